@@ -1,0 +1,3 @@
+"""Rover position and attitude from one picture of the stars."""
+
+__version__ = "0.1.0"

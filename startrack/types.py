@@ -1,0 +1,219 @@
+"""The values that cross module borders, and the exceptions.
+
+Every value is frozen, keyword-only and shape-checked; its arrays are read-only. A stage returns a complete value
+or raises `NoSolution`; there is no NaN, sentinel or half-filled result. Conventions: CONVENTIONS.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+
+class BadInput(Exception):
+    """Input that cannot be used (exit code 4). `reason` is one of the codes of the result format."""
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+class NoSolution(Exception):
+    """A stage found no answer it can stand by (exit code 3). The message says what to try."""
+
+    reason = "inconsistent_evidence"
+
+    def __init__(self, message: str, reason: str | None = None, **evidence: Any) -> None:
+        super().__init__(message)
+        if reason is not None:
+            self.reason = reason
+        self.evidence = evidence
+
+
+class TooFewStars(NoSolution):
+    reason = "no_stars"
+
+
+class NotIdentified(NoSolution):
+    reason = "not_identified"
+
+
+class NotLocated(NoSolution):
+    reason = "insufficient_geometry"
+
+
+def _shaped(**kinds: Any) -> Any:
+    """Dataclass field metadata: `shape` with None for the common length, and `dtype`."""
+    return field(metadata=kinds)
+
+
+def array(*shape: int | str, dtype: Any = np.float64) -> Any:
+    """A checked array field. Letters in `shape` name lengths that must agree within the value."""
+    return _shaped(shape=shape, dtype=dtype)
+
+
+class Value:
+    """Base of the frozen values: converts, checks and locks the fields declared with `array`."""
+
+    def __post_init__(self) -> None:
+        lengths: dict[str, int] = {}
+        for f in fields(self):  # type: ignore[arg-type]
+            if "shape" not in f.metadata:
+                continue
+            a = np.array(getattr(self, f.name), dtype=f.metadata["dtype"])
+            want = f.metadata["shape"]
+            if a.ndim != len(want):
+                raise ValueError(f"{type(self).__name__}.{f.name}: {a.ndim} dimensions, expected {want}")
+            for n, w in zip(a.shape, want, strict=True):
+                if n != (lengths.setdefault(w, n) if isinstance(w, str) else w):
+                    raise ValueError(f"{type(self).__name__}.{f.name}: shape {a.shape}, expected {want} {lengths}")
+            if a.dtype.kind == "f" and np.isnan(a).any():
+                raise ValueError(f"{type(self).__name__}.{f.name} holds NaN")
+            a.flags.writeable = False
+            object.__setattr__(self, f.name, a)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exposure(Value):
+    """One image with the facts that travel with it."""
+
+    pixels_adu: NDArray[np.float32]  # (H, W) [ADU]; a sensor's 16 bits fit float32 exactly
+    name: str = ""  # stem of the file's name
+    path: str = ""  # as given by the user
+    time_utc: datetime | None = None  # mid-exposure, timezone-aware UTC; None when unknown
+    exposure_s: float | None = None
+    camera: str | None = None  # resolved path or shipped name of the camera file
+    terrain: str | None = None  # resolved path or shipped name of the terrain file
+    saturation_adu: float | None = None  # largest value the file's type can hold, None for float images
+    sha256: str = ""
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        p = np.asarray(self.pixels_adu, dtype=np.float32)
+        if p.ndim != 2:
+            raise ValueError(f"Exposure.pixels_adu: {p.ndim} dimensions, expected (H, W)")
+        if p.flags.writeable:
+            p = p.view()
+            p.flags.writeable = False
+        object.__setattr__(self, "pixels_adu", p)
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(W, H)."""
+        return self.pixels_adu.shape[1], self.pixels_adu.shape[0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detections(Value):
+    """Point sources found in an exposure, brightest first."""
+
+    xy_px: Array = array("n", 2)  # centroid
+    covariance_px2: Array = array("n", 2, 2)
+    flux_e: Array = array("n")  # whole-PSF flux [electrons, or ADU when the gain is unknown]
+    flux_sigma_e: Array = array("n")
+    snr: Array = array("n")  # matched-filter signal-to-noise ratio
+    saturated: Bools = array("n", dtype=np.bool_)
+    psf_sigma_px: float  # Gaussian PSF before integration over the pixel, as used
+    background_e: NDArray[np.float32]  # (H, W) smooth background [e], pedestal included
+    noise_e: NDArray[np.float32]  # (H, W) noise of one pixel [e]
+
+    def __len__(self) -> int:
+        return len(self.snr)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stars(Value):
+    """Catalogue stars as seen at one time and place: proper motion and aberration applied."""
+
+    catalog_id: NDArray[np.str_] = array("n", dtype=np.str_)  # such as "HIP 123"
+    hip: Ints = array("n", dtype=np.int64)  # 0 where the star has no Hipparcos number
+    rays_icrs: Array = array("n", 3)  # apparent directions
+    v_mag: Array = array("n")
+    v_sigma_mag: Array = array("n")  # catalogue, colour, variability, unresolved companions
+
+    def __len__(self) -> int:
+        return len(self.v_mag)
+
+    def take(self, which: Any) -> Stars:
+        """The stars selected by a mask, slice or index array."""
+        return Stars(
+            catalog_id=self.catalog_id[which], hip=self.hip[which], rays_icrs=self.rays_icrs[which],
+            v_mag=self.v_mag[which], v_sigma_mag=self.v_sigma_mag[which],
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Body(Value):
+    """A planet, the Earth, the Sun or the Moon as a light source."""
+
+    name: str
+    ray_icrs: Array = array(3)  # apparent direction (light time and aberration applied)
+    v_mag: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attitude(Value):
+    """Rotation of the camera with the covariance of small rotations about the camera's own axes."""
+
+    R_cam_icrs: Array = array(3, 3)
+    covariance_rad2: Array = array(3, 3)  # of the rotation vector w about cam x, y, z: R_true = exp(w) R
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identification(Value):
+    """Which detection is which catalogue star; one-to-one."""
+
+    detection: Ints = array("n", dtype=np.int64)  # index into Detections
+    star: Ints = array("n", dtype=np.int64)  # index into Stars
+    R_cam_icrs: Array = array(3, 3)  # attitude at which the matches were verified
+    false_alarm_probability: float  # that a sky of random detections would be accepted as well matched
+    unexplained: int  # significant detections that no catalogue star explains
+
+    def __len__(self) -> int:
+        return len(self.star)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence(Value):
+    """Rays, each with a log-likelihood ratio "light comes from there" against "the terrain is there".
+
+    Whatever made them: catalogue stars, or patches of the diffuse sky. The localizer does not care.
+    """
+
+    azimuth_rad: Array = array("n")  # in enu
+    elevation_rad: Array = array("n")  # in enu
+    llr: Array = array("n")  # natural log; 0 says nothing
+    edge_sigma_rad: Array = array("n")  # uncertainty of the ray's own elevation
+
+    def __len__(self) -> int:
+        return len(self.llr)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mode(Value):
+    """One connected place of the posterior."""
+
+    east_m: float
+    north_m: float
+    weight: float  # posterior probability
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fix(Value):
+    """Posterior of the camera's position."""
+
+    position_enu_m: Array = array(3)  # posterior mean of the main mode (east, north) and the camera's height there
+    covariance_m2: Array = array(2, 2)  # (east, north)
+    radius95_m: float  # circle about the position that holds 95 % of the posterior
+    radius999_m: float
+    modes: tuple[Mode, ...]  # heaviest first; weights sum to 1
+    ambiguous: bool  # modes outside the main mode's 99.9 % circle hold more than 1 %
+    dropped_mass: float = 0.0  # bound on the posterior probability of what the search pruned

@@ -1,0 +1,18 @@
+"""Cameras: one lens model per file, one camera around them, files to keep them in."""
+
+from startrack.camera.files import camera_from_dict, camera_to_dict, load_camera, save_camera
+from startrack.camera.kannala_brandt import KannalaBrandt
+from startrack.camera.model import Camera, Lens, Sensor
+from startrack.camera.pinhole import Pinhole
+
+__all__ = [
+    "Camera",
+    "KannalaBrandt",
+    "Lens",
+    "Pinhole",
+    "Sensor",
+    "camera_from_dict",
+    "camera_to_dict",
+    "load_camera",
+    "save_camera",
+]

@@ -1,0 +1,160 @@
+"""Camera files (TOML): read, check and write. The format is in docs/formats.md."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from startrack.camera.kannala_brandt import KannalaBrandt
+from startrack.camera.model import ZENITH_MOUNT_R_BODY_CAM, Camera, Lens, Sensor
+from startrack.camera.pinhole import Pinhole
+from startrack.frames import R_from_quat_xyzw, quat_xyzw_from_R
+from startrack.paths import resolve_named
+from startrack.types import BadInput
+
+FORMAT = 1
+
+
+def load_camera(name_or_path: str | Path) -> Camera:
+    """The camera of a file (a path if it ends in .toml or contains a separator) or of a shipped name.
+
+    Raises BadInput no_calibration where there is no such file, bad_calibration where it cannot be used.
+    """
+    path = resolve_named(name_or_path, "calib", "no_calibration")
+    try:
+        return camera_from_dict(tomllib.loads(path.read_text(encoding="utf-8")), default_name=path.stem)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as cause:
+        raise BadInput("bad_calibration", f"{path}: not a TOML file: {cause}") from cause
+    except BadInput as cause:
+        raise BadInput(cause.reason, f"{path}: {cause}") from cause
+
+
+def save_camera(camera: Camera, path: str | Path) -> None:
+    """Write the camera file; `load_camera` gives the same camera back."""
+    import tomli_w
+
+    Path(path).write_text(tomli_w.dumps(camera_to_dict(camera)), encoding="utf-8")
+
+
+def camera_from_dict(d: dict[str, Any], default_name: str = "camera") -> Camera:
+    """The camera of a camera file's keys. Raises BadInput bad_calibration naming the key that is wrong."""
+    if d.get("format", FORMAT) != FORMAT:
+        raise BadInput("bad_calibration", f"format {d['format']!r} is not known; this version reads format {FORMAT}")
+    focal = tuple(_numbers(d, "focal_px", 2))
+    width, height = _numbers(d, "size_px", 2)
+    if min(focal) <= 0 or min(width, height) < 1 or width % 1 or height % 1:
+        raise BadInput("bad_calibration", "focal_px must be positive and size_px positive whole numbers")
+    lens = _lens(d)
+    max_angle = np.radians(_number(d, "max_angle_deg"))
+    if not 0 < max_angle <= np.pi or max_angle > lens.max_invertible_rad + 1e-9:
+        limit = np.degrees(lens.max_invertible_rad)
+        raise BadInput("bad_calibration", f"max_angle_deg: the lens polynomial only rises to {limit:.2f} degrees")
+    calibrated = np.radians(_number(d, "calibrated_angle_deg", np.degrees(max_angle)))
+    order, covariance = _covariance(d.get("covariance"))
+    return Camera(
+        name=str(d.get("name", default_name)),
+        size_px=(int(width), int(height)),
+        focal_px=(focal[0], focal[1]),
+        centre_px=tuple(_numbers(d, "centre_px", 2)),  # type: ignore[arg-type]
+        max_angle_rad=float(max_angle),
+        calibrated_angle_rad=float(min(calibrated, max_angle)),
+        lens=lens,
+        mirrored=bool(d.get("mirrored", False)),
+        R_body_cam=_mount(d.get("mount", {})),
+        sensor=_sensor(d["sensor"]) if "sensor" in d else None,
+        covariance_order=order,
+        covariance=covariance,
+    )
+
+
+def camera_to_dict(camera: Camera) -> dict[str, Any]:
+    """The camera file's keys of a camera."""
+    d: dict[str, Any] = {
+        "format": FORMAT,
+        "name": camera.name,
+        "model": camera.lens.model,
+        "size_px": [int(n) for n in camera.size_px],
+        "focal_px": [float(f) for f in camera.focal_px],
+        "centre_px": [float(c) for c in camera.centre_px],
+    }
+    if camera.lens.model == "kannala_brandt":
+        d["k"] = [float(k) for k in camera.lens.k]
+    d |= {
+        "max_angle_deg": float(np.degrees(camera.max_angle_rad)),
+        "calibrated_angle_deg": float(np.degrees(camera.calibrated_angle_rad)),
+        "mirrored": camera.mirrored,
+    }
+    if not np.array_equal(camera.R_body_cam, ZENITH_MOUNT_R_BODY_CAM):
+        d["mount"] = {"quat_xyzw_body_cam": [float(q) for q in quat_xyzw_from_R(camera.R_body_cam)]}
+    if camera.sensor is not None:
+        d["sensor"] = {**vars(camera.sensor), "vignetting": list(camera.sensor.vignetting)}
+    if camera.covariance is not None:
+        d["covariance"] = {"order": list(camera.covariance_order), "matrix": camera.covariance.tolist()}
+    return d
+
+
+def _lens(d: dict[str, Any]) -> Lens:
+    model = d.get("model", "kannala_brandt")
+    if model == "pinhole":
+        return Pinhole()
+    if model != "kannala_brandt":
+        raise BadInput("bad_calibration", f"model {model!r} is not known: kannala_brandt or pinhole")
+    k = tuple(_numbers(d, "k")) if "k" in d else ()
+    if len(k) > 4:
+        raise BadInput("bad_calibration", f"k has {len(k)} coefficients; at most k1..k4")
+    return KannalaBrandt(k)
+
+
+def _sensor(d: dict[str, Any]) -> Sensor:
+    known = set(Sensor.__dataclass_fields__)
+    unknown = set(d) - known
+    if unknown:
+        raise BadInput("bad_calibration", f"[sensor] has unknown keys: {', '.join(sorted(unknown))}")
+    values: dict[str, Any] = {key: _number(d, key) for key in d if key != "vignetting"}
+    if "vignetting" in d:
+        values["vignetting"] = tuple(_numbers(d, "vignetting", 2))
+    if "zero_point_e_per_s" not in values:
+        raise BadInput("bad_calibration", "[sensor] needs zero_point_e_per_s")
+    sensor = Sensor(**values)
+    if min(sensor.zero_point_e_per_s, sensor.gain_e_per_adu, sensor.psf_sigma_px, sensor.saturation_adu) <= 0:
+        raise BadInput("bad_calibration", "[sensor] zero point, gain, saturation and PSF must be positive")
+    return sensor
+
+
+def _mount(d: dict[str, Any]) -> np.ndarray:
+    if "quat_xyzw_body_cam" not in d:
+        return ZENITH_MOUNT_R_BODY_CAM
+    q = np.array(_numbers(d, "quat_xyzw_body_cam", 4))
+    if abs(np.linalg.norm(q) - 1) > 1e-3:
+        raise BadInput("bad_calibration", "mount.quat_xyzw_body_cam is not a unit quaternion")
+    return R_from_quat_xyzw(q)
+
+
+def _covariance(d: dict[str, Any] | None) -> tuple[tuple[str, ...], np.ndarray | None]:
+    if not d:
+        return (), None
+    order = tuple(str(name) for name in d.get("order", ()))
+    try:
+        matrix = np.array(d.get("matrix"), dtype=np.float64)
+    except (TypeError, ValueError) as cause:
+        raise BadInput("bad_calibration", "[covariance] matrix is not a matrix of numbers") from cause
+    if matrix.shape != (len(order), len(order)):
+        raise BadInput("bad_calibration", f"[covariance] matrix is {matrix.shape} for {len(order)} parameters")
+    return order, matrix
+
+
+def _number(d: dict[str, Any], key: str, default: float | None = None) -> float:
+    value = d.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise BadInput("bad_calibration", f"{key} must be a number, not {value!r}")
+    return float(value)
+
+
+def _numbers(d: dict[str, Any], key: str, count: int | None = None) -> list[float]:
+    values = d.get(key)
+    if not isinstance(values, list) or (count is not None and len(values) != count):
+        raise BadInput("bad_calibration", f"{key} must be a list of {count or 'some'} numbers, not {values!r}")
+    return [_number({key: v}, key) for v in values]

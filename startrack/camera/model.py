@@ -1,0 +1,131 @@
+"""The camera: a lens, a sensor and a mount. Pixels to rays and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from startrack.camera.kannala_brandt import KannalaBrandt
+from startrack.types import Array, Bools
+
+
+class Lens(Protocol):
+    """Radial law of a lens: one file per lens model beside this one."""
+
+    @property
+    def model(self) -> str: ...
+    @property
+    def k(self) -> tuple[float, ...]: ...
+    @property
+    def max_invertible_rad(self) -> float: ...
+    def rho(self, angle_rad: Array) -> Array: ...
+    def slope(self, angle_rad: Array) -> Array: ...
+    def angle_rad(self, rho: Array) -> Array: ...
+
+
+# Body x (forward) = image top = -cam y, body y (left) = +cam x, body z (up) = +cam z: a camera that looks at the zenith.
+ZENITH_MOUNT_R_BODY_CAM = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """What turns light into numbers."""
+
+    zero_point_e_per_s: float  # electrons per second of a V = 0 star on the axis, whole PSF
+    gain_e_per_adu: float = 1.0
+    bias_adu: float = 0.0
+    read_noise_e: float = 0.0
+    dark_e_per_s: float = 0.0  # per pixel
+    saturation_adu: float = 65535.0
+    psf_sigma_px: float = 1.0  # Gaussian, before integration over the pixel
+    vignetting: tuple[float, float] = (0.0, 0.0)
+
+    def throughput(self, angle_rad: Array) -> Array:
+        """Relative throughput 1 + v1 a^2 + v2 a^4 at the angles off the axis [rad]."""
+        a2 = np.square(angle_rad)
+        return np.maximum(1.0 + a2 * (self.vignetting[0] + a2 * self.vignetting[1]), 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """x_px = cx + fx rho(a) cos b, y_px = cy + fy rho(a) sin b, b = atan2(y_cam, x_cam); mirrored: x_px = cx - ...
+
+    Pixel (0, 0) is the centre of the top-left pixel. Works on rays throughout, so z_cam <= 0 (past 90 degrees) is legal.
+    """
+
+    name: str
+    size_px: tuple[int, int]  # (W, H)
+    focal_px: tuple[float, float]  # fx, fy: pixels per radian on the axis
+    centre_px: tuple[float, float]
+    max_angle_rad: float  # edge of the image circle
+    calibrated_angle_rad: float  # beyond this the lens is not known
+    lens: Lens = KannalaBrandt()  # noqa: RUF009 - frozen
+    mirrored: bool = False
+    R_body_cam: Array = field(default_factory=lambda: ZENITH_MOUNT_R_BODY_CAM)
+    sensor: Sensor | None = None
+    covariance_order: tuple[str, ...] = ()
+    covariance: Array | None = None
+
+    @property
+    def _handed_focal_px(self) -> tuple[float, float]:
+        return (-self.focal_px[0] if self.mirrored else self.focal_px[0]), self.focal_px[1]
+
+    def project(self, rays_cam: Array) -> tuple[Array, Bools]:
+        """Pixels (..., 2) of the rays (..., 3), and which of them (...) fall inside the image circle and the frame."""
+        rays_cam = np.asarray(rays_cam, dtype=np.float64)
+        x, y, z = rays_cam[..., 0], rays_cam[..., 1], rays_cam[..., 2]
+        off_axis = np.hypot(x, y)
+        angle = np.arctan2(off_axis, z)
+        imaged = angle <= min(self.max_angle_rad, self.lens.max_invertible_rad)
+        rho = self.lens.rho(np.where(imaged, angle, 0.0))
+        scale = rho / np.where(off_axis > 0, off_axis, 1.0)
+        fx, fy = self._handed_focal_px
+        px = np.stack([self.centre_px[0] + fx * scale * x, self.centre_px[1] + fy * scale * y], axis=-1)
+        width, height = self.size_px
+        within = (px[..., 0] >= -0.5) & (px[..., 0] <= width - 0.5) & (px[..., 1] >= -0.5) & (px[..., 1] <= height - 0.5)
+        return px, imaged & within
+
+    def unproject(self, px: Array) -> Array:
+        """Unit rays_cam (..., 3) of the pixels (..., 2): the exact inverse of `project`."""
+        px = np.asarray(px, dtype=np.float64)
+        fx, fy = self._handed_focal_px
+        u = (px[..., 0] - self.centre_px[0]) / fx
+        v = (px[..., 1] - self.centre_px[1]) / fy
+        rho = np.hypot(u, v)
+        angle = self.lens.angle_rad(rho)
+        scale = np.sin(angle) / np.where(rho > 0, rho, 1.0)
+        return np.stack([u * scale, v * scale, np.cos(angle)], axis=-1)
+
+    def angle_rad(self, px: Array) -> Array:
+        """Angle off the axis [rad] of the pixels (..., 2)."""
+        px = np.asarray(px, dtype=np.float64)
+        u = (px[..., 0] - self.centre_px[0]) / self.focal_px[0]
+        v = (px[..., 1] - self.centre_px[1]) / self.focal_px[1]
+        return self.lens.angle_rad(np.hypot(u, v))
+
+    def jacobian_px_per_rad(self, rays_cam: Array) -> Array:
+        """d px / d w (..., 2, 3) for a small rotation w of the rays about the camera's axes (ray -> ray + w x ray).
+
+        Central differences of the exact projection; the step is far above rounding and far below a pixel.
+        """
+        rays_cam = np.asarray(rays_cam, dtype=np.float64)
+        step_rad = 1e-6
+        columns = []
+        for axis in np.eye(3):
+            turn = step_rad * np.cross(axis, rays_cam)
+            columns.append((self._project_all(rays_cam + turn) - self._project_all(rays_cam - turn)) / (2 * step_rad))
+        return np.stack(columns, axis=-1)
+
+    def _project_all(self, rays_cam: Array) -> Array:
+        return self.project(rays_cam)[0]
+
+    def pixel_solid_angle_sr(self, angle_rad: Array) -> Array:
+        """Solid angle [sr] of one pixel at the angles off the axis [rad]: sin a / (rho rho' fx fy)."""
+        a = np.maximum(np.asarray(angle_rad, dtype=np.float64), 1e-9)
+        return np.sin(a) / (self.lens.rho(a) * self.lens.slope(a) * self.focal_px[0] * self.focal_px[1])
+
+    def mean_scale_rad_per_px(self, angle_rad: Array) -> Array:
+        """Geometric-mean angular size [rad] of one pixel at the angles off the axis [rad]."""
+        return np.sqrt(self.pixel_solid_angle_sr(angle_rad))

@@ -1,0 +1,73 @@
+"""The thesis's crater: a vertical wall of constant height around a flat circular floor, in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.frames import Site
+from startrack.types import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cylinder:
+    """tan H = (depth - camera height) / d(p, a), d the distance from p along azimuth a to the circle of the rim.
+
+    Source: Kua 2008, section 3.1 (eq. 3.1 seen from the camera's height instead of the floor).
+    """
+
+    name: str
+    site: Site
+    diameter_m: float
+    depth_m: float
+    camera_height_m: float = 0.0
+    search_radius_m: float = np.inf
+
+    @property
+    def radius_m(self) -> float:
+        return self.diameter_m / 2
+
+    @property
+    def wall_m(self) -> float:
+        """Height of the rim above the camera [m]."""
+        return self.depth_m - self.camera_height_m
+
+    def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """Horizon elevation [rad]; pi/2 from inside the wall. See `Terrain`."""
+        return np.arctan2(self.wall_m, _distance_to_circle(points_m, azimuths_rad, self.radius_m))
+
+    def horizon_bounds_rad(self, centres_m: Array, half_m: Array, azimuths_rad: Array) -> tuple[Array, Array]:
+        """Bounds of the horizon over boxes [rad], from circles grown and shrunk by the half diagonal.
+
+        A point within r of the centre c sees the circle of radius R no nearer than c sees the one of radius R - r, and
+        no farther than c sees the one of radius R + r.
+        """
+        reach = np.sqrt(2.0) * np.asarray(half_m)
+        nearest = _distance_to_circle(centres_m, azimuths_rad, self.radius_m - reach)
+        farthest = _distance_to_circle(centres_m, azimuths_rad, self.radius_m + reach)
+        return np.arctan2(self.wall_m, farthest), np.arctan2(self.wall_m, nearest)
+
+    def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """Zero: the cylinder is taken as exact."""
+        return np.zeros(np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad)))
+
+    def ground_m(self, points_m: Array) -> Array:
+        """Zero: the floor is the plane z = 0."""
+        return np.zeros(np.shape(points_m)[:-1])
+
+    def allowed(self, points_m: Array) -> Array:
+        """Whether the points (n, 2) are on the floor and inside the search area."""
+        limit = min(self.radius_m, self.search_radius_m)
+        return np.hypot(points_m[..., 0], points_m[..., 1]) < limit
+
+
+def _distance_to_circle(points_m: Array, azimuths_rad: Array, radius_m: Array | float) -> Array:
+    """Distance from p along the azimuth to the far side of the origin's circle; 0 where there is none ahead."""
+    points_m = np.asarray(points_m, dtype=np.float64)
+    x, y = points_m[..., 0], points_m[..., 1]
+    along = x * np.sin(azimuths_rad) + y * np.cos(azimuths_rad)
+    inner = np.square(np.maximum(radius_m, 0.0)) - x * x - y * y
+    root = np.sqrt(np.maximum(along * along + inner, 0.0))
+    # Outside the circle (inner < 0) the rim no longer surrounds the point: the wall is overhead, at distance 0.
+    return np.where(inner > 0, np.maximum(root - along, 0.0), 0.0)

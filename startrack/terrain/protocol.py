@@ -1,0 +1,41 @@
+"""What the localizer asks of any ground: how high the horizon stands, and between which bounds over a box."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from startrack.frames import Site
+from startrack.types import Array
+
+
+class Terrain(Protocol):
+    """A ground whose horizon hides stars. Positions are those of the CAMERA, east and north in enu [m].
+
+    All methods are elementwise over their (broadcast) arguments; the horizon is an elevation in enu [rad], and a star
+    is visible where its elevation exceeds it.
+    """
+
+    name: str
+    site: Site
+    camera_height_m: float  # above the ground
+    search_radius_m: float  # the camera is within this horizontal distance of the origin
+
+    def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """Horizon elevation (n,) seen from the points (n, 2) at the azimuths (n,)."""
+        ...
+
+    def horizon_bounds_rad(self, centres_m: Array, half_m: Array, azimuths_rad: Array) -> tuple[Array, Array]:
+        """Bounds (n,), (n,) that hold the horizon at every allowed point of the boxes |dx|, |dy| <= half (n,)."""
+        ...
+
+    def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """Standard deviation (n,) of the horizon from the errors of the map."""
+        ...
+
+    def ground_m(self, points_m: Array) -> Array:
+        """Height (n,) of the ground in enu."""
+        ...
+
+    def allowed(self, points_m: Array) -> Array:
+        """Whether the camera can stand at the points (n, 2): inside the search area and on the ground."""
+        ...

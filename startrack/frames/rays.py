@@ -1,0 +1,71 @@
+"""Directions: unit vectors, their angles, and what motion and air do to them. Components are on the last axis."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from startrack.types import Array
+
+SPEED_OF_LIGHT_M_S = 299_792_458.0  # exact, SI
+
+
+def rays_from_azel(azimuth_rad: ArrayLike, elevation_rad: ArrayLike) -> Array:
+    """Unit vectors (..., 3) in enu: (sin a cos e, cos a cos e, sin e), azimuth a from north through east."""
+    a, e = np.broadcast_arrays(np.asarray(azimuth_rad, dtype=float), np.asarray(elevation_rad, dtype=float))
+    return np.stack([np.sin(a) * np.cos(e), np.cos(a) * np.cos(e), np.sin(e)], axis=-1)
+
+
+def azel_from_rays(rays_enu: ArrayLike) -> tuple[Array, Array]:
+    """Azimuth in [0, 2 pi) from north through east, and elevation above the horizontal plane, each (...) [rad].
+
+    Weak towards the zenith, where azimuth means little. Vectors need not be of unit length.
+    """
+    east, north, up = np.moveaxis(np.asarray(rays_enu, dtype=float), -1, 0)
+    azimuth_rad = np.arctan2(east, north) % (2 * np.pi)
+    # A tiny negative angle leaves the modulo as 2 pi itself.
+    azimuth_rad = np.where(azimuth_rad >= 2 * np.pi, 0.0, azimuth_rad)
+    return azimuth_rad, np.arctan2(up, np.hypot(east, north))
+
+
+def angle_between_rad(a: ArrayLike, b: ArrayLike) -> Array:
+    """Angle (...) between vectors a and b (..., 3) [rad]: atan2(|a x b|, a . b), exact at 0 and at pi."""
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
+
+
+def aberrate(rays_icrs: ArrayLike, velocity_m_s: ArrayLike) -> Array:
+    """Directions (..., 3) seen by an observer moving at `velocity_m_s` (3,), for directions seen at rest.
+
+    With n at rest, b = v / c and g = (1 - b^2)^(-1/2):  (n / g + (1 + n.b / (1 + 1/g)) b) / (1 + n.b).
+    Exact for any speed below light's (Explanatory Supplement to the Astronomical Almanac, 3rd ed. 2013, eq. 7.40).
+    The bending of light by the Sun is left out: 4 mas at 90 degrees from it, 0.1 arcsec at 5 degrees.
+    """
+    rays = np.asarray(rays_icrs, dtype=float)
+    beta = np.asarray(velocity_m_s, dtype=float) / SPEED_OF_LIGHT_M_S
+    inverse_gamma = np.sqrt(1.0 - beta @ beta)
+    along = (rays @ beta)[..., None]
+    moved = inverse_gamma * rays + (1.0 + along / (1.0 + inverse_gamma)) * beta
+    # Normalised afresh instead of divided by 1 + n.b: rounding in the catalogue's rays must not accumulate.
+    return moved / np.linalg.norm(moved, axis=-1, keepdims=True)
+
+
+def refract_rad(elevation_rad: ArrayLike, pressure_hpa: float = 1010.0, temperature_c: float = 10.0) -> Array:
+    """Apparent elevation (...) in the Earth's air of a source at true elevation `elevation_rad` [rad].
+
+    With lift(h) in arcminutes for the apparent elevation h in degrees, r = cot(h + 7.31 / (h + 4.4)):
+    apparent = true + lift(apparent),  lift = r - 0.06 sin(14.7 r + 13), the sine's argument in degrees,
+    scaled to pressure and temperature. Good to 2 arcsec in average air, down to the horizon, where the weather is
+    worth a tenth of the 34 arcmin. Below -1 degree the lift stays as it is there.
+
+    Source: Bennett (1982), J. Navigation 35, 255, with his correction; as in Meeus (1998), chapter 16.
+    """
+    true_rad = np.asarray(elevation_rad, dtype=float)
+    air = pressure_hpa / 1010.0 * 283.0 / (273.0 + temperature_c)
+    start_deg = np.degrees(np.maximum(true_rad, np.radians(-1.0)))
+    lift_arcmin = np.zeros_like(start_deg)
+    for _ in range(12):  # the lift falls by at most 0.2 arcmin per arcmin: twelve rounds leave nothing
+        h = start_deg + lift_arcmin / 60.0
+        r = 1.0 / np.tan(np.radians(h + 7.31 / (h + 4.4)))
+        lift_arcmin = air * (r - 0.06 * np.sin(np.radians(14.7 * r + 13.0)))
+    return true_rad + np.radians(lift_arcmin / 60.0)

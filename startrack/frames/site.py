@@ -1,0 +1,105 @@
+"""A place on the Moon or the Earth, and the local frame that stands there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite, pi
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from startrack.types import Array, BadInput
+
+MOON_RADIUS_M = 1_737_400.0  # sphere of the LOLA maps, IAU 2015
+EARTH_RADIUS_M = 6_378_137.0  # equatorial, WGS 84
+EARTH_FLATTENING_1 = 1 / 298.257223563  # WGS 84
+
+
+@dataclass(frozen=True)
+class Site:
+    """The origin of a local frame `enu` (east, north, up).
+
+    Moon: planetocentric on the 1737.4 km sphere, mean Earth / polar axis (MOON_ME). Earth: geodetic, WGS 84.
+    """
+
+    body: str  # "moon" or "earth"
+    latitude_rad: float  # north positive
+    longitude_rad: float  # east positive; any turn
+    height_m: float = 0.0  # above the sphere or the ellipsoid
+
+    def __post_init__(self) -> None:
+        if self.body not in ("moon", "earth"):
+            raise BadInput("bad_terrain", f"unknown body {self.body!r}: moon and earth are known")
+        if not all(map(isfinite, (self.latitude_rad, self.longitude_rad, self.height_m))):
+            raise BadInput("bad_terrain", "the origin's latitude, longitude and height must be finite numbers")
+        if abs(self.latitude_rad) > pi / 2:
+            raise BadInput("bad_terrain", f"latitude {np.degrees(self.latitude_rad):.6g} degrees is beyond a pole")
+
+
+def R_enu_fixed(site: Site) -> Array:
+    """Rotation (3, 3) from the body-fixed frame (`mcmf` on the Moon, ITRS on the Earth) to `enu` at the site."""
+    return _R_enu_fixed(site.latitude_rad, site.longitude_rad)
+
+
+def position_fixed_m(site: Site) -> Array:
+    """Position (3,) of the site in the body-fixed frame, from the body's centre [m]."""
+    return _fixed_from_latlon(site.body, site.latitude_rad, site.longitude_rad, site.height_m)
+
+
+def enu_from_latlon(site: Site, latitude_rad: ArrayLike, longitude_rad: ArrayLike, height_m: ArrayLike = 0.0) -> Array:
+    """Points (..., 3) in the site's enu [m] of places on the site's body, as true 3-D points.
+
+    Heights are above the sphere (Moon) or the ellipsoid (Earth): a far place lies below the horizontal plane.
+    """
+    points_m = _fixed_from_latlon(site.body, latitude_rad, longitude_rad, height_m)
+    return (points_m - position_fixed_m(site)) @ R_enu_fixed(site).T
+
+
+def latlon_from_enu(site: Site, east_m: ArrayLike, north_m: ArrayLike, up_m: ArrayLike) -> tuple[Array, Array]:
+    """Latitude and longitude, each (...) [rad], of points in the site's enu; longitude in (-pi, pi].
+
+    Inverse of enu_from_latlon: planetocentric on the Moon, geodetic (WGS 84) on the Earth. At a pole the longitude
+    means nothing.
+    """
+    points_enu_m = np.stack(np.broadcast_arrays(*(np.asarray(c, dtype=float) for c in (east_m, north_m, up_m))), -1)
+    x, y, z = np.moveaxis(points_enu_m @ R_enu_fixed(site) + position_fixed_m(site), -1, 0)
+    axis_distance_m = np.hypot(x, y)
+    longitude_rad = np.arctan2(y, x)
+    if site.body == "moon":
+        return np.arctan2(z, axis_distance_m), longitude_rad
+    return _geodetic_latitude_rad(axis_distance_m, z), longitude_rad
+
+
+def _R_enu_fixed(latitude_rad: float, longitude_rad: float) -> Array:
+    sin_lat, cos_lat = np.sin(latitude_rad), np.cos(latitude_rad)
+    sin_lon, cos_lon = np.sin(longitude_rad), np.cos(longitude_rad)
+    east = [-sin_lon, cos_lon, 0.0]
+    north = [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
+    up = [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]
+    return np.array([east, north, up])
+
+
+def _fixed_from_latlon(body: str, latitude_rad: ArrayLike, longitude_rad: ArrayLike, height_m: ArrayLike) -> Array:
+    lat, lon, h = np.broadcast_arrays(*(np.asarray(v, dtype=float) for v in (latitude_rad, longitude_rad, height_m)))
+    if body == "moon":
+        normal_m, polar_1 = np.full(lat.shape, MOON_RADIUS_M), 1.0
+    else:
+        polar_1 = (1 - EARTH_FLATTENING_1) ** 2
+        normal_m = EARTH_RADIUS_M / np.sqrt(np.cos(lat) ** 2 + polar_1 * np.sin(lat) ** 2)
+    x = (normal_m + h) * np.cos(lat) * np.cos(lon)
+    y = (normal_m + h) * np.cos(lat) * np.sin(lon)
+    return np.stack([x, y, (polar_1 * normal_m + h) * np.sin(lat)], axis=-1)
+
+
+def _geodetic_latitude_rad(axis_distance_m: Array, z_m: Array) -> Array:
+    """Bowring (1976), Survey Review 23, 323: two rounds leave less than a nanoradian within 100 km of the surface."""
+    squash = 1 - EARTH_FLATTENING_1
+    eccentricity2 = 1 - squash**2
+    reduced_rad = np.arctan2(z_m, squash * axis_distance_m)
+    for _ in range(2):
+        latitude_rad = np.arctan2(
+            z_m + eccentricity2 / squash * EARTH_RADIUS_M * np.sin(reduced_rad) ** 3,
+            axis_distance_m - eccentricity2 * EARTH_RADIUS_M * np.cos(reduced_rad) ** 3,
+        )
+        reduced_rad = np.arctan2(squash * np.sin(latitude_rad), np.cos(latitude_rad))
+    return latitude_rad

@@ -1,0 +1,57 @@
+"""Time as text: ISO 8601, always UTC."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime, timedelta
+
+from startrack.types import BadInput
+
+# The suffix only: the date and the time of day before it are left to the standard library.
+_PARTS = re.compile(r"(?P<stamp>\d[\d-]*[Tt ]\d[\d:.,]*)\s?(?P<suffix>[Zz]|[+-][\d:]+)?", re.ASCII)
+_UTC_SUFFIXES = {None, "Z", "z", "+00:00", "+0000", "+00"}
+
+
+def parse_utc(text: str) -> datetime:
+    """The time that `text` names, as an aware UTC datetime.
+
+    ISO 8601 with a date and a time of day. No suffix, Z and +00:00 mean UTC. Digits beyond the microsecond are
+    dropped (the sky turns 15 microarcseconds in one).
+
+    Raises:
+        BadInput: "no_time" for any other offset and for anything that is not such a time; nothing is guessed.
+    """
+    parts = _PARTS.fullmatch(text.strip()) if isinstance(text, str) else None
+    if parts is None:
+        raise BadInput("no_time", f"{text!r} is not an ISO 8601 date and time such as 2026-03-01T12:00:00Z")
+    if parts["suffix"] not in _UTC_SUFFIXES:
+        raise BadInput("no_time", f"{text!r} is a local time (offset {parts['suffix']}): give it in UTC")
+    try:
+        return datetime.fromisoformat(parts["stamp"]).replace(tzinfo=UTC)
+    except ValueError as error:
+        raise BadInput("no_time", f"{text!r} is not a valid date and time: {error}") from error
+
+
+def format_utc(time: datetime) -> str:
+    """`time` as ISO 8601 with microseconds and Z: parse_utc(format_utc(time)) == time.
+
+    Raises:
+        ValueError: the datetime carries no time zone.
+    """
+    return as_utc(time).replace(tzinfo=None).isoformat(timespec="microseconds") + "Z"
+
+
+def as_utc(time: datetime) -> datetime:
+    """The same instant with time zone UTC.
+
+    Raises:
+        ValueError: the datetime carries no time zone, so that it names no instant.
+    """
+    if time.utcoffset() is None:
+        raise ValueError(f"{time!r} carries no time zone")
+    return time.astimezone(UTC)
+
+
+def seconds_since_2000(time: datetime) -> float:
+    """UTC seconds since 2000-01-01T12:00:00Z, leap seconds not counted [s]."""
+    return (as_utc(time) - datetime(2000, 1, 1, 12, tzinfo=UTC)) / timedelta(seconds=1)

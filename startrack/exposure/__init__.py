@@ -1,0 +1,12 @@
+"""One image with the facts that travel with it: read, validate, write.
+
+`read.py` opens a file and picks its decoder (`png.py`, `tiff.py`, `jpeg.py`, `fits.py`); `facts.py` says where time,
+exposure seconds, camera and terrain come from; `write.py` is the way back. Whatever is wrong with a file, the caller
+sees `startrack.types.BadInput` and nothing else.
+"""
+
+from startrack.exposure.facts import Facts, with_facts
+from startrack.exposure.read import read_exposure
+from startrack.exposure.write import write_atomically, write_exposure, write_sidecar
+
+__all__ = ["Facts", "read_exposure", "with_facts", "write_atomically", "write_exposure", "write_sidecar"]

@@ -1,0 +1,96 @@
+"""What every decoder hands back, and the checks they share."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.types import BadInput
+
+MAX_PIXELS = 200_000_000  # contract: larger images are refused from their header, before anything is decoded
+MAX_FILE_BYTES = 8 * MAX_PIXELS + 2**24  # the largest image at the widest pixel type, and its headers
+EXACT_IN_FLOAT32 = 2**24
+UPRIGHT = 1  # EXIF and TIFF orientation of an image stored as seen
+COLOUR_WARNING = "colour image: the plain mean of its three channels is used"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decoded:
+    """Pixels and raw header of one file, before its facts are resolved."""
+
+    pixels_adu: NDArray[np.float32]  # (H, W) [ADU], all finite
+    saturation_adu: float | None  # largest value the stored type can hold; None for floating point
+    header: Mapping[str, Any] = field(default_factory=dict)  # keys as in a FITS header
+    warnings: tuple[str, ...] = ()
+
+
+def refuse(cause: str) -> BadInput:
+    """The exception for a file that is not read; `read_exposure` puts the file's name before the cause."""
+    return BadInput("bad_image", cause)
+
+
+def shown(path: str | os.PathLike[str]) -> str:
+    """`path` for a message: one line, printable on any terminal."""
+    return " ".join(os.fspath(path).encode("utf-8", "backslashreplace").decode().split())
+
+
+def check_size(width_px: int, height_px: int) -> None:
+    """Pass an image of 1 to 200 Mpx; `BadInput` for any other. To be called on header values, before decoding."""
+    if width_px < 1 or height_px < 1:
+        raise refuse(f"holds no pixels ({width_px} x {height_px})")
+    if width_px * height_px > MAX_PIXELS:
+        size, most = width_px * height_px / 1e6, MAX_PIXELS / 1e6
+        raise refuse(f"{width_px} x {height_px} is {size:.1f} Mpx, more than the {most:.0f} allowed")
+
+
+def grey_float32(stored: NDArray[Any]) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+    """Pixels (H, W) as float32 [ADU], with warnings, from (H, W) or (H, W, 3) of any integer or real type.
+
+    8 and 16 bits stay exact. Colour becomes the plain mean of its channels, not rounded. `BadInput` for a pixel that
+    is not a finite number: there is no honest value to put in its place.
+    """
+    warnings: list[str] = []
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is refused below
+        if stored.ndim == 3:
+            warnings.append(COLOUR_WARNING)
+            pixels = stored[..., 0].astype(np.float32)
+            for channel in (1, 2):  # sums of 16-bit values are exact in float32
+                pixels += stored[..., channel]
+            pixels /= np.float32(3)
+        else:
+            pixels = np.ascontiguousarray(stored, dtype=np.float32)
+    if stored.dtype.kind == "f":
+        bad = pixels.size - int(np.count_nonzero(np.isfinite(pixels)))
+        if bad:
+            raise refuse(
+                f"{bad} of {pixels.size} pixels are NaN or infinite; fill them (by their neighbours' median, say) first"
+            )
+    elif stored.dtype.itemsize > 2 and float(np.abs(pixels).max()) > EXACT_IN_FLOAT32:
+        warnings.append("values beyond 2^24 are rounded to 24 significant bits")
+    return pixels, tuple(warnings)
+
+
+def largest_value(dtype: np.dtype[Any]) -> float | None:
+    """Largest value of an integer type; None for floating point, which has no saturation of its own."""
+    return float(np.iinfo(dtype).max) if dtype.kind in "ui" else None
+
+
+def orientation_warnings(orientation: object) -> tuple[str, ...]:
+    """A warning if the file asks to be turned for display: the sensor's geometry belongs to the calibration."""
+    if orientation is None or orientation == UPRIGHT:
+        return ()
+    return (f"orientation tag {orientation} ignored: pixels are taken as the sensor stored them",)
+
+
+def exif_warnings(read_exif: Callable[[], Any]) -> tuple[str, ...]:
+    """`orientation_warnings` of what `read_exif` returns (`PIL.Image.Exif`); unreadable EXIF costs only a warning."""
+    try:
+        return orientation_warnings(read_exif().get(0x0112))
+    except (OSError, SyntaxError, ValueError, TypeError, LookupError, struct.error) as error:
+        return (f"EXIF data cannot be read ({error}); ignored",)

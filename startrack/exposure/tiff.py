@@ -1,0 +1,150 @@
+"""TIFF and BigTIFF: structure and common pixels by tifffile; by OpenCV where a codec is missing (LZW, for one)."""
+
+from __future__ import annotations
+
+import logging
+import math
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.exposure.decoded import (
+    Decoded,
+    check_size,
+    grey_float32,
+    largest_value,
+    orientation_warnings,
+    refuse,
+)
+from startrack.exposure.facts import facts_in_text
+
+MINISWHITE, MINISBLACK, RGB = 0, 1, 2
+REFUSED = {MINISWHITE: "white-is-zero", 3: "palette", 4: "a mask", 5: "CMYK", 6: "YCbCr", 8: "CIELab", 32803: "Bayer"}
+UNCOMPRESSED = 1
+WITHOUT_IMAGECODECS = {UNCOMPRESSED, 8, 32946, 32773}  # deflate twice, PackBits: tifffile needs nothing more for these
+HORIZONTAL = 2  # the predictor it has by itself
+READ = "integers of 8, 16 or 32 bits and floating point"
+TYPES = {"uint8", "uint16", "uint32", "int8", "int16", "int32", "float16", "float32", "float64"}
+
+
+def decode_tiff(raw: bytes) -> Decoded:
+    """Pixels of a TIFF with one grey or colour picture of whole bytes; facts from its ImageDescription.
+
+    `BadInput` if truncated, with alpha, palette or CMYK, or with several pictures (reduced copies do not count).
+    """
+    import tifffile
+
+    _hush(logging.getLogger("tifffile"))
+    with tifffile.TiffFile(BytesIO(raw)) as tiff:
+        _check_chain(tiff, raw)
+        page = _only_page(tiff)
+        _check_kind(page)
+        _check_strips(page, len(raw))
+        stored = _pixels(page, raw)
+        orientation = page.tags.get(274)
+        header = facts_in_text(page.description)
+    pixels, colour = grey_float32(stored)
+    return Decoded(
+        pixels_adu=pixels,
+        saturation_adu=largest_value(stored.dtype),
+        header=header,
+        warnings=orientation_warnings(None if orientation is None else int(orientation.value)) + colour,
+    )
+
+
+def _hush(logger: logging.Logger) -> None:
+    """Keep a damaged file from printing through logging's last resort; the exception says what is wrong."""
+    if not any(isinstance(h, logging.NullHandler) for h in logger.handlers):
+        logger.addHandler(logging.NullHandler())
+
+
+def _check_chain(tiff: Any, raw: bytes) -> None:
+    """The last directory must be whole and say that it is the last: tifffile drops pictures that it cannot find."""
+    if not len(tiff.pages):
+        raise refuse("truncated or damaged TIFF: its directory is not in the file")
+    form, last = tiff.tiff, tiff.pages[-1].offset
+    (tags,) = struct.unpack_from(form.tagnoformat, raw, last)
+    if any(struct.unpack_from(form.offsetformat, raw, last + form.tagnosize + tags * form.tagsize)):
+        raise refuse("truncated or damaged TIFF: one of its directories is not in the file")
+
+
+def _only_page(tiff: Any) -> Any:
+    full = [page for page in tiff.pages if not page.is_reduced]
+    if len(full) != 1:
+        raise refuse(f"TIFF holds {len(full)} pictures; startrack reads files with one")
+    page = full[0]
+    check_size(page.imagewidth, page.imagelength)
+    # A stack can hide behind one page: ImageJ and tifffile write its true shape into the description.
+    hidden = max((math.prod(entry.get("shape", ())) for entry in tiff.shaped_metadata or ()), default=0)
+    if tiff.is_imagej and (tiff.imagej_metadata or {}).get("images", 1) > 1:
+        hidden = page.size * tiff.imagej_metadata["images"]
+    if hidden > page.size:
+        raise refuse("TIFF holds a stack of pictures; startrack reads files with one")
+    return page
+
+
+def _check_kind(page: Any) -> None:
+    photometric, channels = int(page.photometric), page.samplesperpixel
+    if photometric not in (MINISBLACK, RGB):
+        kind = REFUSED.get(photometric, f"photometric type {photometric}")
+        raise refuse(f"TIFF is {kind}; startrack reads plain grey or colour")
+    if channels != {MINISBLACK: 1, RGB: 3}[photometric]:
+        raise refuse(f"TIFF has {channels} channels (alpha?); startrack reads plain grey or colour")
+    if page.imagedepth != 1:
+        raise refuse("TIFF holds a volume; startrack reads pictures")
+    if page.dtype is None or page.dtype.name not in TYPES or page.bitspersample != page.dtype.itemsize * 8:
+        raise refuse(f"TIFF has {page.bitspersample}-bit samples of type {page.dtype}; startrack reads {READ}")
+
+
+def _check_strips(page: Any, file_bytes: int) -> None:
+    """Every strip or tile must lie within the file: a decoder would fill what is missing with a constant."""
+    if page.is_tiled:
+        check_size(page.tilewidth, page.tilelength)  # a tile may be larger than the picture it is cropped to
+    starts, counts = page.dataoffsets, page.databytecounts
+    if not starts or len(starts) != len(counts) or len(starts) != math.prod(page.chunked):
+        raise refuse("damaged TIFF: strips of the picture are missing")
+    for start, count in zip(starts, counts, strict=True):
+        if start <= 0 or count <= 0 or start + count > file_bytes:
+            raise refuse("truncated TIFF: a strip of the picture lies beyond the end of the file")
+    if page.compression == UNCOMPRESSED and sum(counts) < page.size * page.dtype.itemsize:
+        raise refuse("damaged TIFF: its strips are shorter than the picture")
+
+
+def _pixels(page: Any, raw: bytes) -> NDArray[Any]:
+    """(H, W) or (H, W, 3) as stored, native byte order."""
+    if page.compression in WITHOUT_IMAGECODECS and page.predictor in (1, HORIZONTAL):
+        stored = page.asarray()
+        if page.axes == "SYX":  # channels in separate planes
+            stored = np.moveaxis(stored, 0, -1)
+    else:
+        stored = _pixels_by_opencv(raw, page.compression)
+    want = (page.imagelength, page.imagewidth, 3)[: 3 if page.samplesperpixel == 3 else 2]
+    if stored.shape != want or stored.dtype.newbyteorder("=") != page.dtype.newbyteorder("="):
+        raise refuse(f"damaged TIFF: decodes to {stored.shape} of {stored.dtype}")
+    return stored
+
+
+def _pixels_by_opencv(raw: bytes, compression: Any) -> NDArray[Any]:
+    import cv2
+
+    with _quiet(cv2):
+        stored = cv2.imdecode(np.frombuffer(raw, np.uint8), cv2.IMREAD_UNCHANGED)
+    if stored is None:
+        raise refuse(f"TIFF is damaged or its compression ({compression!r}) is unknown here; save it uncompressed")
+    return np.asarray(stored)
+
+
+@contextmanager
+def _quiet(cv2: Any) -> Iterator[None]:
+    """OpenCV prints a failed decoding to stderr; the exception says it instead."""
+    log = cv2.utils.logging
+    level = log.setLogLevel(log.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        log.setLogLevel(level)

@@ -1,0 +1,181 @@
+"""From an `Exposure` to a file: PNG, TIFF or FITS with its facts inside, under its name only when it is whole."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import json
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import timedelta
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.exposure.decoded import shown
+from startrack.exposure.facts import Facts, is_path, sidecars
+from startrack.frames.utc import format_utc
+from startrack.types import BadInput, Exposure
+
+PACKED = {".gz": lambda data: gzip.compress(data, compresslevel=1, mtime=0), ".bz2": bz2.compress}
+
+
+def write_exposure(path: str | os.PathLike[str], exposure: Exposure, *, overwrite: bool = False) -> Path:
+    """Write the image by suffix (.png, .tif, .tiff, .fits, .fits.gz, .fits.bz2), facts inside, and return its path.
+
+    PNG holds 16-bit counts (8-bit ones if that is what the exposure was read from), rounded; TIFF and FITS too, or
+    float32 if the pixels are not such counts. Camera and terrain paths are written relative to the file. The same
+    exposure gives the same bytes. `write_sidecar` is the other place for the facts.
+
+    Raises:
+        BadInput: bad_image if the file exists and not `overwrite`, the suffix is not known, the pixels do not fit the
+            type, or the file cannot be written.
+    """
+    target = Path(path)
+    packing = target.suffix.lower() if target.suffix.lower() in PACKED else ""
+    suffix = Path(target.stem).suffix.lower() if packing else target.suffix.lower()
+    encoder = _ENCODERS.get(suffix)
+    if encoder is None or (packing and suffix not in FITS_SUFFIXES):
+        raise BadInput("bad_image", f"{shown(target)}: startrack writes .png, .tif, .fits, .fits.gz and .fits.bz2")
+    _check_free(target, overwrite)
+    try:
+        data = encoder(exposure.pixels_adu, exposure.saturation_adu, header_entries(exposure, target.parent))
+    except ValueError as error:
+        raise BadInput("bad_image", f"{shown(target)}: {error}") from error
+    write_atomically(target, PACKED[packing](data) if packing else data, overwrite=overwrite)
+    return target
+
+
+def write_sidecar(image: str | os.PathLike[str], facts: Facts | Exposure, *, overwrite: bool = False) -> Path:
+    """Write the facts that are known to NAME.json beside the image NAME.png, and return the sidecar's path."""
+    target = sidecars(Path(image))[-1]
+    values = {
+        "time_utc": None if facts.time_utc is None else format_utc(facts.time_utc),
+        "exposure_s": facts.exposure_s,
+        "camera": _relative(facts.camera, target.parent),
+        "terrain": _relative(facts.terrain, target.parent),
+    }
+    text = json.dumps({k: v for k, v in values.items() if v is not None}, ensure_ascii=False, allow_nan=False)
+    write_atomically(target, text.encode("utf-8") + b"\n", overwrite=overwrite)
+    return target
+
+
+def write_atomically(path: str | os.PathLike[str], data: bytes, *, overwrite: bool = False) -> None:
+    """Put `data` under `path`, whole or not at all; folders are made. `BadInput` (bad_image) if that cannot be."""
+    target = Path(path)
+    _check_free(target, overwrite)
+    # In the same folder, since a rename does not cross file systems; not by tempfile, which makes files private.
+    temporary = target.with_name(f".{uuid4().hex}.part")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with temporary.open("xb") as file:
+            file.write(data)
+        os.replace(temporary, target)
+    except (OSError, ValueError) as error:
+        cause = getattr(error, "strerror", None) or error
+        raise BadInput("bad_image", f"{shown(target)}: cannot be written ({cause})") from error
+    finally:
+        with suppress(OSError):  # gone after the rename; and a failed clean-up must not hide the cause
+            temporary.unlink()
+
+
+def header_entries(exposure: Exposure, folder: Path) -> dict[str, str | float]:
+    """The known facts under the names of a FITS header, both dates among them; paths relative to `folder`."""
+    entries: dict[str, str | float] = {}
+    if exposure.time_utc is not None:
+        entries["TIMESYS"] = "UTC"
+        if exposure.exposure_s is not None:
+            start = exposure.time_utc - timedelta(seconds=exposure.exposure_s / 2)
+            entries["DATE-OBS"] = format_utc(start).removesuffix("Z")  # FITS has no zone letter
+        entries["DATE-AVG"] = format_utc(exposure.time_utc).removesuffix("Z")
+    if exposure.exposure_s is not None:
+        entries["EXPTIME"] = float(exposure.exposure_s)
+    for key, reference in (("STCAMERA", exposure.camera), ("STTERRAI", exposure.terrain)):
+        relative = _relative(reference, folder)
+        if relative is not None:
+            entries[key] = relative
+    return entries
+
+
+def _check_free(target: Path, overwrite: bool) -> None:
+    if not overwrite and os.path.lexists(target):
+        raise BadInput("bad_image", f"{shown(target)}: exists already, and overwriting was not asked for")
+
+
+def _relative(reference: str | None, folder: Path) -> str | None:
+    """A path as seen from `folder`, with forward slashes; a shipped name as it is."""
+    if reference is None or not is_path(reference):
+        return reference
+    try:  # real paths, or ".." would lead astray where the folder is a symbolic link
+        relative = Path(os.path.relpath(os.path.realpath(reference), os.path.realpath(folder))).as_posix()
+    except ValueError:  # another drive of Windows
+        return Path(reference).absolute().as_posix()
+    return relative if is_path(relative) else f"./{relative}"
+
+
+def _counts(pixels: NDArray[np.float32], saturation_adu: float | None) -> NDArray[Any]:
+    """The pixels rounded to the integers a file holds; ValueError if they do not fit."""
+    if not np.isfinite(pixels).all():
+        raise ValueError("pixels that are NaN or infinite cannot be written")
+    lowest, highest = float(pixels.min()), float(pixels.max())
+    if lowest < -0.5 or highest >= 65535.5:
+        raise ValueError(f"values from {lowest:g} to {highest:g} do not fit 16 bits; write TIFF or FITS")
+    eight = saturation_adu == 255 and highest < 255.5
+    return np.rint(pixels).astype(np.uint8 if eight else np.uint16)
+
+
+def _counts_or_float(pixels: NDArray[np.float32], saturation_adu: float | None) -> NDArray[Any]:
+    fit = saturation_adu is not None and pixels.min() >= 0 and pixels.max() <= 65535
+    return _counts(pixels, saturation_adu) if fit and np.array_equal(pixels, np.rint(pixels)) else pixels
+
+
+def _png(pixels: NDArray[np.float32], saturation_adu: float | None, entries: dict[str, str | float]) -> bytes:
+    import cv2
+
+    from startrack.exposure.png import add_text
+
+    # Noise does not compress beyond its entropy: run lengths and Huffman coding take half the time of a search for
+    # matches, and the file is no larger.
+    fast = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+    done, data = cv2.imencode(".png", _counts(pixels, saturation_adu), fast)
+    if not done:
+        raise ValueError("OpenCV cannot encode this image as PNG")
+    return add_text(data.tobytes(), {key: str(value) for key, value in entries.items()})
+
+
+def _tiff(pixels: NDArray[np.float32], saturation_adu: float | None, entries: dict[str, str | float]) -> bytes:
+    import tifffile
+
+    file = BytesIO()
+    stored = _counts_or_float(pixels, saturation_adu)
+    tifffile.imwrite(file, stored, photometric="minisblack", description=json.dumps(entries), metadata=None)
+    return file.getvalue()
+
+
+def _fits(pixels: NDArray[np.float32], saturation_adu: float | None, entries: dict[str, str | float]) -> bytes:
+    from astropy.io import fits
+
+    unit = fits.PrimaryHDU(_counts_or_float(pixels, saturation_adu))
+    for key, value in entries.items():
+        unit.header[key] = (value, _COMMENTS.get(key))
+    unit.add_datasum(when="")  # the default comment holds today's date, and equal input must give equal bytes
+    unit.add_checksum(when="", override_datasum=True)
+    file = BytesIO()
+    unit.writeto(file)
+    return file.getvalue()
+
+
+_COMMENTS = {  # none beside a path, which may need the whole card
+    "TIMESYS": "time scale of the dates",
+    "DATE-OBS": "start of exposure",
+    "DATE-AVG": "middle of exposure",
+    "EXPTIME": "[s] exposure",
+}
+FITS_SUFFIXES = {".fits", ".fit", ".fts"}
+_Encoder = Callable[[NDArray[np.float32], float | None, dict[str, str | float]], bytes]
+_ENCODERS: dict[str, _Encoder] = {".png": _png, ".tif": _tiff, ".tiff": _tiff, **dict.fromkeys(FITS_SUFFIXES, _fits)}

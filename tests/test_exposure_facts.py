@@ -1,0 +1,208 @@
+"""Time, exposure, camera and terrain: flag, then sidecar, then header."""
+
+import json
+import os
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pytest
+import tifffile
+from astropy.io import fits
+from PIL import Image, PngImagePlugin
+
+from startrack.exposure import read_exposure, with_facts
+from startrack.types import BadInput
+
+FRAME = np.arange(12, dtype=np.uint16).reshape(3, 4)
+MID = datetime(2031, 3, 26, 20, 58, 11, 966208, tzinfo=UTC)
+
+
+@pytest.fixture
+def image(tmp_path):
+    """A PNG that says everything about itself."""
+    text = PngImagePlugin.PngInfo()
+    for key, value in {
+        "DATE-OBS": "2020-01-01T00:00:00",
+        "EXPTIME": "20.0",
+        "STCAMERA": "header.toml",
+        "STTERRAI": "header-terrain",
+    }.items():
+        text.add_text(key, value)
+    path = tmp_path / "frame.png"
+    Image.fromarray(FRAME).save(path, pnginfo=text)
+    return path
+
+
+@pytest.fixture
+def sidecar(image):
+    def write(values, name="frame.json"):
+        raw = values if isinstance(values, bytes) else json.dumps(values).encode()
+        (image.parent / name).write_bytes(raw)
+
+    return write
+
+
+def test_header_alone(image):
+    exposure = read_exposure(image)
+    assert exposure.time_utc == datetime(2020, 1, 1, 0, 0, 10, tzinfo=UTC)
+    assert (exposure.exposure_s, exposure.terrain) == (20.0, "header-terrain")
+    assert exposure.camera == str(image.parent / "header.toml")
+
+
+def test_sidecar_goes_before_header_fact_by_fact(image, sidecar):
+    sidecar({"time_utc": "2031-03-26T20:58:11.966208Z", "camera": "fisheye-2048", "remark": "unknown keys pass"})
+    exposure = read_exposure(image)
+    assert exposure.time_utc == MID
+    assert exposure.exposure_s == 20.0
+    assert exposure.camera == "fisheye-2048"
+    assert exposure.terrain == "header-terrain"
+    assert exposure.warnings == ()
+
+
+def test_flags_go_before_sidecar(image, sidecar):
+    sidecar({"time_utc": "2031-03-26T20:58:11Z", "exposure_s": 5, "camera": "a.toml", "terrain": "b.toml"})
+    flags = {"time_utc": MID, "exposure_s": 7.0, "camera": "flag.toml", "terrain": "flagged"}
+    for exposure in (read_exposure(image, **flags), with_facts(read_exposure(image), **flags)):
+        assert {key: getattr(exposure, key) for key in flags} == flags
+
+
+def test_a_fact_given_by_flag_is_not_even_looked_at_below(image, sidecar):
+    sidecar({"time_utc": "2031-03-26T20:58:11+02:00"})
+    with pytest.raises(BadInput, match="local time") as caught:
+        read_exposure(image)
+    assert caught.value.reason == "no_time"
+    assert read_exposure(image, time_utc=MID).time_utc == MID
+
+
+def test_the_exposure_that_holds_moves_the_middle(image, sidecar):
+    """DATE-OBS is a start: half of the exposure that is believed comes on top, whoever said it."""
+    start = datetime(2020, 1, 1, tzinfo=UTC)
+    assert read_exposure(image, exposure_s=8.0).time_utc == start + timedelta(seconds=4)
+    sidecar({"exposure_s": 6})
+    assert read_exposure(image).time_utc == start + timedelta(seconds=3)
+
+
+def test_with_facts_leaves_the_rest_alone(image):
+    before = read_exposure(image)
+    after = with_facts(before, camera="other")
+    assert (after.camera, after.terrain, after.time_utc) == ("other", before.terrain, before.time_utc)
+    assert after.sha256 == before.sha256
+    with pytest.raises(ValueError, match="zone"):
+        with_facts(before, time_utc=datetime(2031, 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("reference", "is_path"),
+    [
+        ("camera.toml", True),
+        ("../calib/camera.toml", True),
+        ("calib/camera", True),
+        ("./camera", True),
+        ("fisheye-2048", False),
+        ("fisheye.2048", False),
+    ],
+)
+def test_paths_are_relative_to_the_sidecar(image, sidecar, monkeypatch, reference, is_path):
+    sidecar({"camera": reference})
+    monkeypatch.chdir(image.parent)
+    for path in (image, "frame.png"):
+        camera = read_exposure(path).camera
+        assert os.path.abspath(camera) == os.path.abspath(reference) if is_path else camera == reference
+
+
+def test_an_absolute_path_stays(image, sidecar):
+    sidecar({"terrain": "/data/crater.toml"})
+    assert read_exposure(image).terrain == "/data/crater.toml"
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        b"{",
+        b"",
+        b"\xff\xfe\x00",
+        b"[1, 2]",
+        b'"text"',
+        b"[" * 100_000,
+        b'{"exposure_s": "ten"}',
+        b'{"exposure_s": true}',
+        b'{"exposure_s": 0}',
+        b'{"exposure_s": -3}',
+        b'{"exposure_s": NaN}',
+        b'{"exposure_s": Infinity}',
+        b'{"exposure_s": 1' + b"0" * 400 + b"}",
+        b'{"camera": 5}',
+        b'{"camera": " "}',
+        b'{"terrain": ["a"]}',
+    ],
+)
+def test_a_sidecar_that_cannot_be_used_is_refused(image, sidecar, raw):
+    sidecar(raw)
+    with pytest.raises(BadInput, match=r"sidecar .*frame\.json: ") as caught:
+        read_exposure(image)
+    assert caught.value.reason == "bad_image"
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(
+    "time", ["2031-03-26T20:58:11-05:00", "2031-03-26", "noon", "9" * 5000, 20310326, "2031-02-30T00:00:00"]
+)
+def test_a_sidecar_time_that_is_not_utc_is_no_time(image, sidecar, time):
+    sidecar({"time_utc": time})
+    with pytest.raises(BadInput) as caught:
+        read_exposure(image)
+    assert caught.value.reason == "no_time"
+    assert len(str(caught.value)) < 500
+
+
+def test_null_means_not_given_and_a_byte_order_mark_is_skipped(image, sidecar):
+    sidecar(b'\xef\xbb\xbf{"exposure_s": null, "camera": null, "terrain": "x"}')
+    exposure = read_exposure(image)
+    assert (exposure.exposure_s, exposure.terrain) == (20.0, "x")
+    assert exposure.camera == str(image.parent / "header.toml")
+
+
+@pytest.mark.parametrize("sidecar_name", ["frame.json", "frame.fits.json", "frame.fits.bz2.json"])
+def test_sidecars_of_a_packed_file(tmp_path, sidecar_name):
+    import bz2
+
+    fits.PrimaryHDU(FRAME).writeto(tmp_path / "frame.fits")
+    (tmp_path / "frame.fits.bz2").write_bytes(bz2.compress((tmp_path / "frame.fits").read_bytes()))
+    (tmp_path / sidecar_name).write_text('{"exposure_s": 60}')
+    assert read_exposure(tmp_path / "frame.fits.bz2").exposure_s == 60.0
+
+
+def test_the_sidecar_that_names_the_suffix_goes_first(image, sidecar):
+    sidecar({"exposure_s": 1})
+    sidecar({"exposure_s": 2}, "frame.png.json")
+    assert read_exposure(image).exposure_s == 2.0
+
+
+def test_a_name_as_long_as_the_system_allows(tmp_path):
+    path = tmp_path / ("x" * 251 + ".png")
+    Image.fromarray(FRAME).save(path)
+    assert read_exposure(path).name == "x" * 251
+
+
+@pytest.mark.parametrize(
+    "description",
+    [
+        "DATE-AVG = 2031-03-26T20:58:11.966208\nEXPTIME= 10\nSTCAMERA = 'camera.toml'\nnotes = none",
+        '{"time_utc": "2031-03-26T20:58:11.966208Z", "exposure_s": 10, "camera": "camera.toml"}',
+        '{"DATE-OBS": "2031-03-26T20:58:06.966208", "EXPTIME": 10, "STCAMERA": "camera.toml"}',
+    ],
+)
+def test_tiff_description(tmp_path, description):
+    path = tmp_path / "frame.tif"
+    tifffile.imwrite(path, FRAME, description=description, metadata=None, datetime=True)
+    exposure = read_exposure(path)
+    assert exposure.time_utc == MID
+    assert exposure.exposure_s == 10.0
+    assert exposure.camera == str(tmp_path / "camera.toml")
+
+
+def test_the_zoneless_time_of_a_tiff_is_not_used(tmp_path):
+    path = tmp_path / "frame.tif"
+    tifffile.imwrite(path, FRAME, datetime=datetime(2020, 1, 1))
+    assert read_exposure(path).time_utc is None

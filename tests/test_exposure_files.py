@@ -1,0 +1,80 @@
+"""What is not an image file at all, odd names, and what reading costs."""
+
+import hashlib
+import os
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from startrack.exposure import read_exposure
+from startrack.types import BadInput
+
+WHOLE = cv2.imencode(".png", np.arange(600, dtype=np.uint16).reshape(20, 30))[1].tobytes()
+
+
+@pytest.mark.parametrize("target", ["missing.png", "folder", "a\0b.png", "pipe.png"])
+def test_what_is_no_file(tmp_path, target):
+    (tmp_path / "folder").mkdir()
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(tmp_path / "pipe.png")
+    with pytest.raises(BadInput, match=r"No such file|is a folder|null|not a regular file") as caught:
+        read_exposure(os.path.join(tmp_path, target))
+    assert caught.value.reason == "bad_image"
+
+
+def test_permission_denied(tmp_path, monkeypatch):
+    """Root may read anything, so the refusal of the system is played."""
+    path = tmp_path / "frame.png"
+    path.write_bytes(WHOLE)
+
+    def denied(*_args, **_keywords):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("pathlib.Path.read_bytes", denied)
+    with pytest.raises(BadInput, match="Permission denied"):
+        read_exposure(path)
+
+
+@pytest.mark.parametrize("name", ["space and ünïcode ☾.png", "line\nbreak.png", "dots.in.name.png", "UPPER.PNG"])
+def test_names(tmp_path, name):
+    path = tmp_path / name
+    path.write_bytes(WHOLE)
+    exposure = read_exposure(path)
+    assert exposure.name == name[:-4]
+    assert exposure.path == str(path)
+    path.write_bytes(WHOLE[:-1])
+    with pytest.raises(BadInput) as caught:
+        read_exposure(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_hash_is_of_the_file(tmp_path):
+    path = tmp_path / "frame.png"
+    path.write_bytes(WHOLE)
+    assert read_exposure(path).sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_import_is_light():
+    code = "import startrack.exposure, sys; print({'cv2', 'astropy', 'tifffile', 'PIL'} & set(sys.modules))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.strip() == "set()"
+
+
+def test_four_megapixels_take_little_longer_than_opencv_alone(tmp_path):
+    noise = np.random.default_rng(1).normal(1000, 20, (2048, 2048)).astype(np.uint16)
+    path = tmp_path / "frame.png"
+    cv2.imwrite(str(path), noise)
+
+    def best_s(call):
+        times = []
+        for _ in range(4):
+            start = time.perf_counter()
+            call()
+            times.append(time.perf_counter() - start)
+        return min(times)
+
+    assert best_s(lambda: read_exposure(path)) < 2 * best_s(lambda: cv2.imread(str(path), cv2.IMREAD_UNCHANGED)) + 0.03

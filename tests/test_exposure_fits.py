@@ -1,0 +1,208 @@
+"""FITS files written by astropy: read as astropy means them, or refused with the cause."""
+
+import bz2
+import gzip
+import io
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from startrack.exposure import read_exposure
+from startrack.types import BadInput
+
+FRAME = np.random.default_rng(5).integers(0, 65536, (31, 47)).astype(np.uint16)
+SIGNED = FRAME.view(np.int16)
+TABLE = fits.BinTableHDU.from_columns([fits.Column("flux", "E", array=np.arange(3.0))])
+
+
+def written(*units, **options):
+    """FITS bytes; None stands for an empty primary unit."""
+    file = io.BytesIO()
+    fits.HDUList([fits.PrimaryHDU() if unit is None else unit for unit in units]).writeto(file, **options)
+    return file.getvalue()
+
+
+def declared(**cards):
+    """Header that astropy would not write, without data."""
+    lines = [f"{'SIMPLE':8}= {'T':>20}", *(f"{key:8}= {value:>20}" for key, value in cards.items()), "END"]
+    return "".join(line.ljust(80) for line in lines).encode().ljust(2880)
+
+
+@pytest.fixture
+def read(tmp_path):
+    def from_bytes(raw, name="frame.fits"):
+        path = tmp_path / name
+        path.write_bytes(raw)
+        return read_exposure(path)
+
+    return from_bytes
+
+
+@pytest.fixture
+def cause(read):
+    def of(raw):
+        with pytest.raises(BadInput) as caught:
+            read(raw)
+        assert caught.value.reason == "bad_image"
+        assert "\n" not in str(caught.value)
+        return str(caught.value)
+
+    return of
+
+
+@pytest.mark.parametrize(
+    ("units", "expected", "saturation"),
+    [
+        ([fits.PrimaryHDU(FRAME)], FRAME, 65535),  # BZERO = 32768
+        ([fits.PrimaryHDU(SIGNED)], SIGNED, 32767),  # big-endian, no BZERO
+        ([fits.PrimaryHDU((FRAME >> 8).astype(np.uint8))], FRAME >> 8, 255),
+        ([fits.PrimaryHDU(FRAME.astype(np.uint32))], FRAME, 2**32 - 1),
+        ([fits.PrimaryHDU(FRAME.astype(np.float32) / 3)], FRAME.astype(np.float32) / 3, None),
+        ([fits.PrimaryHDU(FRAME.astype(np.float64))], FRAME, None),
+        ([None, fits.ImageHDU(FRAME)], FRAME, 65535),
+        ([fits.PrimaryHDU(FRAME), TABLE], FRAME, 65535),
+        ([None, TABLE, fits.ImageHDU(FRAME)], FRAME, 65535),
+        ([fits.PrimaryHDU(FRAME[None])], FRAME, 65535),  # an axis of length 1 makes no cube
+        ([None, fits.CompImageHDU(FRAME)], FRAME, 65535),  # .fz
+        ([None, fits.CompImageHDU(FRAME.astype(np.float32), quantize_level=0)], FRAME, None),
+    ],
+)
+def test_pixels(read, units, expected, saturation):
+    exposure = read(written(*units))
+    assert exposure.pixels_adu.dtype == np.float32
+    assert exposure.pixels_adu.dtype.isnative
+    np.testing.assert_array_equal(exposure.pixels_adu, expected)
+    assert exposure.saturation_adu == pytest.approx(saturation) if saturation else exposure.saturation_adu is None
+    assert exposure.size_px == (47, 31)
+
+
+def test_the_first_stored_row_is_row_zero(read):
+    """FITS pixel (x + 1, y + 1) is ours (x, y): no flip."""
+    raw = written(fits.PrimaryHDU(FRAME))
+    stored_first = np.frombuffer(raw, ">i2", count=47, offset=2880).astype(int) + 32768
+    np.testing.assert_array_equal(read(raw).pixels_adu[0], stored_first)
+
+
+def test_bscale_and_bzero(read):
+    unit = fits.PrimaryHDU(SIGNED, do_not_scale_image_data=True)
+    unit.header["BSCALE"], unit.header["BZERO"] = 2.0, 10.0
+    exposure = read(written(unit))
+    np.testing.assert_array_equal(exposure.pixels_adu, SIGNED * 2.0 + 10.0)
+    assert exposure.saturation_adu == 32767 * 2 + 10
+
+
+@pytest.mark.parametrize(("pack", "suffix"), [(gzip.compress, "gz"), (bz2.compress, "bz2")])
+def test_packed(read, pack, suffix):
+    exposure = read(pack(written(fits.PrimaryHDU(FRAME))), f"night 1.5.fits.{suffix}")
+    np.testing.assert_array_equal(exposure.pixels_adu, FRAME)
+    assert exposure.name == "night 1.5"
+
+
+def undefined():
+    unit = fits.PrimaryHDU(SIGNED.copy())
+    unit.header["BLANK"] = int(SIGNED[4, 7])
+    return written(unit)
+
+
+def with_nan():
+    pixels = FRAME.astype(np.float32)
+    pixels[2, 3] = np.nan
+    return written(fits.PrimaryHDU(pixels))
+
+
+def damaged_below_its_checksum():
+    raw = bytearray(written(fits.PrimaryHDU(FRAME), checksum=True))
+    raw[2880 + 101] ^= 4
+    return bytes(raw)
+
+
+@pytest.mark.parametrize(
+    ("raw", "why"),
+    [
+        (written(None), "no image"),
+        (written(None, TABLE), "no image"),
+        (written(fits.PrimaryHDU(np.stack([FRAME] * 3))), "a cube (47 x 31 x 3)"),
+        (written(fits.PrimaryHDU(FRAME[0])), "a spectrum (47)"),
+        (written(None, fits.ImageHDU(FRAME, name="A"), fits.ImageHDU(FRAME)), "2 images (A 47 x 31, unnamed 47 x 31)"),
+        (with_nan(), "1 of 1457 pixels are NaN"),
+        (undefined(), "pixels are NaN"),
+        (damaged_below_its_checksum(), "DATASUM"),
+        (written(fits.PrimaryHDU(FRAME)) + b"x" * 2880, "damaged"),
+        (written(fits.PrimaryHDU(FRAME))[:-1], "truncated"),
+        (written(fits.PrimaryHDU(FRAME))[:3000], "truncated"),
+        (written(fits.PrimaryHDU(FRAME))[:800], "truncated"),
+        (written(None, fits.ImageHDU(FRAME))[:4000], "truncated"),
+        (gzip.compress(written(fits.PrimaryHDU(FRAME)))[:-9], "truncated"),
+        (bz2.compress(written(fits.PrimaryHDU(FRAME)))[:-9], "truncated"),
+        (gzip.compress(b"a packed text"), "without FITS data"),
+        (declared(BITPIX=16, NAXIS=2, NAXIS1=20000, NAXIS2=20000) + bytes(2880), "400.0 Mpx"),
+        (gzip.compress(declared(BITPIX=16, NAXIS=2, NAXIS1=20000, NAXIS2=20000) + bytes(2880)), "400.0 Mpx"),
+        (declared(BITPIX=16, NAXIS=2, NAXIS1=-5, NAXIS2=20) + bytes(2880), "no pixels"),
+        (declared(BITPIX=17, NAXIS=2, NAXIS1=5, NAXIS2=20) + bytes(2880), "damaged"),
+    ],
+)
+def test_refused_with_the_cause(cause, raw, why):
+    assert why in cause(raw)
+
+
+def with_cards(**cards):
+    unit = fits.PrimaryHDU(FRAME)
+    for key, value in cards.items():
+        unit.header[key.replace("_", "-")] = value
+    return written(unit)
+
+
+def test_facts_of_the_header(read, tmp_path):
+    exposure = read(
+        with_cards(DATE_OBS="2018-08-06T05:17:04.752", EXPTIME=60, STCAMERA="calib/all sky.toml", STTERRAI="shackleton")
+    )
+    assert exposure.time_utc.isoformat() == "2018-08-06T05:17:34.752000+00:00"
+    assert exposure.exposure_s == 60.0
+    assert exposure.camera == str(tmp_path / "calib/all sky.toml")
+    assert exposure.terrain == "shackleton"
+    assert exposure.warnings == ()
+
+
+def test_date_avg_goes_before_date_obs(read):
+    exposure = read(with_cards(DATE_OBS="2018-08-06T05:17:04", DATE_AVG="2018-08-06T05:18:00", EXPTIME=60.0))
+    assert exposure.time_utc.isoformat() == "2018-08-06T05:18:00+00:00"
+
+
+def test_a_card_that_names_the_hardware_is_not_the_camera_file(read):
+    assert read(with_cards(CAMERA="SX Superstar", TERRAIN="rocks")).camera is None
+
+
+def test_facts_of_the_primary_header_hold_for_an_extension(read):
+    primary = fits.PrimaryHDU()
+    primary.header["EXPTIME"] = 4
+    primary.header["DATE-AVG"] = "2018-08-06T05:18:00"
+    image = fits.ImageHDU(FRAME)
+    image.header["EXPTIME"] = 5
+    exposure = read(written(primary, image))
+    assert exposure.exposure_s == 5.0
+    assert exposure.time_utc is not None
+
+
+@pytest.mark.parametrize(
+    ("cards", "note"),
+    [
+        ({"DATE_OBS": "2018-08-06T05:17:04"}, "without EXPTIME its middle is not known"),
+        ({"DATE_OBS": "2018-08-06", "EXPTIME": 60.0}, "DATE-OBS not used"),
+        ({"DATE_OBS": "06/08/99", "EXPTIME": 60.0}, "DATE-OBS not used"),
+        ({"DATE_AVG": "2018-08-06T05:17:04+02:00"}, "local time"),
+        ({"DATE_AVG": "2018-08-06T05:17:04", "TIMESYS": "TAI"}, "time scale TAI"),
+        ({"DATE_OBS": "2018-08-06T05:17:04", "EXPTIME": 0.0}, "EXPTIME '0.0'"),
+        ({"DATE_OBS": "2018-08-06T05:17:04", "EXPTIME": "long"}, "EXPTIME 'long'"),
+    ],
+)
+def test_a_time_that_is_not_known_stays_unknown_and_is_explained(read, cards, note):
+    exposure = read(with_cards(**cards))
+    assert exposure.time_utc is None
+    assert note in " ".join(exposure.warnings)
+
+
+def test_an_unusable_date_avg_leaves_date_obs(read):
+    exposure = read(with_cards(DATE_AVG="yesterday", DATE_OBS="2018-08-06T05:17:00", EXPTIME=60, TIMESYS="UTC"))
+    assert exposure.time_utc.isoformat() == "2018-08-06T05:17:30+00:00"
+    assert "DATE-AVG not used" in exposure.warnings[0]

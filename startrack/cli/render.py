@@ -1,0 +1,239 @@
+"""`startrack render`: synthetic exposures with the truth beside them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from startrack.types import BadInput
+
+if TYPE_CHECKING:
+    from startrack.render import Scene, Series, Truth
+
+SUFFIXES = {"png": ".png", "tiff": ".tif", "fits": ".fits"}
+KNOWN_SUFFIXES = {".png", ".tif", ".tiff", ".fits", ".fit", ".fts"}
+CATALOG_V_MAG = 10.0  # catalogue stars drawn when there are no faint ones to go with them
+PROGRESS_FROM = 3  # images
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add `render` to the commands of the `startrack` parser."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "render",
+        help="make synthetic exposures, with the truth beside them",
+        description="Render what a camera on the crater's floor sees. Place, heading, tilt and time that are not given "
+        "are drawn from the seed. Beside NAME.png: NAME.json (time, exposure, camera, terrain), NAME.truth.json (pose, "
+        "settings) and NAME.truth.ecsv (stars).",
+    )
+    parser.add_argument("-c", "--camera", default="fisheye-2048", metavar="FILE", help="default %(default)s")
+    parser.add_argument("-t", "--terrain", default="shackleton-thesis", metavar="FILE", help="default %(default)s")
+    parser.add_argument("--seed", type=_count, default=0, metavar="N", help="same seed, same bytes (default 0)")
+    parser.add_argument("-n", "--count", type=_count, default=1, metavar="N", help="images (default 1)")
+    _add_pose(parser.add_argument_group("pose and time (what is not given is drawn from the seed)"))
+    _add_light(parser.add_argument_group("light and defects"))
+    _add_output(parser.add_argument_group("output"))
+    parser.set_defaults(usage_error=parser.error)
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Render and write the images; 0. Raises BadInput for files and values that cannot be used."""
+    images = _targets(args)
+    series = _series(args)
+    with _progress(len(images)) as advance:
+        for number, image in enumerate(images):
+            summary = _render_one(args, series, number, image)
+            print(json.dumps(summary) if args.json else _line(summary))
+            advance()
+    return 0
+
+
+def _add_pose(group: Any) -> None:
+    group.add_argument("--time", metavar="UTC", help="middle of the exposure; else between 2024 and 2034")
+    group.add_argument("--east", type=_number, metavar="M", help="from the terrain's origin")
+    group.add_argument("--north", type=_number, metavar="M", help="from the terrain's origin")
+    group.add_argument("--heading", type=_number, metavar="DEG", help="azimuth of the rover's nose")
+    group.add_argument("--pitch", type=_number, metavar="DEG", help="nose up positive")
+    group.add_argument("--roll", type=_number, metavar="DEG", help="right side down positive")
+    group.add_argument("--max-tilt", type=_amount, default=5.0, metavar="DEG", help="of random tilts (5)")
+
+
+def _add_light(group: Any) -> None:
+    help_exposure = "seconds; default: a V 6 star on the axis reaches 5 sigma, which takes fisheye-2048 0.40 s"
+    help_faint = "add stars that the catalogue lacks (FIELD n) down to this magnitude, and draw none fainter (10)"
+    help_scatter = "of each star's flux, beyond the catalogue's own errors (0.03); 0 turns both off"
+    group.add_argument("--exposure", type=_positive, metavar="S", help=help_exposure)
+    group.add_argument("--sky-mag", type=_number, default=22.0, metavar="V", help="diffuse sky per arcsec^2 (22.0)")
+    group.add_argument("--sky-gradient", type=_number, default=0.0, metavar="F", help="its slope to the horizon (0)")
+    group.add_argument("--sky-gradient-azimuth", type=_number, default=0.0, metavar="DEG", help="where it rises to (0)")
+    group.add_argument("--wall-reflectance", type=_amount, default=0.04, metavar="F", help="of the sky's light (0.04)")
+    group.add_argument("--faint-stars", type=_number, default=10.0, metavar="V", help=help_faint)
+    group.add_argument("--no-faint-stars", action="store_true", help="the catalogue's stars alone")
+    group.add_argument("--flux-scatter", type=_amount, default=0.03, metavar="MAG", help=help_scatter)
+    group.add_argument("--hot-pixels", type=_count, default=200, metavar="N", help="of the sensor (200)")
+    group.add_argument("--cosmic-rays", type=_count, default=5, metavar="N", help="tracks per exposure (5)")
+
+
+def _add_output(group: Any) -> None:
+    where = group.add_mutually_exclusive_group()
+    where.add_argument("-o", "--output", metavar="FILE", help="one image: .png, .tif or .fits")
+    where.add_argument("-D", "--dir", default="startrack-out", metavar="OUT", help="folder (default %(default)s)")
+    group.add_argument("--format", choices=SUFFIXES, default="png", help="of images in the folder (png)")
+    group.add_argument("--truth-mag", type=_number, default=8.5, metavar="V", help="faintest star in the table (8.5)")
+    group.add_argument("-O", "--overwrite", action="store_true", help="replace files that are there")
+    group.add_argument("--json", action="store_true", help="one JSON object per image on stdout")
+
+
+def _targets(args: argparse.Namespace) -> list[Path]:
+    """The images to write; every file is checked first, so that nothing is written half-way to a refusal."""
+    from startrack.render import truth_paths
+
+    if args.output is not None and args.count != 1:
+        args.usage_error(f"--output names one image, but --count is {args.count}: give --dir")
+    if args.output is not None:
+        images = [Path(args.output)]
+        if images[0].suffix.lower() not in KNOWN_SUFFIXES:
+            args.usage_error(f"--output {args.output}: the suffix must be .png, .tif or .fits")
+    else:
+        stem = f"{Path(args.terrain).name.removesuffix('.toml')}-{args.seed}"
+        digits = max(3, len(str(args.count - 1)))
+        images = [Path(args.dir) / f"{stem}-{k:0{digits}d}{SUFFIXES[args.format]}" for k in range(args.count)]
+    for path in (p for image in images for p in (image, image.with_suffix(".json"), *truth_paths(image))):
+        if not args.overwrite and os.path.lexists(path):
+            raise BadInput("bad_image", f"{path}: exists already; -O/--overwrite replaces it")
+    return images
+
+
+def _series(args: argparse.Namespace) -> Series:
+    from startrack.camera import load_camera
+    from startrack.catalog import load_catalog
+    from startrack.frames import parse_utc
+    from startrack.render import Series
+    from startrack.terrain import load_terrain
+
+    faint = None if args.no_faint_stars else args.faint_stars
+    return Series(
+        camera=load_camera(args.camera),
+        terrain=load_terrain(args.terrain),
+        catalog=load_catalog().brighter_than(CATALOG_V_MAG if faint is None else faint),
+        seed=args.seed,
+        time_utc=None if args.time is None else parse_utc(args.time),
+        east_m=args.east,
+        north_m=args.north,
+        heading_rad=_radians(args.heading),
+        pitch_rad=_radians(args.pitch),
+        roll_rad=_radians(args.roll),
+        max_tilt_rad=math.radians(args.max_tilt),
+        exposure_s=args.exposure,
+        sky_v_mag_arcsec2=args.sky_mag,
+        sky_gradient=args.sky_gradient,
+        sky_gradient_azimuth_rad=math.radians(args.sky_gradient_azimuth),
+        wall_reflectance=args.wall_reflectance,
+        faint_v_mag=faint,
+        flux_scatter_mag=args.flux_scatter,
+        hot_pixels=args.hot_pixels,
+        cosmic_rays=args.cosmic_rays,
+        camera_ref=args.camera,
+        terrain_ref=args.terrain,
+    )
+
+
+def _render_one(args: argparse.Namespace, series: Series, number: int, image: Path) -> dict[str, Any]:
+    """Render, write image, sidecar and truth, and return what is printed about it."""
+    from startrack.exposure import write_exposure, write_sidecar
+    from startrack.render import render, write_truth
+
+    scene, rng = series.scene(number, image.stem)
+    exposure, truth = render(scene, rng=rng)
+    pose = _pose(scene, truth)
+    write_exposure(image, exposure, overwrite=args.overwrite)
+    write_sidecar(image, exposure, overwrite=args.overwrite)
+    facts = {**pose, "seed": args.seed, "number": number, "settings": _settings(args)}
+    pose_path, table_path = write_truth(image, truth, facts, to_v_mag=args.truth_mag, overwrite=args.overwrite)
+    return {"image": str(image), "truth": str(pose_path), "table": str(table_path), **facts}
+
+
+def _pose(scene: Scene, truth: Truth) -> dict[str, Any]:
+    from startrack.body_angles import heading_pitch_roll_from_R_body_enu
+    from startrack.frames import format_utc
+
+    heading, pitch, roll = heading_pitch_roll_from_R_body_enu(scene.camera.R_body_cam @ scene.R_cam_enu)
+    assert scene.time_utc is not None
+    return {
+        "time_utc": format_utc(scene.time_utc),
+        "exposure_s": scene.exposure_s,
+        "east_m": float(truth.position_enu_m[0]),
+        "north_m": float(truth.position_enu_m[1]),
+        "heading_deg": math.degrees(heading),
+        "pitch_deg": math.degrees(pitch),
+        "roll_body_deg": math.degrees(roll),
+    }
+
+
+def _settings(args: argparse.Namespace) -> dict[str, Any]:
+    """The flags that decide the pixels, without those that only say where the files go."""
+    names = (
+        "max_tilt sky_mag sky_gradient sky_gradient_azimuth wall_reflectance faint_stars no_faint_stars flux_scatter "
+        "hot_pixels cosmic_rays truth_mag"
+    )
+    return {name: getattr(args, name) for name in names.split()}
+
+
+def _line(summary: dict[str, Any]) -> str:
+    return (
+        f"{summary['image']}: east {summary['east_m']:.1f} m, north {summary['north_m']:.1f} m, "
+        f"heading {summary['heading_deg']:.2f}, pitch {summary['pitch_deg']:.2f}, "
+        f"roll {summary['roll_body_deg']:.2f} deg, "
+        f"{summary['time_utc']}, {summary['exposure_s']:.3g} s"
+    )
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[Callable[[], None]]:
+    """A bar on a terminal for more than a few images; the function to call after each."""
+    if total < PROGRESS_FROM or not sys.stderr.isatty():
+        yield lambda: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("render", total=total)
+        yield lambda: bar.advance(task)
+
+
+def _radians(degrees: float | None) -> float | None:
+    return None if degrees is None else math.radians(degrees)
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
+    return value
+
+
+def _amount(text: str) -> float:
+    if _number(text) < 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is negative")
+    return float(text)
+
+
+def _positive(text: str) -> float:
+    if _number(text) <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not above 0")
+    return float(text)
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is negative")
+    return value

@@ -1,0 +1,85 @@
+"""What is to be rendered, and what is then known to be true."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from datetime import datetime
+
+import numpy as np
+
+from startrack.camera import Camera, Sensor
+from startrack.terrain import Terrain
+from startrack.types import Array, BadInput, Body, Bools, Ints, Stars, Value, array
+
+
+@dataclass(frozen=True, kw_only=True)
+class HotPixels(Value):
+    """Pixels of one sensor whose dark current is far above the rest: the same ones in each of its exposures."""
+
+    xy_px: Ints = array("n", 2, dtype=np.int64)  # column, row
+    dark_e_per_s: Array = array("n")  # beyond the sensor's own
+
+    @staticmethod
+    def none() -> HotPixels:
+        """A sensor without any."""
+        return HotPixels(xy_px=np.empty((0, 2), dtype=np.int64), dark_e_per_s=np.empty(0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene(Value):
+    """Everything that decides an exposure, but for the photons' and the electronics' dice."""
+
+    camera: Camera  # with a sensor
+    terrain: Terrain | None  # None: nothing hides the stars
+    stars: Stars  # apparent, with the magnitudes that the catalogue states
+    v_error_mag: Array = array("n")  # true minus stated magnitude of each star
+    bodies: tuple[Body, ...] = ()
+    position_enu_m: Array = array(3)  # the camera's centre
+    R_cam_enu: Array = array(3, 3)
+    R_enu_icrs: Array = array(3, 3)  # at mid-exposure
+    sky_turn_rad: Array = field(  # rotation vector in enu by which the stars turn from start to end
+        default_factory=lambda: np.zeros(3), metadata={"shape": (3,), "dtype": np.float64}
+    )
+    exposure_s: float
+    sky_v_mag_arcsec2: float | None = 22.0  # diffuse light of the sky per square arcsecond; None: a black sky
+    sky_gradient: float = 0.0  # s: the sky is 1 + s cos(elevation) cos(azimuth - sky_gradient_azimuth_rad) of that
+    sky_gradient_azimuth_rad: float = 0.0
+    wall_reflectance: float = 0.04  # light of the terrain, as a fraction of the sky's
+    hot_pixels: HotPixels = field(default_factory=HotPixels.none)
+    cosmic_rays: int = 0  # tracks in this exposure
+    name: str = ""
+    time_utc: datetime | None = None  # mid-exposure
+    camera_ref: str | None = None  # how the exposure's metadata name the camera and the terrain
+    terrain_ref: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.v_error_mag) != len(self.stars):
+            raise ValueError(f"Scene.v_error_mag: {len(self.v_error_mag)} values for {len(self.stars)} stars")
+        if not (np.isfinite(self.exposure_s) and self.exposure_s > 0):
+            raise ValueError(f"Scene.exposure_s must be positive, not {self.exposure_s!r}")
+
+    @property
+    def sensor(self) -> Sensor:
+        """The camera's sensor. Raises BadInput bad_calibration where the camera file names none."""
+        if self.camera.sensor is None:
+            raise BadInput("bad_calibration", f"camera {self.camera.name} has no [sensor]: nothing to render with")
+        return self.camera.sensor
+
+    @property
+    def R_cam_icrs(self) -> Array:
+        """Attitude (3, 3) at mid-exposure."""
+        return self.R_cam_enu @ self.R_enu_icrs
+
+
+@dataclass(frozen=True, kw_only=True)
+class Truth(Value):
+    """What a scorer may compare with: no stage reads it. One row per light source inside the image circle and frame."""
+
+    position_enu_m: Array = array(3)
+    R_cam_enu: Array = array(3, 3)
+    R_cam_icrs: Array = array(3, 3)  # at mid-exposure
+    sources: Stars  # stars and bodies, as the catalogue states them
+    xy_px: Array = array("n", 2)  # at mid-exposure, hidden or not
+    flux_e: Array = array("n")  # whole PSF, from the stated magnitude [electrons]
+    hidden: Bools = array("n", dtype=np.bool_)  # the terrain stands before it at mid-exposure

@@ -29,6 +29,11 @@ class Cylinder:
         return self.diameter_m / 2
 
     @property
+    def reach_m(self) -> float:
+        """The floor, or the search area and a quarter more."""
+        return min(self.radius_m, 1.25 * self.search_radius_m)
+
+    @property
     def wall_m(self) -> float:
         """Height of the rim above the camera [m]."""
         return self.depth_m - self.camera_height_m
@@ -57,9 +62,8 @@ class Cylinder:
         return np.zeros(np.shape(points_m)[:-1])
 
     def allowed(self, points_m: Array) -> Array:
-        """Whether the points (n, 2) are on the floor and inside the search area."""
-        limit = min(self.radius_m, self.search_radius_m)
-        return np.hypot(points_m[..., 0], points_m[..., 1]) < limit
+        """Whether the points (..., 2) are on the floor."""
+        return np.hypot(points_m[..., 0], points_m[..., 1]) < self.radius_m
 
 
 def _distance_to_circle(points_m: Array, azimuths_rad: Array, radius_m: Array | float) -> Array:

@@ -19,6 +19,7 @@ class Terrain(Protocol):
     site: Site
     camera_height_m: float  # above the ground
     search_radius_m: float  # the camera is within this horizontal distance of the origin
+    reach_m: float  # half side of the square that is searched: the search area and a margin to notice leaving it
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation (n,) seen from the points (n, 2) at the azimuths (n,)."""
@@ -37,5 +38,5 @@ class Terrain(Protocol):
         ...
 
     def allowed(self, points_m: Array) -> Array:
-        """Whether the camera can stand at the points (n, 2): inside the search area and on the ground."""
+        """Whether a camera could stand at the points (..., 2): there is ground, known to the terrain, under open sky."""
         ...

@@ -1,0 +1,61 @@
+"""Smooth background and pixel noise of an exposure, robust against stars and steps."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+BLOCK_PX = 16
+MAD_TO_SIGMA = 1.4826
+Image = NDArray[np.float32]
+
+
+def background_and_noise(image: Image) -> tuple[Image, Image]:
+    """Background (H, W) and standard deviation of one pixel (H, W), in the image's unit.
+
+    Medians over blocks, median-filtered so that stars, tracks and saturated blobs drop out but a step (the skyline, the
+    edge of the image circle) stays within a block; interpolated bilinearly. Weak where a bright extended source fills
+    several blocks.
+    """
+    blocks = _blocks(image)
+    level = np.median(blocks, axis=1)
+    # Every other pixel is enough for the spread (10 % per block before the median filter over 25 blocks).
+    spread = MAD_TO_SIGMA * np.median(np.abs(blocks[:, ::2] - level[:, None]), axis=1)
+    shape = -(-image.shape[0] // BLOCK_PX), -(-image.shape[1] // BLOCK_PX)
+    level_map = cv2.medianBlur(level.reshape(shape), 3)
+    spread_map = cv2.medianBlur(spread.reshape(shape), 5)
+    quantum = _quantisation_sigma(image)
+    return _enlarge(level_map, image.shape), np.maximum(_enlarge(spread_map, image.shape), quantum)
+
+
+def local_level(residual: Image, noise: Image, width_px: int) -> Image:
+    """Mean of the residual over a box, stars clipped: what the block medians missed, such as a slope."""
+    clipped = np.minimum(residual, 2.5 * noise)
+    np.maximum(clipped, -2.5 * noise, out=clipped)
+    return cv2.boxFilter(clipped, -1, (width_px, width_px), borderType=cv2.BORDER_REFLECT)
+
+
+def _blocks(image: Image) -> Image:
+    """(blocks, BLOCK_PX^2): the image cut into square blocks, its border reflected to fill the last ones."""
+    height, width = image.shape
+    below, right = -height % BLOCK_PX, -width % BLOCK_PX
+    if below or right:
+        image = cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_REFLECT_101)
+    rows, columns = image.shape[0] // BLOCK_PX, image.shape[1] // BLOCK_PX
+    cut = image.reshape(rows, BLOCK_PX, columns, BLOCK_PX).transpose(0, 2, 1, 3)
+    return np.ascontiguousarray(cut).reshape(rows * columns, BLOCK_PX * BLOCK_PX)
+
+
+def _enlarge(block_map: Image, shape: tuple[int, ...]) -> Image:
+    """Bilinear interpolation between block centres to the full image."""
+    rows, columns = block_map.shape
+    full = cv2.resize(block_map, (columns * BLOCK_PX, rows * BLOCK_PX), interpolation=cv2.INTER_LINEAR)
+    return full[: shape[0], : shape[1]]
+
+
+def _quantisation_sigma(image: Image) -> np.float32:
+    """Rounding noise of the smallest step between pixel values: the noise cannot be below it."""
+    values = np.unique(image[:: max(1, image.shape[0] // 64), :: max(1, image.shape[1] // 64)])
+    step = float(np.diff(values).min()) if len(values) > 1 else 1.0
+    return np.float32(max(step, 1e-6) / np.sqrt(12.0))

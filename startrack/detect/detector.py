@@ -1,0 +1,209 @@
+"""Point sources of an exposure: matched filter, PSF fits, and the rejection of what is not a star."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.camera import Camera
+from startrack.detect.background import background_and_noise, local_level
+from startrack.detect.fit import PointFits, fit_points, fit_widths, radius_for, stamps
+from startrack.psf import filter_kernel, pixel_profile
+from startrack.types import Bools, Detections, Exposure, Ints, TooFewStars
+
+Image = NDArray[np.float32]
+FIRST_PASS_SNR = 4.3  # below the final threshold: a star between pixels shows up to 15 % less in the filtered image
+FIT_ROUNDS = 2
+BAD_FIT_CHI2_PER_DOF = 4.0
+WIDTHS_PX = np.geomspace(0.3, 8.0, 45)
+UNKNOWN_WIDTH_PX = 1.2  # first guess where the camera file does not tell
+WIDTH_TOLERANCE = 0.12  # measured PSF differing by more than this fraction from the expected one is used instead
+SATURATED_FRACTION = 0.98
+
+
+@dataclass(frozen=True)
+class Detector:
+    """Detects point sources: Exposure -> Detections."""
+
+    threshold_snr: float = 5.0
+    max_candidates: int = 30000  # a frame with more peaks is noise, a bright day or a defect: the brightest are kept
+
+    def __call__(self, exposure: Exposure, camera: Camera | None = None) -> Detections:
+        """Point sources, brightest first; fluxes in electrons where the camera knows its gain, else in ADU.
+
+        Raises TooFewStars (reason no_stars) where the frame holds no point source at all.
+        """
+        image, dead = electrons(exposure, camera)
+        background, noise = background_and_noise(image)
+        if not np.ptp(image):
+            raise TooFewStars("the frame is flat: every pixel has the same value (lens cap, or a saturated day sky?)")
+        frame = _Frame(image - background, noise, dead, shot=camera is not None and camera.sensor is not None)
+        known = camera.sensor.psf_sigma_px if camera is not None and camera.sensor is not None else None
+        sigma = known or UNKNOWN_WIDTH_PX
+        centres, fits = self._measure(frame, sigma)
+        measured = _measured_width(frame, centres, fits, sigma)
+        if measured is not None and abs(np.log(measured / sigma)) > WIDTH_TOLERANCE:
+            sigma = measured
+            centres, fits = self._measure(frame, sigma)
+        good = _is_star(fits, self.threshold_snr)
+        if not good.any():
+            raise TooFewStars("no point source stands above the noise: was the lens cap on, or the exposure too short?")
+        return _detections(frame, fits, good, sigma, background, noise)
+
+    def _measure(self, frame: _Frame, sigma: float) -> tuple[Ints, PointFits]:
+        centres = _peaks(frame, sigma, self.max_candidates)
+        if not len(centres):
+            raise TooFewStars("no point source stands above the noise: was the lens cap on, or the exposure too short?")
+        return centres, _fit_all(frame, centres, sigma)
+
+
+@dataclass(frozen=True)
+class _Frame:
+    residual: Image  # background-subtracted
+    noise: Image
+    dead: NDArray[np.bool_]  # saturated or outside the image circle: no weight in fits
+    shot: bool
+
+
+def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray[np.bool_]]:
+    """The exposure in electrons above bias (ADU where the gain is unknown), and the mask of saturated pixels."""
+    pixels = exposure.pixels_adu
+    ceiling = exposure.saturation_adu or np.inf
+    if camera is None or camera.sensor is None:
+        return pixels, pixels >= SATURATED_FRACTION * ceiling
+    sensor = camera.sensor
+    saturated = pixels >= SATURATED_FRACTION * min(ceiling, sensor.saturation_adu)
+    return (pixels - np.float32(sensor.bias_adu)) * np.float32(sensor.gain_e_per_adu), saturated
+
+
+def _peaks(frame: _Frame, sigma: float, most: int) -> Ints:
+    """Integer pixels (n, 2) (x, y) of the local maxima of the matched-filter SNR, brightest first."""
+    kernel = filter_kernel(sigma)
+    level = local_level(frame.residual, frame.noise, 2 * (4 * radius_for(sigma) // 2) + 1)
+    filtered = cv2.sepFilter2D(frame.residual - level, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT)
+    snr = filtered / (frame.noise * np.float32(np.sum(kernel**2)))
+    top = cv2.dilate(snr, np.ones((3, 3), np.uint8))
+    candidate = (snr >= top) & (snr > FIRST_PASS_SNR)
+    margin = radius_for(sigma)
+    candidate[:margin] = candidate[-margin:] = False
+    candidate[:, :margin] = candidate[:, -margin:] = False
+    candidate &= ~frame.dead
+    rows, columns = np.nonzero(candidate)
+    order = np.argsort(-snr[rows, columns], kind="stable")[:most]
+    peaks = np.stack([columns[order], rows[order]], axis=1).astype(np.int64)
+    return np.concatenate([_saturated_blobs(frame.dead, margin), peaks])
+
+
+def _saturated_blobs(dead: NDArray[np.bool_], margin: int) -> Ints:
+    """Middle pixels (n, 2) of the saturated blobs: bright stars whose own peak is a plateau."""
+    if not dead.any():
+        return np.zeros((0, 2), dtype=np.int64)
+    count, _, stats, centroids = cv2.connectedComponentsWithStats(dead.astype(np.uint8))
+    height, width = dead.shape
+    middle = np.rint(centroids[1:count]).astype(np.int64)
+    inside = (middle >= margin).all(axis=1) & (middle[:, 0] < width - margin) & (middle[:, 1] < height - margin)
+    compact = stats[1:count, cv2.CC_STAT_AREA] <= (2 * margin + 1) ** 2
+    return middle[inside & compact]
+
+
+def _fit_all(frame: _Frame, centres: Ints, sigma: float) -> PointFits:
+    """Fits of all candidates, each with its neighbours' light subtracted."""
+    radius = radius_for(sigma)
+    variance = np.square(stamps(frame.noise, centres, radius))
+    usable = ~stamps(frame.dead, centres, radius).astype(bool)
+    data = stamps(frame.residual, centres, radius)
+    start = centres.astype(np.float64)
+    fits = fit_points(data, variance, usable, centres, start, sigma, frame.shot)
+    for _ in range(FIT_ROUNDS - 1):
+        model = _model_image(frame.residual.shape, centres, fits, sigma, radius)
+        own = _own_light(centres, fits, sigma, radius)
+        others = stamps(model, centres, radius) - own
+        # Neighbours' light is known to a few per cent only.
+        fits = fit_points(
+            data - others, variance + np.square(0.1 * others), usable, centres, fits.xy_px, sigma, frame.shot
+        )
+    return fits
+
+
+def _own_light(centres: Ints, fits: PointFits, sigma: float, radius: int) -> NDArray[np.float64]:
+    offset = fits.xy_px - centres
+    px, _ = pixel_profile(offset[:, 0], sigma, radius)
+    py, _ = pixel_profile(offset[:, 1], sigma, radius)
+    return np.maximum(fits.flux, 0.0)[:, None, None] * py[:, :, None] * px[:, None, :]
+
+
+def _model_image(shape: tuple[int, ...], centres: Ints, fits: PointFits, sigma: float, radius: int) -> Image:
+    """Sum of the fitted point sources (H, W)."""
+    light = _own_light(centres, fits, sigma, radius)
+    offset = np.arange(-radius, radius + 1)
+    rows = centres[:, 1, None, None] + offset[None, :, None]
+    columns = centres[:, 0, None, None] + offset[None, None, :]
+    flat = (rows * shape[1] + columns).ravel()
+    return np.bincount(flat, weights=light.ravel(), minlength=shape[0] * shape[1]).reshape(shape).astype(np.float32)
+
+
+def _is_star(fits: PointFits, threshold_snr: float) -> Bools:
+    """Sources that stand above the threshold, look like the PSF, and not rather like a hot pixel or a track."""
+    snr = fits.flux / np.sqrt(fits.covariance[:, 2, 2])
+    return (
+        (snr >= threshold_snr)
+        & (fits.chi2 < BAD_FIT_CHI2_PER_DOF * fits.dof)
+        & (fits.chi2 < fits.chi2_pixel)
+        & (np.sqrt(fits.covariance[:, 0, 0] + fits.covariance[:, 1, 1]) < 2.0)
+    )
+
+
+def _measured_width(frame: _Frame, centres: Ints, fits: PointFits, sigma: float) -> float | None:
+    """Typical PSF sigma [px] of the bright sources; None where there are too few to tell."""
+    snr = fits.flux / np.sqrt(fits.covariance[:, 2, 2])
+    radius = radius_for(sigma)
+    whole = ~stamps(frame.dead, centres, radius).any(axis=(1, 2))
+    bright = np.flatnonzero((snr > 12) & whole)[:600]
+    if len(bright) < 8:
+        return None
+    pixels = centres[bright]
+    data, noise = stamps(frame.residual, pixels, radius), stamps(frame.noise, pixels, radius)
+    subset = PointFits(**{name: getattr(fits, name)[bright] for name in PointFits.__dataclass_fields__})
+    variance = np.square(noise) + (np.maximum(data, 0.0) if frame.shot else 0.0)
+    widths = fit_widths(data, variance, np.ones(data.shape, bool), subset, pixels, WIDTHS_PX)
+    wider_than_a_pixel = widths[widths > 0.45]  # hot pixels fit the narrowest profile
+    if len(wider_than_a_pixel) < 8:
+        return None
+    return float(np.median(wider_than_a_pixel))
+
+
+def _detections(
+    frame: _Frame, fits: PointFits, good: Bools, sigma: float, background: Image, noise: Image
+) -> Detections:
+    flux_sigma = np.sqrt(fits.covariance[:, 2, 2])
+    xy = np.rint(fits.xy_px).astype(int)
+    height, width = frame.dead.shape
+    near = frame.dead[np.clip(xy[:, 1], 0, height - 1), np.clip(xy[:, 0], 0, width - 1)]
+    keep = np.flatnonzero(good)
+    keep = _one_per_place(fits.xy_px, fits.flux, keep, 1.2 * sigma)
+    keep = keep[np.argsort(-fits.flux[keep], kind="stable")]
+    return Detections(
+        xy_px=fits.xy_px[keep],
+        covariance_px2=fits.covariance[keep][:, :2, :2],
+        flux_e=fits.flux[keep],
+        flux_sigma_e=flux_sigma[keep],
+        snr=fits.flux[keep] / flux_sigma[keep],
+        saturated=near[keep],
+        psf_sigma_px=sigma,
+        background_e=background,
+        noise_e=noise,
+    )
+
+
+def _one_per_place(xy_px: NDArray[np.float64], flux: NDArray[np.float64], keep: Ints, closer_px: float) -> Ints:
+    """Of sources that converged onto one place, the brightest."""
+    from scipy.spatial import cKDTree
+
+    order = keep[np.argsort(-flux[keep], kind="stable")]
+    pairs = cKDTree(xy_px[order]).query_pairs(closer_px, output_type="ndarray")
+    fainter = np.zeros(len(order), dtype=bool)
+    fainter[pairs.max(axis=1)] = True
+    return order[~fainter]

@@ -1,0 +1,120 @@
+"""Forced photometry: the light at the very pixel where the catalogue says that a star is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.psf import pixel_profile, stamp_radius
+from startrack.types import Array, Bools, Ints
+
+OUTLIER_SIGMA = 5.0
+MODEL_ERROR = 0.05  # of a star's light, pixel by pixel: the real PSF is not quite the Gaussian
+MOST_MASKED_PX = 6  # a stamp with more deviant pixels is not a star on a smooth background
+
+
+@dataclass(frozen=True, kw_only=True)
+class Photometry:
+    """Measured fluxes at predicted places (n)."""
+
+    flux_e: Array  # (n,) local level and neighbours subtracted
+    variance_e2: Array  # (n,) from the pixels' noise, without the star's own light
+    own_shot: Array  # (n,) variance per electron of the star's own light
+    neighbour_variance_e2: Array  # (n,) from not knowing whether and how brightly the neighbours shine
+    usable: Bools  # (n,) enough good pixels
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sources:
+    """Where stars would shine and how brightly (n)."""
+
+    xy_px: Array  # (n, 2)
+    flux_e: Array  # (n,) expected if visible
+    fraction_sigma: Array  # (n,) its relative uncertainty
+    visible: Array  # (n,) probability that it shines, for its part in its neighbours' measurements
+
+
+def half_width(sigma_px: float) -> int:
+    """Half width [px] of the measuring stamp: the star and enough around it to know the local level."""
+    return stamp_radius(sigma_px) + 1
+
+
+def measure(
+    image: NDArray[np.float32], noise: NDArray[np.float32], dead: NDArray[np.bool_], sources: Sources, sigma_px: float
+) -> Photometry:
+    """Flux and local level at each source by linear least squares, deviant pixels masked.
+
+    `image` is background-subtracted [e], `noise` the standard deviation of a pixel [e], `dead` marks saturated pixels.
+    All sources must lie at least `half_width` inside the frame. The neighbours' expected light is subtracted.
+    """
+    radius = half_width(sigma_px)
+    centre = np.rint(sources.xy_px).astype(np.int64)
+    profile = _profiles(sources.xy_px - centre, sigma_px, radius)
+    rows = centre[:, 1, None] + np.arange(-radius, radius + 1)
+    columns = centre[:, 0, None] + np.arange(-radius, radius + 1)
+    index = rows[:, :, None], columns[:, None, :]
+    pairs, overlap = _neighbour_profiles(sources.xy_px, centre, sigma_px, radius)
+    expected = sources.flux_e * sources.visible
+    n = len(centre)
+    light = np.zeros((n, profile.shape[1]))
+    np.add.at(light, pairs[:, 0], expected[pairs[:, 1], None] * overlap)
+    data = image[index].reshape(n, -1) - light
+    variance = np.square(noise[index].reshape(n, -1), dtype=np.float64)
+    good = ~dead[index].reshape(n, -1)
+    flux, weights = _fit(data, profile, good / variance)
+    # One round of masking: hot pixels and tracks are none of the star's light.
+    level = _level(data, profile, good / variance, flux)
+    own = np.maximum(flux, 0.0)[:, None] * profile
+    spread = np.sqrt(variance + own + light + np.square(MODEL_ERROR * (own + light)))
+    deviant = good & (np.abs(data - flux[:, None] * profile - level[:, None]) > OUTLIER_SIGMA * spread)
+    good &= ~deviant
+    flux, weights = _fit(data, profile, good / variance)
+    uncertain = np.square(sources.flux_e) * (
+        sources.visible * (1 - sources.visible) + sources.visible * np.square(sources.fraction_sigma)
+    )
+    usable = (deviant.sum(axis=1) <= MOST_MASKED_PX) & (np.where(good, profile, 0.0).sum(axis=1) > 0.5)
+    weights[~usable] = 0.0
+    leak = np.einsum("mp,mp->m", weights[pairs[:, 0]], overlap)
+    variance_of_flux = np.einsum("np,np,np->n", weights, weights, variance + light)
+    return Photometry(
+        flux_e=np.where(usable, flux, 0.0),
+        variance_e2=np.where(usable, variance_of_flux, 1.0),
+        own_shot=np.einsum("np,np,np->n", weights, weights, profile),
+        neighbour_variance_e2=np.bincount(pairs[:, 0], weights=leak**2 * uncertain[pairs[:, 1]], minlength=n),
+        usable=usable,
+    )
+
+
+def _profiles(offset_px: Array, sigma_px: float, radius: int) -> Array:
+    """PSF on the stamps (n, pixels)."""
+    px, _ = pixel_profile(offset_px[:, 0], sigma_px, radius)
+    py, _ = pixel_profile(offset_px[:, 1], sigma_px, radius)
+    return (py[:, :, None] * px[:, None, :]).reshape(len(px), -1)
+
+
+def _neighbour_profiles(xy_px: Array, centre: Ints, sigma_px: float, radius: int) -> tuple[Ints, Array]:
+    """Pairs (m, 2) (of a star, its neighbour) and the neighbour's PSF on the star's stamp (m, pixels)."""
+    from scipy.spatial import cKDTree
+
+    found = cKDTree(xy_px).query_pairs(radius + 3.0 * sigma_px, output_type="ndarray")
+    pairs = np.concatenate([found, found[:, ::-1]]).astype(np.int64)
+    offset = xy_px[pairs[:, 1]] - centre[pairs[:, 0]]
+    return pairs, _profiles(offset, sigma_px, radius)
+
+
+def _fit(data: Array, profile: Array, weight: Array) -> tuple[Array, Array]:
+    """Flux (n,) with a free constant level, and the linear weights (n, pixels) that give it: flux = sum weights data."""
+    total = np.maximum(weight.sum(axis=1), 1e-300)
+    middle = np.einsum("np,np->n", weight, profile) / total
+    centred = weight * (profile - middle[:, None])
+    strength = np.einsum("np,np->n", centred, profile)
+    # A stamp without a good pixel measures nothing; the caller marks it unusable.
+    weights = np.divide(centred, strength[:, None], out=np.zeros_like(centred), where=strength[:, None] > 0)
+    return np.einsum("np,np->n", weights, data), weights
+
+
+def _level(data: Array, profile: Array, weight: Array, flux: Array) -> Array:
+    rest = data - flux[:, None] * profile
+    return np.einsum("np,np->n", weight, rest) / np.maximum(weight.sum(axis=1), 1e-300)

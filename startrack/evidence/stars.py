@@ -1,0 +1,154 @@
+"""Evidence of the stars: for every catalogue star in view, does it shine or is it hidden?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.camera import Camera
+from startrack.evidence.photometry import Photometry, Sources, half_width, measure
+from startrack.evidence.ratio import shines_ratio
+from startrack.evidence.scale import FluxScale
+from startrack.frames import azel_from_rays
+from startrack.types import Array, Body, Bools, Detections, Evidence, Ints, Stars
+
+FAINTEST_SNR = 0.5  # fainter stars say next to nothing and would only cost time
+BODY_GLARE_PX = 8.0
+SEEN_LLR = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class StarLight:
+    """What was expected and measured at each catalogue star in the frame (n); the star table's rows."""
+
+    star: Ints  # index into Stars
+    xy_px: Array  # (n, 2) predicted
+    azimuth_rad: Array
+    elevation_rad: Array
+    expected_e: Array
+    flux_e: Array  # measured
+    sigma_e: Array  # of the measured flux if nothing shines
+    llr: Array  # 0 where unusable
+    cause: NDArray[np.str_]  # "" where usable, else why not
+
+    @property
+    def usable(self) -> Bools:
+        return np.asarray(self.cause == "")
+
+    def evidence(self) -> Evidence:
+        """The rays for the localizer."""
+        use = self.usable
+        return Evidence(
+            azimuth_rad=self.azimuth_rad[use],
+            elevation_rad=self.elevation_rad[use],
+            llr=self.llr[use],
+            edge_sigma_rad=np.zeros(int(use.sum())),
+        )
+
+
+@dataclass(frozen=True)
+class StarEvidence:
+    """Forced photometry at the catalogue's stars, turned into log-likelihood ratios."""
+
+    faintest_snr: float = FAINTEST_SNR
+
+    def __call__(
+        self,
+        image_e: NDArray[np.float32],
+        dead: NDArray[np.bool_],
+        detections: Detections,
+        camera: Camera,
+        stars: Stars,
+        bodies: list[Body],
+        R_cam_icrs: Array,
+        R_enu_icrs: Array,
+        scale: FluxScale,
+        place_sigma_px: float,
+        visible: Array | None = None,
+    ) -> StarLight:
+        """Light at every star in view.
+
+        `image_e` in electrons, background included; `visible` (len(stars),) is the probability that each star shines
+        where something is known of it already (used for its light in its neighbours' measurements only).
+        """
+        sigma_px = detections.psf_sigma_px
+        noise_e = float(np.median(detections.noise_e)) * np.sqrt(4 * np.pi) * max(sigma_px, 0.5)
+        faintest = scale.zero_mag - 2.5 * np.log10(self.faintest_snr * max(noise_e, 1e-9))
+        star = np.flatnonzero(stars.v_mag < faintest)
+        rays_cam = stars.rays_icrs[star] @ R_cam_icrs.T
+        xy, inside = camera.project(rays_cam)
+        star, xy, rays_cam = star[inside], xy[inside], rays_cam[inside]
+        angle = np.arctan2(np.hypot(rays_cam[:, 0], rays_cam[:, 1]), rays_cam[:, 2])
+        expected = scale.flux_e(stars.v_mag[star], angle, camera)
+        blur = np.square(place_sigma_px / (2 * sigma_px))  # light lost from a misplaced profile
+        fraction = np.sqrt(
+            scale.scatter**2 + np.square(0.4 * np.log(10) * stars.v_sigma_mag[star]) + blur**2
+        )
+        cause = _unusable(xy, angle, camera, bodies, R_cam_icrs, half_width(sigma_px))
+        measurable = np.flatnonzero(cause != "off the frame")
+        residual = image_e - detections.background_e
+
+        def forced(shining: Array) -> Photometry:
+            sources = Sources(
+                xy_px=xy[measurable],
+                flux_e=expected[measurable],
+                fraction_sigma=fraction[measurable],
+                visible=shining,
+            )
+            return measure(residual, detections.noise_e, dead, sources, sigma_px)
+
+        first = forced(np.zeros(len(measurable)) if visible is None else visible[star[measurable]])
+        llr, sigma = _ratios(first, expected[measurable], fraction[measurable], 0.0)
+        light = first
+        if visible is None:
+            # Bright stars tell by themselves whether they shine; then their light can be taken from their neighbours.
+            light = forced(1.0 / (1.0 + np.exp(-llr)))
+            llr, sigma = _ratios(light, expected[measurable], fraction[measurable], 0.0)
+        azimuth, elevation = azel_from_rays(stars.rays_icrs[star] @ R_enu_icrs.T)
+        cause[measurable[~light.usable & (cause[measurable] == "")]] = "bad pixels"
+        return StarLight(
+            star=star,
+            xy_px=xy,
+            azimuth_rad=azimuth,
+            elevation_rad=elevation,
+            expected_e=expected,
+            flux_e=_spread(light.flux_e, measurable, len(star)),
+            sigma_e=_spread(sigma, measurable, len(star)),
+            llr=np.where(cause == "", _spread(llr, measurable, len(star)), 0.0),
+            cause=cause,
+        )
+
+
+def _ratios(light: Photometry, expected_e: Array, fraction: Array, confusion_e: float) -> tuple[Array, Array]:
+    """Log-likelihood ratios and the standard deviations of the fluxes if nothing shines."""
+    hidden = light.variance_e2 + light.neighbour_variance_e2
+    shining = hidden + light.own_shot * expected_e + np.square(fraction * expected_e) + confusion_e**2
+    sigma = np.sqrt(hidden)
+    return shines_ratio(light.flux_e, expected_e, sigma, np.sqrt(shining)), sigma
+
+
+def _unusable(
+    xy_px: Array, angle_rad: Array, camera: Camera, bodies: list[Body], R_cam_icrs: Array, margin: int
+) -> NDArray[np.str_]:
+    """Why stars (n) cannot be used; empty where they can."""
+    cause = np.full(len(xy_px), "", dtype="U32")
+    for body in bodies:
+        at, seen = camera.project(body.ray_icrs @ R_cam_icrs.T)
+        if seen:
+            cause[np.hypot(*(xy_px - at).T) < BODY_GLARE_PX] = f"beside {body.name}"
+    # The stamp must lie within the lit circle: beyond its edge the background is another.
+    edge = camera.max_angle_rad - (margin + 1) * camera.mean_scale_rad_per_px(np.array(camera.max_angle_rad))
+    cause[angle_rad > edge] = "edge of the image circle"
+    cause[angle_rad > camera.calibrated_angle_rad] = "beyond the calibrated angle"
+    width, height = camera.size_px
+    x, y = xy_px[:, 0], xy_px[:, 1]
+    cause[(x < margin) | (y < margin) | (x > width - 1 - margin) | (y > height - 1 - margin)] = "off the frame"
+    return cause
+
+
+def _spread(values: Array, index: Ints, n: int) -> Array:
+    full = np.zeros(n)
+    full[index] = values
+    return full

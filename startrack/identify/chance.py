@@ -1,0 +1,50 @@
+"""How many matches chance alone would give: the odds against which an identification is accepted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from startrack.types import Array
+
+GRID_POINTS = 600
+NEIGHBOURHOOD_RAD = np.radians(10.0)
+
+
+class ChanceModel:
+    """Expected number of chance coincidences between predicted stars and detections.
+
+    Detections cluster (walls, clouds and trees leave part of the field empty), so the density that counts is the one
+    met where the detections are: sum of squared counts over sum of counts on a grid of overlapping caps.
+    """
+
+    def __init__(self, detection_rays: Array) -> None:
+        from scipy.spatial import cKDTree
+
+        self.tree = cKDTree(detection_rays)
+        chord = 2 * np.sin(NEIGHBOURHOOD_RAD / 2)
+        counts = self.tree.query_ball_point(_fibonacci_sphere(GRID_POINTS), chord, return_length=True)
+        cap_sr = 2 * np.pi * (1 - np.cos(NEIGHBOURHOOD_RAD))
+        occupied = float(np.sum(counts))
+        typical = float(np.sum(np.square(counts, dtype=np.float64))) / occupied if occupied else 0.0
+        self.density_per_sr = max(typical / cap_sr, len(detection_rays) / (4 * np.pi))
+
+    def probability(self, radius_rad: Array | float) -> Array:
+        """Probability that at least one detection lies within the radius of a random direction among the detections."""
+        return -np.expm1(-self.density_per_sr * np.pi * np.square(radius_rad))
+
+    def log_odds(self, matched: Array, predicted: Array, radius_rad: float, given: int = 3) -> Array:
+        """log P(at least `matched` of `predicted` stars coincide by chance); the `given` stars of the pattern are free."""
+        from scipy.stats import binom
+
+        n = np.maximum(predicted - given, 0)
+        k = np.maximum(matched - given, 0)
+        return np.where(k > 0, binom.logsf(k - 1, n, self.probability(radius_rad)), 0.0)
+
+
+def _fibonacci_sphere(n: int) -> Array:
+    """Nearly even unit vectors (n, 3)."""
+    i = np.arange(n) + 0.5
+    z = 1 - 2 * i / n
+    azimuth = np.pi * (1 + np.sqrt(5.0)) * i
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], axis=1)

@@ -1,0 +1,67 @@
+"""The catalogue's triangles in a k-d tree: asked with the sides of an image's triangle, it answers with stars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from startrack.identify.triangles import Triangles, triangles
+from startrack.types import Array, Ints, Stars
+
+NEIGHBOURS_WANTED = 18.0  # pattern stars within the reach of each: enough triangles with most of the sky hidden
+WIDEST_REACH_RAD = np.radians(40.0)
+CLOSE_PAIR_RAD = np.radians(0.05)
+
+
+@dataclass(frozen=True)
+class PatternIndex:
+    """Triangles of the `depth` brightest stars of the sky."""
+
+    star: Ints  # (m,) indices of the pattern stars in Stars
+    rays_icrs: Array  # (m, 3)
+    reach_rad: float
+    triangles: Triangles
+    tree: Any  # scipy.spatial.cKDTree over the triangles' sides
+
+    def candidates(self, image: Triangles, tolerance_rad: float) -> tuple[Ints, Ints]:
+        """Pairs (image triangle, catalogue triangle) whose sides all agree within the tolerance and whose handedness agrees."""
+        from scipy.spatial import cKDTree
+
+        if not len(image) or not len(self.triangles):
+            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        hits = cKDTree(image.sides_rad).query_ball_tree(self.tree, tolerance_rad, p=np.inf)
+        counts = np.array([len(h) for h in hits])
+        left = np.repeat(np.arange(len(hits)), counts)
+        right = np.array([i for h in hits for i in h], dtype=np.int64)
+        agree = image.handed[left] == self.triangles.handed[right]
+        return left[agree], right[agree]
+
+
+def build_index(stars: Stars, field_sr: float) -> PatternIndex:
+    """Index over the brightest stars (sorted, brightest first), deep enough for a camera that sees `field_sr`.
+
+    Wide fields need few stars and long sides, narrow ones many stars and short sides.
+    """
+    from scipy.spatial import cKDTree
+
+    depth = int(np.clip(300 * (2 * np.pi / field_sr) ** 0.8, 300, 12000))
+    star = _without_close_pairs(stars, depth)
+    rays = stars.rays_icrs[star]
+    cap = NEIGHBOURS_WANTED / len(star)  # fraction of the sphere that holds the wanted number of neighbours
+    reach = min(WIDEST_REACH_RAD, 2 * np.arcsin(np.sqrt(cap)), 0.8 * np.sqrt(4 * field_sr / np.pi))
+    found = triangles(rays, reach)
+    return PatternIndex(star, rays, float(reach), found, cKDTree(found.sides_rad))
+
+
+def _without_close_pairs(stars: Stars, depth: int) -> Ints:
+    """The brightest stars, of each close pair only the brighter: a camera sees one light there."""
+    from scipy.spatial import cKDTree
+
+    rays = stars.rays_icrs[: 2 * depth]
+    pairs = cKDTree(rays).query_pairs(CLOSE_PAIR_RAD, output_type="ndarray")
+    keep = np.ones(len(rays), dtype=bool)
+    if len(pairs):
+        keep[pairs.max(axis=1)] = False
+    return np.flatnonzero(keep)[:depth]

@@ -1,0 +1,87 @@
+"""One-to-one matches of detections with predicted stars, by place and brightness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.camera import Camera
+from startrack.types import Array, Detections, Ints, Stars
+
+BLEND_FLUX_RATIO = 0.25  # a neighbour with more than this part of a star's light makes the identity ambiguous
+FIRST_MATCHES = 60
+MAGNITUDE_TOLERANCE = 0.8
+DEPTH_BELOW_THRESHOLD_MAG = 0.7
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Matched pairs and what the frame's brightness scale turned out to be."""
+
+    detection: Ints  # (n,)
+    star: Ints  # (n,)
+    distance_px: Array  # (n,)
+    zero_mag: float  # V of a star of unit flux
+    predicted: int  # stars predicted in the field brighter than the detection limit
+
+
+def match(
+    detections: Detections, camera: Camera, stars: Stars, R_cam_icrs: Array, gate_px: float, radius_px: float
+) -> Matches:
+    """Mutual nearest neighbours within the gate whose brightness agrees; blends of similar stars are left out.
+
+    The brightness scale comes from the frame itself: the median over the brightest stars predicted.
+    """
+    from scipy.spatial import cKDTree
+
+    none = np.zeros(0, dtype=np.int64)
+    predicted_px, inside = camera.project(stars.rays_icrs @ R_cam_icrs.T)
+    seen = np.flatnonzero(inside)
+    if not len(seen) or not len(detections):
+        return Matches(none, none, np.zeros(0), 0.0, 0)
+    tree = cKDTree(detections.xy_px)
+    distance, nearest = tree.query(predicted_px[seen], distance_upper_bound=gate_px)
+    hit = np.isfinite(distance)
+    brightness = -2.5 * np.log10(np.maximum(detections.flux_e, 1e-9))
+    first = np.flatnonzero(hit)[:FIRST_MATCHES]
+    if len(first) < 3:
+        return Matches(none, none, np.zeros(0), 0.0, len(seen))
+    zero_mag = float(np.median(stars.v_mag[seen[first]] - brightness[nearest[first]]))
+    limit = zero_mag + float(np.max(brightness)) + DEPTH_BELOW_THRESHOLD_MAG
+    candidates = hit & (stars.v_mag[seen] < limit)
+    measured_mag = brightness[nearest[candidates]] + zero_mag
+    star = seen[candidates]
+    tolerance = np.hypot(MAGNITUDE_TOLERANCE, 2 * stars.v_sigma_mag[star])
+    # A saturated star's flux is a lower bound.
+    saturated = detections.saturated[nearest[candidates]] & (stars.v_mag[star] < measured_mag)
+    agrees = (np.abs(stars.v_mag[star] - measured_mag) < tolerance) | saturated
+    star, detection = star[agrees], nearest[candidates][agrees]
+    distance = distance[candidates][agrees]
+    keep = _nearest_of_each(detection, distance)
+    star, detection, distance = star[keep], detection[keep], distance[keep]
+    alone = _not_blended(detections.xy_px[detection], star, predicted_px, seen, stars.v_mag, radius_px)
+    predicted = int(np.count_nonzero(stars.v_mag[seen] < limit - DEPTH_BELOW_THRESHOLD_MAG))
+    return Matches(detection[alone], star[alone], distance[alone], zero_mag, predicted)
+
+
+def _nearest_of_each(detection: Ints, distance: Array) -> Ints:
+    """Indices of the closest star of each detection."""
+    order = np.lexsort((distance, detection))
+    _, first = np.unique(detection[order], return_index=True)
+    return np.sort(order[first])
+
+
+def _not_blended(xy_px: Array, star: Ints, predicted_px: Array, seen: Ints, v_mag: Array, radius_px: float) -> Array:
+    """Whether no other star of comparable light falls within the radius of the detections (n, 2)."""
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(predicted_px[seen]).query_ball_point(xy_px, radius_px)
+    faintest = v_mag[star] - 2.5 * np.log10(BLEND_FLUX_RATIO)
+    return np.array(
+        [
+            not any(seen[j] != s and v_mag[seen[j]] < limit for j in others)
+            for others, s, limit in zip(near, star, faintest, strict=True)
+        ],
+        dtype=bool,
+    )

@@ -1,0 +1,18 @@
+"""Localization: evidence and terrain to a position. One method per file, all behind the same call."""
+
+from typing import Protocol
+
+from startrack.localize.hull import Hull
+from startrack.localize.posterior import ExactPosterior
+from startrack.localize.pseudo_gradient import PseudoGradient
+from startrack.terrain import Terrain
+from startrack.types import Evidence, Fix
+
+
+class Localizer(Protocol):
+    """Evidence and terrain to a fix; raises NotLocated."""
+
+    def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix: ...
+
+
+__all__ = ["ExactPosterior", "Hull", "Localizer", "PseudoGradient"]

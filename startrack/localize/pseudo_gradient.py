@@ -1,0 +1,50 @@
+"""Kua's refinement: step by the difference of the centres of mass of the expected and the seen stars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.localize.hull import hull_position
+from startrack.localize.seen import cylinder_of, on_rim_plane, point_fix, seen_stars
+from startrack.terrain import Terrain
+from startrack.types import Array, Bools, Evidence, Fix
+
+PUBLISHED_SIGMA_M = float(np.hypot(34.2, 31.1) / np.sqrt(2))  # mean and s.d. of the error, thesis table 3.1
+
+
+@dataclass(frozen=True)
+class PseudoGradient:
+    """Repeats p <- p + gain (mean of the stars expected at p - mean of the stars seen) until both sets are the same.
+
+    Stars are points on the plane of the rim; those expected at p are the ones with |p + point| < R. Source: Kua 2008,
+    Algorithm 1. Weak when few stars differ: it may wander until the steps run out.
+    """
+
+    gain: float = 1.0
+    most_steps: int = 200
+
+    def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
+        """Raises NotLocated with fewer than 3 seen stars."""
+        cylinder = cylinder_of(terrain)
+        points, seen = on_rim_plane(evidence, cylinder), seen_stars(evidence)
+        start = hull_position(points[seen], cylinder.radius_m)
+        position, _ = descend(points, seen, start, cylinder.radius_m, self.gain, self.most_steps)
+        return point_fix(position, PUBLISHED_SIGMA_M, cylinder)
+
+
+def descend(
+    points_m: Array, seen: Bools, start_m: Array, radius_m: float, gain: float, most_steps: int
+) -> tuple[Array, bool]:
+    """Last position (2,) and whether the expected stars became the seen ones."""
+    seen_mean = points_m[seen].mean(axis=0)
+    position = np.array(start_m)
+    for _ in range(most_steps):
+        expected = np.sum(np.square(points_m + position), axis=1) < radius_m**2
+        if np.array_equal(expected, seen):
+            return position, True
+        if not expected.any():
+            break
+        position = position + gain * (points_m[expected].mean(axis=0) - seen_mean)
+    return position, False

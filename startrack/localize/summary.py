@@ -1,0 +1,103 @@
+"""From a posterior on boxes to a fix: mean, covariance, circles and modes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from startrack.terrain import Terrain
+from startrack.types import Array, Fix, Ints, Mode, NotLocated
+
+AMBIGUOUS_MASS = 0.01
+NEGLIGIBLE_MODE = 1e-4
+USELESS_FRACTION = 0.5  # a 95 % circle wider than this part of the search radius says nothing worth having
+
+
+def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_mass: float, terrain: Terrain) -> Fix:
+    """Fix from equal boxes (n, 2) of the given width with log-likelihoods (n,).
+
+    Raises NotLocated: outside_search_area where most of the posterior lies beyond the search radius, and
+    insufficient_geometry where the posterior is as wide as the area itself.
+    """
+    weight = np.exp(log_weight - np.max(log_weight))
+    weight /= weight.sum()
+    outside = np.hypot(centres_m[:, 0], centres_m[:, 1]) > terrain.search_radius_m
+    if weight[outside].sum() > 0.5:
+        raise NotLocated(
+            f"the stars place the camera outside the search area of {terrain.search_radius_m:.0f} m: "
+            "widen [search] radius_m in the terrain file if that can be true",
+            reason="outside_search_area",
+        )
+    keep = ~outside & (weight > 1e-12)
+    centres_m, weight = centres_m[keep], weight[keep] / weight[keep].sum()
+    label = _modes(centres_m, weight, width_m)
+    modes = _described(centres_m, weight, label)
+    mean, covariance = _moments(centres_m, weight, width_m)
+    main = label == label[int(np.argmax(np.bincount(label, weights=weight)[label]))]
+    main_mean, _ = _moments(centres_m[main], weight[main], width_m)
+    main_999 = _radius(centres_m[main] - main_mean, weight[main] / weight[main].sum(), 0.999, width_m)
+    distance = np.linalg.norm(centres_m - main_mean, axis=1)
+    ambiguous = bool(weight[distance > main_999 + width_m].sum() > AMBIGUOUS_MASS and len(modes) > 1)
+    radius95 = _radius(centres_m - mean, weight, 0.95, width_m)
+    if not ambiguous and radius95 > USELESS_FRACTION * terrain.search_radius_m:
+        raise NotLocated("the rays leave the position open over most of the search area: is the skyline in the picture?")
+    up = float(terrain.ground_m(mean[None, :])[0]) + terrain.camera_height_m
+    return Fix(
+        position_enu_m=np.array([mean[0], mean[1], up]),
+        covariance_m2=covariance,
+        radius95_m=radius95,
+        radius999_m=_radius(centres_m - mean, weight, 0.999, width_m),
+        modes=modes,
+        ambiguous=ambiguous,
+        dropped_mass=dropped_mass,
+    )
+
+
+def _moments(centres_m: Array, weight: Array, width_m: float) -> tuple[Array, Array]:
+    """Mean and covariance; a box's own extent (width^2 / 12) is part of the covariance."""
+    weight = weight / weight.sum()
+    mean = weight @ centres_m
+    centred = centres_m - mean
+    return mean, np.einsum("n,ni,nj->ij", weight, centred, centred) + width_m**2 / 12 * np.eye(2)
+
+
+def _radius(offsets_m: Array, weight: Array, mass: float, width_m: float) -> float:
+    """Radius of the circle that holds the mass, a box's half diagonal included."""
+    distance = np.hypot(offsets_m[:, 0], offsets_m[:, 1])
+    order = np.argsort(distance)
+    at = int(np.searchsorted(np.cumsum(weight[order]), mass * (1 - 1e-12)))
+    return float(distance[order][min(at, len(order) - 1)] + width_m * np.sqrt(0.5))
+
+
+def _modes(centres_m: Array, weight: Array, width_m: float) -> Ints:
+    """Mode number (n,) of each box: boxes linked by gaps no wider than the posterior's local spread."""
+    first = _linked(centres_m, 1.5 * width_m)
+    heaviest = first == np.argmax(np.bincount(first, weights=weight))
+    _, covariance = _moments(centres_m[heaviest], weight[heaviest], width_m)
+    return _linked(centres_m, max(1.5 * width_m, 3.0 * float(np.sqrt(np.linalg.eigvalsh(covariance)[1]))))
+
+
+def _linked(points_m: Array, gap_m: float) -> Ints:
+    """Labels (n,) of the connected groups of points closer than the gap.
+
+    Points are first put into cells of the gap's size, so the cost does not grow with the number of pairs.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    cell = np.floor(points_m / (0.5 * gap_m)).astype(np.int64)
+    cells, of = np.unique(cell, axis=0, return_inverse=True)
+    pairs = cKDTree(cells).query_pairs(2.9, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
+    return np.asarray(connected_components(graph, directed=False)[1])[np.ravel(of)].astype(np.int64)
+
+
+def _described(centres_m: Array, weight: Array, label: Ints) -> tuple[Mode, ...]:
+    mass = np.bincount(label, weights=weight)
+    east = np.bincount(label, weights=weight * centres_m[:, 0]) / np.maximum(mass, 1e-300)
+    north = np.bincount(label, weights=weight * centres_m[:, 1]) / np.maximum(mass, 1e-300)
+    order = [int(i) for i in np.argsort(-mass, kind="stable") if mass[i] > NEGLIGIBLE_MODE]
+    total = float(mass[order].sum())
+    return tuple(
+        Mode(east_m=float(east[i]), north_m=float(north[i]), weight=float(mass[i]) / total) for i in order
+    )

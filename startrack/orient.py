@@ -1,0 +1,116 @@
+"""Attitude from matched rays: the optimal rotation with its covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.camera import Camera
+from startrack.types import Array, Attitude, Bools, NotIdentified
+
+CHI2_2DOF_MEDIAN = 1.3863
+OUTLIER_CHI2 = 16.0  # 4 sigma in each axis: one good star in 3000 is lost
+ROUNDS = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttitudeFit:
+    """Attitude and what the stars say of it."""
+
+    attitude: Attitude
+    residual_px: Array  # (n, 2) measured minus predicted
+    used: Bools  # (n,)
+    rms_px: float  # of the used stars, per axis
+    extra_sigma_px: float  # error per axis beyond the stated centroid errors (lens, blends, catalogue)
+
+
+def wahba(rays_cam: Array, rays_icrs: Array, weights: Array) -> Array:
+    """R_cam_icrs (..., 3, 3) minimising sum w |rays_cam - R rays_icrs|^2 over stars (..., n, 3), weights (..., n).
+
+    Source: Markley 1988, J. Astronaut. Sci. 36, 245 (singular value decomposition of the attitude profile matrix).
+    Weak where all stars lie in one direction.
+    """
+    profile = np.einsum("...n,...ni,...nj->...ij", weights, rays_cam, rays_icrs)
+    u, _, vt = np.linalg.svd(profile)
+    handedness = np.linalg.det(u) * np.linalg.det(vt)
+    u = u.copy()
+    u[..., :, 2] *= handedness[..., None]
+    return u @ vt
+
+
+def rotation(vector_rad: Array) -> Array:
+    """R (3, 3) = exp([w]x) of a rotation vector w [rad] (Rodrigues)."""
+    angle = float(np.linalg.norm(vector_rad))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = vector_rad / angle
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
+
+
+def solve_attitude(
+    camera: Camera, xy_px: Array, covariance_px2: Array, rays_icrs: Array, R_cam_icrs: Array
+) -> AttitudeFit:
+    """Attitude minimising the normalised distance of measured (n, 2) from predicted pixels, outliers rejected.
+
+    Gauss-Newton from `R_cam_icrs` with the stars' centroid covariances (n, 2, 2); an error common to all stars (blends,
+    lens, catalogue) is estimated from the scatter and added to every centroid, so that the covariance is honest.
+    Raises NotIdentified with fewer than 3 stars left.
+    """
+    R = np.array(R_cam_icrs)
+    n = len(xy_px)
+    used = np.ones(n, dtype=bool)
+    extra = 0.0
+    for _ in range(ROUNDS):
+        rays_cam = rays_icrs @ R.T
+        predicted, _ = camera.project(rays_cam)
+        residual = xy_px - predicted
+        weight = np.linalg.inv(covariance_px2 + extra * np.eye(2))
+        chi2 = np.einsum("ni,nij,nj->n", residual, weight, residual)
+        used = chi2 < OUTLIER_CHI2 if extra > 0.0 else used
+        if used.sum() < 3:
+            raise NotIdentified("fewer than 3 stars agree on an attitude", matched=int(used.sum()))
+        jacobian = camera.jacobian_px_per_rad(rays_cam)[used]
+        w, r = _robust(weight, chi2)[used], residual[used]
+        normal = np.einsum("nia,nij,njb->ab", jacobian, w, jacobian)
+        turn = np.linalg.solve(normal, np.einsum("nia,nij,nj->a", jacobian, w, r))
+        R = rotation(turn) @ R
+        new_extra = _extra_variance(residual, covariance_px2)
+        settled = np.linalg.norm(turn) < 1e-9 and abs(new_extra - extra) <= 1e-3 * new_extra
+        extra = new_extra
+        if settled:
+            break
+    information = np.einsum("nia,nij,njb->ab", jacobian, weight[used], jacobian)
+    return AttitudeFit(
+        attitude=Attitude(R_cam_icrs=R, covariance_rad2=np.linalg.inv(information)),
+        residual_px=residual,
+        used=used,
+        rms_px=float(np.sqrt(np.mean(residual[used] ** 2))),
+        extra_sigma_px=float(np.sqrt(extra)),
+    )
+
+
+def _robust(weight: Array, chi2: Array) -> Array:
+    """Weights (n, 2, 2) with Huber's taper beyond 2.5 sigma: what is not quite an outlier does not pull."""
+    return weight * np.minimum(1.0, 2.5 / np.sqrt(np.maximum(chi2, 1e-12)))[:, None, None]
+
+
+def _extra_variance(residual_px: Array, covariance_px2: Array) -> float:
+    """Variance per axis [px^2] to add to every centroid so that the median normalised residual is as expected."""
+
+    def median_chi2(extra: float) -> float:
+        weight = np.linalg.inv(covariance_px2 + extra * np.eye(2))
+        return float(np.median(np.einsum("ni,nij,nj->n", residual_px, weight, residual_px)))
+
+    low, high = 1e-6, 1.0
+    if median_chi2(low) <= CHI2_2DOF_MEDIAN:
+        return low
+    while median_chi2(high) > CHI2_2DOF_MEDIAN and high < 1e4:
+        high *= 4.0
+    for _ in range(40):
+        middle = np.sqrt(low * high)
+        low, high = (middle, high) if median_chi2(middle) > CHI2_2DOF_MEDIAN else (low, middle)
+        if high < 1.001 * low:
+            break
+    return float(high)

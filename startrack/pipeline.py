@@ -1,0 +1,194 @@
+"""The whole story of one image: detect, identify, attitude, evidence, position."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from startrack.bodies import bodies
+from startrack.camera import Camera
+from startrack.consistency import check_consistency
+from startrack.detect import Detector, electrons
+from startrack.evidence import StarEvidence, StarLight, flux_scale
+from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
+from startrack.identify import Identifier
+from startrack.localize import ExactPosterior, Localizer
+from startrack.orient import AttitudeFit, solve_attitude
+from startrack.terrain import Terrain
+from startrack.types import (
+    Array,
+    Attitude,
+    BadInput,
+    Body,
+    Detections,
+    Exposure,
+    Fix,
+    Identification,
+    NoSolution,
+    Stars,
+)
+
+if TYPE_CHECKING:
+    from startrack.catalog import StarCatalog
+
+UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out
+NO_TIME = (
+    "the mid-exposure time is not known: give --time UTC, a sidecar NAME.json with time_utc, or a header with it; "
+    "nothing is guessed"
+)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The stages and their settings; exchange any of them."""
+
+    detector: Detector = field(default_factory=Detector)
+    identifier: Identifier = field(default_factory=Identifier)
+    evidence: StarEvidence = field(default_factory=StarEvidence)
+    localizer: Localizer = field(default_factory=ExactPosterior)
+
+
+@dataclass
+class Result:
+    """What became of one image. Parts that were not reached are None."""
+
+    exposure: Exposure
+    camera: Camera | None = None
+    terrain: Terrain | None = None
+    catalog_name: str = ""
+    status: str = "refused"  # ok, ambiguous or refused
+    reason: str | None = None
+    message: str = ""
+    detections: Detections | None = None
+    stars: Stars | None = None
+    bodies: list[Body] = field(default_factory=list)
+    identification: Identification | None = None
+    attitude_fit: AttitudeFit | None = None
+    R_enu_icrs: Array | None = None
+    light: StarLight | None = None
+    fix: Fix | None = None
+    timing_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def attitude(self) -> Attitude | None:
+        """Attitude with the error of an unknown time included."""
+        if self.attitude_fit is None:
+            return None
+        attitude = self.attitude_fit.attitude
+        if self.exposure.time_utc is not None:
+            return attitude
+        widened = attitude.covariance_rad2 + UNKNOWN_TIME_SIGMA_RAD**2 * np.eye(3)
+        return Attitude(R_cam_icrs=attitude.R_cam_icrs, covariance_rad2=widened)
+
+
+def locate(
+    exposure: Exposure, camera: Camera, terrain: Terrain, catalog: StarCatalog, settings: Settings | None = None
+) -> Result:
+    """Position and attitude of the camera; a Result with a reason where there is none to stand by."""
+    settings = settings or Settings()
+    result = Result(exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name)
+    with _refusals(result):
+        if exposure.time_utc is None:
+            raise BadInput("no_time", NO_TIME)
+        _identify(result, catalog, settings, terrain.site)
+        result.R_enu_icrs = R_enu_icrs(terrain.site, exposure.time_utc)
+        with _timed(result, "evidence"):
+            result.light = _light(result, settings)
+        with _timed(result, "locate"):
+            fix = settings.localizer(result.light.evidence(), terrain)
+            check_consistency(result.light, fix, terrain)
+        result.fix = fix
+        result.status = "ambiguous" if fix.ambiguous else "ok"
+        if fix.ambiguous:
+            result.reason, result.message = "ambiguous", f"{len(fix.modes)} places fit the stars"
+    return result
+
+
+def identify(
+    exposure: Exposure, camera: Camera, catalog: StarCatalog, settings: Settings | None = None, site: Site | None = None
+) -> Result:
+    """Stars and attitude only. Without a time the catalogue is taken at J2000.0, without aberration."""
+    result = Result(exposure=exposure, camera=camera, catalog_name=catalog.name)
+    with _refusals(result):
+        _identify(result, catalog, settings or Settings(), site)
+        result.status = "ok"
+    return result
+
+
+def detect(exposure: Exposure, camera: Camera | None, settings: Settings | None = None) -> Result:
+    """Centroids only."""
+    result = Result(exposure=exposure, camera=camera)
+    with _refusals(result), _timed(result, "detect"):
+        result.detections = (settings or Settings()).detector(exposure, camera)
+        result.status = "ok"
+    return result
+
+
+def _identify(result: Result, catalog: StarCatalog, settings: Settings, site: Site | None) -> None:
+    exposure, camera = result.exposure, result.camera
+    assert camera is not None
+    if exposure.size_px != camera.size_px:
+        raise BadInput(
+            "size_mismatch",
+            f"the image is {exposure.size_px[0]} x {exposure.size_px[1]} px, the camera file says "
+            f"{camera.size_px[0]} x {camera.size_px[1]}",
+        )
+    with _timed(result, "detect"):
+        result.detections = settings.detector(exposure, camera)
+    with _timed(result, "identify"):
+        # Without a site the Moon's centre stands in: the Earth's velocity differs by 0.7 arcsec of aberration.
+        where = site or Site("moon", 0.0, 0.0)
+        when = exposure.time_utc
+        result.stars = catalog.at(when, observer_velocity_m_s(where, when) if when is not None else None)
+        result.bodies = bodies(site, when) if site is not None and when is not None else []
+        result.identification = settings.identifier(result.detections, camera, result.stars)
+    with _timed(result, "attitude"):
+        found, d = result.identification, result.detections
+        result.attitude_fit = solve_attitude(
+            camera,
+            d.xy_px[found.detection],
+            d.covariance_px2[found.detection],
+            result.stars.rays_icrs[found.star],
+            found.R_cam_icrs,
+        )
+
+
+def _light(result: Result, settings: Settings) -> StarLight:
+    assert result.camera is not None and result.detections is not None and result.stars is not None
+    assert result.identification is not None and result.attitude_fit is not None and result.R_enu_icrs is not None
+    image, dead = electrons(result.exposure, result.camera)
+    return settings.evidence(
+        image,
+        dead,
+        result.detections,
+        result.camera,
+        result.stars,
+        result.bodies,
+        result.attitude_fit.attitude.R_cam_icrs,
+        result.R_enu_icrs,
+        flux_scale(result.detections, result.camera, result.stars, result.identification),
+        result.attitude_fit.extra_sigma_px,
+    )
+
+
+@contextmanager
+def _refusals(result: Result) -> Iterator[None]:
+    """A refusal of a stage becomes the result's reason and message."""
+    try:
+        yield
+    except (BadInput, NoSolution) as refusal:
+        result.status, result.reason, result.message = "refused", refusal.reason, str(refusal)
+
+
+@contextmanager
+def _timed(result: Result, stage: str) -> Iterator[None]:
+    start = clock.perf_counter()
+    try:
+        yield
+    finally:
+        result.timing_ms[stage] = result.timing_ms.get(stage, 0.0) + 1e3 * (clock.perf_counter() - start)

@@ -1,0 +1,43 @@
+"""The point-spread function: a Gaussian integrated over the square pixel."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.types import Array
+
+SQRT2 = math.sqrt(2.0)
+
+
+def pixel_profile(offset_px: Array, sigma_px: float | Array, radius: int) -> tuple[Array, Array]:
+    """1-D pixel-integrated Gaussian (n, 2 radius + 1) and its derivative with respect to the offset.
+
+    P_j = Phi((j + 1/2 - offset) / sigma) - Phi((j - 1/2 - offset) / sigma), j = -radius..radius, for the offsets (n,)
+    of the centre from the stamp's middle pixel [px]; `sigma_px` is a number or (n,). The 2-D PSF is the product of two.
+    """
+    from scipy.special import ndtr
+
+    sigma = np.asarray(sigma_px, dtype=np.float64)[..., None]
+    edges = (np.arange(-radius, radius + 2) - 0.5 - np.asarray(offset_px)[:, None]) / sigma
+    density = np.exp(-0.5 * edges * edges) / math.sqrt(2 * math.pi)
+    return np.diff(ndtr(edges), axis=1), -np.diff(density, axis=1) / sigma
+
+
+def filter_kernel(sigma_px: float) -> NDArray[np.float32]:
+    """1-D matched-filter kernel (2 r + 1,) of a centred star."""
+    radius = stamp_radius(sigma_px)
+    return pixel_profile(np.zeros(1), sigma_px, radius)[0][0].astype(np.float32)
+
+
+def stamp_radius(sigma_px: float) -> int:
+    """Half width [px] of a stamp that holds all but 0.3 % of a star's light, and at least 2."""
+    return max(2, math.ceil(3.0 * sigma_px))
+
+
+def noise_area_px(sigma_px: float) -> float:
+    """1 / sum P^2 [px]: background pixels whose noise a matched filter collects (4 pi sigma^2 for a wide PSF)."""
+    kernel = filter_kernel(sigma_px).astype(np.float64)
+    return float(1.0 / np.square(np.sum(kernel**2)))

@@ -1,0 +1,149 @@
+"""What the image commands share: flags, the loop over images, exit codes, and where results go."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from startrack.types import BadInput
+
+if TYPE_CHECKING:
+    from startrack.camera import Camera
+    from startrack.pipeline import Result
+    from startrack.types import Exposure
+
+DEFAULT_OUT = "startrack-out"
+BAD_INPUT_REASONS = frozenset(
+    {"bad_image", "size_mismatch", "no_time", "no_calibration", "bad_calibration", "bad_terrain"}
+)
+
+
+def add_image_flags(parser: argparse.ArgumentParser) -> None:
+    """Flags of every command that reads images."""
+    parser.add_argument("images", nargs="+", metavar="IMAGE", help="PNG, TIFF, FITS or JPEG")
+    parser.add_argument("-c", "--camera", metavar="FILE", help="camera file, or the name of a shipped one")
+    parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601")
+    parser.add_argument("--exposure", type=float, metavar="S", help="exposure time in seconds")
+    add_output_flags(parser)
+
+
+def add_output_flags(parser: argparse.ArgumentParser) -> None:
+    """Flags of every command that writes results."""
+    parser.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the results (%(default)s)")
+    parser.add_argument("-O", "--overwrite", action="store_true", help="replace results of another image of this name")
+    parser.add_argument("--json", action="store_true", help="print one JSON object per image")
+    parser.add_argument("--no-plots", action="store_true", help="no pictures")
+    parser.add_argument("-v", "--verbose", action="count", default=0, help="say more; tracebacks of internal errors")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+
+
+def read(path: str, args: argparse.Namespace) -> Exposure:
+    """The image with its facts; flags come before sidecar and header."""
+    from startrack.exposure import read_exposure
+    from startrack.frames import parse_utc
+
+    flags: dict[str, Any] = {
+        "time_utc": parse_utc(args.time) if args.time is not None else None,
+        "exposure_s": args.exposure,
+        "camera": args.camera,
+        "terrain": getattr(args, "terrain", None),
+    }
+    return read_exposure(path, **{key: value for key, value in flags.items() if value is not None})
+
+
+def camera_of(exposure: Exposure) -> Camera:
+    """The camera that flag, sidecar or header names. Raises BadInput no_calibration where none does."""
+    from startrack.camera import load_camera
+
+    if exposure.camera is None:
+        raise BadInput("no_calibration", f"{exposure.path}: no camera file is known: give -c FILE or a sidecar with camera")
+    return load_camera(exposure.camera)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One image's result as printed and as counted."""
+
+    status: str
+    reason: str | None
+    line: str
+    record: dict[str, Any]
+
+
+def run_images(args: argparse.Namespace, one: Callable[[str, str], Outcome]) -> int:
+    """Run `one(path, output stem)` for each image, print its outcome, and return the exit code."""
+    codes = [0]
+    for path, stem in zip(args.images, output_stems(args.images), strict=True):
+        outcome = one(path, stem)
+        if args.json:
+            print(json.dumps(outcome.record), flush=True)
+        elif outcome.status != "ok":
+            print(outcome.line, file=sys.stdout if not args.quiet else sys.stderr, flush=True)
+        elif not args.quiet:
+            print(outcome.line, flush=True)
+        codes.append(exit_code(outcome))
+    return next((code for code in (1, 4, 3) if code in codes), 0)
+
+
+def exit_code(outcome: Outcome) -> int:
+    """0 solved, 4 bad input, 3 refused or ambiguous."""
+    if outcome.status == "ok":
+        return 0
+    return 4 if outcome.reason in BAD_INPUT_REASONS else 3
+
+
+def refused(path: str, cause: BadInput, format_name: str) -> Outcome:
+    """Outcome of an image that could not even be read, or whose camera or terrain could not."""
+    from startrack.report.summary import refusal_line
+
+    record = {
+        "format": format_name,
+        "image": Path(path).name,
+        "status": "refused",
+        "reason": cause.reason,
+        "message": str(cause),
+    }
+    return Outcome("refused", cause.reason, refusal_line(path, cause.reason, str(cause)), record)
+
+
+def output_stems(images: Sequence[str]) -> list[str]:
+    """Names of the results: the images' stems; equal stems keep their suffix, equal names get a number."""
+    names = [Path(image).name for image in images]
+    stems = [_stem(name) for name in names]
+    often = Counter(stems)
+    chosen = [name if often[stem] > 1 else stem for name, stem in zip(names, stems, strict=True)]
+    seen: Counter[str] = Counter()
+    unique = []
+    for name in chosen:
+        seen[name] += 1
+        unique.append(name if seen[name] == 1 else f"{name}-{seen[name]}")
+    return unique
+
+
+def _stem(name: str) -> str:
+    path = Path(name)
+    packed = path.suffix.lower() in {".gz", ".bz2", ".fz"}
+    return Path(path.stem).stem if packed and Path(path.stem).suffix else path.stem
+
+
+def result_path(out: str, stem: str, suffix: str, result: Result, overwrite: bool) -> Path:
+    """Where a result goes. A result of the same image is renewed; one of another image is kept unless `overwrite`."""
+    path = Path(out) / f"{stem}{suffix}"
+    if path.exists() and not overwrite:
+        try:
+            before = json.loads(path.read_text(encoding="utf-8")).get("provenance", {}).get("image_sha256")
+        except (OSError, ValueError, AttributeError):
+            before = None
+        if before != result.exposure.sha256:
+            raise FileExistsError(f"{path} holds the result of another image: choose another -D, or replace it with -O")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as cause:
+        raise FileExistsError(f"{path.parent}: cannot make the folder of the results: {cause.strerror}") from cause
+    return path

@@ -1,0 +1,49 @@
+"""`startrack detect`: centroids only."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+from startrack.cli.common import Outcome, add_image_flags, camera_of, read, refused, result_path, run_images
+from startrack.types import BadInput
+
+FORMAT = "startrack.detection/1"
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add `detect` to the commands of the `startrack` parser."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "detect",
+        help="centroids only",
+        description="Find the point sources of each image. With a camera file fluxes are in electrons, without one in "
+        "ADU and the PSF is measured from the image. Writes NAME.detections.json and NAME.annotated.png.",
+    )
+    add_image_flags(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Detect in every image; the exit code of the worst."""
+    return run_images(args, lambda path, stem: _one(path, stem, args))
+
+
+def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
+    from startrack.pipeline import detect
+    from startrack.report import detection_dict, summary_line, write_annotated, write_json
+
+    start = time.perf_counter()
+    try:
+        exposure = read(path, args)
+        camera = camera_of(exposure) if exposure.camera is not None else None
+    except BadInput as cause:
+        return refused(path, cause, FORMAT)
+    read_ms = 1e3 * (time.perf_counter() - start)
+    result = detect(exposure, camera)
+    result.timing_ms["read"] = read_ms
+    record = detection_dict(result)
+    out = result_path(args.dir, stem, ".detections.json", result, args.overwrite)
+    if not args.no_plots:
+        write_annotated(out.with_name(f"{stem}.annotated.png"), result)
+    write_json(out, record)
+    return Outcome(result.status, result.reason, summary_line(result, seconds=time.perf_counter() - start), record)

@@ -1,0 +1,61 @@
+"""`startrack identify`: stars and attitude only."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+from startrack.cli.common import Outcome, add_image_flags, camera_of, read, refused, result_path, run_images
+from startrack.types import BadInput
+
+FORMAT = "startrack.identification/1"
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add `identify` to the commands of the `startrack` parser."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "identify",
+        help="stars and attitude only",
+        description="Name the stars of each image and give the attitude. Needs a camera file, but no terrain; without a "
+        "time the catalogue is taken at J2000.0 and 60 arcsec are added to the stated errors. Writes "
+        "NAME.identification.json, NAME.stars.ecsv and NAME.annotated.png.",
+    )
+    add_image_flags(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Identify every image; the exit code of the worst."""
+    return run_images(args, lambda path, stem: _one(path, stem, args))
+
+
+def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
+    from startrack.catalog import load_catalog
+    from startrack.pipeline import identify
+    from startrack.report import (
+        identification_dict,
+        summary_line,
+        verbose_text,
+        write_annotated,
+        write_json,
+        write_star_table,
+    )
+
+    start = time.perf_counter()
+    try:
+        exposure = read(path, args)
+        camera = camera_of(exposure)
+    except BadInput as cause:
+        return refused(path, cause, FORMAT)
+    read_ms = 1e3 * (time.perf_counter() - start)
+    result = identify(exposure, camera, load_catalog())
+    result.timing_ms["read"] = read_ms
+    record = identification_dict(result)
+    out = result_path(args.dir, stem, ".identification.json", result, args.overwrite)
+    if result.identification is not None:
+        write_star_table(out.with_name(f"{stem}.stars.ecsv"), result)
+    if not args.no_plots:
+        write_annotated(out.with_name(f"{stem}.annotated.png"), result)
+    write_json(out, record)
+    line = summary_line(result, seconds=time.perf_counter() - start)
+    return Outcome(result.status, result.reason, line + ("\n" + verbose_text(result) if args.verbose else ""), record)

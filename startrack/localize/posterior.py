@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.localize.likelihood import Sectors
-from startrack.localize.search import Boxes, bounded, centre_scores, on_ground, start_boxes
+from startrack.localize.rays import ray_levels
+from startrack.localize.scout import likely_places, taken
+from startrack.localize.search import Boxes, bounded, centre_scores, on_ground, whole_area
 from startrack.localize.summary import summarize
 from startrack.terrain import Terrain
 from startrack.types import Array, Evidence, Fix, NotLocated
 
-START_ACROSS = 1
+UNBUNDLE_AT_M = 80.0  # boxes below this half side are asked ray by ray, twice as large ones by the finest bundles
 FEWEST_RAYS = 8
 
 
@@ -29,36 +31,43 @@ class ExactPosterior:
     sector_epsilon: float = 1e-4
     prune_nats: float = 16.0  # boxes whose best place is e^-16 as likely as the best known one are dropped
     finest_m: float = 0.05
-    boxes_per_sigma: float = 4.0  # boxes are quartered until this many fit into the posterior's smaller axis
-    most_boxes: int = 60_000
+    boxes_per_sigma: float = 2.5  # boxes are quartered until this many fit into the posterior's smaller axis
+    most_boxes: int = 40_000
 
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
         """Posterior of the camera's position. Raises NotLocated (insufficient_geometry, outside_search_area)."""
         told = np.abs(evidence.llr) > 1e-3
         if told.sum() < FEWEST_RAYS:
             raise NotLocated(f"only {int(told.sum())} rays say anything about the skyline: expose longer")
-        boxes, log_weight, dropped = self._explore(_selected(evidence, told), terrain)
+        boxes, log_weight, dropped = self._explore(taken(evidence, told), terrain)
         return summarize(boxes.centres_m, 2 * boxes.half_m, log_weight, dropped, terrain)
 
     def _explore(self, evidence: Evidence, terrain: Terrain) -> tuple[Boxes, Array, float]:
+        """Boxes that hold the posterior, log-likelihoods at their centres, and a bound on the probability dropped."""
         sectors = Sectors.of(evidence, self.sector_width_rad, self.sector_epsilon)
-        boxes = bounded(start_boxes(sectors, terrain, terrain.reach_m, START_ACROSS), sectors, terrain)
-        best, dropped = -np.inf, -np.inf
+        levels = ray_levels(sectors)
+        rays = levels.pop(0)
+        boxes = bounded(whole_area(sectors, rays, terrain.reach_m), sectors, rays, terrain)
+        best = float(likely_places(evidence, sectors, terrain)[1].max(initial=-np.inf))
+        dropped = -np.inf
         while True:
-            score = centre_scores(boxes, sectors, terrain)
-            allowed = np.asarray(terrain.allowed(boxes.centres_m))
-            if allowed.any():
-                best = max(best, float(score[allowed].max()))
-            best = max(best, float(boxes.lower.max()) if allowed.all() else -np.inf)
-            keep = boxes.upper > best - self.prune_nats
-            if not keep.all():
-                dropped = np.logaddexp(dropped, _log_mass(boxes.upper[~keep], boxes.half_m))
-                boxes, score, allowed = boxes.take(keep), score[keep], allowed[keep]
-            log_weight = np.where(allowed, score, -np.inf)
-            if self._fine_enough(boxes, log_weight):
+            if rays.single:
+                score = centre_scores(boxes, sectors, rays, terrain)
+                log_weight = np.where(terrain.allowed(boxes.centres_m), score, -np.inf)
+                best = max(best, float(log_weight.max(initial=-np.inf)))
+            whole = boxes.upper > best - self.prune_nats
+            dropped = np.logaddexp(dropped, _log_mass(boxes.upper[~whole], boxes.half_m))
+            boxes = boxes.take(whole)
+            if rays.single and self._fine_enough(boxes, log_weight[whole]):
                 break
             boxes = boxes.split()
-            boxes = bounded(boxes.take(on_ground(boxes, terrain)), sectors, terrain)
+            boxes = boxes.take(on_ground(boxes, terrain))
+            if levels and boxes.half_m < UNBUNDLE_AT_M * 2 ** len(levels):
+                boxes, rays = boxes.unbundled(rays), levels.pop(0)
+            boxes = bounded(boxes, sectors, rays, terrain)
+            sure = boxes.lower[np.asarray(terrain.allowed(boxes.centres_m))]
+            best = max(best, float(sure.max(initial=-np.inf)))
+        log_weight = log_weight[whole]
         total = _log_mass(log_weight, boxes.half_m)
         return boxes, log_weight, float(np.exp(min(dropped - total, 0.0)))
 
@@ -72,15 +81,6 @@ class ExactPosterior:
         spread = np.einsum("n,ni,nj->ij", weight, centred, centred) / weight.sum()
         smaller = np.sqrt(max(float(np.linalg.eigvalsh(spread)[0]), 0.0))
         return 2 * boxes.half_m * self.boxes_per_sigma < smaller
-
-
-def _selected(evidence: Evidence, which: Array) -> Evidence:
-    return Evidence(
-        azimuth_rad=evidence.azimuth_rad[which],
-        elevation_rad=evidence.elevation_rad[which],
-        llr=evidence.llr[which],
-        edge_sigma_rad=evidence.edge_sigma_rad[which],
-    )
 
 
 def _log_mass(log_density: Array, half_m: float) -> float:

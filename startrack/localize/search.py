@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from startrack.localize.likelihood import Sectors, contribution
+from startrack.localize.rays import Rays
 from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Ints
 
 SETTLED = 1e-4  # a ray whose contribution varies by less over a box is settled there
-PAIRS_AT_ONCE = 2_000_000
+PAIRS_AT_ONCE = 1_000_000
 CHILDREN = np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
 
 
-@dataclass
+@dataclass(frozen=True)
 class Boxes:
-    """Equal squares still in the running, and the rays that vary over each."""
+    """Equal squares still in the running, and the bundles of rays that vary over each."""
 
     centres_m: Array  # (n, 2)
     half_m: float
-    sums: Array  # (n, sectors) contributions of the settled rays
-    box: Ints  # (pairs,) box of each unsettled (box, ray) pair
-    ray: Ints  # (pairs,)
+    sums: Array  # (n, sectors) contributions of the settled bundles
+    box: Ints  # (pairs,) box of each unsettled (box, bundle) pair
+    ray: Ints  # (pairs,) bundle, on the level in use
     lower: Array  # (n,) bounds of the log-likelihood over the box
     upper: Array  # (n,)
 
@@ -40,75 +41,69 @@ class Boxes:
         )  # fmt: skip
 
     def split(self) -> Boxes:
-        """The four quarters of each box, bounds not yet renewed."""
-        n = len(self)
+        """The four quarters of each box, with the bounds of the whole."""
         quarter = self.half_m / 2
-        centres = (self.centres_m[:, None, :] + quarter * CHILDREN).reshape(-1, 2)
-        pairs_of = (4 * self.box[:, None] + np.arange(4)).ravel()
-        sums = np.repeat(self.sums, 4, axis=0)
-        unset = np.zeros(4 * n)
-        return Boxes(centres, quarter, sums, pairs_of, np.repeat(self.ray, 4), unset, unset)
+        return Boxes(
+            (self.centres_m[:, None, :] + quarter * CHILDREN).reshape(-1, 2),
+            quarter,
+            np.repeat(self.sums, 4, axis=0),
+            (4 * self.box[:, None] + np.arange(4)).ravel(),
+            np.repeat(self.ray, 4),
+            np.repeat(self.lower, 4),
+            np.repeat(self.upper, 4),
+        )
+
+    def unbundled(self, rays: Rays) -> Boxes:
+        """The same boxes with each unsettled bundle of `rays` replaced by its children on the next level."""
+        first, last = rays.first_child[self.ray], rays.first_child[self.ray + 1]
+        count = last - first
+        step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        return replace(self, box=np.repeat(self.box, count), ray=np.repeat(first, count) + step)
 
 
-def start_boxes(sectors: Sectors, terrain: Terrain, reach_m: float, across: int) -> Boxes:
-    """A grid of boxes over the square of half side `reach_m`, bounds not yet known."""
-    half = reach_m / across
-    middle = -reach_m + half * (2 * np.arange(across) + 1)
-    x, y = np.meshgrid(middle, middle)
-    centres = np.stack([x.ravel(), y.ravel()], axis=1)
-    centres = centres[_touches_ground(terrain, centres, half)]
-    n, rays = len(centres), len(sectors.evidence)
-    unset = np.zeros(n)
+def whole_area(sectors: Sectors, rays: Rays, reach_m: float) -> Boxes:
+    """One box over the whole square of half side `reach_m`, nothing settled."""
+    n = len(rays.llr)
     return Boxes(
-        centres, half, np.zeros((n, sectors.count)), np.repeat(np.arange(n), rays), np.tile(np.arange(rays), n),
-        unset, unset,
+        np.zeros((1, 2)), reach_m, np.zeros((1, sectors.count)), np.zeros(n, dtype=np.int64), np.arange(n),
+        np.full(1, -np.inf), np.full(1, np.inf),
     )  # fmt: skip
 
 
-def bounded(boxes: Boxes, sectors: Sectors, terrain: Terrain) -> Boxes:
-    """The boxes with the rays that no longer vary settled, and with bounds of the log-likelihood."""
-    evidence = sectors.evidence
+def bounded(boxes: Boxes, sectors: Sectors, rays: Rays, terrain: Terrain) -> Boxes:
+    """The boxes with the bundles that no longer vary settled, and with bounds of the log-likelihood."""
     n, count = len(boxes), sectors.count
     low, high = np.empty(len(boxes.ray)), np.empty(len(boxes.ray))
     for start in range(0, len(boxes.ray), PAIRS_AT_ONCE):
         some = slice(start, start + PAIRS_AT_ONCE)
-        box, ray = boxes.box[some], boxes.ray[some]
-        azimuth, elevation, llr = evidence.azimuth_rad[ray], evidence.elevation_rad[ray], evidence.llr[ray]
-        centres = boxes.centres_m[box]
-        floor, ceiling = terrain.horizon_bounds_rad(centres, np.full(len(box), boxes.half_m), azimuth)
-        sigma = np.hypot(evidence.edge_sigma_rad[ray], terrain.horizon_sigma_rad(centres, azimuth))
-        ends = contribution(llr, elevation, floor, sigma), contribution(llr, elevation, ceiling, sigma)
-        low[some], high[some] = np.minimum(*ends), np.maximum(*ends)
-    key = boxes.box * count + sectors.sector[boxes.ray]
+        centres = boxes.centres_m[boxes.box[some]]
+        half = np.full(len(centres), boxes.half_m)
+        low[some], high[some] = rays.bounds(terrain, centres, half, boxes.ray[some])
+    key = boxes.box * count + rays.sector[boxes.ray]
     settled = high - low < SETTLED
     sums = boxes.sums + _sum_by(key[settled], 0.5 * (low + high)[settled], n, count)
-    open_key = key[~settled]
-    lower = sectors.score(sums + _sum_by(open_key, low[~settled], n, count))
-    upper = sectors.score(sums + _sum_by(open_key, high[~settled], n, count))
-    return Boxes(boxes.centres_m, boxes.half_m, sums, boxes.box[~settled], boxes.ray[~settled], lower, upper)
+    open_ = ~settled
+    lower = sectors.score(sums + _sum_by(key[open_], low[open_], n, count))
+    upper = sectors.score(sums + _sum_by(key[open_], high[open_], n, count))
+    return Boxes(boxes.centres_m, boxes.half_m, sums, boxes.box[open_], boxes.ray[open_], lower, upper)
 
 
-def centre_scores(boxes: Boxes, sectors: Sectors, terrain: Terrain) -> Array:
-    """Log-likelihood (n,) at the boxes' centres."""
-    evidence = sectors.evidence
-    azimuth = evidence.azimuth_rad[boxes.ray]
+def centre_scores(boxes: Boxes, sectors: Sectors, rays: Rays, terrain: Terrain) -> Array:
+    """Log-likelihood (n,) at the boxes' centres; `rays` must be the single rays."""
+    azimuth = rays.azimuth_rad[boxes.ray]
     centres = boxes.centres_m[boxes.box]
     horizon = terrain.horizon_rad(centres, azimuth)
-    sigma = np.hypot(evidence.edge_sigma_rad[boxes.ray], terrain.horizon_sigma_rad(centres, azimuth))
-    value = contribution(evidence.llr[boxes.ray], evidence.elevation_rad[boxes.ray], horizon, sigma)
-    key = boxes.box * sectors.count + sectors.sector[boxes.ray]
+    sigma = np.hypot(rays.sigma_rad[boxes.ray], terrain.horizon_sigma_rad(centres, azimuth))
+    value = contribution(rays.llr[boxes.ray], rays.lowest_rad[boxes.ray], horizon, sigma)
+    key = boxes.box * sectors.count + rays.sector[boxes.ray]
     return sectors.score(boxes.sums + _sum_by(key, value, len(boxes), sectors.count))
 
 
 def on_ground(boxes: Boxes, terrain: Terrain) -> Bools:
-    """Boxes that hold at least one place where the camera can be, judged at corners, edges' middles and centre."""
-    return _touches_ground(terrain, boxes.centres_m, boxes.half_m)
-
-
-def _touches_ground(terrain: Terrain, centres_m: Array, half_m: float) -> Bools:
-    steps = np.linspace(-half_m, half_m, 5)
+    """Boxes (n,) that hold a place where the camera can be, judged on a 5 x 5 grid of points over each."""
+    steps = np.linspace(-boxes.half_m, boxes.half_m, 5)
     x, y = np.meshgrid(steps, steps)
-    points = centres_m[:, None, :] + np.stack([x.ravel(), y.ravel()], axis=1)
+    points = boxes.centres_m[:, None, :] + np.stack([x.ravel(), y.ravel()], axis=1)
     return np.asarray(terrain.allowed(points)).any(axis=1)
 
 

@@ -42,15 +42,27 @@ class Cylinder:
         """Horizon elevation [rad]; pi/2 from inside the wall. See `Terrain`."""
         return np.arctan2(self.wall_m, _distance_to_circle(points_m, azimuths_rad, self.radius_m))
 
-    def horizon_bounds_rad(self, centres_m: Array, half_m: Array, azimuths_rad: Array) -> tuple[Array, Array]:
+    def horizon_bounds_rad(
+        self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
+    ) -> tuple[Array, Array]:
         """Bounds of the horizon over boxes [rad], from circles grown and shrunk by the half diagonal.
 
         A point within r of the centre c sees the circle of radius R no nearer than c sees the one of radius R - r, and
-        no farther than c sees the one of radius R + r.
+        no farther than c sees the one of radius R + r. Over azimuths the distance grows steadily from the side that the
+        point is on to the opposite one.
         """
         reach = np.sqrt(2.0) * np.asarray(half_m)
-        nearest = _distance_to_circle(centres_m, azimuths_rad, self.radius_m - reach)
-        farthest = _distance_to_circle(centres_m, azimuths_rad, self.radius_m + reach)
+        if not np.any(azimuth_half_rad):
+            nearest = _distance_to_circle(centres_m, azimuths_rad, self.radius_m - reach)
+            farthest = _distance_to_circle(centres_m, azimuths_rad, self.radius_m + reach)
+            return np.arctan2(self.wall_m, farthest), np.arctan2(self.wall_m, nearest)
+        x, y = centres_m[..., 0], centres_m[..., 1]
+        turn = np.abs((azimuths_rad - np.arctan2(x, y) + np.pi) % (2 * np.pi) - np.pi)
+        off_centre = np.hypot(x, y)
+        near_side = np.cos(np.maximum(turn - azimuth_half_rad, 0.0))
+        far_side = np.cos(np.minimum(turn + azimuth_half_rad, np.pi))
+        nearest = _chord(off_centre * near_side, off_centre, self.radius_m - reach)
+        farthest = _chord(off_centre * far_side, off_centre, self.radius_m + reach)
         return np.arctan2(self.wall_m, farthest), np.arctan2(self.wall_m, nearest)
 
     def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
@@ -70,8 +82,12 @@ def _distance_to_circle(points_m: Array, azimuths_rad: Array, radius_m: Array | 
     """Distance from p along the azimuth to the far side of the origin's circle; 0 where there is none ahead."""
     points_m = np.asarray(points_m, dtype=np.float64)
     x, y = points_m[..., 0], points_m[..., 1]
-    along = x * np.sin(azimuths_rad) + y * np.cos(azimuths_rad)
-    inner = np.square(np.maximum(radius_m, 0.0)) - x * x - y * y
-    root = np.sqrt(np.maximum(along * along + inner, 0.0))
+    return _chord(x * np.sin(azimuths_rad) + y * np.cos(azimuths_rad), np.hypot(x, y), radius_m)
+
+
+def _chord(along_m: Array, off_centre_m: Array, radius_m: Array | float) -> Array:
+    """Distance to the circle ahead of a point `off_centre_m` from its middle, `along_m` of it in the direction looked."""
+    inner = np.square(np.maximum(radius_m, 0.0)) - np.square(off_centre_m)
+    root = np.sqrt(np.maximum(np.square(along_m) + inner, 0.0))
     # Outside the circle (inner < 0) the rim no longer surrounds the point: the wall is overhead, at distance 0.
-    return np.where(inner > 0, np.maximum(root - along, 0.0), 0.0)
+    return np.where(inner > 0, np.maximum(root - along_m, 0.0), 0.0)

@@ -25,8 +25,13 @@ class Terrain(Protocol):
         """Horizon elevation (n,) seen from the points (n, 2) at the azimuths (n,)."""
         ...
 
-    def horizon_bounds_rad(self, centres_m: Array, half_m: Array, azimuths_rad: Array) -> tuple[Array, Array]:
-        """Bounds (n,), (n,) that hold the horizon at every allowed point of the boxes |dx|, |dy| <= half (n,)."""
+    def horizon_bounds_rad(
+        self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
+    ) -> tuple[Array, Array]:
+        """Bounds (n,), (n,) that hold the horizon at every allowed point of the boxes |dx|, |dy| <= half (n,).
+
+        And at every azimuth within `azimuth_half_rad` of the given ones.
+        """
         ...
 
     def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:

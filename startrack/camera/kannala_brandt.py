@@ -9,7 +9,8 @@ import numpy as np
 
 from startrack.types import Array
 
-NEWTON_STEPS = 12
+MOST_STEPS = 60  # near the turning point Newton's steps only halve the error
+ROUNDING_RAD = 1e-15
 TURNING_SEARCH_RAD = np.pi
 
 
@@ -60,7 +61,7 @@ class KannalaBrandt:
         low = np.zeros_like(rho)
         high = np.full_like(rho, top)
         a = np.clip(rho, 0.0, top)
-        for _ in range(NEWTON_STEPS):
+        for _ in range(MOST_STEPS):
             miss = self.rho(a) - rho
             low = np.where(miss < 0, a, low)
             high = np.where(miss < 0, high, a)
@@ -68,5 +69,9 @@ class KannalaBrandt:
             step = np.divide(miss, slope, out=np.full_like(miss, np.inf), where=slope > 0)
             newton = a - step
             # A step that leaves the bracket is replaced by bisection, so the polynomial's shape cannot mislead it.
-            a = np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+            moved = np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+            settled = (np.abs(moved - a) <= ROUNDING_RAD) | (np.abs(miss) <= ROUNDING_RAD)
+            a = moved
+            if np.all(settled):
+                break
         return a

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,6 +16,12 @@ from startrack.paths import resolve_named
 from startrack.types import BadInput
 
 FORMAT = 1
+KEYS = {
+    "format", "name", "model", "size_px", "focal_px", "centre_px", "k", "max_angle_deg", "calibrated_angle_deg",
+    "mirrored", "mount", "sensor", "covariance",
+}  # fmt: skip
+KINDS = {str: "text", bool: "truth value (true or false)", list: "list", dict: "table"}
+T = TypeVar("T")
 
 
 def load_camera(name_or_path: str | Path) -> Camera:
@@ -43,28 +49,25 @@ def camera_from_dict(d: dict[str, Any], default_name: str = "camera") -> Camera:
     """The camera of a camera file's keys. Raises BadInput bad_calibration naming the key that is wrong."""
     if d.get("format", FORMAT) != FORMAT:
         raise BadInput("bad_calibration", f"format {d['format']!r} is not known; this version reads format {FORMAT}")
+    _refuse_misspelt(d)
     focal = tuple(_numbers(d, "focal_px", 2))
     width, height = _numbers(d, "size_px", 2)
     if min(focal) <= 0 or min(width, height) < 1 or width % 1 or height % 1:
         raise BadInput("bad_calibration", "focal_px must be positive and size_px positive whole numbers")
     lens = _lens(d)
-    max_angle = np.radians(_number(d, "max_angle_deg"))
-    if not 0 < max_angle <= np.pi or max_angle > lens.max_invertible_rad + 1e-9:
-        limit = np.degrees(lens.max_invertible_rad)
-        raise BadInput("bad_calibration", f"max_angle_deg: the lens polynomial only rises to {limit:.2f} degrees")
-    calibrated = np.radians(_number(d, "calibrated_angle_deg", np.degrees(max_angle)))
-    order, covariance = _covariance(d.get("covariance"))
+    max_angle, calibrated = _angles(d, lens)
+    order, covariance = _covariance(_table(d, "covariance"))
     return Camera(
-        name=str(d.get("name", default_name)),
+        name=_typed(d, "name", str, default_name),
         size_px=(int(width), int(height)),
         focal_px=(focal[0], focal[1]),
         centre_px=tuple(_numbers(d, "centre_px", 2)),  # type: ignore[arg-type]
-        max_angle_rad=float(max_angle),
-        calibrated_angle_rad=float(min(calibrated, max_angle)),
+        max_angle_rad=max_angle,
+        calibrated_angle_rad=calibrated,
         lens=lens,
-        mirrored=bool(d.get("mirrored", False)),
-        R_body_cam=_mount(d.get("mount", {})),
-        sensor=_sensor(d["sensor"]) if "sensor" in d else None,
+        mirrored=_typed(d, "mirrored", bool, False),
+        R_body_cam=_mount(_table(d, "mount")),
+        sensor=_sensor(_table(d, "sensor")) if "sensor" in d else None,
         covariance_order=order,
         covariance=covariance,
     )
@@ -118,10 +121,27 @@ def _sensor(d: dict[str, Any]) -> Sensor:
         values["vignetting"] = tuple(_numbers(d, "vignetting", 2))
     if "zero_point_e_per_s" not in values:
         raise BadInput("bad_calibration", "[sensor] needs zero_point_e_per_s")
-    sensor = Sensor(**values)
-    if min(sensor.zero_point_e_per_s, sensor.gain_e_per_adu, sensor.psf_sigma_px, sensor.saturation_adu) <= 0:
-        raise BadInput("bad_calibration", "[sensor] zero point, gain, saturation and PSF must be positive")
-    return sensor
+    for key in ("zero_point_e_per_s", "gain_e_per_adu", "psf_sigma_px", "saturation_adu"):
+        if values.get(key, 1.0) <= 0:
+            raise BadInput("bad_calibration", f"[sensor] {key} must be positive, not {values[key]:g}")
+    for key in ("read_noise_e", "dark_e_per_s"):
+        if values.get(key, 0.0) < 0:
+            raise BadInput("bad_calibration", f"[sensor] {key} must not be negative")
+    return Sensor(**values)
+
+
+def _angles(d: dict[str, Any], lens: Lens) -> tuple[float, float]:
+    """max_angle and calibrated_angle [rad]."""
+    max_angle = np.radians(_number(d, "max_angle_deg"))
+    if not 0 < max_angle <= np.pi:
+        raise BadInput("bad_calibration", f"max_angle_deg must be between 0 and 180, not {d['max_angle_deg']!r}")
+    if max_angle > lens.max_invertible_rad + 1e-9:
+        limit = np.degrees(lens.max_invertible_rad)
+        raise BadInput("bad_calibration", f"max_angle_deg: the lens polynomial only rises to {limit:.2f} degrees")
+    calibrated = np.radians(_number(d, "calibrated_angle_deg", np.degrees(max_angle)))
+    if calibrated <= 0:
+        raise BadInput("bad_calibration", f"calibrated_angle_deg must be positive, not {d['calibrated_angle_deg']!r}")
+    return float(max_angle), float(min(calibrated, max_angle))
 
 
 def _mount(d: dict[str, Any]) -> np.ndarray:
@@ -133,17 +153,39 @@ def _mount(d: dict[str, Any]) -> np.ndarray:
     return R_from_quat_xyzw(q)
 
 
-def _covariance(d: dict[str, Any] | None) -> tuple[tuple[str, ...], np.ndarray | None]:
+def _covariance(d: dict[str, Any]) -> tuple[tuple[str, ...], np.ndarray | None]:
     if not d:
         return (), None
-    order = tuple(str(name) for name in d.get("order", ()))
+    order = tuple(str(name) for name in _typed(d, "order", list, []))
     try:
         matrix = np.array(d.get("matrix"), dtype=np.float64)
     except (TypeError, ValueError) as cause:
         raise BadInput("bad_calibration", "[covariance] matrix is not a matrix of numbers") from cause
-    if matrix.shape != (len(order), len(order)):
-        raise BadInput("bad_calibration", f"[covariance] matrix is {matrix.shape} for {len(order)} parameters")
+    if matrix.shape != (len(order), len(order)) or not np.isfinite(matrix).all():
+        raise BadInput(
+            "bad_calibration", f"[covariance] matrix must hold {len(order)} x {len(order)} numbers, as its order says"
+        )
     return order, matrix
+
+
+def _refuse_misspelt(d: dict[str, Any]) -> None:
+    """Other programs' keys are ignored; what is almost one of ours is a slip that must not pass in silence."""
+    from difflib import get_close_matches
+
+    for key in sorted(set(d) - KEYS):
+        if meant := get_close_matches(key.lower(), KEYS, n=1, cutoff=0.8):
+            raise BadInput("bad_calibration", f"{key} is not a key of camera files: is {meant[0]} meant?")
+
+
+def _typed(d: dict[str, Any], key: str, kind: type[T], default: T) -> T:
+    value = d.get(key, default)
+    if not isinstance(value, kind):
+        raise BadInput("bad_calibration", f"{key} must be a {KINDS[kind]}, not {value!r}")
+    return value
+
+
+def _table(d: dict[str, Any], key: str) -> dict[str, Any]:
+    return _typed(d, key, dict, {})
 
 
 def _number(d: dict[str, Any], key: str, default: float | None = None) -> float:

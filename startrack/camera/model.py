@@ -25,7 +25,7 @@ class Lens(Protocol):
     def angle_rad(self, rho: Array) -> Array: ...
 
 
-# Body x (forward) = image top = -cam y, body y (left) = +cam x, body z (up) = +cam z: a camera that looks at the zenith.
+# Body x (forward) = image top = -cam y, body y (left) = +cam x, body z (up) = +cam z: it looks at the zenith.
 ZENITH_MOUNT_R_BODY_CAM = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -52,7 +52,7 @@ class Sensor:
 class Camera:
     """x_px = cx + fx rho(a) cos b, y_px = cy + fy rho(a) sin b, b = atan2(y_cam, x_cam); mirrored: x_px = cx - ...
 
-    Pixel (0, 0) is the centre of the top-left pixel. Works on rays throughout, so z_cam <= 0 (past 90 degrees) is legal.
+    Pixel (0, 0) is the centre of the top-left pixel. Works on rays throughout: z_cam <= 0 (past 90 degrees) is legal.
     """
 
     name: str
@@ -84,7 +84,7 @@ class Camera:
         fx, fy = self._handed_focal_px
         px = np.stack([self.centre_px[0] + fx * scale * x, self.centre_px[1] + fy * scale * y], axis=-1)
         width, height = self.size_px
-        within = (px[..., 0] >= -0.5) & (px[..., 0] <= width - 0.5) & (px[..., 1] >= -0.5) & (px[..., 1] <= height - 0.5)
+        within = np.all((px >= -0.5) & (px <= np.array([width, height]) - 0.5), axis=-1)
         return px, imaged & within
 
     def unproject(self, px: Array) -> Array:

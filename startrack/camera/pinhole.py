@@ -8,6 +8,8 @@ import numpy as np
 
 from startrack.types import Array
 
+STEEPEST_RAD = 1.57  # 89.95 degrees: beyond this the tangent is no radius
+
 
 @dataclass(frozen=True)
 class Pinhole:
@@ -15,16 +17,16 @@ class Pinhole:
 
     model: str = field(default="pinhole", init=False)
     k: tuple[float, ...] = field(default=(), init=False)
-    max_invertible_rad: float = field(default=np.pi / 2, init=False)
+    max_invertible_rad: float = field(default=STEEPEST_RAD, init=False)
 
     def rho(self, angle_rad: Array) -> Array:
-        """Radius [focal lengths] at the angles off the axis [rad]; infinite from 90 degrees on."""
+        """Radius [focal lengths] at the angles off the axis [rad]; infinite beyond STEEPEST_RAD."""
         a = np.asarray(angle_rad, dtype=np.float64)
-        return np.where(a < self.max_invertible_rad, np.tan(np.minimum(a, 1.57)), np.inf)
+        return np.where(a <= STEEPEST_RAD, np.tan(np.minimum(a, STEEPEST_RAD)), np.inf)
 
     def slope(self, angle_rad: Array) -> Array:
         """d rho / d angle [1/rad]."""
-        return 1.0 / np.square(np.cos(np.minimum(angle_rad, 1.57)))
+        return 1.0 / np.square(np.cos(np.minimum(angle_rad, STEEPEST_RAD)))
 
     def angle_rad(self, rho: Array) -> Array:
         """Angle off the axis [rad] at the radii [focal lengths]."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from startrack.camera import Camera
 from startrack.detect.background import background_and_noise, local_level
-from startrack.detect.fit import PointFits, fit_points, fit_widths, radius_for, stamps
+from startrack.detect.fit import PointFits, fit_points, fit_widths, psf_misfit, radius_for, stamps
 from startrack.psf import filter_kernel, pixel_profile
 from startrack.types import Bools, Detections, Exposure, Ints, TooFewStars
 
@@ -18,6 +18,10 @@ Image = NDArray[np.float32]
 FIRST_PASS_SNR = 4.3  # below the final threshold: a star between pixels shows up to 15 % less in the filtered image
 FIT_ROUNDS = 2
 BAD_FIT_CHI2_PER_DOF = 4.0
+ROUGH_PSF_MISFIT = 0.1  # from here up the frame's own stars, not the Gaussian, say what a star looks like
+ROUGH_PSF_SPREAD = 2.0  # times the typical misfit that a star of such a frame may have
+BRIGHT_SNR = 12.0  # sources that say what the frame's PSF is
+FEWEST_BRIGHT = 8
 WIDTHS_PX = np.geomspace(0.3, 8.0, 45)
 UNKNOWN_WIDTH_PX = 1.2  # first guess where the camera file does not tell
 WIDTH_TOLERANCE = 0.12  # measured PSF differing by more than this fraction from the expected one is used instead
@@ -48,7 +52,7 @@ class Detector:
         if measured is not None and abs(np.log(measured / sigma)) > WIDTH_TOLERANCE:
             sigma = measured
             centres, fits = self._measure(frame, sigma)
-        good = _is_star(fits, self.threshold_snr)
+        good = _is_star(fits, self.threshold_snr, _misfit(frame, centres, fits, sigma))
         if not good.any():
             raise TooFewStars("no point source stands above the noise: was the lens cap on, or the exposure too short?")
         return _detections(frame, fits, good, sigma, background, noise)
@@ -145,15 +149,30 @@ def _model_image(shape: tuple[int, ...], centres: Ints, fits: PointFits, sigma: 
     return np.bincount(flat, weights=light.ravel(), minlength=shape[0] * shape[1]).reshape(shape).astype(np.float32)
 
 
-def _is_star(fits: PointFits, threshold_snr: float) -> Bools:
-    """Sources that stand above the threshold, look like the PSF, and not rather like a hot pixel or a track."""
+def _is_star(fits: PointFits, threshold_snr: float, misfit: NDArray[np.float64]) -> Bools:
+    """Sources that stand above the threshold, look like the PSF, and not rather like a hot pixel or a track.
+
+    Where the bright sources of the frame all differ from the Gaussian (trails, coma, a real lens), no bright star would
+    pass by its chi^2; there a source passes whose `misfit` (n,) is like theirs.
+    """
     snr = fits.flux / np.sqrt(fits.covariance[:, 2, 2])
+    point = fits.chi2 < fits.chi2_pixel
+    bright = point & (snr > BRIGHT_SNR)
+    typical = float(np.median(misfit[bright])) if np.count_nonzero(bright) >= FEWEST_BRIGHT else 0.0
+    like_the_others = misfit < (ROUGH_PSF_SPREAD * typical if typical > ROUGH_PSF_MISFIT else 0.0)
     return (
         (snr >= threshold_snr)
-        & (fits.chi2 < BAD_FIT_CHI2_PER_DOF * fits.dof)
-        & (fits.chi2 < fits.chi2_pixel)
+        & ((fits.chi2 < BAD_FIT_CHI2_PER_DOF * fits.dof) | like_the_others)
+        & point
         & (np.sqrt(fits.covariance[:, 0, 0] + fits.covariance[:, 1, 1]) < 2.0)
     )
+
+
+def _misfit(frame: _Frame, centres: Ints, fits: PointFits, sigma: float) -> NDArray[np.float64]:
+    radius = radius_for(sigma)
+    data, noise = stamps(frame.residual, centres, radius), stamps(frame.noise, centres, radius)
+    usable = ~stamps(frame.dead, centres, radius).astype(bool)
+    return psf_misfit(data, np.square(noise), usable, centres, fits, sigma, frame.shot)
 
 
 def _measured_width(frame: _Frame, centres: Ints, fits: PointFits, sigma: float) -> float | None:
@@ -161,8 +180,8 @@ def _measured_width(frame: _Frame, centres: Ints, fits: PointFits, sigma: float)
     snr = fits.flux / np.sqrt(fits.covariance[:, 2, 2])
     radius = radius_for(sigma)
     whole = ~stamps(frame.dead, centres, radius).any(axis=(1, 2))
-    bright = np.flatnonzero((snr > 12) & whole)[:600]
-    if len(bright) < 8:
+    bright = np.flatnonzero((snr > BRIGHT_SNR) & whole)[:600]
+    if len(bright) < FEWEST_BRIGHT:
         return None
     pixels = centres[bright]
     data, noise = stamps(frame.residual, pixels, radius), stamps(frame.noise, pixels, radius)
@@ -170,7 +189,7 @@ def _measured_width(frame: _Frame, centres: Ints, fits: PointFits, sigma: float)
     variance = np.square(noise) + (np.maximum(data, 0.0) if frame.shot else 0.0)
     widths = fit_widths(data, variance, np.ones(data.shape, bool), subset, pixels, WIDTHS_PX)
     wider_than_a_pixel = widths[widths > 0.45]  # hot pixels fit the narrowest profile
-    if len(wider_than_a_pixel) < 8:
+    if len(wider_than_a_pixel) < FEWEST_BRIGHT:
         return None
     return float(np.median(wider_than_a_pixel))
 

@@ -1,0 +1,153 @@
+"""The house's rule of imports: strictly downward, stages side by side do not know each other; and a light start."""
+
+import ast
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import startrack
+
+ROOT = Path(startrack.__file__).parent
+
+LAYERS = (  # lowest first; a room imports from lower layers only
+    {"types"},
+    {"paths", "frames"},
+    {"psf", "body_angles", "catalog", "bodies", "camera", "terrain", "exposure"},
+    {"render", "detect", "identify", "orient", "evidence", "localize", "consistency"},
+    {"pipeline"},
+    {"report"},
+    {"cli"},
+)
+# Rooms of one layer that may know each other all the same: identification refines the attitude, and the last check
+# reads what the evidence stage measured.
+ALLOWED = {("identify", "orient"), ("consistency", "evidence")}
+HEAVY = (
+    "astropy", "cv2", "lunarsky", "matplotlib", "PIL", "rich", "scipy", "skimage", "skyfield", "spiceypy", "tifffile",
+)  # fmt: skip
+CV2_ROOMS = {"detect", "evidence", "exposure", "report"}  # image processing, where cv2 is the room's own tool
+
+
+def room_of(path: Path) -> str:
+    return path.relative_to(ROOT).parts[0].removesuffix(".py")
+
+
+def rooms() -> set[str]:
+    return {room_of(path) for path in ROOT.rglob("*.py")} - {"__init__", "data", "__pycache__"}
+
+
+def layer(room: str) -> int:
+    return next(k for k, names in enumerate(LAYERS) if room in names)
+
+
+def imported(tree: ast.AST, package: tuple[str, ...]) -> Iterator[str]:
+    """Dotted names of all modules that a source imports, wherever it does; `package` resolves relative ones."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = ".".join(package[: len(package) - node.level + 1]) if node.level else ""
+            module = ".".join(part for part in (base, node.module) if part)
+            yield from (f"{module}.{alias.name}" for alias in node.names)
+
+
+def edges() -> list[tuple[Path, str, str]]:
+    """(file, its room, room it imports) for every import between rooms."""
+    found = []
+    for path in sorted(ROOT.rglob("*.py")):
+        package = ("startrack", *path.relative_to(ROOT).parent.parts)
+        for name in imported(ast.parse(path.read_text(encoding="utf-8")), package):
+            parts = name.split(".")
+            if parts[0] == "startrack" and len(parts) > 1 and parts[1] in rooms() and parts[1] != room_of(path):
+                found.append((path, room_of(path), parts[1]))
+    return found
+
+
+def violations(found: list[tuple[Path, str, str]]) -> list[str]:
+    return [
+        f"{path.relative_to(ROOT)}: {room} imports {other}"
+        for path, room, other in found
+        if layer(other) >= layer(room) and (room, other) not in ALLOWED
+    ]
+
+
+def test_every_room_has_its_layer():
+    placed = [room for names in LAYERS for room in names]
+    assert sorted(placed) == sorted(set(placed))
+    assert rooms() <= set(placed), f"give a layer to {rooms() - set(placed)}"
+    assert set(placed) <= rooms(), f"no such room: {set(placed) - rooms()}"
+
+
+def test_imports_run_strictly_downward():
+    found = edges()
+    assert len(found) > 100  # the reading of the sources works
+    assert violations(found) == []
+
+
+def test_each_exception_is_still_needed():
+    used = {(room, other) for _, room, other in edges()}
+    assert used >= ALLOWED
+
+
+@pytest.mark.parametrize(
+    ("source", "room", "other"),
+    [
+        ("from startrack.report import summary", "detect", "report"),
+        ("import startrack.identify.match", "detect", "identify"),
+        ("def f():\n    from startrack import pipeline", "camera", "pipeline"),
+        ("from ..cli import common", "evidence", "cli"),
+    ],
+)
+def test_the_check_sees_every_way_to_import(source, room, other):
+    names = [name.split(".")[1] for name in imported(ast.parse(source), ("startrack", room))]
+    assert names == [other]
+    assert violations([(ROOT / room / "x.py", room, other)]) != []
+
+
+def test_nobody_reads_the_truth_but_the_renderer():
+    """The truth beside a rendered image is for tests and scorers: no stage knows of it."""
+    truth = re.compile(r"\bTruth\b|\.truth\b")
+    readers = {room_of(path) for path in ROOT.rglob("*.py") if truth.search(path.read_text(encoding="utf-8"))}
+    assert readers <= {"render", "cli"}
+
+
+def top_level_imports(path: Path) -> set[str]:
+    """Modules that are loaded as soon as the file is imported (not within a function or under TYPE_CHECKING)."""
+    body = ast.parse(path.read_text(encoding="utf-8")).body
+    now = ast.Module([node for node in body if isinstance(node, ast.Import | ast.ImportFrom)], type_ignores=[])
+    return {name.split(".")[0] for name in imported(now, ("startrack", *path.relative_to(ROOT).parent.parts))}
+
+
+def test_heavy_modules_are_imported_where_they_are_used():
+    found = {
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in ROOT.rglob("*.py")
+        for name in top_level_imports(path) & set(HEAVY)
+        if not (name == "cv2" and room_of(path) in CV2_ROOMS)
+    }
+    assert found == set()
+
+
+LOADED = "import sys, json; print(json.dumps(sorted({name.split('.')[0] for name in sys.modules})))"
+
+
+def loaded_after(code: str) -> set[str]:
+    run = subprocess.run([sys.executable, "-c", f"{code}\n{LOADED}"], capture_output=True, text=True, check=True)
+    return set(json.loads(run.stdout.splitlines()[-1]))
+
+
+def test_help_is_printed_without_any_heavy_module():
+    code = "from startrack.cli.main import main\ntry:\n    main(['locate', '--help'])\nexcept SystemExit:\n    pass"
+    loaded = loaded_after(code)
+    assert "startrack" in loaded
+    assert loaded & set(HEAVY) == set()
+
+
+def test_the_library_is_imported_without_the_slow_ones():
+    """The pipeline computes with numpy, scipy and cv2; ephemerides, FITS, plots and progress bars can wait."""
+    loaded = loaded_after("import startrack.pipeline, startrack.report")
+    assert loaded & (set(HEAVY) - {"cv2", "scipy"}) == set()

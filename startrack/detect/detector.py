@@ -16,7 +16,10 @@ from startrack.types import Bools, Detections, Exposure, Ints, TooFewStars
 
 Image = NDArray[np.float32]
 FIRST_PASS_SNR = 4.3  # below the final threshold: a star between pixels shows up to 15 % less in the filtered image
-FIT_ROUNDS = 2
+NARROW_PX = 1.25
+OWN_LEVEL_PART = 0.8  # of the threshold that a source must reach when its own stamp alone defines the background
+NEIGHBOUR_SIGMA = 0.1  # neighbours' light above this part of a pixel's noise is taken away in a second fit
+NEIGHBOUR_ERROR = 0.1  # of it is not known: neighbours' fits, and the PSF's wings
 BAD_FIT_CHI2_PER_DOF = 4.0
 ROUGH_PSF_MISFIT = 0.1  # from here up the frame's own stars, not the Gaussian, say what a star looks like
 ROUGH_PSF_SPREAD = 2.0  # times the typical misfit that a star of such a frame may have
@@ -26,13 +29,14 @@ WIDTHS_PX = np.geomspace(0.3, 8.0, 45)
 UNKNOWN_WIDTH_PX = 1.2  # first guess where the camera file does not tell
 WIDTH_TOLERANCE = 0.12  # measured PSF differing by more than this fraction from the expected one is used instead
 SATURATED_FRACTION = 0.98
+NOTHING_SEEN = "no point source stands above the noise: was the lens cap on, or the exposure too short?"
 
 
 @dataclass(frozen=True)
 class Detector:
     """Detects point sources: Exposure -> Detections."""
 
-    threshold_snr: float = 5.0
+    threshold_snr: float = 5.0  # against the background's noise; a little more for narrow PSFs
     max_candidates: int = 30000  # a frame with more peaks is noise, a bright day or a defect: the brightest are kept
 
     def __call__(self, exposure: Exposure, camera: Camera | None = None) -> Detections:
@@ -52,16 +56,17 @@ class Detector:
         if measured is not None and abs(np.log(measured / sigma)) > WIDTH_TOLERANCE:
             sigma = measured
             centres, fits = self._measure(frame, sigma)
-        good = _is_star(fits, self.threshold_snr, _misfit(frame, centres, fits, sigma))
+        good = _is_star(fits, _threshold(self.threshold_snr, sigma), _misfit(frame, centres, fits, sigma))
         if not good.any():
-            raise TooFewStars("no point source stands above the noise: was the lens cap on, or the exposure too short?")
+            raise TooFewStars(NOTHING_SEEN)
         return _detections(frame, fits, good, sigma, background, noise)
 
     def _measure(self, frame: _Frame, sigma: float) -> tuple[Ints, PointFits]:
-        centres = _peaks(frame, sigma, self.max_candidates)
+        level = local_level(frame.residual, frame.noise, 2 * (4 * radius_for(sigma) // 2) + 1)
+        centres = _peaks(frame, level, sigma, self.max_candidates)
         if not len(centres):
-            raise TooFewStars("no point source stands above the noise: was the lens cap on, or the exposure too short?")
-        return centres, _fit_all(frame, centres, sigma)
+            raise TooFewStars(NOTHING_SEEN)
+        return centres, _fit_all(frame, centres, level, sigma)
 
 
 @dataclass(frozen=True)
@@ -83,10 +88,9 @@ def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray
     return (pixels - np.float32(sensor.bias_adu)) * np.float32(sensor.gain_e_per_adu), saturated
 
 
-def _peaks(frame: _Frame, sigma: float, most: int) -> Ints:
+def _peaks(frame: _Frame, level: Image, sigma: float, most: int) -> Ints:
     """Integer pixels (n, 2) (x, y) of the local maxima of the matched-filter SNR, brightest first."""
     kernel = filter_kernel(sigma)
-    level = local_level(frame.residual, frame.noise, 2 * (4 * radius_for(sigma) // 2) + 1)
     filtered = cv2.sepFilter2D(frame.residual - level, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT)
     snr = filtered / (frame.noise * np.float32(np.sum(kernel**2)))
     top = cv2.dilate(snr, np.ones((3, 3), np.uint8))
@@ -113,23 +117,31 @@ def _saturated_blobs(dead: NDArray[np.bool_], margin: int) -> Ints:
     return middle[inside & compact]
 
 
-def _fit_all(frame: _Frame, centres: Ints, sigma: float) -> PointFits:
+def _fit_all(frame: _Frame, centres: Ints, level: Image, sigma: float) -> PointFits:
     """Fits of all candidates, each with its neighbours' light subtracted."""
     radius = radius_for(sigma)
     variance = np.square(stamps(frame.noise, centres, radius))
     usable = ~stamps(frame.dead, centres, radius).astype(bool)
     data = stamps(frame.residual, centres, radius)
-    start = centres.astype(np.float64)
-    fits = fit_points(data, variance, usable, centres, start, sigma, frame.shot)
-    for _ in range(FIT_ROUNDS - 1):
-        model = _model_image(frame.residual.shape, centres, fits, sigma, radius)
-        own = _own_light(centres, fits, sigma, radius)
-        others = stamps(model, centres, radius) - own
-        # Neighbours' light is known to a few per cent only.
-        fits = fit_points(
-            data - others, variance + np.square(0.1 * others), usable, centres, fits.xy_px, sigma, frame.shot
-        )
-    return fits
+    surround = level[centres[:, 1], centres[:, 0]].astype(np.float64)
+    fits = fit_points(data, variance, usable, centres, centres.astype(np.float64), surround, sigma, frame.shot)
+    model = _model_image(frame.residual.shape, centres, fits, sigma, radius)
+    others = stamps(model, centres, radius) - _own_light(centres, fits, sigma, radius)
+    crowded = np.flatnonzero((others > NEIGHBOUR_SIGMA * np.sqrt(variance)).any(axis=(1, 2)))
+    if not len(crowded):
+        return fits
+    others = others[crowded]
+    again = fit_points(
+        data[crowded] - others,
+        variance[crowded] + np.square(NEIGHBOUR_ERROR * others),
+        usable[crowded],
+        centres[crowded],
+        fits.xy_px[crowded],
+        surround[crowded],
+        sigma,
+        frame.shot,
+    )
+    return fits.replaced(crowded, again)
 
 
 def _own_light(centres: Ints, fits: PointFits, sigma: float, radius: int) -> NDArray[np.float64]:
@@ -149,19 +161,29 @@ def _model_image(shape: tuple[int, ...], centres: Ints, fits: PointFits, sigma: 
     return np.bincount(flat, weights=light.ravel(), minlength=shape[0] * shape[1]).reshape(shape).astype(np.float32)
 
 
+def _threshold(threshold_snr: float, sigma_px: float) -> float:
+    """Significance that gives a narrow PSF no more false peaks than one of NARROW_PX.
+
+    Noise has about sigma^-4 as many peaks above a given height (measured: 7, 2.5 and 0.25 above 5 in 4 Mpx at sigma
+    0.7, 1.0 and 1.5 px), and their number falls as exp(-height^2 / 2).
+    """
+    return float(np.sqrt(threshold_snr**2 + max(8 * np.log(NARROW_PX / sigma_px), 0.0)))
+
+
 def _is_star(fits: PointFits, threshold_snr: float, misfit: NDArray[np.float64]) -> Bools:
     """Sources that stand above the threshold, look like the PSF, and not rather like a hot pixel or a track.
 
     Where the bright sources of the frame all differ from the Gaussian (trails, coma, a real lens), no bright star would
     pass by its chi^2; there a source passes whose `misfit` (n,) is like theirs.
     """
-    snr = fits.flux / np.sqrt(fits.covariance[:, 2, 2])
     point = fits.chi2 < fits.chi2_pixel
-    bright = point & (snr > BRIGHT_SNR)
+    bright = point & (fits.snr > BRIGHT_SNR)
     typical = float(np.median(misfit[bright])) if np.count_nonzero(bright) >= FEWEST_BRIGHT else 0.0
     like_the_others = misfit < (ROUGH_PSF_SPREAD * typical if typical > ROUGH_PSF_MISFIT else 0.0)
     return (
-        (snr >= threshold_snr)
+        (fits.significance >= threshold_snr)
+        # On a slope or at the skyline the surroundings do not tell the level; there the stamp must tell by itself.
+        & (fits.flux >= OWN_LEVEL_PART * threshold_snr * np.sqrt(fits.covariance[:, 2, 2]))
         & ((fits.chi2 < BAD_FIT_CHI2_PER_DOF * fits.dof) | like_the_others)
         & point
         & (np.sqrt(fits.covariance[:, 0, 0] + fits.covariance[:, 1, 1]) < 2.0)
@@ -177,17 +199,15 @@ def _misfit(frame: _Frame, centres: Ints, fits: PointFits, sigma: float) -> NDAr
 
 def _measured_width(frame: _Frame, centres: Ints, fits: PointFits, sigma: float) -> float | None:
     """Typical PSF sigma [px] of the bright sources; None where there are too few to tell."""
-    snr = fits.flux / np.sqrt(fits.covariance[:, 2, 2])
     radius = radius_for(sigma)
     whole = ~stamps(frame.dead, centres, radius).any(axis=(1, 2))
-    bright = np.flatnonzero((snr > BRIGHT_SNR) & whole)[:600]
+    bright = np.flatnonzero((fits.snr > BRIGHT_SNR) & whole)[:600]
     if len(bright) < FEWEST_BRIGHT:
         return None
     pixels = centres[bright]
     data, noise = stamps(frame.residual, pixels, radius), stamps(frame.noise, pixels, radius)
-    subset = PointFits(**{name: getattr(fits, name)[bright] for name in PointFits.__dataclass_fields__})
     variance = np.square(noise) + (np.maximum(data, 0.0) if frame.shot else 0.0)
-    widths = fit_widths(data, variance, np.ones(data.shape, bool), subset, pixels, WIDTHS_PX)
+    widths = fit_widths(data, variance, np.ones(data.shape, bool), fits.take(bright), pixels, WIDTHS_PX)
     wider_than_a_pixel = widths[widths > 0.45]  # hot pixels fit the narrowest profile
     if len(wider_than_a_pixel) < FEWEST_BRIGHT:
         return None
@@ -209,7 +229,7 @@ def _detections(
         covariance_px2=fits.covariance[keep][:, :2, :2],
         flux_e=fits.flux[keep],
         flux_sigma_e=flux_sigma[keep],
-        snr=fits.flux[keep] / flux_sigma[keep],
+        snr=fits.snr[keep],
         saturated=near[keep],
         psf_sigma_px=sigma,
         background_e=background,

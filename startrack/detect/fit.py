@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,19 @@ class PointFits:
     chi2: Array  # (n,) of the point source
     chi2_pixel: Array  # (n,) of a single bright pixel instead
     dof: Array  # (n,)
+    significance: Array  # (n,) matched-filter SNR of the light against nothing but background noise
+    snr: Array  # (n,) matched-filter SNR, the source's own photon noise included
+
+    def take(self, which: Ints) -> PointFits:
+        """The fits selected by indices."""
+        return PointFits(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
+
+    def replaced(self, which: Ints, others: PointFits) -> PointFits:
+        """These fits with those at the indices exchanged for the `others`."""
+        values = {f.name: getattr(self, f.name).copy() for f in fields(self)}
+        for name, value in values.items():
+            value[which] = getattr(others, name)
+        return PointFits(**values)
 
 
 def stamps(image: NDArray[np.float32], centres: Ints, radius: int) -> Array:
@@ -36,13 +49,21 @@ def stamps(image: NDArray[np.float32], centres: Ints, radius: int) -> Array:
 
 
 def fit_points(
-    data: Array, variance: Array, usable: Bools, centres: Ints, start_xy_px: Array, sigma_px: float, shot: bool
+    data: Array,
+    variance: Array,
+    usable: Bools,
+    centres: Ints,
+    start_xy_px: Array,
+    surround: Array,
+    sigma_px: float,
+    shot: bool,
 ) -> PointFits:
     """Position, flux and local level of one point source in each stamp.
 
-    `data`, `variance`, `usable` are stamps (n, s, s) around the pixels `centres` (n, 2). With `shot`, the source's own
-    photon noise (flux in electrons) is added to the variance; a model error of a few per cent always is. Gauss-Newton
-    on the pixel-integrated Gaussian; steps are limited to half a pixel, so a hopeless source stays near where it was.
+    `data`, `variance`, `usable` are stamps (n, s, s) around the pixels `centres` (n, 2); `surround` (n,) is the level
+    of the wider surroundings, which only the significance relies on. With `shot`, the source's own photon noise (flux
+    in electrons) is added to the variance; a model error of a few per cent always is. Gauss-Newton on the
+    pixel-integrated Gaussian; steps are limited to half a pixel, so a hopeless source stays near where it was.
     """
     radius = data.shape[1] // 2
     offset = start_xy_px - centres
@@ -69,8 +90,9 @@ def fit_points(
         ).reshape(n, 4, -1)
         miss = (data - flux[:, None, None] * shape - level[:, None, None]).reshape(n, -1)
         w = weights.reshape(n, -1)
-        normal = np.einsum("nip,np,njp->nij", gradient, w, gradient, optimize=True)
-        right = np.einsum("nip,np,np->ni", gradient, w, miss, optimize=True)
+        weighted = gradient * w[:, None, :]
+        normal = weighted @ gradient.transpose(0, 2, 1)
+        right = (weighted @ miss[:, :, None])[..., 0]
         # A whiff of a prior (positions within ~3 px of the start) keeps sources without light solvable.
         normal[:, [0, 1], [0, 1]] += 0.1
         normal[:, [2, 3], [2, 3]] += 1e-12
@@ -86,6 +108,9 @@ def fit_points(
         offset = np.clip(offset, -radius, radius)
         flux, level = flux + delta[:, 2], level + delta[:, 3]
     chi2 = np.einsum("np,np->n", w, miss**2)
+    filtered = usable / variance * shape
+    against_nothing = np.sum(filtered * (data - surround[:, None, None]), axis=(1, 2))
+    own = np.sum(usable * shape**2 / (variance + (light if shot else 0.0)), axis=(1, 2))
     return PointFits(
         xy_px=centres + offset,
         flux=flux,
@@ -94,6 +119,8 @@ def fit_points(
         chi2=chi2,
         chi2_pixel=_single_pixel_chi2(data, usable / variance),
         dof=np.maximum(usable.sum(axis=(1, 2)) - 4.0, 1.0),
+        significance=against_nothing / np.sqrt(np.maximum(np.sum(filtered * shape, axis=(1, 2)), 1e-300)),
+        snr=flux * np.sqrt(own),
     )
 
 

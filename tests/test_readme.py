@@ -1,0 +1,168 @@
+"""README.md and docs/: what they show is run, and what they name is there."""
+
+import json
+import re
+import shlex
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from startrack.camera.files import camera_from_dict
+from startrack.cli.main import COMMANDS, main
+from startrack.terrain.files import terrain_from_dict
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+FORMATS = (ROOT / "docs/formats.md").read_text(encoding="utf-8")
+LISTED_IN_ONE_ROW = {"timing_ms", "provenance", "camera"}
+PAGES = sorted([ROOT / "README.md", ROOT / "CONVENTIONS.md", *ROOT.glob("docs/*.md"), *ROOT.glob("*/README.md")])
+
+
+def blocks(text, language):
+    return re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def marked(name):
+    """The one line of the block after <!-- name -->."""
+    (block,) = re.findall(rf"<!-- {name} -->\n```sh\n(.*?)```", README, flags=re.DOTALL)
+    (line,) = block.strip().splitlines()
+    return line
+
+
+def without_figures(line):
+    return re.sub(r"-?\d+(\.\d+)?", "#", line)
+
+
+@pytest.fixture
+def clone(tmp_path, monkeypatch):
+    """A folder that looks like the clone to a command that reads the samples."""
+    (tmp_path / "sample_images").symlink_to(ROOT / "sample_images")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_locate_command_prints_what_the_page_shows(clone, capsys):
+    words = shlex.split(marked("locate").split("&&")[-1])
+    assert words[0] == ".venv/bin/startrack"
+    assert main(words[1:]) == 0
+    printed = capsys.readouterr().out.strip()
+    shown = blocks(README, "text")[0].strip()
+    assert without_figures(printed) == without_figures(shown)
+    metres = [float(value) for value in re.findall(r"([EN±]) ?(-?[\d.]+) m", shown) for value in value[1:]]
+    now = [float(value) for value in re.findall(r"([EN±]) ?(-?[\d.]+) m", printed) for value in value[1:]]
+    assert now == pytest.approx(metres, abs=10)
+    files = [f"near-wall{end}" for end in (".annotated.png", ".fix.json", ".stars.ecsv")]
+    assert sorted(path.name for path in (clone / "startrack-out").iterdir()) == files
+
+
+def test_the_true_position_is_the_one_the_page_gives(clone):
+    east, north = re.search(r"really stood at E (-?[\d.]+) m, N (-?[\d.]+) m", README).groups()
+    known = json.loads((ROOT / "sample_images/near-wall.truth.json").read_text())
+    assert known["position_enu_m"][:2] == [float(east), float(north)]
+
+
+def test_every_other_command_of_the_page_runs(clone, capsys):
+    (block,) = [b for b in blocks(README, "sh") if b.startswith("startrack ")]
+    for line in block.splitlines():
+        words = shlex.split(line)
+        assert words[0] == "startrack"
+        assert main(words[1:]) == 0, line
+    record = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert record["status"] == "ok"
+    error_m = abs(record["position"]["east_m"] - 2500) + abs(record["position"]["north_m"] + 1200)
+    assert error_m < 2 * record["position"]["radius999_m"] < 200
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", ROOT / "docs/library.md"], ids=lambda path: path.name)
+def test_python_of_the_page_runs(page, monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    names = {}
+    for code in blocks(page.read_text(encoding="utf-8"), "python"):
+        exec(compile(code, str(page), "exec"), names)
+    if page.name == "README.md":
+        assert re.fullmatch(r"ok: -69\d\d m east, (46|47)\d\d m north, within \d+ m\n", capsys.readouterr().out)
+
+
+def test_ci_runs_the_command_of_the_page():
+    """.ci/run takes the line out of the page; here only that it finds the right one."""
+    line = marked("test")
+    script = (ROOT / ".ci/run").read_text(encoding="utf-8")
+    (sed,) = re.findall(r"\$\((sed .*README\.md)\)", script)
+    found = subprocess.run(["bash", "-c", sed], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert found.splitlines() == [line]
+    assert line.startswith("python3 -m venv .venv && .venv/bin/pip install")
+    assert ".venv/bin/pytest" in line
+
+
+def test_commands_of_the_table_are_the_commands():
+    assert re.findall(r"^\| `startrack (\w+)", README, flags=re.MULTILINE) == list(COMMANDS)
+
+
+def test_rooms_of_the_page_are_the_rooms():
+    from test_layers import LAYERS
+
+    (shown,) = [block for block in blocks(README, "text") if block.startswith("cli ")]
+    rows = [row.split("     ")[0].split() for row in shown.splitlines()]  # without the words on the right
+    shown_depth = {room: depth for depth, row in enumerate(rows) for room in row}
+    true_depth = {room: -layer for layer, names in enumerate(LAYERS) for room in names}
+    assert set(shown_depth) == set(true_depth)
+    for room, depth in shown_depth.items():  # never above a room that it is below in the code
+        assert all(true_depth[room] <= true_depth[other] for other in shown_depth if shown_depth[other] > depth)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
+        if "://" not in target:
+            assert (page.parent / target).exists(), target
+
+
+def test_camera_and_terrain_of_the_format_page_are_the_shipped_ones():
+    camera, terrain = (tomllib.loads(block) for block in blocks(FORMATS, "toml"))
+    shipped = tomllib.loads((ROOT / "calib/fisheye-2048.toml").read_text())
+    assert {key: value for key, value in camera.items() if key != "mount"} == shipped
+    assert terrain == tomllib.loads((ROOT / "terrain/shackleton-thesis.toml").read_text())
+    # The mount that is shown is the one that stands in when it is absent.
+    assert camera_from_dict(camera).R_body_cam == pytest.approx(camera_from_dict(shipped).R_body_cam, abs=1e-12)
+    assert terrain_from_dict(terrain).name == "shackleton-thesis"
+
+
+def leaves(value, before=""):
+    """Keys as the page writes them: of nested dictionaries with dots, of lists of dictionaries by themselves."""
+    for key, inner in value.items():
+        if isinstance(inner, dict) and before + key not in LISTED_IN_ONE_ROW:
+            yield from leaves(inner, f"{before}{key}.")
+            continue
+        yield before + key
+        if isinstance(inner, dict):
+            yield from inner
+        elif isinstance(inner, list) and inner and isinstance(inner[0], dict):
+            yield from inner[0]
+
+
+@pytest.mark.parametrize(
+    "command", ["locate near-wall.png", "identify lowell-2018-08-06.fits.bz2", "detect near-centre.png"]
+)
+def test_every_key_that_is_written_is_explained(clone, capsys, command):
+    name, image = command.split()
+    assert main([name, f"sample_images/{image}", "--json", "--no-plots"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert [key for key in leaves(record) if f"`{key}`" not in FORMATS] == []
+    assert f"`{record['format']}`" in FORMATS
+    tables = list((clone / "startrack-out").glob("*.stars.ecsv"))
+    for table in tables:
+        with table.open(encoding="utf-8") as file:
+            header = next(line for line in file if not line.startswith("#"))
+        assert [column for column in header.split() if f"`{column}`" not in FORMATS] == []
+    assert bool(tables) == (name != "detect")
+
+
+def test_reasons_and_their_exit_codes_are_those_of_the_code():
+    from startrack.cli.common import BAD_INPUT_REASONS
+
+    rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \| ([34]) \|", FORMATS, flags=re.MULTILINE)
+    codes = {name: int(code) for names, code in rows for name in re.findall(r"`(\w+)`", names)}
+    assert {name for name, code in codes.items() if code == 4} == set(BAD_INPUT_REASONS)
+    assert len(codes) == 13

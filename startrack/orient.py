@@ -12,6 +12,7 @@ from startrack.types import Array, Attitude, Bools, NotIdentified
 CHI2_2DOF_MEDIAN = 1.3863
 OUTLIER_CHI2 = 16.0  # 4 sigma in each axis: one good star in 3000 is lost
 ROUNDS = 12
+FEWEST_FOR_SCATTER = 30
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,14 +82,29 @@ def solve_attitude(
         extra = new_extra
         if settled:
             break
-    information = np.einsum("nia,nij,njb->ab", jacobian, weight[used], jacobian)
     return AttitudeFit(
-        attitude=Attitude(R_cam_icrs=R, covariance_rad2=np.linalg.inv(information)),
+        attitude=Attitude(R_cam_icrs=R, covariance_rad2=_covariance(jacobian, weight[used], w, r)),
         residual_px=residual,
         used=used,
         rms_px=float(np.sqrt(np.mean(residual[used] ** 2))),
         extra_sigma_px=float(np.sqrt(extra)),
     )
+
+
+def _covariance(jacobian: Array, weight: Array, tapered: Array, residual: Array) -> Array:
+    """Covariance of the attitude: the stated one, or the one that the scatter of the residuals shows if that is larger.
+
+    The second is the sandwich H^-1 (sum s s^T) H^-1 of the stars' own pulls s; it sees heavy tails and centroid errors
+    that are larger than stated, but is itself noisy with few stars.
+    """
+    stated = np.linalg.inv(np.einsum("nia,nij,njb->ab", jacobian, weight, jacobian))
+    n = len(residual)
+    if n < FEWEST_FOR_SCATTER:
+        return stated
+    bread = np.linalg.inv(np.einsum("nia,nij,njb->ab", jacobian, tapered, jacobian))
+    pulls = np.einsum("nia,nij,nj->na", jacobian, tapered, residual)
+    seen = bread @ np.einsum("na,nb->ab", pulls, pulls) @ bread * (n / (n - 3))
+    return stated * max(1.0, float(np.trace(seen) / np.trace(stated)))
 
 
 def _robust(weight: Array, chi2: Array) -> Array:

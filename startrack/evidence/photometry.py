@@ -58,19 +58,21 @@ def measure(
     pairs, overlap = _neighbour_profiles(sources.xy_px, centre, sigma_px, radius)
     expected = sources.flux_e * sources.visible
     n = len(centre)
-    light = np.zeros((n, profile.shape[1]))
-    np.add.at(light, pairs[:, 0], expected[pairs[:, 1], None] * overlap)
+    light = _summed(expected[pairs[:, 1], None].astype(np.float32) * overlap, pairs[:, 0], n)
     data = image[index].reshape(n, -1) - light
-    variance = np.square(noise[index].reshape(n, -1), dtype=np.float64)
+    variance = np.square(noise[index].reshape(n, -1))
     good = ~dead[index].reshape(n, -1)
     flux, weights = _fit(data, profile, good / variance)
     # One round of masking: hot pixels and tracks are none of the star's light.
     level = _level(data, profile, good / variance, flux)
     own = np.maximum(flux, 0.0)[:, None] * profile
-    spread = np.sqrt(variance + own + light + np.square(MODEL_ERROR * (own + light)))
-    deviant = good & (np.abs(data - flux[:, None] * profile - level[:, None]) > OUTLIER_SIGMA * spread)
+    stars = own + light
+    spread2 = variance + stars + np.square(MODEL_ERROR * stars)
+    rest = data - flux[:, None] * profile - level[:, None]
+    deviant = good & (np.square(rest) > OUTLIER_SIGMA**2 * spread2)
     good &= ~deviant
-    flux, weights = _fit(data, profile, good / variance)
+    redo = deviant.any(axis=1)
+    flux[redo], weights[redo] = _fit(data[redo], profile[redo], good[redo] / variance[redo])
     uncertain = np.square(sources.flux_e) * (
         sources.visible * (1 - sources.visible) + sources.visible * np.square(sources.fraction_sigma)
     )
@@ -91,7 +93,16 @@ def _profiles(offset_px: Array, sigma_px: float, radius: int) -> Array:
     """PSF on the stamps (n, pixels)."""
     px, _ = pixel_profile(offset_px[:, 0], sigma_px, radius)
     py, _ = pixel_profile(offset_px[:, 1], sigma_px, radius)
+    px, py = px.astype(np.float32), py.astype(np.float32)  # stamps are large and pixels have no more digits
     return (py[:, :, None] * px[:, None, :]).reshape(len(px), -1)
+
+
+def _summed(rows: Array, group: Ints, n: int) -> Array:
+    """Sums (n, pixels) of the rows by group."""
+    from scipy.sparse import csr_matrix
+
+    sparse = csr_matrix((np.ones(len(group), np.float32), (group, np.arange(len(group)))), shape=(n, len(group)))
+    return np.asarray(sparse @ rows)
 
 
 def _neighbour_profiles(xy_px: Array, centre: Ints, sigma_px: float, radius: int) -> tuple[Ints, Array]:
@@ -106,7 +117,7 @@ def _neighbour_profiles(xy_px: Array, centre: Ints, sigma_px: float, radius: int
 
 def _fit(data: Array, profile: Array, weight: Array) -> tuple[Array, Array]:
     """Flux (n,) with a free constant level, and the linear weights (n, pixels) that give it: flux = sum weights data."""
-    total = np.maximum(weight.sum(axis=1), 1e-300)
+    total = np.maximum(weight.sum(axis=1), 1e-30)
     middle = np.einsum("np,np->n", weight, profile) / total
     centred = weight * (profile - middle[:, None])
     strength = np.einsum("np,np->n", centred, profile)
@@ -117,4 +128,4 @@ def _fit(data: Array, profile: Array, weight: Array) -> tuple[Array, Array]:
 
 def _level(data: Array, profile: Array, weight: Array, flux: Array) -> Array:
     rest = data - flux[:, None] * profile
-    return np.einsum("np,np->n", weight, rest) / np.maximum(weight.sum(axis=1), 1e-300)
+    return np.einsum("np,np->n", weight, rest) / np.maximum(weight.sum(axis=1), 1e-30)

@@ -12,11 +12,13 @@ from startrack.evidence.photometry import Photometry, Sources, half_width, measu
 from startrack.evidence.ratio import shines_ratio
 from startrack.evidence.scale import FluxScale
 from startrack.frames import azel_from_rays
+from startrack.psf import noise_area_px
 from startrack.types import Array, Body, Bools, Detections, Evidence, Ints, Stars
 
 FAINTEST_SNR = 0.5  # fainter stars say next to nothing and would only cost time
 BODY_GLARE_PX = 8.0
-SEEN_LLR = 3.0
+TELLING_SNR = 1.0  # stars brighter than this tell whether they shine
+SEEN_LLR = 3.0  # from here on a star counts as seen, from minus this as hidden
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +76,7 @@ class StarEvidence:
         where something is known of it already (used for its light in its neighbours' measurements only).
         """
         sigma_px = detections.psf_sigma_px
-        noise_e = float(np.median(detections.noise_e)) * np.sqrt(4 * np.pi) * max(sigma_px, 0.5)
+        noise_e = float(np.median(detections.noise_e)) * np.sqrt(noise_area_px(sigma_px))
         faintest = scale.zero_mag - 2.5 * np.log10(self.faintest_snr * max(noise_e, 1e-9))
         star = np.flatnonzero(stars.v_mag < faintest)
         rays_cam = stars.rays_icrs[star] @ R_cam_icrs.T
@@ -90,22 +92,16 @@ class StarEvidence:
         measurable = np.flatnonzero(cause != "off the frame")
         residual = image_e - detections.background_e
 
-        def forced(shining: Array) -> Photometry:
-            sources = Sources(
-                xy_px=xy[measurable],
-                flux_e=expected[measurable],
-                fraction_sigma=fraction[measurable],
-                visible=shining,
-            )
-            return measure(residual, detections.noise_e, dead, sources, sigma_px)
-
-        first = forced(np.zeros(len(measurable)) if visible is None else visible[star[measurable]])
-        llr, sigma = _ratios(first, expected[measurable], fraction[measurable], 0.0)
-        light = first
-        if visible is None:
-            # Bright stars tell by themselves whether they shine; then their light can be taken from their neighbours.
-            light = forced(1.0 / (1.0 + np.exp(-llr)))
-            llr, sigma = _ratios(light, expected[measurable], fraction[measurable], 0.0)
+        shining = (
+            visible[star[measurable]]
+            if visible is not None
+            else _guess(residual, detections, dead, xy[measurable], expected[measurable], fraction[measurable])
+        )
+        sources = Sources(
+            xy_px=xy[measurable], flux_e=expected[measurable], fraction_sigma=fraction[measurable], visible=shining
+        )
+        light = measure(residual, detections.noise_e, dead, sources, sigma_px)
+        llr, sigma = _ratios(light, expected[measurable], fraction[measurable])
         azimuth, elevation = azel_from_rays(stars.rays_icrs[star] @ R_enu_icrs.T)
         cause[measurable[~light.usable & (cause[measurable] == "")]] = "bad pixels"
         return StarLight(
@@ -121,10 +117,35 @@ class StarEvidence:
         )
 
 
-def _ratios(light: Photometry, expected_e: Array, fraction: Array, confusion_e: float) -> tuple[Array, Array]:
+def _guess(
+    residual: NDArray[np.float32],
+    detections: Detections,
+    dead: NDArray[np.bool_],
+    xy_px: Array,
+    expected_e: Array,
+    fraction: Array,
+) -> Array:
+    """Probability (n,) that each star shines, before anything is known: the brighter ones tell by themselves.
+
+    Needed for their light in their neighbours' measurements; of the faint ones nothing is known (one half).
+    """
+    shining = np.full(len(xy_px), 0.5)
+    noise_e = detections.noise_e[tuple(np.rint(xy_px).astype(int).T[::-1])]
+    bright = np.flatnonzero(expected_e > TELLING_SNR * noise_e * np.sqrt(noise_area_px(detections.psf_sigma_px)))
+    if len(bright):
+        sources = Sources(
+            xy_px=xy_px[bright], flux_e=expected_e[bright], fraction_sigma=fraction[bright], visible=np.zeros(len(bright))
+        )
+        light = measure(residual, detections.noise_e, dead, sources, detections.psf_sigma_px)
+        llr, _ = _ratios(light, expected_e[bright], fraction[bright])
+        shining[bright] = 1.0 / (1.0 + np.exp(-llr))
+    return shining
+
+
+def _ratios(light: Photometry, expected_e: Array, fraction: Array) -> tuple[Array, Array]:
     """Log-likelihood ratios and the standard deviations of the fluxes if nothing shines."""
     hidden = light.variance_e2 + light.neighbour_variance_e2
-    shining = hidden + light.own_shot * expected_e + np.square(fraction * expected_e) + confusion_e**2
+    shining = hidden + light.own_shot * expected_e + np.square(fraction * expected_e)
     sigma = np.sqrt(hidden)
     return shines_ratio(light.flux_e, expected_e, sigma, np.sqrt(shining)), sigma
 

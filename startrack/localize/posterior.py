@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.localize.likelihood import Sectors
-from startrack.localize.rays import ray_levels
+from startrack.localize.rays import bundled
 from startrack.localize.scout import likely_places, taken
 from startrack.localize.search import Boxes, bounded, centre_scores, on_ground, whole_area
 from startrack.localize.summary import summarize
 from startrack.terrain import Terrain
 from startrack.types import Array, Evidence, Fix, NotLocated
 
-UNBUNDLE_AT_M = 80.0  # boxes below this half side are asked ray by ray, twice as large ones by the finest bundles
+RAY_BY_RAY_M = 12.0  # boxes below this half side are asked ray by ray and judged at their centres
 FEWEST_RAYS = 8
 
 
@@ -27,7 +27,7 @@ class ExactPosterior:
     are quartered until they are small against the posterior's own spread. All modes are found; nothing is guessed.
     """
 
-    sector_width_rad: float = float(np.radians(3.0))
+    sector_width_rad: float = float(np.radians(1.5))
     sector_epsilon: float = 1e-4
     prune_nats: float = 16.0  # boxes whose best place is e^-16 as likely as the best known one are dropped
     finest_m: float = 0.05
@@ -45,26 +45,24 @@ class ExactPosterior:
     def _explore(self, evidence: Evidence, terrain: Terrain) -> tuple[Boxes, Array, float]:
         """Boxes that hold the posterior, log-likelihoods at their centres, and a bound on the probability dropped."""
         sectors = Sectors.of(evidence, self.sector_width_rad, self.sector_epsilon)
-        levels = ray_levels(sectors)
-        rays = levels.pop(0)
+        rays = bundled(sectors)
         boxes = bounded(whole_area(sectors, rays, terrain.reach_m), sectors, rays, terrain)
         best = float(likely_places(evidence, sectors, terrain)[1].max(initial=-np.inf))
         dropped = -np.inf
         while True:
-            if rays.single:
+            small = boxes.half_m < RAY_BY_RAY_M
+            if small:
+                boxes = boxes.all_taken_apart(rays)
                 score = centre_scores(boxes, sectors, rays, terrain)
                 log_weight = np.where(terrain.allowed(boxes.centres_m), score, -np.inf)
                 best = max(best, float(log_weight.max(initial=-np.inf)))
             whole = boxes.upper > best - self.prune_nats
             dropped = np.logaddexp(dropped, _log_mass(boxes.upper[~whole], boxes.half_m))
             boxes = boxes.take(whole)
-            if rays.single and self._fine_enough(boxes, log_weight[whole]):
+            if small and self._fine_enough(boxes, log_weight[whole]):
                 break
             boxes = boxes.split()
-            boxes = boxes.take(on_ground(boxes, terrain))
-            if levels and boxes.half_m < UNBUNDLE_AT_M * 2 ** len(levels):
-                boxes, rays = boxes.unbundled(rays), levels.pop(0)
-            boxes = bounded(boxes, sectors, rays, terrain)
+            boxes = bounded(boxes.take(on_ground(boxes, terrain)), sectors, rays, terrain)
             sure = boxes.lower[np.asarray(terrain.allowed(boxes.centres_m))]
             best = max(best, float(sure.max(initial=-np.inf)))
         log_weight = log_weight[whole]

@@ -53,17 +53,28 @@ class Boxes:
             np.repeat(self.upper, 4),
         )
 
-    def unbundled(self, rays: Rays) -> Boxes:
-        """The same boxes with each unsettled bundle of `rays` replaced by its children on the next level."""
-        first, last = rays.first_child[self.ray], rays.first_child[self.ray + 1]
-        count = last - first
+    def taken_apart(self, rays: Rays, which: Bools) -> Boxes:
+        """The same boxes with the bundles of the pairs `which` replaced by their children."""
+        parts = self.ray[which]
+        first, count = rays.first_child[parts], rays.last_child[parts] - rays.first_child[parts]
         step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        return replace(self, box=np.repeat(self.box, count), ray=np.repeat(first, count) + step)
+        return replace(
+            self,
+            box=np.concatenate([self.box[~which], np.repeat(self.box[which], count)]),
+            ray=np.concatenate([self.ray[~which], np.repeat(first, count) + step]),
+        )
+
+    def all_taken_apart(self, rays: Rays) -> Boxes:
+        """The same boxes asked ray by ray."""
+        boxes = self
+        while not (leaf := rays.leaf[boxes.ray]).all():
+            boxes = boxes.taken_apart(rays, ~leaf)
+        return boxes
 
 
 def whole_area(sectors: Sectors, rays: Rays, reach_m: float) -> Boxes:
     """One box over the whole square of half side `reach_m`, nothing settled."""
-    n = len(rays.llr)
+    n = rays.roots
     return Boxes(
         np.zeros((1, 2)), reach_m, np.zeros((1, sectors.count)), np.zeros(n, dtype=np.int64), np.arange(n),
         np.full(1, -np.inf), np.full(1, np.inf),
@@ -71,25 +82,27 @@ def whole_area(sectors: Sectors, rays: Rays, reach_m: float) -> Boxes:
 
 
 def bounded(boxes: Boxes, sectors: Sectors, rays: Rays, terrain: Terrain) -> Boxes:
-    """The boxes with the bundles that no longer vary settled, and with bounds of the log-likelihood."""
+    """The boxes with bounds of the log-likelihood; what no longer varies is settled, coarse bundles are taken apart."""
     n, count = len(boxes), sectors.count
     low, high = np.empty(len(boxes.ray)), np.empty(len(boxes.ray))
+    coarse = np.empty(len(boxes.ray), dtype=bool)
     for start in range(0, len(boxes.ray), PAIRS_AT_ONCE):
         some = slice(start, start + PAIRS_AT_ONCE)
         centres = boxes.centres_m[boxes.box[some]]
         half = np.full(len(centres), boxes.half_m)
-        low[some], high[some] = rays.bounds(terrain, centres, half, boxes.ray[some])
+        low[some], high[some], coarse[some] = rays.bounds(terrain, centres, half, boxes.ray[some])
     key = boxes.box * count + rays.sector[boxes.ray]
     settled = high - low < SETTLED
     sums = boxes.sums + _sum_by(key[settled], 0.5 * (low + high)[settled], n, count)
     open_ = ~settled
     lower = sectors.score(sums + _sum_by(key[open_], low[open_], n, count))
     upper = sectors.score(sums + _sum_by(key[open_], high[open_], n, count))
-    return Boxes(boxes.centres_m, boxes.half_m, sums, boxes.box[open_], boxes.ray[open_], lower, upper)
+    left = Boxes(boxes.centres_m, boxes.half_m, sums, boxes.box[open_], boxes.ray[open_], lower, upper)
+    return left.taken_apart(rays, coarse[open_])
 
 
 def centre_scores(boxes: Boxes, sectors: Sectors, rays: Rays, terrain: Terrain) -> Array:
-    """Log-likelihood (n,) at the boxes' centres; `rays` must be the single rays."""
+    """Log-likelihood (n,) at the centres of boxes that are asked ray by ray."""
     azimuth = rays.azimuth_rad[boxes.ray]
     centres = boxes.centres_m[boxes.box]
     horizon = terrain.horizon_rad(centres, azimuth)

@@ -1,0 +1,18 @@
+"""What people and programs get to see: results as JSON, star tables, annotated pictures, one-line summaries."""
+
+from startrack.report.result import detection_dict, identification_dict, refused_dict, result_dict
+from startrack.report.summary import refusal_line, summary_line, verbose_text
+from startrack.report.write import write_annotated, write_json, write_star_table
+
+__all__ = [
+    "detection_dict",
+    "identification_dict",
+    "refusal_line",
+    "refused_dict",
+    "result_dict",
+    "summary_line",
+    "verbose_text",
+    "write_annotated",
+    "write_json",
+    "write_star_table",
+]

@@ -1,0 +1,55 @@
+"""Results to files: each appears under its name only when it is whole."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import TYPE_CHECKING, Any
+
+from startrack.exposure import write_atomically
+
+if TYPE_CHECKING:
+    from startrack.pipeline import Result
+
+FilePath = str | os.PathLike[str]
+
+
+def write_json(path: FilePath, record: dict[str, Any]) -> None:
+    """Write a result's dictionary, one top-level key a line. The same dictionary gives the same bytes.
+
+    Raises BadInput where the file cannot be written, and ValueError for NaN or an infinity, which JSON has not.
+    """
+    write_atomically(path, json_text(record).encode("utf-8"), overwrite=True)
+
+
+def json_text(record: dict[str, Any]) -> str:
+    """JSON of a dictionary with one top-level key a line."""
+    lines = (f" {json.dumps(key)}: {_json(value)}" for key, value in record.items())
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def write_star_table(path: FilePath, result: Result) -> None:
+    """Write NAME.stars.ecsv: every catalogue star in view. Raises BadInput where it cannot be written."""
+    from startrack.report.star_table import star_table_text
+
+    write_atomically(path, star_table_text(result).encode("utf-8"), overwrite=True)
+
+
+def write_annotated(path: FilePath, result: Result, truth_enu_m: tuple[float, float] | None = None) -> None:
+    """Write NAME.annotated.png. Raises BadInput where it cannot be written.
+
+    `truth_enu_m` (east, north) is drawn where a caller knows it; no stage of the pipeline does.
+    """
+    import cv2
+
+    from startrack.report.annotate import annotate
+
+    picture = annotate(result, truth_enu_m)
+    ok, data = cv2.imencode(".png", picture[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    if not ok:
+        raise RuntimeError("OpenCV could not encode the picture as PNG")
+    write_atomically(path, data.tobytes(), overwrite=True)
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)

@@ -1,0 +1,56 @@
+"""What several test files share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+import pytest
+
+
+@dataclass(frozen=True)
+class Located:
+    """A small rendered exposure, the pipeline's result for it, and what is true of it."""
+
+    result: Any  # pipeline.Result
+    truth: Any  # render.Truth
+    heading_pitch_roll_deg: tuple[float, float, float]
+
+
+@pytest.fixture(scope="session")
+def located() -> Located:
+    """A 1024 px fisheye 6.5 km off the middle of the thesis's crater, seen and located."""
+    from startrack import pipeline
+    from startrack.camera import load_camera
+    from startrack.catalog import load_catalog
+    from startrack.render import Series, render
+    from startrack.terrain import load_terrain
+
+    camera = replace(
+        load_camera("fisheye-2048"),
+        name="fisheye-1024",
+        size_px=(1024, 1024),
+        focal_px=(326.0, 326.0),
+        centre_px=(511.5, 511.5),
+    )
+    catalog, angles_deg = load_catalog().brighter_than(7.0), (30.0, 2.0, -3.0)
+    heading, pitch, roll = np.radians(angles_deg).tolist()
+    series = Series(
+        camera=camera,
+        terrain=load_terrain("shackleton-thesis"),
+        catalog=catalog,
+        seed=7,
+        time_utc=datetime(2030, 6, 1, tzinfo=UTC),
+        east_m=6000.0,
+        north_m=-2500.0,
+        heading_rad=heading,
+        pitch_rad=pitch,
+        roll_rad=roll,
+        faint_v_mag=None,
+        hot_pixels=20,
+    )
+    scene, rng = series.scene(0, "small")
+    exposure, truth = render(scene, rng=rng)
+    return Located(pipeline.locate(exposure, camera, series.terrain, catalog), truth, angles_deg)

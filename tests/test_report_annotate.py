@@ -1,0 +1,154 @@
+"""The annotated picture: marks stand where geometry from elsewhere says, and every kind of result can be drawn."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from startrack import pipeline
+from startrack.camera import Camera, Pinhole
+from startrack.report import write_annotated
+from startrack.report.annotate import annotate
+from startrack.report.backdrop import View, fitted
+from startrack.report.palette import HIDDEN, IDENTIFIED, POSITION, SKYLINE, STATUS, TRUTH
+from startrack.report.panel import PANEL_WIDTH
+from startrack.types import Mode
+
+
+def near(picture, place, colour, reach=2, tolerance=60):
+    """Whether a pixel within `reach` of the place has the colour, or nearly."""
+    x, y = np.rint(place).astype(int)
+    patch = picture[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1].astype(int)
+    return bool((np.abs(patch - colour).sum(axis=-1) < tolerance).any())
+
+
+def count(picture, colour, tolerance=30):
+    return int((np.abs(picture.astype(int) - colour).sum(axis=-1) < tolerance).sum())
+
+
+@pytest.fixture(scope="module")
+def picture(located):
+    return annotate(located.result)
+
+
+@pytest.fixture(scope="module")
+def view(located, picture):
+    scale, size = fitted(located.result.exposure.size_px)
+    return View(scale, (0.0, float((picture.shape[0] - size[1]) // 2)), size)
+
+
+def test_size(picture):
+    assert picture.dtype == np.uint8
+    assert picture.shape[2] == 3
+    assert 1000 <= picture.shape[0] <= 1600
+    assert fitted((2048, 2048)) == (1400 / 2048, (1400, 1400))
+    assert fitted((3000, 2000))[1] == (1400, 933)
+    assert fitted((512, 512))[1] == (900, 900)
+    assert fitted((1024, 1024))[0] == 1.0
+
+
+def test_the_skyline_is_where_the_true_wall_is(picture, view, located):
+    """From the truth and the crater's formula, without any code of the picture's."""
+    (x, y, up), camera = located.truth.position_enu_m, located.result.camera
+    azimuth = np.radians(np.arange(0.0, 360.0, 5.0))
+    along = x * np.sin(azimuth) + y * np.cos(azimuth)
+    elevation = np.arctan2(2000.0 - up, np.sqrt(along**2 + 10_000.0**2 - x**2 - y**2) - along)
+    level = np.cos(elevation)
+    rays = np.stack([np.sin(azimuth) * level, np.cos(azimuth) * level, np.sin(elevation)], axis=-1)
+    xy_px, inside = camera.project(rays @ located.truth.R_cam_enu.T)
+    assert inside.all()
+    assert np.mean([near(picture, place, SKYLINE) for place in view.at(xy_px)]) > 0.9
+    astray = [near(picture, place, SKYLINE) for place in view.at(xy_px + 12.0)]
+    assert np.mean(astray) < 0.5
+
+
+def test_identified_stars_have_a_green_ring_and_hidden_ones_a_cross(picture, view, located):
+    result = located.result
+    ringed = []
+    for k in result.identification.detection[:40]:
+        at = view.at(result.detections.xy_px[k])
+        ringed.append(any(near(picture, at + np.array([0.0, r]), IDENTIFIED) for r in (-10, -9, -8, 8, 9, 10)))
+    assert np.mean(ringed) > 0.8
+    hidden = np.flatnonzero(result.light.llr < -3.0)[:10]
+    assert np.mean([near(picture, place, HIDDEN) for place in view.at(result.light.xy_px[hidden])]) > 0.8
+
+
+def test_beyond_the_image_circle_is_paper(picture, view, located):
+    corner = picture[int(view.origin[1]) + 3, 3]
+    assert corner.max() < 40
+    middle = picture[int(view.origin[1]) + 400 : int(view.origin[1]) + 600, 400:600]
+    assert middle.max() == 255
+
+
+def test_truth_is_drawn_only_when_given(picture, located):
+    assert count(picture, TRUTH) == 0
+    given = annotate(located.result, tuple(located.truth.position_enu_m[:2]))
+    assert count(given[:, -PANEL_WIDTH:], TRUTH) > 20
+
+
+def test_every_kind_of_result_can_be_drawn(located):
+    result = located.result
+    modes = (Mode(east_m=6000.0, north_m=-2500.0, weight=0.7), Mode(east_m=-3000.0, north_m=4000.0, weight=0.3))
+    nothing = {"fix": None, "light": None}
+    unknown = {**nothing, "identification": None, "attitude_fit": None, "R_enu_icrs": None, "bodies": []}
+    badge = np.s_[20:70, -200:]
+    cases = {
+        "ambiguous": replace(result, status="ambiguous", fix=replace(result.fix, modes=modes, ambiguous=True)),
+        "inconsistent": replace(result, status="refused", reason="inconsistent_evidence", message="m " * 400, fix=None),
+        "not identified": replace(result, status="refused", reason="not_identified", message="why", **unknown),
+        "no stars": replace(result, status="refused", reason="no_stars", detections=None, **unknown),
+        "identified": replace(result, terrain=None, R_enu_icrs=None, bodies=[], **nothing),
+        "detected": pipeline.Result(exposure=result.exposure, detections=result.detections, status="ok"),
+    }
+    for name, one in cases.items():
+        drawn = annotate(one)
+        assert count(drawn[badge], STATUS[one.status]) > 500, name
+    assert count(annotate(cases["ambiguous"])[:, -PANEL_WIDTH:], POSITION) > 2 * 60
+
+
+def test_an_image_of_another_size_than_the_cameras(located):
+    wide = replace(located.result.exposure, pixels_adu=located.result.exposure.pixels_adu[:300])
+    refused = pipeline.identify(wide, located.result.camera, SimpleNamespace(name="not needed"))
+    assert refused.reason == "size_mismatch"
+    assert annotate(refused).shape[1] > 1024
+
+
+def test_a_narrow_camera_that_sees_no_skyline(located):
+    """A pinhole camera of 20 degrees looking up: no compass, no wall, no rim in the frame, and no error."""
+    camera = Camera(
+        name="narrow",
+        size_px=(1024, 1024),
+        focal_px=(2900.0, 2900.0),
+        centre_px=(511.5, 511.5),
+        max_angle_rad=0.25,
+        calibrated_angle_rad=0.25,
+        lens=Pinhole(),
+    )
+    result = replace(located.result, camera=camera)
+    assert count(annotate(result)[:, :1024], SKYLINE) == 0
+
+
+def test_a_name_that_the_font_cannot_write(located):
+    exposure = replace(located.result.exposure, path="nächte/星空 – " + "very long " * 20 + ".png")
+    annotate(replace(located.result, exposure=exposure))
+
+
+def test_the_png_is_whole_and_the_same_each_time(located, picture, tmp_path):
+    first, second = tmp_path / "a.annotated.png", tmp_path / "b.annotated.png"
+    write_annotated(first, located.result)
+    write_annotated(second, located.result)
+    np.testing.assert_array_equal(np.asarray(Image.open(first)), picture)
+    assert first.read_bytes() == second.read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [first.name, second.name]
+
+
+def test_matplotlib_stays_out():
+    code = "import sys, startrack.report.annotate, startrack.report.write; print('matplotlib' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +21,9 @@ def background_and_noise(image: Image) -> tuple[Image, Image]:
     several blocks.
     """
     blocks = _blocks(image)
-    level = np.median(blocks, axis=1)
+    level = _median(blocks)
     # Every other pixel is enough for the spread (10 % per block before the median filter over 25 blocks).
-    spread = MAD_TO_SIGMA * np.median(np.abs(blocks[:, ::2] - level[:, None]), axis=1)
+    spread = MAD_TO_SIGMA * _median(np.abs(blocks[:, ::2] - level[:, None]))
     shape = -(-image.shape[0] // BLOCK_PX), -(-image.shape[1] // BLOCK_PX)
     level_map = cv2.medianBlur(level.reshape(shape), 3)
     spread_map = cv2.medianBlur(spread.reshape(shape), 5)
@@ -36,21 +38,28 @@ def local_level(residual: Image, noise: Image, width_px: int) -> Image:
     return cv2.boxFilter(clipped, -1, (width_px, width_px), borderType=cv2.BORDER_REFLECT)
 
 
+def _median(rows: Image) -> Image:
+    """Medians (n,) of rows (n, even): numpy's sort of short rows is many times faster than its median."""
+    ordered = np.sort(rows, axis=1)
+    middle = rows.shape[1] // 2
+    return 0.5 * (ordered[:, middle - 1] + ordered[:, middle])
+
+
 def _blocks(image: Image) -> Image:
     """(blocks, BLOCK_PX^2): the image cut into square blocks, its border reflected to fill the last ones."""
     height, width = image.shape
     below, right = -height % BLOCK_PX, -width % BLOCK_PX
     if below or right:
-        image = cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_REFLECT_101)
+        image = np.asarray(cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_REFLECT_101), dtype=np.float32)
     rows, columns = image.shape[0] // BLOCK_PX, image.shape[1] // BLOCK_PX
     cut = image.reshape(rows, BLOCK_PX, columns, BLOCK_PX).transpose(0, 2, 1, 3)
     return np.ascontiguousarray(cut).reshape(rows * columns, BLOCK_PX * BLOCK_PX)
 
 
-def _enlarge(block_map: Image, shape: tuple[int, ...]) -> Image:
+def _enlarge(block_map: NDArray[Any], shape: tuple[int, ...]) -> Image:
     """Bilinear interpolation between block centres to the full image."""
     rows, columns = block_map.shape
-    full = cv2.resize(block_map, (columns * BLOCK_PX, rows * BLOCK_PX), interpolation=cv2.INTER_LINEAR)
+    full: Any = cv2.resize(block_map, (columns * BLOCK_PX, rows * BLOCK_PX), interpolation=cv2.INTER_LINEAR)
     return full[: shape[0], : shape[1]]
 
 

@@ -17,7 +17,9 @@ from startrack.types import Bools, Detections, Exposure, Ints, TooFewStars
 Image = NDArray[np.float32]
 FIRST_PASS_SNR = 4.3  # below the final threshold: a star between pixels shows up to 15 % less in the filtered image
 NARROW_PX = 1.25
-OWN_LEVEL_PART = 0.8  # of the threshold that a source must reach when its own stamp alone defines the background
+OWN_LEVEL_PART = 0.8  # of the threshold that a source must reach by its own stamp alone, everywhere
+UNEVEN_SIGMA = 2.5  # difference of the stamp's level and that of its surroundings where these are not to be trusted
+EDGE_MARGIN = 30.0  # chi^2 by which an edge must explain a stamp better: noise alone gives faint stars less
 NEIGHBOUR_SIGMA = 0.1  # neighbours' light above this part of a pixel's noise is taken away in a second fit
 NEIGHBOUR_ERROR = 0.1  # of it is not known: neighbours' fits, and the PSF's wings
 BAD_FIT_CHI2_PER_DOF = 4.0
@@ -25,7 +27,8 @@ ROUGH_PSF_MISFIT = 0.1  # from here up the frame's own stars, not the Gaussian, 
 ROUGH_PSF_SPREAD = 2.0  # times the typical misfit that a star of such a frame may have
 BRIGHT_SNR = 12.0  # sources that say what the frame's PSF is
 FEWEST_BRIGHT = 8
-WIDTHS_PX = np.geomspace(0.3, 8.0, 45)
+MOST_BRIGHT = 300
+WIDTHS_PX = np.geomspace(0.3, 8.0, 36)
 UNKNOWN_WIDTH_PX = 1.2  # first guess where the camera file does not tell
 WIDTH_TOLERANCE = 0.12  # measured PSF differing by more than this fraction from the expected one is used instead
 SATURATED_FRACTION = 0.98
@@ -176,14 +179,19 @@ def _is_star(fits: PointFits, threshold_snr: float, misfit: NDArray[np.float64])
     Where the bright sources of the frame all differ from the Gaussian (trails, coma, a real lens), no bright star would
     pass by its chi^2; there a source passes whose `misfit` (n,) is like theirs.
     """
-    point = fits.chi2 < fits.chi2_pixel
+    point = (fits.chi2 < fits.chi2_pixel) & (fits.chi2 < fits.chi2_edge + EDGE_MARGIN)
     bright = point & (fits.snr > BRIGHT_SNR)
     typical = float(np.median(misfit[bright])) if np.count_nonzero(bright) >= FEWEST_BRIGHT else 0.0
     like_the_others = misfit < (ROUGH_PSF_SPREAD * typical if typical > ROUGH_PSF_MISFIT else 0.0)
+    # On a slope or at the skyline the surroundings do not tell the level; there the stamp must tell by itself.
+    level_sigma = np.sqrt(fits.covariance[:, 3, 3])
+    even = np.abs(fits.level - fits.surround) < UNEVEN_SIGMA * level_sigma
+    by_itself = fits.flux / np.sqrt(fits.covariance[:, 2, 2])
+    stands_out = (by_itself >= threshold_snr) | (
+        even & (fits.significance >= threshold_snr) & (by_itself >= OWN_LEVEL_PART * threshold_snr)
+    )
     return (
-        (fits.significance >= threshold_snr)
-        # On a slope or at the skyline the surroundings do not tell the level; there the stamp must tell by itself.
-        & (fits.flux >= OWN_LEVEL_PART * threshold_snr * np.sqrt(fits.covariance[:, 2, 2]))
+        stands_out
         & ((fits.chi2 < BAD_FIT_CHI2_PER_DOF * fits.dof) | like_the_others)
         & point
         & (np.sqrt(fits.covariance[:, 0, 0] + fits.covariance[:, 1, 1]) < 2.0)
@@ -201,7 +209,7 @@ def _measured_width(frame: _Frame, centres: Ints, fits: PointFits, sigma: float)
     """Typical PSF sigma [px] of the bright sources; None where there are too few to tell."""
     radius = radius_for(sigma)
     whole = ~stamps(frame.dead, centres, radius).any(axis=(1, 2))
-    bright = np.flatnonzero((fits.snr > BRIGHT_SNR) & whole)[:600]
+    bright = np.flatnonzero((fits.snr > BRIGHT_SNR) & whole)[:MOST_BRIGHT]
     if len(bright) < FEWEST_BRIGHT:
         return None
     pixels = centres[bright]

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.detect.impostors import edge_chi2, single_pixel_chi2
 from startrack.psf import pixel_profile, stamp_radius
 from startrack.types import Array, Bools, Ints
 
-ITERATIONS = 6
+ITERATIONS = 4
 MODEL_ERROR = 0.03  # fraction of a star's own light by which real PSFs differ from the Gaussian
 
 
@@ -24,7 +26,9 @@ class PointFits:
     covariance: Array  # (n, 4, 4) of x, y, flux, level
     chi2: Array  # (n,) of the point source
     chi2_pixel: Array  # (n,) of a single bright pixel instead
+    chi2_edge: Array  # (n,) of a straight edge or line instead
     dof: Array  # (n,)
+    surround: Array  # (n,) level of the wider surroundings
     significance: Array  # (n,) matched-filter SNR of the light against nothing but background noise
     snr: Array  # (n,) matched-filter SNR, the source's own photon noise included
 
@@ -40,12 +44,11 @@ class PointFits:
         return PointFits(**values)
 
 
-def stamps(image: NDArray[np.float32], centres: Ints, radius: int) -> Array:
+def stamps(image: NDArray[Any], centres: Ints, radius: int) -> Array:
     """Cut-outs (n, 2r+1, 2r+1) of the image around the integer pixels (n, 2) (x, y), which must be `radius` inside."""
-    offset = np.arange(-radius, radius + 1)
-    rows = centres[:, 1, None, None] + offset[None, :, None]
-    columns = centres[:, 0, None, None] + offset[None, None, :]
-    return image[rows, columns].astype(np.float64)
+    side = 2 * radius + 1
+    windows = np.lib.stride_tricks.sliding_window_view(image, (side, side))
+    return windows[centres[:, 1] - radius, centres[:, 0] - radius].astype(np.float64)
 
 
 def fit_points(
@@ -68,10 +71,10 @@ def fit_points(
     radius = data.shape[1] // 2
     offset = start_xy_px - centres
     n = len(data)
-    weights = usable / variance
-    flux = np.zeros(n)
-    level = np.zeros(n)
-    covariance = np.zeros((n, 4, 4))
+    weights: Array = usable / variance
+    flux: Array = np.zeros(n)
+    level: Array = np.zeros(n)
+    covariance: Array = np.zeros((n, 4, 4))
     for step in range(ITERATIONS + 1):
         px, dx = pixel_profile(offset[:, 0], sigma_px, radius)
         py, dy = pixel_profile(offset[:, 1], sigma_px, radius)
@@ -96,13 +99,13 @@ def fit_points(
         # A whiff of a prior (positions within ~3 px of the start) keeps sources without light solvable.
         normal[:, [0, 1], [0, 1]] += 0.1
         normal[:, [2, 3], [2, 3]] += 1e-12
+        delta: Array = np.zeros((n, 4))
         if step == 0:  # flux and level first: without a flux the position has no gradient
-            delta = np.zeros((n, 4))
             delta[:, 2:] = np.linalg.solve(normal[:, 2:, 2:], right[:, 2:, None])[..., 0]
         elif step < ITERATIONS:
-            delta = np.linalg.solve(normal, right[..., None])[..., 0]
+            delta[:] = np.linalg.solve(normal, right[..., None])[..., 0]
         else:
-            covariance = np.linalg.inv(normal)
+            covariance[:] = np.linalg.inv(normal)
             break
         offset = offset + np.clip(delta[:, :2], -0.5, 0.5)
         offset = np.clip(offset, -radius, radius)
@@ -117,8 +120,10 @@ def fit_points(
         level=level,
         covariance=covariance,
         chi2=chi2,
-        chi2_pixel=_single_pixel_chi2(data, usable / variance),
+        chi2_pixel=single_pixel_chi2(data, usable / variance),
+        chi2_edge=edge_chi2(data, weights),
         dof=np.maximum(usable.sum(axis=(1, 2)) - 4.0, 1.0),
+        surround=surround,
         significance=against_nothing / np.sqrt(np.maximum(np.sum(filtered * shape, axis=(1, 2)), 1e-300)),
         snr=flux * np.sqrt(own),
     )
@@ -166,20 +171,6 @@ def fit_widths(data: Array, variance: Array, usable: Bools, fits: PointFits, cen
     log_width = np.log(widths_px)
     step = log_width[1] - log_width[0]
     return np.exp(log_width[best] + np.clip(shift, -1, 1) * step)
-
-
-def _single_pixel_chi2(data: Array, weights: Array) -> Array:
-    """chi^2 (n,) of the model "a constant and one bright pixel": a hot pixel, whatever its brightness."""
-    n = len(data)
-    flat, w = data.reshape(n, -1), weights.reshape(n, -1).copy()
-    middle = data.shape[1] // 2
-    inner = data[:, middle - 1 : middle + 2, middle - 1 : middle + 2].reshape(n, -1)
-    brightest = np.argmax(inner, axis=1)
-    index = (middle - 1 + brightest // 3) * data.shape[1] + middle - 1 + brightest % 3
-    w[np.arange(n), index] = 0.0
-    total = np.maximum(w.sum(axis=1), 1e-300)
-    level = (w * flat).sum(axis=1) / total
-    return (w * np.square(flat - level[:, None])).sum(axis=1)
 
 
 def radius_for(sigma_px: float) -> int:

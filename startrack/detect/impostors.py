@@ -1,0 +1,54 @@
+"""What is not a star but fools a matched filter: single bright pixels, and edges or lines that cross the stamp."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from startrack.types import Array, Ints
+
+DIRECTIONS = 8
+
+
+def single_pixel_chi2(data: Array, weights: Array) -> Array:
+    """chi^2 (n,) of stamps (n, s, s) as a constant and one bright pixel: a hot pixel, whatever its brightness."""
+    n = len(data)
+    flat, w = data.reshape(n, -1), weights.reshape(n, -1).copy()
+    middle = data.shape[1] // 2
+    inner = data[:, middle - 1 : middle + 2, middle - 1 : middle + 2].reshape(n, -1)
+    brightest = np.argmax(inner, axis=1)
+    index = (middle - 1 + brightest // 3) * data.shape[1] + middle - 1 + brightest % 3
+    w[np.arange(n), index] = 0.0
+    total = np.maximum(w.sum(axis=1), 1e-300)
+    level = (w * flat).sum(axis=1) / total
+    return (w * np.square(flat - level[:, None])).sum(axis=1)
+
+
+def edge_chi2(data: Array, weights: Array) -> Array:
+    """chi^2 (n,) of stamps (n, s, s) as straight stripes of any brightness, in the best of eight directions.
+
+    A skyline, the edge of the image circle, a bad column, a satellite's trail: what varies in one direction only.
+    """
+    n, side = len(data), data.shape[1]
+    w = weights.reshape(n, -1)
+    moment = w * data.reshape(n, -1)
+    power = np.sum(moment * data.reshape(n, -1), axis=1)
+    best = np.full(n, np.inf)
+    for stripes in _stripes(side):
+        total, light = w @ stripes, moment @ stripes
+        best = np.minimum(best, power - np.sum(light * light / np.maximum(total, 1e-300), axis=1))
+    return best
+
+
+@lru_cache(maxsize=16)
+def _stripes(side: int) -> tuple[Array, ...]:
+    """For each direction, which pixel (s^2) lies in which stripe of one pixel's width (s^2, stripes): 0 or 1."""
+    offset = np.arange(side) - side // 2
+    x, y = np.tile(offset, side), np.repeat(offset, side)
+    masks = []
+    for turn in np.arange(DIRECTIONS) * np.pi / DIRECTIONS:
+        stripe: Ints = np.rint(x * np.cos(turn) + y * np.sin(turn)).astype(np.int64)
+        _, number = np.unique(stripe, return_inverse=True)
+        masks.append(np.eye(number.max() + 1)[number])
+    return tuple(masks)

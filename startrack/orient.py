@@ -115,9 +115,11 @@ def _robust(weight: Array, chi2: Array) -> Array:
 def _extra_variance(residual_px: Array, covariance_px2: Array) -> float:
     """Variance per axis [px^2] to add to every centroid so that the median normalised residual is as expected."""
 
+    axes_px2, axes = np.linalg.eigh(covariance_px2)
+    squared = np.square(np.einsum("nij,ni->nj", axes, residual_px))
+
     def median_chi2(extra: float) -> float:
-        weight = np.linalg.inv(covariance_px2 + extra * np.eye(2))
-        return float(np.median(np.einsum("ni,nij,nj->n", residual_px, weight, residual_px)))
+        return float(np.median(np.sum(squared / (axes_px2 + extra), axis=1)))
 
     low, high = 1e-6, 1.0
     if median_chi2(low) <= CHI2_2DOF_MEDIAN:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from startrack.types import BadInput
+from startrack.errors import BadInput
 
 PACKAGE = Path(__file__).resolve().parent
 

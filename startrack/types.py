@@ -1,4 +1,4 @@
-"""The values that cross module borders, and the exceptions.
+"""The values that cross module borders (and, from errors.py, the exceptions).
 
 Every value is frozen, keyword-only and shape-checked; its arrays are read-only. A stage returns a complete value
 or raises `NoSolution`; there is no NaN, sentinel or half-filled result. Conventions: CONVENTIONS.md.
@@ -13,41 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.errors import BadInput, NoSolution, NotIdentified, NotLocated, TooFewStars
+
+__all__ = [
+    "Array", "Attitude", "BadInput", "Body", "Bools", "Detections", "Evidence", "Exposure", "Fix", "Identification",
+    "Ints", "Mode", "NoSolution", "NotIdentified", "NotLocated", "Stars", "TooFewStars", "Value", "array",
+]  # fmt: skip
+
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
-
-
-class BadInput(Exception):
-    """Input that cannot be used (exit code 4). `reason` is one of the codes of the result format."""
-
-    def __init__(self, reason: str, message: str) -> None:
-        super().__init__(message)
-        self.reason = reason
-
-
-class NoSolution(Exception):
-    """A stage found no answer it can stand by (exit code 3). The message says what to try."""
-
-    reason = "inconsistent_evidence"
-
-    def __init__(self, message: str, reason: str | None = None, **evidence: Any) -> None:
-        super().__init__(message)
-        if reason is not None:
-            self.reason = reason
-        self.evidence = evidence
-
-
-class TooFewStars(NoSolution):
-    reason = "no_stars"
-
-
-class NotIdentified(NoSolution):
-    reason = "not_identified"
-
-
-class NotLocated(NoSolution):
-    reason = "insufficient_geometry"
 
 
 def _shaped(**kinds: Any) -> Any:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.types import BadInput
+from startrack.errors import BadInput
 
 if TYPE_CHECKING:
     from startrack.camera import Camera

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from startrack.cli.common import Outcome, add_image_flags, camera_of, read, refused, result_path, run_images
-from startrack.types import BadInput
+from startrack.errors import BadInput
 
 FORMAT = "startrack.fix/1"
 

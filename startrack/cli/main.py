@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 
 from startrack import __version__
-from startrack.types import BadInput, NoSolution
+from startrack.errors import BadInput, NoSolution
 
 COMMANDS = ("locate", "identify", "detect", "render", "doctor", "schema")
 OK, INTERNAL_ERROR, USAGE, REFUSED, BAD_INPUT = 0, 1, 2, 3, 4

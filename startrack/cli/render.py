@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.types import BadInput
+from startrack.errors import BadInput
 
 if TYPE_CHECKING:
     from startrack.render import Scene, Series, Truth

@@ -34,11 +34,13 @@ class ChanceModel:
 
     def log_odds(self, matched: Array, predicted: Array, radius_rad: float, given: int = 3) -> Array:
         """log P(at least `matched` of `predicted` stars coincide by chance); the `given` stars of the pattern are free."""
-        from scipy.stats import binom
+        from scipy.special import betainc
 
         n = np.maximum(predicted - given, 0)
         k = np.maximum(matched - given, 0)
-        return np.where(k > 0, binom.logsf(k - 1, n, self.probability(radius_rad)), 0.0)
+        # The binomial tail as an incomplete beta function: P(X >= k) = I_p(k, n - k + 1).
+        tail = betainc(np.maximum(k, 1), np.maximum(n - k, 0) + 1, self.probability(radius_rad))
+        return np.where(k > 0, np.log(np.maximum(tail, 1e-300)), 0.0)
 
 
 def _fibonacci_sphere(n: int) -> Array:

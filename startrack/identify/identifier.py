@@ -12,7 +12,7 @@ from startrack.identify.index import PatternIndex, build_index
 from startrack.identify.match import Matches, match
 from startrack.identify.triangles import triangles
 from startrack.orient import AttitudeFit, solve_attitude, wahba
-from startrack.types import Array, Detections, Identification, Ints, NotIdentified, Stars
+from startrack.types import Array, Detections, Identification, NotIdentified, Stars
 
 HYPOTHESES_AT_ONCE = 256
 MOST_HYPOTHESES = 60_000
@@ -87,7 +87,7 @@ class Identifier:
             star=star,
             R_cam_icrs=fit.attitude.R_cam_icrs,
             false_alarm_probability=float(np.exp(max(log_chance, -690.0))),
-            unexplained=_unexplained(detections, camera, stars, fit.attitude.R_cam_icrs),
+            unexplained=_unexplained(detections, camera, stars, fit.attitude.R_cam_icrs, matches.zero_mag),
         )
 
 
@@ -183,18 +183,16 @@ def _refined(detections: Detections, camera: Camera, stars: Stars, R: Array) -> 
     return fit, matches
 
 
-def _unexplained(detections: Detections, camera: Camera, stars: Stars, R: Array) -> int:
-    """Significant detections with no catalogue star near."""
+def _unexplained(detections: Detections, camera: Camera, stars: Stars, R: Array, zero_mag: float) -> int:
+    """Significant detections with no catalogue star near that could be a part of their light."""
     from scipy.spatial import cKDTree
 
-    px, inside = camera.project(stars.rays_icrs @ R.T)
-    significant = detections.snr > SIGNIFICANT_SNR
-    if not inside.any() or not significant.any():
-        return int(significant.sum())
+    significant = np.flatnonzero(detections.snr > SIGNIFICANT_SNR)
+    if not len(significant):
+        return 0
+    faintest = zero_mag - 2.5 * np.log10(detections.flux_e[significant].min()) + 2.0
+    px, inside = camera.project(stars.rays_icrs[: int(np.searchsorted(stars.v_mag, faintest))] @ R.T)
+    if not inside.any():
+        return len(significant)
     distance, _ = cKDTree(px[inside]).query(detections.xy_px[significant], distance_upper_bound=GATES_PX[-1])
     return int(np.count_nonzero(~np.isfinite(distance)))
-
-
-def matched(detections: Detections, stars: Stars, found: Identification) -> tuple[Array, Array, Ints]:
-    """Pixels (n, 2), apparent rays (n, 3) and Hipparcos numbers (n,) of the matches."""
-    return detections.xy_px[found.detection], stars.rays_icrs[found.star], stars.hip[found.star]

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.types import Array, Detections, Ints, Stars
+from startrack.types import Array, Bools, Detections, Ints, Stars
 
 BLEND_FLUX_RATIO = 0.25  # a neighbour with more than this part of a star's light makes the identity ambiguous
+BRIGHT_STARS = 5000  # enough of the sky's brightest to set the brightness scale
 FIRST_MATCHES = 60
 MAGNITUDE_TOLERANCE = 0.8
 DEPTH_BELOW_THRESHOLD_MAG = 0.7
@@ -36,19 +37,26 @@ def match(
     from scipy.spatial import cKDTree
 
     none = np.zeros(0, dtype=np.int64)
-    predicted_px, inside = camera.project(stars.rays_icrs @ R_cam_icrs.T)
-    seen = np.flatnonzero(inside)
-    if not len(seen) or not len(detections):
+    if not len(detections):
         return Matches(none, none, np.zeros(0), 0.0, 0)
     tree = cKDTree(detections.xy_px)
-    distance, nearest = tree.query(predicted_px[seen], distance_upper_bound=gate_px)
-    hit = np.isfinite(distance)
     brightness = -2.5 * np.log10(np.maximum(detections.flux_e, 1e-9))
+
+    def nearest_to(count: int) -> tuple[Array, Ints, Array, Ints, Bools]:
+        """Predicted pixels and, of the `count` brightest stars, those in the frame with their nearest detections."""
+        predicted_px, inside = camera.project(stars.rays_icrs[:count] @ R_cam_icrs.T)
+        seen = np.flatnonzero(inside)
+        distance, nearest = tree.query(predicted_px[seen], distance_upper_bound=gate_px)
+        return predicted_px, seen, distance, nearest, np.isfinite(distance)
+
+    _, seen, _, nearest, hit = nearest_to(BRIGHT_STARS)
     first = np.flatnonzero(hit)[:FIRST_MATCHES]
     if len(first) < 3:
         return Matches(none, none, np.zeros(0), 0.0, len(seen))
     zero_mag = float(np.median(stars.v_mag[seen[first]] - brightness[nearest[first]]))
     limit = zero_mag + float(np.max(brightness)) + DEPTH_BELOW_THRESHOLD_MAG
+    faintest = limit - 2.5 * np.log10(BLEND_FLUX_RATIO)
+    predicted_px, seen, distance, nearest, hit = nearest_to(int(np.searchsorted(stars.v_mag, faintest)))
     candidates = hit & (stars.v_mag[seen] < limit)
     measured_mag = brightness[nearest[candidates]] + zero_mag
     star = seen[candidates]

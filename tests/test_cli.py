@@ -1,0 +1,367 @@
+"""The commands as a script meets them: exit codes, refusals, what is printed and what is written."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from startrack.cli.main import main
+
+ROOT = Path(__file__).parent.parent
+SAMPLES = ROOT / "sample_images"
+SIZE = 256
+CAMERA = f"""
+format = 1
+name = "small"
+size_px = [{SIZE}, {SIZE}]
+focal_px = [80.0, 80.0]
+centre_px = [127.5, 127.5]
+max_angle_deg = 92.5
+[sensor]
+zero_point_e_per_s = 44000.0
+gain_e_per_adu = 0.5
+bias_adu = 100.0
+read_noise_e = 2.5
+"""
+FACTS = {"time_utc": "2030-01-01T00:00:00Z", "exposure_s": 1.0, "camera": "small.toml", "terrain": "shackleton-thesis"}
+OK, ERROR, USAGE, REFUSED, BAD_INPUT = 0, 1, 2, 3, 4
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    (tmp_path / "small.toml").write_text(CAMERA)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def write_image(name, pixels, **facts):
+    """An image with a sidecar; a fact given as None is left out."""
+    path = Path(name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    ok, data = cv2.imencode(path.suffix, pixels)
+    assert ok
+    path.write_bytes(data.tobytes())
+    known = {key: value for key, value in (FACTS | facts).items() if value is not None}
+    path.with_suffix(".json").write_text(json.dumps(known))
+    return name
+
+
+def black(name="black.png", shape=(SIZE, SIZE), **facts):
+    return write_image(name, np.zeros(shape, np.uint16), **facts)
+
+
+def noise(name="noise.png", seed=1, **facts):
+    pixels = np.random.default_rng(seed).normal(200, 12, (SIZE, SIZE))
+    return write_image(name, pixels.round().astype(np.uint16), **facts)
+
+
+def stars(name="stars.png", **facts):
+    """A handful of point sources that are no part of the sky: enough for `detect`, not for `identify`."""
+    rng = np.random.default_rng(2)
+    y, x = np.mgrid[:SIZE, :SIZE]
+    pixels = rng.normal(200, 12, (SIZE, SIZE))
+    for cx, cy in rng.uniform(20, SIZE - 20, (12, 2)):
+        pixels += 900 * np.exp(-0.5 * ((x - cx) ** 2 + (y - cy) ** 2))
+    return write_image(name, pixels.round().astype(np.uint16), **facts)
+
+
+def truncated(name="cut.png"):
+    noise(name)
+    whole = Path(name).read_bytes()
+    Path(name).write_bytes(whole[: len(whole) // 2])
+    return name
+
+
+def run(capsys, *words):
+    """Exit code, the JSON objects or lines on stdout, and stderr."""
+    code = main(list(words))
+    out, err = capsys.readouterr()
+    return code, out.splitlines(), err
+
+
+def reason(capsys, *words):
+    """Exit code and reason of one image, with the file that was written beside what was printed."""
+    code, lines, err = run(capsys, *words, "--json", "--no-plots")
+    assert err == ""
+    (line,) = lines
+    record = json.loads(line)
+    assert record["status"] == "refused"
+    assert record["message"]
+    assert "\n" not in record["message"]
+    assert "position" not in record
+    return code, record["reason"]
+
+
+def shell(*words, cwd, **environment):
+    """The real command in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "startrack.cli.main", *words],
+        cwd=cwd, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+    )  # fmt: skip
+
+
+# --- what cannot be solved is refused --------------------------------------------------------------------------------
+
+
+def test_a_black_frame_holds_no_stars(folder, capsys):
+    assert reason(capsys, "locate", black()) == (REFUSED, "no_stars")
+
+
+def test_a_saturated_frame_holds_no_stars(folder, capsys):
+    image = write_image("day.png", np.full((SIZE, SIZE), 65535, np.uint16))
+    assert reason(capsys, "locate", image) == (REFUSED, "no_stars")
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_pure_noise_is_never_a_sky(folder, capsys, seed):
+    code, why = reason(capsys, "locate", noise(seed=seed))
+    assert (code, why) in {(REFUSED, "no_stars"), (REFUSED, "not_identified")}
+
+
+def test_point_sources_that_are_no_sky_are_not_identified(folder, capsys):
+    assert reason(capsys, "locate", stars()) == (REFUSED, "not_identified")
+    assert reason(capsys, "identify", "stars.png") == (REFUSED, "not_identified")
+
+
+# --- bad input -------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_no_image_is_bad_input(folder, capsys):
+    Path("empty.png").write_bytes(b"")
+    Path("text.png").write_text("not a picture")
+    Path("folder.png").mkdir()
+    for image in (truncated(), "missing.png", "empty.png", "text.png", "folder.png"):
+        assert reason(capsys, "locate", image) == (BAD_INPUT, "bad_image"), image
+
+
+@pytest.mark.parametrize(
+    ("facts", "expected"),
+    [
+        ({"time_utc": None}, "no_time"),
+        ({"time_utc": "2030-01-01T00:00:00+02:00"}, "no_time"),
+        ({"time_utc": "yesterday"}, "no_time"),
+        ({"camera": None}, "no_calibration"),
+        ({"camera": "nobodys.toml"}, "no_calibration"),
+        ({"camera": "nobodys-camera"}, "no_calibration"),
+        ({"camera": "broken.toml"}, "bad_calibration"),
+        ({"camera": "fisheye-2048"}, "size_mismatch"),
+        ({"terrain": None}, "bad_terrain"),
+        ({"terrain": "nowhere"}, "bad_terrain"),
+        ({"terrain": "broken.toml"}, "bad_terrain"),
+    ],
+)
+def test_facts_that_lack_or_are_wrong_are_named(folder, capsys, facts, expected):
+    Path("broken.toml").write_text("format = 1\nsize_px = [")
+    assert reason(capsys, "locate", stars(**facts)) == (BAD_INPUT, expected)
+
+
+def test_a_sidecar_that_cannot_be_read_is_bad_input(folder, capsys):
+    stars()
+    Path("stars.json").write_text("{")
+    assert reason(capsys, "locate", "stars.png") == (BAD_INPUT, "bad_image")
+
+
+def test_flags_come_before_the_sidecar(folder, capsys):
+    image = stars(time_utc="rubbish", camera="nobodys", terrain="nowhere")
+    flags = ["--time", "2030-01-01T00:00:00", "--camera", "small.toml", "--terrain", "shackleton-thesis"]
+    assert reason(capsys, "locate", image, *flags) == (REFUSED, "not_identified")
+    assert reason(capsys, "locate", image, *flags, "--time", "2030-01-01T00:00:00+01:00") == (BAD_INPUT, "no_time")
+
+
+def test_identify_and_detect_need_no_time_and_detect_no_camera(folder, capsys):
+    assert reason(capsys, "identify", stars(time_utc=None)) == (REFUSED, "not_identified")
+    code, (line,), _ = run(capsys, "detect", stars("bare.png", camera=None, time_utc=None), "--json")
+    assert code == OK
+    assert len(json.loads(line)["detections"]) == 12
+
+
+# --- several images --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kinds", "expected"),
+    [("ok", OK), ("ok dark", REFUSED), ("dark cut ok", BAD_INPUT), ("cut ok dark ok", BAD_INPUT), ("ok ok", OK)],
+)
+def test_the_exit_code_is_that_of_the_worst_image(folder, capsys, kinds, expected):
+    make = {"ok": stars, "dark": black, "cut": truncated}
+    images = [make[kind](f"{k}-{kind}.png") for k, kind in enumerate(kinds.split())]
+    code, lines, err = run(capsys, "detect", *images, "--json", "--no-plots")
+    assert (code, err) == (expected, "")
+    records = [json.loads(line) for line in lines]
+    assert [record["image"] for record in records] == images
+    assert [record["status"] for record in records] == ["ok" if "ok" in image else "refused" for image in images]
+
+
+def test_without_json_there_is_one_line_for_each_image(folder, capsys):
+    code, lines, err = run(capsys, "detect", stars(), black(), "missing.png", "--no-plots")
+    assert (code, err) == (BAD_INPUT, "")
+    starts = [["stars.png", "ok"], ["black.png", "refused"], ["missing.png", "refused"]]
+    assert [line.split()[:2] for line in lines] == starts
+    code, lines, err = run(capsys, "detect", "stars.png", "black.png", "--no-plots", "--quiet")
+    assert (code, lines) == (REFUSED, [])
+    assert err.startswith("black.png  refused  no_stars: ")
+
+
+# --- names and files -------------------------------------------------------------------------------------------------
+
+
+def test_names_may_hold_spaces_and_any_letter(folder, capsys):
+    image = stars("nuit étoilée 星空/mon image.v1.png", camera="../small.toml")
+    code, _, _ = run(capsys, "detect", image, "-D", "résultats à moi")
+    assert code == OK
+    names = sorted(path.name for path in Path("résultats à moi").iterdir())
+    assert names == ["mon image.v1.annotated.png", "mon image.v1.detections.json"]
+
+
+def test_equal_stems_keep_their_suffix_and_equal_names_a_number(folder, capsys):
+    images = [stars("a.png"), stars("a.tif"), stars("b/c.png", camera="../small.toml"), stars("d.png")]
+    images.append(stars("e/d.png", camera="../small.toml"))
+    code, _, _ = run(capsys, "detect", *images, "--no-plots")
+    assert code == OK
+    written = sorted(path.name for path in Path("startrack-out").iterdir())
+    ends = (".detections.json",)
+    assert written == sorted(f"{stem}{end}" for stem in ("a.png", "a.tif", "c", "d.png", "d.png-2") for end in ends)
+
+
+def test_a_result_is_renewed_but_never_that_of_another_image(folder, capsys):
+    stars("one/x.png", camera="../small.toml")
+    stars("two/x.png", camera="../small.toml")
+    pixels = cv2.imread("two/x.png", cv2.IMREAD_UNCHANGED)
+    write_image("two/x.png", pixels[::-1].copy(), camera="../small.toml")
+    result = Path("startrack-out/x.detections.json")
+    assert run(capsys, "detect", "one/x.png", "--no-plots")[0] == OK
+    first = json.loads(result.read_text())["provenance"]["image_sha256"]
+    assert run(capsys, "detect", "one/x.png", "--no-plots")[0] == OK
+    code, lines, err = run(capsys, "detect", "two/x.png", "--no-plots")
+    assert code != OK
+    assert "x.detections.json" in " ".join([*lines, err])
+    assert json.loads(result.read_text())["provenance"]["image_sha256"] == first
+    assert run(capsys, "detect", "two/x.png", "--no-plots", "-O")[0] == OK
+    assert json.loads(result.read_text())["provenance"]["image_sha256"] != first
+
+
+def test_a_refused_image_leaves_its_reason_in_the_file_too(folder, capsys):
+    assert reason(capsys, "locate", black()) == (REFUSED, "no_stars")
+    record = json.loads(Path("startrack-out/black.fix.json").read_text())
+    assert (record["status"], record["reason"]) == ("refused", "no_stars")
+    assert record["provenance"]["time_utc"] == "2030-01-01T00:00:00.000000Z"
+    assert not Path("startrack-out/black.stars.ecsv").exists()
+
+
+def test_the_same_image_gives_the_same_bytes(folder, capsys):
+    shutil.copy(stars(), "again.png")
+    texts = []
+    for out in ("a", "b"):
+        assert run(capsys, "detect", "stars.png", "-D", out)[0] == OK
+        record = json.loads(Path(out, "stars.detections.json").read_text())
+        assert record.pop("timing_ms")["detect"] > 0
+        texts.append(json.dumps(record))
+    assert texts[0] == texts[1]
+    assert Path("a/stars.annotated.png").read_bytes() == Path("b/stars.annotated.png").read_bytes()
+
+
+# --- the command itself ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("words", ["", "nothing", "locate", "locate x.png --nothing", "schema nothing", "render -n -1"])
+def test_wrong_usage_is_two_and_says_how(folder, words):
+    done = shell(*words.split(), cwd=folder)
+    assert done.returncode == USAGE
+    assert "usage: startrack" in done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_no_refusal_shows_a_traceback(folder):
+    images = [truncated(), black(), noise(), "missing.png", stars("s.png", time_utc=None)]
+    done = shell("locate", *images, "--no-plots", cwd=folder)
+    assert done.returncode == BAD_INPUT
+    assert len(done.stdout.splitlines()) == len(images)
+    assert done.stderr == ""
+
+
+def test_output_that_cannot_be_written_is_said_in_one_line(folder):
+    stars()
+    Path("file").write_text("")
+    done = shell("detect", "stars.png", "-D", "file/below", cwd=folder)
+    assert done.returncode in (ERROR, BAD_INPUT)
+    assert "Traceback" not in done.stderr + done.stdout
+    assert "file/below" in done.stderr + done.stdout
+
+
+def test_a_plain_terminal_is_enough(folder):
+    """An ASCII locale must not turn a result into an error."""
+    stars()
+    done = shell("detect", "stars.png", "--no-plots", cwd=folder, LC_ALL="C", PYTHONUTF8="0", PYTHONIOENCODING="ascii")
+    assert (done.returncode, done.stderr) == (OK, "")
+
+
+def test_version_and_help(folder):
+    assert shell("--version", cwd=folder).stdout.startswith("startrack 0.")
+    for command in ("locate", "identify", "detect", "render", "doctor", "schema"):
+        done = shell(command, "--help", cwd=folder)
+        assert (done.returncode, done.stderr) == (OK, "")
+
+
+def test_doctor_finds_all_well(folder, capsys):
+    assert main(["doctor", "--json"]) == OK
+    record = json.loads(capsys.readouterr().out)
+    assert [check["name"] for check in record["checks"] if not check["ok"]] == []
+    assert {"catalogue", "cameras", "terrains", "kernels", "self-test"} <= {check["name"] for check in record["checks"]}
+
+
+# --- round trips -----------------------------------------------------------------------------------------------------
+
+
+def test_render_then_locate(folder, capsys):
+    """The default camera and crater, no flag but the seed; a plain ASCII locale, as on a robot."""
+    assert main(["render", "--seed", "11", "-o", "rover 1.png"]) == OK
+    truth = json.loads(Path("rover 1.truth.json").read_text())
+    capsys.readouterr()
+    code, (line,), err = run(capsys, "locate", "rover 1.png", "--json")
+    assert (code, err) == (OK, "")
+    record = json.loads(line)
+    position = record["position"]
+    error_m = np.hypot(position["east_m"] - truth["east_m"], position["north_m"] - truth["north_m"])
+    assert error_m < min(position["radius999_m"], 40.0)
+    for key, tolerance_deg in (("heading_deg", 0.01), ("pitch_deg", 0.005), ("roll_body_deg", 0.005)):
+        assert record["attitude"][key] == pytest.approx(truth[key], abs=tolerance_deg)
+    assert abs(np.dot(record["attitude"]["quat_xyzw_cam_icrs"], truth["quat_xyzw_cam_icrs"])) > 1 - 1e-9
+    assert record["stars"]["identified"] > 500
+    assert json.loads(Path("startrack-out/rover 1.fix.json").read_text()) == record
+
+
+@pytest.mark.parametrize("name", ["near-centre", "tilted"])
+def test_the_samples_are_located_without_a_flag(folder, capsys, name):
+    code, (line,), _ = run(capsys, "locate", str(SAMPLES / f"{name}.png"), "--json", "--no-plots")
+    assert code == OK
+    record = json.loads(line)
+    truth = json.loads((SAMPLES / f"{name}.truth.json").read_text())
+    position = record["position"]
+    miss_m = np.array([position["east_m"], position["north_m"]]) - truth["position_enu_m"][:2]
+    assert np.hypot(*miss_m) < min(position["radius999_m"], 40.0)
+    assert miss_m @ np.linalg.solve(position["covariance_m2"], miss_m) < 13.8  # 99.9 % of chi^2 with 2 dof
+    assert position["up_m"] == pytest.approx(1.5)
+
+
+def test_a_wrong_time_turns_the_place_about_the_axis_of_a_round_crater(folder, capsys):
+    """Near the pole six hours turn the sky by 3.3 degrees about the zenith, and in a round crater nothing tells.
+
+    The Moon's rotation: 13.17635815 degrees a day (IAU 2015 report, Archinal et al. 2018, table 2).
+    """
+    image = str(SAMPLES / "near-wall.png")
+    truth = json.loads((SAMPLES / "near-wall.truth.json").read_text())
+    code, (line,), _ = run(capsys, "locate", image, "--time", "2029-09-08T09:12:45Z", "--json", "--no-plots")
+    assert code == OK
+    found, attitude = json.loads(line)["position"], json.loads(line)["attitude"]
+    turn = np.degrees(np.arctan2(found["east_m"], found["north_m"]) - np.arctan2(truth["east_m"], truth["north_m"]))
+    expected = 13.17635815 * 6 / 24
+    assert abs(turn) == pytest.approx(expected, abs=0.2)
+    assert attitude["heading_deg"] - truth["heading_deg"] == pytest.approx(turn, abs=0.2)
+    true_m, found_m = (np.hypot(place["east_m"], place["north_m"]) for place in (truth, found))
+    assert found_m == pytest.approx(true_m, abs=20)

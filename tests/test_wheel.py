@@ -1,0 +1,87 @@
+"""The wheel: what is in it, and that it works away from the checkout."""
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+BUILD = "from hatchling.build import build_wheel; import sys; print(build_wheel(sys.argv[1]))"
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    out = tmp_path_factory.mktemp("wheel")
+    done = subprocess.run([sys.executable, "-c", BUILD, str(out)], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return out / done.stdout.splitlines()[-1]
+
+
+@pytest.fixture(scope="module")
+def unpacked(wheel, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder)
+    return folder
+
+
+def names(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        return set(archive.namelist())
+
+
+def elsewhere(unpacked, folder, *words):
+    """`python words` with the wheel's content alone, in another folder."""
+    done = subprocess.run(
+        [sys.executable, *words], cwd=folder, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(unpacked)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_catalogue_cameras_and_terrains_are_inside(wheel):
+    inside = names(wheel)
+    for kind, ends in {"catalogs": ("*.npy", "star_names.csv"), "calib": ("*.toml",), "terrain": ("*.toml",)}.items():
+        wanted = {path.name for end in ends for path in (ROOT / kind).glob(end)}
+        assert wanted
+        assert {f"startrack/data/{kind}/{name}" for name in wanted} <= inside
+    sources = {str(path.relative_to(ROOT)) for path in (ROOT / "startrack").rglob("*.py")}
+    assert sources <= inside
+
+
+def test_nothing_else_is_inside(wheel):
+    inside = names(wheel)
+    assert {name.split("/")[0].split("-")[0] for name in inside} == {"startrack"}
+    assert not [name for name in inside if "test" in name.lower() or "sample" in name or name.endswith(".pyc")]
+    assert any(name.endswith("dist-info/licenses/LICENSE") for name in inside)
+    assert wheel.stat().st_size < 5e6
+
+
+def test_it_works_away_from_the_checkout(unpacked, tmp_path):
+    where = elsewhere(unpacked, tmp_path, "-c", "import startrack; print(startrack.__file__)").strip()
+    assert Path(where).is_relative_to(unpacked)
+    image = str(ROOT / "sample_images/near-wall.png")
+    out = elsewhere(unpacked, tmp_path, "-m", "startrack.cli.main", "locate", image, "--json", "--no-plots")
+    position = json.loads(out)["position"]
+    assert abs(position["east_m"] + 6900) < 40
+    assert abs(position["north_m"] - 4700) < 40
+
+
+def test_every_shipped_file_is_read_from_it(unpacked, tmp_path):
+    out = elsewhere(unpacked, tmp_path, "-m", "startrack.cli.main", "doctor")
+    for kind in ("calib", "terrain"):
+        for path in (ROOT / kind).glob("*.toml"):
+            assert path.stem in out
+
+
+def test_the_command_is_declared(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        (entry,) = [name for name in archive.namelist() if name.endswith("entry_points.txt")]
+        assert "startrack = startrack.cli.main:main" in archive.read(entry).decode()

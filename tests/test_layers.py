@@ -15,8 +15,9 @@ import startrack
 ROOT = Path(startrack.__file__).parent
 
 LAYERS = (  # lowest first; a room imports from lower layers only
-    {"types"},
-    {"paths", "frames"},
+    {"errors"},
+    {"types", "paths"},
+    {"frames"},
     {"psf", "body_angles", "catalog", "bodies", "camera", "terrain", "exposure"},
     {"render", "detect", "identify", "orient", "evidence", "localize", "consistency"},
     {"pipeline"},

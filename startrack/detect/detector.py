@@ -180,13 +180,13 @@ def _is_star(fits: PointFits, threshold_snr: float, misfit: NDArray[np.float64])
     pass by its chi^2; there a source passes whose `misfit` (n,) is like theirs.
     """
     point = (fits.chi2 < fits.chi2_pixel) & (fits.chi2 < fits.chi2_edge + EDGE_MARGIN)
-    bright = point & (fits.snr > BRIGHT_SNR)
+    by_itself = fits.flux / np.sqrt(fits.covariance[:, 2, 2])
+    bright = point & (by_itself > BRIGHT_SNR)
     typical = float(np.median(misfit[bright])) if np.count_nonzero(bright) >= FEWEST_BRIGHT else 0.0
     like_the_others = misfit < (ROUGH_PSF_SPREAD * typical if typical > ROUGH_PSF_MISFIT else 0.0)
     # On a slope or at the skyline the surroundings do not tell the level; there the stamp must tell by itself.
     level_sigma = np.sqrt(fits.covariance[:, 3, 3])
     even = np.abs(fits.level - fits.surround) < UNEVEN_SIGMA * level_sigma
-    by_itself = fits.flux / np.sqrt(fits.covariance[:, 2, 2])
     stands_out = (by_itself >= threshold_snr) | (
         even & (fits.significance >= threshold_snr) & (by_itself >= OWN_LEVEL_PART * threshold_snr)
     )

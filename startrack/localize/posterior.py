@@ -7,15 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.localize.likelihood import Sectors
-from startrack.localize.rays import bundled
+from startrack.localize.profile import Profile
 from startrack.localize.scout import likely_places, taken
-from startrack.localize.search import Boxes, bounded, centre_scores, on_ground, whole_area
+from startrack.localize.search import Boxes, RayBoxes, by_sector, centre_scores, ray_by_ray, split
 from startrack.localize.summary import summarize
 from startrack.terrain import Terrain
 from startrack.types import Array, Evidence, Fix, NotLocated
 
-RAY_BY_RAY_M = 12.0  # boxes below this half side are asked ray by ray and judged at their centres
 FEWEST_RAYS = 8
+RAY_BY_RAY_M = 20.0  # boxes of this half side and less are asked ray by ray, larger ones sector by sector
 
 
 @dataclass(frozen=True)
@@ -39,46 +39,68 @@ class ExactPosterior:
         told = np.abs(evidence.llr) > 1e-3
         if told.sum() < FEWEST_RAYS:
             raise NotLocated(f"only {int(told.sum())} rays say anything about the skyline: expose longer")
-        boxes, log_weight, dropped = self._explore(taken(evidence, told), terrain)
+        search = _Search(self, taken(evidence, told), terrain)
+        boxes = search.refine(search.exclude())
+        log_weight = search.scores(boxes)
+        dropped = float(np.exp(min(search.log_dropped - _log_mass(log_weight, boxes.half_m), 0.0)))
         return summarize(boxes.centres_m, 2 * boxes.half_m, log_weight, dropped, terrain)
 
-    def _explore(self, evidence: Evidence, terrain: Terrain) -> tuple[Boxes, Array, float]:
-        """Boxes that hold the posterior, log-likelihoods at their centres, and a bound on the probability dropped."""
-        sectors = Sectors.of(evidence, self.sector_width_rad, self.sector_epsilon)
-        rays = bundled(sectors)
-        boxes = bounded(whole_area(sectors, rays, terrain.reach_m), sectors, rays, terrain)
-        best = float(likely_places(evidence, sectors, terrain)[1].max(initial=-np.inf))
-        dropped = -np.inf
-        while True:
-            small = boxes.half_m < RAY_BY_RAY_M
-            if small:
-                boxes = boxes.all_taken_apart(rays)
-                score = centre_scores(boxes, sectors, rays, terrain)
-                log_weight = np.where(terrain.allowed(boxes.centres_m), score, -np.inf)
-                best = max(best, float(log_weight.max(initial=-np.inf)))
-            whole = boxes.upper > best - self.prune_nats
-            dropped = np.logaddexp(dropped, _log_mass(boxes.upper[~whole], boxes.half_m))
-            boxes = boxes.take(whole)
-            if small and self._fine_enough(boxes, log_weight[whole]):
-                break
-            boxes = boxes.split()
-            boxes = bounded(boxes.take(on_ground(boxes, terrain)), sectors, rays, terrain)
-            sure = boxes.lower[np.asarray(terrain.allowed(boxes.centres_m))]
-            best = max(best, float(sure.max(initial=-np.inf)))
-        log_weight = log_weight[whole]
-        total = _log_mass(log_weight, boxes.half_m)
-        return boxes, log_weight, float(np.exp(min(dropped - total, 0.0)))
 
-    def _fine_enough(self, boxes: Boxes, log_weight: Array) -> bool:
+class _Search:
+    """One run: what is known of the best place, and how much probability was given up."""
+
+    def __init__(self, method: ExactPosterior, evidence: Evidence, terrain: Terrain) -> None:
+        self.method, self.terrain = method, terrain
+        self.sectors = Sectors.of(evidence, method.sector_width_rad, method.sector_epsilon)
+        self.profile = Profile.of(self.sectors)
+        self.best = float(likely_places(evidence, self.sectors, terrain)[1].max(initial=-np.inf))
+        self.log_dropped = -np.inf
+
+    def exclude(self) -> RayBoxes:
+        """From the whole area down to small boxes, by look-ups."""
+        centres, half = np.zeros((1, 2)), float(self.terrain.reach_m)
+        while True:
+            boxes, first, last = by_sector(centres, half, self.sectors, self.profile, self.terrain)
+            keep = self._promising(boxes)
+            boxes, first, last = boxes.take(keep), first[keep], last[keep]
+            if half < RAY_BY_RAY_M:
+                return ray_by_ray(boxes, first, last, self.sectors, self.profile, self.terrain)
+            centres, half = boxes.quarters(self.terrain)[0], half / 2
+
+    def refine(self, boxes: RayBoxes) -> RayBoxes:
+        """Quartered until small against the posterior's spread."""
+        while True:
+            score = self.scores(boxes)
+            self.best = max(self.best, float(score.max(initial=-np.inf)))
+            keep = self._promising(boxes)
+            boxes = boxes.take(keep)
+            if self._fine_enough(boxes, score[keep]):
+                return boxes
+            boxes = split(boxes, self.sectors, self.profile, self.terrain)
+
+    def scores(self, boxes: RayBoxes) -> Array:
+        """Log-likelihood (n,) at the centres, minus infinity where the camera cannot be."""
+        score = centre_scores(boxes, self.sectors, self.profile, self.terrain)
+        return np.where(self.terrain.allowed(boxes.centres_m), score, -np.inf)
+
+    def _promising(self, boxes: Boxes) -> Array:
+        """Which boxes (n,) might matter; the others' probability is added to what was given up."""
+        sure = boxes.lower[np.asarray(self.terrain.allowed(boxes.centres_m))]
+        self.best = max(self.best, float(sure.max(initial=-np.inf)))
+        keep = boxes.upper > self.best - self.method.prune_nats
+        self.log_dropped = np.logaddexp(self.log_dropped, _log_mass(boxes.upper[~keep], boxes.half_m))
+        return keep
+
+    def _fine_enough(self, boxes: RayBoxes, log_weight: Array) -> bool:
         if not np.isfinite(log_weight).any():
             return False
-        if boxes.half_m <= self.finest_m or 4 * len(boxes) > self.most_boxes or not len(boxes.ray):
+        if boxes.half_m <= self.method.finest_m or 4 * len(boxes) > self.method.most_boxes or not len(boxes.ray):
             return True
         weight = np.exp(log_weight - log_weight.max())
         centred = boxes.centres_m - np.average(boxes.centres_m, axis=0, weights=weight)
         spread = np.einsum("n,ni,nj->ij", weight, centred, centred) / weight.sum()
         smaller = np.sqrt(max(float(np.linalg.eigvalsh(spread)[0]), 0.0))
-        return 2 * boxes.half_m * self.boxes_per_sigma < smaller
+        return 2 * boxes.half_m * self.method.boxes_per_sigma < smaller
 
 
 def _log_mass(log_density: Array, half_m: float) -> float:

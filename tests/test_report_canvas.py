@@ -120,18 +120,24 @@ def fix_at(east, north, covariance):
     )
 
 
-def test_the_ellipse_is_one_sigma_wide_and_turned_as_the_covariance():
-    """Sigmas of 4 m east and 1 m north, then the same turned to the north-east."""
-    filled = np.array(mixed(MAP, POSITION, 0.35))
-    for covariance, along in (([[16.0, 0.0], [0.0, 1.0]], (1.0, 0.0)), ([[8.5, 7.5], [7.5, 8.5]], (0.7071, 0.7071))):
-        canvas = Canvas(601, 601)
-        view = draw_zoom(canvas, (0, 0, 600, 600), fix_at(30.0, 70.0, covariance), None)
-        y, x = np.nonzero(np.abs(canvas.pixels.astype(int) - filled).sum(axis=-1) < 12)
-        east_north = np.stack([x - 300.0, 300.0 - y], axis=-1) * view.metres_per_px
-        east_north = east_north[np.linalg.norm(east_north, axis=1) < 8.0]  # the 95 % circle is further out
-        assert np.abs(east_north @ np.array(along)).max() == pytest.approx(4.0, abs=0.15)
-        across = east_north @ np.array([-along[1], along[0]])
-        assert np.abs(across).max() == pytest.approx(1.0, abs=0.15)
+@pytest.mark.parametrize(
+    ("covariance", "along"),
+    [
+        ([[16.0, 0.0], [0.0, 1.0]], (1.0, 0.0)),
+        ([[10.6, 7.2], [7.2, 6.4]], (0.8, 0.6)),
+        ([[10.6, -7.2], [-7.2, 6.4]], (0.8, -0.6)),
+    ],
+)
+def test_the_ellipse_is_one_sigma_wide_and_turned_as_the_covariance(covariance, along):
+    """Sigmas of 4 m along the direction (east, north) and of 1 m across it."""
+    canvas, filled = Canvas(601, 601), np.array(mixed(MAP, POSITION, 0.35))
+    view = draw_zoom(canvas, (0, 0, 600, 600), fix_at(30.0, 70.0, covariance), None)
+    y, x = np.nonzero(np.abs(canvas.pixels.astype(int) - filled).sum(axis=-1) < 12)
+    east_north = np.stack([x - 300.0, 300.0 - y], axis=-1) * view.metres_per_px
+    east_north = east_north[np.linalg.norm(east_north, axis=1) < 8.0]  # the 95 % circle is further out
+    assert np.abs(east_north @ np.array(along)).max() == pytest.approx(4.0, abs=0.15)
+    across = east_north @ np.array([-along[1], along[0]])
+    assert np.abs(across).max() == pytest.approx(1.0, abs=0.15)
 
 
 @dataclass(frozen=True)

@@ -88,6 +88,14 @@ def test_a_spoiled_result_does_not_fit(located, kind, spoil, message):
         fits(kind, record)
 
 
+def test_no_position_where_several_places_fit(located):
+    records = [record for kind, record in results(located.result) if kind == "fix" and "position" not in record]
+    for record in records:
+        with pytest.raises(ValidationError):
+            fits("fix", {**record, "position": result_dict(located.result)["position"]})
+    assert {record["status"] for record in records} == {"ambiguous", "refused"}
+
+
 def test_shipped_cameras_and_terrains_fit():
     for kind, folder in (("camera", "calib"), ("terrain", "terrain")):
         files = sorted(data_dir(folder).glob("*.toml"))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from startrack.report.backdrop import View, backdrop, fitted
 from startrack.report.canvas import Canvas
-from startrack.report.horizon_marks import draw_compass, draw_nose, draw_skyline, wall_mask
+from startrack.report.horizon_marks import draw_compass, draw_skyline, wall_mask
 from startrack.report.panel import PANEL_HEIGHT, PANEL_WIDTH, draw_panel
 from startrack.report.star_marks import draw_bodies, draw_detections, draw_hidden, name_stars
 
@@ -28,7 +28,6 @@ def annotate(result: Result, truth_enu_m: tuple[float, float] | None = None) -> 
     draw_detections(canvas, view, result)
     draw_hidden(canvas, view, result)
     draw_skyline(canvas, view, result)
-    draw_nose(canvas, view, result)
     draw_compass(canvas, view, result)
     draw_bodies(canvas, view, result)
     name_stars(canvas, view, result)

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from startrack.camera import Camera
-from startrack.detect import electrons
-from startrack.report.palette import PAPER, SKY_BRIGHT, SKY_DARK, STARLIGHT, WALL, Colour
+from startrack.report.palette import PAPER, SKY_BRIGHT, SKY_DARK, STARLIGHT, WALL
 from startrack.types import Array, Bools
 
 if TYPE_CHECKING:
@@ -20,11 +19,13 @@ if TYPE_CHECKING:
 Image = NDArray[np.float32]
 LONGEST_SIDE_PX = 1400
 SHORTEST_SIDE_PX = 900
-SMOOTHING_PX = 1.0  # where the PSF is not known
+SMOOTHING_PX = (0.5, 3.0)  # of the display, as wide as the PSF within these
 CALM_SNR = 2.6  # fainter light than that is taken for noise and left out
 KNEE_SNR, GLARE_SNR = 5.0, 400.0  # where the stretch turns from linear to logarithmic, and where it ends
-EDGE_PX = 20.0
-BACKGROUND_STEP = 6
+STAR_PX = 15  # on the canvas: what is wider is no star
+EDGE_PX = 8.0
+SAMPLE = 4  # levels are taken from every fourth pixel
+FLAT_SNR = 3.0
 WALL_SHADE = 0.75  # how far the wall's colour replaces the sky's
 MADE_OF_NOISE = 0.6745  # median of the absolute value of a standard normal variable
 
@@ -65,47 +66,44 @@ def backdrop(result: Result, size: tuple[int, int], wall: Image | None = None) -
     if result.camera is not None and result.camera.size_px == result.exposure.size_px:
         inside_px = _inside_px(result.camera, size)
     sky, light = _layers(result, size, inside_px > EDGE_PX)
-    picture = _between(_rgb(SKY_DARK), _rgb(SKY_BRIGHT), sky)
-    if wall is not None:
-        picture = _between(picture, _rgb(WALL), wall * np.float32(WALL_SHADE))
     # Next to the circle's edge the background is not known well, and what is left of it is no light.
     light *= np.clip(inside_px / np.float32(EDGE_PX), 0, 1)
-    picture = _between(picture, _rgb(STARLIGHT), light)
-    picture = _between(_rgb(PAPER), picture, np.clip(inside_px + np.float32(0.5), 0, 1))
-    return np.asarray(picture.astype(np.uint8))
+    shade = None if wall is None else wall * np.float32(WALL_SHADE)
+    lit = np.clip(inside_px + np.float32(0.5), 0, 1)
+    channels = []
+    for dark, bright, rock, star, paper in zip(SKY_DARK, SKY_BRIGHT, WALL, STARLIGHT, PAPER, strict=True):
+        channel = dark + sky * np.float32(bright - dark)
+        if shade is not None:
+            channel += shade * (np.float32(rock) - channel)
+        channel += light * (np.float32(star) - channel)
+        channels.append((paper + lit * (channel - np.float32(paper))).astype(np.uint8))
+    return np.asarray(cv2.merge(channels))
 
 
 def _layers(result: Result, size: tuple[int, int], inside: Bools) -> tuple[Image, Image]:
-    """Smooth background and point-like light, each (H, W) from 0 to 1; the background is known `inside` (H, W)."""
-    found = result.detections
-    if found is not None:
-        image, _ = electrons(result.exposure, result.camera)
-        residual, smooth = image - found.background_e, _resized(found.background_e, size)
-    else:
-        # Without detections nothing is known of the background: the frame as it is, about its median.
-        pixels = result.exposure.pixels_adu
-        residual = pixels - np.float32(np.median(pixels[::4, ::4]))
-        smooth = np.zeros(size[::-1], dtype=np.float32)
-    width_px = float(np.clip(found.psf_sigma_px if found is not None else SMOOTHING_PX, 0.5, 3.0))
-    point = _resized(np.asarray(cv2.GaussianBlur(residual, (0, 0), width_px), dtype=np.float32), size)
-    noise = max(float(np.median(np.abs(point[::4, ::4]))) / MADE_OF_NOISE, 1e-6)
-    light = np.arcsinh(np.maximum(point * np.float32(1 / noise) - np.float32(CALM_SNR), 0) / np.float32(KNEE_SNR))
+    """Smooth background and point-like light, each (H, W) from 0 to 1; the background is known `inside` (H, W).
+
+    The detector's background bridges the skyline in blocks; a median as wide as some stars keeps the skyline's step.
+    """
+    scale = size[0] / result.exposure.size_px[0]
+    width_px = scale * (result.detections.psf_sigma_px if result.detections is not None else 1.0)
+    pixels = _resized(result.exposure.pixels_adu, size)
+    image = np.asarray(cv2.GaussianBlur(pixels, (0, 0), float(np.clip(width_px, *SMOOTHING_PX))), dtype=np.float32)
+    sample, known = image[::SAMPLE, ::SAMPLE], inside[::SAMPLE, ::SAMPLE]
+    low, high = (float(level) for level in np.percentile(sample[known] if known.any() else sample, [0.5, 99.0]))
+    step = max(high - low, 1e-6) / 255
+    levels = np.clip((image - np.float32(low)) * np.float32(1 / step) + np.float32(0.5), 0, 255).astype(np.uint8)
+    smooth = cv2.medianBlur(levels, STAR_PX).astype(np.float32) * np.float32(step) + np.float32(low)
+    light = image - smooth
+    noise = max(
+        float(np.median(np.abs(light[::SAMPLE, ::SAMPLE][known]))) / MADE_OF_NOISE if known.any() else 0.0, 1e-6
+    )
+    light = np.arcsinh(np.maximum(light * np.float32(1 / noise) - np.float32(CALM_SNR), 0) / np.float32(KNEE_SNR))
     light = np.minimum(light / np.float32(np.arcsinh(GLARE_SNR / KNEE_SNR)), 1)
-    return _sky(smooth, inside, noise), np.power(light, np.float32(0.75))
-
-
-def _sky(smooth: Image, inside: Bools, noise: float) -> Image:
-    """The background from 0 (dark) to 1 (bright), carried on beyond where it is known."""
-    step = BACKGROUND_STEP
-    coarse, known = smooth[::step, ::step], inside[::step, ::step].astype(np.float32)
-    if not known.any():
-        return np.zeros_like(smooth)
-    spread = cv2.GaussianBlur(coarse * known, (0, 0), 4.0) / np.maximum(cv2.GaussianBlur(known, (0, 0), 4.0), 1e-3)
-    coarse = np.where(known > 0, coarse, spread)
-    low, high = np.percentile(coarse[known > 0], [2, 98])
+    dark, bright = np.percentile(smooth[::SAMPLE, ::SAMPLE][known] if known.any() else smooth, [2, 98])
     # A background that is flatter than the noise shall look flat.
-    sky = (coarse - np.float32(low)) / np.float32(max(high - low, 3 * noise))
-    return np.asarray(cv2.resize(np.clip(sky, 0, 1), smooth.shape[::-1], interpolation=cv2.INTER_LINEAR))
+    sky = (smooth - np.float32(dark)) / np.float32(max(bright - dark, FLAT_SNR * noise))
+    return np.clip(sky, 0, 1), np.power(light, np.float32(0.75))
 
 
 def _inside_px(camera: Camera, size: tuple[int, int]) -> Image:
@@ -118,14 +116,6 @@ def _inside_px(camera: Camera, size: tuple[int, int]) -> Image:
     )
     radius = np.sqrt(x[None, :] ** 2 + y[:, None] ** 2)
     return np.asarray((np.float32(edge) - radius) * np.float32(min(camera.focal_px) * scale))
-
-
-def _between(a: Image, b: Image, part_of_b: Image) -> Image:
-    return a + part_of_b[:, :, None] * (b - a)
-
-
-def _rgb(colour: Colour) -> Image:
-    return np.array(colour, dtype=np.float32)
 
 
 def _resized(image: Image, size: tuple[int, int]) -> Image:

@@ -52,42 +52,50 @@ def draw_skyline(canvas: Canvas, view: View, result: Result) -> None:
 
 
 def draw_compass(canvas: Canvas, view: View, result: Result) -> None:
-    """Ticks each ten degrees and the letters of the compass, at the horizontal or as low as the frame shows."""
+    """The letters of the compass, the rover's nose, and ticks each ten degrees: at the horizontal, or as low as the
+    frame shows."""
     if result.camera is None or result.attitude is None or result.R_enu_icrs is None:
         return
-    for azimuth_deg in range(0, 360, 10):
-        main, letter = azimuth_deg % 30 == 0, COMPASS.get(azimuth_deg)
-        lowest = _lowest_deg(result, np.radians(azimuth_deg))
-        if lowest is None:
-            continue
-        reach = 2.2 if main else 1.2
-        elevation = np.radians([lowest, lowest + reach, lowest + 5.0])
-        places = view.at(_project(result, np.full(3, np.radians(azimuth_deg)), elevation)[0])
-        canvas.line(places[:2], INK if letter else DIM_INK if main else FAINT_INK, 2 if main else 1)
-        if letter:
-            canvas.text(places[2], letter, LETTER_SIZE, INK, "mm", halo=True)
-        elif main and canvas.is_free(around(places[2], 24.0)):
-            canvas.text(places[2], str(azimuth_deg), 15.0, DIM_INK, "mm", halo=True)
+    lowest_deg = {azimuth_deg: _lowest_deg(result, np.radians(azimuth_deg)) for azimuth_deg in range(0, 360, 10)}
+    feet = {azimuth_deg: lowest for azimuth_deg, lowest in lowest_deg.items() if lowest is not None}
+    for azimuth_deg in sorted(COMPASS.keys() & feet.keys()):
+        at = _place(view, result, np.radians(azimuth_deg), feet[azimuth_deg] + 5.0)
+        canvas.text(at, COMPASS[azimuth_deg], LETTER_SIZE, INK, "mm", halo=True)
+    _draw_nose(canvas, view, result)
+    for azimuth_deg, lowest in feet.items():
+        main, letter = azimuth_deg % 30 == 0, azimuth_deg in COMPASS
+        azimuth_rad = np.radians(azimuth_deg)
+        ends = [_place(view, result, azimuth_rad, lowest + reach) for reach in (0.0, 2.2 if main else 1.2)]
+        canvas.line(np.array(ends), INK if letter else DIM_INK if main else FAINT_INK, 2 if main else 1)
+        at = _place(view, result, azimuth_rad, lowest + 5.0)
+        if main and not letter and canvas.is_free(around(at, 24.0)):
+            canvas.text(at, str(azimuth_deg), 15.0, DIM_INK, "mm", halo=True)
 
 
-def draw_nose(canvas: Canvas, view: View, result: Result) -> None:
-    """An arrow head at the edge of the picture where the rover's nose points, with the heading."""
+def _draw_nose(canvas: Canvas, view: View, result: Result) -> None:
+    """An arrow head where the rover's nose points: at the edge of the picture, or further in where a letter stands."""
     body = R_body_enu(result)
-    if body is None or result.camera is None:
-        return
+    assert body is not None
     heading, _, _ = heading_pitch_roll_from_R_body_enu(body)
     lowest = _lowest_deg(result, heading)
     if lowest is None:
         return
-    elevation = np.radians([lowest, lowest + 0.5, lowest + 6.0, lowest + 9.0])
-    places = view.at(_project(result, np.full(4, heading), elevation)[0])
-    along = places[0] - places[2]
-    along /= np.linalg.norm(along)
+    for further_in_deg in (0.5, 8.5, 16.5):
+        tip = _place(view, result, heading, lowest + further_in_deg)
+        along = tip - _place(view, result, heading, lowest + further_in_deg + 6.0)
+        along /= np.linalg.norm(along)
+        base, name = tip - 26.0 * along, tip - 48.0 * along
+        if canvas.is_free(around(base, 20.0)) and canvas.is_free(around(name, 20.0)):
+            break
     across = np.array([-along[1], along[0]])
-    tip, base = places[1], places[1] - 26.0 * along
     canvas.area([tip, base + 12.0 * across, base + 5.0 * along, base - 12.0 * across], INK)
     canvas.keep_free(around(0.5 * (tip + base), 20.0))
-    canvas.text(base - 22.0 * along, "forward", 17.0, INK, "mm", halo=True)
+    canvas.text(name, "forward", 17.0, INK, "mm", halo=True)
+
+
+def _place(view: View, result: Result, azimuth_rad: float, elevation_deg: float) -> Array:
+    """Canvas place (2,) of a direction."""
+    return view.at(_project(result, np.array([azimuth_rad]), np.radians([elevation_deg]))[0][0])
 
 
 def _grounded(result: Result) -> bool:

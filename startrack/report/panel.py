@@ -11,6 +11,7 @@ from startrack.frames import latlon_from_enu
 from startrack.report.canvas import Box, Canvas, text_width, wrapped
 from startrack.report.minimap import draw_leaders, draw_overview, draw_zoom
 from startrack.report.palette import (
+    BODY,
     DETECTION,
     DIM_INK,
     FAINT_INK,
@@ -91,7 +92,7 @@ def _setting(result: Result) -> str:
     camera, terrain, exposure_s = result.camera, result.terrain, result.exposure.exposure_s
     parts = [f"camera {camera.name}"] if camera is not None else []
     parts += [f"terrain {terrain.name}"] if terrain is not None else []
-    parts += [f"{exposure_s:g} s exposure"] if exposure_s is not None else []
+    parts += [f"{exposure_s:.3g} s exposure"] if exposure_s is not None else []
     return "   ".join(parts)
 
 
@@ -165,6 +166,8 @@ def _legend(result: Result, truth: bool) -> list[tuple[str, Colour, str]]:
         rows += [("ring", DETECTION, other)]
     if result.light is not None:
         rows += [("cross", HIDDEN, "star that should be here, and is hidden")]
+    if result.bodies and result.attitude is not None:
+        rows += [("ring", BODY, "planet, Sun, Earth or Moon, where it must be")]
     if result.fix is not None and result.status == "ok":
         rows += [("line", SKYLINE, "skyline of the terrain seen from the position found")]
         rows += [("disc", POSITION, "position; circle 95 %, ellipse one sigma")]

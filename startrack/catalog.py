@@ -4,7 +4,7 @@ A catalogue is one structured .npy file in catalogs/ (columns: catalogs/README.m
 in magnitude is a slice.
 """
 
-# ruff: noqa: RUF009 - `array` declares a field, as dataclasses.field does
+
 from __future__ import annotations
 
 from collections.abc import Mapping

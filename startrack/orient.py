@@ -67,7 +67,7 @@ def solve_attitude(
         rays_cam = rays_icrs @ R.T
         predicted, _ = camera.project(rays_cam)
         residual = xy_px - predicted
-        weight = np.linalg.inv(covariance_px2 + extra * np.eye(2))
+        weight: Array = np.linalg.inv(covariance_px2 + extra * np.eye(2)).astype(np.float64)
         chi2 = np.einsum("ni,nij,nj->n", residual, weight, residual)
         used = chi2 < OUTLIER_CHI2 if extra > 0.0 else used
         if used.sum() < 3:

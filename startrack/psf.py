@@ -33,7 +33,7 @@ def filter_kernel(sigma_px: float) -> NDArray[np.float32]:
 
 
 def stamp_radius(sigma_px: float) -> int:
-    """Half width [px] of a stamp that holds all but 0.3 % of a star's light, and at least 2."""
+    """Half width [px] of a stamp that holds all but 0.5 % of a star's light, and at least 2."""
     return max(2, math.ceil(3.0 * sigma_px))
 
 

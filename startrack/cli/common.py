@@ -62,7 +62,7 @@ def camera_of(exposure: Exposure) -> Camera:
     from startrack.camera import load_camera
 
     if exposure.camera is None:
-        raise BadInput("no_calibration", f"{exposure.path}: no camera file is known: give -c FILE or a sidecar with camera")
+        raise BadInput("no_calibration", "no camera file is known: give -c FILE or a sidecar with camera")
     return load_camera(exposure.camera)
 
 

@@ -17,8 +17,8 @@ def add_parser(subparsers: Any) -> None:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "identify",
         help="stars and attitude only",
-        description="Name the stars of each image and give the attitude. Needs a camera file, but no terrain; without a "
-        "time the catalogue is taken at J2000.0 and 60 arcsec are added to the stated errors. Writes "
+        description="Name the stars of each image and give the attitude. Needs a camera file, but no terrain; without "
+        "a time the catalogue is taken at J2000.0 and 60 arcsec are added to the stated errors. Writes "
         "NAME.identification.json, NAME.stars.ecsv and NAME.annotated.png.",
     )
     add_image_flags(parser)

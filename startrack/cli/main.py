@@ -40,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader of our output has gone; what it wanted of us is done.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
-    except Exception as cause:  # noqa: BLE001 - the last resort: one line, and the traceback for those who ask
+    except Exception as cause:
         if getattr(args, "verbose", 0):
             raise
         return _failed(f"internal error: {type(cause).__name__}: {cause} (-v shows the traceback)", INTERNAL_ERROR)

@@ -19,8 +19,9 @@ FIRST_PASS_SNR = 4.3  # below the final threshold: a star between pixels shows u
 NARROW_PX = 1.25
 OWN_LEVEL_PART = 0.8  # of the threshold that a source must reach by its own stamp alone, everywhere
 UNEVEN_SIGMA = 2.5  # difference of the stamp's level and that of its surroundings where these are not to be trusted
-EDGE_MARGIN = 30.0  # chi^2 by which an edge must explain a stamp better: noise alone gives faint stars less
-NEIGHBOUR_SIGMA = 0.1  # neighbours' light above this part of a pixel's noise is taken away in a second fit
+EDGE_MARGIN = 20.0  # chi^2 by which an edge must explain a stamp better: noise alone gives faint stars less
+CROWDED_ROUNDS = 4  # of subtracting neighbours and fitting again
+NEIGHBOUR_SIGMA = 0.1  # neighbours' light above this part of a pixel's noise is taken away
 NEIGHBOUR_ERROR = 0.1  # of it is not known: neighbours' fits, and the PSF's wings
 BAD_FIT_CHI2_PER_DOF = 4.0
 ROUGH_PSF_MISFIT = 0.1  # from here up the frame's own stars, not the Gaussian, say what a star looks like
@@ -128,40 +129,38 @@ def _fit_all(frame: _Frame, centres: Ints, level: Image, sigma: float) -> PointF
     data = stamps(frame.residual, centres, radius)
     surround = level[centres[:, 1], centres[:, 0]].astype(np.float64)
     fits = fit_points(data, variance, usable, centres, centres.astype(np.float64), surround, sigma, frame.shot)
-    model = _model_image(frame.residual.shape, centres, fits, sigma, radius)
-    others = stamps(model, centres, radius) - _own_light(centres, fits, sigma, radius)
-    crowded = np.flatnonzero((others > NEIGHBOUR_SIGMA * np.sqrt(variance)).any(axis=(1, 2)))
-    if not len(crowded):
-        return fits
-    others = others[crowded]
-    again = fit_points(
-        data[crowded] - others,
-        variance[crowded] + np.square(NEIGHBOUR_ERROR * others),
-        usable[crowded],
-        centres[crowded],
-        fits.xy_px[crowded],
-        surround[crowded],
-        sigma,
-        frame.shot,
-    )
-    return fits.replaced(crowded, again)
+    for _ in range(CROWDED_ROUNDS):
+        others = _neighbours_light(centres, fits, sigma, radius)
+        crowded = np.flatnonzero((others > NEIGHBOUR_SIGMA * np.sqrt(variance)).any(axis=(1, 2)))
+        if not len(crowded):
+            break
+        others = others[crowded]
+        again = fit_points(
+            data[crowded] - others,
+            variance[crowded] + np.square(NEIGHBOUR_ERROR * others),
+            usable[crowded],
+            centres[crowded],
+            fits.xy_px[crowded],
+            surround[crowded],
+            sigma,
+            frame.shot,
+        )
+        fits = fits.replaced(crowded, again)
+    return fits
 
 
-def _own_light(centres: Ints, fits: PointFits, sigma: float, radius: int) -> NDArray[np.float64]:
-    offset = fits.xy_px - centres
+def _neighbours_light(centres: Ints, fits: PointFits, sigma: float, radius: int) -> NDArray[np.float64]:
+    """Light (n, s, s) that the other sources put into each one's stamp."""
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(centres).query_pairs(1.5 * radius + 3.0 * sigma, output_type="ndarray")
+    star, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    offset = fits.xy_px[other] - centres[star]
     px, _ = pixel_profile(offset[:, 0], sigma, radius)
     py, _ = pixel_profile(offset[:, 1], sigma, radius)
-    return np.maximum(fits.flux, 0.0)[:, None, None] * py[:, :, None] * px[:, None, :]
-
-
-def _model_image(shape: tuple[int, ...], centres: Ints, fits: PointFits, sigma: float, radius: int) -> Image:
-    """Sum of the fitted point sources (H, W)."""
-    light = _own_light(centres, fits, sigma, radius)
-    offset = np.arange(-radius, radius + 1)
-    rows = centres[:, 1, None, None] + offset[None, :, None]
-    columns = centres[:, 0, None, None] + offset[None, None, :]
-    flat = (rows * shape[1] + columns).ravel()
-    return np.bincount(flat, weights=light.ravel(), minlength=shape[0] * shape[1]).reshape(shape).astype(np.float32)
+    light = np.zeros((len(centres), 2 * radius + 1, 2 * radius + 1))
+    np.add.at(light, star, np.maximum(fits.flux[other], 0.0)[:, None, None] * py[:, :, None] * px[:, None, :])
+    return light
 
 
 def _threshold(threshold_snr: float, sigma_px: float) -> float:

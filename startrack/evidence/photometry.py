@@ -84,7 +84,9 @@ def measure(
         flux_e=np.where(usable, flux, 0.0),
         variance_e2=np.where(usable, variance_of_flux, 1.0),
         own_shot=np.einsum("np,np,np->n", weights, weights, profile),
-        neighbour_variance_e2=np.bincount(pairs[:, 0], weights=leak**2 * uncertain[pairs[:, 1]], minlength=n),
+        neighbour_variance_e2=np.bincount(
+            pairs[:, 0], weights=leak**2 * uncertain[pairs[:, 1]], minlength=n
+        ).astype(np.float64),
         usable=usable,
     )
 
@@ -101,7 +103,8 @@ def _summed(rows: Array, group: Ints, n: int) -> Array:
     """Sums (n, pixels) of the rows by group."""
     from scipy.sparse import csr_matrix
 
-    sparse = csr_matrix((np.ones(len(group), np.float32), (group, np.arange(len(group)))), shape=(n, len(group)))
+    ones = np.ones(len(group), np.float32)
+    sparse = csr_matrix((ones, (group, np.arange(len(group)))), shape=(n, len(group)))
     return np.asarray(sparse @ rows)
 
 
@@ -116,7 +119,7 @@ def _neighbour_profiles(xy_px: Array, centre: Ints, sigma_px: float, radius: int
 
 
 def _fit(data: Array, profile: Array, weight: Array) -> tuple[Array, Array]:
-    """Flux (n,) with a free constant level, and the linear weights (n, pixels) that give it: flux = sum weights data."""
+    """Flux (n,) with a free constant level, and the weights (n, pixels) that give it: flux = sum weights data."""
     total = np.maximum(weight.sum(axis=1), 1e-30)
     middle = np.einsum("np,np->n", weight, profile) / total
     centred = weight * (profile - middle[:, None])

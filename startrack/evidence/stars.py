@@ -133,8 +133,9 @@ def _guess(
     noise_e = detections.noise_e[tuple(np.rint(xy_px).astype(int).T[::-1])]
     bright = np.flatnonzero(expected_e > TELLING_SNR * noise_e * np.sqrt(noise_area_px(detections.psf_sigma_px)))
     if len(bright):
+        alone = np.zeros(len(bright))
         sources = Sources(
-            xy_px=xy_px[bright], flux_e=expected_e[bright], fraction_sigma=fraction[bright], visible=np.zeros(len(bright))
+            xy_px=xy_px[bright], flux_e=expected_e[bright], fraction_sigma=fraction[bright], visible=alone
         )
         light = measure(residual, detections.noise_e, dead, sources, detections.psf_sigma_px)
         llr, _ = _ratios(light, expected_e[bright], fraction[bright])

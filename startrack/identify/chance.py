@@ -33,7 +33,7 @@ class ChanceModel:
         return -np.expm1(-self.density_per_sr * np.pi * np.square(radius_rad))
 
     def log_odds(self, matched: Array, predicted: Array, radius_rad: float, given: int = 3) -> Array:
-        """log P(at least `matched` of `predicted` stars coincide by chance); the `given` stars of the pattern are free."""
+        """log P(at least `matched` of `predicted` stars coincide by chance), the `given` of the pattern not counted."""
         from scipy.special import betainc
 
         n = np.maximum(predicted - given, 0)

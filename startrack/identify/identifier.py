@@ -58,7 +58,8 @@ class Identifier:
         known = camera.angle_rad(detections.xy_px) <= camera.max_angle_rad
         order = np.flatnonzero(known)
         if len(order) < FEWEST_MATCHES:
-            raise NotIdentified(f"{len(order)} point sources are too few to identify: expose longer", detected=len(order))
+            few = f"{len(order)} point sources are too few to identify: expose longer"
+            raise NotIdentified(few, detected=len(order))
         rays = camera.unproject(detections.xy_px[order])
         index = build_index(stars, _field_sr(camera))
         search = _Search(camera, rays, stars, index, np.log(self.max_false_alarm))

@@ -26,7 +26,7 @@ class PatternIndex:
     tree: Any  # scipy.spatial.cKDTree over the triangles' sides
 
     def candidates(self, image: Triangles, tolerance_rad: float) -> tuple[Ints, Ints]:
-        """Pairs (image triangle, catalogue triangle) whose sides all agree within the tolerance and whose handedness agrees."""
+        """Pairs (image triangle, catalogue triangle) that agree in handedness and, within the tolerance, in sides."""
         from scipy.spatial import cKDTree
 
         if not len(image) or not len(self.triangles):

@@ -11,7 +11,7 @@ from startrack.types import Array, Evidence, Ints
 
 @dataclass(frozen=True)
 class Sectors:
-    """The evidence sorted into narrow sectors of azimuth, each of which may be wholly wrong (a boulder, a mapping error).
+    """The evidence sorted into narrow sectors of azimuth, each of which may be wholly wrong (a boulder, a map error).
 
     With the rays' contributions g_i, a sector contributes log((1 - eps) exp(sum g_i - M) + eps): at worst log eps,
     however many of its stars contradict a place. M is the best that any skyline could reach there, the largest sum of

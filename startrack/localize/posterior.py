@@ -12,7 +12,7 @@ from startrack.localize.scout import likely_places, taken
 from startrack.localize.search import Boxes, RayBoxes, by_sector, centre_scores, ray_by_ray, split
 from startrack.localize.summary import summarize
 from startrack.terrain import Terrain
-from startrack.types import Array, Evidence, Fix, NotLocated
+from startrack.types import Array, Bools, Evidence, Fix, NotLocated
 
 FEWEST_RAYS = 8
 RAY_BY_RAY_M = 20.0  # boxes of this half side and less are asked ray by ray, larger ones sector by sector
@@ -83,7 +83,7 @@ class _Search:
         score = centre_scores(boxes, self.sectors, self.profile, self.terrain)
         return np.where(self.terrain.allowed(boxes.centres_m), score, -np.inf)
 
-    def _promising(self, boxes: Boxes) -> Array:
+    def _promising(self, boxes: Boxes) -> Bools:
         """Which boxes (n,) might matter; the others' probability is added to what was given up."""
         sure = boxes.lower[np.asarray(self.terrain.allowed(boxes.centres_m))]
         self.best = max(self.best, float(sure.max(initial=-np.inf)))

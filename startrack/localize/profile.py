@@ -1,4 +1,4 @@
-"""The evidence as one profile per sector: running sums over elevation, so that a wide box costs a look-up per sector."""
+"""The evidence as one profile per sector: running sums over elevation, so that a box costs a look-up per sector."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from startrack.localize.likelihood import Sectors, contribution
 from startrack.terrain import Terrain
-from startrack.types import Array, Evidence
+from startrack.types import Array, Bools, Evidence, Ints
 
 LOUDEST_RAYS = 800
 FIRST_ACROSS = 25
@@ -48,10 +48,11 @@ def scores(places_m: Array, evidence: Evidence, sectors: Sectors, terrain: Terra
         np.tile(evidence.llr, n), np.tile(evidence.elevation_rad, n), terrain.horizon_rad(points, azimuth), sigma
     )
     key = np.repeat(np.arange(n), rays) * sectors.count + np.tile(sectors.sector, n)
-    return sectors.score(np.bincount(key, weights=value, minlength=n * sectors.count).reshape(n, sectors.count))
+    sums: Array = np.bincount(key, weights=value, minlength=n * sectors.count).astype(np.float64)
+    return sectors.score(sums.reshape(n, sectors.count))
 
 
-def taken(evidence: Evidence, which: Array) -> Evidence:
+def taken(evidence: Evidence, which: Bools | Ints) -> Evidence:
     """The rays selected by a mask or index."""
     return Evidence(
         azimuth_rad=evidence.azimuth_rad[which],

@@ -123,8 +123,8 @@ def holds_ground(terrain: Terrain, centres_m: Array, half_m: float) -> Bools:
     steps = np.linspace(-half_m, half_m, 5)
     x, y = np.meshgrid(steps, steps)
     points = centres_m[:, None, :] + np.stack([x.ravel(), y.ravel()], axis=1)
-    return np.asarray(terrain.allowed(points)).any(axis=1)
+    return np.any(terrain.allowed(points), axis=1)  # type: ignore[no-any-return]
 
 
 def _sum_by(key: Ints, value: Array, n: int, count: int) -> Array:
-    return np.bincount(key, weights=value, minlength=n * count).reshape(n, count)
+    return np.bincount(key, weights=value, minlength=n * count).astype(np.float64).reshape(n, count)

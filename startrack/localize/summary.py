@@ -39,7 +39,7 @@ def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_mass:
     ambiguous = bool(weight[distance > main_999 + width_m].sum() > AMBIGUOUS_MASS and len(modes) > 1)
     radius95 = _radius(centres_m - mean, weight, 0.95, width_m)
     if not ambiguous and radius95 > USELESS_FRACTION * terrain.search_radius_m:
-        raise NotLocated("the rays leave the position open over most of the search area: is the skyline in the picture?")
+        raise NotLocated("the rays leave most of the search area open: is the skyline in the picture?")
     up = float(terrain.ground_m(mean[None, :])[0]) + terrain.camera_height_m
     return Fix(
         position_enu_m=np.array([mean[0], mean[1], up]),

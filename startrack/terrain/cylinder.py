@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.frames import Site
-from startrack.types import Array
+from startrack.types import Array, Bools
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,9 +73,9 @@ class Cylinder:
         """Zero: the floor is the plane z = 0."""
         return np.zeros(np.shape(points_m)[:-1])
 
-    def allowed(self, points_m: Array) -> Array:
+    def allowed(self, points_m: Array) -> Bools:
         """Whether the points (..., 2) are on the floor."""
-        return np.hypot(points_m[..., 0], points_m[..., 1]) < self.radius_m
+        return np.asarray(np.hypot(points_m[..., 0], points_m[..., 1]) < self.radius_m)
 
 
 def _distance_to_circle(points_m: Array, azimuths_rad: Array, radius_m: Array | float) -> Array:
@@ -86,7 +86,7 @@ def _distance_to_circle(points_m: Array, azimuths_rad: Array, radius_m: Array | 
 
 
 def _chord(along_m: Array, off_centre_m: Array, radius_m: Array | float) -> Array:
-    """Distance to the circle ahead of a point `off_centre_m` from its middle, `along_m` of it in the direction looked."""
+    """Distance to the circle ahead of a point `off_centre_m` from its middle, `along_m` of that in the direction."""
     inner = np.square(np.maximum(radius_m, 0.0)) - np.square(off_centre_m)
     root = np.sqrt(np.maximum(np.square(along_m) + inner, 0.0))
     # Outside the circle (inner < 0) the rim no longer surrounds the point: the wall is overhead, at distance 0.

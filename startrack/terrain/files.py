@@ -56,7 +56,7 @@ def terrain_from_dict(d: dict[str, Any], default_name: str = "terrain") -> Terra
     camera_height = _number(_table(d, "rover", {}), "camera_height_m", 1.5)
     search = _number(_table(d, "search", {}), "radius_m", diameter / 2)
     if min(diameter, depth, search) <= 0 or not 0 <= camera_height < depth:
-        raise BadInput("bad_terrain", "diameter_m, depth_m and radius_m must be positive, the camera between floor and rim")
+        raise BadInput("bad_terrain", "diameter_m, depth_m, radius_m must be positive, the camera below the rim")
     return Cylinder(
         name=str(d.get("name", default_name)),
         site=site,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from startrack.frames import Site
-from startrack.types import Array
+from startrack.types import Array, Bools
 
 
 class Terrain(Protocol):
@@ -15,11 +15,24 @@ class Terrain(Protocol):
     is visible where its elevation exceeds it.
     """
 
-    name: str
-    site: Site
-    camera_height_m: float  # above the ground
-    search_radius_m: float  # the camera is within this horizontal distance of the origin
-    reach_m: float  # half side of the square that is searched: the search area and a margin to notice leaving it
+    @property
+    def name(self) -> str: ...
+    @property
+    def site(self) -> Site: ...
+    @property
+    def camera_height_m(self) -> float:
+        """Of the camera above the ground."""
+        ...
+
+    @property
+    def search_radius_m(self) -> float:
+        """The camera is within this horizontal distance of the origin."""
+        ...
+
+    @property
+    def reach_m(self) -> float:
+        """Half side of the square that is searched: the search area and a margin to notice leaving it."""
+        ...
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation (n,) seen from the points (n, 2) at the azimuths (n,)."""
@@ -42,6 +55,6 @@ class Terrain(Protocol):
         """Height (n,) of the ground in enu."""
         ...
 
-    def allowed(self, points_m: Array) -> Array:
-        """Whether a camera could stand at the points (..., 2): there is ground, known to the terrain, under open sky."""
+    def allowed(self, points_m: Array) -> Bools:
+        """Whether a camera could stand at the points (..., 2): there is known ground under open sky."""
         ...

@@ -5,7 +5,6 @@ from startrack.render.defects import draw_hot_pixels
 from startrack.render.light import exposure_reaching
 from startrack.render.nature import draw_field_stars, draw_v_errors, joined
 from startrack.render.scene import HotPixels, Scene, Truth
-from startrack.render.self_test import self_test_exposure
 from startrack.render.series import Series, sky_turn_rad
 from startrack.render.write import truth_paths, write_truth
 
@@ -21,7 +20,6 @@ __all__ = [
     "joined",
     "light_e",
     "render",
-    "self_test_exposure",
     "sky_turn_rad",
     "truth_of",
     "truth_paths",

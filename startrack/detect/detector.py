@@ -32,6 +32,7 @@ MOST_BRIGHT = 300
 WIDTHS_PX = np.geomspace(0.3, 8.0, 36)
 UNKNOWN_WIDTH_PX = 1.2  # first guess where the camera file does not tell
 WIDTH_TOLERANCE = 0.12  # measured PSF differing by more than this fraction from the expected one is used instead
+WIDTH_ROUNDS = 3  # a stamp of the wrong size measures a much wider PSF too small
 SATURATED_FRACTION = 0.98
 NOTHING_SEEN = "no point source stands above the noise: was the lens cap on, or the exposure too short?"
 
@@ -56,8 +57,10 @@ class Detector:
         known = camera.sensor.psf_sigma_px if camera is not None and camera.sensor is not None else None
         sigma = known or UNKNOWN_WIDTH_PX
         centres, fits = self._measure(frame, sigma)
-        measured = _measured_width(frame, centres, fits, sigma)
-        if measured is not None and abs(np.log(measured / sigma)) > WIDTH_TOLERANCE:
+        for _ in range(WIDTH_ROUNDS):
+            measured = _measured_width(frame, centres, fits, sigma)
+            if measured is None or abs(np.log(measured / sigma)) < WIDTH_TOLERANCE:
+                break
             sigma = measured
             centres, fits = self._measure(frame, sigma)
         good = _is_star(fits, _threshold(self.threshold_snr, sigma), _misfit(frame, centres, fits, sigma))

@@ -48,7 +48,7 @@ FILES = {
     "fits": by_astropy(fits.PrimaryHDU(FRAME)),
     "fits extension": by_astropy(fits.PrimaryHDU(), fits.ImageHDU(FRAME)),
     "fits fz": by_astropy(fits.PrimaryHDU(), fits.CompImageHDU(FRAME)),
-    "fits gz": gzip.compress(by_astropy(fits.PrimaryHDU(FRAME))),
+    "fits gz": gzip.compress(by_astropy(fits.PrimaryHDU(FRAME)), mtime=0),
     "fits bz2": bz2.compress(by_astropy(fits.PrimaryHDU(FRAME))),
 }
 

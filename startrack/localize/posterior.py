@@ -6,10 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.localize import compiled
 from startrack.localize.likelihood import Sectors
 from startrack.localize.profile import Profile
 from startrack.localize.scout import likely_places, taken
 from startrack.localize.search import Boxes, RayBoxes, by_sector, centre_scores, ray_by_ray, split
+from startrack.localize.seen import cylinder_of
 from startrack.localize.summary import summarize
 from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Evidence, Fix, NotLocated
@@ -33,13 +35,19 @@ class ExactPosterior:
     finest_m: float = 0.05
     boxes_per_sigma: float = 2.5  # boxes are quartered until this many fit into the posterior's smaller axis
     most_boxes: int = 40_000
+    compiled: bool = False  # with numba, for a cylinder with hard edges: the same answer, 10 to 50 times sooner
 
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
         """Posterior of the camera's position. Raises NotLocated (insufficient_geometry, outside_search_area)."""
         told = np.abs(evidence.llr) > 1e-3
         if told.sum() < FEWEST_RAYS:
             raise NotLocated(f"only {int(told.sum())} rays say anything about the skyline: expose longer")
-        search = _Search(self, taken(evidence, told), terrain)
+        evidence = taken(evidence, told)
+        if self.compiled and compiled.applies(evidence, terrain):
+            centres, half, log_weight, log_dropped = compiled.explored(self, evidence, cylinder_of(terrain))
+            dropped = float(np.exp(min(log_dropped - _log_mass(log_weight, half), 0.0)))
+            return summarize(centres, 2 * half, log_weight, dropped, terrain)
+        search = _Search(self, evidence, terrain)
         boxes = search.refine(search.exclude())
         log_weight = search.scores(boxes)
         dropped = float(np.exp(min(search.log_dropped - _log_mass(log_weight, boxes.half_m), 0.0)))

@@ -70,10 +70,22 @@ def _radius(offsets_m: Array, weight: Array, mass: float, width_m: float) -> flo
 
 def _modes(centres_m: Array, weight: Array, width_m: float) -> Ints:
     """Mode number (n,) of each box: boxes linked by gaps no wider than the posterior's local spread."""
-    first = _linked(centres_m, 1.5 * width_m)
-    heaviest = first == np.argmax(np.bincount(first, weights=weight))
-    _, covariance = _moments(centres_m[heaviest], weight[heaviest], width_m)
-    return _linked(centres_m, max(1.5 * width_m, 3.0 * float(np.sqrt(np.linalg.eigvalsh(covariance)[1]))))
+    label = np.zeros(len(weight), dtype=np.int64)
+    if _in_one_piece(centres_m, weight, width_m):
+        return label
+    for sigmas in (1.0, 1.0, 3.0):  # far modes widen the first spread; the heaviest one's own decides in the end
+        heaviest = label == np.argmax(np.bincount(label, weights=weight))
+        _, covariance = _moments(centres_m[heaviest], weight[heaviest], width_m)
+        gap = max(1.5 * width_m, sigmas * float(np.sqrt(np.linalg.eigvalsh(covariance)[1])))
+        label = _linked(centres_m, gap)
+    return label
+
+
+def _in_one_piece(centres_m: Array, weight: Array, width_m: float) -> bool:
+    """Whether the boxes leave no gap along the posterior's longer axis, where two places would lie apart."""
+    _, covariance = _moments(centres_m, weight, width_m)
+    along = np.sort(centres_m @ np.linalg.eigh(covariance)[1][:, 1])
+    return bool(np.diff(along).max(initial=0.0) < 1.5 * width_m)
 
 
 def _linked(points_m: Array, gap_m: float) -> Ints:
@@ -86,10 +98,15 @@ def _linked(points_m: Array, gap_m: float) -> Ints:
     from scipy.spatial import cKDTree
 
     cell = np.floor(points_m / (0.5 * gap_m)).astype(np.int64)
-    cells, of = np.unique(cell, axis=0, return_inverse=True)
+    cell -= cell.min(axis=0)
+    if cell.max() <= 2:
+        return np.zeros(len(cell), dtype=np.int64)
+    across = int(cell[:, 1].max()) + 1
+    numbers, of = np.unique(cell[:, 0] * across + cell[:, 1], return_inverse=True)
+    cells = np.stack([numbers // across, numbers % across], axis=1)
     pairs = cKDTree(cells).query_pairs(2.9, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
-    return np.asarray(connected_components(graph, directed=False)[1])[np.ravel(of)].astype(np.int64)
+    return np.asarray(connected_components(graph, directed=False)[1])[of].astype(np.int64)
 
 
 def _described(centres_m: Array, weight: Array, label: Ints) -> tuple[Mode, ...]:

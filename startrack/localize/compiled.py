@@ -1,0 +1,46 @@
+"""The compiled search for a cylinder with hard edges: evidence to boxes, as the general search would give them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from startrack.localize.likelihood import Sectors
+from startrack.localize.seen import on_rim_plane
+from startrack.terrain import Cylinder, Terrain
+from startrack.types import Array, Evidence
+
+if TYPE_CHECKING:
+    from startrack.localize.posterior import ExactPosterior
+
+SCOUT_RAYS, SCOUT_ACROSS, SCOUT_KEPT = 300, 15, 4
+FINEST_GUESS_M = 1.0
+FIRST_STEP_M = 64.0
+
+
+def applies(evidence: Evidence, terrain: Terrain) -> bool:
+    """Whether every ray's visible ground is a disk with a sharp edge."""
+    return isinstance(terrain, Cylinder) and not evidence.edge_sigma_rad.any()
+
+
+def explored(method: ExactPosterior, evidence: Evidence, cylinder: Cylinder) -> tuple[Array, float, Array, float]:
+    """Centres (n, 2), half side, log-likelihoods (n,) and log of the mass dropped. Needs numba."""
+    from startrack.localize import disks
+
+    above = evidence.elevation_rad > 0  # at or below the horizontal nothing is ever visible over the rim
+    sectors = Sectors.of(evidence, method.sector_width_rad, method.sector_epsilon)
+    centres = -on_rim_plane(evidence, cylinder)[above]
+    llr, sector = evidence.llr[above], sectors.sector[above]
+    log_floor = float(np.log(method.sector_epsilon)) if method.sector_epsilon > 0 else -np.inf
+    radius, reach = cylinder.radius_m, cylinder.reach_m
+    telling = np.abs(llr) * np.minimum(np.hypot(centres[:, 0], centres[:, 1]), radius)
+    few = np.argpartition(-telling, min(SCOUT_RAYS, len(llr) - 1))[:SCOUT_RAYS]
+    guess = disks.scout(centres[few], llr[few], radius, reach, SCOUT_ACROSS, SCOUT_KEPT, FINEST_GUESS_M)
+    _, best = disks.climb(
+        guess, FIRST_STEP_M, centres, llr, sector, sectors.ceiling, log_floor, radius, FINEST_GUESS_M
+    )
+    return disks.explore(
+        centres, llr, sector, sectors.ceiling, log_floor, radius, reach, best, method.prune_nats, method.finest_m,
+        method.boxes_per_sigma, method.most_boxes,
+    )  # fmt: skip

@@ -1,0 +1,256 @@
+"""The same branch and bound compiled, for the cylinder with hard edges: every ray's visible ground is a disk.
+
+Ray i is visible from p exactly when p lies in the disk of the rim's radius about -rho_i u_i, so bounds over a box are
+two comparisons of squared distances. numba compiles it once per machine; results are those of `search.py`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from startrack.types import Array, Ints
+
+
+@njit(cache=True)
+def _log_mixture(below: float, log_keep: float, log_floor: float) -> float:
+    """log(exp(min(below, 0) + log_keep) + exp(log_floor)); log_floor = -inf means no floor and no ceiling."""
+    if log_floor == -np.inf:
+        return below
+    a = min(below, 0.0) + log_keep
+    if a > log_floor:
+        return a + np.log1p(np.exp(log_floor - a))
+    return log_floor + np.log1p(np.exp(a - log_floor))
+
+
+@njit(cache=True)
+def _log_add(a: float, b: float) -> float:
+    top, low = max(a, b), min(a, b)
+    return top if low == -np.inf else top + np.log1p(np.exp(low - top))
+
+
+@njit(cache=True)
+def scout(
+    disks_m: Array, llr: Array, radius_m: float, reach_m: float, across: int, kept: int, finest_m: float
+) -> Array:
+    """A place (2,) [m] that fits well by the plain sum of the llr of the rays given: grids around the best few."""
+    step = 2 * reach_m / across
+    best_x, best_y = np.zeros(kept), np.zeros(kept)
+    best_score = np.full(kept, -np.inf)
+    centres, width = np.zeros((1, 2)), across
+    while True:
+        best_score[:] = -np.inf
+        for c in range(len(centres)):
+            for i in range(width):
+                for j in range(width):
+                    x = centres[c, 0] + step * (i - (width - 1) / 2)
+                    y = centres[c, 1] + step * (j - (width - 1) / 2)
+                    if x * x + y * y >= radius_m * radius_m:
+                        continue
+                    total = 0.0
+                    for k in range(len(llr)):
+                        u, v = x - disks_m[k, 0], y - disks_m[k, 1]
+                        if u * u + v * v < radius_m * radius_m:
+                            total += llr[k]
+                    worst = np.argmin(best_score)
+                    if total > best_score[worst]:
+                        best_x[worst], best_y[worst], best_score[worst] = x, y, total
+        if step < finest_m:
+            top = np.argmax(best_score)
+            return np.array([best_x[top], best_y[top]])
+        step /= 2
+        found = np.flatnonzero(best_score > -np.inf)
+        centres, width = np.empty((len(found), 2)), 5
+        centres[:, 0], centres[:, 1] = best_x[found], best_y[found]
+
+
+@njit(cache=True)
+def score_at(
+    x: float, y: float, disks_m: Array, llr: Array, sector: Ints, ceiling: Array, log_floor: float, radius_m: float
+) -> float:
+    """Log-likelihood of the place (x, y)."""
+    sums = -ceiling
+    for k in range(len(llr)):
+        u, v = x - disks_m[k, 0], y - disks_m[k, 1]
+        if u * u + v * v < radius_m * radius_m:
+            sums[sector[k]] += llr[k]
+    log_keep = np.log1p(-np.exp(log_floor))
+    total = 0.0
+    for s in range(len(sums)):
+        total += _log_mixture(sums[s], log_keep, log_floor)
+    return total
+
+
+@njit(cache=True)
+def climb(
+    start_m: Array, step_m: float, disks_m: Array, llr: Array, sector: Ints, ceiling: Array, log_floor: float,
+    radius_m: float, finest_m: float,
+) -> tuple[Array, float]:  # fmt: skip
+    """A better place (2,) near the start and its log-likelihood: steps to the best of 8 neighbours, ever shorter."""
+    x, y = start_m[0], start_m[1]
+    best = score_at(x, y, disks_m, llr, sector, ceiling, log_floor, radius_m)
+    while step_m > finest_m:
+        go_x, go_y = x, y
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                u, v = x + step_m * i, y + step_m * j
+                if (i == 0 and j == 0) or u * u + v * v >= radius_m * radius_m:
+                    continue
+                score = score_at(u, v, disks_m, llr, sector, ceiling, log_floor, radius_m)
+                if score > best:
+                    best, go_x, go_y = score, u, v
+        if go_x == x and go_y == y:
+            step_m /= 2
+        x, y = go_x, go_y
+    return np.array([x, y]), best
+
+
+@njit(cache=True)
+def explore(
+    disks_m: Array,
+    llr: Array,
+    sector: Ints,
+    ceiling: Array,
+    log_floor: float,
+    radius_m: float,
+    reach_m: float,
+    best: float,
+    prune_nats: float,
+    finest_m: float,
+    boxes_per_sigma: float,
+    most_boxes: int,
+) -> tuple[Array, float, Array, float]:
+    """Centres (n, 2), half side, log-likelihoods (n,) at the centres (-inf off the floor), log of the mass dropped.
+
+    `disks_m` (m, 2) are the disks' centres, `ceiling` (sectors,) the best that any skyline reaches, `log_floor` the log
+    of the probability that a sector is wrong, `best` a known lower bound of the maximum.
+    """
+    sectors = len(ceiling)
+    log_keep = np.log1p(-np.exp(log_floor))
+    r2 = radius_m * radius_m
+    half = reach_m
+    centres = np.zeros((1, 2))
+    sums = -np.ones((1, 1)) * ceiling.reshape(1, sectors)
+    base = np.zeros(1)
+    for s in range(sectors):
+        base[0] += _log_mixture(sums[0, s], log_keep, log_floor)
+    rays = np.arange(len(llr))
+    first = np.zeros(2, dtype=np.int64)
+    first[1] = len(llr)
+    dropped = -np.inf
+    least, most, at_centre = np.zeros(sectors), np.zeros(sectors), np.zeros(sectors)
+    touched = np.zeros(sectors, dtype=np.int64)
+    stamp = np.zeros(sectors, dtype=np.int64)
+    ticket = 0
+    while True:
+        half /= 2
+        room = 4 * len(centres)
+        new_centres, new_sums = np.empty((room, 2)), np.empty((room, sectors))
+        new_base, new_upper, new_score = np.empty(room), np.empty(room), np.empty(room)
+        new_first = np.zeros(room + 1, dtype=np.int64)
+        new_rays = np.empty(max(4096, 2 * len(rays)), dtype=np.int64)
+        inner, outer = radius_m - half * np.sqrt(2.0), radius_m + half * np.sqrt(2.0)
+        inner2 = inner * inner if inner > 0 else -1.0
+        outer2 = outer * outer
+        cell = np.log(4 * half * half)
+        n, used = 0, 0
+        for b in range(len(centres)):
+            for child in range(4):
+                x = centres[b, 0] + (half if child % 2 else -half)
+                y = centres[b, 1] + (half if child // 2 else -half)
+                nearest_x, nearest_y = max(abs(x) - half, 0.0), max(abs(y) - half, 0.0)
+                if nearest_x * nearest_x + nearest_y * nearest_y >= r2:
+                    continue
+                count = first[b + 1] - first[b]
+                if used + count > len(new_rays):
+                    grown = np.empty(2 * (used + count), dtype=np.int64)
+                    grown[:used] = new_rays[:used]
+                    new_rays = grown
+                new_sums[n] = sums[b]
+                ticket += 1
+                dirty, start = 0, used
+                for q in range(first[b], first[b + 1]):
+                    k = rays[q]
+                    u, v = x - disks_m[k, 0], y - disks_m[k, 1]
+                    d2 = u * u + v * v
+                    if d2 > outer2:
+                        continue
+                    s = sector[k]
+                    if stamp[s] != ticket:
+                        stamp[s] = ticket
+                        touched[dirty] = s
+                        dirty += 1
+                        least[s], most[s], at_centre[s] = 0.0, 0.0, 0.0
+                    if d2 < inner2:
+                        new_sums[n, s] += llr[k]
+                        continue
+                    new_rays[used] = k
+                    used += 1
+                    if llr[k] > 0:
+                        most[s] += llr[k]
+                    else:
+                        least[s] += llr[k]
+                    if d2 < r2:
+                        at_centre[s] += llr[k]
+                score, lower, upper, settled = base[b], base[b], base[b], base[b]
+                for t in range(dirty):
+                    s = touched[t]
+                    before = _log_mixture(sums[b, s], log_keep, log_floor)
+                    now = new_sums[n, s]
+                    settled += _log_mixture(now, log_keep, log_floor) - before
+                    lower += _log_mixture(now + least[s], log_keep, log_floor) - before
+                    upper += _log_mixture(now + most[s], log_keep, log_floor) - before
+                    score += _log_mixture(now + at_centre[s], log_keep, log_floor) - before
+                if x * x + y * y < r2:
+                    best = max(best, score)
+                else:
+                    score = -np.inf
+                if upper <= best - prune_nats:
+                    dropped = _log_add(dropped, upper + cell)
+                    used = start
+                    continue
+                new_centres[n, 0], new_centres[n, 1] = x, y
+                new_base[n], new_upper[n], new_score[n] = settled, upper, score
+                new_first[n + 1] = used
+                n += 1
+        # Boxes kept before a better place was found may have lost their case since.
+        write, write_ray, begin = 0, 0, 0
+        for b in range(n):
+            end = new_first[b + 1]
+            if new_upper[b] <= best - prune_nats:
+                dropped = _log_add(dropped, new_upper[b] + cell)
+            else:
+                for q in range(begin, end):
+                    new_rays[write_ray + q - begin] = new_rays[q]
+                write_ray += end - begin
+                new_centres[write], new_sums[write] = new_centres[b], new_sums[b]
+                new_base[write], new_score[write] = new_base[b], new_score[b]
+                write += 1
+                new_first[write] = write_ray  # write <= b + 1, whose own offset is already in `end`
+            begin = end
+        n = write
+        centres, sums, base, score_now = new_centres[:n], new_sums[:n], new_base[:n], new_score[:n]
+        rays, first = new_rays[:write_ray], new_first[: n + 1]
+        if n == 0 or half <= finest_m or 4 * n > most_boxes or write_ray == 0:
+            return centres.copy(), half, score_now.copy(), dropped
+        top = score_now.max()
+        if top == -np.inf:
+            continue
+        total, mean_x, mean_y = 0.0, 0.0, 0.0
+        for b in range(n):
+            w = np.exp(score_now[b] - top)
+            total += w
+            mean_x += w * centres[b, 0]
+            mean_y += w * centres[b, 1]
+        mean_x /= total
+        mean_y /= total
+        xx, yy, xy = 0.0, 0.0, 0.0
+        for b in range(n):
+            w = np.exp(score_now[b] - top) / total
+            u, v = centres[b, 0] - mean_x, centres[b, 1] - mean_y
+            xx += w * u * u
+            yy += w * v * v
+            xy += w * u * v
+        smaller = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+        if smaller > 0 and 2 * half * boxes_per_sigma < np.sqrt(smaller):
+            return centres.copy(), half, score_now.copy(), dropped

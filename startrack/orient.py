@@ -121,14 +121,16 @@ def _extra_variance(residual_px: Array, covariance_px2: Array) -> float:
     def median_chi2(extra: float) -> float:
         return float(np.median(np.sum(squared / (axes_px2 + extra), axis=1)))
 
+    # The fit has already taken its three parameters' share out of the residuals.
+    expected = CHI2_2DOF_MEDIAN * (1.0 - 1.5 / len(residual_px))
     low, high = 1e-6, 1.0
-    if median_chi2(low) <= CHI2_2DOF_MEDIAN:
+    if median_chi2(low) <= expected:
         return low
-    while median_chi2(high) > CHI2_2DOF_MEDIAN and high < 1e4:
+    while median_chi2(high) > expected and high < 1e4:
         high *= 4.0
     for _ in range(40):
         middle = np.sqrt(low * high)
-        low, high = (middle, high) if median_chi2(middle) > CHI2_2DOF_MEDIAN else (low, middle)
+        low, high = (middle, high) if median_chi2(middle) > expected else (low, middle)
         if high < 1.001 * low:
             break
     return float(high)

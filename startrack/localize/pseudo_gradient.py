@@ -29,7 +29,7 @@ class PseudoGradient:
         """Raises NotLocated with fewer than 3 seen stars."""
         cylinder = cylinder_of(terrain)
         points, seen = on_rim_plane(evidence, cylinder), seen_stars(evidence)
-        start = hull_position(points[seen], cylinder.radius_m)
+        start = hull_position(points[seen], cylinder.wall_m, cylinder.radius_m)
         position, _ = descend(points, seen, start, cylinder.radius_m, self.gain, self.most_steps)
         return point_fix(position, PUBLISHED_SIGMA_M, cylinder)
 
@@ -38,13 +38,16 @@ def descend(
     points_m: Array, seen: Bools, start_m: Array, radius_m: float, gain: float, most_steps: int
 ) -> tuple[Array, bool]:
     """Last position (2,) and whether the expected stars became the seen ones."""
-    seen_mean = points_m[seen].mean(axis=0)
-    position = np.array(start_m)
+    x, y = points_m[:, 0].copy(), points_m[:, 1].copy()
+    seen_x, seen_y = float(x[seen].mean()), float(y[seen].mean())
+    east, north = float(start_m[0]), float(start_m[1])
     for _ in range(most_steps):
-        expected = np.sum(np.square(points_m + position), axis=1) < radius_m**2
+        expected = np.square(x + east) + np.square(y + north) < radius_m**2
         if np.array_equal(expected, seen):
-            return position, True
-        if not expected.any():
+            return np.array([east, north]), True
+        count = np.count_nonzero(expected)
+        if not count:
             break
-        position = position + gain * (points_m[expected].mean(axis=0) - seen_mean)
-    return position, False
+        east += gain * (float(np.sum(x * expected)) / count - seen_x)
+        north += gain * (float(np.sum(y * expected)) / count - seen_y)
+    return np.array([east, north]), False

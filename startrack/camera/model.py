@@ -106,20 +106,34 @@ class Camera:
         return self.lens.angle_rad(np.hypot(u, v))
 
     def jacobian_px_per_rad(self, rays_cam: Array) -> Array:
-        """d px / d w (..., 2, 3) for a small rotation w of the rays about the camera's axes (ray -> ray + w x ray).
+        """d px / d w (..., 2, 3) for a small rotation w of unit rays about the camera's axes (ray -> ray + w x ray).
 
-        Central differences of the exact projection; the step is far above rounding and far below a pixel.
+        From x_px = cx + fx rho(a) u with u = (x, y) / s, s = sin a:  d(rho u) = u rho' da + (rho / s) v (v . d(x, y)),
+        v across u, da = z u . d(x, y) - s dz.
         """
         rays_cam = np.asarray(rays_cam, dtype=np.float64)
-        step_rad = 1e-6
-        columns = []
-        for axis in np.eye(3):
-            turn = step_rad * np.cross(axis, rays_cam)
-            columns.append((self._project_all(rays_cam + turn) - self._project_all(rays_cam - turn)) / (2 * step_rad))
-        return np.stack(columns, axis=-1)
-
-    def _project_all(self, rays_cam: Array) -> Array:
-        return self.project(rays_cam)[0]
+        x, y, z = rays_cam[..., 0], rays_cam[..., 1], rays_cam[..., 2]
+        s = np.hypot(x, y)
+        angle = np.arctan2(s, z)
+        off_axis = s > 1e-12
+        divisor = np.where(off_axis, s, 1.0)
+        ux, uy = np.where(off_axis, x / divisor, 1.0), np.where(off_axis, y / divisor, 0.0)
+        slope = self.lens.slope(angle)
+        ratio = np.where(off_axis, self.lens.rho(angle) / divisor, slope)
+        along = slope * z
+        by_ray = np.stack(
+            [
+                np.stack([along * ux * ux + ratio * uy * uy, (along - ratio) * ux * uy, -slope * s * ux], axis=-1),
+                np.stack([(along - ratio) * ux * uy, along * uy * uy + ratio * ux * ux, -slope * s * uy], axis=-1),
+            ],
+            axis=-2,
+        )
+        zero = np.zeros_like(x)
+        turned = np.stack(
+            [np.stack([zero, z, -y], axis=-1), np.stack([-z, zero, x], axis=-1), np.stack([y, -x, zero], axis=-1)],
+            axis=-2,
+        )
+        return (by_ray @ turned) * np.array(self._handed_focal_px)[:, None]
 
     def pixel_solid_angle_sr(self, angle_rad: Array) -> Array:
         """Solid angle [sr] of one pixel at the angles off the axis [rad]: sin a / (rho rho' fx fy)."""

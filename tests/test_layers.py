@@ -18,7 +18,7 @@ LAYERS = (  # lowest first; a room imports from lower layers only
     {"errors"},
     {"types", "paths"},
     {"frames"},
-    {"psf", "body_angles", "catalog", "bodies", "camera", "terrain", "exposure"},
+    {"psf", "body_angles", "catalog", "deep_catalog", "bodies", "camera", "terrain", "exposure"},
     {"render", "detect", "identify", "orient", "evidence", "localize", "consistency"},
     {"pipeline"},
     {"report"},
@@ -26,7 +26,7 @@ LAYERS = (  # lowest first; a room imports from lower layers only
 )
 # Rooms of one layer that may know each other all the same: identification refines the attitude, and the last check
 # reads what the evidence stage measured.
-ALLOWED = {("identify", "orient"), ("consistency", "evidence")}
+ALLOWED = {("deep_catalog", "catalog"), ("identify", "orient"), ("consistency", "evidence")}
 HEAVY = (
     "astropy", "cv2", "lunarsky", "matplotlib", "PIL", "rich", "scipy", "skimage", "skyfield", "spiceypy", "tifffile",
 )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -15,7 +16,6 @@ from startrack.errors import BadInput
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
-    from startrack.pipeline import Result
     from startrack.types import Exposure
 
 DEFAULT_OUT = "startrack-out"
@@ -29,8 +29,15 @@ def add_image_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("images", nargs="+", metavar="IMAGE", help="PNG, TIFF, FITS or JPEG")
     parser.add_argument("-c", "--camera", metavar="FILE", help="camera file, or the name of a shipped one")
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601")
-    parser.add_argument("--exposure", type=float, metavar="S", help="exposure time in seconds")
+    parser.add_argument("--exposure", type=_seconds, metavar="S", help="exposure time in seconds")
     add_output_flags(parser)
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number of seconds")
+    return value
 
 
 def add_output_flags(parser: argparse.ArgumentParser) -> None:
@@ -76,11 +83,17 @@ class Outcome:
     record: dict[str, Any]
 
 
-def run_images(args: argparse.Namespace, one: Callable[[str, str], Outcome]) -> int:
-    """Run `one(path, output stem)` for each image, print its outcome, and return the exit code."""
+def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, str], Outcome]) -> int:
+    """Run `one(path, output stem)` for each image, print its outcome, and return the exit code.
+
+    One image's BadInput is its own outcome; it never stops the others.
+    """
     codes = [0]
     for path, stem in zip(args.images, output_stems(args.images), strict=True):
-        outcome = one(path, stem)
+        try:
+            outcome = one(path, stem)
+        except BadInput as cause:
+            outcome = _refused(path, cause, format_name)
         if args.json:
             print(json.dumps(outcome.record), flush=True)
         elif outcome.status != "ok":
@@ -98,7 +111,7 @@ def exit_code(outcome: Outcome) -> int:
     return 4 if outcome.reason in BAD_INPUT_REASONS else 3
 
 
-def refused(path: str, cause: BadInput, format_name: str) -> Outcome:
+def _refused(path: str, cause: BadInput, format_name: str) -> Outcome:
     """Outcome of an image that could not even be read, or whose camera or terrain could not."""
     from startrack.report.summary import refusal_line
 
@@ -132,18 +145,24 @@ def _stem(name: str) -> str:
     return Path(path.stem).stem if packed and Path(path.stem).suffix else path.stem
 
 
-def result_path(out: str, stem: str, suffix: str, result: Result, overwrite: bool) -> Path:
-    """Where a result goes. A result of the same image is renewed; one of another image is kept unless `overwrite`."""
-    path = Path(out) / f"{stem}{suffix}"
-    if path.exists() and not overwrite:
-        try:
-            before = json.loads(path.read_text(encoding="utf-8")).get("provenance", {}).get("image_sha256")
-        except (OSError, ValueError, AttributeError):
-            before = None
-        if before != result.exposure.sha256:
-            raise FileExistsError(f"{path} holds the result of another image: choose another -D, or replace it with -O")
+def result_path(args: argparse.Namespace, stem: str, suffix: str, exposure: Exposure) -> Path:
+    """Where a result goes, its folder made. A result of the same image is renewed, one of another kept unless -O.
+
+    Raises BadInput (bad_image, for lack of a better code) before anything is computed.
+    """
+    path = Path(args.dir) / f"{stem}{suffix}"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        before = json.loads(path.read_text(encoding="utf-8")) if path.exists() and not args.overwrite else None
     except OSError as cause:
-        raise FileExistsError(f"{path.parent}: cannot make the folder of the results: {cause.strerror}") from cause
+        raise BadInput("bad_image", f"{path}: results cannot be written there: {cause.strerror}") from cause
+    except ValueError:
+        before = {}
+    if before is not None and not _is_of(before, exposure.sha256):
+        raise BadInput("bad_image", f"{path} is not a result of this image: choose another -D, or replace it with -O")
     return path
+
+
+def _is_of(record: Any, sha256: str) -> bool:
+    provenance = record.get("provenance", {}) if isinstance(record, dict) else {}
+    return isinstance(provenance, dict) and provenance.get("image_sha256") == sha256

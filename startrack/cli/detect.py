@@ -6,8 +6,7 @@ import argparse
 import time
 from typing import Any
 
-from startrack.cli.common import Outcome, add_image_flags, camera_of, read, refused, result_path, run_images
-from startrack.errors import BadInput
+from startrack.cli.common import Outcome, add_image_flags, camera_of, read, result_path, run_images
 
 FORMAT = "startrack.detection/1"
 
@@ -25,7 +24,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Detect in every image; the exit code of the worst."""
-    return run_images(args, lambda path, stem: _one(path, stem, args))
+    return run_images(args, FORMAT, lambda path, stem: _one(path, stem, args))
 
 
 def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
@@ -33,16 +32,13 @@ def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     from startrack.report import detection_dict, summary_line, write_annotated, write_json
 
     start = time.perf_counter()
-    try:
-        exposure = read(path, args)
-        camera = camera_of(exposure) if exposure.camera is not None else None
-    except BadInput as cause:
-        return refused(path, cause, FORMAT)
+    exposure = read(path, args)
+    camera = camera_of(exposure) if exposure.camera is not None else None
+    out = result_path(args, stem, ".detections.json", exposure)
     read_ms = 1e3 * (time.perf_counter() - start)
     result = detect(exposure, camera)
     result.timing_ms["read"] = read_ms
     record = detection_dict(result)
-    out = result_path(args.dir, stem, ".detections.json", result, args.overwrite)
     if not args.no_plots:
         write_annotated(out.with_name(f"{stem}.annotated.png"), result)
     write_json(out, record)

@@ -6,8 +6,7 @@ import argparse
 import time
 from typing import Any
 
-from startrack.cli.common import Outcome, add_image_flags, camera_of, read, refused, result_path, run_images
-from startrack.errors import BadInput
+from startrack.cli.common import Outcome, add_image_flags, camera_of, read, result_path, run_images
 
 FORMAT = "startrack.identification/1"
 
@@ -26,7 +25,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Identify every image; the exit code of the worst."""
-    return run_images(args, lambda path, stem: _one(path, stem, args))
+    return run_images(args, FORMAT, lambda path, stem: _one(path, stem, args))
 
 
 def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
@@ -42,16 +41,13 @@ def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     )
 
     start = time.perf_counter()
-    try:
-        exposure = read(path, args)
-        camera = camera_of(exposure)
-    except BadInput as cause:
-        return refused(path, cause, FORMAT)
+    exposure = read(path, args)
+    camera = camera_of(exposure)
+    out = result_path(args, stem, ".identification.json", exposure)
     read_ms = 1e3 * (time.perf_counter() - start)
     result = identify(exposure, camera, load_catalog())
     result.timing_ms["read"] = read_ms
     record = identification_dict(result)
-    out = result_path(args.dir, stem, ".identification.json", result, args.overwrite)
     if result.identification is not None:
         write_star_table(out.with_name(f"{stem}.stars.ecsv"), result)
     if not args.no_plots:

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from startrack.cli.common import Outcome, add_image_flags, camera_of, read, refused, result_path, run_images
+from startrack.cli.common import Outcome, add_image_flags, camera_of, read, result_path, run_images
 from startrack.errors import BadInput
 
 FORMAT = "startrack.fix/1"
@@ -28,7 +28,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Locate every image; the exit code of the worst."""
-    return run_images(args, lambda path, stem: _one(path, stem, args))
+    return run_images(args, FORMAT, lambda path, stem: _one(path, stem, args))
 
 
 def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
@@ -38,19 +38,16 @@ def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     from startrack.terrain import load_terrain
 
     start = time.perf_counter()
-    try:
-        exposure = read(path, args)
-        camera = camera_of(exposure)
-        if exposure.terrain is None:
-            raise BadInput("bad_terrain", "no terrain file is known: give -t FILE or a sidecar with terrain")
-        terrain = load_terrain(exposure.terrain)
-    except BadInput as cause:
-        return refused(path, cause, FORMAT)
+    exposure = read(path, args)
+    camera = camera_of(exposure)
+    if exposure.terrain is None:
+        raise BadInput("bad_terrain", "no terrain file is known: give -t FILE or a sidecar with terrain")
+    terrain = load_terrain(exposure.terrain)
+    out = result_path(args, stem, ".fix.json", exposure)
     read_ms = 1e3 * (time.perf_counter() - start)
     result = locate(exposure, camera, terrain, load_catalog())
     result.timing_ms["read"] = read_ms
     record = result_dict(result)
-    out = result_path(args.dir, stem, ".fix.json", result, args.overwrite)
     if result.light is not None:
         write_star_table(out.with_name(f"{stem}.stars.ecsv"), result)
     if not args.no_plots:

@@ -1,0 +1,141 @@
+"""`startrack reproduce`: the thesis's tables and figures, ours beside them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from startrack.cli.common import DEFAULT_OUT
+from startrack.errors import BadInput
+
+if TYPE_CHECKING:
+    from startrack.reproduce import Piece, Runs
+
+# As in startrack.reproduce.ARTEFACTS, which would take numpy to look up.
+NAMES = (
+    "table3.1", "fig3.3", "fig3.4", "fig3.5", "fig3.6", "fig3.7", "fig3.8", "fig3.9", "fig3.10", "figA.1", "figA.2",
+    "figB", "magnitude", "aspect",
+)  # fmt: skip
+USAGE = 2
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add `reproduce` to the commands of the `startrack` parser."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "reproduce",
+        help="the thesis's tables and figures, ours beside them",
+        description="Redo the tables and figures of Kua 2008 in its own crater simulator, with its method and with "
+        "ours on the same draws. Each NAME gives NAME.md, NAME.ecsv where there are numbers, and NAME.png. What was "
+        "computed is kept in OUT/.chunks: a run that was stopped goes on from there.",
+    )
+    parser.add_argument(
+        "what", nargs="*", default=["all"], metavar="NAME", help=f"all (default), or any of: {', '.join(NAMES)}"
+    )
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--quick", action="store_true", help="a part of the thesis's places, in about a minute (default)")
+    size.add_argument("--full", action="store_true", help="as many as in the thesis: 10 x 10,000, and 100,000 places")
+    parser.add_argument("-j", "--jobs", type=_jobs, default=None, metavar="N", help="processes (default: all cores)")
+    parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask cluster to use instead (extra: cluster)")
+    parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="same seed, same files (default 0)")
+    parser.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the results (%(default)s)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object per table or figure")
+    parser.add_argument("--no-plots", action="store_true", help="no pictures")
+    parser.add_argument("-v", "--verbose", action="count", default=0, help="tracebacks of internal errors")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    parser.set_defaults(usage_error=parser.error)
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make what was asked for, in the order of the thesis; 0 when all is written."""
+    unknown = [name for name in args.what if name not in (*NAMES, "all")]
+    if unknown:
+        args.usage_error(
+            f"{', '.join(unknown)}: not a table or figure of the thesis; known are {', '.join(NAMES)}, all"
+        )
+    chosen = NAMES if "all" in args.what else [name for name in NAMES if name in args.what]
+    _need(args, "matplotlib", "plots", "figures are drawn", unless=args.no_plots)
+    _need(args, "distributed", "cluster", "a cluster is reached", unless=args.cluster is None)
+
+    from startrack.reproduce import ARTEFACTS, FULL, QUICK, Context, Runs, written
+
+    out, size = Path(args.dir), FULL if args.full else QUICK
+    with Runs(out, jobs=args.jobs or _cores(), progress=_progress, cluster=args.cluster) as runs:
+        if args.cluster is not None:
+            _reach(runs)
+        for name in chosen:
+            start = time.perf_counter()
+            piece = ARTEFACTS[name](Context(size, args.seed, runs))
+            files = written(piece, out, plots=not args.no_plots)
+            _tell(args, piece, size.name, files, time.perf_counter() - start)
+    return 0
+
+
+def _need(args: argparse.Namespace, module: str, extra: str, what: str, *, unless: bool) -> None:
+    if not unless and find_spec(module) is None:
+        hint = "" if extra != "plots" else ", or leave them out with --no-plots"
+        args.usage_error(f"{what} with {module}: pip install 'startrack[{extra}]'{hint}")
+
+
+def _reach(runs: Runs) -> None:
+    try:
+        runs.connect()
+    except (OSError, ValueError) as cause:
+        raise BadInput("no_cluster", f"{runs.cluster}: no Dask scheduler answers ({cause})") from cause
+
+
+def _tell(args: argparse.Namespace, piece: Piece, size: str, files: list[Path], seconds: float) -> None:
+    if args.json:
+        record = {
+            "format": "startrack.reproduction/1",
+            "name": piece.name,
+            "title": piece.title,
+            "size": size,
+            "seed": args.seed,
+            **piece.values,
+            "files": [str(path) for path in files],
+            "timing_ms": {**piece.timing_ms, "all": 1e3 * seconds},
+        }
+        print(json.dumps(record), flush=True)
+    elif not args.quiet:
+        per_fix = ", ".join(f"{key} {value:.1f}" for key, value in piece.timing_ms.items())
+        print(f"{piece.name}: {piece.line}{f' [ms per fix: {per_fix}]' if per_fix else ''}", flush=True)
+
+
+@contextmanager
+def _progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A bar on a terminal; the function to call after each part."""
+    if total == 0 or not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda steps: bar.advance(task, steps)
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _jobs(text: str) -> int:
+    if int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text} processes")
+    return int(text)
+
+
+def _seed(text: str) -> int:
+    if int(text) < 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is negative")
+    return int(text)

@@ -1,0 +1,115 @@
+"""The thesis's crater environment simulator: random starfields, a cylinder, and the list of stars seen from a place.
+
+Source: Kua 2008, sections 3.2.1 and 3.2.2. No pixels: stars are told apart and found without error, unless mistakes are
+asked for. Everything drawn is fixed by (seed, sky, number of the place), whatever else is computed beside it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.frames import Site
+from startrack.terrain import Cylinder
+from startrack.types import Array, Bools, Evidence
+
+DIAMETER_M, DEPTH_M = 20_000.0, 2_000.0  # Shackleton as the thesis has it (section 3.3)
+MAGNITUDE = 6.0
+ASPECT_RATIO = DIAMETER_M / DEPTH_M
+STARS, PLACES, MISTAKES = 1, 2, 3  # streams of random numbers
+EDGE_POINTS = 360  # of the drawn crater edge (section 3.2.1)
+SHACKLETON = Site(body="moon", latitude_rad=float(np.radians(-89.66)), longitude_rad=float(np.radians(129.78)))
+
+
+def star_count(magnitude: float) -> int:
+    """Number of stars down to a magnitude on half the sky: 6.57 e^(1.08 M) (1 - cos(A / 2)) / 2 with A = 180 degrees.
+
+    Rounded: 2142 at magnitude 6. Source: Liebe 2002, as Kua 2008, eq. 3.8.
+    """
+    return round(float(6.57 * np.exp(1.08 * magnitude) * 0.5))
+
+
+def crater(aspect_ratio: float = ASPECT_RATIO) -> Cylinder:
+    """A crater as wide as Shackleton, of any aspect ratio (diameter to depth); the camera is on the floor."""
+    return Cylinder(
+        name=f"kua-2008-{aspect_ratio:g}",
+        site=SHACKLETON,
+        diameter_m=DIAMETER_M,
+        depth_m=DIAMETER_M / aspect_ratio,
+        search_radius_m=DIAMETER_M / 2,
+    )
+
+
+@dataclass(frozen=True)
+class Sky:
+    """A random starfield: azimuths and elevations (n,) [rad] in enu. A deeper one begins with the same stars."""
+
+    azimuth_rad: Array
+    elevation_rad: Array
+
+    @classmethod
+    def drawn(cls, seed: int, sky: int, magnitude: float = MAGNITUDE) -> Sky:
+        """phi = 2 pi r1, theta = arcsin r2, r1 and r2 uniform over [0, 1]: eq. 3.9 and 3.10."""
+        r1, r2 = np.random.default_rng([seed, STARS, sky]).random((star_count(magnitude), 2)).T
+        return cls(2 * np.pi * r1, np.arcsin(r2))
+
+    def __len__(self) -> int:
+        return len(self.azimuth_rad)
+
+    def on_rim_plane(self, cylinder: Cylinder) -> Array:
+        """Points (n, 2) [m]: from p, star i is visible exactly when |p + point_i| < R."""
+        rho = cylinder.wall_m / np.tan(self.elevation_rad)
+        return rho[:, None] * directions(self.azimuth_rad)
+
+
+def directions(azimuth_rad: Array) -> Array:
+    """Horizontal unit vectors (n, 2), east and north."""
+    return np.stack([np.sin(azimuth_rad), np.cos(azimuth_rad)], axis=-1)
+
+
+def places(seed: int, sky: int, start: int, stop: int, radius_m: float = DIAMETER_M / 2) -> Array:
+    """Places number start to stop - 1 (n, 2) [m] of a sky, uniform over the crater's floor."""
+    r1, r2 = np.random.default_rng([seed, PLACES, sky]).random((stop, 2))[start:].T
+    return radius_m * np.sqrt(r1)[:, None] * directions(2 * np.pi * r2)
+
+
+def visible(points_m: Array, place_m: Array, radius_m: float) -> Bools:
+    """Which stars (n,), given on the rim's plane, are in sight from a place (2,).
+
+    The thesis tests against a polygon of 360 points of the rim; it differs from the circle by 0.4 m at most.
+    """
+    return np.asarray(np.square(points_m[:, 0] + place_m[0]) + np.square(points_m[:, 1] + place_m[1]) < radius_m**2)
+
+
+def crater_edge(cylinder: Cylinder, place_m: Array) -> tuple[Array, Array]:
+    """Azimuths and elevations (361,) [rad] of the rim from a place, at even steps along the rim, closed."""
+    rim = cylinder.radius_m * directions(np.linspace(0.0, 2 * np.pi, EDGE_POINTS + 1)) - place_m
+    return np.arctan2(rim[:, 0], rim[:, 1]), np.arctan2(cylinder.wall_m, np.hypot(rim[:, 0], rim[:, 1]))
+
+
+@dataclass(frozen=True)
+class Mistakes:
+    """How often a list of stars is wrong, which is also what the evidence takes for granted."""
+
+    missed: float = 1e-6  # of the stars in sight; a list of the thesis has no mistakes, and 1e-6 none that would show
+    false: float = 1e-6  # of the hidden ones
+
+    def listed(self, in_sight: Bools, seed: int, sky: int, number: int) -> Bools:
+        """The stars (n,) that are on the list of place `number`."""
+        r = np.random.default_rng([seed, MISTAKES, sky, number]).random(len(in_sight))
+        return np.where(in_sight, r >= self.missed, r < self.false)
+
+    def evidence(self, sky: Sky, listed: Bools) -> Evidence:
+        """ln((1 - missed) / false) for the stars on the list, ln(missed / (1 - false)) for the others."""
+        for_it = float(np.log((1 - self.missed) / self.false))
+        against = float(np.log(self.missed / (1 - self.false)))
+        return Evidence(
+            azimuth_rad=sky.azimuth_rad,
+            elevation_rad=sky.elevation_rad,
+            llr=np.where(listed, for_it, against).astype(np.float64),
+            edge_sigma_rad=np.zeros(len(sky)),
+        )
+
+
+PERFECT = Mistakes()

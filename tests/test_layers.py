@@ -19,14 +19,15 @@ LAYERS = (  # lowest first; a room imports from lower layers only
     {"types", "paths"},
     {"frames"},
     {"psf", "body_angles", "catalog", "deep_catalog", "bodies", "camera", "terrain", "exposure"},
-    {"render", "detect", "identify", "orient", "evidence", "localize", "consistency"},
+    {"render", "detect", "identify", "orient", "evidence", "localize"},
     {"pipeline"},
     {"report"},
+    {"reproduce"},
     {"cli"},
 )
 # Rooms of one layer that may know each other all the same: identification refines the attitude, and the last check
 # reads what the evidence stage measured.
-ALLOWED = {("deep_catalog", "catalog"), ("identify", "orient"), ("consistency", "evidence")}
+ALLOWED = {("deep_catalog", "catalog"), ("identify", "orient")}
 HEAVY = (
     "astropy", "cv2", "lunarsky", "matplotlib", "PIL", "rich", "scipy", "skimage", "skyfield", "spiceypy", "tifffile",
 )  # fmt: skip

@@ -23,6 +23,7 @@ from startrack.exposure import write_atomically
 from startrack.reproduce.fixes import Chunk, Task, done
 
 FOLDER = ".chunks"
+CONNECT_S = 10.0
 SOURCES = (  # what computes a chunk: other sources make other chunks
     "localize/*.py", "terrain/cylinder.py", "reproduce/simulator.py", "reproduce/fixes.py", "reproduce/cell.py",
 )  # fmt: skip
@@ -52,7 +53,7 @@ class Runs:
         """Reach the cluster now. Raises OSError where no scheduler answers, ImportError without Dask."""
         from distributed import Client
 
-        self._executor = Client(self.cluster, timeout=10)
+        self._executor = Client(self.cluster, timeout=CONNECT_S)
 
     def chunks(self, what: str, tasks: Sequence[Task]) -> Iterator[Chunk]:
         """The chunks in the tasks' order, computing those that are not there yet."""

@@ -51,7 +51,7 @@ class Sky:
     @classmethod
     def drawn(cls, seed: int, sky: int, magnitude: float = MAGNITUDE) -> Sky:
         """phi = 2 pi r1, theta = arcsin r2, r1 and r2 uniform over [0, 1]: eq. 3.9 and 3.10."""
-        r1, r2 = np.random.default_rng([seed, STARS, sky]).random((star_count(magnitude), 2)).T
+        r1, r2 = _random([seed, STARS, sky], (star_count(magnitude), 2)).T
         return cls(2 * np.pi * r1, np.arcsin(r2))
 
     def __len__(self) -> int:
@@ -70,7 +70,7 @@ def directions(azimuth_rad: Array) -> Array:
 
 def places(seed: int, sky: int, start: int, stop: int, radius_m: float = DIAMETER_M / 2) -> Array:
     """Places number start to stop - 1 (n, 2) [m] of a sky, uniform over the crater's floor."""
-    r1, r2 = np.random.default_rng([seed, PLACES, sky]).random((stop, 2))[start:].T
+    r1, r2 = _random([seed, PLACES, sky], (stop, 2))[start:].T
     return radius_m * np.sqrt(r1)[:, None] * directions(2 * np.pi * r2)
 
 
@@ -97,7 +97,7 @@ class Mistakes:
 
     def listed(self, in_sight: Bools, seed: int, sky: int, number: int) -> Bools:
         """The stars (n,) that are on the list of place `number`."""
-        r = np.random.default_rng([seed, MISTAKES, sky, number]).random(len(in_sight))
+        r = _random([seed, MISTAKES, sky, number], (len(in_sight),))
         return np.where(in_sight, r >= self.missed, r < self.false)
 
     def evidence(self, sky: Sky, listed: Bools) -> Evidence:
@@ -113,3 +113,9 @@ class Mistakes:
 
 
 PERFECT = Mistakes()
+
+
+def _random(stream: list[int], shape: tuple[int, ...]) -> Array:
+    """Uniform over [0, 1), the same for the same stream; a longer draw begins with the shorter one."""
+    rng = np.random.default_rng(stream)
+    return rng.random(shape)

@@ -12,12 +12,11 @@ import numpy as np
 
 from startrack.bodies import bodies
 from startrack.camera import Camera
-from startrack.consistency import check_consistency
 from startrack.detect import Detector, electrons
 from startrack.evidence import StarEvidence, StarLight, flux_scale
 from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
 from startrack.identify import Identifier
-from startrack.localize import ExactPosterior, Localizer
+from startrack.localize import ExactPosterior, Localizer, check_consistency
 from startrack.orient import AttitudeFit, solve_attitude
 from startrack.terrain import Terrain
 from startrack.types import (
@@ -100,8 +99,9 @@ def locate(
         with _timed(result, "evidence"):
             result.light = _light(result, settings)
         with _timed(result, "locate"):
-            fix = settings.localizer(result.light.evidence(), terrain)
-            check_consistency(result.light, fix, terrain)
+            evidence = result.light.evidence()
+            fix = settings.localizer(evidence, terrain)
+            check_consistency(evidence, fix, terrain)
         result.fix = fix
         result.status = "ambiguous" if fix.ambiguous else "ok"
         if fix.ambiguous:

@@ -2,6 +2,7 @@
 
 from typing import Protocol
 
+from startrack.localize.consistency import check_consistency
 from startrack.localize.hull import Hull
 from startrack.localize.posterior import ExactPosterior
 from startrack.localize.pseudo_gradient import PseudoGradient
@@ -15,4 +16,4 @@ class Localizer(Protocol):
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix: ...
 
 
-__all__ = ["ExactPosterior", "Hull", "Localizer", "PseudoGradient"]
+__all__ = ["ExactPosterior", "Hull", "Localizer", "PseudoGradient", "check_consistency"]

@@ -1,42 +1,112 @@
-"""Does the fix explain the stars? Refuse rather than guess."""
+"""Does the fix explain the evidence, and better than a wrong map would? Refuse rather than guess."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from startrack.evidence import StarLight
+from startrack.localize.likelihood import Sectors
+from startrack.localize.scout import scores, taken
 from startrack.terrain import Terrain
-from startrack.types import Fix, NotLocated
+from startrack.types import Array, Evidence, Fix, NotLocated
 
 SURE_LLR = 4.0
 CLEAR_OF_SKYLINE_RAD = np.radians(0.5)
+NEAR_SKYLINE_RAD = np.radians(15.0)
 SECTOR_RAD = np.radians(5.0)
 MOST_CONTRADICTED_SECTORS = 0.15  # a boulder of 20 degrees is 6 % of the horizon
-SECTOR_CONTRADICTED = 0.2  # part of a sector's sure stars that contradict the fix
+SECTOR_CONTRADICTED = 0.2  # part of a sector's sure rays that contradict the fix
 FEWEST_IN_SECTOR = 3
 
+STRETCHES = (0.005, 0.01, 0.015, 0.025, 0.05, 0.1)  # both ways
+STRETCH_WINDOW_RAD = np.radians(4.0)
+TELLING_LLR = 0.3
+STRETCH_GAIN_NATS = 6.0  # 3.5 sigma: a true map is refused once in two thousand images
+FIRST_STEP_M, LAST_STEP_M = 16.0, 2.0
+COMPASS = np.array([[i, j] for i in (-1, 0, 1) for j in (-1, 0, 1)], dtype=np.float64)
 
-def check_consistency(light: StarLight, fix: Fix, terrain: Terrain) -> None:
-    """Raise NotLocated (inconsistent_evidence) where too much of the horizon contradicts the fix.
 
-    Only stars that are sure of themselves and well clear of the fix's skyline are asked, sector by sector of azimuth:
-    a few contradicted sectors are an obstacle or a defect, many are a wrong map, time or identification.
-    """
-    sure = light.usable & (np.abs(light.llr) > SURE_LLR)
-    azimuth, elevation = light.azimuth_rad[sure], light.elevation_rad[sure]
-    horizon = terrain.horizon_rad(fix.position_enu_m[None, :2], azimuth)
-    clear = np.abs(elevation - horizon) > CLEAR_OF_SKYLINE_RAD
-    near = np.abs(elevation - horizon) < np.radians(15.0)
-    wrong = (light.llr[sure] > 0) != (elevation > horizon)
-    sector = (azimuth / SECTOR_RAD).astype(int)
-    asked = np.bincount(sector, weights=clear & near)
-    contradicted = np.bincount(sector, weights=clear & near & wrong)
-    known = asked >= FEWEST_IN_SECTOR
-    if not known.any():
-        return
-    bad = contradicted[known] > SECTOR_CONTRADICTED * asked[known]
-    if bad.mean() > MOST_CONTRADICTED_SECTORS:
+def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain) -> None:
+    """Raise NotLocated (inconsistent_evidence) where too much of the horizon contradicts the fix, or the map does."""
+    contradicted = contradicted_part(evidence, fix, terrain)
+    if contradicted > MOST_CONTRADICTED_SECTORS:
         raise NotLocated(
-            f"{100 * bad.mean():.0f} % of the horizon contradicts the best place: wrong terrain, time or camera file?",
+            f"{100 * contradicted:.0f} % of the horizon contradicts the best place: "
+            "wrong terrain, time or camera file?",
             reason="inconsistent_evidence",
         )
+    stretch, gain = best_stretch(evidence, fix, terrain)
+    if gain > STRETCH_GAIN_NATS:
+        raise NotLocated(
+            f"the stars see a horizon about {100 * abs(stretch - 1):.1f} % {'higher' if stretch > 1 else 'lower'} than "
+            f"the terrain {terrain.name} gives: is its depth, width or camera height right? "
+            "(a cylinder can take depth_sigma_m and diameter_sigma_m)",
+            reason="inconsistent_evidence",
+        )
+
+
+def contradicted_part(evidence: Evidence, fix: Fix, terrain: Terrain) -> float:
+    """Part of the horizon's sectors that contradict the fix.
+
+    Only rays that are sure of themselves, near the fix's skyline and yet well clear of it are asked: a few contradicted
+    sectors are an obstacle or a defect, many are a wrong map, time or identification.
+    """
+    sure = taken(evidence, np.abs(evidence.llr) > SURE_LLR)
+    above = sure.elevation_rad - terrain.horizon_rad(fix.position_enu_m[None, :2], sure.azimuth_rad)
+    asked = (np.abs(above) > CLEAR_OF_SKYLINE_RAD) & (np.abs(above) < NEAR_SKYLINE_RAD)
+    sector = (sure.azimuth_rad / SECTOR_RAD).astype(int)
+    rays = np.bincount(sector, weights=asked)
+    wrong = np.bincount(sector, weights=asked & ((sure.llr > 0) != (above > 0)))
+    known = rays >= FEWEST_IN_SECTOR
+    return float(np.mean(wrong[known] > SECTOR_CONTRADICTED * rays[known])) if known.any() else 0.0
+
+
+def best_stretch(evidence: Evidence, fix: Fix, terrain: Terrain) -> tuple[float, float]:
+    """The stretch of the terrain's height that fits best, and how much better [nats] than the terrain as it is.
+
+    tan H -> s tan H for all azimuths, the position free: a wrong depth, width or camera height shows as s != 1, while a
+    wrong position cannot. Asked in the form tan e -> tan e / s, so that no terrain needs to know of it.
+    """
+    start = fix.position_enu_m[None, :2]
+    below = evidence.elevation_rad - terrain.horizon_rad(start, evidence.azimuth_rad)
+    near = taken(evidence, (np.abs(below) < STRETCH_WINDOW_RAD) & (np.abs(evidence.llr) > TELLING_LLR))
+    if not len(near):
+        return 1.0, 0.0
+    middle, plain = best_near(start, near, terrain)
+    best_stretch, best = 1.0, plain
+    for sign in (1, -1):
+        place = middle
+        for stretch in (1 + sign * size for size in STRETCHES):
+            place, fit = best_near(place, _lowered(near, stretch), terrain)
+            if fit > best:
+                best_stretch, best = stretch, fit
+    return best_stretch, best - plain
+
+
+def _lowered(evidence: Evidence, stretch: float) -> Evidence:
+    return Evidence(
+        azimuth_rad=evidence.azimuth_rad,
+        elevation_rad=np.arctan(np.tan(evidence.elevation_rad) / stretch),
+        llr=evidence.llr,
+        edge_sigma_rad=evidence.edge_sigma_rad,
+    )
+
+
+def best_near(
+    start_m: Array, evidence: Evidence, terrain: Terrain, first_step_m: float = FIRST_STEP_M
+) -> tuple[Array, float]:
+    """Best place (1, 2) near the start and its log-likelihood: steps to the best of 8 neighbours, ever shorter.
+
+    A plain sum, no sectors.
+    """
+    sectors = Sectors.of(evidence, 2 * np.pi, 0.0)
+    place, step, best = start_m, first_step_m, -np.inf
+    while step >= LAST_STEP_M:
+        around = place + step * COMPASS
+        around = around[np.asarray(terrain.allowed(around))]
+        score = scores(around, evidence, sectors, terrain) + sectors.ceiling.sum()
+        top = int(np.argmax(score)) if len(score) else 0
+        if not len(score) or score[top] <= best:
+            step /= 2
+            continue
+        place, best = around[top : top + 1], float(score[top])
+    return place, best

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.localize import compiled
+from startrack.localize.crater import CraterFit, marginalised
 from startrack.localize.likelihood import Sectors
 from startrack.localize.profile import Profile
 from startrack.localize.scout import likely_places, taken
 from startrack.localize.search import Boxes, RayBoxes, by_sector, centre_scores, ray_by_ray, split
 from startrack.localize.seen import cylinder_of
 from startrack.localize.summary import summarize
-from startrack.terrain import Terrain
+from startrack.terrain import Cylinder, Terrain
 from startrack.types import Array, Bools, Evidence, Fix, NotLocated
 
 FEWEST_RAYS = 8
@@ -43,15 +44,24 @@ class ExactPosterior:
         if told.sum() < FEWEST_RAYS:
             raise NotLocated(f"only {int(told.sum())} rays say anything about the skyline: expose longer")
         evidence = taken(evidence, told)
+        if isinstance(terrain, Cylinder) and (terrain.depth_sigma_m > 0 or terrain.diameter_sigma_m > 0):
+            (centres, half, log_weight, log_dropped), _ = marginalised(self._explored, evidence, terrain)
+        else:
+            centres, half, log_weight, log_dropped = self._explored(evidence, terrain)
+        dropped = float(np.exp(min(log_dropped - _log_mass(log_weight, half), 0.0)))
+        return summarize(centres, 2 * half, log_weight, dropped, terrain)
+
+    def crater(self, evidence: Evidence, cylinder: Cylinder) -> CraterFit:
+        """Depth and diameter of a cylinder with uncertain ones, estimated together with the position."""
+        return marginalised(self._explored, evidence, cylinder)[1]
+
+    def _explored(self, evidence: Evidence, terrain: Terrain) -> tuple[Array, float, Array, float]:
+        """Centres (n, 2) of equal boxes, half side, log-likelihoods (n,) there, log of a bound on the mass dropped."""
         if self.compiled and compiled.applies(evidence, terrain):
-            centres, half, log_weight, log_dropped = compiled.explored(self, evidence, cylinder_of(terrain))
-            dropped = float(np.exp(min(log_dropped - _log_mass(log_weight, half), 0.0)))
-            return summarize(centres, 2 * half, log_weight, dropped, terrain)
+            return compiled.explored(self, evidence, cylinder_of(terrain))
         search = _Search(self, evidence, terrain)
         boxes = search.refine(search.exclude())
-        log_weight = search.scores(boxes)
-        dropped = float(np.exp(min(search.log_dropped - _log_mass(log_weight, boxes.half_m), 0.0)))
-        return summarize(boxes.centres_m, 2 * boxes.half_m, log_weight, dropped, terrain)
+        return boxes.centres_m, boxes.half_m, search.scores(boxes), search.log_dropped
 
 
 class _Search:

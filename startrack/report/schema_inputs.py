@@ -52,7 +52,12 @@ ORIGIN = record(
     "Where the frame enu stands: moon, on the 1737.4 km sphere; earth, geodetic WGS 84.",
     optional={"height_m": {**NUMBER, "default": 0.0}},
 )
-CYLINDER = record({"diameter_m": ABOVE_0, "depth_m": ABOVE_0}, "Axis through the origin; floor at z = 0.")
+FROM_0: Schema = {"type": "number", "minimum": 0, "default": 0.0}
+CYLINDER = record(
+    {"diameter_m": ABOVE_0, "depth_m": ABOVE_0},
+    "Axis through the origin; floor at z = 0.",
+    optional={"depth_sigma_m": FROM_0, "diameter_sigma_m": FROM_0},
+)
 DEM = record(
     {"file": {"anyOf": [TEXT, {"type": "array", "items": TEXT, "minItems": 1}], "description": "finest first"}},
     optional={"height_sigma_m": NUMBER},

@@ -23,6 +23,8 @@ class Cylinder:
     depth_m: float
     camera_height_m: float = 0.0
     search_radius_m: float = np.inf
+    depth_sigma_m: float = 0.0  # standard deviations of what the file says; with either, the stars are asked too
+    diameter_sigma_m: float = 0.0
 
     @property
     def radius_m(self) -> float:

@@ -57,6 +57,10 @@ def terrain_from_dict(d: dict[str, Any], default_name: str = "terrain") -> Terra
     search = _number(_table(d, "search", {}), "radius_m", diameter / 2)
     if min(diameter, depth, search) <= 0 or not 0 <= camera_height < depth:
         raise BadInput("bad_terrain", "diameter_m, depth_m, radius_m must be positive, the camera below the rim")
+    depth_sigma = _number(cylinder, "depth_sigma_m", 0.0)
+    diameter_sigma = _number(cylinder, "diameter_sigma_m", 0.0)
+    if not (0 <= depth_sigma < 0.2 * depth and 0 <= diameter_sigma < 0.2 * diameter):
+        raise BadInput("bad_terrain", "depth_sigma_m and diameter_sigma_m must be below a fifth of what they belong to")
     return Cylinder(
         name=str(d.get("name", default_name)),
         site=site,
@@ -64,6 +68,8 @@ def terrain_from_dict(d: dict[str, Any], default_name: str = "terrain") -> Terra
         depth_m=depth,
         camera_height_m=camera_height,
         search_radius_m=search,
+        depth_sigma_m=depth_sigma,
+        diameter_sigma_m=diameter_sigma,
     )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from startrack.catalog import MAS_RAD, StarCatalog, load_catalog
-from startrack.types import Array, BadInput
+from startrack.types import Array, BadInput, Bools
 
 GAIA_EPOCH_YR = 2016.0  # Gaia DR3
 SAME_STAR_RAD = np.radians(6.0 / 3600)  # Hipparcos carried to 2016 agrees to 0.1 arcsec; companions of doubles drop too
@@ -69,7 +69,7 @@ def _axes(ra: Array, dec: Array) -> tuple[Array, Array]:
     return east, north
 
 
-def _near(rays: Array, known: Array) -> Array:
+def _near(rays: Array, known: Array) -> Bools:
     """Whether each ray (n, 3) has a known one within the radius of one star."""
     from scipy.spatial import cKDTree
 

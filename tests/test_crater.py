@@ -52,7 +52,7 @@ def test_an_uncertain_depth_is_found_with_the_position(place_m: tuple[float, flo
     guess = replace(TRUE, depth_m=TRUE.depth_m + 25.0, depth_sigma_m=20.0)
     method = ExactPosterior(compiled=True)
     fix, crater = method(evidence, guess), method.crater(evidence, guess)
-    assert np.linalg.norm(fix.position_enu_m[:2] - place_m) < fix.radius999_m < 100
+    assert np.linalg.norm(fix.position_enu_m[:2] - place_m) < fix.radius999_m < 200
     assert abs(crater.depth_m - TRUE.depth_m) < 4 * np.sqrt(crater.covariance_m2[0, 0])
     assert np.sqrt(crater.covariance_m2[0, 0]) < 6
     assert crater.diameter_m == pytest.approx(guess.diameter_m)

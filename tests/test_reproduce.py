@@ -316,6 +316,12 @@ def test_usage(tmp_path, monkeypatch, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_place_that_cannot_be_written_is_named_at_once(tmp_path, capsys):
+    (tmp_path / "file").write_text("in the way")
+    assert main(["reproduce", "-D", str(tmp_path / "file"), "--full"]) == 4
+    assert str(tmp_path / "file") in capsys.readouterr().err
+
+
 def test_a_progress_bar_on_a_terminal_only(monkeypatch):
     class Terminal(io.StringIO):
         def isatty(self):

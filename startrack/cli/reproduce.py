@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
 
     from startrack.reproduce import ARTEFACTS, FULL, QUICK, Context, Runs, written
 
-    out, size = Path(args.dir), FULL if args.full else QUICK
+    out, size = _folder(args.dir), FULL if args.full else QUICK
     with Runs(out, jobs=args.jobs or _cores(), progress=_progress, cluster=args.cluster) as runs:
         if args.cluster is not None:
             _reach(runs)
@@ -77,6 +77,15 @@ def run(args: argparse.Namespace) -> int:
             files = written(piece, out, plots=not args.no_plots)
             _tell(args, piece, size.name, files, time.perf_counter() - start)
     return 0
+
+
+def _folder(path: str) -> Path:
+    """The folder of the results, made before anything is computed."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as cause:
+        raise BadInput("bad_image", f"{path}: results cannot be written there: {cause.strerror}") from cause
+    return Path(path)
 
 
 def _need(args: argparse.Namespace, module: str, extra: str, what: str, *, unless: bool) -> None:

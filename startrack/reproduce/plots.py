@@ -64,7 +64,7 @@ def error_map(places_m: Array, errors_m: Array, title: str, caption: str) -> byt
     axes = figure.subplots()
     order = np.argsort(errors_m, kind="stable")  # the large ones on top
     share = errors_m[order] / errors_m.max()
-    area = 0.3 + 40.0 * share**1.5 * min(1.0, (2e4 / len(order)) ** 0.5)
+    area = (0.6 + 28.0 * share**1.5) * min(2.0, (2e4 / len(order)) ** 0.5)
     east, north = places_m[order].T / 1e3
     points = axes.scatter(east, north, s=area, c=errors_m[order], cmap="turbo", linewidths=0)
     _floor(axes, title)

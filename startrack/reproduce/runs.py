@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures import as_completed as completed_here
@@ -79,12 +80,18 @@ class Runs:
             for future in as_completed(futures):
                 yield futures.pop(future), future.result()
         elif self.jobs > 1 and len(tasks) > 1:
-            self._executor = self._executor or ProcessPoolExecutor(self.jobs, mp_context=get_context("spawn"))
+            self._executor = self._executor or _pool(self.jobs)
             waiting = {self._executor.submit(done, task): task for task in tasks}
             for finished in completed_here(waiting):
                 yield waiting.pop(finished), finished.result()
         else:
             yield from ((task, done(task)) for task in tasks)
+
+
+def _pool(jobs: int) -> ProcessPoolExecutor:
+    # Fresh processes (a fork would copy the progress bar's thread), which leave Ctrl-C to the one that waits for them.
+    ignore = (signal.SIGINT, signal.SIG_IGN)
+    return ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=signal.signal, initargs=ignore)
 
 
 def _packed(chunk: Chunk) -> bytes:

@@ -42,7 +42,12 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_true", help="a part of the thesis's places, in about a minute (default)")
     size.add_argument("--full", action="store_true", help="as many as in the thesis: 10 x 10,000, and 100,000 places")
-    parser.add_argument("-j", "--jobs", type=_jobs, default=None, metavar="N", help="processes (default: all cores)")
+    parser.add_argument(
+        "--ours", type=_positive, metavar="N", help="our method on at most N places per starfield, 10 N in figure 3.10"
+    )
+    parser.add_argument(
+        "-j", "--jobs", type=_positive, default=None, metavar="N", help="processes (default: all cores)"
+    )
     parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask cluster to use instead (extra: cluster)")
     parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="same seed, same files (default 0)")
     parser.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the results (%(default)s)")
@@ -68,6 +73,8 @@ def run(args: argparse.Namespace) -> int:
     from startrack.reproduce import ARTEFACTS, FULL, QUICK, Context, Runs, written
 
     out, size = _folder(args.dir), FULL if args.full else QUICK
+    if args.ours is not None:
+        size = size.with_ours(args.ours)
     with Runs(out, jobs=args.jobs or _cores(), progress=_progress, cluster=args.cluster) as runs:
         if args.cluster is not None:
             _reach(runs)
@@ -138,9 +145,9 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _jobs(text: str) -> int:
+def _positive(text: str) -> int:
     if int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text} processes")
+        raise argparse.ArgumentTypeError(f"{text} is not above 0")
     return int(text)
 
 

@@ -103,13 +103,15 @@ def test_lists_are_as_wrong_as_they_say():
     assert llr[0] == pytest.approx(np.log(45)) and llr[-1] == pytest.approx(np.log(0.1 / 0.98))
 
 
-def test_the_middle_of_a_cell_with_straight_walls():
-    """Circles of huge radius are straight lines: the cell is the rectangle -7 < x < 5, -2 < y < 3."""
+@pytest.mark.parametrize("size", [1.0, 0.02, 40.0])  # as wide as the first grid, below its step, beyond its window
+def test_the_middle_of_a_cell_with_straight_walls(size):
+    """Circles of huge radius are straight lines: the cell is the rectangle -7 < x < 5, -2 < y < 3, times the size."""
     radius = 1e8
     normals = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    walls = np.array([5.0, 7.0, 3.0, 2.0])
+    walls = size * np.array([5.0, 7.0, 3.0, 2.0])
     points = normals * (radius - walls)[:, None]
-    np.testing.assert_allclose(cell_centroid(points, np.array([4.0, -1.5]), radius), [-1.0, 0.5], atol=0.04)
+    found = cell_centroid(points, size * np.array([4.0, -1.5]), radius)
+    np.testing.assert_allclose(found, size * np.array([-1.0, 0.5]), atol=0.04 * size)
 
 
 # The methods

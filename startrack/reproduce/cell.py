@@ -10,9 +10,10 @@ import numpy as np
 from startrack.reproduce.simulator import visible
 from startrack.types import Array, Bools
 
-ACROSS = 160
+ACROSS = 161  # odd: the place itself is a point of the first grid, so the cell is never missed
 FIRST_HALF_M = 20.0
 WIDER, MARGIN = 2.0, 1.05
+FINER = 2  # times
 
 
 def cell_centroid(points_m: Array, place_m: Array, radius_m: float) -> Array:
@@ -26,14 +27,17 @@ def cell_centroid(points_m: Array, place_m: Array, radius_m: float) -> Array:
     while True:
         inside, x, y = _inside(points_m, seen, low, high, radius_m)
         rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
-        if len(rows) and min(rows[0], columns[0]) > 0 and max(rows[-1], columns[-1]) < ACROSS - 1:
+        if min(rows[0], columns[0]) > 0 and max(rows[-1], columns[-1]) < ACROSS - 1:
             break
         low, high = place_m - WIDER * (place_m - low), place_m + WIDER * (high - place_m)
-    for _ in range(2):
+    for _ in range(FINER):
         step = np.array([x[1] - x[0], y[1] - y[0]])
         ends = np.array([[x[columns[0]], y[rows[0]]], [x[columns[-1]], y[rows[-1]]]])
         middle, half = ends.mean(axis=0), MARGIN * (np.diff(ends, axis=0)[0] / 2 + step)
-        inside, x, y = _inside(points_m, seen, middle - half, middle + half, radius_m)
+        closer, x_closer, y_closer = _inside(points_m, seen, middle - half, middle + half, radius_m)
+        if not closer.any():  # a sliver between the new grid's points: what the coarser one saw of it stands
+            break
+        inside, x, y = closer, x_closer, y_closer
         rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
     north, east = np.nonzero(inside)
     return np.array([x[east].mean(), y[north].mean()])

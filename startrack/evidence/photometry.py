@@ -12,6 +12,7 @@ from startrack.types import Array, Bools, Ints
 
 OUTLIER_SIGMA = 5.0
 MODEL_ERROR = 0.05  # of a star's light, pixel by pixel: the real PSF is not quite the Gaussian
+STARS_AT_ONCE = 2000  # stamps that stay in the processor's cache together
 MOST_MASKED_PX = 6  # a stamp with more deviant pixels is not a star on a smooth background
 
 
@@ -49,46 +50,67 @@ def measure(
     `image` is background-subtracted [e], `noise` the standard deviation of a pixel [e], `dead` marks saturated pixels.
     All sources must lie at least `half_width` inside the frame. The neighbours' expected light is subtracted.
     """
+    from scipy.spatial import cKDTree
+
     radius = half_width(sigma_px)
     centre = np.rint(sources.xy_px).astype(np.int64)
-    profile = _profiles(sources.xy_px - centre, sigma_px, radius)
+    found = cKDTree(sources.xy_px).query_pairs(radius + 3.0 * sigma_px, output_type="ndarray")
+    pairs = np.concatenate([found, found[:, ::-1]]).astype(np.int64)  # of a star and its neighbour
+    pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
+    pictures = image, noise, dead
+    parts = []
+    for start in range(0, max(len(centre), 1), STARS_AT_ONCE):
+        some = slice(start, start + STARS_AT_ONCE)
+        first, last = np.searchsorted(pairs[:, 0], [start, start + STARS_AT_ONCE])
+        parts.append(_measured(pictures, sources, centre[some], pairs[first:last], start, sigma_px, radius))
+    fields = Photometry.__dataclass_fields__
+    return Photometry(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in fields})
+
+
+def _measured(
+    pictures: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]],
+    sources: Sources,
+    centre: Ints,
+    pairs: Ints,
+    start: int,
+    sigma_px: float,
+    radius: int,
+) -> Photometry:
+    """The sources `start`.. whose stamps are around the pixels `centre` (n, 2); `pairs` (m, 2) are theirs."""
+    n = len(centre)
+    profile = _profiles(sources.xy_px[start : start + n] - centre, sigma_px, radius)
     rows = centre[:, 1, None] + np.arange(-radius, radius + 1)
     columns = centre[:, 0, None] + np.arange(-radius, radius + 1)
-    index = rows[:, :, None], columns[:, None, :]
-    pairs, overlap = _neighbour_profiles(sources.xy_px, centre, sigma_px, radius)
-    expected = sources.flux_e * sources.visible
-    n = len(centre)
-    light = _summed(expected[pairs[:, 1], None].astype(np.float32) * overlap, pairs[:, 0], n)
-    data = image[index].reshape(n, -1) - light
-    variance = np.square(noise[index].reshape(n, -1))
-    good = ~dead[index].reshape(n, -1)
+    image, noise, dead = (picture[rows[:, :, None], columns[:, None, :]].reshape(n, -1) for picture in pictures)
+    own_row, neighbour = pairs[:, 0] - start, pairs[:, 1]
+    overlap = _profiles(sources.xy_px[neighbour] - centre[own_row], sigma_px, radius)
+    expected = (sources.flux_e[neighbour] * sources.visible[neighbour]).astype(np.float32)
+    light = _summed(expected[:, None] * overlap, own_row, n)
+    data, variance, good = image - light, np.square(noise), ~dead
     flux, weights = _fit(data, profile, good / variance)
-    # One round of masking: hot pixels and tracks are none of the star's light.
-    level = _level(data, profile, good / variance, flux)
-    own = np.maximum(flux, 0.0)[:, None] * profile
-    stars = own + light
-    spread2 = variance + stars + np.square(MODEL_ERROR * stars)
-    rest = data - flux[:, None] * profile - level[:, None]
-    deviant = good & (np.square(rest) > OUTLIER_SIGMA**2 * spread2)
+    deviant = good & _deviant(data, variance, light, profile, flux, _level(data, profile, good / variance, flux))
     good &= ~deviant
     redo = deviant.any(axis=1)
     flux[redo], weights[redo] = _fit(data[redo], profile[redo], good[redo] / variance[redo])
-    uncertain = np.square(sources.flux_e) * (
-        sources.visible * (1 - sources.visible) + sources.visible * np.square(sources.fraction_sigma)
-    )
     usable = (deviant.sum(axis=1) <= MOST_MASKED_PX) & (np.where(good, profile, 0.0).sum(axis=1) > 0.5)
     weights[~usable] = 0.0
-    leak = np.einsum("mp,mp->m", weights[pairs[:, 0]], overlap)
-    variance_of_flux = np.einsum("np,np,np->n", weights, weights, variance + light)
+    shining, fraction = sources.visible[neighbour], sources.fraction_sigma[neighbour]
+    uncertain = np.square(sources.flux_e[neighbour]) * (shining * (1 - shining) + shining * np.square(fraction))
+    leak = np.square(np.einsum("mp,mp->m", weights[own_row], overlap))
     return Photometry(
         flux_e=np.where(usable, flux, 0.0),
-        variance_e2=np.where(usable, variance_of_flux, 1.0),
+        variance_e2=np.where(usable, np.einsum("np,np,np->n", weights, weights, variance + light), 1.0),
         own_shot=np.einsum("np,np,np->n", weights, weights, profile),
-        neighbour_variance_e2=np.bincount(
-            pairs[:, 0], weights=leak**2 * uncertain[pairs[:, 1]], minlength=n
-        ).astype(np.float64),
+        neighbour_variance_e2=np.bincount(own_row, weights=leak * uncertain, minlength=n).astype(np.float64),
         usable=usable,
     )
+
+
+def _deviant(data: Array, variance: Array, light: Array, profile: Array, flux: Array, level: Array) -> Bools:
+    """Pixels (n, pixels) that are none of the star's light: hot ones and tracks."""
+    stars = np.maximum(flux, 0.0)[:, None] * profile + light
+    rest = data - flux[:, None] * profile - level[:, None]
+    return np.asarray(np.square(rest) > OUTLIER_SIGMA**2 * (variance + stars + np.square(MODEL_ERROR * stars)))
 
 
 def _profiles(offset_px: Array, sigma_px: float, radius: int) -> Array:
@@ -106,16 +128,6 @@ def _summed(rows: Array, group: Ints, n: int) -> Array:
     ones = np.ones(len(group), np.float32)
     sparse = csr_matrix((ones, (group, np.arange(len(group)))), shape=(n, len(group)))
     return np.asarray(sparse @ rows)
-
-
-def _neighbour_profiles(xy_px: Array, centre: Ints, sigma_px: float, radius: int) -> tuple[Ints, Array]:
-    """Pairs (m, 2) (of a star, its neighbour) and the neighbour's PSF on the star's stamp (m, pixels)."""
-    from scipy.spatial import cKDTree
-
-    found = cKDTree(xy_px).query_pairs(radius + 3.0 * sigma_px, output_type="ndarray")
-    pairs = np.concatenate([found, found[:, ::-1]]).astype(np.int64)
-    offset = xy_px[pairs[:, 1]] - centre[pairs[:, 0]]
-    return pairs, _profiles(offset, sigma_px, radius)
 
 
 def _fit(data: Array, profile: Array, weight: Array) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from startrack.types import Array, Body, Bools, Detections, Evidence, Ints, Star
 
 FAINTEST_SNR = 0.5  # fainter stars say next to nothing and would only cost time
 BODY_GLARE_PX = 8.0
-TELLING_SNR = 1.0  # stars brighter than this tell whether they shine
+TELLING_SNR = 2.0  # stars brighter than this tell whether they shine
 SEEN_LLR = 3.0  # from here on a star counts as seen, from minus this as hidden
 
 

@@ -88,7 +88,9 @@ def _kua(points: Array, seen: list[Bools], wall_m: float, radius_m: float) -> Ch
 
 
 def _ours(task: Task, sky: Sky, seen: list[Bools], truth: Array) -> Chunk:
-    localizer, cylinder = ExactPosterior(compiled=find_spec("numba") is not None), crater(task.aspect_ratio)
+    # No boulders here that are not on the map, so a sector of the horizon needs no cap on what it may claim.
+    localizer = ExactPosterior(sector_epsilon=0.0, compiled=find_spec("numba") is not None)
+    cylinder = crater(task.aspect_ratio)
     evidence = [
         task.mistakes.evidence(sky, task.mistakes.listed(one, task.seed, task.sky, task.start + k))
         for k, one in enumerate(seen)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.types import Array
+from startrack.types import Array, Ints
 
 GRID_POINTS = 600
 NEIGHBOURHOOD_RAD = np.radians(10.0)
@@ -14,7 +14,7 @@ class ChanceModel:
     """Expected number of chance coincidences between predicted stars and detections.
 
     Detections cluster (walls, clouds and trees leave part of the field empty), so the density that counts is the one
-    met where the detections are: sum of squared counts over sum of counts on a grid of overlapping caps.
+    met where the detections are: of counts c on a grid of overlapping caps, sum c (c - 1) over sum c.
     """
 
     def __init__(self, detection_rays: Array) -> None:
@@ -25,21 +25,26 @@ class ChanceModel:
         counts = self.tree.query_ball_point(_fibonacci_sphere(GRID_POINTS), chord, return_length=True)
         cap_sr = 2 * np.pi * (1 - np.cos(NEIGHBOURHOOD_RAD))
         occupied = float(np.sum(counts))
-        typical = float(np.sum(np.square(counts, dtype=np.float64))) / occupied if occupied else 0.0
+        typical = float(np.sum(counts * (counts - 1.0))) / occupied if occupied else 0.0
         self.density_per_sr = max(typical / cap_sr, len(detection_rays) / (4 * np.pi))
 
     def probability(self, radius_rad: Array | float) -> Array:
         """Probability that at least one detection lies within the radius of a random direction among the detections."""
         return -np.expm1(-self.density_per_sr * np.pi * np.square(radius_rad))
 
-    def log_odds(self, matched: Array, predicted: Array, radius_rad: float, given: int = 3) -> Array:
-        """log P(at least `matched` of `predicted` stars coincide by chance), the `given` of the pattern not counted."""
+    def log_odds(
+        self, matched: Ints, predicted: Ints, radius_rad: float, given: int = 3, alike: float = 1.0
+    ) -> Array:
+        """log P(at least `matched` of `predicted` stars coincide by chance), the `given` of the pattern not counted.
+
+        `alike`: probability that a chance coincidence is accepted as equally bright.
+        """
         from scipy.special import betainc
 
         n = np.maximum(predicted - given, 0)
         k = np.maximum(matched - given, 0)
         # The binomial tail as an incomplete beta function: P(X >= k) = I_p(k, n - k + 1).
-        tail = betainc(np.maximum(k, 1), np.maximum(n - k, 0) + 1, self.probability(radius_rad))
+        tail = betainc(np.maximum(k, 1), np.maximum(n - k, 0) + 1, alike * self.probability(radius_rad))
         return np.where(k > 0, np.log(np.maximum(tail, 1e-300)), 0.0)
 
 

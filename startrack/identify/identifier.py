@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -10,15 +12,16 @@ from startrack.camera import Camera
 from startrack.identify.chance import ChanceModel
 from startrack.identify.index import PatternIndex, build_index
 from startrack.identify.match import Matches, match
-from startrack.identify.triangles import triangles
-from startrack.orient import AttitudeFit, solve_attitude, wahba
+from startrack.identify.pairs import PairIndex, build_pairs
+from startrack.identify.search import Search
+from startrack.orient import AttitudeFit, solve_attitude
 from startrack.types import Array, Detections, Identification, NotIdentified, Stars
 
-HYPOTHESES_AT_ONCE = 256
-MOST_HYPOTHESES = 60_000
-VERIFICATION_STARS = 400
 FEWEST_MATCHES = 6
 GATES_PX = (6.0, 3.0, 1.5)
+SMALLEST_RADIUS_PX = 0.5
+REFINING_STARS = 300
+MOST_REFINED = 40
 SIGNIFICANT_SNR = 10.0
 
 
@@ -33,13 +36,15 @@ class Identifier:
     max_false_alarm: float = 1e-9
     tolerances_px: tuple[float, ...] = (0.7, 3.0)  # error of a ray: centroids first, then a rough calibration too
     depths: tuple[int, ...] = (30, 60, 120, 240)  # brightest detections that form triangles, round by round
+    few: int = 16  # brightest detections whose pairs are tried where triangles of neighbours fail
 
     def __call__(self, detections: Detections, camera: Camera, stars: Stars) -> Identification:
         """Matches in the frame. `stars` are sorted, brightest first. Raises NotIdentified (or reason mirrored)."""
+        patterns = _Patterns(stars, _field_sr(camera))
         try:
-            return self._identify(detections, camera, stars)
+            return self._identify(detections, camera, patterns)
         except NotIdentified:
-            if self._solves(detections, replace(camera, mirrored=not camera.mirrored), stars):
+            if self._solves(detections, replace(camera, mirrored=not camera.mirrored), patterns):
                 raise NotIdentified(
                     "the image is a mirror image of what the camera file says: flip the image, or set mirrored = "
                     f"{str(not camera.mirrored).lower()} in the camera file",
@@ -47,42 +52,61 @@ class Identifier:
                 ) from None
             raise
 
-    def _solves(self, detections: Detections, camera: Camera, stars: Stars) -> bool:
+    def _solves(self, detections: Detections, camera: Camera, patterns: _Patterns) -> bool:
         try:
-            self._identify(detections, camera, stars)
+            self._identify(detections, camera, patterns)
         except NotIdentified:
             return False
         return True
 
-    def _identify(self, detections: Detections, camera: Camera, stars: Stars) -> Identification:
-        known = camera.angle_rad(detections.xy_px) <= camera.max_angle_rad
-        order = np.flatnonzero(known)
+    def _identify(self, detections: Detections, camera: Camera, patterns: _Patterns) -> Identification:
+        order = np.flatnonzero(camera.angle_rad(detections.xy_px) <= camera.max_angle_rad)
         if len(order) < FEWEST_MATCHES:
             few = f"{len(order)} point sources are too few to identify: expose longer"
             raise NotIdentified(few, detected=len(order))
-        rays = camera.unproject(detections.xy_px[order])
-        index = build_index(stars, _field_sr(camera))
-        search = _Search(camera, rays, stars, index, np.log(self.max_false_alarm))
-        for tolerance_px in self.tolerances_px:
-            found = search.run(tolerance_px, self.depths)
-            if found is not None:
-                R, log_chance = found
-                return self._confirmed(detections, camera, stars, R, log_chance)
+        search = Search(camera, camera.unproject(detections.xy_px[order]), patterns.stars)
+        refusal = "no triangle of stars is the catalogue's"
+        for refined, R in enumerate(self._plausible(search, patterns)):
+            if refined == MOST_REFINED:
+                break
+            try:
+                return self._confirmed(detections, camera, patterns.stars, R, search)
+            except NotIdentified as cause:
+                refusal = str(cause)
         raise NotIdentified(
-            f"no attitude explains the {len(order)} point sources better than chance "
-            f"({search.tested} tried): is the camera file right, and is this the night sky?",
+            f"no attitude explains the {len(order)} point sources better than chance ({search.tried} tried; "
+            f"{refusal}): is the camera file right, and is this the night sky?",
             detected=len(order),
-            tried=search.tested,
+            tried=search.tried,
         )
 
+    def _plausible(self, search: Search, patterns: _Patterns) -> Iterator[Array]:
+        """Attitudes worth refining: triangles of ever more of the detections, then pairs of the brightest few."""
+        for tolerance_px in self.tolerances_px:
+            for done, depth in zip((0, *self.depths), self.depths, strict=False):
+                if done < len(search.rays_cam):
+                    yield from search.by_triangles(patterns.triangles, tolerance_px, (done, depth))
+            yield from search.by_pairs(patterns.pairs, tolerance_px, self.few)
+
     def _confirmed(
-        self, detections: Detections, camera: Camera, stars: Stars, R: Array, log_chance: float
+        self, detections: Detections, camera: Camera, stars: Stars, R: Array, search: Search
     ) -> Identification:
-        """The matches after refinement, judged once more at their own, much smaller radius."""
+        """The matches after refinement, judged at their own, much smaller radius; NotIdentified if chance might do."""
         fit, matches = _refined(detections, camera, stars, R)
         detection, star = matches.detection[fit.used], matches.star[fit.used]
         if len(star) < FEWEST_MATCHES:
             raise NotIdentified(f"only {len(star)} stars match after refinement", matched=len(star))
+        radius_px = min(GATES_PX[-1], max(3.0 * fit.rms_px, SMALLEST_RADIUS_PX))
+        hits = np.count_nonzero(matches.coincident_px < radius_px)
+        chance = ChanceModel(search.rays_cam).log_odds(
+            np.array(hits),
+            np.array(max(matches.predicted, hits)),
+            radius_px * search.scale_rad_per_px,
+            alike=matches.alike,
+        )
+        log_chance = float(chance + np.log(search.tried))
+        if log_chance > np.log(self.max_false_alarm):
+            raise NotIdentified(f"the {hits} stars that match might do so by chance", matched=len(star))
         return Identification(
             detection=detection,
             star=star,
@@ -90,6 +114,21 @@ class Identifier:
             false_alarm_probability=float(np.exp(max(log_chance, -690.0))),
             unexplained=_unexplained(detections, camera, stars, fit.attitude.R_cam_icrs, matches.zero_mag),
         )
+
+
+class _Patterns:
+    """The catalogue's patterns for a camera that sees `field_sr`, worked out when first asked for."""
+
+    def __init__(self, stars: Stars, field_sr: float) -> None:
+        self.stars, self.field_sr = stars, field_sr
+
+    @cached_property
+    def triangles(self) -> PatternIndex:
+        return build_index(self.stars, self.field_sr)
+
+    @cached_property
+    def pairs(self) -> PairIndex:
+        return build_pairs(self.stars, self.field_sr)
 
 
 def _field_sr(camera: Camera) -> float:
@@ -102,86 +141,24 @@ def _field_sr(camera: Camera) -> float:
     return float(np.sum(camera.pixel_solid_angle_sr(angle[lit]) * cell))
 
 
-class _Search:
-    """Hypotheses from matching triangles, and their verification against the bright stars."""
-
-    def __init__(
-        self, camera: Camera, rays_cam: Array, stars: Stars, index: PatternIndex, log_max_false_alarm: float
-    ) -> None:
-        self.camera, self.rays_cam, self.index = camera, rays_cam, index
-        self.bright_icrs = stars.rays_icrs[index.star[: max(VERIFICATION_STARS, len(index.star) // 2)]]
-        self.log_max_false_alarm = log_max_false_alarm
-        self.tested = 0
-        centre = camera.unproject(np.array([camera.centre_px]))[0]
-        self.scale_rad = float(camera.mean_scale_rad_per_px(np.arccos(np.clip(centre[2], -1, 1)) + 0.01))
-
-    def run(self, tolerance_px: float, depths: tuple[int, ...]) -> tuple[Array, float] | None:
-        """The first attitude that chance cannot explain, with its log false-alarm probability."""
-        tolerance = tolerance_px * self.scale_rad
-        done = 0
-        for depth in depths:
-            if depth > done and len(self.rays_cam) > done:
-                found = self._round(tolerance, done, depth)
-                if found is not None or self.tested > MOST_HYPOTHESES:
-                    return found
-            done = depth
-        return None
-
-    def _round(self, tolerance_rad: float, done: int, depth: int) -> tuple[Array, float] | None:
-        image = triangles(self.rays_cam[:depth], self.index.reach_rad)
-        fresh = image.vertices.max(axis=1, initial=0) >= done
-        image = replace(
-            image, vertices=image.vertices[fresh], sides_rad=image.sides_rad[fresh], handed=image.handed[fresh]
-        )
-        left, right = self.index.candidates(image, tolerance_rad)
-        mismatch = np.abs(image.sides_rad[left] - self.index.triangles.sides_rad[right]).max(axis=1)
-        order = np.argsort(mismatch / image.sides_rad[left, 0], kind="stable")
-        seen = ChanceModel(self.rays_cam[: 4 * depth])
-        for start in range(0, len(order), HYPOTHESES_AT_ONCE):
-            chunk = order[start : start + HYPOTHESES_AT_ONCE]
-            cam = self.rays_cam[image.vertices[left[chunk]]]
-            icrs = self.index.rays_icrs[self.index.triangles.vertices[right[chunk]]]
-            R = wahba(cam, icrs, np.ones(cam.shape[:2]))
-            self.tested += len(chunk)
-            found = self._best(R, seen, 2.0 * tolerance_rad)
-            if found is not None:
-                return found
-            if self.tested > MOST_HYPOTHESES:
-                return None
-        return None
-
-    def _best(self, R: Array, seen: ChanceModel, radius_rad: float) -> tuple[Array, float] | None:
-        predicted = self.bright_icrs @ np.swapaxes(R, 1, 2)  # (hypotheses, stars, 3) in cam
-        inside = self._inside(predicted)
-        distance = np.full(inside.shape, np.inf)
-        distance[inside], _ = seen.tree.query(predicted[inside], distance_upper_bound=2 * np.sin(radius_rad / 2))
-        hits = np.isfinite(distance).sum(axis=1)
-        log_chance = seen.log_odds(hits, inside.sum(axis=1), radius_rad) + np.log(max(self.tested, 1))
-        best = int(np.argmin(log_chance))
-        if log_chance[best] > self.log_max_false_alarm or hits[best] < FEWEST_MATCHES:
-            return None
-        return R[best], float(log_chance[best])
-
-    def _inside(self, rays_cam: Array) -> Array:
-        angle_in = rays_cam[..., 2] > np.cos(self.camera.max_angle_rad)
-        inside = np.zeros(angle_in.shape, dtype=bool)
-        inside[angle_in] = self.camera.project(rays_cam[angle_in])[1]
-        return inside
-
-
 def _refined(detections: Detections, camera: Camera, stars: Stars, R: Array) -> tuple[AttitudeFit, Matches]:
-    """Attitude and matches, gate by gate."""
+    """Attitude and matches, gate by gate; the bright ones lead the way."""
     blend_px = 3.0 * detections.psf_sigma_px
-    for gate_px in (*GATES_PX, GATES_PX[-1]):
-        matches = match(detections, camera, stars, R, gate_px, blend_px)
+    brightest = _brightest(detections, REFINING_STARS)
+    for some, gate_px in (*((brightest, gate) for gate in GATES_PX), (detections, GATES_PX[-1])):
+        matches = match(some, camera, stars, R, gate_px, blend_px)
         if len(matches.star) < FEWEST_MATCHES:
             raise NotIdentified(f"only {len(matches.star)} stars match", matched=len(matches.star))
         d = matches.detection
-        fit = solve_attitude(
-            camera, detections.xy_px[d], detections.covariance_px2[d], stars.rays_icrs[matches.star], R
-        )
+        fit = solve_attitude(camera, some.xy_px[d], some.covariance_px2[d], stars.rays_icrs[matches.star], R)
         R = fit.attitude.R_cam_icrs
     return fit, matches
+
+
+def _brightest(detections: Detections, most: int) -> Detections:
+    """The first `most` detections."""
+    names = ("xy_px", "covariance_px2", "flux_e", "flux_sigma_e", "snr", "saturated")
+    return replace(detections, **{name: getattr(detections, name)[:most] for name in names})
 
 
 def _unexplained(detections: Detections, camera: Camera, stars: Stars, R: Array, zero_mag: float) -> int:

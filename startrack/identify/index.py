@@ -47,7 +47,7 @@ def build_index(stars: Stars, field_sr: float) -> PatternIndex:
     from scipy.spatial import cKDTree
 
     depth = int(np.clip(300 * (2 * np.pi / field_sr) ** 0.8, 300, 12000))
-    star = _without_close_pairs(stars, depth)
+    star = bright_stars_apart(stars, depth)
     rays = stars.rays_icrs[star]
     cap = NEIGHBOURS_WANTED / len(star)  # fraction of the sphere that holds the wanted number of neighbours
     reach = min(WIDEST_REACH_RAD, 2 * np.arcsin(np.sqrt(cap)), 0.8 * np.sqrt(4 * field_sr / np.pi))
@@ -55,7 +55,7 @@ def build_index(stars: Stars, field_sr: float) -> PatternIndex:
     return PatternIndex(star, rays, float(reach), found, cKDTree(found.sides_rad))
 
 
-def _without_close_pairs(stars: Stars, depth: int) -> Ints:
+def bright_stars_apart(stars: Stars, depth: int) -> Ints:
     """The brightest stars, of each close pair only the brighter: a camera sees one light there."""
     from scipy.spatial import cKDTree
 

@@ -25,6 +25,8 @@ class Matches:
     distance_px: Array  # (n,)
     zero_mag: float  # V of a star of unit flux
     predicted: int  # stars predicted in the field brighter than the detection limit
+    coincident_px: Array  # (m,) distances of all stars from detections of their brightness, blends included
+    alike: float  # probability that a star and a detection taken at random agree in brightness
 
 
 def match(
@@ -38,7 +40,7 @@ def match(
 
     none = np.zeros(0, dtype=np.int64)
     if not len(detections):
-        return Matches(none, none, np.zeros(0), 0.0, 0)
+        return Matches(none, none, np.zeros(0), 0.0, 0, np.zeros(0), 1.0)
     tree = cKDTree(detections.xy_px)
     brightness = -2.5 * np.log10(np.maximum(detections.flux_e, 1e-9))
 
@@ -52,7 +54,7 @@ def match(
     _, seen, _, nearest, hit = nearest_to(BRIGHT_STARS)
     first = np.flatnonzero(hit)[:FIRST_MATCHES]
     if len(first) < 3:
-        return Matches(none, none, np.zeros(0), 0.0, len(seen))
+        return Matches(none, none, np.zeros(0), 0.0, len(seen), np.zeros(0), 1.0)
     zero_mag = float(np.median(stars.v_mag[seen[first]] - brightness[nearest[first]]))
     limit = zero_mag + float(np.max(brightness)) + DEPTH_BELOW_THRESHOLD_MAG
     faintest = limit - 2.5 * np.log10(BLEND_FLUX_RATIO)
@@ -69,8 +71,19 @@ def match(
     keep = _nearest_of_each(detection, distance)
     star, detection, distance = star[keep], detection[keep], distance[keep]
     alone = _not_blended(detections.xy_px[detection], star, predicted_px, seen, stars.v_mag, radius_px)
-    predicted = int(np.count_nonzero(stars.v_mag[seen] < limit - DEPTH_BELOW_THRESHOLD_MAG))
-    return Matches(detection[alone], star[alone], distance[alone], zero_mag, predicted)
+    bright = stars.v_mag[seen][stars.v_mag[seen] < limit - DEPTH_BELOW_THRESHOLD_MAG]
+    return Matches(
+        detection[alone], star[alone], distance[alone], zero_mag, len(bright), distance,
+        _alike(bright, brightness + zero_mag),
+    )  # fmt: skip
+
+
+def _alike(v_mag: Array, measured_mag: Array) -> float:
+    """Part of the pairs of a star and a detection that agree in brightness."""
+    ordered = np.sort(measured_mag)
+    first = np.searchsorted(ordered, v_mag - MAGNITUDE_TOLERANCE)
+    last = np.searchsorted(ordered, v_mag + MAGNITUDE_TOLERANCE)
+    return float(np.mean(last - first) / len(ordered)) if len(v_mag) else 1.0
 
 
 def _nearest_of_each(detection: Ints, distance: Array) -> Ints:

@@ -21,6 +21,7 @@ FEWEST_MATCHES = 6
 GATES_PX = (6.0, 3.0, 1.5)
 SMALLEST_RADIUS_PX = 0.5
 REFINING_STARS = 300
+ON_PLACE = 0.7  # of the stars within the widest gate are within the narrowest one, if the camera file is right
 MOST_REFINED = 40
 SIGNIFICANT_SNR = 10.0
 
@@ -36,6 +37,7 @@ class Identifier:
     max_false_alarm: float = 1e-9
     tolerances_px: tuple[float, ...] = (0.7, 3.0)  # error of a ray: centroids first, then a rough calibration too
     depths: tuple[int, ...] = (30, 60, 120, 240)  # brightest detections that form triangles, round by round
+    whole_field: bool = True  # refuse a camera that fits only a part of its field; a calibration may begin with one
     few: int = 16  # brightest detections whose pairs are tried where triangles of neighbours fail
 
     def __call__(self, detections: Detections, camera: Camera, stars: Stars) -> Identification:
@@ -43,6 +45,8 @@ class Identifier:
         patterns = _Patterns(stars, _field_sr(camera))
         try:
             return self._identify(detections, camera, patterns)
+        except _RoughCamera:
+            raise
         except NotIdentified:
             if self._solves(detections, replace(camera, mirrored=not camera.mirrored), patterns):
                 raise NotIdentified(
@@ -71,6 +75,8 @@ class Identifier:
                 break
             try:
                 return self._confirmed(detections, camera, patterns.stars, R, search)
+            except _RoughCamera:
+                raise
             except NotIdentified as cause:
                 refusal = str(cause)
         raise NotIdentified(
@@ -107,12 +113,33 @@ class Identifier:
         log_chance = float(chance + np.log(search.tried))
         if log_chance > np.log(self.max_false_alarm):
             raise NotIdentified(f"the {hits} stars that match might do so by chance", matched=len(star))
+        if self.whole_field:
+            _refuse_rough_camera(detections, camera, stars, fit.attitude.R_cam_icrs)
         return Identification(
             detection=detection,
             star=star,
             R_cam_icrs=fit.attitude.R_cam_icrs,
             false_alarm_probability=float(np.exp(max(log_chance, -690.0))),
             unexplained=_unexplained(detections, camera, stars, fit.attitude.R_cam_icrs, matches.zero_mag),
+        )
+
+
+class _RoughCamera(NotIdentified):
+    """The sky is found, but the camera file's lens is not this one."""
+
+
+def _refuse_rough_camera(detections: Detections, camera: Camera, stars: Stars, R: Array) -> None:
+    """Raise where many of the bright stars lie near, but not on, their places.
+
+    Such a camera file fits a patch of the sky, and turns the attitude to suit it: 1 % of focal length is 0.8 degrees.
+    """
+    distance = match(_brightest(detections, REFINING_STARS), camera, stars, R, GATES_PX[0], 0.0).coincident_px
+    on_place, near = np.count_nonzero(distance < GATES_PX[-1]), len(distance)
+    if on_place < ON_PLACE * near - 3.0 * np.sqrt(ON_PLACE * (1 - ON_PLACE) * near):
+        raise _RoughCamera(
+            f"only {on_place} of {near} bright stars lie within {GATES_PX[-1]:g} px of where the camera file puts "
+            f"them, the others up to {GATES_PX[0]:g} px off: it is not the calibration of this lens",
+            matched=on_place,
         )
 
 

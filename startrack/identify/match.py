@@ -11,7 +11,7 @@ from startrack.types import Array, Bools, Detections, Ints, Stars
 
 BLEND_FLUX_RATIO = 0.25  # a neighbour with more than this part of a star's light makes the identity ambiguous
 BRIGHT_STARS = 5000  # enough of the sky's brightest to set the brightness scale
-FIRST_MATCHES = 60
+FIRST_MATCHES = 200
 MAGNITUDE_TOLERANCE = 0.8
 DEPTH_BELOW_THRESHOLD_MAG = 0.7
 
@@ -52,7 +52,9 @@ def match(
         return predicted_px, seen, distance, nearest, np.isfinite(distance)
 
     _, seen, _, nearest, hit = nearest_to(BRIGHT_STARS)
-    first = np.flatnonzero(hit)[:FIRST_MATCHES]
+    measured = hit.copy()
+    measured[hit] = ~detections.saturated[nearest[hit]]  # a saturated star's flux is a lower bound
+    first = np.flatnonzero(measured if np.count_nonzero(measured) >= 3 else hit)[:FIRST_MATCHES]
     if len(first) < 3:
         return Matches(none, none, np.zeros(0), 0.0, len(seen), np.zeros(0), 1.0)
     zero_mag = float(np.median(stars.v_mag[seen[first]] - brightness[nearest[first]]))
@@ -63,7 +65,6 @@ def match(
     measured_mag = brightness[nearest[candidates]] + zero_mag
     star = seen[candidates]
     tolerance = np.hypot(MAGNITUDE_TOLERANCE, 2 * stars.v_sigma_mag[star])
-    # A saturated star's flux is a lower bound.
     saturated = detections.saturated[nearest[candidates]] & (stars.v_mag[star] < measured_mag)
     agrees = (np.abs(stars.v_mag[star] - measured_mag) < tolerance) | saturated
     star, detection = star[agrees], nearest[candidates][agrees]

@@ -18,6 +18,7 @@ from startrack.terrain import Cylinder, Terrain
 from startrack.types import Array, Bools, Evidence, Fix, NotLocated
 
 FEWEST_RAYS = 8
+MOST_COARSE_BOXES = 12_000  # boxes of 20 m and more that all might matter: the stars do not say where
 RAY_BY_RAY_M = 20.0  # boxes of this half side and less are asked ray by ray, larger ones sector by sector
 
 
@@ -81,6 +82,11 @@ class _Search:
             boxes, first, last = by_sector(centres, half, self.sectors, self.profile, self.terrain)
             keep = self._promising(boxes)
             boxes, first, last = boxes.take(keep), first[keep], last[keep]
+            if len(boxes) > MOST_COARSE_BOXES:
+                raise NotLocated(
+                    f"the rays leave {len(boxes) * 4 * half**2 / 1e6:.0f} km2 of the search area open: "
+                    "is the skyline in the picture, and the exposure long enough?"
+                )
             if half < RAY_BY_RAY_M:
                 return ray_by_ray(boxes, first, last, self.sectors, self.profile, self.terrain)
             centres, half = boxes.quarters(self.terrain)[0], half / 2

@@ -118,7 +118,7 @@ def _profiles(offset_px: Array, sigma_px: float, radius: int) -> Array:
     px, _ = pixel_profile(offset_px[:, 0], sigma_px, radius)
     py, _ = pixel_profile(offset_px[:, 1], sigma_px, radius)
     px, py = px.astype(np.float32), py.astype(np.float32)  # stamps are large and pixels have no more digits
-    return (py[:, :, None] * px[:, None, :]).reshape(len(px), -1)
+    return (py[:, :, None] * px[:, None, :]).reshape(len(px), (2 * radius + 1) ** 2)
 
 
 def _summed(rows: Array, group: Ints, n: int) -> Array:

@@ -81,18 +81,27 @@ def _measured(
     profile = _profiles(sources.xy_px[start : start + n] - centre, sigma_px, radius)
     rows = centre[:, 1, None] + np.arange(-radius, radius + 1)
     columns = centre[:, 0, None] + np.arange(-radius, radius + 1)
-    image, noise, dead = (picture[rows[:, :, None], columns[:, None, :]].reshape(n, -1) for picture in pictures)
+    image, noise, dead = (picture[rows[:, :, None], columns[:, None, :]].reshape(profile.shape) for picture in pictures)
     own_row, neighbour = pairs[:, 0] - start, pairs[:, 1]
     overlap = _profiles(sources.xy_px[neighbour] - centre[own_row], sigma_px, radius)
     expected = (sources.flux_e[neighbour] * sources.visible[neighbour]).astype(np.float32)
     light = _summed(expected[:, None] * overlap, own_row, n)
     data, variance, good = image - light, np.square(noise), ~dead
     flux, weights = _fit(data, profile, good / variance)
-    deviant = good & _deviant(data, variance, light, profile, flux, _level(data, profile, good / variance, flux))
-    good &= ~deviant
-    redo = deviant.any(axis=1)
-    flux[redo], weights[redo] = _fit(data[redo], profile[redo], good[redo] / variance[redo])
-    usable = (deviant.sum(axis=1) <= MOST_MASKED_PX) & (np.where(good, profile, 0.0).sum(axis=1) > 0.5)
+    masked = np.zeros(n, dtype=np.int64)
+    redo = np.arange(n)
+    # The worst pixel first: a bright one drags the fit so far that its innocent neighbours look deviant too.
+    for _ in range(MOST_MASKED_PX + 1):
+        excess = _excess(data[redo], variance[redo], light[redo], profile[redo], good[redo], flux[redo])
+        worst = np.argmax(excess, axis=1)
+        deviant = excess[np.arange(len(redo)), worst] > OUTLIER_SIGMA**2
+        redo, worst = redo[deviant], worst[deviant]
+        if not len(redo):
+            break
+        good[redo, worst] = False
+        masked[redo] += 1
+        flux[redo], weights[redo] = _fit(data[redo], profile[redo], good[redo] / variance[redo])
+    usable = (masked <= MOST_MASKED_PX) & (np.where(good, profile, 0.0).sum(axis=1) > 0.5)
     weights[~usable] = 0.0
     shining, fraction = sources.visible[neighbour], sources.fraction_sigma[neighbour]
     uncertain = np.square(sources.flux_e[neighbour]) * (shining * (1 - shining) + shining * np.square(fraction))
@@ -106,11 +115,11 @@ def _measured(
     )
 
 
-def _deviant(data: Array, variance: Array, light: Array, profile: Array, flux: Array, level: Array) -> Bools:
-    """Pixels (n, pixels) that are none of the star's light: hot ones and tracks."""
+def _excess(data: Array, variance: Array, light: Array, profile: Array, good: Bools, flux: Array) -> Array:
+    """Squared deviation (n, pixels) of the good pixels from the fit, in units of its variance."""
     stars = np.maximum(flux, 0.0)[:, None] * profile + light
-    rest = data - flux[:, None] * profile - level[:, None]
-    return np.asarray(np.square(rest) > OUTLIER_SIGMA**2 * (variance + stars + np.square(MODEL_ERROR * stars)))
+    rest = data - flux[:, None] * profile - _level(data, profile, good / variance, flux)[:, None]
+    return np.where(good, np.square(rest) / (variance + stars + np.square(MODEL_ERROR * stars)), 0.0)
 
 
 def _profiles(offset_px: Array, sigma_px: float, radius: int) -> Array:

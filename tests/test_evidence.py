@@ -1,0 +1,413 @@
+"""Evidence: forced photometry of painted stars, and log-likelihood ratios that mean what they say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from render_helpers import FISHEYE, stars_at
+from scipy.spatial.transform import Rotation
+from scipy.special import expit
+from scipy.stats import norm
+from star_painter import cramer_rao, paint
+
+from startrack.evidence import FluxScale, StarEvidence, StarLight, flux_scale
+from startrack.evidence.photometry import Photometry, Sources, half_width, measure
+from startrack.evidence.ratio import CAP, shines_ratio
+from startrack.frames import azel_from_rays
+from startrack.types import Body, Detections, Identification, Stars
+
+SIZE, VARIANCE, READ_NOISE = 1024, 100.0, 2.5
+SCATTER = 0.05
+
+
+def noisy(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Background-subtracted pixels [e] of the light on a background of the usual variance."""
+    background = VARIANCE - READ_NOISE**2
+    return (rng.poisson(light + background) - background + rng.normal(0, READ_NOISE, light.shape)).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Stars (n), where the first of each pair come first, and what was measured of them."""
+
+    expected: np.ndarray
+    true: np.ndarray
+    shines: np.ndarray
+    light: Photometry
+    firsts: int
+
+    def z(self) -> np.ndarray:
+        """Errors of the usable first stars over their stated standard deviations."""
+        m = self.light
+        sigma = np.sqrt(m.variance_e2 + m.own_shot * self.true + m.neighbour_variance_e2)
+        return ((m.flux_e - self.true) / sigma)[: self.firsts][m.usable[: self.firsts]]
+
+    def llr(self) -> np.ndarray:
+        m = self.light
+        hidden = m.variance_e2 + m.neighbour_variance_e2
+        shining = hidden + m.own_shot * self.expected + np.square(SCATTER * self.expected)
+        return shines_ratio(m.flux_e, self.expected, np.sqrt(hidden), np.sqrt(shining))
+
+
+def measured(
+    sigma: float, shining: float, *, rng: np.random.Generator, neighbours: tuple[float, float] | None = None,
+    faintest: float = 30.0, brightest: float = 3000.0, spacing: int = 20,
+) -> Measured:  # fmt: skip
+    """Stars of which the part `shining` shines; each with a neighbour 1 to 4 sigma off that shines with the probability
+    neighbours[0] and is thought to shine with the probability neighbours[1]."""
+    grid = np.arange(14, SIZE - 14, spacing)
+    xy = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2) + rng.uniform(-0.5, 0.5, (len(grid) ** 2, 2))
+    n, thought = len(xy), np.full(len(xy), shining)
+    part = np.full(n, shining)
+    if neighbours is not None:
+        turn, apart = rng.uniform(0, 2 * np.pi, n), sigma * rng.uniform(1, 4, n)
+        xy = np.concatenate([xy, xy + apart[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)])
+        part = np.concatenate([part, np.full(n, neighbours[0])])
+        thought = np.concatenate([thought, np.full(n, neighbours[1])])
+    expected = np.exp(rng.uniform(np.log(faintest), np.log(brightest), len(xy)))
+    shines = rng.random(len(xy)) < part
+    true = np.where(shines, expected * (1 + SCATTER * rng.normal(size=len(xy))), 0.0)
+    image = np.zeros((SIZE, SIZE))
+    paint(image, xy, true, sigma)
+    sources = Sources(xy_px=xy, flux_e=expected, fraction_sigma=np.full(len(xy), SCATTER), visible=thought)
+    noise = np.full((SIZE, SIZE), np.sqrt(VARIANCE), np.float32)
+    light = measure(noisy(image, rng), noise, np.zeros((SIZE, SIZE), bool), sources, sigma)
+    return Measured(expected, true, shines, light, n)
+
+
+@pytest.mark.parametrize(
+    ("shining", "neighbours"),
+    [(1.0, None), (0.0, None), (0.0, (1.0, 1.0)), (1.0, (1.0, 1.0)), (0.0, (0.5, 0.5)), (1.0, (0.5, 0.5))],
+    ids=["shining", "hidden", "hidden beside a star", "beside a star", "hidden beside who knows", "beside who knows"],
+)
+@pytest.mark.parametrize("sigma", [0.7, 1.0, 1.5])
+def test_photometry_is_unbiased_and_its_variance_right(
+    sigma: float, shining: float, neighbours: tuple[float, float] | None
+) -> None:
+    got = measured(sigma, shining, rng=np.random.default_rng(1), neighbours=neighbours)
+    z = got.z()
+    assert len(z) > 0.97 * got.firsts
+    assert abs(z.mean()) < 0.07  # 2500 stars: 3.5 of its own standard deviations
+    assert z.std() == pytest.approx(1.0, abs=0.05)
+    assert np.abs(z).max() < 5.0
+    if shining:
+        bright = got.light.usable[: got.firsts] & (got.expected[: got.firsts] > 1000)
+        ratio = got.light.flux_e[: got.firsts][bright] / got.true[: got.firsts][bright]
+        assert np.median(ratio) == pytest.approx(1.0, abs=0.006)
+
+
+@pytest.mark.parametrize("sigma", [0.7, 1.0, 1.5])
+def test_photometry_wastes_no_light(sigma: float) -> None:
+    """Variance of hidden stars against the Cramer-Rao bound with the place known and the level free."""
+    got = measured(sigma, 0.0, rng=np.random.default_rng(2))
+    p = cramer_rao(np.zeros(2), 1e-6, sigma, VARIANCE)  # no light: place and flux do not mix
+    bound = p[2, 2]
+    assert np.median(got.light.variance_e2) < 1.25 * bound  # the stamp is small: the level costs some
+    assert np.median(got.light.variance_e2) > 0.97 * bound
+
+
+@pytest.mark.parametrize("neighbours", [None, (0.5, 0.5)], ids=["alone", "beside who knows"])
+def test_ratios_mean_what_they_say(neighbours: tuple[float, float] | None) -> None:
+    """Of the stars with ratio l, as many shine as the logistic of l says (half of all do)."""
+    rng = np.random.default_rng(3)
+    llr, shines = [], []
+    for _ in range(3):
+        got = measured(
+            1.0, 0.5, rng=rng, neighbours=neighbours, faintest=10, brightest=600, spacing=20 if neighbours else 15
+        )
+        use = got.light.usable[: got.firsts]
+        llr.append(got.llr()[: got.firsts][use])
+        shines.append(got.shines[: got.firsts][use])
+    ratio, yes = np.concatenate(llr), np.concatenate(shines)
+    for low, high in ((-4, -3), (-3, -2), (-2, -1), (-1, -0.3), (-0.3, 0.3), (0.3, 1), (1, 2), (2, 3), (3, 4)):
+        some = (ratio >= low) & (ratio < high)
+        p = expit(ratio[some])
+        assert some.sum() >= 100
+        assert abs(yes[some].sum() - p.sum()) < 3.5 * np.sqrt(np.sum(p * (1 - p))), (low, high)
+    # Beyond, an allowance for oddities holds the ratios back: never more sure than right.
+    for sure, wrong in ((ratio > 4, ~yes), (ratio < -4, yes)):
+        p = expit(-np.abs(ratio[sure])).sum()
+        assert np.count_nonzero(wrong[sure]) <= p + 3.5 * np.sqrt(p)
+
+
+def test_the_ratio_is_that_of_the_stated_densities() -> None:
+    flux, expected, hidden, shining = 40.0, 60.0, 20.0, 25.0
+    anything = 1 / (2 * expected + 10 * hidden)
+    shines = 0.998 * norm.pdf(flux, expected, shining) + 0.002 * norm.pdf(flux, 0, hidden) + 0.001 * anything
+    hides = 0.999 * norm.pdf(flux, 0, hidden) + 0.001 * anything
+    got = shines_ratio(*(np.array([v]) for v in (flux, expected, hidden, shining)))
+    assert got[0] == pytest.approx(np.log(shines / hides), rel=1e-9)
+
+
+def test_the_ratio_rises_with_the_light_and_is_capped() -> None:
+    flux = np.linspace(-100, 400, 501)
+    ratio = shines_ratio(flux, np.full(501, 200.0), np.full(501, 20.0), np.full(501, 30.0))
+    assert np.all(np.diff(ratio[(flux >= 20) & (flux <= 200)]) > 0)
+    assert np.abs(ratio).max() <= CAP
+    assert ratio[flux == 200][0] > 6
+    assert ratio[flux == 0][0] == pytest.approx(np.log(2e-3), abs=0.5)  # a star may be missing for other reasons
+    # A flash a hundred times brighter than the star, or a hole much darker than the wall, is no witness of either.
+    odd = shines_ratio(np.array([2e4, -500.0]), np.full(2, 200.0), np.full(2, 20.0), np.full(2, 30.0))
+    assert np.all(np.abs(odd) < 1.0)
+
+
+def test_a_star_too_faint_to_tell_says_nothing() -> None:
+    ratio = shines_ratio(np.array([-30.0, 0.0, 30.0]), np.full(3, 0.01), np.full(3, 20.0), np.full(3, 20.0))
+    assert np.abs(ratio).max() < 0.01
+
+
+@pytest.mark.parametrize("excess", [100.0, 1000.0, 20_000.0])
+@pytest.mark.parametrize("flux", [50.0, 400.0, 5000.0])
+def test_a_hot_pixel_near_a_star_is_masked(flux: float, excess: float) -> None:
+    rng = np.random.default_rng(4)
+    grid = np.arange(14, SIZE - 14, 20)
+    xy = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2) + rng.uniform(-0.5, 0.5, (len(grid) ** 2, 2))
+    expected = np.full(len(xy), flux)
+    image = np.zeros((SIZE, SIZE))
+    paint(image, xy[::2], expected[::2], 1.0)  # every other star shines
+    image = noisy(image, rng)
+    spot = np.rint(xy).astype(int) + rng.integers(-3, 4, xy.shape)
+    image[spot[:, 1], spot[:, 0]] += excess
+    sources = Sources(xy_px=xy, flux_e=expected, fraction_sigma=np.full(len(xy), 0.05), visible=np.full(len(xy), 0.5))
+    light = measure(image, np.full((SIZE, SIZE), 10.0, np.float32), np.zeros((SIZE, SIZE), bool), sources, 1.0)
+    true = np.where(np.arange(len(xy)) % 2 == 0, flux, 0.0)
+    z = (light.flux_e - true) / np.sqrt(light.variance_e2 + light.own_shot * true)
+    assert light.usable.mean() > 0.97
+    assert np.mean(np.abs(z[light.usable]) > 5) < 0.005
+    assert z[light.usable].std() < 1.15  # ten sigma on the very middle of a star may pass for a part of it
+
+
+def test_saturated_stamps_are_unusable() -> None:
+    dead = np.zeros((100, 100), bool)
+    dead[48:53, 48:53] = True
+    sources = Sources(
+        xy_px=np.array([[50.0, 50.0], [30.0, 30.0]]), flux_e=np.full(2, 500.0), fraction_sigma=np.zeros(2),
+        visible=np.full(2, 0.5),
+    )  # fmt: skip
+    light = measure(np.zeros((100, 100), np.float32), np.full((100, 100), 10.0, np.float32), dead, sources, 1.0)
+    assert light.usable.tolist() == [False, True]
+    assert all(np.isfinite(getattr(light, name)).all() for name in Photometry.__dataclass_fields__)
+
+
+# The whole of it on a small frame: enu and icrs are the same, the camera looks at the zenith.
+CAMERA = replace(FISHEYE, calibrated_angle_rad=float(np.radians(80.0)))
+R_CAM_ENU = CAMERA.R_body_cam.T @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+SCALE = FluxScale(zero_mag=11.6, trend_per_rad2=0.0, scatter=0.03, stars=100)
+
+
+def random_stars(n: int, rng: np.random.Generator, v_mag: Any = None) -> Stars:
+    z = rng.uniform(-0.1, 1, n)
+    turn = rng.uniform(0, 2 * np.pi, n)
+    rays = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
+    return stars_at(rays, np.sort(rng.uniform(1, 6, n)) if v_mag is None else v_mag)
+
+
+def frame(stars: Stars, shines: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, Detections]:
+    """Pixels [e] with background, and the detections that carry background and noise."""
+    px, inside = CAMERA.project(stars.rays_icrs @ R_CAM_ENU.T)
+    light = np.zeros((512, 512))
+    on = inside & shines
+    paint(light, px[on], 10 ** (-0.4 * (stars.v_mag[on] - SCALE.zero_mag)), 1.0)
+    background = np.full((512, 512), 94.0, np.float32)
+    none = np.zeros(0)
+    detections = Detections(
+        xy_px=np.zeros((0, 2)), covariance_px2=np.zeros((0, 2, 2)), flux_e=none, flux_sigma_e=none, snr=none,
+        saturated=np.zeros(0, bool), psf_sigma_px=1.0, background_e=background,
+        noise_e=np.full((512, 512), 10.0, np.float32),
+    )  # fmt: skip
+    return noisy(light, rng) + background, detections
+
+
+def seen(
+    stars: Stars, shines: np.ndarray, rng: np.random.Generator, dead: np.ndarray | None = None, **how: Any
+) -> StarLight:
+    image, detections = frame(stars, shines, rng)
+    dead = np.zeros(image.shape, bool) if dead is None else dead
+    settings: dict[str, Any] = {"bodies": [], "place_sigma_px": 0.05} | how
+    return StarEvidence()(
+        image, dead, detections, CAMERA, stars, settings["bodies"], R_CAM_ENU, np.eye(3), SCALE,
+        settings["place_sigma_px"],
+    )  # fmt: skip
+
+
+def test_every_star_in_view_gets_a_verdict() -> None:
+    rng = np.random.default_rng(5)
+    stars = random_stars(1500, rng)
+    shines = stars.rays_icrs[:, 0] > 0  # a wall in the west
+    light = seen(stars, shines, rng)
+    _, inside = CAMERA.project(stars.rays_icrs @ R_CAM_ENU.T)
+    assert set(light.star.tolist()) == set(np.flatnonzero(inside & (stars.v_mag < 8)).tolist())
+    azimuth, elevation = azel_from_rays(stars.rays_icrs[light.star])
+    assert light.azimuth_rad == pytest.approx(azimuth)
+    assert light.elevation_rad == pytest.approx(elevation)
+    flux = 10 ** (-0.4 * (stars.v_mag[light.star] - SCALE.zero_mag))
+    assert light.expected_e == pytest.approx(flux)
+    use = light.usable
+    truly = shines[light.star]
+    strong = use & (flux > 300)  # SNR above 7
+    assert strong.sum() > 300
+    assert np.mean((light.llr > 0)[strong] == truly[strong]) > 0.99
+    assert np.abs(light.llr).max() <= CAP
+    z = ((light.flux_e - np.where(truly, flux, 0)) / np.hypot(light.sigma_e, np.sqrt(np.where(truly, flux, 0))))[use]
+    assert np.median(np.abs(z)) * 1.4826 == pytest.approx(1.0, abs=0.1)
+    rays = light.evidence()
+    assert len(rays) == use.sum()
+    assert np.array_equal(rays.llr, light.llr[use])
+    assert np.all(rays.edge_sigma_rad == 0)
+
+
+def test_why_stars_cannot_be_used() -> None:
+    rng = np.random.default_rng(6)
+    stars = random_stars(2500, rng)
+    venus = Body(name="Venus", ray_icrs=stars.rays_icrs[20], v_mag=-4.0)
+    px, inside = CAMERA.project(stars.rays_icrs @ R_CAM_ENU.T)
+    dead = np.zeros((512, 512), bool)
+    x, y = np.rint(px[inside & (stars.rays_icrs[:, 2] > 0.5)][7]).astype(int)
+    dead[y - 3 : y + 4, x - 3 : x + 4] = True
+    light = seen(stars, np.ones(len(stars), bool), rng, dead, bodies=[venus])
+    cause = {int(s): str(c) for s, c in zip(light.star, light.cause, strict=True)}
+    assert cause[20] == "beside Venus"
+    beside = [s for s, c in cause.items() if c == "beside Venus"]
+    assert np.hypot(*(px[beside] - px[20]).T).max() < 8.0
+    near = np.hypot(*(px[light.star] - [x, y]).T) < 1.0
+    assert set(light.cause[near]) == {"bad pixels"}
+    angle = np.arccos(stars.rays_icrs[light.star][:, 2])
+    beyond = angle > CAMERA.calibrated_angle_rad
+    assert beyond.sum() > 50
+    assert not light.usable[beyond].any()
+    assert set(light.cause[angle < np.radians(79)]) == {"", "beside Venus", "bad pixels"}
+    assert np.all(light.llr[~light.usable] == 0)
+    assert len(light.evidence()) == light.usable.sum()
+
+
+def test_stars_at_the_frame_edge_are_left_out() -> None:
+    rng = np.random.default_rng(7)
+    edge = half_width(1.0) + 1.0
+    px = np.array([[255.0, 400.0], [255.0, edge], [255.0, edge - 2]])
+    narrow = replace(CAMERA, size_px=(512, 512), focal_px=(500.0, 500.0))  # the frame cuts the circle
+    stars = stars_at(narrow.unproject(px), np.array([3.0, 3.1, 3.2]))
+    image = noisy(np.zeros((512, 512)), rng)
+    _, detections = frame(stars, np.zeros(3, bool), rng)
+    detections = replace(detections, background_e=np.zeros((512, 512), np.float32))
+    dead = np.zeros((512, 512), bool)
+    light = StarEvidence()(image, dead, detections, narrow, stars, [], np.eye(3), np.eye(3), SCALE, 0.05)
+    assert light.cause.tolist() == ["", "", "off the frame"]
+
+
+def test_one_lonely_star_and_none_at_all() -> None:
+    rng = np.random.default_rng(8)
+    lonely = seen(stars_at([[0.0, 0.3, 0.95]], [3.0]), np.ones(1, bool), rng)
+    assert lonely.llr[0] > 6
+    below = seen(stars_at([[0.0, 0.0, -1.0]], [3.0]), np.ones(1, bool), rng)
+    assert len(below.star) == len(below.evidence()) == 0
+
+
+def test_uncertain_stars_say_less_when_missing() -> None:
+    """A variable star that is not seen may just be faint today."""
+    rng = np.random.default_rng(9)
+    rays = random_stars(300, rng).rays_icrs
+    rays = rays[(rays[:, 2] > 0.3) & (rays[:, 2] < 0.95)]
+    steady = stars_at(rays, np.full(len(rays), 4.0))
+    variable = replace(steady, v_sigma_mag=np.full(len(rays), 0.5))
+    hidden = np.zeros(len(rays), bool)
+    sure = seen(steady, hidden, np.random.default_rng(10)).llr
+    unsure = seen(variable, hidden, np.random.default_rng(10)).llr
+    assert np.median(sure) < -5
+    assert np.median(unsure) > 0.75 * np.median(sure)
+
+
+def scale_from(
+    v_mag: np.ndarray, flux: np.ndarray, *, saturated: np.ndarray | None = None, xy: np.ndarray | None = None
+) -> FluxScale:
+    n = len(v_mag)
+    rng = np.random.default_rng(11)
+    xy = rng.uniform(60, 450, (n, 2)) if xy is None else xy
+    sigma = np.sqrt(flux + 1250)
+    detections = Detections(
+        xy_px=xy, covariance_px2=np.zeros((n, 2, 2)), flux_e=flux, flux_sigma_e=sigma, snr=flux / sigma,
+        saturated=np.zeros(n, bool) if saturated is None else saturated, psf_sigma_px=1.0,
+        background_e=np.zeros((2, 2), np.float32), noise_e=np.ones((2, 2), np.float32),
+    )  # fmt: skip
+    found = Identification(
+        detection=np.arange(n), star=np.arange(n), R_cam_icrs=np.eye(3), false_alarm_probability=0.0, unexplained=0
+    )
+    return flux_scale(detections, CAMERA, stars_at(np.tile([0.0, 0.0, 1.0], (n, 1)), v_mag), found)
+
+
+def test_the_scale_is_found_with_its_scatter() -> None:
+    rng = np.random.default_rng(12)
+    v = rng.uniform(1, 5, 600)
+    flux = 10 ** (-0.4 * (v - 13.0)) * np.exp(0.08 * rng.normal(size=600))
+    flux += np.sqrt(flux + 1250) * rng.normal(size=600)
+    scale = scale_from(v, flux)
+    assert scale.zero_mag == pytest.approx(13.0, abs=0.015)
+    assert scale.scatter == pytest.approx(0.08, abs=0.02)
+    assert scale.trend_per_rad2 == 0.0
+    odd = flux.copy()
+    odd[::10] *= 3  # every tenth is a variable star or a wrong name
+    assert scale_from(v, odd).zero_mag == pytest.approx(13.0, abs=0.03)
+    clipped = v < 2
+    low = np.where(clipped, 0.3 * flux, flux)
+    assert scale_from(v, low, saturated=clipped).zero_mag == pytest.approx(13.0, abs=0.015)
+
+
+def test_vignetting_that_the_camera_file_misses_is_seen_and_carried() -> None:
+    rng = np.random.default_rng(13)
+    xy = rng.uniform(60, 450, (500, 2))
+    angle = CAMERA.angle_rad(xy)
+    v = rng.uniform(1, 4, 500)
+    flux = 10 ** (-0.4 * (v - 13.0)) * np.exp(-0.2 * angle**2 + 0.04 * rng.normal(size=500))
+    scale = scale_from(v, flux, xy=xy)
+    assert scale.trend_per_rad2 == pytest.approx(-0.2, abs=0.02)
+    expected = scale.flux_e(np.array([3.0, 3.0]), np.array([0.0, 1.2]), CAMERA)
+    assert expected == pytest.approx(1e4 * np.exp([0.0, -0.2 * 1.44]), rel=0.02)
+
+
+@pytest.mark.parametrize("n", [1, 3, 6])
+def test_a_few_stars_give_a_scale_too(n: int) -> None:
+    v = np.linspace(2, 3, n)
+    assert scale_from(v, 10 ** (-0.4 * (v - 13.0))).zero_mag == pytest.approx(13.0, abs=0.01)
+    all_saturated = scale_from(v, 10 ** (-0.4 * (v - 13.0)), saturated=np.ones(n, bool))
+    assert all_saturated.zero_mag == pytest.approx(13.0, abs=0.01)
+
+
+def test_evidence_of_a_rendered_crater(located: Any) -> None:
+    """The pipeline's own evidence against the renderer's truth: sure ratios are right, all are calibrated."""
+    light, truth = located.result.light, located.truth
+    stars = located.result.stars
+    hidden = dict(zip(truth.sources.catalog_id.tolist(), truth.hidden.tolist(), strict=True))
+    names = stars.catalog_id[light.star]
+    known = light.usable & np.array([name in hidden for name in names])
+    shines = np.array([not hidden.get(name, True) for name in names])[known]
+    llr = light.llr[known]
+    assert known.sum() > 2000
+    assert np.mean(shines[llr > 4]) > 0.985
+    assert np.mean(~shines[llr < -4]) > 0.985
+    # Log-likelihood of the truth, if ratios were probabilities from even odds: at least as good as stated.
+    p = expit(np.where(shines, llr, -llr))
+    assert np.mean(np.log(p)) > np.mean(p_log_p(llr)) - 3 * np.std(np.log(p)) / np.sqrt(len(p))
+    z = light.flux_e[known][~shines] / light.sigma_e[known][~shines]
+    assert abs(np.median(z)) < 0.1
+    assert 1.4826 * np.median(np.abs(z - np.median(z))) == pytest.approx(1.0, abs=0.1)
+
+
+def p_log_p(llr: np.ndarray) -> np.ndarray:
+    """Expected log-likelihood of calibrated ratios."""
+    p = expit(llr)
+    return p * np.log(p) + (1 - p) * np.log1p(-p)
+
+
+def test_evidence_does_not_depend_on_where_north_is() -> None:
+    rng = np.random.default_rng(14)
+    stars = random_stars(400, rng)
+    image, detections = frame(stars, np.ones(400, bool), rng)
+    dead = np.zeros(image.shape, bool)
+    turn = Rotation.from_euler("z", 40, degrees=True).as_matrix()  # enu turned against icrs
+    plain = StarEvidence()(image, dead, detections, CAMERA, stars, [], R_CAM_ENU, np.eye(3), SCALE, 0.05)
+    turned = StarEvidence()(image, dead, detections, CAMERA, stars, [], R_CAM_ENU, turn, SCALE, 0.05)
+    assert np.array_equal(plain.llr, turned.llr)
+    assert turned.elevation_rad == pytest.approx(plain.elevation_rad, abs=1e-12)
+    assert np.radians(40) == pytest.approx((plain.azimuth_rad - turned.azimuth_rad) % (2 * np.pi), abs=1e-9)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from startrack.camera import Camera
 from startrack.detect.background import background_and_noise, local_level
-from startrack.detect.fit import PointFits, fit_points, fit_widths, psf_misfit, radius_for, stamps
+from startrack.detect.fit import MODEL_ERROR, PointFits, fit_points, fit_widths, radius_for, stamps
+from startrack.detect.impostors import edge_chi2
 from startrack.psf import filter_kernel, pixel_profile
 from startrack.types import Bools, Detections, Exposure, Ints, TooFewStars
 
@@ -20,7 +21,7 @@ NARROW_PX = 1.25
 OWN_LEVEL_PART = 0.8  # of the threshold that a source must reach by its own stamp alone, everywhere
 UNEVEN_SIGMA = 2.5  # difference of the stamp's level and that of its surroundings where these are not to be trusted
 EDGE_MARGIN = 20.0  # chi^2 by which an edge must explain a stamp better: noise alone gives faint stars less
-CROWDED_ROUNDS = 4  # of subtracting neighbours and fitting again
+CROWDED_ROUNDS = 3  # of subtracting neighbours and fitting again
 NEIGHBOUR_SIGMA = 0.1  # neighbours' light above this part of a pixel's noise is taken away
 NEIGHBOUR_ERROR = 0.1  # of it is not known: neighbours' fits, and the PSF's wings
 BAD_FIT_CHI2_PER_DOF = 4.0
@@ -63,7 +64,7 @@ class Detector:
                 break
             sigma = measured
             centres, fits = self._measure(frame, sigma)
-        good = _is_star(fits, _threshold(self.threshold_snr, sigma), _misfit(frame, centres, fits, sigma))
+        good = _is_star(fits, _threshold(self.threshold_snr, sigma), *_likeness(frame, centres, fits, sigma))
         if not good.any():
             raise TooFewStars(NOTHING_SEEN)
         return _detections(frame, fits, good, sigma, background, noise)
@@ -175,13 +176,15 @@ def _threshold(threshold_snr: float, sigma_px: float) -> float:
     return float(np.sqrt(threshold_snr**2 + max(8 * np.log(NARROW_PX / sigma_px), 0.0)))
 
 
-def _is_star(fits: PointFits, threshold_snr: float, misfit: NDArray[np.float64]) -> Bools:
-    """Sources that stand above the threshold, look like the PSF, and not rather like a hot pixel or a track.
+def _is_star(
+    fits: PointFits, threshold_snr: float, misfit: NDArray[np.float64], edge: NDArray[np.float64]
+) -> Bools:
+    """Sources that stand above the threshold, look like the PSF, and not rather like a hot pixel, an edge or a track.
 
     Where the bright sources of the frame all differ from the Gaussian (trails, coma, a real lens), no bright star would
     pass by its chi^2; there a source passes whose `misfit` (n,) is like theirs.
     """
-    point = (fits.chi2 < fits.chi2_pixel) & (fits.chi2 < fits.chi2_edge + EDGE_MARGIN)
+    point = (fits.chi2 < fits.chi2_pixel) & (fits.chi2 < edge + EDGE_MARGIN)
     by_itself = fits.flux / np.sqrt(fits.covariance[:, 2, 2])
     bright = point & (by_itself > BRIGHT_SNR)
     typical = float(np.median(misfit[bright])) if np.count_nonzero(bright) >= FEWEST_BRIGHT else 0.0
@@ -200,11 +203,30 @@ def _is_star(fits: PointFits, threshold_snr: float, misfit: NDArray[np.float64])
     )
 
 
-def _misfit(frame: _Frame, centres: Ints, fits: PointFits, sigma: float) -> NDArray[np.float64]:
+def _likeness(
+    frame: _Frame, centres: Ints, fits: PointFits, sigma: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How far the sources (n) are from the Gaussian PSF, and their chi^2 as straight edges or lines instead.
+
+    The first is the root of the squared residual beyond the noise over the squared light: 0 for a perfect star, about
+    0.6 for a single bright pixel.
+    """
     radius = radius_for(sigma)
-    data, noise = stamps(frame.residual, centres, radius), stamps(frame.noise, centres, radius)
+    data, variance = stamps(frame.residual, centres, radius), np.square(stamps(frame.noise, centres, radius))
     usable = ~stamps(frame.dead, centres, radius).astype(bool)
-    return psf_misfit(data, np.square(noise), usable, centres, fits, sigma, frame.shot)
+    light = _own_light(centres, fits, sigma, radius)
+    noise = variance + (light if frame.shot else 0.0)
+    excess = usable * (np.square(data - light - fits.level[:, None, None]) - noise)
+    total = np.sum(usable * np.square(light), axis=(1, 2))
+    misfit = np.sqrt(np.maximum(excess.sum(axis=(1, 2)), 0.0) / np.maximum(total, 1e-12))
+    return misfit, edge_chi2(data, usable / (noise + np.square(MODEL_ERROR * light)))
+
+
+def _own_light(centres: Ints, fits: PointFits, sigma: float, radius: int) -> NDArray[np.float64]:
+    offset = fits.xy_px - centres
+    px, _ = pixel_profile(offset[:, 0], sigma, radius)
+    py, _ = pixel_profile(offset[:, 1], sigma, radius)
+    return np.maximum(fits.flux, 0.0)[:, None, None] * py[:, :, None] * px[:, None, :]
 
 
 def _measured_width(frame: _Frame, centres: Ints, fits: PointFits, sigma: float) -> float | None:

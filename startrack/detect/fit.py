@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.detect.impostors import edge_chi2, single_pixel_chi2
+from startrack.detect.impostors import single_pixel_chi2
 from startrack.psf import pixel_profile, stamp_radius
 from startrack.types import Array, Bools, Ints
 
@@ -26,7 +26,6 @@ class PointFits:
     covariance: Array  # (n, 4, 4) of x, y, flux, level
     chi2: Array  # (n,) of the point source
     chi2_pixel: Array  # (n,) of a single bright pixel instead
-    chi2_edge: Array  # (n,) of a straight edge or line instead
     dof: Array  # (n,)
     surround: Array  # (n,) level of the wider surroundings
     significance: Array  # (n,) matched-filter SNR of the light against nothing but background noise
@@ -121,29 +120,11 @@ def fit_points(
         covariance=covariance,
         chi2=chi2,
         chi2_pixel=single_pixel_chi2(data, usable / variance),
-        chi2_edge=edge_chi2(data, weights),
         dof=np.maximum(usable.sum(axis=(1, 2)) - 4.0, 1.0),
         surround=surround,
         significance=against_nothing / np.sqrt(np.maximum(np.sum(filtered * shape, axis=(1, 2)), 1e-300)),
         snr=flux * np.sqrt(own),
     )
-
-
-def psf_misfit(
-    data: Array, variance: Array, usable: Bools, centres: Ints, fits: PointFits, sigma_px: float, shot: bool
-) -> Array:
-    """Root of the squared residual beyond the noise over the squared light (n,): 0 for a star that is the Gaussian PSF.
-
-    Arguments as of `fit_points`, and its result. About 0.6 for a single bright pixel.
-    """
-    offset = fits.xy_px - centres
-    px, _ = pixel_profile(offset[:, 0], sigma_px, data.shape[1] // 2)
-    py, _ = pixel_profile(offset[:, 1], sigma_px, data.shape[1] // 2)
-    light = np.maximum(fits.flux, 0.0)[:, None, None] * py[:, :, None] * px[:, None, :]
-    noise = variance + (light if shot else 0.0)
-    excess = usable * (np.square(data - light - fits.level[:, None, None]) - noise)
-    total = np.sum(usable * np.square(light), axis=(1, 2))
-    return np.sqrt(np.maximum(excess.sum(axis=(1, 2)), 0.0) / np.maximum(total, 1e-12))
 
 
 def fit_widths(data: Array, variance: Array, usable: Bools, fits: PointFits, centres: Ints, widths_px: Array) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from startrack.types import Array, Ints
 
@@ -31,24 +32,22 @@ def edge_chi2(data: Array, weights: Array) -> Array:
     A skyline, the edge of the image circle, a bad column, a satellite's trail: what varies in one direction only.
     """
     n, side = len(data), data.shape[1]
-    w = weights.reshape(n, -1)
-    moment = w * data.reshape(n, -1)
-    power = np.sum(moment * data.reshape(n, -1), axis=1)
-    best = np.full(n, np.inf)
-    for stripes in _stripes(side):
-        total, light = w @ stripes, moment @ stripes
-        best = np.minimum(best, power - np.sum(light * light / np.maximum(total, 1e-300), axis=1))
-    return best
+    stripes, starts = _stripes(side)
+    w = weights.reshape(n, -1).astype(np.float32)
+    flat = data.reshape(n, -1).astype(np.float32)
+    moment = w * flat
+    total, light = w @ stripes, moment @ stripes
+    explained = np.add.reduceat(light * light / np.maximum(total, 1e-30), starts, axis=1)
+    return np.asarray(np.sum(moment * flat, axis=1) - explained.max(axis=1), dtype=np.float64)
 
 
 @lru_cache(maxsize=16)
-def _stripes(side: int) -> tuple[Array, ...]:
-    """For each direction, which pixel (s^2) lies in which stripe of one pixel's width (s^2, stripes): 0 or 1."""
+def _stripes(side: int) -> tuple[NDArray[np.float32], Ints]:
+    """Which pixel lies in which stripe of one pixel's width (s^2, m): 0 or 1; and each direction's first stripe."""
     offset = np.arange(side) - side // 2
     x, y = np.tile(offset, side), np.repeat(offset, side)
     masks = []
     for turn in np.arange(DIRECTIONS) * np.pi / DIRECTIONS:
-        stripe: Ints = np.rint(x * np.cos(turn) + y * np.sin(turn)).astype(np.int64)
-        _, number = np.unique(stripe, return_inverse=True)
-        masks.append(np.eye(number.max() + 1)[number])
-    return tuple(masks)
+        _, number = np.unique(np.rint(x * np.cos(turn) + y * np.sin(turn)), return_inverse=True)
+        masks.append(np.eye(number.max() + 1, dtype=np.float32)[number])
+    return np.concatenate(masks, axis=1), np.cumsum([0] + [mask.shape[1] for mask in masks[:-1]])

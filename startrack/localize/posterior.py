@@ -15,10 +15,13 @@ from startrack.localize.search import Boxes, RayBoxes, by_sector, centre_scores,
 from startrack.localize.seen import cylinder_of
 from startrack.localize.summary import summarize
 from startrack.terrain import Cylinder, Terrain
-from startrack.types import Array, Bools, Evidence, Fix, NotLocated
+from startrack.types import Array, Bools, Evidence, Fix, Ints, NotLocated
 
 FEWEST_RAYS = 8
 MOST_COARSE_BOXES = 12_000  # boxes of 20 m and more that all might matter: the stars do not say where
+MOST_PAIRS = 6_000_000  # (box, ray) pairs, some 0.5 GB
+BOXES_AT_ONCE = 2000
+CONTRADICTED_NATS = -3.0  # mean over the sectors at the best place; -0.5 is usual, and -9.2 the worst
 RAY_BY_RAY_M = 20.0  # boxes of this half side and less are asked ray by ray, larger ones sector by sector
 
 
@@ -76,20 +79,40 @@ class _Search:
         self.log_dropped = -np.inf
 
     def exclude(self) -> RayBoxes:
-        """From the whole area down to small boxes, by look-ups."""
+        """From the whole area down to small boxes, by look-ups. Raises NotLocated where too much stays open."""
         centres, half = np.zeros((1, 2)), float(self.terrain.reach_m)
         while True:
-            boxes, first, last = by_sector(centres, half, self.sectors, self.profile, self.terrain)
-            keep = self._promising(boxes)
-            boxes, first, last = boxes.take(keep), first[keep], last[keep]
+            boxes, first, last = self._bounded(centres, half)
             if len(boxes) > MOST_COARSE_BOXES:
-                raise NotLocated(
-                    f"the rays leave {len(boxes) * 4 * half**2 / 1e6:.0f} km2 of the search area open: "
-                    "is the skyline in the picture, and the exposure long enough?"
-                )
+                raise self._lost(len(boxes) * 4 * half**2)
             if half < RAY_BY_RAY_M:
+                if (last - first).sum() > MOST_PAIRS:
+                    raise self._lost(len(boxes) * 4 * half**2)
                 return ray_by_ray(boxes, first, last, self.sectors, self.profile, self.terrain)
             centres, half = boxes.quarters(self.terrain)[0], half / 2
+
+    def _bounded(self, centres: Array, half: float) -> tuple[Boxes, Ints, Ints]:
+        """The promising ones of the boxes with their open rays, some at a time so that memory stays flat."""
+        kept = []
+        for start in range(0, len(centres), BOXES_AT_ONCE):
+            some = centres[start : start + BOXES_AT_ONCE]
+            boxes, first, last = by_sector(some, half, self.sectors, self.profile, self.terrain)
+            keep = self._promising(boxes)
+            kept.append((boxes.take(keep), first[keep], last[keep]))
+        parts = [(box.centres_m, box.lower, box.upper, first, last) for box, first, last in kept]
+        centres, lower, upper, first, last = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return Boxes(centres, half, lower, upper), first, last
+
+    def _lost(self, open_m2: float) -> NotLocated:
+        """Why so much of the area stays open: nothing fits, or everything does."""
+        if self.best < CONTRADICTED_NATS * self.sectors.count:
+            return NotLocated(
+                "no place explains the stars: wrong terrain, time or camera file?", reason="inconsistent_evidence"
+            )
+        return NotLocated(
+            f"the rays leave {open_m2 / 1e6:.1f} km2 of the search area open: "
+            "is the skyline in the picture, and the exposure long enough?"
+        )
 
     def refine(self, boxes: RayBoxes) -> RayBoxes:
         """Quartered until small against the posterior's spread."""

@@ -15,6 +15,9 @@ USELESS_FRACTION = 0.5  # a 95 % circle wider than this part of the search radiu
 def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_mass: float, terrain: Terrain) -> Fix:
     """Fix from equal boxes (n, 2) of the given width with log-likelihoods (n,).
 
+    Position and covariance are those of the heaviest mode: one of half a per cent far away would drag the mean to where
+    nobody can be. The circles about the position hold their part of the whole posterior.
+
     Raises NotLocated: outside_search_area where most of the posterior lies beyond the search radius, and
     insufficient_geometry where the posterior is as wide as the area itself.
     """
@@ -31,11 +34,10 @@ def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_mass:
     centres_m, weight = centres_m[keep], weight[keep] / weight[keep].sum()
     label = _modes(centres_m, weight, width_m)
     modes = _described(centres_m, weight, label)
-    mean, covariance = _moments(centres_m, weight, width_m)
-    main = label == label[int(np.argmax(np.bincount(label, weights=weight)[label]))]
-    main_mean, _ = _moments(centres_m[main], weight[main], width_m)
-    main_999 = _radius(centres_m[main] - main_mean, weight[main] / weight[main].sum(), 0.999, width_m)
-    distance = np.linalg.norm(centres_m - main_mean, axis=1)
+    main = label == np.argmax(np.bincount(label, weights=weight))
+    mean, covariance = _moments(centres_m[main], weight[main], width_m)
+    main_999 = _radius(centres_m[main] - mean, weight[main] / weight[main].sum(), 0.999, width_m)
+    distance = np.linalg.norm(centres_m - mean, axis=1)
     ambiguous = bool(weight[distance > main_999 + width_m].sum() > AMBIGUOUS_MASS and len(modes) > 1)
     radius95 = _radius(centres_m - mean, weight, 0.95, width_m)
     if not ambiguous and radius95 > USELESS_FRACTION * terrain.search_radius_m:

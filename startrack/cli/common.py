@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from startrack.camera import Camera
     from startrack.types import Exposure
 
+INTERNAL_ERROR = "internal_error"
 DEFAULT_OUT = "startrack-out"
 BAD_INPUT_REASONS = frozenset(
     {"bad_image", "size_mismatch", "no_time", "no_calibration", "bad_calibration", "bad_terrain"}
@@ -86,7 +87,7 @@ class Outcome:
 def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, str], Outcome]) -> int:
     """Run `one(path, output stem)` for each image, print its outcome, and return the exit code.
 
-    One image's BadInput is its own outcome; it never stops the others.
+    One image's BadInput, or even an internal error, is its own outcome; it never stops the others.
     """
     codes = [0]
     for path, stem in zip(args.images, output_stems(args.images), strict=True):
@@ -94,6 +95,10 @@ def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, s
             outcome = one(path, stem)
         except BadInput as cause:
             outcome = _refused(path, cause, format_name)
+        except Exception as cause:
+            if args.verbose:
+                raise
+            outcome = _broken(path, cause, format_name)
         if args.json:
             print(json.dumps(outcome.record), flush=True)
         elif outcome.status != "ok":
@@ -105,10 +110,25 @@ def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, s
 
 
 def exit_code(outcome: Outcome) -> int:
-    """0 solved, 4 bad input, 3 refused or ambiguous."""
+    """0 solved, 1 internal error, 4 bad input, 3 refused or ambiguous."""
+    if outcome.reason == INTERNAL_ERROR:
+        return 1
     if outcome.status == "ok":
         return 0
     return 4 if outcome.reason in BAD_INPUT_REASONS else 3
+
+
+def _broken(path: str, cause: Exception, format_name: str) -> Outcome:
+    """Outcome of an image that met a fault of the program's own."""
+    message = f"internal error: {type(cause).__name__}: {cause} (-v shows the traceback)"
+    record = {
+        "format": format_name,
+        "image": Path(path).name,
+        "status": "refused",
+        "reason": INTERNAL_ERROR,
+        "message": message,
+    }
+    return Outcome("refused", INTERNAL_ERROR, f"{Path(path).name}  {message}", record)
 
 
 def _refused(path: str, cause: BadInput, format_name: str) -> Outcome:

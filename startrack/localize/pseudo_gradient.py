@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.localize.hull import hull_position
-from startrack.localize.seen import cylinder_of, on_rim_plane, point_fix, seen_stars
+from startrack.localize.seen import cylinder_of, on_rim_plane, point_fix, risen, seen_stars
 from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Evidence, Fix
 
@@ -28,6 +28,7 @@ class PseudoGradient:
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
         """Raises NotLocated with fewer than 3 seen stars."""
         cylinder = cylinder_of(terrain)
+        evidence = risen(evidence)
         points, seen = on_rim_plane(evidence, cylinder), seen_stars(evidence)
         start = hull_position(points[seen], cylinder.wall_m, cylinder.radius_m)
         position, _ = descend(points, seen, start, cylinder.radius_m, self.gain, self.most_steps)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from startrack.localize.scout import taken
 from startrack.terrain import Cylinder, Terrain
 from startrack.types import Array, BadInput, Bools, Evidence, Fix, Mode
 
@@ -13,6 +14,11 @@ def cylinder_of(terrain: Terrain) -> Cylinder:
     if not isinstance(terrain, Cylinder):
         raise BadInput("bad_terrain", f"{terrain.name}: this method needs a [cylinder]")
     return terrain
+
+
+def risen(evidence: Evidence) -> Evidence:
+    """The rays above the horizontal: the others never pierce the plane of the rim."""
+    return taken(evidence, evidence.elevation_rad > 0)
 
 
 def seen_stars(evidence: Evidence) -> Bools:

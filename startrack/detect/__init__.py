@@ -1,5 +1,6 @@
 """Detection: exposure to point sources."""
 
-from startrack.detect.detector import Detector, electrons
+from startrack.detect.detector import Detector
+from startrack.detect.frame import electrons
 
 __all__ = ["Detector", "electrons"]

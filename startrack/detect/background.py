@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 BLOCK_PX = 16
 MAD_TO_SIGMA = 1.4826
+COARSE_PX = 4  # the local level is a mean over squares of this side
+CLIPPED_SIGMA = np.float32(2.5)
 Image = NDArray[np.float32]
 
 
@@ -31,11 +33,27 @@ def background_and_noise(image: Image) -> tuple[Image, Image]:
     return _enlarge(level_map, image.shape), np.maximum(_enlarge(spread_map, image.shape), quantum)
 
 
-def local_level(residual: Image, noise: Image, width_px: int) -> Image:
-    """Mean of the residual over a box, stars clipped: what the block medians missed, such as a slope."""
-    clipped = np.minimum(residual, 2.5 * noise)
-    np.maximum(clipped, -2.5 * noise, out=clipped)
-    return cv2.boxFilter(clipped, -1, (width_px, width_px), borderType=cv2.BORDER_REFLECT)
+def local_level(standardised: Image, width_px: int) -> Image:
+    """Mean over a box of residuals in units of the noise, stars clipped: what the block medians missed, such as a slope.
+
+    Boxes are made of whole squares of COARSE_PX, which costs a third of the time and no more than their coarseness.
+    """
+    height, width = standardised.shape
+    clipped = np.clip(standardised, -CLIPPED_SIGMA, CLIPPED_SIGMA)
+    small = -(-width // COARSE_PX), -(-height // COARSE_PX)
+    below, right = -height % COARSE_PX, -width % COARSE_PX
+    if below or right:
+        clipped = np.asarray(cv2.copyMakeBorder(clipped, 0, below, 0, right, cv2.BORDER_REFLECT_101))
+    coarse = cv2.resize(clipped, small, interpolation=cv2.INTER_AREA)
+    side = coarse_width(width_px)
+    smooth = cv2.boxFilter(coarse, -1, (side, side), borderType=cv2.BORDER_REFLECT)
+    full: Any = cv2.resize(smooth, (small[0] * COARSE_PX, small[1] * COARSE_PX), interpolation=cv2.INTER_LINEAR)
+    return full[:height, :width]
+
+
+def coarse_width(width_px: int) -> int:
+    """The odd number of COARSE_PX nearest to a width [px]."""
+    return 2 * int(round(width_px / COARSE_PX - 1) // 2) + 1 if width_px > COARSE_PX else 1
 
 
 def _median(rows: Image) -> Image:

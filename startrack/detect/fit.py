@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.detect.frame import Image, LightNoise
 from startrack.detect.impostors import single_pixel_chi2
-from startrack.psf import pixel_profile, stamp_radius
+from startrack.psf import pixel_profile
 from startrack.types import Array, Bools, Ints
 
-ITERATIONS = 4
-MODEL_ERROR = 0.03  # fraction of a star's own light by which real PSFs differ from the Gaussian
+ROUNDS = 4  # of flux and level, then of all four
+BATCH_PIXELS = 65536  # of stamps worked on at a time: what a processor's cache holds
+# Products of the profile P and its derivative D by which x and y enter the normal matrix.
+PP, PD, DD, P, D, ONE = range(6)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,117 +45,146 @@ class PointFits:
         return PointFits(**values)
 
 
-def stamps(image: NDArray[Any], centres: Ints, radius: int) -> Array:
-    """Cut-outs (n, 2r+1, 2r+1) of the image around the integer pixels (n, 2) (x, y), which must be `radius` inside."""
-    side = 2 * radius + 1
-    windows = np.lib.stride_tricks.sliding_window_view(image, (side, side))
-    return windows[centres[:, 1] - radius, centres[:, 0] - radius].astype(np.float64)
+@dataclass(frozen=True)
+class Stamps:
+    """Cut-outs (n, s, s) around the pixels `centres` (n, 2), and the level (n,) of their wider surroundings."""
+
+    data: Image
+    variance: Image
+    usable: Bools | None
+    centres: Ints
+    surround: Array
+
+    def part(self, which: slice) -> Stamps:
+        """Some of them."""
+        usable = None if self.usable is None else self.usable[which]
+        return Stamps(self.data[which], self.variance[which], usable, self.centres[which], self.surround[which])
 
 
 def fit_points(
-    data: Array,
-    variance: Array,
-    usable: Bools,
-    centres: Ints,
-    start_xy_px: Array,
-    surround: Array,
-    sigma_px: float,
-    shot: bool,
+    stamps: Stamps, start_xy_px: Array, sigma_px: float, light_noise: LightNoise, own_part: float
 ) -> PointFits:
     """Position, flux and local level of one point source in each stamp.
 
-    `data`, `variance`, `usable` are stamps (n, s, s) around the pixels `centres` (n, 2); `surround` (n,) is the level
-    of the wider surroundings, which only the significance relies on. With `shot`, the source's own photon noise (flux
-    in electrons) is added to the variance; a model error of a few per cent always is. Gauss-Newton on the
-    pixel-integrated Gaussian; steps are limited to half a pixel, so a hopeless source stays near where it was.
+    Only the significance relies on `surround`, which holds `own_part` of the source's own light. Gauss-Newton on the
+    pixel-integrated Gaussian from `start_xy_px` (n, 2); steps are limited to half a pixel, so a hopeless source stays
+    near where it was. Weights: the pixels' variance and what the source's own light adds to it.
     """
-    radius = data.shape[1] // 2
-    offset = start_xy_px - centres
-    n = len(data)
-    weights: Array = usable / variance
-    flux: Array = np.zeros(n)
-    level: Array = np.zeros(n)
-    covariance: Array = np.zeros((n, 4, 4))
-    for step in range(ITERATIONS + 1):
-        px, dx = pixel_profile(offset[:, 0], sigma_px, radius)
-        py, dy = pixel_profile(offset[:, 1], sigma_px, radius)
+    size = max(1, BATCH_PIXELS // max(stamps.data[0].size, 1)) if len(stamps.data) else 1
+    batches = [
+        _fit(stamps.part(slice(at, at + size)), start_xy_px[at : at + size], sigma_px, light_noise, own_part)
+        for at in range(0, max(len(start_xy_px), 1), size)
+    ]
+    return PointFits(**{f.name: np.concatenate([getattr(b, f.name) for b in batches]) for f in fields(PointFits)})
+
+
+def _fit(s: Stamps, start_xy_px: Array, sigma_px: float, light_noise: LightNoise, own_part: float) -> PointFits:
+    radius = s.data.shape[1] // 2
+    offset = np.clip(start_xy_px - s.centres, -radius, radius)
+    n = len(s.data)
+    flux, level = np.zeros(n), np.zeros(n)
+    weights = _masked(1.0 / s.variance, s.usable)
+    for step in range(ROUNDS + 1):
+        px, dx = _profile(offset[:, 0], sigma_px, radius)
+        py, dy = _profile(offset[:, 1], sigma_px, radius)
         shape = py[:, :, None] * px[:, None, :]
-        if step > 0:
-            light = np.maximum(flux, 0.0)[:, None, None] * shape
-            weights = usable / (variance + (light if shot else 0.0) + np.square(MODEL_ERROR * light))
-        gradient = np.stack(
-            [
-                flux[:, None, None] * py[:, :, None] * dx[:, None, :],
-                flux[:, None, None] * dy[:, :, None] * px[:, None, :],
-                shape,
-                np.ones_like(shape),
-            ],
-            axis=1,
-        ).reshape(n, 4, -1)
-        miss = (data - flux[:, None, None] * shape - level[:, None, None]).reshape(n, -1)
-        w = weights.reshape(n, -1)
-        weighted = gradient * w[:, None, :]
-        normal = weighted @ gradient.transpose(0, 2, 1)
-        right = (weighted @ miss[:, :, None])[..., 0]
-        # A whiff of a prior (positions within ~3 px of the start) keeps sources without light solvable.
-        normal[:, [0, 1], [0, 1]] += 0.1
-        normal[:, [2, 3], [2, 3]] += 1e-12
-        delta: Array = np.zeros((n, 4))
-        if step == 0:  # flux and level first: without a flux the position has no gradient
-            delta[:, 2:] = np.linalg.solve(normal[:, 2:, 2:], right[:, 2:, None])[..., 0]
-        elif step < ITERATIONS:
-            delta[:] = np.linalg.solve(normal, right[..., None])[..., 0]
-        else:
-            covariance[:] = np.linalg.inv(normal)
+        if step == 1:  # the weights follow the light: now roughly, at the end finely
+            weights = _weights(s, flux, shape, light_noise)
+        if step == ROUNDS:
+            weights = _weights(s, flux, shape, light_noise)
+        miss = s.data - flux[:, None, None].astype(np.float32) * shape - level[:, None, None].astype(np.float32)
+        normal, right = _normal_equations(weights, miss, flux, (px, dx), (py, dy))
+        if step == ROUNDS:
             break
-        offset = offset + np.clip(delta[:, :2], -0.5, 0.5)
-        offset = np.clip(offset, -radius, radius)
+        if step == 0:  # flux and level first: without a flux the position has no gradient
+            delta = _solved_pairs(normal[:, 2:, 2:], right[:, 2:])
+            flux, level = flux + delta[:, 0], level + delta[:, 1]
+            continue
+        delta = np.linalg.solve(normal, right[..., None])[..., 0]
+        offset = np.clip(offset + np.clip(delta[:, :2], -0.5, 0.5), -radius, radius)
         flux, level = flux + delta[:, 2], level + delta[:, 3]
-    chi2 = np.einsum("np,np->n", w, miss**2)
-    filtered = usable / variance * shape
-    against_nothing = np.sum(filtered * (data - surround[:, None, None]), axis=(1, 2))
-    own = np.sum(usable * shape**2 / (variance + (light if shot else 0.0)), axis=(1, 2))
+    chi2 = np.einsum("nij,nij,nij->n", weights, miss, miss, dtype=np.float64)
+    return _judged(s, start_xy_px, offset, flux, level, np.linalg.inv(normal), chi2, shape, light_noise, own_part)
+
+
+def _judged(
+    s: Stamps, start: Array, offset: Array, flux: Array, level: Array, covariance: Array, chi2: Array,
+    shape: Image, light_noise: LightNoise, own_part: float,
+) -> PointFits:  # fmt: skip
+    plain = _masked(1.0 / s.variance, s.usable)
+    filtered = plain * shape
+    light = np.maximum(flux, 0.0)[:, None, None].astype(np.float32) * shape
+    against_nothing = np.einsum("nij,nij->n", filtered, s.data - s.surround[:, None, None].astype(np.float32))
+    norm = np.einsum("nij,nij->n", filtered, shape)
+    own = np.einsum("nij,nij->n", filtered, shape / (1.0 + np.float32(light_noise.per_unit) * light / s.variance))
+    # The level of the surroundings was taken from pixels that hold the star: it lowers signal by `own_part`, noise by
+    # its root.
+    undiluted = np.sqrt(np.maximum(norm, 1e-30) * (1.0 - own_part))
+    count = s.data[0].size if s.usable is None else s.usable.sum(axis=(1, 2))
     return PointFits(
-        xy_px=centres + offset,
+        xy_px=s.centres + offset,
         flux=flux,
         level=level,
         covariance=covariance,
         chi2=chi2,
-        chi2_pixel=single_pixel_chi2(data, usable / variance),
-        dof=np.maximum(usable.sum(axis=(1, 2)) - 4.0, 1.0),
-        surround=surround,
-        significance=against_nothing / np.sqrt(np.maximum(np.sum(filtered * shape, axis=(1, 2)), 1e-300)),
+        chi2_pixel=single_pixel_chi2(s.data, plain),
+        dof=np.broadcast_to(np.maximum(count - 4.0, 1.0), flux.shape).astype(np.float64),
+        surround=s.surround,
+        significance=against_nothing / undiluted,
         snr=flux * np.sqrt(own),
     )
 
 
-def fit_widths(data: Array, variance: Array, usable: Bools, fits: PointFits, centres: Ints, widths_px: Array) -> Array:
-    """Best-fitting PSF sigma (n,) [px] of each stamp among `widths_px` (m,), refined by a parabola through chi^2."""
-    radius = data.shape[1] // 2
-    offset = fits.xy_px - centres
-    w = (usable / variance).reshape(len(data), -1)
-    flat = data.reshape(len(data), -1)
-    chi2 = np.empty((len(data), len(widths_px)))
-    for i, width in enumerate(widths_px):
-        px, _ = pixel_profile(offset[:, 0], float(width), radius)
-        py, _ = pixel_profile(offset[:, 1], float(width), radius)
-        shape = (py[:, :, None] * px[:, None, :]).reshape(len(data), -1)
-        sums = [np.einsum("np,np->n", w, q) for q in (shape * shape, shape, np.ones_like(shape), shape * flat, flat)]
-        ss, s1, n1, sd, d1 = sums
-        determinant = ss * n1 - s1 * s1
-        flux = (n1 * sd - s1 * d1) / determinant
-        level = (ss * d1 - s1 * sd) / determinant
-        chi2[:, i] = np.einsum("np,np->n", w, np.square(flat - flux[:, None] * shape - level[:, None]))
-    best = np.clip(np.argmin(chi2, axis=1), 1, len(widths_px) - 2)
-    row = np.arange(len(data))
-    left, middle, right = chi2[row, best - 1], chi2[row, best], chi2[row, best + 1]
-    bend = left - 2 * middle + right
-    shift = np.divide(0.5 * (left - right), bend, out=np.zeros_like(bend), where=bend > 0)
-    log_width = np.log(widths_px)
-    step = log_width[1] - log_width[0]
-    return np.exp(log_width[best] + np.clip(shift, -1, 1) * step)
+def _normal_equations(
+    weights: Image, miss: Image, flux: Array, x: tuple[Image, Image], y: tuple[Image, Image]
+) -> tuple[Array, Array]:
+    """Normal matrix (n, 4, 4) and right side (n, 4) for x, y, flux, level: sums over x, then over y.
+
+    A whiff of a prior (positions within ~3 px of the start) keeps sources without light solvable.
+    """
+    across, down = _products(*x), _products(*y)
+    m = np.matmul(down, np.matmul(weights, across.transpose(0, 2, 1))).astype(np.float64)  # (n, 6 of y, 6 of x)
+    few_y, few_x = down[:, P:], across[:, P:]
+    r = np.matmul(few_y, np.matmul(weights * miss, few_x.transpose(0, 2, 1))).astype(np.float64)  # (n, 3, 3)
+    normal = np.empty((len(flux), 4, 4))
+    normal[:, 0, 0] = flux * flux * m[:, PP, DD] + 0.1
+    normal[:, 1, 1] = flux * flux * m[:, DD, PP] + 0.1
+    normal[:, 0, 1] = normal[:, 1, 0] = flux * flux * m[:, PD, PD]
+    normal[:, 0, 2] = normal[:, 2, 0] = flux * m[:, PP, PD]
+    normal[:, 1, 2] = normal[:, 2, 1] = flux * m[:, PD, PP]
+    normal[:, 0, 3] = normal[:, 3, 0] = flux * m[:, P, D]
+    normal[:, 1, 3] = normal[:, 3, 1] = flux * m[:, D, P]
+    normal[:, 2, 2] = m[:, PP, PP] + 1e-12
+    normal[:, 2, 3] = normal[:, 3, 2] = m[:, P, P]
+    normal[:, 3, 3] = m[:, ONE, ONE] + 1e-12
+    right = np.stack([flux * r[:, 0, 1], flux * r[:, 1, 0], r[:, 0, 0], r[:, 2, 2]], axis=1)
+    return normal, right
 
 
-def radius_for(sigma_px: float) -> int:
-    """Half width [px] of the fitting stamp: the star and a rim of background for the local level."""
-    return stamp_radius(sigma_px) + 1
+def _products(profile: Image, slope: Image) -> Image:
+    """(n, 6, s): the products PP, PD, DD, P, D, ONE of a profile and its slope."""
+    return np.stack([profile * profile, profile * slope, slope * slope, profile, slope, np.ones_like(slope)], axis=1)
+
+
+def _solved_pairs(normal: Array, right: Array) -> Array:
+    """Solutions (n, 2) of the 2 x 2 systems."""
+    a, b, d = normal[:, 0, 0], normal[:, 0, 1], normal[:, 1, 1]
+    determinant = np.maximum(a * d - b * b, 1e-300)
+    return (
+        np.stack([d * right[:, 0] - b * right[:, 1], a * right[:, 1] - b * right[:, 0]], axis=1) / determinant[:, None]
+    )
+
+
+def _weights(s: Stamps, flux: Array, shape: Image, light_noise: LightNoise) -> Image:
+    light = np.maximum(flux, 0.0)[:, None, None].astype(np.float32) * shape
+    variance = s.variance + light * (np.float32(light_noise.per_unit) + np.float32(light_noise.model_error**2) * light)
+    return _masked(1.0 / variance, s.usable)
+
+
+def _masked(weights: Image, usable: Bools | None) -> Image:
+    return weights if usable is None else weights * usable
+
+
+def _profile(offset: Array, sigma_px: float, radius: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    profile, slope = pixel_profile(offset, sigma_px, radius)
+    return profile.astype(np.float32), slope.astype(np.float32)

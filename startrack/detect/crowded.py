@@ -1,0 +1,94 @@
+"""Fits of all candidates, each with its neighbours' light taken away."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from startrack.detect.fit import PointFits, Stamps, fit_points
+from startrack.detect.frame import Frame, Image, radius_for
+from startrack.detect.peaks import Peaks
+from startrack.psf import pixel_profile
+from startrack.types import Array, Ints
+
+CROWDED_ROUNDS = 3  # of subtracting neighbours and fitting again
+NEIGHBOUR_SIGMA = 0.1  # neighbours' light above this part of a pixel's noise is taken away
+NEIGHBOUR_ERROR = 0.1  # of it is not known: neighbours' fits, and the PSF's wings
+BATCH_PIXELS = 2_000_000  # of neighbours' stamps at a time
+
+
+def fit_all(frame: Frame, peaks: Peaks, sigma: float) -> PointFits:
+    """Fits (n) of all candidates."""
+    radius = radius_for(sigma)
+    centres = peaks.centres
+    everything = Stamps(
+        frame.data(centres, radius), frame.variance(centres, radius), frame.usable(centres, radius), centres, peaks.surround
+    )  # fmt: skip
+    fits = fit_points(everything, peaks.start_xy_px, sigma, frame.light_noise, peaks.own_part)
+    star, other = _pairs(centres, 1.5 * radius + 3.0 * sigma)
+    for _ in range(CROWDED_ROUNDS):
+        crowded, light = _neighbours_light(everything, fits, star, other, sigma)
+        if not len(crowded):
+            break
+        usable = None if everything.usable is None else everything.usable[crowded]
+        variance = everything.variance[crowded] + np.square(np.float32(NEIGHBOUR_ERROR) * light)
+        alone = Stamps(everything.data[crowded] - light, variance, usable, centres[crowded], peaks.surround[crowded])
+        again = fit_points(alone, fits.xy_px[crowded], sigma, frame.light_noise, peaks.own_part)
+        fits = fits.replaced(crowded, again)
+    return fits
+
+
+def _pairs(centres: Ints, reach_px: float) -> tuple[Ints, Ints]:
+    """Each candidate that has another one within reach, ascending, and that other one: both (m,)."""
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(centres).query_pairs(reach_px, output_type="ndarray")
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    both = both[np.argsort(both[:, 0], kind="stable")]
+    return both[:, 0], both[:, 1]
+
+
+def _neighbours_light(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> tuple[Ints, Image]:
+    """The candidates (k,) into whose stamps others put light that counts, and that light (k, s, s)."""
+    side = s.data.shape[1]
+    radius = side // 2
+    counts = _may_count(s, fits, star, other, sigma)
+    star, other = star[counts], other[counts]
+    crowded, light = [np.zeros(0, dtype=np.int64)], [np.zeros((0, side, side), dtype=np.float32)]
+    firsts = np.flatnonzero(np.diff(star, prepend=-1))
+    pairs_at_a_time = max(1, BATCH_PIXELS // (side * side))
+    while len(firsts):
+        # Whole stars at a time, at least one: all pairs up to the first of a later star.
+        end = np.searchsorted(firsts, firsts[0] + pairs_at_a_time)
+        last = firsts[end] if end < len(firsts) else len(star)
+        here = slice(firsts[0], last)
+        offset = fits.xy_px[other[here]] - s.centres[star[here]]
+        px, _ = pixel_profile(offset[:, 0], sigma, radius)
+        py, _ = pixel_profile(offset[:, 1], sigma, radius)
+        py *= np.maximum(fits.flux[other[here]], 0.0)[:, None]
+        each = py.astype(np.float32)[:, :, None] * px.astype(np.float32)[:, None, :]
+        sums = np.add.reduceat(each, firsts[:end] - firsts[0], axis=0)
+        who = star[firsts[:end]]
+        matters = (np.square(sums) > NEIGHBOUR_SIGMA**2 * s.variance[who]).any(axis=(1, 2))
+        crowded.append(who[matters])
+        light.append(sums[matters])
+        firsts = firsts[end:]
+    return np.concatenate(crowded), np.concatenate(light)
+
+
+def _may_count(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> Array:
+    """Which pairs (m,) can matter: the neighbour's light at the stamp's nearest pixel against the middle's noise."""
+    radius = s.data.shape[1] // 2
+    beyond = np.maximum(np.abs(fits.xy_px[other] - s.centres[star]) - radius - 0.5, 0.0)
+    wing = np.exp(-0.5 * np.sum(np.square(beyond), axis=1) / (sigma**2 + 0.1))
+    top = min(1.0, 1.0 / (2 * np.pi * sigma**2))
+    noise = np.sqrt(s.variance[star, radius, radius])
+    return np.asarray(fits.flux[other] * top * wing > 0.3 * NEIGHBOUR_SIGMA * noise)
+
+
+def own_light(centres: Ints, fits: PointFits, sigma: float, radius: int) -> Image:
+    """Light (n, s, s) of each source in its own stamp."""
+    offset = fits.xy_px - centres
+    px, _ = pixel_profile(offset[:, 0], sigma, radius)
+    py, _ = pixel_profile(offset[:, 1], sigma, radius)
+    py *= np.maximum(fits.flux, 0.0)[:, None]
+    return np.asarray(py.astype(np.float32)[:, :, None] * px.astype(np.float32)[:, None, :])

@@ -1,0 +1,69 @@
+"""What every step of detection looks at: the frame without its background, its noise, its unusable pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.camera import Camera
+from startrack.psf import stamp_radius
+from startrack.types import Bools, Exposure, Ints
+
+Image = NDArray[np.float32]
+SATURATED_FRACTION = 0.98
+MODEL_ERROR = 0.03  # fraction of a star's own light by which real PSFs differ from the Gaussian
+
+
+@dataclass(frozen=True)
+class LightNoise:
+    """Variance that a star's own light adds to that of the pixel: per_unit light + (model_error light)^2."""
+
+    per_unit: float = 0.0  # photon noise: 1 for electrons, 1 / gain for ADU, 0 where it is not known
+    model_error: float = MODEL_ERROR
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One exposure prepared for detection."""
+
+    residual: Image  # background-subtracted
+    noise: Image  # standard deviation of one pixel
+    dead: NDArray[np.bool_] | None  # saturated: no weight in fits; None where no pixel is
+    light_noise: LightNoise
+
+    def data(self, centres: Ints, radius: int) -> Image:
+        """Stamps (n, s, s) of the residual."""
+        return stamps(self.residual, centres, radius)
+
+    def variance(self, centres: Ints, radius: int) -> Image:
+        """Stamps (n, s, s) of the pixels' variance, the stars' own light not included."""
+        return np.square(stamps(self.noise, centres, radius))
+
+    def usable(self, centres: Ints, radius: int) -> Bools | None:
+        """Stamps (n, s, s) of the pixels that may be used; None where all may."""
+        return None if self.dead is None else ~stamps(self.dead, centres, radius)
+
+
+def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray[np.bool_]]:
+    """The exposure in electrons above bias (ADU where the gain is unknown), and the mask of saturated pixels."""
+    pixels = exposure.pixels_adu
+    ceiling = exposure.saturation_adu or np.inf
+    if camera is None or camera.sensor is None:
+        return pixels, pixels >= SATURATED_FRACTION * ceiling
+    sensor = camera.sensor
+    saturated = pixels >= SATURATED_FRACTION * min(ceiling, sensor.saturation_adu)
+    return (pixels - np.float32(sensor.bias_adu)) * np.float32(sensor.gain_e_per_adu), saturated
+
+
+def stamps(image: NDArray[np.generic], centres: Ints, radius: int) -> NDArray[np.generic]:  # type: ignore[type-var]
+    """Cut-outs (n, 2r+1, 2r+1) of the image around the integer pixels (n, 2) (x, y), which must be `radius` inside."""
+    side = 2 * radius + 1
+    windows = np.lib.stride_tricks.sliding_window_view(image, (side, side))
+    return windows[centres[:, 1] - radius, centres[:, 0] - radius]
+
+
+def radius_for(sigma_px: float) -> int:
+    """Half width [px] of the fitting stamp: the star and a rim of background for the local level."""
+    return stamp_radius(sigma_px) + 1

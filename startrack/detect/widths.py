@@ -1,0 +1,74 @@
+"""The width of the PSF, measured from the frame's own bright sources."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from startrack.detect.fit import PointFits
+from startrack.detect.frame import Frame, Image, radius_for
+from startrack.psf import pixel_profile
+from startrack.types import Array, Ints
+
+BRIGHT_SNR = 12.0  # sources that say what the frame's PSF is
+FEWEST_BRIGHT = 8
+MOST_BRIGHT = 300
+NEAR = np.geomspace(0.7, 1.45, 9)  # widths tried first, in units of the expected one
+WIDTHS_PX = np.geomspace(0.3, 8.0, 36)
+NARROWER_IS_A_PIXEL_PX = 0.45  # hot pixels fit the narrowest profile
+AT_THE_END = 0.3  # part of the sources that the widths tried first may fail to hold
+
+
+def measured_width(frame: Frame, centres: Ints, fits: PointFits, sigma: float) -> float | None:
+    """Typical PSF sigma [px] of the bright sources; None where there are too few to tell."""
+    radius = radius_for(sigma)
+    bright = np.flatnonzero((fits.snr > BRIGHT_SNR) & (fits.chi2 < fits.chi2_pixel))
+    bright = bright[np.argsort(-fits.snr[bright], kind="stable")]
+    usable = frame.usable(centres[bright], radius)
+    bright = (bright if usable is None else bright[usable.all(axis=(1, 2))])[:MOST_BRIGHT]
+    if len(bright) < FEWEST_BRIGHT:
+        return None
+    pixels = centres[bright]
+    data = frame.data(pixels, radius)
+    weights = 1.0 / (frame.variance(pixels, radius) + np.float32(frame.light_noise.per_unit) * np.maximum(data, 0.0))
+    offset = fits.xy_px[bright] - pixels
+    widths, inside = fit_widths(data, weights, offset, sigma * NEAR)
+    if inside.mean() < 1.0 - AT_THE_END:
+        widths, inside = fit_widths(data, weights, offset, WIDTHS_PX)
+    widths = widths[inside & (widths > NARROWER_IS_A_PIXEL_PX)]
+    return float(np.median(widths)) if len(widths) >= FEWEST_BRIGHT else None
+
+
+def fit_widths(data: Image, weights: Image, offset_px: Array, widths_px: Array) -> tuple[Array, Array]:
+    """Best-fitting PSF sigma (n,) [px] of each stamp among `widths_px` (m,), geometric, and whether it is not the last.
+
+    Refined by a parabola through chi^2; flux and level are free, the place is `offset_px` from the middle pixel.
+    """
+    radius = data.shape[1] // 2
+    moment = weights * data
+    total, light = weights.sum(axis=(1, 2)).astype(np.float64), moment.sum(axis=(1, 2)).astype(np.float64)
+    explained = np.empty((len(data), len(widths_px)))
+    for i, width in enumerate(widths_px):
+        px, _ = pixel_profile(offset_px[:, 0], float(width), radius)
+        py, _ = pixel_profile(offset_px[:, 1], float(width), radius)
+        px, py = px.astype(np.float32), py.astype(np.float32)
+        ss = _sums(weights, py * py, px * px)
+        s1 = _sums(weights, py, px)
+        sd = _sums(moment, py, px)
+        # chi^2 falls by this much for a star of this width on a level background.
+        part, excess = ss - s1 * s1 / total, sd - s1 * light / total
+        explained[:, i] = np.square(excess) / np.maximum(part, 1e-30)
+    best = np.argmax(explained, axis=1)
+    inside = (best > 0) & (best < len(widths_px) - 1)
+    best = np.clip(best, 1, len(widths_px) - 2)
+    row = np.arange(len(data))
+    left, middle, right = explained[row, best - 1], explained[row, best], explained[row, best + 1]
+    bend = 2 * middle - left - right
+    shift = np.divide(0.5 * (right - left), bend, out=np.zeros_like(bend), where=bend > 0)
+    log_width = np.log(widths_px)
+    return np.exp(log_width[best] + np.clip(shift, -1, 1) * (log_width[1] - log_width[0])), inside
+
+
+def _sums(stamp: Image, down: Image, across: Image) -> Array:
+    """Sums (n,) of the stamps (n, s, s) times a profile in y and one in x."""
+    by_row = np.matmul(stamp, across[:, :, None])
+    return np.matmul(down[:, None, :], by_row)[:, 0, 0].astype(np.float64)

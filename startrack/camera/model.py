@@ -143,3 +143,13 @@ class Camera:
     def mean_scale_rad_per_px(self, angle_rad: Array) -> Array:
         """Geometric-mean angular size [rad] of one pixel at the angles off the axis [rad]."""
         return np.sqrt(self.pixel_solid_angle_sr(angle_rad))
+
+    def map_sigma_px(self, rays_cam: Array) -> Array:
+        """Error per axis [px] (...) of the map at the rays (..., 3), from the covariance; 0 where there is none.
+
+        The part that a rotation of the camera would undo is left out: the attitude, found with this map, takes it up.
+        Beyond the calibrated angle it only says what the polynomial's own uncertainty would be.
+        """
+        from startrack.camera.uncertainty import map_covariance_px2
+
+        return np.sqrt(np.trace(map_covariance_px2(self, rays_cam), axis1=-2, axis2=-1) / 2.0)

@@ -1,0 +1,7 @@
+"""Camera calibration from the stars themselves: lens with covariance, sensor, and what speaks for or against them."""
+
+from startrack.calibrate.fit import LensFit, fit_lens
+from startrack.calibrate.observations import Observations, observations
+from startrack.calibrate.start import first_state
+
+__all__ = ["LensFit", "Observations", "first_state", "fit_lens", "observations"]

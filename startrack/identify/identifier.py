@@ -11,7 +11,7 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.identify.chance import ChanceModel
 from startrack.identify.index import PatternIndex, build_index
-from startrack.identify.match import Matches, match
+from startrack.identify.match import Matches, brightest, match, unexplained_by
 from startrack.identify.pairs import PairIndex, build_pairs
 from startrack.identify.search import Search
 from startrack.orient import AttitudeFit, solve_attitude
@@ -23,7 +23,6 @@ SMALLEST_RADIUS_PX = 0.5
 REFINING_STARS = 300
 ON_PLACE = 0.7  # of the stars within the widest gate are within the narrowest one, if the camera file is right
 MOST_REFINED = 40
-SIGNIFICANT_SNR = 10.0
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,7 @@ class Identifier:
             star=star,
             R_cam_icrs=fit.attitude.R_cam_icrs,
             false_alarm_probability=float(np.exp(max(log_chance, -690.0))),
-            unexplained=_unexplained(detections, camera, stars, fit.attitude.R_cam_icrs, matches.zero_mag),
+            unexplained=unexplained_by(detections, camera, stars, fit.attitude.R_cam_icrs, matches.zero_mag, GATES_PX[-1]),
         )
 
 
@@ -133,7 +132,7 @@ def _refuse_rough_camera(detections: Detections, camera: Camera, stars: Stars, R
 
     Such a camera file fits a patch of the sky, and turns the attitude to suit it: 1 % of focal length is 0.8 degrees.
     """
-    distance = match(_brightest(detections, REFINING_STARS), camera, stars, R, GATES_PX[0], 0.0).coincident_px
+    distance = match(brightest(detections, REFINING_STARS), camera, stars, R, GATES_PX[0], 0.0).coincident_px
     on_place, near = np.count_nonzero(distance < GATES_PX[-1]), len(distance)
     if on_place < ON_PLACE * near - 3.0 * np.sqrt(ON_PLACE * (1 - ON_PLACE) * near):
         raise _RoughCamera(
@@ -171,8 +170,8 @@ def _field_sr(camera: Camera) -> float:
 def _refined(detections: Detections, camera: Camera, stars: Stars, R: Array) -> tuple[AttitudeFit, Matches]:
     """Attitude and matches, gate by gate; the bright ones lead the way."""
     blend_px = 3.0 * detections.psf_sigma_px
-    brightest = _brightest(detections, REFINING_STARS)
-    for some, gate_px in (*((brightest, gate) for gate in GATES_PX), (detections, GATES_PX[-1])):
+    leaders = brightest(detections, REFINING_STARS)
+    for some, gate_px in (*((leaders, gate) for gate in GATES_PX), (detections, GATES_PX[-1])):
         matches = match(some, camera, stars, R, gate_px, blend_px)
         if len(matches.star) < FEWEST_MATCHES:
             raise NotIdentified(f"only {len(matches.star)} stars match", matched=len(matches.star))
@@ -180,24 +179,3 @@ def _refined(detections: Detections, camera: Camera, stars: Stars, R: Array) -> 
         fit = solve_attitude(camera, some.xy_px[d], some.covariance_px2[d], stars.rays_icrs[matches.star], R)
         R = fit.attitude.R_cam_icrs
     return fit, matches
-
-
-def _brightest(detections: Detections, most: int) -> Detections:
-    """The first `most` detections."""
-    names = ("xy_px", "covariance_px2", "flux_e", "flux_sigma_e", "snr", "saturated")
-    return replace(detections, **{name: getattr(detections, name)[:most] for name in names})
-
-
-def _unexplained(detections: Detections, camera: Camera, stars: Stars, R: Array, zero_mag: float) -> int:
-    """Significant detections with no catalogue star near that could be a part of their light."""
-    from scipy.spatial import cKDTree
-
-    significant = np.flatnonzero(detections.snr > SIGNIFICANT_SNR)
-    if not len(significant):
-        return 0
-    faintest = zero_mag - 2.5 * np.log10(detections.flux_e[significant].min()) + 2.0
-    px, inside = camera.project(stars.rays_icrs[: int(np.searchsorted(stars.v_mag, faintest))] @ R.T)
-    if not inside.any():
-        return len(significant)
-    distance, _ = cKDTree(px[inside]).query(detections.xy_px[significant], distance_upper_bound=GATES_PX[-1])
-    return int(np.count_nonzero(~np.isfinite(distance)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ BRIGHT_STARS = 5000  # enough of the sky's brightest to set the brightness scale
 FIRST_MATCHES = 200
 MAGNITUDE_TOLERANCE = 0.8
 DEPTH_BELOW_THRESHOLD_MAG = 0.7
+SIGNIFICANT_SNR = 10.0
 
 
 @dataclass(frozen=True)
@@ -107,3 +108,26 @@ def _not_blended(xy_px: Array, star: Ints, predicted_px: Array, seen: Ints, v_ma
         ],
         dtype=bool,
     )
+
+
+def brightest(detections: Detections, most: int) -> Detections:
+    """The first `most` detections."""
+    names = ("xy_px", "covariance_px2", "flux_e", "flux_sigma_e", "snr", "saturated")
+    return replace(detections, **{name: getattr(detections, name)[:most] for name in names})
+
+
+def unexplained_by(
+    detections: Detections, camera: Camera, stars: Stars, R_cam_icrs: Array, zero_mag: float, gate_px: float
+) -> int:
+    """Significant detections with no catalogue star near that could be a part of their light."""
+    from scipy.spatial import cKDTree
+
+    significant = np.flatnonzero(detections.snr > SIGNIFICANT_SNR)
+    if not len(significant):
+        return 0
+    faintest = zero_mag - 2.5 * np.log10(detections.flux_e[significant].min()) + 2.0
+    px, inside = camera.project(stars.rays_icrs[: int(np.searchsorted(stars.v_mag, faintest))] @ R_cam_icrs.T)
+    if not inside.any():
+        return len(significant)
+    distance, _ = cKDTree(px[inside]).query(detections.xy_px[significant], distance_upper_bound=gate_px)
+    return int(np.count_nonzero(~np.isfinite(distance)))

@@ -56,7 +56,7 @@ class Search:
         icrs = index.rays_icrs[index.triangles.vertices[right[order]]]
         bright = self.stars.rays_icrs[index.star[: max(VERIFICATION_STARS, len(index.star) // 2)]]
         # A triangle's attitude is as good as its shorter sides.
-        agreed = _agreement(_triad(cam, icrs), 12.0 * tolerance / index.reach_rad)
+        agreed = _agreement(triad(cam, icrs), 12.0 * tolerance / index.reach_rad)
         yield from self._plausible(cam, icrs, agreed, bright, 4 * depth, tolerance)
 
     def by_pairs(self, index: PairIndex, tolerance_px: float, detections: int) -> Iterator[Array]:
@@ -64,7 +64,7 @@ class Search:
         tolerance = tolerance_px * self.scale_rad_per_px
         image, catalogue = index.candidates(self.rays_cam[:detections], tolerance)
         cam, icrs = self.rays_cam[image], index.rays_icrs[catalogue]
-        agreed = _agreement(_triad(cam, icrs), 2.0 * tolerance / index.narrowest_rad)
+        agreed = _agreement(triad(cam, icrs), 2.0 * tolerance / index.narrowest_rad)
         self.tried += int(np.count_nonzero(agreed < FEWEST_AGREEING_PAIRS))
         some = agreed >= FEWEST_AGREEING_PAIRS
         yield from self._plausible(cam[some], icrs[some], agreed[some], index.rays_icrs, 4 * detections, tolerance)
@@ -101,7 +101,7 @@ class Search:
         return np.isfinite(distance).sum(axis=1), inside.sum(axis=1)
 
 
-def _triad(cam: Array, icrs: Array) -> Array:
+def triad(cam: Array, icrs: Array) -> Array:
     """R_cam_icrs (m, 3, 3) from the first two of the rays (m, k, 3): quick, and good enough to be compared."""
 
     def frame(rays: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,10 @@ class Triangles:
 
     def __len__(self) -> int:
         return len(self.vertices)
+
+    def take(self, which: Any) -> Triangles:
+        """The triangles selected by a mask or index array."""
+        return Triangles(vertices=self.vertices[which], sides_rad=self.sides_rad[which], handed=self.handed[which])
 
 
 def triangles(rays: Array, reach_rad: float, most: int = 2_000_000) -> Triangles:

@@ -1,0 +1,162 @@
+"""Which star is which without a camera file: the lens is found with the attitude."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.camera import Camera
+from startrack.identify.family import PINHOLE, radius
+from startrack.identify.grow import WIDE, Grown, Stage, grow
+from startrack.identify.hypotheses import Guess, Hypotheses, apart, patterns_for
+from startrack.identify.polish import Polished, polished
+from startrack.types import Array, Detections, Identification, NotIdentified, Stars
+
+WIDE_FIELD_RAD = np.radians(100.0)  # from here up, `fov` is the angle of the image circle
+NARROW_FIELD_RAD = np.radians(40.0)  # up to here all lenses are nearly pinholes
+FEWEST_WIDE = 12
+FEWEST_NARROW = 7
+DEPTHS = (16, 28, 44)  # brightest detections that form triangles, round by round
+LOG_PLAUSIBLE = -14.0  # of a start's chance hits: random skies reach -20 in a whole search
+LOG_FALSE_ALARM = float(np.log(1e-9))
+MOST_GROWN = 48
+SECONDS = 12.0  # a search without an answer ends here
+APART = 0.02  # of the frame: pattern stars are no closer
+CIRCLES = (0.5, 0.62, 0.42, 0.78, 1.0)  # radius of the image circle over the frame's shorter side
+SIZE_STEP = 0.13  # half width of a guess in the logarithm of the focal length
+SHAPE_STEP = 0.02  # error of the triangles' shapes that an unknown lens makes
+WIDE_SHAPES = (-0.35, 0.25, -0.8, 0.7)
+MIDDLE_SHAPES = (PINHOLE, 0.4, -0.4)
+TRY = "is the field of view right, is this the night sky, and in focus? A camera file (startrack calibrate) needs fewer stars"
+
+
+@dataclass(frozen=True)
+class BlindSolution:
+    """The lens and the stars that it was found with."""
+
+    camera: Camera  # name "unknown"; calibrated as far out as its stars reach
+    identification: Identification
+
+
+def identify_blind(
+    detections: Detections, size_px: tuple[int, int], fov_rad: float, stars: Stars, *, tolerance: float = 0.1
+) -> BlindSolution:
+    """Lens, attitude and matches of a frame (W, H) whose field of view is known to about the relative tolerance.
+
+    `fov_rad`: below 100 degrees the angle across the frame's width, from there up that of the whole image circle,
+    whether the frame clips it or not. `stars` are sorted, brightest first. An answer is accepted where chance would
+    give as many coincidences with probability below 1e-9, all trials included. Raises NotIdentified.
+    """
+    search = _Search(detections, size_px, fov_rad, stars, tolerance)
+    for grown in search.grown():
+        answer = polished(grown, detections, stars, search.hypotheses.tried, search.widest_rad)
+        if answer is not None and answer.log_chance < LOG_FALSE_ALARM and answer.matched >= search.fewest:
+            return _solution(answer)
+    raise NotIdentified(
+        f"no lens of {np.degrees(fov_rad):.3g} degrees ({100 * tolerance:.0f} % more or less) explains the "
+        f"{len(detections)} point sources better than chance ({search.tried} patterns tried): {TRY}",
+        detected=len(detections),
+        tried=search.tried,
+    )
+
+
+def _solution(answer: Polished) -> BlindSolution:
+    return BlindSolution(
+        camera=answer.camera,
+        identification=Identification(
+            detection=answer.detection,
+            star=answer.star,
+            R_cam_icrs=answer.R_cam_icrs,
+            false_alarm_probability=float(np.exp(max(answer.log_chance, -690.0))),
+            unexplained=answer.unexplained,
+        ),
+    )
+
+
+class _Search:
+    """What is tried, in order of likelihood."""
+
+    def __init__(
+        self, detections: Detections, size_px: tuple[int, int], fov_rad: float, stars: Stars, tolerance: float
+    ) -> None:
+        self.size_px, self.fov_rad, self.stars, self.tolerance = size_px, fov_rad, stars, tolerance
+        self.wide = fov_rad >= WIDE_FIELD_RAD
+        self.fewest = FEWEST_WIDE if self.wide else FEWEST_NARROW
+        self.xy_px = detections.xy_px
+        patterns = patterns_for(stars, self._field_sr(), SHAPE_STEP if fov_rad > NARROW_FIELD_RAD else 0.006, SIZE_STEP)
+        chosen = apart(self.xy_px, APART * min(size_px), 100)
+        if len(chosen) < self.fewest:
+            raise NotIdentified(
+                f"{len(chosen)} point sources are too few to identify without a camera file: expose longer, or {TRY}",
+                detected=len(detections),
+            )
+        self.hypotheses = Hypotheses(self.xy_px[chosen], size_px, patterns)
+
+    @property
+    def tried(self) -> int:
+        """Patterns tried so far."""
+        return self.hypotheses.tried
+
+    @property
+    def widest_rad(self) -> float:
+        """Half the field, generously."""
+        return 0.5 * self.fov_rad * (1 + self.tolerance)
+
+    def grown(self) -> Iterator[Grown]:
+        """Hypotheses that survive growing, each at once."""
+        deadline = clock.perf_counter() + SECONDS
+        done = 0
+        stages = self._stages()
+        for depth in DEPTHS:
+            for guess in self._guesses():
+                taken: list[Array] = []
+                for start in self.hypotheses.starts(guess, (done, depth), LOG_PLAUSIBLE):
+                    if any(np.trace(R.T @ start.R_cam_icrs) > 1 + 2 * np.cos(0.05) for R in taken):
+                        continue
+                    taken.append(start.R_cam_icrs)
+                    found = grow(start, self.xy_px, self.stars.rays_icrs, stages)
+                    if found is not None:
+                        yield found
+                if clock.perf_counter() > deadline:
+                    return
+            done = depth
+            if depth >= len(self.hypotheses.xy_px):
+                return
+
+    def _guesses(self) -> list[Guess]:
+        """Lenses to begin with: shapes by focal lengths, the likelier first."""
+        width, height = self.size_px
+        centre = ((width - 1) / 2, (height - 1) / 2)
+        if not self.wide:
+            shapes = (PINHOLE,) if self.fov_rad <= NARROW_FIELD_RAD else MIDDLE_SHAPES
+            return [Guess(width / 2 / float(radius(self.fov_rad / 2, s)), s, centre) for s in shapes]
+        shorter, diagonal = min(self.size_px), float(np.hypot(*self.size_px))
+        circles = [c * shorter for c in CIRCLES if c * shorter < 0.56 * diagonal]
+        return [
+            Guess(circle / float(radius(self.fov_rad / 2, shape)), shape, centre)
+            for circle in circles
+            for shape in WIDE_SHAPES
+            if abs(shape) * self.fov_rad / 2 < np.radians(80.0)
+        ]
+
+    def _field_sr(self) -> float:
+        """Solid angle of the frame, or of the image circle."""
+        if self.wide:
+            return float(2 * np.pi * (1 - np.cos(min(self.fov_rad / 2, np.pi / 2))))
+        half = np.tan(self.fov_rad / 2)
+        other = half * self.size_px[1] / self.size_px[0]
+        return float(4 * np.arcsin(half * other / np.sqrt((1 + half**2) * (1 + other**2))))
+
+    def _stages(self) -> tuple[Stage, ...]:
+        """The stages of growing, smaller for smaller fields."""
+        if self.wide:
+            return WIDE
+        part = float(np.sqrt(self._field_sr() / (2 * np.pi)))
+        free = ("scale",) if self.fov_rad <= NARROW_FIELD_RAD else ("scale", "shape", "centre")
+        return tuple(
+            Stage(min(s.reach_rad * part if s.reach_rad < np.pi else np.pi, np.pi), s.gate_rad * part, s.detections, free)
+            for s in WIDE
+        )

@@ -1,0 +1,185 @@
+"""Hypotheses of a camera of which little is known: similar triangles give scale and attitude, bright stars the odds."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from startrack.camera import Camera
+from startrack.identify.family import Family, angle
+from startrack.identify.grow import Start
+from startrack.identify.index import bright_stars_apart
+from startrack.identify.search import triad
+from startrack.identify.similar import SimilarTriangles, similar_triangles
+from startrack.identify.skymap import SkyMap, sky_map
+from startrack.identify.triangles import triangles
+from startrack.types import Array, Bools, Ints, Stars
+
+HEMISPHERE_SR = 2 * np.pi
+STARS_OF_HEMISPHERE = 200  # pattern stars of the whole sky for a lens that sees half of it
+MOST_PATTERN_STARS = 12000
+REACH_OF_HEMISPHERE_RAD = np.radians(45.0)
+NEAR_OF_HEMISPHERE_RAD = np.radians(1.5)
+NARROWEST_NEAR_RAD = np.radians(0.15)
+LOCAL_REACHES = 1.2  # of the patterns' reach: there an imperfect lens still fits
+MOST_CANDIDATES = 40_000
+MOST_STARTS = 32
+VERIFIED_FIRST = 24  # detections that every candidate is held against
+VERIFIED_FULLY = 80  # and the best of them
+MOST_VERIFIED_FULLY = 1500
+KEPT_INDEXES = 6
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A lens of the family to start from: the focal length is uncertain by the index's tolerance of size."""
+
+    focal_px: float
+    shape: float
+    centre_px: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Patterns:
+    """The catalogue's side: triangles of the brightest stars, and where these are."""
+
+    star: Ints  # (m,) indices in Stars
+    rays_icrs: Array  # (m, 3)
+    reach_rad: float
+    triangles: SimilarTriangles
+    map: SkyMap
+
+    @cached_property
+    def log_tail(self) -> Array:
+        """log P(at least k of n random directions near a bright star), [n, k]."""
+        from scipy.special import betainc
+
+        n, k = np.meshgrid(np.arange(101), np.arange(101), indexing="ij")
+        tail = betainc(np.maximum(k, 1), np.maximum(n - k, 0) + 1, self.map.covered)
+        return np.where(k > 0, np.log(np.maximum(tail, 1e-300)), 0.0)
+
+
+def patterns_for(stars: Stars, field_sr: float, shape_tolerance: float, size_tolerance: float) -> Patterns:
+    """Patterns of the stars (sorted, brightest first) for a camera that sees `field_sr`; the last few are kept."""
+    key = (stars.rays_icrs[:64].tobytes(), len(stars), round(4 * np.log(field_sr)), shape_tolerance, size_tolerance)
+    if key not in _KEPT:
+        _KEPT[key] = _patterns(stars, float(np.exp(key[2] / 4)), shape_tolerance, size_tolerance)
+        while len(_KEPT) > KEPT_INDEXES:
+            _KEPT.popitem(last=False)
+    _KEPT.move_to_end(key)
+    return _KEPT[key]
+
+
+_KEPT: OrderedDict[tuple[object, ...], Patterns] = OrderedDict()
+
+
+def _patterns(stars: Stars, field_sr: float, shape_tolerance: float, size_tolerance: float) -> Patterns:
+    part = min(field_sr / HEMISPHERE_SR, 1.0)
+    star = bright_stars_apart(stars, int(min(STARS_OF_HEMISPHERE / part, MOST_PATTERN_STARS)))
+    rays = stars.rays_icrs[star]
+    reach = float(REACH_OF_HEMISPHERE_RAD * np.sqrt(part))
+    found = similar_triangles(triangles(rays, reach * (1 + size_tolerance)), shape_tolerance, size_tolerance)
+    near = max(NEAR_OF_HEMISPHERE_RAD * np.sqrt(part), NARROWEST_NEAR_RAD)
+    return Patterns(star, rays, reach, found, sky_map(rays, near))
+
+
+def rays_of(xy_px: Array, centre_px: tuple[float, float], focal_px: Array | float, shape: float) -> Array:
+    """Rays (..., 3) of pixels (..., 2) through a lens of the family, unmirrored; focal lengths broadcast."""
+    off = xy_px - np.array(centre_px)
+    r = np.hypot(off[..., 0], off[..., 1])
+    a = angle(r / focal_px, shape)
+    scale = np.sin(a) / np.maximum(r, 1e-9)
+    return np.stack([off[..., 0] * scale, off[..., 1] * scale, np.cos(a)], axis=-1)
+
+
+class Hypotheses:
+    """Starts from the brightest detections (n, 2), no two of them close together."""
+
+    def __init__(self, xy_px: Array, size_px: tuple[int, int], patterns: Patterns) -> None:
+        self.xy_px, self.size_px, self.patterns = xy_px[:100], size_px, patterns
+        self.tried = 0
+
+    def starts(self, guess: Guess, fresh: tuple[int, int], log_plausible: float) -> list[Start]:
+        """The best of the hypotheses, most likely first.
+
+        From triangles of the `fresh[1]` brightest detections not all among the first `fresh[0]`; those whose hits
+        chance explains with log probability above `log_plausible` are left out.
+        """
+        patterns, done, depth = self.patterns, *fresh
+        seen = rays_of(self.xy_px, guess.centre_px, guess.focal_px, guess.shape)
+        image = triangles(seen[:depth], patterns.reach_rad)
+        image = image.take(image.vertices.max(axis=1, initial=0) >= done)
+        left, right = patterns.triangles.candidates(image)
+        self.tried += len(left)
+        if not len(left):
+            return []
+        if len(left) > MOST_CANDIDATES:
+            some = np.linspace(0, len(left) - 1, MOST_CANDIDATES).astype(np.int64)
+            left, right = left[some], right[some]
+        catalogue = patterns.triangles.triangles
+        focal = guess.focal_px * np.mean(image.sides_rad[left] / catalogue.sides_rad[right], axis=1)
+        mirrored = image.handed[left] != catalogue.handed[right]
+        cam = self._rays(self.xy_px[image.vertices[left]], guess, focal, mirrored)
+        R = triad(cam, patterns.rays_icrs[catalogue.vertices[right]])
+        middle = cam.sum(axis=1)
+        middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+        log_chance = self._odds(R, guess, focal, mirrored, middle)
+        best = np.argsort(log_chance, kind="stable")[:MOST_STARTS]
+        return [
+            Start(self._camera(guess, focal[i], bool(mirrored[i])), R[i], middle[i], float(log_chance[i]))
+            for i in best[log_chance[best] < log_plausible]
+        ]
+
+    def _rays(self, xy_px: Array, guess: Guess, focal: Array, mirrored: Bools) -> Array:
+        rays = rays_of(xy_px, guess.centre_px, focal[:, None], guess.shape)
+        rays[mirrored, :, 0] *= -1
+        return rays
+
+    def _odds(self, R: Array, guess: Guess, focal: Array, mirrored: Bools, middle: Array) -> Array:
+        """log P by chance of as many detections near bright stars, near the triangle or in the whole field."""
+        patterns = self.patterns
+        few = self.xy_px[:VERIFIED_FIRST]
+        n, k, n_local, k_local = self._hits(few, R, guess, focal, mirrored, middle)
+        table = patterns.log_tail
+        odds = np.minimum(table[n, k], table[n_local, k_local])
+        best = np.argsort(odds, kind="stable")[:MOST_VERIFIED_FULLY]
+        n, k, n_local, k_local = self._hits(
+            self.xy_px[:VERIFIED_FULLY], R[best], guess, focal[best], mirrored[best], middle[best]
+        )
+        full = np.zeros(len(odds))
+        full[best] = np.minimum(table[n, k], table[n_local, k_local])
+        return full
+
+    def _hits(
+        self, xy_px: Array, R: Array, guess: Guess, focal: Array, mirrored: Bools, middle: Array
+    ) -> tuple[Ints, Ints, Ints, Ints]:
+        """Numbers (h,) of detections and of those near bright stars: all, and those around the triangle."""
+        rays = self._rays(np.broadcast_to(xy_px, (len(R), *xy_px.shape)), guess, focal, mirrored)
+        hit = self.patterns.map(rays @ R)
+        local = np.einsum("hni,hi->hn", rays, middle) > np.cos(LOCAL_REACHES * self.patterns.reach_rad)
+        n = np.full(len(R), len(xy_px))
+        return n, hit.sum(axis=1), local.sum(axis=1), (hit & local).sum(axis=1)
+
+    def _camera(self, guess: Guess, focal: float, mirrored: bool) -> Camera:
+        widest = Family(guess.shape).max_invertible_rad
+        return Camera(
+            name="unknown", size_px=self.size_px, focal_px=(float(focal), float(focal)), centre_px=guess.centre_px,
+            max_angle_rad=widest, calibrated_angle_rad=widest, lens=Family(guess.shape), mirrored=mirrored,
+        )  # fmt: skip
+
+
+def apart(xy_px: Array, closer_px: float, most: int) -> Ints:
+    """The first (brightest) of the points (n, 2), none closer to an earlier one: clumps of false stars shrink to one."""
+    from scipy.spatial import cKDTree
+
+    some = xy_px[: 10 * most]
+    pairs = cKDTree(some).query_pairs(closer_px, output_type="ndarray")
+    pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+    alive = np.ones(len(some), dtype=bool)
+    for i, j in pairs:
+        if alive[i]:
+            alive[j] = False
+    return np.flatnonzero(alive)[:most]

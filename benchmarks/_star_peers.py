@@ -1,4 +1,4 @@
-"""The detectors of the benchmark under one signature: image and PSF sigma to centroids (n, 2), 0-based pixel centres."""
+"""The detectors of the benchmark under one signature: image, PSF sigma to centroids (n, 2), 0-based pixel centres."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def tetra3rs_centroids(image: np.ndarray, sigma_px: float) -> np.ndarray:
 
 
 def blurred_components(image: np.ndarray, sigma_px: float) -> np.ndarray:
-    """OpenCV: Gaussian blur of the PSF's width, threshold at 5 sigma of it, components, their brightness-weighted mean."""
+    """OpenCV: blur by the PSF, threshold at 5 sigma of the blurred noise, components' weighted means."""
     level = cv2.medianBlur(cv2.resize(image, None, fx=1 / 16, fy=1 / 16, interpolation=cv2.INTER_AREA), 5)
     residual = image - cv2.resize(level, image.shape[::-1], interpolation=cv2.INTER_LINEAR)
     blurred = cv2.GaussianBlur(residual, (0, 0), sigma_px)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from startrack.detect.fit import PointFits, Stamps, fit_points
-from startrack.detect.frame import Frame, Image, radius_for
+from startrack.detect.frame import Frame, Pixels, radius_for
 from startrack.detect.peaks import Peaks
 from startrack.psf import pixel_profile
 from startrack.types import Array, Ints
 
 CROWDED_ROUNDS = 3  # of subtracting neighbours and fitting again
 NEIGHBOUR_SIGMA = 0.1  # neighbours' light above this part of a pixel's noise is taken away
-NEIGHBOUR_ERROR = 0.1  # of it is not known: neighbours' fits, and the PSF's wings
+NEIGHBOUR_ERROR = np.float32(0.1)  # of it is not known: neighbours' fits, and the PSF's wings
 BATCH_PIXELS = 2_000_000  # of neighbours' stamps at a time
 
 
@@ -20,18 +22,20 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float) -> PointFits:
     """Fits (n) of all candidates."""
     radius = radius_for(sigma)
     centres = peaks.centres
-    everything = Stamps(
-        frame.data(centres, radius), frame.variance(centres, radius), frame.usable(centres, radius), centres, peaks.surround
-    )  # fmt: skip
+    data, variance, usable = frame.data(centres, radius), frame.variance(centres, radius), frame.usable(centres, radius)
+    everything = Stamps(data, variance, usable, centres, peaks.surround)
     fits = fit_points(everything, peaks.start_xy_px, sigma, frame.light_noise, peaks.own_part)
     star, other = _pairs(centres, 1.5 * radius + 3.0 * sigma)
+    last = np.zeros_like(data)  # neighbours' light with which each was fitted
     for _ in range(CROWDED_ROUNDS):
         crowded, light = _neighbours_light(everything, fits, star, other, sigma)
+        changed = (np.square(light - last[crowded]) > NEIGHBOUR_SIGMA**2 * variance[crowded]).any(axis=(1, 2))
+        crowded, light = crowded[changed], light[changed]
         if not len(crowded):
             break
-        usable = None if everything.usable is None else everything.usable[crowded]
-        variance = everything.variance[crowded] + np.square(np.float32(NEIGHBOUR_ERROR) * light)
-        alone = Stamps(everything.data[crowded] - light, variance, usable, centres[crowded], peaks.surround[crowded])
+        last[crowded] = light
+        part = everything.part(crowded)
+        alone = replace(part, data=part.data - light, variance=part.variance + np.square(NEIGHBOUR_ERROR * light))
         again = fit_points(alone, fits.xy_px[crowded], sigma, frame.light_noise, peaks.own_part)
         fits = fits.replaced(crowded, again)
     return fits
@@ -47,7 +51,7 @@ def _pairs(centres: Ints, reach_px: float) -> tuple[Ints, Ints]:
     return both[:, 0], both[:, 1]
 
 
-def _neighbours_light(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> tuple[Ints, Image]:
+def _neighbours_light(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> tuple[Ints, Pixels]:
     """The candidates (k,) into whose stamps others put light that counts, and that light (k, s, s)."""
     side = s.data.shape[1]
     radius = side // 2
@@ -85,10 +89,25 @@ def _may_count(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float
     return np.asarray(fits.flux[other] * top * wing > 0.3 * NEIGHBOUR_SIGMA * noise)
 
 
-def own_light(centres: Ints, fits: PointFits, sigma: float, radius: int) -> Image:
+def own_light(centres: Ints, fits: PointFits, sigma: float, radius: int) -> Pixels:
     """Light (n, s, s) of each source in its own stamp."""
     offset = fits.xy_px - centres
     px, _ = pixel_profile(offset[:, 0], sigma, radius)
     py, _ = pixel_profile(offset[:, 1], sigma, radius)
     py *= np.maximum(fits.flux, 0.0)[:, None]
     return np.asarray(py.astype(np.float32)[:, :, None] * px.astype(np.float32)[:, None, :])
+
+
+def painted(fits: PointFits, sigma: float, shape: tuple[int, int]) -> Pixels:
+    """Light (H, W) of the fitted sources, to 5 sigma."""
+    radius = int(np.ceil(5.0 * sigma))
+    side = 2 * radius + 1
+    image = np.zeros((shape[0] + 2 * side, shape[1] + 2 * side), dtype=np.float32)
+    centres = np.clip(np.rint(fits.xy_px).astype(np.int64), -radius, np.array([shape[1], shape[0]]) + radius)
+    size = max(1, BATCH_PIXELS // (side * side))
+    for at in range(0, len(centres), size):
+        here = np.arange(at, min(at + size, len(centres)))
+        corners = centres[here] + side - radius
+        for (column, row), light in zip(corners, own_light(centres[here], fits.take(here), sigma, radius), strict=True):
+            image[row : row + side, column : column + side] += light
+    return image[side:-side, side:-side]

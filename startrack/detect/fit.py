@@ -7,12 +7,12 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.detect.frame import Image, LightNoise
+from startrack.detect.frame import LightNoise, Pixels
 from startrack.detect.impostors import single_pixel_chi2
 from startrack.psf import pixel_profile
 from startrack.types import Array, Bools, Ints
 
-ROUNDS = 4  # of flux and level, then of all four
+ROUNDS = 3  # of flux and level, then of all four
 BATCH_PIXELS = 65536  # of stamps worked on at a time: what a processor's cache holds
 # Products of the profile P and its derivative D by which x and y enter the normal matrix.
 PP, PD, DD, P, D, ONE = range(6)
@@ -49,13 +49,13 @@ class PointFits:
 class Stamps:
     """Cut-outs (n, s, s) around the pixels `centres` (n, 2), and the level (n,) of their wider surroundings."""
 
-    data: Image
-    variance: Image
+    data: Pixels
+    variance: Pixels
     usable: Bools | None
     centres: Ints
     surround: Array
 
-    def part(self, which: slice) -> Stamps:
+    def part(self, which: slice | Ints) -> Stamps:
         """Some of them."""
         usable = None if self.usable is None else self.usable[which]
         return Stamps(self.data[which], self.variance[which], usable, self.centres[which], self.surround[which])
@@ -100,16 +100,27 @@ def _fit(s: Stamps, start_xy_px: Array, sigma_px: float, light_noise: LightNoise
             delta = _solved_pairs(normal[:, 2:, 2:], right[:, 2:])
             flux, level = flux + delta[:, 0], level + delta[:, 1]
             continue
-        delta = np.linalg.solve(normal, right[..., None])[..., 0]
+        delta = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], dtype=np.float64)
         offset = np.clip(offset + np.clip(delta[:, :2], -0.5, 0.5), -radius, radius)
         flux, level = flux + delta[:, 2], level + delta[:, 3]
-    chi2 = np.einsum("nij,nij,nij->n", weights, miss, miss, dtype=np.float64)
-    return _judged(s, start_xy_px, offset, flux, level, np.linalg.inv(normal), chi2, shape, light_noise, own_part)
+    chi2: Array = np.einsum("nij,nij,nij->n", weights, miss, miss, dtype=np.float64)
+    return _judged(
+        s,
+        start_xy_px,
+        offset,
+        flux,
+        level,
+        np.asarray(np.linalg.inv(normal), dtype=np.float64),
+        chi2,
+        shape,
+        light_noise,
+        own_part,
+    )
 
 
 def _judged(
     s: Stamps, start: Array, offset: Array, flux: Array, level: Array, covariance: Array, chi2: Array,
-    shape: Image, light_noise: LightNoise, own_part: float,
+    shape: Pixels, light_noise: LightNoise, own_part: float,
 ) -> PointFits:  # fmt: skip
     plain = _masked(1.0 / s.variance, s.usable)
     filtered = plain * shape
@@ -136,7 +147,7 @@ def _judged(
 
 
 def _normal_equations(
-    weights: Image, miss: Image, flux: Array, x: tuple[Image, Image], y: tuple[Image, Image]
+    weights: Pixels, miss: Pixels, flux: Array, x: tuple[Pixels, Pixels], y: tuple[Pixels, Pixels]
 ) -> tuple[Array, Array]:
     """Normal matrix (n, 4, 4) and right side (n, 4) for x, y, flux, level: sums over x, then over y.
 
@@ -161,7 +172,7 @@ def _normal_equations(
     return normal, right
 
 
-def _products(profile: Image, slope: Image) -> Image:
+def _products(profile: Pixels, slope: Pixels) -> Pixels:
     """(n, 6, s): the products PP, PD, DD, P, D, ONE of a profile and its slope."""
     return np.stack([profile * profile, profile * slope, slope * slope, profile, slope, np.ones_like(slope)], axis=1)
 
@@ -175,13 +186,13 @@ def _solved_pairs(normal: Array, right: Array) -> Array:
     )
 
 
-def _weights(s: Stamps, flux: Array, shape: Image, light_noise: LightNoise) -> Image:
+def _weights(s: Stamps, flux: Array, shape: Pixels, light_noise: LightNoise) -> Pixels:
     light = np.maximum(flux, 0.0)[:, None, None].astype(np.float32) * shape
     variance = s.variance + light * (np.float32(light_noise.per_unit) + np.float32(light_noise.model_error**2) * light)
     return _masked(1.0 / variance, s.usable)
 
 
-def _masked(weights: Image, usable: Bools | None) -> Image:
+def _masked(weights: Pixels, usable: Bools | None) -> Pixels:
     return weights if usable is None else weights * usable
 
 

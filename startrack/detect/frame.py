@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +14,9 @@ from startrack.psf import stamp_radius
 from startrack.types import Bools, Exposure, Ints
 
 Image = NDArray[np.float32]
+Pixels = NDArray[np.floating[Any]]  # stamps, in either precision
 SATURATED_FRACTION = 0.98
+LEFT_OVER = 0.1  # fraction of a known star's light that may be left when it is taken away
 MODEL_ERROR = 0.03  # fraction of a star's own light by which real PSFs differ from the Gaussian
 
 
@@ -28,14 +32,30 @@ class LightNoise:
 class Frame:
     """One exposure prepared for detection."""
 
-    residual: Image  # background-subtracted
+    image: Image
+    background: Image
     noise: Image  # standard deviation of one pixel
     dead: NDArray[np.bool_] | None  # saturated: no weight in fits; None where no pixel is
     light_noise: LightNoise
+    found: Image | None = None  # light of the stars known so far, where their wings cover much of the frame
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W)."""
+        return self.image.shape[0], self.image.shape[1]
+
+    def standardised(self, rows: slice) -> Image:
+        """Some rows without their background and the stars known so far, in units of the noise of both."""
+        residual = self.image[rows] - self.background[rows]
+        if self.found is None:
+            return np.asarray(cv2.divide(residual, self.noise[rows], dst=residual))
+        light, found = self.light_noise, self.found[rows]
+        variance = np.square(self.noise[rows]) + found * (light.per_unit + LEFT_OVER**2 * found)
+        return np.asarray((residual - found) / np.sqrt(variance))
 
     def data(self, centres: Ints, radius: int) -> Image:
-        """Stamps (n, s, s) of the residual."""
-        return stamps(self.residual, centres, radius)
+        """Stamps (n, s, s) without their background."""
+        return stamps(self.image, centres, radius) - stamps(self.background, centres, radius)
 
     def variance(self, centres: Ints, radius: int) -> Image:
         """Stamps (n, s, s) of the pixels' variance, the stars' own light not included."""
@@ -54,10 +74,12 @@ def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray
         return pixels, pixels >= SATURATED_FRACTION * ceiling
     sensor = camera.sensor
     saturated = pixels >= SATURATED_FRACTION * min(ceiling, sensor.saturation_adu)
-    return (pixels - np.float32(sensor.bias_adu)) * np.float32(sensor.gain_e_per_adu), saturated
+    image = pixels * np.float32(sensor.gain_e_per_adu)
+    image -= np.float32(sensor.bias_adu * sensor.gain_e_per_adu)
+    return image, saturated
 
 
-def stamps(image: NDArray[np.generic], centres: Ints, radius: int) -> NDArray[np.generic]:  # type: ignore[type-var]
+def stamps(image: NDArray[Any], centres: Ints, radius: int) -> NDArray[Any]:
     """Cut-outs (n, 2r+1, 2r+1) of the image around the integer pixels (n, 2) (x, y), which must be `radius` inside."""
     side = 2 * radius + 1
     windows = np.lib.stride_tricks.sliding_window_view(image, (side, side))

@@ -7,12 +7,13 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.detect.frame import Pixels
 from startrack.types import Array, Ints
 
 DIRECTIONS = 8
 
 
-def single_pixel_chi2(data: Array, weights: Array) -> Array:
+def single_pixel_chi2(data: Pixels, weights: Pixels) -> Array:
     """chi^2 (n,) of stamps (n, s, s) as a constant and one bright pixel: a hot pixel, whatever its brightness."""
     n = len(data)
     flat, w = data.reshape(n, -1), weights.reshape(n, -1).copy()
@@ -26,18 +27,21 @@ def single_pixel_chi2(data: Array, weights: Array) -> Array:
     return (w * np.square(flat - level[:, None])).sum(axis=1)
 
 
-def edge_chi2(data: Array, weights: Array) -> Array:
+def edge_chi2(data: Pixels, weights: Pixels) -> Array:
     """chi^2 (n,) of stamps (n, s, s) as straight stripes of any brightness, in the best of eight directions.
+
+    Larger by the number of stripes than the least squares' own, so that many stripes are no better than few.
 
     A skyline, the edge of the image circle, a bad column, a satellite's trail: what varies in one direction only.
     """
     n, side = len(data), data.shape[1]
     stripes, starts = _stripes(side)
+    counts = np.diff(starts, append=stripes.shape[1]).astype(np.float32)  # of stripes: noise alone explains as much
     w = weights.reshape(n, -1).astype(np.float32)
     flat = data.reshape(n, -1).astype(np.float32)
     moment = w * flat
     total, light = w @ stripes, moment @ stripes
-    explained = np.add.reduceat(light * light / np.maximum(total, 1e-30), starts, axis=1)
+    explained = np.add.reduceat(light * light / np.maximum(total, 1e-30), starts, axis=1) - counts
     return np.asarray(np.sum(moment * flat, axis=1) - explained.max(axis=1), dtype=np.float64)
 
 

@@ -11,10 +11,11 @@ from startrack.detect.impostors import edge_chi2
 from startrack.detect.widths import BRIGHT_SNR, FEWEST_BRIGHT
 from startrack.types import Array, Bools, Ints
 
-NARROW_PX = 1.25
+NOMINAL_PX = 1.25
+SHARPEST_PX = 0.75
 OWN_LEVEL_PART = 0.8  # of the threshold that a source must reach by its own stamp alone, everywhere
 UNEVEN_SIGMA = 2.5  # difference of the stamp's level and that of its surroundings where these are not to be trusted
-EDGE_MARGIN = 20.0  # chi^2 by which an edge must explain a stamp better: noise alone gives faint stars less
+EDGE_MARGIN = 8.0  # chi^2 by which an edge must explain a stamp better: noise alone gives faint stars less
 BAD_FIT_CHI2_PER_DOF = 4.0
 ROUGH_PSF_MISFIT = 0.1  # from here up the frame's own stars, not the Gaussian, say what a star looks like
 ROUGH_PSF_SPREAD = 2.0  # times the typical misfit that a star of such a frame may have
@@ -27,20 +28,15 @@ def stars_among(frame: Frame, centres: Ints, fits: PointFits, sigma: float, thre
     Where the bright sources of the frame all differ from the Gaussian (trails, coma, a real lens), no bright star would
     pass by its chi^2; there a source passes whose misfit is like theirs.
     """
-    threshold = _threshold(threshold_snr, sigma)
-    by_itself = fits.flux / np.sqrt(fits.covariance[:, 2, 2])
-    # On a slope or at the skyline the surroundings do not tell the level; there the stamp must tell by itself.
-    even = np.abs(fits.level - fits.surround) < UNEVEN_SIGMA * np.sqrt(fits.covariance[:, 3, 3])
-    stands_out = (by_itself >= threshold) | (
-        even & (fits.significance >= threshold) & (by_itself >= OWN_LEVEL_PART * threshold)
-    )
+    stands_out = height_of(fits) >= threshold_for(threshold_snr, sigma)
     placed = np.sqrt(fits.covariance[:, 0, 0] + fits.covariance[:, 1, 1]) < LARGEST_SIGMA_PX
     left = np.flatnonzero(stands_out & placed & (fits.chi2 < fits.chi2_pixel))
     if not len(left):
         return left
     misfit, edge = _likeness(frame, centres[left], fits.take(left), sigma)
     unlike_an_edge = fits.chi2[left] < edge + EDGE_MARGIN
-    typical = _typical(misfit[unlike_an_edge & (by_itself[left] > BRIGHT_SNR)])
+    bright = fits.flux[left] > BRIGHT_SNR * np.sqrt(fits.covariance[left, 2, 2])
+    typical = _typical(misfit[unlike_an_edge & bright])
     good_fit = fits.chi2[left] < BAD_FIT_CHI2_PER_DOF * fits.dof[left]
     return left[unlike_an_edge & (good_fit | (misfit < typical))]
 
@@ -57,13 +53,25 @@ def one_per_place(xy_px: Array, flux: Array, closer_px: float) -> Bools:
     return ~fainter
 
 
-def _threshold(threshold_snr: float, sigma_px: float) -> float:
-    """Significance that gives a narrow PSF no more false peaks than one of NARROW_PX.
+def height_of(fits: PointFits) -> Array:
+    """By how many sigma each source (n) stands out.
 
-    Noise has about sigma^-4 as many peaks above a given height (measured: 7, 2.5 and 0.25 above 5 in 4 Mpx at sigma
-    0.7, 1.0 and 1.5 px), and their number falls as exp(-height^2 / 2).
+    Above its surroundings, whose level is known better than that of the stamp, where the stamp by itself shows at least
+    OWN_LEVEL_PART of it; by its own stamp alone where the two levels do not agree: on a slope or at the skyline.
     """
-    return float(np.sqrt(threshold_snr**2 + max(8 * np.log(NARROW_PX / sigma_px), 0.0)))
+    by_itself = fits.flux / np.sqrt(fits.covariance[:, 2, 2])
+    even = np.abs(fits.level - fits.surround) < UNEVEN_SIGMA * np.sqrt(fits.covariance[:, 3, 3])
+    return np.where(even, np.minimum(fits.significance, by_itself / OWN_LEVEL_PART), by_itself)
+
+
+def threshold_for(threshold_snr: float, sigma_px: float) -> float:
+    """Height that gives a PSF of any width as many false peaks as one of NOMINAL_PX at `threshold_snr`.
+
+    Measured heights with 0.5 false stars in 4 Mpx of noise: 5.6, 5.45, 5.35, 5.25, 5.15 and 5.1 at sigma 0.6, 1.0, 1.2,
+    1.5, 2 and 3 px. Below SHARPEST_PX the pixels, no longer the PSF, say how many independent places there are.
+    """
+    places = np.log(NOMINAL_PX / max(sigma_px, SHARPEST_PX))
+    return float(np.sqrt(max(threshold_snr**2 + (5.0 if places > 0 else 3.5) * places, 9.0)))
 
 
 def _typical(misfit: Array) -> float:

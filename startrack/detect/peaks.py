@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,9 +12,10 @@ from numpy.typing import NDArray
 from startrack.detect.background import COARSE_PX, coarse_width, local_level
 from startrack.detect.frame import Frame, Image, radius_for
 from startrack.psf import filter_kernel
-from startrack.types import Array, Ints
+from startrack.types import Array, Bools, Ints
 
-FIRST_PASS_SNR = 4.3  # below the final threshold: a star between pixels shows up to 15 % less in the filtered image
+STRIP_ROWS = 192
+OWN_RESIDUE_SIGMAS = 1.5
 AROUND = [(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)]
 
 
@@ -23,76 +25,107 @@ class Peaks:
 
     centres: Ints  # (n, 2) pixels (x, y)
     start_xy_px: Array  # (n, 2) first guess of the place
-    surround: Array  # (n,) level of the surroundings, the source's own light in it
+    surround: Array  # (n,) level of the surroundings, part of the source's own light in it
     own_part: float  # part of a source's matched-filter light that the level of the surroundings takes away
 
 
-def find_peaks(frame: Frame, sigma: float, most: int) -> Peaks:
-    """Local maxima of the matched-filter SNR above FIRST_PASS_SNR, at most `most` of them: the highest."""
+def find_peaks(frame: Frame, sigma: float, lowest: float, most: int, known: Array | None = None) -> Peaks:
+    """Local maxima of the matched-filter SNR above `lowest`, at most `most` of them: the highest.
+
+    `known` (m, 2): places of stars whose light `frame.found` holds; they come first, the peaks are those of the rest.
+    """
     margin = radius_for(sigma)
-    width = 2 * (4 * margin // 2) + 1
-    standardised = cv2.divide(frame.residual, frame.noise)
-    level = local_level(standardised, width)
     kernel = filter_kernel(sigma)
     squared = float(np.sum(kernel.astype(np.float64) ** 2))
-    np.subtract(standardised, level, out=standardised)
-    snr = cv2.sepFilter2D(standardised, -1, kernel, kernel, dst=standardised, borderType=cv2.BORDER_REFLECT)
-    flat = np.flatnonzero(snr > np.float32(FIRST_PASS_SNR * squared))
-    rows, columns = np.divmod(flat, snr.shape[1])
-    rows, columns = _inside(frame, rows, columns, margin)
-    height = snr[rows, columns]
-    highest = np.ones(len(rows), dtype=bool)
-    for down, right in AROUND:
-        highest &= height >= snr[rows + down, columns + right]
-    rows, columns, height = rows[highest], columns[highest], height[highest]
-    if len(rows) > most:
-        chosen = np.sort(np.argpartition(-height, most)[:most])
-        rows, columns, height = rows[chosen], columns[chosen], height[chosen]
-    order = np.argsort(-height, kind="stable")
-    peaks = np.stack([columns[order], rows[order]], axis=1).astype(np.int64)
-    start = peaks + _parabola(snr, peaks)
+    width = COARSE_PX * coarse_width(6 * margin + 1)
+    pad = COARSE_PX * -(-(width // 2 + 2 * COARSE_PX + len(kernel)) // COARSE_PX)
+    strips = [
+        _strip_peaks(frame, slice(top, min(top + STRIP_ROWS, frame.shape[0])), pad, kernel, lowest * squared, width)
+        for top in range(0, frame.shape[0], STRIP_ROWS)
+    ]
+    pixels, height, offset, level = (np.concatenate(part) for part in zip(*strips, strict=True))
+    chosen = np.argsort(-height, kind="stable")[:most]
+    peaks, start, surround = pixels[chosen], (pixels + offset)[chosen], level[chosen]
     blobs = _saturated_blobs(frame.dead, margin)[:most]
-    centres = np.concatenate([blobs, peaks])
+    if known is not None:
+        away = _away_from(known, start, sigma)
+        peaks, start, surround = peaks[away], start[away], surround[away]
+        blobs = np.concatenate([known, blobs])
+    centres = np.concatenate([_pixels_of(blobs, frame.shape, margin), peaks])
     return Peaks(
         centres=centres,
-        start_xy_px=np.concatenate([blobs.astype(np.float64), start]),
-        surround=_at(level, centres) * _at(frame.noise, centres),
-        own_part=min(float(1.0 / squared**2) / (COARSE_PX * coarse_width(width)) ** 2, 0.5),
+        start_xy_px=np.concatenate([blobs, start]),
+        surround=np.concatenate([np.zeros(len(blobs)), surround * _at(frame.noise, peaks)]),
+        own_part=min(float(1.0 / squared**2) / width**2, 0.5),
     )
+
+
+def _strip_peaks(
+    frame: Frame, rows: slice, pad: int, kernel: Image, lowest: float, width: int
+) -> tuple[Ints, Array, Array, Array]:
+    """Peaks of some rows: pixels (n, 2), heights, offsets (n, 2) of the tops [px], levels of the surroundings [sigma].
+
+    Strip by strip everything stays in the processor's cache.
+    """
+    first = max(rows.start - pad, 0)
+    standardised = frame.standardised(slice(first, rows.stop + pad))
+    level = local_level(standardised, width)
+    filtered = cv2.sepFilter2D(standardised - level, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT)
+    own = filtered[rows.start - first : rows.stop - first]
+    row, column = np.divmod(np.flatnonzero(own > np.float32(lowest)), own.shape[1])
+    row += rows.start
+    inside = _inside(frame, row, column, len(kernel) // 2 + 1)
+    row, column = row[inside] - first, column[inside]
+    height = filtered[row, column]
+    highest = np.ones(len(row), dtype=bool)
+    for down, right in AROUND:
+        highest &= height >= filtered[row + down, column + right]
+    row, column = row[highest], column[highest]
+    offset = _parabola(filtered, row, column)
+    pixels = np.stack([column, row + first], axis=1).astype(np.int64)
+    return pixels, height[highest], offset, level[row, column].astype(np.float64)
+
+
+def _away_from(known: Array, start: Array, sigma: float) -> Bools:
+    """The peaks (n,) that are not on a known star: what is left there is the PSF's misfit."""
+    from scipy.spatial import cKDTree
+
+    return np.asarray(cKDTree(known).query(start)[0] > OWN_RESIDUE_SIGMAS * sigma, dtype=bool)
+
+
+def _pixels_of(xy_px: Array, shape: tuple[int, int], margin: int) -> Ints:
+    pixels = np.rint(xy_px).astype(np.int64)
+    return np.clip(pixels, margin, np.array([shape[1], shape[0]]) - 1 - margin)
 
 
 def _at(image: Image, centres: Ints) -> Array:
     return np.asarray(image[centres[:, 1], centres[:, 0]].astype(np.float64))
 
 
-def _inside(frame: Frame, rows: Ints, columns: Ints, margin: int) -> tuple[Ints, Ints]:
-    height, width = frame.residual.shape
+def _inside(frame: Frame, rows: Ints, columns: Ints, margin: int) -> Bools:
+    height, width = frame.shape
     good = (rows >= margin) & (rows < height - margin) & (columns >= margin) & (columns < width - margin)
-    if frame.dead is not None:
-        good &= ~frame.dead[rows, columns]
-    return rows[good], columns[good]
+    return good if frame.dead is None else good & ~frame.dead[rows, columns]
 
 
-def _parabola(filtered: Image, peaks: Ints) -> Array:
+def _parabola(filtered: Any, y: Ints, x: Ints) -> Array:
     """Offsets (n, 2) [px] of the top of parabolas through the peaks and their neighbours in x and in y."""
-    x, y = peaks[:, 0], peaks[:, 1]
-    offset = np.zeros((len(peaks), 2))
+    offset = np.zeros((len(x), 2))
     middle = filtered[y, x]
-    for axis, (low, high) in enumerate(
-        [(filtered[y, x - 1], filtered[y, x + 1]), (filtered[y - 1, x], filtered[y + 1, x])]
-    ):
+    neighbours = ((filtered[y, x - 1], filtered[y, x + 1]), (filtered[y - 1, x], filtered[y + 1, x]))
+    for axis, (low, high) in enumerate(neighbours):
         bend = low - 2 * middle + high
         offset[:, axis] = np.divide(0.5 * (low - high), bend, out=np.zeros_like(bend), where=bend < 0)
     return np.clip(offset, -0.5, 0.5)
 
 
-def _saturated_blobs(dead: NDArray[np.bool_] | None, margin: int) -> Ints:
-    """Middle pixels (n, 2) of the saturated blobs: bright stars whose own peak is a plateau."""
+def _saturated_blobs(dead: NDArray[np.bool_] | None, margin: int) -> Array:
+    """Middles (n, 2) [px] of the saturated blobs: bright stars whose own peak is a plateau."""
     if dead is None:
-        return np.zeros((0, 2), dtype=np.int64)
+        return np.zeros((0, 2))
     count, _, stats, centroids = cv2.connectedComponentsWithStats(dead.astype(np.uint8))
     height, width = dead.shape
-    middle = np.rint(centroids[1:count]).astype(np.int64)
+    middle = centroids[1:count]
     inside = (middle >= margin).all(axis=1) & (middle[:, 0] < width - margin) & (middle[:, 1] < height - margin)
     compact = stats[1:count, cv2.CC_STAT_AREA] <= (2 * margin + 1) ** 2
     return middle[inside & compact]

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.detect.fit import PointFits
-from startrack.detect.frame import Frame, Image, radius_for
+from startrack.detect.frame import Frame, Pixels, radius_for
 from startrack.psf import pixel_profile
-from startrack.types import Array, Ints
+from startrack.types import Array, Bools, Ints
 
 BRIGHT_SNR = 12.0  # sources that say what the frame's PSF is
 FEWEST_BRIGHT = 8
-MOST_BRIGHT = 300
+MOST_BRIGHT = 150
 NEAR = np.geomspace(0.7, 1.45, 9)  # widths tried first, in units of the expected one
 WIDTHS_PX = np.geomspace(0.3, 8.0, 36)
 NARROWER_IS_A_PIXEL_PX = 0.45  # hot pixels fit the narrowest profile
@@ -38,7 +38,7 @@ def measured_width(frame: Frame, centres: Ints, fits: PointFits, sigma: float) -
     return float(np.median(widths)) if len(widths) >= FEWEST_BRIGHT else None
 
 
-def fit_widths(data: Image, weights: Image, offset_px: Array, widths_px: Array) -> tuple[Array, Array]:
+def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array) -> tuple[Array, Bools]:
     """Best-fitting PSF sigma (n,) [px] of each stamp among `widths_px` (m,), geometric, and whether it is not the last.
 
     Refined by a parabola through chi^2; flux and level are free, the place is `offset_px` from the middle pixel.
@@ -68,7 +68,7 @@ def fit_widths(data: Image, weights: Image, offset_px: Array, widths_px: Array) 
     return np.exp(log_width[best] + np.clip(shift, -1, 1) * (log_width[1] - log_width[0])), inside
 
 
-def _sums(stamp: Image, down: Image, across: Image) -> Array:
+def _sums(stamp: Pixels, down: Pixels, across: Pixels) -> Array:
     """Sums (n,) of the stamps (n, s, s) times a profile in y and one in x."""
     by_row = np.matmul(stamp, across[:, :, None])
     return np.matmul(down[:, None, :], by_row)[:, 0, 0].astype(np.float64)

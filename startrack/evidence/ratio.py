@@ -29,5 +29,10 @@ def shines_ratio(
     return np.clip(shines - hidden, -cap, cap)
 
 
+def gaussian_ratio(flux_e: Array, expected_e: Array, sigma_hidden_e: Array, sigma_shining_e: Array) -> Array:
+    """The same without any cap, as if nothing strange ever happened: to compare with, not to rely on."""
+    return _log_normal(flux_e - expected_e, sigma_shining_e) - _log_normal(flux_e, sigma_hidden_e)
+
+
 def _log_normal(x: Array, sigma: Array) -> Array:
     return -0.5 * np.square(x / sigma) - np.log(sigma) - 0.5 * np.log(2 * np.pi)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from startrack.camera import Camera
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure
-from startrack.evidence.ratio import shines_ratio
+from startrack.evidence.ratio import gaussian_ratio, shines_ratio
 from startrack.evidence.scale import FluxScale
 from startrack.frames import azel_from_rays
 from startrack.psf import noise_area_px
@@ -55,6 +55,7 @@ class StarEvidence:
     """Forced photometry at the catalogue's stars, turned into log-likelihood ratios."""
 
     faintest_snr: float = FAINTEST_SNR
+    capped: bool = True  # False: plain Gaussian ratios, to see what the caps are worth
 
     def __call__(
         self,
@@ -101,7 +102,7 @@ class StarEvidence:
             xy_px=xy[measurable], flux_e=expected[measurable], fraction_sigma=fraction[measurable], visible=shining
         )
         light = measure(residual, detections.noise_e, dead, sources, sigma_px)
-        llr, sigma = _ratios(light, expected[measurable], fraction[measurable])
+        llr, sigma = _ratios(light, expected[measurable], fraction[measurable], self.capped)
         azimuth, elevation = azel_from_rays(stars.rays_icrs[star] @ R_enu_icrs.T)
         cause[measurable[~light.usable & (cause[measurable] == "")]] = "bad pixels"
         return StarLight(
@@ -143,12 +144,13 @@ def _guess(
     return shining
 
 
-def _ratios(light: Photometry, expected_e: Array, fraction: Array) -> tuple[Array, Array]:
+def _ratios(light: Photometry, expected_e: Array, fraction: Array, capped: bool = True) -> tuple[Array, Array]:
     """Log-likelihood ratios and the standard deviations of the fluxes if nothing shines."""
     hidden = light.variance_e2 + light.neighbour_variance_e2
     shining = hidden + light.own_shot * expected_e + np.square(fraction * expected_e)
     sigma = np.sqrt(hidden)
-    return shines_ratio(light.flux_e, expected_e, sigma, np.sqrt(shining)), sigma
+    ratio = shines_ratio if capped else gaussian_ratio
+    return ratio(light.flux_e, expected_e, sigma, np.sqrt(shining)), sigma
 
 
 def _unusable(

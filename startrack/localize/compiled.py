@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from startrack.localize.likelihood import Sectors
+from startrack.localize.scout import taken
 from startrack.localize.seen import on_rim_plane
 from startrack.terrain import Cylinder, Terrain
 from startrack.types import Array, Evidence
@@ -14,9 +15,9 @@ from startrack.types import Array, Evidence
 if TYPE_CHECKING:
     from startrack.localize.posterior import ExactPosterior
 
-SCOUT_RAYS, SCOUT_ACROSS, SCOUT_KEPT = 300, 15, 4
+SCOUT_RAYS, SCOUT_ACROSS, SCOUT_KEPT = 200, 15, 3
 FINEST_GUESS_M = 50.0
-FIRST_STEP_M, LAST_STEP_M = 64.0, 1.0
+FIRST_STEP_M, LAST_STEP_M = 64.0, 4.0
 CLIMB_RANGE_M = 600.0
 
 
@@ -29,21 +30,20 @@ def explored(method: ExactPosterior, evidence: Evidence, cylinder: Cylinder) -> 
     """Centres (n, 2), half side, log-likelihoods (n,) and log of the mass dropped. Needs numba."""
     from startrack.localize import disks
 
-    above = evidence.elevation_rad > 0  # at or below the horizontal nothing is ever visible over the rim
-    centres, llr = -on_rim_plane(evidence, cylinder)[above], evidence.llr[above]
+    evidence = taken(evidence, evidence.elevation_rad > 0)  # below the horizontal nothing is ever visible over the rim
+    centres, llr = -on_rim_plane(evidence, cylinder), evidence.llr
     if method.sector_epsilon > 0:
         sectors = Sectors.of(evidence, method.sector_width_rad, method.sector_epsilon)
-        sector, ceiling, log_floor = sectors.sector[above], sectors.ceiling, float(np.log(method.sector_epsilon))
+        sector, ceiling, log_floor = sectors.sector, sectors.ceiling, float(np.log(method.sector_epsilon))
     else:  # without a floor the sectors do not matter
         sector, ceiling, log_floor = np.zeros(len(llr), dtype=np.int64), np.zeros(1), -np.inf
     radius, reach = cylinder.radius_m, cylinder.reach_m
-    telling = np.abs(llr) * np.minimum(np.hypot(centres[:, 0], centres[:, 1]), radius)
-    few = np.argpartition(-telling, min(SCOUT_RAYS, len(llr) - 1))[:SCOUT_RAYS]
+    few = disks.most_telling(centres, llr, radius, SCOUT_RAYS)
     guess = disks.scout(centres[few], llr[few], radius, reach, SCOUT_ACROSS, SCOUT_KEPT, FINEST_GUESS_M)
     _, best = disks.climb(
         guess, FIRST_STEP_M, centres, llr, sector, ceiling, log_floor, radius, LAST_STEP_M, CLIMB_RANGE_M
     )
     return disks.explore(
-        centres, llr, sector, ceiling, log_floor, radius, reach, best, method.prune_nats, method.finest_m,
-        method.boxes_per_sigma, method.most_boxes,
+        centres, llr, sector, ceiling, log_floor, radius, reach, best, method.prune_nats, method.negligible_nats,
+        method.finest_m, method.boxes_per_sigma, method.most_boxes,
     )  # fmt: skip

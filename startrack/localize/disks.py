@@ -12,6 +12,9 @@ from numba import njit
 from startrack.types import Array, Ints
 
 NEGLIGIBLE_NATS = 14.0  # e^-14 beside 1 is left out: a millionth
+DIGITS_NATS = 37.0  # what is smaller than this beside 1 has no digit in a float64
+LEVELS = 255
+DOOM_EVERY = 32  # rays between two looks at whether a box is lost already
 
 
 @njit(cache=True)
@@ -32,7 +35,33 @@ def _log_mixture(below: float, log_keep: float, log_floor: float) -> float:
 @njit(cache=True)
 def _log_add(a: float, b: float) -> float:
     top, low = max(a, b), min(a, b)
-    return top if low == -np.inf else top + np.log1p(np.exp(low - top))
+    return top if low < top - DIGITS_NATS or low == -np.inf else top + np.log1p(np.exp(low - top))
+
+
+@njit(cache=True)
+def most_telling(disks_m: Array, llr: Array, radius_m: float, count: int) -> Ints:
+    """Indices (<= count,) of rays that say much about the place: sure of themselves, and low over the rim."""
+    telling = np.empty(len(llr))
+    top = 1e-30
+    for k in range(len(llr)):
+        d2 = disks_m[k, 0] * disks_m[k, 0] + disks_m[k, 1] * disks_m[k, 1]
+        telling[k] = abs(llr[k]) * min(d2, radius_m * radius_m)
+        top = max(top, telling[k])
+    in_bin = np.zeros(LEVELS + 1, dtype=np.int64)
+    for k in range(len(llr)):
+        in_bin[int(telling[k] / top * LEVELS)] += 1
+    cut, found = LEVELS, in_bin[LEVELS]
+    while found < count and cut > 0:
+        cut -= 1
+        found += in_bin[cut]
+    chosen = np.empty(found, dtype=np.int64)
+    n = 0
+    for k in range(len(llr)):
+        chosen[n] = k
+        n += int(telling[k] / top * LEVELS) >= cut
+        if n == found:
+            break
+    return chosen[:count]
 
 
 @njit(cache=True)
@@ -56,8 +85,7 @@ def scout(
                     total = 0.0
                     for k in range(len(llr)):
                         u, v = x - disks_m[k, 0], y - disks_m[k, 1]
-                        if u * u + v * v < radius_m * radius_m:
-                            total += llr[k]
+                        total += llr[k] * (u * u + v * v < radius_m * radius_m)
                     worst = np.argmin(best_score)
                     if total > best_score[worst]:
                         best_x[worst], best_y[worst], best_score[worst] = x, y, total
@@ -78,8 +106,7 @@ def score_at(
     sums = -ceiling
     for k in range(len(llr)):
         u, v = x - disks_m[k, 0], y - disks_m[k, 1]
-        if u * u + v * v < radius_m * radius_m:
-            sums[sector[k]] += llr[k]
+        sums[sector[k]] += llr[k] * (u * u + v * v < radius_m * radius_m)
     log_keep = np.log1p(-np.exp(log_floor))
     total = 0.0
     for s in range(len(sums)):
@@ -97,15 +124,14 @@ def climb(
     Only the rays whose disk's edge passes within the range can change on the way; the others are summed once.
     """
     settled = -ceiling
-    near = np.empty(len(llr), dtype=np.int64)
+    near = np.empty(len(llr) + 1, dtype=np.int64)
     count = 0
     for k in range(len(llr)):
-        off = np.hypot(start_m[0] - disks_m[k, 0], start_m[1] - disks_m[k, 1]) - radius_m
-        if abs(off) <= range_m:
-            near[count] = k
-            count += 1
-        elif off < 0:
-            settled[sector[k]] += llr[k]
+        u, v = start_m[0] - disks_m[k, 0], start_m[1] - disks_m[k, 1]
+        off = np.sqrt(u * u + v * v) - radius_m
+        near[count] = k
+        count += abs(off) <= range_m
+        settled[sector[k]] += llr[k] * (off < -range_m)
     near = near[:count]
     disks_m, llr, sector = disks_m[near], llr[near], sector[near]
     x, y = start_m[0], start_m[1]
@@ -128,6 +154,27 @@ def climb(
 
 
 @njit(cache=True)
+def _smaller_variance(centres: Array, score: Array, top: float) -> float:
+    """Variance [m2] along the shorter axis of the boxes weighted by exp(score - top)."""
+    total, mean_x, mean_y = 0.0, 0.0, 0.0
+    for b in range(len(centres)):
+        w = np.exp(score[b] - top)
+        total += w
+        mean_x += w * centres[b, 0]
+        mean_y += w * centres[b, 1]
+    mean_x /= total
+    mean_y /= total
+    xx, yy, xy = 0.0, 0.0, 0.0
+    for b in range(len(centres)):
+        w = np.exp(score[b] - top) / total
+        u, v = centres[b, 0] - mean_x, centres[b, 1] - mean_y
+        xx += w * u * u
+        yy += w * v * v
+        xy += w * u * v
+    return 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+
+
+@njit(cache=True)
 def explore(
     disks_m: Array,
     llr: Array,
@@ -138,6 +185,7 @@ def explore(
     reach_m: float,
     best: float,
     prune_nats: float,
+    negligible_nats: float,
     finest_m: float,
     boxes_per_sigma: float,
     most_boxes: int,
@@ -156,10 +204,14 @@ def explore(
     base = np.zeros(1)
     for s in range(sectors):
         base[0] += _log_mixture(sums[0, s], log_keep, log_floor)
-    rays = np.arange(len(llr))
+    rays = np.arange(len(llr)).astype(np.uint32)
     first = np.zeros(2, dtype=np.int64)
     first[1] = len(llr)
+    # Without a floor losses simply add up, and most boxes are seen to be hopeless after a few dozen rays.
+    additive = log_floor == -np.inf
+    upper_of = base + np.maximum(llr, 0.0).sum()
     dropped = -np.inf
+    certain = -np.inf  # log of the mass that the boxes are sure to hold
     least, most, at_centre = np.zeros(sectors), np.zeros(sectors), np.zeros(sectors)
     touched = np.zeros(sectors, dtype=np.int64)
     stamp = np.zeros(sectors, dtype=np.int64)
@@ -168,13 +220,14 @@ def explore(
         half /= 2
         room = 4 * len(centres)
         new_centres, new_sums = np.empty((room, 2)), np.empty((room, sectors))
-        new_base, new_upper, new_score = np.empty(room), np.empty(room), np.empty(room)
+        new_base, new_upper, new_score, new_lower = np.empty(room), np.empty(room), np.empty(room), np.empty(room)
         new_first = np.zeros(room + 1, dtype=np.int64)
-        new_rays = np.empty(max(4096, 2 * len(rays)), dtype=np.int64)
+        new_rays = np.empty(max(4096, 2 * len(rays)), dtype=np.uint32)
         inner, outer = radius_m - half * np.sqrt(2.0), radius_m + half * np.sqrt(2.0)
         inner2 = inner * inner if inner > 0 else -1.0
         outer2 = outer * outer
         cell = np.log(4 * half * half)
+        enough = certain - negligible_nats - cell
         n, used = 0, 0
         for b in range(len(centres)):
             for child in range(4):
@@ -185,35 +238,40 @@ def explore(
                     continue
                 count = first[b + 1] - first[b]
                 if used + count > len(new_rays):
-                    grown = np.empty(2 * (used + count), dtype=np.int64)
+                    grown = np.empty(2 * (used + count), dtype=np.uint32)
                     grown[:used] = new_rays[:used]
                     new_rays = grown
                 new_sums[n] = sums[b]
                 ticket += 1
                 dirty, start = 0, used
+                doomed, found = upper_of[b] - max(best - prune_nats, enough), 0.0
                 for q in range(first[b], first[b + 1]):
+                    if additive and q % DOOM_EVERY == 0 and found + doomed <= 0.0:
+                        break
                     k = rays[q]
-                    u, v = x - disks_m[k, 0], y - disks_m[k, 1]
-                    d2 = u * u + v * v
-                    if d2 > outer2:
-                        continue
                     s = sector[k]
                     if stamp[s] != ticket:
                         stamp[s] = ticket
                         touched[dirty] = s
                         dirty += 1
                         least[s], most[s], at_centre[s] = 0.0, 0.0, 0.0
-                    if d2 < inner2:
-                        new_sums[n, s] += llr[k]
-                        continue
+                    u, v = x - disks_m[k, 0], y - disks_m[k, 1]
+                    d2 = u * u + v * v
+                    # No processor foretells which case holds: multiplying by 0 or 1 takes half the time of branches.
+                    inside = d2 < inner2
+                    open_ = (d2 >= inner2) & (d2 <= outer2)
+                    gain = llr[k] * open_
+                    new_sums[n, s] += llr[k] * inside
+                    most[s] += gain * (gain > 0)
+                    least[s] += gain * (gain < 0)
+                    at_centre[s] += gain * (d2 < r2)
+                    found += min(llr[k], 0.0) * inside - max(llr[k], 0.0) * (d2 > outer2)
                     new_rays[used] = k
-                    used += 1
-                    if llr[k] > 0:
-                        most[s] += llr[k]
-                    else:
-                        least[s] += llr[k]
-                    if d2 < r2:
-                        at_centre[s] += llr[k]
+                    used += open_
+                if additive and found + doomed <= 0.0:
+                    dropped = _log_add(dropped, upper_of[b] + found + cell)
+                    used = start
+                    continue
                 score, lower, upper, settled = base[b], base[b], base[b], base[b]
                 for t in range(dirty):
                     s = touched[t]
@@ -226,53 +284,43 @@ def explore(
                 if x * x + y * y < r2:
                     best = max(best, score)
                 else:
-                    score = -np.inf
-                if upper <= best - prune_nats:
+                    score, lower = -np.inf, -np.inf
+                if upper <= max(best - prune_nats, enough):
                     dropped = _log_add(dropped, upper + cell)
                     used = start
                     continue
                 new_centres[n, 0], new_centres[n, 1] = x, y
-                new_base[n], new_upper[n], new_score[n] = settled, upper, score
+                new_base[n], new_upper[n], new_score[n], new_lower[n] = settled, upper, score, lower
                 new_first[n + 1] = used
                 n += 1
         # Boxes kept before a better place was found may have lost their case since.
+        certain = -np.inf
+        for b in range(n):
+            certain = _log_add(certain, new_lower[b] + cell)
+        enough = certain - negligible_nats - cell
         write, write_ray, begin = 0, 0, 0
         for b in range(n):
             end = new_first[b + 1]
-            if new_upper[b] <= best - prune_nats:
+            if new_upper[b] <= max(best - prune_nats, enough):
                 dropped = _log_add(dropped, new_upper[b] + cell)
             else:
                 for q in range(begin, end):
                     new_rays[write_ray + q - begin] = new_rays[q]
                 write_ray += end - begin
                 new_centres[write], new_sums[write] = new_centres[b], new_sums[b]
-                new_base[write], new_score[write] = new_base[b], new_score[b]
+                new_base[write], new_upper[write], new_score[write] = new_base[b], new_upper[b], new_score[b]
                 write += 1
                 new_first[write] = write_ray  # write <= b + 1, whose own offset is already in `end`
             begin = end
         n = write
         centres, sums, base, score_now = new_centres[:n], new_sums[:n], new_base[:n], new_score[:n]
+        upper_of = new_upper[:n]
         rays, first = new_rays[:write_ray], new_first[: n + 1]
         if n == 0 or half <= finest_m or 4 * n > most_boxes or write_ray == 0:
             return centres.copy(), half, score_now.copy(), dropped
         top = score_now.max()
         if top == -np.inf:
             continue
-        total, mean_x, mean_y = 0.0, 0.0, 0.0
-        for b in range(n):
-            w = np.exp(score_now[b] - top)
-            total += w
-            mean_x += w * centres[b, 0]
-            mean_y += w * centres[b, 1]
-        mean_x /= total
-        mean_y /= total
-        xx, yy, xy = 0.0, 0.0, 0.0
-        for b in range(n):
-            w = np.exp(score_now[b] - top) / total
-            u, v = centres[b, 0] - mean_x, centres[b, 1] - mean_y
-            xx += w * u * u
-            yy += w * v * v
-            xy += w * u * v
-        smaller = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+        smaller = _smaller_variance(centres, score_now, top)
         if smaller > 0 and 2 * half * boxes_per_sigma < np.sqrt(smaller):
             return centres.copy(), half, score_now.copy(), dropped

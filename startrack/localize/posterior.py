@@ -37,8 +37,9 @@ class ExactPosterior:
     sector_width_rad: float = float(np.radians(1.5))
     sector_epsilon: float = 1e-4
     prune_nats: float = 16.0  # boxes whose best place is e^-16 as likely as the best known one are dropped
+    negligible_nats: float = 18.0  # and so are those that hold at most e^-18 of the probability
     finest_m: float = 0.05
-    boxes_per_sigma: float = 2.5  # boxes are quartered until this many fit into the posterior's smaller axis
+    boxes_per_sigma: float = 1.8  # boxes are quartered until this many fit into the posterior's smaller axis
     most_boxes: int = 40_000
     compiled: bool = False  # with numba, for a cylinder with hard edges: the same answer, 10 to 50 times sooner
 
@@ -134,7 +135,8 @@ class _Search:
         """Which boxes (n,) might matter; the others' probability is added to what was given up."""
         sure = boxes.lower[np.asarray(self.terrain.allowed(boxes.centres_m))]
         self.best = max(self.best, float(sure.max(initial=-np.inf)))
-        keep = boxes.upper > self.best - self.method.prune_nats
+        negligible = _log_mass(sure, boxes.half_m) - self.method.negligible_nats - np.log(4 * boxes.half_m**2)
+        keep = boxes.upper > max(self.best - self.method.prune_nats, negligible)
         self.log_dropped = np.logaddexp(self.log_dropped, _log_mass(boxes.upper[~keep], boxes.half_m))
         return keep
 

@@ -54,6 +54,8 @@ def scores(places_m: Array, evidence: Evidence, sectors: Sectors, terrain: Terra
 
 def taken(evidence: Evidence, which: Bools | Ints) -> Evidence:
     """The rays selected by a mask or index."""
+    if which.dtype == np.bool_ and which.all():
+        return evidence
     return Evidence(
         azimuth_rad=evidence.azimuth_rad[which],
         elevation_rad=evidence.elevation_rad[which],

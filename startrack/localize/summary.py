@@ -22,9 +22,8 @@ def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_mass:
     insufficient_geometry where the posterior is as wide as the area itself.
     """
     weight = np.exp(log_weight - np.max(log_weight))
-    weight /= weight.sum()
-    outside = np.hypot(centres_m[:, 0], centres_m[:, 1]) > terrain.search_radius_m
-    if weight[outside].sum() > 0.5:
+    outside = np.einsum("ni,ni->n", centres_m, centres_m) > terrain.search_radius_m**2
+    if outside.any() and weight[outside].sum() > 0.5 * weight.sum():
         raise NotLocated(
             f"the stars place the camera outside the search area of {terrain.search_radius_m:.0f} m: "
             "widen [search] radius_m in the terrain file if that can be true",
@@ -32,14 +31,18 @@ def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_mass:
         )
     keep = ~outside & (weight > 1e-12)
     centres_m, weight = centres_m[keep], weight[keep] / weight[keep].sum()
-    label = _modes(centres_m, weight, width_m)
+    mean, covariance = _moments(centres_m, weight, width_m)
+    label = _modes(centres_m, weight, width_m, covariance)
     modes = _described(centres_m, weight, label)
-    main = label == np.argmax(np.bincount(label, weights=weight))
-    mean, covariance = _moments(centres_m[main], weight[main], width_m)
-    main_999 = _radius(centres_m[main] - mean, weight[main] / weight[main].sum(), 0.999, width_m)
-    distance = np.linalg.norm(centres_m - mean, axis=1)
-    ambiguous = bool(weight[distance > main_999 + width_m].sum() > AMBIGUOUS_MASS and len(modes) > 1)
-    radius95 = _radius(centres_m - mean, weight, 0.95, width_m)
+    if label.any():
+        main = label == np.argmax(np.bincount(label, weights=weight))
+        mean, covariance = _moments(centres_m[main], weight[main], width_m)
+        (main_999,) = _radii(centres_m[main] - mean, weight[main], (0.999,), width_m)
+        beyond = weight[np.linalg.norm(centres_m - mean, axis=1) > main_999 + width_m].sum()
+        ambiguous = bool(beyond > AMBIGUOUS_MASS and len(modes) > 1)
+    else:
+        ambiguous = False
+    radius95, radius999 = _radii(centres_m - mean, weight, (0.95, 0.999), width_m)
     if not ambiguous and radius95 > USELESS_FRACTION * terrain.search_radius_m:
         raise NotLocated("the rays leave most of the search area open: is the skyline in the picture?")
     up = float(terrain.ground_m(mean[None, :])[0]) + terrain.camera_height_m
@@ -47,7 +50,7 @@ def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_mass:
         position_enu_m=np.array([mean[0], mean[1], up]),
         covariance_m2=covariance,
         radius95_m=radius95,
-        radius999_m=_radius(centres_m - mean, weight, 0.999, width_m),
+        radius999_m=radius999,
         modes=modes,
         ambiguous=ambiguous,
         dropped_mass=dropped_mass,
@@ -59,21 +62,22 @@ def _moments(centres_m: Array, weight: Array, width_m: float) -> tuple[Array, Ar
     weight = weight / weight.sum()
     mean = weight @ centres_m
     centred = centres_m - mean
-    return mean, np.einsum("n,ni,nj->ij", weight, centred, centred) + width_m**2 / 12 * np.eye(2)
+    return mean, (centred * weight[:, None]).T @ centred + width_m**2 / 12 * np.eye(2)
 
 
-def _radius(offsets_m: Array, weight: Array, mass: float, width_m: float) -> float:
-    """Radius of the circle that holds the mass, a box's half diagonal included."""
-    distance = np.hypot(offsets_m[:, 0], offsets_m[:, 1])
+def _radii(offsets_m: Array, weight: Array, masses: tuple[float, ...], width_m: float) -> tuple[float, ...]:
+    """Radii of the circles that hold these parts of the mass, a box's half diagonal included."""
+    distance = np.sqrt(np.einsum("ni,ni->n", offsets_m, offsets_m))
     order = np.argsort(distance)
-    at = int(np.searchsorted(np.cumsum(weight[order]), mass * (1 - 1e-12)))
-    return float(distance[order][min(at, len(order) - 1)] + width_m * np.sqrt(0.5))
+    running = np.cumsum(weight[order])
+    at = np.searchsorted(running, np.array(masses) * running[-1] * (1 - 1e-12))
+    return tuple(float(r) + width_m * np.sqrt(0.5) for r in distance[order[np.minimum(at, len(order) - 1)]])
 
 
-def _modes(centres_m: Array, weight: Array, width_m: float) -> Ints:
+def _modes(centres_m: Array, weight: Array, width_m: float, covariance: Array) -> Ints:
     """Mode number (n,) of each box: boxes linked by gaps no wider than the posterior's local spread."""
     label = np.zeros(len(weight), dtype=np.int64)
-    if _in_one_piece(centres_m, weight, width_m):
+    if _in_one_piece(centres_m, covariance, width_m):
         return label
     for sigmas in (1.0, 1.0, 3.0):  # far modes widen the first spread; the heaviest one's own decides in the end
         heaviest = label == np.argmax(np.bincount(label, weights=weight))
@@ -83,9 +87,8 @@ def _modes(centres_m: Array, weight: Array, width_m: float) -> Ints:
     return label
 
 
-def _in_one_piece(centres_m: Array, weight: Array, width_m: float) -> bool:
+def _in_one_piece(centres_m: Array, covariance: Array, width_m: float) -> bool:
     """Whether the boxes leave no gap along the posterior's longer axis, where two places would lie apart."""
-    _, covariance = _moments(centres_m, weight, width_m)
     along = np.sort(centres_m @ np.linalg.eigh(covariance)[1][:, 1])
     return bool(np.diff(along).max(initial=0.0) < 1.5 * width_m)
 
@@ -117,6 +120,4 @@ def _described(centres_m: Array, weight: Array, label: Ints) -> tuple[Mode, ...]
     north = np.bincount(label, weights=weight * centres_m[:, 1]) / np.maximum(mass, 1e-300)
     order = [int(i) for i in np.argsort(-mass, kind="stable") if mass[i] > NEGLIGIBLE_MODE]
     total = float(mass[order].sum())
-    return tuple(
-        Mode(east_m=float(east[i]), north_m=float(north[i]), weight=float(mass[i]) / total) for i in order
-    )
+    return tuple(Mode(east_m=float(east[i]), north_m=float(north[i]), weight=float(mass[i]) / total) for i in order)

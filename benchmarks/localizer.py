@@ -1,0 +1,74 @@
+"""Time per fix on the thesis's lists: the exact posterior against the thesis's own method, in the same run.
+
+    python benchmarks/localizer.py --places 300
+
+Every method gets the same evidence (2142 stars, perfect lists) and gives a Fix; rounds alternate, so that a busy
+machine disturbs all alike, and the ratio is the median over the rounds. The thesis's method is vectorised and stops as soon as
+its two sets of stars agree.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import numpy as np
+from _results import table, write_section
+
+from startrack.localize import ExactPosterior, PseudoGradient
+from startrack.reproduce.simulator import ASPECT_RATIO, MAGNITUDE, PERFECT, Sky, crater, places, visible
+from startrack.types import Evidence, Fix
+
+ROUNDS = 9
+SEED = 11
+
+
+def main() -> None:
+    """Run, print and write the section."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--places", type=int, default=300)
+    args = parser.parse_args()
+    cylinder, truth, lists = crater(ASPECT_RATIO), places(SEED, 0, 0, args.places), thesis_lists(args.places)
+    methods: dict[str, tuple[Callable[..., Fix], int]] = {  # and how many of the lists it gets
+        "pseudo-gradient (Kua 2008)": (PseudoGradient(), args.places),
+        "exact posterior, compiled": (ExactPosterior(sector_epsilon=0.0, compiled=True), args.places),
+        "the same, with caps for unmapped obstacles": (ExactPosterior(compiled=True), args.places),
+        "the same, plain numpy": (ExactPosterior(), max(args.places // 20, 1)),
+    }
+    times: dict[str, list[float]] = {name: [] for name in methods}
+    errors = {
+        name: np.mean([error_m(method(e, cylinder), p) for e, p in zip(lists[:n], truth[:n], strict=True)])
+        for name, (method, n) in methods.items()
+    }  # and whatever has to be compiled is, before the clock starts
+    for _ in range(ROUNDS):
+        for name, (method, n) in methods.items():
+            start = time.thread_time()
+            for evidence in lists[:n]:
+                method(evidence, cylinder)
+            times[name].append(1e3 * (time.thread_time() - start) / n)
+    thesis = np.array(next(iter(times.values())))
+    rows = [
+        [name, f"{np.median(ms):.2f}", f"{np.median(np.array(ms) / thesis):.2f}", f"{errors[name]:.1f}"]
+        for name, ms in times.items()
+    ]
+    body = table(["method", "ms of CPU per fix", "ratio", "mean error, m"], rows)
+    print(body)
+    write_section("Localizer", f"python benchmarks/localizer.py --places {args.places}", ("numpy", "numba"), body)
+
+
+def thesis_lists(count: int) -> list[Evidence]:
+    """Perfect lists of one of the thesis's random skies at random places."""
+    sky, cylinder = Sky.drawn(SEED, 0, MAGNITUDE), crater(ASPECT_RATIO)
+    points = sky.on_rim_plane(cylinder)
+    seen = [visible(points, place, cylinder.radius_m) for place in places(SEED, 0, 0, count)]
+    return [PERFECT.evidence(sky, PERFECT.listed(one, SEED, 0, k)) for k, one in enumerate(seen)]
+
+
+def error_m(fix: Fix, place_m: np.ndarray) -> float:
+    """Distance of a fix from the truth."""
+    return float(np.linalg.norm(fix.position_enu_m[:2] - place_m))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,5 +1,6 @@
 """Cameras: one lens model per file, one camera around them, files to keep them in."""
 
+from startrack.camera.decentring import Decentring
 from startrack.camera.files import camera_from_dict, camera_to_dict, load_camera, save_camera
 from startrack.camera.kannala_brandt import KannalaBrandt
 from startrack.camera.model import Camera, Lens, Sensor
@@ -7,6 +8,7 @@ from startrack.camera.pinhole import Pinhole
 
 __all__ = [
     "Camera",
+    "Decentring",
     "KannalaBrandt",
     "Lens",
     "Pinhole",

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from startrack.camera.decentring import Decentring
 from startrack.camera.kannala_brandt import KannalaBrandt
 from startrack.camera.model import ZENITH_MOUNT_R_BODY_CAM, Camera, Lens, Sensor
 from startrack.camera.pinhole import Pinhole
@@ -18,7 +19,7 @@ from startrack.types import BadInput
 FORMAT = 1
 KEYS = {
     "format", "name", "model", "size_px", "focal_px", "centre_px", "k", "max_angle_deg", "calibrated_angle_deg",
-    "mirrored", "mount", "sensor", "covariance",
+    "mirrored", "decentring", "mount", "sensor", "covariance",
 }  # fmt: skip
 KINDS = {str: "text", bool: "truth value (true or false)", list: "list", dict: "table"}
 T = TypeVar("T")
@@ -40,9 +41,14 @@ def load_camera(name_or_path: str | Path) -> Camera:
 
 def save_camera(camera: Camera, path: str | Path) -> None:
     """Write the camera file; `load_camera` gives the same camera back."""
+    Path(path).write_text(camera_text(camera), encoding="utf-8")
+
+
+def camera_text(camera: Camera) -> str:
+    """The camera file as text."""
     import tomli_w
 
-    Path(path).write_text(tomli_w.dumps(camera_to_dict(camera)), encoding="utf-8")
+    return tomli_w.dumps(camera_to_dict(camera))
 
 
 def camera_from_dict(d: dict[str, Any], default_name: str = "camera") -> Camera:
@@ -66,6 +72,7 @@ def camera_from_dict(d: dict[str, Any], default_name: str = "camera") -> Camera:
         calibrated_angle_rad=calibrated,
         lens=lens,
         mirrored=_typed(d, "mirrored", bool, False),
+        decentring=Decentring(*_numbers(d, "decentring", 3)) if "decentring" in d else Decentring(),
         R_body_cam=_mount(_table(d, "mount")),
         sensor=_sensor(_table(d, "sensor")) if "sensor" in d else None,
         covariance_order=order,
@@ -90,6 +97,8 @@ def camera_to_dict(camera: Camera) -> dict[str, Any]:
         "calibrated_angle_deg": float(np.degrees(camera.calibrated_angle_rad)),
         "mirrored": camera.mirrored,
     }
+    if camera.decentring:
+        d["decentring"] = [float(p) for p in (camera.decentring.p1, camera.decentring.p2, camera.decentring.e)]
     if not np.array_equal(camera.R_body_cam, ZENITH_MOUNT_R_BODY_CAM):
         d["mount"] = {"quat_xyzw_body_cam": [float(q) for q in quat_xyzw_from_R(camera.R_body_cam)]}
     if camera.sensor is not None:

@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from startrack.camera.decentring import Decentring
 from startrack.camera.kannala_brandt import KannalaBrandt
 from startrack.types import Array, Bools
 
@@ -52,6 +53,8 @@ class Sensor:
 class Camera:
     """x_px = cx + fx rho(a) cos b, y_px = cy + fy rho(a) sin b, b = atan2(y_cam, x_cam); mirrored: x_px = cx - ...
 
+    A decentred lens adds its shift to rho (cos b, sin b).
+
     Pixel (0, 0) is the centre of the top-left pixel. Works on rays throughout: z_cam <= 0 (past 90 degrees) is legal.
     """
 
@@ -63,6 +66,7 @@ class Camera:
     calibrated_angle_rad: float  # beyond this the lens is not known
     lens: Lens = KannalaBrandt()  # noqa: RUF009 - frozen
     mirrored: bool = False
+    decentring: Decentring = Decentring()  # noqa: RUF009 - frozen
     R_body_cam: Array = field(default_factory=lambda: ZENITH_MOUNT_R_BODY_CAM)
     sensor: Sensor | None = None
     covariance_order: tuple[str, ...] = ()
@@ -80,19 +84,21 @@ class Camera:
         angle = np.arctan2(off_axis, z)
         imaged = angle <= min(self.max_angle_rad, self.lens.max_invertible_rad)
         rho = self.lens.rho(np.where(imaged, angle, 0.0))
-        scale = rho / np.where(off_axis > 0, off_axis, 1.0)
+        per_off_axis = 1.0 / np.where(off_axis > 0, off_axis, 1.0)
+        scale = rho * per_off_axis
+        u, v = scale * x, scale * y
+        if self.decentring:
+            shift = self.decentring.shift((angle * per_off_axis)[..., None] * rays_cam[..., :2])
+            u, v = u + shift[..., 0], v + shift[..., 1]
         fx, fy = self._handed_focal_px
-        px = np.stack([self.centre_px[0] + fx * scale * x, self.centre_px[1] + fy * scale * y], axis=-1)
+        px = np.stack([self.centre_px[0] + fx * u, self.centre_px[1] + fy * v], axis=-1)
         width, height = self.size_px
         within = np.all((px >= -0.5) & (px <= np.array([width, height]) - 0.5), axis=-1)
         return px, imaged & within
 
     def unproject(self, px: Array) -> Array:
         """Unit rays_cam (..., 3) of the pixels (..., 2): the exact inverse of `project`."""
-        px = np.asarray(px, dtype=np.float64)
-        fx, fy = self._handed_focal_px
-        u = (px[..., 0] - self.centre_px[0]) / fx
-        v = (px[..., 1] - self.centre_px[1]) / fy
+        u, v = self._radial(px)
         rho = np.hypot(u, v)
         angle = self.lens.angle_rad(rho)
         scale = np.sin(angle) / np.where(rho > 0, rho, 1.0)
@@ -100,10 +106,17 @@ class Camera:
 
     def angle_rad(self, px: Array) -> Array:
         """Angle off the axis [rad] of the pixels (..., 2)."""
+        return self.lens.angle_rad(np.hypot(*self._radial(px)))
+
+    def _radial(self, px: Array) -> tuple[Array, Array]:
+        """rho (cos b, sin b) of the pixels (..., 2): decentring removed."""
         px = np.asarray(px, dtype=np.float64)
-        u = (px[..., 0] - self.centre_px[0]) / self.focal_px[0]
-        v = (px[..., 1] - self.centre_px[1]) / self.focal_px[1]
-        return self.lens.angle_rad(np.hypot(u, v))
+        fx, fy = self._handed_focal_px
+        u, v = (px[..., 0] - self.centre_px[0]) / fx, (px[..., 1] - self.centre_px[1]) / fy
+        if self.decentring:
+            uv = self.decentring.removed(np.stack([u, v], axis=-1), self.lens.angle_rad)
+            u, v = uv[..., 0], uv[..., 1]
+        return u, v
 
     def jacobian_px_per_rad(self, rays_cam: Array) -> Array:
         """d px / d w (..., 2, 3) for a small rotation w of unit rays about the camera's axes (ray -> ray + w x ray).
@@ -128,6 +141,8 @@ class Camera:
             ],
             axis=-2,
         )
+        if self.decentring:
+            by_ray = by_ray + self._decentred_by_ray(x, y, z, s, angle, ux, uy)
         zero = np.zeros_like(x)
         turned = np.stack(
             [np.stack([zero, z, -y], axis=-1), np.stack([-z, zero, x], axis=-1), np.stack([y, -x, zero], axis=-1)],
@@ -135,8 +150,23 @@ class Camera:
         )
         return (by_ray @ turned) * np.array(self._handed_focal_px)[:, None]
 
+    def _decentred_by_ray(self, x: Array, y: Array, z: Array, s: Array, angle: Array, ux: Array, uy: Array) -> Array:
+        """d shift / d ray (..., 2, 3): d(s, t) = u da + (a / sin a) v (v . d(x, y)), as for rho."""
+        ratio = np.divide(angle, s, out=np.ones_like(s), where=s > 1e-12)
+        by_angle = np.stack(
+            [
+                np.stack([z * ux * ux + ratio * uy * uy, (z - ratio) * ux * uy, -s * ux], axis=-1),
+                np.stack([(z - ratio) * ux * uy, z * uy * uy + ratio * ux * ux, -s * uy], axis=-1),
+            ],
+            axis=-2,
+        )
+        return self.decentring.gradient(np.stack([angle * ux, angle * uy], axis=-1)) @ by_angle
+
     def pixel_solid_angle_sr(self, angle_rad: Array) -> Array:
-        """Solid angle [sr] of one pixel at the angles off the axis [rad]: sin a / (rho rho' fx fy)."""
+        """Solid angle [sr] of one pixel at the angles off the axis [rad]: sin a / (rho rho' fx fy).
+
+        Decentring, a part in a thousand, is left out.
+        """
         a = np.maximum(np.asarray(angle_rad, dtype=np.float64), 1e-9)
         return np.sin(a) / (self.lens.rho(a) * self.lens.slope(a) * self.focal_px[0] * self.focal_px[1])
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from startrack.camera.decentring import Decentring
 from startrack.types import Array
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ GOLDEN_ANGLE_RAD = np.pi * (3.0 - np.sqrt(5.0))
 def lens_jacobian(camera: Camera, rays_cam: Array, order: tuple[str, ...]) -> Array:
     """d px / d parameter (..., 2, m) at the rays (..., 3), for the parameters named in `order`.
 
-    Names: fx, fy, cx, cy, k1 ... k4, and f for fx and fy together, fx : fy kept [px per px, or px per 1].
+    Names: fx, fy, cx, cy, k1 ... k4, p1, p2, and f for fx and fy together, fx : fy kept [px per px, or px per 1].
     """
     rays_cam = np.asarray(rays_cam, dtype=np.float64)
     x, y, z = rays_cam[..., 0], rays_cam[..., 1], rays_cam[..., 2]
@@ -26,15 +27,21 @@ def lens_jacobian(camera: Camera, rays_cam: Array, order: tuple[str, ...]) -> Ar
     angle = np.arctan2(off_axis, z)
     ux, uy = (np.divide(c, off_axis, out=np.zeros_like(c), where=off_axis > 0) for c in (x, y))
     fx, fy = camera.focal_px
-    ux = -ux if camera.mirrored else ux
     rho = camera.lens.rho(angle)
+    shift = camera.decentring.shift(angle[..., None] * np.stack([ux, uy], axis=-1))
+    hand = -1.0 if camera.mirrored else 1.0
     zero, one = np.zeros_like(rho), np.ones_like(rho)
-    columns = {"fx": (rho * ux, zero), "fy": (zero, rho * uy), "cx": (one, zero), "cy": (zero, one)}
-    columns["f"] = (rho * ux, rho * uy * (fy / fx))
+    across, down = hand * (rho * ux + shift[..., 0]), rho * uy + shift[..., 1]
+    columns = {"fx": (across, zero), "fy": (zero, down), "cx": (one, zero), "cy": (zero, one)}
+    columns["f"] = (across, down * (fy / fx))
     power = angle
     for n in range(1, 5):
         power = power * np.square(angle)
-        columns[f"k{n}"] = (fx * power * ux, fy * power * uy)
+        columns[f"k{n}"] = (hand * fx * power * ux, fy * power * uy)
+    e = camera.decentring.e
+    for name, unit in (("p1", Decentring(1.0, 0.0, e)), ("p2", Decentring(0.0, 1.0, e))):
+        by = unit.shift(angle[..., None] * np.stack([ux, uy], axis=-1))
+        columns[name] = (hand * fx * by[..., 0], fy * by[..., 1])
     return np.stack([np.stack(columns[name], axis=-1) for name in order], axis=-1)
 
 
@@ -54,7 +61,8 @@ def without_turn(camera: Camera, order: tuple[str, ...]) -> Array:
     """
     grid = cap_grid(camera.calibrated_angle_rad)
     turn = camera.jacobian_px_per_rad(grid).reshape(-1, 3)
-    return -np.linalg.lstsq(turn, lens_jacobian(camera, grid, order).reshape(-1, len(order)), rcond=None)[0]
+    lens = lens_jacobian(camera, grid, order).reshape(-1, len(order))
+    return np.asarray(-np.linalg.lstsq(turn, lens, rcond=None)[0], dtype=np.float64)
 
 
 def map_covariance_px2(camera: Camera, rays_cam: Array) -> Array:

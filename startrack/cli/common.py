@@ -111,11 +111,16 @@ def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, s
 
 def exit_code(outcome: Outcome) -> int:
     """0 solved, 1 internal error, 4 bad input, 3 refused or ambiguous."""
-    if outcome.reason == INTERNAL_ERROR:
+    return exit_code_of_reason(outcome.status, outcome.reason)
+
+
+def exit_code_of_reason(status: str, reason: str | None) -> int:
+    """0 solved, 1 internal error, 4 bad input, 3 refused or ambiguous."""
+    if reason == INTERNAL_ERROR:
         return 1
-    if outcome.status == "ok":
+    if status == "ok":
         return 0
-    return 4 if outcome.reason in BAD_INPUT_REASONS else 3
+    return 4 if reason in BAD_INPUT_REASONS else 3
 
 
 def _broken(path: str, cause: Exception, format_name: str) -> Outcome:

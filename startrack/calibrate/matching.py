@@ -1,0 +1,155 @@
+"""One-to-one matches of a frame's sources with predicted stars, by place and by brightness."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.calibrate.frame import Frame
+from startrack.calibrate.solve import project_freely
+from startrack.camera import Camera
+from startrack.types import Array, Bools, Ints
+
+MAGNITUDE_TOLERANCE = 0.9
+BLEND_MAG = 2.2  # a neighbour less than this fainter than the star shifts its centroid
+BLEND_PX = 3.5  # times the PSF's sigma
+DEPTH_MAG = 0.5  # beyond the faintest source that stars are predicted for
+SCALE_STARS = 4000
+FEWEST_FOR_SHAPE = 30
+SECURE_MAG = 0.7  # a star this much brighter than the frame's limit must be seen where the sky is open
+LIMIT_QUANTILE = 0.85
+CELL_PARTS = 12  # of the frame's longer side: a cell without any source is not open sky
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Pairs of one frame, and how many there should be."""
+
+    detection: Ints  # (n,) indices into the frame's detections
+    star: Ints  # (n,) indices into the frame's sky
+    expected: int  # bright stars predicted where the sky is open
+    expected_found: int  # of them, those with a source of their brightness
+    significant: int  # bright sources within the angle searched
+    significant_matched: int
+    pairs_at_random: float  # coincidences expected from chance alone
+
+    def __len__(self) -> int:
+        return len(self.star)
+
+    @property
+    def fraction(self) -> float:
+        """The larger of: bright stars that have a source, bright sources that have a star.
+
+        Clouds and trees take from the first, hot pixels and lamps from the second; a wrong map takes from both.
+        """
+        return max(
+            self.expected_found / self.expected if self.expected else 0.0,
+            self.significant_matched / self.significant if self.significant else 0.0,
+        )
+
+
+def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: float, gate_px: float) -> Matched:
+    """Nearest pairs closer than the gate and alike in brightness, unblended, up to the angle `within_rad` off axis."""
+    from scipy.spatial import cKDTree
+
+    found, stars = frame.detections, frame.sky.stars
+    source_mag = -2.5 * np.log10(np.maximum(found.flux_e, 1e-9))
+    tree = cKDTree(found.xy_px)
+    px, angle, seen = _predicted(frame, camera, R_cam_icrs, within_rad, len(stars.v_mag))
+    some = seen[seen < SCALE_STARS]
+    distance, nearest = tree.query(px[some], distance_upper_bound=gate_px)
+    hit = np.isfinite(distance)
+    hit[hit] &= ~found.saturated[nearest[hit]]
+    zero = _brightness(angle[some[hit]], stars.v_mag[some[hit]] - source_mag[nearest[hit]])
+    offset = zero(angle)
+    limit = source_mag.max() + DEPTH_MAG
+    seen = seen[(stars.v_mag - offset)[seen] < limit + BLEND_MAG]
+    distance, nearest = tree.query(px[seen], distance_upper_bound=gate_px)
+    hit = np.isfinite(distance) & ((stars.v_mag - offset)[seen] < limit)
+    star, detection, distance = seen[hit], nearest[hit], distance[hit]
+    brighter = (stars.v_mag - offset)[star] - source_mag[detection]
+    alike = np.abs(brighter) < np.hypot(MAGNITUDE_TOLERANCE, 2.0 * stars.v_sigma_mag[star])
+    alike |= found.saturated[detection] & (brighter < 0)
+    star, detection, distance = star[alike], detection[alike], distance[alike]
+    keep = _nearest_of_each(detection, distance)
+    star, detection = star[keep], detection[keep]
+    alone = _alone(px, seen, star, stars.v_mag, BLEND_PX * found.psf_sigma_px)
+    faintest = float(np.quantile(source_mag[detection], LIMIT_QUANTILE)) if len(detection) else -np.inf
+    bright = seen[(stars.v_mag - offset)[seen] < faintest - SECURE_MAG]
+    expected = bright[_open(px[bright], found.xy_px[detection], frame.size_px)]
+    inner = camera.angle_rad(found.xy_px) < within_rad
+    significant = inner & (source_mag < faintest - SECURE_MAG)
+    density = len(found.xy_px) / max(float(np.prod(frame.size_px)), 1.0)
+    return Matched(
+        detection=detection[alone],
+        star=star[alone],
+        expected=len(expected),
+        expected_found=int(np.isin(expected, star).sum()),
+        significant=int(significant.sum()),
+        significant_matched=int(np.count_nonzero(significant[detection])),
+        pairs_at_random=float(len(seen) * density * np.pi * gate_px**2),
+    )
+
+
+def _predicted(
+    frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: float, count: int
+) -> tuple[Array, Array, Ints]:
+    """Pixels (n, 2) and off-axis angles (n,) of the `count` brightest stars, and those that fall into the frame."""
+    rays = frame.sky.stars.rays_icrs[:count] @ R_cam_icrs.T
+    angle = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    px = project_freely(camera, rays)
+    width, height = frame.size_px
+    inside = np.all((px > -0.5) & (px < np.array([width, height]) - 0.5), axis=1)
+    inside &= angle < min(within_rad, camera.lens.max_invertible_rad)
+    return px, angle, np.flatnonzero(inside)
+
+
+def _brightness(angle_rad: Array, zero_mag: Array) -> Callable[[Array], Array]:
+    """Zero point [mag] as a polynomial of the angle off the axis: vignetting and, roughly, the air are in it."""
+    if not len(zero_mag):
+        return np.poly1d([0.0])
+    fit = np.poly1d([float(np.median(zero_mag))])
+    if len(zero_mag) < FEWEST_FOR_SHAPE:
+        return fit
+    for _ in range(4):
+        close = np.abs(zero_mag - fit(angle_rad)) < 1.2
+        if close.sum() < FEWEST_FOR_SHAPE:
+            break
+        fit = np.poly1d(np.polyfit(angle_rad[close], zero_mag[close], 2))
+    # Outside the angles of the stars it was fitted to, a parabola may do anything.
+    low, high = np.min(angle_rad), np.max(angle_rad)
+    return lambda a: fit(np.clip(a, low, high))
+
+
+def _nearest_of_each(detection: Ints, distance: Array) -> Ints:
+    """Indices of the closest star of each detection."""
+    order = np.lexsort((distance, detection))
+    _, first = np.unique(detection[order], return_index=True)
+    return np.sort(order[first])
+
+
+def _alone(px: Array, seen: Ints, star: Ints, v_mag: Array, radius_px: float) -> Bools:
+    """Whether no other star of comparable light falls near the stars (n,)."""
+    from scipy.spatial import cKDTree
+
+    if not len(star):
+        return np.zeros(0, dtype=bool)
+    near = cKDTree(px[seen]).query_ball_point(px[star], radius_px)
+    limit = v_mag[star] + BLEND_MAG
+    return np.array(
+        [
+            not any(seen[j] != s and v_mag[seen[j]] < faintest for j in others)
+            for others, s, faintest in zip(near, star, limit, strict=True)
+        ],
+        dtype=bool,
+    )
+
+
+def _open(px: Array, xy_px: Array, size_px: tuple[int, int]) -> Bools:
+    """Whether the pixels (n, 2) lie in a cell of the frame where a match lies too: elsewhere is cloud, tree or wall."""
+    cell = max(size_px) / CELL_PARTS
+    columns = int(np.ceil(size_px[0] / cell)) + 2
+    numbers = [np.clip(np.rint(p / cell), 0, None).astype(int) @ np.array([1, columns]) for p in (px, xy_px)]
+    return np.isin(*numbers)

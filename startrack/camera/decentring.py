@@ -1,0 +1,67 @@
+"""Decentring: what a lens whose elements are not on one axis adds to the radial law."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.types import Array
+
+ROUNDS = 30
+ROUNDING_1 = 1e-14
+
+
+@dataclass(frozen=True)
+class Decentring:
+    """(du, dv) = (2 p1 s t + p2 (a^2 + 2 s^2 - e), p1 (a^2 + 2 t^2 - e) + 2 p2 s t), in focal lengths.
+
+    (s, t) = a (cos b, sin b), a the angle off the axis [rad]; added to rho (cos b, sin b). With e = 0 this is Brown's
+    tangential distortion on the angles of a fisheye, as in COLMAP's THIN_PRISM_FISHEYE. `e` only moves the origin: it
+    is chosen so that the centre stays where the best lens without decentring has it, and who ignores p loses least.
+
+    Source: Brown 1966, Photogrammetric Engineering 32, 444.
+    """
+
+    p1: float = 0.0
+    p2: float = 0.0
+    e: float = 0.0  # [rad^2]
+
+    def __bool__(self) -> bool:
+        return bool(self.p1 or self.p2)
+
+    def shift(self, st: Array) -> Array:
+        """(du, dv) (..., 2) at the angles (s, t) (..., 2) [rad]."""
+        s, t = st[..., 0], st[..., 1]
+        a2 = s * s + t * t - self.e
+        return np.stack(
+            [2 * self.p1 * s * t + self.p2 * (a2 + 2 * s * s), self.p1 * (a2 + 2 * t * t) + 2 * self.p2 * s * t],
+            axis=-1,
+        )
+
+    def gradient(self, st: Array) -> Array:
+        """d (du, dv) / d (s, t) (..., 2, 2), symmetric."""
+        s, t = st[..., 0], st[..., 1]
+        across = 2 * (self.p1 * s + self.p2 * t)
+        return np.stack(
+            [
+                np.stack([2 * self.p1 * t + 6 * self.p2 * s, across], axis=-1),
+                np.stack([across, 6 * self.p1 * t + 2 * self.p2 * s], axis=-1),
+            ],
+            axis=-2,
+        )
+
+    def removed(self, uv: Array, angle_rad: Callable[[Array], Array]) -> Array:
+        """(u, v) (..., 2) without decentring of image points with it; `angle_rad` inverts the radial law."""
+        if not self:
+            return uv
+        plain = uv
+        for _ in range(ROUNDS):
+            rho = np.hypot(plain[..., 0], plain[..., 1])
+            angle = angle_rad(rho)
+            st = plain * (angle / np.where(rho > 0, rho, 1.0))[..., None]
+            before, plain = plain, uv - self.shift(st)
+            if np.max(np.abs(plain - before), initial=0.0) < ROUNDING_1:
+                break
+        return plain

@@ -1,0 +1,103 @@
+"""What `startrack calibrate` does with camera files: verify, show, convert; and calibration from boards."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from startrack.cli.calibrate import output_path, progress, read, site_of, tell_outcome
+from startrack.errors import BadInput, NoSolution
+
+
+def show(args: argparse.Namespace, words: list[str]) -> int:
+    """Print what camera files say; 0."""
+    from startrack.calibrate.show import camera_text, facts
+    from startrack.camera import load_camera
+
+    for word in words:
+        camera = load_camera(word)
+        print(json.dumps(facts(camera)) if args.json else camera_text(camera))
+    return 0
+
+
+def convert(args: argparse.Namespace, words: list[str]) -> int:
+    """One camera file to another program's or from it; 0."""
+    from startrack.calibrate.convert import from_text, to_text
+    from startrack.calibrate.convert.plain import lost_px
+    from startrack.camera import load_camera
+    from startrack.camera.files import camera_text
+    from startrack.exposure import write_atomically
+
+    if (args.to is None) == (args.source is None) or len(words) != 1:
+        args.usage_error("calibrate convert takes one file, and --to or --from")
+    if args.to is not None:
+        camera = load_camera(words[0])
+        text = to_text(camera, args.to)
+        default = {"colmap": "cameras.txt", "kalibr": "camchain.yaml"}.get(args.to, f"{camera.name}.yaml")
+        lost = lost_px(camera) if camera.decentring and args.to != "colmap" else 0.0
+        note = f"; {args.to} has no decentring: {lost:.2f} px RMS are lost" if lost else ""
+    else:
+        text = camera_text(from_text(_text(words[0]), args.source, args.name or Path(words[0]).stem))
+        default, note = f"{Path(words[0]).stem}.toml", ""
+    out = output_path(args, default)
+    write_atomically(out, text.encode("utf-8"), overwrite=True)
+    if not args.quiet:
+        print(f"{out}{note}")
+    return 0
+
+
+def verify(args: argparse.Namespace, words: list[str]) -> int:
+    """Whether the camera file still fits pictures of the stars; the exit code."""
+    from startrack.calibrate.verify import verify as verified
+    from startrack.calibrate.verify import verify_dict, verify_line
+    from startrack.camera import load_camera
+    from startrack.catalog import load_catalog
+
+    worst = 0
+    for word in words:
+        exposure = read(word, args)
+        named = args.camera or exposure.camera
+        if named is None:
+            raise BadInput("no_calibration", "which camera file is to be verified? give -c FILE")
+        with progress(args) as tell:
+            try:
+                tell(f"verifying with {exposure.name}")
+                found = verified(exposure, load_camera(named), load_catalog(), site_of(args, [exposure]))
+            except NoSolution as cause:
+                record = {"image": exposure.name, "status": "refused", "reason": cause.reason, "message": str(cause)}
+                worst = max(worst, tell_outcome(args, record, f"{exposure.name}  refused {cause.reason}: {cause}"))
+                continue
+        worst = max(worst, tell_outcome(args, verify_dict(found), verify_line(found)))
+    return worst
+
+
+def board(args: argparse.Namespace, words: list[str]) -> int:
+    """A camera file from pictures of a chessboard or a ChArUco board; the exit code."""
+    from startrack.calibrate.board import calibrate_board
+    from startrack.cli.calibrate import write_calibration
+
+    try:
+        columns, rows = (int(n) for n in (args.pattern or "").lower().split("x"))
+    except ValueError:
+        args.usage_error(
+            "calibrate board needs --pattern CxR: inner corners of a chessboard, squares of a ChArUco board"
+        )
+    out = output_path(args, "camera.toml")
+    with progress(args) as tell:
+        found = calibrate_board(
+            words,
+            (columns, rows),
+            charuco=args.charuco,
+            marker_part=args.marker,
+            name=args.name or out.stem,
+            progress=tell,
+        )
+    return write_calibration(args, out, found)
+
+
+def _text(path: str) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as cause:
+        raise BadInput("no_calibration", f"{path}: {cause}") from cause

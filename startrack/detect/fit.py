@@ -88,9 +88,7 @@ def _fit(s: Stamps, start_xy_px: Array, sigma_px: float, light_noise: LightNoise
         px, dx = _profile(offset[:, 0], sigma_px, radius)
         py, dy = _profile(offset[:, 1], sigma_px, radius)
         shape = py[:, :, None] * px[:, None, :]
-        if step == 1:  # the weights follow the light: now roughly, at the end finely
-            weights = _weights(s, flux, shape, light_noise)
-        if step == ROUNDS:
+        if step > 0:  # a flux is known, and with it the noise of the star's own light
             weights = _weights(s, flux, shape, light_noise)
         miss = s.data - flux[:, None, None].astype(np.float32) * shape - level[:, None, None].astype(np.float32)
         normal, right = _normal_equations(weights, miss, flux, (px, dx), (py, dy))
@@ -104,22 +102,12 @@ def _fit(s: Stamps, start_xy_px: Array, sigma_px: float, light_noise: LightNoise
         offset = np.clip(offset + np.clip(delta[:, :2], -0.5, 0.5), -radius, radius)
         flux, level = flux + delta[:, 2], level + delta[:, 3]
     chi2: Array = np.einsum("nij,nij,nij->n", weights, miss, miss, dtype=np.float64)
-    return _judged(
-        s,
-        start_xy_px,
-        offset,
-        flux,
-        level,
-        np.asarray(np.linalg.inv(normal), dtype=np.float64),
-        chi2,
-        shape,
-        light_noise,
-        own_part,
-    )
+    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    return _judged(s, offset, flux, level, covariance, chi2, shape, light_noise, own_part)
 
 
 def _judged(
-    s: Stamps, start: Array, offset: Array, flux: Array, level: Array, covariance: Array, chi2: Array,
+    s: Stamps, offset: Array, flux: Array, level: Array, covariance: Array, chi2: Array,
     shape: Pixels, light_noise: LightNoise, own_part: float,
 ) -> PointFits:  # fmt: skip
     plain = _masked(1.0 / s.variance, s.usable)

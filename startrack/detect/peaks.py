@@ -15,6 +15,8 @@ from startrack.psf import filter_kernel
 from startrack.types import Array, Bools, Ints
 
 STRIP_ROWS = 192
+MOST_STAMP_PIXELS = 2_500_000  # of all candidates together: bounds time and memory, whatever the frame holds
+MOST_BLOBS = 1000  # saturated; the largest
 OWN_RESIDUE_SIGMAS = 1.5
 AROUND = [(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)]
 
@@ -35,6 +37,7 @@ def find_peaks(frame: Frame, sigma: float, lowest: float, most: int, known: Arra
     `known` (m, 2): places of stars whose light `frame.found` holds; they come first, the peaks are those of the rest.
     """
     margin = radius_for(sigma)
+    most = min(most, MOST_STAMP_PIXELS // (2 * margin + 1) ** 2)
     kernel = filter_kernel(sigma)
     squared = float(np.sum(kernel.astype(np.float64) ** 2))
     width = COARSE_PX * coarse_width(6 * margin + 1)
@@ -46,7 +49,7 @@ def find_peaks(frame: Frame, sigma: float, lowest: float, most: int, known: Arra
     pixels, height, offset, level = (np.concatenate(part) for part in zip(*strips, strict=True))
     chosen = np.argsort(-height, kind="stable")[:most]
     peaks, start, surround = pixels[chosen], (pixels + offset)[chosen], level[chosen]
-    blobs = _saturated_blobs(frame.dead, margin)[:most]
+    blobs = _saturated_blobs(frame.dead, margin)
     if known is not None:
         away = _away_from(known, start, sigma)
         peaks, start, surround = peaks[away], start[away], surround[away]
@@ -128,4 +131,5 @@ def _saturated_blobs(dead: NDArray[np.bool_] | None, margin: int) -> Array:
     middle = centroids[1:count]
     inside = (middle >= margin).all(axis=1) & (middle[:, 0] < width - margin) & (middle[:, 1] < height - margin)
     compact = stats[1:count, cv2.CC_STAT_AREA] <= (2 * margin + 1) ** 2
-    return middle[inside & compact]
+    good = np.flatnonzero(inside & compact)
+    return middle[good[np.argsort(-stats[1 + good, cv2.CC_STAT_AREA], kind="stable")[:MOST_BLOBS]]]

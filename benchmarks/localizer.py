@@ -3,8 +3,8 @@
     python benchmarks/localizer.py --places 300
 
 Every method gets the same evidence (2142 stars, perfect lists) and gives a Fix; rounds alternate, so that a busy
-machine disturbs all alike, and the ratio is the median over the rounds. The thesis's method is vectorised and stops as soon as
-its two sets of stars agree.
+machine disturbs all alike, and the ratio is the median over the rounds. The pseudo-gradient is vectorised and stops as
+soon as its two sets of stars agree.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ def test_the_locate_command_prints_what_the_page_shows(clone, capsys):
     metres = [float(value) for value in re.findall(r"([EN±]) ?(-?[\d.]+) m", shown) for value in value[1:]]
     now = [float(value) for value in re.findall(r"([EN±]) ?(-?[\d.]+) m", printed) for value in value[1:]]
     assert now == pytest.approx(metres, abs=10)
-    files = [f"near-wall{end}" for end in (".annotated.png", ".fix.json", ".stars.ecsv")]
+    files = [f"near-wall{end}" for end in (".annotated.png", ".corr", ".fix.json", ".stars.ecsv", ".wcs")]
     assert sorted(path.name for path in (clone / "startrack-out").iterdir()) == files
 
 

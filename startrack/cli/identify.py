@@ -18,7 +18,7 @@ def add_parser(subparsers: Any) -> None:
         help="stars and attitude only",
         description="Name the stars of each image and give the attitude. Needs a camera file, but no terrain; without "
         "a time the catalogue is taken at J2000.0 and 60 arcsec are added to the stated errors. Writes "
-        "NAME.identification.json, NAME.stars.ecsv and NAME.annotated.png.",
+        "NAME.identification.json, NAME.stars.ecsv, NAME.wcs, NAME.corr and NAME.annotated.png.",
     )
     add_image_flags(parser)
 
@@ -38,6 +38,7 @@ def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
         write_annotated,
         write_json,
         write_star_table,
+        write_wcs,
     )
 
     start = time.perf_counter()
@@ -50,6 +51,7 @@ def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     record = identification_dict(result)
     if result.identification is not None:
         write_star_table(out.with_name(f"{stem}.stars.ecsv"), result)
+        write_wcs(out.with_name(f"{stem}.wcs"), out.with_name(f"{stem}.corr"), result)
     if not args.no_plots:
         write_annotated(out.with_name(f"{stem}.annotated.png"), result)
     write_json(out, record)

@@ -20,7 +20,7 @@ def add_parser(subparsers: Any) -> None:
         help="image to position and attitude",
         description="Locate the camera in each image: detect, identify, attitude, evidence, position. Camera, terrain "
         "and time come from flags, else from NAME.json beside the image, else from its header. Writes NAME.fix.json, "
-        "NAME.stars.ecsv and NAME.annotated.png.",
+        "NAME.stars.ecsv, NAME.wcs, NAME.corr and NAME.annotated.png.",
     )
     add_image_flags(parser)
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file, or the name of a shipped one")
@@ -34,7 +34,15 @@ def run(args: argparse.Namespace) -> int:
 def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     from startrack.catalog import load_catalog
     from startrack.pipeline import locate
-    from startrack.report import result_dict, summary_line, verbose_text, write_annotated, write_json, write_star_table
+    from startrack.report import (
+        result_dict,
+        summary_line,
+        verbose_text,
+        write_annotated,
+        write_json,
+        write_star_table,
+        write_wcs,
+    )
     from startrack.terrain import load_terrain
 
     start = time.perf_counter()
@@ -50,6 +58,7 @@ def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     record = result_dict(result)
     if result.light is not None:
         write_star_table(out.with_name(f"{stem}.stars.ecsv"), result)
+        write_wcs(out.with_name(f"{stem}.wcs"), out.with_name(f"{stem}.corr"), result)
     if not args.no_plots:
         write_annotated(out.with_name(f"{stem}.annotated.png"), result)
     write_json(out, record)

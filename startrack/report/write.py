@@ -35,6 +35,17 @@ def write_star_table(path: FilePath, result: Result) -> None:
     write_atomically(path, star_table_text(result).encode("utf-8"), overwrite=True)
 
 
+def write_wcs(path: FilePath, corr_path: FilePath, result: Result) -> None:
+    """Write NAME.wcs, the FITS header of the image's world coordinates, and NAME.corr, its matches as a FITS table.
+
+    Raises BadInput where they cannot be written.
+    """
+    from startrack.report.wcs import matches_bytes, wcs_bytes
+
+    write_atomically(path, wcs_bytes(result), overwrite=True)
+    write_atomically(corr_path, matches_bytes(result), overwrite=True)
+
+
 def write_annotated(path: FilePath, result: Result, truth_enu_m: tuple[float, float] | None = None) -> None:
     """Write NAME.annotated.png. Raises BadInput where it cannot be written.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time as clock
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -11,7 +10,7 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.identify.family import PINHOLE, radius
 from startrack.identify.grow import WIDE, Grown, Stage, grow
-from startrack.identify.hypotheses import Guess, Hypotheses, apart, patterns_for
+from startrack.identify.hypotheses import Guess, Hypotheses, Window, apart, patterns_for
 from startrack.identify.polish import Polished, polished
 from startrack.types import Array, Detections, Identification, NotIdentified, Stars
 
@@ -19,11 +18,12 @@ WIDE_FIELD_RAD = np.radians(100.0)  # from here up, `fov` is the angle of the im
 NARROW_FIELD_RAD = np.radians(40.0)  # up to here all lenses are nearly pinholes
 FEWEST_WIDE = 12
 FEWEST_NARROW = 7
-DEPTHS = (16, 28, 44)  # brightest detections that form triangles, round by round
+WINDOWS = (  # the brightest; those after them, as hot pixels may be brighter than stars; and more of all
+    Window(0, 0, 16), Window(0, 16, 26), Window(26, 26, 46), Window(0, 26, 40), Window(46, 46, 70), Window(0, 40, 60),
+)  # fmt: skip
 LOG_PLAUSIBLE = -14.0  # of a start's chance hits: random skies reach -20 in a whole search
 LOG_FALSE_ALARM = float(np.log(1e-9))
-MOST_GROWN = 48
-SECONDS = 12.0  # a search without an answer ends here
+MOST_TRIED = 1_200_000  # patterns; a search without an answer ends here, after some seconds
 APART = 0.02  # of the frame: pattern stars are no closer
 CIRCLES = (0.5, 0.62, 0.42, 0.78, 1.0)  # radius of the image circle over the frame's shorter side
 SIZE_STEP = 0.13  # half width of a guess in the logarithm of the focal length
@@ -107,24 +107,21 @@ class _Search:
 
     def grown(self) -> Iterator[Grown]:
         """Hypotheses that survive growing, each at once."""
-        deadline = clock.perf_counter() + SECONDS
-        done = 0
         stages = self._stages()
-        for depth in DEPTHS:
+        for window in WINDOWS:
+            if window.done >= len(self.hypotheses.xy_px):
+                return
             for guess in self._guesses():
                 taken: list[Array] = []
-                for start in self.hypotheses.starts(guess, (done, depth), LOG_PLAUSIBLE):
+                for start in self.hypotheses.starts(guess, window, LOG_PLAUSIBLE):
                     if any(np.trace(R.T @ start.R_cam_icrs) > 1 + 2 * np.cos(0.05) for R in taken):
                         continue
                     taken.append(start.R_cam_icrs)
                     found = grow(start, self.xy_px, self.stars.rays_icrs, stages)
                     if found is not None:
                         yield found
-                if clock.perf_counter() > deadline:
+                if self.tried > MOST_TRIED:
                     return
-            done = depth
-            if depth >= len(self.hypotheses.xy_px):
-                return
 
     def _guesses(self) -> list[Guess]:
         """Lenses to begin with: shapes by focal lengths, the likelier first."""
@@ -157,6 +154,6 @@ class _Search:
         part = float(np.sqrt(self._field_sr() / (2 * np.pi)))
         free = ("scale",) if self.fov_rad <= NARROW_FIELD_RAD else ("scale", "shape", "centre")
         return tuple(
-            Stage(min(s.reach_rad * part if s.reach_rad < np.pi else np.pi, np.pi), s.gate_rad * part, s.detections, free)
+            Stage(min(s.reach_rad * part if s.reach_rad < np.pi else np.pi, np.pi), s.gate_rad * part, s.detections, free, s.log_limit)
             for s in WIDE
         )

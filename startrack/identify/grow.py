@@ -32,14 +32,15 @@ class Stage:
     gate_rad: float
     detections: int  # brightest that take part
     free: tuple[str, ...]  # beyond the rotation
+    log_limit: float  # chance of as many pairs in the inner half of the gate, above which it is given up
 
 
 WIDE = (
-    Stage(np.radians(45.0), np.radians(2.0), 60, ("scale",)),
-    Stage(np.radians(70.0), np.radians(2.0), 60, ("scale", "shape", "centre")),
-    Stage(np.pi, np.radians(2.0), 80, ("scale", "shape", "centre")),
-    Stage(np.pi, np.radians(1.0), 120, ("scale", "shape", "centre")),
-    Stage(np.pi, np.radians(0.6), 200, ("scale", "shape", "centre")),
+    Stage(np.radians(45.0), np.radians(2.0), 60, ("scale",), 0.0),
+    Stage(np.radians(70.0), np.radians(2.0), 60, ("scale", "shape", "centre"), -3.0),
+    Stage(np.pi, np.radians(2.0), 80, ("scale", "shape", "centre"), -6.0),
+    Stage(np.pi, np.radians(1.0), 120, ("scale", "shape", "centre"), -10.0),
+    Stage(np.pi, np.radians(0.6), 200, ("scale", "shape", "centre"), -14.0),
 )
 
 
@@ -73,20 +74,24 @@ def grow(start: Start, xy_px: Array, rays_icrs: Array, stages: tuple[Stage, ...]
         for _ in range(ROUNDS):
             gate_px = max(stage.gate_rad * camera.focal_px[0], SMALLEST_GATE_PX)
             near = (middle_icrs, stage.reach_rad)
-            detection, star = mutual_pairs(camera, R, xy_px[: stage.detections], rays_icrs, gate_px, near)
+            detection, star, tried = mutual_pairs(camera, R, xy_px[: stage.detections], rays_icrs, gate_px, near)
             if len(star) < FEWEST:
                 return None
             camera, R, distance = fit(
                 camera, R, xy_px[detection], rays_icrs[star], stage.free, sigma_px=gate_px / 4, prior=start.camera
             )
             grown = Grown(camera, R, detection, star, distance)
+        if _log_chance(distance, gate_px, tried, xy_px[: stage.detections]) > stage.log_limit:
+            return None
     return grown
 
 
 def mutual_pairs(
     camera: Camera, R: Array, xy_px: Array, rays_icrs: Array, gate_px: float, near: tuple[Array, float] | None = None
-) -> tuple[Ints, Ints]:
-    """Mutually nearest (detection, star) within the gate, of the brightest stars about as many as detections.
+) -> tuple[Ints, Ints, int]:
+    """Mutually nearest (detection, star) within the gate, and how many stars were asked for.
+
+    Of the brightest stars in view, about as many as detections.
 
     `near`: only stars about this direction (3,) in ICRS, up to this angle [rad].
     """
@@ -96,13 +101,21 @@ def mutual_pairs(
     if near is not None:
         some = some[rays_icrs[some] @ near[0] > np.cos(near[1])]
     if not len(some):
-        return some, some
+        return some, some, 0
     px, _ = camera.project(rays_icrs[some] @ R.T)
     distance, nearest = cKDTree(xy_px).query(px, distance_upper_bound=gate_px)
     _, back = cKDTree(px).query(xy_px, distance_upper_bound=gate_px)
     hit = np.flatnonzero(np.isfinite(distance))
     keep = back[nearest[hit]] == hit
-    return nearest[hit][keep].astype(np.int64), some[hit][keep]
+    return nearest[hit][keep].astype(np.int64), some[hit][keep], len(some)
+
+
+def _log_chance(distance_px: Array, gate_px: float, stars: int, xy_px: Array) -> float:
+    """About log P that chance brings as many of the stars within half the gate of a detection (n, 2)."""
+    area = float(np.prod(np.ptp(np.percentile(xy_px, (5, 95), axis=0), axis=0)) / 0.81) + 1.0
+    expected = max(stars * min(len(xy_px) * np.pi * (0.5 * gate_px) ** 2 / area, 1.0), 1e-6)
+    hits = int(np.count_nonzero(distance_px < 0.5 * gate_px))
+    return 0.0 if hits <= expected else float(hits - expected - hits * np.log(hits / expected))
 
 
 def _brightest_in_view(camera: Camera, R: Array, rays_icrs: Array, wanted: int) -> Ints:

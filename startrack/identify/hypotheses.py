@@ -15,7 +15,7 @@ from startrack.identify.index import bright_stars_apart
 from startrack.identify.search import triad
 from startrack.identify.similar import SimilarTriangles, similar_triangles
 from startrack.identify.skymap import SkyMap, sky_map
-from startrack.identify.triangles import triangles
+from startrack.identify.triangles import Triangles, triangles
 from startrack.types import Array, Bools, Ints, Stars
 
 HEMISPHERE_SR = 2 * np.pi
@@ -25,11 +25,9 @@ REACH_OF_HEMISPHERE_RAD = np.radians(45.0)
 NEAR_OF_HEMISPHERE_RAD = np.radians(1.5)
 NARROWEST_NEAR_RAD = np.radians(0.15)
 LOCAL_REACHES = 1.2  # of the patterns' reach: there an imperfect lens still fits
-MOST_CANDIDATES = 40_000
-MOST_STARTS = 32
-VERIFIED_FIRST = 24  # detections that every candidate is held against
-VERIFIED_FULLY = 80  # and the best of them
-MOST_VERIFIED_FULLY = 1500
+CANDIDATES_AT_ONCE = 20_000
+MOST_STARTS = 12
+VERIFIED = ((10, -4.0), (24, -7.0), (80, 0.0))  # detections held against the stars, and log odds to go on
 KEPT_INDEXES = 6
 
 
@@ -40,6 +38,15 @@ class Guess:
     focal_px: float
     shape: float
     centre_px: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Window:
+    """Ranks of brightness, `first` to `end`, whose triangles are tried, unless they lie wholly before `done`."""
+
+    first: int
+    done: int
+    end: int
 
 
 @dataclass(frozen=True)
@@ -102,35 +109,44 @@ class Hypotheses:
         self.xy_px, self.size_px, self.patterns = xy_px[:100], size_px, patterns
         self.tried = 0
 
-    def starts(self, guess: Guess, fresh: tuple[int, int], log_plausible: float) -> list[Start]:
-        """The best of the hypotheses, most likely first.
+    def starts(self, guess: Guess, window: Window, log_plausible: float) -> list[Start]:
+        """The best of the hypotheses from the window's triangles, most likely first.
 
-        From triangles of the `fresh[1]` brightest detections not all among the first `fresh[0]`; those whose hits
-        chance explains with log probability above `log_plausible` are left out.
+        Those whose hits chance explains with log probability above `log_plausible` are left out.
         """
-        patterns, done, depth = self.patterns, *fresh
-        seen = rays_of(self.xy_px, guess.centre_px, guess.focal_px, guess.shape)
-        image = triangles(seen[:depth], patterns.reach_rad)
-        image = image.take(image.vertices.max(axis=1, initial=0) >= done)
+        patterns, xy = self.patterns, self.xy_px[window.first :]
+        seen = rays_of(xy[: window.end - window.first], guess.centre_px, guess.focal_px, guess.shape)
+        image = triangles(seen, patterns.reach_rad)
+        image = image.take(image.vertices.max(axis=1, initial=0) >= window.done - window.first)
         left, right = patterns.triangles.candidates(image)
         self.tried += len(left)
         if not len(left):
             return []
-        if len(left) > MOST_CANDIDATES:
-            some = np.linspace(0, len(left) - 1, MOST_CANDIDATES).astype(np.int64)
-            left, right = left[some], right[some]
-        catalogue = patterns.triangles.triangles
-        focal = guess.focal_px * np.mean(image.sides_rad[left] / catalogue.sides_rad[right], axis=1)
-        mirrored = image.handed[left] != catalogue.handed[right]
-        cam = self._rays(self.xy_px[image.vertices[left]], guess, focal, mirrored)
-        R = triad(cam, patterns.rays_icrs[catalogue.vertices[right]])
+        found: list[Start] = []
+        for part in np.array_split(np.arange(len(left)), len(left) // CANDIDATES_AT_ONCE + 1):
+            found += self._likely(guess, xy, image.take(left[part]), right[part], log_plausible)
+        return sorted(found, key=lambda start: start.log_chance)[:MOST_STARTS]
+
+    def _likely(
+        self, guess: Guess, xy_px: Array, image: Triangles, right: Ints, log_plausible: float
+    ) -> list[Start]:
+        """Starts from pairs of an image triangle and a catalogue triangle."""
+        catalogue = self.patterns.triangles.triangles.take(right)
+        focal = guess.focal_px * np.mean(image.sides_rad / catalogue.sides_rad, axis=1)
+        mirrored = image.handed != catalogue.handed
+        cam = self._rays(xy_px[image.vertices], guess, focal, mirrored)
+        R = triad(cam, self.patterns.rays_icrs[catalogue.vertices])
         middle = cam.sum(axis=1)
         middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-        log_chance = self._odds(R, guess, focal, mirrored, middle)
+        alive = np.arange(len(R))
+        log_chance = np.zeros(len(R))
+        for verified, log_limit in ((*VERIFIED[0],), (*VERIFIED[1],), (VERIFIED[2][0], log_plausible)):
+            odds = self._odds(xy_px[:verified], R[alive], guess, focal[alive], mirrored[alive], middle[alive])
+            alive, log_chance = alive[odds < log_limit], odds[odds < log_limit]
         best = np.argsort(log_chance, kind="stable")[:MOST_STARTS]
         return [
-            Start(self._camera(guess, focal[i], bool(mirrored[i])), R[i], middle[i], float(log_chance[i]))
-            for i in best[log_chance[best] < log_plausible]
+            Start(self._camera(guess, focal[i], bool(mirrored[i])), R[i], middle[i], float(chance))
+            for i, chance in zip(alive[best], log_chance[best], strict=True)
         ]
 
     def _rays(self, xy_px: Array, guess: Guess, focal: Array, mirrored: Bools) -> Array:
@@ -138,30 +154,14 @@ class Hypotheses:
         rays[mirrored, :, 0] *= -1
         return rays
 
-    def _odds(self, R: Array, guess: Guess, focal: Array, mirrored: Bools, middle: Array) -> Array:
-        """log P by chance of as many detections near bright stars, near the triangle or in the whole field."""
-        patterns = self.patterns
-        few = self.xy_px[:VERIFIED_FIRST]
-        n, k, n_local, k_local = self._hits(few, R, guess, focal, mirrored, middle)
-        table = patterns.log_tail
-        odds = np.minimum(table[n, k], table[n_local, k_local])
-        best = np.argsort(odds, kind="stable")[:MOST_VERIFIED_FULLY]
-        n, k, n_local, k_local = self._hits(
-            self.xy_px[:VERIFIED_FULLY], R[best], guess, focal[best], mirrored[best], middle[best]
-        )
-        full = np.zeros(len(odds))
-        full[best] = np.minimum(table[n, k], table[n_local, k_local])
-        return full
-
-    def _hits(
-        self, xy_px: Array, R: Array, guess: Guess, focal: Array, mirrored: Bools, middle: Array
-    ) -> tuple[Ints, Ints, Ints, Ints]:
-        """Numbers (h,) of detections and of those near bright stars: all, and those around the triangle."""
+    def _odds(self, xy_px: Array, R: Array, guess: Guess, focal: Array, mirrored: Bools, middle: Array) -> Array:
+        """log P by chance of as many detections near bright stars, around the triangle or in the whole field."""
         rays = self._rays(np.broadcast_to(xy_px, (len(R), *xy_px.shape)), guess, focal, mirrored)
         hit = self.patterns.map(rays @ R)
         local = np.einsum("hni,hi->hn", rays, middle) > np.cos(LOCAL_REACHES * self.patterns.reach_rad)
-        n = np.full(len(R), len(xy_px))
-        return n, hit.sum(axis=1), local.sum(axis=1), (hit & local).sum(axis=1)
+        table = self.patterns.log_tail
+        everywhere = table[len(xy_px), hit.sum(axis=1)]
+        return np.minimum(everywhere, table[local.sum(axis=1), (hit & local).sum(axis=1)])
 
     def _camera(self, guess: Guess, focal: float, mirrored: bool) -> Camera:
         widest = Family(guess.shape).max_invertible_rad

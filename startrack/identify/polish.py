@@ -82,7 +82,7 @@ def _refined(
     prior = camera
     for gate_px, count in STEPS:
         xy = detections.xy_px[:count]
-        detection, star = mutual_pairs(camera, R, xy, stars.rays_icrs, gate_px)
+        detection, star, _ = mutual_pairs(camera, R, xy, stars.rays_icrs, gate_px)
         if len(star) < FEWEST:
             return None
         camera, R, _ = fit(camera, R, xy[detection], stars.rays_icrs[star], _free(camera, len(star)), gate_px / 4, prior)

@@ -93,7 +93,7 @@ def locate(
     result = Result(exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name)
     with _refusals(result):
         if exposure.time_utc is None:
-            raise BadInput("no_time", NO_TIME)
+            raise BadInput("no_time", "; ".join([NO_TIME, *exposure.warnings]))
         _identify(result, catalog, settings, terrain.site)
         result.R_enu_icrs = R_enu_icrs(terrain.site, exposure.time_utc)
         with _timed(result, "evidence"):

@@ -21,7 +21,7 @@ KEYS = {
     "roll_body_deg",
     "stars": "detected identified unexplained predicted_visible rms_px false_alarm_probability",
     "timing_ms": "read detect identify attitude evidence locate",
-    "provenance": "version image_sha256 camera terrain catalog time_utc",
+    "provenance": "version image_sha256 camera terrain catalog time_utc exposure_s",
 }
 
 
@@ -47,7 +47,7 @@ def flat_frame(result):
 
 def test_the_keys_are_those_of_the_format(fix):
     assert list(fix)[:5] == ["format", "image", "status", "reason", "message"]
-    assert set(fix) == {"format", "image", "status", "reason", "message", "modes", *KEYS}
+    assert set(fix) == {"format", "image", "status", "reason", "message", "modes", "warnings", *KEYS}
     for part, keys in KEYS.items():
         assert " ".join(fix[part]) == keys
     assert fix["format"] == "startrack.fix/1"

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from startrack.camera import Camera
     from startrack.types import Exposure
 
+COMPANIONS = (".stars.ecsv", ".annotated.png", ".wcs", ".corr")
 INTERNAL_ERROR = "internal_error"
 DEFAULT_OUT = "startrack-out"
 BAD_INPUT_REASONS = frozenset(
@@ -35,7 +36,10 @@ def add_image_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def _seconds(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds") from None
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number of seconds")
     return value
@@ -47,6 +51,7 @@ def add_output_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-O", "--overwrite", action="store_true", help="replace results of another image of this name")
     parser.add_argument("--json", action="store_true", help="print one JSON object per image")
     parser.add_argument("--no-plots", action="store_true", help="no pictures")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="accepted everywhere; here nothing is random")
     parser.add_argument("-v", "--verbose", action="count", default=0, help="say more; tracebacks of internal errors")
     parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
 
@@ -99,6 +104,8 @@ def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, s
             if args.verbose:
                 raise
             outcome = _broken(path, cause, format_name)
+        for warning in () if args.quiet else outcome.record.get("warnings", ()):
+            print(f"{Path(path).name}: {warning}", file=sys.stderr, flush=True)
         if args.json:
             print(json.dumps(outcome.record), flush=True)
         elif outcome.status != "ok":
@@ -185,6 +192,8 @@ def result_path(args: argparse.Namespace, stem: str, suffix: str, exposure: Expo
         before = {}
     if before is not None and not _is_of(before, exposure.sha256):
         raise BadInput("bad_image", f"{path} is not a result of this image: choose another -D, or replace it with -O")
+    for old in COMPANIONS:  # of an earlier run: a refusal must not leave the picture of a success beside it
+        path.with_name(f"{stem}{old}").unlink(missing_ok=True)
     return path
 
 

@@ -35,7 +35,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("-c", "--camera", default="fisheye-2048", metavar="FILE", help="default %(default)s")
     parser.add_argument("-t", "--terrain", default="shackleton-thesis", metavar="FILE", help="default %(default)s")
     parser.add_argument("--seed", type=_count, default=0, metavar="N", help="same seed, same bytes (default 0)")
-    parser.add_argument("-n", "--count", type=_count, default=1, metavar="N", help="images (default 1)")
+    parser.add_argument("-n", "--count", type=_at_least_one, default=1, metavar="N", help="images (default 1)")
     _add_pose(parser.add_argument_group("pose and time (what is not given is drawn from the seed)"))
     _add_light(parser.add_argument_group("light and defects"))
     _add_output(parser.add_argument_group("output"))
@@ -50,7 +50,8 @@ def run(args: argparse.Namespace) -> int:
     with _progress(len(images)) as advance:
         for number, image in enumerate(images):
             summary = _render_one(args, series, number, image)
-            print(json.dumps(summary) if args.json else _line(summary))
+            if args.json or not args.quiet:
+                print(json.dumps(summary) if args.json else _line(summary))
             advance()
     return 0
 
@@ -89,6 +90,9 @@ def _add_output(group: Any) -> None:
     group.add_argument("--truth-mag", type=_number, default=8.5, metavar="V", help="faintest star in the table (8.5)")
     group.add_argument("-O", "--overwrite", action="store_true", help="replace files that are there")
     group.add_argument("--json", action="store_true", help="one JSON object per image on stdout")
+    group.add_argument("--no-plots", action="store_true", help="accepted everywhere; render draws no plots")
+    group.add_argument("-v", "--verbose", action="count", default=0, help="tracebacks of internal errors")
+    group.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
 
 
 def _targets(args: argparse.Namespace) -> list[Path]:
@@ -230,6 +234,12 @@ def _positive(text: str) -> float:
     if _number(text) <= 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not above 0")
     return float(text)
+
+
+def _at_least_one(text: str) -> int:
+    if _count(text) == 0:
+        raise argparse.ArgumentTypeError("0 images are nothing to render")
+    return int(text)
 
 
 def _count(text: str) -> int:

@@ -16,6 +16,7 @@ from startrack.psf import noise_area_px
 from startrack.types import Array, Body, Bools, Detections, Evidence, Ints, Stars
 
 FAINTEST_SNR = 0.5  # fainter stars say next to nothing and would only cost time
+CROWDED = 4.0  # PSF areas per star: where more stars share the pixels, the same light would be counted twice
 BODY_GLARE_PX = 8.0
 TELLING_SNR = 2.0  # stars brighter than this tell whether they shine
 SEEN_LLR = 3.0  # from here on a star counts as seen, from minus this as hidden
@@ -55,6 +56,7 @@ class StarEvidence:
     """Forced photometry at the catalogue's stars, turned into log-likelihood ratios."""
 
     faintest_snr: float = FAINTEST_SNR
+    crowded: float = CROWDED
     capped: bool = True  # False: plain Gaussian ratios, to see what the caps are worth
 
     def __call__(
@@ -82,7 +84,8 @@ class StarEvidence:
         star = np.flatnonzero(stars.v_mag < faintest)
         rays_cam = stars.rays_icrs[star] @ R_cam_icrs.T
         xy, inside = camera.project(rays_cam)
-        star, xy, rays_cam = star[inside], xy[inside], rays_cam[inside]
+        brightest = np.flatnonzero(inside)[: _room(camera, self.crowded * noise_area_px(sigma_px))]
+        star, xy, rays_cam = star[brightest], xy[brightest], rays_cam[brightest]
         angle = np.arctan2(np.hypot(rays_cam[:, 0], rays_cam[:, 1]), rays_cam[:, 2])
         expected = scale.flux_e(stars.v_mag[star], angle, camera)
         blur = np.square(place_sigma_px / (2 * sigma_px))  # light lost from a misplaced profile
@@ -116,6 +119,14 @@ class StarEvidence:
             llr=np.where(cause == "", _spread(llr, measurable, len(star)), 0.0),
             cause=cause,
         )
+
+
+def _room(camera: Camera, area_px: float) -> int:
+    """How many stars fit on the frame, each on an area [px^2] of its own. Stars are sorted, the brightest first."""
+    rho = float(camera.lens.rho(np.array(camera.max_angle_rad)))
+    circle = np.pi * camera.focal_px[0] * camera.focal_px[1] * rho**2
+    width, height = camera.size_px
+    return max(int(min(circle, width * height) / area_px), 1)
 
 
 def _guess(

@@ -37,11 +37,16 @@ def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain) -> None:
     stretch, gain = best_stretch(evidence, fix, terrain)
     if gain > STRETCH_GAIN_NATS:
         raise NotLocated(
-            f"the stars see a horizon about {100 * abs(stretch - 1):.1f} % {'higher' if stretch > 1 else 'lower'} than "
-            f"the terrain {terrain.name} gives: is its depth, width or camera height right? "
+            f"the stars see a horizon about {_percent(stretch)} {'higher' if stretch > 1 else 'lower'} than the "
+            f"terrain {terrain.name} gives: are its depth, width, camera height and the camera file right? "
             "(a cylinder can take depth_sigma_m and diameter_sigma_m)",
             reason="inconsistent_evidence",
         )
+
+
+def _percent(stretch: float) -> str:
+    size = abs(stretch - 1)
+    return f"{100 * size:.1f} %" + (" or more" if size >= STRETCHES[-1] - 1e-9 else "")
 
 
 def contradicted_part(evidence: Evidence, fix: Fix, terrain: Terrain) -> float:

@@ -76,6 +76,11 @@ class Series:
         """
         rng = np.random.default_rng([self.seed, _EXPOSURE, number])
         time, place_m, heading, pitch, roll = self._pose(rng)
+        if not bool(self.terrain.allowed(place_m[None])[0]):
+            raise BadInput(
+                "bad_terrain",
+                f"{self.terrain.name}: no camera can stand at {place_m[0]:.0f} m east, {place_m[1]:.0f} north",
+            )
         site, exposure_s = self.terrain.site, self.exposure_used_s
         stars, v_error_mag = self._sky(site, time)
         height_m = float(self.terrain.ground_m(place_m[None])[0]) + self.terrain.camera_height_m

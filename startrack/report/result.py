@@ -192,5 +192,7 @@ def _tail(result: Result) -> dict[str, Any]:
             "terrain": exposure.terrain or (result.terrain.name if result.terrain is not None else None),
             "catalog": result.catalog_name or None,
             "time_utc": None if time_utc is None else format_utc(time_utc),
+            "exposure_s": exposure.exposure_s,
         },
+        "warnings": list(exposure.warnings),
     }

@@ -90,6 +90,7 @@ PROVENANCE = record({
     "terrain": _or_null(TEXT, "terrain file or name"),
     "catalog": _or_null(TEXT, "star catalogue"),
     "time_utc": _or_null({"type": "string", "format": "date-time"}, "middle of the exposure; null: not known"),
+    "exposure_s": _or_null(NUMBER, "seconds; null: not known"),
 })  # fmt: skip
 COMMON: Schema = {
     "image": TEXT,
@@ -100,10 +101,14 @@ COMMON: Schema = {
 # An image that could not even be read has no more than the common keys.
 MEASURED: Schema = {"stars": STARS, "timing_ms": record(dict.fromkeys(STAGES, POSITIVE)), "provenance": PROVENANCE}
 
+WARNINGS: Schema = {"type": "array", "items": TEXT, "description": "what was found in the image's file and not used"}
+
 
 def _result(kind: str, title: str, own: Schema, rules: list[Schema]) -> Schema:
     keys = {"format": {"const": FORMATS[kind]}, **COMMON}
-    return schema(title, record(keys, optional={**own, **MEASURED}) | {"allOf": [*_STATUS_RULES, *rules]})
+    return schema(
+        title, record(keys, optional={**own, **MEASURED, "warnings": WARNINGS}) | {"allOf": [*_STATUS_RULES, *rules]}
+    )
 
 
 def _when(status: str, then: Schema) -> Schema:

@@ -49,7 +49,6 @@ def verbose_text(result: Result) -> str:
     lines = [*_place(result), *_attitude(result), *_stars(result)]
     when = result.exposure.time_utc
     lines += [f"time       {format_utc(when) if when is not None else 'not known'} (middle of the exposure)"]
-    lines += [f"warning    {warning}" for warning in result.exposure.warnings]
     spent = [f"{stage} {result.timing_ms[stage]:.0f}" for stage in STAGES if stage in result.timing_ms]
     lines += [f"ms         {', '.join(spent)}"] if spent else []
     return "\n".join(f"  {line}" for line in lines)

@@ -59,12 +59,16 @@ def fit_lens(
     if len(points) < FEWEST:
         raise NotIdentified(f"{len(points)} matched stars cannot fix a lens: at least {FEWEST} are needed")
     state = State(camera=start, R_cam_icrs=np.asarray(R_cam_icrs, dtype=np.float64))
-    robust, extra = _robust(state, points, order)
-    used = _agreeing(robust, points, extra)
-    good = points.take(used)
-    if len(good) < FEWEST:
-        raise NotIdentified(f"only {len(good)} of {len(points)} matched stars agree on a lens", matched=len(good))
-    model, best, candidates = best_model(robust.state, good, max(extra, SMALLEST_PX2), order, plain)
+    for _ in range(2):
+        robust, extra = _robust(state, points, order)
+        used = _agreeing(robust, points, extra)
+        good = points.take(used)
+        if len(good) < FEWEST:
+            raise NotIdentified(f"only {len(good)} of {len(points)} matched stars agree on a lens", matched=len(good))
+        model, best, candidates = best_model(robust.state, good, max(extra, SMALLEST_PX2), order, plain)
+        if model_of(best.state.camera, None) == model_of(state.camera, None):
+            break
+        state = best.state  # the clip was that of a poorer model: once more with the better one
     return _finished(model, best, points, used, candidates)
 
 

@@ -14,7 +14,8 @@ from startrack.orient import rotation
 from startrack.types import Array
 
 ROUNDS = 40
-SETTLED_PX = 1e-7
+SETTLED_PX = 1e-6
+NEARLY_SETTLED_PX = 2e-3  # of a robust fit, which only has to tell wrong matches from right ones
 CAUCHY_CHI2 = 5.0  # chi^2 (two axes) at which the robust loss has halved a star's weight
 CHI2_2DOF_MEDIAN = 1.3863
 FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e6
@@ -69,7 +70,7 @@ def moved(camera: Camera, by: dict[str, float]) -> Camera:
         known = (*lens.k, 0.0, 0.0, 0.0, 0.0)
         lens = KannalaBrandt(tuple(float(known[n] + steps[n]) for n in range(order)))
     bent = camera.decentring
-    bent = Decentring(float(bent.p1 + by.get("p1", 0.0)), float(bent.p2 + by.get("p2", 0.0)), bent.e)
+    bent = Decentring(float(bent.p1 + by.get("p1", 0.0)), float(bent.p2 + by.get("p2", 0.0)))
     return replace(camera, focal_px=focal, centre_px=centre, lens=lens, decentring=bent)
 
 
@@ -118,7 +119,7 @@ def solve(
         damping = max(damping / 30.0, 1e-12)
         shift = float(np.sqrt(np.mean(np.square(trial_residual - residual)))) if len(residual) else 0.0
         state, rays_cam, residual, chi2, cost = trial, trial_rays, trial_residual, trial_chi2, trial_cost
-        settled = shift < SETTLED_PX
+        settled = shift < (NEARLY_SETTLED_PX if robust else SETTLED_PX)
     return Solution(state=state, terms=terms, normal=normal, residual_px=residual, chi2=chi2, weight=weight)
 
 

@@ -15,18 +15,16 @@ ROUNDING_1 = 1e-14
 
 @dataclass(frozen=True)
 class Decentring:
-    """(du, dv) = (2 p1 s t + p2 (a^2 + 2 s^2 - e), p1 (a^2 + 2 t^2 - e) + 2 p2 s t), in focal lengths.
+    """(du, dv) = (2 p1 s t + p2 (a^2 + 2 s^2), p1 (a^2 + 2 t^2) + 2 p2 s t), in focal lengths.
 
-    (s, t) = a (cos b, sin b), a the angle off the axis [rad]; added to rho (cos b, sin b). With e = 0 this is Brown's
-    tangential distortion on the angles of a fisheye, as in COLMAP's THIN_PRISM_FISHEYE. `e` only moves the origin: it
-    is chosen so that the centre stays where the best lens without decentring has it, and who ignores p loses least.
+    (s, t) = a (cos b, sin b), a the angle off the axis [rad]; added to rho (cos b, sin b). Brown's tangential
+    distortion on the angles of a fisheye, as in COLMAP's THIN_PRISM_FISHEYE.
 
     Source: Brown 1966, Photogrammetric Engineering 32, 444.
     """
 
     p1: float = 0.0
     p2: float = 0.0
-    e: float = 0.0  # [rad^2]
 
     def __bool__(self) -> bool:
         return bool(self.p1 or self.p2)
@@ -34,7 +32,7 @@ class Decentring:
     def shift(self, st: Array) -> Array:
         """(du, dv) (..., 2) at the angles (s, t) (..., 2) [rad]."""
         s, t = st[..., 0], st[..., 1]
-        a2 = s * s + t * t - self.e
+        a2 = s * s + t * t
         return np.stack(
             [2 * self.p1 * s * t + self.p2 * (a2 + 2 * s * s), self.p1 * (a2 + 2 * t * t) + 2 * self.p2 * s * t],
             axis=-1,

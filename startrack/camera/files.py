@@ -72,7 +72,7 @@ def camera_from_dict(d: dict[str, Any], default_name: str = "camera") -> Camera:
         calibrated_angle_rad=calibrated,
         lens=lens,
         mirrored=_typed(d, "mirrored", bool, False),
-        decentring=Decentring(*_numbers(d, "decentring", 3)) if "decentring" in d else Decentring(),
+        decentring=Decentring(*_numbers(d, "decentring", 2)) if "decentring" in d else Decentring(),
         R_body_cam=_mount(_table(d, "mount")),
         sensor=_sensor(_table(d, "sensor")) if "sensor" in d else None,
         covariance_order=order,
@@ -98,7 +98,7 @@ def camera_to_dict(camera: Camera) -> dict[str, Any]:
         "mirrored": camera.mirrored,
     }
     if camera.decentring:
-        d["decentring"] = [float(p) for p in (camera.decentring.p1, camera.decentring.p2, camera.decentring.e)]
+        d["decentring"] = [float(camera.decentring.p1), float(camera.decentring.p2)]
     if not np.array_equal(camera.R_body_cam, ZENITH_MOUNT_R_BODY_CAM):
         d["mount"] = {"quat_xyzw_body_cam": [float(q) for q in quat_xyzw_from_R(camera.R_body_cam)]}
     if camera.sensor is not None:

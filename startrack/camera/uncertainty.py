@@ -38,8 +38,7 @@ def lens_jacobian(camera: Camera, rays_cam: Array, order: tuple[str, ...]) -> Ar
     for n in range(1, 5):
         power = power * np.square(angle)
         columns[f"k{n}"] = (hand * fx * power * ux, fy * power * uy)
-    e = camera.decentring.e
-    for name, unit in (("p1", Decentring(1.0, 0.0, e)), ("p2", Decentring(0.0, 1.0, e))):
+    for name, unit in (("p1", Decentring(1.0, 0.0)), ("p2", Decentring(0.0, 1.0))):
         by = unit.shift(angle[..., None] * np.stack([ux, uy], axis=-1))
         columns[name] = (hand * fx * by[..., 0], fy * by[..., 1])
     return np.stack([np.stack(columns[name], axis=-1) for name in order], axis=-1)

@@ -37,7 +37,7 @@ CAMERA = schema(
             "k": {"type": "array", "items": NUMBER, "maxItems": 4},
             "calibrated_angle_deg": {**NUMBER, "description": "beyond this the lens is not known"},
             "mirrored": {"type": "boolean", "default": False},
-            "decentring": {**numbers(3), "description": "p1, p2, e of a decentred lens"},
+            "decentring": {**numbers(2), "description": "p1, p2 of a decentred lens"},
             "mount": MOUNT,
             "sensor": SENSOR,
             "covariance": record({

@@ -25,8 +25,7 @@ def text(camera: Camera) -> str:
     """The cameras.txt file, one camera: number 1."""
     lens, bent = plain(camera), camera.decentring
     (fx, fy), (cx, cy) = lens.focal_px, lens.centre_px
-    # COLMAP has no e: it goes into the centre.
-    values = [fx, fy, cx - fx * bent.e * bent.p2 + CORNER_PX, cy - fy * bent.e * bent.p1 + CORNER_PX]
+    values = [fx, fy, cx + CORNER_PX, cy + CORNER_PX]
     model = "PINHOLE"
     if bent:
         if lens.k is None:

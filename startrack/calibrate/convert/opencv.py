@@ -32,7 +32,7 @@ def camera(text: str, name: str) -> Camera:
         matrix, given = store.getNode("camera_matrix").mat(), store.getNode("distortion_coefficients").mat()
         size = (int(store.getNode("image_width").real()), int(store.getNode("image_height").real()))
         fisheye = store.getNode("fisheye_model").real() == 1
-    except cv2.error as cause:
+    except (cv2.error, SystemError) as cause:  # cv2 wraps what its parser throws in a SystemError
         raise unreadable("OpenCV", cause) from cause
     if matrix is None or matrix.shape != (3, 3) or given is None:
         raise unreadable("OpenCV", "camera_matrix or distortion_coefficients are missing")

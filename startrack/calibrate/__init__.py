@@ -2,7 +2,8 @@
 
 from startrack.calibrate.fit import LensFit, fit_lens
 from startrack.calibrate.observations import Observations, observations
+from startrack.calibrate.photometry import Given
 from startrack.calibrate.run import Calibration, calibrate
 from startrack.calibrate.start import first_state
 
-__all__ = ["Calibration", "LensFit", "Observations", "calibrate", "first_state", "fit_lens", "observations"]
+__all__ = ["Calibration", "Given", "LensFit", "Observations", "calibrate", "first_state", "fit_lens", "observations"]

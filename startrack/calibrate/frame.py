@@ -48,12 +48,9 @@ class Frame:
     """An exposure's sources and sky."""
 
     name: str
-    path: str
-    sha256: str
+    exposure: Exposure
     time_utc: datetime
-    exposure_s: float | None
     size_px: tuple[int, int]
-    saturation_adu: float | None
     detections: Detections  # fluxes in ADU; its pixel images are left out
     sky: Sky
 
@@ -66,12 +63,9 @@ def frame_of(exposure: Exposure, catalog: StarCatalog, site: Site | None, detect
     nothing = np.zeros((1, 1), dtype=np.float32)
     return Frame(
         name=exposure.name,
-        path=exposure.path,
-        sha256=exposure.sha256,
+        exposure=exposure,
         time_utc=exposure.time_utc,
-        exposure_s=exposure.exposure_s,
         size_px=exposure.size_px,
-        saturation_adu=exposure.saturation_adu,
         detections=replace(found, background_e=nothing, noise_e=nothing),
         sky=sky_at(catalog, exposure.time_utc, site),
     )

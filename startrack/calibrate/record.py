@@ -8,6 +8,7 @@ import numpy as np
 
 from startrack import __version__
 from startrack.calibrate.gates import coverage
+from startrack.calibrate.photometry import photometry_dict
 from startrack.calibrate.run import Calibration, Refused
 from startrack.camera import Camera, camera_to_dict
 from startrack.frames import format_utc, quat_xyzw_from_R
@@ -45,6 +46,7 @@ def calibration_dict(calibration: Calibration) -> dict[str, Any]:
             "ring_edges_deg": np.degrees(cover.ring_edges_rad).round(3).tolist(),
             "stars": cover.stars.astype(int).tolist(),
         },
+        "photometry": None if calibration.photometry is None else photometry_dict(calibration.photometry),
         "images": _images(calibration),
         "refused": [vars(refused) for refused in calibration.refused],
         "provenance": {"version": __version__, "false_alarm_probability": calibration.false_alarm_probability},
@@ -104,7 +106,7 @@ def _images(calibration: Calibration) -> list[dict[str, Any]]:
         held = fit.held_out_px[own]
         row: dict[str, Any] = {
             "image": frame.name,
-            "sha256": frame.sha256,
+            "sha256": frame.exposure.sha256,
             "time_utc": format_utc(frame.time_utc),
             "stars": int(own.sum()),
             "matched_fraction": matched.fraction,

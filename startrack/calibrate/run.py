@@ -11,6 +11,7 @@ from startrack.calibrate.fixed import without_fixed
 from startrack.calibrate.frame import Frame, frame_of
 from startrack.calibrate.gates import Gate, gates
 from startrack.calibrate.growing import Joint, grown, joint
+from startrack.calibrate.photometry import Given, Photometry, photometry
 from startrack.calibrate.start import opposite
 from startrack.camera import Camera
 from startrack.catalog import StarCatalog
@@ -41,6 +42,7 @@ class Calibration:
     refused: tuple[Refused, ...]
     site: Site | None
     false_alarm_probability: float  # the largest of the images' identifications
+    photometry: Photometry | None = None
 
     @property
     def failed(self) -> tuple[Gate, ...]:
@@ -80,14 +82,15 @@ def calibrate(
     camera: Camera | None = None,
     fov_rad: float | None = None,
     site: Site | None = None,
+    given: Given | None = None,
     name: str = "camera",
     progress: Progress = lambda text: None,
 ) -> Calibration:
     """The camera of exposures of the open sky, from an approximate `camera` or from a rough field of view alone.
 
-    `site`: on the Earth it lets refraction be taken out; without it the lens contains it. Raises BadInput (no_time,
-    size_mismatch, no_calibration), NotIdentified where no image's stars are named. Look at `accepted`: a calibration
-    that fails a gate must not be used.
+    `given`: what is known of the sensor already. `site`: on the Earth it lets refraction be taken out; without it the
+    lens contains it. Raises BadInput (no_time, size_mismatch, no_calibration), NotIdentified where no image's stars
+    are named. Look at `accepted`: a calibration that fails a gate must not be used.
     """
     if camera is None and fov_rad is None:
         raise BadInput("no_calibration", "give the field of view (--fov DEG) or an approximate camera file (-c)")
@@ -97,13 +100,17 @@ def calibrate(
     together = _together(run)
     fitted = replace(together.fit.camera, name=name)
     fitted = replace(fitted, max_angle_rad=_max_angle_rad(fitted, camera, fov_rad))
+    together = replace(together, fit=replace(together.fit, camera=fitted))
+    progress("measuring light and sensor")
+    light = photometry(together, given or Given())
     return Calibration(
-        camera=fitted,
+        camera=replace(fitted, sensor=light.sensor),
         joint=together,
         gates=gates(together),
         refused=tuple(run.refused),
         site=site,
         false_alarm_probability=run.worst_chance,
+        photometry=light,
     )
 
 
@@ -168,9 +175,9 @@ def _identified(run: _Run, frame: Frame) -> tuple[Camera, Identification]:
             return by_camera(known, frame)
         except NotIdentified as cause:
             refusal = cause
-    if run.fov_rad is None:
-        assert refusal is not None
+    if refusal is not None and (run.fov_rad is None or run.named):
         raise refusal
+    assert run.fov_rad is not None
     from startrack.identify.blind import identify_blind
 
     solution = identify_blind(frame.detections, frame.size_px, run.fov_rad, frame.sky.stars)

@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _calibrate(args: argparse.Namespace) -> int:
-    from startrack.calibrate import calibrate
+    from startrack.calibrate import Given, calibrate
     from startrack.calibrate.record import refusal_dict
     from startrack.catalog import load_catalog
     from startrack.report import write_json
@@ -109,6 +109,7 @@ def _calibrate(args: argparse.Namespace) -> int:
                 camera=start,
                 fov_rad=None if args.fov is None else math.radians(args.fov),
                 site=site_of(args, exposures),
+                given=Given(gain_e_per_adu=args.gain, read_noise_e=args.read_noise, bias_adu=args.bias),
                 name=args.name or out.stem,
                 progress=tell,
             )
@@ -122,6 +123,7 @@ def _calibrate(args: argparse.Namespace) -> int:
 def write_calibration(args: argparse.Namespace, out: Path, found: Calibration) -> int:
     """Write and print a calibration; the exit code."""
     from startrack.calibrate.record import calibration_dict, summary
+    from startrack.calibrate.report import write_report
     from startrack.camera.files import camera_text
     from startrack.exposure import write_atomically
     from startrack.report import write_json
@@ -131,6 +133,14 @@ def write_calibration(args: argparse.Namespace, out: Path, found: Calibration) -
     if found.accepted:
         write_atomically(out, camera_text(found.camera).encode("utf-8"), overwrite=True)
     write_json(out.with_suffix(".calibration.json"), record)
+    hot = None if found.photometry is None else found.photometry.facts.hot_px
+    if hot is not None:
+        lines = ["x_px,y_px", *(f"{x:.0f},{y:.0f}" for x, y in hot)]
+        write_atomically(out.with_suffix(".hot-pixels.csv"), ("\n".join(lines) + "\n").encode(), overwrite=True)
+    if not args.no_plots:
+        write_report(out, found)
+    if args.verbose and found.photometry is not None:
+        line += "".join(f"\n  {note}" for note in found.photometry.notes)
     return tell_outcome(args, record, line)
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.identify.family import PINHOLE, radius
 from startrack.identify.grow import WIDE, Grown, Stage, grow
-from startrack.identify.hypotheses import Guess, Hypotheses, Window, apart, patterns_for
+from startrack.identify.hypotheses import Guess, Hypotheses, Window, apart, narrow_sizes, patterns_for, wide_sizes
 from startrack.identify.polish import Polished, polished
-from startrack.types import Array, Detections, Identification, NotIdentified, Stars
+from startrack.types import Array, Detections, Identification, Ints, NotIdentified, Stars
 
 WIDE_FIELD_RAD = np.radians(100.0)  # from here up, `fov` is the angle of the image circle
 NARROW_FIELD_RAD = np.radians(40.0)  # up to here all lenses are nearly pinholes
@@ -21,13 +21,16 @@ FEWEST_NARROW = 7
 WINDOWS = (  # the brightest; those after them, as hot pixels may be brighter than stars; and more of all
     Window(0, 0, 16), Window(0, 16, 26), Window(26, 26, 46), Window(0, 26, 40), Window(46, 46, 70), Window(0, 40, 60),
 )  # fmt: skip
-LOG_PLAUSIBLE = -14.0  # of a start's chance hits: random skies reach -20 in a whole search
+LOG_PLAUSIBLE = -10.0  # of a start's chance hits: random skies reach -15 in a whole search
 LOG_FALSE_ALARM = float(np.log(1e-9))
 MOST_TRIED = 1_200_000  # patterns; a search without an answer ends here, after some seconds
-APART = 0.02  # of the frame: pattern stars are no closer
+ROOM = 1.3  # around a narrow field, for its focal length and centre are not known
+APART = 0.01  # of the frame: pattern stars are no closer
 CIRCLES = (0.5, 0.62, 0.42, 0.78, 1.0)  # radius of the image circle over the frame's shorter side
-SIZE_STEP = 0.13  # half width of a guess in the logarithm of the focal length
-SHAPE_STEP = 0.02  # error of the triangles' shapes that an unknown lens makes
+NARROW_WINDOWS = (
+    Window(0, 0, 8), Window(0, 8, 14), Window(14, 14, 26), Window(0, 14, 22), Window(26, 26, 40), Window(0, 22, 32),
+)  # fmt: skip
+FIELD_STEPS = 4.0  # indexes are made for fields a fourth part of a factor e apart
 WIDE_SHAPES = (-0.35, 0.25, -0.8, 0.7)
 MIDDLE_SHAPES = (PINHOLE, 0.4, -0.4)
 TRY = "is the field of view right, is this the night sky, and in focus? A camera file (startrack calibrate) needs fewer stars"
@@ -51,10 +54,10 @@ def identify_blind(
     give as many coincidences with probability below 1e-9, all trials included. Raises NotIdentified.
     """
     search = _Search(detections, size_px, fov_rad, stars, tolerance)
-    for grown in search.grown():
-        answer = polished(grown, detections, stars, search.hypotheses.tried, search.widest_rad)
+    for grown, around in search.grown():
+        answer = polished(grown, detections, stars.take(around), search.tried, search.widest_rad)
         if answer is not None and answer.log_chance < LOG_FALSE_ALARM and answer.matched >= search.fewest:
-            return _solution(answer)
+            return _solution(answer, around)
     raise NotIdentified(
         f"no lens of {np.degrees(fov_rad):.3g} degrees ({100 * tolerance:.0f} % more or less) explains the "
         f"{len(detections)} point sources better than chance ({search.tried} patterns tried): {TRY}",
@@ -63,12 +66,12 @@ def identify_blind(
     )
 
 
-def _solution(answer: Polished) -> BlindSolution:
+def _solution(answer: Polished, around: Ints) -> BlindSolution:
     return BlindSolution(
         camera=answer.camera,
         identification=Identification(
             detection=answer.detection,
-            star=answer.star,
+            star=around[answer.star],
             R_cam_icrs=answer.R_cam_icrs,
             false_alarm_probability=float(np.exp(max(answer.log_chance, -690.0))),
             unexplained=answer.unexplained,
@@ -86,7 +89,8 @@ class _Search:
         self.wide = fov_rad >= WIDE_FIELD_RAD
         self.fewest = FEWEST_WIDE if self.wide else FEWEST_NARROW
         self.xy_px = detections.xy_px
-        patterns = patterns_for(stars, self._field_sr(), SHAPE_STEP if fov_rad > NARROW_FIELD_RAD else 0.006, SIZE_STEP)
+        self.narrow = fov_rad <= NARROW_FIELD_RAD
+        patterns = patterns_for(stars, (narrow_sizes if self.narrow else wide_sizes)(self._rounded_field_sr()))
         chosen = apart(self.xy_px, APART * min(size_px), 100)
         if len(chosen) < self.fewest:
             raise NotIdentified(
@@ -105,10 +109,10 @@ class _Search:
         """Half the field, generously."""
         return 0.5 * self.fov_rad * (1 + self.tolerance)
 
-    def grown(self) -> Iterator[Grown]:
-        """Hypotheses that survive growing, each at once."""
+    def grown(self) -> Iterator[tuple[Grown, Ints]]:
+        """Hypotheses that survive growing, and the stars (indices) that they speak of."""
         stages = self._stages()
-        for window in WINDOWS:
+        for window in NARROW_WINDOWS if self.narrow else WINDOWS:
             if window.done >= len(self.hypotheses.xy_px):
                 return
             for guess in self._guesses():
@@ -117,18 +121,26 @@ class _Search:
                     if any(np.trace(R.T @ start.R_cam_icrs) > 1 + 2 * np.cos(0.05) for R in taken):
                         continue
                     taken.append(start.R_cam_icrs)
-                    found = grow(start, self.xy_px, self.stars.rays_icrs, stages)
+                    around = self._around(start.R_cam_icrs[2])
+                    found = grow(start, self.xy_px, self.stars.rays_icrs[around], stages)
                     if found is not None:
-                        yield found
+                        yield found, around
                 if self.tried > MOST_TRIED:
                     return
+
+    def _around(self, axis_icrs: Array) -> Ints:
+        """Indices of the stars that a narrow camera may see; for wide ones all of them."""
+        if self.wide:
+            return np.arange(len(self.stars))
+        reach = np.arctan(np.tan(self.fov_rad / 2) * np.hypot(*self.size_px) / self.size_px[0])
+        return np.flatnonzero(self.stars.rays_icrs @ axis_icrs > np.cos(reach * ROOM))
 
     def _guesses(self) -> list[Guess]:
         """Lenses to begin with: shapes by focal lengths, the likelier first."""
         width, height = self.size_px
         centre = ((width - 1) / 2, (height - 1) / 2)
         if not self.wide:
-            shapes = (PINHOLE,) if self.fov_rad <= NARROW_FIELD_RAD else MIDDLE_SHAPES
+            shapes = (PINHOLE,) if self.narrow else MIDDLE_SHAPES
             return [Guess(width / 2 / float(radius(self.fov_rad / 2, s)), s, centre) for s in shapes]
         shorter, diagonal = min(self.size_px), float(np.hypot(*self.size_px))
         circles = [c * shorter for c in CIRCLES if c * shorter < 0.56 * diagonal]
@@ -147,13 +159,22 @@ class _Search:
         other = half * self.size_px[1] / self.size_px[0]
         return float(4 * np.arcsin(half * other / np.sqrt((1 + half**2) * (1 + other**2))))
 
+    def _rounded_field_sr(self) -> float:
+        return float(np.exp(np.round(FIELD_STEPS * np.log(self._field_sr())) / FIELD_STEPS))
+
     def _stages(self) -> tuple[Stage, ...]:
         """The stages of growing, smaller for smaller fields."""
         if self.wide:
             return WIDE
         part = float(np.sqrt(self._field_sr() / (2 * np.pi)))
-        free = ("scale",) if self.fov_rad <= NARROW_FIELD_RAD else ("scale", "shape", "centre")
+        free = ("scale",) if self.narrow else ("scale", "shape", "centre")
         return tuple(
-            Stage(min(s.reach_rad * part if s.reach_rad < np.pi else np.pi, np.pi), s.gate_rad * part, s.detections, free, s.log_limit)
+            Stage(
+                min(s.reach_rad * part if s.reach_rad < np.pi else np.pi, np.pi),
+                s.gate_rad * part,
+                s.detections,
+                free,
+                s.log_limit,
+            )
             for s in WIDE
         )

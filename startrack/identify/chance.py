@@ -32,9 +32,7 @@ class ChanceModel:
         """Probability that at least one detection lies within the radius of a random direction among the detections."""
         return -np.expm1(-self.density_per_sr * np.pi * np.square(radius_rad))
 
-    def log_odds(
-        self, matched: Ints, predicted: Ints, radius_rad: float, given: int = 3, alike: float = 1.0
-    ) -> Array:
+    def log_odds(self, matched: Ints, predicted: Ints, radius_rad: float, given: int = 3, alike: float = 1.0) -> Array:
         """log P(at least `matched` of `predicted` stars coincide by chance), the `given` of the pattern not counted.
 
         `alike`: probability that a chance coincidence is accepted as equally bright.

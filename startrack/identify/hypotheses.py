@@ -27,8 +27,11 @@ NARROWEST_NEAR_RAD = np.radians(0.15)
 LOCAL_REACHES = 1.2  # of the patterns' reach: there an imperfect lens still fits
 CANDIDATES_AT_ONCE = 20_000
 MOST_STARTS = 12
-VERIFIED = ((10, -4.0), (24, -7.0), (80, 0.0))  # detections held against the stars, and log odds to go on
+VERIFIED = ((24, -1.5), (48, -4.0))  # detections held against the stars, and log odds to go on
+DEEPEST_VERIFIED = 80
+GIVEN = 3  # a triangle's own stars are hits whatever it is
 KEPT_INDEXES = 6
+STARS_OF_NARROW_FIELD = 18
 
 
 @dataclass(frozen=True)
@@ -69,28 +72,51 @@ class Patterns:
         return np.where(k > 0, np.log(np.maximum(tail, 1e-300)), 0.0)
 
 
-def patterns_for(stars: Stars, field_sr: float, shape_tolerance: float, size_tolerance: float) -> Patterns:
-    """Patterns of the stars (sorted, brightest first) for a camera that sees `field_sr`; the last few are kept."""
-    key = (stars.rays_icrs[:64].tobytes(), len(stars), round(4 * np.log(field_sr)), shape_tolerance, size_tolerance)
+@dataclass(frozen=True)
+class PatternSizes:
+    """How the catalogue's patterns are cut for a field of view."""
+
+    stars: int  # brightest of the whole sky
+    reach_rad: float  # longest side of a triangle
+    near_rad: float  # a detection this close to a bright star is a hit
+    shape_tolerance: float
+    size_tolerance: float
+
+
+def wide_sizes(field_sr: float) -> PatternSizes:
+    """Patterns for a lens that bends: loose triangles of few stars."""
+    part = min(field_sr / HEMISPHERE_SR, 1.0)
+    stars = int(min(STARS_OF_HEMISPHERE / part, MOST_PATTERN_STARS))
+    reach, near = REACH_OF_HEMISPHERE_RAD * np.sqrt(part), NEAR_OF_HEMISPHERE_RAD * np.sqrt(part)
+    return PatternSizes(stars, float(reach), float(max(near, NARROWEST_NEAR_RAD)), 0.02, 0.13)
+
+
+def narrow_sizes(field_sr: float) -> PatternSizes:
+    """Patterns for a lens that is almost a pinhole: sharp triangles over the whole field."""
+    diameter = np.sqrt(4 * field_sr / np.pi)
+    stars = int(min(STARS_OF_NARROW_FIELD * 4 * np.pi / field_sr, MOST_PATTERN_STARS))
+    near = max(0.015 * diameter, NARROWEST_NEAR_RAD)
+    return PatternSizes(stars, float(0.5 * diameter), float(near), 0.004, 0.12)
+
+
+def patterns_for(stars: Stars, sizes: PatternSizes) -> Patterns:
+    """Patterns of the stars (sorted, brightest first); the last few are kept, and serve for some years around."""
+    import hashlib
+
+    key = (sizes, len(stars), hashlib.sha1(np.round(stars.rays_icrs[:500], 3).tobytes()).hexdigest())
     if key not in _KEPT:
-        _KEPT[key] = _patterns(stars, float(np.exp(key[2] / 4)), shape_tolerance, size_tolerance)
+        star = bright_stars_apart(stars, sizes.stars)
+        rays = stars.rays_icrs[star]
+        found = triangles(rays, sizes.reach_rad * (1 + sizes.size_tolerance))
+        similar = similar_triangles(found, sizes.shape_tolerance, sizes.size_tolerance)
+        _KEPT[key] = Patterns(star, rays, sizes.reach_rad, similar, sky_map(rays, sizes.near_rad))
         while len(_KEPT) > KEPT_INDEXES:
             _KEPT.popitem(last=False)
     _KEPT.move_to_end(key)
     return _KEPT[key]
 
 
-_KEPT: OrderedDict[tuple[object, ...], Patterns] = OrderedDict()
-
-
-def _patterns(stars: Stars, field_sr: float, shape_tolerance: float, size_tolerance: float) -> Patterns:
-    part = min(field_sr / HEMISPHERE_SR, 1.0)
-    star = bright_stars_apart(stars, int(min(STARS_OF_HEMISPHERE / part, MOST_PATTERN_STARS)))
-    rays = stars.rays_icrs[star]
-    reach = float(REACH_OF_HEMISPHERE_RAD * np.sqrt(part))
-    found = similar_triangles(triangles(rays, reach * (1 + size_tolerance)), shape_tolerance, size_tolerance)
-    near = max(NEAR_OF_HEMISPHERE_RAD * np.sqrt(part), NARROWEST_NEAR_RAD)
-    return Patterns(star, rays, reach, found, sky_map(rays, near))
+_KEPT: OrderedDict[tuple[PatternSizes, int, str], Patterns] = OrderedDict()
 
 
 def rays_of(xy_px: Array, centre_px: tuple[float, float], focal_px: Array | float, shape: float) -> Array:
@@ -127,9 +153,7 @@ class Hypotheses:
             found += self._likely(guess, xy, image.take(left[part]), right[part], log_plausible)
         return sorted(found, key=lambda start: start.log_chance)[:MOST_STARTS]
 
-    def _likely(
-        self, guess: Guess, xy_px: Array, image: Triangles, right: Ints, log_plausible: float
-    ) -> list[Start]:
+    def _likely(self, guess: Guess, xy_px: Array, image: Triangles, right: Ints, log_plausible: float) -> list[Start]:
         """Starts from pairs of an image triangle and a catalogue triangle."""
         catalogue = self.patterns.triangles.triangles.take(right)
         focal = guess.focal_px * np.mean(image.sides_rad / catalogue.sides_rad, axis=1)
@@ -140,9 +164,10 @@ class Hypotheses:
         middle /= np.linalg.norm(middle, axis=1, keepdims=True)
         alive = np.arange(len(R))
         log_chance = np.zeros(len(R))
-        for verified, log_limit in ((*VERIFIED[0],), (*VERIFIED[1],), (VERIFIED[2][0], log_plausible)):
+        for verified, log_limit in (*VERIFIED, (DEEPEST_VERIFIED, log_plausible)):
             odds = self._odds(xy_px[:verified], R[alive], guess, focal[alive], mirrored[alive], middle[alive])
-            alive, log_chance = alive[odds < log_limit], odds[odds < log_limit]
+            log_chance = np.minimum(log_chance, odds)
+            alive, log_chance = alive[log_chance < log_limit], log_chance[log_chance < log_limit]
         best = np.argsort(log_chance, kind="stable")[:MOST_STARTS]
         return [
             Start(self._camera(guess, focal[i], bool(mirrored[i])), R[i], middle[i], float(chance))
@@ -160,8 +185,9 @@ class Hypotheses:
         hit = self.patterns.map(rays @ R)
         local = np.einsum("hni,hi->hn", rays, middle) > np.cos(LOCAL_REACHES * self.patterns.reach_rad)
         table = self.patterns.log_tail
-        everywhere = table[len(xy_px), hit.sum(axis=1)]
-        return np.minimum(everywhere, table[local.sum(axis=1), (hit & local).sum(axis=1)])
+        everywhere = table[max(len(xy_px) - GIVEN, 0), np.maximum(hit.sum(axis=1) - GIVEN, 0)]
+        around = np.maximum(local.sum(axis=1) - GIVEN, 0), np.maximum((hit & local).sum(axis=1) - GIVEN, 0)
+        return np.minimum(everywhere, table[around])
 
     def _camera(self, guess: Guess, focal: float, mirrored: bool) -> Camera:
         widest = Family(guess.shape).max_invertible_rad

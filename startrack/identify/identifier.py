@@ -119,7 +119,9 @@ class Identifier:
             star=star,
             R_cam_icrs=fit.attitude.R_cam_icrs,
             false_alarm_probability=float(np.exp(max(log_chance, -690.0))),
-            unexplained=unexplained_by(detections, camera, stars, fit.attitude.R_cam_icrs, matches.zero_mag, GATES_PX[-1]),
+            unexplained=unexplained_by(
+                detections, camera, stars, fit.attitude.R_cam_icrs, matches.zero_mag, GATES_PX[-1]
+            ),
         )
 
 

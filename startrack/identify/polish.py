@@ -85,7 +85,9 @@ def _refined(
         detection, star, _ = mutual_pairs(camera, R, xy, stars.rays_icrs, gate_px)
         if len(star) < FEWEST:
             return None
-        camera, R, _ = fit(camera, R, xy[detection], stars.rays_icrs[star], _free(camera, len(star)), gate_px / 4, prior)
+        camera, R, _ = fit(
+            camera, R, xy[detection], stars.rays_icrs[star], _free(camera, len(star)), gate_px / 4, prior
+        )
         camera = _bounded(camera, widest_rad)
     for gate_px in GATES_PX:
         matches = match(detections, camera, stars, R, gate_px, _blend_px(detections))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from startrack.localize.common import NEARBY_M, common_error, raised
 from startrack.localize.likelihood import Sectors
 from startrack.localize.scout import scores, taken
 from startrack.terrain import Terrain
@@ -72,6 +73,9 @@ def best_stretch(evidence: Evidence, fix: Fix, terrain: Terrain) -> tuple[float,
     wrong position cannot. Asked in the form tan e -> tan e / s, so that no terrain needs to know of it.
     """
     start = fix.position_enu_m[None, :2]
+    if terrain.common_sigma_rad > 0:  # what the file admits of is not to be found wrong
+        evidence = raised(evidence, common_error(evidence, terrain, start[0]).error_rad)
+    terrain = terrain.near(start[0], NEARBY_M)
     below = evidence.elevation_rad - terrain.horizon_rad(start, evidence.azimuth_rad)
     near = taken(evidence, (np.abs(below) < STRETCH_WINDOW_RAD) & (np.abs(evidence.llr) > TELLING_LLR))
     if not len(near):

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.localize import compiled
+from startrack.localize.common import marginalised_over_common
 from startrack.localize.crater import CraterFit, marginalised
+from startrack.localize.dive import best_by_diving
 from startrack.localize.likelihood import Sectors
 from startrack.localize.profile import Profile
 from startrack.localize.scout import likely_places, taken
@@ -45,12 +47,17 @@ class ExactPosterior:
 
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
         """Posterior of the camera's position. Raises NotLocated (insufficient_geometry, outside_search_area)."""
-        told = np.abs(evidence.llr) > 1e-3
+        told = (np.abs(evidence.llr) > 1e-3) & terrain.tells(evidence.azimuth_rad, evidence.elevation_rad)
         if told.sum() < FEWEST_RAYS:
             raise NotLocated(f"only {int(told.sum())} rays say anything about the skyline: expose longer")
         evidence = taken(evidence, told)
         if isinstance(terrain, Cylinder) and (terrain.depth_sigma_m > 0 or terrain.diameter_sigma_m > 0):
             (centres, half, log_weight, log_dropped), _ = marginalised(self._explored, evidence, terrain)
+        elif terrain.common_sigma_rad > 0:
+            place = _Search(self, evidence, terrain).place_m
+            centres, half, log_weight, log_dropped = marginalised_over_common(
+                lambda rays: self._explored(rays, terrain), evidence, terrain, place
+            )
         else:
             centres, half, log_weight, log_dropped = self._explored(evidence, terrain)
         dropped = float(np.exp(min(log_dropped - _log_mass(log_weight, half), 0.0)))
@@ -74,9 +81,13 @@ class _Search:
 
     def __init__(self, method: ExactPosterior, evidence: Evidence, terrain: Terrain) -> None:
         self.method, self.terrain = method, terrain
+        self.place_m = np.zeros(2)  # a good one to begin with
         self.sectors = Sectors.of(evidence, method.sector_width_rad, method.sector_epsilon)
         self.profile = Profile.of(self.sectors)
-        self.best = float(likely_places(evidence, self.sectors, terrain)[1].max(initial=-np.inf))
+        if isinstance(terrain, Cylinder):
+            self.best = float(likely_places(evidence, self.sectors, terrain)[1].max(initial=-np.inf))
+        else:  # real ground: horizons are costly, and the peak is narrower than any grid's step
+            self.place_m, self.best = best_by_diving(self.sectors, self.profile, terrain)
         self.log_dropped = -np.inf
 
     def exclude(self) -> RayBoxes:

@@ -79,6 +79,19 @@ class Cylinder:
         """Whether the points (..., 2) are on the floor."""
         return np.asarray(np.hypot(points_m[..., 0], points_m[..., 1]) < self.radius_m)
 
+    def tells(self, azimuths_rad: Array, elevations_rad: Array) -> Bools:
+        """True for every ray: the wall is known all around."""
+        return np.ones(np.broadcast_shapes(np.shape(azimuths_rad), np.shape(elevations_rad)), dtype=bool)
+
+    def near(self, centre_m: Array, half_m: float) -> Cylinder:
+        """Itself: a closed form is quick everywhere."""
+        return self
+
+    @property
+    def common_sigma_rad(self) -> float:
+        """Zero: depth_sigma_m and diameter_sigma_m say what is not known."""
+        return 0.0
+
 
 def _distance_to_circle(points_m: Array, azimuths_rad: Array, radius_m: Array | float) -> Array:
     """Distance from p along the azimuth to the far side of the origin's circle; 0 where there is none ahead."""

@@ -58,3 +58,19 @@ class Terrain(Protocol):
     def allowed(self, points_m: Array) -> Bools:
         """Whether a camera could stand at the points (..., 2): there is known ground under open sky."""
         ...
+
+    def tells(self, azimuths_rad: Array, elevations_rad: Array) -> Bools:
+        """Whether the terrain can speak of the rays (n,), from everywhere in the search area.
+
+        Not where ground off its maps may stand, nor in the glare of a sunlit rim: such rays give no evidence.
+        """
+        ...
+
+    def near(self, centre_m: Array, half_m: float) -> Terrain:
+        """The same ground, quick to ask about places within `half_m` of one; itself where it is quick anyway."""
+        ...
+
+    @property
+    def common_sigma_rad(self) -> float:
+        """Standard deviation of an error of the horizon that all azimuths and places share; 0: none."""
+        ...

@@ -1,0 +1,72 @@
+"""Tables of horizons kept on disk, by a hash of all that they follow from."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from startrack.terrain.table import BINS, HorizonTable, Square
+
+if TYPE_CHECKING:
+    from startrack.terrain.dem import HeightTerrain
+
+VERSION = 1  # of the tracing and of the table's format
+
+
+def cache_dir() -> Path:
+    """Folder of the tables: $XDG_CACHE_HOME/startrack/horizons, or ~/.cache/startrack/horizons."""
+    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(base) / "startrack" / "horizons"
+
+
+def key_of(terrain: HeightTerrain) -> str:
+    """SHA-256 over the maps' posts and geometry, the origin, the square, the camera's height and the format."""
+    digest = hashlib.sha256(f"startrack horizons {VERSION} {BINS}".encode())
+    site = terrain.site
+    numbers = [site.latitude_rad, site.longitude_rad, site.height_m, terrain.camera_height_m]
+    numbers += [terrain.reach_m, float(terrain.square.across), terrain.search_radius_m]
+    digest.update(np.array(numbers).tobytes())
+    for height_map in terrain.maps:
+        digest.update(height_map.grid_numbers(site).tobytes())
+        digest.update(np.ascontiguousarray(height_map.heights_m).data)
+    return digest.hexdigest()
+
+
+def path_of(key: str) -> Path:
+    """Where the table of a key is kept."""
+    return cache_dir() / f"{key[:40]}.npz"
+
+
+def loaded(key: str, square: Square) -> HorizonTable | None:
+    """The table of a key; None where there is none, or none that can be read."""
+    try:
+        with np.load(path_of(key), allow_pickle=False) as file:
+            values, unknown = file["values"], file["unknown_rad"]
+    except (OSError, ValueError, KeyError, EOFError):
+        return None
+    if values.shape != (square.across**2, BINS, 9) or unknown.shape != (BINS,):
+        return None
+    return HorizonTable(square, values, unknown)
+
+
+def save(key: str, table: HorizonTable) -> Path | None:
+    """Keep the table, whole or not at all; None where the folder cannot be written (the table is then made again)."""
+    path = path_of(key)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".making-", suffix=".npz")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                np.savez(file, values=table.values, unknown_rad=table.unknown_rad)
+            os.replace(name, path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+    except OSError:
+        return None
+    return path

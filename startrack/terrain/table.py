@@ -1,0 +1,122 @@
+"""What is worked out once per map and place: for each cell of the searched square and each degree of azimuth, bounds of
+the horizon, where it stands, and a line above and a point below the ground that makes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.types import Array, Bools, Ints
+
+BINS = 360  # azimuths; what the localizer asks at once are sectors of 1.5 degrees
+DISTANCE_STEP_M = 4.0
+ANGLE_STEP_RAD = np.pi / 65_000
+FIELDS = 8
+LOW, HIGH, FIRST, LAST, BEST, LINE_TAN, LINE_M, POINT_S, POINT_M = range(9)  # of what tracing finds
+FARTHEST = 65_535
+NOT_KNOWN_M = -32_768
+Progress = Callable[[int, int], None]  # cells done, of how many
+
+
+@dataclass(frozen=True)
+class Square:
+    """The searched square, cut into 2^n x 2^n cells; cell (i, j) is the i-th to the east and j-th to the north."""
+
+    reach_m: float
+    across: int
+
+    @property
+    def half_m(self) -> float:
+        return self.reach_m / self.across
+
+    @property
+    def centres_m(self) -> Array:
+        """(across^2, 2), the north running fastest."""
+        line = self.half_m * (2 * np.arange(self.across) + 1) - self.reach_m
+        east, north = np.meshgrid(line, line, indexing="ij")
+        return np.stack([east.ravel(), north.ravel()], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class HorizonTable:
+    """The cells' horizons, rounded away from the truth.
+
+    Of each cell and degree: 0, 1 bounds of the elevation [ANGLE_STEP_RAD above -pi/2]; 2, 3 between which distances the
+    horizon stands, 4 where it stands from the middle [DISTANCE_STEP_M]; 5, 6 the line z = a + t s that the ground there
+    does not exceed, t as an elevation and a [m]; 7, 8 a distance and a height [m] that it does not fall short of there.
+    """
+
+    square: Square
+    values: NDArray[np.uint16]  # (cells, BINS, 9)
+    unknown_rad: Array  # (BINS,) elevation below which ground off the maps might stand, seen from anywhere; or -pi/2
+
+    @cached_property
+    def pyramid(self) -> list[tuple[NDArray[np.uint16], NDArray[np.uint16]]]:
+        """Least and most elevation (n, n, BINS) of the cells, then of ever larger blocks of them."""
+        n = self.square.across
+        cells = self.values.reshape(n, n, BINS, 9)
+        levels = [(np.ascontiguousarray(cells[..., 0]), np.ascontiguousarray(cells[..., 1]))]
+        while levels[-1][0].shape[0] > 1:
+            levels.append((_quarters(levels[-1][0], np.minimum), _quarters(levels[-1][1], np.maximum)))
+        return levels
+
+
+def _quarters(a: NDArray[np.uint16], choose: np.ufunc) -> NDArray[np.uint16]:
+    return np.asarray(choose(choose(a[::2, ::2], a[1::2, ::2]), choose(a[::2, 1::2], a[1::2, 1::2])))
+
+
+def stored(found: Array) -> NDArray[np.uint16]:
+    """What tracing found (..., 9), rounded so that every bound still holds."""
+    out = np.empty(found.shape, dtype=np.uint16)
+    out[..., 0] = np.clip(np.floor((np.arctan(found[..., LOW]) + np.pi / 2) / ANGLE_STEP_RAD), 0, FARTHEST)
+    out[..., 1] = np.clip(np.ceil((np.arctan(found[..., HIGH]) + np.pi / 2) / ANGLE_STEP_RAD), 0, FARTHEST)
+    for to, name, rounded in ((2, FIRST, np.floor), (3, LAST, np.ceil), (4, BEST, np.round), (7, POINT_S, np.floor)):
+        out[..., to] = np.clip(rounded(found[..., name] / DISTANCE_STEP_M), 0, FARTHEST)
+    tilt = np.round((np.arctan(found[..., LINE_TAN]) + np.pi / 2) / ANGLE_STEP_RAD)
+    out[..., 5] = np.clip(tilt, 0, FARTHEST)
+    flatter = np.maximum(found[..., LINE_TAN] - np.tan(tilt * ANGLE_STEP_RAD - np.pi / 2), 0.0)
+    line = np.ceil(found[..., LINE_M] + flatter * np.maximum(found[..., LAST], 0.0))
+    out[..., 6] = np.clip(line, NOT_KNOWN_M, 32_767).astype(np.int16).view(np.uint16)
+    low = np.floor(found[..., POINT_M])
+    out[..., 8] = np.where(low < NOT_KNOWN_M, NOT_KNOWN_M, np.minimum(low, 32_767)).astype(np.int16).view(np.uint16)
+    # A line beyond what the field holds says nothing; neither does a point so far down.
+    out[..., 3] = np.where((line > 32_767) | (found[..., LAST] > FARTHEST * DISTANCE_STEP_M), FARTHEST, out[..., 3])
+    return out
+
+
+def built(
+    square: Square, wanted: Bools, fill: Callable[[Ints], Array], unknown_rad: Array, progress: Progress | None = None
+) -> HorizonTable:
+    """The table; `fill(cells)` traces some cells (n, BINS, 9). Cells not wanted hold no bounds, only -pi/2 to pi/2.
+
+    Cells are traced on all cores where tracing lets go of Python's lock.
+    """
+    from concurrent.futures import ThreadPoolExecutor
+
+    values = np.zeros((square.across**2, BINS, 9), dtype=np.uint16)
+    values[..., 1] = values[..., 3] = FARTHEST
+    values[..., 8] = np.array(NOT_KNOWN_M, dtype=np.int16).view(np.uint16)
+    cells = np.flatnonzero(wanted)
+    parts = np.array_split(cells, max(1, len(cells) // 64))
+    done = 0
+
+    def work(part: Ints) -> int:
+        values[part] = stored(fill(part))
+        return len(part)
+
+    with ThreadPoolExecutor(_cores()) as pool:
+        for count in pool.map(work, parts):
+            done += count
+            if progress is not None:
+                progress(done, len(cells))
+    return HorizonTable(square, values, unknown_rad)
+
+
+def _cores() -> int:
+    import os
+
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

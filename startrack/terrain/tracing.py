@@ -1,0 +1,100 @@
+"""Tracing with numba where it is installed, else with numpy alone: the same answers, some ten times later."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from startrack.terrain.table import BINS, HorizonTable
+from startrack.types import Array
+
+if TYPE_CHECKING:
+    from startrack.terrain.dem import HeightTerrain
+
+NO_VALUES = np.zeros((0, BINS, 9), dtype=np.uint16)
+
+
+class Tracer(Protocol):
+    """What a `HeightTerrain` asks: all flat arrays (n,), points and centres (n, 2)."""
+
+    def surfaces(self, terrain: HeightTerrain, points: Array) -> Array: ...
+    def horizons(
+        self, terrain: HeightTerrain, table: HorizonTable | None, points: Array, azimuths: Array
+    ) -> tuple[Array, Array, Array]: ...
+    def fill_cells(
+        self, terrain: HeightTerrain, centres: Array, half: float, azimuths: Array, turn: float
+    ) -> Array: ...
+    def box_bounds(self, terrain: HeightTerrain, table: HorizonTable, *arrays: Array) -> None: ...
+    def sector_bounds(self, terrain: HeightTerrain, table: HorizonTable, *arrays: Array) -> None: ...
+
+
+def tracer(use_compiled: bool | None = None) -> Tracer:
+    """The compiled tracer where numba is installed (None), or as asked."""
+    if use_compiled is None:
+        use_compiled = find_spec("numba") is not None
+    return CompiledTracer() if use_compiled else CompiledTracer()
+
+
+class CompiledTracer:
+    """By numba; it lets go of Python's lock."""
+
+    def surfaces(self, terrain: HeightTerrain, points: Array) -> Array:
+        """Heights in enu (n,)."""
+        from startrack.terrain import trace_compiled
+
+        up = np.empty(len(points))
+        trace_compiled.surfaces(terrain.ground, np.ascontiguousarray(points), up)
+        return up
+
+    def horizons(
+        self, terrain: HeightTerrain, table: HorizonTable | None, points: Array, azimuths: Array
+    ) -> tuple[Array, Array, Array]:
+        """tan, distance, distance of the maps' end (n,)."""
+        from startrack.terrain import table_compiled
+
+        tan, at, edge = (np.empty(len(azimuths)) for _ in range(3))
+        values, across, reach = _table(table)
+        table_compiled.horizons(
+            terrain.ground, values, across, reach, terrain.camera_height_m, points, azimuths, tan, at, edge
+        )
+        return tan, at, edge
+
+    def fill_cells(self, terrain: HeightTerrain, centres: Array, half: float, azimuths: Array, turn: float) -> Array:
+        """(cells, azimuths, 9), see `trace_compiled.bounds`."""
+        from startrack.terrain import trace_compiled
+
+        found = np.empty((len(centres), len(azimuths), 9))
+        trace_compiled.fill_cells(
+            terrain.ground, centres, half, terrain.camera_height_m, np.sin(azimuths), np.cos(azimuths), turn, found
+        )
+        return found
+
+    def box_bounds(self, terrain: HeightTerrain, table: HorizonTable, *arrays: Array) -> None:
+        """centres, half, azimuths, turn, and the results low, high."""
+        from startrack.terrain import table_compiled
+
+        table_compiled.box_bounds(terrain.ground, *_table(table), terrain.camera_height_m, *arrays)
+
+    def sector_bounds(self, terrain: HeightTerrain, table: HorizonTable, *arrays: Array) -> None:
+        """Likewise; all boxes of one size."""
+        from startrack.terrain import table_compiled
+
+        values, across, reach = _table(table)
+        lows, highs = table.pyramid[level_for(table, float(arrays[1][0]))]
+        table_compiled.many_sector_bounds(
+            terrain.ground, values, lows, highs, across, reach, terrain.camera_height_m, *arrays
+        )
+
+
+def level_for(table: HorizonTable, half: float) -> int:
+    """Level of the pyramid whose blocks are as wide as the box at least, or the last."""
+    level = 0
+    while level < len(table.pyramid) - 1 and table.square.half_m * 2**level * (1 + 1e-9) < half:
+        level += 1
+    return level
+
+
+def _table(table: HorizonTable | None) -> tuple[Any, int, float]:
+    return (NO_VALUES, 0, 0.0) if table is None else (table.values, table.square.across, table.square.reach_m)

@@ -7,25 +7,34 @@ from dataclasses import replace
 import numpy as np
 
 from startrack.detect.fit import PointFits, Stamps, fit_points
-from startrack.detect.frame import Frame, Pixels, radius_for
+from startrack.detect.frame import Frame, LightNoise, Pixels, radius_for
+from startrack.detect.own_noise import measured_light_noise
 from startrack.detect.peaks import Peaks
 from startrack.psf import pixel_profile
 from startrack.types import Array, Ints
 
+OWN_LIGHT_SNR = 8.0  # from here up the star's own light counts among the noise
 CROWDED_ROUNDS = 3  # of subtracting neighbours and fitting again
 NEIGHBOUR_SIGMA = 0.1  # neighbours' light above this part of a pixel's noise is taken away
 NEIGHBOUR_ERROR = np.float32(0.1)  # of it is not known: neighbours' fits, and the PSF's wings
 BATCH_PIXELS = 2_000_000  # of neighbours' stamps at a time
 
 
-def fit_all(frame: Frame, peaks: Peaks, sigma: float) -> PointFits:
-    """Fits (n) of all candidates."""
+def fit_all(frame: Frame, peaks: Peaks, sigma: float) -> tuple[PointFits, LightNoise]:
+    """Fits (n) of all candidates, and the noise of the stars' own light as the bright ones show it."""
     radius = radius_for(sigma)
     centres = peaks.centres
     data, variance, usable = frame.data(centres, radius), frame.variance(centres, radius), frame.usable(centres, radius)
     everything = Stamps(data, variance, usable, centres, peaks.surround)
     fits = fit_points(everything, peaks.start_xy_px, sigma, frame.light_noise, peaks.own_part)
     star, other = _pairs(centres, 1.5 * radius + 3.0 * sigma)
+    alone = np.ones(len(centres), dtype=bool)
+    alone[star[_may_count(everything, fits, star, other, sigma)]] = False
+    light_noise = measured_light_noise(everything, fits, alone, sigma, frame.light_noise)
+    if light_noise != frame.light_noise:
+        bright = np.flatnonzero(fits.snr > OWN_LIGHT_SNR)
+        again = fit_points(everything.part(bright), fits.xy_px[bright], sigma, light_noise, peaks.own_part)
+        fits = fits.replaced(bright, again)
     last = np.zeros_like(data)  # neighbours' light with which each was fitted
     for _ in range(CROWDED_ROUNDS):
         crowded, light = _neighbours_light(everything, fits, star, other, sigma)
@@ -35,10 +44,10 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float) -> PointFits:
             break
         last[crowded] = light
         part = everything.part(crowded)
-        alone = replace(part, data=part.data - light, variance=part.variance + np.square(NEIGHBOUR_ERROR * light))
-        again = fit_points(alone, fits.xy_px[crowded], sigma, frame.light_noise, peaks.own_part)
+        cleaned = replace(part, data=part.data - light, variance=part.variance + np.square(NEIGHBOUR_ERROR * light))
+        again = fit_points(cleaned, fits.xy_px[crowded], sigma, light_noise, peaks.own_part)
         fits = fits.replaced(crowded, again)
-    return fits
+    return fits, light_noise
 
 
 def _pairs(centres: Ints, reach_px: float) -> tuple[Ints, Ints]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from startrack.detect.fit import PointFits
 from startrack.detect.frame import Frame, Image, LightNoise, electrons
 from startrack.detect.judge import one_per_place, stars_among, threshold_for
 from startrack.detect.peaks import Peaks, find_peaks
+from startrack.detect.streaks import Streaks, drawn_out, find_streaks
 from startrack.detect.widths import measured_width
 from startrack.types import Bools, Detections, Exposure, TooFewStars
 
@@ -43,11 +44,14 @@ class Detector:
         known = camera.sensor.psf_sigma_px if camera is not None and camera.sensor is not None else None
         light_noise = LightNoise(per_unit=0.0 if known is None else 1.0)
         frame, peaks, fits, sigma = self._measured(image, dead, known or UNKNOWN_WIDTH_PX, light_noise)
+        if drawn_out(frame, peaks.centres) and (streaks := find_streaks(frame)) is not None:
+            return _of_streaks(frame, streaks)
         stars = self._stars(frame, peaks, fits, sigma)
         if _covered(stars, sigma, frame.shape) > CROWDED_PART:
-            frame = _frame(image, frame.dead, sigma, light_noise, painted(stars, sigma, frame.shape))
+            frame = _frame(image, frame.dead, sigma, frame.light_noise, painted(stars, sigma, frame.shape))
             peaks = find_peaks(frame, sigma, self._first_pass(sigma), self.max_candidates, known=stars.xy_px)
-            stars = self._stars(frame, peaks, fit_all(frame, peaks, sigma), sigma)
+            fits, own = fit_all(replace(frame, light_noise=light_noise), peaks, sigma)
+            stars = self._stars(replace(frame, light_noise=own), peaks, fits, sigma)
         if not len(stars.flux):
             raise TooFewStars(NOTHING_SEEN)
         return Detections(
@@ -72,12 +76,12 @@ class Detector:
             peaks = find_peaks(frame, sigma, self._first_pass(sigma), self.max_candidates)
             if not len(peaks.centres):
                 raise TooFewStars(NOTHING_SEEN)
-            fits = fit_all(frame, peaks, sigma)
+            fits, own = fit_all(frame, peaks, sigma)
             measured = None if last else measured_width(frame, peaks.centres, fits, sigma)
             if measured is None or abs(np.log(measured / sigma)) < WIDTH_TOLERANCE:
                 break
             sigma = measured
-        return frame, peaks, fits, sigma
+        return replace(frame, light_noise=own), peaks, fits, sigma
 
     def _first_pass(self, sigma: float) -> float:
         """A star between pixels shows less in the filtered image than its fit does."""
@@ -87,6 +91,21 @@ class Detector:
         good = stars_among(frame, peaks.centres, fits, sigma, self.threshold_snr)
         good = good[one_per_place(fits.xy_px[good], fits.flux[good], 1.2 * sigma)]
         return fits.take(good[np.argsort(-fits.flux[good], kind="stable")])
+
+
+def _of_streaks(frame: Frame, streaks: Streaks) -> Detections:
+    """The stars of a frame taken while the camera turned; the PSF's width is that of the whole streak."""
+    return Detections(
+        xy_px=streaks.xy_px,
+        covariance_px2=streaks.covariance_px2,
+        flux_e=streaks.flux,
+        flux_sigma_e=streaks.flux_sigma,
+        snr=streaks.flux / streaks.flux_sigma,
+        saturated=np.zeros(len(streaks.flux), dtype=bool),
+        psf_sigma_px=float(np.hypot(streaks.width_px, streaks.length_px / np.sqrt(12.0))),
+        background_e=frame.background,
+        noise_e=frame.noise,
+    )
 
 
 def _is_flat(image: Image) -> bool:

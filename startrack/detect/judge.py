@@ -17,7 +17,7 @@ OWN_LEVEL_PART = 0.8  # of the threshold that a source must reach by its own sta
 UNEVEN_SIGMA = 2.5  # difference of the stamp's level and that of its surroundings where these are not to be trusted
 EDGE_MARGIN = 8.0  # chi^2 by which an edge must explain a stamp better: noise alone gives faint stars less
 BAD_FIT_CHI2_PER_DOF = 4.0
-ROUGH_PSF_MISFIT = 0.1  # from here up the frame's own stars, not the Gaussian, say what a star looks like
+ROUGH_PSF_MISFIT = 0.06  # from here up the frame's own stars, not the Gaussian, say what a star looks like
 ROUGH_PSF_SPREAD = 2.0  # times the typical misfit that a star of such a frame may have
 LARGEST_SIGMA_PX = 2.0  # of the place
 

@@ -132,4 +132,5 @@ def _saturated_blobs(dead: NDArray[np.bool_] | None, margin: int) -> Array:
     inside = (middle >= margin).all(axis=1) & (middle[:, 0] < width - margin) & (middle[:, 1] < height - margin)
     compact = stats[1:count, cv2.CC_STAT_AREA] <= (2 * margin + 1) ** 2
     good = np.flatnonzero(inside & compact)
-    return middle[good[np.argsort(-stats[1 + good, cv2.CC_STAT_AREA], kind="stable")[:MOST_BLOBS]]]
+    chosen = good[np.argsort(-stats[1 + good, cv2.CC_STAT_AREA], kind="stable")[:MOST_BLOBS]]
+    return np.asarray(middle[chosen], dtype=np.float64)

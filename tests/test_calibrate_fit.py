@@ -115,10 +115,10 @@ def test_from_matches_alone_of_which_a_fifth_is_wrong(law, mirrored):
 
 
 def test_the_covariance_is_as_large_as_the_errors():
-    """Map error in units of its stated sigma, over 40 frames; fx and fy of square pixels are one unknown."""
+    """Map error in units of its stated sigma, over 25 frames; fx and fy of square pixels are one unknown."""
     total, freedom = 0.0, 0
     rays = even(88, 1500, np.random.default_rng(0))
-    for seed in range(40):
+    for seed in range(25):
         camera = fitted("kannala_brandt", 1, 100, 0.2, seed).camera
         assert camera.focal_px[0] == camera.focal_px[1]
         order = camera.covariance_order
@@ -130,12 +130,12 @@ def test_the_covariance_is_as_large_as_the_errors():
         covariance = np.delete(np.delete(camera.covariance, 1, 0), 1, 1)
         u, s, _ = np.linalg.svd(lens @ np.linalg.cholesky(covariance), full_matrices=False)
         total, freedom = total + np.sum((u.T @ miss / s) ** 2), freedom + len(s)
-    assert total / freedom == pytest.approx(1.0, abs=0.25)
+    assert total / freedom == pytest.approx(1.0, abs=0.3)
 
 
 def test_the_map_sigma_is_the_spread_of_the_maps():
     rays = even(85, 400, np.random.default_rng(4))
-    fits = [fitted("equisolid", 1, 150, 0.2, seed).camera for seed in range(25)]
+    fits = [fitted("equisolid", 1, 150, 0.2, seed).camera for seed in range(16)]
     stated = np.mean([np.mean(camera.map_sigma_px(rays) ** 2) for camera in fits])
     seen = np.mean(
         [0.5 * map_error_px(replace(c, calibrated_angle_rad=np.radians(85)), "equisolid") ** 2 for c in fits]

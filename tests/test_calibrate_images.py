@@ -88,8 +88,9 @@ def test_without_a_time_nothing_is_guessed(exposure):
 def test_noise_is_refused_with_advice(exposure):
     rng = np.random.default_rng(0)
     noise = replace(exposure, pixels_adu=rng.normal(1000, 20, (300, 400)).astype(np.float32))
-    with pytest.raises(NotIdentified, match="clear, dark night sky"):
+    with pytest.raises(NotIdentified, match="point source") as refusal:
         calibrate([noise], load_catalog(), camera=replace(load_camera("lowell-ldt"), size_px=(400, 300)))
+    assert refusal.value.reason == "no_stars"
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ class LensFit:
 
     camera: Camera  # with covariance; calibrated to where stars reach
     R_cam_icrs: Array  # (images, 3, 3)
-    turn_covariance_rad2: Array  # (images, 3, 3)
+    turn_covariance_rad2: Array  # (images, 3, 3); of boards (images, 6, 6), with the places [squares]
     residual_px: Array  # (n, 2) measured minus predicted, of all observations
     used: Bools  # (n,) not clipped
     held_out_px: Array  # (n, 2) residual where the fit did not see the observation; of the clipped ones the plain one
@@ -56,9 +56,14 @@ def fit_lens(
     `order`: how many k; None: held-out data decide. `plain`: square pixels and a centred lens, whatever they say.
     Raises NotIdentified where fewer than 12 observations agree with each other.
     """
+    state = State(camera=start, R_cam_icrs=np.asarray(R_cam_icrs, dtype=np.float64))
+    return fit_state(state, points, order=order, plain=plain)
+
+
+def fit_state(state: State, points: Observations, *, order: int | None = None, plain: bool = False) -> LensFit:
+    """As fit_lens, from a state: a board's has places beside the attitudes."""
     if len(points) < FEWEST:
         raise NotIdentified(f"{len(points)} matched stars cannot fix a lens: at least {FEWEST} are needed")
-    state = State(camera=start, R_cam_icrs=np.asarray(R_cam_icrs, dtype=np.float64))
     for _ in range(2):
         robust, extra = _robust(state, points, order)
         used = _agreeing(robust, points, extra)
@@ -91,7 +96,7 @@ def _agreeing(solution: Solution, points: Observations, extra: float) -> Bools:
 
 
 def _count(solution: Solution) -> int:
-    return solution.terms.lens.shape[2] + 3 * solution.terms.images
+    return solution.terms.lens.shape[2] + solution.terms.turn.shape[2] * solution.terms.images
 
 
 def _finished(

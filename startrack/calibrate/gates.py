@@ -20,7 +20,7 @@ FRACTION = 0.6
 HELD_OUT_RMS_PX = 1.0
 MAP_SIGMA_PX = 0.5
 CHANCE = 1e-9
-MOST_CERTAIN = -700.0  # natural logarithm
+MOST_CERTAIN = -690.0  # natural logarithm
 RINGS = 4
 SECTORS = 8
 STARS_PER_RING = 3
@@ -74,7 +74,7 @@ def log_chance(joint: Joint) -> float:
 
     Measured, not modelled: the same matching at attitudes that are surely wrong.
     """
-    from scipy.stats import poisson
+    from scipy.special import gammainc
 
     camera, within = joint.fit.camera, joint.fit.camera.calibrated_angle_rad
     found = sum(map(len, joint.matches))
@@ -85,8 +85,8 @@ def log_chance(joint: Joint) -> float:
         )
         for turn in TURNED_RAD
     ]
-    # The logarithm of an underflowing tail is -inf; no finite number of stars proves more than this.
-    return max(float(poisson.logsf(found - 1, max(float(np.mean(wrong)), 0.5))), MOST_CERTAIN)
+    tail = float(gammainc(max(found, 1), max(float(np.mean(wrong)), 0.5)))  # of a Poisson distribution
+    return max(float(np.log(max(tail, 1e-300))), MOST_CERTAIN)
 
 
 def opposite_rms_px(joint: Joint) -> float:
@@ -106,7 +106,7 @@ def gates(joint: Joint) -> tuple[Gate, ...]:
     cover = coverage(joint)
     rings = int(np.sum(cover.stars.sum(axis=1) >= STARS_PER_RING))
     sectors = int(np.sum(cover.stars.sum(axis=0) >= STARS_PER_SECTOR))
-    sigma = float(np.max(fit.camera.map_sigma_px(_seen(fit.camera))))
+    sigma = float(np.max(fit.camera.map_sigma_px(seen_rays(fit.camera))))
     held = fit.held_out_rms_px
     handed = opposite_rms_px(joint)
     return (
@@ -131,7 +131,7 @@ def gates(joint: Joint) -> tuple[Gate, ...]:
     )  # fmt: skip
 
 
-def _seen(camera: Camera) -> Array:
+def seen_rays(camera: Camera) -> Array:
     """Rays of the calibrated cap that fall into the frame."""
     grid = cap_grid(camera.calibrated_angle_rad)
     inside = camera.project(grid)[1]

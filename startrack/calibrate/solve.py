@@ -19,7 +19,6 @@ NEARLY_SETTLED_PX = 2e-3  # of a robust fit, which only has to tell wrong matche
 CAUCHY_CHI2 = 5.0  # chi^2 (two axes) at which the robust loss has halved a star's weight
 CHI2_2DOF_MEDIAN = 1.3863
 FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e6
-WIDEST_POLYNOMIAL_RAD = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,10 +37,14 @@ class State:
         rays_cam = self.rays_cam(points) if rays_cam is None else rays_cam
         return points.xy_px - project_freely(self.camera, rays_cam)
 
+    def terms(self, points: Observations, rays_cam: Array, free: tuple[str, ...]) -> Terms:
+        """Derivatives of the observations' pixels by the free parameters and the attitudes."""
+        return Terms.at(self.camera, rays_cam, points.image, len(self.R_cam_icrs), free)
+
     def stepped(self, free: tuple[str, ...], lens: Array, turns_rad: Array) -> State:
         """The state after a step of the free parameters (m,) and of the attitudes (images, 3)."""
         turned = np.stack([rotation(w) for w in turns_rad]) @ self.R_cam_icrs
-        return State(camera=moved(self.camera, dict(zip(free, lens.tolist(), strict=True))), R_cam_icrs=turned)
+        return replace(self, camera=moved(self.camera, dict(zip(free, lens.tolist(), strict=True))), R_cam_icrs=turned)
 
 
 def project_freely(camera: Camera, rays_cam: Array) -> Array:
@@ -100,7 +103,7 @@ def solve(
     chi2, cost = _cost(residual, inverse, robust)
     settled = False
     for _ in range(ROUNDS):
-        terms = Terms.at(state.camera, rays_cam, points.image, len(state.R_cam_icrs), free)
+        terms = state.terms(points, rays_cam, free)
         weight = inverse / (1.0 + chi2 / CAUCHY_CHI2)[:, None, None] if robust else inverse
         normal = terms.normal(weight, residual)
         if settled:

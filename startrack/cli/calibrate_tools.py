@@ -74,8 +74,11 @@ def verify(args: argparse.Namespace, words: list[str]) -> int:
 
 def board(args: argparse.Namespace, words: list[str]) -> int:
     """A camera file from pictures of a chessboard or a ChArUco board; the exit code."""
-    from startrack.calibrate.board import calibrate_board
-    from startrack.cli.calibrate import write_calibration
+    from startrack.calibrate.board import board_dict, board_line, calibrate_board
+    from startrack.calibrate.board_corners import Board
+    from startrack.camera.files import camera_text
+    from startrack.exposure import write_atomically
+    from startrack.report import write_json
 
     try:
         columns, rows = (int(n) for n in (args.pattern or "").lower().split("x"))
@@ -84,16 +87,20 @@ def board(args: argparse.Namespace, words: list[str]) -> int:
             "calibrate board needs --pattern CxR: inner corners of a chessboard, squares of a ChArUco board"
         )
     out = output_path(args, "camera.toml")
+    exposures = [read(word, args) for word in words]
     with progress(args) as tell:
-        found = calibrate_board(
-            words,
-            (columns, rows),
-            charuco=args.charuco,
-            marker_part=args.marker,
-            name=args.name or out.stem,
-            progress=tell,
-        )
-    return write_calibration(args, out, found)
+        try:
+            pattern = Board(columns, rows, args.charuco, args.marker)
+            found = calibrate_board(exposures, pattern, name=args.name or out.stem, progress=tell)
+        except NoSolution as cause:
+            record = {"status": "refused", "reason": cause.reason, "message": str(cause), "camera": None}
+            return tell_outcome(args, record, f"{out.name}  refused {cause.reason}: {cause}")
+    record = board_dict(found)
+    if found.accepted:
+        write_atomically(out, camera_text(found.camera).encode("utf-8"), overwrite=True)
+    write_json(out.with_suffix(".calibration.json"), record)
+    line = board_line(found, out.name) + (f"\n  {record['message']}" if record["message"] else "")
+    return tell_outcome(args, record, line)
 
 
 def _text(path: str) -> str:

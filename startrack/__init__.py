@@ -1,3 +1,29 @@
-"""Rover position and attitude from one picture of the stars."""
+"""Rover position and attitude from one picture of the stars.
+
+    import startrack
+    print(startrack.locate("image.png"))
+
+`locate`, `identify` and `detect` take a path or an array; the rooms below (`startrack.pipeline`, `startrack.localize`,
+...) are for those who want the stages one by one.
+"""
+
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+__all__ = ["Solution", "__version__", "detect", "identify", "locate"]
+
+if TYPE_CHECKING:
+    from startrack.api import Solution, detect, identify, locate
+
+
+def __getattr__(name: str) -> Any:
+    """The names of `startrack.api`, loaded when they are first asked for: importing startrack costs nothing."""
+    if name not in __all__:
+        raise AttributeError(f"module 'startrack' has no attribute {name!r}")
+    from startrack import api
+
+    return getattr(api, name)
+
+
+def __dir__() -> list[str]:
+    return __all__

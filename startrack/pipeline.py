@@ -5,7 +5,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,12 +29,15 @@ from startrack.types import (
     Fix,
     Identification,
     NoSolution,
+    NotIdentified,
     Stars,
 )
 
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog
 
+SHARP_PSF_PX = 0.9  # tried where the frame's own sources are wider than BLURRED_PSF_PX and name no stars
+BLURRED_PSF_PX = 2.0
 UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out
 NO_TIME = (
     "the mid-exposure time is not known: give --time UTC, a sidecar NAME.json with time_utc, or a header with it; "
@@ -109,6 +112,27 @@ def locate(
     return result
 
 
+def locate_exposure(exposure: Exposure, settings: Settings | None = None) -> Result:
+    """`locate` with the camera and the terrain that the exposure names, the time of reading them included.
+
+    Raises BadInput (no_calibration, bad_calibration, bad_terrain) where one is not named or cannot be used.
+    """
+    from startrack.camera import load_camera
+    from startrack.catalog import load_catalog
+    from startrack.terrain import load_terrain
+
+    start = clock.perf_counter()
+    if exposure.camera is None:
+        raise BadInput("no_calibration", "no camera file is known: give -c FILE or a sidecar with camera")
+    if exposure.terrain is None:
+        raise BadInput("bad_terrain", "no terrain file is known: give -t FILE or a sidecar with terrain")
+    camera, terrain = load_camera(exposure.camera), load_terrain(exposure.terrain)
+    read_ms = 1e3 * (clock.perf_counter() - start)
+    result = locate(exposure, camera, terrain, load_catalog(), settings)
+    result.timing_ms["read"] = read_ms
+    return result
+
+
 def identify(
     exposure: Exposure, camera: Camera, catalog: StarCatalog, settings: Settings | None = None, site: Site | None = None
 ) -> Result:
@@ -116,6 +140,39 @@ def identify(
     result = Result(exposure=exposure, camera=camera, catalog_name=catalog.name)
     with _refusals(result):
         _identify(result, catalog, settings or Settings(), site)
+        result.status = "ok"
+    return result
+
+
+def identify_blind(
+    exposure: Exposure, fov_rad: float, catalog: StarCatalog, settings: Settings | None = None
+) -> Result:
+    """Stars, attitude and lens without a camera file, from an approximate field of view [rad] alone.
+
+    Below 100 degrees that is the angle across the image's width, from there up that of the whole image circle. The lens
+    found is the result's camera ("unknown").
+    """
+    from startrack.identify.blind import identify_blind as solve
+
+    settings = settings or Settings()
+    result = Result(exposure=exposure, catalog_name=catalog.name)
+    with _refusals(result):
+        _take_stars(result, catalog, None)
+        assert result.stars is not None
+        for detector in (settings.detector, replace(settings.detector, psf_sigma_px=SHARP_PSF_PX)):
+            with _timed(result, "detect"):
+                result.detections = detector(exposure, None)
+            try:
+                with _timed(result, "identify"):
+                    found = solve(result.detections, exposure.size_px, fov_rad, result.stars)
+            except NotIdentified:
+                # Moonlight, clouds and trees may pass for stars out of focus, and hide the sharp ones.
+                if detector is not settings.detector or result.detections.psf_sigma_px < BLURRED_PSF_PX:
+                    raise
+            else:
+                break
+        result.camera, result.identification = found.camera, found.identification
+        _solve_attitude(result)
         result.status = "ok"
     return result
 
@@ -141,16 +198,29 @@ def _identify(result: Result, catalog: StarCatalog, settings: Settings, site: Si
     with _timed(result, "detect"):
         result.detections = settings.detector(exposure, camera)
     with _timed(result, "identify"):
-        # Without a site the Moon's centre stands in: the Earth's velocity differs by 0.7 arcsec of aberration.
-        where = site or Site("moon", 0.0, 0.0)
-        when = exposure.time_utc
-        result.stars = catalog.at(when, observer_velocity_m_s(where, when) if when is not None else None)
-        result.bodies = bodies(site, when) if site is not None and when is not None else []
+        _take_stars(result, catalog, site)
+        assert result.stars is not None
         result.identification = settings.identifier(result.detections, camera, result.stars)
+    _solve_attitude(result)
+
+
+def _take_stars(result: Result, catalog: StarCatalog, site: Site | None) -> None:
+    """The catalogue at the exposure's time.
+
+    Without a site the Moon's centre stands in: the Earth's velocity differs by 0.7 arcsec of aberration.
+    """
+    where = site or Site("moon", 0.0, 0.0)
+    when = result.exposure.time_utc
+    result.stars = catalog.at(when, observer_velocity_m_s(where, when) if when is not None else None)
+    result.bodies = bodies(site, when) if site is not None and when is not None else []
+
+
+def _solve_attitude(result: Result) -> None:
+    found, d = result.identification, result.detections
+    assert found is not None and d is not None and result.camera is not None and result.stars is not None
     with _timed(result, "attitude"):
-        found, d = result.identification, result.detections
         result.attitude_fit = solve_attitude(
-            camera,
+            result.camera,
             d.xy_px[found.detection],
             d.covariance_px2[found.detection],
             result.stars.rays_icrs[found.star],

@@ -6,8 +6,7 @@ import argparse
 import json
 import math
 import sys
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,10 +28,15 @@ BAD_INPUT_REASONS = frozenset(
 def add_image_flags(parser: argparse.ArgumentParser) -> None:
     """Flags of every command that reads images."""
     parser.add_argument("images", nargs="+", metavar="IMAGE", help="PNG, TIFF, FITS or JPEG")
+    add_fact_flags(parser)
+    add_output_flags(parser)
+
+
+def add_fact_flags(parser: argparse.ArgumentParser) -> None:
+    """Flags for what images may not say themselves."""
     parser.add_argument("-c", "--camera", metavar="FILE", help="camera file, or the name of a shipped one")
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601")
     parser.add_argument("--exposure", type=_seconds, metavar="S", help="exposure time in seconds")
-    add_output_flags(parser)
 
 
 def _seconds(text: str) -> float:
@@ -59,6 +63,12 @@ def add_output_flags(parser: argparse.ArgumentParser) -> None:
 def read(path: str, args: argparse.Namespace) -> Exposure:
     """The image with its facts; flags come before sidecar and header."""
     from startrack.exposure import read_exposure
+
+    return read_exposure(path, **flag_facts(args))
+
+
+def flag_facts(args: argparse.Namespace) -> dict[str, Any]:
+    """The facts that flags give, by the names of `read_exposure`."""
     from startrack.frames import parse_utc
 
     flags: dict[str, Any] = {
@@ -67,7 +77,7 @@ def read(path: str, args: argparse.Namespace) -> Exposure:
         "camera": args.camera,
         "terrain": getattr(args, "terrain", None),
     }
-    return read_exposure(path, **{key: value for key, value in flags.items() if value is not None})
+    return {key: value for key, value in flags.items() if value is not None}
 
 
 def camera_of(exposure: Exposure) -> Camera:
@@ -95,6 +105,8 @@ def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, s
     One image's BadInput, or even an internal error, is its own outcome; it never stops the others.
     """
     codes = [0]
+    from startrack.batch.find import output_stems
+
     for path, stem in zip(args.images, output_stems(args.images), strict=True):
         try:
             outcome = one(path, stem)
@@ -155,26 +167,6 @@ def _refused(path: str, cause: BadInput, format_name: str) -> Outcome:
         "message": str(cause),
     }
     return Outcome("refused", cause.reason, refusal_line(path, cause.reason, str(cause)), record)
-
-
-def output_stems(images: Sequence[str]) -> list[str]:
-    """Names of the results: the images' stems; equal stems keep their suffix, equal names get a number."""
-    names = [Path(image).name for image in images]
-    stems = [_stem(name) for name in names]
-    often = Counter(stems)
-    chosen = [name if often[stem] > 1 else stem for name, stem in zip(names, stems, strict=True)]
-    seen: Counter[str] = Counter()
-    unique = []
-    for name in chosen:
-        seen[name] += 1
-        unique.append(name if seen[name] == 1 else f"{name}-{seen[name]}")
-    return unique
-
-
-def _stem(name: str) -> str:
-    path = Path(name)
-    packed = path.suffix.lower() in {".gz", ".bz2", ".fz"}
-    return Path(path.stem).stem if packed and Path(path.stem).suffix else path.stem
 
 
 def result_path(args: argparse.Namespace, stem: str, suffix: str, exposure: Exposure) -> Path:

@@ -7,8 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from startrack.cli.common import Outcome, add_image_flags, camera_of, read, result_path, run_images
-from startrack.errors import BadInput
+from startrack.cli.common import Outcome, add_image_flags, read, result_path, run_images
 
 FORMAT = "startrack.fix/1"
 
@@ -32,36 +31,16 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
-    from startrack.catalog import load_catalog
-    from startrack.pipeline import locate
-    from startrack.report import (
-        result_dict,
-        summary_line,
-        verbose_text,
-        write_annotated,
-        write_json,
-        write_star_table,
-        write_wcs,
-    )
-    from startrack.terrain import load_terrain
+    from startrack.pipeline import locate_exposure
+    from startrack.report import summary_line, verbose_text, write_results
 
     start = time.perf_counter()
     exposure = read(path, args)
-    camera = camera_of(exposure)
-    if exposure.terrain is None:
-        raise BadInput("bad_terrain", "no terrain file is known: give -t FILE or a sidecar with terrain")
-    terrain = load_terrain(exposure.terrain)
     out = result_path(args, stem, ".fix.json", exposure)
     read_ms = 1e3 * (time.perf_counter() - start)
-    result = locate(exposure, camera, terrain, load_catalog())
-    result.timing_ms["read"] = read_ms
-    record = result_dict(result)
-    if result.light is not None:
-        write_star_table(out.with_name(f"{stem}.stars.ecsv"), result)
-        write_wcs(out.with_name(f"{stem}.wcs"), out.with_name(f"{stem}.corr"), result)
-    if not args.no_plots:
-        write_annotated(out.with_name(f"{stem}.annotated.png"), result)
-    write_json(out, record)
+    result = locate_exposure(exposure)
+    result.timing_ms["read"] += read_ms
+    record = write_results(result, out, plots=not args.no_plots)
     line = summary_line(result, seconds=time.perf_counter() - start)
     if args.verbose:
         line += "\n" + verbose_text(result) + f"\n  written to {Path(args.dir)}/{stem}.*"

@@ -2,7 +2,7 @@
 
 from startrack.report.result import detection_dict, identification_dict, refused_dict, result_dict
 from startrack.report.summary import refusal_line, summary_line, verbose_text
-from startrack.report.write import write_annotated, write_json, write_star_table, write_wcs
+from startrack.report.write import write_annotated, write_json, write_results, write_star_table, write_wcs
 
 __all__ = [
     "detection_dict",
@@ -14,6 +14,7 @@ __all__ = [
     "verbose_text",
     "write_annotated",
     "write_json",
+    "write_results",
     "write_star_table",
     "write_wcs",
 ]

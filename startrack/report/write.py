@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.exposure import write_atomically
@@ -12,6 +13,24 @@ if TYPE_CHECKING:
     from startrack.pipeline import Result
 
 FilePath = str | os.PathLike[str]
+
+
+def write_results(result: Result, path: Path, *, plots: bool = True, write_record: bool = True) -> dict[str, Any]:
+    """The record of a located image, written to `path` (NAME.fix.json) after its companions: star table, WCS, picture.
+
+    Raises BadInput where they cannot be written.
+    """
+    from startrack.report.result import result_dict
+
+    record, stem = result_dict(result), path.name.removesuffix(".fix.json")
+    if result.light is not None:
+        write_star_table(path.with_name(f"{stem}.stars.ecsv"), result)
+        write_wcs(path.with_name(f"{stem}.wcs"), path.with_name(f"{stem}.corr"), result)
+    if plots:
+        write_annotated(path.with_name(f"{stem}.annotated.png"), result)
+    if write_record:
+        write_json(path, record)
+    return record
 
 
 def write_json(path: FilePath, record: dict[str, Any]) -> None:

@@ -1,0 +1,204 @@
+"""The library's front door: a picture to a solution that prints itself, with astropy's types at the edge."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack import pipeline
+from startrack.camera import Camera, load_camera
+from startrack.catalog import load_catalog
+from startrack.exposure import read_exposure, with_facts
+from startrack.frames import parse_utc
+from startrack.report import result_dict, summary_line, verbose_text, write_results
+from startrack.report.result import boresight_rad, detection_dict, identification_dict
+from startrack.terrain import Terrain, load_terrain
+from startrack.types import Array, BadInput, Exposure
+
+if TYPE_CHECKING:
+    from astropy.coordinates import SkyCoord
+    from astropy.table import QTable
+    from astropy.time import Time
+
+Picture = str | os.PathLike[str] | NDArray[Any] | Exposure
+When = "str | datetime | Time | None"
+
+
+@dataclass(frozen=True, repr=False)
+class Solution:
+    """What became of one picture. `status` is ok, ambiguous or refused; what was not reached is None."""
+
+    result: pipeline.Result
+
+    @property
+    def status(self) -> str:
+        return self.result.status
+
+    @property
+    def reason(self) -> str | None:
+        return self.result.reason
+
+    @property
+    def message(self) -> str:
+        return self.result.message
+
+    def __bool__(self) -> bool:
+        return self.status == "ok"
+
+    @property
+    def position_m(self) -> Array | None:
+        """The camera's (east, north, up) [m] from the terrain's origin; None unless the status is ok."""
+        return self.result.fix.position_enu_m if self.result.fix is not None and self else None
+
+    @property
+    def covariance_m2(self) -> Array | None:
+        """Of (east, north), (2, 2) [m2]."""
+        return self.result.fix.covariance_m2 if self.result.fix is not None and self else None
+
+    @property
+    def radius95_m(self) -> float | None:
+        """Radius [m] of the circle about the position that holds 95 % of the posterior."""
+        return self.result.fix.radius95_m if self.result.fix is not None and self else None
+
+    @property
+    def modes(self) -> QTable | None:
+        """Every place that fits: east, north, weight; heaviest first."""
+        if self.result.fix is None:
+            return None
+        from astropy import units as u
+        from astropy.table import QTable
+
+        modes = self.result.fix.modes
+        east, north = [m.east_m for m in modes] * u.m, [m.north_m for m in modes] * u.m
+        return QTable({"east": east, "north": north, "weight": [m.weight for m in modes]})
+
+    @property
+    def time(self) -> Time | None:
+        """Middle of the exposure, UTC."""
+        if self.result.exposure.time_utc is None:
+            return None
+        from astropy.time import Time
+
+        return Time(self.result.exposure.time_utc.astimezone(UTC).replace(tzinfo=None), scale="utc")
+
+    @property
+    def boresight(self) -> SkyCoord | None:
+        """Where the camera's axis points, ICRS."""
+        if self.result.attitude is None:
+            return None
+        from astropy.coordinates import SkyCoord
+
+        ra, dec, _ = boresight_rad(self.result.attitude.R_cam_icrs)
+        return SkyCoord(ra, dec, unit="rad", frame="icrs")
+
+    @property
+    def stars(self) -> QTable | None:
+        """The star table: every catalogue star in view, with units."""
+        if self.result.stars is None or self.result.attitude is None:
+            return None
+        from astropy.table import QTable
+
+        from startrack.report.star_table import star_table_text
+
+        return QTable.read(star_table_text(self.result), format="ascii.ecsv")
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `NAME.fix.json` holds (or, without a terrain, the identification; or the detections)."""
+        if self.result.terrain is not None:
+            return result_dict(self.result)
+        return identification_dict(self.result) if self.result.stars is not None else detection_dict(self.result)
+
+    def write(self, folder: str | os.PathLike[str], *, plots: bool = True) -> Path:
+        """The files that `startrack locate` writes; returns the path of NAME.fix.json."""
+        path = Path(folder) / f"{self.result.exposure.name or 'image'}.fix.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_results(self.result, path, plots=plots)
+        return path
+
+    def __repr__(self) -> str:
+        return summary_line(self.result)
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        text = escape(f"{summary_line(self.result)}\n{verbose_text(self.result)}")
+        return f"<pre>{text}</pre>"
+
+
+def locate(
+    image: Picture,
+    *,
+    camera: str | Camera | None = None,
+    terrain: str | Terrain | None = None,
+    time: When = None,
+    settings: pipeline.Settings | None = None,
+) -> Solution:
+    """Position and attitude from a picture of the stars.
+
+    `image` is a file, an array (H, W) of raw counts, or an Exposure; `camera` and `terrain` are files, names of shipped
+    ones, or the objects; `time` is the middle of the exposure: text, datetime or astropy Time (any scale). What is not
+    given comes from the image's sidecar or header. Raises BadInput for a file that cannot be used; a picture that
+    cannot be solved gives a Solution that says why.
+    """
+    exposure = _exposure(image, time)
+    found = pipeline.locate(exposure, _camera(camera, exposure), _terrain(terrain, exposure), load_catalog(), settings)
+    return Solution(found)
+
+
+def identify(image: Picture, *, camera: str | Camera | None = None, time: When = None) -> Solution:
+    """Stars and attitude only: no terrain needed, nor a time."""
+    exposure = _exposure(image, time)
+    return Solution(pipeline.identify(exposure, _camera(camera, exposure), load_catalog()))
+
+
+def detect(image: Picture, *, camera: str | Camera | None = None) -> Solution:
+    """Centroids only; with a camera their fluxes are in electrons."""
+    exposure = _exposure(image, None)
+    known = camera is not None or exposure.camera is not None
+    return Solution(pipeline.detect(exposure, _camera(camera, exposure) if known else None))
+
+
+def _exposure(image: Picture, time: Any) -> Exposure:
+    time_utc = _utc(time)
+    if isinstance(image, Exposure):
+        return with_facts(image, time_utc=time_utc)
+    if isinstance(image, np.ndarray):
+        whole = np.issubdtype(image.dtype, np.integer)
+        largest = float(np.iinfo(image.dtype).max) if whole else None
+        return Exposure(pixels_adu=image, name="array", time_utc=time_utc, saturation_adu=largest)
+    return read_exposure(image, **({} if time_utc is None else {"time_utc": time_utc}))
+
+
+def _utc(time: Any) -> datetime | None:
+    if time is None:
+        return None
+    if isinstance(time, str):
+        return parse_utc(time)
+    if isinstance(time, datetime):
+        if time.tzinfo is None:
+            raise BadInput("no_time", f"{time} has no time zone: give UTC")
+        return time.astimezone(UTC)
+    return parse_utc(time.utc.isot)  # astropy's Time, whatever its scale
+
+
+def _camera(camera: str | Camera | None, exposure: Exposure) -> Camera:
+    if isinstance(camera, Camera):
+        return camera
+    reference = camera if camera is not None else exposure.camera
+    if reference is None:
+        raise BadInput("no_calibration", "no camera is known: give camera=")
+    return load_camera(str(reference))
+
+
+def _terrain(terrain: str | Terrain | None, exposure: Exposure) -> Terrain:
+    reference = terrain if terrain is not None else exposure.terrain
+    if reference is None:
+        raise BadInput("bad_terrain", "no terrain is known: give terrain=")
+    return load_terrain(str(reference)) if isinstance(reference, str | os.PathLike) else reference

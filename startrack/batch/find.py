@@ -1,0 +1,105 @@
+"""Which files of a tree are images, and what their results are called."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from startrack.exposure.facts import PACKING_SUFFIXES, PICTURE_SUFFIXES
+from startrack.types import BadInput
+
+OWN_PICTURES = (".annotated.png",)
+
+
+@dataclass(frozen=True, order=True)
+class Image:
+    """One image of a batch."""
+
+    name: str  # path relative to the folder, with / on every system
+    stem: str  # of its results, relative to the folder of the results
+    path: str
+
+
+def images_under(folder: str | os.PathLike[str], apart_from: str | os.PathLike[str] | None = None) -> list[Image]:
+    """Every image of the tree, in the order of their names; hidden files, links to folders and `apart_from` left out.
+
+    Raises BadInput (bad_image) where there is no such folder.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise BadInput("bad_image", f"{folder}: no such folder")
+    without = None if apart_from is None else Path(apart_from).resolve()
+    return _images(root, _names(root, without))
+
+
+def named_images(folder: str | os.PathLike[str], paths: Iterable[str]) -> list[Image]:
+    """The images named, one path each: absolute, or relative to the folder. All must lie under it.
+
+    Raises BadInput (bad_image) for one that does not.
+    """
+    root = Path(folder)
+    names = set()
+    for text in filter(None, (path.strip("\r\n") for path in paths)):
+        whole = root / text
+        try:
+            names.add(whole.resolve().relative_to(root.resolve()).as_posix())
+        except ValueError:
+            raise BadInput("bad_image", f"{text} is not under {folder}") from None
+    return _images(root, sorted(names))
+
+
+def output_stems(images: Sequence[str]) -> list[str]:
+    """Names of the results: the images' stems; equal stems keep their suffix, equal names get a number."""
+    names = [Path(image).name for image in images]
+    stems = [_stem(name) for name in names]
+    often = Counter(stems)
+    chosen = [name if often[stem] > 1 else stem for name, stem in zip(names, stems, strict=True)]
+    seen: Counter[str] = Counter()
+    unique = []
+    for name in chosen:
+        seen[name] += 1
+        unique.append(name if seen[name] == 1 else f"{name}-{seen[name]}")
+    return unique
+
+
+def _images(root: Path, names: Sequence[str]) -> list[Image]:
+    folders: dict[str, list[str]] = {}
+    for name in names:
+        folders.setdefault(str(PurePosixPath(name).parent), []).append(name)
+    found = [
+        Image(name, (PurePosixPath(parent) / stem).as_posix(), str(root / name))
+        for parent, group in folders.items()
+        for name, stem in zip(group, output_stems(group), strict=True)
+    ]
+    return sorted(found)
+
+
+def _names(root: Path, without: Path | None) -> list[str]:
+    found = []
+    for parent, folders, files in os.walk(root):
+        here = Path(parent)
+        folders[:] = [name for name in folders if not name.startswith(".") and (here / name).resolve() != without]
+        found += [(here / name).relative_to(root).as_posix() for name in files if _is_image(name)]
+    return sorted(found)
+
+
+def _is_image(name: str) -> bool:
+    lower = name.lower()
+    if lower.startswith(".") or lower.endswith(OWN_PICTURES):
+        return False
+    return any(Path(one).suffix in PICTURE_SUFFIXES for one in _unpacked(lower))
+
+
+def _unpacked(name: str) -> Iterator[str]:
+    yield name
+    if Path(name).suffix in PACKING_SUFFIXES:
+        yield Path(name).stem
+
+
+def _stem(name: str) -> str:
+    path = Path(name)
+    packed = path.suffix.lower() in PACKING_SUFFIXES
+    return Path(path.stem).stem if packed and Path(path.stem).suffix else path.stem

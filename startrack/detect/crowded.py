@@ -2,52 +2,69 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.detect.fit import PointFits, Stamps, fit_points
+from startrack.detect.fit import ROUNDS_AGAIN, PointFits, Stamps, fit_points
 from startrack.detect.frame import Frame, LightNoise, Pixels, radius_for
 from startrack.detect.own_noise import measured_light_noise
 from startrack.detect.peaks import Peaks
-from startrack.psf import pixel_profile
+from startrack.psf import pixel_profile_single
 from startrack.types import Array, Ints
 
-OWN_LIGHT_SNR = 8.0  # from here up the star's own light counts among the noise
 CROWDED_ROUNDS = 3  # of subtracting neighbours and fitting again
 NEIGHBOUR_SIGMA = 0.1  # neighbours' light above this part of a pixel's noise is taken away
 NEIGHBOUR_ERROR = np.float32(0.1)  # of it is not known: neighbours' fits, and the PSF's wings
 BATCH_PIXELS = 2_000_000  # of neighbours' stamps at a time
 
 
-def fit_all(frame: Frame, peaks: Peaks, sigma: float) -> tuple[PointFits, LightNoise]:
-    """Fits (n) of all candidates, and the noise of the stars' own light as the bright ones show it."""
+@dataclass(frozen=True)
+class Fitted:
+    """All candidates (n) with their stamps and fits, and the noise of the light of the stars themselves."""
+
+    stamps: Stamps
+    fits: PointFits
+    light_noise: LightNoise
+
+
+def fit_all(frame: Frame, peaks: Peaks, sigma: float) -> Fitted:
+    """Fits of all candidates."""
     radius = radius_for(sigma)
     centres = peaks.centres
     data, variance, usable = frame.data(centres, radius), frame.variance(centres, radius), frame.usable(centres, radius)
-    everything = Stamps(data, variance, usable, centres, peaks.surround)
-    fits = fit_points(everything, peaks.start_xy_px, sigma, frame.light_noise, peaks.own_part)
+    stamps = Stamps(data, variance, usable, centres, peaks.surround)
+    fits = fit_points(stamps, peaks.start_xy_px, sigma, frame.light_noise, peaks.own_part)
     star, other = _pairs(centres, 1.5 * radius + 3.0 * sigma)
     alone = np.ones(len(centres), dtype=bool)
-    alone[star[_may_count(everything, fits, star, other, sigma)]] = False
-    light_noise = measured_light_noise(everything, fits, alone, sigma, frame.light_noise)
-    if light_noise != frame.light_noise:
-        bright = np.flatnonzero(fits.snr > OWN_LIGHT_SNR)
-        again = fit_points(everything.part(bright), fits.xy_px[bright], sigma, light_noise, peaks.own_part)
+    alone[star[_may_count(stamps, fits, star, other, sigma)]] = False
+    light_noise = measured_light_noise(stamps, fits, alone, sigma, frame.light_noise)
+    bright = _otherwise_weighted(fits, sigma, variance, frame.light_noise, light_noise)
+    if len(bright):
+        start = fits.xy_px[bright]
+        again = fit_points(stamps.part(bright), start, sigma, light_noise, peaks.own_part, ROUNDS_AGAIN)
         fits = fits.replaced(bright, again)
     last = np.zeros_like(data)  # neighbours' light with which each was fitted
     for _ in range(CROWDED_ROUNDS):
-        crowded, light = _neighbours_light(everything, fits, star, other, sigma)
+        crowded, light = _neighbours_light(stamps, fits, star, other, sigma)
         changed = (np.square(light - last[crowded]) > NEIGHBOUR_SIGMA**2 * variance[crowded]).any(axis=(1, 2))
         crowded, light = crowded[changed], light[changed]
         if not len(crowded):
             break
         last[crowded] = light
-        part = everything.part(crowded)
+        part = stamps.part(crowded)
         cleaned = replace(part, data=part.data - light, variance=part.variance + np.square(NEIGHBOUR_ERROR * light))
         again = fit_points(cleaned, fits.xy_px[crowded], sigma, light_noise, peaks.own_part)
         fits = fits.replaced(crowded, again)
-    return fits, light_noise
+    return Fitted(stamps, fits, light_noise)
+
+
+def _otherwise_weighted(fits: PointFits, sigma: float, variance: Pixels, was: LightNoise, now: LightNoise) -> Ints:
+    """Candidates whose middle pixel has another variance by a tenth with what is known now of the light's noise."""
+    light = np.maximum(fits.flux, 0.0) / (2.0 * np.pi * sigma**2 + 1.0)
+    dark = variance[:, variance.shape[1] // 2, variance.shape[2] // 2]
+    before, after = (dark + light * (n.per_unit + n.model_error**2 * light) for n in (was, now))
+    return np.flatnonzero(np.abs(after - before) > 0.1 * before)
 
 
 def _pairs(centres: Ints, reach_px: float) -> tuple[Ints, Ints]:
@@ -75,10 +92,10 @@ def _neighbours_light(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma
         last = firsts[end] if end < len(firsts) else len(star)
         here = slice(firsts[0], last)
         offset = fits.xy_px[other[here]] - s.centres[star[here]]
-        px, _ = pixel_profile(offset[:, 0], sigma, radius)
-        py, _ = pixel_profile(offset[:, 1], sigma, radius)
-        py *= np.maximum(fits.flux[other[here]], 0.0)[:, None]
-        each = py.astype(np.float32)[:, :, None] * px.astype(np.float32)[:, None, :]
+        px, _ = pixel_profile_single(offset[:, 0], sigma, radius)
+        py, _ = pixel_profile_single(offset[:, 1], sigma, radius)
+        py *= np.maximum(fits.flux[other[here]], 0.0)[:, None].astype(np.float32)
+        each = py[:, :, None] * px[:, None, :]
         sums = np.add.reduceat(each, firsts[:end] - firsts[0], axis=0)
         who = star[firsts[:end]]
         matters = (np.square(sums) > NEIGHBOUR_SIGMA**2 * s.variance[who]).any(axis=(1, 2))
@@ -101,10 +118,10 @@ def _may_count(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float
 def own_light(centres: Ints, fits: PointFits, sigma: float, radius: int) -> Pixels:
     """Light (n, s, s) of each source in its own stamp."""
     offset = fits.xy_px - centres
-    px, _ = pixel_profile(offset[:, 0], sigma, radius)
-    py, _ = pixel_profile(offset[:, 1], sigma, radius)
-    py *= np.maximum(fits.flux, 0.0)[:, None]
-    return np.asarray(py.astype(np.float32)[:, :, None] * px.astype(np.float32)[:, None, :])
+    px, _ = pixel_profile_single(offset[:, 0], sigma, radius)
+    py, _ = pixel_profile_single(offset[:, 1], sigma, radius)
+    py *= np.maximum(fits.flux, 0.0)[:, None].astype(np.float32)
+    return np.asarray(py[:, :, None] * px[:, None, :])
 
 
 def painted(fits: PointFits, sigma: float, shape: tuple[int, int]) -> Pixels:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from startrack.camera import Camera
 from startrack.detect.background import background_and_noise, quantum_of
-from startrack.detect.crowded import fit_all, painted
+from startrack.detect.crowded import Fitted, fit_all, painted
 from startrack.detect.fit import PointFits
 from startrack.detect.frame import Frame, Image, LightNoise, electrons
 from startrack.detect.judge import one_per_place, stars_among, threshold_for
-from startrack.detect.peaks import Peaks, find_peaks
+from startrack.detect.peaks import find_peaks
 from startrack.detect.streaks import Streaks, drawn_out, find_streaks
 from startrack.detect.widths import measured_width
 from startrack.types import Bools, Detections, Exposure, TooFewStars
@@ -32,6 +32,7 @@ class Detector:
 
     threshold_snr: float = 5.35  # for a PSF of 1.25 px; for others what gives as few false stars, one in 8 Mpx
     max_candidates: int = 15000  # a frame with more peaks is noise, a bright day or a defect: the highest are kept
+    psf_sigma_px: float | None = None  # taken as it is, whatever camera file and frame say of the PSF's width
 
     def __call__(self, exposure: Exposure, camera: Camera | None = None) -> Detections:
         """Point sources, brightest first; fluxes in electrons where the camera knows its gain, else in ADU.
@@ -43,15 +44,16 @@ class Detector:
             raise TooFewStars("the frame is flat: every pixel has the same value (lens cap, or a saturated day sky?)")
         known = camera.sensor.psf_sigma_px if camera is not None and camera.sensor is not None else None
         light_noise = LightNoise(per_unit=0.0 if known is None else 1.0)
-        frame, peaks, fits, sigma = self._measured(image, dead, known or UNKNOWN_WIDTH_PX, light_noise)
-        if drawn_out(frame, peaks.centres) and (streaks := find_streaks(frame)) is not None:
+        frame, fitted, sigma = self._measured(
+            image, dead, self.psf_sigma_px or known or UNKNOWN_WIDTH_PX, light_noise
+        )
+        if drawn_out(frame, fitted.stamps.centres) and (streaks := find_streaks(frame)) is not None:
             return _of_streaks(frame, streaks)
-        stars = self._stars(frame, peaks, fits, sigma)
+        stars = self._stars(fitted, sigma)
         if _covered(stars, sigma, frame.shape) > CROWDED_PART:
-            frame = _frame(image, frame.dead, sigma, frame.light_noise, painted(stars, sigma, frame.shape))
+            frame = _frame(image, frame.dead, sigma, light_noise, painted(stars, sigma, frame.shape))
             peaks = find_peaks(frame, sigma, self._first_pass(sigma), self.max_candidates, known=stars.xy_px)
-            fits, own = fit_all(replace(frame, light_noise=light_noise), peaks, sigma)
-            stars = self._stars(replace(frame, light_noise=own), peaks, fits, sigma)
+            stars = self._stars(fit_all(frame, peaks, sigma), sigma)
         if not len(stars.flux):
             raise TooFewStars(NOTHING_SEEN)
         return Detections(
@@ -68,27 +70,28 @@ class Detector:
 
     def _measured(
         self, image: Image, dead: Bools, sigma: float, light_noise: LightNoise
-    ) -> tuple[Frame, Peaks, PointFits, float]:
+    ) -> tuple[Frame, Fitted, float]:
         """Frame, candidates and their fits, with the PSF's width as the frame shows it."""
         usable = dead if dead.any() else None
-        for last in (*[False] * WIDTH_ROUNDS, True):
+        for last in (*[False] * (0 if self.psf_sigma_px else WIDTH_ROUNDS), True):
             frame = _frame(image, usable, sigma, light_noise)
             peaks = find_peaks(frame, sigma, self._first_pass(sigma), self.max_candidates)
             if not len(peaks.centres):
                 raise TooFewStars(NOTHING_SEEN)
-            fits, own = fit_all(frame, peaks, sigma)
-            measured = None if last else measured_width(frame, peaks.centres, fits, sigma)
+            fitted = fit_all(frame, peaks, sigma)
+            measured = None if last else measured_width(frame, peaks.centres, fitted.fits, sigma)
             if measured is None or abs(np.log(measured / sigma)) < WIDTH_TOLERANCE:
                 break
             sigma = measured
-        return replace(frame, light_noise=own), peaks, fits, sigma
+        return frame, fitted, sigma
 
     def _first_pass(self, sigma: float) -> float:
         """A star between pixels shows less in the filtered image than its fit does."""
         return threshold_for(self.threshold_snr, sigma) - FIRST_PASS_LOWER
 
-    def _stars(self, frame: Frame, peaks: Peaks, fits: PointFits, sigma: float) -> PointFits:
-        good = stars_among(frame, peaks.centres, fits, sigma, self.threshold_snr)
+    def _stars(self, fitted: Fitted, sigma: float) -> PointFits:
+        fits = fitted.fits
+        good = stars_among(fitted, sigma, self.threshold_snr)
         good = good[one_per_place(fits.xy_px[good], fits.flux[good], 1.2 * sigma)]
         return fits.take(good[np.argsort(-fits.flux[good], kind="stable")])
 

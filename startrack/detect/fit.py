@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from startrack.detect.frame import LightNoise, Pixels
 from startrack.detect.impostors import single_pixel_chi2
-from startrack.psf import pixel_profile
+from startrack.psf import pixel_profile_single
 from startrack.types import Array, Bools, Ints
 
-ROUNDS = 3  # of flux and level, then of all four
+ROUNDS, ROUNDS_AGAIN = 3, 2  # of flux and level, then of all four; where a fit has been before
 BATCH_PIXELS = 65536  # of stamps worked on at a time: what a processor's cache holds
 # Products of the profile P and its derivative D by which x and y enter the normal matrix.
 PP, PD, DD, P, D, ONE = range(6)
@@ -62,7 +61,7 @@ class Stamps:
 
 
 def fit_points(
-    stamps: Stamps, start_xy_px: Array, sigma_px: float, light_noise: LightNoise, own_part: float
+    stamps: Stamps, start_xy_px: Array, sigma_px: float, light_noise: LightNoise, own_part: float, rounds: int = ROUNDS
 ) -> PointFits:
     """Position, flux and local level of one point source in each stamp.
 
@@ -72,27 +71,29 @@ def fit_points(
     """
     size = max(1, BATCH_PIXELS // max(stamps.data[0].size, 1)) if len(stamps.data) else 1
     batches = [
-        _fit(stamps.part(slice(at, at + size)), start_xy_px[at : at + size], sigma_px, light_noise, own_part)
+        _fit(stamps.part(slice(at, at + size)), start_xy_px[at : at + size], sigma_px, light_noise, own_part, rounds)
         for at in range(0, max(len(start_xy_px), 1), size)
     ]
     return PointFits(**{f.name: np.concatenate([getattr(b, f.name) for b in batches]) for f in fields(PointFits)})
 
 
-def _fit(s: Stamps, start_xy_px: Array, sigma_px: float, light_noise: LightNoise, own_part: float) -> PointFits:
+def _fit(
+    s: Stamps, start_xy_px: Array, sigma_px: float, light_noise: LightNoise, own_part: float, rounds: int
+) -> PointFits:
     radius = s.data.shape[1] // 2
     offset = np.clip(start_xy_px - s.centres, -radius, radius)
     n = len(s.data)
     flux, level = np.zeros(n), np.zeros(n)
     weights = _masked(1.0 / s.variance, s.usable)
-    for step in range(ROUNDS + 1):
-        px, dx = _profile(offset[:, 0], sigma_px, radius)
-        py, dy = _profile(offset[:, 1], sigma_px, radius)
+    for step in range(rounds + 1):
+        px, dx = pixel_profile_single(offset[:, 0], sigma_px, radius)
+        py, dy = pixel_profile_single(offset[:, 1], sigma_px, radius)
         shape = py[:, :, None] * px[:, None, :]
         if step > 0:  # a flux is known, and with it the noise of the star's own light
             weights = _weights(s, flux, shape, light_noise)
         miss = s.data - flux[:, None, None].astype(np.float32) * shape - level[:, None, None].astype(np.float32)
         normal, right = _normal_equations(weights, miss, flux, (px, dx), (py, dy))
-        if step == ROUNDS:
+        if step == rounds:
             break
         if step == 0:  # flux and level first: without a flux the position has no gradient
             delta = _solved_pairs(normal[:, 2:, 2:], right[:, 2:])
@@ -182,8 +183,3 @@ def _weights(s: Stamps, flux: Array, shape: Pixels, light_noise: LightNoise) -> 
 
 def _masked(weights: Pixels, usable: Bools | None) -> Pixels:
     return weights if usable is None else weights * usable
-
-
-def _profile(offset: Array, sigma_px: float, radius: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    profile, slope = pixel_profile(offset, sigma_px, radius)
-    return profile.astype(np.float32), slope.astype(np.float32)

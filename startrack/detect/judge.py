@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.detect.crowded import own_light
-from startrack.detect.fit import PointFits
-from startrack.detect.frame import Frame, radius_for
+from startrack.detect.crowded import Fitted, own_light
+from startrack.detect.fit import PointFits, Stamps
+from startrack.detect.frame import LightNoise
 from startrack.detect.impostors import edge_chi2
 from startrack.detect.widths import BRIGHT_SNR, FEWEST_BRIGHT
 from startrack.types import Array, Bools, Ints
@@ -22,18 +22,19 @@ ROUGH_PSF_SPREAD = 2.0  # times the typical misfit that a star of such a frame m
 LARGEST_SIGMA_PX = 2.0  # of the place
 
 
-def stars_among(frame: Frame, centres: Ints, fits: PointFits, sigma: float, threshold_snr: float) -> Ints:
+def stars_among(fitted: Fitted, sigma: float, threshold_snr: float) -> Ints:
     """Indices (k,) of the candidates that are point sources.
 
     Where the bright sources of the frame all differ from the Gaussian (trails, coma, a real lens), no bright star would
     pass by its chi^2; there a source passes whose misfit is like theirs.
     """
+    fits = fitted.fits
     stands_out = height_of(fits) >= threshold_for(threshold_snr, sigma)
     placed = np.sqrt(fits.covariance[:, 0, 0] + fits.covariance[:, 1, 1]) < LARGEST_SIGMA_PX
     left = np.flatnonzero(stands_out & placed & (fits.chi2 < fits.chi2_pixel))
     if not len(left):
         return left
-    misfit, edge = _likeness(frame, centres[left], fits.take(left), sigma)
+    misfit, edge = _likeness(fitted.stamps.part(left), fits.take(left), sigma, fitted.light_noise)
     unlike_an_edge = fits.chi2[left] < edge + EDGE_MARGIN
     bright = fits.flux[left] > BRIGHT_SNR * np.sqrt(fits.covariance[left, 2, 2])
     typical = _typical(misfit[unlike_an_edge & bright])
@@ -82,21 +83,19 @@ def _typical(misfit: Array) -> float:
     return ROUGH_PSF_SPREAD * typical if typical > ROUGH_PSF_MISFIT else 0.0
 
 
-def _likeness(frame: Frame, centres: Ints, fits: PointFits, sigma: float) -> tuple[Array, Array]:
+def _likeness(s: Stamps, fits: PointFits, sigma: float, own: LightNoise) -> tuple[Array, Array]:
     """How far the sources (n) are from the Gaussian PSF, and their chi^2 as straight edges or lines instead.
 
     The first is the root of the squared residual beyond the noise over the squared light: 0 for a perfect star, about
     0.6 for a single bright pixel.
     """
-    radius = radius_for(sigma)
-    data, variance, usable = frame.data(centres, radius), frame.variance(centres, radius), frame.usable(centres, radius)
-    light = own_light(centres, fits, sigma, radius)
-    noise = variance + np.float32(frame.light_noise.per_unit) * light
-    excess = np.square(data - light - fits.level[:, None, None].astype(np.float32)) - noise
-    weights = 1.0 / (noise + np.square(np.float32(frame.light_noise.model_error) * light))
+    light = own_light(s.centres, fits, sigma, s.data.shape[1] // 2)
+    noise = s.variance + np.float32(own.per_unit) * light
+    excess = np.square(s.data - light - fits.level[:, None, None].astype(np.float32)) - noise
+    weights = 1.0 / (noise + np.square(np.float32(own.model_error) * light))
     squared = np.square(light)
-    if usable is not None:
-        excess, weights, squared = excess * usable, weights * usable, squared * usable
+    if s.usable is not None:
+        excess, weights, squared = excess * s.usable, weights * s.usable, squared * s.usable
     total = squared.sum(axis=(1, 2), dtype=np.float64)
     misfit = np.sqrt(np.maximum(excess.sum(axis=(1, 2), dtype=np.float64), 0.0) / np.maximum(total, 1e-12))
-    return misfit, edge_chi2(data, weights)
+    return misfit, edge_chi2(s.data, weights)

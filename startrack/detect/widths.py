@@ -6,7 +6,7 @@ import numpy as np
 
 from startrack.detect.fit import PointFits
 from startrack.detect.frame import Frame, Pixels, radius_for
-from startrack.psf import pixel_profile
+from startrack.psf import pixel_profile_single
 from startrack.types import Array, Bools, Ints
 
 BRIGHT_SNR = 12.0  # sources that say what the frame's PSF is
@@ -48,9 +48,8 @@ def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array
     total, light = weights.sum(axis=(1, 2)).astype(np.float64), moment.sum(axis=(1, 2)).astype(np.float64)
     explained = np.empty((len(data), len(widths_px)))
     for i, width in enumerate(widths_px):
-        px, _ = pixel_profile(offset_px[:, 0], float(width), radius)
-        py, _ = pixel_profile(offset_px[:, 1], float(width), radius)
-        px, py = px.astype(np.float32), py.astype(np.float32)
+        px, _ = pixel_profile_single(offset_px[:, 0], float(width), radius)
+        py, _ = pixel_profile_single(offset_px[:, 1], float(width), radius)
         ss = _sums(weights, py * py, px * px)
         s1 = _sums(weights, py, px)
         sd = _sums(moment, py, px)

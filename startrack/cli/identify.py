@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from typing import Any
 
 from startrack.cli.common import Outcome, add_image_flags, camera_of, read, result_path, run_images
 
 FORMAT = "startrack.identification/1"
+NARROWEST_DEG, WIDEST_DEG = 3.0, 280.0
 
 
 def add_parser(subparsers: Any) -> None:
@@ -16,11 +18,24 @@ def add_parser(subparsers: Any) -> None:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "identify",
         help="stars and attitude only",
-        description="Name the stars of each image and give the attitude. Needs a camera file, but no terrain; without "
-        "a time the catalogue is taken at J2000.0 and 60 arcsec are added to the stated errors. Writes "
+        description="Name the stars of each image and give the attitude. Needs a camera file, or with --fov only the "
+        "approximate field of view: the lens is then found with the stars. No terrain is needed; without a time the "
+        "catalogue is taken at J2000.0 and 60 arcsec are added to the stated errors. Writes "
         "NAME.identification.json, NAME.stars.ecsv, NAME.wcs, NAME.corr and NAME.annotated.png.",
     )
     add_image_flags(parser)
+    parser.add_argument(
+        "--fov", type=_field_of_view_rad, metavar="DEG",
+        help="no camera file: field of view in degrees, good to 10 %%; below 100 across the image's width, from there "
+        "up of the whole image circle, even where the frame clips it",
+    )  # fmt: skip
+
+
+def _field_of_view_rad(text: str) -> float:
+    degrees = float(text)
+    if not NARROWEST_DEG <= degrees <= WIDEST_DEG:
+        raise argparse.ArgumentTypeError(f"{text} is not between {NARROWEST_DEG:g} and {WIDEST_DEG:g} degrees")
+    return math.radians(degrees)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -30,9 +45,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     from startrack.catalog import load_catalog
-    from startrack.pipeline import identify
+    from startrack.pipeline import identify, identify_blind
     from startrack.report import (
         identification_dict,
+        lens_text,
         summary_line,
         verbose_text,
         write_annotated,
@@ -43,10 +59,13 @@ def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
 
     start = time.perf_counter()
     exposure = read(path, args)
-    camera = camera_of(exposure)
+    camera = camera_of(exposure) if args.fov is None else None
     out = result_path(args, stem, ".identification.json", exposure)
     read_ms = 1e3 * (time.perf_counter() - start)
-    result = identify(exposure, camera, load_catalog())
+    if camera is not None:
+        result = identify(exposure, camera, load_catalog())
+    else:
+        result = identify_blind(exposure, args.fov, load_catalog())
     result.timing_ms["read"] = read_ms
     record = identification_dict(result)
     if result.identification is not None:
@@ -56,4 +75,8 @@ def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
         write_annotated(out.with_name(f"{stem}.annotated.png"), result)
     write_json(out, record)
     line = summary_line(result, seconds=time.perf_counter() - start)
+    if camera is None and result.camera is not None:
+        line += (
+            f"\n  {lens_text(result.camera)}; a camera file: startrack calibrate --fov {math.degrees(args.fov):g} IMAGE"
+        )
     return Outcome(result.status, result.reason, line + ("\n" + verbose_text(result) if args.verbose else ""), record)

@@ -33,7 +33,7 @@ NARROW_WINDOWS = (
 FIELD_STEPS = 4.0  # indexes are made for fields a fourth part of a factor e apart
 WIDE_SHAPES = (-0.35, 0.25, -0.8, 0.7)
 MIDDLE_SHAPES = (PINHOLE, 0.4, -0.4)
-TRY = "is the field of view right, is this the night sky, and in focus? A camera file (startrack calibrate) needs fewer stars"
+TRY = "is the field of view right, is this the night sky, and in focus? With a camera file fewer stars suffice"
 
 
 @dataclass(frozen=True)
@@ -141,11 +141,11 @@ class _Search:
         centre = ((width - 1) / 2, (height - 1) / 2)
         if not self.wide:
             shapes = (PINHOLE,) if self.narrow else MIDDLE_SHAPES
-            return [Guess(width / 2 / float(radius(self.fov_rad / 2, s)), s, centre) for s in shapes]
+            return [Guess(width / 2 / float(radius(np.array(self.fov_rad / 2), s)), s, centre) for s in shapes]
         shorter, diagonal = min(self.size_px), float(np.hypot(*self.size_px))
         circles = [c * shorter for c in CIRCLES if c * shorter < 0.56 * diagonal]
         return [
-            Guess(circle / float(radius(self.fov_rad / 2, shape)), shape, centre)
+            Guess(circle / float(radius(np.array(self.fov_rad / 2), shape)), shape, centre)
             for circle in circles
             for shape in WIDE_SHAPES
             if abs(shape) * self.fov_rad / 2 < np.radians(80.0)

@@ -198,7 +198,7 @@ class Hypotheses:
 
 
 def apart(xy_px: Array, closer_px: float, most: int) -> Ints:
-    """The first (brightest) of the points (n, 2), none closer to an earlier one: clumps of false stars shrink to one."""
+    """The first (brightest) of the points (n, 2), none near an earlier one: clumps of false stars shrink to one."""
     from scipy.spatial import cKDTree
 
     some = xy_px[: 10 * most]

@@ -1,4 +1,4 @@
-"""The last steps of a blind identification: the lens as a polynomial, all stars matched, and the odds against chance."""
+"""The last steps of a blind identification: the lens as a polynomial, all stars matched, the odds against chance."""
 
 from __future__ import annotations
 

@@ -1,12 +1,13 @@
 """What people and programs get to see: results as JSON, star tables, annotated pictures, one-line summaries."""
 
 from startrack.report.result import detection_dict, identification_dict, refused_dict, result_dict
-from startrack.report.summary import refusal_line, summary_line, verbose_text
+from startrack.report.summary import lens_text, refusal_line, summary_line, verbose_text
 from startrack.report.write import write_annotated, write_json, write_results, write_star_table, write_wcs
 
 __all__ = [
     "detection_dict",
     "identification_dict",
+    "lens_text",
     "refusal_line",
     "refused_dict",
     "result_dict",

@@ -12,6 +12,7 @@ from startrack.frames import format_utc, latlon_from_enu
 from startrack.report.result import ARCSEC_PER_RAD, STAGES, R_body_enu, boresight_rad, image_name, predicted_visible
 
 if TYPE_CHECKING:
+    from startrack.camera import Camera
     from startrack.pipeline import Result
 
 
@@ -37,6 +38,16 @@ def summary_line(result: Result, seconds: float | None = None) -> str:
         parts += [f"{len(result.detections)} point sources"]
     took_s = seconds if seconds is not None else sum(result.timing_ms.values()) / 1e3
     return "  ".join([*parts, f"{took_s:.1f} s"])
+
+
+def lens_text(camera: Camera) -> str:
+    """The lens that a blind identification found: model, focal length, centre, handedness."""
+    x, y = camera.centre_px
+    return (
+        f"lens found: {camera.lens.model}, focal length {camera.focal_px[0]:.1f} px, centre ({x:.1f}, {y:.1f}) px, "
+        f"{'mirrored' if camera.mirrored else 'not mirrored'}, known to {np.degrees(camera.calibrated_angle_rad):.0f} "
+        "degrees off the axis"
+    )
 
 
 def refusal_line(image: str, reason: str, message: str) -> str:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+BAND_PIXELS = 2**18
 BLOCK_PX = 16  # side of the blocks for a PSF up to 1.5 WIDEST_PX
 WIDEST_PX = 1.4
+STEEP_PART = 0.03  # of the blocks
 FEW_STEPS = 1.0  # noise in units of the smallest step below which the pixels hold too few values for quantiles
 LOW, HIGH = 0.05, 0.65  # quantiles between which pixels tell the noise
 COARSE_PX = 4  # the local level is a mean over squares of this side
@@ -27,18 +30,20 @@ def background_and_noise(image: Image, quantum: float, sigma_px: float) -> tuple
     blocks.
     """
     side = BLOCK_PX * max(1, round(sigma_px / WIDEST_PX))
-    ordered = np.sort(_blocks(image, side, quantum), axis=1)
-    middle = ordered.shape[1] // 2
-    level = 0.5 * (ordered[:, middle - 1] + ordered[:, middle])
-    spread = ordered @ _scale_weights(ordered.shape[1])
     shape = -(-image.shape[0] // side), -(-image.shape[1] // side)
+    level, spread = _over_blocks(image, side, quantum, _median_and_spread)
     level_map = cv2.medianBlur(level.reshape(shape), 3)
     spread_map = cv2.medianBlur(spread.reshape(shape), 5)
+    background = _enlarge(level_map, side, image.shape)
+    if _steep_part(level_map, spread_map) > STEEP_PART:  # a slope within a block is no noise
+        _, spread = _over_blocks(image - background, side, quantum, _median_and_spread)
+        spread_map = np.minimum(spread_map, cv2.medianBlur(spread.reshape(shape), 5))
     rounding = quantum**2 / 12.0
     if np.median(spread_map) < FEW_STEPS * quantum:
-        spread_map = cv2.medianBlur(_few_valued(ordered, quantum).reshape(shape), 5)
+        (spread,) = _over_blocks(image, side, quantum, partial(_few_valued, quantum=np.float32(quantum)))
+        spread_map = cv2.medianBlur(spread.reshape(shape), 5)
     noise_map = np.sqrt(np.maximum(np.square(spread_map) - rounding, rounding), dtype=np.float32)
-    return _enlarge(level_map, side, image.shape), _enlarge(noise_map, side, image.shape)
+    return background, _enlarge(noise_map, side, image.shape)
 
 
 def local_level(standardised: Image, width_px: int) -> Image:
@@ -64,6 +69,31 @@ def coarse_width(width_px: int) -> int:
     return 2 * int(round(width_px / COARSE_PX - 1) // 2) + 1 if width_px > COARSE_PX else 1
 
 
+def _steep_part(level: NDArray[Any], spread: NDArray[Any]) -> float:
+    """Part of the blocks between which the level changes by more than the noise."""
+    steps = [np.abs(np.diff(level, axis=axis)) for axis in (0, 1)]
+    return max(float(np.mean(steps[0] > spread[1:])) if len(level) > 1 else 0.0,
+               float(np.mean(steps[1] > spread[:, 1:])) if level.shape[1] > 1 else 0.0)  # fmt: skip
+
+
+def _over_blocks(image: Image, side: int, quantum: float, measure: Callable[[Image], tuple[Image, ...]]) -> list[Image]:
+    """What `measure` says of the ordered pixels (n, side^2) of square blocks, (blocks,) each, left to right and down.
+
+    A few rows of blocks at a time: what the processor's cache holds.
+    """
+    rows = side * max(1, BAND_PIXELS // (side * image.shape[1]))
+    bands = [
+        measure(np.sort(_blocks(image[top : top + rows], side, quantum), axis=1))
+        for top in range(0, image.shape[0], rows)
+    ]
+    return [np.concatenate(parts) for parts in zip(*bands, strict=True)]
+
+
+def _median_and_spread(ordered: Image) -> tuple[Image, Image]:
+    middle = ordered.shape[1] // 2
+    return np.float32(0.5) * (ordered[:, middle - 1] + ordered[:, middle]), ordered @ _scale_weights(ordered.shape[1])
+
+
 def _blocks(image: Image, side: int, quantum: float) -> Image:
     """(blocks, side^2): the image cut into square blocks, its border reflected to fill the last ones.
 
@@ -80,10 +110,10 @@ def _blocks(image: Image, side: int, quantum: float) -> Image:
     return np.add(cut, part_steps, order="C").reshape(rows * columns, side * side)
 
 
-def _few_valued(ordered: Image, quantum: float) -> Image:
+def _few_valued(ordered: Image, quantum: np.float32) -> tuple[Image]:
     """Standard deviation (n,) of rows (n, m) of hardly more than one value, in whose quantiles the noise hides."""
     middle = ordered[:, ordered.shape[1] // 2, None]
-    return np.clip(ordered, middle - 4 * np.float32(quantum), middle + 4 * np.float32(quantum)).std(axis=1)
+    return (np.clip(ordered, middle - 4 * quantum, middle + 4 * quantum).std(axis=1),)
 
 
 @lru_cache(maxsize=8)

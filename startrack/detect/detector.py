@@ -33,7 +33,6 @@ class Detector:
     threshold_snr: float = 5.35  # for a PSF of 1.25 px; for others what gives as few false stars, one in 8 Mpx
     max_candidates: int = 15000  # a frame with more peaks is noise, a bright day or a defect: the highest are kept
     psf_sigma_px: float | None = None  # taken as it is, whatever camera file and frame say of the PSF's width
-    psf_sigma_px: float | None = None  # taken as it is, whatever camera file and frame say of the PSF's width
 
     def __call__(self, exposure: Exposure, camera: Camera | None = None) -> Detections:
         """Point sources, brightest first; fluxes in electrons where the camera knows its gain, else in ADU.
@@ -45,9 +44,7 @@ class Detector:
             raise TooFewStars("the frame is flat: every pixel has the same value (lens cap, or a saturated day sky?)")
         known = camera.sensor.psf_sigma_px if camera is not None and camera.sensor is not None else None
         light_noise = LightNoise(per_unit=0.0 if known is None else 1.0)
-        frame, fitted, sigma = self._measured(
-            image, dead, self.psf_sigma_px or known or UNKNOWN_WIDTH_PX, light_noise
-        )
+        frame, fitted, sigma = self._measured(image, dead, self.psf_sigma_px or known or UNKNOWN_WIDTH_PX, light_noise)
         if drawn_out(frame, fitted.stamps.centres) and (streaks := find_streaks(frame)) is not None:
             return _of_streaks(frame, streaks)
         stars = self._stars(fitted, sigma)

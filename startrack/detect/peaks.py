@@ -14,7 +14,7 @@ from startrack.detect.frame import Frame, Image, radius_for
 from startrack.psf import filter_kernel
 from startrack.types import Array, Bools, Ints
 
-STRIP_ROWS = 192
+STRIP_ROWS = 320
 MOST_STAMP_PIXELS = 2_500_000  # of all candidates together: bounds time and memory, whatever the frame holds
 MOST_BLOBS = 1000  # saturated; the largest
 OWN_RESIDUE_SIGMAS = 1.5

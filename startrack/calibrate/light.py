@@ -43,8 +43,11 @@ class _Stars:
     airmass: Array | None
 
 
-def measured_light(joint: Joint) -> Light | None:
-    """The light of the matched stars; None without exposure times or with fewer than 30 stars."""
+def measured_light(joint: Joint, light_1: float = 1.0) -> Light | None:
+    """The light of the matched stars; None without exposure times or with fewer than 30 stars.
+
+    `light_1`: by which the detector's fluxes are multiplied (its PSF is not quite each star's own).
+    """
     stars = _stars(joint)
     if stars is None or len(stars.gained_mag) < FEWEST:
         return None
@@ -57,7 +60,7 @@ def measured_light(joint: Joint) -> Light | None:
         terms.remove(vague[0])
     found = dict(zip(terms, values.tolist(), strict=True))
     return Light(
-        zero_point_adu_per_s=float(10 ** (0.4 * found["zero"])),
+        zero_point_adu_per_s=float(light_1 * 10 ** (0.4 * found["zero"])),
         zero_point_sigma_mag=float(sigma[0]),
         vignetting=(found["v1"], found["v2"]),
         colour_mag=found.get("colour"),

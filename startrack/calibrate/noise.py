@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -13,7 +12,9 @@ BLOCK_PX = 32
 GOOD_1 = 0.1  # relative error of the gain that is still a measurement
 FEWEST_BLOCKS = 60
 CLIP_SIGMA = 3.0
-SPREAD_OF_MAD = 1.17  # relative error of a MAD's sigma is this over the root of the number of values
+CLIPS = 8
+CORE_SIGMA = 2.0
+CORE_VARIANCE_1 = 0.773741  # of a Gaussian cut off there: 1 - 2 c phi(c) / (2 Phi(c) - 1)
 
 
 @dataclass(frozen=True)
@@ -30,10 +31,14 @@ class Transfer:
         return float(np.sqrt(squared)) if squared > 0 else None
 
 
-def photon_transfer(exposures: list[Exposure]) -> Transfer | None:
-    """Gain from pairs of neighbouring frames; None where there is no pair or too little range of light."""
+def photon_transfer(pairs: list[tuple[Exposure, Exposure]]) -> Transfer | None:
+    """Gain from pairs of frames; None where there is no pair or too little range of light.
+
+    Where the sky has moved between the two, faint stars below the detection limit add to the variance: by some per
+    cent in deep wide-field frames, and the gain comes out as much too low.
+    """
     levels, variances = [], []
-    for a, b in pairwise(exposures):
+    for a, b in pairs:
         level, variance = _blocks(a.pixels_adu.astype(np.float64), b.pixels_adu.astype(np.float64))
         levels.append(level)
         variances.append(variance)
@@ -57,9 +62,13 @@ def _blocks(a: Array, b: Array) -> tuple[Array, Array]:
         return rows.transpose(0, 2, 1, 3).reshape(-1, BLOCK_PX, BLOCK_PX)
 
     step = np.diff(cut(a - b), axis=2).reshape(-1, BLOCK_PX * (BLOCK_PX - 1))
-    sigma = 1.4826 * np.median(np.abs(step - np.median(step, axis=1, keepdims=True)), axis=1)
+    step -= np.median(step, axis=1, keepdims=True)
+    variance = np.square(1.4826 * np.median(np.abs(step), axis=1))
+    for _ in range(CLIPS):  # towards the core: what stars add lies outside
+        core = np.square(step) < CORE_SIGMA**2 * variance[:, None]
+        variance = np.sum(np.square(step) * core, axis=1) / np.maximum(core.sum(axis=1), 1) / CORE_VARIANCE_1
     level = 0.5 * np.median(cut(a) + cut(b), axis=(1, 2))
-    return level, sigma**2 / 4.0
+    return level, variance / 4.0
 
 
 def _line(level: Array, variance: Array) -> Transfer | None:

@@ -33,7 +33,8 @@ class Photometry:
 
 def photometry(joint: Joint, given: Given) -> Photometry:
     """All that the exposures tell of light and sensor."""
-    light, facts = measured_light(joint), measured_sensor(joint, RINGS)
+    facts = measured_sensor(joint, RINGS)
+    light = measured_light(joint, facts.light_1)
     notes: list[str] = []
     bias = given.bias_adu if given.bias_adu is not None else facts.bias_adu
     gain = given.gain_e_per_adu
@@ -48,6 +49,9 @@ def photometry(joint: Joint, given: Given) -> Photometry:
     if gain is None:
         notes.append("gain: not measured; give two pictures of equal exposure with bright and dark parts of sky, or "
                      "--gain")  # fmt: skip
+    elif given.gain_e_per_adu is None and not facts.same_sky:
+        notes.append("gain: the sky moved between the pictures, and faint stars make it some per cent too low; best "
+                     "are two pictures in quick succession")  # fmt: skip
     if bias is None:
         notes.append("bias: not measured; no dark corner outside the image circle: give --bias")
     if noise is None:

@@ -175,13 +175,24 @@ def _identified(run: _Run, frame: Frame) -> tuple[Camera, Identification]:
             return by_camera(known, frame)
         except NotIdentified as cause:
             refusal = cause
-    if refusal is not None and (run.fov_rad is None or run.named):
+    if refusal is not None and run.named:
         raise refusal
-    assert run.fov_rad is not None
     from startrack.identify.blind import identify_blind
 
-    solution = identify_blind(frame.detections, frame.size_px, run.fov_rad, frame.sky.stars)
+    # An approximate camera whose lens is of another kind still says how wide the field is.
+    fov_rad = run.fov_rad if run.fov_rad is not None else _field_rad(run.start)
+    solution = identify_blind(frame.detections, frame.size_px, fov_rad, frame.sky.stars)
     return solution.camera, solution.identification
+
+
+def _field_rad(camera: Camera | None) -> float:
+    """Field of view as `fov_rad` means it: of the image circle where that is wide, else across the frame's width."""
+    assert camera is not None
+    if 2.0 * camera.max_angle_rad >= WIDE_FIELD_RAD:
+        return 2.0 * camera.max_angle_rad
+    width, height = camera.size_px
+    sides = np.array([[-0.5, (height - 1) / 2], [width - 0.5, (height - 1) / 2]])
+    return float(min(np.sum(camera.angle_rad(sides)), 0.99 * WIDE_FIELD_RAD))
 
 
 def by_camera(camera: Camera, frame: Frame) -> tuple[Camera, Identification]:

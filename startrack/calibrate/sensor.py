@@ -12,7 +12,7 @@ from startrack.calibrate.growing import Joint
 from startrack.calibrate.noise import Transfer, photon_transfer
 from startrack.calibrate.widths import star_widths
 from startrack.camera import Camera
-from startrack.types import Array, Bools, Ints
+from startrack.types import Array, Bools, Exposure, Ints
 
 DARK_BEYOND = 1.06  # of the image circle's radius: where no light should be
 FEWEST_DARK = 4000
@@ -21,6 +21,7 @@ FEWEST_SATURATED = 12
 HOT_SIGMA = 8.0
 MOST_HOT = 20_000
 STAR_PX = 3.0
+STILL_PX = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,9 +29,11 @@ class SensorFacts:
     """Measured properties; None where the pictures do not tell."""
 
     transfer: Transfer | None
+    same_sky: bool  # whether photon transfer compares frames between which the sky stood still
     bias_adu: float | None
     saturation_adu: float | None
     psf_sigma_px: float | None
+    light_1: float  # flux with a star's own width over the flux that the detector found
     psf_by_ring_px: tuple[float | None, ...]  # from the axis to the calibrated angle
     hot_px: Array | None  # (n, 2) x, y
 
@@ -38,6 +41,7 @@ class SensorFacts:
 def measured_sensor(joint: Joint, rings: int) -> SensorFacts:
     """All that the exposures of a calibration tell of the sensor."""
     widths = star_widths(joint)
+    pairs, same_sky = _pairs(joint)
     camera = joint.fit.camera
     edges = np.linspace(0.0, camera.calibrated_angle_rad, rings + 1)
     by_ring = tuple(
@@ -45,13 +49,28 @@ def measured_sensor(joint: Joint, rings: int) -> SensorFacts:
         for inside in ((widths.angle_rad >= a) & (widths.angle_rad < b) for a, b in pairwise(edges))
     )
     return SensorFacts(
-        transfer=photon_transfer([frame.exposure for frame in joint.frames]),
+        transfer=photon_transfer(pairs),
+        same_sky=same_sky,
         bias_adu=_dark_level(joint.frames, camera),
         saturation_adu=_saturation(joint.frames),
         psf_sigma_px=float(np.median(widths.sigma_px)) if len(widths.sigma_px) >= 5 else None,
+        light_1=float(np.median(widths.light_1)) if len(widths.sigma_px) >= 5 else 1.0,
         psf_by_ring_px=by_ring,
         hot_px=_hot(joint),
     )
+
+
+def _pairs(joint: Joint) -> tuple[list[tuple[Exposure, Exposure]], bool]:
+    """Neighbouring exposures between which the sky stood still; all neighbours where there are none such."""
+    frames, R = joint.frames, joint.fit.R_cam_icrs
+    still: list[tuple[Exposure, Exposure]] = []
+    moving: list[tuple[Exposure, Exposure]] = []
+    for i, (a, b) in enumerate(pairwise(frames)):
+        turn = R[i + 1] @ R[i].T
+        angle = float(np.linalg.norm(turn - turn.T) / np.sqrt(8.0))
+        near = angle * max(joint.fit.camera.focal_px) < STILL_PX and np.trace(turn) > 0
+        (still if near else moving).append((a.exposure, b.exposure))
+    return (still, True) if still else (moving, False)
 
 
 def _dark_level(frames: tuple[Frame, ...], camera: Camera) -> float | None:

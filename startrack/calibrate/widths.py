@@ -21,11 +21,12 @@ class Widths:
 
     sigma_px: Array  # (n,)
     angle_rad: Array  # (n,) off the axis
+    light_1: Array  # (n,) flux with the star's own width over the flux that the detector found
 
 
 def star_widths(joint: Joint) -> Widths:
     """Best-fitting Gaussian widths of the bright, unsaturated stars of all frames."""
-    sigma, angle = [np.zeros(0)], [np.zeros(0)]
+    sigma, angle, light = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
     for i, (frame, matched) in enumerate(zip(joint.frames, joint.matches, strict=True)):
         found = frame.detections
         used = matched.detection[joint.fit.used[joint.points.image == i]]
@@ -35,13 +36,15 @@ def star_widths(joint: Joint) -> Widths:
         px = found.xy_px[used]
         whole = np.all((px > radius + 1) & (px < np.array([width, height]) - radius - 2), axis=1)
         if whole.any():
-            sigma.append(_widths(np.asarray(frame.exposure.pixels_adu), px[whole], radius))
+            width_px, flux = _widths(np.asarray(frame.exposure.pixels_adu), px[whole], radius)
+            sigma.append(width_px)
+            light.append(flux / found.flux_e[used[whole]])
             angle.append(joint.fit.camera.angle_rad(px[whole]))
-    return Widths(np.concatenate(sigma), np.concatenate(angle))
+    return Widths(np.concatenate(sigma), np.concatenate(angle), np.concatenate(light))
 
 
-def _widths(image: Array, px: Array, radius: int) -> Array:
-    """Width (n,) at which flux and level fit each stamp best, among WIDTHS_PX, refined by a parabola."""
+def _widths(image: Array, px: Array, radius: int) -> tuple[Array, Array]:
+    """Width (n,) at which flux and level fit each stamp best, among WIDTHS_PX and between; and that flux (n,)."""
     centre = np.rint(px).astype(int)
     side = 2 * radius + 1
     windows = np.lib.stride_tricks.sliding_window_view(image, (side, side))
@@ -50,10 +53,7 @@ def _widths(image: Array, px: Array, radius: int) -> Array:
     offset = px - centre
     miss = np.empty((len(WIDTHS_PX), len(px)))
     for k, width in enumerate(WIDTHS_PX):
-        x, _ = pixel_profile(offset[:, 0], float(width), radius)
-        y, _ = pixel_profile(offset[:, 1], float(width), radius)
-        shape = (y[:, :, None] * x[:, None, :]).reshape(len(px), -1)
-        shape = shape - shape.mean(axis=1, keepdims=True)
+        shape = _shape(offset, float(width), radius)
         miss[k] = np.sum(data**2, axis=1) - np.sum(data * shape, axis=1) ** 2 / np.sum(shape**2, axis=1)
     best = np.clip(np.argmin(miss, axis=0), 1, len(WIDTHS_PX) - 2)
     n = np.arange(len(px))
@@ -61,4 +61,14 @@ def _widths(image: Array, px: Array, radius: int) -> Array:
     bend = left - 2 * middle + right
     shift = np.divide(0.5 * (left - right), bend, out=np.zeros_like(bend), where=bend > 0)
     step = np.log(WIDTHS_PX[1] / WIDTHS_PX[0])
-    return np.asarray(WIDTHS_PX[best] * np.exp(np.clip(shift, -1, 1) * step))
+    sigma = np.asarray(WIDTHS_PX[best] * np.exp(np.clip(shift, -1, 1) * step))
+    shape = _shape(offset, sigma, radius)
+    return sigma, np.sum(data * shape, axis=1) / np.sum(shape**2, axis=1)
+
+
+def _shape(offset: Array, sigma_px: float | Array, radius: int) -> Array:
+    """Star of unit flux in each stamp (n, pixels), its mean taken away."""
+    x, _ = pixel_profile(offset[:, 0], sigma_px, radius)
+    y, _ = pixel_profile(offset[:, 1], sigma_px, radius)
+    shape = (y[:, :, None] * x[:, None, :]).reshape(len(offset), -1)
+    return np.asarray(shape - shape.mean(axis=1, keepdims=True))

@@ -1,0 +1,154 @@
+"""Folders of images: what is found, what is kept, and the same tables however the work was cut up."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from astropy.table import QTable
+
+from startrack.batch import Task, images_under, locate_image, named_images
+from startrack.camera import load_camera
+from startrack.camera.files import save_camera
+from startrack.catalog import load_catalog
+from startrack.cli.main import main
+from startrack.errors import BadInput
+from startrack.exposure import write_exposure, write_sidecar
+from startrack.render import Series, render
+from startrack.terrain import load_terrain
+
+TABLES = ("results.ecsv", "results.parquet", "trajectory.tum", "manifest.json")
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory) -> Path:
+    """Three small frames of one crater in a tree, a file that is no image, and what no batch should touch."""
+    root = tmp_path_factory.mktemp("night")
+    camera = replace(
+        load_camera("fisheye-2048"), name="small", size_px=(768, 768), focal_px=(244.0, 244.0), centre_px=(383.5, 383.5)
+    )
+    save_camera(camera, root / "small.toml")
+    series = Series(
+        camera=camera, terrain=load_terrain("shackleton-thesis"), catalog=load_catalog().brighter_than(7.0), seed=3,
+        faint_v_mag=None, hot_pixels=20, terrain_ref="shackleton-thesis",
+    )  # fmt: skip
+    for number, name in enumerate(("a 1.png", "späti/a 1.png", "späti/b.png")):
+        path = root / "images" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        scene, rng = replace(series, camera_ref=str(root / "small.toml")).scene(number, Path(name).stem)
+        exposure, truth = render(scene, rng=rng)
+        write_exposure(path, exposure)
+        write_sidecar(path, exposure)
+        (root / f"truth-{number}.json").write_text(json.dumps(truth.position_enu_m.tolist()))
+    (root / "images" / "broken.png").write_bytes(b"not a picture")
+    (root / "images" / "notes.txt").write_text("no picture either")
+    (root / "images" / ".hidden.png").write_bytes(b"")
+    return root
+
+
+@pytest.fixture(scope="module")
+def done(night) -> Path:
+    """The batch, undisturbed, on one core."""
+    out = night / "out"
+    assert main(["batch", str(night / "images"), "-D", str(out), "-j", "1", "-q"]) == 5  # broken.png is not solved
+    return out
+
+
+def tables(out: Path) -> dict[str, bytes]:
+    return {name: (out / name).read_bytes() for name in TABLES}
+
+
+def test_images_are_found_in_the_order_of_their_names(night):
+    found = images_under(night / "images")
+    assert [image.name for image in found] == ["a 1.png", "broken.png", "späti/a 1.png", "späti/b.png"]
+    assert [image.stem for image in found] == ["a 1", "broken", "späti/a 1", "späti/b"]
+    assert images_under(night / "images", night / "images" / "späti") == found[:2]
+    with pytest.raises(BadInput, match="no such folder"):
+        images_under(night / "nowhere")
+
+
+def test_equal_stems_keep_their_suffix(tmp_path):
+    for name in ("a.png", "a.tif", "b.fits.bz2", "b.jpg", "c.annotated.png"):
+        (tmp_path / name).touch()
+    assert [image.stem for image in images_under(tmp_path)] == ["a.png", "a.tif", "b.fits.bz2", "b.jpg"]
+
+
+def test_named_images_must_lie_in_the_folder(night):
+    named = named_images(night / "images", ["späti/b.png\n", str(night / "images" / "a 1.png") + "\n", "\n"])
+    assert [image.name for image in named] == ["a 1.png", "späti/b.png"]
+    with pytest.raises(BadInput, match="not under"):
+        named_images(night / "images", ["../small.toml"])
+
+
+def test_the_tables_say_what_the_results_say(night, done):
+    table = QTable.read(done / "results.ecsv", format="ascii.ecsv")
+    assert list(table["image"]) == ["a 1.png", "broken.png", "späti/a 1.png", "späti/b.png"]
+    assert list(table["status"]) == ["ok", "refused", "ok", "ok"]
+    parquet = pq.read_table(done / "results.parquet").to_pydict()
+    for number, row in enumerate((0, 2, 3)):
+        truth = json.loads((night / f"truth-{number}.json").read_text())
+        east, north = table["east_m"][row].to_value("m"), table["north_m"][row].to_value("m")
+        assert np.hypot(east - truth[0], north - truth[1]) < table["radius999_m"][row].to_value("m")
+        assert parquet["east_m"][row] == pytest.approx(east, abs=1e-4)
+    assert parquet["east_m"][1] is None
+    manifest = json.loads((done / "manifest.json").read_text())
+    assert [image["status"] for image in manifest["images"]] == ["ok", "refused", "ok", "ok"]
+    assert str(night) not in (done / "manifest.json").read_text() + (done / "results.ecsv").read_text()
+
+
+def test_the_trajectory_is_of_poses_in_the_order_of_time(done):
+    lines = np.loadtxt(done / "trajectory.tum")
+    assert lines.shape == (3, 8)
+    assert np.all(np.diff(lines[:, 0]) > 0)
+    np.testing.assert_allclose(np.linalg.norm(lines[:, 4:], axis=1), 1.0, atol=1e-8)
+
+
+def test_several_processes_and_a_second_run_give_the_same_bytes(night, done, capsys):
+    out = night / "two"
+    assert main(["batch", str(night / "images"), "-D", str(out), "-j", "2", "-q"]) == 5
+    assert tables(out) == tables(done)
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*.fix.json")}
+    assert main(["batch", str(night / "images"), "-D", str(out), "-j", "2"]) == 5
+    assert "(4 were there already)" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*.fix.json")} == before
+
+
+def test_what_was_lost_or_half_written_is_done_again_and_nothing_else(night, done):
+    out = night / "torn"
+    shutil.copytree(done, out)
+    (out / "results.ecsv").unlink()
+    (out / "späti" / "b.fix.json").write_text('{"format": "startrack.fix/1", "ima')
+    kept = (out / "a 1.fix.json").stat().st_mtime_ns
+    assert main(["batch", str(night / "images"), "-D", str(out), "-j", "1", "-q"]) == 5
+    assert tables(out) == tables(done)
+    assert (out / "a 1.fix.json").stat().st_mtime_ns == kept
+
+
+def test_a_changed_sidecar_or_flag_is_another_task(night, tmp_path):
+    image = shutil.copy(night / "images" / "späti" / "b.png", tmp_path / "b.png")
+    task = Task(name="b.png", path=str(image), result=str(tmp_path / "b.fix.json"), facts={}, plots=False)
+    sidecar = json.loads((night / "images" / "späti" / "b.json").read_text()) | {"camera": str(night / "small.toml")}
+    (tmp_path / "b.json").write_text(json.dumps(sidecar))
+    first, kept = locate_image(task)
+    assert first["status"] == "ok" and not kept
+    assert locate_image(task) == (first, True)
+    (tmp_path / "b.json").write_text(json.dumps({**sidecar, "time_utc": "2030-01-01T00:00:00Z"}))
+    assert not locate_image(task)[1]
+    (tmp_path / "b.json").unlink()
+    refused, kept = locate_image(task)
+    assert not kept
+    assert (refused["status"], refused["reason"]) == ("refused", "no_calibration")
+
+
+def test_dask_gives_the_same_as_the_local_run(night, done):
+    distributed = pytest.importorskip("distributed")
+    out = night / "dask"
+    with distributed.LocalCluster(2, processes=True, threads_per_worker=1, dashboard_address=None) as cluster:
+        command = ["batch", str(night / "images"), "-D", str(out), "-q", "--cluster", cluster.scheduler_address]
+        assert main(command) == 5
+    assert tables(out) == tables(done)

@@ -115,10 +115,10 @@ def test_from_matches_alone_of_which_a_fifth_is_wrong(law, mirrored):
 
 
 def test_the_covariance_is_as_large_as_the_errors():
-    """Map error in units of its stated sigma, over 25 frames; fx and fy of square pixels are one unknown."""
+    """Map error in units of its stated sigma, over 20 frames; fx and fy of square pixels are one unknown."""
     total, freedom = 0.0, 0
     rays = even(88, 1500, np.random.default_rng(0))
-    for seed in range(25):
+    for seed in range(20):
         camera = fitted("kannala_brandt", 1, 100, 0.2, seed).camera
         assert camera.focal_px[0] == camera.focal_px[1]
         order = camera.covariance_order
@@ -135,12 +135,12 @@ def test_the_covariance_is_as_large_as_the_errors():
 
 def test_the_map_sigma_is_the_spread_of_the_maps():
     rays = even(85, 400, np.random.default_rng(4))
-    fits = [fitted("equisolid", 1, 150, 0.2, seed).camera for seed in range(16)]
+    fits = [fitted("equisolid", 1, 150, 0.2, seed).camera for seed in range(12)]
     stated = np.mean([np.mean(camera.map_sigma_px(rays) ** 2) for camera in fits])
     seen = np.mean(
         [0.5 * map_error_px(replace(c, calibrated_angle_rad=np.radians(85)), "equisolid") ** 2 for c in fits]
     )
-    assert np.sqrt(seen) == pytest.approx(np.sqrt(stated), rel=0.25)
+    assert np.sqrt(seen) == pytest.approx(np.sqrt(stated), rel=0.3)
 
 
 def test_stars_inside_60_degrees_calibrate_60_degrees():

@@ -106,7 +106,7 @@ def _points(frames: tuple[Frame, ...], matches: tuple[Matched, ...]) -> Observat
 
 def _pairs(detection: Ints, star: Ints) -> Matched:
     order = np.argsort(detection)
-    return Matched(detection[order], star[order], 0, 0, 0, 0, 0.0)
+    return Matched(detection[order], star[order], 0, 0, 0, 0)
 
 
 def _outer(angle_rad: Array) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,6 @@ class Matched:
     expected_found: int  # of them, those with a source of their brightness
     significant: int  # bright sources within the angle searched
     significant_matched: int
-    pairs_at_random: float  # coincidences expected from chance alone
 
     def __len__(self) -> int:
         return len(self.star)
@@ -57,31 +57,21 @@ def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: flo
     found, stars = frame.detections, frame.sky.stars
     source_mag = -2.5 * np.log10(np.maximum(found.flux_e, 1e-9))
     tree = cKDTree(found.xy_px)
-    px, angle, seen = _predicted(frame, camera, R_cam_icrs, within_rad, len(stars.v_mag))
-    some = seen[seen < SCALE_STARS]
-    distance, nearest = tree.query(px[some], distance_upper_bound=gate_px)
-    hit = np.isfinite(distance)
-    hit[hit] &= ~found.saturated[nearest[hit]]
-    zero = _brightness(angle[some[hit]], stars.v_mag[some[hit]] - source_mag[nearest[hit]])
-    offset = zero(angle)
-    limit = source_mag.max() + DEPTH_MAG
-    seen = seen[(stars.v_mag - offset)[seen] < limit + BLEND_MAG]
+    zero = _brightness(frame, camera, R_cam_icrs, within_rad, gate_px, tree)
+    limit = float(source_mag.max()) + DEPTH_MAG
+    faintest_v = limit + BLEND_MAG + float(np.max(zero(np.linspace(0.0, within_rad, 50))))
+    count = int(np.searchsorted(stars.v_mag, faintest_v))
+    px, angle, seen = _predicted(frame, camera, R_cam_icrs, within_rad, count)
+    expected_mag = stars.v_mag[:count] - zero(angle)  # in the instrument's magnitudes
+    seen = seen[expected_mag[seen] < limit + BLEND_MAG]
     distance, nearest = tree.query(px[seen], distance_upper_bound=gate_px)
-    hit = np.isfinite(distance) & ((stars.v_mag - offset)[seen] < limit)
-    star, detection, distance = seen[hit], nearest[hit], distance[hit]
-    brighter = (stars.v_mag - offset)[star] - source_mag[detection]
-    alike = np.abs(brighter) < np.hypot(MAGNITUDE_TOLERANCE, 2.0 * stars.v_sigma_mag[star])
-    alike |= found.saturated[detection] & (brighter < 0)
-    star, detection, distance = star[alike], detection[alike], distance[alike]
-    keep = _nearest_of_each(detection, distance)
-    star, detection = star[keep], detection[keep]
+    hit = np.isfinite(distance) & (expected_mag[seen] < limit)
+    star, detection = _alike(frame, seen[hit], nearest[hit], distance[hit], expected_mag, source_mag)
     alone = _alone(px, seen, star, stars.v_mag, BLEND_PX * found.psf_sigma_px)
     faintest = float(np.quantile(source_mag[detection], LIMIT_QUANTILE)) if len(detection) else -np.inf
-    bright = seen[(stars.v_mag - offset)[seen] < faintest - SECURE_MAG]
+    bright = seen[expected_mag[seen] < faintest - SECURE_MAG]
     expected = bright[_open(px[bright], found.xy_px[detection], frame.size_px)]
-    inner = camera.angle_rad(found.xy_px) < within_rad
-    significant = inner & (source_mag < faintest - SECURE_MAG)
-    density = len(found.xy_px) / max(float(np.prod(frame.size_px)), 1.0)
+    significant = (camera.angle_rad(found.xy_px) < within_rad) & (source_mag < faintest - SECURE_MAG)
     return Matched(
         detection=detection[alone],
         star=star[alone],
@@ -89,8 +79,19 @@ def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: flo
         expected_found=int(np.isin(expected, star).sum()),
         significant=int(significant.sum()),
         significant_matched=int(np.count_nonzero(significant[detection])),
-        pairs_at_random=float(len(seen) * density * np.pi * gate_px**2),
     )
+
+
+def _alike(
+    frame: Frame, star: Ints, detection: Ints, distance: Array, expected_mag: Array, source_mag: Array
+) -> tuple[Ints, Ints]:
+    """Of the pairs (n,) those that are equally bright, and of each source's the closest: stars and sources."""
+    brighter = expected_mag[star] - source_mag[detection]
+    alike = np.abs(brighter) < np.hypot(MAGNITUDE_TOLERANCE, 2.0 * frame.sky.stars.v_sigma_mag[star])
+    alike |= frame.detections.saturated[detection] & (brighter < 0)
+    star, detection, distance = star[alike], detection[alike], distance[alike]
+    keep = _nearest_of_each(detection, distance)
+    return star[keep], detection[keep]
 
 
 def _predicted(
@@ -106,8 +107,21 @@ def _predicted(
     return px, angle, np.flatnonzero(inside)
 
 
-def _brightness(angle_rad: Array, zero_mag: Array) -> Callable[[Array], Array]:
-    """Zero point [mag] as a polynomial of the angle off the axis: vignetting and, roughly, the air are in it."""
+def _brightness(
+    frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: float, gate_px: float, tree: Any
+) -> Callable[[Array], Array]:
+    """Zero point [mag] as a function of the angle off the axis: vignetting and, roughly, the air are in it."""
+    found, v_mag = frame.detections, frame.sky.stars.v_mag
+    px, angle, seen = _predicted(frame, camera, R_cam_icrs, within_rad, SCALE_STARS)
+    distance, nearest = tree.query(px[seen], distance_upper_bound=gate_px)
+    hit = np.isfinite(distance)
+    hit[hit] &= ~found.saturated[nearest[hit]]
+    source_mag = -2.5 * np.log10(np.maximum(found.flux_e[nearest[hit]], 1e-9))
+    return _parabola(angle[seen[hit]], v_mag[seen[hit]] - source_mag)
+
+
+def _parabola(angle_rad: Array, zero_mag: Array) -> Callable[[Array], Array]:
+    """Robust parabola through zero points; constant beyond the angles of the stars, where it might do anything."""
     if not len(zero_mag):
         return np.poly1d([0.0])
     fit = np.poly1d([float(np.median(zero_mag))])
@@ -118,7 +132,6 @@ def _brightness(angle_rad: Array, zero_mag: Array) -> Callable[[Array], Array]:
         if close.sum() < FEWEST_FOR_SHAPE:
             break
         fit = np.poly1d(np.polyfit(angle_rad[close], zero_mag[close], 2))
-    # Outside the angles of the stars it was fitted to, a parabola may do anything.
     low, high = np.min(angle_rad), np.max(angle_rad)
     return lambda a: fit(np.clip(a, low, high))
 

@@ -160,8 +160,10 @@ def _name_all(run: _Run, frames: list[Frame]) -> None:
 def _name(run: _Run, frame: Frame) -> None:
     run.progress(f"naming the stars of {frame.name}")
     camera, found = _identified(run, frame)
-    run.progress(f"following the lens outwards in {frame.name}")
-    camera, R = grown(frame, camera, found.R_cam_icrs, found.star, found.detection)
+    R = found.R_cam_icrs
+    if not run.named:
+        run.progress(f"following the lens outwards in {frame.name}")
+        camera, R = grown(frame, camera, R, found.star, found.detection)
     run.worst_chance = max(run.worst_chance, found.false_alarm_probability)
     run.named.append(_Named(frame, camera, R, len(found)))
 

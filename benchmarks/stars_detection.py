@@ -11,6 +11,7 @@ import argparse
 import time
 from collections import defaultdict
 from dataclasses import dataclass, field
+from importlib import metadata
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ MAIN_WIDTH_PX = 1.2
 SNR_RANGE = (3.0, 300.0)
 FAINT_BINS, BRIGHT_BINS = ((4, 5), (5, 7), (7, 10)), ((10, 20), (20, 50), (50, 100), (100, 300))
 STARS = 2000
+PEERS = ("numpy", "opencv-contrib-python-headless", "sep", "photutils", "tetra3rs")
 
 
 @dataclass
@@ -62,9 +64,17 @@ def main() -> None:
     body = [_main_table(finders, args.frames), _widths_table(finders, max(2, args.frames // 4))]
     print("\n\n".join(body))
     if args.write:
-        packages = ("numpy", "opencv-contrib-python-headless", "sep", "photutils", "tetra3rs")
+        packages = tuple(name for name in PEERS if _installed(name))
         write_section("Stars: detection", f"python benchmarks/stars_detection.py --frames {args.frames}", packages,
                       "\n\n".join(body))  # fmt: skip
+
+
+def _installed(package: str) -> bool:
+    try:
+        metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return False
+    return True
 
 
 def _main_table(finders: dict[str, Finder], frames: int) -> str:

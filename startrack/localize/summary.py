@@ -66,12 +66,13 @@ def _moments(centres_m: Array, weight: Array, width_m: float) -> tuple[Array, Ar
 
 
 def _radii(offsets_m: Array, weight: Array, masses: tuple[float, ...], width_m: float) -> tuple[float, ...]:
-    """Radii of the circles that hold these parts of the mass, a box's half diagonal included."""
+    """Radii of the circles that hold these parts of the mass; of a single box it is the half diagonal."""
     distance = np.sqrt(np.einsum("ni,ni->n", offsets_m, offsets_m))
     order = np.argsort(distance)
     running = np.cumsum(weight[order])
     at = np.searchsorted(running, np.array(masses) * running[-1] * (1 - 1e-12))
-    return tuple(float(r) + width_m * np.sqrt(0.5) for r in distance[order[np.minimum(at, len(order) - 1)]])
+    # As much of the boxes across the circle lies within as beyond it: their size adds in squares, not in full.
+    return tuple(float(np.hypot(r, width_m * np.sqrt(0.5))) for r in distance[order[np.minimum(at, len(order) - 1)]])
 
 
 def _modes(centres_m: Array, weight: Array, width_m: float, covariance: Array) -> Ints:

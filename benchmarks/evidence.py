@@ -25,12 +25,13 @@ from startrack.deep_catalog import load_deep_catalog
 from startrack.detect import electrons
 from startrack.evidence import StarEvidence, StarLight, flux_scale
 from startrack.localize import ExactPosterior
-from startrack.pipeline import Result, locate
+from startrack.pipeline import Result, Settings, locate
 from startrack.render import Series, exposure_reaching, render
 from startrack.terrain import load_terrain
 from startrack.types import Array, Evidence, Fix, NoSolution
 
 CHI2_2 = {"50": 1.3863, "95": 5.9915, "99.9": 13.8155}  # of two degrees of freedom
+LISTS = {"full": "Hipparcos", "gaia list": "Hipparcos and Gaia"}
 CERTAIN = 9.0  # nats: what a list says at most of one star
 
 
@@ -41,7 +42,7 @@ class Depth:
     v_mag: float
     frames: int
     ablations: bool = False
-    gaia: bool = False
+    gaia_frames: int = 0  # the first ones are looked at with Gaia's list too
 
 
 def main() -> None:
@@ -49,14 +50,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=300, help="at V 6.0")
     parser.add_argument("--deep-frames", type=int, default=100, help="at V 7.5")
-    parser.add_argument("--other-frames", type=int, default=40, help="at V 5, 7 and 8")
+    parser.add_argument("--other-frames", type=int, default=20, help="at V 5, 7 and 8")
     parser.add_argument("--seed", type=int, default=1736)
     parser.add_argument("-j", "--jobs", type=int, default=2)
     args = parser.parse_args()
     depths = (
         Depth(5.0, args.other_frames), Depth(6.0, args.frames, ablations=True),
-        Depth(7.0, args.other_frames, gaia=True), Depth(7.5, args.deep_frames, gaia=True),
-        Depth(8.0, args.other_frames, gaia=True),
+        Depth(7.0, args.other_frames), Depth(7.5, args.deep_frames, ablations=True, gaia_frames=args.other_frames),
+        Depth(8.0, args.other_frames),
     )  # fmt: skip
     jobs = [(args.seed, depth, number) for depth in depths for number in range(depth.frames)]
     rows: dict[tuple[float, str], list[dict[str, Any]]] = {}
@@ -65,14 +66,15 @@ def main() -> None:
             for name, row in lines.items():
                 rows.setdefault((job[1].v_mag, name), []).append(row)
             if done % 20 == 0:
-                print(f"{done} of {len(jobs)}", flush=True)
+                print(f"{done} of {len(jobs)}", {key: line(found) for key, found in rows.items()}, flush=True)
     command = f"python benchmarks/evidence.py --frames {args.frames} --deep-frames {args.deep_frames}"
-    parts = [[name, *line(found)] for (v, name), found in rows.items() if v == 6.0]
-    deep = [
-        [f"{v:.1f}", name, *line(found)] for (v, name), found in sorted(rows.items()) if name in ("full", "gaia list")
+    ablated = [depth.v_mag for depth in depths if depth.ablations]
+    parts = [
+        [f"{v:.1f}", name, *line(found)] for (v, name), found in rows.items() if v in ablated and name != "gaia list"
     ]
+    deep = [[f"{v:.1f}", LISTS[name], *line(found)] for (v, name), found in sorted(rows.items()) if name in LISTS]
     for title, text in (
-        ("Evidence, part by part", table(["at V 6.0 = 5 sigma", *HEAD], parts)),
+        ("Evidence, part by part", table(["5 sigma at V", "evidence", *HEAD], parts)),
         ("Depth", table(["5 sigma at V", "list", *HEAD], deep)),
     ):
         print(text)
@@ -106,10 +108,11 @@ def one(job: tuple[int, Depth, int]) -> dict[str, dict[str, Any]]:
     scene, rng = series.scene(number)
     exposure, truth = render(scene, rng=rng)
     place = truth.position_enu_m[:2]
-    result = locate(exposure, camera, terrain, catalog)
+    fast = Settings(localizer=ExactPosterior(compiled=True))
+    result = locate(exposure, camera, terrain, catalog, fast)
     rows = {"full": _scored(result.fix if result.status == "ok" else None, place)}
-    if depth.gaia:
-        deep = locate(exposure, camera, terrain, sky)
+    if number < depth.gaia_frames:
+        deep = locate(exposure, camera, terrain, sky, fast)
         rows["gaia list"] = _scored(deep.fix if deep.status == "ok" else None, place)
     if depth.ablations and result.light is not None:
         for name, evidence, localizer in _ablations(result, catalog):

@@ -21,7 +21,9 @@ from chain import SENSOR
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
+from startrack.evidence import StarEvidence
 from startrack.localize import ExactPosterior
+from startrack.orient import rotation
 from startrack.pipeline import Settings, locate
 from startrack.render import Series, render
 from startrack.terrain import Cylinder, load_terrain
@@ -53,6 +55,18 @@ class Trouble:
     clock_s: float = 0.0
     tilt_deg: float = 5.0
     swapped: float = 0.0  # part of the catalogue's stars whose identities are mixed up
+    attitude_bias_arcsec: float = 0.0  # about each axis of the camera
+
+
+@dataclass(frozen=True)
+class Biased:
+    """The evidence taken at an attitude that is wrong by a rotation."""
+
+    arcsec: float
+
+    def __call__(self, *what: Any) -> Any:
+        turn = rotation(np.radians(np.full(3, self.arcsec) / 3600))
+        return StarEvidence()(*what[:6], turn @ what[6], *what[7:])  # the seventh is the attitude
 
 
 def ridge(width_deg: float, height_deg: float) -> Callable[[Cylinder], Cylinder]:
@@ -76,6 +90,7 @@ TROUBLES = (
     ),
     Trouble("clock wrong by one hour", clock_s=3600.0),
     Trouble("3 % of identities wrong", swapped=0.03),
+    Trouble("attitude biased by 3 sigma (3.5 arcsec per axis)", attitude_bias_arcsec=3.5),
     Trouble("tilt to 10 degrees", tilt_deg=10.0),
     Trouble("tilt to 20 degrees", tilt_deg=20.0),
     Trouble("tilt to 30 degrees", tilt_deg=30.0),
@@ -118,7 +133,8 @@ def one(job: tuple[int, int]) -> dict[str, Any]:
         rays = np.array(catalog.rays_icrs)
         rays[chosen] = rays[np.roll(chosen, 1)]
         catalog = replace(catalog, rays_icrs=rays)
-    settings = Settings(localizer=ExactPosterior(compiled=True))
+    evidence = Biased(trouble.attitude_bias_arcsec) if trouble.attitude_bias_arcsec else StarEvidence()
+    settings = Settings(localizer=ExactPosterior(compiled=True), evidence=evidence)  # type: ignore[arg-type]
     result = locate(exposure, scene.camera, trouble.told(true), catalog, settings)
     if result.fix is None or result.status != "ok":
         return {"status": result.status, "reason": result.reason}

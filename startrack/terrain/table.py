@@ -3,6 +3,7 @@ the horizon, where it stands, and a line above and a point below the ground that
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -108,7 +109,7 @@ def built(
         values[part] = stored(fill(part))
         return len(part)
 
-    with ThreadPoolExecutor(_cores()) as pool:
+    with ThreadPoolExecutor(cpu_count()) as pool:
         for count in pool.map(work, parts):
             done += count
             if progress is not None:
@@ -116,7 +117,6 @@ def built(
     return HorizonTable(square, values, unknown_rad)
 
 
-def _cores() -> int:
-    import os
-
+def cpu_count() -> int:
+    """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

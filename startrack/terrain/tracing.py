@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from startrack.terrain.table import BINS, HorizonTable
+from startrack.terrain.table import BINS, HorizonTable, cpu_count
 from startrack.types import Array
 
 if TYPE_CHECKING:
     from startrack.terrain.dem import HeightTerrain
 
+WORTH_THREADS, MOST_THREADS = 1500, 8
 NO_VALUES = np.zeros((0, BINS, 9), dtype=np.uint16)
 
 
@@ -56,9 +58,8 @@ class CompiledTracer:
 
         tan, at, edge = (np.empty(len(azimuths)) for _ in range(3))
         values, across, reach = _table(table)
-        table_compiled.horizons(
-            terrain.ground, values, across, reach, terrain.camera_height_m, points, azimuths, tan, at, edge
-        )
+        fixed = terrain.ground, values, across, reach, terrain.camera_height_m
+        _side_by_side(table_compiled.horizons, fixed, (points, azimuths, tan, at, edge))
         return tan, at, edge
 
     def fill_cells(self, terrain: HeightTerrain, centres: Array, half: float, azimuths: Array, turn: float) -> Array:
@@ -75,7 +76,8 @@ class CompiledTracer:
         """centres, half, azimuths, turn, and the results low, high."""
         from startrack.terrain import table_compiled
 
-        table_compiled.box_bounds(terrain.ground, *_table(table), terrain.camera_height_m, *arrays)
+        fixed = terrain.ground, *_table(table), terrain.camera_height_m
+        _side_by_side(table_compiled.box_bounds, fixed, arrays)
 
     def sector_bounds(self, terrain: HeightTerrain, table: HorizonTable, *arrays: Array) -> None:
         """Likewise; all boxes of one size."""
@@ -86,6 +88,19 @@ class CompiledTracer:
         table_compiled.many_sector_bounds(
             terrain.ground, values, lows, highs, across, reach, terrain.camera_height_m, *arrays
         )
+
+
+def _side_by_side(function: Any, fixed: tuple[Any, ...], arrays: tuple[Array, ...]) -> None:
+    """Call the function with the fixed arguments and parts of the arrays, on all cores where that is worth while."""
+    n, cores = len(arrays[-1]), min(cpu_count(), MOST_THREADS)
+    if n < WORTH_THREADS or cores == 1:
+        function(*fixed, *arrays)
+        return
+    ends = np.linspace(0, n, cores + 1).astype(int)
+    with ThreadPoolExecutor(cores) as pool:
+        parts = [[a[i:j] for a in arrays] for i, j in zip(ends[:-1], ends[1:], strict=True)]
+        for future in [pool.submit(function, *fixed, *part) for part in parts]:
+            future.result()
 
 
 def level_for(table: HorizonTable, half: float) -> int:

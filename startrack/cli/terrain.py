@@ -1,0 +1,227 @@
+"""`startrack terrain`: look at a terrain, work out its horizons ahead of time, make one from elevation data."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from startrack.cli.common import DEFAULT_OUT
+from startrack.errors import BadInput
+
+if TYPE_CHECKING:
+    from startrack.terrain import Terrain
+    from startrack.terrain.dem import HeightTerrain
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add `terrain` to the commands of the `startrack` parser."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "terrain", help="look at a terrain, work out its horizons, make one from elevation data",
+        description="TERRAIN is a terrain file (a path if it ends in .toml or contains a separator) or a shipped name.",
+    )  # fmt: skip
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    show = actions.add_parser("show", help="facts, relief and, with --at, the horizon seen from a place")
+    show.add_argument("terrain", metavar="TERRAIN")
+    show.add_argument("--at", nargs=2, type=float, metavar=("EAST", "NORTH"), help="a place [m]")
+    build = actions.add_parser("build", help="work out the horizons now; otherwise the first fix does")
+    build.add_argument("terrain", nargs="+", metavar="TERRAIN")
+    build.add_argument("--force", action="store_true", help="even where they are known")
+    made = actions.add_parser("import", help="a terrain file and GeoTIFF crops from elevation data")
+    made.add_argument("maps", nargs="+", metavar="MAP", help="GeoTIFF, COG, PDS label ..., the finest first")
+    made.add_argument("-o", "--output", required=True, metavar="NAME.toml")
+    made.add_argument("--latitude", type=float, required=True, metavar="DEG", help="of the origin, north positive")
+    made.add_argument("--longitude", type=float, required=True, metavar="DEG", help="east positive")
+    made.add_argument("--radius", type=float, default=10_000.0, metavar="M", help="of the search area (%(default).0f)")
+    made.add_argument(
+        "--half", nargs="+", type=float, metavar="M", help="half side of each map's crop (30000 for the first, then 300000)"
+    )
+    made.add_argument(
+        "--scale", nargs="+", type=float, metavar="M", help="metres per unit of each map, where the files do not say"
+    )
+    made.add_argument(
+        "--offset", nargs="+", type=float, metavar="M", help="height of value 0 of each map, where the files do not say"
+    )
+    made.add_argument("--sigma", type=float, default=1.0, metavar="M", help="error of single posts (%(default)g)")
+    made.add_argument("--camera-height", type=float, default=1.5, metavar="M", help="above the ground (%(default)g)")
+    for action in (show, build, made):
+        action.add_argument("--json", action="store_true", help="print one JSON object per terrain")
+        action.add_argument("-v", "--verbose", action="count", default=0, help="tracebacks of internal errors")
+        action.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    show.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the pictures (%(default)s)")
+    show.add_argument("--no-plots", action="store_true", help="no pictures")
+    made.add_argument("-O", "--overwrite", action="store_true", help="replace files")
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do the action; 0 when it is done."""
+    return {"show": _show, "build": _build, "import": _import}[args.action](args)
+
+
+def _show(args: argparse.Namespace) -> int:
+    from startrack.terrain import load_terrain
+
+    terrain = load_terrain(args.terrain)
+    place = None if args.at is None else (args.at[0], args.at[1])
+    facts = _facts(terrain) | _seen_from(terrain, place)
+    if not args.no_plots:
+        facts["files"] = [str(path) for path in _pictures(args, terrain, place)]
+    _tell(args, facts)
+    return 0
+
+
+def _facts(terrain: Terrain) -> dict[str, Any]:
+    from math import degrees
+
+    site = terrain.site
+    facts: dict[str, Any] = {
+        "name": terrain.name,
+        "body": site.body,
+        "latitude_deg": round(degrees(site.latitude_rad), 6),
+        "longitude_deg": round(degrees(site.longitude_rad), 6),
+        "search_radius_m": terrain.search_radius_m,
+        "camera_height_m": terrain.camera_height_m,
+    }
+    return facts | (_map_facts(terrain) if _is_dem(terrain) else {"kind": "cylinder"})
+
+
+def _map_facts(terrain: Any) -> dict[str, Any]:
+    from startrack.terrain import cache
+    from startrack.terrain.projection import NAMES
+
+    maps = [
+        {
+            "file": m.source, "posts": list(m.heights_m.shape), "post_m": round(m.post_m, 3),
+            "projection": NAMES[m.projection.kind], "lowest_m": round(float(m.heights_m.min()), 1),
+            "highest_m": round(float(m.heights_m.max()), 1),
+        }
+        for m in terrain.maps
+    ]  # fmt: skip
+    path = cache.path_of(cache.key_of(terrain))
+    return {
+        "kind": "dem", "maps": maps, "height_sigma_m": terrain.height_sigma_m, "horizons": str(path),
+        "horizons_ready": path.is_file(),
+    }  # fmt: skip
+
+
+def _seen_from(terrain: Terrain, place: tuple[float, float] | None) -> dict[str, Any]:
+    if place is None:
+        return {}
+    import numpy as np
+
+    from startrack.frames import latlon_from_enu
+
+    point = np.array([place])
+    if not terrain.allowed(point)[0]:
+        raise BadInput("bad_terrain", f"E {place[0]:g} m, N {place[1]:g} m is outside what the terrain knows")
+    ground = float(terrain.ground_m(point)[0])
+    horizon = np.degrees(terrain.horizon_rad(point, np.radians(np.arange(720) / 2)))
+    lat, lon = latlon_from_enu(terrain.site, *place, ground)
+    return {
+        "east_m": place[0], "north_m": place[1], "ground_m": round(ground, 2),
+        "place_latitude_deg": round(float(np.degrees(lat)), 6), "place_longitude_deg": round(float(np.degrees(lon)), 6),
+        "horizon_min_deg": round(float(horizon.min()), 3), "horizon_max_deg": round(float(horizon.max()), 3),
+    }  # fmt: skip
+
+
+def _pictures(args: argparse.Namespace, terrain: Terrain, place: tuple[float, float] | None) -> list[Path]:
+    from startrack.report.terrain_picture import panorama_picture, relief_picture
+
+    out = Path(args.dir)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as cause:
+        raise BadInput("bad_terrain", f"{out}: pictures cannot be written there: {cause.strerror}") from cause
+    pictures = {out / f"{terrain.name}.relief.png": relief_picture(terrain, place)}
+    if place is not None:
+        pictures[out / f"{terrain.name}.horizon.png"] = panorama_picture(terrain, place)
+    from PIL import Image
+
+    for path, picture in pictures.items():
+        Image.fromarray(picture).save(path)
+    return list(pictures)
+
+
+def _build(args: argparse.Namespace) -> int:
+    from startrack.terrain import cache, load_terrain
+
+    for name in args.terrain:
+        terrain = load_terrain(name)
+        facts: dict[str, Any] = {"name": terrain.name}
+        if isinstance(terrain, _dem_class()):
+            path = cache.path_of(cache.key_of(terrain))
+            if args.force:
+                path.unlink(missing_ok=True)
+            start = time.perf_counter()
+            known = path.is_file()
+            with building(terrain, quiet=args.quiet):
+                terrain.prepared()
+            facts |= {"horizons": str(path), "known_before": known, "seconds": round(time.perf_counter() - start, 1)}
+        else:
+            facts["horizons"] = None
+        _tell(args, facts)
+    return 0
+
+
+@contextmanager
+def building(terrain: Terrain, quiet: bool = False) -> Iterator[None]:
+    """While a height map's horizons are worked out, a bar on a terminal."""
+    if quiet or not sys.stderr.isatty() or not _is_dem(terrain):  # no terminal to draw a bar on, or nothing to do
+        yield
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(f"horizons of {terrain.name}", total=None, visible=False)
+        advance: Callable[[int, int], None] = lambda done, total: bar.update(  # noqa: E731
+            task, completed=done, total=total, visible=True
+        )
+        terrain.prepared(advance)  # type: ignore[attr-defined]
+        yield
+
+
+def _import(args: argparse.Namespace) -> int:
+    from startrack.terrain.imported import import_maps
+
+    half = list(args.half or [])
+    half += [30_000.0 if not half and k == 0 else 300_000.0 for k in range(len(half), len(args.maps))]
+    path = import_maps(
+        args.maps, args.output, latitude_deg=args.latitude, longitude_deg=args.longitude, half_m=half,
+        radius_m=args.radius, scale=args.scale or (), offset_m=args.offset or (), height_sigma_m=args.sigma,
+        camera_height_m=args.camera_height, overwrite=args.overwrite,
+    )  # fmt: skip
+    from startrack.terrain import load_terrain
+
+    _tell(args, _facts(load_terrain(path)) | {"file": str(path)})
+    return 0
+
+
+def _tell(args: argparse.Namespace, facts: dict[str, Any]) -> None:
+    if args.json:
+        print(json.dumps({"format": "startrack.terrain/1", **facts}), flush=True)
+    elif not args.quiet:
+        print(facts["name"])
+        for key, value in facts.items():
+            if key == "maps":
+                for m in value:
+                    print(f"  map  {'  '.join(f'{k} {v}' for k, v in m.items())}")
+            elif key != "name":
+                print(f"  {key}  {value}", flush=True)
+
+
+def _dem_class() -> type[HeightTerrain]:
+    from startrack.terrain.dem import HeightTerrain
+
+    return HeightTerrain
+
+
+def _is_dem(terrain: Terrain) -> bool:
+    return isinstance(terrain, _dem_class())

@@ -1,0 +1,65 @@
+"""From elevation data to a terrain of one's own: crops as GeoTIFF beside a terrain file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from startrack.terrain.geotiff import write_map
+from startrack.terrain.rasters import read_map
+from startrack.types import BadInput
+
+
+def import_maps(
+    maps: Sequence[str | Path], output: str | Path, *, latitude_deg: float, longitude_deg: float,
+    half_m: Sequence[float], radius_m: float, scale: Sequence[float] = (), offset_m: Sequence[float] = (),
+    height_sigma_m: float = 1.0, camera_height_m: float = 1.5, overwrite: bool = False,
+) -> Path:  # fmt: skip
+    """Write the terrain file and, beside it, a crop of each map, NAME-1.tif the finest; the terrain file's path.
+
+    half_m: half the side of each crop about the origin [m]. scale and offset_m of each map, the finest first, where the
+    files themselves do not say. Raises BadInput bad_terrain: nothing is then written.
+    """
+    import tomli_w
+
+    from startrack.terrain.files import terrain_from_dict
+
+    output = Path(output)
+    if output.suffix != ".toml":
+        raise BadInput("bad_terrain", f"{output}: a terrain file's name ends in .toml")
+    if not abs(latitude_deg) <= 90:
+        raise BadInput("bad_terrain", f"latitude {latitude_deg:g} is not within -90..90")
+    at = float(np.radians(latitude_deg)), float(np.radians(longitude_deg))
+    files = [output.with_name(f"{output.stem}-{k + 1}.tif") for k in range(len(maps))]
+    there = [path for path in (output, *files) if path.exists()]
+    if there and not overwrite:
+        raise BadInput("bad_terrain", f"{there[0]} is there already: choose another name, or replace it with -O")
+    crops = []
+    for k, (source, half) in enumerate(zip(maps, half_m, strict=True)):
+        own = {"scale": scale[k] if k < len(scale) else None, "offset_m": offset_m[k] if k < len(offset_m) else None}
+        crop = read_map(source, near=at, **own).around(*at, half)
+        if min(crop.heights_m.shape) < 2:
+            raise BadInput("bad_terrain", f"{source}: it does not reach {latitude_deg:g}, {longitude_deg:g}")
+        crops.append(replace(crop, source=Path(source).name))
+    d = {
+        "format": 1, "name": output.stem, "body": "moon",
+        "origin": {"latitude_deg": float(latitude_deg), "longitude_deg": float(longitude_deg)},
+        "dem": {"file": [path.name for path in files], "height_sigma_m": float(height_sigma_m)},
+        "rover": {"camera_height_m": float(camera_height_m)}, "search": {"radius_m": float(radius_m)},
+    }  # fmt: skip
+    output.parent.mkdir(parents=True, exist_ok=True)
+    written: list[Path] = []
+    try:
+        for path, crop in zip(files, crops, strict=True):
+            written.append(path)
+            write_map(path, crop)
+        terrain_from_dict(d, folder=output.parent)
+        output.write_text(tomli_w.dumps(d), encoding="utf-8")
+    except BaseException:
+        for path in written:
+            path.unlink(missing_ok=True)
+        raise
+    return output

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from startrack.camera import Camera
 from startrack.identify.family import PINHOLE, radius
 from startrack.identify.grow import WIDE, Grown, Stage, grow
-from startrack.identify.hypotheses import Guess, Hypotheses, Window, apart, narrow_sizes, patterns_for, wide_sizes
+from startrack.identify.hypotheses import (
+    Guess,
+    Hypotheses,
+    PatternSizes,
+    Window,
+    apart,
+    narrow_sizes,
+    patterns_for,
+    wide_sizes,
+)
 from startrack.identify.polish import Polished, polished
 from startrack.types import Array, Detections, Identification, Ints, NotIdentified, Stars
 
@@ -30,6 +39,11 @@ CIRCLES = (0.5, 0.62, 0.42, 0.78, 1.0)  # radius of the image circle over the fr
 NARROW_WINDOWS = (
     Window(0, 0, 8), Window(0, 8, 14), Window(14, 14, 26), Window(0, 14, 22), Window(26, 26, 40), Window(0, 22, 32),
 )  # fmt: skip
+NARROW_PATTERNS = (
+    (10, 0.8, 2),
+    (18, 0.5, 6),
+    (48, 0.28, 6),
+)  # stars in the field, longest side over its diameter, windows
 FIELD_STEPS = 4.0  # indexes are made for fields a fourth part of a factor e apart
 WIDE_SHAPES = (-0.35, 0.25, -0.8, 0.7)
 MIDDLE_SHAPES = (PINHOLE, 0.4, -0.4)
@@ -90,14 +104,13 @@ class _Search:
         self.fewest = FEWEST_WIDE if self.wide else FEWEST_NARROW
         self.xy_px = detections.xy_px
         self.narrow = fov_rad <= NARROW_FIELD_RAD
-        patterns = patterns_for(stars, (narrow_sizes if self.narrow else wide_sizes)(self._rounded_field_sr()))
         chosen = apart(self.xy_px, APART * min(size_px), 100)
         if len(chosen) < self.fewest:
             raise NotIdentified(
                 f"{len(chosen)} point sources are too few to identify without a camera file: expose longer, or {TRY}",
                 detected=len(detections),
             )
-        self.hypotheses = Hypotheses(self.xy_px[chosen], size_px, patterns)
+        self.hypotheses = Hypotheses(self.xy_px[chosen], size_px)
 
     @property
     def tried(self) -> int:
@@ -112,12 +125,13 @@ class _Search:
     def grown(self) -> Iterator[tuple[Grown, Ints]]:
         """Hypotheses that survive growing, and the stars (indices) that they speak of."""
         stages = self._stages()
-        for window in NARROW_WINDOWS if self.narrow else WINDOWS:
+        for sizes, window in self._rounds():
+            patterns = patterns_for(self.stars, sizes)
             if window.done >= len(self.hypotheses.xy_px):
-                return
+                continue
             for guess in self._guesses():
                 taken: list[Array] = []
-                for start in self.hypotheses.starts(guess, window, LOG_PLAUSIBLE):
+                for start in self.hypotheses.starts(patterns, guess, window, LOG_PLAUSIBLE):
                     if any(np.trace(R.T @ start.R_cam_icrs) > 1 + 2 * np.cos(0.05) for R in taken):
                         continue
                     taken.append(start.R_cam_icrs)
@@ -127,6 +141,15 @@ class _Search:
                         yield found, around
                 if self.tried > MOST_TRIED:
                     return
+
+    def _rounds(self) -> Iterator[tuple[PatternSizes, Window]]:
+        """Which patterns of the catalogue and which of the detections, in turn."""
+        field_sr = float(np.exp(np.round(FIELD_STEPS * np.log(self._field_sr())) / FIELD_STEPS))
+        if not self.narrow:
+            yield from ((wide_sizes(field_sr), window) for window in WINDOWS)
+            return
+        for in_field, reach, windows in NARROW_PATTERNS:
+            yield from ((narrow_sizes(field_sr, in_field, reach), window) for window in NARROW_WINDOWS[:windows])
 
     def _around(self, axis_icrs: Array) -> Ints:
         """Indices of the stars that a narrow camera may see; for wide ones all of them."""
@@ -159,22 +182,14 @@ class _Search:
         other = half * self.size_px[1] / self.size_px[0]
         return float(4 * np.arcsin(half * other / np.sqrt((1 + half**2) * (1 + other**2))))
 
-    def _rounded_field_sr(self) -> float:
-        return float(np.exp(np.round(FIELD_STEPS * np.log(self._field_sr())) / FIELD_STEPS))
-
     def _stages(self) -> tuple[Stage, ...]:
         """The stages of growing, smaller for smaller fields."""
         if self.wide:
             return WIDE
         part = float(np.sqrt(self._field_sr() / (2 * np.pi)))
-        free = ("scale",) if self.narrow else ("scale", "shape", "centre")
+        if self.narrow:
+            return tuple(replace(s, gate_rad=s.gate_rad * part, free=("scale",)) for s in WIDE if s.reach_rad == np.pi)
         return tuple(
-            Stage(
-                min(s.reach_rad * part if s.reach_rad < np.pi else np.pi, np.pi),
-                s.gate_rad * part,
-                s.detections,
-                free,
-                s.log_limit,
-            )
+            replace(s, reach_rad=s.reach_rad * (part if s.reach_rad < np.pi else 1.0), gate_rad=s.gate_rad * part)
             for s in WIDE
         )

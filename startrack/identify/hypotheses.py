@@ -20,7 +20,7 @@ from startrack.types import Array, Bools, Ints, Stars
 
 HEMISPHERE_SR = 2 * np.pi
 STARS_OF_HEMISPHERE = 200  # pattern stars of the whole sky for a lens that sees half of it
-MOST_PATTERN_STARS = 12000
+MOST_PATTERN_STARS = 25_000
 REACH_OF_HEMISPHERE_RAD = np.radians(45.0)
 NEAR_OF_HEMISPHERE_RAD = np.radians(1.5)
 NARROWEST_NEAR_RAD = np.radians(0.15)
@@ -31,7 +31,6 @@ VERIFIED = ((24, -1.5), (48, -4.0))  # detections held against the stars, and lo
 DEEPEST_VERIFIED = 80
 GIVEN = 3  # a triangle's own stars are hits whatever it is
 KEPT_INDEXES = 6
-STARS_OF_NARROW_FIELD = 18
 
 
 @dataclass(frozen=True)
@@ -91,12 +90,12 @@ def wide_sizes(field_sr: float) -> PatternSizes:
     return PatternSizes(stars, float(reach), float(max(near, NARROWEST_NEAR_RAD)), 0.02, 0.13)
 
 
-def narrow_sizes(field_sr: float) -> PatternSizes:
-    """Patterns for a lens that is almost a pinhole: sharp triangles over the whole field."""
-    diameter = np.sqrt(4 * field_sr / np.pi)
-    stars = int(min(STARS_OF_NARROW_FIELD * 4 * np.pi / field_sr, MOST_PATTERN_STARS))
+def narrow_sizes(field_sr: float, stars_of_field: int, reach_of_field: float) -> PatternSizes:
+    """Patterns for a lens that is almost a pinhole: sharp triangles, of so many stars in the field, up to this long."""
+    diameter = float(np.sqrt(4 * field_sr / np.pi))
+    stars = int(min(stars_of_field * 4 * np.pi / field_sr, MOST_PATTERN_STARS))
     near = max(0.015 * diameter, NARROWEST_NEAR_RAD)
-    return PatternSizes(stars, float(0.5 * diameter), float(near), 0.004, 0.12)
+    return PatternSizes(stars, reach_of_field * diameter, float(near), 0.004, 0.12)
 
 
 def patterns_for(stars: Stars, sizes: PatternSizes) -> Patterns:
@@ -131,16 +130,16 @@ def rays_of(xy_px: Array, centre_px: tuple[float, float], focal_px: Array | floa
 class Hypotheses:
     """Starts from the brightest detections (n, 2), no two of them close together."""
 
-    def __init__(self, xy_px: Array, size_px: tuple[int, int], patterns: Patterns) -> None:
-        self.xy_px, self.size_px, self.patterns = xy_px[:100], size_px, patterns
+    def __init__(self, xy_px: Array, size_px: tuple[int, int]) -> None:
+        self.xy_px, self.size_px = xy_px[:100], size_px
         self.tried = 0
 
-    def starts(self, guess: Guess, window: Window, log_plausible: float) -> list[Start]:
+    def starts(self, patterns: Patterns, guess: Guess, window: Window, log_plausible: float) -> list[Start]:
         """The best of the hypotheses from the window's triangles, most likely first.
 
         Those whose hits chance explains with log probability above `log_plausible` are left out.
         """
-        patterns, xy = self.patterns, self.xy_px[window.first :]
+        xy = self.xy_px[window.first :]
         seen = rays_of(xy[: window.end - window.first], guess.centre_px, guess.focal_px, guess.shape)
         image = triangles(seen, patterns.reach_rad)
         image = image.take(image.vertices.max(axis=1, initial=0) >= window.done - window.first)
@@ -150,22 +149,24 @@ class Hypotheses:
             return []
         found: list[Start] = []
         for part in np.array_split(np.arange(len(left)), len(left) // CANDIDATES_AT_ONCE + 1):
-            found += self._likely(guess, xy, image.take(left[part]), right[part], log_plausible)
+            found += self._likely(patterns, guess, xy, image.take(left[part]), right[part], log_plausible)
         return sorted(found, key=lambda start: start.log_chance)[:MOST_STARTS]
 
-    def _likely(self, guess: Guess, xy_px: Array, image: Triangles, right: Ints, log_plausible: float) -> list[Start]:
+    def _likely(
+        self, patterns: Patterns, guess: Guess, xy_px: Array, image: Triangles, right: Ints, log_plausible: float
+    ) -> list[Start]:
         """Starts from pairs of an image triangle and a catalogue triangle."""
-        catalogue = self.patterns.triangles.triangles.take(right)
+        catalogue = patterns.triangles.triangles.take(right)
         focal = guess.focal_px * np.mean(image.sides_rad / catalogue.sides_rad, axis=1)
         mirrored = image.handed != catalogue.handed
         cam = self._rays(xy_px[image.vertices], guess, focal, mirrored)
-        R = triad(cam, self.patterns.rays_icrs[catalogue.vertices])
+        R = triad(cam, patterns.rays_icrs[catalogue.vertices])
         middle = cam.sum(axis=1)
         middle /= np.linalg.norm(middle, axis=1, keepdims=True)
         alive = np.arange(len(R))
         log_chance = np.zeros(len(R))
         for verified, log_limit in (*VERIFIED, (DEEPEST_VERIFIED, log_plausible)):
-            odds = self._odds(xy_px[:verified], R[alive], guess, focal[alive], mirrored[alive], middle[alive])
+            odds = self._odds(patterns, xy_px[:verified], R[alive], guess, focal[alive], mirrored[alive], middle[alive])
             log_chance = np.minimum(log_chance, odds)
             alive, log_chance = alive[log_chance < log_limit], log_chance[log_chance < log_limit]
         best = np.argsort(log_chance, kind="stable")[:MOST_STARTS]
@@ -179,12 +180,14 @@ class Hypotheses:
         rays[mirrored, :, 0] *= -1
         return rays
 
-    def _odds(self, xy_px: Array, R: Array, guess: Guess, focal: Array, mirrored: Bools, middle: Array) -> Array:
+    def _odds(
+        self, patterns: Patterns, xy_px: Array, R: Array, guess: Guess, focal: Array, mirrored: Bools, middle: Array
+    ) -> Array:
         """log P by chance of as many detections near bright stars, around the triangle or in the whole field."""
         rays = self._rays(np.broadcast_to(xy_px, (len(R), *xy_px.shape)), guess, focal, mirrored)
-        hit = self.patterns.map(rays @ R)
-        local = np.einsum("hni,hi->hn", rays, middle) > np.cos(LOCAL_REACHES * self.patterns.reach_rad)
-        table = self.patterns.log_tail
+        hit = patterns.map(rays @ R)
+        local = np.einsum("hni,hi->hn", rays, middle) > np.cos(LOCAL_REACHES * patterns.reach_rad)
+        table = patterns.log_tail
         everywhere = table[max(len(xy_px) - GIVEN, 0), np.maximum(hit.sum(axis=1) - GIVEN, 0)]
         around = np.maximum(local.sum(axis=1) - GIVEN, 0), np.maximum((hit & local).sum(axis=1) - GIVEN, 0)
         return np.minimum(everywhere, table[around])

@@ -28,8 +28,8 @@ NARROW = Camera(
     name="narrow", size_px=(1280, 1024), focal_px=(2900.0, 2905.0), centre_px=(639.5, 520.0),
     max_angle_rad=float(np.radians(25)), calibrated_angle_rad=1.0, lens=Pinhole(),
 )  # fmt: skip
-DECENTRED = replace(NARROW, name="decentred narrow", decentring=Decentring(8e-3, -5e-3, 0.01))
-DECENTRED_FISHEYE = replace(FISHEYE, name="decentred fisheye", decentring=Decentring(4e-4, -3e-4, 0.8))
+DECENTRED = replace(NARROW, name="decentred narrow", decentring=Decentring(p1=8e-3, p2=-5e-3))
+DECENTRED_FISHEYE = replace(FISHEYE, name="decentred fisheye", decentring=Decentring(p1=4e-4, p2=-3e-4))
 CAMERAS = [FISHEYE, EQUIDISTANT, NARROW, replace(NARROW, name="mirrored", mirrored=True), DECENTRED, DECENTRED_FISHEYE]
 
 

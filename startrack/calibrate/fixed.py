@@ -21,6 +21,13 @@ def without_fixed(frames: tuple[Frame, ...], R_cam_icrs: Array) -> tuple[Frame, 
     )
 
 
+def has_turned(one: Array, other: Array, size_px: tuple[int, int]) -> bool:
+    """Whether the sky stands clearly elsewhere in the image at two attitudes (3, 3), but near the axis of the turn."""
+    turn = other @ one.T
+    angle = np.arctan2(np.linalg.norm(turn - turn.T) / np.sqrt(8.0), (np.trace(turn) - 1.0) / 2.0)
+    return bool(angle * max(size_px) / 4.0 > TURNED_PX)
+
+
 def _fixed(i: int, frames: tuple[Frame, ...], R_cam_icrs: Array) -> Bools:
     from scipy.spatial import cKDTree
 
@@ -29,10 +36,7 @@ def _fixed(i: int, frames: tuple[Frame, ...], R_cam_icrs: Array) -> Bools:
     for j, other in enumerate(frames):
         if j == i:
             continue
-        turn = R_cam_icrs[j] @ R_cam_icrs[i].T
-        angle = np.arctan2(np.linalg.norm(turn - turn.T) / np.sqrt(8.0), (np.trace(turn) - 1.0) / 2.0)
-        # Near the axis of the turn a star stays in place too: sources that close to it are left in peace.
-        if angle * max(other.size_px) / 4.0 > TURNED_PX:
+        if has_turned(R_cam_icrs[i], R_cam_icrs[j], other.size_px):
             distance, _ = cKDTree(other.detections.xy_px).query(xy, distance_upper_bound=SAME_PX)
             fixed |= np.isfinite(distance)
     return fixed

@@ -14,7 +14,7 @@ from startrack.camera import Camera
 from startrack.types import Array, Bools, Ints
 
 MAGNITUDE_TOLERANCE = 0.9
-BLEND_MAG = 2.2  # a neighbour less than this fainter than the star shifts its centroid
+BLEND_MAG = 2.0  # a neighbour less than this fainter than the star shifts its centroid
 BLEND_PX = 3.5  # times the PSF's sigma
 DEPTH_MAG = 0.5  # beyond the faintest source that stars are predicted for
 SCALE_STARS = 4000
@@ -97,14 +97,20 @@ def _alike(
 def _predicted(
     frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: float, count: int
 ) -> tuple[Array, Array, Ints]:
-    """Pixels (n, 2) and off-axis angles (n,) of the `count` brightest stars, and those that fall into the frame."""
-    rays = frame.sky.stars.rays_icrs[:count] @ R_cam_icrs.T
-    angle = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
-    px = project_freely(camera, rays)
+    """Pixels (n, 2) and off-axis angles (n,) of the `count` brightest stars, and which fall into the frame.
+
+    Of the others the pixels and angles mean nothing.
+    """
+    rays_icrs = frame.sky.stars.rays_icrs[:count]
+    reach = min(within_rad, camera.lens.max_invertible_rad)
+    near = np.flatnonzero(rays_icrs @ R_cam_icrs[2] > np.cos(reach))
+    rays = rays_icrs[near] @ R_cam_icrs.T
+    px, angle = np.zeros((len(rays_icrs), 2)), np.zeros(len(rays_icrs))
+    px[near] = project_freely(camera, rays)
+    angle[near] = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
     width, height = frame.size_px
-    inside = np.all((px > -0.5) & (px < np.array([width, height]) - 0.5), axis=1)
-    inside &= angle < min(within_rad, camera.lens.max_invertible_rad)
-    return px, angle, np.flatnonzero(inside)
+    inside = np.all((px[near] > -0.5) & (px[near] < np.array([width, height]) - 0.5), axis=1)
+    return px, angle, near[inside]
 
 
 def _brightness(

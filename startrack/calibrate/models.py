@@ -16,6 +16,7 @@ MOST_ORDERS = 4
 PINHOLE_LIMIT_RAD = np.radians(65.0)  # the tangent is no lens beyond
 NEARLY_AS_GOOD_CHI2 = 4.0  # a longer polynomial this little worse is taken: its covariance owns up to the rim
 RISES_BEYOND = 1.1  # of the outermost star: a polynomial that turns back sooner is a bad one
+NARROW_RAD = np.radians(30.0)
 EXTRA_CHI2 = 15.0  # by which the held-out chi^2 must fall before a lens is called decentred, or its pixels not square
 
 
@@ -136,4 +137,6 @@ def _longest_of_the_best(tried: list[_Tried], outermost_rad: float) -> _Tried:
     enough = min(RISES_BEYOND * outermost_rad, np.pi - 0.01)
     sound = [t for t in tried if t.solution.state.camera.lens.max_invertible_rad > enough] or tried
     least = min(t.score for t in sound)
-    return [t for t in sound if t.score <= least + NEARLY_AS_GOOD_CHI2][-1]
+    good = [t for t in sound if t.score <= least + NEARLY_AS_GOOD_CHI2]
+    # In a narrow field the terms look alike, and a long polynomial is a sum of large numbers: the shortest will do.
+    return good[0] if outermost_rad < NARROW_RAD else good[-1]

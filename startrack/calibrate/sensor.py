@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from startrack.calibrate.fixed import has_turned
 from startrack.calibrate.frame import Frame
 from startrack.calibrate.growing import Joint
 from startrack.calibrate.noise import Transfer, photon_transfer
@@ -22,6 +23,7 @@ HOT_SIGMA = 8.0
 MOST_HOT = 20_000
 STAR_PX = 3.0
 STILL_PX = 0.3
+NEIGHBOURS = np.array([[0, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0]])  # twice the mean of the four
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,17 +111,22 @@ def _saturation(frames: tuple[Frame, ...]) -> float | None:
 
 
 def _hot(joint: Joint) -> Array | None:
-    """Pixels (n, 2) that stand out in every frame though the sky has turned; None with a single frame."""
+    """Pixels (n, 2) that stand out in every frame though the sky has turned; None where it has not."""
     import cv2
 
-    if len(joint.frames) < 2:
+    first, R = joint.frames[0], joint.fit.R_cam_icrs
+    others = [i for i in range(1, len(joint.frames)) if has_turned(R[0], R[i], first.size_px)]
+    if not others:
         return None
     least: Array | None = None
-    for i, frame in enumerate(joint.frames):
+    for i in (0, *others):
+        frame = joint.frames[i]
         image = np.asarray(frame.exposure.pixels_adu)
         excess = image - cv2.medianBlur(image, 5)
         noise = 1.4826 * float(np.median(np.abs(excess[::3, ::3]))) or 1.0
-        standing = np.asarray(excess / noise, dtype=np.float64)
+        # A star, the Earth or a planet lights the neighbours too, a hot pixel does not.
+        beside = cv2.filter2D(np.maximum(excess, 0.0), -1, NEIGHBOURS)
+        standing = np.asarray((excess - beside) / noise, dtype=np.float64)
         for px in frame.detections.xy_px[joint.matches[i].detection]:
             x, y = np.rint(px).astype(int)
             reach = int(STAR_PX)

@@ -30,9 +30,9 @@ FEWEST_NARROW = 7
 WINDOWS = (  # the brightest; those after them, as hot pixels may be brighter than stars; and more of all
     Window(0, 0, 16), Window(0, 16, 26), Window(26, 26, 46), Window(0, 26, 40), Window(46, 46, 70), Window(0, 40, 60),
 )  # fmt: skip
-LOG_PLAUSIBLE = -10.0  # of a start's chance hits: random skies reach -15 in a whole search
+LOG_PLAUSIBLE = -11.0  # of a start's chance hits: random skies reach -15 in a whole search
 LOG_FALSE_ALARM = float(np.log(1e-9))
-MOST_TRIED = 1_200_000  # patterns; a search without an answer ends here, after some seconds
+MOST_TRIED = 800_000  # patterns; a search without an answer ends here, after some seconds
 ROOM = 1.3  # around a narrow field, for its focal length and centre are not known
 APART = 0.01  # of the frame: pattern stars are no closer
 CIRCLES = (0.5, 0.62, 0.42, 0.78, 1.0)  # radius of the image circle over the frame's shorter side

@@ -11,27 +11,28 @@ from startrack.types import Array
 ORTHOGRAPHIC, EQUISOLID, EQUIDISTANT, STEREOGRAPHIC, PINHOLE = -1.0, -0.5, 0.0, 0.5, 1.0
 STRAIGHT = 1e-4  # shapes below this are the equidistant lens
 STEEPEST_RAD = 1.55  # of the tangent's or sine's own argument
+STEEPEST_SINE = float(np.sin(STEEPEST_RAD))
 
 
-def radius(angle_rad: Array, shape: Array | float) -> Array:
+def radius(angle_rad: Array, shape: float) -> Array:
     """Radius [focal lengths] of the family: sin(|q| a) / |q| for q < 0, a for q = 0, tan(q a) / q for q > 0.
 
     Orthographic is q = -1, equisolid -1/2, equidistant 0, stereographic 1/2, pinhole 1; real lenses lie between.
     """
-    q = np.abs(shape)
-    some = np.maximum(q, STRAIGHT)
-    x = np.minimum(some * angle_rad, STEEPEST_RAD)
-    curved = np.where(np.asarray(shape) < 0, np.sin(x), np.tan(x)) / some
-    return np.where(q < STRAIGHT, angle_rad, curved)
+    q = abs(shape)
+    if q < STRAIGHT:
+        return angle_rad
+    x = np.minimum(q * angle_rad, STEEPEST_RAD)
+    return (np.sin(x) if shape < 0 else np.tan(x)) / q
 
 
-def angle(radius_focal: Array, shape: Array | float) -> Array:
+def angle(radius_focal: Array, shape: float) -> Array:
     """Inverse of `radius` [rad]; the steepest angle where the radius is beyond the lens's reach."""
-    q = np.abs(shape)
-    some = np.maximum(q, STRAIGHT)
-    x = some * radius_focal
-    curved = np.where(np.asarray(shape) < 0, np.arcsin(np.minimum(x, np.sin(STEEPEST_RAD))), np.arctan(x)) / some
-    return np.where(q < STRAIGHT, radius_focal, curved)
+    q = abs(shape)
+    if q < STRAIGHT:
+        return radius_focal
+    x = q * radius_focal
+    return (np.arcsin(np.minimum(x, STEEPEST_SINE)) if shape < 0 else np.arctan(x)) / q
 
 
 @dataclass(frozen=True)

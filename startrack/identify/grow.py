@@ -12,7 +12,7 @@ from startrack.identify.family import PINHOLE, Family
 from startrack.orient import rotation
 from startrack.types import Array, Ints
 
-STEPS = 4  # of Gauss-Newton for one set of matches
+STEPS = 3  # of Gauss-Newton for one set of matches
 ROUNDS = 2  # of matching again within a stage
 NUDGE = 1e-6
 FEWEST = 5

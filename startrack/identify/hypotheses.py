@@ -120,7 +120,7 @@ _KEPT: OrderedDict[tuple[PatternSizes, int, str], Patterns] = OrderedDict()
 
 def rays_of(xy_px: Array, centre_px: tuple[float, float], focal_px: Array | float, shape: float) -> Array:
     """Rays (..., 3) of pixels (..., 2) through a lens of the family, unmirrored; focal lengths broadcast."""
-    off = xy_px - np.array(centre_px)
+    off = xy_px - np.array(centre_px, dtype=xy_px.dtype)
     r = np.hypot(off[..., 0], off[..., 1])
     a = angle(r / focal_px, shape)
     scale = np.sin(a) / np.maximum(r, 1e-9)
@@ -176,7 +176,7 @@ class Hypotheses:
         ]
 
     def _rays(self, xy_px: Array, guess: Guess, focal: Array, mirrored: Bools) -> Array:
-        rays = rays_of(xy_px, guess.centre_px, focal[:, None], guess.shape)
+        rays = rays_of(xy_px, guess.centre_px, focal[:, None].astype(xy_px.dtype), guess.shape)
         rays[mirrored, :, 0] *= -1
         return rays
 
@@ -184,7 +184,9 @@ class Hypotheses:
         self, patterns: Patterns, xy_px: Array, R: Array, guess: Guess, focal: Array, mirrored: Bools, middle: Array
     ) -> Array:
         """log P by chance of as many detections near bright stars, around the triangle or in the whole field."""
-        rays = self._rays(np.broadcast_to(xy_px, (len(R), *xy_px.shape)), guess, focal, mirrored)
+        # Single precision is a thousandth of the map's cells, and twice as fast.
+        single, R, middle = np.float32, R.astype(np.float32), middle.astype(np.float32)
+        rays = self._rays(np.broadcast_to(xy_px.astype(single), (len(R), *xy_px.shape)), guess, focal, mirrored)
         hit = patterns.map(rays @ R)
         local = np.einsum("hni,hi->hn", rays, middle) > np.cos(LOCAL_REACHES * patterns.reach_rad)
         table = patterns.log_tail

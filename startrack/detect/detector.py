@@ -30,7 +30,7 @@ NOTHING_SEEN = "no point source stands above the noise: was the lens cap on, or 
 class Detector:
     """Detects point sources: Exposure -> Detections."""
 
-    threshold_snr: float = 5.42  # for a PSF of 1.25 px; for others what gives as few false stars, one in 8 Mpx
+    threshold_snr: float = 5.42  # for a PSF of 1.25 px; for others what gives about as few false stars
     max_candidates: int = 15000  # a frame with more peaks is noise, a bright day or a defect: the highest are kept
     psf_sigma_px: float | None = None  # taken as it is, whatever camera file and frame say of the PSF's width
 

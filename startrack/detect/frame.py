@@ -74,6 +74,8 @@ def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray
         return pixels, pixels >= SATURATED_FRACTION * ceiling
     sensor = camera.sensor
     saturated = pixels >= SATURATED_FRACTION * min(ceiling, sensor.saturation_adu)
+    if sensor.gain_e_per_adu == 1.0 and sensor.bias_adu == 0.0:
+        return pixels, saturated
     image = pixels * np.float32(sensor.gain_e_per_adu)
     image -= np.float32(sensor.bias_adu * sensor.gain_e_per_adu)
     return image, saturated

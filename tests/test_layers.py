@@ -22,7 +22,7 @@ LAYERS = (  # lowest first; a room imports from lower layers only
     {"render", "detect", "identify", "orient", "evidence", "localize"},
     {"pipeline", "calibrate"},
     {"report"},
-    {"reproduce", "batch", "api"},
+    {"reproduce", "batch", "page", "api"},
     {"cli"},
 )
 # Rooms of one layer that may know each other all the same: identification refines the attitude, and the last check

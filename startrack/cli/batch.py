@@ -44,6 +44,7 @@ def add_parser(subparsers: Any) -> None:
     again.add_argument("-O", "--overwrite", action="store_true", help="do every image again")
     parser.add_argument("--json", action="store_true", help="print one JSON object per image, as they are done")
     parser.add_argument("--no-plots", action="store_true", help="no pictures")
+    parser.add_argument("--report", action="store_true", help="add OUT/report.html, a page for a browser")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="accepted everywhere; here nothing is random")
     parser.add_argument("-v", "--verbose", action="count", default=0, help="a line for every image")
     parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
@@ -81,6 +82,10 @@ def run(args: argparse.Namespace) -> int:
             raise
         raise BadInput("no_cluster", f"{args.cluster}: no Dask scheduler answers ({cause})") from cause
     write_tables(out, records, _settings(facts, args))
+    if args.report:
+        from startrack.cli.report import page_of
+
+        page_of(str(out))
     if not args.quiet:
         print(_summary(counts, len(tasks), out))
     if counts["error"]:

@@ -23,11 +23,17 @@ def add_parser(subparsers: Any) -> None:
     )
     add_image_flags(parser)
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file, or the name of a shipped one")
+    parser.add_argument("--report", action="store_true", help="add a page for a browser, as startrack report makes it")
 
 
 def run(args: argparse.Namespace) -> int:
     """Locate every image; the exit code of the worst."""
-    return run_images(args, FORMAT, lambda path, stem: _one(path, stem, args))
+    code = run_images(args, FORMAT, lambda path, stem: _one(path, stem, args))
+    if args.report:
+        from startrack.cli.report import page_of_images
+
+        page_of_images(args.dir, args.images)
+    return code
 
 
 def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:

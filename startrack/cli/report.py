@@ -1,0 +1,109 @@
+"""`startrack report`: results as one page that any browser opens."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from startrack.errors import BadInput
+
+if TYPE_CHECKING:
+    from startrack.page import Found
+
+PAGE = "report.html"
+OF_ONE = ".report.html"
+DEFAULT_IMAGES = 30
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add `report` to the commands of the `startrack` parser."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "report",
+        help="results as one page for a browser",
+        description="Write OUT/report.html: every result of the folder OUT, in one file that needs no server and no "
+        "network. Of a single NAME.fix.json it writes NAME.report.html beside it.",
+    )
+    parser.add_argument("out", metavar="OUT", help="folder of results, or one NAME.fix.json")
+    parser.add_argument("-o", "--output", metavar="FILE", help="where the page goes")
+    parser.add_argument(
+        "--images", type=_count, default=DEFAULT_IMAGES, metavar="N",
+        help="how many images the page holds with picture and stars (%(default)s); all are in its table",
+    )  # fmt: skip
+    parser.add_argument(
+        "--truth", metavar="FOLDER", help="folder with NAME.truth.json of the images, to show the errors"
+    )
+    parser.add_argument("-v", "--verbose", action="count", default=0, help="tracebacks of internal errors")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+
+
+def run(args: argparse.Namespace) -> int:
+    """0 when the page is written."""
+    path = page_of(args.out, truth=args.truth, images=args.images, output=args.output)
+    if not args.quiet:
+        print(f"page in {path}")
+    return 0
+
+
+def page_of(out: str, *, truth: str | None = None, images: int = DEFAULT_IMAGES, output: str | None = None) -> Path:
+    """Write the page of a folder of results or of one NAME.fix.json; its path. Raises BadInput."""
+    from startrack.page import result_at, results_under, write_page
+
+    if Path(out).is_file():
+        one = result_at(out)
+        path = Path(output) if output else one.beside(OF_ONE)
+        write_page(path, [one], real=_places([one], truth), images=images, single=True)
+        return path
+    found, unread = results_under(out)
+    path = Path(output) if output else Path(out) / PAGE
+    write_page(path, found, unread=unread, real=_places(found, truth), images=images)
+    return path
+
+
+def page_of_images(out: str, images: Sequence[str]) -> None:
+    """The page beside fresh results: of one image NAME.report.html, of several OUT/report.html.
+
+    An image that could not even be read has left no result to show.
+    """
+    from startrack.batch.find import output_stems
+
+    results = [path for stem in output_stems(images) if (path := Path(out) / f"{stem}.fix.json").is_file()]
+    if len(images) == 1 and results:
+        page_of(str(results[0]))
+    elif results:
+        page_of(out)
+
+
+def _places(found: Sequence[Found], folder: str | None) -> dict[str, tuple[float, float]]:
+    """True (east, north) [m] by the results' stems, as far as the folder has them."""
+    if folder is None:
+        return {}
+    if not Path(folder).is_dir():
+        raise BadInput("bad_image", f"{folder}: no such folder of truth")
+    places = {one.stem: _place(Path(folder), one) for one in found}
+    return {stem: place for stem, place in places.items() if place is not None}
+
+
+def _place(folder: Path, one: Found) -> tuple[float, float] | None:
+    """From NAME.truth.json at the image's place in the tree, or at that of its result."""
+    image = one.record["image"]
+    names = dict.fromkeys((image.removesuffix(Path(image).suffix), one.stem, Path(one.stem).name))
+    path = next((file for name in names if (file := folder / f"{name}.truth.json").is_file()), None)
+    if path is None:
+        return None
+    try:
+        east, north = (float(value) for value in json.loads(path.read_text(encoding="utf-8"))["position_enu_m"][:2])
+    except (OSError, ValueError, KeyError, TypeError) as cause:
+        raise BadInput("bad_image", f"{path}: holds no position_enu_m ({type(cause).__name__})") from cause
+    if not (math.isfinite(east) and math.isfinite(north)):
+        raise BadInput("bad_image", f"{path}: position_enu_m is not finite")
+    return east, north
+
+
+def _count(text: str) -> int:
+    if int(text) < 0:
+        raise argparse.ArgumentTypeError(f"{text} is below 0")
+    return int(text)

@@ -1,0 +1,121 @@
+// Everything about one image.
+function detailOf(k) {
+  const node = find(`detail-${k}`);
+  return node ? JSON.parse(node.textContent) : null;
+}
+
+function showDetail(host, k) {
+  const row = page.rows[k];
+  const value = (name) => row[column[name]];
+  const detail = detailOf(k);
+  const record = detail ? detail.record : { status: value("status"), reason: value("reason"), message: value("message"), provenance: {} };
+  const real = known(value("real_e")) ? [value("real_e"), value("real_n")] : null;
+  const stars = detail ? starsOf(detail) : [];
+  const name = value("image");
+  const groups = detail ? factGroups(record, value) : [];
+  host.replaceChildren(...[
+    make("div", { class: "title" }, make("h1", { tabindex: "-1" }, name), badge(record.status)),
+    make("p", { class: "lead" }, leadOf(value)),
+    refusalCard(record), warningsCard(record), detail ? null : leftOut(),
+    detail?.picture ? pictureCard(detail, stars, name, groups.splice(0, 3)) : null,
+    mapsCard(record, real, name),
+    detail && stars.some((star) => known(star.az)) ? panoramaCard(detail, stars, name) : null,
+    groups.length ? make("div", { class: "cards" }, ...groups.map(([title, body]) => section(title, body))) : null,
+    stars.length ? starsCard(detail, stars) : null, filesCard(detail, value("stem")),
+  ].filter(Boolean));
+}
+
+function leadOf(value) {
+  if (known(value("east_m"))) {
+    const error = known(value("error_m")) ? ` The true place is ${say(value("error_m"), 1, "m")} away.` : "";
+    return `East ${say(value("east_m"), 1, "m")}, north ${say(value("north_m"), 1, "m")}, within ${say(value("radius95_m"), 1, "m")} (95 %).${error}`;
+  }
+  return value("status") === "ok" ? `${say(value("identified"), 0)} stars named.` : "";
+}
+
+function refusalCard(record) {
+  if (record.status === "ok") return null;
+  const [words, advice] = page.words[record.reason] || [statusWord(record.status), ""];
+  const modes = record.status === "ambiguous" && record.modes ? make("ol", {}, ...record.modes.map((mode) => make("li", {},
+    `East ${say(mode.east_m, 0, "m")}, north ${say(mode.north_m, 0, "m")}: ${say(100 * mode.weight, 1)} %`))) : null;
+  return make("section", { class: `card why ${record.status}`, "aria-label": "Why there is no single position" },
+    make("h2", {}, words), known(record.message) ? make("p", { class: "message" }, record.message) : null, modes,
+    advice ? make("p", {}, make("strong", {}, "What to try: "), advice) : null);
+}
+
+function warningsCard(record) {
+  if (!record.warnings?.length) return null;
+  return section("Warnings", make("ul", {}, ...record.warnings.map((text) => make("li", {}, text))));
+}
+
+function leftOut() {
+  return make("p", { class: "card note" }, "This page holds the pictures and stars of some images only; startrack report OUT --images N holds more, and so does startrack report NAME.fix.json for this one.");
+}
+
+function pictureCard(detail, stars, name, groups) {
+  const view = skyView(detail, stars, name);
+  const hint = detail.picture.scale && stars.length ? "Point at a star, or tap it. " : "";
+  return section("Picture", make("p", { class: "dim" }, `${hint}Green rings are stars with a name, orange crosses stars that should be here and are hidden, grey rings other point sources; the blue line is the skyline of the place found.`),
+    make("div", { class: "beside" }, view.node, make("div", {}, ...groups.map(([title, body]) => make("div", {}, make("h3", {}, title), body)))));
+}
+
+function panoramaCard(detail, stars, name) {
+  const { total } = detail.stars;
+  const cut = total > stars.length ? ` The ${say(stars.length, 0)} brightest of ${say(total, 0)} stars; fainter ones appear as you zoom in.` : " Fainter stars appear as you zoom in.";
+  const line = detail.horizon ? "The blue line is the horizon that the map gives at the place found: seen stars belong above it, hidden ones below." : "The terrain's file was not at hand, so its horizon is left out.";
+  return section("Panorama", make("p", { class: "dim" }, line + cut), panoramaView(detail, stars, name).node);
+}
+
+function mapsCard(record, real, name) {
+  if (!record.position && !record.modes?.length) return null;
+  const close = record.position ? panel("The position and how sure it is", placeView(record, real, name)) : null;
+  const area = panel(`The search area${record.provenance?.terrain ? ` on ${record.provenance.terrain}` : ""}; north is up`, areaView(record, real, name));
+  return section("Map", make("div", { class: close ? "pair" : "single" }, area, close), mapLegend(record, real));
+}
+
+function factGroups(record, value) {
+  const { position: p, attitude: a, stars: s, provenance: v } = record;
+  const c = p?.covariance_m2;
+  const spread = c ? [1, -1].map((sign) => Math.sqrt(Math.max((c[0][0] + c[1][1]) / 2 + sign * Math.hypot((c[0][0] - c[1][1]) / 2, c[0][1]), 0))) : null;
+  return [
+    p && ["Position", facts([["East", say(p.east_m, 2, "m")], ["North", say(p.north_m, 2, "m")], ["Up", say(p.up_m, 2, "m")],
+      ["Latitude", sayDegrees(p.latitude_deg, 6)], ["Longitude", sayDegrees(p.longitude_deg, 6)], ["95 % within", say(p.radius95_m, 1, "m")],
+      ["99.9 % within", say(p.radius999_m, 1, "m")], ["Sigma", spread && `${say(spread[0], 2, "m")} by ${say(spread[1], 2, "m")}`],
+      ["Error", known(value("error_m")) ? say(value("error_m"), 2, "m") : null], ["NEES", known(value("nees")) ? say(value("nees"), 2) : null]])],
+    a && ["Attitude", facts([["Heading", sayDegrees(a.heading_deg, 3)], ["Pitch", sayDegrees(a.pitch_deg, 3)], ["Roll", sayDegrees(a.roll_body_deg, 3)],
+      ["Right ascension", sayDegrees(a.ra_deg, 4)], ["Declination", sayDegrees(a.dec_deg, 4)], ["Image's top", sayDegrees(a.roll_deg, 4)],
+      ["Sigma", a.sigma_arcsec && `${a.sigma_arcsec.map((one) => say(one, 2)).join(", ")} arcsec about x, y, z`]])],
+    s && ["Stars", facts([["Point sources", say(s.detected, 0)], ["Named", say(s.identified, 0)], ["Unexplained", say(s.unexplained, 0)],
+      ["Above the skyline", say(s.predicted_visible, 0)], ["Residual", say(s.rms_px, 3, "px")],
+      ["Chance match", known(s.false_alarm_probability) ? (s.false_alarm_probability > 0 ? s.false_alarm_probability.toExponential(0).replace("-", "−") : "below 1e−300") : null]])],
+    record.timing_ms && ["Time of each stage", timings(record.timing_ms)],
+    v && ["Made from", facts([["Time", sayTime(v.time_utc)], ["Exposure", known(v.exposure_s) ? say(v.exposure_s, 3, "s") : null], ["Camera", v.camera], ["Terrain", v.terrain],
+      ["Catalogue", v.catalog], ["startrack", v.version], ["Image's SHA-256", v.image_sha256 ? [make("code", {}, v.image_sha256)] : null]])],
+  ].filter(Boolean);
+}
+
+function timings(spent) {
+  const all = Object.values(spent).reduce((sum, ms) => sum + (ms || 0), 0);
+  const longest = Math.max(...Object.values(spent), 1e-9);
+  const time = (ms) => (ms >= 1000 ? say(ms / 1000, 2, "s") : say(ms, ms < 10 ? 1 : 0, "ms"));
+  const rows = Object.entries(spent).map(([stage, ms]) => make("tr", {}, make("th", { scope: "row" }, stage),
+    make("td", { class: "bar" }, make("span", { style: `width:${(100 * ms) / longest}%` })), make("td", {}, time(ms))));
+  return make("table", { class: "times" }, make("tbody", {}, ...rows), make("tfoot", {}, make("tr", {}, make("th", { scope: "row" }, "in all"), make("td"), make("td", {}, time(all)))));
+}
+
+function starsCard(detail, stars) {
+  const head = ["Star", "V mag", "Status", "Light", "Expected", "Evidence"];
+  const kept = stars.slice(0, 50);
+  const body = kept.map((star) => make("tr", {}, make("th", { scope: "row" }, star.name ? `${star.name} (${star.id})` : star.id), ...[say(star.mag, 2),
+    (KINDS[star.kind] || [star.kind])[0] + (star.cause ? `: ${star.cause}` : ""), say(star.flux, 0), say(star.exp, 0), say(star.ev, 2)].map((text) => make("td", {}, text))));
+  return make("details", { class: "card" }, make("summary", {}, `The ${kept.length} brightest stars as a table`),
+    make("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "The brightest stars" }, make("table", { class: "stars" },
+      make("caption", {}, `Light in ${detail.stars.unit}; every star is in the star table`), make("thead", {}, make("tr", {}, ...head.map((text) => make("th", { scope: "col" }, text)))), make("tbody", {}, ...body))));
+}
+
+function filesCard(detail, stem) {
+  const folder = page.single || !stem.includes("/") ? "" : stem.slice(0, stem.lastIndexOf("/") + 1);
+  const names = detail ? detail.files : [`${stem.slice(stem.lastIndexOf("/") + 1)}.fix.json`];
+  const path = (name) => `./${`${folder}${name}`.split("/").map(encodeURIComponent).join("/")}`;
+  return section("Files", make("ul", { class: "files" }, ...names.map((name) => make("li", {}, make("a", { href: path(name) }, name)))));
+}

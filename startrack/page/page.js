@@ -1,0 +1,70 @@
+// The page: the batch as a whole, or one image; which of them is said by the address after the #.
+const overview = find("overview");
+const detailHost = find("detail");
+let cameFrom = 0;
+
+function openImage(index) {
+  window.location.hash = `#i${index}`;
+}
+
+function buildOverview() {
+  const solved = page.rows.filter((row) => row[column.status] === "ok").length;
+  const rowIndex = new Map(page.rows.map((row, k) => [row, k]));
+  const open = (row) => openImage(rowIndex.get(row));
+  overview.replaceChildren(...[
+    make("h1", { tabindex: "-1" }, `${say(page.rows.length, 0)} ${page.rows.length === 1 ? "image" : "images"}`),
+    make("p", { class: "lead" }, `${say(solved, 0)} solved, ${say(page.rows.length - solved, 0)} not.`),
+    page.unread.length ? make("p", { class: "card why refused" }, `Could not be read: ${page.unread.slice(0, 20).join(", ")}${page.unread.length > 20 ? " and others" : ""}`) : null,
+    new Table(openImage).node, trajectoryCard(open), page.errors ? errorsCard(page.rows, open) : null,
+  ].filter(Boolean));
+}
+
+function trajectoryCard(open) {
+  const located = page.rows.filter((row) => known(row[column.east_m]));
+  const names = [...new Set(located.map((row) => row[column.terrain] || ""))].sort();
+  if (!names.length) return null;
+  const holder = make("div", { class: "single" });
+  const show = (name) => {
+    const view = trajectoryView(located.filter((row) => (row[column.terrain] || "") === name), name, open);
+    holder.replaceChildren(view.node);
+  };
+  const select = make("select", { "aria-label": "Terrain", onchange: () => show(select.value) }, ...names.map((name) => make("option", { value: name }, name || "terrain not known")));
+  show(names[0]);
+  return section("Positions", make("p", { class: "dim" }, "Joined in the order of time. Zoomed in, ellipses hold 95 % of each position's posterior. A click opens the image."), names.length > 1 ? select : null, holder);
+}
+
+function neighbours(k) {
+  const link = (index, text) => (index >= 0 && index < page.rows.length ? make("a", { href: `#i${index}` }, text) : make("span", { class: "dim" }, text));
+  return make("nav", { class: "path", "aria-label": "Images" }, make("a", { href: "#all" }, "← All images"), make("span", {}, link(k - 1, "Previous"), " · ", link(k + 1, "Next")));
+}
+
+function route() {
+  const asked = /^#i(\d+)$/.exec(window.location.hash);
+  const index = page.single ? 0 : asked && Number(asked[1]) < page.rows.length ? Number(asked[1]) : null;
+  if (index === null && !["", "#all"].includes(window.location.hash) && !detailHost.hidden) return; // #main: stay
+  const change = overview.hidden !== (index !== null) || detailHost.dataset.index !== String(index);
+  if (!change) return;
+  const moved = !(overview.hidden && detailHost.hidden);
+  if (index !== null && !overview.hidden) cameFrom = window.scrollY;
+  overview.hidden = index !== null;
+  detailHost.hidden = index === null;
+  detailHost.dataset.index = String(index);
+  if (index === null) detailHost.replaceChildren();
+  else {
+    showDetail(detailHost, index);
+    if (!page.single) detailHost.prepend(neighbours(index));
+  }
+  for (const view of View.all) if (view.stage && !view.node.isConnected) View.all.delete(view);
+  if (moved) {
+    window.scrollTo(0, index === null ? cameFrom : 0);
+    (index === null ? overview : detailHost).querySelector("h1")?.focus({ preventScroll: true });
+  }
+}
+
+if (!page.single) buildOverview();
+window.addEventListener("hashchange", route);
+window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+  themeColours = {};
+  for (const view of View.all) view.redraw();
+});
+route();

@@ -1,0 +1,236 @@
+// A drawing that can be zoomed (wheel, pinch, + and -), moved (drag, arrows), reset (double click, 0) and asked about
+// its points (hover, tap, n and p). World coordinates [x0, y0, x1, y1]; `up` where y grows upward.
+const REACH = { mouse: 12, pen: 16, touch: 26 };
+
+class View {
+  constructor(options) {
+    Object.assign(this, { up: true, square: true, ratio: 1, most: 40, points: [], axes: null, shown: () => true }, options);
+    this.canvas = make("canvas", { tabindex: "0", role: "img", "aria-label": `${this.label}. ${View.help}` });
+    this.canvas.view = this;
+    this.tip = make("div", { class: "tip", hidden: true });
+    this.live = make("p", { class: "unseen", role: "status" });
+    this.stage = make("div", { class: "stage", style: `aspect-ratio:${1 / this.ratio}` }, this.canvas, this.tip);
+    const tool = (text, label, act) => make("button", { type: "button", "aria-label": `${label}: ${this.label}`, onclick: act }, text);
+    this.tools = make("div", { class: "tools" }, tool("+", "Zoom in", () => this.zoomBy(1.6)),
+      tool("−", "Zoom out", () => this.zoomBy(1 / 1.6)), tool("Reset", "Show all", () => this.reset()));
+    this.node = make("figure", { class: "view" }, this.stage, this.tools, this.live);
+    this.fingers = new Map();
+    this.listen();
+    this.centre = this.middle();
+    this.zoom = 1;
+    new ResizeObserver(() => this.resize()).observe(this.stage);
+    View.all.add(this);
+  }
+
+  middle() {
+    const [x0, y0, x1, y1] = this.world;
+    return [(x0 + x1) / 2, (y0 + y1) / 2];
+  }
+
+  resize() {
+    const dots = window.devicePixelRatio || 1;
+    this.width = this.stage.clientWidth;
+    this.height = this.stage.clientHeight;
+    if (!this.width || !this.height) return;
+    this.canvas.width = Math.round(this.width * dots);
+    this.canvas.height = Math.round(this.height * dots);
+    this.box = this.axes ? [this.axes.left || 48, 8, this.width - 8, this.height - 34] : [0, 0, this.width, this.height];
+    const [x0, y0, x1, y1] = this.world;
+    const [left, top, right, bottom] = this.box;
+    this.perX = (right - left) / (x1 - x0);
+    this.perY = (bottom - top) / (y1 - y0);
+    if (this.square) this.perX = this.perY = Math.min(this.perX, this.perY);
+    this.changed();
+  }
+
+  screen(x, y) {
+    const [left, top, right, bottom] = this.box;
+    return [(left + right) / 2 + (x - this.centre[0]) * this.perX * this.zoom,
+      (top + bottom) / 2 + (y - this.centre[1]) * this.perY * this.zoom * (this.up ? -1 : 1)];
+  }
+
+  at(sx, sy) {
+    const [left, top, right, bottom] = this.box;
+    return [this.centre[0] + (sx - (left + right) / 2) / (this.perX * this.zoom),
+      this.centre[1] + (sy - (top + bottom) / 2) / (this.perY * this.zoom) * (this.up ? -1 : 1)];
+  }
+
+  zoomBy(factor, sx, sy) {
+    if (!this.box) return;
+    const here = [sx ?? (this.box[0] + this.box[2]) / 2, sy ?? (this.box[1] + this.box[3]) / 2];
+    const before = this.at(...here);
+    this.zoom = Math.min(Math.max(this.zoom * factor, 1), this.most);
+    const after = this.at(...here);
+    this.centre = [this.centre[0] + before[0] - after[0], this.centre[1] + before[1] - after[1]];
+    this.changed();
+  }
+
+  moveBy(dx, dy) {
+    this.centre = [this.centre[0] - dx / (this.perX * this.zoom),
+      this.centre[1] - (dy / (this.perY * this.zoom)) * (this.up ? -1 : 1)];
+    this.changed();
+  }
+
+  reset() {
+    this.zoom = 1;
+    this.centre = this.middle();
+    this.told = null;
+    this.changed();
+  }
+
+  changed() {
+    const [x0, y0, x1, y1] = this.world;
+    const half = [(this.box[2] - this.box[0]) / 2 / (this.perX * this.zoom), (this.box[3] - this.box[1]) / 2 / (this.perY * this.zoom)];
+    this.centre = [[x0, x1], [y0, y1]].map(([low, high], k) => (2 * half[k] >= high - low ? (low + high) / 2
+      : Math.min(Math.max(this.centre[k], low + half[k]), high - half[k])));
+    this.stage.dataset.zoom = this.zoom.toFixed(3);
+    this.canvas.style.touchAction = this.zoom > 1 ? "none" : "pan-y";
+    this.redraw();
+  }
+
+  redraw() {
+    if (this.waiting) return;
+    this.waiting = requestAnimationFrame(() => {
+      this.waiting = null;
+      if (this.box && this.node.isConnected) this.paint();
+    });
+  }
+
+  paint() {
+    const g = this.canvas.getContext("2d");
+    const dots = window.devicePixelRatio || 1;
+    g.setTransform(dots, 0, 0, dots, 0, 0);
+    g.clearRect(0, 0, this.width, this.height);
+    g.fillStyle = colour("plot");
+    g.fillRect(0, 0, this.width, this.height);
+    const [left, top, right, bottom] = this.box;
+    g.save();
+    g.beginPath();
+    g.rect(left, top, right - left, bottom - top);
+    g.clip();
+    if (this.axes) drawGrid(this, g);
+    this.draw(this, g);
+    if (this.told) {
+      const at = this.screen(this.told.x, this.told.y);
+      ring(g, at, 9, "#000", 4.5); // light on dark, to be seen on any ground
+      ring(g, at, 9, "#fff", 2);
+    }
+    g.restore();
+    if (this.axes) drawAxes(this, g);
+    this.placeTip();
+  }
+
+  nearest(sx, sy, reach) {
+    let best = null;
+    let least = reach * reach;
+    for (const point of this.points) {
+      if (!this.shown(point)) continue;
+      const [x, y] = this.screen(point.x, point.y);
+      const away = (x - sx) ** 2 + (y - sy) ** 2;
+      if (away < least) [best, least] = [point, away];
+    }
+    return best;
+  }
+
+  tellOf(point, aloud) {
+    if (point === this.told) return;
+    this.told = point;
+    this.tip.replaceChildren();
+    if (point) {
+      const [title, rows] = this.tell(point);
+      this.tip.append(make("strong", {}, title), facts(rows));
+      if (aloud) this.live.textContent = `${title}: ${rows.filter(([, v]) => known(v)).map(([k, v]) => `${k} ${v}`).join(", ")}`;
+    }
+    this.canvas.style.cursor = point ? "pointer" : "";
+    this.redraw();
+  }
+
+  placeTip() {
+    this.tip.hidden = !this.told;
+    if (!this.told) return;
+    const [x, y] = this.screen(this.told.x, this.told.y);
+    const { offsetWidth: w, offsetHeight: h } = this.tip;
+    const left = x + 16 + w <= this.width ? x + 16 : x - 16 - w;
+    this.tip.style.left = `${Math.min(Math.max(left, 4), Math.max(this.width - w - 4, 4))}px`;
+    this.tip.style.top = `${Math.min(Math.max(y - h / 2, 4), Math.max(this.height - h - 4, 4))}px`;
+  }
+
+  step(by) {
+    const [left, top, right, bottom] = this.box;
+    const inside = this.points.filter((point) => {
+      const [x, y] = this.screen(point.x, point.y);
+      return this.shown(point) && x >= left && x <= right && y >= top && y <= bottom;
+    });
+    if (!inside.length) return;
+    const next = (inside.indexOf(this.told) + by + inside.length) % inside.length;
+    this.tellOf(inside[this.told || by > 0 ? next : inside.length - 1], true);
+  }
+}
+
+View.all = new Set();
+View.help = "Plus and minus zoom, arrow keys move, 0 shows all, n and p step through the points";
+
+function ring(g, [x, y], radius, stroke, width) {
+  g.beginPath();
+  g.arc(x, y, radius, 0, 2 * Math.PI);
+  g.strokeStyle = stroke;
+  g.lineWidth = width || 1.5;
+  g.stroke();
+}
+
+function ticks(view, axis) {
+  const [a, b] = [view.at(view.box[0], view.box[3])[axis], view.at(view.box[2], view.box[1])[axis]];
+  const pixels = axis ? view.box[3] - view.box[1] : view.box[2] - view.box[0];
+  if (view.axes.fixed) return [view.axes.fixed.filter((value) => value >= Math.min(a, b) && value <= Math.max(a, b)), 1];
+  const given = axis ? view.axes.steps?.[1] : view.axes.steps?.[0];
+  const least = (Math.abs(b - a) / pixels) * (axis ? 46 : view.axes.gap || 74);
+  const step = given?.find((one) => one >= least) ?? niceStep(least);
+  const found = [];
+  for (let k = Math.ceil(Math.min(a, b) / step); k * step <= Math.max(a, b) + 1e-9 * step; k += 1) found.push(k * step);
+  return [found, step];
+}
+
+function drawGrid(view, g) {
+  g.strokeStyle = colour("grid");
+  g.lineWidth = 1;
+  g.beginPath();
+  for (const x of ticks(view, 0)[0]) {
+    const [sx] = view.screen(x, 0);
+    g.moveTo(Math.round(sx) + 0.5, view.box[1]);
+    g.lineTo(Math.round(sx) + 0.5, view.box[3]);
+  }
+  for (const y of ticks(view, 1)[0]) {
+    const [, sy] = view.screen(0, y);
+    g.moveTo(view.box[0], Math.round(sy) + 0.5);
+    g.lineTo(view.box[2], Math.round(sy) + 0.5);
+  }
+  g.stroke();
+}
+
+function drawAxes(view, g) {
+  const [left, top, right, bottom] = view.box;
+  g.strokeStyle = colour("line");
+  g.lineWidth = 1;
+  g.strokeRect(left + 0.5, top + 0.5, right - left - 1, bottom - top - 1);
+  g.fillStyle = colour("dim");
+  g.font = "12px system-ui, sans-serif";
+  const text = (value, step) => (view.axes.text ? view.axes.text(value, step) : say(value, Math.max(0, Math.min(6, -Math.floor(Math.log10(step) + 1e-9)))));
+  g.textAlign = "center";
+  g.textBaseline = "top";
+  const [xs, xStep] = ticks(view, 0);
+  for (const x of xs) {
+    const [sx] = view.screen(x, 0);
+    if (sx > left + 8 && sx < right - 12) g.fillText(view.axes.names?.[x] || text(x, xStep), sx, bottom + 4);
+  }
+  g.fillText(view.axes.x, (left + right) / 2, bottom + 19);
+  g.textAlign = "right";
+  g.textBaseline = "middle";
+  const [ys, yStep] = ticks(view, 1);
+  for (const y of ys) {
+    const [, sy] = view.screen(0, y);
+    if (sy > top + 4 && sy < bottom - 2) g.fillText(text(y, yStep), left - 5, sy);
+  }
+  g.textAlign = "left";
+  g.textBaseline = "top";
+  g.fillText(view.axes.y, left + 6, top + 5);
+}

@@ -101,7 +101,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     out = output_path(args, "camera.toml")
     exposures = [read(path, args) for path in args.words]
     start = approximate(args, exposures)
-    with progress(args) as tell:
+    with progress(args, 2 * len(exposures) + 3) as tell:
         try:
             found = calibrate(
                 exposures,
@@ -187,12 +187,15 @@ def site_of(args: argparse.Namespace, exposures: list[Exposure]) -> Site | None:
 
 
 @contextmanager
-def progress(args: argparse.Namespace) -> Iterator[Callable[[str], None]]:
-    """Says what is being done, on a terminal only."""
+def progress(args: argparse.Namespace, steps: int) -> Iterator[Callable[[str], None]]:
+    """A bar over the steps that says what is being done, on a terminal only."""
     if args.quiet or args.json or not sys.stderr.isatty():
         yield lambda text: None
         return
     from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    with Console(stderr=True).status("reading") as status:
-        yield status.update
+    columns = (BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"), TimeElapsedColumn())
+    with Progress(*columns, TextColumn("{task.description}"), console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("starting", total=steps, completed=-1)
+        yield lambda text: bar.update(task, advance=1, description=text)

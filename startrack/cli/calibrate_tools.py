@@ -60,7 +60,7 @@ def verify(args: argparse.Namespace, words: list[str]) -> int:
         named = args.camera or exposure.camera
         if named is None:
             raise BadInput("no_calibration", "which camera file is to be verified? give -c FILE")
-        with progress(args) as tell:
+        with progress(args, 1) as tell:
             try:
                 tell(f"verifying with {exposure.name}")
                 found = verified(exposure, load_camera(named), load_catalog(), site_of(args, [exposure]))
@@ -88,7 +88,7 @@ def board(args: argparse.Namespace, words: list[str]) -> int:
         )
     out = output_path(args, "camera.toml")
     exposures = [read(word, args) for word in words]
-    with progress(args) as tell:
+    with progress(args, len(exposures) + 1) as tell:
         try:
             pattern = Board(columns, rows, args.charuco, args.marker)
             found = calibrate_board(exposures, pattern, name=args.name or out.stem, progress=tell)

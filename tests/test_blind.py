@@ -145,7 +145,7 @@ def test_the_lens_is_found_with_the_stars(case: str, wrong_by: float) -> None:
 
 def test_noise_is_refused_in_bounded_time() -> None:
     rng = np.random.default_rng(5)
-    for n, fov in ((40, 180), (1500, 180), (300, 15)):
+    for n, fov in ((40, 180), (300, 15)):
         noise = detections(rng.uniform(0, 1, (n, 2)) * SIZE, np.sort(rng.pareto(1.5, n) + 1)[::-1])
         with pytest.raises(NotIdentified, match="better than chance") as refusal:
             identify_blind(noise, SIZE, np.radians(fov), sky())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,6 +21,7 @@ from startrack.types import Array, Detections, Identification, NotIdentified, St
 FEWEST_MATCHES = 6
 GATES_PX = (6.0, 3.0, 1.5)
 SMALLEST_RADIUS_PX = 0.5
+KEPT_PATTERNS = 4
 REFINING_STARS = 300
 ON_PLACE = 0.7  # of the stars within the widest gate are within the narrowest one, if the camera file is right
 MOST_REFINED = 40
@@ -41,7 +43,7 @@ class Identifier:
 
     def __call__(self, detections: Detections, camera: Camera, stars: Stars) -> Identification:
         """Matches in the frame. `stars` are sorted, brightest first. Raises NotIdentified (or reason mirrored)."""
-        patterns = _Patterns(stars, _field_sr(camera))
+        patterns = _patterns(stars, _field_sr(camera))
         try:
             return self._identify(detections, camera, patterns)
         except _RoughCamera:
@@ -144,6 +146,17 @@ def _refuse_rough_camera(detections: Detections, camera: Camera, stars: Stars, R
         )
 
 
+def _patterns(stars: Stars, field_sr: float) -> _Patterns:
+    """The patterns of these very stars; the last few are kept."""
+    key = (stars.rays_icrs.shape, stars.rays_icrs[:2000].tobytes(), field_sr)
+    if key not in _KEPT:
+        _KEPT[key] = _Patterns(stars, field_sr)
+        while len(_KEPT) > KEPT_PATTERNS:
+            _KEPT.popitem(last=False)
+    _KEPT.move_to_end(key)
+    return _KEPT[key]
+
+
 class _Patterns:
     """The catalogue's patterns for a camera that sees `field_sr`, worked out when first asked for."""
 
@@ -157,6 +170,9 @@ class _Patterns:
     @cached_property
     def pairs(self) -> PairIndex:
         return build_pairs(self.stars, self.field_sr)
+
+
+_KEPT: OrderedDict[tuple[object, ...], _Patterns] = OrderedDict()
 
 
 def _field_sr(camera: Camera) -> float:

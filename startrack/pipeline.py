@@ -104,7 +104,7 @@ def locate(
         with _timed(result, "locate"):
             evidence = result.light.evidence()
             fix = settings.localizer(evidence, terrain)
-            check_consistency(evidence, fix, terrain)
+            check_consistency(evidence, fix, terrain, getattr(settings.localizer, "compiled", False))
         result.fix = fix
         result.status = "ambiguous" if fix.ambiguous else "ok"
         if fix.ambiguous:

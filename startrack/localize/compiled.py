@@ -26,6 +26,21 @@ def applies(evidence: Evidence, terrain: Terrain) -> bool:
     return isinstance(terrain, Cylinder) and not evidence.edge_sigma_rad.any()
 
 
+def climbed(
+    start_m: Array, evidence: Evidence, cylinder: Cylinder, first_step_m: float, last_step_m: float
+) -> tuple[Array, float]:
+    """The best place (1, 2) near the start (1, 2) by a plain sum of the llr, and that sum. Needs numba."""
+    from startrack.localize import disks
+
+    evidence = taken(evidence, evidence.elevation_rad > 0)
+    sector, ceiling = np.zeros(len(evidence), dtype=np.int64), np.zeros(1)
+    place, best = disks.climb(
+        start_m[0], first_step_m, -on_rim_plane(evidence, cylinder), evidence.llr, sector, ceiling, -np.inf,
+        cylinder.radius_m, 0.5 * last_step_m, CLIMB_RANGE_M,
+    )  # fmt: skip
+    return place[None, :], best
+
+
 def explored(method: ExactPosterior, evidence: Evidence, cylinder: Cylinder) -> tuple[Array, float, Array, float]:
     """Centres (n, 2), half side, log-likelihoods (n,) and log of the mass dropped. Needs numba."""
     from startrack.localize import disks

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from startrack.localize.common import NEARBY_M, common_error, raised
 from startrack.localize.likelihood import Sectors
 from startrack.localize.scout import scores, taken
-from startrack.terrain import Terrain
+from startrack.terrain import Cylinder, Terrain
 from startrack.types import Array, Evidence, Fix, NotLocated
 
 SURE_LLR = 4.0
@@ -26,8 +28,11 @@ FIRST_STEP_M, LAST_STEP_M = 16.0, 2.0
 COMPASS = np.array([[i, j] for i in (-1, 0, 1) for j in (-1, 0, 1)], dtype=np.float64)
 
 
-def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain) -> None:
-    """Raise NotLocated (inconsistent_evidence) where too much of the horizon contradicts the fix, or the map does."""
+def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain, compiled: bool = False) -> None:
+    """Raise NotLocated (inconsistent_evidence) where too much of the horizon contradicts the fix, or the map does.
+
+    `compiled` asks for numba where the terrain allows it: the same answer, sooner.
+    """
     contradicted = contradicted_part(evidence, fix, terrain)
     if contradicted > MOST_CONTRADICTED_SECTORS:
         raise NotLocated(
@@ -35,7 +40,7 @@ def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain) -> None:
             "wrong terrain, time or camera file?",
             reason="inconsistent_evidence",
         )
-    stretch, gain = best_stretch(evidence, fix, terrain)
+    stretch, gain = best_stretch(evidence, fix, terrain, compiled)
     if gain > STRETCH_GAIN_NATS:
         raise NotLocated(
             f"the stars see a horizon about {_percent(stretch)} {'higher' if stretch > 1 else 'lower'} than the "
@@ -66,7 +71,7 @@ def contradicted_part(evidence: Evidence, fix: Fix, terrain: Terrain) -> float:
     return float(np.mean(wrong[known] > SECTOR_CONTRADICTED * rays[known])) if known.any() else 0.0
 
 
-def best_stretch(evidence: Evidence, fix: Fix, terrain: Terrain) -> tuple[float, float]:
+def best_stretch(evidence: Evidence, fix: Fix, terrain: Terrain, compiled: bool = False) -> tuple[float, float]:
     """The stretch of the terrain's height that fits best, and how much better [nats] than the terrain as it is.
 
     tan H -> s tan H for all azimuths, the position free: a wrong depth, width or camera height shows as s != 1, while a
@@ -80,15 +85,25 @@ def best_stretch(evidence: Evidence, fix: Fix, terrain: Terrain) -> tuple[float,
     near = taken(evidence, (np.abs(below) < STRETCH_WINDOW_RAD) & (np.abs(evidence.llr) > TELLING_LLR))
     if not len(near):
         return 1.0, 0.0
-    middle, plain = best_near(start, near, terrain)
+    climb = _climber(near, terrain) if compiled else best_near
+    middle, plain = climb(start, near, terrain)
     best_stretch, best = 1.0, plain
     for sign in (1, -1):
         place = middle
         for stretch in (1 + sign * size for size in STRETCHES):
-            place, fit = best_near(place, _lowered(near, stretch), terrain)
+            place, fit = climb(place, _lowered(near, stretch), terrain)
             if fit > best:
                 best_stretch, best = stretch, fit
     return best_stretch, best - plain
+
+
+def _climber(evidence: Evidence, terrain: Terrain) -> Callable[[Array, Evidence, Terrain], tuple[Array, float]]:
+    """`best_near`, compiled where every ray's visible ground is a disk."""
+    from startrack.localize.compiled import applies, climbed
+
+    if not (isinstance(terrain, Cylinder) and applies(evidence, terrain)):
+        return best_near
+    return lambda start, rays, _: climbed(start, rays, terrain, FIRST_STEP_M, LAST_STEP_M)
 
 
 def _lowered(evidence: Evidence, stretch: float) -> Evidence:

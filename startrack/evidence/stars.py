@@ -88,10 +88,10 @@ class StarEvidence:
         star, xy, rays_cam = star[brightest], xy[brightest], rays_cam[brightest]
         angle = np.arctan2(np.hypot(rays_cam[:, 0], rays_cam[:, 1]), rays_cam[:, 2])
         expected = scale.flux_e(stars.v_mag[star], angle, camera)
-        blur = np.square(place_sigma_px / (2 * sigma_px))  # light lost from a misplaced profile
-        fraction = np.sqrt(
-            scale.scatter**2 + np.square(0.4 * np.log(10) * stars.v_sigma_mag[star]) + blur**2
-        )
+        # Light is lost from a misplaced profile. The rays themselves owe nothing to the lens: they are the catalogue's.
+        misplaced2 = place_sigma_px**2 + (np.square(camera.map_sigma_px(rays_cam)) if camera.covariance_order else 0.0)
+        blur = misplaced2 / (2 * sigma_px) ** 2
+        fraction = np.sqrt(scale.scatter**2 + np.square(0.4 * np.log(10) * stars.v_sigma_mag[star]) + blur**2)
         cause = _unusable(xy, angle, camera, bodies, R_cam_icrs, half_width(sigma_px))
         measurable = np.flatnonzero(cause != "off the frame")
         residual = image_e - detections.background_e

@@ -1,0 +1,40 @@
+"""What the camera file's own uncertainty does to the evidence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from startrack.pipeline import Settings, _light
+
+
+def with_covariance(camera, sigma_px):
+    """The camera with errors of its radial law that grow to the rim: sigma_px at 90 degrees."""
+    order = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
+    sigma = np.array([0, 0, 0, 0, sigma_px / camera.focal_px[0] / (np.pi / 2) ** 3, 0, 0, 0])
+    return replace(camera, covariance_order=order, covariance=np.diag(sigma**2))
+
+
+def test_an_uncertain_lens_makes_stars_at_the_rim_say_less(located):
+    sure = located.result.light
+    camera = with_covariance(located.result.camera, 2.0)
+    doubtful = _light(replace(located.result, camera=camera), Settings())
+    assert np.array_equal(sure.star, doubtful.star)
+    rays = located.result.stars.rays_icrs[sure.star] @ located.result.attitude.R_cam_icrs.T
+    rim = (rays[:, 2] < 0.2) & sure.usable & (sure.llr > 8)
+    axis = (rays[:, 2] > 0.95) & sure.usable & (sure.llr > 8)
+    assert rim.sum() > 20 and axis.sum() > 20
+    bright = sure.flux_e > 20 * sure.sigma_e
+    assert np.median(sure.llr[rim & ~bright]) > np.median(doubtful.llr[rim & ~bright])
+    np.testing.assert_allclose(doubtful.llr[axis], sure.llr[axis], atol=0.5)
+
+
+def test_no_evidence_beyond_the_calibrated_angle(located):
+    camera = replace(located.result.camera, calibrated_angle_rad=float(np.radians(60)))
+    light = _light(replace(located.result, camera=camera), Settings())
+    rays = located.result.stars.rays_icrs[light.star] @ located.result.attitude.R_cam_icrs.T
+    beyond = rays[:, 2] < np.cos(np.radians(60))
+    assert beyond.sum() > 100
+    assert not light.usable[beyond].any()
+    assert np.all(light.llr[beyond] == 0)

@@ -27,8 +27,9 @@ if TYPE_CHECKING:
     from astropy.table import QTable
     from astropy.time import Time
 
+    When = str | datetime | Time | None
+
 Picture = str | os.PathLike[str] | NDArray[Any] | Exposure
-When = "str | datetime | Time | None"
 
 
 @dataclass(frozen=True, repr=False)
@@ -173,7 +174,7 @@ def _exposure(image: Picture, time: Any) -> Exposure:
         whole = np.issubdtype(image.dtype, np.integer)
         largest = float(np.iinfo(image.dtype).max) if whole else None
         return Exposure(pixels_adu=image, name="array", time_utc=time_utc, saturation_adu=largest)
-    return read_exposure(image, **({} if time_utc is None else {"time_utc": time_utc}))
+    return read_exposure(image, time_utc=time_utc)
 
 
 def _utc(time: Any) -> datetime | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,9 @@ def measure(
     from scipy.spatial import cKDTree
 
     radius = half_width(sigma_px)
+    # Down the frame, so that neighbours in the list are neighbours in memory.
+    order = np.argsort(sources.xy_px[:, 1], kind="stable")
+    sources = Sources(**{name: getattr(sources, name)[order] for name in Sources.__dataclass_fields__})
     centre = np.rint(sources.xy_px).astype(np.int64)
     found = cKDTree(sources.xy_px).query_pairs(radius + 3.0 * sigma_px, output_type="ndarray")
     pairs = np.concatenate([found, found[:, ::-1]]).astype(np.int64)  # of a star and its neighbour
@@ -64,7 +68,8 @@ def measure(
         first, last = np.searchsorted(pairs[:, 0], [start, start + STARS_AT_ONCE])
         parts.append(_measured(pictures, sources, centre[some], pairs[first:last], start, sigma_px, radius))
     fields = Photometry.__dataclass_fields__
-    return Photometry(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in fields})
+    back = np.argsort(order)
+    return Photometry(**{name: np.concatenate([getattr(part, name) for part in parts])[back] for name in fields})
 
 
 def _measured(
@@ -79,9 +84,7 @@ def _measured(
     """The sources `start`.. whose stamps are around the pixels `centre` (n, 2); `pairs` (m, 2) are theirs."""
     n = len(centre)
     profile = _profiles(sources.xy_px[start : start + n] - centre, sigma_px, radius)
-    rows = centre[:, 1, None] + np.arange(-radius, radius + 1)
-    columns = centre[:, 0, None] + np.arange(-radius, radius + 1)
-    image, noise, dead = (picture[rows[:, :, None], columns[:, None, :]].reshape(profile.shape) for picture in pictures)
+    image, noise, dead = (_stamps(picture, centre, radius).reshape(profile.shape) for picture in pictures)
     own_row, neighbour = pairs[:, 0] - start, pairs[:, 1]
     overlap = _profiles(sources.xy_px[neighbour] - centre[own_row], sigma_px, radius)
     expected = (sources.flux_e[neighbour] * sources.visible[neighbour]).astype(np.float32)
@@ -113,6 +116,12 @@ def _measured(
         neighbour_variance_e2=np.bincount(own_row, weights=leak * uncertain, minlength=n).astype(np.float64),
         usable=usable,
     )
+
+
+def _stamps(picture: NDArray[Any], centre: Ints, radius: int) -> NDArray[Any]:
+    """The squares (n, side, side) around the pixels `centre` (n, 2)."""
+    windows = np.lib.stride_tricks.sliding_window_view(picture, (2 * radius + 1, 2 * radius + 1))
+    return windows[centre[:, 1] - radius, centre[:, 0] - radius]
 
 
 def _excess(data: Array, variance: Array, light: Array, profile: Array, good: Bools, flux: Array) -> Array:

@@ -60,9 +60,7 @@ def make(folder: Path, out: Path) -> list[str]:
     return ["ldem75s-240m.tif", "ldem75s-1787m.tif", "kepler-48m.tif", "kepler-far.tif"]
 
 
-def polar(
-    source: Path, to: Path, post_m: float, low_m: float, high_m: float, cut: slice = slice(None)
-) -> None:
+def polar(source: Path, to: Path, post_m: float, low_m: float, high_m: float, cut: slice = slice(None)) -> None:
     """A south polar map of a picture whose red and green are the two bytes of the height."""
     picture = cv2.imread(str(source), cv2.IMREAD_UNCHANGED)
     steps = picture[:, :, 2].astype(np.int64) * 256 + picture[:, :, 1]

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,7 +40,11 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     made.add_argument("--longitude", type=float, required=True, metavar="DEG", help="east positive")
     made.add_argument("--radius", type=float, default=10_000.0, metavar="M", help="of the search area (%(default).0f)")
     made.add_argument(
-        "--half", nargs="+", type=float, metavar="M", help="half side of each map's crop (30000 for the first, then 300000)"
+        "--half",
+        nargs="+",
+        type=float,
+        metavar="M",
+        help="half side of each map's crop (30000 for the first, then 300000)",
     )
     made.add_argument(
         "--scale", nargs="+", type=float, metavar="M", help="metres per unit of each map, where the files do not say"
@@ -194,7 +199,7 @@ def _import(args: argparse.Namespace) -> int:
     half = list(args.half or [])
     half += [30_000.0 if not half and k == 0 else 300_000.0 for k in range(len(half), len(args.maps))]
     path = import_maps(
-        args.maps, args.output, latitude_deg=args.latitude, longitude_deg=args.longitude, half_m=half,
+        args.maps, args.output, latitude_rad=radians(args.latitude), longitude_rad=radians(args.longitude), half_m=half,
         radius_m=args.radius, scale=args.scale or (), offset_m=args.offset or (), height_sigma_m=args.sigma,
         camera_height_m=args.camera_height, overwrite=args.overwrite,
     )  # fmt: skip

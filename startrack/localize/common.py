@@ -70,7 +70,7 @@ def marginalised_over_common(
 
 
 def common_error(evidence: Evidence, terrain: Terrain, place_m: Array) -> CommonError:
-    """The error that fits best with its prior: grids of errors, each with its best place, zoom in on those that matter."""
+    """The error that fits best with its prior: grids of errors, each with its best place, zoom in on what matters."""
     middle, half = 0.0, PRIOR_SIGMAS * terrain.common_sigma_rad
     centre, near = place_m, terrain.near(place_m, NEARBY_M)
     for _ in range(ZOOMS):

@@ -1,4 +1,4 @@
-"""A first good place by following the bounds down: where the horizon is costly to ask, or a grid would miss its peak."""
+"""A first good place by following the bounds down: where the horizon is costly to ask, or a grid misses its peak."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ FINEST_M = 0.5
 
 
 def best_by_diving(sectors: Sectors, profile: Profile, terrain: Terrain) -> tuple[Array, float]:
-    """A good place (2,) [m] and its log-likelihood: of ever smaller boxes the most promising ones are quartered, the others left.
+    """A good place (2,) [m] and its log-likelihood: the most promising ones of ever smaller boxes are quartered.
 
-    The log-likelihood is a lower bound of the maximum, usually within a nat or two of it; it decides nothing, but lets the search exclude
-    nearly everything at once.
+    The log-likelihood is a lower bound of the maximum, usually within a nat or two of it; it decides nothing, but lets
+    the search exclude nearly everything at once.
     """
     centres, half = np.zeros((1, 2)), float(terrain.reach_m)
     while True:

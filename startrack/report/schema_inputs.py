@@ -61,7 +61,21 @@ CYLINDER = record(
 )
 DEM = record(
     {"file": {"anyOf": [TEXT, {"type": "array", "items": TEXT, "minItems": 1}], "description": "finest first"}},
-    optional={"height_sigma_m": NUMBER},
+    "Height maps on the Moon's sphere; heights above it, posts at pixel centres, bilinear between.",
+    optional={
+        "height_sigma_m": {**FROM_0, "description": "of single posts, independent of each other"},
+        "horizon_sigma_deg": {**NUMBER, "minimum": 0, "description": "of an error that all azimuths share"},
+        "scale": {**NUMBER, "description": "metres per unit, where the files do not say"},
+        "offset_m": {**NUMBER, "description": "height of value 0, where the files do not say"},
+    },
+)
+SEARCH = record(
+    {},
+    optional={
+        "radius_m": ABOVE_0,
+        "max_slope_deg": {"type": "number", "exclusiveMinimum": 0, "maximum": 90, "default": 90},
+        "glare_deg": {"type": "array", "items": numbers(2), "description": "azimuth ranges that the Sun lights"},
+    },
 )
 TERRAIN = schema(
     "Terrain file",
@@ -73,7 +87,7 @@ TERRAIN = schema(
             "cylinder": CYLINDER,
             "dem": DEM,
             "rover": record({}, optional={"camera_height_m": {**NUMBER, "minimum": 0, "default": 1.5}}),
-            "search": record({}, optional={"radius_m": ABOVE_0}),
+            "search": SEARCH,
         },
     )
     | {"oneOf": [{"required": ["cylinder"]}, {"required": ["dem"]}]},

@@ -61,7 +61,7 @@ def _scales(canvas: Canvas, box: Box, at, low: float, high: float, step: float) 
         canvas.line(at(np.array([0.0, 360.0]), elevation), GRID if elevation else FAINT_INK)
         canvas.text((box[0] - 8, float(at(0.0, elevation)[1])), f"{elevation:g}°", TEXT_PX, DIM_INK, "rm")
     for azimuth in range(0, 361, 30):
-        canvas.line([at(azimuth, low), at(azimuth, low) + [0.0, 6.0]], DIM_INK)
+        canvas.line([at(azimuth, low), at(azimuth, low) + np.array([0.0, 6.0])], DIM_INK)
         name = COMPASS.get(azimuth % 360, f"{azimuth}°")
         canvas.text((float(at(azimuth, low)[0]), box[3] + 10), name, TEXT_PX, DIM_INK, "mt")
     canvas.rectangle(box, FAINT_INK, 1)

@@ -7,6 +7,7 @@ import os
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -47,7 +48,7 @@ def loaded(key: str, square: Square) -> HorizonTable | None:
     try:
         with np.load(path_of(key), allow_pickle=False) as file:
             values, unknown = file["values"], file["unknown_rad"]
-    except (OSError, ValueError, KeyError, EOFError):
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
         return None
     if values.shape != (square.across**2, BINS, 9) or unknown.shape != (BINS,):
         return None

@@ -51,7 +51,9 @@ class HeightTerrain:
     height_sigma_m: float = 0.0  # of single posts, independent of each other
     horizon_sigma_common_rad: float | None = None  # of an error that all azimuths share; None: see common_sigma_rad
     most_slope_rad: float = np.pi / 2  # a rover does not stand on steeper ground
-    glare_rad: tuple[tuple[float, float], ...] = ()  # azimuth ranges, from the first eastward to the second, lit by the Sun
+    glare_rad: tuple[
+        tuple[float, float], ...
+    ] = ()  # azimuth ranges, from the first eastward to the second, lit by the Sun
     use_compiled: bool | None = None  # None: where numba is installed
     _state: dict[str, Any] = field(default_factory=dict, repr=False)
 
@@ -243,7 +245,8 @@ class HeightTerrain:
         if not self._covers(self.search_radius_m):
             raise BadInput(
                 "bad_terrain",
-                f"the maps do not cover the search area of {self.search_radius_m:.0f} m about the origin, or have holes in it",
+                f"the maps do not cover the search area of {self.search_radius_m:.0f} m about the origin, "
+                "or have holes in it",
             )
 
 

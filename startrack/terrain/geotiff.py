@@ -18,7 +18,9 @@ DOUBLES_TAG, ASCII_TAG = 34736, 34737
 USER_DEFINED, METRE, DEGREE = 32767, 9001, 9102
 
 
-def write_map(path: str | Path, height_map: HeightMap, *, step_m: float | None = None, offset_m: float | None = None) -> None:
+def write_map(
+    path: str | Path, height_map: HeightMap, *, step_m: float | None = None, offset_m: float | None = None
+) -> None:
     """Write the map, whole or not at all. Heights are kept to `step_m`, by default a 65,000th of their range."""
     import tifffile
 

@@ -142,7 +142,7 @@ def _raised(tops: NDArray[np.float32], height_map: HeightMap, finer: list[Height
         at = height_map.row_column(*fine.projection.latlon_from_xy(*fine.xy(middles)))
         reach = min(0.71 * size * fine.post_m / height_map.post_m + 0.01, 0.5)
         for d_row, d_column in ((-reach, -reach), (-reach, reach), (reach, -reach), (reach, reach)):
-            cell = np.floor(at + [d_row, d_column]).astype(np.int64)
+            cell = np.floor(at + np.array([d_row, d_column])).astype(np.int64)
             inside = ((cell >= 0) & (cell < tops.shape)).all(axis=-1)
             np.maximum.at(tops, tuple(cell[inside].T), high.ravel()[inside])
     return tops

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.frames import Site, R_enu_fixed
+from startrack.frames import R_enu_fixed, Site
 from startrack.terrain.projection import EQUIRECTANGULAR, STEREOGRAPHIC, Projection
 from startrack.types import Array
 

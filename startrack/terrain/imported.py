@@ -14,7 +14,7 @@ from startrack.types import BadInput
 
 
 def import_maps(
-    maps: Sequence[str | Path], output: str | Path, *, latitude_deg: float, longitude_deg: float,
+    maps: Sequence[str | Path], output: str | Path, *, latitude_rad: float, longitude_rad: float,
     half_m: Sequence[float], radius_m: float, scale: Sequence[float] = (), offset_m: Sequence[float] = (),
     height_sigma_m: float = 1.0, camera_height_m: float = 1.5, overwrite: bool = False,
 ) -> Path:  # fmt: skip
@@ -30,9 +30,10 @@ def import_maps(
     output = Path(output)
     if output.suffix != ".toml":
         raise BadInput("bad_terrain", f"{output}: a terrain file's name ends in .toml")
+    at = latitude_rad, longitude_rad
+    latitude_deg, longitude_deg = (round(float(np.degrees(angle)), 9) for angle in at)
     if not abs(latitude_deg) <= 90:
         raise BadInput("bad_terrain", f"latitude {latitude_deg:g} is not within -90..90")
-    at = float(np.radians(latitude_deg)), float(np.radians(longitude_deg))
     files = [output.with_name(f"{output.stem}-{k + 1}.tif") for k in range(len(maps))]
     there = [path for path in (output, *files) if path.exists()]
     if there and not overwrite:
@@ -46,7 +47,7 @@ def import_maps(
         crops.append(replace(crop, source=Path(source).name))
     d = {
         "format": 1, "name": output.stem, "body": "moon",
-        "origin": {"latitude_deg": float(latitude_deg), "longitude_deg": float(longitude_deg)},
+        "origin": {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg},
         "dem": {"file": [path.name for path in files], "height_sigma_m": float(height_sigma_m)},
         "rover": {"camera_height_m": float(camera_height_m)}, "search": {"radius_m": float(radius_m)},
     }  # fmt: skip

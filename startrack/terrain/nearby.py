@@ -36,8 +36,8 @@ class Nearby:
         """(ACROSS, ACROSS, AZIMUTHS + 1) horizon at the points, east first."""
         line = np.linspace(-self.half_m, self.half_m, ACROSS)
         points = self.centre_m + np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1)
-        azimuths = np.arange(AZIMUTHS) * (2 * np.pi / AZIMUTHS)
-        horizon = self.whole.horizon_rad(points[:, :, None, :], azimuths)
+        azimuths = np.arange(AZIMUTHS, dtype=np.float64) * (2 * np.pi / AZIMUTHS)
+        horizon = self.whole.horizon_rad(np.asarray(points[:, :, None, :], dtype=np.float64), azimuths)
         return np.concatenate([horizon, horizon[..., :1]], axis=-1)
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from startrack.frames import MOON_RADIUS_M, Site, R_enu_fixed
+from startrack.frames import MOON_RADIUS_M, R_enu_fixed, Site
 from startrack.types import Array, BadInput
 
 STEREOGRAPHIC, ORTHOGRAPHIC, EQUIRECTANGULAR = 0, 1, 2
@@ -75,7 +75,8 @@ class Projection:
             up = (4 - r2) / (4 + r2)
             k = (1 + up) / 2
         else:
-            up, k = np.sqrt(np.maximum(1 - r2, 0.0)), 1.0
+            up = np.sqrt(np.maximum(1 - r2, 0.0))
+            k = np.ones_like(up)
         v = np.stack(np.broadcast_arrays(k * x, k * y, up), -1)
         fixed = v @ self.R_projection_fixed
         lat = np.arctan2(fixed[..., 2], np.hypot(fixed[..., 0], fixed[..., 1]))

@@ -51,7 +51,10 @@ def read_map(
         heights_m=heights.astype(np.float32), projection=projection, x0_m=first[0], y0_m=first[1], dx_m=step[0],
         dy_m=step[1], source=path.name,
     )  # fmt: skip
-    return found_map if near is None else found_map.around(*near, HALF_WINDOW_M)
+    cut = found_map if near is None else found_map.around(*near, HALF_WINDOW_M)
+    if min(cut.heights_m.shape) < 2:
+        raise BadInput("bad_terrain", f"{path}: it is not near the origin")
+    return cut
 
 
 def projection_of(p: Mapping[str, Any]) -> Projection:
@@ -96,18 +99,20 @@ def _by_its_tags(path: Path) -> Found | None:
 
     try:
         with tifffile.TiffFile(path) as file:
-            page = file.pages[0]
+            page = file.pages.first
             keys, gdal = file.geotiff_metadata, file.gdal_metadata
             if not isinstance(keys, dict) or "ModelPixelScale" not in keys or "ModelTiepoint" not in keys:
                 if find_spec("rasterio") is None or not keys:
-                    raise BadInput("bad_terrain", f"{path}: it does not say where on the Moon it lies (no GeoTIFF tags)")
+                    raise BadInput(
+                        "bad_terrain", f"{path}: it does not say where on the Moon it lies (no GeoTIFF tags)"
+                    )
                 return None
             if page.size > MOST_PIXELS or len(page.shape) != 2:
                 return None
             nodata = page.tags.get(42113)
             values = np.asarray(page.asarray())
             scale, offset = _gdal_scale(gdal)
-    except (tifffile.TiffFileError, ValueError, KeyError, OSError) as cause:
+    except (tifffile.TiffFileError, ValueError, KeyError, IndexError, OSError) as cause:
         raise BadInput("bad_terrain", f"{path}: not a TIFF file that can be read: {cause}") from cause
     parameters = _proj_of_keys(keys)
     if parameters is None:
@@ -167,7 +172,9 @@ def _proj_of_keys(keys: Mapping[str, Any]) -> dict[str, Any] | None:
 
 def _by_rasterio(path: Path, near: tuple[float, float] | None) -> Found:
     if find_spec("rasterio") is None or find_spec("pyproj") is None:
-        raise BadInput("bad_terrain", f"{path}: such a map is read with rasterio and pyproj: pip install 'startrack[dem]'")
+        raise BadInput(
+            "bad_terrain", f"{path}: such a map is read with rasterio and pyproj: pip install 'startrack[dem]'"
+        )
     import pyproj
     import rasterio
     from rasterio.windows import Window
@@ -188,7 +195,9 @@ def _by_rasterio(path: Path, near: tuple[float, float] | None) -> Found:
                 row, column = _window(projection, first, (t.a, t.e), (file.height, file.width), near)
                 rows, columns = row, column
             if (rows.stop - rows.start) * (columns.stop - columns.start) > MOST_PIXELS:
-                raise BadInput("bad_terrain", f"{path}: too large; cut it to the area (startrack terrain import --half)")
+                raise BadInput(
+                    "bad_terrain", f"{path}: too large; cut it to the area (startrack terrain import --half)"
+                )
             window = Window(columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start)
             values = file.read(1, window=window)
             first = first[0] + columns.start * t.a, first[1] + rows.start * t.e

@@ -155,10 +155,10 @@ def many_sector_bounds(
     out = np.empty(2)
     lowest, highest = 0.0, 0.0
     for k in range(len(low)):
-        if k == 0 or centres[k, 0] != centres[k - 1, 0] or centres[k, 1] != centres[k - 1, 1] or half[k] != half[k - 1]:
-            if half[k] < reach / across:
-                _, lowest, highest = standing(ground, centres[k, 0], centres[k, 1], half[k])
-                lowest, highest = lowest + camera_height, highest + camera_height
+        new = k == 0 or centres[k, 0] != centres[k - 1, 0] or centres[k, 1] != centres[k - 1, 1]
+        if half[k] < reach / across and (new or half[k] != half[k - 1]):
+            _, lowest, highest = standing(ground, centres[k, 0], centres[k, 1], half[k])
+            lowest, highest = lowest + camera_height, highest + camera_height
         sector_bounds(
             values, lows, highs, across, reach, centres[k], half[k], lowest, highest, azimuths[k], turn[k], out
         )

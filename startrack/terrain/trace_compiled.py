@@ -127,8 +127,8 @@ def _best_in_step(tan, at, s0, s2, z0, z1, z2):
 def horizon(ground, east, north, up, sin_a, cos_a, start_m, end_m, hint_m):
     """tan of the horizon, the distance it stands at, and the distance at which the maps end (1e9: not reached).
 
-    Ground nearer than `start_m` or farther than `end_m` is left out. `hint_m` says about where the horizon may stand (0:
-    a row of places is tried): a first sight line over the ground there lets most blocks be stepped over.
+    Ground nearer than `start_m` or farther than `end_m` is left out. `hint_m` says about where the horizon may stand
+    (0: a row of places is tried): a first sight line over the ground there lets most blocks be stepped over.
     """
     grid, heights, posts, tops, _, _, blocks, levels, _, post_m, moon, highest = ground
     tan, at, s, level, edge = LOWEST_TAN, start_m, start_m, 0, FAR_M
@@ -223,11 +223,8 @@ def _most(above, s, reach, cos_turn):
 
 @njit(cache=True, nogil=True, inline="always")
 def _least(above, s, reach, cos_turn):
-    if above > 0.0:
-        tan = above * cos_turn / (s + reach)
-    else:
-        tan = above / (s - reach) if s > reach else LOWEST_TAN
-    return tan
+    under = above / (s - reach) if s > reach else LOWEST_TAN
+    return above * cos_turn / (s + reach) if above > 0.0 else under
 
 
 @njit(cache=True, nogil=True)
@@ -271,9 +268,7 @@ def standing(ground, east, north, half):
             for turn in range(4):  # steepest to the four sides
                 to_e, to_n = post_m[m] * (turn == 0) - post_m[m] * (turn == 1), post_m[m] * (turn > 1) * (5 - 2 * turn)
                 column2, row2 = _grid(grid, m, east + to_e, north + to_n, moon + middle)
-                rise = _steepness(
-                    slopes, at, slope_unit[m], (column2 - column) / post_m[m], (row2 - row) / post_m[m]
-                )
+                rise = _steepness(slopes, at, slope_unit[m], (column2 - column) / post_m[m], (row2 - row) / post_m[m])
                 if turn < 2:
                     a = max(a, abs(rise))
                 else:
@@ -294,8 +289,8 @@ def bounds(ground, east, north, up, low_up, high_up, half, sin_a, cos_a, turn, s
     no higher than the steepest slope along the ray, as the camera stands above the ground.
 
     found: 0, 1: bounds of tan; 2, 3: between which s the ground stands that may be the horizon; 4: where the middle's
-    horizon stands; 5: its tan t; 6: a such that this ground is nowhere higher than a + t s; 7, 8: an s and a height that
-    the ground nowhere falls short of there.
+    horizon stands; 5: its tan t; 6: a such that this ground is nowhere higher than a + t s; 7, 8: an s and a height
+    that the ground nowhere falls short of there.
     """
     grid, heights, posts, tops, wide_tops, slopes, blocks, levels, slope_unit, post_m, moon, highest = ground
     reach = half * (abs(sin_a) + abs(cos_a))

@@ -165,7 +165,9 @@ def _over_cell(
     if not len(k):
         return
     stop, half = s[k] + length, s[k] + 0.5 * length
-    near = np.where(known_s[k] == s[k], known_z[k], surface(g, east[k] + s[k] * sin_a[k], north[k] + s[k] * cos_a[k], guess))
+    near = np.where(
+        known_s[k] == s[k], known_z[k], surface(g, east[k] + s[k] * sin_a[k], north[k] + s[k] * cos_a[k], guess)
+    )
     far = surface(g, east[k] + stop * sin_a[k], north[k] + stop * cos_a[k], near)
     middle = surface(g, east[k] + half * sin_a[k], north[k] + half * cos_a[k], 0.5 * (near + far))
     tan[k], at[k] = best_in_step(tan[k], at[k], s[k], stop, near - up[k], middle - up[k], far - up[k])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -36,7 +37,7 @@ def tracer(use_compiled: bool | None = None) -> Tracer:
     """The compiled tracer where numba is installed (None), or as asked."""
     if use_compiled is None:
         use_compiled = find_spec("numba") is not None
-    return CompiledTracer() if use_compiled else CompiledTracer()
+    return CompiledTracer() if use_compiled else PlainTracer()
 
 
 class CompiledTracer:
@@ -90,6 +91,81 @@ class CompiledTracer:
         )
 
 
+class PlainTracer:
+    """By numpy alone."""
+
+    def surfaces(self, terrain: HeightTerrain, points: Array) -> Array:
+        """Heights in enu (n,)."""
+        from startrack.terrain.trace_plain import surface
+
+        z = surface(terrain.ground, points[:, 0], points[:, 1], np.zeros(len(points)))
+        return surface(terrain.ground, points[:, 0], points[:, 1], z)
+
+    def horizons(
+        self, terrain: HeightTerrain, table: HorizonTable | None, points: Array, azimuths: Array
+    ) -> tuple[Array, Array, Array]:
+        """tan, distance, distance of the maps' end (n,)."""
+        from startrack.terrain.table_plain import look_up
+        from startrack.terrain.trace_plain import horizon
+
+        places, of = np.unique(points, axis=0, return_inverse=True)
+        up = (self.surfaces(terrain, places) + terrain.camera_height_m)[of.ravel()]
+        start, end, hint = look_up(table, points, azimuths)
+        return horizon(terrain.ground, points, up, np.sin(azimuths), np.cos(azimuths), start, end, hint)
+
+    def fill_cells(self, terrain: HeightTerrain, centres: Array, half: float, azimuths: Array, turn: float) -> Array:
+        """(cells, azimuths, 9), see `trace_compiled.bounds`."""
+        n, bins = len(centres), len(azimuths)
+        found = self._bounds(
+            terrain, np.repeat(centres, bins, axis=0), np.full(n * bins, half), np.tile(azimuths, n),
+            np.full(n * bins, turn), np.zeros(n * bins), np.full(n * bins, 1e9),
+        )  # fmt: skip
+        return found.reshape(n, bins, 9)
+
+    def box_bounds(self, terrain: HeightTerrain, table: HorizonTable, *arrays: Array) -> None:
+        """centres, half, azimuths, turn, and the results low, high."""
+        from startrack.terrain.table_plain import look_up_boxes
+
+        centres, half, azimuths, turn, low, high = arrays
+        start, end = look_up_boxes(table, centres, half, azimuths, turn)
+        found = self._bounds(terrain, centres, half, azimuths, turn, start, end)
+        low[:], high[:] = np.arctan(found[:, 0]), np.arctan(found[:, 1])
+
+    def sector_bounds(self, terrain: HeightTerrain, table: HorizonTable, *arrays: Array) -> None:
+        """Likewise; all boxes of one size."""
+        from startrack.terrain.table_plain import sector_bounds
+
+        centres, half, azimuths, turn, low, high = arrays
+        lowest, highest = self._standing(terrain, centres, half)[1:] if half[0] < table.square.half_m else (half, half)
+        level = level_for(table, float(half[0]))
+        low[:], high[:] = sector_bounds(table, level, centres, half, lowest, highest, azimuths, turn)
+
+    def _standing(self, terrain: HeightTerrain, centres: Array, half: Array) -> tuple[Array, Array, Array]:
+        """Heights of the camera (n,): in the middle of boxes, lowest and highest."""
+        from startrack.terrain.bounds_plain import standing
+
+        boxes, of = np.unique(np.column_stack([centres, half]), axis=0, return_inverse=True)
+        found = standing(terrain.ground, boxes[:, :2], boxes[:, 2])
+        middle, low, high = (a[of.ravel()] + terrain.camera_height_m for a in found)
+        return middle, low, high
+
+    def _bounds(
+        self,
+        terrain: HeightTerrain,
+        centres: Array,
+        half: Array,
+        azimuths: Array,
+        turn: Array,
+        start: Array,
+        end: Array,
+    ) -> Array:
+        from startrack.terrain.bounds_plain import bounds
+
+        up, low, high = self._standing(terrain, centres, half)
+        sin_a, cos_a = np.sin(azimuths), np.cos(azimuths)
+        return bounds(terrain.ground, centres, up, low, high, half, sin_a, cos_a, turn, start, end)
+
+
 def _side_by_side(function: Any, fixed: tuple[Any, ...], arrays: tuple[Array, ...]) -> None:
     """Call the function with the fixed arguments and parts of the arrays, on all cores where that is worth while."""
     n, cores = len(arrays[-1]), min(cpu_count(), MOST_THREADS)
@@ -98,7 +174,7 @@ def _side_by_side(function: Any, fixed: tuple[Any, ...], arrays: tuple[Array, ..
         return
     ends = np.linspace(0, n, cores + 1).astype(int)
     with ThreadPoolExecutor(cores) as pool:
-        parts = [[a[i:j] for a in arrays] for i, j in zip(ends[:-1], ends[1:], strict=True)]
+        parts = [[a[i:j] for a in arrays] for i, j in pairwise(ends)]
         for future in [pool.submit(function, *fixed, *part) for part in parts]:
             future.result()
 

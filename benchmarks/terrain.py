@@ -1,0 +1,130 @@
+"""Height maps: places on a crater's floor, from pixels, with the true map and with a degraded one.
+
+    python benchmarks/terrain.py [--terrain shackleton] [--frames 20] [--radius 4000]
+
+The degraded map has errors of 5 m (s.d.) at every post and shows the whole horizon 0.08 degrees too low; its file says
+so (height_sigma_m = 5, horizon_sigma_deg = 0.08). Conditions as in chain.py; places with a slope below 15 degrees.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from _results import table, write_section
+from chain import SENSOR
+
+from startrack.camera import load_camera
+from startrack.catalog import load_catalog
+from startrack.localize import ExactPosterior, check_consistency
+from startrack.localize.common import raised
+from startrack.pipeline import locate
+from startrack.render import Series, render
+from startrack.terrain import load_terrain
+from startrack.terrain.dem import HeightTerrain
+from startrack.types import Evidence, Fix, NoSolution
+
+NOISE_M, BIAS_RAD, SLOPE_RAD = 5.0, np.radians(0.08), np.radians(15.0)
+
+
+def main() -> None:
+    """Run, print and write the section."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--terrain", default="shackleton")
+    parser.add_argument("--frames", type=int, default=20)
+    parser.add_argument("--radius", type=float, default=4000.0)
+    parser.add_argument("--seed", type=int, default=6)
+    parser.add_argument("--no-degraded", action="store_true")
+    args = parser.parse_args()
+    true = fresh(load_terrain(args.terrain), search_radius_m=args.radius, most_slope_rad=SLOPE_RAD)
+    maps = {"the map as it is": (replace_sigma(true, 0.0, 0.0), 0.0), "the shipped file's errors": (true, 0.0)}
+    if not args.no_degraded:
+        maps["degraded, and known to be"] = (degraded(true, args.seed), BIAS_RAD)
+    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in maps}
+    for number in range(args.frames):
+        evidence, place = observed(true, args.seed, number)
+        for name, (terrain, bias) in maps.items():
+            rows[name].append(scored(raised(evidence, -bias), terrain, place))
+            print(number, name, rows[name][-1], flush=True)
+    body = summary(rows)
+    print(body)
+    write_section(
+        f"Height maps: {args.terrain}", f"python benchmarks/terrain.py --terrain {args.terrain} --frames {args.frames}",
+        ("numpy", "scipy", "numba"), body,
+    )  # fmt: skip
+
+
+def fresh(terrain: Any, **changes: Any) -> HeightTerrain:
+    """The terrain with other settings, its horizons not taken over."""
+    made = replace(terrain, **changes, _state={})
+    made.prepared()
+    return made
+
+
+def replace_sigma(terrain: HeightTerrain, height_sigma_m: float, common_rad: float) -> HeightTerrain:
+    """The same map, said to be so good."""
+    return fresh(terrain, height_sigma_m=height_sigma_m, horizon_sigma_common_rad=common_rad)
+
+
+def degraded(terrain: HeightTerrain, seed: int) -> HeightTerrain:
+    """A map with errors at every post, that says so."""
+    rng = np.random.default_rng(seed)
+    maps = [
+        replace(m, heights_m=(m.heights_m + rng.normal(0.0, NOISE_M, m.heights_m.shape)).astype(np.float32))
+        for m in terrain.maps
+    ]
+    return fresh(terrain, maps=tuple(maps), height_sigma_m=NOISE_M, horizon_sigma_common_rad=BIAS_RAD)
+
+
+def observed(terrain: HeightTerrain, seed: int, number: int) -> tuple[Evidence, np.ndarray]:
+    """Evidence of one random frame, through the whole chain, and the true place."""
+    camera, catalog = replace(load_camera("fisheye-2048"), sensor=SENSOR), load_catalog()
+    series = Series(
+        camera=camera, terrain=terrain, catalog=catalog, seed=seed, exposure_s=10.0, hot_pixels=200, cosmic_rays=30
+    )
+    scene, rng = series.scene(number, f"frame-{number:03d}")
+    exposure, truth = render(scene, rng=rng)
+    result = locate(exposure, camera, terrain, catalog)
+    assert result.light is not None, result.message
+    return result.light.evidence(), np.asarray(truth.position_enu_m)
+
+
+def scored(evidence: Evidence, terrain: HeightTerrain, place: np.ndarray) -> dict[str, Any]:
+    """Error, what the fix says of it, and how long it took."""
+    start, cpu = time.perf_counter(), time.process_time()
+    try:
+        fix: Fix = ExactPosterior()(evidence, terrain)
+        took, cpu = time.perf_counter() - start, time.process_time() - cpu
+        check_consistency(evidence, fix, terrain)
+    except NoSolution as cause:
+        return {"status": cause.reason}
+    off = fix.position_enu_m[:2] - place[:2]
+    return {
+        "status": "ambiguous" if fix.ambiguous else "ok", "error_m": round(float(np.hypot(*off)), 2),
+        "nees": round(float(off @ np.linalg.solve(fix.covariance_m2, off)), 2),
+        "in95": bool(np.hypot(*off) < fix.radius95_m), "in999": bool(np.hypot(*off) < fix.radius999_m),
+        "r95": round(fix.radius95_m, 1), "seconds": round(took, 2), "cpu": round(cpu, 2),
+    }  # fmt: skip
+
+
+def summary(rows: dict[str, list[dict[str, Any]]]) -> str:
+    """A table: one row per map."""
+    lines = []
+    for name, found in rows.items():
+        ok = [row for row in found if row["status"] == "ok"]
+        error = np.array([row["error_m"] for row in ok])
+        lines.append([
+            name, f"{len(ok)} of {len(found)}", f"{error.mean():.1f}", f"{np.median(error):.1f}", f"{error.max():.1f}",
+            f"{np.mean([row['nees'] for row in ok]):.2f}", f"{100 * np.mean([row['in95'] for row in ok]):.0f} %",
+            f"{100 * np.mean([row['in999'] for row in ok]):.0f} %", f"{np.median([row['cpu'] for row in ok]):.2f}",
+        ])  # fmt: skip
+    head = ["map", "located", "mean error, m", "median", "largest", "NEES", "in the 95 % circle", "in the 99.9 %",
+            "CPU s a fix"]  # fmt: skip
+    return table(head, lines)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,189 @@
+"""Terrain files with height maps: what is read, what is refused, and the command that makes and shows them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+
+from startrack.cli.main import main
+from startrack.paths import data_dir
+from startrack.terrain import load_terrain
+from startrack.terrain.dem import HeightTerrain
+from startrack.terrain.geotiff import write_map
+from startrack.terrain.heightmap import HeightMap
+from startrack.terrain.projection import EQUIRECTANGULAR, ORTHOGRAPHIC, Projection, polar_stereographic
+from startrack.terrain.rasters import projection_of, read_map
+from startrack.types import BadInput
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def hill(posts: int = 61, post_m: float = 100.0, projection: Projection | None = None) -> HeightMap:
+    """A bowl with a rim, 6 km wide, about the projection's centre."""
+    line = (np.arange(posts) - (posts - 1) / 2) * post_m
+    r = np.hypot(line[:, None], line)
+    return HeightMap(
+        heights_m=(800 * np.exp(-((r - 2000) ** 2) / 500**2)).astype(np.float32),
+        projection=projection or polar_stereographic(), x0_m=line[0], y0_m=-line[0], dx_m=post_m, dy_m=-post_m,
+    )  # fmt: skip
+
+
+def terrain_file(folder: Path, **changes) -> Path:
+    write_map(folder / "hill.tif", hill())
+    d = {
+        "format": 1, "name": "hill", "body": "moon", "origin": {"latitude_deg": -90.0, "longitude_deg": 0.0},
+        "dem": {"file": "hill.tif", "height_sigma_m": 2.0}, "search": {"radius_m": 800.0},
+    }  # fmt: skip
+    for name, value in changes.items():
+        d[name] = {**d[name], **value} if isinstance(value, dict) and name in d else value
+    path = folder / "hill.toml"
+    path.write_text(tomli_w.dumps(d))
+    return path
+
+
+@pytest.mark.parametrize("name", ["shackleton", "haworth", "faustini", "de-gerlache", "kepler"])
+def test_shipped_maps_load(name):
+    terrain = load_terrain(name)
+    assert terrain.name == name
+    ground = terrain.ground_m(np.zeros((1, 2)))[0]
+    floors = {"shackleton": -2720, "haworth": -3377, "faustini": -2707, "de-gerlache": -1115, "kepler": -2900}
+    assert ground == pytest.approx(floors[name], abs=250)  # what others give for the craters' floors
+
+
+def test_every_key_reaches_the_terrain(tmp_path):
+    more = {"radius_m": 700.0, "max_slope_deg": 20.0, "glare_deg": [[350.0, 10.0]]}
+    path = terrain_file(tmp_path, dem={"horizon_sigma_deg": 0.05}, rover={"camera_height_m": 2.5}, search=more)
+    terrain = load_terrain(path)
+    assert isinstance(terrain, HeightTerrain)
+    assert terrain.camera_height_m == 2.5
+    assert terrain.search_radius_m == 700.0
+    assert terrain.height_sigma_m == 2.0
+    assert terrain.most_slope_rad == pytest.approx(np.radians(20))
+    assert terrain.glare_rad == ((pytest.approx(np.radians(350)), pytest.approx(np.radians(10))),)
+    own = np.hypot(np.radians(0.05), 0)
+    assert own < terrain.common_sigma_rad < 3 * own
+    slopes = terrain.slope_rad(np.array([[0.0, 0.0], [0.0, 690.0]]))
+    assert slopes[0] < 0.01
+    assert terrain.allowed(np.array([[0.0, 0.0], [2000.0, 0.0]])).tolist() == [True, False]
+
+
+REFUSED = [
+    ({"dem": {"file": "none.tif"}}, "none.tif"), ({"dem": {"file": []}}, "file"), ({"dem": {"file": 3}}, "file"),
+    ({"dem": {"height_sigma_m": -1.0}}, "height_sigma_m"), ({"dem": {"height_sigma_m": "big"}}, "height_sigma_m"),
+    ({"search": {"radius_m": 5000.0}}, "cover"), ({"search": {"max_slope_deg": 0.0}}, "max_slope_deg"),
+    ({"search": {"glare_deg": [10.0]}}, "glare_deg"), ({"body": "earth"}, "moon"),
+    ({"cylinder": {"diameter_m": 100.0, "depth_m": 10.0}}, "two grounds"),
+    ({"origin": {"latitude_deg": 0.0}}, "not near the origin"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "named"), REFUSED, ids=lambda v: str(v)[:40])
+def test_what_cannot_be_used_is_refused_and_named(changes, named, tmp_path):
+    with pytest.raises(BadInput, match=named) as caught:
+        load_terrain(terrain_file(tmp_path, **changes))
+    assert caught.value.reason == "bad_terrain"
+
+
+def test_maps_without_place_of_other_bodies_or_with_holes_are_refused(tmp_path):
+    import tifffile
+
+    path = terrain_file(tmp_path)
+    tifffile.imwrite(tmp_path / "hill.tif", np.zeros((50, 50), dtype=np.int16))
+    with pytest.raises(BadInput, match="where on the Moon"):
+        load_terrain(path)
+    (tmp_path / "hill.tif").write_bytes(b"II*\x00 not a tiff")
+    with pytest.raises(BadInput, match="can be read"):
+        load_terrain(path)
+    holed = hill()
+    heights = holed.heights_m.copy()
+    heights[30, 32] = np.nan
+    write_map(tmp_path / "hill.tif", replace(holed, heights_m=heights))
+    with pytest.raises(BadInput, match="holes"):
+        load_terrain(path)
+    with pytest.raises(BadInput, match="radius"):
+        projection_of({"proj": "stere", "lat_0": -90, "R": 3_396_190.0})
+    with pytest.raises(BadInput, match="Earth"):
+        projection_of({"proj": "longlat", "datum": "WGS84"})
+
+
+@pytest.mark.parametrize(
+    "projection",
+    [
+        polar_stereographic(), polar_stereographic(south=False, longitude_rad=0.5),
+        Projection(kind=ORTHOGRAPHIC, latitude_rad=0.1, longitude_rad=-0.6),
+        Projection(kind=EQUIRECTANGULAR, longitude_rad=1.0, scale=0.9),
+    ],
+    ids=["south", "north", "orthographic", "equirectangular"],
+)  # fmt: skip
+def test_maps_survive_the_file_and_rasterio_reads_the_same(projection, tmp_path):
+    written = hill(projection=projection)
+    write_map(tmp_path / "a.tif", written)
+    read = read_map(tmp_path / "a.tif")
+    assert np.abs(read.heights_m - written.heights_m).max() < 0.02
+    at = np.array([[3.0, 5.0]])
+    assert np.array(read.xy(at)) == pytest.approx(np.array(written.xy(at)))
+    place = written.projection.latlon_from_xy(*written.xy(at))
+    assert read.row_column(*place) == pytest.approx(at, abs=1e-9)
+    rasterio = pytest.importorskip("rasterio")
+    with rasterio.open(tmp_path / "a.tif") as file:
+        values = file.read(1) * file.scales[0] + file.offsets[0]
+        assert np.abs(values - read.heights_m).max() < 1e-3
+        assert file.xy(3, 5) == pytest.approx([float(v[0]) for v in written.xy(at)])
+        dumb = projection_of(file.crs.to_dict())
+    assert dumb.xy_from_latlon(*place)[0] == pytest.approx(projection.xy_from_latlon(*place)[0], abs=1e-3)
+
+
+def test_rasterio_reads_what_the_tags_do_not_tell(tmp_path):
+    rasterio = pytest.importorskip("rasterio")
+    wkt = rasterio.crs.CRS.from_proj4("+proj=stere +lat_0=-90 +lon_0=0 +R=1737400 +units=m")
+    m = hill()
+    move = rasterio.transform.from_origin(m.x0_m - 50, m.y0_m + 50, 100, 100)
+    with rasterio.open(
+        tmp_path / "a.img", "w", driver="HFA", height=61, width=61, count=1, dtype="float32", crs=wkt, transform=move
+    ) as file:  # fmt: skip
+        file.write(m.heights_m, 1)
+    read = read_map(tmp_path / "a.img")
+    assert np.array_equal(read.heights_m, m.heights_m)
+    assert (read.x0_m, read.y0_m) == (m.x0_m, m.y0_m)
+    assert read.projection == m.projection
+
+
+def test_import_show_and_build(tmp_path, capsys):
+    write_map(tmp_path / "src.tif", hill())
+    words = ["--latitude", "-90", "--longitude", "0", "--radius", "500", "--half", "2500"]
+    made = tmp_path / "mine.toml"
+    assert main(["terrain", "import", str(tmp_path / "src.tif"), "-o", str(made), *words, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["format"] == "startrack.terrain/1"
+    assert facts["maps"][0]["posts"] == [53, 53]
+    assert main(["terrain", "import", str(tmp_path / "src.tif"), "-o", str(made), *words]) == 4
+    assert "-O" in capsys.readouterr().err
+    assert main(["terrain", "build", str(made), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["known_before"] is False
+    assert main(["terrain", "build", str(made), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["known_before"] is True
+    assert main(["terrain", "show", str(made), "--at", "100", "0", "-D", str(tmp_path / "out"), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["horizons_ready"] is True
+    assert 15 < facts["horizon_min_deg"] < facts["horizon_max_deg"] < 40
+    from PIL import Image
+
+    for file in facts["files"]:
+        assert np.asarray(Image.open(file)).std() > 5
+    assert main(["terrain", "show", str(made), "--at", "9000", "0", "--no-plots"]) == 4
+
+
+def test_every_shipped_map_is_named_with_its_source():
+    readme = (data_dir("terrain") / "README.md").read_text()
+    for path in data_dir("terrain").glob("*.t*"):
+        assert path.name in readme

@@ -1,0 +1,234 @@
+"""The page in a real browser: hover, zoom, fingers, keys, sorting and filtering, and no word on the console."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from page_helpers import NASTY, results_in
+
+from startrack.page import page_text, results_under
+from startrack.page.gather import Found
+
+playwright = pytest.importorskip("playwright.sync_api", reason="the extra `browser` is not installed")
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+DESKTOP, PHONE, SMALL = (1280, 800), (390, 844), (360, 740)
+REAL = {"small": (6010.0, -2507.0)}
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    path = next(filter(None, map(shutil.which, BROWSERS)), None)
+    with playwright.sync_playwright() as driver:
+        if path is None and not Path(driver.chromium.executable_path).exists():
+            pytest.skip("no Chromium is installed")
+        browser = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def folder(located, tmp_path_factory) -> Path:
+    out = results_in(tmp_path_factory.mktemp("results"), located)
+    found, unread = results_under(out)
+    (out / "report.html").write_text(page_text(found, unread=unread, real=REAL), encoding="utf-8")
+    rows = [
+        Found(f"n/{k:05}", Path("x"), {**one.record, "image": f"n/{k:05}.png"}) for k, one in enumerate(found * 2500)
+    ]
+    real = {one.stem: (6003.0, -2498.0) for one in rows}
+    (out / "many.html").write_text(page_text(rows, real=real, images=0), encoding="utf-8")
+    return out
+
+
+class Window:
+    """A page that is open, with all that it said on the console."""
+
+    def __init__(self, chromium: Any, path: Path, size: tuple[int, int], scheme: str = "light") -> None:
+        touch = size != DESKTOP
+        view = {"width": size[0], "height": size[1]}
+        self.context = chromium.new_context(viewport=view, color_scheme=scheme, has_touch=touch, is_mobile=touch)
+        self.said: list[str] = []
+        self.page = self.context.new_page()
+        self.page.set_default_timeout(20_000)
+        self.page.on("console", lambda message: self.said.append(message.text))
+        self.page.on("pageerror", lambda error: self.said.append(str(error)))
+        self.page.on(
+            "request", lambda request: self.said.append(request.url) if "data:" not in request.url[:5] else None
+        )
+        self.page.goto(path.as_uri())
+        self.said.remove(path.as_uri())
+
+    def open(self, name: str) -> None:
+        self.page.get_by_role("link", name=name).click()
+        self.page.wait_for_selector("#detail h1")
+
+    def star(self, name: str) -> tuple[float, float]:
+        """Where a star of the picture is in the window."""
+        self.page.locator("#detail .stage canvas").first.scroll_into_view_if_needed()
+        x, y = self.page.evaluate(
+            "name => { const c = document.querySelector('#detail .stage canvas'); const f = c.getBoundingClientRect();"
+            "const s = c.view.points.find(p => p.name === name); const [x, y] = c.view.screen(s.x, s.y);"
+            "if (f.top + y > innerHeight - 40) scrollBy(0, f.top + y - innerHeight / 2);"
+            "return [f.left + x, c.getBoundingClientRect().top + y]; }", name,
+        )  # fmt: skip
+        return x, y
+
+    @property
+    def zoom(self) -> float:
+        return float(self.page.locator("#detail .stage").first.get_attribute("data-zoom"))
+
+    def tip(self) -> str:
+        return self.page.locator("#detail .tip").first.inner_text()
+
+    def fits(self) -> bool:
+        """Whether nothing stands out to the right."""
+        return self.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+
+
+@pytest.fixture
+def window(chromium, folder) -> Iterator[Any]:
+    opened = []
+
+    def make(size: tuple[int, int] = DESKTOP, name: str = "report.html", scheme: str = "light") -> Window:
+        opened.append(Window(chromium, folder / name, size, scheme))
+        return opened[-1]
+
+    yield make
+    for one in opened:
+        said = one.said
+        one.context.close()
+        assert said == []  # no error, no warning, and no request but for the page itself
+
+
+def test_hover_tells_of_a_star_and_the_wheel_zooms_where_it_points(window):
+    w = window()
+    w.open("small.png")
+    x, y = w.star("Vega")
+    assert not w.page.locator("#detail .tip").first.is_visible()
+    w.page.mouse.move(x + 3, y + 2)
+    w.page.wait_for_selector("#detail .tip:not([hidden])")
+    for words in ("Vega", "HIP 91262", "V 0.03", "seen", "its light is there", "evidence", "azimuth"):
+        assert words in w.tip()
+    w.page.mouse.wheel(0, -400)
+    w.page.wait_for_function("document.querySelector('#detail .stage').dataset.zoom > 2")
+    assert w.star("Vega") == pytest.approx((x, y), abs=4)
+    before = w.star("Vega")
+    w.page.mouse.down()
+    w.page.mouse.move(before[0] + 80, before[1] - 50, steps=4)
+    w.page.mouse.up()
+    assert w.star("Vega") == pytest.approx((before[0] + 83, before[1] - 48), abs=6)
+    w.page.mouse.dblclick(*w.star("Vega"))
+    assert w.zoom == 1
+
+
+def test_keys_zoom_move_and_step_through_the_stars(window):
+    w = window()
+    w.open("small.png")
+    w.page.locator("#detail .stage canvas").first.focus()
+    w.page.keyboard.press("+")
+    assert w.zoom == pytest.approx(1.4)
+    centre = "document.querySelector('#detail .stage canvas').view.centre[0]"
+    before = w.page.evaluate(centre)
+    w.page.keyboard.press("ArrowRight")
+    assert w.page.evaluate(centre) > before
+    w.page.keyboard.press("n")
+    first = w.page.locator("#detail [role=status]").first.text_content()
+    w.page.keyboard.press("n")
+    assert "magnitude" in first
+    assert w.page.locator("#detail [role=status]").first.text_content() not in ("", first)
+    w.page.keyboard.press("0")
+    assert w.zoom == 1
+
+
+def test_fingers_tap_and_pinch(window):
+    w = window(PHONE)
+    w.open("small.png")
+    x, y = w.star("Vega")
+    w.page.touchscreen.tap(x, y)
+    w.page.wait_for_selector("#detail .tip:not([hidden])")
+    assert "magnitude" in w.tip()
+    box = w.page.locator("#detail .tip").first.bounding_box()
+    assert box["x"] >= 0 and box["x"] + box["width"] <= PHONE[0]
+    session = w.context.new_cdp_session(w.page)
+    for apart, kind in ((20, "touchStart"), (30, "touchMove"), (60, "touchMove"), (60, "touchEnd")):
+        points = [{"x": x - apart, "y": y, "id": 0}, {"x": x + apart, "y": y, "id": 1}]
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": [] if kind == "touchEnd" else points})
+    assert w.zoom == pytest.approx(3, rel=0.2)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [DESKTOP, PHONE, SMALL], ids=lambda size: str(size[0]))
+def test_nothing_stands_out_sideways(window, size, scheme):
+    w = window(size, scheme=scheme)
+    assert w.fits()
+    for index in range(4):
+        w.page.evaluate("k => { location.hash = `#i${k}` }", index)
+        w.page.wait_for_function("k => document.getElementById('detail').dataset.index === String(k)", arg=index)
+        assert w.fits()
+    luminance = w.page.evaluate(
+        "getComputedStyle(document.body).backgroundColor.match(/\\d+/g).reduce((a, b) => a + +b, 0)"
+    )
+    assert (luminance < 150) == (scheme == "dark")
+
+
+def test_rows_are_sorted_filtered_and_opened(window):
+    w = window()
+    names = w.page.locator("tbody th[scope=row]")
+    assert names.all_inner_texts() == ["dark.png", NASTY, "night 1/two.png", "small.png"]
+    outcome = w.page.get_by_role("button", name="Outcome")
+    outcome.focus()
+    w.page.keyboard.press("Enter")
+    assert names.first.inner_text() == "night 1/two.png"  # ambiguous, ok, refused
+    w.page.keyboard.press("Enter")
+    assert names.first.inner_text() == NASTY
+    assert w.page.locator("th[aria-sort=descending]").inner_text().startswith("Outcome")
+    w.page.get_by_role("button", name="refused").click()
+    assert names.count() == 2
+    w.page.get_by_role("searchbox").fill("NO star")
+    assert names.all_inner_texts() == ["dark.png"]
+    assert "1 of 4" in w.page.locator("#overview [role=status]").first.inner_text()
+    w.page.locator("tbody td").first.click()
+    assert w.page.locator("#detail h1").inner_text() == "dark.png"
+    assert "What to try" in w.page.locator(".why").inner_text()
+    assert not w.page.locator("#overview").is_visible()
+    w.page.go_back()
+    w.page.wait_for_selector("#overview table")
+    assert w.page.locator("#detail").is_hidden()
+
+
+def test_an_ambiguous_image_shows_every_place_and_its_warnings(window):
+    w = window()
+    w.open("night 1/two.png")
+    places = w.page.locator(".why li").all_inner_texts()
+    assert [text.replace("\u00a0", " ") for text in places] == [
+        "East 6,000 m, north −2,500 m: 75.0 %",
+        "East −3,000 m, north 10 m: 25.0 %",
+    ]
+    assert "EXIF orientation" in w.page.locator("#detail").inner_text()
+    assert w.page.locator("a", has_text="two.fix.json").get_attribute("href") == "./night%201/two.fix.json"
+
+
+def test_texts_stay_texts(window):
+    w = window()
+    w.open(NASTY)
+    assert w.page.locator("#detail h1").inner_text() == NASTY
+    assert w.page.locator("#detail b").count() == 0
+
+
+def test_ten_thousand_rows_scroll(window):
+    w = window(name="many.html")
+    assert w.page.locator("tbody tr").count() < 80
+    w.page.locator(".rows").evaluate("box => { box.scrollTop = box.scrollHeight }")
+    w.page.wait_for_selector("text=n/09999.png")
+    assert w.page.locator("tbody tr").count() < 80
+    took_ms = w.page.evaluate(
+        "() => { const start = performance.now(); document.querySelectorAll('thead button')[1].click();"
+        "return performance.now() - start }"
+    )
+    assert took_ms < 3000
+    w.page.get_by_role("searchbox").fill("00042")
+    assert w.page.locator("tbody th[scope=row]").all_inner_texts() == ["n/00042.png"]
+    assert "2,500 with a known place" in w.page.locator("#overview").inner_text()

@@ -6,6 +6,7 @@ import time as clock
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from startrack.bodies import bodies
 from startrack.camera import Camera
 from startrack.detect import Detector, electrons
-from startrack.evidence import StarEvidence, StarLight, flux_scale
+from startrack.evidence import StarEvidence, StarLight, flux_scale, known_well, levelled, near_skyline
 from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
 from startrack.identify import Identifier
 from startrack.localize import ExactPosterior, Localizer, check_consistency
@@ -28,6 +29,7 @@ from startrack.types import (
     Exposure,
     Fix,
     Identification,
+    Ints,
     NoSolution,
     NotIdentified,
     Stars,
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
 
 SHARP_PSF_PX = 0.9  # tried where the frame's own sources are wider than BLURRED_PSF_PX and name no stars
 BLURRED_PSF_PX = 2.0
+RELIT_PX, NEIGHBOURS_PX = 12.0, 10.0  # stars this near the skyline are measured again, beside their neighbours
 UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out
 NO_TIME = (
     "the mid-exposure time is not known: give --time UTC, a sidecar NAME.json with time_utc, or a header with it; "
@@ -104,6 +107,13 @@ def locate(
         with _timed(result, "locate"):
             evidence = result.light.evidence()
             fix = settings.localizer(evidence, terrain)
+        if not fix.ambiguous:
+            with _timed(result, "evidence"):
+                result.light = _relit(result, settings, fix)
+            with _timed(result, "locate"):
+                evidence = result.light.evidence()
+                fix = settings.localizer(evidence, terrain)
+        with _timed(result, "locate"):
             check_consistency(evidence, fix, terrain, getattr(settings.localizer, "compiled", False))
         result.fix = fix
         result.status = "ambiguous" if fix.ambiguous else "ok"
@@ -228,22 +238,47 @@ def _solve_attitude(result: Result) -> None:
         )
 
 
-def _light(result: Result, settings: Settings) -> StarLight:
+def _relit(result: Result, settings: Settings, fix: Fix) -> StarLight:
+    """The light of the stars beside the skyline once more, now that the step of the sky's own light can be told."""
+    assert result.camera is not None and result.detections is not None and result.terrain is not None
+    assert result.light is not None and result.attitude_fit is not None and result.R_enu_icrs is not None
+    camera, place = result.camera, fix.position_enu_m[:2]
+    horizon = partial(result.terrain.horizon_rad, place[None, :])
+    axes = np.linalg.cholesky(fix.covariance_m2).T
+    known = known_well(horizon, [partial(result.terrain.horizon_rad, (place + axis)[None, :]) for axis in axes], camera)
+    image, dead = electrons(result.exposure, camera)
+    R_cam_enu = result.attitude_fit.attitude.R_cam_icrs @ result.R_enu_icrs.T
+    detections = levelled(image, dead, result.detections, camera, R_cam_enu, horizon)
+    light = result.light
+    wanted = near_skyline(light.azimuth_rad, light.elevation_rad, camera, horizon, RELIT_PX) & known(light.azimuth_rad)
+    around = near_skyline(light.azimuth_rad, light.elevation_rad, camera, horizon, RELIT_PX + NEIGHBOURS_PX)
+    return light.renewed(_light(result, settings, detections, light.star[around]), light.star[wanted])
+
+
+def _light(
+    result: Result, settings: Settings, detections: Detections | None = None, only: Ints | None = None
+) -> StarLight:
     assert result.camera is not None and result.detections is not None and result.stars is not None
     assert result.identification is not None and result.attitude_fit is not None and result.R_enu_icrs is not None
     image, dead = electrons(result.exposure, result.camera)
-    return settings.evidence(
+    stars, visible = result.stars, None
+    if only is not None and result.light is not None:
+        stars = stars.take(only)
+        visible = 1.0 / (1.0 + np.exp(-result.light.llr[np.searchsorted(result.light.star, only)]))
+    light = settings.evidence(
         image,
         dead,
-        result.detections,
+        detections or result.detections,
         result.camera,
-        result.stars,
+        stars,
         result.bodies,
         result.attitude_fit.attitude.R_cam_icrs,
         result.R_enu_icrs,
         flux_scale(result.detections, result.camera, result.stars, result.identification),
         result.attitude_fit.extra_sigma_px,
+        visible,
     )
+    return light if only is None else replace(light, star=only[light.star])
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,17 @@ class StarLight:
     @property
     def usable(self) -> Bools:
         return np.asarray(self.cause == "")
+
+    def renewed(self, newer: StarLight, which: Ints) -> StarLight:
+        """With what a newer measurement says of the stars `which`, of those that both have."""
+        there = np.flatnonzero(np.isin(newer.star, which))
+        here = np.searchsorted(self.star, newer.star[there])
+        fresh = {}
+        for name in ("flux_e", "sigma_e", "llr", "cause"):
+            values = getattr(self, name).copy()
+            values[here] = getattr(newer, name)[there]
+            fresh[name] = values
+        return replace(self, **fresh)
 
     def evidence(self) -> Evidence:
         """The rays for the localizer."""

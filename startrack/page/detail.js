@@ -55,7 +55,8 @@ function leftOut() {
 function pictureCard(detail, stars, name, groups) {
   const view = skyView(detail, stars, name);
   const hint = detail.picture.scale && stars.length ? "Point at a star, or tap it. " : "";
-  return section("Picture", make("p", { class: "dim" }, `${hint}Green rings are stars with a name, orange crosses stars that should be here and are hidden, grey rings other point sources; the blue line is the skyline of the place found.`),
+  const ground = detail.record.modes?.length ? "; orange crosses are stars that should be here and are hidden, the blue line is the skyline of the place found." : ".";
+  return section("Picture", make("p", { class: "dim" }, `${hint}Green rings are stars with a name, grey rings other point sources${ground}`),
     make("div", { class: "beside" }, view.node, make("div", {}, ...groups.map(([title, body]) => make("div", {}, make("h3", {}, title), body)))));
 }
 
@@ -86,7 +87,7 @@ function factGroups(record, value) {
       ["Right ascension", sayDegrees(a.ra_deg, 4)], ["Declination", sayDegrees(a.dec_deg, 4)], ["Image's top", sayDegrees(a.roll_deg, 4)],
       ["Sigma", a.sigma_arcsec && `${a.sigma_arcsec.map((one) => say(one, 2)).join(", ")} arcsec about x, y, z`]])],
     s && ["Stars", facts([["Point sources", say(s.detected, 0)], ["Named", say(s.identified, 0)], ["Unexplained", say(s.unexplained, 0)],
-      ["Above the skyline", say(s.predicted_visible, 0)], ["Residual", say(s.rms_px, 3, "px")],
+      ["Above the skyline", record.modes ? say(s.predicted_visible, 0) : null], ["Residual", say(s.rms_px, 3, "px")],
       ["Chance match", known(s.false_alarm_probability) ? (s.false_alarm_probability > 0 ? s.false_alarm_probability.toExponential(0).replace("-", "−") : "below 1e−300") : null]])],
     record.timing_ms && ["Time of each stage", timings(record.timing_ms)],
     v && ["Made from", facts([["Time", sayTime(v.time_utc)], ["Exposure", known(v.exposure_s) ? say(v.exposure_s, 3, "s") : null], ["Camera", v.camera], ["Terrain", v.terrain],
@@ -98,7 +99,7 @@ function timings(spent) {
   const all = Object.values(spent).reduce((sum, ms) => sum + (ms || 0), 0);
   const longest = Math.max(...Object.values(spent), 1e-9);
   const time = (ms) => (ms >= 1000 ? say(ms / 1000, 2, "s") : say(ms, ms < 10 ? 1 : 0, "ms"));
-  const rows = Object.entries(spent).map(([stage, ms]) => make("tr", {}, make("th", { scope: "row" }, stage),
+  const rows = Object.entries(spent).filter(([, ms]) => ms > 0).map(([stage, ms]) => make("tr", {}, make("th", { scope: "row" }, stage),
     make("td", { class: "bar" }, make("span", { style: `width:${(100 * ms) / longest}%` })), make("td", {}, time(ms))));
   return make("table", { class: "times" }, make("tbody", {}, ...rows), make("tfoot", {}, make("tr", {}, make("th", { scope: "row" }, "in all"), make("td"), make("td", {}, time(all)))));
 }

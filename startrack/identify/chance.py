@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cached_property, lru_cache
+from typing import Any
+
 import numpy as np
 
 from startrack.types import Array, Ints
 
+MOST_WITHOUT_TREE = 800
 GRID_POINTS = 600
 NEIGHBOURHOOD_RAD = np.radians(10.0)
 
@@ -18,15 +22,28 @@ class ChanceModel:
     """
 
     def __init__(self, detection_rays: Array) -> None:
-        from scipy.spatial import cKDTree
-
-        self.tree = cKDTree(detection_rays)
-        chord = 2 * np.sin(NEIGHBOURHOOD_RAD / 2)
-        counts = self.tree.query_ball_point(_fibonacci_sphere(GRID_POINTS), chord, return_length=True)
+        self.rays = detection_rays
+        counts = self._counts(_fibonacci_sphere(GRID_POINTS))
         cap_sr = 2 * np.pi * (1 - np.cos(NEIGHBOURHOOD_RAD))
         occupied = float(np.sum(counts))
         typical = float(np.sum(counts * (counts - 1.0))) / occupied if occupied else 0.0
         self.density_per_sr = max(typical / cap_sr, len(detection_rays) / (4 * np.pi))
+
+    @cached_property
+    def tree(self) -> Any:
+        """scipy.spatial.cKDTree over the detections' rays."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.rays)
+
+    def _counts(self, centres: Array) -> Array:
+        """Detections in the cap about each of the centres (m, 3)."""
+        if len(self.rays) <= MOST_WITHOUT_TREE:  # all against all is quicker than a tree
+            near = self.rays @ centres.T > np.cos(NEIGHBOURHOOD_RAD)
+            return np.count_nonzero(near, axis=0).astype(np.float64)
+        chord = 2 * np.sin(NEIGHBOURHOOD_RAD / 2)
+        found: Array = self.tree.query_ball_point(centres, chord, return_length=True)
+        return found.astype(np.float64)
 
     def probability(self, radius_rad: Array | float) -> Array:
         """Probability that at least one detection lies within the radius of a random direction among the detections."""
@@ -46,6 +63,7 @@ class ChanceModel:
         return np.where(k > 0, np.log(np.maximum(tail, 1e-300)), 0.0)
 
 
+@lru_cache(maxsize=1)
 def _fibonacci_sphere(n: int) -> Array:
     """Nearly even unit vectors (n, 3)."""
     i = np.arange(n) + 0.5

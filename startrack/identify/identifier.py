@@ -11,12 +11,15 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.identify.chance import ChanceModel
-from startrack.identify.index import PatternIndex, build_index
-from startrack.identify.match import Matches, brightest, match, unexplained_by
+from startrack.identify.index import PatternIndex, build_bright_index, build_index
+from startrack.identify.kept import KeptPerObject
+from startrack.identify.lean import Found, LeanSearch, scale_of
+from startrack.identify.match import SIGNIFICANT_SNR, Matches, alike, brightest, match, taken, unexplained_by
+from startrack.identify.near import NearStars
 from startrack.identify.pairs import PairIndex, build_pairs
 from startrack.identify.search import Search
 from startrack.orient import AttitudeFit, solve_attitude
-from startrack.types import Array, Detections, Identification, NotIdentified, Stars
+from startrack.types import Array, Detections, Identification, Ints, NotIdentified, Stars
 
 FEWEST_MATCHES = 6
 GATES_PX = (6.0, 3.0, 1.5)
@@ -25,6 +28,7 @@ KEPT_PATTERNS = 4
 REFINING_STARS = 300
 ON_PLACE = 0.7  # of the stars within the widest gate are within the narrowest one, if the camera file is right
 MOST_REFINED = 40
+SHORT_LIST = 600  # detections up to which all may be held against all
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ class Identifier:
 
     def __call__(self, detections: Detections, camera: Camera, stars: Stars) -> Identification:
         """Matches in the frame. `stars` are sorted, brightest first. Raises NotIdentified (or reason mirrored)."""
-        patterns = _patterns(stars, _field_sr(camera))
+        patterns = _patterns(stars, _field_of(camera))
         try:
             return self._identify(detections, camera, patterns)
         except _RoughCamera:
@@ -65,11 +69,18 @@ class Identifier:
         return True
 
     def _identify(self, detections: Detections, camera: Camera, patterns: _Patterns) -> Identification:
-        order = np.flatnonzero(camera.angle_rad(detections.xy_px) <= camera.max_angle_rad)
+        rays_cam = camera.unproject(detections.xy_px)
+        off_axis = np.arctan2(np.hypot(rays_cam[:, 0], rays_cam[:, 1]), rays_cam[:, 2])
+        order = np.flatnonzero(off_axis <= camera.max_angle_rad)
         if len(order) < FEWEST_MATCHES:
             few = f"{len(order)} point sources are too few to identify: expose longer"
             raise NotIdentified(few, detected=len(order))
-        search = Search(camera, camera.unproject(detections.xy_px[order]), patterns.stars)
+        tried = 0
+        if len(order) <= SHORT_LIST:
+            found, tried = self._short(detections, order, rays_cam[order], camera, patterns)
+            if found is not None:
+                return found
+        search = Search(camera, rays_cam[order], patterns.stars, tried)
         refusal = "no triangle of stars is the catalogue's"
         for refined, R in enumerate(self._plausible(search, patterns)):
             if refined == MOST_REFINED:
@@ -86,6 +97,71 @@ class Identifier:
             detected=len(order),
             tried=search.tried,
         )
+
+    def _short(
+        self, detections: Detections, order: Ints, rays_cam: Array, camera: Camera, patterns: _Patterns
+    ) -> tuple[Identification | None, int]:
+        """What long triangles of the brightest few say, if anything, and the number of hypotheses tried."""
+        inside = detections if len(order) == len(detections) else taken(detections, order)
+        chance = ChanceModel(rays_cam)
+        search = LeanSearch(camera, inside, rays_cam, patterns.stars, patterns.bright, patterns.near, chance)
+        for refined, (R, detection, star) in enumerate(search.attitudes(self.tolerances_px[0])):
+            if refined == MOST_REFINED:
+                break
+            found = search.refined(R, detection, star)
+            if found is None:
+                continue
+            try:
+                return self._named(search, found, detections, order), search.tried
+            except _RoughCamera:
+                raise
+            except NotIdentified:
+                continue
+        return None, search.tried
+
+    def _named(self, search: LeanSearch, found: Found, detections: Detections, order: Ints) -> Identification:
+        """The matches of a short list, the detections `order`, judged as those of a long one are."""
+        pairs = found.pairs
+        distance = pairs.distance_px[found.matched]
+        near = found.matched[distance < GATES_PX[-1]]
+        named = near[pairs.alone(near, 3.0 * search.detections.psf_sigma_px)]
+        if len(named) >= FEWEST_MATCHES:
+            named = named[search.agree(pairs, named)[0]]
+        if len(named) < FEWEST_MATCHES:
+            raise NotIdentified(f"only {len(named)} stars match", matched=len(named))
+        rms_px = float(np.sqrt(0.5 * np.mean(np.square(pairs.distance_px[named]))))
+        radius_px = min(GATES_PX[-1], max(3.0 * rms_px, SMALLEST_RADIUS_PX))
+        log_chance = self._log_chance(
+            search.chance,
+            int(np.count_nonzero(distance < radius_px)),
+            len(found.predicted_v_mag),
+            radius_px * scale_of(search.camera).on_axis,
+            alike(found.predicted_v_mag, pairs.light.measured_mag),
+            search.tried,
+        )
+        if self.whole_field:
+            bright = distance[pairs.detection[found.matched] < REFINING_STARS]
+            _refuse_rough_camera(bright[bright < GATES_PX[0]])
+        unexplained = pairs.unexplained(search.detections.snr, GATES_PX[-1])
+        if len(order) < len(detections):
+            unexplained += int(np.count_nonzero(np.delete(detections.snr, order) > SIGNIFICANT_SNR))
+        return Identification(
+            detection=order[pairs.detection[named]],
+            star=pairs.star[named],
+            R_cam_icrs=found.R_cam_icrs,
+            false_alarm_probability=float(np.exp(max(log_chance, -690.0))),
+            unexplained=unexplained,
+        )
+
+    def _log_chance(
+        self, chance: ChanceModel, hits: int, predicted: int, radius_rad: float, alike: float, tried: int
+    ) -> float:
+        """Log of the probability that chance gives as many hits; NotIdentified where that is not small enough."""
+        odds = chance.log_odds(np.array(hits), np.array(max(predicted, hits)), radius_rad, alike=alike)
+        log_chance = float(odds + np.log(tried))
+        if log_chance > np.log(self.max_false_alarm):
+            raise NotIdentified(f"the {hits} stars that match might do so by chance", matched=hits)
+        return log_chance
 
     def _plausible(self, search: Search, patterns: _Patterns) -> Iterator[Array]:
         """Attitudes worth refining: triangles of ever more of the detections, then pairs of the brightest few."""
@@ -104,18 +180,18 @@ class Identifier:
         if len(star) < FEWEST_MATCHES:
             raise NotIdentified(f"only {len(star)} stars match after refinement", matched=len(star))
         radius_px = min(GATES_PX[-1], max(3.0 * fit.rms_px, SMALLEST_RADIUS_PX))
-        hits = np.count_nonzero(matches.coincident_px < radius_px)
-        chance = ChanceModel(search.rays_cam).log_odds(
-            np.array(hits),
-            np.array(max(matches.predicted, hits)),
+        log_chance = self._log_chance(
+            ChanceModel(search.rays_cam),
+            int(np.count_nonzero(matches.coincident_px < radius_px)),
+            matches.predicted,
             radius_px * search.scale_rad_per_px,
-            alike=matches.alike,
+            matches.alike,
+            search.tried,
         )
-        log_chance = float(chance + np.log(search.tried))
-        if log_chance > np.log(self.max_false_alarm):
-            raise NotIdentified(f"the {hits} stars that match might do so by chance", matched=len(star))
         if self.whole_field:
-            _refuse_rough_camera(detections, camera, stars, fit.attitude.R_cam_icrs)
+            leaders = brightest(detections, REFINING_STARS)
+            R_cam_icrs = fit.attitude.R_cam_icrs
+            _refuse_rough_camera(match(leaders, camera, stars, R_cam_icrs, GATES_PX[0], 0.0).coincident_px)
         return Identification(
             detection=detection,
             star=star,
@@ -131,13 +207,12 @@ class _RoughCamera(NotIdentified):
     """The sky is found, but the camera file's lens is not this one."""
 
 
-def _refuse_rough_camera(detections: Detections, camera: Camera, stars: Stars, R: Array) -> None:
-    """Raise where many of the bright stars lie near, but not on, their places.
+def _refuse_rough_camera(distance_px: Array) -> None:
+    """Raise where many of the bright stars lie near (n,), but not on, their places.
 
     Such a camera file fits a patch of the sky, and turns the attitude to suit it: 1 % of focal length is 0.8 degrees.
     """
-    distance = match(brightest(detections, REFINING_STARS), camera, stars, R, GATES_PX[0], 0.0).coincident_px
-    on_place, near = np.count_nonzero(distance < GATES_PX[-1]), len(distance)
+    on_place, near = np.count_nonzero(distance_px < GATES_PX[-1]), len(distance_px)
     if on_place < ON_PLACE * near - 3.0 * np.sqrt(ON_PLACE * (1 - ON_PLACE) * near):
         raise _RoughCamera(
             f"only {on_place} of {near} bright stars lie within {GATES_PX[-1]:g} px of where the camera file puts "
@@ -148,7 +223,7 @@ def _refuse_rough_camera(detections: Detections, camera: Camera, stars: Stars, R
 
 def _patterns(stars: Stars, field_sr: float) -> _Patterns:
     """The patterns of these very stars; the last few are kept."""
-    key = (stars.rays_icrs.shape, stars.rays_icrs[:2000].tobytes(), field_sr)
+    key = (_fingerprint_of(stars), field_sr)
     if key not in _KEPT:
         _KEPT[key] = _Patterns(stars, field_sr)
         while len(_KEPT) > KEPT_PATTERNS:
@@ -168,11 +243,19 @@ class _Patterns:
         return build_index(self.stars, self.field_sr)
 
     @cached_property
+    def bright(self) -> PatternIndex:
+        return build_bright_index(self.stars, self.field_sr)
+
+    @cached_property
+    def near(self) -> NearStars:
+        return NearStars(self.stars)
+
+    @cached_property
     def pairs(self) -> PairIndex:
         return build_pairs(self.stars, self.field_sr)
 
 
-_KEPT: OrderedDict[tuple[object, ...], _Patterns] = OrderedDict()
+_KEPT: OrderedDict[tuple[object, float], _Patterns] = OrderedDict()
 
 
 def _field_sr(camera: Camera) -> float:
@@ -183,6 +266,10 @@ def _field_sr(camera: Camera) -> float:
     cell = width * height / angle.size
     lit = angle < camera.max_angle_rad
     return float(np.sum(camera.pixel_solid_angle_sr(angle[lit]) * cell))
+
+
+_field_of = KeptPerObject(_field_sr)
+_fingerprint_of = KeptPerObject(lambda stars: (stars.rays_icrs.shape, stars.rays_icrs[:2000].tobytes()))
 
 
 def _refined(detections: Detections, camera: Camera, stars: Stars, R: Array) -> tuple[AttitudeFit, Matches]:

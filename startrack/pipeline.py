@@ -6,7 +6,6 @@ import time as clock
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from startrack.bodies import bodies
 from startrack.camera import Camera
 from startrack.detect import Detector, electrons
-from startrack.evidence import StarEvidence, StarLight, flux_scale, known_well, levelled, near_skyline
+from startrack.evidence import Skyline, StarEvidence, StarLight, flux_scale, known_well, levelled, near_skyline
 from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
 from startrack.identify import Identifier
 from startrack.localize import ExactPosterior, Localizer, check_consistency
@@ -113,11 +112,11 @@ def locate(
         with _timed(result, "locate"):
             evidence = result.light.evidence()
             fix = settings.localizer(evidence, terrain)
-        if not fix.ambiguous:
-            with _timed(result, "evidence"):
-                result.light = _relit(result, settings, fix)
+        with _timed(result, "evidence"):
+            relit = None if fix.ambiguous else _relit(result, settings, fix)
+        if relit is not None:
+            result.light, evidence = relit, relit.evidence()
             with _timed(result, "locate"):
-                evidence = result.light.evidence()
                 fix = settings.localizer(evidence, terrain)
         with _timed(result, "locate"):
             check_consistency(evidence, fix, terrain, getattr(settings.localizer, "compiled", False))
@@ -260,17 +259,22 @@ def _deepen(result: Result, site: Site) -> None:
     result.identification = replace(found, star=hipparcos_in_deep()[found.star])
 
 
-def _relit(result: Result, settings: Settings, fix: Fix) -> StarLight:
-    """The light of the stars beside the skyline once more, now that the step of the sky's own light can be told."""
+def _relit(result: Result, settings: Settings, fix: Fix) -> StarLight | None:
+    """The light of the stars beside the skyline once more, now that the step of the sky's own light can be told.
+
+    None where the sky is too dark to show a step.
+    """
     assert result.camera is not None and result.detections is not None and result.terrain is not None
     assert result.light is not None and result.attitude_fit is not None and result.R_enu_icrs is not None
     camera, place = result.camera, fix.position_enu_m[:2]
-    horizon = partial(result.terrain.horizon_rad, place[None, :])
-    axes = np.linalg.cholesky(fix.covariance_m2).T
-    known = known_well(horizon, [partial(result.terrain.horizon_rad, (place + axis)[None, :]) for axis in axes], camera)
+    horizon = Skyline.seen_from(place, result.terrain)
     image, dead = electrons(result.exposure, camera)
     R_cam_enu = result.attitude_fit.attitude.R_cam_icrs @ result.R_enu_icrs.T
     detections = levelled(image, dead, result.detections, camera, R_cam_enu, horizon)
+    if detections is result.detections:
+        return None
+    axes = np.linalg.cholesky(fix.covariance_m2).T
+    known = known_well(horizon, [Skyline.seen_from(place + axis, result.terrain) for axis in axes], camera)
     light = result.light
     wanted = near_skyline(light.azimuth_rad, light.elevation_rad, camera, horizon, RELIT_PX) & known(light.azimuth_rad)
     around = near_skyline(light.azimuth_rad, light.elevation_rad, camera, horizon, RELIT_PX + NEIGHBOURS_PX)

@@ -17,7 +17,7 @@ def with_covariance(camera, sigma_px):
 
 
 def test_an_uncertain_lens_makes_stars_at_the_rim_say_less(located):
-    sure = located.result.light
+    sure = _light(located.result, Settings())
     camera = with_covariance(located.result.camera, 2.0)
     doubtful = _light(replace(located.result, camera=camera), Settings())
     assert np.array_equal(sure.star, doubtful.star)

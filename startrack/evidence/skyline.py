@@ -9,7 +9,7 @@ background model have made of it; an error of the skyline itself shifts this pro
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,18 +17,39 @@ from numpy.typing import NDArray
 
 from startrack.camera import Camera
 from startrack.frames import azel_from_rays, rays_from_azel
+from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Detections, Ints
 
 BAND_PX = 12.0  # both ways; the background model knows no edge sharper than that
 STEP_PX = 0.5
 SECTORS = 36
 SKYLINE_POINTS = 1440
+SKYLINE_SAMPLES = 7200  # one in 3 arcmin: half a pixel of a 180-degree fisheye
 MADE_OF_NOISE = 0.6745  # median of the absolute value of a standard normal variable
 MOST_SHIFT_PX = 0.7  # one sigma
 STEEPEST = 1.0
 FEWEST_PX = 12  # for a median
 
 Horizon = Callable[[Array], Array]  # azimuths (n,) to elevations (n,) [rad]
+
+
+@dataclass(frozen=True)
+class Skyline:
+    """The horizon of one place: elevations [rad] at equally spaced azimuths, called with azimuths (n,) [rad]."""
+
+    elevation_rad: Array
+
+    @classmethod
+    def seen_from(cls, place_m: Array, terrain: Terrain) -> Skyline:
+        """The horizon of the place (2,) [m]: asked once, since real ground takes its time to answer."""
+        azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_SAMPLES, endpoint=False)
+        return cls(terrain.horizon_rad(np.asarray(place_m)[None, :], azimuth))
+
+    def __call__(self, azimuth_rad: Array) -> Array:
+        at = np.mod(azimuth_rad, 2 * np.pi) * (len(self.elevation_rad) / (2 * np.pi))
+        low = at.astype(np.int64) % len(self.elevation_rad)
+        part = at - np.floor(at)
+        return (1 - part) * self.elevation_rad[low] + part * self.elevation_rad[(low + 1) % len(self.elevation_rad)]
 
 
 def levelled(
@@ -39,13 +60,18 @@ def levelled(
     R_cam_enu: Array,
     horizon: Horizon,
 ) -> Detections:
-    """The detections with the step at the skyline in their background, and the noise on either side of it."""
+    """The detections with the step at the skyline in their background, and the noise on either side of it.
+
+    The very same detections where the step is lost in the noise of a pixel: it then moves no star by much.
+    """
     rows, columns = np.nonzero(_band(detections.background_e.shape, camera, R_cam_enu, horizon) & ~dead)
     if not len(rows):
         return detections
     azimuth, above = _above_px(np.stack([columns, rows], axis=1).astype(float), camera, R_cam_enu, horizon)
     near = np.abs(above) < BAND_PX
     rows, columns, azimuth, above = rows[near], columns[near], azimuth[near], above[near]
+    if _step_e(image_e[rows, columns], above) < np.median(detections.noise_e[rows, columns]):
+        return detections
     rest = (image_e - detections.background_e)[rows, columns].astype(np.float64)
     spread = detections.noise_e[rows, columns].astype(np.float64)
     steps = int(2 * BAND_PX / STEP_PX)
@@ -104,6 +130,12 @@ def _above_px(xy_px: Array, camera: Camera, R_cam_enu: Array, horizon: Horizon) 
     azimuth, elevation = azel_from_rays(camera.unproject(xy_px) @ R_cam_enu)
     px_per_rad = np.sqrt(camera.focal_px[0] * camera.focal_px[1]) * camera.lens.slope(camera.angle_rad(xy_px))
     return azimuth, (elevation - horizon(azimuth)) * px_per_rad
+
+
+def _step_e(light_e: NDArray[np.float32], above_px: Array) -> float:
+    """How much brighter the sky is than the wall, well clear of the edge."""
+    sky, wall = light_e[above_px > BAND_PX / 2], light_e[above_px < -BAND_PX / 2]
+    return float(np.median(sky) - np.median(wall)) if len(sky) and len(wall) else 0.0
 
 
 def _step_of(above_px: Array, steps: int) -> Ints:

@@ -39,8 +39,8 @@ class ChanceModel:
     def _counts(self, centres: Array) -> Array:
         """Detections in the cap about each of the centres (m, 3)."""
         if len(self.rays) <= MOST_WITHOUT_TREE:  # all against all is quicker than a tree
-            near = self.rays @ centres.T > np.cos(NEIGHBOURHOOD_RAD)
-            return np.count_nonzero(near, axis=0).astype(np.float64)
+            near = centres @ self.rays.T > np.cos(NEIGHBOURHOOD_RAD)
+            return (near.astype(np.float32) @ np.ones(len(self.rays), dtype=np.float32)).astype(np.float64)
         chord = 2 * np.sin(NEIGHBOURHOOD_RAD / 2)
         found: Array = self.tree.query_ball_point(centres, chord, return_length=True)
         return found.astype(np.float64)

@@ -14,6 +14,7 @@ from startrack.types import Array, Ints, Stars
 NEIGHBOURS_WANTED = 18.0  # pattern stars within the reach of each: enough triangles with most of the sky hidden
 WIDEST_REACH_RAD = np.radians(40.0)
 LEAN_STARS_IN_FIELD, FEWEST_LEAN_STARS, MOST_LEAN_STARS = 20, 150, 2500
+LEAN_TRIANGLES = 120_000
 WIDEST_LEAN_REACH_RAD = np.radians(75.0)
 FEW_TRIANGLES = 2000  # up to which one look-up each is quicker than a tree of their own
 CLOSE_PAIR_RAD = np.radians(0.05)
@@ -71,7 +72,12 @@ def build_bright_index(stars: Stars, field_sr: float) -> PatternIndex:
     depth = int(np.clip(LEAN_STARS_IN_FIELD * 4 * np.pi / field_sr, FEWEST_LEAN_STARS, MOST_LEAN_STARS))
     star = bright_stars_apart(stars, depth)
     rays = stars.rays_icrs[star]
-    reach = min(WIDEST_LEAN_REACH_RAD, 0.8 * np.sqrt(4 * field_sr / np.pi))
+    neighbours = np.sqrt(LEAN_TRIANGLES * 6 / len(star))
+    reach = min(
+        WIDEST_LEAN_REACH_RAD,
+        2 * np.arcsin(np.sqrt(min(neighbours / len(star), 1.0))),
+        0.8 * np.sqrt(4 * field_sr / np.pi),
+    )
     found = triangles(rays, reach)
     return PatternIndex(star, rays, float(reach), found, cKDTree(found.sides_rad))
 

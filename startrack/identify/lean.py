@@ -18,7 +18,6 @@ from startrack.orient import rotation, wahba
 from startrack.types import Array, Bools, Detections, Ints, Stars
 
 DEPTHS = (7, 10, 14, 20, 28, 40, 56)  # brightest detections that form triangles, round by round
-FIRST_VERIFIED = 3
 AT_ONCE = 48
 MOST_VERIFIED = 480  # per round
 MOST_CANDIDATES = 1200  # matching triangles per round; all count as tried
@@ -47,7 +46,7 @@ class Scale:
         angle = np.linspace(0.01, min(camera.max_angle_rad, camera.lens.max_invertible_rad) - 1e-3, 64)
         focal = min(camera.focal_px)
         radial, across = 1.0 / camera.lens.slope(angle), np.sin(angle) / camera.lens.rho(angle)
-        largest = min(2.0 * float(np.maximum(radial, across).max() / focal), 3.0 / focal)
+        largest = min(1.05 * float(np.maximum(radial, across).max() / focal), 3.0 / focal)
         return cls(float(camera.mean_scale_rad_per_px(off_axis)), largest)
 
 
@@ -96,25 +95,26 @@ class LeanSearch:
     def _plausible(self, cam: Array, icrs: Array, radius_rad: float) -> Iterator[tuple[Array, Ints, Ints]]:
         """Of the attitudes that turn the rays icrs (m, 3, 3) to cam (m, 3, 3), those that the bright stars support."""
         best = _most_agreed(cam, icrs)[:MOST_VERIFIED]
-        for chunk in (best[:FIRST_VERIFIED], *np.split(best, range(FIRST_VERIFIED, len(best), AT_ONCE))[1:]):
+        for start in (0, *range(1, len(best), AT_ONCE)):
+            chunk = best[start : start + AT_ONCE] if start else best[:1]  # the first is nearly always right
             R = wahba(cam[chunk], icrs[chunk], np.ones((len(chunk), 3)))
-            on, inside = self._coincident(R, radius_rad)
-            hits, predicted = np.count_nonzero(on.any(axis=1), axis=1), np.count_nonzero(inside, axis=1)
+            cosines, inside = self._cosines(R)
+            on = (cosines.max(axis=2) > np.cos(radius_rad)) & inside
+            hits, predicted = np.add.reduce(on, axis=1), np.add.reduce(inside, axis=1)
             log_chance = self.chance.log_odds(hits, predicted, radius_rad) + np.log(self.tried)
             for i in np.argsort(log_chance, kind="stable"):
                 if log_chance[i] > np.log(PLAUSIBLE) or hits[i] < FEWEST_HITS:
                     break
-                detection, star = np.nonzero(on[i])
-                yield R[i], detection, self.index.star[star]
+                star = np.flatnonzero(on[i])
+                yield R[i], cosines[i, star].argmax(axis=1), self.index.star[star]
 
-    def _coincident(self, R: Array, radius_rad: float) -> tuple[Bools, Bools]:
-        """Which bright stars (h, n, m) lie on which detections at the attitudes (h, 3, 3), and which (h, m) in view.
+    def _cosines(self, R: Array) -> tuple[Array, Bools]:
+        """Of the angles (h, m, n) between bright stars and detections at attitudes (h, 3, 3); the stars (h, m) in view.
 
         All against all: for some hundred of each that is quicker than a tree.
         """
-        predicted = R @ self.index.rays_icrs.T  # (h, 3, m) in cam
-        inside = predicted[:, 2] > np.cos(self.camera.max_angle_rad)
-        return (self.rays_cam @ predicted > np.cos(radius_rad)) & inside[:, None], inside
+        predicted = self.index.rays_icrs @ np.swapaxes(R, 1, 2)  # (h, m, 3) in cam
+        return predicted @ self.rays_cam.T, predicted[..., 2] > np.cos(self.camera.max_angle_rad)
 
     def refined(self, R: Array, detection: Ints, star: Ints) -> Found | None:
         """Attitude and matches by place and brightness, from the bright stars (k,) that lie on detections (k,)."""

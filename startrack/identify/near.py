@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from startrack.identify.match import (
 from startrack.types import Array, Bools, Ints, Stars
 
 LEVELS = (1000, 4000, 16000)  # brightest stars per tree; the last tree holds them all
-NEIGHBOURS = 4
+NEIGHBOURS = 8  # of a detection; more only in clusters
 BLEND_MAG = -2.5 * np.log10(BLEND_FLUX_RATIO)
 
 
@@ -40,14 +41,19 @@ class NearStars:
         """(ray, star) of all pairs closer than the radius, of the `count` brightest stars; sorted by ray."""
         tree, chord = self._tree(count), 2 * np.sin(radius_rad / 2)
         k = min(NEIGHBOURS, tree.n)
-        distance, star = tree.query(rays_icrs, k, distance_upper_bound=chord)
-        while k < tree.n and np.isfinite(distance[:, -1]).any():
-            k = min(4 * k, tree.n)
-            distance, star = tree.query(rays_icrs, k, distance_upper_bound=chord)
-        near = star < count  # a missing neighbour has index n
-        near &= np.isfinite(distance)
-        ray, _ = np.nonzero(near)
-        return ray, star[near]
+        star = tree.query(rays_icrs, k, distance_upper_bound=chord)[1]
+        if k < tree.n and star[:, -1].min() < tree.n:  # a missing neighbour has number n
+            return self._many(tree, rays_icrs, chord, count)
+        ray, column = np.nonzero(star < min(count, tree.n))
+        return ray, star[ray, column]
+
+    def _many(self, tree: Any, rays_icrs: Array, chord: float, count: int) -> tuple[Ints, Ints]:
+        """The same where some ray has many neighbours."""
+        found = tree.query_ball_point(rays_icrs, chord)
+        ray = np.repeat(np.arange(len(found)), list(map(len, found)))
+        star = np.array(list(chain.from_iterable(found)), dtype=np.int64)
+        wanted = star < count
+        return ray[wanted], star[wanted]
 
 
 def middle(values: Array) -> float:

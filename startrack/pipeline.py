@@ -31,15 +31,12 @@ from startrack.types import (
     Identification,
     Ints,
     NoSolution,
-    NotIdentified,
     Stars,
 )
 
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog
 
-SHARP_PSF_PX = 0.9  # tried where the frame's own sources are wider than BLURRED_PSF_PX and name no stars
-BLURRED_PSF_PX = 2.0
 RELIT_PX, NEIGHBOURS_PX = 12.0, 10.0  # stars this near the skyline are measured again, beside their neighbours
 UNDECIDED_PX, CERTAIN = 2.0, 0.99  # farther from the skyline than that the fix decides which stars shine
 COMPLETE_V_MAG = 6.5  # 5 sigma: from here on stars that Hipparcos lacks would say much
@@ -174,18 +171,10 @@ def identify_blind(
     with _refusals(result):
         _take_stars(result, catalog, None)
         assert result.stars is not None
-        for detector in (settings.detector, replace(settings.detector, psf_sigma_px=SHARP_PSF_PX)):
-            with _timed(result, "detect"):
-                result.detections = detector(exposure, None)
-            try:
-                with _timed(result, "identify"):
-                    found = solve(result.detections, exposure.size_px, fov_rad, result.stars)
-            except NotIdentified:
-                # Moonlight, clouds and trees may pass for stars out of focus, and hide the sharp ones.
-                if detector is not settings.detector or result.detections.psf_sigma_px < BLURRED_PSF_PX:
-                    raise
-            else:
-                break
+        with _timed(result, "detect"):
+            result.detections = settings.detector(exposure, None)
+        with _timed(result, "identify"):
+            found = solve(result.detections, exposure.size_px, fov_rad, result.stars)
         result.camera, result.identification = found.camera, found.identification
         _solve_attitude(result)
         result.status = "ok"

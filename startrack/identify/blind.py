@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.identify.circle import Circle, image_circle
 from startrack.identify.family import PINHOLE, radius
 from startrack.identify.grow import WIDE, Grown, Stage, grow
 from startrack.identify.hypotheses import (
@@ -32,10 +33,14 @@ WINDOWS = (  # the brightest; those after them, as hot pixels may be brighter th
 )  # fmt: skip
 LOG_PLAUSIBLE = -11.0  # of a start's chance hits: random skies reach -15 in a whole search
 LOG_FALSE_ALARM = float(np.log(1e-9))
-MOST_TRIED = 800_000  # patterns; a search without an answer ends here, after some seconds
+MOST_TRIED = 600_000  # patterns; a search without an answer ends here, after some seconds
+MOST_TRIED_IN_CIRCLE = 250_000  # where the image circle is seen: real photographs take 1000 to 110,000
+MOST_TRIED_BEYOND = 100_000  # more, as if it were not, in case that it is something else
 ROOM = 1.3  # around a narrow field, for its focal length and centre are not known
 APART = 0.01  # of the frame: pattern stars are no closer
 CIRCLES = (0.5, 0.62, 0.42, 0.78, 1.0)  # radius of the image circle over the frame's shorter side
+SEEN_CIRCLES = (1.0, 1.25)  # radius at half the field over that of the disc that is seen: a dome may hide the horizon
+EDGE = 1.01  # of the disc's radius: point sources beyond it are no stars
 NARROW_WINDOWS = (
     Window(0, 0, 8), Window(0, 8, 14), Window(14, 14, 26), Window(0, 14, 22), Window(26, 26, 40), Window(0, 22, 32),
 )  # fmt: skip
@@ -102,7 +107,11 @@ class _Search:
         self.size_px, self.fov_rad, self.stars, self.tolerance = size_px, fov_rad, stars, tolerance
         self.wide = fov_rad >= WIDE_FIELD_RAD
         self.fewest = FEWEST_WIDE if self.wide else FEWEST_NARROW
+        self.circle = image_circle(detections.background_e) if self.wide else None
         self.xy_px = detections.xy_px
+        if self.circle is not None:
+            off = np.linalg.norm(self.xy_px - self.circle.centre_px, axis=1)
+            self.xy_px = self.xy_px[off < EDGE * self.circle.radius_px]
         self.narrow = fov_rad <= NARROW_FIELD_RAD
         chosen = apart(self.xy_px, APART * min(size_px), 100)
         if len(chosen) < self.fewest:
@@ -124,12 +133,20 @@ class _Search:
 
     def grown(self) -> Iterator[tuple[Grown, Ints]]:
         """Hypotheses that survive growing, and the stars (indices) that they speak of."""
+        if self.circle is None:
+            yield from self._searched(self._guesses(), MOST_TRIED)
+            return
+        yield from self._searched(self._guesses_in(self.circle), MOST_TRIED_IN_CIRCLE)
+        yield from self._searched(self._guesses(), self.tried + MOST_TRIED_BEYOND)
+
+    def _searched(self, guesses: list[Guess], most_tried: int) -> Iterator[tuple[Grown, Ints]]:
+        """`grown` of some lenses, until so many patterns have been tried."""
         stages = self._stages()
         for sizes, window in self._rounds():
             patterns = patterns_for(self.stars, sizes)
             if window.done >= len(self.hypotheses.xy_px):
                 continue
-            for guess in self._guesses():
+            for guess in guesses:
                 taken: list[Array] = []
                 for start in self.hypotheses.starts(patterns, guess, window, LOG_PLAUSIBLE):
                     if any(np.trace(R.T @ start.R_cam_icrs) > 1 + 2 * np.cos(0.05) for R in taken):
@@ -139,7 +156,7 @@ class _Search:
                     found = grow(start, self.xy_px, self.stars.rays_icrs[around], stages)
                     if found is not None:
                         yield found, around
-                if self.tried > MOST_TRIED:
+                if self.tried > most_tried:
                     return
 
     def _rounds(self) -> Iterator[tuple[PatternSizes, Window]]:
@@ -167,9 +184,16 @@ class _Search:
             return [Guess(width / 2 / float(radius(np.array(self.fov_rad / 2), s)), s, centre) for s in shapes]
         shorter, diagonal = min(self.size_px), float(np.hypot(*self.size_px))
         circles = [c * shorter for c in CIRCLES if c * shorter < 0.56 * diagonal]
+        return self._fisheyes(circles, centre)
+
+    def _guesses_in(self, circle: Circle) -> list[Guess]:
+        """Lenses whose image circle is the one seen, or somewhat larger."""
+        return self._fisheyes([c * circle.radius_px for c in SEEN_CIRCLES], circle.centre_px)
+
+    def _fisheyes(self, circles_px: list[float], centre_px: tuple[float, float]) -> list[Guess]:
         return [
-            Guess(circle / float(radius(np.array(self.fov_rad / 2), shape)), shape, centre)
-            for circle in circles
+            Guess(circle / float(radius(np.array(self.fov_rad / 2), shape)), shape, centre_px)
+            for circle in circles_px
             for shape in WIDE_SHAPES
             if abs(shape) * self.fov_rad / 2 < np.radians(80.0)
         ]

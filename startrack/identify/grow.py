@@ -143,14 +143,9 @@ def fit(
     pull = _prior(camera, prior, free) if priors else (np.zeros(n_free), np.zeros(n_free))
     p = np.zeros(n_free)
     for _ in range(STEPS):
-        base = _predicted(*moved(p), rays_icrs)
+        base, jacobian = _base_and_jacobian(moved, p, R, rays_icrs, free)
         residual = xy_px - base
         weight = 1.0 / (1.0 + np.sum(residual**2, axis=1) / (2 * sigma_px) ** 2) / sigma_px**2
-        jacobian = np.empty((*residual.shape, n_free))
-        for i in range(n_free):
-            q = p.copy()
-            q[i] += NUDGE
-            jacobian[..., i] = (_predicted(*moved(q), rays_icrs) - base) / NUDGE
         weighted = jacobian * weight[:, None, None]
         normal = np.einsum("nia,nib->ab", weighted, jacobian) + np.diag(pull[0])
         right = np.einsum("nia,ni->a", weighted, residual) + pull[0] * (pull[1] - p)
@@ -160,6 +155,38 @@ def fit(
             break
     camera, R = moved(p)
     return camera, R, np.linalg.norm(xy_px - _predicted(camera, R, rays_icrs), axis=1)
+
+
+def _base_and_jacobian(
+    moved: Callable[[Array], tuple[Camera, Array]], p: Array, R: Array, rays_icrs: Array, free: tuple[str, ...]
+) -> tuple[Array, Array]:
+    """Pixels (n, 2) of the stars and their derivatives (n, 2, parameters); R is the attitude of p = 0.
+
+    One projection gives those of the rotation; scale and centre need none, only the lens's shape does.
+    """
+    camera, turned = moved(p)
+    nudged = [rotation(p[:3] + NUDGE * axis) @ R for axis in np.eye(3)]
+    rays = rays_icrs @ np.stack([turned, *nudged]).transpose(0, 2, 1)
+    px, _ = camera.project(rays)
+    base = px[0]
+    jacobian = np.empty((*base.shape, len(p)))
+    jacobian[..., :3] = (px[1:] - base).transpose(1, 2, 0) / NUDGE
+    at = 3
+    for name in free:
+        if name == "scale":
+            jacobian[..., at] = base - camera.centre_px
+            at += 1
+        elif name == "centre":
+            unmoved = moved(np.zeros(len(p)))[0].focal_px[0]  # the unit in which the centre moves
+            jacobian[..., at : at + 2] = unmoved * np.eye(2)
+            at += 2
+        else:
+            for _ in range(1 if name == "shape" else len(camera.lens.k)):
+                q = p.copy()
+                q[at] += NUDGE
+                jacobian[..., at] = (moved(q)[0].project(rays[0])[0] - base) / NUDGE
+                at += 1
+    return base, jacobian
 
 
 def _predicted(camera: Camera, R: Array, rays_icrs: Array) -> Array:

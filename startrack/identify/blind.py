@@ -153,8 +153,9 @@ class _Search:
                         continue
                     taken.append(start.R_cam_icrs)
                     around = self._around(start.R_cam_icrs[2])
-                    found = grow(start, self.xy_px, self.stars.rays_icrs[around], stages)
-                    if found is not None:
+                    rays = self.stars.rays_icrs if self.wide else self.stars.rays_icrs[around]
+                    found = grow(start, self.xy_px, rays, stages)
+                    if found is not None and (not self.wide or len(found.star) >= self.fewest):
                         yield found, around
                 if self.tried > most_tried:
                     return

@@ -57,7 +57,7 @@ def image_circle(background: NDArray[Any]) -> Circle | None:
     if best is None or best[2] < CONTRAST:
         return None
     (x, y), radius, _ = best
-    return Circle(((x + 0.5) * scale - 0.5, (y + 0.5) * scale - 0.5), radius * scale)
+    return Circle((float((x + 0.5) * scale - 0.5), float((y + 0.5) * scale - 0.5)), radius * scale)
 
 
 def _best(image: Array, middle: Array, reach: float, radii: Array, step: float) -> tuple[Array, float, float] | None:

@@ -60,7 +60,9 @@ def image_circle(background: NDArray[Any]) -> Circle | None:
     return Circle((float((x + 0.5) * scale - 0.5), float((y + 0.5) * scale - 0.5)), radius * scale)
 
 
-def _best(image: Array, middle: Array, reach: float, radii: Array, step: float) -> tuple[Array, float, float] | None:
+def _best(
+    image: NDArray[Any], middle: Array, reach: float, radii: Array, step: float
+) -> tuple[Array, float, float] | None:
     """Centre, radius and median contrast of the best disc of these radii with its centre within reach of `middle`."""
     turn = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
     around = np.stack([np.cos(turn), np.sin(turn)], axis=1)
@@ -82,7 +84,7 @@ def _best(image: Array, middle: Array, reach: float, radii: Array, step: float) 
     return best
 
 
-def _sampled(image: Array, xy_px: Array) -> tuple[Array, Any]:
+def _sampled(image: NDArray[Any], xy_px: Array) -> tuple[Array, Any]:
     """Values of the nearest pixels, never below 0, and whether the places are in the image."""
     column, row = np.rint(xy_px).astype(np.int64).transpose(2, 0, 1)
     seen = (column >= 0) & (row >= 0) & (column < image.shape[1]) & (row < image.shape[0])

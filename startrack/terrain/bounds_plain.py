@@ -75,8 +75,8 @@ def bounds(
     g: Ground, centres: Array, up: Array, low_up: Array, high_up: Array, half: Array, sin_a: Array, cos_a: Array,
     turn: Array, start: Array, end: Array,
 ) -> Array:  # fmt: skip
-    """What `trace_compiled.bounds` finds (n, 9), for each box and azimuth."""
-    out = np.empty((len(up), 9))
+    """What `trace_compiled.bounds` finds (n, 11), for each box and azimuth."""
+    out = np.empty((len(up), 11))
     for first in range(0, len(up), AT_ONCE):
         part = slice(first, first + AT_ONCE)
         arrays = (a[part] for a in (centres, up, low_up, high_up, half, sin_a, cos_a, turn, start, end))
@@ -95,10 +95,11 @@ def _bounds(
     tan_turn, cos_turn = np.tan(turn), np.cos(turn)
     begin = np.maximum(start, 0.0)
     middle_tan, best_at, _ = horizon(g, centres, up, sin_a, cos_a, begin, end, np.zeros(n))
-    found = np.empty((n, 9))
+    found = np.empty((n, 11))
     low, first, last = np.full(n, LOWEST_TAN), np.full(n, FAR_M), np.full(n, -FAR_M)
     high, line_from = low.copy(), np.full(n, -FAR_M)
     low_s, low_z = np.zeros(n), np.full(n, -1e9)
+    most_rise = np.zeros(n)
     steepest = np.full(n, -FAR_M)  # along the ray, from the box's near side on
     probes = (np.where(best_at > reach, best_at, 12 * reach + 1), 12 * reach + 1)
     z = up.copy()
@@ -159,13 +160,15 @@ def _bounds(
             kk = kq[kept]
             first[kk], last[kk] = np.minimum(first[kk], s[kk]), np.maximum(last[kk], stop[q][kept])
             high[kk] = np.maximum(high[kk], top[kept])
+            most_rise[kk] = np.maximum(most_rise[kk], (slack[q] / width[q])[kept])
             for at, height in zip((s[kq], half_s, stop[q]), heights, strict=True):
-                over = (height + slack[q] + bulge - middle_tan[kq] * at)[kept]
+                over = (height + bulge - middle_tan[kq] * at)[kept]
                 line_from[kk] = np.maximum(line_from[kk], over)
             z[kq] = heights[2]
         s[k] = stop
     found[:, 0], found[:, 1], found[:, 2], found[:, 3], found[:, 4] = low, np.maximum(high, low), first, last, best_at
     found[:, 5], found[:, 6], found[:, 7], found[:, 8] = middle_tan, line_from, low_s, low_z
+    found[:, 9], found[:, 10] = most_rise, 0.0
     return found
 
 

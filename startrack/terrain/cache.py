@@ -11,12 +11,12 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from startrack.terrain.table import BINS, HorizonTable, Square
+from startrack.terrain.table import BINS, FIELDS, HorizonTable, Square
 
 if TYPE_CHECKING:
     from startrack.terrain.dem import HeightTerrain
 
-VERSION = 1  # of the tracing and of the table's format
+VERSION = 2  # of the tracing and of the table's format
 
 
 def cache_dir() -> Path:
@@ -50,7 +50,7 @@ def loaded(key: str, square: Square) -> HorizonTable | None:
             values, unknown = file["values"], file["unknown_rad"]
     except (OSError, ValueError, KeyError, EOFError, BadZipFile):
         return None
-    if values.shape != (square.across**2, BINS, 9) or unknown.shape != (BINS,):
+    if values.shape != (square.across**2, BINS, FIELDS) or unknown.shape != (BINS,):
         return None
     return HorizonTable(square, values, unknown)
 

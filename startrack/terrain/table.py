@@ -16,8 +16,9 @@ from startrack.types import Array, Bools, Ints
 BINS = 360  # azimuths; what the localizer asks at once are sectors of 1.5 degrees
 DISTANCE_STEP_M = 4.0
 ANGLE_STEP_RAD = np.pi / 65_000
-FIELDS = 8
-LOW, HIGH, FIRST, LAST, BEST, LINE_TAN, LINE_M, POINT_S, POINT_M = range(9)  # of what tracing finds
+FIELDS = 11
+RISE_STEP = 1e-3
+LOW, HIGH, FIRST, LAST, BEST, LINE_TAN, LINE_M, POINT_S, POINT_M, RISE, POINT_RISE = range(11)  # of what tracing finds
 FARTHEST = 65_535
 NOT_KNOWN_M = -32_768
 Progress = Callable[[int, int], None]  # cells done, of how many
@@ -48,18 +49,19 @@ class HorizonTable:
 
     Of each cell and degree: 0, 1 bounds of the elevation [ANGLE_STEP_RAD above -pi/2]; 2, 3 between which distances the
     horizon stands, 4 where it stands from the middle [DISTANCE_STEP_M]; 5, 6 the line z = a + t s that the ground there
-    does not exceed, t as an elevation and a [m]; 7, 8 a distance and a height [m] that it does not fall short of there.
+    does not exceed on the middle line, t as an elevation and a [m], and 9 the most it rises aside [RISE_STEP]; 7, 8 a
+    distance and a height [m] that it does not fall short of there, 10 the slope aside that this reckons with.
     """
 
     square: Square
-    values: NDArray[np.uint16]  # (cells, BINS, 9)
+    values: NDArray[np.uint16]  # (cells, BINS, 11)
     unknown_rad: Array  # (BINS,) elevation below which ground off the maps might stand, seen from anywhere; or -pi/2
 
     @cached_property
     def pyramid(self) -> list[tuple[NDArray[np.uint16], NDArray[np.uint16]]]:
         """Least and most elevation (n, n, BINS) of the cells, then of ever larger blocks of them."""
         n = self.square.across
-        cells = self.values.reshape(n, n, BINS, 9)
+        cells = self.values.reshape(n, n, BINS, FIELDS)
         levels = [(np.ascontiguousarray(cells[..., 0]), np.ascontiguousarray(cells[..., 1]))]
         while levels[-1][0].shape[0] > 1:
             levels.append((_quarters(levels[-1][0], np.minimum), _quarters(levels[-1][1], np.maximum)))
@@ -71,7 +73,7 @@ def _quarters(a: NDArray[np.uint16], choose: np.ufunc) -> NDArray[np.uint16]:
 
 
 def stored(found: Array) -> NDArray[np.uint16]:
-    """What tracing found (..., 9), rounded so that every bound still holds."""
+    """What tracing found (..., 11), rounded so that every bound still holds."""
     out = np.empty(found.shape, dtype=np.uint16)
     out[..., 0] = np.clip(np.floor((np.arctan(found[..., LOW]) + np.pi / 2) / ANGLE_STEP_RAD), 0, FARTHEST)
     out[..., 1] = np.clip(np.ceil((np.arctan(found[..., HIGH]) + np.pi / 2) / ANGLE_STEP_RAD), 0, FARTHEST)
@@ -84,6 +86,8 @@ def stored(found: Array) -> NDArray[np.uint16]:
     out[..., 6] = np.clip(line, NOT_KNOWN_M, 32_767).astype(np.int16).view(np.uint16)
     low = np.floor(found[..., POINT_M])
     out[..., 8] = np.where(low < NOT_KNOWN_M, NOT_KNOWN_M, np.minimum(low, 32_767)).astype(np.int16).view(np.uint16)
+    out[..., 9] = np.clip(np.ceil(found[..., RISE] / RISE_STEP), 0, FARTHEST)
+    out[..., 10] = np.clip(np.floor(found[..., POINT_RISE] / RISE_STEP), 0, FARTHEST)
     # A line beyond what the field holds says nothing; neither does a point so far down.
     out[..., 3] = np.where((line > 32_767) | (found[..., LAST] > FARTHEST * DISTANCE_STEP_M), FARTHEST, out[..., 3])
     return out
@@ -92,13 +96,13 @@ def stored(found: Array) -> NDArray[np.uint16]:
 def built(
     square: Square, wanted: Bools, fill: Callable[[Ints], Array], unknown_rad: Array, progress: Progress | None = None
 ) -> HorizonTable:
-    """The table; `fill(cells)` traces some cells (n, BINS, 9). Cells not wanted hold no bounds, only -pi/2 to pi/2.
+    """The table; `fill(cells)` traces some cells (n, BINS, 11). Cells not wanted hold no bounds, only -pi/2 to pi/2.
 
     Cells are traced on all cores where tracing lets go of Python's lock.
     """
     from concurrent.futures import ThreadPoolExecutor
 
-    values = np.zeros((square.across**2, BINS, 9), dtype=np.uint16)
+    values = np.zeros((square.across**2, BINS, FIELDS), dtype=np.uint16)
     values[..., 1] = values[..., 3] = FARTHEST
     values[..., 8] = np.array(NOT_KNOWN_M, dtype=np.int16).view(np.uint16)
     cells = np.flatnonzero(wanted)

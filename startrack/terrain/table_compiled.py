@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from startrack.terrain.table import ANGLE_STEP_RAD, BINS, DISTANCE_STEP_M, FARTHEST, NOT_KNOWN_M
+from startrack.terrain.table import ANGLE_STEP_RAD, BINS, DISTANCE_STEP_M, FARTHEST, NOT_KNOWN_M, RISE_STEP
 from startrack.terrain.trace_compiled import FAR_M, bounds, horizon, standing, surfaces
 
 BIN_RAD = 2 * np.pi / BINS
@@ -45,14 +45,16 @@ def sector_bounds(values, lows, highs, across, reach, centre, half, low_up, high
                     along = (centre[0] - (2 * i + 1) * side / 2 + reach) * sin_a
                     along += (centre[1] - (2 * j + 1) * side / 2 + reach) * cos_a
                     wide = half * (abs(sin_a) + abs(cos_a))
-                    below, above = _of_line(v, along, wide, low_up, high_up)
+                    aside = (centre[0] - (2 * i + 1) * side / 2 + reach) * cos_a
+                    aside -= (centre[1] - (2 * j + 1) * side / 2 + reach) * sin_a
+                    below, above = _of_line(v, along, abs(aside), wide, low_up, high_up, 0.5 * side)
                 low, high = min(low, below), max(high, above)
     out[0], out[1] = low, high
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _of_line(v, along, wide, low_up, high_up):
-    """Bounds of the elevation, seen from `along` -+ `wide` along the ray from the cell's middle."""
+def _of_line(v, along, aside, wide, low_up, high_up, cell_half):
+    """Bounds of the elevation, seen from `along` -+ `wide` along the ray from the cell's middle, and so far aside."""
     below, above = v[0] * ANGLE_STEP_RAD - np.pi / 2, v[1] * ANGLE_STEP_RAD - np.pi / 2
     cos_turn = np.cos(BIN_RAD / 2)
     height = np.int64(v[6])
@@ -60,8 +62,10 @@ def _of_line(v, along, wide, low_up, high_up):
     near, far = v[2] * DISTANCE_STEP_M - along - wide, v[3] * DISTANCE_STEP_M - along - wide
     if v[3] < FARTHEST and near > 0.0:
         tan = np.tan(v[5] * ANGLE_STEP_RAD - np.pi / 2)
-        top0 = height + tan * v[2] * DISTANCE_STEP_M - low_up
-        top1 = height + tan * v[3] * DISTANCE_STEP_M - low_up
+        rise, tan_turn = v[9] * RISE_STEP, np.tan(BIN_RAD / 2)
+        width = aside + wide + 2 * cell_half * tan_turn
+        top0 = height + tan * v[2] * DISTANCE_STEP_M - low_up + rise * (width + v[2] * DISTANCE_STEP_M * tan_turn)
+        top1 = height + tan * v[3] * DISTANCE_STEP_M - low_up + rise * (width + v[3] * DISTANCE_STEP_M * tan_turn)
         top = max(
             top0 / near if top0 > 0.0 else top0 * cos_turn / (near + 2 * wide),
             top1 / far if top1 > 0.0 else top1 * cos_turn / (far + 2 * wide),
@@ -71,7 +75,8 @@ def _of_line(v, along, wide, low_up, high_up):
     point = point - 65_536 if point > 32_767 else point
     s = v[7] * DISTANCE_STEP_M
     if point > NOT_KNOWN_M:
-        over = point - high_up
+        # The point reckons with the whole cell's width aside, of which the box takes up a part.
+        over = point - high_up + v[10] * RISE_STEP * max(cell_half - aside - wide, 0.0)
         if over > 0.0:
             below = max(below, np.arctan(over * cos_turn / (s + DISTANCE_STEP_M - along + wide)))
         elif s - along - wide > 0.0:
@@ -120,7 +125,7 @@ def horizons(ground, values, across, reach, camera_height, points, azimuths, tan
 @njit(cache=True, nogil=True)
 def box_bounds(ground, values, across, reach, camera_height, centres, half, azimuths, turn, low, high):
     """Fill low and high (n,) [rad] with bounds over small boxes and narrow azimuths, traced anew."""
-    near, around, found = np.empty(3), np.empty(3), np.empty(9)
+    near, around, found = np.empty(3), np.empty(3), np.empty(11)
     middle, lowest, highest = 0.0, 0.0, 0.0
     corner = np.empty(2)
     for k in range(len(low)):

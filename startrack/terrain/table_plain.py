@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.terrain.table import ANGLE_STEP_RAD, BINS, DISTANCE_STEP_M, FARTHEST, NOT_KNOWN_M, HorizonTable
+from startrack.terrain.table import (
+    ANGLE_STEP_RAD,
+    BINS,
+    DISTANCE_STEP_M,
+    FARTHEST,
+    NOT_KNOWN_M,
+    RISE_STEP,
+    HorizonTable,
+)
 from startrack.types import Array, Bools, Ints
 
 BIN_RAD = 2 * np.pi / BINS
@@ -74,10 +82,13 @@ def sector_bounds(
     return low, high
 
 
-def _along(table: HorizonTable, i: Ints, j: Ints, b: Ints, points: Array) -> Array:
+def _along(table: HorizonTable, i: Ints, j: Ints, b: Ints, points: Array, aside: bool = False) -> Array:
+    """How far points (n,) lie along their bins' azimuths from the cells' middles, or to the side."""
     side, reach = 2 * table.square.half_m, table.square.reach_m
     middle = (b + 0.5) * BIN_RAD
     east, north = points[:, 0] - (i + 0.5) * side + reach, points[:, 1] - (j + 0.5) * side + reach
+    if aside:
+        return np.asarray(east * np.cos(middle) - north * np.sin(middle))
     return np.asarray(east * np.sin(middle) + north * np.cos(middle))
 
 
@@ -93,11 +104,15 @@ def _of_lines(
     height = v[:, 6].view(np.int16).astype(np.float64)
     tan = np.tan(v[:, 5] * ANGLE_STEP_RAD - np.pi / 2)
     s = [v[:, k].astype(np.float64) * DISTANCE_STEP_M for k in (2, 3)]
+    aside, tan_turn = np.abs(_along(table, i, j, b, centres, aside=True)), np.tan(BIN_RAD / 2)
+    width = aside + wide + 2 * table.square.half_m * tan_turn
+    height = height + v[:, 9] * RISE_STEP * width
+    tan = tan + v[:, 9] * RISE_STEP * tan_turn
     top = np.maximum(*(_seen(height + tan * at - low_up, at - along - wide, at - along + wide, cos_turn) for at in s))
     usable: Bools = (v[:, 3] < FARTHEST) & (s[0] - along - wide > 0)
     above = np.where(usable, np.minimum(above, np.arctan(top)), above)
     point, at = v[:, 8].view(np.int16).astype(np.float64), v[:, 7].astype(np.float64) * DISTANCE_STEP_M
-    over = point - high_up
+    over = point - high_up + v[:, 10] * RISE_STEP * np.maximum(table.square.half_m - aside - wide, 0.0)
     farthest = at + DISTANCE_STEP_M - along + wide
     tan_low = np.where(
         over > 0, over * cos_turn / np.maximum(farthest, 1.0), over / np.maximum(at - along - wide, 1e-9)

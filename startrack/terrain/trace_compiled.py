@@ -289,8 +289,9 @@ def bounds(ground, east, north, up, low_up, high_up, half, sin_a, cos_a, turn, s
     no higher than the steepest slope along the ray, as the camera stands above the ground.
 
     found: 0, 1: bounds of tan; 2, 3: between which s the ground stands that may be the horizon; 4: where the middle's
-    horizon stands; 5: its tan t; 6: a such that this ground is nowhere higher than a + t s; 7, 8: an s and a height
-    that the ground nowhere falls short of there.
+    horizon stands; 5: its tan t; 6: a such that this ground is no higher than a + t s on the middle line, and 9: g such
+    that it is no higher than that and g w at w aside; 7, 8: an s and a height that the ground nowhere falls short of
+    there, and 10: the slope to the side that this reckons with.
     """
     grid, heights, posts, tops, wide_tops, slopes, blocks, levels, slope_unit, post_m, moon, highest = ground
     reach = half * (abs(sin_a) + abs(cos_a))
@@ -301,7 +302,8 @@ def bounds(ground, east, north, up, low_up, high_up, half, sin_a, cos_a, turn, s
     middle_tan, best_at, _ = horizon(ground, east, north, up, sin_a, cos_a, max(start_m, 0.0), end_m, hint_m)
     first, last = FAR_M, -FAR_M
     line_from = -FAR_M
-    low_s, low_z = 0.0, low_up - FAR_M
+    low_s, low_z, low_rise = 0.0, low_up - FAR_M, 0.0
+    most_rise = 0.0
     steepest = -FAR_M  # along the ray, from the box's near side on
     begin = -reach if whole else start_m
     s = best_at if best_at > reach else 12.0 * reach + 1.0
@@ -342,7 +344,7 @@ def bounds(ground, east, north, up, low_up, high_up, half, sin_a, cos_a, turn, s
                     descending = False
                 else:
                     level -= 1
-            slack, bend, stop = 0.0, np.sqrt(e * e + n * n) / moon, s
+            slack, rise_aside, bend, stop = 0.0, 0.0, np.sqrt(e * e + n * n) / moon, s
             if not skipped:
                 at = _block(blocks, m, least_level, column, row)
                 length = _exit(column, row, d_column, d_row, 0)
@@ -355,7 +357,8 @@ def bounds(ground, east, north, up, low_up, high_up, half, sin_a, cos_a, turn, s
                     0.0,
                 )
                 width += length * tan_turn
-                slack = (to_side * (1.005 + 2 * bend) + (aside + width) / moon) * width
+                rise_aside = to_side * (1.005 + 2 * bend) + (aside + width) / moon
+                slack = rise_aside * width
                 if near:
                     along = _steepness(slopes, at, slope_unit[m], d_column, d_row)
                     steepest = max(steepest, along + abs(along) * (0.01 + 2 * bend) + bend + width / moon)
@@ -386,12 +389,14 @@ def bounds(ground, east, north, up, low_up, high_up, half, sin_a, cos_a, turn, s
                     if tan * cos_turn > low:
                         low, low_s = tan * cos_turn, at_s - reach
                         low_z = tan * at_s + high_up
+                        low_rise = rise_aside
                 else:
                     for k in range(3):
                         s_k = s if k == 0 else half_s if k == 1 else stop
                         z_k = (z0 if k == 0 else z1 if k == 1 else z2) - slack
                         if s_k > 0.0 and _least(z_k - high_up, s_k, reach, cos_turn) > low:
                             low, low_s, low_z = _least(z_k - high_up, s_k, reach, cos_turn), s_k, z_k
+                            low_rise = rise_aside
                 if near:
                     top = min(top, steepest)
                 if probing:
@@ -400,17 +405,19 @@ def bounds(ground, east, north, up, low_up, high_up, half, sin_a, cos_a, turn, s
                     if top >= low and stop > -reach:
                         first, last = min(first, s), max(last, stop)
                         high = max(high, top)
-                        over -= middle_tan * s
+                        most_rise = max(most_rise, rise_aside)
+                        over -= slack + middle_tan * s
                         line_from = max(line_from, z0 + over, z1 + over - middle_tan * 0.5 * length)
                         line_from = max(line_from, z2 + over - middle_tan * length)
                     known_z, s = z2, stop
     found[0], found[1], found[2], found[3], found[4] = low, max(high, low), first, last, best_at
     found[5], found[6], found[7], found[8] = middle_tan, line_from, low_s, low_z
+    found[9], found[10] = most_rise, low_rise
 
 
 @njit(cache=True, nogil=True)
 def fill_cells(ground, centres, half, camera_height, sin_a, cos_a, turn, found):
-    """Fill found (cells, azimuths, 9) with `bounds` of each cell and azimuth."""
+    """Fill found (cells, azimuths, 11) with `bounds` of each cell and azimuth."""
     for k in range(len(centres)):
         middle, low, high = standing(ground, centres[k, 0], centres[k, 1], half)
         guess = 0.0

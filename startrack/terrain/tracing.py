@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from startrack.terrain.table import BINS, HorizonTable, cpu_count
+from startrack.terrain.table import BINS, FIELDS, HorizonTable, cpu_count
 from startrack.types import Array
 
 if TYPE_CHECKING:
     from startrack.terrain.dem import HeightTerrain
 
 WORTH_THREADS, MOST_THREADS = 1500, 8
-NO_VALUES = np.zeros((0, BINS, 9), dtype=np.uint16)
+NO_VALUES = np.zeros((0, BINS, FIELDS), dtype=np.uint16)
 
 
 class Tracer(Protocol):
@@ -64,10 +64,10 @@ class CompiledTracer:
         return tan, at, edge
 
     def fill_cells(self, terrain: HeightTerrain, centres: Array, half: float, azimuths: Array, turn: float) -> Array:
-        """(cells, azimuths, 9), see `trace_compiled.bounds`."""
+        """(cells, azimuths, 11), see `trace_compiled.bounds`."""
         from startrack.terrain import trace_compiled
 
-        found = np.empty((len(centres), len(azimuths), 9))
+        found = np.empty((len(centres), len(azimuths), FIELDS))
         trace_compiled.fill_cells(
             terrain.ground, centres, half, terrain.camera_height_m, np.sin(azimuths), np.cos(azimuths), turn, found
         )
@@ -114,13 +114,13 @@ class PlainTracer:
         return horizon(terrain.ground, points, up, np.sin(azimuths), np.cos(azimuths), start, end, hint)
 
     def fill_cells(self, terrain: HeightTerrain, centres: Array, half: float, azimuths: Array, turn: float) -> Array:
-        """(cells, azimuths, 9), see `trace_compiled.bounds`."""
+        """(cells, azimuths, 11), see `trace_compiled.bounds`."""
         n, bins = len(centres), len(azimuths)
         found = self._bounds(
             terrain, np.repeat(centres, bins, axis=0), np.full(n * bins, half), np.tile(azimuths, n),
             np.full(n * bins, turn), np.zeros(n * bins), np.full(n * bins, 1e9),
         )  # fmt: skip
-        return found.reshape(n, bins, 9)
+        return found.reshape(n, bins, FIELDS)
 
     def box_bounds(self, terrain: HeightTerrain, table: HorizonTable, *arrays: Array) -> None:
         """centres, half, azimuths, turn, and the results low, high."""

@@ -21,6 +21,8 @@ SECTOR_CONTRADICTED = 0.2  # part of a sector's sure rays that contradict the fi
 FEWEST_IN_SECTOR = 3
 
 USUAL_HORIZON_RAD = 0.3  # sin H cos H of a crater's rim at 20 degrees: d(tan H) / tan H = dH / (sin H cos H)
+EXPLAINED_SECTOR_RAD = np.radians(1.5)
+LEAST_EXPLAINED_NATS = -1.7  # -0.4 to -0.9 at the right place, up to 0.5 lower with a ridge on no map; -9.2 the worst
 STRETCHES = (0.005, 0.01, 0.015, 0.025, 0.05, 0.1)  # both ways
 STRETCH_WINDOW_RAD = np.radians(4.0)
 TELLING_LLR = 0.3
@@ -42,6 +44,13 @@ def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain, compiled: 
             "wrong terrain, time or camera file?",
             reason="inconsistent_evidence",
         )
+    explained = explained_nats(evidence, fix, terrain)
+    if explained < LEAST_EXPLAINED_NATS:
+        raise NotLocated(
+            f"the best place explains the stars badly ({explained:.1f} nats a sector; usual: -0.4 to -0.9): "
+            "wrong terrain, time or camera file?",
+            reason="inconsistent_evidence",
+        )
     stretch, gain = best_stretch(evidence, fix, terrain, compiled)
     if gain > STRETCH_GAIN_NATS and abs(stretch - 1) > STRETCH_SIGMAS * admitted_stretch(terrain):
         raise NotLocated(
@@ -50,6 +59,17 @@ def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain, compiled: 
             "(a cylinder can take depth_sigma_m and diameter_sigma_m)",
             reason="inconsistent_evidence",
         )
+
+
+def explained_nats(evidence: Evidence, fix: Fix, terrain: Terrain) -> float:
+    """Mean log-likelihood of the horizon's sectors at the fix, beside the best level skyline in each; 0 is perfect.
+
+    0 for a cylinder whose shape is uncertain: the fix was made with another one than the file's.
+    """
+    if isinstance(terrain, Cylinder) and admitted_stretch(terrain) > 0:
+        return 0.0
+    sectors = Sectors.of(evidence, EXPLAINED_SECTOR_RAD, 1e-4)
+    return float(scores(fix.position_enu_m[None, :2], evidence, sectors, terrain)[0]) / sectors.count
 
 
 def admitted_stretch(terrain: Terrain) -> float:

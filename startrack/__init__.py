@@ -3,17 +3,17 @@
     import startrack
     print(startrack.locate("image.png"))
 
-`locate`, `identify` and `detect` take a path or an array; the rooms below (`startrack.pipeline`, `startrack.localize`,
-...) are for those who want the stages one by one.
+`locate` takes a path or an array (and `startrack.api` holds `identify` and `detect`); the rooms below
+(`startrack.pipeline`, `startrack.localize`, ...) are for those who want the stages one by one.
 """
 
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
-__all__ = ["Solution", "__version__", "detect", "identify", "locate"]
+__all__ = ["Solution", "__version__", "locate"]
 
 if TYPE_CHECKING:
-    from startrack.api import Solution, detect, identify, locate
+    from startrack.api import Solution, locate
 
 
 def __getattr__(name: str) -> Any:

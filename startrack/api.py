@@ -17,7 +17,7 @@ from startrack.camera import Camera, load_camera
 from startrack.catalog import load_catalog
 from startrack.exposure import read_exposure, with_facts
 from startrack.frames import parse_utc
-from startrack.report import result_dict, summary_line, verbose_text, write_results
+from startrack.report import result_dict, summary_line, verbose_text, write_json, write_results
 from startrack.report.result import boresight_rad, detection_dict, identification_dict
 from startrack.terrain import Terrain, load_terrain
 from startrack.types import Array, BadInput, Exposure
@@ -117,11 +117,15 @@ class Solution:
         return identification_dict(self.result) if self.result.stars is not None else detection_dict(self.result)
 
     def write(self, folder: str | os.PathLike[str], *, plots: bool = True) -> Path:
-        """The files that `startrack locate` writes; returns the path of NAME.fix.json."""
-        path = Path(folder) / f"{self.result.exposure.name or 'image'}.fix.json"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_results(self.result, path, plots=plots)
-        return path
+        """The files that `startrack locate` writes (the record alone without a terrain); returns the record's path."""
+        name, out = self.result.exposure.name or "image", Path(folder)
+        out.mkdir(parents=True, exist_ok=True)
+        if self.result.terrain is None:
+            kind = "identification" if self.result.stars is not None else "detections"
+            write_json(out / f"{name}.{kind}.json", self.to_dict())
+            return out / f"{name}.{kind}.json"
+        write_results(self.result, out / f"{name}.fix.json", plots=plots)
+        return out / f"{name}.fix.json"
 
     def __repr__(self) -> str:
         return summary_line(self.result)

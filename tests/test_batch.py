@@ -81,7 +81,7 @@ def test_equal_stems_keep_their_suffix(tmp_path):
 def test_named_images_must_lie_in_the_folder(night):
     named = named_images(night / "images", ["späti/b.png\n", str(night / "images" / "a 1.png") + "\n", "\n"])
     assert [image.name for image in named] == ["a 1.png", "späti/b.png"]
-    with pytest.raises(BadInput, match="not under"):
+    with pytest.raises(BadInput, match="not an image under"):
         named_images(night / "images", ["../small.toml"])
 
 

@@ -40,15 +40,14 @@ def named_images(folder: str | os.PathLike[str], paths: Iterable[str]) -> list[I
 
     Raises BadInput (bad_image) for one that does not.
     """
-    root = Path(folder)
-    names = set()
+    root, known = Path(folder), {image.name: image for image in images_under(folder)}
+    chosen = set()
     for text in filter(None, (path.strip("\r\n") for path in paths)):
-        whole = root / text
-        try:
-            names.add(whole.resolve().relative_to(root.resolve()).as_posix())
-        except ValueError:
-            raise BadInput("bad_image", f"{text} is not under {folder}") from None
-    return _images(root, sorted(names))
+        name = os.path.relpath(root / text if not os.path.isabs(text) else text, root).replace(os.sep, "/")
+        if name not in known:
+            raise BadInput("bad_image", f"{text} is not an image under {folder}")
+        chosen.add(known[name])
+    return sorted(chosen)  # named as in a run over the whole folder
 
 
 def output_stems(images: Sequence[str]) -> list[str]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import threading
+import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -11,9 +14,11 @@ from itertools import islice
 from multiprocessing import get_context
 from typing import Any
 
-from startrack.batch.task import Task, locate_image
+from startrack.batch.task import Task, locate_image, lost
 
 CONNECT_S = 10.0
+MOST_RESTARTS = 2
+ORPHAN_CHECK_S = 1.0
 AHEAD = 4  # tasks per worker that wait in the queue: 100,000 images take no more memory than a hundred
 Counts = Counter[str]  # images by outcome: ok, ambiguous, refused, error
 
@@ -44,10 +49,19 @@ class Batch:
                     yield outcome
                 return
             except BrokenProcessPool:
-                tries += 0 if done else 1
-                if tries > 1:
-                    raise
                 left = [task for number, task in enumerate(left) if number not in done]
+                tries += 1
+                if tries > MOST_RESTARTS:
+                    yield from self._one_by_one(left)
+                    return
+
+    def _one_by_one(self, tasks: Sequence[Task]) -> Iterator[tuple[dict[str, Any], bool]]:
+        """Each in a process of its own: the image that kills its worker is found, and told as such."""
+        for task in tasks:
+            try:
+                yield from (outcome for _, outcome in self._once([task]))
+            except BrokenProcessPool:
+                yield lost(task, "internal error: the process that worked on it died (out of memory?)"), False
 
     def _once(self, tasks: Sequence[Task]) -> Iterator[tuple[int, tuple[dict[str, Any], bool]]]:
         pool = _pool(min(self.jobs, len(tasks)))
@@ -86,6 +100,14 @@ def _pool(jobs: int) -> ProcessPoolExecutor:
 
 def _begin() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     import cv2
 
     cv2.setNumThreads(1)  # the cores are taken by other images
+
+
+def _end_with(parent: int) -> None:
+    """End this process when its parent is gone: killed, it cannot tell, and a resumed run must find nobody at work."""
+    while os.getppid() == parent:
+        time.sleep(ORPHAN_CHECK_S)
+    os._exit(1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from startrack.types import BadInput
 
 INTERNAL_ERROR = "internal_error"
 JOB = "job_sha256"  # what a result was made from: content of all its files, flags, version
+INPUTS = "inputs"  # files that the result was made with: path to SHA-256
 OUTPUTS = (".stars.ecsv", ".annotated.png", ".wcs", ".corr")
 
 
@@ -36,27 +36,52 @@ def locate_image(task: Task) -> tuple[dict[str, Any], bool]:
 
     NAME.fix.json is written last, so that a result that is there is whole.
     """
-    key = job_key(task)
-    before = None if task.renew else stored(task.result)
-    if before is not None and before.get(JOB) == key:
-        return before, True
-    result = Path(task.result)
-    result.parent.mkdir(parents=True, exist_ok=True)
-    for suffix in OUTPUTS:
-        result.with_name(result.name.removesuffix(".fix.json") + suffix).unlink(missing_ok=True)
     try:
-        record = _located(task, result)
-    except BadInput as cause:
-        record = _refused(task, cause.reason, str(cause))
+        key = job_key(task)
+        before = None if task.renew else stored(task.result)
+        if before is not None and before.get(JOB) == key and _unchanged(before.get(INPUTS, {})):
+            return before, True
+        return _fresh(task, key), False
+    except BadInput as cause:  # results cannot be written there
+        return lost(task, str(cause), cause.reason), False
     except MemoryError:
         raise
     except Exception as cause:  # noqa: BLE001 - one image's fault is its own; it is counted and told as such
-        record = _refused(task, INTERNAL_ERROR, f"internal error: {type(cause).__name__}: {cause}")
-    from startrack.report import write_json
+        return lost(task, f"internal error: {type(cause).__name__}: {cause}"), False
 
-    record = {**record, "image": task.name, JOB: key}
+
+def lost(task: Task, message: str, reason: str = INTERNAL_ERROR) -> dict[str, Any]:
+    """The record of an image that could not even be begun, or that took its worker with it."""
+    from startrack.report import refused_dict
+
+    return {**refused_dict(task.name, reason, message), "image": printable(task.name)}
+
+
+def printable(name: str) -> str:
+    """A file's name as text: bytes that are none become question marks."""
+    return name.encode("utf-8", "replace").decode("utf-8")
+
+
+def _fresh(task: Task, key: str) -> dict[str, Any]:
+    """The record made anew. The old one goes first, so that no half of a result is ever taken for a whole."""
+    from startrack.report import refused_dict, write_json
+
+    result = Path(task.result)
+    result.parent.mkdir(parents=True, exist_ok=True)
+    for suffix in (".fix.json", *OUTPUTS):
+        result.with_name(result.name.removesuffix(".fix.json") + suffix).unlink(missing_ok=True)
+    inputs: dict[str, str] = {}
+    try:
+        record, inputs = _located(task, result)
+    except BadInput as cause:
+        record = refused_dict(task.name, cause.reason, str(cause))
+    except MemoryError:
+        raise
+    except Exception as cause:  # noqa: BLE001 - one image's fault is its own; it is counted and told as such
+        record = refused_dict(task.name, INTERNAL_ERROR, f"internal error: {type(cause).__name__}: {cause}")
+    record = {**record, "image": printable(task.name), JOB: key, INPUTS: inputs}
     write_json(task.result, record)
-    return record, False
+    return record
 
 
 def stored(result: str) -> dict[str, Any] | None:
@@ -69,18 +94,30 @@ def stored(result: str) -> dict[str, Any] | None:
 
 
 def job_key(task: Task) -> str:
-    """SHA-256 of what decides the result: image, sidecar, camera and terrain files, flags and version."""
+    """SHA-256 of what decides the result: image, sidecar, flags and version; camera and terrain files are INPUTS."""
     digest = hashlib.sha256(json.dumps([__version__, task.facts, task.plots, task.compiled], default=str).encode())
     sidecar = next((path for path in sidecars(Path(task.path)) if path.is_file()), None)
     for path in (Path(task.path), sidecar):
         digest.update(_digest(path))
-    for kind in ("camera", "terrain"):
-        reference = task.facts.get(kind) or _named_in(sidecar, kind)
-        digest.update(_digest(Path(reference)) if reference and Path(reference).is_file() else b"-")
     return digest.hexdigest()
 
 
-def _located(task: Task, result: Path) -> dict[str, Any]:
+def _inputs(references: list[str | None]) -> dict[str, str]:
+    """Path to SHA-256 of the camera's and terrain's files, height maps included; a shipped one's name needs none."""
+    import tomllib
+
+    files = [Path(reference) for reference in references if reference and Path(reference).is_file()]
+    for path in tuple(files):
+        maps = tomllib.loads(path.read_text(encoding="utf-8")).get("dem", {}).get("file", [])
+        files += [path.parent / name for name in ([maps] if isinstance(maps, str) else maps)]
+    return {str(path): _digest(path).hex() for path in files}
+
+
+def _unchanged(inputs: dict[str, str]) -> bool:
+    return all(_digest(Path(path)).hex() == digest for path, digest in inputs.items())
+
+
+def _located(task: Task, result: Path) -> tuple[dict[str, Any], dict[str, str]]:
     from startrack.exposure import read_exposure
     from startrack.localize import ExactPosterior
     from startrack.pipeline import Settings, locate_exposure
@@ -88,13 +125,8 @@ def _located(task: Task, result: Path) -> dict[str, Any]:
 
     exposure = read_exposure(task.path, **task.facts)
     found = locate_exposure(exposure, Settings(localizer=ExactPosterior(compiled=task.compiled)))
-    return write_results(found, result, plots=task.plots, write_record=False)
-
-
-def _refused(task: Task, reason: str, message: str) -> dict[str, Any]:
-    from startrack.report import refused_dict
-
-    return refused_dict(task.name, reason, message)
+    record = write_results(found, result, plots=task.plots, write_record=False)
+    return record, _inputs([exposure.camera, exposure.terrain])
 
 
 def _digest(path: Path | None) -> bytes:
@@ -105,16 +137,3 @@ def _digest(path: Path | None) -> bytes:
             return hashlib.file_digest(file, "sha256").digest()
     except OSError:
         return b"?"  # said by whoever reads it
-
-
-def _named_in(sidecar: Path | None, kind: str) -> str | None:
-    """A camera's or terrain's file as the sidecar names it; a shipped one's name is as good as its content."""
-    if sidecar is None:
-        return None
-    value = _sidecar(str(sidecar), sidecar.stat().st_mtime_ns).get(kind)
-    return str(sidecar.parent / value) if isinstance(value, str) else None
-
-
-@lru_cache(maxsize=16)
-def _sidecar(path: str, _changed_ns: int) -> dict[str, Any]:
-    return stored(path) or {}

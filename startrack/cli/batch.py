@@ -81,6 +81,8 @@ def run(args: argparse.Namespace) -> int:
         if args.cluster is None:
             raise
         raise BadInput("no_cluster", f"{args.cluster}: no Dask scheduler answers ({cause})") from cause
+    if args.files_on_stdin:
+        records += _earlier(images_under(args.folder, out), {image.name for image in found}, out)
     write_tables(out, records, _settings(facts, args))
     if args.report:
         from startrack.cli.report import page_of
@@ -104,6 +106,14 @@ def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argpa
         )
         for image in found
     ]  # fmt: skip
+
+
+def _earlier(whole: Sequence[Image], done: set[str], out: Path) -> list[dict[str, Any]]:
+    """What earlier runs found of the folder's other images: the tables are of all."""
+    from startrack.batch import stored
+
+    records = (stored(str(out / f"{image.stem}.fix.json")) for image in whole if image.name not in done)
+    return [_gist(record) for record in records if record is not None]
 
 
 def _gist(record: dict[str, Any]) -> dict[str, Any]:

@@ -40,7 +40,10 @@ def _log_add(a: float, b: float) -> float:
 
 @njit(cache=True)
 def most_telling(disks_m: Array, llr: Array, radius_m: float, count: int) -> Ints:
-    """Indices (<= count,) of rays that say much about the place: sure of themselves, and low over the rim."""
+    """Indices (<= count,) of rays among those that say most about the place: sure of themselves, low over the rim.
+
+    Sorted into bins, not in order: the guess they are for needs no better.
+    """
     telling = np.empty(len(llr))
     top = 1e-30
     for k in range(len(llr)):

@@ -62,6 +62,7 @@ def verbose_text(result: Result) -> str:
     lines += [f"time       {format_utc(when) if when is not None else 'not known'} (middle of the exposure)"]
     spent = [f"{stage} {result.timing_ms[stage]:.0f}" for stage in STAGES if stage in result.timing_ms]
     lines += [f"ms         {', '.join(spent)}"] if spent else []
+    lines += [f"warning    {warning}" for warning in result.exposure.warnings]
     return "\n".join(f"  {line}" for line in lines)
 
 

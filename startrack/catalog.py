@@ -4,7 +4,6 @@ A catalogue is one structured .npy file in catalogs/ (columns: catalogs/README.m
 in magnitude is a slice.
 """
 
-
 from __future__ import annotations
 
 from collections.abc import Mapping

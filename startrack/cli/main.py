@@ -12,7 +12,8 @@ from startrack import __version__
 from startrack.errors import BadInput, NoSolution
 
 COMMANDS = (
-    "locate", "batch", "identify", "detect", "render", "calibrate", "report", "reproduce", "terrain", "doctor", "schema",
+    "locate", "batch", "identify", "detect", "render", "calibrate", "report", "reproduce", "terrain", "doctor",
+    "schema",
 )  # fmt: skip
 OK, INTERNAL_ERROR, USAGE, REFUSED, BAD_INPUT = 0, 1, 2, 3, 4
 EPILOG = """exit codes: 0 every image solved; 1 internal error; 2 usage; 3 an image ambiguous or refused; 4 bad input

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+INTERNAL_ERROR = "internal_error"  # the reason of an image that met a fault of the program's own
+
 
 class BadInput(Exception):
     """Input that cannot be used (exit code 4). `reason` is one of the codes of the result format."""

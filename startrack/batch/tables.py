@@ -19,10 +19,10 @@ from startrack.batch.task import JOB
 from startrack.exposure import write_atomically
 from startrack.frames import R_from_quat_xyzw, quat_xyzw_from_R
 from startrack.report.ecsv import Column, ecsv_text, formatted
+from startrack.report.result import STAGES
 
 Record = dict[str, Any]
 FORMAT = "startrack.manifest/1"
-STAGES = ("read", "detect", "identify", "attitude", "evidence", "locate")
 EXACT = "%.17g"
 # name, datatype, unit, form, path within the record
 COLUMNS: tuple[tuple[str, str, str | None, str, tuple[str | int, ...]], ...] = (

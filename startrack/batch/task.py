@@ -9,13 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from startrack import __version__
+from startrack.errors import INTERNAL_ERROR, BadInput
 from startrack.exposure.facts import sidecars
-from startrack.types import BadInput
 
-INTERNAL_ERROR = "internal_error"
 JOB = "job_sha256"  # what a result was made from: content of all its files, flags, version
 INPUTS = "inputs"  # files that the result was made with: path to SHA-256
-OUTPUTS = (".stars.ecsv", ".annotated.png", ".wcs", ".corr")
 
 
 @dataclass(frozen=True)
@@ -64,12 +62,12 @@ def printable(name: str) -> str:
 
 def _fresh(task: Task, key: str) -> dict[str, Any]:
     """The record made anew. The old one goes first, so that no half of a result is ever taken for a whole."""
-    from startrack.report import refused_dict, write_json
+    from startrack.report import refused_dict, remove_companions, write_json
 
     result = Path(task.result)
     result.parent.mkdir(parents=True, exist_ok=True)
-    for suffix in (".fix.json", *OUTPUTS):
-        result.with_name(result.name.removesuffix(".fix.json") + suffix).unlink(missing_ok=True)
+    result.unlink(missing_ok=True)
+    remove_companions(result.parent, result.name.removesuffix(".fix.json"))
     inputs: dict[str, str] = {}
     try:
         record, inputs = _located(task, result)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.common import DEFAULT_OUT, add_fact_flags, flag_facts
+from startrack.cli.common import DEFAULT_OUT, add_fact_flags, cores, flag_facts, made_folder, whole_number
 from startrack.errors import BadInput
 
 if TYPE_CHECKING:
@@ -34,7 +33,7 @@ def add_parser(subparsers: Any) -> None:
     add_fact_flags(parser)
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file, or the name of a shipped one")
     parser.add_argument(
-        "-j", "--jobs", type=_positive, default=None, metavar="N", help="processes (default: all cores)"
+        "-j", "--jobs", type=whole_number, default=None, metavar="N", help="processes (default: all cores)"
     )
     parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask cluster to use instead (extra: cluster)")
     parser.add_argument("--files-on-stdin", action="store_true", help="only the images listed on stdin, one a line")
@@ -57,13 +56,13 @@ def run(args: argparse.Namespace) -> int:
         args.usage_error("a cluster is reached with distributed: pip install 'startrack[cluster]'")
     from startrack.batch import Batch, images_under, named_images, write_tables
 
-    out = _folder(args.dir)
+    out = made_folder(args.dir)
     found = named_images(args.folder, sys.stdin) if args.files_on_stdin else images_under(args.folder, out)
     if not found:
         raise BadInput("bad_image", f"{args.folder}: no PNG, TIFF, FITS or JPEG images there")
     facts = flag_facts(args)
     tasks = _tasks(found, out, facts, args)
-    jobs = args.jobs or _cores()
+    jobs = args.jobs or cores()
     records: list[dict[str, Any]] = []
     counts = _no_counts()
     try:
@@ -166,21 +165,3 @@ def _no_counts() -> Counts:
     from startrack.batch import Counts
 
     return Counts()
-
-
-def _folder(path: str) -> Path:
-    try:
-        Path(path).mkdir(parents=True, exist_ok=True)
-    except OSError as cause:
-        raise BadInput("bad_image", f"{path}: results cannot be written there: {cause.strerror}") from cause
-    return Path(path)
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _positive(text: str) -> int:
-    if int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not above 0")
-    return int(text)

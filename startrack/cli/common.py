@@ -5,20 +5,19 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.errors import BadInput
+from startrack.errors import INTERNAL_ERROR, BadInput
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
     from startrack.types import Exposure
 
-COMPANIONS = (".stars.ecsv", ".annotated.png", ".wcs", ".corr")
-INTERNAL_ERROR = "internal_error"
 DEFAULT_OUT = "startrack-out"
 BAD_INPUT_REASONS = frozenset(
     {"bad_image", "size_mismatch", "no_time", "no_calibration", "bad_calibration", "bad_terrain"}
@@ -47,6 +46,27 @@ def _seconds(text: str) -> float:
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number of seconds")
     return value
+
+
+def whole_number(text: str) -> int:
+    """A number of things, at least one: an argparse type."""
+    if int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not above 0")
+    return int(text)
+
+
+def made_folder(path: str) -> Path:
+    """The folder of the results, made before anything is computed. Raises BadInput where it cannot be."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as cause:
+        raise BadInput("bad_image", f"{path}: results cannot be written there: {cause.strerror}") from cause
+    return Path(path)
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def add_output_flags(parser: argparse.ArgumentParser) -> None:
@@ -174,6 +194,8 @@ def result_path(args: argparse.Namespace, stem: str, suffix: str, exposure: Expo
 
     Raises BadInput (bad_image, for lack of a better code) before anything is computed.
     """
+    from startrack.report import remove_companions
+
     path = Path(args.dir) / f"{stem}{suffix}"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -184,8 +206,7 @@ def result_path(args: argparse.Namespace, stem: str, suffix: str, exposure: Expo
         before = {}
     if before is not None and not _is_of(before, exposure.sha256):
         raise BadInput("bad_image", f"{path} is not a result of this image: choose another -D, or replace it with -O")
-    for old in COMPANIONS:  # of an earlier run: a refusal must not leave the picture of a success beside it
-        path.with_name(f"{stem}{old}").unlink(missing_ok=True)
+    remove_companions(path.parent, stem)
     return path
 
 

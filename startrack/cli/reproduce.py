@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -13,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.common import DEFAULT_OUT
+from startrack.cli.common import DEFAULT_OUT, cores, made_folder, whole_number
 from startrack.errors import BadInput
 
 if TYPE_CHECKING:
@@ -43,10 +42,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     size.add_argument("--quick", action="store_true", help="a part of the thesis's places, in about a minute (default)")
     size.add_argument("--full", action="store_true", help="as many as in the thesis: 10 x 10,000, and 100,000 places")
     parser.add_argument(
-        "--ours", type=_positive, metavar="N", help="our method on at most N places per starfield, 10 N in figure 3.10"
+        "--ours",
+        type=whole_number,
+        metavar="N",
+        help="our method on at most N places per starfield, 10 N in figure 3.10",
     )
     parser.add_argument(
-        "-j", "--jobs", type=_positive, default=None, metavar="N", help="processes (default: all cores)"
+        "-j", "--jobs", type=whole_number, default=None, metavar="N", help="processes (default: all cores)"
     )
     parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask cluster to use instead (extra: cluster)")
     parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="same seed, same files (default 0)")
@@ -72,10 +74,10 @@ def run(args: argparse.Namespace) -> int:
 
     from startrack.reproduce import ARTEFACTS, FULL, QUICK, Context, Runs, written
 
-    out, size = _folder(args.dir), FULL if args.full else QUICK
+    out, size = made_folder(args.dir), FULL if args.full else QUICK
     if args.ours is not None:
         size = size.with_ours(args.ours)
-    with Runs(out, jobs=args.jobs or _cores(), progress=_progress, cluster=args.cluster) as runs:
+    with Runs(out, jobs=args.jobs or cores(), progress=_progress, cluster=args.cluster) as runs:
         if args.cluster is not None:
             _reach(runs)
         for name in chosen:
@@ -84,15 +86,6 @@ def run(args: argparse.Namespace) -> int:
             files = written(piece, out, plots=not args.no_plots)
             _tell(args, piece, size.name, files, time.perf_counter() - start)
     return 0
-
-
-def _folder(path: str) -> Path:
-    """The folder of the results, made before anything is computed."""
-    try:
-        Path(path).mkdir(parents=True, exist_ok=True)
-    except OSError as cause:
-        raise BadInput("bad_image", f"{path}: results cannot be written there: {cause.strerror}") from cause
-    return Path(path)
 
 
 def _need(args: argparse.Namespace, module: str, extra: str, what: str, *, unless: bool) -> None:
@@ -139,16 +132,6 @@ def _progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda steps: bar.advance(task, steps)
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _positive(text: str) -> int:
-    if int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not above 0")
-    return int(text)
 
 
 def _seed(text: str) -> int:

@@ -2,7 +2,14 @@
 
 from startrack.report.result import detection_dict, identification_dict, refused_dict, result_dict
 from startrack.report.summary import lens_text, refusal_line, summary_line, verbose_text
-from startrack.report.write import write_annotated, write_json, write_results, write_star_table, write_wcs
+from startrack.report.write import (
+    remove_companions,
+    write_annotated,
+    write_json,
+    write_results,
+    write_star_table,
+    write_wcs,
+)
 
 __all__ = [
     "detection_dict",
@@ -10,6 +17,7 @@ __all__ = [
     "lens_text",
     "refusal_line",
     "refused_dict",
+    "remove_companions",
     "result_dict",
     "summary_line",
     "verbose_text",

@@ -12,7 +12,14 @@ from startrack.exposure import write_atomically
 if TYPE_CHECKING:
     from startrack.pipeline import Result
 
+COMPANIONS = (".stars.ecsv", ".annotated.png", ".wcs", ".corr")  # beside NAME.fix.json
 FilePath = str | os.PathLike[str]
+
+
+def remove_companions(folder: Path, stem: str) -> None:
+    """Remove what an earlier run left beside its record: a refusal must not stand beside the picture of a success."""
+    for suffix in COMPANIONS:
+        (folder / f"{stem}{suffix}").unlink(missing_ok=True)
 
 
 def write_results(result: Result, path: Path, *, plots: bool = True, write_record: bool = True) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from startrack import __version__
 from startrack.calibrate.board_corners import Board, Corners, corners
 from startrack.calibrate.board_pose import first_board_state
 from startrack.calibrate.fit import LensFit, fit_state
-from startrack.calibrate.gates import RINGS, STARS_PER_RING, Gate, seen_rays
+from startrack.calibrate.gates import RINGS, STARS_PER_RING, Gate, Gated, seen_rays
 from startrack.calibrate.observations import observations
 from startrack.calibrate.run import Refused
 from startrack.camera import Camera, camera_to_dict
@@ -26,7 +26,7 @@ FORMAT = "startrack.calibration/1"
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoardCalibration:
+class BoardCalibration(Gated):
     """The lens that boards give, and what was asked of it."""
 
     camera: Camera
@@ -34,16 +34,6 @@ class BoardCalibration:
     gates: tuple[Gate, ...]
     images: tuple[str, ...]
     refused: tuple[Refused, ...]
-
-    @property
-    def failed(self) -> tuple[Gate, ...]:
-        """The gates that the calibration did not pass."""
-        return tuple(gate for gate in self.gates if not gate.passed)
-
-    @property
-    def accepted(self) -> bool:
-        """Whether the camera may be used."""
-        return not self.failed
 
 
 def calibrate_board(

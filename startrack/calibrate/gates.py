@@ -41,6 +41,22 @@ class Gate:
     advice: str  # what pictures to take, or what to look after
 
 
+class Gated:
+    """Whatever was asked for by gates."""
+
+    gates: tuple[Gate, ...]
+
+    @property
+    def failed(self) -> tuple[Gate, ...]:
+        """The gates that the calibration did not pass."""
+        return tuple(gate for gate in self.gates if not gate.passed)
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the camera may be used."""
+        return not self.failed
+
+
 @dataclass(frozen=True)
 class Coverage:
     """Stars by ring and sector of the calibrated cap."""

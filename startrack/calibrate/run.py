@@ -9,7 +9,7 @@ import numpy as np
 
 from startrack.calibrate.fixed import without_fixed
 from startrack.calibrate.frame import Frame, frame_of
-from startrack.calibrate.gates import Gate, gates
+from startrack.calibrate.gates import Gate, Gated, gates
 from startrack.calibrate.growing import Joint, grown, joint
 from startrack.calibrate.photometry import Given, Photometry, photometry
 from startrack.calibrate.start import opposite
@@ -33,7 +33,7 @@ class Refused:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Calibration:
+class Calibration(Gated):
     """The lens, what it rests on and what was said against it."""
 
     camera: Camera
@@ -43,16 +43,6 @@ class Calibration:
     site: Site | None
     false_alarm_probability: float  # the largest of the images' identifications
     photometry: Photometry | None = None
-
-    @property
-    def failed(self) -> tuple[Gate, ...]:
-        """The gates that the calibration did not pass."""
-        return tuple(gate for gate in self.gates if not gate.passed)
-
-    @property
-    def accepted(self) -> bool:
-        """Whether the camera may be used."""
-        return not self.failed
 
 
 @dataclass

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -117,6 +120,34 @@ def test_the_table_is_kept_and_found_again_by_content(shackleton):
     path.write_bytes(path.read_bytes()[:1000])
     assert cache.loaded(cache.key_of(shackleton), shackleton.square) is None  # a damaged table is made again
     cache.save(cache.key_of(shackleton), table)
+
+
+def test_of_two_that_need_a_table_one_makes_it(shackleton, monkeypatch):
+    """Each stands for a process: locks are of open files, not of processes."""
+    made, build = [], HeightTerrain._built
+
+    def slow(terrain, progress):
+        made.append(threading.get_ident())
+        time.sleep(0.3)
+        return build(terrain, progress)
+
+    monkeypatch.setattr(HeightTerrain, "_built", slow)
+    terrains = [replace(shackleton, camera_height_m=1.75, search_radius_m=150.0, _state={}) for _ in range(3)]
+    path = cache.path_of(cache.key_of(terrains[0]))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.with_suffix(".lock").touch()  # left by a process that was killed: nobody holds it
+    with ThreadPoolExecutor(3) as pool:
+        tables = list(pool.map(lambda terrain: terrain.prepared(), terrains))
+    assert len(made) == 1
+    assert all(np.array_equal(table.values, tables[0].values) for table in tables)
+    assert [p.suffix for p in path.parent.iterdir() if p.stem == path.stem] == [".npz"]
+
+
+def test_a_copy_with_other_settings_takes_no_table_over(shackleton):
+    table = shackleton.prepared()
+    higher = replace(shackleton, camera_height_m=30.0, search_radius_m=200.0)  # shares what the first one remembers
+    assert higher.prepared().square.reach_m < table.square.reach_m
+    assert shackleton.prepared().square == table.square
 
 
 def evidence_at(terrain, place, rng, error_rad=0.0, rays=4000) -> Evidence:

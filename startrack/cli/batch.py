@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import DEFAULT_OUT, add_fact_flags, cores, flag_facts, made_folder, whole_number
+from startrack.cli.horizons import ready_for
 from startrack.errors import BadInput
 
 if TYPE_CHECKING:
@@ -62,6 +63,8 @@ def run(args: argparse.Namespace) -> int:
         raise BadInput("bad_image", f"{args.folder}: no PNG, TIFF, FITS or JPEG images there")
     facts = flag_facts(args)
     tasks = _tasks(found, out, facts, args)
+    if args.cluster is None and not all(Path(task.result).exists() for task in tasks):
+        ready_for(_terrain_of(tasks[0]), args)
     jobs = args.jobs or cores()
     records: list[dict[str, Any]] = []
     counts = _no_counts()
@@ -105,6 +108,17 @@ def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argpa
         )
         for image in found
     ]  # fmt: skip
+
+
+def _terrain_of(task: Task) -> str | None:
+    """The terrain of an image: one of the whole folder, as a rule."""
+    from startrack.exposure import read_exposure
+
+    if task.facts.get("terrain"):
+        return str(task.facts["terrain"])
+    with suppress(BadInput):  # said where the image is located
+        return read_exposure(task.path, **task.facts).terrain
+    return None
 
 
 def _earlier(whole: Sequence[Image], done: set[str], out: Path) -> list[dict[str, Any]]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from startrack.cli.common import Outcome, add_image_flags, read, result_path, run_images
+from startrack.cli.horizons import ready_for
 
 FORMAT = "startrack.fix/1"
 
@@ -44,10 +45,13 @@ def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     exposure = read(path, args)
     out = result_path(args, stem, ".fix.json", exposure)
     read_ms = 1e3 * (time.perf_counter() - start)
+    if exposure.time_utc is not None and exposure.camera is not None:
+        ready_for(exposure.terrain, args)
+    start = time.perf_counter()
     result = locate_exposure(exposure)
     result.timing_ms["read"] += read_ms
     record = write_results(result, out, plots=not args.no_plots)
-    line = summary_line(result, seconds=time.perf_counter() - start)
+    line = summary_line(result, seconds=read_ms / 1e3 + time.perf_counter() - start)
     if args.verbose:
         line += "\n" + verbose_text(result) + f"\n  written to {Path(args.dir)}/{stem}.*"
     return Outcome(result.status, result.reason, line, record)

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from dataclasses import replace
 from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import DEFAULT_OUT
+from startrack.cli.horizons import ready
 from startrack.errors import BadInput
 
 if TYPE_CHECKING:
@@ -56,7 +55,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     made.add_argument("--camera-height", type=float, default=1.5, metavar="M", help="above the ground (%(default)g)")
     for action in (show, build, made):
         action.add_argument("--json", action="store_true", help="print one JSON object per terrain")
-        action.add_argument("-v", "--verbose", action="count", default=0, help="tracebacks of internal errors")
+        action.add_argument("-v", "--verbose", action="count", default=0, help="say more; internal tracebacks")
         action.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
     show.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the pictures (%(default)s)")
     show.add_argument("--no-plots", action="store_true", help="no pictures")
@@ -163,34 +162,15 @@ def _build(args: argparse.Namespace) -> int:
             path = cache.path_of(cache.key_of(terrain))
             if args.force:
                 path.unlink(missing_ok=True)
+                terrain = replace(terrain, _state={})
             start = time.perf_counter()
             known = path.is_file()
-            with building(terrain, quiet=args.quiet):
-                terrain.prepared()
+            ready(terrain, args)
             facts |= {"horizons": str(path), "known_before": known, "seconds": round(time.perf_counter() - start, 1)}
         else:
             facts["horizons"] = None
         _tell(args, facts)
     return 0
-
-
-@contextmanager
-def building(terrain: Terrain, quiet: bool = False) -> Iterator[None]:
-    """While a height map's horizons are worked out, a bar on a terminal."""
-    if quiet or not sys.stderr.isatty() or not _is_dem(terrain):  # no terminal to draw a bar on, or nothing to do
-        yield
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(f"horizons of {terrain.name}", total=None, visible=False)
-        advance: Callable[[int, int], None] = lambda done, total: bar.update(  # noqa: E731
-            task, completed=done, total=total, visible=True
-        )
-        terrain.prepared(advance)  # type: ignore[attr-defined]
-        yield
 
 
 def _import(args: argparse.Namespace) -> int:

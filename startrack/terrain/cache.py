@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 from zipfile import BadZipFile
@@ -16,6 +19,7 @@ from startrack.terrain.table import BINS, FIELDS, HorizonTable, Square
 if TYPE_CHECKING:
     from startrack.terrain.dem import HeightTerrain
 
+LOG = logging.getLogger(__name__)
 VERSION = 2  # of the tracing and of the table's format
 
 
@@ -71,3 +75,46 @@ def save(key: str, table: HorizonTable) -> Path | None:
     except OSError:
         return None
     return path
+
+
+@contextmanager
+def one_at_a_time(key: str, name: str) -> Iterator[None]:
+    """Within, this process alone makes the table of the key; others that come here wait until it is done or has died.
+
+    Where files cannot be locked (a folder that cannot be written, some network disks, Windows) nobody waits: the table
+    is then made by each.
+    """
+    handle = _locked(path_of(key).with_suffix(".lock"), name)
+    try:
+        yield
+    finally:
+        if handle is not None:
+            path_of(key).with_suffix(".lock").unlink(missing_ok=True)
+            os.close(handle)
+
+
+def _locked(path: Path, name: str) -> int | None:
+    """An open file that is locked while it is open; None where there are no locks."""
+    try:
+        import fcntl
+    except ImportError:
+        return None
+    handle = -1
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        while True:
+            handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                LOG.info("horizons of %s: another process works them out, waiting for it", name)
+                fcntl.flock(handle, fcntl.LOCK_EX)
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(handle), path.stat()):
+                    return handle
+            os.close(handle)  # its last owner has removed the file: what is locked is no longer what others see
+            handle = -1
+    except OSError:
+        if handle >= 0:
+            os.close(handle)
+        return None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import time as clock
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -27,6 +29,7 @@ from startrack.terrain.table import (
 from startrack.terrain.tracing import Tracer, tracer
 from startrack.types import Array, BadInput, Bools, Ints
 
+LOG = logging.getLogger(__name__)
 CELL_M = 200.0  # cells of the table are no wider
 MOST_CELLS_ACROSS = 128
 COMMON_PER_POST = 3.0
@@ -101,16 +104,37 @@ class HeightTerrain:
             across *= 2
         return Square(self.reach_m, across)
 
+    @cached_property
+    def _key(self) -> str:
+        return cache.key_of(self)
+
+    @property
+    def is_prepared(self) -> bool:
+        """Whether the table of horizons is in memory or on disk."""
+        return self._key in self._state or cache.path_of(self._key).is_file()
+
     def prepared(self, progress: Progress | None = None) -> HorizonTable:
-        """The table of horizons: from memory, else from the cache on disk, else worked out (and cached)."""
-        if "table" not in self._state:
-            key = cache.key_of(self)
-            table = cache.loaded(key, self.square)
+        """The table of horizons: from memory, else from the cache on disk, else worked out (and cached).
+
+        Of several processes that need the same table one works it out, and the others wait for it.
+        """
+        if self._key not in self._state:
+            table = cache.loaded(self._key, self.square)
             if table is None:
-                table = self._built(progress)
-                cache.save(key, table)
-            self._state["table"] = table
-        return self._state["table"]  # type: ignore[no-any-return]
+                with cache.one_at_a_time(self._key, self.name):
+                    table = cache.loaded(self._key, self.square) or self._made(progress)
+            self._state.clear()  # copies made by `replace` share the dictionary, but not the table
+            self._state[self._key] = table
+        return self._state[self._key]  # type: ignore[no-any-return]
+
+    def _made(self, progress: Progress | None) -> HorizonTable:
+        LOG.info("horizons of %s: worked out once, this takes a minute or two", self.name)
+        start = clock.perf_counter()
+        table = self._built(progress)
+        path = cache.save(self._key, table)
+        where = f"kept in {path}" if path else f"not kept: {cache.cache_dir()} cannot be written"
+        LOG.info("horizons of %s: done in %.0f s, %s", self.name, clock.perf_counter() - start, where)
+        return table
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad], traced. See `Terrain`."""
@@ -199,7 +223,7 @@ class HeightTerrain:
         points_m = np.asarray(points_m, dtype=np.float64)
         shape = np.broadcast_shapes(points_m.shape[:-1], np.shape(azimuths_rad))
         points = _flat(points_m, (*shape, 2)).reshape(-1, 2)
-        found = self._tracer.horizons(self, self._state.get("table"), points, _flat(azimuths_rad, shape).ravel())
+        found = self._tracer.horizons(self, self._state.get(self._key), points, _flat(azimuths_rad, shape).ravel())
         return tuple(a.reshape(shape) for a in found)  # type: ignore[return-value]
 
     def _some(self, bounds: Any, centres: Array, half: Array, azimuths: Array, turn: Array, which: Bools) -> Any:

@@ -19,6 +19,7 @@ from startrack.batch.task import Task, locate_image, lost
 CONNECT_S = 10.0
 MOST_RESTARTS = 2
 ORPHAN_CHECK_S = 1.0
+ONE_THREAD = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 AHEAD = 4  # tasks per worker that wait in the queue: 100,000 images take no more memory than a hundred
 Counts = Counter[str]  # images by outcome: ok, ambiguous, refused, error
 
@@ -33,10 +34,8 @@ class Batch:
         """In the order of completion. Raises OSError where no scheduler answers, ImportError without Dask."""
         if self.cluster is not None:
             yield from self._on_cluster(tasks)
-        elif self.jobs > 1 and len(tasks) > 1:
-            yield from self._here(tasks)
         else:
-            yield from map(locate_image, tasks)
+            yield from self._here(tasks)
 
     def _here(self, tasks: Sequence[Task]) -> Iterator[tuple[dict[str, Any], bool]]:
         """In processes. One that dies (out of memory, killed) is replaced, and its images are tried once more."""
@@ -95,6 +94,9 @@ class Batch:
 
 def _pool(jobs: int) -> ProcessPoolExecutor:
     # Fresh processes (a fork would copy the progress bar's thread), which leave Ctrl-C to the one that waits for them.
+    # They inherit these when they load NumPy: the cores are taken by other images.
+    for name in ONE_THREAD:
+        os.environ.setdefault(name, "1")
     return ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_begin)
 
 
@@ -103,7 +105,7 @@ def _begin() -> None:
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     import cv2
 
-    cv2.setNumThreads(1)  # the cores are taken by other images
+    cv2.setNumThreads(1)
 
 
 def _end_with(parent: int) -> None:

@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     out = made_folder(args.dir)
     found = named_images(args.folder, sys.stdin) if args.files_on_stdin else images_under(args.folder, out)
     if not found:
-        raise BadInput("bad_image", f"{args.folder}: no PNG, TIFF, FITS or JPEG images there")
+        raise BadInput("bad_image", f"{args.folder}: no PNG, TIFF, FITS, JPEG or camera raw images there")
     facts = flag_facts(args)
     tasks = _tasks(found, out, facts, args)
     if args.cluster is None and not all(Path(task.result).exists() for task in tasks):

@@ -26,7 +26,7 @@ BAD_INPUT_REASONS = frozenset(
 
 def add_image_flags(parser: argparse.ArgumentParser) -> None:
     """Flags of every command that reads images."""
-    parser.add_argument("images", nargs="+", metavar="IMAGE", help="PNG, TIFF, FITS or JPEG")
+    parser.add_argument("images", nargs="+", metavar="IMAGE", help="PNG, TIFF, FITS, JPEG or camera raw")
     add_fact_flags(parser)
     add_output_flags(parser)
 

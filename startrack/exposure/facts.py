@@ -17,10 +17,12 @@ from startrack.types import BadInput, Exposure
 
 # Names in a header (FITS keywords, PNG text chunks, TIFF description) and what each stands for. The sidecar's own names
 # are understood there too, except in FITS, where a card called CAMERA is common and names the hardware.
-HEADER_KEYS = {k: k for k in ("DATE-AVG", "DATE-OBS", "TIMESYS", "EXPTIME", "STCAMERA", "STTERRAI")}
+HEADER_KEYS = {k: k for k in ("DATE-AVG", "DATE-OBS", "TIMESYS", "EXPTIME", "STCAMERA", "STTERRAI", "BAYERPAT")}
 SIDECAR_KEYS = {"time_utc": "DATE-AVG", "exposure_s": "EXPTIME", "camera": "STCAMERA", "terrain": "STTERRAI"}
+SIDECAR_KEYS |= {"bayer_pattern": "BAYERPAT"}
 HEADER_KEYS |= SIDECAR_KEYS
-PICTURE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".fits", ".fit", ".fts"}
+RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".crw", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"}
+PICTURE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".fits", ".fit", ".fts"} | RAW_SUFFIXES
 PACKING_SUFFIXES = {".gz", ".bz2", ".fz"}
 MAX_EXPOSURE_S = 1e6
 MAX_SIDECAR_BYTES = 2**20
@@ -34,6 +36,7 @@ class Facts:
     exposure_s: float | None = None
     camera: str | None = None  # path, or name of a shipped file
     terrain: str | None = None  # path, or name of a shipped file
+    bayer_pattern: str | None = None  # RGGB and the like: the pixels are a mosaic of colours
     warnings: tuple[str, ...] = ()  # what was found and not used, and why
 
 
@@ -82,6 +85,7 @@ def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts
         terrain=given.terrain
         or _sidecar_reference(sidecar, values, "terrain")
         or _header_reference(image, header, "STTERRAI", notes),
+        bayer_pattern=_sidecar_pattern(sidecar, values.get("bayer_pattern")) or _header_pattern(header, notes),
         warnings=tuple(notes),
     )
 
@@ -177,6 +181,26 @@ def _header_reference(image: Path, header: Mapping[str, Any], key: str, notes: l
         notes.append(f"{key} is no name of a file; not used")
         return None
     return _from_folder(image, value) if value else None
+
+
+def _sidecar_pattern(sidecar: Path, value: object) -> str | None:
+    if value is None:
+        return None
+    if not _is_pattern(value):
+        raise _bad_sidecar(sidecar, f"bayer_pattern is {str(value)[:40]!r}, not like RGGB")
+    return str(value).upper()
+
+
+def _header_pattern(header: Mapping[str, Any], notes: list[str]) -> str | None:
+    value = str(header.get("BAYERPAT") or "").strip().upper()
+    if not value or _is_pattern(value):
+        return value or None
+    notes.append(f"BAYERPAT {value[:40]!r} is not like RGGB; not used")
+    return None
+
+
+def _is_pattern(value: object) -> bool:
+    return isinstance(value, str) and sorted(value.strip().upper()) == sorted("RGGB")
 
 
 def _from_folder(file: Path, reference: str) -> str:

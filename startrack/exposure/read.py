@@ -9,8 +9,11 @@ import warnings
 from datetime import datetime
 from pathlib import Path
 
-from startrack.exposure.decoded import MAX_FILE_BYTES, Decoded, refuse, shown
-from startrack.exposure.facts import Facts, resolve_facts, stem
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.exposure.decoded import COLOUR_WARNING, MAX_FILE_BYTES, Decoded, refuse, shown
+from startrack.exposure.facts import RAW_SUFFIXES, Facts, resolve_facts, stem
 from startrack.types import BadInput, Exposure
 
 PNG = (b"\x89PNG\r\n\x1a\n",)
@@ -27,7 +30,7 @@ def read_exposure(
     camera: str | None = None,
     terrain: str | None = None,
 ) -> Exposure:
-    """The image at `path` (PNG, TIFF, JPEG or FITS, told by content) with its facts.
+    """The image at `path` (PNG, TIFF, JPEG or FITS, told by content, or camera raw) with its facts.
 
     Pixels are the counts in the file, 16 bits kept; pixel (0, 0) is the first of the first row stored, whatever an
     orientation tag says, and in FITS too. The keyword facts, if given, go before those of sidecar and header, which
@@ -38,13 +41,14 @@ def read_exposure(
     """
     try:
         raw = _read_bytes(path)
-        decoded = _decode(raw)
+        decoded = _decode(raw, Path(path).suffix.lower() in RAW_SUFFIXES)
     except BadInput as error:
         raise BadInput(error.reason, " ".join(f"{shown(path)}: {error}".split())) from error
     given = Facts(time_utc=time_utc, exposure_s=exposure_s, camera=camera, terrain=terrain)
     facts = resolve_facts(Path(path), decoded.header, given)
+    pixels, notes = _of_one_colour(decoded, facts)
     return Exposure(
-        pixels_adu=decoded.pixels_adu,
+        pixels_adu=pixels,
         name=stem(Path(path)),
         path=os.fspath(path),
         time_utc=facts.time_utc,
@@ -53,8 +57,18 @@ def read_exposure(
         terrain=facts.terrain,
         saturation_adu=decoded.saturation_adu,
         sha256=hashlib.sha256(raw).hexdigest(),
-        warnings=decoded.warnings + facts.warnings,
+        warnings=decoded.warnings + notes + facts.warnings,
     )
+
+
+def _of_one_colour(decoded: Decoded, facts: Facts) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+    """The pixels with a mosaic's colours evened out, and a warning that they were."""
+    colour_already = decoded.mosaic is None and COLOUR_WARNING in decoded.warnings
+    if colour_already or not (decoded.mosaic or facts.bayer_pattern):
+        return decoded.pixels_adu, ()
+    from startrack.exposure.mosaic import MOSAIC_WARNING, evened
+
+    return evened(decoded.pixels_adu, decoded.saturation_adu), (MOSAIC_WARNING,)
 
 
 def _read_bytes(path: str | os.PathLike[str]) -> bytes:
@@ -75,11 +89,17 @@ def _read_bytes(path: str | os.PathLike[str]) -> bytes:
         raise refuse(f"cannot be opened ({error})") from error
 
 
-def _decode(raw: bytes) -> Decoded:
-    """Only `BadInput` leaves: a decoder fed with damaged bytes raises whatever it pleases."""
+def _decode(raw: bytes, of_camera: bool) -> Decoded:
+    """Camera raw files are told by their suffix: within they are TIFFs, with a thumbnail where the picture should be.
+
+    Only `BadInput` leaves: a decoder fed with damaged bytes raises whatever it pleases."""
     kind, decode = "image", _unknown
     try:
-        if raw.startswith(PNG):
+        if of_camera:
+            from startrack.exposure.camera_raw import decode_camera_raw
+
+            kind, decode = "camera raw file", decode_camera_raw
+        elif raw.startswith(PNG):
             from startrack.exposure.png import decode_png
 
             kind, decode = "PNG", decode_png
@@ -105,4 +125,4 @@ def _decode(raw: bytes) -> Decoded:
 
 
 def _unknown(raw: bytes) -> Decoded:
-    raise refuse("is not a PNG, TIFF, JPEG or FITS file")
+    raise refuse("is not a PNG, TIFF, JPEG or FITS file, nor named as a camera raw file")

@@ -23,8 +23,9 @@ from startrack.exposure.decoded import (
 )
 from startrack.exposure.facts import facts_in_text
 
-MINISWHITE, MINISBLACK, RGB = 0, 1, 2
-REFUSED = {MINISWHITE: "white-is-zero", 3: "palette", 4: "a mask", 5: "CMYK", 6: "YCbCr", 8: "CIELab", 32803: "Bayer"}
+MINISWHITE, MINISBLACK, RGB, MOSAIC = 0, 1, 2, 32803
+REFUSED = {MINISWHITE: "white-is-zero", 3: "palette", 4: "a mask", 5: "CMYK", 6: "YCbCr", 8: "CIELab"}
+CHANNELS = {MINISBLACK: 1, MOSAIC: 1, RGB: 3}
 UNCOMPRESSED = 1
 WITHOUT_IMAGECODECS = {UNCOMPRESSED, 8, 32946, 32773}  # deflate twice, PackBits: tifffile needs nothing more for these
 HORIZONTAL = 2  # the predictor it has by itself
@@ -47,13 +48,14 @@ def decode_tiff(raw: bytes) -> Decoded:
         _check_strips(page, len(raw))
         stored = _pixels(page, raw)
         orientation = page.tags.get(274)
-        header = facts_in_text(page.description)
+        header, mosaic = facts_in_text(page.description), int(page.photometric) == MOSAIC
     pixels, colour = grey_float32(stored)
     return Decoded(
         pixels_adu=pixels,
         saturation_adu=largest_value(stored.dtype),
         header=header,
         warnings=orientation_warnings(None if orientation is None else int(orientation.value)) + colour,
+        mosaic=mosaic or None,
     )
 
 
@@ -90,10 +92,10 @@ def _only_page(tiff: Any) -> Any:
 
 def _check_kind(page: Any) -> None:
     photometric, channels = int(page.photometric), page.samplesperpixel
-    if photometric not in (MINISBLACK, RGB):
+    if photometric not in CHANNELS:
         kind = REFUSED.get(photometric, f"photometric type {photometric}")
         raise refuse(f"TIFF is {kind}; startrack reads plain grey or colour")
-    if channels != {MINISBLACK: 1, RGB: 3}[photometric]:
+    if channels != CHANNELS[photometric]:
         raise refuse(f"TIFF has {channels} channels (alpha?); startrack reads plain grey or colour")
     if page.imagedepth != 1:
         raise refuse("TIFF holds a volume; startrack reads pictures")

@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -145,10 +151,35 @@ def test_a_changed_sidecar_or_flag_is_another_task(night, tmp_path):
     assert (refused["status"], refused["reason"]) == ("refused", "no_calibration")
 
 
-def test_dask_gives_the_same_as_the_local_run(night, done):
+def test_dask_gives_the_same_as_the_local_run_though_a_worker_is_killed(night, done):
     distributed = pytest.importorskip("distributed")
-    out = night / "dask"
+    out, killed = night / "dask", []
     with distributed.LocalCluster(2, processes=True, threads_per_worker=1, dashboard_address=None) as cluster:
+
+        def kill_a_busy_worker() -> None:
+            with distributed.Client(cluster.scheduler_address) as client:
+                while not (busy := [address for address, tasks in client.processing().items() if tasks]):
+                    time.sleep(0.01)
+                pids = client.run(os.getpid)
+                killed.append(pids[busy[0]])
+            os.kill(killed[0], signal.SIGKILL)
+
+        killer = threading.Thread(target=kill_a_busy_worker)
+        killer.start()
         command = ["batch", str(night / "images"), "-D", str(out), "-q", "--cluster", cluster.scheduler_address]
         assert main(command) == 5
+        killer.join()
+    assert killed
+    assert tables(out) == tables(done)
+
+
+def test_killed_at_any_moment_a_batch_is_taken_up_again(night, done):
+    out, command = night / "killed", [sys.executable, "-m", "startrack.cli.main", "batch", str(night / "images"), "-q"]
+    for results in (1, 2):
+        process = subprocess.Popen([*command, "-D", str(out), "-j", "2"])
+        while process.poll() is None and len(list(out.rglob("*.fix.json"))) < results:
+            time.sleep(0.01)
+        process.kill()
+        process.wait()
+    assert main(["batch", str(night / "images"), "-D", str(out), "-j", "2", "-q"]) == 5
     assert tables(out) == tables(done)

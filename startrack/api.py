@@ -4,32 +4,25 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from startrack import pipeline
-from startrack.camera import Camera, load_camera
+from startrack.camera import Camera
 from startrack.catalog import load_catalog
-from startrack.exposure import read_exposure, with_facts
-from startrack.frames import parse_utc
+from startrack.given import Picture, When, angle_rad, given_camera, given_exposure, given_terrain
 from startrack.report import result_dict, summary_line, verbose_text, write_json, write_results
 from startrack.report.result import boresight_rad, detection_dict, identification_dict
-from startrack.terrain import Terrain, load_terrain
-from startrack.types import Array, BadInput, Exposure
+from startrack.terrain import Terrain
+from startrack.types import Array
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
     from astropy.table import QTable
     from astropy.time import Time
-
-    When: TypeAlias = str | datetime | Time | None
-
-Picture = str | os.PathLike[str] | NDArray[Any] | Exposure
+    from astropy.units import Quantity
 
 
 @dataclass(frozen=True, repr=False)
@@ -152,58 +145,27 @@ def locate(
     given comes from the image's sidecar or header. Raises BadInput for a file that cannot be used; a picture that
     cannot be solved gives a Solution that says why.
     """
-    exposure = _exposure(image, time)
-    found = pipeline.locate(exposure, _camera(camera, exposure), _terrain(terrain, exposure), load_catalog(), settings)
-    return Solution(found)
+    exposure = given_exposure(image, time)
+    known = given_camera(camera, exposure), given_terrain(terrain, exposure)
+    return Solution(pipeline.locate(exposure, *known, load_catalog(), settings))
 
 
-def identify(image: Picture, *, camera: str | Camera | None = None, time: When = None) -> Solution:
-    """Stars and attitude only: no terrain needed, nor a time."""
-    exposure = _exposure(image, time)
-    return Solution(pipeline.identify(exposure, _camera(camera, exposure), load_catalog()))
+def identify(
+    image: Picture, *, camera: str | Camera | None = None, time: When = None, fov: float | Quantity | None = None
+) -> Solution:
+    """Stars and attitude only: no terrain needed, nor a time.
+
+    With `fov` no camera either: an angle, or a number of degrees, good to 10 %; across the image's width below 100
+    degrees, else across the image circle. The lens found is then `solution.result.camera`.
+    """
+    exposure = given_exposure(image, time)
+    if fov is not None:
+        return Solution(pipeline.identify_blind(exposure, angle_rad(fov), load_catalog()))
+    return Solution(pipeline.identify(exposure, given_camera(camera, exposure), load_catalog()))
 
 
 def detect(image: Picture, *, camera: str | Camera | None = None) -> Solution:
     """Centroids only; with a camera their fluxes are in electrons."""
-    exposure = _exposure(image, None)
+    exposure = given_exposure(image, None)
     known = camera is not None or exposure.camera is not None
-    return Solution(pipeline.detect(exposure, _camera(camera, exposure) if known else None))
-
-
-def _exposure(image: Picture, time: Any) -> Exposure:
-    time_utc = _utc(time)
-    if isinstance(image, Exposure):
-        return with_facts(image, time_utc=time_utc)
-    if isinstance(image, np.ndarray):
-        whole = np.issubdtype(image.dtype, np.integer)
-        largest = float(np.iinfo(image.dtype).max) if whole else None
-        return Exposure(pixels_adu=image, name="array", time_utc=time_utc, saturation_adu=largest)
-    return read_exposure(image, time_utc=time_utc)
-
-
-def _utc(time: Any) -> datetime | None:
-    if time is None:
-        return None
-    if isinstance(time, str):
-        return parse_utc(time)
-    if isinstance(time, datetime):
-        if time.tzinfo is None:
-            raise BadInput("no_time", f"{time} has no time zone: give UTC")
-        return time.astimezone(UTC)
-    return parse_utc(time.utc.isot)  # astropy's Time, whatever its scale
-
-
-def _camera(camera: str | Camera | None, exposure: Exposure) -> Camera:
-    if isinstance(camera, Camera):
-        return camera
-    reference = camera if camera is not None else exposure.camera
-    if reference is None:
-        raise BadInput("no_calibration", "no camera is known: give camera=")
-    return load_camera(str(reference))
-
-
-def _terrain(terrain: str | Terrain | None, exposure: Exposure) -> Terrain:
-    reference = terrain if terrain is not None else exposure.terrain
-    if reference is None:
-        raise BadInput("bad_terrain", "no terrain is known: give terrain=")
-    return load_terrain(str(reference)) if isinstance(reference, str | os.PathLike) else reference
+    return Solution(pipeline.detect(exposure, given_camera(camera, exposure) if known else None))

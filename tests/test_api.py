@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +12,13 @@ from astropy import units as u
 from astropy.time import Time
 
 import startrack
+import startrack.api
 from startrack.errors import BadInput
 from startrack.exposure import read_exposure
+from startrack.given import given_exposure
 
 IMAGE = "sample_images/near-wall.png"
+LOWELL = "sample_images/lowell-2018-08-06.fits.bz2"
 TRUTH_M = np.array([-6900.0, 4700.0])
 
 
@@ -76,3 +80,39 @@ def test_importing_startrack_loads_nothing_heavy():
     code = "import startrack, sys; print('numpy' in sys.modules, startrack.__version__)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.startswith("False")
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ({"image": np.zeros((64, 64, 4), np.uint8)}, "bad_image"),
+        ({"image": np.zeros((64, 64), complex)}, "bad_image"),
+        ({"image": np.full((64, 64), np.nan)}, "bad_image"),
+        ({"image": 7}, "bad_image"),
+        ({"image": [["a"]]}, "bad_image"),
+        ({"image": IMAGE, "time": 2461000.5}, "no_time"),
+        ({"image": IMAGE, "time": Time(["2030-01-01", "2030-01-02"])}, "no_time"),
+        ({"image": IMAGE, "camera": 5}, "bad_calibration"),
+        ({"image": IMAGE, "terrain": 5}, "bad_terrain"),
+    ],
+)
+def test_odd_things_are_refused_with_a_reason(given, reason):
+    with pytest.raises(BadInput) as caught:
+        startrack.locate(**given)
+    assert caught.value.reason == reason
+
+
+def test_colours_lists_and_paths_are_pictures():
+    pixels = np.full((64, 64, 3), 300, np.uint16)
+    assert "mean of its three channels" in given_exposure(pixels, None).warnings[0]
+    assert given_exposure(pixels[..., 0].tolist(), None).size_px == (64, 64)
+    assert given_exposure(Path(IMAGE), None).name == "near-wall"
+
+
+def test_a_field_of_view_stands_in_for_a_camera():
+    found = startrack.api.identify(LOWELL, fov=180 * u.deg)
+    assert found
+    assert found.result.camera is not None
+    assert len(found.result.identification.star) > 1000
+    with pytest.raises(BadInput, match="no field of view"):
+        startrack.api.identify(IMAGE, fov="wide")

@@ -20,7 +20,7 @@ LAYERS = (  # lowest first; a room imports from lower layers only
     {"frames"},
     {"psf", "body_angles", "catalog", "deep_catalog", "bodies", "camera", "terrain", "exposure"},
     {"render", "detect", "identify", "orient", "evidence", "localize"},
-    {"pipeline", "calibrate"},
+    {"pipeline", "calibrate", "given"},
     {"report"},
     {"reproduce", "batch", "page", "api"},
     {"cli"},

@@ -6,7 +6,7 @@ sees `startrack.types.BadInput` and nothing else.
 """
 
 from startrack.exposure.facts import Facts, with_facts
-from startrack.exposure.read import read_exposure
+from startrack.exposure.read import exposure_of, read_exposure
 from startrack.exposure.write import write_atomically, write_exposure, write_sidecar
 
-__all__ = ["Facts", "read_exposure", "with_facts", "write_atomically", "write_exposure", "write_sidecar"]
+__all__ = ["Facts", "exposure_of", "read_exposure", "with_facts", "write_atomically", "write_exposure", "write_sidecar"]

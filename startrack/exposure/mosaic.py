@@ -28,7 +28,7 @@ def evened(pixels_adu: Picture, saturation_adu: float | None) -> Picture:
     if min(pixels_adu.shape) < 4 * BLOCK_PX:
         return pixels_adu  # too small to hold stars of every phase
     levels = [_level(pixels_adu[i::2, j::2]) for i, j in PHASES]
-    common = np.mean(levels, axis=0, dtype=np.float64).astype(np.float32)
+    common = np.asarray(np.mean(levels, axis=0), dtype=np.float32)
     excess = np.empty_like(pixels_adu)
     for (i, j), level in zip(PHASES, levels, strict=True):
         phase = pixels_adu[i::2, j::2]

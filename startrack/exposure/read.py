@@ -8,11 +8,21 @@ import stat
 import warnings
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.exposure.decoded import COLOUR_WARNING, MAX_FILE_BYTES, Decoded, refuse, shown
+from startrack.exposure.decoded import (
+    COLOUR_WARNING,
+    MAX_FILE_BYTES,
+    Decoded,
+    check_size,
+    grey_float32,
+    largest_value,
+    refuse,
+    shown,
+)
 from startrack.exposure.facts import RAW_SUFFIXES, Facts, resolve_facts, stem
 from startrack.types import BadInput, Exposure
 
@@ -59,6 +69,17 @@ def read_exposure(
         sha256=hashlib.sha256(raw).hexdigest(),
         warnings=decoded.warnings + notes + facts.warnings,
     )
+
+
+def exposure_of(pixels: NDArray[Any], *, time_utc: datetime | None = None, name: str = "array") -> Exposure:
+    """Raw counts (H, W), or colours (H, W, 3), as an exposure without other facts. Raises BadInput (bad_image)."""
+    flat_grey = pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)
+    if not flat_grey or pixels.dtype.kind not in "uif":
+        raise refuse(f"an array of {pixels.dtype} {pixels.shape}; startrack takes numbers (H, W) or (H, W, 3)")
+    check_size(pixels.shape[1], pixels.shape[0])
+    grey, notes = grey_float32(pixels)
+    saturation = largest_value(pixels.dtype)
+    return Exposure(pixels_adu=grey, name=name, time_utc=time_utc, saturation_adu=saturation, warnings=notes)
 
 
 def _of_one_colour(decoded: Decoded, facts: Facts) -> tuple[NDArray[np.float32], tuple[str, ...]]:

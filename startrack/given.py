@@ -1,0 +1,94 @@
+"""What a caller of the library may give for a picture, a time, a camera and a terrain, made into the values inside."""
+
+from __future__ import annotations
+
+import math
+import os
+from datetime import UTC, datetime
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from startrack.camera import Camera, load_camera
+from startrack.exposure import exposure_of, read_exposure, with_facts
+from startrack.frames import parse_utc
+from startrack.terrain import Terrain, load_terrain
+from startrack.types import BadInput, Exposure
+
+Picture: TypeAlias = str | os.PathLike[str] | ArrayLike | Exposure
+When: TypeAlias = Any  # text, datetime, astropy Time (not imported for a type alone), or None
+
+
+def given_exposure(image: Picture, time: When) -> Exposure:
+    """A file's, an array's (H, W) or (H, W, 3), or the exposure itself, at `time` where that is given.
+
+    Raises BadInput (bad_image, no_time).
+    """
+    time_utc = utc(time)
+    if isinstance(image, Exposure):
+        return with_facts(image, time_utc=time_utc)
+    if isinstance(image, str | os.PathLike):
+        return read_exposure(image, time_utc=time_utc)
+    try:
+        pixels = np.asarray(image)
+    except (TypeError, ValueError) as cause:
+        raise BadInput("bad_image", f"{type(image).__name__} is neither a file nor an array of pixels") from cause
+    return exposure_of(pixels, time_utc=time_utc)
+
+
+def utc(time: When) -> datetime | None:
+    """Text, datetime or astropy Time (any scale) as UTC. Raises BadInput (no_time) for anything else."""
+    if time is None:
+        return None
+    if isinstance(time, str):
+        return parse_utc(time)
+    if isinstance(time, datetime):
+        if time.tzinfo is None:
+            raise BadInput("no_time", f"{time} has no time zone: give UTC")
+        return time.astimezone(UTC)
+    moment = getattr(getattr(time, "utc", None), "isot", None)
+    if not isinstance(moment, str):
+        raise BadInput("no_time", f"{time!r} is no time: give text, a datetime or one astropy Time")
+    return parse_utc(moment)
+
+
+def given_camera(camera: str | os.PathLike[str] | Camera | None, exposure: Exposure) -> Camera:
+    """The camera, the one of a file or a shipped name, or the one that the exposure names.
+
+    Raises BadInput (no_calibration, bad_calibration).
+    """
+    if isinstance(camera, Camera):
+        return camera
+    reference = camera if camera is not None else exposure.camera
+    if reference is None:
+        raise BadInput("no_calibration", "no camera is known: give camera=")
+    if not isinstance(reference, str | os.PathLike):
+        raise BadInput("bad_calibration", f"{type(reference).__name__} is no camera: give a file, a name or a Camera")
+    return load_camera(os.fspath(reference))
+
+
+def given_terrain(terrain: str | os.PathLike[str] | Terrain | None, exposure: Exposure) -> Terrain:
+    """The terrain, the one of a file or a shipped name, or the one that the exposure names.
+
+    Raises BadInput (bad_terrain).
+    """
+    reference = terrain if terrain is not None else exposure.terrain
+    if reference is None:
+        raise BadInput("bad_terrain", "no terrain is known: give terrain=")
+    if isinstance(reference, str | os.PathLike):
+        return load_terrain(os.fspath(reference))
+    if not hasattr(reference, "horizon_bounds_rad"):
+        raise BadInput("bad_terrain", f"{type(reference).__name__} is no terrain: give a file, a name or a Terrain")
+    return reference
+
+
+def angle_rad(angle: Any) -> float:
+    """An astropy angle, or a number of degrees [rad]. Raises BadInput (no_calibration) where it is neither."""
+    try:
+        size = float(angle.to_value("rad")) if hasattr(angle, "to_value") else math.radians(angle)
+    except (TypeError, ValueError) as cause:
+        raise BadInput("no_calibration", f"{angle!r} is no field of view: give degrees or an angle") from cause
+    if not 0 < size <= 2 * math.pi:
+        raise BadInput("no_calibration", f"a field of view of {math.degrees(size):g} degrees: give 0 to 360")
+    return size

@@ -16,7 +16,6 @@ from startrack.catalog import load_catalog
 from startrack.frames import angle_between_rad
 from startrack.identify import Identifier
 from startrack.identify.chance import ChanceModel
-from startrack.identify.pairs import build_pairs
 from startrack.identify.triangles import triangles
 from startrack.types import Detections, Identification, NotIdentified, Stars
 
@@ -325,22 +324,3 @@ def test_few_rays_make_no_triangles_and_a_cap_keeps_the_brightest() -> None:
     capped = triangles(rays_about(30, 0.3, 5), 0.6, most=200)
     assert len(capped) <= 200
     assert capped.vertices.max() < 15
-
-
-@pytest.mark.parametrize(("field_sr", "least"), [(2 * np.pi, 50_000), (0.12, 20_000)])
-def test_pairs_are_those_of_a_brute_force_search(field_sr: float, least: int) -> None:
-    index = build_pairs(sky(), field_sr)
-    assert len(index.pairs) > least
-    assert np.all(np.diff(index.sides_rad) >= 0)
-    some = np.random.default_rng(6).integers(len(index.pairs), size=200)
-    a, b = index.rays_icrs[index.pairs[some]].swapaxes(0, 1)
-    assert index.sides_rad[some] == pytest.approx(angle_between_rad(a, b), abs=1e-12)
-    rays = rays_about(5, 0.3, 7) if field_sr > 1 else rays_about(5, 0.1, 7)
-    tolerance = 2e-3
-    image, catalogue = index.candidates(rays, tolerance)
-    expected = 0
-    for i, j in combinations(range(5), 2):
-        side = float(angle_between_rad(rays[i], rays[j]))
-        if index.narrowest_rad < side < index.widest_rad:
-            expected += 2 * int(np.count_nonzero(np.abs(index.sides_rad - side) <= tolerance))
-    assert len(image) == len(catalogue) == expected

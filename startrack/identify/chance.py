@@ -2,48 +2,29 @@
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache
-from typing import Any
-
 import numpy as np
 
 from startrack.types import Array, Ints
 
-MOST_WITHOUT_TREE = 800
-GRID_POINTS = 600
-NEIGHBOURHOOD_RAD = np.radians(10.0)
+MOST_CENTRES = 128
+WIDEST_NEIGHBOURHOOD_RAD = np.radians(10.0)
 
 
 class ChanceModel:
     """Expected number of chance coincidences between predicted stars and detections.
 
     Detections cluster (walls, clouds and trees leave part of the field empty), so the density that counts is the one
-    met where the detections are: of counts c on a grid of overlapping caps, sum c (c - 1) over sum c.
+    met where the detections are: the mean number of others in a cap about each of them.
     """
 
-    def __init__(self, detection_rays: Array) -> None:
-        self.rays = detection_rays
-        counts = self._counts(_fibonacci_sphere(GRID_POINTS))
-        cap_sr = 2 * np.pi * (1 - np.cos(NEIGHBOURHOOD_RAD))
-        occupied = float(np.sum(counts))
-        typical = float(np.sum(counts * (counts - 1.0))) / occupied if occupied else 0.0
-        self.density_per_sr = max(typical / cap_sr, len(detection_rays) / (4 * np.pi))
-
-    @cached_property
-    def tree(self) -> Any:
-        """scipy.spatial.cKDTree over the detections' rays."""
-        from scipy.spatial import cKDTree
-
-        return cKDTree(self.rays)
-
-    def _counts(self, centres: Array) -> Array:
-        """Detections in the cap about each of the centres (m, 3)."""
-        if len(self.rays) <= MOST_WITHOUT_TREE:  # all against all is quicker than a tree
-            near = centres @ self.rays.T > np.cos(NEIGHBOURHOOD_RAD)
-            return (near.astype(np.float32) @ np.ones(len(self.rays), dtype=np.float32)).astype(np.float64)
-        chord = 2 * np.sin(NEIGHBOURHOOD_RAD / 2)
-        found: Array = self.tree.query_ball_point(centres, chord, return_length=True)
-        return found.astype(np.float64)
+    def __init__(self, detection_rays: Array, within_rad: float = WIDEST_NEIGHBOURHOOD_RAD) -> None:
+        """Of the rays (n, 3); caps of radius `within_rad`, small against the field."""
+        n = len(detection_rays)
+        centres = detection_rays[:: -(-n // MOST_CENTRES)] if n else detection_rays
+        near = np.count_nonzero(centres @ detection_rays.T > np.cos(within_rad))
+        others = near / len(centres) - 1.0 if n else 0.0
+        cap_sr = 4 * np.pi * np.sin(within_rad / 2) ** 2
+        self.density_per_sr = max(float(others / cap_sr), n / (4 * np.pi))
 
     def probability(self, radius_rad: Array | float) -> Array:
         """Probability that at least one detection lies within the radius of a random direction among the detections."""
@@ -61,13 +42,3 @@ class ChanceModel:
         # The binomial tail as an incomplete beta function: P(X >= k) = I_p(k, n - k + 1).
         tail = betainc(np.maximum(k, 1), np.maximum(n - k, 0) + 1, alike * self.probability(radius_rad))
         return np.where(k > 0, np.log(np.maximum(tail, 1e-300)), 0.0)
-
-
-@lru_cache(maxsize=1)
-def _fibonacci_sphere(n: int) -> Array:
-    """Nearly even unit vectors (n, 3)."""
-    i = np.arange(n) + 0.5
-    z = 1 - 2 * i / n
-    azimuth = np.pi * (1 + np.sqrt(5.0)) * i
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], axis=1)

@@ -12,10 +12,9 @@ from startrack.camera import Camera
 from startrack.identify.family import Family, angle
 from startrack.identify.grow import Start
 from startrack.identify.index import bright_stars_apart
-from startrack.identify.search import triad
 from startrack.identify.similar import SimilarTriangles, similar_triangles
 from startrack.identify.skymap import SkyMap, sky_map
-from startrack.identify.triangles import Triangles, triangles
+from startrack.identify.triangles import Triangles, triad, triangles
 from startrack.types import Array, Bools, Ints, Stars
 
 HEMISPHERE_SR = 2 * np.pi

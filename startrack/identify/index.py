@@ -1,85 +1,84 @@
-"""The catalogue's triangles in a k-d tree: asked with the sides of an image's triangle, it answers with stars."""
+"""The catalogue's side of an identification: triangles of bright stars by their sides, and trees of stars by depth."""
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass
-from itertools import chain
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from startrack.identify.triangles import Triangles, triangles
+from startrack.identify.kept import KeptPerObject
+from startrack.identify.triangles import triangles
 from startrack.types import Array, Ints, Stars
 
-NEIGHBOURS_WANTED = 18.0  # pattern stars within the reach of each: enough triangles with most of the sky hidden
-WIDEST_REACH_RAD = np.radians(40.0)
-LEAN_STARS_IN_FIELD, FEWEST_LEAN_STARS, MOST_LEAN_STARS = 20, 150, 2500
-LEAN_TRIANGLES = 120_000
-WIDEST_LEAN_REACH_RAD = np.radians(75.0)
-FEW_TRIANGLES = 2000  # up to which one look-up each is quicker than a tree of their own
+if TYPE_CHECKING:
+    from startrack.identify.pairs import PairIndex
+
 CLOSE_PAIR_RAD = np.radians(0.05)
+SHALLOWEST = 1000  # brightest stars in the smallest tree; each next one holds twice as many
+NEIGHBOURS = 10  # of a ray; more only in clusters
+KEPT_PATTERNS = 4
+WHOLE_FIELD = 0.8  # of a field's diameter: sides that often fit into it
+CLOSED = 0.59  # of two neighbours of a star in the plane, the probability that they are each other's
+
+
+@dataclass(frozen=True)
+class PatternSize:
+    """How many stars form how many triangles."""
+
+    stars_in_field: int
+    fewest: int  # of the whole sky
+    most: int
+    triangles: int
+    widest_rad: float
+
+
+# The brightest few, with sides nearly as long as the field allows: so long a triangle leaves little to chance.
+BRIGHT = PatternSize(20, 150, 40_000, 200_000, np.radians(75.0))
+# More stars, shorter sides: where walls, clouds or false stars leave too few of the brightest.
+DEEP = PatternSize(60, 700, 60_000, 400_000, np.radians(45.0))
 
 
 @dataclass(frozen=True)
 class PatternIndex:
-    """Triangles of the `depth` brightest stars of the sky."""
+    """Triangles of the brightest stars of the sky, found by their sides: chords, which no arctangent slows down."""
 
     star: Ints  # (m,) indices of the pattern stars in Stars
     rays_icrs: Array  # (m, 3)
-    reach_rad: float
-    triangles: Triangles
-    tree: Any  # scipy.spatial.cKDTree over the triangles' sides
+    reach: float  # longest side
+    vertices: Ints  # (n, 3) indices into rays_icrs, ordered by the opposite side, shortest first
+    handed: Array  # (n,) sign of the triple product
+    tree: Any  # scipy.spatial.cKDTree over the sides (n, 3), ascending
 
-    def candidates(self, image: Triangles, tolerance_rad: float) -> tuple[Ints, Ints]:
-        """Pairs (image triangle, catalogue triangle) that agree in handedness and, within the tolerance, in sides."""
-        from scipy.spatial import cKDTree
+    def candidates(self, sides: Array, tolerance: float, most: int) -> tuple[Ints, Ints]:
+        """Pairs (row of the sides (m, 3), triangle) that agree within the tolerance; the closest, largest ones first.
 
-        if not len(image) or not len(self.triangles):
-            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-        if len(image) <= FEW_TRIANGLES:
-            hits = list(self.tree.query_ball_point(image.sides_rad, tolerance_rad, p=np.inf))
-        else:
-            hits = cKDTree(image.sides_rad).query_ball_tree(self.tree, tolerance_rad, p=np.inf)
-        left = np.repeat(np.arange(len(hits)), list(map(len, hits)))
-        right = np.array(list(chain.from_iterable(hits)), dtype=np.int64)
-        agree = image.handed[left] == self.triangles.handed[right]
-        return left[agree], right[agree]
+        At most `most` of each row: one look-up of fixed size takes a tenth of the time of a complete one.
+        """
+        distance, found = self.tree.query(sides, most, p=np.inf, distance_upper_bound=tolerance)
+        distance = distance.ravel()
+        close = np.flatnonzero(distance < tolerance)
+        close = close[np.argsort(distance[close] / sides[close // most, 2])]
+        return close // most, found.ravel()[close]
 
 
-def build_index(stars: Stars, field_sr: float) -> PatternIndex:
-    """Index over the brightest stars (sorted, brightest first), deep enough for a camera that sees `field_sr`.
-
-    Wide fields need few stars and long sides, narrow ones many stars and short sides.
-    """
+def build_index(stars: Stars, field_sr: float, size: PatternSize) -> PatternIndex:
+    """The index of the brightest stars (sorted, brightest first) for a camera that sees `field_sr`."""
     from scipy.spatial import cKDTree
 
-    depth = int(np.clip(300 * (2 * np.pi / field_sr) ** 0.8, 300, 12000))
-    star = bright_stars_apart(stars, depth)
+    star = bright_stars_apart(stars, int(np.clip(size.stars_in_field * 4 * np.pi / field_sr, size.fewest, size.most)))
     rays = stars.rays_icrs[star]
-    cap = NEIGHBOURS_WANTED / len(star)  # fraction of the sphere that holds the wanted number of neighbours
-    reach = min(WIDEST_REACH_RAD, 2 * np.arcsin(np.sqrt(cap)), 0.8 * np.sqrt(4 * field_sr / np.pi))
-    found = triangles(rays, reach)
-    return PatternIndex(star, rays, float(reach), found, cKDTree(found.sides_rad))
-
-
-def build_bright_index(stars: Stars, field_sr: float) -> PatternIndex:
-    """Index over the few brightest stars (sorted, brightest first), with sides nearly as long as the field allows.
-
-    A short list's brightest detections are among them, and so long a triangle leaves little to chance.
-    """
-    from scipy.spatial import cKDTree
-
-    depth = int(np.clip(LEAN_STARS_IN_FIELD * 4 * np.pi / field_sr, FEWEST_LEAN_STARS, MOST_LEAN_STARS))
-    star = bright_stars_apart(stars, depth)
-    rays = stars.rays_icrs[star]
-    neighbours = np.sqrt(LEAN_TRIANGLES * 6 / len(star))
+    neighbours = np.sqrt(6 * size.triangles / (CLOSED * len(star)))
     reach = min(
-        WIDEST_LEAN_REACH_RAD,
+        size.widest_rad,
         2 * np.arcsin(np.sqrt(min(neighbours / len(star), 1.0))),
-        0.8 * np.sqrt(4 * field_sr / np.pi),
+        WHOLE_FIELD * np.sqrt(4 * field_sr / np.pi),
     )
     found = triangles(rays, reach)
-    return PatternIndex(star, rays, float(reach), found, cKDTree(found.sides_rad))
+    sides = 2 * np.sin(found.sides_rad / 2)
+    return PatternIndex(star, rays, float(2 * np.sin(reach / 2)), found.vertices, found.handed, cKDTree(sides))
 
 
 def bright_stars_apart(stars: Stars, depth: int) -> Ints:
@@ -92,3 +91,84 @@ def bright_stars_apart(stars: Stars, depth: int) -> Ints:
     if len(pairs):
         keep[pairs.max(axis=1)] = False
     return np.flatnonzero(keep)[:depth]
+
+
+class Patterns:
+    """All of it for a camera that sees `field_sr`, worked out when first asked for."""
+
+    def __init__(self, stars: Stars, field_sr: float) -> None:
+        """`stars` are sorted, brightest first."""
+        self.stars, self.field_sr = stars, field_sr
+        self._trees: dict[int, Any] = {}
+
+    @cached_property
+    def bright(self) -> PatternIndex:
+        """Of the brightest few."""
+        return build_index(self.stars, self.field_sr, BRIGHT)
+
+    @cached_property
+    def deep(self) -> PatternIndex:
+        """Of more stars."""
+        return build_index(self.stars, self.field_sr, DEEP)
+
+    @cached_property
+    def pairs(self) -> PairIndex:
+        """Pairs of bright stars."""
+        from startrack.identify.pairs import build_pairs
+
+        return build_pairs(self.stars, self.field_sr)
+
+    def tree(self, count: int) -> Any:
+        """scipy.spatial.cKDTree of at least the `count` brightest stars: a short list needs only a shallow one."""
+        from scipy.spatial import cKDTree
+
+        level = SHALLOWEST << max((count - 1) // SHALLOWEST, 0).bit_length()
+        if level not in self._trees:
+            self._trees[level] = cKDTree(self.stars.rays_icrs[:level])
+        return self._trees[level]
+
+    def near(self, rays_icrs: Array, radius_rad: float, count: int) -> Near:
+        """All pairs of a ray (n, 3) and a star closer than the radius, of the `count` brightest stars and some more."""
+        return _near(self.tree(count), rays_icrs, 2 * np.sin(radius_rad / 2), NEIGHBOURS)
+
+
+@dataclass(frozen=True)
+class Near:
+    """Rays and the stars beside them."""
+
+    ray: Ints  # (k,) ascending
+    star: Ints  # (k,)
+    chord: Array  # (k,) between them
+    depth: int  # number of the brightest stars that were searched
+
+
+def _near(tree: Any, rays_icrs: Array, chord: float, most: int) -> Near:
+    distance, star = tree.query(rays_icrs, most, distance_upper_bound=chord)
+    close = np.flatnonzero(distance < chord)  # a missing neighbour is infinitely far
+    ray = close // most
+    near = Near(ray, star.ravel()[close], distance.ravel()[close], tree.n)
+    crowded = np.flatnonzero(distance[:, -1] < chord)
+    if not len(crowded):
+        return near
+    more = _near(tree, rays_icrs[crowded], chord, 4 * most)  # in star clusters
+    plain = np.isin(ray, crowded, invert=True)
+    ray = np.concatenate([ray[plain], crowded[more.ray]])
+    order = np.argsort(ray, kind="stable")
+    star = np.concatenate([near.star[plain], more.star])
+    distance = np.concatenate([near.chord[plain], more.chord])
+    return Near(ray[order], star[order], distance[order], near.depth)
+
+
+def patterns_of(stars: Stars, field_sr: float) -> Patterns:
+    """The patterns of these very stars; the last few are kept."""
+    key = (_fingerprint_of(stars), field_sr)
+    if key not in _KEPT:
+        _KEPT[key] = Patterns(stars, field_sr)
+        while len(_KEPT) > KEPT_PATTERNS:
+            _KEPT.popitem(last=False)
+    _KEPT.move_to_end(key)
+    return _KEPT[key]
+
+
+_KEPT: OrderedDict[tuple[object, float], Patterns] = OrderedDict()
+_fingerprint_of = KeptPerObject(lambda stars: (stars.rays_icrs.shape, stars.rays_icrs[:2000].tobytes()))

@@ -86,7 +86,7 @@ def alike(v_mag: Array, measured_mag: Array) -> float:
     ordered = np.sort(measured_mag)
     first = np.searchsorted(ordered, v_mag - MAGNITUDE_TOLERANCE)
     last = np.searchsorted(ordered, v_mag + MAGNITUDE_TOLERANCE)
-    return float(np.mean(last - first) / len(ordered)) if len(v_mag) else 1.0
+    return float((last - first).sum() / (len(v_mag) * len(ordered))) if len(v_mag) else 1.0
 
 
 def _nearest_of_each(detection: Ints, distance: Array) -> Ints:

@@ -1,4 +1,8 @@
-"""Pairs of the sky's brightest stars: for frames with too few stars for triangles of neighbours."""
+"""Triangles without a list of them: for frames with so few stars that no listed one is among them.
+
+Each star within reach of a pivot makes a pair, which the catalogue's pairs of equal length explain; two such pairs
+that share the pivot's star, and whose ends lie as far apart as in the image, make a triangle.
+"""
 
 from __future__ import annotations
 
@@ -11,57 +15,58 @@ from startrack.types import Array, Ints, Stars
 
 PAIRS_WANTED = 180_000
 DEEPEST = 5000
-NARROWEST_RAD = np.radians(8.0)  # closer pairs fix the roll poorly; less in small fields
 WIDEST_RAD = np.radians(110.0)
+NARROWEST_PART = 0.07  # of the widest; closer pairs fix the roll poorly
 
 
 @dataclass(frozen=True)
 class PairIndex:
-    """Pairs of bright stars, by separation."""
+    """Pairs of bright stars, by separation; both orders of each."""
 
-    star: Ints  # (m,) indices of the stars in Stars
     rays_icrs: Array  # (m, 3)
     pairs: Ints  # (k, 2) indices into rays_icrs
-    sides_rad: Array  # (k,) ascending
-    narrowest_rad: float
-    widest_rad: float
+    sides: Array  # (k,) chords, ascending
+    narrowest: float
 
-    def candidates(self, rays_cam: Array, tolerance_rad: float) -> tuple[Ints, Ints]:
-        """Pairs of the rays (n, 3) and of the catalogue (c, 2), (c, 2) whose sides agree, in both orders."""
-        i, j = np.triu_indices(len(rays_cam), 1)
-        side = _angle(rays_cam[i], rays_cam[j])
-        wide = (side > self.narrowest_rad) & (side < self.widest_rad)
-        i, j, side = i[wide], j[wide], side[wide]
-        first = np.searchsorted(self.sides_rad, side - tolerance_rad)
-        count = np.searchsorted(self.sides_rad, side + tolerance_rad) - first
-        own = np.repeat(np.arange(len(i)), count)
+    def triangles(self, rays_cam: Array, pivot: int, tolerance: float) -> tuple[Ints, Ints]:
+        """Triangles of the rays (n, 3), the pivot among them, and of the catalogue, (c, 3) each, whose sides agree."""
+        chords = np.linalg.norm(rays_cam[:, None] - rays_cam, axis=2)
+        wide = np.flatnonzero((chords[pivot] > self.narrowest) & (chords[pivot] < self.sides[-1] + tolerance))
+        first = np.searchsorted(self.sides, chords[pivot, wide] - tolerance)
+        count = np.searchsorted(self.sides, chords[pivot, wide] + tolerance) - first
         at = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
-        image = np.stack([i[own], j[own]], axis=1)
-        catalogue = self.pairs[at]
-        return np.concatenate([image, image]), np.concatenate([catalogue, catalogue[:, ::-1]])
+        end, pair = np.repeat(wide, count), self.pairs[at]
+        order = np.argsort(pair[:, 0], kind="stable")
+        end, pair = end[order], pair[order]
+        one, other = _within_groups(pair[:, 0])
+        apart = np.linalg.norm(self.rays_icrs[pair[one, 1]] - self.rays_icrs[pair[other, 1]], axis=1)
+        fits = (np.abs(apart - chords[end[one], end[other]]) < tolerance) & (end[one] != end[other])
+        one, other = one[fits], other[fits]
+        image = np.stack([np.full(len(one), pivot), end[one], end[other]], axis=1)
+        return image, np.stack([pair[one, 0], pair[one, 1], pair[other, 1]], axis=1)
+
+
+def _within_groups(ordered: Ints) -> tuple[Ints, Ints]:
+    """Places (c,), (c,) of all pairs of equal values among the ascending ones (n,)."""
+    own = np.arange(len(ordered))
+    later = np.searchsorted(ordered, ordered, side="right") - own - 1
+    one = np.repeat(own, later)
+    return one, np.arange(later.sum()) - np.repeat(np.cumsum(later) - later, later) + one + 1
 
 
 def build_pairs(stars: Stars, field_sr: float) -> PairIndex:
     """Pairs no wider than the field, of as many bright stars as keep their number at bay."""
+    from scipy.spatial import cKDTree
+
     diameter = 2 * np.arccos(np.clip(1 - field_sr / (2 * np.pi), -1, 1))
     widest = min(WIDEST_RAD, float(diameter))
-    narrowest = min(NARROWEST_RAD, widest / 4)
     within = 0.5 * (1 - np.cos(widest))  # part of the sphere that a star's partners come from
     star = bright_stars_apart(stars, int(min(np.sqrt(2 * PAIRS_WANTED / within), DEEPEST)))
     rays = stars.rays_icrs[star]
-    i, j = _close(rays, widest)
-    side = _angle(rays[i], rays[j])
-    order = np.argsort(side)
-    order = order[np.searchsorted(side[order], narrowest) :]
-    return PairIndex(star, rays, np.stack([i[order], j[order]], axis=1), side[order], narrowest, widest)
-
-
-def _close(rays: Array, widest_rad: float) -> tuple[Ints, Ints]:
-    from scipy.spatial import cKDTree
-
-    pairs = cKDTree(rays).query_pairs(2 * np.sin(widest_rad / 2), output_type="ndarray").astype(np.int64)
-    return pairs[:, 0], pairs[:, 1]
-
-
-def _angle(a: Array, b: Array) -> Array:
-    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ni,ni->n", a, b))
+    pairs = cKDTree(rays).query_pairs(2 * np.sin(widest / 2), output_type="ndarray").astype(np.int64)
+    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    sides = np.linalg.norm(rays[pairs[:, 0]] - rays[pairs[:, 1]], axis=1)
+    order = np.argsort(sides, kind="stable")
+    narrowest = 2 * np.sin(NARROWEST_PART * widest / 2)
+    order = order[np.searchsorted(sides[order], narrowest) :]
+    return PairIndex(rays, pairs[order], sides[order], float(narrowest))

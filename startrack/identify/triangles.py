@@ -39,12 +39,14 @@ def triangles(rays: Array, reach_rad: float, most: int = 2_000_000) -> Triangles
     return _ordered(rays, vertices, np.stack([_angle(b, c), _angle(c, a), _angle(a, b)], axis=1))
 
 
-def triangles_of_few(rays: Array, reach_rad: float, fresh: int = 0) -> Triangles:
-    """The same for a few dozen rays, without a tree; only triangles that have a vertex from number `fresh` on."""
+def sides_of_few(rays: Array, fresh: int = 0) -> tuple[Ints, Array]:
+    """All triples (m, 3) of a few dozen rays with a member from number `fresh` on, and for each its opposite side.
+
+    Sides are chords, in the order of the vertices: a search sorts only what it needs.
+    """
     i, j, vertices, opposite = _combinations(len(rays), fresh)
-    sides = _angle(rays[i], rays[j])[opposite]
-    short = sides.max(axis=1, initial=0.0) < reach_rad
-    return _ordered(rays, vertices[short], sides[short])
+    apart = rays[i] - rays[j]
+    return vertices, np.sqrt(np.einsum("ni,ni->n", apart, apart))[opposite]
 
 
 @lru_cache(maxsize=64)
@@ -56,6 +58,18 @@ def _combinations(n: int, fresh: int) -> tuple[Ints, Ints, Ints, Ints]:
     triples = [t for t in combinations(range(n), 3) if t[2] >= fresh]
     a, b, c = np.array(triples, dtype=np.int64).reshape(-1, 3).T
     return i, j, np.stack([a, b, c], axis=1), np.stack([number[b, c], number[a, c], number[a, b]], axis=1)
+
+
+def triad(cam: Array, icrs: Array) -> Array:
+    """R_cam_icrs (m, 3, 3) from the first two of the rays (m, k, 3): quick, and good enough to be compared."""
+
+    def frame(rays: Array) -> Array:
+        a = rays[:, 0]
+        c = np.cross(a, rays[:, 1])
+        c /= np.linalg.norm(c, axis=1, keepdims=True)
+        return np.stack([a, c, np.cross(a, c)], axis=2)
+
+    return frame(cam) @ np.swapaxes(frame(icrs), 1, 2)
 
 
 def _ordered(rays: Array, vertices: Ints, sides: Array) -> Triangles:

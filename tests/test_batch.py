@@ -65,6 +65,18 @@ def done(night) -> Path:
     return out
 
 
+def children(pid: int) -> list[int]:
+    path = Path(f"/proc/{pid}/task/{pid}/children")  # Linux; elsewhere nothing is asked
+    return [int(one) for one in path.read_text().split()] if path.exists() else []
+
+
+def alive(pid: int) -> bool:
+    try:
+        return ") Z " not in Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return False
+
+
 def tables(out: Path) -> dict[str, bytes]:
     return {name: (out / name).read_bytes() for name in TABLES}
 
@@ -179,7 +191,13 @@ def test_killed_at_any_moment_a_batch_is_taken_up_again(night, done):
         process = subprocess.Popen([*command, "-D", str(out), "-j", "2"])
         while process.poll() is None and len(list(out.rglob("*.fix.json"))) < results:
             time.sleep(0.01)
+        workers = children(process.pid)
         process.kill()
         process.wait()
+        for _ in range(100):
+            if not any(map(alive, workers)):
+                break
+            time.sleep(0.1)
+        assert not any(map(alive, workers))  # nobody is left at work when the run is taken up again
     assert main(["batch", str(night / "images"), "-D", str(out), "-j", "2", "-q"]) == 5
     assert tables(out) == tables(done)

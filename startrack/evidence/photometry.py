@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.psf import pixel_profile, stamp_radius
+from startrack.psf import pixel_profile_single, stamp_radius
 from startrack.types import Array, Bools, Ints
 
 OUTLIER_SIGMA = 5.0
@@ -133,9 +133,8 @@ def _excess(data: Array, variance: Array, light: Array, profile: Array, good: Bo
 
 def _profiles(offset_px: Array, sigma_px: float, radius: int) -> Array:
     """PSF on the stamps (n, pixels)."""
-    px, _ = pixel_profile(offset_px[:, 0], sigma_px, radius)
-    py, _ = pixel_profile(offset_px[:, 1], sigma_px, radius)
-    px, py = px.astype(np.float32), py.astype(np.float32)  # stamps are large and pixels have no more digits
+    px, _ = pixel_profile_single(offset_px[:, 0], sigma_px, radius)  # stamps are large and pixels have no more digits
+    py, _ = pixel_profile_single(offset_px[:, 1], sigma_px, radius)
     return (py[:, :, None] * px[:, None, :]).reshape(len(px), (2 * radius + 1) ** 2)
 
 

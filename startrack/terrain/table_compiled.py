@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 
 from startrack.terrain.table import ANGLE_STEP_RAD, BINS, DISTANCE_STEP_M, FARTHEST, NOT_KNOWN_M, RISE_STEP
-from startrack.terrain.trace_compiled import FAR_M, bounds, horizon, standing, surfaces
+from startrack.terrain.trace_compiled import FAR_M, bounds, horizon, leaning, standing, surfaces
 
 BIN_RAD = 2 * np.pi / BINS
 EDGE = 1e-9  # of a cell or a bin: what only touches it does not count
@@ -126,11 +126,11 @@ def horizons(ground, values, across, reach, camera_height, points, azimuths, tan
 def box_bounds(ground, values, across, reach, camera_height, centres, half, azimuths, turn, low, high):
     """Fill low and high (n,) [rad] with bounds over small boxes and narrow azimuths, traced anew."""
     near, around, found = np.empty(3), np.empty(3), np.empty(11)
-    middle, lowest, highest = 0.0, 0.0, 0.0
+    middle, lowest, highest, slope_e, slope_n = 0.0, 0.0, 0.0, 0.0, 0.0
     corner = np.empty(2)
     for k in range(len(low)):
         if k == 0 or centres[k, 0] != centres[k - 1, 0] or centres[k, 1] != centres[k - 1, 1] or half[k] != half[k - 1]:
-            middle, lowest, highest = standing(ground, centres[k, 0], centres[k, 1], half[k])
+            middle, lowest, highest, slope_e, slope_n = leaning(ground, centres[k, 0], centres[k, 1], half[k], True)
         near[0], near[1], near[2] = 0.0, FAR_M, 0.0
         if across > 0:
             near[0], near[1] = FAR_M, 0.0
@@ -146,8 +146,8 @@ def box_bounds(ground, values, across, reach, camera_height, centres, half, azim
             near[2] = around[2]
         bounds(
             ground, centres[k, 0], centres[k, 1], middle + camera_height, lowest + camera_height,
-            highest + camera_height, half[k], np.sin(azimuths[k]), np.cos(azimuths[k]), turn[k], near[0], near[1],
-            near[2], found,
+            highest + camera_height, slope_e, slope_n, half[k], np.sin(azimuths[k]), np.cos(azimuths[k]), turn[k],
+            near[0], near[1], near[2], found,
         )  # fmt: skip
         low[k], high[k] = np.arctan(found[0]), np.arctan(found[1])
 

@@ -230,18 +230,36 @@ def _least(above, s, reach, cos_turn):
 @njit(cache=True, nogil=True)
 def standing(ground, east, north, half):
     """Height in enu of the ground in the middle of a box, and the lowest and highest anywhere in it."""
+    middle, low, high, _, _ = leaning(ground, east, north, half, False)
+    return middle, low, high
+
+
+@njit(cache=True, nogil=True)
+def leaning(ground, east, north, half, lean):
+    """Height in enu of the ground in the middle of a box, the lowest and highest anywhere in it, and two slopes.
+
+    With `lean` heights are reckoned from a plane through the middle of the box, which rises by the two slopes returned
+    to the east and north: the one that fits the corners. Without, the slopes are zero.
+    """
     grid, heights, posts, _, _, slopes, blocks, levels, slope_unit, post_m, moon, _ = ground
     middle = _surface(grid, posts, heights, moon, east, north, 0.0)
     middle = _surface(grid, posts, heights, moon, east, north, middle)
     low, high = middle, middle
     map0, cell0, alike = -2, -1, True
     wide_column, wide_row, column0, row0 = 0.0, 0.0, 0.0, 0.0
+    slope_e, slope_n = 0.0, 0.0
+    for corner in range(4 * lean):
+        to_e, to_n = 2 * (corner & 1) - 1, corner - (corner & 1) - 1
+        z = _surface(grid, posts, heights, moon, east + half * to_e, north + half * to_n, middle)
+        slope_e += to_e * z / (4 * half)
+        slope_n += to_n * z / (4 * half)
     for corner in range(4):
         e = east + half * (2 * (corner & 1) - 1)
         n = north + half * (corner - (corner & 1) - 1)
         z = _surface(grid, posts, heights, moon, e, n, middle)
-        low, high = min(low, z), max(high, z)
         m, column, row = _locate(grid, posts, e, n, moon + z)
+        z -= slope_e * (e - east) + slope_n * (n - north)
+        low, high = min(low, z), max(high, z)
         cell = int(row) * posts[m, 2] + int(column) if m >= 0 else -1
         if corner == 0:
             map0, cell0, column0, row0 = m, cell, column, row
@@ -257,7 +275,7 @@ def standing(ground, east, north, half):
         for k in range((ACROSS + 1) * (ACROSS + 1)):
             i = k // (ACROSS + 1)
             e, n = east - half + step * i, north - half + step * (k - i * (ACROSS + 1))
-            z = _surface(grid, posts, heights, moon, e, n, middle)
+            z = _surface(grid, posts, heights, moon, e, n, middle) - slope_e * (e - east) - slope_n * (n - north)
             low, high = min(low, z), max(high, z)
         m, column, row = _locate(grid, posts, east, north, moon + middle)
         slack = 2 * half
@@ -270,15 +288,17 @@ def standing(ground, east, north, half):
                 column2, row2 = _grid(grid, m, east + to_e, north + to_n, moon + middle)
                 rise = _steepness(slopes, at, slope_unit[m], (column2 - column) / post_m[m], (row2 - row) / post_m[m])
                 if turn < 2:
-                    a = max(a, abs(rise))
+                    a = max(a, abs(rise - slope_e * (1 - 2 * turn)) + 0.03 * abs(rise))
                 else:
-                    b = max(b, abs(rise))
-            slack = (a + b) * 1.03 * step / 2 + half * half / moon + half * (abs(east) + abs(north)) / moon
-    return middle, low - slack, high + slack
+                    b = max(b, abs(rise - slope_n * (5 - 2 * turn)) + 0.03 * abs(rise))
+            slack = (a + b) * step / 2 + half * half / moon + half * (abs(east) + abs(north)) / moon
+    return middle, low - slack, high + slack, slope_e, slope_n
 
 
 @njit(cache=True, nogil=True)
-def bounds(ground, east, north, up, low_up, high_up, half, sin_a, cos_a, turn, start_m, end_m, hint_m, found):
+def bounds(
+    ground, east, north, up, low_up, high_up, slope_e, slope_n, half, sin_a, cos_a, turn, start_m, end_m, hint_m, found
+):  # fmt: skip
     """Bounds of the horizon over a box. Fills `found` with what can be said of it, see below.
 
     The box reaches `half` to each side of (east, north), the camera stands between low_up and high_up there (at `up` in
@@ -288,15 +308,21 @@ def bounds(ground, east, north, up, low_up, high_up, half, sin_a, cos_a, turn, s
     is within w times the steepest slope to the side of what it is on the middle line. Close to the box the horizon is
     no higher than the steepest slope along the ray, as the camera stands above the ground.
 
+    All heights (low_up and high_up too) may be reckoned from a plane through the middle of the box that rises by
+    slope_e to the east and slope_n to the north: a tan then is less by the plane's own rise along the ray. On a
+    slope, camera and nearby ground go up and down together, and bounds that reckon from the slope are far closer.
+
     found: 0, 1: bounds of tan; 2, 3: between which s the ground stands that may be the horizon; 4: where the middle's
     horizon stands; 5: its tan t; 6: a such that this ground is no higher than a + t s on the middle line, and 9: g such
     that it is no higher than that and g w at w aside; 7, 8: an s and a height that the ground nowhere falls short of
-    there, and 10: the slope to the side that this reckons with.
+    there, and 10: the slope to the side that this reckons with. 5 to 10 are only meant where the slopes are zero.
     """
     grid, heights, posts, tops, wide_tops, slopes, blocks, levels, slope_unit, post_m, moon, highest = ground
     reach = half * (abs(sin_a) + abs(cos_a))
     tan_turn, cos_turn = np.tan(turn), np.cos(turn)
     aside = abs(east * cos_a - north * sin_a)
+    along_rise, side_rise = slope_e * sin_a + slope_n * cos_a, slope_e * cos_a - slope_n * sin_a  # of the plane
+    tilted = abs(side_rise)
     whole = start_m <= 0.0
     low, high = LOWEST_TAN, LOWEST_TAN
     middle_tan, best_at, _ = horizon(ground, east, north, up, sin_a, cos_a, max(start_m, 0.0), end_m, hint_m)
@@ -317,9 +343,10 @@ def bounds(ground, east, north, up, low_up, high_up, half, sin_a, cos_a, turn, s
             line = moon + known_z
         else:
             line = moon + low_up + low * (max(s - reach, 0.0) if low >= 0.0 else (abs(s) + reach) / cos_turn)
+            line += along_rise * s - tilted * width
         m, column, row = _locate(grid, posts, e, n, line)
         r = np.sqrt(e * e + n * n + line * line)
-        climb = (e * sin_a + n * cos_a + line * low) / r
+        climb = (e * sin_a + n * cos_a + line * (low + along_rise - tilted * tan_turn)) / r
         floor = r - SPHERE_M - (aside + width) / moon * width
         if m < 0 or (not probing and (s >= end_m or (climb >= 0.0 and floor >= highest and s > reach))):
             running = probing
@@ -327,7 +354,7 @@ def bounds(ground, east, north, up, low_up, high_up, half, sin_a, cos_a, turn, s
                 probing, s, known_z = False, begin, up
         else:
             step = post_m[m]
-            rise = max(low, -1.0)
+            rise = max(low + along_rise, -1.0)
             column2, row2 = _grid(grid, m, e + step * sin_a, n + step * cos_a, line + rise * step)
             d_column, d_row = (column2 - column) / step, (row2 - row) / step
             least_level = _level_of(levels, m, post_m, moon, width, e, n)
@@ -351,17 +378,18 @@ def bounds(ground, east, north, up, low_up, high_up, half, sin_a, cos_a, turn, s
                 stop = s + length
                 side_column, side_row = _grid(grid, m, e + step * cos_a, n - step * sin_a, line)
                 to_column, to_row = (side_column - column) / step, (side_row - row) / step
-                to_side = max(
-                    _steepness(slopes, at, slope_unit[m], to_column, to_row),
-                    _steepness(slopes, at, slope_unit[m], -to_column, -to_row),
-                    0.0,
-                )
+                right = _steepness(slopes, at, slope_unit[m], to_column, to_row)
+                left = _steepness(slopes, at, slope_unit[m], -to_column, -to_row)
+                to_side = max(right - side_rise, left + side_rise, 0.0)
+                steep = max(abs(right), abs(left))
+                floor += tilted * width
                 width += length * tan_turn
-                rise_aside = to_side * (1.005 + 2 * bend) + (aside + width) / moon
+                rise_aside = to_side + steep * (0.005 + 2 * bend) + (aside + width) / moon
                 slack = rise_aside * width
                 if near:
-                    along = _steepness(slopes, at, slope_unit[m], d_column, d_row)
-                    steepest = max(steepest, along + abs(along) * (0.01 + 2 * bend) + bend + width / moon)
+                    along = _steepness(slopes, at, slope_unit[m], d_column, d_row) - along_rise
+                    along += (abs(along + along_rise) * (0.01 + 2 * bend) + bend + width / moon) + steep * tan_turn
+                    steepest = max(steepest, along)
                 elif not probing:
                     top_here = tops[_block(blocks, m, 0, column, row)] + slack
                     if floor + min(climb * length, 0.0) >= top_here:
@@ -373,6 +401,8 @@ def bounds(ground, east, north, up, low_up, high_up, half, sin_a, cos_a, turn, s
                 z1 = _surface(
                     grid, posts, heights, moon, east + half_s * sin_a, north + half_s * cos_a, 0.5 * (z0 + z2)
                 )
+                next_z = z2
+                z0, z1, z2 = z0 - along_rise * s, z1 - along_rise * half_s, z2 - along_rise * stop
                 over = slack + max(2 * z1 - z0 - z2, 0.0) / 8
                 if min(z0, z1, z2) + slack > low_up and s > reach:
                     rest = slack - low_up
@@ -409,8 +439,12 @@ def bounds(ground, east, north, up, low_up, high_up, half, sin_a, cos_a, turn, s
                         over -= slack + middle_tan * s
                         line_from = max(line_from, z0 + over, z1 + over - middle_tan * 0.5 * length)
                         line_from = max(line_from, z2 + over - middle_tan * length)
-                    known_z, s = z2, stop
+                    known_z, s = next_z, stop
+    # What the plane itself rises along a ray that is turned by up to `turn`.
+    turned = abs(along_rise) * (1.0 - cos_turn) + tilted * np.sqrt(1.0 - cos_turn * cos_turn)
     found[0], found[1], found[2], found[3], found[4] = low, max(high, low), first, last, best_at
+    found[0] += along_rise - turned
+    found[1] += along_rise + turned
     found[5], found[6], found[7], found[8] = middle_tan, line_from, low_s, low_z
     found[9], found[10] = most_rise, low_rise
 
@@ -424,7 +458,7 @@ def fill_cells(ground, centres, half, camera_height, sin_a, cos_a, turn, found):
         for j in range(len(sin_a)):
             bounds(
                 ground, centres[k, 0], centres[k, 1], middle + camera_height, low + camera_height,
-                high + camera_height, half, sin_a[j], cos_a[j], turn, 0.0, FAR_M, guess, found[k, j],
+                high + camera_height, 0.0, 0.0, half, sin_a[j], cos_a[j], turn, 0.0, FAR_M, guess, found[k, j],
             )  # fmt: skip
             guess = found[k, j, 4]
 

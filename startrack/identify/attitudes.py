@@ -97,11 +97,11 @@ class AttitudeSearch:
 
     def _by_pairs(self, tolerance: float) -> Iterator[Turned]:
         index, few = self.patterns.pairs, self.rays_cam[:PIVOTS]
-        for pivot in range(len(few)):
-            image, catalogue = index.triangles(few, pivot, tolerance)
+        for pivot in range(len(few) - 2):
+            image, catalogue = index.triangles(few[pivot:], tolerance)
             if len(image):
                 icrs = index.rays_icrs[catalogue]
-                yield from self._handed(few[image], icrs, np.linalg.det(icrs), 0, tolerance)
+                yield from self._handed(few[image + pivot], icrs, np.linalg.det(icrs), 0, tolerance)
 
     def _by_neighbours(self, tolerance: float) -> Iterator[Turned]:
         index = self.patterns.deep

@@ -12,7 +12,7 @@ from startrack.identify.attitudes import AttitudeSearch, Turned
 from startrack.identify.chance import WIDEST_NEIGHBOURHOOD_RAD, ChanceModel
 from startrack.identify.index import Patterns, patterns_of
 from startrack.identify.match import SIGNIFICANT_SNR, alike, taken
-from startrack.identify.names import middle
+from startrack.identify.names import DIMMED_MAG, middle
 from startrack.identify.refine import BLEND_SIGMAS, FIRST_GATE_PX, GATE_PX, ON_PLACE_PX, Found, Refiner, reach_px
 from startrack.identify.scale import Scale, scale_of
 from startrack.types import Array, Bools, Detections, Identification, Ints, NotIdentified, Stars
@@ -116,7 +116,7 @@ class Identifier:
         radius_rad = radius_px * seen.scale.on_axis
         expected = np.array(max(int(len(found.visible_v_mag) * seen.scale.part_of_circle), hits))
         chance = ChanceModel(seen.rays_cam, min(LOCAL_PART * seen.scale.diameter_rad, WIDEST_NEIGHBOURHOOD_RAD))
-        alikes = alike(found.visible_v_mag, found.pairs.light.measured_mag)
+        alikes = alike(found.visible_v_mag, found.pairs.light.measured_mag, DIMMED_MAG)
         log_chance = float(chance.log_odds(np.array(hits), expected, radius_rad, alike=alikes)) + float(np.log(tried))
         if log_chance > np.log(self.max_false_alarm):
             raise NotIdentified(f"the {hits} stars that match might do so by chance", matched=hits)

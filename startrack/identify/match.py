@@ -81,11 +81,11 @@ def match(
     )  # fmt: skip
 
 
-def alike(v_mag: Array, measured_mag: Array) -> float:
-    """Part of the pairs of a star and a detection that agree in brightness."""
+def alike(v_mag: Array, measured_mag: Array, dimmed_mag: float = MAGNITUDE_TOLERANCE) -> float:
+    """Part of the pairs of a star and a detection that agree in brightness, the star dimmed by so much at most."""
     ordered = np.sort(measured_mag)
     first = np.searchsorted(ordered, v_mag - MAGNITUDE_TOLERANCE)
-    last = np.searchsorted(ordered, v_mag + MAGNITUDE_TOLERANCE)
+    last = np.searchsorted(ordered, v_mag + dimmed_mag)
     return float((last - first).sum() / (len(v_mag) * len(ordered))) if len(v_mag) else 1.0
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from startrack.identify.match import DEPTH_BELOW_THRESHOLD_MAG, MAGNITUDE_TOLERANCE, SIGNIFICANT_SNR
 from startrack.types import Array, Bools, Ints
 
+DIMMED_MAG = 1.6  # by haze, branches and the lens's rim; nothing makes a star brighter
 PLAINLY_FAINTER_MAG = 0.3  # a light that two stars share goes by the name of the one plainly brighter
 OVERWHELMING_LOG_ODDS = 12.0  # for one star's place against another's
 
@@ -64,8 +65,9 @@ class Pairs:
     def agrees(self) -> Bools:
         """Whether star and detection (k,) are equally bright."""
         measured = self.light.measured_mag[self.detection]
-        agrees = np.abs(self.v_mag - measured) < np.hypot(MAGNITUDE_TOLERANCE, 2 * self.v_sigma_mag)
-        agrees |= self.light.saturated[self.detection] & (self.v_mag < measured)
+        dimmed, sigmas = measured - self.v_mag, 2 * self.v_sigma_mag
+        agrees = (dimmed > -np.hypot(MAGNITUDE_TOLERANCE, sigmas)) & (dimmed < np.hypot(DIMMED_MAG, sigmas))
+        agrees |= self.light.saturated[self.detection] & (dimmed > 0)
         return agrees
 
     @cached_property

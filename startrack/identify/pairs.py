@@ -28,21 +28,24 @@ class PairIndex:
     sides: Array  # (k,) chords, ascending
     narrowest: float
 
-    def triangles(self, rays_cam: Array, pivot: int, tolerance: float) -> tuple[Ints, Ints]:
-        """Triangles of the rays (n, 3), the pivot among them, and of the catalogue, (c, 3) each, whose sides agree."""
-        chords = np.linalg.norm(rays_cam[:, None] - rays_cam, axis=2)
-        wide = np.flatnonzero((chords[pivot] > self.narrowest) & (chords[pivot] < self.sides[-1] + tolerance))
-        first = np.searchsorted(self.sides, chords[pivot, wide] - tolerance)
-        count = np.searchsorted(self.sides, chords[pivot, wide] + tolerance) - first
+    def triangles(self, rays_cam: Array, tolerance: float) -> tuple[Ints, Ints]:
+        """Triangles of the rays (n, 3), the first among them, and of the catalogue, (c, 3) each, whose sides agree."""
+        apart = rays_cam[:, None] - rays_cam
+        chords = np.sqrt(np.einsum("ijk,ijk->ij", apart, apart))
+        wide = np.flatnonzero((chords[0] > self.narrowest) & (chords[0] < self.sides[-1] + tolerance))
+        first = np.searchsorted(self.sides, chords[0, wide] - tolerance)
+        count = np.searchsorted(self.sides, chords[0, wide] + tolerance) - first
         at = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
         end, pair = np.repeat(wide, count), self.pairs[at]
         order = np.argsort(pair[:, 0], kind="stable")
         end, pair = end[order], pair[order]
         one, other = _within_groups(pair[:, 0])
-        apart = np.linalg.norm(self.rays_icrs[pair[one, 1]] - self.rays_icrs[pair[other, 1]], axis=1)
-        fits = (np.abs(apart - chords[end[one], end[other]]) < tolerance) & (end[one] != end[other])
+        wanted = chords[end[one], end[other]]  # 0 for an end and itself
+        apart = self.rays_icrs[pair[one, 1]] - self.rays_icrs[pair[other, 1]]
+        found = np.sqrt(np.einsum("ij,ij->i", apart, apart))
+        fits = (np.abs(found - wanted) < tolerance) & (wanted > 0)
         one, other = one[fits], other[fits]
-        image = np.stack([np.full(len(one), pivot), end[one], end[other]], axis=1)
+        image = np.stack([np.zeros(len(one), dtype=np.int64), end[one], end[other]], axis=1)
         return image, np.stack([pair[one, 0], pair[one, 1], pair[other, 1]], axis=1)
 
 

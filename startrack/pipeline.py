@@ -5,90 +5,27 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from startrack.bodies import bodies
 from startrack.camera import Camera
-from startrack.detect import Detector, electrons
-from startrack.evidence import Skyline, StarEvidence, StarLight, flux_scale, known_well, levelled, near_skyline
 from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
-from startrack.identify import Identifier
-from startrack.localize import ExactPosterior, Localizer, check_consistency
-from startrack.orient import AttitudeFit, solve_attitude
-from startrack.psf import noise_area_px
+from startrack.light import deepen, first_look, second_look
+from startrack.localize import check_consistency
+from startrack.orient import solve_attitude
+from startrack.result import Result, Settings
 from startrack.terrain import Terrain
-from startrack.types import (
-    Array,
-    Attitude,
-    BadInput,
-    Body,
-    Detections,
-    Exposure,
-    Fix,
-    Identification,
-    Ints,
-    NoSolution,
-    Stars,
-)
+from startrack.types import BadInput, Exposure, NoSolution
 
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog
 
-RELIT_PX, NEIGHBOURS_PX = 12.0, 10.0  # stars this near the skyline are measured again, beside their neighbours
-UNDECIDED_PX, CERTAIN = 2.0, 0.99  # farther from the skyline than that the fix decides which stars shine
-COMPLETE_V_MAG = 6.5  # 5 sigma: from here on stars that Hipparcos lacks would say much
-UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out
+__all__ = ["NO_TIME", "Result", "Settings", "detect", "identify", "identify_blind", "locate", "locate_exposure"]
+
 NO_TIME = (
     "the mid-exposure time is not known: give --time UTC, a sidecar NAME.json with time_utc, or a header with it; "
     "nothing is guessed"
 )
-
-
-@dataclass(frozen=True)
-class Settings:
-    """The stages and their settings; exchange any of them."""
-
-    detector: Detector = field(default_factory=Detector)
-    identifier: Identifier = field(default_factory=Identifier)
-    evidence: StarEvidence = field(default_factory=StarEvidence)
-    localizer: Localizer = field(default_factory=ExactPosterior)
-    deep_stars: bool = True  # evidence of Gaia's stars too, where installed and the frame sees deeper than Hipparcos
-
-
-@dataclass
-class Result:
-    """What became of one image. Parts that were not reached are None."""
-
-    exposure: Exposure
-    camera: Camera | None = None
-    terrain: Terrain | None = None
-    catalog_name: str = ""
-    status: str = "refused"  # ok, ambiguous or refused
-    reason: str | None = None
-    message: str = ""
-    detections: Detections | None = None
-    stars: Stars | None = None
-    bodies: list[Body] = field(default_factory=list)
-    identification: Identification | None = None
-    attitude_fit: AttitudeFit | None = None
-    R_enu_icrs: Array | None = None
-    light: StarLight | None = None
-    fix: Fix | None = None
-    timing_ms: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def attitude(self) -> Attitude | None:
-        """Attitude with the error of an unknown time included."""
-        if self.attitude_fit is None:
-            return None
-        attitude = self.attitude_fit.attitude
-        if self.exposure.time_utc is not None:
-            return attitude
-        widened = attitude.covariance_rad2 + UNKNOWN_TIME_SIGMA_RAD**2 * np.eye(3)
-        return Attitude(R_cam_icrs=attitude.R_cam_icrs, covariance_rad2=widened)
 
 
 def locate(
@@ -104,13 +41,13 @@ def locate(
         result.R_enu_icrs = R_enu_icrs(terrain.site, exposure.time_utc)
         with _timed(result, "evidence"):
             if settings.deep_stars and catalog.name == "hipparcos":
-                _deepen(result, terrain.site)
-            result.light = _light(result, settings)
+                deepen(result, terrain.site)
+            result.light = first_look(result, settings)
         with _timed(result, "locate"):
             evidence = result.light.evidence()
             fix = settings.localizer(evidence, terrain)
         with _timed(result, "evidence"):
-            relit = None if fix.ambiguous else _relit(result, settings, fix)
+            relit = None if fix.ambiguous else second_look(result, settings, fix)
         if relit is not None:
             result.light, evidence = relit, relit.evidence()
             with _timed(result, "locate"):
@@ -230,77 +167,6 @@ def _solve_attitude(result: Result) -> None:
             result.stars.rays_icrs[found.star],
             found.R_cam_icrs,
         )
-
-
-def _deepen(result: Result, site: Site) -> None:
-    """Put the deeper list in the catalogue's place if it is installed and the frame is deep enough to need it."""
-    from startrack.deep_catalog import deep_installed, hipparcos_in_deep, load_deep_catalog
-
-    found, when = result.identification, result.exposure.time_utc
-    assert result.camera is not None and result.detections is not None and result.stars is not None
-    assert found is not None and when is not None
-    scale = flux_scale(result.detections, result.camera, result.stars, found)
-    noise_e = float(np.median(result.detections.noise_e)) * np.sqrt(noise_area_px(result.detections.psf_sigma_px))
-    if scale.zero_mag - 2.5 * np.log10(5.0 * noise_e) < COMPLETE_V_MAG or not deep_installed():
-        return
-    deep = load_deep_catalog()
-    result.stars, result.catalog_name = deep.at(when, observer_velocity_m_s(site, when)), deep.name
-    result.identification = replace(found, star=hipparcos_in_deep()[found.star])
-
-
-def _relit(result: Result, settings: Settings, fix: Fix) -> StarLight | None:
-    """The light of the stars beside the skyline once more, now that the step of the sky's own light can be told.
-
-    None where the sky is too dark to show a step.
-    """
-    assert result.camera is not None and result.detections is not None and result.terrain is not None
-    assert result.light is not None and result.attitude_fit is not None and result.R_enu_icrs is not None
-    camera, place = result.camera, fix.position_enu_m[:2]
-    horizon = Skyline.seen_from(place, result.terrain)
-    image, dead = electrons(result.exposure, camera)
-    R_cam_enu = result.attitude_fit.attitude.R_cam_icrs @ result.R_enu_icrs.T
-    detections = levelled(image, dead, result.detections, camera, R_cam_enu, horizon)
-    if detections is result.detections:
-        return None
-    axes = np.linalg.cholesky(fix.covariance_m2).T
-    known = known_well(horizon, [Skyline.seen_from(place + axis, result.terrain) for axis in axes], camera)
-    light = result.light
-    wanted = near_skyline(light.azimuth_rad, light.elevation_rad, camera, horizon, RELIT_PX) & known(light.azimuth_rad)
-    around = near_skyline(light.azimuth_rad, light.elevation_rad, camera, horizon, RELIT_PX + NEIGHBOURS_PX)
-    # The fix tells which neighbours shine, better than their own faint light does; beside the skyline only that.
-    above = light.elevation_rad - horizon(light.azimuth_rad)
-    beside = near_skyline(light.azimuth_rad, light.elevation_rad, camera, horizon, UNDECIDED_PX)
-    beside |= ~known(light.azimuth_rad)
-    visible = np.where(beside, 1.0 / (1.0 + np.exp(-light.llr)), np.where(above > 0, CERTAIN, 1.0 - CERTAIN))
-    newer = _light(result, settings, detections, light.star[around], visible[around])
-    return light.renewed(newer, light.star[wanted])
-
-
-def _light(
-    result: Result,
-    settings: Settings,
-    detections: Detections | None = None,
-    only: Ints | None = None,
-    visible: Array | None = None,
-) -> StarLight:
-    assert result.camera is not None and result.detections is not None and result.stars is not None
-    assert result.identification is not None and result.attitude_fit is not None and result.R_enu_icrs is not None
-    image, dead = electrons(result.exposure, result.camera)
-    stars = result.stars if only is None else result.stars.take(only)
-    light = settings.evidence(
-        image,
-        dead,
-        detections or result.detections,
-        result.camera,
-        stars,
-        result.bodies,
-        result.attitude_fit.attitude.R_cam_icrs,
-        result.R_enu_icrs,
-        flux_scale(result.detections, result.camera, result.stars, result.identification),
-        result.attitude_fit.extra_sigma_px,
-        visible,
-    )
-    return light if only is None else replace(light, star=only[light.star])
 
 
 @contextmanager

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from startrack.pipeline import Settings, _light
+from startrack.light import first_look
+from startrack.result import Settings
 
 
 def with_covariance(camera, sigma_px):
@@ -17,9 +18,9 @@ def with_covariance(camera, sigma_px):
 
 
 def test_an_uncertain_lens_makes_stars_at_the_rim_say_less(located):
-    sure = _light(located.result, Settings())
+    sure = first_look(located.result, Settings())
     camera = with_covariance(located.result.camera, 2.0)
-    doubtful = _light(replace(located.result, camera=camera), Settings())
+    doubtful = first_look(replace(located.result, camera=camera), Settings())
     assert np.array_equal(sure.star, doubtful.star)
     rays = located.result.stars.rays_icrs[sure.star] @ located.result.attitude.R_cam_icrs.T
     rim = (rays[:, 2] < 0.2) & sure.usable & (sure.llr > 8)
@@ -32,7 +33,7 @@ def test_an_uncertain_lens_makes_stars_at_the_rim_say_less(located):
 
 def test_no_evidence_beyond_the_calibrated_angle(located):
     camera = replace(located.result.camera, calibrated_angle_rad=float(np.radians(60)))
-    light = _light(replace(located.result, camera=camera), Settings())
+    light = first_look(replace(located.result, camera=camera), Settings())
     rays = located.result.stars.rays_icrs[light.star] @ located.result.attitude.R_cam_icrs.T
     beyond = rays[:, 2] < np.cos(np.radians(60))
     assert beyond.sum() > 100

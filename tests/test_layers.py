@@ -20,6 +20,8 @@ LAYERS = (  # lowest first; a room imports from lower layers only
     {"frames"},
     {"psf", "body_angles", "catalog", "deep_catalog", "bodies", "camera", "terrain", "exposure"},
     {"render", "detect", "identify", "orient", "evidence", "localize"},
+    {"result"},
+    {"light"},
     {"pipeline", "calibrate", "given"},
     {"report"},
     {"reproduce", "batch", "page", "api"},

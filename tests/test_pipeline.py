@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from startrack import pipeline
 from startrack.catalog import StarCatalog, load_catalog
 from startrack.frames import azel_from_rays
-from startrack.pipeline import Result
+from startrack.result import Result
 from startrack.types import Exposure
 
 ARCSEC = np.pi / 648_000

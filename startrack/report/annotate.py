@@ -14,7 +14,7 @@ from startrack.report.panel import PANEL_HEIGHT, PANEL_WIDTH, draw_panel
 from startrack.report.star_marks import draw_bodies, draw_detections, draw_hidden, name_stars
 
 if TYPE_CHECKING:
-    from startrack.pipeline import Result
+    from startrack.result import Result
 
 
 def annotate(result: Result, truth_enu_m: tuple[float, float] | None = None) -> NDArray[np.uint8]:

@@ -14,7 +14,7 @@ from startrack.report.palette import PAPER, SKY_BRIGHT, SKY_DARK, STARLIGHT, WAL
 from startrack.types import Array, Bools
 
 if TYPE_CHECKING:
-    from startrack.pipeline import Result
+    from startrack.result import Result
 
 Image = NDArray[np.float32]
 LONGEST_SIDE_PX = 1400

@@ -17,7 +17,7 @@ from startrack.report.result import R_body_enu, place_m
 from startrack.types import Array, Bools
 
 if TYPE_CHECKING:
-    from startrack.pipeline import Result
+    from startrack.result import Result
 
 AZIMUTHS_RAD = np.linspace(0.0, 2 * np.pi, 1441)
 WALL_STEP = 4  # the wall's mask is reckoned at every fourth pixel and interpolated

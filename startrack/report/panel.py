@@ -30,7 +30,7 @@ from startrack.report.result import R_body_enu, boresight_rad, image_name, predi
 from startrack.report.summary import chance_text
 
 if TYPE_CHECKING:
-    from startrack.pipeline import Result
+    from startrack.result import Result
 
 PANEL_WIDTH, PANEL_HEIGHT = 620, 1160
 MARGIN = 28

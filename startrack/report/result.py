@@ -13,7 +13,7 @@ from startrack.frames import format_utc, latlon_from_enu, quat_xyzw_from_R
 from startrack.types import Array, Exposure, Fix
 
 if TYPE_CHECKING:
-    from startrack.pipeline import Result
+    from startrack.result import Result
     from startrack.terrain import Terrain
 
 FORMATS = {
@@ -194,5 +194,5 @@ def _tail(result: Result) -> dict[str, Any]:
             "time_utc": None if time_utc is None else format_utc(time_utc),
             "exposure_s": exposure.exposure_s,
         },
-        "warnings": list(exposure.warnings),
+        "warnings": result.warnings,
     }

@@ -15,7 +15,7 @@ from startrack.report.star_table import names_of, status_of
 from startrack.types import Array, Ints
 
 if TYPE_CHECKING:
-    from startrack.pipeline import Result
+    from startrack.result import Result
 
 MOST_CIRCLES = 4000
 MOST_CROSSES = 150  # of hidden stars, the brightest: more would hide the picture

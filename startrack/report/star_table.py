@@ -15,7 +15,7 @@ from startrack.types import Array, Ints, Stars
 
 if TYPE_CHECKING:
     from startrack.evidence import StarLight
-    from startrack.pipeline import Result
+    from startrack.result import Result
 
 STATUSES = ("seen", "hidden", "uncertain", "unusable")
 FAINTER_THAN_FAINTEST_MATCH_MAG = 0.5

@@ -13,7 +13,7 @@ from startrack.report.result import ARCSEC_PER_RAD, STAGES, R_body_enu, boresigh
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
-    from startrack.pipeline import Result
+    from startrack.result import Result
 
 
 def summary_line(result: Result, seconds: float | None = None) -> str:
@@ -62,7 +62,7 @@ def verbose_text(result: Result) -> str:
     lines += [f"time       {format_utc(when) if when is not None else 'not known'} (middle of the exposure)"]
     spent = [f"{stage} {result.timing_ms[stage]:.0f}" for stage in STAGES if stage in result.timing_ms]
     lines += [f"ms         {', '.join(spent)}"] if spent else []
-    lines += [f"warning    {warning}" for warning in result.exposure.warnings]
+    lines += [f"warning    {warning}" for warning in result.warnings]
     return "\n".join(f"  {line}" for line in lines)
 
 

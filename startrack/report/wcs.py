@@ -19,7 +19,7 @@ from startrack.report.fits_blocks import Card, header_block, table_file
 from startrack.types import Array
 
 if TYPE_CHECKING:
-    from startrack.pipeline import Result
+    from startrack.result import Result
 
 SIP_ORDER = 4
 GRID = 40  # points across the frame at which the field is sampled

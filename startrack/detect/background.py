@@ -29,7 +29,7 @@ def background_and_noise(image: Image, quantum: float, sigma_px: float) -> tuple
     the image circle) stays within a block; interpolated bilinearly. Weak where a bright extended source fills several
     blocks.
     """
-    side = BLOCK_PX * max(1, round(sigma_px / WIDEST_PX))
+    side = block_side(sigma_px)
     shape = -(-image.shape[0] // side), -(-image.shape[1] // side)
     level, spread = _over_blocks(image, side, quantum, _median_and_spread)
     level_map = cv2.medianBlur(level.reshape(shape), 3)
@@ -44,6 +44,11 @@ def background_and_noise(image: Image, quantum: float, sigma_px: float) -> tuple
         spread_map = cv2.medianBlur(spread.reshape(shape), 5)
     noise_map = np.sqrt(np.maximum(np.square(spread_map) - rounding, rounding), dtype=np.float32)
     return background, _enlarge(noise_map, side, image.shape)
+
+
+def block_side(sigma_px: float) -> int:
+    """Side [px] of the blocks for a PSF of this width."""
+    return BLOCK_PX * max(1, round(sigma_px / WIDEST_PX))
 
 
 def local_level(standardised: Image, width_px: int) -> Image:
@@ -77,11 +82,11 @@ def _steep_part(level: NDArray[Any], spread: NDArray[Any]) -> float:
 
 
 def _over_blocks(image: Image, side: int, quantum: float, measure: Callable[[Image], tuple[Image, ...]]) -> list[Image]:
-    """What `measure` says of the ordered pixels (n, side^2) of square blocks, (blocks,) each, left to right and down.
+    """What `measure` says of the ordered pixels (n, BLOCK_PX^2) of square blocks: (blocks,), left to right and down.
 
     A few rows of blocks at a time: what the processor's cache holds.
     """
-    rows = side * max(1, BAND_PIXELS // (side * image.shape[1]))
+    rows = side * max(1, BAND_PIXELS * (side // BLOCK_PX) ** 2 // (side * image.shape[1]))
     bands = [
         measure(np.sort(_blocks(image[top : top + rows], side, quantum), axis=1))
         for top in range(0, image.shape[0], rows)
@@ -95,7 +100,9 @@ def _median_and_spread(ordered: Image) -> tuple[Image, Image]:
 
 
 def _blocks(image: Image, side: int, quantum: float) -> Image:
-    """(blocks, side^2): the image cut into square blocks, its border reflected to fill the last ones.
+    """(blocks, BLOCK_PX^2): the image cut into square blocks, its border reflected to fill the last ones.
+
+    Of larger blocks some pixels, spread evenly, are enough: squares of two by two, for colour filters' sake.
 
     Medians of whole numbers are whole numbers, and a spread would be wrong by up to half a step in 8-bit images: the
     same pattern of part-steps, of mean zero, is added to every block; its variance must be taken away again.
@@ -105,9 +112,10 @@ def _blocks(image: Image, side: int, quantum: float) -> Image:
     if below or right:
         image = np.asarray(cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_REFLECT_101), dtype=np.float32)
     rows, columns = image.shape[0] // side, image.shape[1] // side
-    cut = image.reshape(rows, side, columns, side).transpose(0, 2, 1, 3)
-    part_steps = (np.float32(quantum) * _part_steps(side * side)).reshape(side, side)
-    return np.add(cut, part_steps, order="C").reshape(rows * columns, side * side)
+    parts = BLOCK_PX // 2
+    cut = image.reshape(rows, parts, side // parts, columns, parts, side // parts)[:, :, :2, :, :, :2]
+    part_steps = (np.float32(quantum) * _part_steps(BLOCK_PX**2)).reshape(parts, 2, parts, 2)
+    return np.add(cut.transpose(0, 3, 1, 2, 4, 5), part_steps, order="C").reshape(rows * columns, BLOCK_PX**2)
 
 
 def _few_valued(ordered: Image, quantum: np.float32) -> tuple[Image]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.detect.fit import ROUNDS_AGAIN, PointFits, Stamps, fit_points
+from startrack.detect.fit import ROUNDS, ROUNDS_AGAIN, PointFits, Stamps, fit_points, joined
 from startrack.detect.frame import Frame, LightNoise, Pixels, radius_for
 from startrack.detect.own_noise import measured_light_noise
 from startrack.detect.peaks import Peaks
@@ -28,13 +28,21 @@ class Fitted:
     light_noise: LightNoise
 
 
-def fit_all(frame: Frame, peaks: Peaks, sigma: float) -> Fitted:
-    """Fits of all candidates."""
+def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = None) -> Fitted:
+    """Fits of all candidates; of the stars already `known`, whose light `frame.found` holds, only once more.
+
+    The known ones are the first of the peaks.
+    """
     radius = radius_for(sigma)
     centres = peaks.centres
     data, variance, usable = frame.data(centres, radius), frame.variance(centres, radius), frame.usable(centres, radius)
     stamps = Stamps(data, variance, usable, centres, peaks.surround)
-    fits = fit_points(stamps, peaks.start_xy_px, sigma, frame.light_noise, peaks.own_part)
+    last = np.zeros_like(data)  # neighbours' light with which each was fitted
+    if known is not None and frame.found is not None:
+        last = frame.light(centres, radius)
+        last[: len(known.flux)] -= own_light(centres[: len(known.flux)], known, sigma, radius)
+        last[np.square(last).max(axis=(1, 2)) <= NEIGHBOUR_SIGMA**2 * variance[:, radius, radius]] = 0.0
+    fits = _first_fits(frame, peaks, _without(stamps, last), sigma, 0 if known is None else len(known.flux))
     star, other = _pairs(centres, 1.5 * radius + 3.0 * sigma)
     alone = np.ones(len(centres), dtype=bool)
     alone[star[_may_count(stamps, fits, star, other, sigma)]] = False
@@ -42,9 +50,9 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float) -> Fitted:
     bright = _otherwise_weighted(fits, sigma, variance, frame.light_noise, light_noise)
     if len(bright):
         start = fits.xy_px[bright]
-        again = fit_points(stamps.part(bright), start, sigma, light_noise, peaks.own_part, ROUNDS_AGAIN)
+        part = _without(stamps.part(bright), last[bright])
+        again = fit_points(part, start, sigma, light_noise, peaks.own_part, ROUNDS_AGAIN)
         fits = fits.replaced(bright, again)
-    last = np.zeros_like(data)  # neighbours' light with which each was fitted
     for _ in range(CROWDED_ROUNDS):
         crowded, light = _neighbours_light(stamps, fits, star, other, sigma)
         changed = (np.square(light - last[crowded]) > NEIGHBOUR_SIGMA**2 * variance[crowded]).any(axis=(1, 2))
@@ -52,11 +60,25 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float) -> Fitted:
         if not len(crowded):
             break
         last[crowded] = light
-        part = stamps.part(crowded)
-        cleaned = replace(part, data=part.data - light, variance=part.variance + np.square(NEIGHBOUR_ERROR * light))
+        cleaned = _without(stamps.part(crowded), light)
         again = fit_points(cleaned, fits.xy_px[crowded], sigma, light_noise, peaks.own_part)
         fits = fits.replaced(crowded, again)
     return Fitted(stamps, fits, light_noise)
+
+
+def _first_fits(frame: Frame, peaks: Peaks, stamps: Stamps, sigma: float, known: int) -> PointFits:
+    """Fits of all candidates, the first of which are `known` already and need less."""
+    fits = [
+        fit_points(stamps.part(which), peaks.start_xy_px[which], sigma, frame.light_noise, peaks.own_part, rounds)
+        for which, rounds in ((slice(0, known), ROUNDS_AGAIN), (slice(known, None), ROUNDS))
+        if len(stamps.centres[which])
+    ]
+    return joined(fits)
+
+
+def _without(stamps: Stamps, light: Pixels) -> Stamps:
+    """The stamps without their neighbours' light, of which a part is not known."""
+    return replace(stamps, data=stamps.data - light, variance=stamps.variance + np.square(NEIGHBOUR_ERROR * light))
 
 
 def _otherwise_weighted(fits: PointFits, sigma: float, variance: Pixels, was: LightNoise, now: LightNoise) -> Ints:

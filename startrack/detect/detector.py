@@ -7,23 +7,41 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.detect.background import background_and_noise, quantum_of
+from startrack.detect.background import background_and_noise, block_side, quantum_of
+from startrack.detect.binned import any_dead, binned, in_pixels, peaks_in_pixels, pixels_together
 from startrack.detect.crowded import Fitted, fit_all, painted
-from startrack.detect.fit import PointFits
-from startrack.detect.frame import Frame, Image, LightNoise, electrons
-from startrack.detect.judge import one_per_place, stars_among, threshold_for
-from startrack.detect.peaks import find_peaks
+from startrack.detect.fit import PointFits, Stamps, fit_points
+from startrack.detect.frame import Frame, Image, LightNoise, electrons, radius_for
+from startrack.detect.judge import one_per_place, skewness_of, stars_among, threshold_for
+from startrack.detect.peaks import Peaks, bright_pixels, find_peaks
 from startrack.detect.streaks import Streaks, drawn_out, find_streaks
-from startrack.detect.widths import measured_width
-from startrack.types import Bools, Detections, Exposure, TooFewStars
+from startrack.detect.widths import BRIGHT_SNR, measured_width
+from startrack.types import Array, Bools, Detections, Exposure, Ints, TooFewStars
 
 UNKNOWN_WIDTH_PX = 1.2  # first guess where the camera file does not tell
 WIDTH_TOLERANCE = 0.12  # measured PSF differing by more than this fraction from the expected one is used instead
-WIDTH_ROUNDS = 3  # a stamp of the wrong size measures a much wider PSF too small
+BRIGHT_PIXEL_SIGMAS, BRIGHT_PIXELS, ENOUGH_PIXELS = 8.0, 80, 30
+WIDTH_ROUNDS = 4  # a stamp of the wrong size measures a much wider PSF too small
 FIRST_PASS_LOWER = 1.1
 WINGS_SIGMAS = 4.0
 CROWDED_PART = 0.06  # covered by stars: from here up they are taken away before the background is measured again
 NOTHING_SEEN = "no point source stands above the noise: was the lens cap on, or the exposure too short?"
+
+
+@dataclass(frozen=True)
+class _Look:
+    """A frame, the same with its pixels added together `side` by `side`, and the candidates there with their fits."""
+
+    frame: Frame
+    small: Frame
+    side: int
+    sigma: float  # of the PSF in the frame [px]
+    fitted: Fitted
+
+    @property
+    def centres(self) -> Ints:
+        """Pixels (n, 2) of the candidates in the frame."""
+        return self.side * self.fitted.stamps.centres + self.side // 2
 
 
 @dataclass(frozen=True)
@@ -44,14 +62,13 @@ class Detector:
             raise TooFewStars("the frame is flat: every pixel has the same value (lens cap, or a saturated day sky?)")
         known = camera.sensor.psf_sigma_px if camera is not None and camera.sensor is not None else None
         light_noise = LightNoise(per_unit=0.0 if known is None else 1.0)
-        frame, fitted, sigma = self._measured(image, dead, self.psf_sigma_px or known or UNKNOWN_WIDTH_PX, light_noise)
-        if drawn_out(frame, fitted.stamps.centres) and (streaks := find_streaks(frame)) is not None:
+        look = self._looked(_Behind(image, any_dead(dead), light_noise), self.psf_sigma_px or known)
+        frame, sigma = look.frame, look.sigma
+        if drawn_out(frame, look.centres) and (streaks := find_streaks(frame)) is not None:
             return _of_streaks(frame, streaks)
-        stars = self._stars(fitted, sigma)
-        if _covered(stars, sigma, frame.shape) > CROWDED_PART:
-            frame = _frame(image, frame.dead, sigma, light_noise, painted(stars, sigma, frame.shape))
-            peaks = find_peaks(frame, sigma, self._first_pass(sigma), self.max_candidates, known=stars.xy_px)
-            stars = self._stars(fit_all(frame, peaks, sigma), sigma)
+        stars = self._stars(frame, look.fitted, look.side, sigma)
+        if look.side > 1 or _covered(stars, sigma, frame.shape) > CROWDED_PART:
+            frame, stars = self._again(look, in_pixels(stars, look.side))
         if not len(stars.flux):
             raise TooFewStars(NOTHING_SEEN)
         return Detections(
@@ -66,31 +83,52 @@ class Detector:
             noise_e=frame.noise,
         )
 
-    def _measured(
-        self, image: Image, dead: Bools, sigma: float, light_noise: LightNoise
-    ) -> tuple[Frame, Fitted, float]:
-        """Frame, candidates and their fits, with the PSF's width as the frame shows it."""
-        usable = dead if dead.any() else None
-        for last in (*[False] * (0 if self.psf_sigma_px else WIDTH_ROUNDS), True):
-            frame = _frame(image, usable, sigma, light_noise)
-            peaks = find_peaks(frame, sigma, self._first_pass(sigma), self.max_candidates)
-            if not len(peaks.centres):
-                raise TooFewStars(NOTHING_SEEN)
-            fitted = fit_all(frame, peaks, sigma)
-            measured = None if last else measured_width(frame, peaks.centres, fitted.fits, sigma)
-            if measured is None or abs(np.log(measured / sigma)) < WIDTH_TOLERANCE:
-                break
-            sigma = measured
-        return frame, fitted, sigma
+    def _looked(self, behind: _Behind, expected: float | None) -> _Look:
+        """Candidates and their fits, with the PSF's width as the frame shows it."""
+        if expected is None:
+            return self._look(behind, _width_of_brightest(behind, UNKNOWN_WIDTH_PX))
+        look = self._look(behind, expected)
+        if self.psf_sigma_px:
+            return look
+        measured = measured_width(look.small, look.fitted.stamps.centres, look.fitted.fits, look.sigma / look.side)
+        if measured is None or abs(np.log(measured * look.side / expected)) < WIDTH_TOLERANCE:
+            return look
+        return self._look(behind, _width_of_brightest(behind, measured * look.side))
 
-    def _first_pass(self, sigma: float) -> float:
-        """A star between pixels shows less in the filtered image than its fit does."""
-        return threshold_for(self.threshold_snr, sigma) - FIRST_PASS_LOWER
+    def _look(self, behind: _Behind, sigma: float) -> _Look:
+        """Candidates and their fits; where the PSF is wide, in the frame whose pixels are added together."""
+        side = pixels_together(sigma)
+        frame = behind.frame(sigma)
+        small = binned(frame, side)
+        peaks = self._peaks(frame, small, side, sigma)
+        if not len(peaks.centres):
+            raise TooFewStars(NOTHING_SEEN)
+        return _Look(frame, small, side, sigma, fit_all(small, peaks, sigma / side))
 
-    def _stars(self, fitted: Fitted, sigma: float) -> PointFits:
+    def _again(self, look: _Look, stars: PointFits) -> tuple[Frame, PointFits]:
+        """The frame and its stars, those known taken away before background and faint ones are measured."""
+        side, sigma, frame = look.side, look.sigma, look.frame
+        frame = _Behind(frame.image, frame.dead, look.fitted.light_noise).frame(
+            sigma, painted(stars, sigma, frame.shape)
+        )
+        places = (stars.xy_px - 0.5 * (side - 1)) / side
+        peaks = self._peaks(frame, binned(frame, side), side, sigma, known=places)
+        peaks = peaks_in_pixels(peaks, side, frame.shape, radius_for(sigma))
+        if not len(peaks.centres):
+            raise TooFewStars(NOTHING_SEEN)
+        return frame, self._stars(frame, fit_all(frame, peaks, sigma, known=stars), 1, sigma)
+
+    def _peaks(self, frame: Frame, small: Frame, side: int, sigma: float, known: Array | None = None) -> Peaks:
+        """Candidates in a frame's small one: a star between pixels shows less in the filtered image than its fit."""
+        lowest = threshold_for(self.threshold_snr, sigma, skewness_of(frame)) - FIRST_PASS_LOWER
+        return find_peaks(small, sigma / side, lowest, self.max_candidates, known)
+
+    def _stars(self, frame: Frame, fitted: Fitted, side: int, sigma: float) -> PointFits:
+        """The point sources among the candidates, in a frame's small one, brightest first."""
         fits = fitted.fits
-        good = stars_among(fitted, sigma, self.threshold_snr)
-        good = good[one_per_place(fits.xy_px[good], fits.flux[good], 1.2 * sigma)]
+        threshold = threshold_for(self.threshold_snr, sigma / side, skewness_of(frame) / side)
+        good = stars_among(fitted, sigma / side, threshold)
+        good = good[one_per_place(fits.xy_px[good], fits.flux[good], 1.2 * sigma / side)]
         return fits.take(good[np.argsort(-fits.flux[good], kind="stable")])
 
 
@@ -113,13 +151,49 @@ def _is_flat(image: Image) -> bool:
     return float(image[0, 0]) == float(image[-1, -1]) == float(image[::64, ::64].max()) and not np.ptp(image)
 
 
-def _frame(
-    image: Image, dead: Bools | None, sigma: float, light_noise: LightNoise, found: Image | None = None
-) -> Frame:
-    """The image prepared; background and noise are those of what is behind the stars already `found`."""
-    behind = image if found is None else image - found
-    background, noise = background_and_noise(behind, quantum_of(image), sigma)
-    return Frame(image, background, noise, dead, light_noise, found)
+class _Behind:
+    """An image with its unusable pixels; backgrounds are worked out once for each size of their blocks."""
+
+    def __init__(self, image: Image, dead: Bools | None, light_noise: LightNoise) -> None:
+        self.image, self.dead, self.light_noise = image, dead, light_noise
+        self.quantum = quantum_of(image)
+        self._kept: dict[int, tuple[Image, Image]] = {}
+
+    def frame(self, sigma: float, found: Image | None = None) -> Frame:
+        """The image prepared; background and noise are those of what is behind the stars already `found`."""
+        if found is not None:
+            maps = background_and_noise(self.image - found, self.quantum, sigma)
+            return Frame(self.image, *maps, self.dead, self.light_noise, found)
+        side = block_side(sigma)
+        if side not in self._kept:
+            self._kept[side] = background_and_noise(self.image, self.quantum, sigma)
+        return Frame(self.image, *self._kept[side], self.dead, self.light_noise)
+
+
+def _width_of_brightest(behind: _Behind, sigma: float) -> float:
+    """PSF sigma [px] that the frame's brightest pixels show, from a first guess, which is kept if they do not tell."""
+    frame = behind.frame(sigma)
+    pixels = bright_pixels(frame, BRIGHT_PIXEL_SIGMAS, BRIGHT_PIXELS, 1)
+    if len(pixels) < ENOUGH_PIXELS:  # too few stand out by one pixel
+        found = find_peaks(frame, sigma, BRIGHT_SNR, BRIGHT_PIXELS).centres
+        pixels = found if len(found) > len(pixels) else pixels
+    for _ in range(WIDTH_ROUNDS):
+        radius = radius_for(sigma)
+        last = np.array([frame.shape[1], frame.shape[0]]) - 1
+        centres = pixels[((pixels >= radius) & (pixels <= last - radius)).all(axis=1)]
+        if not len(centres):
+            break
+        data, variance = frame.data(centres, radius), frame.variance(centres, radius)
+        stamps = Stamps(data, variance, frame.usable(centres, radius), centres, np.zeros(len(centres)))
+        fits = fit_points(stamps, centres.astype(np.float64), sigma, frame.light_noise, 0.0)
+        measured = measured_width(frame, centres, fits, sigma)
+        if measured is None:
+            break
+        settled = abs(np.log(measured / sigma)) < WIDTH_TOLERANCE
+        sigma = measured
+        if settled:
+            break
+    return sigma
 
 
 def _covered(stars: PointFits, sigma: float, shape: tuple[int, int]) -> float:

@@ -69,12 +69,17 @@ def fit_points(
     pixel-integrated Gaussian from `start_xy_px` (n, 2); steps are limited to half a pixel, so a hopeless source stays
     near where it was. Weights: the pixels' variance and what the source's own light adds to it.
     """
-    size = max(1, BATCH_PIXELS // max(stamps.data[0].size, 1)) if len(stamps.data) else 1
+    size = max(1, BATCH_PIXELS // (stamps.data.shape[1] * stamps.data.shape[2]))
     batches = [
         _fit(stamps.part(slice(at, at + size)), start_xy_px[at : at + size], sigma_px, light_noise, own_part, rounds)
         for at in range(0, max(len(start_xy_px), 1), size)
     ]
-    return PointFits(**{f.name: np.concatenate([getattr(b, f.name) for b in batches]) for f in fields(PointFits)})
+    return joined(batches)
+
+
+def joined(parts: list[PointFits]) -> PointFits:
+    """The fits of all parts, one after the other."""
+    return PointFits(**{f.name: np.concatenate([getattr(b, f.name) for b in parts]) for f in fields(PointFits)})
 
 
 def _fit(
@@ -120,7 +125,7 @@ def _judged(
     # The level of the surroundings was taken from pixels that hold the star: it lowers signal by `own_part`, noise by
     # its root.
     undiluted = np.sqrt(np.maximum(norm, 1e-30) * (1.0 - own_part))
-    count = s.data[0].size if s.usable is None else s.usable.sum(axis=(1, 2))
+    count = s.data.shape[1] * s.data.shape[2] if s.usable is None else s.usable.sum(axis=(1, 2))
     return PointFits(
         xy_px=s.centres + offset,
         flux=flux,
@@ -163,7 +168,12 @@ def _normal_equations(
 
 def _products(profile: Pixels, slope: Pixels) -> Pixels:
     """(n, 6, s): the products PP, PD, DD, P, D, ONE of a profile and its slope."""
-    return np.stack([profile * profile, profile * slope, slope * slope, profile, slope, np.ones_like(slope)], axis=1)
+    products = np.empty((len(profile), 6, profile.shape[1]), dtype=profile.dtype)
+    np.multiply(profile, profile, out=products[:, PP])
+    np.multiply(profile, slope, out=products[:, PD])
+    np.multiply(slope, slope, out=products[:, DD])
+    products[:, P], products[:, D], products[:, ONE] = profile, slope, 1.0
+    return products
 
 
 def _solved_pairs(normal: Array, right: Array) -> Array:

@@ -57,6 +57,11 @@ class Frame:
         """Stamps (n, s, s) without their background."""
         return stamps(self.image, centres, radius) - stamps(self.background, centres, radius)
 
+    def light(self, centres: Ints, radius: int) -> Image:
+        """Stamps (n, s, s) of the light of the stars known so far, which there must be."""
+        assert self.found is not None
+        return stamps(self.found, centres, radius)
+
     def variance(self, centres: Ints, radius: int) -> Image:
         """Stamps (n, s, s) of the pixels' variance, the stars' own light not included."""
         return np.square(stamps(self.noise, centres, radius))
@@ -84,8 +89,11 @@ def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray
 def stamps(image: NDArray[Any], centres: Ints, radius: int) -> NDArray[Any]:
     """Cut-outs (n, 2r+1, 2r+1) of the image around the integer pixels (n, 2) (x, y), which must be `radius` inside."""
     side = 2 * radius + 1
-    windows = np.lib.stride_tricks.sliding_window_view(image, (side, side))
-    return windows[centres[:, 1] - radius, centres[:, 0] - radius]
+    height, width = image.shape
+    places = np.lib.stride_tricks.as_strided(
+        image, (height - side + 1, width - side + 1, side, side), image.strides * 2, writeable=False
+    )
+    return places[centres[:, 1] - radius, centres[:, 0] - radius]
 
 
 def radius_for(sigma_px: float) -> int:

@@ -6,13 +6,17 @@ import numpy as np
 
 from startrack.detect.crowded import Fitted, own_light
 from startrack.detect.fit import PointFits, Stamps
-from startrack.detect.frame import LightNoise
+from startrack.detect.frame import Frame, LightNoise
 from startrack.detect.impostors import edge_chi2
 from startrack.detect.widths import BRIGHT_SNR, FEWEST_BRIGHT
 from startrack.types import Array, Bools, Ints
 
-NOMINAL_PX = 1.25
-SHARPEST_PX = 0.75
+WIDTHS_PX = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0)
+HEIGHTS = (5.79, 5.65, 5.49, 5.40, 5.31, 5.15, 5.09)  # measured at USUAL_SKEWNESS: alike in false stars
+HEIGHT_AT_NOMINAL = 5.42
+USUAL_SKEWNESS, LARGEST_SKEWNESS = 0.088, 0.3  # the first is that of 100 photons and 3 electrons of read noise
+FILTERED_SKEWNESS = 0.376  # 2 / (3 sqrt(pi)): part that a matched filter of 1 px leaves
+NOISE_TOO_SMALL = 0.17  # part of the skewness by which the noise is measured too small
 OWN_LEVEL_PART = 0.8  # of the threshold that a source must reach by its own stamp alone, everywhere
 UNEVEN_SIGMA = 2.5  # difference of the stamp's level and that of its surroundings where these are not to be trusted
 EDGE_MARGIN = 8.0  # chi^2 by which an edge must explain a stamp better: noise alone gives faint stars less
@@ -22,14 +26,14 @@ ROUGH_PSF_SPREAD = 2.0  # times the typical misfit that a star of such a frame m
 LARGEST_SIGMA_PX = 2.0  # of the place
 
 
-def stars_among(fitted: Fitted, sigma: float, threshold_snr: float) -> Ints:
-    """Indices (k,) of the candidates that are point sources.
+def stars_among(fitted: Fitted, sigma: float, threshold: float) -> Ints:
+    """Indices (k,) of the candidates that are point sources, and stand out by the threshold [sigma].
 
     Where the bright sources of the frame all differ from the Gaussian (trails, coma, a real lens), no bright star would
     pass by its chi^2; there a source passes whose misfit is like theirs.
     """
     fits = fitted.fits
-    stands_out = height_of(fits) >= threshold_for(threshold_snr, sigma)
+    stands_out = height_of(fits) >= threshold
     placed = np.sqrt(fits.covariance[:, 0, 0] + fits.covariance[:, 1, 1]) < LARGEST_SIGMA_PX
     left = np.flatnonzero(stands_out & placed & (fits.chi2 < fits.chi2_pixel))
     if not len(left):
@@ -65,15 +69,28 @@ def height_of(fits: PointFits) -> Array:
     return np.where(even, np.minimum(fits.significance, by_itself / OWN_LEVEL_PART), by_itself)
 
 
-def threshold_for(threshold_snr: float, sigma_px: float) -> float:
-    """Height that gives a PSF of any width as many false peaks as one of NOMINAL_PX at `threshold_snr`.
+def threshold_for(threshold_snr: float, sigma_px: float, skewness: float) -> float:
+    """Height that gives about as many false peaks, whatever the PSF's width and the skewness of the pixels' noise.
 
-    Heights with 0.5 to 1 false stars in 4 Mpx (of noise, and of crowds for wide PSFs): 5.7, 5.55, 5.45, 5.35, 5.25 and
-    5.15 at sigma 0.6, 1.0, 1.2, 1.5, 2 and 3 px. Below SHARPEST_PX the pixels, no longer the PSF, say how many
-    independent places there are.
+    That is 0.3 to 0.6 in 4 Mpx at the default. A narrower PSF has more independent places to be false at, down to where
+    the pixels, no longer the PSF, say how many there are; a wider one has fewer, but crowds. Photons' noise is skew:
+    its bright tail is heavier than a Gaussian's (the first term of Cornish and Fisher's expansion, with what the filter
+    leaves of the skewness), and its quantiles below the median, from which the noise is taken, lie closer together.
     """
-    places = np.log(NOMINAL_PX / max(sigma_px, SHARPEST_PX))
-    return float(np.sqrt(max(threshold_snr**2 + (6.5 if places > 0 else 3.5) * places, 9.0)))
+    height = float(np.interp(np.log(sigma_px), np.log(WIDTHS_PX), HEIGHTS))
+    filtered = FILTERED_SKEWNESS / np.sqrt(sigma_px**2 + 1.0 / 12.0)
+    height += (skewness - USUAL_SKEWNESS) * (filtered * (height**2 - 1.0) / 6.0 + NOISE_TOO_SMALL * height)
+    return float(np.sqrt(max(height**2 + threshold_snr**2 - HEIGHT_AT_NOMINAL**2, 9.0)))
+
+
+def skewness_of(frame: Frame) -> float:
+    """Skewness of the noise of the frame's pixels, by the photons of its background; a usual one without a gain."""
+    if frame.light_noise.per_unit != 1.0:  # not in electrons
+        return USUAL_SKEWNESS
+    some = slice(None, None, 64), slice(None, None, 64)
+    noise = float(np.median(frame.noise[some]))
+    photons = min(max(float(np.median(frame.background[some])), 0.0), noise**2)
+    return min(photons / max(noise, 1e-6) ** 3, LARGEST_SKEWNESS)
 
 
 def _typical(misfit: Array) -> float:

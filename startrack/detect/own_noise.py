@@ -10,7 +10,7 @@ from startrack.psf import pixel_profile
 from startrack.types import Array, Bools, Ints
 
 BRIGHT_SNR = 15.0
-FEWEST, MOST = 20, 60
+FEWEST, MOST = 20, 120
 FAINT_PART = 0.3  # of the pixel's variance: pixels with less of the star's light tell nothing
 MOST_LEVERAGE = 0.5  # pixels that the fit follows hide their noise
 BINS, FEWEST_IN_BIN = 12, 15

@@ -17,7 +17,9 @@ from startrack.types import Array, Bools, Ints
 STRIP_ROWS = 320
 MOST_STAMP_PIXELS = 2_500_000  # of all candidates together: bounds time and memory, whatever the frame holds
 MOST_BLOBS = 1000  # saturated; the largest
+FEW_DEAD = 20_000  # pixels up to which they are grouped without looking at the whole mask
 OWN_RESIDUE_SIGMAS = 1.5
+ONE_PIXEL_PART = 0.15  # of a peak's light beside it; a star of 0.45 px has 0.18
 AROUND = [(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)]
 
 
@@ -61,6 +63,37 @@ def find_peaks(frame: Frame, sigma: float, lowest: float, most: int, known: Arra
         surround=np.concatenate([np.zeros(len(blobs)), surround * _at(frame.noise, peaks)]),
         own_part=min(float(1.0 / squared**2) / width**2, 0.5),
     )
+
+
+def bright_pixels(frame: Frame, lowest: float, most: int, margin: int) -> Ints:
+    """Pixels (n, 2) brighter than `lowest` sigma and than their neighbours: the highest, `margin` (1 or more) inside.
+
+    Hot pixels, none of whose neighbours is bright too, are left out.
+    """
+    height, width = frame.shape
+    found, level = [], []
+    for top in range(margin, height - margin, STRIP_ROWS):
+        end = min(top + STRIP_ROWS, height - margin)
+        strip = frame.standardised(slice(top - 1, end + 1))
+        row, column = np.divmod(np.flatnonzero(strip[1:-1] > np.float32(lowest)), width)
+        inside = (column >= margin) & (column < width - margin)
+        row, column = row[inside] + 1, column[inside]
+        own = strip[row, column]
+        highest = np.ones(len(row), dtype=bool)
+        for down, right in AROUND:
+            highest &= own >= strip[row + down, column + right]
+        beside = np.maximum(strip[row, column - 1], strip[row, column + 1])
+        beside = np.maximum(beside, np.maximum(strip[row - 1, column], strip[row + 1, column]))
+        highest &= beside > np.float32(ONE_PIXEL_PART) * own
+        found.append(np.stack([column, row + top - 1], axis=1)[highest])
+        level.append(own[highest])
+    pixels = np.concatenate(found) if found else np.zeros((0, 2), dtype=np.int64)
+    if not len(pixels):
+        return pixels
+    if frame.dead is not None:
+        alive = ~frame.dead[pixels[:, 1], pixels[:, 0]]
+        pixels, level = pixels[alive], [np.concatenate(level)[alive]]
+    return pixels[np.argsort(-np.concatenate(level), kind="stable")[:most]]
 
 
 def _strip_peaks(
@@ -126,11 +159,36 @@ def _saturated_blobs(dead: NDArray[np.bool_] | None, margin: int) -> Array:
     """Middles (n, 2) [px] of the saturated blobs: bright stars whose own peak is a plateau."""
     if dead is None:
         return np.zeros((0, 2))
-    count, _, stats, centroids = cv2.connectedComponentsWithStats(dead.astype(np.uint8))
     height, width = dead.shape
-    middle = centroids[1:count]
+    row, column = np.divmod(np.flatnonzero(dead), width)
+    if not len(row):
+        return np.zeros((0, 2))
+    if len(row) > FEW_DEAD:  # large areas: the whole mask
+        count, labels, _, _ = cv2.connectedComponentsWithStats(dead.astype(np.uint8))
+        label = labels[row, column].astype(np.int64) - 1
+        count -= 1
+    else:
+        count, label = _touching(row, column, width)
+    area = np.bincount(label, minlength=count)
+    middle = np.stack([np.bincount(label, q, count) / np.maximum(area, 1) for q in (column, row)], axis=1)
     inside = (middle >= margin).all(axis=1) & (middle[:, 0] < width - margin) & (middle[:, 1] < height - margin)
-    compact = stats[1:count, cv2.CC_STAT_AREA] <= (2 * margin + 1) ** 2
-    good = np.flatnonzero(inside & compact)
-    chosen = good[np.argsort(-stats[1 + good, cv2.CC_STAT_AREA], kind="stable")[:MOST_BLOBS]]
+    good = np.flatnonzero(inside & (area <= (2 * margin + 1) ** 2))
+    chosen = good[np.argsort(-area[good], kind="stable")[:MOST_BLOBS]]
     return np.asarray(middle[chosen], dtype=np.float64)
+
+
+def _touching(row: Ints, column: Ints, width: int) -> tuple[int, Ints]:
+    """How many groups of touching pixels (corners count) there are among a few, and each one's group (n,)."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    place = row * (width + 2) + column + 1  # a border keeps the rows' ends apart; ascending
+    pairs = []
+    for step in (1, width + 1, width + 2, width + 3):
+        at = np.minimum(np.searchsorted(place, place + step), len(place) - 1)
+        hit = np.flatnonzero(place[at] == place + step)
+        pairs.append(np.stack([hit, at[hit]]))
+    i, j = np.concatenate(pairs, axis=1)
+    graph = coo_matrix((np.ones(len(i), dtype=np.int8), (i, j)), shape=(len(place), len(place)))
+    count, label = connected_components(graph, directed=False)
+    return int(count), label.astype(np.int64)

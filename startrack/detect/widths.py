@@ -11,9 +11,9 @@ from startrack.types import Array, Bools, Ints
 
 BRIGHT_SNR = 12.0  # sources that say what the frame's PSF is
 FEWEST_BRIGHT = 8
-MOST_BRIGHT = 150
+MOST_BRIGHT = 100
 NEAR = np.geomspace(0.7, 1.45, 9)  # widths tried first, in units of the expected one
-WIDTHS_PX = np.geomspace(0.3, 8.0, 36)
+WIDTHS_PX = np.geomspace(0.3, 8.0, 22)
 NARROWER_IS_A_PIXEL_PX = 0.45  # hot pixels fit the narrowest profile
 AT_THE_END = 0.3  # part of the sources that the widths tried first may fail to hold
 STAR_LIKE = 0.75  # of a stamp's variance beyond the noise that a star of the best width explains; clouds: 0.2 to 0.5

@@ -11,13 +11,14 @@ from startrack.camera import Camera
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure
 from startrack.evidence.ratio import gaussian_ratio, shines_ratio
 from startrack.evidence.scale import FluxScale
-from startrack.frames import azel_from_rays
+from startrack.frames import angle_between_rad, azel_from_rays
 from startrack.psf import noise_area_px
 from startrack.types import Array, Body, Bools, Detections, Evidence, Ints, Stars
 
 FAINTEST_SNR = 0.5  # fainter stars say next to nothing and would only cost time
 CROWDED = 2.0  # PSF areas per star: where more stars share the pixels, the same light would be counted twice
 BODY_GLARE_PX = 8.0
+DISKS_RAD = {"Sun": 0.0047, "Moon": 0.0049, "Earth": 0.0180}  # largest radii, the Earth's seen from the Moon
 TELLING_SNR = 2.0  # stars brighter than this tell whether they shine
 SEEN_LLR = 3.0  # from here on a star counts as seen, from minus this as hidden
 
@@ -183,7 +184,9 @@ def _unusable(
     for body in bodies:
         at, seen = camera.project(body.ray_icrs @ R_cam_icrs.T)
         if seen:
-            cause[np.hypot(*(xy_px - at).T) < BODY_GLARE_PX] = f"beside {body.name}"
+            off_axis = angle_between_rad(body.ray_icrs @ R_cam_icrs.T, np.array([0.0, 0.0, 1.0]))
+            disk_px = DISKS_RAD.get(body.name, 0.0) / camera.mean_scale_rad_per_px(off_axis)
+            cause[np.hypot(*(xy_px - at).T) < BODY_GLARE_PX + disk_px] = f"beside {body.name}"
     # The stamp must lie within the lit circle: beyond its edge the background is another.
     edge = camera.max_angle_rad - (margin + 1) * camera.mean_scale_rad_per_px(np.array(camera.max_angle_rad))
     cause[angle_rad > edge] = "edge of the image circle"

@@ -10,7 +10,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.common import DEFAULT_OUT, add_fact_flags, cores, flag_facts, made_folder, whole_number
+from startrack.cli.common import DEFAULT_OUT, add_fact_flags, cores, flag_facts, made_folder
+from startrack.cli.flag_types import at_least_one
 from startrack.cli.horizons import ready_for
 from startrack.errors import BadInput
 
@@ -34,7 +35,7 @@ def add_parser(subparsers: Any) -> None:
     add_fact_flags(parser)
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file, or the name of a shipped one")
     parser.add_argument(
-        "-j", "--jobs", type=whole_number, default=None, metavar="N", help="processes (default: all cores)"
+        "-j", "--jobs", type=at_least_one, default=None, metavar="N", help="processes (default: all cores)"
     )
     parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask cluster to use instead (extra: cluster)")
     parser.add_argument("--files-on-stdin", action="store_true", help="only the images listed on stdin, one a line")

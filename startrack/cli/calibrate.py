@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import DEFAULT_OUT, exit_code_of_reason, read
+from startrack.cli.flag_types import amount, field_of_view_rad, number, positive
 from startrack.errors import BadInput, NoSolution
 
 if TYPE_CHECKING:
@@ -44,18 +45,18 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("words", nargs="+", metavar="IMAGE", help="images; or verify, show, convert, board and theirs")
     parser.add_argument("-o", "--output", metavar="FILE", help="what to write (default: camera.toml in OUT)")
     parser.add_argument("-c", "--camera", metavar="FILE", help="approximate camera file, or one to verify")
-    parser.add_argument("--fov", type=_degrees, metavar="DEG", help="below 100: angle across the width; from 100 up: "
-                        "of the image circle")  # fmt: skip
+    parser.add_argument("--fov", type=field_of_view_rad, metavar="DEG", help="below 100: angle across the "
+                        "width; from 100 up: of the image circle")  # fmt: skip
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601 (one image only)")
-    parser.add_argument("--exposure", type=float, metavar="S", help="exposure time in seconds")
+    parser.add_argument("--exposure", type=positive, metavar="S", help="exposure time in seconds")
     parser.add_argument("--site", metavar="LAT,LON[,M]", help="where on the Earth, in degrees and metres: refraction "
                         "is taken out (--site=-30.2,...)")  # fmt: skip
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file whose origin is the site")
     parser.add_argument("--name", help="name of the camera (default: the file's stem)")
     sensor = parser.add_argument_group("sensor, where the pictures do not tell")
-    sensor.add_argument("--gain", type=float, metavar="E", help="electrons per ADU")
-    sensor.add_argument("--read-noise", type=float, metavar="E", help="read noise, electrons")
-    sensor.add_argument("--bias", type=float, metavar="ADU", help="level without light")
+    sensor.add_argument("--gain", type=positive, metavar="E", help="electrons per ADU")
+    sensor.add_argument("--read-noise", type=amount, metavar="E", help="read noise, electrons")
+    sensor.add_argument("--bias", type=number, metavar="ADU", help="level without light")
     convert = parser.add_argument_group("convert")
     convert.add_argument("--to", choices=FORMATS, help="write this kind of file")
     convert.add_argument("--from", dest="source", choices=FORMATS, help="read this kind of file")
@@ -69,13 +70,6 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("-v", "--verbose", action="count", default=0, help="say more; tracebacks of internal errors")
     parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
     parser.set_defaults(usage_error=parser.error)
-
-
-def _degrees(text: str) -> float:
-    value = float(text)
-    if not 0.5 < value <= 360:
-        raise argparse.ArgumentTypeError(f"{text} is not a field of view in degrees")
-    return value
 
 
 def run(args: argparse.Namespace) -> int:
@@ -107,7 +101,7 @@ def _calibrate(args: argparse.Namespace) -> int:
                 exposures,
                 load_catalog(),
                 camera=start,
-                fov_rad=None if args.fov is None else math.radians(args.fov),
+                fov_rad=args.fov,
                 site=site_of(args, exposures),
                 given=Given(gain_e_per_adu=args.gain, read_noise_e=args.read_noise, bias_adu=args.bias),
                 name=args.name or out.stem,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import sys
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from startrack.cli.flag_types import positive
 from startrack.errors import INTERNAL_ERROR, BadInput
 
 if TYPE_CHECKING:
@@ -35,24 +35,7 @@ def add_fact_flags(parser: argparse.ArgumentParser) -> None:
     """Flags for what images may not say themselves."""
     parser.add_argument("-c", "--camera", metavar="FILE", help="camera file, or the name of a shipped one")
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601")
-    parser.add_argument("--exposure", type=_seconds, metavar="S", help="exposure time in seconds")
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds") from None
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number of seconds")
-    return value
-
-
-def whole_number(text: str) -> int:
-    """A number of things, at least one: an argparse type."""
-    if int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not above 0")
-    return int(text)
+    parser.add_argument("--exposure", type=positive, metavar="S", help="exposure time in seconds")
 
 
 def made_folder(path: str) -> Path:

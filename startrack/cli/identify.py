@@ -8,6 +8,7 @@ import time
 from typing import Any
 
 from startrack.cli.common import Outcome, add_image_flags, camera_of, read, result_path, run_images
+from startrack.cli.flag_types import field_of_view_rad
 
 FORMAT = "startrack.identification/1"
 NARROWEST_DEG, WIDEST_DEG = 3.0, 280.0
@@ -32,10 +33,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def _field_of_view_rad(text: str) -> float:
-    degrees = float(text)
-    if not NARROWEST_DEG <= degrees <= WIDEST_DEG:
-        raise argparse.ArgumentTypeError(f"{text} is not between {NARROWEST_DEG:g} and {WIDEST_DEG:g} degrees")
-    return math.radians(degrees)
+    return field_of_view_rad(text, NARROWEST_DEG, WIDEST_DEG)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from startrack.cli.flag_types import amount, at_least_one, count, number, positive
 from startrack.errors import BadInput
 
 if TYPE_CHECKING:
@@ -34,8 +35,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     )
     parser.add_argument("-c", "--camera", default="fisheye-2048", metavar="FILE", help="default %(default)s")
     parser.add_argument("-t", "--terrain", default="shackleton-thesis", metavar="FILE", help="default %(default)s")
-    parser.add_argument("--seed", type=_count, default=0, metavar="N", help="same seed, same bytes (default 0)")
-    parser.add_argument("-n", "--count", type=_at_least_one, default=1, metavar="N", help="images (default 1)")
+    parser.add_argument("--seed", type=count, default=0, metavar="N", help="same seed, same bytes (default 0)")
+    parser.add_argument("-n", "--count", type=at_least_one, default=1, metavar="N", help="images (default 1)")
     _add_pose(parser.add_argument_group("pose and time (what is not given is drawn from the seed)"))
     _add_light(parser.add_argument_group("light and defects"))
     _add_output(parser.add_argument_group("output"))
@@ -58,28 +59,28 @@ def run(args: argparse.Namespace) -> int:
 
 def _add_pose(group: Any) -> None:
     group.add_argument("--time", metavar="UTC", help="middle of the exposure; else between 2024 and 2034")
-    group.add_argument("--east", type=_number, metavar="M", help="from the terrain's origin")
-    group.add_argument("--north", type=_number, metavar="M", help="from the terrain's origin")
-    group.add_argument("--heading", type=_number, metavar="DEG", help="azimuth of the rover's nose")
-    group.add_argument("--pitch", type=_number, metavar="DEG", help="nose up positive")
-    group.add_argument("--roll", type=_number, metavar="DEG", help="right side down positive")
-    group.add_argument("--max-tilt", type=_amount, default=5.0, metavar="DEG", help="of random tilts (5)")
+    group.add_argument("--east", type=number, metavar="M", help="from the terrain's origin")
+    group.add_argument("--north", type=number, metavar="M", help="from the terrain's origin")
+    group.add_argument("--heading", type=number, metavar="DEG", help="azimuth of the rover's nose")
+    group.add_argument("--pitch", type=number, metavar="DEG", help="nose up positive")
+    group.add_argument("--roll", type=number, metavar="DEG", help="right side down positive")
+    group.add_argument("--max-tilt", type=amount, default=5.0, metavar="DEG", help="of random tilts (5)")
 
 
 def _add_light(group: Any) -> None:
     help_exposure = "seconds; default: a V 6 star on the axis reaches 5 sigma, which takes fisheye-2048 0.40 s"
     help_faint = "add stars that the catalogue lacks (FIELD n) down to this magnitude, and draw none fainter (10)"
     help_scatter = "of each star's flux, beyond the catalogue's own errors (0.03); 0 turns both off"
-    group.add_argument("--exposure", type=_positive, metavar="S", help=help_exposure)
-    group.add_argument("--sky-mag", type=_number, default=22.0, metavar="V", help="diffuse sky per arcsec^2 (22.0)")
-    group.add_argument("--sky-gradient", type=_number, default=0.0, metavar="F", help="its slope to the horizon (0)")
-    group.add_argument("--sky-gradient-azimuth", type=_number, default=0.0, metavar="DEG", help="where it rises to (0)")
-    group.add_argument("--wall-reflectance", type=_amount, default=0.04, metavar="F", help="of the sky's light (0.04)")
-    group.add_argument("--faint-stars", type=_number, default=10.0, metavar="V", help=help_faint)
+    group.add_argument("--exposure", type=positive, metavar="S", help=help_exposure)
+    group.add_argument("--sky-mag", type=number, default=22.0, metavar="V", help="diffuse sky per arcsec^2 (22.0)")
+    group.add_argument("--sky-gradient", type=number, default=0.0, metavar="F", help="its slope to the horizon (0)")
+    group.add_argument("--sky-gradient-azimuth", type=number, default=0.0, metavar="DEG", help="where it rises to (0)")
+    group.add_argument("--wall-reflectance", type=amount, default=0.04, metavar="F", help="of the sky's light (0.04)")
+    group.add_argument("--faint-stars", type=number, default=10.0, metavar="V", help=help_faint)
     group.add_argument("--no-faint-stars", action="store_true", help="the catalogue's stars alone")
-    group.add_argument("--flux-scatter", type=_amount, default=0.03, metavar="MAG", help=help_scatter)
-    group.add_argument("--hot-pixels", type=_count, default=200, metavar="N", help="of the sensor (200)")
-    group.add_argument("--cosmic-rays", type=_count, default=5, metavar="N", help="tracks per exposure (5)")
+    group.add_argument("--flux-scatter", type=amount, default=0.03, metavar="MAG", help=help_scatter)
+    group.add_argument("--hot-pixels", type=count, default=200, metavar="N", help="of the sensor (200)")
+    group.add_argument("--cosmic-rays", type=count, default=5, metavar="N", help="tracks per exposure (5)")
 
 
 def _add_output(group: Any) -> None:
@@ -87,7 +88,7 @@ def _add_output(group: Any) -> None:
     where.add_argument("-o", "--output", metavar="FILE", help="one image: .png, .tif or .fits")
     where.add_argument("-D", "--dir", default="startrack-out", metavar="OUT", help="folder (default %(default)s)")
     group.add_argument("--format", choices=SUFFIXES, default="png", help="of images in the folder (png)")
-    group.add_argument("--truth-mag", type=_number, default=8.5, metavar="V", help="faintest star in the table (8.5)")
+    group.add_argument("--truth-mag", type=number, default=8.5, metavar="V", help="faintest star in the table (8.5)")
     group.add_argument("-O", "--overwrite", action="store_true", help="replace files that are there")
     group.add_argument("--json", action="store_true", help="one JSON object per image on stdout")
     group.add_argument("--no-plots", action="store_true", help="accepted everywhere; render draws no plots")
@@ -215,35 +216,3 @@ def _progress(total: int) -> Iterator[Callable[[], None]]:
 
 def _radians(degrees: float | None) -> float | None:
     return None if degrees is None else math.radians(degrees)
-
-
-def _number(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
-    return value
-
-
-def _amount(text: str) -> float:
-    if _number(text) < 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is negative")
-    return float(text)
-
-
-def _positive(text: str) -> float:
-    if _number(text) <= 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not above 0")
-    return float(text)
-
-
-def _at_least_one(text: str) -> int:
-    if _count(text) == 0:
-        raise argparse.ArgumentTypeError("0 images are nothing to render")
-    return int(text)
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is negative")
-    return value

@@ -12,7 +12,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.common import DEFAULT_OUT, cores, made_folder, whole_number
+from startrack.cli.common import DEFAULT_OUT, cores, made_folder
+from startrack.cli.flag_types import at_least_one
 from startrack.errors import BadInput
 
 if TYPE_CHECKING:
@@ -43,12 +44,12 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     size.add_argument("--full", action="store_true", help="as many as in the thesis: 10 x 10,000, and 100,000 places")
     parser.add_argument(
         "--ours",
-        type=whole_number,
+        type=at_least_one,
         metavar="N",
         help="our method on at most N places per starfield, 10 N in figure 3.10",
     )
     parser.add_argument(
-        "-j", "--jobs", type=whole_number, default=None, metavar="N", help="processes (default: all cores)"
+        "-j", "--jobs", type=at_least_one, default=None, metavar="N", help="processes (default: all cores)"
     )
     parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask cluster to use instead (extra: cluster)")
     parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="same seed, same files (default 0)")

@@ -1,0 +1,56 @@
+"""Numbers on the command line, as argparse types: what is wrong with one is said in words."""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+
+def number(text: str) -> float:
+    """Any finite number."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number")
+    return value
+
+
+def amount(text: str) -> float:
+    """A number from 0 up."""
+    if number(text) < 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is negative")
+    return number(text)
+
+
+def positive(text: str) -> float:
+    """A number above 0."""
+    if number(text) <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not above 0")
+    return number(text)
+
+
+def count(text: str) -> int:
+    """A whole number from 0 up."""
+    try:
+        value = int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is negative")
+    return value
+
+
+def at_least_one(text: str) -> int:
+    """A whole number from 1 up."""
+    if count(text) == 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not above 0")
+    return count(text)
+
+
+def field_of_view_rad(text: str, narrowest_deg: float = 0.5, widest_deg: float = 360.0) -> float:
+    """An angle given in degrees [rad]."""
+    if not narrowest_deg <= number(text) <= widest_deg:
+        raise argparse.ArgumentTypeError(f"{text} is not between {narrowest_deg:g} and {widest_deg:g} degrees")
+    return math.radians(number(text))

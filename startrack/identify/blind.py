@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.identify.blind_judge import Judged
+from startrack.identify.blind_narrow import NarrowSearch
 from startrack.identify.circle import Circle, image_circle
 from startrack.identify.family import PINHOLE, radius
 from startrack.identify.grow import WIDE, Grown, Stage, grow
@@ -73,6 +75,8 @@ def identify_blind(
     give as many coincidences with probability below 1e-9, all trials included. Raises NotIdentified.
     """
     search = _Search(detections, size_px, fov_rad, stars, tolerance)
+    if search.narrow and (quick := _quickly(search, detections)) is not None:
+        return quick
     for grown, around in search.grown():
         answer = polished(grown, detections, stars.take(around), search.tried, search.widest_rad)
         if answer is not None and answer.log_chance < LOG_FALSE_ALARM and answer.matched >= search.fewest:
@@ -85,7 +89,20 @@ def identify_blind(
     )
 
 
-def _solution(answer: Polished, around: Ints) -> BlindSolution:
+def _quickly(search: _Search, detections: Detections) -> BlindSolution | None:
+    """A narrow field by the votes of its brightest stars' triangles; None where that does not suffice."""
+    narrow = NarrowSearch(
+        detections, search.chosen, search.size_px, search.fov_rad, search.rounded_field_sr(), search.stars
+    )
+    for found in narrow.found():
+        said = found.judged
+        if said.log_chance < LOG_FALSE_ALARM and len(said.star) >= search.fewest:
+            return _solution(said, found.around)
+    search.hypotheses.tried += narrow.tried
+    return None
+
+
+def _solution(answer: Polished | Judged, around: Ints) -> BlindSolution:
     return BlindSolution(
         camera=answer.camera,
         identification=Identification(
@@ -113,7 +130,7 @@ class _Search:
             off = np.linalg.norm(self.xy_px - self.circle.centre_px, axis=1)
             self.xy_px = self.xy_px[off < EDGE * self.circle.radius_px]
         self.narrow = fov_rad <= NARROW_FIELD_RAD
-        chosen = apart(self.xy_px, APART * min(size_px), 100)
+        self.chosen = chosen = apart(self.xy_px, APART * min(size_px), 100)
         if len(chosen) < self.fewest:
             raise NotIdentified(
                 f"{len(chosen)} point sources are too few to identify without a camera file: expose longer, or {TRY}",
@@ -162,7 +179,7 @@ class _Search:
 
     def _rounds(self) -> Iterator[tuple[PatternSizes, Window]]:
         """Which patterns of the catalogue and which of the detections, in turn."""
-        field_sr = float(np.exp(np.round(FIELD_STEPS * np.log(self._field_sr())) / FIELD_STEPS))
+        field_sr = self.rounded_field_sr()
         if not self.narrow:
             yield from ((wide_sizes(field_sr), window) for window in WINDOWS)
             return
@@ -198,6 +215,10 @@ class _Search:
             for shape in WIDE_SHAPES
             if abs(shape) * self.fov_rad / 2 < np.radians(80.0)
         ]
+
+    def rounded_field_sr(self) -> float:
+        """The solid angle, so rounded that one index serves many fields."""
+        return float(np.exp(np.round(FIELD_STEPS * np.log(self._field_sr())) / FIELD_STEPS))
 
     def _field_sr(self) -> float:
         """Solid angle of the frame, or of the image circle."""

@@ -52,19 +52,23 @@ def judged(view: View, detections: Detections, stars: Stars, tree: Any, tried: i
     """
     for gate_px in GATES_PX:
         pairs = _pairs(view, detections, stars, tree)
-        on = _plain(pairs, _within(pairs, gate_px), detections)
-        if len(on) < FEWEST:
+        on = None if pairs is None else _plain(pairs, _within(pairs, gate_px), detections)
+        if pairs is None or on is None or len(on) < FEWEST:
             return None
         xy_px, rays = detections.xy_px[pairs.detection[on]], stars.rays_icrs[pairs.star[on]]
         view = view.fitted(xy_px, rays, gate_px / 4, bend=len(on) >= ENOUGH_TO_BEND)
     view = _simpler(view, xy_px, rays, GATES_PX[-1] / 4)
     pairs = _pairs(view, detections, stars, tree)
+    if pairs is None:
+        return None
     off_axis_px = np.linalg.norm(detections.xy_px - view.middle_px, axis=1)
     known_px = _known_px(pairs, off_axis_px)
     if known_px is None:
         return None
     on = _within(pairs, GATES_PX[-1])
     on = on[off_axis_px[pairs.detection[on]] <= known_px]
+    if len(on) < FEWEST:
+        return None
     log_chance = _log_chance(view, pairs, on, detections.xy_px[:JUDGED], stars, known_px)
     on = _plain(pairs, on, detections)
     camera = view.camera()
@@ -100,8 +104,8 @@ def _plain(pairs: Pairs, which: Ints, detections: Detections) -> Ints:
     return pairs.plain(which, variance_px2, min(BLEND_SIGMAS * detections.psf_sigma_px, WIDEST_BLEND_PX))
 
 
-def _pairs(view: View, detections: Detections, stars: Stars, tree: Any) -> Pairs:
-    """All pairs (detection, star) near each other; none where they are too few to tell the brightness scale."""
+def _pairs(view: View, detections: Detections, stars: Stars, tree: Any) -> Pairs | None:
+    """All pairs (detection, star) near each other; None where they are too few to tell the brightness scale."""
     from scipy.spatial import cKDTree
 
     px, inside = view.project(stars.rays_icrs)
@@ -111,7 +115,7 @@ def _pairs(view: View, detections: Detections, stars: Stars, tree: Any) -> Pairs
     detection, star, distance = found["i"].astype(np.int64), seen[found["j"]], found["v"]
     close = np.flatnonzero(distance < GATES_PX[0])
     if len(close) < FEWEST:
-        detection, star, distance, close = detection[:0], star[:0], distance[:0], np.zeros(1, dtype=np.int64)
+        return None
     close = close[np.argsort(star[close], kind="stable")][:FIRST_MATCHES]
     light = Light.of(detections.flux_e, detections.saturated, stars.v_mag[star[close]], detection[close])
     return Pairs(detection, star, distance, stars.v_mag[star], stars.v_sigma_mag[star], light)

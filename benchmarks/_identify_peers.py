@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import product
+from typing import Any
 
 import numpy as np
 from _star_lists import StarList
@@ -56,12 +57,7 @@ def ruststartracker(camera: Camera, stars: Stars, v_limit: float, reach_rad: flo
     """ruststartracker's matcher, fed with unit vectors: 8 matches, its catalogue the stars that the lists may hold."""
     import ruststartracker as peer
 
-    count = int(np.searchsorted(stars.v_mag, v_limit + 1.5))
-    plain = peer.CameraParameters(np.diag([650.0, 650.0, 1.0]).astype(np.float32), camera.size_px, None)
-    tracker = peer.StarTracker(
-        stars.rays_icrs[:count], stars.v_mag[:count], plain, max_lookup_magnitude=v_limit,
-        max_inter_star_angle=reach_rad, inter_star_angle_tolerance=1e-3, n_minimum_matches=8, timeout_secs=2.0,
-    )  # fmt: skip
+    tracker = _tracker(camera.size_px, stars, v_limit, reach_rad)
 
     def prepare(listed: StarList) -> Callable[[], Answer | None]:
         rays = camera.unproject(listed.xy_px)
@@ -77,6 +73,23 @@ def ruststartracker(camera: Camera, stars: Stars, v_limit: float, reach_rad: flo
         return solve
 
     return prepare
+
+
+def _tracker(size_px: tuple[int, int], stars: Stars, v_limit: float, reach_rad: float) -> Any:
+    """Its catalogue with the index; kept, for it takes a while."""
+    import ruststartracker as peer
+
+    if (v_limit, reach_rad) not in _KEPT:
+        count = int(np.searchsorted(stars.v_mag, v_limit + 1.5))
+        plain = peer.CameraParameters(np.diag([650.0, 650.0, 1.0]).astype(np.float32), size_px, None)
+        _KEPT[v_limit, reach_rad] = peer.StarTracker(
+            stars.rays_icrs[:count], stars.v_mag[:count], plain, max_lookup_magnitude=v_limit,
+            max_inter_star_angle=reach_rad, inter_star_angle_tolerance=1e-3, n_minimum_matches=8, timeout_secs=2.0,
+        )  # fmt: skip
+    return _KEPT[v_limit, reach_rad]
+
+
+_KEPT: dict[tuple[float, float], Any] = {}
 
 
 def best_ruststartracker(camera: Camera, stars: Stars, lists: list[StarList]) -> tuple[Solver, str]:

@@ -39,22 +39,40 @@ class StarList:
         )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Trouble:
+    """What befalls a list."""
+
+    hidden: float = 0.0  # part of the stars, on one side of the field
+    scatter_mag: float = SCATTER_MAG
+    strangers: int = 0  # lights brighter than any star: planets, lamps, hot pixels
+    mirrored: bool = False  # the image is a mirror image of what the camera says: no answer is right
+
+
 def star_list(
-    camera: Camera, stars: Stars, true: int, false: int, noise_px: float, *, rng: np.random.Generator
-) -> StarList:
+    camera: Camera, stars: Stars, true: int, false: int, noise_px: float, trouble: Trouble = Trouble(), *,
+    rng: np.random.Generator,
+) -> StarList:  # fmt: skip
     """The `true` brightest stars in view and `false` random ones as bright as they are."""
     R = Rotation.random(random_state=rng).as_matrix()
     px, inside = camera.project(stars.rays_icrs @ R.T)
-    seen = np.flatnonzero(inside)[: 3 * true + 20]  # the stars are sorted, brightest first
+    seen = np.flatnonzero(inside)
+    if trouble.hidden:
+        side = (px[seen] - camera.centre_px) @ rng.normal(size=2)
+        seen = seen[side > np.quantile(side, trouble.hidden)]
+    seen = seen[: 3 * true + 20]  # the stars are sorted, brightest first
     pairs = cKDTree(px[seen]).query_pairs(CLOSE_PX, output_type="ndarray")
     star = np.delete(seen, pairs.max(axis=1) if len(pairs) else [])[:true]
-    strange = scattered(camera, false, rng=rng)
-    v = stars.v_mag[star] + rng.normal(0, SCATTER_MAG, len(star))
+    strange = scattered(camera, false + trouble.strangers, rng=rng)
+    v = stars.v_mag[star] + rng.normal(0, trouble.scatter_mag, len(star))
     like = v if true else 6 + np.log(rng.random(false)) / 1.08  # the magnitudes of a real sky
-    v = np.concatenate([v, rng.choice(like, false)])
+    v = np.concatenate([v, rng.choice(like, false), like.min() - 2 * rng.random(trouble.strangers)])
     order = np.argsort(v)
     xy = np.concatenate([px[star] + rng.normal(0, noise_px, (len(star), 2)), strange])
-    truth = np.concatenate([star, np.full(false, -1)])
+    truth = np.concatenate([star, np.full(len(strange), -1)])
+    if trouble.mirrored:
+        xy[:, 0] = 2 * camera.centre_px[0] - xy[:, 0]
+        truth[:] = -1
     return StarList(xy[order], v[order], truth[order], R, noise_px)
 
 

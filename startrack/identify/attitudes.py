@@ -22,7 +22,7 @@ MATCHES_EACH, ROUGH_MATCHES_EACH = 3, 8  # of an image's triangle
 MOST_IMAGE_TRIANGLES = 20_000
 VERIFIED = 256  # detections held against the stars
 SIFTED, AT_ONCE = 64, 64  # detections that sift a crowd of hypotheses first, and how many of these at once
-DEPTH_FACTOR = 8  # catalogue stars per detection of the whole sky's: some are hidden, or too faint
+DEPTH_FACTOR = 4  # catalogue stars per detection of the whole sky's: some are hidden, or too faint
 FEWEST_HITS = 6
 GIVEN = 3  # a triangle's own stars are hits whatever it is
 PLAUSIBLE = 1e-2  # chance of a match that is worth refining; the refined one is judged by the real limit
@@ -30,9 +30,9 @@ PLAUSIBLE = 1e-2  # chance of a match that is worth refining; the refined one is
 
 @dataclass(frozen=True)
 class Turned:
-    """What coincides at a rough attitude."""
+    """A rough attitude, and what coincides at it."""
 
-    to_icrs: Array  # (3, 3), to be multiplied from the right by rays in cam; about a rotation
+    R_cam_icrs: Array
     detection: Ints  # (k,)
     star: Ints  # (k,)
     near: Near | None  # all stars about the detections, where they were looked up
@@ -116,7 +116,7 @@ class AttitudeSearch:
         """Triangles cam (m, 3, 3) of the same hand as the catalogue's (m,) are tried, the others put aside."""
         self.tried += len(cam)
         same = np.linalg.det(cam) * handed > 0
-        if not same.all():
+        if np.count_nonzero(same) < len(same):
             self.mirrored.append((cam[~same], icrs[~same], first, tolerance))
             cam, icrs = cam[same], icrs[same]
         yield from self._plausible(cam, icrs, self.rays_cam, first, tolerance)
@@ -125,37 +125,31 @@ class AttitudeSearch:
         """Of the attitudes that turn the rays icrs (m, 3, 3) to cam (m, 3, 3), those that the bright stars support."""
         some, radius = rays_cam[: first + VERIFIED], 2.0 * tolerance
         depth = int(DEPTH_FACTOR * 4 * np.pi / self.patterns.field_sr * len(some))
-        for to_icrs in self._sifted(cam, icrs, some[max(first - WINDOW, 0) : first + SIFTED], radius, depth):
-            near = self.patterns.near(some @ to_icrs, self.reach_rad, depth)
+        for R in self._sifted(cam, icrs, some[max(first - WINDOW, 0) : first + SIFTED], radius, depth):
+            near = self.patterns.near(some @ R, self.reach_rad, depth)
             on = near.chord < radius
-            hits = int(np.count_nonzero(on))
-            if hits >= FEWEST_HITS and self._odds(hits, len(some), near.depth, radius) < PLAUSIBLE:
-                yield Turned(to_icrs, near.ray[on], near.star[on], near if len(some) == len(rays_cam) else None)
+            hits = min(int(np.count_nonzero(on)), len(some))
+            if hits >= FEWEST_HITS and self._odds(hits - GIVEN, len(some), near.depth, radius) < PLAUSIBLE:
+                yield Turned(R, near.ray[on], near.star[on], near if len(some) == len(rays_cam) else None)
 
     def _sifted(self, cam: Array, icrs: Array, some: Array, radius: float, depth: int) -> Iterator[Array]:
-        """The closest match, which is nearly always right; then those that a few detections support, the best first.
-
-        Matrices (3, 3), to be multiplied from the right by rays in cam.
-        """
+        """R_cam_icrs of the closest match, which is nearly always right; then those that some detections support."""
         if len(cam):
-            # A linear map through three rays serves for look-ups, and is quicker worked out than a rotation.
-            yield np.linalg.solve(cam[0], icrs[0])
+            yield turns(cam[0], icrs[0])
         tree = self.patterns.tree(depth)
-        for start in range(0, len(cam), AT_ONCE):
+        for start in range(1, len(cam), AT_ONCE):
             R = turns(cam[start : start + AT_ONCE], icrs[start : start + AT_ONCE])
             distance = tree.query(some @ R, distance_upper_bound=radius)[0]
             hits = np.count_nonzero(distance < radius, axis=1)
             best = np.argsort(-hits, kind="stable")
-            odds = self._odds(hits[best], len(some), tree.n, radius)
+            odds = self._odds(np.maximum(hits[best] - GIVEN, 1), len(some), tree.n, radius)
             yield from R[best[odds < PLAUSIBLE]]
 
-    def _odds(self, hits: Ints | int, rays: int, depth: int, radius: float) -> Array:
-        """Probability that chance makes so many of the rays hit one of the `depth` brightest stars, in any trial."""
+    def _odds(self, further: Ints | int, rays: int, depth: int, radius: float) -> Array:
+        """Probability that chance makes so many further rays hit one of the `depth` brightest stars, in any trial."""
         from scipy.special import betainc
 
-        further = np.maximum(hits - GIVEN, 1)
-        p = min(depth * radius**2 / 4, 1.0)
-        odds: Array = self.tried * betainc(further, np.maximum(rays - GIVEN - further, 0) + 1, p)
+        odds: Array = self.tried * betainc(further, rays - GIVEN + 1 - further, min(depth * radius**2 / 4, 1.0))
         return odds
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from startrack.types import Array, Ints
 
-MOST_CENTRES = 128
+MOST_CENTRES = 64
 WIDEST_NEIGHBOURHOOD_RAD = np.radians(10.0)
 
 

@@ -50,11 +50,12 @@ class Identifier:
         seen = _Seen(detections, order, rays_cam[order], patterns, camera, scale)
         search = AttitudeSearch(seen.rays_cam, patterns, scale, reach_px(seen.detections) * scale.largest)
         tolerance_px, rough_px = self.tolerances_px
-        tolerance_px = float(np.clip(TOLERANCE_SIGMAS * np.sqrt(middle(seen.variance_px2)), tolerance_px, rough_px))
+        tolerance_px = min(max(tolerance_px, TOLERANCE_SIGMAS * middle(seen.variance_px2) ** 0.5), rough_px)
         found, refusal = self._first(search.attitudes(tolerance_px, rough_px), seen, search)
         if found is not None:
             return found
-        if self._first(search.mirror_images(), seen.mirrored(), search)[0] is not None:
+        lenient = replace(self, whole_field=False)
+        if lenient._first(search.mirror_images(), seen.mirrored(), search)[0] is not None:
             raise NotIdentified(
                 "the image is a mirror image of what the camera file says: flip the image, or set mirrored = "
                 f"{str(not camera.mirrored).lower()} in the camera file",

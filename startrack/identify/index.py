@@ -60,7 +60,7 @@ class PatternIndex:
         distance, found = self.tree.query(sides, most, p=np.inf, distance_upper_bound=tolerance)
         distance = distance.ravel()
         close = np.flatnonzero(distance < tolerance)
-        close = close[np.argsort(distance[close] / sides[close // most, 2])]
+        close = close[np.argsort(distance[close] / sides[close // most, 0])]
         return close // most, found.ravel()[close]
 
 

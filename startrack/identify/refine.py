@@ -54,7 +54,7 @@ class Refiner:
         light = Light.of(d.flux_e, d.saturated, stars.v_mag[turned.star], turned.detection)
         limit, bright = np.searchsorted(stars.v_mag, [light.limit_mag, light.certain_mag]).tolist()
         near = turned.near
-        strayed_px = np.abs(turned.to_icrs - R).max() / scale.on_axis
+        strayed_px = np.abs(turned.R_cam_icrs - R).max() / scale.on_axis
         if near is None or near.depth < limit or strayed_px > MOST_STRAYED_PX:
             near = self.patterns.near(self.rays_cam @ R, reach_px(d) * scale.largest, limit)
         detection, star = near.ray, near.star

@@ -192,3 +192,4 @@ class Fix(Value):
     modes: tuple[Mode, ...]  # heaviest first; weights sum to 1
     ambiguous: bool  # modes outside the main mode's 99.9 % circle hold more than 1 %
     dropped_mass: float = 0.0  # bound on the posterior probability of what the search pruned
+    horizon_error_rad: float = 0.0  # by how much the true horizon stands higher than the map's, as far as all around

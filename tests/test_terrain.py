@@ -106,7 +106,7 @@ def test_methods_are_elementwise_and_broadcast(terrain: Terrain) -> None:
     assert np.shape(terrain.allowed(places.reshape(7, 1, 2))) == (7, 1)
     assert terrain.tells(azimuth, np.full(7, 1.0)).shape == (7,)
     assert terrain.common_sigma_rad >= 0
-    near = terrain.near(places[0], 1.0)
+    near = terrain.near(places[0], 1.0, azimuth)
     assert near.horizon_rad(places[0], azimuth) == pytest.approx(one_place, abs=1e-4)
     sigma = terrain.horizon_sigma_rad(places, azimuth)
     assert sigma.shape == (7,)

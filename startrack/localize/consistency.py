@@ -6,9 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from startrack.localize.common import NEARBY_M, common_error, raised
-from startrack.localize.likelihood import Sectors
+from startrack.localize.common import raised
+from startrack.localize.likelihood import Sectors, contribution
+from startrack.localize.misfit import FIRST_STEP_M, LAST_STEP_M, STRETCHES, stretch_of_ground, turn_of_sky
+from startrack.localize.profile import Profile
 from startrack.localize.scout import scores, taken
+from startrack.localize.vicinity import COMPASS
 from startrack.terrain import Cylinder, Terrain
 from startrack.types import Array, Evidence, Fix, NotLocated
 
@@ -23,13 +26,13 @@ FEWEST_IN_SECTOR = 3
 USUAL_HORIZON_RAD = 0.3  # sin H cos H of a crater's rim at 20 degrees: d(tan H) / tan H = dH / (sin H cos H)
 EXPLAINED_SECTOR_RAD = np.radians(1.5)
 LEAST_EXPLAINED_NATS = -0.75  # 0 to -0.35 at the right place, up to 0.5 lower with a ridge on no map; -9.2 the worst
-STRETCHES = (0.005, 0.01, 0.015, 0.025, 0.05, 0.1)  # both ways
 STRETCH_WINDOW_RAD = np.radians(4.0)
 TELLING_LLR = 0.3
 STRETCH_GAIN_NATS = 4.5  # a true map gains more in 1 of 370; of 240 images with maps 1 % off the least gain was 7.6
 STRETCH_SIGMAS = 3.0  # of what the terrain file itself admits
-FIRST_STEP_M, LAST_STEP_M = 16.0, 2.0
-COMPASS = np.array([[i, j] for i in (-1, 0, 1) for j in (-1, 0, 1)], dtype=np.float64)
+TURN_GAIN_NATS = 5.0  # of 80 true frames the largest gain was 4.1; of 30 with a clock an hour off half gain more than 5
+
+Sure = tuple[Evidence, Array]
 
 
 def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain, compiled: bool = False) -> None:
@@ -37,21 +40,28 @@ def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain, compiled: 
 
     `compiled` asks for numba where the terrain allows it: the same answer, sooner.
     """
-    contradicted = contradicted_part(evidence, fix, terrain)
+    evidence = raised(evidence, fix.horizon_error_rad)
+    sure = _sure(evidence, fix, terrain)
+    contradicted = contradicted_part(evidence, fix, terrain, sure)
     if contradicted > MOST_CONTRADICTED_SECTORS:
         raise NotLocated(
             f"{100 * contradicted:.0f} % of the horizon contradicts the best place: "
             "wrong terrain, time or camera file?",
             reason="inconsistent_evidence",
         )
-    explained = explained_nats(evidence, fix, terrain)
+    explained = explained_nats(evidence, fix, terrain, sure)
     if explained < LEAST_EXPLAINED_NATS:
         raise NotLocated(
             f"the best place explains the stars badly ({explained:.1f} nats a sector; usual: 0 to -0.3): "
             "wrong terrain, time or camera file?",
             reason="inconsistent_evidence",
         )
-    stretch, gain = best_stretch(evidence, fix, terrain, compiled)
+    if isinstance(terrain, Cylinder):
+        stretch, gain = best_stretch(evidence, fix, terrain, compiled)
+    else:
+        sectors = Sectors.of(evidence, EXPLAINED_SECTOR_RAD, 1e-4)
+        profile = Profile.of(sectors)
+        stretch, gain = stretch_of_ground(sectors, profile, fix.position_enu_m[:2], terrain)
     if gain > STRETCH_GAIN_NATS and abs(stretch - 1) > STRETCH_SIGMAS * admitted_stretch(terrain):
         raise NotLocated(
             f"the stars see a horizon about {_percent(stretch)} {'higher' if stretch > 1 else 'lower'} than the "
@@ -59,19 +69,36 @@ def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain, compiled: 
             "(a cylinder can take depth_sigma_m and diameter_sigma_m)",
             reason="inconsistent_evidence",
         )
+    if not isinstance(terrain, Cylinder):  # there a turned sky only turns the place
+        turn, gain = turn_of_sky(sectors, profile, fix.position_enu_m[:2], terrain)
+        if gain > TURN_GAIN_NATS:
+            raise NotLocated(
+                f"a sky turned by {np.degrees(turn):+.1f} degrees about the vertical would fit the terrain better: "
+                "is the time right? (an hour on the Moon is 0.55 degrees)",
+                reason="inconsistent_evidence",
+            )
 
 
-def explained_nats(evidence: Evidence, fix: Fix, terrain: Terrain) -> float:
+def _sure(evidence: Evidence, fix: Fix, terrain: Terrain) -> Sure:
+    rays = taken(evidence, np.abs(evidence.llr) > SURE_LLR)
+    return rays, np.asarray(terrain.horizon_rad(fix.position_enu_m[None, :2], rays.azimuth_rad))
+
+
+def explained_nats(evidence: Evidence, fix: Fix, terrain: Terrain, sure: Sure | None = None) -> float:
     """Mean log-likelihood of the horizon's sectors at the fix, beside the best level skyline in each; 0 is perfect.
 
     Only rays that are sure of themselves are asked: of the others, some level skyline always fits the noise better.
-    0 for a cylinder whose shape is uncertain: the fix was made with another one than the file's.
+    0 for a cylinder whose shape is uncertain: the fix was made with another one than the file's. `sure` are those rays
+    and the horizon at their azimuths, where they are known.
     """
     if isinstance(terrain, Cylinder) and admitted_stretch(terrain) > 0:
         return 0.0
-    evidence = taken(evidence, np.abs(evidence.llr) > SURE_LLR)
-    sectors = Sectors.of(evidence, EXPLAINED_SECTOR_RAD, 1e-4)
-    return float(scores(fix.position_enu_m[None, :2], evidence, sectors, terrain)[0]) / sectors.count
+    rays, horizon = sure or _sure(evidence, fix, terrain)
+    sectors = Sectors.of(rays, EXPLAINED_SECTOR_RAD, 1e-4)
+    sigma = np.hypot(rays.edge_sigma_rad, terrain.horizon_sigma_rad(fix.position_enu_m[None, :2], rays.azimuth_rad))
+    value = contribution(rays.llr, rays.elevation_rad, horizon, sigma)
+    sums = np.bincount(sectors.sector, weights=value, minlength=sectors.count).astype(np.float64)
+    return float(sectors.score(sums)) / sectors.count
 
 
 def admitted_stretch(terrain: Terrain) -> float:
@@ -86,20 +113,20 @@ def _percent(stretch: float) -> str:
     return f"{100 * size:.1f} %" + (" or more" if size >= STRETCHES[-1] - 1e-9 else "")
 
 
-def contradicted_part(evidence: Evidence, fix: Fix, terrain: Terrain) -> float:
-    """Part of the horizon's sectors that contradict the fix.
+def contradicted_part(evidence: Evidence, fix: Fix, terrain: Terrain, sure: Sure | None = None) -> float:
+    """Part of the horizon's sectors that contradict the fix; `sure` as in `explained_nats`.
 
     Only rays that are sure of themselves, near the fix's skyline and yet well clear of it are asked: a few contradicted
     sectors are an obstacle or a defect, many are a wrong map, time or identification.
     """
-    sure = taken(evidence, np.abs(evidence.llr) > SURE_LLR)
-    above = sure.elevation_rad - terrain.horizon_rad(fix.position_enu_m[None, :2], sure.azimuth_rad)
+    rays, horizon = sure or _sure(evidence, fix, terrain)
+    above = rays.elevation_rad - horizon
     asked = (np.abs(above) > CLEAR_OF_SKYLINE_RAD) & (np.abs(above) < NEAR_SKYLINE_RAD)
-    sector = (sure.azimuth_rad / SECTOR_RAD).astype(int)
-    rays = np.bincount(sector, weights=asked)
-    wrong = np.bincount(sector, weights=asked & ((sure.llr > 0) != (above > 0)))
-    known = rays >= FEWEST_IN_SECTOR
-    return float(np.mean(wrong[known] > SECTOR_CONTRADICTED * rays[known])) if known.any() else 0.0
+    sector = (rays.azimuth_rad / SECTOR_RAD).astype(int)
+    count = np.bincount(sector, weights=asked)
+    wrong = np.bincount(sector, weights=asked & ((rays.llr > 0) != (above > 0)))
+    known = count >= FEWEST_IN_SECTOR
+    return float(np.mean(wrong[known] > SECTOR_CONTRADICTED * count[known])) if known.any() else 0.0
 
 
 def best_stretch(evidence: Evidence, fix: Fix, terrain: Terrain, compiled: bool = False) -> tuple[float, float]:
@@ -109,9 +136,9 @@ def best_stretch(evidence: Evidence, fix: Fix, terrain: Terrain, compiled: bool 
     wrong position cannot. Asked in the form tan e -> tan e / s, so that no terrain needs to know of it.
     """
     start = fix.position_enu_m[None, :2]
-    if terrain.common_sigma_rad > 0:  # what the file admits of is not to be found wrong
-        evidence = raised(evidence, common_error(evidence, terrain, start[0]).error_rad)
-    terrain = terrain.near(start[0], NEARBY_M)
+    if not isinstance(terrain, Cylinder):
+        sectors = Sectors.of(evidence, EXPLAINED_SECTOR_RAD, 1e-4)
+        return stretch_of_ground(sectors, Profile.of(sectors), start[0], terrain)
     below = evidence.elevation_rad - terrain.horizon_rad(start, evidence.azimuth_rad)
     near = taken(evidence, (np.abs(below) < STRETCH_WINDOW_RAD) & (np.abs(evidence.llr) > TELLING_LLR))
     if not len(near):

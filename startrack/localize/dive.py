@@ -6,18 +6,16 @@ import numpy as np
 
 from startrack.localize.likelihood import Sectors
 from startrack.localize.profile import Profile
-from startrack.localize.scout import scores, taken
-from startrack.localize.search import by_sector, centre_scores, ray_by_ray, split
+from startrack.localize.search import asked, by_sector, centre_scores
+from startrack.localize.vicinity import Vicinity
 from startrack.terrain import Terrain
-from startrack.types import Array, Bools
+from startrack.types import Array, Bools, Ints
 
-KEPT_BOXES, KEPT_SMALL_BOXES = 24, 6  # by each of two measures
-SMALL_M = 20.0  # boxes of this half side and less are asked ray by ray
-FINEST_M = 0.5
-WINDOW_RAD = np.radians(8.0)
-LOUDEST_RAYS = 500
-FIRST_STEP_M = 128.0
-COMPASS = np.array([[i, j] for i in (-1, 0, 1) for j in (-1, 0, 1)], dtype=np.float64)
+KEPT_BOXES, KEPT_SMALL_BOXES = 24, 8  # by each of two measures
+SMALL_M = 20.0  # half side of the last boxes
+TRIED, APART_M = 3, 60.0  # places from which the top is climbed, and how far they are apart
+NEARBY_M = 45.0
+FIRST_STEP_M, FINEST_M = 16.0, 0.5
 
 
 def best_by_diving(sectors: Sectors, profile: Profile, terrain: Terrain) -> tuple[Array, float]:
@@ -29,43 +27,46 @@ def best_by_diving(sectors: Sectors, profile: Profile, terrain: Terrain) -> tupl
     centres, half = np.zeros((1, 2)), float(terrain.reach_m)
     while True:
         boxes, first, last = by_sector(centres, half, sectors, profile, terrain)
-        kept = KEPT_BOXES if half >= SMALL_M else KEPT_SMALL_BOXES
         # By the upper bound alone, places whose bounds are loose would win; by the middle, those with tight ones.
-        keep = _best(boxes.upper, kept) | _best(boxes.upper + boxes.lower, kept)
+        keep = _best(boxes.upper, KEPT_BOXES) | _best(boxes.upper + boxes.lower, KEPT_BOXES)
         boxes, first, last = boxes.take(keep), first[keep], last[keep]
-        if half < SMALL_M:
+        if half < SMALL_M or not len(boxes):
             break
         centres, half = boxes.quarters(terrain)[0], half / 2
-    small, best, place = ray_by_ray(boxes, first, last, sectors, profile, terrain), -np.inf, np.zeros(2)
-    while True:
-        score = centre_scores(small, sectors, profile, terrain)
-        score = np.where(terrain.allowed(small.centres_m), score, -np.inf)
-        if len(small) and score.max() > best:
-            best, place = float(score.max()), small.centres_m[int(np.argmax(score))]
-        if small.half_m < FINEST_M or not len(small):
-            return _climbed(place, best, sectors, terrain)
-        keep = _best(score, KEPT_SMALL_BOXES) | _best(small.upper + score, KEPT_SMALL_BOXES)
-        small = split(small.take(keep), sectors, profile, terrain)
+    if not len(boxes):
+        return np.zeros(2), -np.inf
+    few = _best(boxes.upper, KEPT_SMALL_BOXES) | _best(boxes.upper + boxes.lower, KEPT_SMALL_BOXES)
+    boxes, first, last = boxes.take(few), first[few], last[few]
+    score = centre_scores(asked(boxes, first, last, profile), sectors, profile, terrain)
+    best, place = -np.inf, np.zeros(2)
+    order = np.argsort(-score, kind="stable")
+    for box in _apart(boxes.centres_m, order):
+        if boxes.upper[box] < best:
+            continue
+        start = boxes.centres_m[box]
+        about = Vicinity.of(sectors, profile, terrain, start, NEARBY_M, across=2)
+        top, _ = about.climbed(start, FIRST_STEP_M, FINEST_M)
+        both = np.array([top, start])
+        both = both[np.asarray(terrain.allowed(both))]
+        found = exact_scores(both, sectors, profile, terrain)
+        if len(found) and found.max() > best:
+            best, place = float(found.max()), both[int(np.argmax(found))]
+    return place, best
 
 
-def _climbed(place_m: Array, best: float, sectors: Sectors, terrain: Terrain) -> tuple[Array, float]:
-    """From a place that is nearly right, steps to the best of 8 neighbours, ever shorter, by the loudest rays."""
-    rays = sectors.evidence
-    off_skyline = np.abs(rays.elevation_rad - terrain.horizon_rad(place_m[None], rays.azimuth_rad))
-    loudest = np.argsort(-np.abs(rays.llr) * (off_skyline < WINDOW_RAD), kind="stable")[:LOUDEST_RAYS]
-    few = taken(rays, loudest)
-    few_sectors = Sectors.of(few, 2 * np.pi / sectors.count, sectors.epsilon)
-    at, step, high = place_m, FIRST_STEP_M, -np.inf
-    while step >= FINEST_M:
-        around = at + step * COMPASS
-        around = around[np.asarray(terrain.allowed(around))]
-        score = scores(around, few, few_sectors, terrain)
-        if len(score) and score.max() > high:
-            at, high = around[int(np.argmax(score))], float(score.max())
-        else:
-            step /= 2
-    found = float(scores(at[None], rays, sectors, terrain)[0])
-    return (at, found) if found > best else (place_m, best)
+def exact_scores(places_m: Array, sectors: Sectors, profile: Profile, terrain: Terrain) -> Array:
+    """Log-likelihoods (n,) of places (n, 2)."""
+    boxes, first, last = by_sector(places_m, FINEST_M, sectors, profile, terrain)
+    return centre_scores(asked(boxes, first, last, profile), sectors, profile, terrain)
+
+
+def _apart(places_m: Array, order: Ints) -> list[int]:
+    """The first few of the places (n, 2) in that order, but for those close to one that came before."""
+    chosen: list[int] = []
+    for i in order:
+        if len(chosen) < TRIED and all(np.abs(places_m[i] - places_m[k]).max() > APART_M for k in chosen):
+            chosen.append(int(i))
+    return chosen
 
 
 def _best(values: Array, count: int) -> Bools:

@@ -8,6 +8,8 @@ import numpy as np
 
 from startrack.types import Array, Evidence, Ints
 
+SECTOR_STEP = 10.0  # between the numbers of neighbouring sectors: more than any two elevations differ
+
 
 @dataclass(frozen=True)
 class Sectors:
@@ -41,18 +43,22 @@ class Sectors:
             return np.sum(below, axis=-1)
         # Within a narrow sector a real skyline can hardly beat the best level one; bounds must not claim that it does.
         below = np.minimum(below, 0.0)
-        return np.sum(np.logaddexp(below + np.log1p(-self.epsilon), np.log(self.epsilon)), axis=-1)
+        return np.sum(np.log((1.0 - self.epsilon) * np.exp(below) + self.epsilon), axis=-1)  # type: ignore[no-any-return]
 
 
 def _best_skyline(evidence: Evidence, sector: Ints, count: int) -> Array:
     """Largest sum (sectors,) of the llr above one elevation, in each sector; at least 0 (nothing visible)."""
-    order = np.lexsort((-evidence.elevation_rad, sector))
-    running = np.cumsum(evidence.llr[order])
-    first = np.searchsorted(sector[order], np.arange(count))
-    before = np.concatenate([[0.0], running])[first]
-    best = np.zeros(count)
-    np.maximum.at(best, sector[order], running - before[sector[order]])
-    return best
+    order = sorted_by_sector(evidence, sector)
+    below = np.concatenate([[0.0], np.cumsum(evidence.llr[order])])
+    ends = np.searchsorted(sector[order], np.arange(count + 1))
+    # Above the lowest ray, above the next, ..., above none: all that end at the sector's last ray.
+    least = np.minimum.reduceat(below, ends[:-1])
+    return np.asarray(below[ends[1:]] - np.minimum(least, below[ends[1:]]))
+
+
+def sorted_by_sector(evidence: Evidence, sector: Ints) -> Ints:
+    """Order (n,) of the rays by sector, and from low to high within one."""
+    return np.argsort(SECTOR_STEP * sector + evidence.elevation_rad, kind="stable")
 
 
 def contribution(llr: Array, elevation_rad: Array, horizon_rad: Array, sigma_rad: Array) -> Array:
@@ -65,8 +71,9 @@ def contribution(llr: Array, elevation_rad: Array, horizon_rad: Array, sigma_rad
     soft = sigma_rad > 0
     if not np.any(soft):
         return hard
-    from scipy.special import log_ndtr
+    from scipy.special import ndtr
 
+    # V e^l + 1 - V = 1 + V (e^l - 1), and with l < 0 the same from the other side, so that no digits are lost.
     z = np.divide(margin, sigma_rad, out=np.zeros_like(margin), where=soft)
-    mixed = np.logaddexp(log_ndtr(z) + llr, log_ndtr(-z))
+    mixed = np.minimum(llr, 0.0) + np.log1p(ndtr(np.where(llr > 0, z, -z)) * np.expm1(np.abs(llr)))
     return np.where(soft, mixed, hard)

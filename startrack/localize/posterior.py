@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from startrack.localize import compiled
-from startrack.localize.common import marginalised_over_common
+from startrack.localize.common import common_error, marginalised_over_common
 from startrack.localize.crater import CraterFit, marginalised
-from startrack.localize.dive import best_by_diving
+from startrack.localize.dive import best_by_diving, exact_scores
 from startrack.localize.likelihood import Sectors
 from startrack.localize.profile import Profile
 from startrack.localize.scout import likely_places, taken
-from startrack.localize.search import Boxes, RayBoxes, by_sector, centre_scores, ray_by_ray, split
+from startrack.localize.search import Boxes, RayBoxes, asked, by_sector, centre_scores, scored, tightened
 from startrack.localize.seen import cylinder_of
 from startrack.localize.summary import summarize
 from startrack.terrain import Cylinder, Terrain
+from startrack.terrain.nearby import Nearby
 from startrack.types import Array, Bools, Evidence, Fix, Ints, NotLocated
 
 FEWEST_RAYS = 8
@@ -24,7 +25,15 @@ MOST_COARSE_BOXES = 12_000  # boxes of 20 m and more that all might matter: the 
 MOST_PAIRS = 6_000_000  # (box, ray) pairs, some 0.5 GB
 BOXES_AT_ONCE = 2000
 CONTRADICTED_NATS = -3.0  # mean over the sectors at the best place; -0.5 is usual, and -9.2 the worst
+CLOSEST_NODES_M, FIRST_NODES_M = 10.0, 12.0  # between traced points; half side of the first boxes worth it
+WORTH_NODES = 12.0  # horizons traced per open (box, ray) pair, that the levels to come would cost anyhow
+MOST_PAIRS_NEAR = 0.97  # so many of them within the points; the others are traced as before
+LOOKED_UP_RAD = np.radians(0.26)  # height maps look up what is as wide as that, and trace what is narrower
+LOUDNESS = ((4.0, np.inf), (2.0, 4.0), (1.0, 2.0), (0.0, 1.0))  # |llr| of rays that are asked in turns
 RAY_BY_RAY_M = 20.0  # boxes of this half side and less are asked ray by ray, larger ones sector by sector
+NARROW_M, NARROW_PARTS = 60.0, 4  # on real ground, boxes below this half side are asked by quarters of a sector
+NARROW_FROM, NARROW_TO = 600, 4000  # as many boxes as are worth it, and as few as can be traced in seconds
+NARROW_TURNS = 6
 
 
 @dataclass(frozen=True)
@@ -50,28 +59,36 @@ class ExactPosterior:
         told = (np.abs(evidence.llr) > 1e-3) & terrain.tells(evidence.azimuth_rad, evidence.elevation_rad)
         if told.sum() < FEWEST_RAYS:
             raise NotLocated(f"only {int(told.sum())} rays say anything about the skyline: expose longer")
-        evidence = taken(evidence, told)
+        evidence, error_rad = taken(evidence, told), 0.0
         if isinstance(terrain, Cylinder) and (terrain.depth_sigma_m > 0 or terrain.diameter_sigma_m > 0):
             (centres, half, log_weight, log_dropped), _ = marginalised(self._explored, evidence, terrain)
         elif terrain.common_sigma_rad > 0:
-            place = _Search(self, evidence, terrain).place_m
+            first = _Search(self, evidence, terrain)
+            common = common_error(evidence, terrain, first.place_m, first.sectors, first.profile)
+            error_rad = common.error_rad
             centres, half, log_weight, log_dropped = marginalised_over_common(
-                lambda rays: self._explored(rays, terrain), evidence, terrain, place
+                lambda rays, place: self._explored(rays, terrain, place), evidence, terrain, common
             )
         else:
             centres, half, log_weight, log_dropped = self._explored(evidence, terrain)
         dropped = float(np.exp(min(log_dropped - _log_mass(log_weight, half), 0.0)))
-        return summarize(centres, 2 * half, log_weight, dropped, terrain)
+        fix = summarize(centres, 2 * half, log_weight, dropped, terrain)
+        return replace(fix, horizon_error_rad=error_rad) if error_rad else fix
 
     def crater(self, evidence: Evidence, cylinder: Cylinder) -> CraterFit:
         """Depth and diameter of a cylinder with uncertain ones, estimated together with the position."""
         return marginalised(self._explored, evidence, cylinder)[1]
 
-    def _explored(self, evidence: Evidence, terrain: Terrain) -> tuple[Array, float, Array, float]:
-        """Centres (n, 2) of equal boxes, half side, log-likelihoods (n,) there, log of a bound on the mass dropped."""
+    def _explored(
+        self, evidence: Evidence, terrain: Terrain, place_m: Array | None = None
+    ) -> tuple[Array, float, Array, float]:
+        """Centres (n, 2) of equal boxes, half side, log-likelihoods (n,) there, log of a bound on the mass dropped.
+
+        `place_m` is a good place if one is known.
+        """
         if self.compiled and compiled.applies(evidence, terrain):
             return compiled.explored(self, evidence, cylinder_of(terrain))
-        search = _Search(self, evidence, terrain)
+        search = _Search(self, evidence, terrain, place_m)
         boxes = search.refine(search.exclude())
         return boxes.centres_m, boxes.half_m, search.scores(boxes), search.log_dropped
 
@@ -79,29 +96,44 @@ class ExactPosterior:
 class _Search:
     """One run: what is known of the best place, and how much probability was given up."""
 
-    def __init__(self, method: ExactPosterior, evidence: Evidence, terrain: Terrain) -> None:
-        self.method, self.terrain = method, terrain
+    def __init__(
+        self, method: ExactPosterior, evidence: Evidence, terrain: Terrain, place_m: Array | None = None
+    ) -> None:
+        self.method, self.terrain, self.ground = method, terrain, terrain
         self.place_m = np.zeros(2)  # a good one to begin with
         self.sectors = Sectors.of(evidence, method.sector_width_rad, method.sector_epsilon)
         self.profile = Profile.of(self.sectors)
         if isinstance(terrain, Cylinder):
             self.best = float(likely_places(evidence, self.sectors, terrain)[1].max(initial=-np.inf))
+        elif place_m is not None and np.all(terrain.allowed(place_m)):
+            self.place_m = place_m
+            self.best = float(exact_scores(place_m[None], self.sectors, self.profile, terrain)[0])
         else:  # real ground: horizons are costly, and the peak is narrower than any grid's step
             self.place_m, self.best = best_by_diving(self.sectors, self.profile, terrain)
         self.log_dropped = -np.inf
 
     def exclude(self) -> RayBoxes:
-        """From the whole area down to small boxes, by look-ups. Raises NotLocated where too much stays open."""
-        centres, half = np.zeros((1, 2)), float(self.terrain.reach_m)
+        """From the whole area down to small boxes. Raises NotLocated where too much stays open."""
+        centres, half, of = np.zeros((1, 2)), float(self.terrain.reach_m), np.zeros(1, dtype=np.int64)
+        known: tuple[Ints, Ints] | None = None  # open rays of the boxes that the centres are quarters of
         while True:
-            boxes, first, last = self._bounded(centres, half)
+            if known is None:
+                boxes, first, last = self._bounded(centres, half)
+            else:
+                boxes, first, last = self._closer(centres, half, of, *known)
             if len(boxes) > MOST_COARSE_BOXES:
                 raise self._lost(len(boxes) * 4 * half**2)
             if half < RAY_BY_RAY_M:
                 if (last - first).sum() > MOST_PAIRS:
                     raise self._lost(len(boxes) * 4 * half**2)
-                return ray_by_ray(boxes, first, last, self.sectors, self.profile, self.terrain)
-            centres, half = boxes.quarters(self.terrain)[0], half / 2
+                return self._asked_in_turns(asked(boxes, first, last, self.profile))
+            (centres, of), half = boxes.quarters(self.terrain), half / 2
+            if known is not None:
+                known = first, last
+            elif half < NARROW_M and NARROW_FROM < len(centres) <= NARROW_TO and not isinstance(self.terrain, Cylinder):
+                # From here on a ray's number is one of the new profile.
+                whole, self.profile = self.profile, Profile.of(self.sectors, NARROW_PARTS)
+                known = self.profile.handed_down(whole, first, last)
 
     def _bounded(self, centres: Array, half: float) -> tuple[Boxes, Ints, Ints]:
         """The promising ones of the boxes with their open rays, some at a time so that memory stays flat."""
@@ -111,9 +143,26 @@ class _Search:
             boxes, first, last = by_sector(some, half, self.sectors, self.profile, self.terrain)
             keep = self._promising(boxes)
             kept.append((boxes.take(keep), first[keep], last[keep]))
-        parts = [(box.centres_m, box.lower, box.upper, first, last) for box, first, last in kept]
-        centres, lower, upper, first, last = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return Boxes(centres, half, lower, upper), first, last
+        return _joined(kept, half)
+
+    def _closer(self, centres: Array, half: float, of: Ints, first: Ints, last: Ints) -> tuple[Boxes, Ints, Ints]:
+        """Likewise, by parts of a sector, traced anew where the boxes that these are quarters of left rays open.
+
+        Within a whole sector the horizon itself varies more than over a small box; but looking closer costs more, so
+        some sectors are asked at a time: few suffice to exclude most boxes.
+        """
+        turns = np.arange(len(self.profile.ends)) // NARROW_PARTS % NARROW_TURNS
+        kept = []
+        for start in range(0, len(centres), BOXES_AT_ONCE):
+            some = slice(start, start + BOXES_AT_ONCE)
+            at, low, high = centres[some], first[of[some]], last[of[some]]
+            for turn in range(NARROW_TURNS):
+                low, high = self.profile.closer(self.terrain, at, half, low, high, turns == turn)
+                boxes = scored(at, half, low, high, self.sectors, self.profile)
+                keep = self._promising(boxes)
+                boxes, at, low, high = boxes.take(keep), at[keep], low[keep], high[keep]
+            kept.append((boxes, low, high))
+        return _joined(kept, half)
 
     def _lost(self, open_m2: float) -> NotLocated:
         """Why so much of the area stays open: nothing fits, or everything does."""
@@ -132,14 +181,53 @@ class _Search:
             score = self.scores(boxes)
             self.best = max(self.best, float(score.max(initial=-np.inf)))
             keep = self._promising(boxes)
-            boxes = boxes.take(keep)
-            if self._fine_enough(boxes, score[keep]):
+            boxes, score = boxes.take(keep), score[keep]
+            wide = self._width_over_limit(boxes, score)
+            if wide < 1:
                 return boxes
-            boxes = split(boxes, self.sectors, self.profile, self.terrain)
+            self._look_closer(boxes)
+            boxes = boxes.handed_down(self.terrain)
+            if not 1 < wide < 2:  # else these are the last, which are not quartered: their likelihoods suffice
+                boxes = self._asked_in_turns(boxes)
+
+    def _asked_in_turns(self, boxes: RayBoxes) -> RayBoxes:
+        """The boxes bounded ray by ray: the loudest first, since few suffice to exclude most boxes."""
+        if isinstance(self.terrain, Cylinder):
+            return tightened(boxes, None, self.sectors, self.profile, self.ground)
+        if self.ground is self.terrain and boxes.half_m > RAY_BY_RAY_M / 2:
+            boxes = tightened(boxes, None, self.sectors, self.profile, self.terrain, LOOKED_UP_RAD)
+            boxes = boxes.take(self._promising(boxes))
+        for softest, loudest in LOUDNESS:
+            loudness = np.abs(self.profile.evidence.llr[boxes.ray])
+            which = (loudness >= softest) & (loudness < loudest)
+            boxes = tightened(boxes, which, self.sectors, self.profile, self.ground)
+            boxes = boxes.take(self._promising(boxes))
+        return boxes
+
+    def _look_closer(self, boxes: RayBoxes) -> None:
+        """Where most boxes lie close together, horizons are interpolated between points that are traced once.
+
+        And again between closer ones where many azimuths are too rough for that.
+        """
+        if isinstance(self.terrain, Cylinder) or not len(boxes.ray) or boxes.half_m > FIRST_NODES_M:
+            return
+        step = max(2 * boxes.half_m, CLOSEST_NODES_M)
+        traced = 1.0
+        if isinstance(self.ground, Nearby):
+            if step > 0.6 * self.ground.step_m:
+                return
+            traced = self.ground.traced_part(boxes.centres_m[boxes.box], self.profile.evidence.azimuth_rad[boxes.ray])
+        middle = np.median(boxes.centres_m[boxes.box], axis=0)
+        away = np.abs(boxes.centres_m - middle).max(axis=1)[boxes.box]
+        half = float(np.quantile(away, MOST_PAIRS_NEAR)) + boxes.half_m
+        across = max(3, int(np.ceil(2 * half / step)) + 1)
+        rays = np.unique(boxes.ray[away < half])
+        if across**2 * len(rays) < WORTH_NODES * traced * len(boxes.ray):
+            self.ground = self.terrain.near(middle, half, self.profile.evidence.azimuth_rad[rays], across)
 
     def scores(self, boxes: RayBoxes) -> Array:
         """Log-likelihood (n,) at the centres, minus infinity where the camera cannot be."""
-        score = centre_scores(boxes, self.sectors, self.profile, self.terrain)
+        score = centre_scores(boxes, self.sectors, self.profile, self.ground)
         return np.where(self.terrain.allowed(boxes.centres_m), score, -np.inf)
 
     def _promising(self, boxes: Boxes) -> Bools:
@@ -151,16 +239,23 @@ class _Search:
         self.log_dropped = np.logaddexp(self.log_dropped, _log_mass(boxes.upper[~keep], boxes.half_m))
         return keep
 
-    def _fine_enough(self, boxes: RayBoxes, log_weight: Array) -> bool:
+    def _width_over_limit(self, boxes: RayBoxes, log_weight: Array) -> float:
+        """How many times wider the boxes are than need be; 0 where they shall not be quartered anyway."""
         if not np.isfinite(log_weight).any():
-            return False
+            return np.inf
         if boxes.half_m <= self.method.finest_m or 4 * len(boxes) > self.method.most_boxes or not len(boxes.ray):
-            return True
+            return 0.0
         weight = np.exp(log_weight - log_weight.max())
         centred = boxes.centres_m - np.average(boxes.centres_m, axis=0, weights=weight)
         spread = np.einsum("n,ni,nj->ij", weight, centred, centred) / weight.sum()
         smaller = np.sqrt(max(float(np.linalg.eigvalsh(spread)[0]), 0.0))
-        return 2 * boxes.half_m * self.method.boxes_per_sigma < smaller
+        return 2 * boxes.half_m * self.method.boxes_per_sigma / max(smaller, 1e-9)
+
+
+def _joined(parts: list[tuple[Boxes, Ints, Ints]], half: float) -> tuple[Boxes, Ints, Ints]:
+    columns = [(boxes.centres_m, boxes.lower, boxes.upper, first, last) for boxes, first, last in parts]
+    centres, lower, upper, first, last = (np.concatenate(column) for column in zip(*columns, strict=True))
+    return Boxes(centres, half, lower, upper), first, last
 
 
 def _log_mass(log_density: Array, half_m: float) -> float:

@@ -83,7 +83,7 @@ class Cylinder:
         """True for every ray: the wall is known all around."""
         return np.ones(np.broadcast_shapes(np.shape(azimuths_rad), np.shape(elevations_rad)), dtype=bool)
 
-    def near(self, centre_m: Array, half_m: float) -> Cylinder:
+    def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = 3) -> Cylinder:
         """Itself: a closed form is quick everywhere."""
         return self
 

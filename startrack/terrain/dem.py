@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from startrack.frames import Site
-from startrack.terrain import cache
+from startrack.terrain import cache, tracing
 from startrack.terrain.ground import Ground, ground_up_m, packed
 from startrack.terrain.heightmap import HeightMap
-from startrack.terrain.nearby import Nearby
+from startrack.terrain.nearby import ACROSS, Nearby
 from startrack.terrain.protocol import Terrain
 from startrack.terrain.table import (
     ANGLE_STEP_RAD,
@@ -26,7 +26,7 @@ from startrack.terrain.table import (
     Square,
     built,
 )
-from startrack.terrain.tracing import Tracer, tracer
+from startrack.terrain.tracing import Tracer
 from startrack.types import Array, BadInput, Bools, Ints
 
 LOG = logging.getLogger(__name__)
@@ -66,13 +66,18 @@ class HeightTerrain:
         self._check_cover()
 
     @cached_property
-    def _tracer(self) -> Tracer:
-        return tracer(self.use_compiled)
+    def tracer(self) -> Tracer:
+        return tracing.tracer(self.use_compiled)
 
     @cached_property
     def ground(self) -> Ground:
         """The maps packed for tracing."""
         return packed(list(self.maps), self.site)
+
+    @cached_property
+    def finest_post_m(self) -> float:
+        """Spacing of the posts of the finest map."""
+        return min(m.post_m for m in self.maps)
 
     @cached_property
     def common_sigma_rad(self) -> float:
@@ -138,7 +143,7 @@ class HeightTerrain:
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad], traced. See `Terrain`."""
-        return np.arctan(self._horizons(points_m, azimuths_rad)[0])
+        return np.arctan(self.horizons(points_m, azimuths_rad)[0])
 
     def horizon_bounds_rad(
         self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
@@ -154,14 +159,14 @@ class HeightTerrain:
         low, high = np.empty(len(half)), np.empty(len(half))
         traced = (turn < 0.25 * 2 * np.pi / BINS) & (half < table.square.half_m)
         if traced.all():
-            self._tracer.box_bounds(self, table, centres, half, azimuths, turn, low, high)
+            self.tracer.box_bounds(self, table, centres, half, azimuths, turn, low, high)
         elif not traced.any() and np.all(half == half[0]):
-            self._tracer.sector_bounds(self, table, centres, half, azimuths, turn, low, high)
+            self.tracer.sector_bounds(self, table, centres, half, azimuths, turn, low, high)
         else:
             for kind in np.unique(half[~traced]):
                 which = ~traced & (half == kind)
-                low[which], high[which] = self._some(self._tracer.sector_bounds, centres, half, azimuths, turn, which)
-            low[traced], high[traced] = self._some(self._tracer.box_bounds, centres, half, azimuths, turn, traced)
+                low[which], high[which] = self._some(self.tracer.sector_bounds, centres, half, azimuths, turn, which)
+            low[traced], high[traced] = self._some(self.tracer.box_bounds, centres, half, azimuths, turn, traced)
         return low.reshape(shape), high.reshape(shape)
 
     def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
@@ -187,7 +192,7 @@ class HeightTerrain:
     def ground_m(self, points_m: Array) -> Array:
         """Height of the ground in enu (...) [m]."""
         points = np.asarray(points_m, dtype=np.float64)
-        return self._tracer.surfaces(self, points.reshape(-1, 2)).reshape(points.shape[:-1])
+        return self.tracer.surfaces(self, points.reshape(-1, 2)).reshape(points.shape[:-1])
 
     def allowed(self, points_m: Array) -> Bools:
         """Whether the points (..., 2) are within reach and not too steep."""
@@ -214,16 +219,21 @@ class HeightTerrain:
             told &= (azimuths - start) % (2 * np.pi) > (end - start) % (2 * np.pi)
         return np.asarray(told)
 
-    def near(self, centre_m: Array, half_m: float) -> Terrain:
-        """The ground about a place, see `Nearby`."""
-        return Nearby(self, np.asarray(centre_m, dtype=np.float64), half_m)
+    @property
+    def unknown_rad(self) -> Array:
+        """(n,) of n equal sectors from north eastward: below which elevation ground off the maps may stand; or -pi/2."""
+        return self.prepared().unknown_rad
 
-    def _horizons(self, points_m: Array, azimuths_rad: Array) -> tuple[Array, Array, Array]:
+    def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = ACROSS) -> Terrain:
+        """The ground about a place, see `Nearby`."""
+        return Nearby(self, np.asarray(centre_m, dtype=np.float64), half_m, np.unique(azimuths_rad), across)
+
+    def horizons(self, points_m: Array, azimuths_rad: Array) -> tuple[Array, Array, Array]:
         """tan, distance, and distance of the maps' end, of each point and azimuth."""
         points_m = np.asarray(points_m, dtype=np.float64)
         shape = np.broadcast_shapes(points_m.shape[:-1], np.shape(azimuths_rad))
         points = _flat(points_m, (*shape, 2)).reshape(-1, 2)
-        found = self._tracer.horizons(self, self._state.get(self._key), points, _flat(azimuths_rad, shape).ravel())
+        found = self.tracer.horizons(self, self._state.get(self._key), points, _flat(azimuths_rad, shape).ravel())
         return tuple(a.reshape(shape) for a in found)  # type: ignore[return-value]
 
     def _some(self, bounds: Any, centres: Array, half: Array, azimuths: Array, turn: Array, which: Bools) -> Any:
@@ -240,7 +250,7 @@ class HeightTerrain:
         middles = (np.arange(BINS) + 0.5) * 2 * np.pi / BINS
 
         def fill(cells: Ints) -> Array:
-            return self._tracer.fill_cells(self, centres[cells], square.half_m, middles, np.pi / BINS)
+            return self.tracer.fill_cells(self, centres[cells], square.half_m, middles, np.pi / BINS)
 
         return built(square, wanted, fill, self._unknown_rad(), progress)
 
@@ -251,7 +261,7 @@ class HeightTerrain:
         places = places[np.hypot(*places.T) <= self.search_radius_m]
         azimuths = np.repeat((np.arange(BINS)[:, None] + [0.02, 0.5, 0.98]).ravel(), len(places)) * 2 * np.pi / BINS
         where = np.tile(places, (3 * BINS, 1))
-        tan, _, edge = self._horizons(where, azimuths)
+        tan, _, edge = self.horizons(where, azimuths)
         up = self.ground_m(places) + self.camera_height_m
         away = where + edge[:, None] * np.stack([np.sin(azimuths), np.cos(azimuths)], axis=-1)
         drop = np.sum(np.minimum(np.abs(away), 1e7) ** 2, axis=-1) / (2 * self.ground.radius_m)

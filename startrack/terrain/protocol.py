@@ -66,8 +66,11 @@ class Terrain(Protocol):
         """
         ...
 
-    def near(self, centre_m: Array, half_m: float) -> Terrain:
-        """The same ground, quick to ask about places within `half_m` of one; itself where it is quick anyway."""
+    def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = 3) -> Terrain:
+        """The same ground, quick to ask about places within `half_m` of one, at the azimuths (n,).
+
+        Itself where it is quick anyway; else `across` times `across` places may be asked beforehand.
+        """
         ...
 
     @property

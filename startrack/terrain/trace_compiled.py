@@ -248,7 +248,7 @@ def leaning(ground, east, north, half, lean):
     map0, cell0, alike = -2, -1, True
     wide_column, wide_row, column0, row0 = 0.0, 0.0, 0.0, 0.0
     slope_e, slope_n = 0.0, 0.0
-    for corner in range(4 * lean):
+    for corner in range(4 * (lean and half > 0.0)):
         to_e, to_n = 2 * (corner & 1) - 1, corner - (corner & 1) - 1
         z = _surface(grid, posts, heights, moon, east + half * to_e, north + half * to_n, middle)
         slope_e += to_e * z / (4 * half)

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from startrack.terrain.table import BINS, FIELDS, HorizonTable, cpu_count
-from startrack.types import Array
+from startrack.types import Array, Ints
 
 if TYPE_CHECKING:
     from startrack.terrain.dem import HeightTerrain
+    from startrack.terrain.nearby import Nearby
 
 WORTH_THREADS, MOST_THREADS = 1500, 8
 NO_VALUES = np.zeros((0, BINS, FIELDS), dtype=np.uint16)
@@ -21,6 +22,8 @@ NO_VALUES = np.zeros((0, BINS, FIELDS), dtype=np.uint16)
 
 class Tracer(Protocol):
     """What a `HeightTerrain` asks: all flat arrays (n,), points and centres (n, 2)."""
+
+    compiled: bool
 
     def surfaces(self, terrain: HeightTerrain, points: Array) -> Array: ...
     def horizons(
@@ -31,6 +34,10 @@ class Tracer(Protocol):
     ) -> Array: ...
     def box_bounds(self, terrain: HeightTerrain, table: HorizonTable, *arrays: Array) -> None: ...
     def sector_bounds(self, terrain: HeightTerrain, table: HorizonTable, *arrays: Array) -> None: ...
+    def between(self, near: Nearby, points: Array, column: Ints, found: Array) -> None: ...
+    def between_bounds(
+        self, near: Nearby, centres: Array, half: float, column: Ints, low: Array, high: Array
+    ) -> None: ...
 
 
 def tracer(use_compiled: bool | None = None) -> Tracer:
@@ -42,6 +49,8 @@ def tracer(use_compiled: bool | None = None) -> Tracer:
 
 class CompiledTracer:
     """By numba; it lets go of Python's lock."""
+
+    compiled = True
 
     def surfaces(self, terrain: HeightTerrain, points: Array) -> Array:
         """Heights in enu (n,)."""
@@ -90,9 +99,27 @@ class CompiledTracer:
             terrain.ground, values, lows, highs, across, reach, terrain.camera_height_m, *arrays
         )
 
+    def between(self, near: Nearby, points: Array, column: Ints, found: Array) -> None:
+        """Interpolated horizons into found (n,)."""
+        from startrack.terrain import nearby_compiled
+
+        where = near.middle_up_m, *near.centre_m, near.half_m
+        fill: Any = nearby_compiled.between
+        fill(near.ground, near.nodes, near.per_height, *where, points, column, found)
+
+    def between_bounds(self, near: Nearby, centres: Array, half: float, column: Ints, low: Array, high: Array) -> None:
+        """Bounds of the interpolated horizons into low and high (n,)."""
+        from startrack.terrain import nearby_compiled
+
+        where = near.rough, near.middle_up_m, *near.centre_m, near.half_m
+        fill: Any = nearby_compiled.between_bounds
+        fill(near.ground, near.nodes, near.per_height, *where, centres, half, column, low, high)
+
 
 class PlainTracer:
     """By numpy alone."""
+
+    compiled = False
 
     def surfaces(self, terrain: HeightTerrain, points: Array) -> Array:
         """Heights in enu (n,)."""
@@ -139,6 +166,18 @@ class PlainTracer:
         lowest, highest = self._standing(terrain, centres, half)[1:] if half[0] < table.square.half_m else (half, half)
         level = level_for(table, float(half[0]))
         low[:], high[:] = sector_bounds(table, level, centres, half, lowest, highest, azimuths, turn)
+
+    def between(self, near: Nearby, points: Array, column: Ints, found: Array) -> None:
+        """Interpolated horizons into found (n,)."""
+        from startrack.terrain import nearby_plain
+
+        nearby_plain.between(near, points, column, found)
+
+    def between_bounds(self, near: Nearby, centres: Array, half: float, column: Ints, low: Array, high: Array) -> None:
+        """Bounds of the interpolated horizons into low and high (n,)."""
+        from startrack.terrain import nearby_plain
+
+        nearby_plain.between_bounds(near, centres, half, column, low, high)
 
     def _standing(self, terrain: HeightTerrain, centres: Array, half: Array) -> tuple[Array, Array, Array]:
         """Heights of the camera (n,): in the middle of boxes, lowest and highest."""

@@ -108,11 +108,12 @@ class Pairs:
         crowds = self.detection[rival]
         if not len(crowds):
             return which
-        named, sure = which.copy(), np.ones(len(which), dtype=bool)
+        named, sure, detected = which.copy(), np.ones(len(which), dtype=bool), set(self.star[which].tolist())
         rows = np.searchsorted(self.detection, [crowds, crowds + 1]).T  # the pairs of a detection stand together
         for i, (first, last) in zip(np.searchsorted(self.detection[which], crowds), rows, strict=True):
             group = np.arange(first, last)[self.distance_px[first:last] < radius_px]
-            group = group[~np.isin(self.star[group], np.delete(self.star[which], i))]
+            free = [s == self.star[which[i]] or s not in detected for s in self.star[group].tolist()]
+            group = group[free]
             named[i] = group[np.argmin(self.v_mag[group])] if len(group) else which[i]
             sure[i] = self._told_apart(int(named[i]), group, float(variance_px2[i]))
         return named[sure]

@@ -31,14 +31,15 @@ def pixel_profile(offset_px: Array, sigma_px: float | Array, radius: int) -> tup
     return np.diff(ndtr(edges), axis=1), -np.diff(density, axis=1) / sigma
 
 
-def pixel_profile_single(offset_px: Array, sigma_px: float, radius: int) -> tuple[Single, Single]:
+def pixel_profile_single(offset_px: Array, sigma_px: float | Array, radius: int) -> tuple[Single, Single]:
     """`pixel_profile` in single precision (to 1e-6), in a fifth of the time.
 
     The error function from the exponential that the derivative needs anyway (Abramowitz & Stegun 1964, 7.1.26).
     """
     inner = np.arange(-radius, radius + 2, dtype=np.float32) - np.float32(0.5)
     edges = inner - np.asarray(offset_px, dtype=np.float32)[:, None]
-    edges *= np.float32(1.0 / sigma_px)
+    scale = np.asarray(1.0 / np.asarray(sigma_px)[..., None], dtype=np.float32)
+    edges *= scale
     density = np.exp(np.float32(-0.5) * edges * edges)
     t = np.abs(edges)
     t *= ERF_T
@@ -50,7 +51,7 @@ def pixel_profile_single(offset_px: Array, sigma_px: float, radius: int) -> tupl
         poly *= t
     poly *= density
     area = np.copysign(np.float32(0.5) - poly, edges)
-    density *= np.float32(1.0 / (math.sqrt(2 * math.pi) * sigma_px))
+    density *= scale * np.float32(1.0 / math.sqrt(2 * math.pi))
     return area[:, 1:] - area[:, :-1], density[:, :-1] - density[:, 1:]
 
 

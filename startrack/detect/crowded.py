@@ -61,7 +61,7 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
             break
         last[crowded] = light
         cleaned = _without(stamps.part(crowded), light)
-        again = fit_points(cleaned, fits.xy_px[crowded], sigma, light_noise, peaks.own_part)
+        again = fit_points(cleaned, fits.xy_px[crowded], sigma, light_noise, peaks.own_part, ROUNDS_AGAIN)
         fits = fits.replaced(crowded, again)
     return Fitted(stamps, fits, light_noise)
 

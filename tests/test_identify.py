@@ -177,22 +177,28 @@ def test_chance_in_a_narrow_field_is_refused() -> None:
         Identifier()(detected(xy, np.sort(rng.uniform(3, 8, len(xy))), 0.2), NARROW, sky())
 
 
+ODDS = {"wide": (FISHEYE, 10.0, 1.0, 400), "narrow": (NARROW, 2.0, 0.15, 8000)}  # cap and radius [deg], stars
+
+
+@pytest.mark.parametrize("field", ODDS)
 @pytest.mark.parametrize("clustered", [False, True], ids=["uniform", "clustered"])
-def test_the_stated_odds_of_chance_are_true(clustered: bool) -> None:
+def test_the_stated_odds_of_chance_are_true(clustered: bool, field: str) -> None:
     """p-values of random attitudes over random detections: at least as large as they should be, and not much more."""
-    rng = np.random.default_rng(4)
-    bright = sky().rays_icrs[:400]
-    radius, p_values = np.radians(1.0), []
+    camera, cap_deg, radius_deg, stars = ODDS[field]
+    rng, width = np.random.default_rng(4), camera.size_px[0]
+    bright = sky().rays_icrs[:stars]
+    radius, p_values = np.radians(radius_deg), []
     for _ in range(12):
-        xy = scattered(FISHEYE, 150, rng)
+        xy = scattered(camera, 150, rng)
         if clustered:
-            xy = rng.uniform(600, 1400, (6, 2))[rng.integers(6, size=150)] + rng.normal(0, 120, (150, 2))
-        rays = FISHEYE.unproject(xy)
-        model = ChanceModel(rays)
+            xy = rng.uniform(0.3, 0.7, (6, 2))[rng.integers(6, size=150)] * width
+            xy += rng.normal(0, 0.06 * width, (150, 2))
+        rays = camera.unproject(xy)
+        model = ChanceModel(rays, np.radians(cap_deg))
         tree = cKDTree(rays)
         for R in Rotation.random(60, random_state=rng).as_matrix():
             cam = bright @ R.T
-            cam = cam[FISHEYE.project(cam)[1]]
+            cam = cam[camera.project(cam)[1]]
             hits = np.count_nonzero(tree.query(cam)[0] < 2 * np.sin(radius / 2))
             p_values.append(np.exp(model.log_odds(np.array(hits), np.array(len(cam)), radius, given=0)))
     p = np.array(p_values)

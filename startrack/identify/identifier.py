@@ -23,7 +23,7 @@ BRIGHT_DETECTIONS = 300  # by which a camera is judged
 ON_PLACE = 0.7  # of the stars within the widest gate are within the narrowest one, if the camera file is right
 MOST_REFINED = 40
 TOLERANCE_SIGMAS = 3.0
-LOCAL_PART = 0.2  # of the field's diameter: within it the density of detections counts
+LOCAL_PART = 0.1  # of the field's diameter: within it the density of detections counts
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from startrack.identify import Identifier
 from startrack.identify.attitudes import AttitudeSearch, turns
 from startrack.identify.index import Patterns
 from startrack.identify.kept import KeptPerObject
-from startrack.identify.names import last_of_each
+from startrack.identify.names import Light, Pairs, last_of_each
 from startrack.identify.pairs import build_pairs
 from startrack.identify.triangles import sides_of_few, triangles
 from startrack.orient import rotation, wahba
@@ -148,6 +148,35 @@ def test_facts_are_kept_per_object_and_forgotten_with_it() -> None:
     del one
     gc.collect()
     assert len(kept._kept) == 1
+
+
+def pairs_of(detection: list[int], star: list[int], distance_px: list[float], v_mag: list[float]) -> Pairs:
+    """Detections all measured at V 3; stars of the magnitudes given."""
+    v, none = np.array(v_mag), np.zeros(max(detection) + 1)
+    light = Light(none + 3.0, none > 0, 6.0, 5.0)
+    return Pairs(np.array(detection), np.array(star), np.array(distance_px), v, np.zeros(len(v)), light)
+
+
+BLENDS = {
+    "alone": ([0, 1], [4, 5], [0.1, 0.2], [3.0, 3.1], [4, 5]),
+    "with a fainter one": ([0, 0, 1], [4, 5, 6], [0.1, 0.1, 0.1], [3.0, 3.5, 3.0], [4, 6]),
+    "the nearer is the fainter": ([0, 0, 1], [4, 5, 6], [0.3, 0.1, 0.1], [3.0, 3.5, 3.0], [4, 6]),
+    "as bright as each other": ([0, 0, 1], [4, 5, 6], [0.3, 0.1, 0.1], [3.0, 3.2, 3.0], [6]),
+    "as bright, but far off": ([0, 0, 1], [4, 5, 6], [2.0, 0.1, 0.1], [3.1, 3.0, 3.0], [5, 6]),
+    "a brighter one, but not there": ([0, 0, 1], [4, 5, 6], [2.0, 0.1, 0.1], [2.4, 3.0, 3.0], [6]),
+    "each detected": ([0, 0, 1, 1], [4, 5, 4, 5], [0.1, 1.5, 1.5, 0.1], [3.0, 3.0, 3.0, 3.0], [4, 5]),
+    "two claim the same": ([0, 0, 1, 1], [3, 4, 3, 5], [0.3, 0.1, 0.3, 0.1], [2.5, 3.0, 2.5, 3.0], None),
+}
+
+
+@pytest.mark.parametrize("case", BLENDS)
+def test_a_blend_goes_by_the_name_of_the_plainly_brighter_star(case: str) -> None:
+    *listed, named = BLENDS[case]
+    pairs = pairs_of(*listed)
+    plain = pairs.plain(pairs.nearest, np.full(len(pairs.nearest), 0.04), 3.0)
+    assert len(set(pairs.star[plain].tolist())) == len(set(pairs.detection[plain].tolist())) == len(plain)
+    if named is not None:
+        assert pairs.star[plain].tolist() == named
 
 
 def test_the_last_of_each_number() -> None:

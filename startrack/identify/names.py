@@ -105,7 +105,7 @@ class Pairs:
         faintest[self.detection[which]] = self.v_mag[which] + PLAINLY_FAINTER_MAG
         rival = (self.distance_px < radius_px) & (self.v_mag < faintest[self.detection])
         rival &= self.star != own[self.detection]
-        crowds = self.detection[rival]
+        crowds = np.unique(self.detection[rival])
         if not len(crowds):
             return which
         named, sure, detected = which.copy(), np.ones(len(which), dtype=bool), set(self.star[which].tolist())
@@ -116,6 +116,7 @@ class Pairs:
             group = group[free]
             named[i] = group[np.argmin(self.v_mag[group])] if len(group) else which[i]
             sure[i] = self._told_apart(int(named[i]), group, float(variance_px2[i]))
+            detected.add(int(self.star[named[i]]))
         return named[sure]
 
     def _told_apart(self, own: int, group: Ints, variance_px2: float) -> bool:

@@ -26,6 +26,7 @@ from startrack.terrain.projection import (
     Projection,
     polar_stereographic,
 )
+from startrack.terrain.silence import silent_sectors, why_silent
 from startrack.types import Evidence
 
 DATA = Path(__file__).parent / "data"
@@ -199,6 +200,12 @@ def test_rays_that_run_off_the_map_give_no_evidence(shackleton):
     assert not small.tells(azimuth, small.horizon_rad(np.zeros(2), azimuth)).any()
     assert small.tells(azimuth, np.full(len(azimuth), np.radians(80.0))).all()
     assert shackleton.tells(azimuth, np.zeros(len(azimuth))).all()
+    low = small.horizon_rad(np.zeros(2), azimuth)
+    assert set(why_silent(small, azimuth, low)) == {"ground off the map"}
+    assert set(why_silent(small, azimuth, np.full(len(azimuth), np.radians(80.0)))) == {""}
+    (line,) = silent_sectors(small)
+    assert line.startswith("azimuths 0 to 360 degrees: the maps end")
+    assert silent_sectors(shackleton) == []
     blind = evidence_at(small, np.zeros(2), np.random.default_rng(6), -0.2)
     with pytest.raises(NotLocated):
         ExactPosterior()(blind, small)
@@ -208,6 +215,28 @@ def test_glare_takes_the_evidence_of_its_azimuths(shackleton):
     lit = replace(shackleton, glare_rad=((np.radians(350), np.radians(20)),))
     told = lit.tells(np.radians([349.0, 351.0, 0.0, 19.0, 21.0, 180.0]), np.full(6, 0.5))
     assert told.tolist() == [True, False, False, False, True, True]
+    why = why_silent(lit, np.radians([349.0, 351.0]), np.full(2, 0.5))
+    assert why.tolist() == ["", "glare of a lit rim"]
+    (line,) = silent_sectors(lit)
+    assert line.startswith("azimuths 350 to 20 degrees: no evidence")
+
+
+def test_azimuths_where_the_maps_end_are_told_as_ranges(shackleton):
+    """A map that ends close by in the east and far off elsewhere."""
+    whole = shackleton.maps[0].around(shackleton.site.latitude_rad, shackleton.site.longitude_rad, 30_000.0)
+    azimuth = np.radians(np.arange(0.5, 360))
+    place = np.zeros(2)
+    for columns in (slice(0, whole.heights_m.shape[1] // 2 + 20), slice(None)):
+        cut = replace(shackleton, maps=(whole.cut(slice(None), columns),), search_radius_m=200.0, _state={})
+        silent = ~cut.tells(azimuth, cut.horizon_rad(place, azimuth))
+        lines = silent_sectors(cut)
+        assert bool(lines) == bool(silent.any())
+        said = np.zeros(360, dtype=bool)
+        for line in lines:
+            first, last = (int(word) for word in line.split(" degrees")[0].removeprefix("azimuths ").split(" to "))
+            said[np.arange(first, last if last > first else last + 360) % 360] = True
+        assert not np.any(silent & ~said)
+        assert (columns == slice(None)) == (not lines)
 
 
 @pytest.mark.parametrize(

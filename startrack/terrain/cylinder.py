@@ -71,6 +71,10 @@ class Cylinder:
         """Zero: the cylinder is taken as exact."""
         return np.zeros(np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad)))
 
+    def most_sigma_rad(self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float) -> Array:
+        """Zero, as everywhere."""
+        return self.horizon_sigma_rad(centres_m, azimuths_rad)
+
     def ground_m(self, points_m: Array) -> Array:
         """Zero: the floor is the plane z = 0."""
         return np.zeros(np.shape(points_m)[:-1])

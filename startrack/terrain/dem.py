@@ -181,6 +181,34 @@ class HeightTerrain:
         index = np.broadcast_to((cell[..., 0] * n + cell[..., 1]) * BINS + b, shape)
         return np.asarray(self._cell_sigma_rad.ravel()[index])
 
+    def most_sigma_rad(self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float) -> Array:
+        """The largest `horizon_sigma_rad` (n,) over boxes and azimuths: it changes from cell to cell of the table."""
+        shape = np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad))
+        if self.height_sigma_m == 0:
+            return np.zeros(shape)
+        square = self.prepared().square
+        level = tracing.level_for(self.prepared(), half_m)
+        most = self._most_sigma_rad[level]
+        n, side = len(most), 2 * square.reach_m / len(most)
+        steps = 2 + int(2 * azimuth_half_rad * BINS / (2 * np.pi)) if azimuth_half_rad > 0 else 1
+        found = np.zeros(shape)
+        for turn in np.linspace(-azimuth_half_rad, azimuth_half_rad, steps) * (1 - 1e-9):
+            b = np.floor((np.asarray(azimuths_rad) + turn) / (2 * np.pi) * BINS).astype(np.int64) % BINS
+            for corner in half_m * (1 - 1e-9) * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]):
+                cell = np.clip((np.asarray(centres_m) + corner + square.reach_m) / side, 0, n - 1).astype(np.int64)
+                found = np.maximum(found, most[cell[..., 0], cell[..., 1], b])
+        return found
+
+    @cached_property
+    def _most_sigma_rad(self) -> list[Array]:
+        """(m, m, BINS) the largest sigma of the cells, then of ever larger blocks of them."""
+        n = self.square.across
+        levels = [self._cell_sigma_rad.reshape(n, n, BINS)]
+        while len(levels[-1]) > 1:
+            a = levels[-1]
+            levels.append(np.maximum(np.maximum(a[::2, ::2], a[1::2, ::2]), np.maximum(a[::2, 1::2], a[1::2, 1::2])))
+        return levels
+
     @cached_property
     def _cell_sigma_rad(self) -> Array:
         """(cells, BINS)."""

@@ -51,6 +51,10 @@ class Terrain(Protocol):
         """Standard deviation (n,) of the horizon from the errors of the map."""
         ...
 
+    def most_sigma_rad(self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float) -> Array:
+        """The largest of these (n,) over boxes and azimuths, as in `horizon_bounds_rad`."""
+        ...
+
     def ground_m(self, points_m: Array) -> Array:
         """Height (n,) of the ground in enu."""
         ...

@@ -12,7 +12,7 @@ from startrack.detect.binned import any_dead, binned, in_pixels, peaks_in_pixels
 from startrack.detect.crowded import Fitted, fit_all, painted
 from startrack.detect.fit import ROUNDS_AGAIN, PointFits, Stamps, fit_points
 from startrack.detect.frame import Frame, Image, LightNoise, electrons, radius_for
-from startrack.detect.judge import one_per_place, skewness_of, stars_among, threshold_for
+from startrack.detect.judge import height_of, not_beside, one_per_place, skewness_of, stars_among, threshold_for
 from startrack.detect.peaks import Peaks, bright_pixels, find_peaks
 from startrack.detect.streaks import Streaks, drawn_out, find_streaks
 from startrack.detect.widths import BRIGHT_SNR, measured_width
@@ -129,7 +129,9 @@ class Detector:
         threshold = threshold_for(self.threshold_snr, sigma / side, skewness_of(frame) / side)
         good = stars_among(fitted, sigma / side, threshold)
         good = good[one_per_place(fits.xy_px[good], fits.flux[good], 1.2 * sigma / side)]
-        return fits.take(good[np.argsort(-fits.flux[good], kind="stable")])
+        stars = fits.take(good[np.argsort(-fits.flux[good], kind="stable")])
+        clear = not_beside(stars.xy_px, stars.flux, height_of(stars), sigma / side, threshold)
+        return stars.take(np.flatnonzero(clear))
 
 
 def _of_streaks(frame: Frame, streaks: Streaks) -> Detections:

@@ -12,7 +12,7 @@ from startrack.detect.widths import BRIGHT_SNR, FEWEST_BRIGHT
 from startrack.types import Array, Bools, Ints
 
 WIDTHS_PX = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0)
-HEIGHTS = (5.79, 5.65, 5.49, 5.40, 5.31, 5.15, 5.09)  # measured at USUAL_SKEWNESS: alike in false stars
+HEIGHTS = (5.79, 5.65, 5.50, 5.42, 5.31, 5.15, 5.09)  # measured at USUAL_SKEWNESS: alike in false stars
 HEIGHT_AT_NOMINAL = 5.42
 USUAL_SKEWNESS, LARGEST_SKEWNESS = 0.088, 0.3  # the first is that of 100 photons and 3 electrons of read noise
 FILTERED_SKEWNESS = 0.376  # 2 / (3 sqrt(pi)): part that a matched filter of 1 px leaves
@@ -24,6 +24,7 @@ BAD_FIT_CHI2_PER_DOF = 4.0
 ROUGH_PSF_MISFIT = 0.06  # from here up the frame's own stars, not the Gaussian, say what a star looks like
 ROUGH_PSF_SPREAD = 2.0  # times the typical misfit that a star of such a frame may have
 LARGEST_SIGMA_PX = 2.0  # of the place
+WING_SIGMAS, WING_BRIGHTER, WING_HEIGHT = 3.0, 2.0, 1.4  # where a brighter one is, this much brighter, more is asked
 
 
 def stars_among(fitted: Fitted, sigma: float, threshold: float) -> Ints:
@@ -56,6 +57,21 @@ def one_per_place(xy_px: Array, flux: Array, closer_px: float) -> Bools:
     fainter = np.zeros(len(flux), dtype=bool)
     fainter[np.where(rank[pairs[:, 0]] > rank[pairs[:, 1]], pairs[:, 0], pairs[:, 1])] = True
     return ~fainter
+
+
+def not_beside(xy_px: Array, flux: Array, height: Array, sigma: float, threshold: float) -> Bools:
+    """Which sources (n,) to keep: those hardly above the threshold in a brighter one's wing are its misfit, or a blend.
+
+    Two stars that are not resolved are fitted as one, and what that leaves looks like a third.
+    """
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(xy_px).query_pairs(WING_SIGMAS * sigma, output_type="ndarray")
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    fainter = both[flux[both[:, 0]] * WING_BRIGHTER < flux[both[:, 1]], 0]
+    keep = np.ones(len(flux), dtype=bool)
+    keep[fainter[height[fainter] < WING_HEIGHT * threshold]] = False
+    return keep
 
 
 def height_of(fits: PointFits) -> Array:

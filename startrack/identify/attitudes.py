@@ -19,7 +19,7 @@ DEEPEST = 240
 ROUGH_DEPTH, ROUGH_REACH_RAD, ROUGH_PART = 120, np.radians(20.0), 0.4
 PIVOTS = 16  # brightest detections about which triangles of any stars are tried
 MATCHES_EACH, ROUGH_MATCHES_EACH = 3, 8  # of an image's triangle
-MOST_IMAGE_TRIANGLES = 20_000
+MOST_IMAGE_TRIANGLES, MOST_ROUGH = 20_000, 3000  # short triangles of the image; their matches that are tried
 VERIFIED = 256  # detections held against the stars
 SIFTED, AT_ONCE = 64, 64  # detections that sift a crowd of hypotheses first, and how many of these at once
 DEPTH_FACTOR = 4  # catalogue stars per detection of the whole sky's: some are hidden, or too faint
@@ -108,6 +108,8 @@ class AttitudeSearch:
         reach = min(ROUGH_REACH_RAD, ROUGH_PART * self.scale.diameter_rad)
         image = triangles(self.rays_cam[:ROUGH_DEPTH], reach, MOST_IMAGE_TRIANGLES)
         left, right = index.candidates(2 * np.sin(image.sides_rad / 2), tolerance, ROUGH_MATCHES_EACH)
+        self.tried += max(len(left) - MOST_ROUGH, 0)
+        left, right = left[:MOST_ROUGH], right[:MOST_ROUGH]
         if len(left):
             icrs = index.rays_icrs[index.vertices[right]]
             yield from self._handed(self.rays_cam[image.vertices[left]], icrs, index.handed[right], 0, tolerance)

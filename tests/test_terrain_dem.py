@@ -282,6 +282,10 @@ def test_ground_is_the_maps_height_on_the_sphere():
     ground = terrain.ground_m(np.array([[0.0, 0.0], [3000.0, 4000.0]]))
     assert ground[0] == pytest.approx(-1000.0, abs=1e-6)
     assert ground[1] == pytest.approx(np.sqrt(1_736_400.0**2 - 5000.0**2) - 1_737_400.0, abs=1e-3)
+    for compiled in (True, False):  # nothing is made up beyond the map's end, 20 km off
+        there = replace(terrain, use_compiled=compiled, camera_height_m=300.0, _state={})
+        low = there.horizon_rad(np.zeros(2), np.array([np.pi / 4]))[0]
+        assert low == pytest.approx(-0.0205, abs=0.001)
     # On a smooth sphere the horizon dips by sqrt(2 h / R); here seen to where the map ends or beyond
     dip = terrain.horizon_rad(np.zeros(2), np.array([1.0]))[0]
     assert dip == pytest.approx(-np.sqrt(2 * 1.5 / 1_736_400.0), rel=2e-2)

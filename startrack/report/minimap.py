@@ -26,7 +26,7 @@ from startrack.types import Array, Fix
 CIRCLE_RAD = np.linspace(0.0, 2 * np.pi, 181)
 SHADE_CELLS = 200
 GENTLE_SLOPE = 0.02  # gentler ground looks flat
-RELIEF_LIGHT = 2.2  # slopes that face the light, as a multiple of the floor's colour
+RELIEF_LIGHT = 3.0  # slopes that face the light, as a multiple of the floor's colour
 CAPTION_SIZE = 16.0
 
 
@@ -176,7 +176,7 @@ def _shade(window: Canvas, view: MapView, terrain: Terrain) -> None:
     slope_north, slope_east = np.gradient(ground_m.reshape(SHADE_CELLS, SHADE_CELLS), y[::-1], x)
     facing = (slope_east - slope_north) * known.reshape(SHADE_CELLS, SHADE_CELLS)
     steep = max(float(np.percentile(np.abs(facing), 95)), GENTLE_SLOPE)
-    light = np.clip(0.5 + 0.5 * facing / steep, 0.05, 1.0) * known.reshape(SHADE_CELLS, SHADE_CELLS)
+    light = np.maximum(0.5 + 0.5 * np.tanh(1.2 * facing / steep), 0.05) * known.reshape(SHADE_CELLS, SHADE_CELLS)
     height, width = window.pixels.shape[:2]
     shade = cv2.resize(light.astype(np.float32), (width, height))[:, :, None]
     window.pixels[:] = (np.array(MAP) + shade * (RELIEF_LIGHT * np.array(FLOOR) - MAP)).astype(np.uint8)

@@ -249,7 +249,7 @@ class HeightTerrain:
 
     @property
     def unknown_rad(self) -> Array:
-        """(n,) of n equal sectors from north eastward: below which elevation ground off the maps may stand; or -pi/2."""
+        """(n,) of n sectors from north eastward: below which elevation ground off the maps may stand, or -pi/2."""
         return self.prepared().unknown_rad
 
     def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = ACROSS) -> Terrain:

@@ -136,8 +136,9 @@ def horizon(ground, east, north, up, sin_a, cos_a, start_m, end_m, hint_m):
     if hint_m <= 0.0:
         guess = max(start_m, FIRST_GUESS_M)
     while start_m < guess < min(end_m, LAST_GUESS_M):
+        before = z
         z = _surface(grid, posts, heights, moon, east + guess * sin_a, north + guess * cos_a, z)
-        if z - up > tan * guess:
+        if z != before and z - up > tan * guess:  # no change: the maps do not reach there
             tan, at = (z - up) / guess, guess
         guess = guess * GUESS_RATIO if hint_m <= 0.0 else FAR_M
     known_s, known_z = -1.0, up  # the last place where the ground's height was worked out

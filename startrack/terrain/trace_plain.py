@@ -149,9 +149,10 @@ def _first_sight(
     ratio, z = np.where(hint > 0, FAR_M, GUESS_RATIO), up.copy()
     k = np.flatnonzero((guess > start) & (guess < np.minimum(end, LAST_GUESS_M)))
     while len(k):
-        z[k] = surface(g, east[k] + guess[k] * sin_a[k], north[k] + guess[k] * cos_a[k], z[k])
+        before = z[k]
+        z[k] = surface(g, east[k] + guess[k] * sin_a[k], north[k] + guess[k] * cos_a[k], before)
         value = (z[k] - up[k]) / guess[k]
-        better = value > tan[k]
+        better = (value > tan[k]) & (z[k] != before)  # no change: the maps do not reach there
         tan[k[better]], at[k[better]] = value[better], guess[k[better]]
         guess[k] *= ratio[k]
         k = k[guess[k] < np.minimum(end[k], LAST_GUESS_M)]

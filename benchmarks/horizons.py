@@ -1,0 +1,127 @@
+"""Horizons of height maps: beside Embree on the same surface, and beside plain marches in small steps.
+
+    python benchmarks/horizons.py [--places 5]
+
+Random places of the inner two thirds of the search area (floor and wall), 720 azimuths each, on one core. The surface:
+bilinear between posts in the map's own projection. Embree sees triangles of 48 m (Kepler 24 m; 7 m
+within 900 m), and halves down to the elevation where rays begin to miss; its scene's making is not in its time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from _embree import EmbreeHorizons
+from _results import table, write_section
+from numba import njit
+
+from startrack.terrain import load_terrain
+from startrack.terrain.dem import HeightTerrain
+from startrack.terrain.ground import ground_up_m
+from startrack.terrain.trace_compiled import _surface
+
+CROPS_M = {"shackleton": 16_000.0, "haworth": 22_000.0, "kepler": 17_000.0}
+AZIMUTHS_RAD = np.radians(np.arange(0.25, 360, 0.5))
+NUMPY_EVERY = 20
+
+
+def main() -> None:
+    """Run, print and write the section."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--places", type=int, default=5)
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    lines = []
+    for name, half_m in CROPS_M.items():
+        terrain = cropped(name, half_m)
+        rng = np.random.default_rng(args.seed)
+        turn, far = rng.uniform(0, 2 * np.pi, args.places), 0.67 * np.sqrt(rng.random(args.places))
+        places = terrain.search_radius_m * far[:, None] * np.column_stack([np.sin(turn), np.cos(turn)])
+        lines += compared(name, terrain, places)
+        print("\n".join(" ".join(line) for line in lines[-5:]), flush=True)
+    body = table(
+        ["map", "method", "horizons", "RMS from Embree, degrees", "mean", "largest", "CPU microseconds a horizon"],
+        lines,
+    )
+    write_section(
+        "Horizons", f"python benchmarks/horizons.py --places {args.places}", ("numpy", "numba", "embreex"), body
+    )
+
+
+def cropped(name: str, half_m: float) -> HeightTerrain:
+    """The terrain with its finest map alone, as far as that matters."""
+    whole = load_terrain(name)
+    assert isinstance(whole, HeightTerrain)
+    crop = whole.maps[0].around(whole.site.latitude_rad, whole.site.longitude_rad, half_m)
+    return replace(whole, maps=(crop,), _state={})
+
+
+def compared(name: str, terrain: HeightTerrain, places: np.ndarray) -> list[list[str]]:
+    """One row per method."""
+    plain = replace(terrain, use_compiled=False, _state={})
+    step_m = terrain.maps[0].post_m / 8
+    methods: dict[str, tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], int]] = {
+        "startrack, numba": (lambda p, a: terrain.horizon_rad(p[None], a), 1),
+        "startrack, numpy": (lambda p, a: plain.horizon_rad(p[None], a), 1),
+        f"march in steps of {step_m:.0f} m, numba": (lambda p, a: marched(terrain, p, a, step_m), 1),
+        f"march in steps of {step_m:.0f} m, numpy": (lambda p, a: marched_plain(terrain, p, a, step_m), NUMPY_EVERY),
+    }
+    truth, spent, inside = [], 0.0, []
+    for place in places:
+        embree = EmbreeHorizons(terrain, place)
+        start = time.process_time()
+        truth.append(embree.horizon_rad(AZIMUTHS_RAD))
+        spent += time.process_time() - start
+        _, distance, edge = terrain.horizons(place[None], AZIMUTHS_RAD)
+        inside.append(distance < edge - 2 * terrain.maps[0].post_m)  # where the crop ends, its last cell is nobody's
+    count = len(places) * len(AZIMUTHS_RAD)
+    rows = [[name, "Embree", str(count), "-", "-", "-", f"{1e6 * spent / count:.0f}"]]
+    for method, (function, every) in methods.items():
+        function(places[0], AZIMUTHS_RAD[:2])  # compiles
+        start = time.process_time()
+        found = [function(place, AZIMUTHS_RAD[::every]) for place in places]
+        spent = time.process_time() - start
+        off = np.degrees(
+            np.concatenate([(f - t[::every])[i[::every]] for f, t, i in zip(found, truth, inside, strict=True)])
+        )
+        errors = [f"{np.sqrt(np.mean(off**2)):.5f}", f"{off.mean():.5f}", f"{np.abs(off).max():.5f}"]
+        rows.append([name, method, str(len(off)), *errors, f"{1e6 * spent * every / count:.0f}"])
+    return rows
+
+
+@njit(cache=True)
+def _march(grid, posts, heights, moon, points, up, azimuths, step_m, end_m, tan):  # type: ignore[no-untyped-def]
+    for k in range(len(tan)):
+        sin_a, cos_a, z, s = np.sin(azimuths[k]), np.cos(azimuths[k]), up[k], 0.0
+        while s < end_m:
+            s += step_m
+            z = _surface(grid, posts, heights, moon, points[k, 0] + s * sin_a, points[k, 1] + s * cos_a, z)
+            tan[k] = max(tan[k], (z - up[k]) / s)
+
+
+def marched(terrain: HeightTerrain, place: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
+    """Small steps, compiled; the surface is startrack's own."""
+    ground, tan = terrain.ground, np.full(len(azimuths), -50.0)
+    places = np.repeat(place[None], len(azimuths), axis=0)
+    up, end = terrain.ground_m(places) + terrain.camera_height_m, CROPS_M[terrain.name]
+    _march(ground.grid, ground.posts, ground.heights, ground.radius_m, places, up, azimuths, step_m, end, tan)
+    return np.arctan(tan)
+
+
+def marched_plain(terrain: HeightTerrain, place: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
+    """Small steps, a ray at a time, with numpy alone."""
+    s, maps = np.arange(step_m, CROPS_M[terrain.name], step_m), list(terrain.maps)
+    up = ground_up_m(terrain.site, maps, place) + terrain.camera_height_m
+    found = np.empty(len(azimuths))
+    for k, azimuth in enumerate(azimuths):
+        z = ground_up_m(terrain.site, maps, place + s[:, None] * np.array([np.sin(azimuth), np.cos(azimuth)]))
+        found[k] = np.arctan(np.nanmax((z - up) / s))
+    return found
+
+
+if __name__ == "__main__":
+    main()

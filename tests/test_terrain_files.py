@@ -158,6 +158,84 @@ def test_rasterio_reads_what_the_tags_do_not_tell(tmp_path):
     assert read.projection == m.projection
 
 
+def test_a_cloud_optimised_geotiff_is_read(tmp_path):
+    """Tiled, compressed, with overviews, whole numbers with scale, offset and no-data, as agencies hand them out."""
+    rasterio = pytest.importorskip("rasterio")
+    from rasterio.enums import Resampling
+    from rasterio.shutil import copy
+
+    m = hill(posts=121)
+    wkt = rasterio.crs.CRS.from_proj4("+proj=stere +lat_0=-90 +lon_0=0 +R=1737400 +units=m")
+    move = rasterio.transform.from_origin(m.x0_m - 50, m.y0_m + 50, 100, 100)
+    values = np.rint((m.heights_m.astype(float) + 100) / 0.5).astype(np.int16)
+    values[0, :7] = -32768
+    with rasterio.open(
+        tmp_path / "plain.tif", "w", driver="GTiff", height=121, width=121, count=1, dtype="int16", crs=wkt,
+        transform=move, nodata=-32768, tiled=True, blockxsize=64, blockysize=64,
+    ) as file:  # fmt: skip
+        file.write(values, 1)
+        file.scales, file.offsets = (0.5,), (-100.0,)
+        file.build_overviews([2, 4], Resampling.average)
+    copy(tmp_path / "plain.tif", tmp_path / "cog.tif", driver="COG", compress="deflate")
+    read = read_map(tmp_path / "cog.tif")
+    assert np.isnan(read.heights_m[0, :7]).all()
+    assert np.nanmax(np.abs(read.heights_m - m.heights_m)) < 0.26
+    assert (read.x0_m, read.y0_m, read.dx_m, read.dy_m) == pytest.approx((m.x0_m, m.y0_m, 100.0, -100.0))
+    assert read.projection == m.projection
+
+
+PDS3 = """PDS_VERSION_ID = PDS3
+RECORD_TYPE = FIXED_LENGTH
+RECORD_BYTES = 122
+FILE_RECORDS = 61
+^IMAGE = "HILL.IMG"
+TARGET_NAME = {body}
+OBJECT = IMAGE
+  LINES = 61
+  LINE_SAMPLES = 61
+  SAMPLE_TYPE = LSB_INTEGER
+  SAMPLE_BITS = 16
+  UNIT = METER
+  SCALING_FACTOR = 0.5
+  OFFSET = 1737400.
+END_OBJECT = IMAGE
+OBJECT = IMAGE_MAP_PROJECTION
+  MAP_PROJECTION_TYPE = "POLAR STEREOGRAPHIC"
+  MAP_RESOLUTION = 303.23 <pix/deg>
+  A_AXIS_RADIUS = {radius} <km>
+  B_AXIS_RADIUS = {radius} <km>
+  C_AXIS_RADIUS = {radius} <km>
+  POSITIVE_LONGITUDE_DIRECTION = "EAST"
+  CENTER_LATITUDE = -90. <deg>
+  CENTER_LONGITUDE = 0. <deg>
+  LINE_PROJECTION_OFFSET = 30. <pix>
+  SAMPLE_PROJECTION_OFFSET = 30. <pix>
+  MAP_SCALE = 100. <m/pix>
+END_OBJECT = IMAGE_MAP_PROJECTION
+END
+"""
+
+
+@pytest.mark.parametrize(("body", "radius"), [("MOON", "1737.4"), ("MARS", "3396.19")])
+def test_a_pds3_map_is_read_by_its_detached_label(body, radius, tmp_path):
+    """Written by hand as the LOLA team writes them: heights in half metres above the radius that OFFSET gives."""
+    pytest.importorskip("rasterio")
+    m = hill()
+    (tmp_path / "HILL.IMG").write_bytes(np.rint(m.heights_m / 0.5).astype("<i2").tobytes())
+    label = tmp_path / "HILL.LBL"
+    label.write_text(PDS3.format(body=body, radius=radius).replace("\n", "\r\n"))
+    if body == "MARS":
+        with pytest.raises(BadInput, match=r"HILL\.LBL|radius|Moon"):
+            read_map(label)
+        return
+    read = read_map(label)
+    assert np.abs(read.heights_m - m.heights_m).max() < 0.26
+    latitude, longitude = read.projection.latlon_from_xy(*read.xy(np.array([[30.0, 30.0], [30.0, 40.0], [20.0, 30.0]])))
+    assert np.degrees(latitude[0]) == pytest.approx(-90.0, abs=1e-4)
+    assert np.degrees(longitude[1:]) == pytest.approx([90.0, 0.0], abs=0.3)  # east to the right, 0 degrees up
+    assert (90 + np.degrees(latitude[1:])) * 30_323 == pytest.approx([1000.0, 1000.0], rel=1e-3)
+
+
 def test_import_show_and_build(tmp_path, capsys):
     write_map(tmp_path / "src.tif", hill())
     words = ["--latitude", "-90", "--longitude", "0", "--radius", "500", "--half", "2500"]

@@ -21,6 +21,7 @@ from startrack.types import Array, Bools, Detections, Exposure, Ints, TooFewStar
 UNKNOWN_WIDTH_PX = 1.2  # first guess where the camera file does not tell
 WIDTH_TOLERANCE = 0.12  # measured PSF differing by more than this fraction from the expected one is used instead
 BRIGHT_PIXEL_SIGMAS, BRIGHT_PIXELS, ENOUGH_PIXELS = 8.0, 64, 30
+LEAST_BESIDE, LEAST_FALL, MOST_FALL = 0.02, 0.05, 3.5  # light beside a peak; its fall for 4.5 px and 0.45 px
 WIDTH_ROUNDS = 4  # a stamp of the wrong size measures a much wider PSF too small
 FIRST_PASS_LOWER = 1.1
 WINGS_SIGMAS = 4.0
@@ -179,6 +180,8 @@ def _width_of_brightest(behind: _Behind, sigma: float) -> float:
     if len(pixels) < ENOUGH_PIXELS:  # too few stand out by one pixel
         found = find_peaks(frame, sigma, BRIGHT_SNR, BRIGHT_PIXELS).centres
         pixels = found if len(found) > len(pixels) else pixels
+    elif (guess := _width_of_pixels(frame, pixels)) is not None:
+        sigma = guess
     for _ in range(WIDTH_ROUNDS):
         radius = radius_for(sigma)
         last = np.array([frame.shape[1], frame.shape[0]]) - 1
@@ -196,6 +199,21 @@ def _width_of_brightest(behind: _Behind, sigma: float) -> float:
         if settled:
             break
     return sigma
+
+
+def _width_of_pixels(frame: Frame, pixels: Ints) -> float | None:
+    """About the PSF sigma [px] of sources whose brightest pixels (n, 2) lie off the border; None where they are odd.
+
+    Of a Gaussian of variance s^2 the values left and right of a pixel have the product of its square and exp(-1 / s^2),
+    wherever the middle is.
+    """
+    light = np.maximum(frame.data(pixels, 1), 0.0)
+    peak = np.maximum(light[:, 1, 1], 1e-9)
+    beside = np.stack([light[:, 1, 0], light[:, 1, 2], light[:, 0, 1], light[:, 2, 1]], axis=1) / peak[:, None]
+    falls = -0.5 * float(np.median(np.log(np.maximum(beside, LEAST_BESIDE)).sum(axis=1)))
+    if not LEAST_FALL < falls < MOST_FALL:
+        return None
+    return float(np.sqrt(1.0 / falls - 1.0 / 12.0))
 
 
 def _covered(stars: PointFits, sigma: float, shape: tuple[int, int]) -> float:

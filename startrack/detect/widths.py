@@ -12,7 +12,7 @@ from startrack.types import Array, Bools, Ints
 BRIGHT_SNR = 12.0  # sources that say what the frame's PSF is
 FEWEST_BRIGHT = 8
 MOST_BRIGHT, FEW_BRIGHT = 100, 40  # the second where many widths are tried
-NEAR = np.geomspace(0.7, 1.45, 5)  # widths tried first, in units of the expected one
+NEAR = np.geomspace(0.72, 1.4, 8)  # widths tried first, in units of the expected one
 WIDTHS_PX = np.geomspace(0.3, 8.0, 22)
 NARROWER_IS_A_PIXEL_PX = 0.45  # hot pixels fit the narrowest profile
 AT_THE_END = 0.3  # part of the sources that the widths tried first may fail to hold

@@ -143,6 +143,7 @@ def main() -> None:
     if args.write:
         packages = tuple(name for name in PEERS if find_spec(name))
         command = f"python benchmarks/stars_identification.py --trials {args.trials}"
+        command += f" --peer-seconds {args.peer_seconds:g}" + (" --cedar PYTHON" if args.cedar else "")
         write_section("Stars: identification", command, packages, body)
 
 

@@ -31,6 +31,7 @@ def test_every_open_ray_of_a_sector_is_open_in_its_part():
         wanted = set(whole.evidence.llr[open_whole].tolist())
         assert wanted <= set(parts.evidence.llr[open_parts].tolist())
         assert open_parts.sum() <= open_whole.sum() + len(begins)  # one more of each sector at most
+    assert parts.sums(handed[0][:0], handed[1][:0])[0].shape == (0, len(begins))  # no box left
     visible = whole.sums(first, last)[0] - parts.sums(*handed)[0]
     extra = parts.sums(*handed)[2] - parts.sums(*handed)[1]
     assert np.all(np.abs(visible) <= extra + 1e-9)

@@ -112,7 +112,11 @@ class Profile:
         )
 
     def _by_sector(self, of_parts: Array) -> Array:
-        return of_parts if self.parts == 1 else of_parts.reshape(len(of_parts), -1, self.parts).sum(axis=-1)
+        return (
+            of_parts
+            if self.parts == 1
+            else of_parts.reshape(len(of_parts), of_parts.shape[1] // self.parts, self.parts).sum(axis=-1)
+        )
 
     def pairs(self, first: Ints, last: Ints) -> tuple[Ints, Ints]:
         """Every open (box, ray) pair (m,), (m,)."""

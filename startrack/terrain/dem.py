@@ -274,7 +274,7 @@ class HeightTerrain:
     def _built(self, progress: Progress | None) -> HorizonTable:
         square = self.square
         centres = square.centres_m
-        wanted = np.hypot(*centres.T) < self.reach_m * 1.08 + 2 * square.half_m
+        wanted = np.hypot(*centres.T) < self.reach_m + 1.42 * square.half_m  # all that hold a place within reach
         middles = (np.arange(BINS) + 0.5) * 2 * np.pi / BINS
 
         def fill(cells: Ints) -> Array:

@@ -62,7 +62,10 @@ class HorizonTable:
         """Least and most elevation (n, n, BINS) of the cells, then of ever larger blocks of them."""
         n = self.square.across
         cells = self.values.reshape(n, n, BINS, FIELDS)
-        levels = [(np.ascontiguousarray(cells[..., 0]), np.ascontiguousarray(cells[..., 1]))]
+        nowhere = (cells[..., 0] == 0) & (cells[..., 1] == FARTHEST)  # no camera can be there: no word in any block
+        levels = [
+            (np.where(nowhere, np.uint16(FARTHEST), cells[..., 0]), np.where(nowhere, np.uint16(0), cells[..., 1]))
+        ]
         while levels[-1][0].shape[0] > 1:
             levels.append((_quarters(levels[-1][0], np.minimum), _quarters(levels[-1][1], np.maximum)))
         return levels

@@ -91,9 +91,10 @@ def _fit(
     flux, level = np.zeros(n), np.zeros(n)
     weights = _masked(1.0 / s.variance, s.usable)
     for step in range(rounds + 1):
-        px, dx = pixel_profile_single(offset[:, 0], sigma_px, radius)
-        py, dy = pixel_profile_single(offset[:, 1], sigma_px, radius)
-        shape = py[:, :, None] * px[:, None, :]
+        if step != 1:  # the first step leaves the places as they are
+            px, dx = pixel_profile_single(offset[:, 0], sigma_px, radius)
+            py, dy = pixel_profile_single(offset[:, 1], sigma_px, radius)
+            shape = py[:, :, None] * px[:, None, :]
         if step > 0:  # a flux is known, and with it the noise of the star's own light
             weights = _weights(s, flux, shape, light_noise)
         miss = s.data - flux[:, None, None].astype(np.float32) * shape - level[:, None, None].astype(np.float32)

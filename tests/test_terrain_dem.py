@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from startrack.errors import NotLocated
-from startrack.frames import Site, enu_from_latlon
+from startrack.frames import Site, enu_from_latlon, latlon_from_enu
 from startrack.localize import ExactPosterior
 from startrack.localize.common import common_error, raised
 from startrack.terrain import cache, load_terrain
@@ -88,6 +88,20 @@ def test_the_table_changes_no_horizon(shackleton):
     before = replace(shackleton, _state={}).horizon_rad(places, azimuths)
     shackleton.prepared()
     assert np.abs(shackleton.horizon_rad(places, azimuths) - before).max() < np.radians(0.001)
+
+
+def test_far_crests_are_found_with_the_table_too():
+    """From Haworth's wall the horizon in the south stands 50 to 60 km off."""
+    terrain = load_terrain("haworth")
+    latitude, longitude = latlon_from_enu(terrain.site, 7082.0, 12_306.0, 0.0)
+    site = Site("moon", float(latitude), float(longitude))
+    azimuths = np.radians(np.arange(150.5, 220))
+    for compiled in (True, False):
+        there = replace(terrain, site=site, search_radius_m=90.0, use_compiled=compiled, _state={})
+        before, distance, _ = there.horizons(np.zeros(2), azimuths)
+        assert distance.max() > 50_000
+        there.prepared()
+        assert np.abs(there.horizons(np.zeros(2), azimuths)[0] - before).max() < 1e-5
 
 
 def test_tracing_without_numba_agrees_and_its_bounds_hold(shackleton):

@@ -135,12 +135,17 @@ def horizon(ground, east, north, up, sin_a, cos_a, start_m, end_m, hint_m):
     guess, z = hint_m, up
     if hint_m <= 0.0:
         guess = max(start_m, FIRST_GUESS_M)
-    while start_m < guess < min(end_m, LAST_GUESS_M):
+    while start_m < guess < min(end_m, LAST_GUESS_M if hint_m <= 0.0 else FAR_M):
         before = z
         z = _surface(grid, posts, heights, moon, east + guess * sin_a, north + guess * cos_a, z)
         if z != before and z - up > tan * guess:  # no change: the maps do not reach there
             tan, at = (z - up) / guess, guess
         guess = guess * GUESS_RATIO if hint_m <= 0.0 else FAR_M
+    if tan == LOWEST_TAN and start_m > 0.0:  # a sight line straight down would not get far
+        before = z
+        z = _surface(grid, posts, heights, moon, east + start_m * sin_a, north + start_m * cos_a, z)
+        if z != before:
+            tan, at = (z - up) / start_m, start_m
     known_s, known_z = -1.0, up  # the last place where the ground's height was worked out
     running = True
     while running and s < end_m:

@@ -147,7 +147,8 @@ def _first_sight(
 ) -> None:  # fmt: skip
     guess = np.where(hint > 0, hint, np.maximum(start, FIRST_GUESS_M))
     ratio, z = np.where(hint > 0, FAR_M, GUESS_RATIO), up.copy()
-    k = np.flatnonzero((guess > start) & (guess < np.minimum(end, LAST_GUESS_M)))
+    last = np.minimum(end, np.where(hint > 0, FAR_M, LAST_GUESS_M))
+    k = np.flatnonzero((guess > start) & (guess < last))
     while len(k):
         before = z[k]
         z[k] = surface(g, east[k] + guess[k] * sin_a[k], north[k] + guess[k] * cos_a[k], before)
@@ -155,7 +156,12 @@ def _first_sight(
         better = (value > tan[k]) & (z[k] != before)  # no change: the maps do not reach there
         tan[k[better]], at[k[better]] = value[better], guess[k[better]]
         guess[k] *= ratio[k]
-        k = k[guess[k] < np.minimum(end[k], LAST_GUESS_M)]
+        k = k[guess[k] < last[k]]
+    k = np.flatnonzero((tan == LOWEST_TAN) & (start > 0))  # a sight line straight down would not get far
+    if len(k):
+        z[k] = surface(g, east[k] + start[k] * sin_a[k], north[k] + start[k] * cos_a[k], up[k])
+        on = k[z[k] != up[k]]
+        tan[on], at[on] = (z[on] - up[on]) / start[on], start[on]
 
 
 def _over_cell(

@@ -131,7 +131,7 @@ def _excess(data: Array, variance: Array, light: Array, profile: Array, good: Bo
     return np.where(good, np.square(rest) / (variance + stars + np.square(MODEL_ERROR * stars)), 0.0)
 
 
-def _profiles(offset_px: Array, sigma_px: float, radius: int) -> Array:
+def _profiles(offset_px: Array, sigma_px: float, radius: int) -> NDArray[np.float32]:
     """PSF on the stamps (n, pixels)."""
     px, _ = pixel_profile_single(offset_px[:, 0], sigma_px, radius)  # stamps are large and pixels have no more digits
     py, _ = pixel_profile_single(offset_px[:, 1], sigma_px, radius)

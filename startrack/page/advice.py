@@ -6,7 +6,7 @@ from __future__ import annotations
 WORDS: dict[str, tuple[str, str]] = {
     "bad_image": (
         "The image cannot be used",
-        "Check that the file is whole: one picture as PNG, TIFF, FITS, JPEG or camera raw, and a sidecar of valid JSON.",
+        "Check that the file is whole: one picture as PNG, TIFF, FITS, JPEG or camera raw; its sidecar valid JSON.",
     ),
     "size_mismatch": (
         "The image's size is not the camera's",

@@ -131,8 +131,8 @@ def _excess(data: Array, variance: Array, light: Array, profile: Array, good: Bo
     return np.where(good, np.square(rest) / (variance + stars + np.square(MODEL_ERROR * stars)), 0.0)
 
 
-def _profiles(offset_px: Array, sigma_px: float, radius: int) -> NDArray[np.float32]:
-    """PSF on the stamps (n, pixels)."""
+def _profiles(offset_px: Array, sigma_px: float, radius: int) -> Any:
+    """PSF on the stamps (n, pixels), float32."""
     px, _ = pixel_profile_single(offset_px[:, 0], sigma_px, radius)  # stamps are large and pixels have no more digits
     py, _ = pixel_profile_single(offset_px[:, 1], sigma_px, radius)
     return (py[:, :, None] * px[:, None, :]).reshape(len(px), (2 * radius + 1) ** 2)

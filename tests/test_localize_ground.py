@@ -1,0 +1,136 @@
+"""Places on real ground: interpolated horizons, the posterior against a plain grid, wrong clocks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from startrack.localize import ExactPosterior, check_consistency
+from startrack.localize.common import raised
+from startrack.localize.likelihood import Sectors
+from startrack.localize.misfit import turn_of_sky
+from startrack.localize.profile import Profile
+from startrack.localize.scout import scores
+from startrack.localize.vicinity import Vicinity
+from startrack.terrain import load_terrain
+from startrack.terrain.dem import HeightTerrain
+from startrack.types import Array, Evidence
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _own_cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def shackleton() -> HeightTerrain:
+    terrain = load_terrain("shackleton")
+    assert isinstance(terrain, HeightTerrain)
+    terrain = replace(
+        terrain, search_radius_m=300.0, height_sigma_m=0.0, horizon_sigma_common_rad=0.0, _state={}, use_compiled=None
+    )
+    terrain.prepared()
+    return terrain
+
+
+def seen_from(terrain: HeightTerrain, place: Array, rng: np.random.Generator, rays: int, sigma_rad: float) -> Evidence:
+    """Rays of signal-to-noise ratio 1 to 4 near the skyline."""
+    azimuth = rng.uniform(0, 2 * np.pi, rays)
+    horizon = terrain.horizon_rad(place[None], azimuth)
+    elevation = horizon + rng.uniform(-0.06, 0.06, rays)
+    snr = rng.uniform(1, 4, rays)
+    light = snr * (elevation + sigma_rad * rng.normal(size=rays) > horizon) + rng.normal(size=rays)
+    return Evidence(
+        azimuth_rad=azimuth, elevation_rad=elevation, llr=np.clip(snr * light - snr**2 / 2, -9, 9),
+        edge_sigma_rad=np.full(rays, sigma_rad),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_between_traced_points_the_horizon_is_the_traced_one_and_bounds_hold(shackleton, compiled):
+    rng = np.random.default_rng(1)
+    azimuth = np.sort(rng.uniform(0, 2 * np.pi, 60))
+    whole = replace(shackleton, use_compiled=compiled, _state=shackleton._state)
+    near = whole.near(np.array([40.0, -60.0]), 50.0, azimuth, 6)
+    places = near.centre_m + rng.uniform(-50, 50, (40, 1, 2))
+    traced = shackleton.horizon_rad(places, azimuth)
+    off = np.degrees(near.horizon_rad(places, azimuth) - traced)
+    assert np.abs(off).max() < 0.005
+    assert np.sqrt(np.mean(off**2)) < 0.0005
+    centres, which = near.centre_m + rng.uniform(-40, 40, (300, 2)), azimuth[rng.integers(0, 60, 300)]
+    for half in (8.0, 2.0):
+        low, high = near.horizon_bounds_rad(centres, np.array(half), which)
+        inside = centres[:, None] + rng.uniform(-half, half, (300, 20, 2))
+        horizon = shackleton.horizon_rad(inside, which[:, None])
+        assert np.all(low[:, None] - 1e-9 <= horizon)
+        assert np.all(horizon <= high[:, None] + 1e-9)
+        assert np.median(high - low) < np.radians(0.03 * half)
+
+
+@pytest.mark.parametrize("sigma_rad", [0.0, 0.001])
+def test_the_vicinity_scores_places_as_all_rays_do(shackleton, sigma_rad):
+    rng = np.random.default_rng(2)
+    place = np.array([-80.0, 30.0])
+    evidence = seen_from(shackleton, place, rng, 3000, sigma_rad)
+    sectors = Sectors.of(evidence, np.radians(1.5), 1e-4)
+    about = Vicinity.of(sectors, Profile.of(sectors), shackleton, place, 40.0)
+    places = place + rng.uniform(-35, 35, (50, 2))
+    exact = scores(places, evidence, sectors, shackleton)
+    found = about.scores(places)
+    assert np.median(np.abs(found - exact)) < (0.05 if sigma_rad else 1e-6)  # a ray may flip at a hard edge
+    plain = replace(about, ground=replace(shackleton, use_compiled=False).near(place, 40.0, about.azimuth_rad))
+    assert np.median(np.abs(plain.scores(places) - found)) < 0.05  # rough azimuths are traced there
+    top, best = about.climbed(place, 16.0, 0.5)
+    assert best >= found.max() - 5
+    assert np.allclose(plain.climbed(place, 16.0, 0.5)[0], top, atol=1.0)
+
+
+@pytest.mark.parametrize("sigma_rad", [0.0, 0.001])
+def test_posterior_on_ground_equals_a_plain_grid(shackleton, sigma_rad):
+    rng = np.random.default_rng(3)
+    place = np.array([120.0, 60.0])
+    evidence = seen_from(shackleton, place, rng, 1500, sigma_rad)
+    method = ExactPosterior(boxes_per_sigma=3.0)
+    fix = method(evidence, shackleton)
+    step = float(np.sqrt(np.linalg.eigvalsh(fix.covariance_m2)[0])) / 3
+    reach = 4.5 * float(np.sqrt(np.linalg.eigvalsh(fix.covariance_m2)[1]))
+    line = np.arange(-reach, reach, step)
+    grid = fix.position_enu_m[:2] + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    sectors = Sectors.of(evidence, method.sector_width_rad, method.sector_epsilon)
+    log = np.concatenate([scores(some, evidence, sectors, shackleton) for some in np.array_split(grid, 8)])
+    weight = np.exp(log - log.max())
+    weight /= weight.sum()
+    mean = weight @ grid
+    spread = np.einsum("n,ni,nj->ij", weight, grid - mean, grid - mean)
+    sigma = np.sqrt(np.trace(spread))
+    assert np.linalg.norm(fix.position_enu_m[:2] - mean) < 0.1 * sigma
+    assert fix.covariance_m2 == pytest.approx(spread, abs=0.12 * sigma**2)
+    assert fix.dropped_mass < 1e-3
+
+
+def test_a_common_error_found_is_told_and_not_taken_for_a_wrong_map(shackleton):
+    rng, error = np.random.default_rng(4), np.radians(0.08)
+    unsure = replace(shackleton, horizon_sigma_common_rad=np.radians(0.1))
+    evidence = raised(seen_from(shackleton, np.array([50.0, -90.0]), rng, 4000, 0.0), -error)
+    fix = ExactPosterior()(evidence, unsure)
+    assert fix.horizon_error_rad == pytest.approx(error, abs=np.radians(0.02))
+    check_consistency(evidence, fix, unsure)
+
+
+def test_a_sky_turned_by_a_wrong_clock_shows(shackleton):
+    rng = np.random.default_rng(5)
+    place = np.array([50.0, -90.0])
+    evidence = seen_from(shackleton, place, rng, 12_000, 0.0)
+    for turn, refused in ((0.0, False), (np.radians(1.1), True)):
+        turned = replace(evidence, azimuth_rad=np.mod(evidence.azimuth_rad + turn, 2 * np.pi))
+        sectors = Sectors.of(turned, np.radians(1.5), 1e-4)
+        found, gain = turn_of_sky(sectors, Profile.of(sectors), place, shackleton)
+        if refused:
+            assert gain > 5
+            assert found == pytest.approx(-turn, abs=np.radians(0.6))
+        else:
+            assert gain < 2

@@ -27,7 +27,7 @@ BOXES_AT_ONCE = 2000
 CONTRADICTED_NATS = -3.0  # mean over the sectors at the best place; -0.5 is usual, and -9.2 the worst
 CLOSEST_NODES_M, FIRST_NODES_M = 10.0, 12.0  # between traced points; half side of the first boxes worth it
 WORTH_NODES = 12.0  # horizons traced per open (box, ray) pair, that the levels to come would cost anyhow
-MANY_PAIRS = 200_000
+MANY_PAIRS = 200_000  # open ones: horizons at the boxes' middles would cost more than they can tell
 MOST_PAIRS_NEAR = 0.97  # so many of them within the points; the others are traced as before
 LOOKED_UP_RAD = np.radians(0.26)  # height maps look up what is as wide as that, and trace what is narrower
 LOUDNESS = ((4.0, np.inf), (2.0, 4.0), (1.0, 2.0), (0.0, 1.0))  # |llr| of rays that are asked in turns
@@ -179,9 +179,7 @@ class _Search:
     def refine(self, boxes: RayBoxes) -> RayBoxes:
         """Quartered until small against the posterior's spread."""
         while True:
-            if (
-                len(boxes.ray) > MANY_PAIRS and 4 * len(boxes) <= self.method.most_boxes
-            ):  # horizons at the middles would cost more than they can tell
+            if len(boxes.ray) > MANY_PAIRS and 4 * len(boxes) <= self.method.most_boxes:
                 boxes = boxes.take(self._promising(boxes))
                 boxes = self._asked_in_turns(boxes.handed_down(self.terrain))
                 continue

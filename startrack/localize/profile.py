@@ -11,6 +11,7 @@ from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Evidence, Ints
 
 CERTAIN_SIGMAS = 6.0
+ROUNDING = 1e-9  # of the keys
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,8 @@ class Profile:
         middle = (2 * np.arange(count) + 1) * np.pi / count
         boxes = centres_m[:, None, :]
         low, high = terrain.horizon_bounds_rad(boxes, np.array(half_m), middle, np.pi / count)
-        margin = leeway_rad + CERTAIN_SIGMAS * np.hypot(self.sigma_rad, terrain.horizon_sigma_rad(boxes, middle))
+        map_sigma = terrain.most_sigma_rad(boxes, half_m, middle, np.pi / count)
+        margin = leeway_rad + CERTAIN_SIGMAS * np.hypot(self.sigma_rad, map_sigma)
         step = SECTOR_STEP * np.arange(count)
         first = np.searchsorted(self.key, (low - margin + step).ravel(), side="left")
         last = np.searchsorted(self.key, (high + margin + step).ravel(), side="right")
@@ -76,11 +78,11 @@ class Profile:
     def handed_down(self, whole: Profile, first: Ints, last: Ints) -> tuple[Ints, Ints]:
         """Open rays (n, sectors x parts) by those that `whole`, the same rays with one part a sector, left open."""
         ends = []
-        for number in (first, last):
-            # Elevations as they are, so that a ray's key comes out the same to the last digit.
-            elevation = np.append(whole.evidence.elevation_rad, 0.0)[number]
-            lowest = np.where(number < whole.ends, elevation, 0.5 * SECTOR_STEP)  # of the rays from this one on
-            wanted = np.repeat(lowest, self.parts, axis=1) + SECTOR_STEP * np.arange(len(self.ends))
+        for number, leeway in ((first, -ROUNDING), (last, ROUNDING)):  # rather one ray more left open
+            sector = np.arange(len(whole.ends))
+            key = np.append(whole.key, np.inf)[number] - SECTOR_STEP * sector
+            lowest = np.where(number < whole.ends, key, 0.5 * SECTOR_STEP)  # of the rays from this one on
+            wanted = np.repeat(lowest + leeway, self.parts, axis=1) + SECTOR_STEP * np.arange(len(self.ends))
             ends.append(np.searchsorted(self.key, wanted.ravel(), side="left").reshape(wanted.shape))
         return ends[0], ends[1]
 
@@ -92,7 +94,8 @@ class Profile:
         count = len(self.ends)
         middle, centres = (2 * part + 1) * np.pi / count, centres_m[box]
         low, high = terrain.horizon_bounds_rad(centres, np.array(half_m), middle, np.pi / count)
-        margin = CERTAIN_SIGMAS * np.hypot(self.sigma_rad[part], terrain.horizon_sigma_rad(centres, middle))
+        map_sigma = terrain.most_sigma_rad(centres, half_m, middle, np.pi / count)
+        margin = CERTAIN_SIGMAS * np.hypot(self.sigma_rad[part], map_sigma)
         at_least = np.searchsorted(self.key, low - margin + SECTOR_STEP * part, side="left")
         at_most = np.searchsorted(self.key, high + margin + SECTOR_STEP * part, side="right")
         first, last = first.copy(), last.copy()
@@ -109,7 +112,11 @@ class Profile:
         )
 
     def _by_sector(self, of_parts: Array) -> Array:
-        return of_parts if self.parts == 1 else of_parts.reshape(len(of_parts), -1, self.parts).sum(axis=-1)
+        return (
+            of_parts
+            if self.parts == 1
+            else of_parts.reshape(len(of_parts), of_parts.shape[1] // self.parts, self.parts).sum(axis=-1)
+        )
 
     def pairs(self, first: Ints, last: Ints) -> tuple[Ints, Ints]:
         """Every open (box, ray) pair (m,), (m,)."""

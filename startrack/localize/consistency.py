@@ -31,6 +31,7 @@ TELLING_LLR = 0.3
 STRETCH_GAIN_NATS = 4.5  # a true map gains more in 1 of 370; of 240 images with maps 1 % off the least gain was 7.6
 STRETCH_SIGMAS = 3.0  # of what the terrain file itself admits
 TURN_GAIN_NATS = 5.0  # of 80 true frames the largest gain was 4.1; of 30 with a clock an hour off half gain more than 5
+TURN_SIGMA_RAD = np.radians(0.02)  # errors of a map go together from azimuth to azimuth, and fit chance turns as well
 
 Sure = tuple[Evidence, Array]
 
@@ -71,7 +72,8 @@ def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain, compiled: 
         )
     if not isinstance(terrain, Cylinder):  # there a turned sky only turns the place
         turn, gain = turn_of_sky(sectors, profile, fix.position_enu_m[:2], terrain)
-        if gain > TURN_GAIN_NATS:
+        sigma = float(np.median(terrain.horizon_sigma_rad(fix.position_enu_m[None, :2], sure[0].azimuth_rad)))
+        if gain > TURN_GAIN_NATS * (1 + sigma / TURN_SIGMA_RAD):
             raise NotLocated(
                 f"a sky turned by {np.degrees(turn):+.1f} degrees about the vertical would fit the terrain better: "
                 "is the time right? (an hour on the Moon is 0.55 degrees)",

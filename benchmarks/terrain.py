@@ -30,6 +30,7 @@ from startrack.terrain.dem import HeightTerrain
 from startrack.types import Evidence, Fix, NoSolution
 
 NOISE_M, BIAS_RAD, SLOPE_RAD = 5.0, np.radians(0.08), np.radians(15.0)
+SLOPE_ERROR_RAD = np.radians(6.0)  # errors of 5 m at posts 240 m apart tilt the ground by 1.7 degrees (s.d.)
 
 
 def main() -> None:
@@ -79,7 +80,10 @@ def degraded(terrain: HeightTerrain, seed: int) -> HeightTerrain:
         replace(m, heights_m=(m.heights_m + rng.normal(0.0, NOISE_M, m.heights_m.shape)).astype(np.float32))
         for m in terrain.maps
     ]
-    return fresh(terrain, maps=tuple(maps), height_sigma_m=NOISE_M, horizon_sigma_common_rad=BIAS_RAD)
+    return fresh(
+        terrain, maps=tuple(maps), height_sigma_m=NOISE_M, horizon_sigma_common_rad=BIAS_RAD,
+        most_slope_rad=SLOPE_RAD + SLOPE_ERROR_RAD,
+    )  # fmt: skip
 
 
 def kept(folder: Path | None, terrain: HeightTerrain, seed: int, number: int) -> tuple[Evidence, np.ndarray]:

@@ -11,10 +11,12 @@ from startrack.calibrate.frame import Frame
 from startrack.calibrate.matching import Matched, match_frame
 from startrack.calibrate.observations import Observations
 from startrack.camera import Camera
+from startrack.identify.match import taken
 from startrack.types import Array, Ints, NotIdentified
 
 STEP_RAD = np.radians(8.0)
 FIRST_GATE_PX = 6.0
+BRIGHTEST = 1000  # hot pixels may outnumber the bright stars
 GATES_PX = (4.0, 3.0, 2.0)
 LAST_GATE = 4.5  # times the residuals' sigma
 NARROWEST_GATE_PX = 0.8
@@ -38,8 +40,11 @@ class Joint:
 def grown(frame: Frame, camera: Camera, R_cam_icrs: Array, star: Ints, detection: Ints) -> tuple[Camera, Array]:
     """Camera and attitude of one frame, from the given matches outwards, ring by ring to the edge of the frame.
 
+    By its bright sources: among all of them a gate this wide would find a wrong star as often as the right one.
     Raises NotIdentified where too few stars agree.
     """
+    frame = replace(frame, detections=taken(frame.detections, slice(BRIGHTEST)))
+    star, detection = star[detection < BRIGHTEST], detection[detection < BRIGHTEST]
     rays = frame.sky.stars.rays_icrs[star] @ R_cam_icrs.T
     known = _outer(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
     fit = _fit((frame,), (_pairs(detection, star),), camera, R_cam_icrs[None], order=_order(known, len(star)))

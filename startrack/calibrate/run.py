@@ -20,6 +20,7 @@ from startrack.identify import Identifier
 from startrack.types import Array, BadInput, Exposure, Identification, NoSolution, NotIdentified
 
 WIDE_FIELD_RAD = np.radians(100.0)  # from here up a field of view is that of the image circle
+BRIGHTEST_NAMED = 100  # the inner half of them is what a fit grows from
 Progress = Callable[[str], None]
 
 
@@ -188,14 +189,21 @@ def _field_rad(camera: Camera | None) -> float:
 
 
 def by_camera(camera: Camera, frame: Frame) -> tuple[Camera, Identification]:
-    """The stars that an approximate camera, or its mirror image, names. Raises NotIdentified."""
+    """The bright stars that an approximate camera, or its mirror image, names. Raises NotIdentified."""
     identifier = Identifier(whole_field=False)
     try:
-        return camera, identifier(frame.detections, camera, frame.sky.stars)
+        found = identifier(frame.detections, camera, frame.sky.stars)
     except NotIdentified as cause:
         if cause.reason != "mirrored":
             raise
-    return opposite(camera), identifier(frame.detections, opposite(camera), frame.sky.stars)
+        camera = opposite(camera)
+        found = identifier(frame.detections, camera, frame.sky.stars)
+    # Where the lens is pixels off, faint stars take their neighbours' names, most of all far off the axis. Detections
+    # are sorted by brightness.
+    bright = np.argsort(found.detection)[:BRIGHTEST_NAMED]
+    angle = camera.angle_rad(frame.detections.xy_px[found.detection[bright]])
+    sure = np.sort(bright[angle <= np.median(angle)])
+    return camera, replace(found, detection=found.detection[sure], star=found.star[sure])
 
 
 def _together(run: _Run) -> Joint:

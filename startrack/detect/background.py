@@ -17,7 +17,7 @@ STEEP_PART = 0.03  # of the blocks
 FEW_STEPS = 1.0  # noise in units of the smallest step below which the pixels hold too few values for quantiles
 LOW, HIGH = 0.05, 0.65  # quantiles between which pixels tell the noise
 COARSE_PX = 4  # the local level is a mean over squares of this side
-CLIPPED_SIGMA = np.float32(2.5)
+CLIPPED_SIGMA = 2.5
 Image = NDArray[np.float32]
 
 
@@ -57,7 +57,9 @@ def local_level(standardised: Image, width_px: int) -> Image:
     Boxes are made of whole squares of COARSE_PX, which costs a third of the time and no more than their coarseness.
     """
     height, width = standardised.shape
-    clipped = standardised * (np.abs(standardised) < CLIPPED_SIGMA)  # not the nearest value: stars are all on one side
+    # To zero, not to the nearest value: stars are all on one side.
+    _, clipped = cv2.threshold(standardised, CLIPPED_SIGMA, 0.0, cv2.THRESH_TOZERO_INV)
+    cv2.threshold(clipped, -CLIPPED_SIGMA, 0.0, cv2.THRESH_TOZERO, dst=clipped)
     small = -(-width // COARSE_PX), -(-height // COARSE_PX)
     below, right = -height % COARSE_PX, -width % COARSE_PX
     if below or right:

@@ -73,19 +73,17 @@ def bright_pixels(frame: Frame, lowest: float, most: int, margin: int) -> Ints:
     height, width = frame.shape
     found, level = [], []
     for top in range(margin, height - margin, STRIP_ROWS):
-        end = min(top + STRIP_ROWS, height - margin)
-        strip = frame.standardised(slice(top - 1, end + 1))
-        row, column = np.divmod(np.flatnonzero(strip[1:-1] > np.float32(lowest)), width)
+        rows = slice(top, min(top + STRIP_ROWS, height - margin))
+        limit = cv2.scaleAdd(frame.noise[rows], lowest, frame.background[rows])
+        row, column = np.divmod(np.flatnonzero(frame.image[rows] > limit), width)
         inside = (column >= margin) & (column < width - margin)
-        row, column = row[inside] + 1, column[inside]
-        own = strip[row, column]
-        highest = np.ones(len(row), dtype=bool)
-        for down, right in AROUND:
-            highest &= own >= strip[row + down, column + right]
-        beside = np.maximum(strip[row, column - 1], strip[row, column + 1])
-        beside = np.maximum(beside, np.maximum(strip[row - 1, column], strip[row + 1, column]))
+        pixels = np.stack([column, row + top], axis=1)[inside]
+        light = frame.data(pixels, 1) / frame.noise[pixels[:, 1], pixels[:, 0], None, None]
+        own = light[:, 1, 1]
+        highest = (own[:, None, None] >= light).all(axis=(1, 2))
+        beside = np.maximum(light[:, 1, ::2].max(axis=1), light[:, ::2, 1].max(axis=1))
         highest &= beside > np.float32(ONE_PIXEL_PART) * own
-        found.append(np.stack([column, row + top - 1], axis=1)[highest])
+        found.append(pixels[highest])
         level.append(own[highest])
     pixels = np.concatenate(found) if found else np.zeros((0, 2), dtype=np.int64)
     if not len(pixels):
@@ -106,7 +104,8 @@ def _strip_peaks(
     first = max(rows.start - pad, 0)
     standardised = frame.standardised(slice(first, rows.stop + pad))
     level = local_level(standardised, width)
-    filtered = cv2.sepFilter2D(standardised - level, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT)
+    above = cv2.subtract(standardised, level, dst=standardised)
+    filtered = cv2.sepFilter2D(above, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT)
     own = filtered[rows.start - first : rows.stop - first]
     row, column = np.divmod(np.flatnonzero(own > np.float32(lowest)), own.shape[1])
     row += rows.start

@@ -137,7 +137,7 @@ def _may_count(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float
     return np.asarray(fits.flux[other] * top * wing > 0.3 * NEIGHBOUR_SIGMA * noise)
 
 
-def own_light(centres: Ints, fits: PointFits, sigma: float, radius: int) -> Pixels:
+def own_light(centres: Ints, fits: PointFits, sigma: float | Array, radius: int) -> Pixels:
     """Light (n, s, s) of each source in its own stamp."""
     offset = fits.xy_px - centres
     px, _ = pixel_profile_single(offset[:, 0], sigma, radius)

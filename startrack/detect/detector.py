@@ -9,6 +9,7 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.detect.background import background_and_noise, block_side, quantum_of
 from startrack.detect.binned import any_dead, binned, in_pixels, peaks_in_pixels, pixels_together
+from startrack.detect.clipped import wider_where_clipped
 from startrack.detect.crowded import Fitted, fit_all, painted
 from startrack.detect.fit import ROUNDS_AGAIN, PointFits, Stamps, fit_points
 from startrack.detect.frame import Frame, Image, LightNoise, electrons, radius_for
@@ -126,9 +127,10 @@ class Detector:
 
     def _stars(self, frame: Frame, fitted: Fitted, side: int, sigma: float) -> PointFits:
         """The point sources among the candidates, in a frame's small one, brightest first."""
+        fitted, width_px = wider_where_clipped(fitted, sigma / side)
         fits = fitted.fits
         threshold = threshold_for(self.threshold_snr, sigma / side, skewness_of(frame) / side)
-        good = stars_among(fitted, sigma / side, threshold)
+        good = stars_among(fitted, width_px, threshold)
         good = good[one_per_place(fits.xy_px[good], fits.flux[good], 1.2 * sigma / side)]
         stars = fits.take(good[np.argsort(-fits.flux[good], kind="stable")])
         clear = not_beside(stars.xy_px, stars.flux, height_of(stars), sigma / side, threshold)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from startrack.detect.clipped import are_clipped
 from startrack.detect.crowded import Fitted, own_light
 from startrack.detect.fit import PointFits, Stamps
 from startrack.detect.frame import Frame, LightNoise
@@ -23,12 +24,13 @@ EDGE_MARGIN = 8.0  # chi^2 by which an edge must explain a stamp better: noise a
 BAD_FIT_CHI2_PER_DOF = 4.0
 ROUGH_PSF_MISFIT = 0.06  # from here up the frame's own stars, not the Gaussian, say what a star looks like
 ROUGH_PSF_SPREAD = 2.0  # times the typical misfit that a star of such a frame may have
+CLIPPED_MISFIT = 0.2  # of a star that shows only its wings, which are the least Gaussian
 LARGEST_SIGMA_PX = 2.0  # of the place
 WING_SIGMAS, WING_BRIGHTER, WING_HEIGHT = 3.0, 2.0, 1.4  # where a brighter one is, this much brighter, more is asked
 
 
-def stars_among(fitted: Fitted, sigma: float, threshold: float) -> Ints:
-    """Indices (k,) of the candidates that are point sources, and stand out by the threshold [sigma].
+def stars_among(fitted: Fitted, width_px: Array, threshold: float) -> Ints:
+    """Indices (k,) of the candidates, fitted with widths (n,), that are point sources and stand out by the threshold.
 
     Where the bright sources of the frame all differ from the Gaussian (trails, coma, a real lens), no bright star would
     pass by its chi^2; there a source passes whose misfit is like theirs.
@@ -39,12 +41,13 @@ def stars_among(fitted: Fitted, sigma: float, threshold: float) -> Ints:
     left = np.flatnonzero(stands_out & placed & (fits.chi2 < fits.chi2_pixel))
     if not len(left):
         return left
-    misfit, edge = _likeness(fitted.stamps.part(left), fits.take(left), sigma, fitted.light_noise)
+    misfit, edge = _likeness(fitted.stamps.part(left), fits.take(left), width_px[left], fitted.light_noise)
     unlike_an_edge = fits.chi2[left] < edge + EDGE_MARGIN
     bright = fits.flux[left] > BRIGHT_SNR * np.sqrt(fits.covariance[left, 2, 2])
     typical = _typical(misfit[unlike_an_edge & bright])
     good_fit = fits.chi2[left] < BAD_FIT_CHI2_PER_DOF * fits.dof[left]
-    return left[unlike_an_edge & (good_fit | (misfit < typical))]
+    allowed = np.where(are_clipped(fitted.stamps.part(left)), max(typical, CLIPPED_MISFIT), typical)
+    return left[unlike_an_edge & (good_fit | (misfit < allowed))]
 
 
 def one_per_place(xy_px: Array, flux: Array, closer_px: float) -> Bools:
@@ -117,13 +120,13 @@ def _typical(misfit: Array) -> float:
     return ROUGH_PSF_SPREAD * typical if typical > ROUGH_PSF_MISFIT else 0.0
 
 
-def _likeness(s: Stamps, fits: PointFits, sigma: float, own: LightNoise) -> tuple[Array, Array]:
+def _likeness(s: Stamps, fits: PointFits, width_px: Array, own: LightNoise) -> tuple[Array, Array]:
     """How far the sources (n) are from the Gaussian PSF, and their chi^2 as straight edges or lines instead.
 
     The first is the root of the squared residual beyond the noise over the squared light: 0 for a perfect star, about
     0.6 for a single bright pixel.
     """
-    light = own_light(s.centres, fits, sigma, s.data.shape[1] // 2)
+    light = own_light(s.centres, fits, width_px, s.data.shape[1] // 2)
     noise = s.variance + np.float32(own.per_unit) * light
     excess = np.square(s.data - light - fits.level[:, None, None].astype(np.float32)) - noise
     weights = 1.0 / (noise + np.square(np.float32(own.model_error) * light))

@@ -1,4 +1,4 @@
-"""Attitude from matched rays: the optimal rotation with its covariance."""
+"""Attitude from matched rays: the optimal rotation with its covariance, the lens's own errors included."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.camera.uncertainty import lens_jacobian
 from startrack.types import Array, Attitude, Bools, NotIdentified
 
 CHI2_2DOF_MEDIAN = 1.3863
@@ -56,8 +57,9 @@ def solve_attitude(
     """Attitude minimising the normalised distance of measured (n, 2) from predicted pixels, outliers rejected.
 
     Gauss-Newton from `R_cam_icrs` with the stars' centroid covariances (n, 2, 2); an error common to all stars (blends,
-    lens, catalogue) is estimated from the scatter and added to every centroid, so that the covariance is honest.
-    Raises NotIdentified with fewer than 3 stars left.
+    lens, catalogue) is estimated from the scatter and added to every centroid, so that the covariance is honest. What
+    the camera's own covariance leaves open of the lens turns all stars alike, so that no scatter shows it: it is added
+    to the attitude's. Raises NotIdentified with fewer than 3 stars left.
     """
     R = np.array(R_cam_icrs)
     n = len(xy_px)
@@ -73,17 +75,19 @@ def solve_attitude(
         if used.sum() < 3:
             raise NotIdentified("fewer than 3 stars agree on an attitude", matched=int(used.sum()))
         jacobian = camera.jacobian_px_per_rad(rays_cam)[used]
-        w, r = _robust(weight, chi2)[used], residual[used]
+        w, r = tapered(weight, chi2)[used], residual[used]
         normal = np.einsum("nia,nij,njb->ab", jacobian, w, jacobian)
         turn = np.linalg.solve(normal, np.einsum("nia,nij,nj->a", jacobian, w, r))
         R = rotation(turn) @ R
-        new_extra = _extra_variance(residual, covariance_px2)
+        new_extra = extra_variance_px2(residual, covariance_px2)
         settled = np.linalg.norm(turn) < 1e-9 and abs(new_extra - extra) <= 1e-3 * new_extra
         extra = new_extra
         if settled:
             break
+    by_stars = _covariance(jacobian, weight[used], w, r)
+    by_lens = _covariance_by_lens(camera, rays_cam[used], jacobian, w)
     return AttitudeFit(
-        attitude=Attitude(R_cam_icrs=R, covariance_rad2=_covariance(jacobian, weight[used], w, r)),
+        attitude=Attitude(R_cam_icrs=R, covariance_rad2=by_stars + by_lens),
         residual_px=residual,
         used=used,
         rms_px=float(np.sqrt(np.mean(residual[used] ** 2))),
@@ -107,13 +111,31 @@ def _covariance(jacobian: Array, weight: Array, tapered: Array, residual: Array)
     return stated * max(1.0, float(np.trace(seen) / np.trace(stated)))
 
 
-def _robust(weight: Array, chi2: Array) -> Array:
+def _covariance_by_lens(camera: Camera, rays_cam: Array, jacobian: Array, weight: Array) -> Array:
+    """Covariance (3, 3) of the turn with which the attitude answers an error of the lens; 0 where that is not known.
+
+    For a lens that was fitted to these very stars this makes the marginal of the joint fit, if the camera's covariance
+    is its marginal too (the inverse of a matrix in blocks).
+    """
+    if camera.covariance is None:
+        return np.zeros((3, 3))
+    lens = lens_jacobian(camera, rays_cam, camera.covariance_order)
+    turned = np.linalg.solve(
+        np.einsum("nia,nij,njb->ab", jacobian, weight, jacobian), np.einsum("nia,nij,njm->am", jacobian, weight, lens)
+    )
+    return np.asarray(turned @ camera.covariance @ turned.T)
+
+
+def tapered(weight: Array, chi2: Array) -> Array:
     """Weights (n, 2, 2) with Huber's taper beyond 2.5 sigma: what is not quite an outlier does not pull."""
     return weight * np.minimum(1.0, 2.5 / np.sqrt(np.maximum(chi2, 1e-12)))[:, None, None]
 
 
-def _extra_variance(residual_px: Array, covariance_px2: Array) -> float:
-    """Variance per axis [px^2] to add to every centroid so that the median normalised residual is as expected."""
+def extra_variance_px2(residual_px: Array, covariance_px2: Array, parameters: int = 3) -> float:
+    """Variance per axis [px^2] to add to every centroid so that the median normalised residual is as expected.
+
+    `parameters`: of the fit that left the residuals.
+    """
 
     axes_px2, axes = np.linalg.eigh(covariance_px2)
     squared = np.square(np.einsum("nij,ni->nj", axes, residual_px))
@@ -121,8 +143,8 @@ def _extra_variance(residual_px: Array, covariance_px2: Array) -> float:
     def median_chi2(extra: float) -> float:
         return float(np.median(np.sum(squared / (axes_px2 + extra), axis=1)))
 
-    # The fit has already taken its three parameters' share out of the residuals.
-    expected = CHI2_2DOF_MEDIAN * (1.0 - 1.5 / len(residual_px))
+    # The fit has already taken its parameters' share out of the residuals.
+    expected = CHI2_2DOF_MEDIAN * max(1.0 - 0.5 * parameters / len(residual_px), 0.1)
     low, high = 1e-6, 1.0
     if median_chi2(low) <= expected:
         return low

@@ -21,6 +21,7 @@ from startrack.frames import angle_between_rad
 from startrack.identify.blind import BlindSolution, identify_blind
 from startrack.identify.family import EQUIDISTANT, EQUISOLID, ORTHOGRAPHIC, STEREOGRAPHIC, Family
 from startrack.identify.skymap import sky_map
+from startrack.orient import solve_attitude
 from startrack.pipeline import identify_blind as identify_picture
 from startrack.types import Detections, NotIdentified, Stars
 
@@ -233,3 +234,21 @@ def test_the_map_of_the_sky_is_that_of_a_search() -> None:
     clear = np.abs(angle - np.radians(1.5)) > np.radians(0.6)  # cells are three quarters of a degree
     assert np.array_equal(near(asked)[clear], angle[clear] < np.radians(1.5))
     assert near.covered == pytest.approx(400 * (1 - np.cos(np.radians(1.5))) / 2, rel=0.08)
+
+
+@pytest.mark.parametrize(("name", "lists"), [("equisolid, mirrored", 30), ("70 degrees", 12), ("20 degrees", 12)])
+def test_the_attitude_is_as_sure_as_it_says_though_the_lens_comes_from_the_same_stars(name: str, lists: int) -> None:
+    camera, picture_of, fov = LENSES[name]
+    nees = []
+    for seed in range(100, 100 + lists):
+        seen, _, R = picture(camera, seed, **picture_of)
+        found = identify_blind(seen, camera.size_px, np.radians(fov), sky())
+        named = found.identification
+        attitude = solve_attitude(
+            found.camera, seen.xy_px[named.detection], seen.covariance_px2[named.detection],
+            sky().rays_icrs[named.star], named.R_cam_icrs,
+        ).attitude  # fmt: skip
+        w = Rotation.from_matrix(R @ attitude.R_cam_icrs.T).as_rotvec()
+        nees.append(w @ np.linalg.solve(attitude.covariance_rad2, w))
+    assert abs(np.mean(nees) - 3.0) < 3.5 * np.sqrt(6.0 / lists)
+    assert max(nees) < 25

@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from startrack.calibrate import first_state, fit_lens, observations
-from startrack.calibrate.solve import moved, project_freely
+from startrack.calibrate.solve import project_freely
 from startrack.camera import Camera, Decentring, KannalaBrandt, camera_from_dict, camera_to_dict
+from startrack.camera.parameters import moved
 from startrack.camera.uncertainty import lens_jacobian
 from startrack.types import NotIdentified
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera, KannalaBrandt, Pinhole
+from startrack.camera.parameters import moved
 from startrack.orient import AttitudeFit, rotation, solve_attitude, wahba
 from startrack.types import NotIdentified
 
@@ -188,3 +191,24 @@ def test_fewer_than_three_stars_is_refused() -> None:
         solve_attitude(FISHEYE, xy, covariance, rays, R)
     assert caught.value.reason == "not_identified"
     assert caught.value.evidence["matched"] == 2
+
+
+def test_an_error_of_the_lens_that_the_camera_file_states_is_in_the_covariance() -> None:
+    """Lenses drawn from the file's covariance: the scatter of the stars' places shows nothing of their turn."""
+    order = ("fx", "fy", "cx", "cy", "k1")
+    spread = np.diag([0.5, 0.5, 1.0, 1.0, 2e-4]) @ np.array(
+        [[1, 0.999, 0, 0, -0.9], [0.999, 1, 0, 0, -0.9], [0, 0, 1, 0.2, 0], [0, 0, 0.2, 1, 0], [-0.9, -0.9, 0, 0, 1]]
+    )
+    covariance = spread @ np.diag([0.5, 0.5, 1.0, 1.0, 2e-4])
+    nees, blind = [], []
+    for seed in range(60):
+        rng = np.random.default_rng([seed, 11])
+        xy, centroids, rays, R = drawn(FISHEYE, 150, rng)
+        error = dict(zip(order, rng.multivariate_normal(np.zeros(5), covariance), strict=True))
+        stated = replace(moved(FISHEYE, error), covariance_order=order, covariance=covariance)
+        for camera, found in ((stated, nees), (replace(stated, covariance=None), blind)):
+            attitude = solve_attitude(camera, xy, centroids, rays, R).attitude
+            w = Rotation.from_matrix(R @ attitude.R_cam_icrs.T).as_rotvec()
+            found.append(w @ np.linalg.solve(attitude.covariance_rad2, w))
+    assert 2.2 < np.mean(nees) < 4.0  # 3 expected, 0.32 its spread
+    assert np.mean(blind) > 100

@@ -11,8 +11,8 @@ from startrack.calibrate.models import MOST_ORDERS, Candidate, Model, best_model
 from startrack.calibrate.observations import Observations
 from startrack.calibrate.reach import reach_rad
 from startrack.calibrate.solve import Solution, State, mean_scatter_px2, scatter_px2, solve
-from startrack.calibrate.written import written
 from startrack.camera import Camera
+from startrack.camera.parameters import written
 from startrack.types import Array, Bools, NotIdentified
 
 FEWEST = 12

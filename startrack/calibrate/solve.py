@@ -9,7 +9,8 @@ import numpy as np
 
 from startrack.calibrate.normal import Normal, Terms
 from startrack.calibrate.observations import Observations
-from startrack.camera import Camera, Decentring, KannalaBrandt
+from startrack.camera import Camera
+from startrack.camera.parameters import moved
 from startrack.orient import rotation
 from startrack.types import Array
 
@@ -58,23 +59,6 @@ def project_freely(camera: Camera, rays_cam: Array) -> Array:
         uv = uv + camera.decentring.shift((angle * per_off_axis)[:, None] * rays_cam[:, :2])
     fx, fy = camera.focal_px
     return np.asarray(camera.centre_px) + np.array([-fx if camera.mirrored else fx, fy]) * uv
-
-
-def moved(camera: Camera, by: dict[str, float]) -> Camera:
-    """The camera with its parameters changed: f (both focal lengths), fx, fy, cx, cy, k1 ... k4, p1, p2."""
-    fx, fy = camera.focal_px
-    stretched = 1.0 + by.get("f", 0.0) / fx
-    focal = (float(fx * stretched + by.get("fx", 0.0)), float(fy * stretched + by.get("fy", 0.0)))
-    centre = (float(camera.centre_px[0] + by.get("cx", 0.0)), float(camera.centre_px[1] + by.get("cy", 0.0)))
-    lens = camera.lens
-    if camera.lens.model == "kannala_brandt":
-        steps = [by.get(f"k{n}", 0.0) for n in range(1, 5)]
-        order = max(len(lens.k), *(n for n in range(5) if n == 0 or f"k{n}" in by))
-        known = (*lens.k, 0.0, 0.0, 0.0, 0.0)
-        lens = KannalaBrandt(tuple(float(known[n] + steps[n]) for n in range(order)))
-    bent = camera.decentring
-    bent = Decentring(float(bent.p1 + by.get("p1", 0.0)), float(bent.p2 + by.get("p2", 0.0)))
-    return replace(camera, focal_px=focal, centre_px=centre, lens=lens, decentring=bent)
 
 
 @dataclass(frozen=True, kw_only=True)

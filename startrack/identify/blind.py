@@ -23,6 +23,7 @@ from startrack.identify.hypotheses import (
     patterns_for,
     wide_sizes,
 )
+from startrack.identify.joint import fitted_jointly
 from startrack.identify.polish import Polished, polished
 from startrack.types import Array, Detections, Identification, Ints, NotIdentified, Stars
 
@@ -61,7 +62,7 @@ TRY = "is the field of view right, is this the night sky, and in focus? With a c
 class BlindSolution:
     """The lens and the stars that it was found with."""
 
-    camera: Camera  # name "unknown"; calibrated as far out as its stars reach
+    camera: Camera  # name "unknown"; calibrated as far out as its stars reach; with the covariance of its fit
     identification: Identification
 
 
@@ -80,7 +81,7 @@ def identify_blind(
     for grown, around in search.grown():
         answer = polished(grown, detections, stars.take(around), search.tried, search.widest_rad)
         if answer is not None and answer.log_chance < LOG_FALSE_ALARM and answer.matched >= search.fewest:
-            return _solution(answer, around)
+            return _solution(answer, around, search, detections)
     raise NotIdentified(
         f"no lens of {np.degrees(fov_rad):.3g} degrees ({100 * tolerance:.0f} % more or less) explains the "
         f"{len(detections)} point sources better than chance ({search.tried} patterns tried): {TRY}",
@@ -97,18 +98,24 @@ def _quickly(search: _Search, detections: Detections) -> BlindSolution | None:
     for found in narrow.found():
         said = found.judged
         if said.log_chance < LOG_FALSE_ALARM and len(said.star) >= search.fewest:
-            return _solution(said, found.around)
+            return _solution(said, found.around, search, detections)
     search.hypotheses.tried += narrow.tried
     return None
 
 
-def _solution(answer: Polished | Judged, around: Ints) -> BlindSolution:
+def _solution(answer: Polished | Judged, around: Ints, search: _Search, detections: Detections) -> BlindSolution:
+    """The answer with lens and attitude fitted to all its stars together, so that the lens's errors are known."""
+    star, seen = around[answer.star], answer.detection
+    joint = fitted_jointly(
+        answer.camera, answer.R_cam_icrs, detections.xy_px[seen], detections.covariance_px2[seen],
+        search.stars.rays_icrs[star], centre=not search.narrow,
+    )  # fmt: skip
     return BlindSolution(
-        camera=answer.camera,
+        camera=joint.camera,
         identification=Identification(
-            detection=answer.detection,
-            star=around[answer.star],
-            R_cam_icrs=answer.R_cam_icrs,
+            detection=seen,
+            star=star,
+            R_cam_icrs=joint.R_cam_icrs,
             false_alarm_probability=float(np.exp(max(answer.log_chance, -690.0))),
             unexplained=answer.unexplained,
         ),

@@ -3,8 +3,9 @@
     import startrack
     print(startrack.locate("image.png"))
 
-`locate` takes a path or an array (and `startrack.api` holds `identify` and `detect`); the rooms below
-(`startrack.pipeline`, `startrack.localize`, ...) are for those who want the stages one by one.
+`locate` takes a path or an array and returns a `Solution`. Stars and attitude alone, or centroids alone, are
+`startrack.api.identify` and `startrack.api.detect`: `startrack.identify` and `startrack.detect` are two of the rooms
+(with `startrack.pipeline`, `startrack.localize`, ...) for those who want the stages one by one.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -17,13 +17,13 @@ from startrack.terrain import Terrain, load_terrain
 from startrack.types import BadInput, Exposure
 
 Picture: TypeAlias = str | os.PathLike[str] | ArrayLike | Exposure
-When: TypeAlias = Any  # text, datetime, astropy Time (not imported for a type alone), or None
+When: TypeAlias = Any  # text, datetime, datetime64, astropy Time (not imported for a type alone), or None
 
 
 def given_exposure(image: Picture, time: When) -> Exposure:
     """A file's, an array's (H, W) or (H, W, 3), or the exposure itself, at `time` where that is given.
 
-    Raises BadInput (bad_image, no_time).
+    Raises BadInput (bad_image, no_time); a mask that hides pixels is refused, for no stage could heed it.
     """
     time_utc = utc(time)
     if isinstance(image, Exposure):
@@ -31,14 +31,24 @@ def given_exposure(image: Picture, time: When) -> Exposure:
     if isinstance(image, str | os.PathLike):
         return read_exposure(image, time_utc=time_utc)
     try:
-        pixels = np.asarray(image)
+        pixels = np.asanyarray(image)  # a plain array would have lost its mask
     except (TypeError, ValueError) as cause:
         raise BadInput("bad_image", f"{type(image).__name__} is neither a file nor an array of pixels") from cause
-    return exposure_of(pixels, time_utc=time_utc)
+    masked = np.count_nonzero(getattr(pixels, "mask", False))
+    if masked:
+        raise BadInput(
+            "bad_image",
+            f"{masked} of {pixels.size} pixels are masked, and startrack cannot leave pixels out: fill them (by their "
+            "neighbours' median, say) and give the plain array",
+        )
+    return exposure_of(np.asarray(pixels), time_utc=time_utc)
 
 
 def utc(time: When) -> datetime | None:
-    """Text, datetime or astropy Time (any scale) as UTC. Raises BadInput (no_time) for anything else."""
+    """Text, datetime, numpy datetime64 (which has no zone: UTC) or astropy Time (any scale) as UTC.
+
+    Raises BadInput (no_time) for anything else.
+    """
     if time is None:
         return None
     if isinstance(time, str):
@@ -47,9 +57,11 @@ def utc(time: When) -> datetime | None:
         if time.tzinfo is None:
             raise BadInput("no_time", f"{time} has no time zone: give UTC")
         return time.astimezone(UTC)
+    if isinstance(time, np.datetime64):
+        return parse_utc(str(time))
     moment = getattr(getattr(time, "utc", None), "isot", None)
     if not isinstance(moment, str):
-        raise BadInput("no_time", f"{time!r} is no time: give text, a datetime or one astropy Time")
+        raise BadInput("no_time", f"{time!r} is no time: give text, a datetime, a datetime64 or one astropy Time")
     return parse_utc(moment)
 
 

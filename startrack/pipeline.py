@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from startrack.bodies import bodies
 from startrack.camera import Camera
+from startrack.exposure import are_fractions
 from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
 from startrack.light import deepen, first_look, second_look
 from startrack.localize import check_consistency
@@ -122,6 +123,7 @@ def detect(exposure: Exposure, camera: Camera | None, settings: Settings | None 
     """Centroids only."""
     result = Result(exposure=exposure, camera=camera)
     with _refusals(result), _timed(result, "detect"):
+        _check_counts(exposure, camera)
         result.detections = (settings or Settings()).detector(exposure, camera)
         result.status = "ok"
     return result
@@ -137,12 +139,24 @@ def _identify(result: Result, catalog: StarCatalog, settings: Settings, site: Si
             f"{camera.size_px[0]} x {camera.size_px[1]}",
         )
     with _timed(result, "detect"):
+        _check_counts(exposure, camera)
         result.detections = settings.detector(exposure, camera)
     with _timed(result, "identify"):
         _take_stars(result, catalog, site)
         assert result.stars is not None
         result.identification = settings.identifier(result.detections, camera, result.stars)
     _solve_attitude(result)
+
+
+def _check_counts(exposure: Exposure, camera: Camera | None) -> None:
+    """A camera file's levels are in counts: taken for those, fractions from 0 to 1 would all lie below the bias."""
+    stated = camera is not None and camera.sensor is not None
+    if stated and exposure.saturation_adu is None and are_fractions(exposure.pixels_adu):
+        raise BadInput(
+            "bad_image",
+            "the pixels are fractions from 0 to 1, and the camera file's gain and levels are for the sensor's counts: "
+            "give those (8- or 16-bit integers, or floating point in ADU)",
+        )
 
 
 def _take_stars(result: Result, catalog: StarCatalog, site: Site | None) -> None:

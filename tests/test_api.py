@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from astropy import units as u
 from astropy.time import Time
+from astropy.utils.masked import Masked
 
 import startrack
 import startrack.api
 from startrack.errors import BadInput
 from startrack.exposure import read_exposure
-from startrack.given import given_exposure
+from startrack.given import given_exposure, utc
 
 IMAGE = "sample_images/near-wall.png"
 LOWELL = "sample_images/lowell-2018-08-06.fits.bz2"
@@ -52,10 +55,82 @@ def test_astropy_types_at_the_edge(solution):
 
 def test_it_prints_itself(solution, tmp_path):
     assert repr(solution).startswith("near-wall.png  ok  E -690")
-    assert "<pre>" in solution._repr_html_()
+    page = ElementTree.fromstring(f"<body>{solution._repr_html_()}</body>")
+    assert [caption.text for caption in page.iter("b")] == ["Position", "Orientation"]
     path = solution.write(tmp_path, plots=False)
     assert path.name == "near-wall.fix.json"
     assert solution.to_dict()["position"]["frame"] == "enu"
+
+
+def test_the_position_has_units_and_says_how_sure_it_is(solution):
+    p, record = solution.position, solution.to_dict()["position"]
+    assert (p.east.unit, p.covariance.unit, p.latitude.unit) == (u.m, u.m**2, u.deg)
+    np.testing.assert_allclose(u.Quantity([p.east, p.north, p.up]).to_value("m"), solution.position_m)
+    assert p.latitude.deg == pytest.approx(record["latitude_deg"])
+    assert p.radius95.to_value("m") == solution.radius95_m < p.radius999.to_value("m")
+    np.testing.assert_allclose(p.sigma.to_value("m") ** 2, np.diag(solution.covariance_m2))
+    along = np.array([np.sin(p.ellipse.azimuth.rad), np.cos(p.ellipse.azimuth.rad)])
+    assert along @ solution.covariance_m2 @ along == pytest.approx(p.ellipse.semi_major.value**2)
+    assert p.ellipse.semi_minor < p.ellipse.semi_major
+    assert "east           -6901." in repr(p) and "± 3." in repr(p) and "long axis at azimuth" in repr(p)
+
+
+def test_the_attitude_is_a_rotation_and_angles(solution):
+    a, record = solution.attitude, solution.to_dict()["attitude"]
+    np.testing.assert_allclose(a.rotation.as_matrix(), solution.result.attitude.R_cam_icrs, atol=1e-12)
+    np.testing.assert_allclose(a.rotation.inv().apply([0, 0, 1]), solution.boresight.cartesian.xyz.value, atol=1e-12)
+    names = ("ra", "dec", "roll", "heading", "pitch", "roll_body")
+    assert [getattr(a, name).deg for name in names] == pytest.approx([record[f"{name}_deg"] for name in names])
+    assert a.sigma.to_value("arcsec") == pytest.approx(record["sigma_arcsec"])
+    np.testing.assert_allclose(a.body.as_quat(canonical=True), record["quat_xyzw_body_enu"], atol=1e-12)
+    assert solution.heading == a.heading
+    assert "heading           205." in repr(a)
+
+
+def test_stars_alone_give_no_heading():
+    found = startrack.api.identify(IMAGE)
+    assert found.attitude is not None and found.attitude.ra.deg == pytest.approx(87.70, abs=0.01)
+    assert found.heading is None and found.position is None
+    assert "heading" not in repr(found.attitude)
+
+
+def test_writing_replaces_what_an_earlier_result_left(solution, tmp_path):
+    stale = [tmp_path / f"near-wall{end}" for end in (".annotated.png", ".wcs", ".corr", ".stars.ecsv")]
+    for path in stale:
+        path.write_text("of an earlier run")
+    (tmp_path / "near-wall-2.wcs").write_text("of another image")
+    solution.write(tmp_path, plots=False)
+    assert not stale[0].exists()
+    assert all(path.read_bytes() != b"of an earlier run" for path in stale[1:])
+    assert (tmp_path / "near-wall-2.wcs").read_text() == "of another image"
+    solution.write(tmp_path, plots=False)  # the same image's: renewed
+    refused = startrack.locate(read_exposure(IMAGE), time="2030-01-01T00:00:00Z")
+    refused.result.status, refused.result.light = "refused", None
+    refused.write(tmp_path, plots=False)
+    assert [path.name for path in sorted(tmp_path.iterdir())] == ["near-wall-2.wcs", "near-wall.fix.json"]
+
+
+def test_a_result_of_another_image_is_kept_unless_asked(tmp_path):
+    first, second = (startrack.api.detect(np.full((64, 64), level, np.uint16)) for level in (300, 301))
+    path = first.write(tmp_path)
+    kept = path.read_bytes()
+    with pytest.raises(BadInput, match="overwrite=True"):
+        second.write(tmp_path)
+    assert path.read_bytes() == kept
+    first.write(tmp_path)
+    second.write(tmp_path, overwrite=True)
+    assert path.read_bytes() != kept
+
+
+def test_each_call_writes_the_record_of_its_kind(tmp_path):
+    small = startrack.api.identify(np.full((64, 64), 300, np.uint16), camera="fisheye-2048")
+    assert small.reason == "size_mismatch"
+    assert small.to_dict()["format"] == "startrack.identification/1"
+    assert small.write(tmp_path, plots=False).name == "array.identification.json"
+    path = startrack.api.identify(IMAGE).write(tmp_path)
+    assert sorted(p.name for p in path.parent.glob("near-wall*")) == [
+        f"near-wall{end}" for end in (".annotated.png", ".corr", ".identification.json", ".stars.ecsv", ".wcs")
+    ]
 
 
 def test_a_picture_without_stars_says_why():
@@ -70,6 +145,9 @@ def test_a_picture_without_stars_says_why():
 
 def test_what_is_missing_is_asked_for():
     pixels = np.zeros((64, 64), np.uint16)
+    timeless = startrack.locate(pixels, camera="fisheye-2048", terrain="shackleton-thesis")
+    assert timeless.reason == "no_time"
+    assert "give time=," in timeless.message and "--" not in timeless.message
     with pytest.raises(BadInput, match="camera="):
         startrack.locate(pixels)
     with pytest.raises(BadInput, match="terrain="):
@@ -90,7 +168,10 @@ def test_importing_startrack_loads_nothing_heavy():
         ({"image": np.full((64, 64), np.nan)}, "bad_image"),
         ({"image": 7}, "bad_image"),
         ({"image": [["a"]]}, "bad_image"),
+        ({"image": np.ma.masked_less(np.arange(64.0).reshape(8, 8), 5)}, "bad_image"),
         ({"image": IMAGE, "time": 2461000.5}, "no_time"),
+        ({"image": IMAGE, "time": np.datetime64("NaT")}, "no_time"),
+        ({"image": IMAGE, "time": np.datetime64("2030-01-01")}, "no_time"),
         ({"image": IMAGE, "time": Time(["2030-01-01", "2030-01-02"])}, "no_time"),
         ({"image": IMAGE, "camera": 5}, "bad_calibration"),
         ({"image": IMAGE, "terrain": 5}, "bad_terrain"),
@@ -109,10 +190,39 @@ def test_colours_lists_and_paths_are_pictures():
     assert given_exposure(Path(IMAGE), None).name == "near-wall"
 
 
+def test_a_mask_is_never_lost():
+    pixels = np.ma.array(np.arange(64, dtype=np.uint16).reshape(8, 8))
+    assert given_exposure(pixels, None).size_px == (8, 8)
+    pixels[3, 4:6] = np.ma.masked
+    with pytest.raises(BadInput, match="2 of 64 pixels are masked"):
+        given_exposure(pixels, None)
+    with pytest.raises(BadInput, match="2 of 64 pixels are masked"):
+        given_exposure(Masked(pixels.data, mask=pixels.mask), None)
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+def test_numpy_times_are_utc(unit):
+    time = np.datetime64("2029-09-08T03:12:45", unit)
+    assert utc(time) == datetime(2029, 9, 8, 3, 12, 45, tzinfo=UTC)
+
+
+def test_fractions_are_no_counts():
+    """Scaled to 0 .. 1 the sample can be identified blindly, but not with a camera file that states levels in ADU."""
+    exposure = read_exposure(IMAGE)
+    pixels = exposure.pixels_adu / np.float32(65535)
+    assert "from 0 to 1 are no sensor's counts" in given_exposure(pixels, None).warnings[0]
+    with_levels = startrack.locate(pixels, camera=exposure.camera, terrain=exposure.terrain, time=exposure.time_utc)
+    assert with_levels.reason == "bad_image" and "fractions from 0 to 1" in with_levels.message
+    assert startrack.api.identify(pixels, fov=185)
+    assert given_exposure(exposure.pixels_adu, None).warnings == ()
+
+
 def test_a_field_of_view_stands_in_for_a_camera():
     found = startrack.api.identify(LOWELL, fov=180 * u.deg)
     assert found
     assert found.result.camera is not None
     assert len(found.result.identification.star) > 1000
+    with pytest.raises(ValueError, match="exclude each other"):
+        startrack.api.identify(LOWELL, fov=180, camera="lowell-ldt")
     with pytest.raises(BadInput, match="no field of view"):
         startrack.api.identify(IMAGE, fov="wide")

@@ -50,7 +50,7 @@ def test_header_alone(image):
 
 
 def test_sidecar_goes_before_header_fact_by_fact(image, sidecar):
-    sidecar({"time_utc": "2031-03-26T20:58:11.966208Z", "camera": "fisheye-2048", "remark": "unknown keys pass"})
+    sidecar({"time_utc": "2031-03-26T20:58:11.966208Z", "camera": "fisheye-2048"})
     exposure = read_exposure(image)
     assert exposure.time_utc == MID
     assert exposure.exposure_s == 20.0
@@ -154,6 +154,18 @@ def test_a_sidecar_time_that_is_not_utc_is_no_time(image, sidecar, time):
         read_exposure(image)
     assert caught.value.reason == "no_time"
     assert len(str(caught.value)) < 500
+
+
+def test_unknown_keys_of_a_sidecar_pass_with_a_warning(image, sidecar):
+    sidecar({"exposure": 5, "Camera": "a.toml", "terrain": "b"})
+    exposure = read_exposure(image)
+    assert (exposure.exposure_s, exposure.terrain) == (20.0, "b")
+    known = "time_utc, exposure_s, camera, terrain, bayer_pattern"
+    assert exposure.warnings == tuple(
+        f"sidecar frame.json: key {key!r} is none of {known}; not used" for key in ("exposure", "Camera")
+    )
+    sidecar({f"key {k}": k for k in range(1000)})
+    assert len(read_exposure(image).warnings) < 10
 
 
 def test_null_means_not_given_and_a_byte_order_mark_is_skipped(image, sidecar):

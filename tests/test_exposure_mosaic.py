@@ -13,7 +13,7 @@ import tifffile
 import startrack
 from startrack.exposure import read_exposure, write_exposure
 from startrack.exposure.mosaic import evened
-from startrack.types import BadInput
+from startrack.types import BadInput, Exposure
 
 SAMPLE = Path(__file__).parents[1] / "sample_images" / "near-wall"
 PATTERN = (((0, 0), "R"), ((0, 1), "G"), ((1, 0), "G"), ((1, 1), "B"))
@@ -77,10 +77,17 @@ def test_saturated_pixels_stay_saturated():
     assert abs(np.median(even[0::2, 0::2]) - np.median(even[1::2, 1::2])) < 1.0
 
 
-@pytest.mark.parametrize("pattern", ["RGBW", "mono", 3])
+@pytest.mark.parametrize("pattern", ["RGBW", "RBGG", "GGRB", "mono", 3])
 def test_other_patterns_are_refused_in_a_sidecar(colours, pattern):
-    with pytest.raises(BadInput, match=r"bayer_pattern is .* not like RGGB"):
+    with pytest.raises(BadInput, match=r"bayer_pattern is .* none of RGGB, BGGR, GRBG, GBRG"):
         read_exposure(with_sidecar(colours, bayer_pattern=pattern))
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG", " grbg "])
+def test_the_four_patterns_are_taken(tmp_path, pattern):
+    write_exposure(tmp_path / "a.png", Exposure(pixels_adu=np.full((8, 8), 300.0), saturation_adu=65535.0))
+    (tmp_path / "a.json").write_text(json.dumps({"bayer_pattern": pattern}))
+    assert read_exposure(tmp_path / "a.png").warnings[0].startswith("colour mosaic")
 
 
 def test_a_tiff_mosaic_and_a_camera_raw_file_give_the_sensors_counts(tmp_path):

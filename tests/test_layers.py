@@ -24,6 +24,7 @@ LAYERS = (  # lowest first; a room imports from lower layers only
     {"light"},
     {"pipeline", "calibrate", "given"},
     {"report"},
+    {"solution"},
     {"reproduce", "batch", "page", "api"},
     {"cli"},
 )

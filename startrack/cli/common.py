@@ -177,22 +177,8 @@ def result_path(args: argparse.Namespace, stem: str, suffix: str, exposure: Expo
 
     Raises BadInput (bad_image, for lack of a better code) before anything is computed.
     """
-    from startrack.report import remove_companions
+    from startrack.report import make_way
 
     path = Path(args.dir) / f"{stem}{suffix}"
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        before = json.loads(path.read_text(encoding="utf-8")) if path.exists() and not args.overwrite else None
-    except OSError as cause:
-        raise BadInput("bad_image", f"{path}: results cannot be written there: {cause.strerror}") from cause
-    except ValueError:
-        before = {}
-    if before is not None and not _is_of(before, exposure.sha256):
-        raise BadInput("bad_image", f"{path} is not a result of this image: choose another -D, or replace it with -O")
-    remove_companions(path.parent, stem)
+    make_way(path, exposure.sha256, overwrite=args.overwrite, remedy="choose another -D, or replace it with -O")
     return path
-
-
-def _is_of(record: Any, sha256: str) -> bool:
-    provenance = record.get("provenance", {}) if isinstance(record, dict) else {}
-    return isinstance(provenance, dict) and provenance.get("image_sha256") == sha256

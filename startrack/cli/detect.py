@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     from startrack.pipeline import detect
-    from startrack.report import detection_dict, summary_line, write_annotated, write_json
+    from startrack.report import summary_line, write_results
 
     start = time.perf_counter()
     exposure = read(path, args)
@@ -38,8 +38,5 @@ def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     read_ms = 1e3 * (time.perf_counter() - start)
     result = detect(exposure, camera)
     result.timing_ms["read"] = read_ms
-    record = detection_dict(result)
-    if not args.no_plots:
-        write_annotated(out.with_name(f"{stem}.annotated.png"), result)
-    write_json(out, record)
+    record = write_results(result, out, plots=not args.no_plots)
     return Outcome(result.status, result.reason, summary_line(result, seconds=time.perf_counter() - start), record)

@@ -45,14 +45,10 @@ def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     from startrack.catalog import load_catalog
     from startrack.pipeline import identify, identify_blind
     from startrack.report import (
-        identification_dict,
         lens_text,
         summary_line,
         verbose_text,
-        write_annotated,
-        write_json,
-        write_star_table,
-        write_wcs,
+        write_results,
     )
 
     start = time.perf_counter()
@@ -65,13 +61,7 @@ def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     else:
         result = identify_blind(exposure, args.fov, load_catalog())
     result.timing_ms["read"] = read_ms
-    record = identification_dict(result)
-    if result.identification is not None:
-        write_star_table(out.with_name(f"{stem}.stars.ecsv"), result)
-        write_wcs(out.with_name(f"{stem}.wcs"), out.with_name(f"{stem}.corr"), result)
-    if not args.no_plots:
-        write_annotated(out.with_name(f"{stem}.annotated.png"), result)
-    write_json(out, record)
+    record = write_results(result, out, plots=not args.no_plots)
     line = summary_line(result, seconds=time.perf_counter() - start)
     if camera is None and result.camera is not None:
         line += (

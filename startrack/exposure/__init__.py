@@ -5,8 +5,12 @@ exposure seconds, camera and terrain come from; `write.py` is the way back. What
 sees `startrack.types.BadInput` and nothing else.
 """
 
+from startrack.exposure.decoded import are_fractions
 from startrack.exposure.facts import Facts, with_facts
 from startrack.exposure.read import exposure_of, read_exposure
 from startrack.exposure.write import write_atomically, write_exposure, write_sidecar
 
-__all__ = ["Facts", "exposure_of", "read_exposure", "with_facts", "write_atomically", "write_exposure", "write_sidecar"]
+__all__ = [
+    "Facts", "are_fractions", "exposure_of", "read_exposure", "with_facts", "write_atomically", "write_exposure",
+    "write_sidecar",
+]  # fmt: skip

@@ -17,6 +17,10 @@ MAX_PIXELS = 200_000_000  # contract: larger images are refused from their heade
 MAX_FILE_BYTES = 8 * MAX_PIXELS + 2**24  # the largest image at the widest pixel type, and its headers
 EXACT_IN_FLOAT32 = 2**24
 UPRIGHT = 1  # EXIF and TIFF orientation of an image stored as seen
+FRACTIONS_WARNING = (
+    "floating-point pixels from 0 to 1 are no sensor's counts: gain, noise and saturation are not known; give the "
+    "counts themselves (integers, or floating point in ADU)"
+)
 COLOUR_WARNING = "colour image: the plain mean of its three channels is used"
 
 
@@ -54,7 +58,8 @@ def grey_float32(stored: NDArray[Any]) -> tuple[NDArray[np.float32], tuple[str, 
     """Pixels (H, W) as float32 [ADU], with warnings, from (H, W) or (H, W, 3) of any integer or real type.
 
     8 and 16 bits stay exact. Colour becomes the plain mean of its channels, not rounded. `BadInput` for a pixel that
-    is not a finite number: there is no honest value to put in its place.
+    is not a finite number: there is no honest value to put in its place. Fractions from 0 to 1 are kept, with a
+    warning: what scaled them is not known.
     """
     warnings: list[str] = []
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is refused below
@@ -72,9 +77,16 @@ def grey_float32(stored: NDArray[Any]) -> tuple[NDArray[np.float32], tuple[str, 
             raise refuse(
                 f"{bad} of {pixels.size} pixels are NaN or infinite; fill them (by their neighbours' median, say) first"
             )
+        if are_fractions(pixels):
+            warnings.append(FRACTIONS_WARNING)
     elif stored.dtype.itemsize > 2 and float(np.abs(pixels).max()) > EXACT_IN_FLOAT32:
         warnings.append("values beyond 2^24 are rounded to 24 significant bits")
     return pixels, tuple(warnings)
+
+
+def are_fractions(pixels_adu: NDArray[np.float32]) -> bool:
+    """Whether no pixel is above 1 or below 0, and some are above 0: a picture scaled for display, not counts."""
+    return bool(0 < pixels_adu.max() <= 1 and pixels_adu.min() >= 0)
 
 
 def largest_value(dtype: np.dtype[Any]) -> float | None:

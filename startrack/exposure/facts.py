@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -21,11 +21,13 @@ HEADER_KEYS = {k: k for k in ("DATE-AVG", "DATE-OBS", "TIMESYS", "EXPTIME", "STC
 SIDECAR_KEYS = {"time_utc": "DATE-AVG", "exposure_s": "EXPTIME", "camera": "STCAMERA", "terrain": "STTERRAI"}
 SIDECAR_KEYS |= {"bayer_pattern": "BAYERPAT"}
 HEADER_KEYS |= SIDECAR_KEYS
+BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".crw", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"}
 PICTURE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".fits", ".fit", ".fts"} | RAW_SUFFIXES
 PACKING_SUFFIXES = {".gz", ".bz2", ".fz"}
 MAX_EXPOSURE_S = 1e6
 MAX_SIDECAR_BYTES = 2**20
+MOST_UNKNOWN_KEYS = 5  # that are warned of one by one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +67,7 @@ def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts
     (`BadInput`: bad_image, or no_time), which is ours; in a header, which may be anybody's, it is a warning.
     """
     sidecar, values = _read_sidecar(image)
-    notes: list[str] = list(given.warnings)
+    notes: list[str] = [*given.warnings, *_unknown_keys(sidecar, values)]
     exposure_s = given.exposure_s
     if exposure_s is None:
         exposure_s = _sidecar_exposure_s(sidecar, values.get("exposure_s"))
@@ -145,6 +147,19 @@ def _read_sidecar(image: Path) -> tuple[Path, dict[str, Any]]:
     return found, values
 
 
+def _unknown_keys(sidecar: Path, values: Mapping[str, Any]) -> list[str]:
+    """A warning for each key that stands for nothing: a misspelt one would else be missed in silence."""
+    unknown = [key for key in values if key not in SIDECAR_KEYS]
+    return [
+        f"sidecar {shown(sidecar.name)}: key {key[:40]!r} is none of {_listed(SIDECAR_KEYS)}; not used"
+        for key in unknown[:MOST_UNKNOWN_KEYS]
+    ]
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(names)
+
+
 def _bad_sidecar(sidecar: Path, cause: str, reason: str = "bad_image") -> BadInput:
     return BadInput(reason, " ".join(f"sidecar {shown(sidecar)}: {cause}".split()))
 
@@ -187,20 +202,20 @@ def _sidecar_pattern(sidecar: Path, value: object) -> str | None:
     if value is None:
         return None
     if not _is_pattern(value):
-        raise _bad_sidecar(sidecar, f"bayer_pattern is {str(value)[:40]!r}, not like RGGB")
-    return str(value).upper()
+        raise _bad_sidecar(sidecar, f"bayer_pattern is {str(value)[:40]!r}, none of {_listed(BAYER_PATTERNS)}")
+    return str(value).strip().upper()
 
 
 def _header_pattern(header: Mapping[str, Any], notes: list[str]) -> str | None:
     value = str(header.get("BAYERPAT") or "").strip().upper()
     if not value or _is_pattern(value):
         return value or None
-    notes.append(f"BAYERPAT {value[:40]!r} is not like RGGB; not used")
+    notes.append(f"BAYERPAT {value[:40]!r} is none of {_listed(BAYER_PATTERNS)}; not used")
     return None
 
 
 def _is_pattern(value: object) -> bool:
-    return isinstance(value, str) and sorted(value.strip().upper()) == sorted("RGGB")
+    return isinstance(value, str) and value.strip().upper() in BAYER_PATTERNS
 
 
 def _from_folder(file: Path, reference: str) -> str:
@@ -242,7 +257,7 @@ def _header_time(header: Mapping[str, Any], exposure_s: float | None, notes: lis
             return _later(time, exposure_s / 2, notes)
         notes.append(
             "DATE-OBS is when the exposure starts, and without EXPTIME its middle is not known: "
-            "give the time of the middle (--time, or time_utc in a sidecar), or exposure_s"
+            "give the time of the middle (time_utc in a sidecar), or exposure_s"
         )
     return None
 

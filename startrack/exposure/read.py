@@ -72,14 +72,23 @@ def read_exposure(
 
 
 def exposure_of(pixels: NDArray[Any], *, time_utc: datetime | None = None, name: str = "array") -> Exposure:
-    """Raw counts (H, W), or colours (H, W, 3), as an exposure without other facts. Raises BadInput (bad_image)."""
+    """Raw counts (H, W), or colours (H, W, 3), as an exposure without other facts. Raises BadInput (bad_image).
+
+    `sha256` is that of type, shape and values: results of equal arrays are results of the same image.
+    """
     flat_grey = pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)
     if not flat_grey or pixels.dtype.kind not in "uif":
         raise refuse(f"an array of {pixels.dtype} {pixels.shape}; startrack takes numbers (H, W) or (H, W, 3)")
     check_size(pixels.shape[1], pixels.shape[0])
     grey, notes = grey_float32(pixels)
-    saturation = largest_value(pixels.dtype)
-    return Exposure(pixels_adu=grey, name=name, time_utc=time_utc, saturation_adu=saturation, warnings=notes)
+    return Exposure(
+        pixels_adu=grey,
+        name=name,
+        time_utc=time_utc,
+        saturation_adu=largest_value(pixels.dtype),
+        sha256=hashlib.sha256(f"{pixels.dtype.str} {pixels.shape}".encode() + pixels.tobytes()).hexdigest(),
+        warnings=notes,
+    )
 
 
 def _of_one_colour(decoded: Decoded, facts: Facts) -> tuple[NDArray[np.float32], tuple[str, ...]]:

@@ -1,8 +1,9 @@
 """What people and programs get to see: results as JSON, star tables, annotated pictures, one-line summaries."""
 
-from startrack.report.result import detection_dict, identification_dict, refused_dict, result_dict
+from startrack.report.result import detection_dict, identification_dict, record_of, refused_dict, result_dict
 from startrack.report.summary import lens_text, refusal_line, summary_line, verbose_text
 from startrack.report.write import (
+    make_way,
     remove_companions,
     write_annotated,
     write_json,
@@ -15,6 +16,8 @@ __all__ = [
     "detection_dict",
     "identification_dict",
     "lens_text",
+    "make_way",
+    "record_of",
     "refusal_line",
     "refused_dict",
     "remove_companions",

@@ -65,6 +65,11 @@ def detection_dict(result: Result) -> dict[str, Any]:
     return d | _tail(result)
 
 
+def record_of(result: Result, kind: str) -> dict[str, Any]:
+    """The record of a kind, as its file is named (NAME.KIND.json): fix, identification or detections."""
+    return {"fix": result_dict, "identification": identification_dict, "detections": detection_dict}[kind](result)
+
+
 def refused_dict(image: str, reason: str, message: str, kind: str = "fix") -> dict[str, Any]:
     """The result of an image that could not even be read, or whose camera or terrain could not."""
     return {

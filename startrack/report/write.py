@@ -7,12 +7,13 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from startrack.errors import BadInput
 from startrack.exposure import write_atomically
 
 if TYPE_CHECKING:
     from startrack.result import Result
 
-COMPANIONS = (".stars.ecsv", ".annotated.png", ".wcs", ".corr")  # beside NAME.fix.json
+COMPANIONS = (".stars.ecsv", ".annotated.png", ".wcs", ".corr")  # beside NAME.fix.json and the other records
 FilePath = str | os.PathLike[str]
 
 
@@ -22,15 +23,45 @@ def remove_companions(folder: Path, stem: str) -> None:
         (folder / f"{stem}{suffix}").unlink(missing_ok=True)
 
 
+def make_way(path: Path, sha256: str, *, overwrite: bool, remedy: str) -> None:
+    """Make the folder of a record to come, and remove what an earlier one of this name left beside it.
+
+    The record of the same image is there to be renewed; one of another image is kept unless `overwrite`. Raises
+    BadInput (bad_image, for lack of a better code) with the `remedy`, or where nothing can be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        before = json.loads(path.read_text(encoding="utf-8")) if path.exists() and not overwrite else None
+    except OSError as cause:
+        raise BadInput("bad_image", f"{path}: results cannot be written there: {cause.strerror}") from cause
+    except ValueError:  # no JSON: not ours
+        before = {}
+    if before is not None and not _is_of(before, sha256):
+        raise BadInput("bad_image", f"{path} is not a result of this image: {remedy}")
+    remove_companions(path.parent, _stem_and_kind(path)[0])
+
+
+def _is_of(record: Any, sha256: str) -> bool:
+    provenance = record.get("provenance", {}) if isinstance(record, dict) else {}
+    return isinstance(provenance, dict) and provenance.get("image_sha256") == sha256
+
+
+def _stem_and_kind(record: Path) -> tuple[str, str]:
+    """NAME and KIND of NAME.KIND.json."""
+    stem, kind = record.name.removesuffix(".json").rsplit(".", 1)
+    return stem, kind
+
+
 def write_results(result: Result, path: Path, *, plots: bool = True, write_record: bool = True) -> dict[str, Any]:
-    """The record of a located image, written to `path` (NAME.fix.json) after its companions: star table, WCS, picture.
+    """The record of an image, written to `path` (NAME.fix.json, say) after its companions: star table, WCS, picture.
 
     Raises BadInput where they cannot be written.
     """
-    from startrack.report.result import result_dict
+    from startrack.report.result import record_of
 
-    record, stem = result_dict(result), path.name.removesuffix(".fix.json")
-    if result.light is not None:
+    stem, kind = _stem_and_kind(path)
+    record = record_of(result, kind)
+    if result.light is not None or (result.terrain is None and result.attitude is not None):
         write_star_table(path.with_name(f"{stem}.stars.ecsv"), result)
         write_wcs(path.with_name(f"{stem}.wcs"), path.with_name(f"{stem}.corr"), result)
     if plots:

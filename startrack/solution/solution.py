@@ -1,0 +1,150 @@
+"""What became of one picture, with astropy's types at the edge."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from datetime import UTC
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from startrack.report import make_way, record_of, summary_line, write_results
+from startrack.report.result import boresight_rad
+from startrack.solution.values import Orientation, Position, html_table, orientation_of, position_of
+
+if TYPE_CHECKING:
+    from astropy.coordinates import Angle, SkyCoord
+    from astropy.table import QTable
+    from astropy.time import Time
+
+    from startrack.result import Result
+    from startrack.types import Array
+
+
+@dataclass(frozen=True, repr=False)
+class Solution:
+    """What became of one picture. `status` is ok, ambiguous or refused; what was not reached is None."""
+
+    result: Result
+    kind: str = "fix"  # or identification, detections: what was asked for
+
+    @property
+    def status(self) -> str:
+        return self.result.status
+
+    @property
+    def reason(self) -> str | None:
+        return self.result.reason
+
+    @property
+    def message(self) -> str:
+        return self.result.message
+
+    def __bool__(self) -> bool:
+        return self.status == "ok"
+
+    @property
+    def position(self) -> Position | None:
+        """East, north, up, their sigma and ellipse, latitude and longitude, with units; None unless located."""
+        return position_of(self.result)
+
+    @property
+    def attitude(self) -> Orientation | None:
+        """Rotation, right ascension, declination and roll of the camera, heading and pitch of the rover."""
+        return orientation_of(self.result)
+
+    @property
+    def heading(self) -> Angle | None:
+        """Azimuth of the rover's nose, from north through east; None without attitude, terrain or time."""
+        attitude = self.attitude
+        return None if attitude is None else attitude.heading
+
+    @property
+    def position_m(self) -> Array | None:
+        """The camera's (east, north, up) [m] from the terrain's origin; None unless the status is ok."""
+        return self.result.fix.position_enu_m if self.result.fix is not None and self else None
+
+    @property
+    def covariance_m2(self) -> Array | None:
+        """Of (east, north), (2, 2) [m2]."""
+        return self.result.fix.covariance_m2 if self.result.fix is not None and self else None
+
+    @property
+    def radius95_m(self) -> float | None:
+        """Radius [m] of the circle about the position that holds 95 % of the posterior."""
+        return self.result.fix.radius95_m if self.result.fix is not None and self else None
+
+    @property
+    def modes(self) -> QTable | None:
+        """Every place that fits: east, north, weight; heaviest first."""
+        if self.result.fix is None:
+            return None
+        from astropy import units as u
+        from astropy.table import QTable
+
+        modes = self.result.fix.modes
+        east, north = [m.east_m for m in modes] * u.m, [m.north_m for m in modes] * u.m
+        return QTable({"east": east, "north": north, "weight": [m.weight for m in modes]})
+
+    @property
+    def time(self) -> Time | None:
+        """Middle of the exposure, UTC."""
+        if self.result.exposure.time_utc is None:
+            return None
+        from astropy.time import Time
+
+        return Time(self.result.exposure.time_utc.astimezone(UTC).replace(tzinfo=None), scale="utc")
+
+    @property
+    def boresight(self) -> SkyCoord | None:
+        """Where the camera's axis points, ICRS."""
+        if self.result.attitude is None:
+            return None
+        from astropy.coordinates import SkyCoord
+
+        ra, dec, _ = boresight_rad(self.result.attitude.R_cam_icrs)
+        return SkyCoord(ra, dec, unit="rad", frame="icrs")
+
+    @property
+    def stars(self) -> QTable | None:
+        """The star table: every catalogue star in view, with units."""
+        if self.result.stars is None or self.result.attitude is None:
+            return None
+        from astropy.table import QTable
+
+        from startrack.report.star_table import star_table_text
+
+        return QTable.read(star_table_text(self.result), format="ascii.ecsv")
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was found with the picture and not used, and of which azimuths the terrain could not speak."""
+        return self.result.warnings
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `NAME.fix.json` holds, or `NAME.identification.json`, or `NAME.detections.json`."""
+        return record_of(self.result, self.kind)
+
+    def write(self, folder: str | os.PathLike[str], *, plots: bool = True, overwrite: bool = False) -> Path:
+        """The files that the command writes: record, star table, world coordinates, picture; the record's path.
+
+        What an earlier result of this name left beside its record is removed. Raises BadInput (bad_image) where
+        nothing can be written, or where the record there is that of another image and not `overwrite`.
+        """
+        path = Path(folder) / f"{self.result.exposure.name or 'image'}.{self.kind}.json"
+        remedy = "write elsewhere, or with overwrite=True"
+        make_way(path, self.result.exposure.sha256, overwrite=overwrite, remedy=remedy)
+        write_results(self.result, path, plots=plots)
+        return path
+
+    def __repr__(self) -> str:
+        return summary_line(self.result)
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        tables = [part._repr_html_() for part in (self.position, self.attitude) if part is not None]
+        notes = [("warning", text) for text in self.warnings]
+        tables += [html_table("Warnings", notes)] if notes else []
+        return f"<p>{escape(summary_line(self.result))}</p>" + "".join(tables)

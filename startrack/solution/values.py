@@ -1,0 +1,169 @@
+"""Position and attitude as values with units, that print themselves in a terminal and in a notebook."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from html import escape
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from startrack.body_angles import heading_pitch_roll_from_R_body_enu
+from startrack.frames import latlon_from_enu
+from startrack.report.result import ARCSEC_PER_RAD, R_body_enu, boresight_rad
+
+if TYPE_CHECKING:
+    from astropy.coordinates import Angle
+    from astropy.units import Quantity
+    from scipy.spatial.transform import Rotation
+
+    from startrack.result import Result
+
+Rows = list[tuple[str, str]]
+
+
+class Shown:
+    """Prints itself as rows of a name and a text."""
+
+    def rows(self) -> Rows:
+        """What is printed, a line each."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        width = max(len(name) for name, _ in self.rows())
+        lines = (f"  {name:<{width}}  {text}" for name, text in self.rows())
+        return "\n".join([type(self).__name__, *lines])
+
+    def _repr_html_(self) -> str:
+        return html_table(type(self).__name__, self.rows())
+
+
+def html_table(caption: str, rows: Rows) -> str:
+    """Rows as a table for a notebook."""
+    body = "".join(
+        f'<tr><th style="text-align:left">{escape(name)}</th><td style="text-align:left">{escape(text)}</td></tr>'
+        for name, text in rows
+    )
+    return f'<table><caption style="text-align:left"><b>{escape(caption)}</b></caption><tbody>{body}</tbody></table>'
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Ellipse(Shown):
+    """One sigma of a position; 39 % of a Gaussian lie within."""
+
+    semi_major: Quantity  # [m]
+    semi_minor: Quantity  # [m]
+    azimuth: Angle  # of the major axis, from north through east, [0, 180) deg
+
+    def rows(self) -> Rows:
+        lengths = f"{self.semi_major:.2f} by {self.semi_minor:.2f}"
+        return [("one sigma", f"{lengths}, long axis at azimuth {_deg(self.azimuth, 1)}")]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Position(Shown):
+    """Where the camera is: the posterior's mean in the terrain's frame `enu`, and how sure that is."""
+
+    east: Quantity  # [m] from the terrain's origin
+    north: Quantity  # [m]
+    up: Quantity  # [m]
+    covariance: Quantity  # (2, 2) of (east, north) [m2]
+    radius95: Quantity  # [m] of the circle about the position that holds 95 % of the posterior
+    radius999: Quantity  # [m], 99.9 %
+    latitude: Angle
+    longitude: Angle  # east positive, (-180, 180] deg
+    terrain: str
+
+    @property
+    def sigma(self) -> Quantity:
+        """Standard deviations (2,) of east and north [m]."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def ellipse(self) -> Ellipse:
+        """The covariance as an ellipse of one sigma."""
+        from astropy import units as u
+        from astropy.coordinates import Angle
+
+        squares, axes = np.linalg.eigh(self.covariance.to_value(u.m**2))
+        minor, major = np.sqrt(np.maximum(squares, 0.0)) * u.m
+        azimuth_rad = np.arctan2(axes[0, 1], axes[1, 1]) % np.pi
+        return Ellipse(major, minor, Angle(np.degrees(azimuth_rad), u.deg))
+
+    def rows(self) -> Rows:
+        east, north = self.sigma
+        return [
+            ("east", f"{self.east:.2f} ± {east.value:.2f} m"),
+            ("north", f"{self.north:.2f} ± {north.value:.2f} m"),
+            ("up", f"{self.up:.2f}"),
+            ("on", self.terrain),
+            ("latitude", _deg(self.latitude, 6)),
+            ("longitude", _deg(self.longitude, 6)),
+            *self.ellipse.rows(),
+            ("95 % within", f"{self.radius95:.1f}"),
+            ("99.9 % within", f"{self.radius999:.1f}"),
+        ]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Orientation(Shown):
+    """How the camera is turned to the stars and, with a terrain and a time, how the rover stands."""
+
+    rotation: Rotation  # from icrs to cam: rotation.apply(rays_icrs) are rays_cam
+    ra: Angle  # of the camera's axis, ICRS
+    dec: Angle
+    roll: Angle  # position angle of the image's top, from north through east
+    sigma: Quantity  # (3,) of rotations about cam x, y, z [arcsec]
+    body: Rotation | None = None  # from enu to the rover's body
+    heading: Angle | None = None  # azimuth of body x (forward)
+    pitch: Angle | None = None  # nose up positive
+    roll_body: Angle | None = None  # right side down positive
+
+    def rows(self) -> Rows:
+        x, y, z = self.sigma.value
+        rows = [
+            ("right ascension", _deg(self.ra, 4)),
+            ("declination", _deg(self.dec, 4)),
+            ("roll", f"{_deg(self.roll, 4)} (image's top, from north through east)"),
+            ("sigma", f"{x:.2f}, {y:.2f}, {z:.2f} arcsec about cam x, y, z"),
+        ]
+        body = (("heading", self.heading), ("pitch", self.pitch), ("roll of the body", self.roll_body))
+        return rows + [(name, _deg(angle, 3)) for name, angle in body if angle is not None]
+
+
+def position_of(result: Result) -> Position | None:
+    """Of a result whose status is ok."""
+    fix, terrain = result.fix, result.terrain
+    if fix is None or terrain is None or result.status != "ok":
+        return None
+    from astropy import units as u
+    from astropy.coordinates import Angle
+
+    east, north, up = fix.position_enu_m * u.m
+    latitude, longitude = (Angle(np.degrees(a), u.deg) for a in latlon_from_enu(terrain.site, *fix.position_enu_m))
+    return Position(
+        east, north, up, fix.covariance_m2 * u.m**2, fix.radius95_m * u.m, fix.radius999_m * u.m, latitude, longitude,
+        terrain.name,
+    )  # fmt: skip
+
+
+def orientation_of(result: Result) -> Orientation | None:
+    """Of a result whose stars were identified."""
+    attitude, body = result.attitude, R_body_enu(result)
+    if attitude is None:
+        return None
+    from astropy import units as u
+    from astropy.coordinates import Angle
+    from scipy.spatial.transform import Rotation
+
+    ra, dec, roll = (Angle(np.degrees(angle), u.deg) for angle in boresight_rad(attitude.R_cam_icrs))
+    sigma = np.sqrt(np.diag(attitude.covariance_rad2)) * ARCSEC_PER_RAD * u.arcsec
+    found = Orientation(Rotation.from_matrix(attitude.R_cam_icrs), ra, dec, roll, sigma)
+    if body is None:
+        return found
+    heading, pitch, roll_body = (Angle(np.degrees(a), u.deg) for a in heading_pitch_roll_from_R_body_enu(body))
+    return replace(found, body=Rotation.from_matrix(body), heading=heading, pitch=pitch, roll_body=roll_body)
+
+
+def _deg(angle: Angle, decimals: int) -> str:
+    return f"{angle.deg:.{decimals}f}°"

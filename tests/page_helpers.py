@@ -14,6 +14,7 @@ NASTY = "ein <b>\"Bild\"</b> & 'mehr' </script><script>alert(1)</script> ünï�
 def results_in(out: Path, located: Any) -> Path:
     """One image solved, one ambiguous in a folder below, two refused."""
     record = write_results(located.result, out / "small.fix.json") | {"image": "small.png"}
+    record["provenance"] |= {"camera": "/somewhere/else/cameras/small-fisheye.toml"}
     write_json(out / "small.fix.json", record)
     (out / "night 1").mkdir()
     modes = [

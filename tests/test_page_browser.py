@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +17,7 @@ from startrack.page.gather import Found
 playwright = pytest.importorskip("playwright.sync_api", reason="the extra `browser` is not installed")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 DESKTOP, PHONE, SMALL = (1280, 800), (390, 844), (360, 740)
+ROW_PX, LINE_PX = 40, 17
 REAL = {"small": (6010.0, -2507.0)}
 
 
@@ -208,6 +210,63 @@ def test_an_ambiguous_image_shows_every_place_and_its_warnings(window):
     ]
     assert "EXIF orientation" in w.page.locator("#detail").inner_text()
     assert w.page.locator("a", has_text="two.fix.json").get_attribute("href") == "./night%201/two.fix.json"
+
+
+def test_a_magnified_pixel_of_the_picture_looks_like_one(window):
+    w = window()
+    w.open("small.png")
+    x, y = w.star("Canopus")
+    w.page.evaluate(
+        "([x, y]) => { const c = document.querySelector('#detail .stage canvas'), f = c.getBoundingClientRect();"
+        "c.view.zoomBy(20, x - f.left, y - f.top) }", [x, y],
+    )  # fmt: skip
+    w.page.wait_for_function("document.querySelector('#detail .stage').dataset.zoom > 19")
+    w.page.wait_for_function("!document.querySelector('#detail .stage canvas').view.waiting")
+    steps, pixel_px = w.page.evaluate(
+        "() => { const c = document.querySelector('#detail .stage canvas'), side = 200;"
+        "const { data } = c.getContext('2d').getImageData(c.width / 2 - side / 2, c.height / 2 - side / 2, side, side);"
+        "const level = (x, y) => data.slice(4 * (side * y + x), 4 * (side * y + x) + 3).join();"
+        "const rows = [...Array(side).keys()];"
+        "return [rows.slice(1).filter((x) => rows.some((y) => level(x, y) !== level(x - 1, y))).length,"
+        "c.view.magnified] }"
+    )
+    assert pixel_px > 8
+    assert steps <= 200 / pixel_px + 1  # columns where anything changes: the pixels' edges
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_words_beside_the_axes_keep_apart(window, size):
+    w = window(size)
+    w.open("small.png")
+    w.page.wait_for_selector("text=The position and how sure it is")
+    rooms = w.page.evaluate(
+        "[...View.all].filter(v => v.axes && find('detail').contains(v.node)).map(v => { const [xs, step] = ticks(v, 0);"
+        "const at = xs.map(x => v.screen(x, 0)[0]); return at.slice(1).map((x, k) => x - at[k]"
+        "- (widthOf(v, xs[k], step) + widthOf(v, xs[k + 1], step)) / 2) })"
+    )
+    assert len(rooms) == 3
+    assert min(room for one in rooms for room in one) > 4
+
+
+def test_a_file_is_shown_by_its_name_and_found_by_its_path(window):
+    w = window()
+    w.open("small.png")
+    camera = w.page.locator(".facts .tipped")
+    assert camera.inner_text() == "small-fisheye"
+    assert camera.get_attribute("title") == "/somewhere/else/cameras/small-fisheye.toml"
+    assert "The first image of a run" in w.page.locator("#detail").inner_text()
+
+
+def test_a_long_name_wraps_and_is_told_in_full(window, folder):
+    name = "a-name-that-is-long-enough-to-need-a-second-line-in-the-table-of-all-images.png"
+    record = json.loads((folder / "dark.fix.json").read_text()) | {"image": name}
+    page = page_text([Found("long", folder / "long.fix.json", record)], unread=["x.fix.json: holds no JSON object"])
+    (folder / "long.html").write_text(page, encoding="utf-8")
+    w = window(PHONE, name="long.html")
+    link = w.page.get_by_role("link", name=name)
+    assert link.get_attribute("title") == name
+    assert 1.5 * LINE_PX < link.bounding_box()["height"] <= ROW_PX
+    assert "x.fix.json: holds no JSON object" in w.page.locator("#overview").inner_text()
 
 
 def test_texts_stay_texts(window):

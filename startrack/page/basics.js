@@ -53,6 +53,20 @@ function colour(name) {
   return themeColours[name];
 }
 
+// Text on a drawing, with a rim of the ground's colour that keeps it apart from whatever lies below.
+function writeOn(g, text, x, y, fill) {
+  g.lineJoin = "round";
+  g.lineWidth = 4;
+  g.strokeStyle = colour("plot");
+  g.strokeText(text, x, y);
+  g.fillStyle = fill;
+  g.fillText(text, x, y);
+}
+
+// What a file is called, with where it lies as a tooltip: "fisheye-2048" of "/somewhere/calib/fisheye-2048.toml".
+const fileName = (path) => String(path).split(/[\\/]/).pop().replace(/\.toml$/, "");
+const fileNode = (path) => (known(path) ? [make("span", fileName(path) === path ? {} : { title: path, class: "tipped" }, fileName(path))] : null);
+
 // Rows of a table of facts: a term and what is known of it; unknown ones are left out.
 function facts(rows) {
   const shown = rows.filter(([, value]) => known(value) && value !== "–");

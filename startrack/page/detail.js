@@ -20,7 +20,7 @@ function showDetail(host, k) {
     detail?.picture ? pictureCard(detail, stars, name, groups.splice(0, 3)) : null,
     mapsCard(record, real, name),
     detail && stars.some((star) => known(star.az)) ? panoramaCard(detail, stars, name) : null,
-    groups.length ? make("div", { class: "cards" }, ...groups.map(([title, body]) => section(title, body))) : null,
+    groups.length ? make("div", { class: "cards" }, ...groups.map(([title, body]) => section(title, ...[body].flat()))) : null,
     stars.length ? starsCard(detail, stars) : null, filesCard(detail, value("stem")),
   ].filter(Boolean));
 }
@@ -70,7 +70,7 @@ function panoramaCard(detail, stars, name) {
 function mapsCard(record, real, name) {
   if (!record.position && !record.modes?.length) return null;
   const close = record.position ? panel("The position and how sure it is", placeView(record, real, name)) : null;
-  const area = panel(`The search area${record.provenance?.terrain ? ` on ${record.provenance.terrain}` : ""}; north is up`, areaView(record, real, name));
+  const area = panel(`The search area${record.provenance?.terrain ? ` on ${fileName(record.provenance.terrain)}` : ""}; north is up`, areaView(record, real, name));
   return section("Map", make("div", { class: close ? "pair" : "single" }, area, close), mapLegend(record, real));
 }
 
@@ -90,7 +90,7 @@ function factGroups(record, value) {
       ["Above the skyline", record.modes ? say(s.predicted_visible, 0) : null], ["Residual", say(s.rms_px, 3, "px")],
       ["Chance match", known(s.false_alarm_probability) ? (s.false_alarm_probability > 0 ? s.false_alarm_probability.toExponential(0).replace("-", "−") : "below 1e−300") : null]])],
     record.timing_ms && ["Time of each stage", timings(record.timing_ms)],
-    v && ["Made from", facts([["Time", sayTime(v.time_utc)], ["Exposure", known(v.exposure_s) ? say(v.exposure_s, 3, "s") : null], ["Camera", v.camera], ["Terrain", v.terrain],
+    v && ["Made from", facts([["Time", sayTime(v.time_utc)], ["Exposure", known(v.exposure_s) ? say(v.exposure_s, 3, "s") : null], ["Camera", fileNode(v.camera)], ["Terrain", fileNode(v.terrain)],
       ["Catalogue", v.catalog], ["startrack", v.version], ["Image's SHA-256", v.image_sha256 ? [make("code", {}, v.image_sha256)] : null]])],
   ].filter(Boolean);
 }
@@ -101,7 +101,8 @@ function timings(spent) {
   const time = (ms) => (ms >= 1000 ? say(ms / 1000, 2, "s") : say(ms, ms < 10 ? 1 : 0, "ms"));
   const rows = Object.entries(spent).filter(([, ms]) => ms > 0).map(([stage, ms]) => make("tr", {}, make("th", { scope: "row" }, stage),
     make("td", { class: "bar" }, make("span", { style: `width:${(100 * ms) / longest}%` })), make("td", {}, time(ms))));
-  return make("table", { class: "times" }, make("tbody", {}, ...rows), make("tfoot", {}, make("tr", {}, make("th", { scope: "row" }, "in all"), make("td"), make("td", {}, time(all)))));
+  return [make("table", { class: "times" }, make("tbody", {}, ...rows), make("tfoot", {}, make("tr", {}, make("th", { scope: "row" }, "in all"), make("td"), make("td", {}, time(all))))),
+    make("p", { class: "dim" }, "The first image of a run also pays for loading programs, catalogue and maps; later ones take less.")];
 }
 
 function starsCard(detail, stars) {

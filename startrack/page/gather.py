@@ -28,7 +28,7 @@ class Found:
 
 
 def results_under(folder: str | os.PathLike[str]) -> tuple[list[Found], list[str]]:
-    """Every result of the tree in the order of names, and the files that could not be read.
+    """Every result of the tree in the order of names, and a line for each file that could not be read, with the cause.
 
     Raises BadInput (bad_image, for lack of a better code) where there is no folder or no result in it.
     """
@@ -38,12 +38,14 @@ def results_under(folder: str | os.PathLike[str]) -> tuple[list[Found], list[str
     found, unread = [], []
     for path in _files(root):
         name = path.relative_to(root).as_posix()
-        record = _record(path)
-        if record is None:
-            unread.append(name)
-        else:
-            found.append(Found(_stem(name), path, record))
-    if not found and not unread:
+        try:
+            found.append(Found(_stem(name), path, _record(path)))
+        except ValueError as cause:
+            unread.append(f"{name}: {cause}")
+    if unread and not found:
+        others = f" (and {len(unread) - 1} others)" if len(unread) > 1 else ""
+        raise BadInput("bad_image", f"{folder}: no result there can be read: {unread[0]}{others}")
+    if not found:
         raise BadInput("bad_image", f"{folder}: no NAME.fix.json there: run startrack locate or batch first")
     return found, unread
 
@@ -53,10 +55,12 @@ def result_at(path: str | os.PathLike[str]) -> Found:
     file = Path(path)
     if not file.is_file():
         raise BadInput("bad_image", f"{path}: no such result")
-    record = _record(file) if file.name.endswith(KINDS) else None
-    if record is None:
-        raise BadInput("bad_image", f"{path}: is not a NAME.fix.json of startrack")
-    return Found(_stem(file.name), file, record)
+    try:
+        if not file.name.endswith(KINDS):
+            raise ValueError("its name has another ending")
+        return Found(_stem(file.name), file, _record(file))
+    except ValueError as cause:
+        raise BadInput("bad_image", f"{path}: is not a NAME.fix.json of startrack: {cause}") from cause
 
 
 def _files(root: Path) -> list[Path]:
@@ -71,15 +75,22 @@ def _files(root: Path) -> list[Path]:
     return [chosen[stem] for stem in sorted(chosen)]
 
 
-def _record(path: Path) -> dict[str, Any] | None:
+def _record(path: Path) -> dict[str, Any]:
+    """The record of a file. Raises ValueError with the cause where it holds none."""
     try:
         # JSON has no NaN and no infinity, but files written or edited elsewhere may: nothing was known there.
         record = json.loads(path.read_text(encoding="utf-8"), parse_constant=lambda _: None, parse_float=_finite)
-    except (OSError, ValueError):
-        return None
-    if not isinstance(record, dict) or not isinstance(record.get("reason"), str | None):
-        return None
-    return record if isinstance(record.get("image"), str) and isinstance(record.get("status"), str) else None
+    except OSError as cause:
+        raise ValueError(f"cannot be opened ({cause.strerror})") from cause
+    except ValueError as cause:
+        raise ValueError(f"no JSON, or not all of it ({cause})") from cause
+    if not isinstance(record, dict):
+        raise ValueError("holds no JSON object")
+    spoilt = [key for key in ("image", "status") if not isinstance(record.get(key), str)]
+    spoilt += [] if isinstance(record.get("reason"), str | None) else ["reason"]
+    if spoilt:
+        raise ValueError(f"{', '.join(spoilt)}: missing or no text")
+    return record
 
 
 def _finite(text: str) -> float | None:

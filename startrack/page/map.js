@@ -97,7 +97,7 @@ function drawPosterior(v, g, position) {
 function sideText(v, g, text, [x, y], gap) {
   const right = x + gap + g.measureText(text).width <= v.box[2] - 4;
   g.textAlign = right ? "left" : "right";
-  g.fillText(text, right ? x + gap : x - gap, y);
+  writeOn(g, text, right ? x + gap : x - gap, y, colour("ink"));
 }
 
 function placesOf(record, real) {
@@ -121,7 +121,6 @@ function drawPlaces(v, g, record, places) {
     else if (record.status !== "ok") {
       drawDot(g, at, 4);
       ring(g, at, 8, colour("place"), 2);
-      g.fillStyle = colour("ink");
       g.font = "13px system-ui, sans-serif";
       g.textBaseline = "middle";
       sideText(v, g, `${place.title.replace("Place ", "")}: ${place.rows[0][1]}`, at, 13);
@@ -189,7 +188,6 @@ function trajectoryView(rows, terrain, open) {
       if (known(value(place.row, "real_e")) && v.zoom > 4) drawPlus(g, v.screen(value(place.row, "real_e"), value(place.row, "real_n")), 6, colour("real"));
     }
     g.font = "13px system-ui, sans-serif";
-    g.fillStyle = colour("ink");
     g.textBaseline = "middle";
     const ends = dated.length > 1 ? [["first", dated[0]], ["last", dated[dated.length - 1]]] : [];
     for (const [word, place] of ends) {

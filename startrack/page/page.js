@@ -14,21 +14,39 @@ function buildOverview() {
   overview.replaceChildren(...[
     make("h1", { tabindex: "-1" }, `${say(page.rows.length, 0)} ${page.rows.length === 1 ? "image" : "images"}`),
     make("p", { class: "lead" }, `${say(solved, 0)} solved, ${say(page.rows.length - solved, 0)} not.`),
-    page.unread.length ? make("p", { class: "card why refused" }, `Could not be read: ${page.unread.slice(0, 20).join(", ")}${page.unread.length > 20 ? " and others" : ""}`) : null,
+    unreadCard(),
     new Table(openImage).node, trajectoryCard(open), page.errors ? errorsCard(page.rows, open) : null,
   ].filter(Boolean));
+}
+
+function unreadCard() {
+  if (!page.unread.length) return null;
+  const [first, rest] = [page.unread.slice(0, 20), page.unread.length - 20];
+  return make("section", { class: "card why refused" }, make("h2", {}, `${say(page.unread.length, 0)} of the results could not be read`),
+    make("ul", {}, ...first.map((text) => make("li", {}, text)), rest > 0 ? make("li", {}, `and ${say(rest, 0)} others`) : null));
+}
+
+// What the map of positions shows, in numbers.
+function placesFacts(rows) {
+  const of = (name) => rows.map((row) => row[column[name]]).filter(known).sort((a, b) => a - b);
+  const span = (values) => (values.length ? say(values.at(-1) - values[0], 0, "m") : null);
+  const radii = of("radius95_m");
+  const times = rows.map((row) => row[column.time_utc]).filter(known).sort();
+  return facts([["Positions", say(rows.length, 0)], ["From", times.length ? sayTime(times[0]) : null], ["To", times.length ? sayTime(times.at(-1)) : null],
+    ["East to west", span(of("east_m"))], ["North to south", span(of("north_m"))],
+    ["95 % within", radii.length ? `${say(radii[Math.floor(radii.length / 2)], 1, "m")} median, ${say(radii.at(-1), 1, "m")} largest` : null]]);
 }
 
 function trajectoryCard(open) {
   const located = page.rows.filter((row) => known(row[column.east_m]));
   const names = [...new Set(located.map((row) => row[column.terrain] || ""))].sort();
   if (!names.length) return null;
-  const holder = make("div", { class: "single" });
+  const holder = make("div", { class: "beside" });
   const show = (name) => {
-    const view = trajectoryView(located.filter((row) => (row[column.terrain] || "") === name), name, open);
-    holder.replaceChildren(view.node);
+    const shown = located.filter((row) => (row[column.terrain] || "") === name);
+    holder.replaceChildren(trajectoryView(shown, name, open).node, make("div", {}, placesFacts(shown)));
   };
-  const select = make("select", { "aria-label": "Terrain", onchange: () => show(select.value) }, ...names.map((name) => make("option", { value: name }, name || "terrain not known")));
+  const select = make("select", { "aria-label": "Terrain", onchange: () => show(select.value) }, ...names.map((name) => make("option", { value: name }, name ? fileName(name) : "terrain not known")));
   show(names[0]);
   return section("Positions", make("p", { class: "dim" }, "Joined in the order of time. Zoomed in, ellipses hold 95 % of each position's posterior. A click opens the image."), names.length > 1 ? select : null, holder);
 }

@@ -97,6 +97,8 @@ function skyView(detail, stars, name) {
     draw(v, g) {
       const [x, y] = v.screen(0, 0);
       const [right, bottom] = v.screen(picture.width, picture.height);
+      g.imageSmoothingEnabled = v.magnified < 2; // magnified, a pixel shall look like one
+      g.imageSmoothingQuality = "high";
       if (image.complete) g.drawImage(image, x, y, right - x, bottom - y);
       for (const star of placed) if (chosen.has(star.kind)) mark(g, v.screen(star.x, star.y), star.kind, 3.5 + 0.6 * Math.min(v.zoom, 6));
     },

@@ -87,7 +87,7 @@ class Table {
 
   line(row, place) {
     const cells = this.heads.map(([key, , kind, text]) => {
-      if (key === "image") return make("th", { scope: "row", class: kind, title: row.image }, make("a", { href: `#i${row.index}` }, row.image));
+      if (key === "image") return make("th", { scope: "row", class: kind, title: row.image }, make("a", { href: `#i${row.index}`, title: row.image }, row.image));
       if (key === "status") return make("td", { class: kind, title: row.reason }, badge(row.status), outcomeWords(row));
       return make("td", { class: kind }, text(row));
     });

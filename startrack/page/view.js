@@ -1,5 +1,6 @@
 // A drawing that can be zoomed (wheel, pinch, + and -), moved (drag, arrows), reset (double click, 0) and asked about
 // its points (hover, tap, n and p). World coordinates [x0, y0, x1, y1]; `up` where y grows upward.
+const TICK_FONT = "12px system-ui, sans-serif";
 const REACH = { mouse: 12, pen: 16, touch: 26 };
 
 class View {
@@ -76,6 +77,11 @@ class View {
     this.centre = this.middle();
     this.told = null;
     this.changed();
+  }
+
+  // How many pixels of the screen a unit of the world is wide.
+  get magnified() {
+    return this.perX * this.zoom * (window.devicePixelRatio || 1);
   }
 
   changed() {
@@ -183,11 +189,25 @@ function ticks(view, axis) {
   const pixels = axis ? view.box[3] - view.box[1] : view.box[2] - view.box[0];
   if (view.axes.fixed) return [view.axes.fixed.filter((value) => value >= Math.min(a, b) && value <= Math.max(a, b)), 1];
   const given = axis ? view.axes.steps?.[1] : view.axes.steps?.[0];
-  const least = (Math.abs(b - a) / pixels) * (axis ? 46 : view.axes.gap || 74);
-  const step = given?.find((one) => one >= least) ?? niceStep(least);
+  const stepOf = (gap) => {
+    const least = (Math.abs(b - a) / pixels) * gap;
+    return given?.find((one) => one >= least) ?? niceStep(least);
+  };
+  const gap = axis ? 46 : view.axes.gap || 74;
+  const room = axis ? gap : Math.max(gap, ...[a, b].map((end) => widthOf(view, end, stepOf(gap)) + 16));
+  const step = stepOf(room);
   const found = [];
   for (let k = Math.ceil(Math.min(a, b) / step); k * step <= Math.max(a, b) + 1e-9 * step; k += 1) found.push(k * step);
   return [found, step];
+}
+
+const tickText = (view, value, step) => (view.axes.text ? view.axes.text(value, step) : say(value, Math.max(0, Math.min(6, -Math.floor(Math.log10(step) + 1e-9)))));
+
+// Width [px] of the text of the tick that is nearest to a value.
+function widthOf(view, value, step) {
+  const g = view.canvas.getContext("2d");
+  g.font = TICK_FONT;
+  return g.measureText(tickText(view, Math.round(value / step) * step, step)).width;
 }
 
 function drawGrid(view, g) {
@@ -213,14 +233,13 @@ function drawAxes(view, g) {
   g.lineWidth = 1;
   g.strokeRect(left + 0.5, top + 0.5, right - left - 1, bottom - top - 1);
   g.fillStyle = colour("dim");
-  g.font = "12px system-ui, sans-serif";
-  const text = (value, step) => (view.axes.text ? view.axes.text(value, step) : say(value, Math.max(0, Math.min(6, -Math.floor(Math.log10(step) + 1e-9)))));
+  g.font = TICK_FONT;
   g.textAlign = "center";
   g.textBaseline = "top";
   const [xs, xStep] = ticks(view, 0);
   for (const x of xs) {
     const [sx] = view.screen(x, 0);
-    if (sx > left + 8 && sx < right - 12) g.fillText(view.axes.names?.[x] || text(x, xStep), sx, bottom + 4);
+    if (sx > left + 8 && sx < right - 12) g.fillText(view.axes.names?.[x] || tickText(view, x, xStep), sx, bottom + 4);
   }
   g.fillText(view.axes.x, (left + right) / 2, bottom + 19);
   g.textAlign = "right";
@@ -228,9 +247,9 @@ function drawAxes(view, g) {
   const [ys, yStep] = ticks(view, 1);
   for (const y of ys) {
     const [, sy] = view.screen(0, y);
-    if (sy > top + 4 && sy < bottom - 2) g.fillText(text(y, yStep), left - 5, sy);
+    if (sy > top + 4 && sy < bottom - 2) g.fillText(tickText(view, y, yStep), left - 5, sy);
   }
   g.textAlign = "left";
   g.textBaseline = "top";
-  g.fillText(view.axes.y, left + 6, top + 5);
+  writeOn(g, view.axes.y, left + 6, top + 5, colour("dim"));
 }

@@ -96,9 +96,15 @@ def test_equal_stems_keep_their_suffix(tmp_path):
     assert [image.stem for image in images_under(tmp_path)] == ["a.png", "a.tif", "b.fits.bz2", "b.jpg"]
 
 
-def test_named_images_must_lie_in_the_folder(night):
+def test_named_images_must_lie_in_the_folder(night, monkeypatch):
     named = named_images(night / "images", ["späti/b.png\n", str(night / "images" / "a 1.png") + "\n", "\n"])
     assert [image.name for image in named] == ["a 1.png", "späti/b.png"]
+    monkeypatch.chdir(night)  # as find and ls name them
+    assert named_images("images", ["images/späti/b.png\n", "./images/a 1.png\n"]) == named_images(
+        "images", ["späti/b.png", "a 1.png"]
+    )
+    with pytest.raises(BadInput, match="no file names came on standard input"):
+        named_images("images", ["\n"])
     with pytest.raises(BadInput, match="not an image under"):
         named_images(night / "images", ["../small.toml"])
 
@@ -163,7 +169,7 @@ def test_a_changed_sidecar_or_flag_is_another_task(night, tmp_path):
     assert (refused["status"], refused["reason"]) == ("refused", "no_calibration")
 
 
-def test_dask_gives_the_same_as_the_local_run_though_a_worker_is_killed(night, done):
+def test_dask_gives_the_same_as_the_local_run_though_a_worker_is_killed(night, done, monkeypatch):
     distributed = pytest.importorskip("distributed")
     out, killed = night / "dask", []
     with distributed.LocalCluster(2, processes=True, threads_per_worker=1, dashboard_address=None) as cluster:
@@ -178,7 +184,8 @@ def test_dask_gives_the_same_as_the_local_run_though_a_worker_is_killed(night, d
 
         killer = threading.Thread(target=kill_a_busy_worker)
         killer.start()
-        command = ["batch", str(night / "images"), "-D", str(out), "-q", "--cluster", cluster.scheduler_address]
+        monkeypatch.chdir(night)  # where the workers are not
+        command = ["batch", "images", "-D", out.name, "-q", "--cluster", cluster.scheduler_address]
         assert main(command) == 5
         killer.join()
     assert killed

@@ -1,8 +1,25 @@
 """Whole folders of images: found, located side by side, taken up again, and gathered into tables."""
 
 from startrack.batch.find import Image, images_under, named_images
+from startrack.batch.kept import JOB, in_the_tables, is_of_other_images, printable, result_of, stored
 from startrack.batch.run import Batch, Counts
 from startrack.batch.tables import write_tables
-from startrack.batch.task import Task, locate_image, stored
+from startrack.batch.task import BatchStopped, Task, locate_image
 
-__all__ = ["Batch", "Counts", "Image", "Task", "images_under", "locate_image", "named_images", "stored", "write_tables"]
+__all__ = [
+    "JOB",
+    "Batch",
+    "BatchStopped",
+    "Counts",
+    "Image",
+    "Task",
+    "images_under",
+    "in_the_tables",
+    "is_of_other_images",
+    "locate_image",
+    "named_images",
+    "printable",
+    "result_of",
+    "stored",
+    "write_tables",
+]

@@ -35,16 +35,23 @@ def images_under(folder: str | os.PathLike[str], apart_from: str | os.PathLike[s
     return _images(root, _names(root, without))
 
 
-def named_images(folder: str | os.PathLike[str], paths: Iterable[str]) -> list[Image]:
-    """The images named, one path each: absolute, or relative to the folder. All must lie under it.
+def named_images(
+    folder: str | os.PathLike[str], paths: Iterable[str], apart_from: str | os.PathLike[str] | None = None
+) -> list[Image]:
+    """The images named, one path each: absolute, or relative to the current folder or to `folder`.
 
-    Raises BadInput (bad_image) for one that does not.
+    Raises BadInput (bad_image) for one that is no image under `folder`, and where no path came at all.
     """
-    root, known = Path(folder), {image.name: image for image in images_under(folder)}
+    root, known = os.path.abspath(folder), {image.name: image for image in images_under(folder, apart_from)}
+    texts = [text for text in (path.strip("\r\n") for path in paths) if text]
+    if not texts:
+        raise BadInput("bad_image", "no file names came on standard input: give one path a line")
     chosen = set()
-    for text in filter(None, (path.strip("\r\n") for path in paths)):
-        name = os.path.relpath(root / text if not os.path.isabs(text) else text, root).replace(os.sep, "/")
-        if name not in known:
+    for text in texts:
+        places = (os.path.abspath(text), os.path.abspath(os.path.join(root, text)))
+        names = (os.path.relpath(place, root).replace(os.sep, "/") for place in places)
+        name = next((name for name in names if name in known), None)
+        if name is None:
             raise BadInput("bad_image", f"{text} is not an image under {folder}")
         chosen.add(known[name])
     return sorted(chosen)  # named as in a run over the whole folder

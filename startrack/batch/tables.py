@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from startrack import __version__
-from startrack.batch.task import JOB
+from startrack.batch.kept import JOB, MANIFEST, RESULT
 from startrack.exposure import write_atomically
 from startrack.frames import R_from_quat_xyzw, quat_xyzw_from_R
 from startrack.report.ecsv import Column, ecsv_text, formatted
@@ -64,7 +64,7 @@ def write_tables(out: Path, records: Sequence[Record], settings: dict[str, Any])
         ("results.parquet", lambda: _parquet(records)),
         ("trajectory.tum", lambda: "".join(sorted(map(_pose, filter(_located, records)))).encode()),
         ("timings.ecsv", lambda: _timings(records).encode()),
-        ("manifest.json", lambda: _manifest(records, settings)),
+        (MANIFEST, lambda: _manifest(records, settings)),
     )
     for name, make in makers:
         write_atomically(out / name, make(), overwrite=True)
@@ -131,6 +131,7 @@ def _manifest(records: Sequence[Record], settings: dict[str, Any]) -> bytes:
     images = [
         {
             "image": record["image"],
+            RESULT: record.get(RESULT),
             "status": record["status"],
             "image_sha256": record.get("provenance", {}).get("image_sha256"),
             JOB: record.get(JOB),

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
+import errno
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from startrack import __version__
+from startrack.batch.inputs import MISSING, hashes_of, key_of, sha256_of, unchanged
+from startrack.batch.kept import INPUTS, JOB, printable, stored
 from startrack.errors import INTERNAL_ERROR, BadInput
-from startrack.exposure.facts import sidecars
 
-JOB = "job_sha256"  # what a result was made from: content of all its files, flags, version
-INPUTS = "inputs"  # files that the result was made with: path to SHA-256
+# Errors of writing that the next image meets too.
+OF_THE_DISK = {errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.EFBIG, errno.EIO}
+
+
+class BatchStopped(Exception):
+    """No image can be done any more: the disk is full, the cluster has gone. The message says which."""
 
 
 @dataclass(frozen=True)
@@ -32,106 +37,84 @@ class Task:
 def locate_image(task: Task) -> tuple[dict[str, Any], bool]:
     """The image's record, and whether it was there already. Never raises for an image's sake.
 
-    NAME.fix.json is written last, so that a result that is there is whole.
+    NAME.fix.json is written last, so that a result that is there is whole. Raises BatchStopped where the disk takes
+    no more.
     """
     try:
-        key = job_key(task)
+        sha256 = sha256_of(task.path)
+        key = key_of(task.path, sha256, task.facts, task.plots, task.compiled)
         before = None if task.renew else stored(task.result)
-        if before is not None and before.get(JOB) == key and _unchanged(before.get(INPUTS, {})):
+        if before is not None and before.get(JOB) == key and unchanged(task.path, before.get(INPUTS, {})):
             return before, True
-        return _fresh(task, key), False
-    except BadInput as cause:  # results cannot be written there
-        return lost(task, str(cause), cause.reason), False
-    except MemoryError:
-        raise
+        return _fresh(task, sha256, key), False
     except Exception as cause:  # noqa: BLE001 - one image's fault is its own; it is counted and told as such
+        if isinstance(cause, BadInput):  # a refusal is a record: this is of the results, which cannot be written
+            _stop_where_the_disk_is_full(cause)
+            return lost(task, str(cause), cause.reason), False
         return lost(task, f"internal error: {type(cause).__name__}: {cause}"), False
 
 
 def lost(task: Task, message: str, reason: str = INTERNAL_ERROR) -> dict[str, Any]:
-    """The record of an image that could not even be begun, or that took its worker with it."""
-    from startrack.report import refused_dict
+    """The record of an image that has no result to keep: without a hash, so that the next run tries it again."""
+    from startrack.report import refused_dict, write_json
 
-    return {**refused_dict(task.name, reason, message), "image": printable(task.name)}
+    record = {**refused_dict(task.name, reason, message), **_unread(sha256_of(task.path))}
+    record |= {"image": printable(task.name), JOB: None}
+    with suppress(BadInput):  # where it cannot be written, there is nothing to keep either
+        _clear(Path(task.result))
+        write_json(task.result, record)
+    return record
 
 
-def printable(name: str) -> str:
-    """A file's name as text: bytes that are none become question marks."""
-    return name.encode("utf-8", "replace").decode("utf-8")
-
-
-def _fresh(task: Task, key: str) -> dict[str, Any]:
+def _fresh(task: Task, sha256: str, key: str) -> dict[str, Any]:
     """The record made anew. The old one goes first, so that no half of a result is ever taken for a whole."""
-    from startrack.report import refused_dict, remove_companions, write_json
+    from startrack.report import write_json
 
-    result = Path(task.result)
-    result.parent.mkdir(parents=True, exist_ok=True)
-    result.unlink(missing_ok=True)
-    remove_companions(result.parent, result.name.removesuffix(".fix.json"))
-    inputs: dict[str, str] = {}
-    try:
-        record, inputs = _located(task, result)
-    except BadInput as cause:
-        record = refused_dict(task.name, cause.reason, str(cause))
-    except MemoryError:
-        raise
-    except Exception as cause:  # noqa: BLE001 - one image's fault is its own; it is counted and told as such
-        record = refused_dict(task.name, INTERNAL_ERROR, f"internal error: {type(cause).__name__}: {cause}")
+    _clear(Path(task.result))
+    record, inputs = _located(task, sha256)
     record = {**record, "image": printable(task.name), JOB: key, INPUTS: inputs}
     write_json(task.result, record)
     return record
 
 
-def stored(result: str) -> dict[str, Any] | None:
-    """A result's record, or None where there is none that can be read."""
+def _clear(result: Path) -> None:
+    """Make the folder, remove what an earlier run left. Raises BadInput where that cannot be."""
+    from startrack.report import remove_companions
+
     try:
-        record = json.loads(Path(result).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return record if isinstance(record, dict) else None
+        result.parent.mkdir(parents=True, exist_ok=True)
+        result.unlink(missing_ok=True)
+        remove_companions(result.parent, result.name.removesuffix(".fix.json"))
+    except OSError as cause:
+        raise BadInput("bad_image", f"{result}: cannot be written ({cause.strerror})") from cause
 
 
-def job_key(task: Task) -> str:
-    """SHA-256 of what decides the result: image, sidecar, flags and version; camera and terrain files are INPUTS."""
-    digest = hashlib.sha256(json.dumps([__version__, task.facts, task.plots, task.compiled], default=str).encode())
-    sidecar = next((path for path in sidecars(Path(task.path)) if path.is_file()), None)
-    for path in (Path(task.path), sidecar):
-        digest.update(_digest(path))
-    return digest.hexdigest()
-
-
-def _inputs(references: list[str | None]) -> dict[str, str]:
-    """Path to SHA-256 of the camera's and terrain's files, height maps included; a shipped one's name needs none."""
-    import tomllib
-
-    files = [Path(reference) for reference in references if reference and Path(reference).is_file()]
-    for path in tuple(files):
-        maps = tomllib.loads(path.read_text(encoding="utf-8")).get("dem", {}).get("file", [])
-        files += [path.parent / name for name in ([maps] if isinstance(maps, str) else maps)]
-    return {str(path): _digest(path).hex() for path in files}
-
-
-def _unchanged(inputs: dict[str, str]) -> bool:
-    return all(_digest(Path(path)).hex() == digest for path, digest in inputs.items())
-
-
-def _located(task: Task, result: Path) -> tuple[dict[str, Any], dict[str, str]]:
+def _located(task: Task, sha256: str) -> tuple[dict[str, Any], dict[str, str]]:
+    """Result or refusal, and the hashes of its other files. Raises BadInput where its companions cannot be written."""
     from startrack.exposure import read_exposure
     from startrack.localize import ExactPosterior
     from startrack.pipeline import Settings, locate_exposure
-    from startrack.report import write_results
+    from startrack.report import refused_dict, result_dict, write_results
+    from startrack.result import Result
 
-    exposure = read_exposure(task.path, **task.facts)
-    found = locate_exposure(exposure, Settings(localizer=ExactPosterior(compiled=task.compiled)))
-    record = write_results(found, result, plots=task.plots, write_record=False)
-    return record, _inputs([exposure.camera, exposure.terrain])
-
-
-def _digest(path: Path | None) -> bytes:
-    if path is None:
-        return b"-"
     try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").digest()
-    except OSError:
-        return b"?"  # said by whoever reads it
+        exposure = read_exposure(task.path, **task.facts)
+    except BadInput as cause:
+        return {**refused_dict(task.name, cause.reason, str(cause)), **_unread(sha256)}, {}
+    inputs = hashes_of(task.path, [exposure.camera, exposure.terrain])  # before they are read: one that changes is seen
+    try:
+        found = locate_exposure(exposure, Settings(localizer=ExactPosterior(compiled=task.compiled)))
+    except BadInput as cause:
+        return result_dict(Result(exposure=exposure, reason=cause.reason, message=str(cause))), inputs
+    return write_results(found, Path(task.result), plots=task.plots, write_record=False), inputs
+
+
+def _unread(sha256: str) -> dict[str, Any]:
+    """What is known of an image that could not be decoded, or whose sidecar could not be read: which file it was."""
+    unknown = dict.fromkeys(("camera", "terrain", "catalog", "time_utc", "exposure_s"))
+    return {} if sha256 == MISSING else {"provenance": {"version": __version__, "image_sha256": sha256, **unknown}}
+
+
+def _stop_where_the_disk_is_full(cause: BadInput) -> None:
+    if isinstance(cause.__cause__, OSError) and cause.__cause__.errno in OF_THE_DISK:
+        raise BatchStopped(str(cause)) from cause

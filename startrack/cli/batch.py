@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from startrack.cli.batch_show import Halt, ctrl_c_halts, progress, summary
 from startrack.cli.common import DEFAULT_OUT, add_fact_flags, cores, flag_facts, made_folder
 from startrack.cli.flag_types import at_least_one
 from startrack.cli.horizons import ready_for
-from startrack.errors import BadInput
+from startrack.errors import INTERNAL_ERROR, BadInput
+from startrack.paths import is_path
 
 if TYPE_CHECKING:
-    from startrack.batch import Counts, Image, Task
+    from startrack.batch import Batch, Counts, Image, Task
 
-OK, INTERNAL_ERROR, STOPPED = 0, 1, 5
-SHOWN = ("ok", "ambiguous", "refused", "error")
+OK, FAULT, STOPPED = 0, 1, 5
+SCHEMES = ("", "tcp", "tls", "ucx", "ws", "wss")  # of Dask's addresses
 
 
 def add_parser(subparsers: Any) -> None:
@@ -30,14 +33,19 @@ def add_parser(subparsers: Any) -> None:
         description="Locate the camera in every image of a tree, which OUT mirrors. A run that was stopped goes on "
         "from there; images, sidecars, camera or terrain files that have changed are done again. Adds results.ecsv, "
         "results.parquet, trajectory.tum, timings.ecsv and manifest.json.",
+        epilog="exit codes: 0 every image solved; 5 some not solved, or stopped early (Ctrl-C, a full disk, a closed "
+        "pipe); 1 an internal error; 2 usage; 4 bad input",
     )
     parser.add_argument("folder", metavar="FOLDER", help="folder of the images, with all below it")
     add_fact_flags(parser)
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file, or the name of a shipped one")
-    parser.add_argument(
+    workers = parser.add_mutually_exclusive_group()
+    workers.add_argument(
         "-j", "--jobs", type=at_least_one, default=None, metavar="N", help="processes (default: all cores)"
     )
-    parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask cluster to use instead (extra: cluster)")
+    workers.add_argument(
+        "--cluster", type=_address, metavar="ADDRESS", help="a Dask cluster to use instead (extra: cluster)"
+    )
     parser.add_argument("--files-on-stdin", action="store_true", help="only the images listed on stdin, one a line")
     parser.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the results (%(default)s)")
     again = parser.add_mutually_exclusive_group()
@@ -56,55 +64,85 @@ def run(args: argparse.Namespace) -> int:
     """0 when every image is solved, 5 when some are not or the run was stopped, 1 after an internal error."""
     if args.cluster is not None and find_spec("distributed") is None:
         args.usage_error("a cluster is reached with distributed: pip install 'startrack[cluster]'")
-    from startrack.batch import Batch, images_under, named_images, write_tables
+    from startrack.batch import Batch, Counts, images_under, named_images
 
     out = made_folder(args.dir)
-    found = named_images(args.folder, sys.stdin) if args.files_on_stdin else images_under(args.folder, out)
+    whole = images_under(args.folder, out)
+    found = named_images(args.folder, sys.stdin, out) if args.files_on_stdin else whole
     if not found:
         raise BadInput("bad_image", f"{args.folder}: no PNG, TIFF, FITS, JPEG or camera raw images there")
-    facts = flag_facts(args)
+    _check_whose(out, whole, args)
+    facts = _facts(args)
     tasks = _tasks(found, out, facts, args)
     if args.cluster is None and not all(Path(task.result).exists() for task in tasks):
         ready_for(_terrain_of(tasks[0]), args)
-    jobs = args.jobs or cores()
-    records: list[dict[str, Any]] = []
-    counts = _no_counts()
+    batch, counts = Batch(jobs=args.jobs or cores(), cluster=args.cluster), Counts()
+    records, stopped = _work_off(batch, tasks, counts, args)
     try:
-        with _progress(len(tasks), args) as tell:
-            for record, kept in Batch(jobs=jobs, cluster=args.cluster).results(tasks):
-                records.append(_gist(record))
-                outcome = "error" if record["reason"] == "internal_error" else str(record["status"])
-                counts[outcome] += 1
-                counts["kept"] += kept
-                tell(record, counts)
-    except KeyboardInterrupt:
-        print(f"startrack: stopped after {len(records)} of {len(tasks)}; the same command goes on", file=sys.stderr)
+        _write_tables(out, whole, records, {**_shown(facts), "plots": not args.no_plots})
+        tables = f"tables in {out}"
+    except BadInput as cause:
+        stopped, tables = stopped or "the disk takes no more", f"no tables: {cause}"
+    if stopped:
+        again = "the same command without -O" if args.overwrite else "the same command"
+        done = f"{stopped}: {len(records)} of {len(tasks)} images done, {tables}"
+        print(f"startrack: {done}; {again} goes on", file=sys.stderr)
         return STOPPED
-    except (OSError, ImportError) as cause:
-        if args.cluster is None:
-            raise
-        raise BadInput("no_cluster", f"{args.cluster}: no Dask scheduler answers ({cause})") from cause
-    if args.files_on_stdin:
-        records += _earlier(images_under(args.folder, out), {image.name for image in found}, out)
-    write_tables(out, records, _settings(facts, args))
     if args.report:
         from startrack.cli.report import page_of
 
         page_of(str(out))
     if not args.quiet:
-        print(_summary(counts, len(tasks), out))
+        print(f"{summary(counts, len(tasks))}; {tables}", file=sys.stderr if args.json else sys.stdout)
     if counts["error"]:
-        return INTERNAL_ERROR
+        return FAULT
     return OK if counts["ok"] == len(tasks) else STOPPED
 
 
-def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace) -> list[Task]:
-    from startrack.batch import Task
+def _work_off(
+    batch: Batch, tasks: Sequence[Task], counts: Counts, args: argparse.Namespace
+) -> tuple[list[dict[str, Any]], str | None]:
+    """What the tables need of each image that was done, and why it was not all of them."""
+    from startrack.batch import BatchStopped
 
-    compiled = find_spec("numba") is not None
+    records: list[dict[str, Any]] = []
+    halt = Halt(batch)
+    try:
+        with ctrl_c_halts(halt), progress(len(tasks), args, halt) as tell:
+            for record, kept in batch.results(tasks):
+                records.append(_gist(record))
+                counts["error" if record["reason"] == INTERNAL_ERROR else str(record["status"])] += 1
+                counts["kept"] += kept
+                tell(record, counts)
+    except BatchStopped as cause:
+        halt.why = str(cause)
+    return records, halt.why if len(records) < len(tasks) else None
+
+
+def _check_whose(out: Path, images: Sequence[Image], args: argparse.Namespace) -> None:
+    from startrack.batch import is_of_other_images
+
+    if not args.overwrite and is_of_other_images(out, images):
+        args.usage_error(
+            f"{out} holds a batch of other images than {args.folder} has now: choose another -D, or replace its "
+            "results and tables with -O"
+        )
+
+
+def _facts(args: argparse.Namespace) -> dict[str, Any]:
+    """What the flags say; paths made absolute, for workers that stand elsewhere."""
+    facts = flag_facts(args)
+    named = {key: os.path.abspath(facts[key]) for key in ("camera", "terrain") if is_path(facts.get(key, ""))}
+    return facts | named
+
+
+def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace) -> list[Task]:
+    from startrack.batch import Task, result_of
+
+    compiled, here = find_spec("numba") is not None, Path(os.path.abspath(out))
     return [
         Task(
-            name=image.name, path=image.path, result=str(out / f"{image.stem}.fix.json"), facts=facts,
+            name=image.name, path=os.path.abspath(image.path), result=str(result_of(here, image)), facts=facts,
             plots=not args.no_plots, renew=args.overwrite, compiled=compiled,
         )
         for image in found
@@ -122,12 +160,22 @@ def _terrain_of(task: Task) -> str | None:
     return None
 
 
-def _earlier(whole: Sequence[Image], done: set[str], out: Path) -> list[dict[str, Any]]:
-    """What earlier runs found of the folder's other images: the tables are of all."""
-    from startrack.batch import stored
+def _write_tables(
+    out: Path, whole: Iterable[Image], records: Sequence[dict[str, Any]], settings: dict[str, Any]
+) -> None:
+    """The tables of the whole folder: images that this run was not given, or did not reach, as earlier runs left them.
 
-    records = (stored(str(out / f"{image.stem}.fix.json")) for image in whole if image.name not in done)
-    return [_gist(record) for record in records if record is not None]
+    Raises BadInput where they cannot be written.
+    """
+    from startrack.batch import printable, result_of, stored, write_tables
+
+    now, rows = {record["image"]: record for record in records}, []
+    for image in whole:
+        record = now.get(printable(image.name)) or stored(result_of(out, image))
+        if record is not None:
+            result = printable(result_of(Path(), image).as_posix())
+            rows.append({**_gist(record), "image": printable(image.name), "result": result})
+    write_tables(out, rows, settings)
 
 
 def _gist(record: dict[str, Any]) -> dict[str, Any]:
@@ -135,48 +183,15 @@ def _gist(record: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in record.items() if key not in ("modes", "message", "warnings", "format")}
 
 
-def _settings(facts: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
+def _shown(facts: dict[str, Any]) -> dict[str, str]:
     """What was asked for, free of this machine's paths."""
-    shown = {key: Path(value).name if key in ("camera", "terrain") else str(value) for key, value in facts.items()}
-    return {**shown, "plots": not args.no_plots}
+    return {key: Path(value).name if key in ("camera", "terrain") else str(value) for key, value in facts.items()}
 
 
-def _summary(counts: Counts, total: int, out: Path) -> str:
-    parts = [f"{counts[name]} {name}" for name in SHOWN if counts[name]]
-    kept = f" ({counts['kept']} were there already)" if counts["kept"] else ""
-    return f"{total} images: {', '.join(parts)}{kept}; tables in {out}"
-
-
-@contextmanager
-def _progress(total: int, args: argparse.Namespace) -> Iterator[Any]:
-    """A function to call with each record and the counts; a bar on a terminal."""
-
-    def lines(record: dict[str, Any], counts: Counts) -> None:
-        if args.json:
-            import json
-
-            print(json.dumps(record), flush=True)
-        elif args.verbose:
-            print(f"{record['image']}: {record['status']} {record['message']}".rstrip(), flush=True)
-
-    if args.quiet or not sys.stderr.isatty():
-        yield lines
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.fields[counts]}")
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        row = bar.add_task("batch", total=total, counts="")
-
-        def advance(record: dict[str, Any], counts: Counts) -> None:
-            lines(record, counts)
-            bar.update(row, advance=1, counts="  ".join(f"{counts[name]} {name}" for name in SHOWN if counts[name]))
-
-        yield advance
-
-
-def _no_counts() -> Counts:
-    from startrack.batch import Counts
-
-    return Counts()
+def _address(text: str) -> str:
+    """Of a Dask scheduler, as an argparse type."""
+    scheme, _, place = text.rpartition("://")
+    host, _, port = place.rpartition(":")
+    if scheme not in SCHEMES or not host or not port.isdecimal() or not 0 < int(port) < 2**16:
+        raise argparse.ArgumentTypeError(f"{text!r} is not the address of a Dask scheduler such as tcp://host:8786")
+    return text

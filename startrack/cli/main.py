@@ -15,8 +15,9 @@ COMMANDS = (
     "locate", "batch", "identify", "detect", "render", "calibrate", "report", "reproduce", "terrain", "doctor",
     "schema",
 )  # fmt: skip
-OK, INTERNAL_ERROR, USAGE, REFUSED, BAD_INPUT = 0, 1, 2, 3, 4
-EPILOG = """exit codes: 0 every image solved; 1 internal error; 2 usage; 3 an image ambiguous or refused; 4 bad input
+OK, INTERNAL_ERROR, USAGE, REFUSED, BAD_INPUT, STOPPED = range(6)
+EPILOG = """exit codes: 0 every image solved; 1 internal error; 2 usage; 3 an image ambiguous or refused; 4 bad input;
+5 batch: some image not solved; 5 also where the output's reader went before the end (a closed pipe)
 
 startrack locate sample_images/near-centre.png     where is the rover?
 startrack identify sky.png -c camera.toml          which stars are these?
@@ -32,7 +33,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.print_help()
         return USAGE
     try:
-        return int(importlib.import_module(f"startrack.cli.{args.command}").run(args))
+        code = int(importlib.import_module(f"startrack.cli.{args.command}").run(args))
+        sys.stdout.flush()  # here, where a closed pipe is told from an error
+        return code
     except BadInput as cause:
         return _failed(f"{cause.reason}: {cause}", BAD_INPUT)
     except NoSolution as cause:
@@ -40,9 +43,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _failed("interrupted", 130)
     except BrokenPipeError:
-        # The reader of our output has gone; what it wanted of us is done.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return OK
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nobody reads what is left in the buffer
+        return STOPPED
     except Exception as cause:
         if getattr(args, "verbose", 0):
             raise

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 PAGE = "report.html"
 OF_ONE = ".report.html"
 DEFAULT_IMAGES = 30
+FEW = 3
 
 
 def add_parser(subparsers: Any) -> None:
@@ -58,9 +60,30 @@ def page_of(out: str, *, truth: str | None = None, images: int = DEFAULT_IMAGES,
         write_page(path, [one], real=_places([one], truth), images=images, single=True)
         return path
     found, unread = results_under(out)
+    for line in unread:
+        print(f"startrack: left out {line}", file=sys.stderr)
+    found = _in_the_tables(out, found)
     path = Path(output) if output else Path(out) / PAGE
     write_page(path, found, unread=unread, real=_places(found, truth), images=images)
     return path
+
+
+def _in_the_tables(out: str, found: list[Found]) -> list[Found]:
+    """Without what a batch made of images that its tables no longer have, and a word about those."""
+    from startrack.batch import JOB, in_the_tables
+
+    known = in_the_tables(Path(out))
+    if known is None:
+        return found
+    left = {one.stem for one in found if JOB in one.record and one.path.relative_to(out).as_posix() not in known}
+    if left:
+        some = ", ".join(sorted(left)[:FEW]) + (", ..." if len(left) > FEW else "")
+        print(
+            f"startrack: left out {len(left)} results that {out}'s tables do not have ({some}): their images are no "
+            "longer in the batch's folder, or startrack batch is to be run again",
+            file=sys.stderr,
+        )
+    return [one for one in found if one.stem not in left]
 
 
 def page_of_images(out: str, images: Sequence[str]) -> None:

@@ -1,0 +1,93 @@
+"""What a batch shows while it works, and how it is asked to end before it is done."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from startrack.errors import INTERNAL_ERROR
+
+if TYPE_CHECKING:
+    from startrack.batch import Batch, Counts
+
+SHOWN = ("ok", "ambiguous", "refused", "error")
+FINISHING = b"\nstartrack: finishing the images in hand; Ctrl-C once more drops them\n"
+Tell = Callable[[dict[str, Any], "Counts"], None]
+
+
+class Halt:
+    """Asks a batch to end when the images in hand are done, and remembers why."""
+
+    def __init__(self, batch: Batch) -> None:
+        self.why: str | None = None
+        self._batch = batch
+
+    def __call__(self, why: str) -> None:
+        self.why = self.why or why
+        self._batch.stop()
+
+
+@contextmanager
+def ctrl_c_halts(halt: Halt) -> Iterator[None]:
+    """While this lasts, the first Ctrl-C halts the batch, and the second one interrupts as ever."""
+
+    def first(*_: object) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        os.write(2, FINISHING)  # not print: a signal may come in the middle of one
+        halt("interrupted")
+
+    if threading.current_thread() is not threading.main_thread():  # signals are the main thread's
+        yield
+        return
+    before = signal.signal(signal.SIGINT, first)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def progress(total: int, args: argparse.Namespace, halt: Halt) -> Iterator[Tell]:
+    """A function to call with each record and the counts; a bar on a terminal."""
+
+    def lines(record: dict[str, Any], _: Counts) -> None:
+        if record["reason"] == INTERNAL_ERROR:
+            print(f"{record['image']}: {record['message']}", file=sys.stderr, flush=True)
+        try:
+            if args.json:
+                print(json.dumps(record), flush=True)
+            elif args.verbose:
+                print(f"{record['image']}: {record['status']} {record['message']}".rstrip(), flush=True)
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            halt("nobody reads the output any more")
+
+    if args.quiet or not sys.stderr.isatty():
+        yield lines
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.fields[counts]}")
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        row = bar.add_task("batch", total=total, counts="")
+
+        def advance(record: dict[str, Any], counts: Counts) -> None:
+            lines(record, counts)
+            bar.update(row, advance=1, counts="  ".join(f"{counts[name]} {name}" for name in SHOWN if counts[name]))
+
+        yield advance
+
+
+def summary(counts: Counts, total: int) -> str:
+    """How many images of each outcome."""
+    parts = [f"{counts[name]} {name}" for name in SHOWN if counts[name]]
+    kept = f" ({counts['kept']} were there already)" if counts["kept"] else ""
+    return f"{total} images: {', '.join(parts)}{kept}"

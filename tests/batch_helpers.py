@@ -1,0 +1,49 @@
+"""Quick frames for the tests of batches, and work for their processes that ends as the name of the image says."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from startrack.batch import Task
+
+SIZE = 256
+CAMERA = f"""
+name = "small"
+size_px = [{SIZE}, {SIZE}]
+focal_px = [80.0, 80.0]
+centre_px = [127.5, 127.5]
+max_angle_deg = 92.5
+"""
+FACTS = {"time_utc": "2030-01-01T00:00:00Z", "exposure_s": 1.0, "camera": "small.toml", "terrain": "shackleton-thesis"}
+
+
+def frames(folder: Path, count: int, level: int = 100) -> list[Path]:
+    """Frames of the lens cap, each with other noise: refused for want of stars, and that within milliseconds."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "small.toml").write_text(CAMERA)
+    paths = [folder / f"{number:02d}.png" for number in range(count)]
+    for number, path in enumerate(paths):
+        pixels = np.random.default_rng(number).normal(level, 3, (SIZE, SIZE)).round().astype(np.uint16)
+        path.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
+        path.with_suffix(".json").write_text(json.dumps(FACTS))
+    return paths
+
+
+def task_of(image: Path, out: Path, plots: bool = False, **facts: Any) -> Task:
+    """The batch's task for one image."""
+    return Task(name=image.name, path=str(image), result=str(out / f"{image.stem}.fix.json"), facts=facts, plots=plots)
+
+
+def die_if_told(task: Task) -> tuple[dict[str, Any], bool]:
+    """Work that takes a moment, tells its process, and takes the process with it where the image's name says so."""
+    time.sleep(0.02)
+    if "deadly" in task.name:
+        os._exit(9)
+    return {"image": task.name, "reason": None, "process": os.getpid()}, False

@@ -1,0 +1,155 @@
+"""A batch that cannot simply go on: processes that die, a disk that is full, a reader that has gone, Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from astropy.table import Table
+from batch_helpers import die_if_told, frames, task_of
+
+from startrack.batch import Batch, BatchStopped, Task
+from startrack.cli.main import main
+
+TOGETHER = 2  # processes
+
+
+def begun(folder: Path, *flags: str, before: str = "") -> subprocess.Popen[str]:
+    """The command in a shell's process, which `before` may have prepared."""
+    command = [sys.executable, "-m", "startrack.cli.main", "batch", str(folder), *flags]
+    shell = ["bash", "-c", f'{before} exec "$@"', "bash", *command]
+    return subprocess.Popen(shell, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def tasks(folder: Path, names: Sequence[str]) -> list[Task]:
+    return [task_of(folder / name, folder / "out") for name in names]
+
+
+def outcomes(batch: Batch, todo: Sequence[Task]) -> dict[str, dict[str, Any]]:
+    done = {record["image"]: record for record, _ in batch.results(todo)}
+    assert sorted(done) == [task.name for task in todo]
+    return done
+
+
+def test_an_image_that_kills_its_process_costs_the_others_nothing(tmp_path):
+    names = [f"{number:02d}.png" for number in range(60)]
+    names[5] = names[5].replace(".", "-deadly.")
+    names[40] = names[40].replace(".", "-deadly.")
+    done = outcomes(Batch(jobs=TOGETHER, work=die_if_told), tasks(tmp_path, names))
+    died = [name for name, record in done.items() if record["reason"] == "internal_error"]
+    assert died == [name for name in names if "deadly" in name]
+    # Those in hand at a death are done one at a time, by one process until it dies and by one after it; then the
+    # processes work side by side again.
+    assert len({record["process"] for record in done.values() if "process" in record}) <= 3 * TOGETHER + 2 * 2
+    assert json.loads((tmp_path / "out" / "05-deadly.fix.json").read_text())["reason"] == "internal_error"
+
+
+def test_an_image_that_kills_dask_workers_is_given_up_and_the_others_are_done(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    dask = pytest.importorskip("dask")
+    names = ["00.png", "01-deadly.png", "02.png", "03.png"]
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
+        distributed.LocalCluster(1, processes=True, threads_per_worker=1, dashboard_address=None) as cluster,
+    ):
+        batch = Batch(cluster=cluster.scheduler_address, work=die_if_told)
+        done = outcomes(batch, tasks(tmp_path, names))
+    assert done["01-deadly.png"]["reason"] == "internal_error"
+    assert "workers that worked on it died" in done["01-deadly.png"]["message"]
+
+
+def test_a_scheduler_that_does_not_answer_is_bad_input(tmp_path, capsys, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("startrack.batch.run.CONNECT_S", 0.2)
+    frames(tmp_path / "images", 1)
+    out, nobody = str(tmp_path / "out"), "tcp://127.0.0.1:1"
+    assert main(["batch", str(tmp_path / "images"), "-D", out, "--cluster", nobody]) == 4
+    assert f"{nobody}: no Dask scheduler answers" in capsys.readouterr().err
+
+
+def test_a_scheduler_that_goes_stops_the_batch(tmp_path):
+    """It ends, as far as the client can tell, after the first outcome."""
+    distributed = pytest.importorskip("distributed")
+    todo = tasks(tmp_path, [f"{number:02d}.png" for number in range(200)])
+    with distributed.LocalCluster(1, processes=True, threads_per_worker=1, dashboard_address=None) as cluster:
+        results = Batch(cluster=cluster.scheduler_address, work=die_if_told).results(todo)
+        next(results)
+        cluster.close()
+        with pytest.raises(BatchStopped, match="the Dask scheduler has gone"):
+            list(results)
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("--cluster", "nonsense"), "not the address of a Dask scheduler"),
+        (("--cluster", "http://host:8786"), "not the address of a Dask scheduler"),
+        (("--cluster", "tcp://host:99999"), "not the address of a Dask scheduler"),
+        (("--cluster", "tcp://host:8786", "-j", "2"), "not allowed with"),
+    ],
+)
+def test_a_cluster_is_an_address_and_has_its_own_processes(tmp_path, capsys, flags, words):
+    with pytest.raises(SystemExit, match="2"):
+        main(["batch", str(tmp_path), *flags])
+    assert words in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_after_the_frames_in_hand_with_tables_of_what_is_done(tmp_path):
+    frames(tmp_path / "images", 400)
+    out = tmp_path / "out"
+    process = begun(tmp_path / "images", "-D", str(out), "-j", "2", "-O", "-v", "--no-plots")
+    assert process.stdout is not None
+    for _ in range(5):
+        process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    rest, err = process.communicate()
+    done = len(rest.splitlines()) + 5
+    assert process.returncode == 5
+    assert "finishing the images in hand" in err
+    assert f"interrupted: {done} of 400 images done, tables in {out}; the same command without -O goes on" in err
+    assert len(Table.read(out / "results.ecsv", format="ascii.ecsv")) == len(list(out.glob("*.fix.json"))) == done
+    assert not list(out.glob(".*"))
+
+
+def test_a_reader_that_goes_ends_the_batch_early(tmp_path):
+    frames(tmp_path / "images", 400)
+    process = begun(tmp_path / "images", "-D", str(tmp_path / "out"), "-j", "1", "--json", "--no-plots")
+    assert process.stdout is not None and process.stderr is not None
+    assert json.loads(process.stdout.readline())["image"] == "00.png"
+    process.stdout.close()
+    err = process.stderr.read()
+    assert process.wait() == 5
+    assert "nobody reads the output any more" in err
+    assert "Traceback" not in err
+
+
+def test_with_json_nothing_else_is_printed(tmp_path, capsys):
+    frames(tmp_path / "images", 2)
+    assert main(["batch", str(tmp_path / "images"), "-D", str(tmp_path / "out"), "-j", "1", "--json"]) == 5
+    streams = capsys.readouterr()
+    assert [json.loads(line)["image"] for line in streams.out.splitlines()] == ["00.png", "01.png"]
+    assert "2 images: 2 refused" in streams.err
+
+
+def test_a_full_disk_ends_the_batch_with_one_message(tmp_path):
+    """A limit on the size of files stands in for the disk's: once it is lifted, the same command goes on."""
+    frames(tmp_path / "images", 4)
+    flags = "-D", str(tmp_path / "out"), "-j", "1"
+    full = begun(tmp_path / "images", *flags, before="ulimit -f 8;")
+    out, err = full.communicate()
+    assert (full.returncode, out, len(err.splitlines())) == (5, "", 1)
+    assert "cannot be written (File too large): 0 of 4 images done" in err
+    assert main(["batch", str(tmp_path / "images"), *flags, "-q"]) == 5
+    assert len(Table.read(tmp_path / "out" / "results.ecsv", format="ascii.ecsv")) == 4
+
+
+def test_a_folder_that_cannot_be_written_is_said_at_once(tmp_path, capsys):
+    frames(tmp_path / "images", 1)
+    assert main(["batch", str(tmp_path / "images"), "-D", "/proc"]) == 4
+    assert "/proc: results cannot be written" in capsys.readouterr().err

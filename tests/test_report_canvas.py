@@ -12,7 +12,9 @@ from startrack.frames import Site
 from startrack.report.backdrop import View
 from startrack.report.canvas import Canvas, _overlap, printable, text_width, wrapped
 from startrack.report.minimap import distance_text, draw_overview, draw_zoom, map_view, nice_step
-from startrack.report.palette import MAP, POSITION, mixed
+from startrack.report.palette import MAP, PAPER, POSITION, mixed
+from startrack.report.relief import draw_contours, ground_on, shade
+from startrack.report.terrain_picture import relief_picture
 from startrack.types import Fix, Mode
 
 WHITE = (255, 255, 255)
@@ -156,6 +158,49 @@ class Ramp:
 
     def allowed(self, points_m: Any) -> Any:
         return points_m[..., 1] > -500.0
+
+
+def disc(points_m: Any) -> Any:
+    return np.hypot(points_m[..., 0], points_m[..., 1]) < 900.0
+
+
+def test_the_edge_of_the_ground_is_smooth():
+    terrain = Ramp(0.3)
+    object.__setattr__(terrain, "allowed", disc)
+    canvas = Canvas(601, 601)
+    view = map_view((0, 0, 600, 600), (0.0, 0.0), 1000.0)
+    shade(canvas, view, *ground_on(view, terrain, (601, 601)))
+    light = canvas.pixels.max(axis=-1).astype(float)
+    half = (light.max() + light[0, 0]) / 2
+    radii = []
+    for turn in np.linspace(0, 2 * np.pi, 180, endpoint=False):
+        along = np.arange(200.0, 300.0, 0.25)
+        xy = np.rint(300 + along[:, None] * [np.cos(turn), np.sin(turn)]).astype(int)
+        radii.append(along[light[xy[:, 1], xy[:, 0]] > half].max())
+    assert np.mean(radii) == pytest.approx(270.0, abs=1.0)  # 900 m
+    assert np.std(radii) < 0.7  # a cell is 2 px
+
+
+def test_contours_stand_at_their_heights_with_their_names():
+    terrain, canvas = Ramp(0.3), Canvas(601, 601)
+    view = map_view((0, 0, 600, 600), (0.0, 0.0), 1000.0)
+    ground_m, known = ground_on(view, terrain, (601, 601))
+    step_m = draw_contours(canvas, canvas, view, ground_m, known)
+    assert step_m == 50.0  # from -300 to 300 m
+    row = canvas.pixels[200].astype(int).sum(axis=-1)
+    lines = np.flatnonzero((row > sum(PAPER) + 60) & (row >= np.roll(row, 1)) & (row > np.roll(row, -1)))
+    np.testing.assert_allclose(lines[lines > 10], 300 + np.arange(-250, 300, 50), atol=1.0)  # a pixel is 1 m of height
+    assert {text.text for text in canvas._texts} == {str(height) for height in range(-250, 300, 50)}
+    for text in canvas._texts:  # each name stands on its own contour
+        assert text.xy[0] + text_width(text.text, text.size) / 2 == pytest.approx(300 + float(text.text), abs=1.5)
+    assert draw_contours(canvas, canvas, view, np.zeros_like(ground_m), known) is None
+
+
+def test_the_relief_picture_has_scales_and_contours():
+    flat, steep = (relief_picture(Ramp(rise)) for rise in (0.0, 0.3))
+    assert flat.shape == steep.shape
+    assert flat[-50:].max() > 100 and flat[:, :50].max() > 100  # numbers along both sides
+    assert np.abs(flat.astype(int) - steep).max() > 30
 
 
 def test_relief_is_lit_from_the_north_west():

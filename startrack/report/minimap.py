@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -20,13 +19,11 @@ from startrack.report.palette import (
     TRUTH,
     mixed,
 )
+from startrack.report.relief import ground_on, shade
 from startrack.terrain import Cylinder, Terrain
 from startrack.types import Array, Fix
 
 CIRCLE_RAD = np.linspace(0.0, 2 * np.pi, 181)
-SHADE_CELLS = 200
-GENTLE_SLOPE = 0.02  # gentler ground looks flat
-RELIEF_LIGHT = 3.0  # slopes that face the light, as a multiple of the floor's colour
 CAPTION_SIZE = 16.0
 
 
@@ -72,7 +69,7 @@ def draw_overview(
     if rim:
         window.circle(view.middle, rim / view.metres_per_px, FLOOR, -1)
     else:
-        _shade(window, view, terrain)
+        shade(window, view, *ground_on(view, terrain, (window.size[1], window.size[0])))
     _grid(window, view)
     if rim:
         window.circle(view.middle, rim / view.metres_per_px, DIM_INK, 2)
@@ -144,11 +141,17 @@ def _ellipse(centre_m: tuple[float, float], covariance_m2: Array) -> Array:
     return np.asarray(centre_m) + (_ring((0.0, 0.0), 1.0) * half_m) @ axes.T
 
 
-def _grid(window: Canvas, view: MapView) -> None:
+def grid_lines_m(view: MapView, axis: int) -> Array:
+    """Where the grid's lines stand [m], east (axis 0) or north (1)."""
     step = nice_step(0.7 * float(view.half_m.min()))
+    low, high = view.centre_m[axis] - view.half_m[axis], view.centre_m[axis] + view.half_m[axis]
+    return np.arange(np.ceil(low / step), high / step) * step
+
+
+def _grid(window: Canvas, view: MapView) -> None:
     low, high = view.centre_m - view.half_m, view.centre_m + view.half_m
     for axis in (0, 1):
-        for value in np.arange(np.ceil(low[axis] / step), high[axis] / step) * step:
+        for value in grid_lines_m(view, axis):
             ends = np.array([low, high])
             ends[:, axis] = value
             window.line(view.at(ends), GRID)
@@ -164,19 +167,3 @@ def _furniture(canvas: Canvas, view: MapView, caption: str) -> None:
     x, y = right - 14 - length, bottom - 14
     canvas.line([(x, y - 6), (x, y), (x + length, y), (x + length, y - 6)], INK, 2)
     canvas.text((x + length / 2, y - 10), distance_text(length_m), CAPTION_SIZE, INK, "ms", halo=True)
-
-
-def _shade(window: Canvas, view: MapView, terrain: Terrain) -> None:
-    """The ground's relief, lit from the north-west as maps are; black where there is no ground."""
-    x, y = (np.linspace(-half, half, SHADE_CELLS) for half in view.half_m)
-    points_m = np.stack(np.meshgrid(x, y[::-1]), axis=-1)
-    known = np.asarray(terrain.allowed(points_m.reshape(-1, 2)), dtype=bool)
-    ground_m = np.zeros(len(known))
-    ground_m[known] = terrain.ground_m(points_m.reshape(-1, 2)[known])
-    slope_north, slope_east = np.gradient(ground_m.reshape(SHADE_CELLS, SHADE_CELLS), y[::-1], x)
-    facing = (slope_east - slope_north) * known.reshape(SHADE_CELLS, SHADE_CELLS)
-    steep = max(float(np.percentile(np.abs(facing), 95)), GENTLE_SLOPE)
-    light = np.maximum(0.5 + 0.5 * np.tanh(1.2 * facing / steep), 0.05) * known.reshape(SHADE_CELLS, SHADE_CELLS)
-    height, width = window.pixels.shape[:2]
-    shade = cv2.resize(light.astype(np.float32), (width, height))[:, :, None]
-    window.pixels[:] = (np.array(MAP) + shade * (RELIEF_LIGHT * np.array(FLOOR) - MAP)).astype(np.uint8)

@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.report.canvas import Box, Canvas
-from startrack.report.minimap import draw_overview, nice_step
+from startrack.report.canvas import Box, Canvas, around
+from startrack.report.minimap import CAPTION_SIZE, MapView, draw_overview, grid_lines_m, nice_step
 from startrack.report.palette import DIM_INK, FAINT_INK, FLOOR, GRID, INK, MAP, POSITION, SKYLINE
-from startrack.terrain import Terrain
+from startrack.report.relief import draw_contours, ground_on
+from startrack.terrain import Cylinder, Terrain
 from startrack.types import Array
 
 SIZE_PX = 900
+LEFT_PX, BELOW_PX = 56.0, 52.0  # beside the map, for its scales
 PANORAMA_PX = (1440, 420)
 MARGIN_PX = 56.0
 TEXT_PX = 17.0
@@ -20,14 +22,36 @@ COMPASS = {0: "N", 90: "E", 180: "S", 270: "W"}
 
 
 def relief_picture(terrain: Terrain, place_m: tuple[float, float] | None = None) -> NDArray[np.uint8]:
-    """The relief (H, W, 3), lit from the north-west, with the search area dashed and the place, if any."""
-    canvas = Canvas(SIZE_PX, SIZE_PX)
-    view = draw_overview(canvas, (8.0, 8.0, SIZE_PX - 9.0, SIZE_PX - 9.0), terrain, None, False, None)
+    """The relief (H, W, 3), lit from the north-west, with contours, the search area dashed, and the place, if any."""
+    canvas = Canvas(SIZE_PX + round(LEFT_PX), SIZE_PX + round(BELOW_PX))
+    box = (LEFT_PX, 8.0, LEFT_PX + SIZE_PX - 9.0, SIZE_PX - 1.0)
+    view = draw_overview(canvas, box, terrain, None, False, None)
+    canvas.text((box[2] - 13.0, box[1] + 12.0), terrain.name, TEXT_PX, INK, "rt", halo=True)
     if place_m is not None:
         canvas.circle(view.at(place_m), 6.0, POSITION, -1)
         canvas.circle(view.at(place_m), 11.0, POSITION, 2)
-    canvas.text((SIZE_PX - 22.0, 20.0), terrain.name, TEXT_PX, INK, "rt", halo=True)
+        canvas.keep_free(around(view.at(place_m), 14.0))
+    _metres(canvas, view)
+    if not isinstance(terrain, Cylinder):
+        window = canvas.window(box)
+        step_m = draw_contours(canvas, window, view, *ground_on(view, terrain, (window.size[1], window.size[0])))
+        if step_m is not None:
+            words = f"contours each {step_m:g} m, heights above the origin"
+            canvas.text((box[0] + 12.0, box[3] - 14.0), words, CAPTION_SIZE, DIM_INK, "ls", halo=True)
     return canvas.finished()
+
+
+def _metres(canvas: Canvas, view: MapView) -> None:
+    """East and north of the grid's lines, outside of the map."""
+    left, _, right, bottom = view.box
+    unit, metres = ("km", 1000.0) if float(view.half_m.min()) >= 2000.0 else ("m", 1.0)
+    for east_m in grid_lines_m(view, 0):
+        x = float(view.at((east_m, 0.0))[0])
+        canvas.text((x, bottom + 8), f"{east_m / metres:g}", TEXT_PX, DIM_INK, "mt")
+    for north_m in grid_lines_m(view, 1):
+        y = float(view.at((0.0, north_m))[1])
+        canvas.text((left - 8, y), f"{north_m / metres:g}", TEXT_PX, DIM_INK, "rm")
+    canvas.text(((left + right) / 2, bottom + 28), f"east and north of the origin [{unit}]", TEXT_PX, DIM_INK, "mt")
 
 
 def panorama_picture(terrain: Terrain, place_m: tuple[float, float]) -> NDArray[np.uint8]:

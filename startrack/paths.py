@@ -1,8 +1,9 @@
-"""Where the shipped catalogues, cameras and terrains lie, in a wheel as in a checkout."""
+"""Where the shipped catalogues, cameras and terrains lie, in a wheel as in a checkout; and folders for results."""
 
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 
 from startrack.errors import BadInput
@@ -36,4 +37,21 @@ def resolve_named(name_or_path: str | Path, kind: str, reason: str) -> Path:
     if not path.is_file():
         shipped = ", ".join(sorted(p.stem for p in data_dir(kind).glob("*.toml")))
         raise BadInput(reason, f"no shipped file is called {name_or_path!r}; shipped: {shipped}; a path ends in .toml")
+    return path
+
+
+def made_folder(folder: str | Path, reason: str = "bad_image") -> Path:
+    """A folder for results, made and found to take files before anything is computed.
+
+    Raises BadInput (bad_image, for lack of a better code) where nothing can be written there.
+    """
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as cause:
+        raise BadInput(
+            reason, f"{path}: results cannot be written to this folder ({cause.strerror}): choose another"
+        ) from cause
     return path

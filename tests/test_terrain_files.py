@@ -12,7 +12,7 @@ import tomli_w
 
 from startrack.cli.main import main
 from startrack.paths import data_dir
-from startrack.terrain import load_terrain
+from startrack.terrain import cache, load_terrain
 from startrack.terrain.dem import HeightTerrain
 from startrack.terrain.geotiff import write_map
 from startrack.terrain.heightmap import HeightMap
@@ -259,6 +259,119 @@ def test_import_show_and_build(tmp_path, capsys):
     for file in facts["files"]:
         assert np.asarray(Image.open(file)).std() > 5
     assert main(["terrain", "show", str(made), "--at", "9000", "0", "--no-plots"]) == 4
+
+
+IMPORT = ["--latitude", "-90", "--longitude", "0", "--radius", "500", "--half", "2500"]
+
+
+def whole_numbers(path: Path, unit: str | None = None) -> None:
+    """The hill in half metres, as a map that has lost its scale."""
+    rasterio = pytest.importorskip("rasterio")
+    m = hill()
+    wkt = rasterio.crs.CRS.from_proj4("+proj=stere +lat_0=-90 +lon_0=0 +R=1737400 +units=m")
+    move = rasterio.transform.from_origin(m.x0_m - 50, m.y0_m + 50, 100, 100)
+    with rasterio.open(
+        path, "w", driver="GTiff", height=61, width=61, count=1, dtype="int16", crs=wkt, transform=move
+    ) as file:  # fmt: skip
+        file.write(np.rint(m.heights_m / 0.5).astype(np.int16), 1)
+        if unit:
+            file.units = (unit,)
+
+
+def test_whole_numbers_without_a_scale_are_not_taken_for_metres(tmp_path, capsys):
+    whole_numbers(tmp_path / "src.tif")
+    words = ["terrain", "import", str(tmp_path / "src.tif"), "-o", str(tmp_path / "mine.toml"), *IMPORT]
+    assert main(words) == 4
+    assert "--scale" in capsys.readouterr().err
+    assert not (tmp_path / "mine.toml").exists()
+    assert main([*words, "--scale", "0.5", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["maps"][0]["highest_m"] == pytest.approx(800, abs=5)
+    whole_numbers(tmp_path / "said.tif", "metre")
+    assert read_map(tmp_path / "said.tif").heights_m.max() == pytest.approx(1600, abs=5)
+
+
+def test_the_error_of_posts_is_told_by_the_map_where_nobody_says(tmp_path, capsys):
+    """Rough ground known everywhere: what import takes for a grid is what lies between its posts, within a third."""
+    rng = np.random.default_rng(3)
+    wave = np.hypot(*np.meshgrid(np.fft.fftfreq(1025), np.fft.fftfreq(1025)))
+    wave[0, 0] = np.inf
+    ground = np.fft.ifft2(np.fft.fft2(rng.normal(size=wave.shape)) * wave**-1.8).real
+    ground *= 300 / ground.std()
+    taken = {}
+    for every in (8, 32, 128):
+        posts = ground[::every, ::every]
+        n = len(posts)
+        post_m, half = 10.0 * every, 5.0 * every * (n - 1)
+        made = replace(hill(), heights_m=posts.astype(np.float32), x0_m=-half, y0_m=half, dx_m=post_m, dy_m=-post_m)
+        write_map(tmp_path / f"{every}.tif", made)
+        words = ["--latitude", "-90", "--longitude", "0", "--radius", "2000", "--half", "6000", "--json"]
+        out = str(tmp_path / f"mine{every}.toml")
+        assert main(["terrain", "import", str(tmp_path / f"{every}.tif"), "-o", out, *words]) == 0
+        facts = json.loads(capsys.readouterr().out)
+        assert facts["sigma_from"] == "map"
+        assert bool(facts["warnings"]) == (every == 128)
+        half_way = every // 2
+        middle = 0.5 * (posts[:, 1:] + posts[:, :-1])
+        true = float(np.sqrt(np.mean((ground[::every, half_way::every][:, : n - 1] - middle) ** 2)))
+        taken[every] = facts["height_sigma_m"] / true
+    assert all(0.66 < ratio < 1.5 for ratio in taken.values()), taken
+
+
+def test_pixels_given_for_the_label_are_said_to_be(tmp_path, capfd):
+    pytest.importorskip("rasterio")
+    from PIL import Image
+
+    (tmp_path / "HILL.IMG").write_bytes(bytes(61 * 61 * 2))
+    with pytest.raises(BadInput, match=r"HILL\.LBL"):
+        read_map(tmp_path / "HILL.IMG")
+    Image.fromarray(np.zeros((40, 40), dtype=np.uint8)).save(tmp_path / "plain.png")
+    with pytest.raises(BadInput, match="where on the Moon"):
+        read_map(tmp_path / "plain.png")
+    assert capfd.readouterr().err == ""
+
+
+def test_show_speaks_in_words_and_units(tmp_path, capsys):
+    path = terrain_file(tmp_path)
+    assert main(["terrain", "show", str(path), "--no-plots", "--at", "100", "-50"]) == 0
+    said = capsys.readouterr().out
+    for words in ("90.00000 S", "within 800 m", "61 x 61 posts, 100 m apart", "2 m", "E 100 m, N -50 m", "degrees"):
+        assert words in said
+    assert "None" not in said
+    assert not {"[", "{"} & set(said)
+    assert main(["terrain", "show", "shackleton-thesis", "--no-plots"]) == 0
+    assert "20000 m across and 2000 m deep" in capsys.readouterr().out
+
+
+def test_a_folder_that_takes_no_pictures_is_named_before_any_work(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    for out in ("/proc", str(tmp_path / "file" / "below")):
+        assert main(["terrain", "show", "shackleton-thesis", "-D", out]) == 4
+        said = capsys.readouterr().err
+        assert out in said
+        assert "written to this folder" in said
+
+
+def test_a_build_says_so_in_one_line_and_an_interrupted_one_is_forgotten(tmp_path, capsys, monkeypatch):
+    path = terrain_file(tmp_path)
+    terrain = load_terrain(path)
+    assert isinstance(terrain, HeightTerrain)
+
+    def interrupted(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        terrain.prepared(interrupted)
+    table = cache.path_of(cache.key_of(terrain))
+    assert not list(table.parent.iterdir())
+    table.with_suffix(".lock").touch()  # left by one that was killed
+    assert main(["terrain", "build", str(path), "--json"]) == 0
+    heard = capsys.readouterr()
+    assert json.loads(heard.out)["known_before"] is False
+    assert len(heard.err.splitlines()) == 1
+    assert "hill: worked out now, once" in heard.err
+    assert [one.suffix for one in table.parent.iterdir()] == [".npz"]
+    assert main(["terrain", "build", str(path), "-q", "--force"]) == 0
+    assert capsys.readouterr().err == ""
 
 
 def test_every_shipped_map_is_named_with_its_source():

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from startrack.cli.flag_types import positive
 from startrack.errors import INTERNAL_ERROR, BadInput
+from startrack.paths import made_folder as made_folder
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
@@ -36,15 +37,6 @@ def add_fact_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-c", "--camera", metavar="FILE", help="camera file, or the name of a shipped one")
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601")
     parser.add_argument("--exposure", type=positive, metavar="S", help="exposure time in seconds")
-
-
-def made_folder(path: str) -> Path:
-    """The folder of the results, made before anything is computed. Raises BadInput where it cannot be."""
-    try:
-        Path(path).mkdir(parents=True, exist_ok=True)
-    except OSError as cause:
-        raise BadInput("bad_image", f"{path}: results cannot be written there: {cause.strerror}") from cause
-    return Path(path)
 
 
 def cores() -> int:

@@ -1,4 +1,4 @@
-"""A height map's horizons, worked out before they are needed: with a bar on a terminal, and told with -v."""
+"""A height map's horizons, worked out before they are needed: with a bar on a terminal, else told in a line."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def ready(terrain: Terrain, args: argparse.Namespace) -> None:
 
     if not isinstance(terrain, HeightTerrain) or terrain.is_prepared:
         return
-    with _told(args.verbose):
+    with _told(args):
         if args.quiet or not sys.stderr.isatty():
             terrain.prepared()
             return
@@ -45,16 +45,16 @@ def ready(terrain: Terrain, args: argparse.Namespace) -> None:
 
 
 @contextmanager
-def _told(verbose: int) -> Iterator[None]:
-    """While this lasts, what the terrain logs goes to stderr."""
-    if not verbose:
+def _told(args: argparse.Namespace) -> Iterator[None]:
+    """While this lasts, what the terrain logs goes to stderr: that it begins or waits, and with -v where it is kept."""
+    if args.quiet or (sys.stderr.isatty() and not args.verbose):  # a terminal has the bar
         yield
         return
-    log, handler = logging.getLogger("startrack.terrain"), logging.StreamHandler()
+    log, handler = logging.getLogger("startrack.terrain"), logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(message)s"))
     level = log.level
     log.addHandler(handler)
-    log.setLevel(logging.INFO)
+    log.setLevel(logging.DEBUG if args.verbose else logging.INFO)
     try:
         yield
     finally:

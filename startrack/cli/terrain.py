@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from dataclasses import replace
 from math import radians
@@ -12,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import DEFAULT_OUT
 from startrack.cli.horizons import ready
-from startrack.errors import BadInput
+from startrack.cli.terrain_facts import dem_class, facts_of, lines_of, seen_from
+from startrack.paths import made_folder
 
 if TYPE_CHECKING:
     from startrack.terrain import Terrain
-    from startrack.terrain.dem import HeightTerrain
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -46,12 +47,15 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="half side of each map's crop (30000 for the first, then 300000)",
     )
     made.add_argument(
-        "--scale", nargs="+", type=float, metavar="M", help="metres per unit of each map, where the files do not say"
-    )
+        "--scale", nargs="+", type=float, metavar="M",
+        help="metres per unit of each map; needed for whole numbers where the files do not say",
+    )  # fmt: skip
     made.add_argument(
         "--offset", nargs="+", type=float, metavar="M", help="height of value 0 of each map, where the files do not say"
     )
-    made.add_argument("--sigma", type=float, default=1.0, metavar="M", help="error of single posts (%(default)g)")
+    made.add_argument(
+        "--sigma", type=float, metavar="M", help="error of single posts (what the map's own roughness lets expect)"
+    )
     made.add_argument("--camera-height", type=float, default=1.5, metavar="M", help="above the ground (%(default)g)")
     for action in (show, build, made):
         action.add_argument("--json", action="store_true", help="print one JSON object per terrain")
@@ -73,75 +77,17 @@ def _show(args: argparse.Namespace) -> int:
 
     terrain = load_terrain(args.terrain)
     place = None if args.at is None else (args.at[0], args.at[1])
-    facts = _facts(terrain) | _seen_from(terrain, place)
+    facts = facts_of(terrain) | seen_from(terrain, place)
     if not args.no_plots:
         facts["files"] = [str(path) for path in _pictures(args, terrain, place)]
     _tell(args, facts)
     return 0
 
 
-def _facts(terrain: Terrain) -> dict[str, Any]:
-    from math import degrees
-
-    site = terrain.site
-    facts: dict[str, Any] = {
-        "name": terrain.name,
-        "body": site.body,
-        "latitude_deg": round(degrees(site.latitude_rad), 6),
-        "longitude_deg": round(degrees(site.longitude_rad), 6),
-        "search_radius_m": terrain.search_radius_m,
-        "camera_height_m": terrain.camera_height_m,
-    }
-    return facts | (_map_facts(terrain) if _is_dem(terrain) else {"kind": "cylinder"})
-
-
-def _map_facts(terrain: Any) -> dict[str, Any]:
-    from startrack.terrain import cache
-    from startrack.terrain.projection import NAMES
-
-    maps = [
-        {
-            "file": m.source, "posts": list(m.heights_m.shape), "post_m": round(m.post_m, 3),
-            "projection": NAMES[m.projection.kind], "lowest_m": round(float(m.heights_m.min()), 1),
-            "highest_m": round(float(m.heights_m.max()), 1),
-        }
-        for m in terrain.maps
-    ]  # fmt: skip
-    path = cache.path_of(cache.key_of(terrain))
-    return {
-        "kind": "dem", "maps": maps, "height_sigma_m": terrain.height_sigma_m, "horizons": str(path),
-        "horizons_ready": path.is_file(),
-    }  # fmt: skip
-
-
-def _seen_from(terrain: Terrain, place: tuple[float, float] | None) -> dict[str, Any]:
-    if place is None:
-        return {}
-    import numpy as np
-
-    from startrack.frames import latlon_from_enu
-
-    point = np.array([place])
-    if not terrain.allowed(point)[0]:
-        raise BadInput("bad_terrain", f"E {place[0]:g} m, N {place[1]:g} m is outside what the terrain knows")
-    ground = float(terrain.ground_m(point)[0])
-    horizon = np.degrees(terrain.horizon_rad(point, np.radians(np.arange(720) / 2)))
-    lat, lon = latlon_from_enu(terrain.site, *place, ground)
-    return {
-        "east_m": place[0], "north_m": place[1], "ground_m": round(ground, 2),
-        "place_latitude_deg": round(float(np.degrees(lat)), 6), "place_longitude_deg": round(float(np.degrees(lon)), 6),
-        "horizon_min_deg": round(float(horizon.min()), 3), "horizon_max_deg": round(float(horizon.max()), 3),
-    }  # fmt: skip
-
-
 def _pictures(args: argparse.Namespace, terrain: Terrain, place: tuple[float, float] | None) -> list[Path]:
     from startrack.report.terrain_picture import panorama_picture, relief_picture
 
-    out = Path(args.dir)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as cause:
-        raise BadInput("bad_terrain", f"{out}: pictures cannot be written there: {cause.strerror}") from cause
+    out = made_folder(args.dir, "bad_terrain")
     pictures = {out / f"{terrain.name}.relief.png": relief_picture(terrain, place)}
     if place is not None:
         pictures[out / f"{terrain.name}.horizon.png"] = panorama_picture(terrain, place)
@@ -158,7 +104,7 @@ def _build(args: argparse.Namespace) -> int:
     for name in args.terrain:
         terrain = load_terrain(name)
         facts: dict[str, Any] = {"name": terrain.name}
-        if isinstance(terrain, _dem_class()):
+        if isinstance(terrain, dem_class()):
             path = cache.path_of(cache.key_of(terrain))
             if args.force:
                 path.unlink(missing_ok=True)
@@ -174,7 +120,8 @@ def _build(args: argparse.Namespace) -> int:
 
 
 def _import(args: argparse.Namespace) -> int:
-    from startrack.terrain.imported import import_maps
+    from startrack.terrain import load_terrain
+    from startrack.terrain.imported import coarseness, import_maps
 
     half = list(args.half or [])
     half += [30_000.0 if not half and k == 0 else 300_000.0 for k in range(len(half), len(args.maps))]
@@ -183,30 +130,16 @@ def _import(args: argparse.Namespace) -> int:
         radius_m=args.radius, scale=args.scale or (), offset_m=args.offset or (), height_sigma_m=args.sigma,
         camera_height_m=args.camera_height, overwrite=args.overwrite,
     )  # fmt: skip
-    from startrack.terrain import load_terrain
-
-    _tell(args, _facts(load_terrain(path)) | {"file": str(path)})
+    terrain = load_terrain(path)
+    facts = facts_of(terrain) | {"sigma_from": "map" if args.sigma is None else "flag"}
+    _tell(args, facts | {"files": [str(path)], "warnings": coarseness(terrain)})
     return 0
 
 
 def _tell(args: argparse.Namespace, facts: dict[str, Any]) -> None:
+    for warning in () if args.quiet else facts.get("warnings", ()):
+        print(f"{facts['name']}: {warning}", file=sys.stderr, flush=True)
     if args.json:
         print(json.dumps({"format": "startrack.terrain/1", **facts}), flush=True)
     elif not args.quiet:
-        print(facts["name"])
-        for key, value in facts.items():
-            if key == "maps":
-                for m in value:
-                    print(f"  map  {'  '.join(f'{k} {v}' for k, v in m.items())}")
-            elif key != "name":
-                print(f"  {key}  {value}", flush=True)
-
-
-def _dem_class() -> type[HeightTerrain]:
-    from startrack.terrain.dem import HeightTerrain
-
-    return HeightTerrain
-
-
-def _is_dem(terrain: Terrain) -> bool:
-    return isinstance(terrain, _dem_class())
+        print("\n".join(lines_of(facts)), flush=True)

@@ -208,7 +208,7 @@ def _mover(camera: Camera, R: Array, free: tuple[str, ...]) -> Callable[[Array],
             if name == "scale":
                 focal = focal * float(np.exp(rest.pop(0)))
             elif name == "shape":
-                lens = Family(float(np.clip(lens.shape + rest.pop(0), -1.2, 1.2)))  # type: ignore[attr-defined]
+                lens = Family(float(np.clip(_shape(lens) + rest.pop(0), -1.2, 1.2)))
             elif name == "centre":
                 centre = (centre[0] + rest.pop(0) * camera.focal_px[0], centre[1] + rest.pop(0) * camera.focal_px[0])
             else:
@@ -216,6 +216,12 @@ def _mover(camera: Camera, R: Array, free: tuple[str, ...]) -> Callable[[Array],
         return replace(camera, focal_px=(focal, focal), centre_px=centre, lens=lens), rotation(p[:3]) @ R
 
     return moved
+
+
+def _shape(lens: Lens) -> float:
+    """Shape number of a lens of the family: no other has one to be fitted."""
+    assert isinstance(lens, Family)
+    return lens.shape
 
 
 def _prior(camera: Camera, prior: Camera, free: tuple[str, ...]) -> tuple[Array, Array]:
@@ -227,7 +233,7 @@ def _prior(camera: Camera, prior: Camera, free: tuple[str, ...]) -> tuple[Array,
             value.append(float(np.log(prior.focal_px[0] / camera.focal_px[0])))
         elif name == "shape":
             weight.append(SHAPE_SIGMA**-2)
-            value.append(prior.lens.shape - camera.lens.shape)  # type: ignore[attr-defined]
+            value.append(_shape(prior.lens) - _shape(camera.lens))
         elif name == "centre":
             weight += [CENTRE_SIGMA**-2] * 2
             value += [(a - b) / camera.focal_px[0] for a, b in zip(prior.centre_px, camera.centre_px, strict=True)]

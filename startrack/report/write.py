@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from startrack.errors import BadInput
 from startrack.exposure import write_atomically
+from startrack.paths import made_folder
 
 if TYPE_CHECKING:
     from startrack.result import Result
@@ -29,11 +30,11 @@ def make_way(path: Path, sha256: str, *, overwrite: bool, remedy: str) -> None:
     The record of the same image is there to be renewed; one of another image is kept unless `overwrite`. Raises
     BadInput (bad_image, for lack of a better code) with the `remedy`, or where nothing can be written.
     """
+    made_folder(path.parent)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         before = json.loads(path.read_text(encoding="utf-8")) if path.exists() and not overwrite else None
     except OSError as cause:
-        raise BadInput("bad_image", f"{path}: results cannot be written there: {cause.strerror}") from cause
+        raise BadInput("bad_image", f"{path}: cannot be read, nor replaced: {cause.strerror}") from cause
     except ValueError:  # no JSON: not ours
         before = {}
     if before is not None and not _is_of(before, sha256):

@@ -12,20 +12,12 @@ import numpy as np
 
 from startrack.frames import Site
 from startrack.terrain import cache, tracing
+from startrack.terrain.crests import CrestErrors
 from startrack.terrain.ground import Ground, ground_up_m, packed
 from startrack.terrain.heightmap import HeightMap
 from startrack.terrain.nearby import ACROSS, Nearby
 from startrack.terrain.protocol import Terrain
-from startrack.terrain.table import (
-    ANGLE_STEP_RAD,
-    BEST,
-    BINS,
-    DISTANCE_STEP_M,
-    HorizonTable,
-    Progress,
-    Square,
-    built,
-)
+from startrack.terrain.table import BINS, HorizonTable, Progress, Square, built
 from startrack.terrain.tracing import Tracer
 from startrack.types import Array, BadInput, Bools, Ints
 
@@ -88,7 +80,7 @@ class HeightTerrain:
         """
         if not self.height_sigma_m and not self.horizon_sigma_common_rad:
             return 0.0
-        own = float(np.median(self._cell_sigma_rad[self._searched])) if self.height_sigma_m else 0.0
+        own = float(np.median(self._crests.cells_rad[self._searched])) if self.height_sigma_m else 0.0
         said = self.horizon_sigma_common_rad
         return float(np.hypot(own, COMMON_PER_POST * own if said is None else said))
 
@@ -133,12 +125,12 @@ class HeightTerrain:
         return self._state[self._key]  # type: ignore[no-any-return]
 
     def _made(self, progress: Progress | None) -> HorizonTable:
-        LOG.info("horizons of %s: worked out once, this takes a minute or two", self.name)
+        LOG.info("horizons of %s: worked out now, once; this takes a minute or two", self.name)
         start = clock.perf_counter()
         table = self._built(progress)
         path = cache.save(self._key, table)
         where = f"kept in {path}" if path else f"not kept: {cache.cache_dir()} cannot be written"
-        LOG.info("horizons of %s: done in %.0f s, %s", self.name, clock.perf_counter() - start, where)
+        LOG.debug("horizons of %s: done in %.0f s, %s", self.name, clock.perf_counter() - start, where)
         return table
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
@@ -171,51 +163,19 @@ class HeightTerrain:
 
     def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """From the height of the single post that makes the horizon: sigma cos^2 H / its distance."""
-        shape = np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
         if self.height_sigma_m == 0:
-            return np.zeros(shape)
-        table = self.prepared()
-        n, side = table.square.across, 2 * table.square.half_m
-        cell = np.clip((np.asarray(points_m) + table.square.reach_m) / side, 0, n - 1).astype(np.int64)
-        b = (np.asarray(azimuths_rad) / (2 * np.pi) * BINS).astype(np.int64) % BINS
-        index = np.broadcast_to((cell[..., 0] * n + cell[..., 1]) * BINS + b, shape)
-        return np.asarray(self._cell_sigma_rad.ravel()[index])
+            return np.zeros(np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad)))
+        return self._crests.at(points_m, azimuths_rad)
 
     def most_sigma_rad(self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float) -> Array:
-        """The largest `horizon_sigma_rad` (n,) over boxes and azimuths: it changes from cell to cell of the table."""
-        shape = np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad))
+        """The largest `horizon_sigma_rad` (n,) over boxes and azimuths."""
         if self.height_sigma_m == 0:
-            return np.zeros(shape)
-        square = self.prepared().square
-        level = tracing.level_for(self.prepared(), half_m)
-        most = self._most_sigma_rad[level]
-        n, side = len(most), 2 * square.reach_m / len(most)
-        steps = 2 + int(2 * azimuth_half_rad * BINS / (2 * np.pi)) if azimuth_half_rad > 0 else 1
-        found = np.zeros(shape)
-        for turn in np.linspace(-azimuth_half_rad, azimuth_half_rad, steps) * (1 - 1e-9):
-            b = np.floor((np.asarray(azimuths_rad) + turn) / (2 * np.pi) * BINS).astype(np.int64) % BINS
-            for corner in half_m * (1 - 1e-9) * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]):
-                cell = np.clip((np.asarray(centres_m) + corner + square.reach_m) / side, 0, n - 1).astype(np.int64)
-                found = np.maximum(found, most[cell[..., 0], cell[..., 1], b])
-        return found
+            return np.zeros(np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad)))
+        return self._crests.most(centres_m, half_m, azimuths_rad, azimuth_half_rad)
 
     @cached_property
-    def _most_sigma_rad(self) -> list[Array]:
-        """(m, m, BINS) the largest sigma of the cells, then of ever larger blocks of them."""
-        n = self.square.across
-        levels = [self._cell_sigma_rad.reshape(n, n, BINS)]
-        while len(levels[-1]) > 1:
-            a = levels[-1]
-            levels.append(np.maximum(np.maximum(a[::2, ::2], a[1::2, ::2]), np.maximum(a[::2, 1::2], a[1::2, 1::2])))
-        return levels
-
-    @cached_property
-    def _cell_sigma_rad(self) -> Array:
-        """(cells, BINS)."""
-        values = self.prepared().values
-        distance = np.maximum(values[..., BEST].astype(np.float32) * DISTANCE_STEP_M, 50.0)
-        middle = (values[..., 0].astype(np.float32) + values[..., 1]) / 2 * ANGLE_STEP_RAD - np.pi / 2
-        return np.asarray(self.height_sigma_m * np.cos(middle) ** 2 / distance)
+    def _crests(self) -> CrestErrors:
+        return CrestErrors(self.prepared(), self.height_sigma_m)
 
     def ground_m(self, points_m: Array) -> Array:
         """Height of the ground in enu (...) [m]."""

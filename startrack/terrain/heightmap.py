@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,10 +35,6 @@ class HeightMap:
             latitude = (middle - self.projection.false_y_m) / (self.projection.radius_m * self.projection.scale_y)
             stretch = np.array([np.cos(latitude) / self.projection.scale, 1 / self.projection.scale_y])
         return float(np.max(np.abs([self.dx_m, self.dy_m]) * stretch))
-
-    @cached_property
-    def has_holes(self) -> bool:
-        return bool(np.isnan(self.heights_m).any())
 
     def xy(self, row_column: Array) -> tuple[Array, Array]:
         """Map coordinates x, y (...) [m] of fractional rows and columns (..., 2)."""

@@ -9,19 +9,26 @@ from pathlib import Path
 import numpy as np
 
 from startrack.terrain.geotiff import write_map
+from startrack.terrain.heightmap import HeightMap
+from startrack.terrain.protocol import Terrain
 from startrack.terrain.rasters import read_map
+from startrack.terrain.roughness import error_between_posts_m
 from startrack.types import BadInput
+
+RIM_RADII = 1.5  # of the search area: so far away most of the rim stands
+COARSE_PART = 0.2  # of the search radius
 
 
 def import_maps(
     maps: Sequence[str | Path], output: str | Path, *, latitude_rad: float, longitude_rad: float,
     half_m: Sequence[float], radius_m: float, scale: Sequence[float] = (), offset_m: Sequence[float] = (),
-    height_sigma_m: float = 1.0, camera_height_m: float = 1.5, overwrite: bool = False,
+    height_sigma_m: float | None = None, camera_height_m: float = 1.5, overwrite: bool = False,
 ) -> Path:  # fmt: skip
     """Write the terrain file and, beside it, a crop of each map, NAME-1.tif the finest; the terrain file's path.
 
     half_m: half the side of each crop about the origin [m]. scale and offset_m of each map, the finest first, where the
-    files themselves do not say. Raises BadInput bad_terrain: nothing is then written.
+    files themselves do not say. height_sigma_m: None takes what the roughness of the map that makes the horizon lets
+    expect between its posts. Raises BadInput bad_terrain: nothing is then written.
     """
     import tomli_w
 
@@ -45,10 +52,11 @@ def import_maps(
         if min(crop.heights_m.shape) < 2:
             raise BadInput("bad_terrain", f"{source}: it does not reach {latitude_deg:g}, {longitude_deg:g}")
         crops.append(replace(crop, source=Path(source).name))
+    sigma_m = _sigma_m(crops, radius_m) if height_sigma_m is None else float(height_sigma_m)
     d = {
         "format": 1, "name": output.stem, "body": "moon",
         "origin": {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg},
-        "dem": {"file": [path.name for path in files], "height_sigma_m": float(height_sigma_m)},
+        "dem": {"file": [path.name for path in files], "height_sigma_m": sigma_m},
         "rover": {"camera_height_m": float(camera_height_m)}, "search": {"radius_m": float(radius_m)},
     }  # fmt: skip
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -64,3 +72,20 @@ def import_maps(
             path.unlink(missing_ok=True)
         raise
     return output
+
+
+def _sigma_m(crops: Sequence[HeightMap], radius_m: float) -> float:
+    """Error of single posts [m], two digits of it: of the finest map that may hold the rim, or of the last."""
+    rims = [crop for crop in crops if 0.5 * min(crop.heights_m.shape) * crop.post_m >= RIM_RADII * radius_m]
+    return float(f"{error_between_posts_m((rims or crops[-1:])[0]):.2g}")
+
+
+def coarseness(terrain: Terrain) -> list[str]:
+    """A warning where the posts stand so far apart that the search area has hardly any shape."""
+    post_m = getattr(terrain, "finest_post_m", 0.0)
+    if post_m <= COARSE_PART * terrain.search_radius_m:
+        return []
+    return [
+        f"posts are {post_m:.0f} m apart in a search area of {terrain.search_radius_m:.0f} m: such a map hardly tells "
+        "one place from another; give a finer one"
+    ]

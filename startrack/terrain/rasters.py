@@ -17,6 +17,7 @@ from startrack.terrain.projection import EQUIRECTANGULAR, ORTHOGRAPHIC, STEREOGR
 from startrack.types import Array, BadInput
 
 MOST_PIXELS = 200_000_000
+METRES = {"m", "meter", "meters", "metre", "metres"}
 HALF_WINDOW_M = 300_000.0  # so far from the origin ground can matter: a 10 km mountain is at the horizontal
 RADIUS_LIKE_M = 1_000_000.0  # heights like this are counted from the Moon's centre
 STEREOGRAPHIC_CODES, ORTHOGRAPHIC_CODE, EQUIRECTANGULAR_CODE = (14, 15, 16), 21, 17  # GeoTIFF 1.1, annex
@@ -39,7 +40,14 @@ def read_map(
     values, projection, first, step, own_scale, own_offset, nodata = found
     if min(values.shape) < 2:
         raise BadInput("bad_terrain", f"{path}: too small for a height map, or not near the origin")
-    heights = values.astype(np.float64) * (own_scale if scale is None else scale)
+    scale = own_scale if scale is None else scale
+    if scale is None and np.issubdtype(values.dtype, np.integer):
+        raise BadInput(
+            "bad_terrain",
+            f"{path}: it holds whole numbers and no scale: say how many metres one of them is (1 where they are "
+            "metres), with --scale of terrain import or as scale in [dem]",
+        )
+    heights = values.astype(np.float64) * (1.0 if scale is None else scale)
     heights += own_offset if offset_m is None else offset_m
     missing = ~np.isfinite(heights)
     if nodata is not None:
@@ -90,7 +98,8 @@ def projection_of(p: Mapping[str, Any]) -> Projection:
     )
 
 
-Found = tuple[Array, Projection, tuple[float, float], tuple[float, float], float, float, float | None]
+# Values, projection, first post, step, scale (None where the file does not say), offset, no-data value.
+Found = tuple[Array, Projection, tuple[float, float], tuple[float, float], float | None, float, float | None]
 
 
 def _by_its_tags(path: Path) -> Found | None:
@@ -125,8 +134,8 @@ def _by_its_tags(path: Path) -> Found | None:
     return values, projection_of(parameters), first, (dx, dy), scale, offset, missing
 
 
-def _gdal_scale(items: Any) -> tuple[float, float]:
-    """SCALE and OFFSET of GDAL's metadata; 1 and 0 where there are none."""
+def _gdal_scale(items: Any) -> tuple[float | None, float]:
+    """SCALE and OFFSET of GDAL's metadata: None where nothing says what one step is, and 0."""
     if isinstance(items, str):
         items = {e.get("name"): e.text for e in ElementTree.fromstring(items).iter("Item")}
     found = {}
@@ -136,7 +145,8 @@ def _gdal_scale(items: Any) -> tuple[float, float]:
             found[str(name).upper()] = value
         for value in [v for v in items.values() if isinstance(v, dict)]:
             found.update({str(k).upper(): v for k, v in value.items()})
-    return float(found.get("SCALE", 1.0)), float(found.get("OFFSET", 0.0))
+    metres = 1.0 if str(found.get("UNITTYPE", "")).lower() in METRES else None
+    return (float(found["SCALE"]) if "SCALE" in found else metres), float(found.get("OFFSET", 0.0))
 
 
 def _proj_of_keys(keys: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -179,16 +189,17 @@ def _by_rasterio(path: Path, near: tuple[float, float] | None) -> Found:
     import rasterio
     from rasterio.windows import Window
 
+    hint = _label_hint(path)
     try:
-        with rasterio.open(path) as file:
+        with _opened(rasterio, path) as file, warnings.catch_warnings():
+            # That PROJ's words hold less than WKT: enough for spheres.
+            warnings.simplefilter("ignore", UserWarning)
             if file.crs is None or file.transform.is_identity:
-                raise BadInput("bad_terrain", f"{path}: it does not say where on the Moon it lies")
+                raise BadInput("bad_terrain", f"{path}: it does not say where on the Moon it lies{hint}")
             t = file.transform
             if t.b or t.d:
                 raise BadInput("bad_terrain", f"{path}: a rotated grid; bring it to north up (gdalwarp)")
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # that PROJ's words hold less than WKT: enough for spheres
-                projection = projection_of(pyproj.CRS.from_wkt(file.crs.to_wkt()).to_dict())
+            projection = projection_of(pyproj.CRS.from_wkt(file.crs.to_wkt()).to_dict())
             first = t.c + 0.5 * t.a, t.f + 0.5 * t.e
             rows, columns = slice(0, file.height), slice(0, file.width)
             if near is not None:
@@ -202,9 +213,22 @@ def _by_rasterio(path: Path, near: tuple[float, float] | None) -> Found:
             values = file.read(1, window=window)
             first = first[0] + columns.start * t.a, first[1] + rows.start * t.e
             scale, offset, nodata = file.scales[0], file.offsets[0], file.nodata
+            said = (scale, offset) != (1.0, 0.0) or str(file.units[0]).lower() in METRES
     except rasterio.errors.RasterioIOError as cause:
-        raise BadInput("bad_terrain", f"{path}: not a map that can be read: {cause}") from cause
-    return values, projection, first, (float(t.a), float(t.e)), float(scale), float(offset), nodata
+        raise BadInput("bad_terrain", f"{path}: not a map that can be read{hint}: {cause}") from cause
+    return values, projection, first, (float(t.a), float(t.e)), float(scale) if said else None, float(offset), nodata
+
+
+def _opened(rasterio: Any, path: Path) -> Any:
+    """The file, without a word on stderr where it has no place: that is said in our own."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        return rasterio.open(path)
+
+
+def _label_hint(path: Path) -> str:
+    """What to do where a PDS map's bare pixels are given instead of the label that says what they are."""
+    return f" (of a PDS map give the label, {path.stem}.LBL)" if path.suffix.lower() == ".img" else ""
 
 
 def _window(

@@ -116,11 +116,14 @@ def built(
         values[part] = stored(fill(part))
         return len(part)
 
-    with ThreadPoolExecutor(cpu_count()) as pool:
+    pool = ThreadPoolExecutor(cpu_count())
+    try:
         for count in pool.map(work, parts):
             done += count
             if progress is not None:
                 progress(done, len(cells))
+    finally:
+        pool.shutdown(cancel_futures=True)  # whoever interrupts does not wait for the rest
     return HorizonTable(square, values, unknown_rad)
 
 

@@ -1,0 +1,135 @@
+"""What is known of a terrain: as the keys of one JSON object, and as lines to read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import degrees
+from typing import TYPE_CHECKING, Any
+
+from startrack.errors import BadInput
+
+if TYPE_CHECKING:
+    from startrack.terrain import Terrain
+    from startrack.terrain.dem import HeightTerrain
+
+
+def facts_of(terrain: Terrain) -> dict[str, Any]:
+    """Place, search area, and the ground's own facts."""
+    site = terrain.site
+    facts: dict[str, Any] = {
+        "name": terrain.name,
+        "body": site.body,
+        "latitude_deg": round(degrees(site.latitude_rad), 6),
+        "longitude_deg": round(degrees(site.longitude_rad), 6),
+        "search_radius_m": terrain.search_radius_m,
+        "camera_height_m": terrain.camera_height_m,
+    }
+    if is_dem(terrain):
+        return facts | _map_facts(terrain)
+    own = {key: value for key in ("diameter_m", "depth_m") if (value := getattr(terrain, key, None)) is not None}
+    return facts | {"kind": "cylinder", **own}
+
+
+def _map_facts(terrain: Any) -> dict[str, Any]:
+    from startrack.terrain import cache
+    from startrack.terrain.projection import NAMES
+
+    maps = [
+        {
+            "file": m.source, "posts": list(m.heights_m.shape), "post_m": round(m.post_m, 3),
+            "projection": NAMES[m.projection.kind], "lowest_m": round(float(m.heights_m.min()), 1),
+            "highest_m": round(float(m.heights_m.max()), 1),
+        }
+        for m in terrain.maps
+    ]  # fmt: skip
+    path = cache.path_of(cache.key_of(terrain))
+    shared = terrain.horizon_sigma_common_rad
+    return {
+        "kind": "dem", "maps": maps, "height_sigma_m": terrain.height_sigma_m,
+        "horizon_sigma_deg": None if shared is None else round(degrees(shared), 6), "horizons": str(path),
+        "horizons_ready": path.is_file(),
+    }  # fmt: skip
+
+
+def seen_from(terrain: Terrain, place: tuple[float, float] | None) -> dict[str, Any]:
+    """Ground and horizon of a place (east, north) [m]. Raises BadInput where the terrain knows nothing."""
+    if place is None:
+        return {}
+    import numpy as np
+
+    from startrack.frames import latlon_from_enu
+
+    point = np.array([place])
+    if not terrain.allowed(point)[0]:
+        raise BadInput("bad_terrain", f"E {place[0]:g} m, N {place[1]:g} m is outside what the terrain knows")
+    ground = float(terrain.ground_m(point)[0])
+    horizon = np.degrees(terrain.horizon_rad(point, np.radians(np.arange(720) / 2)))
+    lat, lon = latlon_from_enu(terrain.site, *place, ground)
+    return {
+        "east_m": place[0], "north_m": place[1], "ground_m": round(ground, 2),
+        "place_latitude_deg": round(float(np.degrees(lat)), 6), "place_longitude_deg": round(float(np.degrees(lon)), 6),
+        "horizon_min_deg": round(float(horizon.min()), 3), "horizon_max_deg": round(float(horizon.max()), 3),
+    }  # fmt: skip
+
+
+def lines_of(facts: dict[str, Any]) -> Iterator[str]:
+    """The facts in words, with units; only those that are there."""
+    yield facts["name"]
+    if "body" in facts:
+        yield f"  origin    {_place(facts['latitude_deg'], facts['longitude_deg'])}, on the {facts['body'].title()}"
+        yield (
+            f"  search    within {facts['search_radius_m']:g} m of the origin, the camera "
+            f"{facts['camera_height_m']:g} m above the ground"
+        )
+    if "depth_m" in facts:
+        yield f"  ground    a cylinder, {facts['diameter_m']:g} m across and {facts['depth_m']:g} m deep"
+    for m in facts.get("maps", ()):
+        rows, columns = m["posts"]
+        yield (
+            f"  map       {m['file']}: {columns} x {rows} posts, {m['post_m']:g} m apart, {m['projection']}, "
+            f"heights {m['lowest_m']:g} to {m['highest_m']:g} m"
+        )
+    if "height_sigma_m" in facts:
+        yield f"  errors    {_errors(facts)}"
+    if facts.get("horizons") and "seconds" in facts:
+        how = "were known" if facts["known_before"] else f"worked out in {facts['seconds']:g} s"
+        yield f"  horizons  {how}: {facts['horizons']}"
+    elif facts.get("horizons"):
+        ready = facts["horizons_ready"]
+        yield f"  horizons  {facts['horizons'] if ready else 'not worked out yet: startrack terrain build'}"
+    elif "horizons" in facts:
+        yield "  horizons  need no table: a cylinder's are a formula"
+    if "ground_m" in facts:
+        yield (
+            f"  place     E {facts['east_m']:g} m, N {facts['north_m']:g} m: "
+            f"{_place(facts['place_latitude_deg'], facts['place_longitude_deg'])}, ground at {facts['ground_m']:g} m, "
+            f"horizon {facts['horizon_min_deg']:g} to {facts['horizon_max_deg']:g} degrees"
+        )
+    for file in facts.get("files", ()):
+        yield f"  written   {file}"
+
+
+def _errors(facts: dict[str, Any]) -> str:
+    shared = facts["horizon_sigma_deg"]
+    all_around = "three times what these make of it" if shared is None else f"{shared:g} degrees"
+    told = {"map": " (by the map's own roughness)"}.get(facts.get("sigma_from", ""), "")
+    return f"of single posts {facts['height_sigma_m']:g} m{told}; shared by the whole horizon {all_around}"
+
+
+def _place(latitude_deg: float, longitude_deg: float) -> str:
+    return (
+        f"{abs(latitude_deg):.5f} {'N' if latitude_deg >= 0 else 'S'}, "
+        f"{abs(longitude_deg):.5f} {'E' if longitude_deg >= 0 else 'W'}"
+    )
+
+
+def is_dem(terrain: Terrain) -> bool:
+    """Whether it is a height map."""
+    return isinstance(terrain, dem_class())
+
+
+def dem_class() -> type[HeightTerrain]:
+    """The class of height maps, imported only where one is asked for."""
+    from startrack.terrain.dem import HeightTerrain
+
+    return HeightTerrain

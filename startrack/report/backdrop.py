@@ -27,6 +27,10 @@ EDGE_PX = 8.0
 SAMPLE = 4  # levels are taken from every fourth pixel
 FLAT_SNR = 3.0
 WALL_SHADE = 0.75  # how far the wall's colour replaces the sky's
+SPIKE_SIGMAS = 8.0
+SPIKE_NEIGHBOUR = 0.3  # a star's neighbouring pixel has more of its light where the PSF is LEAST_PSF_PX or wider
+LEAST_PSF_PX = 0.7
+RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=np.uint8)
 MADE_OF_NOISE = 0.6745  # median of the absolute value of a standard normal variable
 
 
@@ -87,7 +91,7 @@ def _layers(result: Result, size: tuple[int, int], inside: Bools) -> tuple[Image
     """
     scale = size[0] / result.exposure.size_px[0]
     width_px = scale * (result.detections.psf_sigma_px if result.detections is not None else 1.0)
-    pixels = _resized(result.exposure.pixels_adu, size)
+    pixels = _resized(without_hot_pixels(result.exposure.pixels_adu, width_px / scale), size)
     image = np.asarray(cv2.GaussianBlur(pixels, (0, 0), float(np.clip(width_px, *SMOOTHING_PX))), dtype=np.float32)
     sample, known = image[::SAMPLE, ::SAMPLE], inside[::SAMPLE, ::SAMPLE]
     low, high = (float(level) for level in np.percentile(sample[known] if known.any() else sample, [0.5, 99.0]))
@@ -104,6 +108,19 @@ def _layers(result: Result, size: tuple[int, int], inside: Bools) -> tuple[Image
     # A background that is flatter than the noise shall look flat.
     sky = (smooth - np.float32(dark)) / np.float32(max(bright - dark, FLAT_SNR * noise))
     return np.clip(sky, 0, 1), np.power(light, np.float32(0.75))
+
+
+def without_hot_pixels(pixels_adu: Image, psf_sigma_px: float) -> Image:
+    """The exposure with lone bright pixels, sharper than any star can be, made as dark as those around them."""
+    if psf_sigma_px < LEAST_PSF_PX:
+        return pixels_adu
+    middle = np.asarray(cv2.medianBlur(pixels_adu, 3), dtype=np.float32)
+    noise = float(np.median(np.abs((pixels_adu - middle)[::SAMPLE, ::SAMPLE]))) / MADE_OF_NOISE
+    # Seen from the darkest pixel about: within a wide star the median is the star's own light.
+    darkest = cv2.erode(pixels_adu, np.ones((5, 5), np.uint8))
+    excess, beside = pixels_adu - darkest, cv2.dilate(pixels_adu, RING) - darkest
+    lone = (excess > SPIKE_SIGMAS * max(noise, 1e-6)) & (beside < SPIKE_NEIGHBOUR * excess)
+    return np.asarray(np.where(lone, middle, pixels_adu), dtype=np.float32)
 
 
 def _inside_px(camera: Camera, size: tuple[int, int]) -> Image:

@@ -12,22 +12,24 @@ from startrack.report.canvas import Canvas
 from startrack.report.palette import BODY, DETECTION, HIDDEN, IDENTIFIED, INK, mixed
 from startrack.report.result import place_m
 from startrack.report.star_table import names_of, status_of
-from startrack.types import Array, Ints
+from startrack.types import Array, Bools, Ints
 
 if TYPE_CHECKING:
     from startrack.result import Result
 
 MOST_CIRCLES = 4000
 MOST_CROSSES = 150  # of hidden stars, the brightest: more would hide the picture
-MOST_NAMES = 30
+MOST_NAMES = 20
 MOST_HIDDEN_NAMES = 8
-NAME_SIZE = 17.0
+NAME_SIZE = 19.0
+FAINT_RING = 0.6  # how far the ring of the faintest detection fades into the sky
+DIMMEST_HIDDEN_V_MAG = 3.0  # a fainter planet behind the wall is not missed
 BACKDROP = (12, 17, 28)
 BRIGHT_SNR = 300.0
 
 
 def draw_detections(canvas: Canvas, view: View, result: Result) -> None:
-    """A thin circle about each detection that is no identified star; a green one about each that is."""
+    """A green circle about each identified star; a grey one about each other detection inside the image circle."""
     found = result.detections
     if found is None:
         return
@@ -37,10 +39,20 @@ def draw_detections(canvas: Canvas, view: View, result: Result) -> None:
     strength = np.clip(np.log(np.maximum(found.snr, 5.0) / 5.0) / np.log(BRIGHT_SNR / 5.0), 0, 1)
     places = view.at(found.xy_px)
     # The bright ones last, on top; the faint ones dim, so that a thousand of them do not drown the stars.
+    shown = identified | _imaged(result, found.xy_px)
     for k in reversed(range(min(len(found), MOST_CIRCLES))):
+        if not shown[k]:
+            continue
         colour = IDENTIFIED if identified[k] else DETECTION
-        faint = 0.45 * (1.0 - float(strength[k]))
+        faint = FAINT_RING * (1.0 - float(strength[k]))
         canvas.circle(places[k], 4.5 + 5.5 * float(strength[k]), mixed(colour, BACKDROP, faint))
+
+
+def _imaged(result: Result, xy_px: Array) -> Bools:
+    """Whether light of the lens can reach the pixels (n, 2); all, where the camera is not known."""
+    if result.camera is None or result.camera.size_px != result.exposure.size_px:
+        return np.ones(len(xy_px), dtype=bool)
+    return result.camera.angle_rad(xy_px) <= result.camera.max_angle_rad
 
 
 def draw_hidden(canvas: Canvas, view: View, result: Result) -> None:
@@ -62,6 +74,8 @@ def draw_bodies(canvas: Canvas, view: View, result: Result) -> None:
         if not inside:
             continue
         below = _below_skyline(result, body.ray_icrs)
+        if below and body.v_mag > DIMMEST_HIDDEN_V_MAG:
+            continue
         colour = mixed(BODY, BACKDROP, 0.4) if below else BODY
         at = view.at(xy_px)
         canvas.circle(at, 6.0 if below else 9.0, colour, 2)

@@ -129,6 +129,16 @@ def test_a_reader_that_goes_ends_the_batch_early(tmp_path):
     assert "Traceback" not in err
 
 
+def test_a_reader_that_goes_ends_the_image_commands_early_too(tmp_path):
+    images = [str(path) for path in frames(tmp_path, 300)]
+    command = [sys.executable, "-m", "startrack.cli.main", "detect", *images, "-D", str(tmp_path / "out"), "--no-plots"]
+    process = subprocess.Popen([*command, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.readline()
+    process.stdout.close()
+    assert (process.stderr.read(), process.wait()) == ("", 5)
+
+
 def test_with_json_nothing_else_is_printed(tmp_path, capsys):
     frames(tmp_path / "images", 2)
     assert main(["batch", str(tmp_path / "images"), "-D", str(tmp_path / "out"), "-j", "1", "--json"]) == 5

@@ -277,6 +277,31 @@ def test_wrong_usage_is_two_and_says_how(folder, words):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("identify stars.png --fov 180 -c fisheye-2048", "give one of them"),
+        ("locate stars.png --fov 180", "startrack calibrate --fov 180"),
+    ],
+)
+def test_a_field_of_view_where_it_does_not_help_is_wrong_usage(folder, capsys, words, said):
+    stars()
+    with pytest.raises(SystemExit) as end:
+        main(words.split())
+    assert end.value.code == USAGE
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["locate", "identify", "detect"])
+def test_a_folder_that_takes_no_results_is_named_before_any_work(folder, capsys, command):
+    stars()
+    code, lines, _ = run(capsys, command, "stars.png", "-D", "/proc", "--json")
+    record = json.loads(lines[0])
+    assert (code, record["reason"]) == (BAD_INPUT, "bad_image")
+    assert record["message"].startswith("/proc: results cannot be written to this folder")
+    assert "timing_ms" not in record
+
+
 def test_no_refusal_shows_a_traceback(folder):
     images = [truncated(), black(), noise(), "missing.png", stars("s.png", time_utc=None)]
     done = shell("locate", *images, "--no-plots", cwd=folder)

@@ -10,15 +10,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from startrack import pipeline
+from startrack.catalog import load_catalog
 from startrack.report import detection_dict, identification_dict, refused_dict, result_dict, write_json
 from startrack.report.result import boresight_rad
+from startrack.report.summary import verbose_text
 from startrack.types import BadInput, Mode
 
 ARCSEC = np.pi / 648_000
 KEYS = {
     "position": "frame terrain east_m north_m up_m covariance_m2 radius95_m radius999_m latitude_deg longitude_deg",
-    "attitude": "quat_xyzw_cam_icrs ra_deg dec_deg roll_deg sigma_arcsec quat_xyzw_body_enu heading_deg pitch_deg "
-    "roll_body_deg",
+    "attitude": "quat_xyzw_cam_icrs ra_deg dec_deg roll_deg sigma_arcsec lens_error_included quat_xyzw_body_enu "
+    "heading_deg pitch_deg roll_body_deg",
     "stars": "detected identified unexplained predicted_visible rms_px false_alarm_probability",
     "timing_ms": "read detect identify attitude evidence locate",
     "provenance": "version image_sha256 camera terrain catalog time_utc exposure_s",
@@ -148,9 +150,10 @@ def test_detections_are_brightest_first(located):
 
 def test_without_a_terrain_nothing_is_said_in_enu(located):
     d = result_dict(without_terrain(located.result))
-    assert set(d["attitude"]) == {"quat_xyzw_cam_icrs", "ra_deg", "dec_deg", "roll_deg", "sigma_arcsec"}
+    without = {"quat_xyzw_body_enu", "heading_deg", "pitch_deg", "roll_body_deg"}
+    assert set(d["attitude"]) == set(KEYS["attitude"].split()) - without
     assert "position" not in d
-    assert d["stars"]["predicted_visible"] == 0
+    assert d["stars"]["predicted_visible"] is None
 
 
 def test_an_ambiguous_result_has_modes_and_no_position(located):
@@ -183,6 +186,20 @@ def test_an_unknown_time_widens_the_attitude(located, fix):
     unknown = replace(located.result, exposure=replace(located.result.exposure, time_utc=None))
     sigma = result_dict(unknown)["attitude"]["sigma_arcsec"]
     np.testing.assert_allclose(sigma, np.hypot(fix["attitude"]["sigma_arcsec"], 60.0), rtol=1e-9)
+
+
+def test_sigma_says_whether_the_lens_is_in_it(located, fix):
+    assert fix["attitude"]["lens_error_included"] is False
+    assert "taken as exact" in verbose_text(located.result)
+    camera = located.result.camera
+    stated = replace(camera, covariance_order=("cx", "cy"), covariance=np.diag([0.3**2, 0.4**2]))
+    result = pipeline.identify(located.result.exposure, stated, load_catalog().brighter_than(7.0))
+    attitude = result_dict(result)["attitude"]
+    assert attitude["lens_error_included"] is True
+    assert "taken as exact" not in verbose_text(result)
+    # A centre 0.3 px aside is the camera turned by that about y, as far as 90 degrees off the axis let it be told.
+    px_arcsec = 1 / camera.focal_px[0] / ARCSEC
+    assert attitude["sigma_arcsec"][1] > 0.15 * px_arcsec > 2 * fix["attitude"]["sigma_arcsec"][1]
 
 
 def test_json_files_are_whole_and_the_same_each_time(tmp_path, fix):

@@ -28,8 +28,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--fov", type=_field_of_view_rad, metavar="DEG",
         help="no camera file: field of view in degrees, good to 10 %%; below 100 across the image's width, from there "
-        "up of the whole image circle, even where the frame clips it",
+        "up of the whole image circle, even where the frame clips it. Takes 12 stars, 7 below 100 degrees",
     )  # fmt: skip
+    parser.set_defaults(usage_error=parser.error)
 
 
 def _field_of_view_rad(text: str) -> float:
@@ -38,6 +39,8 @@ def _field_of_view_rad(text: str) -> float:
 
 def run(args: argparse.Namespace) -> int:
     """Identify every image; the exit code of the worst."""
+    if args.fov is not None and args.camera is not None:
+        args.usage_error("--fov says that the lens is not known, -c names it: give one of them")
     return run_images(args, FORMAT, lambda path, stem: _one(path, stem, args))
 
 

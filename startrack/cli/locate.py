@@ -24,11 +24,18 @@ def add_parser(subparsers: Any) -> None:
     )
     add_image_flags(parser)
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file, or the name of a shipped one")
+    parser.add_argument("--fov", metavar="DEG", help=argparse.SUPPRESS)  # of identify and calibrate: asked for here too
+    parser.set_defaults(usage_error=parser.error)
     parser.add_argument("--report", action="store_true", help="add a page for a browser, as startrack report makes it")
 
 
 def run(args: argparse.Namespace) -> int:
     """Locate every image; the exit code of the worst."""
+    if args.fov is not None:
+        args.usage_error(
+            "a position needs the lens better than --fov finds it: make a camera file with startrack calibrate "
+            f"--fov {args.fov} IMAGE... -o CAMERA.toml, then startrack locate -c CAMERA.toml"
+        )
     code = run_images(args, FORMAT, lambda path, stem: _one(path, stem, args))
     if args.report:
         from startrack.cli.report import page_of_images

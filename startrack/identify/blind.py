@@ -140,7 +140,8 @@ class _Search:
         self.chosen = chosen = apart(self.xy_px, APART * min(size_px), 100)
         if len(chosen) < self.fewest:
             raise NotIdentified(
-                f"{len(chosen)} point sources are too few to identify without a camera file: expose longer, or {TRY}",
+                f"{len(chosen)} point sources are too few to identify without a camera file, which takes "
+                f"{self.fewest}: expose longer, or {TRY}",
                 detected=len(detections),
             )
         self.hypotheses = Hypotheses(self.xy_px[chosen], size_px)

@@ -66,8 +66,8 @@ def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain, compiled: 
     if gain > STRETCH_GAIN_NATS and abs(stretch - 1) > STRETCH_SIGMAS * admitted_stretch(terrain):
         raise NotLocated(
             f"the stars see a horizon about {_percent(stretch)} {'higher' if stretch > 1 else 'lower'} than the "
-            f"terrain {terrain.name} gives: are its depth, width, camera height and the camera file right? "
-            "(a cylinder can take depth_sigma_m and diameter_sigma_m)",
+            f"terrain {terrain.name} gives: are the image's time, the terrain's depth and width, its camera height and "
+            "the camera file right? (a cylinder can take depth_sigma_m and diameter_sigma_m)",
             reason="inconsistent_evidence",
         )
     if not isinstance(terrain, Cylinder):  # there a turned sky only turns the place

@@ -110,6 +110,11 @@ def place_m(fix: Fix) -> tuple[float, float]:
     return float(fix.position_enu_m[0]), float(fix.position_enu_m[1])
 
 
+def lens_errors_known(result: Result) -> bool:
+    """Whether the attitude's covariance holds the errors of the lens: the camera says what they are."""
+    return result.camera is not None and result.camera.covariance is not None
+
+
 def predicted_visible(result: Result) -> int:
     """How many stars whose light was measured stand above the fix's skyline; 0 without a fix."""
     if result.fix is None or result.light is None or result.terrain is None:
@@ -168,6 +173,7 @@ def _attitude(result: Result) -> dict[str, Any]:
         "dec_deg": dec,
         "roll_deg": roll,
         "sigma_arcsec": (np.sqrt(np.diag(attitude.covariance_rad2)) * ARCSEC_PER_RAD).tolist(),
+        "lens_error_included": lens_errors_known(result),
     }
     body = R_body_enu(result)
     if body is not None:
@@ -185,7 +191,7 @@ def _tail(result: Result) -> dict[str, Any]:
             "detected": 0 if result.detections is None else len(result.detections),
             "identified": 0 if found is None else len(found),
             "unexplained": None if found is None else found.unexplained,
-            "predicted_visible": predicted_visible(result),
+            "predicted_visible": None if result.terrain is None else predicted_visible(result),
             "rms_px": None if fit is None else fit.rms_px,
             "false_alarm_probability": None if found is None else found.false_alarm_probability,
         },

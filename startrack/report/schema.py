@@ -69,6 +69,10 @@ ATTITUDE = record(
     "v_cam = R v_icrs; ra, dec: boresight; roll: position angle of the image's top, from north through east. "
     "heading: azimuth of body x; pitch: nose up; roll_body: right side down. Fields in enu need terrain and time.",
     optional={
+        "lens_error_included": {
+            "type": "boolean",
+            "description": "whether sigma_arcsec holds the lens's errors: the camera has a covariance",
+        },
         "quat_xyzw_body_enu": QUATERNION,
         "heading_deg": {"type": "number", "minimum": 0, "exclusiveMaximum": 360},
         "pitch_deg": {"type": "number", "minimum": -90, "maximum": 90},
@@ -79,7 +83,9 @@ STARS = record({
     "detected": COUNT,
     "identified": COUNT,
     "unexplained": _or_null(COUNT, "significant detections that no star explains; null: not identified"),
-    "predicted_visible": {**COUNT, "description": "measured stars above the skyline of the fix; 0 without a fix"},
+    "predicted_visible": _or_null(
+        COUNT, "measured stars above the skyline of the fix; 0 without a fix; null: none was asked for"
+    ),
     "rms_px": _or_null(POSITIVE, "per axis, of the stars that the attitude rests on; null: not identified"),
     "false_alarm_probability": _or_null(CHANCE, "that chance would match as well; null: not identified"),
 })  # fmt: skip

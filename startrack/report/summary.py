@@ -9,11 +9,21 @@ import numpy as np
 
 from startrack.body_angles import heading_pitch_roll_from_R_body_enu
 from startrack.frames import format_utc, latlon_from_enu
-from startrack.report.result import ARCSEC_PER_RAD, STAGES, R_body_enu, boresight_rad, image_name, predicted_visible
+from startrack.report.result import (
+    ARCSEC_PER_RAD,
+    STAGES,
+    R_body_enu,
+    boresight_rad,
+    image_name,
+    lens_errors_known,
+    predicted_visible,
+)
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
     from startrack.result import Result
+
+LEAST_CHANCE = 1e-100
 
 
 def summary_line(result: Result, seconds: float | None = None) -> str:
@@ -67,8 +77,8 @@ def verbose_text(result: Result) -> str:
 
 
 def chance_text(probability: float) -> str:
-    """A probability that may be too small for a float."""
-    return f"{probability:.0e}" if probability > 0 else "below 1e-300"
+    """A probability; how small a tiny one is, the models behind it do not say."""
+    return f"{probability:.0e}" if probability >= LEAST_CHANCE else f"below {LEAST_CHANCE:.0e}"
 
 
 def _place(result: Result) -> list[str]:
@@ -95,6 +105,7 @@ def _attitude(result: Result) -> list[str]:
     lines = [
         f"boresight  RA {_degrees(ra, 4)}°, Dec {np.degrees(dec):+.4f}°, roll {_degrees(roll, 4)}°; "
         f"sigma {sigma[0]:.2f}, {sigma[1]:.2f}, {sigma[2]:.2f} arcsec about x, y, z"
+        f"{'' if lens_errors_known(result) else ', the lens taken as exact'}"
     ]
     body = R_body_enu(result)
     if body is not None:

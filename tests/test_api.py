@@ -84,6 +84,7 @@ def test_the_attitude_is_a_rotation_and_angles(solution):
     assert a.sigma.to_value("arcsec") == pytest.approx(record["sigma_arcsec"])
     np.testing.assert_allclose(a.body.as_quat(canonical=True), record["quat_xyzw_body_enu"], atol=1e-12)
     assert solution.heading == a.heading
+    assert a.lens_error_included is record["lens_error_included"] is ("lens taken as exact" not in repr(a))
     assert "heading           205." in repr(a)
 
 

@@ -19,8 +19,10 @@ from startrack.cli.main import main
 from startrack.cli.report import page_of_images
 from startrack.page import page_text, result_at, results_under
 from startrack.page.advice import WORDS
+from startrack.page.ground import ground_map
 from startrack.page.rows import COLUMNS
 from startrack.report import write_json
+from startrack.terrain import load_terrain
 
 VOID = {"meta", "link", "input", "br", "img"}
 
@@ -185,6 +187,19 @@ def test_a_terrain_that_is_not_here_is_left_out(results, tmp_path):
     assert (detail["horizon"], detail["picture"], detail["stars"]) == (None, None, None)
 
 
+def test_a_height_map_is_shaded_and_see_through_where_it_ends():
+    terrain = load_terrain("kepler")
+    ground = ground_map(terrain)
+    encoded = np.frombuffer(base64.b64decode(ground["relief"].split(",")[1]), np.uint8)
+    relief = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
+    x = np.linspace(-ground["half_m"], ground["half_m"], relief.shape[1])
+    away_m = np.hypot(*np.meshgrid(x, x)) - terrain.reach_m
+    cover, cell_m = relief[..., 3], x[1] - x[0]
+    assert (cover[away_m < -3 * cell_m] == 255).mean() > 0.99
+    assert cover[away_m > 3 * cell_m].max() == 0
+    assert 20 < np.std(relief[away_m < -3 * cell_m][:, 0]) < 100  # light and shade
+
+
 def test_every_reason_has_words():
     formats = (Path(__file__).parent.parent / "docs/formats.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \| [34] \|", formats, flags=re.MULTILINE)
@@ -197,16 +212,21 @@ def test_every_reason_has_words():
     "damage",
     ['{"image": "x.png"', '["x"]', '{"image": 3, "status": "ok"}', '{"image": "x.png", "status": "ok", "reason": []}'],
 )
-def test_files_that_are_no_results_are_named_on_the_page(tmp_path, damage):
+def test_files_that_are_no_results_are_named(tmp_path, capsys, damage):
     (tmp_path / "x.fix.json").write_text(damage)
     (tmp_path / "y.fix.json").write_text(
         '{"image": "y.png", "status": "ok", "position": {"east_m": NaN, "north_m": 1e999, "covariance_m2": 5}}'
     )
     assert main(["report", str(tmp_path), "-q"]) == 0
     head = data_of((tmp_path / "report.html").read_text(encoding="utf-8"), "results")
-    assert head["unread"] == ["x.fix.json"]
+    (line,) = head["unread"]
+    assert re.match(r"x\.fix\.json: (no JSON|holds no|\w+: missing)", line)
+    assert capsys.readouterr().err == f"startrack: left out {line}\n"
     assert [row[1] for row in head["rows"]] == ["y"]
     assert main(["report", str(tmp_path / "x.fix.json")]) == 4
+    (tmp_path / "y.fix.json").unlink()
+    assert main(["report", str(tmp_path)]) == 4
+    assert "no result there can be read: x.fix.json" in capsys.readouterr().err
 
 
 def test_the_command_reads_the_folder_of_true_places(results, tmp_path, capsys):

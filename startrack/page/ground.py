@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from startrack.page.picture import data_uri
+from startrack.report.relief import edge_of, ground_cells, light_on
 from startrack.terrain import Cylinder, Terrain, load_terrain
 from startrack.types import BadInput
 
-RELIEF_CELLS = 320
-GENTLE_SLOPE = 0.02  # gentler ground looks flat
+RELIEF_CELLS = 420
+MARGIN = 1.03  # beyond the map, for its edge
 BRIGHTEST = 215.0
 
 
@@ -48,20 +49,14 @@ def ground_map(terrain: Terrain) -> dict[str, Any]:
     shape: dict[str, Any] = {"search_m": terrain.search_radius_m, "site": terrain.site.body}
     if isinstance(terrain, Cylinder):
         return {**shape, "rim_m": terrain.radius_m}
-    return {**shape, "half_m": terrain.reach_m, "relief": _relief(terrain)}
+    half_m = MARGIN * terrain.reach_m
+    return {**shape, "half_m": half_m, "relief": _relief(terrain, half_m)}
 
 
-def _relief(terrain: Terrain) -> str:
-    """The ground's shape, lit from the north-west as maps are; black where a camera cannot stand."""
-    x = np.linspace(-terrain.reach_m, terrain.reach_m, RELIEF_CELLS)
-    points_m = np.stack(np.meshgrid(x, x[::-1]), axis=-1)
-    known = np.asarray(terrain.allowed(points_m.reshape(-1, 2)), dtype=bool)
-    ground_m = np.zeros(len(known))
-    ground_m[known] = terrain.ground_m(points_m.reshape(-1, 2)[known])
-    inside = known.reshape(RELIEF_CELLS, RELIEF_CELLS)
-    slope_north, slope_east = np.gradient(ground_m.reshape(RELIEF_CELLS, RELIEF_CELLS), x[::-1], x)
-    facing = (slope_east - slope_north) * inside
-    steep = max(float(np.percentile(np.abs(facing), 95)), GENTLE_SLOPE)
-    light = np.clip(0.5 + 0.5 * facing / steep, 0.08, 1.0) * inside
-    grey = np.rint(BRIGHTEST * light).astype(np.uint8)
-    return data_uri(np.stack([grey, grey, grey], axis=-1))
+def _relief(terrain: Terrain, half_m: float) -> str:
+    """The ground's shape, lit from the north-west as maps are; see-through where a camera cannot stand."""
+    halves_m, shape = (half_m, half_m), (RELIEF_CELLS, RELIEF_CELLS)
+    ground_m, known = ground_cells(terrain, halves_m, shape)
+    grey = np.rint(BRIGHTEST * light_on(ground_m, known, halves_m)).astype(np.uint8)
+    cover = np.rint(255 * edge_of(known, shape)).astype(np.uint8)
+    return data_uri(np.stack([grey, grey, grey, cover], axis=-1))

@@ -61,7 +61,7 @@ def image_size(wcs: Path, record: dict[str, Any]) -> tuple[int, int] | None:
 
 
 def data_uri(pixels: NDArray[np.uint8]) -> str:
-    """A picture (H, W, 3), blue first, as a WebP data URI: a fifth of the PNG."""
+    """A picture (H, W, 3), blue first, or (H, W, 4) with its cover, as a WebP data URI: a fifth of the PNG."""
     import cv2
 
     ok, data = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])

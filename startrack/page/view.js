@@ -239,7 +239,9 @@ function drawAxes(view, g) {
   const [xs, xStep] = ticks(view, 0);
   for (const x of xs) {
     const [sx] = view.screen(x, 0);
-    if (sx > left + 8 && sx < right - 12) g.fillText(view.axes.names?.[x] || tickText(view, x, xStep), sx, bottom + 4);
+    const text = view.axes.names?.[x] || tickText(view, x, xStep);
+    const half = g.measureText(text).width / 2;
+    if (sx > left + 8 && sx + half < view.width) g.fillText(text, sx, bottom + 4);
   }
   g.fillText(view.axes.x, (left + right) / 2, bottom + 19);
   g.textAlign = "right";

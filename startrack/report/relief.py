@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from startrack.report.canvas import Canvas, around
 from startrack.report.palette import DIM_INK, FLOOR, INK, MAP
@@ -30,26 +30,39 @@ TRIED = 60  # places along a contour
 
 def ground_on(view: MapView, terrain: Terrain, shape: tuple[int, int]) -> tuple[Image, Bools]:
     """Heights [m] of the cells of a map that is `shape` (H, W) pixels large, and where there is ground."""
-    height, width = (max(2, n // CELL_PX) for n in shape)
-    x, y = (np.linspace(-half, half, n) for half, n in zip(view.half_m, (width, height), strict=True))
+    return ground_cells(terrain, view.half_m, tuple(max(2, n // CELL_PX) for n in shape))  # type: ignore[arg-type]
+
+
+def ground_cells(terrain: Terrain, half_m: ArrayLike, shape: tuple[int, int]) -> tuple[Image, Bools]:
+    """Heights [m] (H, W) within `half_m` east and north of the origin, north up, and where there is ground."""
+    x, y = (np.linspace(-half, half, n) for half, n in zip(np.asarray(half_m), shape[::-1], strict=True))
     points_m = np.stack(np.meshgrid(x, y[::-1]), axis=-1).reshape(-1, 2)
     known = np.asarray(terrain.allowed(points_m), dtype=bool)
     ground_m = np.zeros(len(known), dtype=np.float32)
     ground_m[known] = terrain.ground_m(points_m[known])
-    return ground_m.reshape(height, width), known.reshape(height, width)
+    return ground_m.reshape(shape), known.reshape(shape)
 
 
-def shade(window: Canvas, view: MapView, ground_m: Image, known: Bools) -> None:
-    """The relief, lit from the north-west as maps are; the map's colour where there is no ground."""
-    east_m, north_m = (2 * half / (n - 1) for half, n in zip(view.half_m, known.shape[::-1], strict=True))
+def light_on(ground_m: Image, known: Bools, half_m: ArrayLike) -> Image:
+    """Light (H, W), 0 to 1, on cells lit from the north-west as maps are; carried some cells beyond the ground."""
+    east_m, north_m = (2 * half / (n - 1) for half, n in zip(np.asarray(half_m), known.shape[::-1], strict=True))
     down, east = np.gradient(ground_m)
     facing, inner = east / east_m + down / north_m, _inner(known)
     steep = max(float(np.percentile(np.abs(facing[inner]), 95)) if inner.any() else 0.0, GENTLE_SLOPE)
     light = np.maximum(0.5 + 0.5 * np.tanh(1.2 * facing / steep), 0.05)
-    height, width = window.pixels.shape[:2]
-    lit = _resized(_spread(light.astype(np.float32), inner), (width, height))[:, :, None] * _edge(
-        known, (width, height)
-    )
+    return _spread(light.astype(np.float32), inner)
+
+
+def edge_of(known: Bools, size: tuple[int, int]) -> Array:
+    """1 on known ground and 0 beside it, (H, W) of the given size (W, H), with a smooth edge."""
+    soft = _resized(np.asarray(cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.5)), size)
+    return np.clip((soft - 0.5) * 4 + 0.5, 0, 1).astype(np.float64)
+
+
+def shade(window: Canvas, view: MapView, ground_m: Image, known: Bools) -> None:
+    """The relief; the map's colour where there is no ground."""
+    size = window.size
+    lit = (_resized(light_on(ground_m, known, view.half_m), size) * edge_of(known, size))[:, :, None]
     window.pixels[:] = (np.array(MAP) + lit * (RELIEF_LIGHT * np.array(FLOOR) - MAP)).astype(np.uint8)
 
 
@@ -62,9 +75,8 @@ def draw_contours(canvas: Canvas, window: Canvas, view: MapView, ground_m: Image
     if high - low < 1.0:
         return None
     step_m = _step(high - low)
-    height, width = window.pixels.shape[:2]
-    fine = _resized(_spread(ground_m, known), (width, height))
-    inside = _edge(_inner(known), (width, height))[:, :, 0] > 0.5
+    fine = _resized(_spread(ground_m, known), window.size)
+    inside = edge_of(inner, window.size) > 0.5
     down, across = np.gradient(fine)
     slope = np.hypot(down, across)
     level = np.rint(fine / step_m)
@@ -113,12 +125,6 @@ def _spread(values: Image, known: Bools) -> Image:
         new = (weight == 0) & (near > 1e-6)
         filled[new], weight[new] = carried[new], 1.0
     return filled
-
-
-def _edge(known: Bools, size: tuple[int, int]) -> Array:
-    """1 on known ground and 0 beside it, (H, W, 1), its edge smooth."""
-    soft = _resized(np.asarray(cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.5)), size)
-    return np.clip((soft[:, :, None] - 0.5) * 4 + 0.5, 0, 1).astype(np.float64)
 
 
 def _resized(image: Image, size: tuple[int, int]) -> Image:

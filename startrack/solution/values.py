@@ -10,7 +10,7 @@ import numpy as np
 
 from startrack.body_angles import heading_pitch_roll_from_R_body_enu
 from startrack.frames import latlon_from_enu
-from startrack.report.result import ARCSEC_PER_RAD, R_body_enu, boresight_rad
+from startrack.report.result import ARCSEC_PER_RAD, R_body_enu, boresight_rad, lens_errors_known
 
 if TYPE_CHECKING:
     from astropy.coordinates import Angle
@@ -114,6 +114,7 @@ class Orientation(Shown):
     dec: Angle
     roll: Angle  # position angle of the image's top, from north through east
     sigma: Quantity  # (3,) of rotations about cam x, y, z [arcsec]
+    lens_error_included: bool  # whether sigma holds the lens's errors: the camera has a covariance
     body: Rotation | None = None  # from enu to the rover's body
     heading: Angle | None = None  # azimuth of body x (forward)
     pitch: Angle | None = None  # nose up positive
@@ -121,11 +122,12 @@ class Orientation(Shown):
 
     def rows(self) -> Rows:
         x, y, z = self.sigma.value
+        lens = "" if self.lens_error_included else ", the lens taken as exact"
         rows = [
             ("right ascension", _deg(self.ra, 4)),
             ("declination", _deg(self.dec, 4)),
             ("roll", f"{_deg(self.roll, 4)} (image's top, from north through east)"),
-            ("sigma", f"{x:.2f}, {y:.2f}, {z:.2f} arcsec about cam x, y, z"),
+            ("sigma", f"{x:.2f}, {y:.2f}, {z:.2f} arcsec about cam x, y, z{lens}"),
         ]
         body = (("heading", self.heading), ("pitch", self.pitch), ("roll of the body", self.roll_body))
         return rows + [(name, _deg(angle, 3)) for name, angle in body if angle is not None]
@@ -158,7 +160,8 @@ def orientation_of(result: Result) -> Orientation | None:
 
     ra, dec, roll = (Angle(np.degrees(angle), u.deg) for angle in boresight_rad(attitude.R_cam_icrs))
     sigma = np.sqrt(np.diag(attitude.covariance_rad2)) * ARCSEC_PER_RAD * u.arcsec
-    found = Orientation(Rotation.from_matrix(attitude.R_cam_icrs), ra, dec, roll, sigma)
+    rotation = Rotation.from_matrix(attitude.R_cam_icrs)
+    found = Orientation(rotation, ra, dec, roll, sigma, lens_errors_known(result))
     if body is None:
         return found
     heading, pitch, roll_body = (Angle(np.degrees(a), u.deg) for a in heading_pitch_roll_from_R_body_enu(body))

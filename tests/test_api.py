@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import tifffile
 from astropy import units as u
 from astropy.time import Time
 from astropy.utils.masked import Masked
@@ -207,7 +208,7 @@ def test_numpy_times_are_utc(unit):
     assert utc(time) == datetime(2029, 9, 8, 3, 12, 45, tzinfo=UTC)
 
 
-def test_fractions_are_no_counts():
+def test_fractions_are_no_counts(tmp_path):
     """Scaled to 0 .. 1 the sample can be identified blindly, but not with a camera file that states levels in ADU."""
     exposure = read_exposure(IMAGE)
     pixels = exposure.pixels_adu / np.float32(65535)
@@ -216,6 +217,11 @@ def test_fractions_are_no_counts():
     assert with_levels.reason == "bad_image" and "fractions from 0 to 1" in with_levels.message
     assert startrack.api.identify(pixels, fov=185)
     assert given_exposure(exposure.pixels_adu, None).warnings == ()
+    tifffile.imwrite(tmp_path / "a.tif", pixels)
+    scaled = read_exposure(tmp_path / "a.tif")
+    assert scaled.saturation_adu is None
+    assert "from 0 to 1 are no sensor's counts" in scaled.warnings[0]
+    assert startrack.api.detect(scaled, camera="fisheye-2048").reason == "bad_image"
 
 
 def test_a_field_of_view_stands_in_for_a_camera():

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from startrack.localize import ExactPosterior, check_consistency
+from startrack.localize.blurred import Blurred
 from startrack.localize.common import raised
+from startrack.localize.dive import best_by_diving
 from startrack.localize.likelihood import Sectors
 from startrack.localize.misfit import turn_of_sky
 from startrack.localize.profile import Profile
@@ -87,6 +89,38 @@ def test_the_vicinity_scores_places_as_all_rays_do(shackleton, sigma_rad):
     top, best = about.climbed(place, 16.0, 0.5)
     assert best >= found.max() - 5
     assert np.allclose(plain.climbed(place, 16.0, 0.5)[0], top, atol=1.0)
+
+
+def test_a_box_is_blurred_as_horizons_drawn_between_its_bounds_are(shackleton):
+    rng = np.random.default_rng(6)
+    evidence = seen_from(shackleton, np.array([-80.0, 30.0]), rng, 3000, 0.0)
+    sectors = Sectors.of(evidence, np.radians(1.5), 1e-4)
+    centres, half = np.array([[-90.0, 40.0], [150.0, -20.0]]), 40.0
+    found = Blurred.of(sectors, Profile.of(sectors)).score(shackleton, centres, half)
+    count, draws = sectors.count, (np.arange(4000) + 0.5) / 4000
+    middle = (2 * np.arange(count) + 1) * np.pi / count
+    low, high = shackleton.horizon_bounds_rad(centres[:, None], np.array(half), middle, np.pi / count)
+    for box in range(2):
+        plain = 0.0
+        for sector in range(count):
+            own = sectors.sector == sector
+            horizon = low[box, sector] + (high - low)[box, sector] * draws
+            sums = (evidence.llr[own] * (evidence.elevation_rad[own] > horizon[:, None])).sum(axis=1)
+            below = np.minimum(sums - sectors.ceiling[sector], 0.0)
+            plain += np.log((1 - sectors.epsilon) * np.exp(below).mean() + sectors.epsilon)
+        assert found[box] == pytest.approx(plain, abs=0.5)
+    assert found[0] > found[1] + 50
+
+
+def test_the_dive_ends_near_the_top(shackleton):
+    for seed in range(6):
+        rng = np.random.default_rng([7, seed])
+        place = rng.uniform(-200, 200, 2)
+        evidence = seen_from(shackleton, place, rng, 1500, 0.0005)
+        sectors = Sectors.of(evidence, np.radians(1.5), 1e-4)
+        found, best = best_by_diving(sectors, Profile.of(sectors), shackleton)
+        assert best > scores(place[None], evidence, sectors, shackleton)[0] - 2.0
+        assert np.linalg.norm(found - place) < 30.0
 
 
 @pytest.mark.parametrize("sigma_rad", [0.0, 0.001])

@@ -1,21 +1,24 @@
-"""A first good place by following the bounds down: where the horizon is costly to ask, or a grid misses its peak."""
+"""A first good place by following the promise of ever smaller boxes: where the horizon is costly to ask."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from startrack.localize.blurred import Blurred
 from startrack.localize.likelihood import Sectors
 from startrack.localize.profile import Profile
-from startrack.localize.search import asked, by_sector, centre_scores
+from startrack.localize.search import CHILDREN, asked, by_sector, centre_scores, holds_ground
 from startrack.localize.vicinity import Vicinity
 from startrack.terrain import Terrain
-from startrack.types import Array, Bools, Ints
+from startrack.types import Array, Ints
 
-KEPT_BOXES, KEPT_SMALL_BOXES = 24, 8  # by each of two measures
+WIDTHS = (32, 128, 512)  # boxes kept at each level, more where fewer do not lead to a good place
+SCORED = 0.5  # part of the last ones that is scored ray by ray
+GOOD_NATS = -0.6  # mean over the sectors; -0.5 is usual at the best place
 SMALL_M = 20.0  # half side of the last boxes
 TRIED, APART_M = 3, 60.0  # places from which the top is climbed, and how far they are apart
-NEARBY_M = 45.0
-FIRST_STEP_M, FINEST_M = 16.0, 0.5
+FINEST_M = 0.5
+CLIMBS = ((45.0, 16.0, 2), (15.0, 4.0, 3))  # how far [m], first step [m], points across where horizons are traced
 
 
 def best_by_diving(sectors: Sectors, profile: Profile, terrain: Terrain) -> tuple[Array, float]:
@@ -24,33 +27,15 @@ def best_by_diving(sectors: Sectors, profile: Profile, terrain: Terrain) -> tupl
     The log-likelihood is a lower bound of the maximum, usually within a nat or two of it; it decides nothing, but lets
     the search exclude nearly everything at once.
     """
-    centres, half = np.zeros((1, 2)), float(terrain.reach_m)
-    while True:
-        boxes, first, last = by_sector(centres, half, sectors, profile, terrain)
-        # By the upper bound alone, places whose bounds are loose would win; by the middle, those with tight ones.
-        keep = _best(boxes.upper, KEPT_BOXES) | _best(boxes.upper + boxes.lower, KEPT_BOXES)
-        boxes, first, last = boxes.take(keep), first[keep], last[keep]
-        if half < SMALL_M or not len(boxes):
+    blurred = Blurred.of(sectors, profile)
+    place, best = np.zeros(2), -np.inf
+    for width in WIDTHS:
+        boxes_m, half = _promising(blurred, terrain, width)
+        found, score = _climbed(boxes_m, half, sectors, profile, terrain)
+        if score > best:
+            place, best = found, score
+        if best > GOOD_NATS * sectors.count:
             break
-        centres, half = boxes.quarters(terrain)[0], half / 2
-    if not len(boxes):
-        return np.zeros(2), -np.inf
-    few = _best(boxes.upper, KEPT_SMALL_BOXES) | _best(boxes.upper + boxes.lower, KEPT_SMALL_BOXES)
-    boxes, first, last = boxes.take(few), first[few], last[few]
-    score = centre_scores(asked(boxes, first, last, profile), sectors, profile, terrain)
-    best, place = -np.inf, np.zeros(2)
-    order = np.argsort(-score, kind="stable")
-    for box in _apart(boxes.centres_m, order):
-        if boxes.upper[box] < best:
-            continue
-        start = boxes.centres_m[box]
-        about = Vicinity.of(sectors, profile, terrain, start, NEARBY_M, across=2)
-        top, _ = about.climbed(start, FIRST_STEP_M, FINEST_M)
-        both = np.array([top, start])
-        both = both[np.asarray(terrain.allowed(both))]
-        found = exact_scores(both, sectors, profile, terrain)
-        if len(found) and found.max() > best:
-            best, place = float(found.max()), both[int(np.argmax(found))]
     return place, best
 
 
@@ -60,6 +45,40 @@ def exact_scores(places_m: Array, sectors: Sectors, profile: Profile, terrain: T
     return centre_scores(asked(boxes, first, last, profile), sectors, profile, terrain)
 
 
+def _promising(blurred: Blurred, terrain: Terrain, width: int) -> tuple[Array, float]:
+    """Centres (n, 2) of small boxes, the most promising first, and their half side."""
+    centres, half = np.zeros((1, 2)), float(terrain.reach_m)
+    while half > SMALL_M:
+        half /= 2
+        centres = (centres[:, None, :] + half * CHILDREN).reshape(-1, 2)
+        centres = centres[holds_ground(terrain, centres, half)]
+        centres = centres[np.argsort(-blurred.score(terrain, centres, half), kind="stable")[:width]]
+    return centres[: round(SCORED * width)], half
+
+
+def _climbed(
+    centres_m: Array, half_m: float, sectors: Sectors, profile: Profile, terrain: Terrain
+) -> tuple[Array, float]:
+    """The best place (2,) near those of the boxes (n, 2) that score best, and its log-likelihood."""
+    best, place = -np.inf, np.zeros(2)
+    if not len(centres_m):
+        return place, best
+    boxes, first, last = by_sector(centres_m, half_m, sectors, profile, terrain)
+    score = centre_scores(asked(boxes, first, last, profile), sectors, profile, terrain)
+    for box in _apart(centres_m, np.argsort(-score, kind="stable")):
+        if boxes.upper[box] < best:
+            continue
+        ways = [centres_m[box]]
+        for nearby_m, first_step_m, across in CLIMBS:
+            about = Vicinity.of(sectors, profile, terrain, ways[-1], nearby_m, across=across)
+            ways.append(about.climbed(ways[-1], first_step_m, FINEST_M)[0])
+        places = np.array(ways)[np.asarray(terrain.allowed(np.array(ways)))]
+        found = exact_scores(places, sectors, profile, terrain)
+        if len(found) and found.max() > best:
+            best, place = float(found.max()), places[int(np.argmax(found))]
+    return place, best
+
+
 def _apart(places_m: Array, order: Ints) -> list[int]:
     """The first few of the places (n, 2) in that order, but for those close to one that came before."""
     chosen: list[int] = []
@@ -67,9 +86,3 @@ def _apart(places_m: Array, order: Ints) -> list[int]:
         if len(chosen) < TRIED and all(np.abs(places_m[i] - places_m[k]).max() > APART_M for k in chosen):
             chosen.append(int(i))
     return chosen
-
-
-def _best(values: Array, count: int) -> Bools:
-    keep = np.zeros(len(values), dtype=bool)
-    keep[np.argsort(-values, kind="stable")[:count]] = True
-    return keep

@@ -128,7 +128,7 @@ def test_posterior_on_ground_equals_a_plain_grid(shackleton, sigma_rad):
     rng = np.random.default_rng(3)
     place = np.array([120.0, 60.0])
     evidence = seen_from(shackleton, place, rng, 1500, sigma_rad)
-    method = ExactPosterior(boxes_per_sigma=3.0)
+    method = ExactPosterior() if sigma_rad else ExactPosterior(boxes_per_sigma=3.0)
     fix = method(evidence, shackleton)
     step = float(np.sqrt(np.linalg.eigvalsh(fix.covariance_m2)[0])) / 3
     reach = 4.5 * float(np.sqrt(np.linalg.eigvalsh(fix.covariance_m2)[1]))

@@ -35,6 +35,7 @@ RAY_BY_RAY_M = 20.0  # boxes of this half side and less are asked ray by ray, la
 NARROW_M, NARROW_PARTS = 60.0, 4  # on real ground, boxes below this half side are asked by quarters of a sector
 NARROW_FROM, NARROW_TO = 600, 4000  # as many boxes as are worth it, and as few as can be traced in seconds
 NARROW_TURNS = 6
+SMOOTH = 0.6  # of the boxes are enough on real ground, whose many soft edges leave no cells: sums of Gaussians converge
 
 
 @dataclass(frozen=True)
@@ -254,7 +255,8 @@ class _Search:
         centred = boxes.centres_m - np.average(boxes.centres_m, axis=0, weights=weight)
         spread = np.einsum("n,ni,nj->ij", weight, centred, centred) / weight.sum()
         smaller = np.sqrt(max(float(np.linalg.eigvalsh(spread)[0]), 0.0))
-        return 2 * boxes.half_m * self.method.boxes_per_sigma / max(smaller, 1e-9)
+        many = self.method.boxes_per_sigma * (1.0 if isinstance(self.terrain, Cylinder) else SMOOTH)
+        return 2 * boxes.half_m * many / max(smaller, 1e-9)
 
 
 def _joined(parts: list[tuple[Boxes, Ints, Ints]], half: float) -> tuple[Boxes, Ints, Ints]:

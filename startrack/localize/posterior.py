@@ -22,7 +22,7 @@ from startrack.types import Array, Bools, Evidence, Fix, Ints, NotLocated
 
 FEWEST_RAYS = 8
 MOST_COARSE_BOXES = 12_000  # boxes of 20 m and more that all might matter: the stars do not say where
-MOST_PAIRS = 6_000_000  # (box, ray) pairs, some 0.5 GB
+MOST_PAIRS = 3_000_000  # (box, ray) pairs of real ground, some 0.3 GB and a minute: what exceeds them takes many
 BOXES_AT_ONCE = 2000
 CONTRADICTED_NATS = -3.0  # mean over the sectors at the best place; -0.5 is usual, and -9.2 the worst
 CLOSEST_NODES_M, FIRST_NODES_M = 10.0, 12.0  # between traced points; half side of the first boxes worth it
@@ -174,7 +174,7 @@ class _Search:
             )
         return NotLocated(
             f"the rays leave {open_m2 / 1e6:.1f} km2 of the search area open: "
-            "is the skyline in the picture, and the exposure long enough?"
+            "is the skyline in the picture, the exposure long enough, the map fine enough nearby?"
         )
 
     def refine(self, boxes: RayBoxes) -> RayBoxes:

@@ -18,7 +18,7 @@ from startrack.localize.scout import scores
 from startrack.localize.vicinity import Vicinity
 from startrack.terrain import load_terrain
 from startrack.terrain.dem import HeightTerrain
-from startrack.types import Array, Evidence
+from startrack.types import Array, Evidence, NotLocated
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -121,6 +121,16 @@ def test_the_dive_ends_near_the_top(shackleton):
         found, best = best_by_diving(sectors, Profile.of(sectors), shackleton)
         assert best > scores(place[None], evidence, sectors, shackleton)[0] - 2.0
         assert np.linalg.norm(found - place) < 30.0
+
+
+def test_stars_of_another_place_or_time_are_refused_before_the_search(shackleton):
+    rng = np.random.default_rng(8)
+    evidence = seen_from(shackleton, np.array([50.0, -120.0]), rng, 3000, 0.0005)
+    assert ExactPosterior()(evidence, shackleton).radius95_m < 50.0
+    turned = replace(evidence, azimuth_rad=np.mod(evidence.azimuth_rad + np.radians(60), 2 * np.pi))
+    with pytest.raises(NotLocated, match="no place explains the stars") as refused:
+        ExactPosterior()(turned, shackleton)
+    assert refused.value.reason == "inconsistent_evidence"
 
 
 @pytest.mark.parametrize("sigma_rad", [0.0, 0.001])

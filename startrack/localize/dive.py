@@ -13,7 +13,7 @@ from startrack.terrain import Terrain
 from startrack.types import Array, Ints
 
 WIDTHS = (32, 128, 512)  # boxes kept at each level, more where fewer do not lead to a good place
-SCORED = 0.5  # part of the last ones that is scored ray by ray
+SCORED = (16, 64, 96)  # of the last ones, ray by ray
 GOOD_NATS = -0.6  # mean over the sectors; -0.5 is usual at the best place
 SMALL_M = 20.0  # half side of the last boxes
 TRIED, APART_M = 3, 60.0  # places from which the top is climbed, and how far they are apart
@@ -29,9 +29,9 @@ def best_by_diving(sectors: Sectors, profile: Profile, terrain: Terrain) -> tupl
     """
     blurred = Blurred.of(sectors, profile)
     place, best = np.zeros(2), -np.inf
-    for width in WIDTHS:
-        boxes_m, half = _promising(blurred, terrain, width)
-        found, score = _climbed(boxes_m, half, sectors, profile, terrain)
+    for width, scored in zip(WIDTHS, SCORED, strict=True):
+        centres, half = _promising(blurred, terrain, width)
+        found, score = _climbed(centres[:scored], half, sectors, profile, terrain)
         if score > best:
             place, best = found, score
         if best > GOOD_NATS * sectors.count:
@@ -53,7 +53,7 @@ def _promising(blurred: Blurred, terrain: Terrain, width: int) -> tuple[Array, f
         centres = (centres[:, None, :] + half * CHILDREN).reshape(-1, 2)
         centres = centres[holds_ground(terrain, centres, half)]
         centres = centres[np.argsort(-blurred.score(terrain, centres, half), kind="stable")[:width]]
-    return centres[: round(SCORED * width)], half
+    return centres, half
 
 
 def _climbed(

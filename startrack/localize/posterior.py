@@ -24,7 +24,7 @@ FEWEST_RAYS = 8
 MOST_COARSE_BOXES = 12_000  # boxes of 20 m and more that all might matter: the stars do not say where
 MOST_PAIRS = 3_000_000  # (box, ray) pairs of real ground, some 0.3 GB and a minute: what exceeds them takes many
 BOXES_AT_ONCE = 2000
-CONTRADICTED_NATS = -3.0  # mean over the sectors at the best place; -0.5 is usual, and -9.2 the worst
+CONTRADICTED_NATS = -1.7  # mean over the sectors at the best place; -0.5 is usual, and -9.2 the worst
 CLOSEST_NODES_M, FIRST_NODES_M = 10.0, 12.0  # between traced points; half side of the first boxes worth it
 WORTH_NODES = 12.0  # horizons traced per open (box, ray) pair, that the levels to come would cost anyhow
 MANY_PAIRS = 200_000  # open ones: horizons at the boxes' middles would cost more than they can tell
@@ -116,6 +116,8 @@ class _Search:
 
     def exclude(self) -> RayBoxes:
         """From the whole area down to small boxes. Raises NotLocated where too much stays open."""
+        if self.best < CONTRADICTED_NATS * self.sectors.count and not isinstance(self.terrain, Cylinder):
+            raise self._lost(np.pi * self.terrain.reach_m**2)  # nothing could be excluded, at great length
         centres, half, of = np.zeros((1, 2)), float(self.terrain.reach_m), np.zeros(1, dtype=np.int64)
         known: tuple[Ints, Ints] | None = None  # open rays of the boxes that the centres are quarters of
         while True:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 from startrack import pipeline
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
-from startrack.given import Picture, When, angle_rad, given_camera, given_exposure, given_terrain
+from startrack.errors import BAD_INPUT_REASONS, BadInput
+from startrack.given import Picture, When, angle_rad, given_camera, given_exposure, given_settings, given_terrain
 from startrack.solution import Solution
 from startrack.terrain import Terrain
 
@@ -31,15 +32,16 @@ def locate(
 
     `image` is a file, an array (H, W) of raw counts, or an Exposure; `camera` and `terrain` are files, names of shipped
     ones, or the objects; `time` is the middle of the exposure: text, datetime, numpy datetime64 or astropy Time (any
-    scale). What is not given comes from the image's sidecar or header. Raises BadInput for a file that cannot be used;
-    a picture that cannot be solved gives a Solution that says why.
+    scale). What is not given comes from the image's sidecar or header.
+
+    Raises BadInput for every reason that ends the commands with exit code 4: something is missing (no_time,
+    no_calibration, bad_terrain) or cannot be used. A picture that cannot be solved, or fits several places (exit code
+    3), gives a Solution that is false and says why. Raises TypeError for other `settings`.
     """
+    settings = given_settings(settings)
     exposure = given_exposure(image, time)
     known = given_camera(camera, exposure), given_terrain(terrain, exposure)
-    result = pipeline.locate(exposure, *known, load_catalog(), settings)
-    for flag, argument in ARGUMENT_OF_FLAG.items():
-        result.message = result.message.replace(flag, argument)
-    return Solution(result)
+    return _solution(pipeline.locate(exposure, *known, load_catalog(), settings), "fix")
 
 
 def identify(
@@ -55,12 +57,22 @@ def identify(
         raise ValueError("camera= and fov= exclude each other: with fov= the lens is found, with camera= it is known")
     exposure = given_exposure(image, time)
     if fov is not None:
-        return Solution(pipeline.identify_blind(exposure, angle_rad(fov), load_catalog()), "identification")
-    return Solution(pipeline.identify(exposure, given_camera(camera, exposure), load_catalog()), "identification")
+        return _solution(pipeline.identify_blind(exposure, angle_rad(fov), load_catalog()), "identification")
+    return _solution(pipeline.identify(exposure, given_camera(camera, exposure), load_catalog()), "identification")
 
 
 def detect(image: Picture, *, camera: str | Camera | None = None) -> Solution:
-    """Centroids only; with a camera their fluxes are in electrons."""
+    """Centroids only; with a camera their fluxes are in electrons. Raises BadInput as `locate` does."""
     exposure = given_exposure(image, None)
     known = camera is not None or exposure.camera is not None
-    return Solution(pipeline.detect(exposure, given_camera(camera, exposure) if known else None), "detections")
+    return _solution(pipeline.detect(exposure, given_camera(camera, exposure) if known else None), "detections")
+
+
+def _solution(result: pipeline.Result, kind: str) -> Solution:
+    """Raises BadInput where the input was at fault, whichever stage found that."""
+    if result.reason in BAD_INPUT_REASONS:
+        message = result.message
+        for flag, argument in ARGUMENT_OF_FLAG.items():
+            message = message.replace(flag, argument)
+        raise BadInput(result.reason, message)
+    return Solution(result, kind)

@@ -5,6 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 INTERNAL_ERROR = "internal_error"  # the reason of an image that met a fault of the program's own
+BAD_INPUT_REASONS = frozenset(  # exit code 4, and BadInput from the library
+    {"bad_image", "size_mismatch", "no_time", "no_calibration", "bad_calibration", "bad_terrain"}
+)
 
 
 class BadInput(Exception):

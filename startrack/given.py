@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from startrack.camera import Camera, load_camera
 from startrack.exposure import exposure_of, read_exposure, with_facts
 from startrack.frames import parse_utc
+from startrack.result import Settings
 from startrack.terrain import Terrain, load_terrain
 from startrack.types import BadInput, Exposure
 
@@ -59,10 +60,23 @@ def utc(time: When) -> datetime | None:
         return time.astimezone(UTC)
     if isinstance(time, np.datetime64):
         return parse_utc(str(time))
-    moment = getattr(getattr(time, "utc", None), "isot", None)
+    moment = _iso_text(time)
     if not isinstance(moment, str):
         raise BadInput("no_time", f"{time!r} is no time: give text, a datetime, a datetime64 or one astropy Time")
     return parse_utc(moment)
+
+
+def _iso_text(time: Any) -> Any:
+    """An astropy Time in UTC, to the microsecond: its own text ends at the millisecond. None for anything else."""
+    try:
+        moment = getattr(time, "utc", None)
+    except Exception as cause:  # astropy's own, such as of a local time or of UT1 beyond its tables
+        raise BadInput("no_time", f"{time!r} cannot be turned into UTC: {cause}") from cause
+    if not hasattr(moment, "isot"):
+        return None
+    finer = moment.copy()
+    finer.precision = 6
+    return finer.isot
 
 
 def given_camera(camera: str | os.PathLike[str] | Camera | None, exposure: Exposure) -> Camera:
@@ -93,6 +107,16 @@ def given_terrain(terrain: str | os.PathLike[str] | Terrain | None, exposure: Ex
     if not hasattr(reference, "horizon_bounds_rad"):
         raise BadInput("bad_terrain", f"{type(reference).__name__} is no terrain: give a file, a name or a Terrain")
     return reference
+
+
+def given_settings(settings: Settings | None) -> Settings | None:
+    """The settings, None for the usual ones. Raises TypeError for anything else."""
+    if settings is None or isinstance(settings, Settings):
+        return settings
+    raise TypeError(
+        f"settings= is of type {type(settings).__name__}: give startrack.pipeline.Settings(...), such as "
+        "Settings(detector=Detector(threshold_snr=6.0))"
+    )
 
 
 def angle_rad(angle: Any) -> float:

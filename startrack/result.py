@@ -30,9 +30,9 @@ class Settings:
     deep_stars: bool = True  # evidence of Gaia's stars too, where installed and the frame sees deeper than Hipparcos
 
 
-@dataclass
+@dataclass(eq=False)  # arrays have no single answer to ==
 class Result:
-    """What became of one image. Parts that were not reached are None."""
+    """What became of one image. Parts that were not reached are None. Two results are equal only if they are one."""
 
     exposure: Exposure
     camera: Camera | None = None

@@ -125,10 +125,10 @@ def test_a_result_of_another_image_is_kept_unless_asked(tmp_path):
 
 
 def test_each_call_writes_the_record_of_its_kind(tmp_path):
-    small = startrack.api.identify(np.full((64, 64), 300, np.uint16), camera="fisheye-2048")
-    assert small.reason == "size_mismatch"
-    assert small.to_dict()["format"] == "startrack.identification/1"
-    assert small.write(tmp_path, plots=False).name == "array.identification.json"
+    flat = startrack.api.identify(np.full((2048, 2048), 300, np.uint16), camera="fisheye-2048")
+    assert flat.reason == "no_stars"
+    assert flat.to_dict()["format"] == "startrack.identification/1"
+    assert flat.write(tmp_path, plots=False).name == "array.identification.json"
     path = startrack.api.identify(IMAGE).write(tmp_path)
     assert sorted(p.name for p in path.parent.glob("near-wall*")) == [
         f"near-wall{end}" for end in (".annotated.png", ".corr", ".identification.json", ".stars.ecsv", ".wcs")
@@ -147,9 +147,9 @@ def test_a_picture_without_stars_says_why():
 
 def test_what_is_missing_is_asked_for():
     pixels = np.zeros((64, 64), np.uint16)
-    timeless = startrack.locate(pixels, camera="fisheye-2048", terrain="shackleton-thesis")
-    assert timeless.reason == "no_time"
-    assert "give time=," in timeless.message and "--" not in timeless.message
+    with pytest.raises(BadInput, match="give time=,") as timeless:
+        startrack.locate(pixels, camera="fisheye-2048", terrain="shackleton-thesis")
+    assert timeless.value.reason == "no_time" and "--" not in str(timeless.value)
     with pytest.raises(BadInput, match="camera="):
         startrack.locate(pixels)
     with pytest.raises(BadInput, match="terrain="):
@@ -175,6 +175,10 @@ def test_importing_startrack_loads_nothing_heavy():
         ({"image": IMAGE, "time": np.datetime64("NaT")}, "no_time"),
         ({"image": IMAGE, "time": np.datetime64("2030-01-01")}, "no_time"),
         ({"image": IMAGE, "time": Time(["2030-01-01", "2030-01-02"])}, "no_time"),
+        ({"image": IMAGE, "time": Time("2030-01-01", scale="local")}, "no_time"),
+        ({"image": IMAGE, "time": datetime(2030, 1, 1)}, "no_time"),
+        ({"image": np.zeros((64, 64), np.uint16), "camera": "fisheye-2048", "terrain": "kepler"}, "no_time"),
+        ({"image": IMAGE, "camera": "lowell-ldt"}, "size_mismatch"),
         ({"image": IMAGE, "camera": 5}, "bad_calibration"),
         ({"image": IMAGE, "terrain": 5}, "bad_terrain"),
     ],
@@ -183,6 +187,26 @@ def test_odd_things_are_refused_with_a_reason(given, reason):
     with pytest.raises(BadInput) as caught:
         startrack.locate(**given)
     assert caught.value.reason == reason
+
+
+def test_the_same_rule_holds_for_stars_alone():
+    with pytest.raises(BadInput) as caught:
+        startrack.api.identify(np.full((64, 64), 300, np.uint16), camera="fisheye-2048")
+    assert caught.value.reason == "size_mismatch"
+
+
+def test_settings_are_settings():
+    with pytest.raises(TypeError, match=r"settings= is of type dict: give startrack\.pipeline\.Settings"):
+        startrack.locate(IMAGE, settings={"a": 1})
+
+
+def test_a_solution_is_equal_to_itself_and_goes_into_sets(solution):
+    other = startrack.api.detect(np.full((64, 64), 300, np.uint16))
+    assert solution == solution and solution != other
+    assert len({solution, other}) == 2
+    assert solution.result != other.result
+    for name in ("position", "attitude", "boresight", "time", "stars", "modes"):
+        assert getattr(solution, name) is getattr(solution, name)
 
 
 def test_colours_lists_and_paths_are_pictures():
@@ -208,20 +232,27 @@ def test_numpy_times_are_utc(unit):
     assert utc(time) == datetime(2029, 9, 8, 3, 12, 45, tzinfo=UTC)
 
 
+def test_astropy_times_keep_their_microseconds():
+    time = Time("2029-09-08T03:12:45.123456")
+    assert utc(time) == utc(time.tdb) == datetime(2029, 9, 8, 3, 12, 45, 123456, tzinfo=UTC)
+    assert time.precision == 3  # the caller's own is left as it was
+
+
 def test_fractions_are_no_counts(tmp_path):
     """Scaled to 0 .. 1 the sample can be identified blindly, but not with a camera file that states levels in ADU."""
     exposure = read_exposure(IMAGE)
     pixels = exposure.pixels_adu / np.float32(65535)
     assert "from 0 to 1 are no sensor's counts" in given_exposure(pixels, None).warnings[0]
-    with_levels = startrack.locate(pixels, camera=exposure.camera, terrain=exposure.terrain, time=exposure.time_utc)
-    assert with_levels.reason == "bad_image" and "fractions from 0 to 1" in with_levels.message
+    with pytest.raises(BadInput, match="fractions from 0 to 1"):
+        startrack.locate(pixels, camera=exposure.camera, terrain=exposure.terrain, time=exposure.time_utc)
     assert startrack.api.identify(pixels, fov=185)
     assert given_exposure(exposure.pixels_adu, None).warnings == ()
     tifffile.imwrite(tmp_path / "a.tif", pixels)
     scaled = read_exposure(tmp_path / "a.tif")
     assert scaled.saturation_adu is None
     assert "from 0 to 1 are no sensor's counts" in scaled.warnings[0]
-    assert startrack.api.detect(scaled, camera="fisheye-2048").reason == "bad_image"
+    with pytest.raises(BadInput, match="fractions from 0 to 1"):
+        startrack.api.detect(scaled, camera="fisheye-2048")
 
 
 def test_a_field_of_view_stands_in_for_a_camera():

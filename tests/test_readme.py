@@ -183,7 +183,7 @@ def test_every_key_that_is_written_is_explained(clone, capsys, command):
 
 
 def test_reasons_and_their_exit_codes_are_those_of_the_code():
-    from startrack.cli.common import BAD_INPUT_REASONS
+    from startrack.errors import BAD_INPUT_REASONS
 
     rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \| ([34]) \|", FORMATS, flags=re.MULTILINE)
     codes = {name: int(code) for names, code in rows for name in re.findall(r"`(\w+)`", names)}

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.flag_types import positive
-from startrack.errors import INTERNAL_ERROR, BadInput
+from startrack.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
 from startrack.paths import made_folder as made_folder
 
 if TYPE_CHECKING:
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from startrack.types import Exposure
 
 DEFAULT_OUT = "startrack-out"
-BAD_INPUT_REASONS = frozenset(
-    {"bad_image", "size_mismatch", "no_time", "no_calibration", "bad_calibration", "bad_terrain"}
-)
 
 
 def add_image_flags(parser: argparse.ArgumentParser) -> None:

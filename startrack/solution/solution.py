@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from datetime import UTC
+from functools import cached_property
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,9 +23,12 @@ if TYPE_CHECKING:
     from startrack.types import Array
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)  # eq: arrays have no single answer to ==
 class Solution:
-    """What became of one picture. `status` is ok, ambiguous or refused; what was not reached is None."""
+    """What became of one picture. `status` is ok, ambiguous or refused; what was not reached is None.
+
+    Equal to itself only; its values are made once, at the first look.
+    """
 
     result: Result
     kind: str = "fix"  # or identification, detections: what was asked for
@@ -44,12 +48,12 @@ class Solution:
     def __bool__(self) -> bool:
         return self.status == "ok"
 
-    @property
+    @cached_property
     def position(self) -> Position | None:
         """East, north, up, their sigma and ellipse, latitude and longitude, with units; None unless located."""
         return position_of(self.result)
 
-    @property
+    @cached_property
     def attitude(self) -> Orientation | None:
         """Rotation, right ascension, declination and roll of the camera, heading and pitch of the rover."""
         return orientation_of(self.result)
@@ -75,7 +79,7 @@ class Solution:
         """Radius [m] of the circle about the position that holds 95 % of the posterior."""
         return self.result.fix.radius95_m if self.result.fix is not None and self else None
 
-    @property
+    @cached_property
     def modes(self) -> QTable | None:
         """Every place that fits: east, north, weight; heaviest first."""
         if self.result.fix is None:
@@ -87,7 +91,7 @@ class Solution:
         east, north = [m.east_m for m in modes] * u.m, [m.north_m for m in modes] * u.m
         return QTable({"east": east, "north": north, "weight": [m.weight for m in modes]})
 
-    @property
+    @cached_property
     def time(self) -> Time | None:
         """Middle of the exposure, UTC."""
         if self.result.exposure.time_utc is None:
@@ -96,7 +100,7 @@ class Solution:
 
         return Time(self.result.exposure.time_utc.astimezone(UTC).replace(tzinfo=None), scale="utc")
 
-    @property
+    @cached_property
     def boresight(self) -> SkyCoord | None:
         """Where the camera's axis points, ICRS."""
         if self.result.attitude is None:
@@ -106,7 +110,7 @@ class Solution:
         ra, dec, _ = boresight_rad(self.result.attitude.R_cam_icrs)
         return SkyCoord(ra, dec, unit="rad", frame="icrs")
 
-    @property
+    @cached_property
     def stars(self) -> QTable | None:
         """The star table: every catalogue star in view, with units."""
         if self.result.stars is None or self.result.attitude is None:

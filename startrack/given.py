@@ -72,7 +72,7 @@ def _iso_text(time: Any) -> Any:
         moment = getattr(time, "utc", None)
     except Exception as cause:  # astropy's own, such as of a local time or of UT1 beyond its tables
         raise BadInput("no_time", f"{time!r} cannot be turned into UTC: {cause}") from cause
-    if not hasattr(moment, "isot"):
+    if moment is None or not hasattr(moment, "isot"):
         return None
     finer = moment.copy()
     finer.precision = 6

@@ -1,4 +1,4 @@
-"""A folder of results to make pages of, as `locate` and `batch` leave it."""
+"""A folder of results to make pages of, as `locate` and `batch` leave it, and a window that shows such a page."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 from startrack.report import write_json, write_results
 
 NASTY = "ein <b>\"Bild\"</b> & 'mehr' </script><script>alert(1)</script> ünï✶.png"
+DESKTOP, PHONE, SMALL = (1280, 800), (390, 844), (360, 740)
 
 
 def results_in(out: Path, located: Any) -> Path:
@@ -32,3 +33,56 @@ def results_in(out: Path, located: Any) -> Path:
     write_json(out / "bad.fix.json", {**refused, "image": NASTY, "reason": "bad_image", "message": NASTY})
     write_json(out / "dark.fix.json", {**refused, "image": "dark.png", "reason": "no_stars", "message": "no star"})
     return out
+
+
+class Window:
+    """A page that is open, with all that it said on the console."""
+
+    def __init__(self, chromium: Any, path: Path, size: tuple[int, int], scheme: str = "light") -> None:
+        touch = size != DESKTOP
+        view = {"width": size[0], "height": size[1]}
+        self.context = chromium.new_context(viewport=view, color_scheme=scheme, has_touch=touch, is_mobile=touch)
+        self.said: list[str] = []
+        self.page = self.context.new_page()
+        self.page.set_default_timeout(60_000)
+        self.page.on("console", lambda message: self.said.append(message.text))
+        self.page.on("pageerror", lambda error: self.said.append(str(error)))
+        self.page.on(
+            "request", lambda request: self.said.append(request.url) if "data:" not in request.url[:5] else None
+        )
+        self.page.goto(path.as_uri())
+        self.said.remove(path.as_uri())
+
+    def until(self, condition: str) -> None:
+        """Wait for a condition in JavaScript. (Playwright's own way polls by eval, which the page's rules forbid.)"""
+        for _ in range(600):
+            if self.page.evaluate(condition):
+                return
+            self.page.wait_for_timeout(100)
+        raise AssertionError(f"never came true: {condition}")
+
+    def open(self, name: str) -> None:
+        self.page.get_by_role("link", name=name).click()
+        self.page.wait_for_selector("#detail h1")
+
+    def star(self, name: str) -> tuple[float, float]:
+        """Where a star of the picture is in the window."""
+        self.page.locator("#detail .stage canvas").first.scroll_into_view_if_needed()
+        x, y = self.page.evaluate(
+            "name => { const c = document.querySelector('#detail .stage canvas'); const f = c.getBoundingClientRect();"
+            "const s = c.view.points.find(p => p.name === name); const [x, y] = c.view.screen(s.x, s.y);"
+            "if (f.top + y > innerHeight - 40) scrollBy(0, f.top + y - innerHeight / 2);"
+            "return [f.left + x, c.getBoundingClientRect().top + y]; }", name,
+        )  # fmt: skip
+        return x, y
+
+    @property
+    def zoom(self) -> float:
+        return float(self.page.locator("#detail .stage").first.get_attribute("data-zoom"))
+
+    def tip(self) -> str:
+        return self.page.locator("#detail .tip").first.inner_text()
+
+    def fits(self) -> bool:
+        """Whether nothing stands out to the right."""
+        return self.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")

@@ -8,6 +8,7 @@ import re
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from startrack.cli.main import main
 from startrack.cli.report import page_of_images
 from startrack.page import page_text, result_at, results_under
 from startrack.page.advice import WORDS
+from startrack.page.gather import folder_of
 from startrack.page.ground import ground_map
 from startrack.page.rows import COLUMNS
 from startrack.report import write_json
@@ -257,6 +259,26 @@ def test_where_pages_go(results, tmp_path, capsys):
     assert "no such folder" in capsys.readouterr().err
     (tmp_path / "empty").mkdir()
     assert main(["report", str(tmp_path / "empty")]) == 4
+
+
+def test_links_are_relative_to_the_page(results, tmp_path):
+    found, _ = results_under(results)
+    for page in (tmp_path / "a # b/rep.html", tmp_path / "rep.html", results.parent / "rep.html"):
+        page.parent.mkdir(exist_ok=True)
+        assert main(["report", str(results), "-q", "-o", str(page)]) == 0
+        base = unquote(data_of(page.read_text(encoding="utf-8"), "results")["base"])
+        assert (page.parent / base).samefile(results)
+    assert all(folder_of(one) == results for one in found)
+    inside = results / "night 1/two.fix.json"
+    assert main(["report", str(inside), "-q", "-o", str(tmp_path / "one.html")]) == 0
+    base = unquote(data_of((tmp_path / "one.html").read_text(encoding="utf-8"), "results")["base"])
+    assert (tmp_path / base).samefile(inside.parent)
+
+
+def test_the_advice_of_a_bad_image_fits_every_cause():
+    advice = WORDS["bad_image"][1]
+    assert advice.startswith("Mend what the message names")
+    assert all(word in advice for word in ("channel", "whole", "number in every pixel", "PNG", "sidecar"))
 
 
 def test_locate_and_batch_add_the_page(tmp_path, capsys):

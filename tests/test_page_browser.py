@@ -7,17 +7,16 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 import pytest
-from page_helpers import NASTY, results_in
+from page_helpers import DESKTOP, NASTY, PHONE, SMALL, Window, results_in
 
-from startrack.page import page_text, results_under
+from startrack.page import page_text, results_under, write_page
 from startrack.page.gather import Found
 
 playwright = pytest.importorskip("playwright.sync_api", reason="the extra `browser` is not installed")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-DESKTOP, PHONE, SMALL = (1280, 800), (390, 844), (360, 740)
-ROW_PX, LINE_PX = 40, 17
 REAL = {"small": (6010.0, -2507.0)}
 
 
@@ -43,59 +42,6 @@ def folder(located, tmp_path_factory) -> Path:
     real = {one.stem: (6003.0, -2498.0) for one in rows}
     (out / "many.html").write_text(page_text(rows, real=real, images=0), encoding="utf-8")
     return out
-
-
-class Window:
-    """A page that is open, with all that it said on the console."""
-
-    def __init__(self, chromium: Any, path: Path, size: tuple[int, int], scheme: str = "light") -> None:
-        touch = size != DESKTOP
-        view = {"width": size[0], "height": size[1]}
-        self.context = chromium.new_context(viewport=view, color_scheme=scheme, has_touch=touch, is_mobile=touch)
-        self.said: list[str] = []
-        self.page = self.context.new_page()
-        self.page.set_default_timeout(60_000)
-        self.page.on("console", lambda message: self.said.append(message.text))
-        self.page.on("pageerror", lambda error: self.said.append(str(error)))
-        self.page.on(
-            "request", lambda request: self.said.append(request.url) if "data:" not in request.url[:5] else None
-        )
-        self.page.goto(path.as_uri())
-        self.said.remove(path.as_uri())
-
-    def until(self, condition: str) -> None:
-        """Wait for a condition in JavaScript. (Playwright's own way polls by eval, which the page's rules forbid.)"""
-        for _ in range(600):
-            if self.page.evaluate(condition):
-                return
-            self.page.wait_for_timeout(100)
-        raise AssertionError(f"never came true: {condition}")
-
-    def open(self, name: str) -> None:
-        self.page.get_by_role("link", name=name).click()
-        self.page.wait_for_selector("#detail h1")
-
-    def star(self, name: str) -> tuple[float, float]:
-        """Where a star of the picture is in the window."""
-        self.page.locator("#detail .stage canvas").first.scroll_into_view_if_needed()
-        x, y = self.page.evaluate(
-            "name => { const c = document.querySelector('#detail .stage canvas'); const f = c.getBoundingClientRect();"
-            "const s = c.view.points.find(p => p.name === name); const [x, y] = c.view.screen(s.x, s.y);"
-            "if (f.top + y > innerHeight - 40) scrollBy(0, f.top + y - innerHeight / 2);"
-            "return [f.left + x, c.getBoundingClientRect().top + y]; }", name,
-        )  # fmt: skip
-        return x, y
-
-    @property
-    def zoom(self) -> float:
-        return float(self.page.locator("#detail .stage").first.get_attribute("data-zoom"))
-
-    def tip(self) -> str:
-        return self.page.locator("#detail .tip").first.inner_text()
-
-    def fits(self) -> bool:
-        """Whether nothing stands out to the right."""
-        return self.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
 
 
 @pytest.fixture
@@ -160,8 +106,11 @@ def test_fingers_tap_and_pinch(window):
     w.page.touchscreen.tap(x, y)
     w.page.wait_for_selector("#detail .tip:not([hidden])")
     assert "magnitude" in w.tip()
-    box = w.page.locator("#detail .tip").first.bounding_box()
+    box, stage = (w.page.locator(f"#detail {which}").first.bounding_box() for which in (".tip", ".stage"))
     assert box["x"] >= 0 and box["x"] + box["width"] <= PHONE[0]
+    assert box["y"] >= stage["y"] + stage["height"]  # the picture and the star stay in sight
+    assert box["y"] + box["height"] <= PHONE[1]
+    x, y = w.star("Canopus")
     session = w.context.new_cdp_session(w.page)
     for apart, kind in ((20, "touchStart"), (30, "touchMove"), (60, "touchMove"), (60, "touchEnd")):
         points = [{"x": x - apart, "y": y, "id": 0}, {"x": x + apart, "y": y, "id": 1}]
@@ -206,6 +155,16 @@ def test_rows_are_sorted_filtered_and_opened(window):
     w.page.go_back()
     w.page.wait_for_selector("#overview table")
     assert w.page.locator("#detail").is_hidden()
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_the_ways_out_of_an_image_stand_in_one_line(window, size):
+    w = window(size)
+    w.open("night 1/two.png")
+    links = w.page.locator("nav.path a")
+    boxes = [links.nth(k).bounding_box() for k in range(3)]
+    assert len({box["y"] for box in boxes}) == 1
+    assert boxes[2]["x"] - boxes[1]["x"] - boxes[1]["width"] >= 16
 
 
 def test_an_ambiguous_image_shows_every_place_and_its_warnings(window):
@@ -266,16 +225,41 @@ def test_a_file_is_shown_by_its_name_and_found_by_its_path(window):
     assert "The first image of a run" in w.page.locator("#detail").inner_text()
 
 
-def test_a_long_name_wraps_and_is_told_in_full(window, folder):
-    name = "a-name-that-is-long-enough-to-need-a-second-line-in-the-table-of-all-images.png"
-    record = json.loads((folder / "dark.fix.json").read_text()) | {"image": name}
-    page = page_text([Found("long", folder / "long.fix.json", record)], unread=["x.fix.json: holds no JSON object"])
-    (folder / "long.html").write_text(page, encoding="utf-8")
-    w = window(PHONE, name="long.html")
-    link = w.page.get_by_role("link", name=name)
-    assert link.get_attribute("title") == name
-    assert 1.5 * LINE_PX < link.bounding_box()["height"] <= ROW_PX
-    assert "x.fix.json: holds no JSON object" in w.page.locator("#overview").inner_text()
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_long_names_are_whole_and_rows_stay_where_they_are_reckoned(window, folder, size):
+    record = json.loads((folder / "dark.fix.json").read_text())
+    long = "{:04}-a-name-of-many-words-that-needs-some-lines-WWWWWWWWWWWWWWWW-in-the-table-of-images-{:04}-left.png"
+    names = [long.format(k // 2, k) if k % 3 else f"{k // 2:04}.png" for k in range(300)]
+    rows = [Found(f"r{k}", folder / f"r{k}.fix.json", record | {"image": name}) for k, name in enumerate(names)]
+    (folder / "long.html").write_text(page_text(rows, unread=["x.fix.json: no JSON"], images=0), encoding="utf-8")
+    w = window(size, name="long.html")
+    assert "x.fix.json: no JSON" in w.page.locator("#overview").inner_text()
+    for place in ("0", "box.scrollHeight / 2", "box.scrollHeight"):
+        w.page.locator(".rows").evaluate(f"box => {{ box.scrollTop = {place} }}")
+        w.page.wait_for_timeout(100)
+        told = w.page.evaluate(
+            "[...document.querySelectorAll('tbody tr[data-index]')].map(tr => { const a = tr.querySelector('a');"
+            "const cell = a.parentElement;"
+            "return [a.innerText === page.rows[+tr.dataset.index][column.image], a.offsetHeight <= cell.clientHeight,"
+            "a.scrollWidth <= cell.clientWidth, tr.getBoundingClientRect().height - parseFloat(tr.style.height)] })"
+        )
+        assert len(told) > 10
+        assert all(whole and high and wide and abs(off) < 1 for whole, high, wide, off in told)
+    w.page.get_by_role("link", name=max(names)).click()
+    assert w.page.locator("#detail h1").inner_text() == max(names)
+
+
+def test_links_lead_from_the_page_to_the_results(window, folder):
+    place = folder / "other # place"
+    place.mkdir()
+    found, _ = results_under(folder)
+    write_page(place / "rep.html", found)
+    w = window(name="other # place/rep.html")
+    w.open("night 1/two.png")
+    addresses = w.page.evaluate("[...document.querySelectorAll('.files a')].map(a => a.href)")
+    files = [Path(unquote(urlsplit(address).path)) for address in addresses]
+    assert len(files) == 3 and all(file.is_file() for file in files)
+    assert files[0].samefile(folder / "night 1/two.fix.json")
 
 
 def test_texts_stay_texts(window):

@@ -6,7 +6,8 @@ from __future__ import annotations
 WORDS: dict[str, tuple[str, str]] = {
     "bad_image": (
         "The image cannot be used",
-        "Check that the file is whole: one picture as PNG, TIFF, FITS, JPEG or camera raw; its sidecar valid JSON.",
+        "Mend what the message names: startrack takes one whole picture of one channel or three, a number in every "
+        "pixel, as PNG, TIFF, FITS, JPEG or camera raw, and beside it a sidecar that is valid JSON.",
     ),
     "size_mismatch": (
         "The image's size is not the camera's",

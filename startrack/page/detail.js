@@ -116,8 +116,8 @@ function starsCard(detail, stars) {
 }
 
 function filesCard(detail, stem) {
-  const folder = page.single || !stem.includes("/") ? "" : stem.slice(0, stem.lastIndexOf("/") + 1);
-  const names = detail ? detail.files : [`${stem.slice(stem.lastIndexOf("/") + 1)}.fix.json`];
-  const path = (name) => `./${`${folder}${name}`.split("/").map(encodeURIComponent).join("/")}`;
+  const folder = stem.slice(0, stem.lastIndexOf("/") + 1);
+  const names = detail ? detail.files : [`${stem.slice(folder.length)}.fix.json`];
+  const path = (name) => `${page.base}/${`${folder}${name}`.split("/").map(encodeURIComponent).join("/")}`;
   return section("Files", make("ul", { class: "files" }, ...names.map((name) => make("li", {}, make("a", { href: path(name) }, name)))));
 }

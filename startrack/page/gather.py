@@ -63,6 +63,11 @@ def result_at(path: str | os.PathLike[str]) -> Found:
         raise BadInput("bad_image", f"{path}: is not a NAME.fix.json of startrack: {cause}") from cause
 
 
+def folder_of(found: Found) -> Path:
+    """The folder that the stem of a result is relative to."""
+    return found.path.parents[found.stem.count("/")]
+
+
 def _files(root: Path) -> list[Path]:
     """One file of each image, in the order of their names; hidden folders left out."""
     chosen: dict[str, Path] = {}

@@ -22,7 +22,7 @@ View.prototype.listen = function listen() {
     if (this.travelled > 6) return;
     const point = this.nearest(...place(event), REACH[event.pointerType] || 12);
     const again = point && point === this.told;
-    this.tellOf(point, true);
+    this.tellOf(point, true, event.pointerType !== "mouse");
     if (point && this.open && (event.pointerType === "mouse" || again)) this.open(point);
   });
   canvas.addEventListener("pointercancel", (event) => this.fingers.delete(event.pointerId));

@@ -1,6 +1,9 @@
 // The table of a batch: sorted by its headers, filtered by words and outcome. Only the rows in sight are in the page,
-// so that ten thousand scroll as ten do.
+// so that ten thousand scroll as ten do; how high each is, for a long name, is therefore reckoned before it is there.
 const ROW_PX = 40;
+const LINE_PX = 17;
+const ROOM_PX = 6; // above and below the lines of a name
+const LETTER_PX = 16; // what a line may lack of being full, for the next letter is wider
 const SPARE_ROWS = 12;
 const HEADS = [
   ["image", "Image", "wide", null], ["status", "Outcome", "mid", null],
@@ -44,7 +47,44 @@ class Table {
       make("thead", {}, make("tr", { "aria-rowindex": "1" }, ...this.cells)), this.body);
     this.scroller = make("div", { class: "scroll rows", tabindex: "0", role: "region", "aria-label": "Table of images", onscroll: () => this.fill() }, table);
     this.node = section("Images", make("div", { class: "filters" }, make("div", { class: "toggles", role: "group", "aria-label": "Filter by outcome" }, ...this.buttons), this.search), this.count, this.scroller);
-    new ResizeObserver(() => this.fill()).observe(this.scroller);
+    new ResizeObserver(() => this.resized()).observe(this.scroller);
+  }
+
+  resized() {
+    const head = this.cells[0];
+    if (head.clientWidth && head.clientWidth !== this.headWidth) {
+      this.headWidth = head.clientWidth;
+      this.measure(head);
+      this.stack();
+      this.first = null;
+    }
+    this.fill();
+  }
+
+  // Heights of all rows, a name taking the lines that it needs at the width of its column.
+  measure(head) {
+    const side = getComputedStyle(head.firstChild);
+    const width = head.clientWidth - parseFloat(side.paddingLeft) - parseFloat(side.paddingRight) - LETTER_PX;
+    const g = make("canvas").getContext("2d");
+    const { fontSize, fontFamily } = getComputedStyle(this.body);
+    g.font = `${fontSize} ${fontFamily}`;
+    for (const row of this.rows) row.height = Math.max(ROW_PX, ROOM_PX + LINE_PX * Math.ceil(g.measureText(row.image).width / width));
+  }
+
+  // Where each row that is shown begins, and behind them where the last one ends.
+  stack() {
+    this.tops = [0];
+    for (const row of this.shown) this.tops.push(this.tops.at(-1) + (row.height || ROW_PX));
+  }
+
+  rowAt(top) {
+    let [low, high] = [0, this.shown.length];
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (this.tops[middle + 1] <= top) low = middle + 1;
+      else high = middle;
+    }
+    return low;
   }
 
   sortBy(key) {
@@ -69,19 +109,21 @@ class Table {
     });
     this.count.textContent = this.shown.length === this.rows.length ? `${say(this.rows.length, 0)} images` : `${say(this.shown.length, 0)} of ${say(this.rows.length, 0)} images`;
     this.scroller.scrollTop = 0;
+    this.stack();
     this.first = null;
     this.fill();
   }
 
   fill() {
-    const first = Math.max(0, Math.floor(this.scroller.scrollTop / ROW_PX) - SPARE_ROWS);
-    const last = Math.min(this.shown.length, first + Math.ceil((this.scroller.clientHeight || 600) / ROW_PX) + 2 * SPARE_ROWS);
+    const { scrollTop, clientHeight } = this.scroller;
+    const first = Math.max(0, this.rowAt(scrollTop) - SPARE_ROWS);
+    const last = Math.min(this.shown.length, this.rowAt(scrollTop + (clientHeight || 600)) + 1 + SPARE_ROWS);
     if (first === this.first && last === this.last) return;
     const held = this.body.contains(document.activeElement) ? document.activeElement.closest("tr")?.dataset.index : null;
     [this.first, this.last] = [first, last];
-    const spacer = (count) => (count ? make("tr", { "aria-hidden": "true", class: "spacer", style: `height:${count * ROW_PX}px` }, make("td", { colspan: String(this.heads.length) })) : null);
+    const spacer = (height) => (height ? make("tr", { "aria-hidden": "true", class: "spacer", style: `height:${height}px` }, make("td", { colspan: String(this.heads.length) })) : null);
     const rows = this.shown.slice(first, last).map((row, k) => this.line(row, first + k));
-    this.body.replaceChildren(...[spacer(first), ...rows, spacer(this.shown.length - last)].filter(Boolean));
+    this.body.replaceChildren(...[spacer(this.tops[first]), ...rows, spacer(this.tops.at(-1) - this.tops[last])].filter(Boolean));
     if (held) this.body.querySelector(`tr[data-index="${held}"] a`)?.focus({ preventScroll: true });
   }
 
@@ -91,7 +133,7 @@ class Table {
       if (key === "status") return make("td", { class: kind, title: row.reason }, badge(row.status), outcomeWords(row));
       return make("td", { class: kind }, text(row));
     });
-    return make("tr", { "aria-rowindex": String(place + 2), "data-index": String(row.index), onclick: () => this.open(row.index) }, ...cells);
+    return make("tr", { "aria-rowindex": String(place + 2), "data-index": String(row.index), style: `height:${row.height || ROW_PX}px`, onclick: () => this.open(row.index) }, ...cells);
   }
 }
 

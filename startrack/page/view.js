@@ -1,6 +1,7 @@
 // A drawing that can be zoomed (wheel, pinch, + and -), moved (drag, arrows), reset (double click, 0) and asked about
 // its points (hover, tap, n and p). World coordinates [x0, y0, x1, y1]; `up` where y grows upward.
 const TICK_FONT = "12px system-ui, sans-serif";
+const NARROW_PX = 480;
 const REACH = { mouse: 12, pen: 16, touch: 26 };
 
 class View {
@@ -10,11 +11,11 @@ class View {
     this.canvas.view = this;
     this.tip = make("div", { class: "tip", hidden: true });
     this.live = make("p", { class: "unseen", role: "status" });
-    this.stage = make("div", { class: "stage", style: `aspect-ratio:${1 / this.ratio}` }, this.canvas, this.tip);
+    this.stage = make("div", { class: "stage", style: `aspect-ratio:${1 / this.ratio}` }, this.canvas);
     const tool = (text, label, act) => make("button", { type: "button", "aria-label": `${label}: ${this.label}`, onclick: act }, text);
     this.tools = make("div", { class: "tools" }, tool("+", "Zoom in", () => this.zoomBy(1.6)),
       tool("−", "Zoom out", () => this.zoomBy(1 / 1.6)), tool("Reset", "Show all", () => this.reset()));
-    this.node = make("figure", { class: "view" }, this.stage, this.tools, this.live);
+    this.node = make("figure", { class: "view" }, this.stage, this.tip, this.tools, this.live);
     this.fingers = new Map();
     this.listen();
     this.centre = this.middle();
@@ -138,9 +139,11 @@ class View {
     return best;
   }
 
-  tellOf(point, aloud) {
+  // Tells of a point; `aloud` to readers of the screen too. What a finger asked for may take the room below the stage.
+  tellOf(point, aloud, tapped) {
     if (point === this.told) return;
     this.told = point;
+    this.tapped = Boolean(tapped);
     this.tip.replaceChildren();
     if (point) {
       const [title, rows] = this.tell(point);
@@ -148,12 +151,21 @@ class View {
       if (aloud) this.live.textContent = `${title}: ${rows.filter(([, v]) => known(v)).map(([k, v]) => `${k} ${v}`).join(", ")}`;
     }
     this.canvas.style.cursor = point ? "pointer" : "";
+    this.placeTip();
+    if (this.tip.classList.contains("tapped")) this.tip.scrollIntoView({ block: "nearest" });
     this.redraw();
   }
 
   placeTip() {
     this.tip.hidden = !this.told;
     if (!this.told) return;
+    const below = this.width < NARROW_PX; // there it would hide most of the drawing, and the point itself
+    this.tip.classList.toggle("below", below);
+    this.tip.classList.toggle("tapped", below && this.tapped);
+    if (below) {
+      this.tip.style.left = this.tip.style.top = "";
+      return;
+    }
     const [x, y] = this.screen(this.told.x, this.told.y);
     const { offsetWidth: w, offsetHeight: h } = this.tip;
     const left = x + 16 + w <= this.width ? x + 16 : x - 16 - w;

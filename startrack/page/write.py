@@ -8,10 +8,11 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from startrack.exposure import write_atomically
 from startrack.page.advice import words_of
-from startrack.page.gather import Found
+from startrack.page.gather import Found, folder_of
 from startrack.page.ground import Grounds, ground_map, horizon_deg
 from startrack.page.picture import picture_of
 from startrack.page.rows import COLUMNS, Place, chosen, errors_of, number, part, row_of
@@ -39,7 +40,8 @@ def write_page(
 
     `real` has the true (east, north) [m] of images by their stems, where a caller knows them.
     """
-    text = page_text(found, unread=unread, real=real, images=images, single=single)
+    base = _address(folder_of(found[0]), Path(path).parent)
+    text = page_text(found, unread=unread, real=real, images=images, single=single, base=base)
     write_atomically(path, text.encode("utf-8", "replace"), overwrite=True)
 
 
@@ -50,8 +52,9 @@ def page_text(
     real: Mapping[str, Place] | None = None,
     images: int = DEFAULT_IMAGES,
     single: bool = False,
+    base: str = ".",
 ) -> str:
-    """The page as text: the same results give the same text."""
+    """The page as text: the same results give the same text. `base` is the results' folder as the page sees it."""
     real, grounds = real or {}, Grounds()
     detailed = chosen(found, images)
     rows = [row_of(one, real.get(one.stem), k in detailed) for k, one in enumerate(found)]
@@ -61,6 +64,7 @@ def page_text(
         "columns": COLUMNS,
         "rows": rows,
         "single": single and len(found) == 1,
+        "base": base,
         "unread": list(unread),
         "errors": errors_of(rows),
         "words": {reason: words_of(reason) for reason in sorted({row[3] for row in rows if row[3]})},
@@ -77,6 +81,14 @@ def page_text(
     }
     pieces = frame.split("@@")  # never replaced twice: a result may hold any text
     return "".join(parts.get(piece, piece) for piece in pieces)
+
+
+def _address(folder: Path, seen_from: Path) -> str:
+    """Of one folder for links of a page in another; whole where no relative one exists (another drive)."""
+    try:
+        return quote(Path(os.path.relpath(folder, seen_from)).as_posix())
+    except ValueError:
+        return folder.absolute().as_uri()
 
 
 def _detail(found: Found, grounds: Grounds, size: tuple[int, int, int]) -> dict[str, Any]:

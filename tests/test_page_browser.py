@@ -254,12 +254,26 @@ def test_links_lead_from_the_page_to_the_results(window, folder):
     place.mkdir()
     found, _ = results_under(folder)
     write_page(place / "rep.html", found)
-    w = window(name="other # place/rep.html")
-    w.open("night 1/two.png")
-    addresses = w.page.evaluate("[...document.querySelectorAll('.files a')].map(a => a.href)")
-    files = [Path(unquote(urlsplit(address).path)) for address in addresses]
+    files = linked(window(name="other # place/rep.html"), "night 1/two.png")
     assert len(files) == 3 and all(file.is_file() for file in files)
     assert files[0].samefile(folder / "night 1/two.fix.json")
+
+
+def test_an_image_without_details_leads_to_its_result_of_either_kind(window, folder):
+    place = folder / "stars alone"
+    place.mkdir()
+    shutil.copy(folder / "dark.fix.json", place / "dark.identification.json")
+    found, _ = results_under(place)
+    write_page(place / "rep.html", found, images=0)
+    (file,) = linked(window(name="stars alone/rep.html"), "dark.png")
+    assert file.samefile(found[0].path)
+
+
+def linked(w: Window, image: str) -> list[Path]:
+    """The files that the page of an image leads to."""
+    w.open(image)
+    addresses = w.page.evaluate("[...document.querySelectorAll('.files a')].map(a => a.href)")
+    return [Path(unquote(urlsplit(address).path)) for address in addresses]
 
 
 def test_texts_stay_texts(window):

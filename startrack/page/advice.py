@@ -7,7 +7,7 @@ WORDS: dict[str, tuple[str, str]] = {
     "bad_image": (
         "The image cannot be used",
         "Mend what the message names: startrack takes one whole picture of one channel or three, a number in every "
-        "pixel, as PNG, TIFF, FITS, JPEG or camera raw, and beside it a sidecar that is valid JSON.",
+        "pixel, as PNG, TIFF, FITS, JPEG or camera raw, and its sidecar, if any, in valid JSON.",
     ),
     "size_mismatch": (
         "The image's size is not the camera's",

@@ -21,7 +21,7 @@ function showDetail(host, k) {
     mapsCard(record, real, name),
     detail && stars.some((star) => known(star.az)) ? panoramaCard(detail, stars, name) : null,
     groups.length ? make("div", { class: "cards" }, ...groups.map(([title, body]) => section(title, ...[body].flat()))) : null,
-    stars.length ? starsCard(detail, stars) : null, filesCard(detail, value("stem")),
+    stars.length ? starsCard(detail, stars) : null, filesCard(detail, value("stem"), value("kind")),
   ].filter(Boolean));
 }
 
@@ -115,9 +115,9 @@ function starsCard(detail, stars) {
       make("caption", {}, `Light in ${detail.stars.unit}; every star is in the star table`), make("thead", {}, make("tr", {}, ...head.map((text) => make("th", { scope: "col" }, text)))), make("tbody", {}, ...body))));
 }
 
-function filesCard(detail, stem) {
+function filesCard(detail, stem, kind) {
   const folder = stem.slice(0, stem.lastIndexOf("/") + 1);
-  const names = detail ? detail.files : [`${stem.slice(folder.length)}.fix.json`];
+  const names = detail ? detail.files : [`${stem.slice(folder.length)}.${kind}.json`];
   const path = (name) => `${page.base}/${`${folder}${name}`.split("/").map(encodeURIComponent).join("/")}`;
   return section("Files", make("ul", { class: "files" }, ...names.map((name) => make("li", {}, make("a", { href: path(name) }, name)))));
 }

@@ -22,6 +22,11 @@ class Found:
     path: Path  # of the JSON file
     record: dict[str, Any]
 
+    @property
+    def kind(self) -> str:
+        """What its file's name says that it is: fix or identification."""
+        return "identification" if self.path.name.endswith(KINDS[1]) else "fix"
+
     def beside(self, suffix: str) -> Path:
         """Path of a companion such as `.stars.ecsv`."""
         return self.path.with_name(_stem(self.path.name) + suffix)

@@ -12,7 +12,7 @@ Place = tuple[float, float]  # east, north [m]
 COLUMNS = (
     "image", "stem", "status", "reason", "message", "time_utc", "terrain", "east_m", "north_m", "cov_ee", "cov_en",
     "cov_nn", "radius95_m", "radius999_m", "identified", "rms_px", "seconds", "real_e", "real_n", "error_m", "nees",
-    "detail",
+    "kind", "detail",
 )  # fmt: skip
 MESSAGE_LETTERS = 400
 
@@ -31,7 +31,7 @@ def row_of(found: Found, real: Place | None, detailed: bool) -> list[Any]:
         rounded(number(position, "radius95_m"), 2), rounded(number(position, "radius999_m"), 2),
         stars.get("identified"), rounded(number(stars, "rms_px"), 3), rounded(_seconds(record), 3),
         *((rounded(real[0], 2), rounded(real[1], 2)) if real else (None, None)), rounded(error_m, 2), rounded(nees, 3),
-        detailed,
+        found.kind, detailed,
     ]  # fmt: skip
 
 

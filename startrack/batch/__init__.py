@@ -2,6 +2,7 @@
 
 from startrack.batch.find import Image, images_under, named_images
 from startrack.batch.kept import JOB, in_the_tables, is_of_other_images, printable, result_of, stored
+from startrack.batch.rows import Rows, gist, rows_of
 from startrack.batch.run import Batch, Counts
 from startrack.batch.tables import write_tables
 from startrack.batch.task import BatchStopped, Task, locate_image
@@ -12,7 +13,9 @@ __all__ = [
     "BatchStopped",
     "Counts",
     "Image",
+    "Rows",
     "Task",
+    "gist",
     "images_under",
     "in_the_tables",
     "is_of_other_images",
@@ -20,6 +23,7 @@ __all__ = [
     "named_images",
     "printable",
     "result_of",
+    "rows_of",
     "stored",
     "write_tables",
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import stat
 import tomllib
 from collections.abc import Iterable
 from functools import lru_cache
@@ -24,6 +25,8 @@ FILES = ("camera", "terrain")  # facts that may be paths
 def sha256_of(path: str | os.PathLike[str]) -> str:
     """SHA-256 of a file's content in hex, `MISSING` where it cannot be read: whoever needs it will say so."""
     try:
+        if not stat.S_ISREG(os.stat(path).st_mode):  # a pipe would be waited for
+            return MISSING
         with Path(path).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except (OSError, ValueError):  # a NUL in the name
@@ -54,6 +57,15 @@ def unchanged(image: str, hashes: dict[str, str]) -> bool:
     """Whether the files of `hashes_of` are what they were."""
     folder = os.path.realpath(Path(image).parent)
     return all(_sha256_once(Path(folder, path)) == sha256 for path, sha256 in hashes.items())
+
+
+def untouched_since(image: str | os.PathLike[str], result: str | os.PathLike[str]) -> bool:
+    """Whether the image was neither written nor put in its place after its result; quick, for it reads neither."""
+    try:
+        of_image, of_result = os.stat(image), os.stat(result)
+    except (OSError, ValueError):  # a NUL in the name
+        return False
+    return max(of_image.st_mtime_ns, of_image.st_ctime_ns) < of_result.st_mtime_ns
 
 
 def _maps(terrain: Path) -> list[Path]:

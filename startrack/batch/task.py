@@ -6,12 +6,15 @@ import errno
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from startrack import __version__
-from startrack.batch.inputs import MISSING, hashes_of, key_of, sha256_of, unchanged
-from startrack.batch.kept import INPUTS, JOB, printable, stored
-from startrack.errors import INTERNAL_ERROR, BadInput
+from startrack.batch.inputs import MISSING, hashes_of, key_of, sha256_of, unchanged, untouched_since
+from startrack.batch.kept import INPUTS, JOB, has_companions, image_sha256, is_solved, printable, stored
+from startrack.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
+
+if TYPE_CHECKING:
+    from startrack.result import Result
 
 # Errors of writing that the next image meets too.
 OF_THE_DISK = {errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.EFBIG, errno.EIO}
@@ -42,16 +45,22 @@ def locate_image(task: Task) -> tuple[dict[str, Any], bool]:
     """
     try:
         sha256 = sha256_of(task.path)
-        key = key_of(task.path, sha256, task.facts, task.plots, task.compiled)
-        before = None if task.renew else stored(task.result)
-        if before is not None and before.get(JOB) == key and unchanged(task.path, before.get(INPUTS, {})):
-            return before, True
-        return _fresh(task, sha256, key), False
+        before = None if task.renew else _standing(task, sha256)
+        return (before, True) if before is not None else (_fresh(task, sha256), False)
     except Exception as cause:  # noqa: BLE001 - one image's fault is its own; it is counted and told as such
         if isinstance(cause, BadInput):  # a refusal is a record: this is of the results, which cannot be written
             _stop_where_the_disk_is_full(cause)
             return lost(task, str(cause), cause.reason), False
         return lost(task, f"internal error: {type(cause).__name__}: {cause}"), False
+
+
+def still_stored(task: Task) -> dict[str, Any] | None:
+    """The stored record that the next run would keep, else None. An image that is older than its result is not read."""
+    record = stored(task.result)
+    if record is None:
+        return None
+    known = image_sha256(record) if untouched_since(task.path, task.result) else None
+    return _standing(task, known or sha256_of(task.path))
 
 
 def lost(task: Task, message: str, reason: str = INTERNAL_ERROR) -> dict[str, Any]:
@@ -61,19 +70,46 @@ def lost(task: Task, message: str, reason: str = INTERNAL_ERROR) -> dict[str, An
     record = {**refused_dict(task.name, reason, message), **_unread(sha256_of(task.path))}
     record |= {"image": printable(task.name), JOB: None}
     with suppress(BadInput):  # where it cannot be written, there is nothing to keep either
-        _clear(Path(task.result))
-        write_json(task.result, record)
+        if not is_solved(stored(task.result)):
+            _clear(Path(task.result))
+            write_json(task.result, record)
     return record
 
 
-def _fresh(task: Task, sha256: str, key: str) -> dict[str, Any]:
-    """The record made anew. The old one goes first, so that no half of a result is ever taken for a whole."""
-    from startrack.report import write_json
+def _standing(task: Task, sha256: str) -> dict[str, Any] | None:
+    """The stored record where it is made from all that the image's result is made from now, and is whole."""
+    record = stored(task.result)
+    if record is None or record.get(JOB) != _key(task, sha256) or not unchanged(task.path, record.get(INPUTS, {})):
+        return None
+    return record if has_companions(record, Path(task.result), plots=task.plots) else None
 
-    _clear(Path(task.result))
-    record, inputs = _located(task, sha256)
+
+def _key(task: Task, sha256: str) -> str:
+    return key_of(task.path, sha256, task.facts, task.plots, task.compiled)
+
+
+def _fresh(task: Task, sha256: str) -> dict[str, Any]:
+    """The record made anew, and written unless it only says that an input is at fault where a solution stands already.
+
+    The old files go first, when all is worked out, so that no half of a result is ever taken for a whole.
+    """
+    from startrack.report import result_dict, write_json, write_results
+
+    key, result = _key(task, sha256), Path(task.result)
+    found, inputs = _located(task, sha256)
+    reason = found["reason"] if isinstance(found, dict) else found.reason
+    former_stays = reason in BAD_INPUT_REASONS and is_solved(stored(result))
+    if not former_stays:
+        _clear(result)
+    if isinstance(found, dict):
+        record = found
+    elif former_stays:
+        record = result_dict(found)
+    else:
+        record = write_results(found, result, plots=task.plots, write_record=False)
     record = {**record, "image": printable(task.name), JOB: key, INPUTS: inputs}
-    write_json(task.result, record)
+    if not former_stays:
+        write_json(result, record)
     return record
 
 
@@ -89,12 +125,12 @@ def _clear(result: Path) -> None:
         raise BadInput("bad_image", f"{result}: cannot be written ({cause.strerror})") from cause
 
 
-def _located(task: Task, sha256: str) -> tuple[dict[str, Any], dict[str, str]]:
-    """Result or refusal, and the hashes of its other files. Raises BadInput where its companions cannot be written."""
+def _located(task: Task, sha256: str) -> tuple[Result | dict[str, Any], dict[str, str]]:
+    """A result that has companions, or else the record of a refusal; and the hashes of its other files."""
     from startrack.exposure import read_exposure
     from startrack.localize import ExactPosterior
     from startrack.pipeline import Settings, locate_exposure
-    from startrack.report import refused_dict, result_dict, write_results
+    from startrack.report import refused_dict, result_dict
     from startrack.result import Result
 
     try:
@@ -103,10 +139,9 @@ def _located(task: Task, sha256: str) -> tuple[dict[str, Any], dict[str, str]]:
         return {**refused_dict(task.name, cause.reason, str(cause)), **_unread(sha256)}, {}
     inputs = hashes_of(task.path, [exposure.camera, exposure.terrain])  # before they are read: one that changes is seen
     try:
-        found = locate_exposure(exposure, Settings(localizer=ExactPosterior(compiled=task.compiled)))
+        return locate_exposure(exposure, Settings(localizer=ExactPosterior(compiled=task.compiled))), inputs
     except BadInput as cause:
         return result_dict(Result(exposure=exposure, reason=cause.reason, message=str(cause))), inputs
-    return write_results(found, Path(task.result), plots=task.plots, write_record=False), inputs
 
 
 def _unread(sha256: str) -> dict[str, Any]:

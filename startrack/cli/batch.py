@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.batch_show import Halt, ctrl_c_halts, progress, summary
+from startrack.cli.batch_show import Halt, ctrl_c_halts, left_aside, progress, summary
 from startrack.cli.common import DEFAULT_OUT, add_fact_flags, cores, flag_facts, made_folder
 from startrack.cli.flag_types import at_least_one
 from startrack.cli.horizons import ready_for
@@ -66,20 +66,21 @@ def run(args: argparse.Namespace) -> int:
         args.usage_error("a cluster is reached with distributed: pip install 'startrack[cluster]'")
     from startrack.batch import Batch, Counts, images_under, named_images
 
-    out = made_folder(args.dir)
-    whole = images_under(args.folder, out)
-    found = named_images(args.folder, sys.stdin, out) if args.files_on_stdin else whole
+    facts = _facts(args)
+    _check_files_of_flags(facts)
+    whole = images_under(args.folder, args.dir)
+    found = named_images(args.folder, sys.stdin, args.dir) if args.files_on_stdin else whole
     if not found:
         raise BadInput("bad_image", f"{args.folder}: no PNG, TIFF, FITS, JPEG or camera raw images there")
+    out = made_folder(args.dir)
     _check_whose(out, whole, args)
-    facts = _facts(args)
     tasks = _tasks(found, out, facts, args)
     if args.cluster is None and not all(Path(task.result).exists() for task in tasks):
         ready_for(_terrain_of(tasks[0]), args)
     batch, counts = Batch(jobs=args.jobs or cores(), cluster=args.cluster), Counts()
     records, stopped = _work_off(batch, tasks, counts, args)
     try:
-        _write_tables(out, whole, records, {**_shown(facts), "plots": not args.no_plots})
+        _write_tables(out, _tasks(whole, out, facts, args), records, {**_shown(facts), "plots": not args.no_plots})
         tables = f"tables in {out}"
     except BadInput as cause:
         stopped, tables = stopped or "the disk takes no more", f"no tables: {cause}"
@@ -103,14 +104,14 @@ def _work_off(
     batch: Batch, tasks: Sequence[Task], counts: Counts, args: argparse.Namespace
 ) -> tuple[list[dict[str, Any]], str | None]:
     """What the tables need of each image that was done, and why it was not all of them."""
-    from startrack.batch import BatchStopped
+    from startrack.batch import BatchStopped, gist
 
     records: list[dict[str, Any]] = []
     halt = Halt(batch)
     try:
         with ctrl_c_halts(halt), progress(len(tasks), args, halt) as tell:
             for record, kept in batch.results(tasks):
-                records.append(_gist(record))
+                records.append(gist(record))
                 counts["error" if record["reason"] == INTERNAL_ERROR else str(record["status"])] += 1
                 counts["kept"] += kept
                 tell(record, counts)
@@ -134,6 +135,16 @@ def _facts(args: argparse.Namespace) -> dict[str, Any]:
     facts = flag_facts(args)
     named = {key: os.path.abspath(facts[key]) for key in ("camera", "terrain") if is_path(facts.get(key, ""))}
     return facts | named
+
+
+def _check_files_of_flags(facts: dict[str, Any]) -> None:
+    """Raises BadInput: a flag that is wrong for every image is said before anything is touched."""
+    from startrack.camera import load_camera
+    from startrack.terrain import load_terrain
+
+    for key, load in (("camera", load_camera), ("terrain", load_terrain)):
+        if key in facts:
+            load(facts[key])
 
 
 def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace) -> list[Task]:
@@ -161,26 +172,18 @@ def _terrain_of(task: Task) -> str | None:
 
 
 def _write_tables(
-    out: Path, whole: Iterable[Image], records: Sequence[dict[str, Any]], settings: dict[str, Any]
+    out: Path, tasks: Iterable[Task], records: Sequence[dict[str, Any]], settings: dict[str, Any]
 ) -> None:
-    """The tables of the whole folder: images that this run was not given, or did not reach, as earlier runs left them.
+    """The tables of the whole folder, and a line on stderr for each kind of result that they do not have.
 
     Raises BadInput where they cannot be written.
     """
-    from startrack.batch import printable, result_of, stored, write_tables
+    from startrack.batch import rows_of, write_tables
 
-    now, rows = {record["image"]: record for record in records}, []
-    for image in whole:
-        record = now.get(printable(image.name)) or stored(result_of(out, image))
-        if record is not None:
-            result = printable(result_of(Path(), image).as_posix())
-            rows.append({**_gist(record), "image": printable(image.name), "result": result})
-    write_tables(out, rows, settings)
-
-
-def _gist(record: dict[str, Any]) -> dict[str, Any]:
-    """What the tables need: the rest of a hundred thousand records need not stay in memory."""
-    return {key: value for key, value in record.items() if key not in ("modes", "message", "warnings", "format")}
+    found = rows_of(tasks, {record["image"]: record for record in records}, os.path.abspath(out))
+    write_tables(out, found.rows, settings)
+    for line in left_aside(found):
+        print(f"startrack: {line}", file=sys.stderr)
 
 
 def _shown(facts: dict[str, Any]) -> dict[str, str]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from startrack.errors import INTERNAL_ERROR
 
 if TYPE_CHECKING:
-    from startrack.batch import Batch, Counts
+    from startrack.batch import Batch, Counts, Rows
 
 SHOWN = ("ok", "ambiguous", "refused", "error")
 FINISHING = b"\nstartrack: finishing the images in hand; Ctrl-C once more drops them\n"
@@ -91,3 +91,23 @@ def summary(counts: Counts, total: int) -> str:
     parts = [f"{counts[name]} {name}" for name in SHOWN if counts[name]]
     kept = f" ({counts['kept']} were there already)" if counts["kept"] else ""
     return f"{total} images: {', '.join(parts)}{kept}"
+
+
+def left_aside(found: Rows) -> list[str]:
+    """A line for each kind of result that is in the folder and not in its tables."""
+    lines = []
+    if found.former:
+        lines.append(
+            f"{_results(found.former, 'earlier ')} kept, and left out of the tables: the image, or its sidecar, "
+            "camera or terrain file, cannot be used now"
+        )
+    if found.left_out:
+        lines.append(
+            f"{_results(found.left_out)} of other settings or contents left out of the tables; startrack batch over "
+            "the whole folder renews them"
+        )
+    return lines
+
+
+def _results(number: int, kind: str = "") -> str:
+    return f"{number} {kind}result{'' if number == 1 else 's'}"

@@ -1,0 +1,153 @@
+"""What a batch solved stays until something as good takes its place, and its tables never mix settings or contents."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from astropy.table import Table
+from batch_helpers import frames
+
+from startrack.batch import stored
+from startrack.cli.main import main
+
+ROOT = Path(__file__).parent.parent
+SOLVED = "00.png"  # of three images; the others are of the lens cap
+
+
+@pytest.fixture(scope="module")
+def batch_done(tmp_path_factory) -> Path:
+    """A folder of three images, one of them solved, with its results; the camera file lies beside the folder."""
+    root = tmp_path_factory.mktemp("solutions")
+    images = frames(root / "images", 3)
+    shutil.copy(ROOT / "calib" / "fisheye-2048.toml", root / "camera.toml")
+    shutil.copy(ROOT / "sample_images" / "near-centre.png", images[0])
+    images[0].with_suffix(".json").write_text(json.dumps({"camera": "../camera.toml"}))
+    assert batch(root) == 5
+    assert stored(root / "out" / "00.fix.json")["status"] == "ok"
+    return root
+
+
+@pytest.fixture
+def folder(batch_done, tmp_path) -> Path:
+    """A copy of it, to be spoilt."""
+    return Path(shutil.copytree(batch_done, tmp_path / "copy"))
+
+
+def batch(root: Path, *flags: object) -> int:
+    return main(["batch", str(root / "images"), "-D", str(root / "out"), "-j", "1", *map(str, flags)])
+
+
+def files(root: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in (root / "out").glob("00.*")}
+
+
+def table(root: Path) -> dict[str, str]:
+    rows = Table.read(root / "out" / "results.ecsv", format="ascii.ecsv")
+    return dict(zip(rows["image"], rows["status"], strict=True))
+
+
+def result_in_manifest(root: Path) -> str | None:
+    return json.loads((root / "out" / "manifest.json").read_text())["images"][0]["result"]
+
+
+@pytest.mark.parametrize("flags", [("-c", "nowhere.toml"), ("-t", "nowhere.toml"), ("-c", "no-such-name")])
+def test_a_file_that_a_flag_names_is_read_before_anything_is_touched(folder, capsys, flags):
+    before = {path: path.read_bytes() for path in (folder / "out").iterdir()}
+    assert batch(folder, *flags) == 4
+    assert flags[1] in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in (folder / "out").iterdir()} == before
+
+
+def lose_the_camera(folder: Path) -> None:
+    (folder / "camera.toml").unlink()
+
+
+def lose_the_sidecar(folder: Path) -> None:
+    (folder / "images" / "00.json").write_text("{")
+
+
+def break_the_image(folder: Path) -> None:
+    (folder / "images" / SOLVED).write_bytes(b"not a picture")
+
+
+@pytest.mark.parametrize("spoil", [lose_the_camera, lose_the_sidecar, break_the_image])
+@pytest.mark.parametrize("flags", [(), ("-O",)])
+def test_an_input_that_cannot_be_used_costs_no_solution(folder, capsys, spoil, flags):
+    before = files(folder)
+    spoil(folder)
+    assert batch(folder, *flags) == 5
+    assert "1 earlier result kept, and left out of the tables" in capsys.readouterr().err
+    assert files(folder) == before
+    assert table(folder)[SOLVED] == "refused"
+    assert result_in_manifest(folder) is None
+
+
+def test_an_input_that_is_back_finds_its_solution(folder, capsys):
+    camera = (folder / "camera.toml").read_bytes()
+    lose_the_camera(folder)
+    assert batch(folder) == 5
+    (folder / "camera.toml").write_bytes(camera)
+    capsys.readouterr()
+    assert batch(folder) == 5
+    assert "(3 were there already)" in capsys.readouterr().out
+    assert (table(folder)[SOLVED], result_in_manifest(folder)) == ("ok", "00.fix.json")
+
+
+def test_a_refusal_for_want_of_stars_replaces_a_solution(folder):
+    shutil.copy(folder / "images" / "01.png", folder / "images" / SOLVED)
+    shutil.copy(folder / "images" / "01.json", folder / "images" / "00.json")
+    assert batch(folder) == 5
+    assert stored(folder / "out" / "00.fix.json")["reason"] == "no_stars"
+    assert [name for name in files(folder) if name.endswith(("ecsv", "wcs", "corr"))] == []
+
+
+@pytest.mark.parametrize("companion", ["00.stars.ecsv", "00.annotated.png", "00.wcs", "00.corr"])
+def test_a_solution_without_one_of_its_files_is_not_whole(folder, companion):
+    from startrack.batch.kept import has_companions
+
+    record, result = stored(folder / "out" / "00.fix.json"), folder / "out" / "00.fix.json"
+    assert has_companions(record, result, plots=True)
+    (folder / "out" / companion).unlink()
+    assert not has_companions(record, result, plots=True)
+    assert has_companions(record, result, plots=False) == (companion == "00.annotated.png")
+
+
+def test_the_tables_hold_one_kind_of_settings(folder, capsys, monkeypatch):
+    """A run of one image with another flag: what the other images' results say was made without it."""
+    monkeypatch.setattr("sys.stdin", ["01.png\n"])
+    assert batch(folder, "--exposure", "2", "--files-on-stdin") == 5
+    assert "2 results of other settings or contents left out" in capsys.readouterr().err
+    assert table(folder) == {"01.png": "refused"}
+
+
+def test_the_tables_hold_what_the_images_hold_now(folder, capsys, monkeypatch):
+    shutil.copy(folder / "images" / "02.png", folder / "images" / SOLVED)
+    monkeypatch.setattr("sys.stdin", ["01.png\n"])
+    assert batch(folder, "--files-on-stdin") == 5
+    assert "1 result of other settings or contents left out" in capsys.readouterr().err
+    assert table(folder) == {"01.png": "refused", "02.png": "refused"}
+
+
+def test_a_run_of_some_images_gives_the_tables_of_all(folder, monkeypatch):
+    before = table(folder)
+    monkeypatch.setattr("sys.stdin", ["01.png\n"])
+    assert batch(folder, "--files-on-stdin") == 5
+    assert table(folder) == before
+
+
+@pytest.mark.parametrize(
+    "text",
+    ['{"foo": 1}', '{"image": "01.png", "status": "ok", "reason": null}', "[]", '{"image": 1, "status": {}}'],
+)
+def test_what_is_no_whole_record_is_none(folder, monkeypatch, text):
+    result = folder / "out" / "01.fix.json"
+    result.write_text(text)
+    assert stored(result) is None
+    monkeypatch.setattr("sys.stdin", ["02.png\n"])
+    assert batch(folder, "--files-on-stdin") == 5
+    assert list(table(folder)) == [SOLVED, "02.png"]
+    assert batch(folder) == 5
+    assert stored(result)["reason"] == "no_stars"

@@ -10,6 +10,7 @@ import pytest
 from startrack.localize import ExactPosterior, check_consistency
 from startrack.localize.blurred import Blurred
 from startrack.localize.common import raised
+from startrack.localize.consistency import separate_contradictions
 from startrack.localize.dive import best_by_diving
 from startrack.localize.likelihood import Sectors
 from startrack.localize.misfit import turn_of_sky
@@ -131,6 +132,28 @@ def test_stars_of_another_place_or_time_are_refused_before_the_search(shackleton
     with pytest.raises(NotLocated, match="no place explains the stars") as refused:
         ExactPosterior()(turned, shackleton)
     assert refused.value.reason == "inconsistent_evidence"
+
+
+def test_contradictions_are_counted_apart():
+    by_sector = np.zeros(240)
+    assert separate_contradictions(by_sector) == 0
+    by_sector[[238, 239, 0, 1, 3]] = -9.0  # a ridge across north, with a gap in it
+    assert separate_contradictions(by_sector) == 1
+    by_sector[20:200:20] = -4.0
+    assert separate_contradictions(by_sector) == 10
+
+
+def test_no_allowed_ground_is_given_up(shackleton):
+    """Small patches of ground flat enough: large boxes must not be dropped because a few points in them are steep."""
+    slopes = np.degrees(shackleton.slope_rad(np.random.default_rng(9).uniform(-200, 200, (4000, 2))))
+    limited = replace(shackleton, most_slope_rad=np.radians(np.quantile(slopes, 0.02)), _state=shackleton._state)
+    places = np.random.default_rng(10).uniform(-200, 200, (20_000, 2))
+    place = places[np.asarray(limited.allowed(places))][0]
+    evidence = seen_from(shackleton, place, np.random.default_rng(11), 1500, 0.0005)
+    fix = ExactPosterior()(evidence, limited)
+    assert np.linalg.norm(fix.position_enu_m[:2] - place) < max(fix.radius999_m, 1.0)
+    with pytest.raises(NotLocated, match="max_slope_deg"):
+        ExactPosterior()(evidence, replace(limited, most_slope_rad=0.0, _state=shackleton._state))
 
 
 @pytest.mark.parametrize("sigma_rad", [0.0, 0.001])

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from startrack.localize.summary import summarize
+from startrack.localize.summary import smallest_axis, summarize
 from startrack.terrain import Cylinder, load_terrain
 from startrack.types import Fix, NotLocated
 
@@ -111,3 +111,12 @@ def test_a_posterior_as_wide_as_the_area_is_refused() -> None:
     with pytest.raises(NotLocated, match="open") as caught:
         summarize(centres, 300.0, np.zeros(len(centres)), 0.0, TERRAIN)
     assert caught.value.reason == "insufficient_geometry"
+
+
+def test_the_smallest_axis_is_a_mode_s_own():
+    places, sigmas = ((0.0, 0.0), (3000.0, 0.0), (0.0, 4000.0)), ((40.0, 9.0), (20.0, 12.0), (15.0, 30.0))
+    blobs = [blob(place, sigma, part) for place, sigma, part in zip(places, sigmas, (0.5, 0.3, 0.2), strict=True)]
+    centres, log = (np.concatenate(part) for part in zip(*blobs, strict=True))
+    assert smallest_axis(centres, WIDTH_M, log) == pytest.approx(9.0, rel=0.05)
+    one = slice(0, len(blobs[0][0]))
+    assert smallest_axis(centres[one], WIDTH_M, log[one]) == pytest.approx(9.0, rel=0.05)

@@ -26,6 +26,8 @@ FEWEST_IN_SECTOR = 3
 USUAL_HORIZON_RAD = 0.3  # sin H cos H of a crater's rim at 20 degrees: d(tan H) / tan H = dH / (sin H cos H)
 EXPLAINED_SECTOR_RAD = np.radians(1.5)
 LEAST_EXPLAINED_NATS = -0.75  # 0 to -0.35 at the right place, up to 0.5 lower with a ridge on no map; -9.2 the worst
+CONTRADICTED_NATS = -3.0  # of one sector
+MOST_SEPARATE = 7  # at right places 0 to 3 were seen, and 9 or more where the sky was turned by 6 degrees and more
 STRETCH_WINDOW_RAD = np.radians(4.0)
 TELLING_LLR = 0.3
 STRETCH_GAIN_NATS = 4.5  # a true map gains more in 1 of 370; of 240 images with maps 1 % off the least gain was 7.6
@@ -50,11 +52,19 @@ def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain, compiled: 
             "wrong terrain, time or camera file?",
             reason="inconsistent_evidence",
         )
-    explained = explained_nats(evidence, fix, terrain, sure)
+    by_sector = explained_by_sector(evidence, fix, terrain, sure)
+    explained = float(by_sector.mean())
     if explained < LEAST_EXPLAINED_NATS:
         raise NotLocated(
             f"the best place explains the stars badly ({explained:.1f} nats a sector; usual: 0 to -0.3): "
             "wrong terrain, time or camera file?",
+            reason="inconsistent_evidence",
+        )
+    scattered = separate_contradictions(by_sector)
+    if scattered > MOST_SEPARATE and not isinstance(terrain, Cylinder):
+        raise NotLocated(
+            f"the best place is contradicted at {scattered} separate stretches of the horizon, as with a wrong time: "
+            "are the image's time, the terrain and the camera file right?",
             reason="inconsistent_evidence",
         )
     if isinstance(terrain, Cylinder):
@@ -86,21 +96,31 @@ def _sure(evidence: Evidence, fix: Fix, terrain: Terrain) -> Sure:
     return rays, np.asarray(terrain.horizon_rad(fix.position_enu_m[None, :2], rays.azimuth_rad))
 
 
-def explained_nats(evidence: Evidence, fix: Fix, terrain: Terrain, sure: Sure | None = None) -> float:
-    """Mean log-likelihood of the horizon's sectors at the fix, beside the best level skyline in each; 0 is perfect.
+def explained_by_sector(evidence: Evidence, fix: Fix, terrain: Terrain, sure: Sure | None = None) -> Array:
+    """Log-likelihood (sectors,) of the horizon at the fix, beside the best level skyline in each sector; 0 is perfect.
 
     Only rays that are sure of themselves are asked: of the others, some level skyline always fits the noise better.
     0 for a cylinder whose shape is uncertain: the fix was made with another one than the file's. `sure` are those rays
     and the horizon at their azimuths, where they are known.
     """
-    if isinstance(terrain, Cylinder) and admitted_stretch(terrain) > 0:
-        return 0.0
     rays, horizon = sure or _sure(evidence, fix, terrain)
     sectors = Sectors.of(rays, EXPLAINED_SECTOR_RAD, 1e-4)
+    if isinstance(terrain, Cylinder) and admitted_stretch(terrain) > 0:
+        return np.zeros(sectors.count)
     sigma = np.hypot(rays.edge_sigma_rad, terrain.horizon_sigma_rad(fix.position_enu_m[None, :2], rays.azimuth_rad))
     value = contribution(rays.llr, rays.elevation_rad, horizon, sigma)
     sums = np.bincount(sectors.sector, weights=value, minlength=sectors.count).astype(np.float64)
-    return float(sectors.score(sums)) / sectors.count
+    return sectors.by_sector(sums)
+
+
+def separate_contradictions(by_sector: Array) -> int:
+    """Runs of sectors that contradict the fix, single good ones between them not counted as a gap.
+
+    An obstacle on no map makes one, however wide; a wrong time, that turns the whole skyline, makes many.
+    """
+    wrong = by_sector < CONTRADICTED_NATS
+    wrong |= np.roll(wrong, 1) & np.roll(wrong, -1)
+    return int(np.sum(wrong & ~np.roll(wrong, 1)))
 
 
 def admitted_stretch(terrain: Terrain) -> float:

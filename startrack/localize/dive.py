@@ -18,14 +18,15 @@ GOOD_NATS = -0.6  # mean over the sectors; -0.5 is usual at the best place
 SMALL_M = 20.0  # half side of the last boxes
 TRIED, APART_M = 3, 60.0  # places from which the top is climbed, and how far they are apart
 FINEST_M = 0.5
+NEARBY_STEPS_M = np.linspace(-14.0, 14.0, 15)
 CLIMBS = ((45.0, 16.0, 2), (15.0, 4.0, 3))  # how far [m], first step [m], points across where horizons are traced
 
 
 def best_by_diving(sectors: Sectors, profile: Profile, terrain: Terrain) -> tuple[Array, float]:
     """A good place (2,) [m] and its log-likelihood: the most promising ones of ever smaller boxes are quartered.
 
-    The log-likelihood is a lower bound of the maximum, usually within a nat or two of it; it decides nothing, but lets
-    the search exclude nearly everything at once.
+    The log-likelihood is a lower bound of the maximum, usually within a nat or two of it, that lets the search exclude
+    nearly everything at once. Minus infinity where no place was found.
     """
     blurred = Blurred.of(sectors, profile)
     place, best = np.zeros(2), -np.inf
@@ -72,11 +73,21 @@ def _climbed(
         for nearby_m, first_step_m, across in CLIMBS:
             about = Vicinity.of(sectors, profile, terrain, ways[-1], nearby_m, across=across)
             ways.append(about.climbed(ways[-1], first_step_m, FINEST_M)[0])
-        places = np.array(ways)[np.asarray(terrain.allowed(np.array(ways)))]
+        places = _where_allowed(np.array(ways), about, terrain)
         found = exact_scores(places, sectors, profile, terrain)
         if len(found) and found.max() > best:
             best, place = float(found.max()), places[int(np.argmax(found))]
     return place, best
+
+
+def _where_allowed(places_m: Array, about: Vicinity, terrain: Terrain) -> Array:
+    """Those of the places (n, 2) where a camera can stand; where it can at none, the best one nearby, if any."""
+    allowed = np.asarray(terrain.allowed(places_m))
+    if allowed.any():
+        return places_m[allowed]
+    around = places_m[-1] + np.stack(np.meshgrid(NEARBY_STEPS_M, NEARBY_STEPS_M), axis=-1).reshape(-1, 2)
+    around = around[np.asarray(terrain.allowed(around))]
+    return around[np.argsort(-about.scores(around))[:1]]
 
 
 def _apart(places_m: Array, order: Ints) -> list[int]:

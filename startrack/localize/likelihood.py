@@ -38,12 +38,16 @@ class Sectors:
 
     def score(self, sums: Array) -> Array:
         """Log-likelihood (n,) of places from the sums of contributions (n, sectors)."""
+        return np.asarray(np.sum(self.by_sector(sums), axis=-1))
+
+    def by_sector(self, sums: Array) -> Array:
+        """What each sector (n, sectors) adds to it."""
         below = sums - self.ceiling
         if self.epsilon == 0.0:
-            return np.sum(below, axis=-1)
+            return np.asarray(below)
         # Within a narrow sector a real skyline can hardly beat the best level one; bounds must not claim that it does.
         below = np.minimum(below, 0.0)
-        return np.sum(np.log((1.0 - self.epsilon) * np.exp(below) + self.epsilon), axis=-1)  # type: ignore[no-any-return]
+        return np.asarray(np.log((1.0 - self.epsilon) * np.exp(below) + self.epsilon))
 
 
 def _best_skyline(evidence: Evidence, sector: Ints, count: int) -> Array:

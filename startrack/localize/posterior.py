@@ -15,7 +15,7 @@ from startrack.localize.profile import Profile
 from startrack.localize.scout import likely_places, taken
 from startrack.localize.search import Boxes, RayBoxes, asked, by_sector, centre_scores, scored, tightened
 from startrack.localize.seen import cylinder_of
-from startrack.localize.summary import summarize
+from startrack.localize.summary import smallest_axis, summarize
 from startrack.terrain import Cylinder, Terrain
 from startrack.terrain.nearby import Nearby
 from startrack.types import Array, Bools, Evidence, Fix, Ints, NotLocated
@@ -116,7 +116,8 @@ class _Search:
 
     def exclude(self) -> RayBoxes:
         """From the whole area down to small boxes. Raises NotLocated where too much stays open."""
-        if self.best < CONTRADICTED_NATS * self.sectors.count and not isinstance(self.terrain, Cylinder):
+        known_bad = -np.inf < self.best < CONTRADICTED_NATS * self.sectors.count
+        if known_bad and not isinstance(self.terrain, Cylinder):
             raise self._lost(np.pi * self.terrain.reach_m**2)  # nothing could be excluded, at great length
         centres, half, of = np.zeros((1, 2)), float(self.terrain.reach_m), np.zeros(1, dtype=np.int64)
         known: tuple[Ints, Ints] | None = None  # open rays of the boxes that the centres are quarters of
@@ -141,6 +142,11 @@ class _Search:
 
     def _bounded(self, centres: Array, half: float) -> tuple[Boxes, Ints, Ints]:
         """The promising ones of the boxes with their open rays, some at a time so that memory stays flat."""
+        if not len(centres):
+            raise NotLocated(
+                "nowhere in the search area can the camera stand: is [search] max_slope_deg too small?",
+                reason="outside_search_area",
+            )
         kept = []
         for start in range(0, len(centres), BOXES_AT_ONCE):
             some = centres[start : start + BOXES_AT_ONCE]
@@ -184,6 +190,8 @@ class _Search:
         while True:
             if len(boxes.ray) > MANY_PAIRS and 4 * len(boxes) <= self.method.most_boxes:
                 boxes = boxes.take(self._promising(boxes))
+                if len(boxes.ray) > MOST_PAIRS:
+                    raise self._lost(len(boxes) * 4 * boxes.half_m**2)
                 boxes = self._asked_in_turns(boxes.handed_down(self.terrain))
                 continue
             score = self.scores(boxes)
@@ -253,10 +261,7 @@ class _Search:
             return np.inf
         if boxes.half_m <= self.method.finest_m or 4 * len(boxes) > self.method.most_boxes or not len(boxes.ray):
             return 0.0
-        weight = np.exp(log_weight - log_weight.max())
-        centred = boxes.centres_m - np.average(boxes.centres_m, axis=0, weights=weight)
-        spread = np.einsum("n,ni,nj->ij", weight, centred, centred) / weight.sum()
-        smaller = np.sqrt(max(float(np.linalg.eigvalsh(spread)[0]), 0.0))
+        smaller = smallest_axis(boxes.centres_m, 2 * boxes.half_m, log_weight)
         many = self.method.boxes_per_sigma * (1.0 if isinstance(self.terrain, Cylinder) else SMOOTH)
         return 2 * boxes.half_m * many / max(smaller, 1e-9)
 

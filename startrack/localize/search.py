@@ -147,11 +147,18 @@ def centre_scores(boxes: RayBoxes, sectors: Sectors, profile: Profile, terrain: 
 
 
 def holds_ground(terrain: Terrain, centres_m: Array, half_m: float) -> Bools:
-    """Boxes (n,) that hold a place where the camera can be, judged on a grid of points over each."""
-    steps = np.linspace(-half_m, half_m, 5 if half_m > SMALL_BOX_M else 3)
+    """Boxes (n,) that may hold a place where the camera can be: all within reach; of small ones, by a grid of points.
+
+    The grid is closer than slopes change, so that no more than single metres of a small box's ground are missed.
+    """
+    beyond = np.maximum(np.abs(centres_m) - half_m, 0.0)
+    within = np.asarray(np.hypot(beyond[:, 0], beyond[:, 1]) <= terrain.reach_m)
+    if half_m > SMALL_BOX_M:
+        return within
+    steps = np.linspace(-half_m, half_m, 5)
     x, y = np.meshgrid(steps, steps)
     points = centres_m[:, None, :] + np.stack([x.ravel(), y.ravel()], axis=1)
-    return np.any(terrain.allowed(points), axis=1)  # type: ignore[no-any-return]
+    return within & np.asarray(np.any(terrain.allowed(points), axis=1))
 
 
 def _sum_by(key: Ints, value: Array, n: int, count: int) -> Array:

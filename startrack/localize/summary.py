@@ -9,6 +9,7 @@ from startrack.types import Array, Fix, Ints, Mode, NotLocated
 
 AMBIGUOUS_MASS = 0.01
 NEGLIGIBLE_MODE = 1e-4
+NEGLIGIBLE_BOX = 1e-12
 USELESS_FRACTION = 0.5  # a 95 % circle wider than this part of the search radius says nothing worth having
 
 
@@ -29,7 +30,7 @@ def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_mass:
             "widen [search] radius_m in the terrain file if that can be true",
             reason="outside_search_area",
         )
-    keep = ~outside & (weight > 1e-12)
+    keep = ~outside & (weight > NEGLIGIBLE_BOX)
     centres_m, weight = centres_m[keep], weight[keep] / weight[keep].sum()
     mean, covariance = _moments(centres_m, weight, width_m)
     label = _modes(centres_m, weight, width_m, covariance)
@@ -55,6 +56,21 @@ def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_mass:
         ambiguous=ambiguous,
         dropped_mass=dropped_mass,
     )
+
+
+def smallest_axis(centres_m: Array, width_m: float, log_weight: Array) -> float:
+    """Standard deviation [m] of the posterior along its shorter axis; where it has modes, of the narrowest that counts.
+
+    Of all modes together it would be as large as they are far apart.
+    """
+    weight = np.exp(log_weight - np.max(log_weight))
+    weight /= weight.sum()
+    centres_m, weight = centres_m[weight > NEGLIGIBLE_BOX], weight[weight > NEGLIGIBLE_BOX]
+    label = _modes(centres_m, weight, width_m, _moments(centres_m, weight, width_m)[1])
+    counts = np.flatnonzero(np.bincount(label, weights=weight) > AMBIGUOUS_MASS)
+    own = width_m**2 / 12  # of a box
+    variances = [_moments(centres_m[label == i], weight[label == i], width_m)[1] - own * np.eye(2) for i in counts]
+    return float(np.sqrt(max(min(np.linalg.eigvalsh(one)[0] for one in variances), 0.0)))
 
 
 def _moments(centres_m: Array, weight: Array, width_m: float) -> tuple[Array, Array]:

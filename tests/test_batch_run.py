@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ def begun(folder: Path, *flags: str, before: str = "") -> subprocess.Popen[str]:
     """The command in a shell's process, which `before` may have prepared."""
     command = [sys.executable, "-m", "startrack.cli.main", "batch", str(folder), *flags]
     shell = ["bash", "-c", f'{before} exec "$@"', "bash", *command]
-    return subprocess.Popen(shell, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(shell, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
 def tasks(folder: Path, names: Sequence[str]) -> list[Task]:
@@ -48,6 +49,22 @@ def test_an_image_that_kills_its_process_costs_the_others_nothing(tmp_path):
     # processes work side by side again.
     assert len({record["process"] for record in done.values() if "process" in record}) <= 3 * TOGETHER + 2 * 2
     assert json.loads((tmp_path / "out" / "05-deadly.fix.json").read_text())["reason"] == "internal_error"
+
+
+def test_a_death_casts_suspicion_on_what_processes_were_at(tmp_path):
+    names = [f"{number:02d}.png" for number in range(12)]
+    names[3] = "03-deadly.png"
+    todo = tasks(tmp_path, names)
+    ends: list[tuple[list[Task], list[Task]]] = []
+
+    def whole() -> Iterator[tuple[dict[str, Any], bool]]:
+        ends.append((yield from Batch(work=die_if_told)._until_one_dies(iter(todo), TOGETHER, len(todo))))
+
+    done = [record["image"] for record, _ in whole()]
+    ((suspects, queued),) = ends
+    assert "03-deadly.png" in [task.name for task in suspects]
+    assert len(suspects) <= TOGETHER
+    assert sorted(done + [task.name for task in (*suspects, *queued)]) == names
 
 
 def test_an_image_that_kills_dask_workers_is_given_up_and_the_others_are_done(tmp_path):
@@ -100,21 +117,52 @@ def test_a_cluster_is_an_address_and_has_its_own_processes(tmp_path, capsys, fla
     assert words in capsys.readouterr().err
 
 
-def test_ctrl_c_ends_after_the_frames_in_hand_with_tables_of_what_is_done(tmp_path):
+@pytest.mark.parametrize(
+    ("wishes", "to_the_group", "why"),
+    [
+        ([signal.SIGINT], False, "interrupted"),
+        ([signal.SIGINT, signal.SIGINT], True, "interrupted"),  # as timeout sends them
+        ([signal.SIGTERM], True, "terminated"),  # as systemd and Slurm do
+    ],
+)
+def test_a_signal_ends_the_batch_after_the_frames_in_hand_with_tables_of_what_is_done(
+    tmp_path, wishes, to_the_group, why
+):
     frames(tmp_path / "images", 400)
     out = tmp_path / "out"
     process = begun(tmp_path / "images", "-D", str(out), "-j", "2", "-O", "-v", "--no-plots")
     assert process.stdout is not None
     for _ in range(5):
         process.stdout.readline()
-    process.send_signal(signal.SIGINT)
+    for wish in wishes:
+        process.send_signal(wish)
+        if to_the_group:
+            os.killpg(process.pid, wish)
     rest, err = process.communicate()
     done = len(rest.splitlines()) + 5
     assert process.returncode == 5
-    assert "finishing the images in hand" in err
-    assert f"interrupted: {done} of 400 images done, tables in {out}; the same command without -O goes on" in err
+    assert err.count("finishing the images in hand") == 1
+    assert f"{why}: {done} of 400 images done, tables in {out}; the same command without -O goes on" in err
     assert len(Table.read(out / "results.ecsv", format="ascii.ecsv")) == len(list(out.glob("*.fix.json"))) == done
     assert not list(out.glob(".*"))
+
+
+def test_a_later_signal_drops_the_images_in_hand_and_writes_the_tables(tmp_path, monkeypatch):
+    """The wish is made from within, so that it comes between two images."""
+    frames(tmp_path / "images", 40)
+    monkeypatch.setattr("startrack.cli.batch_show.ONE_WISH_S", -1.0)
+    told = []
+
+    def wish(*_: object, **__: object) -> None:
+        told.append(1)
+        if len(told) in (3, 4):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("builtins.print", wish)
+    out = tmp_path / "out"
+    assert main(["batch", str(tmp_path / "images"), "-D", str(out), "-j", "1", "-v", "--no-plots"]) == 5
+    assert len(Table.read(out / "results.ecsv", format="ascii.ecsv")) == len(list(out.glob("*.fix.json")))
+    assert len(list(out.glob("*.fix.json"))) < 40
 
 
 def test_a_reader_that_goes_ends_the_batch_early(tmp_path):

@@ -2,6 +2,7 @@
 
 from startrack.batch.find import Image, images_under, named_images
 from startrack.batch.kept import JOB, in_the_tables, is_of_other_images, printable, result_of, stored
+from startrack.batch.lock import only_writer
 from startrack.batch.rows import Rows, gist, rows_of
 from startrack.batch.run import Batch, Counts
 from startrack.batch.tables import write_tables
@@ -21,6 +22,7 @@ __all__ = [
     "is_of_other_images",
     "locate_image",
     "named_images",
+    "only_writer",
     "printable",
     "result_of",
     "rows_of",

@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from itertools import islice
-from multiprocessing import active_children, get_context
+from ctypes import c_longlong
+from itertools import chain, count, islice
+from multiprocessing import active_children, get_context, parent_process
+from multiprocessing.connection import wait as wait_for
 from typing import TYPE_CHECKING, Any
 
 from startrack.batch.task import BatchStopped, Task, locate_image, lost
@@ -21,8 +22,9 @@ if TYPE_CHECKING:
     from distributed import Client
 
 CONNECT_S = 10.0
-ORPHAN_CHECK_S = 1.0
 ONE_THREAD = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
+QUIET_TRACKER = "ignore:resource_tracker"  # after kill -9 Python tidies up, and would warn that it had to
+NOTHING = -1  # in place of the number of the task that a process is at
 AHEAD = 4  # tasks per worker that wait in the queue: 100,000 images take no more memory than a hundred
 DIED = "internal error: the process that worked on it died (out of memory?), alone as it did beside others"
 DIED_ON_CLUSTER = "internal error: the Dask workers that worked on it died, one after the other (out of memory?)"
@@ -42,7 +44,7 @@ class Batch:
         """Begin no other task; `results` ends when those in hand are done. May be called by a signal's handler."""
         self._stopping = True
 
-    def results(self, tasks: Sequence[Task]) -> Iterator[Outcome]:
+    def results(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
         """In the order of completion.
 
         Raises BadInput (no_cluster) where no scheduler answers, BatchStopped where no task can be done any more.
@@ -50,39 +52,48 @@ class Batch:
         yield from self._on_cluster(tasks) if self.cluster is not None else self._here(tasks)
 
     def _here(self, tasks: Sequence[Task]) -> Iterator[Outcome]:
-        """In processes. When one dies (out of memory, killed), what was in hand is done again, one at a time."""
-        coming, jobs = iter(tasks), min(self.jobs, len(tasks))
-        while suspects := (yield from self._until_one_dies(coming, jobs, AHEAD * jobs)):
-            alone = iter(suspects)
-            while culprits := (yield from self._until_one_dies(alone, 1, 1)):
+        """In processes. When one dies (out of memory, killed), what they were at is done again, one at a time."""
+        coming: Iterator[Task] = iter(tasks)
+        jobs = min(self.jobs, len(tasks))
+        while True:
+            suspects, queued = yield from self._until_one_dies(coming, jobs, AHEAD * jobs)
+            if not suspects:
+                return
+            coming, alone = chain(queued, coming), iter(suspects)
+            while culprits := (yield from self._until_one_dies(alone, 1, 1))[0]:
                 yield lost(culprits[0], DIED), False
 
-    def _until_one_dies(self, coming: Iterator[Task], jobs: int, ahead: int) -> Generator[Outcome, None, list[Task]]:
-        """Returns the tasks that were in hand when a process died, none when all is done."""
-        pool = _pool(jobs)
-        waiting: dict[Future[Outcome], Task] = {}
-        suspects: list[Task] = []
+    def _until_one_dies(
+        self, coming: Iterator[Task], jobs: int, ahead: int
+    ) -> Generator[Outcome, None, tuple[list[Task], list[Task]]]:
+        """Returns the tasks that processes were at when one died, and those that were queued; none when all is done."""
+        at = get_context("spawn").RawArray(c_longlong, [NOTHING] * jobs)
+        pool, numbers = _pool(jobs, at), count()
+        waiting: dict[Future[Outcome], tuple[int, Task]] = {}
+        undone: dict[int, Task] = {}
         try:
             while True:
-                more = 0 if suspects or self._stopping else ahead - len(waiting)
-                waiting |= {_submitted(pool, self.work, task): task for task in islice(coming, more)}
+                more = 0 if undone or self._stopping else ahead - len(waiting)
+                for number, task in zip(numbers, islice(coming, more), strict=False):
+                    waiting[_submitted(pool, self.work, number, task)] = number, task
                 if not waiting:
-                    return suspects
+                    return _suspects(undone, set(at))
                 finished, _ = wait(waiting, return_when=FIRST_COMPLETED)
                 if self._stopping:
                     for future in [one for one in waiting if one.cancel()]:
                         del waiting[future]
                 for future in finished & waiting.keys():
-                    task = waiting.pop(future)
+                    number, task = waiting.pop(future)
                     if isinstance(future.exception(), BrokenProcessPool):
-                        suspects.append(task)
+                        undone[number] = task
                     else:
                         yield future.result()
-        except KeyboardInterrupt:  # a second Ctrl-C: results are whole or not there, so that nothing is spoilt
-            for process in active_children():
-                process.kill()
+        except (KeyboardInterrupt, GeneratorExit):  # results are whole or not there, so that nothing is spoilt
+            _kill_children()
             raise
         finally:
+            if undone:  # the pool asks the other processes to end by a signal that they ignore
+                _kill_children()
             pool.shutdown(wait=True, cancel_futures=True)
 
     def _on_cluster(self, tasks: Sequence[Task]) -> Iterator[Outcome]:
@@ -125,33 +136,71 @@ def _outcome_on_cluster(future: Any, task: Task) -> Outcome:
     return outcome
 
 
-def _submitted(pool: ProcessPoolExecutor, work: Work, task: Task) -> Future[Outcome]:
+def _suspects(undone: dict[int, Task], at: set[int]) -> tuple[list[Task], list[Task]]:
+    """Tasks that processes were at, and the others; all are suspects where a process died before it was at any."""
+    queued = [task for number, task in undone.items() if number not in at]
+    if len(queued) == len(undone):
+        return queued, []
+    return [task for number, task in undone.items() if number in at], queued
+
+
+def _submitted(pool: ProcessPoolExecutor, work: Work, number: int, task: Task) -> Future[Outcome]:
     try:
-        return pool.submit(work, task)
+        return pool.submit(_Process.do, work, number, task)
     except BrokenProcessPool as cause:  # since the last look
         broken: Future[Outcome] = Future()
         broken.set_exception(cause)
         return broken
 
 
-def _pool(jobs: int) -> ProcessPoolExecutor:
-    # Fresh processes (a fork would copy the progress bar's thread), which leave Ctrl-C to the one that waits for them.
+def _pool(jobs: int, at: Any) -> ProcessPoolExecutor:
+    # Fresh processes (a fork would copy the progress bar's thread), which leave signals to the one that waits for them.
     # They inherit these when they load NumPy: the cores are taken by other images.
     for name in ONE_THREAD:
         os.environ.setdefault(name, "1")
-    return ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_begin, initargs=(os.getpid(),))
+    rules = os.environ.get("PYTHONWARNINGS", "")
+    if QUIET_TRACKER not in rules:
+        os.environ["PYTHONWARNINGS"] = f"{rules},{QUIET_TRACKER}".strip(",")
+    context = get_context("spawn")
+    return ProcessPoolExecutor(
+        jobs, mp_context=context, initializer=_Process.begin, initargs=(at, context.Value(c_longlong))
+    )
 
 
-def _begin(parent: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    import cv2
-
-    cv2.setNumThreads(1)
+def _kill_children() -> None:
+    for process in active_children():
+        process.kill()
 
 
-def _end_with(parent: int) -> None:
+class _Process:
+    """What a process of the pool knows of itself: where it says which task it is at, for whoever finds it dead."""
+
+    at: Any
+    place: int
+
+    @classmethod
+    def begin(cls, at: Any, taken: Any) -> None:
+        for number in (signal.SIGINT, signal.SIGTERM):  # sent to the whole group: the images in hand are finished
+            signal.signal(number, signal.SIG_IGN)
+        threading.Thread(target=_end_with_parent, daemon=True).start()
+        with taken:
+            cls.at, cls.place = at, taken.value
+            taken.value += 1
+        import cv2
+
+        cv2.setNumThreads(1)
+
+    @classmethod
+    def do(cls, work: Work, number: int, task: Task) -> Outcome:
+        cls.at[cls.place] = number
+        outcome = work(task)
+        cls.at[cls.place] = NOTHING
+        return outcome
+
+
+def _end_with_parent() -> None:
     """End this process when its parent is gone: killed, it cannot tell, and a resumed run must find nobody at work."""
-    while os.getppid() == parent:
-        time.sleep(ORPHAN_CHECK_S)
+    parent = parent_process()
+    if parent is not None:
+        wait_for([parent.sentinel])
     os._exit(1)

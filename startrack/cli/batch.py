@@ -6,12 +6,12 @@ import argparse
 import os
 import sys
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.batch_show import Halt, ctrl_c_halts, left_aside, progress, summary
+from startrack.cli.batch_show import Halt, left_aside, progress, signals_halt, summary
 from startrack.cli.common import DEFAULT_OUT, add_fact_flags, cores, flag_facts, made_folder
 from startrack.cli.flag_types import at_least_one
 from startrack.cli.horizons import ready_for
@@ -33,7 +33,7 @@ def add_parser(subparsers: Any) -> None:
         description="Locate the camera in every image of a tree, which OUT mirrors. A run that was stopped goes on "
         "from there; images, sidecars, camera or terrain files that have changed are done again. Adds results.ecsv, "
         "results.parquet, trajectory.tum, timings.ecsv and manifest.json.",
-        epilog="exit codes: 0 every image solved; 5 some not solved, or stopped early (Ctrl-C, a full disk, a closed "
+        epilog="exit codes: 0 every image solved; 5 some not solved, or stopped early (Ctrl-C, SIGTERM, a full disk, a closed "
         "pipe); 1 an internal error; 2 usage; 4 bad input",
     )
     parser.add_argument("folder", metavar="FOLDER", help="folder of the images, with all below it")
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     """0 when every image is solved, 5 when some are not or the run was stopped, 1 after an internal error."""
     if args.cluster is not None and find_spec("distributed") is None:
         args.usage_error("a cluster is reached with distributed: pip install 'startrack[cluster]'")
-    from startrack.batch import Batch, Counts, images_under, named_images
+    from startrack.batch import images_under, named_images, only_writer
 
     facts = _facts(args)
     _check_files_of_flags(facts)
@@ -73,17 +73,29 @@ def run(args: argparse.Namespace) -> int:
     if not found:
         raise BadInput("bad_image", f"{args.folder}: no PNG, TIFF, FITS, JPEG or camera raw images there")
     out = made_folder(args.dir)
+    with only_writer(out):
+        return _run(found, whole, out, facts, args)
+
+
+def _run(
+    found: Sequence[Image], whole: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace
+) -> int:
+    """`found`, some of `whole`, done; tables of `whole`; the exit code."""
+    from startrack.batch import Batch, Counts
+
     _check_whose(out, whole, args)
     tasks = _tasks(found, out, facts, args)
     if args.cluster is None and not all(Path(task.result).exists() for task in tasks):
         ready_for(_terrain_of(tasks[0]), args)
     batch, counts = Batch(jobs=args.jobs or cores(), cluster=args.cluster), Counts()
-    records, stopped = _work_off(batch, tasks, counts, args)
-    try:
-        _write_tables(out, _tasks(whole, out, facts, args), records, {**_shown(facts), "plots": not args.no_plots})
-        tables = f"tables in {out}"
-    except BadInput as cause:
-        stopped, tables = stopped or "the disk takes no more", f"no tables: {cause}"
+    halt = Halt(batch)
+    with signals_halt(halt):
+        records, stopped = _work_off(batch, tasks, counts, halt, args)
+        try:
+            _write_tables(out, _tasks(whole, out, facts, args), records, {**_shown(facts), "plots": not args.no_plots})
+            tables = f"tables in {out}"
+        except BadInput as cause:
+            stopped, tables = stopped or "the disk takes no more", f"no tables: {cause}"
     if stopped:
         again = "the same command without -O" if args.overwrite else "the same command"
         done = f"{stopped}: {len(records)} of {len(tasks)} images done, {tables}"
@@ -101,22 +113,23 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _work_off(
-    batch: Batch, tasks: Sequence[Task], counts: Counts, args: argparse.Namespace
+    batch: Batch, tasks: Sequence[Task], counts: Counts, halt: Halt, args: argparse.Namespace
 ) -> tuple[list[dict[str, Any]], str | None]:
     """What the tables need of each image that was done, and why it was not all of them."""
     from startrack.batch import BatchStopped, gist
 
     records: list[dict[str, Any]] = []
-    halt = Halt(batch)
     try:
-        with ctrl_c_halts(halt), progress(len(tasks), args, halt) as tell:
-            for record, kept in batch.results(tasks):
+        with progress(len(tasks), args, halt) as tell, closing(batch.results(tasks)) as outcomes:
+            for record, kept in outcomes:
                 records.append(gist(record))
                 counts["error" if record["reason"] == INTERNAL_ERROR else str(record["status"])] += 1
                 counts["kept"] += kept
                 tell(record, counts)
     except BatchStopped as cause:
         halt.why = str(cause)
+    except KeyboardInterrupt:  # the images in hand are dropped; what is done has its tables all the same
+        halt("interrupted")
     return records, halt.why if len(records) < len(tasks) else None
 
 

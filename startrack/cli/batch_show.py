@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 SHOWN = ("ok", "ambiguous", "refused", "error")
 FINISHING = b"\nstartrack: finishing the images in hand; Ctrl-C once more drops them\n"
+ONE_WISH_S = 1.0  # within it a second signal is the first one's echo: timeout and schedulers signal the group besides
 Tell = Callable[[dict[str, Any], "Counts"], None]
 
 
@@ -35,22 +37,29 @@ class Halt:
 
 
 @contextmanager
-def ctrl_c_halts(halt: Halt) -> Iterator[None]:
-    """While this lasts, the first Ctrl-C halts the batch, and the second one interrupts as ever."""
+def signals_halt(halt: Halt) -> Iterator[None]:
+    """While this lasts, the first Ctrl-C or SIGTERM halts the batch, and a later one interrupts what is in hand."""
+    asked_s: float | None = None
 
-    def first(*_: object) -> None:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        os.write(2, FINISHING)  # not print: a signal may come in the middle of one
-        halt("interrupted")
+    def on_signal(number: int, _: object) -> None:
+        nonlocal asked_s
+        now_s = time.monotonic()
+        if asked_s is None:
+            asked_s = now_s
+            os.write(2, FINISHING)  # not print: a signal may come in the middle of one
+            halt("interrupted" if number == signal.SIGINT else "terminated")
+        elif now_s - asked_s > ONE_WISH_S:
+            raise KeyboardInterrupt
 
     if threading.current_thread() is not threading.main_thread():  # signals are the main thread's
         yield
         return
-    before = signal.signal(signal.SIGINT, first)
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

@@ -1,0 +1,52 @@
+"""One batch at a time writes to a folder."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+from batch_helpers import frames
+
+from startrack.batch import only_writer
+from startrack.batch.lock import LOCK
+from startrack.cli.main import main
+from startrack.errors import BadInput
+
+HOLD = "import sys; from startrack.batch import only_writer\nwith only_writer(sys.argv[1]): print(flush=True); input()"
+
+
+def holder(out) -> subprocess.Popen[str]:
+    """A process that holds the folder, and does."""
+    command = [sys.executable, "-c", HOLD, str(out)]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    process.stdout.readline()
+    return process
+
+
+def test_a_second_batch_is_told_of_the_first_and_touches_nothing(tmp_path, capsys):
+    frames(tmp_path / "images", 1)
+    out = tmp_path / "out"
+    out.mkdir()
+    first = holder(out)
+    assert main(["batch", str(tmp_path / "images"), "-D", str(out), "-j", "1"]) == 4
+    assert f"another batch is writing to {out} (process {first.pid})" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == [LOCK]
+    first.communicate("\n")
+    assert list(out.iterdir()) == []
+    assert main(["batch", str(tmp_path / "images"), "-D", str(out), "-j", "1", "-q"]) == 5
+
+
+def test_a_lock_goes_with_a_killed_process(tmp_path):
+    first = holder(tmp_path)
+    first.send_signal(signal.SIGKILL)
+    first.communicate()
+    assert (tmp_path / LOCK).exists()
+    with only_writer(tmp_path):
+        assert (tmp_path / LOCK).read_text() == str(os.getpid())
+        with pytest.raises(BadInput, match=f"process {os.getpid()}"), only_writer(tmp_path):
+            pass
+    assert not (tmp_path / LOCK).exists()

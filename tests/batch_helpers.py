@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import time
@@ -34,6 +35,11 @@ def frames(folder: Path, count: int, level: int = 100) -> list[Path]:
         path.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
         path.with_suffix(".json").write_text(json.dumps(FACTS))
     return paths
+
+
+def listed(*names: str, end: str = "\n") -> io.TextIOWrapper:
+    """Standard input with the images' names."""
+    return io.TextIOWrapper(io.BytesIO("".join(name + end for name in names).encode()))
 
 
 def task_of(image: Path, out: Path, plots: bool = False, **facts: Any) -> Task:

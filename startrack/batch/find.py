@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path, PurePosixPath
 
 from startrack.exposure.facts import PACKING_SUFFIXES, PICTURE_SUFFIXES
@@ -24,15 +26,15 @@ class Image:
 
 
 def images_under(folder: str | os.PathLike[str], apart_from: str | os.PathLike[str] | None = None) -> list[Image]:
-    """Every image of the tree, in the order of their names; hidden files, links to folders and `apart_from` left out.
+    """Every image of the tree, in the order of their names.
 
-    Raises BadInput (bad_image) where there is no such folder.
+    Links to folders outside the tree are followed, each folder once; hidden files and folders, `apart_from`, and what
+    is no regular file are left out. Raises BadInput (bad_image) where there is no such folder.
     """
     root = Path(folder)
     if not root.is_dir():
         raise BadInput("bad_image", f"{folder}: no such folder")
-    without = None if apart_from is None else Path(apart_from).resolve()
-    return _images(root, _names(root, without))
+    return _images(root, _names(root, None if apart_from is None else os.path.realpath(apart_from)))
 
 
 def named_images(
@@ -40,7 +42,8 @@ def named_images(
 ) -> list[Image]:
     """The images named, one path each: absolute, or relative to the current folder or to `folder`.
 
-    Raises BadInput (bad_image) for one that is no image under `folder`, and where no path came at all.
+    One that is not there (any more) is an image too: it will be refused alone. Raises BadInput (bad_image) for what can
+    be no image under `folder`, and where no path came at all.
     """
     root, known = os.path.abspath(folder), {image.name: image for image in images_under(folder, apart_from)}
     texts = [text for text in (path.strip("\r\n") for path in paths) if text]
@@ -49,25 +52,33 @@ def named_images(
     chosen = set()
     for text in texts:
         places = (os.path.abspath(text), os.path.abspath(os.path.join(root, text)))
-        names = (os.path.relpath(place, root).replace(os.sep, "/") for place in places)
+        names = [os.path.relpath(place, root).replace(os.sep, "/") for place in places]
         name = next((name for name in names if name in known), None)
-        if name is None:
+        gone = next((one for one in names if name is None and _is_gone(root, one)), None)
+        if gone is not None:
+            known[gone] = Image(gone, _stem_of_gone(gone, known.values()), os.path.join(root, gone))
+        elif name is None:
             raise BadInput("bad_image", f"{text} is not an image under {folder}")
-        chosen.add(known[name])
+        chosen.add(known[name or str(gone)])
     return sorted(chosen)  # named as in a run over the whole folder
 
 
 def output_stems(images: Sequence[str]) -> list[str]:
-    """Names of the results: the images' stems; equal stems keep their suffix, equal names get a number."""
+    """Names of the results, each given once: the images' stems, with their suffix where stems are equal, and with the
+    first number that makes them another's where that is taken too.
+    """
     names = [Path(image).name for image in images]
     stems = [_stem(name) for name in names]
     often = Counter(stems)
     chosen = [name if often[stem] > 1 else stem for name, stem in zip(names, stems, strict=True)]
-    seen: Counter[str] = Counter()
+    taken, given = set(chosen), set[str]()
     unique = []
     for name in chosen:
-        seen[name] += 1
-        unique.append(name if seen[name] == 1 else f"{name}-{seen[name]}")
+        numbered = (f"{name}-{number}" for number in count(2))
+        one = next(one for one in numbered if one not in taken) if name in given else name
+        taken.add(one)
+        given.add(one)
+        unique.append(one)
     return unique
 
 
@@ -83,13 +94,45 @@ def _images(root: Path, names: Sequence[str]) -> list[Image]:
     return sorted(found)
 
 
-def _names(root: Path, without: Path | None) -> list[str]:
-    found = []
-    for parent, folders, files in os.walk(root):
+def _is_gone(root: str, name: str) -> bool:
+    """Whether it is the name of an image within the folder, which is not there."""
+    path = PurePosixPath(name)
+    return path.parts[:1] != ("..",) and _is_image(path.name) and not os.path.lexists(os.path.join(root, name))
+
+
+def _stem_of_gone(name: str, others: Iterable[Image]) -> str:
+    stem = (PurePosixPath(name).parent / _stem(PurePosixPath(name).name)).as_posix()
+    return name if stem in {image.stem for image in others} else stem
+
+
+def _names(root: Path, without: str | None) -> list[str]:
+    """Images of the tree relative to it. A folder is entered once, and by its own name before any link's."""
+    top = os.path.realpath(root)
+    entered, found = {top}, []
+
+    def is_to_be_entered(place: Path) -> bool:
+        real = os.path.realpath(place)
+        inside_by_link = place.is_symlink() and Path(real).is_relative_to(top)
+        if place.name.startswith(".") or real == without or real in entered or inside_by_link:
+            return False
+        entered.add(real)
+        return True
+
+    for parent, folders, files in os.walk(root, followlinks=True):
         here = Path(parent)
-        folders[:] = [name for name in folders if not name.startswith(".") and (here / name).resolve() != without]
-        found += [(here / name).relative_to(root).as_posix() for name in files if _is_image(name)]
+        folders[:] = [name for name in sorted(folders) if is_to_be_entered(here / name)]
+        found += [
+            (here / name).relative_to(root).as_posix() for name in files if _is_image(name) and _is_file(here, name)
+        ]
     return sorted(found)
+
+
+def _is_file(folder: Path, name: str) -> bool:
+    """Not a pipe, which would be waited for. A link to nothing is an image that will be refused."""
+    try:
+        return stat.S_ISREG((folder / name).stat().st_mode)
+    except OSError:
+        return True
 
 
 def _is_image(name: str) -> bool:

@@ -15,7 +15,7 @@ from typing import Any
 
 from startrack import __version__
 from startrack.deep_catalog import deep_installed
-from startrack.exposure.facts import RAW_SUFFIXES, sidecars
+from startrack.exposure.facts import RAW_SUFFIXES, sidecar_of
 from startrack.paths import is_path
 
 MISSING = "?"  # in place of the hash of a file that cannot be read: there later, it is another input
@@ -36,7 +36,7 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
 def key_of(image: str, image_sha256: str, facts: dict[str, Any], *others: object) -> str:
     """SHA-256 of image, sidecar, flags, version and the extras that matter; `hashes_of` has camera and terrain."""
     path = Path(image)
-    sidecar = next((one for one in sidecars(path) if one.is_file()), None)
+    sidecar = sidecar_of(path)
     flags = {key: _from(path, value) if key in FILES and is_path(value) else value for key, value in facts.items()}
     extras = [deep_installed(), path.suffix.lower() in RAW_SUFFIXES and find_spec("rawpy") is not None]
     whole = [__version__, flags, *others, extras, image_sha256, sidecar and sha256_of(sidecar)]

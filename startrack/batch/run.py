@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import threading
@@ -116,6 +117,7 @@ class Batch:
     def _client(self) -> Client:
         from distributed import Client
 
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # that a scheduler has gone is said below
         try:
             return Client(self.cluster, timeout=CONNECT_S)
         except OSError as cause:
@@ -130,7 +132,7 @@ def _outcome_on_cluster(future: Any, task: Task) -> Outcome:
     except KilledWorker:
         return lost(task, DIED_ON_CLUSTER), False
     except (OSError, CancelledError) as cause:
-        raise BatchStopped(f"the Dask scheduler has gone ({cause})") from cause
+        raise BatchStopped(f"the Dask scheduler has gone ({str(cause).partition(chr(10))[0]})") from cause
     except ImportError as cause:
         raise BatchStopped(f"the workers cannot load startrack ({cause})") from cause
     return outcome

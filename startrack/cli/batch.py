@@ -33,8 +33,8 @@ def add_parser(subparsers: Any) -> None:
         description="Locate the camera in every image of a tree, which OUT mirrors. A run that was stopped goes on "
         "from there; images, sidecars, camera or terrain files that have changed are done again. Adds results.ecsv, "
         "results.parquet, trajectory.tum, timings.ecsv and manifest.json.",
-        epilog="exit codes: 0 every image solved; 5 some not solved, or stopped early (Ctrl-C, SIGTERM, a full disk, a closed "
-        "pipe); 1 an internal error; 2 usage; 4 bad input",
+        epilog="exit codes: 0 every image solved; 5 some not solved, or stopped early (Ctrl-C, SIGTERM, a full disk, a "
+        "closed pipe); 1 an internal error; 2 usage; 4 bad input",
     )
     parser.add_argument("folder", metavar="FOLDER", help="folder of the images, with all below it")
     add_fact_flags(parser)
@@ -46,7 +46,9 @@ def add_parser(subparsers: Any) -> None:
     workers.add_argument(
         "--cluster", type=_address, metavar="ADDRESS", help="a Dask cluster to use instead (extra: cluster)"
     )
-    parser.add_argument("--files-on-stdin", action="store_true", help="only the images listed on stdin, one a line")
+    parser.add_argument(
+        "--files-on-stdin", action="store_true", help="only the images listed on stdin, one a line, or ended by NUL"
+    )
     parser.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the results (%(default)s)")
     again = parser.add_mutually_exclusive_group()
     again.add_argument("--resume", action="store_true", help="keep the results that are there (default)")
@@ -69,9 +71,14 @@ def run(args: argparse.Namespace) -> int:
     facts = _facts(args)
     _check_files_of_flags(facts)
     whole = images_under(args.folder, args.dir)
-    found = named_images(args.folder, sys.stdin, args.dir) if args.files_on_stdin else whole
+    found = named_images(args.folder, _names(sys.stdin.buffer.read()), args.dir) if args.files_on_stdin else whole
     if not found:
         raise BadInput("bad_image", f"{args.folder}: no PNG, TIFF, FITS, JPEG or camera raw images there")
+    if args.time is not None and len(found) > 1:
+        args.usage_error(
+            f"--time is of one image, and {args.folder} has {len(found)}: give each its time in a sidecar NAME.json "
+            "with time_utc"
+        )
     out = made_folder(args.dir)
     with only_writer(out):
         return _run(found, whole, out, facts, args)
@@ -80,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
 def _run(
     found: Sequence[Image], whole: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace
 ) -> int:
-    """`found`, some of `whole`, done; tables of `whole`; the exit code."""
+    """`found` done; tables of that and of the `whole` folder; the exit code."""
     from startrack.batch import Batch, Counts
 
     _check_whose(out, whole, args)
@@ -92,7 +99,12 @@ def _run(
     with signals_halt(halt):
         records, stopped = _work_off(batch, tasks, counts, halt, args)
         try:
-            _write_tables(out, _tasks(whole, out, facts, args), records, {**_shown(facts), "plots": not args.no_plots})
+            _write_tables(
+                out,
+                _tasks(sorted({*whole, *found}), out, facts, args),
+                records,
+                {**_shown(facts), "plots": not args.no_plots},
+            )
             tables = f"tables in {out}"
         except BadInput as cause:
             stopped, tables = stopped or "the disk takes no more", f"no tables: {cause}"
@@ -148,6 +160,11 @@ def _facts(args: argparse.Namespace) -> dict[str, Any]:
     facts = flag_facts(args)
     named = {key: os.path.abspath(facts[key]) for key in ("camera", "terrain") if is_path(facts.get(key, ""))}
     return facts | named
+
+
+def _names(listed: bytes) -> list[str]:
+    """Paths as `find -print0` lists them, else one a line."""
+    return os.fsdecode(listed).split("\0" if b"\0" in listed else "\n")
 
 
 def _check_files_of_flags(facts: dict[str, Any]) -> None:

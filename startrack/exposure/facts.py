@@ -114,6 +114,12 @@ def sidecars(image: Path) -> list[Path]:
     return [image.with_name(name + ".json") for name in _stems(image)]
 
 
+def sidecar_of(image: Path) -> Path | None:
+    """The sidecar that lies there, if any. Cameras that write NAME.PNG write NAME.JSON."""
+    places = (place for path in sidecars(image) for place in (path, path.with_suffix(".JSON")))
+    return next((place for place in places if os.path.isfile(place)), None)
+
+
 def is_path(reference: str) -> bool:
     """Whether a camera's or terrain's `reference` is a path; otherwise it is the name of a shipped file."""
     return reference.endswith(".toml") or "/" in reference or "\\" in reference
@@ -131,7 +137,7 @@ def _stems(image: Path) -> list[str]:
 
 
 def _read_sidecar(image: Path) -> tuple[Path, dict[str, Any]]:
-    found = next((path for path in sidecars(image) if os.path.isfile(path)), None)
+    found = sidecar_of(image)
     if found is None:
         return image, {}
     try:

@@ -1,0 +1,104 @@
+"""Which files a batch takes for its images, however they lie and are listed, and what their results are called."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import pytest
+from astropy.table import Table
+from batch_helpers import frames, listed, task_of
+
+from startrack.batch import images_under, locate_image
+from startrack.batch.find import output_stems
+from startrack.cli.main import main
+from startrack.exposure import read_exposure
+
+
+def names(folder, *apart) -> list[str]:
+    return [image.name for image in images_under(folder, *apart)]
+
+
+@pytest.mark.parametrize(
+    ("images", "stems"),
+    [
+        (["a.fits", "a.png", "a.png-2.png", "a.png.png"], ["a.fits", "a.png", "a.png-2", "a.png-3"]),
+        (["a.png", "b/a.png", "a.png-2.png"], ["a.png", "a.png-3", "a.png-2"]),
+        (["a.png", "b.png"], ["a", "b"]),
+        (["a.png"] * 3, ["a.png", "a.png-2", "a.png-3"]),
+    ],
+)
+def test_no_two_results_have_one_name(images, stems):
+    assert output_stems(images) == stems
+
+
+def test_links_to_folders_are_followed_once_and_without_loops(tmp_path):
+    root, elsewhere = tmp_path / "images", tmp_path / "elsewhere"
+    for folder in (root / "day", root / ".hidden", elsewhere / "deep"):
+        frames(folder, 1)
+    for link, target in {
+        "linked": elsewhere,
+        "linked-again": elsewhere,
+        "day-again": root / "day",
+        "loop": root,
+        "up": tmp_path,
+    }.items():
+        (root / link).symlink_to(target)
+    (elsewhere / "back").symlink_to(elsewhere)
+    assert names(root) == ["day/00.png", "linked/deep/00.png"]
+    assert names(root, elsewhere) == ["day/00.png"]
+
+
+def test_a_pipe_is_no_image_and_a_link_to_nothing_is_one(tmp_path):
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "linked-pipe.png").symlink_to(tmp_path / "pipe.png")
+    (tmp_path / "nothing.png").symlink_to(tmp_path / "gone.png")
+    (tmp_path / "folder.png").mkdir()
+    assert names(tmp_path) == ["nothing.png"]
+    assert locate_image(task_of(tmp_path / "pipe.png", tmp_path))[0]["reason"] == "bad_image"
+
+
+@pytest.mark.parametrize("end", ["\n", "\0"])
+def test_an_image_that_is_gone_when_its_turn_comes_is_refused_alone(tmp_path, monkeypatch, end):
+    frames(tmp_path / "images", 2)
+    monkeypatch.setattr("sys.stdin", listed("00.png", "gone.png", "gone.png", "gone.fits", end=end))
+    out = str(tmp_path / "out")
+    assert main(["batch", str(tmp_path / "images"), "-D", out, "--files-on-stdin", "-j", "1", "--no-plots", "-q"]) == 5
+    table = Table.read(tmp_path / "out" / "results.ecsv", format="ascii.ecsv")
+    assert dict(zip(table["image"], table["reason"], strict=True)) == {
+        "00.png": "no_stars", "gone.fits": "bad_image", "gone.png": "bad_image",
+    }  # fmt: skip
+
+
+def test_one_time_is_not_given_to_many_images(tmp_path, capsys):
+    images = frames(tmp_path / "images", 2)
+    command = ["batch", str(tmp_path / "images"), "-D", str(tmp_path / "out"), "-j", "1", "--no-plots", "-q"]
+    with pytest.raises(SystemExit, match="2"):
+        main([*command, "--time", "2031-03-26T20:58:11Z"])
+    assert "--time is of one image" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    images[1].unlink()
+    assert main([*command, "--time", "2031-03-26T20:58:11Z"]) == 5
+    record = json.loads((tmp_path / "out" / "00.fix.json").read_text())
+    assert record["provenance"]["time_utc"].startswith("2031-03-26T20:58:11")
+
+
+def test_no_folder_of_results_is_made_for_no_images(tmp_path):
+    (tmp_path / "empty").mkdir()
+    for folder in ("nope", "empty"):
+        assert main(["batch", str(tmp_path / folder), "-D", str(tmp_path / "out"), "-q"]) == 4
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_sidecar_in_capitals_counts_where_there_is_no_other(tmp_path):
+    (image,) = frames(tmp_path, 1)
+    small, capital = image.with_suffix(".json"), image.with_suffix(".JSON")
+    facts = json.loads(small.read_text())
+    capital.write_text(json.dumps(facts | {"exposure_s": 2.0}))
+    assert read_exposure(image).exposure_s == 1.0
+    small.unlink()
+    assert read_exposure(image).exposure_s == 2.0
+    task = task_of(image, tmp_path)
+    assert [locate_image(task)[1], locate_image(task)[1]] == [False, True]
+    capital.write_text(json.dumps(facts | {"exposure_s": 3.0}))
+    assert not locate_image(task)[1]

@@ -151,3 +151,14 @@ def test_what_is_no_whole_record_is_none(folder, monkeypatch, text):
     assert list(table(folder)) == [SOLVED, "02.png"]
     assert batch(folder) == 5
     assert stored(result)["reason"] == "no_stars"
+
+
+def test_warnings_are_counted_and_told_when_asked_for(folder, capsys):
+    sidecar = folder / "images" / "01.json"
+    sidecar.write_text(json.dumps(json.loads(sidecar.read_text()) | {"exposuer_s": 1.0}))
+    assert batch(folder) == 5
+    streams = capsys.readouterr()
+    assert "; 1 with warnings (-v shows them)" in streams.out
+    assert "exposuer_s" not in streams.err
+    assert batch(folder, "-v") == 5
+    assert "01.png: sidecar 01.json: key 'exposuer_s'" in capsys.readouterr().err

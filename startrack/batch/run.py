@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import logging
-import os
-import signal
-import threading
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from ctypes import c_longlong
 from itertools import chain, count, islice
-from multiprocessing import active_children, get_context, parent_process
-from multiprocessing.connection import wait as wait_for
 from typing import TYPE_CHECKING, Any
 
+from startrack.batch.processes import Process, kill_children, pool_of
 from startrack.batch.task import BatchStopped, Task, locate_image, lost
 from startrack.errors import BadInput
 
@@ -23,9 +18,6 @@ if TYPE_CHECKING:
     from distributed import Client
 
 CONNECT_S = 10.0
-ONE_THREAD = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
-QUIET_TRACKER = "ignore:resource_tracker"  # after kill -9 Python tidies up, and would warn that it had to
-NOTHING = -1  # in place of the number of the task that a process is at
 AHEAD = 4  # tasks per worker that wait in the queue: 100,000 images take no more memory than a hundred
 DIED = "internal error: the process that worked on it died (out of memory?), alone as it did beside others"
 DIED_ON_CLUSTER = "internal error: the Dask workers that worked on it died, one after the other (out of memory?)"
@@ -68,8 +60,8 @@ class Batch:
         self, coming: Iterator[Task], jobs: int, ahead: int
     ) -> Generator[Outcome, None, tuple[list[Task], list[Task]]]:
         """Returns the tasks that processes were at when one died, and those that were queued; none when all is done."""
-        at = get_context("spawn").RawArray(c_longlong, [NOTHING] * jobs)
-        pool, numbers = _pool(jobs, at), count()
+        pool, at = pool_of(jobs)
+        numbers = count()
         waiting: dict[Future[Outcome], tuple[int, Task]] = {}
         undone: dict[int, Task] = {}
         try:
@@ -90,11 +82,11 @@ class Batch:
                     else:
                         yield future.result()
         except (KeyboardInterrupt, GeneratorExit):  # results are whole or not there, so that nothing is spoilt
-            _kill_children()
+            kill_children()
             raise
         finally:
             if undone:  # the pool asks the other processes to end by a signal that they ignore
-                _kill_children()
+                kill_children()
             pool.shutdown(wait=True, cancel_futures=True)
 
     def _on_cluster(self, tasks: Sequence[Task]) -> Iterator[Outcome]:
@@ -148,61 +140,8 @@ def _suspects(undone: dict[int, Task], at: set[int]) -> tuple[list[Task], list[T
 
 def _submitted(pool: ProcessPoolExecutor, work: Work, number: int, task: Task) -> Future[Outcome]:
     try:
-        return pool.submit(_Process.do, work, number, task)
+        return pool.submit(Process.do, work, number, task)
     except BrokenProcessPool as cause:  # since the last look
         broken: Future[Outcome] = Future()
         broken.set_exception(cause)
         return broken
-
-
-def _pool(jobs: int, at: Any) -> ProcessPoolExecutor:
-    # Fresh processes (a fork would copy the progress bar's thread), which leave signals to the one that waits for them.
-    # They inherit these when they load NumPy: the cores are taken by other images.
-    for name in ONE_THREAD:
-        os.environ.setdefault(name, "1")
-    rules = os.environ.get("PYTHONWARNINGS", "")
-    if QUIET_TRACKER not in rules:
-        os.environ["PYTHONWARNINGS"] = f"{rules},{QUIET_TRACKER}".strip(",")
-    context = get_context("spawn")
-    return ProcessPoolExecutor(
-        jobs, mp_context=context, initializer=_Process.begin, initargs=(at, context.Value(c_longlong))
-    )
-
-
-def _kill_children() -> None:
-    for process in active_children():
-        process.kill()
-
-
-class _Process:
-    """What a process of the pool knows of itself: where it says which task it is at, for whoever finds it dead."""
-
-    at: Any
-    place: int
-
-    @classmethod
-    def begin(cls, at: Any, taken: Any) -> None:
-        for number in (signal.SIGINT, signal.SIGTERM):  # sent to the whole group: the images in hand are finished
-            signal.signal(number, signal.SIG_IGN)
-        threading.Thread(target=_end_with_parent, daemon=True).start()
-        with taken:
-            cls.at, cls.place = at, taken.value
-            taken.value += 1
-        import cv2
-
-        cv2.setNumThreads(1)
-
-    @classmethod
-    def do(cls, work: Work, number: int, task: Task) -> Outcome:
-        cls.at[cls.place] = number
-        outcome = work(task)
-        cls.at[cls.place] = NOTHING
-        return outcome
-
-
-def _end_with_parent() -> None:
-    """End this process when its parent is gone: killed, it cannot tell, and a resumed run must find nobody at work."""
-    parent = parent_process()
-    if parent is not None:
-        wait_for([parent.sentinel])
-    os._exit(1)

@@ -57,7 +57,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--no-plots", action="store_true", help="no pictures")
     parser.add_argument("--report", action="store_true", help="add OUT/report.html, a page for a browser")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="accepted everywhere; here nothing is random")
-    parser.add_argument("-v", "--verbose", action="count", default=0, help="a line for every image")
+    parser.add_argument("-v", "--verbose", action="count", default=0, help="a line for every image and warning")
     parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
     parser.set_defaults(usage_error=parser.error)
 
@@ -137,6 +137,7 @@ def _work_off(
                 records.append(gist(record))
                 counts["error" if record["reason"] == INTERNAL_ERROR else str(record["status"])] += 1
                 counts["kept"] += kept
+                counts["warned"] += bool(record.get("warnings"))
                 tell(record, counts)
     except BatchStopped as cause:
         halt.why = str(cause)

@@ -69,6 +69,8 @@ def progress(total: int, args: argparse.Namespace, halt: Halt) -> Iterator[Tell]
     def lines(record: dict[str, Any], _: Counts) -> None:
         if record["reason"] == INTERNAL_ERROR:
             print(f"{record['image']}: {record['message']}", file=sys.stderr, flush=True)
+        for warning in record.get("warnings", ()) if args.verbose else ():
+            print(f"{record['image']}: {warning}", file=sys.stderr, flush=True)
         try:
             if args.json:
                 print(json.dumps(record), flush=True)
@@ -99,7 +101,8 @@ def summary(counts: Counts, total: int) -> str:
     """How many images of each outcome."""
     parts = [f"{counts[name]} {name}" for name in SHOWN if counts[name]]
     kept = f" ({counts['kept']} were there already)" if counts["kept"] else ""
-    return f"{total} images: {', '.join(parts)}{kept}"
+    warned = f"; {counts['warned']} with warnings (-v shows them)" if counts["warned"] else ""
+    return f"{total} images: {', '.join(parts)}{kept}{warned}"
 
 
 def left_aside(found: Rows) -> list[str]:

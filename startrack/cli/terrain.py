@@ -121,7 +121,7 @@ def _build(args: argparse.Namespace) -> int:
 
 def _import(args: argparse.Namespace) -> int:
     from startrack.terrain import load_terrain
-    from startrack.terrain.imported import coarseness, import_maps
+    from startrack.terrain.imported import coarseness, import_maps, smoothness
 
     half = list(args.half or [])
     half += [30_000.0 if not half and k == 0 else 300_000.0 for k in range(len(half), len(args.maps))]
@@ -132,7 +132,7 @@ def _import(args: argparse.Namespace) -> int:
     )  # fmt: skip
     terrain = load_terrain(path)
     facts = facts_of(terrain) | {"sigma_from": "map" if args.sigma is None else "flag"}
-    _tell(args, facts | {"files": [str(path)], "warnings": coarseness(terrain)})
+    _tell(args, facts | {"files": [str(path)], "warnings": coarseness(terrain) + smoothness(terrain)})
     return 0
 
 

@@ -12,6 +12,7 @@ from startrack.terrain.geotiff import write_map
 from startrack.terrain.heightmap import HeightMap
 from startrack.terrain.protocol import Terrain
 from startrack.terrain.rasters import read_map
+from startrack.terrain.resolution import carried_spacing
 from startrack.terrain.roughness import error_between_posts_m
 from startrack.types import BadInput
 
@@ -75,9 +76,31 @@ def import_maps(
 
 
 def _sigma_m(crops: Sequence[HeightMap], radius_m: float) -> float:
-    """Error of single posts [m], two digits of it: of the finest map that may hold the rim, or of the last."""
+    """Error of single posts [m], two digits of it, by the map that makes the horizon."""
+    return float(f"{error_between_posts_m(_of_the_rim(crops, radius_m)):.2g}")
+
+
+def _of_the_rim(crops: Sequence[HeightMap], radius_m: float) -> HeightMap:
+    """The finest map that may hold the rim, or the last."""
     rims = [crop for crop in crops if 0.5 * min(crop.heights_m.shape) * crop.post_m >= RIM_RADII * radius_m]
-    return float(f"{error_between_posts_m((rims or crops[-1:])[0]):.2g}")
+    return (rims or crops[-1:])[0]
+
+
+def smoothness(terrain: Terrain) -> list[str]:
+    """A warning where the map that makes the horizon carries no ground as fine as its posts."""
+    maps = getattr(terrain, "maps", ())
+    if not maps:
+        return []
+    rim = _of_the_rim(maps, terrain.search_radius_m)
+    spacing = carried_spacing(rim.heights_m.astype(np.float64))
+    if spacing <= 1:
+        return []
+    error_m = error_between_posts_m(rim, spacing)
+    return [
+        f"{rim.source or 'the map'} looks interpolated or smoothed: posts are {rim.post_m:.3g} m apart, the ground in "
+        f"them about {spacing * rim.post_m:.2g} m, which lets expect errors of {error_m:.2g} m (height_sigma_m is "
+        f"{getattr(terrain, 'height_sigma_m', 0.0):.2g} m); give the map it was made from, or a known error"
+    ]
 
 
 def coarseness(terrain: Terrain) -> list[str]:

@@ -86,6 +86,13 @@ def test_other_times_are_refused_as_no_time(text: object) -> None:
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("text", ["1500-01-01", "2026-03-01", "20260301", "2026-03-01Z"])
+def test_a_date_alone_is_said_to_lack_its_time_of_day(text: str) -> None:
+    with pytest.raises(BadInput, match="date without a time of day") as error:
+        parse_utc(text)
+    assert error.value.reason == "no_time"
+
+
 @given(st.datetimes(min_value=datetime(1000, 1, 1), timezones=st.just(UTC)))
 def test_utc_text_round_trips(time: datetime) -> None:
     assert parse_utc(format_utc(time)) == time

@@ -9,6 +9,7 @@ from startrack.types import BadInput
 
 # The suffix only: the date and the time of day before it are left to the standard library.
 _PARTS = re.compile(r"(?P<stamp>\d[\d-]*[Tt ]\d[\d:.,]*)\s?(?P<suffix>[Zz]|[+-][\d:]+)?", re.ASCII)
+_DATE = re.compile(r"\d{4}(-?\d{2}-?\d{2}|-?W\d{2}-?\d|-\d{3})[Zz]?", re.ASCII)
 _UTC_SUFFIXES = {None, "Z", "z", "+00:00", "+0000", "+00"}
 
 
@@ -22,6 +23,10 @@ def parse_utc(text: str) -> datetime:
         BadInput: "no_time" for any other offset and for anything that is not such a time; nothing is guessed.
     """
     parts = _PARTS.fullmatch(text.strip()) if isinstance(text, str) else None
+    if parts is None and isinstance(text, str) and _DATE.fullmatch(text.strip()):
+        raise BadInput(
+            "no_time", f"{text!r} is a date without a time of day: give one such as {text.strip()}T12:00:00Z"
+        )
     if parts is None:
         raise BadInput("no_time", f"{text!r} is not an ISO 8601 date and time such as 2026-03-01T12:00:00Z")
     if parts["suffix"] not in _UTC_SUFFIXES:

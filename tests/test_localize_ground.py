@@ -10,7 +10,7 @@ import pytest
 from startrack.localize import ExactPosterior, check_consistency
 from startrack.localize.blurred import Blurred
 from startrack.localize.common import raised
-from startrack.localize.consistency import separate_contradictions
+from startrack.localize.consistency import contradicted_stretches
 from startrack.localize.dive import best_by_diving
 from startrack.localize.likelihood import Sectors
 from startrack.localize.misfit import turn_of_sky
@@ -136,11 +136,12 @@ def test_stars_of_another_place_or_time_are_refused_before_the_search(shackleton
 
 def test_contradictions_are_counted_apart():
     by_sector = np.zeros(240)
-    assert separate_contradictions(by_sector) == 0
+    assert contradicted_stretches(by_sector) == []
     by_sector[[238, 239, 0, 1, 3]] = -9.0  # a ridge across north, with a gap in it
-    assert separate_contradictions(by_sector) == 1
+    assert contradicted_stretches(by_sector) == [(238, 6)]
     by_sector[20:200:20] = -4.0
-    assert separate_contradictions(by_sector) == 10
+    assert contradicted_stretches(by_sector) == [*((k, 1) for k in range(20, 200, 20)), (238, 6)]
+    assert contradicted_stretches(np.full(240, -9.0)) == [(0, 240)]
 
 
 def test_no_allowed_ground_is_given_up(shackleton):

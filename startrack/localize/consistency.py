@@ -27,6 +27,7 @@ USUAL_HORIZON_RAD = 0.3  # sin H cos H of a crater's rim at 20 degrees: d(tan H)
 EXPLAINED_SECTOR_RAD = np.radians(1.5)
 LEAST_EXPLAINED_NATS = -0.75  # 0 to -0.35 at the right place, up to 0.5 lower with a ridge on no map; -9.2 the worst
 CONTRADICTED_NATS = -3.0  # of one sector
+MOST_NAMED = 3
 MOST_SEPARATE = 7  # at right places 0 to 3 were seen, and 9 or more where the sky was turned by 6 degrees and more
 STRETCH_WINDOW_RAD = np.radians(4.0)
 TELLING_LLR = 0.3
@@ -45,26 +46,26 @@ def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain, compiled: 
     """
     evidence = raised(evidence, fix.horizon_error_rad)
     sure = _sure(evidence, fix, terrain)
+    by_sector = explained_by_sector(evidence, fix, terrain, sure)
+    stretches = contradicted_stretches(by_sector)
     contradicted = contradicted_part(evidence, fix, terrain, sure)
     if contradicted > MOST_CONTRADICTED_SECTORS:
         raise NotLocated(
-            f"{100 * contradicted:.0f} % of the horizon contradicts the best place: "
-            "wrong terrain, time or camera file?",
+            f"{100 * contradicted:.0f} % of the horizon contradicts the best place{_at_azimuths(stretches)}: "
+            "wrong terrain, time or camera file, or something on no map?",
             reason="inconsistent_evidence",
         )
-    by_sector = explained_by_sector(evidence, fix, terrain, sure)
     explained = float(by_sector.mean())
     if explained < LEAST_EXPLAINED_NATS:
         raise NotLocated(
-            f"the best place explains the stars badly ({explained:.1f} nats a sector; usual: 0 to -0.3): "
-            "wrong terrain, time or camera file?",
+            f"the best place explains the stars badly ({explained:.1f} nats a sector; usual: 0 to -0.3)"
+            f"{_at_azimuths(stretches)}: wrong terrain, time or camera file, or something on no map?",
             reason="inconsistent_evidence",
         )
-    scattered = separate_contradictions(by_sector)
-    if scattered > MOST_SEPARATE and not isinstance(terrain, Cylinder):
+    if len(stretches) > MOST_SEPARATE and not isinstance(terrain, Cylinder):
         raise NotLocated(
-            f"the best place is contradicted at {scattered} separate stretches of the horizon, as with a wrong time: "
-            "are the image's time, the terrain and the camera file right?",
+            f"the best place is contradicted at {len(stretches)} separate stretches of the horizon, as with a wrong "
+            "time: are the image's time, the terrain and the camera file right?",
             reason="inconsistent_evidence",
         )
     if isinstance(terrain, Cylinder):
@@ -113,14 +114,29 @@ def explained_by_sector(evidence: Evidence, fix: Fix, terrain: Terrain, sure: Su
     return sectors.by_sector(sums)
 
 
-def separate_contradictions(by_sector: Array) -> int:
-    """Runs of sectors that contradict the fix, single good ones between them not counted as a gap.
+def contradicted_stretches(by_sector: Array) -> list[tuple[int, int]]:
+    """First sector and number of each run that contradicts the fix; a single good one between them is no gap.
 
-    An obstacle on no map makes one, however wide; a wrong time, that turns the whole skyline, makes many.
+    An obstacle on no map makes one run, however wide; a wrong time, that turns the whole skyline, makes many.
     """
     wrong = by_sector < CONTRADICTED_NATS
     wrong |= np.roll(wrong, 1) & np.roll(wrong, -1)
-    return int(np.sum(wrong & ~np.roll(wrong, 1)))
+    if wrong.all():
+        return [(0, len(wrong))]
+    starts = np.flatnonzero(wrong & ~np.roll(wrong, 1))
+    after = np.flatnonzero(~wrong & np.roll(wrong, 1))  # one past the ends
+    ends = after[np.searchsorted(after, starts) % max(len(after), 1)] if len(starts) else after
+    return [(int(start), int((end - start) % len(wrong))) for start, end in zip(starts, ends, strict=True)]
+
+
+def _at_azimuths(stretches: list[tuple[int, int]]) -> str:
+    """The widest of them in words, for a message."""
+    if not stretches:
+        return ""
+    width = np.degrees(EXPLAINED_SECTOR_RAD)
+    widest = sorted(sorted(stretches, key=lambda one: -one[1])[:MOST_NAMED])
+    words = [f"{width * start:.0f} to {(width * (start + count)) % 360:.0f}" for start, count in widest]
+    return f", most at azimuths {', '.join(words)} degrees"
 
 
 def admitted_stretch(terrain: Terrain) -> float:

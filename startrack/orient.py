@@ -136,12 +136,15 @@ def extra_variance_px2(residual_px: Array, covariance_px2: Array, parameters: in
 
     `parameters`: of the fit that left the residuals.
     """
-
     axes_px2, axes = np.linalg.eigh(covariance_px2)
-    squared = np.square(np.einsum("nij,ni->nj", axes, residual_px))
+    squared = np.square(np.einsum("nij,ni->nj", axes, residual_px)).T
+    axes_px2 = np.ascontiguousarray(axes_px2.T)
+    middle_two = (len(residual_px) - 1) // 2, len(residual_px) // 2
 
     def median_chi2(extra: float) -> float:
-        return float(np.median(np.sum(squared / (axes_px2 + extra), axis=1)))
+        along = squared / (axes_px2 + extra)
+        ordered = np.partition(along[0] + along[1], middle_two)  # np.median itself takes three times as long
+        return 0.5 * float(ordered[middle_two[0]] + ordered[middle_two[1]])
 
     # The fit has already taken its parameters' share out of the residuals.
     expected = CHI2_2DOF_MEDIAN * max(1.0 - 0.5 * parameters / len(residual_px), 0.1)

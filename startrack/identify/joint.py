@@ -13,7 +13,7 @@ from startrack.orient import OUTLIER_CHI2, extra_variance_px2, rotation, tapered
 from startrack.types import Array
 
 ROUNDS = 12
-SETTLED_PX = 1e-4
+SETTLED_PX = 1e-3
 FOCAL_SIGMA, CENTRE_SIGMA = 0.1, 0.06  # known beforehand, in focal lengths
 K_SIGMA = (0.1, 0.1, 0.05, 0.02)
 

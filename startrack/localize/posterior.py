@@ -35,6 +35,7 @@ RAY_BY_RAY_M = 20.0  # boxes of this half side and less are asked ray by ray, la
 NARROW_M, NARROW_PARTS = 60.0, 4  # on real ground, boxes below this half side are asked by quarters of a sector
 NARROW_FROM, NARROW_TO = 600, 4000  # as many boxes as are worth it, and as few as can be traced in seconds
 NARROW_TURNS = 6
+FINEST_ON_GROUND_M = 0.45  # half side: no height map knows its ground better; the boxes' size is in the covariance
 SMOOTH = 0.6  # of the boxes are enough on real ground, whose many soft edges leave no cells: sums of Gaussians converge
 
 
@@ -102,6 +103,7 @@ class _Search:
         self, method: ExactPosterior, evidence: Evidence, terrain: Terrain, place_m: Array | None = None
     ) -> None:
         self.method, self.terrain, self.ground = method, terrain, terrain
+        self.finest_m = method.finest_m if isinstance(terrain, Cylinder) else max(method.finest_m, FINEST_ON_GROUND_M)
         self.place_m = np.zeros(2)  # a good one to begin with
         self.sectors = Sectors.of(evidence, method.sector_width_rad, method.sector_epsilon)
         self.profile = Profile.of(self.sectors)
@@ -188,7 +190,8 @@ class _Search:
     def refine(self, boxes: RayBoxes) -> RayBoxes:
         """Quartered until small against the posterior's spread."""
         while True:
-            if len(boxes.ray) > MANY_PAIRS and 4 * len(boxes) <= self.method.most_boxes:
+            more = 4 * len(boxes) <= self.method.most_boxes and boxes.half_m > self.finest_m
+            if len(boxes.ray) > MANY_PAIRS and more:
                 boxes = boxes.take(self._promising(boxes))
                 if len(boxes.ray) > MOST_PAIRS:
                     raise self._lost(len(boxes) * 4 * boxes.half_m**2)
@@ -259,7 +262,7 @@ class _Search:
         """How many times wider the boxes are than need be; 0 where they shall not be quartered anyway."""
         if not np.isfinite(log_weight).any():
             return np.inf
-        if boxes.half_m <= self.method.finest_m or 4 * len(boxes) > self.method.most_boxes or not len(boxes.ray):
+        if boxes.half_m <= self.finest_m or 4 * len(boxes) > self.method.most_boxes or not len(boxes.ray):
             return 0.0
         smaller = smallest_axis(boxes.centres_m, 2 * boxes.half_m, log_weight)
         many = self.method.boxes_per_sigma * (1.0 if isinstance(self.terrain, Cylinder) else SMOOTH)

@@ -22,7 +22,7 @@ from numba import njit
 from startrack.terrain import load_terrain
 from startrack.terrain.dem import HeightTerrain
 from startrack.terrain.ground import ground_up_m
-from startrack.terrain.trace_compiled import _surface
+from startrack.terrain.trace_compiled import surface
 
 CROPS_M = {"shackleton": 16_000.0, "haworth": 22_000.0, "kepler": 17_000.0}
 AZIMUTHS_RAD = np.radians(np.arange(0.25, 360, 0.5))
@@ -99,7 +99,7 @@ def _march(grid, posts, heights, moon, points, up, azimuths, step_m, end_m, tan)
         sin_a, cos_a, z, s = np.sin(azimuths[k]), np.cos(azimuths[k]), up[k], 0.0
         while s < end_m:
             s += step_m
-            z = _surface(grid, posts, heights, moon, points[k, 0] + s * sin_a, points[k, 1] + s * cos_a, z)
+            z = surface(grid, posts, heights, moon, points[k, 0] + s * sin_a, points[k, 1] + s * cos_a, z)
             tan[k] = max(tan[k], (z - up[k]) / s)
 
 

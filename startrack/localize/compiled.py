@@ -30,11 +30,11 @@ def climbed(
     start_m: Array, evidence: Evidence, cylinder: Cylinder, first_step_m: float, last_step_m: float
 ) -> tuple[Array, float]:
     """The best place (1, 2) near the start (1, 2) by a plain sum of the llr, and that sum. Needs numba."""
-    from startrack.localize import disks
+    from startrack.localize.disks_guess import climb
 
     evidence = taken(evidence, evidence.elevation_rad > 0)
     sector, ceiling = np.zeros(len(evidence), dtype=np.int64), np.zeros(1)
-    place, best = disks.climb(
+    place, best = climb(
         start_m[0], first_step_m, -on_rim_plane(evidence, cylinder), evidence.llr, sector, ceiling, -np.inf,
         cylinder.radius_m, 0.5 * last_step_m, CLIMB_RANGE_M,
     )  # fmt: skip
@@ -43,7 +43,7 @@ def climbed(
 
 def explored(method: ExactPosterior, evidence: Evidence, cylinder: Cylinder) -> tuple[Array, float, Array, float]:
     """Centres (n, 2), half side, log-likelihoods (n,) and log of the mass dropped. Needs numba."""
-    from startrack.localize import disks
+    from startrack.localize import disks, disks_guess
 
     evidence = taken(evidence, evidence.elevation_rad > 0)  # below the horizontal nothing is ever visible over the rim
     centres, llr = -on_rim_plane(evidence, cylinder), evidence.llr
@@ -53,9 +53,9 @@ def explored(method: ExactPosterior, evidence: Evidence, cylinder: Cylinder) -> 
     else:  # without a floor the sectors do not matter
         sector, ceiling, log_floor = np.zeros(len(llr), dtype=np.int64), np.zeros(1), -np.inf
     radius, reach = cylinder.radius_m, cylinder.reach_m
-    few = disks.most_telling(centres, llr, radius, SCOUT_RAYS)
-    guess = disks.scout(centres[few], llr[few], radius, reach, SCOUT_ACROSS, SCOUT_KEPT, FINEST_GUESS_M)
-    _, best = disks.climb(
+    few = disks_guess.most_telling(centres, llr, radius, SCOUT_RAYS)
+    guess = disks_guess.scout(centres[few], llr[few], radius, reach, SCOUT_ACROSS, SCOUT_KEPT, FINEST_GUESS_M)
+    _, best = disks_guess.climb(
         guess, FIRST_STEP_M, centres, llr, sector, ceiling, log_floor, radius, LAST_STEP_M, CLIMB_RANGE_M
     )
     return disks.explore(

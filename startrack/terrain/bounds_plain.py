@@ -1,4 +1,4 @@
-"""Bounds of the horizon over boxes with numpy alone: as `trace_compiled.bounds`, cell by cell for many rays at once."""
+"""Bounds of the horizon over boxes with numpy alone: as `bounds_compiled.py`, cell by cell for many rays at once."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def bounds(
     g: Ground, centres: Array, up: Array, low_up: Array, high_up: Array, half: Array, sin_a: Array, cos_a: Array,
     turn: Array, start: Array, end: Array,
 ) -> Array:  # fmt: skip
-    """What `trace_compiled.bounds` finds (n, 11), for each box and azimuth."""
+    """What `bounds_compiled.bounds` finds (n, 11), for each box and azimuth."""
     out = np.empty((len(up), 11))
     for first in range(0, len(up), AT_ONCE):
         part = slice(first, first + AT_ONCE)

@@ -6,8 +6,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from startrack.terrain.bounds_compiled import bounds, leaning, standing
 from startrack.terrain.table import ANGLE_STEP_RAD, BINS, DISTANCE_STEP_M, FARTHEST, NOT_KNOWN_M, RISE_STEP
-from startrack.terrain.trace_compiled import FAR_M, bounds, horizon, leaning, standing, surfaces
+from startrack.terrain.trace_compiled import FAR_M, horizon, surfaces
 
 BIN_RAD = 2 * np.pi / BINS
 EDGE = 1e-9  # of a cell or a bin: what only touches it does not count
@@ -168,3 +169,17 @@ def many_sector_bounds(
             values, lows, highs, across, reach, centres[k], half[k], lowest, highest, azimuths[k], turn[k], out
         )
         low[k], high[k] = out[0], out[1]
+
+
+@njit(cache=True, nogil=True)
+def fill_cells(ground, centres, half, camera_height, sin_a, cos_a, turn, found):
+    """Fill found (cells, azimuths, 11) with `bounds` of each cell and azimuth."""
+    for k in range(len(centres)):
+        middle, low, high = standing(ground, centres[k, 0], centres[k, 1], half)
+        guess = 0.0
+        for j in range(len(sin_a)):
+            bounds(
+                ground, centres[k, 0], centres[k, 1], middle + camera_height, low + camera_height,
+                high + camera_height, 0.0, 0.0, half, sin_a[j], cos_a[j], turn, 0.0, FAR_M, guess, found[k, j],
+            )  # fmt: skip
+            guess = found[k, j, 4]

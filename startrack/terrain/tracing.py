@@ -73,11 +73,11 @@ class CompiledTracer:
         return tan, at, edge
 
     def fill_cells(self, terrain: HeightTerrain, centres: Array, half: float, azimuths: Array, turn: float) -> Array:
-        """(cells, azimuths, 11), see `trace_compiled.bounds`."""
-        from startrack.terrain import trace_compiled
+        """(cells, azimuths, 11), see `bounds_compiled.bounds`."""
+        from startrack.terrain import table_compiled
 
         found = np.empty((len(centres), len(azimuths), FIELDS))
-        trace_compiled.fill_cells(
+        table_compiled.fill_cells(
             terrain.ground, centres, half, terrain.camera_height_m, np.sin(azimuths), np.cos(azimuths), turn, found
         )
         return found
@@ -141,7 +141,7 @@ class PlainTracer:
         return horizon(terrain.ground, points, up, np.sin(azimuths), np.cos(azimuths), start, end, hint)
 
     def fill_cells(self, terrain: HeightTerrain, centres: Array, half: float, azimuths: Array, turn: float) -> Array:
-        """(cells, azimuths, 11), see `trace_compiled.bounds`."""
+        """(cells, azimuths, 11), see `bounds_compiled.bounds`."""
         n, bins = len(centres), len(azimuths)
         found = self._bounds(
             terrain, np.repeat(centres, bins, axis=0), np.full(n * bins, half), np.tile(azimuths, n),

@@ -80,5 +80,5 @@ def test_a_place_that_explains_the_stars_badly_is_refused() -> None:
     assert explained_by_sector(evidence, fix, TRUE).mean() > -1.0
     aside = replace(fix, position_enu_m=fix.position_enu_m + np.array([1500.0, 0.0, 0.0]))
     assert explained_by_sector(evidence, aside, TRUE).mean() < LEAST_EXPLAINED_NATS
-    with pytest.raises(NotLocated, match="explains the stars badly.*most at azimuths"):
+    with pytest.raises(NotLocated, match=r"explains the stars badly.*most at azimuths"):
         check_consistency(evidence, aside, TRUE)

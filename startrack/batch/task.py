@@ -45,8 +45,9 @@ def locate_image(task: Task) -> tuple[dict[str, Any], bool]:
     """
     try:
         sha256 = sha256_of(task.path)
-        before = None if task.renew else _standing(task, sha256)
-        return (before, True) if before is not None else (_fresh(task, sha256), False)
+        key = _key(task, sha256)
+        before = None if task.renew else _standing(task, key)
+        return (before, True) if before is not None else (_fresh(task, sha256, key), False)
     except Exception as cause:  # noqa: BLE001 - one image's fault is its own; it is counted and told as such
         if isinstance(cause, BadInput):  # a refusal is a record: this is of the results, which cannot be written
             _stop_where_the_disk_is_full(cause)
@@ -60,7 +61,7 @@ def still_stored(task: Task) -> dict[str, Any] | None:
     if record is None:
         return None
     known = image_sha256(record) if untouched_since(task.path, task.result) else None
-    return _standing(task, known or sha256_of(task.path))
+    return _standing(task, _key(task, known or sha256_of(task.path)))
 
 
 def lost(task: Task, message: str, reason: str = INTERNAL_ERROR) -> dict[str, Any]:
@@ -76,10 +77,10 @@ def lost(task: Task, message: str, reason: str = INTERNAL_ERROR) -> dict[str, An
     return record
 
 
-def _standing(task: Task, sha256: str) -> dict[str, Any] | None:
+def _standing(task: Task, key: str) -> dict[str, Any] | None:
     """The stored record where it is made from all that the image's result is made from now, and is whole."""
     record = stored(task.result)
-    if record is None or record.get(JOB) != _key(task, sha256) or not unchanged(task.path, record.get(INPUTS, {})):
+    if record is None or record.get(JOB) != key or not unchanged(task.path, record.get(INPUTS, {})):
         return None
     return record if has_companions(record, Path(task.result), plots=task.plots) else None
 
@@ -88,14 +89,14 @@ def _key(task: Task, sha256: str) -> str:
     return key_of(task.path, sha256, task.facts, task.plots, task.compiled)
 
 
-def _fresh(task: Task, sha256: str) -> dict[str, Any]:
+def _fresh(task: Task, sha256: str, key: str) -> dict[str, Any]:
     """The record made anew, and written unless it only says that an input is at fault where a solution stands already.
 
     The old files go first, when all is worked out, so that no half of a result is ever taken for a whole.
     """
     from startrack.report import result_dict, write_json, write_results
 
-    key, result = _key(task, sha256), Path(task.result)
+    result = Path(task.result)
     found, inputs = _located(task, sha256)
     reason = found["reason"] if isinstance(found, dict) else found.reason
     former_stays = reason in BAD_INPUT_REASONS and is_solved(stored(result))

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.batch_show import Halt, left_aside, progress, signals_halt, summary
-from startrack.cli.common import DEFAULT_OUT, add_fact_flags, cores, flag_facts, made_folder
+from startrack.cli.common import DEFAULT_OUT, add_fact_flags, cores, flag_facts
 from startrack.cli.flag_types import at_least_one
 from startrack.cli.horizons import ready_for
 from startrack.errors import INTERNAL_ERROR, BadInput
-from startrack.paths import is_path
+from startrack.paths import is_path, made_folder
 
 if TYPE_CHECKING:
     from startrack.batch import Batch, Counts, Image, Task

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import DEFAULT_OUT, exit_code_of_reason, read
 from startrack.cli.flag_types import amount, field_of_view_rad, number, positive
-from startrack.errors import BadInput, NoSolution
+from startrack.errors import NoSolution
+from startrack.paths import made_folder
 
 if TYPE_CHECKING:
     from startrack.calibrate import Calibration
@@ -150,10 +151,7 @@ def tell_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) ->
 def output_path(args: argparse.Namespace, default: str) -> Path:
     """Where the result goes, its folder made. Raises BadInput where that is impossible."""
     path = Path(args.output) if args.output else Path(args.dir) / default
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as cause:
-        raise BadInput("bad_image", f"{path}: results cannot be written there: {cause.strerror}") from cause
+    made_folder(path.parent)
     return path
 
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 from startrack.cli.flag_types import positive
 from startrack.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
-from startrack.paths import made_folder as made_folder
 
 if TYPE_CHECKING:
     from startrack.camera import Camera

@@ -12,9 +12,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.common import DEFAULT_OUT, cores, made_folder
+from startrack.cli.common import DEFAULT_OUT, cores
 from startrack.cli.flag_types import at_least_one
 from startrack.errors import BadInput
+from startrack.paths import made_folder
 
 if TYPE_CHECKING:
     from startrack.reproduce import Piece, Runs

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -157,13 +157,9 @@ def _unknown_keys(sidecar: Path, values: Mapping[str, Any]) -> list[str]:
     """A warning for each key that stands for nothing: a misspelt one would else be missed in silence."""
     unknown = [key for key in values if key not in SIDECAR_KEYS]
     return [
-        f"sidecar {shown(sidecar.name)}: key {key[:40]!r} is none of {_listed(SIDECAR_KEYS)}; not used"
+        f"sidecar {shown(sidecar.name)}: key {key[:40]!r} is none of {', '.join(SIDECAR_KEYS)}; not used"
         for key in unknown[:MOST_UNKNOWN_KEYS]
     ]
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(names)
 
 
 def _bad_sidecar(sidecar: Path, cause: str, reason: str = "bad_image") -> BadInput:
@@ -208,7 +204,7 @@ def _sidecar_pattern(sidecar: Path, value: object) -> str | None:
     if value is None:
         return None
     if not _is_pattern(value):
-        raise _bad_sidecar(sidecar, f"bayer_pattern is {str(value)[:40]!r}, none of {_listed(BAYER_PATTERNS)}")
+        raise _bad_sidecar(sidecar, f"bayer_pattern is {str(value)[:40]!r}, none of {', '.join(BAYER_PATTERNS)}")
     return str(value).strip().upper()
 
 
@@ -216,7 +212,7 @@ def _header_pattern(header: Mapping[str, Any], notes: list[str]) -> str | None:
     value = str(header.get("BAYERPAT") or "").strip().upper()
     if not value or _is_pattern(value):
         return value or None
-    notes.append(f"BAYERPAT {value[:40]!r} is none of {_listed(BAYER_PATTERNS)}; not used")
+    notes.append(f"BAYERPAT {value[:40]!r} is none of {', '.join(BAYER_PATTERNS)}; not used")
     return None
 
 

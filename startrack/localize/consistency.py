@@ -123,10 +123,9 @@ def contradicted_stretches(by_sector: Array) -> list[tuple[int, int]]:
     wrong |= np.roll(wrong, 1) & np.roll(wrong, -1)
     if wrong.all():
         return [(0, len(wrong))]
-    starts = np.flatnonzero(wrong & ~np.roll(wrong, 1))
-    after = np.flatnonzero(~wrong & np.roll(wrong, 1))  # one past the ends
-    ends = after[np.searchsorted(after, starts) % max(len(after), 1)] if len(starts) else after
-    return [(int(start), int((end - start) % len(wrong))) for start, end in zip(starts, ends, strict=True)]
+    good = int(np.argmin(wrong))  # begun there, no run is cut in two
+    changes = np.flatnonzero(np.diff(np.roll(wrong, -good), append=False)) + 1
+    return [(int(start + good) % len(wrong), int(end - start)) for start, end in changes.reshape(-1, 2)]
 
 
 def _at_azimuths(stretches: list[tuple[int, int]]) -> str:

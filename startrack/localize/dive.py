@@ -12,8 +12,7 @@ from startrack.localize.vicinity import Vicinity
 from startrack.terrain import Terrain
 from startrack.types import Array, Ints
 
-WIDTHS = (32, 128, 512)  # boxes kept at each level, more where fewer do not lead to a good place
-SCORED = (16, 64, 96)  # of the last ones, ray by ray
+DIVES = ((32, 16), (128, 64), (512, 96))  # boxes kept at each level, and scored ray by ray; more where fewer fail
 GOOD_NATS = -0.6  # mean over the sectors; -0.5 is usual at the best place
 SMALL_M = 20.0  # half side of the last boxes
 TRIED, APART_M = 3, 60.0  # places from which the top is climbed, and how far they are apart
@@ -30,7 +29,7 @@ def best_by_diving(sectors: Sectors, profile: Profile, terrain: Terrain) -> tupl
     """
     blurred = Blurred.of(sectors, profile)
     place, best = np.zeros(2), -np.inf
-    for width, scored in zip(WIDTHS, SCORED, strict=True):
+    for width, scored in DIVES:
         centres, half = _promising(blurred, terrain, width)
         found, score = _climbed(centres[:scored], half, sectors, profile, terrain)
         if score > best:

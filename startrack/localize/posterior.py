@@ -103,11 +103,12 @@ class _Search:
         self, method: ExactPosterior, evidence: Evidence, terrain: Terrain, place_m: Array | None = None
     ) -> None:
         self.method, self.terrain, self.ground = method, terrain, terrain
-        self.finest_m = method.finest_m if isinstance(terrain, Cylinder) else max(method.finest_m, FINEST_ON_GROUND_M)
+        self.on_heights = not isinstance(terrain, Cylinder)
+        self.finest_m = max(method.finest_m, FINEST_ON_GROUND_M) if self.on_heights else method.finest_m
         self.place_m = np.zeros(2)  # a good one to begin with
         self.sectors = Sectors.of(evidence, method.sector_width_rad, method.sector_epsilon)
         self.profile = Profile.of(self.sectors)
-        if isinstance(terrain, Cylinder):
+        if not self.on_heights:
             self.best = float(likely_places(evidence, self.sectors, terrain)[1].max(initial=-np.inf))
         elif place_m is not None and np.all(terrain.allowed(place_m)):
             self.place_m = place_m
@@ -119,7 +120,7 @@ class _Search:
     def exclude(self) -> RayBoxes:
         """From the whole area down to small boxes. Raises NotLocated where too much stays open."""
         known_bad = -np.inf < self.best < CONTRADICTED_NATS * self.sectors.count
-        if known_bad and not isinstance(self.terrain, Cylinder):
+        if known_bad and self.on_heights:
             raise self._lost(np.pi * self.terrain.reach_m**2)  # nothing could be excluded, at great length
         centres, half, of = np.zeros((1, 2)), float(self.terrain.reach_m), np.zeros(1, dtype=np.int64)
         known: tuple[Ints, Ints] | None = None  # open rays of the boxes that the centres are quarters of
@@ -137,7 +138,7 @@ class _Search:
             (centres, of), half = boxes.quarters(self.terrain), half / 2
             if known is not None:
                 known = first, last
-            elif half < NARROW_M and NARROW_FROM < len(centres) <= NARROW_TO and not isinstance(self.terrain, Cylinder):
+            elif half < NARROW_M and NARROW_FROM < len(centres) <= NARROW_TO and self.on_heights:
                 # From here on a ray's number is one of the new profile.
                 whole, self.profile = self.profile, Profile.of(self.sectors, NARROW_PARTS)
                 known = self.profile.handed_down(whole, first, last)
@@ -211,7 +212,7 @@ class _Search:
 
     def _asked_in_turns(self, boxes: RayBoxes) -> RayBoxes:
         """The boxes bounded ray by ray: the loudest first, since few suffice to exclude most boxes."""
-        if isinstance(self.terrain, Cylinder):
+        if not self.on_heights:
             return tightened(boxes, None, self.sectors, self.profile, self.ground)
         if self.ground is self.terrain and boxes.half_m > RAY_BY_RAY_M / 2:
             boxes = tightened(boxes, None, self.sectors, self.profile, self.terrain, LOOKED_UP_RAD)
@@ -228,7 +229,7 @@ class _Search:
 
         And again between closer ones where many azimuths are too rough for that.
         """
-        if isinstance(self.terrain, Cylinder) or not len(boxes.ray) or boxes.half_m > FIRST_NODES_M:
+        if not self.on_heights or not len(boxes.ray) or boxes.half_m > FIRST_NODES_M:
             return
         step = max(2 * boxes.half_m, CLOSEST_NODES_M)
         traced = 1.0
@@ -265,7 +266,7 @@ class _Search:
         if boxes.half_m <= self.finest_m or 4 * len(boxes) > self.method.most_boxes or not len(boxes.ray):
             return 0.0
         smaller = smallest_axis(boxes.centres_m, 2 * boxes.half_m, log_weight)
-        many = self.method.boxes_per_sigma * (1.0 if isinstance(self.terrain, Cylinder) else SMOOTH)
+        many = self.method.boxes_per_sigma * (SMOOTH if self.on_heights else 1.0)
         return 2 * boxes.half_m * many / max(smaller, 1e-9)
 
 

@@ -68,17 +68,22 @@ def smallest_axis(centres_m: Array, width_m: float, log_weight: Array) -> float:
     centres_m, weight = centres_m[weight > NEGLIGIBLE_BOX], weight[weight > NEGLIGIBLE_BOX]
     label = _modes(centres_m, weight, width_m, _moments(centres_m, weight, width_m)[1])
     counts = np.flatnonzero(np.bincount(label, weights=weight) > AMBIGUOUS_MASS)
-    own = width_m**2 / 12  # of a box
-    variances = [_moments(centres_m[label == i], weight[label == i], width_m)[1] - own * np.eye(2) for i in counts]
-    return float(np.sqrt(max(min(np.linalg.eigvalsh(one)[0] for one in variances), 0.0)))
+    spreads = [_mean_and_spread(centres_m[label == i], weight[label == i])[1] for i in counts]
+    return float(np.sqrt(max(min(np.linalg.eigvalsh(spread)[0] for spread in spreads), 0.0)))
 
 
 def _moments(centres_m: Array, weight: Array, width_m: float) -> tuple[Array, Array]:
     """Mean and covariance; a box's own extent (width^2 / 12) is part of the covariance."""
+    mean, spread = _mean_and_spread(centres_m, weight)
+    return mean, spread + width_m**2 / 12 * np.eye(2)
+
+
+def _mean_and_spread(centres_m: Array, weight: Array) -> tuple[Array, Array]:
+    """Mean and covariance of the boxes' centres."""
     weight = weight / weight.sum()
     mean = weight @ centres_m
     centred = centres_m - mean
-    return mean, (centred * weight[:, None]).T @ centred + width_m**2 / 12 * np.eye(2)
+    return mean, (centred * weight[:, None]).T @ centred
 
 
 def _radii(offsets_m: Array, weight: Array, masses: tuple[float, ...], width_m: float) -> tuple[float, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from html import escape
 from typing import TYPE_CHECKING
@@ -22,12 +23,12 @@ if TYPE_CHECKING:
 Rows = list[tuple[str, str]]
 
 
-class Shown:
+class Shown(ABC):
     """Prints itself as rows of a name and a text."""
 
+    @abstractmethod
     def rows(self) -> Rows:
         """What is printed, a line each."""
-        raise NotImplementedError
 
     def __repr__(self) -> str:
         width = max(len(name) for name, _ in self.rows())

@@ -11,7 +11,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from startrack.frames import enu_from_latlon
-from startrack.terrain.dem import HeightTerrain
+from startrack.terrain.height_map import HeightMap
 
 LOWEST, HIGHEST = np.radians(-15.0), np.radians(60.0)
 HALVINGS = 22  # to 2e-5 degrees
@@ -21,7 +21,7 @@ NEAR_M, NEAR_SIDE_M, FAR_SIDE_M = 900.0, 7.5, 48.0  # sides of the triangles
 class EmbreeHorizons:
     """Elevations of the horizon seen from a place on the ground."""
 
-    def __init__(self, terrain: HeightTerrain, place_m: np.ndarray) -> None:
+    def __init__(self, terrain: HeightMap, place_m: np.ndarray) -> None:
         up = float(terrain.ground_m(place_m)) + terrain.camera_height_m
         self.eye = np.array([*place_m, up])
         finest = terrain.maps[0]
@@ -48,14 +48,14 @@ class EmbreeHorizons:
         return (low + high) / 2
 
 
-def vertices(terrain: HeightTerrain, row_column: np.ndarray) -> np.ndarray:
+def vertices(terrain: HeightMap, row_column: np.ndarray) -> np.ndarray:
     """Points (..., 3) in enu [m] of the finest map's surface at fractional rows and columns."""
     finest = terrain.maps[0]
     latitude, longitude = finest.projection.latlon_from_xy(*finest.xy(row_column))
     return np.asarray(enu_from_latlon(terrain.site, latitude, longitude, finest.sampled(row_column)))
 
 
-def mesh(terrain: HeightTerrain, cells: np.ndarray, cut: int, eye_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def mesh(terrain: HeightMap, cells: np.ndarray, cut: int, eye_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (n, 3) reckoned from the eye [m], float32, and triangles (m, 3) of cells (k, 2)."""
     line = np.arange(cut + 1) / cut
     inside = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)

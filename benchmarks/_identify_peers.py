@@ -20,7 +20,7 @@ from _star_lists import StarList
 from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera
-from startrack.identify import Identifier
+from startrack.identification import Identifier
 from startrack.types import NotIdentified, Stars
 
 

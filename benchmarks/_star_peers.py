@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from startrack.camera import Camera, Sensor
-from startrack.detect import Detector
+from startrack.detection import Detector
 from startrack.types import Exposure, TooFewStars
 
 Finder = Callable[[np.ndarray, float], np.ndarray]

@@ -97,7 +97,7 @@ def render_one(path: Path, number: int) -> None:
     from startrack.camera import load_camera, save_camera
     from startrack.catalog import load_catalog
     from startrack.exposure import write_exposure, write_sidecar
-    from startrack.render import Series, render
+    from startrack.rendering import Series, render
     from startrack.terrain import load_terrain
 
     scale, middle = SIDE_PX / 2048, (SIDE_PX - 1) / 2

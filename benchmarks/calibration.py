@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 from _results import table, write_section
 
-from startrack.calibrate import calibrate, first_state, fit_lens, observations
-from startrack.calibrate.solve import project_freely
+from startrack.calibration import calibrate, first_state, fit_lens, observations
+from startrack.calibration.solve import project_freely
 from startrack.camera import Camera, KannalaBrandt
 from startrack.camera.uncertainty import cap_grid, lens_jacobian, without_turn
 from startrack.catalog import load_catalog

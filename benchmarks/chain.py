@@ -26,9 +26,9 @@ from startrack.camera import Sensor, load_camera
 from startrack.catalog import load_catalog
 from startrack.exposure import read_exposure
 from startrack.frames import R_from_quat_xyzw
-from startrack.localize import Hull, PseudoGradient
+from startrack.localization import Hull, PseudoGradient
 from startrack.pipeline import Result, locate
-from startrack.render import Series, render
+from startrack.rendering import Series, render
 from startrack.terrain import load_terrain
 from startrack.types import Evidence, NoSolution
 

@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 from _results import table, write_section
 
-from startrack.bodies import bodies
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
+from startrack.catalog.bodies import bodies
 from startrack.frames import R_enu_icrs, Site
 from startrack.pipeline import locate
-from startrack.render import Series, render
+from startrack.rendering import Series, render
 from startrack.terrain import load_terrain
-from startrack.terrain.dem import HeightTerrain
+from startrack.terrain.height_map import HeightMap
 
 FLOOR_DEG, WALL_DEG = (0.0, 15.0), (15.0, 40.0)
 HIGHEST_SUN = {True: np.sin(np.radians(0.5)), False: np.sin(np.radians(-3.0))}  # in polar craters, elsewhere
@@ -43,7 +43,7 @@ def main() -> None:
     lines: list[list[str]] = []
     for name in args.terrain:
         terrain = load_terrain(name)
-        assert isinstance(terrain, HeightTerrain)
+        assert isinstance(terrain, HeightMap)
         terrain.prepared()
         rng = np.random.default_rng(args.seed)
         places = [*drawn(terrain, args.floor, FLOOR_DEG, rng), *drawn(terrain, args.wall, WALL_DEG, rng)]
@@ -57,7 +57,7 @@ def main() -> None:
 
 
 def drawn(
-    terrain: HeightTerrain, count: int, slopes_deg: tuple[float, float], rng: np.random.Generator
+    terrain: HeightMap, count: int, slopes_deg: tuple[float, float], rng: np.random.Generator
 ) -> list[tuple[np.ndarray, float]]:
     """Places (2,) in the search area with slopes in a range, and the slopes in degrees."""
     found: list[tuple[np.ndarray, float]] = []
@@ -79,7 +79,7 @@ def night(site: Site, rng: np.random.Generator) -> datetime:
             return when
 
 
-def one(terrain: HeightTerrain, place: np.ndarray, slope: float, when: datetime, number: int, seed: int) -> list[str]:
+def one(terrain: HeightMap, place: np.ndarray, slope: float, when: datetime, number: int, seed: int) -> list[str]:
     """Render, locate, and say what came of it."""
     camera, catalog = load_camera("fisheye-2048"), load_catalog()
     series = Series(

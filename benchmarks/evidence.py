@@ -22,12 +22,12 @@ from chain import SENSOR
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.deep_catalog import load_deep_catalog
-from startrack.detect import electrons
+from startrack.catalog.gaia import load_deep_catalog
+from startrack.detection import electrons
 from startrack.evidence import StarEvidence, StarLight, flux_scale
-from startrack.localize import ExactPosterior
+from startrack.localization import ExactPosterior
 from startrack.pipeline import Result, Settings, locate
-from startrack.render import Series, exposure_reaching, render
+from startrack.rendering import Series, exposure_reaching, render
 from startrack.terrain import load_terrain
 from startrack.types import Array, Evidence, Fix, NoSolution
 

@@ -20,9 +20,9 @@ from _results import table, write_section
 from numba import njit
 
 from startrack.terrain import load_terrain
-from startrack.terrain.dem import HeightTerrain
-from startrack.terrain.ground import ground_up_m
-from startrack.terrain.trace_compiled import surface
+from startrack.terrain.height_map import HeightMap
+from startrack.terrain.horizon_kernel import surface
+from startrack.terrain.pyramid import ground_up_m
 
 CROPS_M = {"shackleton": 16_000.0, "haworth": 22_000.0, "kepler": 17_000.0}
 AZIMUTHS_RAD = np.radians(np.arange(0.25, 360, 0.5))
@@ -52,15 +52,15 @@ def main() -> None:
     )
 
 
-def cropped(name: str, half_m: float) -> HeightTerrain:
+def cropped(name: str, half_m: float) -> HeightMap:
     """The terrain with its finest map alone, as far as that matters."""
     whole = load_terrain(name)
-    assert isinstance(whole, HeightTerrain)
+    assert isinstance(whole, HeightMap)
     crop = whole.maps[0].around(whole.site.latitude_rad, whole.site.longitude_rad, half_m)
     return replace(whole, maps=(crop,), _state={})
 
 
-def compared(name: str, terrain: HeightTerrain, places: np.ndarray) -> list[list[str]]:
+def compared(name: str, terrain: HeightMap, places: np.ndarray) -> list[list[str]]:
     """One row per method."""
     plain = replace(terrain, use_compiled=False, _state={})
     step_m = terrain.maps[0].post_m / 8
@@ -103,7 +103,7 @@ def _march(grid, posts, heights, moon, points, up, azimuths, step_m, end_m, tan)
             tan[k] = max(tan[k], (z - up[k]) / s)
 
 
-def marched(terrain: HeightTerrain, place: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
+def marched(terrain: HeightMap, place: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
     """Small steps, compiled; the surface is startrack's own."""
     ground, tan = terrain.ground, np.full(len(azimuths), -50.0)
     places = np.repeat(place[None], len(azimuths), axis=0)
@@ -112,7 +112,7 @@ def marched(terrain: HeightTerrain, place: np.ndarray, azimuths: np.ndarray, ste
     return np.arctan(tan)
 
 
-def marched_plain(terrain: HeightTerrain, place: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
+def marched_plain(terrain: HeightMap, place: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
     """Small steps, a ray at a time, with numpy alone."""
     s, maps = np.arange(step_m, CROPS_M[terrain.name], step_m), list(terrain.maps)
     up = ground_up_m(terrain.site, maps, place) + terrain.camera_height_m

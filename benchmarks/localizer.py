@@ -16,8 +16,8 @@ from collections.abc import Callable
 import numpy as np
 from _results import table, write_section
 
-from startrack.localize import ExactPosterior, PseudoGradient
-from startrack.reproduce.simulator import ASPECT_RATIO, MAGNITUDE, PERFECT, Sky, crater, places, visible
+from startrack.localization import ExactPosterior, PseudoGradient
+from startrack.reproduction.simulator import ASPECT_RATIO, MAGNITUDE, PERFECT, Sky, crater, places, visible
 from startrack.types import Evidence, Fix
 
 ROUNDS = 9

@@ -22,10 +22,10 @@ from chain import SENSOR
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.evidence import StarEvidence
-from startrack.localize import ExactPosterior
+from startrack.localization import ExactPosterior
 from startrack.orient import rotation
 from startrack.pipeline import Settings, locate
-from startrack.render import Series, render
+from startrack.rendering import Series, render
 from startrack.terrain import Cylinder, load_terrain
 from startrack.types import Array
 

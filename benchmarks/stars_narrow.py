@@ -27,9 +27,9 @@ from _star_frames import BACKGROUND_E, READ_NOISE_E, profiles  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 from startrack.catalog import load_catalog  # noqa: E402
-from startrack.detect import Detector  # noqa: E402
+from startrack.detection import Detector  # noqa: E402
 from startrack.exposure import read_exposure  # noqa: E402
-from startrack.identify.blind import identify_blind  # noqa: E402
+from startrack.identification.unknown_lens import identify_blind  # noqa: E402
 from startrack.types import Exposure, NoSolution, Stars  # noqa: E402
 
 FIELDS_DEG = {  # across the width

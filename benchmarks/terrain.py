@@ -21,12 +21,12 @@ from chain import SENSOR
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.localize import ExactPosterior, check_consistency
-from startrack.localize.common import raised
+from startrack.localization import ExactPosterior, check_consistency
+from startrack.localization.horizon_bias import raised
 from startrack.pipeline import locate
-from startrack.render import Series, render
+from startrack.rendering import Series, render
 from startrack.terrain import load_terrain
-from startrack.terrain.dem import HeightTerrain
+from startrack.terrain.height_map import HeightMap
 from startrack.types import Evidence, Fix, NoSolution
 
 NOISE_M, BIAS_RAD, SLOPE_RAD = 5.0, np.radians(0.08), np.radians(15.0)
@@ -61,19 +61,19 @@ def main() -> None:
     )  # fmt: skip
 
 
-def fresh(terrain: Any, **changes: Any) -> HeightTerrain:
+def fresh(terrain: Any, **changes: Any) -> HeightMap:
     """The terrain with other settings, its horizons not taken over."""
     made = replace(terrain, **changes, _state={})
     made.prepared()
     return made
 
 
-def replace_sigma(terrain: HeightTerrain, height_sigma_m: float, common_rad: float) -> HeightTerrain:
+def replace_sigma(terrain: HeightMap, height_sigma_m: float, common_rad: float) -> HeightMap:
     """The same map, said to be so good."""
     return fresh(terrain, height_sigma_m=height_sigma_m, horizon_sigma_common_rad=common_rad)
 
 
-def degraded(terrain: HeightTerrain, seed: int) -> HeightTerrain:
+def degraded(terrain: HeightMap, seed: int) -> HeightMap:
     """A map with errors at every post, that says so."""
     rng = np.random.default_rng(seed)
     maps = [
@@ -86,7 +86,7 @@ def degraded(terrain: HeightTerrain, seed: int) -> HeightTerrain:
     )  # fmt: skip
 
 
-def kept(folder: Path | None, terrain: HeightTerrain, seed: int, number: int) -> tuple[Evidence, np.ndarray]:
+def kept(folder: Path | None, terrain: HeightMap, seed: int, number: int) -> tuple[Evidence, np.ndarray]:
     """`observed`, from a file where there is one."""
     if folder is None:
         return observed(terrain, seed, number)
@@ -98,7 +98,7 @@ def kept(folder: Path | None, terrain: HeightTerrain, seed: int, number: int) ->
     return found
 
 
-def observed(terrain: HeightTerrain, seed: int, number: int) -> tuple[Evidence, np.ndarray]:
+def observed(terrain: HeightMap, seed: int, number: int) -> tuple[Evidence, np.ndarray]:
     """Evidence of one random frame, through the whole chain, and the true place."""
     camera, catalog = replace(load_camera("fisheye-2048"), sensor=SENSOR), load_catalog()
     series = Series(
@@ -111,7 +111,7 @@ def observed(terrain: HeightTerrain, seed: int, number: int) -> tuple[Evidence, 
     return result.light.evidence(), np.asarray(truth.position_enu_m)
 
 
-def scored(evidence: Evidence, terrain: HeightTerrain, place: np.ndarray) -> dict[str, Any]:
+def scored(evidence: Evidence, terrain: HeightMap, place: np.ndarray) -> dict[str, Any]:
     """Error, what the fix says of it, and how long it took."""
     start, cpu = time.perf_counter(), time.process_time()
     try:

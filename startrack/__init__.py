@@ -4,8 +4,8 @@
     print(startrack.locate("image.png"))
 
 `locate` takes a path or an array and returns a `Solution`. Stars and attitude alone, or centroids alone, are
-`startrack.api.identify` and `startrack.api.detect`: `startrack.identify` and `startrack.detect` are two of the rooms
-(with `startrack.pipeline`, `startrack.localize`, ...) for those who want the stages one by one.
+`startrack.api.identify` and `startrack.api.detect`; `startrack.identification`, `startrack.detection` are two packages
+(with `startrack.pipeline`, `startrack.localization`, ...) for those who want the stages one by one.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -8,7 +8,7 @@ from startrack import pipeline
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
 from startrack.errors import BAD_INPUT_REASONS, BadInput
-from startrack.given import Picture, When, angle_rad, given_camera, given_exposure, given_settings, given_terrain
+from startrack.inputs import Picture, When, angle_rad, given_camera, given_exposure, given_settings, given_terrain
 from startrack.solution import Solution
 from startrack.terrain import Terrain
 

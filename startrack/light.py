@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from startrack.detect import electrons
+from startrack.detection import electrons
 from startrack.evidence import Skyline, StarLight, flux_scale, known_well, levelled, near_skyline
 from startrack.frames import Site, observer_velocity_m_s
 from startrack.psf import noise_area_px
 from startrack.result import Result, Settings
-from startrack.terrain.silence import why_silent
+from startrack.terrain.masks import why_silent
 from startrack.types import Array, Detections, Fix, Ints
 
 RELIT_PX, NEIGHBOURS_PX = 12.0, 10.0  # stars this near the skyline are measured again, beside their neighbours
@@ -21,7 +21,7 @@ COMPLETE_V_MAG = 6.5  # 5 sigma: from here on stars that Hipparcos lacks would s
 
 def deepen(result: Result, site: Site) -> None:
     """Put the deeper list in the catalogue's place if it is installed and the frame is deep enough to need it."""
-    from startrack.deep_catalog import deep_installed, hipparcos_in_deep, load_deep_catalog
+    from startrack.catalog.gaia import deep_installed, hipparcos_in_deep, load_deep_catalog
 
     found, when = result.identification, result.exposure.time_utc
     assert result.camera is not None and result.detections is not None and result.stars is not None

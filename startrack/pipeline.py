@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from startrack.bodies import bodies
 from startrack.camera import Camera
+from startrack.catalog.bodies import bodies
 from startrack.exposure import are_fractions
 from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
 from startrack.light import deepen, first_look, second_look
-from startrack.localize import check_consistency
+from startrack.localization import check_consistency
 from startrack.orient import solve_attitude
 from startrack.result import Result, Settings
 from startrack.terrain import Terrain
@@ -102,7 +102,7 @@ def identify_blind(
     Below 100 degrees that is the angle across the image's width, from there up that of the whole image circle. The lens
     found is the result's camera ("unknown").
     """
-    from startrack.identify.blind import identify_blind as solve
+    from startrack.identification.unknown_lens import identify_blind as solve
 
     settings = settings or Settings()
     result = Result(exposure=exposure, catalog_name=catalog.name)

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.detect import Detector
+from startrack.detection import Detector
 from startrack.evidence import StarEvidence, StarLight
-from startrack.identify import Identifier
-from startrack.localize import ExactPosterior, Localizer
+from startrack.identification import Identifier
+from startrack.localization import ExactPosterior, Localizer
 from startrack.orient import AttitudeFit
 from startrack.terrain import Terrain
-from startrack.terrain.silence import silent_sectors
+from startrack.terrain.masks import silent_sectors
 from startrack.types import Array, Attitude, Body, Detections, Exposure, Fix, Identification, Stars
 
 UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 
 from startrack.terrain.geotiff import write_map
-from startrack.terrain.heightmap import HeightMap
 from startrack.terrain.projection import EQUIRECTANGULAR, Projection, polar_stereographic
-from startrack.terrain.rasters import read_map
+from startrack.terrain.raster import Raster
+from startrack.terrain.raster_io import read_map
 
 HERE = Path(__file__).parent
 SUMS = {
@@ -66,20 +66,20 @@ def polar(source: Path, to: Path, post_m: float, low_m: float, high_m: float, cu
     steps = picture[:, :, 2].astype(np.int64) * 256 + picture[:, :, 1]
     step_m = (high_m - low_m) / 65_535
     corner = (steps.shape[0] - 1) / 2 * post_m
-    heights = HeightMap(
+    heights = Raster(
         heights_m=(low_m + steps * step_m).astype(np.float32), projection=polar_stereographic(), x0_m=-corner,
         y0_m=corner, dx_m=post_m, dy_m=-post_m,
     )  # fmt: skip
     write_map(to, heights.cut(cut, cut), step_m=step_m, offset_m=low_m)
 
 
-def global_map(source: Path) -> HeightMap:
+def global_map(source: Path) -> Raster:
     """LDEM_4: 4 posts a degree, row 0 at the north, column 0 at 0 degrees east, half metres."""
     values = np.fromfile(source, dtype="<i2").reshape(720, 1440)
     degrees = 180 / np.pi / 1_737_400.0
     frame = Projection(kind=EQUIRECTANGULAR, scale=degrees, scale_y=degrees)
     turned = np.roll(values, 720, axis=1)  # from -180 to 180 degrees
-    return HeightMap(
+    return Raster(
         heights_m=(0.5 * turned).astype(np.float32), projection=frame, x0_m=-179.875, y0_m=89.875, dx_m=0.25, dy_m=-0.25
     )
 

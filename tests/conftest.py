@@ -25,7 +25,7 @@ def located() -> Located:
     from startrack import pipeline
     from startrack.camera import load_camera
     from startrack.catalog import load_catalog
-    from startrack.render import Series, render
+    from startrack.rendering import Series, render
     from startrack.terrain import load_terrain
 
     camera = replace(

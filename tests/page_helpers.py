@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from startrack.report import write_json, write_results
+from startrack.output import write_json, write_results
 
 NASTY = "ein <b>\"Bild\"</b> & 'mehr' </script><script>alert(1)</script> ünï✶.png"
 DESKTOP, PHONE, SMALL = (1280, 800), (390, 844), (360, 740)

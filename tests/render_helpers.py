@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from startrack.body_angles import R_body_enu_from_heading_pitch_roll
 from startrack.camera import Camera, Sensor
 from startrack.frames import Site, rays_from_azel
-from startrack.render import Scene
+from startrack.frames.body_angles import R_body_enu_from_heading_pitch_roll
+from startrack.rendering import Scene
 from startrack.terrain import Cylinder
 from startrack.types import Stars
 

@@ -19,7 +19,7 @@ import startrack
 import startrack.api
 from startrack.errors import BadInput
 from startrack.exposure import read_exposure
-from startrack.given import given_exposure, utc
+from startrack.inputs import given_exposure, utc
 
 IMAGE = "sample_images/near-wall.png"
 LOWELL = "sample_images/lowell-2018-08-06.fits.bz2"

@@ -20,12 +20,12 @@ from astropy.table import QTable
 
 from startrack.batch import Task, images_under, locate_image, named_images
 from startrack.camera import load_camera
-from startrack.camera.files import save_camera
+from startrack.camera.io import save_camera
 from startrack.catalog import load_catalog
 from startrack.cli.main import main
 from startrack.errors import BadInput
 from startrack.exposure import write_exposure, write_sidecar
-from startrack.render import Series, render
+from startrack.rendering import Series, render
 from startrack.terrain import load_terrain
 
 TABLES = ("results.ecsv", "results.parquet", "trajectory.tum", "manifest.json")

@@ -106,7 +106,7 @@ def test_a_refusal_for_want_of_stars_replaces_a_solution(folder):
 
 @pytest.mark.parametrize("companion", ["00.stars.ecsv", "00.annotated.png", "00.wcs", "00.corr"])
 def test_a_solution_without_one_of_its_files_is_not_whole(folder, companion):
-    from startrack.batch.kept import has_companions
+    from startrack.batch.store import has_companions
 
     record, result = stored(folder / "out" / "00.fix.json"), folder / "out" / "00.fix.json"
     assert has_companions(record, result, plots=True)

@@ -13,7 +13,7 @@ import tomli_w
 from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera, KannalaBrandt, Pinhole, Sensor, camera_from_dict, load_camera, save_camera
-from startrack.paths import data_dir
+from startrack.files import data_dir
 from startrack.types import BadInput
 
 GOOD: dict[str, Any] = {

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from startrack.catalog import StarCatalog, load_catalog, star_names
+from startrack.files import data_dir
 from startrack.frames import angle_between_rad
-from startrack.paths import data_dir
 
 MAS = np.pi / 648_000_000
 DATE = datetime(2026, 11, 20, 6, 0, tzinfo=UTC)

@@ -14,8 +14,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import startrack
-from startrack import bodies, frames, types
+from startrack import frames, types
 from startrack.camera import Camera
+from startrack.catalog import bodies
 from startrack.frames import Site, parse_utc
 
 ROOT = Path(startrack.__file__).parent

@@ -14,8 +14,8 @@ from scipy.stats import norm
 from star_painter import cramer_rao, paint
 
 from startrack.evidence import FluxScale, StarEvidence, StarLight, flux_scale
+from startrack.evidence.likelihood_ratio import CAP, shines_ratio
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure
-from startrack.evidence.ratio import CAP, shines_ratio
 from startrack.frames import azel_from_rays
 from startrack.types import Body, Detections, Identification, Stars
 

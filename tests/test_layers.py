@@ -16,25 +16,25 @@ ROOT = Path(startrack.__file__).parent
 
 LAYERS = (  # lowest first; a room imports from lower layers only
     {"errors"},
-    {"types", "paths"},
+    {"types", "files"},
     {"frames"},
-    {"psf", "body_angles", "catalog", "deep_catalog", "bodies", "camera", "terrain", "exposure"},
-    {"render", "detect", "identify", "orient", "evidence", "localize"},
+    {"psf", "catalog", "camera", "terrain", "exposure"},
+    {"rendering", "detection", "identification", "orient", "evidence", "localization"},
     {"result"},
     {"light"},
-    {"pipeline", "calibrate", "given"},
-    {"report"},
+    {"pipeline", "calibration", "inputs"},
+    {"output"},
     {"solution"},
-    {"reproduce", "batch", "page", "api"},
+    {"reproduction", "batch", "api"},
     {"cli"},
 )
 # Rooms of one layer that may know each other all the same: identification refines the attitude, and the last check
 # reads what the evidence stage measured.
-ALLOWED = {("deep_catalog", "catalog"), ("identify", "orient")}
+ALLOWED = {("identification", "orient")}
 HEAVY = (
     "astropy", "cv2", "lunarsky", "matplotlib", "PIL", "rich", "scipy", "skimage", "skyfield", "spiceypy", "tifffile",
 )  # fmt: skip
-CV2_ROOMS = {"detect", "evidence", "exposure", "report"}  # image processing, where cv2 is the room's own tool
+CV2_ROOMS = {"detection", "evidence", "exposure", "output"}  # image processing, where cv2 is the room's own tool
 
 
 def room_of(path: Path) -> str:
@@ -103,8 +103,8 @@ def test_each_exception_is_still_needed():
 @pytest.mark.parametrize(
     ("source", "room", "other"),
     [
-        ("from startrack.report import summary", "detect", "report"),
-        ("import startrack.identify.match", "detect", "identify"),
+        ("from startrack.output import text", "detection", "output"),
+        ("import startrack.identification.match", "detection", "identification"),
         ("def f():\n    from startrack import pipeline", "camera", "pipeline"),
         ("from ..cli import common", "evidence", "cli"),
     ],
@@ -119,7 +119,7 @@ def test_nobody_reads_the_truth_but_the_renderer():
     """The truth beside a rendered image is for tests and scorers: no stage knows of it."""
     truth = re.compile(r"\bTruth\b|\.truth\b")
     readers = {room_of(path) for path in ROOT.rglob("*.py") if truth.search(path.read_text(encoding="utf-8"))}
-    assert readers <= {"render", "cli"}
+    assert readers <= {"rendering", "cli"}
 
 
 def top_level_imports(path: Path) -> set[str]:
@@ -156,5 +156,5 @@ def test_help_is_printed_without_numpy_or_any_heavy_module():
 
 def test_the_library_is_imported_without_the_slow_ones():
     """The pipeline computes with numpy, scipy and cv2; ephemerides, FITS, plots and progress bars can wait."""
-    loaded = loaded_after("import startrack.pipeline, startrack.report")
+    loaded = loaded_after("import startrack.pipeline, startrack.output")
     assert loaded & (set(HEAVY) - {"cv2", "scipy"}) == set()

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from astropy.table import Table
 
-from startrack.camera.files import camera_from_dict
+from startrack.camera.io import camera_from_dict
 from startrack.cli.main import COMMANDS, main
-from startrack.terrain.files import terrain_from_dict
+from startrack.terrain.io import terrain_from_dict
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -13,8 +13,8 @@ import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from startrack.files import data_dir
 from startrack.frames import Site
-from startrack.paths import data_dir
 from startrack.terrain import Cylinder, Terrain, load_terrain, terrain_from_dict
 from startrack.types import BadInput
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from startrack.frames import Site, latlon_from_enu
-from startrack.localize import ExactPosterior, check_consistency
+from startrack.localization import ExactPosterior, check_consistency
 from startrack.terrain import load_terrain
 from startrack.types import Evidence
 

@@ -11,13 +11,14 @@ import pytest
 import tomli_w
 
 from startrack.cli.main import main
-from startrack.paths import data_dir
-from startrack.terrain import cache, load_terrain
-from startrack.terrain.dem import HeightTerrain
+from startrack.files import data_dir
+from startrack.terrain import load_terrain
+from startrack.terrain import table_cache as cache
 from startrack.terrain.geotiff import write_map
-from startrack.terrain.heightmap import HeightMap
+from startrack.terrain.height_map import HeightMap
 from startrack.terrain.projection import EQUIRECTANGULAR, ORTHOGRAPHIC, Projection, polar_stereographic
-from startrack.terrain.rasters import projection_of, read_map
+from startrack.terrain.raster import Raster
+from startrack.terrain.raster_io import projection_of, read_map
 from startrack.types import BadInput
 
 ROOT = Path(__file__).parent.parent
@@ -28,11 +29,11 @@ def _own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
-def hill(posts: int = 61, post_m: float = 100.0, projection: Projection | None = None) -> HeightMap:
+def hill(posts: int = 61, post_m: float = 100.0, projection: Projection | None = None) -> Raster:
     """A bowl with a rim, 6 km wide, about the projection's centre."""
     line = (np.arange(posts) - (posts - 1) / 2) * post_m
     r = np.hypot(line[:, None], line)
-    return HeightMap(
+    return Raster(
         heights_m=(800 * np.exp(-((r - 2000) ** 2) / 500**2)).astype(np.float32),
         projection=projection or polar_stereographic(), x0_m=line[0], y0_m=-line[0], dx_m=post_m, dy_m=-post_m,
     )  # fmt: skip
@@ -64,7 +65,7 @@ def test_every_key_reaches_the_terrain(tmp_path):
     more = {"radius_m": 700.0, "max_slope_deg": 20.0, "glare_deg": [[350.0, 10.0]]}
     path = terrain_file(tmp_path, dem={"horizon_sigma_deg": 0.05}, rover={"camera_height_m": 2.5}, search=more)
     terrain = load_terrain(path)
-    assert isinstance(terrain, HeightTerrain)
+    assert isinstance(terrain, HeightMap)
     assert terrain.camera_height_m == 2.5
     assert terrain.search_radius_m == 700.0
     assert terrain.height_sigma_m == 2.0
@@ -354,7 +355,7 @@ def test_a_folder_that_takes_no_pictures_is_named_before_any_work(tmp_path, caps
 def test_a_build_says_so_in_one_line_and_an_interrupted_one_is_forgotten(tmp_path, capsys, monkeypatch):
     path = terrain_file(tmp_path)
     terrain = load_terrain(path)
-    assert isinstance(terrain, HeightTerrain)
+    assert isinstance(terrain, HeightMap)
 
     def interrupted(done: int, total: int) -> None:
         raise KeyboardInterrupt

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path, PurePosixPath
 
-from startrack.exposure.facts import PACKING_SUFFIXES, PICTURE_SUFFIXES
+from startrack.exposure.metadata import PACKING_SUFFIXES, PICTURE_SUFFIXES
 from startrack.types import BadInput
 
 OWN_PICTURES = (".annotated.png",)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from startrack.batch.kept import RESULT, is_solved, printable, stored
+from startrack.batch.store import RESULT, is_solved, printable, stored
 from startrack.batch.task import Task, still_stored
 
 NOT_IN_TABLES = ("modes", "message", "warnings", "format")

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from startrack import __version__
-from startrack.batch.kept import JOB, MANIFEST, RESULT
+from startrack.batch.store import JOB, MANIFEST, RESULT
 from startrack.exposure import write_atomically
 from startrack.frames import R_from_quat_xyzw, quat_xyzw_from_R
-from startrack.report.ecsv import Column, ecsv_text, formatted
-from startrack.report.result import STAGES
+from startrack.output.ecsv import Column, ecsv_text, formatted
+from startrack.output.record import STAGES
 
 Record = dict[str, Any]
 FORMAT = "startrack.manifest/1"

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack import __version__
-from startrack.batch.inputs import MISSING, hashes_of, key_of, sha256_of, unchanged, untouched_since
-from startrack.batch.kept import INPUTS, JOB, has_companions, image_sha256, is_solved, printable, stored
+from startrack.batch.fingerprint import MISSING, hashes_of, key_of, sha256_of, unchanged, untouched_since
+from startrack.batch.store import INPUTS, JOB, has_companions, image_sha256, is_solved, printable, stored
 from startrack.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def still_stored(task: Task) -> dict[str, Any] | None:
 
 def lost(task: Task, message: str, reason: str = INTERNAL_ERROR) -> dict[str, Any]:
     """The record of an image that has no result to keep: without a hash, so that the next run tries it again."""
-    from startrack.report import refused_dict, write_json
+    from startrack.output import refused_dict, write_json
 
     record = {**refused_dict(task.name, reason, message), **_unread(sha256_of(task.path))}
     record |= {"image": printable(task.name), JOB: None}
@@ -94,7 +94,7 @@ def _fresh(task: Task, sha256: str, key: str) -> dict[str, Any]:
 
     The old files go first, when all is worked out, so that no half of a result is ever taken for a whole.
     """
-    from startrack.report import result_dict, write_json, write_results
+    from startrack.output import result_dict, write_json, write_results
 
     result = Path(task.result)
     found, inputs = _located(task, sha256)
@@ -116,7 +116,7 @@ def _fresh(task: Task, sha256: str, key: str) -> dict[str, Any]:
 
 def _clear(result: Path) -> None:
     """Make the folder, remove what an earlier run left. Raises BadInput where that cannot be."""
-    from startrack.report import remove_companions
+    from startrack.output import remove_companions
 
     try:
         result.parent.mkdir(parents=True, exist_ok=True)
@@ -129,9 +129,9 @@ def _clear(result: Path) -> None:
 def _located(task: Task, sha256: str) -> tuple[Result | dict[str, Any], dict[str, str]]:
     """A result that has companions, or else the record of a refusal; and the hashes of its other files."""
     from startrack.exposure import read_exposure
-    from startrack.localize import ExactPosterior
+    from startrack.localization import ExactPosterior
+    from startrack.output import refused_dict, result_dict
     from startrack.pipeline import Settings, locate_exposure
-    from startrack.report import refused_dict, result_dict
     from startrack.result import Result
 
     try:

@@ -1,9 +1,9 @@
 """Cameras: one lens model per file, one camera around them, files to keep them in."""
 
+from startrack.camera.camera import Camera, Lens, Sensor
 from startrack.camera.decentring import Decentring
-from startrack.camera.files import camera_from_dict, camera_to_dict, load_camera, save_camera
+from startrack.camera.io import camera_from_dict, camera_to_dict, load_camera, save_camera
 from startrack.camera.kannala_brandt import KannalaBrandt
-from startrack.camera.model import Camera, Lens, Sensor
 from startrack.camera.pinhole import Pinhole
 
 __all__ = [

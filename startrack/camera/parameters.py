@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from startrack.camera.camera import Camera
 from startrack.camera.decentring import Decentring
 from startrack.camera.kannala_brandt import KannalaBrandt
-from startrack.camera.model import Camera
 from startrack.types import Array
 
 LOCKED_1 = 1e-7  # relative: fx and fy of square pixels, apart just enough that the matrix has an inverse

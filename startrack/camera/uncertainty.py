@@ -10,7 +10,7 @@ from startrack.camera.decentring import Decentring
 from startrack.types import Array
 
 if TYPE_CHECKING:
-    from startrack.camera.model import Camera
+    from startrack.camera.camera import Camera
 
 GRID_POINTS = 400
 GOLDEN_ANGLE_RAD = np.pi * (3.0 - np.sqrt(5.0))

@@ -16,7 +16,7 @@ from startrack.cli.common import DEFAULT_OUT, add_fact_flags, cores, flag_facts
 from startrack.cli.flag_types import at_least_one
 from startrack.cli.horizons import ready_for
 from startrack.errors import INTERNAL_ERROR, BadInput
-from startrack.paths import is_path, made_folder
+from startrack.files import is_path, made_folder
 
 if TYPE_CHECKING:
     from startrack.batch import Batch, Counts, Image, Task

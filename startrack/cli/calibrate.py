@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli.common import DEFAULT_OUT, exit_code_of_reason, read
 from startrack.cli.flag_types import amount, field_of_view_rad, number, positive
 from startrack.errors import NoSolution
-from startrack.paths import made_folder
+from startrack.files import made_folder
 
 if TYPE_CHECKING:
-    from startrack.calibrate import Calibration
+    from startrack.calibration import Calibration
     from startrack.camera import Camera
     from startrack.frames import Site
     from startrack.types import Exposure
@@ -86,10 +86,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _calibrate(args: argparse.Namespace) -> int:
-    from startrack.calibrate import Given, calibrate
-    from startrack.calibrate.record import refusal_dict
+    from startrack.calibration import Given, calibrate
+    from startrack.calibration.record import refusal_dict
     from startrack.catalog import load_catalog
-    from startrack.report import write_json
+    from startrack.output import write_json
 
     if args.time is not None and len(args.words) > 1:
         args.usage_error("--time is the time of one image; give each of several its own in a sidecar NAME.json")
@@ -117,11 +117,11 @@ def _calibrate(args: argparse.Namespace) -> int:
 
 def write_calibration(args: argparse.Namespace, out: Path, found: Calibration) -> int:
     """Write and print a calibration; the exit code."""
-    from startrack.calibrate.record import calibration_dict, summary
-    from startrack.calibrate.report import write_report
-    from startrack.camera.files import camera_text
+    from startrack.calibration.record import calibration_dict, summary
+    from startrack.calibration.report import write_report
+    from startrack.camera.io import camera_text
     from startrack.exposure import write_atomically
-    from startrack.report import write_json
+    from startrack.output import write_json
 
     record, line = calibration_dict(found), summary(found, out.name)
     line += f"\n  {record['message']}" if record["message"] else ""

@@ -12,7 +12,7 @@ from startrack.errors import BadInput, NoSolution
 
 def show(args: argparse.Namespace, words: list[str]) -> int:
     """Print what camera files say; 0."""
-    from startrack.calibrate.show import camera_text, facts
+    from startrack.calibration.show import camera_text, facts
     from startrack.camera import load_camera
 
     for word in words:
@@ -23,10 +23,10 @@ def show(args: argparse.Namespace, words: list[str]) -> int:
 
 def convert(args: argparse.Namespace, words: list[str]) -> int:
     """One camera file to another program's or from it; 0."""
-    from startrack.calibrate.convert import from_text, to_text
-    from startrack.calibrate.convert.plain import lost_px
     from startrack.camera import load_camera
-    from startrack.camera.files import camera_text
+    from startrack.camera.convert import from_text, to_text
+    from startrack.camera.convert.intrinsics import lost_px
+    from startrack.camera.io import camera_text
     from startrack.exposure import write_atomically
 
     if (args.to is None) == (args.source is None) or len(words) != 1:
@@ -49,8 +49,8 @@ def convert(args: argparse.Namespace, words: list[str]) -> int:
 
 def verify(args: argparse.Namespace, words: list[str]) -> int:
     """Whether the camera file still fits pictures of the stars; the exit code."""
-    from startrack.calibrate.verify import verify as verified
-    from startrack.calibrate.verify import verify_dict, verify_line
+    from startrack.calibration.verify import verify as verified
+    from startrack.calibration.verify import verify_dict, verify_line
     from startrack.camera import load_camera
     from startrack.catalog import load_catalog
 
@@ -74,11 +74,11 @@ def verify(args: argparse.Namespace, words: list[str]) -> int:
 
 def board(args: argparse.Namespace, words: list[str]) -> int:
     """A camera file from pictures of a chessboard or a ChArUco board; the exit code."""
-    from startrack.calibrate.board import board_dict, board_line, calibrate_board
-    from startrack.calibrate.board_corners import Board
-    from startrack.camera.files import camera_text
+    from startrack.calibration.board import board_dict, board_line, calibrate_board
+    from startrack.calibration.board_corners import Board
+    from startrack.camera.io import camera_text
     from startrack.exposure import write_atomically
-    from startrack.report import write_json
+    from startrack.output import write_json
 
     try:
         columns, rows = (int(n) for n in (args.pattern or "").lower().split("x"))

@@ -148,7 +148,7 @@ def _broken(path: str, cause: Exception, format_name: str) -> Outcome:
 
 def _refused(path: str, cause: BadInput, format_name: str) -> Outcome:
     """Outcome of an image that could not even be read, or whose camera or terrain could not."""
-    from startrack.report.summary import refusal_line
+    from startrack.output.text import refusal_line
 
     record = {
         "format": format_name,
@@ -165,7 +165,7 @@ def result_path(args: argparse.Namespace, stem: str, suffix: str, exposure: Expo
 
     Raises BadInput (bad_image, for lack of a better code) before anything is computed.
     """
-    from startrack.report import make_way
+    from startrack.output import make_way
 
     path = Path(args.dir) / f"{stem}{suffix}"
     make_way(path, exposure.sha256, overwrite=args.overwrite, remedy="choose another -D, or replace it with -O")

@@ -28,8 +28,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
+    from startrack.output import summary_line, write_results
     from startrack.pipeline import detect
-    from startrack.report import summary_line, write_results
 
     start = time.perf_counter()
     exposure = read(path, args)

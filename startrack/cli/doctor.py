@@ -85,7 +85,7 @@ def _catalogue() -> str:
 
 def _shipped(kind: str) -> str:
     from startrack.camera import load_camera
-    from startrack.paths import data_dir
+    from startrack.files import data_dir
     from startrack.terrain import load_terrain
 
     names = sorted(path.stem for path in data_dir(kind).glob("*.toml"))
@@ -97,7 +97,7 @@ def _shipped(kind: str) -> str:
 
 
 def _kernels() -> str:
-    from startrack.bodies import bodies
+    from startrack.catalog.bodies import bodies
     from startrack.frames import parse_utc
     from startrack.terrain import load_terrain
 
@@ -112,7 +112,7 @@ def _self_test() -> str:
     from startrack.camera import load_camera
     from startrack.catalog import load_catalog
     from startrack.pipeline import locate
-    from startrack.render import Series, render
+    from startrack.rendering import Series, render
     from startrack.terrain import load_terrain
 
     terrain, camera, catalog = load_terrain("shackleton-thesis"), load_camera("fisheye-2048"), load_catalog()

@@ -27,9 +27,9 @@ def ready_for(reference: str | None, args: argparse.Namespace) -> None:
 
 def ready(terrain: Terrain, args: argparse.Namespace) -> None:
     """Work out a terrain's horizons, unless they are known or it needs none."""
-    from startrack.terrain.dem import HeightTerrain
+    from startrack.terrain.height_map import HeightMap
 
-    if not isinstance(terrain, HeightTerrain) or terrain.is_prepared:
+    if not isinstance(terrain, HeightMap) or terrain.is_prepared:
         return
     with _told(args):
         if args.quiet or not sys.stderr.isatty():

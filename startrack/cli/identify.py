@@ -46,13 +46,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     from startrack.catalog import load_catalog
-    from startrack.pipeline import identify, identify_blind
-    from startrack.report import (
+    from startrack.output import (
         lens_text,
         summary_line,
         verbose_text,
         write_results,
     )
+    from startrack.pipeline import identify, identify_blind
 
     start = time.perf_counter()
     exposure = read(path, args)

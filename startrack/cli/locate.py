@@ -45,8 +45,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
+    from startrack.output import summary_line, verbose_text, write_results
     from startrack.pipeline import locate_exposure
-    from startrack.report import summary_line, verbose_text, write_results
 
     start = time.perf_counter()
     exposure = read(path, args)

@@ -16,7 +16,7 @@ from startrack.cli.flag_types import amount, at_least_one, count, number, positi
 from startrack.errors import BadInput
 
 if TYPE_CHECKING:
-    from startrack.render import Scene, Series, Truth
+    from startrack.rendering import Scene, Series, Truth
 
 SUFFIXES = {"png": ".png", "tiff": ".tif", "fits": ".fits"}
 KNOWN_SUFFIXES = {".png", ".tif", ".tiff", ".fits", ".fit", ".fts"}
@@ -98,7 +98,7 @@ def _add_output(group: Any) -> None:
 
 def _targets(args: argparse.Namespace) -> list[Path]:
     """The images to write; every file is checked first, so that nothing is written half-way to a refusal."""
-    from startrack.render import truth_paths
+    from startrack.rendering import truth_paths
 
     if args.output is not None and args.count != 1:
         args.usage_error(f"--output names one image, but --count is {args.count}: give --dir")
@@ -120,7 +120,7 @@ def _series(args: argparse.Namespace) -> Series:
     from startrack.camera import load_camera
     from startrack.catalog import load_catalog
     from startrack.frames import parse_utc
-    from startrack.render import Series
+    from startrack.rendering import Series
     from startrack.terrain import load_terrain
 
     faint = None if args.no_faint_stars else args.faint_stars
@@ -153,7 +153,7 @@ def _series(args: argparse.Namespace) -> Series:
 def _render_one(args: argparse.Namespace, series: Series, number: int, image: Path) -> dict[str, Any]:
     """Render, write image, sidecar and truth, and return what is printed about it."""
     from startrack.exposure import write_exposure, write_sidecar
-    from startrack.render import render, write_truth
+    from startrack.rendering import render, write_truth
 
     scene, rng = series.scene(number, image.stem)
     exposure, truth = render(scene, rng=rng)
@@ -166,8 +166,8 @@ def _render_one(args: argparse.Namespace, series: Series, number: int, image: Pa
 
 
 def _pose(scene: Scene, truth: Truth) -> dict[str, Any]:
-    from startrack.body_angles import heading_pitch_roll_from_R_body_enu
     from startrack.frames import format_utc
+    from startrack.frames.body_angles import heading_pitch_roll_from_R_body_enu
 
     heading, pitch, roll = heading_pitch_roll_from_R_body_enu(scene.camera.R_body_cam @ scene.R_cam_enu)
     assert scene.time_utc is not None

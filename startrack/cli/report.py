@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from startrack.errors import BadInput
 
 if TYPE_CHECKING:
-    from startrack.page import Found
+    from startrack.output.html import Found
 
 PAGE = "report.html"
 OF_ONE = ".report.html"
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
 def page_of(out: str, *, truth: str | None = None, images: int = DEFAULT_IMAGES, output: str | None = None) -> Path:
     """Write the page of a folder of results or of one NAME.fix.json; its path. Raises BadInput."""
-    from startrack.page import result_at, results_under, write_page
+    from startrack.output.html import result_at, results_under, write_page
 
     if Path(out).is_file():
         one = result_at(out)

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli.common import DEFAULT_OUT, cores
 from startrack.cli.flag_types import at_least_one
 from startrack.errors import BadInput
-from startrack.paths import made_folder
+from startrack.files import made_folder
 
 if TYPE_CHECKING:
-    from startrack.reproduce import Piece, Runs
+    from startrack.reproduction import Piece, Runs
 
-# As in startrack.reproduce.ARTEFACTS, which would take numpy to look up.
+# As in startrack.reproduction.ARTEFACTS, which would take numpy to look up.
 NAMES = (
     "table3.1", "fig3.3", "fig3.4", "fig3.5", "fig3.6", "fig3.7", "fig3.8", "fig3.9", "fig3.10", "figA.1", "figA.2",
     "figB", "magnitude", "aspect",
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     _need(args, "matplotlib", "plots", "figures are drawn", unless=args.no_plots)
     _need(args, "distributed", "cluster", "a cluster is reached", unless=args.cluster is None)
 
-    from startrack.reproduce import ARTEFACTS, FULL, QUICK, Context, Runs, written
+    from startrack.reproduction import ARTEFACTS, FULL, QUICK, Context, Runs, written
 
     out, size = made_folder(args.dir), FULL if args.full else QUICK
     if args.ours is not None:

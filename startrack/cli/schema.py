@@ -20,7 +20,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a schema; 0, or a usage error for an unknown kind."""
-    from startrack.report.schema import SCHEMAS
+    from startrack.output.schema import SCHEMAS
 
     if args.name is None:
         print("\n".join(SCHEMAS))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli.common import DEFAULT_OUT
 from startrack.cli.horizons import ready
 from startrack.cli.terrain_facts import dem_class, facts_of, lines_of, seen_from
-from startrack.paths import made_folder
+from startrack.files import made_folder
 
 if TYPE_CHECKING:
     from startrack.terrain import Terrain
@@ -85,7 +85,7 @@ def _show(args: argparse.Namespace) -> int:
 
 
 def _pictures(args: argparse.Namespace, terrain: Terrain, place: tuple[float, float] | None) -> list[Path]:
-    from startrack.report.terrain_picture import panorama_picture, relief_picture
+    from startrack.output.picture.terrain_picture import panorama_picture, relief_picture
 
     out = made_folder(args.dir, "bad_terrain")
     pictures = {out / f"{terrain.name}.relief.png": relief_picture(terrain, place)}
@@ -99,7 +99,8 @@ def _pictures(args: argparse.Namespace, terrain: Terrain, place: tuple[float, fl
 
 
 def _build(args: argparse.Namespace) -> int:
-    from startrack.terrain import cache, load_terrain
+    from startrack.terrain import load_terrain
+    from startrack.terrain import table_cache as cache
 
     for name in args.terrain:
         terrain = load_terrain(name)
@@ -121,7 +122,7 @@ def _build(args: argparse.Namespace) -> int:
 
 def _import(args: argparse.Namespace) -> int:
     from startrack.terrain import load_terrain
-    from startrack.terrain.imported import coarseness, import_maps, smoothness
+    from startrack.terrain.import_map import coarseness, import_maps, smoothness
 
     half = list(args.half or [])
     half += [30_000.0 if not half and k == 0 else 300_000.0 for k in range(len(half), len(args.maps))]

@@ -10,7 +10,7 @@ from startrack.errors import BadInput
 
 if TYPE_CHECKING:
     from startrack.terrain import Terrain
-    from startrack.terrain.dem import HeightTerrain
+    from startrack.terrain.height_map import HeightMap
 
 
 def facts_of(terrain: Terrain) -> dict[str, Any]:
@@ -31,7 +31,7 @@ def facts_of(terrain: Terrain) -> dict[str, Any]:
 
 
 def _map_facts(terrain: Any) -> dict[str, Any]:
-    from startrack.terrain import cache
+    from startrack.terrain import table_cache as cache
     from startrack.terrain.projection import NAMES
 
     maps = [
@@ -128,8 +128,8 @@ def is_dem(terrain: Terrain) -> bool:
     return isinstance(terrain, dem_class())
 
 
-def dem_class() -> type[HeightTerrain]:
+def dem_class() -> type[HeightMap]:
     """The class of height maps, imported only where one is asked for."""
-    from startrack.terrain.dem import HeightTerrain
+    from startrack.terrain.height_map import HeightMap
 
-    return HeightTerrain
+    return HeightMap

@@ -6,7 +6,7 @@ sees `startrack.types.BadInput` and nothing else.
 """
 
 from startrack.exposure.decoded import are_fractions
-from startrack.exposure.facts import Facts, with_facts
+from startrack.exposure.metadata import Facts, with_facts
 from startrack.exposure.read import exposure_of, read_exposure
 from startrack.exposure.write import write_atomically, write_exposure, write_sidecar
 

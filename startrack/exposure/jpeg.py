@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.exposure.decoded import Decoded, check_size, exif_warnings, grey_float32, largest_value, refuse
-from startrack.exposure.facts import facts_in_text
+from startrack.exposure.metadata import facts_in_text
 
 START_OF_SCAN, END_OF_IMAGE = 0xDA, b"\xff\xd9"
 PARAMETERLESS = {0x01, *range(0xD0, 0xD8)}  # markers without a length: TEM and the restarts

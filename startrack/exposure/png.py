@@ -22,7 +22,7 @@ from startrack.exposure.decoded import (
     largest_value,
     refuse,
 )
-from startrack.exposure.facts import HEADER_KEYS
+from startrack.exposure.metadata import HEADER_KEYS
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 COLOUR_TYPES = {0: "grey", 2: "colour", 3: "palette", 4: "grey with alpha", 6: "colour with alpha"}

@@ -23,7 +23,7 @@ from startrack.exposure.decoded import (
     refuse,
     shown,
 )
-from startrack.exposure.facts import RAW_SUFFIXES, Facts, resolve_facts, stem
+from startrack.exposure.metadata import RAW_SUFFIXES, Facts, resolve_facts, stem
 from startrack.types import BadInput, Exposure
 
 PNG = (b"\x89PNG\r\n\x1a\n",)
@@ -126,7 +126,7 @@ def _decode(raw: bytes, of_camera: bool) -> Decoded:
     kind, decode = "image", _unknown
     try:
         if of_camera:
-            from startrack.exposure.camera_raw import decode_camera_raw
+            from startrack.exposure.raw import decode_camera_raw
 
             kind, decode = "camera raw file", decode_camera_raw
         elif raw.startswith(PNG):

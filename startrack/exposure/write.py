@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.exposure.decoded import shown
-from startrack.exposure.facts import Facts, is_path, sidecars
-from startrack.frames.utc import format_utc
+from startrack.exposure.metadata import Facts, is_path, sidecars
+from startrack.frames.time import format_utc
 from startrack.types import BadInput, Exposure
 
 PACKED = {".gz": lambda data: gzip.compress(data, compresslevel=1, mtime=0), ".bz2": bz2.compress}

@@ -4,7 +4,6 @@
 """
 
 from startrack.frames.observer import R_enu_icrs, observer_state, observer_velocity_m_s
-from startrack.frames.quaternions import R_from_quat_xyzw, quat_xyzw_from_R
 from startrack.frames.rays import (
     SPEED_OF_LIGHT_M_S,
     aberrate,
@@ -13,6 +12,7 @@ from startrack.frames.rays import (
     rays_from_azel,
     refract_rad,
 )
+from startrack.frames.rotations import R_from_quat_xyzw, quat_xyzw_from_R
 from startrack.frames.site import (
     MOON_RADIUS_M,
     R_enu_fixed,
@@ -22,7 +22,7 @@ from startrack.frames.site import (
     position_fixed_m,
 )
 from startrack.frames.spice import R_mcmf_icrs, barycentric_state, et_s
-from startrack.frames.utc import as_utc, format_utc, parse_utc
+from startrack.frames.time import as_utc, format_utc, parse_utc
 
 __all__ = [
     "MOON_RADIUS_M",

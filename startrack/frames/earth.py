@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from startrack.frames.spice import et_s
-from startrack.frames.utc import seconds_since_2000
+from startrack.frames.time import seconds_since_2000
 from startrack.types import Array
 
 EARTH_SPIN_RAD_S = 7.292115e-5  # nominal mean angular velocity, IERS Conventions (2010), table 1.2

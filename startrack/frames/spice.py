@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack.frames.utc import format_utc, seconds_since_2000
+from startrack.frames.time import format_utc, seconds_since_2000
 from startrack.types import Array, BadInput
 
 # Package to install, module that it provides, file inside. A later kernel rules an earlier one.

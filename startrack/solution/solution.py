@@ -10,8 +10,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.report import make_way, record_of, summary_line, write_results
-from startrack.report.result import boresight_rad
+from startrack.output import make_way, record_of, summary_line, write_results
+from startrack.output.record import boresight_rad
 from startrack.solution.values import Orientation, Position, html_table, orientation_of, position_of
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ class Solution:
             return None
         from astropy.table import QTable
 
-        from startrack.report.star_table import star_table_text
+        from startrack.output.star_table import star_table_text
 
         return QTable.read(star_table_text(self.result), format="ascii.ecsv")
 

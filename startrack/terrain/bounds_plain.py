@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.terrain.ground import Ground
+from startrack.terrain.pyramid import Ground
 from startrack.terrain.trace_plain import (
     FAR_M,
     LOWEST_TAN,

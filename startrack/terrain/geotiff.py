@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from startrack.terrain.heightmap import HeightMap
 from startrack.terrain.projection import EQUIRECTANGULAR, ORTHOGRAPHIC, STEREOGRAPHIC, Projection
+from startrack.terrain.raster import Raster
 
 FINEST_STEP_M = 0.01
 NO_HEIGHT = 65_535
@@ -19,7 +19,7 @@ USER_DEFINED, METRE, DEGREE = 32767, 9001, 9102
 
 
 def write_map(
-    path: str | Path, height_map: HeightMap, *, step_m: float | None = None, offset_m: float | None = None
+    path: str | Path, height_map: Raster, *, step_m: float | None = None, offset_m: float | None = None
 ) -> None:
     """Write the map, whole or not at all. Heights are kept to `step_m`, by default a 65,000th of their range."""
     import tifffile
@@ -51,7 +51,7 @@ def write_map(
         raise
 
 
-def _where(height_map: HeightMap) -> list[tuple[int, str, int, Any, bool]]:
+def _where(height_map: Raster) -> list[tuple[int, str, int, Any, bool]]:
     """The tags that say where the map lies: posts are pixel centres (raster type "area")."""
     m = height_map
     corner = m.x0_m - 0.5 * m.dx_m, m.y0_m - 0.5 * m.dy_m

@@ -9,7 +9,7 @@ import numpy as np
 from startrack.types import Array, Ints
 
 if TYPE_CHECKING:
-    from startrack.terrain.nearby import Nearby
+    from startrack.terrain.horizon_interpolator import Nearby
 
 THREE = np.array([[i, j] for i in (-1, 0, 1) for j in (-1, 0, 1)], dtype=np.float64)
 CORNERS = [0, 2, 6, 8]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.terrain.table import (
+from startrack.terrain.horizon_table import (
     ANGLE_STEP_RAD,
     BINS,
     DISTANCE_STEP_M,

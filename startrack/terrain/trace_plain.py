@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack.terrain.ground import Ground
+from startrack.terrain.pyramid import Ground
 from startrack.types import Array, Bools, Ints
 
 SPHERE_M = 1_737_400.0

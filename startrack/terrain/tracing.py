@@ -9,31 +9,29 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from startrack.terrain.table import BINS, FIELDS, HorizonTable, cpu_count
+from startrack.terrain.horizon_table import BINS, FIELDS, HorizonTable, cpu_count
 from startrack.types import Array, Ints
 
 if TYPE_CHECKING:
-    from startrack.terrain.dem import HeightTerrain
-    from startrack.terrain.nearby import Nearby
+    from startrack.terrain.height_map import HeightMap
+    from startrack.terrain.horizon_interpolator import Nearby
 
 WORTH_THREADS, MOST_THREADS = 1500, 8
 NO_VALUES = np.zeros((0, BINS, FIELDS), dtype=np.uint16)
 
 
 class Tracer(Protocol):
-    """What a `HeightTerrain` asks: all flat arrays (n,), points and centres (n, 2)."""
+    """What a `HeightMap` asks: all flat arrays (n,), points and centres (n, 2)."""
 
     compiled: bool
 
-    def surfaces(self, terrain: HeightTerrain, points: Array) -> Array: ...
+    def surfaces(self, terrain: HeightMap, points: Array) -> Array: ...
     def horizons(
-        self, terrain: HeightTerrain, table: HorizonTable | None, points: Array, azimuths: Array
+        self, terrain: HeightMap, table: HorizonTable | None, points: Array, azimuths: Array
     ) -> tuple[Array, Array, Array]: ...
-    def fill_cells(
-        self, terrain: HeightTerrain, centres: Array, half: float, azimuths: Array, turn: float
-    ) -> Array: ...
-    def box_bounds(self, terrain: HeightTerrain, table: HorizonTable, *arrays: Array) -> None: ...
-    def sector_bounds(self, terrain: HeightTerrain, table: HorizonTable, *arrays: Array) -> None: ...
+    def fill_cells(self, terrain: HeightMap, centres: Array, half: float, azimuths: Array, turn: float) -> Array: ...
+    def box_bounds(self, terrain: HeightMap, table: HorizonTable, *arrays: Array) -> None: ...
+    def sector_bounds(self, terrain: HeightMap, table: HorizonTable, *arrays: Array) -> None: ...
     def between(self, near: Nearby, points: Array, column: Ints, found: Array) -> None: ...
     def between_bounds(
         self, near: Nearby, centres: Array, half: float, column: Ints, low: Array, high: Array
@@ -52,19 +50,19 @@ class CompiledTracer:
 
     compiled = True
 
-    def surfaces(self, terrain: HeightTerrain, points: Array) -> Array:
+    def surfaces(self, terrain: HeightMap, points: Array) -> Array:
         """Heights in enu (n,)."""
-        from startrack.terrain import trace_compiled
+        from startrack.terrain import horizon_kernel as trace_compiled
 
         up = np.empty(len(points))
         trace_compiled.surfaces(terrain.ground, np.ascontiguousarray(points), up)
         return up
 
     def horizons(
-        self, terrain: HeightTerrain, table: HorizonTable | None, points: Array, azimuths: Array
+        self, terrain: HeightMap, table: HorizonTable | None, points: Array, azimuths: Array
     ) -> tuple[Array, Array, Array]:
         """tan, distance, distance of the maps' end (n,)."""
-        from startrack.terrain import table_compiled
+        from startrack.terrain import table_kernel as table_compiled
 
         tan, at, edge = (np.empty(len(azimuths)) for _ in range(3))
         values, across, reach = _table(table)
@@ -72,9 +70,9 @@ class CompiledTracer:
         _side_by_side(table_compiled.horizons, fixed, (points, azimuths, tan, at, edge))
         return tan, at, edge
 
-    def fill_cells(self, terrain: HeightTerrain, centres: Array, half: float, azimuths: Array, turn: float) -> Array:
+    def fill_cells(self, terrain: HeightMap, centres: Array, half: float, azimuths: Array, turn: float) -> Array:
         """(cells, azimuths, 11), see `bounds_compiled.bounds`."""
-        from startrack.terrain import table_compiled
+        from startrack.terrain import table_kernel as table_compiled
 
         found = np.empty((len(centres), len(azimuths), FIELDS))
         table_compiled.fill_cells(
@@ -82,16 +80,16 @@ class CompiledTracer:
         )
         return found
 
-    def box_bounds(self, terrain: HeightTerrain, table: HorizonTable, *arrays: Array) -> None:
+    def box_bounds(self, terrain: HeightMap, table: HorizonTable, *arrays: Array) -> None:
         """centres, half, azimuths, turn, and the results low, high."""
-        from startrack.terrain import table_compiled
+        from startrack.terrain import table_kernel as table_compiled
 
         fixed = terrain.ground, *_table(table), terrain.camera_height_m
         _side_by_side(table_compiled.box_bounds, fixed, arrays)
 
-    def sector_bounds(self, terrain: HeightTerrain, table: HorizonTable, *arrays: Array) -> None:
+    def sector_bounds(self, terrain: HeightMap, table: HorizonTable, *arrays: Array) -> None:
         """Likewise; all boxes of one size."""
-        from startrack.terrain import table_compiled
+        from startrack.terrain import table_kernel as table_compiled
 
         values, across, reach = _table(table)
         lows, highs = table.pyramid[level_for(table, float(arrays[1][0]))]
@@ -101,7 +99,7 @@ class CompiledTracer:
 
     def between(self, near: Nearby, points: Array, column: Ints, found: Array) -> None:
         """Interpolated horizons into found (n,)."""
-        from startrack.terrain import nearby_compiled
+        from startrack.terrain import interpolator_kernel as nearby_compiled
 
         where = near.middle_up_m, *near.centre_m, near.half_m
         fill: Any = nearby_compiled.between
@@ -109,7 +107,7 @@ class CompiledTracer:
 
     def between_bounds(self, near: Nearby, centres: Array, half: float, column: Ints, low: Array, high: Array) -> None:
         """Bounds of the interpolated horizons into low and high (n,)."""
-        from startrack.terrain import nearby_compiled
+        from startrack.terrain import interpolator_kernel as nearby_compiled
 
         where = near.rough, near.middle_up_m, *near.centre_m, near.half_m
         fill: Any = nearby_compiled.between_bounds
@@ -121,7 +119,7 @@ class PlainTracer:
 
     compiled = False
 
-    def surfaces(self, terrain: HeightTerrain, points: Array) -> Array:
+    def surfaces(self, terrain: HeightMap, points: Array) -> Array:
         """Heights in enu (n,)."""
         from startrack.terrain.trace_plain import surface
 
@@ -129,7 +127,7 @@ class PlainTracer:
         return surface(terrain.ground, points[:, 0], points[:, 1], z)
 
     def horizons(
-        self, terrain: HeightTerrain, table: HorizonTable | None, points: Array, azimuths: Array
+        self, terrain: HeightMap, table: HorizonTable | None, points: Array, azimuths: Array
     ) -> tuple[Array, Array, Array]:
         """tan, distance, distance of the maps' end (n,)."""
         from startrack.terrain.table_plain import look_up
@@ -140,7 +138,7 @@ class PlainTracer:
         start, end, hint = look_up(table, points, azimuths)
         return horizon(terrain.ground, points, up, np.sin(azimuths), np.cos(azimuths), start, end, hint)
 
-    def fill_cells(self, terrain: HeightTerrain, centres: Array, half: float, azimuths: Array, turn: float) -> Array:
+    def fill_cells(self, terrain: HeightMap, centres: Array, half: float, azimuths: Array, turn: float) -> Array:
         """(cells, azimuths, 11), see `bounds_compiled.bounds`."""
         n, bins = len(centres), len(azimuths)
         found = self._bounds(
@@ -149,7 +147,7 @@ class PlainTracer:
         )  # fmt: skip
         return found.reshape(n, bins, FIELDS)
 
-    def box_bounds(self, terrain: HeightTerrain, table: HorizonTable, *arrays: Array) -> None:
+    def box_bounds(self, terrain: HeightMap, table: HorizonTable, *arrays: Array) -> None:
         """centres, half, azimuths, turn, and the results low, high."""
         from startrack.terrain.table_plain import look_up_boxes
 
@@ -158,7 +156,7 @@ class PlainTracer:
         found = self._bounds(terrain, centres, half, azimuths, turn, start, end)
         low[:], high[:] = np.arctan(found[:, 0]), np.arctan(found[:, 1])
 
-    def sector_bounds(self, terrain: HeightTerrain, table: HorizonTable, *arrays: Array) -> None:
+    def sector_bounds(self, terrain: HeightMap, table: HorizonTable, *arrays: Array) -> None:
         """Likewise; all boxes of one size."""
         from startrack.terrain.table_plain import sector_bounds
 
@@ -179,7 +177,7 @@ class PlainTracer:
 
         nearby_plain.between_bounds(near, centres, half, column, low, high)
 
-    def _standing(self, terrain: HeightTerrain, centres: Array, half: Array) -> tuple[Array, Array, Array]:
+    def _standing(self, terrain: HeightMap, centres: Array, half: Array) -> tuple[Array, Array, Array]:
         """Heights of the camera (n,): in the middle of boxes, lowest and highest."""
         from startrack.terrain.bounds_plain import standing
 
@@ -190,7 +188,7 @@ class PlainTracer:
 
     def _bounds(
         self,
-        terrain: HeightTerrain,
+        terrain: HeightMap,
         centres: Array,
         half: Array,
         azimuths: Array,

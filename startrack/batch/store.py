@@ -1,0 +1,105 @@
+"""What a folder of results holds already, and of which images it is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from startrack.batch.find import Image
+from startrack.batch.fingerprint import sha256_of
+from startrack.output.write import COMPANIONS
+
+JOB = "job_sha256"  # what a result was made from: content of all its files, flags, version; null: to be done again
+INPUTS = "inputs"  # camera and terrain files that the result was made with: path from the image to SHA-256
+MANIFEST = "manifest.json"
+RESULT = "result"  # in the manifest: path of NAME.fix.json within the folder; null where that is an earlier solution
+SOLVED = ("ok", "ambiguous")
+PICTURE = ".annotated.png"
+NEEDED = {  # by the tables, of a record that is ok
+    "position": ("east_m", "north_m", "up_m", "covariance_m2"),
+    "attitude": ("quat_xyzw_body_enu", "quat_xyzw_cam_icrs", "sigma_arcsec"),
+    "provenance": ("time_utc", "image_sha256"),
+}
+
+
+def stored(result: str | Path) -> dict[str, Any] | None:
+    """A result's record, or None where there is none that can be read, or what is there is no whole one."""
+    record = _object_in(Path(result))
+    return record if record is not None and _is_record(record) else None
+
+
+def is_solved(record: dict[str, Any] | None) -> bool:
+    """Whether a record tells of a place, be it one of several."""
+    return record is not None and record["status"] in SOLVED
+
+
+def has_companions(record: dict[str, Any], result: Path, *, plots: bool) -> bool:
+    """Whether star table, world coordinates and picture stand beside a solved record; others need none."""
+    stem = result.name.removesuffix(".fix.json")
+    needed = [suffix for suffix in COMPANIONS if plots or suffix != PICTURE] if is_solved(record) else []
+    return all(result.with_name(f"{stem}{suffix}").is_file() for suffix in needed)
+
+
+def image_sha256(record: dict[str, Any]) -> str | None:
+    """Of the image that a batch's record was made from: what `locate` left is no batch's."""
+    sha256 = record.get("provenance", {}).get("image_sha256") if JOB in record else None
+    return sha256 if isinstance(sha256, str) else None
+
+
+def printable(name: str) -> str:
+    """A file's name as text: bytes that are none become question marks."""
+    return name.encode("utf-8", "replace").decode("utf-8")
+
+
+def result_of(out: Path, image: Image) -> Path:
+    """Where the image's result goes."""
+    return out / f"{image.stem}.fix.json"
+
+
+def is_of_other_images(out: Path, images: Iterable[Image]) -> bool:
+    """Whether `out` is of a batch of other images: it has results, and not one is of what its image holds now.
+
+    Told by content, so that the folder may have moved, grown, or changed in part.
+    """
+    listed = {one["image"]: one.get("image_sha256") for one in _listed(out) or ()}
+    some = bool(listed)
+    for image in images:
+        record = stored(result_of(out, image))
+        known = listed.get(printable(image.name)) or (record and image_sha256(record))
+        if known is not None and known == sha256_of(image.path):
+            return False
+        some = some or known is not None
+    return some
+
+
+def in_the_tables(out: Path) -> set[str] | None:
+    """Paths within `out` of the results that its tables are of; None where there is no manifest."""
+    images = _listed(out)
+    return None if images is None else {str(one.get(RESULT)) for one in images}
+
+
+def _listed(out: Path) -> list[dict[str, Any]] | None:
+    images = (_object_in(out / MANIFEST) or {}).get("images")
+    if not isinstance(images, list):
+        return None
+    return [one for one in images if isinstance(one, dict) and isinstance(one.get("image"), str)]
+
+
+def _object_in(file: Path) -> dict[str, Any] | None:
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _is_record(found: dict[str, Any]) -> bool:
+    """Whether a JSON object has what keeping it and its row of the tables need."""
+    status, provenance = found.get("status"), found.get("provenance", {})
+    named = isinstance(found.get("image"), str) and "reason" in found and isinstance(provenance, dict)
+    if not named or status not in (*SOLVED, "refused") or not isinstance(found.get(INPUTS, {}), dict):
+        return False
+    parts = NEEDED if status == "ok" else {}
+    return all(isinstance(found.get(part), dict) and found[part].keys() >= set(keys) for part, keys in parts.items())

@@ -1,0 +1,35 @@
+"""Camera files of other programs, read and written in their own conventions.
+
+All of them share our axes (x right, y down, z along the boresight) and our radial polynomial; none of them knows
+mirrored images, image circles, calibrated angles, sensors or covariances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from startrack.camera import Camera
+from startrack.camera.convert import colmap, kalibr, opencv, ros
+
+WRITERS: dict[str, Callable[[Camera], str]] = {
+    "ros": ros.text,
+    "kalibr": kalibr.text,
+    "colmap": colmap.text,
+    "opencv": opencv.text,
+}
+READERS: dict[str, Callable[[str, str], Camera]] = {
+    "ros": ros.camera,
+    "kalibr": kalibr.camera,
+    "colmap": colmap.camera,
+    "opencv": opencv.camera,
+}
+
+
+def to_text(camera: Camera, program: str) -> str:
+    """The camera as a file of the program. Raises BadInput bad_calibration where its format cannot hold the lens."""
+    return WRITERS[program](camera)
+
+
+def from_text(text: str, program: str, name: str) -> Camera:
+    """The camera of a program's file. Raises BadInput bad_calibration where it cannot be read or held."""
+    return READERS[program](text, name)

@@ -1,0 +1,138 @@
+"""Which fitted candidates are point sources: above the threshold, like the PSF, and nothing else's likeness."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from startrack.detection.artifacts import edge_chi2
+from startrack.detection.deblend import Fitted, own_light
+from startrack.detection.fit import PointFits, Stamps
+from startrack.detection.frame import Frame, LightNoise
+from startrack.detection.psf_width import BRIGHT_SNR, FEWEST_BRIGHT
+from startrack.detection.saturated import are_clipped
+from startrack.types import Array, Bools, Ints
+
+WIDTHS_PX = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0)
+HEIGHTS = (5.80, 5.70, 5.54, 5.43, 5.33, 5.18, 5.09)  # measured at USUAL_SKEWNESS: alike in false stars
+HEIGHT_AT_NOMINAL = 5.42
+USUAL_SKEWNESS, LARGEST_SKEWNESS = 0.088, 0.3  # the first is that of 100 photons and 3 electrons of read noise
+FILTERED_SKEWNESS = 0.376  # 2 / (3 sqrt(pi)): part that a matched filter of 1 px leaves
+NOISE_TOO_SMALL = 0.17  # part of the skewness by which the noise is measured too small
+OWN_LEVEL_PART = 0.8  # of the threshold that a source must reach by its own stamp alone, everywhere
+UNEVEN_SIGMA = 2.5  # difference of the stamp's level and that of its surroundings where these are not to be trusted
+EDGE_MARGIN = 8.0  # chi^2 by which an edge must explain a stamp better: noise alone gives faint stars less
+BAD_FIT_CHI2_PER_DOF = 4.0
+ROUGH_PSF_MISFIT = 0.06  # from here up the frame's own stars, not the Gaussian, say what a star looks like
+ROUGH_PSF_SPREAD = 2.0  # times the typical misfit that a star of such a frame may have
+CLIPPED_MISFIT = 0.2  # of a star that shows only its wings, which are the least Gaussian
+LARGEST_SIGMA_PX = 2.0  # of the place
+WING_SIGMAS, WING_BRIGHTER, WING_HEIGHT = 3.0, 2.0, 1.4  # where a brighter one is, this much brighter, more is asked
+
+
+def stars_among(fitted: Fitted, width_px: Array, threshold: float) -> Ints:
+    """Indices (k,) of the candidates, fitted with widths (n,), that are point sources and stand out by the threshold.
+
+    Where the bright sources of the frame all differ from the Gaussian (trails, coma, a real lens), no bright star would
+    pass by its chi^2; there a source passes whose misfit is like theirs.
+    """
+    fits = fitted.fits
+    stands_out = height_of(fits) >= threshold
+    placed = np.sqrt(fits.covariance[:, 0, 0] + fits.covariance[:, 1, 1]) < LARGEST_SIGMA_PX
+    left = np.flatnonzero(stands_out & placed & (fits.chi2 < fits.chi2_pixel))
+    if not len(left):
+        return left
+    misfit, edge = _likeness(fitted.stamps.part(left), fits.take(left), width_px[left], fitted.light_noise)
+    unlike_an_edge = fits.chi2[left] < edge + EDGE_MARGIN
+    bright = fits.flux[left] > BRIGHT_SNR * np.sqrt(fits.covariance[left, 2, 2])
+    typical = _typical(misfit[unlike_an_edge & bright])
+    good_fit = fits.chi2[left] < BAD_FIT_CHI2_PER_DOF * fits.dof[left]
+    allowed = np.where(are_clipped(fitted.stamps.part(left)), max(typical, CLIPPED_MISFIT), typical)
+    return left[unlike_an_edge & (good_fit | (misfit < allowed))]
+
+
+def one_per_place(xy_px: Array, flux: Array, closer_px: float) -> Bools:
+    """Which sources (n,) to keep: of those that converged onto one place, the brightest."""
+    from scipy.spatial import cKDTree
+
+    rank = np.empty(len(flux), dtype=np.int64)
+    rank[np.argsort(-flux, kind="stable")] = np.arange(len(flux))
+    pairs = cKDTree(xy_px).query_pairs(closer_px, output_type="ndarray")
+    fainter = np.zeros(len(flux), dtype=bool)
+    fainter[np.where(rank[pairs[:, 0]] > rank[pairs[:, 1]], pairs[:, 0], pairs[:, 1])] = True
+    return ~fainter
+
+
+def not_beside(xy_px: Array, flux: Array, height: Array, sigma: float, threshold: float) -> Bools:
+    """Which sources (n,) to keep: those hardly above the threshold in a brighter one's wing are its misfit, or a blend.
+
+    Two stars that are not resolved are fitted as one, and what that leaves looks like a third.
+    """
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(xy_px).query_pairs(WING_SIGMAS * sigma, output_type="ndarray")
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    fainter = both[flux[both[:, 0]] * WING_BRIGHTER < flux[both[:, 1]], 0]
+    keep = np.ones(len(flux), dtype=bool)
+    keep[fainter[height[fainter] < WING_HEIGHT * threshold]] = False
+    return keep
+
+
+def height_of(fits: PointFits) -> Array:
+    """By how many sigma each source (n) stands out.
+
+    Above its surroundings, whose level is known better than that of the stamp, where the stamp by itself shows at least
+    OWN_LEVEL_PART of it; by its own stamp alone where the two levels do not agree: on a slope or at the skyline.
+    """
+    by_itself = fits.flux / np.sqrt(fits.covariance[:, 2, 2])
+    even = np.abs(fits.level - fits.surround) < UNEVEN_SIGMA * np.sqrt(fits.covariance[:, 3, 3])
+    return np.where(even, np.minimum(fits.significance, by_itself / OWN_LEVEL_PART), by_itself)
+
+
+def threshold_for(threshold_snr: float, sigma_px: float, skewness: float) -> float:
+    """Height that gives about as many false peaks, whatever the PSF's width and the skewness of the pixels' noise.
+
+    That is 0.3 to 0.6 in 4 Mpx at the default. A narrower PSF has more independent places to be false at, down to where
+    the pixels, no longer the PSF, say how many there are; a wider one has fewer, but crowds. Photons' noise is skew:
+    its bright tail is heavier than a Gaussian's (the first term of Cornish and Fisher's expansion, with what the filter
+    leaves of the skewness), and its quantiles below the median, from which the noise is taken, lie closer together.
+    """
+    height = float(np.interp(np.log(sigma_px), np.log(WIDTHS_PX), HEIGHTS))
+    filtered = FILTERED_SKEWNESS / np.sqrt(sigma_px**2 + 1.0 / 12.0)
+    height += (skewness - USUAL_SKEWNESS) * (filtered * (height**2 - 1.0) / 6.0 + NOISE_TOO_SMALL * height)
+    return float(np.sqrt(max(height**2 + threshold_snr**2 - HEIGHT_AT_NOMINAL**2, 9.0)))
+
+
+def skewness_of(frame: Frame) -> float:
+    """Skewness of the noise of the frame's pixels, by the photons of its background; a usual one without a gain."""
+    if frame.light_noise.per_unit != 1.0:  # not in electrons
+        return USUAL_SKEWNESS
+    some = slice(None, None, 64), slice(None, None, 64)
+    noise = float(np.median(frame.noise[some]))
+    photons = min(max(float(np.median(frame.background[some])), 0.0), noise**2)
+    return min(photons / max(noise, 1e-6) ** 3, LARGEST_SKEWNESS)
+
+
+def _typical(misfit: Array) -> float:
+    """Misfit up to which a source is like the frame's bright ones, where these are rough; 0 where they are not."""
+    if len(misfit) < FEWEST_BRIGHT:
+        return 0.0
+    typical = float(np.median(misfit))
+    return ROUGH_PSF_SPREAD * typical if typical > ROUGH_PSF_MISFIT else 0.0
+
+
+def _likeness(s: Stamps, fits: PointFits, width_px: Array, own: LightNoise) -> tuple[Array, Array]:
+    """How far the sources (n) are from the Gaussian PSF, and their chi^2 as straight edges or lines instead.
+
+    The first is the root of the squared residual beyond the noise over the squared light: 0 for a perfect star, about
+    0.6 for a single bright pixel.
+    """
+    light = own_light(s.centres, fits, width_px, s.data.shape[1] // 2)
+    noise = s.variance + np.float32(own.per_unit) * light
+    excess = np.square(s.data - light - fits.level[:, None, None].astype(np.float32)) - noise
+    weights = 1.0 / (noise + np.square(np.float32(own.model_error) * light))
+    squared = np.square(light)
+    if s.usable is not None:
+        excess, weights, squared = excess * s.usable, weights * s.usable, squared * s.usable
+    total = squared.sum(axis=(1, 2), dtype=np.float64)
+    misfit = np.sqrt(np.maximum(excess.sum(axis=(1, 2), dtype=np.float64), 0.0) / np.maximum(total, 1e-12))
+    return misfit, edge_chi2(s.data, weights)

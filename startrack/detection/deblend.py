@@ -1,0 +1,161 @@
+"""Fits of all candidates, each with its neighbours' light taken away."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from startrack.detection.fit import ROUNDS, ROUNDS_AGAIN, PointFits, Stamps, fit_points, joined
+from startrack.detection.frame import Frame, LightNoise, Pixels, radius_for
+from startrack.detection.peaks import Peaks
+from startrack.detection.source_noise import measured_light_noise
+from startrack.psf import pixel_profile_single
+from startrack.types import Array, Ints
+
+CROWDED_ROUNDS = 3  # of subtracting neighbours and fitting again
+NEIGHBOUR_SIGMA = 0.1  # neighbours' light above this part of a pixel's noise is taken away
+NEIGHBOUR_ERROR = np.float32(0.1)  # of it is not known: neighbours' fits, and the PSF's wings
+BATCH_PIXELS = 2_000_000  # of neighbours' stamps at a time
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """All candidates (n) with their stamps and fits, and the noise of the light of the stars themselves."""
+
+    stamps: Stamps
+    fits: PointFits
+    light_noise: LightNoise
+
+
+def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = None) -> Fitted:
+    """Fits of all candidates; of the stars already `known`, whose light `frame.found` holds, only once more.
+
+    The known ones are the first of the peaks.
+    """
+    radius = radius_for(sigma)
+    centres = peaks.centres
+    data, variance, usable = frame.data(centres, radius), frame.variance(centres, radius), frame.usable(centres, radius)
+    stamps = Stamps(data, variance, usable, centres, peaks.surround)
+    last = np.zeros_like(data)  # neighbours' light with which each was fitted
+    if known is not None and frame.found is not None:
+        last = frame.light(centres, radius)
+        last[: len(known.flux)] -= own_light(centres[: len(known.flux)], known, sigma, radius)
+        last[np.square(last).max(axis=(1, 2)) <= NEIGHBOUR_SIGMA**2 * variance[:, radius, radius]] = 0.0
+    fits = _first_fits(frame, peaks, _without(stamps, last), sigma, 0 if known is None else len(known.flux))
+    star, other = _pairs(centres, 1.5 * radius + 3.0 * sigma)
+    alone = np.ones(len(centres), dtype=bool)
+    alone[star[_may_count(stamps, fits, star, other, sigma)]] = False
+    light_noise = measured_light_noise(stamps, fits, alone, sigma, frame.light_noise)
+    bright = _otherwise_weighted(fits, sigma, variance, frame.light_noise, light_noise)
+    if len(bright):
+        start = fits.xy_px[bright]
+        part = _without(stamps.part(bright), last[bright])
+        again = fit_points(part, start, sigma, light_noise, peaks.own_part, ROUNDS_AGAIN)
+        fits = fits.replaced(bright, again)
+    for _ in range(CROWDED_ROUNDS):
+        crowded, light = _neighbours_light(stamps, fits, star, other, sigma)
+        changed = (np.square(light - last[crowded]) > NEIGHBOUR_SIGMA**2 * variance[crowded]).any(axis=(1, 2))
+        crowded, light = crowded[changed], light[changed]
+        if not len(crowded):
+            break
+        last[crowded] = light
+        cleaned = _without(stamps.part(crowded), light)
+        again = fit_points(cleaned, fits.xy_px[crowded], sigma, light_noise, peaks.own_part, ROUNDS_AGAIN)
+        fits = fits.replaced(crowded, again)
+    return Fitted(stamps, fits, light_noise)
+
+
+def _first_fits(frame: Frame, peaks: Peaks, stamps: Stamps, sigma: float, known: int) -> PointFits:
+    """Fits of all candidates, the first of which are `known` already and need less."""
+    fits = [
+        fit_points(stamps.part(which), peaks.start_xy_px[which], sigma, frame.light_noise, peaks.own_part, rounds)
+        for which, rounds in ((slice(0, known), ROUNDS_AGAIN), (slice(known, None), ROUNDS))
+        if len(stamps.centres[which])
+    ]
+    return joined(fits)
+
+
+def _without(stamps: Stamps, light: Pixels) -> Stamps:
+    """The stamps without their neighbours' light, of which a part is not known."""
+    return replace(stamps, data=stamps.data - light, variance=stamps.variance + np.square(NEIGHBOUR_ERROR * light))
+
+
+def _otherwise_weighted(fits: PointFits, sigma: float, variance: Pixels, was: LightNoise, now: LightNoise) -> Ints:
+    """Candidates whose middle pixel has another variance by a tenth with what is known now of the light's noise."""
+    light = np.maximum(fits.flux, 0.0) / (2.0 * np.pi * sigma**2 + 1.0)
+    dark = variance[:, variance.shape[1] // 2, variance.shape[2] // 2]
+    before, after = (dark + light * (n.per_unit + n.model_error**2 * light) for n in (was, now))
+    return np.flatnonzero(np.abs(after - before) > 0.1 * before)
+
+
+def _pairs(centres: Ints, reach_px: float) -> tuple[Ints, Ints]:
+    """Each candidate that has another one within reach, ascending, and that other one: both (m,)."""
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(centres).query_pairs(reach_px, output_type="ndarray")
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    both = both[np.argsort(both[:, 0], kind="stable")]
+    return both[:, 0], both[:, 1]
+
+
+def _neighbours_light(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> tuple[Ints, Pixels]:
+    """The candidates (k,) into whose stamps others put light that counts, and that light (k, s, s)."""
+    side = s.data.shape[1]
+    radius = side // 2
+    counts = _may_count(s, fits, star, other, sigma)
+    star, other = star[counts], other[counts]
+    crowded, light = [np.zeros(0, dtype=np.int64)], [np.zeros((0, side, side), dtype=np.float32)]
+    firsts = np.flatnonzero(np.diff(star, prepend=-1))
+    pairs_at_a_time = max(1, BATCH_PIXELS // (side * side))
+    while len(firsts):
+        # Whole stars at a time, at least one: all pairs up to the first of a later star.
+        end = np.searchsorted(firsts, firsts[0] + pairs_at_a_time)
+        last = firsts[end] if end < len(firsts) else len(star)
+        here = slice(firsts[0], last)
+        offset = fits.xy_px[other[here]] - s.centres[star[here]]
+        px, _ = pixel_profile_single(offset[:, 0], sigma, radius)
+        py, _ = pixel_profile_single(offset[:, 1], sigma, radius)
+        py *= np.maximum(fits.flux[other[here]], 0.0)[:, None].astype(np.float32)
+        each = py[:, :, None] * px[:, None, :]
+        sums = np.add.reduceat(each, firsts[:end] - firsts[0], axis=0)
+        who = star[firsts[:end]]
+        matters = (np.square(sums) > NEIGHBOUR_SIGMA**2 * s.variance[who]).any(axis=(1, 2))
+        crowded.append(who[matters])
+        light.append(sums[matters])
+        firsts = firsts[end:]
+    return np.concatenate(crowded), np.concatenate(light)
+
+
+def _may_count(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> Array:
+    """Which pairs (m,) can matter: the neighbour's light at the stamp's nearest pixel against the middle's noise."""
+    radius = s.data.shape[1] // 2
+    beyond = np.maximum(np.abs(fits.xy_px[other] - s.centres[star]) - radius - 0.5, 0.0)
+    wing = np.exp(-0.5 * np.sum(np.square(beyond), axis=1) / (sigma**2 + 0.1))
+    top = min(1.0, 1.0 / (2 * np.pi * sigma**2))
+    noise = np.sqrt(s.variance[star, radius, radius])
+    return np.asarray(fits.flux[other] * top * wing > 0.3 * NEIGHBOUR_SIGMA * noise)
+
+
+def own_light(centres: Ints, fits: PointFits, sigma: float | Array, radius: int) -> Pixels:
+    """Light (n, s, s) of each source in its own stamp."""
+    offset = fits.xy_px - centres
+    px, _ = pixel_profile_single(offset[:, 0], sigma, radius)
+    py, _ = pixel_profile_single(offset[:, 1], sigma, radius)
+    py *= np.maximum(fits.flux, 0.0)[:, None].astype(np.float32)
+    return np.asarray(py[:, :, None] * px[:, None, :])
+
+
+def painted(fits: PointFits, sigma: float, shape: tuple[int, int]) -> Pixels:
+    """Light (H, W) of the fitted sources, to 5 sigma."""
+    radius = int(np.ceil(5.0 * sigma))
+    side = 2 * radius + 1
+    image = np.zeros((shape[0] + 2 * side, shape[1] + 2 * side), dtype=np.float32)
+    centres = np.clip(np.rint(fits.xy_px).astype(np.int64), -radius, np.array([shape[1], shape[0]]) + radius)
+    size = max(1, BATCH_PIXELS // (side * side))
+    for at in range(0, len(centres), size):
+        here = np.arange(at, min(at + size, len(centres)))
+        corners = centres[here] + side - radius
+        for (column, row), light in zip(corners, own_light(centres[here], fits.take(here), sigma, radius), strict=True):
+            image[row : row + side, column : column + side] += light
+    return image[side:-side, side:-side]

@@ -1,0 +1,97 @@
+"""The noise of the stars' own light, measured from the residuals of the bright ones: photon noise and PSF misfit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from startrack.detection.fit import PointFits, Stamps
+from startrack.detection.frame import MODEL_ERROR, LightNoise
+from startrack.psf import pixel_profile
+from startrack.types import Array, Bools, Ints
+
+BRIGHT_SNR = 15.0
+FEWEST, MOST = 20, 120
+FAINT_PART = 0.3  # of the pixel's variance: pixels with less of the star's light tell nothing
+MOST_LEVERAGE = 0.5  # pixels that the fit follows hide their noise
+BINS, FEWEST_IN_BIN = 12, 15
+MOST_ALIKE = 2.0
+MEDIAN_OF_SQUARE = 0.4549  # of a unit Gaussian
+LEAST_MODEL_ERROR = 0.005
+
+
+def measured_light_noise(s: Stamps, fits: PointFits, alone: Bools, sigma: float, expected: LightNoise) -> LightNoise:
+    """The frame's own; `expected` where too few bright stars tell. Photon noise that a camera file states is kept.
+
+    From stars `alone` (n,): in bins of a pixel's light, the median squared residual beyond the noise of the dark is
+    a light + b light^2. The PSF's misfit is never taken to be larger than expected. Where residuals of different stars
+    are alike, the PSF is not the model's, and unknown photon noise cannot be told from that.
+    """
+    bright = _bright(s, fits, alone)
+    if len(bright) < FEWEST:
+        return expected
+    light, excess, alike = _excess(s.part(bright), fits.take(bright), sigma)
+    if expected.per_unit == 0.0 and alike > MOST_ALIKE:
+        return expected
+    if len(light) < BINS * FEWEST_IN_BIN:
+        return expected
+    order = np.argsort(light, kind="stable")
+    bins = [part for part in np.array_split(order, BINS) if len(part) >= FEWEST_IN_BIN]
+    rows = [(np.median(light[part]), *_typical(excess[:, part])) for part in bins]
+    level, beyond, error = np.array(rows).T
+    return _fitted(level, beyond, error, expected)
+
+
+def _fitted(level: Array, beyond: Array, error: Array, expected: LightNoise) -> LightNoise:
+    """Weighted least squares for a and b, neither below 0; a is kept where it is known."""
+    one, two = level / error, level**2 / error
+    per_unit = expected.per_unit
+    if per_unit == 0.0:
+        normal = np.array([[one @ one, one @ two], [one @ two, two @ two]])
+        right = np.array([one @ (beyond / error), two @ (beyond / error)])
+        per_unit, b = np.linalg.solve(normal, right)
+        per_unit = float(max(per_unit if b >= 0 else right[0] / normal[0, 0], 0.0))
+    b = float(two @ ((beyond - per_unit * level) / error) / (two @ two))
+    return LightNoise(per_unit, float(np.clip(np.sqrt(max(b, 0.0)), LEAST_MODEL_ERROR, MODEL_ERROR)))
+
+
+def _bright(s: Stamps, fits: PointFits, alone: Bools) -> Ints:
+    good = alone & (fits.snr > BRIGHT_SNR) & (fits.chi2 < fits.chi2_pixel)
+    if s.usable is not None:
+        good &= s.usable.all(axis=(1, 2))
+    which = np.flatnonzero(good)
+    # Some of every brightness: the brightest tell the PSF's misfit, the others photon noise.
+    return which[np.argsort(-fits.snr[which], kind="stable")][:: max(1, len(which) // MOST)]
+
+
+def _excess(s: Stamps, fits: PointFits, sigma: float) -> tuple[Array, Array, float]:
+    """Light (m,) of the stars' pixels; (2, m) squared residuals (what the fit took of them given back) and variances;
+    and how alike the stars' residuals are: 1 for independent ones.
+    """
+    radius = s.data.shape[1] // 2
+    offset, n = fits.xy_px - s.centres, len(s.data)
+    px, dx = pixel_profile(offset[:, 0], sigma, radius)
+    py, dy = pixel_profile(offset[:, 1], sigma, radius)
+    flux = np.maximum(fits.flux, 0.0)[:, None, None]
+    shape = py[:, :, None] * px[:, None, :]
+    light = flux * shape
+    gradient = [flux * py[:, :, None] * dx[:, None, :], flux * dy[:, :, None] * px[:, None, :], shape, 1.0 + 0 * shape]
+    g = np.stack([q.reshape(n, -1) for q in gradient], axis=1)
+    residual = (s.data - light - fits.level[:, None, None]).reshape(n, -1)
+    squared = np.square(residual)
+    variance = s.variance.reshape(n, -1).astype(np.float64)
+    seen = np.maximum(squared, variance + np.square(MODEL_ERROR * light.reshape(n, -1)))
+    leverage = np.sum(g * np.matmul(fits.covariance, g), axis=1) / seen
+    use = (light.reshape(n, -1) > FAINT_PART * variance) & (leverage < MOST_LEVERAGE)
+    relative = residual / flux[:, :, 0]
+    relative /= np.maximum(
+        np.sqrt(np.mean(np.square(relative), axis=1, keepdims=True)), 1e-30
+    )  # each star counts alike
+    alike = float(np.sum(np.square(relative.sum(axis=0))) / np.sum(np.square(relative)))
+    return light.reshape(n, -1)[use], np.stack([(squared / (1.0 - leverage))[use], variance[use]]), alike
+
+
+def _typical(squared_and_variance: Array) -> tuple[float, float]:
+    """Variance beyond the dark pixel's, and its error."""
+    total = float(np.median(squared_and_variance[0])) / MEDIAN_OF_SQUARE
+    dark = float(np.median(squared_and_variance[1]))
+    return total - dark, max(total, dark) * 2.0 / np.sqrt(squared_and_variance.shape[1])

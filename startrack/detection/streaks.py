@@ -1,0 +1,138 @@
+"""Frames whose stars are drawn out into streaks: the middles of the streaks, or a refusal that says so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from startrack.detection.frame import Frame
+from startrack.types import Array, Bools, Ints
+
+PIXEL_SIGMAS = 2.5  # of the lightly smoothed image: what belongs to a streak
+SMOOTH_PX = 1.0
+FEWEST_PX, MOST_PX = 12, 20_000
+BRIGHT_SNR = 15.0  # of the whole streak
+FEWEST = 6  # streaks that agree with each other
+LONG_PX, SLENDER = 4.5, 2.5  # shortest streak, and its length over its width
+SAME_DIRECTION, SAME_LENGTH = np.cos(np.radians(15.0)), 0.3
+LOOK_RADIUS_PX, LOOKED_AT, LOOK_SIGMAS, LOOK_LONG_PX2, LOOK_SLENDER = 7, 100, 4.0, 2.2, 2.2
+IN_LINE_PART = 0.45
+STREAKED_PART = 0.6  # of the bright blobs
+
+
+@dataclass(frozen=True)
+class Streaks:
+    """Streaks (n), brightest first."""
+
+    xy_px: Array  # (n, 2) middle of the light
+    covariance_px2: Array  # (n, 2, 2)
+    flux: Array
+    flux_sigma: Array
+    length_px: float  # typical
+    width_px: float  # typical standard deviation across
+
+
+def drawn_out(frame: Frame, centres: Ints) -> bool:
+    """Whether the highest peaks (n, 2) are parts of something long rather than round: a quick look."""
+    height, width = frame.shape
+    margin = np.minimum(centres, np.array([width, height]) - 1 - centres).min(axis=1)
+    centres = centres[margin >= LOOK_RADIUS_PX][:LOOKED_AT]
+    if len(centres) < FEWEST:
+        return False
+    light, noise = frame.data(centres, LOOK_RADIUS_PX), np.sqrt(frame.variance(centres, LOOK_RADIUS_PX))
+    light = np.where(light > LOOK_SIGMAS * noise, light, 0.0)
+    offset = np.arange(-LOOK_RADIUS_PX, LOOK_RADIUS_PX + 1)
+    x, y = np.meshgrid(offset, offset)
+    total = np.maximum(light.sum(axis=(1, 2)), 1e-9)
+    xx, xy, yy = (np.sum(light * q, axis=(1, 2)) / total for q in (x * x, x * y, y * y))
+    trace, spread = xx + yy, np.hypot(xx - yy, 2.0 * xy)
+    long = (trace + spread) > LOOK_SLENDER * (trace - spread + 0.2)
+    return bool(np.mean(long & (trace + spread > 2.0 * LOOK_LONG_PX2)) > 0.5)
+
+
+def find_streaks(frame: Frame) -> Streaks | None:
+    """The frame's streaks where most of its bright blobs are streaks like their neighbours'; else None.
+
+    The middle of a streak's light is where the star stood at mid-exposure, if the camera turned evenly and the sky was
+    equally clear all the time; a hundredth of the length is allowed for what was not. Tracks of particles have all
+    directions and lengths, and are not streaks of stars.
+    """
+    height, width = frame.shape
+    whole = frame.standardised(slice(0, height))
+    if frame.dead is not None:
+        whole = np.where(frame.dead, np.float32(50.0), whole)
+    smooth = cv2.GaussianBlur(whole, (0, 0), SMOOTH_PX)
+    quiet = 1.0 / np.sqrt(4.0 * np.pi * SMOOTH_PX**2)
+    mask = (smooth > PIXEL_SIGMAS * 2.0 * quiet).astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
+    area = stats[:, cv2.CC_STAT_AREA]
+    left, top = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_TOP]
+    off_border = (left > 1) & (top > 1)
+    off_border &= (left + stats[:, cv2.CC_STAT_WIDTH] < width - 1) & (top + stats[:, cv2.CC_STAT_HEIGHT] < height - 1)
+    rows, columns = np.nonzero(cv2.dilate(mask, np.ones((3, 3), np.uint8)))
+    label = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8))[rows, columns].astype(np.int64)
+    light = (frame.image[rows, columns] - frame.background[rows, columns]).astype(np.float64)
+    variance = np.square(frame.noise[rows, columns].astype(np.float64))
+    variance += frame.light_noise.per_unit * np.maximum(light, 0.0)
+    blobs = _moments(label, np.stack([columns, rows], axis=1).astype(np.float64), light, variance, count)
+    flux, flux_sigma, xy, spread, covariance = blobs
+    bright = (area >= FEWEST_PX) & (area <= MOST_PX) & off_border & (flux > BRIGHT_SNR * flux_sigma)
+    bright[0] = False
+    which = np.flatnonzero(bright)
+    if len(which) < FEWEST:
+        return None
+    values, vectors = np.linalg.eigh(spread[which])
+    length, across = (
+        np.sqrt(12.0 * np.maximum(values[:, 1] - values[:, 0], 0.0)),
+        np.sqrt(np.maximum(values[:, 0], 0.1)),
+    )
+    streaked = (length > LONG_PX) & (length > SLENDER * across)
+    if streaked.sum() < FEWEST or streaked.mean() < STREAKED_PART:
+        return None
+    which, length, across, along = which[streaked], length[streaked], across[streaked], vectors[streaked][:, :, 1]
+    alike = _like_a_neighbour(xy[which], along, length)
+    if alike.sum() < FEWEST or alike.mean() < STREAKED_PART:
+        return None
+    which, length, across = which[alike], length[alike], across[alike]
+    order = np.argsort(-flux[which], kind="stable")
+    which, length = which[order], length[order]
+    uneven = np.einsum("ni,nj->nij", along[alike][order], along[alike][order]) * np.square(0.01 * length)[:, None, None]
+    return Streaks(
+        xy_px=xy[which], covariance_px2=covariance[which] + uneven, flux=flux[which], flux_sigma=flux_sigma[which],
+        length_px=float(np.median(length)), width_px=float(np.median(across)),
+    )  # fmt: skip
+
+
+def _moments(label: Ints, xy: Array, light: Array, variance: Array, count: int) -> tuple[Array, ...]:
+    """Flux (count,), its sigma, middle (count, 2), second moments (count, 2, 2), covariance of the middle."""
+
+    def total(values: Array) -> Array:
+        return np.bincount(label, values, count).astype(np.float64)
+
+    flux = np.maximum(total(light), 1e-9)
+    middle = np.stack([total(light * xy[:, 0]), total(light * xy[:, 1])], axis=1) / flux[:, None]
+    off = xy - middle[label]
+    spread, covariance = np.empty((count, 2, 2)), np.empty((count, 2, 2))
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        spread[:, i, j] = total(light * off[:, i] * off[:, j]) / flux
+        covariance[:, i, j] = total(variance * off[:, i] * off[:, j]) / flux**2
+    covariance += 1e-4 * np.eye(2)  # a hundredth of a pixel for the edges of the mask
+    return flux, np.sqrt(np.maximum(total(variance), 1e-12)), middle, spread, covariance
+
+
+def _like_a_neighbour(xy: Array, along: Array, length: Array) -> Bools:
+    """Which streaks (n,) have the direction and length of one of the three nearest others."""
+    from scipy.spatial import cKDTree
+
+    _, near = cKDTree(xy).query(xy, k=min(4, len(xy)))
+    off = xy[near[:, 1:]] - xy[:, None]
+    off /= np.maximum(np.linalg.norm(off, axis=-1, keepdims=True), 1e-9)
+    # Pieces of one long edge follow each other in their own direction; of stars one in six does.
+    in_line = np.abs(np.einsum("ni,nki->nk", along, off)) > SAME_DIRECTION
+    if in_line[:, 0].mean() > IN_LINE_PART:
+        return np.zeros(len(xy), dtype=bool)
+    parallel = np.abs(np.einsum("ni,nki->nk", along, along[near[:, 1:]])) > SAME_DIRECTION
+    as_long = np.abs(np.log(length[near[:, 1:]] / length[:, None])) < SAME_LENGTH
+    return np.asarray((parallel & as_long).any(axis=1))

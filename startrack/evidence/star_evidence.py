@@ -1,0 +1,203 @@
+"""Evidence of the stars: for every catalogue star in view, does it shine or is it hidden?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.camera import Camera
+from startrack.evidence.flux_scale import FluxScale
+from startrack.evidence.likelihood_ratio import gaussian_ratio, shines_ratio
+from startrack.evidence.photometry import Photometry, Sources, half_width, measure
+from startrack.frames import angle_between_rad, azel_from_rays
+from startrack.psf import noise_area_px
+from startrack.types import Array, Body, Bools, Detections, Evidence, Ints, Stars
+
+FAINTEST_SNR = 0.5  # fainter stars say next to nothing and would only cost time
+CROWDED = 2.0  # PSF areas per star: where more stars share the pixels, the same light would be counted twice
+BODY_GLARE_PX = 8.0
+DISKS_RAD = {"Sun": 0.0047, "Moon": 0.0049, "Earth": 0.0180}  # largest radii, the Earth's seen from the Moon
+TELLING_SNR = 2.0  # stars brighter than this tell whether they shine
+SEEN_LLR = 3.0  # from here on a star counts as seen, from minus this as hidden
+
+
+@dataclass(frozen=True, kw_only=True)
+class StarLight:
+    """What was expected and measured at each catalogue star in the frame (n); the star table's rows."""
+
+    star: Ints  # index into Stars
+    xy_px: Array  # (n, 2) predicted
+    azimuth_rad: Array
+    elevation_rad: Array
+    expected_e: Array
+    flux_e: Array  # measured
+    sigma_e: Array  # of the measured flux if nothing shines
+    llr: Array  # 0 where unusable
+    cause: NDArray[np.str_]  # "" where usable, else why not
+
+    @property
+    def usable(self) -> Bools:
+        return np.asarray(self.cause == "")
+
+    def renewed(self, newer: StarLight, which: Ints) -> StarLight:
+        """With what a newer measurement says of the stars `which`, of those that both have."""
+        there = np.flatnonzero(np.isin(newer.star, which))
+        here = np.searchsorted(self.star, newer.star[there])
+        fresh = {}
+        for name in ("flux_e", "sigma_e", "llr", "cause"):
+            values = getattr(self, name).copy()
+            values[here] = getattr(newer, name)[there]
+            fresh[name] = values
+        return replace(self, **fresh)
+
+    def evidence(self) -> Evidence:
+        """The rays for the localizer."""
+        use = self.usable
+        return Evidence(
+            azimuth_rad=self.azimuth_rad[use],
+            elevation_rad=self.elevation_rad[use],
+            llr=self.llr[use],
+            edge_sigma_rad=np.zeros(int(use.sum())),
+        )
+
+
+@dataclass(frozen=True)
+class StarEvidence:
+    """Forced photometry at the catalogue's stars, turned into log-likelihood ratios."""
+
+    faintest_snr: float = FAINTEST_SNR
+    crowded: float = CROWDED
+    capped: bool = True  # False: plain Gaussian ratios, to see what the caps are worth
+
+    def __call__(
+        self,
+        image_e: NDArray[np.float32],
+        dead: NDArray[np.bool_],
+        detections: Detections,
+        camera: Camera,
+        stars: Stars,
+        bodies: list[Body],
+        R_cam_icrs: Array,
+        R_enu_icrs: Array,
+        scale: FluxScale,
+        place_sigma_px: float,
+        visible: Array | None = None,
+    ) -> StarLight:
+        """Light at every star in view.
+
+        `image_e` in electrons, background included; `visible` (len(stars),) is the probability that each star shines
+        where something is known of it already (used for its light in its neighbours' measurements only).
+        """
+        sigma_px = detections.psf_sigma_px
+        noise_e = float(np.median(detections.noise_e)) * np.sqrt(noise_area_px(sigma_px))
+        faintest = scale.zero_mag - 2.5 * np.log10(self.faintest_snr * max(noise_e, 1e-9))
+        star = np.flatnonzero(stars.v_mag < faintest)
+        rays_cam = stars.rays_icrs[star] @ R_cam_icrs.T
+        xy, inside = camera.project(rays_cam)
+        brightest = np.flatnonzero(inside)[: _room(camera, self.crowded * noise_area_px(sigma_px))]
+        star, xy, rays_cam = star[brightest], xy[brightest], rays_cam[brightest]
+        angle = np.arctan2(np.hypot(rays_cam[:, 0], rays_cam[:, 1]), rays_cam[:, 2])
+        expected = scale.flux_e(stars.v_mag[star], angle, camera)
+        # Light is lost from a misplaced profile. The rays themselves owe nothing to the lens: they are the catalogue's.
+        misplaced2 = place_sigma_px**2 + (np.square(camera.map_sigma_px(rays_cam)) if camera.covariance_order else 0.0)
+        blur = misplaced2 / (2 * sigma_px) ** 2
+        fraction = np.sqrt(scale.scatter**2 + np.square(0.4 * np.log(10) * stars.v_sigma_mag[star]) + blur**2)
+        cause = _unusable(xy, angle, camera, bodies, R_cam_icrs, half_width(sigma_px))
+        measurable = np.flatnonzero(cause != "off the frame")
+        residual = image_e - detections.background_e
+
+        shining = (
+            visible[star[measurable]]
+            if visible is not None
+            else _guess(residual, detections, dead, xy[measurable], expected[measurable], fraction[measurable])
+        )
+        sources = Sources(
+            xy_px=xy[measurable], flux_e=expected[measurable], fraction_sigma=fraction[measurable], visible=shining
+        )
+        light = measure(residual, detections.noise_e, dead, sources, sigma_px)
+        llr, sigma = _ratios(light, expected[measurable], fraction[measurable], self.capped)
+        azimuth, elevation = azel_from_rays(stars.rays_icrs[star] @ R_enu_icrs.T)
+        cause[measurable[~light.usable & (cause[measurable] == "")]] = "bad pixels"
+        return StarLight(
+            star=star,
+            xy_px=xy,
+            azimuth_rad=azimuth,
+            elevation_rad=elevation,
+            expected_e=expected,
+            flux_e=_spread(light.flux_e, measurable, len(star)),
+            sigma_e=_spread(sigma, measurable, len(star)),
+            llr=np.where(cause == "", _spread(llr, measurable, len(star)), 0.0),
+            cause=cause,
+        )
+
+
+def _room(camera: Camera, area_px: float) -> int:
+    """How many stars fit on the frame, each on an area [px^2] of its own. Stars are sorted, the brightest first."""
+    rho = float(camera.lens.rho(np.array(camera.max_angle_rad)))
+    circle = np.pi * camera.focal_px[0] * camera.focal_px[1] * rho**2
+    width, height = camera.size_px
+    return max(int(min(circle, width * height) / area_px), 1)
+
+
+def _guess(
+    residual: NDArray[np.float32],
+    detections: Detections,
+    dead: NDArray[np.bool_],
+    xy_px: Array,
+    expected_e: Array,
+    fraction: Array,
+) -> Array:
+    """Probability (n,) that each star shines, before anything is known: the brighter ones tell by themselves.
+
+    Needed for their light in their neighbours' measurements; of the faint ones nothing is known (one half).
+    """
+    shining = np.full(len(xy_px), 0.5)
+    noise_e = detections.noise_e[tuple(np.rint(xy_px).astype(int).T[::-1])]
+    bright = np.flatnonzero(expected_e > TELLING_SNR * noise_e * np.sqrt(noise_area_px(detections.psf_sigma_px)))
+    if len(bright):
+        alone = np.zeros(len(bright))
+        sources = Sources(
+            xy_px=xy_px[bright], flux_e=expected_e[bright], fraction_sigma=fraction[bright], visible=alone
+        )
+        light = measure(residual, detections.noise_e, dead, sources, detections.psf_sigma_px)
+        llr, _ = _ratios(light, expected_e[bright], fraction[bright])
+        shining[bright] = 1.0 / (1.0 + np.exp(-llr))
+    return shining
+
+
+def _ratios(light: Photometry, expected_e: Array, fraction: Array, capped: bool = True) -> tuple[Array, Array]:
+    """Log-likelihood ratios and the standard deviations of the fluxes if nothing shines."""
+    hidden = light.variance_e2 + light.neighbour_variance_e2
+    shining = hidden + light.own_shot * expected_e + np.square(fraction * expected_e)
+    sigma = np.sqrt(hidden)
+    ratio = shines_ratio if capped else gaussian_ratio
+    return ratio(light.flux_e, expected_e, sigma, np.sqrt(shining)), sigma
+
+
+def _unusable(
+    xy_px: Array, angle_rad: Array, camera: Camera, bodies: list[Body], R_cam_icrs: Array, margin: int
+) -> NDArray[np.str_]:
+    """Why stars (n) cannot be used; empty where they can."""
+    cause = np.full(len(xy_px), "", dtype="U32")
+    for body in bodies:
+        at, seen = camera.project(body.ray_icrs @ R_cam_icrs.T)
+        if seen:
+            off_axis = angle_between_rad(body.ray_icrs @ R_cam_icrs.T, np.array([0.0, 0.0, 1.0]))
+            disk_px = DISKS_RAD.get(body.name, 0.0) / camera.mean_scale_rad_per_px(off_axis)
+            cause[np.hypot(*(xy_px - at).T) < BODY_GLARE_PX + disk_px] = f"beside {body.name}"
+    # The stamp must lie within the lit circle: beyond its edge the background is another.
+    edge = camera.max_angle_rad - (margin + 1) * camera.mean_scale_rad_per_px(np.array(camera.max_angle_rad))
+    cause[angle_rad > edge] = "edge of the image circle"
+    cause[angle_rad > camera.calibrated_angle_rad] = "beyond the calibrated angle"
+    width, height = camera.size_px
+    x, y = xy_px[:, 0], xy_px[:, 1]
+    cause[(x < margin) | (y < margin) | (x > width - 1 - margin) | (y > height - 1 - margin)] = "off the frame"
+    return cause
+
+
+def _spread(values: Array, index: Ints, n: int) -> Array:
+    full = np.zeros(n)
+    full[index] = values
+    return full

@@ -1,0 +1,272 @@
+"""Where time, exposure seconds, camera and terrain come from: flag, then sidecar, then header; nothing is guessed."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from startrack.exposure.decoded import shown
+from startrack.frames.time import as_utc, parse_utc
+from startrack.types import BadInput, Exposure
+
+# Names in a header (FITS keywords, PNG text chunks, TIFF description) and what each stands for. The sidecar's own names
+# are understood there too, except in FITS, where a card called CAMERA is common and names the hardware.
+HEADER_KEYS = {k: k for k in ("DATE-AVG", "DATE-OBS", "TIMESYS", "EXPTIME", "STCAMERA", "STTERRAI", "BAYERPAT")}
+SIDECAR_KEYS = {"time_utc": "DATE-AVG", "exposure_s": "EXPTIME", "camera": "STCAMERA", "terrain": "STTERRAI"}
+SIDECAR_KEYS |= {"bayer_pattern": "BAYERPAT"}
+HEADER_KEYS |= SIDECAR_KEYS
+BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".crw", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"}
+PICTURE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".fits", ".fit", ".fts"} | RAW_SUFFIXES
+PACKING_SUFFIXES = {".gz", ".bz2", ".fz"}
+MAX_EXPOSURE_S = 1e6
+MAX_SIDECAR_BYTES = 2**20
+MOST_UNKNOWN_KEYS = 5  # that are warned of one by one
+
+
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """What is known of an exposure besides its pixels; None where it is not known."""
+
+    time_utc: datetime | None = None  # mid-exposure, timezone-aware
+    exposure_s: float | None = None
+    camera: str | None = None  # path, or name of a shipped file
+    terrain: str | None = None  # path, or name of a shipped file
+    bayer_pattern: str | None = None  # RGGB and the like: the pixels are a mosaic of colours
+    warnings: tuple[str, ...] = ()  # what was found and not used, and why
+
+
+def with_facts(
+    exposure: Exposure,
+    *,
+    time_utc: datetime | None = None,
+    exposure_s: float | None = None,
+    camera: str | None = None,
+    terrain: str | None = None,
+) -> Exposure:
+    """The exposure with every fact that is given here in place of its own.
+
+    A mid-exposure time that was reckoned from DATE-OBS and a header's EXPTIME is not moved by a new `exposure_s`; give
+    the facts to `read_exposure` for that. Raises ValueError for a time without zone.
+    """
+    given: dict[str, Any] = {"exposure_s": exposure_s, "camera": camera, "terrain": terrain}
+    given["time_utc"] = None if time_utc is None else as_utc(time_utc)
+    return replace(exposure, **{key: value for key, value in given.items() if value is not None})
+
+
+def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts:
+    """The facts of `image` from, in this order: `given` (flags), its sidecar, its header.
+
+    A source is consulted only for what the ones before it leave open. An unusable value is refused in a sidecar
+    (`BadInput`: bad_image, or no_time), which is ours; in a header, which may be anybody's, it is a warning.
+    """
+    sidecar, values = _read_sidecar(image)
+    notes: list[str] = [*given.warnings, *_unknown_keys(sidecar, values)]
+    exposure_s = given.exposure_s
+    if exposure_s is None:
+        exposure_s = _sidecar_exposure_s(sidecar, values.get("exposure_s"))
+    if exposure_s is None:
+        exposure_s = _header_exposure_s(header.get("EXPTIME"), notes)
+    time_utc = given.time_utc
+    if time_utc is None:
+        time_utc = _sidecar_time(sidecar, values.get("time_utc"))
+    if time_utc is None:
+        time_utc = _header_time(header, exposure_s, notes)
+    return Facts(
+        time_utc=None if time_utc is None else as_utc(time_utc),
+        exposure_s=exposure_s,
+        camera=given.camera
+        or _sidecar_reference(sidecar, values, "camera")
+        or _header_reference(image, header, "STCAMERA", notes),
+        terrain=given.terrain
+        or _sidecar_reference(sidecar, values, "terrain")
+        or _header_reference(image, header, "STTERRAI", notes),
+        bayer_pattern=_sidecar_pattern(sidecar, values.get("bayer_pattern")) or _header_pattern(header, notes),
+        warnings=tuple(notes),
+    )
+
+
+def facts_in_text(text: str) -> dict[str, Any]:
+    """Header entries in a free text (TIFF ImageDescription, JPEG comment): a JSON object, or lines `KEY = value`."""
+    try:
+        entries = json.loads(text)
+    except (ValueError, RecursionError):  # no JSON, then: the other form, or a text about something else
+        pairs = (line.partition("=") for line in text.splitlines())
+        entries = {key.strip(): value.strip().strip("'\"") for key, _, value in pairs}
+    if not isinstance(entries, dict):
+        return {}
+    return {HEADER_KEYS[key]: value for key, value in reversed(entries.items()) if key in HEADER_KEYS}
+
+
+def stem(image: Path) -> str:
+    """Name without the suffixes of picture and packing: "night 1.2" for "night 1.2.fits.bz2"."""
+    return _stems(image)[-1]
+
+
+def sidecars(image: Path) -> list[Path]:
+    """Where a sidecar may lie, most specific first; NAME.json, the last one, is where it is written."""
+    return [image.with_name(name + ".json") for name in _stems(image)]
+
+
+def sidecar_of(image: Path) -> Path | None:
+    """The sidecar that lies there, if any. Cameras that write NAME.PNG write NAME.JSON."""
+    places = (place for path in sidecars(image) for place in (path, path.with_suffix(".JSON")))
+    return next((place for place in places if os.path.isfile(place)), None)
+
+
+def is_path(reference: str) -> bool:
+    """Whether a camera's or terrain's `reference` is a path; otherwise it is the name of a shipped file."""
+    return reference.endswith(".toml") or "/" in reference or "\\" in reference
+
+
+def _stems(image: Path) -> list[str]:
+    """["a.fits.bz2", "a.fits", "a"]."""
+    names = [image.name]
+    while Path(names[-1]).suffix.lower() in PACKING_SUFFIXES:
+        names.append(Path(names[-1]).stem)
+    last = Path(names[-1])
+    if last.suffix.lower() in PICTURE_SUFFIXES or len(names) == 1:
+        names.append(last.stem)
+    return names
+
+
+def _read_sidecar(image: Path) -> tuple[Path, dict[str, Any]]:
+    found = sidecar_of(image)
+    if found is None:
+        return image, {}
+    try:
+        with found.open("rb") as file:
+            raw = file.read(MAX_SIDECAR_BYTES + 1)
+        if len(raw) > MAX_SIDECAR_BYTES:
+            raise ValueError("more than 1 MiB")
+        values = json.loads(raw.decode("utf-8-sig"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise _bad_sidecar(found, f"cannot be read as JSON ({str(error)[:200]})") from error
+    if not isinstance(values, dict):
+        raise _bad_sidecar(found, 'holds no JSON object such as {"time_utc": "2031-03-26T20:58:11Z"}')
+    return found, values
+
+
+def _unknown_keys(sidecar: Path, values: Mapping[str, Any]) -> list[str]:
+    """A warning for each key that stands for nothing: a misspelt one would else be missed in silence."""
+    unknown = [key for key in values if key not in SIDECAR_KEYS]
+    return [
+        f"sidecar {shown(sidecar.name)}: key {key[:40]!r} is none of {', '.join(SIDECAR_KEYS)}; not used"
+        for key in unknown[:MOST_UNKNOWN_KEYS]
+    ]
+
+
+def _bad_sidecar(sidecar: Path, cause: str, reason: str = "bad_image") -> BadInput:
+    return BadInput(reason, " ".join(f"sidecar {shown(sidecar)}: {cause}".split()))
+
+
+def _sidecar_exposure_s(sidecar: Path, value: object) -> float | None:
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= MAX_EXPOSURE_S:
+        raise _bad_sidecar(sidecar, f"exposure_s is {str(value)[:40]!r}, not a number of seconds above 0")
+    return float(value)
+
+
+def _sidecar_time(sidecar: Path, value: object) -> datetime | None:
+    if value is None:
+        return None
+    try:
+        return parse_utc(str(value))
+    except BadInput as error:
+        raise _bad_sidecar(sidecar, f"time_utc: {str(error)[:200]}", error.reason) from error
+
+
+def _sidecar_reference(sidecar: Path, values: Mapping[str, Any], key: str) -> str | None:
+    value = values.get(key)
+    if value is None:
+        return None
+    if not isinstance(value, str) or not value.strip():
+        raise _bad_sidecar(sidecar, f"{key} is {str(value)[:40]!r}, not a file or the name of a shipped one")
+    return _from_folder(sidecar, value)
+
+
+def _header_reference(image: Path, header: Mapping[str, Any], key: str, notes: list[str]) -> str | None:
+    value = str(header.get(key) or "").strip()
+    if not value.isprintable():
+        notes.append(f"{key} is no name of a file; not used")
+        return None
+    return _from_folder(image, value) if value else None
+
+
+def _sidecar_pattern(sidecar: Path, value: object) -> str | None:
+    if value is None:
+        return None
+    if not _is_pattern(value):
+        raise _bad_sidecar(sidecar, f"bayer_pattern is {str(value)[:40]!r}, none of {', '.join(BAYER_PATTERNS)}")
+    return str(value).strip().upper()
+
+
+def _header_pattern(header: Mapping[str, Any], notes: list[str]) -> str | None:
+    value = str(header.get("BAYERPAT") or "").strip().upper()
+    if not value or _is_pattern(value):
+        return value or None
+    notes.append(f"BAYERPAT {value[:40]!r} is none of {', '.join(BAYER_PATTERNS)}; not used")
+    return None
+
+
+def _is_pattern(value: object) -> bool:
+    return isinstance(value, str) and value.strip().upper() in BAYER_PATTERNS
+
+
+def _from_folder(file: Path, reference: str) -> str:
+    """A path in `file` is relative to the folder of `file`; a name stays a name."""
+    return os.path.join(file.parent, reference) if is_path(reference) else reference
+
+
+def _header_exposure_s(value: object, notes: list[str]) -> float | None:
+    if value is None or value == "":
+        return None
+    try:
+        seconds = math.nan if isinstance(value, bool) else float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        seconds = math.nan
+    if 0 < seconds <= MAX_EXPOSURE_S:
+        return seconds
+    notes.append(f"EXPTIME {str(value)[:40]!r} is not a number of seconds above 0; not used")
+    return None
+
+
+def _header_time(header: Mapping[str, Any], exposure_s: float | None, notes: list[str]) -> datetime | None:
+    """Mid-exposure from DATE-AVG, or from DATE-OBS and half the exposure; the notes say why there is none."""
+    given = [key for key in ("DATE-AVG", "DATE-OBS") if str(header.get(key) or "").strip()]
+    if not given:
+        return None
+    scale = str(header.get("TIMESYS") or "UTC").strip().upper()
+    if scale != "UTC" and not scale.startswith("UTC("):  # FITS allows UTC(NIST) and the like
+        notes.append(f"{given[0]} not used: it is in the time scale {scale[:20]}, not UTC")
+        return None
+    for key in given:
+        try:
+            time = parse_utc(str(header[key]))
+        except BadInput as error:
+            notes.append(f"{key} not used: {str(error)[:200]}")
+            continue
+        if key == "DATE-AVG":
+            return time
+        if exposure_s is not None:
+            return _later(time, exposure_s / 2, notes)
+        notes.append(
+            "DATE-OBS is when the exposure starts, and without EXPTIME its middle is not known: "
+            "give the time of the middle (time_utc in a sidecar), or exposure_s"
+        )
+    return None
+
+
+def _later(start: datetime, seconds: float, notes: list[str]) -> datetime | None:
+    try:
+        return start + timedelta(seconds=seconds)
+    except OverflowError:
+        notes.append(f"DATE-OBS not used: {start} plus half the exposure is beyond the calendar")
+        return None

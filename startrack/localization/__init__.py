@@ -1,0 +1,19 @@
+"""Localization: evidence and terrain to a position. One method per file, all behind the same call."""
+
+from typing import Protocol
+
+from startrack.localization.consistency import check_consistency
+from startrack.localization.convex_hull import Hull
+from startrack.localization.posterior import ExactPosterior
+from startrack.localization.pseudo_gradient import PseudoGradient
+from startrack.terrain import Terrain
+from startrack.types import Evidence, Fix
+
+
+class Localizer(Protocol):
+    """Evidence and terrain to a fix; raises NotLocated."""
+
+    def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix: ...
+
+
+__all__ = ["ExactPosterior", "Hull", "Localizer", "PseudoGradient", "check_consistency"]

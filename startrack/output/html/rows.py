@@ -1,0 +1,114 @@
+"""The table of a page: one short list per image, and how large the errors are where the true places are known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from startrack.output.html.gather import Found
+
+Place = tuple[float, float]  # east, north [m]
+COLUMNS = (
+    "image", "stem", "status", "reason", "message", "time_utc", "terrain", "east_m", "north_m", "cov_ee", "cov_en",
+    "cov_nn", "radius95_m", "radius999_m", "identified", "rms_px", "seconds", "real_e", "real_n", "error_m", "nees",
+    "kind", "detail",
+)  # fmt: skip
+MESSAGE_LETTERS = 400
+
+
+def row_of(found: Found, real: Place | None, detailed: bool) -> list[Any]:
+    """The values of COLUMNS, None where there is none."""
+    record = found.record
+    position, stars, provenance = (part(record, key) for key in ("position", "stars", "provenance"))
+    place = number(position, "east_m"), number(position, "north_m")
+    covariance = _covariance(position)
+    error_m, nees = _error(place, covariance, real)
+    return [
+        record["image"], found.stem, record["status"], record.get("reason"),
+        str(record.get("message") or "")[:MESSAGE_LETTERS], provenance.get("time_utc"), provenance.get("terrain"),
+        rounded(place[0], 2), rounded(place[1], 2), *(rounded(value, 4) for value in covariance or (None,) * 3),
+        rounded(number(position, "radius95_m"), 2), rounded(number(position, "radius999_m"), 2),
+        stars.get("identified"), rounded(number(stars, "rms_px"), 3), rounded(_seconds(record), 3),
+        *((rounded(real[0], 2), rounded(real[1], 2)) if real else (None, None)), rounded(error_m, 2), rounded(nees, 3),
+        found.kind, detailed,
+    ]  # fmt: skip
+
+
+def errors_of(rows: Sequence[Sequence[Any]]) -> dict[str, Any] | None:
+    """Mean, median and largest error [m], mean NEES, and the parts inside the circles; None where nothing is known."""
+    at = {name: k for k, name in enumerate(COLUMNS)}
+    known = [row for row in rows if row[at["error_m"]] is not None]
+    if not known:
+        return None
+    errors = sorted(row[at["error_m"]] for row in known)
+    nees = [row[at["nees"]] for row in known if row[at["nees"]] is not None]
+    middle = len(errors) // 2
+    return {
+        "count": len(known),
+        "mean_m": rounded(sum(errors) / len(errors), 3),
+        "median_m": rounded(errors[middle] if len(errors) % 2 else (errors[middle - 1] + errors[middle]) / 2, 3),
+        "largest_m": errors[-1],
+        "mean_nees": rounded(sum(nees) / len(nees), 3) if nees else None,
+        "inside95": _inside(known, at["error_m"], at["radius95_m"]),
+        "inside999": _inside(known, at["error_m"], at["radius999_m"]),
+    }
+
+
+def chosen(found: Sequence[Found], most: int) -> set[int]:
+    """Which images get their details: those that were not solved first, up to half of `most`, then the others."""
+    unsolved = [k for k, one in enumerate(found) if one.record["status"] != "ok"]
+    solved = [k for k, one in enumerate(found) if one.record["status"] == "ok"]
+    first = unsolved[: max(most // 2, most - len(solved))]
+    return set(first + solved[: most - len(first)])
+
+
+def part(record: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """A dictionary within a record, empty where there is none."""
+    value = record.get(key)
+    return value if isinstance(value, dict) else {}
+
+
+def number(d: Mapping[str, Any], key: str) -> float | None:
+    """A finite number of a record, or None."""
+    value = d.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return float(value) if math.isfinite(value) else None
+
+
+def rounded(value: float | None, decimals: int) -> float | None:
+    """Rounded, None staying None."""
+    return None if value is None else round(value, decimals)
+
+
+def _covariance(position: dict[str, Any]) -> tuple[float, float, float] | None:
+    """East-east, east-north, north-north [m^2]."""
+    try:
+        (ee, en), (_, nn) = position["covariance_m2"]
+        return float(ee), float(en), float(nn)
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def _error(
+    place: tuple[float | None, float | None], covariance: tuple[float, float, float] | None, real: Place | None
+) -> tuple[float | None, float | None]:
+    """Distance from the true place [m] and NEES, e^T C^-1 e."""
+    if real is None or place[0] is None or place[1] is None:
+        return None, None
+    east, north = place[0] - real[0], place[1] - real[1]
+    ee, en, nn = covariance or (0.0, 0.0, 0.0)
+    determinant = ee * nn - en * en
+    nees = (nn * east**2 - 2 * en * east * north + ee * north**2) / determinant if determinant > 0 else None
+    return math.hypot(east, north), nees
+
+
+def _inside(known: Sequence[Sequence[Any]], error: int, radius: int) -> float | None:
+    held = [row[error] <= row[radius] for row in known if row[radius] is not None]
+    return rounded(sum(held) / len(held), 4) if held else None
+
+
+def _seconds(record: Mapping[str, Any]) -> float | None:
+    times = part(record, "timing_ms")
+    return sum(number(times, stage) or 0.0 for stage in times) / 1e3 if times else None

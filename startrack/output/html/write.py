@@ -1,0 +1,133 @@
+"""The page itself: a fixed frame, its style and scripts, and the results as JSON inside it."""
+
+from __future__ import annotations
+
+import html
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from startrack.exposure import write_atomically
+from startrack.output.html.advice import words_of
+from startrack.output.html.gather import Found, folder_of
+from startrack.output.html.ground import Grounds, ground_map, horizon_deg
+from startrack.output.html.picture import picture_of
+from startrack.output.html.rows import COLUMNS, Place, chosen, errors_of, number, part, row_of
+from startrack.output.html.stars import stars_of
+
+HERE = Path(__file__).parent
+STYLES = ("page.css",)
+SCRIPTS = ("basics.js", "view.js", "input.js", "sky.js", "map.js", "errors.js", "detail.js", "table.js", "page.js")
+DEFAULT_IMAGES = 30
+FEW = 4  # images whose details may be large
+LARGE, SMALL = (1400, 4000, 1441), (1000, 1500, 721)  # px of the picture, stars, azimuths of the horizon
+FILES = (".annotated.png", ".stars.ecsv", ".wcs", ".corr")
+
+
+def write_page(
+    path: str | os.PathLike[str],
+    found: Sequence[Found],
+    *,
+    unread: Sequence[str] = (),
+    real: Mapping[str, Place] | None = None,
+    images: int = DEFAULT_IMAGES,
+    single: bool = False,
+) -> None:
+    """Write the page of the results, whole or not at all. Raises BadInput where it cannot be written.
+
+    `real` has the true (east, north) [m] of images by their stems, where a caller knows them.
+    """
+    base = _address(folder_of(found[0]), Path(path).parent)
+    text = page_text(found, unread=unread, real=real, images=images, single=single, base=base)
+    write_atomically(path, text.encode("utf-8", "replace"), overwrite=True)
+
+
+def page_text(
+    found: Sequence[Found],
+    *,
+    unread: Sequence[str] = (),
+    real: Mapping[str, Place] | None = None,
+    images: int = DEFAULT_IMAGES,
+    single: bool = False,
+    base: str = ".",
+) -> str:
+    """The page as text: the same results give the same text. `base` is the results' folder as the page sees it."""
+    real, grounds = real or {}, Grounds()
+    detailed = chosen(found, images)
+    rows = [row_of(one, real.get(one.stem), k in detailed) for k, one in enumerate(found)]
+    size = LARGE if len(detailed) <= FEW else SMALL
+    details = {k: _detail(found[k], grounds, size) for k in sorted(detailed)}
+    head = {
+        "columns": COLUMNS,
+        "rows": rows,
+        "single": single and len(found) == 1,
+        "base": base,
+        "unread": list(unread),
+        "errors": errors_of(rows),
+        "words": {reason: words_of(reason) for reason in sorted({row[3] for row in rows if row[3]})},
+        "terrains": _terrains(found, grounds),
+    }
+    title = f"{found[0].record['image']} · startrack" if head["single"] else f"{len(found):,} images · startrack"
+    frame = (HERE / "page.html").read_text(encoding="utf-8")
+    data = [_data("results", head), *(_data(f"detail-{k}", detail) for k, detail in details.items())]
+    parts = {
+        "TITLE": html.escape(title),
+        "STYLE": "".join((HERE / name).read_text(encoding="utf-8") for name in STYLES),
+        "DATA": "\n".join(data),
+        "SCRIPT": "".join((HERE / name).read_text(encoding="utf-8") for name in SCRIPTS),
+    }
+    pieces = frame.split("@@")  # never replaced twice: a result may hold any text
+    return "".join(parts.get(piece, piece) for piece in pieces)
+
+
+def _address(folder: Path, seen_from: Path) -> str:
+    """Of one folder for links of a page in another; whole where no relative one exists (another drive)."""
+    try:
+        return quote(Path(os.path.relpath(folder, seen_from)).as_posix())
+    except ValueError:
+        return folder.absolute().as_uri()
+
+
+def _detail(found: Found, grounds: Grounds, size: tuple[int, int, int]) -> dict[str, Any]:
+    record = found.record
+    longest_px, stars, azimuths = size
+    return {
+        "record": {key: value for key, value in record.items() if key not in ("matches", "detections", "camera")},
+        "picture": picture_of(found.beside(".annotated.png"), found.beside(".wcs"), record, longest_px),
+        "stars": stars_of(found.beside(".stars.ecsv"), stars),
+        "horizon": _horizon(record, grounds, azimuths),
+        "files": [found.path.name, *(found.beside(end).name for end in FILES if found.beside(end).is_file())],
+    }
+
+
+def _horizon(record: dict[str, Any], grounds: Grounds, azimuths: int) -> list[float] | None:
+    """Of the position, or of the likeliest place; None without a place or where the terrain is not here."""
+    modes = record.get("modes")
+    place = part(record, "position") or (modes[0] if isinstance(modes, list) and modes else {})
+    east, north = number(place, "east_m"), number(place, "north_m")
+    name = _terrain_name(record)
+    terrain = grounds.terrain(name) if name and east is not None and record["status"] != "refused" else None
+    if terrain is None or east is None or north is None:
+        return None
+    return horizon_deg(terrain, east, north, azimuths)
+
+
+def _terrains(found: Sequence[Found], grounds: Grounds) -> dict[str, Any]:
+    """The maps of all terrains that results name and that are here."""
+    names = sorted({name for one in found if (name := _terrain_name(one.record))})
+    known = {name: grounds.terrain(name) for name in names}
+    return {name: ground_map(terrain) for name, terrain in known.items() if terrain is not None}
+
+
+def _terrain_name(record: dict[str, Any]) -> str | None:
+    name = part(record, "provenance").get("terrain")
+    return name if isinstance(name, str) else None
+
+
+def _data(name: str, value: Any) -> str:
+    """A script of data: `<` is written as an escape, so that no text in it can end the script."""
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    return f'<script type="application/json" id="{name}">{text}</script>'

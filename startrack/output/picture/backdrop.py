@@ -1,0 +1,140 @@
+"""The exposure as a picture: scaled to fit, noise calmed, stretched so that faint stars show beside bright ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from startrack.camera import Camera
+from startrack.output.picture.palette import PAPER, SKY_BRIGHT, SKY_DARK, STARLIGHT, WALL
+from startrack.types import Array, Bools
+
+if TYPE_CHECKING:
+    from startrack.result import Result
+
+Image = NDArray[np.float32]
+LONGEST_SIDE_PX = 1400
+SHORTEST_SIDE_PX = 900
+SMOOTHING_PX = (0.5, 3.0)  # of the display, as wide as the PSF within these
+CALM_SNR = 2.6  # fainter light than that is taken for noise and left out
+KNEE_SNR, GLARE_SNR = 5.0, 400.0  # where the stretch turns from linear to logarithmic, and where it ends
+STAR_PX = 15  # on the canvas: what is wider is no star
+EDGE_PX = 8.0
+SAMPLE = 4  # levels are taken from every fourth pixel
+FLAT_SNR = 3.0
+WALL_SHADE = 0.75  # how far the wall's colour replaces the sky's
+SPIKE_SIGMAS = 8.0
+SPIKE_NEIGHBOUR = 0.3  # a star's neighbouring pixel has more of its light where the PSF is LEAST_PSF_PX or wider
+LEAST_PSF_PX = 0.7
+RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=np.uint8)
+MADE_OF_NOISE = 0.6745  # median of the absolute value of a standard normal variable
+
+
+@dataclass(frozen=True)
+class View:
+    """Where pixels of the exposure lie on the canvas: xy_canvas = origin + scale (xy + 1/2) - 1/2."""
+
+    scale: float
+    origin: tuple[float, float]
+    size: tuple[int, int]  # (W, H) on the canvas
+
+    def at(self, xy_px: ArrayLike) -> Array:
+        """Canvas places (..., 2) of pixels (..., 2)."""
+        return np.asarray(self.origin) + self.scale * (np.asarray(xy_px, dtype=float) + 0.5) - 0.5
+
+    @property
+    def box(self) -> tuple[float, float, float, float]:
+        """Left, top, right, bottom on the canvas."""
+        x, y = self.origin
+        return x, y, x + self.size[0] - 1, y + self.size[1] - 1
+
+
+def fitted(size_px: tuple[int, int]) -> tuple[float, tuple[int, int]]:
+    """Scale, and size (W, H) of an exposure on the canvas."""
+    scale = LONGEST_SIDE_PX / max(size_px)
+    if scale > 1:  # small frames grow only until they can be read
+        scale = max(1.0, min(scale, SHORTEST_SIDE_PX / min(size_px)))
+    return scale, (max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale)))
+
+
+def backdrop(result: Result, size: tuple[int, int], wall: Image | None = None) -> NDArray[np.uint8]:
+    """The exposure as (H, W, 3) of the given size (W, H); beyond the image circle is paper.
+
+    `wall` (H, W) is 1 where terrain stands before the sky: it is shown darker than the exposure has it.
+    """
+    inside_px = np.full(size[::-1], np.inf, dtype=np.float32)
+    if result.camera is not None and result.camera.size_px == result.exposure.size_px:
+        inside_px = _inside_px(result.camera, size)
+    sky, light = _layers(result, size, inside_px > EDGE_PX)
+    # Next to the circle's edge the background is not known well, and what is left of it is no light.
+    light *= np.clip(inside_px / np.float32(EDGE_PX), 0, 1)
+    shade = None if wall is None else wall * np.float32(WALL_SHADE)
+    lit = np.clip(inside_px + np.float32(0.5), 0, 1)
+    channels = []
+    for dark, bright, rock, star, paper in zip(SKY_DARK, SKY_BRIGHT, WALL, STARLIGHT, PAPER, strict=True):
+        channel = dark + sky * np.float32(bright - dark)
+        if shade is not None:
+            channel += shade * (np.float32(rock) - channel)
+        channel += light * (np.float32(star) - channel)
+        channels.append((paper + lit * (channel - np.float32(paper))).astype(np.uint8))
+    return np.asarray(cv2.merge(channels))
+
+
+def _layers(result: Result, size: tuple[int, int], inside: Bools) -> tuple[Image, Image]:
+    """Smooth background and point-like light, each (H, W) from 0 to 1; the background is known `inside` (H, W).
+
+    The detector's background bridges the skyline in blocks; a median as wide as some stars keeps the skyline's step.
+    """
+    scale = size[0] / result.exposure.size_px[0]
+    width_px = scale * (result.detections.psf_sigma_px if result.detections is not None else 1.0)
+    pixels = _resized(without_hot_pixels(result.exposure.pixels_adu, width_px / scale), size)
+    image = np.asarray(cv2.GaussianBlur(pixels, (0, 0), float(np.clip(width_px, *SMOOTHING_PX))), dtype=np.float32)
+    sample, known = image[::SAMPLE, ::SAMPLE], inside[::SAMPLE, ::SAMPLE]
+    low, high = (float(level) for level in np.percentile(sample[known] if known.any() else sample, [0.5, 99.0]))
+    step = max(high - low, 1e-6) / 255
+    levels = np.clip((image - np.float32(low)) * np.float32(1 / step) + np.float32(0.5), 0, 255).astype(np.uint8)
+    smooth = cv2.medianBlur(levels, STAR_PX).astype(np.float32) * np.float32(step) + np.float32(low)
+    light = image - smooth
+    noise = max(
+        float(np.median(np.abs(light[::SAMPLE, ::SAMPLE][known]))) / MADE_OF_NOISE if known.any() else 0.0, 1e-6
+    )
+    light = np.arcsinh(np.maximum(light * np.float32(1 / noise) - np.float32(CALM_SNR), 0) / np.float32(KNEE_SNR))
+    light = np.minimum(light / np.float32(np.arcsinh(GLARE_SNR / KNEE_SNR)), 1)
+    dark, bright = np.percentile(smooth[::SAMPLE, ::SAMPLE][known] if known.any() else smooth, [2, 98])
+    # A background that is flatter than the noise shall look flat.
+    sky = (smooth - np.float32(dark)) / np.float32(max(bright - dark, FLAT_SNR * noise))
+    return np.clip(sky, 0, 1), np.power(light, np.float32(0.75))
+
+
+def without_hot_pixels(pixels_adu: Image, psf_sigma_px: float) -> Image:
+    """The exposure with lone bright pixels, sharper than any star can be, made as dark as those around them."""
+    if psf_sigma_px < LEAST_PSF_PX:
+        return pixels_adu
+    middle = np.asarray(cv2.medianBlur(pixels_adu, 3), dtype=np.float32)
+    noise = float(np.median(np.abs((pixels_adu - middle)[::SAMPLE, ::SAMPLE]))) / MADE_OF_NOISE
+    # Seen from the darkest pixel about: within a wide star the median is the star's own light.
+    darkest = cv2.erode(pixels_adu, np.ones((5, 5), np.uint8))
+    excess, beside = pixels_adu - darkest, cv2.dilate(pixels_adu, RING) - darkest
+    lone = (excess > SPIKE_SIGMAS * max(noise, 1e-6)) & (beside < SPIKE_NEIGHBOUR * excess)
+    return np.asarray(np.where(lone, middle, pixels_adu), dtype=np.float32)
+
+
+def _inside_px(camera: Camera, size: tuple[int, int]) -> Image:
+    """Distance to the edge of the image circle (H, W) [canvas px], negative beyond it."""
+    edge = camera.lens.rho(np.array(min(camera.max_angle_rad, camera.lens.max_invertible_rad)))
+    scale = size[0] / camera.size_px[0]
+    x, y = (
+        (((np.arange(n) + 0.5) / scale - 0.5 - centre) / focal).astype(np.float32)
+        for n, centre, focal in zip(size, camera.centre_px, camera.focal_px, strict=True)
+    )
+    radius = np.sqrt(x[None, :] ** 2 + y[:, None] ** 2)
+    return np.asarray((np.float32(edge) - radius) * np.float32(min(camera.focal_px) * scale))
+
+
+def _resized(image: Image, size: tuple[int, int]) -> Image:
+    smaller = size[0] <= image.shape[1]
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR))

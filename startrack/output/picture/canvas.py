@@ -1,0 +1,229 @@
+"""A picture to draw on: anti-aliased shapes at sub-pixel places (OpenCV), text that keeps out of other text's way."""
+
+from __future__ import annotations
+
+import unicodedata
+from copy import copy
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from startrack.output.picture.palette import INK, PAPER, Colour
+
+if TYPE_CHECKING:
+    from PIL.ImageFont import FreeTypeFont
+
+SHIFT_BITS = 4  # OpenCV takes sub-pixel places as integers of 1/16 px
+EDGE_PX = 0.4  # what OpenCV's smoothing adds to the edge of an area
+FARTHEST_PX = 30_000.0  # beyond any picture, within OpenCV's range
+Box = tuple[float, float, float, float]  # left, top, right, bottom
+KNOWN_BEYOND_ASCII = "±°·…"
+
+
+@dataclass(frozen=True)
+class _Text:
+    xy: tuple[float, float]
+    text: str
+    size: float
+    colour: Colour
+    halo: bool
+
+
+class Canvas:
+    """Pixels (H, W, 3), red, green, blue. Place (0, 0) is the centre of the top-left pixel; texts appear at the end."""
+
+    def __init__(self, width: int, height: int, colour: Colour = PAPER) -> None:
+        self.pixels: NDArray[np.uint8] = np.full((height, width, 3), colour, dtype=np.uint8)
+        self._origin = np.zeros(2)
+        self._texts: list[_Text] = []
+        self._taken: list[Box] = []
+
+    def window(self, box: Box) -> Canvas:
+        """The same picture, in the same places, with shapes clipped to the box."""
+        left, top, right, bottom = (round(edge) for edge in box)
+        window = copy(self)
+        window.pixels = self.pixels[top : bottom + 1, left : right + 1]
+        window._origin = self._origin + np.array([left, top])
+        return window
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(W, H)."""
+        return self.pixels.shape[1], self.pixels.shape[0]
+
+    def line(self, points: ArrayLike, colour: Colour, width: int = 1, closed: bool = False) -> None:
+        """A line through the points (n, 2)."""
+        cv2.polylines(self.pixels, [self._fixed(points)], closed, colour, width, cv2.LINE_AA, SHIFT_BITS)
+
+    def dashes(self, points: ArrayLike, colour: Colour, width: int = 1) -> None:
+        """Every other stretch of the line through evenly spaced points (n, 2)."""
+        places = self._fixed(points)
+        cv2.polylines(
+            self.pixels, [places[k : k + 2] for k in range(0, len(places) - 1, 2)], False, colour, width, cv2.LINE_AA,
+            SHIFT_BITS,
+        )  # fmt: skip
+
+    def area(self, points: ArrayLike, colour: Colour) -> None:
+        """A filled convex or plain polygon with corners (n, 2)."""
+        cv2.fillPoly(self.pixels, [self._fixed(points)], colour, cv2.LINE_AA, SHIFT_BITS)
+
+    def curve(self, points: ArrayLike, colour: Colour, width: float, closed: bool = False) -> None:
+        """A smooth curve through the points (n, 2), as a filled ribbon: OpenCV's own thick lines look beaded."""
+        places = np.asarray(points, dtype=float)
+        ahead, behind = np.roll(places, -1, axis=0), np.roll(places, 1, axis=0)
+        if not closed:
+            ahead[-1], behind[0] = places[-1], places[0]
+        along = ahead - behind
+        along /= np.maximum(np.hypot(along[:, 0], along[:, 1]), 1e-9)[:, None]
+        aside = (0.5 * width - EDGE_PX) * np.stack([-along[:, 1], along[:, 0]], axis=-1)
+        left, right = self._fixed(places + aside), self._fixed(places - aside)
+        outline = [left, right] if closed else [np.concatenate([left, right[::-1]])]
+        cv2.fillPoly(self.pixels, outline, colour, cv2.LINE_AA, SHIFT_BITS)
+
+    def circle(self, centre: ArrayLike, radius: float, colour: Colour, width: int = 1) -> None:
+        """A circle; filled where `width` is negative."""
+        if not 0 <= radius < FARTHEST_PX:
+            return
+        if width > 1:
+            turn = np.linspace(0, 2 * np.pi, int(np.clip(4 * radius, 24, 360)), endpoint=False)
+            ring = radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+            self.curve(np.asarray(centre) + ring, colour, width, closed=True)
+            return
+        x, y = self._fixed(centre).tolist()
+        reach = round(radius * 2**SHIFT_BITS)
+        cv2.circle(self.pixels, (x, y), reach, colour, width, cv2.LINE_AA, SHIFT_BITS)
+
+    def cross(self, centre: ArrayLike, half: float, colour: Colour, width: int = 1) -> None:
+        """An x of the given half size."""
+        x, y = (float(c) for c in np.asarray(centre, dtype=float))
+        self.line([(x - half, y - half), (x + half, y + half)], colour, width)
+        self.line([(x - half, y + half), (x + half, y - half)], colour, width)
+
+    def plus(self, centre: ArrayLike, half: float, colour: Colour, width: int = 1) -> None:
+        """A + of the given half size."""
+        x, y = (float(c) for c in np.asarray(centre, dtype=float))
+        self.line([(x - half, y), (x + half, y)], colour, width)
+        self.line([(x, y - half), (x, y + half)], colour, width)
+
+    def rectangle(self, box: Box, colour: Colour, width: int = -1) -> None:
+        """A box; filled where `width` is negative."""
+        left, top, right, bottom = self._fixed(np.reshape(box, (2, 2))).ravel().tolist()
+        cv2.rectangle(self.pixels, (left, top), (right, bottom), colour, width, cv2.LINE_8, SHIFT_BITS)
+
+    def text(
+        self, xy: ArrayLike, text: str, size: float, colour: Colour = INK, anchor: str = "ls", halo: bool = False
+    ) -> Box:
+        """Write where nothing else may be written by `label`; returns the box. Anchor: l, m, r and t (top), m, s."""
+        text = printable(text)
+        x, y = (float(c) for c in np.asarray(xy, dtype=float))
+        width, (rise, fall) = text_width(text, size), _height(size)
+        x -= {"l": 0.0, "m": width / 2, "r": width}[anchor[0]]
+        y += {"t": rise, "m": (rise - fall) / 2 + 0.06 * size, "s": 0.0}[anchor[1]]
+        box = x, y - rise, x + width, y + fall
+        self._texts.append(_Text((x, y), text, size, colour, halo))
+        self._taken.append(box)
+        return box
+
+    def label(self, at: ArrayLike, text: str, size: float, colour: Colour, gap: float, within: Box) -> bool:
+        """Write beside the place `at`, at the first of eight sides that is free; False where there is none."""
+        x, y = (float(c) for c in np.asarray(at, dtype=float))
+        width, (rise, fall) = text_width(printable(text), size), _height(size)
+        near = 0.75 * gap
+        middle = y + (rise - fall) / 2
+        sides = [
+            (x + gap, middle), (x - gap - width, middle), (x + near, y - near), (x + near, y + near + rise),
+            (x - near - width, y - near), (x - near - width, y + near + rise), (x - width / 2, y - gap - fall),
+            (x - width / 2, y + gap + rise),
+        ]  # fmt: skip
+        for left, base in sides:
+            box = left - 2, base - rise, left + width + 2, base + fall
+            if _inside(box, within) and self.is_free(box):
+                self.text((left, base), text, size, colour, halo=True)
+                return True
+        return False
+
+    def is_free(self, box: Box) -> bool:
+        """Whether no text and nothing kept free overlaps the box."""
+        return not any(_overlap(box, taken) for taken in self._taken)
+
+    def keep_free(self, box: Box) -> None:
+        """Keep labels away from a box."""
+        self._taken.append(box)
+
+    def _fixed(self, points: ArrayLike) -> NDArray[np.int32]:
+        places = np.clip(np.asarray(points, dtype=float) - self._origin, -FARTHEST_PX, FARTHEST_PX)
+        return np.rint(places * 2**SHIFT_BITS).astype(np.int32)
+
+    def finished(self) -> NDArray[np.uint8]:
+        """The pixels with all texts."""
+        from PIL import Image, ImageDraw
+
+        picture = Image.fromarray(self.pixels)
+        draw = ImageDraw.Draw(picture)
+        for t in self._texts:
+            stroke = max(1, round(t.size / 10)) if t.halo else 0
+            draw.text(t.xy, t.text, t.colour, _font(t.size), "ls", stroke_width=stroke, stroke_fill=(8, 11, 17))
+        return np.asarray(picture)
+
+
+def around(centre: ArrayLike, half: float) -> Box:
+    """The box of the given half size about a place."""
+    x, y = (float(c) for c in np.asarray(centre, dtype=float))
+    return x - half, y - half, x + half, y + half
+
+
+def printable(text: str) -> str:
+    """The text in the letters that the font has: accents are dropped, other unknown letters become question marks."""
+    letters = unicodedata.normalize("NFKD", text.replace("\N{MINUS SIGN}", "-"))
+    return "".join(_plain(letter) for letter in letters if not unicodedata.combining(letter))
+
+
+def text_width(text: str, size: float) -> float:
+    """Width of a text [px]."""
+    return float(_font(size).getlength(text))
+
+
+def wrapped(text: str, size: float, width: float) -> list[str]:
+    """The text's words in lines no wider than `width` [px], but for a word that alone is wider."""
+    lines: list[str] = []
+    for word in printable(text).split():
+        longer = f"{lines[-1]} {word}" if lines else word
+        if lines and text_width(longer, size) <= width:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return lines
+
+
+def _plain(letter: str) -> str:
+    if letter.isascii():
+        return letter if letter.isprintable() else " "
+    return letter if letter in KNOWN_BEYOND_ASCII else "?"
+
+
+@lru_cache(maxsize=32)
+def _font(size: float) -> FreeTypeFont:
+    from PIL import ImageFont
+
+    font = ImageFont.load_default(size)
+    if not isinstance(font, ImageFont.FreeTypeFont):
+        raise RuntimeError("Pillow was built without FreeType: its default font cannot be scaled")
+    return font
+
+
+@lru_cache(maxsize=32)
+def _height(size: float) -> tuple[float, float]:
+    """Rise above and fall below the line of writing [px]."""
+    return 0.74 * size, 0.22 * size
+
+
+def _inside(box: Box, outer: Box) -> bool:
+    return box[0] >= outer[0] and box[1] >= outer[1] and box[2] <= outer[2] and box[3] <= outer[3]
+
+
+def _overlap(a: Box, b: Box) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]

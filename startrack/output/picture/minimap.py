@@ -1,0 +1,169 @@
+"""Two maps: the whole search area with the place in it, and the place itself with its error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from startrack.output.picture.canvas import Box, Canvas
+from startrack.output.picture.palette import (
+    DIM_INK,
+    FAINT_INK,
+    FLOOR,
+    GRID,
+    INK,
+    MAP,
+    POSITION,
+    TRUTH,
+    mixed,
+)
+from startrack.output.picture.relief import ground_on, shade
+from startrack.terrain import Cylinder, Terrain
+from startrack.types import Array, Fix
+
+CIRCLE_RAD = np.linspace(0.0, 2 * np.pi, 181)
+CAPTION_SIZE = 16.0
+
+
+@dataclass(frozen=True)
+class MapView:
+    """Where points of enu lie on the canvas; north is up."""
+
+    box: Box
+    centre_m: tuple[float, float]
+    metres_per_px: float
+
+    def at(self, points_m: ArrayLike) -> Array:
+        """Canvas places (..., 2) of points (..., 2), east and north [m]."""
+        offset = (np.asarray(points_m, dtype=float) - self.centre_m) / self.metres_per_px
+        return self.middle + offset * [1.0, -1.0]
+
+    @property
+    def middle(self) -> Array:
+        left, top, right, bottom = self.box
+        return np.array([(left + right) / 2, (top + bottom) / 2])
+
+    @property
+    def half_m(self) -> Array:
+        """Half of what is shown, east and north [m]."""
+        left, top, right, bottom = self.box
+        return np.array([right - left, bottom - top]) / 2 * self.metres_per_px
+
+
+def map_view(box: Box, centre_m: tuple[float, float], half_m: float) -> MapView:
+    """A map that shows `half_m` in every direction from the centre."""
+    left, top, right, bottom = box
+    return MapView(box, centre_m, 2 * half_m / min(right - left, bottom - top))
+
+
+def draw_overview(
+    canvas: Canvas, box: Box, terrain: Terrain, fix: Fix | None, ambiguous: bool, truth: ArrayLike | None
+) -> MapView:
+    """The search area (dashed), the rim of a cylinder or the shape of the ground, and the place or places."""
+    rim = terrain.radius_m if isinstance(terrain, Cylinder) else 0.0
+    view = map_view(box, (0.0, 0.0), 1.07 * max(min(terrain.search_radius_m, terrain.reach_m), rim))
+    window = canvas.window(box)
+    window.rectangle(box, MAP)
+    if rim:
+        window.circle(view.middle, rim / view.metres_per_px, FLOOR, -1)
+    else:
+        shade(window, view, *ground_on(view, terrain, (window.size[1], window.size[0])))
+    _grid(window, view)
+    if rim:
+        window.circle(view.middle, rim / view.metres_per_px, DIM_INK, 2)
+    if abs(terrain.search_radius_m - rim) > 0.01 * rim:
+        window.dashes(view.at(_ring((0.0, 0.0), terrain.search_radius_m)), DIM_INK)
+    if truth is not None:
+        window.plus(view.at(truth), 9.0, TRUTH, 2)
+    if fix is not None:
+        for k, mode in enumerate(fix.modes if ambiguous else fix.modes[:1]):
+            place = view.at((mode.east_m, mode.north_m))
+            window.circle(place, 5.0, POSITION, -1)
+            window.circle(place, 9.0, POSITION, 2)
+            if ambiguous:
+                canvas.label(place, f"{k + 1}: {100 * mode.weight:.0f} %", CAPTION_SIZE, INK, 14.0, box)
+    _furniture(canvas, view, "search area, north up")
+    return view
+
+
+def draw_zoom(canvas: Canvas, box: Box, fix: Fix, truth: ArrayLike | None) -> MapView:
+    """The place with its covariance ellipse (one sigma, filled) and the circle that holds 95 % of the posterior."""
+    place = (float(fix.position_enu_m[0]), float(fix.position_enu_m[1]))
+    half = 1.3 * fix.radius95_m
+    if truth is not None:  # as far out as that is still a zoom
+        half = max(half, min(1.3 * float(np.linalg.norm(np.subtract(truth, place))), 4 * half))
+    view = map_view(box, place, half)
+    window = canvas.window(box)
+    window.rectangle(box, MAP)
+    _grid(window, view)
+    ellipse = view.at(_ellipse(place, fix.covariance_m2))
+    window.area(ellipse, mixed(MAP, POSITION, 0.35))
+    window.line(ellipse, mixed(MAP, POSITION, 0.8))
+    window.circle(view.at(place), fix.radius95_m / view.metres_per_px, POSITION, 2)
+    window.plus(view.at(place), 8.0, INK, 2)
+    if truth is not None and bool(np.all(np.abs(np.subtract(truth, place)) < view.half_m)):
+        window.plus(view.at(truth), 9.0, TRUTH, 2)
+        canvas.label(view.at(truth), "truth", CAPTION_SIZE, TRUTH, 14.0, box)
+    _furniture(canvas, view, f"95 % within {fix.radius95_m:.3g} m")
+    return view
+
+
+def draw_leaders(canvas: Canvas, overview: MapView, zoom: MapView) -> None:
+    """Faint lines from the place in the overview to the corners of the zoom below it."""
+    place = overview.at(zoom.centre_m)
+    left, top, right, _ = zoom.box
+    for corner in ((left, top), (right, top)):
+        toward = np.asarray(corner) - place
+        start = place + 12.0 * toward / np.linalg.norm(toward)
+        canvas.line(np.array([start, corner]), FAINT_INK)
+
+
+def nice_step(length: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is no longer than the length."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(m for m in (1.0, 2.0, 5.0) if m * power <= length * (1 + 1e-9)) * power)
+
+
+def distance_text(metres: float) -> str:
+    """A scale bar's length in words."""
+    return f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m" if metres >= 0.1 else f"{100 * metres:g} cm"
+
+
+def _ring(centre_m: tuple[float, float], radius_m: float) -> Array:
+    return np.asarray(centre_m) + radius_m * np.stack([np.sin(CIRCLE_RAD), np.cos(CIRCLE_RAD)], axis=-1)
+
+
+def _ellipse(centre_m: tuple[float, float], covariance_m2: Array) -> Array:
+    lengths, axes = np.linalg.eigh(covariance_m2)
+    half_m = np.sqrt(np.maximum(lengths, 0.0))
+    return np.asarray(centre_m) + (_ring((0.0, 0.0), 1.0) * half_m) @ axes.T
+
+
+def grid_lines_m(view: MapView, axis: int) -> Array:
+    """Where the grid's lines stand [m], east (axis 0) or north (1)."""
+    step = nice_step(0.7 * float(view.half_m.min()))
+    low, high = view.centre_m[axis] - view.half_m[axis], view.centre_m[axis] + view.half_m[axis]
+    return np.arange(np.ceil(low / step), high / step) * step
+
+
+def _grid(window: Canvas, view: MapView) -> None:
+    low, high = view.centre_m - view.half_m, view.centre_m + view.half_m
+    for axis in (0, 1):
+        for value in grid_lines_m(view, axis):
+            ends = np.array([low, high])
+            ends[:, axis] = value
+            window.line(view.at(ends), GRID)
+
+
+def _furniture(canvas: Canvas, view: MapView, caption: str) -> None:
+    """Frame, caption and scale bar."""
+    left, top, right, bottom = view.box
+    canvas.rectangle(view.box, FAINT_INK, 1)
+    canvas.text((left + 12, top + 12), caption, CAPTION_SIZE, DIM_INK, "lt", halo=True)
+    length_m = nice_step(0.3 * 2 * float(view.half_m[0]))
+    length = length_m / view.metres_per_px
+    x, y = right - 14 - length, bottom - 14
+    canvas.line([(x, y - 6), (x, y), (x + length, y), (x + length, y - 6)], INK, 2)
+    canvas.text((x + length / 2, y - 10), distance_text(length_m), CAPTION_SIZE, INK, "ms", halo=True)

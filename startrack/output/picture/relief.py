@@ -1,0 +1,131 @@
+"""The shape of the ground on a map: light and shade, and contours with their heights."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from startrack.output.picture.canvas import Canvas, around
+from startrack.output.picture.palette import DIM_INK, FLOOR, INK, MAP
+from startrack.types import Array, Bools, Ints
+
+if TYPE_CHECKING:
+    from startrack.output.picture.minimap import MapView
+    from startrack.terrain import Terrain
+
+Image = NDArray[np.float32]
+CELL_PX = 2  # the ground is asked for at every second pixel
+GENTLE_SLOPE = 0.02  # gentler ground looks flat
+RELIEF_LIGHT = 3.0  # slopes that face the light, as a multiple of the floor's colour
+MOST_LEVELS = 12.0
+CONTOUR_WEIGHT = 0.45
+FLAT_M_PER_PX = 1e-3  # of a map: flatter ground has no contour that is a line
+LABEL_SIZE = 14.0
+LABELLED_PX = 90  # shorter contours get no label, those of ten times the length two
+TRIED = 60  # places along a contour
+
+
+def ground_on(view: MapView, terrain: Terrain, shape: tuple[int, int]) -> tuple[Image, Bools]:
+    """Heights [m] of the cells of a map that is `shape` (H, W) pixels large, and where there is ground."""
+    return ground_cells(terrain, view.half_m, tuple(max(2, n // CELL_PX) for n in shape))  # type: ignore[arg-type]
+
+
+def ground_cells(terrain: Terrain, half_m: ArrayLike, shape: tuple[int, int]) -> tuple[Image, Bools]:
+    """Heights [m] (H, W) within `half_m` east and north of the origin, north up, and where there is ground."""
+    x, y = (np.linspace(-half, half, n) for half, n in zip(np.asarray(half_m), shape[::-1], strict=True))
+    points_m = np.stack(np.meshgrid(x, y[::-1]), axis=-1).reshape(-1, 2)
+    known = np.asarray(terrain.allowed(points_m), dtype=bool)
+    ground_m = np.zeros(len(known), dtype=np.float32)
+    ground_m[known] = terrain.ground_m(points_m[known])
+    return ground_m.reshape(shape), known.reshape(shape)
+
+
+def light_on(ground_m: Image, known: Bools, half_m: ArrayLike) -> Image:
+    """Light (H, W), 0 to 1, on cells lit from the north-west as maps are; carried some cells beyond the ground."""
+    east_m, north_m = (2 * half / (n - 1) for half, n in zip(np.asarray(half_m), known.shape[::-1], strict=True))
+    down, east = np.gradient(ground_m)
+    facing, inner = east / east_m + down / north_m, _inner(known)
+    steep = max(float(np.percentile(np.abs(facing[inner]), 95)) if inner.any() else 0.0, GENTLE_SLOPE)
+    light = np.maximum(0.5 + 0.5 * np.tanh(1.2 * facing / steep), 0.05)
+    return _spread(light.astype(np.float32), inner)
+
+
+def edge_of(known: Bools, size: tuple[int, int]) -> Array:
+    """1 on known ground and 0 beside it, (H, W) of the given size (W, H), with a smooth edge."""
+    soft = _resized(np.asarray(cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.5)), size)
+    return np.clip((soft - 0.5) * 4 + 0.5, 0, 1).astype(np.float64)
+
+
+def shade(window: Canvas, view: MapView, ground_m: Image, known: Bools) -> None:
+    """The relief; the map's colour where there is no ground."""
+    size = window.size
+    lit = (_resized(light_on(ground_m, known, view.half_m), size) * edge_of(known, size))[:, :, None]
+    window.pixels[:] = (np.array(MAP) + lit * (RELIEF_LIGHT * np.array(FLOOR) - MAP)).astype(np.uint8)
+
+
+def draw_contours(canvas: Canvas, window: Canvas, view: MapView, ground_m: Image, known: Bools) -> float | None:
+    """Contours with their heights [m]; their step [m], or None where the ground is flat."""
+    inner = _inner(known)
+    if not inner.any():
+        return None
+    low, high = float(ground_m[inner].min()), float(ground_m[inner].max())
+    if high - low < 1.0:
+        return None
+    step_m = _step(high - low)
+    fine = _resized(_spread(ground_m, known), window.size)
+    inside = edge_of(inner, window.size) > 0.5
+    down, across = np.gradient(fine)
+    slope = np.hypot(down, across)
+    level = np.rint(fine / step_m)
+    away_px = np.abs(fine - level * step_m) / np.maximum(slope, FLAT_M_PER_PX)
+    weight = CONTOUR_WEIGHT * np.clip(1.3 - away_px, 0, 1) * inside
+    window.pixels[:] = (window.pixels + weight[:, :, None] * (np.array(DIM_INK) - window.pixels)).astype(np.uint8)
+    for number in np.arange(np.ceil(low / step_m), np.floor(high / step_m) + 1):
+        places = np.argwhere(inside & (level == number) & (away_px < 0.7))[:, ::-1]
+        _label(canvas, view, places, f"{number * step_m + 0.0:g}")
+    return step_m
+
+
+def _label(canvas: Canvas, view: MapView, places: Ints, text: str) -> None:
+    """Write a height on its contour, once or twice, where there is room."""
+    left, top, right, bottom = view.box
+    at = places[:: max(1, len(places) // TRIED)] + np.array([left, top])
+    half_px = 0.36 * LABEL_SIZE * len(text) + 8.0
+    at = at[(np.abs(at - view.middle) < np.array([right - left, bottom - top]) / 2 - half_px - 6.0).all(axis=1)]
+    for _ in range(min(2, len(places) // LABELLED_PX)):
+        free = [place for place in at if canvas.is_free(around(place, half_px))]
+        if not free:
+            return
+        # North-east of the middle first, then as far from there as the contour goes.
+        x, y = free[int(np.argmax([place[0] - place[1] for place in free]))]
+        canvas.text((x, y), text, LABEL_SIZE, INK, "mm", halo=True)
+        at = at[np.hypot(*(at - (x, y)).T) > 0.4 * (right - left)]
+
+
+def _step(range_m: float) -> float:
+    """The smallest of 1, 2, 5 times a power of ten that leaves no more than MOST_LEVELS contours."""
+    power = 10.0 ** np.floor(np.log10(range_m / MOST_LEVELS))
+    return float(next(m for m in (1.0, 2.0, 5.0, 10.0) if m * power * MOST_LEVELS >= range_m) * power)
+
+
+def _inner(known: Bools) -> Bools:
+    """Without the cells at the edge: slopes there would be those of a cliff that is not there."""
+    return cv2.erode(known.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE) > 0
+
+
+def _spread(values: Image, known: Bools) -> Image:
+    """Known values, carried a few cells beyond their edge."""
+    filled, weight = np.where(known, values, 0).astype(np.float32), known.astype(np.float32)
+    for reach in (3, 7, 15):
+        near = cv2.blur(weight, (reach, reach))
+        carried = cv2.blur(filled, (reach, reach)) / np.maximum(near, 1e-6)
+        new = (weight == 0) & (near > 1e-6)
+        filled[new], weight[new] = carried[new], 1.0
+    return filled
+
+
+def _resized(image: Image, size: tuple[int, int]) -> Image:
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), dtype=np.float32)

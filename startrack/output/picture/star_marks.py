@@ -1,0 +1,120 @@
+"""Stars, bodies and detections on the picture, and their names."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from startrack.frames import azel_from_rays
+from startrack.output.picture.backdrop import View
+from startrack.output.picture.canvas import Canvas
+from startrack.output.picture.palette import BODY, DETECTION, HIDDEN, IDENTIFIED, INK, mixed
+from startrack.output.record import place_m
+from startrack.output.star_table import names_of, status_of
+from startrack.types import Array, Bools, Ints
+
+if TYPE_CHECKING:
+    from startrack.result import Result
+
+MOST_CIRCLES = 4000
+MOST_CROSSES = 150  # of hidden stars, the brightest: more would hide the picture
+MOST_NAMES = 20
+MOST_HIDDEN_NAMES = 8
+NAME_SIZE = 19.0
+FAINT_RING = 0.6  # how far the ring of the faintest detection fades into the sky
+DIMMEST_HIDDEN_V_MAG = 3.0  # a fainter planet behind the wall is not missed
+BACKDROP = (12, 17, 28)
+BRIGHT_SNR = 300.0
+
+
+def draw_detections(canvas: Canvas, view: View, result: Result) -> None:
+    """A green circle about each identified star; a grey one about each other detection inside the image circle."""
+    found = result.detections
+    if found is None:
+        return
+    identified = np.zeros(len(found), dtype=bool)
+    if result.identification is not None:
+        identified[result.identification.detection] = True
+    strength = np.clip(np.log(np.maximum(found.snr, 5.0) / 5.0) / np.log(BRIGHT_SNR / 5.0), 0, 1)
+    places = view.at(found.xy_px)
+    # The bright ones last, on top; the faint ones dim, so that a thousand of them do not drown the stars.
+    shown = identified | _imaged(result, found.xy_px)
+    for k in reversed(range(min(len(found), MOST_CIRCLES))):
+        if not shown[k]:
+            continue
+        colour = IDENTIFIED if identified[k] else DETECTION
+        faint = FAINT_RING * (1.0 - float(strength[k]))
+        canvas.circle(places[k], 4.5 + 5.5 * float(strength[k]), mixed(colour, BACKDROP, faint))
+
+
+def _imaged(result: Result, xy_px: Array) -> Bools:
+    """Whether light of the lens can reach the pixels (n, 2); all, where the camera is not known."""
+    if result.camera is None or result.camera.size_px != result.exposure.size_px:
+        return np.ones(len(xy_px), dtype=bool)
+    return result.camera.angle_rad(xy_px) <= result.camera.max_angle_rad
+
+
+def draw_hidden(canvas: Canvas, view: View, result: Result) -> None:
+    """A cross at each of the brighter stars that ought to shine there and do not."""
+    _, xy_px = _hidden(result)
+    places = view.at(xy_px[:MOST_CROSSES])
+    for rank, place in enumerate(places):
+        weight = 1.0 - rank / max(len(places), 1)
+        colour = mixed(HIDDEN, BACKDROP, 0.35 * (1.0 - weight))
+        canvas.cross(place, 3.5 + 3.0 * weight, colour, 2 if weight > 0.8 else 1)
+
+
+def draw_bodies(canvas: Canvas, view: View, result: Result) -> None:
+    """A ring and the name at each planet, moon or sun in the frame; stars beside it are not evidence."""
+    if result.camera is None or result.attitude is None:
+        return
+    for body in result.bodies:
+        xy_px, inside = result.camera.project(body.ray_icrs @ result.attitude.R_cam_icrs.T)
+        if not inside:
+            continue
+        below = _below_skyline(result, body.ray_icrs)
+        if below and body.v_mag > DIMMEST_HIDDEN_V_MAG:
+            continue
+        colour = mixed(BODY, BACKDROP, 0.4) if below else BODY
+        at = view.at(xy_px)
+        canvas.circle(at, 6.0 if below else 9.0, colour, 2)
+        text, size = (f"{body.name} (hidden)", 0.85 * NAME_SIZE) if below else (body.name, NAME_SIZE)
+        canvas.label(at, text, size, colour, 13.0, view.box)
+
+
+def name_stars(canvas: Canvas, view: View, result: Result) -> None:
+    """Names of the brightest identified stars and of the brightest hidden ones, where there is room."""
+    if result.stars is None or result.identification is None or result.detections is None:
+        return
+    order = np.argsort(result.stars.v_mag[result.identification.star], kind="stable")
+    star = result.identification.star[order]
+    xy_px = result.detections.xy_px[result.identification.detection[order]]
+    seen = _named(result, star, xy_px, MOST_NAMES)
+    hidden = _named(result, *_hidden(result), MOST_HIDDEN_NAMES)
+    for place, name in seen:
+        canvas.label(view.at(place), name, NAME_SIZE, INK, 13.0, view.box)
+    for place, name in hidden:
+        canvas.label(view.at(place), name, 0.9 * NAME_SIZE, mixed(HIDDEN, BACKDROP, 0.15), 11.0, view.box)
+
+
+def _hidden(result: Result) -> tuple[Ints, Array]:
+    """Stars that are hidden, and their predicted pixels, brightest first."""
+    if result.light is None:
+        return np.empty(0, dtype=np.int64), np.empty((0, 2))
+    hidden = status_of(result.light) == "hidden"
+    return result.light.star[hidden], result.light.xy_px[hidden]
+
+
+def _named(result: Result, star: Ints, xy_px: Array, most: int) -> list[tuple[Array, str]]:
+    assert result.stars is not None
+    first = names_of(result.stars.hip[star[: 4 * most]])
+    return [(place, name) for place, name in zip(xy_px, first, strict=False) if name][:most]
+
+
+def _below_skyline(result: Result, ray_icrs: Array) -> bool:
+    if result.fix is None or result.terrain is None or result.R_enu_icrs is None:
+        return False
+    azimuth, elevation = azel_from_rays(result.R_enu_icrs @ ray_icrs)
+    horizon = result.terrain.horizon_rad(np.array([place_m(result.fix)]), np.array([azimuth]))
+    return bool(elevation < horizon[0])

@@ -1,0 +1,127 @@
+"""The star table: every catalogue star in view, where it should be, what was measured there, and what that says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.catalog import star_names
+from startrack.evidence.star_evidence import SEEN_LLR
+from startrack.output.ecsv import Column, ecsv_text, formatted
+from startrack.types import Array, Ints, Stars
+
+if TYPE_CHECKING:
+    from startrack.evidence import StarLight
+    from startrack.result import Result
+
+STATUSES = ("seen", "hidden", "uncertain", "unusable")
+FAINTER_THAN_FAINTEST_MATCH_MAG = 0.5
+
+
+def star_table_text(result: Result) -> str:
+    """The star table of a result as ECSV, brightest star first; stars must have been identified.
+
+    After `locate`: every star whose light was measured. Without a terrain: the matched stars and all others in the
+    frame down to half a magnitude below the faintest of them, without azimuth, elevation and evidence.
+    """
+    if result.stars is None or result.attitude is None:
+        raise ValueError("no star table without identified stars")
+    if result.light is None:
+        return ecsv_text(_predicted_columns(result, result.stars))
+    return ecsv_text([
+        *_catalog_columns(result.stars, result.light.star),
+        *_direction_columns(result.light),
+        *_place_columns(result, result.light.star, result.light.xy_px),
+        *_light_columns(result.light, _flux_unit(result)),
+    ])  # fmt: skip
+
+
+def status_of(light: StarLight) -> NDArray[np.str_]:
+    """What the light (n,) says of each star: seen, hidden, uncertain, or unusable where it could not be measured."""
+    kinds = np.select([light.cause != "", light.llr >= SEEN_LLR, light.llr <= -SEEN_LLR], [3, 0, 1], 2)
+    return np.array(STATUSES)[kinds]
+
+
+def names_of(hips: Ints) -> list[str]:
+    """Names of Hipparcos stars, empty for those without one."""
+    names = star_names()
+    return [names.get(hip, "") for hip in hips.tolist()]
+
+
+def in_view(result: Result, stars: Stars) -> tuple[Ints, Array]:
+    """Stars in the frame down to the depth of the matches: indices (n,) and predicted pixels (n, 2)."""
+    assert result.camera is not None
+    assert result.attitude is not None
+    matched = result.identification.star if result.identification is not None else np.empty(0, dtype=np.int64)
+    faintest = float(stars.v_mag[matched].max(initial=-np.inf)) + FAINTER_THAN_FAINTEST_MATCH_MAG
+    candidates = np.flatnonzero(stars.v_mag <= faintest)
+    xy_px, inside = result.camera.project(stars.rays_icrs[candidates] @ result.attitude.R_cam_icrs.T)
+    return candidates[inside], xy_px[inside]
+
+
+def _predicted_columns(result: Result, stars: Stars) -> list[Column]:
+    star, xy_px = in_view(result, stars)
+    return [*_catalog_columns(stars, star), *_place_columns(result, star, xy_px)]
+
+
+def _catalog_columns(stars: Stars, star: Ints) -> list[Column]:
+    hips = stars.hip[star]
+    return [
+        Column("catalog_id", stars.catalog_id[star], "string", description="source and number"),
+        Column("hip", ["" if hip == 0 else hip for hip in hips.tolist()], "int64", description="Hipparcos number"),
+        Column("name", names_of(hips), "string", description="proper name, or Bayer, Flamsteed or variable"),
+        Column("v_mag", stars.v_mag[star], "float64", "mag", "%.3f", "Johnson V of the catalogue"),
+    ]
+
+
+def _direction_columns(light: StarLight) -> list[Column]:
+    return [
+        Column("azimuth_deg", np.degrees(light.azimuth_rad), "float64", "deg", "%.5f", "north through east, in enu"),
+        Column("elevation_deg", np.degrees(light.elevation_rad), "float64", "deg", "%.5f", "in enu"),
+    ]
+
+
+def _place_columns(result: Result, star: Ints, xy_px: Array) -> list[Column]:
+    measured = _measured(result, star)
+    origin = "(0, 0) is the centre of the top-left pixel"
+    return [
+        Column("x_px", xy_px[:, 0], "float64", "pix", "%.3f", f"predicted; {origin}"),
+        Column("y_px", xy_px[:, 1], "float64", "pix", "%.3f", "predicted"),
+        Column("x_measured_px", measured[0], "float64", "pix", "%s", "centroid of the detection identified as it"),
+        Column("y_measured_px", measured[1], "float64", "pix", "%s", "centroid of the detection identified as it"),
+    ]
+
+
+def _measured(result: Result, star: Ints) -> tuple[list[str], list[str]]:
+    """Measured pixels of the stars as texts, empty where no detection was identified as the star."""
+    x: list[float | None] = [None] * len(star)
+    y: list[float | None] = [None] * len(star)
+    if result.identification is not None and result.detections is not None:
+        _, row, match = np.intersect1d(star, result.identification.star, return_indices=True)
+        xy_px = result.detections.xy_px[result.identification.detection[match]]
+        for at, (px, py) in zip(row.tolist(), xy_px.tolist(), strict=True):
+            x[at], y[at] = px, py
+    return formatted("%.3f", x), formatted("%.3f", y)
+
+
+def _light_columns(light: StarLight, unit: str) -> Sequence[Column]:
+    usable = light.usable.tolist()
+
+    def measured(form: str, values: Array) -> list[str]:
+        return [form % value if known else "" for value, known in zip(values.tolist(), usable, strict=True)]
+
+    return [
+        Column("expected_e", light.expected_e, "float64", unit, "%.6g", "flux if nothing hides it"),
+        Column("flux_e", measured("%.6g", light.flux_e), "float64", unit, "%s", "measured at the predicted place"),
+        Column("sigma_e", measured("%.6g", light.sigma_e), "float64", unit, "%s", "of flux_e if nothing shines"),
+        Column("evidence", measured("%.3f", light.llr), description="ln p(light | shines) - ln p(light | hidden)"),
+        Column("status", status_of(light), "string", description="seen, hidden, uncertain or unusable"),
+        Column("cause", light.cause, "string", description="why it is unusable"),
+    ]
+
+
+def _flux_unit(result: Result) -> str:
+    return "electron" if result.camera is not None and result.camera.sensor is not None else "adu"

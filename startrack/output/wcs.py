@@ -1,0 +1,147 @@
+"""FITS world coordinates of an identified image, and the table of its matches, as other programs read them.
+
+Calabretta & Greisen 2002, A&A 395, 1077 (ARC, ZPN, TAN); Shupe et al. 2005, ASP Conf. 347, 491 (SIP). Every lens of the
+camera file is one of these exactly; only a decentred one needs the SIP polynomials.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from startrack import __version__
+from startrack.camera import Camera, Decentring
+from startrack.frames import Site, aberrate, format_utc, observer_velocity_m_s
+from startrack.orient import wahba
+from startrack.output.fits_blocks import Card, header_block, table_file
+from startrack.types import Array
+
+if TYPE_CHECKING:
+    from startrack.result import Result
+
+SIP_ORDER = 4
+GRID = 40  # points across the frame at which the field is sampled
+
+
+def wcs_bytes(result: Result) -> bytes:
+    """The header NAME.wcs of a result with an attitude: no pixels, IMAGEW and IMAGEH give their number.
+
+    World coordinates are ICRS directions without aberration, so that catalogue positions at the image's epoch fall on
+    their stars. Aberration bends a whole sky by up to 20 arcsec (0.06 px of a fisheye): the mean over the frame is
+    taken out. FITS pixel (1, 1) is our (0, 0), the first pixel stored.
+    """
+    return header_block(wcs_cards(_camera(result), _R_cam_still(result), result))
+
+
+def wcs_cards(camera: Camera, R_cam_icrs: Array, result: Result | None = None) -> dict[str, Card]:
+    """The header's cards for a camera and its attitude."""
+    axis = R_cam_icrs[2]
+    ra, dec = np.arctan2(axis[1], axis[0]), np.arctan2(axis[2], np.hypot(axis[0], axis[1]))
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    focal = np.array([-camera.focal_px[0] if camera.mirrored else camera.focal_px[0], camera.focal_px[1]])
+    cd = np.degrees(np.stack([east, north]) @ R_cam_icrs[:2].T / focal)  # from px to degrees east and north
+    projection = {"pinhole": "TAN"}.get(camera.lens.model, "ZPN" if any(camera.lens.k) else "ARC")
+    sip = "-SIP" if camera.decentring else ""
+    cards: dict[str, Card] = {"SIMPLE": True, "BITPIX": 8, "NAXIS": 0, "EXTEND": True}
+    cards |= {"WCSAXES": 2, "CTYPE1": f"RA---{projection}{sip}", "CTYPE2": f"DEC--{projection}{sip}"}
+    cards |= {"CUNIT1": "deg", "CUNIT2": "deg", "RADESYS": "ICRS", "LONPOLE": 180.0}
+    cards |= {"CRVAL1": float(np.degrees(ra) % 360.0), "CRVAL2": float(np.degrees(dec))}
+    cards |= {f"CRPIX{i + 1}": float(_axis_px(camera)[i]) + 1.0 for i in range(2)}
+    cards |= {f"CD{i + 1}_{j + 1}": float(cd[i, j]) for i in range(2) for j in range(2)}
+    if projection == "ZPN":
+        cards |= {"PV2_0": 0.0, "PV2_1": 1.0} | {f"PV2_{2 * n + 3}": float(k) for n, k in enumerate(camera.lens.k)}
+    cards |= {"IMAGEW": camera.size_px[0], "IMAGEH": camera.size_px[1]}
+    if sip:
+        cards |= _sip_cards(camera)
+    if result is not None and result.exposure.time_utc is not None:
+        cards["DATE-AVG"] = format_utc(result.exposure.time_utc).removesuffix("Z")
+    return cards | {"CREATOR": f"startrack {__version__}", "COMMENT1": "image rows in the order of the file"}
+
+
+def matches_bytes(result: Result) -> bytes:
+    """The table NAME.corr of the matches: measured place (field) and catalogue's (index), in FITS pixels and degrees.
+
+    Columns as astrometry.net's: field_x, field_y, field_ra, field_dec, index_x, index_y, index_ra, index_dec, and
+    index_id, FLUX, MAG.
+    """
+    camera, R = _camera(result), _R_cam_still(result)
+    assert result.identification is not None and result.detections is not None and result.stars is not None
+    found, stars = result.identification, result.stars.take(result.identification.star)
+    velocity = _velocity_m_s(result)
+    still = stars.rays_icrs if velocity is None else aberrate(stars.rays_icrs, -velocity)
+    measured = result.detections.xy_px[found.detection]
+    assert result.attitude is not None
+    predicted, _ = camera.project(stars.rays_icrs @ result.attitude.R_cam_icrs.T)
+    field_deg, index_deg = _radec_deg(camera.unproject(measured) @ R), _radec_deg(still)
+    return table_file(
+        [
+            ("field_x", "pix", measured[:, 0] + 1), ("field_y", "pix", measured[:, 1] + 1),
+            ("field_ra", "deg", field_deg[:, 0]), ("field_dec", "deg", field_deg[:, 1]),
+            ("index_x", "pix", predicted[:, 0] + 1), ("index_y", "pix", predicted[:, 1] + 1),
+            ("index_ra", "deg", index_deg[:, 0]), ("index_dec", "deg", index_deg[:, 1]),
+            ("index_id", "", np.asarray(stars.catalog_id)), ("FLUX", "", result.detections.flux_e[found.detection]),
+            ("MAG", "mag", stars.v_mag),
+        ],
+        {"EXTNAME": "CORR"},
+    )  # fmt: skip
+
+
+def _camera(result: Result) -> Camera:
+    if result.camera is None or result.attitude is None:
+        raise ValueError("no world coordinates without an attitude")
+    return result.camera
+
+
+def _velocity_m_s(result: Result) -> Array | None:
+    if result.exposure.time_utc is None:
+        return None  # the catalogue was taken without aberration
+    site = result.terrain.site if result.terrain is not None else Site("moon", 0.0, 0.0)
+    return observer_velocity_m_s(site, result.exposure.time_utc)
+
+
+def _R_cam_still(result: Result) -> Array:
+    """R_cam_icrs (3, 3) that takes catalogue directions, without aberration, nearest to where they appear."""
+    camera, velocity = _camera(result), _velocity_m_s(result)
+    assert result.attitude is not None
+    if velocity is None:
+        return result.attitude.R_cam_icrs
+    rays_cam = camera.unproject(_grid(camera))
+    still = aberrate(rays_cam @ result.attitude.R_cam_icrs, -velocity)
+    return wahba(rays_cam, still, np.ones(len(rays_cam)))
+
+
+def _grid(camera: Camera) -> Array:
+    """Pixels (n, 2) over the frame, inside the image circle."""
+    x, y = np.meshgrid(*(np.linspace(0.0, side - 1.0, GRID) for side in camera.size_px))
+    px = np.stack([x.ravel(), y.ravel()], axis=-1)
+    return px[camera.angle_rad(px) <= camera.max_angle_rad]
+
+
+def _axis_px(camera: Camera) -> Array:
+    return camera.project(np.array([0.0, 0.0, 1.0]))[0]
+
+
+def _radec_deg(rays_icrs: Array) -> Array:
+    ra = np.degrees(np.arctan2(rays_icrs[:, 1], rays_icrs[:, 0])) % 360.0
+    return np.stack([ra, np.degrees(np.arctan2(rays_icrs[:, 2], np.hypot(rays_icrs[:, 0], rays_icrs[:, 1])))], axis=1)
+
+
+def _sip_cards(camera: Camera) -> dict[str, Card]:
+    """Polynomials from pixels of the decentred lens to those of one that is not (A, B), and back (AP, BP)."""
+    decentred = _grid(camera)
+    plain, _ = replace(camera, decentring=Decentring()).project(camera.unproject(decentred))
+    u, v = decentred - _axis_px(camera), plain - np.array(camera.centre_px)
+    scale = float(np.abs(u).max())
+    cards: dict[str, Card] = {}
+    for names, start, end in ((("A", "B"), u, v), (("AP", "BP"), v, u)):
+        powers = [(p, q) for p in range(SIP_ORDER + 1) for q in range(SIP_ORDER + 1 - p) if p + q > 0]
+        terms = np.stack([(start[:, 0] / scale) ** p * (start[:, 1] / scale) ** q for p, q in powers], axis=1)
+        found = np.linalg.lstsq(terms, end - start, rcond=None)[0]
+        for axis, name in enumerate(names):
+            cards[f"{name}_ORDER"] = SIP_ORDER
+            for (p, q), value in zip(powers, found[:, axis], strict=True):
+                cards[f"{name}_{p}_{q}"] = float(value / scale ** (p + q))
+    return cards

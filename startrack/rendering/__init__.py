@@ -1,0 +1,27 @@
+"""Catalogue, camera, terrain and a true pose in; an exposure and the truth about it out."""
+
+from startrack.rendering.compose import light_e, render, truth_of
+from startrack.rendering.defects import draw_hot_pixels
+from startrack.rendering.field_stars import draw_field_stars, draw_v_errors, joined
+from startrack.rendering.scene import HotPixels, Scene, Truth
+from startrack.rendering.series import Series, sky_turn_rad
+from startrack.rendering.sources import exposure_reaching
+from startrack.rendering.write import truth_paths, write_truth
+
+__all__ = [
+    "HotPixels",
+    "Scene",
+    "Series",
+    "Truth",
+    "draw_field_stars",
+    "draw_hot_pixels",
+    "draw_v_errors",
+    "exposure_reaching",
+    "joined",
+    "light_e",
+    "render",
+    "sky_turn_rad",
+    "truth_of",
+    "truth_paths",
+    "write_truth",
+]

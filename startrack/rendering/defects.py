@@ -1,0 +1,51 @@
+"""What is not light: hot pixels and the tracks of cosmic rays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from startrack.rendering.psf import splat
+from startrack.rendering.scene import HotPixels
+from startrack.types import Array
+
+HOT_E_PER_S = (50.0, 50_000.0)  # dark current of hot pixels: even in its logarithm, from hardly seen to glaring
+TRACK_MEAN_PX = 6.0  # exponential length: most rays pass steeply, a few graze along the chip
+TRACK_LONGEST_PX = 80.0
+TRACK_E_PER_PX = 150.0  # median charge along a track, log-normal; a muon leaves about 80 e per micrometre of silicon
+TRACK_LOG_SIGMA = 0.8
+TRACK_SIGMA_PX = 0.35  # charge spreads over neighbours by diffusion, much less than light does
+TRACK_STEP_PX = 0.25
+
+
+def draw_hot_pixels(size_px: tuple[int, int], count: int, *, rng: np.random.Generator) -> HotPixels:
+    """`count` different pixels of a sensor of size (W, H) with dark currents log-uniform in HOT_E_PER_S."""
+    width, height = size_px
+    index = rng.choice(width * height, size=min(count, width * height), replace=False)
+    low, high = np.log(HOT_E_PER_S)
+    return HotPixels(
+        xy_px=np.stack([index % width, index // width], axis=-1),
+        dark_e_per_s=np.exp(rng.uniform(low, high, len(index))),
+    )
+
+
+def add_hot_pixels(image_e: Array, hot: HotPixels, exposure_s: float) -> None:
+    """Add to the image (H, W) [e] the hot pixels' dark charge. Raises ValueError where one is off the frame."""
+    height, width = image_e.shape
+    if np.any((hot.xy_px < 0) | (hot.xy_px >= [width, height])):
+        raise ValueError("a hot pixel is off the frame")
+    np.add.at(image_e, (hot.xy_px[:, 1], hot.xy_px[:, 0]), hot.dark_e_per_s * exposure_s)
+
+
+def add_cosmic_rays(image_e: Array, count: int, *, rng: np.random.Generator) -> None:
+    """Add to the image (H, W) [e] `count` straight tracks at random places, directions, lengths and charges."""
+    height, width = image_e.shape
+    for _ in range(count):
+        centre = rng.uniform([-0.5, -0.5], [width - 0.5, height - 0.5])
+        turn = rng.uniform(0, np.pi)
+        length = min(rng.exponential(TRACK_MEAN_PX), TRACK_LONGEST_PX)
+        e_per_px = TRACK_E_PER_PX * np.exp(TRACK_LOG_SIGMA * rng.standard_normal())
+        points = max(1, int(np.ceil(length / TRACK_STEP_PX)))
+        along = (np.arange(points) + 0.5) / points * length - length / 2
+        xy_px = centre + along[:, None] * np.array([np.cos(turn), np.sin(turn)])
+        # A steep ray still crosses the depth of one pixel.
+        splat(image_e, xy_px, np.full(points, e_per_px * max(length, 1.0) / points), TRACK_SIGMA_PX)

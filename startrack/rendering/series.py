@@ -1,0 +1,163 @@
+"""Scenes at given or random poses: one crater, one camera, one true sky, many exposures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from functools import cached_property
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from startrack.camera import Camera
+from startrack.catalog.bodies import bodies
+from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
+from startrack.frames.body_angles import R_body_enu_from_heading_pitch_roll
+from startrack.rendering.defects import draw_hot_pixels
+from startrack.rendering.field_stars import draw_field_stars, draw_v_errors, joined
+from startrack.rendering.scene import Scene
+from startrack.rendering.sources import exposure_reaching
+from startrack.terrain import Terrain
+from startrack.types import Array, BadInput, Stars
+
+if TYPE_CHECKING:
+    from startrack.catalog import StarCatalog
+
+T = TypeVar("T")
+
+REACH_V_MAG, REACH_SNR = 6.0, 5.0  # what the default exposure reaches on the axis
+RANDOM_TIMES = datetime(2024, 1, 1, tzinfo=UTC), datetime(2034, 1, 1, tzinfo=UTC)
+TRIES_FOR_A_PLACE = 1000
+# Streams of the seed. Sky and sensor are the same in every exposure of a series: errors that exposures share.
+_SKY, _SENSOR, _EXPOSURE = 0, 1, 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Series:
+    """Settings of a series of exposures; what is None is drawn from the seed, afresh for each exposure."""
+
+    camera: Camera
+    terrain: Terrain
+    catalog: StarCatalog
+    seed: int
+    time_utc: datetime | None = None  # mid-exposure
+    east_m: float | None = None
+    north_m: float | None = None
+    heading_rad: float | None = None
+    pitch_rad: float | None = None
+    roll_rad: float | None = None
+    max_tilt_rad: float = float(np.radians(5.0))  # of random tilts: uniform over the cap of this radius
+    exposure_s: float | None = None  # None: a V 6 star on the axis reaches 5 sigma
+    sky_v_mag_arcsec2: float | None = 22.0
+    sky_gradient: float = 0.0
+    sky_gradient_azimuth_rad: float = 0.0
+    wall_reflectance: float = 0.04
+    faint_v_mag: float | None = 10.0  # stars that the catalogue lacks are added down to this; None: none
+    flux_scatter_mag: float = 0.03  # beyond the catalogue's own errors; 0: neither
+    hot_pixels: int = 200
+    cosmic_rays: int = 5
+    camera_ref: str | None = None
+    terrain_ref: str | None = None
+
+    @cached_property
+    def exposure_used_s(self) -> float:
+        """The exposure [s], given or default. Raises BadInput bad_calibration when the camera has no sensor."""
+        if self.exposure_s is not None:
+            return self.exposure_s
+        if self.camera.sensor is None:
+            raise BadInput("bad_calibration", f"camera {self.camera.name} has no [sensor]: nothing to render with")
+        return exposure_reaching(self.camera, self.sky_v_mag_arcsec2, v_mag=REACH_V_MAG, snr=REACH_SNR)
+
+    def scene(self, number: int, name: str = "") -> tuple[Scene, np.random.Generator]:
+        """The scene of exposure `number` and the generator to render it with.
+
+        Raises:
+            BadInput: bad_terrain when no place can be found, no_time outside the ephemeris.
+        """
+        rng = np.random.default_rng([self.seed, _EXPOSURE, number])
+        time, place_m, heading, pitch, roll = self._pose(rng)
+        if not bool(self.terrain.allowed(place_m[None])[0]):
+            raise BadInput(
+                "bad_terrain",
+                f"{self.terrain.name}: no camera can stand at {place_m[0]:.0f} m east, {place_m[1]:.0f} north",
+            )
+        site, exposure_s = self.terrain.site, self.exposure_used_s
+        stars, v_error_mag = self._sky(site, time)
+        height_m = float(self.terrain.ground_m(place_m[None])[0]) + self.terrain.camera_height_m
+        sensor_rng = np.random.default_rng([self.seed, _SENSOR])
+        scene = Scene(
+            camera=self.camera,
+            terrain=self.terrain,
+            stars=stars,
+            v_error_mag=v_error_mag,
+            bodies=tuple(bodies(site, time)),
+            position_enu_m=np.append(place_m, height_m),
+            R_cam_enu=self.camera.R_body_cam.T @ R_body_enu_from_heading_pitch_roll(heading, pitch, roll),
+            R_enu_icrs=R_enu_icrs(site, time),
+            sky_turn_rad=sky_turn_rad(site, time, exposure_s),
+            exposure_s=exposure_s,
+            sky_v_mag_arcsec2=self.sky_v_mag_arcsec2,
+            sky_gradient=self.sky_gradient,
+            sky_gradient_azimuth_rad=self.sky_gradient_azimuth_rad,
+            wall_reflectance=self.wall_reflectance,
+            hot_pixels=draw_hot_pixels(self.camera.size_px, self.hot_pixels, rng=sensor_rng),
+            cosmic_rays=self.cosmic_rays,
+            name=name,
+            time_utc=time,
+            camera_ref=self.camera_ref,
+            terrain_ref=self.terrain_ref,
+        )
+        return scene, rng
+
+    def _pose(self, rng: np.random.Generator) -> tuple[datetime, Array, float, float, float]:
+        """Time, place (2,) [m], heading, pitch and roll [rad]: all are drawn, so that giving one leaves the others."""
+        first, last = RANDOM_TIMES
+        time = first + timedelta(microseconds=int(rng.integers((last - first) // timedelta(microseconds=1))))
+        place = _random_place(self.terrain, rng)
+        heading, direction = rng.uniform(0, 2 * np.pi, 2)
+        tilt = self.max_tilt_rad * np.sqrt(rng.random())
+        return (
+            _given(self.time_utc, time),
+            np.array([_given(self.east_m, place[0]), _given(self.north_m, place[1])]),
+            _given(self.heading_rad, heading),
+            _given(self.pitch_rad, tilt * np.cos(direction)),
+            _given(self.roll_rad, tilt * np.sin(direction)),
+        )
+
+    def _sky(self, site: Site, time: datetime) -> tuple[Stars, Array]:
+        """Apparent stars, the lacking ones after the catalogue's, and their magnitude errors (n,)."""
+        rng = np.random.default_rng([self.seed, _SKY])
+        stars = self.catalog.at(time, observer_velocity_m_s(site, time))
+        errors = np.zeros(len(stars))
+        if self.flux_scatter_mag > 0:
+            errors = draw_v_errors(stars, self.flux_scatter_mag, rng=rng)
+        if self.faint_v_mag is None:
+            return stars, errors
+        field = draw_field_stars(stars, self.faint_v_mag, rng=rng)
+        return joined(stars, field), np.concatenate([errors, np.zeros(len(field))])
+
+
+def sky_turn_rad(site: Site, time: datetime, exposure_s: float) -> Array:
+    """Rotation vector (3,) in enu by which the stars turn from the start to the end of an exposure about `time`.
+
+    R_enu_icrs(end) = exp(turn) R_enu_icrs(start); exposures under half a turn of the sky.
+    """
+    half = timedelta(seconds=exposure_s / 2)
+    R = R_enu_icrs(site, time + half) @ R_enu_icrs(site, time - half).T
+    axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine, cosine = float(np.linalg.norm(axis)), 0.5 * (np.trace(R) - 1)
+    return axis * (np.arctan2(sine, cosine) / sine) if sine > 0 else axis
+
+
+def _random_place(terrain: Terrain, rng: np.random.Generator) -> Array:
+    """A place (2,) [m], uniform over the part of the search area where the camera can stand."""
+    for _ in range(TRIES_FOR_A_PLACE):
+        turn = rng.uniform(0, 2 * np.pi)
+        place = terrain.search_radius_m * np.sqrt(rng.random()) * np.array([np.sin(turn), np.cos(turn)])
+        if bool(terrain.allowed(place[None])[0]):
+            return place
+    raise BadInput("bad_terrain", f"{terrain.name}: nowhere in its search area can the camera stand")
+
+
+def _given(value: T | None, drawn: T) -> T:
+    return drawn if value is None else value

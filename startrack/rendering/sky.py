@@ -1,0 +1,167 @@
+"""Diffuse light of the sky, and its step down at the skyline to what the wall reflects."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from startrack.camera import Camera
+from startrack.frames import azel_from_rays, rays_from_azel
+from startrack.rendering.scene import Scene
+from startrack.types import Array, Bools, Ints
+
+ARCSEC2_PER_SR = (180 * 3600 / np.pi) ** 2
+AZIMUTHS = 1 << 16  # of the horizon's table: 0.0055 degrees, a sixteenth of a pixel of the widest fisheye
+EDGE_REACH_SIGMAS = 4.0  # how far from the skyline its PSF-smoothed step is worked out
+TANGENT_NODES_SIGMAS = np.linspace(-3.5, 3.5, 11)  # trapezoid over a Gaussian: exact to 1e-9 for a smooth skyline
+LENS_SAMPLES = 4096
+ROWS_PER_BLOCK = 64
+GRADIENT_STEP_PX = 0.01
+
+
+def sky_e_per_s(camera: Camera, sky_v_mag_arcsec2: float | None, angle_rad: Array) -> Array:
+    """Electrons per second and pixel (n,) of the diffuse sky at the angles off the axis (n,) [rad].
+
+    zero_point 10^(-0.4 sky) x the pixel's solid angle in square arcseconds x throughput; 0 for a black sky (None).
+    """
+    sensor = camera.sensor
+    if sensor is None or sky_v_mag_arcsec2 is None:
+        return np.zeros(np.shape(angle_rad))
+    arcsec2 = camera.pixel_solid_angle_sr(angle_rad) * ARCSEC2_PER_SR
+    return sensor.zero_point_e_per_s * 10 ** (-0.4 * sky_v_mag_arcsec2) * arcsec2 * sensor.throughput(angle_rad)
+
+
+def diffuse_e(scene: Scene) -> Array:
+    """Electrons (H, W) float64 of diffuse light: sky above the skyline, wall below it, nothing off the image circle.
+
+    sky x (wall + (1 - wall) c), c the fraction of the pixel's PSF that lies above the skyline.
+    """
+    sky, above = _sky_and_mask(scene)
+    if scene.terrain is None:
+        return sky
+    fraction = np.where(above, 1.0, scene.wall_reflectance)
+    edge = _near_skyline(above, _sigma_px(scene)) & (sky > 0)
+    y, x = np.nonzero(edge)
+    fraction[y, x] = scene.wall_reflectance + (1 - scene.wall_reflectance) * coverage(scene, np.stack([x, y], axis=-1))
+    sky *= fraction
+    return sky
+
+
+def coverage(scene: Scene, xy_px: Ints | Array) -> Array:
+    """Fraction (n,) of the PSF about each pixel (n, 2) that lies above the skyline; for pixels near the skyline.
+
+    In the pixel plane, r the direction in which the azimuth stands still and t the one across it:
+    c = integral over t of N(t; 0, s) Phi((elevation - H(azimuth)) / (s d elevation/dr)), both taken at t. So a jagged
+    skyline is followed as finely as the PSF can show; s^2 = psf_sigma^2 + 1/12 stands for the pixel's own width.
+    """
+    from scipy.special import ndtr
+
+    sigma = _sigma_px(scene)
+    xy_px = np.asarray(xy_px, dtype=np.float64)
+    across, slope_rad_per_px = _local_axes(scene, xy_px)
+    weights = np.exp(-0.5 * TANGENT_NODES_SIGMAS**2)
+    weights /= weights.sum()
+    azimuths, horizon = _horizon_table(scene)
+    total = np.zeros(len(xy_px))
+    for node, weight in zip(TANGENT_NODES_SIGMAS * sigma, weights, strict=True):
+        azimuth, elevation = _azel(scene, xy_px + node * across)
+        height = elevation - np.interp(azimuth, azimuths, horizon)
+        total += weight * ndtr(height / (sigma * slope_rad_per_px))
+    return total
+
+
+def _sigma_px(scene: Scene) -> float:
+    return float(np.sqrt(scene.sensor.psf_sigma_px**2 + 1 / 12))
+
+
+def _horizon_table(scene: Scene) -> tuple[Array, Array]:
+    """Azimuths from 0 to 2 pi, both ends included, and the horizon there [rad]; the terrain must not be None."""
+    azimuths = np.linspace(0.0, 2 * np.pi, AZIMUTHS + 1)
+    assert scene.terrain is not None
+    horizon = np.asarray(scene.terrain.horizon_rad(scene.position_enu_m[:2], azimuths[:-1]), dtype=np.float64)
+    return azimuths, np.append(horizon, horizon[0])
+
+
+def _azel(scene: Scene, xy_px: Array) -> tuple[Array, Array]:
+    return azel_from_rays(scene.camera.unproject(xy_px) @ scene.R_cam_enu)
+
+
+def _local_axes(scene: Scene, xy_px: Array) -> tuple[Array, Array]:
+    """Unit vectors t (n, 2) across the direction of constant azimuth, and the rise of elevation along it (n,) [rad/px].
+
+    From the four neighbours at a small step: d(elevation)/d(px) and d(azimuth)/d(px).
+    """
+    slopes = []
+    for axis in np.eye(2):
+        azimuth1, elevation1 = _azel(scene, xy_px + GRADIENT_STEP_PX * axis)
+        azimuth0, elevation0 = _azel(scene, xy_px - GRADIENT_STEP_PX * axis)
+        turn = (azimuth1 - azimuth0 + np.pi) % (2 * np.pi) - np.pi
+        slopes.append((turn / (2 * GRADIENT_STEP_PX), (elevation1 - elevation0) / (2 * GRADIENT_STEP_PX)))
+    (azimuth_x, elevation_x), (azimuth_y, elevation_y) = slopes
+    length = np.maximum(np.hypot(azimuth_x, azimuth_y), 1e-12)
+    across = np.stack([azimuth_x, azimuth_y], axis=-1) / length[:, None]
+    return across, np.maximum(np.abs(elevation_x * across[:, 1] - elevation_y * across[:, 0]), 1e-12)
+
+
+def _near_skyline(above: Bools, sigma_px: float) -> Bools:
+    """Pixels (H, W) with both sky and wall within reach of the PSF."""
+    import cv2
+
+    reach = int(np.ceil(EDGE_REACH_SIGMAS * sigma_px)) + 1
+    kernel = np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)
+    mask = above.astype(np.uint8)
+    return cv2.dilate(mask, kernel) != cv2.erode(mask, kernel)
+
+
+def _sky_and_mask(scene: Scene) -> tuple[Array, Bools]:
+    """Sky light (H, W) [e] with no terrain before it, and whether the pixel's centre is above the skyline (H, W)."""
+    camera, (width, height) = scene.camera, scene.camera.size_px
+    rho, light, side, axial = _lens_table(scene)
+    u = (np.arange(width) - camera.centre_px[0]) / camera.focal_px[0]
+    sky, above = np.empty((height, width)), np.ones((height, width), dtype=bool)
+    tan_horizon = None if scene.terrain is None else _tan_table(scene)
+    hand = -1.0 if camera.mirrored else 1.0
+    east, north, up = scene.R_cam_enu.T * [hand, 1.0, 1.0]
+    to_east, to_north, _ = scene.sky_gradient * rays_from_azel(scene.sky_gradient_azimuth_rad, 0.0)
+    for top in range(0, height, ROWS_PER_BLOCK):
+        rows = slice(top, min(top + ROWS_PER_BLOCK, height))
+        v = ((np.arange(rows.start, rows.stop) - camera.centre_px[1]) / camera.focal_px[1])[:, None]
+        r = np.sqrt(u * u + v * v)
+        sky[rows] = np.interp(r, rho, light, right=0.0)
+        s, c = np.interp(r, rho, side), np.interp(r, rho, axial)
+        e, n, h = ((axis[0] * u + axis[1] * v) * s + axis[2] * c for axis in (east, north, up))
+        if scene.sky_gradient:
+            sky[rows] *= np.maximum(1 + to_east * e + to_north * n, 0.0)
+        if tan_horizon is not None:
+            above[rows] = _above(e, n, h, *tan_horizon)
+    return sky, above
+
+
+def _above(east: Array, north: Array, up: Array, azimuths: Array, tan_horizon: Array) -> Bools:
+    """Whether directions are above the horizon; the azimuth is only worked out where the answer depends on it."""
+    level = np.hypot(east, north)
+    above = up > tan_horizon.max() * level
+    unclear = ~above & (up > tan_horizon.min() * level)
+    azimuth = np.arctan2(east[unclear], north[unclear]) % (2 * np.pi)
+    above[unclear] = up[unclear] > np.interp(azimuth, azimuths, tan_horizon) * level[unclear]
+    return above
+
+
+def _tan_table(scene: Scene) -> tuple[Array, Array]:
+    azimuths, horizon = _horizon_table(scene)
+    return azimuths, np.tan(np.minimum(horizon, 1.5707))
+
+
+def _lens_table(scene: Scene) -> tuple[Array, Array, Array, Array]:
+    """Per radius rho [focal lengths]: sky light per pixel [e], sin a / rho and cos a.
+
+    The rim of the image circle is as sharp as the PSF.
+    """
+    from scipy.special import ndtr
+
+    camera = scene.camera
+    top = min(camera.max_angle_rad + 0.05, camera.lens.max_invertible_rad * 0.9999)
+    angle = np.linspace(1e-6, top, LENS_SAMPLES)
+    rho = camera.lens.rho(angle)
+    rim_px = (camera.lens.rho(np.array(min(camera.max_angle_rad, top))) - rho) * np.mean(camera.focal_px)
+    light = sky_e_per_s(camera, scene.sky_v_mag_arcsec2, angle) * scene.exposure_s * ndtr(rim_px / _sigma_px(scene))
+    return rho, light, np.sin(angle) / rho, np.cos(angle)

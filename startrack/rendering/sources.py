@@ -1,0 +1,115 @@
+"""Light of stars and bodies: which reach the camera, where they fall and how many electrons they leave."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from startrack.camera import Camera, Sensor
+from startrack.frames import azel_from_rays
+from startrack.rendering.psf import splat
+from startrack.rendering.scene import Scene
+from startrack.types import Array, Body, Bools
+
+TRAIL_VISIBLE_PX = 0.02  # motion during the exposure below which a star is a point
+TRAIL_STEP_PX = 0.2  # a step s adds s^2/12 to the variance of the trail's profile: 0.003 px^2
+DISK_STEP_PX = 0.5  # spacing of the points that make up a disk
+# Mean radius over mean distance: the Sun from 1 au (IAU 2015 nominal radius), Earth and Moon from 384,400 km.
+ANGULAR_RADIUS_RAD = {"Sun": 6.957e8 / 1.495978707e11, "Earth": 6.3710e6 / 3.844e8, "Moon": 1.7374e6 / 3.844e8}
+
+
+def flux_e(sensor: Sensor, v_mag: Array, angle_rad: Array, exposure_s: float) -> Array:
+    """Electrons (n,) in the whole PSF: zero_point 10^(-0.4 V) exposure throughput(angle)."""
+    return sensor.zero_point_e_per_s * 10 ** (-0.4 * np.asarray(v_mag)) * exposure_s * sensor.throughput(angle_rad)
+
+
+def off_axis_rad(rays_cam: Array) -> Array:
+    """Angles (n,) from the boresight [rad]."""
+    return np.arctan2(np.hypot(rays_cam[..., 0], rays_cam[..., 1]), rays_cam[..., 2])
+
+
+def above_terrain(scene: Scene, rays_enu: Array) -> Bools:
+    """Which of the directions (n, 3) no terrain hides: elevation > horizon, a hard edge."""
+    if scene.terrain is None:
+        return np.ones(len(rays_enu), dtype=bool)
+    azimuth, elevation = azel_from_rays(rays_enu)
+    return elevation > scene.terrain.horizon_rad(scene.position_enu_m[:2], azimuth)
+
+
+def add_sources(image_e: Array, scene: Scene) -> None:
+    """Add to the image (H, W) [e] the stars and bodies of the scene, trailed where the sky turns visibly."""
+    rays_icrs, v_mag = _points(scene)
+    rays_enu = rays_icrs @ scene.R_enu_icrs.T
+    turns = _turns(scene)
+    reach_rad = scene.camera.max_angle_rad + float(np.linalg.norm(scene.sky_turn_rad))
+    nearby = off_axis_rad(rays_enu @ scene.R_cam_enu.T) <= reach_rad
+    rays_enu, v_mag = rays_enu[nearby], v_mag[nearby]
+    for R_turn in turns:
+        turned_enu = rays_enu @ R_turn.T
+        rays_cam = turned_enu @ scene.R_cam_enu.T
+        angle = off_axis_rad(rays_cam)
+        shines = (angle <= scene.camera.max_angle_rad) & above_terrain(scene, turned_enu)
+        xy_px, _ = scene.camera.project(rays_cam[shines])
+        flux = flux_e(scene.sensor, v_mag[shines], angle[shines], scene.exposure_s / len(turns))
+        splat(image_e, xy_px, flux, scene.sensor.psf_sigma_px)
+
+
+def exposure_reaching(camera: Camera, sky_v_mag_arcsec2: float | None, *, v_mag: float, snr: float) -> float:
+    """Seconds in which a star on the axis reaches the matched-filter signal-to-noise ratio.
+
+    snr^2 = S^2 / (S + A (read^2 + B)), S and B the electrons of the star and of one pixel's sky and dark current in
+    the time t, A = 4 pi (sigma^2 + 1/12) the PSF's noise area: a quadratic in t. The camera must have a sensor.
+    """
+    from startrack.rendering.sky import sky_e_per_s
+
+    sensor = camera.sensor
+    if sensor is None:
+        raise ValueError(f"camera {camera.name} has no sensor")
+    star = sensor.zero_point_e_per_s * 10 ** (-0.4 * v_mag)
+    area_px = 4 * np.pi * (sensor.psf_sigma_px**2 + 1 / 12)
+    background = sensor.dark_e_per_s + float(sky_e_per_s(camera, sky_v_mag_arcsec2, np.zeros(1))[0])
+    linear = snr**2 * (star + area_px * background)
+    constant = snr**2 * area_px * sensor.read_noise_e**2
+    return float((linear + np.sqrt(linear**2 + 4 * star**2 * constant)) / (2 * star**2))
+
+
+def _points(scene: Scene) -> tuple[Array, Array]:
+    """Directions (n, 3) and true magnitudes (n,) of all points of light; a disk of a body is many points."""
+    parts = [(scene.stars.rays_icrs, scene.stars.v_mag + scene.v_error_mag)]
+    parts += [_body_points(body, max(scene.camera.focal_px)) for body in scene.bodies]
+    return np.concatenate([rays for rays, _ in parts]), np.concatenate([v_mag for _, v_mag in parts])
+
+
+def _body_points(body: Body, focal_px: float) -> tuple[Array, Array]:
+    """A body as equal points evenly over its disk (a sunflower spiral); phases and dark limbs are left out."""
+    radius = ANGULAR_RADIUS_RAD.get(body.name, 0.0)
+    count = max(1, int(np.ceil(np.pi * (radius * focal_px / DISK_STEP_PX) ** 2)))
+    k = np.arange(count)
+    distance = radius * np.sqrt((k + 0.5) / count) if count > 1 else np.zeros(1)
+    turn = k * np.pi * (3 - np.sqrt(5))
+    centre = body.ray_icrs / np.linalg.norm(body.ray_icrs)
+    across = np.cross(centre, np.eye(3)[np.argmin(np.abs(centre))])
+    across /= np.linalg.norm(across)
+    offsets = np.cos(turn)[:, None] * across + np.sin(turn)[:, None] * np.cross(centre, across)
+    rays = np.cos(distance)[:, None] * centre + np.sin(distance)[:, None] * offsets
+    return rays, np.full(count, body.v_mag + 2.5 * np.log10(count))
+
+
+def _turns(scene: Scene) -> list[Array]:
+    """Rotations (3, 3) of the sky at the middles of equal steps of the exposure, relative to mid-exposure."""
+    angle = float(np.linalg.norm(scene.sky_turn_rad))
+    # Farthest off axis a fisheye stretches the circle around it by up to angle / sin(angle): pi/2 at 90 degrees.
+    motion_px = angle * max(scene.camera.focal_px) * np.pi / 2
+    if motion_px < TRAIL_VISIBLE_PX:
+        return [np.eye(3)]
+    steps = int(np.ceil(motion_px / TRAIL_STEP_PX))
+    return [rotation_from_vector(scene.sky_turn_rad * ((k + 0.5) / steps - 0.5)) for k in range(steps)]
+
+
+def rotation_from_vector(vector_rad: Array) -> Array:
+    """Rotation (3, 3) by |vector| about the vector (Rodrigues)."""
+    angle = float(np.linalg.norm(vector_rad))
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = np.asarray(vector_rad) / angle
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)

@@ -1,0 +1,33 @@
+"""The thesis's tables and figures, redone: `ARTEFACTS` by name, each from a context to a piece."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from startrack.reproduction.artefact import FULL, QUICK, Context, Piece, Size, written
+from startrack.reproduction.craters import fig_a2
+from startrack.reproduction.curves import fig3_7, fig3_8, fig3_9
+from startrack.reproduction.errors import fig3_4, fig3_10, fig_b
+from startrack.reproduction.runs import Runs
+from startrack.reproduction.sky_figures import fig3_3, fig3_5, fig3_6, fig_a1
+from startrack.reproduction.sweeps import by_aspect_ratio, by_magnitude
+from startrack.reproduction.table31 import table31
+
+ARTEFACTS: dict[str, Callable[[Context], Piece]] = {
+    "table3.1": table31,
+    "fig3.3": fig3_3,
+    "fig3.4": fig3_4,
+    "fig3.5": fig3_5,
+    "fig3.6": fig3_6,
+    "fig3.7": fig3_7,
+    "fig3.8": fig3_8,
+    "fig3.9": fig3_9,
+    "fig3.10": fig3_10,
+    "figA.1": fig_a1,
+    "figA.2": fig_a2,
+    "figB": fig_b,
+    "magnitude": by_magnitude,
+    "aspect": by_aspect_ratio,
+}
+
+__all__ = ["ARTEFACTS", "FULL", "QUICK", "Context", "Piece", "Runs", "Size", "written"]

@@ -1,0 +1,86 @@
+"""A reproduced table or figure: what was computed, as values, and how it goes to files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from startrack.exposure import write_atomically
+from startrack.output.ecsv import Column, ecsv_text
+from startrack.reproduction.runs import Runs
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is computed. Places are per sky; smaller sizes are the first part of larger ones."""
+
+    name: str
+    skies: int  # of table 3.1 and figures B.1 to B.10
+    per_sky: int
+    ours_per_sky: int
+    cell_per_sky: int
+    deep_per_sky: int  # at magnitude 8
+    one_sky: int  # of figures 3.4 and 3.10
+    ours_one_sky: int
+    sweep_skies: int  # per magnitude and per aspect ratio
+    sweep_per_sky: int
+    traverses: int
+
+    def with_ours(self, most: int) -> Size:
+        """The same with our method on at most so many places per starfield, ten times as many in figure 3.10."""
+        per_sky = {name: min(getattr(self, name), most) for name in ("ours_per_sky", "cell_per_sky", "deep_per_sky")}
+        return replace(self, **per_sky, ours_one_sky=min(self.ours_one_sky, 10 * most))
+
+
+QUICK = Size("quick", 10, 500, 60, 60, 10, 5_000, 500, 5, 12, 10)
+FULL = Size("full", 10, 10_000, 10_000, 1_000, 500, 100_000, 100_000, 10, 100, 100)
+
+
+@dataclass(frozen=True)
+class Context:
+    """What every table and figure is made with."""
+
+    size: Size
+    seed: int
+    runs: Runs
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One table or figure of the thesis, redone."""
+
+    name: str  # such as "fig3.7"
+    title: str
+    line: str  # the outcome in one line
+    text: str  # Markdown: the table, or what the figure shows and how it compares
+    columns: tuple[Column, ...] = ()
+    pictures: dict[str, Callable[[], bytes]] = field(default_factory=dict)  # file stem: PNG when asked for
+    values: dict[str, Any] = field(default_factory=dict)  # "thesis", "reproduced", "ours"
+    timing_ms: dict[str, float] = field(default_factory=dict)  # per fix
+
+
+def written(piece: Piece, out: Path, *, plots: bool) -> list[Path]:
+    """Write NAME.md, NAME.ecsv and the pictures; their paths."""
+    files: dict[str, bytes] = {}
+    if piece.columns:
+        files[f"{piece.name}.ecsv"] = ecsv_text(piece.columns).encode()
+    if plots:
+        files |= {f"{stem}.png": draw() for stem, draw in piece.pictures.items()}
+    files[f"{piece.name}.md"] = markdown(piece, [name for name in files if name.endswith(".png")]).encode()
+    for name, data in files.items():
+        write_atomically(out / name, data, overwrite=True)
+    return [out / name for name in files]
+
+
+def markdown(piece: Piece, pictures: Iterable[str] = ()) -> str:
+    """The piece as a section of Markdown."""
+    return "\n\n".join([f"## {piece.title}", *(f"![{name}]({name})" for name in pictures), piece.text.strip()]) + "\n"
+
+
+def markdown_table(head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
+    """Rows of cells as a Markdown table."""
+    head = list(head)
+    lines = [head, ["---"] * len(head), *([str(cell) for cell in row] for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

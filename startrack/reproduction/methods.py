@@ -1,0 +1,116 @@
+"""One chunk of fixes: the same sky and places for every method, computed anywhere and in any order."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+import numpy as np
+
+from startrack.localization import ExactPosterior
+from startrack.localization.convex_hull import hull_position
+from startrack.localization.pseudo_gradient import PseudoGradient, descend
+from startrack.reproduction.bound import cell_centroid
+from startrack.reproduction.simulator import ASPECT_RATIO, MAGNITUDE, PERFECT, Mistakes, Sky, crater, places, visible
+from startrack.terrain import Cylinder
+from startrack.types import Array, Bools, Evidence, Fix, NotLocated
+
+KUA, OURS, CELL = "kua", "ours", "cell"  # the methods: the thesis's two steps; ours; the limit for a perfect list
+CHUNK = {KUA: 1000, OURS: 100, CELL: 200}  # fixes: a second or so of work
+Chunk = dict[str, np.ndarray]  # what one task gives
+
+
+@dataclass(frozen=True)
+class Task:
+    """Places number start to stop - 1 of one sky, by one method."""
+
+    method: str
+    seed: int
+    sky: int
+    start: int
+    stop: int
+    magnitude: float = MAGNITUDE
+    aspect_ratio: float = ASPECT_RATIO
+    mistakes: Mistakes = PERFECT
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+
+def tasks(
+    method: str, seed: int, sky: int, count: int, *, magnitude: float = MAGNITUDE, aspect_ratio: float = ASPECT_RATIO,
+    mistakes: Mistakes = PERFECT,
+) -> list[Task]:  # fmt: skip
+    """The first `count` places of a sky, in chunks."""
+    step = CHUNK[method]
+    starts = range(0, count, step)
+    return [
+        Task(method, seed, sky, start, min(start + step, count), magnitude, aspect_ratio, mistakes) for start in starts
+    ]
+
+
+def done(task: Task) -> Chunk:
+    """Arrays over the task's places: `truth_m` (n, 2), the method's own, and `seconds` (1,) of the processor spent on
+    the method.
+
+    kua: `hull_m`, `refined_m` (n, 2), `settled` (n,). ours: `located` (n,); of the located ones `fix_m` (m, 2),
+    `nees` (m,), the squared error over the stated covariance, and `ambiguous` (m,). cell: `centroid_m` (n, 2).
+    """
+    sky, cylinder = Sky.drawn(task.seed, task.sky, task.magnitude), crater(task.aspect_ratio)
+    points = sky.on_rim_plane(cylinder)
+    truth = places(task.seed, task.sky, task.start, task.stop)
+    seen = [visible(points, place, cylinder.radius_m) for place in truth]
+    if task.method == KUA:
+        own = _kua(points, seen, cylinder.wall_m, cylinder.radius_m)
+    elif task.method == CELL:
+        start = time.thread_time()
+        own = {"centroid_m": np.stack([cell_centroid(points, place, cylinder.radius_m) for place in truth])}
+        own["seconds"] = np.array([time.thread_time() - start])
+    else:
+        own = _ours(task, sky, seen, truth)
+    return {"truth_m": truth, **own}
+
+
+def _kua(points: Array, seen: list[Bools], wall_m: float, radius_m: float) -> Chunk:
+    method, start = PseudoGradient(), time.thread_time()
+    hull = np.stack([hull_position(points[one], wall_m, radius_m) for one in seen])
+    ends = [
+        descend(points, one, first, radius_m, method.gain, method.most_steps)
+        for one, first in zip(seen, hull, strict=True)
+    ]
+    return {
+        "hull_m": hull,
+        "refined_m": np.stack([end for end, _ in ends]),
+        "settled": np.array([settled for _, settled in ends]),
+        "seconds": np.array([time.thread_time() - start]),
+    }
+
+
+def _ours(task: Task, sky: Sky, seen: list[Bools], truth: Array) -> Chunk:
+    # No boulders here that are not on the map, so a sector of the horizon needs no cap on what it may claim.
+    localizer = ExactPosterior(sector_epsilon=0.0, compiled=find_spec("numba") is not None)
+    cylinder = crater(task.aspect_ratio)
+    evidence = [
+        task.mistakes.evidence(sky, task.mistakes.listed(one, task.seed, task.sky, task.start + k))
+        for k, one in enumerate(seen)
+    ]
+    _fix_or_none(localizer, evidence[0], cylinder)  # whatever has to be compiled or loaded is, before the clock starts
+    start = time.thread_time()
+    fixes = [_fix_or_none(localizer, one, cylinder) for one in evidence]
+    seconds = time.thread_time() - start
+    error = [(fix, fix.position_enu_m[:2] - place) for fix, place in zip(fixes, truth, strict=True) if fix is not None]
+    return {
+        "located": np.array([fix is not None for fix in fixes]),
+        "fix_m": np.array([fix.position_enu_m[:2] for fix, _ in error]).reshape(-1, 2),
+        "nees": np.array([d @ np.linalg.solve(fix.covariance_m2, d) for fix, d in error]),
+        "ambiguous": np.array([fix.ambiguous for fix, _ in error], dtype=np.bool_),
+        "seconds": np.array([seconds]),
+    }
+
+
+def _fix_or_none(localizer: ExactPosterior, evidence: Evidence, cylinder: Cylinder) -> Fix | None:
+    try:
+        return localizer(evidence, cylinder)
+    except NotLocated:
+        return None  # counted as such: `located` says so

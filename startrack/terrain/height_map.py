@@ -1,0 +1,277 @@
+"""Height maps as terrain: the horizon traced exactly, with a table of bounds that is worked out once and kept."""
+
+from __future__ import annotations
+
+import logging
+import time as clock
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from startrack.frames import Site
+from startrack.terrain import table_cache as cache
+from startrack.terrain import tracing
+from startrack.terrain.horizon_interpolator import ACROSS, Nearby
+from startrack.terrain.horizon_sigma import CrestErrors
+from startrack.terrain.horizon_table import BINS, HorizonTable, Progress, Square, built
+from startrack.terrain.protocol import Terrain
+from startrack.terrain.pyramid import Ground, ground_up_m, packed
+from startrack.terrain.raster import Raster
+from startrack.terrain.tracing import Tracer
+from startrack.types import Array, BadInput, Bools, Ints
+
+LOG = logging.getLogger(__name__)
+CELL_M = 200.0  # cells of the table are no wider
+MOST_CELLS_ACROSS = 128
+COMMON_PER_POST = 3.0
+MARGIN = 1.15  # of the search radius: so far is searched, to notice that the camera left the area
+SLOPE_STEP_M = 5.0
+UNKNOWN_FROM = 12  # places across the square that are asked where the maps end
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HeightMap:
+    """The surface that is bilinear between the posts of height maps, as true 3-D points on the Moon's sphere.
+
+    tan H = max over s of (z(p + s u) - z(p) - camera height) / s, u the azimuth's direction. Where several maps cover
+    a place the first holds. See `Terrain`.
+    """
+
+    name: str
+    site: Site
+    maps: tuple[Raster, ...]  # finest first
+    camera_height_m: float = 1.5
+    search_radius_m: float = 10_000.0
+    height_sigma_m: float = 0.0  # of single posts, independent of each other
+    horizon_sigma_common_rad: float | None = None  # of an error that all azimuths share; None: see common_sigma_rad
+    most_slope_rad: float = np.pi / 2  # a rover does not stand on steeper ground
+    glare_rad: tuple[
+        tuple[float, float], ...
+    ] = ()  # azimuth ranges, from the first eastward to the second, lit by the Sun
+    use_compiled: bool | None = None  # None: where numba is installed
+    _state: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        if not self.maps:
+            raise BadInput("bad_terrain", "[dem] needs at least one map")
+        self._check_cover()
+
+    @cached_property
+    def tracer(self) -> Tracer:
+        return tracing.tracer(self.use_compiled)
+
+    @cached_property
+    def ground(self) -> Ground:
+        """The maps packed for tracing."""
+        return packed(list(self.maps), self.site)
+
+    @cached_property
+    def finest_post_m(self) -> float:
+        """Spacing of the posts of the finest map."""
+        return min(m.post_m for m in self.maps)
+
+    @cached_property
+    def common_sigma_rad(self) -> float:
+        """What the file says, and the height of the camera's own ground.
+
+        Where the file says nothing, three times what `height_sigma_m` makes of the horizon: crests clipped by the grid
+        of posts stand too low by some such amount all around.
+        """
+        if not self.height_sigma_m and not self.horizon_sigma_common_rad:
+            return 0.0
+        own = float(np.median(self._crests.cells_rad[self._searched])) if self.height_sigma_m else 0.0
+        said = self.horizon_sigma_common_rad
+        return float(np.hypot(own, COMMON_PER_POST * own if said is None else said))
+
+    @cached_property
+    def _searched(self) -> Bools:
+        """Cells (n,) in the search area."""
+        return np.asarray(np.hypot(*self.square.centres_m.T) < self.search_radius_m)
+
+    @cached_property
+    def reach_m(self) -> float:
+        """The search area and a margin, as far as the maps reach."""
+        return self.search_radius_m * MARGIN if self._covers(self.search_radius_m * MARGIN) else self.search_radius_m
+
+    @cached_property
+    def square(self) -> Square:
+        across = 1
+        while 2 * self.reach_m / across > CELL_M and across < MOST_CELLS_ACROSS:
+            across *= 2
+        return Square(self.reach_m, across)
+
+    @cached_property
+    def _key(self) -> str:
+        return cache.key_of(self)
+
+    @property
+    def is_prepared(self) -> bool:
+        """Whether the table of horizons is in memory or on disk."""
+        return self._key in self._state or cache.path_of(self._key).is_file()
+
+    def prepared(self, progress: Progress | None = None) -> HorizonTable:
+        """The table of horizons: from memory, else from the cache on disk, else worked out (and cached).
+
+        Of several processes that need the same table one works it out, and the others wait for it.
+        """
+        if self._key not in self._state:
+            table = cache.loaded(self._key, self.square)
+            if table is None:
+                with cache.one_at_a_time(self._key, self.name):
+                    table = cache.loaded(self._key, self.square) or self._made(progress)
+            self._state.clear()  # copies made by `replace` share the dictionary, but not the table
+            self._state[self._key] = table
+        return self._state[self._key]  # type: ignore[no-any-return]
+
+    def _made(self, progress: Progress | None) -> HorizonTable:
+        LOG.info("horizons of %s: worked out now, once; this takes a minute or two", self.name)
+        start = clock.perf_counter()
+        table = self._built(progress)
+        path = cache.save(self._key, table)
+        where = f"kept in {path}" if path else f"not kept: {cache.cache_dir()} cannot be written"
+        LOG.debug("horizons of %s: done in %.0f s, %s", self.name, clock.perf_counter() - start, where)
+        return table
+
+    def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """Horizon elevation [rad], traced. See `Terrain`."""
+        return np.arctan(self.horizons(points_m, azimuths_rad)[0])
+
+    def horizon_bounds_rad(
+        self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
+    ) -> tuple[Array, Array]:
+        """Bounds of the horizon over boxes [rad]: from the table, and for single rays and small boxes traced anew."""
+        centres_m = np.asarray(centres_m, dtype=np.float64)
+        shape = np.broadcast_shapes(
+            centres_m.shape[:-1], np.shape(half_m), np.shape(azimuths_rad), np.shape(azimuth_half_rad)
+        )
+        centres = _flat(centres_m, (*shape, 2)).reshape(-1, 2)
+        half, azimuths, turn = (_flat(a, shape).ravel() for a in (half_m, azimuths_rad, azimuth_half_rad))
+        table = self.prepared()
+        low, high = np.empty(len(half)), np.empty(len(half))
+        traced = (turn < 0.25 * 2 * np.pi / BINS) & (half < table.square.half_m)
+        if traced.all():
+            self.tracer.box_bounds(self, table, centres, half, azimuths, turn, low, high)
+        elif not traced.any() and np.all(half == half[0]):
+            self.tracer.sector_bounds(self, table, centres, half, azimuths, turn, low, high)
+        else:
+            for kind in np.unique(half[~traced]):
+                which = ~traced & (half == kind)
+                low[which], high[which] = self._some(self.tracer.sector_bounds, centres, half, azimuths, turn, which)
+            low[traced], high[traced] = self._some(self.tracer.box_bounds, centres, half, azimuths, turn, traced)
+        return low.reshape(shape), high.reshape(shape)
+
+    def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """From the height of the single post that makes the horizon: sigma cos^2 H / its distance."""
+        if self.height_sigma_m == 0:
+            return np.zeros(np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad)))
+        return self._crests.at(points_m, azimuths_rad)
+
+    def most_sigma_rad(self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float) -> Array:
+        """The largest `horizon_sigma_rad` (n,) over boxes and azimuths."""
+        if self.height_sigma_m == 0:
+            return np.zeros(np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad)))
+        return self._crests.most(centres_m, half_m, azimuths_rad, azimuth_half_rad)
+
+    @cached_property
+    def _crests(self) -> CrestErrors:
+        return CrestErrors(self.prepared(), self.height_sigma_m)
+
+    def ground_m(self, points_m: Array) -> Array:
+        """Height of the ground in enu (...) [m]."""
+        points = np.asarray(points_m, dtype=np.float64)
+        return self.tracer.surfaces(self, points.reshape(-1, 2)).reshape(points.shape[:-1])
+
+    def allowed(self, points_m: Array) -> Bools:
+        """Whether the points (..., 2) are within reach and not too steep."""
+        points = np.asarray(points_m)
+        inside = np.hypot(points[..., 0], points[..., 1]) <= self.reach_m
+        if self.most_slope_rad >= np.pi / 2:
+            return np.asarray(inside)
+        return np.asarray(inside & (self.slope_rad(points) <= self.most_slope_rad))
+
+    def slope_rad(self, points_m: Array) -> Array:
+        """Slope of the ground (...) over 10 m."""
+        points = np.asarray(points_m, dtype=np.float64)
+        steps = SLOPE_STEP_M * np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])
+        z = self.ground_m(points[..., None, :] + steps)
+        rise = np.hypot(z[..., 0] - z[..., 1], z[..., 2] - z[..., 3]) / (2 * SLOPE_STEP_M)
+        return np.asarray(np.arctan(rise))
+
+    def tells(self, azimuths_rad: Array, elevations_rad: Array) -> Bools:
+        """Whether the map can say anything of a ray: not in a glare sector, nor where unmapped ground may stand."""
+        azimuths = np.asarray(azimuths_rad) % (2 * np.pi)
+        b = (azimuths / (2 * np.pi) * BINS).astype(np.int64) % BINS
+        told = np.asarray(elevations_rad) > self.prepared().unknown_rad[b]
+        for start, end in self.glare_rad:
+            told &= (azimuths - start) % (2 * np.pi) > (end - start) % (2 * np.pi)
+        return np.asarray(told)
+
+    @property
+    def unknown_rad(self) -> Array:
+        """(n,) of n sectors from north eastward: below which elevation ground off the maps may stand, or -pi/2."""
+        return self.prepared().unknown_rad
+
+    def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = ACROSS) -> Terrain:
+        """The ground about a place, see `Nearby`."""
+        return Nearby(self, np.asarray(centre_m, dtype=np.float64), half_m, np.unique(azimuths_rad), across)
+
+    def horizons(self, points_m: Array, azimuths_rad: Array) -> tuple[Array, Array, Array]:
+        """tan, distance, and distance of the maps' end, of each point and azimuth."""
+        points_m = np.asarray(points_m, dtype=np.float64)
+        shape = np.broadcast_shapes(points_m.shape[:-1], np.shape(azimuths_rad))
+        points = _flat(points_m, (*shape, 2)).reshape(-1, 2)
+        found = self.tracer.horizons(self, self._state.get(self._key), points, _flat(azimuths_rad, shape).ravel())
+        return tuple(a.reshape(shape) for a in found)  # type: ignore[return-value]
+
+    def _some(self, bounds: Any, centres: Array, half: Array, azimuths: Array, turn: Array, which: Bools) -> Any:
+        low, high = np.empty(int(which.sum())), np.empty(int(which.sum()))
+        if len(low):
+            parts = (np.ascontiguousarray(a[which]) for a in (centres, half, azimuths, turn))
+            bounds(self, self.prepared(), *parts, low, high)
+        return low, high
+
+    def _built(self, progress: Progress | None) -> HorizonTable:
+        square = self.square
+        centres = square.centres_m
+        wanted = np.hypot(*centres.T) < self.reach_m + 1.42 * square.half_m  # all that hold a place within reach
+        middles = (np.arange(BINS) + 0.5) * 2 * np.pi / BINS
+
+        def fill(cells: Ints) -> Array:
+            return self.tracer.fill_cells(self, centres[cells], square.half_m, middles, np.pi / BINS)
+
+        return built(square, wanted, fill, self._unknown_rad(), progress)
+
+    def _unknown_rad(self) -> Array:
+        """(BINS,) elevation below which ground beyond the maps might be seen from somewhere in the search area."""
+        line = np.linspace(-1, 1, UNKNOWN_FROM) * self.search_radius_m
+        places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+        places = places[np.hypot(*places.T) <= self.search_radius_m]
+        azimuths = np.repeat((np.arange(BINS)[:, None] + [0.02, 0.5, 0.98]).ravel(), len(places)) * 2 * np.pi / BINS
+        where = np.tile(places, (3 * BINS, 1))
+        tan, _, edge = self.horizons(where, azimuths)
+        up = self.ground_m(places) + self.camera_height_m
+        away = where + edge[:, None] * np.stack([np.sin(azimuths), np.cos(azimuths)], axis=-1)
+        drop = np.sum(np.minimum(np.abs(away), 1e7) ** 2, axis=-1) / (2 * self.ground.radius_m)
+        possible = (self.ground.highest_m - drop - np.tile(up, 3 * BINS)) / edge
+        unknown = np.where((edge < 1e9) & (possible > tan), np.arctan(possible), -np.pi / 2)
+        return np.asarray(unknown.reshape(BINS, -1).max(axis=1))
+
+    def _covers(self, half_m: float) -> bool:
+        """Whether the maps know all ground in the square about the origin."""
+        line = np.linspace(-half_m, half_m, 65)
+        points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+        return not np.isnan(ground_up_m(self.site, list(self.maps), points)).any()
+
+    def _check_cover(self) -> None:
+        if not self._covers(self.search_radius_m):
+            raise BadInput(
+                "bad_terrain",
+                f"the maps do not cover the search area of {self.search_radius_m:.0f} m about the origin, "
+                "or have holes in it",
+            )
+
+
+def _flat(a: Any, shape: tuple[int, ...]) -> Array:
+    return np.ascontiguousarray(np.broadcast_to(np.asarray(a, dtype=np.float64), shape))

@@ -1,0 +1,67 @@
+"""What the posts' errors make of the horizon: the post that makes it moves the crest by its own error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from startrack.terrain.horizon_table import ANGLE_STEP_RAD, BEST, BINS, DISTANCE_STEP_M, HorizonTable
+from startrack.terrain.tracing import level_for
+from startrack.types import Array
+
+NEAREST_M = 50.0  # crests closer by are not told apart by the table
+CORNERS = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
+
+
+@dataclass(frozen=True, eq=False)
+class CrestErrors:
+    """Sigma of the horizon [rad] by cells and degrees of a table: that of a post, times cos^2 H over its distance."""
+
+    table: HorizonTable
+    height_sigma_m: float
+
+    def at(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """Sigma (...) at the points (..., 2) in these azimuths."""
+        square = self.table.square
+        n, side = square.across, 2 * square.half_m
+        cell = np.clip((np.asarray(points_m) + square.reach_m) / side, 0, n - 1).astype(np.int64)
+        b = (np.asarray(azimuths_rad) / (2 * np.pi) * BINS).astype(np.int64) % BINS
+        index = np.broadcast_to(
+            (cell[..., 0] * n + cell[..., 1]) * BINS + b,
+            np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad)),
+        )
+        return np.asarray(self.cells_rad.ravel()[index])
+
+    def most(self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float) -> Array:
+        """The largest of `at` (n,) over boxes and azimuths: it changes from cell to cell of the table."""
+        most = self._blocks[level_for(self.table, half_m)]
+        reach_m = self.table.square.reach_m
+        n, side = len(most), 2 * reach_m / len(most)
+        steps = 2 + int(2 * azimuth_half_rad * BINS / (2 * np.pi)) if azimuth_half_rad > 0 else 1
+        found = np.zeros(np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad)))
+        for turn in np.linspace(-azimuth_half_rad, azimuth_half_rad, steps) * (1 - 1e-9):
+            b = np.floor((np.asarray(azimuths_rad) + turn) / (2 * np.pi) * BINS).astype(np.int64) % BINS
+            for corner in half_m * (1 - 1e-9) * CORNERS:
+                cell = np.clip((np.asarray(centres_m) + corner + reach_m) / side, 0, n - 1).astype(np.int64)
+                found = np.maximum(found, most[cell[..., 0], cell[..., 1], b])
+        return found
+
+    @cached_property
+    def cells_rad(self) -> Array:
+        """(cells, BINS)."""
+        values = self.table.values
+        distance = np.maximum(values[..., BEST].astype(np.float32) * DISTANCE_STEP_M, NEAREST_M)
+        middle = (values[..., 0].astype(np.float32) + values[..., 1]) / 2 * ANGLE_STEP_RAD - np.pi / 2
+        return np.asarray(self.height_sigma_m * np.cos(middle) ** 2 / distance)
+
+    @cached_property
+    def _blocks(self) -> list[Array]:
+        """(m, m, BINS) the largest sigma of the cells, then of ever larger blocks of them."""
+        n = self.table.square.across
+        levels = [self.cells_rad.reshape(n, n, BINS)]
+        while len(levels[-1]) > 1:
+            a = levels[-1]
+            levels.append(np.maximum(np.maximum(a[::2, ::2], a[1::2, ::2]), np.maximum(a[::2, 1::2], a[1::2, 1::2])))
+        return levels

@@ -1,0 +1,165 @@
+"""Height maps packed for tracing: all posts in one array, and pyramids of the highest ground and of its slopes.
+
+Level L of a pyramid has blocks of 2^L x 2^L cells, a cell lying between four posts. Three things are kept of a block:
+its highest post, the highest of it and its eight neighbours, and the range of the slopes of these nine.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.frames import MOON_RADIUS_M, Site, latlon_from_enu
+from startrack.terrain.raster import GRID_NUMBERS, Raster
+from startrack.types import Array, Ints
+
+SLOPE_STEPS = 127  # a slope is kept as a whole number of 1/127 of the map's steepest, rounded away from the middle
+SMALLEST_BLOCKS = 4  # a pyramid ends where a level has no more blocks than this along an axis
+
+
+class Ground(NamedTuple):
+    """What the tracing functions read; plain arrays, so that numba takes it as it is."""
+
+    grid: Array  # (maps, 16), see Raster.grid_numbers
+    heights: NDArray[np.float32]  # all posts [m above the sphere]
+    posts: Ints  # (maps, 3): where a map's posts begin, rows, columns
+    tops: NDArray[np.float32]  # highest post of each block [m]
+    wide_tops: NDArray[np.float32]  # highest post of each block and its neighbours [m]
+    slopes: NDArray[np.int8]  # (blocks, 8): least and most rise per step along column, row, both, and -column +row
+    blocks: Ints  # (maps, levels, 3): where a level's blocks begin, block rows, block columns
+    levels: Ints  # (maps,)
+    slope_unit: Array  # (maps,) [m per post]
+    post_m: Array  # (maps,) spacing of the posts
+    radius_m: float  # from the Moon's centre to the origin of enu
+    highest_m: float  # highest post of all maps
+
+
+def packed(maps: list[Raster], site: Site) -> Ground:
+    """The maps, finest first, ready for tracing in the site's enu."""
+    heights, posts, tops, wide, slopes, blocks = [], [], [], [], [], []
+    first_post, first_block = 0, 0
+    units = []
+    for number, height_map in enumerate(maps):
+        h = height_map.heights_m
+        heights.append(h.ravel())
+        posts.append((first_post, *h.shape))
+        first_post += h.size
+        unit = max(_steepest(h) / SLOPE_STEPS, 1e-6)
+        units.append(unit)
+        block_table = []
+        top, slope = _raised(_cell_tops(h), height_map, maps[:number]), _cell_slopes(h, unit)
+        while True:
+            tops.append(top.ravel())
+            wide.append(_with_neighbours(top).ravel())
+            slopes.append(_slopes_with_neighbours(slope).reshape(-1, 8))
+            block_table.append((first_block, *top.shape))
+            first_block += top.size
+            if max(top.shape) <= SMALLEST_BLOCKS:
+                break
+            top = _coarser(top, np.maximum)
+            slope = np.concatenate([_coarser(slope[..., :4], np.minimum), _coarser(slope[..., 4:], np.maximum)], -1)
+        blocks.append(block_table)
+    most = max(len(table) for table in blocks)
+    return Ground(
+        grid=np.array([m.grid_numbers(site) for m in maps]).reshape(len(maps), GRID_NUMBERS),
+        heights=np.concatenate(heights),
+        posts=np.array(posts, dtype=np.int64),
+        tops=np.concatenate(tops),
+        wide_tops=np.concatenate(wide),
+        slopes=np.concatenate(slopes),
+        blocks=np.array([table + [table[-1]] * (most - len(table)) for table in blocks], dtype=np.int64),
+        levels=np.array([len(table) for table in blocks], dtype=np.int64),
+        slope_unit=np.array(units),
+        post_m=np.array([m.post_m for m in maps]),
+        radius_m=MOON_RADIUS_M + site.height_m,
+        highest_m=float(max(part.max() for part in tops)),
+    )
+
+
+def _cell_tops(h: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.maximum(np.maximum(h[:-1, :-1], h[:-1, 1:]), np.maximum(h[1:, :-1], h[1:, 1:]))
+
+
+def _steepest(h: NDArray[np.float32]) -> float:
+    """Largest rise between two posts, neighbours across the corner too [m]."""
+    return float(max(np.abs(h[:, 1:] - h[:, :-1]).max(), np.abs(h[1:] - h[:-1]).max())) * 2.05
+
+
+def _cell_slopes(h: NDArray[np.float32], unit: float) -> NDArray[np.int8]:
+    """(rows, columns, 8): least, then most, rise per step along (1, 0), (0, 1), (1, 1), (-1, 1) in (column, row).
+
+    In a bilinear cell the rise along columns lies between those of its two edges, whatever the row, and so for rows.
+    """
+    h = h * np.float32(1 / unit)
+    along, down = h[:, 1:] - h[:, :-1], h[1:] - h[:-1]
+    low_c, high_c = np.minimum(along[:-1], along[1:]), np.maximum(along[:-1], along[1:])
+    low_r, high_r = np.minimum(down[:, :-1], down[:, 1:]), np.maximum(down[:, :-1], down[:, 1:])
+    out = np.empty((*low_c.shape, 8), dtype=np.int8)
+    slack = np.float32(0.01)  # of a step: more than single precision can lose
+    for k, least in enumerate((low_c, low_r, low_c + low_r, low_r - high_c)):
+        out[..., k] = np.floor(least - slack)
+    for k, most in enumerate((high_c, high_r, high_c + high_r, high_r - low_c)):
+        out[..., 4 + k] = np.ceil(most + slack)
+    return out
+
+
+def _padded(a: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    return np.pad(a, ((0, rows), (0, columns), *[(0, 0)] * (a.ndim - 2)), mode="edge")
+
+
+def _coarser(a: np.ndarray, choose: np.ufunc) -> np.ndarray:
+    a = _padded(a, a.shape[0] % 2, a.shape[1] % 2)
+    return np.asarray(choose(choose(a[::2, ::2], a[1::2, ::2]), choose(a[::2, 1::2], a[1::2, 1::2])))
+
+
+def _with_neighbours(a: np.ndarray, choose: np.ufunc = np.maximum) -> np.ndarray:
+    tall = a.copy()
+    choose(tall[1:], a[:-1], out=tall[1:])
+    choose(tall[:-1], a[1:], out=tall[:-1])
+    wide = tall.copy()
+    choose(wide[:, 1:], tall[:, :-1], out=wide[:, 1:])
+    choose(wide[:, :-1], tall[:, 1:], out=wide[:, :-1])
+    return wide
+
+
+def _slopes_with_neighbours(slope: NDArray[np.int8]) -> NDArray[np.int8]:
+    parts = _with_neighbours(slope[..., :4], np.minimum), _with_neighbours(slope[..., 4:], np.maximum)
+    return np.concatenate(parts, axis=-1)
+
+
+def _raised(tops: NDArray[np.float32], height_map: Raster, finer: list[Raster]) -> NDArray[np.float32]:
+    """Cells of a coarse map where finer maps lie are as high as any post of these there or close by."""
+    tops = tops.copy()
+    for fine in finer:
+        size = 1
+        high = _cell_tops(fine.heights_m)
+        while size * fine.post_m < 0.5 * height_map.post_m and max(high.shape) > 1:
+            high, size = _coarser(high, np.maximum), 2 * size
+        rows, columns = (np.indices(high.shape) + 0.5) * size
+        middles = np.stack([rows.ravel(), columns.ravel()], axis=-1)
+        at = height_map.row_column(*fine.projection.latlon_from_xy(*fine.xy(middles)))
+        reach = min(0.71 * size * fine.post_m / height_map.post_m + 0.01, 0.5)
+        for d_row, d_column in ((-reach, -reach), (-reach, reach), (reach, -reach), (reach, reach)):
+            cell = np.floor(at + np.array([d_row, d_column])).astype(np.int64)
+            inside = ((cell >= 0) & (cell < tops.shape)).all(axis=-1)
+            np.maximum.at(tops, tuple(cell[inside].T), high.ravel()[inside])
+    return tops
+
+
+def ground_up_m(site: Site, maps: list[Raster], points_m: Array, rounds: int = 6) -> Array:
+    """Height in enu (...) of the surface at east and north (..., 2) [m]; NaN where no map reaches."""
+    east, north = points_m[..., 0], points_m[..., 1]
+    up = np.zeros(np.shape(east))
+    level2 = east * east + north * north
+    for _ in range(rounds):
+        lat, lon = latlon_from_enu(site, east, north, np.nan_to_num(up))
+        height = np.full(np.shape(east), np.nan)
+        for height_map in maps:
+            missing = np.isnan(height)
+            if not missing.any():
+                break
+            height = np.where(missing, height_map.sampled(height_map.row_column(lat, lon)), height)
+        up = np.sqrt((MOON_RADIUS_M + height) ** 2 - level2) - MOON_RADIUS_M - site.height_m
+    return np.asarray(up)

@@ -1,0 +1,102 @@
+"""A grid of heights in a map projection: posts at pixel centres, the ground bilinear between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.frames import R_enu_fixed, Site
+from startrack.terrain.projection import EQUIRECTANGULAR, STEREOGRAPHIC, Projection
+from startrack.types import Array
+
+GRID_NUMBERS = 16  # see Raster.grid_numbers
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Raster:
+    """Heights above the sphere. Post (row, column) stands at x = x0 + column dx, y = y0 + row dy."""
+
+    heights_m: NDArray[np.float32]  # (rows, columns); NaN where the map has a hole
+    projection: Projection
+    x0_m: float
+    y0_m: float
+    dx_m: float
+    dy_m: float  # negative where the first row is the northern one
+    source: str = ""  # for messages
+
+    @property
+    def post_m(self) -> float:
+        """Spacing of the posts, the wider of the two [m]."""
+        stretch = np.array([1.0, 1.0])
+        if self.projection.kind == EQUIRECTANGULAR:
+            _, middle = self.xy(np.array(self.heights_m.shape) / 2)
+            latitude = (middle - self.projection.false_y_m) / (self.projection.radius_m * self.projection.scale_y)
+            stretch = np.array([np.cos(latitude) / self.projection.scale, 1 / self.projection.scale_y])
+        return float(np.max(np.abs([self.dx_m, self.dy_m]) * stretch))
+
+    def xy(self, row_column: Array) -> tuple[Array, Array]:
+        """Map coordinates x, y (...) [m] of fractional rows and columns (..., 2)."""
+        return self.x0_m + self.dx_m * row_column[..., 1], self.y0_m + self.dy_m * row_column[..., 0]
+
+    def row_column(self, latitude_rad: Array, longitude_rad: Array) -> Array:
+        """Fractional rows and columns (..., 2) of places."""
+        x, y = self.projection.xy_from_latlon(latitude_rad, longitude_rad)
+        return np.stack([(y - self.y0_m) / self.dy_m, (x - self.x0_m) / self.dx_m], axis=-1)
+
+    def sampled(self, row_column: Array) -> Array:
+        """Heights (...) [m] at fractional rows and columns (..., 2), bilinear; NaN beyond the outer posts."""
+        row, column = row_column[..., 0], row_column[..., 1]
+        rows, columns = self.heights_m.shape
+        inside = (row >= 0) & (row <= rows - 1) & (column >= 0) & (column <= columns - 1)
+        i = np.clip(np.floor(np.where(inside, row, 0)).astype(np.int64), 0, rows - 2)
+        j = np.clip(np.floor(np.where(inside, column, 0)).astype(np.int64), 0, columns - 2)
+        down, right = np.where(inside, row - i, np.nan), np.where(inside, column - j, np.nan)
+        h = self.heights_m.astype(np.float64, copy=False) if self.heights_m.size < 1 << 16 else self.heights_m
+        top = h[i, j] * (1 - right) + h[i, j + 1] * right
+        bottom = h[i + 1, j] * (1 - right) + h[i + 1, j + 1] * right
+        return np.asarray(top * (1 - down) + bottom * down)
+
+    def grid_numbers(self, site: Site) -> Array:
+        """What takes a vector from the Moon's centre in the site's enu axes to (column, row), as 16 numbers.
+
+        kind, R_projection_enu (9), size along x and y [m], column = (x - n12) n13, row = (y - n14) n15.
+        """
+        p = self.projection
+        R_projection_enu = p.R_projection_fixed @ R_enu_fixed(site).T
+        size = p.radius_m * p.scale * (2.0 if p.kind == STEREOGRAPHIC else 1.0)
+        numbers = np.empty(GRID_NUMBERS)
+        numbers[0] = p.kind
+        numbers[1:10] = R_projection_enu.ravel()
+        numbers[10:12] = size, p.radius_m * p.scale_y
+        numbers[12:14] = self.x0_m - p.false_x_m, 1 / self.dx_m
+        numbers[14:16] = self.y0_m - p.false_y_m, 1 / self.dy_m
+        return numbers
+
+    def cut(self, rows: slice, columns: slice) -> Raster:
+        """The part of the map within the given rows and columns."""
+        first_row, first_column = rows.start or 0, columns.start or 0
+        return replace(
+            self,
+            heights_m=np.ascontiguousarray(self.heights_m[rows, columns]),
+            x0_m=self.x0_m + first_column * self.dx_m,
+            y0_m=self.y0_m + first_row * self.dy_m,
+        )
+
+    def window(self, latitude_rad: float, longitude_rad: float, half_m: float) -> tuple[slice, slice]:
+        """Rows and columns within `half_m` of a place, and a little more; empty where the map does not reach there."""
+        from startrack.frames import latlon_from_enu
+
+        side = np.linspace(-1.0, 1.0, 33) * half_m
+        east, north = np.meshgrid(side, side)
+        lat, lon = latlon_from_enu(Site("moon", latitude_rad, longitude_rad), east, north, 0.0)
+        at = self.row_column(lat, lon).reshape(-1, 2)
+        slices = []
+        for low, high, n in zip(at.min(axis=0), at.max(axis=0), self.heights_m.shape, strict=True):
+            slices.append(slice(int(np.clip(np.floor(low) - 1, 0, n)), int(np.clip(np.ceil(high) + 2, 0, n))))
+        return slices[0], slices[1]
+
+    def around(self, latitude_rad: float, longitude_rad: float, half_m: float) -> Raster:
+        """The part of the map within about `half_m` of a place; empty where the map does not reach there."""
+        return self.cut(*self.window(latitude_rad, longitude_rad, half_m))

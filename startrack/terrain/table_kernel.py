@@ -1,0 +1,185 @@
+"""Bounds from the table of horizons, compiled with numba; `table_plain.py` holds the same without."""
+
+from __future__ import annotations
+
+# mypy: disable-error-code="no-untyped-def"
+import numpy as np
+from numba import njit
+
+from startrack.terrain.bounds_kernel import bounds, leaning, standing
+from startrack.terrain.horizon_kernel import FAR_M, horizon, surfaces
+from startrack.terrain.horizon_table import ANGLE_STEP_RAD, BINS, DISTANCE_STEP_M, FARTHEST, NOT_KNOWN_M, RISE_STEP
+
+BIN_RAD = 2 * np.pi / BINS
+EDGE = 1e-9  # of a cell or a bin: what only touches it does not count
+
+
+@njit(cache=True, nogil=True)
+def sector_bounds(values, lows, highs, across, reach, centre, half, low_up, high_up, azimuth, turn, out):
+    """Bounds (2,) of the elevation over a box and the azimuths within `turn`; lows, highs: of the level that fits.
+
+    Boxes smaller than a cell take the lines and points of the cells they touch, larger ones the bounds of the level's
+    blocks.
+    """
+    n = lows.shape[0]
+    side = 2 * reach / n
+    fine = n == across and half < 0.5 * side
+    i0 = min(max(int(np.floor((centre[0] - half + reach) / side + EDGE)), 0), n - 1)
+    i1 = min(max(int(np.ceil((centre[0] + half + reach) / side - EDGE)) - 1, i0), n - 1)
+    j0 = min(max(int(np.floor((centre[1] - half + reach) / side + EDGE)), 0), n - 1)
+    j1 = min(max(int(np.ceil((centre[1] + half + reach) / side - EDGE)) - 1, j0), n - 1)
+    first = int(np.floor((azimuth - turn) / BIN_RAD + EDGE))
+    last = max(int(np.ceil((azimuth + turn) / BIN_RAD - EDGE)) - 1, first)
+    last = min(last, first + BINS - 1)
+    low, high = np.inf, -np.inf
+    for i in range(i0, i1 + 1):
+        for j in range(j0, j1 + 1):
+            for k in range(first, last + 1):
+                b = k % BINS
+                if not fine:
+                    below = lows[i, j, b] * ANGLE_STEP_RAD - np.pi / 2
+                    above = highs[i, j, b] * ANGLE_STEP_RAD - np.pi / 2
+                else:
+                    middle = (b + 0.5) * BIN_RAD
+                    sin_a, cos_a = np.sin(middle), np.cos(middle)
+                    v = values[i * across + j, b]
+                    along = (centre[0] - (2 * i + 1) * side / 2 + reach) * sin_a
+                    along += (centre[1] - (2 * j + 1) * side / 2 + reach) * cos_a
+                    wide = half * (abs(sin_a) + abs(cos_a))
+                    aside = (centre[0] - (2 * i + 1) * side / 2 + reach) * cos_a
+                    aside -= (centre[1] - (2 * j + 1) * side / 2 + reach) * sin_a
+                    below, above = _of_line(v, along, abs(aside), wide, low_up, high_up, 0.5 * side)
+                low, high = min(low, below), max(high, above)
+    out[0], out[1] = low, high
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _of_line(v, along, aside, wide, low_up, high_up, cell_half):
+    """Bounds of the elevation, seen from `along` -+ `wide` along the ray from the cell's middle, and so far aside."""
+    below, above = v[0] * ANGLE_STEP_RAD - np.pi / 2, v[1] * ANGLE_STEP_RAD - np.pi / 2
+    cos_turn = np.cos(BIN_RAD / 2)
+    height = np.int64(v[6])
+    height = height - 65_536 if height > 32_767 else height
+    near, far = v[2] * DISTANCE_STEP_M - along - wide, v[3] * DISTANCE_STEP_M - along - wide
+    if v[3] < FARTHEST and near > 0.0:
+        tan = np.tan(v[5] * ANGLE_STEP_RAD - np.pi / 2)
+        rise, tan_turn = v[9] * RISE_STEP, np.tan(BIN_RAD / 2)
+        width = aside + wide + 2 * cell_half * tan_turn
+        top0 = height + tan * v[2] * DISTANCE_STEP_M - low_up + rise * (width + v[2] * DISTANCE_STEP_M * tan_turn)
+        top1 = height + tan * v[3] * DISTANCE_STEP_M - low_up + rise * (width + v[3] * DISTANCE_STEP_M * tan_turn)
+        top = max(
+            top0 / near if top0 > 0.0 else top0 * cos_turn / (near + 2 * wide),
+            top1 / far if top1 > 0.0 else top1 * cos_turn / (far + 2 * wide),
+        )
+        above = min(above, np.arctan(top))
+    point = np.int64(v[8])
+    point = point - 65_536 if point > 32_767 else point
+    s = v[7] * DISTANCE_STEP_M
+    if point > NOT_KNOWN_M:
+        # The point reckons with the whole cell's width aside, of which the box takes up a part.
+        over = point - high_up + v[10] * RISE_STEP * max(cell_half - aside - wide, 0.0)
+        if over > 0.0:
+            below = max(below, np.arctan(over * cos_turn / (s + DISTANCE_STEP_M - along + wide)))
+        elif s - along - wide > 0.0:
+            below = max(below, np.arctan(over / (s - along - wide)))
+    return below, max(above, below)
+
+
+@njit(cache=True, nogil=True)
+def look_up(values, across, reach, point, azimuth, out):
+    """Between which distances the horizon stands from a point, and about where [m]; (0, 1e9, 0) off the table."""
+    side = 2 * reach / across
+    i, j = int(np.floor((point[0] + reach) / side)), int(np.floor((point[1] + reach) / side))
+    out[0], out[1], out[2] = 0.0, 1e9, 0.0
+    if 0 <= i < across and 0 <= j < across:
+        b = int(np.floor(azimuth / BIN_RAD)) % BINS
+        v = values[i * across + j, b]
+        if v[2] <= v[3]:
+            middle = (b + 0.5) * BIN_RAD
+            along = (point[0] - (i + 0.5) * side + reach) * np.sin(middle)
+            along += (point[1] - (j + 0.5) * side + reach) * np.cos(middle)
+            margin = 0.01 * side + DISTANCE_STEP_M
+            out[0] = max(v[2] * DISTANCE_STEP_M - along - margin, 0.0) if v[2] > 0 else 0.0
+            if v[3] < FARTHEST:
+                # A ray turned within the bin needs up to 1 / cos of the turn more to get as far.
+                out[1] = max((v[3] * DISTANCE_STEP_M - along) / np.cos(BIN_RAD / 2) + margin, 0.0)
+            out[2] = max(v[4] * DISTANCE_STEP_M - along, 0.0)
+
+
+@njit(cache=True, nogil=True)
+def horizons(ground, values, across, reach, camera_height, points, azimuths, tan, at, edge):
+    """Fill tan, at and edge (n,) with the horizon of each point at its azimuth; across = 0: there is no table."""
+    near = np.array([0.0, FAR_M, 0.0])
+    up = 0.0
+    one = np.empty(1)
+    for k in range(len(tan)):
+        if k == 0 or points[k, 0] != points[k - 1, 0] or points[k, 1] != points[k - 1, 1]:
+            surfaces(ground, points[k : k + 1], one)
+            up = one[0] + camera_height
+        if across > 0:
+            look_up(values, across, reach, points[k], azimuths[k], near)
+        tan[k], at[k], edge[k] = horizon(
+            ground, points[k, 0], points[k, 1], up, np.sin(azimuths[k]), np.cos(azimuths[k]), near[0], near[1], near[2]
+        )
+
+
+@njit(cache=True, nogil=True)
+def box_bounds(ground, values, across, reach, camera_height, centres, half, azimuths, turn, low, high):
+    """Fill low and high (n,) [rad] with bounds over small boxes and narrow azimuths, traced anew."""
+    near, around, found = np.empty(3), np.empty(3), np.empty(11)
+    middle, lowest, highest, slope_e, slope_n = 0.0, 0.0, 0.0, 0.0, 0.0
+    corner = np.empty(2)
+    for k in range(len(low)):
+        if k == 0 or centres[k, 0] != centres[k - 1, 0] or centres[k, 1] != centres[k - 1, 1] or half[k] != half[k - 1]:
+            middle, lowest, highest, slope_e, slope_n = leaning(ground, centres[k, 0], centres[k, 1], half[k], True)
+        near[0], near[1], near[2] = 0.0, FAR_M, 0.0
+        if across > 0:
+            near[0], near[1] = FAR_M, 0.0
+            for c in range(4):
+                corner[0] = centres[k, 0] + half[k] * (2 * (c & 1) - 1)
+                corner[1] = centres[k, 1] + half[k] * (c - (c & 1) - 1)
+                for side in range(1 if turn[k] == 0.0 else 2):
+                    look_up(values, across, reach, corner, azimuths[k] + turn[k] * (2 * side - 1), around)
+                    near[0], near[1] = min(near[0], around[0]), max(near[1], around[1])
+            wide = 2.0 * half[k]
+            near[0] = max(near[0] - wide, 0.0)
+            near[1] += wide
+            near[2] = around[2]
+        bounds(
+            ground, centres[k, 0], centres[k, 1], middle + camera_height, lowest + camera_height,
+            highest + camera_height, slope_e, slope_n, half[k], np.sin(azimuths[k]), np.cos(azimuths[k]), turn[k],
+            near[0], near[1], near[2], found,
+        )  # fmt: skip
+        low[k], high[k] = np.arctan(found[0]), np.arctan(found[1])
+
+
+@njit(cache=True, nogil=True)
+def many_sector_bounds(
+    ground, values, lows, highs, across, reach, camera_height, centres, half, azimuths, turn, low, high
+):
+    """Fill low and high (n,) [rad] with `sector_bounds`."""
+    out = np.empty(2)
+    lowest, highest = 0.0, 0.0
+    for k in range(len(low)):
+        new = k == 0 or centres[k, 0] != centres[k - 1, 0] or centres[k, 1] != centres[k - 1, 1]
+        if half[k] < reach / across and (new or half[k] != half[k - 1]):
+            _, lowest, highest = standing(ground, centres[k, 0], centres[k, 1], half[k])
+            lowest, highest = lowest + camera_height, highest + camera_height
+        sector_bounds(
+            values, lows, highs, across, reach, centres[k], half[k], lowest, highest, azimuths[k], turn[k], out
+        )
+        low[k], high[k] = out[0], out[1]
+
+
+@njit(cache=True, nogil=True)
+def fill_cells(ground, centres, half, camera_height, sin_a, cos_a, turn, found):
+    """Fill found (cells, azimuths, 11) with `bounds` of each cell and azimuth."""
+    for k in range(len(centres)):
+        middle, low, high = standing(ground, centres[k, 0], centres[k, 1], half)
+        guess = 0.0
+        for j in range(len(sin_a)):
+            bounds(
+                ground, centres[k, 0], centres[k, 1], middle + camera_height, low + camera_height,
+                high + camera_height, 0.0, 0.0, half, sin_a[j], cos_a[j], turn, 0.0, FAR_M, guess, found[k, j],
+            )  # fmt: skip
+            guess = found[k, j, 4]

@@ -1,0 +1,155 @@
+"""Camera files of other programs: there and back, and against those programs' own formulas."""
+
+from __future__ import annotations
+
+import re
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from startrack.camera import Camera, Decentring, KannalaBrandt, Pinhole
+from startrack.camera.convert import from_text, to_text
+from startrack.camera.convert.intrinsics import lost_px
+from startrack.types import BadInput
+
+PROGRAMS = ("ros", "kalibr", "colmap", "opencv")
+BOARD_MOUNT = Rotation.from_quat([0.1, -0.2, 0.3, 0.9]).as_matrix()
+FISHEYE = Camera(
+    name="fisheye", size_px=(1600, 1200), focal_px=(480.123456789, 479.87654321), centre_px=(801.25, 597.75),
+    max_angle_rad=np.radians(95), calibrated_angle_rad=np.radians(90),
+    lens=KannalaBrandt((-0.0141075869, -0.002760624, 1.62897e-4, -4.1316e-4)), R_body_cam=BOARD_MOUNT,
+)  # fmt: skip
+PINHOLE = Camera(
+    name="pinhole", size_px=(1024, 768), focal_px=(5132.25, 5133.5), centre_px=(511.0, 384.25),
+    max_angle_rad=0.13, calibrated_angle_rad=0.12, lens=Pinhole(),
+)  # fmt: skip
+BENT = Camera(
+    name="bent", size_px=(1600, 1200), focal_px=(480.0, 481.0), centre_px=(801.25, 597.75), max_angle_rad=1.6,
+    calibrated_angle_rad=1.5, lens=KannalaBrandt((-0.014, -0.0027, 1.6e-4, -4e-4)),
+    decentring=Decentring(2e-4, -6e-4),
+)  # fmt: skip
+
+
+def rays(top_rad, count=400):
+    rng = np.random.default_rng(0)
+    z, b = rng.uniform(np.cos(top_rad), 1, count), rng.uniform(0, 2 * np.pi, count)
+    return np.stack([np.sqrt(1 - z * z) * np.cos(b), np.sqrt(1 - z * z) * np.sin(b), z], axis=1)
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+@pytest.mark.parametrize("camera", [FISHEYE, PINHOLE], ids=lambda c: c.name)
+def test_there_and_back(program, camera):
+    again = from_text(to_text(camera, program), program, "again")
+    seen = rays(camera.calibrated_angle_rad)
+    np.testing.assert_allclose(again.project(seen)[0], camera.project(seen)[0], atol=1e-6)
+    assert again.size_px == camera.size_px
+    assert again.lens.model == camera.lens.model
+    if program == "kalibr":
+        np.testing.assert_allclose(again.R_body_cam, camera.R_body_cam, atol=1e-12)
+
+
+def test_opencv_puts_the_same_rays_on_the_same_pixels():
+    """cv2.fisheye for a fisheye (to 80 degrees, where it still works), cv2.projectPoints for a pinhole."""
+    for camera, top in ((FISHEYE, np.radians(80)), (PINHOLE, 0.12)):
+        store = cv2.FileStorage(to_text(camera, "opencv"), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        K, D = store.getNode("camera_matrix").mat(), store.getNode("distortion_coefficients").mat()
+        seen = rays(top)
+        points, nothing = (seen / seen[:, 2:])[:, None], np.zeros((3, 1))
+        project = cv2.fisheye.projectPoints if camera is FISHEYE else None
+        px = (
+            project(points, nothing, nothing, K, D)[0]
+            if project
+            else cv2.projectPoints(points, nothing, nothing, K, D)[0]
+        )
+        np.testing.assert_allclose(px[:, 0], camera.project(seen)[0], atol=1e-6)
+
+
+def test_ros_file_read_with_its_own_formula():
+    """REP 104 / camera_info "equidistant": theta_d = theta (1 + k1 theta^2 + ...), x = K [theta_d / r x', ...]."""
+    d = yaml.safe_load(to_text(FISHEYE, "ros"))
+    assert d["distortion_model"] == "equidistant"
+    K, D = np.reshape(d["camera_matrix"]["data"], (3, 3)), d["distortion_coefficients"]["data"]
+    np.testing.assert_allclose(by_angle(K, D, rays(1.4)), FISHEYE.project(rays(1.4))[0], atol=1e-9)
+    P = np.reshape(d["projection_matrix"]["data"], (3, 4))
+    np.testing.assert_array_equal(P[:, :3], K)
+    assert (d["image_width"], d["image_height"]) == FISHEYE.size_px
+
+
+def test_kalibr_file_read_with_its_own_formula():
+    d = yaml.safe_load(to_text(FISHEYE, "kalibr"))["cam0"]
+    fu, fv, pu, pv = d["intrinsics"]
+    K = np.array([[fu, 0, pu], [0, fv, pv], [0, 0, 1]])
+    np.testing.assert_allclose(by_angle(K, d["distortion_coeffs"], rays(1.4)), FISHEYE.project(rays(1.4))[0], atol=1e-9)
+    assert tuple(d["resolution"]) == FISHEYE.size_px
+    T_cam_body = np.array(d["T_cam_imu"])
+    ray_body = np.array([0.3, -0.4, 0.5, 0.0])  # a direction takes no part in the translation
+    np.testing.assert_allclose(BOARD_MOUNT @ (T_cam_body @ ray_body)[:3], ray_body[:3], atol=1e-12)
+
+
+def test_colmap_counts_from_the_corner_of_the_first_pixel():
+    line = to_text(FISHEYE, "colmap").splitlines()[-1].split()
+    assert line[:4] == ["1", "OPENCV_FISHEYE", "1600", "1200"]
+    fx, fy, cx, cy, *k = map(float, line[4:])
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    np.testing.assert_allclose(by_angle(K, k, rays(1.4)), FISHEYE.project(rays(1.4))[0] + 0.5, atol=1e-9)
+
+
+def test_colmap_thin_prism_fisheye_holds_a_decentred_lens():
+    """COLMAP's ThinPrismFisheyeCameraModel::Distortion, written out."""
+    line = to_text(BENT, "colmap").splitlines()[-1].split()
+    assert line[1] == "THIN_PRISM_FISHEYE"
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, sx1, sy1 = map(float, line[4:])
+    seen = rays(1.4)
+    r = np.hypot(seen[:, 0], seen[:, 1])
+    u, v = seen[:, :2].T * np.arctan2(r, seen[:, 2]) / r
+    r2 = u * u + v * v
+    radial = k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
+    du = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u) + sx1 * r2
+    dv = v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v) + sy1 * r2
+    px = np.stack([fx * (u + du) + cx, fy * (v + dv) + cy], axis=1)
+    np.testing.assert_allclose(px, BENT.project(seen)[0] + 0.5, atol=1e-9)
+    again = from_text(to_text(BENT, "colmap"), "colmap", "again")
+    np.testing.assert_allclose(again.project(seen)[0], BENT.project(seen)[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("program", ["ros", "kalibr", "opencv"])
+def test_formats_without_decentring_lose_what_is_stated(program):
+    again = from_text(to_text(BENT, program), program, "again")
+    assert not again.decentring
+    assert 0.05 < lost_px(BENT) < 1.0
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_mirrored_cameras_are_refused(program):
+    from dataclasses import replace
+
+    with pytest.raises(BadInput, match="mirrored") as refusal:
+        to_text(replace(FISHEYE, mirrored=True), program)
+    assert refusal.value.reason == "bad_calibration"
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+@pytest.mark.parametrize("spoil", ["", "nonsense", "[1, 2", "distorted"])
+def test_broken_files_are_refused_by_name(program, spoil):
+    text = spoil
+    if spoil == "distorted":  # a pinhole with real distortion has no counterpart
+        text = to_text(PINHOLE, program)
+        text = (
+            re.sub(r"data: \[ ?0\.0, 0\.0", "data: [ 0.1, 0.0", text, count=1) if program in ("ros", "opencv") else text
+        )
+        text = text.replace("distortion_coeffs: [0.0", "distortion_coeffs: [0.2").replace(" PINHOLE ", " OPENCV ")
+        assert text != to_text(PINHOLE, program)
+    with pytest.raises(BadInput) as refusal:
+        from_text(text, program, "x")
+    assert refusal.value.reason == "bad_calibration"
+
+
+def by_angle(K, k, seen):
+    r = np.hypot(seen[:, 0], seen[:, 1])
+    theta = np.arctan2(r, seen[:, 2])
+    theta_d = theta * (1 + sum(c * theta ** (2 * n + 2) for n, c in enumerate(k)))
+    h = np.column_stack([theta_d / r * seen[:, 0], theta_d / r * seen[:, 1], np.ones(len(r))])
+    return (h @ K.T)[:, :2]

@@ -1,0 +1,205 @@
+"""`startrack calibrate` on pictures: a real all-sky photograph from cold, and rendered frames with known truth."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from startrack.calibration import calibrate
+from startrack.calibration.acceptance import log_chance
+from startrack.calibration.verify import verify, verify_dict
+from startrack.camera import load_camera, save_camera
+from startrack.catalog import load_catalog
+from startrack.cli.main import main
+from startrack.exposure import read_exposure
+from startrack.frames import Site
+from startrack.types import BadInput, NotIdentified
+
+ROOT = Path(__file__).parent.parent
+PHOTO = ROOT / "sample_images/lowell-2018-08-06.fits.bz2"
+SITE = Site("earth", np.radians(34.7443), np.radians(-111.4223), 2361.0)
+REFERENCE = Path(__file__).parent / "data/lowell-2018-08-06-stars.csv"
+
+
+@pytest.fixture(scope="module")
+def exposure():
+    return read_exposure(PHOTO)
+
+
+@pytest.fixture(scope="module")
+def cold(exposure):
+    """From nothing but "about 180 degrees"."""
+    return calibrate([exposure], load_catalog().brighter_than(8.0), fov_rad=np.pi, site=SITE, name="cold")
+
+
+def test_the_photograph_calibrates_from_cold(cold):
+    assert cold.accepted, [gate.name for gate in cold.failed]
+    fit = cold.joint.fit
+    assert fit.used.sum() >= 1000
+    assert fit.held_out_rms_px <= 0.35  # distance, not per axis
+    assert np.degrees(cold.camera.calibrated_angle_rad) == pytest.approx(83, abs=2)
+    assert cold.camera.decentring  # by 0.3 px: without it the held-out RMS is 0.34 px
+    assert not cold.camera.mirrored
+
+
+def test_its_stars_are_those_that_were_named_without_startrack(cold):
+    with REFERENCE.open() as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    px = np.array([[float(row["x_px"]), float(row["y_px"])] for row in rows])
+    frame, matched = cold.joint.frames[0], cold.joint.matches[0]
+    distance, nearest = cKDTree(px).query(frame.detections.xy_px[matched.detection])
+    both = distance < 1.5
+    assert both.sum() >= 380
+    names = np.array([int(row["hip"]) for row in rows])
+    assert np.mean(frame.sky.stars.hip[matched.star][both] == names[nearest[both]]) >= 0.995
+
+
+def test_chance_gives_no_such_number_of_matches(cold):
+    assert log_chance(cold.joint) < np.log(1e-100)
+
+
+def test_the_mirror_image_is_solved_and_said_to_be_one(exposure):
+    flipped = replace(exposure, pixels_adu=exposure.pixels_adu[:, ::-1].copy())
+    found = calibrate([flipped], load_catalog().brighter_than(7.0), camera=load_camera("lowell-ldt"), site=SITE)
+    assert found.accepted
+    assert found.camera.mirrored
+    opposite = next(gate.value for gate in found.gates if gate.name.startswith("opposite"))
+    assert opposite > 50
+
+
+def test_a_picture_of_another_size_is_a_size_mismatch(exposure):
+    smaller = replace(exposure, pixels_adu=exposure.pixels_adu[:-2].copy())
+    with pytest.raises(BadInput) as refusal:
+        calibrate([exposure, smaller], load_catalog(), fov_rad=np.pi)
+    assert refusal.value.reason == "size_mismatch"
+
+
+def test_without_a_time_nothing_is_guessed(exposure):
+    with pytest.raises(BadInput) as refusal:
+        calibrate([replace(exposure, time_utc=None)], load_catalog(), fov_rad=np.pi)
+    assert refusal.value.reason == "no_time"
+
+
+def test_noise_is_refused_with_advice(exposure):
+    rng = np.random.default_rng(0)
+    noise = replace(exposure, pixels_adu=rng.normal(1000, 20, (300, 400)).astype(np.float32))
+    with pytest.raises(NotIdentified, match="point source") as refusal:
+        calibrate([noise], load_catalog(), camera=replace(load_camera("lowell-ldt"), size_px=(400, 300)))
+    assert refusal.value.reason == "no_stars"
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """What the command writes for the photograph, from a camera file that is 2 % and 6 px off."""
+    folder = tmp_path_factory.mktemp("calibration")
+    camera = load_camera("lowell-ldt")
+    rough = replace(camera, focal_px=(343.0, 343.0), centre_px=(camera.centre_px[0] + 6, camera.centre_px[1] - 5))
+    save_camera(rough, folder / "rough.toml")
+    words = [
+        str(PHOTO),
+        "-c",
+        str(folder / "rough.toml"),
+        "--site=34.7443,-111.4223,2361",
+        "-o",
+        str(folder / "new.toml"),
+    ]
+    assert main(["calibrate", *words, "--gain", "0.4", "-q"]) == 0
+    return folder
+
+
+def test_the_command_writes_camera_record_and_report(written):
+    camera = load_camera(written / "new.toml")
+    assert camera.covariance_order[:4] == ("fx", "fy", "cx", "cy")
+    rays = camera.unproject(np.array([[709.0, 489.0], [1100.0, 489.0], [709.0, 60.0]]))
+    assert 0 < camera.map_sigma_px(rays).max() < 0.05
+    record = json.loads((written / "new.calibration.json").read_text())
+    assert (record["status"], record["reason"]) == ("ok", None)
+    assert record["lens"]["held_out_rms_px"] < 0.35
+    assert all(gate["passed"] for gate in record["gates"])
+    page = (written / "new.report.html").read_text()
+    assert "accepted" in page
+    assert not re.search(r'(src|href)="(?!data:)', page)  # nothing is fetched
+    assert (written / "new.report.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_sensor_is_measured_where_the_picture_tells(written):
+    sensor = load_camera(written / "new.toml").sensor
+    assert sensor is not None
+    assert sensor.gain_e_per_adu == 0.4  # given
+    assert 2300 < sensor.bias_adu < 2450  # dark corners; the frame's own minimum is 2192
+    assert sensor.vignetting[0] < 0
+    notes = json.loads((written / "new.calibration.json").read_text())["photometry"]["notes"]
+    assert any("read noise: not measured" in note for note in notes)
+
+
+def test_every_key_of_the_record_is_explained(written):
+    formats = (ROOT / "docs/formats.md").read_text(encoding="utf-8")
+    record = json.loads((written / "new.calibration.json").read_text())
+    keys = (
+        (set(record) - {"lens", "coverage"})
+        | set(record["gates"][0])
+        | set(record["images"][0])
+        | set(record["photometry"]["light"])
+    )
+    keys |= {f"lens.{key}" for key in record["lens"]} | set(record["lens"]["models"][0])
+    keys |= {f"coverage.{key}" for key in record["coverage"]} | set(record["photometry"])
+    assert [key for key in sorted(keys) if f"`{key}`" not in formats] == []
+
+
+def test_verify_and_show(written, capsys):
+    photo, site = str(PHOTO), "--site=34.7443,-111.4223,2361"
+    assert main(["calibrate", "verify", photo, "-c", str(written / "new.toml"), site, "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["status"] == "ok"
+    assert record["map_change_px"] < 0.05
+    assert main(["calibrate", "show", str(written / "new.toml")]) == 0
+    assert "decentring" in capsys.readouterr().out
+
+
+def test_a_lens_that_has_changed_does_not_verify(written, exposure):
+    camera = load_camera(written / "new.toml")
+    moved = replace(camera, focal_px=(camera.focal_px[0] * 1.004, camera.focal_px[1] * 1.004))
+    found = verify(exposure, moved, load_catalog().brighter_than(7.0), SITE)
+    assert not found.fits
+    record = verify_dict(found)
+    assert record["reason"] == "inconsistent_evidence"
+    assert record["focal_change"] == pytest.approx(-0.004, abs=0.0015)
+    assert record["map_change_px"] > 0.4
+
+
+def test_convert_by_command(written, capsys):
+    new, back = str(written / "new.toml"), str(written / "back.toml")
+    assert main(["calibrate", "convert", new, "--to", "colmap", "-o", str(written / "cameras.txt")]) == 0
+    assert main(["calibrate", "convert", str(written / "cameras.txt"), "--from", "colmap", "-o", back]) == 0
+    one, other = load_camera(new), load_camera(back)
+    px = np.array([[300.0, 500.0], [710.0, 100.0], [1100.0, 700.0]])
+    np.testing.assert_allclose(other.project(one.unproject(px))[0], px, atol=1e-6)
+    assert main(["calibrate", "convert", new, "--to", "ros", "-o", str(written / "ros.yaml")]) == 0
+    assert "no decentring" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        ([], 4),  # neither --fov nor -c, and the image names a camera only in its sidecar
+        (["--fov", "180", "--site", "somewhere"], 2),
+        (["--fov", "-3"], 2),
+    ],
+)
+def test_misuse_is_told(words, code, tmp_path, capsys):
+    image = tmp_path / "sky.fits.bz2"
+    image.write_bytes(PHOTO.read_bytes())
+    if code == 2:
+        with pytest.raises(SystemExit) as stopped:
+            main(["calibrate", str(image), *words, "-D", str(tmp_path)])
+        assert stopped.value.code == 2
+    else:
+        assert main(["calibrate", str(image), *words, "-D", str(tmp_path)]) == code
+        assert "--fov" in capsys.readouterr().err

@@ -1,0 +1,127 @@
+"""Zero point, vignetting, gain, noise, PSF, hot pixels: from rendered frames whose sensor is known."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from startrack.calibration import Given, calibrate
+from startrack.calibration.noise import photon_transfer
+from startrack.calibration.photometry import photometry
+from startrack.calibration.throughput import airmass
+from startrack.calibration.verify import difference_px
+from startrack.camera import Camera, KannalaBrandt, Sensor
+from startrack.camera.uncertainty import cap_grid
+from startrack.catalog import load_catalog
+from startrack.rendering import Series, render
+from startrack.terrain import load_terrain
+from startrack.types import Exposure
+
+SENSOR = Sensor(
+    zero_point_e_per_s=9000.0, gain_e_per_adu=0.5, bias_adu=200.0, read_noise_e=6.0, dark_e_per_s=0.1,
+    psf_sigma_px=1.1, vignetting=(-0.15, -0.02),
+)  # fmt: skip
+CAMERA = Camera(
+    name="truth", size_px=(600, 600), focal_px=(179.0, 179.0), centre_px=(302.2, 297.9), max_angle_rad=np.radians(91),
+    calibrated_angle_rad=np.radians(90), lens=KannalaBrandt((-1 / 24, 1 / 1920)), sensor=SENSOR,
+)  # fmt: skip
+EXPOSURE_S = 10.0
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """Two frames of one sky and one 30 hours later, on open ground, and the hot pixels with their light [e]."""
+    start = datetime(2030, 6, 1, tzinfo=UTC)
+    exposures = []
+    for number, later in enumerate((timedelta(0), timedelta(0), timedelta(hours=30))):
+        series = Series(
+            camera=CAMERA, terrain=load_terrain("shackleton-thesis"), catalog=load_catalog().brighter_than(7.5), seed=4,
+            exposure_s=EXPOSURE_S, time_utc=start + later, east_m=0.0, north_m=0.0, heading_rad=0.3, pitch_rad=0.2,
+            roll_rad=0.0, sky_v_mag_arcsec2=20.0, sky_gradient=0.8, hot_pixels=60, faint_v_mag=None,
+        )  # fmt: skip
+        scene, rng = series.scene(number, f"frame{number}")
+        exposures.append(render(replace(scene, terrain=None), rng=rng)[0])
+    hot = scene.hot_pixels
+    return exposures, dict(zip(map(tuple, hot.xy_px.tolist()), hot.dark_e_per_s * EXPOSURE_S, strict=True))
+
+
+@pytest.fixture(scope="module")
+def found(frames):
+    rough = replace(CAMERA, focal_px=(184.0, 184.0), centre_px=(299.5, 299.5), lens=KannalaBrandt(), sensor=None)
+    return calibrate(frames[0], load_catalog().brighter_than(8.0), camera=rough)
+
+
+def test_the_lens_is_the_true_one(found):
+    assert found.accepted, found.failed
+    moved = difference_px(CAMERA, found.camera, cap_grid(found.camera.calibrated_angle_rad))
+    assert np.sqrt(np.mean(np.sum(moved**2, axis=1))) < 0.03
+
+
+def test_the_sensor_is_the_true_one(found):
+    sensor = found.camera.sensor
+    assert sensor.gain_e_per_adu == pytest.approx(0.5, rel=0.02)
+    assert sensor.zero_point_e_per_s == pytest.approx(9000, rel=0.04)
+    assert sensor.bias_adu == pytest.approx(202, abs=1)  # dark current of 10 s is in it
+    assert sensor.read_noise_e == pytest.approx(6.0, rel=0.15)
+    assert sensor.psf_sigma_px == pytest.approx(1.1, rel=0.03)
+    angle = np.radians([30, 60, 85])
+    np.testing.assert_allclose(sensor.throughput(angle), SENSOR.throughput(angle), atol=0.03)
+    assert found.photometry.facts.psf_by_ring_px == pytest.approx([1.1] * 4, rel=0.06)
+
+
+def test_hot_pixels_are_listed(frames, found):
+    listed = {(int(x), int(y)) for x, y in found.photometry.facts.hot_px}
+    bright = {px for px, light_e in frames[1].items() if light_e > 400}  # 12 times the noise of the brightest sky
+    assert len(bright) >= 20
+    assert len(listed & bright) >= 0.9 * len(bright)
+    assert len(listed - set(frames[1])) <= 3
+
+
+def test_what_is_given_goes_before_what_is_measured(found):
+    given = photometry(found.joint, Given(gain_e_per_adu=0.7, read_noise_e=9.0, bias_adu=190.0)).sensor
+    assert (given.gain_e_per_adu, given.read_noise_e, given.bias_adu) == (0.7, 9.0, 190.0)
+
+
+def test_without_exposure_times_no_zero_point_is_invented(found):
+    blind = tuple(replace(f, exposure=replace(f.exposure, exposure_s=None)) for f in found.joint.frames)
+    missing = photometry(replace(found.joint, frames=blind), Given())
+    assert missing.light is None
+    assert missing.sensor is None
+    assert any(re.match("zero point: not measured", note) for note in missing.notes)
+
+
+def test_photon_transfer_on_plain_light():
+    rng = np.random.default_rng(0)
+    light_e = np.linspace(50, 4000, 512)[None, :] * np.ones((512, 1))
+
+    def exposure():
+        return Exposure(
+            pixels_adu=(rng.poisson(light_e) + rng.normal(0, 8, light_e.shape)).astype(np.float32) / 1.7 + 300
+        )
+
+    transfer = photon_transfer([(exposure(), exposure())])
+    assert transfer.gain_e_per_adu == pytest.approx(1.7, rel=0.01)
+    assert transfer.gain_sigma < 0.03
+    assert transfer.read_noise_e(300.0) == pytest.approx(8.0, rel=0.25)
+    assert photon_transfer([]) is None
+    dark = Exposure(pixels_adu=rng.normal(300, 5, (512, 512)).astype(np.float32))
+    assert photon_transfer([(dark, dark)]) is None  # no range of light
+
+
+def test_airmass():
+    """Hardie's and Rozenberg's tables agree at these heights: 1, 2, about 5.6 at 10 degrees, about 38 to 40 below."""
+    np.testing.assert_allclose(airmass(np.radians([90, 30, 10])), [1.0, 1.995, 5.6], rtol=0.02)
+    assert airmass(np.array(0.0)) == pytest.approx(40, rel=0.01)
+
+
+def test_python_of_the_page_runs(capsys):
+    page = (Path(__file__).parent.parent / "docs/calibration.md").read_text(encoding="utf-8")
+    names: dict[str, object] = {}
+    for code in re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL):
+        exec(compile(code, "docs/calibration.md", "exec"), names)
+    assert re.fullmatch(r"0\.\d\d px, \d\d degrees\n", capsys.readouterr().out)

@@ -1,0 +1,80 @@
+"""Wide PSFs, found in frames whose pixels are added together and fitted in the frame itself; and its parts."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from star_painter import cramer_rao, isolated_stars, plain_camera
+
+from startrack.detection import Detector
+from startrack.detection.binned import binned, pixels_together
+from startrack.detection.classify import threshold_for
+from startrack.detection.frame import Frame, LightNoise
+from startrack.detection.peaks import _touching, bright_pixels
+
+SIZE = 1024
+BACKGROUND, READ_NOISE = 94.0, 2.5
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["camera file", "nothing known"])
+@pytest.mark.parametrize("sigma", [2.0, 3.0, 4.5])
+def test_centroids_and_covariances_of_wide_stars(sigma: float, known: bool) -> None:
+    rng = np.random.default_rng(round(10 * sigma))
+    stars = isolated_stars(sigma, BACKGROUND, READ_NOISE, (4, 110), rng=rng, size=SIZE, spacing=48)
+    found = Detector()(stars.exposure, plain_camera((SIZE, SIZE), sigma) if known else None)
+    assert found.psf_sigma_px == pytest.approx(sigma, rel=0.05)
+    distance, nearest = cKDTree(found.xy_px).query(stars.xy_px)
+    assert np.mean(distance[stars.snr > 8] < sigma) > 0.99
+    bright = (distance < sigma) & (stars.snr > 12)
+    error = found.xy_px[nearest[bright]] - stars.xy_px[bright]
+    variance = BACKGROUND + READ_NOISE**2
+    pairs = zip(stars.xy_px[bright], stars.flux[bright], strict=True)
+    bound = np.array([np.diag(cramer_rao(xy - np.rint(xy), flux, sigma, variance))[:2] for xy, flux in pairs])
+    assert bright.sum() > 150
+    assert np.sqrt(np.mean(error**2 / bound)) < 1.15  # one part in 20 is the statistics
+    chi2 = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance_px2[nearest[bright]]), error)
+    assert 1.5 < chi2.mean() < 2.6
+    assert found.background_e.shape == (SIZE, SIZE)
+
+
+def test_binned_frames_keep_light_and_noise() -> None:
+    rng = np.random.default_rng(2)
+    image = rng.poisson(50.0, (201, 303)).astype(np.float32)
+    dead = np.zeros(image.shape, dtype=bool)
+    dead[11, 20] = True
+    flat = np.ones_like(image)
+    small = binned(Frame(image, 50 * flat, np.sqrt(50) * flat, dead, LightNoise()), 4)
+    assert small.shape == (50, 75)
+    assert small.image[3, 5] == pytest.approx(image[12:16, 20:24].sum())
+    assert np.std(small.image - small.background) == pytest.approx(float(small.noise[0, 0]), rel=0.05)
+    assert np.argwhere(small.dead).tolist() == [[2, 5]]
+    assert [pixels_together(s) for s in (0.6, 1.7, 1.8, 3.5, 3.6, 8.0)] == [1, 1, 2, 2, 4, 8]
+
+
+def test_touching_pixels_are_grouped_as_opencv_groups_them() -> None:
+    dead = np.random.default_rng(3).random((90, 120)) < 0.2
+    row, column = np.nonzero(dead)
+    count, label = _touching(row, column, dead.shape[1])
+    expected_count, expected = cv2.connectedComponents(dead.astype(np.uint8))
+    assert count == expected_count - 1 > 20
+    assert len(set(zip(label.tolist(), expected[row, column].tolist(), strict=True))) == count
+
+
+def test_bright_pixels_are_those_of_stars_not_hot_ones() -> None:
+    image = np.random.default_rng(4).normal(0, 1, (200, 300)).astype(np.float32)
+    places = [(40, 50), (100, 120), (220, 150)]
+    for x, y in places:
+        image[y - 1 : y + 2, x - 1 : x + 2] += 15
+        image[y, x] += 20
+    image[70, 70] = 200.0
+    frame = Frame(image, np.zeros_like(image), np.ones_like(image), None, LightNoise())
+    assert sorted(map(tuple, bright_pixels(frame, 8.0, 10, 1).tolist())) == sorted(places)
+
+
+def test_skew_noise_asks_for_more_and_wide_stars_for_less() -> None:
+    usual = threshold_for(5.42, 1.25, 0.088)
+    assert usual == pytest.approx(5.42, abs=0.03)
+    assert threshold_for(5.42, 1.25, 0.2) > usual > threshold_for(5.42, 1.25, 0.0) > 5.0
+    assert threshold_for(5.42, 0.6, 0.088) > usual > threshold_for(5.42, 3.0, 0.088)

@@ -1,0 +1,77 @@
+"""The step of the sky's own light at the skyline: measured, taken out, and left alone where it is not known."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from startrack.camera import load_camera
+from startrack.evidence import known_well, levelled, near_skyline
+from startrack.evidence.sky_step import _above_px
+from startrack.terrain import load_terrain
+from startrack.types import Detections
+
+CAMERA, CRATER = load_camera("fisheye-2048"), load_terrain("shackleton-thesis")
+PLACE = np.array([3000.0, 2000.0])
+STEP_E, NOISE_E = 90.0, 10.0
+R_CAM_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]) * np.array([[1.0], [1.0], [-1.0]])
+
+
+def horizon_at(place):
+    return partial(CRATER.horizon_rad, np.asarray(place)[None, :])
+
+
+@pytest.fixture(scope="module")
+def frame():
+    """A sky of 90 electrons above the wall, blurred by the PSF, as a flat background model sees it."""
+    rows, columns = np.mgrid[0:2048, 0:2048]
+    xy = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float)
+    _, above = _above_px(xy, CAMERA, R_CAM_ENU, horizon_at(PLACE))
+    above = above.reshape(2048, 2048)
+    rng = np.random.default_rng(5)
+    light = STEP_E / (1 + np.exp(np.clip(-above / 0.6, -50, 50)))
+    noise = NOISE_E * np.where(above > 0, 1.5, 1.0)
+    image = (light + noise * rng.standard_normal(light.shape)).astype(np.float32)
+    found = Detections(
+        xy_px=np.empty((0, 2)), covariance_px2=np.empty((0, 2, 2)), flux_e=np.empty(0), flux_sigma_e=np.empty(0),
+        snr=np.empty(0), saturated=np.empty(0, dtype=bool), psf_sigma_px=1.0,
+        background_e=np.full(image.shape, STEP_E / 2, np.float32), noise_e=np.full(image.shape, NOISE_E, np.float32),
+    )  # fmt: skip
+    return image, found, above, light
+
+
+def test_the_step_goes_and_each_side_has_its_own_noise(frame):
+    image, found, above, light = frame
+    better = levelled(image, np.zeros(image.shape, bool), found, CAMERA, R_CAM_ENU, horizon_at(PLACE))
+    inner = np.abs(above) < 8
+    assert np.sqrt(np.mean((found.background_e - light)[inner] ** 2)) > 30
+    assert np.sqrt(np.mean((better.background_e - light)[inner] ** 2)) < 3
+    assert np.median(better.noise_e[inner & (above > 1)]) == pytest.approx(15, rel=0.05)
+    assert np.median(better.noise_e[inner & (above < -1)]) == pytest.approx(10, rel=0.05)
+    assert np.array_equal(better.background_e[np.abs(above) > 13], found.background_e[np.abs(above) > 13])
+
+
+def test_a_skyline_a_little_off_gives_the_same_background(frame):
+    """An error of the fix shifts the profile's own origin, not the light that is taken out."""
+    image, found, above, light = frame
+    aside = horizon_at(PLACE + np.array([12.0, -8.0]))
+    better = levelled(image, np.zeros(image.shape, bool), found, CAMERA, R_CAM_ENU, aside)
+    assert np.sqrt(np.mean((better.background_e - light)[np.abs(above) < 6] ** 2)) < 4
+
+
+def test_right_below_a_wall_the_skyline_is_not_known():
+    azimuth = np.linspace(0, 2 * np.pi, 360, endpoint=False)
+    middle = horizon_at([0.0, 0.0])
+    assert known_well(middle, [horizon_at([4.0, 0.0]), horizon_at([0.0, 4.0])], CAMERA)(azimuth).all()
+    wall = horizon_at([9850.0, 0.0])
+    known = known_well(wall, [horizon_at([9852.0, 0.0]), horizon_at([9850.0, 2.0])], CAMERA)(azimuth)
+    assert known[250:290].all()  # the far rim
+    assert not known[np.r_[0:5, 355:360, 175:185]].any()  # along the wall, north and south: there it turns fastest
+
+
+def test_near_means_pixels():
+    azimuth = np.zeros(3)
+    height = CRATER.horizon_rad(PLACE[None], np.zeros(1))[0] + np.array([-20, 0, 20]) / 652.0
+    assert near_skyline(azimuth, height, CAMERA, horizon_at(PLACE), 12.0).tolist() == [False, True, False]

@@ -1,0 +1,216 @@
+"""Short lists: named wholly and at once; the parts of the search are what they say."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from test_identify import ARCSEC, FISHEYE, NARROW, Frame, detected, frame, off, rays_about, scattered, sky
+
+from startrack.identification import Identifier
+from startrack.identification.attitudes import AttitudeSearch, turns
+from startrack.identification.index import Patterns
+from startrack.identification.matching import Light, Pairs, last_of_each
+from startrack.identification.pairs import build_pairs
+from startrack.identification.triangles import sides_of_few, triangles
+from startrack.identification.weak_cache import KeptPerObject
+from startrack.orient import rotation, wahba
+from startrack.types import NotIdentified
+
+
+def hundred(seed: int, false: int = 20, true: int = 80, noise_px: float = 0.2) -> Frame:
+    """The brightest stars of half the sky, and false ones like them."""
+    return frame(FISHEYE, seed, brightest=true, hidden=0.0, false=false / true, noise_px=noise_px)
+
+
+def _after(search: AttitudeSearch, tried: int, attitudes: Iterator) -> Iterator:
+    search.tried += tried
+    return attitudes
+
+
+@pytest.mark.parametrize("false", [20, 320])
+def test_the_stars_of_a_short_list_are_all_but_all_named(false: int) -> None:
+    named = there = 0
+    for seed in range(10):
+        truth = hundred(seed, false)
+        found = Identifier()(truth.detections, FISHEYE, sky())
+        assert found.false_alarm_probability < 1e-30
+        assert off(found, truth) < 40 * ARCSEC
+        assert np.array_equal(truth.star[found.detection], found.star)
+        named, there = named + len(found), there + np.count_nonzero(truth.star >= 0)
+    assert named >= 0.99 * there
+
+
+def test_a_hundred_stars_do_not_need_the_deep_index(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Patterns, "deep", None)  # using it would raise
+    for seed in range(20):
+        truth = hundred(100 + seed)
+        assert off(Identifier()(truth.detections, FISHEYE, sky()), truth) < 40 * ARCSEC
+
+
+def test_every_hypothesis_counts_against_the_answer() -> None:
+    xy = scattered(FISHEYE, 60, np.random.default_rng(1))
+    with pytest.raises(NotIdentified, match="chance") as caught:
+        Identifier()(detected(xy, np.linspace(1, 4, len(xy)), 0.2), FISHEYE, sky())
+    assert caught.value.evidence["tried"] > 50
+    true = hundred(2)
+    few = Identifier()(true.detections, FISHEYE, sky())
+    search = AttitudeSearch.attitudes
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(AttitudeSearch, "attitudes", lambda self, *how: _after(self, 10**6, search(self, *how)))
+        many = Identifier()(true.detections, FISHEYE, sky())
+    assert many.false_alarm_probability >= few.false_alarm_probability
+
+
+def test_the_search_takes_a_fraction_of_a_second_to_refuse() -> None:
+    rng = np.random.default_rng(7)
+    xy = scattered(FISHEYE, 100, rng)
+    sources = detected(xy, np.sort(6 + np.log(rng.random(100)) / 1.08), 0.2)
+    for timed in (False, True):  # the first builds the index
+        start = time.process_time()
+        with pytest.raises(NotIdentified):
+            Identifier()(sources, FISHEYE, sky())
+        assert not timed or time.process_time() - start < 0.5
+
+
+def test_detections_outside_the_circle_keep_their_numbers_on_the_quick_path() -> None:
+    truth = hundred(3)
+    corner = np.stack([np.linspace(1, 90, 40), np.linspace(90, 1, 40)], axis=1)
+    v = np.concatenate([np.full(40, -3.0), 18.0 - 2.5 * np.log10(truth.detections.flux_e)])
+    found = Identifier()(detected(np.concatenate([corner, truth.detections.xy_px]), v, 0.2), FISHEYE, sky())
+    plain = Identifier()(truth.detections, FISHEYE, sky())
+    assert np.array_equal(found.detection, plain.detection + 40)
+    assert found.unexplained == plain.unexplained + 40
+
+
+def test_a_mirrored_short_list_is_named_as_such() -> None:
+    truth = hundred(4)
+    with pytest.raises(NotIdentified, match="mirror image"):
+        Identifier()(truth.detections, replace(FISHEYE, mirrored=True), sky())
+
+
+def test_pairs_are_those_of_a_brute_force_search() -> None:
+    patterns = Patterns(sky(), 2 * np.pi)
+    rays = sky().rays_icrs[[10, 20, 500]] + np.random.default_rng(2).normal(0, 1e-3, (3, 3))
+    rays = np.concatenate([rays, sky().rays_icrs[sky().hip == 17702]])  # in the Pleiades: many neighbours
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    for count, radius in ((700, 0.02), (3000, 0.02), (len(sky()), 0.004)):
+        near = patterns.near(rays, radius, count)
+        assert count <= near.depth <= 2 * count + 1000
+        distance = np.linalg.norm(rays[:, None] - sky().rays_icrs[None, : near.depth], axis=2)
+        expected = np.argwhere(distance < 2 * np.sin(radius / 2))
+        assert len(expected) > 3
+        assert sorted(zip(near.ray.tolist(), near.star.tolist(), strict=True)) == [tuple(p) for p in expected.tolist()]
+        assert near.chord == pytest.approx(distance[near.ray, near.star], abs=1e-12)
+        assert np.all(np.diff(near.ray) >= 0)
+
+
+@pytest.mark.parametrize("fresh", [0, 9])
+def test_the_sides_of_few_are_those_of_the_general_search(fresh: int) -> None:
+    rays = np.random.default_rng(5).normal((0, 0, 1.5), 1.0, (14, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    vertices, chords = sides_of_few(rays, fresh)
+    few = {tuple(v): np.sort(2 * np.arcsin(c / 2)) for v, c in zip(vertices.tolist(), chords, strict=True)}
+    assert len(few) == len(list(combinations(range(14), 3))) - len(list(combinations(range(fresh), 3)))
+    every = triangles(rays, 0.9)
+    fresher = every.take(every.vertices.max(axis=1) >= fresh)
+    assert len(fresher) > 15
+    for v, sides in zip(fresher.vertices.tolist(), fresher.sides_rad, strict=True):
+        assert few[tuple(sorted(v))] == pytest.approx(sides, abs=1e-14)
+
+
+def test_turns_are_the_best_rotations() -> None:
+    rng = np.random.default_rng(6)
+    icrs = rng.normal(size=(5, 40, 3))
+    icrs /= np.linalg.norm(icrs, axis=-1, keepdims=True)
+    R = rotation(np.array([0.3, -1.0, 0.7]))
+    cam = icrs @ R.T + rng.normal(0, 3e-4, icrs.shape)
+    weights = rng.uniform(0.5, 2, (5, 40))
+    assert turns(cam * weights[..., None], icrs) == pytest.approx(wahba(cam, icrs, weights), abs=1e-12)
+    flat = icrs * [1, 1, 1e-3]
+    assert np.linalg.det(turns(flat @ R.T, flat)) == pytest.approx(1)
+
+
+def test_facts_are_kept_per_object_and_forgotten_with_it() -> None:
+    calls: list[object] = []
+
+    class Thing:
+        pass
+
+    kept = KeptPerObject(lambda thing: calls.append(thing.__class__) or len(calls))
+    one, other = Thing(), Thing()
+    assert [kept(one), kept(one), kept(other)] == [1, 1, 2]
+    del one
+    gc.collect()
+    assert len(kept._kept) == 1
+
+
+def pairs_of(detection: list[int], star: list[int], distance_px: list[float], v_mag: list[float]) -> Pairs:
+    """Detections all measured at V 3; stars of the magnitudes given."""
+    v, none = np.array(v_mag), np.zeros(max(detection) + 1)
+    light = Light(none + 3.0, none > 0, 6.0, 5.0)
+    return Pairs(np.array(detection), np.array(star), np.array(distance_px), v, np.zeros(len(v)), light)
+
+
+BLENDS = {
+    "alone": ([0, 1], [4, 5], [0.1, 0.2], [3.0, 3.1], [4, 5]),
+    "with a fainter one": ([0, 0, 1], [4, 5, 6], [0.1, 0.1, 0.1], [3.0, 3.5, 3.0], [4, 6]),
+    "the nearer is the fainter": ([0, 0, 1], [4, 5, 6], [0.3, 0.1, 0.1], [3.0, 3.5, 3.0], [4, 6]),
+    "as bright as each other": ([0, 0, 1], [4, 5, 6], [0.3, 0.1, 0.1], [3.0, 3.2, 3.0], [6]),
+    "as bright, but far off": ([0, 0, 1], [4, 5, 6], [2.0, 0.1, 0.1], [3.1, 3.0, 3.0], [5, 6]),
+    "a brighter one, but not there": ([0, 0, 1], [4, 5, 6], [2.0, 0.1, 0.1], [2.4, 3.0, 3.0], [6]),
+    "each detected": ([0, 0, 1, 1], [4, 5, 4, 5], [0.1, 1.5, 1.5, 0.1], [3.0, 3.0, 3.0, 3.0], [4, 5]),
+    "two claim the same": ([0, 0, 1, 1], [3, 4, 3, 5], [0.3, 0.1, 0.3, 0.1], [2.5, 3.0, 2.5, 3.0], None),
+}
+
+
+@pytest.mark.parametrize("case", BLENDS)
+def test_a_blend_goes_by_the_name_of_the_plainly_brighter_star(case: str) -> None:
+    *listed, named = BLENDS[case]
+    pairs = pairs_of(*listed)
+    plain = pairs.plain(pairs.nearest, np.full(len(pairs.nearest), 0.04), 3.0)
+    assert len(set(pairs.star[plain].tolist())) == len(set(pairs.detection[plain].tolist())) == len(plain)
+    if named is not None:
+        assert pairs.star[plain].tolist() == named
+
+
+def test_the_last_of_each_number() -> None:
+    assert last_of_each(np.array([4, 2, 4, 7, 2])).tolist() == [False, False, True, True, True]
+    assert last_of_each(np.zeros(0, dtype=np.int64)).tolist() == []
+
+
+@pytest.mark.parametrize("field_sr", [2 * np.pi, 0.5])
+def test_triangles_about_a_pivot_are_those_of_a_brute_force_search(field_sr: float) -> None:
+    index = build_pairs(sky().take(slice(250 if field_sr > 1 else 800)), field_sr)
+    half = 0.6 if field_sr > 1 else 0.3
+    rays, tolerance = rays_about(6, half, 3), 0.01 * half
+    image, catalogue = index.triangles(rays, tolerance)
+    apart = np.linalg.norm(index.rays_icrs[:, None] - index.rays_icrs, axis=2)
+    paired = np.zeros(apart.shape, dtype=bool)
+    paired[tuple(index.pairs.T)] = True
+    expected = set()
+    for j, k in combinations(range(1, 6), 2):
+        a, b, c = (float(np.linalg.norm(rays[p] - rays[q])) for p, q in ((0, j), (0, k), (j, k)))
+        if min(a, b) < index.narrowest:
+            continue
+        near_a, near_b = (paired & (np.abs(apart - side) < tolerance) for side in (a, b))
+        for p in np.flatnonzero(near_a.any(axis=1) & near_b.any(axis=1)):
+            for q, r in np.argwhere(np.abs(apart[near_a[p]][:, near_b[p]] - c) < tolerance):
+                expected.add((j, k, p, np.flatnonzero(near_a[p])[q], np.flatnonzero(near_b[p])[r]))
+    found = set()
+    for (pivot, j, k), (p, q, r) in zip(image.tolist(), catalogue.tolist(), strict=True):
+        assert pivot == 0
+        found.add((j, k, p, q, r) if j < k else (k, j, p, r, q))
+    assert found == expected
+    assert len(found) == len(image) > 5
+
+
+def test_eight_stars_of_a_narrow_field_on_the_quick_path() -> None:
+    truth = frame(NARROW, 7, brightest=30, limit=8.0, hidden=0.0, false=0.2)
+    found = Identifier()(truth.detections, NARROW, sky())
+    assert np.array_equal(truth.star[found.detection], found.star)

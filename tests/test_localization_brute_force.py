@@ -1,0 +1,182 @@
+"""The exact posterior against a plain sum over a fine grid, and the thesis's methods against the thesis."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+from scipy.stats import norm
+
+from startrack.localization import ExactPosterior, Hull, PseudoGradient
+from startrack.localization.pseudo_gradient import descend
+from startrack.localization.rim_plane import on_rim_plane
+from startrack.terrain import Cylinder, load_terrain
+from startrack.types import Evidence, Fix, NotLocated
+
+THESIS = load_terrain("shackleton-thesis")
+assert isinstance(THESIS, Cylinder)
+PIT = replace(THESIS, diameter_m=200.0, depth_m=40.0, camera_height_m=0.0, search_radius_m=100.0)
+STEP_M = 1.0
+EPSILON = 1e-3
+SECTORS = 120  # of 3 degrees
+
+
+def grid() -> np.ndarray:
+    line = np.arange(-100.0, 100.0, STEP_M) + STEP_M / 2
+    x, y = np.meshgrid(line, line)
+    places = np.stack([x.ravel(), y.ravel()], axis=1)
+    return places[np.hypot(*places.T) < 100.0]
+
+
+def log_likelihood(places: np.ndarray, evidence: Evidence, capped: bool) -> np.ndarray:
+    """sum over sectors of log((1 - eps) exp(min(g - M, 0)) + eps), g the sum of log(V e^l + 1 - V), written out."""
+    total = np.zeros(len(places))
+    sector = (evidence.azimuth_rad / (2 * np.pi) * SECTORS).astype(int)
+    for s in np.unique(sector):
+        gain, ceiling, running = np.zeros(len(places)), 0.0, 0.0
+        rays = np.flatnonzero(sector == s)
+        for i in rays[np.argsort(-evidence.elevation_rad[rays])]:
+            a, e, llr = evidence.azimuth_rad[i], evidence.elevation_rad[i], evidence.llr[i]
+            along = places @ [np.sin(a), np.cos(a)]
+            reach = -along + np.sqrt(along**2 + 100.0**2 - np.sum(places**2, axis=1))  # to the wall
+            above = e - np.arctan2(40.0, reach)
+            sigma = evidence.edge_sigma_rad[i]
+            visible = norm.cdf(above / sigma) if sigma > 0 else (above > 0).astype(float)
+            gain += np.log(visible * np.exp(llr) + 1 - visible)
+            running += llr
+            ceiling = max(ceiling, running)
+        below = gain - ceiling
+        total += np.log((1 - EPSILON) * np.exp(np.minimum(below, 0)) + EPSILON) if capped else below
+    return total
+
+
+def rays_seen(at_m: np.ndarray, n: int, sigma_rad: float, rng: np.random.Generator) -> Evidence:
+    """Rays of signal-to-noise ratio 1 to 4, measured from the place."""
+    azimuth, elevation = 2 * np.pi * rng.random(n), np.radians(rng.uniform(5, 75, n))
+    snr = rng.uniform(1, 4, n)
+    edge = elevation + sigma_rad * rng.normal(size=n)
+    light = snr * (edge > PIT.horizon_rad(at_m[None], azimuth)) + rng.normal(size=n)
+    return Evidence(
+        azimuth_rad=azimuth, elevation_rad=elevation, llr=np.clip(snr * light - snr**2 / 2, -9, 9),
+        edge_sigma_rad=np.full(n, sigma_rad),
+    )  # fmt: skip
+
+
+@settings(max_examples=8, deadline=None, derandomize=True)
+@given(
+    st.integers(0, 2**32 - 1), st.floats(-60, 60), st.floats(-60, 60), st.sampled_from([80, 160]),
+    st.sampled_from([0.0, 0.02]), st.booleans(),
+)  # fmt: skip
+def test_any_small_problem_agrees_with_the_grid(
+    seed: int, east: float, north: float, n: int, sigma_rad: float, capped: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    evidence = rays_seen(np.array([east, north]), n, sigma_rad, rng)
+    places = grid()
+    log = log_likelihood(places, evidence, capped)
+    weight = np.exp(log - log.max())
+    weight /= weight.sum()
+    method = ExactPosterior(
+        sector_width_rad=2 * np.pi / SECTORS, sector_epsilon=EPSILON if capped else 0.0, boxes_per_sigma=8.0,
+        finest_m=0.1,
+    )  # fmt: skip
+    try:
+        fix = method(evidence, PIT)
+    except NotLocated:
+        away = np.linalg.norm(places - weight @ places, axis=1)
+        assert weight[away < 45].sum() < 0.95  # nothing worth having
+        return
+    assert fix.dropped_mass < 1e-4
+    close = np.linalg.norm(places - fix.position_enu_m[:2], axis=1)
+    if len(fix.modes) == 1:
+        mean = weight @ places
+        spread = np.einsum("n,ni,nj->ij", weight, places - mean, places - mean) + STEP_M**2 / 12 * np.eye(2)
+        sigma = np.sqrt(np.trace(spread))
+        # Cells narrower than a step are the grid's own error.
+        assert np.linalg.norm(fix.position_enu_m[:2] - mean) < 0.1 * sigma + 0.5 * STEP_M
+        assert fix.covariance_m2 == pytest.approx(spread, abs=0.15 * sigma**2 + 0.3)
+    assert weight[close < fix.radius95_m + STEP_M].sum() > 0.94
+    assert weight[close < fix.radius95_m - 0.15 * fix.radius95_m - STEP_M].sum() < 0.96
+    if fix.ambiguous:
+        for mode in fix.modes[:2]:
+            near = np.hypot(*(places - [mode.east_m, mode.north_m]).T) < 15.0
+            assert weight[near].sum() > 0.5 * mode.weight
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_stated_bound_on_what_was_dropped_holds(seed: int) -> None:
+    """With boxes given up ever more rashly, the probability really lost stays below what is admitted."""
+    rng = np.random.default_rng(seed)
+    evidence = rays_seen(rng.uniform(-50, 50, 2), 120, 0.0, rng)
+    places = grid()
+    log = log_likelihood(places, evidence, capped=True)
+    weight = np.exp(log - log.max())
+    weight /= weight.sum()
+    for nats in (1.0, 3.0, 6.0):
+        method = ExactPosterior(
+            sector_width_rad=2 * np.pi / SECTORS, sector_epsilon=EPSILON, prune_nats=nats, boxes_per_sigma=2.5
+        )
+        centres, half, log_weight, log_dropped = method._explored(evidence, PIT)
+        kept = cKDTree(centres).query(places, p=np.inf)[0] <= half
+        total = np.log(np.sum(np.exp(log_weight - log_weight.max())) * 4 * half**2) + log_weight.max()
+        admitted = np.exp(log_dropped - np.logaddexp(log_dropped, total))
+        assert weight[~kept].sum() <= admitted + 0.01
+        assert weight[~kept].sum() > 0 or nats > 1
+
+
+@pytest.mark.parametrize("n", [1, 5, 7])
+def test_a_few_rays_are_refused(n: int) -> None:
+    evidence = rays_seen(np.zeros(2), n, 0.0, np.random.default_rng(1))
+    with pytest.raises(NotLocated, match=f"only {n} rays") as caught:
+        ExactPosterior()(evidence, PIT)
+    assert caught.value.reason == "insufficient_geometry"
+
+
+def thesis_list(rng: np.random.Generator) -> tuple[Evidence, np.ndarray]:
+    """2142 stars, uniform over the sky, and which of them a place uniform on the floor sees."""
+    azimuth, elevation = 2 * np.pi * rng.random(2142), np.arcsin(rng.random(2142))
+    r, turn = THESIS.radius_m * np.sqrt(rng.random()), 2 * np.pi * rng.random()
+    at = r * np.array([np.sin(turn), np.cos(turn)])
+    seen = elevation > THESIS.horizon_rad(at[None], azimuth)
+    llr = np.where(seen, 9.0, -9.0)
+    return Evidence(azimuth_rad=azimuth, elevation_rad=elevation, llr=llr, edge_sigma_rad=np.zeros(2142)), at
+
+
+def errors_of(method: Hull | PseudoGradient, draws: int) -> np.ndarray:
+    def error(fix: Fix, at: np.ndarray) -> float:
+        return float(np.linalg.norm(fix.position_enu_m[:2] - at))
+
+    pairs = [thesis_list(np.random.default_rng([7, k])) for k in range(draws)]
+    return np.array([error(method(evidence, THESIS), at) for evidence, at in pairs])
+
+
+def test_the_hull_is_as_far_off_as_in_the_thesis() -> None:
+    """Kua 2008, section 3.1.1: mean 637 m, s.d. 275 m, at most 1735 m."""
+    errors = errors_of(Hull(), 400)
+    assert errors.mean() == pytest.approx(637, rel=0.08)
+    assert errors.std() == pytest.approx(275, rel=0.25)
+    assert errors.max() < 2200
+
+
+def test_the_pseudo_gradient_is_as_good_as_in_the_thesis() -> None:
+    """Kua 2008, table 3.1: mean 34.2 m, s.d. 31.1 m, at most 358 m; 0.6 % never settle."""
+    errors = errors_of(PseudoGradient(), 300)
+    assert 24 < errors.mean() < 38
+    assert errors.std() < 40
+    assert np.percentile(errors, 99) < 200
+
+
+def test_a_settled_descent_has_reproduced_the_list() -> None:
+    settled = 0
+    for k in range(60):
+        evidence, at = thesis_list(np.random.default_rng([8, k]))
+        points, seen = on_rim_plane(evidence, THESIS), evidence.llr > 0
+        place, done = descend(points, seen, at + np.array([200.0, -300.0]), THESIS.radius_m, 1.0, 400)
+        settled += done
+        if done:
+            assert np.array_equal(evidence.elevation_rad > THESIS.horizon_rad(place[None], evidence.azimuth_rad), seen)
+    assert settled >= 57

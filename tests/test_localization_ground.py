@@ -1,0 +1,204 @@
+"""Places on real ground: interpolated horizons, the posterior against a plain grid, wrong clocks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from startrack.localization import ExactPosterior, check_consistency
+from startrack.localization.box_average import Blurred
+from startrack.localization.consistency import contradicted_stretches
+from startrack.localization.grid_search import scores
+from startrack.localization.horizon_bias import raised
+from startrack.localization.initial_guess import best_by_diving
+from startrack.localization.local_search import Vicinity
+from startrack.localization.misfit import turn_of_sky
+from startrack.localization.prefix_sums import Profile
+from startrack.localization.sector_likelihood import Sectors
+from startrack.terrain import load_terrain
+from startrack.terrain.height_map import HeightMap
+from startrack.types import Array, Evidence, NotLocated
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _own_cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def shackleton() -> HeightMap:
+    terrain = load_terrain("shackleton")
+    assert isinstance(terrain, HeightMap)
+    terrain = replace(
+        terrain, search_radius_m=300.0, height_sigma_m=0.0, horizon_sigma_common_rad=0.0, _state={}, use_compiled=None
+    )
+    terrain.prepared()
+    return terrain
+
+
+def seen_from(terrain: HeightMap, place: Array, rng: np.random.Generator, rays: int, sigma_rad: float) -> Evidence:
+    """Rays of signal-to-noise ratio 1 to 4 near the skyline."""
+    azimuth = rng.uniform(0, 2 * np.pi, rays)
+    horizon = terrain.horizon_rad(place[None], azimuth)
+    elevation = horizon + rng.uniform(-0.06, 0.06, rays)
+    snr = rng.uniform(1, 4, rays)
+    light = snr * (elevation + sigma_rad * rng.normal(size=rays) > horizon) + rng.normal(size=rays)
+    return Evidence(
+        azimuth_rad=azimuth, elevation_rad=elevation, llr=np.clip(snr * light - snr**2 / 2, -9, 9),
+        edge_sigma_rad=np.full(rays, sigma_rad),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_between_traced_points_the_horizon_is_the_traced_one_and_bounds_hold(shackleton, compiled):
+    rng = np.random.default_rng(1)
+    azimuth = np.sort(rng.uniform(0, 2 * np.pi, 60))
+    whole = replace(shackleton, use_compiled=compiled, _state=shackleton._state)
+    near = whole.near(np.array([40.0, -60.0]), 50.0, azimuth, 6)
+    places = near.centre_m + rng.uniform(-50, 50, (40, 1, 2))
+    traced = shackleton.horizon_rad(places, azimuth)
+    off = np.degrees(near.horizon_rad(places, azimuth) - traced)
+    assert np.abs(off).max() < 0.005
+    assert np.sqrt(np.mean(off**2)) < 0.0005
+    centres, which = near.centre_m + rng.uniform(-40, 40, (300, 2)), azimuth[rng.integers(0, 60, 300)]
+    for half in (8.0, 2.0):
+        low, high = near.horizon_bounds_rad(centres, np.array(half), which)
+        inside = centres[:, None] + rng.uniform(-half, half, (300, 20, 2))
+        horizon = shackleton.horizon_rad(inside, which[:, None])
+        assert np.all(low[:, None] - 1e-9 <= horizon)
+        assert np.all(horizon <= high[:, None] + 1e-9)
+        assert np.median(high - low) < np.radians(0.03 * half)
+
+
+@pytest.mark.parametrize("sigma_rad", [0.0, 0.001])
+def test_the_vicinity_scores_places_as_all_rays_do(shackleton, sigma_rad):
+    rng = np.random.default_rng(2)
+    place = np.array([-80.0, 30.0])
+    evidence = seen_from(shackleton, place, rng, 3000, sigma_rad)
+    sectors = Sectors.of(evidence, np.radians(1.5), 1e-4)
+    about = Vicinity.of(sectors, Profile.of(sectors), shackleton, place, 40.0)
+    places = place + rng.uniform(-35, 35, (50, 2))
+    exact = scores(places, evidence, sectors, shackleton)
+    found = about.scores(places)
+    assert np.median(np.abs(found - exact)) < (0.05 if sigma_rad else 1e-6)  # a ray may flip at a hard edge
+    plain = replace(about, ground=replace(shackleton, use_compiled=False).near(place, 40.0, about.azimuth_rad))
+    assert np.median(np.abs(plain.scores(places) - found)) < 0.05  # rough azimuths are traced there
+    top, best = about.climbed(place, 16.0, 0.5)
+    assert best >= found.max() - 5
+    assert np.allclose(plain.climbed(place, 16.0, 0.5)[0], top, atol=1.0)
+
+
+def test_a_box_is_blurred_as_horizons_drawn_between_its_bounds_are(shackleton):
+    rng = np.random.default_rng(6)
+    evidence = seen_from(shackleton, np.array([-80.0, 30.0]), rng, 3000, 0.0)
+    sectors = Sectors.of(evidence, np.radians(1.5), 1e-4)
+    centres, half = np.array([[-90.0, 40.0], [150.0, -20.0]]), 40.0
+    found = Blurred.of(sectors, Profile.of(sectors)).score(shackleton, centres, half)
+    count, draws = sectors.count, (np.arange(4000) + 0.5) / 4000
+    middle = (2 * np.arange(count) + 1) * np.pi / count
+    low, high = shackleton.horizon_bounds_rad(centres[:, None], np.array(half), middle, np.pi / count)
+    for box in range(2):
+        plain = 0.0
+        for sector in range(count):
+            own = sectors.sector == sector
+            horizon = low[box, sector] + (high - low)[box, sector] * draws
+            sums = (evidence.llr[own] * (evidence.elevation_rad[own] > horizon[:, None])).sum(axis=1)
+            below = np.minimum(sums - sectors.ceiling[sector], 0.0)
+            plain += np.log((1 - sectors.epsilon) * np.exp(below).mean() + sectors.epsilon)
+        assert found[box] == pytest.approx(plain, abs=0.5)
+    assert found[0] > found[1] + 50
+
+
+def test_the_dive_ends_near_the_top(shackleton):
+    for seed in range(6):
+        rng = np.random.default_rng([7, seed])
+        place = rng.uniform(-200, 200, 2)
+        evidence = seen_from(shackleton, place, rng, 1500, 0.0005)
+        sectors = Sectors.of(evidence, np.radians(1.5), 1e-4)
+        found, best = best_by_diving(sectors, Profile.of(sectors), shackleton)
+        assert best > scores(place[None], evidence, sectors, shackleton)[0] - 2.0
+        assert np.linalg.norm(found - place) < 30.0
+
+
+def test_stars_of_another_place_or_time_are_refused_before_the_search(shackleton):
+    rng = np.random.default_rng(8)
+    evidence = seen_from(shackleton, np.array([50.0, -120.0]), rng, 3000, 0.0005)
+    assert ExactPosterior()(evidence, shackleton).radius95_m < 50.0
+    turned = replace(evidence, azimuth_rad=np.mod(evidence.azimuth_rad + np.radians(60), 2 * np.pi))
+    with pytest.raises(NotLocated, match="no place explains the stars") as refused:
+        ExactPosterior()(turned, shackleton)
+    assert refused.value.reason == "inconsistent_evidence"
+
+
+def test_contradictions_are_counted_apart():
+    by_sector = np.zeros(240)
+    assert contradicted_stretches(by_sector) == []
+    by_sector[[238, 239, 0, 1, 3]] = -9.0  # a ridge across north, with a gap in it
+    assert contradicted_stretches(by_sector) == [(238, 6)]
+    by_sector[20:200:20] = -4.0
+    assert contradicted_stretches(by_sector) == [*((k, 1) for k in range(20, 200, 20)), (238, 6)]
+    assert contradicted_stretches(np.full(240, -9.0)) == [(0, 240)]
+
+
+def test_no_allowed_ground_is_given_up(shackleton):
+    """Small patches of ground flat enough: large boxes must not be dropped because a few points in them are steep."""
+    slopes = np.degrees(shackleton.slope_rad(np.random.default_rng(9).uniform(-200, 200, (4000, 2))))
+    limited = replace(shackleton, most_slope_rad=np.radians(np.quantile(slopes, 0.02)), _state=shackleton._state)
+    places = np.random.default_rng(10).uniform(-200, 200, (20_000, 2))
+    place = places[np.asarray(limited.allowed(places))][0]
+    evidence = seen_from(shackleton, place, np.random.default_rng(11), 1500, 0.0005)
+    fix = ExactPosterior()(evidence, limited)
+    assert np.linalg.norm(fix.position_enu_m[:2] - place) < max(fix.radius999_m, 1.0)
+    with pytest.raises(NotLocated, match="max_slope_deg"):
+        ExactPosterior()(evidence, replace(limited, most_slope_rad=0.0, _state=shackleton._state))
+
+
+@pytest.mark.parametrize("sigma_rad", [0.0, 0.001])
+def test_posterior_on_ground_equals_a_plain_grid(shackleton, sigma_rad):
+    rng = np.random.default_rng(3)
+    place = np.array([120.0, 60.0])
+    evidence = seen_from(shackleton, place, rng, 1500, sigma_rad)
+    method = ExactPosterior() if sigma_rad else ExactPosterior(boxes_per_sigma=3.0)
+    fix = method(evidence, shackleton)
+    step = float(np.sqrt(np.linalg.eigvalsh(fix.covariance_m2)[0])) / 3
+    reach = 4.5 * float(np.sqrt(np.linalg.eigvalsh(fix.covariance_m2)[1]))
+    line = np.arange(-reach, reach, step)
+    grid = fix.position_enu_m[:2] + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    sectors = Sectors.of(evidence, method.sector_width_rad, method.sector_epsilon)
+    log = np.concatenate([scores(some, evidence, sectors, shackleton) for some in np.array_split(grid, 8)])
+    weight = np.exp(log - log.max())
+    weight /= weight.sum()
+    mean = weight @ grid
+    spread = np.einsum("n,ni,nj->ij", weight, grid - mean, grid - mean)
+    sigma = np.sqrt(np.trace(spread))
+    assert np.linalg.norm(fix.position_enu_m[:2] - mean) < 0.1 * sigma
+    assert fix.covariance_m2 == pytest.approx(spread, abs=0.12 * sigma**2)
+    assert fix.dropped_mass < 1e-3
+
+
+def test_a_common_error_found_is_told_and_not_taken_for_a_wrong_map(shackleton):
+    rng, error = np.random.default_rng(4), np.radians(0.08)
+    unsure = replace(shackleton, horizon_sigma_common_rad=np.radians(0.1))
+    evidence = raised(seen_from(shackleton, np.array([50.0, -90.0]), rng, 4000, 0.0), -error)
+    fix = ExactPosterior()(evidence, unsure)
+    assert fix.horizon_error_rad == pytest.approx(error, abs=np.radians(0.02))
+    check_consistency(evidence, fix, unsure)
+
+
+def test_a_sky_turned_by_a_wrong_clock_shows(shackleton):
+    rng = np.random.default_rng(5)
+    place = np.array([50.0, -90.0])
+    evidence = seen_from(shackleton, place, rng, 12_000, 0.0)
+    for turn, refused in ((0.0, False), (np.radians(1.1), True)):
+        turned = replace(evidence, azimuth_rad=np.mod(evidence.azimuth_rad + turn, 2 * np.pi))
+        sectors = Sectors.of(turned, np.radians(1.5), 1e-4)
+        found, gain = turn_of_sky(sectors, Profile.of(sectors), place, shackleton)
+        if refused:
+            assert gain > 5
+            assert found == pytest.approx(-turn, abs=np.radians(0.6))
+        else:
+            assert gain < 2

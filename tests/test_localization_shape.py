@@ -1,0 +1,84 @@
+"""A crater of uncertain depth and width: estimated with the position, and a wrong one is not believed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from startrack.localization import ExactPosterior, check_consistency
+from startrack.localization.consistency import LEAST_EXPLAINED_NATS, explained_by_sector
+from startrack.terrain import Cylinder, load_terrain
+from startrack.types import Evidence, NotLocated
+
+TRUE = load_terrain("shackleton-thesis")
+PLACES = [(3000.0, -2000.0), (-6500.0, 1000.0), (500.0, 400.0)]
+
+
+def evidence_at(place_m: tuple[float, float], seed: int) -> Evidence:
+    """Six thousand stars over the sky, each with a noisy measurement of its light: SNR 1 to 8."""
+    assert isinstance(TRUE, Cylinder)
+    rng = np.random.default_rng(seed)
+    n = 6000
+    azimuth, elevation = 2 * np.pi * rng.random(n), np.arcsin(rng.random(n))
+    snr = 8 * rng.random(n) ** 2 + 1
+    visible = elevation > TRUE.horizon_rad(np.array([place_m]), azimuth)
+    flux = snr * visible + rng.standard_normal(n)
+    llr = np.clip(snr * flux - snr**2 / 2, -9, 9)
+    return Evidence(azimuth_rad=azimuth, elevation_rad=elevation, llr=llr, edge_sigma_rad=np.zeros(n))
+
+
+@pytest.mark.parametrize("place_m", PLACES)
+def test_the_true_crater_is_consistent(place_m: tuple[float, float]) -> None:
+    evidence = evidence_at(place_m, 1)
+    check_consistency(evidence, ExactPosterior(compiled=True)(evidence, TRUE), TRUE)
+
+
+@pytest.mark.parametrize("stretch", [0.96, 1.04])
+@pytest.mark.parametrize("place_m", PLACES)
+def test_a_crater_too_deep_or_shallow_is_refused(place_m: tuple[float, float], stretch: float) -> None:
+    assert isinstance(TRUE, Cylinder)
+    evidence, wrong = evidence_at(place_m, 2), replace(TRUE, depth_m=stretch * TRUE.depth_m)
+    fix = ExactPosterior(compiled=True)(evidence, wrong)
+    with pytest.raises(NotLocated, match=r"horizon about .* time") as refusal:
+        check_consistency(evidence, fix, wrong)
+    assert refusal.value.reason == "inconsistent_evidence"
+
+
+@pytest.mark.parametrize("place_m", PLACES)
+def test_an_uncertain_depth_is_found_with_the_position(place_m: tuple[float, float]) -> None:
+    assert isinstance(TRUE, Cylinder)
+    evidence = evidence_at(place_m, 3)
+    guess = replace(TRUE, depth_m=TRUE.depth_m + 25.0, depth_sigma_m=20.0)
+    method = ExactPosterior(compiled=True)
+    fix, crater = method(evidence, guess), method.crater(evidence, guess)
+    assert np.linalg.norm(fix.position_enu_m[:2] - place_m) < fix.radius999_m < 200
+    assert abs(crater.depth_m - TRUE.depth_m) < 4 * np.sqrt(crater.covariance_m2[0, 0])
+    assert np.sqrt(crater.covariance_m2[0, 0]) < 6
+    assert crater.diameter_m == pytest.approx(guess.diameter_m)
+
+
+def test_the_size_of_a_crater_cannot_be_seen_and_is_not_pretended() -> None:
+    # A crater twice as large and as deep looks the same: only the ratio is measured, the scale stays as given.
+    assert isinstance(TRUE, Cylinder)
+    evidence = evidence_at((4000.0, 3000.0), 4)
+    guess = replace(TRUE, depth_sigma_m=20.0, diameter_sigma_m=200.0, search_radius_m=11000.0)
+    method = ExactPosterior(compiled=True)
+    fix, crater = method(evidence, guess), method.crater(evidence, guess)
+    assert np.linalg.norm(fix.position_enu_m[:2] - [4000, 3000]) < fix.radius999_m
+    # 1 % of 5 km, narrowed by what the two priors say together of the common scale: 1 % / sqrt(2).
+    assert 25 < np.sqrt(np.trace(fix.covariance_m2)) < 50
+    ratio = np.array([1 / crater.depth_m, -1 / crater.diameter_m])
+    assert np.sqrt(ratio @ crater.covariance_m2 @ ratio) < 0.003
+
+
+def test_a_place_that_explains_the_stars_badly_is_refused() -> None:
+    """The evidence of one place, and a fix elsewhere that no single star contradicts clearly."""
+    evidence = evidence_at(PLACES[0], seed=3)
+    fix = ExactPosterior(compiled=True)(evidence, TRUE)
+    assert explained_by_sector(evidence, fix, TRUE).mean() > -1.0
+    aside = replace(fix, position_enu_m=fix.position_enu_m + np.array([1500.0, 0.0, 0.0]))
+    assert explained_by_sector(evidence, aside, TRUE).mean() < LEAST_EXPLAINED_NATS
+    with pytest.raises(NotLocated, match=r"explains the stars badly.*most at azimuths"):
+        check_consistency(evidence, aside, TRUE)

@@ -1,0 +1,191 @@
+"""The annotated picture: marks stand where geometry from elsewhere says, and every kind of result can be drawn."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.special import ndtr
+
+from startrack import pipeline
+from startrack.camera import Camera, Pinhole
+from startrack.output import write_annotated
+from startrack.output.picture.annotate import annotate
+from startrack.output.picture.backdrop import View, fitted, without_hot_pixels
+from startrack.output.picture.palette import HIDDEN, IDENTIFIED, POSITION, SKYLINE, STATUS, TRUTH
+from startrack.output.picture.panel import PANEL_WIDTH
+from startrack.types import Mode
+
+
+def near(picture, place, colour, reach=2, tolerance=60):
+    """Whether a pixel within `reach` of the place has the colour, or nearly."""
+    x, y = np.rint(place).astype(int)
+    patch = picture[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1].astype(int)
+    return bool((np.abs(patch - colour).sum(axis=-1) < tolerance).any())
+
+
+def render_stars(shape, centres, fluxes, sigma_px):
+    """Gaussian stars, integrated over the pixels."""
+    light = np.zeros(shape, dtype=np.float32)
+    edges = [np.arange(n + 1) - 0.5 for n in shape]
+    for (x, y), flux in zip(centres, fluxes, strict=True):
+        down, across = (np.diff(ndtr((edge - at) / sigma_px)) for edge, at in zip(edges, (y, x), strict=True))
+        light += (flux * np.outer(down, across)).astype(np.float32)
+    return light
+
+
+def count(picture, colour, tolerance=30):
+    return int((np.abs(picture.astype(int) - colour).sum(axis=-1) < tolerance).sum())
+
+
+@pytest.fixture(scope="module")
+def picture(located):
+    return annotate(located.result)
+
+
+@pytest.fixture(scope="module")
+def view(located, picture):
+    scale, size = fitted(located.result.exposure.size_px)
+    return View(scale, (0.0, float((picture.shape[0] - size[1]) // 2)), size)
+
+
+def test_size(picture):
+    assert picture.dtype == np.uint8
+    assert picture.shape[2] == 3
+    assert 1000 <= picture.shape[0] <= 1600
+    assert fitted((2048, 2048)) == (1400 / 2048, (1400, 1400))
+    assert fitted((3000, 2000))[1] == (1400, 933)
+    assert fitted((512, 512))[1] == (900, 900)
+    assert fitted((1024, 1024))[0] == 1.0
+
+
+def test_the_skyline_is_where_the_true_wall_is(picture, view, located):
+    """From the truth and the crater's formula, without any code of the picture's."""
+    (x, y, up), camera = located.truth.position_enu_m, located.result.camera
+    azimuth = np.radians(np.arange(0.0, 360.0, 5.0))
+    along = x * np.sin(azimuth) + y * np.cos(azimuth)
+    elevation = np.arctan2(2000.0 - up, np.sqrt(along**2 + 10_000.0**2 - x**2 - y**2) - along)
+    level = np.cos(elevation)
+    rays = np.stack([np.sin(azimuth) * level, np.cos(azimuth) * level, np.sin(elevation)], axis=-1)
+    xy_px, inside = camera.project(rays @ located.truth.R_cam_enu.T)
+    assert inside.all()
+    assert np.mean([near(picture, place, SKYLINE) for place in view.at(xy_px)]) > 0.9
+    astray = [near(picture, place, SKYLINE) for place in view.at(xy_px + 12.0)]
+    assert np.mean(astray) < 0.5
+
+
+def test_identified_stars_have_a_green_ring_and_hidden_ones_a_cross(picture, view, located):
+    result = located.result
+    ringed = []
+    for k in np.sort(result.identification.detection)[:40]:  # the brightest: rings of faint ones fade
+        at = view.at(result.detections.xy_px[k])
+        ringed.append(any(near(picture, at + np.array([0.0, r]), IDENTIFIED, tolerance=120) for r in range(5, 11)))
+    assert np.mean(ringed) > 0.8
+    hidden = np.flatnonzero(result.light.llr < -3.0)[:10]
+    assert np.mean([near(picture, place, HIDDEN) for place in view.at(result.light.xy_px[hidden])]) > 0.8
+
+
+def test_beyond_the_image_circle_is_paper(picture, view, located):
+    corner = picture[int(view.origin[1]) + 3, 3]
+    assert corner.max() < 40
+    middle = picture[int(view.origin[1]) + 400 : int(view.origin[1]) + 600, 400:600]
+    assert middle.max() == 255
+
+
+@pytest.mark.parametrize("psf_sigma_px", [0.7, 0.8, 1.0, 2.0])
+def test_hot_pixels_go_and_stars_stay(psf_sigma_px):
+    rng = np.random.default_rng(1)
+    sky = rng.normal(100, 3, (200, 200)).astype(np.float32)
+    places = np.stack(np.meshgrid(np.arange(20, 180, 20), np.arange(20, 180, 20)), axis=-1).reshape(-1, 2)
+    centres = places + rng.uniform(-0.5, 0.5, places.shape)
+    stars = sky + render_stars(sky.shape, centres, np.geomspace(200, 1e5, len(centres)), psf_sigma_px)
+    hot = stars.copy()
+    hot[places[:, 1] + 9, places[:, 0] + 9] += np.geomspace(60, 5e4, len(places)).astype(np.float32)
+    np.testing.assert_array_equal(without_hot_pixels(stars, psf_sigma_px), stars)
+    assert np.abs(without_hot_pixels(hot, psf_sigma_px) - stars).max() < 20
+
+
+def test_detections_beyond_the_image_circle_are_not_drawn(located, view):
+    found = located.result.detections
+    astray = replace(found, xy_px=np.concatenate([[[20.0, 20.0]], found.xy_px[1:]]))
+    others = replace(
+        located.result.identification,
+        detection=located.result.identification.detection[located.result.identification.detection != 0],
+        star=located.result.identification.star[located.result.identification.detection != 0],
+    )
+    drawn = annotate(replace(located.result, detections=astray, identification=others))
+    x, y = np.rint(view.at((20.0, 20.0))).astype(int)
+    assert np.ptp(drawn[y - 12 : y + 13, x - 12 : x + 13].reshape(-1, 3), axis=0).max() == 0
+
+
+def test_truth_is_drawn_only_when_given(picture, located):
+    assert count(picture, TRUTH) == 0
+    given = annotate(located.result, tuple(located.truth.position_enu_m[:2]))
+    assert count(given[:, -PANEL_WIDTH:], TRUTH) > 20
+
+
+def test_every_kind_of_result_can_be_drawn(located):
+    result = located.result
+    modes = (Mode(east_m=6000.0, north_m=-2500.0, weight=0.7), Mode(east_m=-3000.0, north_m=4000.0, weight=0.3))
+    nothing = {"fix": None, "light": None}
+    unknown = {**nothing, "identification": None, "attitude_fit": None, "R_enu_icrs": None, "bodies": []}
+    badge = np.s_[20:70, -200:]
+    cases = {
+        "ambiguous": replace(result, status="ambiguous", fix=replace(result.fix, modes=modes, ambiguous=True)),
+        "inconsistent": replace(result, status="refused", reason="inconsistent_evidence", message="m " * 400, fix=None),
+        "not identified": replace(result, status="refused", reason="not_identified", message="why", **unknown),
+        "no stars": replace(result, status="refused", reason="no_stars", detections=None, **unknown),
+        "identified": replace(result, terrain=None, R_enu_icrs=None, bodies=[], **nothing),
+        "detected": pipeline.Result(exposure=result.exposure, detections=result.detections, status="ok"),
+    }
+    for name, one in cases.items():
+        drawn = annotate(one)
+        assert count(drawn[badge], STATUS[one.status]) > 500, name
+    assert count(annotate(cases["ambiguous"])[:, -PANEL_WIDTH:], POSITION) > 2 * 60
+
+
+def test_an_image_of_another_size_than_the_cameras(located):
+    wide = replace(located.result.exposure, pixels_adu=located.result.exposure.pixels_adu[:300])
+    refused = pipeline.identify(wide, located.result.camera, SimpleNamespace(name="not needed"))
+    assert refused.reason == "size_mismatch"
+    assert annotate(refused).shape[1] > 1024
+
+
+def test_a_narrow_camera_that_sees_no_skyline(located):
+    """A pinhole camera of 20 degrees looking up: no compass, no wall, no rim in the frame, and no error."""
+    camera = Camera(
+        name="narrow",
+        size_px=(1024, 1024),
+        focal_px=(2900.0, 2900.0),
+        centre_px=(511.5, 511.5),
+        max_angle_rad=0.25,
+        calibrated_angle_rad=0.25,
+        lens=Pinhole(),
+    )
+    result = replace(located.result, camera=camera)
+    assert count(annotate(result)[:, :1024], SKYLINE) == 0
+
+
+def test_a_name_that_the_font_cannot_write(located):
+    exposure = replace(located.result.exposure, path="nächte/星空 – " + "very long " * 20 + ".png")
+    annotate(replace(located.result, exposure=exposure))
+
+
+def test_the_png_is_whole_and_the_same_each_time(located, picture, tmp_path):
+    first, second = tmp_path / "a.annotated.png", tmp_path / "b.annotated.png"
+    write_annotated(first, located.result)
+    write_annotated(second, located.result)
+    np.testing.assert_array_equal(np.asarray(Image.open(first)), picture)
+    assert first.read_bytes() == second.read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [first.name, second.name]
+
+
+def test_matplotlib_stays_out():
+    code = "import sys, startrack.output.picture.annotate, startrack.output.write; print('matplotlib' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

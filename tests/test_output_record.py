@@ -1,0 +1,216 @@
+"""Results as JSON: every number against the truth of the scene or a formula from elsewhere."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from startrack import pipeline
+from startrack.catalog import load_catalog
+from startrack.output import detection_dict, identification_dict, refused_dict, result_dict, write_json
+from startrack.output.record import boresight_rad
+from startrack.output.text import verbose_text
+from startrack.types import BadInput, Mode
+
+ARCSEC = np.pi / 648_000
+KEYS = {
+    "position": "frame terrain east_m north_m up_m covariance_m2 radius95_m radius999_m latitude_deg longitude_deg",
+    "attitude": "quat_xyzw_cam_icrs ra_deg dec_deg roll_deg sigma_arcsec lens_error_included quat_xyzw_body_enu "
+    "heading_deg pitch_deg roll_body_deg",
+    "stars": "detected identified unexplained predicted_visible rms_px false_alarm_probability",
+    "timing_ms": "read detect identify attitude evidence locate",
+    "provenance": "version image_sha256 camera terrain catalog time_utc exposure_s",
+}
+
+
+@pytest.fixture(scope="module")
+def fix(located):
+    return result_dict(located.result)
+
+
+def without_terrain(result):
+    return replace(result, terrain=None, R_enu_icrs=None, light=None, fix=None, bodies=[])
+
+
+def ambiguous(result):
+    modes = (Mode(east_m=6000.0, north_m=-2500.0, weight=0.7), Mode(east_m=-3000.0, north_m=4000.0, weight=0.3))
+    fix = replace(result.fix, modes=modes, ambiguous=True)
+    return replace(result, status="ambiguous", reason="ambiguous", message="2 places fit the stars", fix=fix)
+
+
+def flat_frame(result):
+    exposure = replace(result.exposure, pixels_adu=np.full((1024, 1024), 300.0, dtype=np.float32))
+    return pipeline.detect(exposure, result.camera)
+
+
+def test_the_keys_are_those_of_the_format(fix):
+    assert list(fix)[:5] == ["format", "image", "status", "reason", "message"]
+    assert set(fix) == {"format", "image", "status", "reason", "message", "modes", "warnings", *KEYS}
+    for part, keys in KEYS.items():
+        assert " ".join(fix[part]) == keys
+    assert fix["format"] == "startrack.fix/1"
+    assert (fix["status"], fix["reason"]) == ("ok", None)
+    json.dumps(fix, allow_nan=False)
+
+
+def test_the_position_is_where_the_camera_was(fix, located):
+    position, truth = fix["position"], located.truth.position_enu_m
+    error = np.array([position["east_m"], position["north_m"]]) - truth[:2]
+    assert np.linalg.norm(error) < position["radius999_m"] < 200
+    assert error @ np.linalg.solve(position["covariance_m2"], error) < 20
+    assert position["up_m"] == pytest.approx(truth[2], abs=1e-6)
+    assert fix["modes"][0]["weight"] == pytest.approx(1.0, abs=0.01)
+
+
+def test_latitude_and_longitude_are_as_far_from_the_origin_as_the_position(fix):
+    position = fix["position"]
+    lat, lon, lat0, lon0 = np.radians([position["latitude_deg"], position["longitude_deg"], -89.66, 129.78])
+    a = np.sin((lat - lat0) / 2) ** 2 + np.cos(lat) * np.cos(lat0) * np.sin((lon - lon0) / 2) ** 2
+    arc_m = 2 * 1_737_400 * np.arcsin(np.sqrt(a))
+    assert arc_m == pytest.approx(np.hypot(position["east_m"], position["north_m"]), abs=0.1)
+
+
+def test_the_quaternion_is_scipys_and_turns_icrs_to_camera(fix, located):
+    R = Rotation.from_quat(fix["attitude"]["quat_xyzw_cam_icrs"])
+    error = (R * Rotation.from_matrix(located.truth.R_cam_icrs).inv()).magnitude()
+    assert error < 20 * ARCSEC
+    sigma = fix["attitude"]["sigma_arcsec"]
+    assert len(sigma) == 3
+    assert error < 5 * np.linalg.norm(sigma) * ARCSEC
+
+
+def test_body_angles_are_those_that_were_rendered(fix, located):
+    attitude = fix["attitude"]
+    angles = [attitude["heading_deg"], attitude["pitch_deg"], attitude["roll_body_deg"]]
+    np.testing.assert_allclose(angles, located.heading_pitch_roll_deg, atol=0.01)
+    # Forward and up of the body, in enu, straight from the rendered angles: SciPy's rotations, other code than ours.
+    forward, up = Rotation.from_quat(attitude["quat_xyzw_body_enu"]).inv().apply([[1, 0, 0], [0, 0, 1]])
+    heading, pitch, _ = np.radians(located.heading_pitch_roll_deg)
+    expected = [np.sin(heading) * np.cos(pitch), np.cos(heading) * np.cos(pitch), np.sin(pitch)]
+    np.testing.assert_allclose(forward, expected, atol=2e-4)
+    assert up[2] == pytest.approx(np.cos(np.radians(2.0)) * np.cos(np.radians(3.0)), abs=2e-4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_boresight_and_roll_are_astropys(seed):
+    from astropy.coordinates import SkyCoord, UnitSphericalRepresentation
+
+    R = Rotation.random(random_state=seed).as_matrix()
+    # The second point lies a little towards the image's top: -y of the camera.
+    boresight, above = (
+        SkyCoord(SkyCoord(*v, representation_type="cartesian").represent_as(UnitSphericalRepresentation))
+        for v in (R.T @ [0, 0, 1], R.T @ [0, -1e-4, 1])
+    )
+    expected = [boresight.ra.deg, boresight.dec.deg, boresight.position_angle(above).deg]
+    np.testing.assert_allclose(np.degrees(boresight_rad(R)), expected, atol=0.02)
+
+
+def test_star_counts(fix, located):
+    stars, result = fix["stars"], located.result
+    assert stars["detected"] == len(result.detections)
+    assert stars["identified"] == len(result.identification) > 500
+    assert 0 < stars["rms_px"] < 0.5
+    assert 0 <= stars["false_alarm_probability"] < 1e-9
+    # The renderer knows which stars the wall hides; the place found may turn a few of them.
+    visible = set(located.truth.sources.catalog_id[~located.truth.hidden].tolist())
+    measured = result.stars.catalog_id[result.light.star[result.light.usable]].tolist()
+    assert stars["predicted_visible"] == pytest.approx(sum(star in visible for star in measured), abs=8)
+
+
+def test_matches_are_measured_places_of_the_stars_they_name(located):
+    d = identification_dict(located.result)
+    assert d["format"] == "startrack.identification/1"
+    assert "position" not in d
+    assert "modes" not in d
+    assert d["camera"]["size_px"] == [1024, 1024]
+    truth = dict(zip(located.truth.sources.hip.tolist(), located.truth.xy_px.tolist(), strict=True))
+    error = [np.subtract((m["x_px"], m["y_px"]), truth[m["hip"]]) for m in d["matches"] if m["hip"] is not None]
+    assert len(error) > 0.99 * len(d["matches"]) > 500
+    assert np.median(np.linalg.norm(error, axis=1)) < 0.3
+
+
+def test_a_star_without_hipparcos_number_is_null(located):
+    nameless = replace(located.result.stars, hip=np.zeros(len(located.result.stars)))
+    d = identification_dict(replace(located.result, stars=nameless))
+    assert {m["hip"] for m in d["matches"]} == {None}
+
+
+def test_detections_are_brightest_first(located):
+    d = detection_dict(located.result)
+    assert d["format"] == "startrack.detection/1"
+    assert set(d["detections"][0]) == {"x_px", "y_px", "flux_e", "snr"}
+    assert len(d["detections"]) == len(located.result.detections)
+    flux = np.array([one["flux_e"] for one in d["detections"]])
+    assert flux[:50].min() > np.median(flux)
+
+
+def test_without_a_terrain_nothing_is_said_in_enu(located):
+    d = result_dict(without_terrain(located.result))
+    without = {"quat_xyzw_body_enu", "heading_deg", "pitch_deg", "roll_body_deg"}
+    assert set(d["attitude"]) == set(KEYS["attitude"].split()) - without
+    assert "position" not in d
+    assert d["stars"]["predicted_visible"] is None
+
+
+def test_an_ambiguous_result_has_modes_and_no_position(located):
+    d = result_dict(ambiguous(located.result))
+    assert (d["status"], d["reason"]) == ("ambiguous", "ambiguous")
+    assert "position" not in d
+    assert sum(mode["weight"] for mode in d["modes"]) == pytest.approx(1.0)
+
+
+def test_a_refused_result_says_why_and_what_is_known(located):
+    d = result_dict(flat_frame(located.result))
+    assert (d["status"], d["reason"]) == ("refused", "no_stars")
+    assert "flat" in d["message"]
+    assert not {"position", "modes", "attitude"} & set(d)
+    assert d["stars"]["detected"] == d["stars"]["identified"] == 0
+    assert d["stars"]["rms_px"] is d["stars"]["false_alarm_probability"] is None
+    assert d["timing_ms"]["locate"] == 0.0
+    assert d["timing_ms"]["detect"] > 0.0
+
+
+def test_provenance(located, fix):
+    assert fix["provenance"]["time_utc"] == "2030-06-01T00:00:00.000000Z"
+    assert fix["provenance"]["catalog"] == "hipparcos"
+    unknown = replace(located.result, exposure=replace(located.result.exposure, time_utc=None))
+    assert result_dict(unknown)["provenance"]["time_utc"] is None
+    assert refused_dict("night/a.png", "bad_image", "it is truncated")["image"] == "a.png"
+
+
+def test_an_unknown_time_widens_the_attitude(located, fix):
+    unknown = replace(located.result, exposure=replace(located.result.exposure, time_utc=None))
+    sigma = result_dict(unknown)["attitude"]["sigma_arcsec"]
+    np.testing.assert_allclose(sigma, np.hypot(fix["attitude"]["sigma_arcsec"], 60.0), rtol=1e-9)
+
+
+def test_sigma_says_whether_the_lens_is_in_it(located, fix):
+    assert fix["attitude"]["lens_error_included"] is False
+    assert "taken as exact" in verbose_text(located.result)
+    camera = located.result.camera
+    stated = replace(camera, covariance_order=("cx", "cy"), covariance=np.diag([0.3**2, 0.4**2]))
+    result = pipeline.identify(located.result.exposure, stated, load_catalog().brighter_than(7.0))
+    attitude = result_dict(result)["attitude"]
+    assert attitude["lens_error_included"] is True
+    assert "taken as exact" not in verbose_text(result)
+    # A centre 0.3 px aside is the camera turned by that about y, as far as 90 degrees off the axis let it be told.
+    px_arcsec = 1 / camera.focal_px[0] / ARCSEC
+    assert attitude["sigma_arcsec"][1] > 0.15 * px_arcsec > 2 * fix["attitude"]["sigma_arcsec"][1]
+
+
+def test_json_files_are_whole_and_the_same_each_time(tmp_path, fix):
+    first, second = tmp_path / "a.json", tmp_path / "deep" / "b.json"
+    write_json(first, fix)
+    write_json(second, fix)
+    assert json.loads(first.read_text(encoding="utf-8")) == fix
+    assert first.read_bytes() == second.read_bytes()
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(first, {**fix, "position": {"east_m": float("nan")}})
+    assert json.loads(first.read_text(encoding="utf-8")) == fix
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["a.json"]
+    with pytest.raises(BadInput, match="cannot be written"):
+        write_json(first / "below-a-file.json", fix)

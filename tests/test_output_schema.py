@@ -1,0 +1,132 @@
+"""The JSON schemas: real files fit them, spoiled ones do not, and they name every key."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from copy import deepcopy
+from dataclasses import replace
+
+import pytest
+from jsonschema import Draft202012Validator, ValidationError
+
+from startrack.camera.io import camera_to_dict
+from startrack.exposure import write_sidecar
+from startrack.files import data_dir
+from startrack.output import detection_dict, identification_dict, refused_dict, result_dict
+from startrack.output.schema import SCHEMAS
+from startrack.rendering import write_truth
+from startrack.types import Mode
+
+
+def fits(kind, value):
+    Draft202012Validator(SCHEMAS[kind], format_checker=Draft202012Validator.FORMAT_CHECKER).validate(value)
+
+
+def unknown_keys(value, schema, path="$"):
+    """Keys of a value that the schema does not name, at any depth."""
+    found = []
+    for one in [schema, *schema.get("anyOf", [])]:
+        if isinstance(value, dict) and "properties" in one:
+            known = one["properties"]
+            found += [f"{path}.{key}" for key in value if key not in known]
+            found += [k for key in value if key in known for k in unknown_keys(value[key], known[key], f"{path}.{key}")]
+        if isinstance(value, list) and isinstance(one.get("items"), dict):
+            found += [key for item in value for key in unknown_keys(item, one["items"], f"{path}[]")]
+    return found
+
+
+def results(result):
+    two = (Mode(east_m=1.0, north_m=2.0, weight=0.6), Mode(east_m=3.0, north_m=4.0, weight=0.4))
+    ambiguous = replace(result, status="ambiguous", reason="ambiguous", fix=replace(result.fix, modes=two))
+    refused = replace(result, status="refused", reason="inconsistent_evidence", message="no", fix=None)
+    yield from (("fix", result_dict(r)) for r in (result, ambiguous, refused))
+    yield "identification", identification_dict(replace(result, terrain=None, R_enu_icrs=None, fix=None, light=None))
+    yield "detection", detection_dict(result)
+    yield from (
+        (kind, refused_dict("a.png", "bad_image", "no", kind)) for kind in ("fix", "identification", "detection")
+    )
+
+
+@pytest.mark.parametrize("kind", SCHEMAS)
+def test_each_schema_is_one(kind):
+    Draft202012Validator.check_schema(SCHEMAS[kind])
+    assert json.loads(json.dumps(SCHEMAS[kind])) == SCHEMAS[kind]
+
+
+def test_results_fit_and_have_no_key_that_the_schema_does_not_name(located):
+    for kind, record in results(located.result):
+        fits(kind, record)
+        fits(kind, json.loads(json.dumps(record)))
+        assert unknown_keys(record, SCHEMAS[kind]) == []
+
+
+SPOILED = [
+    ("fix", lambda d: d.pop("position"), "'position' is a required property"),
+    ("fix", lambda d: d.update(status="refused", reason="no_stars"), "should not be valid|False schema"),
+    ("fix", lambda d: d.update(reason="no_stars"), "None was expected"),
+    ("fix", lambda d: d.update(status="solved"), "is not one of"),
+    ("fix", lambda d: d["position"].update(east_m=None), "is not of type 'number'"),
+    ("fix", lambda d: d["position"].update(covariance_m2=[[1.0, 0.0]]), "is too short"),
+    ("fix", lambda d: d["attitude"].update(heading_deg=360.0), "360"),
+    ("fix", lambda d: d["stars"].pop("unexplained"), "'unexplained' is a required property"),
+    ("fix", lambda d: d["provenance"].pop("image_sha256"), "'image_sha256' is a required property"),
+    ("identification", lambda d: d["matches"][0].update(hip=0), "not valid under any"),
+    ("identification", lambda d: d["camera"].pop("focal_px"), "'focal_px' is a required property"),
+    ("detection", lambda d: d["detections"][0].pop("snr"), "'snr' is a required property"),
+    ("detection", lambda d: d.update(format="startrack.fix/1"), "was expected"),
+]
+
+
+@pytest.mark.parametrize(("kind", "spoil", "message"), SPOILED)
+def test_a_spoiled_result_does_not_fit(located, kind, spoil, message):
+    make = {"fix": result_dict, "identification": identification_dict, "detection": detection_dict}[kind]
+    record = deepcopy(make(located.result))
+    fits(kind, record)
+    spoil(record)
+    with pytest.raises(ValidationError, match=message):
+        fits(kind, record)
+
+
+def test_no_position_where_several_places_fit(located):
+    records = [record for kind, record in results(located.result) if kind == "fix" and "position" not in record]
+    for record in records:
+        with pytest.raises(ValidationError):
+            fits("fix", {**record, "position": result_dict(located.result)["position"]})
+    assert {record["status"] for record in records} == {"ambiguous", "refused"}
+
+
+def test_shipped_cameras_and_terrains_fit():
+    for kind, folder in (("camera", "calib"), ("terrain", "terrain")):
+        files = sorted(data_dir(folder).glob("*.toml"))
+        assert files
+        for path in files:
+            value = tomllib.loads(path.read_text(encoding="utf-8"))
+            fits(kind, value)
+            assert unknown_keys(value, SCHEMAS[kind]) == []
+
+
+def test_written_cameras_sidecars_and_truths_fit(located, tmp_path):
+    fits("camera", camera_to_dict(located.result.camera))
+    sidecar = write_sidecar(tmp_path / "a.png", located.result.exposure)
+    fits("sidecar", json.loads(sidecar.read_text(encoding="utf-8")))
+    pose, _ = write_truth(tmp_path / "a.png", located.truth, {"seed": 7}, to_v_mag=5.0)
+    fits("truth", json.loads(pose.read_text(encoding="utf-8")))
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        ("camera", "size_px = [2048, 2048]\nfocal_px = [652.0, 0.0]\ncentre_px = [1, 1]\nmax_angle_deg = 92"),
+        ("camera", "size_px = [2048, 2048]\nfocal_px = [652, 652]\ncentre_px = [1, 1]\nmax_angle_deg = 92\nk = 'none'"),
+        (
+            "terrain",
+            "body = 'mars'\n[origin]\nlatitude_deg = 1\nlongitude_deg = 2\n[cylinder]\ndiameter_m=1\ndepth_m=1",
+        ),
+        ("terrain", "body = 'moon'\n[origin]\nlatitude_deg = 1\nlongitude_deg = 2"),
+        ("sidecar", "exposure_s = -1"),
+    ],
+)
+def test_wrong_files_do_not_fit(kind, text):
+    with pytest.raises(ValidationError):
+        fits(kind, tomllib.loads(text))

@@ -1,0 +1,81 @@
+"""Results in words."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import pytest
+
+from startrack import pipeline
+from startrack.output import refusal_line, summary_line, verbose_text
+from startrack.output.text import chance_text
+from startrack.types import Mode
+
+
+def test_one_line_for_a_fix(located):
+    line = summary_line(located.result, seconds=3.14)
+    found = re.fullmatch(
+        r"small  ok  E (-?\d+\.\d) m  N (-?\d+\.\d) m  ±(\d+\.\d) m \(95 %\)  heading (\d+\.\d)°  (\d+) stars  3\.1 s",
+        line,
+    )
+    assert found is not None, line
+    east, north, radius, heading, stars = map(float, found.groups())
+    assert east == pytest.approx(located.truth.position_enu_m[0], abs=3 * radius)
+    assert north == pytest.approx(located.truth.position_enu_m[1], abs=3 * radius)
+    assert heading == pytest.approx(30.0, abs=0.11)
+    assert stars == len(located.result.identification)
+
+
+def test_without_a_time_of_its_own_the_stages_are_added_up(located):
+    seconds = sum(located.result.timing_ms.values()) / 1e3
+    assert summary_line(located.result).endswith(f"  {seconds:.1f} s")
+
+
+def test_other_results(located):
+    result = located.result
+    two = (Mode(east_m=6000.0, north_m=-2500.0, weight=0.7), Mode(east_m=-3000.4, north_m=4000.0, weight=0.3))
+    ambiguous = replace(result, status="ambiguous", fix=replace(result.fix, modes=two, ambiguous=True))
+    assert "ambiguous  2 places fit: E 6000 m N -2500 m (70 %); E -3000 m N 4000 m (30 %)" in summary_line(ambiguous)
+    assert "±" not in summary_line(ambiguous)
+    identified = replace(result, terrain=None, R_enu_icrs=None, light=None, fix=None)
+    assert re.search(
+        r"small  ok  RA \d+\.\d{3}°  Dec [+-]\d+\.\d{3}°  roll \d+\.\d{3}°  \d+ stars", summary_line(identified)
+    )
+    detected = pipeline.Result(exposure=result.exposure, detections=result.detections, status="ok")
+    assert summary_line(detected, seconds=0.2) == f"small  ok  {len(result.detections)} point sources  0.2 s"
+
+
+def test_refusals_are_one_line_with_reason_and_message(located):
+    refused = replace(located.result, status="refused", reason="no_stars", message="the frame\nis flat")
+    assert summary_line(refused, seconds=1.0) == "small  refused  no_stars: the frame is flat"
+    assert refusal_line("night/b.png", "bad_image", "it is truncated") == "b.png  refused  bad_image: it is truncated"
+
+
+def test_a_heading_of_nearly_a_turn_is_nought(located):
+    from startrack.output.text import _degrees
+
+    assert _degrees(6.2831853, 1) == "0.0"
+    assert _degrees(1.0, 3) == "57.296"
+
+
+def test_more_lines_for_those_who_ask(located):
+    text = verbose_text(located.result)
+    assert all(line.startswith("  ") for line in text.splitlines())
+    for part in ("position   E ", "latitude -89.", "error      sigma", "boresight  RA", "heading ", "identified"):
+        assert part in text
+    angles = re.search(r"heading (\S+)°, pitch (\S+)°, roll (\S+)°", text)
+    assert angles is not None
+    assert [float(angle) for angle in angles.groups()] == pytest.approx(located.heading_pitch_roll_deg, abs=0.01)
+    assert "2030-06-01T00:00:00" in text
+    assert "locate" in text.splitlines()[-1]
+    warned = replace(
+        located.result, exposure=replace(located.result.exposure, warnings=("EXIF turned",), time_utc=None)
+    )
+    assert "EXIF turned" in verbose_text(warned)
+    assert "not known" in verbose_text(warned)
+
+
+def test_probabilities_too_small_for_a_float():
+    assert chance_text(2.17e-12) == "2e-12"
+    assert chance_text(1e-300) == chance_text(0.0) == "below 1e-100"  # how tiny, no model knows

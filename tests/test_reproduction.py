@@ -1,0 +1,345 @@
+"""The thesis's simulator, its methods and ours in it: statistics, figures, and runs that can be stopped."""
+
+import io
+import json
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import stats
+
+from startrack.cli import reproduce as cli
+from startrack.cli.main import main
+from startrack.localization import ExactPosterior, Hull, PseudoGradient
+from startrack.reproduction import ARTEFACTS, FULL, QUICK, Context, Runs, Size, published, runs, written
+from startrack.reproduction.bound import cell_centroid
+from startrack.reproduction.methods import KUA, OURS, Task, done, tasks
+from startrack.reproduction.simulator import (
+    PERFECT,
+    Mistakes,
+    Sky,
+    crater,
+    crater_edge,
+    directions,
+    places,
+    star_count,
+    visible,
+)
+from startrack.reproduction.traverse import changes_m, gaps_m, mean_gap_m, stepped_m
+
+SMALL = Size(
+    "small", skies=10, per_sky=300, ours_per_sky=10, cell_per_sky=10, deep_per_sky=3, one_sky=500, ours_one_sky=150,
+    sweep_skies=1, sweep_per_sky=4, traverses=10,
+)  # fmt: skip
+TINY = replace(SMALL, skies=3, per_sky=8, ours_per_sky=4, cell_per_sky=4, deep_per_sky=1, one_sky=8, ours_one_sky=4)
+
+
+@contextmanager
+def silent(what, total):
+    yield lambda steps: None
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Every table and figure of a small run, with its files."""
+    out = tmp_path_factory.mktemp("reproduced")
+    with Runs(out, jobs=1, progress=silent) as some:
+        pieces = {name: make(Context(SMALL, 0, some)) for name, make in ARTEFACTS.items()}
+    return {name: (piece, written(piece, out, plots=True)) for name, piece in pieces.items()}
+
+
+# The simulator
+
+
+def test_star_counts_are_liebes():
+    assert star_count(6.0) == published.STAR_COUNT == 2142
+    assert star_count(2.0) == 28
+
+
+def test_stars_are_uniform_on_the_hemisphere_and_places_on_the_floor():
+    sky = Sky.drawn(3, 0, 8.0)
+    assert stats.kstest(np.sin(sky.elevation_rad), "uniform").pvalue > 0.01
+    assert stats.kstest(sky.azimuth_rad / (2 * np.pi), "uniform").pvalue > 0.01
+    spots = places(3, 0, 0, 5000)
+    assert stats.kstest(np.sum(spots**2, axis=1) / 1e8, "uniform").pvalue > 0.01
+    assert stats.kstest(np.arctan2(*spots.T) / (2 * np.pi) + 0.5, "uniform").pvalue > 0.01
+
+
+def test_smaller_runs_are_the_beginning_of_larger_ones():
+    small, large = Sky.drawn(0, 4, 5.0), Sky.drawn(0, 4, 7.0)
+    np.testing.assert_array_equal(small.elevation_rad, large.elevation_rad[: len(small)])
+    np.testing.assert_array_equal(places(0, 4, 10, 20), places(0, 4, 0, 500)[10:20])
+    whole = done(Task(KUA, 0, 1, 0, 12))
+    parts = [done(Task(KUA, 0, 1, start, start + 6)) for start in (0, 6)]
+    np.testing.assert_array_equal(whole["refined_m"], np.concatenate([part["refined_m"] for part in parts]))
+    assert sum(map(len, tasks(OURS, 0, 0, 250))) == 250
+
+
+def test_stars_in_sight_are_those_above_the_horizon_and_inside_the_drawn_edge():
+    from matplotlib.path import Path as Polygon
+
+    from startrack.reproduction.plots import fisheye
+
+    sky, cylinder = Sky.drawn(0, 0), crater()
+    for place in places(0, 0, 0, 10):
+        seen = visible(sky.on_rim_plane(cylinder), place, cylinder.radius_m)
+        horizon = cylinder.horizon_rad(np.tile(place, (len(sky), 1)), sky.azimuth_rad)
+        np.testing.assert_array_equal(seen, sky.elevation_rad > horizon)
+        polygon = Polygon(fisheye(*crater_edge(cylinder, place)))
+        inside = polygon.contains_points(fisheye(sky.azimuth_rad, sky.elevation_rad))
+        assert np.sum(inside != seen) <= 2  # a polygon of 360 points is not quite the circle
+
+
+def test_lists_are_as_wrong_as_they_say():
+    in_sight = np.repeat([True, False], 20_000)
+    listed = Mistakes(missed=0.1, false=0.02).listed(in_sight, 0, 0, 0)
+    assert np.mean(~listed[in_sight]) == pytest.approx(0.1, abs=0.008)
+    assert np.mean(listed[~in_sight]) == pytest.approx(0.02, abs=0.004)
+    sky = Sky.drawn(0, 0, 3.0)
+    llr = Mistakes(missed=0.1, false=0.02).evidence(sky, np.arange(len(sky)) < 5).llr
+    assert llr[0] == pytest.approx(np.log(45)) and llr[-1] == pytest.approx(np.log(0.1 / 0.98))
+
+
+@pytest.mark.parametrize("size", [1.0, 0.02, 40.0])  # as wide as the first grid, below its step, beyond its window
+def test_the_middle_of_a_cell_with_straight_walls(size):
+    """Circles of huge radius are straight lines: the cell is the rectangle -7 < x < 5, -2 < y < 3, times the size."""
+    radius = 1e8
+    normals = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    walls = size * np.array([5.0, 7.0, 3.0, 2.0])
+    points = normals * (radius - walls)[:, None]
+    found = cell_centroid(points, size * np.array([4.0, -1.5]), radius)
+    np.testing.assert_allclose(found, size * np.array([-1.0, 0.5]), atol=0.04 * size)
+
+
+# The methods
+
+
+def test_the_localizers_give_what_the_table_is_made_of():
+    task = Task(KUA, 0, 2, 0, 5)
+    chunk, sky, cylinder = done(task), Sky.drawn(0, 2), crater()
+    for k, place in enumerate(places(0, 2, 0, 5)):
+        evidence = PERFECT.evidence(sky, visible(sky.on_rim_plane(cylinder), place, cylinder.radius_m))
+        hull, refined = Hull()(evidence, cylinder), PseudoGradient()(evidence, cylinder)
+        np.testing.assert_allclose(hull.position_enu_m[:2], chunk["hull_m"][k], atol=1e-6)
+        np.testing.assert_allclose(refined.position_enu_m[:2], chunk["refined_m"][k], atol=1e-6)
+
+
+def test_table_3_1_is_within_the_bars(made):
+    values = made["table3.1"][0].values
+    assert 30 <= values["reproduced"]["descent"]["mean_m"] <= 38  # thesis 34.2
+    assert 25 <= values["reproduced"]["descent"]["sd_m"] <= 36  # 31.1
+    assert 0.003 <= values["reproduced"]["never_settle"] <= 0.012  # 0.006
+    assert 600 <= values["reproduced"]["hull"]["mean_m"] <= 700  # 637
+    assert values["ours"]["over_limit"] <= 1.03
+    assert values["ours"]["same_lists"]["refused"] == values["ours"]["magnitude_8"]["refused"] == 0
+    assert values["ours"]["magnitude_8"]["mean_m"] <= 4.0
+
+
+def test_ours_is_the_middle_of_the_exact_cell():
+    sky, cylinder = Sky.drawn(0, 1), crater()
+    points, off = sky.on_rim_plane(cylinder), []
+    for place in places(0, 1, 0, 10):
+        evidence = PERFECT.evidence(sky, visible(points, place, cylinder.radius_m))
+        fix = ExactPosterior()(evidence, cylinder)
+        off.append(np.hypot(*(fix.position_enu_m[:2] - cell_centroid(points, place, cylinder.radius_m))))
+    assert np.median(off) < 0.3
+
+
+def test_skyline_is_better_near_the_centre_and_stars_near_the_wall(made):
+    piece = made["fig3.10"][0]
+    columns = {column.name: [float(v) for v in column.values] for column in piece.columns}
+    assert columns["hull_mean"][-1] > 2 * columns["hull_mean"][0]
+    assert columns["descent_mean"][0] > 2 * columns["descent_mean"][-1]
+    assert piece.values["ours"]["mean_m"] < 0.8 * piece.values["reproduced"]["mean_m"]
+
+
+def test_the_published_trials_average_to_the_published_overall():
+    assert np.mean([trial.mean_m for trial in published.TRIALS]) == pytest.approx(published.OVERALL.mean_m, abs=0.05)
+    assert max(trial.max_m for trial in published.TRIALS) == published.OVERALL.max_m
+
+
+# The traverse
+
+
+def test_changes_along_the_traverse_are_where_the_view_changes():
+    sky, cylinder = Sky.drawn(0, 0, 4.0), crater()
+    points, changes = sky.on_rim_plane(cylinder), changes_m(sky, cylinder)
+    ends = np.concatenate([[-9999.9], (changes[1:] + changes[:-1]) / 2, [9999.9]])
+    views = [visible(points, np.array([east, 0.0]), cylinder.radius_m) for east in ends]
+    assert [int(np.sum(a != b)) for a, b in pairwise(views)] == [1] * len(changes)
+
+
+def test_distances_between_changes_are_the_thesis_s():
+    found = []
+    for number in range(20):
+        noticed = stepped_m(changes_m(Sky.drawn(0, number), crater()), crater())
+        found.append((mean_gap_m(noticed, crater()), gaps_m(noticed, crater()).max()))
+    mean, largest = np.array(found).T
+    assert abs(mean.mean() - published.MEAN_GAP_M) < 3 * mean.std() and mean.std() < 0.4
+    assert largest.min() < published.MAX_GAP_M < largest.max()
+
+
+# Files
+
+
+@pytest.mark.parametrize("name", cli.NAMES)
+def test_each_table_and_figure_is_written(made, name):
+    piece, files = made[name]
+    pictures = [path for path in files if path.suffix == ".png"]
+    assert len(pictures) == {"table3.1": 0, "figB": 10, "fig3.10": 2}.get(name, 1)
+    for path in pictures:
+        with Image.open(path) as picture:
+            picture.load()
+            assert picture.format == "PNG" and min(picture.size) >= 400
+            assert len(picture.getcolors()) > 8  # something is drawn
+        assert path.stat().st_size < 200_000
+    text = files[-1].read_text(encoding="utf-8")
+    assert text.startswith(f"## {piece.title}") and all(path.name in text for path in pictures)
+    json.dumps(piece.values)
+    if name not in {"fig3.3", "fig3.5", "fig3.6", "magnitude", "aspect"}:  # no number of the thesis belongs to these
+        assert "thesis" in text and piece.values["thesis"]
+
+
+def test_tables_are_read_by_astropy(made):
+    from astropy import units
+    from astropy.table import QTable
+
+    tables = {p.name: QTable.read(p) for _, files in made.values() for p in files if p.suffix == ".ecsv"}
+    assert set(tables) >= {"table3.1.ecsv", "fig3.7.ecsv", "fig3.9.ecsv", "magnitude.ecsv", "figA.2.ecsv"}
+    assert len(tables["table3.1.ecsv"]) == 10
+    thesis = tables["table3.1.ecsv"]["thesis_mean"]
+    assert thesis.mean().to_value(units.km) == pytest.approx(0.0342, abs=1e-4)
+
+
+def test_names_of_the_command_are_those_that_can_be_made():
+    assert tuple(ARTEFACTS) == cli.NAMES
+    assert FULL.skies * FULL.per_sky == FULL.one_sky == 100_000  # as in the thesis
+    assert QUICK.per_sky < FULL.per_sky
+    fewer = FULL.with_ours(700)
+    assert (fewer.per_sky, fewer.one_sky) == (FULL.per_sky, FULL.one_sky)
+    assert (fewer.ours_per_sky, fewer.cell_per_sky, fewer.deep_per_sky, fewer.ours_one_sky) == (700, 700, 500, 7000)
+
+
+# Runs
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file()}
+
+
+def test_any_number_of_workers_gives_the_same_bytes(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("startrack.reproduction.QUICK", TINY)
+    for jobs in ("1", "2"):
+        assert main(["reproduce", "table3.1", "figB", "-j", jobs, "-D", str(tmp_path / jobs), "-v"]) == 0
+    one, two = contents(tmp_path / "1"), contents(tmp_path / "2")
+    assert one == two
+    assert set(one) == {"table3.1.md", "table3.1.ecsv", "figB.md", "figB.1.png", "figB.2.png", "figB.3.png"}
+    assert capsys.readouterr().out.count("table3.1: pseudo-gradient") == 2
+
+
+def test_a_cluster_gives_the_same_bytes(tmp_path, monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr("startrack.reproduction.QUICK", TINY)
+    with distributed.LocalCluster(1, processes=False, threads_per_worker=1, dashboard_address=None) as cluster:
+        address = cluster.scheduler_address
+        assert main(["reproduce", "table3.1", "--cluster", address, "-D", str(tmp_path / "c"), "-v"]) == 0
+    assert main(["reproduce", "table3.1", "-j", "1", "-D", str(tmp_path / "1"), "-v"]) == 0
+    assert contents(tmp_path / "c") == contents(tmp_path / "1")
+
+
+def test_a_cluster_that_does_not_answer_is_named(tmp_path, capsys, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(runs, "CONNECT_S", 0.5)
+    assert main(["reproduce", "fig3.4", "--cluster", "tcp://127.0.0.1:9", "-D", str(tmp_path)]) == 4
+    assert "127.0.0.1:9" in capsys.readouterr().err
+
+
+def test_a_stopped_run_goes_on_from_where_it_was(tmp_path, monkeypatch):
+    wanted = [task for sky in range(4) for task in tasks(KUA, 0, sky, 3)]
+    computed = []
+
+    def stopping(task):
+        if len(computed) == 2:
+            raise KeyboardInterrupt
+        computed.append(task)
+        return done(task)
+
+    monkeypatch.setattr(runs, "done", stopping)
+    with Runs(tmp_path, jobs=1, progress=silent) as some, pytest.raises(KeyboardInterrupt):
+        list(some.chunks("stopped", wanted))
+    assert len(list((tmp_path / runs.FOLDER).iterdir())) == 2  # whole chunks only, no temporary files
+    computed.clear()
+    monkeypatch.setattr(runs, "done", lambda task: computed.append(task) or done(task))
+    with Runs(tmp_path, jobs=1, progress=silent) as some:
+        chunks = list(some.chunks("resumed", wanted))
+        assert computed == wanted[2:]
+        assert len(list(some.chunks("again", wanted))) == 4 and computed == wanted[2:]
+    for task, chunk in zip(wanted, chunks, strict=True):
+        np.testing.assert_array_equal(chunk["refined_m"], done(task)["refined_m"])
+
+
+def test_chunks_of_other_settings_are_not_taken(tmp_path, monkeypatch):
+    one = Task(KUA, 0, 0, 0, 3)
+    others = [replace(one, seed=1), replace(one, stop=4), replace(one, aspect_ratio=5.0), replace(one, method=OURS),
+              replace(one, mistakes=Mistakes(0.1, 0.1))]  # fmt: skip
+    keys = {runs._key(task) for task in [one, *others]}
+    monkeypatch.setattr(runs, "__version__", "another")
+    assert len(keys | {runs._key(one)}) == len(others) + 2
+
+
+# The command
+
+
+def test_json_has_one_object_for_each(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("startrack.reproduction.QUICK", TINY)
+    argv = ["reproduce", "fig3.8", "fig3.4", "--json", "--no-plots", "-j", "1", "-D", str(tmp_path), "--seed", "5"]
+    assert main(argv) == 0
+    records = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [record["name"] for record in records] == ["fig3.4", "fig3.8"]  # the thesis's order
+    for record in records:
+        assert record["format"] == "startrack.reproduction/1" and record["seed"] == 5
+        assert record["thesis"] and record["reproduced"] and not any(f.endswith(".png") for f in record["files"])
+    assert not list(tmp_path.glob("*.png"))
+
+
+def test_usage(tmp_path, monkeypatch, capsys):
+    def code(*argv):
+        with pytest.raises(SystemExit) as stop:
+            main(["reproduce", *argv, "-D", str(tmp_path)])
+        return stop.value.code
+
+    assert code("fig9.9") == 2 and "fig3.10" in capsys.readouterr().err
+    assert code("--quick", "--full") == 2
+    assert code("-j", "0") == 2
+    monkeypatch.setattr(cli, "find_spec", lambda name: None)
+    assert code("fig3.4") == 2
+    message = capsys.readouterr().err
+    assert "startrack[plots]" in message and "--no-plots" in message
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_that_cannot_be_written_is_named_at_once(tmp_path, capsys):
+    (tmp_path / "file").write_text("in the way")
+    assert main(["reproduce", "-D", str(tmp_path / "file"), "--full"]) == 4
+    assert str(tmp_path / "file") in capsys.readouterr().err
+
+
+def test_a_progress_bar_on_a_terminal_only(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    shown = {}
+    for kind in (io.StringIO, Terminal):
+        monkeypatch.setattr("sys.stderr", kind())
+        with cli._progress("fixes", 10) as advance:
+            advance(10)
+        shown[kind] = cli.sys.stderr.getvalue()
+    assert shown[io.StringIO] == "" and "fixes" in shown[Terminal]
+
+
+def test_directions_are_from_north_through_east():
+    np.testing.assert_allclose(directions(np.radians([0.0, 90.0])), [[0, 1], [1, 0]], atol=1e-12)

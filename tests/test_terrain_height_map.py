@@ -1,0 +1,306 @@
+"""Height maps: horizons against another program's and against a march in small steps, cache, files, errors, places."""
+
+from __future__ import annotations
+
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from startrack.errors import NotLocated
+from startrack.frames import Site, enu_from_latlon, latlon_from_enu
+from startrack.localization import ExactPosterior
+from startrack.localization.horizon_bias import common_error, raised
+from startrack.terrain import load_terrain
+from startrack.terrain import table_cache as cache
+from startrack.terrain.height_map import HeightMap
+from startrack.terrain.masks import silent_sectors, why_silent
+from startrack.terrain.projection import (
+    EQUIRECTANGULAR,
+    ORTHOGRAPHIC,
+    STEREOGRAPHIC,
+    Projection,
+    polar_stereographic,
+)
+from startrack.terrain.pyramid import ground_up_m
+from startrack.terrain.raster import Raster
+from startrack.types import Evidence
+
+DATA = Path(__file__).parent / "data"
+ARCMIN = np.radians(1 / 60)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _own_cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def shackleton() -> HeightMap:
+    terrain = load_terrain("shackleton")
+    assert isinstance(terrain, HeightMap)
+    return replace(terrain, search_radius_m=500.0, _state={})
+
+
+def test_horizon_from_the_floor_is_that_of_another_program():
+    """lunahorizon traced finer maps (5 to 240 m): the 240 m map clips the crest by some hundredths of a degree."""
+    reference = np.genfromtxt(DATA / "shackleton_floor_horizon.csv", delimiter=",", names=True)
+    terrain = replace(load_terrain("shackleton"), camera_height_m=2.0, _state={})
+    place = enu_from_latlon(terrain.site, np.radians(-89.67), np.radians(129.78))[:2]
+    found = np.degrees(terrain.horizon_rad(place, np.radians(reference["azimuth_deg"])))
+    off = found - reference["elevation_deg"]
+    assert abs(off.mean()) < 0.1
+    assert off.std() < 0.03
+    turned = found[::-1] - reference["elevation_deg"]
+    assert turned.std() > 0.3  # a mirrored map would be noticed
+
+
+def marched_rad(terrain: HeightMap, place: np.ndarray, azimuth: float, step_m: float, end_m: float) -> float:
+    """The horizon by small steps, with the numpy surface of `ground_up_m`."""
+    s = np.concatenate([np.arange(step_m / 16, 400.0, step_m / 16), np.arange(400.0, end_m, step_m)])
+    points = place + s[:, None] * np.array([np.sin(azimuth), np.cos(azimuth)])
+    z = ground_up_m(terrain.site, list(terrain.maps), points)
+    eye = ground_up_m(terrain.site, list(terrain.maps), place[None])[0] + terrain.camera_height_m
+    return float(np.arctan(np.max((z - eye) / s)))
+
+
+@pytest.mark.parametrize("name", ["shackleton", "kepler"])
+@pytest.mark.parametrize("compiled", [True, False])
+def test_horizons_are_those_of_small_steps(name, compiled):
+    terrain = replace(load_terrain(name), use_compiled=compiled, _state={})
+    rng = np.random.default_rng(1)
+    places, azimuths = rng.uniform(-6000, 6000, (25, 2)), rng.uniform(0, 2 * np.pi, 25)
+    found = terrain.horizon_rad(places, azimuths)
+    slow = [marched_rad(terrain, p, a, 4.0, 30_000.0) for p, a in zip(places, azimuths, strict=True)]
+    off = np.degrees(found - slow)
+    assert np.sqrt(np.mean(off**2)) < 0.002
+    assert off.min() > -0.002  # small steps can only miss the top
+
+
+def test_the_table_changes_no_horizon(shackleton):
+    rng = np.random.default_rng(2)
+    places, azimuths = rng.uniform(-500, 500, (300, 2)), rng.uniform(0, 2 * np.pi, 300)
+    before = replace(shackleton, _state={}).horizon_rad(places, azimuths)
+    shackleton.prepared()
+    assert np.abs(shackleton.horizon_rad(places, azimuths) - before).max() < np.radians(0.001)
+
+
+def test_far_crests_are_found_with_the_table_too():
+    """From Haworth's wall the horizon in the south stands 50 to 60 km off."""
+    terrain = load_terrain("haworth")
+    latitude, longitude = latlon_from_enu(terrain.site, 7082.0, 12_306.0, 0.0)
+    site = Site("moon", float(latitude), float(longitude))
+    azimuths = np.radians(np.arange(150.5, 220))
+    for compiled in (True, False):
+        there = replace(terrain, site=site, search_radius_m=90.0, use_compiled=compiled, _state={})
+        before, distance, _ = there.horizons(np.zeros(2), azimuths)
+        assert distance.max() > 50_000
+        there.prepared()
+        assert np.abs(there.horizons(np.zeros(2), azimuths)[0] - before).max() < 1e-5
+
+
+def test_tracing_without_numba_agrees_and_its_bounds_hold(shackleton):
+    plain = replace(shackleton, use_compiled=False, search_radius_m=150.0, _state={})
+    rng = np.random.default_rng(3)
+    for half, turn in ((60.0, np.radians(0.75)), (10.0, 0.0), (1.0, 0.0)):
+        centres, azimuths = rng.uniform(-100, 100, (20, 2)), rng.uniform(0, 2 * np.pi, 20)
+        low, high = plain.horizon_bounds_rad(centres, np.array(half), azimuths, turn)
+        places = centres[:, None] + rng.uniform(-half, half, (20, 30, 2))
+        turned = azimuths[:, None] + rng.uniform(-turn, turn, (20, 30))
+        horizon = shackleton.horizon_rad(places, turned)
+        assert np.abs(plain.horizon_rad(places, turned) - horizon).max() < 0.02 * ARCMIN
+        ok = plain.allowed(places)
+        assert np.all((low[:, None] - 1e-6 <= horizon) | ~ok)
+        assert np.all((horizon <= high[:, None] + 1e-6) | ~ok)
+        assert np.median(high - low) < np.radians(0.02 * half + 0.3 * (turn > 0))
+
+
+def test_the_table_is_kept_and_found_again_by_content(shackleton):
+    table = shackleton.prepared()
+    path = cache.path_of(cache.key_of(shackleton))
+    assert path.is_file()
+    assert [p for p in path.parent.iterdir() if p.name.startswith(".")] == []
+    again = replace(shackleton, _state={})
+    assert np.array_equal(again.prepared().values, table.values)
+    higher = replace(shackleton, camera_height_m=3.0, _state={})
+    assert cache.key_of(higher) != cache.key_of(shackleton)
+    first = shackleton.maps[0]
+    other = replace(first, heights_m=first.heights_m + np.float32(0.5))
+    assert cache.key_of(replace(shackleton, maps=(other, *shackleton.maps[1:]), _state={})) != cache.key_of(shackleton)
+    path.write_bytes(path.read_bytes()[:1000])
+    assert cache.loaded(cache.key_of(shackleton), shackleton.square) is None  # a damaged table is made again
+    cache.save(cache.key_of(shackleton), table)
+
+
+def test_of_two_that_need_a_table_one_makes_it(shackleton, monkeypatch):
+    """Each stands for a process: locks are of open files, not of processes."""
+    made, build = [], HeightMap._built
+
+    def slow(terrain, progress):
+        made.append(threading.get_ident())
+        time.sleep(0.3)
+        return build(terrain, progress)
+
+    monkeypatch.setattr(HeightMap, "_built", slow)
+    terrains = [replace(shackleton, camera_height_m=1.75, search_radius_m=150.0, _state={}) for _ in range(3)]
+    path = cache.path_of(cache.key_of(terrains[0]))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.with_suffix(".lock").touch()  # left by a process that was killed: nobody holds it
+    with ThreadPoolExecutor(3) as pool:
+        tables = list(pool.map(lambda terrain: terrain.prepared(), terrains))
+    assert len(made) == 1
+    assert all(np.array_equal(table.values, tables[0].values) for table in tables)
+    assert [p.suffix for p in path.parent.iterdir() if p.stem == path.stem] == [".npz"]
+
+
+def test_a_copy_with_other_settings_takes_no_table_over(shackleton):
+    table = shackleton.prepared()
+    higher = replace(shackleton, camera_height_m=30.0, search_radius_m=200.0)  # shares what the first one remembers
+    assert higher.prepared().square.reach_m < table.square.reach_m
+    assert shackleton.prepared().square == table.square
+
+
+def evidence_at(terrain, place, rng, error_rad=0.0, rays=4000) -> Evidence:
+    """Rays near the skyline of a place, each sure of itself but for one in a hundred."""
+    azimuth = rng.uniform(0, 2 * np.pi, rays)
+    horizon = terrain.horizon_rad(np.asarray(place)[None], azimuth) + error_rad
+    elevation = horizon + rng.uniform(-0.1, 0.1, rays)
+    llr = np.where((elevation > horizon) ^ (rng.random(rays) < 0.01), 4.0, -4.0)
+    return Evidence(azimuth_rad=azimuth, elevation_rad=elevation, llr=llr, edge_sigma_rad=np.full(rays, 1e-5))
+
+
+def test_a_place_is_found_within_its_stated_error(shackleton):
+    exact = replace(shackleton, height_sigma_m=0.0, horizon_sigma_common_rad=0.0)
+    rng, nees = np.random.default_rng(4), []
+    for _ in range(4):
+        place = rng.uniform(-300, 300, 2)
+        fix = ExactPosterior()(evidence_at(exact, place, rng), exact)
+        off = fix.position_enu_m[:2] - place
+        assert np.hypot(*off) < fix.radius999_m < 25.0
+        nees.append(off @ np.linalg.solve(fix.covariance_m2, off))
+        assert fix.position_enu_m[2] == pytest.approx(exact.ground_m(fix.position_enu_m[None, :2])[0] + 1.5)
+    assert 0.3 < np.mean(nees) < 5
+
+
+def test_a_common_error_is_estimated_with_the_place_and_widens_its_covariance(shackleton):
+    rng, place, error = np.random.default_rng(5), np.array([420.0, -130.0]), np.radians(0.08)
+    evidence = evidence_at(shackleton, place, rng, error)
+    unknown = replace(shackleton, height_sigma_m=0.0, horizon_sigma_common_rad=np.radians(0.1))
+    known = replace(unknown, horizon_sigma_common_rad=0.0)
+    found = common_error(evidence, unknown, place + np.array([30.0, -20.0]))
+    assert found.error_rad == pytest.approx(error, abs=4 * found.sigma_rad)
+    assert found.sigma_rad < np.radians(0.01)
+    fix = ExactPosterior()(evidence, unknown)
+    assert np.hypot(*(fix.position_enu_m[:2] - place)) < fix.radius999_m
+    told = ExactPosterior()(raised(evidence, error), known)
+    assert np.trace(fix.covariance_m2) > np.trace(told.covariance_m2)
+
+
+def test_sigma_follows_from_posts_and_distance(shackleton):
+    sigma = replace(shackleton, height_sigma_m=5.0).horizon_sigma_rad(np.zeros((1, 2)), np.array([0.5]))
+    horizon = shackleton.horizon_rad(np.zeros((1, 2)), np.array([0.5]))
+    assert sigma[0] == pytest.approx(5.0 * np.cos(horizon[0]) ** 2 / 10_000, rel=0.1)  # the crest is some 10 km off
+
+
+def test_rays_that_run_off_the_map_give_no_evidence(shackleton):
+    inner = shackleton.maps[0].around(shackleton.site.latitude_rad, shackleton.site.longitude_rad, 4000.0)
+    small = replace(shackleton, maps=(inner,), search_radius_m=300.0, _state={})
+    azimuth = np.radians(np.arange(0, 360, 5.0))
+    assert not small.tells(azimuth, small.horizon_rad(np.zeros(2), azimuth)).any()
+    assert small.tells(azimuth, np.full(len(azimuth), np.radians(80.0))).all()
+    assert shackleton.tells(azimuth, np.zeros(len(azimuth))).all()
+    low = small.horizon_rad(np.zeros(2), azimuth)
+    assert set(why_silent(small, azimuth, low)) == {"ground off the map"}
+    assert set(why_silent(small, azimuth, np.full(len(azimuth), np.radians(80.0)))) == {""}
+    (line,) = silent_sectors(small)
+    assert line.startswith("azimuths 0 to 360 degrees: the maps end")
+    assert silent_sectors(shackleton) == []
+    blind = evidence_at(small, np.zeros(2), np.random.default_rng(6), -0.2)
+    with pytest.raises(NotLocated):
+        ExactPosterior()(blind, small)
+
+
+def test_glare_takes_the_evidence_of_its_azimuths(shackleton):
+    lit = replace(shackleton, glare_rad=((np.radians(350), np.radians(20)),))
+    told = lit.tells(np.radians([349.0, 351.0, 0.0, 19.0, 21.0, 180.0]), np.full(6, 0.5))
+    assert told.tolist() == [True, False, False, False, True, True]
+    why = why_silent(lit, np.radians([349.0, 351.0]), np.full(2, 0.5))
+    assert why.tolist() == ["", "glare of a lit rim"]
+    (line,) = silent_sectors(lit)
+    assert line.startswith("azimuths 350 to 20 degrees: no evidence")
+
+
+def test_azimuths_where_the_maps_end_are_told_as_ranges(shackleton):
+    """A map that ends close by in the east and far off elsewhere."""
+    whole = shackleton.maps[0].around(shackleton.site.latitude_rad, shackleton.site.longitude_rad, 30_000.0)
+    azimuth = np.radians(np.arange(0.5, 360))
+    place = np.zeros(2)
+    for columns in (slice(0, whole.heights_m.shape[1] // 2 + 20), slice(None)):
+        cut = replace(shackleton, maps=(whole.cut(slice(None), columns),), search_radius_m=200.0, _state={})
+        silent = ~cut.tells(azimuth, cut.horizon_rad(place, azimuth))
+        lines = silent_sectors(cut)
+        assert bool(lines) == bool(silent.any())
+        said = np.zeros(360, dtype=bool)
+        for line in lines:
+            first, last = (int(word) for word in line.split(" degrees")[0].removeprefix("azimuths ").split(" to "))
+            said[np.arange(first, last if last > first else last + 360) % 360] = True
+        assert not np.any(silent & ~said)
+        assert (columns == slice(None)) == (not lines)
+
+
+@pytest.mark.parametrize(
+    "projection",
+    [
+        polar_stereographic(),
+        polar_stereographic(south=False, longitude_rad=0.3, true_scale_latitude_rad=np.radians(80)),
+        Projection(kind=STEREOGRAPHIC, latitude_rad=0.4, longitude_rad=-1.0, scale=0.99, false_x_m=10.0),
+        Projection(kind=ORTHOGRAPHIC, latitude_rad=np.radians(8.12), longitude_rad=np.radians(-38.01)),
+        Projection(kind=EQUIRECTANGULAR, longitude_rad=3.0, scale=0.9, false_y_m=-5.0),
+    ],
+    ids=lambda p: f"{p.kind}-{p.latitude_rad:.1f}",
+)
+def test_projections_are_those_of_proj(projection):
+    pyproj = pytest.importorskip("pyproj")
+    p = projection
+    words = {
+        STEREOGRAPHIC: f"+proj=stere +lat_0={np.degrees(p.latitude_rad)} +k_0={p.scale}",
+        ORTHOGRAPHIC: f"+proj=ortho +lat_0={np.degrees(p.latitude_rad)}",
+        EQUIRECTANGULAR: f"+proj=eqc +lat_ts={np.degrees(np.arccos(min(p.scale, 1.0)))}",
+    }[p.kind]
+    words += f" +lon_0={np.degrees(p.longitude_rad)} +x_0={p.false_x_m} +y_0={p.false_y_m} +R=1737400"
+    rng = np.random.default_rng(7)
+    near = (
+        np.clip(p.latitude_rad + rng.uniform(-0.2, 0.2, 50), -1.55, 1.55),
+        p.longitude_rad + rng.uniform(-0.3, 0.3, 50),
+    )
+    x, y = pyproj.Proj(words)(np.degrees(near[1]), np.degrees(near[0]))
+    found = p.xy_from_latlon(*near)
+    assert found[0] == pytest.approx(np.array(x), abs=1e-4)
+    assert found[1] == pytest.approx(np.array(y), abs=1e-4)
+    back = p.latlon_from_xy(*found)
+    assert back[0] == pytest.approx(near[0], abs=1e-12)
+    assert np.sin(back[1] - near[1]) == pytest.approx(0, abs=1e-11)
+
+
+def test_ground_is_the_maps_height_on_the_sphere():
+    flat = Raster(
+        heights_m=np.full((60, 60), -1000.0, dtype=np.float32), projection=polar_stereographic(), x0_m=-15_000.0,
+        y0_m=15_000.0, dx_m=500.0, dy_m=-500.0,
+    )  # fmt: skip
+    terrain = HeightMap(name="flat", site=Site("moon", -np.pi / 2, 0.0), maps=(flat,), search_radius_m=5000.0)
+    ground = terrain.ground_m(np.array([[0.0, 0.0], [3000.0, 4000.0]]))
+    assert ground[0] == pytest.approx(-1000.0, abs=1e-6)
+    assert ground[1] == pytest.approx(np.sqrt(1_736_400.0**2 - 5000.0**2) - 1_737_400.0, abs=1e-3)
+    for compiled in (True, False):  # nothing is made up beyond the map's end, 20 km off
+        there = replace(terrain, use_compiled=compiled, camera_height_m=300.0, _state={})
+        low = there.horizon_rad(np.zeros(2), np.array([np.pi / 4]))[0]
+        assert low == pytest.approx(-0.0205, abs=0.001)
+    # On a smooth sphere the horizon dips by sqrt(2 h / R); here seen to where the map ends or beyond
+    dip = terrain.horizon_rad(np.zeros(2), np.array([1.0]))[0]
+    assert dip == pytest.approx(-np.sqrt(2 * 1.5 / 1_736_400.0), rel=2e-2)

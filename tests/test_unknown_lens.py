@@ -1,0 +1,254 @@
+"""Identification without a camera file: lenses of every family, real photographs, and skies that must be refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole
+from startrack.catalog import load_catalog
+from startrack.cli.main import main
+from startrack.exposure import read_exposure
+from startrack.frames import angle_between_rad
+from startrack.identification.proximity_mask import sky_map
+from startrack.identification.radial_lens_family import EQUIDISTANT, EQUISOLID, ORTHOGRAPHIC, STEREOGRAPHIC, Family
+from startrack.identification.unknown_lens import BlindSolution, identify_blind
+from startrack.orient import solve_attitude
+from startrack.pipeline import identify_blind as identify_picture
+from startrack.types import Detections, NotIdentified, Stars
+
+DATA = Path(__file__).parent / "data"
+PHOTO = Path(__file__).parent.parent / "sample_images/lowell-2018-08-06.fits.bz2"
+SIZE = (1400, 1100)
+ARCSEC = np.pi / 648_000
+
+
+@lru_cache(maxsize=1)
+def sky() -> Stars:
+    return load_catalog().at(None, None)
+
+
+def lens_camera(
+    lens: Lens, fov: float, radius_px: float, size: tuple[int, int] = SIZE, off: tuple[float, float] = (0, 0),
+    mirrored: bool = False,
+) -> Camera:  # fmt: skip
+    """A camera whose image circle of `fov` degrees has this radius, its centre off the frame's."""
+    half = np.radians(fov / 2)
+    focal = radius_px / float(lens.rho(np.array(half)))
+    centre = ((size[0] - 1) / 2 + off[0], (size[1] - 1) / 2 + off[1])
+    return Camera(
+        name="truth", size_px=size, focal_px=(focal, focal), centre_px=centre, max_angle_rad=half,
+        calibrated_angle_rad=half, lens=lens, mirrored=mirrored,
+    )  # fmt: skip
+
+
+def picture(
+    camera: Camera, seed: int, limit: float = 5.0, hidden: float = 0.4, false: float = 0.3,
+    brightest: int | None = None,
+    hot: int = 0,
+) -> tuple[Detections, np.ndarray, np.ndarray]:  # fmt: skip
+    """Detections at a random attitude, the true star of each (-1: none), and that attitude.
+
+    One side of the sky is hidden, false stars are strewn over it, and `hot` pixels are brighter than any star.
+    """
+    rng = np.random.default_rng([seed, 7])
+    R = Rotation.random(random_state=rng).as_matrix()
+    px, inside = camera.project(sky().rays_icrs @ R.T)
+    star = np.flatnonzero(inside & (sky().v_mag < limit))
+    side = (px[star] - camera.centre_px) @ rng.normal(size=2)
+    star = star[side >= np.quantile(side, hidden)][:brightest]
+    v = sky().v_mag[star] + rng.normal(0, 0.2, len(star))
+    wrong = rng.uniform(0, 1, (round(false * len(star)), 2)) * camera.size_px
+    brighter = rng.uniform(0, 1, (hot, 2)) * camera.size_px
+    xy = np.concatenate([px[star] + rng.normal(0, 0.2, (len(star), 2)), wrong, brighter])
+    v = np.concatenate([v, rng.choice(v, len(wrong)), np.full(hot, v.min() - 1)])
+    order = np.argsort(v)
+    truth = np.concatenate([star, np.full(len(wrong) + hot, -1)])
+    return detections(xy[order], 10 ** (-0.4 * (v[order] - 18))), truth[order], R
+
+
+def detections(xy_px: np.ndarray, flux: np.ndarray, psf_sigma_px: float = 1.0) -> Detections:
+    n = len(xy_px)
+    return Detections(
+        xy_px=xy_px, covariance_px2=np.tile(0.04 * np.eye(2), (n, 1, 1)), flux_e=flux,
+        flux_sigma_e=np.sqrt(np.abs(flux) + 1), snr=np.sqrt(np.abs(flux)), saturated=np.zeros(n, dtype=bool),
+        psf_sigma_px=psf_sigma_px, background_e=np.zeros((2, 2), np.float32), noise_e=np.ones((2, 2), np.float32),
+    )  # fmt: skip
+
+
+def listed(name: str) -> Detections:
+    """A real photograph's point sources."""
+    with (DATA / name).open(encoding="utf-8") as file:
+        lines = file.readlines()
+    sigma = next(float(line.split()[-1]) for line in lines if line.startswith("# psf_sigma_px"))
+    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
+    xy = np.array([[float(r["x_px"]), float(r["y_px"])] for r in rows])
+    return replace(
+        detections(xy, np.array([float(r["flux"]) for r in rows]), sigma),
+        flux_sigma_e=np.array([float(r["flux_sigma"]) for r in rows]),
+        saturated=np.array([r["saturated"] == "1" for r in rows]),
+    )
+
+
+def boresight_off_rad(found: BlindSolution, ra_deg: float, dec_deg: float) -> float:
+    ra, dec = np.radians([ra_deg, dec_deg])
+    want = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    middle = (np.array(found.camera.size_px) - 1) / 2
+    ray = found.camera.unproject(middle) @ found.identification.R_cam_icrs
+    return float(angle_between_rad(ray, want))
+
+
+LENSES = {
+    "equidistant, 20 px off centre": (lens_camera(Family(EQUIDISTANT), 180, 520, off=(20, -15)), {}, 180),
+    "equisolid, mirrored": (lens_camera(Family(EQUISOLID), 180, 520, mirrored=True), {}, 180),
+    "stereographic": (lens_camera(Family(STEREOGRAPHIC), 180, 520), {}, 180),
+    "orthographic": (lens_camera(Family(ORTHOGRAPHIC), 170, 520), {}, 170),
+    "no ideal lens, 185 degrees": (lens_camera(KannalaBrandt((-0.03, 0.02, -0.015, 0.002)), 185, 520), {}, 185),
+    "clipped by the frame": (lens_camera(Family(EQUISOLID), 180, 640, size=(1400, 900)), {}, 180),
+    "twenty hot pixels brighter than the stars": (lens_camera(Family(EQUISOLID), 180, 520), {"hot": 20}, 180),
+    "a third of the sky": (lens_camera(Family(EQUISOLID), 180, 520), {"hidden": 0.67}, 180),
+    "30 stars": (lens_camera(Family(EQUIDISTANT), 180, 520), {"brightest": 30, "hidden": 0.0}, 180),
+    "70 degrees": (lens_camera(Pinhole(), 70, 700), {"limit": 6.0}, 70),
+    "20 degrees": (lens_camera(Pinhole(), 20, 700), {"limit": 7.0, "hidden": 0.0}, 20),
+    "20 degrees, mirrored": (lens_camera(Pinhole(), 20, 700, mirrored=True), {"limit": 6.5, "hidden": 0.0}, 20),
+    "8 stars in 20 degrees": (lens_camera(Pinhole(), 20, 700), {"brightest": 8, "hidden": 0.0, "false": 0.0}, 20),
+}
+
+
+@pytest.mark.parametrize(("case", "wrong_by"), list(zip(LENSES, [1.0, 0.91, 1.09] * len(LENSES), strict=False)))
+def test_the_lens_is_found_with_the_stars(case: str, wrong_by: float) -> None:
+    camera, how, fov = LENSES[case]
+    seen, truth, R = picture(camera, seed=3, **how)
+    found = identify_blind(seen, camera.size_px, np.radians(fov * wrong_by), sky())
+    names = found.identification
+    assert np.mean(truth[names.detection] == names.star) >= 0.98
+    assert len(set(names.star.tolist())) == len(set(names.detection.tolist())) == len(names)
+    assert names.false_alarm_probability < 1e-9
+    assert found.camera.mirrored == camera.mirrored
+    assert found.camera.lens.model == ("pinhole" if fov <= 40 else "kannala_brandt")
+    # The map, not its parameters: where the lens is said to be known, its pixels are those of the true one.
+    angle = np.linspace(0, min(found.camera.calibrated_angle_rad, camera.max_angle_rad) * 0.95, 50)
+    radii = [c.focal_px[0] * c.lens.rho(angle) for c in (found.camera, camera)]
+    assert np.abs(radii[0] - radii[1]).max() < 2.0
+    px, inside = camera.project(sky().rays_icrs[:500] @ R.T)
+    again, also = found.camera.project(sky().rays_icrs[:500] @ names.R_cam_icrs.T)
+    known = inside & also & (found.camera.angle_rad(px) < 0.95 * found.camera.calibrated_angle_rad)
+    assert np.linalg.norm(px - again, axis=1)[known].max() < 1.0
+
+
+def test_noise_is_refused_in_bounded_time() -> None:
+    rng = np.random.default_rng(5)
+    for n, fov in ((40, 180), (300, 15)):
+        noise = detections(rng.uniform(0, 1, (n, 2)) * SIZE, np.sort(rng.pareto(1.5, n) + 1)[::-1])
+        with pytest.raises(NotIdentified, match="better than chance") as refusal:
+            identify_blind(noise, SIZE, np.radians(fov), sky())
+        assert refusal.value.evidence["tried"] < 1_500_000  # patterns: the measure of its time
+
+
+def test_too_few_stars_are_refused_at_once() -> None:
+    with pytest.raises(NotIdentified, match="too few"):
+        identify_blind(detections(np.arange(12.0).reshape(6, 2) * 80, np.ones(6)), SIZE, np.pi, sky())
+
+
+@pytest.mark.parametrize(
+    ("name", "ra_deg", "dec_deg", "arcsec"),
+    [("narrow-alt40-azi-45.csv", 172.3676, 57.6493, 8), ("narrow-alt60-azi135.csv", 286.4356, 28.9442, 8)],
+)
+def test_narrow_photographs_agree_with_two_other_solvers(
+    name: str, ra_deg: float, dec_deg: float, arcsec: float
+) -> None:
+    seen = listed(name)
+    for fov in (10.4, 11.4, 12.4):
+        found = identify_blind(seen, (1024, 768), np.radians(fov), sky())
+        assert boresight_off_rad(found, ra_deg, dec_deg) < arcsec * ARCSEC
+        assert 2 * np.degrees(np.arctan(512 / found.camera.focal_px[0])) == pytest.approx(11.423, abs=0.01)
+        assert len(found.identification) >= 70
+        assert not found.camera.mirrored
+
+
+def test_an_overcast_photograph_is_refused() -> None:
+    with pytest.raises(NotIdentified, match="better than chance"):
+        identify_blind(listed("overcast.csv"), (1392, 1040), np.pi, sky())
+
+
+def test_a_moonlit_photograph_is_identified() -> None:
+    found = identify_blind(listed("moonlit.csv"), (1392, 1040), np.pi, sky())
+    assert len(found.identification) >= 300
+    assert found.camera.focal_px[0] == pytest.approx(337.2, abs=1.0)  # of the same camera on another night
+    assert found.camera.centre_px == pytest.approx((709.7, 489.7), abs=1.0)
+
+
+@pytest.fixture(scope="module")
+def photo():
+    return read_exposure(PHOTO)
+
+
+def test_a_photograph_is_identified_cold(photo) -> None:
+    result = identify_picture(photo, np.radians(170.0), load_catalog())
+    assert result.status == "ok", result.message
+    with (DATA / "lowell-2018-08-06-stars.csv").open() as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    px = np.array([[float(row["x_px"]), float(row["y_px"])] for row in rows])
+    hip = np.array([int(row["hip"]) for row in rows])
+    found = result.identification
+    assert len(found) >= 1500
+    distance, nearest = cKDTree(px).query(result.detections.xy_px[found.detection])
+    both = distance < 1.5
+    assert both.sum() >= 400
+    assert np.mean(result.stars.hip[found.star][both] == hip[nearest[both]]) >= 0.99
+    assert result.attitude_fit.rms_px < 0.4
+    assert result.camera.calibrated_angle_rad > np.radians(70)
+
+
+def test_its_mirror_image_half_covered_is_said_to_be_mirrored(photo, tmp_path, capsys) -> None:
+    from PIL import Image
+
+    pixels = photo.pixels_adu[:, ::-1].copy()
+    pixels[:, :600] = np.median(pixels)  # a wall
+    eight_bits = np.clip((pixels - 2000) / 16, 0, 255).astype(np.uint8)
+    path = tmp_path / "flipped.png"
+    Image.fromarray(eight_bits).save(path)
+    code = main(["identify", "--fov", "180", "--no-plots", "-D", str(tmp_path), str(path)])
+    assert code == 0
+    said = capsys.readouterr().out
+    assert "lens found" in said and ", mirrored" in said and "startrack calibrate" in said
+    record = json.loads((tmp_path / "flipped.identification.json").read_text())
+    assert record["camera"]["mirrored"] is True
+    assert record["camera"]["model"] == "kannala_brandt"
+    assert record["camera"]["focal_px"][0] == pytest.approx(337.2, abs=1.5)
+
+
+def test_the_map_of_the_sky_is_that_of_a_search() -> None:
+    rng = np.random.default_rng(1)
+    rays, asked = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in rng.normal(size=(2, 3000, 3)))
+    near = sky_map(rays[:400], np.radians(1.5))
+    angle = 2 * np.arcsin(cKDTree(rays[:400]).query(asked)[0] / 2)
+    clear = np.abs(angle - np.radians(1.5)) > np.radians(0.6)  # cells are three quarters of a degree
+    assert np.array_equal(near(asked)[clear], angle[clear] < np.radians(1.5))
+    assert near.covered == pytest.approx(400 * (1 - np.cos(np.radians(1.5))) / 2, rel=0.08)
+
+
+@pytest.mark.parametrize(("name", "lists"), [("equisolid, mirrored", 30), ("70 degrees", 12), ("20 degrees", 12)])
+def test_the_attitude_is_as_sure_as_it_says_though_the_lens_comes_from_the_same_stars(name: str, lists: int) -> None:
+    camera, picture_of, fov = LENSES[name]
+    nees = []
+    for seed in range(100, 100 + lists):
+        seen, _, R = picture(camera, seed, **picture_of)
+        found = identify_blind(seen, camera.size_px, np.radians(fov), sky())
+        named = found.identification
+        attitude = solve_attitude(
+            found.camera, seen.xy_px[named.detection], seen.covariance_px2[named.detection],
+            sky().rays_icrs[named.star], named.R_cam_icrs,
+        ).attitude  # fmt: skip
+        w = Rotation.from_matrix(R @ attitude.R_cam_icrs.T).as_rotvec()
+        nees.append(w @ np.linalg.solve(attitude.covariance_rad2, w))
+    assert abs(np.mean(nees) - 3.0) < 3.5 * np.sqrt(6.0 / lists)
+    assert max(nees) < 25

@@ -6,9 +6,9 @@ or raises `NoSolution`; there is no NaN, sentinel or half-filled result. Convent
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,16 +23,22 @@ __all__ = [
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
+T = TypeVar("T")
 
 
-def _shaped(**kinds: Any) -> Any:
-    """Dataclass field metadata: `shape` with None for the common length, and `dtype`."""
-    return field(metadata=kinds)
+def array(*shape: int | str, dtype: Any = np.float64, default: float | None = None) -> Any:
+    """A checked array field. Letters in `shape` name lengths that must agree within the value.
+
+    With a default the field may be left out: it is then filled with that number, as long as the fields before it.
+    """
+    metadata = {"shape": shape, "dtype": dtype, "default": default}
+    return field(metadata=metadata) if default is None else field(default=None, metadata=metadata)
 
 
-def array(*shape: int | str, dtype: Any = np.float64) -> Any:
-    """A checked array field. Letters in `shape` name lengths that must agree within the value."""
-    return _shaped(shape=shape, dtype=dtype)
+def take_rows(value: T, which: Any) -> T:
+    """The value with all its array fields of common length n cut to a mask, slice or index array."""
+    rows = [f.name for f in fields(value) if f.metadata.get("shape", ())[:1] == ("n",)]  # type: ignore[arg-type]
+    return replace(value, **{name: getattr(value, name)[which] for name in rows})  # type: ignore[type-var]
 
 
 class Value:
@@ -43,8 +49,10 @@ class Value:
         for f in fields(self):  # type: ignore[arg-type]
             if "shape" not in f.metadata:
                 continue
-            a = np.array(getattr(self, f.name), dtype=f.metadata["dtype"])
-            want = f.metadata["shape"]
+            want, given = f.metadata["shape"], getattr(self, f.name)
+            if given is None:
+                given = np.full([lengths.get(w, w) for w in want], f.metadata["default"])
+            a = np.array(given, dtype=f.metadata["dtype"])
             if a.ndim != len(want):
                 raise ValueError(f"{type(self).__name__}.{f.name}: {a.ndim} dimensions, expected {want}")
             for n, w in zip(a.shape, want, strict=True):
@@ -119,10 +127,7 @@ class Stars(Value):
 
     def take(self, which: Any) -> Stars:
         """The stars selected by a mask, slice or index array."""
-        return Stars(
-            catalog_id=self.catalog_id[which], hip=self.hip[which], rays_icrs=self.rays_icrs[which],
-            v_mag=self.v_mag[which], v_sigma_mag=self.v_sigma_mag[which],
-        )  # fmt: skip
+        return take_rows(self, which)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,15 +163,22 @@ class Identification(Value):
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence(Value):
-    """Rays, each with a log-likelihood ratio "light comes from there" against "the terrain is there".
+    """Rays, each with a log-likelihood ratio l: light comes from there, against: the terrain is there.
 
-    Whatever made them: catalogue stars, or patches of the diffuse sky. The localizer does not care.
+    Rows may come from stars, from pixels of the diffuse sky, and from several exposures. With V the fraction of the
+    ray above the horizon (a step, or Phi((elevation - horizon) / sigma)) a row contributes
+    log(V e^l + 1 - V) for a point source, and l V + c V (1 - V) / 2 for extended light, c = `extended_nats`.
     """
 
     azimuth_rad: Array = array("n")  # in enu
     elevation_rad: Array = array("n")  # in enu
-    llr: Array = array("n")  # natural log; 0 says nothing
-    edge_sigma_rad: Array = array("n")  # uncertainty of the ray's own elevation
+    llr: Array = array("n")  # natural logarithm; 0 carries no information
+    edge_sigma_rad: Array = array("n", default=0.0)  # width of the edge: uncertainty of the elevation, or the PSF
+    extended_nats: Array = array("n", default=0.0)  # (light / noise)^2 of extended light; 0: a point source
+
+    def take(self, which: Any) -> Evidence:
+        """The rows selected by a mask, slice or index array."""
+        return take_rows(self, which)
 
     def __len__(self) -> int:
         return len(self.llr)
@@ -192,4 +204,5 @@ class Fix(Value):
     modes: tuple[Mode, ...]  # heaviest first; weights sum to 1
     ambiguous: bool  # modes outside the main mode's 99.9 % circle hold more than 1 %
     dropped_mass: float = 0.0  # bound on the posterior probability of what the search pruned
+    search: str = "proven"  # no other position fits; "beam": the search ended before that was proven
     horizon_error_rad: float = 0.0  # by how much the true horizon stands higher than the map's, as far as all around

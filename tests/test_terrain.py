@@ -105,7 +105,7 @@ def test_methods_are_elementwise_and_broadcast(terrain: Terrain) -> None:
     )
     assert np.shape(terrain.ground_m(places)) == (7,)
     assert np.shape(terrain.allowed(places.reshape(7, 1, 2))) == (7, 1)
-    assert terrain.tells(azimuth, np.full(7, 1.0)).tolist() == 7 * [True]  # nothing stands so high
+    assert terrain.is_informative(azimuth, np.full(7, 1.0)).tolist() == 7 * [True]  # nothing stands so high
     assert terrain.common_sigma_rad == pytest.approx(COMMON_SIGMA_RAD.get(terrain.name, 0.0), rel=0.05)
     near = terrain.near(places[0], 1.0, azimuth)
     assert near.horizon_rad(places[0], azimuth) == pytest.approx(one_place, abs=1e-4)

@@ -212,9 +212,9 @@ def test_rays_that_run_off_the_map_give_no_evidence(shackleton):
     inner = shackleton.maps[0].around(shackleton.site.latitude_rad, shackleton.site.longitude_rad, 4000.0)
     small = replace(shackleton, maps=(inner,), search_radius_m=300.0, _state={})
     azimuth = np.radians(np.arange(0, 360, 5.0))
-    assert not small.tells(azimuth, small.horizon_rad(np.zeros(2), azimuth)).any()
-    assert small.tells(azimuth, np.full(len(azimuth), np.radians(80.0))).all()
-    assert shackleton.tells(azimuth, np.zeros(len(azimuth))).all()
+    assert not small.is_informative(azimuth, small.horizon_rad(np.zeros(2), azimuth)).any()
+    assert small.is_informative(azimuth, np.full(len(azimuth), np.radians(80.0))).all()
+    assert shackleton.is_informative(azimuth, np.zeros(len(azimuth))).all()
     low = small.horizon_rad(np.zeros(2), azimuth)
     assert set(why_silent(small, azimuth, low)) == {"ground off the map"}
     assert set(why_silent(small, azimuth, np.full(len(azimuth), np.radians(80.0)))) == {""}
@@ -228,7 +228,7 @@ def test_rays_that_run_off_the_map_give_no_evidence(shackleton):
 
 def test_glare_takes_the_evidence_of_its_azimuths(shackleton):
     lit = replace(shackleton, glare_rad=((np.radians(350), np.radians(20)),))
-    told = lit.tells(np.radians([349.0, 351.0, 0.0, 19.0, 21.0, 180.0]), np.full(6, 0.5))
+    told = lit.is_informative(np.radians([349.0, 351.0, 0.0, 19.0, 21.0, 180.0]), np.full(6, 0.5))
     assert told.tolist() == [True, False, False, False, True, True]
     why = why_silent(lit, np.radians([349.0, 351.0]), np.full(2, 0.5))
     assert why.tolist() == ["", "glare of a lit rim"]
@@ -243,7 +243,7 @@ def test_azimuths_where_the_maps_end_are_told_as_ranges(shackleton):
     place = np.zeros(2)
     for columns in (slice(0, whole.heights_m.shape[1] // 2 + 20), slice(None)):
         cut = replace(shackleton, maps=(whole.cut(slice(None), columns),), search_radius_m=200.0, _state={})
-        silent = ~cut.tells(azimuth, cut.horizon_rad(place, azimuth))
+        silent = ~cut.is_informative(azimuth, cut.horizon_rad(place, azimuth))
         lines = silent_sectors(cut)
         assert bool(lines) == bool(silent.any())
         said = np.zeros(360, dtype=bool)

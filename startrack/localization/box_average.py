@@ -46,7 +46,7 @@ class Blurred:
         azimuth, within = (2 * np.arange(count) + 1) * np.pi / count, np.pi / count
         boxes = centres_m[:, None, :]
         low, high = terrain.horizon_bounds_rad(boxes, np.array(half_m), azimuth, within)
-        wider = terrain.most_sigma_rad(boxes, half_m, azimuth, within) + NARROWEST_RAD
+        wider = terrain.max_horizon_sigma_rad(boxes, half_m, azimuth, within) + NARROWEST_RAD
         low, high = low - wider, high + wider
         start = SECTOR_STEP * np.arange(count)
         below = np.interp(high + start, self.key, self.integral) - np.interp(low + start, self.key, self.integral)

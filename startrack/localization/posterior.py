@@ -59,7 +59,7 @@ class ExactPosterior:
 
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
         """Posterior of the camera's position. Raises NotLocated (insufficient_geometry, outside_search_area)."""
-        told = (np.abs(evidence.llr) > 1e-3) & terrain.tells(evidence.azimuth_rad, evidence.elevation_rad)
+        told = (np.abs(evidence.llr) > 1e-3) & terrain.is_informative(evidence.azimuth_rad, evidence.elevation_rad)
         if told.sum() < FEWEST_RAYS:
             raise NotLocated(f"only {int(told.sum())} rays say anything about the skyline: expose longer")
         evidence, error_rad = taken(evidence, told), 0.0

@@ -68,7 +68,7 @@ class Profile:
         middle = (2 * np.arange(count) + 1) * np.pi / count
         boxes = centres_m[:, None, :]
         low, high = terrain.horizon_bounds_rad(boxes, np.array(half_m), middle, np.pi / count)
-        map_sigma = terrain.most_sigma_rad(boxes, half_m, middle, np.pi / count)
+        map_sigma = terrain.max_horizon_sigma_rad(boxes, half_m, middle, np.pi / count)
         margin = leeway_rad + CERTAIN_SIGMAS * np.hypot(self.sigma_rad, map_sigma)
         step = SECTOR_STEP * np.arange(count)
         first = np.searchsorted(self.key, (low - margin + step).ravel(), side="left")
@@ -94,7 +94,7 @@ class Profile:
         count = len(self.ends)
         middle, centres = (2 * part + 1) * np.pi / count, centres_m[box]
         low, high = terrain.horizon_bounds_rad(centres, np.array(half_m), middle, np.pi / count)
-        map_sigma = terrain.most_sigma_rad(centres, half_m, middle, np.pi / count)
+        map_sigma = terrain.max_horizon_sigma_rad(centres, half_m, middle, np.pi / count)
         margin = CERTAIN_SIGMAS * np.hypot(self.sigma_rad[part], map_sigma)
         at_least = np.searchsorted(self.key, low - margin + SECTOR_STEP * part, side="left")
         at_most = np.searchsorted(self.key, high + margin + SECTOR_STEP * part, side="right")

@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
 from startrack.frames import Site
+from startrack.terrain.protocol import Terrain
 from startrack.types import Array, Bools
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cylinder:
+class Cylinder(Terrain):
     """tan H = (depth - camera height) / d(p, a), d the distance from p along azimuth a to the circle of the rim.
 
     Source: Kua 2008, section 3.1 (eq. 3.1 seen from the camera's height instead of the floor).
     """
 
-    name: str
-    site: Site
+    name: str = "cylinder"
+    site: Site | None = None
     diameter_m: float
     depth_m: float
     camera_height_m: float = 0.0
     search_radius_m: float = np.inf
-    depth_sigma_m: float = 0.0  # standard deviations of what the file says; with either, the stars are asked too
+    depth_sigma_m: float = 0.0  # standard deviations; with either, the shape is estimated with the position
     diameter_sigma_m: float = 0.0
+    axisymmetric: ClassVar[bool] = True
 
     @property
     def radius_m(self) -> float:
@@ -67,14 +70,6 @@ class Cylinder:
         farthest = _chord(off_centre * far_side, off_centre, self.radius_m + reach)
         return np.arctan2(self.wall_m, farthest), np.arctan2(self.wall_m, nearest)
 
-    def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """Zero: the cylinder is taken as exact."""
-        return np.zeros(np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad)))
-
-    def most_sigma_rad(self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float) -> Array:
-        """Zero, as everywhere."""
-        return self.horizon_sigma_rad(centres_m, azimuths_rad)
-
     def ground_m(self, points_m: Array) -> Array:
         """Zero: the floor is the plane z = 0."""
         return np.zeros(np.shape(points_m)[:-1])
@@ -83,18 +78,20 @@ class Cylinder:
         """Whether the points (..., 2) are on the floor."""
         return np.asarray(np.hypot(points_m[..., 0], points_m[..., 1]) < self.radius_m)
 
-    def tells(self, azimuths_rad: Array, elevations_rad: Array) -> Bools:
-        """True for every ray: the wall is known all around."""
-        return np.ones(np.broadcast_shapes(np.shape(azimuths_rad), np.shape(elevations_rad)), dtype=bool)
-
-    def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = 3) -> Cylinder:
-        """Itself: a closed form is quick everywhere."""
-        return self
-
     @property
-    def common_sigma_rad(self) -> float:
-        """Zero: depth_sigma_m and diameter_sigma_m say what is not known."""
-        return 0.0
+    def shape_sigma(self) -> tuple[float, float]:  # type: ignore[override]
+        """Relative sigma of the steepness depth / diameter, and of the diameter."""
+        larger = self.diameter_sigma_m / self.diameter_m
+        return float(np.hypot(self.depth_sigma_m / self.depth_m, larger)), larger
+
+    def reshaped(self, shape: Array) -> Cylinder:
+        """The crater shape[0] steeper and shape[1] larger (relative)."""
+        steeper, larger = float(shape[0]), float(shape[1])
+        return replace(
+            self,
+            depth_m=self.depth_m * (1 + steeper) * (1 + larger),
+            diameter_m=self.diameter_m * (1 + larger),
+        )
 
 
 def _distance_to_circle(points_m: Array, azimuths_rad: Array, radius_m: Array | float) -> Array:

@@ -32,14 +32,14 @@ UNKNOWN_FROM = 12  # places across the square that are asked where the maps end
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class HeightMap:
+class HeightMap(Terrain):
     """The surface that is bilinear between the posts of height maps, as true 3-D points on the Moon's sphere.
 
     tan H = max over s of (z(p + s u) - z(p) - camera height) / s, u the azimuth's direction. Where several maps cover
     a place the first holds. See `Terrain`.
     """
 
-    name: str
+    name: str = "height map"
     site: Site
     maps: tuple[Raster, ...]  # finest first
     camera_height_m: float = 1.5
@@ -168,7 +168,9 @@ class HeightMap:
             return np.zeros(np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad)))
         return self._crests.at(points_m, azimuths_rad)
 
-    def most_sigma_rad(self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float) -> Array:
+    def max_horizon_sigma_rad(
+        self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float
+    ) -> Array:
         """The largest `horizon_sigma_rad` (n,) over boxes and azimuths."""
         if self.height_sigma_m == 0:
             return np.zeros(np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad)))
@@ -199,7 +201,7 @@ class HeightMap:
         rise = np.hypot(z[..., 0] - z[..., 1], z[..., 2] - z[..., 3]) / (2 * SLOPE_STEP_M)
         return np.asarray(np.arctan(rise))
 
-    def tells(self, azimuths_rad: Array, elevations_rad: Array) -> Bools:
+    def is_informative(self, azimuths_rad: Array, elevations_rad: Array) -> Bools:
         """Whether the map can say anything of a ray: not in a glare sector, nor where unmapped ground may stand."""
         azimuths = np.asarray(azimuths_rad) % (2 * np.pi)
         b = (azimuths / (2 * np.pi) * BINS).astype(np.int64) % BINS

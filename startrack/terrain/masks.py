@@ -13,7 +13,7 @@ GLARE, OFF_MAP = "glare of a lit rim", "ground off the map"
 
 def why_silent(terrain: Terrain, azimuths_rad: Array, elevations_rad: Array) -> NDArray[np.str_]:
     """Why the terrain says nothing of rays (n,); empty where it does."""
-    silent = ~np.asarray(terrain.tells(azimuths_rad, elevations_rad))
+    silent = ~np.asarray(terrain.is_informative(azimuths_rad, elevations_rad))
     cause = np.where(silent, OFF_MAP, "")
     return np.where(silent & _in_glare(terrain, np.asarray(azimuths_rad)), GLARE, cause)
 

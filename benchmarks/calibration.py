@@ -25,8 +25,7 @@ from startrack.camera import Camera, KannalaBrandt
 from startrack.camera.uncertainty import cap_grid, lens_jacobian, without_turn
 from startrack.catalog import load_catalog
 from startrack.exposure import read_exposure
-from startrack.frames import R_from_quat_xyzw, Site
-from startrack.orient import rotation
+from startrack.frames import R_from_quat_xyzw, R_from_rotvec, Site
 
 Law = Callable[[np.ndarray], np.ndarray]
 FOCAL_PX, SIZE_PX = 652.0, (2048, 2048)
@@ -120,7 +119,7 @@ def trial(case: Case, law: str, rng: np.random.Generator) -> Trial:
         state = first_state(points, SIZE_PX)
         fit = fit_lens(state.camera, state.R_cam_icrs, points)
     else:
-        fit = fit_lens(rough(), np.stack([rotation(rng.normal(0, 0.01, 3)) @ r for r in R]), points)
+        fit = fit_lens(rough(), np.stack([R_from_rotvec(rng.normal(0, 0.01, 3)) @ r for r in R]), points)
     seconds = time.perf_counter() - start
     error, nees, freedom = map_error(fit.camera, rho, centre)
     return Trial(error, nees, freedom, float(np.degrees(fit.camera.calibrated_angle_rad)), seconds)

@@ -22,8 +22,8 @@ from chain import SENSOR
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.evidence import StarEvidence
+from startrack.frames import R_from_rotvec
 from startrack.localization import ExactPosterior
-from startrack.orient import rotation
 from startrack.pipeline import Settings, locate
 from startrack.rendering import Series, render
 from startrack.terrain import Cylinder, load_terrain
@@ -65,7 +65,7 @@ class Biased:
     arcsec: float
 
     def __call__(self, *what: Any) -> Any:
-        turn = rotation(np.radians(np.full(3, self.arcsec) / 3600))
+        turn = R_from_rotvec(np.radians(np.full(3, self.arcsec) / 3600))
         return StarEvidence()(*what[:6], turn @ what[6], *what[7:])  # the seventh is the attitude
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.camera.uncertainty import lens_jacobian
+from startrack.frames import R_from_rotvec
 from startrack.types import Array, Attitude, Bools, NotIdentified
 
 CHI2_2DOF_MEDIAN = 1.3863
@@ -25,30 +26,6 @@ class AttitudeFit:
     used: Bools  # (n,)
     rms_px: float  # of the used stars, per axis
     extra_sigma_px: float  # error per axis beyond the stated centroid errors (lens, blends, catalogue)
-
-
-def wahba(rays_cam: Array, rays_icrs: Array, weights: Array) -> Array:
-    """R_cam_icrs (..., 3, 3) minimising sum w |rays_cam - R rays_icrs|^2 over stars (..., n, 3), weights (..., n).
-
-    Source: Markley 1988, J. Astronaut. Sci. 36, 245 (singular value decomposition of the attitude profile matrix).
-    Weak where all stars lie in one direction.
-    """
-    profile = np.einsum("...n,...ni,...nj->...ij", weights, rays_cam, rays_icrs)
-    u, _, vt = np.linalg.svd(profile)
-    handedness = np.linalg.det(u) * np.linalg.det(vt)
-    u = u.copy()
-    u[..., :, 2] *= handedness[..., None]
-    return u @ vt
-
-
-def rotation(vector_rad: Array) -> Array:
-    """R (3, 3) = exp([w]x) of a rotation vector w [rad] (Rodrigues)."""
-    angle = float(np.linalg.norm(vector_rad))
-    if angle == 0.0:
-        return np.eye(3)
-    x, y, z = vector_rad / angle
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
 
 
 def solve_attitude(
@@ -78,7 +55,7 @@ def solve_attitude(
         w, r = tapered(weight, chi2)[used], residual[used]
         normal = np.einsum("nia,nij,njb->ab", jacobian, w, jacobian)
         turn = np.linalg.solve(normal, np.einsum("nia,nij,nj->a", jacobian, w, r))
-        R = rotation(turn) @ R
+        R = R_from_rotvec(turn) @ R
         new_extra = extra_variance_px2(residual, covariance_px2)
         settled = np.linalg.norm(turn) < 1e-9 and abs(new_extra - extra) <= 1e-3 * new_extra
         extra = new_extra

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from startrack.camera import Camera, Sensor
-from startrack.frames import Site, rays_from_azel
-from startrack.frames.body_angles import R_body_enu_from_heading_pitch_roll
+from startrack.frames import R_body_enu_from_heading_pitch_roll, Site, rays_from_azel
 from startrack.rendering import Scene
 from startrack.terrain import Cylinder
 from startrack.types import Stars

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from startrack.calibration import first_state, fit_lens, observations
 from startrack.calibration.solve import project_freely
 from startrack.camera import Camera, Decentring, KannalaBrandt, camera_from_dict, camera_to_dict
-from startrack.camera.parameters import moved
+from startrack.camera.parameters import with_update
 from startrack.camera.uncertainty import lens_jacobian
 from startrack.types import NotIdentified
 
@@ -137,7 +137,7 @@ def test_the_covariance_is_as_large_as_the_errors():
 def test_the_map_sigma_is_the_spread_of_the_maps():
     rays = even(85, 400, np.random.default_rng(4))
     fits = [fitted("equisolid", 1, 150, 0.2, seed).camera for seed in range(12)]
-    stated = np.mean([np.mean(camera.map_sigma_px(rays) ** 2) for camera in fits])
+    stated = np.mean([np.mean(camera.projection_sigma_px(rays) ** 2) for camera in fits])
     seen = np.mean(
         [0.5 * map_error_px(replace(c, calibrated_angle_rad=np.radians(85)), "equisolid") ** 2 for c in fits]
     )
@@ -148,7 +148,7 @@ def test_stars_inside_60_degrees_calibrate_60_degrees():
     camera = fitted("equisolid", 1, 300, 0.2, 5, top_deg=60.0).camera
     assert np.degrees(camera.calibrated_angle_rad) == pytest.approx(59.5, abs=1.0)
     edge = np.array([[np.sin(a), 0, np.cos(a)] for a in np.radians([59, 80, 90])])
-    inside, beyond, far = camera.map_sigma_px(edge)
+    inside, beyond, far = camera.projection_sigma_px(edge)
     assert inside < 0.15 < beyond < far  # and what lies beyond is not hidden
 
 
@@ -195,7 +195,8 @@ def test_derivatives_of_a_decentred_mirrored_lens():
     rays, step = even(95, 200, np.random.default_rng(3)), 1e-6
     order = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "f")
     numeric = [
-        (project_freely(moved(camera, {n: step}), rays) - project_freely(moved(camera, {n: -step}), rays)) / (2 * step)
+        (project_freely(with_update(camera, {n: step}), rays) - project_freely(with_update(camera, {n: -step}), rays))
+        / (2 * step)
         for n in order
     ]
     np.testing.assert_allclose(lens_jacobian(camera, rays, order), np.stack(numeric, axis=-1), atol=2e-6)

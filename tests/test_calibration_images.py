@@ -118,7 +118,7 @@ def test_the_command_writes_camera_record_and_report(written):
     camera = load_camera(written / "new.toml")
     assert camera.covariance_order[:4] == ("fx", "fy", "cx", "cy")
     rays = camera.unproject(np.array([[709.0, 489.0], [1100.0, 489.0], [709.0, 60.0]]))
-    assert 0 < camera.map_sigma_px(rays).max() < 0.05
+    assert 0 < camera.projection_sigma_px(rays).max() < 0.05
     record = json.loads((written / "new.calibration.json").read_text())
     assert (record["status"], record["reason"]) == ("ok", None)
     assert record["lens"]["held_out_rms_px"] < 0.35

@@ -12,8 +12,13 @@ from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.cli import render as command
 from startrack.exposure import read_exposure
-from startrack.frames import R_enu_icrs, R_from_quat_xyzw, observer_velocity_m_s, parse_utc
-from startrack.frames.body_angles import heading_pitch_roll_from_R_body_enu
+from startrack.frames import (
+    R_enu_icrs,
+    R_from_quat_xyzw,
+    heading_pitch_roll_from_R_body_enu,
+    observer_velocity_m_s,
+    parse_utc,
+)
 from startrack.terrain import load_terrain
 from startrack.types import BadInput
 

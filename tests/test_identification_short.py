@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from test_identify import ARCSEC, FISHEYE, NARROW, Frame, detected, frame, off, rays_about, scattered, sky
 
+from startrack.frames import R_from_rotvec, wahba
 from startrack.identification import Identifier
-from startrack.identification.attitudes import AttitudeSearch, turns
+from startrack.identification.attitudes import AttitudeSearch
 from startrack.identification.index import Patterns
 from startrack.identification.matching import Light, Pairs, last_of_each
 from startrack.identification.pairs import build_pairs
 from startrack.identification.triangles import sides_of_few, triangles
 from startrack.identification.weak_cache import KeptPerObject
-from startrack.orient import rotation, wahba
 from startrack.types import NotIdentified
 
 
@@ -128,12 +128,12 @@ def test_turns_are_the_best_rotations() -> None:
     rng = np.random.default_rng(6)
     icrs = rng.normal(size=(5, 40, 3))
     icrs /= np.linalg.norm(icrs, axis=-1, keepdims=True)
-    R = rotation(np.array([0.3, -1.0, 0.7]))
+    R = R_from_rotvec(np.array([0.3, -1.0, 0.7]))
     cam = icrs @ R.T + rng.normal(0, 3e-4, icrs.shape)
     weights = rng.uniform(0.5, 2, (5, 40))
-    assert turns(cam * weights[..., None], icrs) == pytest.approx(wahba(cam, icrs, weights), abs=1e-12)
+    assert wahba(cam * weights[..., None], icrs) == pytest.approx(wahba(cam, icrs, weights), abs=1e-12)
     flat = icrs * [1, 1, 1e-3]
-    assert np.linalg.det(turns(flat @ R.T, flat)) == pytest.approx(1)
+    assert np.linalg.det(wahba(flat @ R.T, flat)) == pytest.approx(1)
 
 
 def test_facts_are_kept_per_object_and_forgotten_with_it() -> None:

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera, KannalaBrandt, Pinhole
-from startrack.camera.parameters import moved
-from startrack.orient import AttitudeFit, rotation, solve_attitude, wahba
+from startrack.camera.parameters import with_update
+from startrack.orient import AttitudeFit, solve_attitude
 from startrack.types import NotIdentified
 
 ARCSEC = np.pi / 648_000
@@ -72,35 +72,6 @@ def mean_nees(camera: Camera, n: int, draws: int = 100, **errors: float) -> floa
         nees.append(w @ np.linalg.solve(fit.attitude.covariance_rad2, w))
     assert len(nees) > 0.95 * draws
     return float(np.mean(nees))
-
-
-@pytest.mark.parametrize("n", [2, 3, 5, 100])
-def test_wahba_agrees_with_scipy(n: int) -> None:
-    rng = np.random.default_rng(n)
-    for _ in range(20):
-        R = Rotation.random(random_state=rng).as_matrix()
-        icrs, weights = random_rays(n, rng), rng.uniform(0.1, 5, n)
-        cam = icrs @ R.T + rng.normal(0, 1e-3, (n, 3))
-        cam /= np.linalg.norm(cam, axis=1, keepdims=True)
-        theirs = Rotation.align_vectors(cam, icrs, weights)[0].as_matrix()
-        assert wahba(cam, icrs, weights) == pytest.approx(theirs, abs=1e-9)
-
-
-def test_wahba_in_batches_and_never_a_mirror() -> None:
-    rng = np.random.default_rng(1)
-    icrs, weights = np.stack([random_rays(3, rng) for _ in range(50)]), np.ones((50, 3))
-    cam = icrs * [-1, 1, 1]  # a mirror image: the best proper rotation is asked for
-    batch = wahba(cam, icrs, weights)
-    assert np.linalg.det(batch) == pytest.approx(1.0)
-    each = [wahba(c, i, w) for c, i, w in zip(cam, icrs, weights, strict=True)]
-    assert batch == pytest.approx(np.array(each), abs=1e-12)
-    theirs = [Rotation.align_vectors(c, i)[0].as_matrix() for c, i in zip(cam, icrs, strict=True)]
-    assert batch == pytest.approx(np.array(theirs), abs=1e-6)
-
-
-@pytest.mark.parametrize("vector", [(0, 0, 0), (1e-9, 0, 0), (0.3, -0.2, 0.5), (3.0, 0.5, -0.2)])
-def test_rotation_vector_to_matrix(vector: tuple[float, float, float]) -> None:
-    assert rotation(np.array(vector)) == pytest.approx(Rotation.from_rotvec(vector).as_matrix(), abs=1e-15)
 
 
 @pytest.mark.parametrize("camera", [FISHEYE, NARROW], ids=lambda c: c.name)
@@ -205,7 +176,7 @@ def test_an_error_of_the_lens_that_the_camera_file_states_is_in_the_covariance()
         rng = np.random.default_rng([seed, 11])
         xy, centroids, rays, R = drawn(FISHEYE, 150, rng)
         error = dict(zip(order, rng.multivariate_normal(np.zeros(5), covariance), strict=True))
-        stated = replace(moved(FISHEYE, error), covariance_order=order, covariance=covariance)
+        stated = replace(with_update(FISHEYE, error), covariance_order=order, covariance=covariance)
         for camera, found in ((stated, nees), (replace(stated, covariance=None), blind)):
             attitude = solve_attitude(camera, xy, centroids, rays, R).attitude
             w = Rotation.from_matrix(R @ attitude.R_cam_icrs.T).as_rotvec()

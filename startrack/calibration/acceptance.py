@@ -12,7 +12,7 @@ from startrack.calibration.observations import Observations
 from startrack.calibration.region_growing import Joint
 from startrack.camera import Camera
 from startrack.camera.uncertainty import cap_grid
-from startrack.orient import rotation
+from startrack.frames import R_from_rotvec
 from startrack.types import Array, Ints
 
 FEWEST_MATCHES = 40
@@ -96,7 +96,7 @@ def log_chance(joint: Joint) -> float:
     found = sum(map(len, joint.matches))
     wrong = [
         sum(
-            len(match_frame(frame, camera, rotation(np.array([0.0, 0.3 * turn, turn])) @ R, within, joint.gate_px))
+            len(match_frame(frame, camera, R_from_rotvec(np.array([0.0, 0.3 * turn, turn])) @ R, within, joint.gate_px))
             for frame, R in zip(joint.frames, joint.fit.R_cam_icrs, strict=True)
         )
         for turn in TURNED_RAD
@@ -122,7 +122,7 @@ def gates(joint: Joint) -> tuple[Gate, ...]:
     cover = coverage(joint)
     rings = int(np.sum(cover.stars.sum(axis=1) >= STARS_PER_RING))
     sectors = int(np.sum(cover.stars.sum(axis=0) >= STARS_PER_SECTOR))
-    sigma = float(np.max(fit.camera.map_sigma_px(seen_rays(fit.camera))))
+    sigma = float(np.max(fit.camera.projection_sigma_px(seen_rays(fit.camera))))
     held = fit.held_out_rms_px
     handed = opposite_rms_px(joint)
     return (

@@ -86,7 +86,7 @@ def _gates(fit: LensFit, xy_px: Any, pictures: int) -> tuple[Gate, ...]:
     angle = camera.angle_rad(xy_px[fit.used])
     ring = np.clip((RINGS * angle / camera.calibrated_angle_rad).astype(int), 0, RINGS - 1)
     rings = int(np.sum(np.bincount(ring, minlength=RINGS) >= STARS_PER_RING))
-    sigma = float(np.max(camera.map_sigma_px(seen_rays(camera))))
+    sigma = float(np.max(camera.projection_sigma_px(seen_rays(camera))))
     used, held = int(fit.used.sum()), fit.held_out_rms_px
     tilt = "more pictures: the board tilted by 30 degrees and more, near and far, and in every corner of the image"
     return (

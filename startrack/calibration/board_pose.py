@@ -12,7 +12,7 @@ from startrack.calibration.observations import Observations
 from startrack.calibration.solve import State
 from startrack.camera import Camera
 from startrack.camera.uncertainty import lens_jacobian
-from startrack.orient import rotation
+from startrack.frames import R_from_rotvec, nearest_rotation
 from startrack.types import Array, NotIdentified
 
 IMAGES_TRIED = 4
@@ -47,7 +47,7 @@ class BoardState(State):
     def stepped(self, free: tuple[str, ...], lens: Array, turns_rad: Array) -> BoardState:
         """The state after a step; `turns_rad` (images, 6): turns [rad] and shifts [squares]."""
         turned = super().stepped(free, lens, turns_rad[:, :3])
-        R = np.stack([rotation(w) for w in turns_rad[:, :3]])
+        R = R_from_rotvec(turns_rad[:, :3])
         place = np.einsum("nij,nj->ni", R, self.place) + turns_rad[:, 3:]
         return replace(self, camera=turned.camera, R_cam_icrs=turned.R_cam_icrs, place=place)
 
@@ -106,6 +106,4 @@ def _pose(rays: Array, places: Array) -> tuple[Array, Array]:
     H = H if np.sum(rays * (flat @ H.T)) > 0 else -H  # the board is where the rays point, not behind
     scale = 2.0 / (np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1]))
     first, second = H[:, 0] * scale, H[:, 1] * scale
-    u, _, vt = np.linalg.svd(np.stack([first, second, np.cross(first, second)], axis=1))
-    R = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return R, H[:, 2] * scale
+    return nearest_rotation(np.stack([first, second, np.cross(first, second)], axis=1)), H[:, 2] * scale

@@ -12,7 +12,7 @@ from startrack.calibration.lens_models import MOST_ORDERS, Candidate, Model, bes
 from startrack.calibration.observations import Observations
 from startrack.calibration.solve import Solution, State, mean_scatter_px2, scatter_px2, solve
 from startrack.camera import Camera
-from startrack.camera.parameters import written
+from startrack.camera.parameters import with_covariance
 from startrack.types import Array, Bools, NotIdentified
 
 FEWEST = 12
@@ -119,7 +119,7 @@ def _finished(
     reached = min(reach_rad(off_axis[used]), top)
     camera = replace(fitted, calibrated_angle_rad=reached, max_angle_rad=max(min(fitted.max_angle_rad, top), reached))
     return LensFit(
-        camera=written(camera, model.free, last.normal.lens_covariance),
+        camera=with_covariance(camera, model.free, last.normal.lens_covariance),
         R_cam_icrs=last.state.R_cam_icrs,
         turn_covariance_rad2=last.normal.turn_covariance,
         residual_px=residual,

@@ -10,8 +10,7 @@ import numpy as np
 from startrack.calibration.observations import Observations
 from startrack.calibration.solve import State
 from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole
-from startrack.frames import angle_between_rad
-from startrack.orient import wahba
+from startrack.frames import angle_between_rad, wahba
 from startrack.types import Array, Ints, NotIdentified
 
 PAIRS_OF = 80

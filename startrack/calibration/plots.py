@@ -96,7 +96,7 @@ def _sigma(axes: Axes, camera: Camera) -> None:
     x, y = np.meshgrid(np.linspace(0, width - 1, MAP_SIDE), np.linspace(0, height - 1, MAP_SIDE * height // width))
     rays = camera.unproject(np.stack([x, y], axis=-1))
     inside = camera.angle_rad(np.stack([x, y], axis=-1)) <= camera.calibrated_angle_rad
-    sigma: Array = np.ma.masked_where(~inside, camera.map_sigma_px(rays))
+    sigma: Array = np.ma.masked_where(~inside, camera.projection_sigma_px(rays))
     drawn = axes.imshow(sigma, extent=(-0.5, width - 0.5, height - 0.5, -0.5), cmap="viridis", interpolation="bilinear")
     axes.figure.colorbar(drawn, ax=axes, shrink=0.85, label="px per axis")
     axes.set_title("Map sigma inside the calibrated radius, attitude free", fontsize=11)

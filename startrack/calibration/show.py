@@ -42,7 +42,7 @@ def by_angle(camera: Camera, angle_rad: Array) -> tuple[Array, Array, Array]:
         ],
         axis=-1,
     )
-    sigma = np.sqrt(np.mean(np.square(camera.map_sigma_px(rays)), axis=1))
+    sigma = np.sqrt(np.mean(np.square(camera.projection_sigma_px(rays)), axis=1))
     radius = np.sqrt(np.prod(camera.focal_px)) * camera.lens.rho(angle_rad)
     return radius, np.degrees(camera.mean_scale_rad_per_px(np.maximum(angle_rad, 1e-6))) * 60.0, sigma
 

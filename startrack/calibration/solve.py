@@ -10,8 +10,8 @@ import numpy as np
 from startrack.calibration.normal import Normal, Terms
 from startrack.calibration.observations import Observations
 from startrack.camera import Camera
-from startrack.camera.parameters import moved
-from startrack.orient import rotation
+from startrack.camera.parameters import with_update
+from startrack.frames import R_from_rotvec
 from startrack.types import Array
 
 ROUNDS = 40
@@ -44,8 +44,10 @@ class State:
 
     def stepped(self, free: tuple[str, ...], lens: Array, turns_rad: Array) -> State:
         """The state after a step of the free parameters (m,) and of the attitudes (images, 3)."""
-        turned = np.stack([rotation(w) for w in turns_rad]) @ self.R_cam_icrs
-        return replace(self, camera=moved(self.camera, dict(zip(free, lens.tolist(), strict=True))), R_cam_icrs=turned)
+        turned = R_from_rotvec(turns_rad) @ self.R_cam_icrs
+        return replace(
+            self, camera=with_update(self.camera, dict(zip(free, lens.tolist(), strict=True))), R_cam_icrs=turned
+        )
 
 
 def project_freely(camera: Camera, rays_cam: Array) -> Array:

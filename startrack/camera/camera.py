@@ -174,7 +174,7 @@ class Camera:
         """Geometric-mean angular size [rad] of one pixel at the angles off the axis [rad]."""
         return np.sqrt(self.pixel_solid_angle_sr(angle_rad))
 
-    def map_sigma_px(self, rays_cam: Array) -> Array:
+    def projection_sigma_px(self, rays_cam: Array) -> Array:
         """Error per axis [px] (...) of the map at the rays (..., 3), from the covariance; 0 where there is none.
 
         The part that a rotation of the camera would undo is left out: the attitude, found with this map, takes it up.

@@ -14,7 +14,7 @@ from startrack.types import Array
 LOCKED_1 = 1e-7  # relative: fx and fy of square pixels, apart just enough that the matrix has an inverse
 
 
-def moved(camera: Camera, by: dict[str, float]) -> Camera:
+def with_update(camera: Camera, by: dict[str, float]) -> Camera:
     """The camera with its parameters changed: f (both focal lengths), fx, fy, cx, cy, k1 ... k4, p1, p2."""
     fx, fy = camera.focal_px
     stretched = 1.0 + by.get("f", 0.0) / fx
@@ -31,7 +31,7 @@ def moved(camera: Camera, by: dict[str, float]) -> Camera:
     return replace(camera, focal_px=focal, centre_px=centre, lens=lens, decentring=bent)
 
 
-def written(camera: Camera, free: tuple[str, ...], covariance: Array) -> Camera:
+def with_covariance(camera: Camera, free: tuple[str, ...], covariance: Array) -> Camera:
     """The camera with the covariance (m, m) of its free parameters, fx and fy each by itself."""
     if free[0] == "fx":
         return replace(camera, covariance_order=free, covariance=0.5 * (covariance + covariance.T))

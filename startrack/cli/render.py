@@ -166,8 +166,7 @@ def _render_one(args: argparse.Namespace, series: Series, number: int, image: Pa
 
 
 def _pose(scene: Scene, truth: Truth) -> dict[str, Any]:
-    from startrack.frames import format_utc
-    from startrack.frames.body_angles import heading_pitch_roll_from_R_body_enu
+    from startrack.frames import format_utc, heading_pitch_roll_from_R_body_enu
 
     heading, pitch, roll = heading_pitch_roll_from_R_body_enu(scene.camera.R_body_cam @ scene.R_cam_enu)
     assert scene.time_utc is not None

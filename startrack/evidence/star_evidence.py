@@ -101,7 +101,9 @@ class StarEvidence:
         angle = np.arctan2(np.hypot(rays_cam[:, 0], rays_cam[:, 1]), rays_cam[:, 2])
         expected = scale.flux_e(stars.v_mag[star], angle, camera)
         # Light is lost from a misplaced profile. The rays themselves owe nothing to the lens: they are the catalogue's.
-        misplaced2 = place_sigma_px**2 + (np.square(camera.map_sigma_px(rays_cam)) if camera.covariance_order else 0.0)
+        misplaced2 = place_sigma_px**2 + (
+            np.square(camera.projection_sigma_px(rays_cam)) if camera.covariance_order else 0.0
+        )
         blur = misplaced2 / (2 * sigma_px) ** 2
         fraction = np.sqrt(scale.scatter**2 + np.square(0.4 * np.log(10) * stars.v_sigma_mag[star]) + blur**2)
         cause = _unusable(xy, angle, camera, bodies, R_cam_icrs, half_width(sigma_px))

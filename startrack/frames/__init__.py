@@ -3,7 +3,6 @@
 `icrs` -> (R_enu_icrs) -> `enu` of a site. Importing this is light; SPICE and ERFA load when they are first needed.
 """
 
-from startrack.frames.observer import R_enu_icrs, observer_state, observer_velocity_m_s
 from startrack.frames.rays import (
     SPEED_OF_LIGHT_M_S,
     aberrate,
@@ -12,13 +11,24 @@ from startrack.frames.rays import (
     rays_from_azel,
     refract_rad,
 )
-from startrack.frames.rotations import R_from_quat_xyzw, quat_xyzw_from_R
+from startrack.frames.rotations import (
+    R_body_enu_from_heading_pitch_roll,
+    R_from_quat_xyzw,
+    R_from_rotvec,
+    heading_pitch_roll_from_R_body_enu,
+    nearest_rotation,
+    quat_xyzw_from_R,
+    wahba,
+)
 from startrack.frames.site import (
     MOON_RADIUS_M,
     R_enu_fixed,
+    R_enu_icrs,
     Site,
     enu_from_latlon,
     latlon_from_enu,
+    observer_state,
+    observer_velocity_m_s,
     position_fixed_m,
 )
 from startrack.frames.spice import R_mcmf_icrs, barycentric_state, et_s
@@ -27,9 +37,11 @@ from startrack.frames.time import as_utc, format_utc, parse_utc
 __all__ = [
     "MOON_RADIUS_M",
     "SPEED_OF_LIGHT_M_S",
+    "R_body_enu_from_heading_pitch_roll",
     "R_enu_fixed",
     "R_enu_icrs",
     "R_from_quat_xyzw",
+    "R_from_rotvec",
     "R_mcmf_icrs",
     "Site",
     "aberrate",
@@ -40,7 +52,9 @@ __all__ = [
     "enu_from_latlon",
     "et_s",
     "format_utc",
+    "heading_pitch_roll_from_R_body_enu",
     "latlon_from_enu",
+    "nearest_rotation",
     "observer_state",
     "observer_velocity_m_s",
     "parse_utc",
@@ -48,4 +62,5 @@ __all__ = [
     "quat_xyzw_from_R",
     "rays_from_azel",
     "refract_rad",
+    "wahba",
 ]

@@ -1,4 +1,9 @@
-"""Quaternions, for the file edge only: order x, y, z, w (SciPy, ROS); inside the library rotations are matrices."""
+"""Rotations: from vectors, from matched directions, as quaternions, and as heading, pitch and roll of the rover.
+
+Inside the library a rotation is a matrix R_to_from. Quaternions belong to files: order x, y, z, w (SciPy, ROS).
+Body axes: x forward, y left, z up. Heading is the azimuth of body x (from north through east); pitch is nose up
+positive; roll is right side down positive.
+"""
 
 from __future__ import annotations
 
@@ -7,43 +12,91 @@ from numpy.typing import ArrayLike
 
 from startrack.types import Array
 
+GIMBAL_LOCK_SIN = 1e-9  # body x this close to the vertical: heading and roll turn about the same axis
+ORTHONORMAL_1 = 1e-6  # largest error of R R^T that still counts as a rotation matrix
+
+
+def R_from_rotvec(rotvec_rad: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) = exp([w]x) of the rotation vectors w (..., 3) [rad]."""
+    from scipy.spatial.transform import Rotation
+
+    w = np.asarray(rotvec_rad, dtype=float)
+    return Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix().reshape(*w.shape[:-1], 3, 3)
+
+
+def nearest_rotation(profile: Array) -> Array:
+    """The rotations R (..., 3, 3) that maximise trace(R^T profile) for the matrices `profile` (..., 3, 3).
+
+    With profile = sum w to from^T this is the solution of Wahba's problem.
+    Source: Markley 1988, J. Astronaut. Sci. 36, 245 (singular value decomposition of the attitude profile matrix).
+    """
+    u, _, vt = np.linalg.svd(profile)
+    u[..., 2] *= np.linalg.det(u @ vt)[..., None]
+    return np.asarray(u @ vt)
+
+
+def wahba(rays_to: Array, rays_from: Array, weights: Array | None = None) -> Array:
+    """R_to_from (..., 3, 3) that minimises sum w |rays_to - R rays_from|^2 over the rays (..., n, 3).
+
+    Weights (..., n) default to 1. Poorly determined where all rays have nearly the same direction.
+    """
+    weighted = rays_to if weights is None else np.asarray(weights)[..., None] * rays_to
+    return nearest_rotation(np.swapaxes(weighted, -1, -2) @ rays_from)
+
 
 def quat_xyzw_from_R(R: ArrayLike) -> Array:
     """Unit quaternion (4,) x, y, z, w of the rotation matrix R (3, 3), such that R_from_quat_xyzw gives R back.
 
     Of the two signs the one with w > 0; at w = 0 the first component that is not zero is positive (SciPy's canonical
-    form). The largest component is found first, so that no angle is weak (Shepperd 1978, J. Guidance 1, 223).
+    form).
 
     Raises:
         ValueError: R is not a proper rotation (orthonormal to 1e-6, determinant +1).
     """
+    from scipy.spatial.transform import Rotation
+
     m = np.asarray(R, dtype=float)
-    if m.shape != (3, 3) or not np.allclose(m @ m.T, np.eye(3), atol=1e-6) or np.linalg.det(m) < 0:
+    if m.shape != (3, 3) or not np.allclose(m @ m.T, np.eye(3), atol=ORTHONORMAL_1) or np.linalg.det(m) < 0:
         raise ValueError("not a rotation matrix")
-    x, y, z = np.diag(m)
-    # Four times the outer product of the quaternion with itself; its longest row is the quaternion, scaled.
-    outer = np.array([
-        [1 + x - y - z, m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[2, 1] - m[1, 2]],
-        [m[0, 1] + m[1, 0], 1 - x + y - z, m[1, 2] + m[2, 1], m[0, 2] - m[2, 0]],
-        [m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1 - x - y + z, m[1, 0] - m[0, 1]],
-        [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], 1 + x + y + z],
-    ])  # fmt: skip
-    row = outer[np.argmax(np.diag(outer))]
-    q = row / np.linalg.norm(row)
-    leading = next(component for component in (q[3], q[0], q[1], q[2]) if component != 0)
-    return q if leading > 0 else -q
+    return Rotation.from_matrix(m).as_quat(canonical=True)
 
 
 def R_from_quat_xyzw(quat_xyzw: ArrayLike) -> Array:
-    """Rotation matrix (3, 3) of the quaternion (4,) x, y, z, w; its length is divided out.
+    """Rotation matrix (3, 3) of the quaternion (4,) x, y, z, w, which need not be of unit length.
 
     Raises:
         ValueError: not four finite numbers, or all of them zero.
     """
+    from scipy.spatial.transform import Rotation
+
     q = np.asarray(quat_xyzw, dtype=float)
     if q.shape != (4,) or not np.isfinite(q).all() or not q.any():
         raise ValueError(f"not a quaternion: {quat_xyzw!r}")
-    v, w = q[:3], q[3]
-    x, y, z = v
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return ((w * w - v @ v) * np.eye(3) + 2 * np.outer(v, v) + 2 * w * cross) / (q @ q)
+    return Rotation.from_quat(q / np.abs(q).max()).as_matrix()
+
+
+def R_body_enu_from_heading_pitch_roll(heading_rad: float, pitch_rad: float, roll_rad: float) -> Array:
+    """Rotation (3, 3) from enu to body: its rows are body x, y, z (forward, left, up) in enu.
+
+    Yaw (pi/2 - heading), pitch (-pitch) and roll about the body's z, y and x axes, as in ROS REP 103.
+    """
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_euler("ZYX", [np.pi / 2 - heading_rad, -pitch_rad, roll_rad]).as_matrix().T
+
+
+def heading_pitch_roll_from_R_body_enu(R_body_enu: ArrayLike) -> tuple[float, float, float]:
+    """Heading in [0, 2 pi), pitch in [-pi/2, pi/2] and roll in (-pi, pi] of the rotation (3, 3) [rad].
+
+    Inverse of R_body_enu_from_heading_pitch_roll. With the nose straight up or down only the sum of heading and roll
+    is defined: roll is then given as 0.
+    """
+    forward, left, up = np.asarray(R_body_enu, dtype=float)
+    level = np.hypot(forward[0], forward[1])
+    pitch = np.arctan2(forward[2], level)
+    if level < GIMBAL_LOCK_SIN:
+        heading, roll = np.arctan2(left[1], -left[0]), 0.0
+    else:
+        heading, roll = np.arctan2(forward[0], forward[1]), np.arctan2(left[2], up[2])
+    heading = heading % (2 * np.pi)
+    return float(heading if heading < 2 * np.pi else 0.0), float(pitch), float(roll)

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from startrack.frames import wahba
 from startrack.identification.index import Near, PatternIndex, Patterns
 from startrack.identification.scale import Scale
 from startrack.identification.triangles import sides_of_few, triangles
@@ -137,10 +138,10 @@ class AttitudeSearch:
     def _sifted(self, cam: Array, icrs: Array, some: Array, radius: float, depth: int) -> Iterator[Array]:
         """R_cam_icrs of the closest match, which is nearly always right; then those that some detections support."""
         if len(cam):
-            yield turns(cam[0], icrs[0])
+            yield wahba(cam[0], icrs[0])
         tree = self.patterns.tree(depth)
         for start in range(1, len(cam), AT_ONCE):
-            R = turns(cam[start : start + AT_ONCE], icrs[start : start + AT_ONCE])
+            R = wahba(cam[start : start + AT_ONCE], icrs[start : start + AT_ONCE])
             distance = tree.query(some @ R, distance_upper_bound=radius)[0]
             hits = np.count_nonzero(distance < radius, axis=1)
             best = np.argsort(-hits, kind="stable")
@@ -153,14 +154,3 @@ class AttitudeSearch:
 
         odds: Array = self.tried * betainc(further, rays - GIVEN + 1 - further, min(depth * radius**2 / 4, 1.0))
         return odds
-
-
-def turns(cam: Array, icrs: Array) -> Array:
-    """Rotations (..., 3, 3) that turn the rays icrs (..., n, 3) best to cam (..., n, 3), which may be weighted.
-
-    Source: Markley 1988, J. Astronaut. Sci. 36, 245 (singular value decomposition of the attitude profile matrix).
-    """
-    u, _, vt = np.linalg.svd(np.swapaxes(cam, -1, -2) @ icrs)
-    u[..., 2] *= np.linalg.det(u @ vt)[..., None]
-    turned: Array = u @ vt
-    return turned

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.camera.parameters import moved, written
+from startrack.camera.parameters import with_covariance, with_update
 from startrack.camera.uncertainty import lens_jacobian
-from startrack.orient import OUTLIER_CHI2, extra_variance_px2, rotation, tapered
+from startrack.frames import R_from_rotvec
+from startrack.orient import OUTLIER_CHI2, extra_variance_px2, tapered
 from startrack.types import Array
 
 ROUNDS = 12
@@ -49,8 +50,8 @@ def fitted_jointly(
         normal = np.einsum("nia,nij,njb->ab", jacobian, weight, jacobian) + prior
         right = np.einsum("nia,nij,nj->a", jacobian, weight, residual) - prior @ gone
         step = _solved(normal, right[:, None])[:, 0]
-        R = rotation(step[:3]) @ R
-        known = moved(known, dict(zip(free, step[3:].tolist(), strict=True)))
+        R = R_from_rotvec(step[:3]) @ R
+        known = with_update(known, dict(zip(free, step[3:].tolist(), strict=True)))
         gone[3:] += step[3:]
         if np.abs(jacobian @ step).max() < SETTLED_PX:
             break
@@ -61,7 +62,7 @@ def fitted_jointly(
         max_angle_rad=min(camera.max_angle_rad, top),
         calibrated_angle_rad=min(camera.calibrated_angle_rad, top),
     )
-    return Joint(written(within, free, covariance), R)
+    return Joint(with_covariance(within, free, covariance), R)
 
 
 def _sigmas(camera: Camera, free: tuple[str, ...]) -> Array:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.identification.attitudes import Turned, turns
+from startrack.frames import wahba
+from startrack.identification.attitudes import Turned
 from startrack.identification.index import Patterns
 from startrack.identification.matching import Light, Pairs, middle
 from startrack.identification.scale import scale_of
@@ -50,7 +51,7 @@ class Refiner:
     def __call__(self, turned: Turned) -> Found | None:
         """From the bright stars that lie on detections at a rough attitude; None where they do not hold."""
         d, stars, scale = self.detections, self.patterns.stars, scale_of(self.camera)
-        R = turns(self.rays_cam[turned.detection], stars.rays_icrs[turned.star])
+        R = wahba(self.rays_cam[turned.detection], stars.rays_icrs[turned.star])
         light = Light.of(d.flux_e, d.saturated, stars.v_mag[turned.star], turned.detection)
         limit, bright = np.searchsorted(stars.v_mag, [light.limit_mag, light.certain_mag]).tolist()
         near = turned.near
@@ -73,7 +74,7 @@ class Refiner:
             used = matched[agree]
             if len(used) < FEWEST:
                 return None
-            better = turns(self.rays_cam[detection[used]] / variance[agree][:, None], rays_icrs[used])
+            better = wahba(self.rays_cam[detection[used]] / variance[agree][:, None], rays_icrs[used])
             moved_px = np.abs(better - R).max() / scale.on_axis
             if moved_px < SETTLED_PX:
                 break

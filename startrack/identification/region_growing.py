@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole
+from startrack.frames import R_from_rotvec
 from startrack.identification.radial_lens_family import PINHOLE, Family
-from startrack.orient import rotation
 from startrack.types import Array, Ints
 
 STEPS = 3  # of Gauss-Newton for one set of matches
@@ -165,7 +165,7 @@ def _base_and_jacobian(
     One projection gives those of the rotation; scale and centre need none, only the lens's shape does.
     """
     camera, turned = moved(p)
-    nudged = [rotation(p[:3] + NUDGE * axis) @ R for axis in np.eye(3)]
+    nudged = [R_from_rotvec(p[:3] + NUDGE * axis) @ R for axis in np.eye(3)]
     rays = rays_icrs @ np.stack([turned, *nudged]).transpose(0, 2, 1)
     px, _ = camera.project(rays)
     base = px[0]
@@ -213,7 +213,7 @@ def _mover(camera: Camera, R: Array, free: tuple[str, ...]) -> Callable[[Array],
                 centre = (centre[0] + rest.pop(0) * camera.focal_px[0], centre[1] + rest.pop(0) * camera.focal_px[0])
             else:
                 lens = KannalaBrandt(tuple(k + rest.pop(0) for k in lens.k))
-        return replace(camera, focal_px=(focal, focal), centre_px=centre, lens=lens), rotation(p[:3]) @ R
+        return replace(camera, focal_px=(focal, focal), centre_px=centre, lens=lens), R_from_rotvec(p[:3]) @ R
 
     return moved
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole
-from startrack.orient import rotation
+from startrack.frames import R_from_rotvec
 from startrack.types import Array, Bools, Ints
 
 LONGEST_STEP = 0.1
@@ -59,7 +59,7 @@ class View:
             step = np.clip(step, -LONGEST_STEP, LONGEST_STEP)
             view = replace(
                 view,
-                R_cam_icrs=rotation(step[:3]) @ view.R_cam_icrs,
+                R_cam_icrs=R_from_rotvec(step[:3]) @ view.R_cam_icrs,
                 focal_px=float(view.focal_px * np.exp(step[3])),
                 bend=view.bend + float(step[4]) if bend else view.bend,
             )

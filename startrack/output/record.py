@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from startrack import __version__
-from startrack.frames import format_utc, latlon_from_enu, quat_xyzw_from_R
-from startrack.frames.body_angles import heading_pitch_roll_from_R_body_enu
+from startrack.frames import format_utc, heading_pitch_roll_from_R_body_enu, latlon_from_enu, quat_xyzw_from_R
 from startrack.types import Array, Exposure, Fix
 
 if TYPE_CHECKING:

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from startrack.frames import format_utc, latlon_from_enu
-from startrack.frames.body_angles import heading_pitch_roll_from_R_body_enu
+from startrack.frames import format_utc, heading_pitch_roll_from_R_body_enu, latlon_from_enu
 from startrack.output.record import (
     ARCSEC_PER_RAD,
     STAGES,

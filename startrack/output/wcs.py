@@ -13,8 +13,7 @@ import numpy as np
 
 from startrack import __version__
 from startrack.camera import Camera, Decentring
-from startrack.frames import Site, aberrate, format_utc, observer_velocity_m_s
-from startrack.orient import wahba
+from startrack.frames import Site, aberrate, format_utc, observer_velocity_m_s, wahba
 from startrack.output.fits_blocks import Card, header_block, table_file
 from startrack.types import Array
 
@@ -110,7 +109,7 @@ def _R_cam_still(result: Result) -> Array:
         return result.attitude.R_cam_icrs
     rays_cam = camera.unproject(_grid(camera))
     still = aberrate(rays_cam @ result.attitude.R_cam_icrs, -velocity)
-    return wahba(rays_cam, still, np.ones(len(rays_cam)))
+    return wahba(rays_cam, still)
 
 
 def _grid(camera: Camera) -> Array:

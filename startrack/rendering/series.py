@@ -11,8 +11,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.catalog.bodies import bodies
-from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
-from startrack.frames.body_angles import R_body_enu_from_heading_pitch_roll
+from startrack.frames import R_body_enu_from_heading_pitch_roll, R_enu_icrs, Site, observer_velocity_m_s
 from startrack.rendering.defects import draw_hot_pixels
 from startrack.rendering.field_stars import draw_field_stars, draw_v_errors, joined
 from startrack.rendering.scene import Scene

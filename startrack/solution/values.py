@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from startrack.frames import latlon_from_enu
-from startrack.frames.body_angles import heading_pitch_roll_from_R_body_enu
+from startrack.frames import heading_pitch_roll_from_R_body_enu, latlon_from_enu
 from startrack.output.record import ARCSEC_PER_RAD, R_body_enu, boresight_rad, lens_errors_known
 
 if TYPE_CHECKING:

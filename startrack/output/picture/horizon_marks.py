@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.frames import azel_from_rays, rays_from_azel
-from startrack.frames.body_angles import heading_pitch_roll_from_R_body_enu
+from startrack.frames import azel_from_rays, heading_pitch_roll_from_R_body_enu, rays_from_azel
 from startrack.output.picture.backdrop import View
 from startrack.output.picture.canvas import Canvas, around
 from startrack.output.picture.palette import DIM_INK, FAINT_INK, INK, SKYLINE

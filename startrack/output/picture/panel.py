@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from startrack.frames import latlon_from_enu
-from startrack.frames.body_angles import heading_pitch_roll_from_R_body_enu
+from startrack.frames import heading_pitch_roll_from_R_body_enu, latlon_from_enu
 from startrack.output.picture.canvas import Box, Canvas, text_width, wrapped
 from startrack.output.picture.minimap import draw_leaders, draw_overview, draw_zoom
 from startrack.output.picture.palette import (

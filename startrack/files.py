@@ -1,14 +1,26 @@
-"""Where the shipped catalogues, cameras and terrains lie, in a wheel as in a checkout; and folders for results."""
+"""Shipped files by name, folders for results, atomic writes and file locks."""
 
 from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from uuid import uuid4
 
 from startrack.errors import BadInput
 
 PACKAGE = Path(__file__).resolve().parent
+FilePath = str | os.PathLike[str]
+
+
+class Locked(Exception):
+    """Another process holds the lock. `owner` is its process number as text, "unknown" if it cannot be read."""
+
+    def __init__(self, owner: str) -> None:
+        super().__init__(f"process {owner} holds the lock")
+        self.owner = owner
 
 
 def data_dir(kind: str) -> Path:
@@ -20,14 +32,17 @@ def data_dir(kind: str) -> Path:
     return inside if inside.is_dir() else PACKAGE.parent / kind
 
 
-def is_path(name_or_path: str | Path) -> bool:
-    """Whether a user's word means a path (it ends in .toml or contains a separator) rather than a shipped name."""
-    text = str(name_or_path)
-    return text.endswith(".toml") or "/" in text or os.sep in text
+def is_path(reference: FilePath) -> bool:
+    """Whether a camera's or terrain's `reference` is a path; otherwise it is the name of a shipped file.
+
+    A path ends in .toml or contains a separator: "/", or "\\" as written on Windows.
+    """
+    text = os.fspath(reference)
+    return text.endswith(".toml") or "/" in text or "\\" in text
 
 
 def resolve_named(name_or_path: str | Path, kind: str, reason: str) -> Path:
-    """Path of a user's file or of a shipped one. Raises BadInput `reason` where there is none."""
+    """Path of a user's file or of a shipped one. Raises BadInput `reason` if there is no such file."""
     if is_path(name_or_path):
         path = Path(name_or_path)
         if not path.is_file():
@@ -40,10 +55,10 @@ def resolve_named(name_or_path: str | Path, kind: str, reason: str) -> Path:
     return path
 
 
-def made_folder(folder: str | Path, reason: str = "bad_image") -> Path:
-    """A folder for results, made and found to take files before anything is computed.
+def make_folder(folder: FilePath, reason: str = "bad_image") -> Path:
+    """Make a folder for results and check that files can be written there, before anything is computed.
 
-    Raises BadInput (bad_image, for lack of a better code) where nothing can be written there.
+    Raises BadInput `reason` if they cannot.
     """
     path = Path(folder)
     try:
@@ -55,3 +70,85 @@ def made_folder(folder: str | Path, reason: str = "bad_image") -> Path:
             reason, f"{path}: results cannot be written to this folder ({cause.strerror}): choose another"
         ) from cause
     return path
+
+
+def printable(name: FilePath) -> str:
+    """A file's name as one line of text for messages: undecodable bytes are escaped, white space is one blank."""
+    return " ".join(os.fspath(name).encode("utf-8", "backslashreplace").decode().split())
+
+
+@contextmanager
+def atomic_file(path: FilePath) -> Iterator[Path]:
+    """A temporary path in the folder of `path`, renamed to it at the end of the block, removed after an exception.
+
+    Missing folders are made. Raises OSError, and ValueError for a name that the system cannot take.
+    """
+    target = Path(path)
+    # In the same folder, because a rename does not cross file systems; tempfile would make the file private.
+    temporary = target.with_name(f".{uuid4().hex}.part")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        yield temporary
+        os.replace(temporary, target)
+    finally:
+        with suppress(OSError):  # renamed already; and a failed clean-up must not hide the cause
+            temporary.unlink()
+
+
+def write_atomically(path: FilePath, data: bytes, *, overwrite: bool, reason: str = "bad_image") -> None:
+    """Write a file that appears under its name only when it is complete; missing folders are made.
+
+    Raises BadInput `reason` if the file exists and not `overwrite`, or if it cannot be written.
+    """
+    check_free(path, overwrite=overwrite, reason=reason)
+    try:
+        with atomic_file(path) as temporary, temporary.open("xb") as file:
+            file.write(data)
+    except (OSError, ValueError) as error:
+        cause = getattr(error, "strerror", None) or error
+        raise BadInput(reason, f"{printable(path)}: cannot be written ({cause})") from error
+
+
+def check_free(path: FilePath, *, overwrite: bool, reason: str = "bad_image") -> None:
+    """Raise BadInput `reason` if the file exists and may not be replaced."""
+    if not overwrite and os.path.lexists(path):
+        raise BadInput(reason, f"{printable(path)}: exists already, and overwriting was not asked for")
+
+
+@contextmanager
+def locked(path: FilePath, *, wait: bool = True, on_wait: Callable[[], None] | None = None) -> Iterator[None]:
+    """Hold the lock file `path` for the length of the block; the system releases it if the process is killed.
+
+    With `wait`, wait for another holder, after one call of `on_wait`; otherwise raise Locked. The lock works between
+    processes of one machine, and on a shared file system as far as that supports locks. Raises OSError if the lock
+    file cannot be made.
+    """
+    from filelock import FileLock, Timeout
+
+    file = Path(path)
+    lock = FileLock(file, thread_local=False)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        if not wait:
+            raise Locked(_owner(file)) from None
+        if on_wait is not None:
+            on_wait()
+        lock.acquire()
+    try:
+        with suppress(OSError):
+            file.write_text(str(os.getpid()), encoding="ascii")
+        yield
+    finally:
+        with suppress(OSError):  # Windows keeps open files; a file that is left behind locks nobody out
+            file.unlink()
+        lock.release()
+
+
+def _owner(lock_file: Path) -> str:
+    """The number of the process that holds a lock."""
+    try:
+        text = lock_file.read_text(encoding="ascii").strip()
+    except (OSError, ValueError):
+        return "unknown"
+    return text if text.isdecimal() else "unknown"

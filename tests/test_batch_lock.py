@@ -10,12 +10,16 @@ import sys
 import pytest
 from batch_helpers import frames
 
-from startrack.batch import only_writer
-from startrack.batch.lock import LOCK
+from startrack.batch import LOCK, only_writer
 from startrack.cli.main import main
 from startrack.errors import BadInput
 
-HOLD = "import sys; from startrack.batch import only_writer\nwith only_writer(sys.argv[1]): print(flush=True); input()"
+HOLD = """
+import sys
+from pathlib import Path
+from startrack.batch import only_writer
+with only_writer(Path(sys.argv[1])): print(flush=True); input()
+"""
 
 
 def holder(out) -> subprocess.Popen[str]:
@@ -50,3 +54,16 @@ def test_a_lock_goes_with_a_killed_process(tmp_path):
         with pytest.raises(BadInput, match=f"process {os.getpid()}"), only_writer(tmp_path):
             pass
     assert not (tmp_path / LOCK).exists()
+
+
+@pytest.mark.parametrize("kind", ["folder", "symlink"])
+def test_a_lock_file_of_another_kind_is_bad_input(tmp_path, kind):
+    target = tmp_path / "target"
+    target.write_text("not ours")
+    if kind == "folder":
+        (tmp_path / LOCK).mkdir()
+    else:
+        (tmp_path / LOCK).symlink_to(target)
+    with pytest.raises(BadInput, match="cannot be used as lock file"), only_writer(tmp_path):
+        pass
+    assert target.read_text() == "not ours"

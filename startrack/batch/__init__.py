@@ -1,15 +1,24 @@
 """Whole folders of images: found, located side by side, taken up again, and gathered into tables."""
 
 from startrack.batch.find import Image, images_under, named_images
-from startrack.batch.lock import only_writer
 from startrack.batch.rows import Rows, gist, rows_of
 from startrack.batch.run import Batch, Counts
-from startrack.batch.store import JOB, in_the_tables, is_of_other_images, printable, result_of, stored
+from startrack.batch.store import (
+    JOB,
+    LOCK,
+    in_the_tables,
+    is_of_other_images,
+    only_writer,
+    printable,
+    result_of,
+    stored,
+)
 from startrack.batch.tables import write_tables
 from startrack.batch.task import BatchStopped, Task, locate_image
 
 __all__ = [
     "JOB",
+    "LOCK",
     "Batch",
     "BatchStopped",
     "Counts",

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from startrack.batch.find import Image
 from startrack.batch.fingerprint import sha256_of
+from startrack.errors import BadInput
+from startrack.files import Locked, locked
 from startrack.output.write import COMPANIONS
 
 JOB = "job_sha256"  # what a result was made from: content of all its files, flags, version; null: to be done again
 INPUTS = "inputs"  # camera and terrain files that the result was made with: path from the image to SHA-256
 MANIFEST = "manifest.json"
+LOCK = ".startrack-batch.lock"
 RESULT = "result"  # in the manifest: path of NAME.fix.json within the folder; null where that is an earlier solution
 SOLVED = ("ok", "ambiguous")
 PICTURE = ".annotated.png"
@@ -22,6 +26,25 @@ NEEDED = {  # by the tables, of a record that is ok
     "attitude": ("quat_xyzw_body_enu", "quat_xyzw_cam_icrs", "sigma_arcsec"),
     "provenance": ("time_utc", "image_sha256"),
 }
+
+
+@contextmanager
+def only_writer(out: Path) -> Iterator[None]:
+    """Lock a folder of results against other batches.
+
+    Raises BadInput (bad_image) if another batch writes to it, or if the lock file cannot be used.
+    """
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(locked(out / LOCK, wait=False))
+        except Locked as cause:
+            raise BadInput(
+                "bad_image",
+                f"another batch is writing to {out} (process {cause.owner}): wait for it, or choose another -D",
+            ) from cause
+        except OSError as cause:
+            raise BadInput("bad_image", f"{out / LOCK}: cannot be used as lock file ({cause.strerror})") from cause
+        yield
 
 
 def stored(result: str | Path) -> dict[str, Any] | None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from startrack import __version__
 from startrack.batch.store import JOB, MANIFEST, RESULT
-from startrack.exposure import write_atomically
+from startrack.files import write_atomically
 from startrack.frames import R_from_quat_xyzw, quat_xyzw_from_R
 from startrack.output.ecsv import Column, ecsv_text, formatted
 from startrack.output.record import STAGES

@@ -13,7 +13,7 @@ from startrack.calibration.acceptance import RINGS, SECTORS, Coverage, coverage,
 from startrack.calibration.record import arcmin_per_px, message, summary
 from startrack.calibration.run import Calibration
 from startrack.calibration.show import camera_text
-from startrack.exposure import write_atomically
+from startrack.files import write_atomically
 from startrack.frames import format_utc
 from startrack.types import Array
 

@@ -16,7 +16,7 @@ from startrack.cli.common import DEFAULT_OUT, add_fact_flags, cores, flag_facts
 from startrack.cli.flag_types import at_least_one
 from startrack.cli.horizons import ready_for
 from startrack.errors import INTERNAL_ERROR, BadInput
-from startrack.files import is_path, made_folder
+from startrack.files import is_path, make_folder
 
 if TYPE_CHECKING:
     from startrack.batch import Batch, Counts, Image, Task
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
             f"--time is of one image, and {args.folder} has {len(found)}: give each its time in a sidecar NAME.json "
             "with time_utc"
         )
-    out = made_folder(args.dir)
+    out = make_folder(args.dir)
     with only_writer(out):
         return _run(found, whole, out, facts, args)
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli.common import DEFAULT_OUT, exit_code_of_reason, read
 from startrack.cli.flag_types import amount, field_of_view_rad, number, positive
 from startrack.errors import NoSolution
-from startrack.files import made_folder
+from startrack.files import make_folder
 
 if TYPE_CHECKING:
     from startrack.calibration import Calibration
@@ -120,7 +120,7 @@ def write_calibration(args: argparse.Namespace, out: Path, found: Calibration) -
     from startrack.calibration.record import calibration_dict, summary
     from startrack.calibration.report import write_report
     from startrack.camera.io import camera_text
-    from startrack.exposure import write_atomically
+    from startrack.files import write_atomically
     from startrack.output import write_json
 
     record, line = calibration_dict(found), summary(found, out.name)
@@ -151,7 +151,7 @@ def tell_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) ->
 def output_path(args: argparse.Namespace, default: str) -> Path:
     """Where the result goes, its folder made. Raises BadInput where that is impossible."""
     path = Path(args.output) if args.output else Path(args.dir) / default
-    made_folder(path.parent)
+    make_folder(path.parent)
     return path
 
 

@@ -27,7 +27,7 @@ def convert(args: argparse.Namespace, words: list[str]) -> int:
     from startrack.camera.convert import from_text, to_text
     from startrack.camera.convert.intrinsics import lost_px
     from startrack.camera.io import camera_text
-    from startrack.exposure import write_atomically
+    from startrack.files import write_atomically
 
     if (args.to is None) == (args.source is None) or len(words) != 1:
         args.usage_error("calibrate convert takes one file, and --to or --from")
@@ -77,7 +77,7 @@ def board(args: argparse.Namespace, words: list[str]) -> int:
     from startrack.calibration.board import board_dict, board_line, calibrate_board
     from startrack.calibration.board_corners import Board
     from startrack.camera.io import camera_text
-    from startrack.exposure import write_atomically
+    from startrack.files import write_atomically
     from startrack.output import write_json
 
     try:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli.common import DEFAULT_OUT, cores
 from startrack.cli.flag_types import at_least_one
 from startrack.errors import BadInput
-from startrack.files import made_folder
+from startrack.files import make_folder
 
 if TYPE_CHECKING:
     from startrack.reproduction import Piece, Runs
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
 
     from startrack.reproduction import ARTEFACTS, FULL, QUICK, Context, Runs, written
 
-    out, size = made_folder(args.dir), FULL if args.full else QUICK
+    out, size = make_folder(args.dir), FULL if args.full else QUICK
     if args.ours is not None:
         size = size.with_ours(args.ours)
     with Runs(out, jobs=args.jobs or cores(), progress=_progress, cluster=args.cluster) as runs:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli.common import DEFAULT_OUT
 from startrack.cli.horizons import ready
 from startrack.cli.terrain_facts import dem_class, facts_of, lines_of, seen_from
-from startrack.files import made_folder
+from startrack.files import make_folder
 
 if TYPE_CHECKING:
     from startrack.terrain import Terrain
@@ -87,7 +87,7 @@ def _show(args: argparse.Namespace) -> int:
 def _pictures(args: argparse.Namespace, terrain: Terrain, place: tuple[float, float] | None) -> list[Path]:
     from startrack.output.picture.terrain_picture import panorama_picture, relief_picture
 
-    out = made_folder(args.dir, "bad_terrain")
+    out = make_folder(args.dir, "bad_terrain")
     pictures = {out / f"{terrain.name}.relief.png": relief_picture(terrain, place)}
     if place is not None:
         pictures[out / f"{terrain.name}.horizon.png"] = panorama_picture(terrain, place)

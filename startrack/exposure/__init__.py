@@ -8,9 +8,9 @@ sees `startrack.types.BadInput` and nothing else.
 from startrack.exposure.decoded import are_fractions
 from startrack.exposure.metadata import Facts, with_facts
 from startrack.exposure.read import exposure_of, read_exposure
-from startrack.exposure.write import write_atomically, write_exposure, write_sidecar
+from startrack.exposure.write import write_exposure, write_sidecar
 
 __all__ = [
-    "Facts", "are_fractions", "exposure_of", "read_exposure", "with_facts", "write_atomically", "write_exposure",
+    "Facts", "are_fractions", "exposure_of", "read_exposure", "with_facts", "write_exposure",
     "write_sidecar",
 ]  # fmt: skip

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -38,11 +37,6 @@ class Decoded:
 def refuse(cause: str) -> BadInput:
     """The exception for a file that is not read; `read_exposure` puts the file's name before the cause."""
     return BadInput("bad_image", cause)
-
-
-def shown(path: str | os.PathLike[str]) -> str:
-    """`path` for a message: one line, printable on any terminal."""
-    return " ".join(os.fspath(path).encode("utf-8", "backslashreplace").decode().split())
 
 
 def check_size(width_px: int, height_px: int) -> None:

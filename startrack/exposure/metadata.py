@@ -11,7 +11,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from startrack.exposure.decoded import shown
+from startrack.files import is_path, printable
 from startrack.frames.time import as_utc, parse_utc
 from startrack.types import BadInput, Exposure
 
@@ -120,11 +120,6 @@ def sidecar_of(image: Path) -> Path | None:
     return next((place for place in places if os.path.isfile(place)), None)
 
 
-def is_path(reference: str) -> bool:
-    """Whether a camera's or terrain's `reference` is a path; otherwise it is the name of a shipped file."""
-    return reference.endswith(".toml") or "/" in reference or "\\" in reference
-
-
 def _stems(image: Path) -> list[str]:
     """["a.fits.bz2", "a.fits", "a"]."""
     names = [image.name]
@@ -157,13 +152,13 @@ def _unknown_keys(sidecar: Path, values: Mapping[str, Any]) -> list[str]:
     """A warning for each key that stands for nothing: a misspelt one would else be missed in silence."""
     unknown = [key for key in values if key not in SIDECAR_KEYS]
     return [
-        f"sidecar {shown(sidecar.name)}: key {key[:40]!r} is none of {', '.join(SIDECAR_KEYS)}; not used"
+        f"sidecar {printable(sidecar.name)}: key {key[:40]!r} is none of {', '.join(SIDECAR_KEYS)}; not used"
         for key in unknown[:MOST_UNKNOWN_KEYS]
     ]
 
 
 def _bad_sidecar(sidecar: Path, cause: str, reason: str = "bad_image") -> BadInput:
-    return BadInput(reason, " ".join(f"sidecar {shown(sidecar)}: {cause}".split()))
+    return BadInput(reason, " ".join(f"sidecar {printable(sidecar)}: {cause}".split()))
 
 
 def _sidecar_exposure_s(sidecar: Path, value: object) -> float | None:

@@ -21,9 +21,9 @@ from startrack.exposure.decoded import (
     grey_float32,
     largest_value,
     refuse,
-    shown,
 )
 from startrack.exposure.metadata import RAW_SUFFIXES, Facts, resolve_facts, stem
+from startrack.files import printable
 from startrack.types import BadInput, Exposure
 
 PNG = (b"\x89PNG\r\n\x1a\n",)
@@ -53,7 +53,7 @@ def read_exposure(
         raw = _read_bytes(path)
         decoded = _decode(raw, Path(path).suffix.lower() in RAW_SUFFIXES)
     except BadInput as error:
-        raise BadInput(error.reason, " ".join(f"{shown(path)}: {error}".split())) from error
+        raise BadInput(error.reason, " ".join(f"{printable(path)}: {error}".split())) from error
     given = Facts(time_utc=time_utc, exposure_s=exposure_s, camera=camera, terrain=terrain)
     facts = resolve_facts(Path(path), decoded.header, given)
     pixels, notes = _of_one_colour(decoded, facts)

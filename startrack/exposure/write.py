@@ -7,18 +7,16 @@ import gzip
 import json
 import os
 from collections.abc import Callable
-from contextlib import suppress
 from datetime import timedelta
 from io import BytesIO
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.exposure.decoded import shown
-from startrack.exposure.metadata import Facts, is_path, sidecars
+from startrack.exposure.metadata import Facts, sidecars
+from startrack.files import check_free, is_path, printable, write_atomically
 from startrack.frames.time import format_utc
 from startrack.types import BadInput, Exposure
 
@@ -41,12 +39,12 @@ def write_exposure(path: str | os.PathLike[str], exposure: Exposure, *, overwrit
     suffix = Path(target.stem).suffix.lower() if packing else target.suffix.lower()
     encoder = _ENCODERS.get(suffix)
     if encoder is None or (packing and suffix not in FITS_SUFFIXES):
-        raise BadInput("bad_image", f"{shown(target)}: startrack writes .png, .tif, .fits, .fits.gz and .fits.bz2")
-    _check_free(target, overwrite)
+        raise BadInput("bad_image", f"{printable(target)}: startrack writes .png, .tif, .fits, .fits.gz and .fits.bz2")
+    check_free(target, overwrite=overwrite)
     try:
         data = encoder(exposure.pixels_adu, exposure.saturation_adu, header_entries(exposure, target.parent))
     except ValueError as error:
-        raise BadInput("bad_image", f"{shown(target)}: {error}") from error
+        raise BadInput("bad_image", f"{printable(target)}: {error}") from error
     write_atomically(target, PACKED[packing](data) if packing else data, overwrite=overwrite)
     return target
 
@@ -65,25 +63,6 @@ def write_sidecar(image: str | os.PathLike[str], facts: Facts | Exposure, *, ove
     return target
 
 
-def write_atomically(path: str | os.PathLike[str], data: bytes, *, overwrite: bool = False) -> None:
-    """Put `data` under `path`, whole or not at all; folders are made. `BadInput` (bad_image) if that cannot be."""
-    target = Path(path)
-    _check_free(target, overwrite)
-    # In the same folder, since a rename does not cross file systems; not by tempfile, which makes files private.
-    temporary = target.with_name(f".{uuid4().hex}.part")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("xb") as file:
-            file.write(data)
-        os.replace(temporary, target)
-    except (OSError, ValueError) as error:
-        cause = getattr(error, "strerror", None) or error
-        raise BadInput("bad_image", f"{shown(target)}: cannot be written ({cause})") from error
-    finally:
-        with suppress(OSError):  # gone after the rename; and a failed clean-up must not hide the cause
-            temporary.unlink()
-
-
 def header_entries(exposure: Exposure, folder: Path) -> dict[str, str | float]:
     """The known facts under the names of a FITS header, both dates among them; paths relative to `folder`."""
     entries: dict[str, str | float] = {}
@@ -100,11 +79,6 @@ def header_entries(exposure: Exposure, folder: Path) -> dict[str, str | float]:
         if relative is not None:
             entries[key] = relative
     return entries
-
-
-def _check_free(target: Path, overwrite: bool) -> None:
-    if not overwrite and os.path.lexists(target):
-        raise BadInput("bad_image", f"{shown(target)}: exists already, and overwriting was not asked for")
 
 
 def _relative(reference: str | None, folder: Path) -> str | None:

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.errors import BadInput
-from startrack.exposure import write_atomically
-from startrack.files import made_folder
+from startrack.files import make_folder, write_atomically
 
 if TYPE_CHECKING:
     from startrack.result import Result
@@ -30,7 +29,7 @@ def make_way(path: Path, sha256: str, *, overwrite: bool, remedy: str) -> None:
     The record of the same image is there to be renewed; one of another image is kept unless `overwrite`. Raises
     BadInput (bad_image, for lack of a better code) with the `remedy`, or where nothing can be written.
     """
-    made_folder(path.parent)
+    make_folder(path.parent)
     try:
         before = json.loads(path.read_text(encoding="utf-8")) if path.exists() and not overwrite else None
     except OSError as cause:

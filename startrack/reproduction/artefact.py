@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from startrack.exposure import write_atomically
+from startrack.files import write_atomically
 from startrack.output.ecsv import Column, ecsv_text
 from startrack.reproduction.runs import Runs
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from startrack import __version__
-from startrack.exposure import write_atomically
+from startrack.files import write_atomically
 from startrack.reproduction.methods import Chunk, Task, done
 
 FOLDER = ".chunks"

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from startrack.exposure import write_atomically
+from startrack.files import write_atomically
 from startrack.output.html.advice import words_of
 from startrack.output.html.gather import Found, folder_of
 from startrack.output.html.ground import Grounds, ground_map, horizon_deg

@@ -11,7 +11,7 @@ import numpy as np
 from startrack.localization.prefix_sums import Profile
 from startrack.localization.sector_likelihood import Sectors, contribution
 from startrack.terrain import Terrain
-from startrack.terrain.horizon_interpolator import Nearby
+from startrack.terrain.horizon_interpolator import HorizonInterpolator
 from startrack.types import Array, Ints
 
 COMPASS = np.array([[i, j] for i in (-1, 0, 1) for j in (-1, 0, 1)], dtype=np.float64)
@@ -59,7 +59,7 @@ class Vicinity:
     def scores(self, places_m: Array, elevation_rad: Array | None = None) -> Array:
         """Log-likelihoods (n,) of places (n, 2), the rays standing at other elevations where these are given."""
         elevation = self.elevation_rad if elevation_rad is None else elevation_rad
-        if isinstance(self.ground, Nearby) and self.ground.tracer.compiled:
+        if isinstance(self.ground, HorizonInterpolator):
             from startrack.localization import local_search_kernel as vicinity_compiled
 
             found = np.empty(len(places_m))
@@ -81,7 +81,7 @@ class Vicinity:
         Whether a camera can stand there is not asked.
         """
         elevation = self.elevation_rad if elevation_rad is None else elevation_rad
-        if isinstance(self.ground, Nearby) and self.ground.tracer.compiled:
+        if isinstance(self.ground, HorizonInterpolator):
             from startrack.localization import local_search_kernel as vicinity_compiled
 
             start = np.ascontiguousarray(place_m, dtype=np.float64)
@@ -104,7 +104,7 @@ class Vicinity:
         """The same rays at azimuths so much larger; horizons are asked at four corners only."""
         azimuth = np.mod(self.azimuth_rad + turn_rad, 2 * np.pi)
         near = self.ground
-        if isinstance(near, Nearby):
+        if isinstance(near, HorizonInterpolator):
             near = near.whole.near(near.centre_m, near.half_m, azimuth, 2)
         return replace(self, azimuth_rad=azimuth, ground=near)
 
@@ -119,7 +119,7 @@ class Vicinity:
     @cached_property
     def _fixed(self) -> tuple[Any, ...]:
         near = self.ground
-        assert isinstance(near, Nearby)
+        assert isinstance(near, HorizonInterpolator)
         column = near.column(self.azimuth_rad)[0]
         where = near.middle_up_m, float(near.centre_m[0]), float(near.centre_m[1]), float(near.half_m)
         return (

@@ -17,7 +17,7 @@ from startrack.localization.rim_plane import cylinder_of
 from startrack.localization.sector_likelihood import Sectors
 from startrack.localization.summary import smallest_axis, summarize
 from startrack.terrain import Cylinder, Terrain
-from startrack.terrain.horizon_interpolator import Nearby
+from startrack.terrain.horizon_interpolator import HorizonInterpolator
 from startrack.types import Array, Bools, Evidence, Fix, Ints, NotLocated
 
 FEWEST_RAYS = 8
@@ -233,7 +233,7 @@ class _Search:
             return
         step = max(2 * boxes.half_m, CLOSEST_NODES_M)
         traced = 1.0
-        if isinstance(self.ground, Nearby):
+        if isinstance(self.ground, HorizonInterpolator):
             if step > 0.6 * self.ground.step_m:
                 return
             traced = self.ground.traced_part(boxes.centres_m[boxes.box], self.profile.evidence.azimuth_rad[boxes.ray])

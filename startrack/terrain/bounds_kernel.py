@@ -1,4 +1,4 @@
-"""Bounds of the horizon over boxes, compiled with numba, by the rays of `trace_compiled.py`.
+"""Bounds of the horizon over boxes, compiled with numba, by the rays of `horizon_kernel`.
 
 A ray from anywhere in a box passes near the middle line, so that steepest slopes to the side bound the ground there.
 """

@@ -13,13 +13,12 @@ import numpy as np
 from startrack.frames import Site
 from startrack.terrain import table_cache as cache
 from startrack.terrain import tracing
-from startrack.terrain.horizon_interpolator import ACROSS, Nearby
+from startrack.terrain.horizon_interpolator import NODES_ACROSS, HorizonInterpolator
 from startrack.terrain.horizon_sigma import CrestErrors
 from startrack.terrain.horizon_table import BINS, HorizonTable, Progress, Square, built
 from startrack.terrain.protocol import Terrain
 from startrack.terrain.pyramid import Ground, ground_up_m, packed
 from startrack.terrain.raster import Raster
-from startrack.terrain.tracing import Tracer
 from startrack.types import Array, BadInput, Bools, Ints
 
 LOG = logging.getLogger(__name__)
@@ -50,17 +49,12 @@ class HeightMap(Terrain):
     glare_rad: tuple[
         tuple[float, float], ...
     ] = ()  # azimuth ranges, from the first eastward to the second, lit by the Sun
-    use_compiled: bool | None = None  # None: where numba is installed
     _state: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         if not self.maps:
             raise BadInput("bad_terrain", "[dem] needs at least one map")
         self._check_cover()
-
-    @cached_property
-    def tracer(self) -> Tracer:
-        return tracing.tracer(self.use_compiled)
 
     @cached_property
     def ground(self) -> Ground:
@@ -152,14 +146,16 @@ class HeightMap(Terrain):
         low, high = np.empty(len(half)), np.empty(len(half))
         traced = (turn < 0.25 * 2 * np.pi / BINS) & (half < table.square.half_m)
         if traced.all():
-            self.tracer.box_bounds(self, table, centres, half, azimuths, turn, low, high)
+            tracing.trace_box_bounds(self, table, centres, half, azimuths, turn, low, high)
         elif not traced.any() and np.all(half == half[0]):
-            self.tracer.sector_bounds(self, table, centres, half, azimuths, turn, low, high)
+            tracing.look_up_sector_bounds(self, table, centres, half, azimuths, turn, low, high)
         else:
             for kind in np.unique(half[~traced]):
                 which = ~traced & (half == kind)
-                low[which], high[which] = self._some(self.tracer.sector_bounds, centres, half, azimuths, turn, which)
-            low[traced], high[traced] = self._some(self.tracer.box_bounds, centres, half, azimuths, turn, traced)
+                low[which], high[which] = self._some(
+                    tracing.look_up_sector_bounds, centres, half, azimuths, turn, which
+                )
+            low[traced], high[traced] = self._some(tracing.trace_box_bounds, centres, half, azimuths, turn, traced)
         return low.reshape(shape), high.reshape(shape)
 
     def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
@@ -183,7 +179,7 @@ class HeightMap(Terrain):
     def ground_m(self, points_m: Array) -> Array:
         """Height of the ground in enu (...) [m]."""
         points = np.asarray(points_m, dtype=np.float64)
-        return self.tracer.surfaces(self, points.reshape(-1, 2)).reshape(points.shape[:-1])
+        return tracing.ground_heights(self, points.reshape(-1, 2)).reshape(points.shape[:-1])
 
     def allowed(self, points_m: Array) -> Bools:
         """Whether the points (..., 2) are within reach and not too steep."""
@@ -215,16 +211,18 @@ class HeightMap(Terrain):
         """(n,) of n sectors from north eastward: below which elevation ground off the maps may stand, or -pi/2."""
         return self.prepared().unknown_rad
 
-    def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = ACROSS) -> Terrain:
-        """The ground about a place, see `Nearby`."""
-        return Nearby(self, np.asarray(centre_m, dtype=np.float64), half_m, np.unique(azimuths_rad), across)
+    def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = NODES_ACROSS) -> Terrain:
+        """The ground near a centre (2,), see `HorizonInterpolator`."""
+        return HorizonInterpolator(
+            self, np.asarray(centre_m, dtype=np.float64), half_m, np.unique(azimuths_rad), across
+        )
 
     def horizons(self, points_m: Array, azimuths_rad: Array) -> tuple[Array, Array, Array]:
         """tan, distance, and distance of the maps' end, of each point and azimuth."""
         points_m = np.asarray(points_m, dtype=np.float64)
         shape = np.broadcast_shapes(points_m.shape[:-1], np.shape(azimuths_rad))
         points = _flat(points_m, (*shape, 2)).reshape(-1, 2)
-        found = self.tracer.horizons(self, self._state.get(self._key), points, _flat(azimuths_rad, shape).ravel())
+        found = tracing.trace_horizons(self, self._state.get(self._key), points, _flat(azimuths_rad, shape).ravel())
         return tuple(a.reshape(shape) for a in found)  # type: ignore[return-value]
 
     def _some(self, bounds: Any, centres: Array, half: Array, azimuths: Array, turn: Array, which: Bools) -> Any:
@@ -241,7 +239,7 @@ class HeightMap(Terrain):
         middles = (np.arange(BINS) + 0.5) * 2 * np.pi / BINS
 
         def fill(cells: Ints) -> Array:
-            return self.tracer.fill_cells(self, centres[cells], square.half_m, middles, np.pi / BINS)
+            return tracing.trace_cells(self, centres[cells], square.half_m, middles, np.pi / BINS)
 
         return built(square, wanted, fill, self._unknown_rad(), progress)
 

@@ -1,4 +1,4 @@
-"""The neighbourhood of a place: horizons at a few points around it, and between them by interpolation."""
+"""Horizons near one point: traced at a few nodes around it, and interpolated between them."""
 
 from __future__ import annotations
 
@@ -8,35 +8,38 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from startrack.terrain import tracing
 from startrack.types import Array, Bools, Ints
 
 if TYPE_CHECKING:
     from startrack.terrain.height_map import HeightMap
 
-ACROSS = 3  # points along each side, where nothing else is asked for
-ROUGH = 8e-5  # of tan H: azimuths whose horizon bends by more between the points (0.004 degrees) are traced one by one
-ROUGH_SIGMAS = 0.5  # or by more than that part of the map's own error
+NODES_ACROSS = 3  # nodes along each side by default
+MAX_BEND_TAN = 8e-5  # of tan H (0.004 degrees): azimuths whose horizon bends by more between the nodes are traced
+MAX_BEND_SIGMAS = 0.5  # or by more than that part of the map's own error
 
 
 @dataclass(frozen=True, eq=False)
-class Nearby:
-    """The terrain about a place, quick to ask at the azimuths named; whatever else is asked is asked of `whole`.
+class HorizonInterpolator:
+    """The terrain near a centre, with fast horizons at the azimuths that it was made for; else as `whole`.
 
-    A crest at the distance d is seen higher as the camera's own ground falls: tan H + z / d bends much less from place
-    to place than tan H, and is bilinear between traced points. Good to `rough`, checked by the points themselves.
+    A crest at the distance d is seen higher as the camera's own ground falls: tan H + z / d bends much less from point
+    to point than tan H, and is bilinear between traced nodes. Its error is below `rough`, which the nodes themselves
+    show. Azimuths with a larger one are traced.
     """
 
     whole: HeightMap
     centre_m: Array  # (2,)
     half_m: float
     azimuths_rad: Array  # (n,) ascending
-    across: int = ACROSS
+    across: int = NODES_ACROSS
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.whole, name)
 
     @cached_property
     def step_m(self) -> float:
+        """Distance between neighbouring nodes [m]."""
         return 2 * self.half_m / (self.across - 1)
 
     @cached_property
@@ -52,12 +55,12 @@ class Nearby:
 
     @property
     def nodes(self) -> Array:
-        """(n, across, across) tan of the horizon at the points, east first, were they all as high as the middle."""
+        """(n, across, across) tan of the horizon at the nodes, east first, were they all as high as the middle."""
         return self._traced[0]
 
     @property
     def per_height(self) -> Array:
-        """(n,) how much lower [1/m] tan of the horizon is seen from a metre higher."""
+        """(n,) decrease of tan of the horizon per metre of the camera's height [1/m]."""
         return self._traced[1]
 
     @property
@@ -67,7 +70,7 @@ class Nearby:
 
     @cached_property
     def rough(self) -> Array:
-        """(n,) how far the nodes' true values between the points may lie from the bilinear ones.
+        """(n,) largest error of the bilinear nodes between the nodes.
 
         A smooth bend errs by an eighth of the second differences, a change from one crest to another by all of one.
         """
@@ -76,10 +79,10 @@ class Nearby:
 
     @cached_property
     def _smooth(self) -> Bools:
-        return np.asarray(self.rough < np.maximum(ROUGH, ROUGH_SIGMAS * self._sigma_rad))
+        return np.asarray(self.rough < np.maximum(MAX_BEND_TAN, MAX_BEND_SIGMAS * self._sigma_rad))
 
     def column(self, azimuths_rad: Array) -> tuple[Ints, Bools]:
-        """Index of each azimuth (...), and whether it is one of those named."""
+        """Index of each azimuth (...) in `azimuths_rad`, and whether it is there."""
         at = np.minimum(np.searchsorted(self.azimuths_rad, azimuths_rad), len(self.azimuths_rad) - 1)
         return at, np.asarray(self.azimuths_rad[at] == azimuths_rad)
 
@@ -90,18 +93,18 @@ class Nearby:
 
     def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Standard deviation [rad], that in the middle for all points; see `Terrain`."""
-        column, named = self.column(azimuths_rad)
-        if not np.all(named):
+        column, known = self.column(azimuths_rad)
+        if not np.all(known):
             return self.whole.horizon_sigma_rad(points_m, azimuths_rad)
         return np.broadcast_to(
             self._sigma_rad[column], np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
         )
 
     def traced_part(self, points_m: Array, azimuths_rad: Array) -> float:
-        """Part of the points (n, 2) and azimuths (n,) whose horizons have to be traced all the same."""
-        column, named = self.column(azimuths_rad)
+        """Fraction of the pairs of points (n, 2) and azimuths (n,) that `horizon_rad` traces."""
+        column, known = self.column(azimuths_rad)
         inside = np.abs(points_m - self.centre_m).max(axis=-1) <= self.half_m * (1 + 1e-9)
-        return 1.0 - float(np.mean(inside & named & self._smooth[column]))
+        return 1.0 - float(np.mean(inside & known & self._smooth[column]))
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad]; see `Terrain`."""
@@ -109,11 +112,10 @@ class Nearby:
         shape = np.broadcast_shapes(points_m.shape[:-1], np.shape(azimuths_rad))
         points = np.ascontiguousarray(np.broadcast_to(points_m, (*shape, 2))).reshape(-1, 2)
         azimuths = np.broadcast_to(azimuths_rad, shape).ravel()
-        column, named = self.column(azimuths)
-        found = np.empty(len(azimuths))
-        self.whole.tracer.between(self, points, column, found)
+        column, known = self.column(azimuths)
+        found = tracing.interpolate(self, points, column)
         inside = np.abs(points - self.centre_m).max(axis=-1) <= self.half_m * (1 + 1e-9)
-        other = ~(inside & named & self._smooth[column])
+        other = ~(inside & known & self._smooth[column])
         if other.any():
             found[other] = self.whole.horizon_rad(points[other], azimuths[other])
         return found.reshape(shape)
@@ -121,16 +123,15 @@ class Nearby:
     def horizon_bounds_rad(
         self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
     ) -> tuple[Array, Array]:
-        """Bounds over boxes [rad]; see `Terrain`. Interpolated for small boxes in the neighbourhood, else traced."""
+        """Bounds over boxes [rad]; see `Terrain`. Interpolated for small boxes within the nodes, else traced."""
         half = float(np.max(half_m))
         too_wide = half > self.step_m / 2 or 2 * half > self.whole.finest_post_m
         if np.any(azimuth_half_rad) or np.ndim(half_m) or too_wide:
             return self.whole.horizon_bounds_rad(centres_m, half_m, azimuths_rad, azimuth_half_rad)
-        column, named = self.column(azimuths_rad)
-        low, high = np.empty(len(column)), np.empty(len(column))
-        self.whole.tracer.between_bounds(self, np.ascontiguousarray(centres_m), half, column, low, high)
+        column, known = self.column(azimuths_rad)
+        low, high = tracing.interpolate_bounds(self, np.ascontiguousarray(centres_m), half, column)
         inside = np.abs(centres_m - self.centre_m).max(axis=-1) + half <= self.half_m * (1 + 1e-9)
-        other = ~(inside & named & self._smooth[column])
+        other = ~(inside & known & self._smooth[column])
         if other.any():
             low[other], high[other] = self.whole.horizon_bounds_rad(centres_m[other], half_m, azimuths_rad[other])
         return low, high

@@ -1,4 +1,4 @@
-"""Interpolation between traced horizons, compiled with numba; `nearby_plain.py` holds the same without."""
+"""Interpolation between traced horizons, compiled with numba."""
 
 from __future__ import annotations
 

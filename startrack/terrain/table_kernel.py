@@ -1,4 +1,4 @@
-"""Bounds from the table of horizons, compiled with numba; `table_plain.py` holds the same without."""
+"""Bounds from the table of horizons, compiled with numba."""
 
 from __future__ import annotations
 

@@ -1,6 +1,9 @@
 """Dark craters from their shipped maps, from pixels: places on floor and wall, no prior, by night.
 
-    python benchmarks/craters.py [--terrain haworth de-gerlache kepler] [--floor 3] [--wall 2]
+    python benchmarks/craters.py [--terrain haworth de-gerlache kepler rough] [--floor 3] [--wall 2]
+
+"rough" is a map of a user's own (_rough_map.py), kept in a temporary folder; it gets 5 places on the floor and 5 on
+the wall.
 
 fisheye-2048 with its own sensor and default exposure (V 6 on the axis at 5 sigma), the sky, defects and headings as
 `startrack render` has them. Floor: slopes below 15 degrees; wall: 15 to 40. Times between 2025 and 2032 with the Sun
@@ -11,12 +14,15 @@ Kepler always, in the others now and then.
 from __future__ import annotations
 
 import argparse
+import tempfile
 import time
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from _results import table, write_section
+from _rough_map import rough_terrain
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
@@ -28,6 +34,7 @@ from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
 
 FLOOR_DEG, WALL_DEG = (0.0, 15.0), (15.0, 40.0)
+ROUGH_PLACES = 5  # each on floor and wall
 HIGHEST_SUN = {True: np.sin(np.radians(0.5)), False: np.sin(np.radians(-3.0))}  # in polar craters, elsewhere
 POLAR_RAD = np.radians(60)
 
@@ -35,18 +42,20 @@ POLAR_RAD = np.radians(60)
 def main() -> None:
     """Run, print and write the section."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--terrain", nargs="+", default=["haworth", "de-gerlache", "kepler"])
+    parser.add_argument("--terrain", nargs="+", default=["haworth", "de-gerlache", "kepler", "rough"])
     parser.add_argument("--floor", type=int, default=3)
     parser.add_argument("--wall", type=int, default=2)
     parser.add_argument("--seed", type=int, default=11)
     args = parser.parse_args()
     lines: list[list[str]] = []
     for name in args.terrain:
-        terrain = load_terrain(name)
+        rough = name == "rough"
+        terrain = load_terrain(rough_terrain(Path(tempfile.gettempdir()) / "startrack-rough-map") if rough else name)
         assert isinstance(terrain, HeightMap)
         terrain.prepared()
         rng = np.random.default_rng(args.seed)
-        places = [*drawn(terrain, args.floor, FLOOR_DEG, rng), *drawn(terrain, args.wall, WALL_DEG, rng)]
+        floor, wall = (ROUGH_PLACES, ROUGH_PLACES) if rough else (args.floor, args.wall)
+        places = [*drawn(terrain, floor, FLOOR_DEG, rng), *drawn(terrain, wall, WALL_DEG, rng)]
         for number, (place, slope) in enumerate(places):
             lines.append([name, *one(terrain, place, slope, night(terrain.site, rng), number, args.seed)])
             print(" | ".join(lines[-1]), flush=True)

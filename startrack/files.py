@@ -1,17 +1,20 @@
-"""Shipped files by name, folders for results, atomic writes and file locks."""
+"""Shipped files by name, TOML files, folders for results, atomic writes and file locks."""
 
 from __future__ import annotations
 
 import os
 import tempfile
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 from startrack.errors import BadInput
 
 PACKAGE = Path(__file__).resolve().parent
+MAX_TOML_BYTES = 2**20  # camera and terrain files have a few kilobytes
 FilePath = str | os.PathLike[str]
 
 
@@ -45,14 +48,28 @@ def resolve_named(name_or_path: str | Path, kind: str, reason: str) -> Path:
     """Path of a user's file or of a shipped one. Raises BadInput `reason` if there is no such file."""
     if is_path(name_or_path):
         path = Path(name_or_path)
-        if not path.is_file():
+        if not os.path.isfile(path):  # False also for names too long for the file system
             raise BadInput(reason, f"{path}: no such file")
         return path
     path = data_dir(kind) / f"{name_or_path}.toml"
-    if not path.is_file():
+    if not os.path.isfile(path):
         shipped = ", ".join(sorted(p.stem for p in data_dir(kind).glob("*.toml")))
         raise BadInput(reason, f"no shipped file is called {name_or_path!r}; shipped: {shipped}; a path ends in .toml")
     return path
+
+
+def read_toml(path: Path, reason: str) -> dict[str, Any]:
+    """The keys of a TOML file. Raises BadInput `reason` with one line that names the file and the cause."""
+    try:
+        with path.open("rb") as file:
+            raw = file.read(MAX_TOML_BYTES + 1)
+        if len(raw) > MAX_TOML_BYTES:
+            raise ValueError("it has more than 1 MiB")
+        return tomllib.loads(raw.decode("utf-8"))
+    except OSError as cause:
+        raise BadInput(reason, f"{path}: cannot be read ({cause.strerror or cause})") from cause
+    except (ValueError, RecursionError) as cause:  # not UTF-8, not TOML, huge integers, deeply nested lists
+        raise BadInput(reason, " ".join(f"{path}: not a TOML file: {str(cause)[:200]}".split())) from cause
 
 
 def make_folder(folder: FilePath, reason: str = "bad_image") -> Path:

@@ -16,7 +16,7 @@ ROOT = Path(startrack.__file__).parent
 
 LAYERS = (  # lowest first; a room imports from lower layers only
     {"errors"},
-    {"types", "files"},
+    {"types", "files", "declaration"},
     {"frames"},
     {"psf", "catalog", "camera", "terrain", "exposure"},
     {"rendering", "detection", "identification", "orient", "evidence", "localization"},

@@ -27,8 +27,9 @@ from startrack.catalog import load_catalog
 from startrack.exposure import read_exposure
 from startrack.frames import R_from_quat_xyzw
 from startrack.localization import Hull, PseudoGradient
-from startrack.pipeline import Result, locate
+from startrack.pipeline import locate
 from startrack.rendering import Series, render
+from startrack.stages import Identified, Located, Oriented, Outcome, reached
 from startrack.terrain import load_terrain
 from startrack.types import Evidence, NoSolution
 
@@ -84,17 +85,18 @@ def from_file(truth_path: Path) -> dict[str, Any]:
     return scored(result, np.array(truth["position_enu_m"]), R_from_quat_xyzw(quat), time.perf_counter() - start)
 
 
-def scored(result: Result, position_m: np.ndarray, R_cam_icrs: np.ndarray, seconds: float) -> dict[str, Any]:
+def scored(result: Outcome, position_m: np.ndarray, R_cam_icrs: np.ndarray, seconds: float) -> dict[str, Any]:
     """Errors of one result."""
     row: dict[str, Any] = {"status": result.status, "reason": result.reason, "seconds": seconds}
-    row["stage_ms"] = result.timing_ms
-    if result.attitude is not None:
-        turn = R_cam_icrs @ result.attitude.R_cam_icrs.T
+    row["stage_ms"] = dict(result.timing_ms)
+    value = reached(result)
+    if isinstance(value, Oriented):
+        turn = R_cam_icrs @ value.attitude.R_cam_icrs.T
         w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
         row["attitude_arcsec"] = float(np.linalg.norm(w) * ARCSEC)
-        row["attitude_nees"] = float(w @ np.linalg.solve(result.attitude.covariance_rad2, w))
-        row["wrong"], row["matches"] = wrong_identities(result, R_cam_icrs)
-    if result.fix is not None:
+        row["attitude_nees"] = float(w @ np.linalg.solve(value.attitude.covariance_rad2, w))
+        row["wrong"], row["matches"] = wrong_identities(value, R_cam_icrs)
+    if isinstance(result, Located):
         d = result.fix.position_enu_m[:2] - position_m[:2]
         row["error_m"] = float(np.linalg.norm(d))
         row["nees"] = float(d @ np.linalg.solve(result.fix.covariance_m2, d))
@@ -104,19 +106,16 @@ def scored(result: Result, position_m: np.ndarray, R_cam_icrs: np.ndarray, secon
     return row
 
 
-def wrong_identities(result: Result, R_cam_icrs: np.ndarray) -> tuple[int, int]:
+def wrong_identities(result: Identified, R_cam_icrs: np.ndarray) -> tuple[int, int]:
     """Matches whose star, at the true attitude, lies more than 1.5 px from its detection; and all matches."""
     found = result.identification
-    assert found is not None and result.stars is not None
-    assert result.detections is not None and result.camera is not None
     px, _ = result.camera.project(result.stars.rays_icrs[found.star] @ R_cam_icrs.T)
     distance = np.linalg.norm(px - result.detections.xy_px[found.detection], axis=1)
     return int(np.count_nonzero(distance > 1.5)), len(found)
 
 
-def peers(result: Result, position_m: np.ndarray) -> dict[str, float]:
+def peers(result: Located, position_m: np.ndarray) -> dict[str, float]:
     """The thesis's methods on this frame's own list: catalogue stars to the detection limit, seen when identified."""
-    assert result.light is not None and result.identification is not None and result.terrain is not None
     light = result.light
     seen = np.isin(light.star, result.identification.star)
     listed = seen | (light.expected_e > 5.0 * np.maximum(light.sigma_e, 1e-9))

@@ -30,6 +30,7 @@ from startrack.catalog.bodies import bodies
 from startrack.frames import R_enu_icrs, Site
 from startrack.pipeline import locate
 from startrack.rendering import Series, render
+from startrack.stages import Located
 from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
 
@@ -103,7 +104,7 @@ def one(terrain: HeightMap, place: np.ndarray, slope: float, when: datetime, num
     horizon = np.degrees(terrain.horizon_rad(place[None], np.radians(np.arange(360.0))))
     where = [f"E {place[0]:.0f} N {place[1]:.0f}", f"{slope:.0f}", f"{horizon.min():.1f} to {horizon.max():.1f}"]
     times = [f"{result.timing_ms.get('locate', 0.0) / 1e3:.1f}", f"{spent:.1f}"]
-    if result.fix is None or result.status != "ok":
+    if not isinstance(result, Located) or result.status != "ok":
         return [*where, result.reason or result.status, *["-"] * 4, *times]
     fix: Any = result.fix
     off = fix.position_enu_m[:2] - place

@@ -26,8 +26,9 @@ from startrack.catalog.gaia import load_deep_catalog
 from startrack.detection import electrons
 from startrack.evidence import StarEvidence, StarLight, flux_scale
 from startrack.localization import ExactPosterior
-from startrack.pipeline import Result, Settings, locate
+from startrack.pipeline import Settings, locate
 from startrack.rendering import Series, exposure_reaching, render
+from startrack.stages import Located, Measured, reached
 from startrack.terrain import load_terrain
 from startrack.types import Array, Evidence, Fix, NoSolution
 
@@ -107,17 +108,22 @@ def one(job: tuple[int, Depth, int]) -> dict[str, dict[str, Any]]:
     place = truth.position_enu_m[:2]
     fast = Settings(localizer=ExactPosterior(compiled=True))
     result = locate(exposure, camera, terrain, catalog, fast)
-    rows = {"full": _scored(result.fix if result.status == "ok" else None, place)}
-    if number < depth.compared and result.light is not None:
+    rows = {"full": _scored(_fix(result), place)}
+    value = reached(result)
+    if number < depth.compared and isinstance(value, Measured):
         plain = locate(exposure, camera, terrain, catalog, replace(fast, deep_stars=False))
-        rows["Hipparcos alone"] = _scored(plain.fix if plain.status == "ok" else None, place)
-        for name, evidence, localizer in _ablations(result):
+        rows["Hipparcos alone"] = _scored(_fix(plain), place)
+        for name, evidence, localizer in _ablations(value):
             try:
                 fix = localizer(evidence, terrain)
             except NoSolution:
                 fix = None
             rows[name] = _scored(fix, place)
     return rows
+
+
+def _fix(outcome: Any) -> Fix | None:
+    return outcome.fix if isinstance(outcome, Located) and not outcome.fix.ambiguous else None
 
 
 def _scored(fix: Fix | None, place_m: Array) -> dict[str, Any]:
@@ -128,8 +134,7 @@ def _scored(fix: Fix | None, place_m: Array) -> dict[str, Any]:
     return {"error_m": error, "nees": float(d @ np.linalg.solve(fix.covariance_m2, d)), "in95": error < fix.radius95_m}
 
 
-def _ablations(result: Result) -> Iterator[tuple[str, Evidence, ExactPosterior]]:
-    assert result.light is not None and result.stars is not None
+def _ablations(result: Measured) -> Iterator[tuple[str, Evidence, ExactPosterior]]:
     full = ExactPosterior(compiled=True)
     yield "without the second look at the skyline", _light(result).evidence(), full
     yield "list at 5 sigma", _listed(result.light, 5.0), full
@@ -158,11 +163,9 @@ def _listed(light: StarLight, threshold: float) -> Evidence:
 
 
 def _light(
-    result: Result, *, visible: Array | None = None, certain: bool = False, settings: StarEvidence | None = None
+    result: Measured, *, visible: Array | None = None, certain: bool = False, settings: StarEvidence | None = None
 ) -> StarLight:
     """The frame's evidence once more, with a part left out."""
-    assert result.camera is not None and result.detections is not None and result.stars is not None
-    assert result.identification is not None and result.attitude_fit is not None and result.R_enu_icrs is not None
     stars, scale = result.stars, flux_scale(result.detections, result.camera, result.stars, result.identification)
     extra_px = result.attitude_fit.extra_sigma_px
     if certain:
@@ -170,7 +173,7 @@ def _light(
         extra_px = 0.0
     image, dead = electrons(result.exposure, result.camera)
     return (settings or StarEvidence())(
-        image, dead, result.detections, result.camera, stars, result.bodies,
+        image, dead, result.detections, result.camera, stars, list(result.bodies),
         result.attitude_fit.attitude.R_cam_icrs, result.R_enu_icrs, scale, extra_px, visible,
     )  # fmt: skip
 

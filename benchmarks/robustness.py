@@ -26,6 +26,7 @@ from startrack.frames import R_from_rotvec
 from startrack.localization import ExactPosterior
 from startrack.pipeline import Settings, locate
 from startrack.rendering import Series, render
+from startrack.stages import Located
 from startrack.terrain import Cylinder, load_terrain
 from startrack.types import Array
 
@@ -136,7 +137,7 @@ def one(job: tuple[int, int]) -> dict[str, Any]:
     evidence = Biased(trouble.attitude_bias_arcsec) if trouble.attitude_bias_arcsec else StarEvidence()
     settings = Settings(localizer=ExactPosterior(compiled=True), evidence=evidence)  # type: ignore[arg-type]
     result = locate(exposure, scene.camera, trouble.told(true), catalog, settings)
-    if result.fix is None or result.status != "ok":
+    if not isinstance(result, Located) or result.status != "ok":
         return {"status": result.status, "reason": result.reason}
     error = float(np.linalg.norm((result.fix.position_enu_m - truth.position_enu_m)[:2]))
     return {"status": "ok", "error_m": error, "beyond": error > result.fix.radius999_m}

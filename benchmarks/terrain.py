@@ -25,6 +25,7 @@ from startrack.localization import ExactPosterior, check_consistency
 from startrack.localization.horizon_bias import raised
 from startrack.pipeline import locate
 from startrack.rendering import Series, render
+from startrack.stages import Measured, reached
 from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
 from startrack.types import Evidence, Fix, NoSolution
@@ -107,8 +108,9 @@ def observed(terrain: HeightMap, seed: int, number: int) -> tuple[Evidence, np.n
     scene, rng = series.scene(number, f"frame-{number:03d}")
     exposure, truth = render(scene, rng=rng)
     result = locate(exposure, camera, terrain, catalog)
-    assert result.light is not None, result.message
-    return result.light.evidence(), np.asarray(truth.position_enu_m)
+    value = reached(result)
+    assert isinstance(value, Measured), result.message
+    return value.evidence(), np.asarray(truth.position_enu_m)
 
 
 def scored(evidence: Evidence, terrain: HeightMap, place: np.ndarray) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from startrack.catalog import load_catalog
 from startrack.errors import BAD_INPUT_REASONS, BadInput
 from startrack.inputs import Picture, When, angle_rad, given_camera, given_exposure, given_settings, given_terrain
 from startrack.solution import Solution
+from startrack.stages import Outcome, Refused
 from startrack.terrain import Terrain
 
 if TYPE_CHECKING:
@@ -68,9 +69,9 @@ def detect(image: Picture, *, camera: str | Camera | None = None) -> Solution:
     return _solution(pipeline.detect(exposure, given_camera(camera, exposure) if known else None), "detections")
 
 
-def _solution(result: pipeline.Result, kind: str) -> Solution:
+def _solution(result: Outcome, kind: str) -> Solution:
     """Raises BadInput where the input was at fault, whichever stage found that."""
-    if result.reason in BAD_INPUT_REASONS:
+    if isinstance(result, Refused) and result.reason in BAD_INPUT_REASONS:
         message = result.message
         for flag, argument in ARGUMENT_OF_FLAG.items():
             message = message.replace(flag, argument)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from startrack.camera import Camera, load_camera
 from startrack.exposure import exposure_of, read_exposure, with_facts
 from startrack.frames import parse_utc
-from startrack.result import Settings
+from startrack.stages import Settings
 from startrack.terrain import Terrain, load_terrain
 from startrack.types import BadInput, Exposure
 

@@ -1,69 +1,77 @@
-"""The whole story of one image: detect, identify, attitude, evidence, position."""
+"""From one image to the position: detect, identify, orient, measure, localize. Each stage returns a complete value."""
 
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Iterator
-from contextlib import contextmanager
+from datetime import datetime
 from typing import TYPE_CHECKING
 
 from startrack.camera import Camera
 from startrack.catalog.bodies import bodies
+from startrack.detection import Detector
 from startrack.exposure import are_fractions
-from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
-from startrack.light import deepen, first_look, second_look
+from startrack.frames import Site, observer_velocity_m_s
+from startrack.identification import Identifier
 from startrack.localization import check_consistency
+from startrack.measurement import measure_evidence, remeasure_near_skyline
 from startrack.orient import solve_attitude
-from startrack.result import Result, Settings
+from startrack.stages import (
+    Detected,
+    Identified,
+    Inputs,
+    Located,
+    Oriented,
+    Refused,
+    Run,
+    Settings,
+    extend,
+    with_timing,
+)  # fmt: skip
 from startrack.terrain import Terrain
-from startrack.types import BadInput, Exposure, NoSolution
+from startrack.types import BadInput, Exposure, NoSolution, Stars
 
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog
 
-__all__ = ["NO_TIME", "Result", "Settings", "detect", "identify", "identify_blind", "locate", "locate_exposure"]
+__all__ = ["NO_TIME", "Settings", "detect", "identify", "identify_blind", "locate", "locate_exposure"]
 
 NO_TIME = (
     "the mid-exposure time is not known: give --time UTC, a sidecar NAME.json with time_utc, or a header with it; "
     "nothing is guessed"
 )
+NO_SITE = "terrain {} has no site: an image can be located only on ground whose place on a body is known"
+ANYWHERE = Site("moon", 0.0, 0.0)  # stands in for an unknown site: 0.7 arcsec of aberration at most
 
 
 def locate(
     exposure: Exposure, camera: Camera, terrain: Terrain, catalog: StarCatalog, settings: Settings | None = None
-) -> Result:
-    """Position and attitude of the camera; a Result with a reason where there is none to stand by."""
+) -> Located | Refused:
+    """Position and attitude of the camera, or the reason why there is none.
+
+    `exposure` must have a time and the image size of the `camera`, `terrain` a site; `catalog` is the list of stars.
+    `settings` exchanges stages. Bad input of an image makes a refusal too: nothing is raised for an image's sake.
+    """
     settings = settings or Settings()
-    result = Result(exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name)
-    with _refusals(result):
-        if exposure.time_utc is None:
-            raise BadInput("no_time", "; ".join([NO_TIME, *exposure.warnings]))
-        _identify(result, catalog, settings, terrain.site)
-        result.R_enu_icrs = R_enu_icrs(terrain.site, exposure.time_utc)
-        with _timed(result, "evidence"):
-            if settings.deep_stars and catalog.name == "hipparcos":
-                deepen(result, terrain.site)
-            result.light = first_look(result, settings)
-        with _timed(result, "locate"):
-            evidence = result.light.evidence()
-            fix = settings.localizer(evidence, terrain)
-        with _timed(result, "evidence"):
-            relit = None if fix.ambiguous else second_look(result, settings, fix)
-        if relit is not None:
-            result.light, evidence = relit, relit.evidence()
-            with _timed(result, "locate"):
-                fix = settings.localizer(evidence, terrain)
-        with _timed(result, "locate"):
-            check_consistency(evidence, fix, terrain, getattr(settings.localizer, "compiled", False))
-        result.fix = fix
-        result.status = "ambiguous" if fix.ambiguous else "ok"
-        if fix.ambiguous:
-            result.reason, result.message = "ambiguous", f"{len(fix.modes)} places fit the stars"
-    return result
+    run = Run(Inputs(exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name))
+    try:
+        check_inputs(run.reached)
+        detected = run.step("detect", detect_sources, run.reached, camera, settings.detector)
+        identified = run.step("identify", identify_stars, detected, camera, catalog, settings.identifier, terrain.site)
+        oriented = run.step("attitude", solve_orientation, identified)
+        measured = run.step("evidence", measure_evidence, oriented, terrain, settings)
+        fix = run.time("locate", settings.localizer, measured.evidence(), terrain)
+        if not fix.ambiguous:
+            again = run.step("evidence", remeasure_near_skyline, measured, fix, settings.evidence)
+            if again is not measured:
+                measured, fix = again, run.time("locate", settings.localizer, again.evidence(), terrain)
+        run.time("locate", check_consistency, measured.evidence(), fix, terrain)
+        return run.finish(extend(measured, Located, fix=fix))
+    except (BadInput, NoSolution) as refusal:
+        return run.refuse(refusal)
 
 
-def locate_exposure(exposure: Exposure, settings: Settings | None = None) -> Result:
-    """`locate` with the camera and the terrain that the exposure names, the time of reading them included.
+def locate_exposure(exposure: Exposure, settings: Settings | None = None) -> Located | Refused:
+    """`locate` with the camera and the terrain that `exposure` names, and `settings`; stage `read` is reading them.
 
     Raises BadInput (no_calibration, bad_calibration, bad_terrain) where one is not named or cannot be used.
     """
@@ -78,124 +86,130 @@ def locate_exposure(exposure: Exposure, settings: Settings | None = None) -> Res
         raise BadInput("bad_terrain", "no terrain file is known: give -t FILE or a sidecar with terrain")
     camera, terrain = load_camera(exposure.camera), load_terrain(exposure.terrain)
     read_ms = 1e3 * (clock.perf_counter() - start)
-    result = locate(exposure, camera, terrain, load_catalog(), settings)
-    result.timing_ms["read"] = read_ms
-    return result
+    return with_timing(locate(exposure, camera, terrain, load_catalog(), settings), read=read_ms)
 
 
 def identify(
     exposure: Exposure, camera: Camera, catalog: StarCatalog, settings: Settings | None = None, site: Site | None = None
-) -> Result:
-    """Stars and attitude only. Without a time the catalogue is taken at J2000.0, without aberration."""
-    result = Result(exposure=exposure, camera=camera, catalog_name=catalog.name)
-    with _refusals(result):
-        _identify(result, catalog, settings or Settings(), site)
-        result.status = "ok"
-    return result
+) -> Oriented | Refused:
+    """Stars and attitude only. Without a time the `catalog` is taken at J2000.0, without aberration.
+
+    `exposure` must have the image size of the `camera`; `settings` exchanges stages; `site` (None: not known) adds
+    planets and the aberration of the body that it is on.
+    """
+    settings = settings or Settings()
+    run = Run(Inputs(exposure=exposure, camera=camera, catalog_name=catalog.name))
+    try:
+        check_inputs(run.reached)
+        detected = run.step("detect", detect_sources, run.reached, camera, settings.detector)
+        identified = run.step("identify", identify_stars, detected, camera, catalog, settings.identifier, site)
+        return run.finish(run.step("attitude", solve_orientation, identified))
+    except (BadInput, NoSolution) as refusal:
+        return run.refuse(refusal)
 
 
 def identify_blind(
     exposure: Exposure, fov_rad: float, catalog: StarCatalog, settings: Settings | None = None
-) -> Result:
-    """Stars, attitude and lens without a camera file, from an approximate field of view [rad] alone.
+) -> Oriented | Refused:
+    """Stars, attitude and lens of an `exposure` without a camera file, from an approximate field of view alone.
 
-    Below 100 degrees that is the angle across the image's width, from there up that of the whole image circle. The lens
-    found is the result's camera ("unknown").
+    `fov_rad` [rad] is the angle across the image's width below 100 degrees, from there up that of the whole image
+    circle. `catalog` is the list of stars; `settings` has the detector. The lens found is the value's `camera`.
     """
-    from startrack.identification.unknown_lens import identify_blind as solve
-
-    settings = settings or Settings()
-    result = Result(exposure=exposure, catalog_name=catalog.name)
-    with _refusals(result):
-        _take_stars(result, catalog, None)
-        assert result.stars is not None
-        with _timed(result, "detect"):
-            result.detections = settings.detector(exposure, None)
-        with _timed(result, "identify"):
-            found = solve(result.detections, exposure.size_px, fov_rad, result.stars)
-        result.camera, result.identification = found.camera, found.identification
-        _solve_attitude(result)
-        result.status = "ok"
-    return result
+    run = Run(Inputs(exposure=exposure, catalog_name=catalog.name))
+    try:
+        detected = run.step("detect", detect_sources, run.reached, None, (settings or Settings()).detector)
+        identified = run.step("identify", identify_unknown_lens, detected, fov_rad, catalog)
+        return run.finish(run.step("attitude", solve_orientation, identified))
+    except (BadInput, NoSolution) as refusal:
+        return run.refuse(refusal)
 
 
-def detect(exposure: Exposure, camera: Camera | None, settings: Settings | None = None) -> Result:
-    """Centroids only."""
-    result = Result(exposure=exposure, camera=camera)
-    with _refusals(result), _timed(result, "detect"):
-        _check_counts(exposure, camera)
-        result.detections = (settings or Settings()).detector(exposure, camera)
-        result.status = "ok"
-    return result
+def detect(exposure: Exposure, camera: Camera | None, settings: Settings | None = None) -> Detected | Refused:
+    """Point sources of an `exposure`; `camera` (None: not known) gives fluxes in electrons, `settings` the detector."""
+    run = Run(Inputs(exposure=exposure, camera=camera))
+    try:
+        return run.finish(run.step("detect", detect_sources, run.reached, camera, (settings or Settings()).detector))
+    except (BadInput, NoSolution) as refusal:
+        return run.refuse(refusal)
 
 
-def _identify(result: Result, catalog: StarCatalog, settings: Settings, site: Site | None) -> None:
-    exposure, camera = result.exposure, result.camera
-    assert camera is not None
-    if exposure.size_px != camera.size_px:
+def check_inputs(inputs: Inputs) -> None:
+    """Raises BadInput no_time, bad_terrain or size_mismatch for `inputs` that cannot be solved together."""
+    exposure, camera, terrain = inputs.exposure, inputs.camera, inputs.terrain
+    if terrain is not None and exposure.time_utc is None:
+        raise BadInput("no_time", "; ".join([NO_TIME, *exposure.warnings]))
+    if terrain is not None and terrain.site is None:
+        raise BadInput("bad_terrain", NO_SITE.format(terrain.name))
+    if camera is not None and exposure.size_px != camera.size_px:
         raise BadInput(
             "size_mismatch",
             f"the image is {exposure.size_px[0]} x {exposure.size_px[1]} px, the camera file says "
             f"{camera.size_px[0]} x {camera.size_px[1]}",
         )
-    with _timed(result, "detect"):
-        _check_counts(exposure, camera)
-        result.detections = settings.detector(exposure, camera)
-    with _timed(result, "identify"):
-        _take_stars(result, catalog, site)
-        assert result.stars is not None
-        result.identification = settings.identifier(result.detections, camera, result.stars)
-    _solve_attitude(result)
 
 
-def _check_counts(exposure: Exposure, camera: Camera | None) -> None:
-    """A camera file's levels are in counts: taken for those, fractions from 0 to 1 would all lie below the bias."""
+def detect_sources(inputs: Inputs, camera: Camera | None, detector: Detector) -> Detected:
+    """The point sources. Raises BadInput bad_image for fractions where the camera's levels are in counts.
+
+    `detector` finds them in the exposure of `inputs`; with a `camera` its levels turn counts into electrons.
+    """
     stated = camera is not None and camera.sensor is not None
-    if stated and exposure.saturation_adu is None and are_fractions(exposure.pixels_adu):
+    if stated and inputs.exposure.saturation_adu is None and are_fractions(inputs.exposure.pixels_adu):
         raise BadInput(
             "bad_image",
             "the pixels are fractions from 0 to 1, and the camera file's gain and levels are for the sensor's counts: "
             "give those (8- or 16-bit integers, or floating point in ADU)",
         )
+    return extend(inputs, Detected, detections=detector(inputs.exposure, camera))
 
 
-def _take_stars(result: Result, catalog: StarCatalog, site: Site | None) -> None:
-    """The catalogue at the exposure's time.
+def identify_stars(
+    detected: Detected, camera: Camera, catalog: StarCatalog, identifier: Identifier, site: Site | None
+) -> Identified:
+    """Which of the point sources `detected` is which star of the `catalog`, found by the `identifier`.
 
-    Without a site the Moon's centre stands in: the Earth's velocity differs by 0.7 arcsec of aberration.
+    `site` (None: not known) is where the `camera` stands. Raises NotIdentified, TooFewStars.
     """
-    where = site or Site("moon", 0.0, 0.0)
-    when = result.exposure.time_utc
-    result.stars = catalog.at(when, observer_velocity_m_s(where, when) if when is not None else None)
-    result.bodies = bodies(site, when) if site is not None and when is not None else []
+    when = detected.exposure.time_utc
+    stars = stars_at(catalog, when, site)
+    return extend(
+        detected,
+        Identified,
+        camera=camera,
+        stars=stars,
+        bodies=tuple(bodies(site, when)) if site is not None and when is not None else (),
+        identification=identifier(detected.detections, camera, stars),
+    )
 
 
-def _solve_attitude(result: Result) -> None:
-    found, d = result.identification, result.detections
-    assert found is not None and d is not None and result.camera is not None and result.stars is not None
-    with _timed(result, "attitude"):
-        result.attitude_fit = solve_attitude(
-            result.camera,
-            d.xy_px[found.detection],
-            d.covariance_px2[found.detection],
-            result.stars.rays_icrs[found.star],
-            found.R_cam_icrs,
-        )
+def identify_unknown_lens(detected: Detected, fov_rad: float, catalog: StarCatalog) -> Identified:
+    """As `identify_stars`, with the camera found from the approximate field of view `fov_rad` [rad].
+
+    `detected` has the point sources, `catalog` the stars. Raises NotIdentified, TooFewStars.
+    """
+    from startrack.identification.unknown_lens import identify_blind as solve
+
+    stars = stars_at(catalog, detected.exposure.time_utc, None)
+    found = solve(detected.detections, detected.exposure.size_px, fov_rad, stars)
+    return extend(
+        detected, Identified, camera=found.camera, stars=stars, bodies=(), identification=found.identification
+    )
 
 
-@contextmanager
-def _refusals(result: Result) -> Iterator[None]:
-    """A refusal of a stage becomes the result's reason and message."""
-    try:
-        yield
-    except (BadInput, NoSolution) as refusal:
-        result.status, result.reason, result.message = "refused", refusal.reason, str(refusal)
+def solve_orientation(identified: Identified) -> Oriented:
+    """The attitude that fits the `identified` stars. Raises NotIdentified."""
+    found, detections = identified.identification, identified.detections
+    fit = solve_attitude(
+        identified.camera,
+        detections.xy_px[found.detection],
+        detections.covariance_px2[found.detection],
+        identified.stars.rays_icrs[found.star],
+        found.R_cam_icrs,
+    )
+    return extend(identified, Oriented, attitude_fit=fit)
 
 
-@contextmanager
-def _timed(result: Result, stage: str) -> Iterator[None]:
-    start = clock.perf_counter()
-    try:
-        yield
-    finally:
-        result.timing_ms[stage] = result.timing_ms.get(stage, 0.0) + 1e3 * (clock.perf_counter() - start)
+def stars_at(catalog: StarCatalog, when: datetime | None, site: Site | None) -> Stars:
+    """The `catalog` as seen at the time `when` from a `site`; at J2000.0 without aberration where the time is None."""
+    return catalog.at(when, observer_velocity_m_s(site or ANYWHERE, when) if when is not None else None)

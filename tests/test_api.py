@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from xml.etree import ElementTree
@@ -20,6 +21,7 @@ import startrack.api
 from startrack.errors import BadInput
 from startrack.exposure import read_exposure
 from startrack.inputs import given_exposure, utc
+from startrack.stages import Oriented, Refused, extend, reached
 
 IMAGE = "sample_images/near-wall.png"
 LOWELL = "sample_images/lowell-2018-08-06.fits.bz2"
@@ -107,7 +109,8 @@ def test_writing_replaces_what_an_earlier_result_left(solution, tmp_path):
     assert (tmp_path / "near-wall-2.wcs").read_text() == "of another image"
     solution.write(tmp_path, plots=False)  # the same image's: renewed
     refused = startrack.locate(read_exposure(IMAGE), time="2030-01-01T00:00:00Z")
-    refused.result.status, refused.result.light = "refused", None
+    result = Refused(reason="no_stars", message="", reached=extend(reached(refused.result), Oriented))
+    refused = replace(refused, result=result)
     refused.write(tmp_path, plots=False)
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["near-wall-2.wcs", "near-wall.fix.json"]
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from startrack.light import first_look
-from startrack.result import Settings
+from startrack.measurement import measure_evidence
+from startrack.stages import Settings
 
 
 def with_covariance(camera, sigma_px):
@@ -17,10 +17,14 @@ def with_covariance(camera, sigma_px):
     return replace(camera, covariance_order=order, covariance=np.diag(sigma**2))
 
 
+def photometry(result):
+    return measure_evidence(result, result.terrain, Settings(deep_stars=False)).light
+
+
 def test_an_uncertain_lens_makes_stars_at_the_rim_say_less(located):
-    sure = first_look(located.result, Settings())
+    sure = photometry(located.result)
     camera = with_covariance(located.result.camera, 2.0)
-    doubtful = first_look(replace(located.result, camera=camera), Settings())
+    doubtful = photometry(replace(located.result, camera=camera))
     assert np.array_equal(sure.star, doubtful.star)
     rays = located.result.stars.rays_icrs[sure.star] @ located.result.attitude.R_cam_icrs.T
     rim = (rays[:, 2] < 0.2) & sure.usable & (sure.llr > 8)
@@ -33,7 +37,7 @@ def test_an_uncertain_lens_makes_stars_at_the_rim_say_less(located):
 
 def test_no_evidence_beyond_the_calibrated_angle(located):
     camera = replace(located.result.camera, calibrated_angle_rad=float(np.radians(60)))
-    light = first_look(replace(located.result, camera=camera), Settings())
+    light = photometry(replace(located.result, camera=camera))
     rays = located.result.stars.rays_icrs[light.star] @ located.result.attitude.R_cam_icrs.T
     beyond = rays[:, 2] < np.cos(np.radians(60))
     assert beyond.sum() > 100

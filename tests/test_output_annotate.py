@@ -19,6 +19,7 @@ from startrack.output.picture.annotate import annotate
 from startrack.output.picture.backdrop import View, fitted, without_hot_pixels
 from startrack.output.picture.palette import HIDDEN, IDENTIFIED, POSITION, SKYLINE, STATUS, TRUTH
 from startrack.output.picture.panel import PANEL_WIDTH
+from startrack.stages import Detected, Inputs, Measured, Oriented, Refused, extend
 from startrack.types import Mode
 
 
@@ -132,16 +133,18 @@ def test_truth_is_drawn_only_when_given(picture, located):
 def test_every_kind_of_result_can_be_drawn(located):
     result = located.result
     modes = (Mode(east_m=6000.0, north_m=-2500.0, weight=0.7), Mode(east_m=-3000.0, north_m=4000.0, weight=0.3))
-    nothing = {"fix": None, "light": None}
-    unknown = {**nothing, "identification": None, "attitude_fit": None, "R_enu_icrs": None, "bodies": []}
+
+    def refused(reason, message, stage):
+        return Refused(reason=reason, message=message, reached=extend(result, stage))
+
     badge = np.s_[20:70, -200:]
     cases = {
-        "ambiguous": replace(result, status="ambiguous", fix=replace(result.fix, modes=modes, ambiguous=True)),
-        "inconsistent": replace(result, status="refused", reason="inconsistent_evidence", message="m " * 400, fix=None),
-        "not identified": replace(result, status="refused", reason="not_identified", message="why", **unknown),
-        "no stars": replace(result, status="refused", reason="no_stars", detections=None, **unknown),
-        "identified": replace(result, terrain=None, R_enu_icrs=None, bodies=[], **nothing),
-        "detected": pipeline.Result(exposure=result.exposure, detections=result.detections, status="ok"),
+        "ambiguous": replace(result, fix=replace(result.fix, modes=modes, ambiguous=True)),
+        "inconsistent": refused("inconsistent_evidence", "m " * 400, Measured),
+        "not identified": refused("not_identified", "why", Detected),
+        "no stars": refused("no_stars", "", Inputs),
+        "identified": extend(result, Oriented, terrain=None, bodies=()),
+        "detected": extend(result, Detected, camera=None, terrain=None),
     }
     for name, one in cases.items():
         drawn = annotate(one)

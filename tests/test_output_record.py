@@ -14,6 +14,7 @@ from startrack.catalog import load_catalog
 from startrack.output import detection_dict, identification_dict, refused_dict, result_dict, write_json
 from startrack.output.record import boresight_rad
 from startrack.output.text import verbose_text
+from startrack.stages import Oriented, extend
 from startrack.types import BadInput, Mode
 
 ARCSEC = np.pi / 648_000
@@ -33,13 +34,13 @@ def fix(located):
 
 
 def without_terrain(result):
-    return replace(result, terrain=None, R_enu_icrs=None, light=None, fix=None, bodies=[])
+    return extend(result, Oriented, terrain=None, bodies=())
 
 
 def ambiguous(result):
     modes = (Mode(east_m=6000.0, north_m=-2500.0, weight=0.7), Mode(east_m=-3000.0, north_m=4000.0, weight=0.3))
     fix = replace(result.fix, modes=modes, ambiguous=True)
-    return replace(result, status="ambiguous", reason="ambiguous", message="2 places fit the stars", fix=fix)
+    return replace(result, fix=fix)
 
 
 def flat_frame(result):

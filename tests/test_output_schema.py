@@ -16,6 +16,7 @@ from startrack.files import data_dir
 from startrack.output import detection_dict, identification_dict, refused_dict, result_dict
 from startrack.output.schema import SCHEMAS
 from startrack.rendering import write_truth
+from startrack.stages import Measured, Oriented, Refused, extend
 from startrack.types import Mode
 
 
@@ -38,10 +39,10 @@ def unknown_keys(value, schema, path="$"):
 
 def results(result):
     two = (Mode(east_m=1.0, north_m=2.0, weight=0.6), Mode(east_m=3.0, north_m=4.0, weight=0.4))
-    ambiguous = replace(result, status="ambiguous", reason="ambiguous", fix=replace(result.fix, modes=two))
-    refused = replace(result, status="refused", reason="inconsistent_evidence", message="no", fix=None)
+    ambiguous = replace(result, fix=replace(result.fix, modes=two, ambiguous=True))
+    refused = Refused(reason="inconsistent_evidence", message="no", reached=extend(result, Measured))
     yield from (("fix", result_dict(r)) for r in (result, ambiguous, refused))
-    yield "identification", identification_dict(replace(result, terrain=None, R_enu_icrs=None, fix=None, light=None))
+    yield "identification", identification_dict(extend(result, Oriented, terrain=None))
     yield "detection", detection_dict(result)
     yield from (
         (kind, refused_dict("a.png", "bad_image", "no", kind)) for kind in ("fix", "identification", "detection")

@@ -13,6 +13,7 @@ from astropy.table import Table
 from startrack.output import write_star_table
 from startrack.output.ecsv import Column, ecsv_text
 from startrack.output.star_table import star_table_text, status_of
+from startrack.stages import Identified, Oriented, extend
 
 COLUMNS = (
     "catalog_id hip name v_mag azimuth_deg elevation_deg x_px y_px x_measured_px y_measured_px expected_e flux_e "
@@ -79,7 +80,7 @@ def replace_row(light, llr, cause):
 
 
 def test_without_a_terrain_there_are_matches_and_predictions(located, tmp_path):
-    result = replace(located.result, terrain=None, R_enu_icrs=None, light=None, fix=None)
+    result = extend(located.result, Oriented, terrain=None)
     write_star_table(tmp_path / "t.ecsv", result)
     table = Table.read(tmp_path / "t.ecsv", format="ascii.ecsv")
     assert table.colnames == COLUMNS.split()[:4] + COLUMNS.split()[6:10]
@@ -87,7 +88,7 @@ def test_without_a_terrain_there_are_matches_and_predictions(located, tmp_path):
     assert matched.sum() == len(result.identification)
     assert (~matched).sum() > 100
     with pytest.raises(ValueError, match="identified"):
-        star_table_text(replace(result, attitude_fit=None))
+        star_table_text(extend(result, Identified))
 
 
 def test_a_full_table_is_written_quickly(located):
@@ -95,7 +96,8 @@ def test_a_full_table_is_written_quickly(located):
     light = located.result.light
     many = np.resize(np.arange(len(light.star)), 35_000)
     rows = {name: getattr(light, name)[many] for name in vars(light)}
-    result = replace(located.result, light=replace(light, **rows), identification=None)
+    nobody = replace(located.result.identification, detection=np.empty(0), star=np.empty(0))
+    result = replace(located.result, light=replace(light, **rows), identification=nobody)
     start = time.perf_counter()
     text = star_table_text(result)
     assert text.count("\n") > 35_000

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from startrack import pipeline
 from startrack.output import refusal_line, summary_line, verbose_text
 from startrack.output.text import chance_text
+from startrack.stages import Detected, Oriented, Refused, extend
 from startrack.types import Mode
 
 
@@ -35,19 +35,19 @@ def test_without_a_time_of_its_own_the_stages_are_added_up(located):
 def test_other_results(located):
     result = located.result
     two = (Mode(east_m=6000.0, north_m=-2500.0, weight=0.7), Mode(east_m=-3000.4, north_m=4000.0, weight=0.3))
-    ambiguous = replace(result, status="ambiguous", fix=replace(result.fix, modes=two, ambiguous=True))
+    ambiguous = replace(result, fix=replace(result.fix, modes=two, ambiguous=True))
     assert "ambiguous  2 places fit: E 6000 m N -2500 m (70 %); E -3000 m N 4000 m (30 %)" in summary_line(ambiguous)
     assert "±" not in summary_line(ambiguous)
-    identified = replace(result, terrain=None, R_enu_icrs=None, light=None, fix=None)
+    identified = extend(result, Oriented, terrain=None)
     assert re.search(
         r"small  ok  RA \d+\.\d{3}°  Dec [+-]\d+\.\d{3}°  roll \d+\.\d{3}°  \d+ stars", summary_line(identified)
     )
-    detected = pipeline.Result(exposure=result.exposure, detections=result.detections, status="ok")
+    detected = extend(result, Detected)
     assert summary_line(detected, seconds=0.2) == f"small  ok  {len(result.detections)} point sources  0.2 s"
 
 
 def test_refusals_are_one_line_with_reason_and_message(located):
-    refused = replace(located.result, status="refused", reason="no_stars", message="the frame\nis flat")
+    refused = Refused(reason="no_stars", message="the frame\nis flat", reached=located.result)
     assert summary_line(refused, seconds=1.0) == "small  refused  no_stars: the frame is flat"
     assert refusal_line("night/b.png", "bad_image", "it is truncated") == "b.png  refused  bad_image: it is truncated"
 

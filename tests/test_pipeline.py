@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from startrack import pipeline
 from startrack.catalog import StarCatalog, load_catalog
 from startrack.frames import azel_from_rays
-from startrack.result import Result
+from startrack.stages import Located, Outcome
 from startrack.types import Exposure
 
 ARCSEC = np.pi / 648_000
@@ -24,24 +24,22 @@ def catalog() -> StarCatalog:
     return load_catalog().brighter_than(7.0)
 
 
-def again(located: Any, catalog: StarCatalog, pixels: np.ndarray | None = None, **terrain: float) -> Result:
+def again(located: Any, catalog: StarCatalog, pixels: np.ndarray | None = None, **terrain: float) -> Outcome:
     """The same exposure located once more, with other pixels or in another crater."""
     known = located.result
     exposure = known.exposure if pixels is None else replace(known.exposure, pixels_adu=pixels.astype(np.float32))
     return pipeline.locate(exposure, known.camera, replace(known.terrain, **terrain), catalog)
 
 
-def miss(result: Result, located: Any) -> np.ndarray:
+def miss(result: Outcome, located: Any) -> np.ndarray:
     """East and north error [m]; the status must be ok."""
-    assert result.status == "ok", result.message
-    assert result.fix is not None
+    assert isinstance(result, Located) and result.status == "ok", result.message
     return result.fix.position_enu_m[:2] - located.truth.position_enu_m[:2]
 
 
-def holds(result: Result, located: Any) -> bool:
+def holds(result: Outcome, located: Any) -> bool:
     """Whether the stated covariance and the 99.9 % circle hold the truth."""
     error, fix = miss(result, located), result.fix
-    assert fix is not None
     nees = error @ np.linalg.solve(fix.covariance_m2, error)
     return bool(nees < EVERY_CHI2_2DOF and np.linalg.norm(error) < fix.radius999_m)
 
@@ -91,7 +89,7 @@ def test_turning_the_camera_turns_the_attitude_and_not_the_place(located: Any, c
 
 def test_a_mirrored_picture_is_refused_as_such(located: Any, catalog: StarCatalog) -> None:
     result = again(located, catalog, located.result.exposure.pixels_adu[:, ::-1])
-    assert (result.status, result.reason, result.fix) == ("refused", "mirrored", None)
+    assert (result.status, result.reason) == ("refused", "mirrored")
 
 
 @pytest.mark.parametrize(
@@ -99,7 +97,7 @@ def test_a_mirrored_picture_is_refused_as_such(located: Any, catalog: StarCatalo
 )
 def test_the_wrong_crater_is_refused(located: Any, catalog: StarCatalog, terrain: dict[str, float]) -> None:
     result = again(located, catalog, **terrain)
-    assert (result.status, result.reason, result.fix) == ("refused", "inconsistent_evidence", None)
+    assert (result.status, result.reason) == ("refused", "inconsistent_evidence")
 
 
 def test_a_place_beyond_the_search_area_is_refused(located: Any, catalog: StarCatalog) -> None:

@@ -14,7 +14,7 @@ from startrack.batch.store import INPUTS, JOB, has_companions, image_sha256, is_
 from startrack.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
 
 if TYPE_CHECKING:
-    from startrack.result import Result
+    from startrack.stages import Outcome
 
 # Errors of writing that the next image meets too.
 OF_THE_DISK = {errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.EFBIG, errno.EIO}
@@ -126,13 +126,13 @@ def _clear(result: Path) -> None:
         raise BadInput("bad_image", f"{result}: cannot be written ({cause.strerror})") from cause
 
 
-def _located(task: Task, sha256: str) -> tuple[Result | dict[str, Any], dict[str, str]]:
+def _located(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str, str]]:
     """A result that has companions, or else the record of a refusal; and the hashes of its other files."""
     from startrack.exposure import read_exposure
     from startrack.localization import ExactPosterior
     from startrack.output import refused_dict, result_dict
     from startrack.pipeline import Settings, locate_exposure
-    from startrack.result import Result
+    from startrack.stages import Inputs, Refused
 
     try:
         exposure = read_exposure(task.path, **task.facts)
@@ -142,7 +142,7 @@ def _located(task: Task, sha256: str) -> tuple[Result | dict[str, Any], dict[str
     try:
         return locate_exposure(exposure, Settings(localizer=ExactPosterior(compiled=task.compiled))), inputs
     except BadInput as cause:
-        return result_dict(Result(exposure=exposure, reason=cause.reason, message=str(cause))), inputs
+        return result_dict(Refused(reason=cause.reason, message=str(cause), reached=Inputs(exposure=exposure))), inputs
 
 
 def _unread(sha256: str) -> dict[str, Any]:

@@ -30,13 +30,13 @@ def run(args: argparse.Namespace) -> int:
 def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     from startrack.output import summary_line, write_results
     from startrack.pipeline import detect
+    from startrack.stages import with_timing
 
     start = time.perf_counter()
     exposure = read(path, args)
     camera = camera_of(exposure) if exposure.camera is not None else None
     out = result_path(args, stem, ".detections.json", exposure)
     read_ms = 1e3 * (time.perf_counter() - start)
-    result = detect(exposure, camera)
-    result.timing_ms["read"] = read_ms
+    result = with_timing(detect(exposure, camera), read=read_ms)
     record = write_results(result, out, plots=not args.no_plots)
     return Outcome(result.status, result.reason, summary_line(result, seconds=time.perf_counter() - start), record)

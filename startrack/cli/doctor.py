@@ -113,6 +113,7 @@ def _self_test() -> str:
     from startrack.catalog import load_catalog
     from startrack.pipeline import locate
     from startrack.rendering import Series, render
+    from startrack.stages import Refused
     from startrack.terrain import load_terrain
 
     terrain, camera, catalog = load_terrain("shackleton-thesis"), load_camera("fisheye-2048"), load_catalog()
@@ -120,7 +121,7 @@ def _self_test() -> str:
     scene, rng = series.scene(0)
     exposure, truth = render(scene, rng=rng)
     result = locate(exposure, camera, terrain, catalog)
-    if result.fix is None:
+    if isinstance(result, Refused):
         raise RuntimeError(f"the rendered exposure was refused: {result.reason}: {result.message}")
     error = float(np.linalg.norm((result.fix.position_enu_m - truth.position_enu_m)[:2]))
     if error > SELF_TEST_LIMIT_M:

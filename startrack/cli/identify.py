@@ -53,6 +53,7 @@ def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
         write_results,
     )
     from startrack.pipeline import identify, identify_blind
+    from startrack.stages import Oriented, Refused, with_timing
 
     start = time.perf_counter()
     exposure = read(path, args)
@@ -60,13 +61,13 @@ def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     out = result_path(args, stem, ".identification.json", exposure)
     read_ms = 1e3 * (time.perf_counter() - start)
     if camera is not None:
-        result = identify(exposure, camera, load_catalog())
+        result: Oriented | Refused = identify(exposure, camera, load_catalog())
     else:
         result = identify_blind(exposure, args.fov, load_catalog())
-    result.timing_ms["read"] = read_ms
+    result = with_timing(result, read=read_ms)
     record = write_results(result, out, plots=not args.no_plots)
     line = summary_line(result, seconds=time.perf_counter() - start)
-    if camera is None and result.camera is not None:
+    if camera is None and isinstance(result, Oriented):
         line += (
             f"\n  {lens_text(result.camera)}; a camera file: startrack calibrate --fov {math.degrees(args.fov):g} IMAGE"
         )

@@ -47,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
 def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     from startrack.output import summary_line, verbose_text, write_results
     from startrack.pipeline import locate_exposure
+    from startrack.stages import with_timing
 
     start = time.perf_counter()
     exposure = read(path, args)
@@ -55,8 +56,7 @@ def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     if exposure.time_utc is not None and exposure.camera is not None:
         ready_for(exposure.terrain, args)
     start = time.perf_counter()
-    result = locate_exposure(exposure)
-    result.timing_ms["read"] += read_ms
+    result = with_timing(locate_exposure(exposure), read=read_ms)
     record = write_results(result, out, plots=not args.no_plots)
     line = summary_line(result, seconds=read_ms / 1e3 + time.perf_counter() - start)
     if args.verbose:

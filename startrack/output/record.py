@@ -3,68 +3,77 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from startrack import __version__
 from startrack.frames import format_utc, heading_pitch_roll_from_R_body_enu, latlon_from_enu, quat_xyzw_from_R
+from startrack.stages import (
+    STAGES,
+    Detected,
+    Identified,
+    Inputs,
+    Located,
+    Measured,
+    Oriented,
+    Outcome,
+    reached,
+)  # fmt: skip
 from startrack.types import Array, Exposure, Fix
-
-if TYPE_CHECKING:
-    from startrack.result import Result
-    from startrack.terrain import Terrain
 
 FORMATS = {
     "fix": "startrack.fix/1",
     "identification": "startrack.identification/1",
     "detection": "startrack.detection/1",
 }
-STAGES = ("read", "detect", "identify", "attitude", "evidence", "locate")
 ARCSEC_PER_RAD = 648_000 / np.pi
 
 
-def result_dict(result: Result) -> dict[str, Any]:
+def result_dict(result: Outcome) -> dict[str, Any]:
     """The fix of one image: `position` where the status is ok, `modes` where there are any.
 
     A refused result holds its status, reason and message and whatever was known by then; `null` stands for what was
     not. Fields in `enu` are absent where terrain or time were not known.
     """
     d = _head("fix", result)
-    if result.fix is not None and result.terrain is not None:
-        if result.status == "ok":
-            d["position"] = _position(result.fix, result.terrain)
-        d["modes"] = [{"east_m": m.east_m, "north_m": m.north_m, "weight": m.weight} for m in result.fix.modes]
+    value = reached(result)
+    if isinstance(value, Located):
+        if not value.fix.ambiguous:
+            d["position"] = _position(value)
+        d["modes"] = [{"east_m": m.east_m, "north_m": m.north_m, "weight": m.weight} for m in value.fix.modes]
     return d | _attitude(result) | _tail(result)
 
 
-def identification_dict(result: Result) -> dict[str, Any]:
+def identification_dict(result: Outcome) -> dict[str, Any]:
     """Attitude, the camera that was used and the matches: stars with the positions measured for them."""
     from startrack.camera.io import camera_to_dict
 
+    value = reached(result)
     d = _head("identification", result) | _attitude(result)
-    if result.camera is not None:
-        d["camera"] = camera_to_dict(result.camera)
+    if value.camera is not None:
+        d["camera"] = camera_to_dict(value.camera)
     d["matches"] = []
-    if result.identification is not None and result.detections is not None and result.stars is not None:
-        xy_px = result.detections.xy_px[result.identification.detection].tolist()
-        hips = result.stars.hip[result.identification.star].tolist()
+    if isinstance(value, Identified):
+        xy_px = value.detections.xy_px[value.identification.detection].tolist()
+        hips = value.stars.hip[value.identification.star].tolist()
         d["matches"] = [{"hip": hip or None, "x_px": x, "y_px": y} for hip, (x, y) in zip(hips, xy_px, strict=True)]
     return d | _tail(result)
 
 
-def detection_dict(result: Result) -> dict[str, Any]:
+def detection_dict(result: Outcome) -> dict[str, Any]:
     """The point sources, brightest first; fluxes are in ADU where the gain is not known."""
     d = _head("detection", result)
     d["detections"] = []
-    found = result.detections
-    if found is not None:
+    value = reached(result)
+    if isinstance(value, Detected):
+        found = value.detections
         rows = zip(found.xy_px.tolist(), found.flux_e.tolist(), found.snr.tolist(), strict=True)
         d["detections"] = [{"x_px": x, "y_px": y, "flux_e": flux, "snr": snr} for (x, y), flux, snr in rows]
     return d | _tail(result)
 
 
-def record_of(result: Result, kind: str) -> dict[str, Any]:
+def record_of(result: Outcome, kind: str) -> dict[str, Any]:
     """The record of a kind, as its file is named (NAME.KIND.json): fix, identification or detections."""
     return {"fix": result_dict, "identification": identification_dict, "detections": detection_dict}[kind](result)
 
@@ -80,11 +89,9 @@ def refused_dict(image: str, reason: str, message: str, kind: str = "fix") -> di
     }
 
 
-def R_body_enu(result: Result) -> Array | None:
-    """Rotation (3, 3) from enu to the rover's body, or None where attitude, terrain or time are not known."""
-    if result.attitude is None or result.camera is None or result.R_enu_icrs is None:
-        return None
-    return np.asarray(result.camera.R_body_cam @ result.attitude.R_cam_icrs @ result.R_enu_icrs.T)
+def R_body_enu(value: Measured) -> Array:
+    """Rotation (3, 3) from enu to the rover's body."""
+    return np.asarray(value.camera.R_body_cam @ value.R_cam_enu)
 
 
 def boresight_rad(R_cam_icrs: Array) -> tuple[float, float, float]:
@@ -109,17 +116,17 @@ def place_m(fix: Fix) -> tuple[float, float]:
     return float(fix.position_enu_m[0]), float(fix.position_enu_m[1])
 
 
-def lens_errors_known(result: Result) -> bool:
+def lens_errors_known(value: Oriented) -> bool:
     """Whether the attitude's covariance holds the errors of the lens: the camera says what they are."""
-    return result.camera is not None and result.camera.covariance is not None
+    return value.camera.covariance is not None
 
 
-def predicted_visible(result: Result) -> int:
+def predicted_visible(value: Inputs) -> int:
     """How many stars whose light was measured stand above the fix's skyline; 0 without a fix."""
-    if result.fix is None or result.light is None or result.terrain is None:
+    if not isinstance(value, Located):
         return 0
-    light = result.light
-    horizon = result.terrain.horizon_rad(np.array([place_m(result.fix)]), light.azimuth_rad)
+    light = value.light
+    horizon = value.terrain.horizon_rad(np.array([place_m(value.fix)]), light.azimuth_rad)
     return int((light.usable & (light.elevation_rad > horizon)).sum())
 
 
@@ -128,7 +135,7 @@ def image_name(exposure: Exposure) -> str:
     return Path(exposure.path).name or exposure.name
 
 
-def _head(kind: str, result: Result) -> dict[str, Any]:
+def _head(kind: str, result: Outcome) -> dict[str, Any]:
     return {
         "format": FORMATS[kind],
         "image": image_name(result.exposure),
@@ -144,12 +151,13 @@ def _within_a_turn(angle_rad: float) -> float:
     return turned if turned < 2 * np.pi else 0.0
 
 
-def _position(fix: Fix, terrain: Terrain) -> dict[str, Any]:
+def _position(value: Located) -> dict[str, Any]:
+    fix = value.fix
     east, north, up = fix.position_enu_m.tolist()
-    latitude, longitude = latlon_from_enu(terrain.site, east, north, up)
+    latitude, longitude = latlon_from_enu(value.site, east, north, up)
     return {
         "frame": "enu",
-        "terrain": terrain.name,
+        "terrain": value.terrain.name,
         "east_m": east,
         "north_m": north,
         "up_m": up,
@@ -161,10 +169,11 @@ def _position(fix: Fix, terrain: Terrain) -> dict[str, Any]:
     }
 
 
-def _attitude(result: Result) -> dict[str, Any]:
-    attitude = result.attitude
-    if attitude is None:
+def _attitude(result: Outcome) -> dict[str, Any]:
+    value = reached(result)
+    if not isinstance(value, Oriented):
         return {}
+    attitude = value.attitude
     ra, dec, roll = np.degrees(boresight_rad(attitude.R_cam_icrs)).tolist()
     d = {
         "quat_xyzw_cam_icrs": quat_xyzw_from_R(attitude.R_cam_icrs).tolist(),
@@ -172,25 +181,27 @@ def _attitude(result: Result) -> dict[str, Any]:
         "dec_deg": dec,
         "roll_deg": roll,
         "sigma_arcsec": (np.sqrt(np.diag(attitude.covariance_rad2)) * ARCSEC_PER_RAD).tolist(),
-        "lens_error_included": lens_errors_known(result),
+        "lens_error_included": lens_errors_known(value),
     }
-    body = R_body_enu(result)
-    if body is not None:
+    if isinstance(value, Measured):
+        body = R_body_enu(value)
         heading, pitch, roll_body = np.degrees(heading_pitch_roll_from_R_body_enu(body)).tolist()
         d["quat_xyzw_body_enu"] = quat_xyzw_from_R(body).tolist()
         d |= {"heading_deg": heading, "pitch_deg": pitch, "roll_body_deg": roll_body}
     return {"attitude": d}
 
 
-def _tail(result: Result) -> dict[str, Any]:
-    found, fit, exposure = result.identification, result.attitude_fit, result.exposure
+def _tail(result: Outcome) -> dict[str, Any]:
+    value, exposure = reached(result), result.exposure
+    found = value.identification if isinstance(value, Identified) else None
+    fit = value.attitude_fit if isinstance(value, Oriented) else None
     time_utc = exposure.time_utc
     return {
         "stars": {
-            "detected": 0 if result.detections is None else len(result.detections),
+            "detected": len(value.detections) if isinstance(value, Detected) else 0,
             "identified": 0 if found is None else len(found),
             "unexplained": None if found is None else found.unexplained,
-            "predicted_visible": None if result.terrain is None else predicted_visible(result),
+            "predicted_visible": None if value.terrain is None else predicted_visible(value),
             "rms_px": None if fit is None else fit.rms_px,
             "false_alarm_probability": None if found is None else found.false_alarm_probability,
         },
@@ -198,9 +209,9 @@ def _tail(result: Result) -> dict[str, Any]:
         "provenance": {
             "version": __version__,
             "image_sha256": exposure.sha256,
-            "camera": exposure.camera or (result.camera.name if result.camera is not None else None),
-            "terrain": exposure.terrain or (result.terrain.name if result.terrain is not None else None),
-            "catalog": result.catalog_name or None,
+            "camera": exposure.camera or (value.camera.name if value.camera is not None else None),
+            "terrain": exposure.terrain or (value.terrain.name if value.terrain is not None else None),
+            "catalog": value.catalog_name or None,
             "time_utc": None if time_utc is None else format_utc(time_utc),
             "exposure_s": exposure.exposure_s,
         },

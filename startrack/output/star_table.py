@@ -11,31 +11,31 @@ from numpy.typing import NDArray
 from startrack.catalog import star_names
 from startrack.evidence.star_evidence import SEEN_LLR
 from startrack.output.ecsv import Column, ecsv_text, formatted
+from startrack.stages import Identified, Inputs, Measured, Oriented
 from startrack.types import Array, Ints, Stars
 
 if TYPE_CHECKING:
     from startrack.evidence import StarLight
-    from startrack.result import Result
 
 STATUSES = ("seen", "hidden", "uncertain", "unusable")
 FAINTER_THAN_FAINTEST_MATCH_MAG = 0.5
 
 
-def star_table_text(result: Result) -> str:
+def star_table_text(value: Inputs) -> str:
     """The star table of a result as ECSV, brightest star first; stars must have been identified.
 
     After `locate`: every star whose light was measured. Without a terrain: the matched stars and all others in the
     frame down to half a magnitude below the faintest of them, without azimuth, elevation and evidence.
     """
-    if result.stars is None or result.attitude is None:
+    if not isinstance(value, Oriented):
         raise ValueError("no star table without identified stars")
-    if result.light is None:
-        return ecsv_text(_predicted_columns(result, result.stars))
+    if not isinstance(value, Measured):
+        return ecsv_text(_predicted_columns(value))
     return ecsv_text([
-        *_catalog_columns(result.stars, result.light.star),
-        *_direction_columns(result.light),
-        *_place_columns(result, result.light.star, result.light.xy_px),
-        *_light_columns(result.light, _flux_unit(result)),
+        *_catalog_columns(value.stars, value.light.star),
+        *_direction_columns(value.light),
+        *_place_columns(value, value.light.star, value.light.xy_px),
+        *_light_columns(value.light, _flux_unit(value)),
     ])  # fmt: skip
 
 
@@ -51,20 +51,18 @@ def names_of(hips: Ints) -> list[str]:
     return [names.get(hip, "") for hip in hips.tolist()]
 
 
-def in_view(result: Result, stars: Stars) -> tuple[Ints, Array]:
+def in_view(value: Oriented) -> tuple[Ints, Array]:
     """Stars in the frame down to the depth of the matches: indices (n,) and predicted pixels (n, 2)."""
-    assert result.camera is not None
-    assert result.attitude is not None
-    matched = result.identification.star if result.identification is not None else np.empty(0, dtype=np.int64)
+    stars, matched = value.stars, value.identification.star
     faintest = float(stars.v_mag[matched].max(initial=-np.inf)) + FAINTER_THAN_FAINTEST_MATCH_MAG
     candidates = np.flatnonzero(stars.v_mag <= faintest)
-    xy_px, inside = result.camera.project(stars.rays_icrs[candidates] @ result.attitude.R_cam_icrs.T)
+    xy_px, inside = value.camera.project(stars.rays_icrs[candidates] @ value.attitude.R_cam_icrs.T)
     return candidates[inside], xy_px[inside]
 
 
-def _predicted_columns(result: Result, stars: Stars) -> list[Column]:
-    star, xy_px = in_view(result, stars)
-    return [*_catalog_columns(stars, star), *_place_columns(result, star, xy_px)]
+def _predicted_columns(value: Oriented) -> list[Column]:
+    star, xy_px = in_view(value)
+    return [*_catalog_columns(value.stars, star), *_place_columns(value, star, xy_px)]
 
 
 def _catalog_columns(stars: Stars, star: Ints) -> list[Column]:
@@ -84,8 +82,8 @@ def _direction_columns(light: StarLight) -> list[Column]:
     ]
 
 
-def _place_columns(result: Result, star: Ints, xy_px: Array) -> list[Column]:
-    measured = _measured(result, star)
+def _place_columns(value: Identified, star: Ints, xy_px: Array) -> list[Column]:
+    measured = _measured(value, star)
     origin = "(0, 0) is the centre of the top-left pixel"
     return [
         Column("x_px", xy_px[:, 0], "float64", "pix", "%.3f", f"predicted; {origin}"),
@@ -95,15 +93,14 @@ def _place_columns(result: Result, star: Ints, xy_px: Array) -> list[Column]:
     ]
 
 
-def _measured(result: Result, star: Ints) -> tuple[list[str], list[str]]:
+def _measured(value: Identified, star: Ints) -> tuple[list[str], list[str]]:
     """Measured pixels of the stars as texts, empty where no detection was identified as the star."""
     x: list[float | None] = [None] * len(star)
     y: list[float | None] = [None] * len(star)
-    if result.identification is not None and result.detections is not None:
-        _, row, match = np.intersect1d(star, result.identification.star, return_indices=True)
-        xy_px = result.detections.xy_px[result.identification.detection[match]]
-        for at, (px, py) in zip(row.tolist(), xy_px.tolist(), strict=True):
-            x[at], y[at] = px, py
+    _, row, match = np.intersect1d(star, value.identification.star, return_indices=True)
+    xy_px = value.detections.xy_px[value.identification.detection[match]]
+    for at, (px, py) in zip(row.tolist(), xy_px.tolist(), strict=True):
+        x[at], y[at] = px, py
     return formatted("%.3f", x), formatted("%.3f", y)
 
 
@@ -123,5 +120,5 @@ def _light_columns(light: StarLight, unit: str) -> Sequence[Column]:
     ]
 
 
-def _flux_unit(result: Result) -> str:
-    return "electron" if result.camera is not None and result.camera.sensor is not None else "adu"
+def _flux_unit(value: Identified) -> str:
+    return "electron" if value.camera.sensor is not None else "adu"

@@ -17,33 +17,33 @@ from startrack.output.record import (
     lens_errors_known,
     predicted_visible,
 )
+from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented, Outcome, Refused, reached
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
-    from startrack.result import Result
+    from startrack.types import Fix
 
 LEAST_CHANCE = 1e-100
 
 
-def summary_line(result: Result, seconds: float | None = None) -> str:
+def summary_line(result: Outcome, seconds: float | None = None) -> str:
     """One line: what became of the image. `seconds` is what it took in all; without it the stages' times are added."""
-    if result.status == "refused":
-        return refusal_line(image_name(result.exposure), result.reason or "", result.message)
+    if isinstance(result, Refused):
+        return refusal_line(image_name(result.exposure), result.reason, result.message)
     parts = [image_name(result.exposure), result.status]
-    if result.fix is not None and result.status == "ambiguous":
-        parts += [f"{len(result.fix.modes)} places fit: {_modes(result)}"]
-    elif result.fix is not None:
+    if isinstance(result, Located) and result.fix.ambiguous:
+        parts += [f"{len(result.fix.modes)} places fit: {_modes(result.fix)}"]
+    elif isinstance(result, Located):
         east, north, _ = result.fix.position_enu_m
         parts += [f"E {east:.1f} m", f"N {north:.1f} m", f"±{result.fix.radius95_m:.1f} m (95 %)"]
-    body = R_body_enu(result)
-    if body is not None:
-        parts += [f"heading {_degrees(heading_pitch_roll_from_R_body_enu(body)[0], 1)}°"]
-    elif result.attitude is not None:
+    if isinstance(result, Measured):
+        parts += [f"heading {_degrees(heading_pitch_roll_from_R_body_enu(R_body_enu(result))[0], 1)}°"]
+    elif isinstance(result, Oriented):
         ra, dec, roll = boresight_rad(result.attitude.R_cam_icrs)
         parts += [f"RA {_degrees(ra, 3)}°", f"Dec {np.degrees(dec):+.3f}°", f"roll {_degrees(roll, 3)}°"]
-    if result.identification is not None:
+    if isinstance(result, Identified):
         parts += [f"{len(result.identification)} stars"]
-    elif result.detections is not None:
+    elif isinstance(result, Detected):
         parts += [f"{len(result.detections)} point sources"]
     took_s = seconds if seconds is not None else sum(result.timing_ms.values()) / 1e3
     return "  ".join([*parts, f"{took_s:.1f} s"])
@@ -64,9 +64,10 @@ def refusal_line(image: str, reason: str, message: str) -> str:
     return f"{Path(image).name}  refused  {reason}: {' '.join(message.split())}"
 
 
-def verbose_text(result: Result) -> str:
+def verbose_text(result: Outcome) -> str:
     """Some indented lines: place, attitude, stars and times, as far as they are known."""
-    lines = [*_place(result), *_attitude(result), *_stars(result)]
+    value = reached(result)
+    lines = [*_place(value), *_attitude(value), *_stars(value)]
     when = result.exposure.time_utc
     lines += [f"time       {format_utc(when) if when is not None else 'not known'} (middle of the exposure)"]
     spent = [f"{stage} {result.timing_ms[stage]:.0f}" for stage in STAGES if stage in result.timing_ms]
@@ -80,12 +81,12 @@ def chance_text(probability: float) -> str:
     return f"{probability:.0e}" if probability >= LEAST_CHANCE else f"below {LEAST_CHANCE:.0e}"
 
 
-def _place(result: Result) -> list[str]:
-    if result.fix is None or result.terrain is None:
+def _place(result: Inputs) -> list[str]:
+    if not isinstance(result, Located):
         return []
-    if result.status == "ambiguous":
-        return [f"places     {_modes(result)}"]
-    fix, site = result.fix, result.terrain.site
+    if result.fix.ambiguous:
+        return [f"places     {_modes(result.fix)}"]
+    fix, site = result.fix, result.site
     latitude, longitude = np.degrees(latlon_from_enu(site, *fix.position_enu_m))
     sigma = np.sqrt(np.linalg.eigvalsh(fix.covariance_m2))
     return [
@@ -96,8 +97,8 @@ def _place(result: Result) -> list[str]:
     ]
 
 
-def _attitude(result: Result) -> list[str]:
-    if result.attitude is None:
+def _attitude(result: Inputs) -> list[str]:
+    if not isinstance(result, Oriented):
         return []
     ra, dec, roll = boresight_rad(result.attitude.R_cam_icrs)
     sigma = np.sqrt(np.diag(result.attitude.covariance_rad2)) * ARCSEC_PER_RAD
@@ -106,9 +107,8 @@ def _attitude(result: Result) -> list[str]:
         f"sigma {sigma[0]:.2f}, {sigma[1]:.2f}, {sigma[2]:.2f} arcsec about x, y, z"
         f"{'' if lens_errors_known(result) else ', the lens taken as exact'}"
     ]
-    body = R_body_enu(result)
-    if body is not None:
-        heading, pitch, roll_body = heading_pitch_roll_from_R_body_enu(body)
+    if isinstance(result, Measured):
+        heading, pitch, roll_body = heading_pitch_roll_from_R_body_enu(R_body_enu(result))
         lines += [
             f"body       heading {_degrees(heading, 3)}°, pitch {np.degrees(pitch):+.3f}°, "
             f"roll {np.degrees(roll_body):+.3f}°"
@@ -116,25 +116,26 @@ def _attitude(result: Result) -> list[str]:
     return lines
 
 
-def _stars(result: Result) -> list[str]:
-    if result.detections is None:
+def _stars(result: Inputs) -> list[str]:
+    if not isinstance(result, Detected):
         return []
     text = f"{len(result.detections)} point sources"
-    found, fit = result.identification, result.attitude_fit
+    found = result.identification if isinstance(result, Identified) else None
     if found is not None:
         text += f", {len(found)} identified, {found.unexplained} significant ones unexplained"
-    if found is not None and fit is not None:
-        text += f"; rms {fit.rms_px:.3f} px; false alarm {chance_text(found.false_alarm_probability)}"
+    if found is not None and isinstance(result, Oriented):
+        text += f"; rms {result.attitude_fit.rms_px:.3f} px; false alarm {chance_text(found.false_alarm_probability)}"
     lines = [f"stars      {text}"]
-    if result.light is not None:
+    if isinstance(result, Measured):
         lines += [f"evidence   {int(result.light.usable.sum())} catalogue stars measured"]
-        lines[-1] += f", {predicted_visible(result)} above the skyline of the fix" if result.fix is not None else ""
+        lines[-1] += (
+            f", {predicted_visible(result)} above the skyline of the fix" if isinstance(result, Located) else ""
+        )
     return lines
 
 
-def _modes(result: Result) -> str:
-    assert result.fix is not None
-    return "; ".join(f"E {m.east_m:.0f} m N {m.north_m:.0f} m ({100 * m.weight:.0f} %)" for m in result.fix.modes)
+def _modes(fix: Fix) -> str:
+    return "; ".join(f"E {m.east_m:.0f} m N {m.north_m:.0f} m ({100 * m.weight:.0f} %)" for m in fix.modes)
 
 
 def _degrees(angle_rad: float, decimals: int) -> str:

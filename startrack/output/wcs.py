@@ -7,7 +7,6 @@ camera file is one of these exactly; only a decentred one needs the SIP polynomi
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,26 +14,24 @@ from startrack import __version__
 from startrack.camera import Camera, Decentring
 from startrack.frames import Site, aberrate, format_utc, observer_velocity_m_s, wahba
 from startrack.output.fits_blocks import Card, header_block, table_file
+from startrack.stages import Measured, Oriented
 from startrack.types import Array
-
-if TYPE_CHECKING:
-    from startrack.result import Result
 
 SIP_ORDER = 4
 GRID = 40  # points across the frame at which the field is sampled
 
 
-def wcs_bytes(result: Result) -> bytes:
+def wcs_bytes(value: Oriented) -> bytes:
     """The header NAME.wcs of a result with an attitude: no pixels, IMAGEW and IMAGEH give their number.
 
     World coordinates are ICRS directions without aberration, so that catalogue positions at the image's epoch fall on
     their stars. Aberration bends a whole sky by up to 20 arcsec (0.06 px of a fisheye): the mean over the frame is
     taken out. FITS pixel (1, 1) is our (0, 0), the first pixel stored.
     """
-    return header_block(wcs_cards(_camera(result), _R_cam_still(result), result))
+    return header_block(wcs_cards(value.camera, _R_cam_still(value), value))
 
 
-def wcs_cards(camera: Camera, R_cam_icrs: Array, result: Result | None = None) -> dict[str, Card]:
+def wcs_cards(camera: Camera, R_cam_icrs: Array, value: Oriented | None = None) -> dict[str, Card]:
     """The header's cards for a camera and its attitude."""
     axis = R_cam_icrs[2]
     ra, dec = np.arctan2(axis[1], axis[0]), np.arctan2(axis[2], np.hypot(axis[0], axis[1]))
@@ -55,25 +52,23 @@ def wcs_cards(camera: Camera, R_cam_icrs: Array, result: Result | None = None) -
     cards |= {"IMAGEW": camera.size_px[0], "IMAGEH": camera.size_px[1]}
     if sip:
         cards |= _sip_cards(camera)
-    if result is not None and result.exposure.time_utc is not None:
-        cards["DATE-AVG"] = format_utc(result.exposure.time_utc).removesuffix("Z")
+    if value is not None and value.exposure.time_utc is not None:
+        cards["DATE-AVG"] = format_utc(value.exposure.time_utc).removesuffix("Z")
     return cards | {"CREATOR": f"startrack {__version__}", "COMMENT1": "image rows in the order of the file"}
 
 
-def matches_bytes(result: Result) -> bytes:
+def matches_bytes(value: Oriented) -> bytes:
     """The table NAME.corr of the matches: measured place (field) and catalogue's (index), in FITS pixels and degrees.
 
     Columns as astrometry.net's: field_x, field_y, field_ra, field_dec, index_x, index_y, index_ra, index_dec, and
     index_id, FLUX, MAG.
     """
-    camera, R = _camera(result), _R_cam_still(result)
-    assert result.identification is not None and result.detections is not None and result.stars is not None
-    found, stars = result.identification, result.stars.take(result.identification.star)
-    velocity = _velocity_m_s(result)
+    camera, R = value.camera, _R_cam_still(value)
+    found, stars = value.identification, value.stars.take(value.identification.star)
+    velocity = _velocity_m_s(value)
     still = stars.rays_icrs if velocity is None else aberrate(stars.rays_icrs, -velocity)
-    measured = result.detections.xy_px[found.detection]
-    assert result.attitude is not None
-    predicted, _ = camera.project(stars.rays_icrs @ result.attitude.R_cam_icrs.T)
+    measured = value.detections.xy_px[found.detection]
+    predicted, _ = camera.project(stars.rays_icrs @ value.attitude.R_cam_icrs.T)
     field_deg, index_deg = _radec_deg(camera.unproject(measured) @ R), _radec_deg(still)
     return table_file(
         [
@@ -81,34 +76,27 @@ def matches_bytes(result: Result) -> bytes:
             ("field_ra", "deg", field_deg[:, 0]), ("field_dec", "deg", field_deg[:, 1]),
             ("index_x", "pix", predicted[:, 0] + 1), ("index_y", "pix", predicted[:, 1] + 1),
             ("index_ra", "deg", index_deg[:, 0]), ("index_dec", "deg", index_deg[:, 1]),
-            ("index_id", "", np.asarray(stars.catalog_id)), ("FLUX", "", result.detections.flux_e[found.detection]),
+            ("index_id", "", np.asarray(stars.catalog_id)), ("FLUX", "", value.detections.flux_e[found.detection]),
             ("MAG", "mag", stars.v_mag),
         ],
         {"EXTNAME": "CORR"},
     )  # fmt: skip
 
 
-def _camera(result: Result) -> Camera:
-    if result.camera is None or result.attitude is None:
-        raise ValueError("no world coordinates without an attitude")
-    return result.camera
-
-
-def _velocity_m_s(result: Result) -> Array | None:
-    if result.exposure.time_utc is None:
+def _velocity_m_s(value: Oriented) -> Array | None:
+    if value.exposure.time_utc is None:
         return None  # the catalogue was taken without aberration
-    site = result.terrain.site if result.terrain is not None else Site("moon", 0.0, 0.0)
-    return observer_velocity_m_s(site, result.exposure.time_utc)
+    site = value.site if isinstance(value, Measured) else Site("moon", 0.0, 0.0)
+    return observer_velocity_m_s(site, value.exposure.time_utc)
 
 
-def _R_cam_still(result: Result) -> Array:
+def _R_cam_still(value: Oriented) -> Array:
     """R_cam_icrs (3, 3) that takes catalogue directions, without aberration, nearest to where they appear."""
-    camera, velocity = _camera(result), _velocity_m_s(result)
-    assert result.attitude is not None
+    camera, velocity = value.camera, _velocity_m_s(value)
     if velocity is None:
-        return result.attitude.R_cam_icrs
+        return value.attitude.R_cam_icrs
     rays_cam = camera.unproject(_grid(camera))
-    still = aberrate(rays_cam @ result.attitude.R_cam_icrs, -velocity)
+    still = aberrate(rays_cam @ value.attitude.R_cam_icrs, -velocity)
     return wahba(rays_cam, still)
 
 

@@ -11,7 +11,7 @@ from startrack.errors import BadInput
 from startrack.files import make_folder, write_atomically
 
 if TYPE_CHECKING:
-    from startrack.result import Result
+    from startrack.stages import Oriented, Outcome
 
 COMPANIONS = (".stars.ecsv", ".annotated.png", ".wcs", ".corr")  # beside NAME.fix.json and the other records
 FilePath = str | os.PathLike[str]
@@ -52,20 +52,21 @@ def _stem_and_kind(record: Path) -> tuple[str, str]:
     return stem, kind
 
 
-def write_results(result: Result, path: Path, *, plots: bool = True, write_record: bool = True) -> dict[str, Any]:
+def write_results(outcome: Outcome, path: Path, *, plots: bool = True, write_record: bool = True) -> dict[str, Any]:
     """The record of an image, written to `path` (NAME.fix.json, say) after its companions: star table, WCS, picture.
 
     Raises BadInput where they cannot be written.
     """
     from startrack.output.record import record_of
+    from startrack.stages import Measured, Oriented, reached
 
     stem, kind = _stem_and_kind(path)
-    record = record_of(result, kind)
-    if result.light is not None or (result.terrain is None and result.attitude is not None):
-        write_star_table(path.with_name(f"{stem}.stars.ecsv"), result)
-        write_wcs(path.with_name(f"{stem}.wcs"), path.with_name(f"{stem}.corr"), result)
+    record, value = record_of(outcome, kind), reached(outcome)
+    if isinstance(value, Measured) or (isinstance(value, Oriented) and value.terrain is None):
+        write_star_table(path.with_name(f"{stem}.stars.ecsv"), value)
+        write_wcs(path.with_name(f"{stem}.wcs"), path.with_name(f"{stem}.corr"), value)
     if plots:
-        write_annotated(path.with_name(f"{stem}.annotated.png"), result)
+        write_annotated(path.with_name(f"{stem}.annotated.png"), outcome)
     if write_record:
         write_json(path, record)
     return record
@@ -85,25 +86,25 @@ def json_text(record: dict[str, Any]) -> str:
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
-def write_star_table(path: FilePath, result: Result) -> None:
+def write_star_table(path: FilePath, value: Oriented) -> None:
     """Write NAME.stars.ecsv: every catalogue star in view. Raises BadInput where it cannot be written."""
     from startrack.output.star_table import star_table_text
 
-    write_atomically(path, star_table_text(result).encode("utf-8"), overwrite=True)
+    write_atomically(path, star_table_text(value).encode("utf-8"), overwrite=True)
 
 
-def write_wcs(path: FilePath, corr_path: FilePath, result: Result) -> None:
+def write_wcs(path: FilePath, corr_path: FilePath, value: Oriented) -> None:
     """Write NAME.wcs, the FITS header of the image's world coordinates, and NAME.corr, its matches as a FITS table.
 
     Raises BadInput where they cannot be written.
     """
     from startrack.output.wcs import matches_bytes, wcs_bytes
 
-    write_atomically(path, wcs_bytes(result), overwrite=True)
-    write_atomically(corr_path, matches_bytes(result), overwrite=True)
+    write_atomically(path, wcs_bytes(value), overwrite=True)
+    write_atomically(corr_path, matches_bytes(value), overwrite=True)
 
 
-def write_annotated(path: FilePath, result: Result, truth_enu_m: tuple[float, float] | None = None) -> None:
+def write_annotated(path: FilePath, outcome: Outcome, truth_enu_m: tuple[float, float] | None = None) -> None:
     """Write NAME.annotated.png. Raises BadInput where it cannot be written.
 
     `truth_enu_m` (east, north) is drawn where a caller knows it; no stage of the pipeline does.
@@ -112,7 +113,7 @@ def write_annotated(path: FilePath, result: Result, truth_enu_m: tuple[float, fl
 
     from startrack.output.picture.annotate import annotate
 
-    picture = annotate(result, truth_enu_m)
+    picture = annotate(outcome, truth_enu_m)
     run_lengths = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]  # smaller and quicker for flat colours
     ok, data = cv2.imencode(".png", picture[:, :, ::-1], run_lengths)
     if not ok:

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 from startrack.output import make_way, record_of, summary_line, write_results
 from startrack.output.record import boresight_rad
 from startrack.solution.values import Orientation, Position, html_table, orientation_of, position_of
+from startrack.stages import Located, Oriented, Outcome, reached
 
 if TYPE_CHECKING:
     from astropy.coordinates import Angle, SkyCoord
     from astropy.table import QTable
     from astropy.time import Time
 
-    from startrack.result import Result
-    from startrack.types import Array
+    from startrack.types import Array, Fix
 
 
 @dataclass(frozen=True, eq=False, repr=False)  # eq: arrays have no single answer to ==
@@ -30,7 +30,7 @@ class Solution:
     Equal to itself only; its values are made once, at the first look.
     """
 
-    result: Result
+    result: Outcome
     kind: str = "fix"  # or identification, detections: what was asked for
 
     @property
@@ -51,12 +51,12 @@ class Solution:
     @cached_property
     def position(self) -> Position | None:
         """East, north, up, their sigma and ellipse, latitude and longitude, with units; None unless located."""
-        return position_of(self.result)
+        return position_of(reached(self.result))
 
     @cached_property
     def attitude(self) -> Orientation | None:
         """Rotation, right ascension, declination and roll of the camera, heading and pitch of the rover."""
-        return orientation_of(self.result)
+        return orientation_of(reached(self.result))
 
     @property
     def heading(self) -> Angle | None:
@@ -67,22 +67,29 @@ class Solution:
     @property
     def position_m(self) -> Array | None:
         """The camera's (east, north, up) [m] from the terrain's origin; None unless the status is ok."""
-        return self.result.fix.position_enu_m if self.result.fix is not None and self else None
+        fix = self._fix
+        return None if fix is None else fix.position_enu_m
 
     @property
     def covariance_m2(self) -> Array | None:
         """Of (east, north), (2, 2) [m2]."""
-        return self.result.fix.covariance_m2 if self.result.fix is not None and self else None
+        fix = self._fix
+        return None if fix is None else fix.covariance_m2
 
     @property
     def radius95_m(self) -> float | None:
         """Radius [m] of the circle about the position that holds 95 % of the posterior."""
-        return self.result.fix.radius95_m if self.result.fix is not None and self else None
+        fix = self._fix
+        return None if fix is None else fix.radius95_m
+
+    @property
+    def _fix(self) -> Fix | None:
+        return self.result.fix if isinstance(self.result, Located) and self else None
 
     @cached_property
     def modes(self) -> QTable | None:
         """Every place that fits: east, north, weight; heaviest first."""
-        if self.result.fix is None:
+        if not isinstance(self.result, Located):
             return None
         from astropy import units as u
         from astropy.table import QTable
@@ -103,23 +110,25 @@ class Solution:
     @cached_property
     def boresight(self) -> SkyCoord | None:
         """Where the camera's axis points, ICRS."""
-        if self.result.attitude is None:
+        value = reached(self.result)
+        if not isinstance(value, Oriented):
             return None
         from astropy.coordinates import SkyCoord
 
-        ra, dec, _ = boresight_rad(self.result.attitude.R_cam_icrs)
+        ra, dec, _ = boresight_rad(value.attitude.R_cam_icrs)
         return SkyCoord(ra, dec, unit="rad", frame="icrs")
 
     @cached_property
     def stars(self) -> QTable | None:
         """The star table: every catalogue star in view, with units."""
-        if self.result.stars is None or self.result.attitude is None:
+        value = reached(self.result)
+        if not isinstance(value, Oriented):
             return None
         from astropy.table import QTable
 
         from startrack.output.star_table import star_table_text
 
-        return QTable.read(star_table_text(self.result), format="ascii.ecsv")
+        return QTable.read(star_table_text(value), format="ascii.ecsv")
 
     @property
     def warnings(self) -> list[str]:

@@ -11,13 +11,14 @@ import numpy as np
 
 from startrack.frames import heading_pitch_roll_from_R_body_enu, latlon_from_enu
 from startrack.output.record import ARCSEC_PER_RAD, R_body_enu, boresight_rad, lens_errors_known
+from startrack.stages import Located, Measured, Oriented
 
 if TYPE_CHECKING:
     from astropy.coordinates import Angle
     from astropy.units import Quantity
     from scipy.spatial.transform import Rotation
 
-    from startrack.result import Result
+    from startrack.stages import Inputs
 
 Rows = list[tuple[str, str]]
 
@@ -133,27 +134,27 @@ class Orientation(Shown):
         return rows + [(name, _deg(angle, 3)) for name, angle in body if angle is not None]
 
 
-def position_of(result: Result) -> Position | None:
+def position_of(result: Inputs) -> Position | None:
     """Of a result whose status is ok."""
-    fix, terrain = result.fix, result.terrain
-    if fix is None or terrain is None or result.status != "ok":
+    if not isinstance(result, Located) or result.fix.ambiguous:
         return None
+    fix, terrain = result.fix, result.terrain
     from astropy import units as u
     from astropy.coordinates import Angle
 
     east, north, up = fix.position_enu_m * u.m
-    latitude, longitude = (Angle(np.degrees(a), u.deg) for a in latlon_from_enu(terrain.site, *fix.position_enu_m))
+    latitude, longitude = (Angle(np.degrees(a), u.deg) for a in latlon_from_enu(result.site, *fix.position_enu_m))
     return Position(
         east, north, up, fix.covariance_m2 * u.m**2, fix.radius95_m * u.m, fix.radius999_m * u.m, latitude, longitude,
         terrain.name,
     )  # fmt: skip
 
 
-def orientation_of(result: Result) -> Orientation | None:
+def orientation_of(result: Inputs) -> Orientation | None:
     """Of a result whose stars were identified."""
-    attitude, body = result.attitude, R_body_enu(result)
-    if attitude is None:
+    if not isinstance(result, Oriented):
         return None
+    attitude = result.attitude
     from astropy import units as u
     from astropy.coordinates import Angle
     from scipy.spatial.transform import Rotation
@@ -162,8 +163,9 @@ def orientation_of(result: Result) -> Orientation | None:
     sigma = np.sqrt(np.diag(attitude.covariance_rad2)) * ARCSEC_PER_RAD * u.arcsec
     rotation = Rotation.from_matrix(attitude.R_cam_icrs)
     found = Orientation(rotation, ra, dec, roll, sigma, lens_errors_known(result))
-    if body is None:
+    if not isinstance(result, Measured):
         return found
+    body = R_body_enu(result)
     heading, pitch, roll_body = (Angle(np.degrees(a), u.deg) for a in heading_pitch_roll_from_R_body_enu(body))
     return replace(found, body=Rotation.from_matrix(body), heading=heading, pitch=pitch, roll_body=roll_body)
 

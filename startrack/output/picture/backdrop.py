@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -11,10 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from startrack.camera import Camera
 from startrack.output.picture.palette import PAPER, SKY_BRIGHT, SKY_DARK, STARLIGHT, WALL
+from startrack.stages import Detected, Inputs
 from startrack.types import Array, Bools
-
-if TYPE_CHECKING:
-    from startrack.result import Result
 
 Image = NDArray[np.float32]
 LONGEST_SIDE_PX = 1400
@@ -61,15 +58,15 @@ def fitted(size_px: tuple[int, int]) -> tuple[float, tuple[int, int]]:
     return scale, (max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale)))
 
 
-def backdrop(result: Result, size: tuple[int, int], wall: Image | None = None) -> NDArray[np.uint8]:
+def backdrop(value: Inputs, size: tuple[int, int], wall: Image | None = None) -> NDArray[np.uint8]:
     """The exposure as (H, W, 3) of the given size (W, H); beyond the image circle is paper.
 
     `wall` (H, W) is 1 where terrain stands before the sky: it is shown darker than the exposure has it.
     """
     inside_px = np.full(size[::-1], np.inf, dtype=np.float32)
-    if result.camera is not None and result.camera.size_px == result.exposure.size_px:
-        inside_px = _inside_px(result.camera, size)
-    sky, light = _layers(result, size, inside_px > EDGE_PX)
+    if value.camera is not None and value.camera.size_px == value.exposure.size_px:
+        inside_px = _inside_px(value.camera, size)
+    sky, light = _layers(value, size, inside_px > EDGE_PX)
     # Next to the circle's edge the background is not known well, and what is left of it is no light.
     light *= np.clip(inside_px / np.float32(EDGE_PX), 0, 1)
     shade = None if wall is None else wall * np.float32(WALL_SHADE)
@@ -84,14 +81,14 @@ def backdrop(result: Result, size: tuple[int, int], wall: Image | None = None) -
     return np.asarray(cv2.merge(channels))
 
 
-def _layers(result: Result, size: tuple[int, int], inside: Bools) -> tuple[Image, Image]:
+def _layers(value: Inputs, size: tuple[int, int], inside: Bools) -> tuple[Image, Image]:
     """Smooth background and point-like light, each (H, W) from 0 to 1; the background is known `inside` (H, W).
 
     The detector's background bridges the skyline in blocks; a median as wide as some stars keeps the skyline's step.
     """
-    scale = size[0] / result.exposure.size_px[0]
-    width_px = scale * (result.detections.psf_sigma_px if result.detections is not None else 1.0)
-    pixels = _resized(without_hot_pixels(result.exposure.pixels_adu, width_px / scale), size)
+    scale = size[0] / value.exposure.size_px[0]
+    width_px = scale * (value.detections.psf_sigma_px if isinstance(value, Detected) else 1.0)
+    pixels = _resized(without_hot_pixels(value.exposure.pixels_adu, width_px / scale), size)
     image = np.asarray(cv2.GaussianBlur(pixels, (0, 0), float(np.clip(width_px, *SMOOTHING_PX))), dtype=np.float32)
     sample, known = image[::SAMPLE, ::SAMPLE], inside[::SAMPLE, ::SAMPLE]
     low, high = (float(level) for level in np.percentile(sample[known] if known.any() else sample, [0.5, 99.0]))

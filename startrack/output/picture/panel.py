@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from startrack.frames import heading_pitch_roll_from_R_body_enu, latlon_from_enu
@@ -27,9 +25,7 @@ from startrack.output.picture.palette import (
 from startrack.output.picture.residuals import draw_residuals
 from startrack.output.record import R_body_enu, boresight_rad, image_name, predicted_visible
 from startrack.output.text import chance_text
-
-if TYPE_CHECKING:
-    from startrack.result import Result
+from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented, Outcome, reached
 
 PANEL_WIDTH, PANEL_HEIGHT = 620, 1160
 MARGIN = 28
@@ -41,20 +37,21 @@ LOWEST_FIGURE_PX = 120
 MOST_MODES = 4
 
 
-def draw_panel(canvas: Canvas, left: int, result: Result, truth_enu_m: tuple[float, float] | None) -> None:
+def draw_panel(canvas: Canvas, left: int, outcome: Outcome, truth_enu_m: tuple[float, float] | None) -> None:
     """Fill the canvas from `left` to its right edge, top to bottom."""
     width, height = canvas.size
     canvas.rectangle((left, 0, width - 1, height - 1), PANEL)
     left, right = left + MARGIN, width - MARGIN
-    facts, legend = _facts(result), _legend(result, truth_enu_m is not None)
+    value = reached(outcome)
+    facts, legend = _facts(value), _legend(value, truth_enu_m is not None)
     legend_top = height - MARGIN - LEGEND_STEP * len(legend) - 14
-    top = _header(canvas, left, right, result)
+    top = _header(canvas, left, right, outcome)
     room = (left, top, right, legend_top - 30 - FACT_STEP * len(facts))
-    y = _figures(canvas, room, result, truth_enu_m)
-    for name, value in facts:
+    y = _figures(canvas, room, value, truth_enu_m)
+    for name, fact in facts:
         y += FACT_STEP
         canvas.text((left, y), name, FACT_SIZE, DIM_INK)
-        canvas.text((left + VALUE_AT, y), value, FACT_SIZE, INK)
+        canvas.text((left + VALUE_AT, y), fact, FACT_SIZE, INK)
     if legend:
         canvas.line([(left, legend_top), (right, legend_top)], FAINT_INK)
     for row, (kind, colour, text) in enumerate(legend):
@@ -63,117 +60,117 @@ def draw_panel(canvas: Canvas, left: int, result: Result, truth_enu_m: tuple[flo
         canvas.text((left + 36, y), text, 17.0, DIM_INK)
 
 
-def _header(canvas: Canvas, left: float, right: float, result: Result) -> float:
+def _header(canvas: Canvas, left: float, right: float, outcome: Outcome) -> float:
     """Name of the image, status, and the message of a result that is not ok; returns where the next thing may stand."""
-    status = result.status.upper()
+    status = outcome.status.upper()
     badge = text_width(status, 20.0) + 28
-    canvas.rectangle((right - badge, MARGIN, right, MARGIN + 36), STATUS[result.status])
+    canvas.rectangle((right - badge, MARGIN, right, MARGIN + 36), STATUS[outcome.status])
     canvas.text((right - badge / 2, MARGIN + 18), status, 20.0, (255, 255, 255), "mm")
-    name = _shortened(image_name(result.exposure), 27.0, right - left - badge - 20)
+    name = _shortened(image_name(outcome.exposure), 27.0, right - left - badge - 20)
     canvas.text((left, MARGIN + 28), name, 27.0, INK)
     y = float(MARGIN + 36 + 28)
-    canvas.text((left, y), _shortened(_setting(result), 17.0, right - left), 17.0, DIM_INK)
+    canvas.text((left, y), _shortened(_setting(reached(outcome)), 17.0, right - left), 17.0, DIM_INK)
     y += 18
-    if result.status == "ok":
+    if outcome.status == "ok":
         return y
     y += 12
-    reason = (result.reason or "").replace("_", " ")
-    canvas.text((left, y + 14), reason, 22.0, STATUS[result.status])
+    reason = (outcome.reason or "").replace("_", " ")
+    canvas.text((left, y + 14), reason, 22.0, STATUS[outcome.status])
     y += 26
-    for line in wrapped(result.message, 20.0, right - left)[:8]:
+    for line in wrapped(outcome.message, 20.0, right - left)[:8]:
         y += 28
         canvas.text((left, y - 6), line, 20.0, INK)
     return y + 16
 
 
-def _setting(result: Result) -> str:
+def _setting(value: Inputs) -> str:
     """Camera, terrain and exposure in words."""
-    camera, terrain, exposure_s = result.camera, result.terrain, result.exposure.exposure_s
+    camera, terrain, exposure_s = value.camera, value.terrain, value.exposure.exposure_s
     parts = [f"camera {camera.name}"] if camera is not None else []
     parts += [f"terrain {terrain.name}"] if terrain is not None else []
     parts += [f"{exposure_s:.3g} s exposure"] if exposure_s is not None else []
     return "   ".join(parts)
 
 
-def _figures(canvas: Canvas, room: Box, result: Result, truth: tuple[float, float] | None) -> float:
+def _figures(canvas: Canvas, room: Box, value: Inputs, truth: tuple[float, float] | None) -> float:
     """Maps where there is a terrain, else residuals; returns where the next thing may stand."""
     left, top, right, bottom = room
-    zoomed = result.fix is not None and result.status == "ok"
+    zoomed = isinstance(value, Located) and not value.fix.ambiguous
     tallest = right - left if not zoomed else np.inf
     bottom = min(bottom, top + tallest)
     if bottom - top < LOWEST_FIGURE_PX:
         return top
-    if result.terrain is None:
-        if result.attitude_fit is None:
+    if value.terrain is None:
+        if not isinstance(value, Oriented):
             return top
-        draw_residuals(canvas, (left, top, right, bottom), result.attitude_fit)
+        draw_residuals(canvas, (left, top, right, bottom), value.attitude_fit)
         return bottom + 12
     split = top + (OVERVIEW_PART if zoomed else 1.0) * (bottom - top)
-    ambiguous = result.status == "ambiguous"
-    overview = draw_overview(canvas, (left, top, right, split), result.terrain, result.fix, ambiguous, truth)
-    if result.fix is not None and zoomed:
-        zoom = draw_zoom(canvas, (left, split + 16, right, bottom), result.fix, truth)
+    fix = value.fix if isinstance(value, Located) else None
+    ambiguous = fix is not None and fix.ambiguous
+    overview = draw_overview(canvas, (left, top, right, split), value.terrain, fix, ambiguous, truth)
+    if fix is not None and not ambiguous:
+        zoom = draw_zoom(canvas, (left, split + 16, right, bottom), fix, truth)
         draw_leaders(canvas, overview, zoom)
     return bottom + 12
 
 
-def _facts(result: Result) -> list[tuple[str, str]]:
-    when = result.exposure.time_utc
+def _facts(value: Inputs) -> list[tuple[str, str]]:
+    when = value.exposure.time_utc
     rows = [("Time", f"{when:%Y-%m-%d  %H:%M:%S} UTC" if when is not None else "not known")]
-    fix = result.fix
-    if fix is not None and result.terrain is not None and result.status == "ok":
+    if isinstance(value, Located) and not value.fix.ambiguous:
+        fix = value.fix
         east, north, _ = fix.position_enu_m
-        latitude, longitude = np.degrees(latlon_from_enu(result.terrain.site, *fix.position_enu_m))
+        latitude, longitude = np.degrees(latlon_from_enu(value.site, *fix.position_enu_m))
         rows += [
             ("Position", f"E {east:.1f} m   N {north:.1f} m   ±{fix.radius95_m:.1f} m (95 %)"),
             ("Lat, lon", f"{latitude:.5f}°   {longitude:.5f}°"),
         ]
-    if fix is not None and result.status == "ambiguous":
-        for k, mode in enumerate(fix.modes[:MOST_MODES]):
+    if isinstance(value, Located) and value.fix.ambiguous:
+        for k, mode in enumerate(value.fix.modes[:MOST_MODES]):
             place = f"E {mode.east_m:.0f} m   N {mode.north_m:.0f} m   ({100 * mode.weight:.0f} %)"
             rows += [(f"Place {k + 1}", place)]
-    body = R_body_enu(result)
-    if body is not None:
-        heading, pitch, roll = np.degrees(heading_pitch_roll_from_R_body_enu(body))
+    if isinstance(value, Measured):
+        heading, pitch, roll = np.degrees(heading_pitch_roll_from_R_body_enu(R_body_enu(value)))
         rows += [("Heading", f"{heading:.2f}°   pitch {pitch:+.2f}°   roll {roll:+.2f}°")]
-    elif result.attitude is not None:
-        ra, dec, roll = np.degrees(boresight_rad(result.attitude.R_cam_icrs))
+    elif isinstance(value, Oriented):
+        ra, dec, roll = np.degrees(boresight_rad(value.attitude.R_cam_icrs))
         rows += [("Boresight", f"RA {ra:.3f}°   Dec {dec:+.3f}°   roll {roll:.3f}°")]
-    return rows + _star_facts(result)
+    return rows + _star_facts(value)
 
 
-def _star_facts(result: Result) -> list[tuple[str, str]]:
-    if result.detections is None:
+def _star_facts(value: Inputs) -> list[tuple[str, str]]:
+    if not isinstance(value, Detected):
         return []
-    if result.identification is None or result.attitude_fit is None:
-        return [("Stars", f"{len(result.detections):,} point sources")]
-    rows = [("Stars", f"{len(result.identification):,} of {len(result.detections):,} point sources identified")]
-    chance = chance_text(result.identification.false_alarm_probability)
-    rows += [("Residual", f"{result.attitude_fit.rms_px:.2f} px   false alarm {chance}")]
-    if result.light is not None and result.fix is not None:
-        measured = int(result.light.usable.sum())
-        rows += [("Evidence", f"{measured:,} stars, {predicted_visible(result):,} above the skyline")]
+    if not isinstance(value, Oriented):
+        return [("Stars", f"{len(value.detections):,} point sources")]
+    rows = [("Stars", f"{len(value.identification):,} of {len(value.detections):,} point sources identified")]
+    chance = chance_text(value.identification.false_alarm_probability)
+    rows += [("Residual", f"{value.attitude_fit.rms_px:.2f} px   false alarm {chance}")]
+    if isinstance(value, Located):
+        measured = int(value.light.usable.sum())
+        rows += [("Evidence", f"{measured:,} stars, {predicted_visible(value):,} above the skyline")]
     return rows
 
 
-def _legend(result: Result, truth: bool) -> list[tuple[str, Colour, str]]:
+def _legend(value: Inputs, truth: bool) -> list[tuple[str, Colour, str]]:
     rows: list[tuple[str, Colour, str]] = []
-    if result.identification is not None:
+    if isinstance(value, Identified):
         rows += [("ring", IDENTIFIED, "star of the catalogue, identified")]
-    if result.detections is not None:
-        other = "other point source" if result.identification is not None else "point source"
+    if isinstance(value, Detected):
+        other = "other point source" if isinstance(value, Identified) else "point source"
         rows += [("ring", DETECTION, other)]
-    if result.light is not None:
+    if isinstance(value, Measured):
         rows += [("cross", HIDDEN, "star that should be here, and is hidden")]
-    if result.bodies and result.attitude is not None:
+    if isinstance(value, Oriented) and value.bodies:
         rows += [("ring", BODY, "planet, Sun, Earth or Moon, where it must be")]
-    if result.fix is not None and result.status == "ok":
+    if isinstance(value, Located) and not value.fix.ambiguous:
         rows += [("line", SKYLINE, "skyline of the terrain seen from the position found")]
         rows += [("disc", POSITION, "position; circle 95 %, ellipse one sigma")]
-    if result.fix is not None and result.status == "ambiguous":
+    if isinstance(value, Located) and value.fix.ambiguous:
         rows += [("line", SKYLINE, "skyline of the terrain seen from place 1")]
         rows += [("disc", POSITION, "place that fits the stars, with its probability")]
-    if truth and result.terrain is not None:
+    if truth and value.terrain is not None:
         rows += [("plus", TRUTH, "true position (not known to the method)")]
     return rows
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from startrack.frames import azel_from_rays
@@ -12,10 +10,8 @@ from startrack.output.picture.canvas import Canvas
 from startrack.output.picture.palette import BODY, DETECTION, HIDDEN, IDENTIFIED, INK, mixed
 from startrack.output.record import place_m
 from startrack.output.star_table import names_of, status_of
+from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented
 from startrack.types import Array, Bools, Ints
-
-if TYPE_CHECKING:
-    from startrack.result import Result
 
 MOST_CIRCLES = 4000
 MOST_CROSSES = 150  # of hidden stars, the brightest: more would hide the picture
@@ -28,18 +24,18 @@ BACKDROP = (12, 17, 28)
 BRIGHT_SNR = 300.0
 
 
-def draw_detections(canvas: Canvas, view: View, result: Result) -> None:
+def draw_detections(canvas: Canvas, view: View, value: Inputs) -> None:
     """A green circle about each identified star; a grey one about each other detection inside the image circle."""
-    found = result.detections
-    if found is None:
+    if not isinstance(value, Detected):
         return
+    found = value.detections
     identified = np.zeros(len(found), dtype=bool)
-    if result.identification is not None:
-        identified[result.identification.detection] = True
+    if isinstance(value, Identified):
+        identified[value.identification.detection] = True
     strength = np.clip(np.log(np.maximum(found.snr, 5.0) / 5.0) / np.log(BRIGHT_SNR / 5.0), 0, 1)
     places = view.at(found.xy_px)
     # The bright ones last, on top; the faint ones dim, so that a thousand of them do not drown the stars.
-    shown = identified | _imaged(result, found.xy_px)
+    shown = identified | _imaged(value, found.xy_px)
     for k in reversed(range(min(len(found), MOST_CIRCLES))):
         if not shown[k]:
             continue
@@ -48,16 +44,16 @@ def draw_detections(canvas: Canvas, view: View, result: Result) -> None:
         canvas.circle(places[k], 4.5 + 5.5 * float(strength[k]), mixed(colour, BACKDROP, faint))
 
 
-def _imaged(result: Result, xy_px: Array) -> Bools:
+def _imaged(value: Inputs, xy_px: Array) -> Bools:
     """Whether light of the lens can reach the pixels (n, 2); all, where the camera is not known."""
-    if result.camera is None or result.camera.size_px != result.exposure.size_px:
+    if value.camera is None or value.camera.size_px != value.exposure.size_px:
         return np.ones(len(xy_px), dtype=bool)
-    return result.camera.angle_rad(xy_px) <= result.camera.max_angle_rad
+    return value.camera.angle_rad(xy_px) <= value.camera.max_angle_rad
 
 
-def draw_hidden(canvas: Canvas, view: View, result: Result) -> None:
+def draw_hidden(canvas: Canvas, view: View, value: Inputs) -> None:
     """A cross at each of the brighter stars that ought to shine there and do not."""
-    _, xy_px = _hidden(result)
+    _, xy_px = _hidden(value)
     places = view.at(xy_px[:MOST_CROSSES])
     for rank, place in enumerate(places):
         weight = 1.0 - rank / max(len(places), 1)
@@ -65,15 +61,15 @@ def draw_hidden(canvas: Canvas, view: View, result: Result) -> None:
         canvas.cross(place, 3.5 + 3.0 * weight, colour, 2 if weight > 0.8 else 1)
 
 
-def draw_bodies(canvas: Canvas, view: View, result: Result) -> None:
+def draw_bodies(canvas: Canvas, view: View, value: Inputs) -> None:
     """A ring and the name at each planet, moon or sun in the frame; stars beside it are not evidence."""
-    if result.camera is None or result.attitude is None:
+    if not isinstance(value, Oriented):
         return
-    for body in result.bodies:
-        xy_px, inside = result.camera.project(body.ray_icrs @ result.attitude.R_cam_icrs.T)
+    for body in value.bodies:
+        xy_px, inside = value.camera.project(body.ray_icrs @ value.attitude.R_cam_icrs.T)
         if not inside:
             continue
-        below = _below_skyline(result, body.ray_icrs)
+        below = _below_skyline(value, body.ray_icrs)
         if below and body.v_mag > DIMMEST_HIDDEN_V_MAG:
             continue
         colour = mixed(BODY, BACKDROP, 0.4) if below else BODY
@@ -83,38 +79,37 @@ def draw_bodies(canvas: Canvas, view: View, result: Result) -> None:
         canvas.label(at, text, size, colour, 13.0, view.box)
 
 
-def name_stars(canvas: Canvas, view: View, result: Result) -> None:
+def name_stars(canvas: Canvas, view: View, value: Inputs) -> None:
     """Names of the brightest identified stars and of the brightest hidden ones, where there is room."""
-    if result.stars is None or result.identification is None or result.detections is None:
+    if not isinstance(value, Identified):
         return
-    order = np.argsort(result.stars.v_mag[result.identification.star], kind="stable")
-    star = result.identification.star[order]
-    xy_px = result.detections.xy_px[result.identification.detection[order]]
-    seen = _named(result, star, xy_px, MOST_NAMES)
-    hidden = _named(result, *_hidden(result), MOST_HIDDEN_NAMES)
+    order = np.argsort(value.stars.v_mag[value.identification.star], kind="stable")
+    star = value.identification.star[order]
+    xy_px = value.detections.xy_px[value.identification.detection[order]]
+    seen = _named(value, star, xy_px, MOST_NAMES)
+    hidden = _named(value, *_hidden(value), MOST_HIDDEN_NAMES)
     for place, name in seen:
         canvas.label(view.at(place), name, NAME_SIZE, INK, 13.0, view.box)
     for place, name in hidden:
         canvas.label(view.at(place), name, 0.9 * NAME_SIZE, mixed(HIDDEN, BACKDROP, 0.15), 11.0, view.box)
 
 
-def _hidden(result: Result) -> tuple[Ints, Array]:
+def _hidden(value: Inputs) -> tuple[Ints, Array]:
     """Stars that are hidden, and their predicted pixels, brightest first."""
-    if result.light is None:
+    if not isinstance(value, Measured):
         return np.empty(0, dtype=np.int64), np.empty((0, 2))
-    hidden = status_of(result.light) == "hidden"
-    return result.light.star[hidden], result.light.xy_px[hidden]
+    hidden = status_of(value.light) == "hidden"
+    return value.light.star[hidden], value.light.xy_px[hidden]
 
 
-def _named(result: Result, star: Ints, xy_px: Array, most: int) -> list[tuple[Array, str]]:
-    assert result.stars is not None
-    first = names_of(result.stars.hip[star[: 4 * most]])
+def _named(value: Identified, star: Ints, xy_px: Array, most: int) -> list[tuple[Array, str]]:
+    first = names_of(value.stars.hip[star[: 4 * most]])
     return [(place, name) for place, name in zip(xy_px, first, strict=False) if name][:most]
 
 
-def _below_skyline(result: Result, ray_icrs: Array) -> bool:
-    if result.fix is None or result.terrain is None or result.R_enu_icrs is None:
+def _below_skyline(value: Inputs, ray_icrs: Array) -> bool:
+    if not isinstance(value, Located):
         return False
-    azimuth, elevation = azel_from_rays(result.R_enu_icrs @ ray_icrs)
-    horizon = result.terrain.horizon_rad(np.array([place_m(result.fix)]), np.array([azimuth]))
+    azimuth, elevation = azel_from_rays(value.R_enu_icrs @ ray_icrs)
+    horizon = value.terrain.horizon_rad(np.array([place_m(value.fix)]), np.array([azimuth]))
     return bool(elevation < horizon[0])

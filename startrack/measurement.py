@@ -1,0 +1,122 @@
+"""Photometry of the catalogue stars in one image: add faint stars if needed, measure, remeasure near the skyline."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from startrack.catalog.gaia import deep_installed, hipparcos_in_deep, load_deep_catalog
+from startrack.detection import electrons
+from startrack.evidence import Skyline, StarEvidence, StarLight, flux_scale, known_well, levelled, near_skyline
+from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
+from startrack.psf import noise_area_px
+from startrack.stages import Measured, Oriented, Settings, extend
+from startrack.terrain import Terrain
+from startrack.terrain.masks import why_silent
+from startrack.types import Array, BadInput, Detections, Fix, Ints
+
+REMEASURED_PX = 12.0  # stars this near the skyline are measured again
+NEIGHBOURS_PX = 10.0  # and with them the stars this much farther away, whose light overlaps theirs
+UNDECIDED_PX = 2.0  # farther from the skyline than this, the fix decides which stars are visible
+CERTAIN_PROBABILITY = 0.99  # of being visible, or hidden, for the stars that the fix decides
+COMPLETE_V_MAG = 6.5  # frames with 5 sigma at this magnitude show many stars that Hipparcos lacks
+
+
+def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -> Measured:
+    """The light at every catalogue star in view, above a terrain.
+
+    `oriented` is the exposure with its attitude; its time must be known. `settings` has the photometry, and whether
+    Gaia's stars are used. Raises BadInput (bad_terrain, no_time) where the frame `enu` cannot be related to the stars.
+    """
+    when = oriented.exposure.time_utc
+    if terrain.site is None:
+        raise BadInput(
+            "bad_terrain", f"terrain {terrain.name} has no site: locating an image needs its place on a body"
+        )
+    if when is None:
+        raise BadInput("no_time", "the mid-exposure time is not known")
+    if settings.deep_stars and oriented.catalog_name == "hipparcos":
+        oriented = add_gaia_stars(oriented, terrain.site)
+    R = R_enu_icrs(terrain.site, when)
+    light = _photometry(oriented, terrain, R, settings.evidence, oriented.detections)
+    return extend(oriented, Measured, terrain=terrain, site=terrain.site, R_enu_icrs=R, light=light)
+
+
+def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
+    """The same stars in the deeper Gaia list, if that is installed and the frame is deep enough to need it.
+
+    `site` is where the camera stands, for the aberration. Returns `oriented` itself where nothing changes.
+    """
+    found, when = oriented.identification, oriented.exposure.time_utc
+    scale = flux_scale(oriented.detections, oriented.camera, oriented.stars, found)
+    noise_e = float(np.median(oriented.detections.noise_e)) * np.sqrt(noise_area_px(oriented.detections.psf_sigma_px))
+    limiting_mag = scale.zero_mag - 2.5 * np.log10(5.0 * noise_e)
+    if when is None or limiting_mag < COMPLETE_V_MAG or not deep_installed():
+        return oriented
+    deep = load_deep_catalog()
+    return replace(
+        oriented,
+        catalog_name=deep.name,
+        stars=deep.at(when, observer_velocity_m_s(site, when)),
+        identification=replace(found, star=hipparcos_in_deep()[found.star]),
+    )
+
+
+def remeasure_near_skyline(measured: Measured, fix: Fix, photometry: StarEvidence) -> Measured:
+    """The stars near the skyline of a fix measured again, with the step of the sky's own light taken out.
+
+    `fix` is a position found with `measured`, `photometry` the settings of the measurement. Returns `measured` itself
+    where the sky is too dark to show a step.
+    """
+    camera, terrain, position_m = measured.camera, measured.terrain, fix.position_enu_m[:2]
+    horizon = Skyline.seen_from(position_m, terrain)
+    image, dead = electrons(measured.exposure, camera)
+    detections = levelled(image, dead, measured.detections, camera, measured.R_cam_enu, horizon)
+    if detections is measured.detections:
+        return measured
+    axes = np.linalg.cholesky(fix.covariance_m2).T
+    reliable = known_well(horizon, [Skyline.seen_from(position_m + axis, terrain) for axis in axes], camera)
+    light = measured.light
+    azimuth, elevation = light.azimuth_rad, light.elevation_rad
+    wanted = near_skyline(azimuth, elevation, camera, horizon, REMEASURED_PX) & reliable(azimuth)
+    around = near_skyline(azimuth, elevation, camera, horizon, REMEASURED_PX + NEIGHBOURS_PX)
+    # The fix says which neighbours are visible better than their own faint light does, but not next to the skyline.
+    above = elevation - horizon(azimuth)
+    undecided = near_skyline(azimuth, elevation, camera, horizon, UNDECIDED_PX) | ~reliable(azimuth)
+    by_fix = np.where(above > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)
+    visible = np.where(undecided, 1.0 / (1.0 + np.exp(-light.llr)), by_fix)
+    newer = _photometry(
+        measured, terrain, measured.R_enu_icrs, photometry, detections, light.star[around], visible[around]
+    )
+    return replace(measured, light=light.renewed(newer, light.star[wanted]))
+
+
+def _photometry(
+    oriented: Oriented,
+    terrain: Terrain,
+    R_enu_icrs: Array,
+    photometry: StarEvidence,
+    detections: Detections,
+    only: Ints | None = None,
+    visible: Array | None = None,
+) -> StarLight:
+    """Photometry of all stars, or of those with the indices `only`; 0 evidence where the terrain is not known."""
+    image, dead = electrons(oriented.exposure, oriented.camera)
+    light = photometry(
+        image,
+        dead,
+        detections,
+        oriented.camera,
+        oriented.stars if only is None else oriented.stars.take(only),
+        list(oriented.bodies),
+        oriented.attitude_fit.attitude.R_cam_icrs,
+        R_enu_icrs,
+        flux_scale(oriented.detections, oriented.camera, oriented.stars, oriented.identification),
+        oriented.attitude_fit.extra_sigma_px,
+        visible,
+    )
+    light = light if only is None else replace(light, star=only[light.star])
+    masked = why_silent(terrain, light.azimuth_rad, light.elevation_rad)
+    cause = np.where(light.cause == "", masked, light.cause)
+    return replace(light, cause=cause, llr=np.where(cause == "", light.llr, 0.0))

@@ -1,0 +1,248 @@
+"""The values that the stages of the pipeline hand on, each complete, and the settings of the stages.
+
+    Inputs -> Detected -> Identified -> Oriented -> Measured -> Located, or Refused
+
+Each value has the fields of the one before it and the results of one more stage. All are frozen. Which value a function
+returns says which stages have run; no field is filled in later.
+"""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from types import MappingProxyType
+from typing import Any, TypeAlias, TypeVar
+
+import numpy as np
+
+from startrack.camera import Camera
+from startrack.detection import Detector
+from startrack.evidence import StarEvidence, StarLight
+from startrack.frames import Site
+from startrack.identification import Identifier
+from startrack.localization import ExactPosterior, Localizer
+from startrack.orient import AttitudeFit
+from startrack.terrain import Terrain
+from startrack.terrain.masks import silent_sectors
+from startrack.types import (
+    Array,
+    Attitude,
+    BadInput,
+    Body,
+    Detections,
+    Evidence,
+    Exposure,
+    Fix,
+    Identification,
+    NoSolution,
+    Stars,
+)  # fmt: skip
+
+UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out
+STAGES = ("read", "detect", "identify", "attitude", "evidence", "locate")  # keys of `timing_ms`
+T = TypeVar("T", bound="Inputs")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The stages and their settings; each can be replaced by another one with the same call."""
+
+    detector: Detector = field(default_factory=Detector)
+    identifier: Identifier = field(default_factory=Identifier)
+    evidence: StarEvidence = field(default_factory=StarEvidence)
+    localizer: Localizer = field(default_factory=ExactPosterior)
+    deep_stars: bool = True  # use Gaia's stars too, where they are installed and the frame sees deeper than Hipparcos
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)  # eq: arrays have no single answer to ==
+class Inputs:
+    """One exposure and what it is to be solved with. Two values are equal only if they are one object."""
+
+    exposure: Exposure
+    camera: Camera | None = None  # None: not known; `detect` works without, `identify_blind` finds it
+    terrain: Terrain | None = None  # None: no position is asked for
+    catalog_name: str = ""
+    timing_ms: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))  # stage to wall time [ms]
+
+    @property
+    def status(self) -> str:
+        """The status of the result format: ok, ambiguous or refused."""
+        return "ok"
+
+    @property
+    def reason(self) -> str | None:
+        """Code of the reason where the status is not ok, else None."""
+        return None
+
+    @property
+    def message(self) -> str:
+        """One line of text about the status; empty where it is ok."""
+        return ""
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was found in the image's file and not used."""
+        return list(self.exposure.warnings)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Detected(Inputs):
+    """An exposure and its point sources."""
+
+    detections: Detections
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Identified(Detected):
+    """Detections with the catalogue stars that they are."""
+
+    camera: Camera  # the given one, or the one found
+    stars: Stars  # the catalogue at the time of the exposure
+    bodies: tuple[Body, ...]  # planets, Sun, Moon, Earth; empty without a site and a time
+    identification: Identification
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Oriented(Identified):
+    """Identified stars with the attitude of the camera among the stars."""
+
+    attitude_fit: AttitudeFit
+
+    @property
+    def attitude(self) -> Attitude:
+        """Attitude with the error of an unknown time included."""
+        attitude = self.attitude_fit.attitude
+        if self.exposure.time_utc is not None:
+            return attitude
+        widened = attitude.covariance_rad2 + UNKNOWN_TIME_SIGMA_RAD**2 * np.eye(3)
+        return Attitude(R_cam_icrs=attitude.R_cam_icrs, covariance_rad2=widened)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measured(Oriented):
+    """An attitude above a terrain, with the light measured at every catalogue star in view."""
+
+    terrain: Terrain
+    site: Site  # of the terrain
+    R_enu_icrs: Array  # (3, 3)
+    light: StarLight
+
+    @property
+    def R_cam_enu(self) -> Array:
+        """Rotation (3, 3) from enu to the camera."""
+        return np.asarray(self.attitude_fit.attitude.R_cam_icrs @ self.R_enu_icrs.T)
+
+    def evidence(self) -> Evidence:
+        """The rays for the localizer."""
+        return self.light.evidence()
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was found in the image's file and not used, and the azimuths that the terrain does not cover."""
+        return [*self.exposure.warnings, *silent_sectors(self.terrain)]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Located(Measured):
+    """The whole solution: evidence and the position that explains it."""
+
+    fix: Fix
+
+    @property
+    def status(self) -> str:
+        """ok, or ambiguous where several positions fit."""
+        return "ambiguous" if self.fix.ambiguous else "ok"
+
+    @property
+    def reason(self) -> str | None:
+        """`ambiguous` where several positions fit."""
+        return "ambiguous" if self.fix.ambiguous else None
+
+    @property
+    def message(self) -> str:
+        """How many positions fit, where there are several."""
+        return f"{len(self.fix.modes)} places fit the stars" if self.fix.ambiguous else ""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Refused:
+    """An exposure without a solution, why, and the last complete value that was reached."""
+
+    reason: str
+    message: str
+    reached: Inputs
+    timing_ms: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))  # the failed stage included
+
+    @property
+    def status(self) -> str:
+        """Always refused."""
+        return "refused"
+
+    @property
+    def exposure(self) -> Exposure:
+        """The exposure that was refused."""
+        return self.reached.exposure
+
+    @property
+    def warnings(self) -> list[str]:
+        """The warnings of the value reached."""
+        return self.reached.warnings
+
+
+Outcome: TypeAlias = Inputs | Refused  # of a command: Detected, Oriented or Located, or a refusal
+
+
+def reached(outcome: Outcome) -> Inputs:
+    """The last complete value of an outcome: itself, or what was reached before it was refused."""
+    return outcome.reached if isinstance(outcome, Refused) else outcome
+
+
+def extend(value: Inputs, to: type[T], **more: Any) -> T:
+    """The fields of a value and the results of one more stage as the next value of the chain."""
+    known = {f.name: getattr(value, f.name) for f in fields(to) if hasattr(value, f.name)}
+    return to(**known | more)
+
+
+def with_timing(outcome: Any, **more_ms: float) -> Any:
+    """The same outcome with wall times [ms] added to those of its stages."""
+    times = dict(outcome.timing_ms)
+    for stage, ms in more_ms.items():
+        times[stage] = times.get(stage, 0.0) + ms
+    return replace(outcome, timing_ms=MappingProxyType(times))
+
+
+class Run:
+    """One exposure on its way through the stages: the last complete value, and the wall time of each stage."""
+
+    def __init__(self, inputs: Inputs) -> None:
+        self.reached = inputs
+        self._timing_ms: dict[str, float] = {}
+
+    def time(self, stage: str, function: Callable[..., R], *args: Any) -> R:
+        """The result of `function(*args)`, its time added to that of the `stage`."""
+        start = clock.perf_counter()
+        try:
+            return function(*args)
+        finally:
+            self._timing_ms[stage] = self._timing_ms.get(stage, 0.0) + 1e3 * (clock.perf_counter() - start)
+
+    def step(self, stage: str, function: Callable[..., T], *args: Any) -> T:
+        """As `time`, for a function that returns the next complete value."""
+        value = self.time(stage, function, *args)
+        self.reached = value
+        return value
+
+    def finish(self, value: T) -> T:
+        """The `value` with the times of the stages."""
+        return replace(value, timing_ms=MappingProxyType(self._timing_ms))
+
+    def refuse(self, cause: BadInput | NoSolution) -> Refused:
+        """The refusal for a `cause`, with the last complete value."""
+        return Refused(
+            reason=cause.reason,
+            message=str(cause),
+            reached=self.reached,
+            timing_ms=MappingProxyType(self._timing_ms),
+        )

@@ -53,7 +53,7 @@ def main() -> None:
         rough = name == "rough"
         terrain = load_terrain(rough_terrain(Path(tempfile.gettempdir()) / "startrack-rough-map") if rough else name)
         assert isinstance(terrain, HeightMap)
-        terrain.prepared()
+        terrain.prepare()
         rng = np.random.default_rng(args.seed)
         floor, wall = (ROUGH_PLACES, ROUGH_PLACES) if rough else (args.floor, args.wall)
         places = [*drawn(terrain, floor, FLOOR_DEG, rng), *drawn(terrain, wall, WALL_DEG, rng)]

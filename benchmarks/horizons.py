@@ -57,7 +57,7 @@ def cropped(name: str, half_m: float) -> HeightMap:
     whole = load_terrain(name)
     assert isinstance(whole, HeightMap)
     crop = whole.maps[0].around(whole.site.latitude_rad, whole.site.longitude_rad, half_m)
-    return replace(whole, maps=(crop,), _state={})
+    return replace(whole, maps=(crop,))
 
 
 def compared(name: str, terrain: HeightMap, places: np.ndarray) -> list[list[str]]:

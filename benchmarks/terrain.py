@@ -64,8 +64,8 @@ def main() -> None:
 
 def fresh(terrain: Any, **changes: Any) -> HeightMap:
     """The terrain with other settings, its horizons not taken over."""
-    made = replace(terrain, **changes, _state={})
-    made.prepared()
+    made = replace(terrain, **changes)
+    made.prepare()
     return made
 
 

@@ -13,7 +13,6 @@ from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
 from startrack.psf import noise_area_px
 from startrack.stages import Measured, Oriented, Settings, extend
 from startrack.terrain import Terrain
-from startrack.terrain.masks import why_silent
 from startrack.types import Array, BadInput, Detections, Fix, Ints
 
 REMEASURED_PX = 12.0  # stars this near the skyline are measured again
@@ -117,6 +116,6 @@ def _photometry(
         visible,
     )
     light = light if only is None else replace(light, star=only[light.star])
-    masked = why_silent(terrain, light.azimuth_rad, light.elevation_rad)
+    masked = terrain.mask_reason(light.azimuth_rad, light.elevation_rad)
     cause = np.where(light.cause == "", masked, light.cause)
     return replace(light, cause=cause, llr=np.where(cause == "", light.llr, 0.0))

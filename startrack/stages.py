@@ -24,7 +24,6 @@ from startrack.identification import Identifier
 from startrack.localization import ExactPosterior, Localizer
 from startrack.orient import AttitudeFit
 from startrack.terrain import Terrain
-from startrack.terrain.masks import silent_sectors
 from startrack.types import (
     Array,
     Attitude,
@@ -141,7 +140,7 @@ class Measured(Oriented):
     @property
     def warnings(self) -> list[str]:
         """What was found in the image's file and not used, and the azimuths that the terrain does not cover."""
-        return [*self.exposure.warnings, *silent_sectors(self.terrain)]
+        return [*self.exposure.warnings, *self.terrain.masked_sectors()]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -33,8 +33,8 @@ def _own_cache(tmp_path_factory):
 def shackleton() -> HeightMap:
     terrain = load_terrain("shackleton")
     assert isinstance(terrain, HeightMap)
-    terrain = replace(terrain, search_radius_m=300.0, height_sigma_m=0.0, horizon_sigma_common_rad=0.0, _state={})
-    terrain.prepared()
+    terrain = replace(terrain, search_radius_m=300.0, height_sigma_m=0.0, horizon_sigma_common_rad=0.0)
+    terrain.prepare()
     return terrain
 
 
@@ -143,14 +143,14 @@ def test_contradictions_are_counted_apart():
 def test_no_allowed_ground_is_given_up(shackleton):
     """Small patches of ground flat enough: large boxes must not be dropped because a few points in them are steep."""
     slopes = np.degrees(shackleton.slope_rad(np.random.default_rng(9).uniform(-200, 200, (4000, 2))))
-    limited = replace(shackleton, most_slope_rad=np.radians(np.quantile(slopes, 0.02)), _state=shackleton._state)
+    limited = replace(shackleton, most_slope_rad=np.radians(np.quantile(slopes, 0.02)))
     places = np.random.default_rng(10).uniform(-200, 200, (20_000, 2))
     place = places[np.asarray(limited.allowed(places))][0]
     evidence = seen_from(shackleton, place, np.random.default_rng(11), 1500, 0.0005)
     fix = ExactPosterior()(evidence, limited)
     assert np.linalg.norm(fix.position_enu_m[:2] - place) < max(fix.radius999_m, 1.0)
     with pytest.raises(NotLocated, match="max_slope_deg"):
-        ExactPosterior()(evidence, replace(limited, most_slope_rad=0.0, _state=shackleton._state))
+        ExactPosterior()(evidence, replace(limited, most_slope_rad=0.0))
 
 
 @pytest.mark.parametrize("sigma_rad", [0.0, 0.001])

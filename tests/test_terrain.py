@@ -27,7 +27,7 @@ def cylinder(name: str, diameter_m: float, depth_m: float, height_m: float, sear
     )
 
 
-SHACKLETON = replace(load_terrain("shackleton"), search_radius_m=500.0, _state={})
+SHACKLETON = replace(load_terrain("shackleton"), search_radius_m=500.0)
 EXACT = {SHACKLETON.name: 3e-6}  # [rad] to which traced horizons and their bounds meet; closed forms do so exactly
 COMMON_SIGMA_RAD = {SHACKLETON.name: np.radians(0.1)}  # what its file says; cylinders state no error of this kind
 

@@ -27,7 +27,7 @@ def _own_cache(tmp_path, monkeypatch):
 def test_a_place_in_a_shipped_crater_is_found(where):
     terrain = load_terrain(where.split()[0])
     latitude, longitude = latlon_from_enu(terrain.site, *PLACES[where], 0.0)
-    terrain = replace(terrain, site=Site("moon", float(latitude), float(longitude)), search_radius_m=250.0, _state={})
+    terrain = replace(terrain, site=Site("moon", float(latitude), float(longitude)), search_radius_m=250.0)
     rays = 1200 if where.startswith("kepler") else 3000  # wide craters with low rims tell less
     rng, place = np.random.default_rng(3), np.array([110.0, -70.0])
     azimuth = rng.uniform(0, 2 * np.pi, rays)

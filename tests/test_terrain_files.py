@@ -13,7 +13,6 @@ import tomli_w
 from startrack.cli.main import main
 from startrack.files import data_dir
 from startrack.terrain import load_terrain
-from startrack.terrain import table_cache as cache
 from startrack.terrain.geotiff import write_map
 from startrack.terrain.height_map import HeightMap
 from startrack.terrain.projection import EQUIRECTANGULAR, ORTHOGRAPHIC, Projection, polar_stereographic
@@ -361,8 +360,8 @@ def test_a_build_says_so_in_one_line_and_an_interrupted_one_is_forgotten(tmp_pat
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        terrain.prepared(interrupted)
-    table = cache.path_of(cache.key_of(terrain))
+        terrain.prepare(interrupted)
+    table = terrain.table_path
     assert not list(table.parent.iterdir())
     table.with_suffix(".lock").touch()  # left by one that was killed
     assert main(["terrain", "build", str(path), "--json"]) == 0

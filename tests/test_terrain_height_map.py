@@ -18,7 +18,6 @@ from startrack.localization.horizon_bias import common_error, raised
 from startrack.terrain import load_terrain
 from startrack.terrain import table_cache as cache
 from startrack.terrain.height_map import HeightMap
-from startrack.terrain.masks import silent_sectors, why_silent
 from startrack.terrain.projection import (
     EQUIRECTANGULAR,
     ORTHOGRAPHIC,
@@ -44,13 +43,13 @@ def _own_cache(tmp_path_factory):
 def shackleton() -> HeightMap:
     terrain = load_terrain("shackleton")
     assert isinstance(terrain, HeightMap)
-    return replace(terrain, search_radius_m=500.0, _state={})
+    return replace(terrain, search_radius_m=500.0)
 
 
 def test_horizon_from_the_floor_is_that_of_another_program():
     """lunahorizon traced finer maps (5 to 240 m): the 240 m map clips the crest by some hundredths of a degree."""
     reference = np.genfromtxt(DATA / "shackleton_floor_horizon.csv", delimiter=",", names=True)
-    terrain = replace(load_terrain("shackleton"), camera_height_m=2.0, _state={})
+    terrain = replace(load_terrain("shackleton"), camera_height_m=2.0)
     place = enu_from_latlon(terrain.site, np.radians(-89.67), np.radians(129.78))[:2]
     found = np.degrees(terrain.horizon_rad(place, np.radians(reference["azimuth_deg"])))
     off = found - reference["elevation_deg"]
@@ -84,9 +83,11 @@ def test_horizons_are_those_of_small_steps(name):
 def test_the_table_changes_no_horizon(shackleton):
     rng = np.random.default_rng(2)
     places, azimuths = rng.uniform(-500, 500, (300, 2)), rng.uniform(0, 2 * np.pi, 300)
-    before = replace(shackleton, _state={}).horizon_rad(places, azimuths)
-    shackleton.prepared()
-    assert np.abs(shackleton.horizon_rad(places, azimuths) - before).max() < np.radians(0.001)
+    fresh = replace(shackleton, camera_height_m=1.6)
+    before = fresh.horizon_rad(places, azimuths)
+    assert not fresh.is_prepared
+    fresh.prepare()
+    assert np.abs(fresh.horizon_rad(places, azimuths) - before).max() < np.radians(0.001)
 
 
 def test_far_crests_are_found_with_the_table_too():
@@ -95,16 +96,16 @@ def test_far_crests_are_found_with_the_table_too():
     latitude, longitude = latlon_from_enu(terrain.site, 7082.0, 12_306.0, 0.0)
     site = Site("moon", float(latitude), float(longitude))
     azimuths = np.radians(np.arange(150.5, 220))
-    there = replace(terrain, site=site, search_radius_m=90.0, _state={})
+    there = replace(terrain, site=site, search_radius_m=90.0)
     before, distance, _ = there.horizons(np.zeros(2), azimuths)
     assert distance.max() > 50_000
-    there.prepared()
+    there.prepare()
     assert np.abs(there.horizons(np.zeros(2), azimuths)[0] - before).max() < 1e-5
 
 
 @pytest.mark.parametrize(("half", "turn"), [(60.0, np.radians(0.75)), (10.0, 0.0), (1.0, 0.0)])
 def test_bounds_hold_the_horizons_of_small_steps(shackleton, half, turn):
-    small = replace(shackleton, search_radius_m=150.0, _state={})
+    small = replace(shackleton, search_radius_m=150.0)
     rng = np.random.default_rng(3)
     centres, azimuths = rng.uniform(-100, 100, (20, 2)), rng.uniform(0, 2 * np.pi, 20)
     low, high = small.horizon_bounds_rad(centres, np.array(half), azimuths, turn)
@@ -120,48 +121,58 @@ def test_bounds_hold_the_horizons_of_small_steps(shackleton, half, turn):
 
 
 def test_the_table_is_kept_and_found_again_by_content(shackleton):
-    table = shackleton.prepared()
-    path = cache.path_of(cache.key_of(shackleton))
+    terrain = replace(shackleton, camera_height_m=1.7, search_radius_m=150.0)
+    table = terrain.table
+    key, path = cache.key_of(terrain), terrain.table_path
     assert path.is_file()
     assert [p for p in path.parent.iterdir() if p.name.startswith(".")] == []
-    again = replace(shackleton, _state={})
-    assert np.array_equal(again.prepared().values, table.values)
-    higher = replace(shackleton, camera_height_m=3.0, _state={})
-    assert cache.key_of(higher) != cache.key_of(shackleton)
-    first = shackleton.maps[0]
+    cache.TABLES_IN_MEMORY.pop(key)
+    again = replace(terrain)
+    assert again.is_prepared
+    assert again.table is not table
+    assert np.array_equal(again.table.values, table.values)
+    assert replace(terrain).table is again.table  # variants with the same table share it
+    higher = replace(terrain, camera_height_m=3.0)
+    assert cache.key_of(higher) != key
+    first = terrain.maps[0]
     other = replace(first, heights_m=first.heights_m + np.float32(0.5))
-    assert cache.key_of(replace(shackleton, maps=(other, *shackleton.maps[1:]), _state={})) != cache.key_of(shackleton)
+    assert cache.key_of(replace(terrain, maps=(other, *terrain.maps[1:]))) != key
     path.write_bytes(path.read_bytes()[:1000])
-    assert cache.loaded(cache.key_of(shackleton), shackleton.square) is None  # a damaged table is made again
-    cache.save(cache.key_of(shackleton), table)
+    cache.TABLES_IN_MEMORY.pop(key)
+    assert cache.load_table(key, terrain.square) is None  # a damaged table is made again
+    cache.keep_table(key, table)
+    assert cache.load_table(key, terrain.square) is table
 
 
 def test_of_two_that_need_a_table_one_makes_it(shackleton, monkeypatch):
     """Each stands for a process: locks are of open files, not of processes."""
-    made, build = [], HeightMap._built
+    made, build = [], HeightMap._build_table
 
     def slow(terrain, progress):
         made.append(threading.get_ident())
         time.sleep(0.3)
         return build(terrain, progress)
 
-    monkeypatch.setattr(HeightMap, "_built", slow)
-    terrains = [replace(shackleton, camera_height_m=1.75, search_radius_m=150.0, _state={}) for _ in range(3)]
+    monkeypatch.setattr(HeightMap, "_build_table", slow)
+    terrains = [replace(shackleton, camera_height_m=1.75, search_radius_m=150.0) for _ in range(3)]
     path = cache.path_of(cache.key_of(terrains[0]))
     path.parent.mkdir(parents=True, exist_ok=True)
     path.with_suffix(".lock").touch()  # left by a process that was killed: nobody holds it
     with ThreadPoolExecutor(3) as pool:
-        tables = list(pool.map(lambda terrain: terrain.prepared(), terrains))
+        tables = list(pool.map(lambda terrain: terrain.table, terrains))
     assert len(made) == 1
     assert all(np.array_equal(table.values, tables[0].values) for table in tables)
     assert [p.suffix for p in path.parent.iterdir() if p.stem == path.stem] == [".npz"]
 
 
-def test_a_copy_with_other_settings_takes_no_table_over(shackleton):
-    table = shackleton.prepared()
-    higher = replace(shackleton, camera_height_m=30.0, search_radius_m=200.0)  # shares what the first one remembers
-    assert higher.prepared().square.reach_m < table.square.reach_m
-    assert shackleton.prepared().square == table.square
+def test_each_variant_of_a_terrain_keeps_its_own_table(shackleton):
+    table = shackleton.table
+    higher = replace(shackleton, camera_height_m=30.0, search_radius_m=200.0)
+    other = higher.table
+    assert other.square.reach_m < table.square.reach_m
+    assert shackleton.table is table
+    assert higher.table is other
+    assert replace(shackleton, height_sigma_m=3.0).table is table  # the errors are no part of it
 
 
 def evidence_at(terrain, place, rng, error_rad=0.0, rays=4000) -> Evidence:
@@ -208,17 +219,17 @@ def test_sigma_follows_from_posts_and_distance(shackleton):
 
 def test_rays_that_run_off_the_map_give_no_evidence(shackleton):
     inner = shackleton.maps[0].around(shackleton.site.latitude_rad, shackleton.site.longitude_rad, 4000.0)
-    small = replace(shackleton, maps=(inner,), search_radius_m=300.0, _state={})
+    small = replace(shackleton, maps=(inner,), search_radius_m=300.0)
     azimuth = np.radians(np.arange(0, 360, 5.0))
     assert not small.is_informative(azimuth, small.horizon_rad(np.zeros(2), azimuth)).any()
     assert small.is_informative(azimuth, np.full(len(azimuth), np.radians(80.0))).all()
     assert shackleton.is_informative(azimuth, np.zeros(len(azimuth))).all()
     low = small.horizon_rad(np.zeros(2), azimuth)
-    assert set(why_silent(small, azimuth, low)) == {"ground off the map"}
-    assert set(why_silent(small, azimuth, np.full(len(azimuth), np.radians(80.0)))) == {""}
-    (line,) = silent_sectors(small)
+    assert set(small.mask_reason(azimuth, low)) == {"ground off the map"}
+    assert set(small.mask_reason(azimuth, np.full(len(azimuth), np.radians(80.0)))) == {""}
+    (line,) = small.masked_sectors()
     assert line.startswith("azimuths 0 to 360 degrees: the maps end")
-    assert silent_sectors(shackleton) == []
+    assert shackleton.masked_sectors() == []
     blind = evidence_at(small, np.zeros(2), np.random.default_rng(6), -0.2)
     with pytest.raises(NotLocated):
         ExactPosterior()(blind, small)
@@ -228,9 +239,9 @@ def test_glare_takes_the_evidence_of_its_azimuths(shackleton):
     lit = replace(shackleton, glare_rad=((np.radians(350), np.radians(20)),))
     told = lit.is_informative(np.radians([349.0, 351.0, 0.0, 19.0, 21.0, 180.0]), np.full(6, 0.5))
     assert told.tolist() == [True, False, False, False, True, True]
-    why = why_silent(lit, np.radians([349.0, 351.0]), np.full(2, 0.5))
+    why = lit.mask_reason(np.radians([349.0, 351.0]), np.full(2, 0.5))
     assert why.tolist() == ["", "glare of a lit rim"]
-    (line,) = silent_sectors(lit)
+    (line,) = lit.masked_sectors()
     assert line.startswith("azimuths 350 to 20 degrees: no evidence")
 
 
@@ -240,9 +251,9 @@ def test_azimuths_where_the_maps_end_are_told_as_ranges(shackleton):
     azimuth = np.radians(np.arange(0.5, 360))
     place = np.zeros(2)
     for columns in (slice(0, whole.heights_m.shape[1] // 2 + 20), slice(None)):
-        cut = replace(shackleton, maps=(whole.cut(slice(None), columns),), search_radius_m=200.0, _state={})
+        cut = replace(shackleton, maps=(whole.cut(slice(None), columns),), search_radius_m=200.0)
         silent = ~cut.is_informative(azimuth, cut.horizon_rad(place, azimuth))
-        lines = silent_sectors(cut)
+        lines = cut.masked_sectors()
         assert bool(lines) == bool(silent.any())
         said = np.zeros(360, dtype=bool)
         for line in lines:
@@ -295,7 +306,7 @@ def test_ground_is_the_maps_height_on_the_sphere():
     ground = terrain.ground_m(np.array([[0.0, 0.0], [3000.0, 4000.0]]))
     assert ground[0] == pytest.approx(-1000.0, abs=1e-6)
     assert ground[1] == pytest.approx(np.sqrt(1_736_400.0**2 - 5000.0**2) - 1_737_400.0, abs=1e-3)
-    there = replace(terrain, camera_height_m=300.0, _state={})  # nothing is made up beyond the map's end, 20 km off
+    there = replace(terrain, camera_height_m=300.0)  # nothing is made up beyond the map's end, 20 km off
     assert there.horizon_rad(np.zeros(2), np.array([np.pi / 4]))[0] == pytest.approx(-0.0205, abs=0.001)
     # On a smooth sphere the horizon dips by sqrt(2 h / R); here seen to where the map ends or beyond
     dip = terrain.horizon_rad(np.zeros(2), np.array([1.0]))[0]

@@ -27,13 +27,11 @@ def ready_for(reference: str | None, args: argparse.Namespace) -> None:
 
 def ready(terrain: Terrain, args: argparse.Namespace) -> None:
     """Work out a terrain's horizons, unless they are known or it needs none."""
-    from startrack.terrain.height_map import HeightMap
-
-    if not isinstance(terrain, HeightMap) or terrain.is_prepared:
+    if terrain.is_prepared:
         return
     with _told(args):
         if args.quiet or not sys.stderr.isatty():
-            terrain.prepared()
+            terrain.prepare()
             return
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -41,7 +39,7 @@ def ready(terrain: Terrain, args: argparse.Namespace) -> None:
         columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
         with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
             row = bar.add_task(f"horizons of {terrain.name}, once", total=None)
-            terrain.prepared(lambda done, total: bar.update(row, completed=done, total=total))
+            terrain.prepare(lambda done, total: bar.update(row, completed=done, total=total))
 
 
 @contextmanager

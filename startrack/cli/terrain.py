@@ -6,14 +6,13 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import replace
 from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import DEFAULT_OUT
 from startrack.cli.horizons import ready
-from startrack.cli.terrain_facts import dem_class, facts_of, lines_of, seen_from
+from startrack.cli.terrain_facts import facts_of, lines_of, seen_from
 from startrack.files import make_folder
 
 if TYPE_CHECKING:
@@ -100,22 +99,18 @@ def _pictures(args: argparse.Namespace, terrain: Terrain, place: tuple[float, fl
 
 def _build(args: argparse.Namespace) -> int:
     from startrack.terrain import load_terrain
-    from startrack.terrain import table_cache as cache
 
     for name in args.terrain:
         terrain = load_terrain(name)
-        facts: dict[str, Any] = {"name": terrain.name}
-        if isinstance(terrain, dem_class()):
-            path = cache.path_of(cache.key_of(terrain))
+        facts: dict[str, Any] = {"name": terrain.name, "horizons": None}
+        if terrain.table_path is not None:
             if args.force:
-                path.unlink(missing_ok=True)
-                terrain = replace(terrain, _state={})
+                terrain.discard_table()
             start = time.perf_counter()
-            known = path.is_file()
+            known = terrain.is_prepared
             ready(terrain, args)
-            facts |= {"horizons": str(path), "known_before": known, "seconds": round(time.perf_counter() - start, 1)}
-        else:
-            facts["horizons"] = None
+            facts |= {"horizons": str(terrain.table_path), "known_before": known}
+            facts["seconds"] = round(time.perf_counter() - start, 1)
         _tell(args, facts)
     return 0
 

@@ -10,7 +10,6 @@ from startrack.errors import BadInput
 
 if TYPE_CHECKING:
     from startrack.terrain import Terrain
-    from startrack.terrain.height_map import HeightMap
 
 
 def facts_of(terrain: Terrain) -> dict[str, Any]:
@@ -24,31 +23,7 @@ def facts_of(terrain: Terrain) -> dict[str, Any]:
         "search_radius_m": terrain.search_radius_m,
         "camera_height_m": terrain.camera_height_m,
     }
-    if is_dem(terrain):
-        return facts | _map_facts(terrain)
-    own = {key: value for key in ("diameter_m", "depth_m") if (value := getattr(terrain, key, None)) is not None}
-    return facts | {"kind": "cylinder", **own}
-
-
-def _map_facts(terrain: Any) -> dict[str, Any]:
-    from startrack.terrain import table_cache as cache
-    from startrack.terrain.projection import NAMES
-
-    maps = [
-        {
-            "file": m.source, "posts": list(m.heights_m.shape), "post_m": round(m.post_m, 3),
-            "projection": NAMES[m.projection.kind], "lowest_m": round(float(m.heights_m.min()), 1),
-            "highest_m": round(float(m.heights_m.max()), 1),
-        }
-        for m in terrain.maps
-    ]  # fmt: skip
-    path = cache.path_of(cache.key_of(terrain))
-    shared = terrain.horizon_sigma_common_rad
-    return {
-        "kind": "dem", "maps": maps, "height_sigma_m": terrain.height_sigma_m,
-        "horizon_sigma_deg": None if shared is None else round(degrees(shared), 6), "horizons": str(path),
-        "horizons_ready": path.is_file(),
-    }  # fmt: skip
+    return facts | terrain.facts()
 
 
 def seen_from(terrain: Terrain, place: tuple[float, float] | None) -> dict[str, Any]:
@@ -121,15 +96,3 @@ def _place(latitude_deg: float, longitude_deg: float) -> str:
         f"{abs(latitude_deg):.5f} {'N' if latitude_deg >= 0 else 'S'}, "
         f"{abs(longitude_deg):.5f} {'E' if longitude_deg >= 0 else 'W'}"
     )
-
-
-def is_dem(terrain: Terrain) -> bool:
-    """Whether it is a height map."""
-    return isinstance(terrain, dem_class())
-
-
-def dem_class() -> type[HeightMap]:
-    """The class of height maps, imported only where one is asked for."""
-    from startrack.terrain.height_map import HeightMap
-
-    return HeightMap

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -27,11 +27,16 @@ class Cylinder(Terrain):
     search_radius_m: float = np.inf
     depth_sigma_m: float = 0.0  # standard deviations; with either, the shape is estimated with the position
     diameter_sigma_m: float = 0.0
-    axisymmetric: ClassVar[bool] = True
+    axisymmetric = True
 
     @property
     def radius_m(self) -> float:
         return self.diameter_m / 2
+
+    @property
+    def rim_radius_m(self) -> float:  # type: ignore[override]
+        """The wall's, to be drawn on maps."""
+        return self.radius_m
 
     @property
     def reach_m(self) -> float:
@@ -92,6 +97,10 @@ class Cylinder(Terrain):
             depth_m=self.depth_m * (1 + steeper) * (1 + larger),
             diameter_m=self.diameter_m * (1 + larger),
         )
+
+    def facts(self) -> dict[str, Any]:
+        """Diameter and depth, as JSON values."""
+        return {"kind": "cylinder", "diameter_m": self.diameter_m, "depth_m": self.depth_m}
 
 
 def _distance_to_circle(points_m: Array, azimuths_rad: Array, radius_m: Array | float) -> Array:

@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import logging
 import time as clock
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from startrack.frames import Site
 from startrack.terrain import table_cache as cache
 from startrack.terrain import tracing
 from startrack.terrain.horizon_interpolator import NODES_ACROSS, HorizonInterpolator
 from startrack.terrain.horizon_sigma import CrestErrors
-from startrack.terrain.horizon_table import BINS, HorizonTable, Progress, Square, built
-from startrack.terrain.protocol import Terrain
+from startrack.terrain.horizon_table import BINS, HorizonTable, Square, built
+from startrack.terrain.masks import GLARE, OFF_MAP, Sectors, describe_masks, in_sectors
+from startrack.terrain.protocol import Progress, Terrain
 from startrack.terrain.pyramid import Ground, ground_up_m, packed
 from startrack.terrain.raster import Raster
 from startrack.types import Array, BadInput, Bools, Ints
 
 LOG = logging.getLogger(__name__)
+FINEST_BOX_M = 0.45  # half side of the smallest boxes of positions: no height map knows its ground better
 CELL_M = 200.0  # cells of the table are no wider
 MOST_CELLS_ACROSS = 128
 COMMON_PER_POST = 3.0
@@ -35,7 +39,7 @@ class HeightMap(Terrain):
     """The surface that is bilinear between the posts of height maps, as true 3-D points on the Moon's sphere.
 
     tan H = max over s of (z(p + s u) - z(p) - camera height) / s, u the azimuth's direction. Where several maps cover
-    a place the first holds. See `Terrain`.
+    a point the first holds. Raises BadInput bad_terrain if the maps do not cover the search area. See `Terrain`.
     """
 
     name: str = "height map"
@@ -46,15 +50,23 @@ class HeightMap(Terrain):
     height_sigma_m: float = 0.0  # of single posts, independent of each other
     horizon_sigma_common_rad: float | None = None  # of an error that all azimuths share; None: see common_sigma_rad
     most_slope_rad: float = np.pi / 2  # a rover does not stand on steeper ground
-    glare_rad: tuple[
-        tuple[float, float], ...
-    ] = ()  # azimuth ranges, from the first eastward to the second, lit by the Sun
-    _state: dict[str, Any] = field(default_factory=dict, repr=False)
+    glare_rad: Sectors = ()  # lit by the Sun: no evidence there
+    finest_m = FINEST_BOX_M
 
     def __post_init__(self) -> None:
         if not self.maps:
             raise BadInput("bad_terrain", "[dem] needs at least one map")
-        self._check_cover()
+        if not self._covers(self.search_radius_m):
+            raise BadInput(
+                "bad_terrain",
+                f"the maps do not cover the search area of {self.search_radius_m:.0f} m about the origin, "
+                "or have holes in it",
+            )
+
+    @property
+    def hard_edges(self) -> bool:  # type: ignore[override]
+        """Whether single posts have no error: the horizon of a point is then exact, but for a common error."""
+        return self.height_sigma_m == 0
 
     @cached_property
     def ground(self) -> Ground:
@@ -67,17 +79,17 @@ class HeightMap(Terrain):
         return min(m.post_m for m in self.maps)
 
     @cached_property
-    def common_sigma_rad(self) -> float:
-        """What the file says, and the height of the camera's own ground.
+    def common_sigma_rad(self) -> float:  # type: ignore[override]
+        """Standard deviation [rad] of the error that all azimuths share, with that of the camera's own ground.
 
-        Where the file says nothing, three times what `height_sigma_m` makes of the horizon: crests clipped by the grid
-        of posts stand too low by some such amount all around.
+        If it is not known, three times the horizon's sigma from `height_sigma_m`: crests clipped by the grid of posts
+        stand too low by some such amount all around.
         """
         if not self.height_sigma_m and not self.horizon_sigma_common_rad:
             return 0.0
         own = float(np.median(self._crests.cells_rad[self._searched])) if self.height_sigma_m else 0.0
-        said = self.horizon_sigma_common_rad
-        return float(np.hypot(own, COMMON_PER_POST * own if said is None else said))
+        known = self.horizon_sigma_common_rad
+        return float(np.hypot(own, COMMON_PER_POST * own if known is None else known))
 
     @cached_property
     def _searched(self) -> Bools:
@@ -91,6 +103,7 @@ class HeightMap(Terrain):
 
     @cached_property
     def square(self) -> Square:
+        """The cells of the table."""
         across = 1
         while 2 * self.reach_m / across > CELL_M and across < MOST_CELLS_ACROSS:
             across *= 2
@@ -101,32 +114,49 @@ class HeightMap(Terrain):
         return cache.key_of(self)
 
     @property
+    def table_path(self) -> Path:  # type: ignore[override]
+        """File of the table of horizons."""
+        return cache.path_of(self._key)
+
+    @property
     def is_prepared(self) -> bool:
         """Whether the table of horizons is in memory or on disk."""
-        return self._key in self._state or cache.path_of(self._key).is_file()
+        return self._key in cache.TABLES_IN_MEMORY or self.table_path.is_file()
 
-    def prepared(self, progress: Progress | None = None) -> HorizonTable:
-        """The table of horizons: from memory, else from the cache on disk, else worked out (and cached).
+    def prepare(self, progress: Progress | None = None) -> None:
+        """Have the table of horizons in memory: from the cache on disk, else worked out and cached.
 
         Of several processes that need the same table one works it out, and the others wait for it.
         """
-        if self._key not in self._state:
-            table = cache.loaded(self._key, self.square)
-            if table is None:
-                with cache.one_at_a_time(self._key, self.name):
-                    table = cache.loaded(self._key, self.square) or self._made(progress)
-            self._state.clear()  # copies made by `replace` share the dictionary, but not the table
-            self._state[self._key] = table
-        return self._state[self._key]  # type: ignore[no-any-return]
+        if "table" not in self.__dict__:
+            self.__dict__["table"] = self._load_or_build_table(progress)
 
-    def _made(self, progress: Progress | None) -> HorizonTable:
+    @cached_property
+    def table(self) -> HorizonTable:
+        """The table of horizons; see `prepare`."""
+        return self._load_or_build_table(None)
+
+    def _load_or_build_table(self, progress: Progress | None) -> HorizonTable:
+        table = cache.load_table(self._key, self.square)
+        if table is None:
+            with cache.single_builder(self._key, self.name):
+                table = cache.load_table(self._key, self.square) or self._build_and_keep_table(progress)
+        return table
+
+    def _build_and_keep_table(self, progress: Progress | None) -> HorizonTable:
         LOG.info("horizons of %s: worked out now, once; this takes a minute or two", self.name)
         start = clock.perf_counter()
-        table = self._built(progress)
-        path = cache.save(self._key, table)
+        table = self._build_table(progress)
+        path = cache.keep_table(self._key, table)
         where = f"kept in {path}" if path else f"not kept: {cache.cache_dir()} cannot be written"
         LOG.debug("horizons of %s: done in %.0f s, %s", self.name, clock.perf_counter() - start, where)
         return table
+
+    def discard_table(self) -> None:
+        """Remove the table of horizons from memory and disk."""
+        self.__dict__.pop("table", None)
+        self.__dict__.pop("_crests", None)
+        cache.discard_table(self._key)
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad], traced. See `Terrain`."""
@@ -142,7 +172,7 @@ class HeightMap(Terrain):
         )
         centres = _flat(centres_m, (*shape, 2)).reshape(-1, 2)
         half, azimuths, turn = (_flat(a, shape).ravel() for a in (half_m, azimuths_rad, azimuth_half_rad))
-        table = self.prepared()
+        table = self.table
         low, high = np.empty(len(half)), np.empty(len(half))
         traced = (turn < 0.25 * 2 * np.pi / BINS) & (half < table.square.half_m)
         if traced.all():
@@ -174,7 +204,7 @@ class HeightMap(Terrain):
 
     @cached_property
     def _crests(self) -> CrestErrors:
-        return CrestErrors(self.prepared(), self.height_sigma_m)
+        return CrestErrors(self.table, self.height_sigma_m)
 
     def ground_m(self, points_m: Array) -> Array:
         """Height of the ground in enu (...) [m]."""
@@ -198,18 +228,37 @@ class HeightMap(Terrain):
         return np.asarray(np.arctan(rise))
 
     def is_informative(self, azimuths_rad: Array, elevations_rad: Array) -> Bools:
-        """Whether the map can say anything of a ray: not in a glare sector, nor where unmapped ground may stand."""
+        """Whether the map decides if the rays (...) are visible: outside glare, and above unmapped ground."""
         azimuths = np.asarray(azimuths_rad) % (2 * np.pi)
         b = (azimuths / (2 * np.pi) * BINS).astype(np.int64) % BINS
-        told = np.asarray(elevations_rad) > self.prepared().unknown_rad[b]
-        for start, end in self.glare_rad:
-            told &= (azimuths - start) % (2 * np.pi) > (end - start) % (2 * np.pi)
-        return np.asarray(told)
+        above = np.asarray(elevations_rad) > self.unknown_rad[b]
+        return np.asarray(above & ~in_sectors(azimuths, self.glare_rad))
 
     @property
     def unknown_rad(self) -> Array:
         """(n,) of n sectors from north eastward: below which elevation ground off the maps may stand, or -pi/2."""
-        return self.prepared().unknown_rad
+        return self.table.unknown_rad
+
+    def mask_reason(self, azimuths_rad: Array, elevations_rad: Array) -> NDArray[np.str_]:
+        """Why rays (n,) are not informative; empty where they are."""
+        reason = np.where(self.is_informative(azimuths_rad, elevations_rad), "", OFF_MAP)
+        return np.where((reason != "") & in_sectors(azimuths_rad, self.glare_rad), GLARE, reason)
+
+    def masked_sectors(self) -> list[str]:
+        """One line of text per range of azimuths that is not informative."""
+        return describe_masks(self.glare_rad, self.unknown_rad)
+
+    def facts(self) -> dict[str, Any]:
+        """Facts about the maps and their errors, as JSON values."""
+        common = self.horizon_sigma_common_rad
+        return {
+            "kind": "dem",
+            "maps": [raster.facts() for raster in self.maps],
+            "height_sigma_m": self.height_sigma_m,
+            "horizon_sigma_deg": None if common is None else round(float(np.degrees(common)), 6),
+            "horizons": str(self.table_path),
+            "horizons_ready": self.table_path.is_file(),
+        }
 
     def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = NODES_ACROSS) -> Terrain:
         """The ground near a centre (2,), see `HorizonInterpolator`."""
@@ -222,17 +271,19 @@ class HeightMap(Terrain):
         points_m = np.asarray(points_m, dtype=np.float64)
         shape = np.broadcast_shapes(points_m.shape[:-1], np.shape(azimuths_rad))
         points = _flat(points_m, (*shape, 2)).reshape(-1, 2)
-        found = tracing.trace_horizons(self, self._state.get(self._key), points, _flat(azimuths_rad, shape).ravel())
+        found = tracing.trace_horizons(
+            self, cache.TABLES_IN_MEMORY.get(self._key), points, _flat(azimuths_rad, shape).ravel()
+        )
         return tuple(a.reshape(shape) for a in found)  # type: ignore[return-value]
 
     def _some(self, bounds: Any, centres: Array, half: Array, azimuths: Array, turn: Array, which: Bools) -> Any:
         low, high = np.empty(int(which.sum())), np.empty(int(which.sum()))
         if len(low):
             parts = (np.ascontiguousarray(a[which]) for a in (centres, half, azimuths, turn))
-            bounds(self, self.prepared(), *parts, low, high)
+            bounds(self, self.table, *parts, low, high)
         return low, high
 
-    def _built(self, progress: Progress | None) -> HorizonTable:
+    def _build_table(self, progress: Progress | None) -> HorizonTable:
         square = self.square
         centres = square.centres_m
         wanted = np.hypot(*centres.T) < self.reach_m + 1.42 * square.half_m  # all that hold a place within reach
@@ -263,14 +314,6 @@ class HeightMap(Terrain):
         line = np.linspace(-half_m, half_m, 65)
         points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
         return not np.isnan(ground_up_m(self.site, list(self.maps), points)).any()
-
-    def _check_cover(self) -> None:
-        if not self._covers(self.search_radius_m):
-            raise BadInput(
-                "bad_terrain",
-                f"the maps do not cover the search area of {self.search_radius_m:.0f} m about the origin, "
-                "or have holes in it",
-            )
 
 
 def _flat(a: Any, shape: tuple[int, ...]) -> Array:

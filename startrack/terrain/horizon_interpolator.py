@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from startrack.terrain import tracing
+from startrack.terrain.protocol import ForwardingTerrain
 from startrack.types import Array, Bools, Ints
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ MAX_BEND_SIGMAS = 0.5  # or by more than that part of the map's own error
 
 
 @dataclass(frozen=True, eq=False)
-class HorizonInterpolator:
+class HorizonInterpolator(ForwardingTerrain):
     """The terrain near a centre, with fast horizons at the azimuths that it was made for; else as `whole`.
 
     A crest at the distance d is seen higher as the camera's own ground falls: tan H + z / d bends much less from point
@@ -33,9 +34,6 @@ class HorizonInterpolator:
     half_m: float
     azimuths_rad: Array  # (n,) ascending
     across: int = NODES_ACROSS
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.whole, name)
 
     @cached_property
     def step_m(self) -> float:
@@ -128,10 +126,14 @@ class HorizonInterpolator:
         too_wide = half > self.step_m / 2 or 2 * half > self.whole.finest_post_m
         if np.any(azimuth_half_rad) or np.ndim(half_m) or too_wide:
             return self.whole.horizon_bounds_rad(centres_m, half_m, azimuths_rad, azimuth_half_rad)
-        column, known = self.column(azimuths_rad)
-        low, high = tracing.interpolate_bounds(self, np.ascontiguousarray(centres_m), half, column)
-        inside = np.abs(centres_m - self.centre_m).max(axis=-1) + half <= self.half_m * (1 + 1e-9)
+        centres_m = np.asarray(centres_m, dtype=np.float64)
+        shape = np.broadcast_shapes(centres_m.shape[:-1], np.shape(azimuths_rad))
+        centres = np.ascontiguousarray(np.broadcast_to(centres_m, (*shape, 2))).reshape(-1, 2)
+        azimuths = np.broadcast_to(azimuths_rad, shape).ravel()
+        column, known = self.column(azimuths)
+        low, high = tracing.interpolate_bounds(self, centres, half, column)
+        inside = np.abs(centres - self.centre_m).max(axis=-1) + half <= self.half_m * (1 + 1e-9)
         other = ~(inside & known & self._smooth[column])
         if other.any():
-            low[other], high[other] = self.whole.horizon_bounds_rad(centres_m[other], half_m, azimuths_rad[other])
-        return low, high
+            low[other], high[other] = self.whole.horizon_bounds_rad(centres[other], half_m, azimuths[other])
+        return low.reshape(shape), high.reshape(shape)

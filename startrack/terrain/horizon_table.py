@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.terrain.protocol import Progress
 from startrack.types import Array, Bools, Ints
 
 BINS = 360  # azimuths; what the localizer asks at once are sectors of 1.5 degrees
@@ -21,7 +22,6 @@ RISE_STEP = 1e-3
 LOW, HIGH, FIRST, LAST, BEST, LINE_TAN, LINE_M, POINT_S, POINT_M, RISE, POINT_RISE = range(11)  # of what tracing finds
 FARTHEST = 65_535
 NOT_KNOWN_M = -32_768
-Progress = Callable[[int, int], None]  # cells done, of how many
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,8 @@ class Terrain(ABC):
     finest_m: float = 0.05  # half side of the smallest box of positions that the ground distinguishes
     axisymmetric: bool = False  # whether a turn of the sky about the vertical only turns the position
     shape_sigma: tuple[float, float] = (0.0, 0.0)  # relative, of steepness and of size: see `reshaped`
+    rim_radius_m: float | None = None  # of a circular rim about the origin, drawn on maps instead of the relief
+    table_path: Path | None = None  # file of what `prepare` works out; None where it works out nothing
 
     @property
     def reach_m(self) -> float:
@@ -104,3 +107,35 @@ class Terrain(ABC):
 
     def prepare(self, progress: Progress | None = None) -> None:  # noqa: B027 - the default has nothing to do
         """Work out, once, what the first call of `horizon_bounds_rad` needs."""
+
+    def discard_table(self) -> None:  # noqa: B027 - the default has nothing to discard
+        """Forget what `prepare` has worked out, in memory and on disk."""
+
+    def facts(self) -> dict[str, Any]:
+        """Facts about the ground that `startrack terrain show` prints, as JSON values; "kind" is one of them."""
+        return {"kind": "other"}
+
+
+def _forward(name: str) -> Any:
+    return property(lambda self: getattr(self.whole, name))
+
+
+class ForwardingTerrain(Terrain):
+    """A terrain with every attribute and method of another one, `whole`; subclasses replace some of them."""
+
+    def __init__(self, whole: Terrain) -> None:
+        self.whole = whole
+
+    name, site, camera_height_m = _forward("name"), _forward("site"), _forward("camera_height_m")
+    search_radius_m, reach_m, finest_m = _forward("search_radius_m"), _forward("reach_m"), _forward("finest_m")
+    common_sigma_rad, hard_edges = _forward("common_sigma_rad"), _forward("hard_edges")
+    axisymmetric, shape_sigma = _forward("axisymmetric"), _forward("shape_sigma")
+    rim_radius_m, table_path, facts = _forward("rim_radius_m"), _forward("table_path"), _forward("facts")
+    horizon_rad, horizon_bounds_rad = _forward("horizon_rad"), _forward("horizon_bounds_rad")
+    horizon_sigma_rad = _forward("horizon_sigma_rad")
+    max_horizon_sigma_rad = _forward("max_horizon_sigma_rad")
+    ground_m, allowed, near = _forward("ground_m"), _forward("allowed"), _forward("near")
+    is_informative, mask_reason = _forward("is_informative"), _forward("mask_reason")
+    masked_sectors = _forward("masked_sectors")
+    reshaped, closed_form = _forward("reshaped"), _forward("closed_form")
+    is_prepared, prepare, discard_table = _forward("is_prepared"), _forward("prepare"), _forward("discard_table")

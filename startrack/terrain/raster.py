@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from startrack.frames import R_enu_fixed, Site
-from startrack.terrain.projection import EQUIRECTANGULAR, STEREOGRAPHIC, Projection
+from startrack.terrain.projection import EQUIRECTANGULAR, NAMES, STEREOGRAPHIC, Projection
 from startrack.types import Array
 
 GRID_NUMBERS = 16  # see Raster.grid_numbers
@@ -35,6 +36,17 @@ class Raster:
             latitude = (middle - self.projection.false_y_m) / (self.projection.radius_m * self.projection.scale_y)
             stretch = np.array([np.cos(latitude) / self.projection.scale, 1 / self.projection.scale_y])
         return float(np.max(np.abs([self.dx_m, self.dy_m]) * stretch))
+
+    def facts(self) -> dict[str, Any]:
+        """File, size, projection and range of the heights, as JSON values."""
+        return {
+            "file": self.source,
+            "posts": list(self.heights_m.shape),
+            "post_m": round(self.post_m, 3),
+            "projection": NAMES[self.projection.kind],
+            "lowest_m": round(float(self.heights_m.min()), 1),
+            "highest_m": round(float(self.heights_m.max()), 1),
+        }
 
     def xy(self, row_column: Array) -> tuple[Array, Array]:
         """Map coordinates x, y (...) [m] of fractional rows and columns (..., 2)."""

@@ -1,19 +1,20 @@
-"""Tables of horizons kept on disk, by a hash of all that they follow from."""
+"""Tables of horizons, kept on disk and in memory by a hash of all that they follow from."""
 
 from __future__ import annotations
 
 import hashlib
 import logging
 import os
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
+from weakref import WeakValueDictionary
 from zipfile import BadZipFile
 
 import numpy as np
 
+from startrack.files import atomic_file, locked
 from startrack.terrain.horizon_table import BINS, FIELDS, HorizonTable, Square
 
 if TYPE_CHECKING:
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger(__name__)
 VERSION = 2  # of the tracing and of the table's format
+
+# Terrains that need the same table share one in memory, for as long as one of them lives.
+TABLES_IN_MEMORY: WeakValueDictionary[str, HorizonTable] = WeakValueDictionary()
 
 
 def cache_dir() -> Path:
@@ -36,21 +40,30 @@ def key_of(terrain: HeightMap) -> str:
     numbers = [site.latitude_rad, site.longitude_rad, site.height_m, terrain.camera_height_m]
     numbers += [terrain.reach_m, float(terrain.square.across), terrain.search_radius_m]
     digest.update(np.array(numbers).tobytes())
-    for height_map in terrain.maps:
-        digest.update(height_map.grid_numbers(site).tobytes())
-        digest.update(np.ascontiguousarray(height_map.heights_m).data)
+    for raster in terrain.maps:
+        digest.update(raster.grid_numbers(site).tobytes())
+        digest.update(np.ascontiguousarray(raster.heights_m).data)
     return digest.hexdigest()
 
 
 def path_of(key: str) -> Path:
-    """Where the table of a key is kept."""
+    """File of the table of a key."""
     return cache_dir() / f"{key[:40]}.npz"
 
 
-def loaded(key: str, square: Square) -> HorizonTable | None:
-    """The table of a key; None where there is none, or none that can be read."""
+def load_table(key: str, square: Square) -> HorizonTable | None:
+    """The table of a key from memory or disk; None if there is none that can be read."""
+    table = TABLES_IN_MEMORY.get(key)
+    if table is None:
+        table = _read_table(path_of(key), square)
+        if table is not None:
+            TABLES_IN_MEMORY[key] = table
+    return table
+
+
+def _read_table(path: Path, square: Square) -> HorizonTable | None:
     try:
-        with np.load(path_of(key), allow_pickle=False) as file:
+        with np.load(path, allow_pickle=False) as file:
             values, unknown = file["values"], file["unknown_rad"]
     except (OSError, ValueError, KeyError, EOFError, BadZipFile):
         return None
@@ -59,62 +72,38 @@ def loaded(key: str, square: Square) -> HorizonTable | None:
     return HorizonTable(square, values, unknown)
 
 
-def save(key: str, table: HorizonTable) -> Path | None:
-    """Keep the table, whole or not at all; None where the folder cannot be written (the table is then made again)."""
+def keep_table(key: str, table: HorizonTable) -> Path | None:
+    """Keep the table in memory and, if the folder can be written, in the file that is returned."""
+    TABLES_IN_MEMORY[key] = table
     path = path_of(key)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".making-", suffix=".npz")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez(file, values=table.values, unknown_rad=table.unknown_rad)
-            os.replace(name, path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
+        with atomic_file(path) as temporary, temporary.open("xb") as file:
+            np.savez(file, values=table.values, unknown_rad=table.unknown_rad)
     except OSError:
         return None
     return path
 
 
+def discard_table(key: str) -> None:
+    """Remove the table from memory and disk."""
+    TABLES_IN_MEMORY.pop(key, None)
+    with suppress(OSError):
+        path_of(key).unlink()
+
+
 @contextmanager
-def one_at_a_time(key: str, name: str) -> Iterator[None]:
-    """Within, this process alone makes the table of the key; others that come here wait until it is done or has died.
+def single_builder(key: str, name: str) -> Iterator[None]:
+    """Within the block this process alone makes the table of the key; others wait until it is done or has died.
 
-    Where files cannot be locked (a folder that cannot be written, some network disks, Windows) nobody waits: the table
-    is then made by each.
+    Where files cannot be locked (a read-only folder, some network disks) nobody waits, and each process makes its own.
     """
-    handle = _locked(path_of(key).with_suffix(".lock"), name)
-    try:
+    path = path_of(key).with_suffix(".lock")
+
+    def announce() -> None:
+        LOG.info("horizons of %s: another process works them out, waiting for it", name)
+
+    with ExitStack() as stack:
+        with suppress(OSError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(locked(path, on_wait=announce))
         yield
-    finally:
-        if handle is not None:
-            path_of(key).with_suffix(".lock").unlink(missing_ok=True)
-            os.close(handle)
-
-
-def _locked(path: Path, name: str) -> int | None:
-    """An open file that is locked while it is open; None where there are no locks."""
-    try:
-        import fcntl
-    except ImportError:
-        return None
-    handle = -1
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        while True:
-            handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                LOG.info("horizons of %s: another process works them out, waiting for it", name)
-                fcntl.flock(handle, fcntl.LOCK_EX)
-            with suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(handle), path.stat()):
-                    return handle
-            os.close(handle)  # its last owner has removed the file: what is locked is no longer what others see
-            handle = -1
-    except OSError:
-        if handle >= 0:
-            os.close(handle)
-        return None

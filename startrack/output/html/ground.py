@@ -8,7 +8,7 @@ import numpy as np
 
 from startrack.output.html.picture import data_uri
 from startrack.output.picture.relief import edge_of, ground_cells, light_on
-from startrack.terrain import Cylinder, Terrain, load_terrain
+from startrack.terrain import Terrain, load_terrain
 from startrack.types import BadInput
 
 RELIEF_CELLS = 420
@@ -47,8 +47,8 @@ def horizon_deg(terrain: Terrain, east_m: float, north_m: float, count: int) -> 
 def ground_map(terrain: Terrain) -> dict[str, Any]:
     """`search_m`, the radius of the search area; of a cylinder `rim_m`, else `relief` with its `half_m`."""
     shape: dict[str, Any] = {"search_m": terrain.search_radius_m, "site": terrain.site.body}
-    if isinstance(terrain, Cylinder):
-        return {**shape, "rim_m": terrain.radius_m}
+    if terrain.rim_radius_m is not None:
+        return {**shape, "rim_m": terrain.rim_radius_m}
     half_m = MARGIN * terrain.reach_m
     return {**shape, "half_m": half_m, "relief": _relief(terrain, half_m)}
 

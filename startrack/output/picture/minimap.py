@@ -20,7 +20,7 @@ from startrack.output.picture.palette import (
     mixed,
 )
 from startrack.output.picture.relief import ground_on, shade
-from startrack.terrain import Cylinder, Terrain
+from startrack.terrain import Terrain
 from startrack.types import Array, Fix
 
 CIRCLE_RAD = np.linspace(0.0, 2 * np.pi, 181)
@@ -62,7 +62,7 @@ def draw_overview(
     canvas: Canvas, box: Box, terrain: Terrain, fix: Fix | None, ambiguous: bool, truth: ArrayLike | None
 ) -> MapView:
     """The search area (dashed), the rim of a cylinder or the shape of the ground, and the place or places."""
-    rim = terrain.radius_m if isinstance(terrain, Cylinder) else 0.0
+    rim = terrain.rim_radius_m or 0.0
     view = map_view(box, (0.0, 0.0), 1.07 * max(min(terrain.search_radius_m, terrain.reach_m), rim))
     window = canvas.window(box)
     window.rectangle(box, MAP)

@@ -9,7 +9,7 @@ from startrack.output.picture.canvas import Box, Canvas, around
 from startrack.output.picture.minimap import CAPTION_SIZE, MapView, draw_overview, grid_lines_m, nice_step
 from startrack.output.picture.palette import DIM_INK, FAINT_INK, FLOOR, GRID, INK, MAP, POSITION, SKYLINE
 from startrack.output.picture.relief import draw_contours, ground_on
-from startrack.terrain import Cylinder, Terrain
+from startrack.terrain import Terrain
 from startrack.types import Array
 
 SIZE_PX = 900
@@ -32,7 +32,7 @@ def relief_picture(terrain: Terrain, place_m: tuple[float, float] | None = None)
         canvas.circle(view.at(place_m), 11.0, POSITION, 2)
         canvas.keep_free(around(view.at(place_m), 14.0))
     _metres(canvas, view)
-    if not isinstance(terrain, Cylinder):
+    if terrain.rim_radius_m is None:
         window = canvas.window(box)
         step_m = draw_contours(canvas, window, view, *ground_on(view, terrain, (window.size[1], window.size[0])))
         if step_m is not None:

@@ -74,7 +74,7 @@ def measured(
     paint(image, xy, true, sigma)
     sources = Sources(xy_px=xy, flux_e=expected, fraction_sigma=np.full(len(xy), SCATTER), visible=thought)
     noise = np.full((SIZE, SIZE), np.sqrt(VARIANCE), np.float32)
-    light = measure(noisy(image, rng), noise, np.zeros((SIZE, SIZE), bool), sources, sigma)
+    light = measure(noisy(image, rng), np.zeros_like(noise), noise, np.zeros((SIZE, SIZE), bool), sources, sigma)
     return Measured(expected, true, shines, light, n)
 
 
@@ -172,7 +172,9 @@ def test_a_hot_pixel_near_a_star_is_masked(flux: float, excess: float) -> None:
     spot = np.rint(xy).astype(int) + rng.integers(-3, 4, xy.shape)
     image[spot[:, 1], spot[:, 0]] += excess
     sources = Sources(xy_px=xy, flux_e=expected, fraction_sigma=np.full(len(xy), 0.05), visible=np.full(len(xy), 0.5))
-    light = measure(image, np.full((SIZE, SIZE), 10.0, np.float32), np.zeros((SIZE, SIZE), bool), sources, 1.0)
+    light = measure(
+        image, np.zeros_like(image), np.full((SIZE, SIZE), 10.0, np.float32), np.zeros((SIZE, SIZE), bool), sources, 1.0
+    )
     true = np.where(np.arange(len(xy)) % 2 == 0, flux, 0.0)
     z = (light.flux_e - true) / np.sqrt(light.variance_e2 + light.own_shot * true)
     assert light.usable.mean() > 0.97
@@ -187,7 +189,7 @@ def test_saturated_stamps_are_unusable() -> None:
         xy_px=np.array([[50.0, 50.0], [30.0, 30.0]]), flux_e=np.full(2, 500.0), fraction_sigma=np.zeros(2),
         visible=np.full(2, 0.5),
     )  # fmt: skip
-    light = measure(np.zeros((100, 100), np.float32), np.full((100, 100), 10.0, np.float32), dead, sources, 1.0)
+    light = measure(*np.zeros((2, 100, 100), np.float32), np.full((100, 100), 10.0, np.float32), dead, sources, 1.0)
     assert light.usable.tolist() == [False, True]
     assert all(np.isfinite(getattr(light, name)).all() for name in Photometry.__dataclass_fields__)
 

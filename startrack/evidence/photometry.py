@@ -8,18 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.psf import pixel_profile_single, stamp_radius
+from startrack.psf import pixel_profile_table, stamp_radius
 from startrack.types import Array, Bools, Ints
 
-OUTLIER_SIGMA = 5.0
-MODEL_ERROR = 0.05  # of a star's light, pixel by pixel: the real PSF is not quite the Gaussian
-STARS_AT_ONCE = 2000  # stamps that stay in the processor's cache together
-MOST_MASKED_PX = 6  # a stamp with more deviant pixels is not a star on a smooth background
+PROFILE_SIGMAS = 6.0  # half width of a neighbour's profile: 1e-9 of its light lies beyond
 
 
 @dataclass(frozen=True, kw_only=True)
 class Photometry:
-    """Measured fluxes at predicted places (n)."""
+    """Measured fluxes at predicted pixels (n)."""
 
     flux_e: Array  # (n,) local level and neighbours subtracted
     variance_e2: Array  # (n,) from the pixels' noise, without the star's own light
@@ -44,120 +41,52 @@ def half_width(sigma_px: float) -> int:
 
 
 def measure(
-    image: NDArray[np.float32], noise: NDArray[np.float32], dead: NDArray[np.bool_], sources: Sources, sigma_px: float
+    image_e: NDArray[np.float32],
+    background_e: NDArray[np.float32],
+    noise_e: NDArray[np.float32],
+    dead: NDArray[np.bool_],
+    sources: Sources,
+    sigma_px: float,
 ) -> Photometry:
     """Flux and local level at each source by linear least squares, deviant pixels masked.
 
-    `image` is background-subtracted [e], `noise` the standard deviation of a pixel [e], `dead` marks saturated pixels.
-    All sources must lie at least `half_width` inside the frame. The neighbours' expected light is subtracted.
+    The images (H, W) hold the light, its smooth background and the standard deviation of a pixel [e]; `dead` (H, W)
+    marks saturated pixels. All sources must lie at least `half_width` inside the frame. The neighbours' expected light
+    is subtracted.
     """
-    from scipy.spatial import cKDTree
+    from startrack.evidence.photometry_kernel import measure_sources
 
     radius = half_width(sigma_px)
-    # Down the frame, so that neighbours in the list are neighbours in memory.
-    order = np.argsort(sources.xy_px[:, 1], kind="stable")
-    sources = Sources(**{name: getattr(sources, name)[order] for name in Sources.__dataclass_fields__})
-    centre = np.rint(sources.xy_px).astype(np.int64)
-    found = cKDTree(sources.xy_px).query_pairs(radius + 3.0 * sigma_px, output_type="ndarray")
-    pairs = np.concatenate([found, found[:, ::-1]]).astype(np.int64)  # of a star and its neighbour
-    pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
-    pictures = image, noise, dead
-    parts = []
-    for start in range(0, max(len(centre), 1), STARS_AT_ONCE):
-        some = slice(start, start + STARS_AT_ONCE)
-        first, last = np.searchsorted(pairs[:, 0], [start, start + STARS_AT_ONCE])
-        parts.append(_measured(pictures, sources, centre[some], pairs[first:last], start, sigma_px, radius))
-    fields = Photometry.__dataclass_fields__
-    back = np.argsort(order)
-    return Photometry(**{name: np.concatenate([getattr(part, name) for part in parts])[back] for name in fields})
-
-
-def _measured(
-    pictures: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]],
-    sources: Sources,
-    centre: Ints,
-    pairs: Ints,
-    start: int,
-    sigma_px: float,
-    radius: int,
-) -> Photometry:
-    """The sources `start`.. whose stamps are around the pixels `centre` (n, 2); `pairs` (m, 2) are theirs."""
-    n = len(centre)
-    profile = _profiles(sources.xy_px[start : start + n] - centre, sigma_px, radius)
-    image, noise, dead = (_stamps(picture, centre, radius).reshape(profile.shape) for picture in pictures)
-    own_row, neighbour = pairs[:, 0] - start, pairs[:, 1]
-    overlap = _profiles(sources.xy_px[neighbour] - centre[own_row], sigma_px, radius)
-    expected = (sources.flux_e[neighbour] * sources.visible[neighbour]).astype(np.float32)
-    light = _summed(expected[:, None] * overlap, own_row, n)
-    data, variance, good = image - light, np.square(noise), ~dead
-    flux, weights = _fit(data, profile, good / variance)
-    masked = np.zeros(n, dtype=np.int64)
-    redo = np.arange(n)
-    # The worst pixel first: a bright one drags the fit so far that its innocent neighbours look deviant too.
-    for _ in range(MOST_MASKED_PX + 1):
-        excess = _excess(data[redo], variance[redo], light[redo], profile[redo], good[redo], flux[redo])
-        worst = np.argmax(excess, axis=1)
-        deviant = excess[np.arange(len(redo)), worst] > OUTLIER_SIGMA**2
-        redo, worst = redo[deviant], worst[deviant]
-        if not len(redo):
-            break
-        good[redo, worst] = False
-        masked[redo] += 1
-        flux[redo], weights[redo] = _fit(data[redo], profile[redo], good[redo] / variance[redo])
-    usable = (masked <= MOST_MASKED_PX) & (np.where(good, profile, 0.0).sum(axis=1) > 0.5)
-    weights[~usable] = 0.0
-    shining, fraction = sources.visible[neighbour], sources.fraction_sigma[neighbour]
-    uncertain = np.square(sources.flux_e[neighbour]) * (shining * (1 - shining) + shining * np.square(fraction))
-    leak = np.square(np.einsum("mp,mp->m", weights[own_row], overlap))
+    reach_px = radius + 3.0 * sigma_px
+    order, first, columns = _order_by_cell(sources.xy_px, image_e.shape, reach_px)
+    table = pixel_profile_table(sigma_px, max(radius, int(np.ceil(PROFILE_SIGMAS * sigma_px)) + 1))
+    by_cell = (values[order] for values in (sources.xy_px, sources.flux_e, sources.fraction_sigma, sources.visible))
+    measured, usable = np.empty((len(order), 4)), np.empty(len(order), dtype=np.bool_)
+    pictures = (_read_only(picture) for picture in (image_e, background_e, noise_e, dead))
+    measure_sources(*pictures, *by_cell, first, columns, reach_px, reach_px, radius, table, measured, usable)
+    columns_out, usable_out = np.empty((4, len(order))), np.empty_like(usable)
+    columns_out[:, order], usable_out[order] = measured.T, usable
+    flux_e, variance_e2, own_shot, neighbour_variance_e2 = columns_out
     return Photometry(
-        flux_e=np.where(usable, flux, 0.0),
-        variance_e2=np.where(usable, np.einsum("np,np,np->n", weights, weights, variance + light), 1.0),
-        own_shot=np.einsum("np,np,np->n", weights, weights, profile),
-        neighbour_variance_e2=np.bincount(own_row, weights=leak * uncertain, minlength=n).astype(np.float64),
-        usable=usable,
+        flux_e=flux_e,
+        variance_e2=variance_e2,
+        own_shot=own_shot,
+        neighbour_variance_e2=neighbour_variance_e2,
+        usable=usable_out,
     )
 
 
-def _stamps(picture: NDArray[Any], centre: Ints, radius: int) -> NDArray[Any]:
-    """The squares (n, side, side) around the pixels `centre` (n, 2)."""
-    windows = np.lib.stride_tricks.sliding_window_view(picture, (2 * radius + 1, 2 * radius + 1))
-    return windows[centre[:, 1] - radius, centre[:, 0] - radius]
+def _order_by_cell(xy_px: Array, shape: tuple[int, ...], side_px: float) -> tuple[Ints, Ints, int]:
+    """Order of the sources (n, 2) by square cells of a grid over an image (H, W); each cell's first; the columns."""
+    columns, rows = int(shape[1] / side_px) + 1, int(shape[0] / side_px) + 1
+    place = (xy_px / side_px).astype(np.int64)
+    cell = place[:, 1] * columns + place[:, 0]
+    first = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=rows * columns))])
+    return np.argsort(cell, kind="stable"), first, columns
 
 
-def _excess(data: Array, variance: Array, light: Array, profile: Array, good: Bools, flux: Array) -> Array:
-    """Squared deviation (n, pixels) of the good pixels from the fit, in units of its variance."""
-    stars = np.maximum(flux, 0.0)[:, None] * profile + light
-    rest = data - flux[:, None] * profile - _level(data, profile, good / variance, flux)[:, None]
-    return np.where(good, np.square(rest) / (variance + stars + np.square(MODEL_ERROR * stars)), 0.0)
-
-
-def _profiles(offset_px: Array, sigma_px: float, radius: int) -> Any:
-    """PSF on the stamps (n, pixels), float32."""
-    px, _ = pixel_profile_single(offset_px[:, 0], sigma_px, radius)  # stamps are large and pixels have no more digits
-    py, _ = pixel_profile_single(offset_px[:, 1], sigma_px, radius)
-    return (py[:, :, None] * px[:, None, :]).reshape(len(px), (2 * radius + 1) ** 2)
-
-
-def _summed(rows: Array, group: Ints, n: int) -> Array:
-    """Sums (n, pixels) of the rows by group."""
-    from scipy.sparse import csr_matrix
-
-    ones = np.ones(len(group), np.float32)
-    sparse = csr_matrix((ones, (group, np.arange(len(group)))), shape=(n, len(group)))
-    return np.asarray(sparse @ rows)
-
-
-def _fit(data: Array, profile: Array, weight: Array) -> tuple[Array, Array]:
-    """Flux (n,) with a free constant level, and the weights (n, pixels) that give it: flux = sum weights data."""
-    total = np.maximum(weight.sum(axis=1), 1e-30)
-    middle = np.einsum("np,np->n", weight, profile) / total
-    centred = weight * (profile - middle[:, None])
-    strength = np.einsum("np,np->n", centred, profile)
-    # A stamp without a good pixel measures nothing; the caller marks it unusable.
-    weights = np.divide(centred, strength[:, None], out=np.zeros_like(centred), where=strength[:, None] > 0)
-    return np.einsum("np,np->n", weights, data), weights
-
-
-def _level(data: Array, profile: Array, weight: Array, flux: Array) -> Array:
-    rest = data - flux[:, None] * profile
-    return np.einsum("np,np->n", weight, rest) / np.maximum(weight.sum(axis=1), 1e-30)
+def _read_only(picture: NDArray[Any]) -> NDArray[Any]:
+    """The image in one block and never writable: each flag and layout would compile the loop once more."""
+    view = np.ascontiguousarray(picture).view()
+    view.flags.writeable = False
+    return view

@@ -108,17 +108,15 @@ class StarEvidence:
         fraction = np.sqrt(scale.scatter**2 + np.square(0.4 * np.log(10) * stars.v_sigma_mag[star]) + blur**2)
         cause = _unusable(xy, angle, camera, bodies, R_cam_icrs, half_width(sigma_px))
         measurable = np.flatnonzero(cause != "off the frame")
-        residual = image_e - detections.background_e
-
         shining = (
             visible[star[measurable]]
             if visible is not None
-            else _guess(residual, detections, dead, xy[measurable], expected[measurable], fraction[measurable])
+            else _guess(image_e, detections, dead, xy[measurable], expected[measurable], fraction[measurable])
         )
         sources = Sources(
             xy_px=xy[measurable], flux_e=expected[measurable], fraction_sigma=fraction[measurable], visible=shining
         )
-        light = measure(residual, detections.noise_e, dead, sources, sigma_px)
+        light = measure(image_e, detections.background_e, detections.noise_e, dead, sources, sigma_px)
         llr, sigma = _ratios(light, expected[measurable], fraction[measurable], self.capped)
         azimuth, elevation = azel_from_rays(stars.rays_icrs[star] @ R_enu_icrs.T)
         cause[measurable[~light.usable & (cause[measurable] == "")]] = "bad pixels"
@@ -144,7 +142,7 @@ def _room(camera: Camera, area_px: float) -> int:
 
 
 def _guess(
-    residual: NDArray[np.float32],
+    image_e: NDArray[np.float32],
     detections: Detections,
     dead: NDArray[np.bool_],
     xy_px: Array,
@@ -163,7 +161,8 @@ def _guess(
         sources = Sources(
             xy_px=xy_px[bright], flux_e=expected_e[bright], fraction_sigma=fraction[bright], visible=alone
         )
-        light = measure(residual, detections.noise_e, dead, sources, detections.psf_sigma_px)
+        maps = detections.background_e, detections.noise_e
+        light = measure(image_e, *maps, dead, sources, detections.psf_sigma_px)
         llr, _ = _ratios(light, expected_e[bright], fraction[bright])
         shining[bright] = 1.0 / (1.0 + np.exp(-llr))
     return shining

@@ -1,0 +1,185 @@
+"""The compiled loops of the forced photometry: one pass over the stars, each with the neighbours within reach."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+OUTLIER_SIGMA = 5.0
+MODEL_ERROR = 0.05  # of a star's light, pixel by pixel: the real PSF is not quite the Gaussian
+MAX_MASKED_PX = 6  # a stamp with more deviant pixels is not a star on a smooth background
+REORDERED_SUMS = {"reassoc", "contract", "nsz"}  # lets the compiler sum several pixels at a time
+
+
+@njit(cache=True, nogil=True)
+def measure_sources(
+    image, background, noise, dead, xy_px, flux_e, fraction_sigma, visible, first, columns,
+    reach_px, side_px, radius, profiles, measured, usable,
+) -> None:  # fmt: skip
+    """Fill `measured` (n, 4) and `usable` (n,) for sources (n) ordered by cells, their stamps inside the frame.
+
+    The columns are flux, variance, own shot noise and neighbours' variance, as `Photometry` explains them. `profiles`
+    (steps + 1, 2 k + 1) are pixel profiles at offsets from -1/2 to 1/2. Neighbours lie within `reach_px`, at most
+    `side_px`, the side of the cells; `first` is each cell's first source.
+    """
+    n = len(xy_px)
+    k = profiles.shape[1] // 2
+    side = 2 * radius + 1
+    across, down, centre = _profiles(xy_px, profiles)
+    size = side * side
+    profile, light, data = np.empty(size), np.empty(size), np.empty(size)
+    variance, weight = np.empty(size), np.empty(size)
+    near = np.empty(n, np.int64)
+    for i in range(n):
+        count = _find_neighbours(near, i, xy_px, visible, first, columns, side_px, reach_px)
+        left, top = centre[i, 0] - radius, centre[i, 1] - radius
+        light[:] = 0.0
+        for m in range(count):
+            j = near[m]
+            x, y = k + left - centre[j, 0], k + top - centre[j, 1]
+            _add_light(light, side, flux_e[j] * visible[j], across[j], down[j], x, y)
+        for r in range(side):
+            y = top + r
+            for c in range(side):
+                x, p = left + c, r * side + c
+                profile[p] = down[i, k - radius + r] * across[i, k - radius + c]
+                data[p] = image[y, x] - background[y, x] - light[p]
+                variance[p] = noise[y, x] * noise[y, x]
+                weight[p] = 0.0 if dead[y, x] else 1.0 / variance[p]
+        flux, middle, strength, masked = _fit_masking(profile, light, data, variance, weight)
+        usable[i] = masked <= MAX_MASKED_PX and _seen(profile, weight) > 0.5
+        measured[i, 0], measured[i, 1], measured[i, 2], measured[i, 3] = 0.0, 1.0, 0.0, 0.0
+        if not usable[i]:
+            continue
+        measured[i, 0] = flux
+        measured[i, 1], measured[i, 2] = _variances(profile, light, variance, weight, middle, strength)
+        for m in range(count):
+            j = near[m]
+            x, y = k + left - centre[j, 0], k + top - centre[j, 1]
+            leak = flux_e[j] * _leak(weight, side, across[j], down[j], x, y)
+            measured[i, 3] += leak**2 * (visible[j] * (1.0 - visible[j]) + visible[j] * fraction_sigma[j] ** 2)
+
+
+@njit(cache=True, nogil=True)
+def _find_neighbours(near, i, xy_px, visible, first, columns, side_px, reach_px) -> int:
+    """Write into `near` the sources within reach of source i that may shine; returns how many there are."""
+    rows = (len(first) - 1) // columns
+    column, row = int(xy_px[i, 0] / side_px), int(xy_px[i, 1] / side_px)
+    count = 0
+    for cell_row in range(max(row - 1, 0), min(row + 2, rows)):
+        start = first[cell_row * columns + max(column - 1, 0)]
+        stop = first[cell_row * columns + min(column + 1, columns - 1) + 1]
+        for j in range(start, stop):
+            dx, dy = xy_px[j, 0] - xy_px[i, 0], xy_px[j, 1] - xy_px[i, 1]
+            if dx * dx + dy * dy <= reach_px * reach_px and visible[j] > 0.0 and j != i:
+                near[count] = j
+                count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _profiles(xy_px: Any, profiles: Any) -> Any:
+    """Profiles (n, 2 k + 1) of the sources in x and in y about their middle pixels, and these pixels (n, 2)."""
+    n, wide = len(xy_px), profiles.shape[1]
+    steps = profiles.shape[0] - 1
+    across, down = np.empty((n, wide), np.float32), np.empty((n, wide), np.float32)
+    centre = np.empty((n, 2), np.int64)
+    for i in range(n):
+        for axis in range(2):
+            pixel = np.rint(xy_px[i, axis])
+            centre[i, axis] = int(pixel)
+            step = (xy_px[i, axis] - pixel + 0.5) * steps
+            low = min(max(int(step), 0), steps - 1)
+            part = step - low
+            out = across[i] if axis == 0 else down[i]
+            before, after = profiles[low], profiles[low + 1]
+            for j in range(wide):
+                out[j] = (1.0 - part) * before[j] + part * after[j]
+    return across, down, centre
+
+
+@njit(cache=True, nogil=True)
+def _add_light(light, side, flux, across, down, x, y) -> None:
+    """Add to the stamp the part of a neighbour's light whose profiles start at -x, -y."""
+    wide = len(across)
+    c0, c1 = max(0, -x), min(side, wide - x)
+    for r in range(max(0, -y), min(side, wide - y)):
+        height = flux * down[r + y]
+        for c in range(c0, c1):
+            light[r * side + c] += height * across[c + x]
+
+
+@njit(cache=True, nogil=True)
+def _leak(weight, side, across, down, x, y) -> float:
+    """Part of a neighbour's light that the weights of the stamp take for the star's."""
+    wide = len(across)
+    c0, c1 = max(0, -x), min(side, wide - x)
+    total = 0.0
+    for r in range(max(0, -y), min(side, wide - y)):
+        inner = 0.0
+        for c in range(c0, c1):
+            inner += weight[r * side + c] * across[c + x]
+        total += inner * down[r + y]
+    return total
+
+
+@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
+def _fit_masking(profile, light, data, variance, weight):  # type: ignore[no-untyped-def]
+    """Flux, the profile's weighted mean, its strength about that, and how many deviant pixels got the weight 0."""
+    size = len(profile)
+    masked = 0
+    while True:
+        w, wp, wd, wpp, wpd = 0.0, 0.0, 0.0, 0.0, 0.0
+        for p in range(size):
+            v, q = weight[p], profile[p]
+            w += v
+            wp += v * q
+            wd += v * data[p]
+            wpp += v * q * q
+            wpd += v * q * data[p]
+        middle = wp / max(w, 1e-30)
+        strength = wpp - middle * wp
+        flux = (wpd - middle * wd) / strength if strength > 0.0 else 0.0
+        level = (wd - flux * wp) / max(w, 1e-30)
+        shine = max(flux, 0.0)
+        deviant = 0
+        for p in range(size):
+            stars = shine * profile[p] + light[p]
+            rest = data[p] - flux * profile[p] - level
+            allowed = variance[p] + stars + (MODEL_ERROR * stars) ** 2
+            deviant += 1 if weight[p] * rest * rest > weight[p] * allowed * OUTLIER_SIGMA**2 else 0
+        if deviant == 0 or masked > MAX_MASKED_PX:
+            return flux, middle, strength, masked
+        # The worst pixel first: a bright one drags the fit so far that its innocent neighbours look deviant too.
+        worst, worst_excess = 0, 0.0
+        for p in range(size):
+            stars = shine * profile[p] + light[p]
+            rest = data[p] - flux * profile[p] - level
+            excess = rest * rest / (variance[p] + stars + (MODEL_ERROR * stars) ** 2)
+            if weight[p] > 0.0 and excess > worst_excess:
+                worst, worst_excess = p, excess
+        weight[worst] = 0.0
+        masked += 1
+
+
+@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
+def _seen(profile, weight) -> float:
+    """Part of the star's light in pixels that have a weight."""
+    total = 0.0
+    for p in range(len(profile)):
+        total += profile[p] if weight[p] > 0.0 else 0.0
+    return total
+
+
+@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
+def _variances(profile, light, variance, weight, middle, strength):  # type: ignore[no-untyped-def]
+    """Variance of the flux without and per electron of its own light; the weights become those of flux = sum w data."""
+    total, own = 0.0, 0.0
+    for p in range(len(profile)):
+        weight[p] = weight[p] * (profile[p] - middle) / strength
+        squared = weight[p] * weight[p]
+        total += squared * (variance[p] + light[p])
+        own += squared * profile[p]
+    return total, own

@@ -6,6 +6,7 @@ One thread. The frame is located once beforehand, so that files are cached and k
 `startrack.locate` and sep (background, extraction at 2 sigma, windowed centroids) one after the other.
 """
 
+# ruff: noqa: E402 - the numbers of threads must be set before the libraries are imported
 from __future__ import annotations
 
 import os

@@ -60,10 +60,12 @@ def measure(
     reach_px = radius + 3.0 * sigma_px
     order, first, columns = _order_by_cell(sources.xy_px, image_e.shape, reach_px)
     table = pixel_profile_table(sigma_px, max(radius, int(np.ceil(PROFILE_SIGMAS * sigma_px)) + 1))
-    by_cell = (values[order] for values in (sources.xy_px, sources.flux_e, sources.fraction_sigma, sources.visible))
     measured, usable = np.empty((len(order), 4)), np.empty(len(order), dtype=np.bool_)
-    pictures = (_read_only(picture) for picture in (image_e, background_e, noise_e, dead))
-    measure_sources(*pictures, *by_cell, first, columns, reach_px, reach_px, radius, table, measured, usable)
+    measure_sources(
+        _read_only(image_e), _read_only(background_e), _read_only(noise_e), _read_only(dead), sources.xy_px[order],
+        sources.flux_e[order], sources.fraction_sigma[order], sources.visible[order], first, columns, reach_px,
+        reach_px, radius, table, measured, usable,
+    )  # fmt: skip
     columns_out, usable_out = np.empty((4, len(order))), np.empty_like(usable)
     columns_out[:, order], usable_out[order] = measured.T, usable
     flux_e, variance_e2, own_shot, neighbour_variance_e2 = columns_out

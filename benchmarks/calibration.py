@@ -20,9 +20,8 @@ import numpy as np
 from _results import table, write_section
 
 from startrack.calibration import calibrate, first_state, fit_lens, observations
-from startrack.calibration.solve import project_freely
 from startrack.camera import Camera, KannalaBrandt
-from startrack.camera.uncertainty import cap_grid, lens_jacobian, without_turn
+from startrack.camera.uncertainty import cap_grid, compensating_rotation, lens_jacobian
 from startrack.catalog import load_catalog
 from startrack.exposure import read_exposure
 from startrack.frames import R_from_quat_xyzw, R_from_rotvec, Site
@@ -158,10 +157,10 @@ def map_error(camera: Camera, rho: Law, centre_px: np.ndarray) -> tuple[float, f
     """RMS error [px] with the best rotation removed, its NEES, and the NEES's degrees of freedom."""
     grid = cap_grid(camera.calibrated_angle_rad, MAP_POINTS)
     turn = camera.jacobian_px_per_rad(grid).reshape(-1, 3)
-    error = (project_freely(camera, grid) - projected(rho, centre_px, grid)).reshape(-1)
+    error = (camera.project_unlimited(grid) - projected(rho, centre_px, grid)).reshape(-1)
     error = error - turn @ np.linalg.lstsq(turn, error, rcond=None)[0]
     order = camera.covariance_order
-    lens = lens_jacobian(camera, grid, order).reshape(-1, len(order)) + turn @ without_turn(camera, order)
+    lens = lens_jacobian(camera, grid, order).reshape(-1, len(order)) + turn @ compensating_rotation(camera, order)
     covariance = camera.covariance
     if camera.focal_px[0] == camera.focal_px[1]:  # square pixels: fx and fy are one unknown
         lens = np.concatenate([lens[:, :1] + lens[:, 1:2], lens[:, 2:]], axis=1)

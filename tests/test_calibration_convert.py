@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera, Decentring, KannalaBrandt, Pinhole
 from startrack.camera.convert import from_text, to_text
-from startrack.camera.convert.intrinsics import lost_px
+from startrack.camera.convert.intrinsics import decentring_rms_px
 from startrack.types import BadInput
 
 PROGRAMS = ("ros", "kalibr", "colmap", "opencv")
@@ -119,7 +119,7 @@ def test_colmap_thin_prism_fisheye_holds_a_decentred_lens():
 def test_formats_without_decentring_lose_what_is_stated(program):
     again = from_text(to_text(BENT, program), program, "again")
     assert not again.decentring
-    assert 0.05 < lost_px(BENT) < 1.0
+    assert 0.05 < decentring_rms_px(BENT) < 1.0
 
 
 @pytest.mark.parametrize("program", PROGRAMS)

@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from startrack.calibration import first_state, fit_lens, observations
-from startrack.calibration.solve import project_freely
 from startrack.camera import Camera, Decentring, KannalaBrandt, camera_from_dict, camera_to_dict
 from startrack.camera.parameters import with_update
 from startrack.camera.uncertainty import lens_jacobian
@@ -73,10 +72,10 @@ def fitted(law, frames, stars, sigma_px, seed, plain=False, **kind):
 def map_error_px(camera, law, **kind):
     """RMS over solid angle to the calibrated angle, the best rotation removed by trying rotations."""
     rays = even(np.degrees(camera.calibrated_angle_rad), 3000, np.random.default_rng(0))
-    miss = (project_freely(camera, rays) - pixels(LAWS[law], rays, **kind)).ravel()
+    miss = (camera.project_unlimited(rays) - pixels(LAWS[law], rays, **kind)).ravel()
     step = 1e-6
     turn = np.stack(
-        [(project_freely(camera, Rotation.from_rotvec(w).apply(rays)) - project_freely(camera, rays)).ravel() / step
+        [(camera.project_unlimited(Rotation.from_rotvec(w).apply(rays)) - camera.project_unlimited(rays)).ravel() / step
          for w in step * np.eye(3)], axis=1,
     )  # fmt: skip
     miss -= turn @ np.linalg.lstsq(turn, miss, rcond=None)[0]
@@ -125,7 +124,7 @@ def test_the_covariance_is_as_large_as_the_errors():
         order = camera.covariance_order
         turn = camera.jacobian_px_per_rad(rays).reshape(-1, 3)
         lens = lens_jacobian(camera, rays, order).reshape(-1, len(order))
-        miss = (project_freely(camera, rays) - pixels(LAWS["kannala_brandt"], rays)).ravel()
+        miss = (camera.project_unlimited(rays) - pixels(LAWS["kannala_brandt"], rays)).ravel()
         lens, miss = (v - turn @ np.linalg.lstsq(turn, v, rcond=None)[0] for v in (lens, miss))
         lens = np.concatenate([lens[:, :1] + lens[:, 1:2], lens[:, 2:]], axis=1)
         covariance = np.delete(np.delete(camera.covariance, 1, 0), 1, 1)
@@ -194,11 +193,11 @@ def test_derivatives_of_a_decentred_mirrored_lens():
     )  # fmt: skip
     rays, step = even(95, 200, np.random.default_rng(3)), 1e-6
     order = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "f")
-    numeric = [
-        (project_freely(with_update(camera, {n: step}), rays) - project_freely(with_update(camera, {n: -step}), rays))
-        / (2 * step)
-        for n in order
-    ]
+
+    def pixels_after(name: str, by: float) -> np.ndarray:
+        return with_update(camera, {name: by}).project_unlimited(rays)
+
+    numeric = [(pixels_after(name, step) - pixels_after(name, -step)) / (2 * step) for name in order]
     np.testing.assert_allclose(lens_jacobian(camera, rays, order), np.stack(numeric, axis=-1), atol=2e-6)
     turned = [
         (

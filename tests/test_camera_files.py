@@ -127,6 +127,12 @@ BAD = [
     ("covariance", 5), ("covariance.matrix", [[1.0]]), ("covariance.matrix", [[1.0, "x"], [0.0, 1.0]]),
     ("covariance.matrix", None), ("covariance.order", 3), ("covariance.order", ["fx"]),
     ("covariance.matrix", [[1.0, 0.0], [0.0, float("nan")]]), ("covariance.matrix", [[1.0], [0.0, 1.0]]),
+    ("size_px", [2**70, 800]), ("size_px", [65_000, 65_000]), ("focal_px", [1e308, 300.0]), ("centre_px", [2**70, 0.0]),
+    ("k", [1e308]), ("sensor.psf_sigma_px", 1e6), ("sensor.psf_sigma_px", 1e-300), ("sensor.zero_point_e_per_s", 1e308),
+    ("sensor.saturation_adu", 10**400), ("covariance.matrix", [[1e308, 0.0], [0.0, 1.0]]),
+    ("covariance.order", [1, 2]), ("covariance.order", [["fx"], ["k1"]]), ("covariance.order", ["fx", "fx"]),
+    ("covariance.order", ["fx", "x1"]), ("covariance.matrix", [[1.0, 0.5], [0.0, 1.0]]),
+    ("covariance.matrix", [[-1.0, 0.0], [0.0, 1.0]]), ("name", ""), ("name", "two\nlines"), ("name", "x" * 250),
     ("name", 7), ("focal_pix", [300.0, 300.0]), ("calibrated_angle", 90.0),
 ]  # fmt: skip
 
@@ -161,12 +167,19 @@ def test_a_missing_file_is_no_calibration(tmp_path: Path) -> None:
         load_camera("fisheye")
 
 
-@pytest.mark.parametrize("text", [b"size_px = [1, 2", b"\xff\xfe\x00", b"", b"a = 1\na = 2"])
+NOT_TOML = [
+    b"size_px = [1, 2", b"\xff\xfe\x00", b"", b"a = 1\na = 2", b"name = " + 2000 * b"[" + 2000 * b"]",
+    b"size_px = [" + 5000 * b"9" + b", 9]", b"#" * 2**21,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", NOT_TOML, ids=range(len(NOT_TOML)))
 def test_what_is_not_toml_is_bad_calibration(text: bytes, tmp_path: Path) -> None:
     (tmp_path / "bad.toml").write_bytes(text)
     with pytest.raises(BadInput) as caught:
         load_camera(tmp_path / "bad.toml")
     assert caught.value.reason == "bad_calibration"
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
 
 
 def test_vignetting_is_the_stated_polynomial_and_never_negative() -> None:

@@ -49,6 +49,15 @@ def test_header_alone(image):
     assert exposure.camera == str(image.parent / "header.toml")
 
 
+@pytest.mark.parametrize("key", ["camera", "terrain"])
+@pytest.mark.parametrize("value", ["", 5, ["a"], "x" * 2000, "two\nlines", {"a": "b"}])
+def test_a_sidecar_reference_that_is_no_name_is_refused_in_one_line(image, sidecar, key, value):
+    sidecar({key: value})
+    with pytest.raises(BadInput, match=key) as caught:
+        read_exposure(image)
+    assert caught.value.reason == "bad_image" and "\n" not in str(caught.value) and len(str(caught.value)) < 400
+
+
 def test_sidecar_goes_before_header_fact_by_fact(image, sidecar):
     sidecar({"time_utc": "2031-03-26T20:58:11.966208Z", "camera": "fisheye-2048"})
     exposure = read_exposure(image)

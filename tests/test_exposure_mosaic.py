@@ -79,7 +79,7 @@ def test_saturated_pixels_stay_saturated():
 
 @pytest.mark.parametrize("pattern", ["RGBW", "RBGG", "GGRB", "mono", 3])
 def test_other_patterns_are_refused_in_a_sidecar(colours, pattern):
-    with pytest.raises(BadInput, match=r"bayer_pattern is .* none of RGGB, BGGR, GRBG, GBRG"):
+    with pytest.raises(BadInput, match="bayer_pattern must be RGGB or BGGR or GRBG or GBRG"):
         read_exposure(with_sidecar(colours, bayer_pattern=pattern))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from startrack.calibration.calibrated_radius import reach_rad
 from startrack.calibration.cross_validation import folds, held_out_residual_px
-from startrack.calibration.lens_models import MOST_ORDERS, Candidate, Model, best_model, model_of
+from startrack.calibration.lens_models import Candidate, Model, best_model, extensions, model_of
 from startrack.calibration.observations import Observations
 from startrack.calibration.solve import Solution, State, mean_scatter_px2, scatter_px2, solve
 from startrack.camera import Camera
@@ -71,7 +71,7 @@ def fit_state(state: State, points: Observations, *, order: int | None = None, p
         if len(good) < FEWEST:
             raise NotIdentified(f"only {len(good)} of {len(points)} matched stars agree on a lens", matched=len(good))
         model, best, candidates = best_model(robust.state, good, max(extra, SMALLEST_PX2), order, plain)
-        if model_of(best.state.camera, None) == model_of(state.camera, None):
+        if extensions(best.state.camera) == extensions(state.camera):
             break
         state = best.state  # the clip was that of a poorer model: once more with the better one
     return _finished(model, best, points, used, candidates)
@@ -80,10 +80,8 @@ def fit_state(state: State, points: Observations, *, order: int | None = None, p
 def _robust(state: State, points: Observations, order: int | None) -> tuple[Solution, float]:
     """Solution with Cauchy's loss, and the variance per axis that the centroids have beyond the stated one."""
     extra = FIRST_SIGMA_PX**2
-    most = MOST_ORDERS if order is None else order
     for k in range(ROBUST_ROUNDS):
-        kind = None if state.camera.lens.model == "pinhole" else min(most, 1 + k)
-        free = model_of(state.camera, kind).free
+        free = model_of(state.camera, 1 + k if order is None else min(order, 1 + k)).free
         solution = solve(state, points, free, max(extra, SMALLEST_PX2), robust=True)
         state = solution.state
         extra = scatter_px2(solution.residual_px, points.covariance_px2, _count(solution))

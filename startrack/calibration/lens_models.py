@@ -1,4 +1,4 @@
-"""Which lens model the data bear: every one is judged by stars that its fit did not see."""
+"""Choice of the lens model: every candidate is judged by stars that its fit did not use (cross-validation)."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ import numpy as np
 from startrack.calibration.cross_validation import folds, held_out_residual_px
 from startrack.calibration.observations import Observations
 from startrack.calibration.solve import Solution, State, solve
-from startrack.camera import Camera, Decentring, KannalaBrandt, Pinhole
+from startrack.camera import Camera, Decentring, Lens
+from startrack.camera.lenses import default_lens, lens_kinds
 from startrack.types import Ints
 
-MOST_ORDERS = 4
-PINHOLE_LIMIT_RAD = np.radians(65.0)  # the tangent is no lens beyond
 NEARLY_AS_GOOD_CHI2 = 4.0  # a longer polynomial this little worse is taken: its covariance owns up to the rim
 RISES_BEYOND = 1.1  # of the outermost star: a polynomial that turns back sooner is a bad one
 NARROW_RAD = np.radians(30.0)
@@ -22,32 +21,29 @@ EXTRA_CHI2 = 15.0  # by which the held-out chi^2 must fall before a lens is call
 
 @dataclass(frozen=True, kw_only=True)
 class Model:
-    """What is free in a lens."""
+    """What is free in a camera: the kind of lens, how many of its parameters, and two extensions."""
 
-    order: int | None  # number of k; None: pinhole
-    aspect: bool = False  # fx and fy apart
+    lens: type[Lens]
+    size: int  # number of free parameters of the lens
+    aspect: bool = False  # fx and fy separate
     decentred: bool = False
 
     @property
     def free(self) -> tuple[str, ...]:
         """Names of the free parameters."""
         focal = ("fx", "fy") if self.aspect else ("f",)
-        bent = ("p1", "p2") if self.decentred else ()
-        return (*focal, "cx", "cy", *(f"k{n + 1}" for n in range(self.order or 0)), *bent)
+        decentring = ("p1", "p2") if self.decentred else ()
+        return (*focal, "cx", "cy", *self.lens.parameter_names[: self.size], *decentring)
 
     @property
     def text(self) -> str:
-        """For people."""
-        lens = "pinhole" if self.order is None else f"Kannala-Brandt with {self.order} k"
-        return lens + (", fx and fy apart" if self.aspect else "") + (", decentred" if self.decentred else "")
+        """Name in reports."""
+        extensions = (", fx and fy apart" if self.aspect else "") + (", decentred" if self.decentred else "")
+        return self.lens.fit_text(self.size) + extensions
 
     def begin(self, state: State) -> State:
         """A state of this model, from one of another."""
-        camera = state.camera
-        if self.order is None:
-            camera = replace(camera, lens=Pinhole())
-        else:
-            camera = replace(camera, lens=KannalaBrandt((*camera.lens.k, *(MOST_ORDERS * (0.0,)))[: self.order]))
+        camera = replace(state.camera, lens=self.lens.fit_start(state.camera.lens, self.size))
         if not self.aspect:
             focal = float(np.sqrt(np.prod(camera.focal_px)))
             camera = replace(camera, focal_px=(focal, focal))
@@ -56,10 +52,22 @@ class Model:
         return replace(state, camera=camera)
 
 
-def model_of(camera: Camera, order: int | None) -> Model:
-    """The model that a camera is of, with another number of k."""
-    aspect = camera.focal_px[0] != camera.focal_px[1]
-    return Model(order=order, aspect=aspect, decentred=bool(camera.decentring))
+def model_of(camera: Camera, size: int) -> Model:
+    """The model of a camera, with at most `size` free parameters of its lens."""
+    kind = type(camera.lens)
+    aspect, decentred = extensions(camera)
+    return Model(lens=kind, size=kind.fit_size(size), aspect=aspect, decentred=decentred)
+
+
+def extensions(camera: Camera) -> tuple[bool, bool]:
+    """Whether fx and fy of a camera differ, and whether it is decentred."""
+    return camera.focal_px[0] != camera.focal_px[1], bool(camera.decentring)
+
+
+def candidate_models(outermost_rad: float) -> list[Model]:
+    """Models for stars up to this angle off the axis: lenses of fixed shape first, then by number of parameters."""
+    lenses = sorted(lens_kinds().values(), key=lambda lens: len(lens.fit_sizes()))
+    return [Model(lens=lens, size=n) for lens in lenses if outermost_rad < lens.max_fit_rad for n in lens.fit_sizes()]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +96,8 @@ def best_model(
 ) -> tuple[Model, Solution, tuple[Candidate, ...]]:
     """The model that predicts held-out stars best, fitted, and all that were tried.
 
-    `order`: the number of k, where it is decided already; `plain`: square pixels and a centred lens, likewise.
+    `order`: number of free parameters of the default lens if that is decided; None: all lenses are tried. `plain`:
+    square pixels and a centred lens.
     """
     rays = state.rays_cam(points)
     off_axis = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
@@ -97,9 +106,10 @@ def best_model(
     def attempt(model: Model, start: State) -> _Tried:
         return _try(model, model.begin(start), points, extra_px2, fold)
 
-    models = [Model(order=k) for k in range(MOST_ORDERS + 1)] if order is None else [Model(order=order)]
-    if order is None and off_axis.max() < PINHOLE_LIMIT_RAD:
-        models.insert(0, Model(order=None))
+    if order is None:
+        models = candidate_models(float(off_axis.max()))
+    else:
+        models = [Model(lens=default_lens(), size=default_lens().fit_size(order))]
     tried = [attempt(model, state) for model in models]
     chosen = _longest_of_the_best(tried, float(off_axis.max()))
     for _ in range(0 if plain else 2):

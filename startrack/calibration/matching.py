@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from startrack.calibration.frame import Frame
-from startrack.calibration.solve import project_freely
 from startrack.camera import Camera
 from startrack.types import Array, Bools, Ints
 
@@ -106,7 +105,7 @@ def _predicted(
     near = np.flatnonzero(rays_icrs @ R_cam_icrs[2] > np.cos(reach))
     rays = rays_icrs[near] @ R_cam_icrs.T
     px, angle = np.zeros((len(rays_icrs), 2)), np.zeros(len(rays_icrs))
-    px[near] = project_freely(camera, rays)
+    px[near] = camera.project_unlimited(rays)
     angle[near] = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
     width, height = frame.size_px
     inside = np.all((px[near] > -0.5) & (px[near] < np.array([width, height]) - 0.5), axis=1)

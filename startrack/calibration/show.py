@@ -54,7 +54,7 @@ def camera_text(camera: Camera) -> str:
         f"{camera.name}: {camera.lens.model}, {camera.size_px[0]} x {camera.size_px[1]} px"
         + (", mirrored" if camera.mirrored else ""),
         f"  focal length {fx:.3f}, {fy:.3f} px/rad; centre {cx:.3f}, {cy:.3f} px"
-        + "".join(f"; k{n + 1} {k:.6g}" for n, k in enumerate(camera.lens.k))
+        + "".join(f"; {name} {value:.6g}" for name, value in camera.lens.parameters.items())
         + (f"; decentring {camera.decentring.p1:.3g}, {camera.decentring.p2:.3g}" if camera.decentring else ""),
         f"  image circle to {np.degrees(camera.max_angle_rad):.2f}°, calibrated to "
         f"{np.degrees(camera.calibrated_angle_rad):.2f}°; "

@@ -36,7 +36,7 @@ class State:
     def residual_px(self, points: Observations, rays_cam: Array | None = None) -> Array:
         """Measured minus predicted (n, 2), also outside the frame and the calibrated angle."""
         rays_cam = self.rays_cam(points) if rays_cam is None else rays_cam
-        return points.xy_px - project_freely(self.camera, rays_cam)
+        return points.xy_px - self.camera.project_unlimited(rays_cam)
 
     def terms(self, points: Observations, rays_cam: Array, free: tuple[str, ...]) -> Terms:
         """Derivatives of the observations' pixels by the free parameters and the attitudes."""
@@ -48,19 +48,6 @@ class State:
         return replace(
             self, camera=with_update(self.camera, dict(zip(free, lens.tolist(), strict=True))), R_cam_icrs=turned
         )
-
-
-def project_freely(camera: Camera, rays_cam: Array) -> Array:
-    """Pixels (n, 2) of rays (n, 3) by the lens's formula alone, wherever they fall."""
-    off_axis = np.hypot(rays_cam[:, 0], rays_cam[:, 1])
-    rho = camera.lens.rho(np.arctan2(off_axis, rays_cam[:, 2]))
-    per_off_axis = 1.0 / np.where(off_axis > 0, off_axis, 1.0)
-    uv = (rho * per_off_axis)[:, None] * rays_cam[:, :2]
-    if camera.decentring:
-        angle = np.arctan2(off_axis, rays_cam[:, 2])
-        uv = uv + camera.decentring.shift((angle * per_off_axis)[:, None] * rays_cam[:, :2])
-    fx, fy = camera.focal_px
-    return np.asarray(camera.centre_px) + np.array([-fx if camera.mirrored else fx, fy]) * uv
 
 
 @dataclass(frozen=True, kw_only=True)

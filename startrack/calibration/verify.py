@@ -10,9 +10,8 @@ import numpy as np
 from startrack.calibration.frame import frame_of
 from startrack.calibration.region_growing import grown, joint
 from startrack.calibration.run import by_camera
-from startrack.calibration.solve import project_freely
 from startrack.camera import Camera
-from startrack.camera.uncertainty import cap_grid, map_covariance_px2
+from startrack.camera.uncertainty import cap_grid, projection_covariance_px2
 from startrack.catalog import StarCatalog
 from startrack.frames import Site
 from startrack.types import Array, Exposure, NotIdentified
@@ -53,7 +52,7 @@ def verify(exposure: Exposure, camera: Camera, catalog: StarCatalog, site: Site 
     fit = joint((frame,), start, R[None]).fit
     grid = cap_grid(min(camera.calibrated_angle_rad, fit.camera.calibrated_angle_rad))
     moved = difference_px(camera, fit.camera, grid)
-    variance = map_covariance_px2(fit.camera, grid) + map_covariance_px2(camera, grid)
+    variance = projection_covariance_px2(fit.camera, grid) + projection_covariance_px2(camera, grid)
     return Verification(
         image=exposure.name,
         camera=camera,
@@ -68,7 +67,7 @@ def verify(exposure: Exposure, camera: Camera, catalog: StarCatalog, site: Site 
 
 def difference_px(one: Camera, other: Camera, rays_cam: Array) -> Array:
     """Pixels (n, 2) of `other` minus those of `one` at the rays (n, 3), the best rotation between them removed."""
-    moved = (project_freely(other, rays_cam) - project_freely(one, rays_cam)).reshape(-1)
+    moved = (other.project_unlimited(rays_cam) - one.project_unlimited(rays_cam)).reshape(-1)
     turn = one.jacobian_px_per_rad(rays_cam).reshape(-1, 3)
     rest = moved - turn @ np.linalg.lstsq(turn, moved, rcond=None)[0]
     return np.asarray(rest.reshape(-1, 2), dtype=np.float64)

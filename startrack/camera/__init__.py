@@ -1,9 +1,10 @@
-"""Cameras: one lens model per file, one camera around them, files to keep them in."""
+"""Cameras: a lens (one file each, listed in `lenses.py`), a camera around it, and camera files."""
 
-from startrack.camera.camera import Camera, Lens, Sensor
+from startrack.camera.camera import Camera, Sensor
 from startrack.camera.decentring import Decentring
 from startrack.camera.io import camera_from_dict, camera_to_dict, load_camera, save_camera
 from startrack.camera.kannala_brandt import KannalaBrandt
+from startrack.camera.lens import Lens
 from startrack.camera.pinhole import Pinhole
 
 __all__ = [

@@ -3,28 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 
 from startrack.camera.decentring import Decentring
 from startrack.camera.kannala_brandt import KannalaBrandt
+from startrack.camera.lens import Lens
 from startrack.types import Array, Bools
-
-
-class Lens(Protocol):
-    """Radial law of a lens: one file per lens model beside this one."""
-
-    @property
-    def model(self) -> str: ...
-    @property
-    def k(self) -> tuple[float, ...]: ...
-    @property
-    def max_invertible_rad(self) -> float: ...
-    def rho(self, angle_rad: Array) -> Array: ...
-    def slope(self, angle_rad: Array) -> Array: ...
-    def angle_rad(self, rho: Array) -> Array: ...
-
 
 # Body x (forward) = image top = -cam y, body y (left) = +cam x, body z (up) = +cam z: it looks at the zenith.
 ZENITH_MOUNT_R_BODY_CAM = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -32,7 +17,7 @@ ZENITH_MOUNT_R_BODY_CAM = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """What turns light into numbers."""
+    """Sensor and whole optics: from light to numbers."""
 
     zero_point_e_per_s: float  # electrons per second of a V = 0 star on the axis, whole PSF
     gain_e_per_adu: float = 1.0
@@ -44,18 +29,17 @@ class Sensor:
     vignetting: tuple[float, float] = (0.0, 0.0)
 
     def throughput(self, angle_rad: Array) -> Array:
-        """Relative throughput 1 + v1 a^2 + v2 a^4 at the angles off the axis [rad]."""
+        """Relative throughput max(1 + v1 a^2 + v2 a^4, 0) at the angles a off the axis [rad], any shape."""
         a2 = np.square(angle_rad)
         return np.maximum(1.0 + a2 * (self.vignetting[0] + a2 * self.vignetting[1]), 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """x_px = cx + fx rho(a) cos b, y_px = cy + fy rho(a) sin b, b = atan2(y_cam, x_cam); mirrored: x_px = cx - ...
+    """x_px = cx + fx rho(a) cos b, y_px = cy + fy rho(a) sin b, b = atan2(y_cam, x_cam); mirrored: x_px = cx - fx ...
 
-    A decentred lens adds its shift to rho (cos b, sin b).
-
-    Pixel (0, 0) is the centre of the top-left pixel. Works on rays throughout: z_cam <= 0 (past 90 degrees) is legal.
+    A decentred lens adds its shift to rho (cos b, sin b). Pixel (0, 0) is the centre of the top-left pixel. Rays past
+    90 degrees (z_cam <= 0) are legal.
     """
 
     name: str
@@ -73,28 +57,35 @@ class Camera:
     covariance: Array | None = None
 
     @property
-    def _handed_focal_px(self) -> tuple[float, float]:
+    def handed_focal_px(self) -> tuple[float, float]:
+        """(fx, fy), fx negative if the image is mirrored."""
         return (-self.focal_px[0] if self.mirrored else self.focal_px[0]), self.focal_px[1]
 
     def project(self, rays_cam: Array) -> tuple[Array, Bools]:
-        """Pixels (..., 2) of the rays (..., 3), and which of them (...) fall inside the image circle and the frame."""
+        """Pixels (..., 2) of the rays (..., 3), and which of them (...) are inside the image circle and the frame."""
         rays_cam = np.asarray(rays_cam, dtype=np.float64)
-        x, y, z = rays_cam[..., 0], rays_cam[..., 1], rays_cam[..., 2]
-        off_axis = np.hypot(x, y)
-        angle = np.arctan2(off_axis, z)
+        angle = np.arctan2(np.hypot(rays_cam[..., 0], rays_cam[..., 1]), rays_cam[..., 2])
         imaged = angle <= min(self.max_angle_rad, self.lens.max_invertible_rad)
-        rho = self.lens.rho(np.where(imaged, angle, 0.0))
+        px = self._pixels(rays_cam, angle, self.lens.rho(np.where(imaged, angle, 0.0)))
+        within = np.all((px >= -0.5) & (px <= np.array(self.size_px) - 0.5), axis=-1)
+        return px, imaged & within
+
+    def project_unlimited(self, rays_cam: Array) -> Array:
+        """Pixels (..., 2) of the rays (..., 3) by the lens's formula alone, also beyond the image circle."""
+        rays_cam = np.asarray(rays_cam, dtype=np.float64)
+        angle = np.arctan2(np.hypot(rays_cam[..., 0], rays_cam[..., 1]), rays_cam[..., 2])
+        return self._pixels(rays_cam, angle, self.lens.rho(angle))
+
+    def _pixels(self, rays_cam: Array, angle_rad: Array, rho: Array) -> Array:
+        off_axis = np.hypot(rays_cam[..., 0], rays_cam[..., 1])
         per_off_axis = 1.0 / np.where(off_axis > 0, off_axis, 1.0)
         scale = rho * per_off_axis
-        u, v = scale * x, scale * y
+        u, v = scale * rays_cam[..., 0], scale * rays_cam[..., 1]
         if self.decentring:
-            shift = self.decentring.shift((angle * per_off_axis)[..., None] * rays_cam[..., :2])
+            shift = self.decentring.shift((angle_rad * per_off_axis)[..., None] * rays_cam[..., :2])
             u, v = u + shift[..., 0], v + shift[..., 1]
-        fx, fy = self._handed_focal_px
-        px = np.stack([self.centre_px[0] + fx * u, self.centre_px[1] + fy * v], axis=-1)
-        width, height = self.size_px
-        within = np.all((px >= -0.5) & (px <= np.array([width, height]) - 0.5), axis=-1)
-        return px, imaged & within
+        fx, fy = self.handed_focal_px
+        return np.stack([self.centre_px[0] + fx * u, self.centre_px[1] + fy * v], axis=-1)
 
     def unproject(self, px: Array) -> Array:
         """Unit rays_cam (..., 3) of the pixels (..., 2): the exact inverse of `project`."""
@@ -109,12 +100,12 @@ class Camera:
         return self.lens.angle_rad(np.hypot(*self._radial(px)))
 
     def _radial(self, px: Array) -> tuple[Array, Array]:
-        """rho (cos b, sin b) of the pixels (..., 2): decentring removed."""
+        """u, v = rho (cos b, sin b) of the pixels (..., 2), decentring removed."""
         px = np.asarray(px, dtype=np.float64)
-        fx, fy = self._handed_focal_px
+        fx, fy = self.handed_focal_px
         u, v = (px[..., 0] - self.centre_px[0]) / fx, (px[..., 1] - self.centre_px[1]) / fy
         if self.decentring:
-            uv = self.decentring.removed(np.stack([u, v], axis=-1), self.lens.angle_rad)
+            uv = self.decentring.remove(np.stack([u, v], axis=-1), self.lens.angle_rad)
             u, v = uv[..., 0], uv[..., 1]
         return u, v
 
@@ -144,11 +135,11 @@ class Camera:
         if self.decentring:
             by_ray = by_ray + self._decentred_by_ray(x, y, z, s, angle, ux, uy)
         zero = np.zeros_like(x)
-        turned = np.stack(
+        by_rotation = np.stack(
             [np.stack([zero, z, -y], axis=-1), np.stack([-z, zero, x], axis=-1), np.stack([y, -x, zero], axis=-1)],
             axis=-2,
         )
-        return (by_ray @ turned) * np.array(self._handed_focal_px)[:, None]
+        return (by_ray @ by_rotation) * np.array(self.handed_focal_px)[:, None]
 
     def _decentred_by_ray(self, x: Array, y: Array, z: Array, s: Array, angle: Array, ux: Array, uy: Array) -> Array:
         """d shift / d ray (..., 2, 3): d(s, t) = u da + (a / sin a) v (v . d(x, y)), as for rho."""
@@ -163,23 +154,23 @@ class Camera:
         return self.decentring.gradient(np.stack([angle * ux, angle * uy], axis=-1)) @ by_angle
 
     def pixel_solid_angle_sr(self, angle_rad: Array) -> Array:
-        """Solid angle [sr] of one pixel at the angles off the axis [rad]: sin a / (rho rho' fx fy).
+        """Solid angle [sr] of one pixel at the angles a off the axis [rad], any shape: sin a / (rho rho' fx fy).
 
-        Decentring, a part in a thousand, is left out.
+        Decentring (a part in a thousand) is neglected.
         """
         a = np.maximum(np.asarray(angle_rad, dtype=np.float64), 1e-9)
         return np.sin(a) / (self.lens.rho(a) * self.lens.slope(a) * self.focal_px[0] * self.focal_px[1])
 
     def mean_scale_rad_per_px(self, angle_rad: Array) -> Array:
-        """Geometric-mean angular size [rad] of one pixel at the angles off the axis [rad]."""
+        """Geometric-mean angular size [rad] of one pixel at the angles off the axis [rad], any shape."""
         return np.sqrt(self.pixel_solid_angle_sr(angle_rad))
 
     def projection_sigma_px(self, rays_cam: Array) -> Array:
-        """Error per axis [px] (...) of the map at the rays (..., 3), from the covariance; 0 where there is none.
+        """Sigma per axis [px] (...) of the projection of the rays (..., 3), from the covariance; 0 without one.
 
-        The part that a rotation of the camera would undo is left out: the attitude, found with this map, takes it up.
-        Beyond the calibrated angle it only says what the polynomial's own uncertainty would be.
+        The part that a rotation of the camera compensates is removed: the attitude, found with this camera, absorbs
+        it. Beyond the calibrated angle it is the uncertainty of the fitted law, not of the real lens.
         """
-        from startrack.camera.uncertainty import map_covariance_px2
+        from startrack.camera.uncertainty import projection_covariance_px2
 
-        return np.sqrt(np.trace(map_covariance_px2(self, rays_cam), axis1=-2, axis2=-1) / 2.0)
+        return np.sqrt(np.trace(projection_covariance_px2(self, rays_cam), axis1=-2, axis2=-1) / 2.0)

@@ -1,4 +1,4 @@
-"""Decentring: what a lens whose elements are not on one axis adds to the radial law."""
+"""Decentring: shift of the image points if the elements of a lens are not on one axis."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from startrack.types import Array
 
-ROUNDS = 30
-ROUNDING_1 = 1e-14
+MAX_INVERSION_STEPS = 30
+INVERSION_TOLERANCE_1 = 1e-14  # in focal lengths
 
 
 @dataclass(frozen=True)
@@ -50,16 +50,18 @@ class Decentring:
             axis=-2,
         )
 
-    def removed(self, uv: Array, angle_rad: Callable[[Array], Array]) -> Array:
-        """(u, v) (..., 2) without decentring of image points with it; `angle_rad` inverts the radial law."""
+    def remove(self, uv: Array, angle_rad: Callable[[Array], Array]) -> Array:
+        """Points (u, v) (..., 2) without the shift, from points with it [focal lengths], by fixed-point steps.
+
+        `angle_rad` inverts the radial law.
+        """
         if not self:
             return uv
-        plain = uv
-        for _ in range(ROUNDS):
-            rho = np.hypot(plain[..., 0], plain[..., 1])
-            angle = angle_rad(rho)
-            st = plain * (angle / np.where(rho > 0, rho, 1.0))[..., None]
-            before, plain = plain, uv - self.shift(st)
-            if np.max(np.abs(plain - before), initial=0.0) < ROUNDING_1:
+        centred = uv
+        for _ in range(MAX_INVERSION_STEPS):
+            rho = np.hypot(centred[..., 0], centred[..., 1])
+            st = centred * (angle_rad(rho) / np.where(rho > 0, rho, 1.0))[..., None]
+            before, centred = centred, uv - self.shift(st)
+            if np.max(np.abs(centred - before), initial=0.0) < INVERSION_TOLERANCE_1:
                 break
-        return plain
+        return centred

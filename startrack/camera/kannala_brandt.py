@@ -2,76 +2,114 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from startrack.camera.lens import Lens, WcsProjection
+from startrack.declaration import Key, List, Number
 from startrack.types import Array
 
-MOST_STEPS = 60  # near the turning point Newton's steps only halve the error
-ROUNDING_RAD = 1e-15
-TURNING_SEARCH_RAD = np.pi
+MAX_COEFFICIENTS = 4
 
 
 @dataclass(frozen=True)
-class KannalaBrandt:
+class KannalaBrandt(Lens):
     """rho = a + k1 a^3 + k2 a^5 + k3 a^7 + k4 a^9, a = angle off the axis [rad], rho in units of the focal length.
 
-    Without coefficients this is the pure equidistant lens. Valid past 90 degrees, up to the polynomial's first turning
-    point. Source: Kannala & Brandt 2006, IEEE TPAMI 28, 1335, eq. 6 (with k of the linear term absorbed by the focal
-    length).
+    Without coefficients this is the equidistant lens. Valid past 90 degrees, up to the polynomial's first maximum.
+    Source: Kannala & Brandt 2006, IEEE TPAMI 28, 1335, eq. 6 (with k of the linear term absorbed by the focal length).
     """
 
+    model: ClassVar[str] = "kannala_brandt"
+    label: ClassVar[str] = "Kannala-Brandt"
+    parameter_names: ClassVar[tuple[str, ...]] = tuple(f"k{n + 1}" for n in range(MAX_COEFFICIENTS))
+
     k: tuple[float, ...] = ()
-    model: str = field(default="kannala_brandt", init=False)
 
     def rho(self, angle_rad: Array) -> Array:
         """Radius [focal lengths] at the angles off the axis [rad], any shape."""
         a2 = np.square(angle_rad)
-        poly = np.zeros_like(a2)
+        polynomial = np.zeros_like(a2)
         for k in reversed(self.k):
-            poly = (poly + k) * a2
-        return angle_rad * (1.0 + poly)
+            polynomial = (polynomial + k) * a2
+        return angle_rad * (1.0 + polynomial)
 
     def slope(self, angle_rad: Array) -> Array:
         """d rho / d angle [1/rad]."""
         a2 = np.square(angle_rad)
-        poly = np.zeros_like(a2)
+        polynomial = np.zeros_like(a2)
         for n in range(len(self.k), 0, -1):
-            poly = (poly + (2 * n + 1) * self.k[n - 1]) * a2
-        return 1.0 + poly
+            polynomial = (polynomial + (2 * n + 1) * self.k[n - 1]) * a2
+        return 1.0 + polynomial
 
-    @cached_property
-    def max_invertible_rad(self) -> float:
-        """Angle at which the polynomial first turns back [rad]; pi where it never does."""
-        a = np.linspace(0.0, TURNING_SEARCH_RAD, 4001)
-        turned = np.flatnonzero(self.slope(a) <= 0)
-        return float(a[turned[0] - 1]) if len(turned) else TURNING_SEARCH_RAD
+    def derivative(self, name: str, angle_rad: Array) -> Array:
+        """d rho / d k_n = a^(2 n + 1), also for coefficients that are not in use."""
+        power = angle_rad
+        for _ in range(self.parameter_names.index(name) + 1):
+            power = power * np.square(angle_rad)
+        return power
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The coefficients in use, by name."""
+        return dict(zip(self.parameter_names, map(float, self.k), strict=False))
+
+    def with_update(self, step: Mapping[str, float]) -> KannalaBrandt:
+        """The lens with `step` added to its coefficients; those not in use begin at 0."""
+        named = [n + 1 for n, name in enumerate(self.parameter_names) if name in step]
+        k = np.zeros(max([len(self.k), *named]))
+        k[: len(self.k)] = self.k
+        for n in named:
+            k[n - 1] += step[f"k{n}"]
+        return KannalaBrandt(tuple(k.tolist()))
 
     def angle_rad(self, rho: Array) -> Array:
-        """Angle off the axis [rad] at the radii [focal lengths]: the exact inverse, by safeguarded Newton steps.
-
-        Radii beyond the turning point give the turning angle itself.
-        """
-        rho = np.asarray(rho, dtype=np.float64)
-        top = self.max_invertible_rad
+        """Angle off the axis [rad] at the radii [focal lengths], any shape."""
         if not any(self.k):
-            return np.minimum(rho, top)
-        low = np.zeros_like(rho)
-        high = np.full_like(rho, top)
-        a = np.clip(rho, 0.0, top)
-        for _ in range(MOST_STEPS):
-            miss = self.rho(a) - rho
-            low = np.where(miss < 0, a, low)
-            high = np.where(miss < 0, high, a)
-            slope = self.slope(a)
-            step = np.divide(miss, slope, out=np.full_like(miss, np.inf), where=slope > 0)
-            newton = a - step
-            # A step that leaves the bracket is replaced by bisection, so the polynomial's shape cannot mislead it.
-            moved = np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
-            settled = (np.abs(moved - a) <= ROUNDING_RAD) | (np.abs(miss) <= ROUNDING_RAD)
-            a = moved
-            if np.all(settled):
-                break
-        return a
+            return np.minimum(np.asarray(rho, dtype=np.float64), self.max_invertible_rad)
+        return super().angle_rad(rho)
+
+    @classmethod
+    def file_keys(cls) -> dict[str, Key]:
+        """The coefficients as one list."""
+        return {"k": List(each=Number(low=-1e3, high=1e3), most=MAX_COEFFICIENTS, description="k1 to k4")}
+
+    @classmethod
+    def from_file(cls, values: Mapping[str, Any]) -> Self:
+        """The lens of a camera file; without `k` the equidistant one."""
+        return cls(values.get("k", ()))
+
+    def file_values(self) -> dict[str, Any]:
+        """The coefficients as one list."""
+        return {"k": [float(k) for k in self.k]}
+
+    @classmethod
+    def fit_sizes(cls) -> tuple[int, ...]:
+        """None to all of the coefficients."""
+        return tuple(range(MAX_COEFFICIENTS + 1))
+
+    @classmethod
+    def fit_start(cls, lens: Lens, size: int) -> KannalaBrandt:
+        """The first `size` coefficients of `lens`, zeros where it has none."""
+        k = lens.k if isinstance(lens, KannalaBrandt) else ()
+        return cls((*k, *(MAX_COEFFICIENTS * (0.0,)))[:size])
+
+    @classmethod
+    def fit_text(cls, size: int) -> str:
+        """Name of the lens with `size` coefficients in reports."""
+        return f"{cls.label} with {size} k"
+
+    def wcs_projection(self, max_angle_rad: float) -> WcsProjection:
+        """Zenithal polynomial, or zenithal equidistant without coefficients: exact."""
+        if not any(self.k):
+            return WcsProjection("ARC")
+        cards = {f"PV2_{2 * n + 3}": float(k) for n, k in enumerate(self.k)}
+        return WcsProjection("ZPN", {"PV2_0": 0.0, "PV2_1": 1.0, **cards})
+
+    @property
+    def opencv_coefficients(self) -> tuple[str, tuple[float, ...]]:
+        """The coefficients of cv2.fisheye: k1 to k4."""
+        return "fisheye", (*self.k, *(MAX_COEFFICIENTS * (0.0,)))[:MAX_COEFFICIENTS]

@@ -25,7 +25,7 @@ def convert(args: argparse.Namespace, words: list[str]) -> int:
     """One camera file to another program's or from it; 0."""
     from startrack.camera import load_camera
     from startrack.camera.convert import from_text, to_text
-    from startrack.camera.convert.intrinsics import lost_px
+    from startrack.camera.convert.intrinsics import decentring_rms_px
     from startrack.camera.io import camera_text
     from startrack.files import write_atomically
 
@@ -35,7 +35,7 @@ def convert(args: argparse.Namespace, words: list[str]) -> int:
         camera = load_camera(words[0])
         text = to_text(camera, args.to)
         default = {"colmap": "cameras.txt", "kalibr": "camchain.yaml"}.get(args.to, f"{camera.name}.yaml")
-        lost = lost_px(camera) if camera.decentring and args.to != "colmap" else 0.0
+        lost = decentring_rms_px(camera) if camera.decentring and args.to != "colmap" else 0.0
         note = f"; {args.to} has no decentring: {lost:.2f} px RMS are lost" if lost else ""
     else:
         text = camera_text(from_text(_text(words[0]), args.source, args.name or Path(words[0]).stem))

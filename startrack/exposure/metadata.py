@@ -11,23 +11,32 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+from startrack.declaration import SHOWN_CHARS, Choice, Number, Table, Text, shown
 from startrack.files import is_path, printable
 from startrack.frames.time import as_utc, parse_utc
 from startrack.types import BadInput, Exposure
 
-# Names in a header (FITS keywords, PNG text chunks, TIFF description) and what each stands for. The sidecar's own names
-# are understood there too, except in FITS, where a card called CAMERA is common and names the hardware.
-HEADER_KEYS = {k: k for k in ("DATE-AVG", "DATE-OBS", "TIMESYS", "EXPTIME", "STCAMERA", "STTERRAI", "BAYERPAT")}
-SIDECAR_KEYS = {"time_utc": "DATE-AVG", "exposure_s": "EXPTIME", "camera": "STCAMERA", "terrain": "STTERRAI"}
-SIDECAR_KEYS |= {"bayer_pattern": "BAYERPAT"}
-HEADER_KEYS |= SIDECAR_KEYS
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+MAX_EXPOSURE_S = 1e6
+SIDECAR = Table(
+    description="NAME.json beside NAME.png. Paths are relative to the sidecar.",
+    keys={
+        "time_utc": Text(max_chars=100, description="middle of the exposure, ISO 8601, UTC"),
+        "exposure_s": Number(low=0, high=MAX_EXPOSURE_S, above=True),
+        "camera": Text(description="a camera file, or the name of a shipped one"),
+        "terrain": Text(description="a terrain file, or the name of a shipped one"),
+        "bayer_pattern": Choice(values=BAYER_PATTERNS, description="colours of the first 2 x 2 pixels of a mosaic"),
+    },
+)
+# Names in a header (FITS keywords, PNG text chunks, TIFF description) and the fact that each one gives. The names of
+# the sidecar's keys are valid there too, except in FITS, where a card called CAMERA is common and names the hardware.
+HEADER_KEYS = {k: k for k in ("DATE-AVG", "DATE-OBS", "TIMESYS", "EXPTIME", "STCAMERA", "STTERRAI", "BAYERPAT")}
+HEADER_KEYS |= dict(zip(SIDECAR.keys, ("DATE-AVG", "EXPTIME", "STCAMERA", "STTERRAI", "BAYERPAT"), strict=True))
 RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".crw", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"}
 PICTURE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".fits", ".fit", ".fts"} | RAW_SUFFIXES
 PACKING_SUFFIXES = {".gz", ".bz2", ".fz"}
-MAX_EXPOSURE_S = 1e6
 MAX_SIDECAR_BYTES = 2**20
-MOST_UNKNOWN_KEYS = 5  # that are warned of one by one
+MAX_UNKNOWN_KEY_WARNINGS = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +79,7 @@ def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts
     notes: list[str] = [*given.warnings, *_unknown_keys(sidecar, values)]
     exposure_s = given.exposure_s
     if exposure_s is None:
-        exposure_s = _sidecar_exposure_s(sidecar, values.get("exposure_s"))
+        exposure_s = _sidecar_value(sidecar, values, "exposure_s")
     if exposure_s is None:
         exposure_s = _header_exposure_s(header.get("EXPTIME"), notes)
     time_utc = given.time_utc
@@ -87,7 +96,7 @@ def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts
         terrain=given.terrain
         or _sidecar_reference(sidecar, values, "terrain")
         or _header_reference(image, header, "STTERRAI", notes),
-        bayer_pattern=_sidecar_pattern(sidecar, values.get("bayer_pattern")) or _header_pattern(header, notes),
+        bayer_pattern=_sidecar_value(sidecar, values, "bayer_pattern") or _header_pattern(header, notes),
         warnings=tuple(notes),
     )
 
@@ -150,10 +159,10 @@ def _read_sidecar(image: Path) -> tuple[Path, dict[str, Any]]:
 
 def _unknown_keys(sidecar: Path, values: Mapping[str, Any]) -> list[str]:
     """A warning for each key that stands for nothing: a misspelt one would else be missed in silence."""
-    unknown = [key for key in values if key not in SIDECAR_KEYS]
+    unknown = [key for key in values if key not in SIDECAR.keys]
     return [
-        f"sidecar {printable(sidecar.name)}: key {key[:40]!r} is none of {', '.join(SIDECAR_KEYS)}; not used"
-        for key in unknown[:MOST_UNKNOWN_KEYS]
+        f"sidecar {printable(sidecar.name)}: key {key[:SHOWN_CHARS]!r} is none of {', '.join(SIDECAR.keys)}; not used"
+        for key in unknown[:MAX_UNKNOWN_KEY_WARNINGS]
     ]
 
 
@@ -161,30 +170,31 @@ def _bad_sidecar(sidecar: Path, cause: str, reason: str = "bad_image") -> BadInp
     return BadInput(reason, " ".join(f"sidecar {printable(sidecar)}: {cause}".split()))
 
 
-def _sidecar_exposure_s(sidecar: Path, value: object) -> float | None:
+def _sidecar_value(sidecar: Path, values: Mapping[str, Any], key: str) -> Any:
+    """The checked value of a sidecar's key; None if the key is missing or null."""
+    value = values.get(key)
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= MAX_EXPOSURE_S:
-        raise _bad_sidecar(sidecar, f"exposure_s is {str(value)[:40]!r}, not a number of seconds above 0")
-    return float(value)
+    try:
+        return SIDECAR.keys[key].check(
+            value.strip().upper() if key == "bayer_pattern" and _is_pattern(value) else value, key
+        )
+    except ValueError as error:
+        raise _bad_sidecar(sidecar, str(error)) from error
 
 
 def _sidecar_time(sidecar: Path, value: object) -> datetime | None:
     if value is None:
         return None
     try:
-        return parse_utc(str(value))
+        return parse_utc(value if isinstance(value, str) else shown(value))
     except BadInput as error:
         raise _bad_sidecar(sidecar, f"time_utc: {str(error)[:200]}", error.reason) from error
 
 
 def _sidecar_reference(sidecar: Path, values: Mapping[str, Any], key: str) -> str | None:
-    value = values.get(key)
-    if value is None:
-        return None
-    if not isinstance(value, str) or not value.strip():
-        raise _bad_sidecar(sidecar, f"{key} is {str(value)[:40]!r}, not a file or the name of a shipped one")
-    return _from_folder(sidecar, value)
+    value = _sidecar_value(sidecar, values, key)
+    return None if value is None else _from_folder(sidecar, value)
 
 
 def _header_reference(image: Path, header: Mapping[str, Any], key: str, notes: list[str]) -> str | None:
@@ -195,19 +205,11 @@ def _header_reference(image: Path, header: Mapping[str, Any], key: str, notes: l
     return _from_folder(image, value) if value else None
 
 
-def _sidecar_pattern(sidecar: Path, value: object) -> str | None:
-    if value is None:
-        return None
-    if not _is_pattern(value):
-        raise _bad_sidecar(sidecar, f"bayer_pattern is {str(value)[:40]!r}, none of {', '.join(BAYER_PATTERNS)}")
-    return str(value).strip().upper()
-
-
 def _header_pattern(header: Mapping[str, Any], notes: list[str]) -> str | None:
     value = str(header.get("BAYERPAT") or "").strip().upper()
     if not value or _is_pattern(value):
         return value or None
-    notes.append(f"BAYERPAT {value[:40]!r} is none of {', '.join(BAYER_PATTERNS)}; not used")
+    notes.append(f"BAYERPAT {value[:SHOWN_CHARS]!r} is none of {', '.join(BAYER_PATTERNS)}; not used")
     return None
 
 
@@ -229,7 +231,7 @@ def _header_exposure_s(value: object, notes: list[str]) -> float | None:
         seconds = math.nan
     if 0 < seconds <= MAX_EXPOSURE_S:
         return seconds
-    notes.append(f"EXPTIME {str(value)[:40]!r} is not a number of seconds above 0; not used")
+    notes.append(f"EXPTIME {shown(value)} is not a number of seconds above 0; not used")
     return None
 
 

@@ -1,7 +1,7 @@
 """FITS world coordinates of an identified image, and the table of its matches, as other programs read them.
 
-Calabretta & Greisen 2002, A&A 395, 1077 (ARC, ZPN, TAN); Shupe et al. 2005, ASP Conf. 347, 491 (SIP). Every lens of the
-camera file is one of these exactly; only a decentred one needs the SIP polynomials.
+Calabretta & Greisen 2002, A&A 395, 1077 (ARC, ZPN, TAN); Shupe et al. 2005, ASP Conf. 347, 491 (SIP). The lens
+says which projection it is, or how well a polynomial fits it; a decentred one needs the SIP polynomials.
 """
 
 from __future__ import annotations
@@ -21,39 +21,46 @@ SIP_ORDER = 4
 GRID = 40  # points across the frame at which the field is sampled
 
 
-def wcs_bytes(value: Oriented) -> bytes:
+def wcs_bytes(value: Oriented) -> bytes | None:
     """The header NAME.wcs of a result with an attitude: no pixels, IMAGEW and IMAGEH give their number.
+
+    None if no FITS projection describes the lens.
 
     World coordinates are ICRS directions without aberration, so that catalogue positions at the image's epoch fall on
     their stars. Aberration bends a whole sky by up to 20 arcsec (0.06 px of a fisheye): the mean over the frame is
     taken out. FITS pixel (1, 1) is our (0, 0), the first pixel stored.
     """
-    return header_block(wcs_cards(value.camera, _R_cam_still(value), value))
+    cards = wcs_cards(value.camera, _R_cam_still(value), value)
+    return None if cards is None else header_block(cards)
 
 
-def wcs_cards(camera: Camera, R_cam_icrs: Array, value: Oriented | None = None) -> dict[str, Card]:
-    """The header's cards for a camera and its attitude."""
+def wcs_cards(camera: Camera, R_cam_icrs: Array, value: Oriented | None = None) -> dict[str, Card] | None:
+    """The header's cards for a camera and its attitude; None if no FITS projection describes the lens."""
+    projection = camera.lens.wcs_projection(camera.max_angle_rad)
+    if projection is None:
+        return None
     axis = R_cam_icrs[2]
     ra, dec = np.arctan2(axis[1], axis[0]), np.arctan2(axis[2], np.hypot(axis[0], axis[1]))
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
-    focal = np.array([-camera.focal_px[0] if camera.mirrored else camera.focal_px[0], camera.focal_px[1]])
+    focal = np.array(camera.handed_focal_px)
     cd = np.degrees(np.stack([east, north]) @ R_cam_icrs[:2].T / focal)  # from px to degrees east and north
-    projection = {"pinhole": "TAN"}.get(camera.lens.model, "ZPN" if any(camera.lens.k) else "ARC")
     sip = "-SIP" if camera.decentring else ""
     cards: dict[str, Card] = {"SIMPLE": True, "BITPIX": 8, "NAXIS": 0, "EXTEND": True}
-    cards |= {"WCSAXES": 2, "CTYPE1": f"RA---{projection}{sip}", "CTYPE2": f"DEC--{projection}{sip}"}
+    cards |= {"WCSAXES": 2, "CTYPE1": f"RA---{projection.code}{sip}", "CTYPE2": f"DEC--{projection.code}{sip}"}
     cards |= {"CUNIT1": "deg", "CUNIT2": "deg", "RADESYS": "ICRS", "LONPOLE": 180.0}
     cards |= {"CRVAL1": float(np.degrees(ra) % 360.0), "CRVAL2": float(np.degrees(dec))}
     cards |= {f"CRPIX{i + 1}": float(_axis_px(camera)[i]) + 1.0 for i in range(2)}
     cards |= {f"CD{i + 1}_{j + 1}": float(cd[i, j]) for i in range(2) for j in range(2)}
-    if projection == "ZPN":
-        cards |= {"PV2_0": 0.0, "PV2_1": 1.0} | {f"PV2_{2 * n + 3}": float(k) for n, k in enumerate(camera.lens.k)}
+    cards |= projection.cards
     cards |= {"IMAGEW": camera.size_px[0], "IMAGEH": camera.size_px[1]}
     if sip:
         cards |= _sip_cards(camera)
     if value is not None and value.exposure.time_utc is not None:
         cards["DATE-AVG"] = format_utc(value.exposure.time_utc).removesuffix("Z")
+    if projection.error_1:
+        error_px = projection.error_1 * max(camera.focal_px)
+        cards["COMMENT2"] = f"projection fitted to the lens: largest error {error_px:.2g} px"
     return cards | {"CREATOR": f"startrack {__version__}", "COMMENT1": "image rows in the order of the file"}
 
 

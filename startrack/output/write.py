@@ -96,11 +96,15 @@ def write_star_table(path: FilePath, value: Oriented) -> None:
 def write_wcs(path: FilePath, corr_path: FilePath, value: Oriented) -> None:
     """Write NAME.wcs, the FITS header of the image's world coordinates, and NAME.corr, its matches as a FITS table.
 
-    Raises BadInput where they cannot be written.
+    No NAME.wcs is left if no FITS projection describes the lens. Raises BadInput where they cannot be written.
     """
     from startrack.output.wcs import matches_bytes, wcs_bytes
 
-    write_atomically(path, wcs_bytes(value), overwrite=True)
+    header = wcs_bytes(value)
+    if header is None:
+        Path(path).unlink(missing_ok=True)
+    else:
+        write_atomically(path, header, overwrite=True)
     write_atomically(corr_path, matches_bytes(value), overwrite=True)
 
 

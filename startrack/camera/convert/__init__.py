@@ -1,6 +1,6 @@
 """Camera files of other programs, read and written in their own conventions.
 
-All of them share our axes (x right, y down, z along the boresight) and our radial polynomial; none of them knows
+All of them share our axes (x right, y down, z along the boresight) and our radial polynomial; none of them has
 mirrored images, image circles, calibrated angles, sensors or covariances.
 """
 
@@ -12,16 +12,16 @@ from startrack.camera import Camera
 from startrack.camera.convert import colmap, kalibr, opencv, ros
 
 WRITERS: dict[str, Callable[[Camera], str]] = {
-    "ros": ros.text,
-    "kalibr": kalibr.text,
-    "colmap": colmap.text,
-    "opencv": opencv.text,
+    "ros": ros.to_text,
+    "kalibr": kalibr.to_text,
+    "colmap": colmap.to_text,
+    "opencv": opencv.to_text,
 }
 READERS: dict[str, Callable[[str, str], Camera]] = {
-    "ros": ros.camera,
-    "kalibr": kalibr.camera,
-    "colmap": colmap.camera,
-    "opencv": opencv.camera,
+    "ros": ros.from_text,
+    "kalibr": kalibr.from_text,
+    "colmap": colmap.from_text,
+    "opencv": opencv.from_text,
 }
 
 

@@ -6,7 +6,7 @@ COLMAP's origin is the CORNER of the first pixel, whose centre is at (0.5, 0.5).
 from __future__ import annotations
 
 from startrack.camera import Camera, Decentring
-from startrack.camera.convert.intrinsics import Plain, camera_from, plain, unreadable
+from startrack.camera.convert.intrinsics import Intrinsics, camera_from_intrinsics, intrinsics_of, unreadable_file
 from startrack.types import BadInput
 
 CORNER_PX = 0.5
@@ -21,9 +21,9 @@ COUNTS = {
 }
 
 
-def text(camera: Camera) -> str:
+def to_text(camera: Camera) -> str:
     """The cameras.txt file, one camera: number 1."""
-    lens, bent = plain(camera), camera.decentring
+    lens, bent = intrinsics_of(camera), camera.decentring
     (fx, fy), (cx, cy) = lens.focal_px, lens.centre_px
     values = [fx, fy, cx + CORNER_PX, cy + CORNER_PX]
     model = "PINHOLE"
@@ -39,7 +39,7 @@ def text(camera: Camera) -> str:
     return f"{HEAD}# Number of cameras: 1\n1 {model} {lens.size_px[0]} {lens.size_px[1]} {numbers}\n"
 
 
-def camera(text: str, name: str) -> Camera:
+def from_text(text: str, name: str) -> Camera:
     """The first camera of a cameras.txt file. Raises BadInput bad_calibration."""
     try:
         lines = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
@@ -57,9 +57,9 @@ def camera(text: str, name: str) -> Camera:
                 raise ValueError("thin-prism coefficients other than 0 have no counterpart")
             rest, decentring = [k1, k2, k3, k4], Decentring(p1, p2)
         k = None if model.endswith("PINHOLE") else (*rest, *(4 * (0.0,)))[:4]
-        lens = Plain((int(width), int(height)), (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), k)
-        return camera_from(lens, name, decentring)
+        lens = Intrinsics((int(width), int(height)), (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), k)
+        return camera_from_intrinsics(lens, name, decentring)
     except BadInput:
         raise
     except (ValueError, IndexError) as cause:
-        raise unreadable("COLMAP", repr(cause)) from cause
+        raise unreadable_file("COLMAP", repr(cause)) from cause

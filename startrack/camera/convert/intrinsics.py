@@ -1,4 +1,4 @@
-"""The numbers that all formats share, and what none of them can hold."""
+"""The intrinsic parameters that ROS, Kalibr, COLMAP and OpenCV files share, and helpers to read and write them."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from startrack.camera import Camera, Decentring, KannalaBrandt, Pinhole
+from startrack.camera import Camera, Decentring, KannalaBrandt, Lens, Pinhole
 from startrack.camera.uncertainty import cap_grid
 from startrack.types import BadInput
 
-COEFFICIENTS = 4
+FISHEYE_COEFFICIENTS = 4
 
 
 @dataclass(frozen=True)
-class Plain:
-    """A lens by numbers: pixel (0, 0) is the centre of the first pixel; `k` is None for a pinhole."""
+class Intrinsics:
+    """A camera by numbers: pixel (0, 0) is the centre of the first pixel; `k` is None for a pinhole."""
 
     size_px: tuple[int, int]
     focal_px: tuple[float, float]
@@ -26,44 +26,53 @@ class Plain:
 
     @property
     def matrix(self) -> list[float]:
-        """K, row by row."""
+        """Camera matrix K (9,), row by row."""
         (fx, fy), (cx, cy) = self.focal_px, self.centre_px
         return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
 
 
-def plain(camera: Camera) -> Plain:
-    """The camera's numbers. Raises BadInput for a mirrored camera; of decentring see `centred`."""
+def intrinsics_of(camera: Camera) -> Intrinsics:
+    """The camera's numbers, its decentring left out (see `without_decentring`).
+
+    Raises BadInput bad_calibration for a mirrored camera and for a lens that these formats do not have.
+    """
     if camera.mirrored:
         raise BadInput(
             "bad_calibration",
-            "the camera is mirrored, which no other program's format can say: flip the images left to right and "
+            "the camera is mirrored, which no other program's format can express: flip the images left to right and "
             "calibrate those",
         )
-    k = None if camera.lens.model == "pinhole" else (*camera.lens.k, *(COEFFICIENTS * (0.0,)))[:COEFFICIENTS]
+    distortion = camera.lens.opencv_coefficients
+    if distortion is None:
+        raise BadInput("bad_calibration", f"no other program's format has the {camera.lens.model} lens")
+    model, coefficients = distortion
     fx, fy, cx, cy = (float(v) for v in (*camera.focal_px, *camera.centre_px))
-    return Plain(camera.size_px, (fx, fy), (cx, cy), k)
+    return Intrinsics(camera.size_px, (fx, fy), (cx, cy), None if model == "pinhole" else coefficients)
 
 
-def centred(camera: Camera) -> Camera:
+def without_decentring(camera: Camera) -> Camera:
     """The camera without its decentring, for formats that have none."""
     return replace(camera, decentring=Decentring())
 
 
-def lost_px(camera: Camera) -> float:
-    """RMS [px] over the calibrated cap by which `centred` differs, once the attitude has adapted."""
+def decentring_rms_px(camera: Camera) -> float:
+    """RMS difference [px] over the calibrated cap to `without_decentring`, the best rotation removed."""
     grid = cap_grid(camera.calibrated_angle_rad)
-    bare = centred(camera)
-    difference = (camera.project(grid)[0] - bare.project(grid)[0]).reshape(-1)
-    turn = bare.jacobian_px_per_rad(grid).reshape(-1, 3)
-    rest = difference - turn @ np.linalg.lstsq(turn, difference, rcond=None)[0]
+    centred = without_decentring(camera)
+    difference = (camera.project(grid)[0] - centred.project(grid)[0]).reshape(-1)
+    rotation = centred.jacobian_px_per_rad(grid).reshape(-1, 3)
+    rest = difference - rotation @ np.linalg.lstsq(rotation, difference, rcond=None)[0]
     return float(np.sqrt(np.mean(np.sum(rest.reshape(-1, 2) ** 2, axis=1))))
 
 
-def camera_from(numbers: Plain, name: str, decentring: Decentring | None = None) -> Camera:
-    """A camera of ours: its image circle ends at the frame's corner, or where the polynomial turns back."""
+def camera_from_intrinsics(numbers: Intrinsics, name: str, decentring: Decentring | None = None) -> Camera:
+    """A camera whose image circle ends at the frame's farthest corner, or where the radius stops rising.
+
+    Raises BadInput bad_calibration for numbers that are not finite and positive.
+    """
     if min(*numbers.focal_px, *numbers.size_px) <= 0 or not np.isfinite([*numbers.matrix, *(numbers.k or ())]).all():
         raise BadInput("bad_calibration", "image size and focal lengths must be positive, and all numbers finite")
-    lens: Any = Pinhole() if numbers.k is None else KannalaBrandt(numbers.k if any(numbers.k) else ())
+    lens: Lens = Pinhole() if numbers.k is None else KannalaBrandt(numbers.k if any(numbers.k) else ())
     camera = Camera(
         name=name,
         size_px=numbers.size_px,
@@ -80,19 +89,44 @@ def camera_from(numbers: Plain, name: str, decentring: Decentring | None = None)
     return replace(camera, max_angle_rad=edge, calibrated_angle_rad=edge)
 
 
-def unreadable(program: str, cause: object) -> BadInput:
-    """The refusal of a file that is not what it should be."""
+def unreadable_file(program: str, cause: object) -> BadInput:
+    """The exception for a file that is not a camera file of the program."""
     return BadInput("bad_calibration", f"not a {program} camera file that can be used: {cause}")
 
 
-def numbers(values: Any, count: int, what: str) -> list[float]:
-    """`count` numbers. Raises ValueError naming what is wrong."""
+def read_numbers(values: Any, count: int, key: str) -> list[float]:
+    """`count` numbers. Raises ValueError naming the key."""
     if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
-        raise ValueError(f"{what} must be {count} numbers")
+        raise ValueError(f"{key} must be {count} numbers")
     return [float(v) for v in values]
 
 
-def no_other_distortion(coefficients: list[float], model: str) -> None:
-    """Raise ValueError unless a pinhole's distortion is nil: ours has none."""
+def check_no_distortion(coefficients: list[float], model: str) -> None:
+    """Raise ValueError if a pinhole has distortion: ours has none."""
     if any(coefficients):
         raise ValueError(f"distortion {model} with coefficients other than 0 has no counterpart; fisheye models have")
+
+
+def read_yaml(text: str) -> dict[str, Any]:
+    """The mapping of a YAML file. Raises ValueError if there is none."""
+    import yaml
+
+    try:
+        value = yaml.safe_load(text)
+    except (yaml.YAMLError, RecursionError) as cause:
+        raise ValueError(str(cause)) from cause
+    if not isinstance(value, dict):
+        raise ValueError("no keys")
+    return value
+
+
+def yaml_list(values: list[float]) -> str:
+    """A list in one line of YAML, numbers to the last digit."""
+    return "[" + ", ".join(_yaml_number(v) for v in values) + "]"
+
+
+def _yaml_number(value: float) -> str:
+    """YAML needs a point in a number with an exponent."""
+    text = repr(float(value))
+    mantissa, exponent, power = text.partition("e")
+    return mantissa + (".0" if exponent and "." not in mantissa else "") + exponent + power

@@ -12,56 +12,57 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.camera.convert.intrinsics import (
-    COEFFICIENTS,
-    Plain,
-    camera_from,
-    centred,
-    no_other_distortion,
-    numbers,
-    plain,
-    unreadable,
+    FISHEYE_COEFFICIENTS,
+    Intrinsics,
+    camera_from_intrinsics,
+    check_no_distortion,
+    intrinsics_of,
+    read_numbers,
+    read_yaml,
+    unreadable_file,
+    without_decentring,
+    yaml_list,
 )
-from startrack.camera.convert.yaml_text import flow, parsed
 from startrack.types import BadInput
 
 
-def text(camera: Camera) -> str:
+def to_text(camera: Camera) -> str:
     """The camchain file, one camera: cam0."""
-    lens = plain(centred(camera))
+    lens = intrinsics_of(without_decentring(camera))
     model, coefficients = ("radtan", [0.0] * 4) if lens.k is None else ("equidistant", list(lens.k))
     R_cam_body = camera.R_body_cam.T
-    rows = "".join(f"  - {flow([*row, 0.0])}\n" for row in R_cam_body.tolist())
+    rows = "".join(f"  - {yaml_list([*row, 0.0])}\n" for row in R_cam_body.tolist())
     return (
-        f"cam0:\n  cam_overlaps: []\n  camera_model: pinhole\n  distortion_coeffs: {flow(coefficients)}\n"
-        f"  distortion_model: {model}\n  intrinsics: {flow([*lens.focal_px, *lens.centre_px])}\n"
+        f"cam0:\n  cam_overlaps: []\n  camera_model: pinhole\n  distortion_coeffs: {yaml_list(coefficients)}\n"
+        f"  distortion_model: {model}\n  intrinsics: {yaml_list([*lens.focal_px, *lens.centre_px])}\n"
         f"  resolution: [{lens.size_px[0]}, {lens.size_px[1]}]\n"
         f"  T_cam_imu:\n{rows}  - [0.0, 0.0, 0.0, 1.0]\n"
     )
 
 
-def camera(text: str, name: str) -> Camera:
+def from_text(text: str, name: str) -> Camera:
     """The first camera of a camchain file. Raises BadInput bad_calibration."""
     try:
-        chain = parsed(text)
+        chain = read_yaml(text)
         d = chain.get("cam0", chain)
         if d["camera_model"] != "pinhole":
             raise ValueError(f"camera_model {d['camera_model']!r} has no counterpart")
-        fx, fy, cx, cy = numbers(d["intrinsics"], 4, "intrinsics")
-        width, height = numbers(d["resolution"], 2, "resolution")
-        given = [float(v) for v in d.get("distortion_coeffs", [])]
+        fx, fy, cx, cy = read_numbers(d["intrinsics"], 4, "intrinsics")
+        width, height = read_numbers(d["resolution"], 2, "resolution")
+        distortion = [float(v) for v in d.get("distortion_coeffs", [])]
         k: tuple[float, ...] | None = None
         if d["distortion_model"] in ("equidistant", "equi"):
-            k = tuple(numbers(given, COEFFICIENTS, "distortion_coeffs"))
+            k = tuple(read_numbers(distortion, FISHEYE_COEFFICIENTS, "distortion_coeffs"))
         else:
-            no_other_distortion(given, str(d["distortion_model"]))
-        made = camera_from(Plain((int(width), int(height)), (fx, fy), (cx, cy), k), name)
+            check_no_distortion(distortion, str(d["distortion_model"]))
+        camera = camera_from_intrinsics(Intrinsics((int(width), int(height)), (fx, fy), (cx, cy), k), name)
         if "T_cam_imu" not in d:
-            return made
-        R_cam_body = np.array([numbers(row, 4, "T_cam_imu")[:3] for row in d["T_cam_imu"][:3]])
+            return camera
+        R_cam_body = np.array([read_numbers(row, 4, "T_cam_imu")[:3] for row in d["T_cam_imu"][:3]])
         if R_cam_body.shape != (3, 3) or np.abs(R_cam_body @ R_cam_body.T - np.eye(3)).max() > 1e-6:
             raise ValueError("T_cam_imu holds no rotation")
-        return replace(made, R_body_cam=R_cam_body.T)
+        return replace(camera, R_body_cam=R_cam_body.T)
     except BadInput:
         raise
     except (ValueError, KeyError, TypeError) as cause:
-        raise unreadable("Kalibr", repr(cause)) from cause
+        raise unreadable_file("Kalibr", repr(cause)) from cause

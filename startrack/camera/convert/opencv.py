@@ -7,13 +7,20 @@ k1 to k4. cv2.fisheye itself mirrors rays past 90 degrees: the numbers are right
 from __future__ import annotations
 
 from startrack.camera import Camera
-from startrack.camera.convert.intrinsics import Plain, camera_from, centred, no_other_distortion, plain, unreadable
+from startrack.camera.convert.intrinsics import (
+    Intrinsics,
+    camera_from_intrinsics,
+    check_no_distortion,
+    intrinsics_of,
+    unreadable_file,
+    without_decentring,
+)
 from startrack.types import BadInput
 
 
-def text(camera: Camera) -> str:
+def to_text(camera: Camera) -> str:
     """The FileStorage file as YAML."""
-    lens = plain(centred(camera))
+    lens = intrinsics_of(without_decentring(camera))
     fisheye, coefficients = (0, [0.0] * 5) if lens.k is None else (1, list(lens.k))
     return (
         f"%YAML:1.0\n---\nimage_width: {lens.size_px[0]}\nimage_height: {lens.size_px[1]}\n"
@@ -23,37 +30,37 @@ def text(camera: Camera) -> str:
     )
 
 
-def camera(text: str, name: str) -> Camera:
+def from_text(text: str, name: str) -> Camera:
     """The camera of a FileStorage file. Raises BadInput bad_calibration."""
     import cv2
 
     try:
         store = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        matrix, given = store.getNode("camera_matrix").mat(), store.getNode("distortion_coefficients").mat()
+        matrix, distortion = store.getNode("camera_matrix").mat(), store.getNode("distortion_coefficients").mat()
         size = (int(store.getNode("image_width").real()), int(store.getNode("image_height").real()))
         fisheye = store.getNode("fisheye_model").real() == 1
     except (cv2.error, SystemError) as cause:  # cv2 wraps what its parser throws in a SystemError
-        raise unreadable("OpenCV", cause) from cause
-    if matrix is None or matrix.shape != (3, 3) or given is None:
-        raise unreadable("OpenCV", "camera_matrix or distortion_coefficients are missing")
+        raise unreadable_file("OpenCV", cause) from cause
+    if matrix is None or matrix.shape != (3, 3) or distortion is None:
+        raise unreadable_file("OpenCV", "camera_matrix or distortion_coefficients are missing")
     try:
-        coefficients = [float(v) for v in given.ravel()]
+        coefficients = [float(v) for v in distortion.ravel()]
         k: tuple[float, ...] | None = tuple(coefficients)
         if not fisheye:
-            no_other_distortion(coefficients, "of the pinhole model")
+            check_no_distortion(coefficients, "of the pinhole model")
             k = None
         elif len(coefficients) != 4 or matrix[0, 1]:
             raise ValueError("a fisheye has four coefficients and no skew")
         focal, centre = (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2])
-        return camera_from(
-            Plain(size, (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])), k), name
+        return camera_from_intrinsics(
+            Intrinsics(size, (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])), k), name
         )
     except BadInput:
         raise
     except ValueError as cause:
-        raise unreadable("OpenCV", cause) from cause
+        raise unreadable_file("OpenCV", cause) from cause
 
 
 def _matrix(rows: int, columns: int, data: list[float]) -> str:
-    numbers = ", ".join(repr(float(v)) for v in data)
-    return f"!!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [ {numbers} ]\n"
+    text = ", ".join(repr(float(v)) for v in data)
+    return f"!!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [ {text} ]\n"

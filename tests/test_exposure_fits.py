@@ -3,6 +3,7 @@
 import bz2
 import gzip
 import io
+import time
 
 import numpy as np
 import pytest
@@ -192,7 +193,7 @@ def test_facts_of_the_primary_header_hold_for_an_extension(read):
         ({"DATE_OBS": "06/08/99", "EXPTIME": 60.0}, "DATE-OBS not used"),
         ({"DATE_AVG": "2018-08-06T05:17:04+02:00"}, "local time"),
         ({"DATE_AVG": "2018-08-06T05:17:04", "TIMESYS": "TAI"}, "time scale TAI"),
-        ({"DATE_OBS": "2018-08-06T05:17:04", "EXPTIME": 0.0}, "EXPTIME '0.0'"),
+        ({"DATE_OBS": "2018-08-06T05:17:04", "EXPTIME": 0.0}, "EXPTIME 0.0"),
         ({"DATE_OBS": "2018-08-06T05:17:04", "EXPTIME": "long"}, "EXPTIME 'long'"),
     ],
 )
@@ -206,3 +207,32 @@ def test_an_unusable_date_avg_leaves_date_obs(read):
     exposure = read(with_cards(DATE_AVG="yesterday", DATE_OBS="2018-08-06T05:17:00", EXPTIME=60, TIMESYS="UTC"))
     assert exposure.time_utc.isoformat() == "2018-08-06T05:17:30+00:00"
     assert "DATE-AVG not used" in exposure.warnings[0]
+
+
+def patched(raw, card, value, nth=0):
+    """The file with the value of its nth card of that name replaced."""
+    at = -1
+    for _ in range(nth + 1):
+        at = raw.index(f"{card:<8}=".encode(), at + 1)
+    return raw[: at + 10] + f"{value:>20}".encode() + raw[at + 30 :]
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        patched(written(fits.PrimaryHDU(FRAME)), "NAXIS", 10**9),
+        patched(written(fits.PrimaryHDU(FRAME)), "NAXIS", -2),
+        patched(written(fits.PrimaryHDU(FRAME)), "NAXIS1", 10**9),
+        patched(written(None, fits.ImageHDU(FRAME)), "NAXIS", 10**9, nth=1),
+        patched(written(fits.PrimaryHDU(FRAME), TABLE), "TFIELDS", 10**9),
+        patched(written(fits.PrimaryHDU(FRAME), TABLE), "GCOUNT", -(10**9)),
+        gzip.compress(patched(written(fits.PrimaryHDU(FRAME)), "NAXIS", 10**9), mtime=0),
+    ],
+    ids=["axes", "negative axes", "width", "axes of an extension", "fields", "negative size", "packed"],
+)
+def test_huge_numbers_in_a_header_are_refused_at_once(read, raw):
+    start = time.process_time()
+    with pytest.raises(BadInput) as caught:
+        read(raw)
+    assert caught.value.reason == "bad_image"
+    assert time.process_time() - start < 3.0

@@ -12,7 +12,7 @@ import tifffile
 
 import startrack
 from startrack.exposure import read_exposure, write_exposure
-from startrack.exposure.mosaic import evened
+from startrack.exposure.mosaic import equalize_mosaic
 from startrack.types import BadInput, Exposure
 
 SAMPLE = Path(__file__).parents[1] / "sample_images" / "near-wall"
@@ -59,7 +59,7 @@ def test_a_mosaic_is_located_and_shows_more_stars_than_its_raw_pixels(colours):
 
 def test_levels_become_one_and_gains_are_found(colours):
     pixels = read_exposure(with_sidecar(colours)).pixels_adu
-    even = evened(pixels, 65535.0)
+    even = equalize_mosaic(pixels, 65535.0)
     middles = [np.median(even[i:400:2, j:400:2]) for (i, j), _ in PATTERN]
     assert np.ptp(middles) < 1.0 < np.ptp([np.median(pixels[i:400:2, j:400:2]) for (i, j), _ in PATTERN])
     bright = even > 2000  # stars: sums over many are the phases' gains
@@ -72,7 +72,7 @@ def test_saturated_pixels_stay_saturated():
     pixels = rng.normal(300, 5, (256, 256)).astype(np.float32)
     pixels[0::2, 0::2] += 500
     pixels[100:104, 100:104] = 4095.0
-    even = evened(pixels, 4095.0)
+    even = equalize_mosaic(pixels, 4095.0)
     assert np.all(even[100:104, 100:104] >= 4095.0)
     assert abs(np.median(even[0::2, 0::2]) - np.median(even[1::2, 1::2])) < 1.0
 

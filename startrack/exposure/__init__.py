@@ -1,8 +1,8 @@
 """One image with the facts that travel with it: read, validate, write.
 
-`read.py` opens a file and picks its decoder (`png.py`, `tiff.py`, `jpeg.py`, `fits.py`); `facts.py` says where time,
-exposure seconds, camera and terrain come from; `write.py` is the way back. Whatever is wrong with a file, the caller
-sees `startrack.types.BadInput` and nothing else.
+`read.py` opens a file and picks its decoder (`png.py`, `tiff.py`, `jpeg.py`, `fits.py`, `mosaic.py` for camera raw
+files); `metadata.py` finds time, exposure seconds, camera and terrain; `write.py` writes images and sidecars. A file
+that cannot be used raises `startrack.types.BadInput` and no other exception.
 """
 
 from startrack.exposure.decoded import are_fractions

@@ -1,4 +1,4 @@
-"""What every decoder hands back, and the checks they share."""
+"""The value that every decoder returns, and the checks that decoders share."""
 
 from __future__ import annotations
 
@@ -34,26 +34,25 @@ class Decoded:
     mosaic: bool | None = None  # whether the pixels are a mosaic of colours; None: the file's kind does not say
 
 
-def refuse(cause: str) -> BadInput:
-    """The exception for a file that is not read; `read_exposure` puts the file's name before the cause."""
+def bad_image(cause: str) -> BadInput:
+    """The exception for a file that cannot be read; `read_exposure` puts the file's name before the cause."""
     return BadInput("bad_image", cause)
 
 
 def check_size(width_px: int, height_px: int) -> None:
-    """Pass an image of 1 to 200 Mpx; `BadInput` for any other. To be called on header values, before decoding."""
+    """Raise BadInput bad_image unless the image has 1 to 200 Mpx. Called with header values, before decoding."""
     if width_px < 1 or height_px < 1:
-        raise refuse(f"holds no pixels ({width_px} x {height_px})")
+        raise bad_image(f"holds no pixels ({width_px} x {height_px})")
     if width_px * height_px > MAX_PIXELS:
         size, most = width_px * height_px / 1e6, MAX_PIXELS / 1e6
-        raise refuse(f"{width_px} x {height_px} is {size:.1f} Mpx, more than the {most:.0f} allowed")
+        raise bad_image(f"{width_px} x {height_px} is {size:.1f} Mpx, more than the {most:.0f} allowed")
 
 
 def grey_float32(stored: NDArray[Any]) -> tuple[NDArray[np.float32], tuple[str, ...]]:
-    """Pixels (H, W) as float32 [ADU], with warnings, from (H, W) or (H, W, 3) of any integer or real type.
+    """Pixels (H, W) as float32 [ADU], and warnings, from (H, W) or (H, W, 3) of any integer or real type.
 
-    8 and 16 bits stay exact. Colour becomes the plain mean of its channels, not rounded. `BadInput` for a pixel that
-    is not a finite number: there is no honest value to put in its place. Fractions from 0 to 1 are kept, with a
-    warning: what scaled them is not known.
+    8 and 16 bits stay exact. Colour becomes the mean of its channels, not rounded. Fractions from 0 to 1 are kept, with
+    a warning, because their scale is not known. Raises BadInput bad_image for a pixel that is not finite.
     """
     warnings: list[str] = []
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is refused below
@@ -68,7 +67,7 @@ def grey_float32(stored: NDArray[Any]) -> tuple[NDArray[np.float32], tuple[str, 
     if stored.dtype.kind == "f":
         bad = pixels.size - int(np.count_nonzero(np.isfinite(pixels)))
         if bad:
-            raise refuse(
+            raise bad_image(
                 f"{bad} of {pixels.size} pixels are NaN or infinite; fill them (by their neighbours' median, say) first"
             )
         if are_fractions(pixels):
@@ -79,7 +78,7 @@ def grey_float32(stored: NDArray[Any]) -> tuple[NDArray[np.float32], tuple[str, 
 
 
 def are_fractions(pixels_adu: NDArray[np.float32]) -> bool:
-    """Whether no pixel is above 1 or below 0, and some are above 0: a picture scaled for display, not counts."""
+    """Whether all pixels are from 0 to 1 and some above 0: a picture scaled for display, not counts."""
     return bool(0 < pixels_adu.max() <= 1 and pixels_adu.min() >= 0)
 
 
@@ -89,7 +88,7 @@ def largest_value(dtype: np.dtype[Any]) -> float | None:
 
 
 def orientation_warnings(orientation: object) -> tuple[str, ...]:
-    """A warning if the file asks to be turned for display: the sensor's geometry belongs to the calibration."""
+    """A warning if the file has to be rotated for display: the calibration refers to the pixels as stored."""
     if orientation is None or orientation == UPRIGHT:
         return ()
     return (f"orientation tag {orientation} ignored: pixels are taken as the sensor stored them",)

@@ -1,48 +1,57 @@
-"""JPEG: read by Pillow, the one decoder at hand that refuses a truncated file.
+"""JPEG: read by Pillow, which refuses a truncated file.
 
-OpenCV returns a truncated JPEG whole, its missing part a flat grey: a wall, to a program that looks for hidden stars.
-Pillow does so too where an end marker follows the cut, so the picture is decoded twice (see FILLER).
+OpenCV returns a truncated JPEG with flat grey in place of the missing part, which would be taken for a wall that hides
+stars. Pillow does the same if an end marker follows the cut, so the picture is decoded twice (see FILLER).
 """
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from io import BytesIO
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.exposure.decoded import Decoded, check_size, exif_warnings, grey_float32, largest_value, refuse
+from startrack.exposure.decoded import Decoded, bad_image, check_size, exif_warnings, grey_float32, largest_value
 from startrack.exposure.metadata import facts_in_text
 
 START_OF_SCAN, END_OF_IMAGE = 0xDA, b"\xff\xd9"
+STRIP_ROWS = 512
 PARAMETERLESS = {0x01, *range(0xD0, 0xD8)}  # markers without a length: TEM and the restarts
-# Where data are missing before the end marker, decoders make up a flat rest and say nothing. Bytes put there show it:
-# a complete picture is the same with them, an incomplete one takes them for its own. Restart markers, each of the
-# eight, for a picture cut where it expects one.
+# If data are missing before the end marker, decoders fill the rest without a warning. These bytes, inserted there, show
+# it: they do not change a complete picture, and become part of an incomplete one. They hold each of the eight restart
+# markers, for a picture cut where it expects one.
 FILLER = b"".join(bytes((37 * i + 11) % 251 for i in range(128)) + bytes((0xFF, 0xD0 + k)) for k in range(8))
 
 
 def decode_jpeg(raw: bytes) -> Decoded:
-    """Pixels of a grey or colour JPEG, 0..255; facts from its comment. `BadInput` if truncated, damaged or CMYK."""
+    """Pixels of a grey or colour JPEG, 0 to 255; metadata from its comment.
+
+    Raises BadInput bad_image if it is truncated, damaged or CMYK.
+    """
     image = _open(raw)
     check_size(*image.size)
     if image.mode not in ("L", "RGB"):
-        raise refuse(f"JPEG is {image.mode}; startrack reads plain grey or colour")
+        raise bad_image(f"JPEG is {image.mode}; startrack reads plain grey or colour")
     end = raw.find(END_OF_IMAGE, _scan_start(raw))
     if end < 0:
-        raise refuse("truncated JPEG: the file ends before its end marker")
-    stored = _load(image)
-    if not np.array_equal(stored, _load(_open(raw[:end] + FILLER + raw[end:]))):
-        raise refuse("truncated JPEG: its end marker comes before the end of the picture")
+        raise bad_image("truncated JPEG: the file ends before its end marker")
+    stored = np.empty((image.height, image.width, 3)[: 2 if image.mode == "L" else 3], np.uint8)
+    for rows, strip in _strips(image):
+        stored[rows] = strip
+    comment, exif = image.info.get("comment", b""), exif_warnings(image.getexif)
+    del image  # a decoded picture in Pillow takes 4 bytes a pixel: never two at a time
+    again = _open(raw[:end] + FILLER + raw[end:])
+    if not all(np.array_equal(stored[rows], strip) for rows, strip in _strips(again)):
+        raise bad_image("truncated JPEG: its end marker comes before the end of the picture")
     pixels, colour = grey_float32(stored)
-    comment = image.info.get("comment", b"")
     return Decoded(
         pixels_adu=pixels,
         saturation_adu=largest_value(stored.dtype),
         header=facts_in_text(comment.decode("utf-8", "replace") if isinstance(comment, bytes) else str(comment)),
-        warnings=exif_warnings(image.getexif) + colour,
+        warnings=exif + colour,
     )
 
 
@@ -53,12 +62,16 @@ def _open(raw: bytes) -> Any:
     return JpegImageFile(BytesIO(raw))
 
 
-def _load(image: Any) -> NDArray[np.uint8]:
+def _strips(image: Any) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+    """Rows and pixels of the decoded picture, strip by strip: a copy of the whole would double the memory."""
     try:
         image.load()
     except OSError as error:
-        raise refuse(f"truncated or damaged JPEG: {error}") from error
-    return np.asarray(image)
+        raise bad_image(f"truncated or damaged JPEG: {error}") from error
+    width, height = image.size
+    for top in range(0, height, STRIP_ROWS):
+        bottom = min(top + STRIP_ROWS, height)
+        yield slice(top, bottom), np.asarray(image.crop((0, top, width, bottom)))
 
 
 def _scan_start(raw: bytes) -> int:
@@ -66,7 +79,7 @@ def _scan_start(raw: bytes) -> int:
     at = 2
     while at + 4 <= len(raw):
         if raw[at] != 0xFF:
-            raise refuse("damaged JPEG: a marker is missing")
+            raise bad_image("damaged JPEG: a marker is missing")
         marker = raw[at + 1]
         if marker == START_OF_SCAN:
             return at
@@ -76,4 +89,4 @@ def _scan_start(raw: bytes) -> int:
             at += 2
         else:
             at += 2 + struct.unpack_from(">H", raw, at + 2)[0]
-    raise refuse("truncated JPEG: the file ends before its picture")
+    raise bad_image("truncated JPEG: the file ends before its picture")

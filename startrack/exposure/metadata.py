@@ -1,4 +1,4 @@
-"""Where time, exposure seconds, camera and terrain come from: flag, then sidecar, then header; nothing is guessed."""
+"""Time, exposure seconds, camera and terrain of an image: from a flag, else its sidecar, else its header."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ MAX_UNKNOWN_KEY_WARNINGS = 5
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What is known of an exposure besides its pixels; None where it is not known."""
+    """Metadata of an exposure besides its pixels; None if not known."""
 
     time_utc: datetime | None = None  # mid-exposure, timezone-aware
     exposure_s: float | None = None
     camera: str | None = None  # path, or name of a shipped file
     terrain: str | None = None  # path, or name of a shipped file
     bayer_pattern: str | None = None  # RGGB and the like: the pixels are a mosaic of colours
-    warnings: tuple[str, ...] = ()  # what was found and not used, and why
+    warnings: tuple[str, ...] = ()  # values that were ignored, and why
 
 
 def with_facts(
@@ -59,10 +59,10 @@ def with_facts(
     camera: str | None = None,
     terrain: str | None = None,
 ) -> Exposure:
-    """The exposure with every fact that is given here in place of its own.
+    """The exposure with the values given here in place of its own; `time_utc` is mid-exposure.
 
-    A mid-exposure time that was reckoned from DATE-OBS and a header's EXPTIME is not moved by a new `exposure_s`; give
-    the facts to `read_exposure` for that. Raises ValueError for a time without zone.
+    A mid-exposure time computed from DATE-OBS and a header's EXPTIME does not change with a new `exposure_s`; give it
+    to `read_exposure` for that. Raises ValueError for a time without zone.
     """
     given: dict[str, Any] = {"exposure_s": exposure_s, "camera": camera, "terrain": terrain}
     given["time_utc"] = None if time_utc is None else as_utc(time_utc)
@@ -70,10 +70,10 @@ def with_facts(
 
 
 def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts:
-    """The facts of `image` from, in this order: `given` (flags), its sidecar, its header.
+    """The metadata of `image` from, in this order: `given` (flags), its sidecar, its header.
 
-    A source is consulted only for what the ones before it leave open. An unusable value is refused in a sidecar
-    (`BadInput`: bad_image, or no_time), which is ours; in a header, which may be anybody's, it is a warning.
+    A source is read only for values that the sources before it do not have. An unusable value in a sidecar raises
+    BadInput (bad_image, or no_time); in a header, which any program may have written, it gives a warning.
     """
     sidecar, values = _read_sidecar(image)
     notes: list[str] = [*given.warnings, *_unknown_keys(sidecar, values)]
@@ -119,12 +119,12 @@ def stem(image: Path) -> str:
 
 
 def sidecars(image: Path) -> list[Path]:
-    """Where a sidecar may lie, most specific first; NAME.json, the last one, is where it is written."""
+    """Possible paths of a sidecar, most specific first; it is written to the last one, NAME.json."""
     return [image.with_name(name + ".json") for name in _stems(image)]
 
 
 def sidecar_of(image: Path) -> Path | None:
-    """The sidecar that lies there, if any. Cameras that write NAME.PNG write NAME.JSON."""
+    """The sidecar of the image if there is one. Cameras that write NAME.PNG write NAME.JSON."""
     places = (place for path in sidecars(image) for place in (path, path.with_suffix(".JSON")))
     return next((place for place in places if os.path.isfile(place)), None)
 
@@ -158,7 +158,7 @@ def _read_sidecar(image: Path) -> tuple[Path, dict[str, Any]]:
 
 
 def _unknown_keys(sidecar: Path, values: Mapping[str, Any]) -> list[str]:
-    """A warning for each key that stands for nothing: a misspelt one would else be missed in silence."""
+    """A warning for each unknown key, which may be a misspelt one."""
     unknown = [key for key in values if key not in SIDECAR.keys]
     return [
         f"sidecar {printable(sidecar.name)}: key {key[:SHOWN_CHARS]!r} is none of {', '.join(SIDECAR.keys)}; not used"
@@ -236,7 +236,7 @@ def _header_exposure_s(value: object, notes: list[str]) -> float | None:
 
 
 def _header_time(header: Mapping[str, Any], exposure_s: float | None, notes: list[str]) -> datetime | None:
-    """Mid-exposure from DATE-AVG, or from DATE-OBS and half the exposure; the notes say why there is none."""
+    """Mid-exposure from DATE-AVG, or from DATE-OBS and half the exposure; the notes have the cause if there is none."""
     given = [key for key in ("DATE-AVG", "DATE-OBS") if str(header.get(key) or "").strip()]
     if not given:
         return None
@@ -253,7 +253,7 @@ def _header_time(header: Mapping[str, Any], exposure_s: float | None, notes: lis
         if key == "DATE-AVG":
             return time
         if exposure_s is not None:
-            return _later(time, exposure_s / 2, notes)
+            return _time_after(time, exposure_s / 2, notes)
         notes.append(
             "DATE-OBS is when the exposure starts, and without EXPTIME its middle is not known: "
             "give the time of the middle (time_utc in a sidecar), or exposure_s"
@@ -261,7 +261,7 @@ def _header_time(header: Mapping[str, Any], exposure_s: float | None, notes: lis
     return None
 
 
-def _later(start: datetime, seconds: float, notes: list[str]) -> datetime | None:
+def _time_after(start: datetime, seconds: float, notes: list[str]) -> datetime | None:
     try:
         return start + timedelta(seconds=seconds)
     except OverflowError:

@@ -1,7 +1,7 @@
-"""PNG: strict walk through the chunks, pixels by OpenCV.
+"""PNG: strict check of all chunks, pixels by OpenCV.
 
-A PNG carries a checksum for each chunk, so truncation and damage are found by zlib.crc32 in about a millisecond, where
-a decoder's own verification would decode the picture twice. Format: W3C PNG specification (third edition, 2025).
+Each chunk has a checksum: zlib.crc32 finds truncation and damage in about a millisecond, without decoding twice.
+Format: W3C PNG specification (third edition, 2025).
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import numpy as np
 
 from startrack.exposure.decoded import (
     Decoded,
+    bad_image,
     check_size,
     exif_warnings,
     grey_float32,
     largest_value,
-    refuse,
 )
 from startrack.exposure.metadata import HEADER_KEYS
 
@@ -47,20 +47,20 @@ def decode_png(raw: bytes) -> Decoded:
         elif kind == b"IDAT":
             picture.append(body)
         elif kind in (b"tEXt", b"zTXt", b"iTXt"):
-            _take_text(kind, bytes(body), header)
+            _read_text(kind, bytes(body), header)
         elif kind == b"tRNS":
-            raise refuse("PNG with a transparent colour (alpha): save it without transparency")
+            raise bad_image("PNG with a transparent colour (alpha): save it without transparency")
         elif kind == b"acTL":
-            raise refuse("animated PNG: several pictures in one file")
+            raise bad_image("animated PNG: several pictures in one file")
         elif kind == b"eXIf":
             warnings = exif_warnings(partial(_read_exif, bytes(body)))
         elif kind[:1].isupper() and kind != b"PLTE":
-            raise refuse(f"PNG needs a feature that startrack does not know ({kind!r})")
-    # OpenCV sees the picture alone: gamma, colour profile and orientation cannot change what it returns.
+            raise bad_image(f"PNG needs a feature that startrack does not know ({kind!r})")
+    # OpenCV gets the picture alone: gamma, colour profile and orientation cannot change the pixels.
     bare = b"".join((raw[:IHDR_END], chunk(b"IDAT", b"".join(picture)), chunk(b"IEND", b"")))
     stored = cv2.imdecode(np.frombuffer(bare, np.uint8), cv2.IMREAD_UNCHANGED)
     if stored is None or stored.shape[:2] != (height, width) or stored.dtype.itemsize * 8 != depth:
-        raise refuse("damaged PNG: its picture data cannot be decoded")
+        raise bad_image("damaged PNG: its picture data cannot be decoded")
     pixels, colour = grey_float32(stored)
     return Decoded(
         pixels_adu=pixels, saturation_adu=largest_value(stored.dtype), header=header, warnings=warnings + colour
@@ -78,15 +78,15 @@ def _chunks(raw: bytes) -> Iterator[tuple[bytes, memoryview]]:
     at = len(SIGNATURE)
     while True:
         if at + 12 > len(raw):
-            raise refuse("truncated PNG: the file ends before its IEND chunk")
+            raise bad_image("truncated PNG: the file ends before its IEND chunk")
         (length,) = struct.unpack_from(">I", raw, at)
         kind, end = raw[at + 4 : at + 8], at + 8 + length
         if end + 4 > len(raw):
-            raise refuse("truncated PNG: the file ends within a chunk")
+            raise bad_image("truncated PNG: the file ends within a chunk")
         if zlib.crc32(view[at + 4 : end]) != struct.unpack_from(">I", raw, end)[0]:
-            raise refuse("damaged PNG: the checksum of a chunk does not agree")
+            raise bad_image("damaged PNG: the checksum of a chunk does not agree")
         if (kind == b"IHDR") != (at == len(SIGNATURE)):
-            raise refuse("damaged PNG: its header chunk is not where it belongs")
+            raise bad_image("damaged PNG: its header chunk is not where it belongs")
         if kind == b"IEND":
             return
         yield kind, view[at + 8 : end]
@@ -95,19 +95,19 @@ def _chunks(raw: bytes) -> Iterator[tuple[bytes, memoryview]]:
 
 def _check_ihdr(body: memoryview) -> tuple[int, int, int]:
     if len(body) != 13:
-        raise refuse("damaged PNG: its header chunk has a wrong length")
+        raise bad_image("damaged PNG: its header chunk has a wrong length")
     width, height, depth, colour_type = struct.unpack_from(">IIBB", body)
     check_size(width, height)
     if colour_type not in (0, 2):
         name = COLOUR_TYPES.get(colour_type, f"colour type {colour_type}")
-        raise refuse(f"PNG is {name}; startrack reads plain grey or colour")
+        raise bad_image(f"PNG is {name}; startrack reads plain grey or colour")
     if depth not in (8, 16):
-        raise refuse(f"PNG has {depth} bits a pixel; startrack reads 8 or 16")
+        raise bad_image(f"PNG has {depth} bits a pixel; startrack reads 8 or 16")
     return width, height, depth
 
 
-def _take_text(kind: bytes, body: bytes, header: dict[str, str]) -> None:
-    """Add the fact of one text chunk to `header`; others pass by unread. The first of equal keys counts."""
+def _read_text(kind: bytes, body: bytes, header: dict[str, str]) -> None:
+    """Add the value of one text chunk to `header` if its key is known; the first of equal keys counts."""
     keyword, _, rest = body.partition(b"\0")
     key = HEADER_KEYS.get(keyword.decode("latin-1"))
     if key is None or key in header:

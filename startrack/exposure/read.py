@@ -1,4 +1,4 @@
-"""From a file to an `Exposure`: open, tell the type by its first bytes, decode strictly, resolve the facts."""
+"""From a file to an `Exposure`: open, find the type from its first bytes, decode strictly, find the metadata."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from startrack.exposure.decoded import (
     COLOUR_WARNING,
     MAX_FILE_BYTES,
     Decoded,
+    bad_image,
     check_size,
     grey_float32,
     largest_value,
-    refuse,
 )
 from startrack.exposure.metadata import RAW_SUFFIXES, Facts, resolve_facts, stem
 from startrack.files import printable
@@ -40,14 +40,14 @@ def read_exposure(
     camera: str | None = None,
     terrain: str | None = None,
 ) -> Exposure:
-    """The image at `path` (PNG, TIFF, JPEG or FITS, told by content, or camera raw) with its facts.
+    """The image at `path` (PNG, TIFF, JPEG or FITS by its content, or camera raw by its suffix) with its metadata.
 
-    Pixels are the counts in the file, 16 bits kept; pixel (0, 0) is the first of the first row stored, whatever an
-    orientation tag says, and in FITS too. The keyword facts, if given, go before those of sidecar and header, which
-    are then not even looked at; `time_utc` is mid-exposure. What was ignored, and why, is in `warnings`.
+    Pixels (H, W) are the counts in the file [ADU], 16 bits kept; pixel (0, 0) is the first of the first row stored,
+    in FITS too; orientation tags are ignored. Keyword arguments replace the values of sidecar and header, which are
+    then not read; `time_utc` is mid-exposure. `warnings` lists what was ignored, and why.
 
     Raises:
-        BadInput: bad_image with the file and the cause in one line; no_time for a sidecar's time that is not UTC.
+        BadInput: bad_image with file and cause in one line; no_time if a sidecar's time is not UTC.
     """
     try:
         raw = _read_bytes(path)
@@ -56,7 +56,7 @@ def read_exposure(
         raise BadInput(error.reason, " ".join(f"{printable(path)}: {error}".split())) from error
     given = Facts(time_utc=time_utc, exposure_s=exposure_s, camera=camera, terrain=terrain)
     facts = resolve_facts(Path(path), decoded.header, given)
-    pixels, notes = _of_one_colour(decoded, facts)
+    pixels, notes = _without_mosaic(decoded, facts)
     return Exposure(
         pixels_adu=pixels,
         name=stem(Path(path)),
@@ -72,13 +72,13 @@ def read_exposure(
 
 
 def exposure_of(pixels: NDArray[Any], *, time_utc: datetime | None = None, name: str = "array") -> Exposure:
-    """Raw counts (H, W), or colours (H, W, 3), as an exposure without other facts. Raises BadInput (bad_image).
+    """Counts (H, W) [ADU], or colours (H, W, 3), as an exposure without further metadata.
 
-    `sha256` is that of type, shape and values: results of equal arrays are results of the same image.
+    `sha256` is that of type, shape and values. Raises BadInput bad_image.
     """
     flat_grey = pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)
     if not flat_grey or pixels.dtype.kind not in "uif":
-        raise refuse(f"an array of {pixels.dtype} {pixels.shape}; startrack takes numbers (H, W) or (H, W, 3)")
+        raise bad_image(f"an array of {pixels.dtype} {pixels.shape}; startrack takes numbers (H, W) or (H, W, 3)")
     check_size(pixels.shape[1], pixels.shape[0])
     grey, notes = grey_float32(pixels)
     return Exposure(
@@ -91,42 +91,43 @@ def exposure_of(pixels: NDArray[Any], *, time_utc: datetime | None = None, name:
     )
 
 
-def _of_one_colour(decoded: Decoded, facts: Facts) -> tuple[NDArray[np.float32], tuple[str, ...]]:
-    """The pixels with a mosaic's colours evened out, and a warning that they were."""
+def _without_mosaic(decoded: Decoded, facts: Facts) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+    """The pixels, those of a mosaic brought to one level and gain, and a warning if that was done."""
     colour_already = decoded.mosaic is None and COLOUR_WARNING in decoded.warnings
     if colour_already or not (decoded.mosaic or facts.bayer_pattern):
         return decoded.pixels_adu, ()
-    from startrack.exposure.mosaic import MOSAIC_WARNING, evened
+    from startrack.exposure.mosaic import MOSAIC_WARNING, equalize_mosaic
 
-    return evened(decoded.pixels_adu, decoded.saturation_adu), (MOSAIC_WARNING,)
+    return equalize_mosaic(decoded.pixels_adu, decoded.saturation_adu), (MOSAIC_WARNING,)
 
 
 def _read_bytes(path: str | os.PathLike[str]) -> bytes:
     try:
         status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):
-            raise refuse("is a folder, not an image")
+            raise bad_image("is a folder, not an image")
         if not stat.S_ISREG(status.st_mode):  # a pipe would block, a device never end
-            raise refuse("is not a regular file")
+            raise bad_image("is not a regular file")
         if status.st_size == 0:
-            raise refuse("is empty")
+            raise bad_image("is empty")
         if status.st_size > MAX_FILE_BYTES:
-            raise refuse(f"is {status.st_size / 1e9:.1f} GB, more than any image startrack reads")
+            raise bad_image(f"is {status.st_size / 1e9:.1f} GB, more than any image startrack reads")
         return Path(path).read_bytes()
     except OSError as error:
-        raise refuse(f"cannot be opened ({error.strerror or error})") from error
+        raise bad_image(f"cannot be opened ({error.strerror or error})") from error
     except ValueError as error:  # a NUL in the name
-        raise refuse(f"cannot be opened ({error})") from error
+        raise bad_image(f"cannot be opened ({error})") from error
 
 
-def _decode(raw: bytes, of_camera: bool) -> Decoded:
-    """Camera raw files are told by their suffix: within they are TIFFs, with a thumbnail where the picture should be.
+def _decode(raw: bytes, camera_raw: bool) -> Decoded:
+    """The decoded file. Camera raw files are known by their suffix: they are TIFFs with a thumbnail as their picture.
 
-    Only `BadInput` leaves: a decoder fed with damaged bytes raises whatever it pleases."""
+    Raises BadInput bad_image; whatever else a decoder raises for damaged bytes is turned into it.
+    """
     kind, decode = "image", _unknown
     try:
-        if of_camera:
-            from startrack.exposure.raw import decode_camera_raw
+        if camera_raw:
+            from startrack.exposure.mosaic import decode_camera_raw
 
             kind, decode = "camera raw file", decode_camera_raw
         elif raw.startswith(PNG):
@@ -145,14 +146,14 @@ def _decode(raw: bytes, of_camera: bool) -> Decoded:
             from startrack.exposure.fits import decode_fits
 
             kind, decode = "FITS", decode_fits
-        with warnings.catch_warnings():  # what matters of them is a refusal, or in `Exposure.warnings`
+        with warnings.catch_warnings():  # the decoders' checks refuse the file or fill `Exposure.warnings`
             warnings.simplefilter("ignore")
             return decode(raw)
     except BadInput:
         raise
     except Exception as error:
-        raise refuse(f"truncated or damaged {kind} ({type(error).__name__}: {str(error)[:200]})") from error
+        raise bad_image(f"truncated or damaged {kind} ({type(error).__name__}: {str(error)[:200]})") from error
 
 
 def _unknown(raw: bytes) -> Decoded:
-    raise refuse("is not a PNG, TIFF, JPEG or FITS file, nor named as a camera raw file")
+    raise bad_image("is not a PNG, TIFF, JPEG or FITS file, nor named as a camera raw file")

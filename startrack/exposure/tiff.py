@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from startrack.exposure.decoded import (
     Decoded,
+    bad_image,
     check_size,
     grey_float32,
     largest_value,
     orientation_warnings,
-    refuse,
 )
 from startrack.exposure.metadata import facts_in_text
 
@@ -34,13 +34,14 @@ TYPES = {"uint8", "uint16", "uint32", "int8", "int16", "int32", "float16", "floa
 
 
 def decode_tiff(raw: bytes) -> Decoded:
-    """Pixels of a TIFF with one grey or colour picture of whole bytes; facts from its ImageDescription.
+    """Pixels of a TIFF with one grey or colour picture of whole bytes; metadata from its ImageDescription.
 
-    `BadInput` if truncated, with alpha, palette or CMYK, or with several pictures (reduced copies do not count).
+    Raises BadInput bad_image if it is truncated, has alpha, palette or CMYK, or holds several pictures (reduced copies
+    do not count).
     """
     import tifffile
 
-    _hush(logging.getLogger("tifffile"))
+    _silence_logger(logging.getLogger("tifffile"))
     with tifffile.TiffFile(BytesIO(raw)) as tiff:
         _check_chain(tiff, raw)
         page = _only_page(tiff)
@@ -59,26 +60,26 @@ def decode_tiff(raw: bytes) -> Decoded:
     )
 
 
-def _hush(logger: logging.Logger) -> None:
-    """Keep a damaged file from printing through logging's last resort; the exception says what is wrong."""
+def _silence_logger(logger: logging.Logger) -> None:
+    """Keep tifffile from printing about a damaged file: the exception has the cause."""
     if not any(isinstance(h, logging.NullHandler) for h in logger.handlers):
         logger.addHandler(logging.NullHandler())
 
 
 def _check_chain(tiff: Any, raw: bytes) -> None:
-    """The last directory must be whole and say that it is the last: tifffile drops pictures that it cannot find."""
+    """Check that the last directory is complete and marked as the last: tifffile drops pictures that it cannot find."""
     if not len(tiff.pages):
-        raise refuse("truncated or damaged TIFF: its directory is not in the file")
+        raise bad_image("truncated or damaged TIFF: its directory is not in the file")
     form, last = tiff.tiff, tiff.pages[-1].offset
     (tags,) = struct.unpack_from(form.tagnoformat, raw, last)
     if any(struct.unpack_from(form.offsetformat, raw, last + form.tagnosize + tags * form.tagsize)):
-        raise refuse("truncated or damaged TIFF: one of its directories is not in the file")
+        raise bad_image("truncated or damaged TIFF: one of its directories is not in the file")
 
 
 def _only_page(tiff: Any) -> Any:
     full = [page for page in tiff.pages if not page.is_reduced]
     if len(full) != 1:
-        raise refuse(f"TIFF holds {len(full)} pictures; startrack reads files with one")
+        raise bad_image(f"TIFF holds {len(full)} pictures; startrack reads files with one")
     page = full[0]
     check_size(page.imagewidth, page.imagelength)
     # A stack can hide behind one page: ImageJ and tifffile write its true shape into the description.
@@ -86,7 +87,7 @@ def _only_page(tiff: Any) -> Any:
     if tiff.is_imagej and (tiff.imagej_metadata or {}).get("images", 1) > 1:
         hidden = page.size * tiff.imagej_metadata["images"]
     if hidden > page.size:
-        raise refuse("TIFF holds a stack of pictures; startrack reads files with one")
+        raise bad_image("TIFF holds a stack of pictures; startrack reads files with one")
     return page
 
 
@@ -94,27 +95,27 @@ def _check_kind(page: Any) -> None:
     photometric, channels = int(page.photometric), page.samplesperpixel
     if photometric not in CHANNELS:
         kind = REFUSED.get(photometric, f"photometric type {photometric}")
-        raise refuse(f"TIFF is {kind}; startrack reads plain grey or colour")
+        raise bad_image(f"TIFF is {kind}; startrack reads plain grey or colour")
     if channels != CHANNELS[photometric]:
-        raise refuse(f"TIFF has {channels} channels (alpha?); startrack reads plain grey or colour")
+        raise bad_image(f"TIFF has {channels} channels (alpha?); startrack reads plain grey or colour")
     if page.imagedepth != 1:
-        raise refuse("TIFF holds a volume; startrack reads pictures")
+        raise bad_image("TIFF holds a volume; startrack reads pictures")
     if page.dtype is None or page.dtype.name not in TYPES or page.bitspersample != page.dtype.itemsize * 8:
-        raise refuse(f"TIFF has {page.bitspersample}-bit samples of type {page.dtype}; startrack reads {READ}")
+        raise bad_image(f"TIFF has {page.bitspersample}-bit samples of type {page.dtype}; startrack reads {READ}")
 
 
 def _check_strips(page: Any, file_bytes: int) -> None:
-    """Every strip or tile must lie within the file: a decoder would fill what is missing with a constant."""
+    """Check that every strip or tile is in the file: a decoder would fill a missing one with a constant."""
     if page.is_tiled:
         check_size(page.tilewidth, page.tilelength)  # a tile may be larger than the picture it is cropped to
     starts, counts = page.dataoffsets, page.databytecounts
     if not starts or len(starts) != len(counts) or len(starts) != math.prod(page.chunked):
-        raise refuse("damaged TIFF: strips of the picture are missing")
+        raise bad_image("damaged TIFF: strips of the picture are missing")
     for start, count in zip(starts, counts, strict=True):
         if start <= 0 or count <= 0 or start + count > file_bytes:
-            raise refuse("truncated TIFF: a strip of the picture lies beyond the end of the file")
+            raise bad_image("truncated TIFF: a strip of the picture lies beyond the end of the file")
     if page.compression == UNCOMPRESSED and sum(counts) < page.size * page.dtype.itemsize:
-        raise refuse("damaged TIFF: its strips are shorter than the picture")
+        raise bad_image("damaged TIFF: its strips are shorter than the picture")
 
 
 def _pixels(page: Any, raw: bytes) -> NDArray[Any]:
@@ -127,7 +128,7 @@ def _pixels(page: Any, raw: bytes) -> NDArray[Any]:
         stored = _pixels_by_opencv(raw, page.compression)
     want = (page.imagelength, page.imagewidth, 3)[: 3 if page.samplesperpixel == 3 else 2]
     if stored.shape != want or stored.dtype.newbyteorder("=") != page.dtype.newbyteorder("="):
-        raise refuse(f"damaged TIFF: decodes to {stored.shape} of {stored.dtype}")
+        raise bad_image(f"damaged TIFF: decodes to {stored.shape} of {stored.dtype}")
     return stored
 
 
@@ -137,13 +138,13 @@ def _pixels_by_opencv(raw: bytes, compression: Any) -> NDArray[Any]:
     with _quiet(cv2):
         stored = cv2.imdecode(np.frombuffer(raw, np.uint8), cv2.IMREAD_UNCHANGED)
     if stored is None:
-        raise refuse(f"TIFF is damaged or its compression ({compression!r}) is unknown here; save it uncompressed")
+        raise bad_image(f"TIFF is damaged or its compression ({compression!r}) is unknown here; save it uncompressed")
     return np.asarray(stored)
 
 
 @contextmanager
 def _quiet(cv2: Any) -> Iterator[None]:
-    """OpenCV prints a failed decoding to stderr; the exception says it instead."""
+    """Keep OpenCV from printing about a failed decoding: the exception has the cause."""
     log = cv2.utils.logging
     level = log.setLogLevel(log.LOG_LEVEL_SILENT)
     try:

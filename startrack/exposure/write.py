@@ -1,4 +1,4 @@
-"""From an `Exposure` to a file: PNG, TIFF or FITS with its facts inside, under its name only when it is whole."""
+"""From an `Exposure` to a file: PNG, TIFF or FITS with its metadata, written atomically; and sidecars."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ PACKED = {".gz": lambda data: gzip.compress(data, compresslevel=1, mtime=0), ".b
 
 
 def write_exposure(path: str | os.PathLike[str], exposure: Exposure, *, overwrite: bool = False) -> Path:
-    """Write the image by suffix (.png, .tif, .tiff, .fits, .fits.gz, .fits.bz2), facts inside, and return its path.
+    """Write the image by suffix (.png, .tif, .tiff, .fits, .fits.gz, .fits.bz2) with its metadata; return its path.
 
     PNG holds 16-bit counts (8-bit ones if that is what the exposure was read from), rounded; TIFF and FITS too, or
     float32 if the pixels are not such counts. Camera and terrain paths are written relative to the file. The same
-    exposure gives the same bytes. `write_sidecar` is the other place for the facts.
+    exposure gives the same bytes.
 
     Raises:
         BadInput: bad_image if the file exists and not `overwrite`, the suffix is not known, the pixels do not fit the
@@ -50,13 +50,17 @@ def write_exposure(path: str | os.PathLike[str], exposure: Exposure, *, overwrit
 
 
 def write_sidecar(image: str | os.PathLike[str], facts: Facts | Exposure, *, overwrite: bool = False) -> Path:
-    """Write the facts that are known to NAME.json beside the image NAME.png, and return the sidecar's path."""
+    """Write the known metadata to NAME.json beside the image NAME.png, and return the sidecar's path.
+
+    Raises BadInput bad_image if the file exists and not `overwrite`, or if it cannot be written.
+    """
     target = sidecars(Path(image))[-1]
     values = {
         "time_utc": None if facts.time_utc is None else format_utc(facts.time_utc),
         "exposure_s": facts.exposure_s,
         "camera": _relative(facts.camera, target.parent),
         "terrain": _relative(facts.terrain, target.parent),
+        "bayer_pattern": facts.bayer_pattern if isinstance(facts, Facts) else None,
     }
     text = json.dumps({k: v for k, v in values.items() if v is not None}, ensure_ascii=False, allow_nan=False)
     write_atomically(target, text.encode("utf-8") + b"\n", overwrite=overwrite)
@@ -64,7 +68,7 @@ def write_sidecar(image: str | os.PathLike[str], facts: Facts | Exposure, *, ove
 
 
 def header_entries(exposure: Exposure, folder: Path) -> dict[str, str | float]:
-    """The known facts under the names of a FITS header, both dates among them; paths relative to `folder`."""
+    """The known metadata under the names of a FITS header, with both dates; paths relative to `folder`."""
     entries: dict[str, str | float] = {}
     if exposure.time_utc is not None:
         entries["TIMESYS"] = "UTC"

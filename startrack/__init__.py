@@ -10,8 +10,12 @@
 
 from typing import TYPE_CHECKING, Any
 
+from startrack.compilation import choose_cache_folder
+
 __version__ = "0.1.0"
 __all__ = ["Solution", "__version__", "locate"]
+
+choose_cache_folder()
 
 if TYPE_CHECKING:
     from startrack.api import Solution, locate

@@ -1,11 +1,9 @@
-"""Quick frames for the tests of batches, and work for their processes that ends as the name of the image says."""
+"""Quick frames for the tests of batches."""
 
 from __future__ import annotations
 
 import io
 import json
-import os
-import time
 from pathlib import Path
 from typing import Any
 
@@ -45,11 +43,3 @@ def listed(*names: str, end: str = "\n") -> io.TextIOWrapper:
 def task_of(image: Path, out: Path, plots: bool = False, **facts: Any) -> Task:
     """The batch's task for one image."""
     return Task(name=image.name, path=str(image), result=str(out / f"{image.stem}.fix.json"), facts=facts, plots=plots)
-
-
-def die_if_told(task: Task) -> tuple[dict[str, Any], bool]:
-    """Work that takes a moment, tells its process, and takes the process with it where the image's name says so."""
-    time.sleep(0.02)
-    if "deadly" in task.name:
-        os._exit(9)
-    return {"image": task.name, "reason": None, "process": os.getpid()}, False

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 from astropy.table import Table
-from batch_helpers import die_if_told, frames, task_of
+from batch_helpers import frames
 
-from startrack.batch import Batch, BatchStopped, Task
 from startrack.cli.main import main
-
-TOGETHER = 2  # processes
 
 
 def begun(folder: Path, *flags: str, before: str = "") -> subprocess.Popen[str]:
@@ -29,79 +23,13 @@ def begun(folder: Path, *flags: str, before: str = "") -> subprocess.Popen[str]:
     return subprocess.Popen(shell, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
-def tasks(folder: Path, names: Sequence[str]) -> list[Task]:
-    return [task_of(folder / name, folder / "out") for name in names]
-
-
-def outcomes(batch: Batch, todo: Sequence[Task]) -> dict[str, dict[str, Any]]:
-    done = {record["image"]: record for record, _ in batch.results(todo)}
-    assert sorted(done) == [task.name for task in todo]
-    return done
-
-
-def test_an_image_that_kills_its_process_costs_the_others_nothing(tmp_path):
-    names = [f"{number:02d}.png" for number in range(60)]
-    names[5] = names[5].replace(".", "-deadly.")
-    names[40] = names[40].replace(".", "-deadly.")
-    done = outcomes(Batch(jobs=TOGETHER, work=die_if_told), tasks(tmp_path, names))
-    died = [name for name, record in done.items() if record["reason"] == "internal_error"]
-    assert died == [name for name in names if "deadly" in name]
-    # Those in hand at a death are done one at a time, by one process until it dies and by one after it; then the
-    # processes work side by side again.
-    assert len({record["process"] for record in done.values() if "process" in record}) <= 3 * TOGETHER + 2 * 2
-    assert json.loads((tmp_path / "out" / "05-deadly.fix.json").read_text())["reason"] == "internal_error"
-
-
-def test_a_death_casts_suspicion_on_what_processes_were_at(tmp_path):
-    names = [f"{number:02d}.png" for number in range(12)]
-    names[3] = "03-deadly.png"
-    todo = tasks(tmp_path, names)
-    ends: list[tuple[list[Task], list[Task]]] = []
-
-    def whole() -> Iterator[tuple[dict[str, Any], bool]]:
-        ends.append((yield from Batch(work=die_if_told)._until_one_dies(iter(todo), TOGETHER, len(todo))))
-
-    done = [record["image"] for record, _ in whole()]
-    ((suspects, queued),) = ends
-    assert "03-deadly.png" in [task.name for task in suspects]
-    assert len(suspects) <= TOGETHER
-    assert sorted(done + [task.name for task in (*suspects, *queued)]) == names
-
-
-def test_an_image_that_kills_dask_workers_is_given_up_and_the_others_are_done(tmp_path):
-    distributed = pytest.importorskip("distributed")
-    dask = pytest.importorskip("dask")
-    names = ["00.png", "01-deadly.png", "02.png", "03.png"]
-    with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
-        distributed.LocalCluster(1, processes=True, threads_per_worker=1, dashboard_address=None) as cluster,
-    ):
-        batch = Batch(cluster=cluster.scheduler_address, work=die_if_told)
-        done = outcomes(batch, tasks(tmp_path, names))
-    assert done["01-deadly.png"]["reason"] == "internal_error"
-    assert "workers that worked on it died" in done["01-deadly.png"]["message"]
-
-
 def test_a_scheduler_that_does_not_answer_is_bad_input(tmp_path, capsys, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("startrack.batch.run.CONNECT_S", 0.2)
+    monkeypatch.setattr("startrack.runner.CONNECT_S", 0.2)
     frames(tmp_path / "images", 1)
     out, nobody = str(tmp_path / "out"), "tcp://127.0.0.1:1"
     assert main(["batch", str(tmp_path / "images"), "-D", out, "--cluster", nobody]) == 4
     assert f"{nobody}: no Dask scheduler answers" in capsys.readouterr().err
-
-
-def test_a_scheduler_that_goes_stops_the_batch(tmp_path):
-    """It ends, as far as the client can tell, after the first outcome."""
-    distributed = pytest.importorskip("distributed")
-    todo = tasks(tmp_path, [f"{number:02d}.png" for number in range(200)])
-    with distributed.LocalCluster(1, processes=True, threads_per_worker=1, dashboard_address=None) as cluster:
-        results = Batch(cluster=cluster.scheduler_address, work=die_if_told).results(todo)
-        next(results)
-        cluster.close()
-        with pytest.raises(BatchStopped, match=r"the Dask scheduler has gone [^\n]*$"):
-            list(results)
-    assert not logging.getLogger("distributed.client").isEnabledFor(logging.ERROR)  # it would add tracebacks
 
 
 @pytest.mark.parametrize(

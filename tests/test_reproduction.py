@@ -2,6 +2,7 @@
 
 import io
 import json
+import sys
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
@@ -11,44 +12,59 @@ import pytest
 from PIL import Image
 from scipy import stats
 
+from startrack import runner
 from startrack.cli import reproduce as cli
 from startrack.cli.main import main
+from startrack.cli.progress import Progress, progress
 from startrack.localization import ExactPosterior, Hull, PseudoGradient
-from startrack.reproduction import ARTEFACTS, FULL, QUICK, Context, Runs, Size, published, runs, written
+from startrack.reproduction import (
+    ARTEFACTS,
+    FULL,
+    QUICK,
+    ChunkStore,
+    Context,
+    Size,
+    chunks,
+    published,
+    write_artefact,
+)
 from startrack.reproduction.bound import cell_centroid
-from startrack.reproduction.methods import KUA, OURS, Task, done, tasks
+from startrack.reproduction.methods import KUA, OURS, Task, compute_chunk, tasks_of
 from startrack.reproduction.simulator import (
     PERFECT,
     Mistakes,
     Sky,
+    changes_m,
     crater,
     crater_edge,
     directions,
+    gaps_m,
+    mean_gap_m,
     places,
     star_count,
+    stepped_m,
     visible,
 )
-from startrack.reproduction.traverse import changes_m, gaps_m, mean_gap_m, stepped_m
 
 SMALL = Size(
-    "small", skies=10, per_sky=300, ours_per_sky=10, cell_per_sky=10, deep_per_sky=3, one_sky=500, ours_one_sky=150,
+    "small", skies=10, per_sky=300, ours_per_sky=10, bound_per_sky=10, deep_per_sky=3, one_sky=500, ours_one_sky=150,
     sweep_skies=1, sweep_per_sky=4, traverses=10,
 )  # fmt: skip
-TINY = replace(SMALL, skies=3, per_sky=8, ours_per_sky=4, cell_per_sky=4, deep_per_sky=1, one_sky=8, ours_one_sky=4)
+TINY = replace(SMALL, skies=3, per_sky=8, ours_per_sky=4, bound_per_sky=4, deep_per_sky=1, one_sky=8, ours_one_sky=4)
 
 
 @contextmanager
 def silent(what, total):
-    yield lambda steps: None
+    yield Progress()
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """Every table and figure of a small run, with its files."""
     out = tmp_path_factory.mktemp("reproduced")
-    with Runs(out, jobs=1, progress=silent) as some:
-        pieces = {name: make(Context(SMALL, 0, some)) for name, make in ARTEFACTS.items()}
-    return {name: (piece, written(piece, out, plots=True)) for name, piece in pieces.items()}
+    with ChunkStore(out, jobs=1, progress=silent) as store:
+        artefacts = {name: make(Context(SMALL, 0, store)) for name, make in ARTEFACTS.items()}
+    return {name: (artefact, write_artefact(artefact, out, plots=True)) for name, artefact in artefacts.items()}
 
 
 # The simulator
@@ -72,16 +88,16 @@ def test_smaller_runs_are_the_beginning_of_larger_ones():
     small, large = Sky.drawn(0, 4, 5.0), Sky.drawn(0, 4, 7.0)
     np.testing.assert_array_equal(small.elevation_rad, large.elevation_rad[: len(small)])
     np.testing.assert_array_equal(places(0, 4, 10, 20), places(0, 4, 0, 500)[10:20])
-    whole = done(Task(KUA, 0, 1, 0, 12))
-    parts = [done(Task(KUA, 0, 1, start, start + 6)) for start in (0, 6)]
+    whole = compute_chunk(Task(KUA, 0, 1, 0, 12))
+    parts = [compute_chunk(Task(KUA, 0, 1, start, start + 6)) for start in (0, 6)]
     np.testing.assert_array_equal(whole["refined_m"], np.concatenate([part["refined_m"] for part in parts]))
-    assert sum(map(len, tasks(OURS, 0, 0, 250))) == 250
+    assert sum(map(len, tasks_of(OURS, 0, 0, 250))) == 250
 
 
 def test_stars_in_sight_are_those_above_the_horizon_and_inside_the_drawn_edge():
     from matplotlib.path import Path as Polygon
 
-    from startrack.reproduction.plots import fisheye
+    from startrack.reproduction.drawing import fisheye
 
     sky, cylinder = Sky.drawn(0, 0), crater()
     for place in places(0, 0, 0, 10):
@@ -119,7 +135,7 @@ def test_the_middle_of_a_cell_with_straight_walls(size):
 
 def test_the_localizers_give_what_the_table_is_made_of():
     task = Task(KUA, 0, 2, 0, 5)
-    chunk, sky, cylinder = done(task), Sky.drawn(0, 2), crater()
+    chunk, sky, cylinder = compute_chunk(task), Sky.drawn(0, 2), crater()
     for k, place in enumerate(places(0, 2, 0, 5)):
         evidence = PERFECT.evidence(sky, visible(sky.on_rim_plane(cylinder), place, cylinder.radius_m))
         hull, refined = Hull()(evidence, cylinder), PseudoGradient()(evidence, cylinder)
@@ -149,11 +165,11 @@ def test_ours_is_the_middle_of_the_exact_cell():
 
 
 def test_skyline_is_better_near_the_centre_and_stars_near_the_wall(made):
-    piece = made["fig3.10"][0]
-    columns = {column.name: [float(v) for v in column.values] for column in piece.columns}
+    artefact = made["fig3.10"][0]
+    columns = {column.name: [float(v) for v in column.values] for column in artefact.columns}
     assert columns["hull_mean"][-1] > 2 * columns["hull_mean"][0]
     assert columns["descent_mean"][0] > 2 * columns["descent_mean"][-1]
-    assert piece.values["ours"]["mean_m"] < 0.8 * piece.values["reproduced"]["mean_m"]
+    assert artefact.values["ours"]["mean_m"] < 0.8 * artefact.values["reproduced"]["mean_m"]
 
 
 def test_the_published_trials_average_to_the_published_overall():
@@ -187,7 +203,7 @@ def test_distances_between_changes_are_the_thesis_s():
 
 @pytest.mark.parametrize("name", cli.NAMES)
 def test_each_table_and_figure_is_written(made, name):
-    piece, files = made[name]
+    artefact, files = made[name]
     pictures = [path for path in files if path.suffix == ".png"]
     assert len(pictures) == {"table3.1": 0, "figB": 10, "fig3.10": 2}.get(name, 1)
     for path in pictures:
@@ -197,10 +213,10 @@ def test_each_table_and_figure_is_written(made, name):
             assert len(picture.getcolors()) > 8  # something is drawn
         assert path.stat().st_size < 200_000
     text = files[-1].read_text(encoding="utf-8")
-    assert text.startswith(f"## {piece.title}") and all(path.name in text for path in pictures)
-    json.dumps(piece.values)
+    assert text.startswith(f"## {artefact.title}") and all(path.name in text for path in pictures)
+    json.dumps(artefact.values)
     if name not in {"fig3.3", "fig3.5", "fig3.6", "magnitude", "aspect"}:  # no number of the thesis belongs to these
-        assert "thesis" in text and piece.values["thesis"]
+        assert "thesis" in text and artefact.values["thesis"]
 
 
 def test_tables_are_read_by_astropy(made):
@@ -220,7 +236,7 @@ def test_names_of_the_command_are_those_that_can_be_made():
     assert QUICK.per_sky < FULL.per_sky
     fewer = FULL.with_ours(700)
     assert (fewer.per_sky, fewer.one_sky) == (FULL.per_sky, FULL.one_sky)
-    assert (fewer.ours_per_sky, fewer.cell_per_sky, fewer.deep_per_sky, fewer.ours_one_sky) == (700, 700, 500, 7000)
+    assert (fewer.ours_per_sky, fewer.bound_per_sky, fewer.deep_per_sky, fewer.ours_one_sky) == (700, 700, 500, 7000)
 
 
 # Runs
@@ -252,42 +268,42 @@ def test_a_cluster_gives_the_same_bytes(tmp_path, monkeypatch):
 
 def test_a_cluster_that_does_not_answer_is_named(tmp_path, capsys, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(runs, "CONNECT_S", 0.5)
+    monkeypatch.setattr(runner, "CONNECT_S", 0.5)
     assert main(["reproduce", "fig3.4", "--cluster", "tcp://127.0.0.1:9", "-D", str(tmp_path)]) == 4
     assert "127.0.0.1:9" in capsys.readouterr().err
 
 
 def test_a_stopped_run_goes_on_from_where_it_was(tmp_path, monkeypatch):
-    wanted = [task for sky in range(4) for task in tasks(KUA, 0, sky, 3)]
+    wanted = [task for sky in range(4) for task in tasks_of(KUA, 0, sky, 3)]
     computed = []
 
     def stopping(task):
         if len(computed) == 2:
             raise KeyboardInterrupt
         computed.append(task)
-        return done(task)
+        return compute_chunk(task)
 
-    monkeypatch.setattr(runs, "done", stopping)
-    with Runs(tmp_path, jobs=1, progress=silent) as some, pytest.raises(KeyboardInterrupt):
-        list(some.chunks("stopped", wanted))
-    assert len(list((tmp_path / runs.FOLDER).iterdir())) == 2  # whole chunks only, no temporary files
+    monkeypatch.setattr(chunks, "compute_chunk", stopping)
+    with ChunkStore(tmp_path, jobs=1, progress=silent) as store, pytest.raises(KeyboardInterrupt):
+        list(store.chunks("stopped", wanted))
+    assert len(list((tmp_path / chunks.FOLDER).iterdir())) == 2  # whole chunks only, no temporary files
     computed.clear()
-    monkeypatch.setattr(runs, "done", lambda task: computed.append(task) or done(task))
-    with Runs(tmp_path, jobs=1, progress=silent) as some:
-        chunks = list(some.chunks("resumed", wanted))
+    monkeypatch.setattr(chunks, "compute_chunk", lambda task: computed.append(task) or compute_chunk(task))
+    with ChunkStore(tmp_path, jobs=1, progress=silent) as store:
+        computed_chunks = list(store.chunks("resumed", wanted))
         assert computed == wanted[2:]
-        assert len(list(some.chunks("again", wanted))) == 4 and computed == wanted[2:]
-    for task, chunk in zip(wanted, chunks, strict=True):
-        np.testing.assert_array_equal(chunk["refined_m"], done(task)["refined_m"])
+        assert len(list(store.chunks("again", wanted))) == 4 and computed == wanted[2:]
+    for task, chunk in zip(wanted, computed_chunks, strict=True):
+        np.testing.assert_array_equal(chunk["refined_m"], compute_chunk(task)["refined_m"])
 
 
 def test_chunks_of_other_settings_are_not_taken(tmp_path, monkeypatch):
     one = Task(KUA, 0, 0, 0, 3)
     others = [replace(one, seed=1), replace(one, stop=4), replace(one, aspect_ratio=5.0), replace(one, method=OURS),
               replace(one, mistakes=Mistakes(0.1, 0.1))]  # fmt: skip
-    keys = {runs._key(task) for task in [one, *others]}
-    monkeypatch.setattr(runs, "__version__", "another")
-    assert len(keys | {runs._key(one)}) == len(others) + 2
+    keys = {chunks._key(task) for task in [one, *others]}
+    monkeypatch.setattr(chunks, "__version__", "another")
+    assert len(keys | {chunks._key(one)}) == len(others) + 2
 
 
 # The command
@@ -335,9 +351,9 @@ def test_a_progress_bar_on_a_terminal_only(monkeypatch):
     shown = {}
     for kind in (io.StringIO, Terminal):
         monkeypatch.setattr("sys.stderr", kind())
-        with cli._progress("fixes", 10) as advance:
-            advance(10)
-        shown[kind] = cli.sys.stderr.getvalue()
+        with progress("fixes", 10) as bar:
+            bar.advance(10)
+        shown[kind] = sys.stderr.getvalue()
     assert shown[io.StringIO] == "" and "fixes" in shown[Terminal]
 
 

@@ -2,7 +2,6 @@
 
 from startrack.batch.find import Image, images_under, named_images
 from startrack.batch.rows import Rows, gist, rows_of
-from startrack.batch.run import Batch, Counts
 from startrack.batch.store import (
     JOB,
     LOCK,
@@ -14,15 +13,13 @@ from startrack.batch.store import (
     stored,
 )
 from startrack.batch.tables import write_tables
-from startrack.batch.task import BatchStopped, Task, locate_image
+from startrack.batch.task import Outcome, Task, locate_image, locate_images
 
 __all__ = [
     "JOB",
     "LOCK",
-    "Batch",
-    "BatchStopped",
-    "Counts",
     "Image",
+    "Outcome",
     "Rows",
     "Task",
     "gist",
@@ -30,6 +27,7 @@ __all__ = [
     "in_the_tables",
     "is_of_other_images",
     "locate_image",
+    "locate_images",
     "named_images",
     "only_writer",
     "printable",

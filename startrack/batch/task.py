@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import errno
-from contextlib import suppress
+from collections.abc import Generator, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,16 +13,14 @@ from startrack import __version__
 from startrack.batch.fingerprint import MISSING, hashes_of, key_of, sha256_of, unchanged, untouched_since
 from startrack.batch.store import INPUTS, JOB, has_companions, image_sha256, is_solved, printable, stored
 from startrack.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
+from startrack.runner import Died, Runner, RunStopped
 
 if TYPE_CHECKING:
     from startrack.stages import Outcome
 
-# Errors of writing that the next image meets too.
-OF_THE_DISK = {errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.EFBIG, errno.EIO}
-
-
-class BatchStopped(Exception):
-    """No image can be done any more: the disk is full, the cluster has gone. The message says which."""
+Record = dict[str, Any]
+Outcome = tuple[Record, bool]  # the record, and whether it was there already
+DISK_ERRORS = {errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.EFBIG, errno.EIO}
 
 
 @dataclass(frozen=True)
@@ -34,13 +33,20 @@ class Task:
     facts: dict[str, Any] = field(default_factory=dict)  # from flags: time_utc, exposure_s, camera, terrain
     plots: bool = True
     renew: bool = False  # do it again even where the result is there
-    compiled: bool = False  # the localizer's compiled engine
+    localizer: str = "posterior"  # of startrack.localization.LOCALIZERS
 
 
-def locate_image(task: Task) -> tuple[dict[str, Any], bool]:
+def locate_images(runner: Runner[Task, Outcome], tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
+    """The outcomes in the order of completion. Raises BadInput (no_cluster), RunStopped."""
+    with closing(runner.results(tasks)) as results:
+        for task, outcome in results:
+            yield (lost(task, f"internal error: {outcome.cause}"), False) if isinstance(outcome, Died) else outcome
+
+
+def locate_image(task: Task) -> Outcome:
     """The image's record, and whether it was there already. Never raises for an image's sake.
 
-    NAME.fix.json is written last, so that a result that is there is whole. Raises BatchStopped where the disk takes
+    NAME.fix.json is written last, so that a result that is there is whole. Raises RunStopped where the disk takes
     no more.
     """
     try:
@@ -86,7 +92,7 @@ def _standing(task: Task, key: str) -> dict[str, Any] | None:
 
 
 def _key(task: Task, sha256: str) -> str:
-    return key_of(task.path, sha256, task.facts, task.plots, task.compiled)
+    return key_of(task.path, sha256, task.facts, task.plots, task.localizer)
 
 
 def _fresh(task: Task, sha256: str, key: str) -> dict[str, Any]:
@@ -129,7 +135,7 @@ def _clear(result: Path) -> None:
 def _located(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str, str]]:
     """A result that has companions, or else the record of a refusal; and the hashes of its other files."""
     from startrack.exposure import read_exposure
-    from startrack.localization import ExactPosterior
+    from startrack.localization import LOCALIZERS
     from startrack.output import refused_dict, result_dict
     from startrack.pipeline import Settings, locate_exposure
     from startrack.stages import Inputs, Refused
@@ -140,7 +146,7 @@ def _located(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[st
         return {**refused_dict(task.name, cause.reason, str(cause)), **_unread(sha256)}, {}
     inputs = hashes_of(task.path, [exposure.camera, exposure.terrain])  # before they are read: one that changes is seen
     try:
-        return locate_exposure(exposure, Settings(localizer=ExactPosterior(compiled=task.compiled))), inputs
+        return locate_exposure(exposure, Settings(localizer=LOCALIZERS[task.localizer]())), inputs
     except BadInput as cause:
         return result_dict(Refused(reason=cause.reason, message=str(cause), reached=Inputs(exposure=exposure))), inputs
 
@@ -152,5 +158,5 @@ def _unread(sha256: str) -> dict[str, Any]:
 
 
 def _stop_where_the_disk_is_full(cause: BadInput) -> None:
-    if isinstance(cause.__cause__, OSError) and cause.__cause__.errno in OF_THE_DISK:
-        raise BatchStopped(str(cause)) from cause
+    if isinstance(cause.__cause__, OSError) and cause.__cause__.errno in DISK_ERRORS:
+        raise RunStopped(str(cause)) from cause

@@ -11,15 +11,17 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.batch_show import Halt, left_aside, progress, signals_halt, summary
-from startrack.cli.common import DEFAULT_OUT, add_fact_flags, cores, flag_facts
+from startrack.cli.batch_show import Counts, Halt, omission_lines, outcomes_shown, signals_halt, summary
+from startrack.cli.common import DEFAULT_OUT, add_fact_flags, add_localizer_flag, cores, flag_facts, localizer_of
 from startrack.cli.flag_types import at_least_one
-from startrack.cli.horizons import ready_for
+from startrack.cli.preparation import compile_kernels, prepare_reference
+from startrack.compilation import announce
 from startrack.errors import INTERNAL_ERROR, BadInput
 from startrack.files import is_path, make_folder
 
 if TYPE_CHECKING:
-    from startrack.batch import Batch, Counts, Image, Task
+    from startrack.batch import Image, Outcome, Task
+    from startrack.runner import Runner
 
 OK, FAULT, STOPPED = 0, 1, 5
 SCHEMES = ("", "tcp", "tls", "ucx", "ws", "wss")  # of Dask's addresses
@@ -39,6 +41,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("folder", metavar="FOLDER", help="folder of the images, with all below it")
     add_fact_flags(parser)
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file, or the name of a shipped one")
+    add_localizer_flag(parser)
     workers = parser.add_mutually_exclusive_group()
     workers.add_argument(
         "-j", "--jobs", type=at_least_one, default=None, metavar="N", help="processes (default: all cores)"
@@ -59,7 +62,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="accepted everywhere; here nothing is random")
     parser.add_argument("-v", "--verbose", action="count", default=0, help="a line for every image and warning")
     parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
-    parser.set_defaults(usage_error=parser.error)
+    parser.set_defaults(run=run, usage_error=parser.error)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -69,6 +72,7 @@ def run(args: argparse.Namespace) -> int:
     from startrack.batch import images_under, named_images, only_writer
 
     facts = _facts(args)
+    localizer_of(args)
     _check_files_of_flags(facts)
     whole = images_under(args.folder, args.dir)
     found = named_images(args.folder, _names(sys.stdin.buffer.read()), args.dir) if args.files_on_stdin else whole
@@ -88,22 +92,25 @@ def _run(
     found: Sequence[Image], whole: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace
 ) -> int:
     """`found` done; tables of that and of the `whole` folder; the exit code."""
-    from startrack.batch import Batch, Counts
+    from startrack.batch import locate_image
+    from startrack.runner import Runner
 
     _check_whose(out, whole, args)
     tasks = _tasks(found, out, facts, args)
     if args.cluster is None and not all(Path(task.result).exists() for task in tasks):
-        ready_for(_terrain_of(tasks[0]), args)
-    batch, counts = Batch(jobs=args.jobs or cores(), cluster=args.cluster), Counts()
-    halt = Halt(batch)
+        _prepare(tasks[0], args)
+    counts = Counts()
+    runner: Runner[Task, Outcome] = Runner(locate_image, jobs=args.jobs or cores(), cluster=args.cluster)
+    halt = Halt(runner.stop)
     with signals_halt(halt):
-        records, stopped = _work_off(batch, tasks, counts, halt, args)
+        with runner:
+            records, stopped = _locate_all(runner, tasks, counts, halt, args)
         try:
             _write_tables(
                 out,
                 _tasks(sorted({*whole, *found}), out, facts, args),
                 records,
-                {**_shown(facts), "plots": not args.no_plots},
+                {**_shown(facts), "localizer": args.localizer, "plots": not args.no_plots},
             )
             tables = f"tables in {out}"
         except BadInput as cause:
@@ -124,22 +131,23 @@ def _run(
     return OK if counts["ok"] == len(tasks) else STOPPED
 
 
-def _work_off(
-    batch: Batch, tasks: Sequence[Task], counts: Counts, halt: Halt, args: argparse.Namespace
+def _locate_all(
+    runner: Runner[Task, Outcome], tasks: Sequence[Task], counts: Counts, halt: Halt, args: argparse.Namespace
 ) -> tuple[list[dict[str, Any]], str | None]:
-    """What the tables need of each image that was done, and why it was not all of them."""
-    from startrack.batch import BatchStopped, gist
+    """What the tables need of each image that was done, and why not all of them were."""
+    from startrack.batch import gist, locate_images
+    from startrack.runner import RunStopped
 
     records: list[dict[str, Any]] = []
     try:
-        with progress(len(tasks), args, halt) as tell, closing(batch.results(tasks)) as outcomes:
+        with outcomes_shown(len(tasks), args, halt) as show, closing(locate_images(runner, tasks)) as outcomes:
             for record, kept in outcomes:
                 records.append(gist(record))
                 counts["error" if record["reason"] == INTERNAL_ERROR else str(record["status"])] += 1
                 counts["kept"] += kept
                 counts["warned"] += bool(record.get("warnings"))
-                tell(record, counts)
-    except BatchStopped as cause:
+                show(record, counts)
+    except RunStopped as cause:
         halt.why = str(cause)
     except KeyboardInterrupt:  # the images in hand are dropped; what is done has its tables all the same
         halt("interrupted")
@@ -181,14 +189,21 @@ def _check_files_of_flags(facts: dict[str, Any]) -> None:
 def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace) -> list[Task]:
     from startrack.batch import Task, result_of
 
-    compiled, here = find_spec("numba") is not None, Path(os.path.abspath(out))
+    here = Path(os.path.abspath(out))
     return [
         Task(
             name=image.name, path=os.path.abspath(image.path), result=str(result_of(here, image)), facts=facts,
-            plots=not args.no_plots, renew=args.overwrite, compiled=compiled,
+            plots=not args.no_plots, renew=args.overwrite, localizer=args.localizer,
         )
         for image in found
     ]  # fmt: skip
+
+
+def _prepare(task: Task, args: argparse.Namespace) -> None:
+    """Prepare the terrain of an image, as a rule that of all, once instead of in every process."""
+    terrain = prepare_reference(_terrain_of(task), args)
+    if terrain is not None and announce(height_map=not terrain.axisymmetric):
+        compile_kernels(terrain)
 
 
 def _terrain_of(task: Task) -> str | None:
@@ -213,7 +228,7 @@ def _write_tables(
 
     found = rows_of(tasks, {record["image"]: record for record in records}, os.path.abspath(out))
     write_tables(out, found.rows, settings)
-    for line in left_aside(found):
+    for line in omission_lines(found):
         print(f"startrack: {line}", file=sys.stderr)
 
 

@@ -9,31 +9,34 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from startrack.cli.progress import progress
 from startrack.errors import INTERNAL_ERROR
 
 if TYPE_CHECKING:
-    from startrack.batch import Batch, Counts, Rows
+    from startrack.batch import Rows
 
 SHOWN = ("ok", "ambiguous", "refused", "error")
 FINISHING = b"\nstartrack: finishing the images in hand; Ctrl-C once more drops them\n"
 ONE_WISH_S = 1.0  # within it a second signal is the first one's echo: timeout and schedulers signal the group besides
-Tell = Callable[[dict[str, Any], "Counts"], None]
+Counts = Counter[str]  # images by outcome: ok, ambiguous, refused, error; and of those kept, warned
+Show = Callable[[dict[str, Any], Counts], None]
 
 
 class Halt:
     """Asks a batch to end when the images in hand are done, and remembers why."""
 
-    def __init__(self, batch: Batch) -> None:
+    def __init__(self, stop: Callable[[], None]) -> None:
         self.why: str | None = None
-        self._batch = batch
+        self._stop = stop
 
     def __call__(self, why: str) -> None:
         self.why = self.why or why
-        self._batch.stop()
+        self._stop()
 
 
 @contextmanager
@@ -63,10 +66,10 @@ def signals_halt(halt: Halt) -> Iterator[None]:
 
 
 @contextmanager
-def progress(total: int, args: argparse.Namespace, halt: Halt) -> Iterator[Tell]:
+def outcomes_shown(total: int, args: argparse.Namespace, halt: Halt) -> Iterator[Show]:
     """A function to call with each record and the counts; a bar on a terminal."""
 
-    def lines(record: dict[str, Any], _: Counts) -> None:
+    def print_lines(record: dict[str, Any]) -> None:
         if record["reason"] == INTERNAL_ERROR:
             print(f"{record['image']}: {record['message']}", file=sys.stderr, flush=True)
         for warning in record.get("warnings", ()) if args.verbose else ():
@@ -80,21 +83,13 @@ def progress(total: int, args: argparse.Namespace, halt: Halt) -> Iterator[Tell]
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             halt("nobody reads the output any more")
 
-    if args.quiet or not sys.stderr.isatty():
-        yield lines
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    with progress("locate", total, shown=not args.quiet) as bar:
 
-    columns = BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.fields[counts]}")
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        row = bar.add_task("batch", total=total, counts="")
+        def show(record: dict[str, Any], counts: Counts) -> None:
+            print_lines(record)
+            bar.advance(text="  ".join(f"{counts[name]} {name}" for name in SHOWN if counts[name]))
 
-        def advance(record: dict[str, Any], counts: Counts) -> None:
-            lines(record, counts)
-            bar.update(row, advance=1, counts="  ".join(f"{counts[name]} {name}" for name in SHOWN if counts[name]))
-
-        yield advance
+        yield show
 
 
 def summary(counts: Counts, total: int) -> str:
@@ -105,7 +100,7 @@ def summary(counts: Counts, total: int) -> str:
     return f"{total} images: {', '.join(parts)}{kept}{warned}"
 
 
-def left_aside(found: Rows) -> list[str]:
+def omission_lines(found: Rows) -> list[str]:
     """A line for each kind of result that is in the folder and not in its tables."""
     lines = []
     if found.former:

@@ -16,9 +16,11 @@ from startrack.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
+    from startrack.localization import Localizer
     from startrack.types import Exposure
 
 DEFAULT_OUT = "startrack-out"
+DEFAULT_LOCALIZER = "posterior"
 
 
 def add_image_flags(parser: argparse.ArgumentParser) -> None:
@@ -33,6 +35,23 @@ def add_fact_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-c", "--camera", metavar="FILE", help="camera file, or the name of a shipped one")
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601")
     parser.add_argument("--exposure", type=positive, metavar="S", help="exposure time in seconds")
+
+
+def add_localizer_flag(parser: argparse.ArgumentParser) -> None:
+    """The flag that chooses the method of localization."""
+    parser.add_argument(
+        "--localizer", default=DEFAULT_LOCALIZER, metavar="NAME",
+        help="posterior (default), pseudo-gradient, hull, or another of startrack.localization.LOCALIZERS",
+    )  # fmt: skip
+
+
+def localizer_of(args: argparse.Namespace) -> type[Localizer]:
+    """The class that --localizer names; a usage error for an unknown name."""
+    from startrack.localization import LOCALIZERS
+
+    if args.localizer not in LOCALIZERS:
+        args.usage_error(f"--localizer {args.localizer}: known are {', '.join(LOCALIZERS)}")
+    return LOCALIZERS[args.localizer]
 
 
 def cores() -> int:

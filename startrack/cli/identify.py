@@ -30,7 +30,7 @@ def add_parser(subparsers: Any) -> None:
         help="no camera file: field of view in degrees, good to 10 %%; below 100 across the image's width, from there "
         "up of the whole image circle, even where the frame clips it. Takes 12 stars, 7 below 100 degrees",
     )  # fmt: skip
-    parser.set_defaults(usage_error=parser.error)
+    parser.set_defaults(run=run, usage_error=parser.error)
 
 
 def _field_of_view_rad(text: str) -> float:

@@ -5,10 +5,21 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from startrack.cli.common import Outcome, add_image_flags, read, result_path, run_images
-from startrack.cli.horizons import ready_for
+from startrack.cli.common import (
+    Outcome,
+    add_image_flags,
+    add_localizer_flag,
+    localizer_of,
+    read,
+    result_path,
+    run_images,
+)
+from startrack.cli.preparation import prepare_reference
+
+if TYPE_CHECKING:
+    from startrack.pipeline import Settings
 
 FORMAT = "startrack.fix/1"
 
@@ -24,8 +35,9 @@ def add_parser(subparsers: Any) -> None:
     )
     add_image_flags(parser)
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file, or the name of a shipped one")
+    add_localizer_flag(parser)
     parser.add_argument("--fov", metavar="DEG", help=argparse.SUPPRESS)  # of identify and calibrate: asked for here too
-    parser.set_defaults(usage_error=parser.error)
+    parser.set_defaults(run=run, usage_error=parser.error)
     parser.add_argument("--report", action="store_true", help="add a page for a browser, as startrack report makes it")
 
 
@@ -36,7 +48,10 @@ def run(args: argparse.Namespace) -> int:
             "a position needs the lens better than --fov finds it: make a camera file with startrack calibrate "
             f"--fov {args.fov} IMAGE... -o CAMERA.toml, then startrack locate -c CAMERA.toml"
         )
-    code = run_images(args, FORMAT, lambda path, stem: _one(path, stem, args))
+    from startrack.pipeline import Settings
+
+    settings = Settings(localizer=localizer_of(args)())
+    code = run_images(args, FORMAT, lambda path, stem: _one(path, stem, args, settings))
     if args.report:
         from startrack.cli.report import page_of_images
 
@@ -44,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     return code
 
 
-def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
+def _one(path: str, stem: str, args: argparse.Namespace, settings: Settings) -> Outcome:
     from startrack.output import summary_line, verbose_text, write_results
     from startrack.pipeline import locate_exposure
     from startrack.stages import with_timing
@@ -54,9 +69,9 @@ def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     out = result_path(args, stem, ".fix.json", exposure)
     read_ms = 1e3 * (time.perf_counter() - start)
     if exposure.time_utc is not None and exposure.camera is not None:
-        ready_for(exposure.terrain, args)
+        prepare_reference(exposure.terrain, args)
     start = time.perf_counter()
-    result = with_timing(locate_exposure(exposure), read=read_ms)
+    result = with_timing(locate_exposure(exposure, settings), read=read_ms)
     record = write_results(result, out, plots=not args.no_plots)
     line = summary_line(result, seconds=read_ms / 1e3 + time.perf_counter() - start)
     if args.verbose:

@@ -1,9 +1,13 @@
-"""The `startrack` command: finds the subcommand, runs it, and turns what went wrong into one line and an exit code."""
+"""The `startrack` command: parses the arguments, runs one command, turns errors into one line and an exit code."""
 
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
+import importlib.util
+import io
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -15,9 +19,12 @@ COMMANDS = (
     "locate", "batch", "identify", "detect", "render", "calibrate", "report", "reproduce", "terrain", "doctor",
     "schema",
 )  # fmt: skip
+ACTIONS = {"calibrate": ("verify", "show", "convert", "board")}  # with a parser each, beside the command's own
 OK, INTERNAL_ERROR, USAGE, REFUSED, BAD_INPUT, STOPPED = range(6)
+INTERRUPTED = 130
+FULL_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}  # errors of writing to stdout
 EPILOG = """exit codes: 0 every image solved; 1 internal error; 2 usage; 3 an image ambiguous or refused; 4 bad input;
-5 batch: some image not solved; 5 also where the output's reader went before the end (a closed pipe)
+5 batch: some image not solved; 5 also if the reader of the output has gone before the end (a closed pipe)
 
 startrack locate sample_images/near-centre.png     where is the rover?
 startrack identify sky.png -c camera.toml          which stars are these?
@@ -27,34 +34,42 @@ startrack render --seed 1                          a synthetic exposure to try i
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
+    _write_any_text()
     parser = _parser()
-    args = parser.parse_args(argv)
+    _offer_completion(parser)
+    args = parser.parse_args(_joined_action(sys.argv[1:] if argv is None else argv))
     if not args.command:
         parser.print_help()
         return USAGE
+    logging.getLogger("startrack").setLevel(logging.ERROR if getattr(args, "quiet", False) else logging.NOTSET)
     try:
-        code = int(importlib.import_module(f"startrack.cli.{args.command}").run(args))
+        code = int(args.run(args))
         sys.stdout.flush()  # here, where a closed pipe is told from an error
         return code
     except BadInput as cause:
-        return _failed(f"{cause.reason}: {cause}", BAD_INPUT)
+        return _report_failure(f"{cause.reason}: {cause}", BAD_INPUT)
     except NoSolution as cause:
-        return _failed(f"{cause.reason}: {cause}", REFUSED)
+        return _report_failure(f"{cause.reason}: {cause}", REFUSED)
     except KeyboardInterrupt:
-        return _failed("interrupted", 130)
+        return _report_failure("interrupted", INTERRUPTED)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nobody reads what is left in the buffer
+        _discard_stdout()
         return STOPPED
     except Exception as cause:
+        if isinstance(cause, OSError) and cause.errno in FULL_DISK and cause.filename is None:
+            _discard_stdout()
+            return _report_failure(f"the output cannot be written ({cause.strerror})", BAD_INPUT)
         if getattr(args, "verbose", 0):
             raise
-        return _failed(f"internal error: {type(cause).__name__}: {cause} (-v shows the traceback)", INTERNAL_ERROR)
+        return _report_failure(
+            f"internal error: {type(cause).__name__}: {cause} (-v shows the traceback)", INTERNAL_ERROR
+        )
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="startrack",
-        description="Rover position and attitude from one picture of the stars.",
+        description="Rover position and attitude from one star exposure.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -65,7 +80,36 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _failed(message: str, code: int) -> int:
+def _joined_action(argv: Sequence[str]) -> list[str]:
+    """["calibrate", "show", ...] as ["calibrate show", ...], so that the action has its own parser and help."""
+    words = list(argv)
+    return [" ".join(words[:2]), *words[2:]] if words[1:] and words[1] in ACTIONS.get(words[0], ()) else words
+
+
+def _offer_completion(parser: argparse.ArgumentParser) -> None:
+    """Complete words in the shell, if it asks for that and the extra `completion` is installed."""
+    if "_ARGCOMPLETE" in os.environ and importlib.util.find_spec("argcomplete") is not None:
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
+
+
+def _write_any_text() -> None:
+    """Escape what the terminal's encoding lacks (LC_ALL=C and a name beyond ASCII) instead of failing."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _discard_stdout() -> None:
+    """Send to nowhere what is left in the buffer: its reader has gone, or its disk is full."""
+    try:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (OSError, ValueError):  # not a file, as under a test
+        return
+
+
+def _report_failure(message: str, code: int) -> int:
     print(f"startrack: {message}", file=sys.stderr)
     return code
 

@@ -6,13 +6,11 @@ import argparse
 import json
 import math
 import os
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.flag_types import amount, at_least_one, count, number, positive
+from startrack.cli.progress import progress
 from startrack.errors import BadInput
 
 if TYPE_CHECKING:
@@ -40,7 +38,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     _add_pose(parser.add_argument_group("pose and time (what is not given is drawn from the seed)"))
     _add_light(parser.add_argument_group("light and defects"))
     _add_output(parser.add_argument_group("output"))
-    parser.set_defaults(usage_error=parser.error)
+    parser.set_defaults(run=run, usage_error=parser.error)
     return parser
 
 
@@ -48,12 +46,12 @@ def run(args: argparse.Namespace) -> int:
     """Render and write the images; 0. Raises BadInput for files and values that cannot be used."""
     images = _targets(args)
     series = _series(args)
-    with _progress(len(images)) as advance:
+    with progress("render", len(images), shown=len(images) >= PROGRESS_FROM) as bar:
         for number, image in enumerate(images):
             summary = _render_one(args, series, number, image)
             if args.json or not args.quiet:
                 print(json.dumps(summary) if args.json else _line(summary))
-            advance()
+            bar.advance()
     return 0
 
 
@@ -197,20 +195,6 @@ def _line(summary: dict[str, Any]) -> str:
         f"roll {summary['roll_body_deg']:.2f} deg, "
         f"{summary['time_utc']}, {summary['exposure_s']:.3g} s"
     )
-
-
-@contextmanager
-def _progress(total: int) -> Iterator[Callable[[], None]]:
-    """A bar on a terminal for more than a few images; the function to call after each."""
-    if total < PROGRESS_FROM or not sys.stderr.isatty():
-        yield lambda: None
-        return
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("render", total=total)
-        yield lambda: bar.advance(task)
 
 
 def _radians(degrees: float | None) -> float | None:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from startrack.cli.flag_types import count
 from startrack.errors import BadInput
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("out", metavar="OUT", help="folder of results, or one NAME.fix.json")
     parser.add_argument("-o", "--output", metavar="FILE", help="where the page goes")
     parser.add_argument(
-        "--images", type=_count, default=DEFAULT_IMAGES, metavar="N",
+        "--images", type=count, default=DEFAULT_IMAGES, metavar="N",
         help="how many images the page holds with picture and stars (%(default)s); all are in its table",
     )  # fmt: skip
     parser.add_argument(
@@ -40,6 +41,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("-v", "--verbose", action="count", default=0, help="tracebacks of internal errors")
     parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -124,9 +126,3 @@ def _place(folder: Path, one: Found) -> tuple[float, float] | None:
     if not (math.isfinite(east) and math.isfinite(north)):
         raise BadInput("bad_image", f"{path}: position_enu_m is not finite")
     return east, north
-
-
-def _count(text: str) -> int:
-    if int(text) < 0:
-        raise argparse.ArgumentTypeError(f"{text} is below 0")
-    return int(text)

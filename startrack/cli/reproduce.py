@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import DEFAULT_OUT, cores
-from startrack.cli.flag_types import at_least_one
-from startrack.errors import BadInput
+from startrack.cli.flag_types import at_least_one, count
+from startrack.cli.progress import progress
+from startrack.compilation import announce
 from startrack.files import make_folder
 
 if TYPE_CHECKING:
-    from startrack.reproduction import Piece, Runs
+    from startrack.reproduction import Artefact
 
 # As in startrack.reproduction.ARTEFACTS, which would take numpy to look up.
 NAMES = (
@@ -53,13 +51,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "-j", "--jobs", type=at_least_one, default=None, metavar="N", help="processes (default: all cores)"
     )
     parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask cluster to use instead (extra: cluster)")
-    parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="same seed, same files (default 0)")
+    parser.add_argument("--seed", type=count, default=0, metavar="N", help="same seed, same files (default 0)")
     parser.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the results (%(default)s)")
     parser.add_argument("--json", action="store_true", help="print one JSON object per table or figure")
     parser.add_argument("--no-plots", action="store_true", help="no pictures")
     parser.add_argument("-v", "--verbose", action="count", default=0, help="tracebacks of internal errors")
     parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
-    parser.set_defaults(usage_error=parser.error)
+    parser.set_defaults(run=run, usage_error=parser.error)
     return parser
 
 
@@ -74,19 +72,20 @@ def run(args: argparse.Namespace) -> int:
     _need(args, "matplotlib", "plots", "figures are drawn", unless=args.no_plots)
     _need(args, "distributed", "cluster", "a cluster is reached", unless=args.cluster is None)
 
-    from startrack.reproduction import ARTEFACTS, FULL, QUICK, Context, Runs, written
+    from startrack.reproduction import ARTEFACTS, FULL, QUICK, ChunkStore, Context, write_artefact
 
     out, size = make_folder(args.dir), FULL if args.full else QUICK
+    announce(height_map=False)
     if args.ours is not None:
         size = size.with_ours(args.ours)
-    with Runs(out, jobs=args.jobs or cores(), progress=_progress, cluster=args.cluster) as runs:
+    with ChunkStore(out, jobs=args.jobs or cores(), progress=progress, cluster=args.cluster) as store:
         if args.cluster is not None:
-            _reach(runs)
+            store.connect()
         for name in chosen:
             start = time.perf_counter()
-            piece = ARTEFACTS[name](Context(size, args.seed, runs))
-            files = written(piece, out, plots=not args.no_plots)
-            _tell(args, piece, size.name, files, time.perf_counter() - start)
+            artefact = ARTEFACTS[name](Context(size, args.seed, store))
+            files = write_artefact(artefact, out, plots=not args.no_plots)
+            _print_artefact(args, artefact, size.name, files, time.perf_counter() - start)
     return 0
 
 
@@ -96,47 +95,19 @@ def _need(args: argparse.Namespace, module: str, extra: str, what: str, *, unles
         args.usage_error(f"{what} with {module}: pip install 'startrack[{extra}]'{hint}")
 
 
-def _reach(runs: Runs) -> None:
-    try:
-        runs.connect()
-    except (OSError, ValueError) as cause:
-        raise BadInput("no_cluster", f"{runs.cluster}: no Dask scheduler answers ({cause})") from cause
-
-
-def _tell(args: argparse.Namespace, piece: Piece, size: str, files: list[Path], seconds: float) -> None:
+def _print_artefact(args: argparse.Namespace, artefact: Artefact, size: str, files: list[Path], seconds: float) -> None:
     if args.json:
         record = {
             "format": "startrack.reproduction/1",
-            "name": piece.name,
-            "title": piece.title,
+            "name": artefact.name,
+            "title": artefact.title,
             "size": size,
             "seed": args.seed,
-            **piece.values,
+            **artefact.values,
             "files": [str(path) for path in files],
-            "timing_ms": {**piece.timing_ms, "all": 1e3 * seconds},
+            "timing_ms": {**artefact.timing_ms, "all": 1e3 * seconds},
         }
         print(json.dumps(record), flush=True)
     elif not args.quiet:
-        per_fix = ", ".join(f"{key} {value:.1f}" for key, value in piece.timing_ms.items())
-        print(f"{piece.name}: {piece.line}{f' [ms per fix: {per_fix}]' if per_fix else ''}", flush=True)
-
-
-@contextmanager
-def _progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar on a terminal; the function to call after each part."""
-    if total == 0 or not sys.stderr.isatty():
-        yield lambda _: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=total)
-        yield lambda steps: bar.advance(task, steps)
-
-
-def _seed(text: str) -> int:
-    if int(text) < 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is negative")
-    return int(text)
+        per_fix = ", ".join(f"{key} {value:.1f}" for key, value in artefact.timing_ms.items())
+        print(f"{artefact.name}: {artefact.line}{f' [ms per fix: {per_fix}]' if per_fix else ''}", flush=True)

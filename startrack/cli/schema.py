@@ -15,7 +15,7 @@ def add_parser(subparsers: Any) -> None:
         description="Print the JSON schema of one kind of file, or without a name the list of kinds.",
     )
     parser.add_argument("name", nargs="?", metavar="KIND", help="such as fix, identification, camera, terrain")
-    parser.set_defaults(usage_error=parser.error)
+    parser.set_defaults(run=run, usage_error=parser.error)
 
 
 def run(args: argparse.Namespace) -> int:

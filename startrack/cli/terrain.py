@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import DEFAULT_OUT
-from startrack.cli.horizons import ready
+from startrack.cli.preparation import prepare
 from startrack.cli.terrain_facts import facts_of, lines_of, seen_from
 from startrack.files import make_folder
 
@@ -62,6 +62,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         action.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
     show.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the pictures (%(default)s)")
     show.add_argument("--no-plots", action="store_true", help="no pictures")
+    parser.set_defaults(run=run)
     made.add_argument("-O", "--overwrite", action="store_true", help="replace files")
     return parser
 
@@ -108,7 +109,7 @@ def _build(args: argparse.Namespace) -> int:
                 terrain.discard_table()
             start = time.perf_counter()
             known = terrain.is_prepared
-            ready(terrain, args)
+            prepare(terrain, args)
             facts |= {"horizons": str(terrain.table_path), "known_before": known}
             facts["seconds"] = round(time.perf_counter() - start, 1)
         _tell(args, facts)

@@ -16,4 +16,6 @@ class Localizer(Protocol):
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix: ...
 
 
-__all__ = ["ExactPosterior", "Hull", "Localizer", "PseudoGradient", "check_consistency"]
+LOCALIZERS: dict[str, type[Localizer]] = {"posterior": ExactPosterior, "pseudo-gradient": PseudoGradient, "hull": Hull}
+
+__all__ = ["LOCALIZERS", "ExactPosterior", "Hull", "Localizer", "PseudoGradient", "check_consistency"]

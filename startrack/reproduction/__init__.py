@@ -1,19 +1,17 @@
-"""The thesis's tables and figures, redone: `ARTEFACTS` by name, each from a context to a piece."""
+"""The thesis's tables and figures, redone: `ARTEFACTS` by name, each made from a context."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from startrack.reproduction.artefact import FULL, QUICK, Context, Piece, Size, written
-from startrack.reproduction.craters import fig_a2
-from startrack.reproduction.curves import fig3_7, fig3_8, fig3_9
-from startrack.reproduction.errors import fig3_4, fig3_10, fig_b
-from startrack.reproduction.runs import Runs
+from startrack.reproduction.artefact import FULL, QUICK, Artefact, Context, Size, write_artefact
+from startrack.reproduction.chunks import ChunkStore
+from startrack.reproduction.distance_figures import fig3_7, fig3_8, fig3_9, fig_a2
+from startrack.reproduction.error_figures import by_aspect_ratio, by_magnitude, fig3_4, fig3_10, fig_b
 from startrack.reproduction.sky_figures import fig3_3, fig3_5, fig3_6, fig_a1
-from startrack.reproduction.sweeps import by_aspect_ratio, by_magnitude
 from startrack.reproduction.table31 import table31
 
-ARTEFACTS: dict[str, Callable[[Context], Piece]] = {
+ARTEFACTS: dict[str, Callable[[Context], Artefact]] = {
     "table3.1": table31,
     "fig3.3": fig3_3,
     "fig3.4": fig3_4,
@@ -30,4 +28,4 @@ ARTEFACTS: dict[str, Callable[[Context], Piece]] = {
     "aspect": by_aspect_ratio,
 }
 
-__all__ = ["ARTEFACTS", "FULL", "QUICK", "Context", "Piece", "Runs", "Size", "written"]
+__all__ = ["ARTEFACTS", "FULL", "QUICK", "Artefact", "ChunkStore", "Context", "Size", "write_artefact"]

@@ -9,7 +9,7 @@ from typing import Any
 
 from startrack.files import write_atomically
 from startrack.output.ecsv import Column, ecsv_text
-from startrack.reproduction.runs import Runs
+from startrack.reproduction.chunks import ChunkStore
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Size:
     skies: int  # of table 3.1 and figures B.1 to B.10
     per_sky: int
     ours_per_sky: int
-    cell_per_sky: int
+    bound_per_sky: int
     deep_per_sky: int  # at magnitude 8
     one_sky: int  # of figures 3.4 and 3.10
     ours_one_sky: int
@@ -30,7 +30,7 @@ class Size:
 
     def with_ours(self, most: int) -> Size:
         """The same with our method on at most so many places per starfield, ten times as many in figure 3.10."""
-        per_sky = {name: min(getattr(self, name), most) for name in ("ours_per_sky", "cell_per_sky", "deep_per_sky")}
+        per_sky = {name: min(getattr(self, name), most) for name in ("ours_per_sky", "bound_per_sky", "deep_per_sky")}
         return replace(self, **per_sky, ours_one_sky=min(self.ours_one_sky, 10 * most))
 
 
@@ -44,11 +44,11 @@ class Context:
 
     size: Size
     seed: int
-    runs: Runs
+    store: ChunkStore
 
 
 @dataclass(frozen=True)
-class Piece:
+class Artefact:
     """One table or figure of the thesis, redone."""
 
     name: str  # such as "fig3.7"
@@ -61,22 +61,25 @@ class Piece:
     timing_ms: dict[str, float] = field(default_factory=dict)  # per fix
 
 
-def written(piece: Piece, out: Path, *, plots: bool) -> list[Path]:
+def write_artefact(artefact: Artefact, out: Path, *, plots: bool) -> list[Path]:
     """Write NAME.md, NAME.ecsv and the pictures; their paths."""
     files: dict[str, bytes] = {}
-    if piece.columns:
-        files[f"{piece.name}.ecsv"] = ecsv_text(piece.columns).encode()
+    if artefact.columns:
+        files[f"{artefact.name}.ecsv"] = ecsv_text(artefact.columns).encode()
     if plots:
-        files |= {f"{stem}.png": draw() for stem, draw in piece.pictures.items()}
-    files[f"{piece.name}.md"] = markdown(piece, [name for name in files if name.endswith(".png")]).encode()
+        files |= {f"{stem}.png": draw() for stem, draw in artefact.pictures.items()}
+    files[f"{artefact.name}.md"] = markdown(artefact, [name for name in files if name.endswith(".png")]).encode()
     for name, data in files.items():
         write_atomically(out / name, data, overwrite=True)
     return [out / name for name in files]
 
 
-def markdown(piece: Piece, pictures: Iterable[str] = ()) -> str:
-    """The piece as a section of Markdown."""
-    return "\n\n".join([f"## {piece.title}", *(f"![{name}]({name})" for name in pictures), piece.text.strip()]) + "\n"
+def markdown(artefact: Artefact, pictures: Iterable[str] = ()) -> str:
+    """The artefact as a section of Markdown."""
+    return (
+        "\n\n".join([f"## {artefact.title}", *(f"![{name}]({name})" for name in pictures), artefact.text.strip()])
+        + "\n"
+    )
 
 
 def markdown_table(head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from importlib.util import find_spec
 
 import numpy as np
 
@@ -16,8 +15,8 @@ from startrack.reproduction.simulator import ASPECT_RATIO, MAGNITUDE, PERFECT, M
 from startrack.terrain import Cylinder
 from startrack.types import Array, Bools, Evidence, Fix, NotLocated
 
-KUA, OURS, CELL = "kua", "ours", "cell"  # the methods: the thesis's two steps; ours; the limit for a perfect list
-CHUNK = {KUA: 1000, OURS: 100, CELL: 200}  # fixes: a second or so of work
+KUA, OURS, BOUND = "kua", "ours", "bound"  # the methods: the thesis's two steps; ours; the limit for a perfect list
+CHUNK = {KUA: 1000, OURS: 100, BOUND: 200}  # fixes: a second or so of work
 Chunk = dict[str, np.ndarray]  # what one task gives
 
 
@@ -38,7 +37,7 @@ class Task:
         return self.stop - self.start
 
 
-def tasks(
+def tasks_of(
     method: str, seed: int, sky: int, count: int, *, magnitude: float = MAGNITUDE, aspect_ratio: float = ASPECT_RATIO,
     mistakes: Mistakes = PERFECT,
 ) -> list[Task]:  # fmt: skip
@@ -50,7 +49,7 @@ def tasks(
     ]
 
 
-def done(task: Task) -> Chunk:
+def compute_chunk(task: Task) -> Chunk:
     """Arrays over the task's places: `truth_m` (n, 2), the method's own, and `seconds` (1,) of the processor spent on
     the method.
 
@@ -63,7 +62,7 @@ def done(task: Task) -> Chunk:
     seen = [visible(points, place, cylinder.radius_m) for place in truth]
     if task.method == KUA:
         own = _kua(points, seen, cylinder.wall_m, cylinder.radius_m)
-    elif task.method == CELL:
+    elif task.method == BOUND:
         start = time.thread_time()
         own = {"centroid_m": np.stack([cell_centroid(points, place, cylinder.radius_m) for place in truth])}
         own["seconds"] = np.array([time.thread_time() - start])
@@ -89,7 +88,7 @@ def _kua(points: Array, seen: list[Bools], wall_m: float, radius_m: float) -> Ch
 
 def _ours(task: Task, sky: Sky, seen: list[Bools], truth: Array) -> Chunk:
     # No boulders here that are not on the map, so a sector of the horizon needs no cap on what it may claim.
-    localizer = ExactPosterior(sector_epsilon=0.0, compiled=find_spec("numba") is not None)
+    localizer = ExactPosterior(sector_epsilon=0.0)
     cylinder = crater(task.aspect_ratio)
     evidence = [
         task.mistakes.evidence(sky, task.mistakes.listed(one, task.seed, task.sky, task.start + k))

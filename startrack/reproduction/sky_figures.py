@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from startrack.reproduction.artefact import Context, Piece
-from startrack.reproduction.plots import CENTRE, EDGE, OTHER_STAR, STAR, fisheye, fisheye_axes, new_figure, png
+from startrack.reproduction.artefact import Artefact, Context
+from startrack.reproduction.drawing import CENTRE, EDGE, OTHER_STAR, STAR, fisheye, fisheye_axes, new_figure, png
 from startrack.reproduction.simulator import Sky, crater, crater_edge, directions, star_count, visible
 from startrack.types import Array
 
@@ -17,7 +17,7 @@ EXAMPLE_M = np.array([5000.0, 2000.0])  # of figure 3.6, and the true place of f
 ESTIMATE_M = np.array([-3000.0, -1500.0])  # of figure 3.5: far off, so that the vector can be seen
 
 
-def fig3_3(context: Context) -> Piece:
+def fig3_3(context: Context) -> Artefact:
     """Viewed starfields along the centreline."""
     sky = Sky.drawn(context.seed, 0)
     points = sky.on_rim_plane(crater())
@@ -34,7 +34,7 @@ def fig3_3(context: Context) -> Piece:
     )  # fmt: skip
 
 
-def fig3_5(context: Context) -> Piece:
+def fig3_5(context: Context) -> Artefact:
     """One step of the pseudo-gradient."""
     sky = Sky.drawn(context.seed, 0)
     points, radius = sky.on_rim_plane(crater()), crater().radius_m
@@ -56,7 +56,7 @@ def fig3_5(context: Context) -> Piece:
     )  # fmt: skip
 
 
-def fig3_6(context: Context) -> Piece:
+def fig3_6(context: Context) -> Artefact:
     """How the viewed starfield is found."""
     sky = Sky.drawn(context.seed, 0)
     in_sight = int(visible(sky.on_rim_plane(crater()), EXAMPLE_M, crater().radius_m).sum())
@@ -70,7 +70,7 @@ def fig3_6(context: Context) -> Piece:
     )  # fmt: skip
 
 
-def fig_a1(context: Context) -> Piece:
+def fig_a1(context: Context) -> Artefact:
     """The whole starfield."""
     sky = Sky.drawn(context.seed, 0)
     caption = (
@@ -83,9 +83,9 @@ def fig_a1(context: Context) -> Piece:
     )  # fmt: skip
 
 
-def _picture(name: str, title: str, caption: str, line: str, draw: Any, values: dict[str, Any]) -> Piece:
+def _picture(name: str, title: str, caption: str, line: str, draw: Any, values: dict[str, Any]) -> Artefact:
     number = name.removeprefix("fig")
-    return Piece(
+    return Artefact(
         name=name,
         title=f"Figure {number}: {title}",
         line=line,

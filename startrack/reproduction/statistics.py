@@ -11,17 +11,17 @@ from startrack.reproduction.artefact import Context
 from startrack.reproduction.methods import Chunk, Task
 from startrack.types import Array, Bools
 
-ERROR_OF = {"kua": ("hull_m", "refined_m"), "ours": ("fix_m",), "cell": ("centroid_m",)}
-TOLD = {"kua": "settled", "ours": "located", "cell": None}
+ERROR_OF = {"kua": ("hull_m", "refined_m"), "ours": ("fix_m",), "bound": ("centroid_m",)}
+ANSWERED = {"kua": "settled", "ours": "located", "bound": None}
 
 
 @dataclass(frozen=True)
-class Collected:
+class MethodErrors:
     """Errors of one estimate."""
 
     places_m: tuple[Array, ...]  # by sky: (n, 2) [m], where there is an estimate
     errors_m: tuple[Array, ...]  # by sky: (n,) [m]
-    told: tuple[Bools, ...]  # by sky: settled (kua) or located (ours), for every place
+    answered: tuple[Bools, ...]  # by sky: settled (kua) or located (ours), for every place
     ms_per_fix: float
 
     @property
@@ -32,30 +32,30 @@ class Collected:
     @property
     def refused(self) -> int:
         """Places without an estimate; for the pseudo-gradient, with one that never settled."""
-        return int(sum((~one).sum() for one in self.told))
+        return int(sum((~one).sum() for one in self.answered))
 
     @property
     def refused_fraction(self) -> float:
-        return self.refused / max(sum(map(len, self.told)), 1)
+        return self.refused / max(sum(map(len, self.answered)), 1)
 
 
-def collect(context: Context, what: str, by_sky: Sequence[Sequence[Task]]) -> list[Collected]:
+def collect_errors(context: Context, what: str, by_sky: Sequence[Sequence[Task]]) -> list[MethodErrors]:
     """Errors of every estimate of the tasks' method (all of one method), in the order of `ERROR_OF`."""
     wanted = [task for one in by_sky for task in one]
     chunks: list[list[Chunk]] = [[] for _ in by_sky]
     sky_of = [number for number, one in enumerate(by_sky) for _ in one]
-    for number, chunk in zip(sky_of, context.runs.chunks(what, wanted), strict=True):
+    for number, chunk in zip(sky_of, context.store.chunks(what, wanted), strict=True):
         chunks[number].append(chunk)
     method = wanted[0].method
     ms = 1e3 * sum(float(chunk["seconds"][0]) for one in chunks for chunk in one) / sum(map(len, wanted))
-    told = TOLD[method]
-    flags = tuple(np.concatenate([chunk[told] for chunk in one]) for one in chunks) if told else ()
+    flag = ANSWERED[method]
+    flags = tuple(np.concatenate([chunk[flag] for chunk in one]) for one in chunks) if flag else ()
     found = []
     for key in ERROR_OF[method]:
         pairs = [[_places_and_errors(chunk, key) for chunk in one] for one in chunks]
         places = tuple(np.concatenate([place for place, _ in one]) for one in pairs)
         errors = tuple(np.concatenate([error for _, error in one]) for one in pairs)
-        found.append(Collected(places, errors, flags, ms))
+        found.append(MethodErrors(places, errors, flags, ms))
     return found
 
 
@@ -74,6 +74,6 @@ def statistics(errors_m: Array) -> dict[str, float]:
     }
 
 
-def shown(errors_m: Array, form: str = "{:.1f} / {:.1f} / {:.1f}") -> str:
+def format_errors(errors_m: Array, form: str = "{:.1f} / {:.1f} / {:.1f}") -> str:
     """Mean / standard deviation / largest."""
     return form.format(errors_m.mean(), errors_m.std(), errors_m.max())

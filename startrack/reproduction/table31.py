@@ -8,24 +8,24 @@ import numpy as np
 
 from startrack.output.ecsv import Column
 from startrack.reproduction import published
-from startrack.reproduction.artefact import Context, Piece, markdown_table
-from startrack.reproduction.methods import CELL, KUA, OURS, Task, tasks
+from startrack.reproduction.artefact import Artefact, Context, markdown_table
+from startrack.reproduction.methods import BOUND, KUA, OURS, Task, tasks_of
 from startrack.reproduction.simulator import MAGNITUDE, PERFECT, Mistakes, star_count
-from startrack.reproduction.statistics import Collected, collect, shown, statistics
+from startrack.reproduction.statistics import MethodErrors, collect_errors, format_errors, statistics
 from startrack.types import Array
 
 DEEP_MAGNITUDE, DEEP_MISTAKES = 8.0, Mistakes(missed=0.10, false=0.01)
 WHOLE, HUNDREDTHS = "{:.0f} / {:.0f} / {:.0f}", "{:.2f} / {:.2f} / {:.1f}"
 
 
-def table31(context: Context) -> Piece:
+def table31(context: Context) -> Artefact:
     """Table 3.1 with the hull, ours and the limit beside the thesis's own figures."""
     size = context.size
-    hull, descent = collect(context, "table 3.1, the thesis's methods", _tasks(context, KUA, size.per_sky))
-    (ours,) = collect(context, "table 3.1, ours", _tasks(context, OURS, size.ours_per_sky))
-    (limit,) = collect(context, "table 3.1, the limit", _tasks(context, CELL, size.cell_per_sky))
+    hull, descent = collect_errors(context, "table 3.1, the thesis's methods", _tasks(context, KUA, size.per_sky))
+    (ours,) = collect_errors(context, "table 3.1, ours", _tasks(context, OURS, size.ours_per_sky))
+    (limit,) = collect_errors(context, "table 3.1, the limit", _tasks(context, BOUND, size.bound_per_sky))
     deep_tasks = _tasks(context, OURS, size.deep_per_sky, DEEP_MAGNITUDE, DEEP_MISTAKES)
-    (deep,) = collect(context, "table 3.1, ours at magnitude 8", deep_tasks)
+    (deep,) = collect_errors(context, "table 3.1, ours at magnitude 8", deep_tasks)
     ratio = _over_limit(ours, limit)
     line = (
         f"pseudo-gradient {descent.errors.mean():.1f} m (thesis 34.2), never settles "
@@ -33,7 +33,7 @@ def table31(context: Context) -> Piece:
         f"ours {ours.errors.mean():.1f} m (limit {limit.errors.mean():.1f}), "
         f"at magnitude 8 {deep.errors.mean():.2f} m"
     )
-    return Piece(
+    return Artefact(
         name="table3.1",
         title="Table 3.1: Results of ten simulation runs in a Shackleton-like crater",
         line=line,
@@ -48,23 +48,23 @@ def _tasks(
     context: Context, method: str, per_sky: int, magnitude: float = MAGNITUDE, mistakes: Mistakes = PERFECT
 ) -> list[list[Task]]:
     return [
-        tasks(method, context.seed, sky, per_sky, magnitude=magnitude, mistakes=mistakes)
+        tasks_of(method, context.seed, sky, per_sky, magnitude=magnitude, mistakes=mistakes)
         for sky in range(context.size.skies)
     ]
 
 
-def _over_limit(ours: Collected, limit: Collected) -> float:
+def _over_limit(ours: MethodErrors, limit: MethodErrors) -> float:
     """Mean error of ours over the limit's, on the places that both were computed for."""
     pairs = [
         (fix[: len(best)], best[: len(fix)])
-        for fix, best, located in zip(ours.errors_m, limit.errors_m, ours.told, strict=True)
+        for fix, best, located in zip(ours.errors_m, limit.errors_m, ours.answered, strict=True)
         if located.all()  # else the places do not pair up
     ]
     return float(np.concatenate([fix for fix, _ in pairs]).mean() / np.concatenate([best for _, best in pairs]).mean())
 
 
 def _values(
-    hull: Collected, descent: Collected, ours: Collected, limit: Collected, deep: Collected, ratio: float
+    hull: MethodErrors, descent: MethodErrors, ours: MethodErrors, limit: MethodErrors, deep: MethodErrors, ratio: float
 ) -> dict[str, object]:
     return {
         "thesis": {
@@ -89,25 +89,26 @@ def _values(
 
 
 def _text(
-    context: Context, hull: Collected, descent: Collected, ours: Collected, limit: Collected, deep: Collected,
+    context: Context, hull: MethodErrors, descent: MethodErrors, ours: MethodErrors, limit: MethodErrors,
+    deep: MethodErrors,
     ratio: float,
 ) -> str:  # fmt: skip
     size = context.size
     rows = [
-        [k + 1, _published(trial), shown(descent.errors_m[k]), f"{100 * np.mean(~descent.told[k]):.2f} %",
-         shown(hull.errors_m[k], WHOLE), shown(ours.errors_m[k]), shown(limit.errors_m[k])]
+        [k + 1, _published(trial), format_errors(descent.errors_m[k]), f"{100 * np.mean(~descent.answered[k]):.2f} %",
+         format_errors(hull.errors_m[k], WHOLE), format_errors(ours.errors_m[k]), format_errors(limit.errors_m[k])]
         for k, trial in enumerate(published.TRIALS[: size.skies])
     ]  # fmt: skip
     overall_never = f"{100 * descent.refused_fraction:.2f} % (thesis 0.6 %)"
-    overall_hull = f"{shown(hull.errors, WHOLE)} (thesis 637 / 275 / 1735)"
+    overall_hull = f"{format_errors(hull.errors, WHOLE)} (thesis 637 / 275 / 1735)"
     rows.append(
-        ["Overall", _published(published.OVERALL), shown(descent.errors), overall_never, overall_hull,
-         shown(ours.errors), shown(limit.errors)]
+        ["Overall", _published(published.OVERALL), format_errors(descent.errors), overall_never, overall_hull,
+         format_errors(ours.errors), format_errors(limit.errors)]
     )  # fmt: skip
     head = ["Trial", "thesis", "its method, redone", "never settles", "its hull, redone", "ours", "limit"]
     return f"""Position error in metres: mean / standard deviation / largest. {star_count(MAGNITUDE)} stars (magnitude \
 6), perfect lists; {size.per_sky:,} places per starfield for the thesis's methods, the first {size.ours_per_sky:,} of \
-them for ours, {size.cell_per_sky:,} for the limit. The limit is the middle of the cell of places from which exactly \
+them for ours, {size.bound_per_sky:,} for the limit. The limit is the middle of the cell of places from which exactly \
 the listed stars are in sight. Seed {context.seed}.
 
 {markdown_table(head, rows)}
@@ -115,7 +116,8 @@ the listed stars are in sight. Seed {context.seed}.
 Ours over the limit, on the same places: {ratio:.3f}. Refused by ours: {ours.refused}.
 
 A camera two magnitudes deeper ({star_count(DEEP_MAGNITUDE):,} stars, {DEEP_MISTAKES.missed:.0%} of those in sight \
-missed, {DEEP_MISTAKES.false:.0%} of the hidden ones on the list by mistake): ours {shown(deep.errors, HUNDREDTHS)} \
+missed, {DEEP_MISTAKES.false:.0%} of the hidden ones on the list by mistake): ours \
+{format_errors(deep.errors, HUNDREDTHS)} \
 over {len(deep.errors):,} places; refused: {deep.refused}."""
 
 
@@ -123,24 +125,24 @@ def _published(trial: published.Errors) -> str:
     return f"{trial.mean_m:.1f} / {trial.sd_m:.1f} / {trial.max_m:.1f}"
 
 
-def _columns(hull: Collected, descent: Collected, ours: Collected, limit: Collected) -> tuple[Column, ...]:
+def _columns(hull: MethodErrors, descent: MethodErrors, ours: MethodErrors, limit: MethodErrors) -> tuple[Column, ...]:
     skies = len(descent.errors_m)
     columns = [Column("trial", list(range(1, skies + 1)), "int64", form="%d", description="starfield")]
     measures: tuple[tuple[str, Callable[[Array], float]], ...] = (("mean", np.mean), ("sd", np.std), ("max", np.max))
     for name, _ in measures:
         values = [getattr(trial, f"{name}_m") for trial in published.TRIALS[:skies]]
         columns.append(Column(f"thesis_{name}", values, unit="m", form="%.1f", description="Kua 2008, table 3.1"))
-    told = (
+    methods = (
         (descent, "descent", "hull and pseudo-gradient"),
         (hull, "hull", "hull alone"),
         (ours, "ours", "posterior mean"),
         (limit, "limit", "middle of the exact cell"),
     )
-    for method, prefix, description in told:
+    for method, prefix, description in methods:
         for name, measure in measures:
             values = [float(measure(errors)) for errors in method.errors_m]
             columns.append(Column(f"{prefix}_{name}", values, unit="m", form="%.3f", description=description))
         columns.append(Column(f"{prefix}_count", [len(errors) for errors in method.errors_m], "int64", form="%d"))
-    never = [float(np.mean(~settled)) for settled in descent.told]
+    never = [float(np.mean(~settled)) for settled in descent.answered]
     columns.append(Column("never_settles", never, form="%.5f", description="fraction of the descents"))
     return tuple(columns)

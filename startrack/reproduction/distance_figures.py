@@ -1,4 +1,4 @@
-"""Figures 3.7 to 3.9: how far a rover travels before the view of the starfield changes."""
+"""Figures 3.7 to 3.9: the distance between changes of the view of the starfield; figure A.2: aspect ratios."""
 
 from __future__ import annotations
 
@@ -9,10 +9,19 @@ import numpy as np
 
 from startrack.output.ecsv import Column
 from startrack.reproduction import published
-from startrack.reproduction.artefact import Context, Piece
-from startrack.reproduction.plots import PUBLISHED, STAR, mark, new_figure, png
-from startrack.reproduction.simulator import MAGNITUDE, Sky, crater, star_count
-from startrack.reproduction.traverse import STEP_M, changes_m, gaps_m, mean_gap_m, stepped_m
+from startrack.reproduction.artefact import Artefact, Context
+from startrack.reproduction.drawing import PUBLISHED, STAR, mark, new_figure, png
+from startrack.reproduction.simulator import (
+    MAGNITUDE,
+    STEP_M,
+    Sky,
+    changes_m,
+    crater,
+    gaps_m,
+    mean_gap_m,
+    star_count,
+    stepped_m,
+)
 from startrack.types import Array
 
 MAGNITUDES = np.arange(2.0, 7.01, 0.25)
@@ -20,7 +29,7 @@ ASPECT_RATIOS = np.logspace(-1, 3, 33)
 STEPS = f"views compared at every {STEP_M:.0f} m"
 
 
-def fig3_7(context: Context) -> Piece:
+def fig3_7(context: Context) -> Artefact:
     """Distance between changes against the faintest magnitude."""
     curves = np.array([_gaps(context, magnitude, 10.0) for magnitude in MAGNITUDES])
     six = curves[int(np.argmin(np.abs(MAGNITUDES - MAGNITUDE)))].mean(axis=0)
@@ -30,13 +39,13 @@ def fig3_7(context: Context) -> Piece:
         f"({STEPS}; every single change counted, the mean is {six[2]:.1f} m)."
     )
     axis = "Minimum Detected Magnitude"
-    return _piece(
+    return _artefact(
         "fig3.7", "Effects of changing the star detection limit", caption, "magnitude", MAGNITUDES, curves, six,
         partial(_draw_two, MAGNITUDES, curves, axis, (700.0, 7000.0), False, caption),
     )  # fmt: skip
 
 
-def fig3_9(context: Context) -> Piece:
+def fig3_9(context: Context) -> Artefact:
     """Distance between changes against the crater's aspect ratio."""
     curves = np.array([_gaps(context, MAGNITUDE, ratio) for ratio in ASPECT_RATIOS])
     ten = _gaps(context, MAGNITUDE, 10.0).mean(axis=0)
@@ -47,13 +56,13 @@ def fig3_9(context: Context) -> Piece:
         f"(thesis 14.9 and 215 m); at 50:1 largest {widest[1]:.0f} m (thesis: approximately 1 km)."
     )
     axis = "Crater Aspect Ratio (Diameter:Depth)"
-    return _piece(
+    return _artefact(
         "fig3.9", "Effects of changing the crater aspect ratio", caption, "aspect_ratio", ASPECT_RATIOS, curves, ten,
         partial(_draw_two, ASPECT_RATIOS, curves, axis, (250.0, 8000.0), True, caption),
     )  # fmt: skip
 
 
-def fig3_8(context: Context) -> Piece:
+def fig3_8(context: Context) -> Artefact:
     """Distance between changes along one traverse."""
     cylinder = crater()
     changes = stepped_m(changes_m(Sky.drawn(context.seed, 0), cylinder), cylinder)
@@ -64,7 +73,7 @@ def fig3_8(context: Context) -> Piece:
         f"Largest {gaps.max():.0f} m (thesis 215 m); mean {inner:.1f} m within 2 km of the centre, {outer:.1f} m "
         "beyond 8 km."
     )
-    return Piece(
+    return Artefact(
         name="fig3.8",
         title="Figure 3.8: Plot of the distance between starfield changes along a crater traverse",
         line=f"largest {gaps.max():.0f} m (thesis 215), {inner:.0f} m near the centre, {outer:.0f} m near the wall",
@@ -91,16 +100,16 @@ def _gaps(context: Context, magnitude: float, aspect_ratio: float) -> Array:
     return np.array(rows)
 
 
-def _piece(
+def _artefact(
     name: str, title: str, caption: str, along: str, x: Array, curves: Array, standard: Array, draw: Any
-) -> Piece:
+) -> Artefact:
     mean = curves.mean(axis=1)
     columns = [Column(along, x, form="%.6g")]
     if along == "magnitude":
         columns.append(Column("stars", [star_count(m) for m in x], "int64", form="%d"))
     for k, column in enumerate(("mean_distance", "max_distance", "mean_distance_every_change")):
         columns.append(Column(column, mean[:, k], unit="m", form="%.3f", description="mean of the starfields"))
-    return Piece(
+    return Artefact(
         name=name,
         title=f"Figure {name.removeprefix('fig')}: {title}",
         line=f"under standard conditions mean {standard[0]:.1f} m (thesis 14.9), largest {standard[1]:.0f} m (215)",
@@ -154,4 +163,43 @@ def _draw_traverse(middles_m: Array, gaps: Array, caption: str) -> bytes:
     axes.set_ylabel("Distance (m)")
     axes.set_title("Distances between appearing/disappearing stars during a crater traverse", fontsize=10)
     axes.legend(frameon=False)
+    return png(figure, caption)
+
+
+def fig_a2(context: Context) -> Artefact:
+    """Aspect ratios of lunar craters by diameter."""
+    simple, complex_ = np.linspace(0.5, 15, 59), np.linspace(12, 275, 264)
+    ratios = simple / published.simple_depth_km(simple), complex_ / published.complex_depth_km(complex_)
+    shown = [f"{r.min():.2f} to {r.max():.2f}" for r in ratios]
+    caption = (
+        f"Figure A.2: Lunar crater aspect ratio ranges: simple craters {shown[0]} (thesis: approximately 5; axis 4.96 "
+        f"to 5.14), complex craters {shown[1]} (thesis: approximately 5 to 50)."
+    )
+    return Artefact(
+        name="figA.2",
+        title="Figure A.2: Lunar crater aspect ratio ranges",
+        line=f"simple craters {shown[0]} (thesis 5), complex {shown[1]} (thesis 5 to 50)",
+        text=caption,
+        columns=(
+            Column("diameter", np.concatenate([simple, complex_]), unit="km", form="%.3f"),
+            Column("aspect_ratio", np.concatenate(ratios), form="%.4f", description="diameter over depth"),
+            Column("craterform", ["simple"] * len(simple) + ["complex"] * len(complex_), "string"),
+        ),
+        pictures={"figA.2": partial(_draw_ratios, (simple, complex_), ratios, caption)},
+        values={
+            "thesis": {"aspect_ratios": list(published.LUNAR_ASPECT_RATIOS)},
+            "reproduced": {"simple": [*map(float, (ratios[0].min(), ratios[0].max()))],
+                           "complex": [*map(float, (ratios[1].min(), ratios[1].max()))]},
+        },
+    )  # fmt: skip
+
+
+def _draw_ratios(diameters: tuple[Array, Array], ratios: tuple[Array, Array], caption: str) -> bytes:
+    figure = new_figure(7.0, 8.0)
+    titles = "(a) Aspect ratios for simple craterforms", "(b) Aspect ratios for complex craterforms"
+    limits = ((0, 15), (4.96, 5.14)), ((0, 300), (5, 50))
+    for axes, x, y, title, (xlim, ylim) in zip(figure.subplots(2, 1), diameters, ratios, titles, limits, strict=True):
+        axes.plot(x, y, color=STAR)
+        axes.set(xlim=xlim, ylim=ylim, xlabel="Diameter (km)", ylabel="Aspect Ratio (X:1)")
+        axes.set_title(title, fontsize=10)
     return png(figure, caption)

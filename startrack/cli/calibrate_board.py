@@ -1,0 +1,54 @@
+"""`startrack calibrate board`: a camera file from pictures of a chessboard or a ChArUco board."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from startrack.cli.calibrate import add_camera_output_flags, output_path, print_outcome, steps_shown
+from startrack.cli.common import read
+from startrack.errors import NoSolution
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add `calibrate board` to the commands of the `startrack` parser."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "calibrate board",
+        prog="startrack calibrate board",
+        description="Fit the lens of a camera to pictures of a chessboard or a ChArUco board.",
+    )
+    parser.add_argument("images", nargs="+", metavar="IMAGE", help="pictures of the board")
+    parser.add_argument("--pattern", metavar="CxR", help="inner corners of a chessboard; squares of a ChArUco board")
+    parser.add_argument("--charuco", metavar="DICT", help="ChArUco with this dictionary, such as DICT_5X5_100")
+    parser.add_argument("--marker", type=float, default=0.75, metavar="PART", help="marker's side over square's (0.75)")
+    add_camera_output_flags(parser)
+    parser.set_defaults(run=run, usage_error=parser.error, camera=None, time=None, exposure=None)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Calibrate with the board; the exit code."""
+    from startrack.calibration.board import board_dict, board_line, calibrate_board
+    from startrack.calibration.board_corners import Board
+    from startrack.camera.io import camera_text
+    from startrack.files import write_atomically
+    from startrack.output import write_json
+
+    try:
+        columns, rows = (int(n) for n in (args.pattern or "").lower().split("x"))
+    except ValueError:
+        args.usage_error("--pattern CxR is needed: inner corners of a chessboard, squares of a ChArUco board")
+    out = output_path(args, "camera.toml")
+    exposures = [read(path, args) for path in args.images]
+    with steps_shown(args, len(exposures) + 1) as show_step:
+        try:
+            pattern = Board(columns, rows, args.charuco, args.marker)
+            found = calibrate_board(exposures, pattern, name=args.name or out.stem, progress=show_step)
+        except NoSolution as cause:
+            record = {"status": "refused", "reason": cause.reason, "message": str(cause), "camera": None}
+            return print_outcome(args, record, f"{out.name}  refused {cause.reason}: {cause}")
+    record = board_dict(found)
+    if found.accepted:
+        write_atomically(out, camera_text(found.camera).encode("utf-8"), overwrite=True)
+    write_json(out.with_suffix(".calibration.json"), record)
+    line = board_line(found, out.name) + (f"\n  {record['message']}" if record["message"] else "")
+    return print_outcome(args, record, line)

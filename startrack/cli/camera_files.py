@@ -1,0 +1,110 @@
+"""`startrack calibrate verify`, `show` and `convert`: what is done with camera files that are there."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from startrack.cli.calibrate import add_print_flags, add_site_flags, output_path, print_outcome, site_of, steps_shown
+from startrack.cli.common import DEFAULT_OUT, read
+from startrack.errors import BadInput, NoSolution
+
+FORMATS = ("ros", "kalibr", "colmap", "opencv")
+DEFAULT_NAMES = {"colmap": "cameras.txt", "kalibr": "camchain.yaml"}  # of the other programs
+
+
+def add_parsers(subparsers: Any) -> None:
+    """Add the actions to the commands of the `startrack` parser."""
+    verify = _add_action(subparsers, "verify", "Check whether a camera file still fits exposures of the stars.")
+    verify.add_argument("images", nargs="+", metavar="IMAGE", help="PNG, TIFF, FITS, JPEG or camera raw")
+    verify.add_argument("-c", "--camera", metavar="FILE", help="camera file (default: the one that the image names)")
+    add_site_flags(verify)
+    verify.set_defaults(run=run_verify)
+    show = _add_action(subparsers, "show", "Print the content of camera files.")
+    show.add_argument("cameras", nargs="+", metavar="CAMERA", help="camera file, or the name of a shipped one")
+    show.set_defaults(run=run_show)
+    convert = _add_action(subparsers, "convert", "Convert a camera file to another program's format, or from it.")
+    convert.add_argument("file", metavar="FILE", help="camera file with --to; the other program's file with --from")
+    direction = convert.add_mutually_exclusive_group(required=True)
+    direction.add_argument("--to", choices=FORMATS, help="write this format")
+    direction.add_argument("--from", dest="source", choices=FORMATS, help="read this format")
+    convert.add_argument("-o", "--output", metavar="FILE", help="what to write (default: a file in OUT)")
+    convert.add_argument("--name", help="name of the camera (default: the file's stem)")
+    convert.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the results (%(default)s)")
+    convert.set_defaults(run=run_convert)
+
+
+def _add_action(subparsers: Any, action: str, description: str) -> argparse.ArgumentParser:
+    name = f"calibrate {action}"
+    parser: argparse.ArgumentParser = subparsers.add_parser(name, prog=f"startrack {name}", description=description)
+    add_print_flags(parser)
+    parser.set_defaults(usage_error=parser.error)
+    return parser
+
+
+def run_show(args: argparse.Namespace) -> int:
+    """Print what camera files say; 0."""
+    from startrack.calibration.show import camera_text, facts
+    from startrack.camera import load_camera
+
+    for name in args.cameras:
+        camera = load_camera(name)
+        print(json.dumps(facts(camera)) if args.json else camera_text(camera))
+    return 0
+
+
+def run_convert(args: argparse.Namespace) -> int:
+    """Convert one camera file; 0."""
+    from startrack.camera import load_camera
+    from startrack.camera.convert import from_text, to_text
+    from startrack.camera.convert.intrinsics import decentring_rms_px
+    from startrack.camera.io import camera_text
+    from startrack.files import write_atomically
+
+    if args.to is not None:
+        camera = load_camera(args.file)
+        text = to_text(camera, args.to)
+        default = DEFAULT_NAMES.get(args.to, f"{camera.name}.yaml")
+        lost = decentring_rms_px(camera) if camera.decentring and args.to != "colmap" else 0.0
+        note = f"; {args.to} has no decentring: {lost:.2f} px RMS are lost" if lost else ""
+    else:
+        text = camera_text(from_text(_text(args.file), args.source, args.name or Path(args.file).stem))
+        default, note = f"{Path(args.file).stem}.toml", ""
+    out = output_path(args, default)
+    write_atomically(out, text.encode("utf-8"), overwrite=True)
+    if not args.quiet:
+        print(f"{out}{note}")
+    return 0
+
+
+def run_verify(args: argparse.Namespace) -> int:
+    """Check a camera file against exposures of the stars; the exit code of the worst."""
+    from startrack.calibration.verify import verify, verify_dict, verify_line
+    from startrack.camera import load_camera
+    from startrack.catalog import load_catalog
+
+    worst = 0
+    for path in args.images:
+        exposure = read(path, args)
+        named = args.camera or exposure.camera
+        if named is None:
+            raise BadInput("no_calibration", "no camera file to verify is known: give -c FILE")
+        with steps_shown(args, 1) as show_step:
+            try:
+                show_step(f"verifying with {exposure.name}")
+                found = verify(exposure, load_camera(named), load_catalog(), site_of(args, [exposure]))
+            except NoSolution as cause:
+                record = {"image": exposure.name, "status": "refused", "reason": cause.reason, "message": str(cause)}
+                worst = max(worst, print_outcome(args, record, f"{exposure.name}  refused {cause.reason}: {cause}"))
+                continue
+        worst = max(worst, print_outcome(args, verify_dict(found), verify_line(found)))
+    return worst
+
+
+def _text(path: str) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as cause:
+        raise BadInput("no_calibration", f"{path}: {cause}") from cause

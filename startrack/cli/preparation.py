@@ -1,0 +1,82 @@
+"""What a terrain needs before its first fix: compiled kernels and, for a height map, the table of its horizons."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
+
+from startrack.cli.progress import progress
+from startrack.compilation import announce
+from startrack.errors import BadInput
+
+if TYPE_CHECKING:
+    from startrack.terrain import Terrain
+
+RAYS = 360  # of the fix that compiles the kernels: one a degree above the skyline and one below
+OFFSET_RAD = 0.01
+LLR = 4.0
+EDGE_SIGMA_RAD = 0.001
+
+
+def prepare_reference(reference: str | None, args: argparse.Namespace) -> Terrain | None:
+    """Prepare the terrain that a file or shipped name refers to; None if it cannot be loaded."""
+    if reference is None:
+        return None
+    from startrack.terrain import load_terrain
+
+    with suppress(BadInput):  # reported by the command that loads the terrain for its image
+        terrain = load_terrain(reference)
+        prepare(terrain, args)
+        return terrain
+    return None
+
+
+def prepare(terrain: Terrain, args: argparse.Namespace) -> None:
+    """Compute a terrain's horizon table, unless it is known or there is none."""
+    if terrain.is_prepared:
+        return
+    announce(height_map=True)
+    with _terrain_log(args), progress(f"horizons of {terrain.name}, once", shown=not args.quiet) as bar:
+        terrain.prepare(bar.update)
+
+
+def compile_kernels(terrain: Terrain) -> None:
+    """Compile the kernels of a fix on this terrain, by one fix from an ideal skyline seen from the origin."""
+    import numpy as np
+
+    from startrack.localization import ExactPosterior
+    from startrack.types import Evidence, NotLocated
+
+    announce(height_map=not terrain.axisymmetric)
+    azimuth = np.linspace(0.0, 2 * np.pi, RAYS, endpoint=False)
+    skyline = terrain.horizon_rad(np.zeros((RAYS, 2)), azimuth)
+    evidence = Evidence(
+        azimuth_rad=np.tile(azimuth, 2),
+        elevation_rad=np.concatenate([skyline + OFFSET_RAD, skyline - OFFSET_RAD]),
+        llr=np.repeat([LLR, -LLR], RAYS),
+        edge_sigma_rad=np.full(2 * RAYS, EDGE_SIGMA_RAD),
+    )
+    with suppress(NotLocated):  # whatever the answer, the kernels are compiled
+        ExactPosterior()(evidence, terrain)
+
+
+@contextmanager
+def _terrain_log(args: argparse.Namespace) -> Iterator[None]:
+    """Print on stderr what the terrain logs in the block: that it begins or waits, and with -v where the table is."""
+    if args.quiet or (sys.stderr.isatty() and not args.verbose):  # a terminal has the bar
+        yield
+        return
+    log, handler = logging.getLogger("startrack.terrain"), logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(message)s"))
+    level = log.level
+    log.addHandler(handler)
+    log.setLevel(logging.DEBUG if args.verbose else logging.INFO)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)

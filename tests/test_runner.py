@@ -1,0 +1,144 @@
+"""Tasks in processes and on Dask: some kill their process, some block it, and the others are done all the same."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import pytest
+from batch_helpers import task_of
+
+from startrack.batch import locate_images
+from startrack.runner import Died, Runner, RunStopped
+
+JOBS = 2
+
+
+def work(name: str) -> tuple[str, int]:
+    """A moment of work; the name says whether the process dies of it, or stops for ever."""
+    time.sleep(0.02)
+    if "deadly" in name:
+        os._exit(9)
+    if "stopping" in name:
+        os.kill(os.getpid(), signal.SIGSTOP)
+    if "failing" in name:
+        raise RunStopped("the disk is full")
+    return name, os.getpid()
+
+
+def outcomes(runner: Runner[str, tuple[str, int]], names: list[str]) -> dict[str, tuple[str, int] | Died]:
+    with runner:
+        done = list(runner.results(names))
+    assert sorted(name for name, _ in done) == sorted(names)
+    return dict(done)
+
+
+def test_a_task_that_kills_its_process_costs_the_others_nothing():
+    names = [f"{number:02d}" for number in range(60)]
+    names[5], names[40] = "05-deadly", "40-deadly"
+    done = outcomes(Runner(work, jobs=JOBS), names)
+    assert [name for name in names if isinstance(done[name], Died)] == ["05-deadly", "40-deadly"]
+    # Those in hand at a death are done one at a time, by one process until it dies and by one after it; then the
+    # processes work side by side again.
+    processes = {outcome[1] for outcome in done.values() if not isinstance(outcome, Died)}
+    assert len(processes) <= 3 * JOBS + 2 * 2
+
+
+def test_few_tasks_are_repeated_after_a_death():
+    names = [f"{number:02d}" for number in range(12)]
+    names[3] = "03-deadly"
+    runner: Runner[str, tuple[str, int]] = Runner(work, jobs=JOBS)
+    with runner:
+        ends: list[list[str]] = []
+
+        def until_failure():
+            from startrack.runner import TASKS_PER_PROCESS, _Pool
+
+            ends.append((yield from runner._until_failure(iter(names), _Pool(JOBS), TASKS_PER_PROCESS * JOBS)))
+
+        done = [name for name, _ in until_failure()]
+    (suspects,) = ends
+    assert "03-deadly" in suspects
+    assert len(suspects) <= 2 * JOBS
+    assert not {*done} & {*suspects}
+
+
+def test_a_stopped_process_does_not_hold_the_end():
+    start = time.monotonic()
+    done = outcomes(Runner(work, jobs=JOBS, limit_s=3.0), ["0", "1-stopping", "2", "3"])
+    assert [name for name, outcome in done.items() if isinstance(outcome, Died)] == ["1-stopping"]
+    assert time.monotonic() - start < 60
+
+
+def test_an_exception_of_the_work_reaches_the_caller():
+    with Runner(work, jobs=JOBS) as runner, pytest.raises(RunStopped, match="the disk is full"):
+        list(runner.results(["0", "1-failing", "2"]))
+
+
+def test_processes_are_kept_between_calls():
+    with Runner(work, jobs=1) as runner:
+        (first,), (second,) = ([outcome for _, outcome in runner.results([name])] for name in "ab")
+    assert first[1] == second[1] != os.getpid()
+    assert next(Runner(work, in_process=True).results(["a"]))[1] == ("a", os.getpid())
+
+
+def test_a_signal_while_processes_start_neither_hangs_nor_kills_them():
+    """Sent to the process group while its processes start, as a terminal sends Ctrl-C."""
+    code = """
+        import os, signal, sys, threading
+        from startrack.runner import Runner
+        if __name__ == "__main__":
+            seen = []
+            signal.signal(signal.SIGINT, lambda *_: seen.append(1))
+            for delay_s in (0.02, 0.1, 0.3):
+                threading.Timer(delay_s, lambda: os.killpg(0, signal.SIGINT)).start()
+            with Runner(abs, jobs=2) as runner:
+                done = sorted(outcome for _, outcome in runner.results(range(8)))
+            print(done, len(seen))
+    """
+    process = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, start_new_session=True,
+        timeout=120,
+    )  # fmt: skip
+    assert process.stdout == f"{list(range(8))} 3\n", process.stderr
+
+
+def test_an_image_that_kills_dask_workers_is_given_up_and_the_others_are_done(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    dask = pytest.importorskip("dask")
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
+        distributed.LocalCluster(1, processes=True, threads_per_worker=1, dashboard_address=None) as cluster,
+    ):
+        done = outcomes(Runner(work, cluster=cluster.scheduler_address), ["00", "01-deadly", "02", "03"])
+    died = [outcome for outcome in done.values() if isinstance(outcome, Died)]
+    assert done["01-deadly"] in died and "workers that worked on it died" in died[0].cause
+
+
+def test_a_task_that_died_is_an_internal_error_of_its_image(tmp_path):
+    class Dying(Runner):
+        def results(self, tasks):
+            yield from ((task, Died("gone")) for task in tasks)
+
+    task = task_of(tmp_path / "05.png", tmp_path / "out")
+    ((record, kept),) = locate_images(Dying(work), [task])
+    assert (record["reason"], record["message"], kept) == ("internal_error", "internal error: gone", False)
+    assert json.loads((tmp_path / "out" / "05.fix.json").read_text())["reason"] == "internal_error"
+
+
+def test_a_scheduler_that_goes_stops_the_run():
+    """It ends, as far as the client can tell, after the first outcome."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(1, processes=True, threads_per_worker=1, dashboard_address=None) as cluster:
+        results = Runner(work, cluster=cluster.scheduler_address).results([str(number) for number in range(200)])
+        next(results)
+        cluster.close()
+        with pytest.raises(RunStopped, match=r"the Dask scheduler has gone [^\n]*$"):
+            list(results)
+    assert not logging.getLogger("distributed.client").isEnabledFor(logging.ERROR)  # it would add tracebacks

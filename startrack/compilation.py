@@ -15,14 +15,12 @@ import tempfile
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from startrack.files import PACKAGE
 
 LOG = logging.getLogger(__name__)
 VARIABLE = "NUMBA_CACHE_DIR"
-KERNEL_MARK = b"@njit("
-TERRAIN = PACKAGE / "terrain"  # kernels that only height maps need; all others serve every terrain
-CYLINDER_S, HEIGHT_MAP_S = 15, 40  # of one core, from an empty cache to the first fix
 
 
 def choose_cache_folder() -> None:
@@ -45,30 +43,37 @@ def choose_cache_folder() -> None:
 
 
 @cache
-def announce(*, height_map: bool) -> bool:
-    """Log one line if the next fix has to compile its kernels first, once a process; whether it has to.
+def announce_compilation() -> None:
+    """From now on, log one line when numba compiles the first kernel of startrack in this process.
 
-    Args:
-        height_map: Whether the terrain is a height map, which needs further kernels.
+    Nothing is logged where all kernels come from the cache. Call this before the first use of a kernel.
     """
-    seconds = 0
-    if not _any_compiled(path for path in _kernel_files() if TERRAIN not in path.parents):
-        seconds = CYLINDER_S
-    if height_map and not _any_compiled(path for path in _kernel_files() if TERRAIN in path.parents):
-        seconds = HEIGHT_MAP_S
-    if seconds:
-        LOG.warning("compiling for this machine, once: about %d s", seconds)
-    return bool(seconds)
+    from numba.core import event
+
+    class Announcement(event.Listener):  # type: ignore[misc]
+        made = False
+
+        def on_start(self, event: Any) -> None:
+            if not self.made and event.data["dispatcher"].py_func.__module__.startswith("startrack."):
+                self.made = True
+                LOG.warning("compiling for this machine, once: 15 s, for height maps up to a minute")
+
+        def on_end(self, event: Any) -> None:
+            """Nothing to do."""
+
+    event.register("numba:compile", Announcement())
 
 
-def _kernel_files() -> Iterator[Path]:
-    """Sources with kernels that numba compiles."""
-    return (path for path in sorted(PACKAGE.rglob("*.py")) if KERNEL_MARK in path.read_bytes())
+def is_compiled() -> bool:
+    """Whether numba's cache holds localization kernels for this Python, compiled since their source changed.
 
-
-def _any_compiled(sources: Iterator[Path]) -> bool:
-    """Whether numba's cache holds a kernel of any of the sources for this Python, compiled since the source changed."""
-    return any(index.stat().st_mtime >= source.stat().st_mtime for source in sources for index in _indices_of(source))
+    For a decision that costs nothing but time if it is wrong.
+    """
+    return any(
+        index.stat().st_mtime >= source.stat().st_mtime
+        for source in (PACKAGE / "localization").glob("*.py")
+        for index in _indices_of(source)
+    )
 
 
 def _indices_of(source: Path) -> Iterator[Path]:

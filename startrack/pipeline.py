@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from startrack.camera import Camera
 from startrack.catalog.bodies import bodies
+from startrack.compilation import announce_compilation
 from startrack.detection import Detector
 from startrack.exposure import are_fractions
 from startrack.frames import Site, observer_velocity_m_s
@@ -55,6 +56,7 @@ def locate(
     run = Run(Inputs(exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name))
     try:
         check_inputs(run.reached)
+        announce_compilation()
         detected = run.step("detect", detect_sources, run.reached, camera, settings.detector)
         identified = run.step("identify", identify_stars, detected, camera, catalog, settings.identifier, terrain.site)
         oriented = run.step("attitude", solve_orientation, identified)
@@ -64,7 +66,8 @@ def locate(
             again = run.step("evidence", remeasure_near_skyline, measured, fix, settings.evidence)
             if again is not measured:
                 measured, fix = again, run.time("locate", settings.localizer, again.evidence(), terrain)
-        run.time("locate", check_consistency, measured.evidence(), fix, terrain)
+        if getattr(settings.localizer, "explains_evidence", True):
+            run.time("locate", check_consistency, measured.evidence(), fix, terrain)
         return run.finish(extend(measured, Located, fix=fix))
     except (BadInput, NoSolution) as refusal:
         return run.refuse(refusal)

@@ -13,13 +13,13 @@ from startrack.batch.store import (
     stored,
 )
 from startrack.batch.tables import write_tables
-from startrack.batch.task import Outcome, Task, locate_image, locate_images
+from startrack.batch.task import ImageDone, Task, locate_image, locate_images
 
 __all__ = [
     "JOB",
     "LOCK",
     "Image",
-    "Outcome",
+    "ImageDone",
     "Rows",
     "Task",
     "gist",

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from startrack.stages import Outcome
 
 Record = dict[str, Any]
-Outcome = tuple[Record, bool]  # the record, and whether it was there already
+ImageDone = tuple[Record, bool]  # the record, and whether it was there already
 DISK_ERRORS = {errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.EFBIG, errno.EIO}
 
 
@@ -36,14 +36,14 @@ class Task:
     localizer: str = "posterior"  # of startrack.localization.LOCALIZERS
 
 
-def locate_images(runner: Runner[Task, Outcome], tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
+def locate_images(runner: Runner[Task, ImageDone], tasks: Sequence[Task]) -> Generator[ImageDone, None, None]:
     """The outcomes in the order of completion. Raises BadInput (no_cluster), RunStopped."""
     with closing(runner.results(tasks)) as results:
         for task, outcome in results:
             yield (lost(task, f"internal error: {outcome.cause}"), False) if isinstance(outcome, Died) else outcome
 
 
-def locate_image(task: Task) -> Outcome:
+def locate_image(task: Task) -> ImageDone:
     """The image's record, and whether it was there already. Never raises for an image's sake.
 
     NAME.fix.json is written last, so that a result that is there is whole. Raises RunStopped where the disk takes

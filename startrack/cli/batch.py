@@ -15,12 +15,12 @@ from startrack.cli.batch_show import Counts, Halt, omission_lines, outcomes_show
 from startrack.cli.common import DEFAULT_OUT, add_fact_flags, add_localizer_flag, cores, flag_facts, localizer_of
 from startrack.cli.flag_types import at_least_one
 from startrack.cli.preparation import compile_kernels, prepare_reference
-from startrack.compilation import announce
+from startrack.compilation import is_compiled
 from startrack.errors import INTERNAL_ERROR, BadInput
 from startrack.files import is_path, make_folder
 
 if TYPE_CHECKING:
-    from startrack.batch import Image, Outcome, Task
+    from startrack.batch import Image, ImageDone, Task
     from startrack.runner import Runner
 
 OK, FAULT, STOPPED = 0, 1, 5
@@ -100,7 +100,7 @@ def _run(
     if args.cluster is None and not all(Path(task.result).exists() for task in tasks):
         _prepare(tasks[0], args)
     counts = Counts()
-    runner: Runner[Task, Outcome] = Runner(locate_image, jobs=args.jobs or cores(), cluster=args.cluster)
+    runner: Runner[Task, ImageDone] = Runner(locate_image, jobs=args.jobs or cores(), cluster=args.cluster)
     halt = Halt(runner.stop)
     with signals_halt(halt):
         with runner:
@@ -132,7 +132,7 @@ def _run(
 
 
 def _locate_all(
-    runner: Runner[Task, Outcome], tasks: Sequence[Task], counts: Counts, halt: Halt, args: argparse.Namespace
+    runner: Runner[Task, ImageDone], tasks: Sequence[Task], counts: Counts, halt: Halt, args: argparse.Namespace
 ) -> tuple[list[dict[str, Any]], str | None]:
     """What the tables need of each image that was done, and why not all of them were."""
     from startrack.batch import gist, locate_images
@@ -202,7 +202,7 @@ def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argpa
 def _prepare(task: Task, args: argparse.Namespace) -> None:
     """Prepare the terrain of an image, as a rule that of all, once instead of in every process."""
     terrain = prepare_reference(_terrain_of(task), args)
-    if terrain is not None and announce(height_map=not terrain.axisymmetric):
+    if terrain is not None and not is_compiled():
         compile_kernels(terrain)
 
 

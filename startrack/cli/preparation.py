@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from startrack.cli.progress import progress
-from startrack.compilation import announce
+from startrack.compilation import announce_compilation
 from startrack.errors import BadInput
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def prepare(terrain: Terrain, args: argparse.Namespace) -> None:
     """Compute a terrain's horizon table, unless it is known or there is none."""
     if terrain.is_prepared:
         return
-    announce(height_map=True)
+    announce_compilation()
     with _terrain_log(args), progress(f"horizons of {terrain.name}, once", shown=not args.quiet) as bar:
         terrain.prepare(bar.update)
 
@@ -51,7 +51,7 @@ def compile_kernels(terrain: Terrain) -> None:
     from startrack.localization import ExactPosterior
     from startrack.types import Evidence, NotLocated
 
-    announce(height_map=not terrain.axisymmetric)
+    announce_compilation()
     azimuth = np.linspace(0.0, 2 * np.pi, RAYS, endpoint=False)
     skyline = terrain.horizon_rad(np.zeros((RAYS, 2)), azimuth)
     evidence = Evidence(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli.common import DEFAULT_OUT, cores
 from startrack.cli.flag_types import at_least_one, count
 from startrack.cli.progress import progress
-from startrack.compilation import announce
+from startrack.compilation import announce_compilation
 from startrack.files import make_folder
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     from startrack.reproduction import ARTEFACTS, FULL, QUICK, ChunkStore, Context, write_artefact
 
     out, size = make_folder(args.dir), FULL if args.full else QUICK
-    announce(height_map=False)
+    announce_compilation()
     if args.ours is not None:
         size = size.with_ours(args.ours)
     with ChunkStore(out, jobs=args.jobs or cores(), progress=progress, cluster=args.cluster) as store:

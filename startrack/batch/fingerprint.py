@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from startrack import __version__
-from startrack.catalog.gaia import deep_installed
+from startrack.catalog.gaia import has_deep_catalog
 from startrack.exposure.metadata import RAW_SUFFIXES, sidecar_of
 from startrack.files import is_path
 
@@ -38,7 +38,7 @@ def key_of(image: str, image_sha256: str, facts: dict[str, Any], *others: object
     path = Path(image)
     sidecar = sidecar_of(path)
     flags = {key: _from(path, value) if key in FILES and is_path(value) else value for key, value in facts.items()}
-    extras = [deep_installed(), path.suffix.lower() in RAW_SUFFIXES and find_spec("rawpy") is not None]
+    extras = [has_deep_catalog(), path.suffix.lower() in RAW_SUFFIXES and find_spec("rawpy") is not None]
     whole = [__version__, flags, *others, extras, image_sha256, sidecar and sha256_of(sidecar)]
     return hashlib.sha256(json.dumps(whole, default=str).encode()).hexdigest()
 

@@ -1,4 +1,4 @@
-"""The camera: a lens, a sensor and a mount. Pixels to rays and back."""
+"""The camera: a lens, a sensor and a mount. Rays to pixels and back."""
 
 from __future__ import annotations
 
@@ -36,7 +36,9 @@ class Sensor:
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """x_px = cx + fx rho(a) cos b, y_px = cy + fy rho(a) sin b, b = atan2(y_cam, x_cam); mirrored: x_px = cx - fx ...
+    """A lens in front of a sensor, with its mount on the rover.
+
+    x_px = cx + fx rho(a) cos b, y_px = cy + fy rho(a) sin b, b = atan2(y_cam, x_cam); mirrored: x_px = cx - fx ...
 
     A decentred lens adds its shift to rho (cos b, sin b). Pixel (0, 0) is the centre of the top-left pixel. Rays past
     90 degrees (z_cam <= 0) are legal.

@@ -1,5 +1,6 @@
-"""Stars and bodies: Hipparcos, Gaia's fainter stars, the Sun, the planets, the Moon and the Earth."""
+"""Stars and bodies: Hipparcos, Gaia's fainter stars, names, and the Sun, planets, Moon and Earth."""
 
-from startrack.catalog.hipparcos import StarCatalog, load_catalog, star_names
+from startrack.catalog.hipparcos import StarCatalog, load_catalog
+from startrack.catalog.names import star_names
 
 __all__ = ["StarCatalog", "load_catalog", "star_names"]

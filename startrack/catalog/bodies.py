@@ -1,4 +1,7 @@
-"""The Sun, the planets, the Earth and the Moon as lights in the sky of a site: false stars, named beforehand."""
+"""Sun, planets, Earth and Moon in the sky of a site: sources that are no catalogue stars.
+
+No library at hand gives the magnitudes of all of them: Skyfield has the planets, but not the Earth and the Moon.
+"""
 
 from __future__ import annotations
 
@@ -43,9 +46,8 @@ def bodies(site: Site, time: datetime) -> list[Body]:
     """
     observer_m, velocity_m_s = observer_state(site, time)
     et = et_s(time)
-    return [
-        _seen(source, observer_m, velocity_m_s, et) for source in _SOURCES if source.name.lower() != site.body.lower()
-    ]
+    sources = (source for source in _SOURCES if source.name.lower() != site.body.lower())
+    return [_apparent(source, observer_m, velocity_m_s, et) for source in sources]
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ class _Source:
     v_mag: Callable[[_View], float]
 
 
-def _seen(source: _Source, observer_m: Array, velocity_m_s: Array, et: float) -> Body:
+def _apparent(source: _Source, observer_m: Array, velocity_m_s: Array, et: float) -> Body:
     light_time_s = 0.0
     for _ in range(3):  # each round shrinks the error by v / c = 1e-4
         body_m, _ = barycentric_state(source.naif, et - light_time_s)

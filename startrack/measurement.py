@@ -9,8 +9,8 @@ import numpy as np
 from startrack.catalog.gaia import has_deep_catalog, hipparcos_rows_in_deep, load_deep_catalog
 from startrack.detection import electrons
 from startrack.evidence import Skyline, StarEvidence, StarLight, flux_scale, known_well, levelled, near_skyline
+from startrack.evidence.star_evidence import filtered_noise_e
 from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
-from startrack.psf import noise_area_px
 from startrack.stages import Measured, Oriented, Settings, extend
 from startrack.terrain import Terrain
 from startrack.types import Array, BadInput, Detections, Fix, Ints
@@ -49,8 +49,7 @@ def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
     """
     found, when = oriented.identification, oriented.exposure.time_utc
     scale = flux_scale(oriented.detections, oriented.camera, oriented.stars, found)
-    noise_e = float(np.median(oriented.detections.noise_e)) * np.sqrt(noise_area_px(oriented.detections.psf_sigma_px))
-    limiting_mag = scale.zero_mag - 2.5 * np.log10(5.0 * noise_e)
+    limiting_mag = scale.zero_mag - 2.5 * np.log10(5.0 * filtered_noise_e(oriented.detections))
     if when is None or limiting_mag < COMPLETE_V_MAG or not has_deep_catalog():
         return oriented
     deep = load_deep_catalog()

@@ -41,6 +41,14 @@ def take_rows(value: T, which: Any) -> T:
     return replace(value, **{name: getattr(value, name)[which] for name in rows})  # type: ignore[type-var]
 
 
+def _is_locked(given: Any, dtype: Any) -> bool:
+    """Whether nothing can change an array of this kind of numbers any more: it then needs no copy."""
+    if type(given) is not np.ndarray or given.flags.writeable or not given.flags.c_contiguous:
+        return False
+    base = given.base
+    return np.issubdtype(given.dtype, dtype) and (base is None or (type(base) is np.ndarray and not base.flags.writeable))
+
+
 class Value:
     """Base of the frozen values: converts, checks and locks the fields declared with `array`."""
 
@@ -52,7 +60,7 @@ class Value:
             want, given = f.metadata["shape"], getattr(self, f.name)
             if given is None:
                 given = np.full([lengths.get(w, w) for w in want], f.metadata["default"])
-            a = np.array(given, dtype=f.metadata["dtype"])
+            a = given if _is_locked(given, f.metadata["dtype"]) else np.array(given, dtype=f.metadata["dtype"])
             if a.ndim != len(want):
                 raise ValueError(f"{type(self).__name__}.{f.name}: {a.ndim} dimensions, expected {want}")
             for n, w in zip(a.shape, want, strict=True):

@@ -58,9 +58,7 @@ class StarCatalog(Value):
     @cached_property
     def catalog_id(self) -> NDArray[np.str_]:
         """Ids (n,) such as "HIP 32349"."""
-        ids = id_texts(self.sources, self.source, self.number)
-        ids.flags.writeable = False
-        return ids
+        return id_texts(self.sources, self.source, self.number)
 
     @property
     def names(self) -> Mapping[int, str]:
@@ -92,17 +90,20 @@ class StarCatalog(Value):
         """
         moment = J2000 if time is None else as_utc(time)
         years = 2000.0 + (moment - J2000).total_seconds() / JULIAN_YEAR_S - self.epoch_yr
-        rays = self.rays_icrs + years * self.motion_rad_yr
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        rays = years * self.motion_rad_yr
+        rays += self.rays_icrs
+        rays /= np.sqrt(np.einsum("ni,ni->n", rays, rays))[:, None]
         if velocity_m_s is not None:
             rays = aberrate(rays, velocity_m_s)
+        rays.flags.writeable = False
         return Stars(
             catalog_id=self.catalog_id, hip=self.hip, rays_icrs=rays, v_mag=self.v_mag, v_sigma_mag=self.v_sigma_mag
         )
 
 
+@lru_cache(maxsize=4)
 def load_catalog(name: str = "hipparcos") -> StarCatalog:
-    """The shipped catalogue `name`; every star of it.
+    """Every star of the shipped catalogue `name`, read once in a process.
 
     Raises:
         FileNotFoundError: no such catalogue; the message lists the shipped ones.

@@ -41,4 +41,5 @@ def id_texts(sources: tuple[str, ...], source: Ints, number: Ints) -> NDArray[np
             for column in range(start + d - 1, start - 1, -1):
                 rest, last = np.divmod(rest, 10)
                 code_points[rows, column] = ord("0") + last
+    code_points.flags.writeable = False
     return code_points.view(f"<U{width}")[:, 0]

@@ -45,9 +45,11 @@ def aberrate(rays_icrs: ArrayLike, velocity_m_s: ArrayLike) -> Array:
     beta = np.asarray(velocity_m_s, dtype=float) / SPEED_OF_LIGHT_M_S
     inverse_gamma = np.sqrt(1.0 - beta @ beta)
     along = (rays @ beta)[..., None]
-    moved = inverse_gamma * rays + (1.0 + along / (1.0 + inverse_gamma)) * beta
+    moved = (1.0 + along / (1.0 + inverse_gamma)) * beta
+    moved += inverse_gamma * rays
     # Normalised afresh instead of divided by 1 + n.b: rounding in the catalogue's rays must not accumulate.
-    return moved / np.linalg.norm(moved, axis=-1, keepdims=True)
+    moved /= np.sqrt(np.einsum("...i,...i->...", moved, moved))[..., None]
+    return np.asarray(moved)
 
 
 def refract_rad(elevation_rad: ArrayLike, pressure_hpa: float = 1010.0, temperature_c: float = 10.0) -> Array:

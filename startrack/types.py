@@ -46,7 +46,9 @@ def _is_locked(given: Any, dtype: Any) -> bool:
     if type(given) is not np.ndarray or given.flags.writeable or not given.flags.c_contiguous:
         return False
     base = given.base
-    return np.issubdtype(given.dtype, dtype) and (base is None or (type(base) is np.ndarray and not base.flags.writeable))
+    return np.issubdtype(given.dtype, dtype) and (
+        base is None or (type(base) is np.ndarray and not base.flags.writeable)
+    )
 
 
 class Value:

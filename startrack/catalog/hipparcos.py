@@ -61,6 +61,11 @@ class StarCatalog(Value):
         return id_texts(self.sources, self.source, self.number)
 
     @property
+    def is_deep(self) -> bool:
+        """Whether it has Gaia's stars, so that it lacks none of the sky's to about magnitude 10."""
+        return "GAIA" in self.sources
+
+    @property
     def names(self) -> Mapping[int, str]:
         """Names by Hipparcos number, as `star_names`."""
         return star_names()

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 SUFFIXES = {"png": ".png", "tiff": ".tif", "fits": ".fits"}
 KNOWN_SUFFIXES = {".png", ".tif", ".tiff", ".fits", ".fit", ".fts"}
 CATALOG_V_MAG = 10.0  # catalogue stars drawn when there are no faint ones to go with them
+STAR_LISTS = ("auto", "hipparcos", "gaia")
 PROGRESS_FROM = 3  # images
 
 
@@ -67,13 +68,15 @@ def _add_pose(group: Any) -> None:
 
 def _add_light(group: Any) -> None:
     help_exposure = "seconds; default: a V 6 star on the axis reaches 5 sigma, which takes fisheye-2048 0.40 s"
-    help_faint = "add stars that the catalogue lacks (FIELD n) down to this magnitude, and draw none fainter (10)"
+    help_faint = "no stars fainter than this; down to it, stars that Hipparcos lacks are drawn at random (FIELD n) (10)"
+    help_stars = "whose stars the sky has (auto: Gaia's where the extra `deep` is installed)"
     help_scatter = "of each star's flux, beyond the catalogue's own errors (0.03); 0 turns both off"
     group.add_argument("--exposure", type=positive, metavar="S", help=help_exposure)
     group.add_argument("--sky-mag", type=number, default=22.0, metavar="V", help="diffuse sky per arcsec^2 (22.0)")
     group.add_argument("--sky-gradient", type=number, default=0.0, metavar="F", help="its slope to the horizon (0)")
     group.add_argument("--sky-gradient-azimuth", type=number, default=0.0, metavar="DEG", help="where it rises to (0)")
     group.add_argument("--wall-reflectance", type=amount, default=0.04, metavar="F", help="of the sky's light (0.04)")
+    group.add_argument("--stars", choices=STAR_LISTS, default="auto", help=help_stars)
     group.add_argument("--faint-stars", type=number, default=10.0, metavar="V", help=help_faint)
     group.add_argument("--no-faint-stars", action="store_true", help="the catalogue's stars alone")
     group.add_argument("--flux-scatter", type=amount, default=0.03, metavar="MAG", help=help_scatter)
@@ -116,16 +119,16 @@ def _targets(args: argparse.Namespace) -> list[Path]:
 
 def _series(args: argparse.Namespace) -> Series:
     from startrack.camera import load_camera
-    from startrack.catalog import load_catalog
     from startrack.frames import parse_utc
-    from startrack.rendering import Series
+    from startrack.rendering import Series, load_sky_catalog
     from startrack.terrain import load_terrain
 
+    catalog = load_sky_catalog(args.stars)
     faint = None if args.no_faint_stars else args.faint_stars
     return Series(
         camera=load_camera(args.camera),
         terrain=load_terrain(args.terrain),
-        catalog=load_catalog().brighter_than(CATALOG_V_MAG if faint is None else faint),
+        catalog=catalog.brighter_than(CATALOG_V_MAG if faint is None else faint),
         seed=args.seed,
         time_utc=None if args.time is None else parse_utc(args.time),
         east_m=args.east,
@@ -158,7 +161,7 @@ def _render_one(args: argparse.Namespace, series: Series, number: int, image: Pa
     pose = _pose(scene, truth)
     write_exposure(image, exposure, overwrite=args.overwrite)
     write_sidecar(image, exposure, overwrite=args.overwrite)
-    facts = {**pose, "seed": args.seed, "number": number, "settings": _settings(args)}
+    facts = {**pose, "seed": args.seed, "number": number, "catalog": series.catalog.name, "settings": _settings(args)}
     pose_path, table_path = write_truth(image, truth, facts, to_v_mag=args.truth_mag, overwrite=args.overwrite)
     return {"image": str(image), "truth": str(pose_path), "table": str(table_path), **facts}
 

@@ -4,7 +4,7 @@ from startrack.rendering.compose import light_e, render, truth_of
 from startrack.rendering.defects import draw_hot_pixels
 from startrack.rendering.field_stars import draw_field_stars, draw_v_errors, joined
 from startrack.rendering.scene import HotPixels, Scene, Truth
-from startrack.rendering.series import Series, sky_turn_rad
+from startrack.rendering.series import Series, load_sky_catalog, sky_turn_rad
 from startrack.rendering.sources import exposure_reaching
 from startrack.rendering.write import truth_paths, write_truth
 
@@ -19,6 +19,7 @@ __all__ = [
     "exposure_reaching",
     "joined",
     "light_e",
+    "load_sky_catalog",
     "render",
     "sky_turn_rad",
     "truth_of",

@@ -51,7 +51,7 @@ class Series:
     sky_gradient: float = 0.0
     sky_gradient_azimuth_rad: float = 0.0
     wall_reflectance: float = 0.04
-    faint_v_mag: float | None = 10.0  # stars that the catalogue lacks are added down to this; None: none
+    faint_v_mag: float | None = 10.0  # random stars that Hipparcos lacks are added down to this; None: none
     flux_scatter_mag: float = 0.03  # beyond the catalogue's own errors; 0: neither
     hot_pixels: int = 200
     cosmic_rays: int = 5
@@ -130,10 +130,22 @@ class Series:
         errors = np.zeros(len(stars))
         if self.flux_scatter_mag > 0:
             errors = draw_v_errors(stars, self.flux_scatter_mag, rng=rng)
-        if self.faint_v_mag is None:
+        if self.faint_v_mag is None or self.catalog.is_deep:
             return stars, errors
         field = draw_field_stars(stars, self.faint_v_mag, rng=rng)
         return joined(stars, field), np.concatenate([errors, np.zeros(len(field))])
+
+
+def load_sky_catalog(stars: str) -> StarCatalog:
+    """The catalogue of the sky's stars: "hipparcos", "gaia", or "auto" for Gaia's where they are installed.
+
+    The evidence of long exposures expects Gaia's stars where they are installed; a sky with other faint stars would
+    contradict it. Raises BadInput (bad_calibration) for "gaia" where the package is not installed.
+    """
+    from startrack.catalog import load_catalog
+    from startrack.catalog.gaia import deep_installed, load_deep_catalog
+
+    return load_deep_catalog() if stars == "gaia" or (stars == "auto" and deep_installed()) else load_catalog()
 
 
 def sky_turn_rad(site: Site, time: datetime, exposure_s: float) -> Array:

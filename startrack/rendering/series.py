@@ -143,9 +143,9 @@ def load_sky_catalog(stars: str) -> StarCatalog:
     contradict it. Raises BadInput (bad_calibration) for "gaia" where the package is not installed.
     """
     from startrack.catalog import load_catalog
-    from startrack.catalog.gaia import deep_installed, load_deep_catalog
+    from startrack.catalog.gaia import has_deep_catalog, load_deep_catalog
 
-    return load_deep_catalog() if stars == "gaia" or (stars == "auto" and deep_installed()) else load_catalog()
+    return load_deep_catalog() if stars == "gaia" or (stars == "auto" and has_deep_catalog()) else load_catalog()
 
 
 def sky_turn_rad(site: Site, time: datetime, exposure_s: float) -> Array:

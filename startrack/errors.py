@@ -1,42 +1,148 @@
-"""What can go wrong. Kept apart from the values so that the commands start without numpy."""
+"""What can go wrong: the reasons with their exit codes and advice, and the exceptions that carry them.
+
+Kept apart from the values so that the commands start without numpy. Exit codes, JSON schema, the page's advice and the
+table in docs/formats.md are made from `Reason`; a new reason is one entry here.
+"""
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Any
 
-INTERNAL_ERROR = "internal_error"  # the reason of an image that met a fault of the program's own
-BAD_INPUT_REASONS = frozenset(  # exit code 4, and BadInput from the library
-    {"bad_image", "size_mismatch", "no_time", "no_calibration", "bad_calibration", "bad_terrain"}
-)
+EXIT_OK, EXIT_INTERNAL_ERROR, EXIT_REFUSED, EXIT_BAD_INPUT = 0, 1, 3, 4
+
+
+class Reason(StrEnum):
+    """Why an image has no position, as the result format spells it; each value is also that text.
+
+    `exit_code` is the command's, `meaning` a heading, `advice` what the user can do about it.
+    """
+
+    exit_code: int
+    meaning: str
+    advice: str
+
+    def __new__(cls, code: str, exit_code: int, meaning: str, advice: str) -> Reason:
+        one = str.__new__(cls, code)
+        one._value_ = code
+        one.exit_code, one.meaning, one.advice = exit_code, meaning, advice
+        return one
+
+    BAD_IMAGE = (
+        "bad_image", EXIT_BAD_INPUT, "The image, or its sidecar, cannot be used",
+        "Correct what the message names. startrack reads one whole picture of one channel or three, with a number in "
+        "every pixel, as PNG, TIFF, FITS, JPEG or camera raw; a sidecar must be valid JSON.",
+    )  # fmt: skip
+    SIZE_MISMATCH = (
+        "size_mismatch", EXIT_BAD_INPUT, "The image's size is not the camera's",
+        "Give the right camera file with -c, and the picture as it left the camera, neither cropped nor scaled.",
+    )  # fmt: skip
+    NO_TIME = (
+        "no_time", EXIT_BAD_INPUT, "The time is not known, or is not UTC",
+        "Give the middle of the exposure in UTC: --time, time_utc in NAME.json, or DATE-AVG in a FITS header.",
+    )  # fmt: skip
+    NO_CALIBRATION = (
+        "no_calibration", EXIT_BAD_INPUT, "No camera file is known",
+        "Give one with -c or in NAME.json; startrack calibrate makes one from pictures of the open sky.",
+    )  # fmt: skip
+    BAD_CALIBRATION = (
+        "bad_calibration", EXIT_BAD_INPUT, "The camera file cannot be used",
+        "Correct what the message names; docs/formats.md lists every key with its unit.",
+    )  # fmt: skip
+    BAD_TERRAIN = (
+        "bad_terrain", EXIT_BAD_INPUT, "No terrain file is known, or it cannot be used",
+        "Give a terrain file with -t or in NAME.json, and correct what the message names.",
+    )  # fmt: skip
+    NO_CLUSTER = (
+        "no_cluster", EXIT_BAD_INPUT, "The cluster of --cluster cannot be reached",
+        "Start a Dask scheduler and give its address, such as tcp://host:8786.",
+    )  # fmt: skip
+    NO_STARS = (
+        "no_stars", EXIT_REFUSED, "No stars stand out of the noise",
+        "Expose longer, keep stray light out, check the lens cap and the focus.",
+    )  # fmt: skip
+    NOT_IDENTIFIED = (
+        "not_identified", EXIT_REFUSED, "No attitude explains the point sources better than chance (one in 10^9)",
+        "Check that the camera file is that of this lens; expose longer for more stars; where the lens is not known, "
+        "startrack identify --fov finds it.",
+    )  # fmt: skip
+    MIRRORED = (
+        "mirrored", EXIT_REFUSED, "The image is a mirror image of what the camera file says",
+        "Read the sensor the other way round, or set mirrored in the camera file.",
+    )  # fmt: skip
+    INSUFFICIENT_GEOMETRY = (
+        "insufficient_geometry", EXIT_REFUSED, "The stars leave the position open",
+        "More of the skyline must be in view, with stars on both sides of it: look up more steeply, use a wider lens, "
+        "or expose longer.",
+    )  # fmt: skip
+    OUTSIDE_SEARCH_AREA = (
+        "outside_search_area", EXIT_REFUSED, "The stars point to a position outside the search area",
+        "Check time and terrain; enlarge [search] radius_m in the terrain file if the rover may be farther out.",
+    )  # fmt: skip
+    INCONSISTENT_EVIDENCE = (
+        "inconsistent_evidence", EXIT_REFUSED, "The horizon in the image is not the one that the map predicts",
+        "Check terrain, time and camera height; something that is not on the map (a boulder, the lander) may stand in "
+        "view.",
+    )  # fmt: skip
+    AMBIGUOUS = (
+        "ambiguous", EXIT_REFUSED, "More than one position fits",
+        "Take another picture some way off, expose longer, or narrow [search] in the terrain file to where the rover "
+        "can be.",
+    )  # fmt: skip
+    INTERNAL_ERROR = (
+        "internal_error", EXIT_INTERNAL_ERROR, "The program met a fault of its own",
+        "Please report it with the image; startrack locate IMAGE -v shows where it happened.",
+    )  # fmt: skip
+
+
+INTERNAL_ERROR = Reason.INTERNAL_ERROR
+_OF_CODE = {one.value: one for one in Reason}
+BAD_INPUT_REASONS = frozenset(one for one in Reason if one.exit_code == EXIT_BAD_INPUT)  # BadInput in the library
+
+
+def reason_of(code: str) -> Reason:
+    """The reason with a `code` of the result format. Raises KeyError for any other text."""
+    return _OF_CODE[code]
+
+
+def exit_code_of(reason: str | None) -> int:
+    """Exit code of an image's `reason`; 0 for None, which stands for a solution."""
+    return EXIT_OK if reason is None else reason_of(reason).exit_code
 
 
 class BadInput(Exception):
-    """Input that cannot be used (exit code 4). `reason` is one of the codes of the result format."""
+    """Input that cannot be used (exit code 4). `reason` is one of the codes of `Reason`, `message` the cause."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
-        self.reason = reason
+        self.reason = reason_of(reason)
 
 
 class NoSolution(Exception):
-    """A stage found no answer it can stand by (exit code 3). The message says what to try."""
+    """A stage found no reliable answer (exit code 3). The message says what to try."""
 
-    reason = "inconsistent_evidence"
+    reason: Reason = Reason.INCONSISTENT_EVIDENCE
 
     def __init__(self, message: str, reason: str | None = None, **evidence: Any) -> None:
         super().__init__(message)
         if reason is not None:
-            self.reason = reason
+            self.reason = reason_of(reason)
         self.evidence = evidence
 
 
 class TooFewStars(NoSolution):
-    reason = "no_stars"
+    """Too few point sources for an identification."""
+
+    reason = Reason.NO_STARS
 
 
 class NotIdentified(NoSolution):
-    reason = "not_identified"
+    """No attitude explains the point sources."""
+
+    reason = Reason.NOT_IDENTIFIED
 
 
 class NotLocated(NoSolution):
-    reason = "insufficient_geometry"
+    """The evidence does not determine a position."""
+
+    reason = Reason.INSUFFICIENT_GEOMETRY

@@ -8,7 +8,17 @@ import numpy as np
 
 from startrack.catalog.gaia import has_deep_catalog, hipparcos_rows_in_deep, load_deep_catalog
 from startrack.detection import electrons
-from startrack.evidence import Skyline, StarEvidence, StarLight, flux_scale, known_well, levelled, near_skyline
+from startrack.evidence import (
+    Skyline,
+    SkyStep,
+    StarEvidence,
+    StarLight,
+    flux_scale,
+    measure_sky_step,
+    near_skyline,
+    reliable_azimuths,
+    subtract_sky_step,
+)  # fmt: skip
 from startrack.evidence.star_evidence import filtered_noise_e
 from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
 from startrack.stages import Measured, Oriented, Settings, extend
@@ -61,20 +71,27 @@ def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
     )
 
 
-def remeasure_near_skyline(measured: Measured, fix: Fix, photometry: StarEvidence) -> Measured:
-    """The stars near the skyline of a fix measured again, with the step of the sky's own light taken out.
+def sky_step_at(measured: Measured, fix: Fix) -> SkyStep | None:
+    """The step of the sky's light at the skyline that the terrain shows from a `fix` found with `measured`.
 
-    `fix` is a position found with `measured`, `photometry` the settings of the measurement. Returns `measured` itself
-    where the sky is too dark to show a step.
+    None where the image does not show that skyline.
+    """
+    image, dead = electrons(measured.exposure, measured.camera)
+    horizon = Skyline.seen_from(fix.position_enu_m[:2], measured.terrain)
+    return measure_sky_step(image, dead, measured.detections, measured.camera, measured.R_cam_enu, horizon)
+
+
+def remeasure_near_skyline(measured: Measured, fix: Fix, step: SkyStep, photometry: StarEvidence) -> Measured:
+    """The stars near the skyline of a `fix` measured again, with the `step` of the sky's light taken out.
+
+    `fix` is a position found with `measured`, `photometry` the settings of the measurement.
     """
     camera, terrain, position_m = measured.camera, measured.terrain, fix.position_enu_m[:2]
-    horizon = Skyline.seen_from(position_m, terrain)
-    image, dead = electrons(measured.exposure, camera)
-    detections = levelled(image, dead, measured.detections, camera, measured.R_cam_enu, horizon)
-    if detections is measured.detections:
-        return measured
+    horizon = step.horizon
+    image, _ = electrons(measured.exposure, camera)
+    detections = subtract_sky_step(step, image, measured.detections)
     axes = np.linalg.cholesky(fix.covariance_m2).T
-    reliable = known_well(horizon, [Skyline.seen_from(position_m + axis, terrain) for axis in axes], camera)
+    reliable = reliable_azimuths(horizon, [Skyline.seen_from(position_m + axis, terrain) for axis in axes], camera)
     light = measured.light
     azimuth, elevation = light.azimuth_rad, light.elevation_rad
     wanted = near_skyline(azimuth, elevation, camera, horizon, REMEASURED_PX) & reliable(azimuth)

@@ -14,7 +14,7 @@ from startrack.exposure import are_fractions
 from startrack.frames import Site, observer_velocity_m_s
 from startrack.identification import Identifier
 from startrack.localization import check_consistency
-from startrack.measurement import measure_evidence, remeasure_near_skyline
+from startrack.measurement import measure_evidence, remeasure_near_skyline, sky_step_at
 from startrack.orient import solve_attitude
 from startrack.stages import (
     Detected,
@@ -62,13 +62,14 @@ def locate(
         oriented = run.step("attitude", solve_orientation, identified)
         measured = run.step("evidence", measure_evidence, oriented, terrain, settings)
         fix = run.time("locate", settings.localizer, measured.evidence(), terrain)
-        if not fix.ambiguous:
-            again = run.step("evidence", remeasure_near_skyline, measured, fix, settings.evidence)
-            if again is not measured:
-                measured, fix = again, run.time("locate", settings.localizer, again.evidence(), terrain)
+        step = None if fix.ambiguous else run.time("evidence", sky_step_at, measured, fix)
+        if step is not None and step.exceeds_noise:
+            measured = run.step("evidence", remeasure_near_skyline, measured, fix, step, settings.evidence)
+            fix = run.time("locate", settings.localizer, measured.evidence(), terrain)
         if getattr(settings.localizer, "explains_evidence", True):
             run.time("locate", check_consistency, measured.evidence(), fix, terrain)
-        return run.finish(extend(measured, Located, fix=fix))
+        sky_mag = step and step.brightness_mag_arcsec2(camera, exposure.exposure_s)
+        return run.finish(extend(measured, Located, fix=fix, sky_brightness_mag_arcsec2=sky_mag))
     except (BadInput, NoSolution) as refusal:
         return run.refuse(refusal)
 

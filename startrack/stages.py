@@ -18,6 +18,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.detection import Detector
+from startrack.errors import Reason
 from startrack.evidence import StarEvidence, StarLight
 from startrack.frames import Site
 from startrack.identification import Identifier
@@ -71,7 +72,7 @@ class Inputs:
         return "ok"
 
     @property
-    def reason(self) -> str | None:
+    def reason(self) -> Reason | None:
         """Code of the reason where the status is not ok, else None."""
         return None
 
@@ -148,6 +149,9 @@ class Located(Measured):
     """The whole solution: evidence and the position that explains it."""
 
     fix: Fix
+    sky_brightness_mag_arcsec2: (
+        float | None
+    )  # of the sky beyond the ground at the skyline; None: no step, no zero point
 
     @property
     def status(self) -> str:
@@ -155,9 +159,9 @@ class Located(Measured):
         return "ambiguous" if self.fix.ambiguous else "ok"
 
     @property
-    def reason(self) -> str | None:
+    def reason(self) -> Reason | None:
         """`ambiguous` where several positions fit."""
-        return "ambiguous" if self.fix.ambiguous else None
+        return Reason.AMBIGUOUS if self.fix.ambiguous else None
 
     @property
     def message(self) -> str:
@@ -169,7 +173,7 @@ class Located(Measured):
 class Refused:
     """An exposure without a solution, why, and the last complete value that was reached."""
 
-    reason: str
+    reason: Reason
     message: str
     reached: Inputs
     timing_ms: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))  # the failed stage included

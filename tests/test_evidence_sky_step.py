@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from startrack.camera import load_camera
-from startrack.evidence import known_well, levelled, near_skyline
+from startrack.evidence import measure_sky_step, near_skyline, reliable_azimuths, subtract_sky_step
 from startrack.evidence.sky_step import _above_px
 from startrack.terrain import load_terrain
 from startrack.types import Detections
@@ -21,6 +21,12 @@ R_CAM_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]) * np.
 
 def horizon_at(place):
     return partial(CRATER.horizon_rad, np.asarray(place)[None, :])
+
+
+def levelled(image, found, horizon):
+    step = measure_sky_step(image, np.zeros(image.shape, bool), found, CAMERA, R_CAM_ENU, horizon)
+    assert step is not None and step.exceeds_noise
+    return subtract_sky_step(step, image, found)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +50,7 @@ def frame():
 
 def test_the_step_goes_and_each_side_has_its_own_noise(frame):
     image, found, above, light = frame
-    better = levelled(image, np.zeros(image.shape, bool), found, CAMERA, R_CAM_ENU, horizon_at(PLACE))
+    better = levelled(image, found, horizon_at(PLACE))
     inner = np.abs(above) < 8
     assert np.sqrt(np.mean((found.background_e - light)[inner] ** 2)) > 30
     assert np.sqrt(np.mean((better.background_e - light)[inner] ** 2)) < 3
@@ -57,16 +63,16 @@ def test_a_skyline_a_little_off_gives_the_same_background(frame):
     """An error of the fix shifts the profile's own origin, not the light that is taken out."""
     image, found, above, light = frame
     aside = horizon_at(PLACE + np.array([12.0, -8.0]))
-    better = levelled(image, np.zeros(image.shape, bool), found, CAMERA, R_CAM_ENU, aside)
+    better = levelled(image, found, aside)
     assert np.sqrt(np.mean((better.background_e - light)[np.abs(above) < 6] ** 2)) < 4
 
 
 def test_right_below_a_wall_the_skyline_is_not_known():
     azimuth = np.linspace(0, 2 * np.pi, 360, endpoint=False)
     middle = horizon_at([0.0, 0.0])
-    assert known_well(middle, [horizon_at([4.0, 0.0]), horizon_at([0.0, 4.0])], CAMERA)(azimuth).all()
+    assert reliable_azimuths(middle, [horizon_at([4.0, 0.0]), horizon_at([0.0, 4.0])], CAMERA)(azimuth).all()
     wall = horizon_at([9850.0, 0.0])
-    known = known_well(wall, [horizon_at([9852.0, 0.0]), horizon_at([9850.0, 2.0])], CAMERA)(azimuth)
+    known = reliable_azimuths(wall, [horizon_at([9852.0, 0.0]), horizon_at([9850.0, 2.0])], CAMERA)(azimuth)
     assert known[250:290].all()  # the far rim
     assert not known[np.r_[0:5, 355:360, 175:185]].any()  # along the wall, north and south: there it turns fastest
 

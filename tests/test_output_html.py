@@ -18,9 +18,9 @@ from page_helpers import NASTY, results_in
 
 from startrack.cli.main import main
 from startrack.cli.report import page_of_images
+from startrack.errors import Reason
 from startrack.output import write_json
 from startrack.output.html import page_text, result_at, results_under
-from startrack.output.html.advice import WORDS
 from startrack.output.html.gather import folder_of
 from startrack.output.html.ground import ground_map
 from startrack.output.html.rows import COLUMNS
@@ -204,10 +204,9 @@ def test_a_height_map_is_shaded_and_see_through_where_it_ends():
 
 def test_every_reason_has_words():
     formats = (Path(__file__).parent.parent / "docs/formats.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \| [34] \|", formats, flags=re.MULTILINE)
-    reasons = {name for names in rows for name in re.findall(r"`(\w+)`", names)}
-    assert len(reasons) >= 13
-    assert reasons <= set(WORDS)
+    reasons = set(re.findall(r"^\| `(\w+)` \| [134] \|", formats, flags=re.MULTILINE))
+    assert reasons == {one.value for one in Reason}
+    assert all(one.meaning and one.advice for one in Reason)
 
 
 @pytest.mark.parametrize(
@@ -276,8 +275,8 @@ def test_links_are_relative_to_the_page(results, tmp_path):
 
 
 def test_the_advice_of_a_bad_image_fits_every_cause():
-    advice = WORDS["bad_image"][1]
-    assert advice.startswith("Mend what the message names")
+    advice = Reason.BAD_IMAGE.advice
+    assert advice.startswith("Correct what the message names")
     assert all(word in advice for word in ("channel", "whole", "number in every pixel", "PNG", "sidecar"))
 
 

@@ -12,17 +12,19 @@ from scipy.spatial.transform import Rotation
 from startrack import pipeline
 from startrack.catalog import load_catalog
 from startrack.output import detection_dict, identification_dict, refused_dict, result_dict, write_json
-from startrack.output.record import boresight_rad
 from startrack.output.text import verbose_text
+from startrack.output.values import boresight_rad
 from startrack.stages import Oriented, extend
 from startrack.types import BadInput, Mode
 
 ARCSEC = np.pi / 648_000
 KEYS = {
-    "position": "frame terrain east_m north_m up_m covariance_m2 radius95_m radius999_m latitude_deg longitude_deg",
+    "position": "frame terrain east_m north_m up_m covariance_m2 radius95_m radius999_m latitude_deg longitude_deg "
+    "search",
     "attitude": "quat_xyzw_cam_icrs ra_deg dec_deg roll_deg sigma_arcsec lens_error_included quat_xyzw_body_enu "
-    "heading_deg pitch_deg roll_body_deg",
+    "heading_deg pitch_deg roll_body_deg sigma_heading_deg sigma_pitch_deg sigma_roll_body_deg",
     "stars": "detected identified unexplained predicted_visible rms_px false_alarm_probability",
+    "sky": "brightness_mag_arcsec2",
     "timing_ms": "read detect identify attitude evidence locate",
     "provenance": "version image_sha256 camera terrain catalog time_utc exposure_s",
 }
@@ -151,7 +153,7 @@ def test_detections_are_brightest_first(located):
 
 def test_without_a_terrain_nothing_is_said_in_enu(located):
     d = result_dict(without_terrain(located.result))
-    without = {"quat_xyzw_body_enu", "heading_deg", "pitch_deg", "roll_body_deg"}
+    without = {key for key in KEYS["attitude"].split() if "body" in key or "heading" in key or "pitch" in key}
     assert set(d["attitude"]) == set(KEYS["attitude"].split()) - without
     assert "position" not in d
     assert d["stars"]["predicted_visible"] is None

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from startrack.output import refusal_line, summary_line, verbose_text
-from startrack.output.text import chance_text
+from startrack.output.values import chance_text
 from startrack.stages import Detected, Oriented, Refused, extend
 from startrack.types import Mode
 
@@ -53,10 +53,10 @@ def test_refusals_are_one_line_with_reason_and_message(located):
 
 
 def test_a_heading_of_nearly_a_turn_is_nought(located):
-    from startrack.output.text import _degrees
+    from startrack.output.values import Angle
 
-    assert _degrees(6.2831853, 1) == "0.0"
-    assert _degrees(1.0, 3) == "57.296"
+    assert f"{Angle(359.99999):.1f}" == "0.0"
+    assert f"{Angle(57.2957795):.3f}" == "57.296"
 
 
 def test_more_lines_for_those_who_ask(located):

@@ -1,5 +1,6 @@
 """README.md and docs/: what they show is run, and what they name is there."""
 
+import importlib.util
 import json
 import re
 import shlex
@@ -12,6 +13,7 @@ from astropy.table import Table
 
 from startrack.camera.io import camera_from_dict
 from startrack.cli.main import COMMANDS, main
+from startrack.errors import Reason
 from startrack.terrain.io import terrain_from_dict
 
 ROOT = Path(__file__).parent.parent
@@ -183,9 +185,13 @@ def test_every_key_that_is_written_is_explained(clone, capsys, command):
 
 
 def test_reasons_and_their_exit_codes_are_those_of_the_code():
-    from startrack.errors import BAD_INPUT_REASONS
+    rows = re.findall(r"^\| `(\w+)` \| ([134]) \|", FORMATS, flags=re.MULTILINE)
+    assert {name: int(code) for name, code in rows} == {one.value: one.exit_code for one in Reason}
 
-    rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \| ([34]) \|", FORMATS, flags=re.MULTILINE)
-    codes = {name: int(code) for names, code in rows for name in re.findall(r"`(\w+)`", names)}
-    assert {name for name, code in codes.items() if code == 4} == set(BAD_INPUT_REASONS)
-    assert len(codes) == 13
+
+def test_tables_of_the_format_page_are_made_from_the_code():
+    """After a new quantity or reason: python docs/make_tables.py."""
+    spec = importlib.util.spec_from_file_location("make_tables", ROOT / "docs/make_tables.py")
+    make_tables = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(make_tables)
+    assert make_tables.page_with_tables(FORMATS) == FORMATS

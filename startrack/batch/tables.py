@@ -19,40 +19,32 @@ from startrack.batch.store import JOB, MANIFEST, RESULT
 from startrack.files import write_atomically
 from startrack.frames import R_from_quat_xyzw, quat_xyzw_from_R
 from startrack.output.ecsv import Column, ecsv_text, formatted
-from startrack.output.record import STAGES
+from startrack.output.views import columns
+from startrack.stages import STAGES
 
 Record = dict[str, Any]
 FORMAT = "startrack.manifest/1"
-EXACT = "%.17g"
+UNITS = {
+    "m": "m",
+    "m^2": "m2",
+    "deg": "deg",
+    "arcsec": "arcsec",
+    "px": "pix",
+    "s": "s",
+    "mag/arcsec^2": "mag / arcsec2",
+}  # astropy's
+KINDS = {"d": "int64", "s": "string"}  # by the last letter of the format, else float64
 # name, datatype, unit, form, path within the record
-COLUMNS: tuple[tuple[str, str, str | None, str, tuple[str | int, ...]], ...] = (
+COLUMNS: list[tuple[str, str, str | None, str, tuple[Any, ...]]] = [
     ("image", "string", None, "%s", ("image",)),
     ("status", "string", None, "%s", ("status",)),
     ("reason", "string", None, "%s", ("reason",)),
-    ("time_utc", "string", None, "%s", ("provenance", "time_utc")),
-    ("exposure_s", "float64", "s", "%.9g", ("provenance", "exposure_s")),
-    ("east_m", "float64", "m", "%.4f", ("position", "east_m")),
-    ("north_m", "float64", "m", "%.4f", ("position", "north_m")),
-    ("up_m", "float64", "m", "%.4f", ("position", "up_m")),
-    ("cov_east_east_m2", "float64", "m2", "%.6g", ("position", "covariance_m2", 0, 0)),
-    ("cov_east_north_m2", "float64", "m2", "%.6g", ("position", "covariance_m2", 0, 1)),
-    ("cov_north_north_m2", "float64", "m2", "%.6g", ("position", "covariance_m2", 1, 1)),
-    ("radius95_m", "float64", "m", "%.4f", ("position", "radius95_m")),
-    ("radius999_m", "float64", "m", "%.4f", ("position", "radius999_m")),
-    ("latitude_deg", "float64", "deg", "%.8f", ("position", "latitude_deg")),
-    ("longitude_deg", "float64", "deg", "%.8f", ("position", "longitude_deg")),
-    ("heading_deg", "float64", "deg", "%.6f", ("attitude", "heading_deg")),
-    ("pitch_deg", "float64", "deg", "%.6f", ("attitude", "pitch_deg")),
-    ("roll_body_deg", "float64", "deg", "%.6f", ("attitude", "roll_body_deg")),
-    *((f"q{axis}_cam_icrs", "float64", None, "%.12f", ("attitude", "quat_xyzw_cam_icrs", i))
-      for i, axis in enumerate("xyzw")),
-    *((f"sigma_{axis}_arcsec", "float64", "arcsec", "%.4f", ("attitude", "sigma_arcsec", i))
-      for i, axis in enumerate("xyz")),
-    ("detected", "int64", None, "%d", ("stars", "detected")),
-    ("identified", "int64", None, "%d", ("stars", "identified")),
-    ("rms_px", "float64", "pix", "%.5f", ("stars", "rms_px")),
-    ("image_sha256", "string", None, "%s", ("provenance", "image_sha256")),
-)  # fmt: skip
+    *(
+        (column.name, KINDS.get(column.form[-1], "float64"), UNITS.get(one.unit), column.form,
+         (*one.path.split("."), *column.at))
+        for one, column in columns()
+    ),
+]  # fmt: skip
 
 
 def write_tables(out: Path, records: Sequence[Record], settings: dict[str, Any]) -> list[Path]:
@@ -120,11 +112,11 @@ def _pose(record: Record) -> str:
 
 
 def _timings(records: Sequence[Record]) -> str:
-    columns = [Column("image", values_of(records, ("image",)), "string")]
+    table = [Column("image", values_of(records, ("image",)), "string")]
     for stage in STAGES:
         times = formatted("%.3f", values_of(records, ("timing_ms", stage)))
-        columns.append(Column(f"{stage}_ms", times, "float64", "ms"))
-    return ecsv_text(columns)
+        table.append(Column(f"{stage}_ms", times, "float64", "ms"))
+    return ecsv_text(table)
 
 
 def _manifest(records: Sequence[Record], settings: dict[str, Any]) -> bytes:

@@ -11,10 +11,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.common import DEFAULT_OUT, exit_code_of_reason, read
+from startrack.cli.common import DEFAULT_OUT, read
 from startrack.cli.flag_types import amount, field_of_view_rad, number, positive
 from startrack.cli.progress import progress
-from startrack.errors import NoSolution
+from startrack.errors import NoSolution, exit_code_of
 from startrack.files import make_folder
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ def print_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) -
         print(json.dumps(record), flush=True)
     elif not args.quiet or record["status"] != "ok":
         print(line, file=sys.stderr if args.quiet else sys.stdout, flush=True)
-    return exit_code_of_reason(record["status"], record["reason"])
+    return exit_code_of(record["reason"])
 
 
 def output_path(args: argparse.Namespace, default: str) -> Path:

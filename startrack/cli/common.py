@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.flag_types import positive
-from startrack.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
+from startrack.errors import INTERNAL_ERROR, BadInput, exit_code_of
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
@@ -140,16 +140,7 @@ def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, s
 
 def exit_code(outcome: Outcome) -> int:
     """0 solved, 1 internal error, 4 bad input, 3 refused or ambiguous."""
-    return exit_code_of_reason(outcome.status, outcome.reason)
-
-
-def exit_code_of_reason(status: str, reason: str | None) -> int:
-    """0 solved, 1 internal error, 4 bad input, 3 refused or ambiguous."""
-    if reason == INTERNAL_ERROR:
-        return 1
-    if status == "ok":
-        return 0
-    return 4 if reason in BAD_INPUT_REASONS else 3
+    return exit_code_of(outcome.reason)
 
 
 def _broken(path: str, cause: Exception, format_name: str) -> Outcome:

@@ -1,7 +1,25 @@
 """Evidence: exposure, attitude and catalogue to rays that say "light" or "wall"."""
 
 from startrack.evidence.flux_scale import FluxScale, flux_scale
-from startrack.evidence.sky_step import Skyline, known_well, levelled, near_skyline
+from startrack.evidence.sky_step import (
+    Skyline,
+    SkyStep,
+    measure_sky_step,
+    near_skyline,
+    reliable_azimuths,
+    subtract_sky_step,
+)  # fmt: skip
 from startrack.evidence.star_evidence import StarEvidence, StarLight
 
-__all__ = ["FluxScale", "Skyline", "StarEvidence", "StarLight", "flux_scale", "known_well", "levelled", "near_skyline"]
+__all__ = [
+    "FluxScale",
+    "SkyStep",
+    "Skyline",
+    "StarEvidence",
+    "StarLight",
+    "flux_scale",
+    "measure_sky_step",
+    "near_skyline",
+    "reliable_azimuths",
+    "subtract_sky_step",
+]

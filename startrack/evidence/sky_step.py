@@ -29,6 +29,9 @@ MADE_OF_NOISE = 0.6745  # median of the absolute value of a standard normal vari
 MOST_SHIFT_PX = 0.7  # one sigma
 STEEPEST = 1.0
 FEWEST_PX = 12  # for a median
+MEDIAN_LOSS = 1.2533  # standard deviation of the median of normal values, as a multiple of that of their mean
+SIGNIFICANT_SIGMAS = 5.0  # of a step that is stated as the brightness of the sky
+ARCSEC2_PER_SR = (180 * 3600 / np.pi) ** 2
 
 Horizon = Callable[[Array], Array]  # azimuths (n,) to elevations (n,) [rad]
 
@@ -52,26 +55,73 @@ class Skyline:
         return (1 - part) * self.elevation_rad[low] + part * self.elevation_rad[(low + 1) % len(self.elevation_rad)]
 
 
-def levelled(
+@dataclass(frozen=True, eq=False)
+class SkyStep:
+    """The pixels beside the skyline, and how much brighter the sky above it is than the ground below."""
+
+    horizon: Horizon  # of the position that the step belongs to
+    rows: Ints  # (n,) of the pixels within BAND_PX of the skyline
+    columns: Ints  # (n,)
+    azimuth_rad: Array  # (n,) in enu
+    above_px: Array  # (n,) distance above the skyline, negative below it
+    light_e: float  # median pixel of the sky minus that of the ground; 0 where only one of them is in view
+    sigma_e: float  # standard deviation of light_e
+    noise_e: float  # median noise of one pixel
+    angle_rad: float  # off the camera's axis, of the median pixel
+
+    @property
+    def exceeds_noise(self) -> bool:
+        """Whether the step is larger than the noise of a pixel: a smaller one shifts no star's flux by much."""
+        return self.light_e >= self.noise_e
+
+    def brightness_mag_arcsec2(self, camera: Camera, exposure_s: float | None) -> float | None:
+        """Brightness of the sky beyond that of the ground [V mag/arcsec2], by the zero point of the `camera`.
+
+        The step per solid angle of the pixel, throughput and second of the exposure (`exposure_s`). None where the
+        step is not significant, or the camera has no zero point, or the exposure no known duration.
+        """
+        sensor = camera.sensor
+        if sensor is None or not exposure_s or not self.light_e > SIGNIFICANT_SIGMAS * self.sigma_e:
+            return None
+        angle = np.array(self.angle_rad)
+        arcsec2 = float(camera.pixel_solid_angle_sr(angle)) * ARCSEC2_PER_SR * float(sensor.throughput(angle))
+        return float(-2.5 * np.log10(self.light_e / (arcsec2 * exposure_s * sensor.zero_point_e_per_s)))
+
+
+def measure_sky_step(
     image_e: NDArray[np.float32],
     dead: Bools,
     detections: Detections,
     camera: Camera,
     R_cam_enu: Array,
     horizon: Horizon,
-) -> Detections:
-    """The detections with the step at the skyline in their background, and the noise on either side of it.
+) -> SkyStep | None:
+    """The step of the sky's light at a `horizon` (azimuths to elevations [rad]); None where it is not in view.
 
-    The very same detections where the step is lost in the noise of a pixel: it then moves no star by much.
+    `image_e` (H, W) in electrons, `dead` (H, W) marks pixels to leave out, `detections` has the noise of the pixels,
+    `camera` and `R_cam_enu` say where the skyline lies in the image.
     """
     rows, columns = np.nonzero(_band(detections.background_e.shape, camera, R_cam_enu, horizon) & ~dead)
     if not len(rows):
-        return detections
+        return None
     azimuth, above = _above_px(np.stack([columns, rows], axis=1).astype(float), camera, R_cam_enu, horizon)
     near = np.abs(above) < BAND_PX
     rows, columns, azimuth, above = rows[near], columns[near], azimuth[near], above[near]
-    if _step_e(image_e[rows, columns], above) < np.median(detections.noise_e[rows, columns]):
-        return detections
+    if not len(rows):
+        return None
+    light_e, sigma_e = _step_e(image_e[rows, columns], above)
+    middle = len(rows) // 2
+    angle = np.partition(camera.angle_rad(np.stack([columns, rows], axis=1).astype(float)), middle)[middle]
+    noise_e = float(np.median(detections.noise_e[rows, columns]))
+    return SkyStep(horizon, rows, columns, azimuth, above, light_e, sigma_e, noise_e, float(angle))
+
+
+def subtract_sky_step(step: SkyStep, image_e: NDArray[np.float32], detections: Detections) -> Detections:
+    """The `detections` with the `step` in their background, and the noise of the pixels on either side of it.
+
+    `image_e` (H, W) is the image in electrons in which the step was measured.
+    """
+    rows, columns, azimuth, above = step.rows, step.columns, step.azimuth_rad, step.above_px
     rest = (image_e - detections.background_e)[rows, columns].astype(np.float64)
     spread = detections.noise_e[rows, columns].astype(np.float64)
     steps = int(2 * BAND_PX / STEP_PX)
@@ -87,11 +137,12 @@ def levelled(
     return replace(detections, background_e=background, noise_e=noise)
 
 
-def known_well(horizon: Horizon, shifted: list[Horizon], camera: Camera) -> Callable[[Array], Bools]:
-    """Tells of azimuths (n,) whether the skyline there is level enough and known to a part of a pixel.
+def reliable_azimuths(horizon: Horizon, shifted: list[Horizon], camera: Camera) -> Callable[[Array], Bools]:
+    """A function of azimuths (n,): whether the skyline there is level enough and known to a part of a pixel.
 
-    `shifted` are the horizons one sigma of the position away, along each axis of its covariance. Right below a wall a
-    step aside turns the whole skyline: no step of light can be taken out there.
+    `horizon` is that of the position, `shifted` those one sigma of the position away, along each axis of its
+    covariance; `camera` gives the scale of a pixel. Right below a wall a small shift turns the whole skyline: no step
+    of light can be subtracted there.
     """
     azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS, endpoint=False)
     here = horizon(azimuth)
@@ -132,10 +183,27 @@ def _above_px(xy_px: Array, camera: Camera, R_cam_enu: Array, horizon: Horizon) 
     return azimuth, (elevation - horizon(azimuth)) * px_per_rad
 
 
-def _step_e(light_e: NDArray[np.float32], above_px: Array) -> float:
-    """How much brighter the sky is than the wall, well clear of the edge."""
+def _step_e(light_e: NDArray[np.float32], above_px: Array) -> tuple[float, float]:
+    """How much brighter the sky is than the ground, well clear of the edge, and the standard deviation of that."""
     sky, wall = light_e[above_px > BAND_PX / 2], light_e[above_px < -BAND_PX / 2]
-    return float(np.median(sky) - np.median(wall)) if len(sky) and len(wall) else 0.0
+    if not len(sky) or not len(wall):
+        return 0.0, 0.0
+    level = _median(sky), _median(wall)
+    spread = [
+        float(np.median(np.abs(side - middle))) / MADE_OF_NOISE * MEDIAN_LOSS / np.sqrt(len(side))
+        for side, middle in zip((sky, wall), level, strict=True)
+    ]
+    return level[0] - level[1], float(np.hypot(*spread))
+
+
+def _median(values: NDArray[np.float32]) -> float:
+    """The median of counts: within the one that holds it, by how many values lie on either side."""
+    middle = float(np.median(values))
+    below, equal, above = values < middle, values == middle, values > middle
+    if not (below.any() and equal.any() and above.any()):
+        return middle
+    step = (float(values[above].min()) - float(values[below].max())) / 2
+    return middle + step * (np.count_nonzero(above) - np.count_nonzero(below)) / (2 * np.count_nonzero(equal))
 
 
 def _step_of(above_px: Array, steps: int) -> Ints:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.output import make_way, record_of, summary_line, write_results
-from startrack.output.record import boresight_rad
+from startrack.output.values import boresight_rad
 from startrack.solution.values import Orientation, Position, html_table, orientation_of, position_of
 from startrack.stages import Located, Oriented, Outcome, reached
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from html import escape
 from typing import TYPE_CHECKING
@@ -10,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from startrack.frames import heading_pitch_roll_from_R_body_enu, latlon_from_enu
-from startrack.output.record import ARCSEC_PER_RAD, R_body_enu, boresight_rad, lens_errors_known
+from startrack.output.values import ARCSEC_PER_RAD, R_body_enu, boresight_rad
+from startrack.output.views import Rows, at_stage, rows
 from startrack.stages import Located, Measured, Oriented
 
 if TYPE_CHECKING:
@@ -20,23 +20,19 @@ if TYPE_CHECKING:
 
     from startrack.stages import Inputs
 
-Rows = list[tuple[str, str]]
 
-
-class Shown(ABC):
+class Shown:
     """Prints itself as rows of a name and a text."""
 
-    @abstractmethod
-    def rows(self) -> Rows:
-        """What is printed, a line each."""
+    shown: Rows
 
     def __repr__(self) -> str:
-        width = max(len(name) for name, _ in self.rows())
-        lines = (f"  {name:<{width}}  {text}" for name, text in self.rows())
+        width = max(len(name) for name, _ in self.shown)
+        lines = (f"  {name:<{width}}  {text}" for name, text in self.shown)
         return "\n".join([type(self).__name__, *lines])
 
     def _repr_html_(self) -> str:
-        return html_table(type(self).__name__, self.rows())
+        return html_table(type(self).__name__, self.shown)
 
 
 def html_table(caption: str, rows: Rows) -> str:
@@ -56,9 +52,11 @@ class Ellipse(Shown):
     semi_minor: Quantity  # [m]
     azimuth: Angle  # of the major axis, from north through east, [0, 180) deg
 
-    def rows(self) -> Rows:
+    @property
+    def shown(self) -> Rows:  # type: ignore[override]
+        """The ellipse in one row."""
         lengths = f"{self.semi_major:.2f} by {self.semi_minor:.2f}"
-        return [("one sigma", f"{lengths}, long axis at azimuth {_deg(self.azimuth, 1)}")]
+        return [("one sigma", f"{lengths}, long axis at azimuth {self.azimuth.deg:.1f}°")]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -74,6 +72,7 @@ class Position(Shown):
     latitude: Angle
     longitude: Angle  # east positive, (-180, 180] deg
     terrain: str
+    shown: Rows  # name and text of each quantity of the table
 
     @property
     def sigma(self) -> Quantity:
@@ -91,20 +90,6 @@ class Position(Shown):
         azimuth_rad = np.arctan2(axes[0, 1], axes[1, 1]) % np.pi
         return Ellipse(major, minor, Angle(np.degrees(azimuth_rad), u.deg))
 
-    def rows(self) -> Rows:
-        east, north = self.sigma
-        return [
-            ("east", f"{self.east:.2f} ± {east.value:.2f} m"),
-            ("north", f"{self.north:.2f} ± {north.value:.2f} m"),
-            ("up", f"{self.up:.2f}"),
-            ("on", self.terrain),
-            ("latitude", _deg(self.latitude, 6)),
-            ("longitude", _deg(self.longitude, 6)),
-            *self.ellipse.rows(),
-            ("95 % within", f"{self.radius95:.1f}"),
-            ("99.9 % within", f"{self.radius999:.1f}"),
-        ]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Orientation(Shown):
@@ -116,22 +101,11 @@ class Orientation(Shown):
     roll: Angle  # position angle of the image's top, from north through east
     sigma: Quantity  # (3,) of rotations about cam x, y, z [arcsec]
     lens_error_included: bool  # whether sigma holds the lens's errors: the camera has a covariance
+    shown: Rows  # name and text of each quantity of the table
     body: Rotation | None = None  # from enu to the rover's body
     heading: Angle | None = None  # azimuth of body x (forward)
     pitch: Angle | None = None  # nose up positive
     roll_body: Angle | None = None  # right side down positive
-
-    def rows(self) -> Rows:
-        x, y, z = self.sigma.value
-        lens = "" if self.lens_error_included else ", the lens taken as exact"
-        rows = [
-            ("right ascension", _deg(self.ra, 4)),
-            ("declination", _deg(self.dec, 4)),
-            ("roll", f"{_deg(self.roll, 4)} (image's top, from north through east)"),
-            ("sigma", f"{x:.2f}, {y:.2f}, {z:.2f} arcsec about cam x, y, z{lens}"),
-        ]
-        body = (("heading", self.heading), ("pitch", self.pitch), ("roll of the body", self.roll_body))
-        return rows + [(name, _deg(angle, 3)) for name, angle in body if angle is not None]
 
 
 def position_of(result: Inputs) -> Position | None:
@@ -146,7 +120,7 @@ def position_of(result: Inputs) -> Position | None:
     latitude, longitude = (Angle(np.degrees(a), u.deg) for a in latlon_from_enu(result.site, *fix.position_enu_m))
     return Position(
         east, north, up, fix.covariance_m2 * u.m**2, fix.radius95_m * u.m, fix.radius999_m * u.m, latitude, longitude,
-        terrain.name,
+        terrain.name, rows("notebook", at_stage(result), ("position", "sky")),
     )  # fmt: skip
 
 
@@ -162,13 +136,10 @@ def orientation_of(result: Inputs) -> Orientation | None:
     ra, dec, roll = (Angle(np.degrees(angle), u.deg) for angle in boresight_rad(attitude.R_cam_icrs))
     sigma = np.sqrt(np.diag(attitude.covariance_rad2)) * ARCSEC_PER_RAD * u.arcsec
     rotation = Rotation.from_matrix(attitude.R_cam_icrs)
-    found = Orientation(rotation, ra, dec, roll, sigma, lens_errors_known(result))
+    shown = rows("notebook", at_stage(result), ("attitude",))
+    found = Orientation(rotation, ra, dec, roll, sigma, result.camera.covariance is not None, shown)
     if not isinstance(result, Measured):
         return found
     body = R_body_enu(result)
     heading, pitch, roll_body = (Angle(np.degrees(a), u.deg) for a in heading_pitch_roll_from_R_body_enu(body))
     return replace(found, body=Rotation.from_matrix(body), heading=heading, pitch=pitch, roll_body=roll_body)
-
-
-def _deg(angle: Angle, decimals: int) -> str:
-    return f"{angle.deg:.{decimals}f}°"

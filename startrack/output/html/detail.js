@@ -12,7 +12,7 @@ function showDetail(host, k) {
   const real = known(value("real_e")) ? [value("real_e"), value("real_n")] : null;
   const stars = detail ? starsOf(detail) : [];
   const name = value("image");
-  const groups = detail ? factGroups(record, value) : [];
+  const groups = detail ? factGroups(detail, value) : [];
   host.replaceChildren(...[
     make("div", { class: "title" }, make("h1", { tabindex: "-1" }, name), badge(record.status)),
     make("p", { class: "lead" }, leadOf(value)),
@@ -35,7 +35,7 @@ function leadOf(value) {
 
 function refusalCard(record) {
   if (record.status === "ok") return null;
-  const [words, advice] = page.words[record.reason] || [statusWord(record.status), ""];
+  const [words, advice] = page.words[record.reason] || [record.reason ? record.reason.replaceAll("_", " ") : statusWord(record.status), ""];
   const modes = record.status === "ambiguous" && record.modes ? make("ol", {}, ...record.modes.map((mode) => make("li", {},
     `East ${say(mode.east_m, 0, "m")}, north ${say(mode.north_m, 0, "m")}: ${say(100 * mode.weight, 1)} %`))) : null;
   return make("section", { class: `card why ${record.status}`, "aria-label": "Why there is no single position" },
@@ -74,21 +74,14 @@ function mapsCard(record, real, name) {
   return section("Map", make("div", { class: close ? "pair" : "single" }, area, close), mapLegend(record, real));
 }
 
-function factGroups(record, value) {
-  const { position: p, attitude: a, stars: s, provenance: v } = record;
-  const c = p?.covariance_m2;
-  const spread = c ? [1, -1].map((sign) => Math.sqrt(Math.max((c[0][0] + c[1][1]) / 2 + sign * Math.hypot((c[0][0] - c[1][1]) / 2, c[0][1]), 0))) : null;
+// The quantities of the record come with their texts; the page adds what it knows of the truth, times and origin.
+function factGroups(detail, value) {
+  const { record } = detail;
+  const v = record.provenance;
+  const groups = detail.facts.map(([title, rows]) => [title, facts(title === "Position" ? [...rows,
+    ["Error", known(value("error_m")) ? say(value("error_m"), 2, "m") : null], ["NEES", known(value("nees")) ? say(value("nees"), 2) : null]] : rows)]);
   return [
-    p && ["Position", facts([["East", say(p.east_m, 2, "m")], ["North", say(p.north_m, 2, "m")], ["Up", say(p.up_m, 2, "m")],
-      ["Latitude", sayDegrees(p.latitude_deg, 6)], ["Longitude", sayDegrees(p.longitude_deg, 6)], ["95 % within", say(p.radius95_m, 1, "m")],
-      ["99.9 % within", say(p.radius999_m, 1, "m")], ["Sigma", spread && `${say(spread[0], 2, "m")} by ${say(spread[1], 2, "m")}`],
-      ["Error", known(value("error_m")) ? say(value("error_m"), 2, "m") : null], ["NEES", known(value("nees")) ? say(value("nees"), 2) : null]])],
-    a && ["Attitude", facts([["Heading", sayDegrees(a.heading_deg, 3)], ["Pitch", sayDegrees(a.pitch_deg, 3)], ["Roll", sayDegrees(a.roll_body_deg, 3)],
-      ["Right ascension", sayDegrees(a.ra_deg, 4)], ["Declination", sayDegrees(a.dec_deg, 4)], ["Image's top", sayDegrees(a.roll_deg, 4)],
-      ["Sigma", a.sigma_arcsec && `${a.sigma_arcsec.map((one) => say(one, 2)).join(", ")} arcsec about x, y, z${a.lens_error_included === false ? ", the lens taken as exact" : ""}`]])],
-    s && ["Stars", facts([["Point sources", say(s.detected, 0)], ["Named", say(s.identified, 0)], ["Unexplained", say(s.unexplained, 0)],
-      ["Above the skyline", record.modes ? say(s.predicted_visible, 0) : null], ["Residual", say(s.rms_px, 3, "px")],
-      ["Chance match", known(s.false_alarm_probability) ? (s.false_alarm_probability >= 1e-100 ? s.false_alarm_probability.toExponential(0).replace("-", "−") : "below 1e−100") : null]])],
+    ...groups,
     record.timing_ms && ["Time of each stage", timings(record.timing_ms)],
     v && ["Made from", facts([["Time", sayTime(v.time_utc)], ["Exposure", known(v.exposure_s) ? say(v.exposure_s, 3, "s") : null], ["Camera", fileNode(v.camera)], ["Terrain", fileNode(v.terrain)],
       ["Catalogue", v.catalog], ["startrack", v.version], ["Image's SHA-256", v.image_sha256 ? [make("code", {}, v.image_sha256)] : null]])],

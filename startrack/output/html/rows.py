@@ -7,12 +7,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from startrack.output.html.gather import Found
+from startrack.output.quantities import QUANTITIES, Quantity
+from startrack.output.views import at_record, rows
 
 Place = tuple[float, float]  # east, north [m]
+LISTED = tuple(one for one in QUANTITIES if one.listed is not None)
 COLUMNS = (
-    "image", "stem", "status", "reason", "message", "time_utc", "terrain", "east_m", "north_m", "cov_ee", "cov_en",
-    "cov_nn", "radius95_m", "radius999_m", "identified", "rms_px", "seconds", "real_e", "real_n", "error_m", "nees",
-    "kind", "detail",
+    "image", "stem", "status", "reason", "message", "time_utc", "terrain", "cov_ee", "cov_en", "cov_nn", "radius999_m",
+    "rms_px", "seconds", "real_e", "real_n", "error_m", "nees", *(one.key for one in LISTED), "kind", "detail",
 )  # fmt: skip
 MESSAGE_LETTERS = 400
 
@@ -27,18 +29,34 @@ def row_of(found: Found, real: Place | None, detailed: bool) -> list[Any]:
     return [
         record["image"], found.stem, record["status"], record.get("reason"),
         str(record.get("message") or "")[:MESSAGE_LETTERS], provenance.get("time_utc"), provenance.get("terrain"),
-        rounded(place[0], 2), rounded(place[1], 2), *(rounded(value, 4) for value in covariance or (None,) * 3),
-        rounded(number(position, "radius95_m"), 2), rounded(number(position, "radius999_m"), 2),
-        stars.get("identified"), rounded(number(stars, "rms_px"), 3), rounded(_seconds(record), 3),
+        *(rounded(value, 4) for value in covariance or (None,) * 3), rounded(number(position, "radius999_m"), 2),
+        rounded(number(stars, "rms_px"), 3), rounded(_seconds(record), 3),
         *((rounded(real[0], 2), rounded(real[1], 2)) if real else (None, None)), rounded(error_m, 2), rounded(nees, 3),
-        found.kind, detailed,
+        *(_listed(record, one) for one in LISTED), found.kind, detailed,
     ]  # fmt: skip
 
 
-def errors_of(rows: Sequence[Sequence[Any]]) -> dict[str, Any] | None:
+def headings() -> list[list[Any]]:
+    """The listed quantities as columns of the page's list: key, heading, unit, decimals, shown on narrow screens."""
+    return [
+        [one.key, one.listed.heading, one.unit, one.listed.decimals, one.listed.always]
+        for one in LISTED
+        if one.listed is not None
+    ]
+
+
+def facts_of(record: Mapping[str, Any]) -> list[list[Any]]:
+    """The quantities of a record for people: title of each group, and its rows of a name and a text."""
+    groups = (("Position", ("position",)), ("Attitude", ("attitude",)), ("Stars", ("stars", "sky")))
+    at = at_record(record)
+    found = [(title, rows("page", at, sections)) for title, sections in groups if part(record, sections[0])]
+    return [[title, [[name, text.replace("-", "−")] for name, text in facts]] for title, facts in found]
+
+
+def errors_of(table: Sequence[Sequence[Any]]) -> dict[str, Any] | None:
     """Mean, median and largest error [m], mean NEES, and the parts inside the circles; None where nothing is known."""
     at = {name: k for k, name in enumerate(COLUMNS)}
-    known = [row for row in rows if row[at["error_m"]] is not None]
+    known = [row for row in table if row[at["error_m"]] is not None]
     if not known:
         return None
     errors = sorted(row[at["error_m"]] for row in known)
@@ -80,6 +98,13 @@ def number(d: Mapping[str, Any], key: str) -> float | None:
 def rounded(value: float | None, decimals: int) -> float | None:
     """Rounded, None staying None."""
     return None if value is None else round(value, decimals)
+
+
+def _listed(record: Mapping[str, Any], one: Quantity) -> float | int | None:
+    value = number(part(record, one.section), one.key)
+    if value is None or one.listed is None or one.listed.decimals == 0:
+        return None if value is None else round(value)
+    return round(value, one.listed.decimals + 1)
 
 
 def _covariance(position: dict[str, Any]) -> tuple[float, float, float] | None:

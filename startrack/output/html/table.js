@@ -5,12 +5,14 @@ const LINE_PX = 17;
 const ROOM_PX = 6; // above and below the lines of a name
 const LETTER_PX = 16; // what a line may lack of being full, for the next letter is wider
 const SPARE_ROWS = 12;
+const quantityHead = ([key, text, unit, decimals, always]) => [key, text, `${unit === "m" && !always ? "metres " : ""}num${always ? "" : " extra"}`, (row) => say(row[key], decimals, unit || undefined)];
+const inMetres = ([, , unit]) => unit === "m";
 const HEADS = [
   ["image", "Image", "wide", null], ["status", "Outcome", "mid", null],
   ["time_utc", "Time (UTC)", "time extra", (row) => (known(row.time_utc) ? sayTime(row.time_utc).replace(" UTC", "") : "–")],
-  ["east_m", "East", "metres num extra", (row) => say(row.east_m, 1, "m")], ["north_m", "North", "metres num extra", (row) => say(row.north_m, 1, "m")],
-  ["radius95_m", "± 95 %", "num", (row) => say(row.radius95_m, 1, "m")], ["error_m", "Error", "num extra", (row) => say(row.error_m, 1, "m")],
-  ["nees", "NEES", "num extra", (row) => say(row.nees, 2)], ["identified", "Stars", "num extra", (row) => say(row.identified, 0)],
+  ...page.headings.filter(inMetres).map(quantityHead),
+  ["error_m", "Error", "num extra", (row) => say(row.error_m, 1, "m")], ["nees", "NEES", "num extra", (row) => say(row.nees, 2)],
+  ...page.headings.filter((head) => !inMetres(head)).map(quantityHead),
   ["seconds", "Took", "num extra", (row) => say(row.seconds, 1, "s")],
 ];
 

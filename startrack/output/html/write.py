@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from startrack.errors import Reason
 from startrack.files import write_atomically
-from startrack.output.html.advice import words_of
 from startrack.output.html.gather import Found, folder_of
 from startrack.output.html.ground import Grounds, ground_map, horizon_deg
 from startrack.output.html.picture import picture_of
-from startrack.output.html.rows import COLUMNS, Place, chosen, errors_of, number, part, row_of
+from startrack.output.html.rows import COLUMNS, Place, chosen, errors_of, facts_of, headings, number, part, row_of
 from startrack.output.html.stars import stars_of
 
 HERE = Path(__file__).parent
@@ -63,11 +63,12 @@ def page_text(
     head = {
         "columns": COLUMNS,
         "rows": rows,
+        "headings": headings(),
         "single": single and len(found) == 1,
         "base": base,
         "unread": list(unread),
         "errors": errors_of(rows),
-        "words": {reason: words_of(reason) for reason in sorted({row[3] for row in rows if row[3]})},
+        "words": {one.value: (one.meaning, one.advice) for one in Reason if one in {row[3] for row in rows}},
         "terrains": _terrains(found, grounds),
     }
     title = f"{found[0].record['image']} · startrack" if head["single"] else f"{len(found):,} images · startrack"
@@ -96,6 +97,7 @@ def _detail(found: Found, grounds: Grounds, size: tuple[int, int, int]) -> dict[
     longest_px, stars, azimuths = size
     return {
         "record": {key: value for key, value in record.items() if key not in ("matches", "detections", "camera")},
+        "facts": facts_of(record),
         "picture": picture_of(found.beside(".annotated.png"), found.beside(".wcs"), record, longest_px),
         "stars": stars_of(found.beside(".stars.ecsv"), stars),
         "horizon": _horizon(record, grounds, azimuths),

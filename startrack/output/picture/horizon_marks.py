@@ -10,7 +10,7 @@ from startrack.frames import azel_from_rays, heading_pitch_roll_from_R_body_enu,
 from startrack.output.picture.backdrop import View
 from startrack.output.picture.canvas import Canvas, around
 from startrack.output.picture.palette import DIM_INK, FAINT_INK, INK, SKYLINE
-from startrack.output.record import R_body_enu, place_m
+from startrack.output.values import R_body_enu, place_m
 from startrack.stages import Inputs, Located, Measured
 from startrack.types import Array, Bools
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.frames import heading_pitch_roll_from_R_body_enu, latlon_from_enu
 from startrack.output.picture.canvas import Box, Canvas, text_width, wrapped
 from startrack.output.picture.minimap import draw_leaders, draw_overview, draw_zoom
 from startrack.output.picture.palette import (
@@ -23,8 +22,8 @@ from startrack.output.picture.palette import (
     Colour,
 )
 from startrack.output.picture.residuals import draw_residuals
-from startrack.output.record import R_body_enu, boresight_rad, image_name, predicted_visible
-from startrack.output.text import chance_text
+from startrack.output.record import image_name
+from startrack.output.views import Rows, at_stage, rows
 from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented, Outcome, reached
 
 PANEL_WIDTH, PANEL_HEIGHT = 620, 1160
@@ -115,64 +114,37 @@ def _figures(canvas: Canvas, room: Box, value: Inputs, truth: tuple[float, float
     return bottom + 12
 
 
-def _facts(value: Inputs) -> list[tuple[str, str]]:
+def _facts(value: Inputs) -> Rows:
+    """Names and texts of the quantities that the panel shows."""
     when = value.exposure.time_utc
-    rows = [("Time", f"{when:%Y-%m-%d  %H:%M:%S} UTC" if when is not None else "not known")]
-    if isinstance(value, Located) and not value.fix.ambiguous:
-        fix = value.fix
-        east, north, _ = fix.position_enu_m
-        latitude, longitude = np.degrees(latlon_from_enu(value.site, *fix.position_enu_m))
-        rows += [
-            ("Position", f"E {east:.1f} m   N {north:.1f} m   ±{fix.radius95_m:.1f} m (95 %)"),
-            ("Lat, lon", f"{latitude:.5f}°   {longitude:.5f}°"),
-        ]
+    found = [("Time", f"{when:%Y-%m-%d  %H:%M:%S} UTC" if when is not None else "not known")]
     if isinstance(value, Located) and value.fix.ambiguous:
         for k, mode in enumerate(value.fix.modes[:MOST_MODES]):
             place = f"E {mode.east_m:.0f} m   N {mode.north_m:.0f} m   ({100 * mode.weight:.0f} %)"
-            rows += [(f"Place {k + 1}", place)]
-    if isinstance(value, Measured):
-        heading, pitch, roll = np.degrees(heading_pitch_roll_from_R_body_enu(R_body_enu(value)))
-        rows += [("Heading", f"{heading:.2f}°   pitch {pitch:+.2f}°   roll {roll:+.2f}°")]
-    elif isinstance(value, Oriented):
-        ra, dec, roll = np.degrees(boresight_rad(value.attitude.R_cam_icrs))
-        rows += [("Boresight", f"RA {ra:.3f}°   Dec {dec:+.3f}°   roll {roll:.3f}°")]
-    return rows + _star_facts(value)
-
-
-def _star_facts(value: Inputs) -> list[tuple[str, str]]:
-    if not isinstance(value, Detected):
-        return []
-    if not isinstance(value, Oriented):
-        return [("Stars", f"{len(value.detections):,} point sources")]
-    rows = [("Stars", f"{len(value.identification):,} of {len(value.detections):,} point sources identified")]
-    chance = chance_text(value.identification.false_alarm_probability)
-    rows += [("Residual", f"{value.attitude_fit.rms_px:.2f} px   false alarm {chance}")]
-    if isinstance(value, Located):
-        measured = int(value.light.usable.sum())
-        rows += [("Evidence", f"{measured:,} stars, {predicted_visible(value):,} above the skyline")]
-    return rows
+            found += [(f"Place {k + 1}", place)]
+    return found + rows("panel", at_stage(value))
 
 
 def _legend(value: Inputs, truth: bool) -> list[tuple[str, Colour, str]]:
-    rows: list[tuple[str, Colour, str]] = []
+    found: list[tuple[str, Colour, str]] = []
     if isinstance(value, Identified):
-        rows += [("ring", IDENTIFIED, "star of the catalogue, identified")]
+        found += [("ring", IDENTIFIED, "star of the catalogue, identified")]
     if isinstance(value, Detected):
         other = "other point source" if isinstance(value, Identified) else "point source"
-        rows += [("ring", DETECTION, other)]
+        found += [("ring", DETECTION, other)]
     if isinstance(value, Measured):
-        rows += [("cross", HIDDEN, "star that should be here, and is hidden")]
+        found += [("cross", HIDDEN, "star that should be here, and is hidden")]
     if isinstance(value, Oriented) and value.bodies:
-        rows += [("ring", BODY, "planet, Sun, Earth or Moon, where it must be")]
+        found += [("ring", BODY, "planet, Sun, Earth or Moon, where it must be")]
     if isinstance(value, Located) and not value.fix.ambiguous:
-        rows += [("line", SKYLINE, "skyline of the terrain seen from the position found")]
-        rows += [("disc", POSITION, "position; circle 95 %, ellipse one sigma")]
+        found += [("line", SKYLINE, "skyline of the terrain seen from the position found")]
+        found += [("disc", POSITION, "position; circle 95 %, ellipse one sigma")]
     if isinstance(value, Located) and value.fix.ambiguous:
-        rows += [("line", SKYLINE, "skyline of the terrain seen from place 1")]
-        rows += [("disc", POSITION, "place that fits the stars, with its probability")]
+        found += [("line", SKYLINE, "skyline of the terrain seen from place 1")]
+        found += [("disc", POSITION, "place that fits the stars, with its probability")]
     if truth and value.terrain is not None:
-        rows += [("plus", TRUTH, "true position (not known to the method)")]
-    return rows
+        found += [("plus", TRUTH, "true position (not known to the method)")]
+    return found
 
 
 def _sample(canvas: Canvas, x: float, y: float, kind: str, colour: Colour) -> None:

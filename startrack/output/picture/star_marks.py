@@ -8,8 +8,8 @@ from startrack.frames import azel_from_rays
 from startrack.output.picture.backdrop import View
 from startrack.output.picture.canvas import Canvas
 from startrack.output.picture.palette import BODY, DETECTION, HIDDEN, IDENTIFIED, INK, mixed
-from startrack.output.record import place_m
 from startrack.output.star_table import names_of, status_of
+from startrack.output.values import place_m
 from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented
 from startrack.types import Array, Bools, Ints
 

@@ -1,0 +1,145 @@
+"""How the output quantities are computed from the values of the pipeline, and how some of them are spelled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from startrack.frames import R_from_rotvec, heading_pitch_roll_from_R_body_enu, latlon_from_enu
+from startrack.stages import Located, Measured, Oriented
+from startrack.types import Array, Fix
+
+ARCSEC_PER_RAD = 648_000 / np.pi
+SMALLEST_CHANCE = 1e-100  # smaller probabilities are beyond the models that they come from
+ROTATION_STEP_RAD = 1e-5  # of the numerical derivative of heading, pitch and roll
+_predicted_visible: WeakKeyDictionary[Located, int] = WeakKeyDictionary()
+At = Callable[[str], Any]  # from the path of a quantity to its value, None where it is not known
+
+
+class Angle(float):
+    """An angle [deg] whose formatted text never reads 360."""
+
+    def __format__(self, spec: str) -> str:
+        text = format(float(self), spec)
+        return format(0.0, spec) if text == format(360.0, spec) else text
+
+
+def place_m(fix: Fix) -> tuple[float, float]:
+    """East and north [m] of the position of a `fix`, or of its heaviest mode where several positions fit."""
+    if fix.ambiguous:
+        return fix.modes[0].east_m, fix.modes[0].north_m
+    return float(fix.position_enu_m[0]), float(fix.position_enu_m[1])
+
+
+def boresight_rad(R_cam_icrs: Array) -> tuple[float, float, float]:
+    """Right ascension in [0, 2 pi), declination, and roll in [0, 2 pi) [rad] of the camera with `R_cam_icrs` (3, 3).
+
+    Roll is the position angle of the image's top (-y of cam) at the boresight, from north through east. Near a
+    celestial pole right ascension and roll are poorly determined; the quaternion is not.
+    """
+    up, ahead = -R_cam_icrs[1], R_cam_icrs[2]
+    ra = np.arctan2(ahead[1], ahead[0])
+    dec = np.arctan2(ahead[2], np.hypot(ahead[0], ahead[1]))
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    roll = np.arctan2(up @ east, up @ north)
+    return positive_turn(float(ra)), float(dec), positive_turn(float(roll))
+
+
+def R_body_enu(value: Measured) -> Array:
+    """Rotation (3, 3) from enu to the rover's body, of a measured `value`."""
+    return np.asarray(value.camera.R_body_cam @ value.R_cam_enu)
+
+
+def body_sigmas_deg(value: Measured) -> Array:
+    """Standard deviations (3,) of heading, pitch and roll [deg] of a measured `value`.
+
+    From the attitude's covariance C of rotations about the camera's axes, J C J^T with the numerical derivative J of
+    the three angles. Not meaningful where the nose points to the zenith: heading and roll are then one angle.
+    """
+    angles = [
+        np.array(heading_pitch_roll_from_R_body_enu(value.camera.R_body_cam @ R_from_rotvec(step) @ value.R_cam_enu))
+        for axis in np.eye(3) * ROTATION_STEP_RAD
+        for step in (axis, -axis)
+    ]
+    change = (np.stack(angles[::2]) - np.stack(angles[1::2]) + np.pi) % (2 * np.pi) - np.pi
+    jacobian = change.T / (2 * ROTATION_STEP_RAD)
+    return np.degrees(np.sqrt(np.diag(jacobian @ value.attitude.covariance_rad2 @ jacobian.T)))
+
+
+def predicted_visible(value: Located) -> int:
+    """How many stars of a located `value` whose light was measured stand above the skyline of the fix."""
+    if value not in _predicted_visible:  # horizons of a height map take time, and several outputs need this number
+        light = value.light
+        horizon = value.terrain.horizon_rad(np.array([place_m(value.fix)]), light.azimuth_rad)
+        _predicted_visible[value] = int((light.usable & (light.elevation_rad > horizon)).sum())
+    return _predicted_visible[value]
+
+
+def chance_text(probability: float) -> str:
+    """A `probability` as text; below 1e-100 the models behind it do not hold."""
+    return f"{probability:.0e}" if probability >= SMALLEST_CHANCE else f"below {SMALLEST_CHANCE:.0e}"
+
+
+def positive_turn(angle_rad: float) -> float:
+    """The angle within [0, 2 pi)."""
+    turned = angle_rad % (2 * np.pi)
+    return turned if turned < 2 * np.pi else 0.0  # a tiny negative angle leaves the modulo as 2 pi itself
+
+
+def boresight_deg(axis: int) -> Callable[[Oriented], float]:
+    """Right ascension, declination or roll (`axis` 0 to 2) of the camera [deg]."""
+    return lambda v: float(np.degrees(boresight_rad(v.attitude.R_cam_icrs)[axis]))
+
+
+def body_deg(axis: int) -> Callable[[Measured], float]:
+    """Heading, pitch or roll (`axis` 0 to 2) of the rover [deg]."""
+    return lambda v: float(np.degrees(heading_pitch_roll_from_R_body_enu(R_body_enu(v))[axis]))
+
+
+def latlon_deg(axis: int) -> Callable[[Located], float]:
+    """Latitude or longitude (`axis` 0, 1) of the position [deg]."""
+    return lambda v: float(np.degrees(latlon_from_enu(v.site, *v.fix.position_enu_m)[axis]))
+
+
+def ellipse(at: At) -> tuple[float, float, float] | None:
+    """Semi-axes [m] of one sigma, the larger first, and the azimuth of the larger one in [0, 180) [deg]."""
+    covariance = at("position.covariance_m2")
+    if covariance is None:
+        return None
+    squares, axes = np.linalg.eigh(np.asarray(covariance, dtype=float))
+    minor, major = np.sqrt(np.maximum(squares, 0.0))
+    return float(major), float(minor), float(np.degrees(np.arctan2(axes[0, 1], axes[1, 1]) % np.pi))
+
+
+def sigma_m(axis: int) -> Callable[[At], float | None]:
+    """Standard deviation of east or north (`axis` 0, 1) [m]."""
+
+    def sigma(at: At) -> float | None:
+        covariance = at("position.covariance_m2")
+        return None if covariance is None else float(np.sqrt(covariance[axis][axis]))
+
+    return sigma
+
+
+def ambiguous_modes(at: At) -> Any:
+    """The modes where no single position is stated."""
+    return at("modes") if at("position.east_m") is None else None
+
+
+def modes_text(modes: list[dict[str, float]]) -> str:
+    """Every mode with its weight."""
+    return "; ".join(f"E {m['east_m']:.0f} m N {m['north_m']:.0f} m ({100 * m['weight']:.0f} %)" for m in modes)
+
+
+def arcsec_text(sigma: list[float]) -> str:
+    """Three standard deviations in one unit."""
+    return f"{sigma[0]:.2f}, {sigma[1]:.2f}, {sigma[2]:.2f} arcsec about"
+
+
+def exact_lens_text(included: bool) -> str:
+    """What a sigma of the attitude leaves out, where the camera has no covariance."""
+    return "" if included else ", the lens taken as exact"

@@ -19,7 +19,7 @@ from startrack.terrain.io import terrain_from_dict
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 FORMATS = (ROOT / "docs/formats.md").read_text(encoding="utf-8")
-LISTED_IN_ONE_ROW = {"timing_ms", "provenance", "camera"}
+LISTED_IN_ONE_ROW = {"timing_ms", "camera"}
 PAGES = sorted([ROOT / "README.md", ROOT / "CONVENTIONS.md", *ROOT.glob("docs/*.md"), *ROOT.glob("*/README.md")])
 
 

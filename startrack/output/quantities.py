@@ -113,7 +113,7 @@ class Quantity:
 
 def everywhere(label: str, form: str, line: str) -> tuple[Show, ...]:
     """A quantity shown as `label` with its `form` in text (on the `line`), panel, notebook and page."""
-    where = (("text", line), ("panel", label), ("notebook", label), ("page", label))
+    where = (("text", line), ("panel", label), ("notebook", label.lower()), ("page", label))
     return tuple(Show(place, row, f"; {label.lower()} {form}" if place == "text" else form) for place, row in where)
 
 

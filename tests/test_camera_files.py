@@ -132,7 +132,8 @@ BAD = [
     ("sensor.saturation_adu", 10**400), ("covariance.matrix", [[1e308, 0.0], [0.0, 1.0]]),
     ("covariance.order", [1, 2]), ("covariance.order", [["fx"], ["k1"]]), ("covariance.order", ["fx", "fx"]),
     ("covariance.order", ["fx", "x1"]), ("covariance.matrix", [[1.0, 0.5], [0.0, 1.0]]),
-    ("covariance.matrix", [[-1.0, 0.0], [0.0, 1.0]]), ("name", ""), ("name", "two\nlines"), ("name", "x" * 250),
+    ("covariance.matrix", [[-1.0, 0.0], [0.0, 1.0]]), ("covariance.matrix", [[1.0, 2.0], [2.0, 1.0]]),
+    ("covariance.matrix", [[1e-300, 1e12], [1e12, 1e-300]]), ("name", ""), ("name", "two\nlines"), ("name", "x" * 250),
     ("name", 7), ("focal_pix", [300.0, 300.0]), ("calibrated_angle", 90.0),
 ]  # fmt: skip
 

@@ -175,4 +175,5 @@ class Camera:
         """
         from startrack.camera.uncertainty import projection_covariance_px2
 
-        return np.sqrt(np.trace(projection_covariance_px2(self, rays_cam), axis1=-2, axis2=-1) / 2.0)
+        variance_px2 = np.trace(projection_covariance_px2(self, rays_cam), axis1=-2, axis2=-1) / 2.0
+        return np.sqrt(np.maximum(variance_px2, 0.0))  # below zero by rounding

@@ -18,7 +18,8 @@ from startrack.types import Array, BadInput
 
 MAX_PIXELS = 200_000_000  # as of images
 UNIT_QUATERNION_1 = 1e-3  # largest error of the length
-SYMMETRIC_1 = 1e-6  # relative asymmetry of a covariance that counts as rounding
+MIN_SIGMA = 1e-15  # of a parameter, px or 1; smaller ones count as zero
+ROUNDING_1 = 1e-6  # of correlations: asymmetry and negative eigenvalues up to this are rounding
 MAX_PARAMETERS = 32
 CAMERA_PARAMETERS = ("fx", "fy", "cx", "cy", "p1", "p2")  # beside those of the lens
 SENSOR = Table(
@@ -217,7 +218,9 @@ def _covariance(values: dict[str, Any] | None, lens: Lens) -> tuple[tuple[str, .
     if len(set(order)) < len(order) or not set(order) <= set(known):
         raise ValueError(f"covariance.order must name parameters of this lens, each once: {', '.join(known)}")
     matrix = np.array(rows)
-    size = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    if np.any(np.diag(matrix) < 0) or np.any(np.abs(matrix - matrix.T) > SYMMETRIC_1 * np.outer(size, size)):
-        raise ValueError("covariance.matrix is not a covariance: it must be symmetric, its diagonal not negative")
+    sigma = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    sigma[sigma < MIN_SIGMA] = 1.0
+    correlation = matrix / np.outer(sigma, sigma)
+    if np.abs(correlation - correlation.T).max() > ROUNDING_1 or np.linalg.eigvalsh(correlation).min() < -ROUNDING_1:
+        raise ValueError("covariance.matrix is no covariance: it must be symmetric and positive semi-definite")
     return order, matrix

@@ -20,6 +20,7 @@ __all__ = [
     "Ints", "Mode", "NoSolution", "NotIdentified", "NotLocated", "Stars", "TooFewStars", "Value", "array",
 ]  # fmt: skip
 
+MAX_PIXELS = 200_000_000  # contract: a larger image is refused from its header, before anything is decoded
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]

@@ -7,9 +7,8 @@ import pytest
 from render_helpers import SITE, stars_at
 
 from startrack.catalog import load_catalog
-from startrack.frames import R_enu_icrs, Site
+from startrack.frames import R_enu_icrs, R_from_rotvec, Site
 from startrack.rendering import draw_field_stars, draw_v_errors, joined, sky_turn_rad
-from startrack.rendering.sources import rotation_from_vector
 from startrack.types import Stars
 
 TIME = datetime(2026, 3, 1, 12, tzinfo=UTC)
@@ -77,5 +76,5 @@ def test_the_turn_carries_the_start_into_the_end():
     from datetime import timedelta
 
     site, half = Site("earth", np.radians(-20.0), 1.0), timedelta(seconds=900)
-    R = rotation_from_vector(sky_turn_rad(site, TIME, 1800.0))
+    R = R_from_rotvec(sky_turn_rad(site, TIME, 1800.0))
     np.testing.assert_allclose(R @ R_enu_icrs(site, TIME - half), R_enu_icrs(site, TIME + half), atol=1e-12)

@@ -9,6 +9,7 @@ import numpy as np
 from startrack.camera.decentring import Decentring
 from startrack.camera.kannala_brandt import KannalaBrandt
 from startrack.camera.lens import Lens
+from startrack.frames import off_axis_rad
 from startrack.types import Array, Bools
 
 # Body x (forward) = image top = -cam y, body y (left) = +cam x, body z (up) = +cam z: it looks at the zenith.
@@ -66,7 +67,7 @@ class Camera:
     def project(self, rays_cam: Array) -> tuple[Array, Bools]:
         """Pixels (..., 2) of the rays (..., 3), and which of them (...) are inside the image circle and the frame."""
         rays_cam = np.asarray(rays_cam, dtype=np.float64)
-        angle = np.arctan2(np.hypot(rays_cam[..., 0], rays_cam[..., 1]), rays_cam[..., 2])
+        angle = off_axis_rad(rays_cam)
         imaged = angle <= min(self.max_angle_rad, self.lens.max_invertible_rad)
         px = self._pixels(rays_cam, angle, self.lens.rho(np.where(imaged, angle, 0.0)))
         within = np.all((px >= -0.5) & (px <= np.array(self.size_px) - 0.5), axis=-1)
@@ -75,7 +76,7 @@ class Camera:
     def project_unlimited(self, rays_cam: Array) -> Array:
         """Pixels (..., 2) of the rays (..., 3) by the lens's formula alone, also beyond the image circle."""
         rays_cam = np.asarray(rays_cam, dtype=np.float64)
-        angle = np.arctan2(np.hypot(rays_cam[..., 0], rays_cam[..., 1]), rays_cam[..., 2])
+        angle = off_axis_rad(rays_cam)
         return self._pixels(rays_cam, angle, self.lens.rho(angle))
 
     def _pixels(self, rays_cam: Array, angle_rad: Array, rho: Array) -> Array:

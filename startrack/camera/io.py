@@ -14,9 +14,8 @@ from startrack.camera.lenses import default_lens, lens_kinds
 from startrack.declaration import Choice, Flag, List, Number, Table, Text
 from startrack.files import read_toml, resolve_named, write_atomically
 from startrack.frames import R_from_quat_xyzw, quat_xyzw_from_R
-from startrack.types import Array, BadInput
+from startrack.types import MAX_PIXELS, Array, BadInput
 
-MAX_PIXELS = 200_000_000  # as of images
 UNIT_QUATERNION_1 = 1e-3  # largest error of the length
 MIN_SIGMA = 1e-15  # of a parameter, px or 1; smaller ones count as zero
 ROUNDING_1 = 1e-6  # of correlations: asymmetry and negative eigenvalues up to this are rounding
@@ -80,7 +79,7 @@ def camera_keys() -> Table:
             "model": Choice(values=tuple(lens_kinds()), default=default_lens().model),
             "size_px": List(each=Number(low=1, high=65_535, integer=True), count=2, required=True),
             "focal_px": List(
-                each=Number(low=1e-3, high=1e7), count=2, required=True, description="pixels per radian on the axis"
+                each=Number(low=1e-3, high=1e6), count=2, required=True, description="pixels per radian on the axis"
             ),
             "centre_px": List(
                 each=Number(low=-1e6, high=1e6),

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.types import BadInput
+from startrack.types import MAX_PIXELS, BadInput
 
-MAX_PIXELS = 200_000_000  # contract: larger images are refused from their header, before anything is decoded
 MAX_FILE_BYTES = 8 * MAX_PIXELS + 2**24  # the largest image at the widest pixel type, and its headers
 EXACT_IN_FLOAT32 = 2**24
 UPRIGHT = 1  # EXIF and TIFF orientation of an image stored as seen

@@ -8,6 +8,7 @@ from startrack.frames.rays import (
     aberrate,
     angle_between_rad,
     azel_from_rays,
+    off_axis_rad,
     rays_from_azel,
     refract_rad,
 )
@@ -57,6 +58,7 @@ __all__ = [
     "nearest_rotation",
     "observer_state",
     "observer_velocity_m_s",
+    "off_axis_rad",
     "parse_utc",
     "position_fixed_m",
     "quat_xyzw_from_R",

@@ -28,6 +28,12 @@ def azel_from_rays(rays_enu: ArrayLike) -> tuple[Array, Array]:
     return azimuth_rad, np.arctan2(up, np.hypot(east, north))
 
 
+def off_axis_rad(rays: ArrayLike) -> Array:
+    """Angle (...) between the vectors (..., 3) and their frame's z axis [rad], exact at 0 and at pi."""
+    x, y, z = np.moveaxis(np.asarray(rays, dtype=float), -1, 0)
+    return np.arctan2(np.hypot(x, y), z)
+
+
 def angle_between_rad(a: ArrayLike, b: ArrayLike) -> Array:
     """Angle (...) between vectors a and b (..., 3) [rad]: atan2(|a x b|, a . b), exact at 0 and at pi."""
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)

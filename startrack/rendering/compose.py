@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from startrack.frames import off_axis_rad
 from startrack.rendering.defects import add_cosmic_rays, add_hot_pixels
 from startrack.rendering.field_stars import joined
 from startrack.rendering.scene import Scene, Truth
 from startrack.rendering.sensor import ADC_MAX_ADU, read_out
 from startrack.rendering.sky import diffuse_e
-from startrack.rendering.sources import above_terrain, add_sources, flux_e, off_axis_rad
+from startrack.rendering.sources import above_terrain, add_sources, flux_e
 from startrack.types import Array, Exposure, Stars
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.camera import Camera, Sensor
-from startrack.frames import azel_from_rays
+from startrack.frames import R_from_rotvec, azel_from_rays, off_axis_rad
 from startrack.rendering.psf import splat
 from startrack.rendering.scene import Scene
 from startrack.types import Array, Body, Bools
@@ -20,11 +20,6 @@ ANGULAR_RADIUS_RAD = {"Sun": 6.957e8 / 1.495978707e11, "Earth": 6.3710e6 / 3.844
 def flux_e(sensor: Sensor, v_mag: Array, angle_rad: Array, exposure_s: float) -> Array:
     """Electrons (n,) in the whole PSF: zero_point 10^(-0.4 V) exposure throughput(angle)."""
     return sensor.zero_point_e_per_s * 10 ** (-0.4 * np.asarray(v_mag)) * exposure_s * sensor.throughput(angle_rad)
-
-
-def off_axis_rad(rays_cam: Array) -> Array:
-    """Angles (n,) from the boresight [rad]."""
-    return np.arctan2(np.hypot(rays_cam[..., 0], rays_cam[..., 1]), rays_cam[..., 2])
 
 
 def above_terrain(scene: Scene, rays_enu: Array) -> Bools:
@@ -102,14 +97,4 @@ def _turns(scene: Scene) -> list[Array]:
     if motion_px < TRAIL_VISIBLE_PX:
         return [np.eye(3)]
     steps = int(np.ceil(motion_px / TRAIL_STEP_PX))
-    return [rotation_from_vector(scene.sky_turn_rad * ((k + 0.5) / steps - 0.5)) for k in range(steps)]
-
-
-def rotation_from_vector(vector_rad: Array) -> Array:
-    """Rotation (3, 3) by |vector| about the vector (Rodrigues)."""
-    angle = float(np.linalg.norm(vector_rad))
-    if angle == 0:
-        return np.eye(3)
-    x, y, z = np.asarray(vector_rad) / angle
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
+    return [R_from_rotvec(scene.sky_turn_rad * ((k + 0.5) / steps - 0.5)) for k in range(steps)]

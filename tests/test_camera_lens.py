@@ -15,6 +15,7 @@ from astropy.wcs import WCS
 from scipy.spatial.transform import Rotation
 
 from startrack.calibration import fit_lens, observations
+from startrack.calibration.show import camera_text
 from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole, lenses, load_camera, save_camera
 from startrack.camera.convert import to_text
 from startrack.camera.io import camera_keys
@@ -93,6 +94,11 @@ def test_camera_file(tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text(text.replace('"m"', '"k1"'))
     with pytest.raises(BadInput, match=r"covariance\.order"):
         load_camera(tmp_path / "own.toml")
+
+
+def test_report_of_the_camera_file() -> None:
+    first, second = camera_text(CAMERA).splitlines()[:2]
+    assert first.startswith("own: sine, 2048 x 1900 px, mirrored") and second.endswith("; m 1.9")
 
 
 def test_schema() -> None:

@@ -221,7 +221,7 @@ def test_randomness_is_explicit() -> None:
 
 UNITS = re.compile(r"_(m|s|rad|px|adu|e|mag|m2|px2|rad2|m_s|e_per_s|e_per_adu|e_per_px)$")
 # Pure numbers, and what says its frame instead of a unit.
-UNITLESS = re.compile(r"^(R_\w+_\w+|rays?_(icrs|enu|cam|body)|\w*(snr|llr|weight|probability|mass))$")
+UNITLESS = re.compile(r"^(R_\w+_\w+|rays?_(icrs|enu|cam|body)|\w*(snr|llr|nats|weight|probability|mass))$")
 
 
 def test_values_name_their_units_and_frames() -> None:

@@ -236,3 +236,8 @@ def test_huge_numbers_in_a_header_are_refused_at_once(read, raw):
         read(raw)
     assert caught.value.reason == "bad_image"
     assert time.process_time() - start < 3.0
+
+
+def test_a_compressed_image_without_rows_is_refused(read):
+    with pytest.raises(BadInput, match="damaged FITS"):
+        read(patched(written(None, fits.CompImageHDU(FRAME)), "NAXIS2", 0))

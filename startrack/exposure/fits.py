@@ -42,13 +42,16 @@ def decode_fits(raw: bytes) -> Decoded:
         with fits.open(BytesIO(raw), memmap=False, checksum=True) as units:
             _check_complete(units, raw)
             unit = _only_image(units)
-            check_size(*_plane_shape(unit)[::-1])
+            shape = _plane_shape(unit)
+            check_size(*shape[::-1])
             header = _metadata(units, unit)
             saturation = _saturation(unit.header)
             stored = np.asarray(unit.data)
             if any("Datasum verification failed" in str(w.message) for w in issued):
                 raise bad_image("damaged FITS: its data do not agree with DATASUM")
-    pixels, notes = grey_float32(stored.reshape(stored.shape[-2:]))
+    if stored.shape[-2:] != shape:  # of a damaged tile-compressed image
+        raise bad_image(f"damaged FITS: its data are {stored.shape}, its header says {shape}")
+    pixels, notes = grey_float32(stored.reshape(shape))
     return Decoded(pixels_adu=pixels, saturation_adu=saturation, header=header, warnings=notes)
 
 

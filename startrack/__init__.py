@@ -3,31 +3,65 @@
     import startrack
     print(startrack.locate("image.png"))
 
-`locate` takes a path or an array and returns a `Solution`. Stars and attitude alone, or centroids alone, are
-`startrack.api.identify` and `startrack.api.detect`; `startrack.identification`, `startrack.detection` are two packages
-(with `startrack.pipeline`, `startrack.localization`, ...) for those who want the stages one by one.
+`locate` takes a path or an array and returns a `Solution`; `identify` and `detect` stop earlier, `calibrate` makes a
+camera, `render` an image. The packages (`startrack.detection`, `startrack.identification`, `startrack.localization`,
+...) have the stages one by one. Every name is loaded at its first use: importing startrack costs nothing.
 """
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
-from startrack.compilation import choose_cache_folder
-
 __version__ = "0.1.0"
-__all__ = ["Solution", "__version__", "locate"]
-
-choose_cache_folder()
+_MODULES = {  # public name to the module that has it
+    "calibrate": "api", "detect": "api", "identify": "api", "locate": "api", "render": "api",
+    "Solution": "solution",
+    "Camera": "camera", "load_camera": "camera",
+    "Cylinder": "terrain", "HeightMap": "terrain.height_map", "Terrain": "terrain", "load_terrain": "terrain",
+    "load_catalog": "catalog",
+    "Detections": "types", "Evidence": "types", "Fix": "types",
+    "ExactPosterior": "localization",
+    "BadInput": "errors", "NoSolution": "errors",
+}  # fmt: skip
+__all__ = [
+    "BadInput",
+    "Camera",
+    "Cylinder",
+    "Detections",
+    "Evidence",
+    "ExactPosterior",
+    "Fix",
+    "HeightMap",
+    "NoSolution",
+    "Solution",
+    "Terrain",
+    "__version__",
+    "calibrate",
+    "detect",
+    "identify",
+    "load_camera",
+    "load_catalog",
+    "load_terrain",
+    "locate",
+    "render",
+]
 
 if TYPE_CHECKING:
-    from startrack.api import Solution, locate
+    from startrack.api import calibrate, detect, identify, locate, render
+    from startrack.camera import Camera, load_camera
+    from startrack.catalog import load_catalog
+    from startrack.errors import BadInput, NoSolution
+    from startrack.localization import ExactPosterior
+    from startrack.solution import Solution
+    from startrack.terrain import Cylinder, Terrain, load_terrain
+    from startrack.terrain.height_map import HeightMap
+    from startrack.types import Detections, Evidence, Fix
 
 
 def __getattr__(name: str) -> Any:
-    """The names of `startrack.api`, loaded when they are first asked for: importing startrack costs nothing."""
-    if name not in __all__:
+    """The public names, each from its module at the first use."""
+    if name not in _MODULES:
         raise AttributeError(f"module 'startrack' has no attribute {name!r}")
-    from startrack import api
-
-    return getattr(api, name)
+    return getattr(importlib.import_module(f"startrack.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -1,79 +1,243 @@
-"""The library's front door: a picture to a solution that prints itself, with astropy's types at the edge."""
+"""The functions of the library: images to solutions or to a camera, a pose to an image; with astropy's types."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from startrack import pipeline
-from startrack.camera import Camera
+from startrack.calibration import Calibration
+from startrack.calibration import calibrate as calibrate_exposures
+from startrack.camera import Camera, load_camera
 from startrack.catalog import load_catalog
 from startrack.errors import BAD_INPUT_REASONS, BadInput
-from startrack.inputs import Picture, When, angle_rad, given_camera, given_exposure, given_settings, given_terrain
+from startrack.frames import Site
+from startrack.inputs import (
+    Image,
+    Time,
+    angle_rad,
+    camera_input,
+    exposure_input,
+    settings_input,
+    terrain_input,
+    time_input,
+)  # fmt: skip
+from startrack.rendering import Series, Truth, load_sky_catalog
+from startrack.rendering import render as render_scene
 from startrack.solution import Solution
-from startrack.stages import Outcome, Refused
+from startrack.stages import Outcome, Refused, Settings
 from startrack.terrain import Terrain
+from startrack.types import Exposure
 
 if TYPE_CHECKING:
     from astropy.units import Quantity
+    from numpy.typing import ArrayLike
 
-__all__ = ["Solution", "detect", "identify", "locate"]
+    from startrack.identification import IdentifiedCentroids
 
-ARGUMENT_OF_FLAG = {"--time UTC": "time="}  # messages of the stages name what the commands take
+__all__ = ["calibrate", "detect", "identify", "locate", "render"]
+
+ARGUMENT_OF_FLAG = {"--time UTC": "time="}  # messages of the stages name the flags of the commands
 
 
 def locate(
-    image: Picture,
+    image: Image,
     *,
     camera: str | Camera | None = None,
     terrain: str | Terrain | None = None,
-    time: When = None,
-    settings: pipeline.Settings | None = None,
+    time: Time = None,
+    settings: Settings | None = None,
 ) -> Solution:
-    """Position and attitude from a picture of the stars.
+    """Position and attitude from one image of the stars.
 
-    `image` is a file, an array (H, W) of raw counts, or an Exposure; `camera` and `terrain` are files, names of shipped
-    ones, or the objects; `time` is the middle of the exposure: text, datetime, numpy datetime64 or astropy Time (any
-    scale). What is not given comes from the image's sidecar or header.
+    What is not given comes from the image's sidecar or header.
 
-    Raises BadInput for every reason that ends the commands with exit code 4: something is missing (no_time,
-    no_calibration, bad_terrain) or cannot be used. A picture that cannot be solved, or fits several places (exit code
-    3), gives a Solution that is false and says why. Raises TypeError for other `settings`.
+    Args:
+        image: a file, an array (H, W) of raw counts, colours (H, W, 3), or an Exposure.
+        camera: a camera file, the name of a shipped one, or the object.
+        terrain: a terrain file, the name of a shipped one, or the object.
+        time: middle of the exposure: text, aware datetime, numpy datetime64 (UTC) or astropy Time (any scale).
+        settings: stages to use instead of the usual ones.
+
+    Returns:
+        The solution. It is false, and says why, where the image cannot be solved or fits several positions (exit code 3
+        of the commands).
+
+    Raises:
+        BadInput: something is missing (no_time, no_calibration, bad_terrain) or cannot be used (exit code 4).
+        TypeError: `settings` of another type.
     """
-    settings = given_settings(settings)
-    exposure = given_exposure(image, time)
-    known = given_camera(camera, exposure), given_terrain(terrain, exposure)
+    settings = settings_input(settings)
+    exposure = exposure_input(image, time)
+    known = camera_input(camera, exposure), terrain_input(terrain, exposure)
     return _solution(pipeline.locate(exposure, *known, load_catalog(), settings), "fix")
 
 
 def identify(
-    image: Picture, *, camera: str | Camera | None = None, time: When = None, fov: float | Quantity | None = None
-) -> Solution:
-    """Stars and attitude only: no terrain needed, nor a time.
+    image: Image,
+    *,
+    camera: str | Camera | None = None,
+    time: Time = None,
+    fov: float | Quantity | None = None,
+    size_px: tuple[int, int] | None = None,
+    flux: ArrayLike | None = None,
+    sigma_px: ArrayLike | None = None,
+) -> Solution | IdentifiedCentroids:
+    """Stars and attitude of an image, or of a list of centroids. No terrain is needed, nor a time.
 
-    With `fov` no camera either: an angle, or a number of degrees, good to 10 %; across the image's width below 100
-    degrees, else across the image circle. The lens found is then `solution.result.camera`. Raises ValueError where both
-    are given, BadInput as `locate` does.
+    Args:
+        image: an image, as for `locate`; or centroids (n, 2), x and y in px from the centre of the top-left pixel.
+        camera: the camera, as for `locate`. Of an image it may come from sidecar or header.
+        time: middle of the exposure, as for `locate`. None: the catalogue is taken at J2000.0 without aberration.
+        fov: instead of a camera, the field of view to 10 %: an angle or degrees; across the frame's width below 100
+            degrees, else across the image circle. The lens is then found with the stars.
+        size_px: of centroids: width and height of the frame; needed with `fov`.
+        flux: of centroids: (n,) in any linear unit. None: they are sorted, brightest first.
+        sigma_px: of centroids: error per axis, one number or (n,). None: 0.3 px.
+
+    Returns:
+        Of an image a Solution, whose `result.camera` is the camera used or found. Of centroids `IdentifiedCentroids`:
+        `detection` and `star` (indices), `hip`, `attitude`, `camera`.
+
+    Raises:
+        ValueError: both `camera` and `fov` are given, or of centroids neither.
+        BadInput: as `locate`.
+        NotIdentified: the centroids are not identified.
     """
     if fov is not None and camera is not None:
         raise ValueError("camera= and fov= exclude each other: with fov= the lens is found, with camera= it is known")
-    exposure = given_exposure(image, time)
+    if size_px is not None or flux is not None or _are_centroids(image):
+        return _identify_list(image, camera, time, fov, size_px, flux, sigma_px)
+    exposure = exposure_input(image, time)
     if fov is not None:
         return _solution(pipeline.identify_blind(exposure, angle_rad(fov), load_catalog()), "identification")
-    return _solution(pipeline.identify(exposure, given_camera(camera, exposure), load_catalog()), "identification")
+    return _solution(pipeline.identify(exposure, camera_input(camera, exposure), load_catalog()), "identification")
 
 
-def detect(image: Picture, *, camera: str | Camera | None = None) -> Solution:
-    """Centroids only; with a camera their fluxes are in electrons. Raises BadInput as `locate` does."""
-    exposure = given_exposure(image, None)
-    known = camera is not None or exposure.camera is not None
-    return _solution(pipeline.detect(exposure, given_camera(camera, exposure) if known else None), "detections")
+def detect(image: Image, *, camera: str | Camera | None = None) -> Solution:
+    """Point sources only.
+
+    Args:
+        image: as for `locate`.
+        camera: as for `locate`; with one the fluxes are in electrons, else in ADU.
+
+    Raises:
+        BadInput: as `locate`.
+    """
+    exposure = exposure_input(image, None)
+    is_known = camera is not None or exposure.camera is not None
+    return _solution(pipeline.detect(exposure, camera_input(camera, exposure) if is_known else None), "detections")
 
 
-def _solution(result: Outcome, kind: str) -> Solution:
+def calibrate(
+    images: Sequence[Image],
+    *,
+    camera: str | Camera | None = None,
+    fov: float | Quantity | None = None,
+    site: Site | None = None,
+    name: str = "camera",
+) -> Calibration:
+    """A camera from images of the open sky.
+
+    Args:
+        images: as for `locate`, each with its time.
+        camera: an approximate camera; or give `fov`.
+        fov: field of view, as for `identify`.
+        site: on the Earth, where the camera stood: refraction is then taken out of the lens.
+        name: of the camera.
+
+    Returns:
+        The calibration. Use its `camera` only where `accepted` is true; `gates` says which conditions were not met.
+
+    Raises:
+        BadInput: as `locate`.
+        NotIdentified: no image's stars could be identified.
+    """
+    start = load_camera(camera) if isinstance(camera, str) else camera
+    exposures = [exposure_input(image, None) for image in images]
+    fov_rad = None if fov is None else angle_rad(fov)
+    return calibrate_exposures(exposures, load_catalog(), camera=start, fov_rad=fov_rad, site=site, name=name)
+
+
+def render(
+    camera: str | Camera = "fisheye-2048",
+    terrain: str | Terrain = "shackleton-thesis",
+    *,
+    time: Time = None,
+    position_m: tuple[float, float] | None = None,
+    heading: float | Quantity | None = None,
+    seed: int = 0,
+    number: int = 0,
+    **settings: Any,
+) -> tuple[Exposure, Truth]:
+    """A synthetic exposure, and the truth about it. The same arguments give the same pixels.
+
+    Args:
+        camera: as for `locate`; it needs a `[sensor]`.
+        terrain: as for `locate`.
+        time: middle of the exposure, as for `locate`. None: drawn from the seed, like all that is not given.
+        position_m: (east, north) from the terrain's origin [m].
+        heading: azimuth of the rover's nose: an angle, or degrees.
+        seed: of sky, sensor and noise.
+        number: of the exposure within the series of this seed.
+        settings: further fields of `startrack.rendering.Series`, such as `exposure_s` or `sky_v_mag_arcsec2`.
+
+    Raises:
+        BadInput: bad_calibration without a sensor, bad_terrain where no camera can stand there.
+    """
+    lens = load_camera(camera) if isinstance(camera, str) else camera
+    ground = terrain_input(terrain, None)
+    catalog = load_sky_catalog("auto").brighter_than(settings.get("faint_v_mag", Series.faint_v_mag) or np.inf)
+    east_m, north_m = position_m if position_m is not None else (None, None)
+    series = Series(
+        camera=lens,
+        terrain=ground,
+        seed=seed,
+        time_utc=time_input(time),
+        east_m=east_m,
+        north_m=north_m,
+        heading_rad=None if heading is None else angle_rad(heading) % (2 * np.pi),
+        **{"catalog": catalog, **settings},
+    )
+    scene, rng = series.scene(number, f"{ground.name}-{seed}-{number:03d}")
+    return render_scene(scene, rng=rng)
+
+
+def _are_centroids(image: Any) -> bool:
+    """Whether an array is a list of centroids (n, 2): no image is two pixels wide."""
+    shape = np.shape(image) if isinstance(image, np.ndarray | list | tuple) else ()
+    return len(shape) == 2 and shape[1] == 2
+
+
+def _identify_list(
+    xy_px: Any,
+    camera: str | Camera | None,
+    time: Time,
+    fov: float | Quantity | None,
+    size_px: tuple[int, int] | None,
+    flux: ArrayLike | None,
+    sigma_px: ArrayLike | None,
+) -> IdentifiedCentroids:
+    from startrack.identification import identify_centroids
+
+    return identify_centroids(
+        np.asarray(xy_px, dtype=float),
+        camera=load_camera(camera) if isinstance(camera, str) else camera,
+        fov_rad=None if fov is None else angle_rad(fov),
+        size_px=size_px,
+        flux=flux,
+        sigma_px=sigma_px,
+        stars=pipeline.stars_at(load_catalog(), time_input(time), None),
+    )
+
+
+def _solution(outcome: Outcome, kind: str) -> Solution:
     """Raises BadInput where the input was at fault, whichever stage found that."""
-    if isinstance(result, Refused) and result.reason in BAD_INPUT_REASONS:
-        message = result.message
+    if isinstance(outcome, Refused) and outcome.reason in BAD_INPUT_REASONS:
+        message = outcome.message
         for flag, argument in ARGUMENT_OF_FLAG.items():
             message = message.replace(flag, argument)
-        raise BadInput(result.reason, message)
-    return Solution(result, kind)
+        raise BadInput(outcome.reason, message)
+    return Solution(outcome, kind)

@@ -1,4 +1,4 @@
-"""What a caller of the library may give for a picture, a time, a camera and a terrain, made into the values inside."""
+"""Arguments of the library's functions (image, time, camera, terrain, angle) as the values used inside."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from startrack.stages import Settings
 from startrack.terrain import Terrain, load_terrain
 from startrack.types import BadInput, Exposure
 
-Picture: TypeAlias = str | os.PathLike[str] | ArrayLike | Exposure
-When: TypeAlias = Any  # text, datetime, datetime64, astropy Time (not imported for a type alone), or None
+Image: TypeAlias = str | os.PathLike[str] | ArrayLike | Exposure
+Time: TypeAlias = Any  # text, datetime, datetime64, astropy Time (not imported for a type alone), or None
 
 
-def given_exposure(image: Picture, time: When) -> Exposure:
-    """A file's, an array's (H, W) or (H, W, 3), or the exposure itself, at `time` where that is given.
+def exposure_input(image: Image, time: Time) -> Exposure:
+    """The exposure of an `image`: a file, an array (H, W) or (H, W, 3), or the exposure itself; at `time` if given.
 
-    Raises BadInput (bad_image, no_time); a mask that hides pixels is refused, for no stage could heed it.
+    Raises BadInput (bad_image, no_time). An array whose mask hides pixels is refused: no stage can leave pixels out.
     """
-    time_utc = utc(time)
+    time_utc = time_input(time)
     if isinstance(image, Exposure):
         return with_facts(image, time_utc=time_utc)
     if isinstance(image, str | os.PathLike):
@@ -45,10 +45,10 @@ def given_exposure(image: Picture, time: When) -> Exposure:
     return exposure_of(np.asarray(pixels), time_utc=time_utc)
 
 
-def utc(time: When) -> datetime | None:
-    """Text, datetime, numpy datetime64 (which has no zone: UTC) or astropy Time (any scale) as UTC.
+def time_input(time: Time) -> datetime | None:
+    """A `time` as UTC: text, datetime, numpy datetime64 (which has no zone: UTC) or astropy Time (any scale).
 
-    Raises BadInput (no_time) for anything else.
+    None stays None. Raises BadInput (no_time) for anything else.
     """
     if time is None:
         return None
@@ -79,8 +79,8 @@ def _iso_text(time: Any) -> Any:
     return finer.isot
 
 
-def given_camera(camera: str | os.PathLike[str] | Camera | None, exposure: Exposure) -> Camera:
-    """The camera, the one of a file or a shipped name, or the one that the exposure names.
+def camera_input(camera: str | os.PathLike[str] | Camera | None, exposure: Exposure) -> Camera:
+    """The `camera`, the one of a file or a shipped name, or the one that the `exposure` names.
 
     Raises BadInput (no_calibration, bad_calibration).
     """
@@ -94,12 +94,12 @@ def given_camera(camera: str | os.PathLike[str] | Camera | None, exposure: Expos
     return load_camera(os.fspath(reference))
 
 
-def given_terrain(terrain: str | os.PathLike[str] | Terrain | None, exposure: Exposure) -> Terrain:
-    """The terrain, the one of a file or a shipped name, or the one that the exposure names.
+def terrain_input(terrain: str | os.PathLike[str] | Terrain | None, exposure: Exposure | None) -> Terrain:
+    """The `terrain`, the one of a file or a shipped name, or the one that the `exposure` names.
 
     Raises BadInput (bad_terrain).
     """
-    reference = terrain if terrain is not None else exposure.terrain
+    reference = terrain if terrain is not None or exposure is None else exposure.terrain
     if reference is None:
         raise BadInput("bad_terrain", "no terrain is known: give terrain=")
     if isinstance(reference, str | os.PathLike):
@@ -109,8 +109,8 @@ def given_terrain(terrain: str | os.PathLike[str] | Terrain | None, exposure: Ex
     return reference
 
 
-def given_settings(settings: Settings | None) -> Settings | None:
-    """The settings, None for the usual ones. Raises TypeError for anything else."""
+def settings_input(settings: Settings | None) -> Settings | None:
+    """The `settings`, None for the usual ones. Raises TypeError for anything else."""
     if settings is None or isinstance(settings, Settings):
         return settings
     raise TypeError(
@@ -120,7 +120,7 @@ def given_settings(settings: Settings | None) -> Settings | None:
 
 
 def angle_rad(angle: Any) -> float:
-    """An astropy angle, or a number of degrees [rad]. Raises BadInput (no_calibration) where it is neither."""
+    """An astropy `angle`, or a number of degrees [rad]. Raises BadInput (no_calibration) where it is neither."""
     try:
         size = float(angle.to_value("rad")) if hasattr(angle, "to_value") else math.radians(angle)
     except (TypeError, ValueError) as cause:

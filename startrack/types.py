@@ -137,7 +137,7 @@ class Stars(Value):
         return len(self.v_mag)
 
     def take(self, which: Any) -> Stars:
-        """The stars selected by a mask, slice or index array."""
+        """The stars that a mask, slice or index array `which` selects."""
         return take_rows(self, which)
 
 
@@ -188,7 +188,7 @@ class Evidence(Value):
     extended_nats: Array = array("n", default=0.0)  # (light / noise)^2 of extended light; 0: a point source
 
     def take(self, which: Any) -> Evidence:
-        """The rows selected by a mask, slice or index array."""
+        """The rows that a mask, slice or index array `which` selects."""
         return take_rows(self, which)
 
     def __len__(self) -> int:

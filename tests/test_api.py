@@ -17,10 +17,9 @@ from astropy.time import Time
 from astropy.utils.masked import Masked
 
 import startrack
-import startrack.api
 from startrack.errors import BadInput
 from startrack.exposure import read_exposure
-from startrack.inputs import given_exposure, utc
+from startrack.inputs import exposure_input, time_input
 from startrack.stages import Oriented, Refused, extend, reached
 
 IMAGE = "sample_images/near-wall.png"
@@ -92,7 +91,7 @@ def test_the_attitude_is_a_rotation_and_angles(solution):
 
 
 def test_stars_alone_give_no_heading():
-    found = startrack.api.identify(IMAGE)
+    found = startrack.identify(IMAGE)
     assert found.attitude is not None and found.attitude.ra.deg == pytest.approx(87.70, abs=0.01)
     assert found.heading is None and found.position is None
     assert "heading" not in repr(found.attitude)
@@ -116,7 +115,7 @@ def test_writing_replaces_what_an_earlier_result_left(solution, tmp_path):
 
 
 def test_a_result_of_another_image_is_kept_unless_asked(tmp_path):
-    first, second = (startrack.api.detect(np.full((64, 64), level, np.uint16)) for level in (300, 301))
+    first, second = (startrack.detect(np.full((64, 64), level, np.uint16)) for level in (300, 301))
     path = first.write(tmp_path)
     kept = path.read_bytes()
     with pytest.raises(BadInput, match="overwrite=True"):
@@ -128,14 +127,27 @@ def test_a_result_of_another_image_is_kept_unless_asked(tmp_path):
 
 
 def test_each_call_writes_the_record_of_its_kind(tmp_path):
-    flat = startrack.api.identify(np.full((2048, 2048), 300, np.uint16), camera="fisheye-2048")
+    flat = startrack.identify(np.full((2048, 2048), 300, np.uint16), camera="fisheye-2048")
     assert flat.reason == "no_stars"
     assert flat.to_dict()["format"] == "startrack.identification/1"
     assert flat.write(tmp_path, plots=False).name == "array.identification.json"
-    path = startrack.api.identify(IMAGE).write(tmp_path)
+    path = startrack.identify(IMAGE).write(tmp_path)
     assert sorted(p.name for p in path.parent.glob("near-wall*")) == [
         f"near-wall{end}" for end in (".annotated.png", ".corr", ".identification.json", ".stars.ecsv", ".wcs")
     ]
+
+
+def test_identify_and_detect_leave_the_files_of_locate_alone(solution, tmp_path):
+    solution.write(tmp_path)
+    files = sorted(tmp_path.iterdir())
+    before = [path.read_bytes() for path in files]
+    startrack.detect(IMAGE).write(tmp_path)
+    startrack.identify(IMAGE).write(tmp_path)
+    startrack.identify(IMAGE).write(tmp_path)
+    assert [path.read_bytes() for path in files] == before
+    own = {path.name.removeprefix("near-wall.") for path in set(tmp_path.iterdir()) - set(files)}
+    kinds = ("json", "annotated.png", "stars.ecsv", "wcs", "corr")
+    assert own == {"detections.json", "detections.annotated.png", *(f"identification.{kind}" for kind in kinds)}
 
 
 def test_a_picture_without_stars_says_why():
@@ -194,7 +206,7 @@ def test_odd_things_are_refused_with_a_reason(given, reason):
 
 def test_the_same_rule_holds_for_stars_alone():
     with pytest.raises(BadInput) as caught:
-        startrack.api.identify(np.full((64, 64), 300, np.uint16), camera="fisheye-2048")
+        startrack.identify(np.full((64, 64), 300, np.uint16), camera="fisheye-2048")
     assert caught.value.reason == "size_mismatch"
 
 
@@ -204,7 +216,7 @@ def test_settings_are_settings():
 
 
 def test_a_solution_is_equal_to_itself_and_goes_into_sets(solution):
-    other = startrack.api.detect(np.full((64, 64), 300, np.uint16))
+    other = startrack.detect(np.full((64, 64), 300, np.uint16))
     assert solution == solution and solution != other
     assert len({solution, other}) == 2
     assert solution.result != other.result
@@ -214,30 +226,30 @@ def test_a_solution_is_equal_to_itself_and_goes_into_sets(solution):
 
 def test_colours_lists_and_paths_are_pictures():
     pixels = np.full((64, 64, 3), 300, np.uint16)
-    assert "mean of its three channels" in given_exposure(pixels, None).warnings[0]
-    assert given_exposure(pixels[..., 0].tolist(), None).size_px == (64, 64)
-    assert given_exposure(Path(IMAGE), None).name == "near-wall"
+    assert "mean of its three channels" in exposure_input(pixels, None).warnings[0]
+    assert exposure_input(pixels[..., 0].tolist(), None).size_px == (64, 64)
+    assert exposure_input(Path(IMAGE), None).name == "near-wall"
 
 
 def test_a_mask_is_never_lost():
     pixels = np.ma.array(np.arange(64, dtype=np.uint16).reshape(8, 8))
-    assert given_exposure(pixels, None).size_px == (8, 8)
+    assert exposure_input(pixels, None).size_px == (8, 8)
     pixels[3, 4:6] = np.ma.masked
     with pytest.raises(BadInput, match="2 of 64 pixels are masked"):
-        given_exposure(pixels, None)
+        exposure_input(pixels, None)
     with pytest.raises(BadInput, match="2 of 64 pixels are masked"):
-        given_exposure(Masked(pixels.data, mask=pixels.mask), None)
+        exposure_input(Masked(pixels.data, mask=pixels.mask), None)
 
 
 @pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
 def test_numpy_times_are_utc(unit):
     time = np.datetime64("2029-09-08T03:12:45", unit)
-    assert utc(time) == datetime(2029, 9, 8, 3, 12, 45, tzinfo=UTC)
+    assert time_input(time) == datetime(2029, 9, 8, 3, 12, 45, tzinfo=UTC)
 
 
 def test_astropy_times_keep_their_microseconds():
     time = Time("2029-09-08T03:12:45.123456")
-    assert utc(time) == utc(time.tdb) == datetime(2029, 9, 8, 3, 12, 45, 123456, tzinfo=UTC)
+    assert time_input(time) == time_input(time.tdb) == datetime(2029, 9, 8, 3, 12, 45, 123456, tzinfo=UTC)
     assert time.precision == 3  # the caller's own is left as it was
 
 
@@ -245,25 +257,25 @@ def test_fractions_are_no_counts(tmp_path):
     """Scaled to 0 .. 1 the sample can be identified blindly, but not with a camera file that states levels in ADU."""
     exposure = read_exposure(IMAGE)
     pixels = exposure.pixels_adu / np.float32(65535)
-    assert "from 0 to 1 are no sensor's counts" in given_exposure(pixels, None).warnings[0]
+    assert "from 0 to 1 are no sensor's counts" in exposure_input(pixels, None).warnings[0]
     with pytest.raises(BadInput, match="fractions from 0 to 1"):
         startrack.locate(pixels, camera=exposure.camera, terrain=exposure.terrain, time=exposure.time_utc)
-    assert startrack.api.identify(pixels, fov=185)
-    assert given_exposure(exposure.pixels_adu, None).warnings == ()
+    assert startrack.identify(pixels, fov=185)
+    assert exposure_input(exposure.pixels_adu, None).warnings == ()
     tifffile.imwrite(tmp_path / "a.tif", pixels)
     scaled = read_exposure(tmp_path / "a.tif")
     assert scaled.saturation_adu is None
     assert "from 0 to 1 are no sensor's counts" in scaled.warnings[0]
     with pytest.raises(BadInput, match="fractions from 0 to 1"):
-        startrack.api.detect(scaled, camera="fisheye-2048")
+        startrack.detect(scaled, camera="fisheye-2048")
 
 
 def test_a_field_of_view_stands_in_for_a_camera():
-    found = startrack.api.identify(LOWELL, fov=180 * u.deg)
+    found = startrack.identify(LOWELL, fov=180 * u.deg)
     assert found
     assert found.result.camera is not None
     assert len(found.result.identification.star) > 1000
     with pytest.raises(ValueError, match="exclude each other"):
-        startrack.api.identify(LOWELL, fov=180, camera="lowell-ldt")
+        startrack.identify(LOWELL, fov=180, camera="lowell-ldt")
     with pytest.raises(BadInput, match="no field of view"):
-        startrack.api.identify(IMAGE, fov="wide")
+        startrack.identify(IMAGE, fov="wide")

@@ -127,7 +127,7 @@ def _clear(result: Path) -> None:
     try:
         result.parent.mkdir(parents=True, exist_ok=True)
         result.unlink(missing_ok=True)
-        remove_companions(result.parent, result.name.removesuffix(".fix.json"))
+        remove_companions(result)
     except OSError as cause:
         raise BadInput("bad_image", f"{result}: cannot be written ({cause.strerror})") from cause
 

@@ -14,20 +14,33 @@ if TYPE_CHECKING:
     from startrack.stages import Oriented, Outcome
 
 COMPANIONS = (".stars.ecsv", ".annotated.png", ".wcs", ".corr")  # beside NAME.fix.json and the other records
+KINDS = {"fix": COMPANIONS, "identification": COMPANIONS, "detections": (".annotated.png",)}  # most complete first
 FilePath = str | os.PathLike[str]
 
 
-def remove_companions(folder: Path, stem: str) -> None:
-    """Remove what an earlier run left beside its record: a refusal must not stand beside the picture of a success."""
-    for suffix in COMPANIONS:
-        (folder / f"{stem}{suffix}").unlink(missing_ok=True)
+def companion(record: Path, suffix: str) -> Path:
+    """Path of the companion with a `suffix` (one of COMPANIONS) of a `record` NAME.KIND.json: NAME and the suffix.
+
+    NAME.KIND and the suffix where a record of a more complete kind has the plain names: `detect` and `identify` leave
+    the files of `locate` alone.
+    """
+    stem, kind = _stem_and_kind(record)
+    kinds = list(KINDS)
+    taken = any(record.with_name(f"{stem}.{other}.json").exists() for other in kinds[: kinds.index(kind)])
+    return record.with_name(f"{stem}.{kind}{suffix}" if taken else f"{stem}{suffix}")
+
+
+def remove_companions(record: Path) -> None:
+    """Remove what an earlier run left beside a `record`: a refusal must not stand beside the picture of a success."""
+    for suffix in KINDS[_stem_and_kind(record)[1]]:
+        companion(record, suffix).unlink(missing_ok=True)
 
 
 def make_way(path: Path, sha256: str, *, overwrite: bool, remedy: str) -> None:
-    """Make the folder of a record to come, and remove what an earlier one of this name left beside it.
+    """Make the folder of a record at `path`, and remove the companions of an earlier one of this name.
 
-    The record of the same image is there to be renewed; one of another image is kept unless `overwrite`. Raises
-    BadInput (bad_image, for lack of a better code) with the `remedy`, or where nothing can be written.
+    The record of the same image (`sha256` of its file) may be replaced; one of another image only with `overwrite`.
+    Raises BadInput (bad_image, for lack of a better code) with the `remedy`, or where nothing can be written.
     """
     make_folder(path.parent)
     try:
@@ -38,7 +51,7 @@ def make_way(path: Path, sha256: str, *, overwrite: bool, remedy: str) -> None:
         before = {}
     if before is not None and not _is_of(before, sha256):
         raise BadInput("bad_image", f"{path} is not a result of this image: {remedy}")
-    remove_companions(path.parent, _stem_and_kind(path)[0])
+    remove_companions(path)
 
 
 def _is_of(record: Any, sha256: str) -> bool:
@@ -53,27 +66,27 @@ def _stem_and_kind(record: Path) -> tuple[str, str]:
 
 
 def write_results(outcome: Outcome, path: Path, *, plots: bool = True, write_record: bool = True) -> dict[str, Any]:
-    """The record of an image, written to `path` (NAME.fix.json, say) after its companions: star table, WCS, picture.
+    """The record of an `outcome`, written to `path` (such as NAME.fix.json) after star table, WCS and picture.
 
-    Raises BadInput where they cannot be written.
+    `plots` and `write_record` say whether the picture and the record are written. Raises BadInput where a file cannot
+    be written.
     """
     from startrack.output.record import record_of
     from startrack.stages import Measured, Oriented, reached
 
-    stem, kind = _stem_and_kind(path)
-    record, value = record_of(outcome, kind), reached(outcome)
+    record, value = record_of(outcome, _stem_and_kind(path)[1]), reached(outcome)
     if isinstance(value, Measured) or (isinstance(value, Oriented) and value.terrain is None):
-        write_star_table(path.with_name(f"{stem}.stars.ecsv"), value)
-        write_wcs(path.with_name(f"{stem}.wcs"), path.with_name(f"{stem}.corr"), value)
+        write_star_table(companion(path, ".stars.ecsv"), value)
+        write_wcs(companion(path, ".wcs"), companion(path, ".corr"), value)
     if plots:
-        write_annotated(path.with_name(f"{stem}.annotated.png"), outcome)
+        write_annotated(companion(path, ".annotated.png"), outcome)
     if write_record:
         write_json(path, record)
     return record
 
 
 def write_json(path: FilePath, record: dict[str, Any]) -> None:
-    """Write a result's dictionary, one top-level key a line. The same dictionary gives the same bytes.
+    """Write a `record` to `path`, one top-level key a line. The same record gives the same bytes.
 
     Raises BadInput where the file cannot be written, and ValueError for NaN or an infinity, which JSON has not.
     """
@@ -81,20 +94,20 @@ def write_json(path: FilePath, record: dict[str, Any]) -> None:
 
 
 def json_text(record: dict[str, Any]) -> str:
-    """JSON of a dictionary with one top-level key a line."""
+    """JSON of a `record` with one top-level key a line."""
     lines = (f" {json.dumps(key)}: {_json(value)}" for key, value in record.items())
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 def write_star_table(path: FilePath, value: Oriented) -> None:
-    """Write NAME.stars.ecsv: every catalogue star in view. Raises BadInput where it cannot be written."""
+    """Write the star table of an identified `value` to `path`. Raises BadInput where it cannot be written."""
     from startrack.output.star_table import star_table_text
 
     write_atomically(path, star_table_text(value).encode("utf-8"), overwrite=True)
 
 
 def write_wcs(path: FilePath, corr_path: FilePath, value: Oriented) -> None:
-    """Write NAME.wcs, the FITS header of the image's world coordinates, and NAME.corr, its matches as a FITS table.
+    """Write the world coordinates of an identified `value` to `path` (FITS header), its matches to `corr_path`.
 
     No NAME.wcs is left if no FITS projection describes the lens. Raises BadInput where they cannot be written.
     """
@@ -109,9 +122,9 @@ def write_wcs(path: FilePath, corr_path: FilePath, value: Oriented) -> None:
 
 
 def write_annotated(path: FilePath, outcome: Outcome, truth_enu_m: tuple[float, float] | None = None) -> None:
-    """Write NAME.annotated.png. Raises BadInput where it cannot be written.
+    """Write the annotated picture of an `outcome` to `path` (PNG). Raises BadInput where it cannot be written.
 
-    `truth_enu_m` (east, north) is drawn where a caller knows it; no stage of the pipeline does.
+    `truth_enu_m` (east, north) [m] is drawn where a caller knows it; no stage of the pipeline does.
     """
     import cv2
 

@@ -1,4 +1,4 @@
-"""What a caller of the library gets: a solution, and its position and attitude as values with units."""
+"""Results of the library's functions: a solution, and its position and attitude as values with units."""
 
 from startrack.solution.solution import Solution
 from startrack.solution.values import Ellipse, Orientation, Position

@@ -1,4 +1,4 @@
-"""What became of one picture, with astropy's types at the edge."""
+"""The solution of one image, with astropy's types."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)  # eq: arrays have no single answer to ==
 class Solution:
-    """What became of one picture. `status` is ok, ambiguous or refused; what was not reached is None.
+    """The solution of one image. `status` is ok, ambiguous or refused; values of stages not reached are None.
 
-    Equal to itself only; its values are made once, at the first look.
+    A solution equals itself only; its values are computed once, at the first use.
     """
 
     result: Outcome
-    kind: str = "fix"  # or identification, detections: what was asked for
+    kind: str = "fix"  # or identification, detections: of the function that returned it
 
     @property
     def status(self) -> str:
@@ -132,7 +132,7 @@ class Solution:
 
     @property
     def warnings(self) -> list[str]:
-        """What was found with the picture and not used, and of which azimuths the terrain could not speak."""
+        """What was found in the image's file and not used, and the azimuths that the terrain does not cover."""
         return self.result.warnings
 
     def to_dict(self) -> dict[str, Any]:
@@ -140,10 +140,18 @@ class Solution:
         return record_of(self.result, self.kind)
 
     def write(self, folder: str | os.PathLike[str], *, plots: bool = True, overwrite: bool = False) -> Path:
-        """The files that the command writes: record, star table, world coordinates, picture; the record's path.
+        """Write the files of the command (record, star table, world coordinates, picture); returns the record's path.
 
-        What an earlier result of this name left beside its record is removed. Raises BadInput (bad_image) where
-        nothing can be written, or where the record there is that of another image and not `overwrite`.
+        Args:
+            folder: of the files; it is made where it is missing.
+            plots: whether the picture is written.
+            overwrite: whether the record of another image of this name may be replaced.
+
+        Companions of an earlier result of this kind and name are removed; those of a more complete result (`locate`
+        before `identify` before `detect`) stay, and this one's then have its kind in their names.
+
+        Raises:
+            BadInput: bad_image where nothing can be written, or where the record of another image is there.
         """
         path = Path(folder) / f"{self.result.exposure.name or 'image'}.{self.kind}.json"
         remedy = "write elsewhere, or with overwrite=True"

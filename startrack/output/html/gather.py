@@ -28,12 +28,12 @@ class Found:
         return "identification" if self.path.name.endswith(KINDS[1]) else "fix"
 
     def beside(self, suffix: str) -> Path:
-        """Path of a companion such as `.stars.ecsv`."""
+        """Path of the companion with a `suffix` such as `.stars.ecsv`."""
         return self.path.with_name(_stem(self.path.name) + suffix)
 
 
 def results_under(folder: str | os.PathLike[str]) -> tuple[list[Found], list[str]]:
-    """Every result of the tree in the order of names, and a line for each file that could not be read, with the cause.
+    """Every result of the tree `folder` in the order of names, and a line with the cause for each unreadable file.
 
     Raises BadInput (bad_image, for lack of a better code) where there is no folder or no result in it.
     """
@@ -56,7 +56,7 @@ def results_under(folder: str | os.PathLike[str]) -> tuple[list[Found], list[str
 
 
 def result_at(path: str | os.PathLike[str]) -> Found:
-    """The result of one file. Raises BadInput (bad_image) where it is none."""
+    """The result in the file at `path`. Raises BadInput (bad_image) where it is none."""
     file = Path(path)
     if not file.is_file():
         raise BadInput("bad_image", f"{path}: no such result")

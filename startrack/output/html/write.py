@@ -36,9 +36,9 @@ def write_page(
     images: int = DEFAULT_IMAGES,
     single: bool = False,
 ) -> None:
-    """Write the page of the results, whole or not at all. Raises BadInput where it cannot be written.
+    """Write the page of the results to `path`, whole or not at all. Raises BadInput where it cannot be written.
 
-    `real` has the true (east, north) [m] of images by their stems, where a caller knows them.
+    The other arguments are those of `page_text`: `found`, `unread`, `real`, `images` and `single`.
     """
     base = _address(folder_of(found[0]), Path(path).parent)
     text = page_text(found, unread=unread, real=real, images=images, single=single, base=base)
@@ -54,7 +54,16 @@ def page_text(
     single: bool = False,
     base: str = ".",
 ) -> str:
-    """The page as text: the same results give the same text. `base` is the results' folder as the page sees it."""
+    """The page as text: the same results give the same text.
+
+    Args:
+        found: the results.
+        unread: a line of text for each result that could not be read.
+        real: the true (east, north) [m] of images by their stems, where a caller knows them.
+        images: how many images have their details in the page.
+        single: whether the page is about one image, without a list.
+        base: the folder of the results as the page sees it.
+    """
     real, grounds = real or {}, Grounds()
     detailed = chosen(found, images)
     rows = [row_of(one, real.get(one.stem), k in detailed) for k, one in enumerate(found)]

@@ -30,7 +30,7 @@ class Sensor:
     vignetting: tuple[float, float] = (0.0, 0.0)
 
     def throughput(self, angle_rad: Array) -> Array:
-        """Relative throughput max(1 + v1 a^2 + v2 a^4, 0) at the angles a off the axis [rad], any shape."""
+        """Relative throughput max(1 + v1 a^2 + v2 a^4, 0) at the angles a = `angle_rad` off the axis, any shape."""
         a2 = np.square(angle_rad)
         return np.maximum(1.0 + a2 * (self.vignetting[0] + a2 * self.vignetting[1]), 0.0)
 
@@ -65,7 +65,7 @@ class Camera:
         return (-self.focal_px[0] if self.mirrored else self.focal_px[0]), self.focal_px[1]
 
     def project(self, rays_cam: Array) -> tuple[Array, Bools]:
-        """Pixels (..., 2) of the rays (..., 3), and which of them (...) are inside the image circle and the frame."""
+        """Pixels (..., 2) of `rays_cam` (..., 3), and which of them (...) are inside the image circle and the frame."""
         rays_cam = np.asarray(rays_cam, dtype=np.float64)
         angle = off_axis_rad(rays_cam)
         imaged = angle <= min(self.max_angle_rad, self.lens.max_invertible_rad)
@@ -74,7 +74,7 @@ class Camera:
         return px, imaged & within
 
     def project_unlimited(self, rays_cam: Array) -> Array:
-        """Pixels (..., 2) of the rays (..., 3) by the lens's formula alone, also beyond the image circle."""
+        """Pixels (..., 2) of `rays_cam` (..., 3) by the lens's formula alone, also beyond the image circle."""
         rays_cam = np.asarray(rays_cam, dtype=np.float64)
         angle = off_axis_rad(rays_cam)
         return self._pixels(rays_cam, angle, self.lens.rho(angle))
@@ -91,7 +91,7 @@ class Camera:
         return np.stack([self.centre_px[0] + fx * u, self.centre_px[1] + fy * v], axis=-1)
 
     def unproject(self, px: Array) -> Array:
-        """Unit rays_cam (..., 3) of the pixels (..., 2): the exact inverse of `project`."""
+        """Unit rays_cam (..., 3) of the pixels `px` (..., 2): the exact inverse of `project`."""
         u, v = self._radial(px)
         rho = np.hypot(u, v)
         angle = self.lens.angle_rad(rho)
@@ -99,7 +99,7 @@ class Camera:
         return np.stack([u * scale, v * scale, np.cos(angle)], axis=-1)
 
     def angle_rad(self, px: Array) -> Array:
-        """Angle off the axis [rad] of the pixels (..., 2)."""
+        """Angle (...) off the axis [rad] of the pixels `px` (..., 2)."""
         return self.lens.angle_rad(np.hypot(*self._radial(px)))
 
     def _radial(self, px: Array) -> tuple[Array, Array]:
@@ -113,7 +113,7 @@ class Camera:
         return u, v
 
     def jacobian_px_per_rad(self, rays_cam: Array) -> Array:
-        """d px / d w (..., 2, 3) for a small rotation w of unit rays about the camera's axes (ray -> ray + w x ray).
+        """d px / d w (..., 2, 3) for a small rotation w of the unit `rays_cam` (..., 3): ray -> ray + w x ray.
 
         From x_px = cx + fx rho(a) u with u = (x, y) / s, s = sin a:  d(rho u) = u rho' da + (rho / s) v (v . d(x, y)),
         v across u, da = z u . d(x, y) - s dz.
@@ -157,19 +157,19 @@ class Camera:
         return self.decentring.gradient(np.stack([angle * ux, angle * uy], axis=-1)) @ by_angle
 
     def pixel_solid_angle_sr(self, angle_rad: Array) -> Array:
-        """Solid angle [sr] of one pixel at the angles a off the axis [rad], any shape: sin a / (rho rho' fx fy).
+        """Solid angle [sr] of one pixel at the angles a = `angle_rad` off the axis, any shape.
 
-        Decentring (a part in a thousand) is neglected.
+        It is sin a / (rho rho' fx fy). Decentring (a part in a thousand) is neglected.
         """
         a = np.maximum(np.asarray(angle_rad, dtype=np.float64), 1e-9)
         return np.sin(a) / (self.lens.rho(a) * self.lens.slope(a) * self.focal_px[0] * self.focal_px[1])
 
     def mean_scale_rad_per_px(self, angle_rad: Array) -> Array:
-        """Geometric-mean angular size [rad] of one pixel at the angles off the axis [rad], any shape."""
+        """Geometric-mean angular size [rad] of one pixel at the angles `angle_rad` off the axis, any shape."""
         return np.sqrt(self.pixel_solid_angle_sr(angle_rad))
 
     def projection_sigma_px(self, rays_cam: Array) -> Array:
-        """Sigma per axis [px] (...) of the projection of the rays (..., 3), from the covariance; 0 without one.
+        """Sigma per axis [px] (...) of the projected `rays_cam` (..., 3), from the covariance; 0 without one.
 
         The part that a rotation of the camera compensates is removed: the attitude, found with this camera, absorbs
         it. Beyond the calibrated angle it is the uncertainty of the fitted law, not of the real lens.

@@ -30,7 +30,7 @@ class Decentring:
         return bool(self.p1 or self.p2)
 
     def shift(self, st: Array) -> Array:
-        """(du, dv) (..., 2) at the angles (s, t) (..., 2) [rad]."""
+        """(du, dv) (..., 2) at the angles `st` = (s, t) (..., 2) [rad]."""
         s, t = st[..., 0], st[..., 1]
         a2 = s * s + t * t
         return np.stack(
@@ -39,7 +39,7 @@ class Decentring:
         )
 
     def gradient(self, st: Array) -> Array:
-        """d (du, dv) / d (s, t) (..., 2, 2), symmetric."""
+        """d (du, dv) / d (s, t) (..., 2, 2), symmetric, at the angles `st` (..., 2) [rad]."""
         s, t = st[..., 0], st[..., 1]
         across = 2 * (self.p1 * s + self.p2 * t)
         return np.stack(
@@ -51,7 +51,7 @@ class Decentring:
         )
 
     def remove(self, uv: Array, angle_rad: Callable[[Array], Array]) -> Array:
-        """Points (u, v) (..., 2) without the shift, from points with it [focal lengths], by fixed-point steps.
+        """Points (u, v) (..., 2) without the shift, from points `uv` with it [focal lengths], by fixed-point steps.
 
         `angle_rad` inverts the radial law.
         """

@@ -104,7 +104,7 @@ def camera_keys() -> Table:
 
 
 def load_camera(name_or_path: str | Path) -> Camera:
-    """The camera of a file (a path if it ends in .toml or contains a separator) or of a shipped name.
+    """The camera of a file; `name_or_path` is a path if it ends in .toml or contains a separator, else a shipped name.
 
     Raises BadInput: no_calibration if there is no such file, bad_calibration if it cannot be used.
     """
@@ -117,7 +117,7 @@ def load_camera(name_or_path: str | Path) -> Camera:
 
 
 def save_camera(camera: Camera, path: str | Path) -> None:
-    """Write the camera file; `load_camera` gives the same camera back. Raises BadInput if it cannot be written."""
+    """Write the camera to the file `path`; `load_camera` gives it back. Raises BadInput if it cannot be written."""
     write_atomically(path, camera_text(camera).encode("utf-8"), overwrite=True)
 
 
@@ -129,7 +129,10 @@ def camera_text(camera: Camera) -> str:
 
 
 def camera_from_dict(d: dict[str, Any], default_name: str = "camera") -> Camera:
-    """The camera of a camera file's keys. Raises BadInput bad_calibration with a line that names the wrong key."""
+    """The camera of the keys `d` of a camera file, called `default_name` if they have no name.
+
+    Raises BadInput bad_calibration with a line that names the wrong key.
+    """
     try:
         return _camera(camera_keys().check(d, ""), default_name)
     except ValueError as cause:

@@ -30,7 +30,7 @@ class KannalaBrandt(Lens):
     k: tuple[float, ...] = ()
 
     def rho(self, angle_rad: Array) -> Array:
-        """Radius [focal lengths] at the angles off the axis [rad], any shape."""
+        """Radius [focal lengths] at the angles `angle_rad` off the axis, any shape."""
         a2 = np.square(angle_rad)
         polynomial = np.zeros_like(a2)
         for k in reversed(self.k):
@@ -38,7 +38,7 @@ class KannalaBrandt(Lens):
         return angle_rad * (1.0 + polynomial)
 
     def slope(self, angle_rad: Array) -> Array:
-        """d rho / d angle [1/rad]."""
+        """d rho / d angle [1/rad] at the angles `angle_rad` off the axis, any shape."""
         a2 = np.square(angle_rad)
         polynomial = np.zeros_like(a2)
         for n in range(len(self.k), 0, -1):
@@ -46,7 +46,7 @@ class KannalaBrandt(Lens):
         return 1.0 + polynomial
 
     def derivative(self, name: str, angle_rad: Array) -> Array:
-        """d rho / d k_n = a^(2 n + 1), also for coefficients that are not in use."""
+        """d rho / d k_n = a^(2 n + 1), a = `angle_rad`, for the `name` "kn", also of coefficients not in use."""
         power = angle_rad
         for _ in range(self.parameter_names.index(name) + 1):
             power = power * np.square(angle_rad)
@@ -67,7 +67,7 @@ class KannalaBrandt(Lens):
         return KannalaBrandt(tuple(k.tolist()))
 
     def angle_rad(self, rho: Array) -> Array:
-        """Angle off the axis [rad] at the radii [focal lengths], any shape."""
+        """Angle off the axis [rad] at the radii `rho` [focal lengths], any shape."""
         if not any(self.k):
             return np.minimum(np.asarray(rho, dtype=np.float64), self.max_invertible_rad)
         return super().angle_rad(rho)
@@ -79,7 +79,7 @@ class KannalaBrandt(Lens):
 
     @classmethod
     def from_file(cls, values: Mapping[str, Any]) -> Self:
-        """The lens of a camera file; without `k` the equidistant one."""
+        """The lens of a camera file's checked `values`; without `k` the equidistant one."""
         return cls(values.get("k", ()))
 
     def file_values(self) -> dict[str, Any]:
@@ -103,7 +103,7 @@ class KannalaBrandt(Lens):
         return f"{cls.label} with {size} k"
 
     def wcs_projection(self, max_angle_rad: float) -> WcsProjection:
-        """Zenithal polynomial, or zenithal equidistant without coefficients: exact."""
+        """Zenithal polynomial, or zenithal equidistant without coefficients: exact at any `max_angle_rad`."""
         if not any(self.k):
             return WcsProjection("ARC")
         cards = {f"PV2_{2 * n + 3}": float(k) for n, k in enumerate(self.k)}

@@ -46,14 +46,14 @@ class Lens(ABC):
 
     @abstractmethod
     def rho(self, angle_rad: Array) -> Array:
-        """Radius [focal lengths] at the angles off the axis [rad], any shape."""
+        """Radius [focal lengths] at the angles `angle_rad` off the axis, any shape."""
 
     @abstractmethod
     def slope(self, angle_rad: Array) -> Array:
-        """d rho / d angle [1/rad] at the angles off the axis [rad], any shape."""
+        """d rho / d angle [1/rad] at the angles `angle_rad` off the axis, any shape."""
 
     def derivative(self, name: str, angle_rad: Array) -> Array:
-        """d rho / d parameter [1 per 1] at the angles off the axis [rad], any shape."""
+        """d rho / d parameter `name` [1 per 1] at the angles `angle_rad` off the axis, any shape."""
         raise ValueError(f"the {self.model} lens has no parameter {name}")
 
     @property
@@ -74,7 +74,7 @@ class Lens(ABC):
         return float(a[max(falling[0] - 1, 0)]) if len(falling) else float(np.pi)
 
     def angle_rad(self, rho: Array) -> Array:
-        """Angle off the axis [rad] at the radii [focal lengths], any shape.
+        """Angle off the axis [rad] at the radii `rho` [focal lengths], any shape.
 
         Inverse of `rho` by safeguarded Newton steps. Radii beyond that of `max_invertible_rad` give this angle.
         """
@@ -107,7 +107,7 @@ class Lens(ABC):
 
     @classmethod
     def from_file(cls, values: Mapping[str, Any]) -> Self:
-        """The lens of a camera file's checked values. Raises ValueError with a line that names the wrong key."""
+        """The lens of a camera file's checked `values`. Raises ValueError with a line that names the wrong key."""
         return cls(**{key: values[key] for key in cls.file_keys() if key in values})
 
     def file_values(self) -> dict[str, Any]:

@@ -22,16 +22,16 @@ class Pinhole(Lens):
     max_fit_rad: ClassVar[float] = np.radians(65.0)
 
     def rho(self, angle_rad: Array) -> Array:
-        """Radius [focal lengths] at the angles off the axis [rad], any shape; infinite beyond MAX_ANGLE_RAD."""
+        """Radius [focal lengths] at the angles `angle_rad` off the axis, any shape; infinite beyond MAX_ANGLE_RAD."""
         a = np.asarray(angle_rad, dtype=np.float64)
         return np.where(a <= MAX_ANGLE_RAD, np.tan(np.minimum(a, MAX_ANGLE_RAD)), np.inf)
 
     def slope(self, angle_rad: Array) -> Array:
-        """d rho / d angle [1/rad]."""
+        """d rho / d angle [1/rad] at the angles `angle_rad` off the axis, any shape."""
         return 1.0 / np.square(np.cos(np.minimum(angle_rad, MAX_ANGLE_RAD)))
 
     def angle_rad(self, rho: Array) -> Array:
-        """Angle off the axis [rad] at the radii [focal lengths], any shape."""
+        """Angle off the axis [rad] at the radii `rho` [focal lengths], any shape."""
         return np.arctan(rho)
 
     @property
@@ -40,7 +40,7 @@ class Pinhole(Lens):
         return MAX_ANGLE_RAD
 
     def wcs_projection(self, max_angle_rad: float) -> WcsProjection:
-        """Gnomonic: exact."""
+        """Gnomonic: exact at any `max_angle_rad`."""
         return WcsProjection("TAN")
 
     @property

@@ -17,7 +17,7 @@ GOLDEN_ANGLE_RAD = np.pi * (3.0 - np.sqrt(5.0))
 
 
 def lens_jacobian(camera: Camera, rays_cam: Array, order: tuple[str, ...]) -> Array:
-    """d px / d parameter (..., 2, m) at the rays (..., 3), for the parameters named in `order`.
+    """d px / d parameter (..., 2, m) of a camera at `rays_cam` (..., 3), for the m parameters named in `order`.
 
     Names: as in `parameters.py` [px per px, or px per 1]. Raises ValueError for a name that the lens does not have.
     """
@@ -47,7 +47,7 @@ def lens_jacobian(camera: Camera, rays_cam: Array, order: tuple[str, ...]) -> Ar
 
 
 def cap_grid(angle_rad: float, points: int = GRID_POINTS) -> Array:
-    """Rays (n, 3) spread evenly in solid angle over the cap within `angle_rad` of the axis."""
+    """Rays (`points`, 3) spread evenly in solid angle over the cap within `angle_rad` of the axis."""
     i = np.arange(points) + 0.5
     z = 1.0 - (1.0 - np.cos(angle_rad)) * i / points
     r = np.sqrt(np.maximum(1.0 - z * z, 0.0))
@@ -55,7 +55,7 @@ def cap_grid(angle_rad: float, points: int = GRID_POINTS) -> Array:
 
 
 def compensating_rotation(camera: Camera, order: tuple[str, ...]) -> Array:
-    """Rotation (3, m) of the camera [rad per parameter] that best compensates a change of each parameter.
+    """Rotation (3, m) of the camera [rad per parameter] that best compensates a change of each parameter in `order`.
 
     Least squares over the calibrated cap, evenly in solid angle. An image's attitude is found with the same camera, so
     that this part of a lens error does not reach a prediction.
@@ -67,7 +67,7 @@ def compensating_rotation(camera: Camera, order: tuple[str, ...]) -> Array:
 
 
 def projection_covariance_px2(camera: Camera, rays_cam: Array) -> Array:
-    """Covariance (..., 2, 2) [px^2] of the projected rays (..., 3), best rotation removed; 0 without a covariance."""
+    """Covariance (..., 2, 2) [px^2] of the projected `rays_cam` (..., 3), best rotation removed; 0 if not known."""
     rays_cam = np.asarray(rays_cam, dtype=np.float64)
     if camera.covariance is None:
         return np.zeros((*rays_cam.shape[:-1], 2, 2))

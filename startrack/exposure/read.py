@@ -43,8 +43,8 @@ def read_exposure(
     """The image at `path` (PNG, TIFF, JPEG or FITS by its content, or camera raw by its suffix) with its metadata.
 
     Pixels (H, W) are the counts in the file [ADU], 16 bits kept; pixel (0, 0) is the first of the first row stored,
-    in FITS too; orientation tags are ignored. Keyword arguments replace the values of sidecar and header, which are
-    then not read; `time_utc` is mid-exposure. `warnings` lists what was ignored, and why.
+    in FITS too; orientation tags are ignored. `time_utc` (mid-exposure), `exposure_s`, `camera` and `terrain` replace
+    the values of sidecar and header, which are then not read. `warnings` lists what was ignored, and why.
 
     Raises:
         BadInput: bad_image with file and cause in one line; no_time if a sidecar's time is not UTC.
@@ -72,7 +72,7 @@ def read_exposure(
 
 
 def exposure_of(pixels: NDArray[Any], *, time_utc: datetime | None = None, name: str = "array") -> Exposure:
-    """Counts (H, W) [ADU], or colours (H, W, 3), as an exposure without further metadata.
+    """The counts `pixels` (H, W) [ADU], or colours (H, W, 3), as an exposure with `time_utc` and `name` alone.
 
     `sha256` is that of type, shape and values. Raises BadInput bad_image.
     """

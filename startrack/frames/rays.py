@@ -11,7 +11,10 @@ SPEED_OF_LIGHT_M_S = 299_792_458.0  # exact, SI
 
 
 def rays_from_azel(azimuth_rad: ArrayLike, elevation_rad: ArrayLike) -> Array:
-    """Unit vectors (..., 3) in enu: (sin a cos e, cos a cos e, sin e), azimuth a from north through east."""
+    """Unit vectors (..., 3) in enu: (sin a cos e, cos a cos e, sin e), a = `azimuth_rad`, e = `elevation_rad` (...).
+
+    The azimuth is counted from north through east.
+    """
     a, e = np.broadcast_arrays(np.asarray(azimuth_rad, dtype=float), np.asarray(elevation_rad, dtype=float))
     return np.stack([np.sin(a) * np.cos(e), np.cos(a) * np.cos(e), np.sin(e)], axis=-1)
 
@@ -29,7 +32,7 @@ def azel_from_rays(rays_enu: ArrayLike) -> tuple[Array, Array]:
 
 
 def off_axis_rad(rays: ArrayLike) -> Array:
-    """Angle (...) between the vectors (..., 3) and their frame's z axis [rad], exact at 0 and at pi."""
+    """Angle (...) between the vectors `rays` (..., 3) and their frame's z axis [rad], exact at 0 and at pi."""
     x, y, z = np.moveaxis(np.asarray(rays, dtype=float), -1, 0)
     return np.arctan2(np.hypot(x, y), z)
 
@@ -41,7 +44,7 @@ def angle_between_rad(a: ArrayLike, b: ArrayLike) -> Array:
 
 
 def aberrate(rays_icrs: ArrayLike, velocity_m_s: ArrayLike) -> Array:
-    """Directions (..., 3) seen by an observer moving at `velocity_m_s` (3,), for directions seen at rest.
+    """Directions (..., 3) for an observer with `velocity_m_s` (3,), from the directions `rays_icrs` (..., 3) at rest.
 
     With n at rest, b = v / c and g = (1 - b^2)^(-1/2):  (n / g + (1 + n.b / (1 + 1/g)) b) / (1 + n.b).
     Exact for any speed below light's (Explanatory Supplement to the Astronomical Almanac, 3rd ed. 2013, eq. 7.40).
@@ -63,8 +66,8 @@ def refract_rad(elevation_rad: ArrayLike, pressure_hpa: float = 1010.0, temperat
 
     With lift(h) in arcminutes for the apparent elevation h in degrees, r = cot(h + 7.31 / (h + 4.4)):
     apparent = true + lift(apparent),  lift = r - 0.06 sin(14.7 r + 13), the sine's argument in degrees,
-    scaled to pressure and temperature. Good to 2 arcsec in average air, down to the horizon, where the weather is
-    worth a tenth of the 34 arcmin. Below -1 degree the lift keeps its value there.
+    scaled to `pressure_hpa` and `temperature_c`. Good to 2 arcsec in average air, down to the horizon, where the
+    weather is worth a tenth of the 34 arcmin. Below -1 degree the lift keeps its value there.
 
     Source: Bennett (1982), J. Navigation 35, 255, with his correction; as in Meeus (1998), chapter 16.
     """

@@ -17,7 +17,7 @@ ORTHONORMAL_1 = 1e-6  # largest error of R R^T that still counts as a rotation m
 
 
 def R_from_rotvec(rotvec_rad: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) = exp([w]x) of the rotation vectors w (..., 3) [rad]."""
+    """Rotation matrices (..., 3, 3) = exp([w]x) of the rotation vectors w = `rotvec_rad` (..., 3)."""
     from scipy.spatial.transform import Rotation
 
     w = np.asarray(rotvec_rad, dtype=float)
@@ -38,7 +38,7 @@ def nearest_rotation(profile: Array) -> Array:
 def wahba(rays_to: Array, rays_from: Array, weights: Array | None = None) -> Array:
     """R_to_from (..., 3, 3) that minimises sum w |rays_to - R rays_from|^2 over the rays (..., n, 3).
 
-    Weights (..., n) default to 1. Poorly determined where all rays have nearly the same direction.
+    The `weights` w (..., n) default to 1. Poorly determined where all rays have nearly the same direction.
     """
     weighted = rays_to if weights is None else np.asarray(weights)[..., None] * rays_to
     return nearest_rotation(np.swapaxes(weighted, -1, -2) @ rays_from)
@@ -62,7 +62,7 @@ def quat_xyzw_from_R(R: ArrayLike) -> Array:
 
 
 def R_from_quat_xyzw(quat_xyzw: ArrayLike) -> Array:
-    """Rotation matrix (3, 3) of the quaternion (4,) x, y, z, w, which need not be of unit length.
+    """Rotation matrix (3, 3) of the quaternion `quat_xyzw` (4,), which need not be of unit length.
 
     Raises:
         ValueError: not four finite numbers, or all of them zero.

@@ -51,19 +51,20 @@ def position_fixed_m(site: Site) -> Array:
 
 
 def enu_from_latlon(site: Site, latitude_rad: ArrayLike, longitude_rad: ArrayLike, height_m: ArrayLike = 0.0) -> Array:
-    """Points (..., 3) in the site's enu [m] of places on the site's body, as true 3-D points.
+    """Points (..., 3) in the site's enu [m] of `latitude_rad`, `longitude_rad`, `height_m` (...) on the site's body.
 
-    Heights are above the sphere (Moon) or the ellipsoid (Earth): a far place lies below the horizontal plane.
+    Heights are above the sphere (Moon) or the ellipsoid (Earth). The points are true 3-D points: distant ones lie below
+    the horizontal plane.
     """
     points_m = _fixed_from_latlon(site.body, latitude_rad, longitude_rad, height_m)
     return (points_m - position_fixed_m(site)) @ R_enu_fixed(site).T
 
 
 def latlon_from_enu(site: Site, east_m: ArrayLike, north_m: ArrayLike, up_m: ArrayLike) -> tuple[Array, Array]:
-    """Latitude and longitude, each (...) [rad], of points in the site's enu; longitude in (-pi, pi].
+    """Latitude and longitude, each (...) [rad], of the points `east_m`, `north_m`, `up_m` (...) in the site's enu.
 
-    Inverse of enu_from_latlon: planetocentric on the Moon, geodetic (WGS 84) on the Earth. At a pole the longitude is
-    not defined.
+    Inverse of enu_from_latlon: planetocentric on the Moon, geodetic (WGS 84) on the Earth; longitude in (-pi, pi], not
+    defined at a pole.
     """
     points_enu_m = np.stack(np.broadcast_arrays(*(np.asarray(c, dtype=float) for c in (east_m, north_m, up_m))), -1)
     x, y, z = np.moveaxis(points_enu_m @ R_enu_fixed(site) + position_fixed_m(site), -1, 0)
@@ -89,7 +90,7 @@ def R_enu_icrs(site: Site, time: datetime) -> Array:
 
 
 def observer_velocity_m_s(site: Site, time: datetime) -> Array:
-    """Velocity (3,) of the site relative to the solar system's barycentre, ICRS axes [m/s], for `aberrate`.
+    """Velocity (3,) of the site at `time`, from the solar system's barycentre, ICRS axes [m/s], for `aberrate`.
 
     The body's motion (about 30 km/s) and its spin (Earth 465 m/s, Moon 4.6 m/s at the equator).
 
@@ -99,7 +100,7 @@ def observer_velocity_m_s(site: Site, time: datetime) -> Array:
 
 
 def observer_state(site: Site, time: datetime) -> tuple[Array, Array]:
-    """Position (3,) [m] and velocity (3,) [m/s] of the site from the solar system's barycentre, ICRS axes.
+    """Position (3,) [m] and velocity (3,) [m/s] of the site at `time` from the solar system's barycentre, ICRS axes.
 
     Raises: as R_enu_icrs.
     """

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from startrack.catalog.gaia import has_deep_catalog, hipparcos_rows_in_deep, load_deep_catalog
-from startrack.detection import electrons
+from startrack.detection import electrons, electrons_at
 from startrack.evidence import (
     Skyline,
     SkyStep,
@@ -76,9 +77,9 @@ def sky_step_at(measured: Measured, fix: Fix) -> SkyStep | None:
 
     None where the image does not show that skyline.
     """
-    image, dead = electrons(measured.exposure, measured.camera)
     horizon = Skyline.seen_from(fix.position_enu_m[:2], measured.terrain)
-    return measure_sky_step(image, dead, measured.detections, measured.camera, measured.R_cam_enu, horizon)
+    sample_e = partial(electrons_at, measured.exposure, measured.camera)
+    return measure_sky_step(sample_e, measured.detections, measured.camera, measured.R_cam_enu, horizon)
 
 
 def remeasure_near_skyline(measured: Measured, fix: Fix, step: SkyStep, photometry: StarEvidence) -> Measured:
@@ -88,8 +89,8 @@ def remeasure_near_skyline(measured: Measured, fix: Fix, step: SkyStep, photomet
     """
     camera, terrain, position_m = measured.camera, measured.terrain, fix.position_enu_m[:2]
     horizon = step.horizon
-    image, _ = electrons(measured.exposure, camera)
-    detections = subtract_sky_step(step, image, measured.detections)
+    image, dead = electrons(measured.exposure, camera)
+    detections = subtract_sky_step(image, dead, measured.detections, camera, measured.R_cam_enu, horizon)
     axes = np.linalg.cholesky(fix.covariance_m2).T
     reliable = reliable_azimuths(horizon, [Skyline.seen_from(position_m + axis, terrain) for axis in axes], camera)
     light = measured.light

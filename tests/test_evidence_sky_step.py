@@ -24,9 +24,12 @@ def horizon_at(place):
 
 
 def levelled(image, found, horizon):
-    step = measure_sky_step(image, np.zeros(image.shape, bool), found, CAMERA, R_CAM_ENU, horizon)
+    dead = np.zeros(image.shape, bool)
+    step = measure_sky_step(lambda *at: (image[at], dead[at]), found, CAMERA, R_CAM_ENU, horizon)
     assert step is not None and step.exceeds_noise
-    return subtract_sky_step(step, image, found)
+    assert step.light_e == pytest.approx(STEP_E, abs=max(4 * step.sigma_e, 0.01 * STEP_E))
+    assert 0.05 < step.sigma_e < 0.5
+    return subtract_sky_step(image, dead, found, CAMERA, R_CAM_ENU, horizon)
 
 
 @pytest.fixture(scope="module")

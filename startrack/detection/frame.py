@@ -73,15 +73,23 @@ class Frame:
 
 def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray[np.bool_]]:
     """The exposure in electrons above bias (ADU where the gain is unknown), and the mask of saturated pixels."""
-    pixels = exposure.pixels_adu
+    return _to_electrons(exposure.pixels_adu, exposure, camera)
+
+
+def electrons_at(exposure: Exposure, camera: Camera, rows: Ints, columns: Ints) -> tuple[Image, NDArray[np.bool_]]:
+    """As `electrons`, of the pixels (n,) at some rows and columns (n,) only."""
+    return _to_electrons(exposure.pixels_adu[rows, columns], exposure, camera)
+
+
+def _to_electrons(pixels_adu: Image, exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray[np.bool_]]:
     ceiling = exposure.saturation_adu or np.inf
     if camera is None or camera.sensor is None:
-        return pixels, pixels >= SATURATED_FRACTION * ceiling
+        return pixels_adu, pixels_adu >= SATURATED_FRACTION * ceiling
     sensor = camera.sensor
-    saturated = pixels >= SATURATED_FRACTION * min(ceiling, sensor.saturation_adu)
+    saturated = pixels_adu >= SATURATED_FRACTION * min(ceiling, sensor.saturation_adu)
     if sensor.gain_e_per_adu == 1.0 and sensor.bias_adu == 0.0:
-        return pixels, saturated
-    image = pixels * np.float32(sensor.gain_e_per_adu)
+        return pixels_adu, saturated
+    image = pixels_adu * np.float32(sensor.gain_e_per_adu)
     image -= np.float32(sensor.bias_adu * sensor.gain_e_per_adu)
     return image, saturated
 

@@ -22,6 +22,8 @@ from startrack.types import Array, Bools, Detections, Ints
 
 BAND_PX = 12.0  # both ways; the background model knows no edge sharper than that
 STEP_PX = 0.5
+STEP_SAMPLES = 3600  # azimuths at which the step is measured
+STEP_OFFSETS_PX = np.array([-11.0, -9.5, -8.0, -6.5, 6.5, 8.0, 9.5, 11.0])  # heights above the skyline
 SECTORS = 36
 SKYLINE_POINTS = 1440
 SKYLINE_SAMPLES = 7200  # one in 3 arcmin: half a pixel of a 180-degree fisheye
@@ -34,6 +36,7 @@ SIGNIFICANT_SIGMAS = 5.0  # of a step that is stated as the brightness of the sk
 ARCSEC2_PER_SR = (180 * 3600 / np.pi) ** 2
 
 Horizon = Callable[[Array], Array]  # azimuths (n,) to elevations (n,) [rad]
+Sampler = Callable[[Ints, Ints], tuple[NDArray[np.float32], Bools]]  # rows and columns (n,) to electrons and saturated
 
 
 @dataclass(frozen=True)
@@ -57,17 +60,13 @@ class Skyline:
 
 @dataclass(frozen=True, eq=False)
 class SkyStep:
-    """The pixels beside the skyline, and how much brighter the sky above it is than the ground below."""
+    """How much brighter the sky is than the ground at the skyline, by pixels sampled on both sides."""
 
     horizon: Horizon  # of the position that the step belongs to
-    rows: Ints  # (n,) of the pixels within BAND_PX of the skyline
-    columns: Ints  # (n,)
-    azimuth_rad: Array  # (n,) in enu
-    above_px: Array  # (n,) distance above the skyline, negative below it
     light_e: float  # median pixel of the sky minus that of the ground; 0 where only one of them is in view
     sigma_e: float  # standard deviation of light_e
     noise_e: float  # median noise of one pixel
-    angle_rad: float  # off the camera's axis, of the median pixel
+    angle_rad: float  # off the camera's axis, of the median sample
 
     @property
     def exceeds_noise(self) -> bool:
@@ -89,40 +88,50 @@ class SkyStep:
 
 
 def measure_sky_step(
+    sample_e: Sampler, detections: Detections, camera: Camera, R_cam_enu: Array, horizon: Horizon
+) -> SkyStep | None:
+    """The step of the sky's light at a `horizon` (azimuths to elevations [rad]); None where it is not in view.
+
+    `sample_e` gives the electrons of pixels and whether they are saturated. Pixels are taken above and below the
+    skyline, which `camera` and `R_cam_enu` place in the image; `detections` has the noise of the pixels.
+    """
+    azimuth = np.linspace(0.0, 2 * np.pi, STEP_SAMPLES, endpoint=False)
+    elevation = horizon(azimuth)
+    skyline_cam = rays_from_azel(azimuth, elevation) @ R_cam_enu.T
+    angle = np.arctan2(np.hypot(skyline_cam[:, 0], skyline_cam[:, 1]), skyline_cam[:, 2])
+    shift_rad = np.multiply.outer(STEP_OFFSETS_PX, 1.0 / _px_per_rad(camera, angle))
+    rays_enu = rays_from_azel(azimuth, elevation + shift_rad)
+    xy_px, inside = camera.project(rays_enu @ R_cam_enu.T)
+    columns, rows = np.rint(xy_px[inside]).astype(np.int64).T
+    if not len(rows):
+        return None
+    light, saturated = sample_e(rows, columns)
+    above = (STEP_OFFSETS_PX[:, None] > 0) & inside
+    light_e, sigma_e = _step_e(light[~saturated], above[inside][~saturated])
+    noise_e = float(np.median(detections.noise_e[rows, columns]))
+    return SkyStep(horizon, light_e, sigma_e, noise_e, float(np.median(angle[inside.any(axis=0)])))
+
+
+def subtract_sky_step(
     image_e: NDArray[np.float32],
     dead: Bools,
     detections: Detections,
     camera: Camera,
     R_cam_enu: Array,
     horizon: Horizon,
-) -> SkyStep | None:
-    """The step of the sky's light at a `horizon` (azimuths to elevations [rad]); None where it is not in view.
+) -> Detections:
+    """The `detections` with the step at a `horizon` in their background, and the noise on either side of it.
 
-    `image_e` (H, W) in electrons, `dead` (H, W) marks pixels to leave out, `detections` has the noise of the pixels,
-    `camera` and `R_cam_enu` say where the skyline lies in the image.
+    `image_e` (H, W) in electrons, `dead` (H, W) marks pixels to leave out, `camera` and `R_cam_enu` place the skyline
+    in the image. The step is the median of the pixels at equal distances from the skyline, sector by sector.
     """
-    rows, columns = np.nonzero(_band(detections.background_e.shape, camera, R_cam_enu, horizon) & ~dead)
-    if not len(rows):
-        return None
+    rows, columns = np.divmod(np.flatnonzero(_band(image_e.shape, camera, R_cam_enu, horizon)), image_e.shape[1])
     azimuth, above = _above_px(np.stack([columns, rows], axis=1).astype(float), camera, R_cam_enu, horizon)
-    near = np.abs(above) < BAND_PX
+    near = (np.abs(above) < BAND_PX) & ~dead[rows, columns]
     rows, columns, azimuth, above = rows[near], columns[near], azimuth[near], above[near]
     if not len(rows):
-        return None
-    light_e, sigma_e = _step_e(image_e[rows, columns], above)
-    middle = len(rows) // 2
-    angle = np.partition(camera.angle_rad(np.stack([columns, rows], axis=1).astype(float)), middle)[middle]
-    noise_e = float(np.median(detections.noise_e[rows, columns]))
-    return SkyStep(horizon, rows, columns, azimuth, above, light_e, sigma_e, noise_e, float(angle))
-
-
-def subtract_sky_step(step: SkyStep, image_e: NDArray[np.float32], detections: Detections) -> Detections:
-    """The `detections` with the `step` in their background, and the noise of the pixels on either side of it.
-
-    `image_e` (H, W) is the image in electrons in which the step was measured.
-    """
-    rows, columns, azimuth, above = step.rows, step.columns, step.azimuth_rad, step.above_px
-    rest = (image_e - detections.background_e)[rows, columns].astype(np.float64)
+        return detections
+    rest = (image_e[rows, columns] - detections.background_e[rows, columns]).astype(np.float64)
     spread = detections.noise_e[rows, columns].astype(np.float64)
     steps = int(2 * BAND_PX / STEP_PX)
     cell = (azimuth / (2 * np.pi) * SECTORS).astype(np.int64) % SECTORS * steps + _step_of(above, steps)
@@ -170,40 +179,45 @@ def _band(shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horizon: Hor
     xy, inside = camera.project(rays_from_azel(azimuth, horizon(azimuth)) @ R_cam_enu.T)
     picture = np.zeros(shape, dtype=np.uint8)
     points = np.rint(xy).astype(np.int32)
-    for i in range(len(points)):
-        if inside[i - 1] and inside[i]:
-            cv2.line(picture, points[i - 1].tolist(), points[i].tolist(), 1, int(2 * BAND_PX) + 5)
-    return picture > 0
+    both = np.flatnonzero(inside & np.roll(inside, 1))
+    segments = [np.stack([points[i - 1], points[i]]) for i in both]
+    cv2.polylines(picture, segments, False, 1, int(2 * BAND_PX) + 5)
+    return picture.view(np.bool_)
 
 
 def _above_px(xy_px: Array, camera: Camera, R_cam_enu: Array, horizon: Horizon) -> tuple[Array, Array]:
     """Azimuth [rad] and height above the skyline [px] of pixels (n, 2)."""
     azimuth, elevation = azel_from_rays(camera.unproject(xy_px) @ R_cam_enu)
-    px_per_rad = np.sqrt(camera.focal_px[0] * camera.focal_px[1]) * camera.lens.slope(camera.angle_rad(xy_px))
-    return azimuth, (elevation - horizon(azimuth)) * px_per_rad
+    return azimuth, (elevation - horizon(azimuth)) * _px_per_rad(camera, camera.angle_rad(xy_px))
 
 
-def _step_e(light_e: NDArray[np.float32], above_px: Array) -> tuple[float, float]:
-    """How much brighter the sky is than the ground, well clear of the edge, and the standard deviation of that."""
-    sky, wall = light_e[above_px > BAND_PX / 2], light_e[above_px < -BAND_PX / 2]
-    if not len(sky) or not len(wall):
+def _px_per_rad(camera: Camera, angle_rad: Array) -> Array:
+    """Scale of the image away from its centre at angles off the axis (n,) [rad]."""
+    return np.asarray(np.sqrt(camera.focal_px[0] * camera.focal_px[1]) * camera.lens.slope(angle_rad))
+
+
+def _step_e(light_e: NDArray[np.float32], above: Bools) -> tuple[float, float]:
+    """How much brighter the pixels (n,) `above` the skyline are than the others, and the standard deviation of that."""
+    sides = light_e[above], light_e[~above]
+    if not all(map(len, sides)):
         return 0.0, 0.0
-    level = _median(sky), _median(wall)
-    spread = [
-        float(np.median(np.abs(side - middle))) / MADE_OF_NOISE * MEDIAN_LOSS / np.sqrt(len(side))
-        for side, middle in zip((sky, wall), level, strict=True)
-    ]
-    return level[0] - level[1], float(np.hypot(*spread))
+    (sky, sky_sigma), (ground, ground_sigma) = (_grouped_median(side) for side in sides)
+    return sky - ground, float(np.hypot(sky_sigma, ground_sigma))
 
 
-def _median(values: NDArray[np.float32]) -> float:
-    """The median of counts: within the one that holds it, by how many values lie on either side."""
-    middle = float(np.median(values))
-    below, equal, above = values < middle, values == middle, values > middle
-    if not (below.any() and equal.any() and above.any()):
-        return middle
-    step = (float(values[above].min()) - float(values[below].max())) / 2
-    return middle + step * (np.count_nonzero(above) - np.count_nonzero(below)) / (2 * np.count_nonzero(equal))
+def _grouped_median(light_e: NDArray[np.float32]) -> tuple[float, float]:
+    """Median of pixels (n,) and its standard deviation; whole counts are taken as spread evenly over their step.
+
+    The median hardly feels the stars among the pixels, but plain it would be a whole number of counts.
+    """
+    values, counts = np.unique(light_e, return_counts=True)
+    steps = np.diff(values)
+    quantum = float(steps.min()) if len(steps) else 0.0
+    below = np.cumsum(counts) - counts
+    at = int(np.searchsorted(below, 0.5 * len(light_e), side="right")) - 1
+    median = float(values[at]) + quantum * ((0.5 * len(light_e) - below[at]) / counts[at] - 0.5)
+    sigma = float(np.median(np.abs(light_e - median))) / MADE_OF_NOISE
+    return median, sigma * MEDIAN_LOSS / float(np.sqrt(len(light_e)))
 
 
 def _step_of(above_px: Array, steps: int) -> Ints:

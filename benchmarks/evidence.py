@@ -24,7 +24,7 @@ from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.catalog.gaia import load_deep_catalog
 from startrack.detection import electrons
-from startrack.evidence import StarEvidence, StarLight, flux_scale
+from startrack.evidence import StarEvidence, StarPhotometry, flux_scale
 from startrack.localization import ExactPosterior
 from startrack.pipeline import Settings, locate
 from startrack.rendering import Series, exposure_reaching, render
@@ -146,7 +146,7 @@ def _ablations(result: Measured) -> Iterator[tuple[str, Evidence, ExactPosterior
     yield "without caps", plain.evidence(), replace(full, sector_epsilon=0.0)
 
 
-def _listed(light: StarLight, threshold: float) -> Evidence:
+def _listed(light: StarPhotometry, threshold: float) -> Evidence:
     """What a list says: each star that should pass the threshold either did or did not, and no more."""
     from scipy.stats import norm
 
@@ -164,7 +164,7 @@ def _listed(light: StarLight, threshold: float) -> Evidence:
 
 def _light(
     result: Measured, *, visible: Array | None = None, certain: bool = False, settings: StarEvidence | None = None
-) -> StarLight:
+) -> StarPhotometry:
     """The frame's evidence once more, with a part left out."""
     stars, scale = result.stars, flux_scale(result.detections, result.camera, result.stars, result.identification)
     extra_px = result.attitude_fit.extra_sigma_px

@@ -19,7 +19,7 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.detection import Detector
 from startrack.errors import Reason
-from startrack.evidence import StarEvidence, StarLight
+from startrack.evidence import StarEvidence, StarPhotometry
 from startrack.frames import Site
 from startrack.identification import Identifier
 from startrack.localization import ExactPosterior, Localizer
@@ -127,7 +127,7 @@ class Measured(Oriented):
     terrain: Terrain
     site: Site  # of the terrain
     R_enu_icrs: Array  # (3, 3)
-    light: StarLight
+    light: StarPhotometry
 
     @property
     def R_cam_enu(self) -> Array:

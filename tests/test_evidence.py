@@ -13,8 +13,8 @@ from scipy.special import expit
 from scipy.stats import norm
 from star_painter import cramer_rao, paint
 
-from startrack.evidence import FluxScale, StarEvidence, StarLight, flux_scale
-from startrack.evidence.likelihood_ratio import CAP, shines_ratio
+from startrack.evidence import FluxScale, StarEvidence, StarPhotometry, flux_scale
+from startrack.evidence.likelihood_ratio import CAP, visibility_llr
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure
 from startrack.frames import azel_from_rays
 from startrack.types import Body, Detections, Identification, Stars
@@ -49,7 +49,7 @@ class Measured:
         m = self.light
         hidden = m.variance_e2 + m.neighbour_variance_e2
         shining = hidden + m.own_shot * self.expected + np.square(SCATTER * self.expected)
-        return shines_ratio(m.flux_e, self.expected, np.sqrt(hidden), np.sqrt(shining))
+        return visibility_llr(m.flux_e, self.expected, np.sqrt(hidden), np.sqrt(shining))
 
 
 def measured(
@@ -138,24 +138,24 @@ def test_the_ratio_is_that_of_the_stated_densities() -> None:
     anything = 1 / (2 * expected + 10 * hidden)
     shines = 0.998 * norm.pdf(flux, expected, shining) + 0.002 * norm.pdf(flux, 0, hidden) + 0.001 * anything
     hides = 0.999 * norm.pdf(flux, 0, hidden) + 0.001 * anything
-    got = shines_ratio(*(np.array([v]) for v in (flux, expected, hidden, shining)))
+    got = visibility_llr(*(np.array([v]) for v in (flux, expected, hidden, shining)))
     assert got[0] == pytest.approx(np.log(shines / hides), rel=1e-9)
 
 
 def test_the_ratio_rises_with_the_light_and_is_capped() -> None:
     flux = np.linspace(-100, 400, 501)
-    ratio = shines_ratio(flux, np.full(501, 200.0), np.full(501, 20.0), np.full(501, 30.0))
+    ratio = visibility_llr(flux, np.full(501, 200.0), np.full(501, 20.0), np.full(501, 30.0))
     assert np.all(np.diff(ratio[(flux >= 20) & (flux <= 200)]) > 0)
     assert np.abs(ratio).max() <= CAP
     assert ratio[flux == 200][0] > 6
     assert ratio[flux == 0][0] == pytest.approx(np.log(2e-3), abs=0.5)  # a star may be missing for other reasons
     # A flash a hundred times brighter than the star, or a hole much darker than the wall, is no witness of either.
-    odd = shines_ratio(np.array([2e4, -500.0]), np.full(2, 200.0), np.full(2, 20.0), np.full(2, 30.0))
+    odd = visibility_llr(np.array([2e4, -500.0]), np.full(2, 200.0), np.full(2, 20.0), np.full(2, 30.0))
     assert np.all(np.abs(odd) < 1.0)
 
 
 def test_a_star_too_faint_to_tell_says_nothing() -> None:
-    ratio = shines_ratio(np.array([-30.0, 0.0, 30.0]), np.full(3, 0.01), np.full(3, 20.0), np.full(3, 20.0))
+    ratio = visibility_llr(np.array([-30.0, 0.0, 30.0]), np.full(3, 0.01), np.full(3, 20.0), np.full(3, 20.0))
     assert np.abs(ratio).max() < 0.01
 
 
@@ -225,7 +225,7 @@ def frame(stars: Stars, shines: np.ndarray, rng: np.random.Generator) -> tuple[n
 
 def seen(
     stars: Stars, shines: np.ndarray, rng: np.random.Generator, dead: np.ndarray | None = None, **how: Any
-) -> StarLight:
+) -> StarPhotometry:
     image, detections = frame(stars, shines, rng)
     dead = np.zeros(image.shape, bool) if dead is None else dead
     settings: dict[str, Any] = {"bodies": [], "place_sigma_px": 0.05} | how

@@ -9,14 +9,14 @@ from startrack.evidence.sky_step import (
     reliable_azimuths,
     subtract_sky_step,
 )  # fmt: skip
-from startrack.evidence.star_evidence import StarEvidence, StarLight
+from startrack.evidence.star_evidence import StarEvidence, StarPhotometry
 
 __all__ = [
     "FluxScale",
     "SkyStep",
     "Skyline",
     "StarEvidence",
-    "StarLight",
+    "StarPhotometry",
     "flux_scale",
     "measure_sky_step",
     "near_skyline",

@@ -11,7 +11,7 @@ STRANGE_WHEN_HIDDEN = 1e-3  # light where the wall is: track, reflection, defect
 CAP = 9.0  # nothing that one star says is worth more
 
 
-def shines_ratio(
+def visibility_llr(
     flux_e: Array, expected_e: Array, sigma_hidden_e: Array, sigma_shining_e: Array, cap: float = CAP
 ) -> Array:
     """ln p(flux | shines) - ln p(flux | hidden) (n,), capped.
@@ -29,7 +29,7 @@ def shines_ratio(
     return np.clip(shines - hidden, -cap, cap)
 
 
-def gaussian_ratio(flux_e: Array, expected_e: Array, sigma_hidden_e: Array, sigma_shining_e: Array) -> Array:
+def gaussian_llr(flux_e: Array, expected_e: Array, sigma_hidden_e: Array, sigma_shining_e: Array) -> Array:
     """The same without any cap, as if nothing strange ever happened: to compare with, not to rely on."""
     return _log_normal(flux_e - expected_e, sigma_shining_e) - _log_normal(flux_e, sigma_hidden_e)
 

@@ -46,7 +46,7 @@ class Skyline:
     elevation_rad: Array
 
     @classmethod
-    def seen_from(cls, place_m: Array, terrain: Terrain) -> Skyline:
+    def trace(cls, place_m: Array, terrain: Terrain) -> Skyline:
         """The horizon of the place (2,) [m]: asked once, since real ground takes its time to answer."""
         azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_SAMPLES, endpoint=False)
         return cls(terrain.horizon_rad(np.asarray(place_m)[None, :], azimuth))
@@ -180,8 +180,7 @@ def _band(shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horizon: Hor
     picture = np.zeros(shape, dtype=np.uint8)
     points = np.rint(xy).astype(np.int32)
     both = np.flatnonzero(inside & np.roll(inside, 1))
-    segments = [np.stack([points[i - 1], points[i]]) for i in both]
-    cv2.polylines(picture, segments, False, 1, int(2 * BAND_PX) + 5)
+    cv2.polylines(picture, list(np.stack([points[both - 1], points[both]], axis=1)), False, 1, int(2 * BAND_PX) + 5)
     return picture.view(np.bool_)
 
 
@@ -226,7 +225,8 @@ def _step_of(above_px: Array, steps: int) -> Ints:
 
 def _medians(values: Array, cell: Ints, cells: int) -> Array:
     """Median (cells,) of the values (n,) in each cell; 0 where there are too few."""
-    order = np.lexsort((values, cell))
+    order = np.argsort(values)
+    order = order[np.argsort(cell[order].astype(np.int16), kind="stable")]
     count = np.bincount(cell, minlength=cells)
     middle = np.cumsum(count) - count + count // 2
     median = values[order][np.minimum(middle, len(values) - 1)]
@@ -240,8 +240,6 @@ def _interpolated(table: Array, azimuth_rad: Array, above_px: Array) -> Array:
     d = np.clip((above_px + BAND_PX) / STEP_PX - 0.5, 0.0, steps - 1.001)
     s0, d0 = np.floor(s).astype(np.int64), np.floor(d).astype(np.int64)
     fs, fd = s - s0, d - d0
-    low, high = table[s0 % sectors], table[(s0 + 1) % sectors]
-    take = np.arange(len(d0))
-    at = [(1 - fd) * rows[take, d0] + fd * rows[take, d0 + 1] for rows in (low, high)]
+    at = [(1 - fd) * table[row, d0] + fd * table[row, d0 + 1] for row in (s0 % sectors, (s0 + 1) % sectors)]
     fade = np.clip((BAND_PX - np.abs(above_px)) / 3.0, 0.0, 1.0)
     return fade * ((1 - fs) * at[0] + fs * at[1])

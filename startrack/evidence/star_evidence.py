@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from startrack.camera import Camera
 from startrack.evidence.flux_scale import FluxScale
-from startrack.evidence.likelihood_ratio import gaussian_ratio, shines_ratio
+from startrack.evidence.likelihood_ratio import gaussian_llr, visibility_llr
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure
 from startrack.frames import angle_between_rad, azel_from_rays
 from startrack.psf import noise_area_px
@@ -28,7 +28,7 @@ SEEN_LLR = 3.0  # from here on a star counts as seen, from minus this as hidden
 
 
 @dataclass(frozen=True, kw_only=True)
-class StarLight:
+class StarPhotometry:
     """What was expected and measured at each catalogue star in the frame (n); the star table's rows."""
 
     star: Ints  # index into Stars
@@ -45,7 +45,7 @@ class StarLight:
     def usable(self) -> Bools:
         return np.asarray(self.cause == "")
 
-    def renewed(self, newer: StarLight, which: Ints) -> StarLight:
+    def replace_stars(self, newer: StarPhotometry, which: Ints) -> StarPhotometry:
         """With what a newer measurement says of the stars `which`, of those that both have."""
         there = np.flatnonzero(np.isin(newer.star, which))
         here = np.searchsorted(self.star, newer.star[there])
@@ -88,7 +88,7 @@ class StarEvidence:
         scale: FluxScale,
         place_sigma_px: float,
         visible: Array | None = None,
-    ) -> StarLight:
+    ) -> StarPhotometry:
         """Light at every star in view.
 
         `image_e` in electrons, background included; `visible` (len(stars),) is the probability that each star shines
@@ -124,7 +124,7 @@ class StarEvidence:
         llr, sigma = _ratios(light, expected[measurable], fraction[measurable], self.capped)
         azimuth, elevation = azel_from_rays(rays_icrs @ R_enu_icrs.T)
         cause[measurable[~light.usable & (cause[measurable] == USABLE)]] = BAD_PIXELS
-        return StarLight(
+        return StarPhotometry(
             star=star,
             xy_px=xy,
             azimuth_rad=azimuth,
@@ -189,7 +189,7 @@ def _ratios(light: Photometry, expected_e: Array, fraction: Array, capped: bool 
     hidden = light.variance_e2 + light.neighbour_variance_e2
     shining = hidden + light.own_shot * expected_e + np.square(fraction * expected_e)
     sigma = np.sqrt(hidden)
-    ratio = shines_ratio if capped else gaussian_ratio
+    ratio = visibility_llr if capped else gaussian_llr
     return ratio(light.flux_e, expected_e, sigma, np.sqrt(shining)), sigma
 
 

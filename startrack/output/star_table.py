@@ -15,7 +15,7 @@ from startrack.stages import Identified, Inputs, Measured, Oriented
 from startrack.types import Array, Ints, Stars
 
 if TYPE_CHECKING:
-    from startrack.evidence import StarLight
+    from startrack.evidence import StarPhotometry
 
 STATUSES = ("seen", "hidden", "uncertain", "unusable")
 FAINTER_THAN_FAINTEST_MATCH_MAG = 0.5
@@ -39,7 +39,7 @@ def star_table_text(value: Inputs) -> str:
     ])  # fmt: skip
 
 
-def status_of(light: StarLight) -> NDArray[np.str_]:
+def status_of(light: StarPhotometry) -> NDArray[np.str_]:
     """What the light (n,) says of each star: seen, hidden, uncertain, or unusable where it could not be measured."""
     kinds = np.select([light.cause != "", light.llr >= SEEN_LLR, light.llr <= -SEEN_LLR], [3, 0, 1], 2)
     return np.array(STATUSES)[kinds]
@@ -75,7 +75,7 @@ def _catalog_columns(stars: Stars, star: Ints) -> list[Column]:
     ]
 
 
-def _direction_columns(light: StarLight) -> list[Column]:
+def _direction_columns(light: StarPhotometry) -> list[Column]:
     return [
         Column("azimuth_deg", np.degrees(light.azimuth_rad), "float64", "deg", "%.5f", "north through east, in enu"),
         Column("elevation_deg", np.degrees(light.elevation_rad), "float64", "deg", "%.5f", "in enu"),
@@ -104,7 +104,7 @@ def _measured(value: Identified, star: Ints) -> tuple[list[str], list[str]]:
     return formatted("%.3f", x), formatted("%.3f", y)
 
 
-def _light_columns(light: StarLight, unit: str) -> Sequence[Column]:
+def _light_columns(light: StarPhotometry, unit: str) -> Sequence[Column]:
     usable = light.usable.tolist()
 
     def measured(form: str, values: Array) -> list[str]:

@@ -333,7 +333,7 @@ def test_usage(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(cli, "find_spec", lambda name: None)
     assert code("fig3.4") == 2
     message = capsys.readouterr().err
-    assert "startrack[plots]" in message and "--no-plots" in message
+    assert "'.[plots]'" in message and "--no-plots" in message
     assert list(tmp_path.iterdir()) == []
 
 

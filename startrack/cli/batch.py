@@ -68,7 +68,7 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """0 when every image is solved, 5 when some are not or the run was stopped, 1 after an internal error."""
     if args.cluster is not None and find_spec("distributed") is None:
-        args.usage_error("a cluster is reached with distributed: pip install 'startrack[cluster]'")
+        args.usage_error("a cluster is reached with distributed: pip install '.[cluster]' in a clone of startrack")
     from startrack.batch import images_under, named_images, only_writer
 
     facts = _facts(args)

@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
 def _need(args: argparse.Namespace, module: str, extra: str, what: str, *, unless: bool) -> None:
     if not unless and find_spec(module) is None:
         hint = "" if extra != "plots" else ", or leave them out with --no-plots"
-        args.usage_error(f"{what} with {module}: pip install 'startrack[{extra}]'{hint}")
+        args.usage_error(f"{what} with {module}: pip install '.[{extra}]' in a clone of startrack{hint}")
 
 
 def _print_artefact(args: argparse.Namespace, artefact: Artefact, size: str, files: list[Path], seconds: float) -> None:

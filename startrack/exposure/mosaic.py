@@ -35,7 +35,7 @@ def decode_camera_raw(raw: bytes) -> Decoded:
     are no 2 x 2 mosaic, or if rawpy (extra `raw`) is not installed.
     """
     if find_spec("rawpy") is None:
-        raise bad_image("is a camera raw file, which needs rawpy: pip install 'startrack[raw]'")
+        raise bad_image("is a camera raw file, which needs rawpy: pip install '.[raw]' in a clone of startrack")
     import rawpy
 
     with rawpy.imread(BytesIO(raw)) as file:

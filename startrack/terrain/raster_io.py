@@ -183,7 +183,8 @@ def _proj_of_keys(keys: Mapping[str, Any]) -> dict[str, Any] | None:
 def _by_rasterio(path: Path, near: tuple[float, float] | None) -> Found:
     if find_spec("rasterio") is None or find_spec("pyproj") is None:
         raise BadInput(
-            "bad_terrain", f"{path}: such a map is read with rasterio and pyproj: pip install 'startrack[dem]'"
+            "bad_terrain",
+            f"{path}: such a map needs rasterio and pyproj: pip install '.[dem]' in a clone of startrack",
         )
     import pyproj
     import rasterio

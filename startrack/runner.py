@@ -147,12 +147,12 @@ class Runner(Generic[Task, Result]):
                 if self._stopping:
                     for future in [one for one in waiting if one.cancel()]:
                         del waiting[future]
-                failed = not finished or any(map(_is_broken, finished & waiting.keys()))
-                if failed:  # the executor then ends all other futures too, and some of them with a result
+                broken = any(map(_is_broken, finished & waiting.keys()))
+                if broken:  # the executor then ends all other futures too, some of them with a result
                     finished, _ = wait(waiting, timeout=CLOSE_S)
                 for future in [one for one in waiting if one in finished and not _is_broken(one)]:
                     yield waiting.pop(future), future.result()
-                if failed:
+                if broken or not finished:
                     pool.close(kill=True)
                     return list(waiting.values())
         except (KeyboardInterrupt, GeneratorExit):  # files are complete or absent, so that nothing is damaged

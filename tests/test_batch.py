@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 from astropy.table import QTable
 
-from startrack.batch import Task, images_under, locate_image, named_images
+from startrack.batch import Task, images_under, listed_images, locate_image
 from startrack.camera import load_camera
 from startrack.camera.io import save_camera
 from startrack.catalog import load_catalog
@@ -97,16 +97,16 @@ def test_equal_stems_keep_their_suffix(tmp_path):
 
 
 def test_named_images_must_lie_in_the_folder(night, monkeypatch):
-    named = named_images(night / "images", ["späti/b.png\n", str(night / "images" / "a 1.png") + "\n", "\n"])
+    named = listed_images(night / "images", ["späti/b.png\n", str(night / "images" / "a 1.png") + "\n", "\n"])
     assert [image.name for image in named] == ["a 1.png", "späti/b.png"]
     monkeypatch.chdir(night)  # as find and ls name them
-    assert named_images("images", ["images/späti/b.png\n", "./images/a 1.png\n"]) == named_images(
+    assert listed_images("images", ["images/späti/b.png\n", "./images/a 1.png\n"]) == listed_images(
         "images", ["späti/b.png", "a 1.png"]
     )
     with pytest.raises(BadInput, match="no file names came on standard input"):
-        named_images("images", ["\n"])
+        listed_images("images", ["\n"])
     with pytest.raises(BadInput, match="not an image under"):
-        named_images(night / "images", ["../small.toml"])
+        listed_images(night / "images", ["../small.toml"])
 
 
 def test_the_tables_say_what_the_results_say(night, done):

@@ -10,7 +10,7 @@ from astropy.table import Table
 from batch_helpers import frames, listed, task_of
 
 from startrack.batch import images_under, locate_image
-from startrack.batch.find import output_stems
+from startrack.batch.find import result_stems
 from startrack.cli.main import main
 from startrack.exposure import read_exposure
 
@@ -29,7 +29,7 @@ def names(folder, *apart) -> list[str]:
     ],
 )
 def test_no_two_results_have_one_name(images, stems):
-    assert output_stems(images) == stems
+    assert result_stems(images) == stems
 
 
 def test_links_to_folders_are_followed_once_and_without_loops(tmp_path):

@@ -47,6 +47,14 @@ def test_a_cluster_is_an_address_and_has_its_own_processes(tmp_path, capsys, fla
     assert words in capsys.readouterr().err
 
 
+@pytest.fixture(scope="module")
+def many(tmp_path_factory) -> Path:
+    """A folder with more frames than a batch does before it is stopped."""
+    folder = tmp_path_factory.mktemp("many")
+    frames(folder, 400)
+    return folder
+
+
 @pytest.mark.parametrize(
     ("wishes", "to_the_group", "why"),
     [
@@ -56,11 +64,10 @@ def test_a_cluster_is_an_address_and_has_its_own_processes(tmp_path, capsys, fla
     ],
 )
 def test_a_signal_ends_the_batch_after_the_frames_in_hand_with_tables_of_what_is_done(
-    tmp_path, wishes, to_the_group, why
+    many, tmp_path, wishes, to_the_group, why
 ):
-    frames(tmp_path / "images", 400)
     out = tmp_path / "out"
-    process = begun(tmp_path / "images", "-D", str(out), "-j", "2", "-O", "-v", "--no-plots")
+    process = begun(many, "-D", str(out), "-j", "2", "-O", "-v", "--no-plots")
     assert process.stdout is not None
     for _ in range(5):
         process.stdout.readline()
@@ -95,9 +102,8 @@ def test_a_later_signal_drops_the_images_in_hand_and_writes_the_tables(tmp_path,
     assert len(list(out.glob("*.fix.json"))) < 40
 
 
-def test_a_reader_that_goes_ends_the_batch_early(tmp_path):
-    frames(tmp_path / "images", 400)
-    process = begun(tmp_path / "images", "-D", str(tmp_path / "out"), "-j", "1", "--json", "--no-plots")
+def test_a_reader_that_goes_ends_the_batch_early(many, tmp_path):
+    process = begun(many, "-D", str(tmp_path / "out"), "-j", "1", "--json", "--no-plots")
     assert process.stdout is not None and process.stderr is not None
     assert json.loads(process.stdout.readline())["image"] == "00.png"
     process.stdout.close()
@@ -107,8 +113,8 @@ def test_a_reader_that_goes_ends_the_batch_early(tmp_path):
     assert "Traceback" not in err
 
 
-def test_a_reader_that_goes_ends_the_image_commands_early_too(tmp_path):
-    images = [str(path) for path in frames(tmp_path, 300)]
+def test_a_reader_that_goes_ends_the_image_commands_early_too(many, tmp_path):
+    images = sorted(str(path) for path in many.glob("*.png"))[:300]
     command = [sys.executable, "-m", "startrack.cli.main", "detect", *images, "-D", str(tmp_path / "out"), "--no-plots"]
     process = subprocess.Popen([*command, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None and process.stderr is not None

@@ -10,7 +10,7 @@ import pytest
 from astropy.table import Table
 from batch_helpers import frames, listed
 
-from startrack.batch import stored
+from startrack.batch import stored_record
 from startrack.cli.main import main
 
 ROOT = Path(__file__).parent.parent
@@ -26,7 +26,7 @@ def batch_done(tmp_path_factory) -> Path:
     shutil.copy(ROOT / "sample_images" / "near-centre.png", images[0])
     images[0].with_suffix(".json").write_text(json.dumps({"camera": "../camera.toml"}))
     assert batch(root) == 5
-    assert stored(root / "out" / "00.fix.json")["status"] == "ok"
+    assert stored_record(root / "out" / "00.fix.json")["status"] == "ok"
     return root
 
 
@@ -100,7 +100,7 @@ def test_a_refusal_for_want_of_stars_replaces_a_solution(folder):
     shutil.copy(folder / "images" / "01.png", folder / "images" / SOLVED)
     shutil.copy(folder / "images" / "01.json", folder / "images" / "00.json")
     assert batch(folder) == 5
-    assert stored(folder / "out" / "00.fix.json")["reason"] == "no_stars"
+    assert stored_record(folder / "out" / "00.fix.json")["reason"] == "no_stars"
     assert [name for name in files(folder) if name.endswith(("ecsv", "wcs", "corr"))] == []
 
 
@@ -108,7 +108,7 @@ def test_a_refusal_for_want_of_stars_replaces_a_solution(folder):
 def test_a_solution_without_one_of_its_files_is_not_whole(folder, companion):
     from startrack.batch.store import has_companions
 
-    record, result = stored(folder / "out" / "00.fix.json"), folder / "out" / "00.fix.json"
+    record, result = stored_record(folder / "out" / "00.fix.json"), folder / "out" / "00.fix.json"
     assert has_companions(record, result, plots=True)
     (folder / "out" / companion).unlink()
     assert not has_companions(record, result, plots=True)
@@ -145,12 +145,12 @@ def test_a_run_of_some_images_gives_the_tables_of_all(folder, monkeypatch):
 def test_what_is_no_whole_record_is_none(folder, monkeypatch, text):
     result = folder / "out" / "01.fix.json"
     result.write_text(text)
-    assert stored(result) is None
+    assert stored_record(result) is None
     monkeypatch.setattr("sys.stdin", listed("02.png"))
     assert batch(folder, "--files-on-stdin") == 5
     assert list(table(folder)) == [SOLVED, "02.png"]
     assert batch(folder) == 5
-    assert stored(result)["reason"] == "no_stars"
+    assert stored_record(result)["reason"] == "no_stars"
 
 
 def test_warnings_are_counted_and_told_when_asked_for(folder, capsys):

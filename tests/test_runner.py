@@ -71,7 +71,7 @@ def test_few_tasks_are_repeated_after_a_death():
 
 def test_a_stopped_process_does_not_hold_the_end():
     start = time.monotonic()
-    done = outcomes(Runner(work, jobs=JOBS, limit_s=3.0), ["0", "1-stopping", "2", "3"])
+    done = outcomes(Runner(work, jobs=JOBS, limit_s=10.0), ["0", "1-stopping", "2", "3"])
     assert [name for name, outcome in done.items() if isinstance(outcome, Died)] == ["1-stopping"]
     assert time.monotonic() - start < 60
 

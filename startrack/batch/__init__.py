@@ -1,16 +1,16 @@
 """Whole folders of images: found, located side by side, taken up again, and gathered into tables."""
 
-from startrack.batch.find import Image, images_under, named_images
-from startrack.batch.rows import Rows, gist, rows_of
+from startrack.batch.find import Image, images_under, listed_images
+from startrack.batch.rows import Rows, table_rows, table_values
 from startrack.batch.store import (
     JOB,
     LOCK,
-    in_the_tables,
-    is_of_other_images,
+    belongs_to_other_images,
     only_writer,
-    printable,
-    result_of,
-    stored,
+    record_path,
+    stored_record,
+    tabled_results,
+    text_of_name,
 )
 from startrack.batch.tables import write_tables
 from startrack.batch.task import ImageDone, Task, locate_image, locate_images
@@ -22,17 +22,17 @@ __all__ = [
     "ImageDone",
     "Rows",
     "Task",
-    "gist",
+    "belongs_to_other_images",
     "images_under",
-    "in_the_tables",
-    "is_of_other_images",
+    "listed_images",
     "locate_image",
     "locate_images",
-    "named_images",
     "only_writer",
-    "printable",
-    "result_of",
-    "rows_of",
-    "stored",
+    "record_path",
+    "stored_record",
+    "table_rows",
+    "table_values",
+    "tabled_results",
+    "text_of_name",
     "write_tables",
 ]

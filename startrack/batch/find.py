@@ -1,4 +1,4 @@
-"""Which files of a tree are images, and what their results are called."""
+"""The images of a folder tree, and the names of their results."""
 
 from __future__ import annotations
 
@@ -25,47 +25,47 @@ class Image:
     path: str
 
 
-def images_under(folder: str | os.PathLike[str], apart_from: str | os.PathLike[str] | None = None) -> list[Image]:
-    """Every image of the tree, in the order of their names.
+def images_under(folder: str | os.PathLike[str], excluded: str | os.PathLike[str] | None = None) -> list[Image]:
+    """Every image of the tree, sorted by name.
 
-    Links to folders outside the tree are followed, each folder once; hidden files and folders, `apart_from`, and what
-    is no regular file are left out. Raises BadInput (bad_image) where there is no such folder.
+    Links to folders outside the tree are followed, each folder once. Hidden files and folders, the folder `excluded`
+    and anything but regular files are left out. Raises BadInput (bad_image) if there is no such folder.
     """
     root = Path(folder)
     if not root.is_dir():
         raise BadInput("bad_image", f"{folder}: no such folder")
-    return _images(root, _names(root, None if apart_from is None else os.path.realpath(apart_from)))
+    return _images(root, _image_names(root, None if excluded is None else os.path.realpath(excluded)))
 
 
-def named_images(
-    folder: str | os.PathLike[str], paths: Iterable[str], apart_from: str | os.PathLike[str] | None = None
+def listed_images(
+    folder: str | os.PathLike[str], paths: Iterable[str], excluded: str | os.PathLike[str] | None = None
 ) -> list[Image]:
-    """The images named, one path each: absolute, or relative to the current folder or to `folder`.
+    """The images at `paths`: absolute, or relative to the current folder or to `folder`.
 
-    One that is not there (any more) is an image too: it will be refused alone. Raises BadInput (bad_image) for what can
-    be no image under `folder`, and where no path came at all.
+    An image that does not exist (any more) is included, and refused when it is read. Raises BadInput (bad_image) for a
+    path that is no image under `folder`, and if there is no path at all.
     """
-    root, known = os.path.abspath(folder), {image.name: image for image in images_under(folder, apart_from)}
+    root, known = os.path.abspath(folder), {image.name: image for image in images_under(folder, excluded)}
     texts = [text for text in (path.strip("\r\n") for path in paths) if text]
     if not texts:
         raise BadInput("bad_image", "no file names came on standard input: give one path a line")
     chosen = set()
     for text in texts:
-        places = (os.path.abspath(text), os.path.abspath(os.path.join(root, text)))
-        names = [os.path.relpath(place, root).replace(os.sep, "/") for place in places]
+        paths_read = (os.path.abspath(text), os.path.abspath(os.path.join(root, text)))
+        names = [os.path.relpath(path, root).replace(os.sep, "/") for path in paths_read]
         name = next((name for name in names if name in known), None)
-        gone = next((one for one in names if name is None and _is_gone(root, one)), None)
-        if gone is not None:
-            known[gone] = Image(gone, _stem_of_gone(gone, known.values()), os.path.join(root, gone))
-        elif name is None:
-            raise BadInput("bad_image", f"{text} is not an image under {folder}")
-        chosen.add(known[name or str(gone)])
-    return sorted(chosen)  # named as in a run over the whole folder
+        if name is None:
+            name = next((name for name in names if _is_missing(root, name)), None)
+            if name is None:
+                raise BadInput("bad_image", f"{text} is not an image under {folder}")
+            known[name] = Image(name, _stem_of_missing(name, known.values()), os.path.join(root, name))
+        chosen.add(known[name])
+    return sorted(chosen)  # with the results' names of a run over the whole folder
 
 
-def output_stems(images: Sequence[str]) -> list[str]:
-    """Names of the results, each given once: the images' stems, with their suffix where stems are equal, and with the
-    first number that makes them another's where that is taken too.
+def result_stems(images: Sequence[str]) -> list[str]:
+    """Unique names of the results: the images' stems, with the suffix where stems are equal, and with the first free
+    number where even that name is taken.
     """
     names = [Path(image).name for image in images]
     stems = [_stem(name) for name in names]
@@ -89,38 +89,38 @@ def _images(root: Path, names: Sequence[str]) -> list[Image]:
     found = [
         Image(name, (PurePosixPath(parent) / stem).as_posix(), str(root / name))
         for parent, group in folders.items()
-        for name, stem in zip(group, output_stems(group), strict=True)
+        for name, stem in zip(group, result_stems(group), strict=True)
     ]
     return sorted(found)
 
 
-def _is_gone(root: str, name: str) -> bool:
-    """Whether it is the name of an image within the folder, which is not there."""
+def _is_missing(root: str, name: str) -> bool:
+    """Whether `name` is that of an image within the folder that does not exist."""
     path = PurePosixPath(name)
     return path.parts[:1] != ("..",) and _is_image(path.name) and not os.path.lexists(os.path.join(root, name))
 
 
-def _stem_of_gone(name: str, others: Iterable[Image]) -> str:
+def _stem_of_missing(name: str, others: Iterable[Image]) -> str:
     stem = (PurePosixPath(name).parent / _stem(PurePosixPath(name).name)).as_posix()
     return name if stem in {image.stem for image in others} else stem
 
 
-def _names(root: Path, without: str | None) -> list[str]:
-    """Images of the tree relative to it. A folder is entered once, and by its own name before any link's."""
+def _image_names(root: Path, excluded: str | None) -> list[str]:
+    """Paths of the tree's images, relative to it. A folder is entered once, by its own name rather than by a link."""
     top = os.path.realpath(root)
     entered, found = {top}, []
 
-    def is_to_be_entered(place: Path) -> bool:
+    def is_entered(place: Path) -> bool:
         real = os.path.realpath(place)
         inside_by_link = place.is_symlink() and Path(real).is_relative_to(top)
-        if place.name.startswith(".") or real == without or real in entered or inside_by_link:
+        if place.name.startswith(".") or real == excluded or real in entered or inside_by_link:
             return False
         entered.add(real)
         return True
 
     for parent, folders, files in os.walk(root, followlinks=True):
         here = Path(parent)
-        folders[:] = [name for name in sorted(folders) if is_to_be_entered(here / name)]
+        folders[:] = [name for name in sorted(folders) if is_entered(here / name)]
         found += [
             (here / name).relative_to(root).as_posix() for name in files if _is_image(name) and _is_file(here, name)
         ]
@@ -128,7 +128,7 @@ def _names(root: Path, without: str | None) -> list[str]:
 
 
 def _is_file(folder: Path, name: str) -> bool:
-    """Not a pipe, which would be waited for. A link to nothing is an image that will be refused."""
+    """Not a pipe, which would block the reader. A link to nothing is an image that will be refused."""
     try:
         return stat.S_ISREG((folder / name).stat().st_mode)
     except OSError:

@@ -1,4 +1,4 @@
-"""What decides an image's result: the contents of all its files, the flags, this version; as hashes, to be compared."""
+"""Hashes of all that decides an image's result: the content of its files, the flags, this version."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from startrack.catalog.gaia import has_deep_catalog
 from startrack.exposure.metadata import RAW_SUFFIXES, sidecar_of
 from startrack.files import is_path
 
-MISSING = "?"  # in place of the hash of a file that cannot be read: there later, it is another input
+MISSING = "?"  # in place of the hash of a file that cannot be read; once it can, the hash differs
 FILES = ("camera", "terrain")  # facts that may be paths
 
 
 def sha256_of(path: str | os.PathLike[str]) -> str:
-    """SHA-256 of a file's content in hex, `MISSING` where it cannot be read: whoever needs it will say so."""
+    """SHA-256 of a file's content in hex; `MISSING` if it cannot be read, which the reader of the file reports."""
     try:
-        if not stat.S_ISREG(os.stat(path).st_mode):  # a pipe would be waited for
+        if not stat.S_ISREG(os.stat(path).st_mode):  # opening a pipe would block
             return MISSING
         with Path(path).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -33,34 +33,35 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
         return MISSING
 
 
-def key_of(image: str, image_sha256: str, facts: dict[str, Any], *others: object) -> str:
-    """SHA-256 of image, sidecar, flags, version and the extras that matter; `hashes_of` has camera and terrain."""
+def job_sha256(image: str, image_sha256: str, facts: dict[str, Any], *others: object) -> str:
+    """SHA-256 of image, sidecar, flags, version and extras; `input_hashes` covers camera and terrain files."""
     path = Path(image)
     sidecar = sidecar_of(path)
-    flags = {key: _from(path, value) if key in FILES and is_path(value) else value for key, value in facts.items()}
+    files = {key: _relative_path(path, facts[key]) for key in FILES if is_path(facts.get(key, ""))}
+    flags = {**facts, **files}
     extras = [has_deep_catalog(), path.suffix.lower() in RAW_SUFFIXES and find_spec("rawpy") is not None]
     whole = [__version__, flags, *others, extras, image_sha256, sidecar and sha256_of(sidecar)]
     return hashlib.sha256(json.dumps(whole, default=str).encode()).hexdigest()
 
 
-def hashes_of(image: str, references: Iterable[str | None]) -> dict[str, str]:
-    """Path to SHA-256 of the camera's and the terrain's file, height maps included; shipped ones belong to the version.
+def input_hashes(image: str, references: Iterable[str | None]) -> dict[str, str]:
+    """Path to SHA-256 of the camera file, the terrain file and its height maps; shipped files belong to the version.
 
-    Paths are as seen from the image's folder, so that a tree may move.
+    Paths are relative to the image's folder, so that a tree may move.
     """
     files = [Path(reference) for reference in references if reference and is_path(reference)]
-    files += [named for file in tuple(files) for named in _maps(file)]
-    return {_from(Path(image), file): _sha256_once(file) for file in files}
+    files += [named for file in tuple(files) for named in _height_maps(file)]
+    return {_relative_path(Path(image), file): _cached_sha256(file) for file in files}
 
 
-def unchanged(image: str, hashes: dict[str, str]) -> bool:
-    """Whether the files of `hashes_of` are what they were."""
+def are_unchanged(image: str, hashes: dict[str, str]) -> bool:
+    """Whether the files of `input_hashes` have the content they had."""
     folder = os.path.realpath(Path(image).parent)
-    return all(_sha256_once(Path(folder, path)) == sha256 for path, sha256 in hashes.items())
+    return all(_cached_sha256(Path(folder, path)) == sha256 for path, sha256 in hashes.items())
 
 
-def untouched_since(image: str | os.PathLike[str], result: str | os.PathLike[str]) -> bool:
-    """Whether the image was neither written nor put in its place after its result; quick, for it reads neither."""
+def is_older_than(image: str | os.PathLike[str], result: str | os.PathLike[str]) -> bool:
+    """Whether the image was neither written nor moved after its result was written; neither file is read."""
     try:
         of_image, of_result = os.stat(image), os.stat(result)
     except (OSError, ValueError):  # a NUL in the name
@@ -68,18 +69,18 @@ def untouched_since(image: str | os.PathLike[str], result: str | os.PathLike[str
     return max(of_image.st_mtime_ns, of_image.st_ctime_ns) < of_result.st_mtime_ns
 
 
-def _maps(terrain: Path) -> list[Path]:
+def _height_maps(terrain: Path) -> list[Path]:
     """The height maps that a terrain file names."""
     try:
         dem = tomllib.loads(terrain.read_text(encoding="utf-8")).get("dem")
-    except (OSError, ValueError):  # no terrain file, or none that can be read: refused where it is loaded
+    except (OSError, ValueError):  # missing or unreadable: refused when it is loaded
         return []
     names = dem.get("file") if isinstance(dem, dict) else None
     return [terrain.parent / str(name) for name in (names if isinstance(names, list) else [names]) if name]
 
 
-def _from(image: Path, file: str | Path) -> str:
-    """A path as seen from the image's folder; real paths, for `..` leads astray where a folder is a link."""
+def _relative_path(image: Path, file: str | Path) -> str:
+    """A path relative to the image's folder. Real paths: `..` of a linked folder is not the folder above the link."""
     real = os.path.realpath(file)
     try:
         return Path(os.path.relpath(real, os.path.realpath(image.parent))).as_posix()
@@ -87,15 +88,15 @@ def _from(image: Path, file: str | Path) -> str:
         return real
 
 
-def _sha256_once(path: Path) -> str:
-    """A height map is read once, not for every image."""
+def _cached_sha256(path: Path) -> str:
+    """As `sha256_of`; a height map is read once, not for every image."""
     try:
         found = path.stat()
     except (OSError, ValueError):
         return MISSING
-    return _sha256_as_of(path, (found.st_ino, found.st_size, found.st_mtime_ns))
+    return _sha256_at_stamp(path, (found.st_ino, found.st_size, found.st_mtime_ns))
 
 
 @lru_cache(maxsize=64)
-def _sha256_as_of(path: Path, stamp: tuple[int, ...]) -> str:
+def _sha256_at_stamp(path: Path, stamp: tuple[int, ...]) -> str:
     return sha256_of(path)

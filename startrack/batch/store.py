@@ -1,8 +1,9 @@
-"""What a folder of results holds already, and of which images it is."""
+"""A folder of results: its lock, the records in it, and the images it belongs to."""
 
 from __future__ import annotations
 
 import json
+import stat
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -14,7 +15,7 @@ from startrack.errors import BadInput
 from startrack.files import Locked, locked
 from startrack.output.write import COMPANIONS
 
-JOB = "job_sha256"  # what a result was made from: content of all its files, flags, version; null: to be done again
+JOB = "job_sha256"  # hash of what a result was made from: content of its files, flags, version; null: do it again
 INPUTS = "inputs"  # camera and terrain files that the result was made with: path from the image to SHA-256
 MANIFEST = "manifest.json"
 LOCK = ".startrack-batch.lock"
@@ -47,79 +48,82 @@ def only_writer(out: Path) -> Iterator[None]:
         yield
 
 
-def stored(result: str | Path) -> dict[str, Any] | None:
-    """A result's record, or None where there is none that can be read, or what is there is no whole one."""
-    record = _object_in(Path(result))
+def stored_record(result: str | Path) -> dict[str, Any] | None:
+    """A result's record; None if there is none, or it cannot be read or is incomplete."""
+    record = _read_object(Path(result))
     return record if record is not None and _is_record(record) else None
 
 
 def is_solved(record: dict[str, Any] | None) -> bool:
-    """Whether a record tells of a place, be it one of several."""
+    """Whether a record has a position, or several that fit."""
     return record is not None and record["status"] in SOLVED
 
 
 def has_companions(record: dict[str, Any], result: Path, *, plots: bool) -> bool:
-    """Whether star table, world coordinates and picture stand beside a solved record; others need none."""
+    """Whether star table, WCS and picture are beside a solved record; other records need none."""
     stem = result.name.removesuffix(".fix.json")
     needed = [suffix for suffix in COMPANIONS if plots or suffix != PICTURE] if is_solved(record) else []
     return all(result.with_name(f"{stem}{suffix}").is_file() for suffix in needed)
 
 
 def image_sha256(record: dict[str, Any]) -> str | None:
-    """Of the image that a batch's record was made from: what `locate` left is no batch's."""
+    """SHA-256 of the image that a batch made the record from; None for records of `locate`."""
     sha256 = record.get("provenance", {}).get("image_sha256") if JOB in record else None
     return sha256 if isinstance(sha256, str) else None
 
 
-def printable(name: str) -> str:
-    """A file's name as text: bytes that are none become question marks."""
+def text_of_name(name: str) -> str:
+    """A file's name as text: undecodable bytes become question marks."""
     return name.encode("utf-8", "replace").decode("utf-8")
 
 
-def result_of(out: Path, image: Image) -> Path:
-    """Where the image's result goes."""
+def record_path(out: Path, image: Image) -> Path:
+    """Path of an image's record."""
     return out / f"{image.stem}.fix.json"
 
 
-def is_of_other_images(out: Path, images: Iterable[Image]) -> bool:
-    """Whether `out` is of a batch of other images: it has results, and not one is of what its image holds now.
+def belongs_to_other_images(out: Path, images: Iterable[Image]) -> bool:
+    """Whether `out` has results, none of which matches the current content of its image.
 
-    Told by content, so that the folder may have moved, grown, or changed in part.
+    Compared by content: the folder may have moved or grown, or some images may have changed.
     """
-    listed = {one["image"]: one.get("image_sha256") for one in _listed(out) or ()}
+    listed = {one["image"]: one.get("image_sha256") for one in _manifest_images(out) or ()}
     some = bool(listed)
     for image in images:
-        record = stored(result_of(out, image))
-        known = listed.get(printable(image.name)) or (record and image_sha256(record))
+        record = stored_record(record_path(out, image))
+        known = listed.get(text_of_name(image.name)) or (record and image_sha256(record))
         if known is not None and known == sha256_of(image.path):
             return False
         some = some or known is not None
     return some
 
 
-def in_the_tables(out: Path) -> set[str] | None:
-    """Paths within `out` of the results that its tables are of; None where there is no manifest."""
-    images = _listed(out)
+def tabled_results(out: Path) -> set[str] | None:
+    """Paths within `out` of the results in its tables; None if there is no manifest."""
+    images = _manifest_images(out)
     return None if images is None else {str(one.get(RESULT)) for one in images}
 
 
-def _listed(out: Path) -> list[dict[str, Any]] | None:
-    images = (_object_in(out / MANIFEST) or {}).get("images")
+def _manifest_images(out: Path) -> list[dict[str, Any]] | None:
+    images = (_read_object(out / MANIFEST) or {}).get("images")
     if not isinstance(images, list):
         return None
     return [one for one in images if isinstance(one, dict) and isinstance(one.get("image"), str)]
 
 
-def _object_in(file: Path) -> dict[str, Any] | None:
+def _read_object(file: Path) -> dict[str, Any] | None:
+    """The JSON object in a file; None if it cannot be read, or is nested too deep."""
     try:
+        if not stat.S_ISREG(file.stat().st_mode):  # reading a pipe would block
+            return None
         found = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None
 
 
 def _is_record(found: dict[str, Any]) -> bool:
-    """Whether a JSON object has what keeping it and its row of the tables need."""
+    """Whether a JSON object has the keys that resuming and the tables need."""
     status, provenance = found.get("status"), found.get("provenance", {})
     named = isinstance(found.get("image"), str) and "reason" in found and isinstance(provenance, dict)
     if not named or status not in (*SOLVED, "refused") or not isinstance(found.get(INPUTS, {}), dict):

@@ -1,4 +1,4 @@
-"""One image of a batch: located wherever a worker is, unless its result is there already."""
+"""One image of a batch: located in any process, unless a valid result is there already."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack import __version__
-from startrack.batch.fingerprint import MISSING, hashes_of, key_of, sha256_of, unchanged, untouched_since
-from startrack.batch.store import INPUTS, JOB, has_companions, image_sha256, is_solved, printable, stored
+from startrack.batch.fingerprint import MISSING, are_unchanged, input_hashes, is_older_than, job_sha256, sha256_of
+from startrack.batch.store import INPUTS, JOB, has_companions, image_sha256, is_solved, stored_record, text_of_name
 from startrack.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
 from startrack.runner import Died, Runner, RunStopped
 
@@ -25,14 +25,14 @@ DISK_ERRORS = {errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.EFBIG, errno.EIO}
 
 @dataclass(frozen=True)
 class Task:
-    """An image and all that decides its result; small, so that it travels to any worker."""
+    """An image and all settings that decide its result; small, so that it is cheap to send to a worker."""
 
     name: str  # of the image, relative to the batch's folder
     path: str
     result: str  # path of NAME.fix.json
     facts: dict[str, Any] = field(default_factory=dict)  # from flags: time_utc, exposure_s, camera, terrain
     plots: bool = True
-    renew: bool = False  # do it again even where the result is there
+    overwrite: bool = False  # locate it again even if a valid result is there
     localizer: str = "posterior"  # of startrack.localization.LOCALIZERS
 
 
@@ -40,88 +40,90 @@ def locate_images(runner: Runner[Task, ImageDone], tasks: Sequence[Task]) -> Gen
     """The outcomes in the order of completion. Raises BadInput (no_cluster), RunStopped."""
     with closing(runner.results(tasks)) as results:
         for task, outcome in results:
-            yield (lost(task, f"internal error: {outcome.cause}"), False) if isinstance(outcome, Died) else outcome
+            if isinstance(outcome, Died):
+                yield write_failure(task, f"internal error: {outcome.cause}"), False
+            else:
+                yield outcome
 
 
 def locate_image(task: Task) -> ImageDone:
-    """The image's record, and whether it was there already. Never raises for an image's sake.
+    """The image's record, and whether it was there already. Bad images and internal errors make records too.
 
-    NAME.fix.json is written last, so that a result that is there is whole. Raises RunStopped where the disk takes
-    no more.
+    NAME.fix.json is written last, so that a record that exists is complete. Raises RunStopped if the disk is full.
     """
     try:
         sha256 = sha256_of(task.path)
         key = _key(task, sha256)
-        before = None if task.renew else _standing(task, key)
-        return (before, True) if before is not None else (_fresh(task, sha256, key), False)
-    except Exception as cause:  # noqa: BLE001 - one image's fault is its own; it is counted and told as such
-        if isinstance(cause, BadInput):  # a refusal is a record: this is of the results, which cannot be written
-            _stop_where_the_disk_is_full(cause)
-            return lost(task, str(cause), cause.reason), False
-        return lost(task, f"internal error: {type(cause).__name__}: {cause}"), False
+        before = None if task.overwrite else _valid_record(task, key)
+        return (before, True) if before is not None else (_locate_and_write(task, sha256, key), False)
+    except Exception as cause:  # noqa: BLE001 - an internal error of one image is counted and recorded; the others go on
+        if isinstance(cause, BadInput):  # not of the image, which would be a record: the results cannot be written
+            _stop_if_disk_is_full(cause)
+            return write_failure(task, str(cause), cause.reason), False
+        return write_failure(task, f"internal error: {type(cause).__name__}: {cause}"), False
 
 
-def still_stored(task: Task) -> dict[str, Any] | None:
-    """The stored record that the next run would keep, else None. An image that is older than its result is not read."""
-    record = stored(task.result)
+def valid_stored_record(task: Task) -> dict[str, Any] | None:
+    """The stored record that the next run would keep, else None. An image older than its record is not read."""
+    record = stored_record(task.result)
     if record is None:
         return None
-    known = image_sha256(record) if untouched_since(task.path, task.result) else None
-    return _standing(task, _key(task, known or sha256_of(task.path)))
+    known = image_sha256(record) if is_older_than(task.path, task.result) else None
+    return _valid_record(task, _key(task, known or sha256_of(task.path)))
 
 
-def lost(task: Task, message: str, reason: str = INTERNAL_ERROR) -> dict[str, Any]:
-    """The record of an image that has no result to keep: without a hash, so that the next run tries it again."""
+def write_failure(task: Task, message: str, reason: str = INTERNAL_ERROR) -> dict[str, Any]:
+    """Write and return the record of an image that failed: without a job hash, so that the next run repeats it."""
     from startrack.output import refused_dict, write_json
 
-    record = {**refused_dict(task.name, reason, message), **_unread(sha256_of(task.path))}
-    record |= {"image": printable(task.name), JOB: None}
-    with suppress(BadInput):  # where it cannot be written, there is nothing to keep either
-        if not is_solved(stored(task.result)):
-            _clear(Path(task.result))
+    record = {**refused_dict(task.name, reason, message), **_unread_provenance(sha256_of(task.path))}
+    record |= {"image": text_of_name(task.name), JOB: None}
+    with suppress(BadInput):  # the record is returned all the same
+        if not is_solved(stored_record(task.result)):
+            _remove_former(Path(task.result))
             write_json(task.result, record)
     return record
 
 
-def _standing(task: Task, key: str) -> dict[str, Any] | None:
-    """The stored record where it is made from all that the image's result is made from now, and is whole."""
-    record = stored(task.result)
-    if record is None or record.get(JOB) != key or not unchanged(task.path, record.get(INPUTS, {})):
+def _valid_record(task: Task, key: str) -> dict[str, Any] | None:
+    """The stored record, if it is complete and everything it was made from is unchanged; else None."""
+    record = stored_record(task.result)
+    if record is None or record.get(JOB) != key or not are_unchanged(task.path, record.get(INPUTS, {})):
         return None
     return record if has_companions(record, Path(task.result), plots=task.plots) else None
 
 
 def _key(task: Task, sha256: str) -> str:
-    return key_of(task.path, sha256, task.facts, task.plots, task.localizer)
+    return job_sha256(task.path, sha256, task.facts, task.plots, task.localizer)
 
 
-def _fresh(task: Task, sha256: str, key: str) -> dict[str, Any]:
-    """The record made anew, and written unless it only says that an input is at fault where a solution stands already.
+def _locate_and_write(task: Task, sha256: str, key: str) -> dict[str, Any]:
+    """Locate the image and write its record and companions, unless an input is at fault and a solution exists already.
 
-    The old files go first, when all is worked out, so that no half of a result is ever taken for a whole.
+    Former files are removed before new ones are written, so that no mixture of both is taken for a result.
     """
     from startrack.output import result_dict, write_json, write_results
 
     result = Path(task.result)
-    found, inputs = _located(task, sha256)
+    found, inputs = _locate(task, sha256)
     reason = found["reason"] if isinstance(found, dict) else found.reason
-    former_stays = reason in BAD_INPUT_REASONS and is_solved(stored(result))
-    if not former_stays:
-        _clear(result)
+    keeps_former = reason in BAD_INPUT_REASONS and is_solved(stored_record(result))
+    if not keeps_former:
+        _remove_former(result)
     if isinstance(found, dict):
         record = found
-    elif former_stays:
+    elif keeps_former:
         record = result_dict(found)
     else:
         record = write_results(found, result, plots=task.plots, write_record=False)
-    record = {**record, "image": printable(task.name), JOB: key, INPUTS: inputs}
-    if not former_stays:
+    record = {**record, "image": text_of_name(task.name), JOB: key, INPUTS: inputs}
+    if not keeps_former:
         write_json(result, record)
     return record
 
 
-def _clear(result: Path) -> None:
-    """Make the folder, remove what an earlier run left. Raises BadInput where that cannot be."""
+def _remove_former(result: Path) -> None:
+    """Make the folder and remove the files of an earlier run. Raises BadInput if that is impossible."""
     from startrack.output import remove_companions
 
     try:
@@ -132,8 +134,8 @@ def _clear(result: Path) -> None:
         raise BadInput("bad_image", f"{result}: cannot be written ({cause.strerror})") from cause
 
 
-def _located(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str, str]]:
-    """A result that has companions, or else the record of a refusal; and the hashes of its other files."""
+def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str, str]]:
+    """A value with companions, or the record of a refusal without; and the hashes of camera and terrain files."""
     from startrack.exposure import read_exposure
     from startrack.localization import LOCALIZERS
     from startrack.output import refused_dict, result_dict
@@ -143,20 +145,21 @@ def _located(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[st
     try:
         exposure = read_exposure(task.path, **task.facts)
     except BadInput as cause:
-        return {**refused_dict(task.name, cause.reason, str(cause)), **_unread(sha256)}, {}
-    inputs = hashes_of(task.path, [exposure.camera, exposure.terrain])  # before they are read: one that changes is seen
+        return {**refused_dict(task.name, cause.reason, str(cause)), **_unread_provenance(sha256)}, {}
+    # Before the files are read, so that a change in between is noticed.
+    inputs = input_hashes(task.path, [exposure.camera, exposure.terrain])
     try:
         return locate_exposure(exposure, Settings(localizer=LOCALIZERS[task.localizer]())), inputs
     except BadInput as cause:
         return result_dict(Refused(reason=cause.reason, message=str(cause), reached=Inputs(exposure=exposure))), inputs
 
 
-def _unread(sha256: str) -> dict[str, Any]:
-    """What is known of an image that could not be decoded, or whose sidecar could not be read: which file it was."""
+def _unread_provenance(sha256: str) -> dict[str, Any]:
+    """The provenance of an image that could not be decoded, or its sidecar not be read: the file's hash."""
     unknown = dict.fromkeys(("camera", "terrain", "catalog", "time_utc", "exposure_s"))
     return {} if sha256 == MISSING else {"provenance": {"version": __version__, "image_sha256": sha256, **unknown}}
 
 
-def _stop_where_the_disk_is_full(cause: BadInput) -> None:
+def _stop_if_disk_is_full(cause: BadInput) -> None:
     if isinstance(cause.__cause__, OSError) and cause.__cause__.errno in DISK_ERRORS:
         raise RunStopped(str(cause)) from cause

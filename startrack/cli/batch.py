@@ -69,13 +69,13 @@ def run(args: argparse.Namespace) -> int:
     """0 when every image is solved, 5 when some are not or the run was stopped, 1 after an internal error."""
     if args.cluster is not None and find_spec("distributed") is None:
         args.usage_error("a cluster is reached with distributed: pip install '.[cluster]' in a clone of startrack")
-    from startrack.batch import images_under, named_images, only_writer
+    from startrack.batch import images_under, listed_images, only_writer
 
     facts = _facts(args)
     localizer_of(args)
     _check_files_of_flags(facts)
     whole = images_under(args.folder, args.dir)
-    found = named_images(args.folder, _names(sys.stdin.buffer.read()), args.dir) if args.files_on_stdin else whole
+    found = listed_images(args.folder, _names(sys.stdin.buffer.read()), args.dir) if args.files_on_stdin else whole
     if not found:
         raise BadInput("bad_image", f"{args.folder}: no PNG, TIFF, FITS, JPEG or camera raw images there")
     if args.time is not None and len(found) > 1:
@@ -135,14 +135,14 @@ def _locate_all(
     runner: Runner[Task, ImageDone], tasks: Sequence[Task], counts: Counts, halt: Halt, args: argparse.Namespace
 ) -> tuple[list[dict[str, Any]], str | None]:
     """What the tables need of each image that was done, and why not all of them were."""
-    from startrack.batch import gist, locate_images
+    from startrack.batch import locate_images, table_values
     from startrack.runner import RunStopped
 
     records: list[dict[str, Any]] = []
     try:
         with outcomes_shown(len(tasks), args, halt) as show, closing(locate_images(runner, tasks)) as outcomes:
             for record, kept in outcomes:
-                records.append(gist(record))
+                records.append(table_values(record))
                 counts["error" if record["reason"] == INTERNAL_ERROR else str(record["status"])] += 1
                 counts["kept"] += kept
                 counts["warned"] += bool(record.get("warnings"))
@@ -155,9 +155,9 @@ def _locate_all(
 
 
 def _check_whose(out: Path, images: Sequence[Image], args: argparse.Namespace) -> None:
-    from startrack.batch import is_of_other_images
+    from startrack.batch import belongs_to_other_images
 
-    if not args.overwrite and is_of_other_images(out, images):
+    if not args.overwrite and belongs_to_other_images(out, images):
         args.usage_error(
             f"{out} holds a batch of other images than {args.folder} has now: choose another -D, or replace its "
             "results and tables with -O"
@@ -187,13 +187,13 @@ def _check_files_of_flags(facts: dict[str, Any]) -> None:
 
 
 def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace) -> list[Task]:
-    from startrack.batch import Task, result_of
+    from startrack.batch import Task, record_path
 
     here = Path(os.path.abspath(out))
     return [
         Task(
-            name=image.name, path=os.path.abspath(image.path), result=str(result_of(here, image)), facts=facts,
-            plots=not args.no_plots, renew=args.overwrite, localizer=args.localizer,
+            name=image.name, path=os.path.abspath(image.path), result=str(record_path(here, image)), facts=facts,
+            plots=not args.no_plots, overwrite=args.overwrite, localizer=args.localizer,
         )
         for image in found
     ]  # fmt: skip
@@ -224,9 +224,9 @@ def _write_tables(
 
     Raises BadInput where they cannot be written.
     """
-    from startrack.batch import rows_of, write_tables
+    from startrack.batch import table_rows, write_tables
 
-    found = rows_of(tasks, {record["image"]: record for record in records}, os.path.abspath(out))
+    found = table_rows(tasks, {record["image"]: record for record in records}, os.path.abspath(out))
     write_tables(out, found.rows, settings)
     for line in omission_lines(found):
         print(f"startrack: {line}", file=sys.stderr)

@@ -103,14 +103,14 @@ def summary(counts: Counts, total: int) -> str:
 def omission_lines(found: Rows) -> list[str]:
     """A line for each kind of result that is in the folder and not in its tables."""
     lines = []
-    if found.former:
+    if found.superseded:
         lines.append(
-            f"{_results(found.former, 'earlier ')} kept, and left out of the tables: the image, or its sidecar, "
+            f"{_results(found.superseded, 'earlier ')} kept, and left out of the tables: the image, or its sidecar, "
             "camera or terrain file, cannot be used now"
         )
-    if found.left_out:
+    if found.omitted:
         lines.append(
-            f"{_results(found.left_out)} of other settings or contents left out of the tables; startrack batch over "
+            f"{_results(found.omitted)} of other settings or contents left out of the tables; startrack batch over "
             "the whole folder renews them"
         )
     return lines

@@ -115,9 +115,9 @@ def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, s
     One image's BadInput, or even an internal error, is its own outcome; it never stops the others.
     """
     codes = [0]
-    from startrack.batch.find import output_stems
+    from startrack.batch.find import result_stems
 
-    for path, stem in zip(args.images, output_stems(args.images), strict=True):
+    for path, stem in zip(args.images, result_stems(args.images), strict=True):
         try:
             outcome = one(path, stem)
         except BadInput as cause:

@@ -64,17 +64,17 @@ def page_of(out: str, *, truth: str | None = None, images: int = DEFAULT_IMAGES,
     found, unread = results_under(out)
     for line in unread:
         print(f"startrack: left out {line}", file=sys.stderr)
-    found = _in_the_tables(out, found)
+    found = _only_tabled(out, found)
     path = Path(output) if output else Path(out) / PAGE
     write_page(path, found, unread=unread, real=_places(found, truth), images=images)
     return path
 
 
-def _in_the_tables(out: str, found: list[Found]) -> list[Found]:
+def _only_tabled(out: str, found: list[Found]) -> list[Found]:
     """Without what a batch made of images that its tables no longer have, and a word about those."""
-    from startrack.batch import JOB, in_the_tables
+    from startrack.batch import JOB, tabled_results
 
-    known = in_the_tables(Path(out))
+    known = tabled_results(Path(out))
     if known is None:
         return found
     left = {one.stem for one in found if JOB in one.record and one.path.relative_to(out).as_posix() not in known}
@@ -93,9 +93,9 @@ def page_of_images(out: str, images: Sequence[str]) -> None:
 
     An image that could not even be read has left no result to show.
     """
-    from startrack.batch.find import output_stems
+    from startrack.batch.find import result_stems
 
-    results = [path for stem in output_stems(images) if (path := Path(out) / f"{stem}.fix.json").is_file()]
+    results = [path for stem in result_stems(images) if (path := Path(out) / f"{stem}.fix.json").is_file()]
     if len(images) == 1 and results:
         page_of(str(results[0]))
     elif results:

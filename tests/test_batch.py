@@ -18,13 +18,16 @@ import pyarrow.parquet as pq
 import pytest
 from astropy.table import QTable
 
-from startrack.batch import Task, images_under, listed_images, locate_image
+from startrack.batch import Task, images_under, listed_images, locate_image, write_tables
 from startrack.camera import load_camera
 from startrack.camera.io import save_camera
 from startrack.catalog import load_catalog
 from startrack.cli.main import main
 from startrack.errors import BadInput
 from startrack.exposure import write_exposure, write_sidecar
+from startrack.localization import LOCALIZERS
+from startrack.localization.pseudo_gradient import PUBLISHED_SIGMA_M
+from startrack.localization.rim_plane import point_fix
 from startrack.rendering import Series, render
 from startrack.terrain import load_terrain
 
@@ -130,6 +133,76 @@ def test_the_trajectory_is_of_poses_in_the_order_of_time(done):
     assert lines.shape == (3, 8)
     assert np.all(np.diff(lines[:, 0]) > 0)
     np.testing.assert_allclose(np.linalg.norm(lines[:, 4:], axis=1), 1.0, atol=1e-8)
+
+
+def records_in(out: Path) -> list[dict]:
+    return [json.loads(path.read_text()) for path in sorted(out.rglob("*.fix.json"))]
+
+
+def test_a_trajectory_holds_poses_above_one_terrain(done, tmp_path):
+    """Coordinates of different terrains have different origins: one file each."""
+    records = records_in(done)
+    write_tables(tmp_path, records, {})
+    assert (tmp_path / "trajectory.tum").read_bytes() == (done / "trajectory.tum").read_bytes()
+    first, *others = [record for record in records if record["status"] == "ok"]
+    first["provenance"]["terrain"] = "/somewhere/other.toml"
+    write_tables(tmp_path, records, {})
+    assert sorted(path.name for path in tmp_path.glob("*.tum")) == [
+        "trajectory-other.tum", "trajectory-shackleton-thesis.tum",
+    ]  # fmt: skip
+    assert len(np.loadtxt(tmp_path / "trajectory-other.tum", ndmin=2)) == 1
+    assert len(np.loadtxt(tmp_path / "trajectory-shackleton-thesis.tum")) == len(others)
+    table = QTable.read(tmp_path / "results.ecsv", format="ascii.ecsv")
+    assert {*table["terrain"][table["status"] == "ok"]} == {"other", "shackleton-thesis"}
+    assert {*table["camera"][table["status"] == "ok"]} == {"small"}
+    for record in (first, others[0]):  # files of one name and different content are different terrains
+        record["provenance"]["terrain"] = f"/{record['image']}/t.toml"
+        record["inputs"] = {"../t.toml": record["image"]}
+    write_tables(tmp_path, records[:-1], {})
+    assert {"trajectory-t.tum", "trajectory-t-2.tum"} <= {path.name for path in tmp_path.glob("*.tum")}
+
+
+def test_parquet_is_written_with_the_extra_only(done, tmp_path, monkeypatch):
+    write_tables(tmp_path, records_in(done), {})
+    assert (tmp_path / "results.parquet").exists()
+    monkeypatch.setattr("startrack.batch.tables.find_spec", lambda name: None)
+    write_tables(tmp_path, records_in(done), {})
+    assert not (tmp_path / "results.parquet").exists()  # the one of the earlier run would be out of date
+    assert (tmp_path / "results.ecsv").exists()
+
+
+class FixedPosition:
+    """A localizer of one's own."""
+
+    explains_evidence = False
+
+    def __call__(self, evidence, terrain):
+        return point_fix(np.array([123.0, 45.0]), 10.0, terrain)
+
+
+def test_a_localizer_is_one_class_and_one_line_in_the_list(night, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(LOCALIZERS, "fixed", FixedPosition)
+    image = night / "images" / "späti" / "b.png"
+    task = Task("b.png", str(image), str(tmp_path / "b.fix.json"), plots=False)
+    record, _ = locate_image(replace(task, localizer="fixed"))
+    assert (record["position"]["east_m"], record["position"]["north_m"]) == (123.0, 45.0)
+    assert locate_image(replace(task, localizer="fixed")) == (record, True)
+    other, kept = locate_image(task)  # by another localizer it is another result
+    assert not kept
+    assert other["position"]["east_m"] != 123.0
+    assert main(["locate", str(image), "--localizer", "fixed", "-D", str(tmp_path), "--json", "--no-plots"]) == 0
+    assert json.loads(capsys.readouterr().out)["position"]["east_m"] == 123.0
+
+
+def test_batch_takes_a_localizer_by_name(night, tmp_path, capsys):
+    command = ["batch", str(night / "images" / "späti"), "-D", str(tmp_path), "-j", "1", "-q", "--no-plots"]
+    assert main([*command, "--localizer", "pseudo-gradient"]) == 0
+    for record in records_in(tmp_path):
+        assert record["position"]["radius95_m"] == pytest.approx(2.448 * PUBLISHED_SIGMA_M)
+    assert json.loads((tmp_path / "manifest.json").read_text())["settings"]["localizer"] == "pseudo-gradient"
+    with pytest.raises(SystemExit, match="2"):
+        main([*command, "--localizer", "nobody"])
+    assert "known are posterior, pseudo-gradient, hull" in capsys.readouterr().err
 
 
 def test_several_processes_and_a_second_run_give_the_same_bytes(night, done, capsys):

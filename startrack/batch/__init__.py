@@ -1,7 +1,6 @@
 """Whole folders of images: found, located side by side, taken up again, and gathered into tables."""
 
 from startrack.batch.find import Image, images_under, listed_images
-from startrack.batch.rows import Rows, table_rows, table_values
 from startrack.batch.store import (
     JOB,
     LOCK,
@@ -12,7 +11,7 @@ from startrack.batch.store import (
     tabled_results,
     text_of_name,
 )
-from startrack.batch.tables import write_tables
+from startrack.batch.tables import Rows, has_parquet, table_rows, table_values, write_tables
 from startrack.batch.task import ImageDone, Task, locate_image, locate_images
 
 __all__ = [
@@ -23,6 +22,7 @@ __all__ = [
     "Rows",
     "Task",
     "belongs_to_other_images",
+    "has_parquet",
     "images_under",
     "listed_images",
     "locate_image",

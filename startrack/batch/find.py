@@ -64,16 +64,18 @@ def listed_images(
 
 
 def result_stems(images: Sequence[str]) -> list[str]:
-    """Unique names of the results: the images' stems, with the suffix where stems are equal, and with the first free
-    number where even that name is taken.
-    """
+    """Unique names of the results: the images' stems, with the suffix where stems are equal."""
     names = [Path(image).name for image in images]
     stems = [_stem(name) for name in names]
     often = Counter(stems)
-    chosen = [name if often[stem] > 1 else stem for name, stem in zip(names, stems, strict=True)]
-    taken, given = set(chosen), set[str]()
+    return unique_names([name if often[stem] > 1 else stem for name, stem in zip(names, stems, strict=True)])
+
+
+def unique_names(names: Sequence[str]) -> list[str]:
+    """The names; a repeated one gets the first number that makes it unique."""
+    taken, given = set(names), set[str]()
     unique = []
-    for name in chosen:
+    for name in names:
         numbered = (f"{name}-{number}" for number in count(2))
         one = next(one for one in numbered if one not in taken) if name in given else name
         taken.add(one)

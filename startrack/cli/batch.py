@@ -34,7 +34,7 @@ def add_parser(subparsers: Any) -> None:
         help="every image of a folder",
         description="Locate the camera in every image of a tree, which OUT mirrors. A run that was stopped goes on "
         "from there; images, sidecars, camera or terrain files that have changed are done again. Adds results.ecsv, "
-        "results.parquet, trajectory.tum, timings.ecsv and manifest.json.",
+        "trajectory.tum, timings.ecsv, manifest.json and, with the extra parquet, results.parquet.",
         epilog="exit codes: 0 every image solved; 5 some not solved, or stopped early (Ctrl-C, SIGTERM, a full disk, a "
         "closed pipe); 1 an internal error; 2 usage; 4 bad input",
     )
@@ -92,7 +92,7 @@ def _run(
     found: Sequence[Image], whole: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace
 ) -> int:
     """`found` done; tables of that and of the `whole` folder; the exit code."""
-    from startrack.batch import locate_image
+    from startrack.batch import has_parquet, locate_image
     from startrack.runner import Runner
 
     _check_whose(out, whole, args)
@@ -112,9 +112,11 @@ def _run(
                 records,
                 {**_shown(facts), "localizer": args.localizer, "plots": not args.no_plots},
             )
-            tables = f"tables in {out}"
+            tables = f"tables in {out}" + (
+                "" if has_parquet() else " (no results.parquet: the extra parquet is missing)"
+            )
         except BadInput as cause:
-            stopped, tables = stopped or "the disk takes no more", f"no tables: {cause}"
+            stopped, tables = stopped or "the tables cannot be written", f"no tables: {cause}"
     if stopped:
         again = "the same command without -O" if args.overwrite else "the same command"
         done = f"{stopped}: {len(records)} of {len(tasks)} images done, {tables}"

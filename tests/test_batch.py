@@ -151,7 +151,7 @@ def test_a_trajectory_holds_poses_above_one_terrain(done, tmp_path):
         "trajectory-other.tum", "trajectory-shackleton-thesis.tum",
     ]  # fmt: skip
     assert len(np.loadtxt(tmp_path / "trajectory-other.tum", ndmin=2)) == 1
-    assert len(np.loadtxt(tmp_path / "trajectory-shackleton-thesis.tum")) == len(others)
+    assert len(np.loadtxt(tmp_path / "trajectory-shackleton-thesis.tum", ndmin=2)) == len(others)
     table = QTable.read(tmp_path / "results.ecsv", format="ascii.ecsv")
     assert {*table["terrain"][table["status"] == "ok"]} == {"other", "shackleton-thesis"}
     assert {*table["camera"][table["status"] == "ok"]} == {"small"}

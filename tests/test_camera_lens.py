@@ -16,7 +16,17 @@ from scipy.spatial.transform import Rotation
 
 from startrack.calibration import fit_lens, observations
 from startrack.calibration.show import camera_text
-from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole, lenses, load_camera, save_camera
+from startrack.camera import (
+    Camera,
+    KannalaBrandt,
+    Lens,
+    Pinhole,
+    camera_from_dict,
+    camera_to_dict,
+    lenses,
+    load_camera,
+    save_camera,
+)
 from startrack.camera.convert import to_text
 from startrack.camera.io import camera_keys
 from startrack.camera.parameters import with_update
@@ -94,6 +104,12 @@ def test_camera_file(tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text(text.replace('"m"', '"k1"'))
     with pytest.raises(BadInput, match=r"covariance\.order"):
         load_camera(tmp_path / "own.toml")
+
+
+def test_files_of_other_lenses_are_read_as_before() -> None:
+    assert load_camera("fisheye-2048").lens == KannalaBrandt((0.0, 0.0, 0.0, 0.0))
+    with pytest.raises(BadInput, match="m is missing"):
+        camera_from_dict({key: value for key, value in camera_to_dict(CAMERA).items() if key != "m"})
 
 
 def test_report_of_the_camera_file() -> None:

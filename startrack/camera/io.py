@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,9 +68,13 @@ COVARIANCE = Table(
 )
 
 
-def camera_keys() -> Table:
-    """The declared keys of camera files, those of all lenses in the list among them."""
-    lens_keys = {key: declared for lens in lens_kinds().values() for key, declared in lens.file_keys().items()}
+def camera_keys(lens: type[Lens] | None = None) -> Table:
+    """The declared keys of camera files with this lens; None: those of all lenses, none of which is then required."""
+    if lens is None:
+        declared = (item for kind in lens_kinds().values() for item in kind.file_keys().items())
+        lens_keys = {key: replace(one, required=False) for key, one in declared}
+    else:
+        lens_keys = lens.file_keys()
     return Table(
         description="x_px = cx + fx rho cos b, y_px = cy + fy rho sin b; rho = a + k1 a^3 + k2 a^5 + k3 a^7 + k4 a^9, "
         "or tan a",
@@ -134,7 +139,9 @@ def camera_from_dict(d: dict[str, Any], default_name: str = "camera") -> Camera:
     Raises BadInput bad_calibration with a line that names the wrong key.
     """
     try:
-        return _camera(camera_keys().check(d, ""), default_name)
+        model = d.get("model", default_lens().model)
+        lens = lens_kinds().get(model) if isinstance(model, str) else None
+        return _camera(camera_keys(lens).check(d, ""), default_name)
     except ValueError as cause:
         raise BadInput("bad_calibration", str(cause)) from cause
 

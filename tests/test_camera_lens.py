@@ -31,8 +31,7 @@ from startrack.camera.convert import to_text
 from startrack.camera.io import camera_keys
 from startrack.camera.parameters import with_update
 from startrack.camera.uncertainty import lens_jacobian
-from startrack.output.fits_blocks import header_block
-from startrack.output.wcs import wcs_cards
+from startrack.output.wcs import header_block, wcs_cards
 from startrack.types import Array, BadInput
 
 

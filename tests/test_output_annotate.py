@@ -15,10 +15,9 @@ from scipy.special import ndtr
 from startrack import pipeline
 from startrack.camera import Camera, Pinhole
 from startrack.output import write_annotated
-from startrack.output.picture.annotate import annotate
+from startrack.output.picture.annotate import PANEL_WIDTH, annotate
 from startrack.output.picture.backdrop import View, fitted, without_hot_pixels
-from startrack.output.picture.palette import HIDDEN, IDENTIFIED, POSITION, SKYLINE, STATUS, TRUTH
-from startrack.output.picture.panel import PANEL_WIDTH
+from startrack.output.picture.canvas import HIDDEN, IDENTIFIED, POSITION, SKYLINE, STATUS, TRUTH
 from startrack.stages import Detected, Inputs, Measured, Oriented, Refused, extend
 from startrack.types import Mode
 

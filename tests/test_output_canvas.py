@@ -10,11 +10,21 @@ import pytest
 
 from startrack.frames import Site
 from startrack.output.picture.backdrop import View
-from startrack.output.picture.canvas import Canvas, _overlap, printable, text_width, wrapped
-from startrack.output.picture.minimap import distance_text, draw_overview, draw_zoom, map_view, nice_step
-from startrack.output.picture.palette import MAP, PAPER, POSITION, mixed
+from startrack.output.picture.canvas import (
+    MAP,
+    PAPER,
+    POSITION,
+    Canvas,
+    _overlap,
+    mixed,
+    printable,
+    text_width,
+    wrapped,
+)
+from startrack.output.picture.maps import distance_text, draw_overview, draw_zoom, map_view, nice_step
 from startrack.output.picture.relief import draw_contours, ground_on, shade
 from startrack.output.picture.terrain_picture import relief_picture
+from startrack.terrain import Terrain
 from startrack.types import Fix, Mode
 
 WHITE = (255, 255, 255)
@@ -143,15 +153,24 @@ def test_the_ellipse_is_one_sigma_wide_and_turned_as_the_covariance(covariance, 
 
 
 @dataclass(frozen=True)
-class Ramp:
+class Ramp(Terrain):
     """Ground that rises to the east: its slopes face west, towards the light of the map."""
 
     rise: float
     name: str = "ramp"
     site: Site = SITE
     search_radius_m: float = 1000.0
-    reach_m: float = 1500.0
     camera_height_m: float = 1.5
+
+    @property
+    def reach_m(self) -> float:
+        return 1500.0
+
+    def horizon_rad(self, points_m: Any, azimuths_rad: Any) -> Any:
+        raise NotImplementedError("maps draw the ground")
+
+    def horizon_bounds_rad(self, *args: Any) -> Any:
+        raise NotImplementedError("maps draw the ground")
 
     def ground_m(self, points_m: Any) -> Any:
         return self.rise * points_m[..., 0]

@@ -21,8 +21,8 @@ from startrack.cli.report import page_of_images
 from startrack.errors import Reason
 from startrack.output import write_json
 from startrack.output.html import page_text, result_at, results_under
+from startrack.output.html.details import ground_map
 from startrack.output.html.gather import folder_of
-from startrack.output.html.ground import ground_map
 from startrack.output.html.rows import COLUMNS
 from startrack.terrain import load_terrain
 

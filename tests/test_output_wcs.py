@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera, Decentring, KannalaBrandt, Pinhole
 from startrack.cli.main import main
-from startrack.output.fits_blocks import header_block, table_file
-from startrack.output.wcs import wcs_cards
+from startrack.output.wcs import header_block, wcs_cards
 
 SAMPLES = Path(__file__).parent.parent / "sample_images"
 FISHEYE = Camera(
@@ -68,19 +67,6 @@ def test_boresight_at_the_pole() -> None:
     ra, dec = np.radians(wcs.all_pix2world(px, 0).T)
     rays = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
     assert np.abs(NARROW.project(rays)[0] - px).max() < 1e-6
-
-
-def test_a_table_as_astropy_reads_it(tmp_path: Path) -> None:
-    path = tmp_path / "t.fits"
-    columns = [("a", "deg", np.array([1.5, -2.25])), ("n", "", np.array([3, -4])), ("s", "", np.array(["HIP 1", "x"]))]
-    path.write_bytes(table_file(columns, {"EXTNAME": "CORR"}))
-    with fits.open(path, checksum=True) as units:
-        units.verify("exception")
-        assert units["CORR"].data["a"].tolist() == [1.5, -2.25]
-    table = Table.read(path)
-    assert table["n"].tolist() == [3, -4]
-    assert [str(s).strip() for s in table["s"]] == ["HIP 1", "x"]
-    assert str(table["a"].unit) == "deg"
 
 
 def test_identify_writes_world_coordinates_on_which_catalogue_stars_fall(tmp_path, monkeypatch) -> None:

@@ -6,17 +6,21 @@ says which projection it is, or how well a polynomial fits it; a decentred one n
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from io import BytesIO
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from startrack import __version__
 from startrack.camera import Camera, Decentring
 from startrack.frames import Site, aberrate, format_utc, observer_velocity_m_s, wahba
-from startrack.output.fits_blocks import Card, header_block, table_file
 from startrack.stages import Measured, Oriented
 from startrack.types import Array
 
+Card = bool | int | float | str
 SIP_ORDER = 4
 GRID = 40  # points across the frame at which the field is sampled
 
@@ -77,7 +81,7 @@ def matches_bytes(value: Oriented) -> bytes:
     measured = value.detections.xy_px[found.detection]
     predicted, _ = camera.project(stars.rays_icrs @ value.attitude.R_cam_icrs.T)
     field_deg, index_deg = _radec_deg(camera.unproject(measured) @ R), _radec_deg(still)
-    return table_file(
+    return _table_file(
         [
             ("field_x", "pix", measured[:, 0] + 1), ("field_y", "pix", measured[:, 1] + 1),
             ("field_ra", "deg", field_deg[:, 0]), ("field_dec", "deg", field_deg[:, 1]),
@@ -86,8 +90,37 @@ def matches_bytes(value: Oriented) -> bytes:
             ("index_id", "", np.asarray(stars.catalog_id)), ("FLUX", "", value.detections.flux_e[found.detection]),
             ("MAG", "mag", stars.v_mag),
         ],
-        {"EXTNAME": "CORR"},
+        "CORR",
     )  # fmt: skip
+
+
+def header_block(cards: Mapping[str, Card]) -> bytes:
+    """A FITS header with the `cards`; keys that begin with COMMENT are its comments."""
+    from astropy.io.fits import Header
+
+    header = Header()
+    for key, value in cards.items():
+        if key.startswith("COMMENT"):  # COMMENT1, COMMENT2, ...: keys of a mapping are unique
+            header.add_comment(value)
+        else:
+            header[key] = value
+    return bytes(header.tostring().encode("ascii"))
+
+
+def _table_file(columns: Sequence[tuple[str, str, NDArray[Any]]], name: str) -> bytes:
+    """A FITS file with one binary table: columns as (name, unit, values), floats or texts."""
+    from astropy.io import fits
+
+    made = [
+        fits.Column(
+            name=key, unit=unit or None, array=values,
+            format=f"{max(values.dtype.itemsize // 4, 1)}A" if values.dtype.kind == "U" else "D",
+        )
+        for key, unit, values in columns
+    ]  # fmt: skip
+    file = BytesIO()
+    fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns(made, name=name)]).writeto(file)
+    return file.getvalue()
 
 
 def _velocity_m_s(value: Oriented) -> Array | None:

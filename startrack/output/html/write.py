@@ -12,11 +12,9 @@ from urllib.parse import quote
 
 from startrack.errors import Reason
 from startrack.files import write_atomically
+from startrack.output.html.details import Grounds, ground_map, horizon_deg, picture_of, stars_of
 from startrack.output.html.gather import Found, folder_of
-from startrack.output.html.ground import Grounds, ground_map, horizon_deg
-from startrack.output.html.picture import picture_of
 from startrack.output.html.rows import COLUMNS, Place, chosen, errors_of, facts_of, headings, number, part, row_of
-from startrack.output.html.stars import stars_of
 
 HERE = Path(__file__).parent
 STYLES = ("page.css",)

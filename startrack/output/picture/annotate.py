@@ -1,4 +1,4 @@
-"""The annotated picture of a result: the exposure with what was found in it, and a panel with map and numbers."""
+"""The annotated picture of a result: the exposure with what was found in it, and a panel with maps and quantities."""
 
 from __future__ import annotations
 
@@ -6,11 +6,182 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.output.picture.backdrop import View, backdrop, fitted
-from startrack.output.picture.canvas import Canvas
-from startrack.output.picture.horizon_marks import draw_compass, draw_skyline, wall_mask
-from startrack.output.picture.panel import PANEL_HEIGHT, PANEL_WIDTH, draw_panel
-from startrack.output.picture.star_marks import draw_bodies, draw_detections, draw_hidden, name_stars
-from startrack.stages import Outcome, reached
+from startrack.output.picture.canvas import (
+    BODY,
+    DETECTION,
+    DIM_INK,
+    FAINT_INK,
+    HIDDEN,
+    IDENTIFIED,
+    INK,
+    PANEL,
+    POSITION,
+    SKYLINE,
+    STATUS,
+    TRUTH,
+    Box,
+    Canvas,
+    Colour,
+    text_width,
+    wrapped,
+)
+from startrack.output.picture.maps import draw_leaders, draw_overview, draw_residuals, draw_zoom
+from startrack.output.picture.marks import (
+    draw_bodies,
+    draw_compass,
+    draw_detections,
+    draw_hidden,
+    draw_skyline,
+    name_stars,
+    wall_mask,
+)
+from startrack.output.record import image_name
+from startrack.output.views import Rows, at_stage, rows
+from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented, Outcome, reached
+
+PANEL_WIDTH, PANEL_HEIGHT = 620, 1160
+MARGIN = 28
+FACT_SIZE, FACT_STEP = 20.0, 32
+LEGEND_STEP = 27
+VALUE_AT = 150  # from the left margin
+OVERVIEW_PART = 0.58  # of the height left for maps
+LOWEST_FIGURE_PX = 120
+MOST_MODES = 4
+
+
+def draw_panel(canvas: Canvas, left: int, outcome: Outcome, truth_enu_m: tuple[float, float] | None) -> None:
+    """Fill the canvas from `left` to its right edge, top to bottom."""
+    width, height = canvas.size
+    canvas.rectangle((left, 0, width - 1, height - 1), PANEL)
+    left, right = left + MARGIN, width - MARGIN
+    value = reached(outcome)
+    facts, legend = _facts(value), _legend(value, truth_enu_m is not None)
+    legend_top = height - MARGIN - LEGEND_STEP * len(legend) - 14
+    top = _header(canvas, left, right, outcome)
+    room = (left, top, right, legend_top - 30 - FACT_STEP * len(facts))
+    y = _figures(canvas, room, value, truth_enu_m)
+    for name, fact in facts:
+        y += FACT_STEP
+        canvas.text((left, y), name, FACT_SIZE, DIM_INK)
+        canvas.text((left + VALUE_AT, y), fact, FACT_SIZE, INK)
+    if legend:
+        canvas.line([(left, legend_top), (right, legend_top)], FAINT_INK)
+    for row, (kind, colour, text) in enumerate(legend):
+        y = legend_top + 14 + LEGEND_STEP * (row + 1)
+        _sample(canvas, left + 12, y - 6, kind, colour)
+        canvas.text((left + 36, y), text, 17.0, DIM_INK)
+
+
+def _header(canvas: Canvas, left: float, right: float, outcome: Outcome) -> float:
+    """Name of the image, status, and the message of a result that is not ok; returns where the next thing may stand."""
+    status = outcome.status.upper()
+    badge = text_width(status, 20.0) + 28
+    canvas.rectangle((right - badge, MARGIN, right, MARGIN + 36), STATUS[outcome.status])
+    canvas.text((right - badge / 2, MARGIN + 18), status, 20.0, (255, 255, 255), "mm")
+    name = _shortened(image_name(outcome.exposure), 27.0, right - left - badge - 20)
+    canvas.text((left, MARGIN + 28), name, 27.0, INK)
+    y = float(MARGIN + 36 + 28)
+    canvas.text((left, y), _shortened(_setting(reached(outcome)), 17.0, right - left), 17.0, DIM_INK)
+    y += 18
+    if outcome.status == "ok":
+        return y
+    y += 12
+    reason = (outcome.reason or "").replace("_", " ")
+    canvas.text((left, y + 14), reason, 22.0, STATUS[outcome.status])
+    y += 26
+    for line in wrapped(outcome.message, 20.0, right - left)[:8]:
+        y += 28
+        canvas.text((left, y - 6), line, 20.0, INK)
+    return y + 16
+
+
+def _setting(value: Inputs) -> str:
+    """Camera, terrain and exposure in words."""
+    camera, terrain, exposure_s = value.camera, value.terrain, value.exposure.exposure_s
+    parts = [f"camera {camera.name}"] if camera is not None else []
+    parts += [f"terrain {terrain.name}"] if terrain is not None else []
+    parts += [f"{exposure_s:.3g} s exposure"] if exposure_s is not None else []
+    return "   ".join(parts)
+
+
+def _figures(canvas: Canvas, room: Box, value: Inputs, truth: tuple[float, float] | None) -> float:
+    """Maps where there is a terrain, else residuals; returns where the next thing may stand."""
+    left, top, right, bottom = room
+    zoomed = isinstance(value, Located) and not value.fix.ambiguous
+    tallest = right - left if not zoomed else np.inf
+    bottom = min(bottom, top + tallest)
+    if bottom - top < LOWEST_FIGURE_PX:
+        return top
+    if value.terrain is None:
+        if not isinstance(value, Oriented):
+            return top
+        draw_residuals(canvas, (left, top, right, bottom), value.attitude_fit)
+        return bottom + 12
+    split = top + (OVERVIEW_PART if zoomed else 1.0) * (bottom - top)
+    fix = value.fix if isinstance(value, Located) else None
+    ambiguous = fix is not None and fix.ambiguous
+    overview = draw_overview(canvas, (left, top, right, split), value.terrain, fix, ambiguous, truth)
+    if fix is not None and not ambiguous:
+        zoom = draw_zoom(canvas, (left, split + 16, right, bottom), fix, truth)
+        draw_leaders(canvas, overview, zoom)
+    return bottom + 12
+
+
+def _facts(value: Inputs) -> Rows:
+    """Names and texts of the quantities that the panel shows."""
+    when = value.exposure.time_utc
+    found = [("Time", f"{when:%Y-%m-%d  %H:%M:%S} UTC" if when is not None else "not known")]
+    if isinstance(value, Located) and value.fix.ambiguous:
+        for k, mode in enumerate(value.fix.modes[:MOST_MODES]):
+            place = f"E {mode.east_m:.0f} m   N {mode.north_m:.0f} m   ({100 * mode.weight:.0f} %)"
+            found += [(f"Place {k + 1}", place)]
+    return found + rows("panel", at_stage(value))
+
+
+def _legend(value: Inputs, truth: bool) -> list[tuple[str, Colour, str]]:
+    found: list[tuple[str, Colour, str]] = []
+    if isinstance(value, Identified):
+        found += [("ring", IDENTIFIED, "star of the catalogue, identified")]
+    if isinstance(value, Detected):
+        other = "other point source" if isinstance(value, Identified) else "point source"
+        found += [("ring", DETECTION, other)]
+    if isinstance(value, Measured):
+        found += [("cross", HIDDEN, "star that should be here, and is hidden")]
+    if isinstance(value, Oriented) and value.bodies:
+        found += [("ring", BODY, "planet, Sun, Earth or Moon, where it must be")]
+    if isinstance(value, Located) and not value.fix.ambiguous:
+        found += [("line", SKYLINE, "skyline of the terrain seen from the position found")]
+        found += [("disc", POSITION, "position; circle 95 %, ellipse one sigma")]
+    if isinstance(value, Located) and value.fix.ambiguous:
+        found += [("line", SKYLINE, "skyline of the terrain seen from place 1")]
+        found += [("disc", POSITION, "place that fits the stars, with its probability")]
+    if truth and value.terrain is not None:
+        found += [("plus", TRUTH, "true position (not known to the method)")]
+    return found
+
+
+def _sample(canvas: Canvas, x: float, y: float, kind: str, colour: Colour) -> None:
+    if kind == "ring":
+        canvas.circle((x, y), 7.0, colour, 2)
+    elif kind == "cross":
+        canvas.cross((x, y), 5.5, colour, 2)
+    elif kind == "line":
+        canvas.line([(x - 11, y), (x + 11, y)], colour, 3)
+    elif kind == "plus":
+        canvas.plus((x, y), 8.0, colour, 2)
+    else:
+        canvas.circle((x, y), 4.0, colour, -1)
+        canvas.circle((x, y), 8.0, colour, 2)
+
+
+def _shortened(text: str, size: float, width: float) -> str:
+    """The text, or as much of its start and end as there is room for."""
+    if text_width(text, size) <= width:
+        return text
+    kept = len(text)
+    while kept > 4 and text_width(f"{text[: kept // 2]}…{text[-(kept // 2) :]}", size) > width:
+        kept -= 1
+    return f"{text[: kept // 2]}…{text[-(kept // 2) :]}"
 
 
 def annotate(outcome: Outcome, truth_enu_m: tuple[float, float] | None = None) -> NDArray[np.uint8]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from startrack.camera import Camera
-from startrack.output.picture.palette import PAPER, SKY_BRIGHT, SKY_DARK, STARLIGHT, WALL
+from startrack.output.picture.canvas import PAPER, SKY_BRIGHT, SKY_DARK, STARLIGHT, WALL
 from startrack.stages import Detected, Inputs
 from startrack.types import Array, Bools
 

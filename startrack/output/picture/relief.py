@@ -8,12 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from startrack.output.picture.canvas import Canvas, around
-from startrack.output.picture.palette import DIM_INK, FLOOR, INK, MAP
-from startrack.types import Array, Bools, Ints
+from startrack.output.picture.canvas import DIM_INK, FLOOR, INK, MAP, SHIFT_BITS, Canvas, around
+from startrack.types import Array, Bools
 
 if TYPE_CHECKING:
-    from startrack.output.picture.minimap import MapView
+    from startrack.output.picture.maps import MapView
     from startrack.terrain import Terrain
 
 Image = NDArray[np.float32]
@@ -22,9 +21,8 @@ GENTLE_SLOPE = 0.02  # gentler ground looks flat
 RELIEF_LIGHT = 3.0  # slopes that face the light, as a multiple of the floor's colour
 MOST_LEVELS = 12.0
 CONTOUR_WEIGHT = 0.45
-FLAT_M_PER_PX = 1e-3  # of a map: flatter ground has no contour that is a line
 LABEL_SIZE = 14.0
-LABELLED_PX = 90  # shorter contours get no label, those of ten times the length two
+LABELLED_PX = 90  # shorter contours get no label, those of twice the length and more two
 TRIED = 60  # places along a contour
 
 
@@ -74,28 +72,31 @@ def draw_contours(canvas: Canvas, window: Canvas, view: MapView, ground_m: Image
     low, high = float(ground_m[inner].min()), float(ground_m[inner].max())
     if high - low < 1.0:
         return None
+    from skimage.measure import find_contours
+
     step_m = _step(high - low)
     fine = _resized(_spread(ground_m, known), window.size)
     inside = edge_of(inner, window.size) > 0.5
-    down, across = np.gradient(fine)
-    slope = np.hypot(down, across)
-    level = np.rint(fine / step_m)
-    away_px = np.abs(fine - level * step_m) / np.maximum(slope, FLAT_M_PER_PX)
-    weight = CONTOUR_WEIGHT * np.clip(1.3 - away_px, 0, 1) * inside
-    window.pixels[:] = (window.pixels + weight[:, :, None] * (np.array(DIM_INK) - window.pixels)).astype(np.uint8)
-    for number in np.arange(np.ceil(low / step_m), np.floor(high / step_m) + 1):
-        places = np.argwhere(inside & (level == number) & (away_px < 0.7))[:, ::-1]
-        _label(canvas, view, places, f"{number * step_m + 0.0:g}")
+    cover, left_top = np.zeros(fine.shape, dtype=np.uint8), np.array(view.box[:2])
+    for number in np.arange(np.floor(low / step_m) + 1, np.ceil(high / step_m)):
+        lines = [line[:, ::-1] for line in find_contours(fine, number * step_m, mask=inside)]
+        fixed = [np.rint(line * 2**SHIFT_BITS).astype(np.int32) for line in lines]
+        cv2.polylines(cover, fixed, False, 255, 1, cv2.LINE_AA, SHIFT_BITS)
+        for line in lines:
+            _label(canvas, view, line + left_top, f"{number * step_m + 0.0:g}")
+    weight = (CONTOUR_WEIGHT / 255 * cover)[:, :, None]
+    window.pixels[:] = (window.pixels + weight * (np.array(DIM_INK) - window.pixels)).astype(np.uint8)
     return step_m
 
 
-def _label(canvas: Canvas, view: MapView, places: Ints, text: str) -> None:
-    """Write a height on its contour, once or twice, where there is room."""
+def _label(canvas: Canvas, view: MapView, line: Array, text: str) -> None:
+    """Write a height on its contour (n, 2) on the canvas, once or twice, where there is room."""
     left, top, right, bottom = view.box
-    at = places[:: max(1, len(places) // TRIED)] + np.array([left, top])
+    length_px = float(np.hypot(*np.diff(line, axis=0).T).sum())
+    at = line[:: max(1, len(line) // TRIED)]
     half_px = 0.36 * LABEL_SIZE * len(text) + 8.0
     at = at[(np.abs(at - view.middle) < np.array([right - left, bottom - top]) / 2 - half_px - 6.0).all(axis=1)]
-    for _ in range(min(2, len(places) // LABELLED_PX)):
+    for _ in range(min(2, int(length_px / LABELLED_PX))):
         free = [place for place in at if canvas.is_free(around(place, half_px))]
         if not free:
             return

@@ -5,9 +5,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.output.picture.canvas import Box, Canvas, around
-from startrack.output.picture.minimap import CAPTION_SIZE, MapView, draw_overview, grid_lines_m, nice_step
-from startrack.output.picture.palette import DIM_INK, FAINT_INK, FLOOR, GRID, INK, MAP, POSITION, SKYLINE
+from startrack.output.picture.canvas import (
+    DIM_INK,
+    FAINT_INK,
+    FLOOR,
+    GRID,
+    INK,
+    MAP,
+    POSITION,
+    SKYLINE,
+    Box,
+    Canvas,
+    around,
+)
+from startrack.output.picture.maps import CAPTION_SIZE, MapView, draw_overview, grid_lines_m, nice_step
 from startrack.output.picture.relief import draw_contours, ground_on
 from startrack.terrain import Terrain
 from startrack.types import Array

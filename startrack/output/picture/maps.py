@@ -1,4 +1,4 @@
-"""Two maps: the whole search area with the place in it, and the place itself with its error."""
+"""Figures of the panel: the search area with the position, the position with its error, and residuals of the stars."""
 
 from __future__ import annotations
 
@@ -7,16 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from startrack.output.picture.canvas import Box, Canvas
-from startrack.output.picture.palette import (
+from startrack.orient import AttitudeFit
+from startrack.output.picture.canvas import (
     DIM_INK,
     FAINT_INK,
     FLOOR,
     GRID,
+    IDENTIFIED,
     INK,
     MAP,
     POSITION,
     TRUTH,
+    Box,
+    Canvas,
     mixed,
 )
 from startrack.output.picture.relief import ground_on, shade
@@ -167,3 +170,28 @@ def _furniture(canvas: Canvas, view: MapView, caption: str) -> None:
     x, y = right - 14 - length, bottom - 14
     canvas.line([(x, y - 6), (x, y), (x + length, y), (x + length, y - 6)], INK, 2)
     canvas.text((x + length / 2, y - 10), distance_text(length_m), CAPTION_SIZE, INK, "ms", halo=True)
+
+
+WIDEST_RMS = 4.5  # residuals beyond this many rms are outliers and would squeeze the rest
+
+
+def draw_residuals(canvas: Canvas, box: Box, fit: AttitudeFit) -> None:
+    """Measured minus predicted pixels of the stars that the attitude rests on, with rings to read them by."""
+    left, top, right, bottom = box
+    window, middle = canvas.window(box), np.array([(left + right) / 2, (top + bottom) / 2])
+    window.rectangle(box, MAP)
+    residual_px = fit.residual_px[fit.used]
+    reach_px = WIDEST_RMS * max(fit.rms_px, 1e-3)
+    scale = 0.5 * min(right - left, bottom - top) / reach_px
+    step = nice_step(reach_px / 2)
+    for ring in np.arange(step, 2 * reach_px, step):
+        window.circle(middle, ring * scale, GRID)
+    window.line([(left, middle[1]), (right, middle[1])], GRID)
+    window.line([(middle[0], top), (middle[0], bottom)], GRID)
+    for place in middle + scale * residual_px:
+        window.circle(place, 2.0, mixed(IDENTIFIED, INK, 0.15), -1)
+    canvas.rectangle(box, FAINT_INK, 1)
+    canvas.text((left + 12, top + 12), "measured minus predicted", CAPTION_SIZE, DIM_INK, "lt", halo=True)
+    canvas.text(
+        middle + 2 * step * scale * np.array([0.707, -0.707]), f"{2 * step:g} px", CAPTION_SIZE, INK, "mm", halo=True
+    )

@@ -1,0 +1,197 @@
+"""Details of one image on a page: its brightest stars, the ground with its horizon, and the annotated picture."""
+
+from __future__ import annotations
+
+import base64
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.camera import load_camera
+from startrack.output.picture.annotate import PANEL_WIDTH
+from startrack.output.picture.backdrop import fitted
+from startrack.output.picture.relief import edge_of, ground_cells, light_on
+from startrack.terrain import Terrain, load_terrain
+from startrack.types import BadInput
+
+Columns = dict[str, list[Any]]
+# name on the page, column of NAME.stars.ecsv, decimals (None: a text)
+STAR_COLUMNS: tuple[tuple[str, str, int | None], ...] = (
+    ("id", "catalog_id", None), ("name", "name", None), ("mag", "v_mag", 2), ("az", "azimuth_deg", 3),
+    ("el", "elevation_deg", 3), ("x", "x_px", 2), ("y", "y_px", 2), ("mx", "x_measured_px", 2),
+    ("my", "y_measured_px", 2), ("exp", "expected_e", 0), ("flux", "flux_e", 0), ("sigma", "sigma_e", 0),
+    ("ev", "evidence", 2), ("status", "status", None), ("cause", "cause", None),
+)  # fmt: skip
+
+
+def stars_of(path: Path, most: int) -> dict[str, Any] | None:
+    """The `most` brightest stars as columns, with how many the table has of each status; None where there is none."""
+    if not path.is_file():
+        return None
+    kept: Columns = {name: [] for name, _, _ in STAR_COLUMNS}
+    counts: dict[str, int] = {}
+    total, unit = 0, "e"
+    with path.open(encoding="utf-8", newline="") as file:
+        head, rows = _opened(file)
+        if any("'expected_e'" in line and "unit: adu" in line for line in head):
+            unit = "ADU"
+        for row in rows:
+            total += 1
+            status = row.get("status", "")
+            counts[status] = counts.get(status, 0) + 1
+            if total <= most:
+                for name, column, decimals in STAR_COLUMNS:
+                    kept[name].append(_value(row.get(column) or "", decimals))
+    return {"total": total, "counts": counts, "unit": unit, "columns": _filled(kept)}
+
+
+def _opened(file: Any) -> tuple[list[str], Iterator[dict[str, str]]]:
+    """ECSV's comment lines, and its rows."""
+    head: list[str] = []
+    for line in file:
+        if not line.startswith("#"):
+            names = next(csv.reader([line]))
+            return head, (dict(zip(names, row, strict=False)) for row in csv.reader(file))
+        head.append(line)
+    return head, iter(())
+
+
+def _value(text: str, decimals: int | None) -> Any:
+    if decimals is None:
+        return text
+    try:
+        number = round(float(text), decimals)
+    except ValueError:  # an empty field: nothing was measured
+        return None
+    return int(number) if decimals == 0 or number == int(number) else number
+
+
+def _filled(columns: Columns) -> Columns:
+    """Without the columns that hold nothing."""
+    return {name: values for name, values in columns.items() if any(value not in (None, "") for value in values)}
+
+
+RELIEF_CELLS = 420
+MARGIN = 1.03  # beyond the map, for its edge
+BRIGHTEST = 215.0
+
+
+class Grounds:
+    """Terrains by the names that results give them, each loaded once; None where its file is not here."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, Terrain | None] = {}
+
+    def terrain(self, name: str) -> Terrain | None:
+        """The terrain of a name or path."""
+        if name not in self._known:
+            try:
+                self._known[name] = load_terrain(name)
+            except BadInput:  # a page must not need more than the results: it says what it leaves out
+                self._known[name] = None
+        return self._known[name]
+
+
+def horizon_deg(terrain: Terrain, east_m: float, north_m: float, count: int) -> list[float] | None:
+    """Elevation of the horizon [deg] at `count` azimuths, evenly from 0 to 360 degrees, both ends included.
+
+    None from where it is not known: a place off the map.
+    """
+    azimuths_rad = np.linspace(0.0, 2 * np.pi, count)
+    horizon_rad = terrain.horizon_rad(np.broadcast_to([east_m, north_m], (count, 2)), azimuths_rad)
+    if not np.isfinite(horizon_rad).all():
+        return None
+    return [round(value, 3) for value in np.degrees(horizon_rad).tolist()]
+
+
+def ground_map(terrain: Terrain) -> dict[str, Any]:
+    """`search_m`, the radius of the search area; of a cylinder `rim_m`, else `relief` with its `half_m`."""
+    shape: dict[str, Any] = {
+        "search_m": terrain.search_radius_m,
+        "site": terrain.site.body if terrain.site is not None else None,
+    }
+    if terrain.rim_radius_m is not None:
+        return {**shape, "rim_m": terrain.rim_radius_m}
+    half_m = MARGIN * terrain.reach_m
+    return {**shape, "half_m": half_m, "relief": _relief(terrain, half_m)}
+
+
+def _relief(terrain: Terrain, half_m: float) -> str:
+    """The ground's shape, lit from the north-west as maps are; see-through where a camera cannot stand."""
+    halves_m, shape = (half_m, half_m), (RELIEF_CELLS, RELIEF_CELLS)
+    ground_m, known = ground_cells(terrain, halves_m, shape)
+    grey = np.rint(BRIGHTEST * light_on(ground_m, known, halves_m)).astype(np.uint8)
+    cover = np.rint(255 * edge_of(known, shape)).astype(np.uint8)
+    return data_uri(np.stack([grey, grey, grey, cover], axis=-1))
+
+
+CARD = 80  # bytes of a line of a FITS header
+QUALITY = 82
+
+
+def picture_of(picture: Path, wcs: Path, record: dict[str, Any], longest_px: int) -> dict[str, Any] | None:
+    """`src` (a data URI), `width`, `height` [px of the picture], and, where the image's size is known, `scale`.
+
+    The image's pixel (x, y) lies at scale (x + 1/2), scale (y + 1/2) from the picture's top-left corner. None without a
+    picture.
+    """
+    import cv2
+
+    data = np.frombuffer(picture.read_bytes(), dtype=np.uint8) if picture.is_file() else np.empty(0, np.uint8)
+    whole = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    if whole is None or whole.shape[1] <= PANEL_WIDTH:
+        return None
+    size_px = image_size(wcs, record)
+    sky, known = _sky(np.asarray(whole, dtype=np.uint8), size_px)
+    shrink = min(1.0, longest_px / max(sky.shape[:2]))
+    if shrink < 1:
+        size = tuple(max(1, round(n * shrink)) for n in sky.shape[1::-1])
+        sky = np.asarray(cv2.resize(sky, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    shown = {"src": data_uri(sky), "width": sky.shape[1], "height": sky.shape[0]}
+    return {**shown, "scale": round(sky.shape[1] / size_px[0], 6)} if known and size_px is not None else shown
+
+
+def image_size(wcs: Path, record: dict[str, Any]) -> tuple[int, int] | None:
+    """Width and height of the image [px]: from NAME.wcs, the record's camera, or the camera file; None if unknown."""
+    if wcs.is_file():
+        cards = wcs.read_bytes().decode("ascii", "replace")
+        found = {cards[k : k + 8].strip(): cards[k + 10 : k + 30].strip() for k in range(0, len(cards), CARD)}
+        if found.get("IMAGEW", "").isdigit() and found.get("IMAGEH", "").isdigit():
+            return int(found["IMAGEW"]), int(found["IMAGEH"])
+    provenance = record.get("provenance")
+    camera = record.get("camera")
+    if isinstance(camera, dict) and isinstance(camera.get("size_px"), list) and len(camera["size_px"]) == 2:
+        return int(camera["size_px"][0]), int(camera["size_px"][1])
+    name = provenance.get("camera") if isinstance(provenance, dict) else None
+    if not isinstance(name, str):
+        return None
+    try:
+        return load_camera(name).size_px
+    except BadInput:  # its file is not here: the picture is shown without stars to point at
+        return None
+
+
+def data_uri(pixels: NDArray[np.uint8]) -> str:
+    """A picture (H, W, 3), blue first, or (H, W, 4) with its cover, as a WebP data URI: a fifth of the PNG."""
+    import cv2
+
+    ok, data = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
+    if not ok:
+        raise RuntimeError("OpenCV could not encode the picture as WebP")
+    return f"data:image/webp;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
+
+
+def _sky(whole: NDArray[np.uint8], size_px: tuple[int, int] | None) -> tuple[NDArray[np.uint8], bool]:
+    """The part of the annotated picture that shows the exposure, and whether it is exactly that part."""
+    left = whole[:, : whole.shape[1] - PANEL_WIDTH]
+    if size_px is None:
+        return left, False
+    _, (width, height) = fitted(size_px)
+    if width != left.shape[1] or height > left.shape[0]:
+        return left, False
+    top = (left.shape[0] - height) // 2
+    return left[top : top + height], True

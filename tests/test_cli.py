@@ -2,9 +2,11 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import cv2
@@ -331,6 +333,66 @@ def test_version_and_help(folder):
     for command in ("locate", "identify", "detect", "render", "doctor", "schema"):
         done = shell(command, "--help", cwd=folder)
         assert (done.returncode, done.stderr) == (OK, "")
+
+
+def test_the_module_is_the_command_too(folder):
+    done = subprocess.run(
+        [sys.executable, "-m", "startrack", "--version"], cwd=folder, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert (done.returncode, done.stdout[:12], done.stderr) == (OK, "startrack 0.", "")
+
+
+@pytest.mark.parametrize("action", ["verify", "show", "convert", "board"])
+def test_each_action_of_calibrate_has_its_own_help(capsys, action):
+    with pytest.raises(SystemExit, match="0"):
+        main(["calibrate", action, "--help"])
+    text = capsys.readouterr().out
+    assert text.startswith(f"usage: startrack calibrate {action} ")
+    assert ("--to" in text) == (action == "convert")
+    assert ("--pattern" in text) == (action == "board")
+
+
+def test_calibrate_takes_images_without_an_action(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main(["calibrate", "--help"])
+    assert "usage: startrack calibrate [-h]" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_a_full_disk_behind_stdout_is_named(folder):
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "startrack", "schema"]
+        done = subprocess.run(
+            command, cwd=folder, stdout=full, stderr=subprocess.PIPE, text=True,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
+    assert (done.returncode, done.stderr) == (
+        BAD_INPUT,
+        "startrack: the output cannot be written (No space left on device)\n",
+    )
+
+
+def test_shell_completion_knows_the_commands(folder, tmp_path):
+    """As bash asks through argcomplete: the answer comes on descriptor 8."""
+    pytest.importorskip("argcomplete", reason="the extra `completion` is not installed")
+    answer = tmp_path / "answer"
+    words = {"COMP_LINE": "startrack loc", "COMP_POINT": "13", "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n"}
+    command = f"exec 8>{answer} 9>/dev/null; exec {sys.executable} -m startrack"
+    subprocess.run(
+        ["bash", "-c", command], cwd=folder, check=False, env={**os.environ, **words, "PYTHONPATH": str(ROOT)}
+    )
+    assert answer.read_text().strip() == "locate"
+
+
+def test_doctor_knows_the_packages_and_extras_of_the_project():
+    from startrack.cli.doctor import OPTIONAL, REQUIRED
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert {*REQUIRED} == {re.split("[><=]", one)[0] for one in project["dependencies"]}
+    extras = {*project["optional-dependencies"]} - {"test", "dev", "bench", "browser"}
+    assert {*OPTIONAL} == extras
+    assert re.findall(r"^\| `(\w+)` \|", (ROOT / "README.md").read_text(), flags=re.MULTILINE) == [*OPTIONAL]
 
 
 def test_doctor_finds_all_well(folder, capsys):

@@ -1,0 +1,78 @@
+"""numba's cache: compiling is announced once, loading from the cache is not; a folder for read-only installations."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from startrack import compilation
+
+ROOT = Path(__file__).parent.parent
+FIRST_USE = """
+import sys
+
+from startrack.compilation import announce_compilation
+
+announce_compilation()
+announce_compilation()
+from numba import njit
+
+__name__ = "startrack.probe"  # a kernel of the package, as far as numba can tell
+sys.modules[__name__] = sys.modules["__main__"]
+
+@njit(cache=True)
+def kernel(x):
+    return x + 1.0
+
+kernel(1.0)
+kernel(1)
+"""
+
+
+def printed_by(script: Path, cache: Path) -> str:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(cache)}
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=environment)
+    assert (done.returncode, done.stdout) == (0, "")
+    return done.stderr
+
+
+def test_compiling_is_announced_once_and_loading_is_not(tmp_path):
+    script = tmp_path / "first_use.py"
+    script.write_text(FIRST_USE)
+    assert printed_by(script, tmp_path / "cache").splitlines() == [
+        "compiling for this machine, once: 15 s, for height maps up to a minute"
+    ]
+    assert printed_by(script, tmp_path / "cache") == ""
+
+
+@pytest.fixture
+def read_only(monkeypatch, tmp_path):
+    """An installation that cannot be written to, for a user with a home."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(compilation.os, "access", lambda path, mode: False)
+
+
+def test_kernels_of_a_read_only_installation_are_kept_in_the_users_cache(read_only, tmp_path):
+    compilation.choose_cache_folder()
+    assert os.environ.pop("NUMBA_CACHE_DIR") == str(tmp_path / "cache" / "startrack" / "numba")
+
+
+def test_without_any_folder_the_kernels_are_kept_for_the_process(read_only, tmp_path):
+    (tmp_path / "cache").write_text("no folder")
+    compilation.choose_cache_folder()
+    folder = Path(os.environ.pop("NUMBA_CACHE_DIR"))
+    assert folder.is_dir()
+    assert folder.stat().st_mode & 0o077 == 0  # numba unpickles what it finds there
+    folder.rmdir()
+
+
+def test_a_folder_that_the_user_names_is_kept(monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "mine")
+    monkeypatch.setattr(compilation.os, "access", lambda path, mode: False)
+    compilation.choose_cache_folder()
+    assert os.environ["NUMBA_CACHE_DIR"] == "mine"

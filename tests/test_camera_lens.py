@@ -15,7 +15,6 @@ from astropy.wcs import WCS
 from scipy.spatial.transform import Rotation
 
 from startrack.calibration import fit_lens, observations
-from startrack.calibration.show import camera_text
 from startrack.camera import (
     Camera,
     KannalaBrandt,
@@ -31,6 +30,7 @@ from startrack.camera.convert import to_text
 from startrack.camera.io import camera_keys
 from startrack.camera.parameters import with_update
 from startrack.camera.uncertainty import lens_jacobian
+from startrack.cli.main import main
 from startrack.output.wcs import header_block, wcs_cards
 from startrack.types import Array, BadInput
 
@@ -111,8 +111,10 @@ def test_files_of_other_lenses_are_read_as_before() -> None:
         camera_from_dict({key: value for key, value in camera_to_dict(CAMERA).items() if key != "m"})
 
 
-def test_report_of_the_camera_file() -> None:
-    first, second = camera_text(CAMERA).splitlines()[:2]
+def test_report_of_the_camera_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_camera(CAMERA, tmp_path / "own.toml")
+    assert main(["calibrate", "show", str(tmp_path / "own.toml")]) == 0
+    first, second = capsys.readouterr().out.splitlines()[:2]
     assert first.startswith("own: sine, 2048 x 1900 px, mirrored") and second.endswith("; m 1.9")
 
 

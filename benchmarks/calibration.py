@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from _results import table, write_section
 
-from startrack.calibration import calibrate, first_state, fit_lens, observations
+from startrack.calibration import calibrate, fit_lens, initial_state, observations
 from startrack.camera import Camera, KannalaBrandt
 from startrack.camera.uncertainty import cap_grid, compensating_rotation, lens_jacobian
 from startrack.catalog import load_catalog
@@ -115,7 +115,7 @@ def trial(case: Case, law: str, rng: np.random.Generator) -> Trial:
     start = time.perf_counter()
     points = observations(xy, rays, case.sigma_px**2)
     if case.from_nothing:
-        state = first_state(points, SIZE_PX)
+        state = initial_state(points, SIZE_PX)
         fit = fit_lens(state.camera, state.R_cam_icrs, points)
     else:
         fit = fit_lens(rough(), np.stack([R_from_rotvec(rng.normal(0, 0.01, 3)) @ r for r in R]), points)
@@ -187,7 +187,7 @@ def photograph() -> str:
     found = calibrate([exposure], load_catalog(), fov_rad=np.pi, site=PHOTO_SITE)
     fit = found.joint.fit
     gates = "all passed" if found.accepted else ", ".join(gate.name for gate in found.failed) + " FAILED"
-    opposite = next(gate.value for gate in found.gates if gate.name.startswith("opposite"))
+    opposite = next(gate.value for gate in found.checks if gate.name.startswith("opposite"))
     reach = np.degrees(fit.camera.calibrated_angle_rad)
     return (
         f"`{PHOTO.name}` from cold (`--fov 180`), {time.perf_counter() - start:.1f} s: {int(fit.used.sum())} stars, "

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 from startrack.catalog import load_catalog  # noqa: E402
 from startrack.detection import Detector  # noqa: E402
 from startrack.exposure import read_exposure  # noqa: E402
-from startrack.identification.unknown_lens import identify_blind  # noqa: E402
+from startrack.identification.unknown_lens import identify_unknown_lens  # noqa: E402
 from startrack.types import Exposure, NoSolution, Stars  # noqa: E402
 
 FIELDS_DEG = {  # across the width
@@ -149,7 +149,7 @@ def _wrong(tally: Tally, other: Tally, pictures: list[Picture]) -> int:
 
 def _ours(found: object, picture: Picture, stars: Stars) -> np.ndarray | None:
     size = picture.exposure.size_px
-    answer = identify_blind(found, size, np.radians(picture.fov_deg), stars)  # type: ignore[arg-type]
+    answer = identify_unknown_lens(found, size, np.radians(picture.fov_deg), stars)  # type: ignore[arg-type]
     return np.asarray(answer.identification.R_cam_icrs[2])
 
 

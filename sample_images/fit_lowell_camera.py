@@ -12,8 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from startrack.camera import Camera, KannalaBrandt, save_camera
-from startrack.frames import rays_from_azel
-from startrack.orient import rotation, wahba
+from startrack.frames import R_from_rotvec, rays_from_azel, wahba
 
 ROOT = Path(__file__).resolve().parent.parent
 STARS = ROOT / "tests/data/lowell-2018-08-06-stars.csv"
@@ -54,7 +53,7 @@ def fit(rays_enu: np.ndarray, px: np.ndarray) -> tuple[Camera, np.ndarray]:
     R_cam_enu = wahba(camera(*START).unproject(px), rays_enu, np.ones(len(px)))
 
     def miss(p: np.ndarray) -> np.ndarray:
-        return camera(*p[3:]).project(rays_enu @ (rotation(p[:3]) @ R_cam_enu).T)[0] - px
+        return camera(*p[3:]).project(rays_enu @ (R_from_rotvec(p[:3]) @ R_cam_enu).T)[0] - px
 
     robust = least_squares(
         lambda p: miss(p).ravel(), (0.0, 0.0, 0.0, *START), loss="soft_l1", f_scale=0.5, x_scale=STEP

@@ -6,6 +6,7 @@ import time as clock
 from datetime import datetime
 from typing import TYPE_CHECKING
 
+from startrack.adjust import solve_attitude
 from startrack.camera import Camera
 from startrack.catalog.bodies import bodies
 from startrack.compilation import announce_compilation
@@ -15,7 +16,6 @@ from startrack.frames import Site, observer_velocity_m_s
 from startrack.identification import Identifier
 from startrack.localization import check_consistency
 from startrack.measurement import measure_evidence, remeasure_near_skyline, sky_step_at
-from startrack.orient import solve_attitude
 from startrack.stages import (
     Detected,
     Identified,
@@ -192,10 +192,11 @@ def identify_unknown_lens(detected: Detected, fov_rad: float, catalog: StarCatal
 
     `detected` has the point sources, `catalog` the stars. Raises NotIdentified, TooFewStars.
     """
-    from startrack.identification.unknown_lens import identify_blind as solve
+    from startrack.identification import identify_unknown_lens as solve
 
     stars = stars_at(catalog, detected.exposure.time_utc, None)
-    found = solve(detected.detections, detected.exposure.size_px, fov_rad, stars)
+    sources, size_px = detected.detections, detected.exposure.size_px
+    found = solve(sources, size_px, fov_rad, stars, background=sources.background_e)
     return extend(
         detected, Identified, camera=found.camera, stars=stars, bodies=(), identification=found.identification
     )

@@ -16,6 +16,7 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
+from startrack.adjust import AttitudeFit
 from startrack.camera import Camera
 from startrack.detection import Detector
 from startrack.errors import Reason
@@ -23,7 +24,6 @@ from startrack.evidence import StarEvidence, StarPhotometry
 from startrack.frames import Site
 from startrack.identification import Identifier
 from startrack.localization import ExactPosterior, Localizer
-from startrack.orient import AttitudeFit
 from startrack.terrain import Terrain
 from startrack.types import (
     Array,

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from startrack.errors import BadInput, NoSolution, NotIdentified, NotLocated, TooFewStars
 
 __all__ = [
-    "Array", "Attitude", "BadInput", "Body", "Bools", "Detections", "Evidence", "Exposure", "Fix", "Identification",
-    "Ints", "Mode", "NoSolution", "NotIdentified", "NotLocated", "Stars", "TooFewStars", "Value", "array",
+    "Array", "Attitude", "BadInput", "Body", "Bools", "Centroids", "Detections", "Evidence", "Exposure", "Fix",
+    "Identification", "Ints", "Mode", "NoSolution", "NotIdentified", "NotLocated", "Stars", "TooFewStars", "Value",
+    "array",
 ]  # fmt: skip
 
 MAX_PIXELS = 200_000_000  # contract: a larger image is refused from its header, before anything is decoded
@@ -106,21 +107,32 @@ class Exposure(Value):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Detections(Value):
-    """Point sources found in an exposure, brightest first."""
+class Centroids(Value):
+    """Positions and brightness of point sources, brightest first: what identification needs of them."""
 
-    xy_px: Array = array("n", 2)  # centroid
+    xy_px: Array = array("n", 2)
     covariance_px2: Array = array("n", 2, 2)
     flux_e: Array = array("n")  # whole-PSF flux [electrons, or ADU when the gain is unknown]
-    flux_sigma_e: Array = array("n")
     snr: Array = array("n")  # matched-filter signal-to-noise ratio
     saturated: Bools = array("n", dtype=np.bool_)
     psf_sigma_px: float  # Gaussian PSF before integration over the pixel, as used
-    background_e: NDArray[np.float32]  # (H, W) smooth background [e], pedestal included
-    noise_e: NDArray[np.float32]  # (H, W) noise of one pixel [e]
+    brightness_sigma_mag: float = 0.0  # added to each star's sigma; infinite where only the order is known
 
     def __len__(self) -> int:
         return len(self.snr)
+
+    def take(self: T, which: Any) -> T:
+        """The sources selected by a mask, slice or index array."""
+        return take_rows(self, which)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detections(Centroids):
+    """Point sources found in an exposure, brightest first, with the images that they were measured against."""
+
+    flux_sigma_e: Array = array("n")
+    background_e: NDArray[np.float32]  # (H, W) smooth background [e], pedestal included
+    noise_e: NDArray[np.float32]  # (H, W) noise of one pixel [e]
 
 
 @dataclass(frozen=True, kw_only=True)

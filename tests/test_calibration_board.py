@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from startrack.adjust import observations
 from startrack.calibration.board import calibrate_board
-from startrack.calibration.board_corners import Board, Corners, corners
-from startrack.calibration.board_pose import BoardState, first_board_state
-from startrack.calibration.fit import fit_state
-from startrack.calibration.observations import observations
+from startrack.calibration.board_pose import Board, BoardState, Corners, find_corners, initial_board_state
+from startrack.calibration.lens_fit import fit_state
 from startrack.camera import Camera, KannalaBrandt, load_camera
 from startrack.cli.main import main
 from startrack.exposure import write_exposure
@@ -106,7 +105,7 @@ def chessboards():
 
 def test_drawn_corners_are_found_where_they_are(chessboards):
     """The drawing and OpenCV's detector agree: what follows rests on both."""
-    found = corners(chessboards[1], Board(COLUMNS, ROWS))
+    found = find_corners(chessboards[1], Board(COLUMNS, ROWS))
     place, _ = rays_to_board(POSES[1], TRUTH.unproject(found.xy_px))
     assert np.median(np.abs(place - np.rint(place))) < 0.005
     assert np.abs(place - np.rint(place)).max() < 0.1
@@ -145,8 +144,8 @@ def test_exact_corners_give_the_exact_lens_past_90_degrees():
             facing = Rotation.align_vectors([middle], [[0, 0, 1.0]])[0] * Rotation.from_rotvec(rng.normal(0, 0.4, 3))
             points = facing.apply(board - [4, 2.5, 0]) + middle
             seen.append(Corners(wide.project(points)[0] + rng.normal(0, 0.02, (54, 2)), board))
-    points = observations([s.xy_px for s in seen], [s.place for s in seen])
-    state = first_board_state(points, (1000, 1000))
+    points = observations([s.xy_px for s in seen], [s.position for s in seen])
+    state = initial_board_state(points, (1000, 1000))
     assert isinstance(state, BoardState)
     fit = fit_state(state, points)
     assert fit.camera.focal_px[0] == pytest.approx(260, abs=0.05)

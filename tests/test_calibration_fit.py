@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from startrack.calibration import first_state, fit_lens, observations
+from startrack.calibration import fit_lens, initial_state, observations
 from startrack.camera import Camera, Decentring, KannalaBrandt, camera_from_dict, camera_to_dict
 from startrack.camera.parameters import with_update
 from startrack.camera.uncertainty import lens_jacobian
@@ -59,13 +59,13 @@ def simulated(law, frames, stars, sigma_px, seed, top_deg=None, **kind):
     return xy, [rays @ r for rays, r in zip(seen, R, strict=True)], R
 
 
-def fitted(law, frames, stars, sigma_px, seed, plain=False, **kind):
+def fitted(law, frames, stars, sigma_px, seed, square=False, **kind):
     xy, rays, R = simulated(law, frames, stars, sigma_px, seed, **kind)
     return fit_lens(
         ROUGH,
         Rotation.from_rotvec([0.01, -0.008, 0.012]).as_matrix() @ R,
         observations(xy, rays, sigma_px**2),
-        plain=plain,
+        square=square,
     )
 
 
@@ -105,7 +105,7 @@ def test_from_matches_alone_of_which_a_fifth_is_wrong(law, mirrored):
     xy[0][:10] = rng.uniform(0, 2047, (10, 2))
     xy[0][10:20] += rng.uniform(-12, 12, (10, 2))
     points = observations(xy, rays)  # not even the centroids' errors are told
-    start = first_state(points, SIZE_PX)
+    start = initial_state(points, SIZE_PX)
     fit = fit_lens(start.camera, start.R_cam_icrs, points)
     assert fit.camera.mirrored == mirrored
     assert map_error_px(fit.camera, law, mirrored=mirrored) <= 0.1
@@ -175,7 +175,7 @@ def test_a_decentred_lens_is_found_and_its_file_read_back():
     assert (camera.decentring.p1, camera.decentring.p2) == pytest.approx(p, abs=2e-5)
     assert map_error_px(camera, "equisolid", p=p) < 0.03
     bare = replace(camera, decentring=Decentring())
-    centred = fitted("equisolid", 4, 200, 0.1, 7, p=p, plain=True)  # what a reader who ignores the key could have had
+    centred = fitted("equisolid", 4, 200, 0.1, 7, p=p, square=True)  # what a reader who ignores the key could have had
     assert map_error_px(bare, "equisolid", p=p) < 1.25 * map_error_px(centred.camera, "equisolid", p=p)
     assert centred.held_out_rms_px > 5 * fit.held_out_rms_px
     again = camera_from_dict(camera_to_dict(camera))
@@ -216,7 +216,7 @@ def test_narrow_fields_get_a_pinhole_or_a_short_polynomial():
     R = Rotation.random(random_state=1).as_matrix()
     xy = CENTRE_PX + 8000.0 * rays[:, :2] / rays[:, 2:] + rng.normal(0, 0.1, (150, 2))
     points = observations([xy], [rays @ R], 0.01)
-    start = first_state(points, SIZE_PX)
+    start = initial_state(points, SIZE_PX)
     camera = fit_lens(start.camera, start.R_cam_icrs, points).camera
     assert camera.focal_px[0] == pytest.approx(8000, rel=2e-3)
     assert camera.lens.model == "pinhole" or len(camera.lens.k) <= 2
@@ -226,7 +226,7 @@ def test_narrow_fields_get_a_pinhole_or_a_short_polynomial():
 def test_matches_that_agree_on_nothing_are_refused():
     rng = np.random.default_rng(9)
     points = observations([rng.uniform(0, 2047, (60, 2))], [even(90, 60, rng)], 0.04)
-    start = first_state(points, SIZE_PX)
+    start = initial_state(points, SIZE_PX)
     fit_px = None
     try:
         fit_px = fit_lens(start.camera, start.R_cam_icrs, points).held_out_rms_px

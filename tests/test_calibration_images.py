@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from startrack.calibration import calibrate
-from startrack.calibration.acceptance import log_chance
+from startrack.calibration.acceptance import joint_log_p_value
 from startrack.calibration.verify import verify, verify_dict
 from startrack.camera import load_camera, save_camera
 from startrack.catalog import load_catalog
@@ -40,7 +40,7 @@ def cold(exposure):
 
 
 def test_the_photograph_calibrates_from_cold(cold):
-    assert cold.accepted, [gate.name for gate in cold.failed]
+    assert cold.accepted, [check.name for check in cold.failed]
     fit = cold.joint.fit
     assert fit.used.sum() >= 1000
     assert fit.held_out_rms_px <= 0.35  # distance, not per axis
@@ -54,7 +54,7 @@ def test_its_stars_are_those_that_were_named_without_startrack(cold):
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     px = np.array([[float(row["x_px"]), float(row["y_px"])] for row in rows])
     frame, matched = cold.joint.frames[0], cold.joint.matches[0]
-    distance, nearest = cKDTree(px).query(frame.detections.xy_px[matched.detection])
+    distance, nearest = cKDTree(px).query(frame.sources.xy_px[matched.detection])
     both = distance < 1.5
     assert both.sum() >= 380
     names = np.array([int(row["hip"]) for row in rows])
@@ -62,7 +62,7 @@ def test_its_stars_are_those_that_were_named_without_startrack(cold):
 
 
 def test_chance_gives_no_such_number_of_matches(cold):
-    assert log_chance(cold.joint) < np.log(1e-100)
+    assert joint_log_p_value(cold.joint) < np.log(1e-100)
 
 
 def test_the_mirror_image_is_solved_and_said_to_be_one(exposure):
@@ -70,7 +70,7 @@ def test_the_mirror_image_is_solved_and_said_to_be_one(exposure):
     found = calibrate([flipped], load_catalog().brighter_than(7.0), camera=load_camera("lowell-ldt"), site=SITE)
     assert found.accepted
     assert found.camera.mirrored
-    opposite = next(gate.value for gate in found.gates if gate.name.startswith("opposite"))
+    opposite = next(gate.value for gate in found.checks if gate.name.startswith("opposite"))
     assert opposite > 50
 
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from startrack.calibration import Given, calibrate
-from startrack.calibration.noise import photon_transfer
-from startrack.calibration.photometry import photometry
+from startrack.calibration import KnownSensor, calibrate
+from startrack.calibration.photometry import measure_photometry
+from startrack.calibration.photon_transfer import fit_photon_transfer
 from startrack.calibration.throughput import airmass
 from startrack.calibration.verify import difference_px
 from startrack.camera import Camera, KannalaBrandt, Sensor
@@ -71,11 +71,11 @@ def test_the_sensor_is_the_true_one(found):
     assert sensor.psf_sigma_px == pytest.approx(1.1, rel=0.03)
     angle = np.radians([30, 60, 85])
     np.testing.assert_allclose(sensor.throughput(angle), SENSOR.throughput(angle), atol=0.03)
-    assert found.photometry.facts.psf_by_ring_px == pytest.approx([1.1] * 4, rel=0.06)
+    assert found.photometry.properties.psf_by_ring_px == pytest.approx([1.1] * 4, rel=0.06)
 
 
 def test_hot_pixels_are_listed(frames, found):
-    listed = {(int(x), int(y)) for x, y in found.photometry.facts.hot_px}
+    listed = {(int(x), int(y)) for x, y in found.photometry.properties.hot_px}
     bright = {px for px, light_e in frames[1].items() if light_e > 400}  # 12 times the noise of the brightest sky
     assert len(bright) >= 20
     assert len(listed & bright) >= 0.9 * len(bright)
@@ -83,14 +83,14 @@ def test_hot_pixels_are_listed(frames, found):
 
 
 def test_what_is_given_goes_before_what_is_measured(found):
-    given = photometry(found.joint, Given(gain_e_per_adu=0.7, read_noise_e=9.0, bias_adu=190.0)).sensor
+    given = measure_photometry(found.joint, KnownSensor(gain_e_per_adu=0.7, read_noise_e=9.0, bias_adu=190.0)).sensor
     assert (given.gain_e_per_adu, given.read_noise_e, given.bias_adu) == (0.7, 9.0, 190.0)
 
 
 def test_without_exposure_times_no_zero_point_is_invented(found):
     blind = tuple(replace(f, exposure=replace(f.exposure, exposure_s=None)) for f in found.joint.frames)
-    missing = photometry(replace(found.joint, frames=blind), Given())
-    assert missing.light is None
+    missing = measure_photometry(replace(found.joint, frames=blind), KnownSensor())
+    assert missing.throughput is None
     assert missing.sensor is None
     assert any(re.match("zero point: not measured", note) for note in missing.notes)
 
@@ -104,13 +104,13 @@ def test_photon_transfer_on_plain_light():
             pixels_adu=(rng.poisson(light_e) + rng.normal(0, 8, light_e.shape)).astype(np.float32) / 1.7 + 300
         )
 
-    transfer = photon_transfer([(exposure(), exposure())])
+    transfer = fit_photon_transfer([(exposure(), exposure())])
     assert transfer.gain_e_per_adu == pytest.approx(1.7, rel=0.01)
     assert transfer.gain_sigma < 0.03
     assert transfer.read_noise_e(300.0) == pytest.approx(8.0, rel=0.25)
-    assert photon_transfer([]) is None
+    assert fit_photon_transfer([]) is None
     dark = Exposure(pixels_adu=rng.normal(300, 5, (512, 512)).astype(np.float32))
-    assert photon_transfer([(dark, dark)]) is None  # no range of light
+    assert fit_photon_transfer([(dark, dark)]) is None  # no range of light
 
 
 def test_airmass():

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera, Pinhole, load_camera
 from startrack.catalog import load_catalog
+from startrack.false_alarm import coincidence_probability, density_per_sr, log_p_value
 from startrack.frames import angle_between_rad
 from startrack.identification import Identifier
-from startrack.identification.chance import ChanceModel
 from startrack.identification.triangles import triangles
 from startrack.types import Detections, Identification, NotIdentified, Stars
 
@@ -194,13 +194,14 @@ def test_the_stated_odds_of_chance_are_true(clustered: bool, field: str) -> None
             xy = rng.uniform(0.3, 0.7, (6, 2))[rng.integers(6, size=150)] * width
             xy += rng.normal(0, 0.06 * width, (150, 2))
         rays = camera.unproject(xy)
-        model = ChanceModel(rays, np.radians(cap_deg))
+        density = density_per_sr(rays, np.radians(cap_deg))
+        each = coincidence_probability(density * np.pi * radius**2)
         tree = cKDTree(rays)
         for R in Rotation.random(60, random_state=rng).as_matrix():
             cam = bright @ R.T
             cam = cam[camera.project(cam)[1]]
             hits = np.count_nonzero(tree.query(cam)[0] < 2 * np.sin(radius / 2))
-            p_values.append(np.exp(model.log_odds(np.array(hits), np.array(len(cam)), radius, given=0)))
+            p_values.append(np.exp(log_p_value(hits, len(cam), each, free=0)))
     p = np.array(p_values)
     for level in (0.2, 0.05, 0.01):
         share = np.mean(p <= level)
@@ -307,7 +308,7 @@ def test_triangles_are_all_that_there_are() -> None:
             expected.add((i, j, k))
     assert listed == expected
     assert len(found) == len(listed) > 100
-    for (a, b, c), sides, handed in zip(found.vertices, found.sides_rad, found.handed, strict=True):
+    for (a, b, c), sides, handed in zip(found.vertices, found.sides_rad, found.handedness, strict=True):
         opposite = [angle_between_rad(rays[p], rays[q]) for p, q in ((b, c), (c, a), (a, b))]
         assert sides == pytest.approx(opposite, abs=1e-12)  # each vertex is listed by the side opposite to it
         assert np.all(np.diff(sides) > 0)
@@ -320,8 +321,8 @@ def test_triangles_keep_their_sides_under_rotation_and_lose_their_hand_in_a_mirr
     turned = triangles(rays @ Rotation.random(random_state=3).as_matrix().T, 0.6)
     assert np.array_equal(turned.vertices, plain.vertices)
     assert turned.sides_rad == pytest.approx(plain.sides_rad, abs=1e-12)
-    assert np.array_equal(turned.handed, plain.handed)
-    assert np.array_equal(triangles(rays * [-1, 1, 1], 0.6).handed, -plain.handed)
+    assert np.array_equal(turned.handedness, plain.handedness)
+    assert np.array_equal(triangles(rays * [-1, 1, 1], 0.6).handedness, -plain.handedness)
 
 
 def test_few_rays_make_no_triangles_and_a_cap_keeps_the_brightest() -> None:

@@ -10,16 +10,15 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from test_identify import ARCSEC, FISHEYE, NARROW, Frame, detected, frame, off, rays_about, scattered, sky
+from test_identification import ARCSEC, FISHEYE, NARROW, Frame, detected, frame, off, rays_about, scattered, sky
 
 from startrack.frames import R_from_rotvec, wahba
 from startrack.identification import Identifier
-from startrack.identification.attitudes import AttitudeSearch
-from startrack.identification.index import Patterns
-from startrack.identification.matching import Light, Pairs, last_of_each
+from startrack.identification.attitude_search import AttitudeSearch
+from startrack.identification.index import CatalogPatterns, PerObject
 from startrack.identification.pairs import build_pairs
 from startrack.identification.triangles import sides_of_few, triangles
-from startrack.identification.weak_cache import KeptPerObject
+from startrack.match import CandidatePairs, PhotometricScale, last_of_each
 from startrack.types import NotIdentified
 
 
@@ -47,7 +46,7 @@ def test_the_stars_of_a_short_list_are_all_but_all_named(false: int) -> None:
 
 
 def test_a_hundred_stars_do_not_need_the_deep_index(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Patterns, "deep", None)  # using it would raise
+    monkeypatch.setattr(CatalogPatterns, "deep", None)  # using it would raise
     for seed in range(20):
         truth = hundred(100 + seed)
         assert off(Identifier()(truth.detections, FISHEYE, sky()), truth) < 40 * ARCSEC
@@ -60,9 +59,9 @@ def test_every_hypothesis_counts_against_the_answer() -> None:
     assert caught.value.evidence["tried"] > 50
     true = hundred(2)
     few = Identifier()(true.detections, FISHEYE, sky())
-    search = AttitudeSearch.attitudes
+    search = AttitudeSearch.hypotheses
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(AttitudeSearch, "attitudes", lambda self, *how: _after(self, 10**6, search(self, *how)))
+        patch.setattr(AttitudeSearch, "hypotheses", lambda self, *how: _after(self, 10**6, search(self, *how)))
         many = Identifier()(true.detections, FISHEYE, sky())
     assert many.false_alarm_probability >= few.false_alarm_probability
 
@@ -95,12 +94,12 @@ def test_a_mirrored_short_list_is_named_as_such() -> None:
 
 
 def test_pairs_are_those_of_a_brute_force_search() -> None:
-    patterns = Patterns(sky(), 2 * np.pi)
+    patterns = CatalogPatterns(sky(), 2 * np.pi)
     rays = sky().rays_icrs[[10, 20, 500]] + np.random.default_rng(2).normal(0, 1e-3, (3, 3))
     rays = np.concatenate([rays, sky().rays_icrs[sky().hip == 17702]])  # in the Pleiades: many neighbours
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     for count, radius in ((700, 0.02), (3000, 0.02), (len(sky()), 0.004)):
-        near = patterns.near(rays, radius, count)
+        near = patterns.neighbours(rays, radius, count)
         assert count <= near.depth <= 2 * count + 1000
         distance = np.linalg.norm(rays[:, None] - sky().rays_icrs[None, : near.depth], axis=2)
         expected = np.argwhere(distance < 2 * np.sin(radius / 2))
@@ -142,19 +141,19 @@ def test_facts_are_kept_per_object_and_forgotten_with_it() -> None:
     class Thing:
         pass
 
-    kept = KeptPerObject(lambda thing: calls.append(thing.__class__) or len(calls))
+    kept = PerObject(lambda thing: calls.append(thing.__class__) or len(calls))
     one, other = Thing(), Thing()
     assert [kept(one), kept(one), kept(other)] == [1, 1, 2]
     del one
     gc.collect()
-    assert len(kept._kept) == 1
+    assert len(kept._cache) == 1
 
 
-def pairs_of(detection: list[int], star: list[int], distance_px: list[float], v_mag: list[float]) -> Pairs:
+def pairs_of(detection: list[int], star: list[int], distance_px: list[float], v_mag: list[float]) -> CandidatePairs:
     """Detections all measured at V 3; stars of the magnitudes given."""
     v, none = np.array(v_mag), np.zeros(max(detection) + 1)
-    light = Light(none + 3.0, none > 0, 6.0, 5.0)
-    return Pairs(np.array(detection), np.array(star), np.array(distance_px), v, np.zeros(len(v)), light)
+    light = PhotometricScale(none + 3.0, none > 0, 6.0, 5.0)
+    return CandidatePairs(np.array(detection), np.array(star), np.array(distance_px), v, np.zeros(len(v)), light)
 
 
 BLENDS = {
@@ -173,7 +172,7 @@ BLENDS = {
 def test_a_blend_goes_by_the_name_of_the_plainly_brighter_star(case: str) -> None:
     *listed, named = BLENDS[case]
     pairs = pairs_of(*listed)
-    plain = pairs.plain(pairs.nearest, np.full(len(pairs.nearest), 0.04), 3.0)
+    plain = pairs.unambiguous(pairs.one_to_one, np.full(len(pairs.one_to_one), 0.04), 3.0)
     assert len(set(pairs.star[plain].tolist())) == len(set(pairs.detection[plain].tolist())) == len(plain)
     if named is not None:
         assert pairs.star[plain].tolist() == named

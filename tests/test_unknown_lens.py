@@ -13,15 +13,21 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from startrack.adjust import solve_attitude
 from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole
 from startrack.catalog import load_catalog
 from startrack.cli.main import main
 from startrack.exposure import read_exposure
 from startrack.frames import angle_between_rad
-from startrack.identification.proximity_mask import sky_map
-from startrack.identification.radial_lens_family import EQUIDISTANT, EQUISOLID, ORTHOGRAPHIC, STEREOGRAPHIC, Family
-from startrack.identification.unknown_lens import BlindSolution, identify_blind
-from startrack.orient import solve_attitude
+from startrack.identification.proximity_mask import proximity_mask
+from startrack.identification.radial_lens_family import (
+    EQUIDISTANT,
+    EQUISOLID,
+    ORTHOGRAPHIC,
+    STEREOGRAPHIC,
+    RadialFamily,
+)
+from startrack.identification.unknown_lens import UnknownLensSolution, identify_unknown_lens
 from startrack.pipeline import identify_blind as identify_picture
 from startrack.types import Detections, NotIdentified, Stars
 
@@ -98,7 +104,7 @@ def listed(name: str) -> Detections:
     )
 
 
-def boresight_off_rad(found: BlindSolution, ra_deg: float, dec_deg: float) -> float:
+def boresight_off_rad(found: UnknownLensSolution, ra_deg: float, dec_deg: float) -> float:
     ra, dec = np.radians([ra_deg, dec_deg])
     want = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
     middle = (np.array(found.camera.size_px) - 1) / 2
@@ -107,15 +113,15 @@ def boresight_off_rad(found: BlindSolution, ra_deg: float, dec_deg: float) -> fl
 
 
 LENSES = {
-    "equidistant, 20 px off centre": (lens_camera(Family(EQUIDISTANT), 180, 520, off=(20, -15)), {}, 180),
-    "equisolid, mirrored": (lens_camera(Family(EQUISOLID), 180, 520, mirrored=True), {}, 180),
-    "stereographic": (lens_camera(Family(STEREOGRAPHIC), 180, 520), {}, 180),
-    "orthographic": (lens_camera(Family(ORTHOGRAPHIC), 170, 520), {}, 170),
+    "equidistant, 20 px off centre": (lens_camera(RadialFamily(EQUIDISTANT), 180, 520, off=(20, -15)), {}, 180),
+    "equisolid, mirrored": (lens_camera(RadialFamily(EQUISOLID), 180, 520, mirrored=True), {}, 180),
+    "stereographic": (lens_camera(RadialFamily(STEREOGRAPHIC), 180, 520), {}, 180),
+    "orthographic": (lens_camera(RadialFamily(ORTHOGRAPHIC), 170, 520), {}, 170),
     "no ideal lens, 185 degrees": (lens_camera(KannalaBrandt((-0.03, 0.02, -0.015, 0.002)), 185, 520), {}, 185),
-    "clipped by the frame": (lens_camera(Family(EQUISOLID), 180, 640, size=(1400, 900)), {}, 180),
-    "twenty hot pixels brighter than the stars": (lens_camera(Family(EQUISOLID), 180, 520), {"hot": 20}, 180),
-    "a third of the sky": (lens_camera(Family(EQUISOLID), 180, 520), {"hidden": 0.67}, 180),
-    "30 stars": (lens_camera(Family(EQUIDISTANT), 180, 520), {"brightest": 30, "hidden": 0.0}, 180),
+    "clipped by the frame": (lens_camera(RadialFamily(EQUISOLID), 180, 640, size=(1400, 900)), {}, 180),
+    "twenty hot pixels brighter than the stars": (lens_camera(RadialFamily(EQUISOLID), 180, 520), {"hot": 20}, 180),
+    "a third of the sky": (lens_camera(RadialFamily(EQUISOLID), 180, 520), {"hidden": 0.67}, 180),
+    "30 stars": (lens_camera(RadialFamily(EQUIDISTANT), 180, 520), {"brightest": 30, "hidden": 0.0}, 180),
     "70 degrees": (lens_camera(Pinhole(), 70, 700), {"limit": 6.0}, 70),
     "20 degrees": (lens_camera(Pinhole(), 20, 700), {"limit": 7.0, "hidden": 0.0}, 20),
     "20 degrees, mirrored": (lens_camera(Pinhole(), 20, 700, mirrored=True), {"limit": 6.5, "hidden": 0.0}, 20),
@@ -127,7 +133,7 @@ LENSES = {
 def test_the_lens_is_found_with_the_stars(case: str, wrong_by: float) -> None:
     camera, how, fov = LENSES[case]
     seen, truth, R = picture(camera, seed=3, **how)
-    found = identify_blind(seen, camera.size_px, np.radians(fov * wrong_by), sky())
+    found = identify_unknown_lens(seen, camera.size_px, np.radians(fov * wrong_by), sky())
     names = found.identification
     assert np.mean(truth[names.detection] == names.star) >= 0.98
     assert len(set(names.star.tolist())) == len(set(names.detection.tolist())) == len(names)
@@ -149,13 +155,13 @@ def test_noise_is_refused_in_bounded_time() -> None:
     for n, fov in ((40, 180), (300, 15)):
         noise = detections(rng.uniform(0, 1, (n, 2)) * SIZE, np.sort(rng.pareto(1.5, n) + 1)[::-1])
         with pytest.raises(NotIdentified, match="better than chance") as refusal:
-            identify_blind(noise, SIZE, np.radians(fov), sky())
+            identify_unknown_lens(noise, SIZE, np.radians(fov), sky())
         assert refusal.value.evidence["tried"] < 1_500_000  # patterns: the measure of its time
 
 
 def test_too_few_stars_are_refused_at_once() -> None:
     with pytest.raises(NotIdentified, match="too few"):
-        identify_blind(detections(np.arange(12.0).reshape(6, 2) * 80, np.ones(6)), SIZE, np.pi, sky())
+        identify_unknown_lens(detections(np.arange(12.0).reshape(6, 2) * 80, np.ones(6)), SIZE, np.pi, sky())
 
 
 @pytest.mark.parametrize(
@@ -167,7 +173,7 @@ def test_narrow_photographs_agree_with_two_other_solvers(
 ) -> None:
     seen = listed(name)
     for fov in (10.4, 11.4, 12.4):
-        found = identify_blind(seen, (1024, 768), np.radians(fov), sky())
+        found = identify_unknown_lens(seen, (1024, 768), np.radians(fov), sky())
         assert boresight_off_rad(found, ra_deg, dec_deg) < arcsec * ARCSEC
         assert 2 * np.degrees(np.arctan(512 / found.camera.focal_px[0])) == pytest.approx(11.423, abs=0.01)
         assert len(found.identification) >= 70
@@ -176,11 +182,11 @@ def test_narrow_photographs_agree_with_two_other_solvers(
 
 def test_an_overcast_photograph_is_refused() -> None:
     with pytest.raises(NotIdentified, match="better than chance"):
-        identify_blind(listed("overcast.csv"), (1392, 1040), np.pi, sky())
+        identify_unknown_lens(listed("overcast.csv"), (1392, 1040), np.pi, sky())
 
 
 def test_a_moonlit_photograph_is_identified() -> None:
-    found = identify_blind(listed("moonlit.csv"), (1392, 1040), np.pi, sky())
+    found = identify_unknown_lens(listed("moonlit.csv"), (1392, 1040), np.pi, sky())
     assert len(found.identification) >= 300
     assert found.camera.focal_px[0] == pytest.approx(337.2, abs=1.0)  # of the same camera on another night
     assert found.camera.centre_px == pytest.approx((709.7, 489.7), abs=1.0)
@@ -229,11 +235,11 @@ def test_its_mirror_image_half_covered_is_said_to_be_mirrored(photo, tmp_path, c
 def test_the_map_of_the_sky_is_that_of_a_search() -> None:
     rng = np.random.default_rng(1)
     rays, asked = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in rng.normal(size=(2, 3000, 3)))
-    near = sky_map(rays[:400], np.radians(1.5))
+    near = proximity_mask(rays[:400], np.radians(1.5))
     angle = 2 * np.arcsin(cKDTree(rays[:400]).query(asked)[0] / 2)
     clear = np.abs(angle - np.radians(1.5)) > np.radians(0.6)  # cells are three quarters of a degree
     assert np.array_equal(near(asked)[clear], angle[clear] < np.radians(1.5))
-    assert near.covered == pytest.approx(400 * (1 - np.cos(np.radians(1.5))) / 2, rel=0.08)
+    assert near.sky_fraction == pytest.approx(400 * (1 - np.cos(np.radians(1.5))) / 2, rel=0.08)
 
 
 @pytest.mark.parametrize(("name", "lists"), [("equisolid, mirrored", 30), ("70 degrees", 12), ("20 degrees", 12)])
@@ -242,7 +248,7 @@ def test_the_attitude_is_as_sure_as_it_says_though_the_lens_comes_from_the_same_
     nees = []
     for seed in range(100, 100 + lists):
         seen, _, R = picture(camera, seed, **picture_of)
-        found = identify_blind(seen, camera.size_px, np.radians(fov), sky())
+        found = identify_unknown_lens(seen, camera.size_px, np.radians(fov), sky())
         named = found.identification
         attitude = solve_attitude(
             found.camera, seen.xy_px[named.detection], seen.covariance_px2[named.detection],

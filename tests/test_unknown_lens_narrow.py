@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_blind import SIZE, detections, lens_camera, picture, sky
+from test_unknown_lens import SIZE, detections, lens_camera, picture, sky
 
 from startrack.camera import KannalaBrandt, Pinhole
-from startrack.identification.shape_index import similar_triangles
+from startrack.identification.narrow_field import NarrowFieldSearch
+from startrack.identification.shape_index import shape_index
 from startrack.identification.triangles import triangles
-from startrack.identification.unknown_lens import LOG_FALSE_ALARM, identify_blind
-from startrack.identification.unknown_lens_narrow import NarrowSearch
+from startrack.identification.unknown_lens import LOG_FALSE_ALARM, identify_unknown_lens
 from startrack.types import Detections
 
 FIELD_SR = 0.05
 
 
-def search(seen: Detections, fov: float, size: tuple[int, int] = SIZE) -> NarrowSearch:
-    return NarrowSearch(seen, np.arange(min(len(seen), 100)), size, np.radians(fov), FIELD_SR, sky())
+def search(seen: Detections, fov: float, size: tuple[int, int] = SIZE) -> NarrowFieldSearch:
+    return NarrowFieldSearch(seen, np.arange(min(len(seen), 100)), size, np.radians(fov), FIELD_SR, sky())
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -27,13 +27,13 @@ def test_the_first_view_voted_for_is_right(seed: int, wrong_by: float, mirrored:
     camera = lens_camera(Pinhole(), 16, 700, mirrored=mirrored)
     seen, truth, R = picture(camera, seed=seed, limit=7.0, hidden=0.2)
     narrow = search(seen, 16 * wrong_by)
-    found = next(narrow.found())
+    found = next(narrow.views())
     assert narrow.tried < 30_000
-    assert found.judged.log_chance < LOG_FALSE_ALARM
+    assert found.lens.log_p < LOG_FALSE_ALARM
     assert found.view.mirrored == mirrored
     assert found.view.focal_px == pytest.approx(camera.focal_px[0], rel=1e-3)
-    names = found.around[found.judged.star]
-    assert np.mean(truth[found.judged.detection] == names) >= 0.98
+    names = found.around[found.lens.star]
+    assert np.mean(truth[found.lens.detection] == names) >= 0.98
     assert np.trace(found.view.R_cam_icrs.T @ R) > 3 - 1e-7
 
 
@@ -45,7 +45,7 @@ def test_a_narrow_lens_that_bends_is_not_called_a_pinhole(bend_px: float) -> Non
     lens = KannalaBrandt((1 / 3 + bend, 2 / 15, 17 / 315, 62 / 2835))
     camera = lens_camera(lens, 30, 700 + bend_px)
     seen, truth, R = picture(camera, seed=5, limit=6.5, hidden=0.0)
-    found = identify_blind(seen, SIZE, np.radians(30), sky())
+    found = identify_unknown_lens(seen, SIZE, np.radians(30), sky())
     names = found.identification
     assert np.mean(truth[names.detection] == names.star) >= 0.98
     assert found.camera.lens.model == "kannala_brandt"
@@ -68,7 +68,7 @@ def test_noise_in_heaps_or_not_is_nowhere_near_an_answer(seed: int) -> None:
     )
     noise = detections(np.clip(xy, 0, np.array(SIZE) - 1), 100 * np.sort(rng.pareto(1.5, n) + 1)[::-1])
     narrow = search(noise, 14)
-    assert all(found.judged.log_chance > -12 for found in narrow.found())
+    assert all(found.lens.log_p > -12 for found in narrow.views())
     assert narrow.tried > 1000
 
 
@@ -76,7 +76,7 @@ def test_similar_triangles_are_those_of_a_comparison_of_all_with_all() -> None:
     rng = np.random.default_rng(1)
     rays = rng.normal(size=(150, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    index = similar_triangles(triangles(rays, 0.9), shape_tolerance=0.02, size_tolerance=0.13)
+    index = shape_index(triangles(rays, 0.9), shape_tolerance=0.02, size_tolerance=0.13)
     image = triangles(rays[:40], 1.0)
     left, right = index.candidates(image)
     sides, others = image.sides_rad[:, None], index.triangles.sides_rad[None]

@@ -1,9 +1,18 @@
-"""Camera calibration from the stars themselves: lens with covariance, sensor, and what speaks for or against them."""
+"""Camera calibration from the stars: lens with covariance, throughput, sensor, and acceptance checks."""
 
-from startrack.calibration.fit import LensFit, fit_lens
-from startrack.calibration.initial_camera import first_state
-from startrack.calibration.observations import Observations, observations
-from startrack.calibration.photometry import Given
+from startrack.adjust import Observations, observations
+from startrack.calibration.initial_camera import initial_state
+from startrack.calibration.lens_fit import LensFit, fit_lens
+from startrack.calibration.photometry import KnownSensor
 from startrack.calibration.run import Calibration, calibrate
 
-__all__ = ["Calibration", "Given", "LensFit", "Observations", "calibrate", "first_state", "fit_lens", "observations"]
+__all__ = [
+    "Calibration",
+    "KnownSensor",
+    "LensFit",
+    "Observations",
+    "calibrate",
+    "fit_lens",
+    "initial_state",
+    "observations",
+]

@@ -1,4 +1,4 @@
-"""What must be true of a calibration before it is handed out, and what to do where it is not."""
+"""Acceptance checks of a calibration, and what to do where one fails."""
 
 from __future__ import annotations
 
@@ -6,50 +6,51 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.calibration.initial_camera import attitudes, opposite
+from startrack.adjust import Observations
+from startrack.calibration.initial_camera import fit_attitudes, mirror_camera
 from startrack.calibration.matching import match_frame
-from startrack.calibration.observations import Observations
-from startrack.calibration.region_growing import Joint
+from startrack.calibration.region_growing import JointFit
 from startrack.camera import Camera
 from startrack.camera.uncertainty import cap_grid
+from startrack.false_alarm import log_p_value_poisson
 from startrack.frames import R_from_rotvec
 from startrack.types import Array, Ints
 
 FEWEST_MATCHES = 40
-FRACTION = 0.6
-HELD_OUT_RMS_PX = 1.0
-MAP_SIGMA_PX = 0.5
-CHANCE = 1e-9
-MOST_CERTAIN = -690.0  # natural logarithm
+SMALLEST_FRACTION = 0.6
+LARGEST_HELD_OUT_RMS_PX = 1.0
+LARGEST_MAP_SIGMA_PX = 0.5
+MOST_FALSE_ALARM = 1e-9
 RINGS = 4
 SECTORS = 8
 STARS_PER_RING = 3
 STARS_PER_SECTOR = 2
-SECTORS_WANTED = 5
-TURNED_RAD = tuple(np.radians((-31.0, -17.0, 13.0, 29.0)))  # skies that cannot match but by chance
+FEWEST_SECTORS = 5
+WRONG_ROTATIONS_RAD = tuple(np.radians((-31.0, -17.0, 13.0, 29.0)))  # attitudes at which only chance matches
+FEWEST_BY_CHANCE = 0.5
 
 
 @dataclass(frozen=True)
-class Gate:
-    """One condition."""
+class Check:
+    """One condition of acceptance."""
 
     name: str
     value: float
     limit: str  # in words, such as ">= 40"
     passed: bool
     reason: str  # of the refusal
-    advice: str  # what pictures to take, or what to look after
+    advice: str  # which pictures to take
 
 
-class Gated:
-    """Whatever was asked for by gates."""
+class Checked:
+    """A calibration with its acceptance checks."""
 
-    gates: tuple[Gate, ...]
+    checks: tuple[Check, ...]
 
     @property
-    def failed(self) -> tuple[Gate, ...]:
-        """The gates that the calibration did not pass."""
-        return tuple(gate for gate in self.gates if not gate.passed)
+    def failed(self) -> tuple[Check, ...]:
+        """The checks that the calibration did not pass."""
+        return tuple(check for check in self.checks if not check.passed)
 
     @property
     def accepted(self) -> bool:
@@ -65,8 +66,8 @@ class Coverage:
     stars: Array  # (rings, sectors) counts
 
 
-def coverage(joint: Joint) -> Coverage:
-    """Counts of the used stars of all frames: rings of equal width in angle, sectors from image right, clockwise."""
+def star_coverage(joint: JointFit) -> Coverage:
+    """Counts of the used stars of all frames by ring (equal widths) and sector (clockwise from image right)."""
     camera, points = joint.fit.camera, joint.points.take(joint.fit.used)
     angle, ring, sector = rings_and_sectors(camera, points)
     edges = np.linspace(0.0, camera.calibrated_angle_rad, RINGS + 1)
@@ -81,17 +82,15 @@ def rings_and_sectors(camera: Camera, points: Observations) -> tuple[Array, Ints
     angle = camera.angle_rad(points.xy_px)
     ring = np.clip((RINGS * angle / camera.calibrated_angle_rad).astype(int), 0, RINGS - 1)
     offset = points.xy_px - np.asarray(camera.centre_px)
-    turn = np.arctan2(offset[:, 1], offset[:, 0]) % (2 * np.pi)
-    return angle, ring, np.minimum((SECTORS * turn / (2 * np.pi)).astype(int), SECTORS - 1)
+    around = np.arctan2(offset[:, 1], offset[:, 0]) % (2 * np.pi)
+    return angle, ring, np.minimum((SECTORS * around / (2 * np.pi)).astype(int), SECTORS - 1)
 
 
-def log_chance(joint: Joint) -> float:
-    """ln P(as many matches as were found, by chance).
+def joint_log_p_value(joint: JointFit) -> float:
+    """Log-probability (natural) of as many matches by chance.
 
-    Measured, not modelled: the same matching at attitudes that are surely wrong.
+    The number expected by chance is measured: by the same matching at attitudes that are certainly wrong.
     """
-    from scipy.special import gammainc
-
     camera, within = joint.fit.camera, joint.fit.camera.calibrated_angle_rad
     found = sum(map(len, joint.matches))
     wrong = [
@@ -99,56 +98,58 @@ def log_chance(joint: Joint) -> float:
             len(match_frame(frame, camera, R_from_rotvec(np.array([0.0, 0.3 * turn, turn])) @ R, within, joint.gate_px))
             for frame, R in zip(joint.frames, joint.fit.R_cam_icrs, strict=True)
         )
-        for turn in TURNED_RAD
+        for turn in WRONG_ROTATIONS_RAD
     ]
-    tail = float(gammainc(max(found, 1), max(float(np.mean(wrong)), 0.5)))  # of a Poisson distribution
-    return max(float(np.log(max(tail, 1e-300))), MOST_CERTAIN)
+    return log_p_value_poisson(found, max(float(np.mean(wrong)), FEWEST_BY_CHANCE))
 
 
-def opposite_rms_px(joint: Joint) -> float:
-    """Median distance [px] at which the mirror image's camera puts the same stars."""
-    mirrored, points = opposite(joint.fit.camera), joint.points.take(joint.fit.used)
-    R = attitudes(mirrored, points)
+def mirrored_residual_px(joint: JointFit) -> float:
+    """Median residual [px] of the same stars with the mirror-image camera."""
+    mirrored, points = mirror_camera(joint.fit.camera), joint.points.take(joint.fit.used)
+    R = fit_attitudes(mirrored, points)
     rays = np.einsum("nij,nj->ni", R[points.image], points.rays_icrs)
     return float(np.median(np.linalg.norm(mirrored.project(rays)[0] - points.xy_px, axis=1)))
 
 
-def gates(joint: Joint) -> tuple[Gate, ...]:
-    """All conditions, in the order in which a reader should look at them."""
+def check_acceptance(joint: JointFit) -> tuple[Check, ...]:
+    """All checks, the most telling first."""
     fit, matches = joint.fit, joint.matches
     stars = int(fit.used.sum())
     fraction = float(np.average([m.fraction for m in matches], weights=[max(len(m), 1) for m in matches]))
-    chance = log_chance(joint)
-    cover = coverage(joint)
+    log_p = joint_log_p_value(joint)
+    cover = star_coverage(joint)
     rings = int(np.sum(cover.stars.sum(axis=1) >= STARS_PER_RING))
     sectors = int(np.sum(cover.stars.sum(axis=0) >= STARS_PER_SECTOR))
-    sigma = float(np.max(fit.camera.projection_sigma_px(seen_rays(fit.camera))))
+    sigma = float(np.max(fit.camera.projection_sigma_px(calibrated_rays(fit.camera))))
     held = fit.held_out_rms_px
-    handed = opposite_rms_px(joint)
+    mirrored = mirrored_residual_px(joint)
     return (
-        Gate("matched stars", stars, f">= {FEWEST_MATCHES}", stars >= FEWEST_MATCHES, "not_identified",
+        Check("matched stars", stars, f">= {FEWEST_MATCHES}", stars >= FEWEST_MATCHES, "not_identified",
              "expose longer or open the lens, or add more pictures of the clear night sky"),
-        Gate("matched fraction", fraction, f">= {FRACTION}", fraction >= FRACTION, "inconsistent_evidence",
-             "the map leaves bright stars or bright sources without partner: use a clear sky without cloud, "
+        Check("matched fraction", fraction, f">= {SMALLEST_FRACTION}", fraction >= SMALLEST_FRACTION,
+             "inconsistent_evidence",
+             "bright stars lack a source, or bright sources a star: use a clear sky without cloud, "
              "and check the time and the site"),
-        Gate("log10 chance of as many matches", chance / np.log(10), "<= -9", chance <= np.log(CHANCE),
+        Check("log10 chance of as many matches", log_p / np.log(10), "<= -9", log_p <= np.log(MOST_FALSE_ALARM),
              "not_identified", "more stars are needed: expose longer, focus better"),
-        Gate("held-out RMS [px]", held, f"<= {HELD_OUT_RMS_PX}", held <= HELD_OUT_RMS_PX,
+        Check("held-out RMS [px]", held, f"<= {LARGEST_HELD_OUT_RMS_PX}", held <= LARGEST_HELD_OUT_RMS_PX,
              "inconsistent_evidence", "sharp stars are needed: focus, expose shorter, keep the camera still"),
-        Gate("rings with stars", rings, f"= {RINGS}", rings == RINGS, "insufficient_geometry",
+        Check("rings with stars", rings, f"= {RINGS}", rings == RINGS, "insufficient_geometry",
              "take pictures where stars fill the image from its middle to its edge: open sky, no walls"),
-        Gate("sectors with stars", sectors, f">= {SECTORS_WANTED} of {SECTORS}", sectors >= SECTORS_WANTED,
+        Check("sectors with stars", sectors, f">= {FEWEST_SECTORS} of {SECTORS}", sectors >= FEWEST_SECTORS,
              "insufficient_geometry", "add pictures with the camera turned about its axis, so that stars fall on the "
              "empty side of the image too"),
-        Gate("map sigma [px]", sigma, f"<= {MAP_SIGMA_PX}", sigma <= MAP_SIGMA_PX, "insufficient_geometry",
+        Check("map sigma [px]", sigma, f"<= {LARGEST_MAP_SIGMA_PX}", sigma <= LARGEST_MAP_SIGMA_PX,
+             "insufficient_geometry",
              "more stars near the edge of the image are needed: add pictures at other attitudes of the camera"),
-        Gate("opposite handedness [px]", handed, f">= {5 * HELD_OUT_RMS_PX:g}", handed >= 5 * HELD_OUT_RMS_PX,
-             "inconsistent_evidence", "stars on one line cannot tell an image from its mirror image: add pictures"),
+        Check("opposite handedness [px]", mirrored, f">= {5 * LARGEST_HELD_OUT_RMS_PX:g}",
+             mirrored >= 5 * LARGEST_HELD_OUT_RMS_PX,
+             "inconsistent_evidence", "stars on one line do not determine the handedness: add pictures"),
     )  # fmt: skip
 
 
-def seen_rays(camera: Camera) -> Array:
-    """Rays of the calibrated cap that fall into the frame."""
+def calibrated_rays(camera: Camera) -> Array:
+    """Rays (n, 3) of the calibrated cap that fall into the frame."""
     grid = cap_grid(camera.calibrated_angle_rad)
     inside = camera.project(grid)[1]
     return grid[inside] if inside.any() else grid

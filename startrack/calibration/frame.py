@@ -1,8 +1,8 @@
-"""One exposure as a calibration needs it: its point sources, and the sky as it stood above the camera."""
+"""One exposure of a calibration: its point sources and the apparent sky; and the removal of static sources."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from datetime import datetime
 
 import numpy as np
@@ -17,11 +17,13 @@ from startrack.frames import (
     rays_from_azel,
     refract_rad,
 )
-from startrack.types import Array, BadInput, Detections, Exposure, Stars
+from startrack.types import Array, BadInput, Bools, Centroids, Exposure, Stars, take_rows
 
-LOWEST_RAD = np.radians(3.0)  # on the Earth: below, the air's refraction is anybody's guess
+LOWEST_RAD = np.radians(3.0)  # on the Earth; below it refraction is not predictable
 SEA_LEVEL_HPA, SCALE_HEIGHT_M = 1010.0, 8430.0  # average air
-ANYWHERE = Site("moon", 0.0, 0.0)  # its velocity serves where no site is known: 0.7 arcsec of aberration at most
+DEFAULT_SITE = Site("moon", 0.0, 0.0)  # without a site; at most 0.7 arcsec of aberration off
+SAME_PX = 0.7
+TURNED_PX = 4.0  # motion of the sky in the image from which a source at the same pixel is not a star
 NO_TIME = (
     "the mid-exposure time is not known: give --time UTC, a sidecar NAME.json with time_utc, or a header with it; "
     "nothing is guessed"
@@ -30,7 +32,7 @@ NO_TIME = (
 
 @dataclass(frozen=True, kw_only=True)
 class Sky:
-    """Catalogue stars where the air, if there is any, shows them; brightest first."""
+    """Catalogue stars in their apparent directions, refraction included where there is air; brightest first."""
 
     stars: Stars
     b_v: Array  # (n,)
@@ -45,38 +47,37 @@ class Sky:
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """An exposure's sources and sky."""
+    """An exposure with its sources and its sky."""
 
     name: str
     exposure: Exposure
     time_utc: datetime
     size_px: tuple[int, int]
-    detections: Detections  # fluxes in ADU; its pixel images are left out
+    sources: Centroids  # fluxes in ADU
     sky: Sky
 
 
-def frame_of(exposure: Exposure, catalog: StarCatalog, site: Site | None, detector: Detector | None = None) -> Frame:
-    """Detect, and put up the sky of the exposure's time. Raises BadInput no_time, TooFewStars."""
+def load_frame(exposure: Exposure, catalog: StarCatalog, site: Site | None, detector: Detector | None = None) -> Frame:
+    """Detect the sources and compute the sky at the exposure's time. Raises BadInput no_time, TooFewStars."""
     if exposure.time_utc is None:
         raise BadInput("no_time", f"{exposure.name}: {NO_TIME}")
     found = (detector or Detector())(exposure, None)
-    nothing = np.zeros((1, 1), dtype=np.float32)
     return Frame(
         name=exposure.name,
         exposure=exposure,
         time_utc=exposure.time_utc,
         size_px=exposure.size_px,
-        detections=replace(found, background_e=nothing, noise_e=nothing),
+        sources=Centroids(**{f.name: getattr(found, f.name) for f in fields(Centroids)}),
         sky=sky_at(catalog, exposure.time_utc, site),
     )
 
 
 def sky_at(catalog: StarCatalog, time_utc: datetime, site: Site | None) -> Sky:
-    """The catalogue above a site: aberration always; on the Earth refraction, and no star lower than 3 degrees.
+    """The catalogue at a time and site: with aberration; on the Earth with refraction, above 3 degrees of elevation.
 
-    Without a site there is no refraction: on the Earth it then ends up in the lens.
+    Without a site there is no refraction: on the Earth the fitted lens then contains it.
     """
-    stars = catalog.at(time_utc, observer_velocity_m_s(site or ANYWHERE, time_utc))
+    stars = catalog.at(time_utc, observer_velocity_m_s(site or DEFAULT_SITE, time_utc))
     if site is None:
         return Sky(stars=stars, b_v=catalog.b_v, elevation_rad=None, R_enu_icrs=None)
     R = R_enu_icrs(site, time_utc)
@@ -93,3 +94,34 @@ def sky_at(catalog: StarCatalog, time_utc: datetime, site: Site | None) -> Sky:
 def pressure_hpa(height_m: float) -> float:
     """Average air pressure at a height above the sea."""
     return float(SEA_LEVEL_HPA * np.exp(-height_m / SCALE_HEIGHT_M))
+
+
+def remove_static_sources(frames: tuple[Frame, ...], R_cam_icrs: Array) -> tuple[Frame, ...]:
+    """The frames without sources that keep their pixel while the sky moves: hot pixels, dust, lamps.
+
+    `R_cam_icrs`: attitudes (frames, 3, 3).
+    """
+    return tuple(
+        replace(frame, sources=take_rows(frame.sources, ~_is_static(i, frames, R_cam_icrs)))
+        for i, frame in enumerate(frames)
+    )
+
+
+def has_turned(one: Array, other: Array, size_px: tuple[int, int]) -> bool:
+    """Whether the sky has clearly moved in the image between two attitudes (3, 3), except near the rotation's axis."""
+    between = other @ one.T
+    angle = np.arctan2(np.linalg.norm(between - between.T) / np.sqrt(8.0), (np.trace(between) - 1.0) / 2.0)
+    return bool(angle * max(size_px) / 4.0 > TURNED_PX)
+
+
+def _is_static(i: int, frames: tuple[Frame, ...], R_cam_icrs: Array) -> Bools:
+    """Whether each source (n,) of frame `i` lies at the pixel of a source of a frame whose sky has moved."""
+    from scipy.spatial import cKDTree
+
+    xy = frames[i].sources.xy_px
+    static = np.zeros(len(xy), dtype=bool)
+    for j, other in enumerate(frames):
+        if j != i and has_turned(R_cam_icrs[i], R_cam_icrs[j], other.size_px):
+            distance, _ = cKDTree(other.sources.xy_px).query(xy, distance_upper_bound=SAME_PX)
+            static |= np.isfinite(distance)
+    return static

@@ -1,4 +1,4 @@
-"""A first camera from matched stars alone: focal length, kind of lens, handedness and attitudes."""
+"""Initial camera from matched stars alone: focal length, kind of lens, handedness and attitudes."""
 
 from __future__ import annotations
 
@@ -7,16 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from startrack.calibration.observations import Observations
-from startrack.calibration.solve import State
+from startrack.adjust import Observations, State
 from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole
 from startrack.frames import angle_between_rad, wahba
 from startrack.types import Array, Ints, NotIdentified
 
-PAIRS_OF = 80
-NEAR_PAIRS = 0.3
-STRETCHES = np.geomspace(0.6, 1.7, 23)
-# Equidistant, equisolid, stereographic and orthographic as polynomials: good enough to begin with.
+PAIR_STARS = 80  # of an image, whose pairs give the focal length
+NEAR_PAIRS_QUANTILE = 0.3
+FOCAL_FACTORS = np.geomspace(0.6, 1.7, 23)
+# Equidistant, equisolid, stereographic and orthographic as short polynomials.
 LENSES: tuple[Lens, ...] = (
     KannalaBrandt(),
     KannalaBrandt((-1 / 24,)),
@@ -26,46 +25,43 @@ LENSES: tuple[Lens, ...] = (
 )
 ROUNDS = 8
 IMAGES_TRIED = 3
-WRONG_RAD = np.radians(4.0)  # a ray this far off does not count
+OUTLIER_RAD = np.radians(4.0)  # larger errors of a ray count as this one
 FIRST_TOLERANCE_RAD = np.radians(1.0)
+SMALLEST_TOLERANCE_RAD = 1e-4
 
 
-def first_state(points: Observations, size_px: tuple[int, int]) -> State:
-    """The best of many simple cameras in the middle of the frame, both handednesses tried, with its attitudes.
+def initial_state(points: Observations, size_px: tuple[int, int]) -> State:
+    """The best of many simple cameras with the axis in the middle of the frame, with its attitudes.
 
-    Wrong matches do not matter as long as they are fewer than half. Raises NotIdentified without any points.
+    Up to half of the matches may be wrong. Raises NotIdentified without observations.
     """
     if not len(points):
-        raise NotIdentified("no matched stars to begin a calibration with")
+        raise NotIdentified("a calibration needs matched stars")
     some = points.take(np.isin(points.image, _fullest_images(points)))
-    best: tuple[float, Camera] | None = None
-    for camera in _cameras(_focal_px(some), size_px):
-        score = float(np.sum(_misses(camera, some)[1]))
-        if best is None or score < best[0]:
-            best = (score, camera)
-    assert best is not None
-    return State(camera=best[1], R_cam_icrs=_misses(best[1], points)[0])
+    best = min(_cameras(_focal_px(some), size_px), key=lambda camera: float(np.sum(_fit_rays(camera, some)[1])))
+    return State(camera=best, R_cam_icrs=fit_attitudes(best, points))
 
 
-def opposite(camera: Camera) -> Camera:
+def mirror_camera(camera: Camera) -> Camera:
     """The camera of the mirror image."""
     return replace(camera, mirrored=not camera.mirrored)
 
 
-def attitudes(camera: Camera, points: Observations) -> Array:
-    """R_cam_icrs (images, 3, 3) by robustly weighted rotations; identity where an image has no points."""
-    return _misses(camera, points)[0]
+def fit_attitudes(camera: Camera, points: Observations) -> Array:
+    """R_cam_icrs (images, 3, 3), robustly weighted; identity where an image has no observations."""
+    return _fit_rays(camera, points)[0]
 
 
 def _cameras(focal_px: float, size_px: tuple[int, int]) -> Iterator[Camera]:
+    """All lenses, focal lengths and handednesses that are tried."""
     width, height = size_px
     for lens in LENSES:
-        for stretch in STRETCHES:
+        for factor in FOCAL_FACTORS:
             for mirrored in (False, True):
                 yield Camera(
-                    name="first guess",
+                    name="initial",
                     size_px=size_px,
-                    focal_px=(focal_px * stretch, focal_px * stretch),
+                    focal_px=(focal_px * factor, focal_px * factor),
                     centre_px=((width - 1) / 2, (height - 1) / 2),
                     max_angle_rad=min(np.pi, lens.max_invertible_rad),
                     calibrated_angle_rad=min(np.pi / 2, lens.max_invertible_rad),
@@ -75,18 +71,19 @@ def _cameras(focal_px: float, size_px: tuple[int, int]) -> Iterator[Camera]:
 
 
 def _fullest_images(points: Observations) -> Ints:
+    """Images with the most observations."""
     return np.argsort(-np.bincount(points.image), kind="stable")[:IMAGES_TRIED]
 
 
 def _focal_px(points: Observations) -> float:
-    """Pixels per radian, from the distances of near pairs: neither the centre nor an attitude is needed."""
+    """Pixels per radian from the distances of near pairs, which depend on neither centre nor attitude."""
     ratios = []
     for i in np.unique(points.image):
         own = points.take(points.image == i)
-        own = own.take(np.linspace(0, len(own) - 1, min(len(own), PAIRS_OF)).astype(int))
+        own = own.take(np.linspace(0, len(own) - 1, min(len(own), PAIR_STARS)).astype(int))
         a, b = np.triu_indices(len(own), 1)
         angle = angle_between_rad(own.rays_icrs[a], own.rays_icrs[b])
-        near = angle <= np.quantile(angle, NEAR_PAIRS) if len(angle) else np.zeros(0, dtype=bool)
+        near = angle <= np.quantile(angle, NEAR_PAIRS_QUANTILE) if len(angle) else np.zeros(0, dtype=bool)
         near &= angle > 0
         ratios.append(np.linalg.norm(own.xy_px[a] - own.xy_px[b], axis=1)[near] / angle[near])
     ratio = np.concatenate(ratios)
@@ -95,18 +92,18 @@ def _focal_px(points: Observations) -> float:
     return float(np.median(ratio))
 
 
-def _misses(camera: Camera, points: Observations) -> tuple[Array, Array]:
-    """Attitudes (images, 3, 3), and the squared distances (n,) of the rays [rad^2], cut off at WRONG_RAD."""
+def _fit_rays(camera: Camera, points: Observations) -> tuple[Array, Array]:
+    """Attitudes (images, 3, 3), and the squared errors (n,) of the rays [rad^2], at most OUTLIER_RAD squared."""
     rays = camera.unproject(points.xy_px)
     R = np.tile(np.eye(3), (points.images, 1, 1))
-    missed = np.empty(len(points))
+    squared_error = np.empty(len(points))
     for i in np.unique(points.image):
         own = np.flatnonzero(points.image == i)
         weight, tolerance = np.ones(len(own)), FIRST_TOLERANCE_RAD
         for _ in range(ROUNDS):
             R[i] = wahba(rays[own], points.rays_icrs[own], weight)
             squared = np.sum(np.square(rays[own] - points.rays_icrs[own] @ R[i].T), axis=1)
-            tolerance = max(float(np.sqrt(np.median(squared))), 1e-4)
+            tolerance = max(float(np.sqrt(np.median(squared))), SMALLEST_TOLERANCE_RAD)
             weight = 1.0 / (1.0 + squared / tolerance**2) ** 2
-        missed[own] = np.minimum(squared, WRONG_RAD**2)
-    return R, missed
+        squared_error[own] = np.minimum(squared, OUTLIER_RAD**2)
+    return R, squared_error

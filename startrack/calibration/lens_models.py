@@ -1,4 +1,4 @@
-"""Choice of the lens model: every candidate is judged by stars that its fit did not use (cross-validation)."""
+"""Choice of the lens model by cross-validation: each model predicts stars that its fit did not contain."""
 
 from __future__ import annotations
 
@@ -6,22 +6,46 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.calibration.cross_validation import folds, held_out_residual_px
-from startrack.calibration.observations import Observations
-from startrack.calibration.solve import Solution, State, solve
+from startrack.adjust import SQUARES, CameraState, Observations, Scheme, Solution, adjust
 from startrack.camera import Camera, Decentring, Lens
 from startrack.camera.lenses import default_lens, lens_kinds
-from startrack.types import Ints
+from startrack.types import Array, Ints
 
-NEARLY_AS_GOOD_CHI2 = 4.0  # a longer polynomial this little worse is taken: its covariance owns up to the rim
-RISES_BEYOND = 1.1  # of the outermost star: a polynomial that turns back sooner is a bad one
+FOLDS = 10
+EQUALLY_GOOD_CHI2 = 4.0  # a longer polynomial this little worse is chosen: its covariance holds up to the edge
+RISES_BEYOND_1 = 1.1  # of the outermost star's angle: up to here the polynomial must rise
 NARROW_RAD = np.radians(30.0)
-EXTRA_CHI2 = 15.0  # by which the held-out chi^2 must fall before a lens is called decentred, or its pixels not square
+EXTENSION_CHI2 = 15.0  # fall of the held-out chi-square that justifies decentring, or pixels that are not square
+LEAST_SQUARES = Scheme(loss=SQUARES)
+
+
+def assign_folds(points: Observations, angle_rad: Array) -> Ints:
+    """Fold (n,) of each observation: every image and every ring is divided evenly among the folds."""
+    order = np.lexsort((angle_rad, points.image))
+    fold = np.empty(len(points), dtype=np.int64)
+    fold[order] = np.arange(len(points)) % FOLDS
+    return fold
+
+
+def held_out_residual_px(solution: Solution, fold: Ints) -> Array:
+    """Residual (n, 2) [px] of each observation with respect to lens and attitudes from the other folds.
+
+    One Gauss-Newton step from the solution with all observations: there the fit is nearly linear.
+    """
+    terms, out = solution.terms, np.array(solution.residual_px)
+    for k in range(FOLDS):
+        held = np.flatnonzero(fold == k)
+        if not len(held):
+            continue
+        part = terms.take(held)
+        rest = solution.equations.minus(part.normal_equations(solution.weight[held], solution.residual_px[held]))
+        out[held] -= part.shift_px(*rest.solve())
+    return out
 
 
 @dataclass(frozen=True, kw_only=True)
-class Model:
-    """What is free in a camera: the kind of lens, how many of its parameters, and two extensions."""
+class LensModel:
+    """Free parameters of a camera: the kind of lens, how many of its parameters, and two extensions."""
 
     lens: type[Lens]
     size: int  # number of free parameters of the lens
@@ -38,11 +62,11 @@ class Model:
     @property
     def text(self) -> str:
         """Name in reports."""
-        extensions = (", fx and fy apart" if self.aspect else "") + (", decentred" if self.decentred else "")
-        return self.lens.fit_text(self.size) + extensions
+        added = (", fx and fy apart" if self.aspect else "") + (", decentred" if self.decentred else "")
+        return self.lens.fit_text(self.size) + added
 
-    def begin(self, state: State) -> State:
-        """A state of this model, from one of another."""
+    def start_from(self, state: CameraState) -> CameraState:
+        """A state of this model that is close to a state of another one."""
         camera = replace(state.camera, lens=self.lens.fit_start(state.camera.lens, self.size))
         if not self.aspect:
             focal = float(np.sqrt(np.prod(camera.focal_px)))
@@ -52,27 +76,29 @@ class Model:
         return replace(state, camera=camera)
 
 
-def model_of(camera: Camera, size: int) -> Model:
+def model_of(camera: Camera, size: int) -> LensModel:
     """The model of a camera, with at most `size` free parameters of its lens."""
     kind = type(camera.lens)
-    aspect, decentred = extensions(camera)
-    return Model(lens=kind, size=kind.fit_size(size), aspect=aspect, decentred=decentred)
+    aspect, decentred = extensions_of(camera)
+    return LensModel(lens=kind, size=kind.fit_size(size), aspect=aspect, decentred=decentred)
 
 
-def extensions(camera: Camera) -> tuple[bool, bool]:
+def extensions_of(camera: Camera) -> tuple[bool, bool]:
     """Whether fx and fy of a camera differ, and whether it is decentred."""
     return camera.focal_px[0] != camera.focal_px[1], bool(camera.decentring)
 
 
-def candidate_models(outermost_rad: float) -> list[Model]:
+def candidate_models(outermost_rad: float) -> list[LensModel]:
     """Models for stars up to this angle off the axis: lenses of fixed shape first, then by number of parameters."""
     lenses = sorted(lens_kinds().values(), key=lambda lens: len(lens.fit_sizes()))
-    return [Model(lens=lens, size=n) for lens in lenses if outermost_rad < lens.max_fit_rad for n in lens.fit_sizes()]
+    return [
+        LensModel(lens=lens, size=n) for lens in lenses if outermost_rad < lens.max_fit_rad for n in lens.fit_sizes()
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Candidate:
-    """One lens model that was tried."""
+class ModelScore:
+    """Result of one lens model."""
 
     name: str
     parameters: int
@@ -81,72 +107,66 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class _Tried:
-    model: Model
+class _Fitted:
+    model: LensModel
     solution: Solution
-    candidate: Candidate
-
-    @property
-    def score(self) -> float:
-        return self.candidate.held_out_chi2
+    score: ModelScore
 
 
 def best_model(
-    state: State, points: Observations, extra_px2: float, order: int | None, plain: bool
-) -> tuple[Model, Solution, tuple[Candidate, ...]]:
-    """The model that predicts held-out stars best, fitted, and all that were tried.
+    state: CameraState, points: Observations, extra_px2: float, coefficients: int | None, square: bool
+) -> tuple[LensModel, Solution, tuple[ModelScore, ...]]:
+    """The model that predicts held-out stars best, its solution, and the scores of all models tried.
 
-    `order`: number of free parameters of the default lens if that is decided; None: all lenses are tried. `plain`:
-    square pixels and a centred lens.
+    `coefficients`: number of free parameters of the default lens; None: all lenses are tried. `square`: square pixels
+    and a centred lens.
     """
     rays = state.rays_cam(points)
     off_axis = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
-    fold = folds(points, off_axis)
+    fold = assign_folds(points, off_axis)
 
-    def attempt(model: Model, start: State) -> _Tried:
-        return _try(model, model.begin(start), points, extra_px2, fold)
+    def fit(model: LensModel, start: CameraState) -> _Fitted:
+        return _fit(model, model.start_from(start), points, extra_px2, fold)
 
-    if order is None:
+    if coefficients is None:
         models = candidate_models(float(off_axis.max()))
     else:
-        models = [Model(lens=default_lens(), size=default_lens().fit_size(order))]
-    tried = [attempt(model, state) for model in models]
-    chosen = _longest_of_the_best(tried, float(off_axis.max()))
-    for _ in range(0 if plain else 2):
-        wider = [m for m in _extended(chosen.model) if m is not None]
-        more = [attempt(model, chosen.solution.state) for model in wider]
-        tried += more
-        better = min(more, key=lambda t: t.score, default=chosen)
-        if better.score > chosen.score - EXTRA_CHI2:
+        models = [LensModel(lens=default_lens(), size=default_lens().fit_size(coefficients))]
+    fitted = [fit(model, state) for model in models]
+    chosen = _longest_of_the_best(fitted, float(off_axis.max()))
+    for _ in range(0 if square else 2):
+        more = [fit(model, chosen.solution.state) for model in _extensions(chosen.model)]
+        fitted += more
+        better = min(more, key=lambda f: f.score.held_out_chi2, default=chosen)
+        if better.score.held_out_chi2 > chosen.score.held_out_chi2 - EXTENSION_CHI2:
             break
         chosen = better
-    return chosen.model, chosen.solution, tuple(t.candidate for t in tried)
+    return chosen.model, chosen.solution, tuple(f.score for f in fitted)
 
 
-def _extended(model: Model) -> tuple[Model | None, Model | None]:
-    return (
-        None if model.aspect else replace(model, aspect=True),
-        None if model.decentred else replace(model, decentred=True),
-    )
+def _extensions(model: LensModel) -> list[LensModel]:
+    """The models with one more kind of free parameters."""
+    aspect = [] if model.aspect else [replace(model, aspect=True)]
+    return aspect + ([] if model.decentred else [replace(model, decentred=True)])
 
 
-def _try(model: Model, start: State, points: Observations, extra_px2: float, fold: Ints) -> _Tried:
-    solution = solve(start, points, model.free, extra_px2)
+def _fit(model: LensModel, start: CameraState, points: Observations, extra_px2: float, fold: Ints) -> _Fitted:
+    solution = adjust(start, points, model.free, LEAST_SQUARES, extra_px2=extra_px2)
     held = held_out_residual_px(solution, fold)
     chi2 = np.einsum("ni,nij,nj->", held, solution.weight, held)
-    candidate = Candidate(
+    score = ModelScore(
         name=model.text,
         parameters=len(model.free),
         held_out_chi2=float(chi2),
         held_out_rms_px=float(np.sqrt(np.mean(np.sum(held**2, axis=1)))),
     )
-    return _Tried(model, solution, candidate)
+    return _Fitted(model, solution, score)
 
 
-def _longest_of_the_best(tried: list[_Tried], outermost_rad: float) -> _Tried:
-    enough = min(RISES_BEYOND * outermost_rad, np.pi - 0.01)
-    sound = [t for t in tried if t.solution.state.camera.lens.max_invertible_rad > enough] or tried
-    least = min(t.score for t in sound)
-    good = [t for t in sound if t.score <= least + NEARLY_AS_GOOD_CHI2]
-    # In a narrow field the terms look alike, and a long polynomial is a sum of large numbers: the shortest will do.
+def _longest_of_the_best(fitted: list[_Fitted], outermost_rad: float) -> _Fitted:
+    """Of the equally good polynomials the longest; in narrow fields the shortest, where the terms are degenerate."""
+    enough = min(RISES_BEYOND_1 * outermost_rad, np.pi - 0.01)
+    sound = [f for f in fitted if f.solution.state.camera.lens.max_invertible_rad > enough] or fitted
+    least = min(f.score.held_out_chi2 for f in sound)
+    good = [f for f in sound if f.score.held_out_chi2 <= least + EQUALLY_GOOD_CHI2]
     return good[0] if outermost_rad < NARROW_RAD else good[-1]

@@ -1,4 +1,4 @@
-"""Inside out: from the stars that a rough camera names to all stars of the frame."""
+"""Region growing: from the stars that a rough camera identifies outwards to all stars of the frame."""
 
 from __future__ import annotations
 
@@ -6,118 +6,130 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.calibration.fit import FEWEST, LensFit, fit_lens
+from startrack.adjust import Observations
 from startrack.calibration.frame import Frame
-from startrack.calibration.matching import Matched, match_frame
-from startrack.calibration.observations import Observations
+from startrack.calibration.lens_fit import FEWEST, LensFit, fit_lens
+from startrack.calibration.matching import FrameMatches, match_frame
 from startrack.camera import Camera
-from startrack.identification.match import taken
 from startrack.types import Array, Ints, NotIdentified
 
-STEP_RAD = np.radians(8.0)
+RING_RAD = np.radians(8.0)  # by which the field grows
+SMALLEST_GROWTH_RAD = np.radians(0.5)
 FIRST_GATE_PX = 6.0
-BRIGHTEST = 1000  # hot pixels may outnumber the bright stars
+BRIGHTEST_SOURCES = 1000  # hot pixels may outnumber the bright stars
 GATES_PX = (4.0, 3.0, 2.0)
-LAST_GATE = 4.5  # times the residuals' sigma
+GATE_SIGMAS = 4.5  # of the residuals, for the last gates
 NARROWEST_GATE_PX = 0.8
 GROWTH_ROUNDS = 16
 FINAL_ROUNDS = 8
-SETTLED_PART = 0.003
-MANY = 100
+SETTLED_FRACTION = 0.003  # change of the number of matches
+MANY_STARS = 100  # from which the order follows from the angle alone
+FEWEST_FOR_POLYNOMIAL = 25
+DEGREES_PER_COEFFICIENT = 25
+KNOWN_QUANTILE = 0.95
 
 
 @dataclass(frozen=True)
-class Joint:
-    """The lens of several frames with the matches it rests on."""
+class JointFit:
+    """The lens of several frames with the matches that it rests on."""
 
     frames: tuple[Frame, ...]
-    matches: tuple[Matched, ...]
+    matches: tuple[FrameMatches, ...]
     points: Observations
     fit: LensFit
     gate_px: float
 
 
-def grown(frame: Frame, camera: Camera, R_cam_icrs: Array, star: Ints, detection: Ints) -> tuple[Camera, Array]:
-    """Camera and attitude of one frame, from the given matches outwards, ring by ring to the edge of the frame.
+def grow_from_matches(
+    frame: Frame, camera: Camera, R_cam_icrs: Array, star: Ints, detection: Ints
+) -> tuple[Camera, Array]:
+    """Camera and attitude of one frame, grown ring by ring from the matches (star, detection) to the edge of the frame.
 
-    By its bright sources: among all of them a gate this wide would find a wrong star as often as the right one.
+    Only bright sources take part: with all of them a gate this wide would match wrong stars as often as right ones.
     Raises NotIdentified where too few stars agree.
     """
-    frame = replace(frame, detections=taken(frame.detections, slice(BRIGHTEST)))
-    star, detection = star[detection < BRIGHTEST], detection[detection < BRIGHTEST]
+    frame = replace(frame, sources=frame.sources.take(slice(BRIGHTEST_SOURCES)))
+    star, detection = star[detection < BRIGHTEST_SOURCES], detection[detection < BRIGHTEST_SOURCES]
     rays = frame.sky.stars.rays_icrs[star] @ R_cam_icrs.T
-    known = _outer(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
-    fit = _fit((frame,), (_pairs(detection, star),), camera, R_cam_icrs[None], order=_order(known, len(star)))
+    known = _outer_angle(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
+    fit = _fit(
+        (frame,), (_pairs(detection, star),), camera, R_cam_icrs[None], coefficients=_coefficients(known, len(star))
+    )
     for _ in range(GROWTH_ROUNDS):
-        reach = known + STEP_RAD
-        matched = match_frame(frame, fit.camera, fit.R_cam_icrs[0], reach, FIRST_GATE_PX)
+        within = known + RING_RAD
+        matched = match_frame(frame, fit.camera, fit.R_cam_icrs[0], within, FIRST_GATE_PX)
         if len(matched) < FEWEST:
             break
-        fit = _fit((frame,), (matched,), fit.camera, fit.R_cam_icrs, order=_order(reach, len(matched)))
-        moved_on = fit.camera.calibrated_angle_rad
-        if moved_on < known + np.radians(0.5):
+        fit = _fit((frame,), (matched,), fit.camera, fit.R_cam_icrs, coefficients=_coefficients(within, len(matched)))
+        reached = fit.camera.calibrated_angle_rad
+        if reached < known + SMALLEST_GROWTH_RAD:
             break
-        known = moved_on
+        known = reached
     return fit.camera, fit.R_cam_icrs[0]
 
 
-def joint(frames: tuple[Frame, ...], camera: Camera, R_cam_icrs: Array) -> Joint:
-    """All frames together: match with a shrinking gate and fit, until the matches settle.
+def fit_frames(frames: tuple[Frame, ...], camera: Camera, R_cam_icrs: Array) -> JointFit:
+    """The lens of all frames together: matches with a shrinking gate and fits, until the matches settle.
 
-    `R_cam_icrs` (frames, 3, 3) and the camera must be right to a few pixels where stars were matched.
+    `R_cam_icrs` (frames, 3, 3) and the camera must be right within a few pixels where stars were matched.
     """
-    fit: LensFit | None = None
-    before = 0
-    gate = GATES_PX[0]
+    before, gate_px = 0, GATES_PX[0]
     for k in range(FINAL_ROUNDS):
-        gate = GATES_PX[k] if k < len(GATES_PX) else _gate(fit)
-        within = camera.calibrated_angle_rad + STEP_RAD
+        first = k < len(GATES_PX)
+        gate_px = GATES_PX[k] if first else gate_px
+        within = camera.calibrated_angle_rad + RING_RAD
         matches = tuple(
-            match_frame(frame, camera, R, within, gate) for frame, R in zip(frames, R_cam_icrs, strict=True)
+            match_frame(frame, camera, R, within, gate_px) for frame, R in zip(frames, R_cam_icrs, strict=True)
         )
-        fit = _fit(frames, matches, camera, R_cam_icrs, order=None if k >= len(GATES_PX) else _order(within, MANY))
+        fit = _fit(frames, matches, camera, R_cam_icrs, _coefficients(within, MANY_STARS) if first else None)
         camera, R_cam_icrs = fit.camera, fit.R_cam_icrs
         total = sum(map(len, matches))
-        if k > len(GATES_PX) and abs(total - before) <= SETTLED_PART * total:
+        if k > len(GATES_PX) and abs(total - before) <= SETTLED_FRACTION * total:
             break
-        before = total
-    assert fit is not None
-    return Joint(frames=frames, matches=matches, points=_points(frames, matches), fit=fit, gate_px=gate)
+        before, gate_px = total, _gate_px(fit)
+    return JointFit(frames=frames, matches=matches, points=_points(frames, matches), fit=fit, gate_px=gate_px)
 
 
-def _gate(fit: LensFit | None) -> float:
-    assert fit is not None
-    return float(np.clip(LAST_GATE * fit.rms_px / np.sqrt(2.0), NARROWEST_GATE_PX, GATES_PX[-1]))
+def _gate_px(fit: LensFit) -> float:
+    return float(np.clip(GATE_SIGMAS * fit.rms_px / np.sqrt(2.0), NARROWEST_GATE_PX, GATES_PX[-1]))
 
 
 def _fit(
-    frames: tuple[Frame, ...], matches: tuple[Matched, ...], camera: Camera, R_cam_icrs: Array, order: int | None
-) -> LensFit:
+    frames: tuple[Frame, ...],
+    matches: tuple[FrameMatches, ...],
+    camera: Camera,
+    R_cam_icrs: Array,
+    coefficients: int | None,
+) -> LensFit:  # fmt: skip
     points = _points(frames, matches)
     if not len(points):
-        raise NotIdentified("no star lies where the camera puts it")
-    return fit_lens(replace(camera, covariance=None, covariance_order=()), R_cam_icrs, points, order=order)
+        raise NotIdentified("no star lies where the camera predicts it")
+    return fit_lens(
+        replace(camera, covariance=None, covariance_order=()), R_cam_icrs, points, coefficients=coefficients
+    )
 
 
-def _points(frames: tuple[Frame, ...], matches: tuple[Matched, ...]) -> Observations:
+def _points(frames: tuple[Frame, ...], matches: tuple[FrameMatches, ...]) -> Observations:
     pairs = list(zip(frames, matches, strict=True))
     return Observations(
         image=np.repeat(np.arange(len(pairs)), [len(m) for _, m in pairs]),
-        xy_px=np.concatenate([f.detections.xy_px[m.detection] for f, m in pairs]),
-        covariance_px2=np.concatenate([f.detections.covariance_px2[m.detection] for f, m in pairs]),
+        xy_px=np.concatenate([f.sources.xy_px[m.detection] for f, m in pairs]),
+        covariance_px2=np.concatenate([f.sources.covariance_px2[m.detection] for f, m in pairs]),
         rays_icrs=np.concatenate([f.sky.stars.rays_icrs[m.star] for f, m in pairs]),
     )
 
 
-def _pairs(detection: Ints, star: Ints) -> Matched:
+def _pairs(detection: Ints, star: Ints) -> FrameMatches:
     order = np.argsort(detection)
-    return Matched(detection[order], star[order], 0, 0, 0, 0)
+    return FrameMatches(detection[order], star[order], 0, 0, 0, 0)
 
 
-def _outer(angle_rad: Array) -> float:
-    return float(np.quantile(angle_rad, 0.95)) if len(angle_rad) else 0.0
+def _outer_angle(angle_rad: Array) -> float:
+    return float(np.quantile(angle_rad, KNOWN_QUANTILE)) if len(angle_rad) else 0.0
 
 
-def _order(reach_rad: float, count: int) -> int:
-    """Terms of the polynomial that stars out to this angle can bear."""
-    return int(np.clip(1 + np.degrees(reach_rad) // 25, 1, 4)) if count >= 25 else 1
+def _coefficients(angle_rad: float, stars: int) -> int:
+    """Number of k that stars out to this angle determine."""
+    if stars < FEWEST_FOR_POLYNOMIAL:
+        return 1
+    return int(np.clip(1 + np.degrees(angle_rad) // DEGREES_PER_COEFFICIENT, 1, 4))

@@ -1,4 +1,4 @@
-"""The report of a calibration: one HTML page with its picture inside, and the picture as a PNG beside it."""
+"""Report of a calibration: a self-contained HTML page, and its picture as PNG."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from startrack.calibration.acceptance import RINGS, SECTORS, Coverage, coverage, rings_and_sectors
-from startrack.calibration.record import arcmin_per_px, message, summary
+from startrack.calibration.acceptance import RINGS, SECTORS, Coverage, rings_and_sectors, star_coverage
+from startrack.calibration.record import arcmin_per_px, camera_text, message, summary
 from startrack.calibration.run import Calibration
-from startrack.calibration.show import camera_text
 from startrack.files import write_atomically
 from startrack.frames import format_utc
 from startrack.types import Array
@@ -29,7 +28,7 @@ pre{background:#f3f5f8;padding:.8rem;overflow-x:auto} p.lead{font-size:1.05rem}
 
 
 def write_report(camera_path: Path, calibration: Calibration) -> None:
-    """Write NAME.report.html and, where matplotlib is there, NAME.report.png beside the camera file."""
+    """Write NAME.report.html and, where matplotlib is installed, NAME.report.png beside the camera file."""
     picture: bytes | None = None
     if find_spec("matplotlib") is not None:
         from startrack.calibration.plots import report_png
@@ -41,7 +40,7 @@ def write_report(camera_path: Path, calibration: Calibration) -> None:
 
 
 def report_html(calibration: Calibration, picture: bytes | None) -> str:
-    """The page; it needs no other file, no network and no script."""
+    """The page, without scripts or other files."""
     camera = calibration.camera
     verdict = "ok" if calibration.accepted else "no"
     text = "accepted" if calibration.accepted else f"refused: {html.escape(message(calibration))}"
@@ -57,11 +56,11 @@ def report_html(calibration: Calibration, picture: bytes | None) -> str:
         f"<h1>Calibration of {html.escape(camera.name)}</h1>"
         f'<p class="lead"><span class="{verdict}">{text}</span></p>'
         f"<p>{html.escape(summary(calibration, camera.name))}</p>"
-        f"<h2>What was asked of it</h2>{_gates(calibration)}"
-        f"<h2>Residuals</h2>{image}{_rings(calibration)}"
-        f"<h2>Lens models, judged by stars that the fit did not see</h2>{_models(calibration)}"
-        f"<h2>Pictures</h2>{_pictures(calibration)}"
-        f"<h2>Light and sensor</h2>{_light(calibration)}"
+        f"<h2>Acceptance checks</h2>{_checks_table(calibration)}"
+        f"<h2>Residuals</h2>{image}{_rings_table(calibration)}"
+        f"<h2>Lens models, tested with held-out stars</h2>{_models_table(calibration)}"
+        f"<h2>Pictures</h2>{_pictures_table(calibration)}"
+        f"<h2>Throughput and sensor</h2>{_photometry_table(calibration)}"
         f"<h2>The camera</h2><pre>{html.escape(camera_text(camera))}</pre></html>\n"
     )
 
@@ -81,7 +80,7 @@ def ring_rms_px(calibration: Calibration) -> tuple[Coverage, Array, Array]:
     np.add.at(count, (ring[inside], sector[inside]), 1.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         by_ring = np.sqrt(squared.sum(axis=1) / count.sum(axis=1))
-        return coverage(joint), by_ring, np.sqrt(squared / count)
+        return star_coverage(joint), by_ring, np.sqrt(squared / count)
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:
@@ -91,43 +90,43 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
     return "<table>" + line(head, "th") + "".join(line(row, "td") for row in rows) + "</table>"
 
 
-def _gates(calibration: Calibration) -> str:
+def _checks_table(calibration: Calibration) -> str:
     return _table(
-        ["condition", "found", "wanted", "", "what to do"],
+        ["condition", "value", "required", "", "advice"],
         [
-            [html.escape(g.name), f"{g.value:.3g}", html.escape(g.limit),
-             f'<span class="{"ok" if g.passed else "no"}">{"passed" if g.passed else "failed"}</span>',
-             "" if g.passed else html.escape(g.advice)]
-            for g in calibration.gates
+            [html.escape(c.name), f"{c.value:,.0f}" if c.value >= 1000 else f"{c.value:.3g}", html.escape(c.limit),
+             f'<span class="{"ok" if c.passed else "no"}">{"passed" if c.passed else "failed"}</span>',
+             "" if c.passed else html.escape(c.advice)]
+            for c in calibration.checks
         ],
     )  # fmt: skip
 
 
-def _rings(calibration: Calibration) -> str:
+def _rings_table(calibration: Calibration) -> str:
     cover, by_ring, by_sector = ring_rms_px(calibration)
     scale = arcmin_per_px(calibration.camera)
     edges = np.degrees(cover.ring_edges_rad)
     sectors = [f"{360 * k // SECTORS}°" for k in range(SECTORS)]
     rows = [
-        [f"{edges[k]:.0f}° to {edges[k + 1]:.0f}°", f"{cover.stars[k].sum():.0f}", _figure(by_ring[k]),
-         _figure(by_ring[k] * scale), *(_figure(value) for value in by_sector[k])]
+        [f"{edges[k]:.0f}° to {edges[k + 1]:.0f}°", f"{cover.stars[k].sum():.0f}", _two_decimals(by_ring[k]),
+         _two_decimals(by_ring[k] * scale), *(_two_decimals(value) for value in by_sector[k])]
         for k in range(RINGS)
     ]  # fmt: skip
     fit = calibration.joint.fit
     note = (
-        f"<p>Held-out RMS distance by ring and by sector (from image right, clockwise). All together: "
+        f"<p>Held-out RMS distance by ring and by sector (from image right, clockwise). All stars: "
         f"{fit.held_out_rms_px:.3f} px = {fit.held_out_rms_px * scale:.2f}', chi² per degree of freedom with the "
-        f"stated centroid errors {fit.chi2_per_dof:.2f}; beyond those {fit.extra_sigma_px:.3f} px per axis more. "
-        f"{int((~fit.used).sum())} of {len(fit.used)} matches were clipped.</p>"
+        f"stated centroid errors {fit.chi2_per_dof:.2f}; additional error {fit.extra_sigma_px:.3f} px per axis. "
+        f"{int((~fit.used).sum())} of {len(fit.used)} matches were rejected.</p>"
     )
     return _table(["ring", "stars", "RMS px", "RMS '", *sectors], rows) + note
 
 
-def _figure(value: float) -> str:
+def _two_decimals(value: float) -> str:
     return f"{value:.2f}" if np.isfinite(value) else "–"
 
 
-def _models(calibration: Calibration) -> str:
+def _models_table(calibration: Calibration) -> str:
     rows = [
         [html.escape(c.name), str(c.parameters), f"{c.held_out_chi2:.0f}", f"{c.held_out_rms_px:.3f}"]
         for c in calibration.joint.fit.candidates
@@ -135,7 +134,7 @@ def _models(calibration: Calibration) -> str:
     return _table(["model", "parameters", "held-out chi²", "held-out RMS px"], rows)
 
 
-def _pictures(calibration: Calibration) -> str:
+def _pictures_table(calibration: Calibration) -> str:
     joint = calibration.joint
     rows = []
     for i, (frame, matched) in enumerate(zip(joint.frames, joint.matches, strict=True)):
@@ -147,7 +146,7 @@ def _pictures(calibration: Calibration) -> str:
                 html.escape(format_utc(frame.time_utc)),
                 str(int(own.sum())),
                 f"{matched.fraction:.2f}",
-                _figure(float(rms)),
+                _two_decimals(float(rms)),
                 "used",
             ]
         )
@@ -164,39 +163,37 @@ def _pictures(calibration: Calibration) -> str:
     ]
     air = all(frame.sky.refracted for frame in joint.frames)
     note = "Refraction is taken out." if air else (
-        "No site on the Earth was given: if these are pictures through air, refraction (up to half a degree at the "
-        "horizon) is part of this lens. Give --site."
+        "No site on the Earth was given: of pictures taken through air this lens contains the refraction (up to half a "
+        "degree at the horizon). Give --site."
     )  # fmt: skip
     return _table(["picture", "time", "stars", "matched", "RMS px", ""], rows) + f"<p>{note}</p>"
 
 
-def _light(calibration: Calibration) -> str:
+def _photometry_table(calibration: Calibration) -> str:
     found = calibration.photometry
-    if found is None:
-        return "<p>Not measured.</p>"
     rows: list[list[str]] = []
-    if found.light is not None:
-        light = found.light
+    if found.throughput is not None:
+        light = found.throughput
         rows += [
             ["zero point", f"{light.zero_point_adu_per_s:.0f} ADU/s (± {light.zero_point_sigma_mag:.3f} mag)"],
             ["vignetting", f"{light.vignetting[0]:.3f}, {light.vignetting[1]:.3f}"],
-            ["colour term", _known(light.colour_mag, "mag per B-V")],
-            ["extinction", _known(light.extinction_mag, "mag per airmass")],
+            ["colour term", _with_unit(light.colour_mag, "mag per B-V")],
+            ["extinction", _with_unit(light.extinction_mag, "mag per airmass")],
             ["scatter", f"{light.scatter_mag:.3f} mag, {light.stars} stars"],
         ]
-    facts = found.facts
-    gain = facts.transfer.gain_e_per_adu if facts.transfer is not None else None
+    sensor = found.properties
+    gain = sensor.transfer.gain_e_per_adu if sensor.transfer is not None else None
     rows += [
-        ["gain (photon transfer)", _known(gain, "e/ADU")],
-        ["level without light", _known(facts.bias_adu, "ADU")],
-        ["saturation", _known(facts.saturation_adu, "ADU")],
-        ["PSF sigma", _known(facts.psf_sigma_px, "px")],
-        ["PSF sigma by ring", ", ".join("–" if v is None else f"{v:.2f}" for v in facts.psf_by_ring_px) + " px"],
-        ["hot pixels", "–" if facts.hot_px is None else str(len(facts.hot_px))],
+        ["gain (photon transfer)", _with_unit(gain, "e/ADU")],
+        ["dark level", _with_unit(sensor.bias_adu, "ADU")],
+        ["saturation", _with_unit(sensor.saturation_adu, "ADU")],
+        ["PSF sigma", _with_unit(sensor.psf_sigma_px, "px")],
+        ["PSF sigma by ring", ", ".join("–" if v is None else f"{v:.2f}" for v in sensor.psf_by_ring_px) + " px"],
+        ["hot pixels", "–" if sensor.hot_px is None else str(len(sensor.hot_px))],
     ]
     notes = "".join(f"<li>{html.escape(note)}</li>" for note in found.notes)
     return _table(["", "measured"], rows) + (f"<ul>{notes}</ul>" if notes else "")
 
 
-def _known(value: float | None, unit: str) -> str:
+def _with_unit(value: float | None, unit: str) -> str:
     return "not measured" if value is None else f"{value:.4g} {unit}"

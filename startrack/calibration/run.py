@@ -1,4 +1,4 @@
-"""A calibration from exposures: detect, name the stars, grow inside out, fit all together, judge."""
+"""Calibration from exposures: detect, identify, grow the lens outwards, fit all frames together, check."""
 
 from __future__ import annotations
 
@@ -7,26 +7,25 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from startrack.calibration.acceptance import Gate, Gated, gates
-from startrack.calibration.frame import Frame, frame_of
-from startrack.calibration.initial_camera import opposite
-from startrack.calibration.photometry import Given, Photometry, photometry
-from startrack.calibration.region_growing import Joint, grown, joint
-from startrack.calibration.static_sources import without_fixed
+from startrack.calibration.acceptance import Check, Checked, check_acceptance
+from startrack.calibration.frame import Frame, load_frame, remove_static_sources
+from startrack.calibration.initial_camera import mirror_camera
+from startrack.calibration.photometry import KnownSensor, Photometry, measure_photometry
+from startrack.calibration.region_growing import JointFit, fit_frames, grow_from_matches
 from startrack.camera import Camera
 from startrack.catalog import StarCatalog
 from startrack.frames import Site
-from startrack.identification import Identifier
+from startrack.identification import Identifier, identify_unknown_lens
 from startrack.types import Array, BadInput, Exposure, Identification, NoSolution, NotIdentified
 
 WIDE_FIELD_RAD = np.radians(100.0)  # from here up a field of view is that of the image circle
-BRIGHTEST_NAMED = 100  # the inner half of them is what a fit grows from
+BRIGHTEST_IDENTIFIED = 100  # the inner half of them is the start of the region growing
 Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Refused:
-    """An image that the calibration does without."""
+class RefusedImage:
+    """An image that the calibration does not use."""
 
     name: str
     reason: str
@@ -34,20 +33,20 @@ class Refused:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Calibration(Gated):
-    """The lens, what it rests on and what was said against it."""
+class Calibration(Checked):
+    """The camera, the fit that it rests on, and its acceptance checks."""
 
     camera: Camera
-    joint: Joint
-    gates: tuple[Gate, ...]
-    refused: tuple[Refused, ...]
+    joint: JointFit
+    checks: tuple[Check, ...]
+    refused: tuple[RefusedImage, ...]
     site: Site | None
     false_alarm_probability: float  # the largest of the images' identifications
-    photometry: Photometry | None = None
+    photometry: Photometry
 
 
 @dataclass
-class _Named:
+class _IdentifiedFrame:
     frame: Frame
     camera: Camera
     R_cam_icrs: Array
@@ -61,9 +60,9 @@ class _Run:
     fov_rad: float | None
     site: Site | None
     progress: Progress
-    named: list[_Named] = field(default_factory=list)
-    refused: list[Refused] = field(default_factory=list)
-    worst_chance: float = 0.0
+    identified: list[_IdentifiedFrame] = field(default_factory=list)
+    refused: list[RefusedImage] = field(default_factory=list)
+    largest_false_alarm: float = 0.0
 
 
 def calibrate(
@@ -73,35 +72,48 @@ def calibrate(
     camera: Camera | None = None,
     fov_rad: float | None = None,
     site: Site | None = None,
-    given: Given | None = None,
+    known_sensor: KnownSensor | None = None,
     name: str = "camera",
     progress: Progress = lambda text: None,
 ) -> Calibration:
-    """The camera of exposures of the open sky, from an approximate `camera` or from a rough field of view alone.
+    """Calibrate a camera with exposures of the open night sky.
 
-    `given`: what is known of the sensor already. `site`: on the Earth it lets refraction be taken out; without it the
-    lens contains it. Raises BadInput (no_time, size_mismatch, no_calibration), NotIdentified where no image's stars
-    are named. Look at `accepted`: a calibration that fails a gate must not be used.
+    Args:
+        exposures: pictures of one camera, each with its mid-exposure time.
+        catalog: stars.
+        camera: approximate camera; None: `fov_rad` is needed.
+        fov_rad: field of view to about 10 %. Below 100 degrees the angle across the frame's width, from there up that
+            of the image circle.
+        site: on the Earth, for refraction and extinction; without it the lens contains the refraction.
+        known_sensor: properties of the sensor that are known already.
+        name: of the camera.
+        progress: is called with a text at each step.
+
+    A calibration that fails a check (`accepted` is False) must not be used.
+
+    Raises:
+        BadInput: no_time, size_mismatch, no_calibration.
+        NotIdentified: the stars of no image are identified.
     """
     if camera is None and fov_rad is None:
         raise BadInput("no_calibration", "give the field of view (--fov DEG) or an approximate camera file (-c)")
     run = _Run(catalog, camera, fov_rad, site, progress)
     frames = _frames(run, exposures)
-    _name_all(run, frames)
-    together = _together(run)
-    fitted = replace(together.fit.camera, name=name)
+    _identify_all(run, frames)
+    joint = _fit_jointly(run)
+    fitted = replace(joint.fit.camera, name=name)
     fitted = replace(fitted, max_angle_rad=_max_angle_rad(fitted, camera, fov_rad))
-    together = replace(together, fit=replace(together.fit, camera=fitted))
-    progress("measuring light and sensor")
-    light = photometry(together, given or Given())
+    joint = replace(joint, fit=replace(joint.fit, camera=fitted))
+    progress("measuring throughput and sensor")
+    photometry = measure_photometry(joint, known_sensor or KnownSensor())
     return Calibration(
-        camera=replace(fitted, sensor=light.sensor),
-        joint=together,
-        gates=gates(together),
+        camera=replace(fitted, sensor=photometry.sensor),
+        joint=joint,
+        checks=check_acceptance(joint),
         refused=tuple(run.refused),
         site=site,
-        false_alarm_probability=run.worst_chance,
-        photometry=light,
+        false_alarm_probability=run.largest_false_alarm,
+        photometry=photometry,
     )
 
 
@@ -117,64 +129,62 @@ def _frames(run: _Run, exposures: Sequence[Exposure]) -> list[Frame]:
             )
         run.progress(f"detecting stars in {exposure.name}")
         try:
-            frames.append(frame_of(exposure, run.catalog, run.site))
+            frames.append(load_frame(exposure, run.catalog, run.site))
         except NoSolution as cause:
-            run.refused.append(Refused(name=exposure.name, reason=cause.reason, message=str(cause)))
+            run.refused.append(RefusedImage(name=exposure.name, reason=cause.reason, message=str(cause)))
     if not frames:
         raise NotIdentified(run.refused[0].message if run.refused else "no image was given", reason="no_stars")
     return frames
 
 
-def _name_all(run: _Run, frames: list[Frame]) -> None:
-    """Name the stars of every frame; what fails is tried again with the lens that the others gave."""
+def _identify_all(run: _Run, frames: list[Frame]) -> None:
+    """Identify the stars of every frame; failures are tried again with the lens of the others."""
     waiting: list[tuple[Frame, NoSolution]] = []
     for frame in frames:
         try:
-            _name(run, frame)
+            _identify(run, frame)
         except NoSolution as cause:
             waiting.append((frame, cause))
     for frame, refusal in waiting:
         try:
-            if not run.named:
+            if not run.identified:
                 raise refusal
-            _name(run, frame)
+            _identify(run, frame)
         except NoSolution as cause:
-            run.refused.append(Refused(name=frame.name, reason=cause.reason, message=str(cause)))
-    if not run.named:
+            run.refused.append(RefusedImage(name=frame.name, reason=cause.reason, message=str(cause)))
+    if not run.identified:
         raise NotIdentified(
-            f"no image's stars could be named ({run.refused[0].message}). Take pictures of the clear, dark night sky, "
-            "in focus, with the camera still and at least a hundred stars in view",
+            f"the stars of no image could be identified ({run.refused[0].message}). Take pictures of the clear, dark "
+            "night sky, in focus, with the camera still and at least a hundred stars in view",
             reason=run.refused[0].reason,
         )
 
 
-def _name(run: _Run, frame: Frame) -> None:
-    run.progress(f"naming the stars of {frame.name}")
-    camera, found = _identified(run, frame)
+def _identify(run: _Run, frame: Frame) -> None:
+    run.progress(f"identifying the stars of {frame.name}")
+    camera, found = _first_identification(run, frame)
     R = found.R_cam_icrs
-    if not run.named:
-        run.progress(f"following the lens outwards in {frame.name}")
-        camera, R = grown(frame, camera, R, found.star, found.detection)
-    run.worst_chance = max(run.worst_chance, found.false_alarm_probability)
-    run.named.append(_Named(frame, camera, R, len(found)))
+    if not run.identified:
+        run.progress(f"growing the lens outwards in {frame.name}")
+        camera, R = grow_from_matches(frame, camera, R, found.star, found.detection)
+    run.largest_false_alarm = max(run.largest_false_alarm, found.false_alarm_probability)
+    run.identified.append(_IdentifiedFrame(frame, camera, R, len(found)))
 
 
-def _identified(run: _Run, frame: Frame) -> tuple[Camera, Identification]:
-    """Camera and identification: by the lens of the frames before, else the approximate one, else from nothing."""
-    known = max(run.named, key=lambda n: n.stars).camera if run.named else run.start
+def _first_identification(run: _Run, frame: Frame) -> tuple[Camera, Identification]:
+    """Camera and identification: with the lens of earlier frames, else the approximate one, else without a lens."""
+    known = max(run.identified, key=lambda n: n.stars).camera if run.identified else run.start
     refusal: NotIdentified | None = None
     if known is not None:
         try:
-            return by_camera(known, frame)
+            return identify_with(known, frame)
         except NotIdentified as cause:
             refusal = cause
-    if refusal is not None and run.named:
+    if refusal is not None and run.identified:
         raise refusal
-    from startrack.identification.unknown_lens import identify_blind
-
-    # An approximate camera whose lens is of another kind still says how wide the field is.
+    # An approximate camera with another kind of lens still gives the field of view.
     fov_rad = run.fov_rad if run.fov_rad is not None else _field_rad(run.start)
-    solution = identify_blind(frame.detections, frame.size_px, fov_rad, frame.sky.stars)
+    solution = identify_unknown_lens(frame.sources, frame.size_px, fov_rad, frame.sky.stars)
     return solution.camera, solution.identification
 
 
@@ -188,39 +198,39 @@ def _field_rad(camera: Camera | None) -> float:
     return float(min(np.sum(camera.angle_rad(sides)), 0.99 * WIDE_FIELD_RAD))
 
 
-def by_camera(camera: Camera, frame: Frame) -> tuple[Camera, Identification]:
-    """The bright stars that an approximate camera, or its mirror image, names. Raises NotIdentified."""
+def identify_with(camera: Camera, frame: Frame) -> tuple[Camera, Identification]:
+    """Bright stars identified with an approximate camera or with its mirror image. Raises NotIdentified."""
     identifier = Identifier(whole_field=False)
     try:
-        found = identifier(frame.detections, camera, frame.sky.stars)
+        found = identifier(frame.sources, camera, frame.sky.stars)
     except NotIdentified as cause:
         if cause.reason != "mirrored":
             raise
-        camera = opposite(camera)
-        found = identifier(frame.detections, camera, frame.sky.stars)
-    # Where the lens is pixels off, faint stars take their neighbours' names, most of all far off the axis. Detections
-    # are sorted by brightness.
-    bright = np.argsort(found.detection)[:BRIGHTEST_NAMED]
-    angle = camera.angle_rad(frame.detections.xy_px[found.detection[bright]])
+        camera = mirror_camera(camera)
+        found = identifier(frame.sources, camera, frame.sky.stars)
+    # Where the lens is wrong by pixels, faint stars are confused with their neighbours, above all far off the axis.
+    # Sources are sorted by brightness.
+    bright = np.argsort(found.detection)[:BRIGHTEST_IDENTIFIED]
+    angle = camera.angle_rad(frame.sources.xy_px[found.detection[bright]])
     sure = np.sort(bright[angle <= np.median(angle)])
     return camera, replace(found, detection=found.detection[sure], star=found.star[sure])
 
 
-def _together(run: _Run) -> Joint:
-    """The joint fit, without sources that stay in place while the sky turns, and without images that contradict."""
-    lead = max(run.named, key=lambda n: n.stars)
-    same = [n for n in run.named if n.camera.mirrored == lead.camera.mirrored]
-    for other in run.named:
+def _fit_jointly(run: _Run) -> JointFit:
+    """The joint fit without static sources, and without images of the other handedness."""
+    lead = max(run.identified, key=lambda n: n.stars)
+    same = [n for n in run.identified if n.camera.mirrored == lead.camera.mirrored]
+    for other in run.identified:
         if other not in same:
             text = "it is the mirror image of the others: one camera has one handedness"
-            run.refused.append(Refused(name=other.frame.name, reason="mirrored", message=text))
+            run.refused.append(RefusedImage(name=other.frame.name, reason="mirrored", message=text))
     R = np.stack([n.R_cam_icrs for n in same])
     run.progress("fitting the lens to all images")
-    return joint(without_fixed(tuple(n.frame for n in same), R), lead.camera, R)
+    return fit_frames(remove_static_sources(tuple(n.frame for n in same), R), lead.camera, R)
 
 
 def _max_angle_rad(fitted: Camera, start: Camera | None, fov_rad: float | None) -> float:
-    """Edge of the image circle: as given, else the frame's corner; never beyond where the polynomial turns."""
+    """Edge of the image circle: as given, else the frame's corner; at most where the polynomial turns."""
     width, height = fitted.size_px
     corners = np.array([[-0.5, -0.5], [width - 0.5, -0.5], [-0.5, height - 0.5], [width - 0.5, height - 0.5]])
     edge = float(np.max(fitted.angle_rad(corners)))

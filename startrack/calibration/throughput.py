@@ -1,4 +1,9 @@
-"""How much light reaches the sensor: zero point, colour, vignetting and, on the Earth, extinction."""
+"""Throughput from the stars' fluxes: zero point, vignetting, colour term and, on the Earth, extinction.
+
+The fit is bounded to what is physically possible. In a camera that looks at the zenith airmass is a function of the
+angle off the axis, so that extinction and vignetting can be exchanged for each other; a term that the data do not
+determine, or that ends at a bound, is left out, and so is the whole throughput where it fails a held-out test.
+"""
 
 from __future__ import annotations
 
@@ -6,121 +11,238 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.calibration.region_growing import Joint
-from startrack.types import Array
+from startrack.calibration.region_growing import JointFit
+from startrack.types import Array, Ints
 
-FEWEST = 30
+FEWEST_STARS = 30
 BRIGHT_SNR = 10.0
-ROBUST_MAG = 0.2
-PHOTOMETRY_MAG = 0.05  # of a star beside what the catalogue and the noise say
-WELL_KNOWN_MAG = 0.03  # per airmass, or B-V: a term less well known is left out
+LOSS_MAG = 0.2  # residual from which a star's pull no longer grows
+PHOTOMETRY_MAG = 0.05  # error of a star's magnitude beyond catalogue and noise
+LARGEST_TERM_SIGMA_MAG = 0.03  # per airmass, or per B-V: a term with a larger sigma is left out
 TYPICAL_B_V = 0.6
-DIMMEST_1 = 0.02
-LOWEST_AIR_RAD = np.radians(8.0)
+LOWEST_ELEVATION_RAD = np.radians(8.0)
+THROUGHPUT_1 = (0.05, 1.1)  # relative to the axis, up to the calibrated angle: a lens dims its edge
+EXTINCTION_MAG = (0.0, 1.5)  # per airmass; 0.1 to 0.5 in clear air
+COLOUR_MAG = (-1.0, 1.0)  # per B-V
+AT_BOUND_1 = 1e-3  # of the range of a term
+FOLDS = 5
+LARGEST_HELD_OUT_MAG = 0.4  # median scatter of held-out stars
+LARGEST_HELD_OUT_RATIO = 1.5  # of held-out scatter to that of the fit
+LARGEST_IMAGE_OFFSET_MAG = 0.15  # of an image's zero point from the common one: clouds, or twilight
+FEWEST_OF_IMAGE = 10
+NORMAL_BY_MAD = 1.4826
 
 
 @dataclass(frozen=True, kw_only=True)
-class Light:
-    """What the stars' fluxes say; None where they do not tell."""
+class Throughput:
+    """Fitted throughput; None for terms that the data do not determine."""
 
     zero_point_adu_per_s: float  # of a V = 0 star of typical colour on the axis, above the air if extinction is known
     zero_point_sigma_mag: float
-    vignetting: tuple[float, float]  # 1 + v1 a^2 + v2 a^4
-    colour_mag: float | None  # gained per magnitude of B-V redder than 0.6
-    extinction_mag: float | None  # lost per airmass
+    vignetting: tuple[float, float]  # relative throughput 1 + v1 a^2 + v2 a^4
+    colour_mag: float | None  # gain per magnitude of B-V redder than 0.6
+    extinction_mag: float | None  # loss per airmass
     scatter_mag: float
     stars: int
 
 
 @dataclass(frozen=True)
-class _Stars:
-    """Stars of all frames, each (n,)."""
+class ThroughputFit:
+    """The throughput (None where it is not known), and warnings for the record."""
 
-    gained_mag: Array  # V minus the instrument's magnitude
+    throughput: Throughput | None
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class StarFluxes:
+    """Bright matched stars of all frames, each (n,)."""
+
+    gain_mag: Array  # V minus the instrumental magnitude
     sigma_mag: Array
     angle_rad: Array
     b_v: Array
     airmass: Array | None
+    image: Ints
+
+    def take(self, which: Array) -> StarFluxes:
+        """The stars selected by a mask or index array."""
+        air = None if self.airmass is None else self.airmass[which]
+        return StarFluxes(
+            self.gain_mag[which], self.sigma_mag[which], self.angle_rad[which], self.b_v[which], air, self.image[which]
+        )
 
 
-def measured_light(joint: Joint, light_1: float = 1.0) -> Light | None:
-    """The light of the matched stars; None without exposure times or with fewer than 30 stars.
+@dataclass(frozen=True)
+class _Fit:
+    """Values of the terms, their sigmas, the scatter of the stars, and the terms at a bound."""
 
-    `light_1`: by which the detector's fluxes are multiplied (its PSF is not quite each star's own).
-    """
-    stars = _stars(joint)
-    if stars is None or len(stars.gained_mag) < FEWEST:
-        return None
-    terms = ["zero", "v1", "v2", "colour", *(["air"] if stars.airmass is not None else [])]
-    while True:
-        values, sigma, scatter = _fit(stars, terms)
-        vague = [t for t in ("air", "colour") if t in terms and sigma[terms.index(t)] > WELL_KNOWN_MAG]
-        if not vague:
-            break
-        terms.remove(vague[0])
-    found = dict(zip(terms, values.tolist(), strict=True))
-    return Light(
-        zero_point_adu_per_s=float(light_1 * 10 ** (0.4 * found["zero"])),
-        zero_point_sigma_mag=float(sigma[0]),
-        vignetting=(found["v1"], found["v2"]),
-        colour_mag=found.get("colour"),
-        extinction_mag=-found["air"] if "air" in found else None,
-        scatter_mag=scatter,
-        stars=len(stars.gained_mag),
-    )
+    values: dict[str, float]
+    sigma: dict[str, float]
+    scatter_mag: float
+    at_bound: tuple[str, ...]
+    edge_rad: float
 
 
 def airmass(elevation_rad: Array) -> Array:
-    """Air along the line of sight, zenith = 1. Source: Rozenberg 1966, Twilight, p. 160."""
+    """Airmass along the line of sight, zenith = 1. Source: Rozenberg 1966, Twilight, p. 160."""
     s = np.sin(elevation_rad)
     return 1.0 / (s + 0.025 * np.exp(-11.0 * s))
 
 
-def _stars(joint: Joint) -> _Stars | None:
+def measure_throughput(joint: JointFit, flux_ratio: float = 1.0) -> ThroughputFit:
+    """The throughput from the matched stars of all frames.
+
+    `flux_ratio`: by which the detector's fluxes are multiplied (its PSF is not quite each star's own).
+    """
+    stars = _star_fluxes(joint)
+    if stars is None or len(stars.gain_mag) < FEWEST_STARS:
+        return ThroughputFit(None, (
+            "zero point: not measured; the images must state their exposure time (EXPTIME, exposure_s), and 30 "
+            "unsaturated stars are needed",
+        ))  # fmt: skip
+    return fit_throughput(stars, joint.fit.camera.calibrated_angle_rad, flux_ratio)
+
+
+def fit_throughput(stars: StarFluxes, edge_rad: float, flux_ratio: float = 1.0) -> ThroughputFit:
+    """The throughput of stars up to the angle `edge_rad` off the axis, tested; None with a warning if it fails."""
+    warnings: list[str] = []
+    terms = ["zero", "middle", "edge", "colour", *(["air"] if stars.airmass is not None else [])]
+    while True:
+        fit = _fit(stars, terms, edge_rad)
+        optional = [t for t in ("air", "colour") if t in terms]
+        poor = [t for t in optional if t in fit.at_bound or fit.sigma[t] > LARGEST_TERM_SIGMA_MAG]
+        if not poor:
+            break
+        if poor[0] == "air" and "air" in fit.at_bound:
+            warnings.append("extinction: left out; the fitted value is not physical, so that it cannot be told from "
+                            "vignetting")  # fmt: skip
+        terms.remove(poor[0])
+    failures = _failures(stars, terms, fit)
+    if failures:
+        return ThroughputFit(None, (*warnings, *(f"throughput: left out; {failure}" for failure in failures)))
+    if fit.values.get("air") is None and not warnings:
+        warnings.append("extinction: not distinguished from vignetting; zero point and vignetting contain it")
+    return ThroughputFit(
+        Throughput(
+            zero_point_adu_per_s=float(flux_ratio * 10 ** (0.4 * fit.values["zero"])),
+            zero_point_sigma_mag=fit.sigma["zero"],
+            vignetting=_vignetting(fit.values["middle"], fit.values["edge"], edge_rad),
+            colour_mag=fit.values.get("colour"),
+            extinction_mag=fit.values.get("air"),
+            scatter_mag=fit.scatter_mag,
+            stars=len(stars.gain_mag),
+        ),
+        tuple(warnings),
+    )
+
+
+def _failures(stars: StarFluxes, terms: list[str], fit: _Fit) -> list[str]:
+    """Reasons not to trust the fit: a bound, held-out stars, or images with different zero points."""
+    failures = []
+    if {"middle", "edge"} & set(fit.at_bound):
+        failures.append("the fitted vignetting is not physical")
+    held_out = _held_out_mag(stars, terms, fit.edge_rad)
+    scatter = NORMAL_BY_MAD * float(np.median(np.abs(held_out)))
+    if scatter > min(LARGEST_HELD_OUT_MAG, LARGEST_HELD_OUT_RATIO * max(fit.scatter_mag, PHOTOMETRY_MAG)):
+        failures.append(f"held-out stars scatter by {scatter:.2f} mag, the fitted ones by {fit.scatter_mag:.2f}")
+    residual = stars.gain_mag - _model(stars, fit.values, fit.edge_rad)
+    offsets = [
+        float(np.median(residual[stars.image == i]))
+        for i, count in enumerate(np.bincount(stars.image))
+        if count >= FEWEST_OF_IMAGE
+    ]
+    if len(offsets) > 1 and (largest := float(np.max(np.abs(offsets)))) > LARGEST_IMAGE_OFFSET_MAG:
+        failures.append(f"the zero points of the images differ by up to {largest:.2f} mag from their mean: clouds?")
+    return failures
+
+
+def _held_out_mag(stars: StarFluxes, terms: list[str], edge_rad: float) -> Array:
+    """Residuals (n,) of fits that do not contain the star: with several images, none of its image's stars."""
+    images = len(np.unique(stars.image))
+    order = np.argsort(stars.angle_rad, kind="stable")
+    fold = np.empty(len(order), dtype=np.int64)
+    fold[order] = np.arange(len(order)) % FOLDS
+    fold = stars.image if images > 1 else fold
+    residual = np.empty(len(fold))
+    for k in np.unique(fold):
+        held = fold == k
+        rest = stars.take(~held)
+        if len(rest.gain_mag) < FEWEST_STARS:
+            rest = stars
+        residual[held] = (stars.gain_mag - _model(stars, _fit(rest, terms, edge_rad).values, edge_rad))[held]
+    return residual
+
+
+def _star_fluxes(joint: JointFit) -> StarFluxes | None:
+    """The bright, unsaturated matched stars; None where no image has an exposure time."""
     columns: list[tuple[Array, ...]] = []
-    reach = joint.fit.camera.calibrated_angle_rad
+    calibrated = joint.fit.camera.calibrated_angle_rad
     for i, (frame, matched) in enumerate(zip(joint.frames, joint.matches, strict=True)):
         exposure_s = frame.exposure.exposure_s
         if exposure_s is None:
             continue
         used = joint.fit.used[joint.points.image == i]
         d, s = matched.detection[used], matched.star[used]
-        found, sky = frame.detections, frame.sky
+        found, sky = frame.sources, frame.sky
         angle = joint.fit.camera.angle_rad(found.xy_px[d])
-        good = (found.snr[d] > BRIGHT_SNR) & ~found.saturated[d] & (angle < reach) & np.isfinite(sky.b_v[s])
+        good = (found.snr[d] > BRIGHT_SNR) & ~found.saturated[d] & (angle < calibrated) & np.isfinite(sky.b_v[s])
         if sky.elevation_rad is not None:
-            good &= sky.elevation_rad[s] > LOWEST_AIR_RAD
+            good &= sky.elevation_rad[s] > LOWEST_ELEVATION_RAD
         d, s, angle = d[good], s[good], angle[good]
-        instrument = -2.5 * np.log10(found.flux_e[d] / exposure_s)
+        instrumental = -2.5 * np.log10(found.flux_e[d] / exposure_s)
         sigma = np.sqrt((1.086 / found.snr[d]) ** 2 + sky.stars.v_sigma_mag[s] ** 2 + PHOTOMETRY_MAG**2)
         air = airmass(sky.elevation_rad[s]) if sky.elevation_rad is not None else np.full(len(s), np.nan)
-        columns.append((sky.stars.v_mag[s] - instrument, sigma, angle, sky.b_v[s], air))
+        columns.append((sky.stars.v_mag[s] - instrumental, sigma, angle, sky.b_v[s], air, np.full(len(s), i)))
     if not columns:
         return None
-    gained, sigma, angle, b_v, air = (np.concatenate(c) for c in zip(*columns, strict=True))
-    return _Stars(gained, sigma, angle, b_v, None if np.isnan(air).any() else air)
+    gain, sigma, angle, b_v, air, image = (np.concatenate(c) for c in zip(*columns, strict=True))
+    return StarFluxes(gain, sigma, angle, b_v, None if np.isnan(air).any() else air, image.astype(np.int64))
 
 
-def _fit(stars: _Stars, terms: list[str]) -> tuple[Array, Array, float]:
-    """Values and sigmas (m,) of the terms, and the stars' scatter about them [mag]."""
+def _vignetting(middle: float, edge: float, edge_rad: float) -> tuple[float, float]:
+    """v1, v2 of the relative throughput 1 + v1 a^2 + v2 a^4 from its values at a^2 = edge^2 / 2 and edge^2."""
+    u = edge_rad**2
+    return (4.0 * middle - edge - 3.0) / u, (2.0 + 2.0 * edge - 4.0 * middle) / u**2
+
+
+def _model(stars: StarFluxes, values: dict[str, float], edge_rad: float) -> Array:
+    """V minus the instrumental magnitude (n,) by the model."""
+    v1, v2 = _vignetting(values["middle"], values["edge"], edge_rad)
+    a2 = np.square(stars.angle_rad)
+    throughput = np.maximum(1.0 + a2 * (v1 + a2 * v2), THROUGHPUT_1[0] / 2)
+    model = values["zero"] + 2.5 * np.log10(throughput) + values.get("colour", 0.0) * (stars.b_v - TYPICAL_B_V)
+    return np.asarray(model if stars.airmass is None else model - values.get("air", 0.0) * stars.airmass)
+
+
+def _fit(stars: StarFluxes, terms: list[str], edge_rad: float) -> _Fit:
+    """Bounded robust least squares over the terms."""
     from scipy.optimize import least_squares
 
-    a2 = np.square(stars.angle_rad)
+    zero = float(np.median(stars.gain_mag))
+    bounds = {"zero": (zero - 10.0, zero + 10.0), "middle": THROUGHPUT_1, "edge": THROUGHPUT_1, "colour": COLOUR_MAG,
+              "air": EXTINCTION_MAG}  # fmt: skip
+    start = {"zero": zero, "middle": 0.95, "edge": 0.9, "colour": 0.0, "air": 0.2}
+    low, high = np.array([bounds[t] for t in terms]).T
 
-    def miss(p: Array) -> Array:
-        value = dict(zip(terms, p, strict=True))
-        through = np.maximum(1.0 + a2 * (value["v1"] + a2 * value["v2"]), DIMMEST_1)
-        model = value["zero"] + 2.5 * np.log10(through) + value.get("colour", 0.0) * (stars.b_v - TYPICAL_B_V)
-        if stars.airmass is not None:
-            model = model + value.get("air", 0.0) * stars.airmass
-        return np.asarray((stars.gained_mag - model) / stars.sigma_mag)
+    def misfit(p: Array) -> Array:
+        values = dict(zip(terms, p.tolist(), strict=True))
+        return np.asarray((stars.gain_mag - _model(stars, values, edge_rad)) / stars.sigma_mag)
 
-    start = np.zeros(len(terms))
-    start[0] = np.median(stars.gained_mag)
-    robust = ROBUST_MAG / float(np.median(stars.sigma_mag))
-    fit = least_squares(miss, start, loss="soft_l1", f_scale=robust)
-    residual = miss(fit.x)
-    spread = 1.4826 * float(np.median(np.abs(residual)))
+    loss_scale = LOSS_MAG / float(np.median(stars.sigma_mag))
+    fit = least_squares(
+        misfit, [start[t] for t in terms], bounds=(low, high), loss="soft_l1", f_scale=loss_scale, xtol=1e-12,
+        ftol=1e-12, gtol=1e-12,
+    )  # fmt: skip
+    residual = misfit(fit.x)
+    spread = NORMAL_BY_MAD * float(np.median(np.abs(residual)))
     covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * max(spread, 1.0) ** 2
-    scatter = 1.4826 * float(np.median(np.abs(residual * stars.sigma_mag)))
-    return fit.x, np.sqrt(np.diag(covariance)), scatter
+    margin = AT_BOUND_1 * (high - low)
+    at_bound = (fit.x < low + margin) | (fit.x > high - margin)
+    return _Fit(
+        values=dict(zip(terms, fit.x.tolist(), strict=True)),
+        sigma=dict(zip(terms, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+        scatter_mag=NORMAL_BY_MAD * float(np.median(np.abs(residual * stars.sigma_mag))),
+        at_bound=tuple(t for t, reached in zip(terms, at_bound, strict=True) if reached),
+        edge_rad=edge_rad,
+    )

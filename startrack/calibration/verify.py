@@ -1,4 +1,4 @@
-"""Does a camera file still fit? One new picture of the stars against the map that the file gives."""
+"""Verification of a camera file: one new picture of the stars, its own lens compared with the file's."""
 
 from __future__ import annotations
 
@@ -7,51 +7,51 @@ from typing import Any
 
 import numpy as np
 
-from startrack.calibration.frame import frame_of
-from startrack.calibration.region_growing import grown, joint
-from startrack.calibration.run import by_camera
+from startrack.calibration.frame import load_frame
+from startrack.calibration.region_growing import fit_frames, grow_from_matches
+from startrack.calibration.run import identify_with
 from startrack.camera import Camera
 from startrack.camera.uncertainty import cap_grid, projection_covariance_px2
 from startrack.catalog import StarCatalog
 from startrack.frames import Site
 from startrack.types import Array, Exposure, NotIdentified
 
-ALLOWED_PX = 0.3  # RMS of the map that does no harm: a tenth of it reaches the position
-SIGNIFICANT = 3.0  # times its own sigma: less is noise
+ALLOWED_PX = 0.3  # RMS change of the map without consequence: a tenth of it reaches the position
+SIGNIFICANT_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Verification:
-    """The picture's own lens against the file's."""
+    """The lens of the picture compared with that of the file."""
 
     image: str
     camera: Camera
     fresh: Camera  # fitted to this picture
     stars: int
     rms_px: float  # of the fresh fit
-    moved_px: float  # RMS of the map's change, the best rotation removed
-    moved_sigma_px: float  # what chance alone would give
+    change_px: float  # RMS change of the map, the best rotation removed
+    change_sigma_px: float  # expected from noise alone
     largest_px: float
 
     @property
     def fits(self) -> bool:
-        """Whether the file may go on being used."""
-        return self.moved_px <= max(ALLOWED_PX, SIGNIFICANT * self.moved_sigma_px)
+        """Whether the file can still be used."""
+        return self.change_px <= max(ALLOWED_PX, SIGNIFICANT_SIGMAS * self.change_sigma_px)
 
 
 def verify(exposure: Exposure, camera: Camera, catalog: StarCatalog, site: Site | None = None) -> Verification:
     """Fit the lens afresh to the picture and compare the maps where both are calibrated.
 
-    Raises BadInput no_time, NotIdentified (also reason mirrored) where the stars cannot be named with the file.
+    Raises BadInput no_time, NotIdentified (also reason mirrored) where the stars cannot be identified with the file.
     """
-    frame = frame_of(exposure, catalog, site)
-    found_camera, found = by_camera(camera, frame)
+    frame = load_frame(exposure, catalog, site)
+    found_camera, found = identify_with(camera, frame)
     if found_camera.mirrored != camera.mirrored:
         raise NotIdentified("the picture is a mirror image of what the camera file says", reason="mirrored")
-    start, R = grown(frame, found_camera, found.R_cam_icrs, found.star, found.detection)
-    fit = joint((frame,), start, R[None]).fit
+    start, R = grow_from_matches(frame, found_camera, found.R_cam_icrs, found.star, found.detection)
+    fit = fit_frames((frame,), start, R[None]).fit
     grid = cap_grid(min(camera.calibrated_angle_rad, fit.camera.calibrated_angle_rad))
-    moved = difference_px(camera, fit.camera, grid)
+    change = difference_px(camera, fit.camera, grid)
     variance = projection_covariance_px2(fit.camera, grid) + projection_covariance_px2(camera, grid)
     return Verification(
         image=exposure.name,
@@ -59,22 +59,22 @@ def verify(exposure: Exposure, camera: Camera, catalog: StarCatalog, site: Site 
         fresh=fit.camera,
         stars=int(fit.used.sum()),
         rms_px=fit.rms_px,
-        moved_px=float(np.sqrt(np.mean(np.sum(moved**2, axis=1)))),
-        moved_sigma_px=float(np.sqrt(np.mean(np.trace(variance, axis1=1, axis2=2)))),
-        largest_px=float(np.max(np.linalg.norm(moved, axis=1))),
+        change_px=float(np.sqrt(np.mean(np.sum(change**2, axis=1)))),
+        change_sigma_px=float(np.sqrt(np.mean(np.trace(variance, axis1=1, axis2=2)))),
+        largest_px=float(np.max(np.linalg.norm(change, axis=1))),
     )
 
 
 def difference_px(one: Camera, other: Camera, rays_cam: Array) -> Array:
     """Pixels (n, 2) of `other` minus those of `one` at the rays (n, 3), the best rotation between them removed."""
-    moved = (other.project_unlimited(rays_cam) - one.project_unlimited(rays_cam)).reshape(-1)
-    turn = one.jacobian_px_per_rad(rays_cam).reshape(-1, 3)
-    rest = moved - turn @ np.linalg.lstsq(turn, moved, rcond=None)[0]
+    change = (other.project_unlimited(rays_cam) - one.project_unlimited(rays_cam)).reshape(-1)
+    by_rotation = one.jacobian_px_per_rad(rays_cam).reshape(-1, 3)
+    rest = change - by_rotation @ np.linalg.lstsq(by_rotation, change, rcond=None)[0]
     return np.asarray(rest.reshape(-1, 2), dtype=np.float64)
 
 
 def verify_dict(found: Verification) -> dict[str, Any]:
-    """The JSON object."""
+    """The verification's JSON object."""
     old, new = found.camera, found.fresh
     return {
         "format": "startrack.verification/1",
@@ -85,8 +85,8 @@ def verify_dict(found: Verification) -> dict[str, Any]:
         "camera": old.name,
         "stars": found.stars,
         "rms_px": found.rms_px,
-        "map_change_px": found.moved_px,
-        "map_change_sigma_px": found.moved_sigma_px,
+        "map_change_px": found.change_px,
+        "map_change_sigma_px": found.change_sigma_px,
         "map_change_largest_px": found.largest_px,
         "focal_change": float(new.focal_px[0] / old.focal_px[0] - 1.0),
         "centre_change_px": [float(b - a) for a, b in zip(old.centre_px, new.centre_px, strict=True)],
@@ -94,9 +94,9 @@ def verify_dict(found: Verification) -> dict[str, Any]:
 
 
 def verify_line(found: Verification) -> str:
-    """One line for people."""
+    """Summary in one line."""
     verdict = "ok" if found.fits else "refused inconsistent_evidence: the lens has changed, calibrate again:"
     return (
-        f"{found.image}  {verdict}  {found.stars} stars  map moved by {found.moved_px:.2f} px RMS "
-        f"(± {found.moved_sigma_px:.2f}), {found.largest_px:.2f} px at most"
+        f"{found.image}  {verdict}  {found.stars} stars  map changed by {found.change_px:.2f} px RMS "
+        f"(± {found.change_sigma_px:.2f}), {found.largest_px:.2f} px at most"
     )

@@ -86,7 +86,7 @@ def add_print_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate; the exit code."""
-    from startrack.calibration import Given, calibrate
+    from startrack.calibration import KnownSensor, calibrate
     from startrack.calibration.record import refusal_dict
     from startrack.catalog import load_catalog
     from startrack.output import write_json
@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
                 camera=start,
                 fov_rad=args.fov,
                 site=site_of(args, exposures),
-                given=Given(gain_e_per_adu=args.gain, read_noise_e=args.read_noise, bias_adu=args.bias),
+                known_sensor=KnownSensor(gain_e_per_adu=args.gain, read_noise_e=args.read_noise, bias_adu=args.bias),
                 name=args.name or out.stem,
                 progress=show_step,
             )
@@ -128,13 +128,13 @@ def _write_calibration(args: argparse.Namespace, out: Path, found: Calibration) 
     if found.accepted:
         write_atomically(out, camera_text(found.camera).encode("utf-8"), overwrite=True)
     write_json(out.with_suffix(".calibration.json"), record)
-    hot = None if found.photometry is None else found.photometry.facts.hot_px
+    hot = found.photometry.properties.hot_px
     if hot is not None:
         lines = ["x_px,y_px", *(f"{x:.0f},{y:.0f}" for x, y in hot)]
         write_atomically(out.with_suffix(".hot-pixels.csv"), ("\n".join(lines) + "\n").encode(), overwrite=True)
     if not args.no_plots:
         write_report(out, found)
-    if args.verbose and found.photometry is not None:
+    if args.verbose:
         line += "".join(f"\n  {note}" for note in found.photometry.notes)
     return print_outcome(args, record, line)
 

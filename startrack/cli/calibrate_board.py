@@ -28,7 +28,7 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Calibrate with the board; the exit code."""
     from startrack.calibration.board import board_dict, board_line, calibrate_board
-    from startrack.calibration.board_corners import Board
+    from startrack.calibration.board_pose import Board
     from startrack.camera.io import camera_text
     from startrack.files import write_atomically
     from startrack.output import write_json

@@ -46,12 +46,12 @@ def _add_action(subparsers: Any, action: str, description: str) -> argparse.Argu
 
 def run_show(args: argparse.Namespace) -> int:
     """Print what camera files say; 0."""
-    from startrack.calibration.show import camera_text, facts
+    from startrack.calibration.record import camera_properties, camera_text
     from startrack.camera import load_camera
 
     for name in args.cameras:
         camera = load_camera(name)
-        print(json.dumps(facts(camera)) if args.json else camera_text(camera))
+        print(json.dumps(camera_properties(camera)) if args.json else camera_text(camera))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Hypotheses of a camera of which little is known: similar triangles give scale and attitude, bright stars the odds."""
+"""Hypotheses of an unknown camera: similar triangles propose scale and attitude, the bright stars rank them."""
 
 from __future__ import annotations
 
@@ -9,32 +9,33 @@ from functools import cached_property
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.false_alarm import PATTERN_MATCHES, log_p_value
 from startrack.identification.index import bright_stars_apart
-from startrack.identification.proximity_mask import SkyMap, sky_map
-from startrack.identification.radial_lens_family import Family, angle
-from startrack.identification.region_growing import Start
-from startrack.identification.shape_index import SimilarTriangles, similar_triangles
-from startrack.identification.triangles import Triangles, triad, triangles
+from startrack.identification.proximity_mask import ProximityMask, proximity_mask
+from startrack.identification.radial_lens_family import RadialFamily, angle
+from startrack.identification.region_growing import LensHypothesis
+from startrack.identification.shape_index import ShapeIndex, shape_index
+from startrack.identification.triangles import Triangles, triad_attitude, triangles
 from startrack.types import Array, Bools, Ints, Stars
 
 HEMISPHERE_SR = 2 * np.pi
 STARS_OF_HEMISPHERE = 200  # pattern stars of the whole sky for a lens that sees half of it
 MOST_PATTERN_STARS = 25_000
-REACH_OF_HEMISPHERE_RAD = np.radians(45.0)
+SIDE_OF_HEMISPHERE_RAD = np.radians(45.0)
 NEAR_OF_HEMISPHERE_RAD = np.radians(1.5)
 NARROWEST_NEAR_RAD = np.radians(0.15)
-LOCAL_REACHES = 1.2  # of the patterns' reach: there an imperfect lens still fits
+LOCAL_SIDES = 1.2  # of the longest side, about the triangle: within it an imperfect lens still fits
 CANDIDATES_AT_ONCE = 20_000
-MOST_STARTS = 6  # of one lens and window; the true one is all but always the likeliest
-VERIFIED = ((24, -1.5), (48, -4.0))  # detections held against the stars, and log odds to go on
-DEEPEST_VERIFIED = 80
-GIVEN = 3  # a triangle's own stars are hits whatever it is
-KEPT_INDEXES = 6
+MOST_HYPOTHESES = 6  # of one lens and window; the true one is nearly always the likeliest
+MOST_DETECTIONS = 100
+VERIFIED = ((24, -1.5), (48, -4.0))  # detections tested against the stars; log p-value below which the test goes on
+MOST_VERIFIED = 80
+CACHED_PATTERNS = 6
 
 
 @dataclass(frozen=True)
-class Guess:
-    """A lens of the family to start from: the focal length is uncertain by the index's tolerance of size."""
+class LensGuess:
+    """A lens of the family; its focal length is uncertain by the size tolerance of the patterns."""
 
     focal_px: float
     shape: float
@@ -43,7 +44,7 @@ class Guess:
 
 @dataclass(frozen=True)
 class Window:
-    """Ranks of brightness, `first` to `end`, whose triangles are tried, unless they lie wholly before `done`."""
+    """Ranks of brightness, `first` to `end`, whose triangles are tried, unless all vertices come before `done`."""
 
     first: int
     done: int
@@ -51,74 +52,77 @@ class Window:
 
 
 @dataclass(frozen=True)
-class Patterns:
-    """The catalogue's side: triangles of the brightest stars, and where these are."""
+class ShapePatterns:
+    """Triangles of the brightest catalogue stars by shape, and a mask of the sky near these stars."""
 
     star: Ints  # (m,) indices in Stars
     rays_icrs: Array  # (m, 3)
-    reach_rad: float
-    triangles: SimilarTriangles
-    map: SkyMap
+    longest_side_rad: float
+    triangles: ShapeIndex
+    mask: ProximityMask
 
     @cached_property
-    def log_tail(self) -> Array:
+    def log_p_table(self) -> Array:
         """log P(at least k of n random directions near a bright star), [n, k]."""
-        from scipy.special import betainc
-
-        n, k = np.meshgrid(np.arange(101), np.arange(101), indexing="ij")
-        tail = betainc(np.maximum(k, 1), np.maximum(n - k, 0) + 1, self.map.covered)
-        return np.where(k > 0, np.log(np.maximum(tail, 1e-300)), 0.0)
+        n, k = np.meshgrid(np.arange(MOST_DETECTIONS + 1), np.arange(MOST_DETECTIONS + 1), indexing="ij")
+        return log_p_value(k, n, self.mask.sky_fraction, free=0)
 
 
 @dataclass(frozen=True)
 class PatternSizes:
-    """How the catalogue's patterns are cut for a field of view."""
+    """How the catalogue's patterns are chosen for a field of view."""
 
     stars: int  # brightest of the whole sky
-    reach_rad: float  # longest side of a triangle
+    longest_side_rad: float
     near_rad: float  # a detection this close to a bright star is a hit
     shape_tolerance: float
     size_tolerance: float
 
 
 def wide_sizes(field_sr: float) -> PatternSizes:
-    """Patterns for a lens that bends: loose triangles of few stars."""
-    part = min(field_sr / HEMISPHERE_SR, 1.0)
-    stars = int(min(STARS_OF_HEMISPHERE / part, MOST_PATTERN_STARS))
-    reach, near = REACH_OF_HEMISPHERE_RAD * np.sqrt(part), NEAR_OF_HEMISPHERE_RAD * np.sqrt(part)
-    return PatternSizes(stars, float(reach), float(max(near, NARROWEST_NEAR_RAD)), 0.02, 0.13)
+    """Sizes for an unknown distorting lens: few stars, wide tolerances."""
+    fraction = min(field_sr / HEMISPHERE_SR, 1.0)
+    stars = int(min(STARS_OF_HEMISPHERE / fraction, MOST_PATTERN_STARS))
+    side, near = SIDE_OF_HEMISPHERE_RAD * np.sqrt(fraction), NEAR_OF_HEMISPHERE_RAD * np.sqrt(fraction)
+    return PatternSizes(stars, float(side), float(max(near, NARROWEST_NEAR_RAD)), 0.02, 0.13)
 
 
-def narrow_sizes(field_sr: float, stars_of_field: int, reach_of_field: float) -> PatternSizes:
-    """Patterns for a lens that is almost a pinhole: sharp triangles, of so many stars in the field, up to this long."""
+def narrow_sizes(field_sr: float, stars_in_field: int, side_of_field: float) -> PatternSizes:
+    """Sizes for a lens close to a pinhole: narrow tolerances.
+
+    `stars_in_field`: pattern stars in a field; `side_of_field`: longest side over the field's diameter.
+    """
     diameter = float(np.sqrt(4 * field_sr / np.pi))
-    stars = int(min(stars_of_field * 4 * np.pi / field_sr, MOST_PATTERN_STARS))
+    stars = int(min(stars_in_field * 4 * np.pi / field_sr, MOST_PATTERN_STARS))
     near = max(0.015 * diameter, NARROWEST_NEAR_RAD)
-    return PatternSizes(stars, reach_of_field * diameter, float(near), 0.004, 0.12)
+    return PatternSizes(stars, side_of_field * diameter, float(near), 0.004, 0.12)
 
 
-def patterns_for(stars: Stars, sizes: PatternSizes) -> Patterns:
-    """Patterns of the stars (sorted, brightest first); the last few are kept, and serve for some years around."""
+def patterns_for(stars: Stars, sizes: PatternSizes) -> ShapePatterns:
+    """Patterns of the stars (sorted, brightest first).
+
+    The last few are kept; the key rounds the stars' directions, so that catalogues of nearby years share them.
+    """
     import hashlib
 
     key = (sizes, len(stars), hashlib.sha1(np.round(stars.rays_icrs[:500], 3).tobytes()).hexdigest())
-    if key not in _KEPT:
+    if key not in _CACHE:
         star = bright_stars_apart(stars, sizes.stars)
         rays = stars.rays_icrs[star]
-        found = triangles(rays, sizes.reach_rad * (1 + sizes.size_tolerance))
-        similar = similar_triangles(found, sizes.shape_tolerance, sizes.size_tolerance)
-        _KEPT[key] = Patterns(star, rays, sizes.reach_rad, similar, sky_map(rays, sizes.near_rad))
-        while len(_KEPT) > KEPT_INDEXES:
-            _KEPT.popitem(last=False)
-    _KEPT.move_to_end(key)
-    return _KEPT[key]
+        found = triangles(rays, sizes.longest_side_rad * (1 + sizes.size_tolerance))
+        index = shape_index(found, sizes.shape_tolerance, sizes.size_tolerance)
+        _CACHE[key] = ShapePatterns(star, rays, sizes.longest_side_rad, index, proximity_mask(rays, sizes.near_rad))
+        while len(_CACHE) > CACHED_PATTERNS:
+            _CACHE.popitem(last=False)
+    _CACHE.move_to_end(key)
+    return _CACHE[key]
 
 
-_KEPT: OrderedDict[tuple[PatternSizes, int, str], Patterns] = OrderedDict()
+_CACHE: OrderedDict[tuple[PatternSizes, int, str], ShapePatterns] = OrderedDict()
 
 
-def rays_of(xy_px: Array, centre_px: tuple[float, float], focal_px: Array | float, shape: float) -> Array:
-    """Rays (..., 3) of pixels (..., 2) through a lens of the family, unmirrored; focal lengths broadcast."""
+def family_rays(xy_px: Array, centre_px: tuple[float, float], focal_px: Array | float, shape: float) -> Array:
+    """Rays (..., 3) of pixels (..., 2) through a lens of the family, not mirrored; focal lengths broadcast."""
     off = xy_px - np.array(centre_px, dtype=xy_px.dtype)
     r = np.hypot(off[..., 0], off[..., 1])
     a = angle(r / focal_px, shape)
@@ -126,87 +130,90 @@ def rays_of(xy_px: Array, centre_px: tuple[float, float], focal_px: Array | floa
     return np.stack([off[..., 0] * scale, off[..., 1] * scale, np.cos(a)], axis=-1)
 
 
-class Hypotheses:
-    """Starts from the brightest detections (n, 2), no two of them close together."""
+class HypothesisSearch:
+    """Lens hypotheses from the brightest detections (n, 2), no two of which are close together."""
 
     def __init__(self, xy_px: Array, size_px: tuple[int, int]) -> None:
-        self.xy_px, self.size_px = xy_px[:100], size_px
+        self.xy_px, self.size_px = xy_px[:MOST_DETECTIONS], size_px
         self.tried = 0
 
-    def starts(self, patterns: Patterns, guess: Guess, window: Window, log_plausible: float) -> list[Start]:
-        """The best of the hypotheses from the window's triangles, most likely first.
-
-        Those whose hits chance explains with log probability above `log_plausible` are left out.
-        """
+    def hypotheses(
+        self, patterns: ShapePatterns, guess: LensGuess, window: Window, most_log_p: float
+    ) -> list[LensHypothesis]:
+        """The likeliest hypotheses from the window's triangles, with a log p-value below `most_log_p`."""
         xy = self.xy_px[window.first :]
-        seen = rays_of(xy[: window.end - window.first], guess.centre_px, guess.focal_px, guess.shape)
-        image = triangles(seen, patterns.reach_rad)
+        rays = family_rays(xy[: window.end - window.first], guess.centre_px, guess.focal_px, guess.shape)
+        image = triangles(rays, patterns.longest_side_rad)
         image = image.take(image.vertices.max(axis=1, initial=0) >= window.done - window.first)
         left, right = patterns.triangles.candidates(image)
         self.tried += len(left)
         if not len(left):
             return []
-        found: list[Start] = []
+        found: list[LensHypothesis] = []
         for part in np.array_split(np.arange(len(left)), len(left) // CANDIDATES_AT_ONCE + 1):
-            found += self._likely(patterns, guess, xy, image.take(left[part]), right[part], log_plausible)
-        return sorted(found, key=lambda start: start.log_chance)[:MOST_STARTS]
+            found += self._likely(patterns, guess, xy, image.take(left[part]), right[part], most_log_p)
+        return sorted(found, key=lambda hypothesis: hypothesis.log_p)[:MOST_HYPOTHESES]
 
     def _likely(
-        self, patterns: Patterns, guess: Guess, xy_px: Array, image: Triangles, right: Ints, log_plausible: float
-    ) -> list[Start]:
-        """Starts from pairs of an image triangle and a catalogue triangle."""
+        self, patterns: ShapePatterns, guess: LensGuess, xy_px: Array, image: Triangles, right: Ints, most_log_p: float
+    ) -> list[LensHypothesis]:
+        """Hypotheses from pairs of an image triangle and a catalogue triangle."""
         catalogue = patterns.triangles.triangles.take(right)
         focal = guess.focal_px * np.mean(image.sides_rad / catalogue.sides_rad, axis=1)
-        mirrored = image.handed != catalogue.handed
+        mirrored = image.handedness != catalogue.handedness
         cam = self._rays(xy_px[image.vertices], guess, focal, mirrored)
-        R = triad(cam, patterns.rays_icrs[catalogue.vertices])
+        R = triad_attitude(cam, patterns.rays_icrs[catalogue.vertices])
         middle = cam.sum(axis=1)
         middle /= np.linalg.norm(middle, axis=1, keepdims=True)
         alive = np.arange(len(R))
-        log_chance = np.zeros(len(R))
-        for verified, log_limit in (*VERIFIED, (DEEPEST_VERIFIED, log_plausible)):
-            odds = self._odds(patterns, xy_px[:verified], R[alive], guess, focal[alive], mirrored[alive], middle[alive])
-            log_chance = np.minimum(log_chance, odds)
-            alive, log_chance = alive[log_chance < log_limit], log_chance[log_chance < log_limit]
-        best = np.argsort(log_chance, kind="stable")[:MOST_STARTS]
+        log_p = np.zeros(len(R))
+        for verified, limit in (*VERIFIED, (MOST_VERIFIED, most_log_p)):
+            deeper = self._log_p_value(
+                patterns, xy_px[:verified], R[alive], guess, focal[alive], mirrored[alive], middle[alive]
+            )
+            log_p = np.minimum(log_p, deeper)
+            alive, log_p = alive[log_p < limit], log_p[log_p < limit]
+        best = np.argsort(log_p, kind="stable")[:MOST_HYPOTHESES]
         return [
-            Start(self._camera(guess, focal[i], bool(mirrored[i])), R[i], middle[i], float(chance))
-            for i, chance in zip(alive[best], log_chance[best], strict=True)
+            LensHypothesis(self._camera(guess, focal[i], bool(mirrored[i])), R[i], middle[i], float(value))
+            for i, value in zip(alive[best], log_p[best], strict=True)
         ]
 
-    def _rays(self, xy_px: Array, guess: Guess, focal: Array, mirrored: Bools) -> Array:
-        rays = rays_of(xy_px, guess.centre_px, focal[:, None].astype(xy_px.dtype), guess.shape)
+    def _rays(self, xy_px: Array, guess: LensGuess, focal: Array, mirrored: Bools) -> Array:
+        rays = family_rays(xy_px, guess.centre_px, focal[:, None].astype(xy_px.dtype), guess.shape)
         rays[mirrored, :, 0] *= -1
         return rays
 
-    def _odds(
-        self, patterns: Patterns, xy_px: Array, R: Array, guess: Guess, focal: Array, mirrored: Bools, middle: Array
-    ) -> Array:
-        """log P by chance of as many detections near bright stars, around the triangle or in the whole field."""
-        # Single precision is a thousandth of the map's cells, and twice as fast.
+    def _log_p_value(
+        self, patterns: ShapePatterns, xy_px: Array, R: Array, guess: LensGuess, focal: Array, mirrored: Bools,
+        middle: Array,
+    ) -> Array:  # fmt: skip
+        """Log p-value of the detections near bright stars: about the triangle, or in the whole field if smaller."""
+        # Single precision is a thousandth of the mask's cells, and twice as fast.
         single, R, middle = np.float32, R.astype(np.float32), middle.astype(np.float32)
         rays = self._rays(np.broadcast_to(xy_px.astype(single), (len(R), *xy_px.shape)), guess, focal, mirrored)
-        hit = patterns.map(rays @ R)
-        local = np.einsum("hni,hi->hn", rays, middle) > np.cos(LOCAL_REACHES * patterns.reach_rad)
-        table = patterns.log_tail
-        everywhere = table[max(len(xy_px) - GIVEN, 0), np.maximum(hit.sum(axis=1) - GIVEN, 0)]
-        around = np.maximum(local.sum(axis=1) - GIVEN, 0), np.maximum((hit & local).sum(axis=1) - GIVEN, 0)
+        hit = patterns.mask(rays @ R)
+        local = np.einsum("hni,hi->hn", rays, middle) > np.cos(LOCAL_SIDES * patterns.longest_side_rad)
+        table, free = patterns.log_p_table, PATTERN_MATCHES
+        everywhere = table[max(len(xy_px) - free, 0), np.maximum(hit.sum(axis=1) - free, 0)]
+        around = np.maximum(local.sum(axis=1) - free, 0), np.maximum((hit & local).sum(axis=1) - free, 0)
         return np.minimum(everywhere, table[around])
 
-    def _camera(self, guess: Guess, focal: float, mirrored: bool) -> Camera:
-        widest = Family(guess.shape).max_invertible_rad
+    def _camera(self, guess: LensGuess, focal: float, mirrored: bool) -> Camera:
+        lens = RadialFamily(guess.shape)
+        widest = lens.max_invertible_rad
         return Camera(
             name="unknown", size_px=self.size_px, focal_px=(float(focal), float(focal)), centre_px=guess.centre_px,
-            max_angle_rad=widest, calibrated_angle_rad=widest, lens=Family(guess.shape), mirrored=mirrored,
+            max_angle_rad=widest, calibrated_angle_rad=widest, lens=lens, mirrored=mirrored,
         )  # fmt: skip
 
 
-def apart(xy_px: Array, closer_px: float, most: int) -> Ints:
-    """The first (brightest) of the points (n, 2), none near an earlier one: clumps of false stars shrink to one."""
+def without_clumps(xy_px: Array, smallest_px: float, most: int) -> Ints:
+    """Indices of the first (brightest) of the points (n, 2), none closer than `smallest_px` to an earlier one."""
     from scipy.spatial import cKDTree
 
     some = xy_px[: 10 * most]
-    pairs = cKDTree(some).query_pairs(closer_px, output_type="ndarray")
+    pairs = cKDTree(some).query_pairs(smallest_px, output_type="ndarray")
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
     alive = np.ones(len(some), dtype=bool)
     for i, j in pairs:

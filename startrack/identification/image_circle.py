@@ -22,14 +22,14 @@ DARKEST_PERCENTILE = 0.5
 
 
 @dataclass(frozen=True)
-class Circle:
+class ImageCircle:
     """What the lens lights up: pixels [px] of the frame."""
 
     centre_px: tuple[float, float]
     radius_px: float
 
 
-def image_circle(background: NDArray[Any]) -> Circle | None:
+def image_circle(background: NDArray[Any]) -> ImageCircle | None:
     """The bright disc in a background (H, W); None where no edge stands out, or the frame lies within the disc.
 
     Of all discs the one with the largest median contrast (bright - dark) / (bright + dark - 2 darkest) over its edge:
@@ -57,7 +57,7 @@ def image_circle(background: NDArray[Any]) -> Circle | None:
     if best is None or best[2] < CONTRAST:
         return None
     (x, y), radius, _ = best
-    return Circle((float((x + 0.5) * scale - 0.5), float((y + 0.5) * scale - 0.5)), radius * scale)
+    return ImageCircle((float((x + 0.5) * scale - 0.5), float((y + 0.5) * scale - 0.5)), radius * scale)
 
 
 def _best(

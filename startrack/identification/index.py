@@ -1,32 +1,103 @@
-"""The catalogue's side of an identification: triangles of bright stars by their sides, and trees of stars by depth."""
+"""Catalogue patterns for one field of view: triangles of bright stars by their sides, and k-d trees of stars by depth.
+
+Patterns and the angular size of a camera's pixels are computed once per catalogue and camera, and kept.
+"""
 
 from __future__ import annotations
 
+import weakref
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
+from startrack.camera import Camera
 from startrack.identification.triangles import triangles
-from startrack.identification.weak_cache import KeptPerObject
 from startrack.types import Array, Ints, Stars
 
 if TYPE_CHECKING:
     from startrack.identification.pairs import PairIndex
 
-CLOSE_PAIR_RAD = np.radians(0.05)
-SHALLOWEST = 1000  # brightest stars in the smallest tree; each next one holds twice as many
-NEIGHBOURS = 10  # of a ray; more only in clusters
-KEPT_PATTERNS = 4
-WHOLE_FIELD = 0.8  # of a field's diameter: sides that often fit into it
-CLOSED = 0.59  # of two neighbours of a star in the plane, the probability that they are each other's
+CLOSE_PAIR_RAD = np.radians(0.05)  # stars this close are one detection
+SHALLOWEST_TREE = 1000  # brightest stars in the smallest tree; each next one holds twice as many
+NEIGHBOURS_OF_RAY = 10  # looked up at once; more only in clusters
+CACHED_PATTERNS = 4
+LONGEST_SIDE_OF_FIELD = 0.8  # of a field's diameter: sides that often fit into it
+CLOSURE_PROBABILITY = 0.59  # that two neighbours of a star in the plane are neighbours of each other
+SCALE_GRID = 33  # pixels per axis at which the solid angle of the field is summed
+SCALE_ANGLES = 64
+LARGEST_SCALE_1 = 3.0  # of the scale on the axis: a lens that bends its edge is not followed further
+
+Computed = TypeVar("Computed")
+
+
+class PerObject(Generic[Computed]):
+    """`compute(thing)`, computed once per object and kept as long as the object lives.
+
+    The key is the object, not its value: comparing catalogues would take longer than the computation saves.
+    """
+
+    def __init__(self, compute: Callable[[Any], Computed]) -> None:
+        self._compute = compute
+        self._cache: dict[int, tuple[weakref.ref[Any], Computed]] = {}
+
+    def __call__(self, thing: Any) -> Computed:
+        key = id(thing)
+        entry = self._cache.get(key)
+        if entry is None or entry[0]() is not thing:
+            entry = (weakref.ref(thing, lambda _: self._cache.pop(key, None)), self._compute(thing))
+            self._cache[key] = entry
+        return entry[1]
+
+
+@dataclass(frozen=True)
+class PixelScale:
+    """Angular size of a camera's pixels, and the field of view."""
+
+    axis_rad_per_px: float
+    largest_rad_per_px: float  # anywhere in the field and in any direction
+    field_sr: float  # of the image circle, or of the frame where that is smaller
+    frame_fraction: float  # of the image circle that the frame contains
+
+    @property
+    def diameter_rad(self) -> float:
+        """Diameter of a flat disc with the field's solid angle."""
+        return float(np.sqrt(4 * self.field_sr / np.pi))
+
+    @classmethod
+    def of(cls, camera: Camera) -> PixelScale:
+        """Measured on grids of angles and of pixels."""
+        axis = camera.unproject(np.array([camera.centre_px]))[0]
+        off_axis = np.arctan2(np.hypot(axis[0], axis[1]), axis[2]) + 0.01
+        angle = np.linspace(0.01, min(camera.max_angle_rad, camera.lens.max_invertible_rad) - 1e-3, SCALE_ANGLES)
+        focal = min(camera.focal_px)
+        radial, across = 1.0 / camera.lens.slope(angle), np.sin(angle) / camera.lens.rho(angle)
+        largest = min(1.05 * float(np.maximum(radial, across).max() / focal), LARGEST_SCALE_1 / focal)
+        field_sr = _field_sr(camera)
+        circle_sr = 2 * np.pi * (1 - np.cos(camera.max_angle_rad))
+        on_axis = float(camera.mean_scale_rad_per_px(off_axis))
+        return cls(on_axis, largest, field_sr, min(float(field_sr / circle_sr), 1.0))
+
+
+def _field_sr(camera: Camera) -> float:
+    """Solid angle of the part of the frame inside the image circle."""
+    width, height = camera.size_px
+    x, y = np.meshgrid(np.linspace(0, width - 1, SCALE_GRID), np.linspace(0, height - 1, SCALE_GRID))
+    angle = camera.angle_rad(np.stack([x, y], axis=-1))
+    cell = width * height / angle.size
+    lit = angle < camera.max_angle_rad
+    return float(np.sum(camera.pixel_solid_angle_sr(angle[lit]) * cell))
+
+
+pixel_scale_of = PerObject(PixelScale.of)
 
 
 @dataclass(frozen=True)
 class PatternSize:
-    """How many stars form how many triangles."""
+    """Numbers of stars and of triangles of an index."""
 
     stars_in_field: int
     fewest: int  # of the whole sky
@@ -35,7 +106,7 @@ class PatternSize:
     widest_rad: float
 
 
-# The brightest few, with sides nearly as long as the field allows: so long a triangle leaves little to chance.
+# The brightest few, with sides nearly as long as the field allows: a long triangle seldom matches by chance.
 BRIGHT = PatternSize(20, 150, 40_000, 200_000, np.radians(75.0))
 # More stars, shorter sides: where walls, clouds or false stars leave too few of the brightest.
 DEEP = PatternSize(60, 700, 60_000, 400_000, np.radians(45.0))
@@ -43,19 +114,19 @@ DEEP = PatternSize(60, 700, 60_000, 400_000, np.radians(45.0))
 
 @dataclass(frozen=True)
 class PatternIndex:
-    """Triangles of the brightest stars of the sky, found by their sides: chords, which no arctangent slows down."""
+    """Triangles of the brightest stars of the sky, looked up by their sides, which are chords of the unit sphere."""
 
     star: Ints  # (m,) indices of the pattern stars in Stars
     rays_icrs: Array  # (m, 3)
-    reach: float  # longest side
+    longest_chord: float  # of the sides
     vertices: Ints  # (n, 3) indices into rays_icrs, ordered by the opposite side, shortest first
-    handed: Array  # (n,) sign of the triple product
+    handedness: Array  # (n,) sign of the triple product
     tree: Any  # scipy.spatial.cKDTree over the sides (n, 3), ascending
 
     def candidates(self, sides: Array, tolerance: float, most: int) -> tuple[Ints, Ints]:
-        """Pairs (row of the sides (m, 3), triangle) that agree within the tolerance; the closest, largest ones first.
+        """Pairs (row of the sides (m, 3), triangle) that agree within the tolerance, best relative agreement first.
 
-        At most `most` of each row: one look-up of fixed size takes a tenth of the time of a complete one.
+        At most `most` for each row: one look-up of fixed size takes a tenth of the time of a complete one.
         """
         distance, found = self.tree.query(sides, most, p=np.inf, distance_upper_bound=tolerance)
         distance = distance.ravel()
@@ -70,19 +141,19 @@ def build_index(stars: Stars, field_sr: float, size: PatternSize) -> PatternInde
 
     star = bright_stars_apart(stars, int(np.clip(size.stars_in_field * 4 * np.pi / field_sr, size.fewest, size.most)))
     rays = stars.rays_icrs[star]
-    neighbours = np.sqrt(6 * size.triangles / (CLOSED * len(star)))
+    neighbours = np.sqrt(6 * size.triangles / (CLOSURE_PROBABILITY * len(star)))
     reach = min(
         size.widest_rad,
         2 * np.arcsin(np.sqrt(min(neighbours / len(star), 1.0))),
-        WHOLE_FIELD * np.sqrt(4 * field_sr / np.pi),
+        LONGEST_SIDE_OF_FIELD * np.sqrt(4 * field_sr / np.pi),
     )
     found = triangles(rays, reach)
     sides = 2 * np.sin(found.sides_rad / 2)
-    return PatternIndex(star, rays, float(2 * np.sin(reach / 2)), found.vertices, found.handed, cKDTree(sides))
+    return PatternIndex(star, rays, float(2 * np.sin(reach / 2)), found.vertices, found.handedness, cKDTree(sides))
 
 
 def bright_stars_apart(stars: Stars, depth: int) -> Ints:
-    """The brightest stars, of each close pair only the brighter: a camera sees one light there."""
+    """Indices of the brightest stars, of each close pair only the brighter: a camera sees them as one."""
     from scipy.spatial import cKDTree
 
     rays = stars.rays_icrs[: 2 * depth]
@@ -93,8 +164,8 @@ def bright_stars_apart(stars: Stars, depth: int) -> Ints:
     return np.flatnonzero(keep)[:depth]
 
 
-class Patterns:
-    """All of it for a camera that sees `field_sr`, worked out when first asked for."""
+class CatalogPatterns:
+    """The indexes for a camera that sees `field_sr`, each built when it is first used."""
 
     def __init__(self, stars: Stars, field_sr: float) -> None:
         """`stars` are sorted, brightest first."""
@@ -103,12 +174,12 @@ class Patterns:
 
     @cached_property
     def bright(self) -> PatternIndex:
-        """Of the brightest few."""
+        """Triangles of the brightest few stars."""
         return build_index(self.stars, self.field_sr, BRIGHT)
 
     @cached_property
     def deep(self) -> PatternIndex:
-        """Of more stars."""
+        """Triangles of more stars."""
         return build_index(self.stars, self.field_sr, DEEP)
 
     @cached_property
@@ -119,56 +190,56 @@ class Patterns:
         return build_pairs(self.stars, self.field_sr)
 
     def tree(self, count: int) -> Any:
-        """scipy.spatial.cKDTree of at least the `count` brightest stars: a short list needs only a shallow one."""
+        """scipy.spatial.cKDTree of at least the `count` brightest stars."""
         from scipy.spatial import cKDTree
 
-        level = SHALLOWEST << max((count - 1) // SHALLOWEST, 0).bit_length()
+        level = SHALLOWEST_TREE << max((count - 1) // SHALLOWEST_TREE, 0).bit_length()
         if level not in self._trees:
             self._trees[level] = cKDTree(self.stars.rays_icrs[:level])
         return self._trees[level]
 
-    def near(self, rays_icrs: Array, radius_rad: float, count: int) -> Near:
+    def neighbours(self, rays_icrs: Array, radius_rad: float, count: int) -> Neighbours:
         """All pairs of a ray (n, 3) and a star closer than the radius, of the `count` brightest stars and some more."""
-        return _near(self.tree(count), rays_icrs, 2 * np.sin(radius_rad / 2), NEIGHBOURS)
+        return _neighbours(self.tree(count), rays_icrs, 2 * np.sin(radius_rad / 2), NEIGHBOURS_OF_RAY)
 
 
 @dataclass(frozen=True)
-class Near:
-    """Rays and the stars beside them."""
+class Neighbours:
+    """Pairs of a ray and a star near it."""
 
     ray: Ints  # (k,) ascending
     star: Ints  # (k,)
-    chord: Array  # (k,) between them
+    chord: Array  # (k,) distance on the unit sphere
     depth: int  # number of the brightest stars that were searched
 
 
-def _near(tree: Any, rays_icrs: Array, chord: float, most: int) -> Near:
+def _neighbours(tree: Any, rays_icrs: Array, chord: float, most: int) -> Neighbours:
     distance, star = tree.query(rays_icrs, most, distance_upper_bound=chord)
     close = np.flatnonzero(distance < chord)  # a missing neighbour is infinitely far
     ray = close // most
-    near = Near(ray, star.ravel()[close], distance.ravel()[close], tree.n)
+    near = Neighbours(ray, star.ravel()[close], distance.ravel()[close], tree.n)
     crowded = np.flatnonzero(distance[:, -1] < chord)
     if not len(crowded):
         return near
-    more = _near(tree, rays_icrs[crowded], chord, 4 * most)  # in star clusters
+    more = _neighbours(tree, rays_icrs[crowded], chord, 4 * most)  # in star clusters
     plain = np.isin(ray, crowded, invert=True)
     ray = np.concatenate([ray[plain], crowded[more.ray]])
     order = np.argsort(ray, kind="stable")
     star = np.concatenate([near.star[plain], more.star])
     distance = np.concatenate([near.chord[plain], more.chord])
-    return Near(ray[order], star[order], distance[order], near.depth)
+    return Neighbours(ray[order], star[order], distance[order], near.depth)
 
 
-def patterns_of(stars: Stars, field_sr: float) -> Patterns:
-    """The patterns of these very stars; the last few are kept."""
+def patterns_of(stars: Stars, field_sr: float) -> CatalogPatterns:
+    """The patterns of these stars; those of the last few catalogues and fields are kept."""
     key = (_fingerprint_of(stars), field_sr)
-    if key not in _KEPT:
-        _KEPT[key] = Patterns(stars, field_sr)
-        while len(_KEPT) > KEPT_PATTERNS:
-            _KEPT.popitem(last=False)
-    _KEPT.move_to_end(key)
-    return _KEPT[key]
+    if key not in _CACHE:
+        _CACHE[key] = CatalogPatterns(stars, field_sr)
+        while len(_CACHE) > CACHED_PATTERNS:
+            _CACHE.popitem(last=False)
+    _CACHE.move_to_end(key)
+    return _CACHE[key]
 
 
-_KEPT: OrderedDict[tuple[object, float], Patterns] = OrderedDict()
-_fingerprint_of = KeptPerObject(lambda stars: (stars.rays_icrs.shape, stars.rays_icrs[:2000].tobytes()))
+_CACHE: OrderedDict[tuple[object, float], CatalogPatterns] = OrderedDict()
+_fingerprint_of = PerObject(lambda stars: (stars.rays_icrs.shape, stars.rays_icrs[:2000].tobytes()))

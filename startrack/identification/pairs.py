@@ -1,7 +1,7 @@
-"""Triangles without a list of them: for frames with so few stars that no listed one is among them.
+"""Triangles assembled from pairs of catalogue stars, for frames with so few stars that no indexed triangle fits.
 
-Each star within reach of a pivot makes a pair, which the catalogue's pairs of equal length explain; two such pairs
-that share the pivot's star, and whose ends lie as far apart as in the image, make a triangle.
+Each pair of a pivot and another detection is compared with the catalogue's pairs of equal length. Two such pairs with
+the same catalogue star at the pivot form a triangle if their other ends are as far apart as in the image.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from startrack.types import Array, Ints, Stars
 PAIRS_WANTED = 180_000
 DEEPEST = 5000
 WIDEST_RAD = np.radians(110.0)
-NARROWEST_PART = 0.07  # of the widest; closer pairs fix the roll poorly
+NARROWEST_FRACTION = 0.07  # of the widest; closer pairs determine the roll poorly
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class PairIndex:
 
 
 def _within_groups(ordered: Ints) -> tuple[Ints, Ints]:
-    """Places (c,), (c,) of all pairs of equal values among the ascending ones (n,)."""
+    """Indices (c,), (c,) of all pairs of equal values among the ascending values (n,)."""
     own = np.arange(len(ordered))
     later = np.searchsorted(ordered, ordered, side="right") - own - 1
     one = np.repeat(own, later)
@@ -58,18 +58,18 @@ def _within_groups(ordered: Ints) -> tuple[Ints, Ints]:
 
 
 def build_pairs(stars: Stars, field_sr: float) -> PairIndex:
-    """Pairs no wider than the field, of as many bright stars as keep their number at bay."""
+    """Index of the pairs no wider than the field, of as many bright stars as give about PAIRS_WANTED pairs."""
     from scipy.spatial import cKDTree
 
     diameter = 2 * np.arccos(np.clip(1 - field_sr / (2 * np.pi), -1, 1))
     widest = min(WIDEST_RAD, float(diameter))
-    within = 0.5 * (1 - np.cos(widest))  # part of the sphere that a star's partners come from
+    within = 0.5 * (1 - np.cos(widest))  # fraction of the sphere that contains a star's partners
     star = bright_stars_apart(stars, int(min(np.sqrt(2 * PAIRS_WANTED / within), DEEPEST)))
     rays = stars.rays_icrs[star]
     pairs = cKDTree(rays).query_pairs(2 * np.sin(widest / 2), output_type="ndarray").astype(np.int64)
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     sides = np.linalg.norm(rays[pairs[:, 0]] - rays[pairs[:, 1]], axis=1)
     order = np.argsort(sides, kind="stable")
-    narrowest = 2 * np.sin(NARROWEST_PART * widest / 2)
+    narrowest = 2 * np.sin(NARROWEST_FRACTION * widest / 2)
     order = order[np.searchsorted(sides[order], narrowest) :]
     return PairIndex(rays, pairs[order], sides[order], float(narrowest))

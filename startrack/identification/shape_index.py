@@ -1,4 +1,4 @@
-"""Triangles alike in shape and roughly in size: what a lens of unknown scale leaves of a pattern of stars."""
+"""Index of triangles by shape and rough size, for a lens of unknown scale."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from startrack.identification.triangles import Triangles
 from startrack.types import Array, Ints
 
-CELL_LENGTH = 16.0  # of the key's part that tells the size, in e-folds: more than there are between stars
+CELL_LENGTH = 16.0  # range of the logarithm of the size within a cell of the key
 SMALLEST_LOG = -12.0
 
 
 @dataclass(frozen=True)
-class SimilarTriangles:
+class ShapeIndex:
     """Catalogue triangles sorted by a key: the cell of their two ratios of sides, then the logarithm of the size."""
 
     triangles: Triangles
@@ -28,7 +28,7 @@ class SimilarTriangles:
         """Pairs (image triangle, catalogue triangle) that agree, mirror images included; sorted by the first."""
         ratios, log_size = _features(image)
         cell = np.floor(ratios / (2 * self.shape_tolerance) - 0.5).astype(np.int64)
-        # The tolerance is half a cell: four cells may hold what agrees.
+        # The tolerance is half a cell, so that candidates lie in at most four cells.
         cells = cell[:, None] + np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
         keys = _key(cells, log_size[:, None], self.shape_tolerance).ravel()
         first = np.searchsorted(self.key, keys - self.size_tolerance)
@@ -41,14 +41,12 @@ class SimilarTriangles:
         return left[agree], right[agree]
 
 
-def similar_triangles(found: Triangles, shape_tolerance: float, size_tolerance: float) -> SimilarTriangles:
-    """The index of the triangles; tolerances are relative."""
+def shape_index(found: Triangles, shape_tolerance: float, size_tolerance: float) -> ShapeIndex:
+    """Index of the triangles; the tolerances are relative."""
     ratios, log_size = _features(found)
     key = _key(np.floor(ratios / (2 * shape_tolerance)).astype(np.int64), log_size, shape_tolerance)
     order = np.argsort(key)
-    return SimilarTriangles(
-        found.take(order), key[order], ratios[order].astype(np.float32), shape_tolerance, size_tolerance
-    )
+    return ShapeIndex(found.take(order), key[order], ratios[order].astype(np.float32), shape_tolerance, size_tolerance)
 
 
 def _features(found: Triangles) -> tuple[Array, Array]:
@@ -59,6 +57,6 @@ def _features(found: Triangles) -> tuple[Array, Array]:
 
 def _key(cell: Ints, log_size: Array, shape_tolerance: float) -> Array:
     """Cells (..., 2) first, sizes (...) within them."""
-    in_a_row = int(1.0 / (2 * shape_tolerance)) + 3
+    cells_in_row = int(1.0 / (2 * shape_tolerance)) + 3
     size = np.clip(log_size - SMALLEST_LOG, 1.0, CELL_LENGTH - 1.0)
-    return (cell[..., 0] * in_a_row + cell[..., 1]) * CELL_LENGTH + size
+    return (cell[..., 0] * cells_in_row + cell[..., 1]) * CELL_LENGTH + size

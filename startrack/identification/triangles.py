@@ -1,4 +1,4 @@
-"""Triangles of rays: the pattern that no lens, rotation or scale of the image changes once pixels are rays."""
+"""Triangles of rays: patterns whose sides do not depend on the attitude."""
 
 from __future__ import annotations
 
@@ -18,31 +18,33 @@ class Triangles:
 
     vertices: Ints  # (n, 3) indices of the rays
     sides_rad: Array  # (n, 3) ascending
-    handed: Array  # (n,) sign of the triple product of the ordered vertices: tells a sky from its mirror image
+    handedness: Array  # (n,) sign of the triple product of the ordered vertices; the mirror image has the other sign
 
     def __len__(self) -> int:
         return len(self.vertices)
 
     def take(self, which: Any) -> Triangles:
         """The triangles selected by a mask or index array."""
-        return Triangles(vertices=self.vertices[which], sides_rad=self.sides_rad[which], handed=self.handed[which])
+        return Triangles(
+            vertices=self.vertices[which], sides_rad=self.sides_rad[which], handedness=self.handedness[which]
+        )
 
 
-def triangles(rays: Array, reach_rad: float, most: int = 2_000_000) -> Triangles:
-    """All triangles of the rays (n, 3) whose sides are all shorter than the reach [rad] (below 90 degrees).
+def triangles(rays: Array, longest_rad: float, most: int = 2_000_000) -> Triangles:
+    """All triangles of the rays (n, 3) with sides shorter than `longest_rad` (below 90 degrees).
 
     At most `most`, those of the earliest (brightest) rays first. Flat triangles and those with two nearly equal sides
-    are left out: their vertices cannot be ordered or their handedness told.
+    are left out: their handedness, or the order of their vertices, is not determined.
     """
-    vertices = _triples(rays, 2 * np.sin(reach_rad / 2), most)
+    vertices = _triples(rays, 2 * np.sin(longest_rad / 2), most)
     a, b, c = rays[vertices[:, 0]], rays[vertices[:, 1]], rays[vertices[:, 2]]
-    return _ordered(rays, vertices, np.stack([_angle(b, c), _angle(c, a), _angle(a, b)], axis=1))
+    return _by_opposite_side(rays, vertices, np.stack([_angle(b, c), _angle(c, a), _angle(a, b)], axis=1))
 
 
 def sides_of_few(rays: Array, fresh: int = 0) -> tuple[Ints, Array]:
-    """All triples (m, 3) of a few dozen rays with a member from number `fresh` on, and for each its opposite side.
+    """All triples (m, 3) of a few dozen rays with a vertex from index `fresh` on, and their opposite sides (m, 3).
 
-    Sides are chords, in the order of the vertices: a search sorts only what it needs.
+    Sides are chords in the order of the vertices; the caller sorts those that it needs.
     """
     i, j, vertices, opposite = _combinations(len(rays), fresh)
     apart = rays[i] - rays[j]
@@ -51,7 +53,7 @@ def sides_of_few(rays: Array, fresh: int = 0) -> tuple[Ints, Array]:
 
 @lru_cache(maxsize=64)
 def _combinations(n: int, fresh: int) -> tuple[Ints, Ints, Ints, Ints]:
-    """Pairs i < j, triples (m, 3), and for each vertex of a triple the number of the pair opposite to it."""
+    """Pairs i < j, triples (m, 3), and for each vertex of a triple the index of the opposite pair."""
     i, j = np.triu_indices(n, 1)
     number = np.zeros((n, n), dtype=np.int64)
     number[i, j] = np.arange(len(i))
@@ -60,8 +62,11 @@ def _combinations(n: int, fresh: int) -> tuple[Ints, Ints, Ints, Ints]:
     return i, j, np.stack([a, b, c], axis=1), np.stack([number[b, c], number[a, c], number[a, b]], axis=1)
 
 
-def triad(cam: Array, icrs: Array) -> Array:
-    """R_cam_icrs (m, 3, 3) from the first two of the rays (m, k, 3): quick, and good enough to be compared."""
+def triad_attitude(cam: Array, icrs: Array) -> Array:
+    """R_cam_icrs (m, 3, 3) from the first two of the rays (m, k, 3): fast, and accurate enough for a comparison.
+
+    Source: Black 1964, AIAA J. 2, 1350 (TRIAD).
+    """
 
     def frame(rays: Array) -> Array:
         a = rays[:, 0]
@@ -72,14 +77,14 @@ def triad(cam: Array, icrs: Array) -> Array:
     return frame(cam) @ np.swapaxes(frame(icrs), 1, 2)
 
 
-def _ordered(rays: Array, vertices: Ints, sides: Array) -> Triangles:
-    """Vertices (n, 3) sorted by their opposite sides (n, 3); doubtful triangles left out."""
+def _by_opposite_side(rays: Array, vertices: Ints, sides: Array) -> Triangles:
+    """Triangles with vertices (n, 3) sorted by their opposite sides (n, 3); degenerate ones are left out."""
     order = np.argsort(sides, axis=1)
     sides = np.take_along_axis(sides, order, axis=1)
     vertices = np.take_along_axis(vertices, order, axis=1)
     volume = np.linalg.det(rays[vertices])
     good = (np.abs(volume) > 0.05 * sides[:, 2] ** 2 * 0.5) & (np.diff(sides, axis=1).min(axis=1) > 0.01 * sides[:, 2])
-    return Triangles(vertices=vertices[good], sides_rad=sides[good], handed=np.sign(volume[good]))
+    return Triangles(vertices=vertices[good], sides_rad=sides[good], handedness=np.sign(volume[good]))
 
 
 def _triples(rays: Array, chord: float, most: int) -> Ints:
@@ -93,7 +98,7 @@ def _triples(rays: Array, chord: float, most: int) -> Ints:
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
     n = len(rays)
     starts = np.searchsorted(pairs[:, 0], np.arange(n + 1))
-    # Every pair (i, j) is extended by each later partner k of i; kept where (j, k) is a pair too.
+    # Each pair (i, j) is extended by every later partner k of i, and kept where (j, k) is a pair too.
     own = np.arange(len(pairs))
     later = starts[pairs[:, 0] + 1] - own - 1
     first = np.repeat(own, later)
@@ -110,7 +115,7 @@ def _triples(rays: Array, chord: float, most: int) -> Ints:
 
 
 def _angle(a: Array, b: Array) -> Array:
-    """Angles (n,) between unit vectors (n, 3), exact at all sizes (Kahan): without a cross product, which is slow."""
+    """Angles (n,) between unit vectors (n, 3), exact at all sizes (Kahan), without a slow cross product."""
     apart, together = a - b, a + b
     short, long = np.einsum("ni,ni->n", apart, apart), np.einsum("ni,ni->n", together, together)
     return 2.0 * np.arctan2(np.sqrt(short), np.sqrt(long))

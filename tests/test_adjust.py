@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from startrack.adjust import AttitudeFit, solve_attitude
 from startrack.camera import Camera, KannalaBrandt, Pinhole
 from startrack.camera.parameters import with_update
-from startrack.orient import AttitudeFit, solve_attitude
 from startrack.types import NotIdentified
 
 ARCSEC = np.pi / 648_000

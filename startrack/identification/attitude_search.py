@@ -1,0 +1,162 @@
+"""Search for attitudes: triangles of detections that match the catalogue's, tested against the bright stars.
+
+All arrays are small and the number of numpy calls is kept low: a typical search ends with its first triangles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from startrack.false_alarm import PATTERN_MATCHES, expected_false_alarms
+from startrack.frames import wahba
+from startrack.identification.index import CatalogPatterns, Neighbours, PatternIndex, PixelScale
+from startrack.identification.triangles import sides_of_few, triangles
+from startrack.types import Array, Ints
+
+PREFIXES = (0, 7, 10, 14, 20, 28)  # number of brightest detections that form triangles, round by round
+WINDOW, FRESH = 24, 12  # ranks of brightness that form triangles beyond these, and how many of them are new
+DEEPEST_RANK = 240
+ROUGH_DEPTH, ROUGH_REACH_RAD, ROUGH_FRACTION = 120, np.radians(20.0), 0.4
+PIVOTS = 16  # brightest detections about which triangles that no index lists are tried
+MATCHES_EACH, ROUGH_MATCHES_EACH = 3, 8  # catalogue triangles looked up for a triangle of detections
+MOST_IMAGE_TRIANGLES, MOST_ROUGH = 20_000, 3000  # short triangles of detections; their matches that are tried
+VERIFIED = 256  # detections tested against the stars
+SIFTED, SIFTED_AT_ONCE = 64, 64  # detections that test a crowd of hypotheses first; hypotheses tested together
+DEPTH_FACTOR = 4  # catalogue stars per detection (of the whole sky): some are hidden or too faint
+FEWEST_HITS = 6
+PLAUSIBLE = 1e-2  # expected false alarms below which a hypothesis is refined; then the real limit decides
+
+
+@dataclass(frozen=True)
+class AttitudeHypothesis:
+    """A rough attitude with the pairs that coincide."""
+
+    R_cam_icrs: Array
+    detection: Ints  # (k,)
+    star: Ints  # (k,)
+    near: Neighbours | None  # all stars near the detections, where they were looked up
+
+
+@dataclass
+class AttitudeSearch:
+    """Hypotheses of the attitude, in order of likelihood."""
+
+    rays_cam: Array  # (n, 3) of the detections inside the image circle, brightest first
+    patterns: CatalogPatterns
+    scale: PixelScale
+    neighbour_radius_rad: float  # stars this near a detection matter
+    tried: int = 0  # matching triangles so far
+    mirrored: list[tuple[Array, Array, int, float]] = field(default_factory=list)  # matches of the other handedness
+
+    def hypotheses(self, tolerance_px: float, rough_px: float) -> Iterator[AttitudeHypothesis]:
+        """Attitudes that chance hardly explains.
+
+        First from long triangles of the few brightest detections, then of fainter ones and with more catalogue stars,
+        then from triangles that no index lists; last from short ones, for rays in error by `rough_px`: over a short
+        distance a rough calibration is still good.
+        """
+        brightest, beyond = list(self._prefixes()), list(self._windows())
+        tolerance = tolerance_px * self.scale.axis_rad_per_px
+        for windows in (brightest, beyond):
+            for deep in (False, True):
+                for first, fresh, end in windows:
+                    index = self.patterns.deep if deep else self.patterns.bright
+                    yield from self._from_triangles(index, first, fresh, end, tolerance)
+        yield from self._from_pairs(tolerance)
+        yield from self._from_short_triangles(rough_px * self.scale.axis_rad_per_px)
+
+    def mirrored_hypotheses(self) -> Iterator[AttitudeHypothesis]:
+        """The same for the mirror image, from the triangles of the other handedness met so far."""
+        flip = np.array([-1.0, 1.0, 1.0])
+        for cam, icrs, first, tolerance in self.mirrored:
+            yield from self._plausible(cam * flip, icrs, self.rays_cam * flip, first, tolerance)
+
+    def _prefixes(self) -> Iterator[tuple[int, int, int]]:
+        n = len(self.rays_cam)
+        return ((0, done, min(end, n)) for done, end in pairwise(PREFIXES) if done < n)
+
+    def _windows(self) -> Iterator[tuple[int, int, int]]:
+        n = min(len(self.rays_cam), DEEPEST_RANK)
+        start = PREFIXES[-1] - (WINDOW - FRESH)
+        return ((k, WINDOW - FRESH, min(k + WINDOW, n)) for k in range(start, n - WINDOW + FRESH, FRESH))
+
+    def _from_triangles(
+        self, index: PatternIndex, first: int, fresh: int, end: int, tolerance: float
+    ) -> Iterator[AttitudeHypothesis]:
+        """From triangles of the detections `first` to `end` that have a vertex from the `fresh`-th of them on."""
+        vertices, sides = sides_of_few(self.rays_cam[first:end], fresh)
+        ordered = np.sort(sides, axis=1)
+        short = np.flatnonzero(ordered[:, 2] < index.longest_chord)
+        left, right = index.candidates(ordered[short], tolerance, MATCHES_EACH)
+        if len(left):
+            left = short[left]
+            order = np.argsort(sides[left], axis=1)
+            vertex = vertices[left[:, None], order] + first
+            icrs = index.rays_icrs[index.vertices[right]]
+            yield from self._of_one_hand(self.rays_cam[vertex], icrs, index.handedness[right], first, tolerance)
+
+    def _from_pairs(self, tolerance: float) -> Iterator[AttitudeHypothesis]:
+        index, few = self.patterns.pairs, self.rays_cam[:PIVOTS]
+        for pivot in range(len(few) - 2):
+            image, catalogue = index.triangles(few[pivot:], tolerance)
+            if len(image):
+                icrs = index.rays_icrs[catalogue]
+                yield from self._of_one_hand(few[image + pivot], icrs, np.linalg.det(icrs), 0, tolerance)
+
+    def _from_short_triangles(self, tolerance: float) -> Iterator[AttitudeHypothesis]:
+        index = self.patterns.deep
+        longest = min(ROUGH_REACH_RAD, ROUGH_FRACTION * self.scale.diameter_rad)
+        image = triangles(self.rays_cam[:ROUGH_DEPTH], longest, MOST_IMAGE_TRIANGLES)
+        left, right = index.candidates(2 * np.sin(image.sides_rad / 2), tolerance, ROUGH_MATCHES_EACH)
+        self.tried += max(len(left) - MOST_ROUGH, 0)
+        left, right = left[:MOST_ROUGH], right[:MOST_ROUGH]
+        if len(left):
+            cam, icrs = self.rays_cam[image.vertices[left]], index.rays_icrs[index.vertices[right]]
+            yield from self._of_one_hand(cam, icrs, index.handedness[right], 0, tolerance)
+
+    def _of_one_hand(
+        self, cam: Array, icrs: Array, handedness: Array, first: int, tolerance: float
+    ) -> Iterator[AttitudeHypothesis]:
+        """Test the triangles cam (m, 3, 3) of the catalogue's handedness (m,); store the others in `mirrored`."""
+        self.tried += len(cam)
+        same = np.linalg.det(cam) * handedness > 0
+        if np.count_nonzero(same) < len(same):
+            self.mirrored.append((cam[~same], icrs[~same], first, tolerance))
+            cam, icrs = cam[same], icrs[same]
+        yield from self._plausible(cam, icrs, self.rays_cam, first, tolerance)
+
+    def _plausible(
+        self, cam: Array, icrs: Array, rays_cam: Array, first: int, tolerance: float
+    ) -> Iterator[AttitudeHypothesis]:
+        """Of the attitudes that rotate the rays icrs (m, 3, 3) to cam (m, 3, 3), those that bright stars support."""
+        some, radius = rays_cam[: first + VERIFIED], 2.0 * tolerance
+        depth = int(DEPTH_FACTOR * 4 * np.pi / self.patterns.field_sr * len(some))
+        for R in self._sifted(cam, icrs, some[max(first - WINDOW, 0) : first + SIFTED], radius, depth):
+            near = self.patterns.neighbours(some @ R, self.neighbour_radius_rad, depth)
+            on = near.chord < radius
+            hits = min(int(np.count_nonzero(on)), len(some))
+            if hits < FEWEST_HITS:
+                continue
+            if self._false_alarms(hits - PATTERN_MATCHES, len(some), near.depth, radius) < PLAUSIBLE:
+                yield AttitudeHypothesis(R, near.ray[on], near.star[on], near if len(some) == len(rays_cam) else None)
+
+    def _sifted(self, cam: Array, icrs: Array, some: Array, radius: float, depth: int) -> Iterator[Array]:
+        """R_cam_icrs of the closest match, which is nearly always right; then of those that detections support."""
+        if len(cam):
+            yield wahba(cam[0], icrs[0])
+        tree = self.patterns.tree(depth)
+        for start in range(1, len(cam), SIFTED_AT_ONCE):
+            R = wahba(cam[start : start + SIFTED_AT_ONCE], icrs[start : start + SIFTED_AT_ONCE])
+            distance = tree.query(some @ R, distance_upper_bound=radius)[0]
+            hits = np.count_nonzero(distance < radius, axis=1)
+            best = np.argsort(-hits, kind="stable")
+            expected = self._false_alarms(np.maximum(hits[best] - PATTERN_MATCHES, 1), len(some), tree.n, radius)
+            yield from R[best[expected < PLAUSIBLE]]
+
+    def _false_alarms(self, further: Ints | int, rays: int, depth: int, radius: float) -> Array:
+        """Expected number of trials in which so many further rays hit one of the `depth` brightest stars by chance."""
+        return expected_false_alarms(self.tried, further, rays, min(depth * radius**2 / 4, 1.0))

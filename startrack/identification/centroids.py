@@ -1,0 +1,139 @@
+"""Identification of a plain list of centroids in one call."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from startrack.adjust import AttitudeFit, solve_attitude
+from startrack.camera import Camera
+from startrack.identification.lost_in_space import Identifier
+from startrack.identification.unknown_lens import identify_unknown_lens
+from startrack.types import Attitude, Centroids, Identification, Ints, Stars
+
+DEFAULT_SIGMA_PX = 0.3  # centroid error per axis where none is given
+DEFAULT_PSF_SIGMA_PX = 1.0
+STAR_COUNT_SLOPE = 1.08  # natural logarithm of the increase of the number of stars per magnitude
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentifiedCentroids:
+    """Matches, attitude and camera of a list of centroids."""
+
+    identification: Identification  # its `detection` counts the centroids in the order given
+    stars: Stars  # the catalogue to which its `star` refers
+    camera: Camera  # as given, or found (name "unknown", with covariance)
+    attitude_fit: AttitudeFit
+
+    @property
+    def attitude(self) -> Attitude:
+        """R_cam_icrs with its covariance."""
+        return self.attitude_fit.attitude
+
+    @property
+    def detection(self) -> Ints:
+        """Indices (n,) of the identified centroids."""
+        return self.identification.detection
+
+    @property
+    def star(self) -> Ints:
+        """Indices (n,) of their stars in `stars`."""
+        return self.identification.star
+
+    @property
+    def hip(self) -> Ints:
+        """Hipparcos numbers (n,) of the stars, 0 where there is none."""
+        return self.stars.hip[self.identification.star]
+
+    @property
+    def false_alarm_probability(self) -> float:
+        """Probability that random centroids would be accepted as well matched."""
+        return self.identification.false_alarm_probability
+
+
+def identify_centroids(
+    xy_px: ArrayLike,
+    *,
+    camera: Camera | None = None,
+    fov_rad: float | None = None,
+    size_px: tuple[int, int] | None = None,
+    flux: ArrayLike | None = None,
+    sigma_px: ArrayLike | None = None,
+    saturated: ArrayLike | None = None,
+    psf_sigma_px: float = DEFAULT_PSF_SIGMA_PX,
+    stars: Stars | None = None,
+    identifier: Identifier | None = None,
+) -> IdentifiedCentroids:
+    """Identify the stars in a list of centroids, with a camera or from a field of view alone.
+
+    Args:
+        xy_px: centroids (n, 2); (0, 0) is the centre of the top-left pixel, x right, y down.
+        camera: the calibrated camera; None: the lens is found too, and `fov_rad` and `size_px` are needed.
+        fov_rad: field of view to about 10 %. Below 100 degrees the angle across the frame's width, from there up that
+            of the image circle.
+        size_px: width and height of the frame.
+        flux: (n,) in any linear unit. None: the brightness is not known and the list is sorted, brightest first.
+        sigma_px: centroid error per axis, one number or (n,); None: 0.3 px.
+        saturated: (n,) True where the flux is a lower limit; None: nowhere.
+        psf_sigma_px: width of the stars; nearer stars than three times this share one centroid.
+        stars: catalogue at the time of the exposure, brightest first; None: Hipparcos at J2000.0, without aberration.
+        identifier: settings of the identification with a camera.
+
+    Raises:
+        ValueError: neither a camera, nor a field of view with the frame's size; or lists of different lengths.
+        NotIdentified: the stars are not identified; its `reason` is "mirrored" for the mirror image of a known camera.
+    """
+    if camera is None and (fov_rad is None or size_px is None):
+        raise ValueError("give a camera, or fov_rad with size_px")
+    if stars is None:
+        from startrack.catalog import load_catalog
+
+        stars = load_catalog().at(None, None)
+    sources, order = sorted_centroids(xy_px, flux, sigma_px, saturated, psf_sigma_px)
+    if camera is None:
+        assert size_px is not None and fov_rad is not None
+        solution = identify_unknown_lens(sources, size_px, fov_rad, stars)
+        camera, found = solution.camera, solution.identification
+    else:
+        found = (identifier or Identifier())(sources, camera, stars)
+    fit = solve_attitude(
+        camera, sources.xy_px[found.detection], sources.covariance_px2[found.detection], stars.rays_icrs[found.star],
+        found.R_cam_icrs,
+    )  # fmt: skip
+    found = Identification(
+        detection=order[found.detection], star=found.star, R_cam_icrs=fit.attitude.R_cam_icrs,
+        false_alarm_probability=found.false_alarm_probability, unexplained=found.unexplained,
+    )  # fmt: skip
+    return IdentifiedCentroids(identification=found, stars=stars, camera=camera, attitude_fit=fit)
+
+
+def sorted_centroids(
+    xy_px: ArrayLike, flux: ArrayLike | None, sigma_px: ArrayLike | None, saturated: ArrayLike | None,
+    psf_sigma_px: float,
+) -> tuple[Centroids, Ints]:  # fmt: skip
+    """Centroids, brightest first, and their indices (n,) in the given order. Raises ValueError.
+
+    Without fluxes each rank has the magnitude at which a typical sky has as many stars, and the brightness takes no
+    part in the matches.
+    """
+    xy = np.asarray(xy_px, dtype=np.float64).reshape(-1, 2)
+    n = len(xy)
+    if flux is None:
+        order, brightness_sigma_mag = np.arange(n, dtype=np.int64), np.inf
+        light = np.exp(-np.log(10.0) * 0.4 / STAR_COUNT_SLOPE * np.log(np.arange(1, n + 1)))
+    else:
+        light, brightness_sigma_mag = np.asarray(flux, dtype=np.float64), 0.0
+        order = np.argsort(-light, kind="stable")
+    sigma = np.broadcast_to(np.asarray(DEFAULT_SIGMA_PX if sigma_px is None else sigma_px, dtype=np.float64), n)
+    clipped = np.zeros(n, dtype=bool) if saturated is None else np.asarray(saturated, dtype=bool)
+    return Centroids(
+        xy_px=xy[order],
+        covariance_px2=np.square(sigma[order])[:, None, None] * np.eye(2),
+        flux_e=light[order],
+        snr=np.full(n, np.inf),
+        saturated=clipped[order],
+        psf_sigma_px=psf_sigma_px,
+        brightness_sigma_mag=brightness_sigma_mag,
+    ), order

@@ -1,0 +1,258 @@
+"""Verification of a lens found without a camera file: all stars matched, the trusted field measured, the p-value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from startrack.camera import Camera, Pinhole
+from startrack.false_alarm import coincidence_probability, density_per_sr, log_p_value, log_trials
+from startrack.identification.radial_lens_family import PINHOLE, RadialFamily
+from startrack.identification.region_growing import GrownLens, as_polynomial, fit_camera, match_in_view
+from startrack.match import (
+    BRIGHTER_MAG,
+    DEPTH_BELOW_THRESHOLD_MAG,
+    FEWEST_UNSATURATED,
+    SIGNIFICANT_SNR,
+    brightness_agreement,
+    instrumental_mag,
+    is_isolated,
+    match_by_brightness,
+)
+from startrack.types import Array, Bools, Centroids, Ints, Stars
+
+FITS = ((4.0, 200), (2.5, 500), (1.8, 3000))  # gate [px] and number of brightest detections
+GATES_PX = (2.0, 1.5)  # of the matches by brightness
+TESTED = 400  # brightest detections that the p-value rests on
+NEAR_PX = 6.0  # stars this near their predicted pixel show whether the lens is right there
+SMALLEST_RADIUS_PX, RADIUS_SIGMAS = 0.6, 2.5
+ON_PLACE_FRACTION = 0.5  # of the stars near their predicted pixels, where the lens is right
+STARS_OF_A_RING, MOST_RINGS = 8, 12
+FEWEST = 5
+FREE_MATCHES, FREE_MATCHES_PINHOLE = 8, 3  # that a fit of attitude and lens produces by itself
+FEWEST_TIMES_CHANCE = 3.0  # matches over those expected by chance
+ORDERS = ((150, 4), (60, 3), (25, 2), (0, 1))  # coefficients of the polynomial from this many matches on
+POLYNOMIAL_RMS_1 = 0.9  # a polynomial replaces a pinhole if it leaves less than this part of the residual
+FEWEST_FOR_CENTRE = 30
+BLEND_SIGMAS, WIDEST_PSF_PX = 3.0, 1.5
+BLEND_FLUX_RATIO = 0.25  # a neighbour with more than this part of a star's flux makes the match ambiguous
+BLEND_MAG = float(-2.5 * np.log10(BLEND_FLUX_RATIO))
+SCALE_STARS, SCALE_MATCHES = 5000, 200  # brightest stars predicted, and matches used, for the photometric scale
+UNEXPLAINED_MARGIN_MAG = 2.0  # fainter stars than this below a detection do not explain it
+
+
+@dataclass(frozen=True)
+class VerifiedLens:
+    """Camera, attitude and matches with their p-value."""
+
+    camera: Camera  # calibrated as far out as stars lie on their predicted pixels
+    R_cam_icrs: Array
+    detection: Ints
+    star: Ints
+    log_p: float  # that a random sky would be matched as well by one of all trials
+    unexplained: int
+
+    @property
+    def matched(self) -> int:
+        """Number of matches."""
+        return len(self.star)
+
+
+@dataclass(frozen=True)
+class FluxMatches:
+    """Matches by position and flux, and the photometric scale of the frame."""
+
+    detection: Ints  # (n,)
+    star: Ints  # (n,)
+    distance_px: Array  # (n,)
+    zero_mag: float  # V of a star of unit flux
+    predicted: int  # stars in the field brighter than the faintest detection
+    coincident_px: Array  # (m,) distances of all matches, blends included
+    agreement: float  # fraction of random pairs of a star and a detection that agree in brightness
+
+
+def match_by_flux(
+    centroids: Centroids, camera: Camera, stars: Stars, R_cam_icrs: Array, gate_px: float, blend_px: float
+) -> FluxMatches:
+    """Nearest pairs within the gate whose brightness agrees; blends within `blend_px` are left out.
+
+    The photometric scale is the median over the brightest predicted stars of the frame itself.
+    """
+    from scipy.spatial import cKDTree
+
+    none = np.zeros(0, dtype=np.int64)
+    if not len(centroids):
+        return FluxMatches(none, none, np.zeros(0), 0.0, 0, np.zeros(0), 1.0)
+    tree, brightness = cKDTree(centroids.xy_px), instrumental_mag(centroids.flux_e)
+    px, inside = camera.project(stars.rays_icrs[:SCALE_STARS] @ R_cam_icrs.T)
+    seen = np.flatnonzero(inside)
+    distance, nearest = tree.query(px[seen], distance_upper_bound=gate_px)
+    hit = np.isfinite(distance)
+    usable = hit.copy()
+    usable[hit] = ~centroids.saturated[nearest[hit]]
+    first = np.flatnonzero(usable if np.count_nonzero(usable) >= FEWEST_UNSATURATED else hit)[:SCALE_MATCHES]
+    if len(first) < FEWEST_UNSATURATED:
+        return FluxMatches(none, none, np.zeros(0), 0.0, len(seen), np.zeros(0), 1.0)
+    zero_mag = float(np.median(stars.v_mag[seen[first]] - brightness[nearest[first]]))
+    faintest = zero_mag + float(np.max(brightness))
+    limit = faintest + DEPTH_BELOW_THRESHOLD_MAG
+    count = int(np.searchsorted(stars.v_mag, limit + BLEND_MAG))
+    px, inside = camera.project(stars.rays_icrs[:count] @ R_cam_icrs.T)
+    seen = np.flatnonzero(inside)
+    detection, star, distance = match_by_brightness(
+        tree, px, seen, gate_px, star_mag=stars.v_mag,
+        star_sigma_mag=stars.v_sigma_mag + centroids.brightness_sigma_mag, detection_mag=brightness + zero_mag,
+        saturated=centroids.saturated, limit_mag=limit, tolerance_mag=BRIGHTER_MAG,
+    )  # fmt: skip
+    alone = is_isolated(centroids.xy_px[detection], star, px, seen, stars.v_mag, blend_px, BLEND_MAG)
+    bright = stars.v_mag[seen][stars.v_mag[seen] < limit - DEPTH_BELOW_THRESHOLD_MAG]
+    return FluxMatches(
+        detection[alone], star[alone], distance[alone], zero_mag, len(bright), distance,
+        agreement_of(centroids, bright, brightness + zero_mag),
+    )  # fmt: skip
+
+
+def agreement_of(centroids: Centroids, v_mag: Array, measured_mag: Array) -> float:
+    """Fraction of random pairs that agree in brightness; 1 where the brightness is not known."""
+    return brightness_agreement(v_mag, measured_mag) if np.isfinite(centroids.brightness_sigma_mag) else 1.0
+
+
+def verify(grown: GrownLens, centroids: Centroids, stars: Stars, tried: int, widest_rad: float) -> VerifiedLens | None:
+    """The grown lens refined with all stars and verified; None where too few stars agree."""
+    fits = [_refine(c, grown.R_cam_icrs, centroids, stars, widest_rad) for c in _start_lenses(grown, widest_rad)]
+    found = [fit for fit in fits if fit is not None]
+    if not found:
+        return None
+    camera, R, rms_px = found[0]
+    if len(found) > 1 and found[1][2] < POLYNOMIAL_RMS_1 * rms_px:
+        camera, R, rms_px = found[1]
+    matches = match_by_flux(centroids.take(slice(TESTED)), camera, stars, R, NEAR_PX, 0.0)
+    off_axis = camera.angle_rad(centroids.xy_px[matches.detection])
+    trusted_rad = trusted_radius(off_axis, matches.distance_px < GATES_PX[-1])
+    if trusted_rad is None:
+        return None
+    camera = replace(camera, calibrated_angle_rad=min(trusted_rad, camera.max_angle_rad))
+    return _test(camera, R, centroids, stars, tried)
+
+
+def trusted_radius(off_axis: Array, on_place: Bools) -> float | None:
+    """Distance from the axis up to which the stars (n,) near their predicted pixels lie on them; None: nowhere.
+
+    The stars are divided into rings of equal numbers. The first ring with too few stars on their pixels ends the
+    trusted field.
+    """
+    order = np.argsort(off_axis)
+    on_place = on_place[order]
+    trusted = None
+    for ring in np.array_split(np.arange(len(order)), max(min(len(order) // STARS_OF_A_RING, MOST_RINGS), 1)):
+        if not len(ring) or on_place[ring].mean() < ON_PLACE_FRACTION:
+            break
+        trusted = float(off_axis[order[ring[on_place[ring]][-1]]])
+    return trusted
+
+
+def significance(hits: int, predicted: int, each: float, free: int) -> float:
+    """Log p-value of the hits; 0 unless they are several times as many as chance gives."""
+    if hits < FEWEST_TIMES_CHANCE * predicted * each:
+        return 0.0
+    return float(log_p_value(hits, predicted, each, free))
+
+
+def _start_lenses(grown: GrownLens, widest_rad: float) -> list[Camera]:
+    """The lenses to refine: a polynomial; or a pinhole, and a polynomial if there are stars enough for one."""
+    n = len(grown.star)
+    order = next(order for fewest, order in ORDERS if n >= fewest)
+    polynomial = _with_limits(as_polynomial(grown.camera, order, widest_rad), widest_rad)
+    lens = grown.camera.lens
+    if not (isinstance(lens, RadialFamily) and lens.shape == PINHOLE):
+        return [polynomial]
+    pinhole = _with_limits(replace(grown.camera, lens=Pinhole()), widest_rad)
+    return [pinhole, polynomial] if n >= ORDERS[-2][0] else [pinhole]
+
+
+def _refine(
+    camera: Camera, R: Array, centroids: Centroids, stars: Stars, widest_rad: float
+) -> tuple[Camera, Array, float] | None:
+    """Camera, attitude and RMS [px] after smaller gates and longer lists; the last matches are by brightness too."""
+    prior = camera
+    for gate_px, count in FITS:
+        xy = centroids.xy_px[:count]
+        detection, star, _ = match_in_view(camera, R, xy, stars.rays_icrs, gate_px)
+        if len(star) < FEWEST:
+            return None
+        free = _free_parameters(camera, len(star))
+        camera, R, _ = fit_camera(camera, R, xy[detection], stars.rays_icrs[star], free, gate_px / 4, prior)
+        camera = _with_limits(camera, widest_rad)
+    for gate_px in GATES_PX:
+        matches = match_by_flux(centroids, camera, stars, R, gate_px, _blend_px(centroids))
+        if len(matches.star) < FEWEST:
+            return None
+        xy, rays = centroids.xy_px[matches.detection], stars.rays_icrs[matches.star]
+        camera, R, distance = fit_camera(camera, R, xy, rays, _free_parameters(camera, len(rays)), gate_px / 4, prior)
+        camera = _with_limits(camera, widest_rad)
+    return camera, R, float(np.sqrt(np.mean(distance**2)))
+
+
+def _free_parameters(camera: Camera, matched: int) -> tuple[str, ...]:
+    if isinstance(camera.lens, Pinhole):
+        return ("f",)
+    centre = ("cx", "cy") if matched >= FEWEST_FOR_CENTRE else ()
+    return ("f", *camera.lens.parameters, *centre)
+
+
+def _with_limits(camera: Camera, widest_rad: float) -> Camera:
+    """The camera with its largest angles where the frame ends or the polynomial turns."""
+    width, height = camera.size_px
+    corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=float)
+    corner_rad = float(np.max(camera.angle_rad(corners)))
+    allowed = max(widest_rad, corner_rad) if isinstance(camera.lens, Pinhole) else widest_rad * 1.3
+    widest = min(allowed, corner_rad, camera.lens.max_invertible_rad)
+    return replace(camera, max_angle_rad=widest, calibrated_angle_rad=widest)
+
+
+def _blend_px(centroids: Centroids) -> float:
+    return BLEND_SIGMAS * min(centroids.psf_sigma_px, WIDEST_PSF_PX)
+
+
+def _test(camera: Camera, R: Array, centroids: Centroids, stars: Stars, tried: int) -> VerifiedLens | None:
+    """All matches inside the trusted field, with the p-value of those of the brightest detections."""
+    matches = match_by_flux(centroids, camera, stars, R, GATES_PX[-1], _blend_px(centroids))
+    inside = camera.angle_rad(centroids.xy_px[matches.detection]) <= camera.calibrated_angle_rad
+    detection, star = matches.detection[inside], matches.star[inside]
+    if len(star) < FEWEST:
+        return None
+    tested = centroids.take(slice(TESTED))
+    trusted = replace(camera, max_angle_rad=camera.calibrated_angle_rad)
+    some = match_by_flux(tested, trusted, stars, R, GATES_PX[-1], 0.0)
+    rms_px = float(np.sqrt(np.mean(matches.distance_px[inside] ** 2)))
+    radius_px = float(np.clip(RADIUS_SIGMAS * rms_px, SMALLEST_RADIUS_PX, GATES_PX[-1]))
+    hits = int(np.count_nonzero(some.coincident_px < radius_px))
+    predicted = max(some.predicted, hits)
+    rays = camera.unproject(tested.xy_px[camera.angle_rad(tested.xy_px) <= camera.calibrated_angle_rad])
+    radius_rad = radius_px * float(camera.mean_scale_rad_per_px(np.array(camera.calibrated_angle_rad / 2)))
+    each = some.agreement * float(coincidence_probability(density_per_sr(rays) * np.pi * radius_rad**2))
+    free = FREE_MATCHES_PINHOLE if isinstance(camera.lens, Pinhole) else FREE_MATCHES
+    return VerifiedLens(
+        camera=camera,
+        R_cam_icrs=R,
+        detection=detection,
+        star=star,
+        log_p=significance(hits, predicted, each, free) + log_trials(tried),
+        unexplained=_count_unexplained(centroids, camera, stars, R, matches.zero_mag),
+    )
+
+
+def _count_unexplained(centroids: Centroids, camera: Camera, stars: Stars, R: Array, zero_mag: float) -> int:
+    """Number of significant detections without a catalogue star near that is bright enough to contribute."""
+    from scipy.spatial import cKDTree
+
+    significant = np.flatnonzero(centroids.snr > SIGNIFICANT_SNR)
+    if not len(significant):
+        return 0
+    faintest = zero_mag - 2.5 * np.log10(centroids.flux_e[significant].min()) + UNEXPLAINED_MARGIN_MAG
+    px, inside = camera.project(stars.rays_icrs[: int(np.searchsorted(stars.v_mag, faintest))] @ R.T)
+    if not inside.any():
+        return len(significant)
+    distance, _ = cKDTree(px[inside]).query(centroids.xy_px[significant], distance_upper_bound=GATES_PX[-1])
+    return int(np.count_nonzero(~np.isfinite(distance)))

@@ -87,7 +87,7 @@ def test_a_signal_ends_the_batch_after_the_frames_in_hand_with_tables_of_what_is
 def test_a_later_signal_drops_the_images_in_hand_and_writes_the_tables(tmp_path, monkeypatch):
     """The wish is made from within, so that it comes between two images."""
     frames(tmp_path / "images", 40)
-    monkeypatch.setattr("startrack.cli.batch_show.ONE_WISH_S", -1.0)
+    monkeypatch.setattr("startrack.cli.batch_show.SAME_SIGNAL_S", -1.0)
     told = []
 
     def wish(*_: object, **__: object) -> None:

@@ -17,7 +17,7 @@ from astropy.table import Table
 from page_helpers import NASTY, results_in
 
 from startrack.cli.main import main
-from startrack.cli.report import page_of_images
+from startrack.cli.report import write_page_of_images
 from startrack.errors import Reason
 from startrack.output import write_json
 from startrack.output.html import page_text, result_at, results_under
@@ -249,10 +249,10 @@ def test_the_command_reads_the_folder_of_true_places(results, tmp_path, capsys):
 def test_where_pages_go(results, tmp_path, capsys):
     out = tmp_path / "out"
     shutil.copytree(results, out)
-    page_of_images(str(out), ["images/small.png"])
+    write_page_of_images(str(out), ["images/small.png"])
     assert (out / "small.report.html").is_file() and not (out / "report.html").exists()
     assert data_of((out / "small.report.html").read_text(encoding="utf-8"), "results")["single"] is True
-    page_of_images(str(out), ["small.png", "dark.png"])
+    write_page_of_images(str(out), ["small.png", "dark.png"])
     assert (out / "report.html").is_file()
     assert main(["report", str(tmp_path / "nothing")]) == 4
     assert "no such folder" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""`startrack batch`: every image of a folder, side by side, taken up again where it was left."""
+"""`startrack batch`: every image of a folder, in parallel; a stopped run is resumed."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def add_parser(subparsers: Any) -> None:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "batch",
         help="every image of a folder",
-        description="Locate the camera in every image of a tree, which OUT mirrors. A run that was stopped goes on "
-        "from there; images, sidecars, camera or terrain files that have changed are done again. Adds results.ecsv, "
+        description="Locate the camera in every image of a tree, which OUT mirrors. A stopped run is resumed; images "
+        "are repeated if they, their sidecar, camera or terrain file have changed. Adds results.ecsv, "
         "trajectory.tum, timings.ecsv, manifest.json and, with the extra parquet, results.parquet.",
         epilog="exit codes: 0 every image solved; 5 some not solved, or stopped early (Ctrl-C, SIGTERM, a full disk, a "
         "closed pipe); 1 an internal error; 2 usage; 4 bad input",
@@ -66,7 +66,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """0 when every image is solved, 5 when some are not or the run was stopped, 1 after an internal error."""
+    """0 if every image is solved, 5 if some are not or the run was stopped, 1 after an internal error."""
     if args.cluster is not None and find_spec("distributed") is None:
         args.usage_error("a cluster is reached with distributed: pip install '.[cluster]' in a clone of startrack")
     from startrack.batch import images_under, listed_images, only_writer
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     localizer_of(args)
     _check_files_of_flags(facts)
     whole = images_under(args.folder, args.dir)
-    found = listed_images(args.folder, _names(sys.stdin.buffer.read()), args.dir) if args.files_on_stdin else whole
+    found = listed_images(args.folder, _paths_in(sys.stdin.buffer.read()), args.dir) if args.files_on_stdin else whole
     if not found:
         raise BadInput("bad_image", f"{args.folder}: no PNG, TIFF, FITS, JPEG or camera raw images there")
     if args.time is not None and len(found) > 1:
@@ -91,11 +91,11 @@ def run(args: argparse.Namespace) -> int:
 def _run(
     found: Sequence[Image], whole: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace
 ) -> int:
-    """`found` done; tables of that and of the `whole` folder; the exit code."""
+    """Locate the images `found` and write the tables of the `whole` folder; the exit code."""
     from startrack.batch import has_parquet, locate_image
     from startrack.runner import Runner
 
-    _check_whose(out, whole, args)
+    _check_ownership(out, whole, args)
     tasks = _tasks(found, out, facts, args)
     if args.cluster is None and not all(Path(task.result).exists() for task in tasks):
         _prepare(tasks[0], args)
@@ -110,7 +110,7 @@ def _run(
                 out,
                 _tasks(sorted({*whole, *found}), out, facts, args),
                 records,
-                {**_shown(facts), "localizer": args.localizer, "plots": not args.no_plots},
+                {**_without_paths(facts), "localizer": args.localizer, "plots": not args.no_plots},
             )
             tables = f"tables in {out}" + (
                 "" if has_parquet() else " (no results.parquet: the extra parquet is missing)"
@@ -123,9 +123,9 @@ def _run(
         print(f"startrack: {done}; {again} goes on", file=sys.stderr)
         return STOPPED
     if args.report:
-        from startrack.cli.report import page_of
+        from startrack.cli.report import write_page_of
 
-        page_of(str(out))
+        write_page_of(str(out))
     if not args.quiet:
         print(f"{summary(counts, len(tasks))}; {tables}", file=sys.stderr if args.json else sys.stdout)
     if counts["error"]:
@@ -136,7 +136,7 @@ def _run(
 def _locate_all(
     runner: Runner[Task, ImageDone], tasks: Sequence[Task], counts: Counts, halt: Halt, args: argparse.Namespace
 ) -> tuple[list[dict[str, Any]], str | None]:
-    """What the tables need of each image that was done, and why not all of them were."""
+    """Table values of each image that was done, and the cause if not all were."""
     from startrack.batch import locate_images, table_values
     from startrack.runner import RunStopped
 
@@ -156,7 +156,7 @@ def _locate_all(
     return records, halt.why if len(records) < len(tasks) else None
 
 
-def _check_whose(out: Path, images: Sequence[Image], args: argparse.Namespace) -> None:
+def _check_ownership(out: Path, images: Sequence[Image], args: argparse.Namespace) -> None:
     from startrack.batch import belongs_to_other_images
 
     if not args.overwrite and belongs_to_other_images(out, images):
@@ -167,19 +167,19 @@ def _check_whose(out: Path, images: Sequence[Image], args: argparse.Namespace) -
 
 
 def _facts(args: argparse.Namespace) -> dict[str, Any]:
-    """What the flags say; paths made absolute, for workers that stand elsewhere."""
+    """The facts given by flags, with absolute paths, since workers run in other folders."""
     facts = flag_facts(args)
     named = {key: os.path.abspath(facts[key]) for key in ("camera", "terrain") if is_path(facts.get(key, ""))}
     return facts | named
 
 
-def _names(listed: bytes) -> list[str]:
-    """Paths as `find -print0` lists them, else one a line."""
+def _paths_in(listed: bytes) -> list[str]:
+    """Paths ended by NUL, as from `find -print0`, or else one a line."""
     return os.fsdecode(listed).split("\0" if b"\0" in listed else "\n")
 
 
 def _check_files_of_flags(facts: dict[str, Any]) -> None:
-    """Raises BadInput: a flag that is wrong for every image is said before anything is touched."""
+    """Raise BadInput for a camera or terrain file of a flag before anything is changed."""
     from startrack.camera import load_camera
     from startrack.terrain import load_terrain
 
@@ -209,12 +209,12 @@ def _prepare(task: Task, args: argparse.Namespace) -> None:
 
 
 def _terrain_of(task: Task) -> str | None:
-    """The terrain of an image: one of the whole folder, as a rule."""
+    """Reference of the terrain of an image."""
     from startrack.exposure import read_exposure
 
     if task.facts.get("terrain"):
         return str(task.facts["terrain"])
-    with suppress(BadInput):  # said where the image is located
+    with suppress(BadInput):  # reported when the image is located
         return read_exposure(task.path, **task.facts).terrain
     return None
 
@@ -222,9 +222,9 @@ def _terrain_of(task: Task) -> str | None:
 def _write_tables(
     out: Path, tasks: Iterable[Task], records: Sequence[dict[str, Any]], settings: dict[str, Any]
 ) -> None:
-    """The tables of the whole folder, and a line on stderr for each kind of result that they do not have.
+    """Write the tables of the whole folder; print a line on stderr for each kind of result that they lack.
 
-    Raises BadInput where they cannot be written.
+    Raises BadInput if they cannot be written.
     """
     from startrack.batch import table_rows, write_tables
 
@@ -234,13 +234,13 @@ def _write_tables(
         print(f"startrack: {line}", file=sys.stderr)
 
 
-def _shown(facts: dict[str, Any]) -> dict[str, str]:
-    """What was asked for, free of this machine's paths."""
+def _without_paths(facts: dict[str, Any]) -> dict[str, str]:
+    """The facts of flags for the manifest, without paths of this machine."""
     return {key: Path(value).name if key in ("camera", "terrain") else str(value) for key, value in facts.items()}
 
 
 def _address(text: str) -> str:
-    """Of a Dask scheduler, as an argparse type."""
+    """Address of a Dask scheduler, as an argparse type."""
     scheme, _, place = text.rpartition("://")
     host, _, port = place.rpartition(":")
     if scheme not in SCHEMES or not host or not port.isdecimal() or not 0 < int(port) < 2**16:

@@ -1,4 +1,4 @@
-"""What a batch shows while it works, and how it is asked to end before it is done."""
+"""What a batch prints while it runs, and how signals stop it early."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 SHOWN = ("ok", "ambiguous", "refused", "error")
 FINISHING = b"\nstartrack: finishing the images in hand; Ctrl-C once more drops them\n"
-ONE_WISH_S = 1.0  # within it a second signal is the first one's echo: timeout and schedulers signal the group besides
+SAME_SIGNAL_S = 1.0  # a second signal within it is the same request: timeout signals process and group
 Counts = Counter[str]  # images by outcome: ok, ambiguous, refused, error; and of those kept, warned
 Show = Callable[[dict[str, Any], Counts], None]
 
 
 class Halt:
-    """Asks a batch to end when the images in hand are done, and remembers why."""
+    """Stops a batch after the images in hand, and keeps the first cause."""
 
     def __init__(self, stop: Callable[[], None]) -> None:
         self.why: str | None = None
@@ -41,20 +41,20 @@ class Halt:
 
 @contextmanager
 def signals_halt(halt: Halt) -> Iterator[None]:
-    """While this lasts, the first Ctrl-C or SIGTERM halts the batch, and a later one interrupts what is in hand."""
-    asked_s: float | None = None
+    """In the block the first Ctrl-C or SIGTERM stops the batch after the images in hand; a later one drops those."""
+    first_s: float | None = None
 
     def on_signal(number: int, _: object) -> None:
-        nonlocal asked_s
+        nonlocal first_s
         now_s = time.monotonic()
-        if asked_s is None:
-            asked_s = now_s
-            os.write(2, FINISHING)  # not print: a signal may come in the middle of one
+        if first_s is None:
+            first_s = now_s
+            os.write(2, FINISHING)  # not print, which is not reentrant
             halt("interrupted" if number == signal.SIGINT else "terminated")
-        elif now_s - asked_s > ONE_WISH_S:
+        elif now_s - first_s > SAME_SIGNAL_S:
             raise KeyboardInterrupt
 
-    if threading.current_thread() is not threading.main_thread():  # signals are the main thread's
+    if threading.current_thread() is not threading.main_thread():  # only the main thread gets signals
         yield
         return
     before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -93,7 +93,7 @@ def outcomes_shown(total: int, args: argparse.Namespace, halt: Halt) -> Iterator
 
 
 def summary(counts: Counts, total: int) -> str:
-    """How many images of each outcome."""
+    """Number of images of each outcome, in words."""
     parts = [f"{counts[name]} {name}" for name in SHOWN if counts[name]]
     kept = f" ({counts['kept']} were there already)" if counts["kept"] else ""
     warned = f"; {counts['warned']} with warnings (-v shows them)" if counts["warned"] else ""
@@ -101,7 +101,7 @@ def summary(counts: Counts, total: int) -> str:
 
 
 def omission_lines(found: Rows) -> list[str]:
-    """A line for each kind of result that is in the folder and not in its tables."""
+    """A line for each kind of result that is in the folder but not in its tables."""
     lines = []
     if found.superseded:
         lines.append(

@@ -1,4 +1,4 @@
-"""What the image commands share: flags, the loop over images, exit codes, and where results go."""
+"""Shared by the image commands: flags, the loop over images, exit codes, and paths of results."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def add_image_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def add_fact_flags(parser: argparse.ArgumentParser) -> None:
-    """Flags for what images may not say themselves."""
+    """Flags for facts that images may lack."""
     parser.add_argument("-c", "--camera", metavar="FILE", help="camera file, or the name of a shipped one")
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601")
     parser.add_argument("--exposure", type=positive, metavar="S", help="exposure time in seconds")
@@ -66,19 +66,19 @@ def add_output_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object per image")
     parser.add_argument("--no-plots", action="store_true", help="no pictures")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="accepted everywhere; here nothing is random")
-    parser.add_argument("-v", "--verbose", action="count", default=0, help="say more; tracebacks of internal errors")
+    parser.add_argument("-v", "--verbose", action="count", default=0, help="more output; tracebacks of internal errors")
     parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
 
 
 def read(path: str, args: argparse.Namespace) -> Exposure:
-    """The image with its facts; flags come before sidecar and header."""
+    """The image with its facts; flags take precedence over sidecar and header."""
     from startrack.exposure import read_exposure
 
     return read_exposure(path, **flag_facts(args))
 
 
 def flag_facts(args: argparse.Namespace) -> dict[str, Any]:
-    """The facts that flags give, by the names of `read_exposure`."""
+    """The facts given by flags, by the parameter names of `read_exposure`."""
     from startrack.frames import parse_utc
 
     flags: dict[str, Any] = {
@@ -91,7 +91,7 @@ def flag_facts(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def camera_of(exposure: Exposure) -> Camera:
-    """The camera that flag, sidecar or header names. Raises BadInput no_calibration where none does."""
+    """The camera named by flag, sidecar or header. Raises BadInput (no_calibration) if there is none."""
     from startrack.camera import load_camera
 
     if exposure.camera is None:
@@ -101,7 +101,7 @@ def camera_of(exposure: Exposure) -> Camera:
 
 @dataclass(frozen=True)
 class Outcome:
-    """One image's result as printed and as counted."""
+    """The printed result of one image."""
 
     status: str
     reason: str | None
@@ -112,7 +112,7 @@ class Outcome:
 def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, str], Outcome]) -> int:
     """Run `one(path, output stem)` for each image, print its outcome, and return the exit code.
 
-    One image's BadInput, or even an internal error, is its own outcome; it never stops the others.
+    A BadInput or an internal error of one image is its outcome and does not stop the others.
     """
     codes = [0]
     from startrack.batch.find import result_stems
@@ -125,7 +125,7 @@ def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, s
         except Exception as cause:
             if args.verbose:
                 raise
-            outcome = _broken(path, cause, format_name)
+            outcome = _internal_error(path, cause, format_name)
         for warning in () if args.quiet else outcome.record.get("warnings", ()):
             print(f"{Path(path).name}: {warning}", file=sys.stderr, flush=True)
         if args.json:
@@ -143,8 +143,8 @@ def exit_code(outcome: Outcome) -> int:
     return exit_code_of(outcome.reason)
 
 
-def _broken(path: str, cause: Exception, format_name: str) -> Outcome:
-    """Outcome of an image that met a fault of the program's own."""
+def _internal_error(path: str, cause: Exception, format_name: str) -> Outcome:
+    """Outcome of an image with an internal error."""
     message = f"internal error: {type(cause).__name__}: {cause} (-v shows the traceback)"
     record = {
         "format": format_name,
@@ -157,7 +157,7 @@ def _broken(path: str, cause: Exception, format_name: str) -> Outcome:
 
 
 def _refused(path: str, cause: BadInput, format_name: str) -> Outcome:
-    """Outcome of an image that could not even be read, or whose camera or terrain could not."""
+    """Outcome of an image that could not be read, or whose camera or terrain could not."""
     from startrack.output.text import refusal_line
 
     record = {
@@ -171,7 +171,7 @@ def _refused(path: str, cause: BadInput, format_name: str) -> Outcome:
 
 
 def result_path(args: argparse.Namespace, stem: str, suffix: str, exposure: Exposure) -> Path:
-    """Where a result goes, its folder made. A result of the same image is renewed, one of another kept unless -O.
+    """Path of a result; its folder is made. A result of the same image is replaced, that of another only with -O.
 
     Raises BadInput (bad_image, for lack of a better code) before anything is computed.
     """

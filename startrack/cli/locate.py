@@ -53,9 +53,9 @@ def run(args: argparse.Namespace) -> int:
     settings = Settings(localizer=localizer_of(args)())
     code = run_images(args, FORMAT, lambda path, stem: _one(path, stem, args, settings))
     if args.report:
-        from startrack.cli.report import page_of_images
+        from startrack.cli.report import write_page_of_images
 
-        page_of_images(args.dir, args.images)
+        write_page_of_images(args.dir, args.images)
     return code
 
 

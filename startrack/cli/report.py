@@ -45,33 +45,35 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """0 when the page is written."""
-    path = page_of(args.out, truth=args.truth, images=args.images, output=args.output)
+    """Write the page; 0."""
+    path = write_page_of(args.out, truth=args.truth, images=args.images, output=args.output)
     if not args.quiet:
         print(f"page in {path}")
     return 0
 
 
-def page_of(out: str, *, truth: str | None = None, images: int = DEFAULT_IMAGES, output: str | None = None) -> Path:
+def write_page_of(
+    out: str, *, truth: str | None = None, images: int = DEFAULT_IMAGES, output: str | None = None
+) -> Path:
     """Write the page of a folder of results or of one NAME.fix.json; its path. Raises BadInput."""
     from startrack.output.html import result_at, results_under, write_page
 
     if Path(out).is_file():
         one = result_at(out)
         path = Path(output) if output else one.beside(OF_ONE)
-        write_page(path, [one], real=_places([one], truth), images=images, single=True)
+        write_page(path, [one], real=_true_positions([one], truth), images=images, single=True)
         return path
     found, unread = results_under(out)
     for line in unread:
         print(f"startrack: left out {line}", file=sys.stderr)
     found = _only_tabled(out, found)
     path = Path(output) if output else Path(out) / PAGE
-    write_page(path, found, unread=unread, real=_places(found, truth), images=images)
+    write_page(path, found, unread=unread, real=_true_positions(found, truth), images=images)
     return path
 
 
 def _only_tabled(out: str, found: list[Found]) -> list[Found]:
-    """Without what a batch made of images that its tables no longer have, and a word about those."""
+    """The results without those of a batch that its tables lack; a line on stderr names these."""
     from startrack.batch import JOB, tabled_results
 
     known = tabled_results(Path(out))
@@ -88,32 +90,32 @@ def _only_tabled(out: str, found: list[Found]) -> list[Found]:
     return [one for one in found if one.stem not in left]
 
 
-def page_of_images(out: str, images: Sequence[str]) -> None:
-    """The page beside fresh results: of one image NAME.report.html, of several OUT/report.html.
+def write_page_of_images(out: str, images: Sequence[str]) -> None:
+    """Write the page beside new results: NAME.report.html of one image, OUT/report.html of several.
 
-    An image that could not even be read has left no result to show.
+    An image that could not be read has no result to show.
     """
     from startrack.batch.find import result_stems
 
     results = [path for stem in result_stems(images) if (path := Path(out) / f"{stem}.fix.json").is_file()]
     if len(images) == 1 and results:
-        page_of(str(results[0]))
+        write_page_of(str(results[0]))
     elif results:
-        page_of(out)
+        write_page_of(out)
 
 
-def _places(found: Sequence[Found], folder: str | None) -> dict[str, tuple[float, float]]:
-    """True (east, north) [m] by the results' stems, as far as the folder has them."""
+def _true_positions(found: Sequence[Found], folder: str | None) -> dict[str, tuple[float, float]]:
+    """True (east, north) [m] by the results' stems, where the folder has them."""
     if folder is None:
         return {}
     if not Path(folder).is_dir():
         raise BadInput("bad_image", f"{folder}: no such folder of truth")
-    places = {one.stem: _place(Path(folder), one) for one in found}
+    places = {one.stem: _true_position(Path(folder), one) for one in found}
     return {stem: place for stem, place in places.items() if place is not None}
 
 
-def _place(folder: Path, one: Found) -> tuple[float, float] | None:
-    """From NAME.truth.json at the image's place in the tree, or at that of its result."""
+def _true_position(folder: Path, one: Found) -> tuple[float, float] | None:
+    """(east, north) [m] from NAME.truth.json at the path of the image or of its result."""
     image = one.record["image"]
     names = dict.fromkeys((image.removesuffix(Path(image).suffix), one.stem, Path(one.stem).name))
     path = next((file for name in names if (file := folder / f"{name}.truth.json").is_file()), None)

@@ -1,4 +1,4 @@
-"""`startrack reproduce`: the thesis's tables and figures, ours beside them."""
+"""`startrack reproduce`: the thesis's tables and figures, with our method beside them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from startrack.files import make_folder
 if TYPE_CHECKING:
     from startrack.reproduction import Artefact
 
-# As in startrack.reproduction.ARTEFACTS, which would take numpy to look up.
+# The keys of startrack.reproduction.ARTEFACTS, whose import would load numpy.
 NAMES = (
     "table3.1", "fig3.3", "fig3.4", "fig3.5", "fig3.6", "fig3.7", "fig3.8", "fig3.9", "fig3.10", "figA.1", "figA.2",
     "figB", "magnitude", "aspect",
@@ -31,9 +31,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "reproduce",
         help="the thesis's tables and figures, ours beside them",
-        description="Redo the tables and figures of Kua 2008 in its own crater simulator, with its method and with "
-        "ours on the same draws. Each NAME gives NAME.md, NAME.ecsv where there are numbers, and NAME.png. What was "
-        "computed is kept in OUT/.chunks: a run that was stopped goes on from there.",
+        description="Reproduce the tables and figures of Kua 2008 in its crater simulator, with its method and ours "
+        "on the same draws. Each NAME gives NAME.md, NAME.png and, with numbers, NAME.ecsv. Computed chunks are kept "
+        "in OUT/.chunks: a stopped run is resumed.",
     )
     parser.add_argument(
         "what", nargs="*", default=["all"], metavar="NAME", help=f"all (default), or any of: {', '.join(NAMES)}"
@@ -62,7 +62,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make what was asked for, in the order of the thesis; 0 when all is written."""
+    """Make the named artefacts, in the order of the thesis; 0."""
     unknown = [name for name in args.what if name not in (*NAMES, "all")]
     if unknown:
         args.usage_error(

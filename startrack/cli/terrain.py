@@ -1,4 +1,4 @@
-"""`startrack terrain`: look at a terrain, work out its horizons ahead of time, make one from elevation data."""
+"""`startrack terrain`: show a terrain, compute its horizons ahead of time, make one from elevation data."""
 
 from __future__ import annotations
 
@@ -22,53 +22,59 @@ if TYPE_CHECKING:
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add `terrain` to the commands of the `startrack` parser."""
     parser: argparse.ArgumentParser = subparsers.add_parser(
-        "terrain", help="look at a terrain, work out its horizons, make one from elevation data",
+        "terrain", help="show a terrain, compute its horizons, make one from elevation data",
         description="TERRAIN is a terrain file (a path if it ends in .toml or contains a separator) or a shipped name.",
     )  # fmt: skip
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    show = actions.add_parser("show", help="facts, relief and, with --at, the horizon seen from a place")
+    show = actions.add_parser("show", help="properties, relief and, with --at, the horizon from a position")
     show.add_argument("terrain", metavar="TERRAIN")
-    show.add_argument("--at", nargs=2, type=float, metavar=("EAST", "NORTH"), help="a place [m]")
-    build = actions.add_parser("build", help="work out the horizons now; otherwise the first fix does")
+    show.add_argument("--at", nargs=2, type=float, metavar=("EAST", "NORTH"), help="a position [m]")
+    build = actions.add_parser("build", help="compute the horizons now; otherwise the first fix does")
     build.add_argument("terrain", nargs="+", metavar="TERRAIN")
-    build.add_argument("--force", action="store_true", help="even where they are known")
-    made = actions.add_parser("import", help="a terrain file and GeoTIFF crops from elevation data")
-    made.add_argument("maps", nargs="+", metavar="MAP", help="GeoTIFF, COG, PDS label ..., the finest first")
-    made.add_argument("-o", "--output", required=True, metavar="NAME.toml")
-    made.add_argument("--latitude", type=float, required=True, metavar="DEG", help="of the origin, north positive")
-    made.add_argument("--longitude", type=float, required=True, metavar="DEG", help="east positive")
-    made.add_argument("--radius", type=float, default=10_000.0, metavar="M", help="of the search area (%(default).0f)")
-    made.add_argument(
+    build.add_argument("--force", action="store_true", help="even if they are known")
+    imported = actions.add_parser("import", help="a terrain file and GeoTIFF crops from elevation data")
+    imported.add_argument("maps", nargs="+", metavar="MAP", help="GeoTIFF, COG, PDS label ..., the finest first")
+    imported.add_argument("-o", "--output", required=True, metavar="NAME.toml")
+    imported.add_argument("--latitude", type=float, required=True, metavar="DEG", help="of the origin, north positive")
+    imported.add_argument("--longitude", type=float, required=True, metavar="DEG", help="east positive")
+    imported.add_argument(
+        "--radius", type=float, default=10_000.0, metavar="M", help="of the search area (%(default).0f)"
+    )
+    imported.add_argument(
         "--half",
         nargs="+",
         type=float,
         metavar="M",
         help="half side of each map's crop (30000 for the first, then 300000)",
     )
-    made.add_argument(
+    imported.add_argument(
         "--scale", nargs="+", type=float, metavar="M",
-        help="metres per unit of each map; needed for whole numbers where the files do not say",
+        help="metres per unit of each map; needed for integers if the files lack it",
     )  # fmt: skip
-    made.add_argument(
-        "--offset", nargs="+", type=float, metavar="M", help="height of value 0 of each map, where the files do not say"
+    imported.add_argument(
+        "--offset", nargs="+", type=float, metavar="M", help="height of value 0 of each map, if the files lack it"
     )
-    made.add_argument(
-        "--sigma", type=float, metavar="M", help="error of single posts (what the map's own roughness lets expect)"
+    imported.add_argument(
+        "--sigma", type=float, metavar="M", help="error of single posts (default: estimated from the map's roughness)"
     )
-    made.add_argument("--camera-height", type=float, default=1.5, metavar="M", help="above the ground (%(default)g)")
-    for action in (show, build, made):
+    imported.add_argument(
+        "--camera-height", type=float, default=1.5, metavar="M", help="above the ground (%(default)g)"
+    )
+    for action in (show, build, imported):
         action.add_argument("--json", action="store_true", help="print one JSON object per terrain")
-        action.add_argument("-v", "--verbose", action="count", default=0, help="say more; internal tracebacks")
+        action.add_argument(
+            "-v", "--verbose", action="count", default=0, help="more output; tracebacks of internal errors"
+        )
         action.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
     show.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the pictures (%(default)s)")
     show.add_argument("--no-plots", action="store_true", help="no pictures")
     parser.set_defaults(run=run)
-    made.add_argument("-O", "--overwrite", action="store_true", help="replace files")
+    imported.add_argument("-O", "--overwrite", action="store_true", help="replace files")
     return parser
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the action; 0 when it is done."""
+    """Run the action; 0."""
     return {"show": _show, "build": _build, "import": _import}[args.action](args)
 
 
@@ -80,7 +86,7 @@ def _show(args: argparse.Namespace) -> int:
     facts = facts_of(terrain) | seen_from(terrain, place)
     if not args.no_plots:
         facts["files"] = [str(path) for path in _pictures(args, terrain, place)]
-    _tell(args, facts)
+    _print_facts(args, facts)
     return 0
 
 
@@ -112,7 +118,7 @@ def _build(args: argparse.Namespace) -> int:
             prepare(terrain, args)
             facts |= {"horizons": str(terrain.table_path), "known_before": known}
             facts["seconds"] = round(time.perf_counter() - start, 1)
-        _tell(args, facts)
+        _print_facts(args, facts)
     return 0
 
 
@@ -129,11 +135,11 @@ def _import(args: argparse.Namespace) -> int:
     )  # fmt: skip
     terrain = load_terrain(path)
     facts = facts_of(terrain) | {"sigma_from": "map" if args.sigma is None else "flag"}
-    _tell(args, facts | {"files": [str(path)], "warnings": coarseness(terrain) + smoothness(terrain)})
+    _print_facts(args, facts | {"files": [str(path)], "warnings": coarseness(terrain) + smoothness(terrain)})
     return 0
 
 
-def _tell(args: argparse.Namespace, facts: dict[str, Any]) -> None:
+def _print_facts(args: argparse.Namespace, facts: dict[str, Any]) -> None:
     for warning in () if args.quiet else facts.get("warnings", ()):
         print(f"{facts['name']}: {warning}", file=sys.stderr, flush=True)
     if args.json:

@@ -103,12 +103,12 @@ def test_a_later_signal_drops_the_images_in_hand_and_writes_the_tables(tmp_path,
 
 
 def test_a_reader_that_goes_ends_the_batch_early(many, tmp_path):
-    process = begun(many, "-D", str(tmp_path / "out"), "-j", "1", "--json", "--no-plots")
-    assert process.stdout is not None and process.stderr is not None
-    assert json.loads(process.stdout.readline())["image"] == "00.png"
-    process.stdout.close()
-    err = process.stderr.read()
-    assert process.wait() == 5
+    with begun(many, "-D", str(tmp_path / "out"), "-j", "1", "--json", "--no-plots") as process:
+        assert process.stdout is not None and process.stderr is not None
+        assert json.loads(process.stdout.readline())["image"] == "00.png"
+        process.stdout.close()
+        err = process.stderr.read()
+    assert process.returncode == 5
     assert "nobody reads the output any more" in err
     assert "Traceback" not in err
 
@@ -116,11 +116,12 @@ def test_a_reader_that_goes_ends_the_batch_early(many, tmp_path):
 def test_a_reader_that_goes_ends_the_image_commands_early_too(many, tmp_path):
     images = sorted(str(path) for path in many.glob("*.png"))[:300]
     command = [sys.executable, "-m", "startrack.cli.main", "detect", *images, "-D", str(tmp_path / "out"), "--no-plots"]
-    process = subprocess.Popen([*command, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stdout is not None and process.stderr is not None
-    process.stdout.readline()
-    process.stdout.close()
-    assert (process.stderr.read(), process.wait()) == ("", 5)
+    with subprocess.Popen([*command, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.readline()
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 5
 
 
 def test_with_json_nothing_else_is_printed(tmp_path, capsys):

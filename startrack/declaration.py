@@ -1,8 +1,8 @@
 """Declared keys of the files that users write: one declaration gives the check, the limits and the JSON schema.
 
 A `Table` holds the keys of a file or of a part of it. `Table.read` returns the checked values with their defaults;
-numbers come as float (or int), lists as tuples, tables as dictionaries. Whatever else a file holds, the reader gets
-BadInput with one line that names the key.
+numbers as float (or int), lists as tuples, tables as dictionaries. Any other content raises BadInput with one line
+that names the key.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SIMILAR = 0.8  # ratio (difflib) from which an unknown key counts as a misspelt 
 
 @dataclass(frozen=True, kw_only=True)
 class Key(ABC):
-    """One key: what it means, whether it must be there, and its value where it is not."""
+    """One key: its meaning, whether it is required, and its default value."""
 
     description: str = ""
     required: bool = False

@@ -86,7 +86,7 @@ def _chunks(raw: bytes) -> Iterator[tuple[bytes, memoryview]]:
         if zlib.crc32(view[at + 4 : end]) != struct.unpack_from(">I", raw, end)[0]:
             raise bad_image("damaged PNG: the checksum of a chunk does not agree")
         if (kind == b"IHDR") != (at == len(SIGNATURE)):
-            raise bad_image("damaged PNG: its header chunk is not where it belongs")
+            raise bad_image("damaged PNG: its header chunk is not the first one")
         if kind == b"IEND":
             return
         yield kind, view[at + 8 : end]

@@ -26,10 +26,10 @@ READERS: dict[str, Callable[[str, str], Camera]] = {
 
 
 def to_text(camera: Camera, program: str) -> str:
-    """The camera as a file of the program. Raises BadInput bad_calibration where its format cannot hold the lens."""
+    """The camera as text of a file of `program`. Raises BadInput bad_calibration if its format cannot hold the lens."""
     return WRITERS[program](camera)
 
 
 def from_text(text: str, program: str, name: str) -> Camera:
-    """The camera of a program's file. Raises BadInput bad_calibration where it cannot be read or held."""
+    """The camera, called `name`, of the `text` of a file of `program`. Raises BadInput bad_calibration."""
     return READERS[program](text, name)

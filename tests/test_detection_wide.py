@@ -9,10 +9,9 @@ from scipy.spatial import cKDTree
 from star_painter import cramer_rao, isolated_stars, plain_camera
 
 from startrack.detection import Detector
-from startrack.detection.binned import binned, pixels_together
-from startrack.detection.classify import threshold_for
-from startrack.detection.frame import Frame, LightNoise
-from startrack.detection.peaks import _touching, bright_pixels
+from startrack.detection.classify import detection_threshold
+from startrack.detection.frame import Frame, LightNoise, bin_frame, binning_factor
+from startrack.detection.peaks import _group_touching, bright_pixels
 
 SIZE = 1024
 BACKGROUND, READ_NOISE = 94.0, 2.5
@@ -45,18 +44,18 @@ def test_binned_frames_keep_light_and_noise() -> None:
     dead = np.zeros(image.shape, dtype=bool)
     dead[11, 20] = True
     flat = np.ones_like(image)
-    small = binned(Frame(image, 50 * flat, np.sqrt(50) * flat, dead, LightNoise()), 4)
+    small = bin_frame(Frame(image, 50 * flat, np.sqrt(50) * flat, dead, LightNoise()), 4)
     assert small.shape == (50, 75)
     assert small.image[3, 5] == pytest.approx(image[12:16, 20:24].sum())
     assert np.std(small.image - small.background) == pytest.approx(float(small.noise[0, 0]), rel=0.05)
     assert np.argwhere(small.dead).tolist() == [[2, 5]]
-    assert [pixels_together(s) for s in (0.6, 1.7, 1.8, 3.5, 3.6, 8.0)] == [1, 1, 2, 2, 4, 8]
+    assert [binning_factor(s) for s in (0.6, 1.7, 1.8, 3.5, 3.6, 8.0)] == [1, 1, 2, 2, 4, 8]
 
 
 def test_touching_pixels_are_grouped_as_opencv_groups_them() -> None:
     dead = np.random.default_rng(3).random((90, 120)) < 0.2
     row, column = np.nonzero(dead)
-    count, label = _touching(row, column, dead.shape[1])
+    count, label = _group_touching(row, column, dead.shape[1])
     expected_count, expected = cv2.connectedComponents(dead.astype(np.uint8))
     assert count == expected_count - 1 > 20
     assert len(set(zip(label.tolist(), expected[row, column].tolist(), strict=True))) == count
@@ -74,7 +73,7 @@ def test_bright_pixels_are_those_of_stars_not_hot_ones() -> None:
 
 
 def test_skew_noise_asks_for_more_and_wide_stars_for_less() -> None:
-    usual = threshold_for(5.42, 1.25, 0.088)
+    usual = detection_threshold(5.42, 1.25, 0.088)
     assert usual == pytest.approx(5.42, abs=0.03)
-    assert threshold_for(5.42, 1.25, 0.2) > usual > threshold_for(5.42, 1.25, 0.0) > 5.0
-    assert threshold_for(5.42, 0.6, 0.088) > usual > threshold_for(5.42, 3.0, 0.088)
+    assert detection_threshold(5.42, 1.25, 0.2) > usual > detection_threshold(5.42, 1.25, 0.0) > 5.0
+    assert detection_threshold(5.42, 0.6, 0.088) > usual > detection_threshold(5.42, 3.0, 0.088)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 BAND_PIXELS = 2**18
 BLOCK_PX = 16  # side of the blocks for a PSF up to 1.5 WIDEST_PX
 WIDEST_PX = 1.4
-STEEP_PART = 0.03  # of the blocks
-FEW_STEPS = 1.0  # noise in units of the smallest step below which the pixels hold too few values for quantiles
+STEEP_FRACTION = 0.03  # of the blocks
+MIN_NOISE_STEPS = 1.0  # noise in units of the smallest step below which the pixels hold too few values for quantiles
 LOW, HIGH = 0.05, 0.65  # quantiles between which pixels tell the noise
 COARSE_PX = 4  # the local level is a mean over squares of this side
 CLIPPED_SIGMA = 2.5
@@ -31,16 +31,16 @@ def background_and_noise(image: Image, quantum: float, sigma_px: float) -> tuple
     """
     side = block_side(sigma_px)
     shape = -(-image.shape[0] // side), -(-image.shape[1] // side)
-    level, spread = _over_blocks(image, side, quantum, _median_and_spread)
+    level, spread = _measure_blocks(image, side, quantum, _median_and_spread)
     level_map = cv2.medianBlur(level.reshape(shape), 3)
     spread_map = cv2.medianBlur(spread.reshape(shape), 5)
     background = _enlarge(level_map, side, image.shape)
-    if _steep_part(level_map, spread_map) > STEEP_PART:  # a slope within a block is no noise
-        _, spread = _over_blocks(image - background, side, quantum, _median_and_spread)
+    if _steep_fraction(level_map, spread_map) > STEEP_FRACTION:  # a slope within a block is no noise
+        _, spread = _measure_blocks(image - background, side, quantum, _median_and_spread)
         spread_map = np.minimum(spread_map, cv2.medianBlur(spread.reshape(shape), 5))
     rounding = quantum**2 / 12.0
-    if np.median(spread_map) < FEW_STEPS * quantum:
-        (spread,) = _over_blocks(image, side, quantum, partial(_few_valued, quantum=np.float32(quantum)))
+    if np.median(spread_map) < MIN_NOISE_STEPS * quantum:
+        (spread,) = _measure_blocks(image, side, quantum, partial(_clipped_spread, quantum=np.float32(quantum)))
         spread_map = cv2.medianBlur(spread.reshape(shape), 5)
     noise_map = np.sqrt(np.maximum(np.square(spread_map) - rounding, rounding), dtype=np.float32)
     return background, _enlarge(noise_map, side, image.shape)
@@ -76,14 +76,16 @@ def coarse_width(width_px: int) -> int:
     return 2 * int(round(width_px / COARSE_PX - 1) // 2) + 1 if width_px > COARSE_PX else 1
 
 
-def _steep_part(level: NDArray[Any], spread: NDArray[Any]) -> float:
+def _steep_fraction(level: NDArray[Any], spread: NDArray[Any]) -> float:
     """Part of the blocks between which the level changes by more than the noise."""
     steps = [np.abs(np.diff(level, axis=axis)) for axis in (0, 1)]
     return max(float(np.mean(steps[0] > spread[1:])) if len(level) > 1 else 0.0,
                float(np.mean(steps[1] > spread[:, 1:])) if level.shape[1] > 1 else 0.0)  # fmt: skip
 
 
-def _over_blocks(image: Image, side: int, quantum: float, measure: Callable[[Image], tuple[Image, ...]]) -> list[Image]:
+def _measure_blocks(
+    image: Image, side: int, quantum: float, measure: Callable[[Image], tuple[Image, ...]]
+) -> list[Image]:
     """What `measure` says of the ordered pixels (n, BLOCK_PX^2) of square blocks: (blocks,), left to right and down.
 
     A few rows of blocks at a time: what the processor's cache holds.
@@ -116,18 +118,18 @@ def _blocks(image: Image, side: int, quantum: float) -> Image:
     rows, columns = image.shape[0] // side, image.shape[1] // side
     parts = BLOCK_PX // 2
     cut = image.reshape(rows, parts, side // parts, columns, parts, side // parts)[:, :, :2, :, :, :2]
-    part_steps = (np.float32(quantum) * _part_steps(BLOCK_PX**2)).reshape(parts, 2, parts, 2)
+    part_steps = (np.float32(quantum) * _dither_steps(BLOCK_PX**2)).reshape(parts, 2, parts, 2)
     return np.add(cut.transpose(0, 3, 1, 2, 4, 5), part_steps, order="C").reshape(rows * columns, BLOCK_PX**2)
 
 
-def _few_valued(ordered: Image, quantum: np.float32) -> tuple[Image]:
+def _clipped_spread(ordered: Image, quantum: np.float32) -> tuple[Image]:
     """Standard deviation (n,) of rows (n, m) of hardly more than one value, in whose quantiles the noise hides."""
     middle = ordered[:, ordered.shape[1] // 2, None]
     return (np.clip(ordered, middle - 4 * quantum, middle + 4 * quantum).std(axis=1),)
 
 
 @lru_cache(maxsize=8)
-def _part_steps(count: int) -> Image:
+def _dither_steps(count: int) -> Image:
     """Values (count,) spread evenly from -1/2 to 1/2, in an order without a pattern."""
     order = np.arange(count) * 101 % count  # 101 is a prime: each number once
     return ((order - 0.5 * (count - 1)) / count).astype(np.float32)
@@ -156,7 +158,7 @@ def _enlarge(block_map: NDArray[Any], side: int, shape: tuple[int, ...]) -> Imag
     return full[: shape[0], : shape[1]]
 
 
-def quantum_of(image: Image) -> float:
+def smallest_step(image: Image) -> float:
     """Smallest step between pixel values: the noise cannot be below its rounding error."""
     values = np.unique(image[:: max(1, image.shape[0] // 64), :: max(1, image.shape[1] // 64)])
     step = float(np.diff(values).min()) if len(values) > 1 else 1.0

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
+from functools import lru_cache
 
-from startrack.detection.artifacts import edge_chi2
+import numpy as np
+from numpy.typing import NDArray
+
 from startrack.detection.deblend import Fitted, own_light
 from startrack.detection.fit import PointFits, Stamps
-from startrack.detection.frame import Frame, LightNoise
-from startrack.detection.psf_width import BRIGHT_SNR, FEWEST_BRIGHT
-from startrack.detection.saturated import are_clipped
+from startrack.detection.frame import Frame, LightNoise, Pixels
+from startrack.detection.psf_width import BRIGHT_SNR, MIN_BRIGHT
+from startrack.detection.saturated import are_saturated
 from startrack.types import Array, Bools, Ints
 
 WIDTHS_PX = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0)
@@ -18,39 +20,40 @@ HEIGHT_AT_NOMINAL = 5.42
 USUAL_SKEWNESS, LARGEST_SKEWNESS = 0.088, 0.3  # the first is that of 100 photons and 3 electrons of read noise
 FILTERED_SKEWNESS = 0.376  # 2 / (3 sqrt(pi)): part that a matched filter of 1 px leaves
 NOISE_TOO_SMALL = 0.17  # part of the skewness by which the noise is measured too small
-OWN_LEVEL_PART = 0.8  # of the threshold that a source must reach by its own stamp alone, everywhere
+OWN_LEVEL_FRACTION = 0.8  # of the threshold that a source must reach by its own stamp alone, everywhere
 UNEVEN_SIGMA = 2.5  # difference of the stamp's level and that of its surroundings where these are not to be trusted
 EDGE_MARGIN = 8.0  # chi^2 by which an edge must explain a stamp better: noise alone gives faint stars less
 BAD_FIT_CHI2_PER_DOF = 4.0
 ROUGH_PSF_MISFIT = 0.06  # from here up the frame's own stars, not the Gaussian, say what a star looks like
 ROUGH_PSF_SPREAD = 2.0  # times the typical misfit that a star of such a frame may have
-CLIPPED_MISFIT = 0.2  # of a star that shows only its wings, which are the least Gaussian
+SATURATED_MISFIT = 0.2  # of a star that shows only its wings, which are the least Gaussian
+EDGE_DIRECTIONS = 8  # of the straight edges or lines tried
 LARGEST_SIGMA_PX = 2.0  # of the place
 WING_SIGMAS, WING_BRIGHTER, WING_HEIGHT = 3.0, 2.0, 1.4  # where a brighter one is, this much brighter, more is asked
 
 
-def stars_among(fitted: Fitted, width_px: Array, threshold: float) -> Ints:
+def select_stars(fitted: Fitted, width_px: Array, threshold: float) -> Ints:
     """Indices (k,) of the candidates, fitted with widths (n,), that are point sources and stand out by the threshold.
 
     Where the bright sources of the frame all differ from the Gaussian (trails, coma, a real lens), no bright star would
     pass by its chi^2; there a source passes whose misfit is like theirs.
     """
     fits = fitted.fits
-    stands_out = height_of(fits) >= threshold
+    stands_out = peak_heights(fits) >= threshold
     placed = np.sqrt(fits.covariance[:, 0, 0] + fits.covariance[:, 1, 1]) < LARGEST_SIGMA_PX
     left = np.flatnonzero(stands_out & placed & (fits.chi2 < fits.chi2_pixel))
     if not len(left):
         return left
-    misfit, edge = _likeness(fitted.stamps.part(left), fits.take(left), width_px[left], fitted.light_noise)
+    misfit, edge = _psf_and_edge_misfit(fitted.stamps.take(left), fits.take(left), width_px[left], fitted.light_noise)
     unlike_an_edge = fits.chi2[left] < edge + EDGE_MARGIN
     bright = fits.flux[left] > BRIGHT_SNR * np.sqrt(fits.covariance[left, 2, 2])
     typical = _typical(misfit[unlike_an_edge & bright])
     good_fit = fits.chi2[left] < BAD_FIT_CHI2_PER_DOF * fits.dof[left]
-    allowed = np.where(are_clipped(fitted.stamps.part(left)), max(typical, CLIPPED_MISFIT), typical)
+    allowed = np.where(are_saturated(fitted.stamps.take(left)), max(typical, SATURATED_MISFIT), typical)
     return left[unlike_an_edge & (good_fit | (misfit < allowed))]
 
 
-def one_per_place(xy_px: Array, flux: Array, closer_px: float) -> Bools:
+def brightest_per_position(xy_px: Array, flux: Array, closer_px: float) -> Bools:
     """Which sources (n,) to keep: of those that converged onto one place, the brightest."""
     from scipy.spatial import cKDTree
 
@@ -62,7 +65,7 @@ def one_per_place(xy_px: Array, flux: Array, closer_px: float) -> Bools:
     return ~fainter
 
 
-def not_beside(xy_px: Array, flux: Array, height: Array, sigma: float, threshold: float) -> Bools:
+def clear_of_wings(xy_px: Array, flux: Array, height: Array, sigma: float, threshold: float) -> Bools:
     """Which sources (n,) to keep: those hardly above the threshold in a brighter one's wing are its misfit, or a blend.
 
     Two stars that are not resolved are fitted as one, and what that leaves looks like a third.
@@ -77,7 +80,7 @@ def not_beside(xy_px: Array, flux: Array, height: Array, sigma: float, threshold
     return keep
 
 
-def height_of(fits: PointFits) -> Array:
+def peak_heights(fits: PointFits) -> Array:
     """By how many sigma each source (n) stands out.
 
     Above its surroundings, whose level is known better than that of the stamp, where the stamp by itself shows at least
@@ -85,10 +88,10 @@ def height_of(fits: PointFits) -> Array:
     """
     by_itself = fits.flux / np.sqrt(fits.covariance[:, 2, 2])
     even = np.abs(fits.level - fits.surround) < UNEVEN_SIGMA * np.sqrt(fits.covariance[:, 3, 3])
-    return np.where(even, np.minimum(fits.significance, by_itself / OWN_LEVEL_PART), by_itself)
+    return np.where(even, np.minimum(fits.significance, by_itself / OWN_LEVEL_FRACTION), by_itself)
 
 
-def threshold_for(threshold_snr: float, sigma_px: float, skewness: float) -> float:
+def detection_threshold(threshold_snr: float, sigma_px: float, skewness: float) -> float:
     """Height that gives about as many false peaks, whatever the PSF's width and the skewness of the pixels' noise.
 
     That is 0.3 to 0.6 in 4 Mpx at the default. A narrower PSF has more independent places to be false at, down to where
@@ -102,7 +105,7 @@ def threshold_for(threshold_snr: float, sigma_px: float, skewness: float) -> flo
     return float(np.sqrt(max(height**2 + threshold_snr**2 - HEIGHT_AT_NOMINAL**2, 9.0)))
 
 
-def skewness_of(frame: Frame) -> float:
+def noise_skewness(frame: Frame) -> float:
     """Skewness of the noise of the frame's pixels, by the photons of its background; a usual one without a gain."""
     if frame.light_noise.per_unit != 1.0:  # not in electrons
         return USUAL_SKEWNESS
@@ -114,13 +117,13 @@ def skewness_of(frame: Frame) -> float:
 
 def _typical(misfit: Array) -> float:
     """Misfit up to which a source is like the frame's bright ones, where these are rough; 0 where they are not."""
-    if len(misfit) < FEWEST_BRIGHT:
+    if len(misfit) < MIN_BRIGHT:
         return 0.0
     typical = float(np.median(misfit))
     return ROUGH_PSF_SPREAD * typical if typical > ROUGH_PSF_MISFIT else 0.0
 
 
-def _likeness(s: Stamps, fits: PointFits, width_px: Array, own: LightNoise) -> tuple[Array, Array]:
+def _psf_and_edge_misfit(s: Stamps, fits: PointFits, width_px: Array, own: LightNoise) -> tuple[Array, Array]:
     """How far the sources (n) are from the Gaussian PSF, and their chi^2 as straight edges or lines instead.
 
     The first is the root of the squared residual beyond the noise over the squared light: 0 for a perfect star, about
@@ -136,3 +139,33 @@ def _likeness(s: Stamps, fits: PointFits, width_px: Array, own: LightNoise) -> t
     total = squared.sum(axis=(1, 2), dtype=np.float64)
     misfit = np.sqrt(np.maximum(excess.sum(axis=(1, 2), dtype=np.float64), 0.0) / np.maximum(total, 1e-12))
     return misfit, edge_chi2(s.data, weights)
+
+
+def edge_chi2(data: Pixels, weights: Pixels) -> Array:
+    """chi^2 (n,) of stamps (n, s, s) as straight stripes of any brightness, in the best of eight directions.
+
+    Larger by the number of stripes than the least squares' own, so that many stripes are no better than few.
+
+    A skyline, the edge of the image circle, a bad column, a satellite's trail: what varies in one direction only.
+    """
+    n, side = len(data), data.shape[1]
+    stripes, starts = _stripes(side)
+    counts = np.diff(starts, append=stripes.shape[1]).astype(np.float32)  # of stripes: noise alone explains as much
+    w = weights.reshape(n, -1).astype(np.float32)
+    flat = data.reshape(n, -1).astype(np.float32)
+    moment = w * flat
+    total, light = w @ stripes, moment @ stripes
+    explained = np.add.reduceat(light * light / np.maximum(total, 1e-30), starts, axis=1) - counts
+    return np.asarray(np.sum(moment * flat, axis=1) - explained.max(axis=1), dtype=np.float64)
+
+
+@lru_cache(maxsize=16)
+def _stripes(side: int) -> tuple[NDArray[np.float32], Ints]:
+    """Which pixel lies in which stripe of one pixel's width (s^2, m): 0 or 1; and each direction's first stripe."""
+    offset = np.arange(side) - side // 2
+    x, y = np.tile(offset, side), np.repeat(offset, side)
+    masks = []
+    for turn in np.arange(EDGE_DIRECTIONS) * np.pi / EDGE_DIRECTIONS:
+        _, number = np.unique(np.rint(x * np.cos(turn) + y * np.sin(turn)), return_inverse=True)
+        masks.append(np.eye(number.max() + 1, dtype=np.float32)[number])
+    return np.concatenate(masks, axis=1), np.cumsum([0] + [mask.shape[1] for mask in masks[:-1]])

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.detection.fit import ROUNDS, ROUNDS_AGAIN, PointFits, Stamps, fit_points, joined
+from startrack.detection.fit import ROUNDS, ROUNDS_AGAIN, PointFits, Stamps, concatenate_fits, fit_points
 from startrack.detection.frame import Frame, LightNoise, Pixels, radius_for
 from startrack.detection.peaks import Peaks
-from startrack.detection.source_noise import measured_light_noise
+from startrack.detection.source_noise import measure_light_noise
 from startrack.psf import pixel_profile_single
 from startrack.types import Array, Ints
 
@@ -42,46 +42,46 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
         last = frame.light(centres, radius)
         last[: len(known.flux)] -= own_light(centres[: len(known.flux)], known, sigma, radius)
         last[np.square(last).max(axis=(1, 2)) <= NEIGHBOUR_SIGMA**2 * variance[:, radius, radius]] = 0.0
-    fits = _first_fits(frame, peaks, _without(stamps, last), sigma, 0 if known is None else len(known.flux))
-    star, other = _pairs(centres, 1.5 * radius + 3.0 * sigma)
+    fits = _first_fits(frame, peaks, _subtract_light(stamps, last), sigma, 0 if known is None else len(known.flux))
+    star, other = _find_pairs(centres, 1.5 * radius + 3.0 * sigma)
     alone = np.ones(len(centres), dtype=bool)
-    alone[star[_may_count(stamps, fits, star, other, sigma)]] = False
-    light_noise = measured_light_noise(stamps, fits, alone, sigma, frame.light_noise)
-    bright = _otherwise_weighted(fits, sigma, variance, frame.light_noise, light_noise)
+    alone[star[_are_relevant(stamps, fits, star, other, sigma)]] = False
+    light_noise = measure_light_noise(stamps, fits, alone, sigma, frame.light_noise)
+    bright = _find_reweighted(fits, sigma, variance, frame.light_noise, light_noise)
     if len(bright):
         start = fits.xy_px[bright]
-        part = _without(stamps.part(bright), last[bright])
+        part = _subtract_light(stamps.take(bright), last[bright])
         again = fit_points(part, start, sigma, light_noise, peaks.own_part, ROUNDS_AGAIN)
-        fits = fits.replaced(bright, again)
+        fits = fits.with_rows(bright, again)
     for _ in range(CROWDED_ROUNDS):
-        crowded, light = _neighbours_light(stamps, fits, star, other, sigma)
+        crowded, light = _sum_neighbour_light(stamps, fits, star, other, sigma)
         changed = (np.square(light - last[crowded]) > NEIGHBOUR_SIGMA**2 * variance[crowded]).any(axis=(1, 2))
         crowded, light = crowded[changed], light[changed]
         if not len(crowded):
             break
         last[crowded] = light
-        cleaned = _without(stamps.part(crowded), light)
+        cleaned = _subtract_light(stamps.take(crowded), light)
         again = fit_points(cleaned, fits.xy_px[crowded], sigma, light_noise, peaks.own_part, ROUNDS_AGAIN)
-        fits = fits.replaced(crowded, again)
+        fits = fits.with_rows(crowded, again)
     return Fitted(stamps, fits, light_noise)
 
 
 def _first_fits(frame: Frame, peaks: Peaks, stamps: Stamps, sigma: float, known: int) -> PointFits:
     """Fits of all candidates, the first of which are `known` already and need less."""
     fits = [
-        fit_points(stamps.part(which), peaks.start_xy_px[which], sigma, frame.light_noise, peaks.own_part, rounds)
+        fit_points(stamps.take(which), peaks.start_xy_px[which], sigma, frame.light_noise, peaks.own_part, rounds)
         for which, rounds in ((slice(0, known), ROUNDS_AGAIN), (slice(known, None), ROUNDS))
         if len(stamps.centres[which])
     ]
-    return joined(fits)
+    return concatenate_fits(fits)
 
 
-def _without(stamps: Stamps, light: Pixels) -> Stamps:
+def _subtract_light(stamps: Stamps, light: Pixels) -> Stamps:
     """The stamps without their neighbours' light, of which a part is not known."""
     return replace(stamps, data=stamps.data - light, variance=stamps.variance + np.square(NEIGHBOUR_ERROR * light))
 
 
-def _otherwise_weighted(fits: PointFits, sigma: float, variance: Pixels, was: LightNoise, now: LightNoise) -> Ints:
+def _find_reweighted(fits: PointFits, sigma: float, variance: Pixels, was: LightNoise, now: LightNoise) -> Ints:
     """Candidates whose middle pixel has another variance by a tenth with what is known now of the light's noise."""
     light = np.maximum(fits.flux, 0.0) / (2.0 * np.pi * sigma**2 + 1.0)
     dark = variance[:, variance.shape[1] // 2, variance.shape[2] // 2]
@@ -89,7 +89,7 @@ def _otherwise_weighted(fits: PointFits, sigma: float, variance: Pixels, was: Li
     return np.flatnonzero(np.abs(after - before) > 0.1 * before)
 
 
-def _pairs(centres: Ints, reach_px: float) -> tuple[Ints, Ints]:
+def _find_pairs(centres: Ints, reach_px: float) -> tuple[Ints, Ints]:
     """Each candidate that has another one within reach, ascending, and that other one: both (m,)."""
     from scipy.spatial import cKDTree
 
@@ -99,11 +99,11 @@ def _pairs(centres: Ints, reach_px: float) -> tuple[Ints, Ints]:
     return both[:, 0], both[:, 1]
 
 
-def _neighbours_light(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> tuple[Ints, Pixels]:
+def _sum_neighbour_light(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> tuple[Ints, Pixels]:
     """The candidates (k,) into whose stamps others put light that counts, and that light (k, s, s)."""
     side = s.data.shape[1]
     radius = side // 2
-    counts = _may_count(s, fits, star, other, sigma)
+    counts = _are_relevant(s, fits, star, other, sigma)
     star, other = star[counts], other[counts]
     crowded, light = [np.zeros(0, dtype=np.int64)], [np.zeros((0, side, side), dtype=np.float32)]
     firsts = np.flatnonzero(np.diff(star, prepend=-1))
@@ -127,7 +127,7 @@ def _neighbours_light(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma
     return np.concatenate(crowded), np.concatenate(light)
 
 
-def _may_count(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> Array:
+def _are_relevant(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> Array:
     """Which pairs (m,) can matter: the neighbour's light at the stamp's nearest pixel against the middle's noise."""
     radius = s.data.shape[1] // 2
     beyond = np.maximum(np.abs(fits.xy_px[other] - s.centres[star]) - radius - 0.5, 0.0)
@@ -146,7 +146,7 @@ def own_light(centres: Ints, fits: PointFits, sigma: float | Array, radius: int)
     return np.asarray(py[:, :, None] * px[:, None, :])
 
 
-def painted(fits: PointFits, sigma: float, shape: tuple[int, int]) -> Pixels:
+def paint_sources(fits: PointFits, sigma: float, shape: tuple[int, int]) -> Pixels:
     """Light (H, W) of the fitted sources, to 5 sigma."""
     radius = int(np.ceil(5.0 * sigma))
     side = 2 * radius + 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -32,7 +32,7 @@ class PointFits:
         """The fits selected by indices."""
         return PointFits(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
-    def replaced(self, which: Ints, others: PointFits) -> PointFits:
+    def with_rows(self, which: Ints, others: PointFits) -> PointFits:
         """These fits with those at the indices exchanged for the `others`."""
         values = {f.name: getattr(self, f.name).copy() for f in fields(self)}
         for name, value in values.items():
@@ -50,7 +50,7 @@ class Stamps:
     centres: Ints
     surround: Array
 
-    def part(self, which: slice | Ints) -> Stamps:
+    def take(self, which: slice | Ints) -> Stamps:
         """Some of them."""
         usable = None if self.usable is None else self.usable[which]
         return Stamps(self.data[which], self.variance[which], usable, self.centres[which], self.surround[which])
@@ -92,6 +92,20 @@ def fit_points(
     )
 
 
-def joined(parts: list[PointFits]) -> PointFits:
+def concatenate_fits(parts: list[PointFits]) -> PointFits:
     """The fits of all parts, one after the other."""
     return PointFits(**{f.name: np.concatenate([getattr(b, f.name) for b in parts]) for f in fields(PointFits)})
+
+
+def unbin_fits(fits: PointFits, side: int) -> PointFits:
+    """Fits in a binned frame as they are in the frame itself: places and their errors; levels per pixel."""
+    if side == 1:
+        return fits
+    unit = np.array([side, side, 1.0, 1.0 / side**2])
+    return replace(
+        fits,
+        xy_px=side * fits.xy_px + 0.5 * (side - 1),
+        level=fits.level / side**2,
+        surround=fits.surround / side**2,
+        covariance=fits.covariance * np.outer(unit, unit),
+    )

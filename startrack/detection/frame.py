@@ -16,7 +16,8 @@ from startrack.types import Bools, Exposure, Ints
 Image = NDArray[np.float32]
 Pixels = NDArray[np.floating[Any]]  # stamps, in either precision
 SATURATED_FRACTION = 0.98
-LEFT_OVER = 0.1  # fraction of a known star's light that may be left when it is taken away
+MIN_BINNED_SIGMA_PX = 1.8  # from here up the pixels are smaller than need be
+RESIDUAL_FRACTION = 0.1  # fraction of a known star's light that may be left when it is taken away
 MODEL_ERROR = 0.03  # fraction of a star's own light by which real PSFs differ from the Gaussian
 
 
@@ -50,7 +51,7 @@ class Frame:
         if self.found is None:
             return np.asarray(cv2.divide(residual, self.noise[rows], dst=residual))
         light, found = self.light_noise, self.found[rows]
-        variance = np.square(self.noise[rows]) + found * (light.per_unit + LEFT_OVER**2 * found)
+        variance = np.square(self.noise[rows]) + found * (light.per_unit + RESIDUAL_FRACTION**2 * found)
         return np.asarray((residual - found) / np.sqrt(variance))
 
     def data(self, centres: Ints, radius: int) -> Image:
@@ -107,3 +108,39 @@ def stamps(image: NDArray[Any], centres: Ints, radius: int) -> NDArray[Any]:
 def radius_for(sigma_px: float) -> int:
     """Half width [px] of the fitting stamp: the star and a rim of background for the local level."""
     return stamp_radius(sigma_px) + 1
+
+
+def binning_factor(sigma_px: float) -> int:
+    """Side of the squares: a power of two that leaves a PSF of 0.9 px or more."""
+    return 1 if sigma_px < MIN_BINNED_SIGMA_PX else int(2 ** np.floor(np.log2(2.0 * sigma_px / MIN_BINNED_SIGMA_PX)))
+
+
+def bin_frame(frame: Frame, side: int) -> Frame:
+    """The frame of the sums of squares (what does not fill a square at the right and below is left out).
+
+    A square is unusable where any of its pixels is.
+    """
+    if side == 1:
+        return frame
+    height, width = (side * (length // side) for length in frame.shape)
+    whole = slice(0, height), slice(0, width)
+    dead = None
+    if frame.dead is not None:
+        dead = np.asarray(frame.dead[whole].reshape(height // side, side, width // side, side).any(axis=(1, 3)))
+    found = None if frame.found is None else _sums(frame.found[whole], side)
+    # Background and noise are smooth: one pixel of a square is as good as their mean.
+    middle = slice(side // 2, height, side), slice(side // 2, width, side)
+    background = frame.background[middle] * np.float32(side**2)
+    noise = frame.noise[middle] * np.float32(side)
+    return Frame(_sums(frame.image[whole], side), background, noise, dead, frame.light_noise, found)
+
+
+def _sums(image: Image, side: int) -> Image:
+    size = image.shape[1] // side, image.shape[0] // side
+    small: Any = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(small * np.float32(side * side), dtype=np.float32)
+
+
+def mask_or_none(dead: Bools) -> Bools | None:
+    """The mask, or None where no pixel is unusable."""
+    return dead if dead.any() else None

@@ -15,12 +15,12 @@ from startrack.psf import filter_kernel
 from startrack.types import Array, Bools, Ints
 
 STRIP_ROWS = 320
-MOST_STAMP_PIXELS = 2_500_000  # of all candidates together: bounds time and memory, whatever the frame holds
-MOST_BLOBS = 1000  # saturated; the largest
-FEW_DEAD = 20_000  # pixels up to which they are grouped without looking at the whole mask
+MAX_STAMP_PIXELS = 2_500_000  # of all candidates together: bounds time and memory, whatever the frame holds
+MAX_BLOBS = 1000  # saturated; the largest
+MAX_DEAD_GROUPED_PX = 20_000  # pixels up to which they are grouped without looking at the whole mask
 OWN_RESIDUE_SIGMAS = 1.5
-ONE_PIXEL_PART = 0.15  # of a peak's light beside it; a star of 0.45 px has 0.18
-AROUND = [(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)]
+ONE_PIXEL_FRACTION = 0.15  # of a peak's light beside it; a star of 0.45 px has 0.18
+NEIGHBOURS = [(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)]
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def find_peaks(frame: Frame, sigma: float, lowest: float, most: int, known: Arra
     `known` (m, 2): places of stars whose light `frame.found` holds; they come first, the peaks are those of the rest.
     """
     margin = radius_for(sigma)
-    most = min(most, MOST_STAMP_PIXELS // (2 * margin + 1) ** 2)
+    most = min(most, MAX_STAMP_PIXELS // (2 * margin + 1) ** 2)
     kernel = filter_kernel(sigma)
     squared = float(np.sum(kernel.astype(np.float64) ** 2))
     width = COARSE_PX * coarse_width(6 * margin + 1)
@@ -53,14 +53,14 @@ def find_peaks(frame: Frame, sigma: float, lowest: float, most: int, known: Arra
     peaks, start, surround = pixels[chosen], (pixels + offset)[chosen], level[chosen]
     blobs = _saturated_blobs(frame.dead, margin)
     if known is not None:
-        away = _away_from(known, start, sigma)
+        away = _are_off_known(known, start, sigma)
         peaks, start, surround = peaks[away], start[away], surround[away]
         blobs = np.concatenate([known, blobs])
     centres = np.concatenate([_pixels_of(blobs, frame.shape, margin), peaks])
     return Peaks(
         centres=centres,
         start_xy_px=np.concatenate([blobs, start]),
-        surround=np.concatenate([np.zeros(len(blobs)), surround * _at(frame.noise, peaks)]),
+        surround=np.concatenate([np.zeros(len(blobs)), surround * _values_at(frame.noise, peaks)]),
         own_part=min(float(1.0 / squared**2) / width**2, 0.5),
     )
 
@@ -82,7 +82,7 @@ def bright_pixels(frame: Frame, lowest: float, most: int, margin: int) -> Ints:
         own = light[:, 1, 1]
         highest = (own[:, None, None] >= light).all(axis=(1, 2))
         beside = np.maximum(light[:, 1, ::2].max(axis=1), light[:, ::2, 1].max(axis=1))
-        highest &= beside > np.float32(ONE_PIXEL_PART) * own
+        highest &= beside > np.float32(ONE_PIXEL_FRACTION) * own
         found.append(pixels[highest])
         level.append(own[highest])
     pixels = np.concatenate(found) if found else np.zeros((0, 2), dtype=np.int64)
@@ -109,11 +109,11 @@ def _strip_peaks(
     own = filtered[rows.start - first : rows.stop - first]
     row, column = np.divmod(np.flatnonzero(own > np.float32(lowest)), own.shape[1])
     row += rows.start
-    inside = _inside(frame, row, column, len(kernel) // 2 + 1)
+    inside = _are_usable(frame, row, column, len(kernel) // 2 + 1)
     row, column = row[inside] - first, column[inside]
     height = filtered[row, column]
     highest = np.ones(len(row), dtype=bool)
-    for down, right in AROUND:
+    for down, right in NEIGHBOURS:
         highest &= height >= filtered[row + down, column + right]
     row, column = row[highest], column[highest]
     offset = _parabola(filtered, row, column)
@@ -121,7 +121,7 @@ def _strip_peaks(
     return pixels, height[highest], offset, level[row, column].astype(np.float64)
 
 
-def _away_from(known: Array, start: Array, sigma: float) -> Bools:
+def _are_off_known(known: Array, start: Array, sigma: float) -> Bools:
     """The peaks (n,) that are not on a known star: what is left there is the PSF's misfit."""
     from scipy.spatial import cKDTree
 
@@ -133,11 +133,11 @@ def _pixels_of(xy_px: Array, shape: tuple[int, int], margin: int) -> Ints:
     return np.clip(pixels, margin, np.array([shape[1], shape[0]]) - 1 - margin)
 
 
-def _at(image: Image, centres: Ints) -> Array:
+def _values_at(image: Image, centres: Ints) -> Array:
     return np.asarray(image[centres[:, 1], centres[:, 0]].astype(np.float64))
 
 
-def _inside(frame: Frame, rows: Ints, columns: Ints, margin: int) -> Bools:
+def _are_usable(frame: Frame, rows: Ints, columns: Ints, margin: int) -> Bools:
     height, width = frame.shape
     good = (rows >= margin) & (rows < height - margin) & (columns >= margin) & (columns < width - margin)
     return good if frame.dead is None else good & ~frame.dead[rows, columns]
@@ -162,21 +162,21 @@ def _saturated_blobs(dead: NDArray[np.bool_] | None, margin: int) -> Array:
     row, column = np.divmod(np.flatnonzero(dead), width)
     if not len(row):
         return np.zeros((0, 2))
-    if len(row) > FEW_DEAD:  # large areas: the whole mask
+    if len(row) > MAX_DEAD_GROUPED_PX:  # large areas: the whole mask
         count, labels, _, _ = cv2.connectedComponentsWithStats(dead.astype(np.uint8))
         label = labels[row, column].astype(np.int64) - 1
         count -= 1
     else:
-        count, label = _touching(row, column, width)
+        count, label = _group_touching(row, column, width)
     area = np.bincount(label, minlength=count)
     middle = np.stack([np.bincount(label, q, count) / np.maximum(area, 1) for q in (column, row)], axis=1)
     inside = (middle >= margin).all(axis=1) & (middle[:, 0] < width - margin) & (middle[:, 1] < height - margin)
     good = np.flatnonzero(inside & (area <= (2 * margin + 1) ** 2))
-    chosen = good[np.argsort(-area[good], kind="stable")[:MOST_BLOBS]]
+    chosen = good[np.argsort(-area[good], kind="stable")[:MAX_BLOBS]]
     return np.asarray(middle[chosen], dtype=np.float64)
 
 
-def _touching(row: Ints, column: Ints, width: int) -> tuple[int, Ints]:
+def _group_touching(row: Ints, column: Ints, width: int) -> tuple[int, Ints]:
     """How many groups of touching pixels (corners count) there are among a few, and each one's group (n,)."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -191,3 +191,12 @@ def _touching(row: Ints, column: Ints, width: int) -> tuple[int, Ints]:
     graph = coo_matrix((np.ones(len(i), dtype=np.int8), (i, j)), shape=(len(place), len(place)))
     count, label = connected_components(graph, directed=False)
     return int(count), label.astype(np.int64)
+
+
+def unbin_peaks(peaks: Peaks, side: int, shape: tuple[int, int], margin: int) -> Peaks:
+    """Peaks of a binned frame as candidates of the frame itself, of this shape (H, W), `margin` off its border."""
+    if side == 1:
+        return peaks
+    start = side * peaks.start_xy_px + 0.5 * (side - 1)
+    pixels = np.clip(np.rint(start).astype(np.int64), margin, np.array([shape[1], shape[0]]) - 1 - margin)
+    return Peaks(pixels, start, peaks.surround / side**2, peaks.own_part)

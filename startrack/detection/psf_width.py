@@ -2,37 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-from startrack.detection.fit import PointFits
+from startrack.detection.fit import ROUNDS_AGAIN, PointFits, Stamps, fit_points
 from startrack.detection.frame import Frame, Pixels, radius_for
+from startrack.detection.peaks import bright_pixels, find_peaks
 from startrack.psf import pixel_profile_single
 from startrack.types import Array, Bools, Ints
 
-BRIGHT_SNR = 12.0  # sources that say what the frame's PSF is
-FEWEST_BRIGHT = 8
-MOST_BRIGHT, FEW_BRIGHT = 100, 40  # the second where many widths are tried
+BRIGHT_SNR = 12.0  # of the sources from which the width is measured
+WIDTH_TOLERANCE = 0.12  # a measured PSF that differs by more than this fraction from the expected one replaces it
+WIDTH_ROUNDS = 4  # a stamp of the wrong size measures a much wider PSF too small
+BRIGHT_PIXEL_SIGMAS, MAX_BRIGHT_PIXELS, MIN_BRIGHT_PIXELS = 8.0, 64, 30
+MIN_BESIDE, MIN_FALL, MAX_FALL = 0.02, 0.05, 3.5  # light beside a peak; its fall for 4.5 px and 0.45 px
+MIN_BRIGHT = 8
+MAX_BRIGHT, MAX_BRIGHT_ALL_WIDTHS = 100, 40  # the second where many widths are tried
 NEAR = np.geomspace(0.72, 1.4, 8)  # widths tried first, in units of the expected one
 WIDTHS_PX = np.geomspace(0.3, 8.0, 22)
 NARROWER_IS_A_PIXEL_PX = 0.45  # hot pixels fit the narrowest profile
 AT_THE_END = 0.3  # part of the sources that the widths tried first may fail to hold
 STAR_LIKE = 0.75  # of a stamp's variance beyond the noise that a star of the best width explains; clouds: 0.2 to 0.5
 SHARP_RATIO = 0.6  # sources narrower than this part of the typical width are stars among something else
-SHARP_PART = 0.1  # of the sources, from which these are no accident
+SHARP_FRACTION = 0.1  # of the sources, from which these are no accident
 
 
-def measured_width(frame: Frame, centres: Ints, fits: PointFits, sigma: float) -> float | None:
-    """Typical PSF sigma [px] of the bright sources that are like stars; None where there are too few to tell.
+def measure_psf_width(frame: Frame, centres: Ints, fits: PointFits, sigma: float) -> float | None:
+    """Typical PSF sigma [px] of the bright sources that are like stars; None where there are too few.
 
-    Clouds, moonlight and branches give bumps of any width, the wider the filter the wider: bumps that no Gaussian
-    explains say nothing, and of two kinds of width the sharper is the stars'.
+    Clouds, moonlight and branches give bumps of any width, wider ones with a wider filter: bumps that no Gaussian
+    explains are left out, and of two kinds of width the sharper one belongs to the stars.
     """
     radius = radius_for(sigma)
     bright = np.flatnonzero((fits.snr > BRIGHT_SNR) & (fits.chi2 < fits.chi2_pixel))
     bright = bright[np.argsort(-fits.snr[bright], kind="stable")]
     usable = frame.usable(centres[bright], radius)
-    bright = (bright if usable is None else bright[usable.all(axis=(1, 2))])[:MOST_BRIGHT]
-    if len(bright) < FEWEST_BRIGHT:
+    bright = (bright if usable is None else bright[usable.all(axis=(1, 2))])[:MAX_BRIGHT]
+    if len(bright) < MIN_BRIGHT:
         return None
     pixels = centres[bright]
     data = frame.data(pixels, radius)
@@ -40,13 +47,13 @@ def measured_width(frame: Frame, centres: Ints, fits: PointFits, sigma: float) -
     offset = fits.xy_px[bright] - pixels
     widths, inside, part = fit_widths(data, weights, offset, sigma * NEAR)
     if inside.mean() < 1.0 - AT_THE_END:
-        few = slice(0, FEW_BRIGHT)
+        few = slice(0, MAX_BRIGHT_ALL_WIDTHS)
         widths, inside, part = fit_widths(data[few], weights[few], offset[few], WIDTHS_PX)
     widths = widths[inside & (part > STAR_LIKE) & (widths > NARROWER_IS_A_PIXEL_PX)]
-    if len(widths) < FEWEST_BRIGHT:
+    if len(widths) < MIN_BRIGHT:
         return None
     sharp = widths[widths < SHARP_RATIO * np.median(widths)]
-    return float(np.median(sharp if len(sharp) >= max(FEWEST_BRIGHT, SHARP_PART * len(widths)) else widths))
+    return float(np.median(sharp if len(sharp) >= max(MIN_BRIGHT, SHARP_FRACTION * len(widths)) else widths))
 
 
 def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array) -> tuple[Array, Bools, Array]:
@@ -84,3 +91,49 @@ def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array
 def _sums(stamp: Pixels, down: Pixels, across: Pixels) -> Array:
     """Sums (n, m) of the stamps (n, s, s) times profiles (n, m, s) in y and in x."""
     return np.einsum("nms,nms->nm", np.matmul(down, stamp), across).astype(np.float64)
+
+
+def guess_psf_width(prepare: Callable[[float], Frame], sigma: float) -> float:
+    """PSF sigma [px] by the brightest pixels, from a first guess, which is kept where they give no width.
+
+    `prepare` gives the frame with the background for a PSF of that width.
+    """
+    frame = prepare(sigma)
+    pixels = bright_pixels(frame, BRIGHT_PIXEL_SIGMAS, MAX_BRIGHT_PIXELS, 1)
+    if len(pixels) < MIN_BRIGHT_PIXELS:  # too few stand out by one pixel
+        found = find_peaks(frame, sigma, BRIGHT_SNR, MAX_BRIGHT_PIXELS).centres
+        pixels = found if len(found) > len(pixels) else pixels
+    elif (guess := _width_by_fall(frame, pixels)) is not None:
+        sigma = guess
+    for _ in range(WIDTH_ROUNDS):
+        radius = radius_for(sigma)
+        last = np.array([frame.shape[1], frame.shape[0]]) - 1
+        centres = pixels[((pixels >= radius) & (pixels <= last - radius)).all(axis=1)]
+        if not len(centres):
+            break
+        data, variance = frame.data(centres, radius), frame.variance(centres, radius)
+        stamps = Stamps(data, variance, frame.usable(centres, radius), centres, np.zeros(len(centres)))
+        fits = fit_points(stamps, centres.astype(np.float64), sigma, frame.light_noise, 0.0, ROUNDS_AGAIN)
+        measured = measure_psf_width(frame, centres, fits, sigma)
+        if measured is None:
+            break
+        settled = abs(np.log(measured / sigma)) < WIDTH_TOLERANCE
+        sigma = measured
+        if settled:
+            break
+    return sigma
+
+
+def _width_by_fall(frame: Frame, pixels: Ints) -> float | None:
+    """About the PSF sigma [px] of sources whose brightest pixels (n, 2) lie off the border; None where they are odd.
+
+    Of a Gaussian of variance s^2 the values left and right of a pixel have the product of its square and exp(-1 / s^2),
+    wherever the middle is.
+    """
+    light = np.maximum(frame.data(pixels, 1), 0.0)
+    peak = np.maximum(light[:, 1, 1], 1e-9)
+    beside = np.stack([light[:, 1, 0], light[:, 1, 2], light[:, 0, 1], light[:, 2, 1]], axis=1) / peak[:, None]
+    falls = -0.5 * float(np.median(np.log(np.maximum(beside, MIN_BESIDE)).sum(axis=1)))
+    if not MIN_FALL < falls < MAX_FALL:
+        return None
+    return float(np.sqrt(1.0 / falls - 1.0 / 12.0))

@@ -10,38 +10,38 @@ from startrack.psf import pixel_profile
 from startrack.types import Array, Bools, Ints
 
 BRIGHT_SNR = 15.0
-FEWEST, MOST = 20, 120
-FAINT_PART = 0.3  # of the pixel's variance: pixels with less of the star's light tell nothing
-MOST_LEVERAGE = 0.5  # pixels that the fit follows hide their noise
-BINS, FEWEST_IN_BIN = 12, 15
-MOST_ALIKE = 2.0
+MIN_STARS, MAX_STARS = 20, 120
+FAINT_FRACTION = 0.3  # of the pixel's variance: pixels with less of the star's light tell nothing
+MAX_LEVERAGE = 0.5  # pixels that the fit follows hide their noise
+BINS, MIN_IN_BIN = 12, 15
+MAX_ALIKE = 2.0
 MEDIAN_OF_SQUARE = 0.4549  # of a unit Gaussian
-LEAST_MODEL_ERROR = 0.005
+MIN_MODEL_ERROR = 0.005
 
 
-def measured_light_noise(s: Stamps, fits: PointFits, alone: Bools, sigma: float, expected: LightNoise) -> LightNoise:
+def measure_light_noise(s: Stamps, fits: PointFits, alone: Bools, sigma: float, expected: LightNoise) -> LightNoise:
     """The frame's own; `expected` where too few bright stars tell. Photon noise that a camera file states is kept.
 
     From stars `alone` (n,): in bins of a pixel's light, the median squared residual beyond the noise of the dark is
     a light + b light^2. The PSF's misfit is never taken to be larger than expected. Where residuals of different stars
     are alike, the PSF is not the model's, and unknown photon noise cannot be told from that.
     """
-    bright = _bright(s, fits, alone)
-    if len(bright) < FEWEST:
+    bright = _select_bright(s, fits, alone)
+    if len(bright) < MIN_STARS:
         return expected
-    light, excess, alike = _excess(s.part(bright), fits.take(bright), sigma)
-    if expected.per_unit == 0.0 and alike > MOST_ALIKE:
+    light, excess, alike = _excess_variance(s.take(bright), fits.take(bright), sigma)
+    if expected.per_unit == 0.0 and alike > MAX_ALIKE:
         return expected
-    if len(light) < BINS * FEWEST_IN_BIN:
+    if len(light) < BINS * MIN_IN_BIN:
         return expected
     order = np.argsort(light, kind="stable")
-    bins = [part for part in np.array_split(order, BINS) if len(part) >= FEWEST_IN_BIN]
+    bins = [part for part in np.array_split(order, BINS) if len(part) >= MIN_IN_BIN]
     rows = [(np.median(light[part]), *_typical(excess[:, part])) for part in bins]
     level, beyond, error = np.array(rows).T
-    return _fitted(level, beyond, error, expected)
+    return _fit_noise_terms(level, beyond, error, expected)
 
 
-def _fitted(level: Array, beyond: Array, error: Array, expected: LightNoise) -> LightNoise:
+def _fit_noise_terms(level: Array, beyond: Array, error: Array, expected: LightNoise) -> LightNoise:
     """Weighted least squares for a and b, neither below 0; a is kept where it is known."""
     one, two = level / error, level**2 / error
     per_unit = expected.per_unit
@@ -51,19 +51,19 @@ def _fitted(level: Array, beyond: Array, error: Array, expected: LightNoise) -> 
         per_unit, b = np.linalg.solve(normal, right)
         per_unit = float(max(per_unit if b >= 0 else right[0] / normal[0, 0], 0.0))
     b = float(two @ ((beyond - per_unit * level) / error) / (two @ two))
-    return LightNoise(per_unit, float(np.clip(np.sqrt(max(b, 0.0)), LEAST_MODEL_ERROR, MODEL_ERROR)))
+    return LightNoise(per_unit, float(np.clip(np.sqrt(max(b, 0.0)), MIN_MODEL_ERROR, MODEL_ERROR)))
 
 
-def _bright(s: Stamps, fits: PointFits, alone: Bools) -> Ints:
+def _select_bright(s: Stamps, fits: PointFits, alone: Bools) -> Ints:
     good = alone & (fits.snr > BRIGHT_SNR) & (fits.chi2 < fits.chi2_pixel)
     if s.usable is not None:
         good &= s.usable.all(axis=(1, 2))
     which = np.flatnonzero(good)
     # Some of every brightness: the brightest tell the PSF's misfit, the others photon noise.
-    return which[np.argsort(-fits.snr[which], kind="stable")][:: max(1, len(which) // MOST)]
+    return which[np.argsort(-fits.snr[which], kind="stable")][:: max(1, len(which) // MAX_STARS)]
 
 
-def _excess(s: Stamps, fits: PointFits, sigma: float) -> tuple[Array, Array, float]:
+def _excess_variance(s: Stamps, fits: PointFits, sigma: float) -> tuple[Array, Array, float]:
     """Light (m,) of the stars' pixels; (2, m) squared residuals (what the fit took of them given back) and variances;
     and how alike the stars' residuals are: 1 for independent ones.
     """
@@ -81,7 +81,7 @@ def _excess(s: Stamps, fits: PointFits, sigma: float) -> tuple[Array, Array, flo
     variance = s.variance.reshape(n, -1).astype(np.float64)
     seen = np.maximum(squared, variance + np.square(MODEL_ERROR * light.reshape(n, -1)))
     leverage = np.sum(g * np.matmul(fits.covariance, g), axis=1) / seen
-    use = (light.reshape(n, -1) > FAINT_PART * variance) & (leverage < MOST_LEVERAGE)
+    use = (light.reshape(n, -1) > FAINT_FRACTION * variance) & (leverage < MAX_LEVERAGE)
     relative = residual / flux[:, :, 0]
     relative /= np.maximum(
         np.sqrt(np.mean(np.square(relative), axis=1, keepdims=True)), 1e-30

@@ -12,14 +12,14 @@ from startrack.types import Array, Bools, Ints
 
 PIXEL_SIGMAS = 2.5  # of the lightly smoothed image: what belongs to a streak
 SMOOTH_PX = 1.0
-FEWEST_PX, MOST_PX = 12, 20_000
+MIN_AREA_PX, MAX_AREA_PX = 12, 20_000
 BRIGHT_SNR = 15.0  # of the whole streak
-FEWEST = 6  # streaks that agree with each other
+MIN_STARS = 6  # streaks that agree with each other
 LONG_PX, SLENDER = 4.5, 2.5  # shortest streak, and its length over its width
 SAME_DIRECTION, SAME_LENGTH = np.cos(np.radians(15.0)), 0.3
-LOOK_RADIUS_PX, LOOKED_AT, LOOK_SIGMAS, LOOK_LONG_PX2, LOOK_SLENDER = 7, 100, 4.0, 2.2, 2.2
-IN_LINE_PART = 0.45
-STREAKED_PART = 0.6  # of the bright blobs
+ELONGATION_RADIUS_PX, ELONGATION_PEAKS, ELONGATION_SIGMAS, ELONGATION_PX2, ELONGATION_RATIO = 7, 100, 4.0, 2.2, 2.2
+IN_LINE_FRACTION = 0.45
+STREAKED_FRACTION = 0.6  # of the bright blobs
 
 
 @dataclass(frozen=True)
@@ -34,22 +34,22 @@ class Streaks:
     width_px: float  # typical standard deviation across
 
 
-def drawn_out(frame: Frame, centres: Ints) -> bool:
+def are_elongated(frame: Frame, centres: Ints) -> bool:
     """Whether the highest peaks (n, 2) are parts of something long rather than round: a quick look."""
     height, width = frame.shape
     margin = np.minimum(centres, np.array([width, height]) - 1 - centres).min(axis=1)
-    centres = centres[margin >= LOOK_RADIUS_PX][:LOOKED_AT]
-    if len(centres) < FEWEST:
+    centres = centres[margin >= ELONGATION_RADIUS_PX][:ELONGATION_PEAKS]
+    if len(centres) < MIN_STARS:
         return False
-    light, noise = frame.data(centres, LOOK_RADIUS_PX), np.sqrt(frame.variance(centres, LOOK_RADIUS_PX))
-    light = np.where(light > LOOK_SIGMAS * noise, light, 0.0)
-    offset = np.arange(-LOOK_RADIUS_PX, LOOK_RADIUS_PX + 1)
+    light, noise = frame.data(centres, ELONGATION_RADIUS_PX), np.sqrt(frame.variance(centres, ELONGATION_RADIUS_PX))
+    light = np.where(light > ELONGATION_SIGMAS * noise, light, 0.0)
+    offset = np.arange(-ELONGATION_RADIUS_PX, ELONGATION_RADIUS_PX + 1)
     x, y = np.meshgrid(offset, offset)
     total = np.maximum(light.sum(axis=(1, 2)), 1e-9)
     xx, xy, yy = (np.sum(light * q, axis=(1, 2)) / total for q in (x * x, x * y, y * y))
     trace, spread = xx + yy, np.hypot(xx - yy, 2.0 * xy)
-    long = (trace + spread) > LOOK_SLENDER * (trace - spread + 0.2)
-    return bool(np.mean(long & (trace + spread > 2.0 * LOOK_LONG_PX2)) > 0.5)
+    long = (trace + spread) > ELONGATION_RATIO * (trace - spread + 0.2)
+    return bool(np.mean(long & (trace + spread > 2.0 * ELONGATION_PX2)) > 0.5)
 
 
 def find_streaks(frame: Frame) -> Streaks | None:
@@ -78,10 +78,10 @@ def find_streaks(frame: Frame) -> Streaks | None:
     variance += frame.light_noise.per_unit * np.maximum(light, 0.0)
     blobs = _moments(label, np.stack([columns, rows], axis=1).astype(np.float64), light, variance, count)
     flux, flux_sigma, xy, spread, covariance = blobs
-    bright = (area >= FEWEST_PX) & (area <= MOST_PX) & off_border & (flux > BRIGHT_SNR * flux_sigma)
+    bright = (area >= MIN_AREA_PX) & (area <= MAX_AREA_PX) & off_border & (flux > BRIGHT_SNR * flux_sigma)
     bright[0] = False
     which = np.flatnonzero(bright)
-    if len(which) < FEWEST:
+    if len(which) < MIN_STARS:
         return None
     values, vectors = np.linalg.eigh(spread[which])
     length, across = (
@@ -89,11 +89,11 @@ def find_streaks(frame: Frame) -> Streaks | None:
         np.sqrt(np.maximum(values[:, 0], 0.1)),
     )
     streaked = (length > LONG_PX) & (length > SLENDER * across)
-    if streaked.sum() < FEWEST or streaked.mean() < STREAKED_PART:
+    if streaked.sum() < MIN_STARS or streaked.mean() < STREAKED_FRACTION:
         return None
     which, length, across, along = which[streaked], length[streaked], across[streaked], vectors[streaked][:, :, 1]
-    alike = _like_a_neighbour(xy[which], along, length)
-    if alike.sum() < FEWEST or alike.mean() < STREAKED_PART:
+    alike = _resemble_neighbours(xy[which], along, length)
+    if alike.sum() < MIN_STARS or alike.mean() < STREAKED_FRACTION:
         return None
     which, length, across = which[alike], length[alike], across[alike]
     order = np.argsort(-flux[which], kind="stable")
@@ -122,7 +122,7 @@ def _moments(label: Ints, xy: Array, light: Array, variance: Array, count: int) 
     return flux, np.sqrt(np.maximum(total(variance), 1e-12)), middle, spread, covariance
 
 
-def _like_a_neighbour(xy: Array, along: Array, length: Array) -> Bools:
+def _resemble_neighbours(xy: Array, along: Array, length: Array) -> Bools:
     """Which streaks (n,) have the direction and length of one of the three nearest others."""
     from scipy.spatial import cKDTree
 
@@ -131,7 +131,7 @@ def _like_a_neighbour(xy: Array, along: Array, length: Array) -> Bools:
     off /= np.maximum(np.linalg.norm(off, axis=-1, keepdims=True), 1e-9)
     # Pieces of one long edge follow each other in their own direction; of stars one in six does.
     in_line = np.abs(np.einsum("ni,nki->nk", along, off)) > SAME_DIRECTION
-    if in_line[:, 0].mean() > IN_LINE_PART:
+    if in_line[:, 0].mean() > IN_LINE_FRACTION:
         return np.zeros(len(xy), dtype=bool)
     parallel = np.abs(np.einsum("ni,nki->nk", along, along[near[:, 1:]])) > SAME_DIRECTION
     as_long = np.abs(np.log(length[near[:, 1:]] / length[:, None])) < SAME_LENGTH

@@ -15,7 +15,7 @@ BLOCK_PX = 16  # side of the blocks for a PSF up to 1.5 WIDEST_PX
 WIDEST_PX = 1.4
 STEEP_FRACTION = 0.03  # of the blocks
 MIN_NOISE_STEPS = 1.0  # noise in units of the smallest step below which the pixels hold too few values for quantiles
-LOW, HIGH = 0.05, 0.65  # quantiles between which pixels tell the noise
+LOW, HIGH = 0.05, 0.65  # quantiles of the pixels between which the noise is measured
 COARSE_PX = 4  # the local level is a mean over squares of this side
 CLIPPED_SIGMA = 2.5
 Image = NDArray[np.float32]
@@ -52,7 +52,7 @@ def block_side(sigma_px: float) -> int:
 
 
 def local_level(standardised: Image, width_px: int) -> Image:
-    """Mean over a box of residuals in units of the noise, stars left out: what the block medians missed.
+    """Mean over a box of residuals in units of the noise, without stars: the background that block medians miss.
 
     Boxes are made of whole squares of COARSE_PX, which costs a third of the time and no more than their coarseness.
     """
@@ -86,9 +86,9 @@ def _steep_fraction(level: NDArray[Any], spread: NDArray[Any]) -> float:
 def _measure_blocks(
     image: Image, side: int, quantum: float, measure: Callable[[Image], tuple[Image, ...]]
 ) -> list[Image]:
-    """What `measure` says of the ordered pixels (n, BLOCK_PX^2) of square blocks: (blocks,), left to right and down.
+    """The results (blocks,) of `measure` for the ordered pixels (n, BLOCK_PX^2) of square blocks, row by row.
 
-    A few rows of blocks at a time: what the processor's cache holds.
+    A few rows of blocks at a time fit into the processor's cache.
     """
     rows = side * max(1, BAND_PIXELS * (side // BLOCK_PX) ** 2 // (side * image.shape[1]))
     bands = [

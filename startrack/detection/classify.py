@@ -1,4 +1,4 @@
-"""Which fitted candidates are point sources: above the threshold, like the PSF, and nothing else's likeness."""
+"""Selection of point sources among the fitted candidates, by height, likeness to the PSF, and no edge or hot pixel."""
 
 from __future__ import annotations
 
@@ -24,12 +24,16 @@ OWN_LEVEL_FRACTION = 0.8  # of the threshold that a source must reach by its own
 UNEVEN_SIGMA = 2.5  # difference of the stamp's level and that of its surroundings where these are not to be trusted
 EDGE_MARGIN = 8.0  # chi^2 by which an edge must explain a stamp better: noise alone gives faint stars less
 BAD_FIT_CHI2_PER_DOF = 4.0
-ROUGH_PSF_MISFIT = 0.06  # from here up the frame's own stars, not the Gaussian, say what a star looks like
+ROUGH_PSF_MISFIT = 0.06  # from here up stars are compared with the frame's own bright stars, not with the Gaussian
 ROUGH_PSF_SPREAD = 2.0  # times the typical misfit that a star of such a frame may have
 SATURATED_MISFIT = 0.2  # of a star that shows only its wings, which are the least Gaussian
 EDGE_DIRECTIONS = 8  # of the straight edges or lines tried
 LARGEST_SIGMA_PX = 2.0  # of the place
-WING_SIGMAS, WING_BRIGHTER, WING_HEIGHT = 3.0, 2.0, 1.4  # where a brighter one is, this much brighter, more is asked
+WING_SIGMAS, WING_BRIGHTER, WING_HEIGHT = (
+    3.0,
+    2.0,
+    1.4,
+)  # within this radius of a source this much brighter the threshold is higher
 
 
 def select_stars(fitted: Fitted, width_px: Array, threshold: float) -> Ints:
@@ -95,7 +99,7 @@ def detection_threshold(threshold_snr: float, sigma_px: float, skewness: float) 
     """Height that gives about as many false peaks, whatever the PSF's width and the skewness of the pixels' noise.
 
     That is 0.3 to 0.6 in 4 Mpx at the default. A narrower PSF has more independent places to be false at, down to where
-    the pixels, no longer the PSF, say how many there are; a wider one has fewer, but crowds. Photons' noise is skew:
+    the number of pixels limits it; a wider one has fewer, but more crowded sources. Photons' noise is skew:
     its bright tail is heavier than a Gaussian's (the first term of Cornish and Fisher's expansion, with what the filter
     leaves of the skewness), and its quantiles below the median, from which the noise is taken, lie closer together.
     """

@@ -63,7 +63,7 @@ class Detector:
 
     threshold_snr: float = 5.42  # for a PSF of 1.25 px; for others what gives about as few false stars
     max_candidates: int = 15000  # a frame with more peaks is noise, a bright day or a defect: the highest are kept
-    psf_sigma_px: float | None = None  # taken as it is, whatever camera file and frame say of the PSF's width
+    psf_sigma_px: float | None = None  # used without measuring it; None: from the camera file and the frame
 
     def __call__(self, exposure: Exposure, camera: Camera | None = None) -> Detections:
         """Point sources, brightest first; fluxes in electrons where the camera knows its gain, else in ADU.

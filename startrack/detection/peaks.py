@@ -1,4 +1,4 @@
-"""Where point sources may be: peaks of the matched filter, and the middles of saturated blobs."""
+"""Candidates for point sources: peaks of the matched filter, and the middles of saturated blobs."""
 
 from __future__ import annotations
 

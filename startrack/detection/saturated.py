@@ -1,4 +1,4 @@
-"""Stars whose middle is saturated: only their wings are seen, and a real PSF's are wider than the Gaussian's."""
+"""Stars with saturated middles: only their wings are measured, and a real PSF has wider wings than the Gaussian."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from startrack.types import Array, Bools, Ints
 
 BRIGHT_SNR = 15.0
 MIN_STARS, MAX_STARS = 20, 120
-FAINT_FRACTION = 0.3  # of the pixel's variance: pixels with less of the star's light tell nothing
+FAINT_FRACTION = 0.3  # of the pixel's variance: pixels with less of the star's light are left out
 MAX_LEVERAGE = 0.5  # pixels that the fit follows hide their noise
 BINS, MIN_IN_BIN = 12, 15
 MAX_ALIKE = 2.0
@@ -20,11 +20,11 @@ MIN_MODEL_ERROR = 0.005
 
 
 def measure_light_noise(s: Stamps, fits: PointFits, alone: Bools, sigma: float, expected: LightNoise) -> LightNoise:
-    """The frame's own; `expected` where too few bright stars tell. Photon noise that a camera file states is kept.
+    """The noise of the frame's own stars; `expected` where bright stars are too few. Stated photon noise is kept.
 
     From stars `alone` (n,): in bins of a pixel's light, the median squared residual beyond the noise of the dark is
     a light + b light^2. The PSF's misfit is never taken to be larger than expected. Where residuals of different stars
-    are alike, the PSF is not the model's, and unknown photon noise cannot be told from that.
+    are alike, the PSF differs from the model, and unknown photon noise cannot be separated from that.
     """
     bright = _select_bright(s, fits, alone)
     if len(bright) < MIN_STARS:
@@ -59,7 +59,7 @@ def _select_bright(s: Stamps, fits: PointFits, alone: Bools) -> Ints:
     if s.usable is not None:
         good &= s.usable.all(axis=(1, 2))
     which = np.flatnonzero(good)
-    # Some of every brightness: the brightest tell the PSF's misfit, the others photon noise.
+    # Some of every brightness: the brightest show the PSF's misfit, the others photon noise.
     return which[np.argsort(-fits.snr[which], kind="stable")][:: max(1, len(which) // MAX_STARS)]
 
 

@@ -1,4 +1,4 @@
-"""Evidence: exposure, attitude and catalogue to rays that say "light" or "wall"."""
+"""Evidence: exposure, attitude and catalogue to rays, each with the log-likelihood ratio of sky against ground."""
 
 from startrack.evidence.flux_scale import FluxScale, flux_scale
 from startrack.evidence.sky_step import (

@@ -1,4 +1,4 @@
-"""The frame's own brightness scale: what its identified stars say of the zero point."""
+"""The brightness scale of a frame: its zero point, from its identified stars."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from startrack.camera import Camera
 from startrack.types import Array, Detections, Identification, Stars
 
 BRIGHT_SNR = 15.0
-FEWEST_STARS = 5
-SMALLEST_SCATTER = 0.02
+MIN_STARS = 5
+MIN_SCATTER = 0.02
 TREND_SIGNIFICANCE = 5.0
 
 
@@ -34,7 +34,7 @@ def flux_scale(detections: Detections, camera: Camera, stars: Stars, found: Iden
     """Scale from the bright identified stars: median, robust scatter, and a radial trend only where it is plain."""
     d, s = found.detection, found.star
     trusted = (detections.snr[d] > BRIGHT_SNR) & ~detections.saturated[d] & (stars.v_sigma_mag[s] < 0.1)
-    if trusted.sum() < FEWEST_STARS:
+    if trusted.sum() < MIN_STARS:
         trusted = ~detections.saturated[d] if (~detections.saturated[d]).any() else np.ones(len(d), dtype=bool)
     d, s = d[trusted], s[trusted]
     angle = camera.angle_rad(detections.xy_px[d])
@@ -46,7 +46,7 @@ def flux_scale(detections: Detections, camera: Camera, stars: Stars, found: Iden
     middle = float(np.median(rest))
     scatter = 1.4826 * float(np.median(np.abs(rest - middle)))
     noise = float(np.median(detections.flux_sigma_e[d] / detections.flux_e[d]))
-    intrinsic = max(float(np.sqrt(max(scatter**2 - noise**2, 0.0))), SMALLEST_SCATTER)
+    intrinsic = max(float(np.sqrt(max(scatter**2 - noise**2, 0.0))), MIN_SCATTER)
     return FluxScale(middle / (0.4 * np.log(10)), trend, intrinsic, len(d))
 
 

@@ -1,4 +1,4 @@
-"""Forced photometry: the light at the very pixel where the catalogue says that a star is."""
+"""Forced photometry: the flux at the predicted pixels of catalogue stars."""
 
 from __future__ import annotations
 

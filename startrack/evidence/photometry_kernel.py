@@ -191,7 +191,7 @@ def _fit_masking(profile, light, data, variance, weight):
             deviant += 1 if weight[p] * rest * rest > weight[p] * allowed * OUTLIER_SIGMA**2 else 0
         if deviant == 0 or masked > MAX_MASKED_PX:
             break
-        # The worst pixel first: a bright one drags the fit so far that its innocent neighbours look deviant too.
+        # The worst pixel first: a bright one shifts the fit so far that normal pixels beside it look deviant too.
         worst, worst_excess = 0, 0.0
         for p in range(size):
             stars = shine * profile[p] + light[p]

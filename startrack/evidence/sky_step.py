@@ -27,10 +27,10 @@ STEP_OFFSETS_PX = np.array([-11.0, -9.5, -8.0, -6.5, 6.5, 8.0, 9.5, 11.0])  # he
 SECTORS = 36
 SKYLINE_POINTS = 1440
 SKYLINE_SAMPLES = 7200  # one in 3 arcmin: half a pixel of a 180-degree fisheye
-MADE_OF_NOISE = 0.6745  # median of the absolute value of a standard normal variable
-MOST_SHIFT_PX = 0.7  # one sigma
-STEEPEST = 1.0
-FEWEST_PX = 12  # for a median
+MEDIAN_ABS_NORMAL = 0.6745  # median of the absolute value of a standard normal variable
+MAX_SHIFT_PX = 0.7  # one sigma
+MAX_SLOPE = 1.0
+MIN_MEDIAN_PX = 12  # for a median
 MEDIAN_LOSS = 1.2533  # standard deviation of the median of normal values, as a multiple of that of their mean
 SIGNIFICANT_SIGMAS = 5.0  # of a step that is stated as the brightness of the sky
 ARCSEC2_PER_SR = (180 * 3600 / np.pi) ** 2
@@ -140,7 +140,7 @@ def subtract_sky_step(
     profile = _interpolated(middle, azimuth, above)
     background[rows, columns] += profile.astype(np.float32)
     across = _step_of(above, steps)  # all sectors together: the noise is known better than it varies
-    ratio = _medians(np.abs(rest - profile) / spread, across, steps) / MADE_OF_NOISE
+    ratio = _medians(np.abs(rest - profile) / spread, across, steps) / MEDIAN_ABS_NORMAL
     ratio = np.where(ratio > 0, ratio, 1.0)
     noise[rows, columns] *= ratio[across].astype(np.float32)
     return replace(detections, background_e=background, noise_e=noise)
@@ -159,7 +159,7 @@ def reliable_azimuths(horizon: Horizon, shifted: list[Horizon], camera: Camera) 
     shift_px = np.sqrt(sum(np.square(other(azimuth) - here) for other in shifted)) * px_per_rad
     run = 2 * np.pi / SKYLINE_POINTS * np.cos(here)
     steep = np.abs(np.roll(here, -1) - np.roll(here, 1)) / (2 * run)
-    good = (shift_px < MOST_SHIFT_PX) & (steep < STEEPEST)
+    good = (shift_px < MAX_SHIFT_PX) & (steep < MAX_SLOPE)
 
     def known(azimuth_rad: Array) -> Bools:
         return np.asarray(good[np.rint(azimuth_rad / (2 * np.pi) * SKYLINE_POINTS).astype(np.int64) % SKYLINE_POINTS])
@@ -215,7 +215,7 @@ def _grouped_median(light_e: NDArray[np.float32]) -> tuple[float, float]:
     below = np.cumsum(counts) - counts
     at = int(np.searchsorted(below, 0.5 * len(light_e), side="right")) - 1
     median = float(values[at]) + quantum * ((0.5 * len(light_e) - below[at]) / counts[at] - 0.5)
-    sigma = float(np.median(np.abs(light_e - median))) / MADE_OF_NOISE
+    sigma = float(np.median(np.abs(light_e - median))) / MEDIAN_ABS_NORMAL
     return median, sigma * MEDIAN_LOSS / float(np.sqrt(len(light_e)))
 
 
@@ -230,7 +230,7 @@ def _medians(values: Array, cell: Ints, cells: int) -> Array:
     count = np.bincount(cell, minlength=cells)
     middle = np.cumsum(count) - count + count // 2
     median = values[order][np.minimum(middle, len(values) - 1)]
-    return np.where(count >= FEWEST_PX, median, 0.0)
+    return np.where(count >= MIN_MEDIAN_PX, median, 0.0)
 
 
 def _interpolated(table: Array, azimuth_rad: Array, above_px: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Evidence of the stars: for every catalogue star in view, does it shine or is it hidden?"""
+"""Evidence of the stars: for every catalogue star in view, is it visible or hidden?"""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from startrack.frames import angle_between_rad, azel_from_rays
 from startrack.psf import noise_area_px
 from startrack.types import Array, Body, Bools, Detections, Evidence, Ints, Stars
 
-FAINTEST_SNR = 0.5  # fainter stars say next to nothing and would only cost time
-CROWDED = 2.0  # PSF areas per star: where more stars share the pixels, the same light would be counted twice
+MIN_SNR = 0.5  # fainter stars carry almost no information
+MIN_PSF_AREAS_PER_STAR = 2.0  # with more stars in the pixels the same light would be counted twice
 BODY_GLARE_PX = 8.0
 DISKS_RAD = {"Sun": 0.0047, "Moon": 0.0049, "Earth": 0.0180}  # largest radii, the Earth's seen from the Moon
-TELLING_SNR = 2.0  # stars brighter than this tell whether they shine
+DECIDABLE_SNR = 2.0  # of stars whose own flux shows whether they are visible
 NOISE_STEP_PX = 4  # the noise is smooth: every 16th pixel gives its median
 VIEW_MARGIN_RAD = 1e-6  # for rounding
 CAUSES = ("", "edge of the image circle", "beyond the calibrated angle", "off the frame", "bad pixels")
@@ -46,7 +46,7 @@ class StarPhotometry:
         return np.asarray(self.cause == "")
 
     def replace_stars(self, newer: StarPhotometry, which: Ints) -> StarPhotometry:
-        """With what a newer measurement says of the stars `which`, of those that both have."""
+        """Replace the rows of the stars `which` by the newer measurement, where both contain the star."""
         there = np.flatnonzero(np.isin(newer.star, which))
         here = np.searchsorted(self.star, newer.star[there])
         fresh = {}
@@ -71,8 +71,8 @@ class StarPhotometry:
 class StarEvidence:
     """Forced photometry at the catalogue's stars, turned into log-likelihood ratios."""
 
-    faintest_snr: float = FAINTEST_SNR
-    crowded: float = CROWDED
+    faintest_snr: float = MIN_SNR
+    crowded: float = MIN_PSF_AREAS_PER_STAR
     capped: bool = True  # False: plain Gaussian ratios, to see what the caps are worth
 
     def __call__(
@@ -100,23 +100,23 @@ class StarEvidence:
         rays_icrs = stars.rays_icrs[star]
         rays_cam = rays_icrs @ R_cam_icrs.T
         xy, inside = camera.project(rays_cam)
-        brightest = np.flatnonzero(inside)[: _room(camera, self.crowded * noise_area_px(sigma_px))]
+        brightest = np.flatnonzero(inside)[: _max_stars(camera, self.crowded * noise_area_px(sigma_px))]
         star, xy, rays_cam, rays_icrs = star[brightest], xy[brightest], rays_cam[brightest], rays_icrs[brightest]
         angle = np.arctan2(np.hypot(rays_cam[:, 0], rays_cam[:, 1]), rays_cam[:, 2])
         expected = scale.flux_e(stars.v_mag[star], angle, camera)
-        # Light is lost from a misplaced profile. The rays themselves owe nothing to the lens: they are the catalogue's.
+        # A misplaced profile loses light. The rays do not depend on the lens: they are the catalogue's.
         misplaced2 = place_sigma_px**2 + (
             np.square(camera.projection_sigma_px(rays_cam)) if camera.covariance_order else 0.0
         )
         blur = misplaced2 / (2 * sigma_px) ** 2
         fraction = np.sqrt(scale.scatter**2 + np.square(0.4 * np.log(10) * stars.v_sigma_mag[star]) + blur**2)
-        cause = _unusable(xy, angle, camera, bodies, R_cam_icrs, half_width(sigma_px))
+        cause = _causes(xy, angle, camera, bodies, R_cam_icrs, half_width(sigma_px))
         measurable = np.flatnonzero(cause != OFF_FRAME)
-        shining = (
-            visible[star[measurable]]
-            if visible is not None
-            else _guess(image_e, detections, dead, xy[measurable], expected[measurable], fraction[measurable])
-        )
+        if visible is None:
+            at = xy[measurable], expected[measurable], fraction[measurable]
+            shining = _guess_visibility(image_e, detections, dead, *at)
+        else:
+            shining = visible[star[measurable]]
         sources = Sources(
             xy_px=xy[measurable], flux_e=expected[measurable], fraction_sigma=fraction[measurable], visible=shining
         )
@@ -130,9 +130,9 @@ class StarEvidence:
             azimuth_rad=azimuth,
             elevation_rad=elevation,
             expected_e=expected,
-            flux_e=_spread(light.flux_e, measurable, len(star)),
-            sigma_e=_spread(sigma, measurable, len(star)),
-            llr=np.where(cause == USABLE, _spread(llr, measurable, len(star)), 0.0),
+            flux_e=_scatter_rows(light.flux_e, measurable, len(star)),
+            sigma_e=_scatter_rows(sigma, measurable, len(star)),
+            llr=np.where(cause == USABLE, _scatter_rows(llr, measurable, len(star)), 0.0),
             cause=np.array([*CAUSES, *(f"beside {body.name}" for body in bodies)])[cause],
         )
 
@@ -149,7 +149,7 @@ def stars_in_view(camera: Camera, stars: Stars, R_cam_icrs: Array, faintest_mag:
     return np.flatnonzero(near_axis & (stars.v_mag < faintest_mag))
 
 
-def _room(camera: Camera, area_px: float) -> int:
+def _max_stars(camera: Camera, area_px: float) -> int:
     """How many stars fit on the frame, each on an area [px^2] of its own. Stars are sorted, the brightest first."""
     rho = float(camera.lens.rho(np.array(camera.max_angle_rad)))
     circle = np.pi * camera.focal_px[0] * camera.focal_px[1] * rho**2
@@ -157,7 +157,7 @@ def _room(camera: Camera, area_px: float) -> int:
     return max(int(min(circle, width * height) / area_px), 1)
 
 
-def _guess(
+def _guess_visibility(
     image_e: NDArray[np.float32],
     detections: Detections,
     dead: NDArray[np.bool_],
@@ -165,13 +165,13 @@ def _guess(
     expected_e: Array,
     fraction: Array,
 ) -> Array:
-    """Probability (n,) that each star shines, before anything is known: the brighter ones tell by themselves.
+    """Probability (n,) that each star is visible, before a position is known: by their own flux for the brighter ones.
 
-    Needed for their light in their neighbours' measurements; of the faint ones nothing is known (one half).
+    It weights their light in their neighbours' measurements; one half for the faint ones.
     """
     shining = np.full(len(xy_px), 0.5)
     noise_e = detections.noise_e[tuple(np.rint(xy_px).astype(int).T[::-1])]
-    bright = np.flatnonzero(expected_e > TELLING_SNR * noise_e * np.sqrt(noise_area_px(detections.psf_sigma_px)))
+    bright = np.flatnonzero(expected_e > DECIDABLE_SNR * noise_e * np.sqrt(noise_area_px(detections.psf_sigma_px)))
     if len(bright):
         alone = np.zeros(len(bright))
         sources = Sources(
@@ -193,7 +193,7 @@ def _ratios(light: Photometry, expected_e: Array, fraction: Array, capped: bool 
     return ratio(light.flux_e, expected_e, sigma, np.sqrt(shining)), sigma
 
 
-def _unusable(
+def _causes(
     xy_px: Array, angle_rad: Array, camera: Camera, bodies: list[Body], R_cam_icrs: Array, margin: int
 ) -> NDArray[np.int8]:
     """Why stars (n) cannot be used: indices into CAUSES, followed by the bodies; USABLE where they can."""
@@ -215,7 +215,7 @@ def _unusable(
     return cause
 
 
-def _spread(values: Array, index: Ints, n: int) -> Array:
+def _scatter_rows(values: Array, index: Ints, n: int) -> Array:
     full = np.zeros(n)
     full[index] = values
     return full

@@ -2,7 +2,7 @@
 
 from startrack.rendering.compose import light_e, render, truth_of
 from startrack.rendering.defects import draw_hot_pixels
-from startrack.rendering.field_stars import draw_field_stars, draw_v_errors, joined
+from startrack.rendering.field_stars import concatenate_stars, draw_field_stars, draw_v_errors
 from startrack.rendering.scene import HotPixels, Scene, Truth
 from startrack.rendering.series import Series, load_sky_catalog, sky_turn_rad
 from startrack.rendering.sources import exposure_reaching
@@ -13,11 +13,11 @@ __all__ = [
     "Scene",
     "Series",
     "Truth",
+    "concatenate_stars",
     "draw_field_stars",
     "draw_hot_pixels",
     "draw_v_errors",
     "exposure_reaching",
-    "joined",
     "light_e",
     "load_sky_catalog",
     "render",

@@ -1,4 +1,4 @@
-"""The renderer's story: light falls on the sensor, the sensor adds its own, and is read out."""
+"""Rendering of a scene: light on the sensor, the sensor's own charge, and the readout."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from startrack.frames import off_axis_rad
 from startrack.rendering.defects import add_cosmic_rays, add_hot_pixels
-from startrack.rendering.field_stars import joined
+from startrack.rendering.field_stars import concatenate_stars
 from startrack.rendering.scene import Scene, Truth
 from startrack.rendering.sensor import ADC_MAX_ADU, read_out
 from startrack.rendering.sky import diffuse_e
@@ -45,7 +45,7 @@ def light_e(scene: Scene) -> Array:
 
 def truth_of(scene: Scene) -> Truth:
     """Where each star and body falls at mid-exposure, its stated flux, and whether the terrain hides it."""
-    sources = joined(scene.stars, _bodies_as_stars(scene))
+    sources = concatenate_stars(scene.stars, _bodies_as_stars(scene))
     rays_enu = sources.rays_icrs @ scene.R_enu_icrs.T
     rays_cam = rays_enu @ scene.R_cam_enu.T
     xy_px, inside = scene.camera.project(rays_cam)

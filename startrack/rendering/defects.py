@@ -1,4 +1,4 @@
-"""What is not light: hot pixels and the tracks of cosmic rays."""
+"""Charge that is not light: hot pixels and the tracks of cosmic rays."""
 
 from __future__ import annotations
 

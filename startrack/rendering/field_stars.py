@@ -1,4 +1,4 @@
-"""What the catalogue does not know: its own errors, and the stars that it lacks."""
+"""Random errors of the catalogue's magnitudes, and random stars that the catalogue lacks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ V_REF_MAG = 7.0
 N_REF = 15_600  # Hipparcos with the Bright Star Catalogue has 15,479 to V 7.0 and lacks about 1 % there
 # Against an independent list to V 7.5 Hipparcos lacks 0.3 % at V 6.0-6.5 and 1.1 % at 6.5-7.0.
 FIRST_LACKING_MAG = 6.5
-LEAST_LACKING = 0.01
+MIN_LACKING = 0.01
 BIN_MAG = 0.25
 CLUSTER_RAD = 0.07  # scatter of a field star about a catalogue star: 4 degrees
 
@@ -31,10 +31,10 @@ def draw_field_stars(stars: Stars, to_v_mag: float, *, rng: np.random.Generator)
     """
     edges = np.arange(FIRST_LACKING_MAG, to_v_mag + 1e-9, BIN_MAG)
     if len(edges) < 2:
-        return _field(np.empty((0, 3)), np.empty(0))
+        return _field_stars(np.empty((0, 3)), np.empty(0))
     expected = np.diff(N_REF * np.exp(GROWTH_PER_MAG * (edges - V_REF_MAG)))
     listed = np.histogram(stars.v_mag, edges)[0]
-    lacking = rng.poisson(np.maximum(expected - listed, LEAST_LACKING * listed))
+    lacking = rng.poisson(np.maximum(expected - listed, MIN_LACKING * listed))
     low = np.repeat(edges[:-1], lacking)
     # Inverse of the cumulative e^(GROWTH V) within a bin.
     steep = np.expm1(GROWTH_PER_MAG * BIN_MAG)
@@ -42,10 +42,10 @@ def draw_field_stars(stars: Stars, to_v_mag: float, *, rng: np.random.Generator)
     rays = rng.standard_normal((len(v_mag), 3))
     if len(stars):
         rays = stars.rays_icrs[rng.integers(len(stars), size=len(v_mag))] + CLUSTER_RAD * rays
-    return _field(rays / np.linalg.norm(rays, axis=1, keepdims=True), v_mag)
+    return _field_stars(rays / np.linalg.norm(rays, axis=1, keepdims=True), v_mag)
 
 
-def joined(first: Stars, second: Stars) -> Stars:
+def concatenate_stars(first: Stars, second: Stars) -> Stars:
     """The stars of both, in that order."""
     return Stars(
         catalog_id=np.concatenate([first.catalog_id, second.catalog_id]),
@@ -56,7 +56,7 @@ def joined(first: Stars, second: Stars) -> Stars:
     )
 
 
-def _field(rays_icrs: Array, v_mag: Array) -> Stars:
+def _field_stars(rays_icrs: Array, v_mag: Array) -> Stars:
     n = len(v_mag)
     ids = np.char.add("FIELD ", np.arange(1, n + 1).astype(str)) if n else np.empty(0, dtype="U9")
     return Stars(

@@ -1,4 +1,4 @@
-"""What is to be rendered, and what is then known to be true."""
+"""The scene to render, and the truth about the rendered exposure."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class HotPixels(Value):
 
 @dataclass(frozen=True, kw_only=True)
 class Scene(Value):
-    """Everything that decides an exposure, but for the photons' and the electronics' dice."""
+    """Everything that determines an exposure, except the noise of photons and electronics."""
 
     camera: Camera  # with a sensor
     terrain: Terrain | None  # None: nothing hides the stars

@@ -1,4 +1,4 @@
-"""From electrons to numbers: shot noise, read noise, gain, bias, saturation, whole numbers."""
+"""Readout of the sensor: shot noise, read noise, gain, bias, saturation, rounding."""
 
 from __future__ import annotations
 

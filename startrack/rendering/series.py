@@ -13,7 +13,7 @@ from startrack.camera import Camera
 from startrack.catalog.bodies import bodies
 from startrack.frames import R_body_enu_from_heading_pitch_roll, R_enu_icrs, Site, observer_velocity_m_s
 from startrack.rendering.defects import draw_hot_pixels
-from startrack.rendering.field_stars import draw_field_stars, draw_v_errors, joined
+from startrack.rendering.field_stars import concatenate_stars, draw_field_stars, draw_v_errors
 from startrack.rendering.scene import Scene
 from startrack.rendering.sources import exposure_reaching
 from startrack.terrain import Terrain
@@ -116,11 +116,11 @@ class Series:
         heading, direction = rng.uniform(0, 2 * np.pi, 2)
         tilt = self.max_tilt_rad * np.sqrt(rng.random())
         return (
-            _given(self.time_utc, time),
-            np.array([_given(self.east_m, place[0]), _given(self.north_m, place[1])]),
-            _given(self.heading_rad, heading),
-            _given(self.pitch_rad, tilt * np.cos(direction)),
-            _given(self.roll_rad, tilt * np.sin(direction)),
+            _drawn_unless_given(self.time_utc, time),
+            np.array([_drawn_unless_given(self.east_m, place[0]), _drawn_unless_given(self.north_m, place[1])]),
+            _drawn_unless_given(self.heading_rad, heading),
+            _drawn_unless_given(self.pitch_rad, tilt * np.cos(direction)),
+            _drawn_unless_given(self.roll_rad, tilt * np.sin(direction)),
         )
 
     def _sky(self, site: Site, time: datetime) -> tuple[Stars, Array]:
@@ -133,7 +133,7 @@ class Series:
         if self.faint_v_mag is None or self.catalog.is_deep:
             return stars, errors
         field = draw_field_stars(stars, self.faint_v_mag, rng=rng)
-        return joined(stars, field), np.concatenate([errors, np.zeros(len(field))])
+        return concatenate_stars(stars, field), np.concatenate([errors, np.zeros(len(field))])
 
 
 def load_sky_catalog(stars: str) -> StarCatalog:
@@ -170,5 +170,5 @@ def _random_place(terrain: Terrain, rng: np.random.Generator) -> Array:
     raise BadInput("bad_terrain", f"{terrain.name}: nowhere in its search area can the camera stand")
 
 
-def _given(value: T | None, drawn: T) -> T:
+def _drawn_unless_given(value: T | None, drawn: T) -> T:
     return drawn if value is None else value

@@ -81,6 +81,8 @@ class Series:
                 f"{self.terrain.name}: no camera can stand at {place_m[0]:.0f} m east, {place_m[1]:.0f} north",
             )
         site, exposure_s = self.terrain.site, self.exposure_used_s
+        if site is None:
+            raise BadInput("bad_terrain", f"terrain {self.terrain.name} has no site: its sky is not known")
         stars, v_error_mag = self._sky(site, time)
         height_m = float(self.terrain.ground_m(place_m[None])[0]) + self.terrain.camera_height_m
         sensor_rng = np.random.default_rng([self.seed, _SENSOR])

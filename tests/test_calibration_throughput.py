@@ -13,7 +13,7 @@ import pytest
 from startrack.calibration import KnownSensor, calibrate
 from startrack.calibration.photometry import measure_photometry
 from startrack.calibration.photon_transfer import fit_photon_transfer
-from startrack.calibration.throughput import airmass
+from startrack.calibration.throughput import StarFluxes, airmass, fit_throughput
 from startrack.calibration.verify import difference_px
 from startrack.camera import Camera, KannalaBrandt, Sensor
 from startrack.camera.uncertainty import cap_grid
@@ -125,3 +125,51 @@ def test_python_of_the_page_runs(capsys):
     for code in re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL):
         exec(compile(code, "docs/calibration.md", "exec"), names)
     assert re.fullmatch(r"0\.\d\d px, \d\d degrees\n", capsys.readouterr().out)
+
+
+def star_fluxes(
+    images: int = 3, stars: int = 200, extinction: float = 0.25, edge: float = 0.7, offset_mag: float = 0.0,
+    varied: bool = True, seed: int = 0,
+) -> StarFluxes:  # fmt: skip
+    """Fluxes through a lens that dims its edge, under air; without `varied` airmass is a function of the angle."""
+    rng = np.random.default_rng(seed)
+    n = images * stars
+    angle, b_v = np.radians(80) * np.sqrt(rng.random(n)), rng.normal(0.6, 0.4, n)
+    zenith = np.clip(angle + (rng.normal(0, 0.5, n) if varied else 0.0), 0, np.radians(78))
+    air = airmass(np.pi / 2 - zenith)
+    u = np.square(angle / np.radians(80))
+    image = np.repeat(np.arange(images), stars)
+    gain = 10.0 + 2.5 * np.log10(1 - (1 - edge) * u) - extinction * air + rng.normal(0, 0.08, n)
+    return StarFluxes(gain + offset_mag * (image == 1), np.full(n, 0.08), angle, b_v, air, image)
+
+
+def test_throughput_and_extinction_are_recovered_where_they_can_be_told_apart():
+    fit = fit_throughput(star_fluxes(), np.radians(80))
+    assert fit.throughput.extinction_mag == pytest.approx(0.25, abs=0.04)
+    assert 2.5 * np.log10(fit.throughput.zero_point_adu_per_s) == pytest.approx(10.0, abs=0.06)
+    v1, v2 = fit.throughput.vignetting
+    assert 1 + v1 * np.radians(80) ** 2 + v2 * np.radians(80) ** 4 == pytest.approx(0.7, abs=0.05)
+    assert fit.warnings == ()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_zenith_camera_gets_no_impossible_extinction_or_vignetting(seed):
+    fit = fit_throughput(star_fluxes(extinction=-0.3, edge=1.0, varied=False, seed=seed), np.radians(80))
+    if fit.throughput is not None:
+        assert fit.throughput.extinction_mag is None or fit.throughput.extinction_mag >= 0
+        v1, v2 = fit.throughput.vignetting
+        a2 = np.square(np.linspace(0, np.radians(80), 50))
+        assert np.all((1 + a2 * (v1 + a2 * v2) > 0.03) & (1 + a2 * (v1 + a2 * v2) < 1.15))
+    assert fit.warnings
+
+
+def test_a_lens_that_brightens_its_edge_is_not_believed():
+    fit = fit_throughput(star_fluxes(extinction=0.0, edge=2.5), np.radians(80))
+    assert fit.throughput is None
+    assert any("vignetting is not physical" in warning for warning in fit.warnings)
+
+
+def test_images_of_different_transparency_give_no_throughput():
+    fit = fit_throughput(star_fluxes(offset_mag=-0.8), np.radians(80))
+    assert fit.throughput is None
+    assert any("zero points of the images differ" in warning for warning in fit.warnings)

@@ -195,7 +195,7 @@ def calibrated(stars: int = 400, frames: int = 4, sigma_px: float = 0.1) -> tupl
     rough = replace(camera, focal_px=(640.0, 640.0), centre_px=(1023.5, 949.5), lens=KannalaBrandt())
     sky = [rays @ r for rays, r in zip(seen, R, strict=True)]
     start = Rotation.from_rotvec([0.01, -0.008, 0.012]).as_matrix() @ R
-    fit = fit_lens(rough, start, observations(xy, sky, sigma_px**2), plain=True)
+    fit = fit_lens(rough, start, observations(xy, sky, sigma_px**2), square=True)
     return fit.camera, tuple(candidate.name for candidate in fit.candidates)
 
 

@@ -34,16 +34,16 @@ from startrack.reproduction.simulator import (
     PERFECT,
     Mistakes,
     Sky,
+    change_steps_m,
     changes_m,
     crater,
     crater_edge,
     directions,
+    draw_places,
     gaps_m,
     mean_gap_m,
-    places,
     star_count,
-    stepped_m,
-    visible,
+    visible_stars,
 )
 
 SMALL = Size(
@@ -76,18 +76,18 @@ def test_star_counts_are_liebes():
 
 
 def test_stars_are_uniform_on_the_hemisphere_and_places_on_the_floor():
-    sky = Sky.drawn(3, 0, 8.0)
+    sky = Sky.draw(3, 0, 8.0)
     assert stats.kstest(np.sin(sky.elevation_rad), "uniform").pvalue > 0.01
     assert stats.kstest(sky.azimuth_rad / (2 * np.pi), "uniform").pvalue > 0.01
-    spots = places(3, 0, 0, 5000)
+    spots = draw_places(3, 0, 0, 5000)
     assert stats.kstest(np.sum(spots**2, axis=1) / 1e8, "uniform").pvalue > 0.01
     assert stats.kstest(np.arctan2(*spots.T) / (2 * np.pi) + 0.5, "uniform").pvalue > 0.01
 
 
 def test_smaller_runs_are_the_beginning_of_larger_ones():
-    small, large = Sky.drawn(0, 4, 5.0), Sky.drawn(0, 4, 7.0)
+    small, large = Sky.draw(0, 4, 5.0), Sky.draw(0, 4, 7.0)
     np.testing.assert_array_equal(small.elevation_rad, large.elevation_rad[: len(small)])
-    np.testing.assert_array_equal(places(0, 4, 10, 20), places(0, 4, 0, 500)[10:20])
+    np.testing.assert_array_equal(draw_places(0, 4, 10, 20), draw_places(0, 4, 0, 500)[10:20])
     whole = compute_chunk(Task(KUA, 0, 1, 0, 12))
     parts = [compute_chunk(Task(KUA, 0, 1, start, start + 6)) for start in (0, 6)]
     np.testing.assert_array_equal(whole["refined_m"], np.concatenate([part["refined_m"] for part in parts]))
@@ -97,24 +97,24 @@ def test_smaller_runs_are_the_beginning_of_larger_ones():
 def test_stars_in_sight_are_those_above_the_horizon_and_inside_the_drawn_edge():
     from matplotlib.path import Path as Polygon
 
-    from startrack.reproduction.drawing import fisheye
+    from startrack.reproduction.drawing import fisheye_points
 
-    sky, cylinder = Sky.drawn(0, 0), crater()
-    for place in places(0, 0, 0, 10):
-        seen = visible(sky.on_rim_plane(cylinder), place, cylinder.radius_m)
+    sky, cylinder = Sky.draw(0, 0), crater()
+    for place in draw_places(0, 0, 0, 10):
+        seen = visible_stars(sky.on_rim_plane(cylinder), place, cylinder.radius_m)
         horizon = cylinder.horizon_rad(np.tile(place, (len(sky), 1)), sky.azimuth_rad)
         np.testing.assert_array_equal(seen, sky.elevation_rad > horizon)
-        polygon = Polygon(fisheye(*crater_edge(cylinder, place)))
-        inside = polygon.contains_points(fisheye(sky.azimuth_rad, sky.elevation_rad))
+        polygon = Polygon(fisheye_points(*crater_edge(cylinder, place)))
+        inside = polygon.contains_points(fisheye_points(sky.azimuth_rad, sky.elevation_rad))
         assert np.sum(inside != seen) <= 2  # a polygon of 360 points is not quite the circle
 
 
 def test_lists_are_as_wrong_as_they_say():
     in_sight = np.repeat([True, False], 20_000)
-    listed = Mistakes(missed=0.1, false=0.02).listed(in_sight, 0, 0, 0)
+    listed = Mistakes(missed=0.1, false=0.02).draw_list(in_sight, 0, 0, 0)
     assert np.mean(~listed[in_sight]) == pytest.approx(0.1, abs=0.008)
     assert np.mean(listed[~in_sight]) == pytest.approx(0.02, abs=0.004)
-    sky = Sky.drawn(0, 0, 3.0)
+    sky = Sky.draw(0, 0, 3.0)
     llr = Mistakes(missed=0.1, false=0.02).evidence(sky, np.arange(len(sky)) < 5).llr
     assert llr[0] == pytest.approx(np.log(45)) and llr[-1] == pytest.approx(np.log(0.1 / 0.98))
 
@@ -135,9 +135,9 @@ def test_the_middle_of_a_cell_with_straight_walls(size):
 
 def test_the_localizers_give_what_the_table_is_made_of():
     task = Task(KUA, 0, 2, 0, 5)
-    chunk, sky, cylinder = compute_chunk(task), Sky.drawn(0, 2), crater()
-    for k, place in enumerate(places(0, 2, 0, 5)):
-        evidence = PERFECT.evidence(sky, visible(sky.on_rim_plane(cylinder), place, cylinder.radius_m))
+    chunk, sky, cylinder = compute_chunk(task), Sky.draw(0, 2), crater()
+    for k, place in enumerate(draw_places(0, 2, 0, 5)):
+        evidence = PERFECT.evidence(sky, visible_stars(sky.on_rim_plane(cylinder), place, cylinder.radius_m))
         hull, refined = Hull()(evidence, cylinder), PseudoGradient()(evidence, cylinder)
         np.testing.assert_allclose(hull.position_enu_m[:2], chunk["hull_m"][k], atol=1e-6)
         np.testing.assert_allclose(refined.position_enu_m[:2], chunk["refined_m"][k], atol=1e-6)
@@ -155,10 +155,10 @@ def test_table_3_1_is_within_the_bars(made):
 
 
 def test_ours_is_the_middle_of_the_exact_cell():
-    sky, cylinder = Sky.drawn(0, 1), crater()
+    sky, cylinder = Sky.draw(0, 1), crater()
     points, off = sky.on_rim_plane(cylinder), []
-    for place in places(0, 1, 0, 10):
-        evidence = PERFECT.evidence(sky, visible(points, place, cylinder.radius_m))
+    for place in draw_places(0, 1, 0, 10):
+        evidence = PERFECT.evidence(sky, visible_stars(points, place, cylinder.radius_m))
         fix = ExactPosterior()(evidence, cylinder)
         off.append(np.hypot(*(fix.position_enu_m[:2] - cell_centroid(points, place, cylinder.radius_m))))
     assert np.median(off) < 0.3
@@ -181,17 +181,17 @@ def test_the_published_trials_average_to_the_published_overall():
 
 
 def test_changes_along_the_traverse_are_where_the_view_changes():
-    sky, cylinder = Sky.drawn(0, 0, 4.0), crater()
+    sky, cylinder = Sky.draw(0, 0, 4.0), crater()
     points, changes = sky.on_rim_plane(cylinder), changes_m(sky, cylinder)
     ends = np.concatenate([[-9999.9], (changes[1:] + changes[:-1]) / 2, [9999.9]])
-    views = [visible(points, np.array([east, 0.0]), cylinder.radius_m) for east in ends]
+    views = [visible_stars(points, np.array([east, 0.0]), cylinder.radius_m) for east in ends]
     assert [int(np.sum(a != b)) for a, b in pairwise(views)] == [1] * len(changes)
 
 
 def test_distances_between_changes_are_the_thesis_s():
     found = []
     for number in range(20):
-        noticed = stepped_m(changes_m(Sky.drawn(0, number), crater()), crater())
+        noticed = change_steps_m(changes_m(Sky.draw(0, number), crater()), crater())
         found.append((mean_gap_m(noticed, crater()), gaps_m(noticed, crater()).max()))
     mean, largest = np.array(found).T
     assert abs(mean.mean() - published.MEAN_GAP_M) < 3 * mean.std() and mean.std() < 0.4

@@ -1,4 +1,4 @@
-"""The thesis's tables and figures, redone: `ARTEFACTS` by name, each made from a context."""
+"""The thesis's tables and figures reproduced: `ARTEFACTS` by name, each a function of a context."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A reproduced table or figure: what was computed, as values, and how it goes to files."""
+"""A reproduced table or figure, as values and as files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from startrack.reproduction.chunks import ChunkStore
 
 @dataclass(frozen=True)
 class Size:
-    """How much is computed. Places are per sky; smaller sizes are the first part of larger ones."""
+    """How much is computed: numbers of places per sky. Smaller sizes are the first part of larger ones."""
 
     name: str
     skies: int  # of table 3.1 and figures B.1 to B.10
@@ -29,7 +29,7 @@ class Size:
     traverses: int
 
     def with_ours(self, most: int) -> Size:
-        """The same with our method on at most so many places per starfield, ten times as many in figure 3.10."""
+        """This size with our method on at most so many places per starfield, ten times as many in figure 3.10."""
         per_sky = {name: min(getattr(self, name), most) for name in ("ours_per_sky", "bound_per_sky", "deep_per_sky")}
         return replace(self, **per_sky, ours_one_sky=min(self.ours_one_sky, 10 * most))
 
@@ -40,7 +40,7 @@ FULL = Size("full", 10, 10_000, 10_000, 1_000, 500, 100_000, 100_000, 10, 100, 1
 
 @dataclass(frozen=True)
 class Context:
-    """What every table and figure is made with."""
+    """The common inputs of all tables and figures."""
 
     size: Size
     seed: int
@@ -49,20 +49,20 @@ class Context:
 
 @dataclass(frozen=True)
 class Artefact:
-    """One table or figure of the thesis, redone."""
+    """One reproduced table or figure of the thesis."""
 
     name: str  # such as "fig3.7"
     title: str
     line: str  # the outcome in one line
-    text: str  # Markdown: the table, or what the figure shows and how it compares
+    text: str  # Markdown: the table, or the caption of the figure with the comparison
     columns: tuple[Column, ...] = ()
-    pictures: dict[str, Callable[[], bytes]] = field(default_factory=dict)  # file stem: PNG when asked for
+    pictures: dict[str, Callable[[], bytes]] = field(default_factory=dict)  # file stem to a function that draws the PNG
     values: dict[str, Any] = field(default_factory=dict)  # "thesis", "reproduced", "ours"
     timing_ms: dict[str, float] = field(default_factory=dict)  # per fix
 
 
 def write_artefact(artefact: Artefact, out: Path, *, plots: bool) -> list[Path]:
-    """Write NAME.md, NAME.ecsv and the pictures; their paths."""
+    """Write NAME.md, NAME.ecsv and, with `plots`, the pictures; their paths. Raises BadInput."""
     files: dict[str, bytes] = {}
     if artefact.columns:
         files[f"{artefact.name}.ecsv"] = ecsv_text(artefact.columns).encode()

@@ -21,7 +21,7 @@ from startrack.reproduction.methods import Chunk, Task, compute_chunk
 from startrack.runner import Died, Runner, RunStopped
 
 FOLDER = ".chunks"
-SOURCES = (  # what decides a chunk: other sources make other chunks
+SOURCES = (  # their content is part of a chunk's key
     "localization/*.py", "terrain/cylinder.py", "reproduction/simulator.py", "reproduction/methods.py",
     "reproduction/bound.py",
 )  # fmt: skip

@@ -10,17 +10,17 @@ import numpy as np
 from startrack.output.ecsv import Column
 from startrack.reproduction import published
 from startrack.reproduction.artefact import Artefact, Context
-from startrack.reproduction.drawing import PUBLISHED, STAR, mark, new_figure, png
+from startrack.reproduction.drawing import PUBLISHED, STAR, mark_published, new_figure, png_bytes
 from startrack.reproduction.simulator import (
     MAGNITUDE,
     STEP_M,
     Sky,
+    change_steps_m,
     changes_m,
     crater,
     gaps_m,
     mean_gap_m,
     star_count,
-    stepped_m,
 )
 from startrack.types import Array
 
@@ -65,7 +65,7 @@ def fig3_9(context: Context) -> Artefact:
 def fig3_8(context: Context) -> Artefact:
     """Distance between changes along one traverse."""
     cylinder = crater()
-    changes = stepped_m(changes_m(Sky.drawn(context.seed, 0), cylinder), cylinder)
+    changes = change_steps_m(changes_m(Sky.draw(context.seed, 0), cylinder), cylinder)
     gaps, middles = gaps_m(changes, cylinder), (changes[1:] + changes[:-1]) / 2
     inner, outer = (float(gaps[part].mean()) for part in (np.abs(middles) < 2000, np.abs(middles) > 8000))
     caption = (
@@ -94,8 +94,8 @@ def _gaps(context: Context, magnitude: float, aspect_ratio: float) -> Array:
     """Mean and largest distance between noticed changes, mean between all (skies, 3) [m]."""
     cylinder, rows = crater(aspect_ratio), []
     for sky in range(context.size.traverses):
-        every = changes_m(Sky.drawn(context.seed, sky, magnitude), cylinder)
-        noticed = stepped_m(every, cylinder)
+        every = changes_m(Sky.draw(context.seed, sky, magnitude), cylinder)
+        noticed = change_steps_m(every, cylinder)
         rows.append([mean_gap_m(noticed, cylinder), gaps_m(noticed, cylinder).max(), mean_gap_m(every, cylinder)])
     return np.array(rows)
 
@@ -135,7 +135,7 @@ def _draw_two(x: Array, curves: Array, axis: str, tops: tuple[float, float], log
         if k == 0:
             axes.plot(x, curves[..., 2].mean(axis=1), "--", color="0.5", linewidth=1, label="every change counted")
         value = (published.MEAN_GAP_M, published.MAX_GAP_M)[k]
-        mark(axes, 10.0 if log else 6.0, value, f"thesis: {value:g} m")
+        mark_published(axes, 10.0 if log else 6.0, value, f"thesis: {value:g} m")
         if log:
             axes.set_xscale("log")
             _mark_craters(axes, top)
@@ -144,7 +144,7 @@ def _draw_two(x: Array, curves: Array, axis: str, tops: tuple[float, float], log
         axes.set(xlim=(x[0], x[-1]), ylim=(0, top), xlabel=axis, ylabel="Distance (m)")
         axes.set_title(f"({'ab'[k]}) {word} distance between changes in the viewed starfield", fontsize=10)
         axes.legend(loc="upper center" if log else "upper right", frameon=False)
-    return png(figure, caption)
+    return png_bytes(figure, caption)
 
 
 def _mark_craters(axes: Any, top: float) -> None:
@@ -163,7 +163,7 @@ def _draw_traverse(middles_m: Array, gaps: Array, caption: str) -> bytes:
     axes.set_ylabel("Distance (m)")
     axes.set_title("Distances between appearing/disappearing stars during a crater traverse", fontsize=10)
     axes.legend(frameon=False)
-    return png(figure, caption)
+    return png_bytes(figure, caption)
 
 
 def fig_a2(context: Context) -> Artefact:
@@ -202,4 +202,4 @@ def _draw_ratios(diameters: tuple[Array, Array], ratios: tuple[Array, Array], ca
         axes.plot(x, y, color=STAR)
         axes.set(xlim=xlim, ylim=ylim, xlabel="Diameter (km)", ylabel="Aspect Ratio (X:1)")
         axes.set_title(title, fontsize=10)
-    return png(figure, caption)
+    return png_bytes(figure, caption)

@@ -1,4 +1,4 @@
-"""What the figures share: matplotlib without global state, captions, fisheye pictures and maps of errors."""
+"""Shared by the figures: matplotlib without global state, captions, fisheye pictures and maps of errors."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ COLOURS = 128  # of a PNG's palette: enough for these drawings, at a third of th
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure that belongs to nobody else (no pyplot)."""
+    """An empty figure, without pyplot's global state."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
 
 
-def png(figure: Figure, caption: str) -> bytes:
+def png_bytes(figure: Figure, caption: str) -> bytes:
     """The figure with its caption below, as a PNG with a palette; the same figure gives the same bytes."""
     from PIL import Image
 
@@ -44,13 +44,13 @@ def png(figure: Figure, caption: str) -> bytes:
     return packed.getvalue()
 
 
-def fisheye(azimuth_rad: Array, elevation_rad: Array) -> Array:
+def fisheye_points(azimuth_rad: Array, elevation_rad: Array) -> Array:
     """Points (n, 2) of the picture: zenith distance in degrees times the horizontal direction, east to the right."""
     return np.degrees(np.pi / 2 - elevation_rad)[:, None] * directions(azimuth_rad)
 
 
 def fisheye_axes(axes: Axes) -> None:
-    """Equal scales, the horizon as a circle, and no numbers: as the thesis shows its starfields."""
+    """Equal scales, the horizon as a circle, and no tick labels, as in the thesis."""
     ring = 90.0 * directions(np.linspace(0.0, 2 * np.pi, 361))
     axes.plot(*ring.T, color="0.6", linewidth=0.7)
     axes.set(aspect="equal", xlim=(-93, 93), ylim=(-93, 93), xticks=[], yticks=[])
@@ -69,7 +69,7 @@ def error_map(places_m: Array, errors_m: Array, title: str, caption: str) -> byt
     points = axes.scatter(east, north, s=area, c=errors_m[order], cmap="turbo", linewidths=0)
     _floor(axes, title)
     figure.colorbar(points, ax=axes, label="position error (m)", shrink=0.85)
-    return png(figure, caption)
+    return png_bytes(figure, caption)
 
 
 def _floor(axes: Axes, title: str) -> None:
@@ -82,6 +82,6 @@ def _floor(axes: Axes, title: str) -> None:
     axes.set_title(title, fontsize=10)
 
 
-def mark(axes: Any, x: float, y: float, text: str) -> None:
-    """A value of the thesis, as a red diamond with its text."""
+def mark_published(axes: Any, x: float, y: float, text: str) -> None:
+    """Draw a value of the thesis as a red diamond with a legend entry."""
     axes.plot([x], [y], "D", color=PUBLISHED, markersize=6, label=text, zorder=5)

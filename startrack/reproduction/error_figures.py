@@ -11,7 +11,7 @@ import numpy as np
 from startrack.output.ecsv import Column
 from startrack.reproduction import published
 from startrack.reproduction.artefact import Artefact, Context, markdown_table
-from startrack.reproduction.drawing import STAR, error_map, new_figure, png
+from startrack.reproduction.drawing import STAR, error_map, new_figure, png_bytes
 from startrack.reproduction.methods import BOUND, KUA, OURS, tasks_of
 from startrack.reproduction.simulator import MAGNITUDE, star_count
 from startrack.reproduction.statistics import MethodErrors, collect_errors, format_errors, statistics
@@ -233,4 +233,4 @@ def _draw_sweep(x: tuple[float, ...], means: np.ndarray, label: str, caption: st
     axes.set(xlabel=label, ylabel="mean position error (m)")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
-    return png(figure, caption)
+    return png_bytes(figure, caption)

@@ -1,4 +1,4 @@
-"""One chunk of fixes: the same sky and places for every method, computed anywhere and in any order."""
+"""The methods on one chunk of places. Sky and places depend on the seed only, not on the method or the order."""
 
 from __future__ import annotations
 
@@ -11,18 +11,27 @@ from startrack.localization import ExactPosterior
 from startrack.localization.convex_hull import hull_position
 from startrack.localization.pseudo_gradient import PseudoGradient, descend
 from startrack.reproduction.bound import cell_centroid
-from startrack.reproduction.simulator import ASPECT_RATIO, MAGNITUDE, PERFECT, Mistakes, Sky, crater, places, visible
+from startrack.reproduction.simulator import (
+    ASPECT_RATIO,
+    MAGNITUDE,
+    PERFECT,
+    Mistakes,
+    Sky,
+    crater,
+    draw_places,
+    visible_stars,
+)
 from startrack.terrain import Cylinder
 from startrack.types import Array, Bools, Evidence, Fix, NotLocated
 
-KUA, OURS, BOUND = "kua", "ours", "bound"  # the methods: the thesis's two steps; ours; the limit for a perfect list
-CHUNK = {KUA: 1000, OURS: 100, BOUND: 200}  # fixes: a second or so of work
-Chunk = dict[str, np.ndarray]  # what one task gives
+KUA, OURS, BOUND = "kua", "ours", "bound"  # the thesis's two steps; ours; the limit for a perfect list
+FIXES_PER_CHUNK = {KUA: 1000, OURS: 100, BOUND: 200}  # about a second of work
+Chunk = dict[str, np.ndarray]  # the result of one task, by name
 
 
 @dataclass(frozen=True)
 class Task:
-    """Places number start to stop - 1 of one sky, by one method."""
+    """Places number start to stop - 1 of one sky, to be solved by one method."""
 
     method: str
     seed: int
@@ -42,7 +51,7 @@ def tasks_of(
     mistakes: Mistakes = PERFECT,
 ) -> list[Task]:  # fmt: skip
     """The first `count` places of a sky, in chunks."""
-    step = CHUNK[method]
+    step = FIXES_PER_CHUNK[method]
     starts = range(0, count, step)
     return [
         Task(method, seed, sky, start, min(start + step, count), magnitude, aspect_ratio, mistakes) for start in starts
@@ -56,10 +65,10 @@ def compute_chunk(task: Task) -> Chunk:
     kua: `hull_m`, `refined_m` (n, 2), `settled` (n,). ours: `located` (n,); of the located ones `fix_m` (m, 2),
     `nees` (m,), the squared error over the stated covariance, and `ambiguous` (m,). cell: `centroid_m` (n, 2).
     """
-    sky, cylinder = Sky.drawn(task.seed, task.sky, task.magnitude), crater(task.aspect_ratio)
+    sky, cylinder = Sky.draw(task.seed, task.sky, task.magnitude), crater(task.aspect_ratio)
     points = sky.on_rim_plane(cylinder)
-    truth = places(task.seed, task.sky, task.start, task.stop)
-    seen = [visible(points, place, cylinder.radius_m) for place in truth]
+    truth = draw_places(task.seed, task.sky, task.start, task.stop)
+    seen = [visible_stars(points, place, cylinder.radius_m) for place in truth]
     if task.method == KUA:
         own = _kua(points, seen, cylinder.wall_m, cylinder.radius_m)
     elif task.method == BOUND:
@@ -87,14 +96,14 @@ def _kua(points: Array, seen: list[Bools], wall_m: float, radius_m: float) -> Ch
 
 
 def _ours(task: Task, sky: Sky, seen: list[Bools], truth: Array) -> Chunk:
-    # No boulders here that are not on the map, so a sector of the horizon needs no cap on what it may claim.
+    # The simulator has no boulders that the map lacks, so the evidence of a sector needs no cap.
     localizer = ExactPosterior(sector_epsilon=0.0)
     cylinder = crater(task.aspect_ratio)
     evidence = [
-        task.mistakes.evidence(sky, task.mistakes.listed(one, task.seed, task.sky, task.start + k))
+        task.mistakes.evidence(sky, task.mistakes.draw_list(one, task.seed, task.sky, task.start + k))
         for k, one in enumerate(seen)
     ]
-    _fix_or_none(localizer, evidence[0], cylinder)  # whatever has to be compiled or loaded is, before the clock starts
+    _fix_or_none(localizer, evidence[0], cylinder)  # compiles and loads before the clock starts
     start = time.thread_time()
     fixes = [_fix_or_none(localizer, one, cylinder) for one in evidence]
     seconds = time.thread_time() - start
@@ -112,4 +121,4 @@ def _fix_or_none(localizer: ExactPosterior, evidence: Evidence, cylinder: Cylind
     try:
         return localizer(evidence, cylinder)
     except NotLocated:
-        return None  # counted as such: `located` says so
+        return None  # `located` is False then

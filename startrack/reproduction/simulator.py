@@ -1,7 +1,7 @@
-"""The thesis's crater environment simulator: random starfields, a cylinder, and the list of stars seen from a place.
+"""The thesis's crater environment simulator: random starfields, a cylinder, and the list of stars visible from a place.
 
-Source: Kua 2008, sections 3.2.1 and 3.2.2. No pixels: stars are told apart and found without error, unless mistakes are
-asked for. Everything drawn is fixed by (seed, sky, number of the place), whatever else is computed beside it.
+Source: Kua 2008, sections 3.2.1 and 3.2.2. No pixels: stars are identified and detected without error, except for
+`Mistakes`. All random draws depend on (seed, sky, number of the place) only.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Sky:
     elevation_rad: Array
 
     @classmethod
-    def drawn(cls, seed: int, sky: int, magnitude: float = MAGNITUDE) -> Sky:
+    def draw(cls, seed: int, sky: int, magnitude: float = MAGNITUDE) -> Sky:
         """phi = 2 pi r1, theta = arcsin r2, r1 and r2 uniform over [0, 1]: eq. 3.9 and 3.10."""
         r1, r2 = _random([seed, STARS, sky], (star_count(magnitude), 2)).T
         return cls(2 * np.pi * r1, np.arcsin(r2))
@@ -69,13 +69,13 @@ def directions(azimuth_rad: Array) -> Array:
     return np.stack([np.sin(azimuth_rad), np.cos(azimuth_rad)], axis=-1)
 
 
-def places(seed: int, sky: int, start: int, stop: int, radius_m: float = DIAMETER_M / 2) -> Array:
+def draw_places(seed: int, sky: int, start: int, stop: int, radius_m: float = DIAMETER_M / 2) -> Array:
     """Places number start to stop - 1 (n, 2) [m] of a sky, uniform over the crater's floor."""
     r1, r2 = _random([seed, PLACES, sky], (stop, 2))[start:].T
     return radius_m * np.sqrt(r1)[:, None] * directions(2 * np.pi * r2)
 
 
-def visible(points_m: Array, place_m: Array, radius_m: float) -> Bools:
+def visible_stars(points_m: Array, place_m: Array, radius_m: float) -> Bools:
     """Which stars (n,), given on the rim's plane, are in sight from a place (2,).
 
     The thesis tests against a polygon of 360 points of the rim; it differs from the circle by 0.4 m at most.
@@ -91,13 +91,13 @@ def crater_edge(cylinder: Cylinder, place_m: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Mistakes:
-    """How often a list of stars is wrong, which is also what the evidence takes for granted."""
+    """The error rates of a list of stars, which the evidence assumes too."""
 
-    missed: float = 1e-6  # of the stars in sight; a list of the thesis has no mistakes, and 1e-6 none that would show
-    false: float = 1e-6  # of the hidden ones
+    missed: float = 1e-6  # probability for a visible star; 1e-6: none, as in the thesis
+    false: float = 1e-6  # for a hidden star
 
-    def listed(self, in_sight: Bools, seed: int, sky: int, number: int) -> Bools:
-        """The stars (n,) that are on the list of place `number`."""
+    def draw_list(self, in_sight: Bools, seed: int, sky: int, number: int) -> Bools:
+        """Draw the list of place `number`: which stars (n,) are on it."""
         r = _random([seed, MISTAKES, sky, number], (len(in_sight),))
         return np.where(in_sight, r >= self.missed, r < self.false)
 
@@ -130,7 +130,7 @@ def changes_m(sky: Sky, cylinder: Cylinder) -> Array:
 
 
 def gaps_m(changes: Array, cylinder: Cylinder) -> Array:
-    """Distances (n - 1,) [m] travelled from one change to the next; the whole diameter where there are not two."""
+    """Distances (n - 1,) [m] from one change to the next; the diameter if there are fewer than two changes."""
     return np.diff(changes) if len(changes) > 1 else np.array([cylinder.diameter_m])
 
 
@@ -139,8 +139,8 @@ def mean_gap_m(changes: Array, cylinder: Cylinder) -> float:
     return cylinder.diameter_m / max(len(changes), 1)
 
 
-def stepped_m(changes: Array, cylinder: Cylinder, step_m: float = STEP_M) -> Array:
-    """Ends (n,) [m] of those steps along the traverse within which the view changes: all that a stepping rover notices.
+def change_steps_m(changes: Array, cylinder: Cylinder, step_m: float = STEP_M) -> Array:
+    """Ends (n,) [m] of the steps along the traverse within which the view changes.
 
     Several changes within one step count as one. Source: Kua 2008, figures 3.7-3.9, whose step is not given: 5 m is
     what its figures at magnitude 6 are multiples of (215 m), and what gives its mean (20 km / 1342).

@@ -1,4 +1,4 @@
-"""Figures 3.3, 3.5, 3.6 and A.1: what the starfield looks like, whole, seen from the crater, and compared."""
+"""Figures 3.3, 3.5, 3.6 and A.1: the starfield, whole, seen from the crater, and compared."""
 
 from __future__ import annotations
 
@@ -8,20 +8,29 @@ from typing import Any
 import numpy as np
 
 from startrack.reproduction.artefact import Artefact, Context
-from startrack.reproduction.drawing import CENTRE, EDGE, OTHER_STAR, STAR, fisheye, fisheye_axes, new_figure, png
-from startrack.reproduction.simulator import Sky, crater, crater_edge, directions, star_count, visible
+from startrack.reproduction.drawing import (
+    CENTRE,
+    EDGE,
+    OTHER_STAR,
+    STAR,
+    fisheye_axes,
+    fisheye_points,
+    new_figure,
+    png_bytes,
+)
+from startrack.reproduction.simulator import Sky, crater, crater_edge, directions, star_count, visible_stars
 from startrack.types import Array
 
 ALONG_KM = (-9.0, -6.0, -3.0, 0.0, 3.0, 6.0, 9.0, 9.9)  # places of figure 3.3
 EXAMPLE_M = np.array([5000.0, 2000.0])  # of figure 3.6, and the true place of figure 3.5
-ESTIMATE_M = np.array([-3000.0, -1500.0])  # of figure 3.5: far off, so that the vector can be seen
+ESTIMATE_M = np.array([-3000.0, -1500.0])  # of figure 3.5: far from the true position, so that the vector is visible
 
 
 def fig3_3(context: Context) -> Artefact:
     """Viewed starfields along the centreline."""
-    sky = Sky.drawn(context.seed, 0)
+    sky = Sky.draw(context.seed, 0)
     points = sky.on_rim_plane(crater())
-    counts = [int(visible(points, np.array([1e3 * east, 0.0]), crater().radius_m).sum()) for east in ALONG_KM]
+    counts = [int(visible_stars(points, np.array([1e3 * east, 0.0]), crater().radius_m).sum()) for east in ALONG_KM]
     caption = (
         "Figure 3.3: Viewed starfields at different positions along the centerline of the crater. The green line "
         "indicates the position of the edge. Fisheye picture (equidistant, the outer circle is the horizontal), east "
@@ -36,9 +45,9 @@ def fig3_3(context: Context) -> Artefact:
 
 def fig3_5(context: Context) -> Artefact:
     """One step of the pseudo-gradient."""
-    sky = Sky.drawn(context.seed, 0)
+    sky = Sky.draw(context.seed, 0)
     points, radius = sky.on_rim_plane(crater()), crater().radius_m
-    views = [visible(points, place, radius) for place in (ESTIMATE_M, EXAMPLE_M)]
+    views = [visible_stars(points, place, radius) for place in (ESTIMATE_M, EXAMPLE_M)]
     centres = np.stack([points[view].mean(axis=0) for view in views])
     step, wanted = centres[0] - centres[1], EXAMPLE_M - ESTIMATE_M
     turn = np.degrees(np.arctan2(wanted[0] * step[1] - wanted[1] * step[0], wanted @ step))
@@ -57,9 +66,9 @@ def fig3_5(context: Context) -> Artefact:
 
 
 def fig3_6(context: Context) -> Artefact:
-    """How the viewed starfield is found."""
-    sky = Sky.drawn(context.seed, 0)
-    in_sight = int(visible(sky.on_rim_plane(crater()), EXAMPLE_M, crater().radius_m).sum())
+    """The visible part of the starfield."""
+    sky = Sky.draw(context.seed, 0)
+    in_sight = int(visible_stars(sky.on_rim_plane(crater()), EXAMPLE_M, crater().radius_m).sum())
     caption = (
         "Figure 3.6: Example showing viewed starfield computation. The green line is the crater edge projected onto "
         f"the entire starfield. Stars within the crater edge are the viewed stars: {in_sight} of {len(sky)}."
@@ -72,7 +81,7 @@ def fig3_6(context: Context) -> Artefact:
 
 def fig_a1(context: Context) -> Artefact:
     """The whole starfield."""
-    sky = Sky.drawn(context.seed, 0)
+    sky = Sky.draw(context.seed, 0)
     caption = (
         "Figure A.1: Simulation generated starfield for a magnitude 6 detection limit: (a) projected on the unit "
         f"hemisphere, (b) fisheye projection. {star_count(6.0)} stars (thesis: 2142)."
@@ -97,16 +106,16 @@ def _picture(name: str, title: str, caption: str, line: str, draw: Any, values: 
 
 def _draw_line(sky: Sky, caption: str) -> bytes:
     figure = new_figure(10.0, 5.9)
-    cylinder, stars = crater(), fisheye(sky.azimuth_rad, sky.elevation_rad)
+    cylinder, stars = crater(), fisheye_points(sky.azimuth_rad, sky.elevation_rad)
     points = sky.on_rim_plane(cylinder)
     for axes, east in zip(figure.subplots(2, 4).ravel(), ALONG_KM, strict=True):
         place = np.array([1e3 * east, 0.0])
-        seen = visible(points, place, cylinder.radius_m)
+        seen = visible_stars(points, place, cylinder.radius_m)
         axes.plot(*stars[seen].T, ".", color=STAR, markersize=1.6)
-        axes.plot(*fisheye(*crater_edge(cylinder, place)).T, color=EDGE, linewidth=1.0)
+        axes.plot(*fisheye_points(*crater_edge(cylinder, place)).T, color=EDGE, linewidth=1.0)
         fisheye_axes(axes)
         axes.set_title(f"{east:g} km: {int(seen.sum())} stars", fontsize=9)
-    return png(figure, caption)
+    return png_bytes(figure, caption)
 
 
 def _draw_step(points_m: Array, views: list[Any], centres_m: Array, caption: str) -> bytes:
@@ -128,20 +137,20 @@ def _draw_step(points_m: Array, views: list[Any], centres_m: Array, caption: str
         axes.set(aspect="equal", xlim=(-16, 16), ylim=(-14, 14), xlabel="east (km)")
         axes.set_title(title, fontsize=10)
     figure.axes[0].set_ylabel("north (km)")
-    return png(figure, caption)
+    return png_bytes(figure, caption)
 
 
 def _draw_view(sky: Sky, caption: str) -> bytes:
     figure = new_figure(6.4, 6.8)
     axes, cylinder = figure.subplots(), crater()
-    stars = fisheye(sky.azimuth_rad, sky.elevation_rad)
-    seen = visible(sky.on_rim_plane(cylinder), EXAMPLE_M, cylinder.radius_m)
+    stars = fisheye_points(sky.azimuth_rad, sky.elevation_rad)
+    seen = visible_stars(sky.on_rim_plane(cylinder), EXAMPLE_M, cylinder.radius_m)
     axes.plot(*stars[~seen].T, ".", color=OTHER_STAR, markersize=3)
     axes.plot(*stars[seen].T, ".", color=STAR, markersize=3)
-    axes.plot(*fisheye(*crater_edge(cylinder, EXAMPLE_M)).T, color=EDGE, linewidth=1.5)
+    axes.plot(*fisheye_points(*crater_edge(cylinder, EXAMPLE_M)).T, color=EDGE, linewidth=1.5)
     fisheye_axes(axes)
     axes.set_title(f"{EXAMPLE_M[0] / 1e3:.0f} km east, {EXAMPLE_M[1] / 1e3:.0f} km north of the centre", fontsize=10)
-    return png(figure, caption)
+    return png_bytes(figure, caption)
 
 
 def _draw_sky(sky: Sky, caption: str) -> bytes:
@@ -153,7 +162,7 @@ def _draw_sky(sky: Sky, caption: str) -> bytes:
     up.set(xlabel="east", ylabel="north", zlabel="up", zlim=(0, 1), box_aspect=(2, 2, 1))
     up.set_title("(a) Starfield projected on the unit hemisphere", fontsize=10)
     flat = figure.add_subplot(2, 1, 2)
-    flat.plot(*fisheye(sky.azimuth_rad, sky.elevation_rad).T, ".", color=STAR, markersize=2)
+    flat.plot(*fisheye_points(sky.azimuth_rad, sky.elevation_rad).T, ".", color=STAR, markersize=2)
     fisheye_axes(flat)
     flat.set_title("(b) Fisheye projection of the starfield", fontsize=10)
-    return png(figure, caption)
+    return png_bytes(figure, caption)

@@ -1,4 +1,4 @@
-"""Errors of one method, sky by sky, from the chunks."""
+"""Errors of one method by sky, collected from the chunks."""
 
 from __future__ import annotations
 

@@ -54,11 +54,11 @@ def _tasks(
 
 
 def _over_limit(ours: MethodErrors, limit: MethodErrors) -> float:
-    """Mean error of ours over the limit's, on the places that both were computed for."""
+    """Mean error of our method over that of the limit, on the places computed for both."""
     pairs = [
         (fix[: len(best)], best[: len(fix)])
         for fix, best, located in zip(ours.errors_m, limit.errors_m, ours.answered, strict=True)
-        if located.all()  # else the places do not pair up
+        if located.all()  # otherwise the places of both differ
     ]
     return float(np.concatenate([fix for fix, _ in pairs]).mean() / np.concatenate([best for _, best in pairs]).mean())
 

@@ -46,7 +46,7 @@ def cell_centroid(points_m: Array, position_m: Array, radius_m: float) -> Array:
 def _cell_mask(
     points_m: Array, seen: Bools, low_m: Array, high_m: Array, radius_m: float
 ) -> tuple[Bools, Array, Array]:
-    """The grid points (rows north, columns east) from which exactly the listed stars are visible; x and y of the grid."""
+    """Grid points (rows north, columns east) from which exactly the listed stars are visible; x and y of the grid."""
     x = np.linspace(low_m[0], high_m[0], GRID_POINTS)
     y = np.linspace(low_m[1], high_m[1], GRID_POINTS)
     middle, half_diagonal_m = (low_m + high_m) / 2, float(np.hypot(*(high_m - low_m))) / 2

@@ -1,9 +1,9 @@
-"""A night of images: throughput on one and on all cores, memory, three kills and a lost worker of a cluster.
+"""A large batch: throughput on one and on all cores, memory, resumption after three kills, a lost Dask worker.
 
     python benchmarks/batch.py [--frames 1000] [--single 150] [--folder FOLDER]
 
-Frames of 1024 x 1024 pixels, rendered once into the folder (a temporary one unless named). Each run is the command
-`startrack batch` as a user starts it; memory is the sum over its processes, shared pages counted once for each.
+Frames of 1024 x 1024 pixels are rendered into the folder, once. Each run is the command `startrack batch`; memory is
+the sum over its processes, shared pages in proportion.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ TABLES = ("results.ecsv", "trajectory.tum", "manifest.json")
 
 @dataclass
 class Run:
-    """What one run of the command took."""
+    """Time, memory and exit code of one run of the command."""
 
     seconds: float
     peak_bytes: int
@@ -46,8 +46,8 @@ def main() -> None:
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         folder = args.folder or Path(scratch)
-        images = rendered(folder, args.frames)
-        rows, notes = measured(folder, images, args.single)
+        images = render_frames(folder, args.frames)
+        rows, notes = measure_runs(folder, images, args.single)
     body = table(["run", "frames", "seconds", "frames a second", "peak memory, GB"], rows) + "\n\n" + "\n".join(notes)
     print(body)
     if args.no_write:
@@ -56,11 +56,11 @@ def main() -> None:
     write_section("A night of images", command, ("numpy", "opencv-contrib-python-headless", "numba", "dask"), body)
 
 
-def measured(folder: Path, images: list[Path], single: int) -> tuple[list[list[str]], list[str]]:
-    """All runs; rows of the table and what was compared."""
+def measure_runs(folder: Path, images: list[Path], single: int) -> tuple[list[list[str]], list[str]]:
+    """All runs; rows of the table, and notes of the comparisons."""
     cores = len(os.sched_getaffinity(0))
     first = images[:single]
-    run(folder, first[:2], folder / "warm", 1)  # compiles what is compiled, once
+    run(folder, first[:2], folder / "warm", 1)  # compiles the kernels
     one = run(folder, first, folder / "one", 1)
     both = run(folder, first, folder / "both", cores)
     whole = run(folder, images, folder / "whole", cores)
@@ -75,14 +75,14 @@ def measured(folder: Path, images: list[Path], single: int) -> tuple[list[list[s
     notes = [
         f"Located: {solved} of {len(images)}.",
         f"Throughput of {cores} cores: {one.seconds / both.seconds:.2f} times that of one.",
-        f"Killed (-9) three times and taken up again: {same(folder / 'whole', folder / 'killed')}.",
-        f"Dask, worker {lost} killed: {same(folder / 'both', folder / 'cluster')} as by the local run.",
+        f"Killed (-9) three times and taken up again: {compare_tables(folder / 'whole', folder / 'killed')}.",
+        f"Dask, worker {lost} killed: {compare_tables(folder / 'both', folder / 'cluster')} as by the local run.",
     ]
     return rows, notes
 
 
-def rendered(folder: Path, count: int) -> list[Path]:
-    """The frames, those that are there already not made again."""
+def render_frames(folder: Path, count: int) -> list[Path]:
+    """Render the frames that are not there yet; the paths of all."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     paths = [folder / "images" / f"{k // 100:02d}" / f"frame-{k:04d}.png" for k in range(count)]
     todo = [(path, k) for k, path in enumerate(paths) if not path.with_suffix(".json").exists()]
@@ -120,7 +120,7 @@ def render_one(path: Path, number: int) -> None:
 
 
 def start(folder: Path, images: list[Path], out: Path, *flags: str) -> subprocess.Popen[str]:
-    """The command, begun."""
+    """Start the command."""
     command = [sys.executable, "-m", "startrack.cli.main", "batch", str(folder / "images"), "-D", str(out), *flags]
     process = subprocess.Popen([*command, "--no-plots", "--files-on-stdin", "-q"], stdin=subprocess.PIPE, text=True)
     assert process.stdin is not None
@@ -130,16 +130,16 @@ def start(folder: Path, images: list[Path], out: Path, *flags: str) -> subproces
 
 
 def run(folder: Path, images: list[Path], out: Path, jobs: int) -> Run:
-    """The command to its end."""
-    return watched(start(folder, images, out, "-j", str(jobs)))
+    """Run the command to its end."""
+    return watch(start(folder, images, out, "-j", str(jobs)))
 
 
-def watched(
+def watch(
     process: subprocess.Popen[str], most_s: float = np.inf, top: int | None = None, each: Callable[[], None] = int
 ) -> Run:
     """Its time, and the peak memory of the processes below `top` (itself); killed with -9 after `most_s`.
 
-    `each` is called again and again meanwhile.
+    `each` is called at every poll.
     """
     begin, peak = time.perf_counter(), 0
     while process.poll() is None:
@@ -152,16 +152,16 @@ def watched(
 
 
 def run_with_kills(folder: Path, images: list[Path], out: Path, jobs: int, usual_s: float) -> Run:
-    """The command, killed at three random times and begun again."""
+    """Run the command, killed at three random times and resumed."""
     rng, runs = np.random.default_rng(9), []
     for _ in range(3):
-        runs.append(watched(start(folder, images, out, "-j", str(jobs)), float(rng.uniform(0.1, 0.3) * usual_s)))
+        runs.append(watch(start(folder, images, out, "-j", str(jobs)), float(rng.uniform(0.1, 0.3) * usual_s)))
     runs.append(run(folder, images, out, jobs))
     return Run(sum(r.seconds for r in runs), max(r.peak_bytes for r in runs), runs[-1].code)
 
 
 def run_on_cluster(folder: Path, images: list[Path], out: Path, workers: int) -> tuple[Run, int]:
-    """The command on a scheduler with worker processes of its own, one of which is killed on the way."""
+    """Run the command on a Dask scheduler, one of whose workers is killed meanwhile."""
     from distributed import LocalCluster
 
     killed: list[int] = []
@@ -173,7 +173,7 @@ def run_on_cluster(folder: Path, images: list[Path], out: Path, workers: int) ->
                 os.kill(killed[0], signal.SIGKILL)
 
         process = start(folder, images, out, "--cluster", cluster.scheduler_address)
-        return watched(process, top=os.getpid(), each=kill_one), killed[0]
+        return watch(process, top=os.getpid(), each=kill_one), killed[0]
 
 
 def family(pid: int) -> list[int]:
@@ -196,7 +196,7 @@ def resident_bytes(pid: int) -> int:
     return sum(1024 * int(line.split()[1]) for line in lines if line.startswith("Pss:"))
 
 
-def same(one: Path, other: Path) -> str:
+def compare_tables(one: Path, other: Path) -> str:
     """Whether two runs gave the same tables, byte for byte."""
     differ = [name for name in TABLES if (one / name).read_bytes() != (other / name).read_bytes()]
     return f"differ in {', '.join(differ)}" if differ else f"the same bytes in {', '.join(TABLES)}"

@@ -56,7 +56,6 @@ def locate(
     run = Run(Inputs(exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name))
     try:
         check_inputs(run.reached)
-        announce_compilation()
         detected = run.step("detect", detect_sources, run.reached, camera, settings.detector)
         identified = run.step("identify", identify_stars, detected, camera, catalog, settings.identifier, terrain.site)
         oriented = run.step("attitude", solve_orientation, identified)
@@ -158,6 +157,7 @@ def detect_sources(inputs: Inputs, camera: Camera | None, detector: Detector) ->
 
     `detector` finds them in the exposure of `inputs`; with a `camera` its levels turn counts into electrons.
     """
+    announce_compilation()
     stated = camera is not None and camera.sensor is not None
     if stated and inputs.exposure.saturation_adu is None and are_fractions(inputs.exposure.pixels_adu):
         raise BadInput(

@@ -20,6 +20,11 @@ class Located:
 
 
 @pytest.fixture(scope="session")
+def compiled(located: Located) -> None:
+    """The kernels of a fix on the cylinder are in numba's cache, so that other processes load them."""
+
+
+@pytest.fixture(scope="session")
 def located() -> Located:
     """A 1024 px fisheye 6.5 km off the middle of the thesis's crater, seen and located."""
     from startrack import pipeline

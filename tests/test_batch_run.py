@@ -15,6 +15,8 @@ from batch_helpers import frames
 
 from startrack.cli.main import main
 
+pytestmark = pytest.mark.usefixtures("compiled")  # else the first command announces on stderr that it compiles
+
 
 def begun(folder: Path, *flags: str, before: str = "") -> subprocess.Popen[str]:
     """The command in a shell's process, which `before` may have prepared."""

@@ -33,6 +33,7 @@ read_noise_e = 2.5
 """
 FACTS = {"time_utc": "2030-01-01T00:00:00Z", "exposure_s": 1.0, "camera": "small.toml", "terrain": "shackleton-thesis"}
 OK, ERROR, USAGE, REFUSED, BAD_INPUT = 0, 1, 2, 3, 4
+pytestmark = pytest.mark.usefixtures("compiled")  # else the first command announces on stderr that it compiles
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli.common import DEFAULT_OUT, read
 from startrack.cli.flag_types import amount, field_of_view_rad, number, positive
 from startrack.cli.progress import progress
+from startrack.compilation import announce_compilation
 from startrack.errors import NoSolution, exit_code_of
 from startrack.files import make_folder
 
@@ -95,6 +96,7 @@ def run(args: argparse.Namespace) -> int:
         args.usage_error("--time is the time of one image; give each of several its own in a sidecar NAME.json")
     out = output_path(args, "camera.toml")
     exposures = [read(path, args) for path in args.images]
+    announce_compilation()
     start = approximate_camera(args, exposures)
     with steps_shown(args, 2 * len(exposures) + 3) as show_step:
         try:

@@ -1,4 +1,4 @@
-"""What is known of a terrain: as the keys of one JSON object, and as lines to read."""
+"""Properties of a terrain, as keys of one JSON object and as lines of text."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 from startrack.errors import BadInput
 
 if TYPE_CHECKING:
+    from startrack.frames import Site
     from startrack.terrain import Terrain
 
 
 def facts_of(terrain: Terrain) -> dict[str, Any]:
-    """Place, search area, and the ground's own facts."""
-    site = terrain.site
+    """Origin, search area, and the properties of the ground. Raises BadInput (bad_terrain) without an origin."""
+    site = site_of(terrain)
     facts: dict[str, Any] = {
         "name": terrain.name,
         "body": site.body,
@@ -26,8 +27,15 @@ def facts_of(terrain: Terrain) -> dict[str, Any]:
     return facts | terrain.facts()
 
 
+def site_of(terrain: Terrain) -> Site:
+    """Where the terrain is. Raises BadInput (bad_terrain) if it does not say."""
+    if terrain.site is None:
+        raise BadInput("bad_terrain", f"{terrain.name} has no origin on a body")
+    return terrain.site
+
+
 def seen_from(terrain: Terrain, place: tuple[float, float] | None) -> dict[str, Any]:
-    """Ground and horizon of a place (east, north) [m]. Raises BadInput where the terrain knows nothing."""
+    """Ground and horizon at a position (east, north) [m]. Raises BadInput outside the terrain."""
     if place is None:
         return {}
     import numpy as np
@@ -36,10 +44,10 @@ def seen_from(terrain: Terrain, place: tuple[float, float] | None) -> dict[str, 
 
     point = np.array([place])
     if not terrain.allowed(point)[0]:
-        raise BadInput("bad_terrain", f"E {place[0]:g} m, N {place[1]:g} m is outside what the terrain knows")
+        raise BadInput("bad_terrain", f"E {place[0]:g} m, N {place[1]:g} m is outside the terrain")
     ground = float(terrain.ground_m(point)[0])
     horizon = np.degrees(terrain.horizon_rad(point, np.radians(np.arange(720) / 2)))
-    lat, lon = latlon_from_enu(terrain.site, *place, ground)
+    lat, lon = latlon_from_enu(site_of(terrain), *place, ground)
     return {
         "east_m": place[0], "north_m": place[1], "ground_m": round(ground, 2),
         "place_latitude_deg": round(float(np.degrees(lat)), 6), "place_longitude_deg": round(float(np.degrees(lon)), 6),
@@ -48,7 +56,7 @@ def seen_from(terrain: Terrain, place: tuple[float, float] | None) -> dict[str, 
 
 
 def lines_of(facts: dict[str, Any]) -> Iterator[str]:
-    """The facts in words, with units; only those that are there."""
+    """The properties that `facts` holds, as lines with units."""
     yield facts["name"]
     if "body" in facts:
         yield f"  origin    {_place(facts['latitude_deg'], facts['longitude_deg'])}, on the {facts['body'].title()}"
@@ -67,13 +75,13 @@ def lines_of(facts: dict[str, Any]) -> Iterator[str]:
     if "height_sigma_m" in facts:
         yield f"  errors    {_errors(facts)}"
     if facts.get("horizons") and "seconds" in facts:
-        how = "were known" if facts["known_before"] else f"worked out in {facts['seconds']:g} s"
+        how = "were known" if facts["known_before"] else f"computed in {facts['seconds']:g} s"
         yield f"  horizons  {how}: {facts['horizons']}"
     elif facts.get("horizons"):
         ready = facts["horizons_ready"]
-        yield f"  horizons  {facts['horizons'] if ready else 'not worked out yet: startrack terrain build'}"
+        yield f"  horizons  {facts['horizons'] if ready else 'not computed yet: startrack terrain build'}"
     elif "horizons" in facts:
-        yield "  horizons  need no table: a cylinder's are a formula"
+        yield "  horizons  need no table: those of a cylinder are a formula"
     if "ground_m" in facts:
         yield (
             f"  place     E {facts['east_m']:g} m, N {facts['north_m']:g} m: "

@@ -31,21 +31,22 @@ def fit_stamps(
     """
     n, side = data.shape[0], data.shape[1]
     radius = side // 2
-    px, dx, py, dy = np.zeros(side), np.zeros(side), np.zeros(side), np.zeros(side)
+    profile, slope, centre = np.zeros((2, side)), np.zeros((2, side)), np.zeros(2)
     weight, miss = np.zeros((side, side)), np.zeros((side, side))
-    normal, right, delta = np.zeros((4, 4)), np.zeros(4), np.zeros(4)
+    size = covariance.shape[1]  # 4
+    normal, right, delta = np.zeros((size, size)), np.zeros(size), np.zeros(size)
     for i in range(n):
-        x = min(max(start_px[i, 0], -radius), radius)
-        y = min(max(start_px[i, 1], -radius), radius)
+        for axis in range(2):
+            centre[axis] = min(max(start_px[i, axis], -radius), radius)
         flux, level = 0.0, 0.0
         for step in range(rounds + 1):
             if step != 1:  # the first step leaves the position as it is
-                _profile(px, dx, x, sigma_px, radius)
-                _profile(py, dy, y, sigma_px, radius)
+                for axis in range(2):
+                    _profile(profile, slope, axis, centre[axis], sigma_px, radius)
             shine = max(flux, 0.0)
             for r in range(side):
                 for c in range(side):
-                    shape = py[r] * px[c]
+                    shape = profile[1, r] * profile[0, c]
                     light = shine * shape
                     noise = variance[i, r, c] + light * (per_unit + model_error * model_error * light)
                     weight[r, c] = 1.0 / noise
@@ -55,9 +56,7 @@ def fit_stamps(
                     for c in range(side):
                         if not usable[i, r, c]:
                             weight[r, c] = 0.0
-            _normal_equations(weight, miss, flux, px, dx, py, dy, normal, right)
-            if step == rounds:
-                break
+            _normal_equations(weight, miss, flux, profile, slope, normal, right)
             if step == 0:  # flux and level first: without a flux the position has no gradient
                 a, b, d = normal[2, 2], normal[2, 3], normal[3, 3]
                 determinant = max(a * d - b * b, 1e-300)
@@ -65,26 +64,27 @@ def fit_stamps(
                 level = (a * right[3] - b * right[2]) / determinant
                 continue
             _factorise(normal)
-            _solve(normal, right, delta)
-            x = min(max(x + min(max(delta[0], -MAX_STEP_PX), MAX_STEP_PX), -radius), radius)
-            y = min(max(y + min(max(delta[1], -MAX_STEP_PX), MAX_STEP_PX), -radius), radius)
-            flux += delta[2]
-            level += delta[3]
-        xy_px[i, 0], xy_px[i, 1] = x, y
-        _factorise(normal)
-        for k in range(4):
-            for m in range(4):
-                right[m] = 1.0 if m == k else 0.0
-            _solve(normal, right, delta)
-            for m in range(4):
-                covariance[i, m, k] = delta[m]
+            for k in range(size + 1):  # the columns of the inverse, then the step
+                for m in range(size):
+                    delta[m] = right[m] if k == size else (1.0 if m == k else 0.0)
+                _solve(normal, delta)
+                for m in range(size):
+                    if k < size:
+                        covariance[i, m, k] = delta[m]
+            if step < rounds:
+                for axis in range(2):
+                    moved = centre[axis] + min(max(delta[axis], -MAX_STEP_PX), MAX_STEP_PX)
+                    centre[axis] = min(max(moved, -radius), radius)
+                flux += delta[2]
+                level += delta[3]
+        xy_px[i, 0], xy_px[i, 1] = centre[0], centre[1]
         values[i, 0], values[i, 1] = flux, level
-        _judge(data, variance, usable, i, weight, miss, px, py, flux, per_unit, surround, values)
+        _judge(data, variance, usable, i, weight, miss, profile, flux, per_unit, surround, values)
 
 
-@njit(cache=True, nogil=True)
-def _profile(profile, slope, offset, sigma_px, radius) -> None:
-    """The pixel-integrated Gaussian and its derivative with respect to the offset, as `psf.pixel_profile_single`."""
+@njit(inline="always")
+def _profile(profile, slope, axis, offset, sigma_px, radius) -> None:
+    """Row `axis`: the pixel-integrated Gaussian and its derivative by the offset, as `psf.pixel_profile_single`."""
     last_area, last_density = 0.0, 0.0
     for j in range(2 * radius + 2):
         edge = (j - radius - 0.5 - offset) / sigma_px
@@ -94,19 +94,19 @@ def _profile(profile, slope, offset, sigma_px, radius) -> None:
         area = area if edge >= 0.0 else -area
         density /= sigma_px * SQRT_2PI
         if j > 0:
-            profile[j - 1], slope[j - 1] = area - last_area, last_density - density
+            profile[axis, j - 1], slope[axis, j - 1] = area - last_area, last_density - density
         last_area, last_density = area, density
 
 
-@njit(cache=True, nogil=True)
-def _normal_equations(weight, miss, flux, px, dx, py, dy, normal, right) -> None:
+@njit(inline="always")
+def _normal_equations(weight, miss, flux, profile, slope, normal, right) -> None:
     """Normal matrix (4, 4), symmetric, and right side (4,) for x, y, flux, level: sums over x, then over y."""
-    side = len(px)
+    side = profile.shape[1]
     xx = yy = xy = xf = yf = xl = yl = ff = fl = ll = bx = by = bf = bl = 0.0
     for r in range(side):
         w = wp = wd = wpp = wpd = wdd = m = mp = md = 0.0
         for c in range(side):
-            v, p, d = weight[r, c], px[c], dx[c]
+            v, p, d = weight[r, c], profile[0, c], slope[0, c]
             e = v * miss[r, c]
             w += v
             wp += v * p
@@ -117,7 +117,7 @@ def _normal_equations(weight, miss, flux, px, dx, py, dy, normal, right) -> None
             m += e
             mp += e * p
             md += e * d
-        p, d = py[r], dy[r]
+        p, d = profile[1, r], slope[1, r]
         xx += p * p * wdd
         yy += d * d * wpp
         xy += p * d * wpd
@@ -140,41 +140,43 @@ def _normal_equations(weight, miss, flux, px, dx, py, dy, normal, right) -> None
     right[0], right[1], right[2], right[3] = flux * bx, flux * by, bf, bl
 
 
-@njit(cache=True, nogil=True)
+@njit(inline="always")
 def _factorise(matrix) -> None:
     """Cholesky factor of a positive definite matrix (4, 4) in place of its lower triangle, 1 / root on the diagonal."""
-    for j in range(4):
+    size = len(matrix)  # a constant would be unrolled into much code
+    for j in range(size):
         rest = matrix[j, j]
         for k in range(j):
             rest -= matrix[j, k] * matrix[j, k]
         matrix[j, j] = 1.0 / math.sqrt(max(rest, 1e-300))
-        for i in range(j + 1, 4):
+        for i in range(j + 1, size):
             rest = matrix[i, j]
             for k in range(j):
                 rest -= matrix[i, k] * matrix[j, k]
             matrix[i, j] = rest * matrix[j, j]
 
 
-@njit(cache=True, nogil=True)
-def _solve(factor, right, solution) -> None:
-    """The solution (4,) for a right side (4,), by the factor of `_factorise`."""
-    for i in range(4):
-        rest = right[i]
+@njit(inline="always")
+def _solve(factor, x) -> None:
+    """Replace a right side (4,) by its solution, by the factor of `_factorise`."""
+    size = len(x)
+    for i in range(size):
+        rest = x[i]
         for k in range(i):
-            rest -= factor[i, k] * solution[k]
-        solution[i] = rest * factor[i, i]
-    for m in range(4):
-        i = 3 - m
-        rest = solution[i]
-        for k in range(i + 1, 4):
-            rest -= factor[k, i] * solution[k]
-        solution[i] = rest * factor[i, i]
+            rest -= factor[i, k] * x[k]
+        x[i] = rest * factor[i, i]
+    for m in range(size):
+        i = size - 1 - m
+        rest = x[i]
+        for k in range(i + 1, size):
+            rest -= factor[k, i] * x[k]
+        x[i] = rest * factor[i, i]
 
 
-@njit(cache=True, nogil=True)
-def _judge(data, variance, usable, i, weight, miss, px, py, flux, per_unit, surround, values) -> None:
+@njit(inline="always")
+def _judge(data, variance, usable, i, weight, miss, profile, flux, per_unit, surround, values) -> None:
     """Fill values[i, 2:] for the fitted source: how well it fits, how well a single pixel does, and filter sums."""
-    side = len(px)
+    side = profile.shape[1]
     middle = side // 2
     hot_r, hot_c = middle - 1, middle - 1
     for r in range(middle - 1, middle + 2):
@@ -189,7 +191,7 @@ def _judge(data, variance, usable, i, weight, miss, px, py, flux, per_unit, surr
             if len(usable) > 0 and not usable[i, r, c]:
                 continue
             count += 1.0
-            plain, shape = 1.0 / variance[i, r, c], py[r] * px[c]
+            plain, shape = 1.0 / variance[i, r, c], profile[1, r] * profile[0, c]
             above += plain * shape * (data[i, r, c] - surround[i])
             norm += plain * shape * shape
             own += plain * shape * shape / (1.0 + per_unit * shine * shape * plain)

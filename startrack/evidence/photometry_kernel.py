@@ -16,7 +16,7 @@ MAX_MASKED_PX = 6  # a stamp with more deviant pixels is not a star on a smooth 
 REORDERED_SUMS = {"reassoc", "contract", "nsz"}  # lets the compiler sum several pixels at a time
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
 def measure_sources(
     image, background, noise, dead, xy_px, flux_e, fraction_sigma, visible, first, columns,
     reach_px, side_px, radius, profiles, measured, usable,
@@ -76,7 +76,7 @@ def measure_sources(
             measured[i, 3] += leak**2 * (visible[j] * (1.0 - visible[j]) + visible[j] * fraction_sigma[j] ** 2)
 
 
-@njit(cache=True, nogil=True)
+@njit(inline="always")
 def _find_neighbours(near, i, xy_px, visible, first, columns, side_px, reach_px) -> int:
     """Write into `near` the sources within reach of source i that may shine; returns how many there are."""
     rows = (len(first) - 1) // columns
@@ -93,7 +93,7 @@ def _find_neighbours(near, i, xy_px, visible, first, columns, side_px, reach_px)
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(inline="always")
 def _profiles(xy_px, profiles):
     """Profiles (n, 2 k + 1) of the sources in x and in y about their middle pixels, and these pixels (n, 2)."""
     n, wide = len(xy_px), profiles.shape[1]
@@ -116,7 +116,7 @@ def _profiles(xy_px, profiles):
     return across, down, centre
 
 
-@njit(cache=True, nogil=True)
+@njit(inline="always")
 def _load_stamp(
     image, background, noise, dead, across, down, i, left, top, radius, k, light, profile, data, variance, weight
 ) -> None:
@@ -136,7 +136,7 @@ def _load_stamp(
             weight[p] = 0.0 if dead[y, x] else 1.0 / variance[p]
 
 
-@njit(cache=True, nogil=True)
+@njit(inline="always")
 def _add_light(light, side, flux, across, down, j, x, y) -> None:
     """Add to the stamp the part of the light of neighbour j whose profiles start at -x, -y."""
     wide = across.shape[1]
@@ -148,7 +148,7 @@ def _add_light(light, side, flux, across, down, j, x, y) -> None:
             light[r * width + c] += height * across[neighbour, c + dx]
 
 
-@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
+@njit(inline="always")
 def _leak(weight, side, across, down, j, x, y) -> float:
     """Part of the light of neighbour j that the weights of the stamp take for the star's."""
     wide = across.shape[1]
@@ -163,7 +163,7 @@ def _leak(weight, side, across, down, j, x, y) -> float:
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
+@njit(inline="always")
 def _fit_masking(profile, light, data, variance, weight):
     """Flux, the profile's weighted mean, its strength about that, and how many deviant pixels got the weight 0."""
     size = len(profile)
@@ -204,7 +204,7 @@ def _fit_masking(profile, light, data, variance, weight):
     return flux, middle, strength, masked
 
 
-@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
+@njit(inline="always")
 def _seen(profile, weight) -> float:
     """Part of the star's light in pixels that have a weight."""
     total = 0.0
@@ -213,7 +213,7 @@ def _seen(profile, weight) -> float:
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
+@njit(inline="always")
 def _variances(profile, light, variance, weight, middle, strength):
     """Variance of the flux without and per electron of its own light; the weights become those of flux = sum w data."""
     total, own = 0.0, 0.0

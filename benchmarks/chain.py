@@ -29,7 +29,7 @@ from startrack.frames import R_from_quat_xyzw
 from startrack.localization import Hull, PseudoGradient
 from startrack.pipeline import locate
 from startrack.rendering import Series, render
-from startrack.stages import Identified, Located, Oriented, Outcome, reached
+from startrack.stages import Identified, Located, Oriented, Outcome, last_value
 from startrack.terrain import load_terrain
 from startrack.types import Evidence, NoSolution
 
@@ -89,7 +89,7 @@ def scored(result: Outcome, position_m: np.ndarray, R_cam_icrs: np.ndarray, seco
     """Errors of one result."""
     row: dict[str, Any] = {"status": result.status, "reason": result.reason, "seconds": seconds}
     row["stage_ms"] = dict(result.timing_ms)
-    value = reached(result)
+    value = last_value(result)
     if isinstance(value, Oriented):
         turn = R_cam_icrs @ value.attitude.R_cam_icrs.T
         w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])

@@ -28,7 +28,7 @@ from startrack.evidence import StarEvidence, StarPhotometry, flux_scale
 from startrack.localization import ExactPosterior
 from startrack.pipeline import Settings, locate
 from startrack.rendering import Series, exposure_reaching, render
-from startrack.stages import Located, Measured, reached
+from startrack.stages import Located, Measured, last_value
 from startrack.terrain import load_terrain
 from startrack.types import Array, Evidence, Fix, NoSolution
 
@@ -109,7 +109,7 @@ def one(job: tuple[int, Depth, int]) -> dict[str, dict[str, Any]]:
     fast = Settings(localizer=ExactPosterior(compiled=True))
     result = locate(exposure, camera, terrain, catalog, fast)
     rows = {"full": _scored(_fix(result), place)}
-    value = reached(result)
+    value = last_value(result)
     if number < depth.compared and isinstance(value, Measured):
         plain = locate(exposure, camera, terrain, catalog, replace(fast, deep_stars=False))
         rows["Hipparcos alone"] = _scored(_fix(plain), place)

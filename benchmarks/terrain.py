@@ -25,7 +25,7 @@ from startrack.localization import ExactPosterior, check_consistency
 from startrack.localization.horizon_bias import raised
 from startrack.pipeline import locate
 from startrack.rendering import Series, render
-from startrack.stages import Measured, reached
+from startrack.stages import Measured, last_value
 from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
 from startrack.types import Evidence, Fix, NoSolution
@@ -108,7 +108,7 @@ def observed(terrain: HeightMap, seed: int, number: int) -> tuple[Evidence, np.n
     scene, rng = series.scene(number, f"frame-{number:03d}")
     exposure, truth = render(scene, rng=rng)
     result = locate(exposure, camera, terrain, catalog)
-    value = reached(result)
+    value = last_value(result)
     assert isinstance(value, Measured), result.message
     return value.evidence(), np.asarray(truth.position_enu_m)
 

@@ -197,7 +197,7 @@ class Refused:
 Outcome: TypeAlias = Inputs | Refused  # of a command: Detected, Oriented or Located, or a refusal
 
 
-def reached(outcome: Outcome) -> Inputs:
+def last_value(outcome: Outcome) -> Inputs:
     """The last complete value of an outcome: itself, or what was reached before it was refused."""
     return outcome.reached if isinstance(outcome, Refused) else outcome
 

@@ -20,7 +20,7 @@ import startrack
 from startrack.errors import BadInput
 from startrack.exposure import read_exposure
 from startrack.inputs import exposure_input, time_input
-from startrack.stages import Oriented, Refused, extend, reached
+from startrack.stages import Oriented, Refused, extend, last_value
 
 IMAGE = "sample_images/near-wall.png"
 LOWELL = "sample_images/lowell-2018-08-06.fits.bz2"
@@ -108,7 +108,7 @@ def test_writing_replaces_what_an_earlier_result_left(solution, tmp_path):
     assert (tmp_path / "near-wall-2.wcs").read_text() == "of another image"
     solution.write(tmp_path, plots=False)  # the same image's: renewed
     refused = startrack.locate(read_exposure(IMAGE), time="2030-01-01T00:00:00Z")
-    result = Refused(reason="no_stars", message="", reached=extend(reached(refused.result), Oriented))
+    result = Refused(reason="no_stars", message="", reached=extend(last_value(refused.result), Oriented))
     refused = replace(refused, result=result)
     refused.write(tmp_path, plots=False)
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["near-wall-2.wcs", "near-wall.fix.json"]

@@ -16,7 +16,7 @@ from startrack import pipeline
 from startrack.camera import Camera, Pinhole
 from startrack.output import write_annotated
 from startrack.output.picture.annotate import PANEL_WIDTH, annotate
-from startrack.output.picture.backdrop import View, fitted, without_hot_pixels
+from startrack.output.picture.backdrop import View, fit_to_canvas, remove_hot_pixels
 from startrack.output.picture.canvas import HIDDEN, IDENTIFIED, POSITION, SKYLINE, STATUS, TRUTH
 from startrack.stages import Detected, Inputs, Measured, Oriented, Refused, extend
 from startrack.types import Mode
@@ -50,7 +50,7 @@ def picture(located):
 
 @pytest.fixture(scope="module")
 def view(located, picture):
-    scale, size = fitted(located.result.exposure.size_px)
+    scale, size = fit_to_canvas(located.result.exposure.size_px)
     return View(scale, (0.0, float((picture.shape[0] - size[1]) // 2)), size)
 
 
@@ -58,10 +58,10 @@ def test_size(picture):
     assert picture.dtype == np.uint8
     assert picture.shape[2] == 3
     assert 1000 <= picture.shape[0] <= 1600
-    assert fitted((2048, 2048)) == (1400 / 2048, (1400, 1400))
-    assert fitted((3000, 2000))[1] == (1400, 933)
-    assert fitted((512, 512))[1] == (900, 900)
-    assert fitted((1024, 1024))[0] == 1.0
+    assert fit_to_canvas((2048, 2048)) == (1400 / 2048, (1400, 1400))
+    assert fit_to_canvas((3000, 2000))[1] == (1400, 933)
+    assert fit_to_canvas((512, 512))[1] == (900, 900)
+    assert fit_to_canvas((1024, 1024))[0] == 1.0
 
 
 def test_the_skyline_is_where_the_true_wall_is(picture, view, located):
@@ -106,8 +106,8 @@ def test_hot_pixels_go_and_stars_stay(psf_sigma_px):
     stars = sky + render_stars(sky.shape, centres, np.geomspace(200, 1e5, len(centres)), psf_sigma_px)
     hot = stars.copy()
     hot[places[:, 1] + 9, places[:, 0] + 9] += np.geomspace(60, 5e4, len(places)).astype(np.float32)
-    np.testing.assert_array_equal(without_hot_pixels(stars, psf_sigma_px), stars)
-    assert np.abs(without_hot_pixels(hot, psf_sigma_px) - stars).max() < 20
+    np.testing.assert_array_equal(remove_hot_pixels(stars, psf_sigma_px), stars)
+    assert np.abs(remove_hot_pixels(hot, psf_sigma_px) - stars).max() < 20
 
 
 def test_detections_beyond_the_image_circle_are_not_drawn(located, view):

@@ -15,14 +15,14 @@ from startrack.output.picture.canvas import (
     PAPER,
     POSITION,
     Canvas,
-    _overlap,
-    mixed,
+    _boxes_overlap,
+    mix_colours,
     printable,
     text_width,
-    wrapped,
+    wrap_text,
 )
 from startrack.output.picture.maps import distance_text, draw_overview, draw_zoom, map_view, nice_step
-from startrack.output.picture.relief import draw_contours, ground_on, shade
+from startrack.output.picture.relief import draw_contours, draw_relief, ground_of_view
 from startrack.output.picture.terrain_picture import relief_picture
 from startrack.terrain import Terrain
 from startrack.types import Fix, Mode
@@ -68,9 +68,9 @@ def test_labels_keep_apart_and_inside():
     canvas, rng = Canvas(400, 300), np.random.default_rng(3)
     inside = (0.0, 0.0, 399.0, 299.0)
     put = [canvas.label(rng.uniform((0, 0), (400, 300)), "Canopus", 16.0, WHITE, 10.0, inside) for _ in range(200)]
-    boxes = canvas._taken
+    boxes = canvas._occupied
     assert 10 < sum(put) == len(boxes) < 150
-    assert not any(_overlap(a, b) for k, a in enumerate(boxes) for b in boxes[:k])
+    assert not any(_boxes_overlap(a, b) for k, a in enumerate(boxes) for b in boxes[:k])
     assert np.min(boxes) >= 0
     assert (np.max(boxes, axis=0)[2:] <= [399, 299]).all()
 
@@ -78,7 +78,7 @@ def test_labels_keep_apart_and_inside():
 def test_a_text_lies_in_its_box():
     canvas = Canvas(300, 100, (0, 0, 0))
     left, top, right, bottom = canvas.text((150, 50), "Sagittarius", 30.0, WHITE, "mm")
-    lit = np.argwhere(canvas.finished().max(axis=-1) > 60)
+    lit = np.argwhere(canvas.rendered_pixels().max(axis=-1) > 60)
     (y0, x0), (y1, x1) = lit.min(axis=0), lit.max(axis=0)
     assert left - 1 <= x0 < left + 4
     assert right - 5 < x1 <= right + 1
@@ -93,11 +93,11 @@ def test_letters_that_the_font_lacks():
 
 
 def test_wrapping():
-    lines = wrapped("is the camera file right, and is it the night sky that it shows?", 20.0, 200.0)
+    lines = wrap_text("is the camera file right, and is it the night sky that it shows?", 20.0, 200.0)
     assert " ".join(lines) == "is the camera file right, and is it the night sky that it shows?"
     assert len(lines) > 2
     assert max(text_width(line, 20.0) for line in lines) <= 200.0
-    assert wrapped("", 20.0, 100.0) == []
+    assert wrap_text("", 20.0, 100.0) == []
 
 
 def test_the_view_keeps_pixel_centres():
@@ -142,7 +142,7 @@ def fix_at(east, north, covariance):
 )
 def test_the_ellipse_is_one_sigma_wide_and_turned_as_the_covariance(covariance, along):
     """Sigmas of 4 m along the direction (east, north) and of 1 m across it."""
-    canvas, filled = Canvas(601, 601), np.array(mixed(MAP, POSITION, 0.35))
+    canvas, filled = Canvas(601, 601), np.array(mix_colours(MAP, POSITION, 0.35))
     view = draw_zoom(canvas, (0, 0, 600, 600), fix_at(30.0, 70.0, covariance), None)
     y, x = np.nonzero(np.abs(canvas.pixels.astype(int) - filled).sum(axis=-1) < 12)
     east_north = np.stack([x - 300.0, 300.0 - y], axis=-1) * view.metres_per_px
@@ -188,7 +188,7 @@ def test_the_edge_of_the_ground_is_smooth():
     object.__setattr__(terrain, "allowed", disc)
     canvas = Canvas(601, 601)
     view = map_view((0, 0, 600, 600), (0.0, 0.0), 1000.0)
-    shade(canvas, view, *ground_on(view, terrain, (601, 601)))
+    draw_relief(canvas, view, *ground_of_view(view, terrain, (601, 601)))
     light = canvas.pixels.max(axis=-1).astype(float)
     half = (light.max() + light[0, 0]) / 2
     radii = []
@@ -203,7 +203,7 @@ def test_the_edge_of_the_ground_is_smooth():
 def test_contours_stand_at_their_heights_with_their_names():
     terrain, canvas = Ramp(0.3), Canvas(601, 601)
     view = map_view((0, 0, 600, 600), (0.0, 0.0), 1000.0)
-    ground_m, known = ground_on(view, terrain, (601, 601))
+    ground_m, known = ground_of_view(view, terrain, (601, 601))
     step_m = draw_contours(canvas, canvas, view, ground_m, known)
     assert step_m == 50.0  # from -300 to 300 m
     row = canvas.pixels[200].astype(int).sum(axis=-1)

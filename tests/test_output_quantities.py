@@ -13,7 +13,7 @@ from jsonschema import Draft202012Validator
 from startrack.errors import Reason
 from startrack.frames import R_from_rotvec, heading_pitch_roll_from_R_body_enu
 from startrack.output import quantities, result_dict, views
-from startrack.output.quantities import Column, Listed, Quantity, everywhere
+from startrack.output.quantities import Column, Listed, Quantity, show_everywhere
 from startrack.output.schema import SCHEMAS
 from startrack.output.schema_parts import POSITIVE
 from startrack.output.values import body_sigmas_deg
@@ -27,7 +27,8 @@ ARCSEC = np.pi / 648_000
 def test_a_new_quantity_is_one_entry(located, monkeypatch):
     new = Quantity(
         "position.twice_m", "m", Located, lambda v: 2 * v.fix.radius95_m, "twice the radius", POSITIVE, optional=True,
-        columns=(Column("twice_m", "%.2f"),), shown=everywhere("Twice", "{:.1f} m", "error"), listed=Listed("Twice", 1),
+        columns=(Column("twice_m", "%.2f"),), shown=show_everywhere("Twice", "{:.1f} m", "error"),
+        listed=Listed("Twice", 1),
     )  # fmt: skip
     table = (*quantities.QUANTITIES, new)
     monkeypatch.setattr(quantities, "QUANTITIES", table)

@@ -24,7 +24,7 @@ from startrack.batch.store import INPUTS, JOB, MANIFEST, RESULT, is_solved, stor
 from startrack.batch.task import Record, Task, valid_stored_record
 from startrack.files import write_atomically
 from startrack.frames import R_from_quat_xyzw, quat_xyzw_from_R
-from startrack.output.ecsv import Column, ecsv_text, formatted
+from startrack.output.ecsv import Column, ecsv_text, format_values
 from startrack.output.views import columns
 from startrack.stages import STAGES
 
@@ -131,7 +131,7 @@ def file_stem(reference: str) -> str:
 
 
 def _results(records: Sequence[Record]) -> bytes:
-    table = [Column(one.name, formatted(one.form, one.values(records)), one.datatype, one.unit) for one in COLUMNS]
+    table = [Column(one.name, format_values(one.form, one.values(records)), one.datatype, one.unit) for one in COLUMNS]
     return ecsv_text(table).encode()
 
 
@@ -183,7 +183,7 @@ def _timings(records: Sequence[Record]) -> bytes:
     table = [Column("image", [record["image"] for record in records], "string")]
     for stage in STAGES:
         times = [_value_at(record, ("timing_ms", stage)) for record in records]
-        table.append(Column(f"{stage}_ms", formatted("%.3f", times), "float64", "ms"))
+        table.append(Column(f"{stage}_ms", format_values("%.3f", times), "float64", "ms"))
     return ecsv_text(table).encode()
 
 

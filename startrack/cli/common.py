@@ -175,8 +175,8 @@ def result_path(args: argparse.Namespace, stem: str, suffix: str, exposure: Expo
 
     Raises BadInput (bad_image, for lack of a better code) before anything is computed.
     """
-    from startrack.output import make_way
+    from startrack.output import prepare_folder
 
     path = Path(args.dir) / f"{stem}{suffix}"
-    make_way(path, exposure.sha256, overwrite=args.overwrite, remedy="choose another -D, or replace it with -O")
+    prepare_folder(path, exposure.sha256, overwrite=args.overwrite, remedy="choose another -D, or replace it with -O")
     return path

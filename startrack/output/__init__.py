@@ -3,7 +3,7 @@
 from startrack.output.record import detection_dict, identification_dict, record_of, refused_dict, result_dict
 from startrack.output.text import lens_text, refusal_line, summary_line, verbose_text
 from startrack.output.write import (
-    make_way,
+    prepare_folder,
     remove_companions,
     write_annotated,
     write_json,
@@ -16,7 +16,7 @@ __all__ = [
     "detection_dict",
     "identification_dict",
     "lens_text",
-    "make_way",
+    "prepare_folder",
     "record_of",
     "refusal_line",
     "refused_dict",

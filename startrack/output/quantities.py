@@ -111,7 +111,7 @@ class Quantity:
         return self.path.rpartition(".")[2]
 
 
-def everywhere(label: str, form: str, line: str) -> tuple[Show, ...]:
+def show_everywhere(label: str, form: str, line: str) -> tuple[Show, ...]:
     """A quantity shown as `label` with its `form` in text (on the `line`), panel, notebook and page."""
     where = (("text", line), ("panel", label), ("notebook", label.lower()), ("page", label))
     return tuple(Show(place, row, f"; {label.lower()} {form}" if place == "text" else form) for place, row in where)
@@ -274,7 +274,7 @@ QUANTITIES: tuple[Quantity, ...] = (
       "V of the sky beyond that of the ground at the skyline, by the camera's zero point and the exposure's duration; "
       "null where the image shows no step of light there, or one of the two is not known",
       {"anyOf": [NUMBER, {"type": "null"}]}, columns=(Column("sky_mag_arcsec2", "%.4f"),),
-      shown=everywhere("Sky", "{:.2f} mag/arcsec2", "evidence")),
+      shown=show_everywhere("Sky", "{:.2f} mag/arcsec2", "evidence")),
     Q("provenance.version", "", Inputs, lambda v: __version__, "of startrack", TEXT),
     Q("provenance.image_sha256", "", Inputs, lambda v: v.exposure.sha256,
       "of the file; of an array: of its type, shape and values", TEXT, columns=(Column("image_sha256", "%s"),)),

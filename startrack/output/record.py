@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from startrack.output.views import record_sections
-from startrack.stages import STAGES, Detected, Identified, Outcome, reached
+from startrack.stages import STAGES, Detected, Identified, Outcome, last_value
 from startrack.types import Exposure
 
 FORMATS = {
@@ -29,7 +29,7 @@ def identification_dict(result: Outcome) -> dict[str, Any]:
     """Attitude, the camera that was used and the matches of a `result`: stars with the positions measured for them."""
     from startrack.camera.io import camera_to_dict
 
-    value, own = reached(result), dict[str, Any]()
+    value, own = last_value(result), dict[str, Any]()
     if value.camera is not None:
         own["camera"] = camera_to_dict(value.camera)
     own["matches"] = []
@@ -42,7 +42,7 @@ def identification_dict(result: Outcome) -> dict[str, Any]:
 
 def detection_dict(result: Outcome) -> dict[str, Any]:
     """The point sources of a `result`, brightest first; fluxes are in ADU where the gain is not known."""
-    value, rows = reached(result), list[dict[str, float]]()
+    value, rows = last_value(result), list[dict[str, float]]()
     if isinstance(value, Detected):
         found = value.detections
         columns = zip(found.xy_px.tolist(), found.flux_e.tolist(), found.snr.tolist(), strict=True)
@@ -78,7 +78,7 @@ def _record(
     kind: str, result: Outcome, own: dict[str, Any] | None = None, without: tuple[str, ...] = ()
 ) -> dict[str, Any]:
     """The record with its `own` keys after the attitude, and without some sections."""
-    sections = {key: part for key, part in record_sections(reached(result)).items() if key not in without}
+    sections = {key: part for key, part in record_sections(last_value(result)).items() if key not in without}
     first: dict[str, Any] = {key: sections.pop(key) for key in ("position", "modes", "attitude") if key in sections}
     provenance = sections.pop("provenance")
     return {

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from startrack.catalog import star_names
 from startrack.evidence.star_evidence import SEEN_LLR
-from startrack.output.ecsv import Column, ecsv_text, formatted
+from startrack.output.ecsv import Column, ecsv_text, format_values
 from startrack.stages import Identified, Inputs, Measured, Oriented
 from startrack.types import Array, Ints, Stars
 
@@ -51,7 +51,7 @@ def names_of(hips: Ints) -> list[str]:
     return [names.get(hip, "") for hip in hips.tolist()]
 
 
-def in_view(value: Oriented) -> tuple[Ints, Array]:
+def stars_in_view(value: Oriented) -> tuple[Ints, Array]:
     """Stars in the frame down to the depth of the matches: indices (n,) and predicted pixels (n, 2)."""
     stars, matched = value.stars, value.identification.star
     faintest = float(stars.v_mag[matched].max(initial=-np.inf)) + FAINTER_THAN_FAINTEST_MATCH_MAG
@@ -61,7 +61,7 @@ def in_view(value: Oriented) -> tuple[Ints, Array]:
 
 
 def _predicted_columns(value: Oriented) -> list[Column]:
-    star, xy_px = in_view(value)
+    star, xy_px = stars_in_view(value)
     return [*_catalog_columns(value.stars, star), *_place_columns(value, star, xy_px)]
 
 
@@ -83,7 +83,7 @@ def _direction_columns(light: StarPhotometry) -> list[Column]:
 
 
 def _place_columns(value: Identified, star: Ints, xy_px: Array) -> list[Column]:
-    measured = _measured(value, star)
+    measured = _measured_px_texts(value, star)
     origin = "(0, 0) is the centre of the top-left pixel"
     return [
         Column("x_px", xy_px[:, 0], "float64", "pix", "%.3f", f"predicted; {origin}"),
@@ -93,7 +93,7 @@ def _place_columns(value: Identified, star: Ints, xy_px: Array) -> list[Column]:
     ]
 
 
-def _measured(value: Identified, star: Ints) -> tuple[list[str], list[str]]:
+def _measured_px_texts(value: Identified, star: Ints) -> tuple[list[str], list[str]]:
     """Measured pixels of the stars as texts, empty where no detection was identified as the star."""
     x: list[float | None] = [None] * len(star)
     y: list[float | None] = [None] * len(star)
@@ -101,7 +101,7 @@ def _measured(value: Identified, star: Ints) -> tuple[list[str], list[str]]:
     xy_px = value.detections.xy_px[value.identification.detection[match]]
     for at, (px, py) in zip(row.tolist(), xy_px.tolist(), strict=True):
         x[at], y[at] = px, py
-    return formatted("%.3f", x), formatted("%.3f", y)
+    return format_values("%.3f", x), format_values("%.3f", y)
 
 
 def _light_columns(light: StarPhotometry, unit: str) -> Sequence[Column]:

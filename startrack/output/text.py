@@ -9,7 +9,7 @@ import numpy as np
 
 from startrack.output.record import image_name
 from startrack.output.views import at_stage, rows
-from startrack.stages import STAGES, Outcome, Refused, reached
+from startrack.stages import STAGES, Outcome, Refused, last_value
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
@@ -43,7 +43,7 @@ def lens_text(camera: Camera) -> str:
 
 def verbose_text(result: Outcome) -> str:
     """Indented lines about a `result`: position, attitude, stars and times, as far as they are known."""
-    at = at_stage(reached(result))
+    at = at_stage(last_value(result))
     lines = rows("text", at)
     when = at("provenance.time_utc")
     lines += [("time", f"{when if when is not None else 'not known'} (middle of the exposure)")]

@@ -34,7 +34,7 @@ def wcs_bytes(value: Oriented) -> bytes | None:
     their stars. Aberration bends a whole sky by up to 20 arcsec (0.06 px of a fisheye): the mean over the frame is
     taken out. FITS pixel (1, 1) is our (0, 0), the first pixel stored.
     """
-    cards = wcs_cards(value.camera, _R_cam_still(value), value)
+    cards = wcs_cards(value.camera, _R_cam_catalog(value), value)
     return None if cards is None else header_block(cards)
 
 
@@ -74,7 +74,7 @@ def matches_bytes(value: Oriented) -> bytes:
     Columns as astrometry.net's: field_x, field_y, field_ra, field_dec, index_x, index_y, index_ra, index_dec, and
     index_id, FLUX, MAG.
     """
-    camera, R = value.camera, _R_cam_still(value)
+    camera, R = value.camera, _R_cam_catalog(value)
     found, stars = value.identification, value.stars.take(value.identification.star)
     velocity = _velocity_m_s(value)
     still = stars.rays_icrs if velocity is None else aberrate(stars.rays_icrs, -velocity)
@@ -130,7 +130,7 @@ def _velocity_m_s(value: Oriented) -> Array | None:
     return observer_velocity_m_s(site, value.exposure.time_utc)
 
 
-def _R_cam_still(value: Oriented) -> Array:
+def _R_cam_catalog(value: Oriented) -> Array:
     """R_cam_icrs (3, 3) that takes catalogue directions, without aberration, nearest to where they appear."""
     camera, velocity = value.camera, _velocity_m_s(value)
     if velocity is None:

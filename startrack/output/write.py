@@ -36,7 +36,7 @@ def remove_companions(record: Path) -> None:
         companion(record, suffix).unlink(missing_ok=True)
 
 
-def make_way(path: Path, sha256: str, *, overwrite: bool, remedy: str) -> None:
+def prepare_folder(path: Path, sha256: str, *, overwrite: bool, remedy: str) -> None:
     """Make the folder of a record at `path`, and remove the companions of an earlier one of this name.
 
     The record of the same image (`sha256` of its file) may be replaced; one of another image only with `overwrite`.
@@ -72,9 +72,9 @@ def write_results(outcome: Outcome, path: Path, *, plots: bool = True, write_rec
     be written.
     """
     from startrack.output.record import record_of
-    from startrack.stages import Measured, Oriented, reached
+    from startrack.stages import Measured, Oriented, last_value
 
-    record, value = record_of(outcome, _stem_and_kind(path)[1]), reached(outcome)
+    record, value = record_of(outcome, _stem_and_kind(path)[1]), last_value(outcome)
     if isinstance(value, Measured) or (isinstance(value, Oriented) and value.terrain is None):
         write_star_table(companion(path, ".stars.ecsv"), value)
         write_wcs(companion(path, ".wcs"), companion(path, ".corr"), value)

@@ -10,10 +10,10 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.output import make_way, record_of, summary_line, write_results
+from startrack.output import prepare_folder, record_of, summary_line, write_results
 from startrack.output.values import boresight_rad
 from startrack.solution.values import Orientation, Position, html_table, orientation_of, position_of
-from startrack.stages import Located, Oriented, Outcome, reached
+from startrack.stages import Located, Oriented, Outcome, last_value
 
 if TYPE_CHECKING:
     from astropy.coordinates import Angle, SkyCoord
@@ -51,12 +51,12 @@ class Solution:
     @cached_property
     def position(self) -> Position | None:
         """East, north, up, their sigma and ellipse, latitude and longitude, with units; None unless located."""
-        return position_of(reached(self.result))
+        return position_of(last_value(self.result))
 
     @cached_property
     def attitude(self) -> Orientation | None:
         """Rotation, right ascension, declination and roll of the camera, heading and pitch of the rover."""
-        return orientation_of(reached(self.result))
+        return orientation_of(last_value(self.result))
 
     @property
     def heading(self) -> Angle | None:
@@ -110,7 +110,7 @@ class Solution:
     @cached_property
     def boresight(self) -> SkyCoord | None:
         """Where the camera's axis points, ICRS."""
-        value = reached(self.result)
+        value = last_value(self.result)
         if not isinstance(value, Oriented):
             return None
         from astropy.coordinates import SkyCoord
@@ -121,7 +121,7 @@ class Solution:
     @cached_property
     def stars(self) -> QTable | None:
         """The star table: every catalogue star in view, with units."""
-        value = reached(self.result)
+        value = last_value(self.result)
         if not isinstance(value, Oriented):
             return None
         from astropy.table import QTable
@@ -155,7 +155,7 @@ class Solution:
         """
         path = Path(folder) / f"{self.result.exposure.name or 'image'}.{self.kind}.json"
         remedy = "write elsewhere, or with overwrite=True"
-        make_way(path, self.result.exposure.sha256, overwrite=overwrite, remedy=remedy)
+        prepare_folder(path, self.result.exposure.sha256, overwrite=overwrite, remedy=remedy)
         write_results(self.result, path, plots=plots)
         return path
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from startrack.camera import load_camera
 from startrack.output.picture.annotate import PANEL_WIDTH
-from startrack.output.picture.backdrop import fitted
-from startrack.output.picture.relief import edge_of, ground_cells, light_on
+from startrack.output.picture.backdrop import fit_to_canvas
+from startrack.output.picture.relief import edge_cover, ground_cells, hill_shading
 from startrack.terrain import Terrain, load_terrain
 from startrack.types import BadInput
 
@@ -36,7 +36,7 @@ def stars_of(path: Path, most: int) -> dict[str, Any] | None:
     counts: dict[str, int] = {}
     total, unit = 0, "e"
     with path.open(encoding="utf-8", newline="") as file:
-        head, rows = _opened(file)
+        head, rows = _read_ecsv(file)
         if any("'expected_e'" in line and "unit: adu" in line for line in head):
             unit = "ADU"
         for row in rows:
@@ -45,11 +45,11 @@ def stars_of(path: Path, most: int) -> dict[str, Any] | None:
             counts[status] = counts.get(status, 0) + 1
             if total <= most:
                 for name, column, decimals in STAR_COLUMNS:
-                    kept[name].append(_value(row.get(column) or "", decimals))
-    return {"total": total, "counts": counts, "unit": unit, "columns": _filled(kept)}
+                    kept[name].append(_text_or_number(row.get(column) or "", decimals))
+    return {"total": total, "counts": counts, "unit": unit, "columns": _without_empty(kept)}
 
 
-def _opened(file: Any) -> tuple[list[str], Iterator[dict[str, str]]]:
+def _read_ecsv(file: Any) -> tuple[list[str], Iterator[dict[str, str]]]:
     """ECSV's comment lines, and its rows."""
     head: list[str] = []
     for line in file:
@@ -60,7 +60,7 @@ def _opened(file: Any) -> tuple[list[str], Iterator[dict[str, str]]]:
     return head, iter(())
 
 
-def _value(text: str, decimals: int | None) -> Any:
+def _text_or_number(text: str, decimals: int | None) -> Any:
     if decimals is None:
         return text
     try:
@@ -70,7 +70,7 @@ def _value(text: str, decimals: int | None) -> Any:
     return int(number) if decimals == 0 or number == int(number) else number
 
 
-def _filled(columns: Columns) -> Columns:
+def _without_empty(columns: Columns) -> Columns:
     """Without the columns that hold nothing."""
     return {name: values for name, values in columns.items() if any(value not in (None, "") for value in values)}
 
@@ -80,7 +80,7 @@ MARGIN = 1.03  # beyond the map, for its edge
 BRIGHTEST = 215.0
 
 
-class Grounds:
+class TerrainsByName:
     """Terrains by the names that results give them, each loaded once; None where its file is not here."""
 
     def __init__(self) -> None:
@@ -124,8 +124,8 @@ def _relief(terrain: Terrain, half_m: float) -> str:
     """The ground's shape, lit from the north-west as maps are; see-through where a camera cannot stand."""
     halves_m, shape = (half_m, half_m), (RELIEF_CELLS, RELIEF_CELLS)
     ground_m, known = ground_cells(terrain, halves_m, shape)
-    grey = np.rint(BRIGHTEST * light_on(ground_m, known, halves_m)).astype(np.uint8)
-    cover = np.rint(255 * edge_of(known, shape)).astype(np.uint8)
+    grey = np.rint(BRIGHTEST * hill_shading(ground_m, known, halves_m)).astype(np.uint8)
+    cover = np.rint(255 * edge_cover(known, shape)).astype(np.uint8)
     return data_uri(np.stack([grey, grey, grey, cover], axis=-1))
 
 
@@ -146,7 +146,7 @@ def picture_of(picture: Path, wcs: Path, record: dict[str, Any], longest_px: int
     if whole is None or whole.shape[1] <= PANEL_WIDTH:
         return None
     size_px = image_size(wcs, record)
-    sky, known = _sky(np.asarray(whole, dtype=np.uint8), size_px)
+    sky, known = _sky_part(np.asarray(whole, dtype=np.uint8), size_px)
     shrink = min(1.0, longest_px / max(sky.shape[:2]))
     if shrink < 1:
         size = tuple(max(1, round(n * shrink)) for n in sky.shape[1::-1])
@@ -185,12 +185,12 @@ def data_uri(pixels: NDArray[np.uint8]) -> str:
     return f"data:image/webp;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
 
 
-def _sky(whole: NDArray[np.uint8], size_px: tuple[int, int] | None) -> tuple[NDArray[np.uint8], bool]:
-    """The part of the annotated picture that shows the exposure, and whether it is exactly that part."""
+def _sky_part(whole: NDArray[np.uint8], size_px: tuple[int, int] | None) -> tuple[NDArray[np.uint8], bool]:
+    """The part of the annotated picture that shows the exposure, and whether it shows nothing else."""
     left = whole[:, : whole.shape[1] - PANEL_WIDTH]
     if size_px is None:
         return left, False
-    _, (width, height) = fitted(size_px)
+    _, (width, height) = fit_to_canvas(size_px)
     if width != left.shape[1] or height > left.shape[0]:
         return left, False
     top = (left.shape[0] - height) // 2

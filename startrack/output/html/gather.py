@@ -96,10 +96,10 @@ def _record(path: Path) -> dict[str, Any]:
         raise ValueError(f"no JSON, or not all of it ({cause})") from cause
     if not isinstance(record, dict):
         raise ValueError("holds no JSON object")
-    spoilt = [key for key in ("image", "status") if not isinstance(record.get(key), str)]
-    spoilt += [] if isinstance(record.get("reason"), str | None) else ["reason"]
-    if spoilt:
-        raise ValueError(f"{', '.join(spoilt)}: missing or no text")
+    invalid = [key for key in ("image", "status") if not isinstance(record.get(key), str)]
+    invalid += [] if isinstance(record.get("reason"), str | None) else ["reason"]
+    if invalid:
+        raise ValueError(f"{', '.join(invalid)}: missing or no text")
     return record
 
 

@@ -22,17 +22,19 @@ MESSAGE_LETTERS = 400
 def row_of(found: Found, real: Place | None, detailed: bool) -> list[Any]:
     """The values of COLUMNS, None where there is none."""
     record = found.record
-    position, stars, provenance = (part(record, key) for key in ("position", "stars", "provenance"))
-    place = number(position, "east_m"), number(position, "north_m")
+    position, stars, provenance = (section_of(record, key) for key in ("position", "stars", "provenance"))
+    place = number_of(position, "east_m"), number_of(position, "north_m")
     covariance = _covariance(position)
-    error_m, nees = _error(place, covariance, real)
+    error_m, nees = _error_and_nees(place, covariance, real)
+    east_m, north_m = real or (None, None)
     return [
         record["image"], found.stem, record["status"], record.get("reason"),
         str(record.get("message") or "")[:MESSAGE_LETTERS], provenance.get("time_utc"), provenance.get("terrain"),
-        *(rounded(value, 4) for value in covariance or (None,) * 3), rounded(number(position, "radius999_m"), 2),
-        rounded(number(stars, "rms_px"), 3), rounded(_seconds(record), 3),
-        *((rounded(real[0], 2), rounded(real[1], 2)) if real else (None, None)), rounded(error_m, 2), rounded(nees, 3),
-        *(_listed(record, one) for one in LISTED), found.kind, detailed,
+        *(round_or_none(value, 4) for value in covariance or (None,) * 3),
+        round_or_none(number_of(position, "radius999_m"), 2), round_or_none(number_of(stars, "rms_px"), 3),
+        round_or_none(_seconds(record), 3), round_or_none(east_m, 2), round_or_none(north_m, 2),
+        round_or_none(error_m, 2), round_or_none(nees, 3), *(_listed(record, one) for one in LISTED),
+        found.kind, detailed,
     ]  # fmt: skip
 
 
@@ -49,7 +51,7 @@ def facts_of(record: Mapping[str, Any]) -> list[list[Any]]:
     """The quantities of a record for people: title of each group, and its rows of a name and a text."""
     groups = (("Position", ("position",)), ("Attitude", ("attitude",)), ("Stars", ("stars", "sky")))
     at = at_record(record)
-    found = [(title, rows("page", at, sections)) for title, sections in groups if part(record, sections[0])]
+    found = [(title, rows("page", at, sections)) for title, sections in groups if section_of(record, sections[0])]
     return [[title, [[name, text.replace("-", "−")] for name, text in facts]] for title, facts in found]
 
 
@@ -64,16 +66,16 @@ def errors_of(table: Sequence[Sequence[Any]]) -> dict[str, Any] | None:
     middle = len(errors) // 2
     return {
         "count": len(known),
-        "mean_m": rounded(sum(errors) / len(errors), 3),
-        "median_m": rounded(errors[middle] if len(errors) % 2 else (errors[middle - 1] + errors[middle]) / 2, 3),
+        "mean_m": round_or_none(sum(errors) / len(errors), 3),
+        "median_m": round_or_none(errors[middle] if len(errors) % 2 else (errors[middle - 1] + errors[middle]) / 2, 3),
         "largest_m": errors[-1],
-        "mean_nees": rounded(sum(nees) / len(nees), 3) if nees else None,
-        "inside95": _inside(known, at["error_m"], at["radius95_m"]),
-        "inside999": _inside(known, at["error_m"], at["radius999_m"]),
+        "mean_nees": round_or_none(sum(nees) / len(nees), 3) if nees else None,
+        "inside95": _fraction_inside(known, at["error_m"], at["radius95_m"]),
+        "inside999": _fraction_inside(known, at["error_m"], at["radius999_m"]),
     }
 
 
-def chosen(found: Sequence[Found], most: int) -> set[int]:
+def images_with_details(found: Sequence[Found], most: int) -> set[int]:
     """Which images get their details: those that were not solved first, up to half of `most`, then the others."""
     unsolved = [k for k, one in enumerate(found) if one.record["status"] != "ok"]
     solved = [k for k, one in enumerate(found) if one.record["status"] == "ok"]
@@ -81,13 +83,13 @@ def chosen(found: Sequence[Found], most: int) -> set[int]:
     return set(first + solved[: most - len(first)])
 
 
-def part(record: Mapping[str, Any], key: str) -> dict[str, Any]:
+def section_of(record: Mapping[str, Any], key: str) -> dict[str, Any]:
     """A dictionary within a record, empty where there is none."""
     value = record.get(key)
     return value if isinstance(value, dict) else {}
 
 
-def number(d: Mapping[str, Any], key: str) -> float | None:
+def number_of(d: Mapping[str, Any], key: str) -> float | None:
     """A finite number of a record, or None."""
     value = d.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -95,13 +97,13 @@ def number(d: Mapping[str, Any], key: str) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def rounded(value: float | None, decimals: int) -> float | None:
+def round_or_none(value: float | None, decimals: int) -> float | None:
     """Rounded, None staying None."""
     return None if value is None else round(value, decimals)
 
 
 def _listed(record: Mapping[str, Any], one: Quantity) -> float | int | None:
-    value = number(part(record, one.section), one.key)
+    value = number_of(section_of(record, one.section), one.key)
     if value is None or one.listed is None or one.listed.decimals == 0:
         return None if value is None else round(value)
     return round(value, one.listed.decimals + 1)
@@ -116,7 +118,7 @@ def _covariance(position: dict[str, Any]) -> tuple[float, float, float] | None:
         return None
 
 
-def _error(
+def _error_and_nees(
     place: tuple[float | None, float | None], covariance: tuple[float, float, float] | None, real: Place | None
 ) -> tuple[float | None, float | None]:
     """Distance from the true place [m] and NEES, e^T C^-1 e."""
@@ -129,11 +131,11 @@ def _error(
     return math.hypot(east, north), nees
 
 
-def _inside(known: Sequence[Sequence[Any]], error: int, radius: int) -> float | None:
+def _fraction_inside(known: Sequence[Sequence[Any]], error: int, radius: int) -> float | None:
     held = [row[error] <= row[radius] for row in known if row[radius] is not None]
-    return rounded(sum(held) / len(held), 4) if held else None
+    return round_or_none(sum(held) / len(held), 4) if held else None
 
 
 def _seconds(record: Mapping[str, Any]) -> float | None:
-    times = part(record, "timing_ms")
-    return sum(number(times, stage) or 0.0 for stage in times) / 1e3 if times else None
+    times = section_of(record, "timing_ms")
+    return sum(number_of(times, stage) or 0.0 for stage in times) / 1e3 if times else None

@@ -12,9 +12,19 @@ from urllib.parse import quote
 
 from startrack.errors import Reason
 from startrack.files import write_atomically
-from startrack.output.html.details import Grounds, ground_map, horizon_deg, picture_of, stars_of
+from startrack.output.html.details import TerrainsByName, ground_map, horizon_deg, picture_of, stars_of
 from startrack.output.html.gather import Found, folder_of
-from startrack.output.html.rows import COLUMNS, Place, chosen, errors_of, facts_of, headings, number, part, row_of
+from startrack.output.html.rows import (
+    COLUMNS,
+    Place,
+    errors_of,
+    facts_of,
+    headings,
+    images_with_details,
+    number_of,
+    row_of,
+    section_of,
+)
 
 HERE = Path(__file__).parent
 STYLES = ("page.css",)
@@ -38,7 +48,7 @@ def write_page(
 
     The other arguments are those of `page_text`: `found`, `unread`, `real`, `images` and `single`.
     """
-    base = _address(folder_of(found[0]), Path(path).parent)
+    base = _relative_url(folder_of(found[0]), Path(path).parent)
     text = page_text(found, unread=unread, real=real, images=images, single=single, base=base)
     write_atomically(path, text.encode("utf-8", "replace"), overwrite=True)
 
@@ -62,11 +72,11 @@ def page_text(
         single: whether the page is about one image, without a list.
         base: the folder of the results as the page sees it.
     """
-    real, grounds = real or {}, Grounds()
-    detailed = chosen(found, images)
+    real, terrains = real or {}, TerrainsByName()
+    detailed = images_with_details(found, images)
     rows = [row_of(one, real.get(one.stem), k in detailed) for k, one in enumerate(found)]
     size = LARGE if len(detailed) <= FEW else SMALL
-    details = {k: _detail(found[k], grounds, size) for k in sorted(detailed)}
+    details = {k: _detail(found[k], terrains, size) for k in sorted(detailed)}
     head = {
         "columns": COLUMNS,
         "rows": rows,
@@ -76,11 +86,14 @@ def page_text(
         "unread": list(unread),
         "errors": errors_of(rows),
         "words": {one.value: (one.meaning, one.advice) for one in Reason if one in {row[3] for row in rows}},
-        "terrains": _terrains(found, grounds),
+        "terrains": _terrains(found, terrains),
     }
     title = f"{found[0].record['image']} · startrack" if head["single"] else f"{len(found):,} images · startrack"
     frame = (HERE / "page.html").read_text(encoding="utf-8")
-    data = [_data("results", head), *(_data(f"detail-{k}", detail) for k, detail in details.items())]
+    data = [
+        _script_of_data("results", head),
+        *(_script_of_data(f"detail-{k}", detail) for k, detail in details.items()),
+    ]
     parts = {
         "TITLE": html.escape(title),
         "STYLE": "".join((HERE / name).read_text(encoding="utf-8") for name in STYLES),
@@ -91,7 +104,7 @@ def page_text(
     return "".join(parts.get(piece, piece) for piece in pieces)
 
 
-def _address(folder: Path, seen_from: Path) -> str:
+def _relative_url(folder: Path, seen_from: Path) -> str:
     """Of one folder for links of a page in another; whole where no relative one exists (another drive)."""
     try:
         return quote(Path(os.path.relpath(folder, seen_from)).as_posix())
@@ -99,7 +112,7 @@ def _address(folder: Path, seen_from: Path) -> str:
         return folder.absolute().as_uri()
 
 
-def _detail(found: Found, grounds: Grounds, size: tuple[int, int, int]) -> dict[str, Any]:
+def _detail(found: Found, terrains: TerrainsByName, size: tuple[int, int, int]) -> dict[str, Any]:
     record = found.record
     longest_px, stars, azimuths = size
     return {
@@ -107,36 +120,36 @@ def _detail(found: Found, grounds: Grounds, size: tuple[int, int, int]) -> dict[
         "facts": facts_of(record),
         "picture": picture_of(found.beside(".annotated.png"), found.beside(".wcs"), record, longest_px),
         "stars": stars_of(found.beside(".stars.ecsv"), stars),
-        "horizon": _horizon(record, grounds, azimuths),
+        "horizon": _horizon(record, terrains, azimuths),
         "files": [found.path.name, *(found.beside(end).name for end in FILES if found.beside(end).is_file())],
     }
 
 
-def _horizon(record: dict[str, Any], grounds: Grounds, azimuths: int) -> list[float] | None:
+def _horizon(record: dict[str, Any], terrains: TerrainsByName, azimuths: int) -> list[float] | None:
     """Of the position, or of the likeliest place; None without a place or where the terrain is not here."""
     modes = record.get("modes")
-    place = part(record, "position") or (modes[0] if isinstance(modes, list) and modes else {})
-    east, north = number(place, "east_m"), number(place, "north_m")
+    place = section_of(record, "position") or (modes[0] if isinstance(modes, list) and modes else {})
+    east, north = number_of(place, "east_m"), number_of(place, "north_m")
     name = _terrain_name(record)
-    terrain = grounds.terrain(name) if name and east is not None and record["status"] != "refused" else None
+    terrain = terrains.terrain(name) if name and east is not None and record["status"] != "refused" else None
     if terrain is None or east is None or north is None:
         return None
     return horizon_deg(terrain, east, north, azimuths)
 
 
-def _terrains(found: Sequence[Found], grounds: Grounds) -> dict[str, Any]:
+def _terrains(found: Sequence[Found], terrains: TerrainsByName) -> dict[str, Any]:
     """The maps of all terrains that results name and that are here."""
     names = sorted({name for one in found if (name := _terrain_name(one.record))})
-    known = {name: grounds.terrain(name) for name in names}
+    known = {name: terrains.terrain(name) for name in names}
     return {name: ground_map(terrain) for name, terrain in known.items() if terrain is not None}
 
 
 def _terrain_name(record: dict[str, Any]) -> str | None:
-    name = part(record, "provenance").get("terrain")
+    name = section_of(record, "provenance").get("terrain")
     return name if isinstance(name, str) else None
 
 
-def _data(name: str, value: Any) -> str:
+def _script_of_data(name: str, value: Any) -> str:
     """A script of data: `<` is written as an escape, so that no text in it can end the script."""
     text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     return f'<script type="application/json" id="{name}">{text}</script>'

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.output.picture.backdrop import View, backdrop, fitted
+from startrack.output.picture.backdrop import View, backdrop, fit_to_canvas
 from startrack.output.picture.canvas import (
     BODY,
     DETECTION,
@@ -23,7 +23,7 @@ from startrack.output.picture.canvas import (
     Canvas,
     Colour,
     text_width,
-    wrapped,
+    wrap_text,
 )
 from startrack.output.picture.maps import draw_leaders, draw_overview, draw_residuals, draw_zoom
 from startrack.output.picture.marks import (
@@ -37,7 +37,7 @@ from startrack.output.picture.marks import (
 )
 from startrack.output.record import image_name
 from startrack.output.views import Rows, at_stage, rows
-from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented, Outcome, reached
+from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented, Outcome, last_value
 
 PANEL_WIDTH, PANEL_HEIGHT = 620, 1160
 MARGIN = 28
@@ -54,12 +54,12 @@ def draw_panel(canvas: Canvas, left: int, outcome: Outcome, truth_enu_m: tuple[f
     width, height = canvas.size
     canvas.rectangle((left, 0, width - 1, height - 1), PANEL)
     left, right = left + MARGIN, width - MARGIN
-    value = reached(outcome)
+    value = last_value(outcome)
     facts, legend = _facts(value), _legend(value, truth_enu_m is not None)
     legend_top = height - MARGIN - LEGEND_STEP * len(legend) - 14
-    top = _header(canvas, left, right, outcome)
+    top = _draw_header(canvas, left, right, outcome)
     room = (left, top, right, legend_top - 30 - FACT_STEP * len(facts))
-    y = _figures(canvas, room, value, truth_enu_m)
+    y = _draw_figures(canvas, room, value, truth_enu_m)
     for name, fact in facts:
         y += FACT_STEP
         canvas.text((left, y), name, FACT_SIZE, DIM_INK)
@@ -68,20 +68,20 @@ def draw_panel(canvas: Canvas, left: int, outcome: Outcome, truth_enu_m: tuple[f
         canvas.line([(left, legend_top), (right, legend_top)], FAINT_INK)
     for row, (kind, colour, text) in enumerate(legend):
         y = legend_top + 14 + LEGEND_STEP * (row + 1)
-        _sample(canvas, left + 12, y - 6, kind, colour)
+        _draw_legend_sample(canvas, left + 12, y - 6, kind, colour)
         canvas.text((left + 36, y), text, 17.0, DIM_INK)
 
 
-def _header(canvas: Canvas, left: float, right: float, outcome: Outcome) -> float:
+def _draw_header(canvas: Canvas, left: float, right: float, outcome: Outcome) -> float:
     """Name of the image, status, and the message of a result that is not ok; returns where the next thing may stand."""
     status = outcome.status.upper()
     badge = text_width(status, 20.0) + 28
     canvas.rectangle((right - badge, MARGIN, right, MARGIN + 36), STATUS[outcome.status])
     canvas.text((right - badge / 2, MARGIN + 18), status, 20.0, (255, 255, 255), "mm")
-    name = _shortened(image_name(outcome.exposure), 27.0, right - left - badge - 20)
+    name = _shorten_text(image_name(outcome.exposure), 27.0, right - left - badge - 20)
     canvas.text((left, MARGIN + 28), name, 27.0, INK)
     y = float(MARGIN + 36 + 28)
-    canvas.text((left, y), _shortened(_setting(reached(outcome)), 17.0, right - left), 17.0, DIM_INK)
+    canvas.text((left, y), _shorten_text(_inputs_text(last_value(outcome)), 17.0, right - left), 17.0, DIM_INK)
     y += 18
     if outcome.status == "ok":
         return y
@@ -89,13 +89,13 @@ def _header(canvas: Canvas, left: float, right: float, outcome: Outcome) -> floa
     reason = (outcome.reason or "").replace("_", " ")
     canvas.text((left, y + 14), reason, 22.0, STATUS[outcome.status])
     y += 26
-    for line in wrapped(outcome.message, 20.0, right - left)[:8]:
+    for line in wrap_text(outcome.message, 20.0, right - left)[:8]:
         y += 28
         canvas.text((left, y - 6), line, 20.0, INK)
     return y + 16
 
 
-def _setting(value: Inputs) -> str:
+def _inputs_text(value: Inputs) -> str:
     """Camera, terrain and exposure in words."""
     camera, terrain, exposure_s = value.camera, value.terrain, value.exposure.exposure_s
     parts = [f"camera {camera.name}"] if camera is not None else []
@@ -104,7 +104,7 @@ def _setting(value: Inputs) -> str:
     return "   ".join(parts)
 
 
-def _figures(canvas: Canvas, room: Box, value: Inputs, truth: tuple[float, float] | None) -> float:
+def _draw_figures(canvas: Canvas, room: Box, value: Inputs, truth: tuple[float, float] | None) -> float:
     """Maps where there is a terrain, else residuals; returns where the next thing may stand."""
     left, top, right, bottom = room
     zoomed = isinstance(value, Located) and not value.fix.ambiguous
@@ -160,7 +160,7 @@ def _legend(value: Inputs, truth: bool) -> list[tuple[str, Colour, str]]:
     return found
 
 
-def _sample(canvas: Canvas, x: float, y: float, kind: str, colour: Colour) -> None:
+def _draw_legend_sample(canvas: Canvas, x: float, y: float, kind: str, colour: Colour) -> None:
     if kind == "ring":
         canvas.circle((x, y), 7.0, colour, 2)
     elif kind == "cross":
@@ -174,7 +174,7 @@ def _sample(canvas: Canvas, x: float, y: float, kind: str, colour: Colour) -> No
         canvas.circle((x, y), 8.0, colour, 2)
 
 
-def _shortened(text: str, size: float, width: float) -> str:
+def _shorten_text(text: str, size: float, width: float) -> str:
     """The text, or as much of its start and end as there is room for."""
     if text_width(text, size) <= width:
         return text
@@ -186,8 +186,8 @@ def _shortened(text: str, size: float, width: float) -> str:
 
 def annotate(outcome: Outcome, truth_enu_m: tuple[float, float] | None = None) -> NDArray[np.uint8]:
     """The picture (H, W, 3), red, green, blue. Parts that were not reached are left out; `truth_enu_m` is optional."""
-    value = reached(outcome)
-    scale, size = fitted(value.exposure.size_px)
+    value = last_value(outcome)
+    scale, size = fit_to_canvas(value.exposure.size_px)
     height = max(size[1], PANEL_HEIGHT)
     canvas = Canvas(size[0] + PANEL_WIDTH, height)
     view = View(scale, (0.0, float((height - size[1]) // 2)), size)
@@ -200,4 +200,4 @@ def annotate(outcome: Outcome, truth_enu_m: tuple[float, float] | None = None) -
     draw_bodies(canvas, view, value)
     name_stars(canvas, view, value)
     draw_panel(canvas, size[0], outcome, truth_enu_m)
-    return canvas.finished()
+    return canvas.rendered_pixels()

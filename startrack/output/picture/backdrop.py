@@ -50,7 +50,7 @@ class View:
         return x, y, x + self.size[0] - 1, y + self.size[1] - 1
 
 
-def fitted(size_px: tuple[int, int]) -> tuple[float, tuple[int, int]]:
+def fit_to_canvas(size_px: tuple[int, int]) -> tuple[float, tuple[int, int]]:
     """Scale, and size (W, H) of an exposure on the canvas."""
     scale = LONGEST_SIDE_PX / max(size_px)
     if scale > 1:  # small frames grow only until they can be read
@@ -65,8 +65,8 @@ def backdrop(value: Inputs, size: tuple[int, int], wall: Image | None = None) ->
     """
     inside_px = np.full(size[::-1], np.inf, dtype=np.float32)
     if value.camera is not None and value.camera.size_px == value.exposure.size_px:
-        inside_px = _inside_px(value.camera, size)
-    sky, light = _layers(value, size, inside_px > EDGE_PX)
+        inside_px = _distance_to_edge_px(value.camera, size)
+    sky, light = _background_and_light(value, size, inside_px > EDGE_PX)
     # Next to the circle's edge the background is not known well, and what is left of it is no light.
     light *= np.clip(inside_px / np.float32(EDGE_PX), 0, 1)
     shade = None if wall is None else wall * np.float32(WALL_SHADE)
@@ -81,14 +81,14 @@ def backdrop(value: Inputs, size: tuple[int, int], wall: Image | None = None) ->
     return np.asarray(cv2.merge(channels))
 
 
-def _layers(value: Inputs, size: tuple[int, int], inside: Bools) -> tuple[Image, Image]:
+def _background_and_light(value: Inputs, size: tuple[int, int], inside: Bools) -> tuple[Image, Image]:
     """Smooth background and point-like light, each (H, W) from 0 to 1; the background is known `inside` (H, W).
 
     The detector's background bridges the skyline in blocks; a median as wide as some stars keeps the skyline's step.
     """
     scale = size[0] / value.exposure.size_px[0]
     width_px = scale * (value.detections.psf_sigma_px if isinstance(value, Detected) else 1.0)
-    pixels = _resized(without_hot_pixels(value.exposure.pixels_adu, width_px / scale), size)
+    pixels = _resize(remove_hot_pixels(value.exposure.pixels_adu, width_px / scale), size)
     image = np.asarray(cv2.GaussianBlur(pixels, (0, 0), float(np.clip(width_px, *SMOOTHING_PX))), dtype=np.float32)
     sample, known = image[::SAMPLE, ::SAMPLE], inside[::SAMPLE, ::SAMPLE]
     low, high = (float(level) for level in np.percentile(sample[known] if known.any() else sample, [0.5, 99.0]))
@@ -107,8 +107,8 @@ def _layers(value: Inputs, size: tuple[int, int], inside: Bools) -> tuple[Image,
     return np.clip(sky, 0, 1), np.power(light, np.float32(0.75))
 
 
-def without_hot_pixels(pixels_adu: Image, psf_sigma_px: float) -> Image:
-    """The exposure with lone bright pixels, sharper than any star can be, made as dark as those around them."""
+def remove_hot_pixels(pixels_adu: Image, psf_sigma_px: float) -> Image:
+    """The exposure with lone bright pixels, sharper than any star, replaced by the median of their neighbours."""
     if psf_sigma_px < LEAST_PSF_PX:
         return pixels_adu
     middle = np.asarray(cv2.medianBlur(pixels_adu, 3), dtype=np.float32)
@@ -120,7 +120,7 @@ def without_hot_pixels(pixels_adu: Image, psf_sigma_px: float) -> Image:
     return np.asarray(np.where(lone, middle, pixels_adu), dtype=np.float32)
 
 
-def _inside_px(camera: Camera, size: tuple[int, int]) -> Image:
+def _distance_to_edge_px(camera: Camera, size: tuple[int, int]) -> Image:
     """Distance to the edge of the image circle (H, W) [canvas px], negative beyond it."""
     edge = camera.lens.rho(np.array(min(camera.max_angle_rad, camera.lens.max_invertible_rad)))
     scale = size[0] / camera.size_px[0]
@@ -132,6 +132,6 @@ def _inside_px(camera: Camera, size: tuple[int, int]) -> Image:
     return np.asarray((np.float32(edge) - radius) * np.float32(min(camera.focal_px) * scale))
 
 
-def _resized(image: Image, size: tuple[int, int]) -> Image:
+def _resize(image: Image, size: tuple[int, int]) -> Image:
     smaller = size[0] <= image.shape[1]
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR))

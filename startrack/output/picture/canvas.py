@@ -48,7 +48,7 @@ FLOOR: Colour = (27, 36, 51)
 STATUS: dict[str, Colour] = {"ok": BLUISH_GREEN, "ambiguous": ORANGE, "refused": VERMILLION}
 
 
-def mixed(a: Colour, b: Colour, part_of_b: float) -> Colour:
+def mix_colours(a: Colour, b: Colour, part_of_b: float) -> Colour:
     """Colour between a and b."""
     r, g, blue = (round((1 - part_of_b) * x + part_of_b * y) for x, y in zip(a, b, strict=True))
     return r, g, blue
@@ -77,7 +77,7 @@ class Canvas:
         self.pixels: NDArray[np.uint8] = np.full((height, width, 3), colour, dtype=np.uint8)
         self._origin = np.zeros(2)
         self._texts: list[_Text] = []
-        self._taken: list[Box] = []
+        self._occupied: list[Box] = []
 
     def window(self, box: Box) -> Canvas:
         """The same picture, in the same places, with shapes clipped to the box."""
@@ -162,7 +162,7 @@ class Canvas:
         y += {"t": rise, "m": (rise - fall) / 2 + 0.06 * size, "s": 0.0}[anchor[1]]
         box = x, y - rise, x + width, y + fall
         self._texts.append(_Text((x, y), text, size, colour, halo))
-        self._taken.append(box)
+        self._occupied.append(box)
         return box
 
     def label(self, at: ArrayLike, text: str, size: float, colour: Colour, gap: float, within: Box) -> bool:
@@ -185,17 +185,17 @@ class Canvas:
 
     def is_free(self, box: Box) -> bool:
         """Whether no text and nothing kept free overlaps the box."""
-        return not any(_overlap(box, taken) for taken in self._taken)
+        return not any(_boxes_overlap(box, taken) for taken in self._occupied)
 
-    def keep_free(self, box: Box) -> None:
+    def reserve(self, box: Box) -> None:
         """Keep labels away from a box."""
-        self._taken.append(box)
+        self._occupied.append(box)
 
     def _fixed(self, points: ArrayLike) -> NDArray[np.int32]:
         places = np.clip(np.asarray(points, dtype=float) - self._origin, -FARTHEST_PX, FARTHEST_PX)
         return np.rint(places * 2**SHIFT_BITS).astype(np.int32)
 
-    def finished(self) -> NDArray[np.uint8]:
+    def rendered_pixels(self) -> NDArray[np.uint8]:
         """The pixels with all texts."""
         from PIL import Image, ImageDraw
 
@@ -207,7 +207,7 @@ class Canvas:
         return np.asarray(picture)
 
 
-def around(centre: ArrayLike, half: float) -> Box:
+def box_around(centre: ArrayLike, half: float) -> Box:
     """The box of the given half size about a place."""
     x, y = (float(c) for c in np.asarray(centre, dtype=float))
     return x - half, y - half, x + half, y + half
@@ -216,7 +216,7 @@ def around(centre: ArrayLike, half: float) -> Box:
 def printable(text: str) -> str:
     """The text in the letters that the font has: accents are dropped, other unknown letters become question marks."""
     letters = unicodedata.normalize("NFKD", text.replace("\N{MINUS SIGN}", "-"))
-    return "".join(_plain(letter) for letter in letters if not unicodedata.combining(letter))
+    return "".join(_ascii_letter(letter) for letter in letters if not unicodedata.combining(letter))
 
 
 def text_width(text: str, size: float) -> float:
@@ -224,7 +224,7 @@ def text_width(text: str, size: float) -> float:
     return float(_font(size).getlength(text))
 
 
-def wrapped(text: str, size: float, width: float) -> list[str]:
+def wrap_text(text: str, size: float, width: float) -> list[str]:
     """The text's words in lines no wider than `width` [px], but for a word that alone is wider."""
     lines: list[str] = []
     for word in printable(text).split():
@@ -236,7 +236,7 @@ def wrapped(text: str, size: float, width: float) -> list[str]:
     return lines
 
 
-def _plain(letter: str) -> str:
+def _ascii_letter(letter: str) -> str:
     if letter.isascii():
         return letter if letter.isprintable() else " "
     return letter if letter in KNOWN_BEYOND_ASCII else "?"
@@ -262,5 +262,5 @@ def _inside(box: Box, outer: Box) -> bool:
     return box[0] >= outer[0] and box[1] >= outer[1] and box[2] <= outer[2] and box[3] <= outer[3]
 
 
-def _overlap(a: Box, b: Box) -> bool:
+def _boxes_overlap(a: Box, b: Box) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]

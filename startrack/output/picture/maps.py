@@ -20,9 +20,9 @@ from startrack.output.picture.canvas import (
     TRUTH,
     Box,
     Canvas,
-    mixed,
+    mix_colours,
 )
-from startrack.output.picture.relief import ground_on, shade
+from startrack.output.picture.relief import draw_relief, ground_of_view
 from startrack.terrain import Terrain
 from startrack.types import Array, Fix
 
@@ -72,8 +72,8 @@ def draw_overview(
     if rim:
         window.circle(view.middle, rim / view.metres_per_px, FLOOR, -1)
     else:
-        shade(window, view, *ground_on(view, terrain, (window.size[1], window.size[0])))
-    _grid(window, view)
+        draw_relief(window, view, *ground_of_view(view, terrain, (window.size[1], window.size[0])))
+    _draw_grid(window, view)
     if rim:
         window.circle(view.middle, rim / view.metres_per_px, DIM_INK, 2)
     if abs(terrain.search_radius_m - rim) > 0.01 * rim:
@@ -87,7 +87,7 @@ def draw_overview(
             window.circle(place, 9.0, POSITION, 2)
             if ambiguous:
                 canvas.label(place, f"{k + 1}: {100 * mode.weight:.0f} %", CAPTION_SIZE, INK, 14.0, box)
-    _furniture(canvas, view, "search area, north up")
+    _draw_frame(canvas, view, "search area, north up")
     return view
 
 
@@ -100,16 +100,16 @@ def draw_zoom(canvas: Canvas, box: Box, fix: Fix, truth: ArrayLike | None) -> Ma
     view = map_view(box, place, half)
     window = canvas.window(box)
     window.rectangle(box, MAP)
-    _grid(window, view)
+    _draw_grid(window, view)
     ellipse = view.at(_ellipse(place, fix.covariance_m2))
-    window.area(ellipse, mixed(MAP, POSITION, 0.35))
-    window.line(ellipse, mixed(MAP, POSITION, 0.8))
+    window.area(ellipse, mix_colours(MAP, POSITION, 0.35))
+    window.line(ellipse, mix_colours(MAP, POSITION, 0.8))
     window.circle(view.at(place), fix.radius95_m / view.metres_per_px, POSITION, 2)
     window.plus(view.at(place), 8.0, INK, 2)
     if truth is not None and bool(np.all(np.abs(np.subtract(truth, place)) < view.half_m)):
         window.plus(view.at(truth), 9.0, TRUTH, 2)
         canvas.label(view.at(truth), "truth", CAPTION_SIZE, TRUTH, 14.0, box)
-    _furniture(canvas, view, f"95 % within {fix.radius95_m:.3g} m")
+    _draw_frame(canvas, view, f"95 % within {fix.radius95_m:.3g} m")
     return view
 
 
@@ -151,7 +151,7 @@ def grid_lines_m(view: MapView, axis: int) -> Array:
     return np.arange(np.ceil(low / step), high / step) * step
 
 
-def _grid(window: Canvas, view: MapView) -> None:
+def _draw_grid(window: Canvas, view: MapView) -> None:
     low, high = view.centre_m - view.half_m, view.centre_m + view.half_m
     for axis in (0, 1):
         for value in grid_lines_m(view, axis):
@@ -160,7 +160,7 @@ def _grid(window: Canvas, view: MapView) -> None:
             window.line(view.at(ends), GRID)
 
 
-def _furniture(canvas: Canvas, view: MapView, caption: str) -> None:
+def _draw_frame(canvas: Canvas, view: MapView, caption: str) -> None:
     """Frame, caption and scale bar."""
     left, top, right, bottom = view.box
     canvas.rectangle(view.box, FAINT_INK, 1)
@@ -189,7 +189,7 @@ def draw_residuals(canvas: Canvas, box: Box, fit: AttitudeFit) -> None:
     window.line([(left, middle[1]), (right, middle[1])], GRID)
     window.line([(middle[0], top), (middle[0], bottom)], GRID)
     for place in middle + scale * residual_px:
-        window.circle(place, 2.0, mixed(IDENTIFIED, INK, 0.15), -1)
+        window.circle(place, 2.0, mix_colours(IDENTIFIED, INK, 0.15), -1)
     canvas.rectangle(box, FAINT_INK, 1)
     canvas.text((left + 12, top + 12), "measured minus predicted", CAPTION_SIZE, DIM_INK, "lt", halo=True)
     canvas.text(

@@ -18,8 +18,8 @@ from startrack.output.picture.canvas import (
     INK,
     SKYLINE,
     Canvas,
-    around,
-    mixed,
+    box_around,
+    mix_colours,
 )
 from startrack.output.star_table import names_of, status_of
 from startrack.output.values import R_body_enu, place_m
@@ -48,16 +48,16 @@ def draw_detections(canvas: Canvas, view: View, value: Inputs) -> None:
     strength = np.clip(np.log(np.maximum(found.snr, 5.0) / 5.0) / np.log(BRIGHT_SNR / 5.0), 0, 1)
     places = view.at(found.xy_px)
     # The bright ones last, on top; the faint ones dim, so that a thousand of them do not drown the stars.
-    shown = identified | _imaged(value, found.xy_px)
+    shown = identified | _is_within_image_circle(value, found.xy_px)
     for k in reversed(range(min(len(found), MOST_CIRCLES))):
         if not shown[k]:
             continue
         colour = IDENTIFIED if identified[k] else DETECTION
         faint = FAINT_RING * (1.0 - float(strength[k]))
-        canvas.circle(places[k], 4.5 + 5.5 * float(strength[k]), mixed(colour, BACKDROP, faint))
+        canvas.circle(places[k], 4.5 + 5.5 * float(strength[k]), mix_colours(colour, BACKDROP, faint))
 
 
-def _imaged(value: Inputs, xy_px: Array) -> Bools:
+def _is_within_image_circle(value: Inputs, xy_px: Array) -> Bools:
     """Whether light of the lens can reach the pixels (n, 2); all, where the camera is not known."""
     if value.camera is None or value.camera.size_px != value.exposure.size_px:
         return np.ones(len(xy_px), dtype=bool)
@@ -66,11 +66,11 @@ def _imaged(value: Inputs, xy_px: Array) -> Bools:
 
 def draw_hidden(canvas: Canvas, view: View, value: Inputs) -> None:
     """A cross at each of the brighter stars that ought to shine there and do not."""
-    _, xy_px = _hidden(value)
+    _, xy_px = _hidden_stars(value)
     places = view.at(xy_px[:MOST_CROSSES])
     for rank, place in enumerate(places):
         weight = 1.0 - rank / max(len(places), 1)
-        colour = mixed(HIDDEN, BACKDROP, 0.35 * (1.0 - weight))
+        colour = mix_colours(HIDDEN, BACKDROP, 0.35 * (1.0 - weight))
         canvas.cross(place, 3.5 + 3.0 * weight, colour, 2 if weight > 0.8 else 1)
 
 
@@ -85,7 +85,7 @@ def draw_bodies(canvas: Canvas, view: View, value: Inputs) -> None:
         below = _is_below_skyline(value, body.ray_icrs)
         if below and body.v_mag > DIMMEST_HIDDEN_V_MAG:
             continue
-        colour = mixed(BODY, BACKDROP, 0.4) if below else BODY
+        colour = mix_colours(BODY, BACKDROP, 0.4) if below else BODY
         at = view.at(xy_px)
         canvas.circle(at, 6.0 if below else 9.0, colour, 2)
         text, size = (f"{body.name} (hidden)", 0.85 * NAME_SIZE) if below else (body.name, NAME_SIZE)
@@ -100,14 +100,14 @@ def name_stars(canvas: Canvas, view: View, value: Inputs) -> None:
     star = value.identification.star[order]
     xy_px = value.detections.xy_px[value.identification.detection[order]]
     seen = _names_at(value, star, xy_px, MOST_NAMES)
-    hidden = _names_at(value, *_hidden(value), MOST_HIDDEN_NAMES)
+    hidden = _names_at(value, *_hidden_stars(value), MOST_HIDDEN_NAMES)
     for place, name in seen:
         canvas.label(view.at(place), name, NAME_SIZE, INK, 13.0, view.box)
     for place, name in hidden:
-        canvas.label(view.at(place), name, 0.9 * NAME_SIZE, mixed(HIDDEN, BACKDROP, 0.15), 11.0, view.box)
+        canvas.label(view.at(place), name, 0.9 * NAME_SIZE, mix_colours(HIDDEN, BACKDROP, 0.15), 11.0, view.box)
 
 
-def _hidden(value: Inputs) -> tuple[Ints, Array]:
+def _hidden_stars(value: Inputs) -> tuple[Ints, Array]:
     """Stars that are hidden, and their predicted pixels, brightest first."""
     if not isinstance(value, Measured):
         return np.empty(0, dtype=np.int64), np.empty((0, 2))
@@ -177,7 +177,7 @@ def draw_compass(canvas: Canvas, view: View, value: Inputs) -> None:
         ends = [_canvas_at(view, value, azimuth_rad, lowest + reach) for reach in (0.0, 2.2 if main else 1.2)]
         canvas.line(np.array(ends), INK if letter else DIM_INK if main else FAINT_INK, 2 if main else 1)
         at = _canvas_at(view, value, azimuth_rad, lowest + 5.0)
-        if main and not letter and canvas.is_free(around(at, 24.0)):
+        if main and not letter and canvas.is_free(box_around(at, 24.0)):
             canvas.text(at, str(azimuth_deg), 15.0, DIM_INK, "mm", halo=True)
 
 
@@ -192,11 +192,11 @@ def _draw_nose(canvas: Canvas, view: View, value: Measured) -> None:
         along = tip - _canvas_at(view, value, heading, lowest + further_in_deg + 6.0)
         along /= np.linalg.norm(along)
         base, name = tip - 26.0 * along, tip - 48.0 * along
-        if canvas.is_free(around(base, 20.0)) and canvas.is_free(around(name, 20.0)):
+        if canvas.is_free(box_around(base, 20.0)) and canvas.is_free(box_around(name, 20.0)):
             break
     across = np.array([-along[1], along[0]])
     canvas.area([tip, base + 12.0 * across, base + 5.0 * along, base - 12.0 * across], INK)
-    canvas.keep_free(around(0.5 * (tip + base), 20.0))
+    canvas.reserve(box_around(0.5 * (tip + base), 20.0))
     canvas.text(name, "forward", 17.0, INK, "mm", halo=True)
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from startrack.output.picture.canvas import DIM_INK, FLOOR, INK, MAP, SHIFT_BITS, Canvas, around
+from startrack.output.picture.canvas import DIM_INK, FLOOR, INK, MAP, SHIFT_BITS, Canvas, box_around
 from startrack.types import Array, Bools
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ LABELLED_PX = 90  # shorter contours get no label, those of twice the length and
 TRIED = 60  # places along a contour
 
 
-def ground_on(view: MapView, terrain: Terrain, shape: tuple[int, int]) -> tuple[Image, Bools]:
+def ground_of_view(view: MapView, terrain: Terrain, shape: tuple[int, int]) -> tuple[Image, Bools]:
     """Heights [m] of the cells of a map that is `shape` (H, W) pixels large, and where there is ground."""
     return ground_cells(terrain, view.half_m, tuple(max(2, n // CELL_PX) for n in shape))  # type: ignore[arg-type]
 
@@ -41,32 +41,32 @@ def ground_cells(terrain: Terrain, half_m: ArrayLike, shape: tuple[int, int]) ->
     return ground_m.reshape(shape), known.reshape(shape)
 
 
-def light_on(ground_m: Image, known: Bools, half_m: ArrayLike) -> Image:
+def hill_shading(ground_m: Image, known: Bools, half_m: ArrayLike) -> Image:
     """Light (H, W), 0 to 1, on cells lit from the north-west as maps are; carried some cells beyond the ground."""
     east_m, north_m = (2 * half / (n - 1) for half, n in zip(np.asarray(half_m), known.shape[::-1], strict=True))
     down, east = np.gradient(ground_m)
-    facing, inner = east / east_m + down / north_m, _inner(known)
+    facing, inner = east / east_m + down / north_m, _erode(known)
     steep = max(float(np.percentile(np.abs(facing[inner]), 95)) if inner.any() else 0.0, GENTLE_SLOPE)
     light = np.maximum(0.5 + 0.5 * np.tanh(1.2 * facing / steep), 0.05)
-    return _spread(light.astype(np.float32), inner)
+    return _extrapolate(light.astype(np.float32), inner)
 
 
-def edge_of(known: Bools, size: tuple[int, int]) -> Array:
+def edge_cover(known: Bools, size: tuple[int, int]) -> Array:
     """1 on known ground and 0 beside it, (H, W) of the given size (W, H), with a smooth edge."""
-    soft = _resized(np.asarray(cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.5)), size)
+    soft = _resize(np.asarray(cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.5)), size)
     return np.clip((soft - 0.5) * 4 + 0.5, 0, 1).astype(np.float64)
 
 
-def shade(window: Canvas, view: MapView, ground_m: Image, known: Bools) -> None:
+def draw_relief(window: Canvas, view: MapView, ground_m: Image, known: Bools) -> None:
     """The relief; the map's colour where there is no ground."""
     size = window.size
-    lit = (_resized(light_on(ground_m, known, view.half_m), size) * edge_of(known, size))[:, :, None]
+    lit = (_resize(hill_shading(ground_m, known, view.half_m), size) * edge_cover(known, size))[:, :, None]
     window.pixels[:] = (np.array(MAP) + lit * (RELIEF_LIGHT * np.array(FLOOR) - MAP)).astype(np.uint8)
 
 
 def draw_contours(canvas: Canvas, window: Canvas, view: MapView, ground_m: Image, known: Bools) -> float | None:
     """Contours with their heights [m]; their step [m], or None where the ground is flat."""
-    inner = _inner(known)
+    inner = _erode(known)
     if not inner.any():
         return None
     low, high = float(ground_m[inner].min()), float(ground_m[inner].max())
@@ -74,22 +74,22 @@ def draw_contours(canvas: Canvas, window: Canvas, view: MapView, ground_m: Image
         return None
     from skimage.measure import find_contours
 
-    step_m = _step(high - low)
-    fine = _resized(_spread(ground_m, known), window.size)
-    inside = edge_of(inner, window.size) > 0.5
+    step_m = _contour_step_m(high - low)
+    fine = _resize(_extrapolate(ground_m, known), window.size)
+    inside = edge_cover(inner, window.size) > 0.5
     cover, left_top = np.zeros(fine.shape, dtype=np.uint8), np.array(view.box[:2])
     for number in np.arange(np.floor(low / step_m) + 1, np.ceil(high / step_m)):
         lines = [line[:, ::-1] for line in find_contours(fine, number * step_m, mask=inside)]
         fixed = [np.rint(line * 2**SHIFT_BITS).astype(np.int32) for line in lines]
         cv2.polylines(cover, fixed, False, 255, 1, cv2.LINE_AA, SHIFT_BITS)
         for line in lines:
-            _label(canvas, view, line + left_top, f"{number * step_m + 0.0:g}")
+            _label_contour(canvas, view, line + left_top, f"{number * step_m + 0.0:g}")
     weight = (CONTOUR_WEIGHT / 255 * cover)[:, :, None]
     window.pixels[:] = (window.pixels + weight * (np.array(DIM_INK) - window.pixels)).astype(np.uint8)
     return step_m
 
 
-def _label(canvas: Canvas, view: MapView, line: Array, text: str) -> None:
+def _label_contour(canvas: Canvas, view: MapView, line: Array, text: str) -> None:
     """Write a height on its contour (n, 2) on the canvas, once or twice, where there is room."""
     left, top, right, bottom = view.box
     length_px = float(np.hypot(*np.diff(line, axis=0).T).sum())
@@ -97,7 +97,7 @@ def _label(canvas: Canvas, view: MapView, line: Array, text: str) -> None:
     half_px = 0.36 * LABEL_SIZE * len(text) + 8.0
     at = at[(np.abs(at - view.middle) < np.array([right - left, bottom - top]) / 2 - half_px - 6.0).all(axis=1)]
     for _ in range(min(2, int(length_px / LABELLED_PX))):
-        free = [place for place in at if canvas.is_free(around(place, half_px))]
+        free = [place for place in at if canvas.is_free(box_around(place, half_px))]
         if not free:
             return
         # North-east of the middle first, then as far from there as the contour goes.
@@ -106,18 +106,18 @@ def _label(canvas: Canvas, view: MapView, line: Array, text: str) -> None:
         at = at[np.hypot(*(at - (x, y)).T) > 0.4 * (right - left)]
 
 
-def _step(range_m: float) -> float:
+def _contour_step_m(range_m: float) -> float:
     """The smallest of 1, 2, 5 times a power of ten that leaves no more than MOST_LEVELS contours."""
     power = 10.0 ** np.floor(np.log10(range_m / MOST_LEVELS))
     return float(next(m for m in (1.0, 2.0, 5.0, 10.0) if m * power * MOST_LEVELS >= range_m) * power)
 
 
-def _inner(known: Bools) -> Bools:
+def _erode(known: Bools) -> Bools:
     """Without the cells at the edge: slopes there would be those of a cliff that is not there."""
     return cv2.erode(known.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE) > 0
 
 
-def _spread(values: Image, known: Bools) -> Image:
+def _extrapolate(values: Image, known: Bools) -> Image:
     """Known values, carried a few cells beyond their edge."""
     filled, weight = np.where(known, values, 0).astype(np.float32), known.astype(np.float32)
     for reach in (3, 7, 15):
@@ -128,5 +128,5 @@ def _spread(values: Image, known: Bools) -> Image:
     return filled
 
 
-def _resized(image: Image, size: tuple[int, int]) -> Image:
+def _resize(image: Image, size: tuple[int, int]) -> Image:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), dtype=np.float32)

@@ -16,10 +16,10 @@ from startrack.output.picture.canvas import (
     SKYLINE,
     Box,
     Canvas,
-    around,
+    box_around,
 )
 from startrack.output.picture.maps import CAPTION_SIZE, MapView, draw_overview, grid_lines_m, nice_step
-from startrack.output.picture.relief import draw_contours, ground_on
+from startrack.output.picture.relief import draw_contours, ground_of_view
 from startrack.terrain import Terrain
 from startrack.types import Array
 
@@ -41,18 +41,18 @@ def relief_picture(terrain: Terrain, place_m: tuple[float, float] | None = None)
     if place_m is not None:
         canvas.circle(view.at(place_m), 6.0, POSITION, -1)
         canvas.circle(view.at(place_m), 11.0, POSITION, 2)
-        canvas.keep_free(around(view.at(place_m), 14.0))
-    _metres(canvas, view)
+        canvas.reserve(box_around(view.at(place_m), 14.0))
+    _draw_distances(canvas, view)
     if terrain.rim_radius_m is None:
         window = canvas.window(box)
-        step_m = draw_contours(canvas, window, view, *ground_on(view, terrain, (window.size[1], window.size[0])))
+        step_m = draw_contours(canvas, window, view, *ground_of_view(view, terrain, (window.size[1], window.size[0])))
         if step_m is not None:
             words = f"contours each {step_m:g} m, heights above the origin"
             canvas.text((box[0] + 12.0, box[3] - 14.0), words, CAPTION_SIZE, DIM_INK, "ls", halo=True)
-    return canvas.finished()
+    return canvas.rendered_pixels()
 
 
-def _metres(canvas: Canvas, view: MapView) -> None:
+def _draw_distances(canvas: Canvas, view: MapView) -> None:
     """East and north of the grid's lines, outside of the map."""
     left, _, right, bottom = view.box
     unit, metres = ("km", 1000.0) if float(view.half_m.min()) >= 2000.0 else ("m", 1.0)
@@ -84,14 +84,14 @@ def panorama_picture(terrain: Terrain, place_m: tuple[float, float]) -> NDArray[
 
     ground = np.concatenate([at(azimuth_deg, horizon_deg), at(np.array([360.0, 0.0]), low)])
     canvas.window(box).area(ground, FLOOR)
-    _scales(canvas, box, at, low, high, step)
+    _draw_scales(canvas, box, at, low, high, step)
     canvas.curve(at(azimuth_deg, horizon_deg), SKYLINE, 2.0)
     title = f"{terrain.name}: horizon seen from E {place_m[0]:.0f} m, N {place_m[1]:.0f} m"
     canvas.text((box[0], 9.0), title, TEXT_PX, INK, "lt")
-    return canvas.finished()
+    return canvas.rendered_pixels()
 
 
-def _scales(canvas: Canvas, box: Box, at, low: float, high: float, step: float) -> None:  # type: ignore[no-untyped-def]
+def _draw_scales(canvas: Canvas, box: Box, at, low: float, high: float, step: float) -> None:  # type: ignore[no-untyped-def]
     for elevation in np.arange(low, high + step / 2, step):
         canvas.line(at(np.array([0.0, 360.0]), elevation), GRID if elevation else FAINT_INK)
         canvas.text((box[0] - 8, float(at(0.0, elevation)[1])), f"{elevation:g}°", TEXT_PX, DIM_INK, "rm")

@@ -17,69 +17,16 @@ from startrack.camera import Camera
 from startrack.camera.parameters import with_update
 from startrack.camera.uncertainty import lens_jacobian
 from startrack.frames import R_from_rotvec
-from startrack.normal_equations import NormalEquations, Terms
-from startrack.types import Array, Attitude, Bools, Ints, NotIdentified, Value, array
+from startrack.normal_equations import NormalEquations, Observations, Terms
+from startrack.types import Array, NotIdentified
 
 CHI2_2DOF_MEDIAN = 1.3863
 OUTLIER_CHI2 = 16.0  # 4 sigma in each axis: one good star in 3000 is lost
 HUBER_SIGMAS = 2.5  # from here the pull of an observation no longer grows
 FEWEST_STARS = 3
-FEWEST_FOR_SCATTER = 30  # stars from which the scatter of the residuals is a better covariance than the stated one
 SMALLEST_EXTRA_PX2, LARGEST_EXTRA_PX2 = 1e-6, 1e8
-FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e6
+SMALLEST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-12, 1e-6, 1e6
 SMALLEST_RISE_RAD = 0.2  # a lens whose radius stops growing sooner is no lens
-
-
-@dataclass(frozen=True, kw_only=True)
-class Observations(Value):
-    """Measured pixels with known directions, sorted by image."""
-
-    image: Ints = array("n", dtype=np.int64)  # 0 ... images - 1, ascending
-    xy_px: Array = array("n", 2)  # measured
-    covariance_px2: Array = array("n", 2, 2)  # of the measurement
-    rays_icrs: Array = array("n", 3)  # apparent directions, refraction included; of boards: positions [squares]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if np.any(np.diff(self.image) < 0) or np.any(self.image[:1] < 0):
-            raise ValueError("Observations.image must ascend from 0")
-
-    def __len__(self) -> int:
-        return len(self.image)
-
-    @property
-    def images(self) -> int:
-        """Number of images."""
-        return int(self.image[-1]) + 1 if len(self.image) else 0
-
-    def take(self, which: Any) -> Observations:
-        """The observations selected by a mask or by ascending indices; the images keep their numbers."""
-        return replace(
-            self, image=self.image[which], xy_px=self.xy_px[which], covariance_px2=self.covariance_px2[which],
-            rays_icrs=self.rays_icrs[which],
-        )  # fmt: skip
-
-
-def observations(
-    xy_px: list[Array], rays_icrs: list[Array], covariance_px2: list[Array] | float | None = None
-) -> Observations:
-    """Observations from pixels (n_i, 2) and directions (n_i, 3), one array per image.
-
-    `covariance_px2`: per image (n_i, 2, 2), or one variance per axis [px^2] for all. None: the centroid errors are not
-    known; a fit then takes them from the scatter.
-    """
-    counts = [len(xy) for xy in xy_px]
-    covariance = (
-        np.concatenate(covariance_px2)
-        if isinstance(covariance_px2, list)
-        else np.broadcast_to((covariance_px2 or 0.0) * np.eye(2), (sum(counts), 2, 2))
-    )
-    return Observations(
-        image=np.repeat(np.arange(len(counts)), counts),
-        xy_px=np.concatenate(xy_px),
-        covariance_px2=covariance,
-        rays_icrs=np.concatenate(rays_icrs),
-    )
 
 
 class Adjustable(Protocol):
@@ -215,24 +162,17 @@ def adjust(
     `extra_px2`: variance per axis beyond the stated one, unless the scheme estimates it. Raises
     NotIdentified where a loss with a cut leaves fewer than 3 observations.
     """
-    state, damping, settled, extra = start, FIRST_DAMPING, False, extra_px2
     damped = scheme.damped and not scheme.estimates_extra
-    moved = np.zeros(len(free))
+    state, settled, extra, moved = start, False, extra_px2, np.zeros(len(free))
     rays = state.rays_cam(points)
     residual = state.residual_px(points, rays)
     inverse = inverse_covariance(points.covariance_px2, extra)
-
-    def cost_of(residual_px: Array, moved_by: Array) -> float:
-        by_prior = 0.0 if prior is None else float(np.sum(prior.precision * np.square(prior.offset - moved_by)))
-        return float(np.sum(scheme.loss.cost(chi_square(residual_px, inverse)))) + by_prior
-
-    cost = cost_of(residual, moved) if damped else np.inf
-    for _ in range(scheme.steps):
+    damping = _Damping(points, free, scheme.loss, inverse, prior) if damped else None
+    for k in range(scheme.steps):
         if scheme.estimates_extra:
             extra = extra_variance_px2(residual, points.covariance_px2, len(free) + 3 * points.images)
             inverse = inverse_covariance(points.covariance_px2, extra)
-        chi2 = chi_square(residual, inverse)
-        factor = scheme.loss.weight_factor(chi2)
+        factor = scheme.loss.weight_factor(chi_square(residual, inverse))
         if (agreeing := int(np.count_nonzero(factor))) < FEWEST_STARS:
             raise NotIdentified("fewer than 3 stars agree on an attitude", matched=agreeing)
         weight = inverse * factor[:, None, None]
@@ -242,29 +182,65 @@ def adjust(
             equations = equations.with_prior(prior.precision, prior.offset - moved)
         if settled:
             break
-        while True:
-            lens, poses = (equations.damped(damping) if damped else equations).solve()
-            trial = state.step(free, lens, poses)
-            trial_rays = trial.rays_cam(points)
-            trial_residual = trial.residual_px(points, trial_rays)
-            if not damped:
+        before = residual
+        if damping is not None:
+            trial = damping.step(equations, state, residual, moved)
+            if trial is None:
                 break
-            trial_cost = cost_of(trial_residual, moved + lens)
-            if trial_cost <= cost * (1 + 1e-12) and trial.is_valid:
-                cost = trial_cost
-                break
-            damping = max(damping * 10.0, 1e-6)
-            if damping >= MOST_DAMPING:
-                return Solution(state=state, terms=terms, equations=equations, residual_px=residual, chi2=chi2,
-                                inverse=inverse, weight=weight, extra_px2=extra)  # fmt: skip
-        damping = max(damping / 30.0, 1e-12)
-        shift = float(np.sqrt(np.mean(np.square(trial_residual - residual)))) if len(residual) else 0.0
-        state, rays, residual, moved = trial, trial_rays, trial_residual, moved + lens
-        settled = shift < scheme.settled_px
+            state, rays, residual, lens = trial
+        else:
+            lens, poses = equations.solve()
+            state = state.step(free, lens, poses)
+            if k == scheme.steps - 1 and not scheme.estimates_extra:
+                break  # nobody reads the residual of a few plain steps
+            rays = state.rays_cam(points)
+            residual = state.residual_px(points, rays)
+        moved = moved + lens
+        settled = len(residual) == 0 or float(np.sqrt(np.mean(np.square(residual - before)))) < scheme.settled_px
         if settled and not damped:
             break  # the equations of the last step are good enough
-    return Solution(state=state, terms=terms, equations=equations, residual_px=residual,
-                    chi2=chi_square(residual, inverse), inverse=inverse, weight=weight, extra_px2=extra)  # fmt: skip
+    return Solution(
+        state=state, terms=terms, equations=equations, residual_px=residual, chi2=chi_square(residual, inverse),
+        inverse=inverse, weight=weight, extra_px2=extra,
+    )  # fmt: skip
+
+
+@dataclass
+class _Damping:
+    """Marquardt's damping: a step is taken only if it lowers the cost."""
+
+    points: Observations
+    free: tuple[str, ...]
+    loss: Loss
+    inverse: Array  # (n, 2, 2)
+    prior: Prior | None
+    damping: float = FIRST_DAMPING
+
+    def step(
+        self, equations: NormalEquations, state: Any, residual_px: Array, moved: Array
+    ) -> tuple[Any, Array, Array, Array] | None:
+        """New state, its rays and residuals, and the step of the lens parameters; None where no step lowers the cost.
+
+        `moved`: sum of the earlier steps of the lens parameters (m,).
+        """
+        cost = self.cost(residual_px, moved)
+        while self.damping < MOST_DAMPING:
+            lens, poses = equations.damped(self.damping).solve()
+            trial = state.step(self.free, lens, poses)
+            rays = trial.rays_cam(self.points)
+            residual = trial.residual_px(self.points, rays)
+            if self.cost(residual, moved + lens) <= cost * (1 + 1e-12) and trial.is_valid:
+                self.damping = max(self.damping / 30.0, SMALLEST_DAMPING)
+                return trial, rays, residual, lens
+            self.damping = max(self.damping * 10.0, FIRST_DAMPING)
+        return None
+
+    def cost(self, residual_px: Array, moved: Array) -> float:
+        """Loss of the residuals (n, 2) and of the prior."""
+        by_data = float(np.sum(self.loss.cost(chi_square(residual_px, self.inverse))))
+        if self.prior is None:
+            return by_data
+        return by_data + float(np.sum(self.prior.precision * np.square(self.prior.offset - moved)))
 
 
 def inverse_covariance(covariance_px2: Array, extra_px2: float) -> Array:
@@ -315,75 +291,3 @@ def extra_variance_px2(
     while excess(high) > 0.0 and high < np.log(LARGEST_EXTRA_PX2):
         low, high = high, high + np.log(4.0)
     return float(np.exp(brentq(excess, low, high, xtol=1e-6))) if excess(high) < 0.0 else float(np.exp(high))
-
-
-@dataclass(frozen=True, kw_only=True)
-class AttitudeFit:
-    """Result of `solve_attitude`."""
-
-    attitude: Attitude
-    residual_px: Array  # (n, 2) measured minus predicted
-    used: Bools  # (n,) not rejected as outliers
-    rms_px: float  # of the used stars, per axis
-    extra_sigma_px: float  # error per axis beyond the stated centroid errors (lens, blends, catalogue)
-
-
-def solve_attitude(
-    camera: Camera, xy_px: Array, covariance_px2: Array, rays_icrs: Array, R_cam_icrs: Array
-) -> AttitudeFit:
-    """Attitude that fits measured pixels (n, 2) with covariances (n, 2, 2) of stars (n, 3), outliers rejected.
-
-    `R_cam_icrs` (3, 3): a start within some pixels. The scatter of the residuals sets an error common to all stars,
-    which is added to every centroid. The uncertainty of the lens (the camera's covariance) turns all stars alike, so
-    that no scatter shows it: it is added to the attitude's covariance. Raises NotIdentified with fewer than 3 stars.
-    """
-    if len(xy_px) < FEWEST_STARS:
-        raise NotIdentified("fewer than 3 stars agree on an attitude", matched=len(xy_px))
-    points = Observations(
-        image=np.zeros(len(xy_px), dtype=np.int64), xy_px=xy_px, covariance_px2=covariance_px2, rays_icrs=rays_icrs
-    )
-    start = State(camera=camera, R_cam_icrs=np.array(R_cam_icrs)[None])
-    found = adjust(start, points, (), Scheme(loss=HUBER_WITH_CUT, steps=12, estimates_extra=True))
-    used = found.chi2 < OUTLIER_CHI2
-    jacobian, weight, residual = found.terms.pose[used], found.weight[used], found.residual_px[used]
-    by_stars = _attitude_covariance(jacobian, found.inverse[used], weight, residual)
-    rays_cam = found.state.rays_cam(points)[used]
-    by_lens = _attitude_covariance_by_lens(camera, rays_cam, jacobian, weight)
-    return AttitudeFit(
-        attitude=Attitude(R_cam_icrs=found.state.R_cam_icrs[0], covariance_rad2=by_stars + by_lens),
-        residual_px=found.residual_px,
-        used=used,
-        rms_px=float(np.sqrt(np.mean(residual**2))),
-        extra_sigma_px=float(np.sqrt(found.extra_px2)),
-    )
-
-
-def _attitude_covariance(jacobian: Array, inverse: Array, weight: Array, residual_px: Array) -> Array:
-    """Covariance (3, 3) from the stated errors, or from the scatter of the residuals where that is larger.
-
-    The second is the sandwich H^-1 (sum s s^T) H^-1 of the stars' scores s: it holds for heavy tails and for centroid
-    errors larger than stated, but is noisy with few stars.
-    """
-    stated = np.linalg.inv(np.einsum("nia,nij,njb->ab", jacobian, inverse, jacobian, optimize=True))
-    n = len(residual_px)
-    if n < FEWEST_FOR_SCATTER:
-        return np.asarray(stated)
-    bread = np.linalg.inv(np.einsum("nia,nij,njb->ab", jacobian, weight, jacobian, optimize=True))
-    scores = np.einsum("nia,nij,nj->na", jacobian, weight, residual_px, optimize=True)
-    by_scatter = bread @ (scores.T @ scores) @ bread * (n / (n - 3))
-    return np.asarray(stated * max(1.0, float(np.trace(by_scatter) / np.trace(stated))))
-
-
-def _attitude_covariance_by_lens(camera: Camera, rays_cam: Array, jacobian: Array, weight: Array) -> Array:
-    """Covariance (3, 3) of the attitude's response to an error of the lens; 0 where the camera has no covariance.
-
-    For a lens fitted to these very stars the sum of both covariances is the marginal of the joint fit, provided that
-    the camera's covariance is its marginal too (the inverse of a matrix in blocks).
-    """
-    if camera.covariance is None:
-        return np.zeros((3, 3))
-    weighted = np.einsum("nia,nij->naj", jacobian, weight)
-    by_turn = np.einsum("naj,njb->ab", weighted, jacobian)
-    by_lens = np.einsum("naj,njm->am", weighted, lens_jacobian(camera, rays_cam, camera.covariance_order))
-    response = np.linalg.solve(by_turn, by_lens)
-    return np.asarray(response @ camera.covariance @ response.T)

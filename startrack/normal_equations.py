@@ -1,4 +1,4 @@
-"""Normal equations of one lens and the attitudes of many images, solved by the Schur complement over the images.
+"""Observations of one lens in many images, and their normal equations, solved by the Schur complement.
 
 The attitudes of different images share only the lens, so that each image's block is eliminated by itself: the cost
 grows linearly with the number of images, where a dense solution grows with its cube.
@@ -9,13 +9,72 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
-from startrack.types import Array, Ints
+from startrack.types import Array, Ints, Value, array
 
 RIDGE_1 = 1e-14  # relative to the diagonal; a parameter that nothing constrains stays solvable
 TINY = 1e-300
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observations(Value):
+    """Measured pixels with known directions, sorted by image."""
+
+    image: Ints = array("n", dtype=np.int64)  # 0 ... images - 1, ascending
+    xy_px: Array = array("n", 2)  # measured
+    covariance_px2: Array = array("n", 2, 2)  # of the measurement
+    rays_icrs: Array = array("n", 3)  # apparent directions, refraction included; of boards: positions [squares]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if np.any(np.diff(self.image) < 0) or np.any(self.image[:1] < 0):
+            raise ValueError("Observations.image must ascend from 0")
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+    @property
+    def images(self) -> int:
+        """Number of images."""
+        return int(self.image[-1]) + 1 if len(self.image) else 0
+
+    def take(self, which: Any) -> Observations:
+        """The observations selected by a mask or by ascending indices; the images keep their numbers."""
+        return replace(
+            self, image=self.image[which], xy_px=self.xy_px[which], covariance_px2=self.covariance_px2[which],
+            rays_icrs=self.rays_icrs[which],
+        )  # fmt: skip
+
+
+def observations(
+    xy_px: list[Array], rays_icrs: list[Array], covariance_px2: list[Array] | float | None = None
+) -> Observations:
+    """Observations from pixels (n_i, 2) and directions (n_i, 3), one array per image.
+
+    `covariance_px2`: per image (n_i, 2, 2), or one variance per axis [px^2] for all. None: the centroid errors are not
+    known; a fit then takes them from the scatter.
+    """
+    counts = [len(xy) for xy in xy_px]
+    covariance = (
+        np.concatenate(covariance_px2)
+        if isinstance(covariance_px2, list)
+        else np.broadcast_to((covariance_px2 or 0.0) * np.eye(2), (sum(counts), 2, 2))
+    )
+    return Observations(
+        image=np.repeat(np.arange(len(counts)), counts),
+        xy_px=np.concatenate(xy_px),
+        covariance_px2=covariance,
+        rays_icrs=np.concatenate(rays_icrs),
+    )
+
+
+def observations_of_image(xy_px: Array, covariance_px2: Array, rays_icrs: Array) -> Observations:
+    """Observations of a single image: pixels (n, 2), their covariances (n, 2, 2), directions (n, 3)."""
+    image = np.zeros(len(xy_px), dtype=np.int64)
+    return Observations(image=image, xy_px=xy_px, covariance_px2=covariance_px2, rays_icrs=rays_icrs)
 
 
 @dataclass(frozen=True)

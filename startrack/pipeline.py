@@ -6,7 +6,7 @@ import time as clock
 from datetime import datetime
 from typing import TYPE_CHECKING
 
-from startrack.adjust import solve_attitude
+from startrack.attitude import solve_attitude
 from startrack.camera import Camera
 from startrack.catalog.bodies import bodies
 from startrack.compilation import announce_compilation

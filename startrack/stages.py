@@ -16,7 +16,7 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from startrack.adjust import AttitudeFit
+from startrack.attitude import AttitudeFit
 from startrack.camera import Camera
 from startrack.detection import Detector
 from startrack.errors import Reason

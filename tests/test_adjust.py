@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from startrack.adjust import AttitudeFit, solve_attitude
+from startrack.attitude import AttitudeFit, solve_attitude
 from startrack.camera import Camera, KannalaBrandt, Pinhole
 from startrack.camera.parameters import with_update
 from startrack.types import NotIdentified

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from startrack.adjust import observations
 from startrack.calibration.board import calibrate_board
 from startrack.calibration.board_pose import Board, BoardState, Corners, find_corners, initial_board_state
 from startrack.calibration.lens_fit import fit_state
 from startrack.camera import Camera, KannalaBrandt, load_camera
 from startrack.cli.main import main
 from startrack.exposure import write_exposure
+from startrack.normal_equations import observations
 from startrack.types import Exposure, NotIdentified
 
 SIZE_PX = (640, 480)

@@ -22,6 +22,7 @@ LAYERS = (  # lowest first; a room imports from lower layers only
     {"psf", "catalog", "camera", "terrain", "exposure"},
     {"match", "normal_equations", "false_alarm"},
     {"adjust"},
+    {"attitude"},
     {"rendering", "detection", "identification", "evidence", "localization"},
     {"stages"},
     {"measurement"},

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from startrack.adjust import solve_attitude
+from startrack.attitude import solve_attitude
 from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole
 from startrack.catalog import load_catalog
 from startrack.cli.main import main

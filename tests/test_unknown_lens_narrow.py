@@ -8,8 +8,7 @@ from test_unknown_lens import SIZE, detections, lens_camera, picture, sky
 
 from startrack.camera import KannalaBrandt, Pinhole
 from startrack.identification.narrow_field import NarrowFieldSearch
-from startrack.identification.shape_index import shape_index
-from startrack.identification.triangles import triangles
+from startrack.identification.triangles import shape_index, triangles
 from startrack.identification.unknown_lens import LOG_FALSE_ALARM, identify_unknown_lens
 from startrack.types import Detections
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.adjust import Observations
 from startrack.calibration.initial_camera import fit_attitudes, mirror_camera
 from startrack.calibration.matching import match_frame
 from startrack.calibration.region_growing import JointFit
@@ -14,6 +13,7 @@ from startrack.camera import Camera
 from startrack.camera.uncertainty import cap_grid
 from startrack.false_alarm import log_p_value_poisson
 from startrack.frames import R_from_rotvec
+from startrack.normal_equations import Observations
 from startrack.types import Array, Ints
 
 FEWEST_MATCHES = 40

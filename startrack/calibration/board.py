@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from startrack import __version__
-from startrack.adjust import observations
 from startrack.calibration.acceptance import RINGS, STARS_PER_RING, Check, Checked, calibrated_rays
 from startrack.calibration.board_pose import Board, Corners, find_corners, initial_board_state
 from startrack.calibration.lens_fit import LensFit, fit_state
 from startrack.calibration.run import RefusedImage
 from startrack.camera import Camera, camera_to_dict
+from startrack.normal_equations import observations
 from startrack.types import Array, BadInput, Exposure, NotIdentified
 
 FEWEST_PICTURES = 3

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from startrack.adjust import SMALLEST_RISE_RAD, Observations
+from startrack.adjust import SMALLEST_RISE_RAD
 from startrack.calibration.initial_camera import FOCAL_FACTORS, LENSES
 from startrack.camera import Camera
 from startrack.camera.parameters import with_update
 from startrack.camera.uncertainty import lens_jacobian
 from startrack.frames import R_from_rotvec, nearest_rotation
-from startrack.normal_equations import Terms
+from startrack.normal_equations import Observations, Terms
 from startrack.types import Array, BadInput, Exposure, NotIdentified
 
 IMAGES_TRIED = 4

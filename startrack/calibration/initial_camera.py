@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from startrack.adjust import Observations, State
+from startrack.adjust import State
 from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole
 from startrack.frames import angle_between_rad, wahba
+from startrack.normal_equations import Observations
 from startrack.types import Array, Ints, NotIdentified
 
 PAIR_STARS = 80  # of an image, whose pairs give the focal length

@@ -12,7 +12,6 @@ import numpy as np
 from startrack.adjust import (
     SMALLEST_EXTRA_PX2,
     CameraState,
-    Observations,
     Scheme,
     Solution,
     State,
@@ -34,6 +33,7 @@ from startrack.calibration.lens_models import (
 )
 from startrack.camera import Camera
 from startrack.camera.parameters import with_covariance
+from startrack.normal_equations import Observations
 from startrack.types import Array, Bools, NotIdentified
 
 FEWEST = 12

@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.adjust import SQUARES, CameraState, Observations, Scheme, Solution, adjust
+from startrack.adjust import SQUARES, CameraState, Scheme, Solution, adjust
 from startrack.camera import Camera, Decentring, Lens
 from startrack.camera.lenses import default_lens, lens_kinds
+from startrack.normal_equations import Observations
 from startrack.types import Array, Ints
 
 FOLDS = 10

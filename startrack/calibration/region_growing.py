@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.adjust import Observations
 from startrack.calibration.frame import Frame
 from startrack.calibration.lens_fit import FEWEST, LensFit, fit_lens
 from startrack.calibration.matching import FrameMatches, match_frame
 from startrack.camera import Camera
+from startrack.normal_equations import Observations
 from startrack.types import Array, Ints, NotIdentified
 
 RING_RAD = np.radians(8.0)  # by which the field grows

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from startrack.adjust import AttitudeFit, solve_attitude
+from startrack.attitude import AttitudeFit, solve_attitude
 from startrack.camera import Camera
 from startrack.identification.lost_in_space import Identifier
 from startrack.identification.unknown_lens import identify_unknown_lens

@@ -14,8 +14,7 @@ from startrack.identification.index import bright_stars_apart
 from startrack.identification.proximity_mask import ProximityMask, proximity_mask
 from startrack.identification.radial_lens_family import RadialFamily, angle
 from startrack.identification.region_growing import LensHypothesis
-from startrack.identification.shape_index import ShapeIndex, shape_index
-from startrack.identification.triangles import Triangles, triad_attitude, triangles
+from startrack.identification.triangles import ShapeIndex, Triangles, shape_index, triad_attitude, triangles
 from startrack.types import Array, Bools, Ints, Stars
 
 HEMISPHERE_SR = 2 * np.pi

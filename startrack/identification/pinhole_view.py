@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.adjust import Observations, Scheme, adjust, cauchy_loss
+from startrack.adjust import Scheme, adjust, cauchy_loss
 from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole
 from startrack.frames import R_from_rotvec
-from startrack.normal_equations import Terms
+from startrack.normal_equations import Observations, Terms, observations_of_image
 from startrack.types import Array, Bools
 
 TANGENT = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)  # series of tan a beyond a: to 1e-7 up to 20 degrees
@@ -60,10 +60,8 @@ class PinholeView:
 
         `distorted`: whether the lens may differ from a pinhole.
         """
-        points = Observations(
-            image=np.zeros(len(xy_px), dtype=np.int64), xy_px=xy_px,
-            covariance_px2=np.broadcast_to(sigma_px**2 * np.eye(2), (len(xy_px), 2, 2)), rays_icrs=rays_icrs,
-        )  # fmt: skip
+        covariance = np.broadcast_to(sigma_px**2 * np.eye(2), (len(xy_px), 2, 2))
+        points = observations_of_image(xy_px, covariance, rays_icrs)
         free = ("log_focal", "distortion") if distorted else ("log_focal",)
         scheme = Scheme(loss=cauchy_loss(LOSS_CHI2), steps=steps, settled_px=0.0, damped=False)
         found: PinholeView = adjust(self, points, free, scheme).state

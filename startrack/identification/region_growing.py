@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.adjust import Observations, Prior, Scheme, State, adjust, cauchy_loss
+from startrack.adjust import Prior, Scheme, State, adjust, cauchy_loss
 from startrack.camera import Camera, KannalaBrandt, Pinhole
 from startrack.false_alarm import log_p_value_bound
 from startrack.identification.radial_lens_family import PINHOLE, RadialFamily
 from startrack.match import match_mutual
+from startrack.normal_equations import observations_of_image
 from startrack.types import Array, Ints
 
 ROUNDS = 2  # of matching and fitting within a stage
@@ -114,10 +115,7 @@ def fit_camera(
     `sigma_px`: scale of the loss. `prior`: the camera before any fit.
     """
     n = len(xy_px)
-    points = Observations(
-        image=np.zeros(n, dtype=np.int64), xy_px=xy_px, covariance_px2=np.tile(sigma_px**2 * np.eye(2), (n, 1, 1)),
-        rays_icrs=rays_icrs,
-    )  # fmt: skip
+    points = observations_of_image(xy_px, np.tile(sigma_px**2 * np.eye(2), (n, 1, 1)), rays_icrs)
     found = adjust(State(camera=camera, R_cam_icrs=R[None]), points, free, FIT, prior=prior_of(camera, prior, free))
     return found.state.camera, found.state.R_cam_icrs[0], np.linalg.norm(found.residual_px, axis=1)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.adjust import HUBER_WITH_CUT, Observations, Scheme, State, adjust
+from startrack.adjust import HUBER_WITH_CUT, Scheme, State, adjust
 from startrack.camera import Camera
 from startrack.camera.parameters import with_covariance
 from startrack.false_alarm import probability
@@ -28,6 +28,7 @@ from startrack.identification.narrow_field import NarrowFieldSearch
 from startrack.identification.radial_lens_family import PINHOLE, radius
 from startrack.identification.region_growing import WIDE_STAGES, GrownLens, GrowthStage, grow, prior_of
 from startrack.identification.verify_unknown_lens import VerifiedLens, verify
+from startrack.normal_equations import observations_of_image
 from startrack.types import Array, Centroids, Identification, Ints, NotIdentified, Stars
 
 WIDE_FIELD_RAD = np.radians(100.0)  # from here up, `fov_rad` is the angle of the image circle
@@ -136,10 +137,8 @@ def _fit_with_covariance(
     """
     camera = lens.camera
     free = ("f", *(("cx", "cy") if centre else ()), *camera.lens.parameters)
-    points = Observations(
-        image=np.zeros(len(rays_icrs), dtype=np.int64), xy_px=centroids.xy_px[lens.detection],
-        covariance_px2=centroids.covariance_px2[lens.detection], rays_icrs=rays_icrs,
-    )  # fmt: skip
+    seen = lens.detection
+    points = observations_of_image(centroids.xy_px[seen], centroids.covariance_px2[seen], rays_icrs)
     start = State(camera=camera, R_cam_icrs=lens.R_cam_icrs[None])
     found = adjust(start, points, free, JOINT_FIT, prior=prior_of(camera, camera, free))
     fitted = found.state.camera

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from startrack.adjust import AttitudeFit
+from startrack.attitude import AttitudeFit
 from startrack.output.picture.canvas import (
     DIM_INK,
     FAINT_INK,

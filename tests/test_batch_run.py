@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -84,6 +85,18 @@ def test_a_signal_ends_the_batch_after_the_frames_in_hand_with_tables_of_what_is
     assert f"{why}: {done} of 400 images done, tables in {out}; the same command without -O goes on" in err
     assert len(Table.read(out / "results.ecsv", format="ascii.ecsv")) == len(list(out.glob("*.fix.json"))) == done
     assert not list(out.glob(".*"))
+
+
+@pytest.mark.parametrize("delay_s", [0.1, 0.4, 0.8])
+def test_an_early_signal_ends_the_batch_at_once(many, tmp_path, delay_s):
+    """While the program is loaded, and while its processes start."""
+    with begun(many, "-D", str(tmp_path / "out"), "-j", "2", "-O", "--no-plots") as process:
+        time.sleep(delay_s)
+        os.killpg(process.pid, signal.SIGINT)
+        _, err = process.communicate(timeout=120)
+    assert process.returncode in (-signal.SIGINT, 5, 130)  # before Python is ready, the system ends the process
+    if process.returncode == 5:
+        assert "images done" in err
 
 
 def test_a_later_signal_drops_the_images_in_hand_and_writes_the_tables(tmp_path, monkeypatch):

@@ -329,6 +329,15 @@ def test_a_plain_terminal_is_enough(folder):
     assert (done.returncode, done.stderr) == (OK, "")
 
 
+def test_a_name_beyond_ascii_under_an_ascii_locale(folder):
+    black("spä✶.png")
+    ascii_locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = shell("detect", "spä✶.png", "--no-plots", cwd=folder, **ascii_locale)
+    assert (done.returncode, done.stderr) == (REFUSED, "")
+    assert "refused  no_stars" in done.stdout
+    assert json.loads((folder / "startrack-out" / "spä✶.detections.json").read_text())["reason"] == "no_stars"
+
+
 def test_version_and_help(folder):
     assert shell("--version", cwd=folder).stdout.startswith("startrack 0.")
     for command in ("locate", "identify", "detect", "render", "doctor", "schema"):

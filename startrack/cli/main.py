@@ -34,13 +34,21 @@ startrack render --seed 1                          a synthetic exposure to try i
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
-    _write_any_text()
-    parser = _parser()
-    _offer_completion(parser)
-    args = parser.parse_args(_joined_action(sys.argv[1:] if argv is None else argv))
-    if not args.command:
-        parser.print_help()
-        return USAGE
+    try:
+        _write_any_text()
+        parser = _parser()
+        _offer_completion(parser)
+        args = parser.parse_args(_joined_action(sys.argv[1:] if argv is None else argv))
+        if not args.command:
+            parser.print_help()
+            return USAGE
+        return _run(args)
+    except KeyboardInterrupt:
+        return _report_failure("interrupted", INTERRUPTED)
+
+
+def _run(args: argparse.Namespace) -> int:
+    """Run the command that was parsed; the exit code."""
     logging.getLogger("startrack").setLevel(logging.ERROR if getattr(args, "quiet", False) else logging.NOTSET)
     try:
         code = int(args.run(args))
@@ -50,8 +58,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _report_failure(f"{cause.reason}: {cause}", BAD_INPUT)
     except NoSolution as cause:
         return _report_failure(f"{cause.reason}: {cause}", REFUSED)
-    except KeyboardInterrupt:
-        return _report_failure("interrupted", INTERRUPTED)
     except BrokenPipeError:
         _discard_stdout()
         return STOPPED

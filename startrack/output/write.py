@@ -90,7 +90,7 @@ def write_json(path: FilePath, record: dict[str, Any]) -> None:
 
     Raises BadInput where the file cannot be written, and ValueError for NaN or an infinity, which JSON has not.
     """
-    write_atomically(path, json_text(record).encode("utf-8"), overwrite=True)
+    write_atomically(path, json_text(record).encode("utf-8", "replace"), overwrite=True)
 
 
 def json_text(record: dict[str, Any]) -> str:

@@ -1,6 +1,6 @@
 """Bounds of the horizon over boxes, compiled with numba, by the rays of `horizon_kernel`.
 
-A ray from anywhere in a box passes near the middle line, so that steepest slopes to the side bound the ground there.
+A ray from anywhere in a box passes near the middle line: the steepest slopes to the side bound the ground there.
 """
 
 from __future__ import annotations
@@ -24,6 +24,11 @@ from startrack.terrain.horizon_kernel import (
 
 SHIFT_HEIGHT_M = 1000.0
 ACROSS = 8  # steps along each side of a box
+FINE_POSTS = 1.2  # posts: of narrower bands slopes are taken cell by cell
+KINK_M = 0.02  # by which a traced ray may miss a kink of the ground: NUDGE_M times the change of slope
+PARTS = 4  # of a step, whose slopes are taken one by one
+MOST_TOUCHED = 25  # cells of a part
+TOUCH_MARGIN = 0.02  # of a cell: more than maps bend over a step
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -52,6 +57,47 @@ def _level_of(levels, m, post_m, moon, width, e, n):
     return level
 
 
+@njit(cache=True, nogil=True)
+def _slope_range(heights, posts, m, column, row, d_column, d_row, begin, end, to_column, to_row, width):
+    """Least and most rise per metre to the side in a band; (1, -1) where it leaves the map or touches many cells.
+
+    The band reaches `width` to each side (`to_column`, `to_row` per metre) of the segment that begins and ends at these
+    distances from (column, row) in the direction (d_column, d_row) per metre. The rise in a bilinear cell is linear in
+    column and row: its extremes are at the ends of the part of the segment whose band touches the cell.
+    """
+    columns, rows = posts[m, 2], posts[m, 1]
+    side_column, side_row = width * abs(to_column) + TOUCH_MARGIN, width * abs(to_row) + TOUCH_MARGIN
+    j0 = int(np.floor(column + min(d_column * begin, d_column * end) - side_column))
+    j1 = int(np.floor(column + max(d_column * begin, d_column * end) + side_column))
+    i0 = int(np.floor(row + min(d_row * begin, d_row * end) - side_row))
+    i1 = int(np.floor(row + max(d_row * begin, d_row * end) + side_row))
+    least, most = 1.0, -1.0
+    if j0 >= 0 and i0 >= 0 and j1 < columns - 1 and i1 < rows - 1 and (j1 - j0 + 1) * (i1 - i0 + 1) <= MOST_TOUCHED:
+        least, most = np.inf, -np.inf
+        for i in range(i0, i1 + 1):
+            for j in range(j0, j1 + 1):
+                x, y = column - j, row - i
+                first, last = begin, end
+                if abs(d_column) > 1e-12:
+                    a, b = (-side_column - x) / d_column, (1 + side_column - x) / d_column
+                    first, last = max(first, min(a, b)), min(last, max(a, b))
+                if abs(d_row) > 1e-12:
+                    a, b = (-side_row - y) / d_row, (1 + side_row - y) / d_row
+                    first, last = max(first, min(a, b)), min(last, max(a, b))
+                if first <= last:
+                    at = posts[m, 0] + i * columns + j
+                    corner, across, down = heights[at], heights[at + 1], heights[at + columns]
+                    twist = corner - across - down + heights[at + columns + 1]
+                    straight = to_column * (across - corner + twist * y) + to_row * (down - corner + twist * x)
+                    along = twist * (to_column * d_row + to_row * d_column)
+                    aside = 2 * abs(twist * to_column * to_row) * width + abs(twist) * TOUCH_MARGIN * (
+                        abs(to_column) + abs(to_row)
+                    )
+                    least = min(least, straight + min(along * first, along * last) - aside)
+                    most = max(most, straight + max(along * first, along * last) + aside)
+    return least, most
+
+
 @njit(cache=True, nogil=True, inline="always")
 def _most(above, s, reach, cos_turn):
     """Largest tan of a height above the lowest camera, at s from the middle of the box."""
@@ -69,18 +115,41 @@ def _least(above, s, reach, cos_turn):
 
 
 @njit(cache=True, nogil=True)
-def standing(ground, east, north, half):
-    """Height in enu of the ground in the middle of a box, and the lowest and highest anywhere in it."""
-    middle, low, high, _, _ = leaning(ground, east, north, half, False)
-    return middle, low, high
+def _step_bounds(s0, s1, s2, z0, z1, z2, slack, low_up, high_up, reach, cos_turn):
+    """Most tan of the ground of a step, least tan of it, and the distance and height of the latter.
+
+    The middle line's heights z0, z1, z2 stand at s0, s1 (half way) and s2; the ground beside differs by up to `slack`.
+    """
+    over = slack + max(2 * z1 - z0 - z2, 0.0) / 8
+    if min(z0, z1, z2) + slack > low_up and s0 > reach:
+        rest = slack - low_up
+        top, _ = best_in_step(-FAR_M, 0.0, s0 - reach, s2 - reach, z0 + rest, z1 + rest, z2 + rest)
+    else:
+        top = max(
+            _most(z0 + over - low_up, s0, reach, cos_turn),
+            _most(z1 + over - low_up, s1, reach, cos_turn),
+            _most(z2 + over - low_up, s2, reach, cos_turn),
+        )
+    bottom, bottom_s, bottom_z = LOWEST_TAN, 0.0, 0.0
+    rest = slack + high_up
+    if min(z0, z1, z2) > rest and s0 > 0.0:
+        tan, at = best_in_step(-FAR_M, 0.0, s0 + reach, s2 + reach, z0 - rest, z1 - rest, z2 - rest)
+        bottom, bottom_s, bottom_z = tan * cos_turn, at - reach, tan * at + high_up
+    else:
+        for k in range(3):
+            s_k = s0 if k == 0 else s1 if k == 1 else s2
+            z_k = (z0 if k == 0 else z1 if k == 1 else z2) - slack
+            if s_k > 0.0 and _least(z_k - high_up, s_k, reach, cos_turn) > bottom:
+                bottom, bottom_s, bottom_z = _least(z_k - high_up, s_k, reach, cos_turn), s_k, z_k
+    return top, bottom, bottom_s, bottom_z
 
 
 @njit(cache=True, nogil=True)
-def leaning(ground, east, north, half, lean):
+def box_height_bounds(ground, east, north, half, tilted):
     """Height in enu of the ground in the middle of a box, the lowest and highest anywhere in it, and two slopes.
 
-    With `lean` heights are reckoned from a plane through the middle of the box, which rises by the two slopes returned
-    to the east and north: the one that fits the corners. Without, the slopes are zero.
+    With `tilted` heights are relative to the plane through the middle of the box that fits the corners, which rises by
+    the two slopes to the east and north. Otherwise the slopes are zero.
     """
     grid, heights, posts, _, _, slopes, blocks, levels, slope_unit, post_m, moon, _ = ground
     middle = surface(grid, posts, heights, moon, east, north, 0.0)
@@ -89,7 +158,7 @@ def leaning(ground, east, north, half, lean):
     map0, cell0, alike = -2, -1, True
     wide_column, wide_row, column0, row0 = 0.0, 0.0, 0.0, 0.0
     slope_e, slope_n = 0.0, 0.0
-    for corner in range(4 * (lean and half > 0.0)):
+    for corner in range(4 * (tilted and half > 0.0)):
         to_e, to_n = 2 * (corner & 1) - 1, corner - (corner & 1) - 1
         z = surface(grid, posts, heights, moon, east + half * to_e, north + half * to_n, middle)
         slope_e += to_e * z / (4 * half)
@@ -138,35 +207,50 @@ def leaning(ground, east, north, half, lean):
 
 @njit(cache=True, nogil=True)
 def bounds(
-    ground, east, north, up, low_up, high_up, slope_e, slope_n, half, sin_a, cos_a, turn, start_m, end_m, hint_m, found
+    ground, east, north, up, low_up, high_up, slope_e, slope_n, half, sin_a, cos_a, turn, start_m, end_m, hint_m,
+    tilt_to_crest, found,
 ):  # fmt: skip
-    """Bounds of the horizon over a box. Fills `found` with what can be said of it, see below.
+    """Bounds of the horizon over a box, written to `found`.
 
     The box reaches `half` to each side of (east, north), the camera stands between low_up and high_up there (at `up` in
-    the middle), and azimuths reach `turn` to each side. Ground nearer than start_m or beyond end_m does not matter.
+    the middle), and azimuths reach `turn` to each side. Ground nearer than start_m or beyond end_m is left out.
     A ray from the box passes the middle line's point s within w = r + (s + r) tan(turn) to the side, at a distance
     between s - r and (s + r) / cos(turn) of its own, r the half width of the box seen along the ray. There the ground
     is within w times the steepest slope to the side of what it is on the middle line. Close to the box the horizon is
     no higher than the steepest slope along the ray, as the camera stands above the ground.
 
-    All heights (low_up and high_up too) may be reckoned from a plane through the middle of the box that rises by
-    slope_e to the east and slope_n to the north: a tan then is less by the plane's own rise along the ray. On a
-    slope, camera and nearby ground go up and down together, and bounds that reckon from the slope are far closer.
+    Slopes to the side come from the pyramid. Where a step may make the horizon and w is below about a post, they are
+    taken again from the cells that the band touches, in PARTS parts of the step.
 
-    found: 0, 1: bounds of tan; 2, 3: between which s the ground stands that may be the horizon; 4: where the middle's
-    horizon stands; 5: its tan t; 6: a such that this ground is no higher than a + t s on the middle line, and 9: g such
-    that it is no higher than that and g w at w aside; 7, 8: an s and a height that the ground nowhere falls short of
-    there, and 10: the slope to the side that this reckons with. 5 to 10 are only meant where the slopes are zero.
+    All heights (low_up and high_up too) may be relative to a plane through the middle of the box that rises by slope_e
+    to the east and slope_n to the north: a tan then is less by the plane's own rise along the ray. With `tilt_to_crest`
+    the plane is replaced by the one through the box and the middle's horizon, tilted to the side as the ground is
+    there. The linear change of the horizon over the box is then that of the camera's height above this plane, whose
+    bounds over a box are exact: h (|dz/de| + |dz/dn|).
+
+    found: 0, 1: bounds of tan; 2, 3: range of s of the ground that may make the horizon; 4: s of the middle's horizon;
+    5: its tan t; 6: a such that this ground is no higher than a + t s on the middle line, and 9: g such that it is no
+    higher than that plus g w at w aside; 7, 8: an s and a height that the ground reaches everywhere there, and 10: the
+    slope to the side that this assumes. 5 to 10 hold only if the slopes are zero and not `tilt_to_crest`.
     """
     grid, heights, posts, tops, wide_tops, slopes, blocks, levels, slope_unit, post_m, moon, highest = ground
     reach = half * (abs(sin_a) + abs(cos_a))
     tan_turn, cos_turn = np.tan(turn), np.cos(turn)
     aside = abs(east * cos_a - north * sin_a)
+    middle_tan, best_at, _ = horizon(ground, east, north, up, sin_a, cos_a, max(start_m, 0.0), end_m, hint_m)
+    if tilt_to_crest and half > 0.0 and middle_tan > LOWEST_TAN:
+        width = reach + (best_at + reach) * tan_turn
+        e, n = east + best_at * sin_a, north + best_at * cos_a
+        z0 = surface(grid, posts, heights, moon, e - width * cos_a, n + width * sin_a, up + middle_tan * best_at)
+        z2 = surface(grid, posts, heights, moon, e + width * cos_a, n - width * sin_a, z0)
+        side_rise = (z2 - z0) / (2 * width)
+        to_e, to_n = middle_tan * sin_a + side_rise * cos_a, middle_tan * cos_a - side_rise * sin_a
+        spread = half * (abs(slope_e - to_e) + abs(slope_n - to_n))
+        low_up, high_up, slope_e, slope_n = low_up - spread, high_up + spread, to_e, to_n
     along_rise, side_rise = slope_e * sin_a + slope_n * cos_a, slope_e * cos_a - slope_n * sin_a  # of the plane
     tilted = abs(side_rise)
     whole = start_m <= 0.0
     low, high = LOWEST_TAN, LOWEST_TAN
-    middle_tan, best_at, _ = horizon(ground, east, north, up, sin_a, cos_a, max(start_m, 0.0), end_m, hint_m)
     first, last = FAR_M, -FAR_M
     line_from = -FAR_M
     low_s, low_z, low_rise = 0.0, low_up - FAR_M, 0.0
@@ -242,42 +326,50 @@ def bounds(
                 z1 = surface(grid, posts, heights, moon, east + half_s * sin_a, north + half_s * cos_a, 0.5 * (z0 + z2))
                 next_z = z2
                 z0, z1, z2 = z0 - along_rise * s, z1 - along_rise * half_s, z2 - along_rise * stop
-                over = slack + max(2 * z1 - z0 - z2, 0.0) / 8
-                if min(z0, z1, z2) + slack > low_up and s > reach:
-                    rest = slack - low_up
-                    top, _ = best_in_step(-FAR_M, 0.0, s - reach, stop - reach, z0 + rest, z1 + rest, z2 + rest)
-                else:
-                    top = max(
-                        _most(z0 + over - low_up, s, reach, cos_turn),
-                        _most(z1 + over - low_up, half_s, reach, cos_turn),
-                        _most(z2 + over - low_up, stop, reach, cos_turn),
-                    )
-                rest = slack + high_up
-                if min(z0, z1, z2) > rest and s > 0.0:
-                    tan, at_s = best_in_step(-FAR_M, 0.0, s + reach, stop + reach, z0 - rest, z1 - rest, z2 - rest)
-                    if tan * cos_turn > low:
-                        low, low_s = tan * cos_turn, at_s - reach
-                        low_z = tan * at_s + high_up
-                        low_rise = rise_aside
-                else:
-                    for k in range(3):
-                        s_k = s if k == 0 else half_s if k == 1 else stop
-                        z_k = (z0 if k == 0 else z1 if k == 1 else z2) - slack
-                        if s_k > 0.0 and _least(z_k - high_up, s_k, reach, cos_turn) > low:
-                            low, low_s, low_z = _least(z_k - high_up, s_k, reach, cos_turn), s_k, z_k
-                            low_rise = rise_aside
-                if near:
-                    top = min(top, steepest)
+                top, bottom, bottom_s, bottom_z = _step_bounds(
+                    s, half_s, stop, z0, z1, z2, slack, low_up, high_up, reach, cos_turn
+                )
+                parts, part_slack = 1, KINK_M * min(width, 1.0)
+                if top >= low and width < FINE_POSTS * post_m[m]:
+                    parts = PARTS
+                    column0, row0 = on_map(grid, m, e, n, moon + z0 + along_rise * s)
+                bend_k = (z0 - 2 * z1 + z2) * 2 / (length * length)
+                rise_k = (z2 - z0) / length - bend_k * length
+                for k in range(parts):
+                    s0, s1, s2 = s, half_s, stop
+                    y0, y1, y2 = z0, z1, z2
+                    part_rise = rise_aside
+                    if parts > 1:
+                        a0, a2 = length * k / parts, length * (k + 1) / parts
+                        a1 = 0.5 * (a0 + a2)
+                        least, most = _slope_range(
+                            heights, posts, m, column0, row0, d_column, d_row, a0, a2, to_column, to_row, width
+                        )
+                        if least <= most:
+                            part_rise = max(most - side_rise, side_rise - least, 0.0)
+                            part_rise += max(abs(least), abs(most)) * (0.005 + 2 * bend) + (aside + width) / moon
+                            part_rise = min(part_rise, rise_aside)
+                        s0, s1, s2 = s + a0, s + a1, s + a2
+                        y0 = z0 + a0 * (rise_k + a0 * bend_k)
+                        y1 = z0 + a1 * (rise_k + a1 * bend_k)
+                        y2 = z0 + a2 * (rise_k + a2 * bend_k)
+                        top, bottom, bottom_s, bottom_z = _step_bounds(
+                            s0, s1, s2, y0, y1, y2, part_rise * width + part_slack, low_up, high_up, reach, cos_turn
+                        )
+                    if bottom > low:
+                        low, low_s, low_z, low_rise = bottom, bottom_s, bottom_z, part_rise
+                    if near:
+                        top = min(top, steepest)
+                    if not probing and top >= low and s2 > -reach:
+                        first, last = min(first, s0), max(last, s2)
+                        high = max(high, top)
+                        most_rise = max(most_rise, part_rise)
+                        over = max(2 * y1 - y0 - y2, 0.0) / 8
+                        line_from = max(line_from, over + y0 - middle_tan * s0, over + y1 - middle_tan * s1)
+                        line_from = max(line_from, over + y2 - middle_tan * s2)
                 if probing:
                     probing, s, known_z = False, begin, up
                 else:
-                    if top >= low and stop > -reach:
-                        first, last = min(first, s), max(last, stop)
-                        high = max(high, top)
-                        most_rise = max(most_rise, rise_aside)
-                        over -= slack + middle_tan * s
-                        line_from = max(line_from, z0 + over, z1 + over - middle_tan * 0.5 * length)
-                        line_from = max(line_from, z2 + over - middle_tan * length)
                     known_z, s = next_z, stop
     # What the plane itself rises along a ray that is turned by up to `turn`.
     turned = abs(along_rise) * (1.0 - cos_turn) + tilted * np.sqrt(1.0 - cos_turn * cos_turn)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from startrack.terrain.height_map import HeightMap
 
 LOG = logging.getLogger(__name__)
-VERSION = 2  # of the tracing and of the table's format
+VERSION = 3  # of the tracing and of the table's format
 
 # Terrains that need the same table share one in memory, for as long as one of them lives.
 TABLES_IN_MEMORY: WeakValueDictionary[str, HorizonTable] = WeakValueDictionary()
@@ -63,8 +63,8 @@ def load_table(key: str, square: Square) -> HorizonTable | None:
 
 def _read_table(path: Path, square: Square) -> HorizonTable | None:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            values, unknown = file["values"], file["unknown_rad"]
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            values, unknown = arrays["values"], arrays["unknown_rad"]
     except (OSError, ValueError, KeyError, EOFError, BadZipFile):
         return None
     if values.shape != (square.across**2, BINS, FIELDS) or unknown.shape != (BINS,):

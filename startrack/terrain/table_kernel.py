@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from startrack.terrain.bounds_kernel import bounds, leaning, standing
+from startrack.terrain.bounds_kernel import bounds, box_height_bounds
 from startrack.terrain.horizon_kernel import FAR_M, horizon, surfaces
 from startrack.terrain.horizon_table import ANGLE_STEP_RAD, BINS, DISTANCE_STEP_M, FARTHEST, NOT_KNOWN_M, RISE_STEP
 
@@ -131,7 +131,9 @@ def box_bounds(ground, values, across, reach, camera_height, centres, half, azim
     corner = np.empty(2)
     for k in range(len(low)):
         if k == 0 or centres[k, 0] != centres[k - 1, 0] or centres[k, 1] != centres[k - 1, 1] or half[k] != half[k - 1]:
-            middle, lowest, highest, slope_e, slope_n = leaning(ground, centres[k, 0], centres[k, 1], half[k], True)
+            middle, lowest, highest, slope_e, slope_n = box_height_bounds(
+                ground, centres[k, 0], centres[k, 1], half[k], True
+            )
         near[0], near[1], near[2] = 0.0, FAR_M, 0.0
         if across > 0:
             near[0], near[1] = FAR_M, 0.0
@@ -148,7 +150,7 @@ def box_bounds(ground, values, across, reach, camera_height, centres, half, azim
         bounds(
             ground, centres[k, 0], centres[k, 1], middle + camera_height, lowest + camera_height,
             highest + camera_height, slope_e, slope_n, half[k], np.sin(azimuths[k]), np.cos(azimuths[k]), turn[k],
-            near[0], near[1], near[2], found,
+            near[0], near[1], near[2], True, found,
         )  # fmt: skip
         low[k], high[k] = np.arctan(found[0]), np.arctan(found[1])
 
@@ -163,7 +165,7 @@ def many_sector_bounds(
     for k in range(len(low)):
         new = k == 0 or centres[k, 0] != centres[k - 1, 0] or centres[k, 1] != centres[k - 1, 1]
         if half[k] < reach / across and (new or half[k] != half[k - 1]):
-            _, lowest, highest = standing(ground, centres[k, 0], centres[k, 1], half[k])
+            _, lowest, highest, _, _ = box_height_bounds(ground, centres[k, 0], centres[k, 1], half[k], False)
             lowest, highest = lowest + camera_height, highest + camera_height
         sector_bounds(
             values, lows, highs, across, reach, centres[k], half[k], lowest, highest, azimuths[k], turn[k], out
@@ -175,11 +177,11 @@ def many_sector_bounds(
 def fill_cells(ground, centres, half, camera_height, sin_a, cos_a, turn, found):
     """Fill found (cells, azimuths, 11) with `bounds` of each cell and azimuth."""
     for k in range(len(centres)):
-        middle, low, high = standing(ground, centres[k, 0], centres[k, 1], half)
+        middle, low, high, _, _ = box_height_bounds(ground, centres[k, 0], centres[k, 1], half, False)
         guess = 0.0
         for j in range(len(sin_a)):
             bounds(
                 ground, centres[k, 0], centres[k, 1], middle + camera_height, low + camera_height,
-                high + camera_height, 0.0, 0.0, half, sin_a[j], cos_a[j], turn, 0.0, FAR_M, guess, found[k, j],
+                high + camera_height, 0.0, 0.0, half, sin_a[j], cos_a[j], turn, 0.0, FAR_M, guess, False, found[k, j],
             )  # fmt: skip
             guess = found[k, j, 4]

@@ -72,22 +72,22 @@ def look_up_sector_bounds(terrain: HeightMap, table: HorizonTable, *arrays: Arra
 
 def interpolate(near: HorizonInterpolator, points: Array, column: Ints) -> Array:
     """Interpolated horizons (n,) [rad] at points (n, 2) for the interpolator's azimuths of index `column` (n,)."""
-    from startrack.terrain import interpolator_kernel
+    from startrack.terrain import horizon_kernel
 
     found = np.empty(len(column))
     where = near.middle_up_m, *near.centre_m, near.half_m
-    fill: Any = interpolator_kernel.between
+    fill: Any = horizon_kernel.interpolate
     fill(near.whole.ground, near.nodes, near.per_height, *where, points, column, found)
     return found
 
 
 def interpolate_bounds(near: HorizonInterpolator, centres: Array, half: float, column: Ints) -> tuple[Array, Array]:
     """Bounds (n,), (n,) [rad] of the interpolated horizons over boxes of one half side [m]."""
-    from startrack.terrain import interpolator_kernel
+    from startrack.terrain import horizon_kernel
 
     low, high = np.empty(len(column)), np.empty(len(column))
     where = near.rough, near.middle_up_m, *near.centre_m, near.half_m
-    fill: Any = interpolator_kernel.between_bounds
+    fill: Any = horizon_kernel.interpolate_bounds
     fill(near.whole.ground, near.nodes, near.per_height, *where, centres, half, column, low, high)
     return low, high
 

@@ -52,7 +52,7 @@ def vertices(terrain: HeightMap, row_column: np.ndarray) -> np.ndarray:
     """Points (..., 3) in enu [m] of the finest map's surface at fractional rows and columns."""
     finest = terrain.maps[0]
     latitude, longitude = finest.projection.latlon_from_xy(*finest.xy(row_column))
-    return np.asarray(enu_from_latlon(terrain.site, latitude, longitude, finest.sampled(row_column)))
+    return np.asarray(enu_from_latlon(terrain.site, latitude, longitude, finest.sample(row_column)))
 
 
 def mesh(terrain: HeightMap, cells: np.ndarray, cut: int, eye_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -16,8 +16,7 @@ import numpy as np
 
 from startrack.cli.main import main as startrack
 from startrack.terrain.geotiff import write_map
-from startrack.terrain.projection import STEREOGRAPHIC, Projection
-from startrack.terrain.raster import Raster
+from startrack.terrain.raster import STEREOGRAPHIC, Projection, Raster
 
 POSTS, POST_M = 1500, 20.0
 LATITUDE_DEG, LONGITUDE_DEG = 30.0, 12.0

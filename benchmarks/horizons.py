@@ -56,7 +56,7 @@ def cropped(name: str, half_m: float) -> HeightMap:
     """The terrain with its finest map alone, as far as that matters."""
     whole = load_terrain(name)
     assert isinstance(whole, HeightMap)
-    crop = whole.maps[0].around(whole.site.latitude_rad, whole.site.longitude_rad, half_m)
+    crop = whole.maps[0].crop_around(whole.site.latitude_rad, whole.site.longitude_rad, half_m)
     return replace(whole, maps=(crop,))
 
 

@@ -16,8 +16,7 @@ import cv2
 import numpy as np
 
 from startrack.terrain.geotiff import write_map
-from startrack.terrain.projection import EQUIRECTANGULAR, Projection, polar_stereographic
-from startrack.terrain.raster import Raster
+from startrack.terrain.raster import EQUIRECTANGULAR, Projection, Raster, polar_stereographic
 from startrack.terrain.raster_io import read_map
 
 HERE = Path(__file__).parent
@@ -55,7 +54,7 @@ def make(folder: Path, out: Path) -> list[str]:
     polar(folder / "ldem75s_cap_240m_rg16.png", out / "ldem75s-240m.tif", 240.0, -5499.0, 7025.0, MIDDLE)
     polar(folder / "ldem75s_far_1787m_rg16.png", out / "ldem75s-1787m.tif", 1786.875, -6829.5, 7025.0)
     write_map(out / "kepler-48m.tif", read_map(folder / "kepler_lola_48m.tif", scale=0.5), step_m=0.5, offset_m=-4000.0)
-    write_map(out / "kepler-far.tif", global_map(folder / "LDEM_4.IMG").around(*KEPLER, FAR_KEPLER_M), step_m=0.5,
+    write_map(out / "kepler-far.tif", global_map(folder / "LDEM_4.IMG").crop_around(*KEPLER, FAR_KEPLER_M), step_m=0.5,
               offset_m=-10000.0)  # fmt: skip
     return ["ldem75s-240m.tif", "ldem75s-1787m.tif", "kepler-48m.tif", "kepler-far.tif"]
 
@@ -70,7 +69,7 @@ def polar(source: Path, to: Path, post_m: float, low_m: float, high_m: float, cu
         heights_m=(low_m + steps * step_m).astype(np.float32), projection=polar_stereographic(), x0_m=-corner,
         y0_m=corner, dx_m=post_m, dy_m=-post_m,
     )  # fmt: skip
-    write_map(to, heights.cut(cut, cut), step_m=step_m, offset_m=low_m)
+    write_map(to, heights.crop(cut, cut), step_m=step_m, offset_m=low_m)
 
 
 def global_map(source: Path) -> Raster:

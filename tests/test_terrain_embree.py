@@ -20,7 +20,7 @@ def test_horizons_are_those_of_embree(name, half_m, monkeypatch):
     from _embree import EmbreeHorizons
 
     whole = load_terrain(name)
-    crop = whole.maps[0].around(whole.site.latitude_rad, whole.site.longitude_rad, half_m)
+    crop = whole.maps[0].crop_around(whole.site.latitude_rad, whole.site.longitude_rad, half_m)
     terrain = replace(whole, maps=(crop,), search_radius_m=0.3 * half_m)
     place, azimuth = half_m * np.array([0.1, -0.15]), np.radians(np.arange(0.25, 360, 0.5))
     tan, distance, edge = terrain.horizons(place[None], azimuth)

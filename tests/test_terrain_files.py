@@ -12,12 +12,18 @@ import tomli_w
 
 from startrack.cli.main import main
 from startrack.files import data_dir
-from startrack.terrain import load_terrain
+from startrack.terrain import load_terrain, terrain_from_dict
 from startrack.terrain.geotiff import write_map
 from startrack.terrain.height_map import HeightMap
-from startrack.terrain.projection import EQUIRECTANGULAR, ORTHOGRAPHIC, Projection, polar_stereographic
-from startrack.terrain.raster import Raster
-from startrack.terrain.raster_io import projection_of, read_map
+from startrack.terrain.raster import (
+    EQUIRECTANGULAR,
+    ORTHOGRAPHIC,
+    Projection,
+    Raster,
+    polar_stereographic,
+    projection_of,
+)
+from startrack.terrain.raster_io import read_map
 from startrack.types import BadInput
 
 ROOT = Path(__file__).parent.parent
@@ -38,12 +44,15 @@ def hill(posts: int = 61, post_m: float = 100.0, projection: Projection | None =
     )  # fmt: skip
 
 
+HILL = {
+    "format": 1, "name": "hill", "body": "moon", "origin": {"latitude_deg": -90.0, "longitude_deg": 0.0},
+    "dem": {"file": "hill.tif", "height_sigma_m": 2.0}, "search": {"radius_m": 800.0},
+}  # fmt: skip
+
+
 def terrain_file(folder: Path, **changes) -> Path:
     write_map(folder / "hill.tif", hill())
-    d = {
-        "format": 1, "name": "hill", "body": "moon", "origin": {"latitude_deg": -90.0, "longitude_deg": 0.0},
-        "dem": {"file": "hill.tif", "height_sigma_m": 2.0}, "search": {"radius_m": 800.0},
-    }  # fmt: skip
+    d = dict(HILL)
     for name, value in changes.items():
         d[name] = {**d[name], **value} if isinstance(value, dict) and name in d else value
     path = folder / "hill.toml"
@@ -378,3 +387,100 @@ def test_every_shipped_map_is_named_with_its_source():
     readme = (data_dir("terrain") / "README.md").read_text()
     for path in data_dir("terrain").glob("*.t*"):
         assert path.name in readme
+
+
+def damaged_maps(folder: Path) -> list[Path]:
+    """Maps with flipped bytes, cut ends, and tags that hold no usable numbers, of three encodings."""
+    import tifffile
+
+    shutil = pytest.importorskip("rasterio.shutil")  # LZW is read through rasterio
+
+    rng, paths = np.random.default_rng(8), []
+
+    def keep(data: bytes) -> None:
+        paths.append(folder / f"damaged-{len(paths)}.tif")
+        paths[-1].write_bytes(data)
+
+    write_map(folder / "sound.tif", hill())
+    with tifffile.TiffFile(folder / "sound.tif") as file:
+        page = file.pages.first
+        place = [tag for tag in page.tags if tag.code in (33550, 33922, 34735, 34736)]
+        extra = [(tag.code, tag.dtype, tag.count, tag.value, True) for tag in place]
+        values = page.asarray()
+    for compression in ("deflate", "lzw", None):
+        own = None if compression == "lzw" else compression
+        tifffile.imwrite(folder / "one.tif", values, compression=own, extratags=extra, metadata=None)
+        if compression == "lzw":
+            shutil.copy(folder / "one.tif", folder / "lzw.tif", driver="GTiff", compress="lzw")
+        sound = (folder / ("lzw.tif" if compression == "lzw" else "one.tif")).read_bytes()
+        for k in range(25):
+            changed = bytearray(sound)
+            many = rng.integers(1, 20) if k % 2 else 1
+            top = len(sound) if k % 3 else 700
+            for at in rng.integers(0, top, many):
+                changed[at] = rng.integers(0, 256)
+            keep(bytes(changed))
+        for part in (0.1, 0.5, 0.9, 0.999):
+            keep(sound[: int(part * len(sound))])
+    wrong = {
+        33550: (np.nan, np.inf, 0.0, 1e308), 33922: (np.nan, 1e308), 34736: (np.nan, 1e308, -1.0),
+        42113: ("nonsense", "1e999"), 42112: ("<not xml", "<GDALMetadata><Item name='SCALE'>nan</Item></GDALMetadata>"),
+    }  # fmt: skip
+    for code, bad_values in wrong.items():
+        for bad in bad_values:
+            own = [tag for tag in extra if tag[0] != code]
+            new = (code, "s", 0, bad, True) if isinstance(bad, str) else None
+            for tag in extra:
+                if tag[0] == code:
+                    new = (code, tag[1], tag[2], tuple(bad for _ in tag[3]), True)
+            assert new is not None
+            tifffile.imwrite(folder / "one.tif", values, extratags=[*own, new], metadata=None)
+            keep((folder / "one.tif").read_bytes())
+    return paths
+
+
+def test_damaged_maps_are_refused_and_named_or_read(tmp_path, capfd):
+    """A flipped byte among the heights cannot be noticed; whatever is noticed is bad_terrain in one line."""
+    path, refusals = terrain_file(tmp_path, dem={"scale": 0.02}), []
+    for damaged in damaged_maps(tmp_path):
+        path.write_text(tomli_w.dumps({**HILL, "dem": {"file": damaged.name, "scale": 0.02}}))
+        try:
+            load_terrain(path)
+        except BadInput as cause:
+            refusals.append(cause)
+    assert len(refusals) > 40
+    assert {cause.reason for cause in refusals} == {"bad_terrain"}
+    assert all("\n" not in str(cause) and len(str(cause)) < 800 for cause in refusals)
+    said = capfd.readouterr()
+    assert said.out + said.err == ""
+
+
+WRONG_VALUES = [
+    ({"dem": {"file": "x" * 300}}, "no such file"), ({"dem": {"file": "a\nb.tif"}}, "file"),
+    ({"dem": {"height_sigma_m": 1e308}}, "height_sigma_m"), ({"dem": {"scale": 1e308}}, "scale"),
+    ({"origin": {"latitude_deg": 10**300}}, "latitude_deg"), ({"origin": {"height_m": 1e308}}, "height_m"),
+    ({"search": {"radius_m": 1e308}}, "radius_m"), ({"search": {"radius_m": 2**80}}, "radius_m"),
+    ({"rover": {"camera_height_m": 1e308}}, "camera_height_m"), ({"name": "n" * 250}, "name"),
+    ({"search": {"radius": 5.0}}, "radius_m"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "named"), WRONG_VALUES, ids=lambda v: str(v)[:40])
+def test_values_beyond_all_limits_are_refused_and_named(changes, named, tmp_path):
+    path = terrain_file(tmp_path)
+    d = {**HILL, **changes} if not isinstance(next(iter(changes.values())), dict) else HILL
+    for table, keys in changes.items():
+        d = {**d, table: {**d.get(table, {}), **keys}} if isinstance(keys, dict) else d
+    with pytest.raises(BadInput, match=named) as caught:
+        terrain_from_dict(d, folder=path.parent)
+    assert caught.value.reason == "bad_terrain"
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["a = " + "[" * 5000, "a = " + "9" * 5000, "body = 'moon'\nbody = 'moon'"])
+def test_texts_that_no_parser_takes_are_bad_terrain(text, tmp_path):
+    (tmp_path / "bad.toml").write_text(text)
+    for name in (tmp_path / "bad.toml", tmp_path, f"{'x' * 300}.toml"):
+        with pytest.raises(BadInput) as caught:
+            load_terrain(name)
+        assert caught.value.reason == "bad_terrain"

@@ -18,15 +18,15 @@ from startrack.localization.horizon_bias import common_error, raised
 from startrack.terrain import load_terrain
 from startrack.terrain import table_cache as cache
 from startrack.terrain.height_map import HeightMap
-from startrack.terrain.projection import (
+from startrack.terrain.pyramid import ground_up_m
+from startrack.terrain.raster import (
     EQUIRECTANGULAR,
     ORTHOGRAPHIC,
     STEREOGRAPHIC,
     Projection,
+    Raster,
     polar_stereographic,
 )
-from startrack.terrain.pyramid import ground_up_m
-from startrack.terrain.raster import Raster
 from startrack.types import Evidence
 
 DATA = Path(__file__).parent / "data"
@@ -218,7 +218,7 @@ def test_sigma_follows_from_posts_and_distance(shackleton):
 
 
 def test_rays_that_run_off_the_map_give_no_evidence(shackleton):
-    inner = shackleton.maps[0].around(shackleton.site.latitude_rad, shackleton.site.longitude_rad, 4000.0)
+    inner = shackleton.maps[0].crop_around(shackleton.site.latitude_rad, shackleton.site.longitude_rad, 4000.0)
     small = replace(shackleton, maps=(inner,), search_radius_m=300.0)
     azimuth = np.radians(np.arange(0, 360, 5.0))
     assert not small.is_informative(azimuth, small.horizon_rad(np.zeros(2), azimuth)).any()
@@ -247,11 +247,11 @@ def test_glare_takes_the_evidence_of_its_azimuths(shackleton):
 
 def test_azimuths_where_the_maps_end_are_told_as_ranges(shackleton):
     """A map that ends close by in the east and far off elsewhere."""
-    whole = shackleton.maps[0].around(shackleton.site.latitude_rad, shackleton.site.longitude_rad, 30_000.0)
+    whole = shackleton.maps[0].crop_around(shackleton.site.latitude_rad, shackleton.site.longitude_rad, 30_000.0)
     azimuth = np.radians(np.arange(0.5, 360))
     place = np.zeros(2)
     for columns in (slice(0, whole.heights_m.shape[1] // 2 + 20), slice(None)):
-        cut = replace(shackleton, maps=(whole.cut(slice(None), columns),), search_radius_m=200.0)
+        cut = replace(shackleton, maps=(whole.crop(slice(None), columns),), search_radius_m=200.0)
         silent = ~cut.is_informative(azimuth, cut.horizon_rad(place, azimuth))
         lines = cut.masked_sectors()
         assert bool(lines) == bool(silent.any())

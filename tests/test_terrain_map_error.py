@@ -11,10 +11,8 @@ from scipy.ndimage import map_coordinates
 from startrack.cli.main import main
 from startrack.terrain import load_terrain
 from startrack.terrain.geotiff import write_map
-from startrack.terrain.map_error import error_between_posts_m
-from startrack.terrain.map_resolution import carried_spacing
-from startrack.terrain.projection import polar_stereographic
-from startrack.terrain.raster import Raster
+from startrack.terrain.map_error import carried_spacing, error_between_posts_m
+from startrack.terrain.raster import Raster, polar_stereographic
 from startrack.types import Array, BadInput
 
 
@@ -38,7 +36,7 @@ def rough(exponent: float) -> Array:
 def measured() -> Array:
     terrain = load_terrain("shackleton")
     at = terrain.site.latitude_rad, terrain.site.longitude_rad
-    return np.asarray(terrain.maps[0].around(*at, 60_000.0).heights_m, dtype=np.float64)
+    return np.asarray(terrain.maps[0].crop_around(*at, 60_000.0).heights_m, dtype=np.float64)
 
 
 def interpolated(ground: Array, every: int, order: int) -> Array:

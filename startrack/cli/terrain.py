@@ -124,18 +124,17 @@ def _build(args: argparse.Namespace) -> int:
 
 def _import(args: argparse.Namespace) -> int:
     from startrack.terrain import load_terrain
-    from startrack.terrain.import_map import coarseness, import_maps, smoothness
+    from startrack.terrain.import_map import import_maps
 
     half = list(args.half or [])
     half += [30_000.0 if not half and k == 0 else 300_000.0 for k in range(len(half), len(args.maps))]
-    path = import_maps(
+    imported = import_maps(
         args.maps, args.output, latitude_rad=radians(args.latitude), longitude_rad=radians(args.longitude), half_m=half,
         radius_m=args.radius, scale=args.scale or (), offset_m=args.offset or (), height_sigma_m=args.sigma,
         camera_height_m=args.camera_height, overwrite=args.overwrite,
     )  # fmt: skip
-    terrain = load_terrain(path)
-    facts = facts_of(terrain) | {"sigma_from": "map" if args.sigma is None else "flag"}
-    _print_facts(args, facts | {"files": [str(path)], "warnings": coarseness(terrain) + smoothness(terrain)})
+    facts = facts_of(load_terrain(imported.path)) | {"sigma_from": "map" if args.sigma is None else "flag"}
+    _print_facts(args, facts | {"files": [str(imported.path)], "warnings": imported.warnings})
     return 0
 
 

@@ -1,59 +1,169 @@
-"""Height maps to GeoTIFF files: 16-bit steps with scale and offset, deflated, as GDAL and this library read them."""
+"""GeoTIFF files by their own tags, read and written: the ground of height maps on the Moon's sphere."""
 
 from __future__ import annotations
 
-import os
-import tempfile
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
-from startrack.terrain.projection import EQUIRECTANGULAR, ORTHOGRAPHIC, STEREOGRAPHIC, Projection
-from startrack.terrain.raster import Raster
+from startrack.files import atomic_file
+from startrack.terrain.raster import (
+    EQUIRECTANGULAR,
+    ORTHOGRAPHIC,
+    STEREOGRAPHIC,
+    Grid,
+    Projection,
+    Raster,
+    projection_of,
+)
+from startrack.types import BadInput
 
-FINEST_STEP_M = 0.01
+MAX_PIXELS = 200_000_000
+MIN_STEP_M = 0.01  # of the heights in files that are written
 NO_HEIGHT = 65_535
-DOUBLES_TAG, ASCII_TAG = 34736, 34737
+METRES = {"m", "meter", "meters", "metre", "metres"}
+STEREOGRAPHIC_CODES, ORTHOGRAPHIC_CODE, EQUIRECTANGULAR_CODE = (14, 15, 16), 21, 17  # GeoTIFF 1.1, annex
+DOUBLES_TAG, ASCII_TAG, METADATA_TAG, NO_DATA_TAG = 34736, 34737, 42112, 42113
+DECODED = (1, 8, 32773, 32946)  # codes of compression: none, deflate, PackBits, deflate
 USER_DEFINED, METRE, DEGREE = 32767, 9001, 9102
 
 
-def write_map(
-    path: str | Path, height_map: Raster, *, step_m: float | None = None, offset_m: float | None = None
-) -> None:
-    """Write the map, whole or not at all. Heights are kept to `step_m`, by default a 65,000th of their range."""
+def read_geotiff(path: Path) -> Grid | None:
+    """The grid of a GeoTIFF, or None where its place, size, projection or compression is one for rasterio.
+
+    Raises BadInput bad_terrain for a file that cannot be decoded.
+    """
     import tifffile
 
-    h = height_map.heights_m.astype(np.float64)
+    try:
+        with _silent_tifffile(), tifffile.TiffFile(path) as file:
+            page = file.pages.first
+            keys, gdal = file.geotiff_metadata, file.gdal_metadata
+            if not keys:
+                raise BadInput("bad_terrain", f"{path}: it does not say where on the Moon it lies (no GeoTIFF tags)")
+            if not isinstance(keys, dict) or "ModelPixelScale" not in keys or "ModelTiepoint" not in keys:
+                return None
+            parameters = _proj_parameters(keys)
+            if page.compression not in DECODED:
+                return None
+            if parameters is None or page.size > MAX_PIXELS or len(page.shape) != 2:
+                return None
+            scale, offset = _gdal_scale(gdal)
+            no_data = page.tags.get(NO_DATA_TAG)
+            dx, dy = float(keys["ModelPixelScale"][0]), -float(keys["ModelPixelScale"][1])
+            i, j, _, x, y, _ = (float(v) for v in keys["ModelTiepoint"][:6])
+            middle = 0.0 if int(keys.get("GTRasterTypeGeoKey", 1)) == 2 else 0.5  # 2: the tie point is a post
+            return Grid(
+                values=np.asarray(page.asarray()),
+                projection=projection_of(parameters),
+                first_m=(x + (middle - i) * dx, y + (middle - j) * dy),
+                step_m=(dx, dy),
+                scale=scale,
+                offset_m=offset,
+                no_data=None if no_data is None else float(str(no_data.value).strip("\x00 ")),
+            )
+    except BadInput:
+        raise
+    except Exception as cause:  # a damaged file makes the decoders raise errors of nearly any class
+        raise BadInput("bad_terrain", f"{path}: not a TIFF file that can be read: {_one_line(cause)}") from cause
+
+
+@contextmanager
+def _silent_tifffile() -> Iterator[None]:
+    """Without tifffile's log of what is wrong with a file: the exception says it."""
+    log = logging.getLogger("tifffile")
+    level = log.level
+    log.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+
+
+def _one_line(cause: Exception) -> str:
+    return " ".join(str(cause).split())[:200] or type(cause).__name__
+
+
+def _gdal_scale(items: Any) -> tuple[float | None, float]:
+    """SCALE and OFFSET of GDAL's metadata: None where nothing says what one step is, and 0."""
+    if isinstance(items, str):
+        items = {e.get("name"): e.text for e in ElementTree.fromstring(items).iter("Item")}
+    found = {}
+    if isinstance(items, dict):
+        for key, value in items.items():
+            name = key[0] if isinstance(key, tuple) else key
+            found[str(name).upper()] = value
+        for value in [v for v in items.values() if isinstance(v, dict)]:
+            found.update({str(k).upper(): v for k, v in value.items()})
+    metres = 1.0 if str(found.get("UNITTYPE", "")).lower() in METRES else None
+    return (float(found["SCALE"]) if "SCALE" in found else metres), float(found.get("OFFSET", 0.0))
+
+
+def _proj_parameters(keys: Mapping[str, Any]) -> dict[str, Any] | None:
+    """PROJ's parameters of GeoTIFF keys; None for projections that only rasterio knows."""
+
+    def number(*names: str, default: float = 0.0) -> float:
+        return next((float(keys[name]) for name in names if name in keys), default)
+
+    p: dict[str, Any] = {"x_0": number("ProjFalseEastingGeoKey", "ProjFalseOriginEastingGeoKey")}
+    p["y_0"] = number("ProjFalseNorthingGeoKey", "ProjFalseOriginNorthingGeoKey")
+    if "GeogSemiMajorAxisGeoKey" not in keys:
+        return None
+    p["a"] = number("GeogSemiMajorAxisGeoKey")
+    p["b"] = number("GeogSemiMinorAxisGeoKey", default=p["a"])
+    if int(keys.get("GTModelTypeGeoKey", 0)) == 2:
+        return {**p, "proj": "longlat", "lon_0": 0.0}
+    if "ProjLinearUnitsGeoKey" in keys and int(keys["ProjLinearUnitsGeoKey"]) != 9001:
+        return None
+    code = int(keys.get("ProjCoordTransGeoKey", 0))
+    p["lon_0"] = number("ProjStraightVertPoleLongGeoKey", "ProjCenterLongGeoKey", "ProjNatOriginLongGeoKey")
+    p["lat_0"] = number("ProjCenterLatGeoKey", "ProjNatOriginLatGeoKey")
+    if code in STEREOGRAPHIC_CODES:
+        p["k_0"] = number("ProjScaleAtNatOriginGeoKey", default=1.0)
+        if code == 15 and abs(p["lat_0"]) < 90:  # the variant that names the latitude of true scale
+            p["lat_ts"], p["lat_0"] = p["lat_0"], 90.0 if p["lat_0"] > 0 else -90.0
+        return {**p, "proj": "stere"}
+    if code == ORTHOGRAPHIC_CODE:
+        return {**p, "proj": "ortho"}
+    if code == EQUIRECTANGULAR_CODE:
+        return {**p, "proj": "eqc", "lat_ts": number("ProjStdParallel1GeoKey")}
+    return None
+
+
+def write_map(path: str | Path, raster: Raster, *, step_m: float | None = None, offset_m: float | None = None) -> None:
+    """Write a map as deflated 16-bit steps with scale and offset, as GDAL reads them; the file appears when complete.
+
+    Heights are rounded to `step_m`, by default a 65,000th of their range. Raises OSError.
+    """
+    import tifffile
+
+    h = raster.heights_m.astype(np.float64)
     low, high = float(np.nanmin(h)), float(np.nanmax(h))
     offset = low if offset_m is None else offset_m
-    step = max((high - low) / 65_000, FINEST_STEP_M) if step_m is None else step_m
+    step = max((high - low) / 65_000, MIN_STEP_M) if step_m is None else step_m
     values = np.where(np.isnan(h), NO_HEIGHT, np.round((np.nan_to_num(h) - offset) / step)).astype(np.uint16)
     metadata = (
         f'<GDALMetadata><Item name="SCALE" sample="0" role="scale">{step!r}</Item>'
         f'<Item name="OFFSET" sample="0" role="offset">{offset!r}</Item></GDALMetadata>'
     )
-    tags = [(42112, "s", 0, metadata, True), *_where(height_map)]
+    tags = [(METADATA_TAG, "s", 0, metadata, True), *_place_tags(raster)]
     if np.isnan(h).any():
-        tags.append((42113, "s", 0, str(NO_HEIGHT), True))
-    path = Path(path)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".making-", suffix=".tif")
-    os.close(handle)
-    try:
+        tags.append((NO_DATA_TAG, "s", 0, str(NO_HEIGHT), True))
+    with atomic_file(path) as temporary:
         tifffile.imwrite(
-            name, values, compression="deflate", compressionargs={"level": 9}, predictor=True, extratags=tags,
+            temporary, values, compression="deflate", compressionargs={"level": 9}, predictor=True, extratags=tags,
             metadata=None, rowsperstrip=256, software="startrack",
         )  # fmt: skip
-        Path(name).chmod(0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
 
 
-def _where(height_map: Raster) -> list[tuple[int, str, int, Any, bool]]:
-    """The tags that say where the map lies: posts are pixel centres (raster type "area")."""
-    m = height_map
+def _place_tags(raster: Raster) -> list[tuple[int, str, int, Any, bool]]:
+    """The tags of the map's place: posts are pixel centres (raster type "area")."""
+    m = raster
     corner = m.x0_m - 0.5 * m.dx_m, m.y0_m - 0.5 * m.dy_m
     keys, doubles, text = _geo_keys(m.projection)
     directory = [1, 1, 1, len(keys), *(number for key in sorted(keys) for number in key)]

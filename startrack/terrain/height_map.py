@@ -16,11 +16,11 @@ from startrack.frames import Site
 from startrack.terrain import table_cache as cache
 from startrack.terrain import tracing
 from startrack.terrain.horizon_interpolator import NODES_ACROSS, HorizonInterpolator
-from startrack.terrain.horizon_sigma import CrestErrors
-from startrack.terrain.horizon_table import BINS, HorizonTable, Square, built
+from startrack.terrain.horizon_sigma import HorizonSigma
+from startrack.terrain.horizon_table import BINS, HorizonTable, Square, build_table
 from startrack.terrain.masks import GLARE, OFF_MAP, Sectors, describe_masks, in_sectors
 from startrack.terrain.protocol import Progress, Terrain
-from startrack.terrain.pyramid import Ground, ground_up_m, packed
+from startrack.terrain.pyramid import Ground, ground_up_m, pack_maps
 from startrack.terrain.raster import Raster
 from startrack.types import Array, BadInput, Bools, Ints
 
@@ -71,7 +71,7 @@ class HeightMap(Terrain):
     @cached_property
     def ground(self) -> Ground:
         """The maps packed for tracing."""
-        return packed(list(self.maps), self.site)
+        return pack_maps(list(self.maps), self.site)
 
     @cached_property
     def finest_post_m(self) -> float:
@@ -87,7 +87,7 @@ class HeightMap(Terrain):
         """
         if not self.height_sigma_m and not self.horizon_sigma_common_rad:
             return 0.0
-        own = float(np.median(self._crests.cells_rad[self._searched])) if self.height_sigma_m else 0.0
+        own = float(np.median(self._sigma.cells_rad[self._searched])) if self.height_sigma_m else 0.0
         known = self.horizon_sigma_common_rad
         return float(np.hypot(own, COMMON_PER_POST * own if known is None else known))
 
@@ -155,7 +155,7 @@ class HeightMap(Terrain):
     def discard_table(self) -> None:
         """Remove the table of horizons from memory and disk."""
         self.__dict__.pop("table", None)
-        self.__dict__.pop("_crests", None)
+        self.__dict__.pop("_sigma", None)
         cache.discard_table(self._key)
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
@@ -192,7 +192,7 @@ class HeightMap(Terrain):
         """From the height of the single post that makes the horizon: sigma cos^2 H / its distance."""
         if self.height_sigma_m == 0:
             return np.zeros(np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad)))
-        return self._crests.at(points_m, azimuths_rad)
+        return self._sigma.sigma_rad(points_m, azimuths_rad)
 
     def max_horizon_sigma_rad(
         self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float
@@ -200,11 +200,11 @@ class HeightMap(Terrain):
         """The largest `horizon_sigma_rad` (n,) over boxes and azimuths."""
         if self.height_sigma_m == 0:
             return np.zeros(np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad)))
-        return self._crests.most(centres_m, half_m, azimuths_rad, azimuth_half_rad)
+        return self._sigma.max_sigma_rad(centres_m, half_m, azimuths_rad, azimuth_half_rad)
 
     @cached_property
-    def _crests(self) -> CrestErrors:
-        return CrestErrors(self.table, self.height_sigma_m)
+    def _sigma(self) -> HorizonSigma:
+        return HorizonSigma(self.table, self.height_sigma_m)
 
     def ground_m(self, points_m: Array) -> Array:
         """Height of the ground in enu (...) [m]."""
@@ -292,7 +292,7 @@ class HeightMap(Terrain):
         def fill(cells: Ints) -> Array:
             return tracing.trace_cells(self, centres[cells], square.half_m, middles, np.pi / BINS)
 
-        return built(square, wanted, fill, self._unknown_rad(), progress)
+        return build_table(square, wanted, fill, self._unknown_rad(), progress)
 
     def _unknown_rad(self) -> Array:
         """(BINS,) elevation below which ground beyond the maps might be seen from somewhere in the search area."""

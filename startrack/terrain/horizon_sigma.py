@@ -16,13 +16,13 @@ CORNERS = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
 
 
 @dataclass(frozen=True, eq=False)
-class CrestErrors:
+class HorizonSigma:
     """Sigma of the horizon [rad] by cells and degrees of a table: that of a post, times cos^2 H over its distance."""
 
     table: HorizonTable
     height_sigma_m: float
 
-    def at(self, points_m: Array, azimuths_rad: Array) -> Array:
+    def sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Sigma (...) at the points (..., 2) in these azimuths."""
         square = self.table.square
         n, side = square.across, 2 * square.half_m
@@ -34,8 +34,8 @@ class CrestErrors:
         )
         return np.asarray(self.cells_rad.ravel()[index])
 
-    def most(self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float) -> Array:
-        """The largest of `at` (n,) over boxes and azimuths: it changes from cell to cell of the table."""
+    def max_sigma_rad(self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float) -> Array:
+        """The largest of `sigma_rad` (n,) over boxes and azimuths: it changes from cell to cell of the table."""
         most = self._blocks[level_for(self.table, half_m)]
         reach_m = self.table.square.reach_m
         n, side = len(most), 2 * reach_m / len(most)

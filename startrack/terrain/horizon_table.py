@@ -1,5 +1,8 @@
-"""What is worked out once per map and place: for each cell of the searched square and each degree of azimuth, bounds of
-the horizon, where it stands, and a line above and a point below the ground that makes it."""
+"""Table of horizons, computed once per map and search area.
+
+For each cell of the searched square and each degree of azimuth: bounds of the horizon, its distance, and a line above
+and a point below the ground that makes it.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from numpy.typing import NDArray
 from startrack.terrain.protocol import Progress
 from startrack.types import Array, Bools, Ints
 
-BINS = 360  # azimuths; what the localizer asks at once are sectors of 1.5 degrees
+BINS = 360  # azimuths; the localizer's sectors are 1.5 degrees wide
 DISTANCE_STEP_M = 4.0
 ANGLE_STEP_RAD = np.pi / 65_000
 FIELDS = 11
@@ -45,12 +48,12 @@ class Square:
 
 @dataclass(frozen=True, eq=False)
 class HorizonTable:
-    """The cells' horizons, rounded away from the truth.
+    """The cells' horizons, rounded so that bounds stay bounds.
 
-    Of each cell and degree: 0, 1 bounds of the elevation [ANGLE_STEP_RAD above -pi/2]; 2, 3 between which distances the
-    horizon stands, 4 where it stands from the middle [DISTANCE_STEP_M]; 5, 6 the line z = a + t s that the ground there
-    does not exceed on the middle line, t as an elevation and a [m], and 9 the most it rises aside [RISE_STEP]; 7, 8 a
-    distance and a height [m] that it does not fall short of there, 10 the slope aside that this reckons with.
+    Fields of each cell and degree: 0, 1 bounds of the elevation [ANGLE_STEP_RAD above -pi/2]; 2, 3 range of the
+    horizon's distance, 4 its distance from the middle [DISTANCE_STEP_M]; 5, 6 the line z = a + t s above the ground
+    there on the middle line, t as an elevation and a [m], and 9 its largest rise to the side [RISE_STEP]; 7, 8 distance
+    and height [m] of a point below the ground, 10 the slope to the side that this point assumes [RISE_STEP].
     """
 
     square: Square
@@ -62,7 +65,7 @@ class HorizonTable:
         """Least and most elevation (n, n, BINS) of the cells, then of ever larger blocks of them."""
         n = self.square.across
         cells = self.values.reshape(n, n, BINS, FIELDS)
-        nowhere = (cells[..., 0] == 0) & (cells[..., 1] == FARTHEST)  # no camera can be there: no word in any block
+        nowhere = (cells[..., 0] == 0) & (cells[..., 1] == FARTHEST)  # no camera can be there: no part of any block
         levels = [
             (np.where(nowhere, np.uint16(FARTHEST), cells[..., 0]), np.where(nowhere, np.uint16(0), cells[..., 1]))
         ]
@@ -75,8 +78,8 @@ def _quarters(a: NDArray[np.uint16], choose: np.ufunc) -> NDArray[np.uint16]:
     return np.asarray(choose(choose(a[::2, ::2], a[1::2, ::2]), choose(a[::2, 1::2], a[1::2, 1::2])))
 
 
-def stored(found: Array) -> NDArray[np.uint16]:
-    """What tracing found (..., 11), rounded so that every bound still holds."""
+def quantize_fields(found: Array) -> NDArray[np.uint16]:
+    """The fields (..., 11) that tracing found, rounded so that every bound still holds."""
     out = np.empty(found.shape, dtype=np.uint16)
     out[..., 0] = np.clip(np.floor((np.arctan(found[..., LOW]) + np.pi / 2) / ANGLE_STEP_RAD), 0, FARTHEST)
     out[..., 1] = np.clip(np.ceil((np.arctan(found[..., HIGH]) + np.pi / 2) / ANGLE_STEP_RAD), 0, FARTHEST)
@@ -91,17 +94,17 @@ def stored(found: Array) -> NDArray[np.uint16]:
     out[..., 8] = np.where(low < NOT_KNOWN_M, NOT_KNOWN_M, np.minimum(low, 32_767)).astype(np.int16).view(np.uint16)
     out[..., 9] = np.clip(np.ceil(found[..., RISE] / RISE_STEP), 0, FARTHEST)
     out[..., 10] = np.clip(np.floor(found[..., POINT_RISE] / RISE_STEP), 0, FARTHEST)
-    # A line beyond what the field holds says nothing; neither does a point so far down.
+    # A line beyond the range of its field is left out, and so is a point so far down.
     out[..., 3] = np.where((line > 32_767) | (found[..., LAST] > FARTHEST * DISTANCE_STEP_M), FARTHEST, out[..., 3])
     return out
 
 
-def built(
+def build_table(
     square: Square, wanted: Bools, fill: Callable[[Ints], Array], unknown_rad: Array, progress: Progress | None = None
 ) -> HorizonTable:
-    """The table; `fill(cells)` traces some cells (n, BINS, 11). Cells not wanted hold no bounds, only -pi/2 to pi/2.
+    """The table; `fill(cells)` traces some cells (n, BINS, 11). Cells that are not `wanted` have bounds of -+ pi/2.
 
-    Cells are traced on all cores where tracing lets go of Python's lock.
+    Cells are traced on all cores: the kernels release Python's lock.
     """
     from concurrent.futures import ThreadPoolExecutor
 
@@ -113,7 +116,7 @@ def built(
     done = 0
 
     def work(part: Ints) -> int:
-        values[part] = stored(fill(part))
+        values[part] = quantize_fields(fill(part))
         return len(part)
 
     pool = ThreadPoolExecutor(cpu_count())
@@ -123,7 +126,7 @@ def built(
             if progress is not None:
                 progress(done, len(cells))
     finally:
-        pool.shutdown(cancel_futures=True)  # whoever interrupts does not wait for the rest
+        pool.shutdown(cancel_futures=True)  # an interrupted build does not wait for the other parts
     return HorizonTable(square, values, unknown_rad)
 
 

@@ -1,114 +1,121 @@
-"""From elevation data to a terrain of one's own: crops as GeoTIFF beside a terrain file."""
+"""Import of elevation data: crops as GeoTIFF beside a terrain file, and what should be known about the maps."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from startrack.terrain.geotiff import write_map
-from startrack.terrain.map_error import error_between_posts_m
-from startrack.terrain.map_resolution import carried_spacing
-from startrack.terrain.protocol import Terrain
+from startrack.terrain.map_error import carried_spacing, error_between_posts_m
 from startrack.terrain.raster import Raster
 from startrack.terrain.raster_io import read_map
 from startrack.types import BadInput
 
-RIM_RADII = 1.5  # of the search area: so far away most of the rim stands
-COARSE_PART = 0.2  # of the search radius
+RIM_RADII = 1.5  # of the search area: most of the rim is nearer
+MAX_POST_RADII = 0.2  # of the search area: with posts further apart it has hardly any shape
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportedTerrain:
+    """The terrain file that was written, and warnings about its maps."""
+
+    path: Path
+    warnings: list[str]
 
 
 def import_maps(
     maps: Sequence[str | Path], output: str | Path, *, latitude_rad: float, longitude_rad: float,
     half_m: Sequence[float], radius_m: float, scale: Sequence[float] = (), offset_m: Sequence[float] = (),
     height_sigma_m: float | None = None, camera_height_m: float = 1.5, overwrite: bool = False,
-) -> Path:  # fmt: skip
-    """Write the terrain file and, beside it, a crop of each map, NAME-1.tif the finest; the terrain file's path.
+) -> ImportedTerrain:  # fmt: skip
+    """Write the terrain file `output` and, beside it, a crop of each map: NAME-1.tif, the finest, and so on.
 
-    half_m: half the side of each crop about the origin [m]. scale and offset_m of each map, the finest first, where the
-    files themselves do not say. height_sigma_m: None takes what the roughness of the map that makes the horizon lets
-    expect between its posts. Raises BadInput bad_terrain: nothing is then written.
+    latitude_rad, longitude_rad: the origin. half_m: half the side of each crop about it [m]. radius_m: of the search
+    area. scale, offset_m: of each map, the finest first, where the files themselves do not say. height_sigma_m: error
+    of single posts [m]; None estimates it from the roughness of the map that makes the horizon. camera_height_m: above
+    the ground [m]. overwrite: replace existing files.
+
+    Raises BadInput bad_terrain; nothing is then written.
     """
-    import tomli_w
-
-    from startrack.terrain.io import terrain_from_dict
-
     output = Path(output)
     if output.suffix != ".toml":
         raise BadInput("bad_terrain", f"{output}: a terrain file's name ends in .toml")
-    at = latitude_rad, longitude_rad
-    latitude_deg, longitude_deg = (round(float(np.degrees(angle)), 9) for angle in at)
+    origin = latitude_rad, longitude_rad
+    latitude_deg, longitude_deg = (round(float(np.degrees(angle)), 9) for angle in origin)
     if not abs(latitude_deg) <= 90:
         raise BadInput("bad_terrain", f"latitude {latitude_deg:g} is not within -90..90")
     files = [output.with_name(f"{output.stem}-{k + 1}.tif") for k in range(len(maps))]
-    there = [path for path in (output, *files) if path.exists()]
-    if there and not overwrite:
-        raise BadInput("bad_terrain", f"{there[0]} is there already: choose another name, or replace it with -O")
+    existing = [path for path in (output, *files) if path.exists()]
+    if existing and not overwrite:
+        raise BadInput("bad_terrain", f"{existing[0]} exists: choose another name, or replace it with -O")
     crops = []
     for k, (source, half) in enumerate(zip(maps, half_m, strict=True)):
         own = {"scale": scale[k] if k < len(scale) else None, "offset_m": offset_m[k] if k < len(offset_m) else None}
-        crop = read_map(source, near=at, **own).around(*at, half)
+        crop = read_map(source, near=origin, **own).crop_around(*origin, half)
         if min(crop.heights_m.shape) < 2:
             raise BadInput("bad_terrain", f"{source}: it does not reach {latitude_deg:g}, {longitude_deg:g}")
         crops.append(replace(crop, source=Path(source).name))
-    sigma_m = _sigma_m(crops, radius_m) if height_sigma_m is None else float(height_sigma_m)
-    d = {
+    rim = _rim_map(crops, radius_m)
+    sigma_m = float(f"{error_between_posts_m(rim):.2g}") if height_sigma_m is None else float(height_sigma_m)
+    values = {
         "format": 1, "name": output.stem, "body": "moon",
         "origin": {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg},
         "dem": {"file": [path.name for path in files], "height_sigma_m": sigma_m},
         "rover": {"camera_height_m": float(camera_height_m)}, "search": {"radius_m": float(radius_m)},
     }  # fmt: skip
+    _write_terrain(output, values, dict(zip(files, crops, strict=True)))
+    return ImportedTerrain(path=output, warnings=spacing_warnings(crops, radius_m) + smoothness_warnings(rim, sigma_m))
+
+
+def _write_terrain(output: Path, values: dict[str, Any], crops: dict[Path, Raster]) -> None:
+    """Write the maps, check them as a terrain, and write its file. After an exception no file is left."""
+    import tomli_w
+
+    from startrack.terrain.io import terrain_from_dict
+
     output.parent.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     try:
-        for path, crop in zip(files, crops, strict=True):
+        for path, crop in crops.items():
             written.append(path)
             write_map(path, crop)
-        terrain_from_dict(d, folder=output.parent)
-        output.write_text(tomli_w.dumps(d), encoding="utf-8")
+        terrain_from_dict(values, folder=output.parent)
+        output.write_text(tomli_w.dumps(values), encoding="utf-8")
     except BaseException:
         for path in written:
             path.unlink(missing_ok=True)
         raise
-    return output
 
 
-def _sigma_m(crops: Sequence[Raster], radius_m: float) -> float:
-    """Error of single posts [m], two digits of it, by the map that makes the horizon."""
-    return float(f"{error_between_posts_m(_of_the_rim(crops, radius_m)):.2g}")
-
-
-def _of_the_rim(crops: Sequence[Raster], radius_m: float) -> Raster:
+def _rim_map(maps: Sequence[Raster], radius_m: float) -> Raster:
     """The finest map that may hold the rim, or the last."""
-    rims = [crop for crop in crops if 0.5 * min(crop.heights_m.shape) * crop.post_m >= RIM_RADII * radius_m]
-    return (rims or crops[-1:])[0]
+    rims = [one for one in maps if 0.5 * min(one.heights_m.shape) * one.post_m >= RIM_RADII * radius_m]
+    return (rims or maps[-1:])[0]
 
 
-def smoothness(terrain: Terrain) -> list[str]:
-    """A warning where the map that makes the horizon carries no ground as fine as its posts."""
-    maps = getattr(terrain, "maps", ())
-    if not maps:
-        return []
-    rim = _of_the_rim(maps, terrain.search_radius_m)
+def smoothness_warnings(rim: Raster, height_sigma_m: float) -> list[str]:
+    """A warning if the map that makes the horizon is smoother than ground is at the spacing of its posts."""
     spacing = carried_spacing(rim.heights_m.astype(np.float64))
     if spacing <= 1:
         return []
     error_m = error_between_posts_m(rim, spacing)
     return [
-        f"{rim.source or 'the map'} looks interpolated or smoothed: posts are {rim.post_m:.3g} m apart, the ground in "
-        f"them about {spacing * rim.post_m:.2g} m, which lets expect errors of {error_m:.2g} m (height_sigma_m is "
-        f"{getattr(terrain, 'height_sigma_m', 0.0):.2g} m); give the map it was made from, or a known error"
+        f"{rim.source or 'the map'} looks interpolated or smoothed: posts are {rim.post_m:.3g} m apart, but its ground "
+        f"is that of posts {spacing * rim.post_m:.2g} m apart, with errors of about {error_m:.2g} m (height_sigma_m is "
+        f"{height_sigma_m:.2g} m); give the map it was made from, or a known error"
     ]
 
 
-def coarseness(terrain: Terrain) -> list[str]:
-    """A warning where the posts stand so far apart that the search area has hardly any shape."""
-    post_m = getattr(terrain, "finest_post_m", 0.0)
-    if post_m <= COARSE_PART * terrain.search_radius_m:
+def spacing_warnings(maps: Sequence[Raster], radius_m: float) -> list[str]:
+    """A warning if the posts are so far apart that the search area has hardly any shape."""
+    post_m = min(one.post_m for one in maps)
+    if post_m <= MAX_POST_RADII * radius_m:
         return []
     return [
-        f"posts are {post_m:.0f} m apart in a search area of {terrain.search_radius_m:.0f} m: such a map hardly tells "
-        "one place from another; give a finer one"
+        f"posts are {post_m:.0f} m apart in a search area of {radius_m:.0f} m: such a map hardly distinguishes "
+        "positions; give a finer one"
     ]

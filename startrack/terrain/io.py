@@ -1,4 +1,4 @@
-"""Terrain files (TOML): read and check. The format is in docs/formats.md."""
+"""Terrain files (TOML): the declaration of their keys, and the terrain that they describe."""
 
 from __future__ import annotations
 
@@ -9,152 +9,182 @@ from typing import Any
 
 import numpy as np
 
+from startrack.declaration import Choice, Either, List, Number, Table, Text
 from startrack.files import resolve_named
 from startrack.frames import Site
 from startrack.terrain.cylinder import Cylinder
 from startrack.terrain.protocol import Terrain
 from startrack.types import BadInput
 
-FORMAT = 1
-DEM_RADIUS_M = 10_000.0
+DEFAULT_MAP_RADIUS_M = 10_000.0  # of the search area on height maps
+DEFAULT_CAMERA_HEIGHT_M = 1.5
+MAX_LENGTH_M = 1e7  # five times the Moon's radius
+MAX_SHAPE_SIGMA = 0.2  # of depth and diameter; the posterior of the shape is expanded about the stated one
+
+LENGTH = Number(low=0.0, high=MAX_LENGTH_M, above=True)
+SIGMA = Number(low=0.0, high=MAX_LENGTH_M, default=0.0)
+FILE = Text(max_chars=4000)
+KEYS = Table(
+    keys={
+        "format": Choice(values=(1,), default=1),
+        "name": Text(max_chars=200),
+        "body": Choice(values=("moon", "earth"), required=True),
+        "origin": Table(
+            description="Where the frame enu stands: moon, on the 1737.4 km sphere; earth, geodetic WGS 84.",
+            required=True,
+            keys={
+                "latitude_deg": Number(low=-90.0, high=90.0, required=True),
+                "longitude_deg": Number(low=-360.0, high=360.0, required=True, description="east positive"),
+                "height_m": Number(low=-MAX_LENGTH_M, high=MAX_LENGTH_M, default=0.0),
+            },
+        ),
+        "cylinder": Table(
+            description="Axis through the origin; floor at z = 0.",
+            keys={
+                "diameter_m": Number(low=0.0, high=MAX_LENGTH_M, above=True, required=True),
+                "depth_m": Number(low=0.0, high=MAX_LENGTH_M, above=True, required=True),
+                "depth_sigma_m": SIGMA,
+                "diameter_sigma_m": SIGMA,
+            },
+        ),
+        "dem": Table(
+            description="Height maps on the Moon's sphere; heights above it, posts at pixel centres, bilinear between.",
+            keys={
+                "file": Either(kinds=(FILE, List(each=FILE, least=1, most=100)), required=True,
+                               description="finest first"),
+                "height_sigma_m": Number(low=0.0, high=MAX_LENGTH_M, default=0.0,
+                                         description="of single posts, independent of each other"),
+                "horizon_sigma_deg": Number(low=0.0, high=9.99, description="of an error that all azimuths share"),
+                "scale": Number(low=-1e6, high=1e6, description="metres per unit, where the files do not say"),
+                "offset_m": Number(low=-MAX_LENGTH_M, high=MAX_LENGTH_M,
+                                   description="height of value 0, where the files do not say"),
+            },
+        ),
+        "rover": Table(
+            keys={"camera_height_m": Number(low=0.0, high=MAX_LENGTH_M, default=DEFAULT_CAMERA_HEIGHT_M)}
+        ),
+        "search": Table(
+            keys={
+                "radius_m": LENGTH,
+                "max_slope_deg": Number(low=0.0, high=90.0, above=True, default=90.0),
+                "glare_deg": List(each=List(each=Number(low=-720.0, high=720.0), count=2),
+                                  description="azimuth ranges that the Sun lights"),
+            },
+        ),
+    },
+)  # fmt: skip
 
 
 def load_terrain(name_or_path: str | Path) -> Terrain:
     """The terrain of a file (a path if it ends in .toml or contains a separator) or of a shipped name.
 
-    Raises BadInput bad_terrain naming the cause.
+    Raises BadInput bad_terrain with the file and the cause.
     """
-    path = resolve_named(name_or_path, "terrain", "bad_terrain")
     try:
+        path = resolve_named(name_or_path, "terrain", "bad_terrain")
         text = path.read_text(encoding="utf-8")
-        return _terrain_of(path.absolute(), text, _stamps(path.parent, tomllib.loads(text)))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as cause:
-        raise BadInput("bad_terrain", f"{path}: not a TOML file: {cause}") from cause
+    except (OSError, UnicodeDecodeError) as cause:
+        raise BadInput("bad_terrain", f"{name_or_path}: not a TOML file that can be read: {cause}") from cause
+    try:
+        return _load_cached(path.absolute(), text, _map_stamps(path.parent, read_keys(text)))
     except BadInput as cause:
         raise BadInput("bad_terrain", f"{path}: {cause}") from cause
 
 
+def read_keys(text: str) -> dict[str, Any]:
+    """The checked keys of a terrain file's text. Raises BadInput bad_terrain."""
+    try:
+        values = tomllib.loads(text)
+    except (ValueError, RecursionError) as cause:  # TOMLDecodeError, huge integers, deep nesting
+        raise BadInput("bad_terrain", f"not a TOML file: {cause}") from cause
+    return KEYS.read(values, "bad_terrain")
+
+
 @lru_cache(maxsize=2)
-def _terrain_of(path: Path, text: str, stamps: tuple[Any, ...]) -> Terrain:
-    """Read once for many images: maps, packed ground and tables are some 0.3 GB and half a second."""
+def _load_cached(path: Path, text: str, stamps: tuple[Any, ...]) -> Terrain:
+    """Read once for many images: maps, packed ground and tables take some 0.3 GB and half a second."""
     return terrain_from_dict(tomllib.loads(text), default_name=path.stem, folder=path.parent)
 
 
-def _stamps(folder: Path, d: dict[str, Any]) -> tuple[Any, ...]:
-    """What changes when one of the maps does."""
-    dem = d.get("dem")
-    files = dem.get("file") if isinstance(dem, dict) else None
-    paths = [folder / str(file) for file in (files if isinstance(files, list) else [files])]
-    found = [path.stat() for path in paths if path.is_file()]
-    return tuple((s.st_ino, s.st_size, s.st_mtime_ns) for s in found)
+def _map_files(keys: dict[str, Any], folder: Path) -> list[Path]:
+    """Paths of the height maps that the keys name."""
+    files = keys["dem"]["file"] if "dem" in keys else ()
+    return [folder / file for file in ((files,) if isinstance(files, str) else files)]
 
 
-def terrain_from_dict(d: dict[str, Any], default_name: str = "terrain", folder: Path | None = None) -> Terrain:
-    """The terrain of a terrain file's keys; maps are looked for in the folder.
+def _map_stamps(folder: Path, keys: dict[str, Any]) -> tuple[Any, ...]:
+    """Values that change when one of the maps does."""
+    stamps = []
+    for path in _map_files(keys, folder):
+        try:
+            status = path.stat()
+        except (OSError, ValueError):  # `read_map` reports it
+            continue
+        stamps.append((status.st_ino, status.st_size, status.st_mtime_ns))
+    return tuple(stamps)
 
-    Raises BadInput bad_terrain naming the key that is wrong.
+
+def terrain_from_dict(values: dict[str, Any], default_name: str = "terrain", folder: Path | None = None) -> Terrain:
+    """The terrain of a terrain file's keys; paths of maps are relative to the folder.
+
+    Raises BadInput bad_terrain with the key that is wrong.
     """
-    if d.get("format", FORMAT) != FORMAT:
-        raise BadInput("bad_terrain", f"format {d['format']!r} is not known; this version reads format {FORMAT}")
-    body = d.get("body")
-    if body not in ("moon", "earth"):
-        raise BadInput("bad_terrain", f"body must be moon or earth, not {body!r}")
-    origin = _table(d, "origin")
-    latitude = _number(origin, "latitude_deg")
-    if abs(latitude) > 90:
-        raise BadInput("bad_terrain", f"latitude_deg is {latitude:g}: not within -90..90")
+    keys = KEYS.read(values, "bad_terrain")
+    origin = keys["origin"]
     site = Site(
-        body=body,
-        latitude_rad=float(np.radians(latitude)),
-        longitude_rad=float(np.radians(_number(origin, "longitude_deg"))),
-        height_m=_number(origin, "height_m", 0.0),
+        body=keys["body"],
+        latitude_rad=float(np.radians(origin["latitude_deg"])),
+        longitude_rad=float(np.radians(origin["longitude_deg"])),
+        height_m=origin["height_m"],
     )
-    if ("cylinder" in d) == ("dem" in d):
-        what = "it names two grounds" if "dem" in d else "it names no ground"
+    if ("cylinder" in keys) == ("dem" in keys):
+        what = "it has two grounds" if "dem" in keys else "it has no ground"
         raise BadInput("bad_terrain", f"{what}: give a [cylinder] with diameter_m and depth_m, or a [dem] with file")
-    name = str(d.get("name", default_name))
-    return _dem(d, name, site, folder or Path()) if "dem" in d else _cylinder(d, name, site)
+    name = keys.get("name", default_name)
+    if "cylinder" in keys:
+        return _make_cylinder(keys, name, site)
+    return _make_height_map(keys, name, site, folder or Path())
 
 
-def _cylinder(d: dict[str, Any], name: str, site: Site) -> Cylinder:
-    cylinder = _table(d, "cylinder")
-    diameter, depth = _number(cylinder, "diameter_m"), _number(cylinder, "depth_m")
-    camera_height = _number(_table(d, "rover", {}), "camera_height_m", 1.5)
-    search = _number(_table(d, "search", {}), "radius_m", diameter / 2)
-    if min(diameter, depth, search) <= 0 or not 0 <= camera_height < depth:
-        raise BadInput("bad_terrain", "diameter_m, depth_m, radius_m must be positive, the camera below the rim")
-    depth_sigma = _number(cylinder, "depth_sigma_m", 0.0)
-    diameter_sigma = _number(cylinder, "diameter_sigma_m", 0.0)
-    if not (0 <= depth_sigma < 0.2 * depth and 0 <= diameter_sigma < 0.2 * diameter):
-        raise BadInput("bad_terrain", "depth_sigma_m and diameter_sigma_m must be below a fifth of what they belong to")
+def _make_cylinder(keys: dict[str, Any], name: str, site: Site) -> Cylinder:
+    cylinder, search = keys["cylinder"], keys.get("search", {})
+    diameter, depth = cylinder["diameter_m"], cylinder["depth_m"]
+    camera_height = keys.get("rover", {}).get("camera_height_m", DEFAULT_CAMERA_HEIGHT_M)
+    if camera_height >= depth:
+        raise BadInput("bad_terrain", f"rover.camera_height_m is {camera_height:g}: the camera must be below the rim")
+    for key, size in (("depth_sigma_m", depth), ("diameter_sigma_m", diameter)):
+        if cylinder[key] >= MAX_SHAPE_SIGMA * size:
+            raise BadInput("bad_terrain", f"cylinder.{key} must be below {MAX_SHAPE_SIGMA * size:g} m, a fifth of it")
     return Cylinder(
         name=name,
         site=site,
         diameter_m=diameter,
         depth_m=depth,
         camera_height_m=camera_height,
-        search_radius_m=search,
-        depth_sigma_m=depth_sigma,
-        diameter_sigma_m=diameter_sigma,
+        search_radius_m=search.get("radius_m", diameter / 2),
+        depth_sigma_m=cylinder["depth_sigma_m"],
+        diameter_sigma_m=cylinder["diameter_sigma_m"],
     )
 
 
-def _dem(d: dict[str, Any], name: str, site: Site, folder: Path) -> Terrain:
+def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) -> Terrain:
     from startrack.terrain.height_map import HeightMap
     from startrack.terrain.raster_io import read_map
 
     if site.body != "moon":
         raise BadInput("bad_terrain", "[dem] maps are heights above the Moon's sphere: body must be moon")
-    dem, search = _table(d, "dem"), _table(d, "search", {})
-    files = dem.get("file")
-    files = [files] if isinstance(files, str) else files
-    if not isinstance(files, list) or not files or not all(isinstance(file, str) for file in files):
-        raise BadInput("bad_terrain", "file must name a height map, or a list of them, finest first")
-    numbers = {key: _number(dem, key) for key in ("scale", "offset_m") if key in dem}
-    radius = _number(search, "radius_m", DEM_RADIUS_M)
-    camera_height = _number(_table(d, "rover", {}), "camera_height_m", 1.5)
-    sigma = _number(dem, "height_sigma_m", 0.0)
-    common = _number(dem, "horizon_sigma_deg") if "horizon_sigma_deg" in dem else None
-    slope = _number(search, "max_slope_deg", 90.0)
-    if radius <= 0 or camera_height < 0 or sigma < 0 or not 0 <= (common or 0.0) < 10 or not 0 < slope <= 90:
-        raise BadInput(
-            "bad_terrain",
-            "radius_m must be positive, camera_height_m, height_sigma_m and horizon_sigma_deg not negative, "
-            "max_slope_deg within 0..90",
-        )
+    dem, search = keys["dem"], keys.get("search", {})
+    scaling = {key: dem[key] for key in ("scale", "offset_m") if key in dem}
     near = site.latitude_rad, site.longitude_rad
+    common_deg = dem.get("horizon_sigma_deg")
     return HeightMap(
         name=name,
         site=site,
-        maps=tuple(read_map(folder / file, near=near, **numbers) for file in files),
-        camera_height_m=camera_height,
-        search_radius_m=radius,
-        height_sigma_m=sigma,
-        horizon_sigma_common_rad=None if common is None else float(np.radians(common)),
-        most_slope_rad=float(np.radians(slope)),
-        glare_rad=_glare(search),
+        maps=tuple(read_map(file, near=near, **scaling) for file in _map_files(keys, folder)),
+        camera_height_m=keys.get("rover", {}).get("camera_height_m", DEFAULT_CAMERA_HEIGHT_M),
+        search_radius_m=search.get("radius_m", DEFAULT_MAP_RADIUS_M),
+        height_sigma_m=dem["height_sigma_m"],
+        horizon_sigma_common_rad=None if common_deg is None else float(np.radians(common_deg)),
+        most_slope_rad=float(np.radians(search.get("max_slope_deg", 90.0))),
+        glare_rad=tuple((float(np.radians(a)), float(np.radians(b))) for a, b in search.get("glare_deg", ())),
     )
-
-
-def _glare(search: dict[str, Any]) -> tuple[tuple[float, float], ...]:
-    """Azimuth ranges [rad] of `glare_deg`, a list of pairs."""
-    pairs = search.get("glare_deg", [])
-    if not isinstance(pairs, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in pairs):
-        raise BadInput("bad_terrain", "glare_deg must be a list of pairs of azimuths, [[from, to], ...]")
-    named = [{"glare_deg": value} for pair in pairs for value in pair]
-    ends = [float(np.radians(_number(one, "glare_deg"))) for one in named]
-    return tuple(zip(ends[::2], ends[1::2], strict=True))
-
-
-def _table(d: dict[str, Any], key: str, default: dict[str, Any] | None = None) -> dict[str, Any]:
-    value = d.get(key, default)
-    if not isinstance(value, dict):
-        raise BadInput("bad_terrain", f"needs a table [{key}]")
-    return value
-
-
-def _number(d: dict[str, Any], key: str, default: float | None = None) -> float:
-    value = d.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise BadInput("bad_terrain", f"{key} must be a number, not {value!r}")
-    return float(value)

@@ -1,7 +1,7 @@
 """Height maps packed for tracing: all posts in one array, and pyramids of the highest ground and of its slopes.
 
-Level L of a pyramid has blocks of 2^L x 2^L cells, a cell lying between four posts. Three things are kept of a block:
-its highest post, the highest of it and its eight neighbours, and the range of the slopes of these nine.
+Level L of a pyramid has blocks of 2^L x 2^L cells, a cell lying between four posts. Of each block the pyramid holds the
+highest post, the highest of it and its eight neighbours, and the range of the slopes of these nine.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SMALLEST_BLOCKS = 4  # a pyramid ends where a level has no more blocks than this
 
 
 class Ground(NamedTuple):
-    """What the tracing functions read; plain arrays, so that numba takes it as it is."""
+    """The maps as the kernels read them: plain arrays in a tuple, which numba takes."""
 
     grid: Array  # (maps, 16), see Raster.grid_numbers
     heights: NDArray[np.float32]  # all posts [m above the sphere]
@@ -36,7 +36,7 @@ class Ground(NamedTuple):
     highest_m: float  # highest post of all maps
 
 
-def packed(maps: list[Raster], site: Site) -> Ground:
+def pack_maps(maps: list[Raster], site: Site) -> Ground:
     """The maps, finest first, ready for tracing in the site's enu."""
     heights, posts, tops, wide, slopes, blocks = [], [], [], [], [], []
     first_post, first_block = 0, 0
@@ -160,6 +160,6 @@ def ground_up_m(site: Site, maps: list[Raster], points_m: Array, rounds: int = 6
             missing = np.isnan(height)
             if not missing.any():
                 break
-            height = np.where(missing, height_map.sampled(height_map.row_column(lat, lon)), height)
+            height = np.where(missing, height_map.sample(height_map.row_column(lat, lon)), height)
         up = np.sqrt((MOON_RADIUS_M + height) ** 2 - level2) - MOON_RADIUS_M - site.height_m
     return np.asarray(up)

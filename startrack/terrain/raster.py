@@ -1,18 +1,149 @@
-"""A grid of heights in a map projection: posts at pixel centres, the ground bilinear between them."""
+"""Height maps in memory: posts at pixel centres in a map projection, the ground bilinear between them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from startrack.frames import R_enu_fixed, Site
-from startrack.terrain.projection import EQUIRECTANGULAR, NAMES, STEREOGRAPHIC, Projection
-from startrack.types import Array
+from startrack.frames import MOON_RADIUS_M, R_enu_fixed, Site, latlon_from_enu
+from startrack.types import Array, BadInput
 
+STEREOGRAPHIC, ORTHOGRAPHIC, EQUIRECTANGULAR = 0, 1, 2
+NAMES = ("stereographic", "orthographic", "equirectangular")
+RADIUS_TOLERANCE_M = 50.0  # maps name 1737.4 km or, rarely, 1737.4 with other digits; Mars and the Earth are far away
 GRID_NUMBERS = 16  # see Raster.grid_numbers
+
+
+@dataclass(frozen=True, kw_only=True)
+class Projection:
+    """x to the east and y to the north at the centre [m], on the sphere of the Moon.
+
+    stereographic: (x, y) = 2 R scale (v1, v2) / (1 + v3); orthographic: (x, y) = R scale (v1, v2), v the direction in
+    the frame east, north, up of the centre. equirectangular: (x, y) = R (scale longitude', scale_y latitude), the
+    longitude counted from the centre's. About a pole, "north" is the centre longitude's side: x = rho sin(lon - lon0).
+    """
+
+    kind: int
+    latitude_rad: float = 0.0
+    longitude_rad: float = 0.0
+    scale: float = 1.0  # along x, at the centre
+    scale_y: float = 1.0  # equirectangular only
+    false_x_m: float = 0.0
+    false_y_m: float = 0.0
+    radius_m: float = MOON_RADIUS_M
+
+    def __post_init__(self) -> None:
+        numbers = (self.latitude_rad, self.longitude_rad, self.scale, self.scale_y, self.false_x_m, self.false_y_m)
+        if not np.isfinite(numbers).all() or not self.scale * self.scale_y > 0 or abs(self.latitude_rad) > 1.6:
+            raise BadInput("bad_terrain", f"the map's projection has impossible numbers: {numbers}")
+        if not abs(self.radius_m - MOON_RADIUS_M) <= RADIUS_TOLERANCE_M:
+            raise BadInput(
+                "bad_terrain",
+                f"the map is of a body of {self.radius_m / 1000:.1f} km radius, not the Moon's 1737.4 km sphere",
+            )
+
+    @property
+    def R_projection_fixed(self) -> Array:
+        """Rotation (3, 3) from the body-fixed frame to the frame in which the projection's formula is written."""
+        if self.kind == EQUIRECTANGULAR:
+            s, c = np.sin(self.longitude_rad), np.cos(self.longitude_rad)
+            return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        return R_enu_fixed(Site("moon", self.latitude_rad, self.longitude_rad))
+
+    def xy_from_latlon(self, latitude_rad: ArrayLike, longitude_rad: ArrayLike) -> tuple[Array, Array]:
+        """Map coordinates x, y (...) [m] of places."""
+        lat, lon = np.asarray(latitude_rad, dtype=float), np.asarray(longitude_rad, dtype=float)
+        fixed = np.stack(np.broadcast_arrays(np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)), -1)
+        v = fixed @ self.R_projection_fixed.T
+        size = self.radius_m * self.scale
+        if self.kind == EQUIRECTANGULAR:
+            x = size * np.arctan2(v[..., 1], v[..., 0])
+            y = self.radius_m * self.scale_y * np.arctan2(v[..., 2], np.hypot(v[..., 0], v[..., 1]))
+        else:
+            k = 2 * size / (1 + v[..., 2]) if self.kind == STEREOGRAPHIC else size
+            x, y = k * v[..., 0], k * v[..., 1]
+        return x + self.false_x_m, y + self.false_y_m
+
+    def latlon_from_xy(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[Array, Array]:
+        """Latitude and longitude (...) [rad] of map coordinates; inverse of xy_from_latlon."""
+        x = (np.asarray(x_m, dtype=float) - self.false_x_m) / (self.radius_m * self.scale)
+        if self.kind == EQUIRECTANGULAR:
+            y = (np.asarray(y_m, dtype=float) - self.false_y_m) / (self.radius_m * self.scale_y)
+            lat, lon = np.broadcast_arrays(y, x)
+            return lat, (lon + self.longitude_rad + np.pi) % (2 * np.pi) - np.pi
+        y = (np.asarray(y_m, dtype=float) - self.false_y_m) / (self.radius_m * self.scale)
+        r2 = x * x + y * y
+        if self.kind == STEREOGRAPHIC:
+            up = (4 - r2) / (4 + r2)
+            k = (1 + up) / 2
+        else:
+            up = np.sqrt(np.maximum(1 - r2, 0.0))
+            k = np.ones_like(up)
+        v = np.stack(np.broadcast_arrays(k * x, k * y, up), -1)
+        fixed = v @ self.R_projection_fixed
+        lat = np.arctan2(fixed[..., 2], np.hypot(fixed[..., 0], fixed[..., 1]))
+        return lat, np.arctan2(fixed[..., 1], fixed[..., 0])
+
+
+def polar_stereographic(
+    south: bool = True, longitude_rad: float = 0.0, true_scale_latitude_rad: float | None = None
+) -> Projection:
+    """About a pole. rho = 2 R tan((90 - |latitude|) / 2) where the scale is true at the pole (the LOLA polar maps)."""
+    pole = -np.pi / 2 if south else np.pi / 2
+    at = pole if true_scale_latitude_rad is None else true_scale_latitude_rad
+    return Projection(
+        kind=STEREOGRAPHIC, latitude_rad=pole, longitude_rad=longitude_rad, scale=float((1 + np.sin(abs(at))) / 2)
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Grid:
+    """The content of a map file: height = offset + scale x value."""
+
+    values: NDArray[Any]  # (rows, columns)
+    projection: Projection
+    first_m: tuple[float, float]  # x, y of the first post
+    step_m: tuple[float, float]  # from a post to the next, in x and y
+    scale: float | None  # [m]; None where the file does not say
+    offset_m: float
+    no_data: float | None
+
+
+def projection_of(p: Mapping[str, Any]) -> Projection:
+    """The projection of PROJ's parameters. Raises BadInput bad_terrain for one that is not known here."""
+    radius = float(p.get("R", p.get("a", MOON_RADIUS_M)))
+    if "a" in p and "b" in p and abs(float(p["a"]) - float(p["b"])) > 1:
+        raise BadInput("bad_terrain", "the map is on an ellipsoid, not on the Moon's 1737.4 km sphere")
+    if str(p.get("ellps", p.get("datum", ""))).upper() in ("WGS84", "GRS80"):
+        raise BadInput("bad_terrain", "the map is of the Earth, not of the Moon")
+    common = {
+        "longitude_rad": float(np.radians(float(p.get("lon_0", 0.0)))), "radius_m": radius,
+        "false_x_m": float(p.get("x_0", 0.0)), "false_y_m": float(p.get("y_0", 0.0)),
+    }  # fmt: skip
+    name, lat_0 = p.get("proj"), float(p.get("lat_0", 0.0))
+    if name == "stere":
+        scale = float(p.get("k_0", p.get("k", 1.0)))
+        if "lat_ts" in p:
+            scale = (1 + np.sin(np.radians(abs(float(p["lat_ts"]))))) / 2
+        return Projection(kind=STEREOGRAPHIC, latitude_rad=float(np.radians(lat_0)), scale=float(scale), **common)
+    if name == "ortho":
+        return Projection(kind=ORTHOGRAPHIC, latitude_rad=float(np.radians(lat_0)), **common)
+    if name == "eqc":
+        scale = float(np.cos(np.radians(float(p.get("lat_ts", 0.0)))))
+        common["false_y_m"] -= radius * float(np.radians(lat_0))
+        return Projection(kind=EQUIRECTANGULAR, scale=scale, **common)
+    if name == "longlat":
+        degrees = float(180 / np.pi / radius)
+        return Projection(kind=EQUIRECTANGULAR, scale=degrees, scale_y=degrees, **common)
+    raise BadInput(
+        "bad_terrain",
+        f"projection {name!r} is not known: bring the map to polar stereographic, stereographic, orthographic or "
+        "equirectangular (gdalwarp -r bilinear -t_srs ...)",
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -57,7 +188,7 @@ class Raster:
         x, y = self.projection.xy_from_latlon(latitude_rad, longitude_rad)
         return np.stack([(y - self.y0_m) / self.dy_m, (x - self.x0_m) / self.dx_m], axis=-1)
 
-    def sampled(self, row_column: Array) -> Array:
+    def sample(self, row_column: Array) -> Array:
         """Heights (...) [m] at fractional rows and columns (..., 2), bilinear; NaN beyond the outer posts."""
         row, column = row_column[..., 0], row_column[..., 1]
         rows, columns = self.heights_m.shape
@@ -86,7 +217,7 @@ class Raster:
         numbers[14:16] = self.y0_m - p.false_y_m, 1 / self.dy_m
         return numbers
 
-    def cut(self, rows: slice, columns: slice) -> Raster:
+    def crop(self, rows: slice, columns: slice) -> Raster:
         """The part of the map within the given rows and columns."""
         first_row, first_column = rows.start or 0, columns.start or 0
         return replace(
@@ -98,17 +229,17 @@ class Raster:
 
     def window(self, latitude_rad: float, longitude_rad: float, half_m: float) -> tuple[slice, slice]:
         """Rows and columns within `half_m` of a place, and a little more; empty where the map does not reach there."""
-        from startrack.frames import latlon_from_enu
-
         side = np.linspace(-1.0, 1.0, 33) * half_m
         east, north = np.meshgrid(side, side)
         lat, lon = latlon_from_enu(Site("moon", latitude_rad, longitude_rad), east, north, 0.0)
         at = self.row_column(lat, lon).reshape(-1, 2)
+        if not np.isfinite(at).all():  # on the other side of the Moon
+            return slice(0, 0), slice(0, 0)
         slices = []
         for low, high, n in zip(at.min(axis=0), at.max(axis=0), self.heights_m.shape, strict=True):
             slices.append(slice(int(np.clip(np.floor(low) - 1, 0, n)), int(np.clip(np.ceil(high) + 2, 0, n))))
         return slices[0], slices[1]
 
-    def around(self, latitude_rad: float, longitude_rad: float, half_m: float) -> Raster:
+    def crop_around(self, latitude_rad: float, longitude_rad: float, half_m: float) -> Raster:
         """The part of the map within about `half_m` of a place; empty where the map does not reach there."""
-        return self.cut(*self.window(latitude_rad, longitude_rad, half_m))
+        return self.crop(*self.window(latitude_rad, longitude_rad, half_m))

@@ -72,6 +72,16 @@ def test_the_functions_work():
     assert isinstance(named, startrack.Solution) and named, named.message
 
 
+def test_a_list_of_centroids_is_identified_in_one_call():
+    found = startrack.detect(IMAGE, camera="fisheye-2048").result.detections
+    named = startrack.identify(found.xy_px[:200], flux=found.flux_e[:200], camera="fisheye-2048")
+    assert len(named.hip) > 150 and named.false_alarm_probability < 1e-9
+    again = startrack.identify(found.xy_px[:200], flux=found.flux_e[:200], size_px=(2048, 2048), fov=185.0)
+    assert np.isin(again.hip, named.hip).mean() > 0.95
+    with pytest.raises(ValueError, match="give a camera"):
+        startrack.identify(found.xy_px[:200])
+
+
 def test_a_calibration_says_what_it_found():
     found = startrack.calibrate(["sample_images/lowell-2018-08-06.fits.bz2"], fov=180.0, name="lowell")
     assert found.camera.name == "lowell" and found.gates

@@ -149,7 +149,7 @@ def calibrate(
         name: of the camera.
 
     Returns:
-        The calibration. Use its `camera` only where `accepted` is true; `gates` says which conditions were not met.
+        The calibration. Use its `camera` only where `accepted` is true; `checks` says which conditions were met.
 
     Raises:
         BadInput: as `locate`.

@@ -42,7 +42,7 @@ class Observations(Value):
         return int(self.image[-1]) + 1 if len(self.image) else 0
 
     def take(self, which: Any) -> Observations:
-        """The observations selected by a mask or by ascending indices; the images keep their numbers."""
+        """The observations that a mask or ascending indices `which` select; the images keep their numbers."""
         return replace(
             self, image=self.image[which], xy_px=self.xy_px[which], covariance_px2=self.covariance_px2[which],
             rays_icrs=self.rays_icrs[which],
@@ -52,7 +52,7 @@ class Observations(Value):
 def observations(
     xy_px: list[Array], rays_icrs: list[Array], covariance_px2: list[Array] | float | None = None
 ) -> Observations:
-    """Observations from pixels (n_i, 2) and directions (n_i, 3), one array per image.
+    """Observations from pixels `xy_px` (n_i, 2) and directions `rays_icrs` (n_i, 3), one array per image.
 
     `covariance_px2`: per image (n_i, 2, 2), or one variance per axis [px^2] for all. None: the centroid errors are not
     known; a fit then takes them from the scatter.

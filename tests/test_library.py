@@ -84,7 +84,7 @@ def test_a_list_of_centroids_is_identified_in_one_call():
 
 def test_a_calibration_says_what_it_found():
     found = startrack.calibrate(["sample_images/lowell-2018-08-06.fits.bz2"], fov=180.0, name="lowell")
-    assert found.camera.name == "lowell" and found.gates
+    assert found.camera.name == "lowell" and found.checks
 
 
 def test_rays_of_ones_own_are_located_in_one_call():

@@ -40,7 +40,7 @@ def images_under(folder: str | os.PathLike[str], excluded: str | os.PathLike[str
 def listed_images(
     folder: str | os.PathLike[str], paths: Iterable[str], excluded: str | os.PathLike[str] | None = None
 ) -> list[Image]:
-    """The images at `paths`: absolute, or relative to the current folder or to `folder`.
+    """The images at `paths`: absolute, or relative to the current folder or to `folder`. `excluded` is no image folder.
 
     An image that does not exist (any more) is included, and refused when it is read. Raises BadInput (bad_image) for a
     path that is no image under `folder`, and if there is no path at all.

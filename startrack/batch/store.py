@@ -31,7 +31,7 @@ NEEDED = {  # by the tables, of a record that is ok
 
 @contextmanager
 def only_writer(out: Path) -> Iterator[None]:
-    """Lock a folder of results against other batches.
+    """Lock the folder `out` of results against other batches.
 
     Raises BadInput (bad_image) if another batch writes to it, or if the lock file cannot be used.
     """
@@ -78,7 +78,7 @@ def text_of_name(name: str) -> str:
 
 
 def record_path(out: Path, image: Image) -> Path:
-    """Path of an image's record."""
+    """Path of the record of an `image` in the folder `out`."""
     return out / f"{image.stem}.fix.json"
 
 

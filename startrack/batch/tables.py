@@ -83,7 +83,9 @@ def table_values(record: Record) -> Record:
 
 
 def table_rows(tasks: Iterable[Task], now: Mapping[str, Record], out: str | os.PathLike[str]) -> Rows:
-    """Rows of the whole folder's `tasks`; `now` has the records of this run by the images' names as text."""
+    """Rows of the whole folder's `tasks`; `now` has the records of this run by the images' names as text.
+
+    `out` is the folder of the results."""
     found = Rows()
     for task in tasks:
         name = text_of_name(task.name)
@@ -100,6 +102,11 @@ def table_rows(tasks: Iterable[Task], now: Mapping[str, Record], out: str | os.P
 
 def write_tables(out: Path, records: Sequence[Record], settings: dict[str, Any]) -> list[Path]:
     """Write results.ecsv, results.parquet (with the extra `parquet`), trajectories, timings.ecsv and manifest.json.
+
+    Args:
+        out: folder of the results.
+        records: of the images.
+        settings: of the run, for the manifest.
 
     Tables of an earlier run that this one does not make are removed. Returns the paths written; raises BadInput if
     one cannot be.

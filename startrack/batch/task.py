@@ -37,7 +37,7 @@ class Task:
 
 
 def locate_images(runner: Runner[Task, ImageDone], tasks: Sequence[Task]) -> Generator[ImageDone, None, None]:
-    """The outcomes in the order of completion. Raises BadInput (no_cluster), RunStopped."""
+    """The outcomes of `tasks` on a `runner` in the order of completion. Raises BadInput (no_cluster), RunStopped."""
     with closing(runner.results(tasks)) as results:
         for task, outcome in results:
             if isinstance(outcome, Died):
@@ -47,7 +47,7 @@ def locate_images(runner: Runner[Task, ImageDone], tasks: Sequence[Task]) -> Gen
 
 
 def locate_image(task: Task) -> ImageDone:
-    """The image's record, and whether it was there already. Bad images and internal errors make records too.
+    """The record of a `task`'s image, and whether it existed already. Bad images and internal errors have records too.
 
     NAME.fix.json is written last, so that a record that exists is complete. Raises RunStopped if the disk is full.
     """

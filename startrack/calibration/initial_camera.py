@@ -34,7 +34,8 @@ SMALLEST_TOLERANCE_RAD = 1e-4
 def initial_state(points: Observations, size_px: tuple[int, int]) -> State:
     """The best of many simple cameras with the axis in the middle of the frame, with its attitudes.
 
-    Up to half of the matches may be wrong. Raises NotIdentified without observations.
+    `points` are the observations of a frame of `size_px` (W, H). Up to half of the matches may be wrong. Raises
+    NotIdentified without observations.
     """
     if not len(points):
         raise NotIdentified("a calibration needs matched stars")

@@ -75,7 +75,9 @@ class LensFit:
 def fit_lens(
     start: Camera, R_cam_icrs: Array, points: Observations, *, coefficients: int | None = None, square: bool = False
 ) -> LensFit:
-    """Lens and attitudes that fit the observations best, from a camera and attitudes (images, 3, 3) roughly right.
+    """Lens and attitudes that fit the observations `points` best.
+
+    `start` and `R_cam_icrs` (images, 3, 3) are a camera and attitudes that are roughly right.
 
     `coefficients`: number of parameters of the default lens; None: chosen by cross-validation. `square`: square
     pixels and a centred lens.

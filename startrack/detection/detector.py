@@ -66,7 +66,7 @@ class Detector:
     psf_sigma_px: float | None = None  # used without measuring it; None: from the camera file and the frame
 
     def __call__(self, exposure: Exposure, camera: Camera | None = None) -> Detections:
-        """Point sources, brightest first; fluxes in electrons where the camera knows its gain, else in ADU.
+        """Point sources of an `exposure`, brightest first; fluxes in electrons with the camera's gain, else in ADU.
 
         Raises TooFewStars (reason no_stars) where the frame holds no point source at all.
         """

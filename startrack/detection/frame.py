@@ -73,12 +73,12 @@ class Frame:
 
 
 def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray[np.bool_]]:
-    """The exposure in electrons above bias (ADU where the gain is unknown), and the mask of saturated pixels."""
+    """The exposure in electrons above bias (ADU without the gain of a `camera`), and the mask of saturated pixels."""
     return _to_electrons(exposure.pixels_adu, exposure, camera)
 
 
 def electrons_at(exposure: Exposure, camera: Camera, rows: Ints, columns: Ints) -> tuple[Image, NDArray[np.bool_]]:
-    """As `electrons`, of the pixels (n,) at some rows and columns (n,) only."""
+    """As `electrons` of an `exposure` and its `camera`, of the pixels (n,) at some rows and columns (n,) only."""
     return _to_electrons(exposure.pixels_adu[rows, columns], exposure, camera)
 
 

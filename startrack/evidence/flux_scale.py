@@ -25,13 +25,16 @@ class FluxScale:
     stars: int  # that defined it
 
     def flux_e(self, v_mag: Array, angle_rad: Array, camera: Camera) -> Array:
-        """Expected flux (n,) of stars at angles off the axis [rad]."""
+        """Expected flux (n,) of stars of `v_mag` (n,) at `angle_rad` (n,) off the axis of a `camera`."""
         throughput = camera.sensor.throughput(angle_rad) if camera.sensor is not None else 1.0
         return 10 ** (-0.4 * (v_mag - self.zero_mag)) * throughput * np.exp(self.trend_per_rad2 * np.square(angle_rad))
 
 
 def flux_scale(detections: Detections, camera: Camera, stars: Stars, found: Identification) -> FluxScale:
-    """Scale from the bright identified stars: median, robust scatter, and a radial trend only where it is plain."""
+    """Scale from the bright identified stars: median, robust scatter, and a radial trend only where it is significant.
+
+    `found` says which of the `detections` is which of the stars; the `camera` has the throughput of the lens.
+    """
     d, s = found.detection, found.star
     trusted = (detections.snr[d] > BRIGHT_SNR) & ~detections.saturated[d] & (stars.v_sigma_mag[s] < 0.1)
     if trusted.sum() < MIN_STARS:

@@ -41,13 +41,13 @@ Sampler = Callable[[Ints, Ints], tuple[NDArray[np.float32], Bools]]  # rows and 
 
 @dataclass(frozen=True)
 class Skyline:
-    """The horizon of one place: elevations [rad] at equally spaced azimuths, called with azimuths (n,) [rad]."""
+    """The horizon of one position: elevations [rad] at equally spaced azimuths, called with `azimuth_rad` (n,)."""
 
     elevation_rad: Array
 
     @classmethod
     def trace(cls, place_m: Array, terrain: Terrain) -> Skyline:
-        """The horizon of the place (2,) [m]: asked once, since real ground takes its time to answer."""
+        """The horizon of a `terrain` at `place_m` (2,), traced once: on a height map that takes time."""
         azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_SAMPLES, endpoint=False)
         return cls(terrain.horizon_rad(np.asarray(place_m)[None, :], azimuth))
 
@@ -168,7 +168,10 @@ def reliable_azimuths(horizon: Horizon, shifted: list[Horizon], camera: Camera) 
 
 
 def near_skyline(azimuth_rad: Array, elevation_rad: Array, camera: Camera, horizon: Horizon, within_px: float) -> Bools:
-    """Which directions (n,) lie within so many pixels of the skyline."""
+    """Which directions (n,), `azimuth_rad` and `elevation_rad`, lie within `within_px` pixels of a `horizon`.
+
+    The scale is that of the `camera` half way to its edge.
+    """
     scale = float(camera.mean_scale_rad_per_px(np.array(camera.max_angle_rad / 2)))
     return np.asarray(np.abs(elevation_rad - horizon(azimuth_rad)) < within_px * scale)
 

@@ -89,10 +89,21 @@ class StarEvidence:
         place_sigma_px: float,
         visible: Array | None = None,
     ) -> StarPhotometry:
-        """Light at every star in view.
+        """Photometry of every star in view.
 
-        `image_e` in electrons, background included; `visible` (len(stars),) is the probability that each star shines
-        where something is known of it already (used for its light in its neighbours' measurements only).
+        Args:
+            image_e: (H, W) in electrons, background included.
+            dead: (H, W) pixels to leave out.
+            detections: their background, noise and PSF are used.
+            camera: projects the stars.
+            stars: of the catalogue, brightest first.
+            bodies: whose glare spoils the stars beside them.
+            R_cam_icrs: (3, 3).
+            R_enu_icrs: (3, 3).
+            scale: of the fluxes.
+            place_sigma_px: error of the predicted pixels per axis.
+            visible: (len(stars),) probability that each star is visible where that is known already; it is used for
+                the star's light in its neighbours' measurements only.
         """
         sigma_px = detections.psf_sigma_px
         faintest = scale.zero_mag - 2.5 * np.log10(self.faintest_snr * max(filtered_noise_e(detections), 1e-9))

@@ -77,7 +77,7 @@ def grey_float32(stored: NDArray[Any]) -> tuple[NDArray[np.float32], tuple[str, 
 
 
 def are_fractions(pixels_adu: NDArray[np.float32]) -> bool:
-    """Whether all pixels are from 0 to 1 and some above 0: a picture scaled for display, not counts."""
+    """Whether all of `pixels_adu` (H, W) are from 0 to 1 and some above 0: a picture scaled for display, not counts."""
     return bool(0 < pixels_adu.max() <= 1 and pixels_adu.min() >= 0)
 
 

@@ -61,6 +61,8 @@ def with_facts(
 ) -> Exposure:
     """The exposure with the values given here in place of its own; `time_utc` is mid-exposure.
 
+    `camera` and `terrain` are names or paths of files.
+
     A mid-exposure time computed from DATE-OBS and a header's EXPTIME does not change with a new `exposure_s`; give it
     to `read_exposure` for that. Raises ValueError for a time without zone.
     """

@@ -50,7 +50,7 @@ def write_exposure(path: str | os.PathLike[str], exposure: Exposure, *, overwrit
 
 
 def write_sidecar(image: str | os.PathLike[str], facts: Facts | Exposure, *, overwrite: bool = False) -> Path:
-    """Write the known metadata to NAME.json beside the image NAME.png, and return the sidecar's path.
+    """Write the known metadata `facts` to NAME.json beside the image NAME.png, and return the sidecar's path.
 
     Raises BadInput bad_image if the file exists and not `overwrite`, or if it cannot be written.
     """

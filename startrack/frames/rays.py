@@ -20,7 +20,7 @@ def rays_from_azel(azimuth_rad: ArrayLike, elevation_rad: ArrayLike) -> Array:
 
 
 def azel_from_rays(rays_enu: ArrayLike) -> tuple[Array, Array]:
-    """Azimuth in [0, 2 pi) from north through east, and elevation above the horizontal plane, each (...) [rad].
+    """Azimuth in [0, 2 pi) from north through east, and elevation above the horizontal, of `rays_enu` (..., 3) [rad].
 
     Vectors need not be of unit length. At the zenith the azimuth is not defined.
     """

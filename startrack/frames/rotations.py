@@ -78,7 +78,7 @@ def R_from_quat_xyzw(quat_xyzw: ArrayLike) -> Array:
 def R_body_enu_from_heading_pitch_roll(heading_rad: float, pitch_rad: float, roll_rad: float) -> Array:
     """Rotation (3, 3) from enu to body: its rows are body x, y, z (forward, left, up) in enu.
 
-    Yaw (pi/2 - heading), pitch (-pitch) and roll about the body's z, y and x axes, as in ROS REP 103.
+    Yaw pi/2 - `heading_rad`, pitch -`pitch_rad` and roll `roll_rad` about the body's z, y and x axes (ROS REP 103).
     """
     from scipy.spatial.transform import Rotation
 
@@ -86,7 +86,7 @@ def R_body_enu_from_heading_pitch_roll(heading_rad: float, pitch_rad: float, rol
 
 
 def heading_pitch_roll_from_R_body_enu(R_body_enu: ArrayLike) -> tuple[float, float, float]:
-    """Heading in [0, 2 pi), pitch in [-pi/2, pi/2] and roll in (-pi, pi] of the rotation (3, 3) [rad].
+    """Heading in [0, 2 pi), pitch in [-pi/2, pi/2] and roll in (-pi, pi] of `R_body_enu` (3, 3) [rad].
 
     Inverse of R_body_enu_from_heading_pitch_roll. With the nose straight up or down only the sum of heading and roll
     is defined: roll is then given as 0.

@@ -76,7 +76,7 @@ def latlon_from_enu(site: Site, east_m: ArrayLike, north_m: ArrayLike, up_m: Arr
 
 
 def R_enu_icrs(site: Site, time: datetime) -> Array:
-    """Rotation (3, 3) from ICRS axes to east, north, up at the site: rays_enu = rays_icrs @ R_enu_icrs.T.
+    """Rotation (3, 3) from ICRS axes to east, north, up at the site and `time`: rays_enu = rays_icrs @ R_enu_icrs.T.
 
     Apparent directions give apparent directions: see `aberrate` and `refract_rad` for aberration and refraction.
     Moon: SPICE with the DE421 orientation, MOON_ME. Earth: see R_itrs_icrs.

@@ -54,7 +54,7 @@ def et_s(time: datetime) -> float:
 
 
 def R_mcmf_icrs(time: datetime) -> Array:
-    """Rotation (3, 3) from ICRS to the Moon-fixed frame: mean Earth / polar axis of DE421 (SPICE's MOON_ME).
+    """Rotation (3, 3) from ICRS to the Moon-fixed frame at a `time`: mean Earth / polar axis of DE421 (MOON_ME).
 
     Raises:
         BadInput: "no_time" outside the kernels' coverage.

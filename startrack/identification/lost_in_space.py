@@ -52,7 +52,7 @@ class Identifier:
     whole_field: bool = True  # refuse a camera that fits only a part of its field; a calibration may begin with one
 
     def __call__(self, centroids: Centroids, camera: Camera, stars: Stars) -> Identification:
-        """Match a list of detections (sorted, brightest first) with the stars (sorted, brightest first).
+        """Match `centroids` of a `camera` with the `stars`, both sorted, brightest first.
 
         Raises NotIdentified; its reason is "mirrored" where only the mirror image of the frame can be identified.
         """

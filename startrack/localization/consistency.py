@@ -40,7 +40,7 @@ Sure = tuple[Evidence, Array]
 
 
 def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain, compiled: bool = False) -> None:
-    """Raise NotLocated (inconsistent_evidence) where too much of the horizon contradicts the fix, or the map does.
+    """Raise NotLocated (inconsistent_evidence) where too much of the `evidence` contradicts the fix, or the map does.
 
     `compiled` asks for numba where the terrain allows it: the same answer, sooner.
     """

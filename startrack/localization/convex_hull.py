@@ -26,7 +26,7 @@ class Hull:
     explains_evidence: ClassVar[bool] = False
 
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
-        """Raises NotLocated with fewer than 3 seen stars."""
+        """The position from the `evidence` above a `terrain`. Raises NotLocated with fewer than 3 seen stars."""
         cylinder = cylinder_of(terrain)
         evidence = decided_stars(evidence, cylinder)
         points = on_rim_plane(evidence, cylinder)[seen_stars(evidence)]

@@ -28,7 +28,7 @@ class PseudoGradient:
     most_steps: int = 200
 
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
-        """Raises NotLocated with fewer than 3 seen stars."""
+        """The position from the `evidence` above a `terrain`. Raises NotLocated with fewer than 3 seen stars."""
         cylinder = cylinder_of(terrain)
         evidence = decided_stars(evidence, cylinder)
         points, seen = on_rim_plane(evidence, cylinder), seen_stars(evidence)

@@ -15,7 +15,7 @@ from startrack.types import Array, Exposure, Stars
 
 
 def render(scene: Scene, *, rng: np.random.Generator) -> tuple[Exposure, Truth]:
-    """The exposure of a scene, and the truth about it. The same scene and the same generator state, the same pixels.
+    """The exposure of a scene, and the truth about it. The same scene and state of `rng` give the same pixels.
 
     Raises:
         BadInput: bad_calibration when the camera has no sensor.
@@ -44,7 +44,7 @@ def light_e(scene: Scene) -> Array:
 
 
 def truth_of(scene: Scene) -> Truth:
-    """Where each star and body falls at mid-exposure, its stated flux, and whether the terrain hides it."""
+    """Pixel at mid-exposure of each star and body of a `scene`, its stated flux, and whether the terrain hides it."""
     sources = concatenate_stars(scene.stars, _bodies_as_stars(scene))
     rays_enu = sources.rays_icrs @ scene.R_enu_icrs.T
     rays_cam = rays_enu @ scene.R_cam_enu.T

@@ -18,7 +18,7 @@ TRACK_STEP_PX = 0.25
 
 
 def draw_hot_pixels(size_px: tuple[int, int], count: int, *, rng: np.random.Generator) -> HotPixels:
-    """`count` different pixels of a sensor of size (W, H) with dark currents log-uniform in HOT_E_PER_S."""
+    """`count` random pixels (`rng`) of a sensor of `size_px` (W, H), dark currents log-uniform in HOT_E_PER_S."""
     width, height = size_px
     index = rng.choice(width * height, size=min(count, width * height), replace=False)
     low, high = np.log(HOT_E_PER_S)

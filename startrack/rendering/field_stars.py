@@ -18,12 +18,12 @@ CLUSTER_RAD = 0.07  # scatter of a field star about a catalogue star: 4 degrees
 
 
 def draw_v_errors(stars: Stars, scatter_mag: float, *, rng: np.random.Generator) -> Array:
-    """True minus stated magnitude (n,): normal, of the catalogue's own sigma and `scatter_mag` in quadrature."""
+    """True minus stated magnitude (n,) of `stars`, drawn from `rng`: normal, sigma and `scatter_mag` in quadrature."""
     return rng.standard_normal(len(stars)) * np.hypot(stars.v_sigma_mag, scatter_mag)
 
 
 def draw_field_stars(stars: Stars, to_v_mag: float, *, rng: np.random.Generator) -> Stars:
-    """Stars that the sky has and the catalogue lacks, down to `to_v_mag`: ids "FIELD n", hip 0, brightest first.
+    """Random stars (from `rng`) that the catalogue `stars` lacks, to `to_v_mag`: ids "FIELD n", hip 0, brightest first.
 
     In each quarter of a magnitude from FIRST_LACKING_MAG on, as many as the counts N(V) above exceed the catalogue's,
     and never under 1 % of the catalogue's. They crowd where the catalogue does: each lies about a randomly chosen
@@ -46,7 +46,7 @@ def draw_field_stars(stars: Stars, to_v_mag: float, *, rng: np.random.Generator)
 
 
 def concatenate_stars(first: Stars, second: Stars) -> Stars:
-    """The stars of both, in that order."""
+    """The stars of `first` and `second`, in that order."""
     return Stars(
         catalog_id=np.concatenate([first.catalog_id, second.catalog_id]),
         hip=np.concatenate([first.hip, second.hip]),

@@ -68,7 +68,7 @@ class Series:
         return exposure_reaching(self.camera, self.sky_v_mag_arcsec2, v_mag=REACH_V_MAG, snr=REACH_SNR)
 
     def scene(self, number: int, name: str = "") -> tuple[Scene, np.random.Generator]:
-        """The scene of exposure `number` and the generator to render it with.
+        """The scene of exposure `number`, called `name`, and the generator to render it with.
 
         Raises:
             BadInput: bad_terrain when no place can be found, no_time outside the ephemeris.
@@ -151,7 +151,7 @@ def load_sky_catalog(stars: str) -> StarCatalog:
 
 
 def sky_turn_rad(site: Site, time: datetime, exposure_s: float) -> Array:
-    """Rotation vector (3,) in enu by which the stars turn from the start to the end of an exposure about `time`.
+    """Rotation vector (3,) in enu of the stars at a `site` over an exposure of `exposure_s` about `time`.
 
     R_enu_icrs(end) = exp(turn) R_enu_icrs(start); exposures under half a turn of the sky.
     """

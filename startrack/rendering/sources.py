@@ -49,7 +49,9 @@ def add_sources(image_e: Array, scene: Scene) -> None:
 
 
 def exposure_reaching(camera: Camera, sky_v_mag_arcsec2: float | None, *, v_mag: float, snr: float) -> float:
-    """Seconds in which a star on the axis reaches the matched-filter signal-to-noise ratio.
+    """Seconds in which a star of `v_mag` on the axis reaches the matched-filter ratio `snr`.
+
+    `sky_v_mag_arcsec2` is the brightness of the sky (None: black).
 
     snr^2 = S^2 / (S + A (read^2 + B)), S and B the electrons of the star and of one pixel's sky and dark current in
     the time t, A = 4 pi (sigma^2 + 1/12) the PSF's noise area: a quadratic in t. The camera must have a sensor.

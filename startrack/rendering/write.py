@@ -32,8 +32,8 @@ def write_truth(
 ) -> tuple[Path, Path]:
     """Write the truth beside the image and return both paths; the table holds the sources down to `to_v_mag`.
 
-    `settings` are further keys of the JSON file (exposure, seed, ...). Raises BadInput bad_image where a file is in
-    the way or cannot be written.
+    `settings` are further keys of the JSON file (exposure, seed, ...). Raises BadInput bad_image where a file is
+    there and not `overwrite`, or cannot be written.
     """
     pose_path, table_path = truth_paths(image)
     pose = {

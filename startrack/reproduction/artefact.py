@@ -62,7 +62,7 @@ class Artefact:
 
 
 def write_artefact(artefact: Artefact, out: Path, *, plots: bool) -> list[Path]:
-    """Write NAME.md, NAME.ecsv and, with `plots`, the pictures; their paths. Raises BadInput."""
+    """Write NAME.md, NAME.ecsv and, with `plots`, pictures of an `artefact` to `out`; their paths. Raises BadInput."""
     files: dict[str, bytes] = {}
     if artefact.columns:
         files[f"{artefact.name}.ecsv"] = ecsv_text(artefact.columns).encode()

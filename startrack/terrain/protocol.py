@@ -23,6 +23,10 @@ class Terrain(ABC):
     other members have defaults, which describe exact ground that is known everywhere. Methods are elementwise over
     their broadcast arguments. The horizon is an elevation in enu [rad]; a star is visible where its elevation exceeds
     it.
+
+    Arguments of the methods: `points_m` (..., 2) positions; `centres_m` (..., 2) and `half_m` (...) centres and half
+    sides of boxes of positions; `centre_m` (2,) one position; `azimuths_rad` and `elevations_rad` (...) directions in
+    enu; `azimuth_half_rad` half the width of a range of azimuths; `progress` a function of the parts done and of all.
     """
 
     name: str = "terrain"

@@ -76,7 +76,7 @@ def identify_unknown_lens(
     centroids: Centroids, size_px: tuple[int, int], fov_rad: float, stars: Stars, *, tolerance: float = 0.1,
     background: NDArray[Any] | None = None,
 ) -> UnknownLensSolution:  # fmt: skip
-    """Lens, attitude and matches of `centroids` in a frame of `size_px` (W, H) with a field of view known to `tolerance`.
+    """Lens, attitude and matches of `centroids` in a frame of `size_px` (W, H), its field of view known to `tolerance`.
 
     `fov_rad`: below 100 degrees the angle across the frame's width, from there up that of the whole image circle,
     whether the frame clips it or not. `stars` are sorted, brightest first. `background` (H, W): smooth background of

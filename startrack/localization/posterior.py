@@ -58,7 +58,10 @@ class ExactPosterior:
     compiled: bool = False  # with numba, for a cylinder with hard edges: the same answer, 10 to 50 times sooner
 
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
-        """Posterior of the camera's position on a `terrain`. Raises NotLocated (insufficient_geometry, outside_search_area)."""
+        """Posterior of the camera's position on a `terrain`.
+
+        Raises NotLocated (insufficient_geometry, outside_search_area).
+        """
         told = (np.abs(evidence.llr) > 1e-3) & terrain.is_informative(evidence.azimuth_rad, evidence.elevation_rad)
         if told.sum() < FEWEST_RAYS:
             raise NotLocated(f"only {int(told.sum())} rays say anything about the skyline: expose longer")

@@ -76,7 +76,7 @@ KEYS = Table(
 
 
 def load_terrain(name_or_path: str | Path) -> Terrain:
-    """The terrain of a file (a path if it ends in .toml or contains a separator) or of a shipped name.
+    """The terrain of a file `name_or_path`: a path if it ends in .toml or contains a separator, else a shipped name.
 
     Raises BadInput bad_terrain with the file and the cause.
     """
@@ -125,7 +125,7 @@ def _map_stamps(folder: Path, keys: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def terrain_from_dict(values: dict[str, Any], default_name: str = "terrain", folder: Path | None = None) -> Terrain:
-    """The terrain of a terrain file's keys; paths of maps are relative to the folder.
+    """The terrain of a terrain file's `values`, called `default_name` without a name; paths are relative to `folder`.
 
     Raises BadInput bad_terrain with the key that is wrong.
     """

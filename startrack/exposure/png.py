@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from startrack.compilation import announce_compilation
 from startrack.exposure.decoded import (
     Decoded,
     bad_image,
@@ -37,6 +38,7 @@ def decode_png(raw: bytes) -> Decoded:
     """
     import cv2
 
+    announce_compilation()
     from startrack.exposure.png_rows import DAMAGED, decode_rows
 
     header: dict[str, str] = {}

@@ -3,7 +3,7 @@
     python benchmarks/evidence.py --frames 300 --deep-frames 100
 
 The true sky is Hipparcos and the Gaia stars that it lacks (extra `deep`); the locator takes Gaia's only where the frame
-is deep enough. "full" is what `locate` does; each other line leaves one part out, and the second look at the skyline
+is deep enough. "full" is what `locate` does; each other line leaves one part out, and the second measurement near the skyline
 too. 2048 px fisheye, 3 % scatter of the fluxes beside the catalogue's own errors, hot pixels, cosmic rays, random
 places, dates, headings, tilt to 5 degrees. All lines of a table see the same frames, or the first of them.
 """
@@ -136,7 +136,7 @@ def _scored(fix: Fix | None, place_m: Array) -> dict[str, Any]:
 
 def _ablations(result: Measured) -> Iterator[tuple[str, Evidence, ExactPosterior]]:
     full = ExactPosterior(compiled=True)
-    yield "without the second look at the skyline", _light(result).evidence(), full
+    yield "without remeasuring near the skyline", _light(result).evidence(), full
     yield "list at 5 sigma", _listed(result.light, 5.0), full
     yield "list at 3 sigma", _listed(result.light, 3.0), full
     lonely = _light(result, visible=np.zeros(len(result.stars)))  # neighbours that never shine

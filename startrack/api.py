@@ -24,6 +24,7 @@ from startrack.inputs import (
     terrain_input,
     time_input,
 )  # fmt: skip
+from startrack.orientation import stars_at
 from startrack.rendering import Series, Truth, load_sky_catalog
 from startrack.rendering import render as render_scene
 from startrack.solution import Solution
@@ -229,7 +230,7 @@ def _identify_list(
         size_px=size_px,
         flux=flux,
         sigma_px=sigma_px,
-        stars=pipeline.stars_at(load_catalog(), time_input(time), None),
+        stars=stars_at(load_catalog(), time_input(time), None),
     )
 
 

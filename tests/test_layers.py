@@ -25,7 +25,7 @@ LAYERS = (  # lowest first; a room imports from lower layers only
     {"attitude"},
     {"rendering", "detection", "identification", "evidence", "localization"},
     {"stages"},
-    {"measurement"},
+    {"measurement", "orientation"},
     {"pipeline", "calibration", "inputs"},
     {"output"},
     {"solution"},

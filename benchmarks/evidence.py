@@ -4,8 +4,8 @@
 
 The true sky is Hipparcos and the Gaia stars that it lacks (extra `deep`); the locator takes Gaia's only where the frame
 is deep enough. "full" is what `locate` does; each other line leaves one part out, and the second measurement near the
-skyline too. 2048 px fisheye, 3 % scatter of the fluxes beside the catalogue's own errors, hot pixels, cosmic rays, random
-places, dates, headings, tilt to 5 degrees. All lines of a table see the same frames, or the first of them.
+skyline too. 2048 px fisheye, 3 % scatter of the fluxes beside the catalogue's own errors, hot pixels, cosmic rays,
+random places, dates, headings, tilt to 5 degrees. All lines of a table see the same frames, or the first of them.
 """
 
 from __future__ import annotations

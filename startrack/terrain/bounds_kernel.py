@@ -21,81 +21,12 @@ from startrack.terrain.horizon_kernel import (
     on_map,
     surface,
 )
+from startrack.terrain.slope_kernel import level_of, slope_range, steepness
 
-SHIFT_HEIGHT_M = 1000.0
 ACROSS = 8  # steps along each side of a box
 FINE_POSTS = 1.2  # posts: of narrower bands slopes are taken cell by cell
 KINK_M = 0.02  # by which a traced ray may miss a kink of the ground: NUDGE_M times the change of slope
 PARTS = 4  # of a step, whose slopes are taken one by one
-MOST_TOUCHED = 25  # cells of a part
-TOUCH_MARGIN = 0.02  # of a cell: more than maps bend over a step
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _steepness(slopes, at, unit, d_column, d_row):
-    """Most rise per metre in a block and its neighbours, going (d_column, d_row) per metre."""
-    a, b = abs(d_column), abs(d_row)
-    if a >= b:
-        straight = slopes[at, 4] if d_column > 0.0 else -slopes[at, 0]
-    else:
-        straight = slopes[at, 5] if d_row > 0.0 else -slopes[at, 1]
-    if d_column * d_row >= 0.0:
-        slanted = slopes[at, 6] if d_row + d_column > 0.0 else -slopes[at, 2]
-    else:
-        slanted = slopes[at, 7] if d_row > 0.0 else -slopes[at, 3]
-    return unit * (abs(a - b) * straight + min(a, b) * slanted)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _level_of(levels, m, post_m, moon, width, e, n):
-    """Lowest level whose blocks' neighbours reach `width` to the side."""
-    shift = SHIFT_HEIGHT_M * np.sqrt(e * e + n * n) / moon  # how far 1 km of height moves a place on the map
-    across = (1.05 * width + shift) / post_m[m] + 1e-6
-    level = 0
-    while (1 << level) < across and level < levels[m] - 1:
-        level += 1
-    return level
-
-
-@njit(cache=True, nogil=True)
-def _slope_range(heights, posts, m, column, row, d_column, d_row, begin, end, to_column, to_row, width):
-    """Least and most rise per metre to the side in a band; (1, -1) where it leaves the map or touches many cells.
-
-    The band reaches `width` to each side (`to_column`, `to_row` per metre) of the segment that begins and ends at these
-    distances from (column, row) in the direction (d_column, d_row) per metre. The rise in a bilinear cell is linear in
-    column and row: its extremes are at the ends of the part of the segment whose band touches the cell.
-    """
-    columns, rows = posts[m, 2], posts[m, 1]
-    side_column, side_row = width * abs(to_column) + TOUCH_MARGIN, width * abs(to_row) + TOUCH_MARGIN
-    j0 = int(np.floor(column + min(d_column * begin, d_column * end) - side_column))
-    j1 = int(np.floor(column + max(d_column * begin, d_column * end) + side_column))
-    i0 = int(np.floor(row + min(d_row * begin, d_row * end) - side_row))
-    i1 = int(np.floor(row + max(d_row * begin, d_row * end) + side_row))
-    least, most = 1.0, -1.0
-    if j0 >= 0 and i0 >= 0 and j1 < columns - 1 and i1 < rows - 1 and (j1 - j0 + 1) * (i1 - i0 + 1) <= MOST_TOUCHED:
-        least, most = np.inf, -np.inf
-        for i in range(i0, i1 + 1):
-            for j in range(j0, j1 + 1):
-                x, y = column - j, row - i
-                first, last = begin, end
-                if abs(d_column) > 1e-12:
-                    a, b = (-side_column - x) / d_column, (1 + side_column - x) / d_column
-                    first, last = max(first, min(a, b)), min(last, max(a, b))
-                if abs(d_row) > 1e-12:
-                    a, b = (-side_row - y) / d_row, (1 + side_row - y) / d_row
-                    first, last = max(first, min(a, b)), min(last, max(a, b))
-                if first <= last:
-                    at = posts[m, 0] + i * columns + j
-                    corner, across, down = heights[at], heights[at + 1], heights[at + columns]
-                    twist = corner - across - down + heights[at + columns + 1]
-                    straight = to_column * (across - corner + twist * y) + to_row * (down - corner + twist * x)
-                    along = twist * (to_column * d_row + to_row * d_column)
-                    aside = 2 * abs(twist * to_column * to_row) * width + abs(twist) * TOUCH_MARGIN * (
-                        abs(to_column) + abs(to_row)
-                    )
-                    least = min(least, straight + min(along * first, along * last) - aside)
-                    most = max(most, straight + max(along * first, along * last) + aside)
-    return least, most
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -190,13 +121,13 @@ def box_height_bounds(ground, east, north, half, tilted):
         m, column, row = locate(grid, posts, east, north, moon + middle)
         slack = 2 * half
         if m >= 0:
-            level = _level_of(levels, m, post_m, moon, 1.5 * half, east, north)
+            level = level_of(levels, m, post_m, moon, 1.5 * half, east, north)
             at = block_at(blocks, m, level, column, row)
             a, b = 0.0, 0.0
             for turn in range(4):  # steepest to the four sides
                 to_e, to_n = post_m[m] * (turn == 0) - post_m[m] * (turn == 1), post_m[m] * (turn > 1) * (5 - 2 * turn)
                 column2, row2 = on_map(grid, m, east + to_e, north + to_n, moon + middle)
-                rise = _steepness(slopes, at, slope_unit[m], (column2 - column) / post_m[m], (row2 - row) / post_m[m])
+                rise = steepness(slopes, at, slope_unit[m], (column2 - column) / post_m[m], (row2 - row) / post_m[m])
                 if turn < 2:
                     a = max(a, abs(rise - slope_e * (1 - 2 * turn)) + 0.03 * abs(rise))
                 else:
@@ -219,8 +150,8 @@ def bounds(
     is within w times the steepest slope to the side of what it is on the middle line. Close to the box the horizon is
     no higher than the steepest slope along the ray, as the camera stands above the ground.
 
-    Slopes to the side come from the pyramid. Where a step may make the horizon and w is below about a post, they are
-    taken again from the cells that the band touches, in PARTS parts of the step.
+    Slopes to the side come from the pyramid. With `tilt_to_crest`, where a step may make the horizon and w is below
+    about a post, they are taken again from the cells that the band touches, in PARTS parts of the step.
 
     All heights (low_up and high_up too) may be relative to a plane through the middle of the box that rises by slope_e
     to the east and slope_n to the north: a tan then is less by the plane's own rise along the ray. With `tilt_to_crest`
@@ -282,7 +213,7 @@ def bounds(
             rise = max(low + along_rise, -1.0)
             column2, row2 = on_map(grid, m, e + step * sin_a, n + step * cos_a, line + rise * step)
             d_column, d_row = (column2 - column) / step, (row2 - row) / step
-            least_level = _level_of(levels, m, post_m, moon, width, e, n)
+            least_level = level_of(levels, m, post_m, moon, width, e, n)
             near = whole and s < 6.0 * reach and not probing
             level = least_level if near or probing else min(max(level, least_level), levels[m] - 1)
             descending, skipped = not (near or probing), False
@@ -303,8 +234,8 @@ def bounds(
                 stop = s + length
                 side_column, side_row = on_map(grid, m, e + step * cos_a, n - step * sin_a, line)
                 to_column, to_row = (side_column - column) / step, (side_row - row) / step
-                right = _steepness(slopes, at, slope_unit[m], to_column, to_row)
-                left = _steepness(slopes, at, slope_unit[m], -to_column, -to_row)
+                right = steepness(slopes, at, slope_unit[m], to_column, to_row)
+                left = steepness(slopes, at, slope_unit[m], -to_column, -to_row)
                 to_side = max(right - side_rise, left + side_rise, 0.0)
                 steep = max(abs(right), abs(left))
                 floor += tilted * width
@@ -312,7 +243,7 @@ def bounds(
                 rise_aside = to_side + steep * (0.005 + 2 * bend) + (aside + width) / moon
                 slack = rise_aside * width
                 if near:
-                    along = _steepness(slopes, at, slope_unit[m], d_column, d_row) - along_rise
+                    along = steepness(slopes, at, slope_unit[m], d_column, d_row) - along_rise
                     along += (abs(along + along_rise) * (0.01 + 2 * bend) + bend + width / moon) + steep * tan_turn
                     steepest = max(steepest, along)
                 elif not probing:
@@ -330,7 +261,7 @@ def bounds(
                     s, half_s, stop, z0, z1, z2, slack, low_up, high_up, reach, cos_turn
                 )
                 parts, part_slack = 1, KINK_M * min(width, 1.0)
-                if top >= low and width < FINE_POSTS * post_m[m]:
+                if tilt_to_crest and top >= low and width < FINE_POSTS * post_m[m]:
                     parts = PARTS
                     column0, row0 = on_map(grid, m, e, n, moon + z0 + along_rise * s)
                 bend_k = (z0 - 2 * z1 + z2) * 2 / (length * length)
@@ -342,7 +273,7 @@ def bounds(
                     if parts > 1:
                         a0, a2 = length * k / parts, length * (k + 1) / parts
                         a1 = 0.5 * (a0 + a2)
-                        least, most = _slope_range(
+                        least, most = slope_range(
                             heights, posts, m, column0, row0, d_column, d_row, a0, a2, to_column, to_row, width
                         )
                         if least <= most:

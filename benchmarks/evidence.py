@@ -106,7 +106,7 @@ def one(job: tuple[int, Depth, int]) -> dict[str, dict[str, Any]]:
     scene, rng = series.scene(number)
     exposure, truth = render(scene, rng=rng)
     place = truth.position_enu_m[:2]
-    fast = Settings(localizer=ExactPosterior(compiled=True))
+    fast = Settings(localizer=ExactPosterior())
     result = locate(exposure, camera, terrain, catalog, fast)
     rows = {"full": _scored(_fix(result), place)}
     value = last_value(result)
@@ -135,7 +135,7 @@ def _scored(fix: Fix | None, place_m: Array) -> dict[str, Any]:
 
 
 def _ablations(result: Measured) -> Iterator[tuple[str, Evidence, ExactPosterior]]:
-    full = ExactPosterior(compiled=True)
+    full = ExactPosterior()
     yield "without remeasuring near the skyline", _light(result).evidence(), full
     yield "list at 5 sigma", _listed(result.light, 5.0), full
     yield "list at 3 sigma", _listed(result.light, 3.0), full

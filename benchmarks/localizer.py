@@ -17,7 +17,15 @@ import numpy as np
 from _results import table, write_section
 
 from startrack.localization import ExactPosterior, PseudoGradient
-from startrack.reproduction.simulator import ASPECT_RATIO, MAGNITUDE, PERFECT, Sky, crater, places, visible
+from startrack.reproduction.simulator import (
+    ASPECT_RATIO,
+    MAGNITUDE,
+    PERFECT,
+    Sky,
+    crater,
+    draw_places,
+    visible_stars,
+)
 from startrack.types import Evidence, Fix
 
 ROUNDS = 9
@@ -29,12 +37,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--places", type=int, default=300)
     args = parser.parse_args()
-    cylinder, truth, lists = crater(ASPECT_RATIO), places(SEED, 0, 0, args.places), thesis_lists(args.places)
+    cylinder, truth, lists = crater(ASPECT_RATIO), draw_places(SEED, 0, 0, args.places), thesis_lists(args.places)
     methods: dict[str, tuple[Callable[..., Fix], int]] = {  # and how many of the lists it gets
         "pseudo-gradient (Kua 2008)": (PseudoGradient(), args.places),
-        "exact posterior, compiled": (ExactPosterior(sector_epsilon=0.0, compiled=True), args.places),
-        "the same, with caps for unmapped obstacles": (ExactPosterior(compiled=True), args.places),
-        "the same, plain numpy": (ExactPosterior(), max(args.places // 20, 1)),
+        "exact posterior": (ExactPosterior(sector_epsilon=0.0), args.places),
+        "the same, with floors for unmapped obstacles": (ExactPosterior(), args.places),
     }
     times: dict[str, list[float]] = {name: [] for name in methods}
     errors = {
@@ -59,10 +66,10 @@ def main() -> None:
 
 def thesis_lists(count: int) -> list[Evidence]:
     """Perfect lists of one of the thesis's random skies at random places."""
-    sky, cylinder = Sky.drawn(SEED, 0, MAGNITUDE), crater(ASPECT_RATIO)
+    sky, cylinder = Sky.draw(SEED, 0, MAGNITUDE), crater(ASPECT_RATIO)
     points = sky.on_rim_plane(cylinder)
-    seen = [visible(points, place, cylinder.radius_m) for place in places(SEED, 0, 0, count)]
-    return [PERFECT.evidence(sky, PERFECT.listed(one, SEED, 0, k)) for k, one in enumerate(seen)]
+    seen = [visible_stars(points, place, cylinder.radius_m) for place in draw_places(SEED, 0, 0, count)]
+    return [PERFECT.evidence(sky, PERFECT.draw_list(one, SEED, 0, k)) for k, one in enumerate(seen)]
 
 
 def error_m(fix: Fix, place_m: np.ndarray) -> float:

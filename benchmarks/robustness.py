@@ -135,7 +135,7 @@ def one(job: tuple[int, int]) -> dict[str, Any]:
         rays[chosen] = rays[np.roll(chosen, 1)]
         catalog = replace(catalog, rays_icrs=rays)
     evidence = Biased(trouble.attitude_bias_arcsec) if trouble.attitude_bias_arcsec else StarEvidence()
-    settings = Settings(localizer=ExactPosterior(compiled=True), evidence=evidence)  # type: ignore[arg-type]
+    settings = Settings(localizer=ExactPosterior(), evidence=evidence)  # type: ignore[arg-type]
     result = locate(exposure, scene.camera, trouble.told(true), catalog, settings)
     if not isinstance(result, Located) or result.status != "ok":
         return {"status": result.status, "reason": result.reason}

@@ -22,7 +22,7 @@ from chain import SENSOR
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.localization import ExactPosterior, check_consistency
-from startrack.localization.horizon_bias import raised
+from startrack.localization.nuisance import lower_evidence
 from startrack.pipeline import locate
 from startrack.rendering import Series, render
 from startrack.stages import Measured, last_value
@@ -52,7 +52,7 @@ def main() -> None:
     for number in range(args.frames):
         evidence, place = kept(args.keep, true, args.seed, number)
         for name, (terrain, bias) in maps.items():
-            rows[name].append(scored(raised(evidence, -bias), terrain, place))
+            rows[name].append(scored(lower_evidence(evidence, -bias), terrain, place))
             print(number, name, rows[name][-1], flush=True)
     body = summary(rows)
     print(body)

@@ -203,6 +203,12 @@ class Evidence(Value):
         """The rows that a mask, slice or index array `which` selects."""
         return take_rows(self, which)
 
+    @classmethod
+    def joined(cls, *parts: Evidence) -> Evidence:
+        """The rows of all `parts`, of several sources or exposures, in one value."""
+        names = [f.name for f in fields(cls)]
+        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
     def __len__(self) -> int:
         return len(self.llr)
 

@@ -6,18 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from localization_helpers import WRAPPERS, ThreeMethods, slow_contributions, slow_scores
 
 from startrack.localization import ExactPosterior, Hull, Localizer, PseudoGradient
-from startrack.localization.branch_and_bound import by_sector, ray_by_ray, split
-from startrack.localization.grid_search import scores
-from startrack.localization.prefix_sums import Profile
-from startrack.localization.sector_likelihood import Sectors, contribution
-from startrack.terrain import Cylinder, load_terrain
+from startrack.localization.branch_and_bound import Search
+from startrack.localization.initial_guess import Guess
+from startrack.localization.likelihood import PositionLikelihood
+from startrack.localization.sector_likelihood import Sectors, contributions, row_range
+from startrack.terrain import Cylinder, Terrain, load_terrain
 from startrack.types import Array, Evidence, NotLocated
 
 TERRAIN = load_terrain("shackleton-thesis")
 assert isinstance(TERRAIN, Cylinder)
 THESIS_STARS = 2142  # Kua 2008, eq. 3.8 at magnitude 6
+NO_GUESS = Guess(np.zeros((0, 2)), np.zeros(0))
 
 
 def sky(rng: np.random.Generator, n: int) -> tuple[Array, Array]:
@@ -51,7 +53,7 @@ def measured(rng: np.random.Generator, at_m: Array, terrain: Cylinder, n: int, s
 
 @pytest.mark.parametrize(
     ("method", "mean_m", "most_m"),
-    [(ExactPosterior(compiled=True), 28.0, 200.0), (PseudoGradient(), 50.0, 400.0), (Hull(), 800.0, 2500.0)],
+    [(ExactPosterior(), 28.0, 200.0), (PseudoGradient(), 50.0, 400.0), (Hull(), 800.0, 2500.0)],
     ids=["exact", "pseudo-gradient", "hull"],
 )
 def test_contract_of_every_localizer(method: Localizer, mean_m: float, most_m: float) -> None:
@@ -88,14 +90,14 @@ def test_exact_posterior_equals_brute_force(seed: int, epsilon: float, sigma_rad
     """Mean, covariance and the 95 % circle of a grid of 1 m over the whole floor of a small crater."""
     rng = np.random.default_rng(seed)
     evidence = measured(rng, place(rng, SMALL), SMALL, 250, sigma_rad)
-    method = ExactPosterior(sector_epsilon=epsilon, boxes_per_sigma=6.0)
+    method = ExactPosterior(sector_epsilon=epsilon)
     fix = method(evidence, SMALL)
     line = np.arange(-200.0, 200.0, 1.0) + 0.5
     x, y = np.meshgrid(line, line)
     grid = np.stack([x.ravel(), y.ravel()], axis=1)
     grid = grid[np.hypot(grid[:, 0], grid[:, 1]) < 200.0]
-    sectors = Sectors.of(evidence, method.sector_width_rad, epsilon)
-    log = np.concatenate([scores(some, evidence, sectors, SMALL) for some in np.array_split(grid, 60)])
+    sectors = Sectors.from_evidence(evidence, method.sector_width_rad, epsilon)
+    log = np.concatenate([slow_scores(some, evidence, SMALL, sectors) for some in np.array_split(grid, 60)])
     weight = np.exp(log - log.max())
     weight /= weight.sum()
     mean = weight @ grid
@@ -108,22 +110,48 @@ def test_exact_posterior_equals_brute_force(seed: int, epsilon: float, sigma_rad
     assert fix.dropped_mass < 1e-3
 
 
-def test_bounds_hold_at_random_places_of_every_box() -> None:
-    """Both kinds of bounds, on two levels, with soft edges."""
+@pytest.mark.parametrize("sigma_rad", [0.0, 0.002])
+def test_bounds_hold_at_random_positions_of_every_box(sigma_rad: float) -> None:
+    """Bounds by sectors, by parts of sectors, by rows, and of quarters."""
     rng = np.random.default_rng(8)
-    evidence = measured(rng, place(rng), TERRAIN, 400, 0.002)
-    sectors = Sectors.of(evidence, float(np.radians(1.5)), 1e-4)
-    profile = Profile.of(sectors)
+    evidence = measured(rng, place(rng), TERRAIN, 400, sigma_rad)
+    likelihood = PositionLikelihood.from_evidence(evidence, ThreeMethods(TERRAIN))
+    search = Search(ExactPosterior(prune_nats=np.inf, negligible_nats=np.inf), likelihood, NO_GUESS, likelihood.terrain)
     centres = np.array([[1000.0, 2000.0], [-7000.0, 3000.0], [6500.0, -6500.0]])
-    coarse, first, last = by_sector(centres, 300.0, sectors, profile, TERRAIN)
-    by_ray = ray_by_ray(coarse, first, last, sectors, profile, TERRAIN)
-    for boxes in (coarse, by_ray, split(by_ray, sectors, profile, TERRAIN)):
-        for k in range(len(boxes)):
+    first, last = likelihood.sums.open_rays(likelihood.terrain, centres, 300.0)
+    coarse = likelihood.boxes_by_rows(centres, 300.0, *likelihood.part_sums.split(likelihood.sums, first, last))
+    by_row = search._bound_by_llr_tier(coarse)
+    for boxes in (coarse, by_row, search._bound_by_llr_tier(search._split(by_row))):
+        assert len(boxes.lower) >= 3
+        for k in range(len(boxes.lower)):
             inside = boxes.centres_m[k] + boxes.half_m * (2 * rng.random((60, 2)) - 1)
             inside = inside[TERRAIN.allowed(inside)]
-            score = scores(inside, evidence, sectors, TERRAIN)
-            assert np.all(score >= boxes.lower[k] - 1e-2)
-            assert np.all(score <= boxes.upper[k] + 1e-2)
+            score = slow_scores(inside, evidence, TERRAIN, likelihood.sectors)
+            assert np.all(score >= boxes.lower[k] - 1e-4)
+            assert np.all(score <= boxes.upper[k] + 1e-4)
+
+
+@pytest.mark.parametrize("sigma_rad", [0.0, 0.002])
+@pytest.mark.parametrize("wrapper", WRAPPERS)
+def test_a_wrapped_terrain_gives_the_terrains_own_fix(wrapper: type, sigma_rad: float) -> None:
+    rng = np.random.default_rng(9)
+    at = place(rng)
+    evidence = measured(rng, at, TERRAIN, 3000, sigma_rad)
+    own, wrapped = ExactPosterior()(evidence, TERRAIN), ExactPosterior()(evidence, wrapper(TERRAIN))
+    np.testing.assert_allclose(wrapped.position_enu_m, own.position_enu_m, atol=1e-6)
+    np.testing.assert_allclose(wrapped.covariance_m2, own.covariance_m2, rtol=1e-6)
+    assert wrapped.radius95_m == pytest.approx(own.radius95_m, rel=1e-6)
+
+
+def test_positions_beside_the_wall_and_deep_evidence_are_located() -> None:
+    """Within 50 m of the wall, and with 60,000 strong rows, as exposures to V 8 give."""
+    for seed, n in ((1, 4000), (2, 4000), (3, 60_000)):
+        rng = np.random.default_rng(seed)
+        turn = 2 * np.pi * rng.random()
+        at = (TERRAIN.radius_m - 50 * rng.random()) * np.array([np.sin(turn), np.cos(turn)])
+        fix = ExactPosterior()(measured(rng, at, TERRAIN, n), TERRAIN)
+        assert np.linalg.norm(fix.position_enu_m[:2] - at) < fix.radius999_m
+        assert fix.search == "proven"
 
 
 def test_errors_are_as_large_as_stated() -> None:
@@ -132,7 +160,7 @@ def test_errors_are_as_large_as_stated() -> None:
     for seed in range(150):
         rng = np.random.default_rng(1000 + seed)
         at = place(rng)
-        fix = ExactPosterior(compiled=True)(measured(rng, at, TERRAIN, 3000), TERRAIN)
+        fix = ExactPosterior()(measured(rng, at, TERRAIN, 3000), TERRAIN)
         d = fix.position_enu_m[:2] - at
         nees.append(d @ np.linalg.solve(fix.covariance_m2, d))
         within.append(np.linalg.norm(d) < fix.radius95_m)
@@ -140,8 +168,8 @@ def test_errors_are_as_large_as_stated() -> None:
     assert 0.89 < np.mean(within) <= 1.0
 
 
-@pytest.mark.parametrize("compiled", [False, True])
-def test_two_places_that_fit_are_both_named(compiled: bool) -> None:
+@pytest.mark.parametrize("terrain", [TERRAIN, ThreeMethods(TERRAIN)], ids=["disks", "bounds"])
+def test_two_places_that_fit_are_both_named(terrain: Terrain) -> None:
     """Stars due east and due west only: a place and its mirror image to the south see the same horizon there."""
     rng = np.random.default_rng(3)
     n, at = 1500, np.array([2000.0, 6000.0])
@@ -150,7 +178,7 @@ def test_two_places_that_fit_are_both_named(compiled: bool) -> None:
     flux = snr * (elevation > TERRAIN.horizon_rad(at[None], azimuth)) + rng.standard_normal(n)
     llr = np.clip(snr * flux - snr**2 / 2, -9, 9)
     evidence = Evidence(azimuth_rad=azimuth, elevation_rad=elevation, llr=llr, edge_sigma_rad=np.zeros(n))
-    fix = ExactPosterior(sector_epsilon=0.0, compiled=compiled)(evidence, TERRAIN)
+    fix = ExactPosterior(sector_epsilon=0.0)(evidence, terrain)
     assert fix.ambiguous
     first, second = fix.modes[:2]
     assert first.weight == pytest.approx(0.5, abs=0.1)
@@ -179,14 +207,59 @@ def test_stars_high_above_the_rim_locate_nothing() -> None:
     assert refusal.value.reason == "insufficient_geometry"
 
 
-def test_soft_edge_is_the_mixture_of_both_cases() -> None:
-    from scipy.stats import norm
+def rows(rng: np.random.Generator, n: int) -> Evidence:
+    """Point sources and extended light, half each."""
+    return Evidence(
+        azimuth_rad=np.zeros(n), elevation_rad=rng.random(n), llr=6 * rng.standard_normal(n),
+        extended_nats=np.where(np.arange(n) % 2, 20 * rng.random(n), 0.0),
+    )  # fmt: skip
 
+
+def test_contributions_are_those_written_out() -> None:
+    """The mixture of both cases for point sources, the parabola for extended light."""
     rng = np.random.default_rng(6)
-    llr, elevation, horizon, sigma = 6 * rng.standard_normal(50), rng.random(50), rng.random(50), 0.3 * rng.random(50)
-    visible = norm.cdf((elevation - horizon) / sigma)
-    expected = np.log(visible * np.exp(llr) + 1 - visible)
-    np.testing.assert_allclose(contribution(llr, elevation, horizon, sigma), expected, atol=1e-12)
+    e, horizon, sigma = rows(rng, 60), rng.random(60), 0.3 * rng.random(60)
+    found = contributions(e.llr, e.extended_nats, e.elevation_rad, horizon, sigma)
+    np.testing.assert_allclose(found, slow_contributions(e, e.elevation_rad - horizon, sigma), atol=1e-11)
+
+
+def test_ranges_of_contributions_hold_every_value_between() -> None:
+    rng = np.random.default_rng(12)
+    e, low = rows(rng, 200), rng.uniform(-7, 7, 200)
+    high = low + rng.uniform(0, 6, 200)
+    between = low + (high - low) * np.linspace(0, 1, 50)[:, None]
+    value = slow_contributions(e, between, np.ones(200))
+    for k in range(200):
+        least, most = row_range(e.llr[k], e.extended_nats[k], low[k], high[k])
+        assert least - 1e-6 <= value[:, k].min()
+        assert value[:, k].max() <= most + 1e-6
+        assert most - least <= np.ptp(value[:, k]) + 0.05 + 0.02 * e.extended_nats[k]
+
+
+def test_pixels_of_the_sky_and_several_exposures_are_rows_like_any_other() -> None:
+    """Extended light beside stars, from two exposures in one value, locates better than the stars alone."""
+    rng = np.random.default_rng(13)
+    at = np.array([3000.0, -1500.0])
+    stars = measured(rng, at, TERRAIN, 1500)
+    azimuth, sigma = 2 * np.pi * rng.random(4000), np.full(4000, 0.001)
+    elevation = TERRAIN.horizon_rad(at[None], azimuth) + rng.uniform(-0.01, 0.01, 4000)
+    step = 0.5  # of the sky's light, in sigmas of a pixel
+    visible = slow_visible(elevation - TERRAIN.horizon_rad(at[None], azimuth), sigma)
+    light = step * visible + rng.standard_normal(4000)
+    pixels = Evidence(
+        azimuth_rad=azimuth, elevation_rad=elevation, llr=step * light - step**2 / 2, edge_sigma_rad=sigma,
+        extended_nats=np.full(4000, step**2),
+    )  # fmt: skip
+    both = Evidence.joined(stars, pixels)
+    alone, together = ExactPosterior()(stars, TERRAIN), ExactPosterior()(both, TERRAIN)
+    assert np.trace(together.covariance_m2) < 0.5 * np.trace(alone.covariance_m2)
+    assert np.linalg.norm(together.position_enu_m[:2] - at) < together.radius999_m
+
+
+def slow_visible(margin_rad: Array, sigma_rad: Array) -> Array:
+    from scipy.special import ndtr
+
+    return np.asarray(ndtr(margin_rad / sigma_rad))
 
 
 def test_a_boulder_costs_no_more_than_its_sectors() -> None:
@@ -197,10 +270,43 @@ def test_a_boulder_costs_no_more_than_its_sectors() -> None:
     dark = (np.degrees(evidence.azimuth_rad) < 20) & (evidence.elevation_rad < np.radians(30))
     llr = np.where(dark, -9.0, evidence.llr)
     hidden = replace(evidence, llr=llr)
-    fix = ExactPosterior(compiled=True)(hidden, TERRAIN)
+    fix = ExactPosterior()(hidden, TERRAIN)
     assert np.linalg.norm(fix.position_enu_m[:2] - at) < fix.radius999_m
     # What the dark sectors can say against the place is bounded: 14 sectors of 1.5 degrees at ln(1e-4) each.
-    sectors = Sectors.of(hidden, float(np.radians(1.5)), 1e-4)
-    clear = Sectors.of(evidence, float(np.radians(1.5)), 1e-4)
-    loss = scores(at[None], evidence, clear, TERRAIN)[0] - scores(at[None], hidden, sectors, TERRAIN)[0]
+    sectors = Sectors.from_evidence(hidden, float(np.radians(1.5)), 1e-4)
+    clear = Sectors.from_evidence(evidence, float(np.radians(1.5)), 1e-4)
+    loss = slow_scores(at[None], evidence, TERRAIN, clear)[0] - slow_scores(at[None], hidden, TERRAIN, sectors)[0]
     assert 0 < loss < 14 * -np.log(1e-4)
+
+
+def whole_sky(seed: int, n: int = 1500) -> Evidence:
+    """Stars with SNR 0.5 to 6 measured from a random place."""
+    rng = np.random.default_rng(seed)
+    azimuth, elevation = 2 * np.pi * rng.random(n), np.arcsin(2 * rng.random(n) - 1)
+    at = 9000 * np.sqrt(rng.random()) * np.array([1.0, 0.0])
+    snr = 0.5 + 5.5 * rng.random(n)
+    flux = snr * (elevation > TERRAIN.horizon_rad(at[None], azimuth)) + rng.standard_normal(n)
+    return Evidence(
+        azimuth_rad=azimuth,
+        elevation_rad=elevation,
+        llr=np.clip(snr * flux - snr**2 / 2, -9, 9),
+    )
+
+
+def test_rays_below_the_horizontal_never_shine_and_do_no_harm() -> None:
+    evidence = whole_sky(3)
+    above = evidence.elevation_rad > 0
+    kept = evidence.take(above)
+    method = ExactPosterior()
+    with_all, without = method(evidence, TERRAIN), method(kept, TERRAIN)
+    np.testing.assert_allclose(with_all.position_enu_m, without.position_enu_m, atol=1e-6)
+
+
+def test_a_smaller_search_area_is_kept_to() -> None:
+    evidence = whole_sky(0)
+    fix = ExactPosterior()(evidence, TERRAIN)
+    radius = float(np.hypot(*fix.position_enu_m[:2])) + 400.0
+    near = ExactPosterior()(evidence, replace(TERRAIN, search_radius_m=radius))
+    # Other boxes, the same posterior.
+    sigma = np.sqrt(np.trace(fix.covariance_m2))
+    np.testing.assert_allclose(near.position_enu_m, fix.position_enu_m, atol=0.1 * sigma)

@@ -6,17 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from localization_helpers import WRAPPERS, slow_scores
 
 from startrack.localization import ExactPosterior, check_consistency
-from startrack.localization.box_average import Blurred
-from startrack.localization.consistency import contradicted_stretches
-from startrack.localization.grid_search import scores
-from startrack.localization.horizon_bias import raised
-from startrack.localization.initial_guess import best_by_diving
-from startrack.localization.local_search import Vicinity
-from startrack.localization.misfit import turn_of_sky
-from startrack.localization.prefix_sums import Profile
-from startrack.localization.sector_likelihood import Sectors
+from startrack.localization.box_average import BoxAverage
+from startrack.localization.consistency import best_turn, contradicted_stretches
+from startrack.localization.initial_guess import beam_search
+from startrack.localization.likelihood import PositionLikelihood
+from startrack.localization.nuisance import lower_evidence
 from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
 from startrack.types import Array, Evidence, NotLocated
@@ -75,25 +72,27 @@ def test_the_vicinity_scores_places_as_all_rays_do(shackleton, sigma_rad):
     rng = np.random.default_rng(2)
     place = np.array([-80.0, 30.0])
     evidence = seen_from(shackleton, place, rng, 3000, sigma_rad)
-    sectors = Sectors.of(evidence, np.radians(1.5), 1e-4)
-    about = Vicinity.of(sectors, Profile.of(sectors), shackleton, place, 40.0)
+    likelihood = PositionLikelihood.from_evidence(evidence, shackleton)
+    about = likelihood.near(place, 40.0)
     places = place + rng.uniform(-35, 35, (50, 2))
-    exact = scores(places, evidence, sectors, shackleton)
+    exact = slow_scores(places, evidence, shackleton, likelihood.sectors)
+    assert np.allclose(likelihood.exact_scores(places), exact, atol=1e-5)
     found = about.scores(places)
     assert np.median(np.abs(found - exact)) < (0.05 if sigma_rad else 1e-6)  # a ray may flip at a hard edge
     plain = replace(about, ground=shackleton)  # every horizon is traced
     assert np.median(np.abs(plain.scores(places) - found)) < 0.05  # rough azimuths are traced there
-    top, best = about.climbed(place, 16.0, 0.5)
+    top, best = about.climb(place, 16.0, 0.5)
     assert best >= found.max() - 5
-    assert np.allclose(plain.climbed(place, 16.0, 0.5)[0], top, atol=1.0)
+    assert np.allclose(plain.climb(place, 16.0, 0.5)[0], top, atol=1.0)
 
 
 def test_a_box_is_blurred_as_horizons_drawn_between_its_bounds_are(shackleton):
     rng = np.random.default_rng(6)
     evidence = seen_from(shackleton, np.array([-80.0, 30.0]), rng, 3000, 0.0)
-    sectors = Sectors.of(evidence, np.radians(1.5), 1e-4)
+    likelihood = PositionLikelihood.from_evidence(evidence, shackleton)
+    sectors = likelihood.sectors
     centres, half = np.array([[-90.0, 40.0], [150.0, -20.0]]), 40.0
-    found = Blurred.of(sectors, Profile.of(sectors)).score(shackleton, centres, half)
+    found = BoxAverage.from_sectors(sectors, likelihood.sums).score(shackleton, centres, half)
     count, draws = sectors.count, (np.arange(4000) + 0.5) / 4000
     middle = (2 * np.arange(count) + 1) * np.pi / count
     low, high = shackleton.horizon_bounds_rad(centres[:, None], np.array(half), middle, np.pi / count)
@@ -109,23 +108,23 @@ def test_a_box_is_blurred_as_horizons_drawn_between_its_bounds_are(shackleton):
     assert found[0] > found[1] + 50
 
 
-def test_the_dive_ends_near_the_top(shackleton):
+def test_the_beam_search_ends_near_the_top(shackleton):
     for seed in range(6):
         rng = np.random.default_rng([7, seed])
         place = rng.uniform(-200, 200, 2)
         evidence = seen_from(shackleton, place, rng, 1500, 0.0005)
-        sectors = Sectors.of(evidence, np.radians(1.5), 1e-4)
-        found, best = best_by_diving(sectors, Profile.of(sectors), shackleton)
-        assert best > scores(place[None], evidence, sectors, shackleton)[0] - 2.0
-        assert np.linalg.norm(found - place) < 30.0
+        likelihood = PositionLikelihood.from_evidence(evidence, shackleton)
+        guess = beam_search(likelihood)
+        assert guess.best > likelihood.exact_scores(place[None])[0] - 2.0
+        assert np.linalg.norm(guess.points_m[0] - place) < 30.0
 
 
-def test_stars_of_another_place_or_time_are_refused_before_the_search(shackleton):
+def test_stars_of_another_place_or_time_are_refused(shackleton):
     rng = np.random.default_rng(8)
     evidence = seen_from(shackleton, np.array([50.0, -120.0]), rng, 3000, 0.0005)
     assert ExactPosterior()(evidence, shackleton).radius95_m < 50.0
     turned = replace(evidence, azimuth_rad=np.mod(evidence.azimuth_rad + np.radians(60), 2 * np.pi))
-    with pytest.raises(NotLocated, match="no place explains the stars") as refused:
+    with pytest.raises(NotLocated, match="explains the stars") as refused:
         ExactPosterior()(turned, shackleton)
     assert refused.value.reason == "inconsistent_evidence"
 
@@ -158,14 +157,13 @@ def test_posterior_on_ground_equals_a_plain_grid(shackleton, sigma_rad):
     rng = np.random.default_rng(3)
     place = np.array([120.0, 60.0])
     evidence = seen_from(shackleton, place, rng, 1500, sigma_rad)
-    method = ExactPosterior() if sigma_rad else ExactPosterior(boxes_per_sigma=3.0)
-    fix = method(evidence, shackleton)
+    fix = ExactPosterior()(evidence, shackleton)
     step = float(np.sqrt(np.linalg.eigvalsh(fix.covariance_m2)[0])) / 3
     reach = 4.5 * float(np.sqrt(np.linalg.eigvalsh(fix.covariance_m2)[1]))
     line = np.arange(-reach, reach, step)
     grid = fix.position_enu_m[:2] + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    sectors = Sectors.of(evidence, method.sector_width_rad, method.sector_epsilon)
-    log = np.concatenate([scores(some, evidence, sectors, shackleton) for some in np.array_split(grid, 8)])
+    sectors = PositionLikelihood.from_evidence(evidence, shackleton).sectors
+    log = np.concatenate([slow_scores(some, evidence, shackleton, sectors) for some in np.array_split(grid, 8)])
     weight = np.exp(log - log.max())
     weight /= weight.sum()
     mean = weight @ grid
@@ -173,13 +171,14 @@ def test_posterior_on_ground_equals_a_plain_grid(shackleton, sigma_rad):
     sigma = np.sqrt(np.trace(spread))
     assert np.linalg.norm(fix.position_enu_m[:2] - mean) < 0.1 * sigma
     assert fix.covariance_m2 == pytest.approx(spread, abs=0.12 * sigma**2)
-    assert fix.dropped_mass < 1e-3
+    assert fix.search == ("beam" if sigma_rad else "proven")  # with soft edges all rays near the skyline stay open
+    assert fix.dropped_mass < 1e-3 or sigma_rad
 
 
 def test_a_common_error_found_is_told_and_not_taken_for_a_wrong_map(shackleton):
     rng, error = np.random.default_rng(4), np.radians(0.08)
     unsure = replace(shackleton, horizon_sigma_common_rad=np.radians(0.1))
-    evidence = raised(seen_from(shackleton, np.array([50.0, -90.0]), rng, 4000, 0.0), -error)
+    evidence = lower_evidence(seen_from(shackleton, np.array([50.0, -90.0]), rng, 4000, 0.0), -error)
     fix = ExactPosterior()(evidence, unsure)
     assert fix.horizon_error_rad == pytest.approx(error, abs=np.radians(0.02))
     check_consistency(evidence, fix, unsure)
@@ -191,10 +190,31 @@ def test_a_sky_turned_by_a_wrong_clock_shows(shackleton):
     evidence = seen_from(shackleton, place, rng, 12_000, 0.0)
     for turn, refused in ((0.0, False), (np.radians(1.1), True)):
         turned = replace(evidence, azimuth_rad=np.mod(evidence.azimuth_rad + turn, 2 * np.pi))
-        sectors = Sectors.of(turned, np.radians(1.5), 1e-4)
-        found, gain = turn_of_sky(sectors, Profile.of(sectors), place, shackleton)
+        found, gain = best_turn(PositionLikelihood.from_evidence(turned, shackleton), place)
         if refused:
             assert gain > 5
             assert found == pytest.approx(-turn, abs=np.radians(0.6))
         else:
             assert gain < 2
+
+
+@pytest.mark.parametrize("wrapper", WRAPPERS)
+def test_a_wrapped_map_gives_the_maps_own_fix(shackleton, wrapper):
+    evidence = seen_from(shackleton, np.array([-60.0, 110.0]), np.random.default_rng(14), 3000, 0.0005)
+    own, wrapped = ExactPosterior()(evidence, shackleton), ExactPosterior()(evidence, wrapper(shackleton))
+    atol = 1e-6 if wrapper is not WRAPPERS[-1] else 0.3  # which traces every horizon, and interpolates none
+    np.testing.assert_allclose(wrapped.position_enu_m[:2], own.position_enu_m[:2], atol=atol)
+
+
+def test_an_unfinished_proof_gives_the_posterior_near_the_best_positions(shackleton):
+    evidence = seen_from(shackleton, np.array([-60.0, 110.0]), np.random.default_rng(15), 3000, 0.0005)
+    beam = ExactPosterior(budget_horizons=1.0)(evidence, shackleton)
+    proven = ExactPosterior(budget_horizons=1e9)(evidence, shackleton)
+    assert (proven.search, beam.search) == ("proven", "beam")
+    assert beam.dropped_mass > proven.dropped_mass
+    sigma = np.sqrt(np.trace(proven.covariance_m2))
+    assert np.linalg.norm(beam.position_enu_m - proven.position_enu_m) < 0.2 * sigma
+    np.testing.assert_allclose(beam.covariance_m2, proven.covariance_m2, atol=0.2 * sigma**2)
+    away = replace(evidence, azimuth_rad=np.mod(evidence.azimuth_rad + 1.0, 2 * np.pi))
+    with pytest.raises(NotLocated, match=r"no position found explains the stars.*the search ended"):
+        ExactPosterior(budget_horizons=1.0)(away, shackleton)

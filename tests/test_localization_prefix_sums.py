@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.localization.prefix_sums import Profile
+from startrack.localization.prefix_sums import PrefixSums
 from startrack.localization.sector_likelihood import Sectors
 from startrack.types import Evidence
 
@@ -15,12 +15,12 @@ def test_every_open_ray_of_a_sector_is_open_in_its_part():
         azimuth_rad=rng.uniform(0, 2 * np.pi, 20_000), elevation_rad=rng.uniform(-0.1, 1.5, 20_000),
         llr=rng.normal(0, 5, 20_000), edge_sigma_rad=np.zeros(20_000),
     )  # fmt: skip
-    sectors = Sectors.of(evidence, np.radians(1.5), 1e-4)
-    whole, parts = Profile.of(sectors), Profile.of(sectors, 4)
+    sectors = Sectors.from_evidence(evidence, np.radians(1.5), 1e-4)
+    whole, parts = PrefixSums.from_sectors(sectors), PrefixSums.from_sectors(sectors, 4)
     begins = np.concatenate([[0], whole.ends[:-1]])
     first = begins + rng.integers(0, whole.ends - begins + 1, (30, len(begins)))
     last = first + rng.integers(0, whole.ends - first + 1)
-    handed = parts.handed_down(whole, first, last)
+    handed = parts.split(whole, first, last)
     for box in range(len(first)):
         open_whole = np.zeros(len(evidence), dtype=bool)
         open_parts = open_whole.copy()

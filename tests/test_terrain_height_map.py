@@ -14,7 +14,8 @@ import pytest
 from startrack.errors import NotLocated
 from startrack.frames import Site, enu_from_latlon, latlon_from_enu
 from startrack.localization import ExactPosterior
-from startrack.localization.horizon_bias import common_error, raised
+from startrack.localization.likelihood import PositionLikelihood
+from startrack.localization.nuisance import estimate_horizon_bias, lower_evidence
 from startrack.terrain import load_terrain
 from startrack.terrain import table_cache as cache
 from startrack.terrain.height_map import HeightMap
@@ -202,12 +203,13 @@ def test_a_common_error_is_estimated_with_the_place_and_widens_its_covariance(sh
     evidence = evidence_at(shackleton, place, rng, error)
     unknown = replace(shackleton, height_sigma_m=0.0, horizon_sigma_common_rad=np.radians(0.1))
     known = replace(unknown, horizon_sigma_common_rad=0.0)
-    found = common_error(evidence, unknown, place + np.array([30.0, -20.0]))
-    assert found.error_rad == pytest.approx(error, abs=4 * found.sigma_rad)
+    likelihood = PositionLikelihood.from_evidence(evidence, unknown)
+    found = estimate_horizon_bias(likelihood, place + np.array([30.0, -20.0]))
+    assert found.bias_rad == pytest.approx(error, abs=4 * found.sigma_rad)
     assert found.sigma_rad < np.radians(0.01)
     fix = ExactPosterior()(evidence, unknown)
     assert np.hypot(*(fix.position_enu_m[:2] - place)) < fix.radius999_m
-    told = ExactPosterior()(raised(evidence, error), known)
+    told = ExactPosterior()(lower_evidence(evidence, error), known)
     assert np.trace(fix.covariance_m2) > np.trace(told.covariance_m2)
 
 

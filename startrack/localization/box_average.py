@@ -1,55 +1,101 @@
-"""The evidence as a box of ground sees it on average: each sector's horizon anywhere between its bounds there."""
+"""Likelihood of a box of positions on average: each sector's horizon anywhere between its bounds over the box."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import log
 
 import numpy as np
+from numba import njit
 
-from startrack.localization.prefix_sums import Profile
+from startrack.localization.prefix_sums import PrefixSums
 from startrack.localization.sector_likelihood import SECTOR_STEP, Sectors
 from startrack.terrain import Terrain
-from startrack.types import Array
+from startrack.types import Array, Evidence, Ints
 
 NARROWEST_RAD = 1e-6
+ROWS_PER_SECTOR = 30  # sparse evidence is averaged over wider sectors, which hold so many rows on average
 
 
 @dataclass(frozen=True)
-class Blurred:
-    """Likelihood of boxes if each sector's horizon were equally likely anywhere between its bounds, on its own.
+class BoxAverage:
+    """Log-likelihood of boxes if each sector's horizon is equally likely anywhere between its bounds, independently.
 
-    Neither a bound nor exact, but no worse for large boxes than for small ones: among boxes of one size it tells which
-    are worth a look. A sector's likelihood is a step function of the elevation of its horizon, so that its mean is a
-    difference of a running integral.
+    It is neither a bound nor exact, but as good for large boxes as for small ones: it ranks boxes of one size. A
+    sector's likelihood is a step function of the elevation of its horizon, so its mean is a difference of a running
+    integral.
     """
 
-    key: Array  # (m,) sector and elevation in one ascending number, as in the profile
-    integral: Array  # (m,) of the likelihood, up to there
-    sectors: Sectors
+    key: Array  # (m,) elevations at which the likelihood of a sector steps, ascending within each sector
+    integral: Array  # (m,) of the likelihood over the elevation, up to there
+    starts: Ints  # (sectors + 1,) first key of each sector
+    epsilon: float
 
     @classmethod
-    def of(cls, sectors: Sectors, profile: Profile) -> Blurred:
-        """From a profile of one part a sector."""
-        visible = profile.total[profile.ends[profile.sector]] - profile.total[:-1]  # with a horizon below the ray
-        below = np.exp(np.minimum(visible - sectors.ceiling[profile.sector], 0.0))
+    def from_evidence(cls, evidence: Evidence, width_rad: float, epsilon: float) -> BoxAverage:
+        """From rows of evidence in sectors of at least the given width [rad]."""
+        width = max(width_rad, 2 * np.pi * ROWS_PER_SECTOR / max(len(evidence), 1))
+        sectors = Sectors.from_evidence(evidence, min(width, np.pi / 2), epsilon)
+        return cls.from_sectors(sectors, PrefixSums.from_sectors(sectors))
+
+    @classmethod
+    def from_sectors(cls, sectors: Sectors, sums: PrefixSums) -> BoxAverage:
+        """From the sectors and their prefix sums (of one part a sector)."""
+        visible = sums.total[sums.ends[sums.sector]] - sums.total[:-1]  # with a horizon just below the ray
+        below = np.exp(np.minimum(visible - sectors.ceiling[sums.sector], 0.0))
         hidden = np.exp(-sectors.ceiling)  # the whole sector
         middle = SECTOR_STEP * np.arange(sectors.count)
-        key = np.concatenate([profile.key, middle - 0.5 * SECTOR_STEP, middle + 0.5 * SECTOR_STEP])
+        key = np.concatenate([sums.key, middle - 0.5 * SECTOR_STEP, middle + 0.5 * SECTOR_STEP])
         value = np.concatenate([below, np.zeros(sectors.count), hidden])  # from the key before up to this one
         order = np.argsort(key, kind="stable")
         steps = value[order[1:]] * np.diff(key[order])
-        return cls(key[order], np.concatenate([[0.0], np.cumsum(steps)]), sectors)
+        rows = np.bincount(sums.sector, minlength=sectors.count) + 2
+        elevation = key[order] - np.repeat(middle, rows)
+        starts = np.concatenate([[0], np.cumsum(rows)])
+        return cls(elevation, np.concatenate([[0.0], np.cumsum(steps)]), starts, sectors.epsilon)
 
-    def score(self, terrain: Terrain, centres_m: Array, half_m: float) -> Array:
-        """Log-likelihood (n,) of boxes (n, 2)."""
-        count = self.sectors.count
+    def score(self, terrain: Terrain, centres_m: Array, half_m: float, traced: bool = False) -> Array:
+        """Log-likelihood (n,) of the boxes |dx|, |dy| <= half_m about the centres (n, 2) [m].
+
+        With bounds of the horizon, or, with `traced`, its estimated spread about the horizon of each centre.
+        """
+        count = len(self.starts) - 1
         azimuth, within = (2 * np.arange(count) + 1) * np.pi / count, np.pi / count
         boxes = centres_m[:, None, :]
-        low, high = terrain.horizon_bounds_rad(boxes, np.array(half_m), azimuth, within)
-        wider = terrain.max_horizon_sigma_rad(boxes, half_m, azimuth, within) + NARROWEST_RAD
-        low, high = low - wider, high + wider
-        start = SECTOR_STEP * np.arange(count)
-        below = np.interp(high + start, self.key, self.integral) - np.interp(low + start, self.key, self.integral)
-        mean = np.clip(below / (high - low), 0.0, 1.0)
-        epsilon = self.sectors.epsilon
-        return np.asarray(np.log((1.0 - epsilon) * mean + max(epsilon, 1e-300)).sum(axis=-1))
+        if traced:
+            middle, width = terrain.horizon_spread_rad(boxes, half_m, azimuth)
+            low, high = middle - width, middle + width
+        else:
+            low, high = terrain.horizon_bounds_rad(boxes, np.array(half_m), azimuth, within)
+        if not terrain.hard_edges:
+            wider = terrain.max_horizon_sigma_rad(boxes, half_m, azimuth, within)
+            low, high = low - wider, high + wider
+        found = np.empty(len(centres_m))
+        _average(self.key, self.integral, self.starts, self.epsilon, low, high, found)
+        return found
+
+
+@njit(cache=True, nogil=True)
+def _average(key, integral, starts, epsilon, low, high, found):  # type: ignore[no-untyped-def]
+    """Fill found (n,) with the log-likelihoods of boxes with horizon bounds low, high (n, sectors)."""
+    least = max(epsilon, 1e-300)
+    for n in range(len(found)):
+        total = 0.0
+        for s in range(len(starts) - 1):
+            a, b = low[n, s] - NARROWEST_RAD, high[n, s] + NARROWEST_RAD
+            mean = (_integral(key, integral, starts, s, b) - _integral(key, integral, starts, s, a)) / (b - a)
+            total += log((1.0 - epsilon) * min(max(mean, 0.0), 1.0) + least)
+        found[n] = total
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _integral(key, integral, starts, s, elevation):  # type: ignore[no-untyped-def]
+    """The sector's integral at an elevation, linear between the keys."""
+    first, last = starts[s], starts[s + 1] - 1
+    while last - first > 1:
+        middle = (first + last) >> 1
+        if key[middle] <= elevation:
+            first = middle
+        else:
+            last = middle
+    return integral[first] + (elevation - key[first]) * (integral[last] - integral[first]) / (key[last] - key[first])

@@ -1,165 +1,317 @@
-"""Branch and bound over the ground: every place that could matter, refined; everything else excluded with proof."""
+"""Branch and bound over the searched square: all positions that can matter are refined, all others excluded."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from startrack.localization.prefix_sums import Profile
-from startrack.localization.sector_likelihood import Sectors, contribution
+from startrack.localization.box_kernel import NO_NUMBERS, Boxes, bound_boxes, open_pairs, refine_disks, split_boxes
+from startrack.localization.initial_guess import EXPLAINED_NATS, Guess, beam_search, holds_allowed_ground
+from startrack.localization.likelihood import PARTS, PositionLikelihood
+from startrack.localization.summary import smallest_axis
 from startrack.terrain import Terrain
-from startrack.types import Array, Bools, Evidence, Ints
+from startrack.types import Array, Bools, Ints, NotLocated
 
-SETTLED = 1e-4  # a ray whose contribution varies by less over a box is settled there
-SMALL_BOX_M = 20.0
-CHILDREN = np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
+BOXES_AT_ONCE = 2000  # so that memory stays flat
+ROW_BY_ROW_M = 20.0  # boxes of this half side and less are bounded row by row, larger ones sector by sector
+PARTS_BELOW_M, PARTS_FROM, PARTS_TO = 60.0, 600, 4000  # half side, and numbers of boxes, bounded by parts of sectors
+PARTS_TURNS = 6
+LOOKED_UP_RAD = np.radians(0.26)  # height maps look up what is as wide as that, and trace what is narrower
+LLR_TIERS = ((4.0, np.inf), (2.0, 4.0), (1.0, 2.0), (0.0, 1.0))  # |llr| of rows that are bounded in turns
+MANY_PAIRS = 200_000  # open (box, row) pairs above which horizons at the boxes' centres cost more than they gain
+SOFT_BOXES = 0.3  # of the boxes per sigma suffice where edges are soft: sums of Gaussians converge, and leave no cells
+UNLIKELY_NATS = 16.0  # boxes that are less likely than the best by more are no part of the posterior
+NODE_STEP_M, FIRST_NODES_M = 10.0, 12.0  # least distance of traced points; half side of the first boxes worth it
+WORTH_NODES = 12.0  # horizons traced per open pair, which the levels to come would cost anyhow
+PAIRS_NEAR_NODES = 0.97  # of the pairs lie within the points; the others are traced
+LOOK_UP_COST, INTERPOLATION_COST, BOX_COST = 0.08, 0.03, 2.0  # a look-up, an interpolation, a traced box; in horizons
 
 
-@dataclass(frozen=True)
-class Boxes:
-    """Equal squares still in the running, with bounds of the log-likelihood over each."""
+class SearchSettings(Protocol):
+    """What the search reads of `ExactPosterior`."""
+
+    prune_nats: float
+    negligible_nats: float
+    finest_m: float
+    boxes_per_sigma: float
+    most_boxes: int
+    budget_horizons: float
+
+
+class Explored(NamedTuple):
+    """The posterior on equal boxes."""
 
     centres_m: Array  # (n, 2)
     half_m: float
-    lower: Array  # (n,)
-    upper: Array  # (n,)
-
-    def __len__(self) -> int:
-        return len(self.centres_m)
-
-    def take(self, keep: Bools) -> Boxes:
-        """The kept boxes."""
-        return Boxes(self.centres_m[keep], self.half_m, self.lower[keep], self.upper[keep])
-
-    def quarters(self, terrain: Terrain) -> tuple[Array, Ints]:
-        """Centres (m, 2) of the quarters that hold ground, and the box (m,) that each is of."""
-        half = self.half_m / 2
-        centres = (self.centres_m[:, None, :] + half * CHILDREN).reshape(-1, 2)
-        on_ground = holds_ground(terrain, centres, half)
-        return centres[on_ground], np.repeat(np.arange(len(self)), 4)[on_ground]
+    log_likelihood: Array  # (n,) at the centres
+    log_dropped: float  # logarithm of a bound of the mass [m2] that was dropped
+    search: str  # "proven" or "beam"
 
 
-@dataclass(frozen=True)
-class RayBoxes(Boxes):
-    """Boxes asked ray by ray."""
+class BudgetSpent(Exception):
+    """The search has traced as many horizons as it may, and `open_m2` of the area may still matter."""
 
-    sums: Array  # (n, sectors) contributions of the settled rays
-    box: Ints  # (pairs,) box of each open (box, ray) pair
-    ray: Ints  # (pairs,)
-    least: Array  # (pairs,) bounds of their contributions
-    most: Array  # (pairs,)
+    def __init__(self, open_m2: float, log_open: float) -> None:
+        super().__init__(open_m2, log_open)
+        self.open_m2, self.log_open = open_m2, log_open
 
-    def take(self, keep: Bools) -> RayBoxes:
-        """The kept boxes."""
-        number = np.cumsum(keep) - 1
-        pairs = keep[self.box]
-        return RayBoxes(
-            self.centres_m[keep], self.half_m, self.lower[keep], self.upper[keep], self.sums[keep],
-            number[self.box[pairs]], self.ray[pairs], self.least[pairs], self.most[pairs],
+
+@dataclass
+class Search:
+    """One run: the best log-likelihood known, the work done, and how much probability was dropped."""
+
+    settings: SearchSettings
+    likelihood: PositionLikelihood
+    guess: Guess
+    ground: Terrain  # the terrain, or the same with horizons prepared near the best position
+    node_step_m: float = np.inf
+    best: float = -np.inf
+    certain: float = -np.inf
+    log_dropped: float = -np.inf
+    work: float = 0.0  # in horizons traced
+
+    @classmethod
+    def begin(cls, settings: SearchSettings, likelihood: PositionLikelihood, starts_m: Array | None = None) -> Search:
+        """With good positions (n, 2) where some are known, else with the first guess.
+
+        Bounds in closed form cost so little that the search needs no guess.
+        """
+        known = np.zeros((0, 2)) if starts_m is None else starts_m[np.asarray(likelihood.terrain.allowed(starts_m))]
+        if len(known) or likelihood.in_closed_form:
+            guess = Guess(known, likelihood.exact_scores(known))
+        else:
+            guess = beam_search(likelihood)
+        return cls(settings, likelihood, guess, likelihood.terrain, best=guess.best)
+
+    @property
+    def terrain(self) -> Terrain:
+        return self.likelihood.terrain
+
+    def run(self) -> Explored:
+        """The posterior. Raises NotLocated, and BudgetSpent where the proof would take too long."""
+        if self.likelihood.in_closed_form:
+            boxes = self._refine_by_disks(self.likelihood.root)
+        else:
+            boxes = self._refine(self._exclude_by_sectors())
+        # Which unlikely boxes are left depends on how tight the terrain's bounds are; the likely ones do not.
+        top, mass = float(boxes.score.max(initial=-np.inf)), log_sum(boxes.score)
+        keep = boxes.score > max(
+            top - max(self.settings.prune_nats, UNLIKELY_NATS), mass - self.settings.negligible_nats
+        )
+        lost = log_sum(boxes.score[~keep]) + float(np.log(4 * boxes.half_m**2))
+        self.log_dropped = float(np.logaddexp(self.log_dropped, lost))
+        return Explored(boxes.centres_m[keep], boxes.half_m, boxes.score[keep], self.log_dropped, "proven")
+
+    def _exclude_by_sectors(self) -> Boxes:
+        """From the whole square to boxes of `ROW_BY_ROW_M`, with look-ups of whole sectors or of their parts."""
+        lk, terrain = self.likelihood, self.terrain
+        centres, half, parent = np.zeros((1, 2)), float(terrain.reach_m), np.zeros(1, dtype=np.int64)
+        known: tuple[Ints, Ints] | None = None  # open rows of the parts, once these are bounded
+        while True:
+            if known is None:
+                centres, first, last = self._bound_sectors(centres, half)
+            else:
+                centres, first, last = self._bound_parts(centres, half, parent, *known)
+            if half < ROW_BY_ROW_M:
+                if known is None:
+                    first, last = lk.part_sums.split(lk.sums, first, last)
+                boxes = lk.boxes_by_rows(centres, half, first, last)
+                self._spend(LOOK_UP_COST * len(boxes.row), boxes)
+                return self._bound_by_llr_tier(boxes)
+            quarters, parent = split_boxes(centres, half, terrain.reach_m)
+            half /= 2
+            holds = holds_allowed_ground(terrain, quarters, half)
+            centres, parent = quarters[holds], parent[holds]
+            if known is not None:
+                known = first, last
+            elif half < PARTS_BELOW_M and PARTS_FROM < len(centres) <= PARTS_TO:
+                known = lk.part_sums.split(lk.sums, first, last)
+
+    def _bound_sectors(self, centres: Array, half: float) -> tuple[Array, Ints, Ints]:
+        """Centres (n, 2) of the boxes that may matter, and their open rows (n, sectors)."""
+        if not len(centres):
+            raise NotLocated(
+                "no camera can stand anywhere in the search area: is [search] max_slope_deg too small?",
+                reason="outside_search_area",
+            )
+        lk, kept = self.likelihood, []
+        for start in range(0, len(centres), BOXES_AT_ONCE):
+            some = centres[start : start + BOXES_AT_ONCE]
+            first, last = lk.sums.open_rays(self.terrain, some, half)
+            keep, upper = self._keep(some, half, *lk.sums.sums(first, last))
+            kept.append((some[keep], upper, first[keep], last[keep]))
+            self._spend_on_boxes(LOOK_UP_COST * first.size, kept, half)
+        centres, _, first, last = (np.concatenate(part) for part in zip(*kept, strict=True))
+        return centres, first, last
+
+    def _bound_parts(
+        self, centres: Array, half: float, parent: Ints, first: Ints, last: Ints
+    ) -> tuple[Array, Ints, Ints]:
+        """As `_bound_sectors`, by parts of sectors, and only for rows that are open in the parent box.
+
+        Within a whole sector the horizon itself varies more than over a small box. Some sectors are bounded at a time:
+        few suffice to exclude most boxes.
+        """
+        sums = self.likelihood.part_sums
+        turns, kept = np.arange(len(sums.ends)) // PARTS % PARTS_TURNS, []
+        for start in range(0, len(centres), BOXES_AT_ONCE):
+            some = slice(start, start + BOXES_AT_ONCE)
+            at, low, high, upper = centres[some], first[parent[some]], last[parent[some]], np.zeros(0)
+            for turn in range(PARTS_TURNS):
+                self._spend_on_boxes(BOX_COST * np.count_nonzero((low < high) & (turns == turn)), kept, half)
+                low, high = sums.refine_bounds(self.terrain, at, half, low, high, turns == turn)
+                keep, upper = self._keep(at, half, *sums.sums(low, high))
+                at, low, high = at[keep], low[keep], high[keep]
+            kept.append((at, upper, low, high))
+        centres, _, first, last = (np.concatenate(part) for part in zip(*kept, strict=True))
+        return centres, first, last
+
+    def _keep(self, centres: Array, half: float, visible: Array, least: Array, most: Array) -> tuple[Bools, Array]:
+        """Which boxes (n,) may matter, and the upper bounds of those."""
+        sectors, settings, cell = self.likelihood.sectors, self.settings, np.log(4 * half**2)
+        lower, upper = sectors.score(visible + least), sectors.score(visible + most)
+        sure = lower[np.asarray(self.terrain.allowed(centres))]
+        self.best = max(self.best, float(sure.max(initial=-np.inf)))
+        negligible = log_sum(sure) - settings.negligible_nats
+        keep = upper > max(self.best - settings.prune_nats, negligible)
+        self.log_dropped = float(np.logaddexp(self.log_dropped, log_sum(upper[~keep]) + cell))
+        return keep, upper[keep]
+
+    def _refine_by_disks(self, boxes: Boxes) -> Boxes:
+        """Quartered until small against the posterior's spread, in compiled steps; see `_refine`."""
+        s, terrain = self.settings, self.terrain
+        while True:
+            boxes, self.best, self.certain, dropped = refine_disks(
+                self.likelihood.rows, boxes, terrain.reach_m, self.best, self.certain, s.prune_nats, s.negligible_nats,
+                s.boxes_per_sigma, max(s.finest_m, terrain.finest_m), s.most_boxes,
+            )  # fmt: skip
+            self.log_dropped = float(np.logaddexp(self.log_dropped, dropped))
+            if self._width_over_limit(boxes) < 1:
+                return boxes
+
+    def _refine(self, boxes: Boxes) -> Boxes:
+        """Quartered until small against the posterior's spread."""
+        while True:
+            last = False
+            if len(boxes.row) <= MANY_PAIRS or not self._may_split(boxes):
+                boxes = self._with_scores(boxes)
+                width = self._width_over_limit(boxes)
+                if width < 1:
+                    return boxes
+                last = 1 < width < 2  # the quarters are final: their scores suffice, without bounds
+                self._trace_nodes(boxes)
+            boxes = self._split(boxes)
+            if not last:
+                boxes = self._bound_by_llr_tier(boxes)
+
+    def _split(self, boxes: Boxes) -> Boxes:
+        """The quarters that hold ground, with the bounds and open rows of the boxes that they are quarters of."""
+        centres, parent = split_boxes(boxes.centres_m, boxes.half_m, self.terrain.reach_m)
+        holds = holds_allowed_ground(self.terrain, centres, boxes.half_m / 2)
+        boxes = self._bound(boxes, centres[holds], boxes.half_m / 2, parent[holds], np.inf, np.inf, (NO_NUMBERS,) * 3)
+        self._spend(0.0, boxes)
+        return boxes
+
+    def _bound_by_llr_tier(self, boxes: Boxes) -> Boxes:
+        """The boxes bounded row by row: rows of the greatest |llr| first, since few suffice to exclude most boxes."""
+        if self.ground is self.terrain and boxes.half_m > ROW_BY_ROW_M / 2:
+            boxes = self._bound_tier(boxes, 0.0, np.inf, LOOKED_UP_RAD)
+        for weakest, strongest in LLR_TIERS:
+            boxes = self._bound_tier(boxes, weakest, strongest)
+        return boxes
+
+    def _bound_tier(self, boxes: Boxes, weakest: float, strongest: float, turn_rad: float = 0.0) -> Boxes:
+        """The boxes with the horizon bounded for the rows of a tier, over all azimuths within the turn.
+
+        A wide turn may cost less than none: it is looked up.
+        """
+        same = np.arange(len(boxes.centres_m))
+        box, row = open_pairs(same, boxes.first, boxes.row, self.likelihood.strength, weakest, strongest)
+        centres, azimuth = boxes.centres_m[box], self.likelihood.rows.azimuth_rad[row]
+        looked_up = turn_rad > 0.0
+        part = self.ground.interpolated_part(centres, azimuth) if len(box) and not looked_up else 0.0
+        cost = LOOK_UP_COST if looked_up else INTERPOLATION_COST * part + BOX_COST * (1.0 - part)
+        self._spend(cost * len(box), boxes)
+        low, high = self.ground.horizon_bounds_rad(centres, np.array(boxes.half_m), azimuth, turn_rad)
+        sigma = self.ground.horizon_sigma_rad(centres, azimuth)
+        bounds = tuple(np.ascontiguousarray(a, dtype=np.float64) for a in (low, high, sigma))
+        return self._bound(boxes, boxes.centres_m, boxes.half_m, same, weakest, strongest, bounds)
+
+    def _bound(
+        self, boxes: Boxes, centres: Array, half: float, parent: Ints, weakest: float, strongest: float,
+        bounds: tuple[Array, ...],
+    ) -> Boxes:  # fmt: skip
+        kept, self.best, self.certain, dropped = bound_boxes(
+            self.likelihood.rows, self.terrain.reach_m, boxes, centres, half, parent,
+            np.asarray(self.terrain.allowed(centres)), self.likelihood.strength, weakest, strongest, *bounds,
+            self.best, self.certain, self.settings.prune_nats, self.settings.negligible_nats,
         )  # fmt: skip
+        self.log_dropped = float(np.logaddexp(self.log_dropped, dropped))
+        return kept
 
-    def handed_down(self, terrain: Terrain) -> RayBoxes:
-        """The quarters that hold ground, with what is known of the boxes that they are quarters of."""
-        centres, of = self.quarters(terrain)
-        # Pairs of a box go to each of its quarters: pairs are sorted by box, so those of one box are a run.
-        count = np.bincount(self.box, minlength=len(self))
-        order = np.argsort(self.box, kind="stable")
-        starts = np.cumsum(count) - count
-        box = np.repeat(np.arange(len(of)), count[of])
-        step = np.arange(count[of].sum()) - np.repeat(np.cumsum(count[of]) - count[of], count[of])
-        pair = order[np.repeat(starts[of], count[of]) + step]
-        return RayBoxes(
-            centres, self.half_m / 2, self.lower[of], self.upper[of], self.sums[of], box, self.ray[pair],
-            self.least[pair], self.most[pair],
-        )  # fmt: skip
+    def _with_scores(self, boxes: Boxes) -> Boxes:
+        """The boxes that may matter, with the log-likelihood at their centres."""
+        part = 1.0 if self.ground is not self.terrain else 0.0
+        self._spend((INTERPOLATION_COST * part + (1.0 - part)) * len(boxes.row), boxes)
+        score = self.likelihood.centre_scores(boxes, self.ground)
+        score = np.where(self.terrain.allowed(boxes.centres_m), score, -np.inf)
+        self.best = max(self.best, float(score.max(initial=-np.inf)))
+        return boxes._replace(score=score)
 
+    def _may_split(self, boxes: Boxes) -> bool:
+        finest = max(self.settings.finest_m, self.terrain.finest_m)
+        return 4 * len(boxes.centres_m) <= self.settings.most_boxes and boxes.half_m > finest and len(boxes.row) > 0
 
-def by_sector(
-    centres_m: Array, half_m: float, sectors: Sectors, profile: Profile, terrain: Terrain
-) -> tuple[Boxes, Ints, Ints]:
-    """Boxes bounded with one look-up per sector, and the open rays (n, sectors) of each: first, one past the last."""
-    first, last = profile.open_rays(terrain, centres_m, half_m)
-    return scored(centres_m, half_m, first, last, sectors, profile), first, last
+    def _width_over_limit(self, boxes: Boxes) -> float:
+        """How many times wider the boxes are than needed; 0 where they shall not be split."""
+        if not self._may_split(boxes):
+            return 0.0
+        if not np.isfinite(boxes.score).any():
+            return np.inf
+        many = self.settings.boxes_per_sigma * (1.0 if self.terrain.hard_edges else SOFT_BOXES)
+        return 2 * boxes.half_m * many / max(smallest_axis(boxes.centres_m, 2 * boxes.half_m, boxes.score), 1e-9)
 
+    def _trace_nodes(self, boxes: Boxes) -> None:
+        """Prepare horizons near the boxes once most of them lie close together, and again at smaller distances."""
+        if not len(boxes.row) or boxes.half_m > FIRST_NODES_M:
+            return
+        step = max(2 * boxes.half_m, NODE_STEP_M)
+        if step > 0.6 * self.node_step_m:
+            return
+        box = np.repeat(np.arange(len(boxes.centres_m)), np.diff(boxes.first))
+        centres, azimuth = boxes.centres_m[box], self.likelihood.rows.azimuth_rad
+        traced = 1.0 - self.ground.interpolated_part(centres, azimuth[boxes.row])
+        middle = np.median(centres, axis=0)
+        away = np.abs(boxes.centres_m - middle).max(axis=1)[box]
+        half = float(np.quantile(away, PAIRS_NEAR_NODES)) + boxes.half_m
+        across = max(3, int(np.ceil(2 * half / step)) + 1)
+        rows = np.unique(boxes.row[away < half])
+        if across**2 * len(rows) < WORTH_NODES * traced * len(boxes.row):
+            self._spend(float(across**2 * len(rows)), boxes)
+            self.ground = self.terrain.near(middle, half, azimuth[rows], across)
+            self.node_step_m = 2 * half / (across - 1)
 
-def scored(centres_m: Array, half_m: float, first: Ints, last: Ints, sectors: Sectors, profile: Profile) -> Boxes:
-    """Boxes (n, 2) with the bounds that their open rays leave."""
-    visible, least, most = profile.sums(first, last)
-    return Boxes(centres_m, half_m, sectors.score(visible + least), sectors.score(visible + most))
+    def _spend_on_boxes(self, horizons: float, kept: list[tuple[Array, Array, Ints, Ints]], half: float) -> None:
+        self.work += horizons * self.terrain.horizon_cost
+        if self.work > self.settings.budget_horizons:
+            upper = np.concatenate([part[1] for part in kept] or [np.zeros(1)])
+            raise BudgetSpent(len(upper) * 4 * half**2, log_sum(upper) + float(np.log(4 * half**2)))
 
-
-def ray_by_ray(boxes: Boxes, first: Ints, last: Ints, sectors: Sectors, profile: Profile, terrain: Terrain) -> RayBoxes:
-    """The same boxes with each open ray on its own, bounded anew."""
-    return tightened(asked(boxes, first, last, profile), None, sectors, profile, terrain)
-
-
-def split(boxes: RayBoxes, sectors: Sectors, profile: Profile, terrain: Terrain) -> RayBoxes:
-    """The quarters that hold ground, bounded."""
-    return tightened(boxes.handed_down(terrain), None, sectors, profile, terrain)
-
-
-def asked(boxes: Boxes, first: Ints, last: Ints, profile: Profile) -> RayBoxes:
-    """The same boxes with their open rays, the bounds as they are."""
-    box, ray = profile.pairs(first, last)
-    sums, _, _ = profile.sums(first, last)
-    llr = profile.evidence.llr[ray]
-    return RayBoxes(
-        boxes.centres_m, boxes.half_m, boxes.lower, boxes.upper, sums, box, ray, np.minimum(llr, 0), np.maximum(llr, 0)
-    )
-
-
-def tightened(
-    boxes: RayBoxes, which: Bools | None, sectors: Sectors, profile: Profile, terrain: Terrain, turn_rad: float = 0.0
-) -> RayBoxes:
-    """The boxes with the horizon's bounds asked for some pairs (pairs,) or all, and what no longer varies settled.
-
-    They are asked for all azimuths within the turn, which may be wider and yet quicker to tell than for one.
-    """
-    n, count, rays = len(boxes), sectors.count, profile.evidence
-    some = np.arange(len(boxes.ray)) if which is None else np.flatnonzero(which)
-    box, ray = boxes.box[some], boxes.ray[some]
-    azimuth, elevation, llr = rays.azimuth_rad[ray], rays.elevation_rad[ray], rays.llr[ray]
-    floor, ceiling = terrain.horizon_bounds_rad(boxes.centres_m[box], np.array(boxes.half_m), azimuth, turn_rad)
-    sigma = np.hypot(rays.edge_sigma_rad[ray], terrain.horizon_sigma_rad(boxes.centres_m[box], azimuth))
-    ends = contribution(llr, elevation, floor, sigma), contribution(llr, elevation, ceiling, sigma)
-    least, most = boxes.least.copy(), boxes.most.copy()
-    least[some], most[some] = np.minimum(*ends), np.maximum(*ends)
-    key = boxes.box * count + profile.sector[boxes.ray]
-    open_ = most - least >= SETTLED
-    sums = boxes.sums + _sum_by(key[~open_], 0.5 * (least + most)[~open_], n, count)
-    box, ray, least, most, key = boxes.box[open_], boxes.ray[open_], least[open_], most[open_], key[open_]
-    lower = sectors.score(sums + _sum_by(key, least, n, count))
-    upper = sectors.score(sums + _sum_by(key, most, n, count))
-    return RayBoxes(boxes.centres_m, boxes.half_m, lower, upper, sums, box, ray, least, most)
+    def _spend(self, horizons: float, boxes: Boxes) -> None:
+        self.work += horizons * self.terrain.horizon_cost
+        if self.work > self.settings.budget_horizons:
+            cell = 4 * boxes.half_m**2
+            raise BudgetSpent(len(boxes.centres_m) * cell, log_sum(boxes.upper) + float(np.log(cell)))
 
 
-def centre_scores(boxes: RayBoxes, sectors: Sectors, profile: Profile, terrain: Terrain) -> Array:
-    """Log-likelihood (n,) at the boxes' centres."""
-    rays: Evidence = profile.evidence
-    azimuth, centres = rays.azimuth_rad[boxes.ray], boxes.centres_m[boxes.box]
-    sigma = np.hypot(rays.edge_sigma_rad[boxes.ray], terrain.horizon_sigma_rad(centres, azimuth))
-    value = contribution(
-        rays.llr[boxes.ray], rays.elevation_rad[boxes.ray], terrain.horizon_rad(centres, azimuth), sigma
-    )
-    key = boxes.box * sectors.count + profile.sector[boxes.ray]
-    return sectors.score(boxes.sums + _sum_by(key, value, len(boxes), sectors.count))
+def explains_all_sectors(log_likelihood: float, likelihood: PositionLikelihood) -> bool:
+    """Whether a position explains the evidence as well as a true one: positions hundreds of metres away do not."""
+    return log_likelihood > 1.7 * EXPLAINED_NATS * likelihood.sectors.count
 
 
-def holds_ground(terrain: Terrain, centres_m: Array, half_m: float) -> Bools:
-    """Boxes (n,) that may hold a place where the camera can be: all within reach; of small ones, by a grid of points.
-
-    The grid is closer than slopes change, so that no more than single metres of a small box's ground are missed.
-    """
-    beyond = np.maximum(np.abs(centres_m) - half_m, 0.0)
-    within = np.asarray(np.hypot(beyond[:, 0], beyond[:, 1]) <= terrain.reach_m)
-    if half_m > SMALL_BOX_M:
-        return within
-    steps = np.linspace(-half_m, half_m, 5)
-    x, y = np.meshgrid(steps, steps)
-    points = centres_m[:, None, :] + np.stack([x.ravel(), y.ravel()], axis=1)
-    return within & np.asarray(np.any(terrain.allowed(points), axis=1))
-
-
-def _sum_by(key: Ints, value: Array, n: int, count: int) -> Array:
-    return np.bincount(key, weights=value, minlength=n * count).astype(np.float64).reshape(n, count)
+def log_sum(values: Array) -> float:
+    """Logarithm of the sum of exponentials; -inf of none."""
+    top = float(np.max(values, initial=-np.inf))
+    return top + float(np.log(np.sum(np.exp(values - top)))) if np.isfinite(top) else -np.inf

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from startrack.localization.rim_plane import cylinder_of, decided_stars, on_rim_plane, point_fix, seen_stars
+from startrack.localization.rim_plane import point_fix, stars_on_rim_plane
 from startrack.terrain import Terrain
 from startrack.types import Array, Evidence, Fix, NotLocated
 
@@ -26,11 +26,13 @@ class Hull:
     explains_evidence: ClassVar[bool] = False
 
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
-        """The position from the `evidence` above a `terrain`. Raises NotLocated with fewer than 3 seen stars."""
-        cylinder = cylinder_of(terrain)
-        evidence = decided_stars(evidence, cylinder)
-        points = on_rim_plane(evidence, cylinder)[seen_stars(evidence)]
-        return point_fix(hull_position(points, cylinder.wall_m, cylinder.radius_m), PUBLISHED_SIGMA_M, cylinder)
+        """The position from the `evidence` in a `terrain` that is a cylinder.
+
+        Raises NotLocated with fewer than 3 seen stars, BadInput bad_terrain on another terrain.
+        """
+        plane = stars_on_rim_plane(evidence, terrain)
+        position = hull_position(plane.points_m[plane.seen], plane.wall_m, plane.radius_m)
+        return point_fix(position, PUBLISHED_SIGMA_M, terrain)
 
 
 def hull_position(points_m: Array, wall_m: float, radius_m: float) -> Array:

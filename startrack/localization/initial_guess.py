@@ -1,98 +1,131 @@
-"""A first good place by following the promise of ever smaller boxes: where the horizon is costly to ask."""
+"""First positions that explain the evidence well: a beam search over ever smaller boxes."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from startrack.localization.box_average import Blurred
-from startrack.localization.branch_and_bound import CHILDREN, asked, by_sector, centre_scores, holds_ground
-from startrack.localization.local_search import Vicinity
-from startrack.localization.prefix_sums import Profile
-from startrack.localization.sector_likelihood import Sectors
+from startrack.localization.box_kernel import split_boxes
+from startrack.localization.likelihood import PositionLikelihood
+from startrack.localization.local_search import LocalLikelihood
 from startrack.terrain import Terrain
-from startrack.types import Array, Ints
+from startrack.types import Array, Bools, Ints
 
-DIVES = ((32, 16), (128, 64), (512, 96))  # boxes kept at each level, and scored ray by ray; more where fewer fail
-GOOD_NATS = -0.6  # mean over the sectors; -0.5 is usual at the best place
-SMALL_M = 20.0  # half side of the last boxes
-TRIED, APART_M = 3, 60.0  # places from which the top is climbed, and how far they are apart
-FINEST_M = 0.5
-NEARBY_STEPS_M = np.linspace(-14.0, 14.0, 15)
-CLIMBS = ((45.0, 16.0, 2), (15.0, 4.0, 3))  # how far [m], first step [m], points across where horizons are traced
+FIRST_ACROSS = 8  # boxes along each side of the searched square at the beginning
+SMALL_BOX_M = 20.0  # half side up to which boxes are tested for allowed ground point by point
+TRACED_BELOW_M = 400.0  # half side; the horizons of smaller boxes may be traced instead of looked up
+LAST_HALF_M = {False: 20.0, True: 12.0}  # half side of the last boxes, looked up or traced; smaller ones rank no better
+EXPLAINED_NATS = -0.6  # mean over the sectors; -0.2 to -0.6 at the true position, -5 and less hundreds of metres away
+SCORED = 16  # of the last boxes, row by row
+CANDIDATES, APART_M = 3, 60.0  # positions that are climbed from, and how far they are apart
+LAST_STEP_M = 0.5
+CLIMBS = ((45.0, 16.0, 2), (15.0, 4.0, 3))  # neighbourhood [m], first step [m], points across where horizons are traced
+GRID_M = np.linspace(-14.0, 14.0, 15)
+STRONG_LLR, MANY_ROWS = 1.0, 2000  # of many rows only the strong ones rank candidates
 
 
-def best_by_diving(sectors: Sectors, profile: Profile, terrain: Terrain) -> tuple[Array, float]:
-    """A good place (2,) [m] and its log-likelihood: the most promising ones of ever smaller boxes are quartered.
+@dataclass(frozen=True)
+class Beam:
+    """How many boxes are kept at each level, and whether the horizons of small boxes are traced."""
 
-    The log-likelihood is a lower bound of the maximum, usually within a nat or two of it, that lets the search exclude
-    nearly everything at once. Minus infinity where no place was found.
+    width: int
+    traced: bool
+
+
+# Looked-up horizons rank most positions right. Beside near crests they are too wide: of 9 positions on Shackleton's
+# floor and walls they miss 2, where traced ones rank the true box among the first 70 at every level.
+BEAMS = (Beam(32, traced=False), Beam(80, traced=True), Beam(200, traced=True))
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Positions that explain the evidence well, the best first, and their exact log-likelihoods."""
+
+    points_m: Array  # (n, 2); n may be 0
+    log_likelihood: Array  # (n,) lower bounds of the maximum
+
+    @property
+    def best(self) -> float:
+        return float(self.log_likelihood.max(initial=-np.inf))
+
+
+def beam_search(likelihood: PositionLikelihood) -> Guess:
+    """A few good positions: of ever smaller boxes those with the best average likelihood are quartered.
+
+    The guess decides nothing: without a good one the proof takes longer. Wider beams follow where a narrow one finds no
+    position that explains all sectors.
     """
-    blurred = Blurred.of(sectors, profile)
-    place, best = np.zeros(2), -np.inf
-    for width, scored in DIVES:
-        centres, half = _promising(blurred, terrain, width)
-        found, score = _climbed(centres[:scored], half, sectors, profile, terrain)
-        if score > best:
-            place, best = found, score
-        if best > GOOD_NATS * sectors.count:
+    found = Guess(np.zeros((0, 2)), np.zeros(0))
+    for beam in BEAMS:
+        guess = _climb(likelihood, _last_boxes(likelihood, beam)[:SCORED])
+        if guess.best > found.best:
+            found = guess
+        if found.best > EXPLAINED_NATS * likelihood.sectors.count:
             break
-    return place, best
+    return found
 
 
-def exact_scores(places_m: Array, sectors: Sectors, profile: Profile, terrain: Terrain) -> Array:
-    """Log-likelihoods (n,) of places (n, 2)."""
-    boxes, first, last = by_sector(places_m, FINEST_M, sectors, profile, terrain)
-    return centre_scores(asked(boxes, first, last, profile), sectors, profile, terrain)
+def holds_allowed_ground(terrain: Terrain, centres_m: Array, half_m: float) -> Bools:
+    """Boxes (n,) that may hold a position where a camera can stand: all but small ones, which are tested on a grid.
+
+    The grid is closer than slopes change: at most single metres of a small box's ground are missed.
+    """
+    if half_m > SMALL_BOX_M:
+        return np.ones(len(centres_m), dtype=bool)
+    steps = np.linspace(-half_m, half_m, 5)
+    x, y = np.meshgrid(steps, steps)
+    points = centres_m[:, None, :] + np.stack([x.ravel(), y.ravel()], axis=1)
+    return np.asarray(np.any(terrain.allowed(points), axis=1))
 
 
-def _promising(blurred: Blurred, terrain: Terrain, width: int) -> tuple[Array, float]:
-    """Centres (n, 2) of small boxes, the most promising first, and their half side."""
-    centres, half = np.zeros((1, 2)), float(terrain.reach_m)
-    while half > SMALL_M:
-        half /= 2
-        centres = (centres[:, None, :] + half * CHILDREN).reshape(-1, 2)
-        centres = centres[holds_ground(terrain, centres, half)]
-        centres = centres[np.argsort(-blurred.score(terrain, centres, half), kind="stable")[:width]]
-    return centres, half
+def _last_boxes(likelihood: PositionLikelihood, beam: Beam) -> Array:
+    """Centres (n, 2) of the last boxes, the best average first."""
+    terrain, average = likelihood.terrain, likelihood.average
+    half = terrain.reach_m / FIRST_ACROSS
+    line = half * (2 * np.arange(FIRST_ACROSS) + 1) - terrain.reach_m
+    centres = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    beyond = np.maximum(np.abs(centres) - half, 0.0)
+    centres = centres[np.hypot(beyond[:, 0], beyond[:, 1]) <= terrain.reach_m]
+    while True:
+        centres = centres[holds_allowed_ground(terrain, centres, half)]
+        score = average.score(terrain, centres, half, traced=beam.traced and half < TRACED_BELOW_M)
+        centres = centres[np.argsort(-score, kind="stable")[: beam.width]]
+        if half <= LAST_HALF_M[beam.traced] or not len(centres):
+            return centres
+        centres, half = split_boxes(centres, half, terrain.reach_m)[0], half / 2
 
 
-def _climbed(
-    centres_m: Array, half_m: float, sectors: Sectors, profile: Profile, terrain: Terrain
-) -> tuple[Array, float]:
-    """The best place (2,) near those of the boxes (n, 2) that score best, and its log-likelihood."""
-    best, place = -np.inf, np.zeros(2)
-    if not len(centres_m):
-        return place, best
-    boxes, first, last = by_sector(centres_m, half_m, sectors, profile, terrain)
-    score = centre_scores(asked(boxes, first, last, profile), sectors, profile, terrain)
-    for box in _apart(centres_m, np.argsort(-score, kind="stable")):
-        if boxes.upper[box] < best:
-            continue
-        ways = [centres_m[box]]
+def _climb(likelihood: PositionLikelihood, centres_m: Array) -> Guess:
+    """The best positions near those of the centres (n, 2) that score best."""
+    strong = likelihood.strong(STRONG_LLR, MANY_ROWS)
+    points: list[Array] = []
+    for box in _distinct(centres_m, np.argsort(-strong.exact_scores(centres_m), kind="stable")):
+        way = [centres_m[box]]
         for nearby_m, first_step_m, across in CLIMBS:
-            about = Vicinity.of(sectors, profile, terrain, ways[-1], nearby_m, across=across)
-            ways.append(about.climbed(ways[-1], first_step_m, FINEST_M)[0])
-        places = _where_allowed(np.array(ways), about, terrain)
-        found = exact_scores(places, sectors, profile, terrain)
-        if len(found) and found.max() > best:
-            best, place = float(found.max()), places[int(np.argmax(found))]
-    return place, best
+            local = strong.near(way[-1], nearby_m, across=across)
+            way.append(local.climb(way[-1], first_step_m, LAST_STEP_M)[0])
+        points.extend(_allowed_near(np.array(way), local, likelihood.terrain))
+    found = np.array(points).reshape(-1, 2)
+    score = likelihood.exact_scores(found)
+    best = np.array(_distinct(found, np.argsort(-score, kind="stable")), dtype=np.int64)
+    return Guess(found[best], score[best])
 
 
-def _where_allowed(places_m: Array, about: Vicinity, terrain: Terrain) -> Array:
-    """Those of the places (n, 2) where a camera can stand; where it can at none, the best one nearby, if any."""
-    allowed = np.asarray(terrain.allowed(places_m))
+def _allowed_near(points_m: Array, local: LocalLikelihood, terrain: Terrain) -> Array:
+    """Those of the positions (n, 2) where a camera can stand; where none is, the best one nearby, if any."""
+    allowed = np.asarray(terrain.allowed(points_m))
     if allowed.any():
-        return places_m[allowed]
-    around = places_m[-1] + np.stack(np.meshgrid(NEARBY_STEPS_M, NEARBY_STEPS_M), axis=-1).reshape(-1, 2)
+        return points_m[allowed]
+    around = points_m[-1] + np.stack(np.meshgrid(GRID_M, GRID_M), axis=-1).reshape(-1, 2)
     around = around[np.asarray(terrain.allowed(around))]
-    return around[np.argsort(-about.scores(around))[:1]]
+    return around[np.argsort(-local.scores(around))[:1]]
 
 
-def _apart(places_m: Array, order: Ints) -> list[int]:
-    """The first few of the places (n, 2) in that order, but for those close to one that came before."""
+def _distinct(points_m: Array, order: Ints) -> list[int]:
+    """The first few of the points (n, 2) in that order, without those close to an earlier one."""
     chosen: list[int] = []
     for i in order:
-        if len(chosen) < TRIED and all(np.abs(places_m[i] - places_m[k]).max() > APART_M for k in chosen):
+        if len(chosen) < CANDIDATES and all(np.abs(points_m[i] - points_m[k]).max() > APART_M for k in chosen):
             chosen.append(int(i))
     return chosen

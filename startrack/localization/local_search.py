@@ -1,128 +1,151 @@
-"""Log-likelihoods about one place: the rays that its neighbourhood leaves open, against horizons worked out once."""
+"""Log-likelihoods of positions near one: the rows that stay open nearby, against horizons prepared once."""
 
 from __future__ import annotations
 
+# mypy: disable-error-code="no-untyped-def"
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from math import floor
 
 import numpy as np
+from numba import njit
 
-from startrack.localization.prefix_sums import Profile
-from startrack.localization.sector_likelihood import Sectors, contribution
+from startrack.localization.box_kernel import log_mixtures, score_disks
+from startrack.localization.prefix_sums import PrefixSums
+from startrack.localization.sector_likelihood import Sectors, contributions, row_contribution
 from startrack.terrain import Terrain
-from startrack.terrain.horizon_interpolator import HorizonInterpolator
-from startrack.types import Array, Ints
+from startrack.terrain.horizon_kernel import surfaces
+from startrack.types import Array, Evidence, Ints
 
 COMPASS = np.array([[i, j] for i in (-1, 0, 1) for j in (-1, 0, 1)], dtype=np.float64)
 
 
 @dataclass(frozen=True)
-class Vicinity:
-    """What the evidence says of places within `half_m` of one, and how it changes where all elevations change.
+class LocalLikelihood:
+    """Log-likelihood of positions within `half_m` of one, all rows counted.
 
-    The log-likelihoods are those of all rays: what lies too far from the skyline to change is summed up beforehand.
+    Rows too far from the skyline to change there are summed beforehand. Elevations may be replaced within the leeway
+    of `near`, which serves horizon bias and stretch; azimuths may be turned.
     """
 
-    ground: Terrain
-    azimuth_rad: Array  # (n,) of the open rays
-    elevation_rad: Array
-    llr: Array
-    sigma_rad: Array  # of the edge
+    terrain: Terrain
+    ground: Terrain  # the same, prepared for the neighbourhood
+    centre_m: Array  # (2,)
+    half_m: float
+    evidence: Evidence  # the open rows
+    sigma_rad: Array  # (n,) of the edge, with the terrain's
     sector: Ints
-    visible: Array  # (sectors,) sums of the rays that are visible all the same
-    ceiling: Array  # (sectors,)
-    epsilon: float
+    settled: Array  # (sectors,) sums of the visible settled rows, less the ceilings
+    log_floor: float
 
     @classmethod
-    def of(
-        cls, sectors: Sectors, profile: Profile, terrain: Terrain, place_m: Array, half_m: float,
+    def near(
+        cls, sectors: Sectors, sums: PrefixSums, terrain: Terrain, centre_m: Array, half_m: float,
         leeway_rad: float = 0.0, across: int = 3,
-    ) -> Vicinity:  # fmt: skip
-        """About a place (2,) [m], for elevations that change by no more than the leeway."""
-        first, last = profile.open_rays(terrain, place_m[None], half_m, leeway_rad)
-        rays = profile.pairs(first, last)[1]
-        e = profile.evidence
-        sigma = np.hypot(e.edge_sigma_rad[rays], terrain.horizon_sigma_rad(place_m[None], e.azimuth_rad[rays]))
+    ) -> LocalLikelihood:  # fmt: skip
+        """About a position (2,) [m], for elevations that change by no more than the leeway."""
+        first, last = sums.open_rays(terrain, centre_m[None], half_m, leeway_rad)
+        rows = sums.pairs(first, last)[1]
+        e = sums.evidence.take(rows)
         return cls(
-            ground=terrain.near(place_m, half_m, e.azimuth_rad[rays], across),
-            azimuth_rad=e.azimuth_rad[rays],
-            elevation_rad=e.elevation_rad[rays],
-            llr=e.llr[rays],
-            sigma_rad=sigma,
-            sector=profile.sector[rays],
-            visible=profile.sums(first, last)[0][0],
-            ceiling=sectors.ceiling,
-            epsilon=sectors.epsilon,
+            terrain=terrain,
+            ground=terrain.near(centre_m, half_m, e.azimuth_rad, across),
+            centre_m=centre_m,
+            half_m=half_m,
+            evidence=e,
+            sigma_rad=np.hypot(e.edge_sigma_rad, terrain.horizon_sigma_rad(centre_m[None], e.azimuth_rad)),
+            sector=sums.sector[rows],
+            settled=sums.sums(first, last)[0][0] - sectors.ceiling,
+            log_floor=sectors.log_floor,
         )
 
-    def scores(self, places_m: Array, elevation_rad: Array | None = None) -> Array:
-        """Log-likelihoods (n,) of places (n, 2), the rays standing at other elevations where these are given."""
-        elevation = self.elevation_rad if elevation_rad is None else elevation_rad
-        if isinstance(self.ground, HorizonInterpolator):
-            from startrack.localization import local_search_kernel as vicinity_compiled
+    def scores(self, points_m: Array, elevation_rad: Array | None = None) -> Array:
+        """Log-likelihoods (n,) of positions (n, 2), the rows at other elevations where these are given."""
+        return self._scorer(elevation_rad)(points_m)
 
-            found = np.empty(len(places_m))
-            fill: Any = vicinity_compiled.scores
-            fill(*self._fixed, np.ascontiguousarray(places_m), np.tan(elevation), found)
-            return found
-        horizon = self.ground.horizon_rad(places_m[:, None], self.azimuth_rad)
-        value = contribution(self.llr, elevation, horizon, self.sigma_rad)
-        n, count = len(places_m), len(self.ceiling)
-        key = np.arange(n)[:, None] * count + self.sector
-        sums = np.bincount(key.ravel(), weights=value.ravel(), minlength=n * count).reshape(n, count)
-        return self._sectors.score(self.visible + sums)
-
-    def climbed(
-        self, place_m: Array, first_step_m: float, last_step_m: float, elevation_rad: Array | None = None
+    def climb(
+        self, start_m: Array, first_step_m: float, last_step_m: float, elevation_rad: Array | None = None
     ) -> tuple[Array, float]:
-        """Best place (2,) near the start and its log-likelihood: steps to the best of 8 neighbours, ever shorter.
+        """Best position (2,) near the start and its log-likelihood: steps to the best of 8 neighbours, ever shorter.
 
-        Whether a camera can stand there is not asked.
+        Positions where no camera can stand are not excluded.
         """
-        elevation = self.elevation_rad if elevation_rad is None else elevation_rad
-        if isinstance(self.ground, HorizonInterpolator):
-            from startrack.localization import local_search_kernel as vicinity_compiled
-
-            start = np.ascontiguousarray(place_m, dtype=np.float64)
-            rise = np.tan(elevation)
-            climb: Any = vicinity_compiled.climb
-            east, north, best = climb(*self._fixed, start, first_step_m, last_step_m, rise)
-            return np.array([east, north]), best
-        place, step, best = np.asarray(place_m, dtype=np.float64), first_step_m, -np.inf
+        score = self._scorer(elevation_rad)
+        position, step, best = np.asarray(start_m, dtype=np.float64), first_step_m, -np.inf
         while step >= last_step_m:
-            around = place + step * COMPASS
-            score = self.scores(around, elevation)
-            top = int(np.argmax(score))
-            if score[top] > best:
-                place, best = around[top], float(score[top])
+            around = position + step * COMPASS
+            found = score(around)
+            top = int(np.argmax(found))
+            if found[top] > best:
+                position, best = around[top], float(found[top])
             else:
                 step /= 2
-        return place, best
+        return position, best
 
-    def turned(self, turn_rad: float) -> Vicinity:
-        """The same rays at azimuths so much larger; horizons are asked at four corners only."""
-        azimuth = np.mod(self.azimuth_rad + turn_rad, 2 * np.pi)
-        near = self.ground
-        if isinstance(near, HorizonInterpolator):
-            near = near.whole.near(near.centre_m, near.half_m, azimuth, 2)
-        return replace(self, azimuth_rad=azimuth, ground=near)
+    def on(self, terrain: Terrain) -> LocalLikelihood:
+        """The same rows on another terrain, whose horizon differs by no more than the leeway."""
+        ground = terrain.near(self.centre_m, self.half_m, self.evidence.azimuth_rad)
+        return replace(self, terrain=terrain, ground=ground)
 
-    @cached_property
-    def _sectors(self) -> Sectors:
-        from startrack.types import Evidence
+    def with_turned_sky(self, turn_rad: float) -> LocalLikelihood:
+        """The same rows at azimuths so much larger; horizons are prepared at four corners only."""
+        azimuth = np.mod(self.evidence.azimuth_rad + turn_rad, 2 * np.pi)
+        ground = self.terrain.near(self.centre_m, self.half_m, azimuth, 2)
+        return replace(self, evidence=replace(self.evidence, azimuth_rad=azimuth), ground=ground)
 
-        none = np.zeros(0)
-        rays = Evidence(azimuth_rad=none, elevation_rad=none, llr=none, edge_sigma_rad=none)
-        return Sectors(rays, np.zeros(0, dtype=np.int64), self.ceiling, self.epsilon)
+    def _scorer(self, elevation_rad: Array | None) -> Callable[[Array], Array]:
+        """Positions (n, 2) to log-likelihoods (n,), by interpolated horizons, by disks, or by the terrain itself."""
+        e = self.evidence if elevation_rad is None else replace(self.evidence, elevation_rad=elevation_rad)
+        nodes = self.ground.interpolation(e.azimuth_rad)
+        disks = None if nodes is not None or self.sigma_rad.any() else self.terrain.visible_disks(*rays_of(e))
 
-    @cached_property
-    def _fixed(self) -> tuple[Any, ...]:
-        near = self.ground
-        assert isinstance(near, HorizonInterpolator)
-        column = near.column(self.azimuth_rad)[0]
-        where = near.middle_up_m, float(near.centre_m[0]), float(near.centre_m[1]), float(near.half_m)
-        return (
-            near.whole.ground, np.ascontiguousarray(near.nodes[column]), near.per_height[column], *where, self.llr,
-            np.ascontiguousarray(self.sigma_rad), self.sector, self.visible, self.ceiling, self.epsilon,
-        )  # fmt: skip
+        def score(points_m: Array) -> Array:
+            points, found = np.ascontiguousarray(points_m, dtype=np.float64), np.empty(len(points_m))
+            if nodes is not None:
+                rise = np.tan(e.elevation_rad)
+                _score_nodes(nodes, rise, e.llr, e.extended_nats, self.sigma_rad, *fixed, points, found)
+            elif disks is not None:
+                score_disks(*disks, e.llr, *fixed, points, found)
+            else:
+                horizon = self.ground.horizon_rad(points[:, None], e.azimuth_rad)
+                for k in range(len(points)):
+                    value = contributions(e.llr, e.extended_nats, e.elevation_rad, horizon[k], self.sigma_rad)
+                    sums = np.bincount(self.sector, weights=value, minlength=len(self.settled))
+                    found[k] = log_mixtures(self.settled + sums, self.log_floor)
+            return found
+
+        fixed = self.sector, self.settled, self.log_floor
+        return score
+
+
+def rays_of(evidence: Evidence) -> tuple[Array, Array]:
+    """Azimuths and elevations (n,), (n,) [rad]."""
+    return evidence.azimuth_rad, evidence.elevation_rad
+
+
+@njit(cache=True, nogil=True)
+def _score_nodes(nodes, rise, llr, extended, sigma, sector, settled, log_floor, points, found):
+    """Fill found (n,) with the log-likelihoods of points (n, 2); rise (rows,): tan of the rows' elevations."""
+    across = nodes.nodes.shape[1]
+    scale = (across - 1) / (2 * nodes.half_m)
+    sums, up = np.empty(len(settled)), np.empty(1)
+    for p in range(len(found)):
+        sums[:] = settled
+        x, y = (
+            (points[p, 0] - nodes.east_m + nodes.half_m) * scale,
+            (points[p, 1] - nodes.north_m + nodes.half_m) * scale,
+        )
+        surfaces(nodes.ground, points[p : p + 1], up)
+        higher = up[0] - nodes.middle_up_m
+        i, j = min(max(floor(x), 0), across - 2), min(max(floor(y), 0), across - 2)
+        u, v = x - i, y - j
+        a, b, c, d = (1 - u) * (1 - v), (1 - u) * v, u * (1 - v), u * v
+        for k in range(len(llr)):
+            n = nodes.nodes[k]
+            tan = a * n[i, j] + b * n[i, j + 1] + c * n[i + 1, j] + d * n[i + 1, j + 1] - higher * nodes.per_height[k]
+            above = (rise[k] - tan) / (1.0 + rise[k] * tan)  # tan of the difference
+            if sigma[k] > 0.0:
+                sums[sector[k]] += row_contribution(llr[k], extended[k], above / sigma[k], 0)
+            elif above > 0.0:
+                sums[sector[k]] += llr[k]
+        found[p] = log_mixtures(sums, log_floor)

@@ -1,4 +1,4 @@
-"""The evidence as one profile per sector or part of one: running sums over elevation, so that a box costs a look-up."""
+"""Prefix sums of the evidence over elevation, per sector or part of one: a box of positions costs two look-ups each."""
 
 from __future__ import annotations
 
@@ -6,41 +6,42 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.localization.sector_likelihood import SECTOR_STEP, Sectors, sorted_by_sector
+from startrack.localization.sector_likelihood import (
+    CERTAIN_SIGMAS,
+    SECTOR_STEP,
+    Sectors,
+    elevation_order,
+    row_limits,
+)
 from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Evidence, Ints
 
-CERTAIN_SIGMAS = 6.0
 ROUNDING = 1e-9  # of the keys
 
 
 @dataclass(frozen=True)
-class Profile:
-    """Rays sorted by part of a sector and elevation, with running sums."""
+class PrefixSums:
+    """Rays sorted by part of a sector and elevation, with running sums of what they contribute."""
 
     evidence: Evidence  # sorted
     sector: Ints  # (n,) of the sorted rays
     parts: int  # of each sector, looked up one by one
     key: Array  # (n,) part and elevation in one ascending number
     total: Array  # (n + 1,) running sum of the llr
-    negative: Array  # (n + 1,) of the negative ones
-    positive: Array
+    least: Array  # (n + 1,) of the least contribution of each row, over all visible fractions
+    most: Array  # (n + 1,) of the greatest
     ends: Ints  # (sectors x parts,) one past the last ray of each part
     sigma_rad: Array  # (sectors x parts,) largest edge sigma
 
     @classmethod
-    def of(cls, sectors: Sectors, parts: int = 1) -> Profile:
+    def from_sectors(cls, sectors: Sectors, parts: int = 1) -> PrefixSums:
         e = sectors.evidence
         within = e.azimuth_rad / (2 * np.pi) * sectors.count - sectors.sector
         part = sectors.sector * parts + np.clip(within * parts, 0, parts - 1).astype(np.int64)
-        order = sorted_by_sector(e, part)
+        order = elevation_order(e, part)
         part, llr = part[order], e.llr[order]
-        evidence = Evidence(
-            azimuth_rad=e.azimuth_rad[order],
-            elevation_rad=e.elevation_rad[order],
-            llr=llr,
-            edge_sigma_rad=e.edge_sigma_rad[order],
-        )
+        evidence = e.take(order)
+        least, most = row_limits(evidence)
         sigma = np.zeros(sectors.count * parts)
         if evidence.edge_sigma_rad.any():
             np.maximum.at(sigma, part, evidence.edge_sigma_rad)
@@ -49,9 +50,9 @@ class Profile:
             sector=part // parts,
             parts=parts,
             key=SECTOR_STEP * part + evidence.elevation_rad,
-            total=_running(llr),
-            negative=_running(np.minimum(llr, 0.0)),
-            positive=_running(np.maximum(llr, 0.0)),
+            total=_running_sum(llr),
+            least=_running_sum(least),
+            most=_running_sum(most),
             ends=np.searchsorted(part, np.arange(len(sigma)), side="right"),
             sigma_rad=sigma,
         )
@@ -61,8 +62,8 @@ class Profile:
     ) -> tuple[Ints, Ints]:
         """First and one past the last ray (n, sectors x parts) that the horizon may meet somewhere in the boxes (n, 2).
 
-        Rays of a part below these are hidden, those above visible, from every place in the box, and were they higher
-        or lower by the leeway.
+        Rays of a part below these are hidden from every position in the box, and rays above are visible, even if all
+        elevations change by the leeway [rad].
         """
         count = len(self.ends)
         middle = (2 * np.arange(count) + 1) * np.pi / count
@@ -75,8 +76,8 @@ class Profile:
         last = np.searchsorted(self.key, (high + margin + step).ravel(), side="right")
         return first.reshape(low.shape), last.reshape(low.shape)
 
-    def handed_down(self, whole: Profile, first: Ints, last: Ints) -> tuple[Ints, Ints]:
-        """Open rays (n, sectors x parts) by those that `whole`, the same rays with one part a sector, left open."""
+    def split(self, whole: PrefixSums, first: Ints, last: Ints) -> tuple[Ints, Ints]:
+        """Open rays (n, sectors x parts) of these parts, from those of `whole`: the same rays, one part a sector."""
         ends = []
         for number, leeway in ((first, -ROUNDING), (last, ROUNDING)):  # rather one ray more left open
             sector = np.arange(len(whole.ends))
@@ -86,11 +87,11 @@ class Profile:
             ends.append(np.searchsorted(self.key, wanted.ravel(), side="left").reshape(wanted.shape))
         return ends[0], ends[1]
 
-    def closer(
-        self, terrain: Terrain, centres_m: Array, half_m: float, first: Ints, last: Ints, asked: Bools
+    def refine_bounds(
+        self, terrain: Terrain, centres_m: Array, half_m: float, first: Ints, last: Ints, which: Bools
     ) -> tuple[Ints, Ints]:
-        """Of boxes whose open rays are known (n, sectors x parts), fewer: the asked parts (sectors x parts,) anew."""
-        box, part = np.nonzero((first < last) & asked)
+        """First and one past the last open ray (n, sectors x parts) of boxes, the parts `which` bounded anew."""
+        box, part = np.nonzero((first < last) & which)
         count = len(self.ends)
         middle, centres = (2 * part + 1) * np.pi / count, centres_m[box]
         low, high = terrain.horizon_bounds_rad(centres, np.array(half_m), middle, np.pi / count)
@@ -104,11 +105,11 @@ class Profile:
         return first, last
 
     def sums(self, first: Ints, last: Ints) -> tuple[Array, Array, Array]:
-        """Contributions (n, sectors): of the certainly visible rays, and the least and the most of the open ones."""
+        """Contributions (n, sectors): of the certainly visible rays, and least and greatest of the open ones."""
         return (
             self._by_sector(self.total[self.ends] - self.total[last]),
-            self._by_sector(self.negative[last] - self.negative[first]),
-            self._by_sector(self.positive[last] - self.positive[first]),
+            self._by_sector(self.least[last] - self.least[first]),
+            self._by_sector(self.most[last] - self.most[first]),
         )
 
     def _by_sector(self, of_parts: Array) -> Array:
@@ -126,5 +127,5 @@ class Profile:
         return box, np.repeat(first.ravel(), count) + step
 
 
-def _running(values: Array) -> Array:
+def _running_sum(values: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(values)])

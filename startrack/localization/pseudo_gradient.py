@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from startrack.localization.convex_hull import hull_position
-from startrack.localization.rim_plane import cylinder_of, decided_stars, on_rim_plane, point_fix, seen_stars
+from startrack.localization.rim_plane import point_fix, stars_on_rim_plane
 from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Evidence, Fix
 
@@ -28,13 +28,14 @@ class PseudoGradient:
     most_steps: int = 200
 
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
-        """The position from the `evidence` above a `terrain`. Raises NotLocated with fewer than 3 seen stars."""
-        cylinder = cylinder_of(terrain)
-        evidence = decided_stars(evidence, cylinder)
-        points, seen = on_rim_plane(evidence, cylinder), seen_stars(evidence)
-        start = hull_position(points[seen], cylinder.wall_m, cylinder.radius_m)
-        position, _ = descend(points, seen, start, cylinder.radius_m, self.gain, self.most_steps)
-        return point_fix(position, PUBLISHED_SIGMA_M, cylinder)
+        """The position from the `evidence` in a `terrain` that is a cylinder.
+
+        Raises NotLocated with fewer than 3 seen stars, BadInput bad_terrain on another terrain.
+        """
+        plane = stars_on_rim_plane(evidence, terrain)
+        start = hull_position(plane.points_m[plane.seen], plane.wall_m, plane.radius_m)
+        position, _ = descend(plane.points_m, plane.seen, start, plane.radius_m, self.gain, self.most_steps)
+        return point_fix(position, PUBLISHED_SIGMA_M, terrain)
 
 
 def descend(

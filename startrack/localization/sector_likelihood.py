@@ -1,83 +1,164 @@
-"""From horizon heights to the log-likelihood of a place: soft edges, and a cap on what one direction may claim."""
+"""From horizon elevations to the log-likelihood of a position: soft edges, and a floor for each direction."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from math import erfc, exp, expm1, inf, log, log1p, sqrt
 
 import numpy as np
+from numba import njit
 
 from startrack.types import Array, Evidence, Ints
 
-SECTOR_STEP = 10.0  # between the numbers of neighbouring sectors: more than any two elevations differ
+SECTOR_STEP = 10.0  # between the keys of neighbouring sectors: more than any two elevations differ [rad]
+CERTAIN_SIGMAS = 6.0  # a ray farther than this from the horizon is visible or hidden for certain: to 1e-9
+EDGE_SIGMAS = 8.0  # beyond this the edge of a single row is not computed
+NEGLIGIBLE_NATS = 14.0  # e^-14 beside 1 is left out: a millionth
 
 
 @dataclass(frozen=True)
 class Sectors:
     """The evidence sorted into narrow sectors of azimuth, each of which may be wholly wrong (a boulder, a map error).
 
-    With the rays' contributions g_i, a sector contributes log((1 - eps) exp(sum g_i - M) + eps): at worst log eps,
-    however many of its stars contradict a place. M is the best that any skyline could reach there, the largest sum of
-    l_i above one elevation. (The sum of all positive l_i is no such measure: thousands of faint stars make it so high
-    that no skyline comes near it, and every sector would always count as wrong.)
+    With the rows' contributions g_i, a sector contributes log((1 - eps) exp(min(sum g_i - M, 0)) + eps): at worst
+    log eps, however many of its stars contradict a position. M is the best that any level skyline reaches there, the
+    largest sum of l_i above one elevation. (The sum of all positive l_i would not do: thousands of faint stars make it
+    so high that every sector counts as wrong.) With eps = 0 the contributions are summed without floor and ceiling.
     """
 
     evidence: Evidence
-    sector: Ints  # (n,) of each ray
-    ceiling: Array  # (sectors,) M
+    count: int
     epsilon: float
 
     @classmethod
-    def of(cls, evidence: Evidence, width_rad: float, epsilon: float) -> Sectors:
-        count = max(1, round(2 * np.pi / width_rad))
-        sector = (evidence.azimuth_rad / (2 * np.pi) * count).astype(np.int64) % count
-        return cls(evidence, sector, _best_skyline(evidence, sector, count), epsilon)
+    def from_evidence(cls, evidence: Evidence, width_rad: float, epsilon: float) -> Sectors:
+        """Sectors of about the given width [rad]."""
+        return cls(evidence, max(1, round(2 * np.pi / width_rad)), epsilon)
 
-    @property
-    def count(self) -> int:
-        return len(self.ceiling)
+    @cached_property
+    def sector(self) -> Ints:
+        """(n,) of each row."""
+        return (self.evidence.azimuth_rad / (2 * np.pi) * self.count).astype(np.int64) % self.count
+
+    @cached_property
+    def ceiling(self) -> Array:
+        """(sectors,) M."""
+        return level_skyline_maximum(self.evidence, self.sector, self.count)
+
+    @cached_property
+    def log_floor(self) -> float:
+        """log eps; -inf: no floor and no ceiling."""
+        return log(self.epsilon) if self.epsilon > 0.0 else -inf
 
     def score(self, sums: Array) -> Array:
-        """Log-likelihood (n,) of places from the sums of contributions (n, sectors)."""
+        """Log-likelihood (n,) of positions from the sums of contributions (n, sectors)."""
         return np.asarray(np.sum(self.by_sector(sums), axis=-1))
 
     def by_sector(self, sums: Array) -> Array:
-        """What each sector (n, sectors) adds to it."""
+        """Contribution of each sector (n, sectors) to the log-likelihood."""
         below = sums - self.ceiling
         if self.epsilon == 0.0:
             return np.asarray(below)
-        # Within a narrow sector a real skyline can hardly beat the best level one; bounds must not claim that it does.
-        below = np.minimum(below, 0.0)
-        return np.asarray(np.log((1.0 - self.epsilon) * np.exp(below) + self.epsilon))
+        # Within a narrow sector a real skyline hardly beats the best level one; bounds must not claim that it does.
+        return np.asarray(np.log((1.0 - self.epsilon) * np.exp(np.minimum(below, 0.0)) + self.epsilon))
 
 
-def _best_skyline(evidence: Evidence, sector: Ints, count: int) -> Array:
-    """Largest sum (sectors,) of the llr above one elevation, in each sector; at least 0 (nothing visible)."""
-    order = sorted_by_sector(evidence, sector)
+def level_skyline_maximum(evidence: Evidence, sector: Ints, count: int) -> Array:
+    """Largest sum (count,) of the llr above one elevation, in each sector; at least 0 (nothing visible)."""
+    order = elevation_order(evidence, sector)
     below = np.concatenate([[0.0], np.cumsum(evidence.llr[order])])
     ends = np.searchsorted(sector[order], np.arange(count + 1))
-    # Above the lowest ray, above the next, ..., above none: all that end at the sector's last ray.
+    # Above the lowest ray, above the next, ..., above none: all these sums end at the sector's last ray.
     least = np.minimum.reduceat(below, ends[:-1])
     return np.asarray(below[ends[1:]] - np.minimum(least, below[ends[1:]]))
 
 
-def sorted_by_sector(evidence: Evidence, sector: Ints) -> Ints:
-    """Order (n,) of the rays by sector, and from low to high within one."""
+def elevation_order(evidence: Evidence, sector: Ints) -> Ints:
+    """Order (n,) of the rows by sector, and from low to high within one."""
     return np.argsort(SECTOR_STEP * sector + evidence.elevation_rad, kind="stable")
 
 
-def contribution(llr: Array, elevation_rad: Array, horizon_rad: Array, sigma_rad: Array) -> Array:
-    """Log-likelihood ratio of a ray given the horizon: l V with a hard edge, else log(V e^l + 1 - V).
+def row_limits(evidence: Evidence) -> tuple[Array, Array]:
+    """Least and greatest contribution (n,), (n,) of each row over all visible fractions from 0 to 1."""
+    llr, extended = evidence.llr, evidence.extended_nats
+    least, most = np.minimum(llr, 0.0), np.maximum(llr, 0.0)
+    inner = np.abs(llr) < 0.5 * extended  # the parabola has its top inside
+    if inner.any():
+        top = np.square(llr[inner] + 0.5 * extended[inner]) / (2 * extended[inner])
+        most[inner] = np.maximum(most[inner], top)
+    return least, most
 
-    V = Phi((e - H) / sigma). Rises with V for l > 0 and falls for l < 0, so bounds of H give bounds of it.
+
+@njit(cache=True, nogil=True, inline="always")
+def row_contribution(llr, extended, sigmas_above, hard_above):  # type: ignore[no-untyped-def]
+    """Contribution of a row `sigmas_above` the horizon; with `hard_above` 1 or -1 it is wholly visible or hidden.
+
+    A point source contributes log(V e^l + 1 - V), extended light l V + c V (1 - V) / 2, V = Phi(sigmas_above). The
+    mixture is computed from the less likely side, which keeps all digits.
     """
-    margin = elevation_rad - horizon_rad
-    hard = np.where(margin > 0, llr, 0.0)
-    soft = sigma_rad > 0
-    if not np.any(soft):
-        return hard
-    from scipy.special import ndtr
+    value = 0.0
+    if hard_above > 0 or (hard_above == 0 and sigmas_above > EDGE_SIGMAS):
+        value = llr
+    elif hard_above == 0 and sigmas_above > -EDGE_SIGMAS:
+        if extended > 0.0:
+            visible = 0.5 * erfc(-sigmas_above / sqrt(2.0))
+            value = llr * visible + 0.5 * extended * visible * (1.0 - visible)
+        else:
+            fraction = 0.5 * erfc((-sigmas_above if llr > 0.0 else sigmas_above) / sqrt(2.0))
+            value = min(llr, 0.0) + log1p(fraction * expm1(abs(llr)))
+    return value
 
-    # V e^l + 1 - V = 1 + V (e^l - 1), and with l < 0 the same from the other side, so that no digits are lost.
-    z = np.divide(margin, sigma_rad, out=np.zeros_like(margin), where=soft)
-    mixed = np.minimum(llr, 0.0) + np.log1p(ndtr(np.where(llr > 0, z, -z)) * np.expm1(np.abs(llr)))
-    return np.where(soft, mixed, hard)
+
+@njit(cache=True, nogil=True, inline="always")
+def row_range(llr, extended, low, high):  # type: ignore[no-untyped-def]
+    """Least and greatest contribution where the row stands between `low` and `high` sigmas above the horizon."""
+    a, b = row_contribution(llr, extended, low, 0), row_contribution(llr, extended, high, 0)
+    least, most = min(a, b), max(a, b)
+    if extended > 0.0 and abs(llr) < 0.5 * extended:
+        top = llr / extended + 0.5  # of the parabola in V
+        if 0.5 * erfc(-low / sqrt(2.0)) < top < 0.5 * erfc(-high / sqrt(2.0)):
+            most = (llr + 0.5 * extended) ** 2 / (2.0 * extended)
+    return least, most
+
+
+@njit(cache=True, nogil=True)
+def contributions(llr, extended, elevation, horizon, sigma):  # type: ignore[no-untyped-def]
+    """Contribution (n,) of rows at their elevation above the horizon (n,) [rad], with edges of width sigma (n,) [rad].
+
+    It rises with the margin for l > 0 and falls for l < 0 (point sources), so bounds of the horizon bound it.
+    """
+    value = np.empty(len(llr))
+    for k in range(len(llr)):
+        margin = elevation[k] - horizon[k]
+        if sigma[k] > 0.0:
+            value[k] = row_contribution(llr[k], extended[k], margin / sigma[k], 0)
+        else:
+            value[k] = llr[k] if margin > 0.0 else 0.0
+    return value
+
+
+@njit(cache=True, nogil=True, inline="always")
+def log_mixture(below, log_keep, log_floor):  # type: ignore[no-untyped-def]
+    """log(exp(min(below, 0) + log_keep) + exp(log_floor)); log_floor = -inf means no floor and no ceiling."""
+    value = below
+    if log_floor > -np.inf:
+        value = min(below, 0.0) + log_keep
+        if value < log_floor - NEGLIGIBLE_NATS:
+            value = log_floor
+        elif value < log_floor + NEGLIGIBLE_NATS:
+            if value > log_floor:
+                value += log1p(exp(log_floor - value))
+            else:
+                value = log_floor + log1p(exp(value - log_floor))
+    return value
+
+
+@njit(cache=True, nogil=True)
+def total_log_mixture(sums, ceiling, log_floor):  # type: ignore[no-untyped-def]
+    """Log-likelihood of the sums of contributions (sectors,)."""
+    log_keep = log1p(-exp(log_floor))
+    total = 0.0
+    for s in range(len(sums)):
+        total += log_mixture(sums[s] - ceiling[s], log_keep, log_floor)
+    return total

@@ -22,6 +22,8 @@ def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_mass:
     Raises NotLocated: outside_search_area where most of the posterior lies beyond the search radius, and
     insufficient_geometry where the posterior is as wide as the area itself.
     """
+    if not np.isfinite(log_weight).any():
+        raise NotLocated("no position in the search area is possible: widen [search] radius_m in the terrain file?")
     weight = np.exp(log_weight - np.max(log_weight))
     outside = np.einsum("ni,ni->n", centres_m, centres_m) > terrain.search_radius_m**2
     if outside.any() and weight[outside].sum() > 0.5 * weight.sum():

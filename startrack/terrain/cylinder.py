@@ -28,6 +28,7 @@ class Cylinder(Terrain):
     depth_sigma_m: float = 0.0  # standard deviations; with either, the shape is estimated with the position
     diameter_sigma_m: float = 0.0
     axisymmetric = True
+    horizon_cost = 0.02
 
     @property
     def radius_m(self) -> float:
@@ -80,8 +81,9 @@ class Cylinder(Terrain):
         return np.zeros(np.shape(points_m)[:-1])
 
     def allowed(self, points_m: Array) -> Bools:
-        """Whether the points (..., 2) are on the floor."""
-        return np.asarray(np.hypot(points_m[..., 0], points_m[..., 1]) < self.radius_m)
+        """Whether the points (..., 2) are on the floor and within reach."""
+        away = np.hypot(points_m[..., 0], points_m[..., 1])
+        return np.asarray((away < self.radius_m) & (away <= self.reach_m))
 
     @property
     def shape_sigma(self) -> tuple[float, float]:  # type: ignore[override]
@@ -101,6 +103,25 @@ class Cylinder(Terrain):
     def facts(self) -> dict[str, Any]:
         """Diameter and depth, as JSON values."""
         return {"kind": "cylinder", "diameter_m": self.diameter_m, "depth_m": self.depth_m}
+
+    def log_prior(self, shape: Array) -> float:
+        """Normal priors of depth and diameter, independent of each other."""
+        crater, z2 = self.reshaped(shape), 0.0
+        if self.depth_sigma_m > 0:
+            z2 += ((crater.depth_m - self.depth_m) / self.depth_sigma_m) ** 2
+        if self.diameter_sigma_m > 0:
+            z2 += ((crater.diameter_m - self.diameter_m) / self.diameter_sigma_m) ** 2
+        return -0.5 * z2
+
+    def visible_disks(self, azimuths_rad: Array, elevations_rad: Array) -> tuple[Array, float]:
+        """A ray is visible from p exactly where |p + rho u| < R, rho = wall / tan e, u its horizontal direction.
+
+        Rays at or below the horizontal are visible nowhere: their disks lie infinitely far away.
+        """
+        tan = np.tan(elevations_rad)
+        rho = np.divide(self.wall_m, tan, out=np.full_like(tan, 1e12), where=tan > 0)
+        u = np.stack([np.sin(azimuths_rad), np.cos(azimuths_rad)], axis=-1)
+        return -np.minimum(rho, 1e12)[:, None] * u, self.radius_m
 
 
 def _distance_to_circle(points_m: Array, azimuths_rad: Array, radius_m: Array | float) -> Array:

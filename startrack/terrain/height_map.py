@@ -194,6 +194,13 @@ class HeightMap(Terrain):
             return np.zeros(np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad)))
         return self._sigma.sigma_rad(points_m, azimuths_rad)
 
+    def horizon_spread_rad(self, points_m: Array, half_m: float, azimuths_rad: Array) -> tuple[Array, Array]:
+        """From the horizon of the middle and its distance d: a move by `half_m` changes tan H by slopes half_m / d."""
+        points = np.asarray(points_m, dtype=np.float64)
+        tan, distance, _ = self.horizons(points, azimuths_rad)
+        slopes = np.abs(tan) + np.tan(self.slope_rad(points))
+        return np.arctan(tan), half_m * slopes / np.maximum(distance, half_m) / (1.0 + tan * tan)
+
     def max_horizon_sigma_rad(
         self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float
     ) -> Array:

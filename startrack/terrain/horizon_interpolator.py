@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from startrack.terrain import tracing
-from startrack.terrain.protocol import ForwardingTerrain
+from startrack.terrain.protocol import ForwardingTerrain, Interpolation
 from startrack.types import Array, Bools, Ints
 
 if TYPE_CHECKING:
@@ -79,6 +79,14 @@ class HorizonInterpolator(ForwardingTerrain):
     def _smooth(self) -> Bools:
         return np.asarray(self.rough < np.maximum(MAX_BEND_TAN, MAX_BEND_SIGMAS * self._sigma_rad))
 
+    def interpolation(self, azimuths_rad: Array) -> Interpolation:
+        """See `Terrain`; all azimuths must be among those named."""
+        column = self.column(azimuths_rad)[0]
+        return Interpolation(
+            self.whole.ground, np.ascontiguousarray(self.nodes[column]), self.per_height[column], self.middle_up_m,
+            float(self.centre_m[0]), float(self.centre_m[1]), float(self.half_m),
+        )  # fmt: skip
+
     def column(self, azimuths_rad: Array) -> tuple[Ints, Bools]:
         """Index of each azimuth (...) in `azimuths_rad`, and whether it is there."""
         at = np.minimum(np.searchsorted(self.azimuths_rad, azimuths_rad), len(self.azimuths_rad) - 1)
@@ -98,11 +106,11 @@ class HorizonInterpolator(ForwardingTerrain):
             self._sigma_rad[column], np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
         )
 
-    def traced_part(self, points_m: Array, azimuths_rad: Array) -> float:
-        """Fraction of the pairs of points (n, 2) and azimuths (n,) that `horizon_rad` traces."""
+    def interpolated_part(self, points_m: Array, azimuths_rad: Array) -> float:
+        """See `Terrain`."""
         column, known = self.column(azimuths_rad)
         inside = np.abs(points_m - self.centre_m).max(axis=-1) <= self.half_m * (1 + 1e-9)
-        return 1.0 - float(np.mean(inside & known & self._smooth[column]))
+        return float(np.mean(inside & known & self._smooth[column]))
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad]; see `Terrain`."""

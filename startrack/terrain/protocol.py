@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,21 @@ from startrack.frames import Site
 from startrack.types import Array, Bools
 
 Progress = Callable[[int, int], None]  # parts done, of how many
+
+
+class Interpolation(NamedTuple):
+    """tan H between points about a position: bilinear, and lower by `per_height` for each metre the ground rises.
+
+    Row k is that of azimuth k: nodes[k, i, j] stands at centre - half + (i, j) step, i to the east.
+    """
+
+    ground: Any  # the packed maps, for the height of the ground
+    nodes: Array  # (n, across, across) tan of the horizon, were the ground everywhere as high as in the middle
+    per_height: Array  # (n,) [1/m]
+    middle_up_m: float  # height of the ground in the middle
+    east_m: float
+    north_m: float
+    half_m: float
 
 
 class Terrain(ABC):
@@ -37,6 +52,7 @@ class Terrain(ABC):
     hard_edges: bool = True  # whether the horizon is exact: `horizon_sigma_rad` is zero everywhere
     finest_m: float = 0.05  # half side of the smallest box of positions that the ground distinguishes
     axisymmetric: bool = False  # whether a turn of the sky about the vertical only turns the position
+    horizon_cost: float = 1.0  # of one horizon, beside one traced on a height map: the search has a budget of these
     shape_sigma: tuple[float, float] = (0.0, 0.0)  # relative, of steepness and of size: see `reshaped`
     rim_radius_m: float | None = None  # of a circular rim about the origin, drawn on maps instead of the relief
     table_path: Path | None = None  # file of what `prepare` works out; None where it works out nothing
@@ -73,6 +89,11 @@ class Terrain(ABC):
         """The largest `horizon_sigma_rad` (...) over boxes and azimuths, as in `horizon_bounds_rad`."""
         return np.zeros(np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad)))
 
+    def horizon_spread_rad(self, points_m: Array, half_m: float, azimuths_rad: Array) -> tuple[Array, Array]:
+        """Middle and half width (...), (...) [rad] of the horizon over boxes: an estimate, where bounds are wide."""
+        low, high = self.horizon_bounds_rad(points_m, np.array(half_m), azimuths_rad)
+        return 0.5 * (low + high), 0.5 * (high - low)
+
     def allowed(self, points_m: Array) -> Bools:
         """Whether a camera could stand at the points (..., 2): known ground under open sky."""
         return np.asarray(np.hypot(points_m[..., 0], points_m[..., 1]) <= self.reach_m)
@@ -100,9 +121,24 @@ class Terrain(ABC):
         """The terrain shape[0] steeper and shape[1] larger (relative); only where `shape_sigma` is not zero."""
         return self
 
-    def closed_form(self) -> Any:
-        """Compiled bounds in closed form for the branch and bound, or None: `horizon_bounds_rad` is called instead."""
+    def log_prior(self, shape: Array) -> float:
+        """Logarithm of the prior density of `reshaped(shape)`, beside that of the terrain as it is."""
+        return 0.0
+
+    def visible_disks(self, azimuths_rad: Array, elevations_rad: Array) -> tuple[Array, float] | None:
+        """Centres (n, 2) and radius [m] of the disks of ground from which the rays (n,) are visible.
+
+        None where the visible ground of a ray is not a disk of one radius for all rays.
+        """
         return None
+
+    def interpolation(self, azimuths_rad: Array) -> Interpolation | None:
+        """Horizons prepared by `near` as the compiled kernels read them, for the azimuths (n,); None: not prepared."""
+        return None
+
+    def interpolated_part(self, points_m: Array, azimuths_rad: Array) -> float:
+        """Part of the points (n, 2) and azimuths (n,) whose horizons are interpolated instead of traced."""
+        return 0.0
 
     @property
     def is_prepared(self) -> bool:
@@ -134,6 +170,7 @@ class ForwardingTerrain(Terrain):
     search_radius_m, reach_m, finest_m = _forward("search_radius_m"), _forward("reach_m"), _forward("finest_m")
     common_sigma_rad, hard_edges = _forward("common_sigma_rad"), _forward("hard_edges")
     axisymmetric, shape_sigma = _forward("axisymmetric"), _forward("shape_sigma")
+    horizon_cost = _forward("horizon_cost")
     rim_radius_m, table_path, facts = _forward("rim_radius_m"), _forward("table_path"), _forward("facts")
     horizon_rad, horizon_bounds_rad = _forward("horizon_rad"), _forward("horizon_bounds_rad")
     horizon_sigma_rad = _forward("horizon_sigma_rad")
@@ -141,5 +178,7 @@ class ForwardingTerrain(Terrain):
     ground_m, allowed, near = _forward("ground_m"), _forward("allowed"), _forward("near")
     is_informative, mask_reason = _forward("is_informative"), _forward("mask_reason")
     masked_sectors = _forward("masked_sectors")
-    reshaped, closed_form = _forward("reshaped"), _forward("closed_form")
+    reshaped, log_prior = _forward("reshaped"), _forward("log_prior")
+    visible_disks, interpolation = _forward("visible_disks"), _forward("interpolation")
+    interpolated_part, horizon_spread_rad = _forward("interpolated_part"), _forward("horizon_spread_rad")
     is_prepared, prepare, discard_table = _forward("is_prepared"), _forward("prepare"), _forward("discard_table")

@@ -1,0 +1,401 @@
+"""The compiled step of the branch and bound: bounds of the log-likelihood over boxes of positions.
+
+A box keeps the sums of the rows that are settled over it and a list of its open rows. A row is settled where its
+contribution no longer varies over the box. Rows are compared with disks where the visible ground of each is a disk of
+one radius (`Terrain.visible_disks`), else with bounds of the horizon that the terrain gave for each (box, row) pair.
+"""
+
+from __future__ import annotations
+
+# mypy: disable-error-code="no-untyped-def"
+from math import exp, inf, log, log1p, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from startrack.localization.sector_likelihood import log_mixture, row_contribution, row_range
+from startrack.types import Array, Ints
+
+SETTLED_NATS = 1e-9  # a row whose contribution varies by less over a box is settled there
+DIGITS_NATS = 37.0  # what is smaller than this beside 1 has no digit in a float64
+CLIMB_BELOW = 12.0  # of the radius: half side of the boxes in the best of which the search climbs
+LAST_CLIMB_STEP = 1.0 / 64.0  # of the half side
+DOOM_EVERY = 32  # rows between two tests whether a box can still matter
+NO_NUMBERS = np.zeros(0)
+NO_DISKS = np.zeros((0, 2))
+
+
+class Rows(NamedTuple):
+    """The evidence as the kernels read it."""
+
+    azimuth_rad: Array  # (n,)
+    elevation_rad: Array
+    llr: Array
+    extended_nats: Array
+    sigma_rad: Array  # of the edge, without the terrain's
+    least: Array  # (n,) least contribution
+    most: Array
+    sector: Ints
+    ceiling: Array  # (sectors,)
+    log_floor: float
+    disks_m: Array  # (n, 2) centres of the disks from which the rows are visible; (0, 2): not disks
+    radius_m: float
+
+
+class Boxes(NamedTuple):
+    """Equal boxes of positions that may still matter, with the open rows of each."""
+
+    centres_m: Array  # (n, 2)
+    half_m: float
+    first: Ints  # (n + 1,) where the open rows of each box begin
+    row: Ints  # (pairs,)
+    least: Array  # (pairs,) bounds of the rows' contributions; empty where rows are compared with disks
+    most: Array
+    sums: Array  # (n, sectors) contributions of the settled rows, less the sectors' ceilings
+    settled: Array  # (n,) log-likelihood of these sums
+    lower: Array  # (n,) bounds of the log-likelihood over the box
+    upper: Array
+    score: Array  # (n,) log-likelihood at the centre; -inf where no camera can be; valid only with disks
+
+
+@njit(cache=True, nogil=True)
+def split_boxes(centres, half, reach):
+    """Centres (m, 2) of the quarters that come within reach of the origin, and the box (m,) of each."""
+    quarter = 0.5 * half
+    found = np.empty((4 * len(centres), 2))
+    parent = np.empty(4 * len(centres), dtype=np.int64)
+    n = 0
+    for b in range(len(centres)):
+        for k in range(4):
+            x = centres[b, 0] + (quarter if k % 2 else -quarter)
+            y = centres[b, 1] + (quarter if k // 2 else -quarter)
+            beyond_x, beyond_y = max(abs(x) - quarter, 0.0), max(abs(y) - quarter, 0.0)
+            found[n, 0], found[n, 1], parent[n] = x, y, b
+            n += beyond_x * beyond_x + beyond_y * beyond_y <= reach * reach
+    return found[:n], parent[:n]
+
+
+@njit(cache=True, nogil=True)
+def open_pairs(parent, first, row, strength, weakest, strongest):
+    """Box (m,) and row (m,) of the open pairs with strengths from weakest to below strongest, box by box."""
+    total = 0
+    for b in range(len(parent)):
+        for q in range(first[parent[b]], first[parent[b] + 1]):
+            total += weakest <= strength[row[q]] < strongest
+    box, rows = np.empty(total, dtype=np.int64), np.empty(total, dtype=np.int64)
+    n = 0
+    for b in range(len(parent)):
+        for q in range(first[parent[b]], first[parent[b] + 1]):
+            k = row[q]
+            if weakest <= strength[k] < strongest:
+                box[n], rows[n] = b, k
+                n += 1
+    return box, rows
+
+
+@njit(cache=True, nogil=True)
+def bound_boxes(rows, reach, boxes, centres, half, parent, allowed, strength, weakest, strongest, low, high, sigma,
+                best, certain, prune_nats, negligible_nats):  # fmt: skip
+    """Bounds over boxes (n, 2) whose open rows are those of their parents in `boxes`; drop what cannot matter.
+
+    Rows of a strength from `weakest` to below `strongest` are compared with their disks, or with the horizon's bounds
+    low, high (pairs,) and its sigma (pairs,), in the order of `open_pairs`. `best` is the best log-likelihood known,
+    `certain` the logarithm of the mass [m2] that the boxes hold at least. Returns the boxes kept, both of these anew,
+    and the logarithm of a bound of the mass dropped.
+    """
+    sectors = len(rows.ceiling)
+    disks = len(rows.disks_m) > 0
+    log_floor = rows.log_floor
+    log_keep = log1p(-exp(log_floor))
+    additive = disks and log_floor == -inf  # losses simply add up: most boxes are hopeless after a few dozen rows
+    r2 = rows.radius_m * rows.radius_m
+    inner, outer = rows.radius_m - half * sqrt(2.0), rows.radius_m + half * sqrt(2.0)
+    inner2 = inner * inner if inner > 0.0 else -1.0
+    outer2 = outer * outer
+    room = len(centres)
+    kept_centres, kept_sums = np.empty((room, 2)), np.empty((room, sectors))
+    settled, lower, upper, score = np.empty(room), np.empty(room), np.empty(room), np.empty(room)
+    kept_first = np.zeros(room + 1, dtype=np.int64)
+    space = max(1024, len(boxes.row) + len(boxes.row) // 2)
+    kept_row = np.empty(space, dtype=boxes.row.dtype)
+    kept_least, kept_most = np.empty(0 if disks else space), np.empty(0 if disks else space)
+    least, most, at_centre = np.zeros(sectors), np.zeros(sectors), np.zeros(sectors)
+    touched, stamp = np.zeros(sectors, dtype=np.int64), np.zeros(sectors, dtype=np.int64)
+    cell = log(4.0 * half * half)
+    dropped, enough = -inf, certain - negligible_nats - cell
+    certain = -inf
+    n, used, pair = 0, 0, 0
+    for b in range(room):
+        p = parent[b]
+        x, y = centres[b, 0], centres[b, 1]
+        count = boxes.first[p + 1] - boxes.first[p]
+        if used + count > len(kept_row):
+            kept_row = _grown(kept_row, used, 2 * (used + count))
+            if not disks:
+                kept_least = _grown(kept_least, used, 2 * (used + count))
+                kept_most = _grown(kept_most, used, 2 * (used + count))
+        kept_sums[n] = boxes.sums[p]
+        dirty, start = 0, used
+        limit = max(best - prune_nats, enough)
+        gain_needed, lost = boxes.upper[p] - limit, 0.0
+        hopeless = False
+        for q in range(boxes.first[p], boxes.first[p + 1]):
+            if additive and q % DOOM_EVERY == 0 and lost + gain_needed <= 0.0:
+                hopeless = True
+                break
+            k = boxes.row[q]
+            s = rows.sector[k]
+            if stamp[s] != b + 1:
+                stamp[s] = b + 1
+                touched[dirty] = s
+                dirty += 1
+                least[s], most[s], at_centre[s] = 0.0, 0.0, 0.0
+            llr = rows.llr[k]
+            if disks:
+                u, v = x - rows.disks_m[k, 0], y - rows.disks_m[k, 1]
+                d2 = u * u + v * v
+                # No processor predicts which case holds: multiplying by 0 or 1 takes half the time of branches.
+                inside = d2 < inner2
+                open_ = (d2 >= inner2) & (d2 <= outer2)
+                gain = llr * open_
+                kept_sums[n, s] += llr * inside
+                most[s] += gain * (gain > 0.0)
+                least[s] += gain * (gain < 0.0)
+                at_centre[s] += gain * (d2 < r2)
+                lost += min(llr, 0.0) * inside - max(llr, 0.0) * (d2 > outer2)
+                kept_row[used] = k
+                used += open_
+            else:
+                under, over = boxes.least[q], boxes.most[q]
+                if weakest <= strength[k] < strongest:
+                    e, width = rows.elevation_rad[k], sqrt(rows.sigma_rad[k] ** 2 + sigma[pair] ** 2)
+                    if width > 0.0:
+                        above, below = (e - high[pair]) / width, (e - low[pair]) / width
+                        under, over = row_range(llr, rows.extended_nats[k], above, below)
+                    elif e > high[pair]:
+                        under, over = llr, llr
+                    elif e <= low[pair]:
+                        under, over = 0.0, 0.0
+                    pair += 1
+                if over - under < SETTLED_NATS:
+                    kept_sums[n, s] += 0.5 * (under + over)
+                else:
+                    least[s] += under
+                    most[s] += over
+                    kept_row[used], kept_least[used], kept_most[used] = k, under, over
+                    used += 1
+        if hopeless:
+            dropped = _log_add(dropped, boxes.upper[p] + lost + cell)
+            used = start
+            continue
+        now, low_total, high_total, centre_total = (
+            boxes.settled[p],
+            boxes.settled[p],
+            boxes.settled[p],
+            boxes.settled[p],
+        )
+        for t in range(dirty):
+            s = touched[t]
+            before = log_mixture(boxes.sums[p, s], log_keep, log_floor)
+            total = kept_sums[n, s]
+            now += log_mixture(total, log_keep, log_floor) - before
+            low_total += log_mixture(total + least[s], log_keep, log_floor) - before
+            high_total += log_mixture(total + most[s], log_keep, log_floor) - before
+            if disks:
+                centre_total += log_mixture(total + at_centre[s], log_keep, log_floor) - before
+        if not allowed[b]:
+            low_total, centre_total = -inf, -inf
+        best = max(best, low_total)
+        if disks:
+            best = max(best, centre_total)
+        if high_total <= max(best - prune_nats, enough):
+            dropped = _log_add(dropped, high_total + cell)
+            used = start
+            continue
+        kept_centres[n] = centres[b]
+        settled[n], lower[n], upper[n], score[n] = now, low_total, high_total, centre_total
+        certain = _log_add(certain, low_total + cell)
+        kept_first[n + 1] = used
+        n += 1
+    if disks and n > 0 and half * CLIMB_BELOW < rows.radius_m:
+        top = np.argmax(score[:n])
+        if score[top] > -inf:
+            first, last = kept_first[top], kept_first[top + 1]
+            climbed = _climb_in_box(
+                rows, kept_sums[top], kept_row[first:last], kept_centres[top], half, score[top], reach
+            )
+            best = max(best, climbed)
+    # Boxes that were kept before a better position was known may no longer matter.
+    enough = certain - negligible_nats - cell
+    write, write_pair, begin = 0, 0, 0
+    for b in range(n):
+        end = kept_first[b + 1]
+        if upper[b] <= max(best - prune_nats, enough):
+            dropped = _log_add(dropped, upper[b] + cell)
+        else:
+            if write != b:
+                for q in range(begin, end):
+                    kept_row[write_pair + q - begin] = kept_row[q]
+                    if not disks:
+                        kept_least[write_pair + q - begin] = kept_least[q]
+                        kept_most[write_pair + q - begin] = kept_most[q]
+                kept_centres[write], kept_sums[write] = kept_centres[b], kept_sums[b]
+                settled[write], lower[write], upper[write], score[write] = settled[b], lower[b], upper[b], score[b]
+            write_pair += end - begin
+            write += 1
+            kept_first[write] = write_pair  # write <= b + 1, whose own offset is already in `end`
+        begin = end
+    pairs = 0 if disks else write_pair
+    kept = Boxes(
+        kept_centres[:write], half, kept_first[: write + 1], kept_row[:write_pair], kept_least[:pairs],
+        kept_most[:pairs], kept_sums[:write], settled[:write], lower[:write], upper[:write], score[:write],
+    )  # fmt: skip
+    return kept, best, certain, dropped
+
+
+@njit(cache=True, nogil=True)
+def refine_disks(rows, boxes, reach, best, certain, prune_nats, negligible_nats, boxes_per_sigma, finest, most_boxes):
+    """Quarter the boxes by the disks of the rows, at least once, until `boxes_per_sigma` fit into their spread.
+
+    They are also small enough at the half side `finest` [m], or where four times as many exceed `most_boxes`, or where
+    no row is open. Returns as `bound_boxes` does.
+    """
+    nothing, dropped = np.zeros(0), -inf
+    while True:
+        centres, parent = split_boxes(boxes.centres_m, boxes.half_m, reach)
+        away2 = centres[:, 0] ** 2 + centres[:, 1] ** 2
+        allowed = (away2 < rows.radius_m**2) & (away2 <= reach * reach)
+        boxes, best, certain, lost = bound_boxes(
+            rows, reach, boxes, centres, 0.5 * boxes.half_m, parent, allowed, nothing, 0.0, inf, nothing, nothing,
+            nothing, best, certain, prune_nats, negligible_nats,
+        )  # fmt: skip
+        dropped = _log_add(dropped, lost)
+        n = len(boxes.centres_m)
+        if boxes.half_m <= finest or 4 * n > most_boxes or len(boxes.row) == 0:
+            break
+        if 2.0 * boxes.half_m * boxes_per_sigma < smaller_sigma(boxes.centres_m, boxes.score):
+            break
+    return boxes, best, certain, dropped
+
+
+@njit(cache=True, nogil=True)
+def _climb_in_box(rows, sums, row, centre, half, best, reach):
+    """Best log-likelihood on a climb from the centre of a box that stays in it: only the open rows change there."""
+    r2, log_keep = rows.radius_m * rows.radius_m, log1p(-exp(rows.log_floor))
+    limit2 = min(r2, reach * reach)
+    now = np.empty(len(sums))
+    x, y, step = centre[0], centre[1], 0.5 * half
+    while step > half * LAST_CLIMB_STEP:
+        to_x, to_y = x, y
+        for k in range(9):
+            u, v = x + step * (k // 3 - 1), y + step * (k % 3 - 1)
+            if k == 4 or abs(u - centre[0]) > half or abs(v - centre[1]) > half or u * u + v * v >= limit2:
+                continue
+            now[:] = sums
+            for q in range(len(row)):
+                a, b = u - rows.disks_m[row[q], 0], v - rows.disks_m[row[q], 1]
+                now[rows.sector[row[q]]] += rows.llr[row[q]] * (a * a + b * b < r2)
+            total = 0.0
+            for s in range(len(now)):
+                total += log_mixture(now[s], log_keep, rows.log_floor)
+            if total > best:
+                best, to_x, to_y = total, u, v
+        if to_x == x and to_y == y:
+            step *= 0.5
+        x, y = to_x, to_y
+    return best
+
+
+@njit(cache=True, nogil=True)
+def score_boxes(rows, boxes, horizon, sigma, score):
+    """Fill score (n,) with log-likelihoods where the open rows of the boxes meet horizons (pairs,) of that sigma."""
+    log_keep = log1p(-exp(rows.log_floor))
+    sums = np.empty(len(rows.ceiling))
+    for b in range(len(score)):
+        sums[:] = boxes.sums[b]
+        for q in range(boxes.first[b], boxes.first[b + 1]):
+            k = boxes.row[q]
+            width = sqrt(rows.sigma_rad[k] ** 2 + sigma[q] ** 2)
+            margin = rows.elevation_rad[k] - horizon[q]
+            if width > 0.0:
+                sums[rows.sector[k]] += row_contribution(rows.llr[k], rows.extended_nats[k], margin / width, 0)
+            elif margin > 0.0:
+                sums[rows.sector[k]] += rows.llr[k]
+        total = 0.0
+        for s in range(len(sums)):
+            total += log_mixture(sums[s], log_keep, rows.log_floor)
+        score[b] = total
+
+
+@njit(cache=True, nogil=True)
+def smaller_sigma(centres, score):
+    """Standard deviation [m] along the shorter axis of the boxes weighted by exp(score); 0 for a single box."""
+    top = -inf
+    for b in range(len(score)):
+        top = max(top, score[b])
+    total, mean_x, mean_y, xx, yy, xy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    if top > -inf:
+        for b in range(len(score)):
+            w = exp(score[b] - top)
+            total += w
+            mean_x += w * centres[b, 0]
+            mean_y += w * centres[b, 1]
+        mean_x /= total
+        mean_y /= total
+        for b in range(len(score)):
+            w = exp(score[b] - top) / total
+            u, v = centres[b, 0] - mean_x, centres[b, 1] - mean_y
+            xx += w * u * u
+            yy += w * v * v
+            xy += w * u * v
+    return sqrt(max(0.5 * (xx + yy) - sqrt(0.25 * (xx - yy) ** 2 + xy * xy), 0.0))
+
+
+@njit(cache=True, nogil=True)
+def _grown(a, used, size):
+    larger = np.empty(size, dtype=a.dtype)
+    larger[:used] = a[:used]
+    return larger
+
+
+@njit(cache=True, nogil=True)
+def _log_add(a, b):
+    top, low = max(a, b), min(a, b)
+    return top if low < top - DIGITS_NATS or low == -inf else top + log1p(exp(low - top))
+
+
+@njit(cache=True, nogil=True)
+def score_disks(disks, radius, llr, sector, settled, log_floor, points, found):
+    """Fill found (n,) with the log-likelihoods of points (n, 2) inside or outside the disks (rows, 2) of the rows."""
+    r2, log_keep = radius * radius, log1p(-exp(log_floor))
+    sums = np.empty(len(settled))
+    for p in range(len(found)):
+        sums[:] = settled
+        for k in range(len(llr)):
+            u, v = points[p, 0] - disks[k, 0], points[p, 1] - disks[k, 1]
+            sums[sector[k]] += llr[k] * (u * u + v * v < r2)
+        found[p] = 0.0
+        for s in range(len(sums)):
+            found[p] += log_mixture(sums[s], log_keep, log_floor)
+
+
+def root_box(rows: Rows, half_m: float) -> Boxes:
+    """One box about the origin with all rows open."""
+    sums = -rows.ceiling[None]
+    settled = log_mixtures(sums[0], rows.log_floor)
+    n, open_pairs_too = len(rows.llr), not len(rows.disks_m)
+    return Boxes(
+        np.zeros((1, 2)), half_m, np.array([0, n]), np.arange(n), rows.least if open_pairs_too else NO_NUMBERS,
+        rows.most if open_pairs_too else NO_NUMBERS, sums, np.array([settled]), np.array([-inf]),
+        np.array([settled + rows.most.sum()]), np.array([-inf]),
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def log_mixtures(sums, log_floor):
+    """Log-likelihood of the sums of contributions, less the ceilings (sectors,)."""
+    log_keep, total = log1p(-exp(log_floor)), 0.0
+    for s in range(len(sums)):
+        total += log_mixture(sums[s], log_keep, log_floor)
+    return total

@@ -1,0 +1,68 @@
+"""The posterior near the positions of the first guess, where the proof that no other fits was not completed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from startrack.localization.branch_and_bound import Explored
+from startrack.localization.initial_guess import Guess
+from startrack.localization.likelihood import PositionLikelihood
+from startrack.types import Array
+
+MODE_NATS = 12.0  # positions that are less likely than the best by more are no modes
+FIRST_HALF_M, LAST_HALF_M = 48.0, 400.0  # of the square about a position
+FIRST_CELLS, MAX_CELLS = 16, 64  # boxes from the middle of a square to its side
+EDGE_MASS = 1e-4  # of a square's probability may lie in its outermost boxes
+REACH_SIGMAS = 5.0  # from the middle of a square to its side, along the longer axis of the mode
+BOXES_PER_SIGMA = 1.0  # of the shorter axis
+NODE_STEP_M, MIN_NODES, MAX_NODES = 12.0, 5, 13  # distance of traced horizons; points along a side
+
+
+def local_posterior(likelihood: PositionLikelihood, guess: Guess, log_open: float) -> Explored:
+    """The posterior on squares about the guess's positions, as large as their modes need.
+
+    `log_open` is the logarithm of a bound of the mass [m2] that the search left open elsewhere.
+    """
+    modes = guess.points_m[guess.log_likelihood > guess.best - MODE_NATS]
+    squares = [_square(likelihood, position) for position in modes]
+    half = min(square[2] for square in squares)
+    parts = [_score(likelihood, middle, size, half, NODE_STEP_M) for middle, size, _ in squares]
+    centres = np.concatenate([part[0] for part in parts])
+    score = np.concatenate([part[1] for part in parts])
+    # Squares of neighbouring modes overlap: each box counts once.
+    _, first = np.unique(np.round(centres / (2 * half)).astype(np.int64), axis=0, return_index=True)
+    return Explored(centres[first], half, score[first], log_open, "beam")
+
+
+def _square(likelihood: PositionLikelihood, position_m: Array) -> tuple[Array, float, float]:
+    """Middle (2,) and half side of a square that holds the mode, and half side of boxes that resolve it [m]."""
+    size = FIRST_HALF_M
+    while True:
+        half = size / (2 * FIRST_CELLS)
+        centres, score = _score(likelihood, position_m, size, half, size)
+        if not np.isfinite(score).any():
+            return position_m, size, half
+        weight = np.exp(score - score.max())
+        weight /= weight.sum()
+        rim = np.abs(centres - position_m).max(axis=1) > size - 2.5 * half
+        if weight[rim].sum() < EDGE_MASS or size >= LAST_HALF_M:
+            break
+        size *= 2
+    middle = weight @ centres
+    variances = np.linalg.eigvalsh(((centres - middle) * weight[:, None]).T @ (centres - middle))
+    narrow, wide = np.sqrt(np.maximum(variances, half**2 / 3))
+    size = min(REACH_SIGMAS * wide + float(np.abs(middle - position_m).max()), 1.5 * size)
+    return middle, size, max(0.5 * narrow / BOXES_PER_SIGMA, size / (2 * MAX_CELLS), likelihood.terrain.finest_m)
+
+
+def _score(
+    likelihood: PositionLikelihood, middle_m: Array, size: float, half: float, node_step_m: float
+) -> tuple[Array, Array]:
+    """Centres (n, 2) of a square's boxes where a camera can stand, on one grid for all squares, and scores (n,)."""
+    across = int(np.clip(np.ceil(2 * size / node_step_m) + 1, MIN_NODES, MAX_NODES))
+    count = max(int(np.ceil(size / (2 * half))), 1)
+    line = 2 * half * np.arange(-count, count + 1)
+    on_grid = 2 * half * np.round(middle_m / (2 * half))
+    centres = on_grid + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    centres = centres[np.asarray(likelihood.terrain.allowed(centres))]
+    return centres, likelihood.near(middle_m, size + 2 * half, across=across).scores(centres)

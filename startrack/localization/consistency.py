@@ -78,7 +78,8 @@ def _check_stretch(likelihood: PositionLikelihood, position_m: Array) -> None:
 def _check_turn(likelihood: PositionLikelihood, position_m: Array) -> None:
     """Raise NotLocated where a turned sky explains the stars much better: the clock is off."""
     turn, gain = best_turn(likelihood, position_m)
-    azimuths = likelihood.evidence.take(np.abs(likelihood.evidence.llr) > SURE_LLR).azimuth_rad
+    strong = np.abs(likelihood.evidence.llr) >= min(SURE_LLR, float(likelihood.strength.max()))
+    azimuths = likelihood.evidence.azimuth_rad[strong]
     sigma = float(np.median(likelihood.terrain.horizon_sigma_rad(position_m[None], azimuths)))
     if gain > TURN_GAIN_NATS * (1 + sigma / TURN_SIGMA_RAD):
         raise NotLocated(

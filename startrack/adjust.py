@@ -23,9 +23,9 @@ from startrack.types import Array, NotIdentified
 CHI2_2DOF_MEDIAN = 1.3863
 OUTLIER_CHI2 = 16.0  # 4 sigma in each axis: one good star in 3000 is lost
 HUBER_SIGMAS = 2.5  # from here the pull of an observation no longer grows
-FEWEST_STARS = 3
+MIN_STARS = 3
 SMALLEST_EXTRA_PX2, LARGEST_EXTRA_PX2 = 1e-6, 1e8
-SMALLEST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-12, 1e-6, 1e6
+SMALLEST_DAMPING, FIRST_DAMPING, MAX_DAMPING = 1e-12, 1e-6, 1e6
 SMALLEST_RISE_RAD = 0.2  # a lens whose radius stops growing sooner is no lens
 
 
@@ -173,7 +173,7 @@ def adjust(
             extra = extra_variance_px2(residual, points.covariance_px2, len(free) + 3 * points.images)
             inverse = inverse_covariance(points.covariance_px2, extra)
         factor = scheme.loss.weight_factor(chi_square(residual, inverse))
-        if (agreeing := int(np.count_nonzero(factor))) < FEWEST_STARS:
+        if (agreeing := int(np.count_nonzero(factor))) < MIN_STARS:
             raise NotIdentified("fewer than 3 stars agree on an attitude", matched=agreeing)
         weight = inverse * factor[:, None, None]
         terms = state.terms(points, rays, free)
@@ -224,8 +224,8 @@ class _Damping:
         `moved`: sum of the earlier steps of the lens parameters (m,).
         """
         cost = self.cost(residual_px, moved)
-        while self.damping < MOST_DAMPING:
-            lens, poses = equations.damped(self.damping).solve()
+        while self.damping < MAX_DAMPING:
+            lens, poses = equations.with_damping(self.damping).solve()
             trial = state.step(self.free, lens, poses)
             rays = trial.rays_cam(self.points)
             residual = trial.residual_px(self.points, rays)

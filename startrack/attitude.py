@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.adjust import FEWEST_STARS, HUBER_WITH_CUT, OUTLIER_CHI2, Scheme, State, adjust
+from startrack.adjust import HUBER_WITH_CUT, MIN_STARS, OUTLIER_CHI2, Scheme, State, adjust
 from startrack.camera import Camera
 from startrack.camera.uncertainty import lens_jacobian
 from startrack.normal_equations import observations_of_image
 from startrack.types import Array, Attitude, Bools, NotIdentified
 
-FEWEST_FOR_SCATTER = 30  # stars from which the scatter of the residuals is a better covariance than the stated one
+MIN_FOR_SCATTER = 30  # stars from which the scatter of the residuals is a better covariance than the stated one
 SCHEME = Scheme(loss=HUBER_WITH_CUT, steps=12, estimates_extra=True)
 
 
@@ -36,7 +36,7 @@ def solve_attitude(
     which is added to every centroid. The uncertainty of the lens (the camera's covariance) turns all stars alike, so
     that no scatter shows it: it is added to the attitude's covariance. Raises NotIdentified with fewer than 3 stars.
     """
-    if len(xy_px) < FEWEST_STARS:
+    if len(xy_px) < MIN_STARS:
         raise NotIdentified("fewer than 3 stars agree on an attitude", matched=len(xy_px))
     points = observations_of_image(xy_px, covariance_px2, rays_icrs)
     start = State(camera=camera, R_cam_icrs=np.array(R_cam_icrs)[None])
@@ -63,7 +63,7 @@ def _attitude_covariance(jacobian: Array, inverse: Array, weight: Array, residua
     """
     stated = np.linalg.inv(np.einsum("nia,nij,njb->ab", jacobian, inverse, jacobian, optimize=True))
     n = len(residual_px)
-    if n < FEWEST_FOR_SCATTER:
+    if n < MIN_FOR_SCATTER:
         return np.asarray(stated)
     bread = np.linalg.inv(np.einsum("nia,nij,njb->ab", jacobian, weight, jacobian, optimize=True))
     scores = np.einsum("nia,nij,nj->na", jacobian, weight, residual_px, optimize=True)

@@ -60,12 +60,12 @@ class Number(Key):
     def check(self, value: Any, name: str) -> float | int:
         kind = "a whole number" if self.integer else "a number"
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ValueError(f"{name} must be {kind}, not {shown(value)}")
+            raise ValueError(f"{name} must be {kind}, not {value_text(value)}")
         if not self.low <= value <= self.high or (self.above and value == self.low):  # NaN fails the first
             limits = f"above {self.low:g} and at most" if self.above else f"from {self.low:g} to"
-            raise ValueError(f"{name} must be {kind} {limits} {self.high:g}, not {shown(value)}")
+            raise ValueError(f"{name} must be {kind} {limits} {self.high:g}, not {value_text(value)}")
         if self.integer and value % 1:
-            raise ValueError(f"{name} must be {kind}, not {shown(value)}")
+            raise ValueError(f"{name} must be {kind}, not {value_text(value)}")
         return int(value) if self.integer else float(value)
 
     def body(self) -> Schema:
@@ -81,9 +81,9 @@ class Text(Key):
 
     def check(self, value: Any, name: str) -> str:
         if not isinstance(value, str) or not value.strip():
-            raise ValueError(f"{name} must be a text, not {shown(value)}")
+            raise ValueError(f"{name} must be a text, not {value_text(value)}")
         if len(value) > self.max_chars or not value.isprintable():
-            raise ValueError(f"{name} must be one line of at most {self.max_chars} characters, not {shown(value)}")
+            raise ValueError(f"{name} must be one line of at most {self.max_chars} characters, not {value_text(value)}")
         return value
 
     def body(self) -> Schema:
@@ -96,7 +96,7 @@ class Flag(Key):
 
     def check(self, value: Any, name: str) -> bool:
         if not isinstance(value, bool):
-            raise ValueError(f"{name} must be true or false, not {shown(value)}")
+            raise ValueError(f"{name} must be true or false, not {value_text(value)}")
         return value
 
     def body(self) -> Schema:
@@ -111,7 +111,7 @@ class Choice(Key):
 
     def check(self, value: Any, name: str) -> str | int:
         if isinstance(value, bool) or not isinstance(value, str | int) or value not in self.values:
-            raise ValueError(f"{name} must be {' or '.join(map(str, self.values))}, not {shown(value)}")
+            raise ValueError(f"{name} must be {' or '.join(map(str, self.values))}, not {value_text(value)}")
         return value
 
     def body(self) -> Schema:
@@ -136,7 +136,7 @@ class List(Key):
         least, most = self.lengths
         if not isinstance(value, list | tuple) or not least <= len(value) <= most:
             length = f"{least}" if least == most else f"{least} to {most}"
-            raise ValueError(f"{name} must be a list of {length} values, not {shown(value)}")
+            raise ValueError(f"{name} must be a list of {length} values, not {value_text(value)}")
         return tuple(self.each.check(one, name) for one in value)
 
     def body(self) -> Schema:
@@ -179,7 +179,7 @@ class Table(Key):
 
     def check(self, value: Any, name: str) -> dict[str, Any]:
         if not isinstance(value, dict):
-            raise ValueError(f"{name or 'the file'} must be a table of keys, not {shown(value)}")
+            raise ValueError(f"{name or 'the file'} must be a table of keys, not {value_text(value)}")
         prefix = f"{name}." if name else ""
         for unknown in sorted(str(key) for key in set(value) - set(self.keys)):
             meant = get_close_matches(unknown.lower(), self.keys, n=1, cutoff=SIMILAR)
@@ -202,7 +202,7 @@ class Table(Key):
         return schema | ({"additionalProperties": False} if self.closed else {})
 
 
-def shown(value: Any) -> str:
+def value_text(value: Any) -> str:
     """The beginning of a value as one line for a message, however long or deeply nested it is."""
     try:
         text = repr(value)

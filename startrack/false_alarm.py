@@ -18,7 +18,7 @@ SMALLEST_LOG_PROBABILITY = -690.0  # below this an exponential underflows
 CAP_CENTRES = 64  # detections about which the density is measured
 CAP_RADIUS_RAD = np.radians(10.0)
 CELLS_ACROSS = 12  # of the frame's longer side, for the density in the image plane
-FEWEST_EXPECTED = 1e-6
+MIN_EXPECTED = 1e-6
 
 
 def probability(log_probability: float) -> float:
@@ -68,7 +68,7 @@ def log_p_value_bound(distance_px: Array, gate_px: float, predicted: int, densit
     `distance_px` (n,): distances of the matches. `density_px2`: detections per pixel.
     """
     each = min(density_px2 * np.pi * (0.5 * gate_px) ** 2, 1.0)
-    expected = max(predicted * each, FEWEST_EXPECTED)
+    expected = max(predicted * each, MIN_EXPECTED)
     hits = int(np.count_nonzero(distance_px < 0.5 * gate_px))
     return 0.0 if hits <= expected else float(hits - expected - hits * np.log(hits / expected))
 

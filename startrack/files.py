@@ -133,7 +133,7 @@ def check_free(path: FilePath, *, overwrite: bool, reason: str = "bad_image") ->
 
 
 @contextmanager
-def locked(path: FilePath, *, wait: bool = True, on_wait: Callable[[], None] | None = None) -> Iterator[None]:
+def hold_lock(path: FilePath, *, wait: bool = True, on_wait: Callable[[], None] | None = None) -> Iterator[None]:
     """Hold the lock file `path` for the length of the block; the system releases it if the process is killed.
 
     With `wait`, wait for another holder, after one call of `on_wait`; otherwise raise Locked. The lock works between

@@ -22,7 +22,7 @@ PX_PER_MAG = 0.6  # distance that counts as much as one magnitude of disagreemen
 DISTINCT_MAG = 0.3  # of stars that share a detection, one this much brighter gives it its name
 DECISIVE_NATS = 12.0  # log-likelihood ratio that decides between two positions
 SIGNIFICANT_SNR = 10.0  # detections above this should have a catalogue star
-FEWEST_UNSATURATED = 3  # for the photometric scale; below this, saturated stars are used too
+MIN_UNSATURATED = 3  # for the photometric scale; below this, saturated stars are used too
 SMALLEST_FLUX = 1e-9
 
 
@@ -134,7 +134,7 @@ class PhotometricScale:
         """Scale from stars of magnitudes `v_mag` (k,) that lie on the detections `detection` (k,)."""
         brightness = instrumental_mag(flux_e)
         usable = ~saturated[detection]
-        if np.count_nonzero(usable) >= FEWEST_UNSATURATED:
+        if np.count_nonzero(usable) >= MIN_UNSATURATED:
             v_mag, detection = v_mag[usable], detection[usable]
         measured = brightness + upper_median(v_mag - brightness[detection])
         faintest = float(measured.max())

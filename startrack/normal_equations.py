@@ -98,7 +98,7 @@ class NormalEquations:
         """With a prior of the lens parameters: precisions (m,) and expected values minus the current ones (m,)."""
         return replace(self, lens=self.lens + np.diag(precision), lens_right=self.lens_right + precision * offset)
 
-    def damped(self, damping: float) -> NormalEquations:
+    def with_damping(self, damping: float) -> NormalEquations:
         """With the diagonals multiplied by 1 + damping. Source: Marquardt 1963, J. SIAM 11, 431."""
         return replace(
             self,

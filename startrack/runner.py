@@ -105,13 +105,13 @@ class Runner(Generic[Task, Result]):
         Raises BadInput (no_cluster) if no scheduler answers, RunStopped if the cluster fails.
         """
         if self.cluster is not None:
-            yield from self._on_cluster(tasks)
+            yield from self._run_on_cluster(tasks)
         elif self._in_process:
             yield from ((task, self.work(task)) for task in tasks if not self._stopping)
         else:
-            yield from self._in_pool(tasks)
+            yield from self._run_in_pool(tasks)
 
-    def _in_pool(self, tasks: Iterable[Task]) -> Generator[tuple[Task, Result | Died], None, None]:
+    def _run_in_pool(self, tasks: Iterable[Task]) -> Generator[tuple[Task, Result | Died], None, None]:
         """After a process has died or stood still, the tasks then in hand are repeated one by one to find the cause."""
         coming = iter(tasks)
         while True:
@@ -163,7 +163,7 @@ class Runner(Generic[Task, Result]):
             for future in waiting:
                 future.cancel()
 
-    def _on_cluster(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Result | Died]]:
+    def _run_on_cluster(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Result | Died]]:
         """The workers see the same folders. Dask repeats the tasks of a lost worker on another."""
         from distributed import as_completed
 

@@ -9,7 +9,7 @@ import pytest
 
 from startrack.camera import load_camera
 from startrack.evidence import measure_sky_step, near_skyline, reliable_azimuths, subtract_sky_step
-from startrack.evidence.sky_step import _above_px
+from startrack.evidence.sky_step import _azimuth_and_height
 from startrack.terrain import load_terrain
 from startrack.types import Detections
 
@@ -37,7 +37,7 @@ def frame():
     """A sky of 90 electrons above the wall, blurred by the PSF, as a flat background model sees it."""
     rows, columns = np.mgrid[0:2048, 0:2048]
     xy = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float)
-    _, above = _above_px(xy, CAMERA, R_CAM_ENU, horizon_at(PLACE))
+    _, above = _azimuth_and_height(xy, CAMERA, R_CAM_ENU, horizon_at(PLACE))
     above = above.reshape(2048, 2048)
     rng = np.random.default_rng(5)
     light = STEP_E / (1 + np.exp(np.clip(-above / 0.6, -50, 50)))

@@ -141,10 +141,10 @@ def _is_image(name: str) -> bool:
     lower = name.lower()
     if lower.startswith(".") or lower.endswith(OWN_PICTURES):
         return False
-    return any(Path(one).suffix in PICTURE_SUFFIXES for one in _unpacked(lower))
+    return any(Path(one).suffix in PICTURE_SUFFIXES for one in _names_without_compression(lower))
 
 
-def _unpacked(name: str) -> Iterator[str]:
+def _names_without_compression(name: str) -> Iterator[str]:
     yield name
     if Path(name).suffix in PACKING_SUFFIXES:
         yield Path(name).stem

@@ -12,7 +12,7 @@ from typing import Any
 from startrack.batch.find import Image
 from startrack.batch.fingerprint import sha256_of
 from startrack.errors import BadInput
-from startrack.files import Locked, locked
+from startrack.files import Locked, hold_lock
 from startrack.output.write import COMPANIONS
 
 JOB = "job_sha256"  # hash of what a result was made from: content of its files, flags, version; null: do it again
@@ -37,7 +37,7 @@ def only_writer(out: Path) -> Iterator[None]:
     """
     with ExitStack() as stack:
         try:
-            stack.enter_context(locked(out / LOCK, wait=False))
+            stack.enter_context(hold_lock(out / LOCK, wait=False))
         except Locked as cause:
             raise BadInput(
                 "bad_image",

@@ -16,18 +16,18 @@ from startrack.frames import R_from_rotvec
 from startrack.normal_equations import Observations
 from startrack.types import Array, Ints
 
-FEWEST_MATCHES = 40
+MIN_MATCHES = 40
 SMALLEST_FRACTION = 0.6
 LARGEST_HELD_OUT_RMS_PX = 1.0
 LARGEST_MAP_SIGMA_PX = 0.5
-MOST_FALSE_ALARM = 1e-9
+MAX_FALSE_ALARM = 1e-9
 RINGS = 4
 SECTORS = 8
 STARS_PER_RING = 3
 STARS_PER_SECTOR = 2
-FEWEST_SECTORS = 5
+MIN_SECTORS = 5
 WRONG_ROTATIONS_RAD = tuple(np.radians((-31.0, -17.0, 13.0, 29.0)))  # attitudes at which only chance matches
-FEWEST_BY_CHANCE = 0.5
+MIN_BY_CHANCE = 0.5
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def joint_log_p_value(joint: JointFit) -> float:
         )
         for turn in WRONG_ROTATIONS_RAD
     ]
-    return log_p_value_poisson(found, max(float(np.mean(wrong)), FEWEST_BY_CHANCE))
+    return log_p_value_poisson(found, max(float(np.mean(wrong)), MIN_BY_CHANCE))
 
 
 def mirrored_residual_px(joint: JointFit) -> float:
@@ -124,19 +124,19 @@ def check_acceptance(joint: JointFit) -> tuple[Check, ...]:
     held = fit.held_out_rms_px
     mirrored = mirrored_residual_px(joint)
     return (
-        Check("matched stars", stars, f">= {FEWEST_MATCHES}", stars >= FEWEST_MATCHES, "not_identified",
+        Check("matched stars", stars, f">= {MIN_MATCHES}", stars >= MIN_MATCHES, "not_identified",
              "expose longer or open the lens, or add more pictures of the clear night sky"),
         Check("matched fraction", fraction, f">= {SMALLEST_FRACTION}", fraction >= SMALLEST_FRACTION,
              "inconsistent_evidence",
              "bright stars lack a source, or bright sources a star: use a clear sky without cloud, "
              "and check the time and the site"),
-        Check("log10 chance of as many matches", log_p / np.log(10), "<= -9", log_p <= np.log(MOST_FALSE_ALARM),
+        Check("log10 chance of as many matches", log_p / np.log(10), "<= -9", log_p <= np.log(MAX_FALSE_ALARM),
              "not_identified", "more stars are needed: expose longer, focus better"),
         Check("held-out RMS [px]", held, f"<= {LARGEST_HELD_OUT_RMS_PX}", held <= LARGEST_HELD_OUT_RMS_PX,
              "inconsistent_evidence", "sharp stars are needed: focus, expose shorter, keep the camera still"),
         Check("rings with stars", rings, f"= {RINGS}", rings == RINGS, "insufficient_geometry",
              "take pictures where stars fill the image from its middle to its edge: open sky, no walls"),
-        Check("sectors with stars", sectors, f">= {FEWEST_SECTORS} of {SECTORS}", sectors >= FEWEST_SECTORS,
+        Check("sectors with stars", sectors, f">= {MIN_SECTORS} of {SECTORS}", sectors >= MIN_SECTORS,
              "insufficient_geometry", "add pictures with the camera turned about its axis, so that stars fall on the "
              "empty side of the image too"),
         Check("map sigma [px]", sigma, f"<= {LARGEST_MAP_SIGMA_PX}", sigma <= LARGEST_MAP_SIGMA_PX,

@@ -17,8 +17,8 @@ from startrack.camera import Camera, camera_to_dict
 from startrack.normal_equations import observations
 from startrack.types import Array, BadInput, Exposure, NotIdentified
 
-FEWEST_PICTURES = 3
-FEWEST_CORNERS = 100
+MIN_PICTURES = 3
+MIN_CORNERS = 100
 LARGEST_HELD_OUT_RMS_PX = 1.0
 LARGEST_MAP_SIGMA_PX = 0.5
 FORMAT = "startrack.calibration/1"
@@ -90,9 +90,9 @@ def _check_acceptance(fit: LensFit, xy_px: Array, pictures: int) -> tuple[Check,
     used, held = int(fit.used.sum()), fit.held_out_rms_px
     tilt = "more pictures: the board tilted by 30 degrees and more, near and far, and in every corner of the image"
     return (
-        Check("pictures with a board", pictures, f">= {FEWEST_PICTURES}", pictures >= FEWEST_PICTURES,
+        Check("pictures with a board", pictures, f">= {MIN_PICTURES}", pictures >= MIN_PICTURES,
              "insufficient_geometry", tilt),
-        Check("corners", used, f">= {FEWEST_CORNERS}", used >= FEWEST_CORNERS, "insufficient_geometry", tilt),
+        Check("corners", used, f">= {MIN_CORNERS}", used >= MIN_CORNERS, "insufficient_geometry", tilt),
         Check("held-out RMS [px]", held, f"<= {LARGEST_HELD_OUT_RMS_PX}", held <= LARGEST_HELD_OUT_RMS_PX,
              "inconsistent_evidence", "a flat board and sharp pictures are needed"),
         Check("rings with corners", rings, f"= {RINGS}", rings == RINGS, "insufficient_geometry", tilt),

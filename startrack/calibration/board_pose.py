@@ -19,7 +19,7 @@ from startrack.types import Array, BadInput, Exposure, NotIdentified
 IMAGES_TRIED = 4
 LARGEST_ERROR_RAD = 0.05  # median error of the corners' rays with a usable initial camera
 FOCAL_PARTS = (0.33, 1.0)  # of the frame's width: initial focal lengths
-FEWEST_CHARUCO_CORNERS = 4
+MIN_CHARUCO_CORNERS = 4
 CONTRAST_PERCENTILES = (0.5, 99.5)
 
 
@@ -76,7 +76,7 @@ def _find_charuco(grey: Any, board: Board) -> Corners | None:
     dictionary = cv2.aruco.getPredefinedDictionary(number)
     pattern = cv2.aruco.CharucoBoard((board.columns, board.rows), 1.0, board.marker_fraction, dictionary)
     px, ids, _, _ = cv2.aruco.CharucoDetector(pattern).detectBoard(grey)
-    if ids is None or px is None or len(ids) < FEWEST_CHARUCO_CORNERS:
+    if ids is None or px is None or len(ids) < MIN_CHARUCO_CORNERS:
         return None
     position = np.asarray(pattern.getChessboardCorners(), dtype=np.float64)[np.asarray(ids).ravel()]
     return Corners(np.asarray(px, dtype=np.float64).reshape(-1, 2), position)

@@ -43,7 +43,7 @@ ROBUST = Scheme(loss=cauchy_loss(CAUCHY_CHI2), settled_px=2e-3)  # it only has t
 ROBUST_ROUNDS = 4
 FIRST_SIGMA_PX = 1.0
 SCATTER_SIGMAS = 3.0  # chi-square beyond which the stated centroid errors are not believed
-FEWEST_BEYOND, FRACTION_BEYOND = 3, 0.01  # stars at the calibrated angle or farther off the axis
+MIN_BEYOND, FRACTION_BEYOND = 3, 0.01  # stars at the calibrated angle or farther off the axis
 WIDEST_GAP_RAD = np.radians(8.0)
 
 
@@ -160,7 +160,7 @@ def calibrated_radius_rad(off_axis_rad: Array) -> float:
     It also ends at a gap of more than 8 degrees without stars: beyond that the lens would be extrapolated.
     """
     ordered = np.sort(off_axis_rad)
-    beyond = max(FEWEST_BEYOND, int(np.ceil(FRACTION_BEYOND * len(ordered))))
+    beyond = max(MIN_BEYOND, int(np.ceil(FRACTION_BEYOND * len(ordered))))
     outermost = ordered[max(len(ordered) - beyond, 0)]
     outer = ordered[ordered >= ordered[len(ordered) // 2]]
     gaps = np.flatnonzero(np.diff(outer) > WIDEST_GAP_RAD)

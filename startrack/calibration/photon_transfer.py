@@ -13,7 +13,7 @@ from startrack.types import Array, Exposure
 
 BLOCK_PX = 32
 LARGEST_GAIN_ERROR_1 = 0.1  # relative
-FEWEST_BLOCKS = 60
+MIN_BLOCKS = 60
 CLIP_SIGMA = 3.0
 CLIPS = 8
 CORE_SIGMA = 2.0
@@ -49,7 +49,7 @@ def fit_photon_transfer(pairs: list[tuple[Exposure, Exposure]]) -> PhotonTransfe
         return None
     level, variance = np.concatenate(levels), np.concatenate(variances)
     good = variance > 0
-    return _fit_line(level[good], variance[good]) if good.sum() >= FEWEST_BLOCKS else None
+    return _fit_line(level[good], variance[good]) if good.sum() >= MIN_BLOCKS else None
 
 
 def _block_statistics(a: Array, b: Array) -> tuple[Array, Array]:
@@ -85,7 +85,7 @@ def _fit_line(level: Array, variance: Array) -> PhotonTransfer | None:
         relative = (variance - fitted) / fitted
         spread = max(1.4826 * float(np.median(np.abs(relative))), 1e-6)
         weight = np.where(np.abs(relative) < CLIP_SIGMA * spread, 1.0 / (fitted * spread) ** 2, 0.0)
-        if np.count_nonzero(weight) < FEWEST_BLOCKS:
+        if np.count_nonzero(weight) < MIN_BLOCKS:
             return None
     error = float(np.sqrt(np.linalg.inv(design.T @ (weight[:, None] * design))[0, 0]))
     if slope <= 0 or error > LARGEST_GAIN_ERROR_1 * slope:

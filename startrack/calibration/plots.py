@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 INK, GOOD, BAD, LINE = "#1b2430", "#0072b2", "#d55e00", "#009e73"
 ARROW_FRACTION = 0.02  # of the frame's width: length of an arrow of the RMS residual
 MAP_SIDE = 160
-MOST_ARROWS = 1000  # more overlap
+MAX_ARROWS = 1000  # more overlap
 CIRCLE_RAD = np.linspace(0.0, 2 * np.pi, 181)
 
 
@@ -61,7 +61,7 @@ def _draw_vectors(axes: Axes, calibration: Calibration) -> None:
     px, residual = calibration.joint.points.xy_px, fit.held_out_px
     scale = ARROW_FRACTION * camera.size_px[0] / max(fit.held_out_rms_px, 1e-6)
     used = np.flatnonzero(fit.used)
-    used = used[:: max(len(used) // MOST_ARROWS, 1)]
+    used = used[:: max(len(used) // MAX_ARROWS, 1)]
     axes.quiver(
         px[used, 0], px[used, 1], scale * residual[used, 0], scale * residual[used, 1], color=GOOD, angles="xy",
         scale_units="xy", scale=1, width=0.0016,

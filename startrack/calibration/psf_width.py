@@ -11,7 +11,7 @@ from startrack.psf import pixel_profile, stamp_radius
 from startrack.types import Array
 
 BRIGHT_SNR = 25.0
-MOST_STARS = 400  # of an image
+MAX_STARS = 400  # of an image
 WIDTHS_PX = np.geomspace(0.35, 6.0, 40)
 
 
@@ -30,7 +30,7 @@ def measure_psf_widths(joint: JointFit) -> PsfWidths:
     for i, (frame, matched) in enumerate(zip(joint.frames, joint.matches, strict=True)):
         found = frame.sources
         used = matched.detection[joint.fit.used[joint.points.image == i]]
-        used = used[(found.snr[used] > BRIGHT_SNR) & ~found.saturated[used]][:MOST_STARS]
+        used = used[(found.snr[used] > BRIGHT_SNR) & ~found.saturated[used]][:MAX_STARS]
         radius = stamp_radius(1.6 * found.psf_sigma_px) + 2
         width, height = frame.size_px
         px = found.xy_px[used]

@@ -41,7 +41,7 @@ def calibration_dict(calibration: Calibration) -> dict[str, Any]:
             "models": [vars(candidate) for candidate in fit.candidates],
         },
         "gates": [
-            {"name": check.name, "value": _limited(check.value), "limit": check.limit, "passed": bool(check.passed)}
+            {"name": check.name, "value": _json_number(check.value), "limit": check.limit, "passed": bool(check.passed)}
             for check in calibration.checks
         ],
         "coverage": {
@@ -96,7 +96,7 @@ def _is_refracted(calibration: Calibration) -> bool:
     return all(frame.sky.refracted for frame in calibration.joint.frames)
 
 
-def _limited(value: float) -> float:
+def _json_number(value: float) -> float:
     return float(np.clip(value, -1e6, 1e6))
 
 

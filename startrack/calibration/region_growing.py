@@ -24,7 +24,7 @@ GROWTH_ROUNDS = 16
 FINAL_ROUNDS = 8
 SETTLED_FRACTION = 0.003  # change of the number of matches
 MANY_STARS = 100  # from which the order follows from the angle alone
-FEWEST_FOR_POLYNOMIAL = 25
+MIN_FOR_POLYNOMIAL = 25
 DEGREES_PER_COEFFICIENT = 25
 KNOWN_QUANTILE = 0.95
 
@@ -130,6 +130,6 @@ def _outer_angle(angle_rad: Array) -> float:
 
 def _coefficients(angle_rad: float, stars: int) -> int:
     """Number of k that stars out to this angle determine."""
-    if stars < FEWEST_FOR_POLYNOMIAL:
+    if stars < MIN_FOR_POLYNOMIAL:
         return 1
     return int(np.clip(1 + np.degrees(angle_rad) // DEGREES_PER_COEFFICIENT, 1, 4))

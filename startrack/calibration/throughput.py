@@ -14,7 +14,7 @@ import numpy as np
 from startrack.calibration.region_growing import JointFit
 from startrack.types import Array, Ints
 
-FEWEST_STARS = 30
+MIN_STARS = 30
 BRIGHT_SNR = 10.0
 LOSS_MAG = 0.2  # residual from which a star's pull no longer grows
 PHOTOMETRY_MAG = 0.05  # error of a star's magnitude beyond catalogue and noise
@@ -29,7 +29,7 @@ FOLDS = 5
 LARGEST_HELD_OUT_MAG = 0.4  # median scatter of held-out stars
 LARGEST_HELD_OUT_RATIO = 1.5  # of held-out scatter to that of the fit
 LARGEST_IMAGE_OFFSET_MAG = 0.15  # of an image's zero point from the common one: clouds, or twilight
-FEWEST_OF_IMAGE = 10
+MIN_OF_IMAGE = 10
 NORMAL_BY_MAD = 1.4826
 
 
@@ -96,7 +96,7 @@ def measure_throughput(joint: JointFit, flux_ratio: float = 1.0) -> ThroughputFi
     `flux_ratio`: by which the detector's fluxes are multiplied (its PSF is not quite each star's own).
     """
     stars = _star_fluxes(joint)
-    if stars is None or len(stars.gain_mag) < FEWEST_STARS:
+    if stars is None or len(stars.gain_mag) < MIN_STARS:
         return ThroughputFit(None, (
             "zero point: not measured; the images must state their exposure time (EXPTIME, exposure_s), and 30 "
             "unsaturated stars are needed",
@@ -150,7 +150,7 @@ def _failures(stars: StarFluxes, terms: list[str], fit: _Fit) -> list[str]:
     offsets = [
         float(np.median(residual[stars.image == i]))
         for i, count in enumerate(np.bincount(stars.image))
-        if count >= FEWEST_OF_IMAGE
+        if count >= MIN_OF_IMAGE
     ]
     if len(offsets) > 1 and (largest := float(np.max(np.abs(offsets)))) > LARGEST_IMAGE_OFFSET_MAG:
         failures.append(f"the zero points of the images differ by up to {largest:.2f} mag from their mean: clouds?")
@@ -168,7 +168,7 @@ def _held_out_mag(stars: StarFluxes, terms: list[str], edge_rad: float) -> Array
     for k in np.unique(fold):
         held = fold == k
         rest = stars.take(~held)
-        if len(rest.gain_mag) < FEWEST_STARS:
+        if len(rest.gain_mag) < MIN_STARS:
             rest = stars
         residual[held] = (stars.gain_mag - _model(stars, _fit(rest, terms, edge_rad).values, edge_rad))[held]
     return residual

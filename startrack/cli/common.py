@@ -121,7 +121,7 @@ def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, s
         try:
             outcome = one(path, stem)
         except BadInput as cause:
-            outcome = _refused(path, cause, format_name)
+            outcome = _refused_outcome(path, cause, format_name)
         except Exception as cause:
             if args.verbose:
                 raise
@@ -156,7 +156,7 @@ def _internal_error(path: str, cause: Exception, format_name: str) -> Outcome:
     return Outcome("refused", INTERNAL_ERROR, f"{Path(path).name}  {message}", record)
 
 
-def _refused(path: str, cause: BadInput, format_name: str) -> Outcome:
+def _refused_outcome(path: str, cause: BadInput, format_name: str) -> Outcome:
     """Outcome of an image that could not be read, or whose camera or terrain could not."""
     from startrack.output.text import refusal_line
 

@@ -49,7 +49,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the checks; 0 if all pass, else 1."""
-    checks = [_checked(name, check) for name, check in _checks(args).items()]
+    checks = [_run_check(name, check) for name, check in _checks(args).items()]
     if args.json:
         record = {"version": __version__, "python": platform.python_version(), "checks": checks}
         print(json.dumps(record, indent=2))
@@ -68,8 +68,8 @@ def _checks(args: argparse.Namespace) -> dict[str, Callable[[], str]]:
         "packages": _packages,
         "extras": _extras,
         "catalogue": _catalogue,
-        "cameras": lambda: _shipped("calib"),
-        "terrains": lambda: _shipped("terrain"),
+        "cameras": lambda: _check_shipped_files("calib"),
+        "terrains": lambda: _check_shipped_files("terrain"),
         "ephemeris": _ephemeris,
         "kernels": lambda: _kernels(args),
         "self-test": _self_test,
@@ -77,7 +77,7 @@ def _checks(args: argparse.Namespace) -> dict[str, Callable[[], str]]:
     return checks
 
 
-def _checked(name: str, check: Callable[[], str]) -> dict[str, Any]:
+def _run_check(name: str, check: Callable[[], str]) -> dict[str, Any]:
     try:
         return {"name": name, "ok": True, "message": check()}
     except Exception as cause:  # noqa: BLE001 - a doctor reports whatever is wrong
@@ -108,7 +108,7 @@ def _catalogue() -> str:
     return f"{catalog.name}: {len(catalog)} stars in {1e3 * (time.perf_counter() - start):.0f} ms"
 
 
-def _shipped(kind: str) -> str:
+def _check_shipped_files(kind: str) -> str:
     from startrack.camera import load_camera
     from startrack.files import data_dir
     from startrack.terrain import load_terrain

@@ -60,7 +60,7 @@ def write_page_of(
 
     if Path(out).is_file():
         one = result_at(out)
-        path = Path(output) if output else one.beside(OF_ONE)
+        path = Path(output) if output else one.companion(OF_ONE)
         write_page(path, [one], real=_true_positions([one], truth), images=images, single=True)
         return path
     found, unread = results_under(out)

@@ -69,8 +69,8 @@ def run(args: argparse.Namespace) -> int:
             f"{', '.join(unknown)}: not a table or figure of the thesis; known are {', '.join(NAMES)}, all"
         )
     chosen = NAMES if "all" in args.what else [name for name in NAMES if name in args.what]
-    _need(args, "matplotlib", "plots", "figures are drawn", unless=args.no_plots)
-    _need(args, "distributed", "cluster", "a cluster is reached", unless=args.cluster is None)
+    _require_extra(args, "matplotlib", "plots", "figures are drawn", unless=args.no_plots)
+    _require_extra(args, "distributed", "cluster", "a cluster is reached", unless=args.cluster is None)
 
     from startrack.reproduction import ARTEFACTS, FULL, QUICK, ChunkStore, Context, write_artefact
 
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _need(args: argparse.Namespace, module: str, extra: str, what: str, *, unless: bool) -> None:
+def _require_extra(args: argparse.Namespace, module: str, extra: str, what: str, *, unless: bool) -> None:
     if not unless and find_spec(module) is None:
         hint = "" if extra != "plots" else ", or leave them out with --no-plots"
         args.usage_error(f"{what} with {module}: pip install '.[{extra}]' in a clone of startrack{hint}")

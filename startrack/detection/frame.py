@@ -45,7 +45,7 @@ class Frame:
         """(H, W)."""
         return self.image.shape[0], self.image.shape[1]
 
-    def standardised(self, rows: slice) -> Image:
+    def standardise(self, rows: slice) -> Image:
         """Some rows without their background and the stars known so far, in units of the noise of both."""
         residual = self.image[rows] - self.background[rows]
         if self.found is None:

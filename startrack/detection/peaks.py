@@ -102,7 +102,7 @@ def _strip_peaks(
     Strip by strip everything stays in the processor's cache.
     """
     first = max(rows.start - pad, 0)
-    standardised = frame.standardised(slice(first, rows.stop + pad))
+    standardised = frame.standardise(slice(first, rows.stop + pad))
     level = local_level(standardised, width)
     above = cv2.subtract(standardised, level, dst=standardised)
     filtered = cv2.sepFilter2D(above, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT)

@@ -60,7 +60,7 @@ def find_streaks(frame: Frame) -> Streaks | None:
     directions and lengths, and are not streaks of stars.
     """
     height, width = frame.shape
-    whole = frame.standardised(slice(0, height))
+    whole = frame.standardise(slice(0, height))
     if frame.dead is not None:
         whole = np.where(frame.dead, np.float32(50.0), whole)
     smooth = cv2.GaussianBlur(whole, (0, 0), SMOOTH_PX)

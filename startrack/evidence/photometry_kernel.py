@@ -63,7 +63,7 @@ def measure_sources(
             weight,
         )
         flux, middle, strength, masked = _fit_masking(profile, light, data, variance, weight)
-        usable[i] = masked <= MAX_MASKED_PX and _seen(profile, weight) > 0.5
+        usable[i] = masked <= MAX_MASKED_PX and _visible_fraction(profile, weight) > 0.5
         measured[i, 0], measured[i, 1], measured[i, 2], measured[i, 3] = 0.0, 1.0, 0.0, 0.0
         if not usable[i]:
             continue
@@ -205,7 +205,7 @@ def _fit_masking(profile, light, data, variance, weight):
 
 
 @njit(inline="always")
-def _seen(profile, weight) -> float:
+def _visible_fraction(profile, weight) -> float:
     """Part of the star's light in pixels that have a weight."""
     total = 0.0
     for p in range(len(profile)):

@@ -126,7 +126,7 @@ def subtract_sky_step(
     in the image. The step is the median of the pixels at equal distances from the skyline, sector by sector.
     """
     rows, columns = np.divmod(np.flatnonzero(_band(image_e.shape, camera, R_cam_enu, horizon)), image_e.shape[1])
-    azimuth, above = _above_px(np.stack([columns, rows], axis=1).astype(float), camera, R_cam_enu, horizon)
+    azimuth, above = _azimuth_and_height(np.stack([columns, rows], axis=1).astype(float), camera, R_cam_enu, horizon)
     near = (np.abs(above) < BAND_PX) & ~dead[rows, columns]
     rows, columns, azimuth, above = rows[near], columns[near], azimuth[near], above[near]
     if not len(rows):
@@ -137,7 +137,7 @@ def subtract_sky_step(
     cell = (azimuth / (2 * np.pi) * SECTORS).astype(np.int64) % SECTORS * steps + _step_of(above, steps)
     middle = _medians(rest, cell, SECTORS * steps).reshape(SECTORS, steps)
     background, noise = detections.background_e.copy(), detections.noise_e.copy()
-    profile = _interpolated(middle, azimuth, above)
+    profile = _interpolate_table(middle, azimuth, above)
     background[rows, columns] += profile.astype(np.float32)
     across = _step_of(above, steps)  # all sectors together: the noise is known better than it varies
     ratio = _medians(np.abs(rest - profile) / spread, across, steps) / MEDIAN_ABS_NORMAL
@@ -187,7 +187,7 @@ def _band(shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horizon: Hor
     return picture.view(np.bool_)
 
 
-def _above_px(xy_px: Array, camera: Camera, R_cam_enu: Array, horizon: Horizon) -> tuple[Array, Array]:
+def _azimuth_and_height(xy_px: Array, camera: Camera, R_cam_enu: Array, horizon: Horizon) -> tuple[Array, Array]:
     """Azimuth [rad] and height above the skyline [px] of pixels (n, 2)."""
     azimuth, elevation = azel_from_rays(camera.unproject(xy_px) @ R_cam_enu)
     return azimuth, (elevation - horizon(azimuth)) * _px_per_rad(camera, camera.angle_rad(xy_px))
@@ -236,7 +236,7 @@ def _medians(values: Array, cell: Ints, cells: int) -> Array:
     return np.where(count >= MIN_MEDIAN_PX, median, 0.0)
 
 
-def _interpolated(table: Array, azimuth_rad: Array, above_px: Array) -> Array:
+def _interpolate_table(table: Array, azimuth_rad: Array, above_px: Array) -> Array:
     """Values (n,) of the table (sectors, steps), linear both ways; fading to nothing at the band's ends."""
     sectors, steps = table.shape
     s = azimuth_rad / (2 * np.pi) * sectors - 0.5

@@ -31,7 +31,7 @@ def decode_jpeg(raw: bytes) -> Decoded:
 
     Raises BadInput bad_image if it is truncated, damaged or CMYK.
     """
-    image = _open(raw)
+    image = _open_image(raw)
     check_size(*image.size)
     if image.mode not in ("L", "RGB"):
         raise bad_image(f"JPEG is {image.mode}; startrack reads plain grey or colour")
@@ -43,7 +43,7 @@ def decode_jpeg(raw: bytes) -> Decoded:
         stored[rows] = strip
     comment, exif = image.info.get("comment", b""), exif_warnings(image.getexif)
     del image  # a decoded picture in Pillow takes 4 bytes a pixel: never two at a time
-    again = _open(raw[:end] + FILLER + raw[end:])
+    again = _open_image(raw[:end] + FILLER + raw[end:])
     if not all(np.array_equal(stored[rows], strip) for rows, strip in _strips(again)):
         raise bad_image("truncated JPEG: its end marker comes before the end of the picture")
     pixels, colour = grey_float32(stored)
@@ -55,7 +55,7 @@ def decode_jpeg(raw: bytes) -> Decoded:
     )
 
 
-def _open(raw: bytes) -> Any:
+def _open_image(raw: bytes) -> Any:
     # The class itself, not Image.open: the latter's size limit is a process-wide setting, and not ours.
     from PIL.JpegImagePlugin import JpegImageFile
 

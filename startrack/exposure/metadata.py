@@ -196,7 +196,7 @@ def _sidecar_time(sidecar: Path, value: object) -> datetime | None:
 
 def _sidecar_reference(sidecar: Path, values: Mapping[str, Any], key: str) -> str | None:
     value = _sidecar_value(sidecar, values, key)
-    return None if value is None else _from_folder(sidecar, value)
+    return None if value is None else _resolve_path(sidecar, value)
 
 
 def _header_reference(image: Path, header: Mapping[str, Any], key: str, notes: list[str]) -> str | None:
@@ -204,7 +204,7 @@ def _header_reference(image: Path, header: Mapping[str, Any], key: str, notes: l
     if not value.isprintable():
         notes.append(f"{key} is no name of a file; not used")
         return None
-    return _from_folder(image, value) if value else None
+    return _resolve_path(image, value) if value else None
 
 
 def _header_pattern(header: Mapping[str, Any], notes: list[str]) -> str | None:
@@ -219,7 +219,7 @@ def _is_pattern(value: object) -> bool:
     return isinstance(value, str) and value.strip().upper() in BAYER_PATTERNS
 
 
-def _from_folder(file: Path, reference: str) -> str:
+def _resolve_path(file: Path, reference: str) -> str:
     """A path in `file` is relative to the folder of `file`; a name stays a name."""
     return os.path.join(file.parent, reference) if is_path(reference) else reference
 

@@ -56,7 +56,7 @@ def read_exposure(
         raise BadInput(error.reason, " ".join(f"{printable(path)}: {error}".split())) from error
     given = Facts(time_utc=time_utc, exposure_s=exposure_s, camera=camera, terrain=terrain)
     facts = resolve_facts(Path(path), decoded.header, given)
-    pixels, notes = _without_mosaic(decoded, facts)
+    pixels, notes = _level_mosaic(decoded, facts)
     return Exposure(
         pixels_adu=pixels,
         name=stem(Path(path)),
@@ -91,7 +91,7 @@ def exposure_of(pixels: NDArray[Any], *, time_utc: datetime | None = None, name:
     )
 
 
-def _without_mosaic(decoded: Decoded, facts: Facts) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+def _level_mosaic(decoded: Decoded, facts: Facts) -> tuple[NDArray[np.float32], tuple[str, ...]]:
     """The pixels, those of a mosaic brought to one level and gain, and a warning if that was done."""
     colour_already = decoded.mosaic is None and COLOUR_WARNING in decoded.warnings
     if colour_already or not (decoded.mosaic or facts.bayer_pattern):

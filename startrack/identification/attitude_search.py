@@ -23,11 +23,11 @@ DEEPEST_RANK = 240
 ROUGH_DEPTH, ROUGH_REACH_RAD, ROUGH_FRACTION = 120, np.radians(20.0), 0.4
 PIVOTS = 16  # brightest detections about which triangles that no index lists are tried
 MATCHES_EACH, ROUGH_MATCHES_EACH = 3, 8  # catalogue triangles looked up for a triangle of detections
-MOST_IMAGE_TRIANGLES, MOST_ROUGH = 20_000, 3000  # short triangles of detections; their matches that are tried
+MAX_IMAGE_TRIANGLES, MAX_ROUGH = 20_000, 3000  # short triangles of detections; their matches that are tried
 VERIFIED = 256  # detections tested against the stars
 SIFTED, SIFTED_AT_ONCE = 64, 64  # detections that test a crowd of hypotheses first; hypotheses tested together
 DEPTH_FACTOR = 4  # catalogue stars per detection (of the whole sky): some are hidden or too faint
-FEWEST_HITS = 6
+MIN_HITS = 6
 PLAUSIBLE = 1e-2  # expected false alarms below which a hypothesis is refined; then the real limit decides
 
 
@@ -65,9 +65,9 @@ class AttitudeSearch:
             for deep in (False, True):
                 for first, fresh, end in windows:
                     index = self.patterns.deep if deep else self.patterns.bright
-                    yield from self._from_triangles(index, first, fresh, end, tolerance)
-        yield from self._from_pairs(tolerance)
-        yield from self._from_short_triangles(rough_px * self.scale.axis_rad_per_px)
+                    yield from self._attitudes_from_triangles(index, first, fresh, end, tolerance)
+        yield from self._attitudes_from_pairs(tolerance)
+        yield from self._attitudes_from_short_triangles(rough_px * self.scale.axis_rad_per_px)
 
     def mirrored_hypotheses(self) -> Iterator[AttitudeHypothesis]:
         """The same for the mirror image, from the triangles of the other handedness met so far."""
@@ -84,7 +84,7 @@ class AttitudeSearch:
         start = PREFIXES[-1] - (WINDOW - FRESH)
         return ((k, WINDOW - FRESH, min(k + WINDOW, n)) for k in range(start, n - WINDOW + FRESH, FRESH))
 
-    def _from_triangles(
+    def _attitudes_from_triangles(
         self, index: PatternIndex, first: int, fresh: int, end: int, tolerance: float
     ) -> Iterator[AttitudeHypothesis]:
         """From triangles of the detections `first` to `end` that have a vertex from the `fresh`-th of them on."""
@@ -97,28 +97,28 @@ class AttitudeSearch:
             order = np.argsort(sides[left], axis=1)
             vertex = vertices[left[:, None], order] + first
             icrs = index.rays_icrs[index.vertices[right]]
-            yield from self._of_one_hand(self.rays_cam[vertex], icrs, index.handedness[right], first, tolerance)
+            yield from self._test_triangles(self.rays_cam[vertex], icrs, index.handedness[right], first, tolerance)
 
-    def _from_pairs(self, tolerance: float) -> Iterator[AttitudeHypothesis]:
+    def _attitudes_from_pairs(self, tolerance: float) -> Iterator[AttitudeHypothesis]:
         index, few = self.patterns.pairs, self.rays_cam[:PIVOTS]
         for pivot in range(len(few) - 2):
             image, catalogue = index.triangles(few[pivot:], tolerance)
             if len(image):
                 icrs = index.rays_icrs[catalogue]
-                yield from self._of_one_hand(few[image + pivot], icrs, np.linalg.det(icrs), 0, tolerance)
+                yield from self._test_triangles(few[image + pivot], icrs, np.linalg.det(icrs), 0, tolerance)
 
-    def _from_short_triangles(self, tolerance: float) -> Iterator[AttitudeHypothesis]:
+    def _attitudes_from_short_triangles(self, tolerance: float) -> Iterator[AttitudeHypothesis]:
         index = self.patterns.deep
         longest = min(ROUGH_REACH_RAD, ROUGH_FRACTION * self.scale.diameter_rad)
-        image = triangles(self.rays_cam[:ROUGH_DEPTH], longest, MOST_IMAGE_TRIANGLES)
+        image = triangles(self.rays_cam[:ROUGH_DEPTH], longest, MAX_IMAGE_TRIANGLES)
         left, right = index.candidates(2 * np.sin(image.sides_rad / 2), tolerance, ROUGH_MATCHES_EACH)
-        self.tried += max(len(left) - MOST_ROUGH, 0)
-        left, right = left[:MOST_ROUGH], right[:MOST_ROUGH]
+        self.tried += max(len(left) - MAX_ROUGH, 0)
+        left, right = left[:MAX_ROUGH], right[:MAX_ROUGH]
         if len(left):
             cam, icrs = self.rays_cam[image.vertices[left]], index.rays_icrs[index.vertices[right]]
-            yield from self._of_one_hand(cam, icrs, index.handedness[right], 0, tolerance)
+            yield from self._test_triangles(cam, icrs, index.handedness[right], 0, tolerance)
 
-    def _of_one_hand(
+    def _test_triangles(
         self, cam: Array, icrs: Array, handedness: Array, first: int, tolerance: float
     ) -> Iterator[AttitudeHypothesis]:
         """Test the triangles cam (m, 3, 3) of the catalogue's handedness (m,); store the others in `mirrored`."""
@@ -135,16 +135,16 @@ class AttitudeSearch:
         """Of the attitudes that rotate the rays icrs (m, 3, 3) to cam (m, 3, 3), those that bright stars support."""
         some, radius = rays_cam[: first + VERIFIED], 2.0 * tolerance
         depth = int(DEPTH_FACTOR * 4 * np.pi / self.patterns.field_sr * len(some))
-        for R in self._sifted(cam, icrs, some[max(first - WINDOW, 0) : first + SIFTED], radius, depth):
+        for R in self._supported_attitudes(cam, icrs, some[max(first - WINDOW, 0) : first + SIFTED], radius, depth):
             near = self.patterns.neighbours(some @ R, self.neighbour_radius_rad, depth)
             on = near.chord < radius
             hits = min(int(np.count_nonzero(on)), len(some))
-            if hits < FEWEST_HITS:
+            if hits < MIN_HITS:
                 continue
             if self._false_alarms(hits - PATTERN_MATCHES, len(some), near.depth, radius) < PLAUSIBLE:
                 yield AttitudeHypothesis(R, near.ray[on], near.star[on], near if len(some) == len(rays_cam) else None)
 
-    def _sifted(self, cam: Array, icrs: Array, some: Array, radius: float, depth: int) -> Iterator[Array]:
+    def _supported_attitudes(self, cam: Array, icrs: Array, some: Array, radius: float, depth: int) -> Iterator[Array]:
         """R_cam_icrs of the closest match, which is nearly always right; then of those that detections support."""
         if len(cam):
             yield wahba(cam[0], icrs[0])

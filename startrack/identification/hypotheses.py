@@ -19,16 +19,16 @@ from startrack.types import Array, Bools, Ints, Stars
 
 HEMISPHERE_SR = 2 * np.pi
 STARS_OF_HEMISPHERE = 200  # pattern stars of the whole sky for a lens that sees half of it
-MOST_PATTERN_STARS = 25_000
+MAX_PATTERN_STARS = 25_000
 SIDE_OF_HEMISPHERE_RAD = np.radians(45.0)
 NEAR_OF_HEMISPHERE_RAD = np.radians(1.5)
 NARROWEST_NEAR_RAD = np.radians(0.15)
 LOCAL_SIDES = 1.2  # of the longest side, about the triangle: within it an imperfect lens still fits
 CANDIDATES_AT_ONCE = 20_000
-MOST_HYPOTHESES = 6  # of one lens and window; the true one is nearly always the likeliest
-MOST_DETECTIONS = 100
+MAX_HYPOTHESES = 6  # of one lens and window; the true one is nearly always the likeliest
+MAX_DETECTIONS = 100
 VERIFIED = ((24, -1.5), (48, -4.0))  # detections tested against the stars; log p-value below which the test goes on
-MOST_VERIFIED = 80
+MAX_VERIFIED = 80
 CACHED_PATTERNS = 6
 
 
@@ -63,7 +63,7 @@ class ShapePatterns:
     @cached_property
     def log_p_table(self) -> Array:
         """log P(at least k of n random directions near a bright star), [n, k]."""
-        n, k = np.meshgrid(np.arange(MOST_DETECTIONS + 1), np.arange(MOST_DETECTIONS + 1), indexing="ij")
+        n, k = np.meshgrid(np.arange(MAX_DETECTIONS + 1), np.arange(MAX_DETECTIONS + 1), indexing="ij")
         return log_p_value(k, n, self.mask.sky_fraction, free=0)
 
 
@@ -81,7 +81,7 @@ class PatternSizes:
 def wide_sizes(field_sr: float) -> PatternSizes:
     """Sizes for an unknown distorting lens: few stars, wide tolerances."""
     fraction = min(field_sr / HEMISPHERE_SR, 1.0)
-    stars = int(min(STARS_OF_HEMISPHERE / fraction, MOST_PATTERN_STARS))
+    stars = int(min(STARS_OF_HEMISPHERE / fraction, MAX_PATTERN_STARS))
     side, near = SIDE_OF_HEMISPHERE_RAD * np.sqrt(fraction), NEAR_OF_HEMISPHERE_RAD * np.sqrt(fraction)
     return PatternSizes(stars, float(side), float(max(near, NARROWEST_NEAR_RAD)), 0.02, 0.13)
 
@@ -92,7 +92,7 @@ def narrow_sizes(field_sr: float, stars_in_field: int, side_of_field: float) -> 
     `stars_in_field`: pattern stars in a field; `side_of_field`: longest side over the field's diameter.
     """
     diameter = float(np.sqrt(4 * field_sr / np.pi))
-    stars = int(min(stars_in_field * 4 * np.pi / field_sr, MOST_PATTERN_STARS))
+    stars = int(min(stars_in_field * 4 * np.pi / field_sr, MAX_PATTERN_STARS))
     near = max(0.015 * diameter, NARROWEST_NEAR_RAD)
     return PatternSizes(stars, side_of_field * diameter, float(near), 0.004, 0.12)
 
@@ -133,7 +133,7 @@ class HypothesisSearch:
     """Lens hypotheses from the brightest detections (n, 2), no two of which are close together."""
 
     def __init__(self, xy_px: Array, size_px: tuple[int, int]) -> None:
-        self.xy_px, self.size_px = xy_px[:MOST_DETECTIONS], size_px
+        self.xy_px, self.size_px = xy_px[:MAX_DETECTIONS], size_px
         self.tried = 0
 
     def hypotheses(
@@ -150,10 +150,10 @@ class HypothesisSearch:
             return []
         found: list[LensHypothesis] = []
         for part in np.array_split(np.arange(len(left)), len(left) // CANDIDATES_AT_ONCE + 1):
-            found += self._likely(patterns, guess, xy, image.take(left[part]), right[part], most_log_p)
-        return sorted(found, key=lambda hypothesis: hypothesis.log_p)[:MOST_HYPOTHESES]
+            found += self._likely_hypotheses(patterns, guess, xy, image.take(left[part]), right[part], most_log_p)
+        return sorted(found, key=lambda hypothesis: hypothesis.log_p)[:MAX_HYPOTHESES]
 
-    def _likely(
+    def _likely_hypotheses(
         self, patterns: ShapePatterns, guess: LensGuess, xy_px: Array, image: Triangles, right: Ints, most_log_p: float
     ) -> list[LensHypothesis]:
         """Hypotheses from pairs of an image triangle and a catalogue triangle."""
@@ -166,13 +166,13 @@ class HypothesisSearch:
         middle /= np.linalg.norm(middle, axis=1, keepdims=True)
         alive = np.arange(len(R))
         log_p = np.zeros(len(R))
-        for verified, limit in (*VERIFIED, (MOST_VERIFIED, most_log_p)):
+        for verified, limit in (*VERIFIED, (MAX_VERIFIED, most_log_p)):
             deeper = self._log_p_value(
                 patterns, xy_px[:verified], R[alive], guess, focal[alive], mirrored[alive], middle[alive]
             )
             log_p = np.minimum(log_p, deeper)
             alive, log_p = alive[log_p < limit], log_p[log_p < limit]
-        best = np.argsort(log_p, kind="stable")[:MOST_HYPOTHESES]
+        best = np.argsort(log_p, kind="stable")[:MAX_HYPOTHESES]
         return [
             LensHypothesis(self._camera(guess, focal[i], bool(mirrored[i])), R[i], middle[i], float(value))
             for i, value in zip(alive[best], log_p[best], strict=True)

@@ -16,8 +16,8 @@ LARGEST_OFFSET_1 = 0.1  # of the centre from the frame's, over the shorter side
 SMALLEST_RADIUS_1, LARGEST_RADIUS_1 = 0.28, 0.62  # over the frame's shorter side
 RING_1 = 0.05  # of the radius: distance of the rings inside and outside the edge
 STEP_PX = 2.0
-FEWEST_CONTRAST_1 = 0.2  # median over the directions; moonlit photographs with trees reach 0.3
-FEWEST_SEEN_1 = 0.5  # of the directions that lie in the frame
+MIN_CONTRAST_1 = 0.2  # median over the directions; moonlit photographs with trees reach 0.3
+MIN_SEEN_1 = 0.5  # of the directions that lie in the frame
 DARKEST_PERCENTILE = 0.5
 
 
@@ -58,7 +58,7 @@ def image_circle(background: NDArray[Any]) -> ImageCircle | None:
         return None
     centre, radius, _ = best
     best = _best_disc(small, centre, STEP_PX, radius + np.arange(-STEP_PX, STEP_PX + 0.1, 0.5), 0.5)
-    if best is None or best[2] < FEWEST_CONTRAST_1:
+    if best is None or best[2] < MIN_CONTRAST_1:
         return None
     (x, y), radius, _ = best
     return ImageCircle((float((x + 0.5) * scale - 0.5), float((y + 0.5) * scale - 0.5)), radius * scale)
@@ -80,7 +80,7 @@ def _best_disc(
         inner, _ = _sample(image, centres[:, None] + (1 - RING_1) * radius * around)
         outer, seen = _sample(image, centres[:, None] + (1 + RING_1) * radius * around)
         contrast = np.where(seen, (inner - outer) / np.maximum(inner + outer, bright), np.nan)
-        enough = seen.mean(axis=1) >= FEWEST_SEEN_1
+        enough = seen.mean(axis=1) >= MIN_SEEN_1
         if not enough.any():
             continue
         median = np.nanmedian(contrast[enough], axis=1) * np.sqrt(seen[enough].mean(axis=1))

@@ -30,11 +30,11 @@ from startrack.identification.refine_attitude import (
 from startrack.match import DIMMED_MAG, SIGNIFICANT_SNR, brightness_agreement, upper_median
 from startrack.types import Array, Bools, Centroids, Identification, Ints, NotIdentified, Stars
 
-FEWEST_MATCHES = 6
+MIN_MATCHES = 6
 SMALLEST_RADIUS_PX = 0.5
 BRIGHT_DETECTIONS = 300  # brightest detections that decide whether the camera file is right
 ON_PLACE_FRACTION = 0.7  # of the stars within GATE_PX that lie within ON_PLACE_PX if the camera file is right
-MOST_REFINED = 40
+MAX_REFINED = 40
 TOLERANCE_SIGMAS = 3.0
 LOCAL_FRACTION = 0.1  # of the field's diameter: radius of the caps in which the density of detections is measured
 
@@ -60,7 +60,7 @@ class Identifier:
         patterns = patterns_of(stars, scale.field_sr)
         rays_cam = camera.unproject(centroids.xy_px)
         inside = np.flatnonzero(rays_cam[:, 2] >= np.cos(camera.max_angle_rad))
-        if len(inside) < FEWEST_MATCHES:
+        if len(inside) < MIN_MATCHES:
             few = f"{len(inside)} point sources are too few to identify: expose longer"
             raise NotIdentified(few, detected=len(inside))
         frame = _Frame(centroids, inside, rays_cam[inside], patterns, camera, scale)
@@ -93,7 +93,7 @@ class Identifier:
         refusal = "no triangle of detections matches one of the catalogue"
         refine = AttitudeRefiner(frame.camera, frame.centroids, frame.rays_cam, frame.variance_px2, frame.patterns)
         for refined, hypothesis in enumerate(hypotheses):
-            if refined == MOST_REFINED:
+            if refined == MAX_REFINED:
                 break
             match = refine(hypothesis)
             if match is None:
@@ -111,7 +111,7 @@ class Identifier:
         pairs = match.pairs
         distance = pairs.distance_px[match.matched]
         named_distance = distance[match.named]
-        if len(named_distance) < FEWEST_MATCHES:
+        if len(named_distance) < MIN_MATCHES:
             raise NotIdentified(f"only {len(named_distance)} stars match", matched=len(named_distance))
         rms_px = float(np.sqrt(0.5 * (named_distance @ named_distance) / len(named_distance)))
         radius_px = min(FIRST_GATE_PX, max(3.0 * rms_px, SMALLEST_RADIUS_PX))

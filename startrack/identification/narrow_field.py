@@ -36,9 +36,9 @@ from startrack.types import Array, Centroids, Ints, Stars
 
 STARS_IN_FIELD, SIDE_OF_FIELD = 24, 0.4  # pattern stars; longest side of their triangles over the field's diameter
 ROUNDS = ((0, 10), (0, 16), (8, 22), (0, 22), (20, 34))  # ranks of brightness whose triangles vote together
-MOST_VOTED = 150  # triangles with the most votes whose attitudes are compared
+MAX_VOTED = 150  # triangles with the most votes whose attitudes are compared
 SAME_ATTITUDE_RAD, SAME_SCALE_1 = 0.02, 0.01
-FEWEST_AGREEING = 3
+MIN_AGREEING = 3
 VIEWS_OF_ROUND = 4
 # Detections, stars for each, the gate (part of the frame's width, but at least pixels), and the largest log p-value
 # bound of the matches in the inner half of the gate.
@@ -49,7 +49,7 @@ GATE_PX = 1.5
 SCALE_MATCHES = 200  # brightest, for the photometric scale
 SMALLEST_ERROR_PX = 0.1  # of a centroid against the lens
 BLEND_SIGMAS, WIDEST_BLEND_PX = 3.0, 4.5
-FEWEST_FOR_DISTORTION, DISTORTED_RMS_1 = 25, 0.7  # a distorted lens leaves less than this part of the residual
+MIN_FOR_DISTORTION, DISTORTED_RMS_1 = 25, 0.7  # a distorted lens leaves less than this part of the residual
 
 
 class NearStars(NamedTuple):
@@ -112,7 +112,7 @@ class NarrowFieldSearch:
         # The pairs (detection, star) of a wrong triangle occur once, those of a right one in all right triangles.
         pair = (image.vertices[left] + len(xy_px) * mirrored[:, None]) * len(patterns.star) + catalogue.vertices[right]
         votes = np.bincount(pair.ravel())[pair].min(axis=1)
-        most = np.argsort(-votes, kind="stable")[:MOST_VOTED]
+        most = np.argsort(-votes, kind="stable")[:MAX_VOTED]
         return self._agreeing_views(patterns, xy_px, image.take(left[most]), catalogue.take(right[most]))
 
     def _agreeing_views(
@@ -136,7 +136,7 @@ class NarrowFieldSearch:
         for _ in range(VIEWS_OF_ROUND):
             count = np.where(left, np.count_nonzero(same & left, axis=1), 0)
             best = int(np.argmax(count))
-            if count[best] < FEWEST_AGREEING:
+            if count[best] < MIN_AGREEING:
                 break
             views.append(PinholeView(R[best], float(focal[best]), bool(mirrored[best]), self.size_px))
             left &= ~same[best]
@@ -157,7 +157,7 @@ class NarrowFieldSearch:
             density = len(xy) / (self.size_px[0] * self.size_px[1])
             if len(star) < FEWEST or log_p_value_bound(distance, gate_px, len(some), density) > most_log_p:
                 return None
-            distorted = len(star) >= FEWEST_FOR_DISTORTION
+            distorted = len(star) >= MIN_FOR_DISTORTION
             view = view.fit(xy[detection], rays[some[star]], gate_px / 4, distorted, STEPS)
         return verify_view(view, self.centroids, self.stars, around, self._tree(len(self.centroids)), self.tried)
 
@@ -191,12 +191,12 @@ def verify_view(
     pairs = _candidate_pairs(view, centroids, stars, tree)
     if pairs is None:
         return None
-    on = _unambiguous(pairs, _within_gate(pairs), centroids)
+    on = _unambiguous(pairs, _pairs_within_gate(pairs), centroids)
     if len(on) < FEWEST:
         return None
     xy_px, rays = centroids.xy_px[pairs.detection[on]], stars.rays_icrs[pairs.star[on]]
-    view = view.fit(xy_px, rays, GATE_PX / 4, distorted=len(on) >= FEWEST_FOR_DISTORTION)
-    view = _simplest(view, xy_px, rays, GATE_PX / 4)
+    view = view.fit(xy_px, rays, GATE_PX / 4, distorted=len(on) >= MIN_FOR_DISTORTION)
+    view = _choose_lens(view, xy_px, rays, GATE_PX / 4)
     pairs = _candidate_pairs(view, centroids, stars, tree)
     if pairs is None:
         return None
@@ -205,7 +205,7 @@ def verify_view(
     trusted_px = trusted_radius(off_axis_px[pairs.detection[near]], pairs.distance_px[near] < GATE_PX)
     if trusted_px is None:
         return None
-    on = _within_gate(pairs)
+    on = _pairs_within_gate(pairs)
     on = on[off_axis_px[pairs.detection[on]] <= trusted_px]
     if len(on) < FEWEST:
         return None
@@ -224,18 +224,18 @@ def verify_view(
     return VerifiedView(view, around, lens)
 
 
-def _within_gate(pairs: CandidatePairs) -> Ints:
+def _pairs_within_gate(pairs: CandidatePairs) -> Ints:
     """Indices of the one-to-one pairs closer than the gate."""
     return pairs.one_to_one[pairs.distance_px[pairs.one_to_one] < GATE_PX]
 
 
-def _simplest(view: PinholeView, xy_px: Array, rays_icrs: Array, sigma_px: float) -> PinholeView:
+def _choose_lens(view: PinholeView, xy_px: Array, rays_icrs: Array, sigma_px: float) -> PinholeView:
     """A pinhole, unless the distorted lens fits the stars (n, 3) at the pixels (n, 2) much better."""
     if not view.distortion:
         return view
-    pinhole = view.undistorted().fit(xy_px, rays_icrs, sigma_px, distorted=False, steps=2)
+    pinhole = view.as_pinhole().fit(xy_px, rays_icrs, sigma_px, distorted=False, steps=2)
     left = [np.sum(np.square(xy_px - v.project(rays_icrs)[0])) for v in (view, pinhole)]
-    return view if len(xy_px) >= FEWEST_FOR_DISTORTION and left[0] < DISTORTED_RMS_1**2 * left[1] else pinhole
+    return view if len(xy_px) >= MIN_FOR_DISTORTION and left[0] < DISTORTED_RMS_1**2 * left[1] else pinhole
 
 
 def _unambiguous(pairs: CandidatePairs, which: Ints, centroids: Centroids) -> Ints:

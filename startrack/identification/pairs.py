@@ -39,7 +39,7 @@ class PairIndex:
         end, pair = np.repeat(wide, count), self.pairs[at]
         order = np.argsort(pair[:, 0], kind="stable")
         end, pair = end[order], pair[order]
-        one, other = _within_groups(pair[:, 0])
+        one, other = _pairs_within_groups(pair[:, 0])
         wanted = chords[end[one], end[other]]  # 0 for an end and itself
         apart = self.rays_icrs[pair[one, 1]] - self.rays_icrs[pair[other, 1]]
         found = np.sqrt(np.einsum("ij,ij->i", apart, apart))
@@ -49,7 +49,7 @@ class PairIndex:
         return image, np.stack([pair[one, 0], pair[one, 1], pair[other, 1]], axis=1)
 
 
-def _within_groups(ordered: Ints) -> tuple[Ints, Ints]:
+def _pairs_within_groups(ordered: Ints) -> tuple[Ints, Ints]:
     """Indices (c,), (c,) of all pairs of equal values among the ascending values (n,)."""
     own = np.arange(len(ordered))
     later = np.searchsorted(ordered, ordered, side="right") - own - 1

@@ -67,7 +67,7 @@ class PinholeView:
         found: PinholeView = adjust(self, points, free, scheme).state
         return found
 
-    def undistorted(self) -> PinholeView:
+    def as_pinhole(self) -> PinholeView:
         """The same view by a pinhole."""
         return replace(self, distortion=0.0)
 

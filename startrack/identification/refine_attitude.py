@@ -20,7 +20,7 @@ ON_PLACE_PX, ON_PLACE_CHI2 = 1.5, 16.0  # distance of a detection from its star;
 BLEND_SIGMAS = 3.0  # of the PSF: radius within which stars share one detection
 ROUNDS = 4  # of matching and rotating; one is enough where the bright stars have settled the attitude
 SETTLED_PX = 0.15
-MOST_STRAYED_PX = 0.7  # change of the attitude up to which the neighbours need not be looked up again
+MAX_STRAYED_PX = 0.7  # change of the attitude up to which the neighbours need not be looked up again
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class AttitudeRefiner:
         limit, complete = np.searchsorted(stars.v_mag, [photometry.limit_mag, photometry.complete_mag]).tolist()
         near = hypothesis.near
         strayed_px = np.abs(hypothesis.R_cam_icrs - R).max() / scale.axis_rad_per_px
-        if near is None or near.depth < limit or strayed_px > MOST_STRAYED_PX:
+        if near is None or near.depth < limit or strayed_px > MAX_STRAYED_PX:
             radius_rad = neighbour_radius_px(d.psf_sigma_px) * scale.largest_rad_per_px
             near = self.patterns.neighbours(self.rays_cam @ R, radius_rad, limit)
         detection, star = near.ray, near.star
@@ -72,7 +72,7 @@ class AttitudeRefiner:
             matched = pairs.one_to_one
             if len(matched) < FEWEST:
                 return None
-            agree, variance = self._agreeing(pairs, matched)
+            agree, variance = self._select_inliers(pairs, matched)
             used = matched[agree]
             if len(used) < FEWEST:
                 return None
@@ -87,7 +87,7 @@ class AttitudeRefiner:
         named = on_place & agree & (squared / (OUTLIER_CHI2 * variance) + misfit * misfit < 1.0)
         return AttitudeMatch(refined, pairs, matched, named, on_place, variance, stars.v_mag[:complete][visible])
 
-    def _agreeing(self, pairs: CandidatePairs, which: Ints) -> tuple[Bools, Array]:
+    def _select_inliers(self, pairs: CandidatePairs, which: Ints) -> tuple[Bools, Array]:
         """Which of the pairs are no outliers, and their variance per axis [px^2], the common error added.
 
         The common error is estimated as in `extra_variance_px2`, but in closed form: for one variance per star.

@@ -42,7 +42,7 @@ def triangles(rays: Array, longest_rad: float, most: int = 2_000_000) -> Triangl
     """
     vertices = _triples(rays, 2 * np.sin(longest_rad / 2), most)
     a, b, c = rays[vertices[:, 0]], rays[vertices[:, 1]], rays[vertices[:, 2]]
-    return _by_opposite_side(rays, vertices, np.stack([_angle(b, c), _angle(c, a), _angle(a, b)], axis=1))
+    return _sort_by_opposite_side(rays, vertices, np.stack([_angle(b, c), _angle(c, a), _angle(a, b)], axis=1))
 
 
 def sides_of_few(rays: Array, fresh: int = 0) -> tuple[Ints, Array]:
@@ -81,7 +81,7 @@ def triad_attitude(cam: Array, icrs: Array) -> Array:
     return frame(cam) @ np.swapaxes(frame(icrs), 1, 2)
 
 
-def _by_opposite_side(rays: Array, vertices: Ints, sides: Array) -> Triangles:
+def _sort_by_opposite_side(rays: Array, vertices: Ints, sides: Array) -> Triangles:
     """Triangles with vertices (n, 3) sorted by their opposite sides (n, 3); degenerate ones are left out."""
     order = np.argsort(sides, axis=1)
     sides = np.take_along_axis(sides, order, axis=1)

@@ -33,16 +33,16 @@ from startrack.types import Array, Centroids, Identification, Ints, NotIdentifie
 
 WIDE_FIELD_RAD = np.radians(100.0)  # from here up, `fov_rad` is the angle of the image circle
 NARROW_FIELD_RAD = np.radians(40.0)  # up to here all lenses are nearly pinholes
-FEWEST_WIDE, FEWEST_NARROW = 12, 7  # matches
-MOST_PATTERN_DETECTIONS = 100
+MIN_WIDE, MIN_NARROW = 12, 7  # matches
+MAX_PATTERN_DETECTIONS = 100
 WINDOWS = (  # the brightest; those after them, as hot pixels may be brighter than stars; and more of all
     Window(0, 0, 16), Window(0, 16, 26), Window(26, 26, 46), Window(0, 26, 40), Window(46, 46, 70), Window(0, 40, 60),
 )  # fmt: skip
 LOG_PLAUSIBLE = -11.0  # log p-value of a hypothesis that is grown: random skies reach -15 in a whole search
 LOG_FALSE_ALARM = float(np.log(1e-9))
-MOST_TRIED = 600_000  # patterns; a search without an answer ends here, after some seconds
-MOST_TRIED_IN_CIRCLE = 250_000  # where the image circle is seen: real photographs take 1000 to 110,000
-MOST_TRIED_BEYOND = 100_000  # further patterns without the image circle, in case that it is something else
+MAX_TRIED = 600_000  # patterns; a search without an answer ends here, after some seconds
+MAX_TRIED_IN_CIRCLE = 250_000  # where the image circle is seen: real photographs take 1000 to 110,000
+MAX_TRIED_BEYOND = 100_000  # further patterns without the image circle, in case that it is something else
 FIELD_MARGIN = 1.3  # about a narrow field, for its focal length and centre are not known
 CLUMP_FRACTION = 0.01  # of the frame: detections used for patterns are no closer
 CIRCLES = (0.5, 0.62, 0.42, 0.78, 1.0)  # radius of the image circle over the frame's shorter side
@@ -160,14 +160,14 @@ class _Search:
     ) -> None:  # fmt: skip
         self.size_px, self.fov_rad, self.stars, self.tolerance = size_px, fov_rad, stars, tolerance
         self.wide = fov_rad >= WIDE_FIELD_RAD
-        self.fewest = FEWEST_WIDE if self.wide else FEWEST_NARROW
+        self.fewest = MIN_WIDE if self.wide else MIN_NARROW
         self.circle = image_circle(background) if self.wide and background is not None else None
         self.xy_px = centroids.xy_px
         if self.circle is not None:
             off = np.linalg.norm(self.xy_px - self.circle.centre_px, axis=1)
             self.xy_px = self.xy_px[off < CIRCLE_EDGE * self.circle.radius_px]
         self.narrow = fov_rad <= NARROW_FIELD_RAD
-        self.chosen = without_clumps(self.xy_px, CLUMP_FRACTION * min(size_px), MOST_PATTERN_DETECTIONS)
+        self.chosen = without_clumps(self.xy_px, CLUMP_FRACTION * min(size_px), MAX_PATTERN_DETECTIONS)
         if len(self.chosen) < self.fewest:
             raise NotIdentified(
                 f"{len(self.chosen)} point sources are too few to identify without a camera file, which takes "
@@ -189,10 +189,10 @@ class _Search:
     def grown_lenses(self) -> Iterator[tuple[GrownLens, Ints]]:
         """Lenses that survive growing, and the catalogue indices to which their stars refer."""
         if self.circle is None:
-            yield from self._grow_all(self._guesses(), MOST_TRIED)
+            yield from self._grow_all(self._guesses(), MAX_TRIED)
             return
-        yield from self._grow_all(self._guesses_in(self.circle), MOST_TRIED_IN_CIRCLE)
-        yield from self._grow_all(self._guesses(), self.tried + MOST_TRIED_BEYOND)
+        yield from self._grow_all(self._guesses_in(self.circle), MAX_TRIED_IN_CIRCLE)
+        yield from self._grow_all(self._guesses(), self.tried + MAX_TRIED_BEYOND)
 
     def _grow_all(self, guesses: list[LensGuess], most_tried: int) -> Iterator[tuple[GrownLens, Ints]]:
         """`grown_lenses` of these guesses, until so many patterns have been tried."""

@@ -13,7 +13,7 @@ from startrack.identification.region_growing import GrownLens, as_polynomial, fi
 from startrack.match import (
     BRIGHTER_MAG,
     DEPTH_BELOW_THRESHOLD_MAG,
-    FEWEST_UNSATURATED,
+    MIN_UNSATURATED,
     SIGNIFICANT_SNR,
     brightness_agreement,
     instrumental_mag,
@@ -28,13 +28,13 @@ TESTED = 400  # brightest detections that the p-value rests on
 NEAR_PX = 6.0  # stars this near their predicted pixel show whether the lens is right there
 SMALLEST_RADIUS_PX, RADIUS_SIGMAS = 0.6, 2.5
 ON_PLACE_FRACTION = 0.5  # of the stars near their predicted pixels, where the lens is right
-STARS_OF_A_RING, MOST_RINGS = 8, 12
+STARS_OF_A_RING, MAX_RINGS = 8, 12
 FEWEST = 5
 FREE_MATCHES, FREE_MATCHES_PINHOLE = 8, 3  # that a fit of attitude and lens produces by itself
-FEWEST_TIMES_CHANCE = 3.0  # matches over those expected by chance
+MIN_TIMES_CHANCE = 3.0  # matches over those expected by chance
 ORDERS = ((150, 4), (60, 3), (25, 2), (0, 1))  # coefficients of the polynomial from this many matches on
 POLYNOMIAL_RMS_1 = 0.9  # a polynomial replaces a pinhole if it leaves less than this part of the residual
-FEWEST_FOR_CENTRE = 30
+MIN_FOR_CENTRE = 30
 BLEND_SIGMAS, WIDEST_PSF_PX = 3.0, 1.5
 BLEND_FLUX_RATIO = 0.25  # a neighbour with more than this part of a star's flux makes the match ambiguous
 BLEND_MAG = float(-2.5 * np.log10(BLEND_FLUX_RATIO))
@@ -91,8 +91,8 @@ def match_by_flux(
     hit = np.isfinite(distance)
     usable = hit.copy()
     usable[hit] = ~centroids.saturated[nearest[hit]]
-    first = np.flatnonzero(usable if np.count_nonzero(usable) >= FEWEST_UNSATURATED else hit)[:SCALE_MATCHES]
-    if len(first) < FEWEST_UNSATURATED:
+    first = np.flatnonzero(usable if np.count_nonzero(usable) >= MIN_UNSATURATED else hit)[:SCALE_MATCHES]
+    if len(first) < MIN_UNSATURATED:
         return FluxMatches(none, none, np.zeros(0), 0.0, len(seen), np.zeros(0), 1.0)
     zero_mag = float(np.median(stars.v_mag[seen[first]] - brightness[nearest[first]]))
     faintest = zero_mag + float(np.max(brightness))
@@ -133,7 +133,7 @@ def verify(grown: GrownLens, centroids: Centroids, stars: Stars, tried: int, wid
     if trusted_rad is None:
         return None
     camera = replace(camera, calibrated_angle_rad=min(trusted_rad, camera.max_angle_rad))
-    return _test(camera, R, centroids, stars, tried)
+    return _match_field(camera, R, centroids, stars, tried)
 
 
 def trusted_radius(off_axis: Array, on_place: Bools) -> float | None:
@@ -145,7 +145,7 @@ def trusted_radius(off_axis: Array, on_place: Bools) -> float | None:
     order = np.argsort(off_axis)
     on_place = on_place[order]
     trusted = None
-    for ring in np.array_split(np.arange(len(order)), max(min(len(order) // STARS_OF_A_RING, MOST_RINGS), 1)):
+    for ring in np.array_split(np.arange(len(order)), max(min(len(order) // STARS_OF_A_RING, MAX_RINGS), 1)):
         if not len(ring) or on_place[ring].mean() < ON_PLACE_FRACTION:
             break
         trusted = float(off_axis[order[ring[on_place[ring]][-1]]])
@@ -154,7 +154,7 @@ def trusted_radius(off_axis: Array, on_place: Bools) -> float | None:
 
 def significance(hits: int, predicted: int, each: float, free: int) -> float:
     """Log p-value of the hits; 0 unless they are several times as many as chance gives."""
-    if hits < FEWEST_TIMES_CHANCE * predicted * each:
+    if hits < MIN_TIMES_CHANCE * predicted * each:
         return 0.0
     return float(log_p_value(hits, predicted, each, free))
 
@@ -163,11 +163,11 @@ def _start_lenses(grown: GrownLens, widest_rad: float) -> list[Camera]:
     """The lenses to refine: a polynomial; or a pinhole, and a polynomial if there are stars enough for one."""
     n = len(grown.star)
     order = next(order for fewest, order in ORDERS if n >= fewest)
-    polynomial = _with_limits(as_polynomial(grown.camera, order, widest_rad), widest_rad)
+    polynomial = _limit_angles(as_polynomial(grown.camera, order, widest_rad), widest_rad)
     lens = grown.camera.lens
     if not (isinstance(lens, RadialFamily) and lens.shape == PINHOLE):
         return [polynomial]
-    pinhole = _with_limits(replace(grown.camera, lens=Pinhole()), widest_rad)
+    pinhole = _limit_angles(replace(grown.camera, lens=Pinhole()), widest_rad)
     return [pinhole, polynomial] if n >= ORDERS[-2][0] else [pinhole]
 
 
@@ -183,25 +183,25 @@ def _refine(
             return None
         free = _free_parameters(camera, len(star))
         camera, R, _ = fit_camera(camera, R, xy[detection], stars.rays_icrs[star], free, gate_px / 4, prior)
-        camera = _with_limits(camera, widest_rad)
+        camera = _limit_angles(camera, widest_rad)
     for gate_px in GATES_PX:
         matches = match_by_flux(centroids, camera, stars, R, gate_px, _blend_px(centroids))
         if len(matches.star) < FEWEST:
             return None
         xy, rays = centroids.xy_px[matches.detection], stars.rays_icrs[matches.star]
         camera, R, distance = fit_camera(camera, R, xy, rays, _free_parameters(camera, len(rays)), gate_px / 4, prior)
-        camera = _with_limits(camera, widest_rad)
+        camera = _limit_angles(camera, widest_rad)
     return camera, R, float(np.sqrt(np.mean(distance**2)))
 
 
 def _free_parameters(camera: Camera, matched: int) -> tuple[str, ...]:
     if isinstance(camera.lens, Pinhole):
         return ("f",)
-    centre = ("cx", "cy") if matched >= FEWEST_FOR_CENTRE else ()
+    centre = ("cx", "cy") if matched >= MIN_FOR_CENTRE else ()
     return ("f", *camera.lens.parameters, *centre)
 
 
-def _with_limits(camera: Camera, widest_rad: float) -> Camera:
+def _limit_angles(camera: Camera, widest_rad: float) -> Camera:
     """The camera with its largest angles where the frame ends or the polynomial turns."""
     width, height = camera.size_px
     corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=float)
@@ -215,7 +215,7 @@ def _blend_px(centroids: Centroids) -> float:
     return BLEND_SIGMAS * min(centroids.psf_sigma_px, WIDEST_PSF_PX)
 
 
-def _test(camera: Camera, R: Array, centroids: Centroids, stars: Stars, tried: int) -> VerifiedLens | None:
+def _match_field(camera: Camera, R: Array, centroids: Centroids, stars: Stars, tried: int) -> VerifiedLens | None:
     """All matches inside the trusted field, with the p-value of those of the brightest detections."""
     matches = match_by_flux(centroids, camera, stars, R, GATES_PX[-1], _blend_px(centroids))
     inside = camera.angle_rad(centroids.xy_px[matches.detection]) <= camera.calibrated_angle_rad

@@ -64,19 +64,19 @@ def _result(kind: str, title: str, own: Schema, rules: list[Schema]) -> Schema:
     )
 
 
-def _when(status: str, then: Schema) -> Schema:
+def _if_status(status: str, then: Schema) -> Schema:
     return {"if": {"properties": {"status": {"const": status}}}, "then": then}
 
 
 _STATUS_RULES = [
-    _when("ok", {"properties": {"reason": {"const": None}}, "required": [*MEASURED]}),
-    _when("ambiguous", {"properties": {"reason": {"const": "ambiguous"}}, "required": [*MEASURED]}),
-    _when("refused", {"properties": {"reason": {"enum": REFUSALS}}}),
+    _if_status("ok", {"properties": {"reason": {"const": None}}, "required": [*MEASURED]}),
+    _if_status("ambiguous", {"properties": {"reason": {"const": "ambiguous"}}, "required": [*MEASURED]}),
+    _if_status("refused", {"properties": {"reason": {"enum": REFUSALS}}}),
 ]
 _FIX_RULES = [
-    _when("ok", {"required": ["position", "attitude"]}),
-    _when("ambiguous", {"required": ["modes", "attitude"], "properties": {"position": False}}),
-    _when("refused", {"properties": {"position": False}}),
+    _if_status("ok", {"required": ["position", "attitude"]}),
+    _if_status("ambiguous", {"required": ["modes", "attitude"], "properties": {"position": False}}),
+    _if_status("refused", {"properties": {"position": False}}),
 ]
 MATCH = record({
     "hip": or_null({"type": "integer", "minimum": 1}, "Hipparcos number; null: the star has none"),
@@ -96,13 +96,13 @@ SCHEMAS: dict[str, Schema] = {
         "identification",
         "Stars and attitude of one image",
         {"attitude": ATTITUDE, "camera": _part_of(CAMERA), "matches": {"type": "array", "items": MATCH}},
-        [_when("ok", {"required": ["attitude", "camera", "matches"]})],
+        [_if_status("ok", {"required": ["attitude", "camera", "matches"]})],
     ),
     "detection": _result(
         "detection",
         "Point sources of one image",
         {"detections": {"type": "array", "items": DETECTION}},
-        [_when("ok", {"required": ["detections"]})],
+        [_if_status("ok", {"required": ["detections"]})],
     ),
     "truth": schema(
         "What is true of a rendered image, for tests and scorers",

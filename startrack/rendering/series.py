@@ -114,15 +114,15 @@ class Series:
         """Time, place (2,) [m], heading, pitch and roll [rad]: all are drawn, so that giving one leaves the others."""
         first, last = RANDOM_TIMES
         time = first + timedelta(microseconds=int(rng.integers((last - first) // timedelta(microseconds=1))))
-        place = _random_place(self.terrain, rng)
+        place = _random_position(self.terrain, rng)
         heading, direction = rng.uniform(0, 2 * np.pi, 2)
         tilt = self.max_tilt_rad * np.sqrt(rng.random())
         return (
-            _drawn_unless_given(self.time_utc, time),
-            np.array([_drawn_unless_given(self.east_m, place[0]), _drawn_unless_given(self.north_m, place[1])]),
-            _drawn_unless_given(self.heading_rad, heading),
-            _drawn_unless_given(self.pitch_rad, tilt * np.cos(direction)),
-            _drawn_unless_given(self.roll_rad, tilt * np.sin(direction)),
+            _value_or_draw(self.time_utc, time),
+            np.array([_value_or_draw(self.east_m, place[0]), _value_or_draw(self.north_m, place[1])]),
+            _value_or_draw(self.heading_rad, heading),
+            _value_or_draw(self.pitch_rad, tilt * np.cos(direction)),
+            _value_or_draw(self.roll_rad, tilt * np.sin(direction)),
         )
 
     def _sky(self, site: Site, time: datetime) -> tuple[Stars, Array]:
@@ -162,7 +162,7 @@ def sky_turn_rad(site: Site, time: datetime, exposure_s: float) -> Array:
     return axis * (np.arctan2(sine, cosine) / sine) if sine > 0 else axis
 
 
-def _random_place(terrain: Terrain, rng: np.random.Generator) -> Array:
+def _random_position(terrain: Terrain, rng: np.random.Generator) -> Array:
     """A place (2,) [m], uniform over the part of the search area where the camera can stand."""
     for _ in range(TRIES_FOR_A_PLACE):
         turn = rng.uniform(0, 2 * np.pi)
@@ -172,5 +172,5 @@ def _random_place(terrain: Terrain, rng: np.random.Generator) -> Array:
     raise BadInput("bad_terrain", f"{terrain.name}: nowhere in its search area can the camera stand")
 
 
-def _drawn_unless_given(value: T | None, drawn: T) -> T:
+def _value_or_draw(value: T | None, drawn: T) -> T:
     return drawn if value is None else value

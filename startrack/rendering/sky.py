@@ -39,7 +39,7 @@ def diffuse_e(scene: Scene) -> Array:
     if scene.terrain is None:
         return sky
     fraction = np.where(above, 1.0, scene.wall_reflectance)
-    edge = _near_skyline(above, _sigma_px(scene)) & (sky > 0)
+    edge = _skyline_pixels(above, _sigma_px(scene)) & (sky > 0)
     y, x = np.nonzero(edge)
     fraction[y, x] = scene.wall_reflectance + (1 - scene.wall_reflectance) * coverage(scene, np.stack([x, y], axis=-1))
     sky *= fraction
@@ -102,7 +102,7 @@ def _local_axes(scene: Scene, xy_px: Array) -> tuple[Array, Array]:
     return across, np.maximum(np.abs(elevation_x * across[:, 1] - elevation_y * across[:, 0]), 1e-12)
 
 
-def _near_skyline(above: Bools, sigma_px: float) -> Bools:
+def _skyline_pixels(above: Bools, sigma_px: float) -> Bools:
     """Pixels (H, W) with both sky and wall within reach of the PSF."""
     import cv2
 
@@ -132,11 +132,11 @@ def _sky_and_mask(scene: Scene) -> tuple[Array, Bools]:
         if scene.sky_gradient:
             sky[rows] *= np.maximum(1 + to_east * e + to_north * n, 0.0)
         if tan_horizon is not None:
-            above[rows] = _above(e, n, h, *tan_horizon)
+            above[rows] = _is_above_horizon(e, n, h, *tan_horizon)
     return sky, above
 
 
-def _above(east: Array, north: Array, up: Array, azimuths: Array, tan_horizon: Array) -> Bools:
+def _is_above_horizon(east: Array, north: Array, up: Array, azimuths: Array, tan_horizon: Array) -> Bools:
     """Whether directions are above the horizon; the azimuth is only worked out where the answer depends on it."""
     level = np.hypot(east, north)
     above = up > tan_horizon.max() * level

@@ -63,7 +63,7 @@ class ChunkStore:
             for task, chunk in self._runner.results(missing):
                 if isinstance(chunk, Died):
                     raise RunStopped(f"{what}: {chunk.cause}")
-                write_atomically(self._path(task), _packed(chunk), overwrite=True)
+                write_atomically(self._path(task), _pack_chunk(chunk), overwrite=True)
                 bar.advance(len(task))
         for task in tasks:
             with np.load(self._path(task)) as stored:
@@ -73,7 +73,7 @@ class ChunkStore:
         return self.folder / f"{_key(task)}.npz"
 
 
-def _packed(chunk: Chunk) -> bytes:
+def _pack_chunk(chunk: Chunk) -> bytes:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **chunk)  # type: ignore[arg-type]
     return buffer.getvalue()

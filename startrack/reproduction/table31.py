@@ -26,7 +26,7 @@ def table31(context: Context) -> Artefact:
     (limit,) = collect_errors(context, "table 3.1, the limit", _tasks(context, BOUND, size.bound_per_sky))
     deep_tasks = _tasks(context, OURS, size.deep_per_sky, DEEP_MAGNITUDE, DEEP_MISTAKES)
     (deep,) = collect_errors(context, "table 3.1, ours at magnitude 8", deep_tasks)
-    ratio = _over_limit(ours, limit)
+    ratio = _ratio_to_limit(ours, limit)
     line = (
         f"pseudo-gradient {descent.errors.mean():.1f} m (thesis 34.2), never settles "
         f"{100 * descent.refused_fraction:.2f} % (0.6), hull {hull.errors.mean():.0f} m (637); "
@@ -53,7 +53,7 @@ def _tasks(
     ]
 
 
-def _over_limit(ours: MethodErrors, limit: MethodErrors) -> float:
+def _ratio_to_limit(ours: MethodErrors, limit: MethodErrors) -> float:
     """Mean error of our method over that of the limit, on the places computed for both."""
     pairs = [
         (fix[: len(best)], best[: len(fix)])
@@ -95,14 +95,14 @@ def _text(
 ) -> str:  # fmt: skip
     size = context.size
     rows = [
-        [k + 1, _published(trial), format_errors(descent.errors_m[k]), f"{100 * np.mean(~descent.answered[k]):.2f} %",
+        [k + 1, _trial_text(trial), format_errors(descent.errors_m[k]), f"{100 * np.mean(~descent.answered[k]):.2f} %",
          format_errors(hull.errors_m[k], WHOLE), format_errors(ours.errors_m[k]), format_errors(limit.errors_m[k])]
         for k, trial in enumerate(published.TRIALS[: size.skies])
     ]  # fmt: skip
     overall_never = f"{100 * descent.refused_fraction:.2f} % (thesis 0.6 %)"
     overall_hull = f"{format_errors(hull.errors, WHOLE)} (thesis 637 / 275 / 1735)"
     rows.append(
-        ["Overall", _published(published.OVERALL), format_errors(descent.errors), overall_never, overall_hull,
+        ["Overall", _trial_text(published.OVERALL), format_errors(descent.errors), overall_never, overall_hull,
          format_errors(ours.errors), format_errors(limit.errors)]
     )  # fmt: skip
     head = ["Trial", "thesis", "its method, redone", "never settles", "its hull, redone", "ours", "limit"]
@@ -121,7 +121,7 @@ missed, {DEEP_MISTAKES.false:.0%} of the hidden ones on the list by mistake): ou
 over {len(deep.errors):,} places; refused: {deep.refused}."""
 
 
-def _published(trial: published.Errors) -> str:
+def _trial_text(trial: published.Errors) -> str:
     return f"{trial.mean_m:.1f} / {trial.sd_m:.1f} / {trial.max_m:.1f}"
 
 

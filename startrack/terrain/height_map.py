@@ -27,7 +27,7 @@ from startrack.types import Array, BadInput, Bools, Ints
 LOG = logging.getLogger(__name__)
 FINEST_BOX_M = 0.45  # half side of the smallest boxes of positions: no height map knows its ground better
 CELL_M = 200.0  # cells of the table are no wider
-MOST_CELLS_ACROSS = 128
+MAX_CELLS_ACROSS = 128
 COMMON_PER_POST = 3.0
 MARGIN = 1.15  # of the search radius: so far is searched, to notice that the camera left the area
 SLOPE_STEP_M = 5.0
@@ -87,12 +87,12 @@ class HeightMap(Terrain):
         """
         if not self.height_sigma_m and not self.horizon_sigma_common_rad:
             return 0.0
-        own = float(np.median(self._sigma.cells_rad[self._searched])) if self.height_sigma_m else 0.0
+        own = float(np.median(self._sigma.cells_rad[self._search_area_cells])) if self.height_sigma_m else 0.0
         known = self.horizon_sigma_common_rad
         return float(np.hypot(own, COMMON_PER_POST * own if known is None else known))
 
     @cached_property
-    def _searched(self) -> Bools:
+    def _search_area_cells(self) -> Bools:
         """Cells (n,) in the search area."""
         return np.asarray(np.hypot(*self.square.centres_m.T) < self.search_radius_m)
 
@@ -105,7 +105,7 @@ class HeightMap(Terrain):
     def square(self) -> Square:
         """The cells of the table."""
         across = 1
-        while 2 * self.reach_m / across > CELL_M and across < MOST_CELLS_ACROSS:
+        while 2 * self.reach_m / across > CELL_M and across < MAX_CELLS_ACROSS:
             across *= 2
         return Square(self.reach_m, across)
 

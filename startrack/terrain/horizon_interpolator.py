@@ -41,7 +41,7 @@ class HorizonInterpolator(ForwardingTerrain):
         return 2 * self.half_m / (self.across - 1)
 
     @cached_property
-    def _traced(self) -> tuple[Array, Array, float]:
+    def _traced_nodes(self) -> tuple[Array, Array, float]:
         """Nodes (n, across, across), one over the crests' distances (n,), and height of the ground in the middle."""
         line = np.linspace(-self.half_m, self.half_m, self.across)
         points = np.asarray(self.centre_m + np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1), dtype=np.float64)
@@ -54,17 +54,17 @@ class HorizonInterpolator(ForwardingTerrain):
     @property
     def nodes(self) -> Array:
         """(n, across, across) tan of the horizon at the nodes, east first, were they all as high as the middle."""
-        return self._traced[0]
+        return self._traced_nodes[0]
 
     @property
     def per_height(self) -> Array:
         """(n,) decrease of tan of the horizon per metre of the camera's height [1/m]."""
-        return self._traced[1]
+        return self._traced_nodes[1]
 
     @property
     def middle_up_m(self) -> float:
         """Height of the ground in the middle."""
-        return self._traced[2]
+        return self._traced_nodes[2]
 
     @cached_property
     def rough(self) -> Array:

@@ -97,10 +97,10 @@ def carried_spacing(heights_m: Array) -> float:
     A smooth surface through posts further apart has hardly any power at wavelengths below two of their spacings; one
     with straight lines between them bends only there. NaN are holes.
     """
-    return max(_by_spectrum(heights_m), float(_by_bends(heights_m)))
+    return max(_spacing_by_spectrum(heights_m), float(_spacing_by_bends(heights_m)))
 
 
-def _by_spectrum(h: Array) -> float:
+def _spacing_by_spectrum(h: Array) -> float:
     """From the longest waves at which the power falls, over half an octave, faster than that of any ground."""
     power = _power(h)
     if power is None:
@@ -138,7 +138,7 @@ def _power(h: Array) -> Array | None:
     return np.asarray(np.maximum(power, 1e-12 * max(float(power.max()), 1e-30)))
 
 
-def _by_bends(h: Array) -> int:
+def _spacing_by_bends(h: Array) -> int:
     """The widest spacing at which all bends lie at one post, or at two neighbours, of each so many."""
     return max((s for s in range(2, MAX_SPACING + 1) for lines in (h, h.T) if _bends_at_posts(lines, s)), default=1)
 

@@ -46,10 +46,10 @@ def pack_maps(maps: list[Raster], site: Site) -> Ground:
         heights.append(h.ravel())
         posts.append((first_post, *h.shape))
         first_post += h.size
-        unit = max(_steepest(h) / SLOPE_STEPS, 1e-6)
+        unit = max(_steepest_rise(h) / SLOPE_STEPS, 1e-6)
         units.append(unit)
         block_table = []
-        top, slope = _raised(_cell_tops(h), height_map, maps[:number]), _cell_slopes(h, unit)
+        top, slope = _raise_to_finer_maps(_cell_tops(h), height_map, maps[:number]), _cell_slopes(h, unit)
         while True:
             tops.append(top.ravel())
             wide.append(_with_neighbours(top).ravel())
@@ -82,7 +82,7 @@ def _cell_tops(h: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.maximum(np.maximum(h[:-1, :-1], h[:-1, 1:]), np.maximum(h[1:, :-1], h[1:, 1:]))
 
 
-def _steepest(h: NDArray[np.float32]) -> float:
+def _steepest_rise(h: NDArray[np.float32]) -> float:
     """Largest rise between two posts, neighbours across the corner too [m]."""
     return float(max(np.abs(h[:, 1:] - h[:, :-1]).max(), np.abs(h[1:] - h[:-1]).max())) * 2.05
 
@@ -105,12 +105,12 @@ def _cell_slopes(h: NDArray[np.float32], unit: float) -> NDArray[np.int8]:
     return out
 
 
-def _padded(a: np.ndarray, rows: int, columns: int) -> np.ndarray:
+def _pad(a: np.ndarray, rows: int, columns: int) -> np.ndarray:
     return np.pad(a, ((0, rows), (0, columns), *[(0, 0)] * (a.ndim - 2)), mode="edge")
 
 
 def _coarser(a: np.ndarray, choose: np.ufunc) -> np.ndarray:
-    a = _padded(a, a.shape[0] % 2, a.shape[1] % 2)
+    a = _pad(a, a.shape[0] % 2, a.shape[1] % 2)
     return np.asarray(choose(choose(a[::2, ::2], a[1::2, ::2]), choose(a[::2, 1::2], a[1::2, 1::2])))
 
 
@@ -129,7 +129,7 @@ def _slopes_with_neighbours(slope: NDArray[np.int8]) -> NDArray[np.int8]:
     return np.concatenate(parts, axis=-1)
 
 
-def _raised(tops: NDArray[np.float32], height_map: Raster, finer: list[Raster]) -> NDArray[np.float32]:
+def _raise_to_finer_maps(tops: NDArray[np.float32], height_map: Raster, finer: list[Raster]) -> NDArray[np.float32]:
     """Cells of a coarse map where finer maps lie are as high as any post of these there or close by."""
     tops = tops.copy()
     for fine in finer:

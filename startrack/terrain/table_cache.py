@@ -14,7 +14,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from startrack.files import atomic_file, locked
+from startrack.files import atomic_file, hold_lock
 from startrack.terrain.horizon_table import BINS, FIELDS, HorizonTable, Square
 
 if TYPE_CHECKING:
@@ -105,5 +105,5 @@ def single_builder(key: str, name: str) -> Iterator[None]:
     with ExitStack() as stack:
         with suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
-            stack.enter_context(locked(path, on_wait=announce))
+            stack.enter_context(hold_lock(path, on_wait=announce))
         yield

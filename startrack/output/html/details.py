@@ -46,7 +46,7 @@ def stars_of(path: Path, most: int) -> dict[str, Any] | None:
             if total <= most:
                 for name, column, decimals in STAR_COLUMNS:
                     kept[name].append(_text_or_number(row.get(column) or "", decimals))
-    return {"total": total, "counts": counts, "unit": unit, "columns": _without_empty(kept)}
+    return {"total": total, "counts": counts, "unit": unit, "columns": _drop_empty_columns(kept)}
 
 
 def _read_ecsv(file: Any) -> tuple[list[str], Iterator[dict[str, str]]]:
@@ -70,7 +70,7 @@ def _text_or_number(text: str, decimals: int | None) -> Any:
     return int(number) if decimals == 0 or number == int(number) else number
 
 
-def _without_empty(columns: Columns) -> Columns:
+def _drop_empty_columns(columns: Columns) -> Columns:
     """Without the columns that hold nothing."""
     return {name: values for name, values in columns.items() if any(value not in (None, "") for value in values)}
 

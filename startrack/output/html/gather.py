@@ -27,7 +27,7 @@ class Found:
         """What its file's name says that it is: fix or identification."""
         return "identification" if self.path.name.endswith(KINDS[1]) else "fix"
 
-    def beside(self, suffix: str) -> Path:
+    def companion(self, suffix: str) -> Path:
         """Path of the companion with a `suffix` such as `.stars.ecsv`."""
         return self.path.with_name(_stem(self.path.name) + suffix)
 

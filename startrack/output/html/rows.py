@@ -33,7 +33,7 @@ def row_of(found: Found, real: Place | None, detailed: bool) -> list[Any]:
         *(round_or_none(value, 4) for value in covariance or (None,) * 3),
         round_or_none(number_of(position, "radius999_m"), 2), round_or_none(number_of(stars, "rms_px"), 3),
         round_or_none(_seconds(record), 3), round_or_none(east_m, 2), round_or_none(north_m, 2),
-        round_or_none(error_m, 2), round_or_none(nees, 3), *(_listed(record, one) for one in LISTED),
+        round_or_none(error_m, 2), round_or_none(nees, 3), *(_listed_value(record, one) for one in LISTED),
         found.kind, detailed,
     ]  # fmt: skip
 
@@ -102,7 +102,7 @@ def round_or_none(value: float | None, decimals: int) -> float | None:
     return None if value is None else round(value, decimals)
 
 
-def _listed(record: Mapping[str, Any], one: Quantity) -> float | int | None:
+def _listed_value(record: Mapping[str, Any], one: Quantity) -> float | int | None:
     value = number_of(section_of(record, one.section), one.key)
     if value is None or one.listed is None or one.listed.decimals == 0:
         return None if value is None else round(value)

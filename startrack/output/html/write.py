@@ -118,10 +118,13 @@ def _detail(found: Found, terrains: TerrainsByName, size: tuple[int, int, int]) 
     return {
         "record": {key: value for key, value in record.items() if key not in ("matches", "detections", "camera")},
         "facts": facts_of(record),
-        "picture": picture_of(found.beside(".annotated.png"), found.beside(".wcs"), record, longest_px),
-        "stars": stars_of(found.beside(".stars.ecsv"), stars),
+        "picture": picture_of(found.companion(".annotated.png"), found.companion(".wcs"), record, longest_px),
+        "stars": stars_of(found.companion(".stars.ecsv"), stars),
         "horizon": _horizon(record, terrains, azimuths),
-        "files": [found.path.name, *(found.beside(end).name for end in FILES if found.beside(end).is_file())],
+        "files": [
+            found.path.name,
+            *(found.companion(end).name for end in FILES if found.companion(end).is_file()),
+        ],
     }
 
 

@@ -46,7 +46,7 @@ LEGEND_STEP = 27
 VALUE_AT = 150  # from the left margin
 OVERVIEW_PART = 0.58  # of the height left for maps
 LOWEST_FIGURE_PX = 120
-MOST_MODES = 4
+MAX_MODES = 4
 
 
 def draw_panel(canvas: Canvas, left: int, outcome: Outcome, truth_enu_m: tuple[float, float] | None) -> None:
@@ -132,7 +132,7 @@ def _facts(value: Inputs) -> Rows:
     when = value.exposure.time_utc
     found = [("Time", f"{when:%Y-%m-%d  %H:%M:%S} UTC" if when is not None else "not known")]
     if isinstance(value, Located) and value.fix.ambiguous:
-        for k, mode in enumerate(value.fix.modes[:MOST_MODES]):
+        for k, mode in enumerate(value.fix.modes[:MAX_MODES]):
             place = f"E {mode.east_m:.0f} m   N {mode.north_m:.0f} m   ({100 * mode.weight:.0f} %)"
             found += [(f"Place {k + 1}", place)]
     return found + rows("panel", at_stage(value))

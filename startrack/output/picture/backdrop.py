@@ -25,8 +25,8 @@ SAMPLE = 4  # levels are taken from every fourth pixel
 FLAT_SNR = 3.0
 WALL_SHADE = 0.75  # how far the wall's colour replaces the sky's
 SPIKE_SIGMAS = 8.0
-SPIKE_NEIGHBOUR = 0.3  # a star's neighbouring pixel has more of its light where the PSF is LEAST_PSF_PX or wider
-LEAST_PSF_PX = 0.7
+SPIKE_NEIGHBOUR = 0.3  # a star's neighbouring pixel has more of its light where the PSF is MIN_PSF_PX or wider
+MIN_PSF_PX = 0.7
 RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=np.uint8)
 MADE_OF_NOISE = 0.6745  # median of the absolute value of a standard normal variable
 
@@ -109,7 +109,7 @@ def _background_and_light(value: Inputs, size: tuple[int, int], inside: Bools) -
 
 def remove_hot_pixels(pixels_adu: Image, psf_sigma_px: float) -> Image:
     """The exposure with lone bright pixels, sharper than any star, replaced by the median of their neighbours."""
-    if psf_sigma_px < LEAST_PSF_PX:
+    if psf_sigma_px < MIN_PSF_PX:
         return pixels_adu
     middle = np.asarray(cv2.medianBlur(pixels_adu, 3), dtype=np.float32)
     noise = float(np.median(np.abs((pixels_adu - middle)[::SAMPLE, ::SAMPLE]))) / MADE_OF_NOISE

@@ -94,11 +94,11 @@ class Canvas:
 
     def line(self, points: ArrayLike, colour: Colour, width: int = 1, closed: bool = False) -> None:
         """A line through the points (n, 2)."""
-        cv2.polylines(self.pixels, [self._fixed(points)], closed, colour, width, cv2.LINE_AA, SHIFT_BITS)
+        cv2.polylines(self.pixels, [self._to_fixed_point(points)], closed, colour, width, cv2.LINE_AA, SHIFT_BITS)
 
     def dashes(self, points: ArrayLike, colour: Colour, width: int = 1) -> None:
         """Every other stretch of the line through evenly spaced points (n, 2)."""
-        places = self._fixed(points)
+        places = self._to_fixed_point(points)
         cv2.polylines(
             self.pixels, [places[k : k + 2] for k in range(0, len(places) - 1, 2)], False, colour, width, cv2.LINE_AA,
             SHIFT_BITS,
@@ -106,7 +106,7 @@ class Canvas:
 
     def area(self, points: ArrayLike, colour: Colour) -> None:
         """A filled convex or plain polygon with corners (n, 2)."""
-        cv2.fillPoly(self.pixels, [self._fixed(points)], colour, cv2.LINE_AA, SHIFT_BITS)
+        cv2.fillPoly(self.pixels, [self._to_fixed_point(points)], colour, cv2.LINE_AA, SHIFT_BITS)
 
     def curve(self, points: ArrayLike, colour: Colour, width: float, closed: bool = False) -> None:
         """A smooth curve through the points (n, 2), as a filled ribbon: OpenCV's own thick lines look beaded."""
@@ -117,7 +117,7 @@ class Canvas:
         along = ahead - behind
         along /= np.maximum(np.hypot(along[:, 0], along[:, 1]), 1e-9)[:, None]
         aside = (0.5 * width - EDGE_PX) * np.stack([-along[:, 1], along[:, 0]], axis=-1)
-        left, right = self._fixed(places + aside), self._fixed(places - aside)
+        left, right = self._to_fixed_point(places + aside), self._to_fixed_point(places - aside)
         outline = [left, right] if closed else [np.concatenate([left, right[::-1]])]
         cv2.fillPoly(self.pixels, outline, colour, cv2.LINE_AA, SHIFT_BITS)
 
@@ -130,7 +130,7 @@ class Canvas:
             ring = radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
             self.curve(np.asarray(centre) + ring, colour, width, closed=True)
             return
-        x, y = self._fixed(centre).tolist()
+        x, y = self._to_fixed_point(centre).tolist()
         reach = round(radius * 2**SHIFT_BITS)
         cv2.circle(self.pixels, (x, y), reach, colour, width, cv2.LINE_AA, SHIFT_BITS)
 
@@ -148,7 +148,7 @@ class Canvas:
 
     def rectangle(self, box: Box, colour: Colour, width: int = -1) -> None:
         """A box; filled where `width` is negative."""
-        left, top, right, bottom = self._fixed(np.reshape(box, (2, 2))).ravel().tolist()
+        left, top, right, bottom = self._to_fixed_point(np.reshape(box, (2, 2))).ravel().tolist()
         cv2.rectangle(self.pixels, (left, top), (right, bottom), colour, width, cv2.LINE_8, SHIFT_BITS)
 
     def text(
@@ -191,7 +191,7 @@ class Canvas:
         """Keep labels away from a box."""
         self._occupied.append(box)
 
-    def _fixed(self, points: ArrayLike) -> NDArray[np.int32]:
+    def _to_fixed_point(self, points: ArrayLike) -> NDArray[np.int32]:
         places = np.clip(np.asarray(points, dtype=float) - self._origin, -FARTHEST_PX, FARTHEST_PX)
         return np.rint(places * 2**SHIFT_BITS).astype(np.int32)
 

@@ -26,10 +26,10 @@ from startrack.output.values import R_body_enu, place_m
 from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented
 from startrack.types import Array, Bools, Ints
 
-MOST_CIRCLES = 4000
-MOST_CROSSES = 150  # of hidden stars, the brightest: more would hide the picture
-MOST_NAMES = 20
-MOST_HIDDEN_NAMES = 8
+MAX_CIRCLES = 4000
+MAX_CROSSES = 150  # of hidden stars, the brightest: more would hide the picture
+MAX_NAMES = 20
+MAX_HIDDEN_NAMES = 8
 NAME_SIZE = 19.0
 FAINT_RING = 0.6  # how far the ring of the faintest detection fades into the sky
 DIMMEST_HIDDEN_V_MAG = 3.0  # a fainter planet behind the wall is not missed
@@ -49,7 +49,7 @@ def draw_detections(canvas: Canvas, view: View, value: Inputs) -> None:
     places = view.at(found.xy_px)
     # The bright ones last, on top; the faint ones dim, so that a thousand of them do not drown the stars.
     shown = identified | _is_within_image_circle(value, found.xy_px)
-    for k in reversed(range(min(len(found), MOST_CIRCLES))):
+    for k in reversed(range(min(len(found), MAX_CIRCLES))):
         if not shown[k]:
             continue
         colour = IDENTIFIED if identified[k] else DETECTION
@@ -67,7 +67,7 @@ def _is_within_image_circle(value: Inputs, xy_px: Array) -> Bools:
 def draw_hidden(canvas: Canvas, view: View, value: Inputs) -> None:
     """A cross at each of the brighter stars that ought to shine there and do not."""
     _, xy_px = _hidden_stars(value)
-    places = view.at(xy_px[:MOST_CROSSES])
+    places = view.at(xy_px[:MAX_CROSSES])
     for rank, place in enumerate(places):
         weight = 1.0 - rank / max(len(places), 1)
         colour = mix_colours(HIDDEN, BACKDROP, 0.35 * (1.0 - weight))
@@ -99,8 +99,8 @@ def name_stars(canvas: Canvas, view: View, value: Inputs) -> None:
     order = np.argsort(value.stars.v_mag[value.identification.star], kind="stable")
     star = value.identification.star[order]
     xy_px = value.detections.xy_px[value.identification.detection[order]]
-    seen = _names_at(value, star, xy_px, MOST_NAMES)
-    hidden = _names_at(value, *_hidden_stars(value), MOST_HIDDEN_NAMES)
+    seen = _names_at(value, star, xy_px, MAX_NAMES)
+    hidden = _names_at(value, *_hidden_stars(value), MAX_HIDDEN_NAMES)
     for place, name in seen:
         canvas.label(view.at(place), name, NAME_SIZE, INK, 13.0, view.box)
     for place, name in hidden:

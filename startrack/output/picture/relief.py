@@ -19,7 +19,7 @@ Image = NDArray[np.float32]
 CELL_PX = 2  # the ground is asked for at every second pixel
 GENTLE_SLOPE = 0.02  # gentler ground looks flat
 RELIEF_LIGHT = 3.0  # slopes that face the light, as a multiple of the floor's colour
-MOST_LEVELS = 12.0
+MAX_LEVELS = 12.0
 CONTOUR_WEIGHT = 0.45
 LABEL_SIZE = 14.0
 LABELLED_PX = 90  # shorter contours get no label, those of twice the length and more two
@@ -107,9 +107,9 @@ def _label_contour(canvas: Canvas, view: MapView, line: Array, text: str) -> Non
 
 
 def _contour_step_m(range_m: float) -> float:
-    """The smallest of 1, 2, 5 times a power of ten that leaves no more than MOST_LEVELS contours."""
-    power = 10.0 ** np.floor(np.log10(range_m / MOST_LEVELS))
-    return float(next(m for m in (1.0, 2.0, 5.0, 10.0) if m * power * MOST_LEVELS >= range_m) * power)
+    """The smallest of 1, 2, 5 times a power of ten that leaves no more than MAX_LEVELS contours."""
+    power = 10.0 ** np.floor(np.log10(range_m / MAX_LEVELS))
+    return float(next(m for m in (1.0, 2.0, 5.0, 10.0) if m * power * MAX_LEVELS >= range_m) * power)
 
 
 def _erode(known: Bools) -> Bools:

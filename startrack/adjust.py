@@ -1,4 +1,4 @@
-"""Least-squares adjustment of attitudes and lens parameters to measured pixels, robust where asked for.
+"""Least-squares adjustment of attitudes and lens parameters to measured pixels, robust if requested.
 
 One loop serves the attitude of a calibrated camera, the lens of an unknown one and a calibration of many images.
 Callers choose the free lens parameters, the loss, a prior, and whether the variance beyond the stated centroid errors

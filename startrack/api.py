@@ -63,8 +63,8 @@ def locate(
         settings: stages to use instead of the usual ones.
 
     Returns:
-        The solution. It is false, and says why, where the image cannot be solved or fits several positions (exit code 3
-        of the commands).
+        The solution. It is false, with reason and message, where the image cannot be solved or fits several positions
+        (exit code 3 of the commands).
 
     Raises:
         BadInput: something is missing (no_time, no_calibration, bad_terrain) or cannot be used (exit code 4).
@@ -150,7 +150,7 @@ def calibrate(
         name: of the camera.
 
     Returns:
-        The calibration. Use its `camera` only where `accepted` is true; `checks` says which conditions were met.
+        The calibration. Use its `camera` only where `accepted` is true; `checks` lists the conditions.
 
     Raises:
         BadInput: as `locate`.

@@ -67,7 +67,7 @@ class Reason(StrEnum):
         "startrack identify --fov finds it.",
     )  # fmt: skip
     MIRRORED = (
-        "mirrored", EXIT_REFUSED, "The image is a mirror image of what the camera file says",
+        "mirrored", EXIT_REFUSED, "The image is a mirror image, compared with the camera file",
         "Read the sensor the other way round, or set mirrored in the camera file.",
     )  # fmt: skip
     INSUFFICIENT_GEOMETRY = (
@@ -90,7 +90,7 @@ class Reason(StrEnum):
         "can be.",
     )  # fmt: skip
     INTERNAL_ERROR = (
-        "internal_error", EXIT_INTERNAL_ERROR, "The program met a fault of its own",
+        "internal_error", EXIT_INTERNAL_ERROR, "The program has an error",
         "Please report it with the image; startrack locate IMAGE -v shows where it happened.",
     )  # fmt: skip
 
@@ -119,7 +119,7 @@ class BadInput(Exception):
 
 
 class NoSolution(Exception):
-    """A stage found no reliable answer (exit code 3). The message says what to try."""
+    """A stage found no reliable answer (exit code 3). The message contains advice."""
 
     reason: Reason = Reason.INCONSISTENT_EVIDENCE
 

@@ -43,7 +43,7 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
     when = oriented.exposure.time_utc
     if terrain.site is None:
         raise BadInput(
-            "bad_terrain", f"terrain {terrain.name} has no site: locating an image needs its place on a body"
+            "bad_terrain", f"terrain {terrain.name} has no site: locating an image needs its position on a body"
         )
     if when is None:
         raise BadInput("no_time", "the mid-exposure time is not known")
@@ -99,7 +99,7 @@ def remeasure_near_skyline(measured: Measured, fix: Fix, step: SkyStep, photomet
     azimuth, elevation = light.azimuth_rad, light.elevation_rad
     wanted = near_skyline(azimuth, elevation, camera, horizon, REMEASURED_PX) & reliable(azimuth)
     around = near_skyline(azimuth, elevation, camera, horizon, REMEASURED_PX + NEIGHBOURS_PX)
-    # The fix says which neighbours are visible better than their own faint light does, but not next to the skyline.
+    # The fix shows which neighbours are visible better than their own faint light, but not next to the skyline.
     above = elevation - horizon(azimuth)
     undecided = near_skyline(azimuth, elevation, camera, horizon, UNDECIDED_PX) | ~reliable(azimuth)
     by_fix = np.where(above > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)

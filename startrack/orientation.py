@@ -29,7 +29,7 @@ NO_TIME = (
     "the mid-exposure time is not known: give --time UTC, a sidecar NAME.json with time_utc, or a header with it; "
     "nothing is guessed"
 )
-NO_SITE = "terrain {} has no site: an image can be located only on ground whose place on a body is known"
+NO_SITE = "terrain {} has no site: an image can be located only on ground whose position on a body is known"
 ANYWHERE = Site("moon", 0.0, 0.0)  # stands in for an unknown site: 0.7 arcsec of aberration at most
 
 
@@ -43,7 +43,7 @@ def check_inputs(inputs: Inputs) -> None:
     if camera is not None and exposure.size_px != camera.size_px:
         raise BadInput(
             "size_mismatch",
-            f"the image is {exposure.size_px[0]} x {exposure.size_px[1]} px, the camera file says "
+            f"the image is {exposure.size_px[0]} x {exposure.size_px[1]} px, the camera file gives "
             f"{camera.size_px[0]} x {camera.size_px[1]}",
         )
 

@@ -40,7 +40,7 @@ Result = TypeVar("Result")
 
 
 class RunStopped(Exception):
-    """No further task can be done: the disk is full, the cluster is gone. The message says which."""
+    """No further task can be done: the disk is full, the cluster is gone. The message has the cause."""
 
 
 @dataclass(frozen=True)

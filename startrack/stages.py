@@ -3,7 +3,7 @@
     Inputs -> Detected -> Identified -> Oriented -> Measured -> Located, or Refused
 
 Each value has the fields of the one before it and the results of one more stage. All are frozen. Which value a function
-returns says which stages have run; no field is filled in later.
+returns states which stages have run; no field is filled in later.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Settings:
     identifier: Identifier = field(default_factory=Identifier)
     evidence: StarEvidence = field(default_factory=StarEvidence)
     localizer: Localizer = field(default_factory=ExactPosterior)
-    deep_stars: bool = True  # use Gaia's stars too, where they are installed and the frame sees deeper than Hipparcos
+    deep_stars: bool = True  # use Gaia's stars too, where they are installed and the frame is deeper than Hipparcos
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)  # eq: arrays have no single answer to ==
@@ -62,7 +62,7 @@ class Inputs:
 
     exposure: Exposure
     camera: Camera | None = None  # None: not known; `detect` works without, `identify_blind` finds it
-    terrain: Terrain | None = None  # None: no position is asked for
+    terrain: Terrain | None = None  # None: identification or detection only
     catalog_name: str = ""
     timing_ms: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))  # stage to wall time [ms]
 
@@ -166,7 +166,7 @@ class Located(Measured):
     @property
     def message(self) -> str:
         """How many positions fit, where there are several."""
-        return f"{len(self.fix.modes)} places fit the stars" if self.fix.ambiguous else ""
+        return f"{len(self.fix.modes)} positions fit the stars" if self.fix.ambiguous else ""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -137,7 +137,7 @@ class Detections(Centroids):
 
 @dataclass(frozen=True, kw_only=True)
 class Stars(Value):
-    """Catalogue stars as seen at one time and place: proper motion and aberration applied."""
+    """Catalogue stars as seen at one time and position: proper motion and aberration applied."""
 
     catalog_id: NDArray[np.str_] = array("n", dtype=np.str_)  # such as "HIP 123"
     hip: Ints = array("n", dtype=np.int64)  # 0 where the star has no Hipparcos number

@@ -36,7 +36,7 @@ def test_other_results(located):
     result = located.result
     two = (Mode(east_m=6000.0, north_m=-2500.0, weight=0.7), Mode(east_m=-3000.4, north_m=4000.0, weight=0.3))
     ambiguous = replace(result, fix=replace(result.fix, modes=two, ambiguous=True))
-    assert "ambiguous  2 places fit: E 6000 m N -2500 m (70 %); E -3000 m N 4000 m (30 %)" in summary_line(ambiguous)
+    assert "ambiguous  2 positions fit: E 6000 m N -2500 m (70 %); E -3000 m N 4000 m (30 %)" in summary_line(ambiguous)
     assert "±" not in summary_line(ambiguous)
     identified = extend(result, Oriented, terrain=None)
     assert re.search(

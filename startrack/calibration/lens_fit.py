@@ -39,7 +39,7 @@ from startrack.types import Array, Bools, NotIdentified
 FEWEST = 12
 OUTLIER_CHI2 = 20.0  # two axes: one good star in 20,000 is lost
 CAUCHY_CHI2 = 5.0  # chi-square at which the robust loss has halved a star's weight
-ROBUST = Scheme(loss=cauchy_loss(CAUCHY_CHI2), settled_px=2e-3)  # it only has to tell wrong matches from right ones
+ROBUST = Scheme(loss=cauchy_loss(CAUCHY_CHI2), settled_px=2e-3)  # it only separates wrong matches from right ones
 ROBUST_ROUNDS = 4
 FIRST_SIGMA_PX = 1.0
 SCATTER_SIGMAS = 3.0  # chi-square beyond which the stated centroid errors are not believed

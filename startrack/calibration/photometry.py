@@ -14,7 +14,7 @@ from startrack.camera import Sensor
 
 @dataclass(frozen=True, kw_only=True)
 class KnownSensor:
-    """Properties of the sensor that the user knows; None where not."""
+    """Properties of the sensor that the user gives; None where not known."""
 
     gain_e_per_adu: float | None = None
     read_noise_e: float | None = None

@@ -115,7 +115,7 @@ def fit_throughput(stars: StarFluxes, edge_rad: float, flux_ratio: float = 1.0) 
         if not poor:
             break
         if poor[0] == "air" and "air" in fit.at_bound:
-            warnings.append("extinction: left out; the fitted value is not physical, so that it cannot be told from "
+            warnings.append("extinction: left out; the fitted value is not physical: it cannot be separated from "
                             "vignetting")  # fmt: skip
         terms.remove(poor[0])
     failures = _failures(stars, terms, fit)

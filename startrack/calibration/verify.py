@@ -47,7 +47,7 @@ def verify(exposure: Exposure, camera: Camera, catalog: StarCatalog, site: Site 
     frame = load_frame(exposure, catalog, site)
     found_camera, found = identify_with(camera, frame)
     if found_camera.mirrored != camera.mirrored:
-        raise NotIdentified("the picture is a mirror image of what the camera file says", reason="mirrored")
+        raise NotIdentified("the picture is a mirror image, compared with the camera file", reason="mirrored")
     start, R = grow_from_matches(frame, found_camera, found.R_cam_icrs, found.star, found.detection)
     fit = fit_frames((frame,), start, R[None]).fit
     grid = cap_grid(min(camera.calibrated_angle_rad, fit.camera.calibrated_angle_rad))

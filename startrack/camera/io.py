@@ -222,7 +222,7 @@ def _covariance(values: dict[str, Any] | None, lens: Lens) -> tuple[tuple[str, .
         return (), None
     order, rows = values["order"], values["matrix"]
     if len(rows) != len(order) or any(len(row) != len(order) for row in rows):
-        raise ValueError(f"covariance.matrix must hold {len(order)} x {len(order)} numbers, as covariance.order says")
+        raise ValueError(f"covariance.matrix must hold {len(order)} x {len(order)} numbers, as covariance.order has")
     known = (*CAMERA_PARAMETERS, *lens.parameter_names)
     if len(set(order)) < len(order) or not set(order) <= set(known):
         raise ValueError(f"covariance.order must name parameters of this lens, each once: {', '.join(known)}")

@@ -1,6 +1,6 @@
 """Sun, planets, Earth and Moon in the sky of a site: sources that are no catalogue stars.
 
-No library at hand gives the magnitudes of all of them: Skyfield has the planets, but not the Earth and the Moon.
+No library gives the magnitudes of all of them: Skyfield has the planets, but not the Earth and the Moon.
 """
 
 from __future__ import annotations

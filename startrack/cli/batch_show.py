@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 SHOWN = ("ok", "ambiguous", "refused", "error")
 FINISHING = b"\nstartrack: finishing the images in hand; Ctrl-C once more drops them\n"
 SAME_SIGNAL_S = 1.0  # a second signal within it is the same request: timeout signals process and group
-Counts = Counter[str]  # images by outcome: ok, ambiguous, refused, error; and of those kept, warned
+Counts = Counter[str]  # images by outcome: ok, ambiguous, refused, error; and kept, warned
 Show = Callable[[dict[str, Any], Counts], None]
 
 

@@ -64,7 +64,7 @@ def add_site_flags(parser: argparse.ArgumentParser) -> None:
     """Flags for the time, the length and the place of exposures of the sky."""
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601 (one image only)")
     parser.add_argument("--exposure", type=positive, metavar="S", help="exposure time in seconds")
-    parser.add_argument("--site", metavar="LAT,LON[,M]", help="place on the Earth, in degrees and metres, to correct "
+    parser.add_argument("--site", metavar="LAT,LON[,M]", help="site on the Earth, in degrees and metres, to correct "
                         "for refraction (--site=-30.2,...)")  # fmt: skip
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file whose origin is the site")
 

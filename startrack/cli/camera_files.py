@@ -45,7 +45,7 @@ def _add_action(subparsers: Any, action: str, description: str) -> argparse.Argu
 
 
 def run_show(args: argparse.Namespace) -> int:
-    """Print what camera files say; 0."""
+    """Print the contents of camera files; 0."""
     from startrack.calibration.record import camera_properties, camera_text
     from startrack.camera import load_camera
 

@@ -80,7 +80,7 @@ def _checks(args: argparse.Namespace) -> dict[str, Callable[[], str]]:
 def _run_check(name: str, check: Callable[[], str]) -> dict[str, Any]:
     try:
         return {"name": name, "ok": True, "message": check()}
-    except Exception as cause:  # noqa: BLE001 - a doctor reports whatever is wrong
+    except Exception as cause:  # noqa: BLE001 - doctor reports every error
         return {"name": name, "ok": False, "message": f"{type(cause).__name__}: {cause}"}
 
 
@@ -130,7 +130,7 @@ def _ephemeris() -> str:
 
 
 def _kernels(args: argparse.Namespace) -> str:
-    """Compile the kernels of the cylinder, and of a terrain that was asked for, with its horizons."""
+    """Compile the kernels of the cylinder, and of the terrain of the flag, with its horizons."""
     from startrack.cli.preparation import compile_kernels, prepare
     from startrack.terrain import load_terrain
 

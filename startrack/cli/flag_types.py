@@ -1,4 +1,4 @@
-"""Numbers on the command line, as argparse types: what is wrong with one is said in words."""
+"""Numbers on the command line, as argparse types with messages in words."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def _field_of_view_rad(text: str) -> float:
 def run(args: argparse.Namespace) -> int:
     """Identify every image; the exit code of the worst."""
     if args.fov is not None and args.camera is not None:
-        args.usage_error("--fov says that the lens is not known, -c names it: give one of them")
+        args.usage_error("--fov is for an unknown lens, -c for a known one: give one of them")
     return run_images(args, FORMAT, lambda path, stem: _one(path, stem, args))
 
 

@@ -36,7 +36,7 @@ def add_parser(subparsers: Any) -> None:
     add_image_flags(parser)
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file, or the name of a shipped one")
     add_localizer_flag(parser)
-    parser.add_argument("--fov", metavar="DEG", help=argparse.SUPPRESS)  # of identify and calibrate: asked for here too
+    parser.add_argument("--fov", metavar="DEG", help=argparse.SUPPRESS)  # a flag of identify and calibrate
     parser.set_defaults(run=run, usage_error=parser.error)
     parser.add_argument("--report", action="store_true", help="add a page for a browser, as startrack report makes it")
 

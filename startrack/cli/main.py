@@ -52,7 +52,7 @@ def _run(args: argparse.Namespace) -> int:
     logging.getLogger("startrack").setLevel(logging.ERROR if getattr(args, "quiet", False) else logging.NOTSET)
     try:
         code = int(args.run(args))
-        sys.stdout.flush()  # here, where a closed pipe is told from an error
+        sys.stdout.flush()  # here, where a closed pipe is distinguished from an error
         return code
     except BadInput as cause:
         return _report_failure(f"{cause.reason}: {cause}", BAD_INPUT)
@@ -93,7 +93,7 @@ def _joined_action(argv: Sequence[str]) -> list[str]:
 
 
 def _offer_completion(parser: argparse.ArgumentParser) -> None:
-    """Complete words in the shell, if it asks for that and the extra `completion` is installed."""
+    """Complete words in the shell, if it requests that and the extra `completion` is installed."""
     if "_ARGCOMPLETE" in os.environ and importlib.util.find_spec("argcomplete") is not None:
         import argcomplete
 

@@ -16,7 +16,7 @@ class Progress:
     """How far a command has come; this one shows nothing."""
 
     def advance(self, steps: int = 1, text: str | None = None) -> None:
-        """So many more steps are done; `text` says what is in hand."""
+        """So many more steps are done; `text` names the current step."""
 
     def update(self, completed: int, total: int) -> None:
         """So many steps are done, of how many."""

@@ -28,9 +28,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "render",
         help="make synthetic exposures, with the truth beside them",
-        description="Render what a camera on the crater's floor sees. Place, heading, tilt and time that are not given "
-        "are drawn from the seed. Beside NAME.png: NAME.json (time, exposure, camera, terrain), NAME.truth.json (pose, "
-        "settings) and NAME.truth.ecsv (stars).",
+        description="Render the image of a camera on the crater's floor. Position, heading, tilt and time are drawn "
+        "from the seed unless they are given. Beside NAME.png: NAME.json (time, exposure, camera, terrain), "
+        "NAME.truth.json (pose, settings) and NAME.truth.ecsv (stars).",
     )
     parser.add_argument("-c", "--camera", default="fisheye-2048", metavar="FILE", help="default %(default)s")
     parser.add_argument("-t", "--terrain", default="shackleton-thesis", metavar="FILE", help="default %(default)s")
@@ -183,7 +183,7 @@ def _pose(scene: Scene, truth: Truth) -> dict[str, Any]:
 
 
 def _settings(args: argparse.Namespace) -> dict[str, Any]:
-    """The flags that decide the pixels, without those that only say where the files go."""
+    """The flags that determine the pixels, without the flags for the files' names."""
     names = (
         "max_tilt sky_mag sky_gradient sky_gradient_azimuth wall_reflectance faint_stars no_faint_stars flux_scatter "
         "hot_pixels cosmic_rays truth_mag"

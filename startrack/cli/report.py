@@ -110,8 +110,8 @@ def _true_positions(found: Sequence[Found], folder: str | None) -> dict[str, tup
         return {}
     if not Path(folder).is_dir():
         raise BadInput("bad_image", f"{folder}: no such folder of truth")
-    places = {one.stem: _true_position(Path(folder), one) for one in found}
-    return {stem: place for stem, place in places.items() if place is not None}
+    positions = {one.stem: _true_position(Path(folder), one) for one in found}
+    return {stem: position for stem, position in positions.items() if position is not None}
 
 
 def _true_position(folder: Path, one: Found) -> tuple[float, float] | None:

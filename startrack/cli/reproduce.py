@@ -39,13 +39,15 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "what", nargs="*", default=["all"], metavar="NAME", help=f"all (default), or any of: {', '.join(NAMES)}"
     )
     size = parser.add_mutually_exclusive_group()
-    size.add_argument("--quick", action="store_true", help="a part of the thesis's places, in about a minute (default)")
-    size.add_argument("--full", action="store_true", help="as many as in the thesis: 10 x 10,000, and 100,000 places")
+    size.add_argument(
+        "--quick", action="store_true", help="fewer positions than the thesis, in about a minute (default)"
+    )
+    size.add_argument("--full", action="store_true", help="as in the thesis: 10 x 10,000, and 100,000 positions")
     parser.add_argument(
         "--ours",
         type=at_least_one,
         metavar="N",
-        help="our method on at most N places per starfield, 10 N in figure 3.10",
+        help="our method on at most N positions per starfield, 10 N in figure 3.10",
     )
     parser.add_argument(
         "-j", "--jobs", type=at_least_one, default=None, metavar="N", help="processes (default: all cores)"

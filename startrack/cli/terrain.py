@@ -82,21 +82,21 @@ def _show(args: argparse.Namespace) -> int:
     from startrack.terrain import load_terrain
 
     terrain = load_terrain(args.terrain)
-    place = None if args.at is None else (args.at[0], args.at[1])
-    facts = facts_of(terrain) | seen_from(terrain, place)
+    position = None if args.at is None else (args.at[0], args.at[1])
+    facts = facts_of(terrain) | seen_from(terrain, position)
     if not args.no_plots:
-        facts["files"] = [str(path) for path in _pictures(args, terrain, place)]
+        facts["files"] = [str(path) for path in _pictures(args, terrain, position)]
     _print_facts(args, facts)
     return 0
 
 
-def _pictures(args: argparse.Namespace, terrain: Terrain, place: tuple[float, float] | None) -> list[Path]:
+def _pictures(args: argparse.Namespace, terrain: Terrain, position: tuple[float, float] | None) -> list[Path]:
     from startrack.output.picture.terrain_picture import panorama_picture, relief_picture
 
     out = make_folder(args.dir, "bad_terrain")
-    pictures = {out / f"{terrain.name}.relief.png": relief_picture(terrain, place)}
-    if place is not None:
-        pictures[out / f"{terrain.name}.horizon.png"] = panorama_picture(terrain, place)
+    pictures = {out / f"{terrain.name}.relief.png": relief_picture(terrain, position)}
+    if position is not None:
+        pictures[out / f"{terrain.name}.horizon.png"] = panorama_picture(terrain, position)
     from PIL import Image
 
     for path, picture in pictures.items():

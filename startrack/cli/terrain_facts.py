@@ -28,28 +28,28 @@ def facts_of(terrain: Terrain) -> dict[str, Any]:
 
 
 def site_of(terrain: Terrain) -> Site:
-    """Where the terrain is. Raises BadInput (bad_terrain) if it does not say."""
+    """The terrain's site. Raises BadInput (bad_terrain) if it has none."""
     if terrain.site is None:
         raise BadInput("bad_terrain", f"{terrain.name} has no origin on a body")
     return terrain.site
 
 
-def seen_from(terrain: Terrain, place: tuple[float, float] | None) -> dict[str, Any]:
+def seen_from(terrain: Terrain, position: tuple[float, float] | None) -> dict[str, Any]:
     """Ground and horizon at a position (east, north) [m]. Raises BadInput outside the terrain."""
-    if place is None:
+    if position is None:
         return {}
     import numpy as np
 
     from startrack.frames import latlon_from_enu
 
-    point = np.array([place])
+    point = np.array([position])
     if not terrain.allowed(point)[0]:
-        raise BadInput("bad_terrain", f"E {place[0]:g} m, N {place[1]:g} m is outside the terrain")
+        raise BadInput("bad_terrain", f"E {position[0]:g} m, N {position[1]:g} m is outside the terrain")
     ground = float(terrain.ground_m(point)[0])
     horizon = np.degrees(terrain.horizon_rad(point, np.radians(np.arange(720) / 2)))
-    lat, lon = latlon_from_enu(site_of(terrain), *place, ground)
+    lat, lon = latlon_from_enu(site_of(terrain), *position, ground)
     return {
-        "east_m": place[0], "north_m": place[1], "ground_m": round(ground, 2),
+        "east_m": position[0], "north_m": position[1], "ground_m": round(ground, 2),
         "place_latitude_deg": round(float(np.degrees(lat)), 6), "place_longitude_deg": round(float(np.degrees(lon)), 6),
         "horizon_min_deg": round(float(horizon.min()), 3), "horizon_max_deg": round(float(horizon.max()), 3),
     }  # fmt: skip
@@ -84,7 +84,7 @@ def lines_of(facts: dict[str, Any]) -> Iterator[str]:
         yield "  horizons  need no table: those of a cylinder are a formula"
     if "ground_m" in facts:
         yield (
-            f"  place     E {facts['east_m']:g} m, N {facts['north_m']:g} m: "
+            f"  position     E {facts['east_m']:g} m, N {facts['north_m']:g} m: "
             f"{_place(facts['place_latitude_deg'], facts['place_longitude_deg'])}, ground at {facts['ground_m']:g} m, "
             f"horizon {facts['horizon_min_deg']:g} to {facts['horizon_max_deg']:g} degrees"
         )
@@ -95,8 +95,8 @@ def lines_of(facts: dict[str, Any]) -> Iterator[str]:
 def _errors(facts: dict[str, Any]) -> str:
     shared = facts["horizon_sigma_deg"]
     all_around = "three times what these make of it" if shared is None else f"{shared:g} degrees"
-    told = {"map": " (by the map's own roughness)"}.get(facts.get("sigma_from", ""), "")
-    return f"of single posts {facts['height_sigma_m']:g} m{told}; shared by the whole horizon {all_around}"
+    source = {"map": " (from the map's roughness)"}.get(facts.get("sigma_from", ""), "")
+    return f"of single posts {facts['height_sigma_m']:g} m{source}; shared by the whole horizon {all_around}"
 
 
 def _place(latitude_deg: float, longitude_deg: float) -> str:

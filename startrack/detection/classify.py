@@ -28,7 +28,7 @@ ROUGH_PSF_MISFIT = 0.06  # from here up stars are compared with the frame's own 
 ROUGH_PSF_SPREAD = 2.0  # times the typical misfit that a star of such a frame may have
 SATURATED_MISFIT = 0.2  # of a star that shows only its wings, which are the least Gaussian
 EDGE_DIRECTIONS = 8  # of the straight edges or lines tried
-LARGEST_SIGMA_PX = 2.0  # of the place
+LARGEST_SIGMA_PX = 2.0  # of the position
 WING_SIGMAS, WING_BRIGHTER, WING_HEIGHT = (
     3.0,
     2.0,
@@ -58,7 +58,7 @@ def select_stars(fitted: Fitted, width_px: Array, threshold: float) -> Ints:
 
 
 def brightest_per_position(xy_px: Array, flux: Array, closer_px: float) -> Bools:
-    """Which sources (n,) to keep: of those that converged onto one place, the brightest."""
+    """Which sources (n,) to keep: of those that converged onto one position, the brightest."""
     from scipy.spatial import cKDTree
 
     rank = np.empty(len(flux), dtype=np.int64)
@@ -98,8 +98,8 @@ def peak_heights(fits: PointFits) -> Array:
 def detection_threshold(threshold_snr: float, sigma_px: float, skewness: float) -> float:
     """Height that gives about as many false peaks, whatever the PSF's width and the skewness of the pixels' noise.
 
-    That is 0.3 to 0.6 in 4 Mpx at the default. A narrower PSF has more independent places to be false at, down to where
-    the number of pixels limits it; a wider one has fewer, but more crowded sources. Photons' noise is skew:
+    That is 0.3 to 0.6 in 4 Mpx at the default. A narrower PSF has more independent positions for false stars, down to
+    where the number of pixels limits it; a wider one has fewer, but more crowded sources. Photons' noise is skew:
     its bright tail is heavier than a Gaussian's (the first term of Cornish and Fisher's expansion, with what the filter
     leaves of the skewness), and its quantiles below the median, from which the noise is taken, lie closer together.
     """

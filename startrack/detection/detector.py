@@ -129,8 +129,8 @@ class Detector:
         frame = _FrameSource(frame.image, frame.dead, candidates.fitted.light_noise).frame(
             sigma, paint_sources(stars, sigma, frame.shape)
         )
-        places = (stars.xy_px - 0.5 * (side - 1)) / side
-        peaks = self._find_peaks(frame, bin_frame(frame, side), side, sigma, known=places)
+        positions = (stars.xy_px - 0.5 * (side - 1)) / side
+        peaks = self._find_peaks(frame, bin_frame(frame, side), side, sigma, known=positions)
         peaks = unbin_peaks(peaks, side, frame.shape, radius_for(sigma))
         if not len(peaks.centres):
             raise TooFewStars(NOTHING_SEEN)

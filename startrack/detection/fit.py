@@ -98,7 +98,7 @@ def concatenate_fits(parts: list[PointFits]) -> PointFits:
 
 
 def unbin_fits(fits: PointFits, side: int) -> PointFits:
-    """Fits in a binned frame as they are in the frame itself: places and their errors; levels per pixel."""
+    """Fits in a binned frame as they are in the frame itself: positions and their errors; levels per pixel."""
     if side == 1:
         return fits
     unit = np.array([side, side, 1.0, 1.0 / side**2])

@@ -99,10 +99,10 @@ def stamps(image: NDArray[Any], centres: Ints, radius: int) -> NDArray[Any]:
     """Cut-outs (n, 2r+1, 2r+1) of the image around the integer pixels (n, 2) (x, y), which must be `radius` inside."""
     side = 2 * radius + 1
     height, width = image.shape
-    places = np.lib.stride_tricks.as_strided(
+    positions = np.lib.stride_tricks.as_strided(
         image, (height - side + 1, width - side + 1, side, side), image.strides * 2, writeable=False
     )
-    return places[centres[:, 1] - radius, centres[:, 0] - radius]
+    return positions[centres[:, 1] - radius, centres[:, 0] - radius]
 
 
 def radius_for(sigma_px: float) -> int:

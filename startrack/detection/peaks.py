@@ -28,7 +28,7 @@ class Peaks:
     """Candidates (n), saturated blobs first, then by the height of their peak."""
 
     centres: Ints  # (n, 2) pixels (x, y)
-    start_xy_px: Array  # (n, 2) first guess of the place
+    start_xy_px: Array  # (n, 2) first guess of the position
     surround: Array  # (n,) level of the surroundings, part of the source's own light in it
     own_part: float  # part of a source's matched-filter light that the level of the surroundings takes away
 
@@ -181,14 +181,14 @@ def _group_touching(row: Ints, column: Ints, width: int) -> tuple[int, Ints]:
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    place = row * (width + 2) + column + 1  # a border keeps the rows' ends apart; ascending
+    position = row * (width + 2) + column + 1  # a border keeps the rows' ends apart; ascending
     pairs = []
     for step in (1, width + 1, width + 2, width + 3):
-        at = np.minimum(np.searchsorted(place, place + step), len(place) - 1)
-        hit = np.flatnonzero(place[at] == place + step)
+        at = np.minimum(np.searchsorted(position, position + step), len(position) - 1)
+        hit = np.flatnonzero(position[at] == position + step)
         pairs.append(np.stack([hit, at[hit]]))
     i, j = np.concatenate(pairs, axis=1)
-    graph = coo_matrix((np.ones(len(i), dtype=np.int8), (i, j)), shape=(len(place), len(place)))
+    graph = coo_matrix((np.ones(len(i), dtype=np.int8), (i, j)), shape=(len(position), len(position)))
     count, label = connected_components(graph, directed=False)
     return int(count), label.astype(np.int64)
 

@@ -60,7 +60,7 @@ def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array
     """Best-fitting PSF sigma (n,) [px] of each stamp among `widths_px` (m,), geometric; whether it is not the last;
     and the part of the stamp's variance beyond the noise that it explains, about 1 for a star.
 
-    Refined by a parabola through chi^2; flux and level are free, the place is `offset_px` from the middle pixel.
+    Refined by a parabola through chi^2; flux and level are free, the position is `offset_px` from the middle pixel.
     """
     radius, m = data.shape[1] // 2, len(widths_px)
     moment = weights * data

@@ -35,7 +35,7 @@ class Streaks:
 
 
 def are_elongated(frame: Frame, centres: Ints) -> bool:
-    """Whether the highest peaks (n, 2) are parts of something long rather than round: a quick look."""
+    """Whether the highest peaks (n, 2) are parts of long sources rather than round ones: a quick test."""
     height, width = frame.shape
     margin = np.minimum(centres, np.array([width, height]) - 1 - centres).min(axis=1)
     centres = centres[margin >= ELONGATION_RADIUS_PX][:ELONGATION_PEAKS]

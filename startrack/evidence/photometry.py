@@ -21,18 +21,18 @@ class Photometry:
     flux_e: Array  # (n,) local level and neighbours subtracted
     variance_e2: Array  # (n,) from the pixels' noise, without the star's own light
     own_shot: Array  # (n,) variance per electron of the star's own light
-    neighbour_variance_e2: Array  # (n,) from not knowing whether and how brightly the neighbours shine
+    neighbour_variance_e2: Array  # (n,) from the unknown visibility and brightness of the neighbours
     usable: Bools  # (n,) enough good pixels
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sources:
-    """Where stars would shine and how brightly (n)."""
+    """Predicted positions and fluxes of stars (n)."""
 
     xy_px: Array  # (n, 2)
     flux_e: Array  # (n,) expected if visible
     fraction_sigma: Array  # (n,) its relative uncertainty
-    visible: Array  # (n,) probability that it shines, for its part in its neighbours' measurements
+    visible: Array  # (n,) probability that it is visible, for its part in its neighbours' measurements
 
 
 def half_width(sigma_px: float) -> int:
@@ -81,8 +81,8 @@ def measure(
 def _order_by_cell(xy_px: Array, shape: tuple[int, ...], side_px: float) -> tuple[Ints, Ints, int]:
     """Order of the sources (n, 2) by square cells of a grid over an image (H, W); each cell's first; the columns."""
     columns, rows = int(shape[1] / side_px) + 1, int(shape[0] / side_px) + 1
-    place = (xy_px / side_px).astype(np.int64)
-    cell = place[:, 1] * columns + place[:, 0]
+    position = (xy_px / side_px).astype(np.int64)
+    cell = position[:, 1] * columns + position[:, 0]
     first = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=rows * columns))])
     return np.argsort(cell, kind="stable"), first, columns
 

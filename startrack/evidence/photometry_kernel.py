@@ -78,7 +78,7 @@ def measure_sources(
 
 @njit(inline="always")
 def _find_neighbours(near, i, xy_px, visible, first, columns, side_px, reach_px) -> int:
-    """Write into `near` the sources within reach of source i that may shine; returns how many there are."""
+    """Write into `near` the sources within reach of source i that may be visible; returns how many there are."""
     rows = (len(first) - 1) // columns
     column, row = int(xy_px[i, 0] / side_px), int(xy_px[i, 1] / side_px)
     count = 0

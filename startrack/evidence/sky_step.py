@@ -1,6 +1,6 @@
 """The step of the sky's own light at the skyline: measured in the frame and taken out, so that stars can be measured.
 
-The sky shines faintly and the wall does not. A star beside the edge is measured on half a step, which would add light
+The sky is faintly bright and the wall is not. A star beside the edge is measured on half a step, which would add light
 to the one just above the skyline and take it from the one just below. The step is the same all along the skyline, so
 the median of the pixels at equal distances from it is the step without the stars, whatever lens, vignetting and
 background model have made of it; an error of the skyline itself shifts this profile and nothing else.
@@ -20,7 +20,7 @@ from startrack.frames import azel_from_rays, rays_from_azel
 from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Detections, Ints
 
-BAND_PX = 12.0  # both ways; the background model knows no edge sharper than that
+BAND_PX = 12.0  # both ways; the background model has no sharper edge
 STEP_PX = 0.5
 STEP_SAMPLES = 3600  # azimuths at which the step is measured
 STEP_OFFSETS_PX = np.array([-11.0, -9.5, -8.0, -6.5, 6.5, 8.0, 9.5, 11.0])  # heights above the skyline

@@ -37,7 +37,7 @@ class StarPhotometry:
     elevation_rad: Array
     expected_e: Array
     flux_e: Array  # measured
-    sigma_e: Array  # of the measured flux if nothing shines
+    sigma_e: Array  # of the measured flux without a star
     llr: Array  # 0 where unusable
     cause: NDArray[np.str_]  # "" where usable, else why not
 
@@ -196,7 +196,7 @@ def _guess_visibility(
 
 
 def _ratios(light: Photometry, expected_e: Array, fraction: Array, capped: bool = True) -> tuple[Array, Array]:
-    """Log-likelihood ratios and the standard deviations of the fluxes if nothing shines."""
+    """Log-likelihood ratios and the standard deviations of the fluxes without a star."""
     hidden = light.variance_e2 + light.neighbour_variance_e2
     shining = hidden + light.own_shot * expected_e + np.square(fraction * expected_e)
     sigma = np.sqrt(hidden)

@@ -30,7 +30,7 @@ class Decoded:
     saturation_adu: float | None  # largest value the stored type can hold; None for floating point
     header: Mapping[str, Any] = field(default_factory=dict)  # keys as in a FITS header
     warnings: tuple[str, ...] = ()
-    mosaic: bool | None = None  # whether the pixels are a mosaic of colours; None: the file's kind does not say
+    mosaic: bool | None = None  # whether the pixels are a mosaic of colours; None: unknown for this kind of file
 
 
 def bad_image(cause: str) -> BadInput:

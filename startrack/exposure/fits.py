@@ -50,7 +50,7 @@ def decode_fits(raw: bytes) -> Decoded:
             if any("Datasum verification failed" in str(w.message) for w in issued):
                 raise bad_image("damaged FITS: its data do not agree with DATASUM")
     if stored.shape[-2:] != shape:  # of a damaged tile-compressed image
-        raise bad_image(f"damaged FITS: its data are {stored.shape}, its header says {shape}")
+        raise bad_image(f"damaged FITS: its data are {stored.shape}, its header gives {shape}")
     pixels, notes = grey_float32(stored.reshape(shape))
     return Decoded(pixels_adu=pixels, saturation_adu=saturation, header=header, warnings=notes)
 

@@ -11,7 +11,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from startrack.declaration import SHOWN_CHARS, Choice, Number, Table, Text, shown
+from startrack.declaration import SHOWN_CHARS, Choice, Number, Table, Text, value_text
 from startrack.files import is_path, printable
 from startrack.frames.time import as_utc, parse_utc
 from startrack.types import BadInput, Exposure
@@ -189,7 +189,7 @@ def _sidecar_time(sidecar: Path, value: object) -> datetime | None:
     if value is None:
         return None
     try:
-        return parse_utc(value if isinstance(value, str) else shown(value))
+        return parse_utc(value if isinstance(value, str) else value_text(value))
     except BadInput as error:
         raise _bad_sidecar(sidecar, f"time_utc: {str(error)[:200]}", error.reason) from error
 
@@ -233,7 +233,7 @@ def _header_exposure_s(value: object, notes: list[str]) -> float | None:
         seconds = math.nan
     if 0 < seconds <= MAX_EXPOSURE_S:
         return seconds
-    notes.append(f"EXPTIME {shown(value)} is not a number of seconds above 0; not used")
+    notes.append(f"EXPTIME {value_text(value)} is not a number of seconds above 0; not used")
     return None
 
 

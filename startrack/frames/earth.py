@@ -53,7 +53,7 @@ def _earth_orientation_at(mjd: float) -> tuple[float, float, float]:
 def _earth_orientation() -> Array:
     """Rows MJD [d], pole x, pole y [arcsec], UT1 - UTC [s], day by day, from IERS finals2000A (Bulletin A).
 
-    Read here and not through astropy.utils.iers, which takes 0.6 s and may want to go to the network.
+    Read here and not through astropy.utils.iers, which takes 0.6 s and may access the network.
     """
     try:
         from astropy_iers_data import IERS_A_FILE

@@ -1,4 +1,4 @@
-"""A place on the Moon or the Earth: its local frame, and its orientation, position and velocity at a time."""
+"""A site on the Moon or the Earth: its local frame, and its orientation, position and velocity at a time."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from startrack.identification.triangles import ShapeIndex, Triangles, shape_inde
 from startrack.types import Array, Bools, Ints, Stars
 
 HEMISPHERE_SR = 2 * np.pi
-STARS_OF_HEMISPHERE = 200  # pattern stars of the whole sky for a lens that sees half of it
+STARS_OF_HEMISPHERE = 200  # pattern stars of the whole sky for a lens with half of it in view
 MAX_PATTERN_STARS = 25_000
 SIDE_OF_HEMISPHERE_RAD = np.radians(45.0)
 NEAR_OF_HEMISPHERE_RAD = np.radians(1.5)

@@ -153,7 +153,7 @@ def build_index(stars: Stars, field_sr: float, size: PatternSize) -> PatternInde
 
 
 def bright_stars_apart(stars: Stars, depth: int) -> Ints:
-    """Indices of the brightest stars, of each close pair only the brighter: a camera sees them as one."""
+    """Indices of the brightest stars, of each close pair only the brighter: a camera does not resolve them."""
     from scipy.spatial import cKDTree
 
     rays = stars.rays_icrs[: 2 * depth]

@@ -75,7 +75,7 @@ class Identifier:
         lenient = replace(self, whole_field=False)
         if lenient._first_accepted(search.mirrored_hypotheses(), frame.mirrored(), search)[0] is not None:
             raise NotIdentified(
-                "the image is a mirror image of what the camera file says: flip the image, or set mirrored = "
+                "the image is a mirror image, compared with the camera file: flip the image, or set mirrored = "
                 f"{str(not camera.mirrored).lower()} in the camera file",
                 reason="mirrored",
             )

@@ -182,7 +182,7 @@ QUANTITIES: tuple[Quantity, ...] = (
       "modes outside the main mode's 99.9 % circle hold more than 1 %",
       {"type": "array", "items": record({"east_m": NUMBER, "north_m": NUMBER, "weight": CHANCE}), "minItems": 1}),
     Q("modes.text", "", Located, ambiguous_modes, "the positions that fit", derived=True,
-      shown=(Show("summary", "modes", lambda m: f"{len(m)} places fit: {modes_text(m)}"),
+      shown=(Show("summary", "modes", lambda m: f"{len(m)} positions fit: {modes_text(m)}"),
              Show("text", "places", modes_text))),
     Q("attitude.quat_xyzw_cam_icrs", "", Oriented, lambda v: quat_xyzw_from_R(v.attitude.R_cam_icrs).tolist(),
       "v_cam = R v_icrs, SciPy's order", QUATERNION,

@@ -1,4 +1,4 @@
-"""The star table: every catalogue star in view, where it should be, what was measured there, and what that says."""
+"""The star table: every catalogue star in view, its predicted position, the measurement there, and the evidence."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def star_table_text(value: Inputs) -> str:
 
 
 def status_of(light: StarPhotometry) -> NDArray[np.str_]:
-    """What the light (n,) says of each star: seen, hidden, uncertain, or unusable where it could not be measured."""
+    """Status (n,) of each star by its photometry: seen, hidden, uncertain, or unusable where it was not measured."""
     kinds = np.select([light.cause != "", light.llr >= SEEN_LLR, light.llr <= -SEEN_LLR], [3, 0, 1], 2)
     return np.array(STATUSES)[kinds]
 
@@ -112,9 +112,9 @@ def _light_columns(light: StarPhotometry, unit: str) -> Sequence[Column]:
 
     return [
         Column("expected_e", light.expected_e, "float64", unit, "%.6g", "flux if nothing hides it"),
-        Column("flux_e", measured("%.6g", light.flux_e), "float64", unit, "%s", "measured at the predicted place"),
-        Column("sigma_e", measured("%.6g", light.sigma_e), "float64", unit, "%s", "of flux_e if nothing shines"),
-        Column("evidence", measured("%.3f", light.llr), description="ln p(light | shines) - ln p(light | hidden)"),
+        Column("flux_e", measured("%.6g", light.flux_e), "float64", unit, "%s", "measured at the predicted position"),
+        Column("sigma_e", measured("%.6g", light.sigma_e), "float64", unit, "%s", "of flux_e without a star"),
+        Column("evidence", measured("%.3f", light.llr), description="ln p(light | visible) - ln p(light | hidden)"),
         Column("status", status_of(light), "string", description="seen, hidden, uncertain or unusable"),
         Column("cause", light.cause, "string", description="why it is unusable"),
     ]

@@ -1,7 +1,7 @@
 """FITS world coordinates of an identified image, and the table of its matches, as other programs read them.
 
 Calabretta & Greisen 2002, A&A 395, 1077 (ARC, ZPN, TAN); Shupe et al. 2005, ASP Conf. 347, 491 (SIP). The lens
-says which projection it is, or how well a polynomial fits it; a decentred one needs the SIP polynomials.
+has a FITS projection or a polynomial with its error; a decentred one needs the SIP polynomials.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def wcs_cards(camera: Camera, R_cam_icrs: Array, value: Oriented | None = None) 
 
 
 def matches_bytes(value: Oriented) -> bytes:
-    """The table NAME.corr of the matches: measured place (field) and catalogue's (index), in FITS pixels and degrees.
+    """The table NAME.corr of the matches: measured position (field) and predicted one (index), in FITS pixels, degrees.
 
     Columns as astrometry.net's: field_x, field_y, field_ra, field_dec, index_x, index_y, index_ra, index_dec, and
     index_id, FLUX, MAG.

@@ -68,7 +68,7 @@ def _stem_and_kind(record: Path) -> tuple[str, str]:
 def write_results(outcome: Outcome, path: Path, *, plots: bool = True, write_record: bool = True) -> dict[str, Any]:
     """The record of an `outcome`, written to `path` (such as NAME.fix.json) after star table, WCS and picture.
 
-    `plots` and `write_record` say whether the picture and the record are written. Raises BadInput where a file cannot
+    `plots` and `write_record`: whether the picture and the record are written. Raises BadInput where a file cannot
     be written.
     """
     from startrack.output.record import record_of
@@ -124,7 +124,7 @@ def write_wcs(path: FilePath, corr_path: FilePath, value: Oriented) -> None:
 def write_annotated(path: FilePath, outcome: Outcome, truth_enu_m: tuple[float, float] | None = None) -> None:
     """Write the annotated picture of an `outcome` to `path` (PNG). Raises BadInput where it cannot be written.
 
-    `truth_enu_m` (east, north) [m] is drawn where a caller knows it; no stage of the pipeline does.
+    `truth_enu_m` (east, north) [m] is drawn if it is given; no stage of the pipeline has it.
     """
     import cv2
 

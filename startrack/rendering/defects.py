@@ -37,7 +37,7 @@ def add_hot_pixels(image_e: Array, hot: HotPixels, exposure_s: float) -> None:
 
 
 def add_cosmic_rays(image_e: Array, count: int, *, rng: np.random.Generator) -> None:
-    """Add to the image (H, W) [e] `count` straight tracks at random places, directions, lengths and charges."""
+    """Add to the image (H, W) [e] `count` straight tracks at random positions, directions, lengths and charges."""
     height, width = image_e.shape
     for _ in range(count):
         centre = rng.uniform([-0.5, -0.5], [width - 0.5, height - 0.5])

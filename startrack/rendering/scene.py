@@ -82,4 +82,4 @@ class Truth(Value):
     sources: Stars  # stars and bodies, as the catalogue states them
     xy_px: Array = array("n", 2)  # at mid-exposure, hidden or not
     flux_e: Array = array("n")  # whole PSF, from the stated magnitude [electrons]
-    hidden: Bools = array("n", dtype=np.bool_)  # the terrain stands before it at mid-exposure
+    hidden: Bools = array("n", dtype=np.bool_)  # the terrain hides it at mid-exposure

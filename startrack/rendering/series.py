@@ -71,7 +71,7 @@ class Series:
         """The scene of exposure `number`, called `name`, and the generator to render it with.
 
         Raises:
-            BadInput: bad_terrain when no place can be found, no_time outside the ephemeris.
+            BadInput: bad_terrain when no position can be found, no_time outside the ephemeris.
         """
         rng = np.random.default_rng([self.seed, _EXPOSURE, number])
         time, place_m, heading, pitch, roll = self._pose(rng)
@@ -111,15 +111,15 @@ class Series:
         return scene, rng
 
     def _pose(self, rng: np.random.Generator) -> tuple[datetime, Array, float, float, float]:
-        """Time, place (2,) [m], heading, pitch and roll [rad]: all are drawn, so that giving one leaves the others."""
+        """Time, position (2,) [m], heading, pitch and roll [rad]. All are drawn: giving one leaves the others."""
         first, last = RANDOM_TIMES
         time = first + timedelta(microseconds=int(rng.integers((last - first) // timedelta(microseconds=1))))
-        place = _random_position(self.terrain, rng)
+        position = _random_position(self.terrain, rng)
         heading, direction = rng.uniform(0, 2 * np.pi, 2)
         tilt = self.max_tilt_rad * np.sqrt(rng.random())
         return (
             _value_or_draw(self.time_utc, time),
-            np.array([_value_or_draw(self.east_m, place[0]), _value_or_draw(self.north_m, place[1])]),
+            np.array([_value_or_draw(self.east_m, position[0]), _value_or_draw(self.north_m, position[1])]),
             _value_or_draw(self.heading_rad, heading),
             _value_or_draw(self.pitch_rad, tilt * np.cos(direction)),
             _value_or_draw(self.roll_rad, tilt * np.sin(direction)),
@@ -163,12 +163,12 @@ def sky_turn_rad(site: Site, time: datetime, exposure_s: float) -> Array:
 
 
 def _random_position(terrain: Terrain, rng: np.random.Generator) -> Array:
-    """A place (2,) [m], uniform over the part of the search area where the camera can stand."""
+    """A position (2,) [m], uniform over the part of the search area where the camera can stand."""
     for _ in range(TRIES_FOR_A_PLACE):
         turn = rng.uniform(0, 2 * np.pi)
-        place = terrain.search_radius_m * np.sqrt(rng.random()) * np.array([np.sin(turn), np.cos(turn)])
-        if bool(terrain.allowed(place[None])[0]):
-            return place
+        position = terrain.search_radius_m * np.sqrt(rng.random()) * np.array([np.sin(turn), np.cos(turn)])
+        if bool(terrain.allowed(position[None])[0]):
+            return position
     raise BadInput("bad_terrain", f"{terrain.name}: nowhere in its search area can the camera stand")
 
 

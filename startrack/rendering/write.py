@@ -17,7 +17,7 @@ _COLUMNS = (
     ("y_px", "float64", "pix", "at mid-exposure"),
     ("v_mag", "float64", "mag", "as the catalogue states it"),
     ("flux_e", "float64", "electron", "whole PSF, from v_mag"),
-    ("hidden", "bool", None, "the terrain stands before it at mid-exposure"),
+    ("hidden", "bool", None, "the terrain hides it at mid-exposure"),
 )
 
 

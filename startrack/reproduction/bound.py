@@ -1,4 +1,4 @@
-"""The limit for a perfect list: the centroid of the cell of places from which exactly the listed stars are visible.
+"""The limit for a perfect list: the centroid of the cell of positions from which exactly the listed stars are visible.
 
 By brute force on a grid, independently of the localizer's search, so that each checks the other.
 """

@@ -1,4 +1,4 @@
-"""Figures 3.4, 3.10 and B.1 to B.10: the error at many places; and the error against magnitude and aspect ratio."""
+"""Figures 3.4, 3.10 and B.1 to B.10: the error at many positions; and the error against magnitude and aspect ratio."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def fig3_10(context: Context) -> Artefact:
         f"{100 * descent.refused_fraction:.2f} % never settle (thesis 0.6 %)."
     )
     of_ours = (
-        f"Ours on the same starfield and places (the first {size.ours_one_sky:,}): {format_errors(ours.errors)} m. "
+        f"Ours on the same starfield and positions (the first {size.ours_one_sky:,}): {format_errors(ours.errors)} m. "
         f"{SCALED} "
         f"The pseudo-gradient: {format_errors(descent.errors)} m."
     )
@@ -115,8 +115,8 @@ def fig_b(context: Context) -> Artefact:
 
 
 def _ring_means(method: MethodErrors) -> list[float | None]:
-    """Mean error [m] by distance from the centre; None where there is no place."""
-    distance = np.concatenate([np.hypot(*places.T) for places in method.places_m]) / 1e3
+    """Mean error [m] by distance from the centre; None where there is no position."""
+    distance = np.concatenate([np.hypot(*positions.T) for positions in method.places_m]) / 1e3
     rings = [(distance >= a) & (distance < b) for a, b in pairwise(RINGS_KM)]
     return [float(method.errors[ring].mean()) if ring.any() else None for ring in rings]
 
@@ -193,8 +193,8 @@ def _sweep_artefact(
     )
     caption = (
         f"Mean position error against {head[0]}: {context.size.sweep_skies} starfields of {context.size.sweep_per_sky} "
-        "places each, perfect lists. The limit is the middle of the exact cell, at all places; what ours refuses (the "
-        "stars leave too much of the floor open) is not in its mean."
+        "positions each, perfect lists. The limit is the middle of the exact cell, at all positions; positions that "
+        "ours refuses (the stars leave too much of the floor open) are not in its mean."
     )
     standard = means[x.index(6.0 if name == "magnitude" else 10.0)]
     columns = [Column(head[0].replace(" ", "_"), x, form="%g")]

@@ -1,4 +1,4 @@
-"""The methods on one chunk of places. Sky and places depend on the seed only, not on the method or the order."""
+"""The methods on one chunk of positions. Sky and positions depend on the seed only, not on the method or the order."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Chunk = dict[str, np.ndarray]  # the result of one task, by name
 
 @dataclass(frozen=True)
 class Task:
-    """Places number start to stop - 1 of one sky, to be solved by one method."""
+    """Positions number start to stop - 1 of one sky, to be solved by one method."""
 
     method: str
     seed: int
@@ -59,7 +59,7 @@ def tasks_of(
 
 
 def compute_chunk(task: Task) -> Chunk:
-    """Arrays over the task's places: `truth_m` (n, 2), the method's own, and `seconds` (1,) of the processor spent on
+    """Arrays over the task's positions: `truth_m` (n, 2), the method's own, and `seconds` (1,) of processor time for
     the method.
 
     kua: `hull_m`, `refined_m` (n, 2), `settled` (n,). ours: `located` (n,); of the located ones `fix_m` (m, 2),
@@ -68,12 +68,12 @@ def compute_chunk(task: Task) -> Chunk:
     sky, cylinder = Sky.draw(task.seed, task.sky, task.magnitude), crater(task.aspect_ratio)
     points = sky.on_rim_plane(cylinder)
     truth = draw_places(task.seed, task.sky, task.start, task.stop)
-    seen = [visible_stars(points, place, cylinder.radius_m) for place in truth]
+    seen = [visible_stars(points, position, cylinder.radius_m) for position in truth]
     if task.method == KUA:
         own = _kua(points, seen, cylinder.wall_m, cylinder.radius_m)
     elif task.method == BOUND:
         start = time.thread_time()
-        own = {"centroid_m": np.stack([cell_centroid(points, place, cylinder.radius_m) for place in truth])}
+        own = {"centroid_m": np.stack([cell_centroid(points, position, cylinder.radius_m) for position in truth])}
         own["seconds"] = np.array([time.thread_time() - start])
     else:
         own = _ours(task, sky, seen, truth)
@@ -107,7 +107,9 @@ def _ours(task: Task, sky: Sky, seen: list[Bools], truth: Array) -> Chunk:
     start = time.thread_time()
     fixes = [_fix_or_none(localizer, one, cylinder) for one in evidence]
     seconds = time.thread_time() - start
-    error = [(fix, fix.position_enu_m[:2] - place) for fix, place in zip(fixes, truth, strict=True) if fix is not None]
+    error = [
+        (fix, fix.position_enu_m[:2] - position) for fix, position in zip(fixes, truth, strict=True) if fix is not None
+    ]
     return {
         "located": np.array([fix is not None for fix in fixes]),
         "fix_m": np.array([fix.position_enu_m[:2] for fix, _ in error]).reshape(-1, 2),

@@ -11,7 +11,7 @@ from startrack.types import Array
 
 @dataclass(frozen=True)
 class Errors:
-    """Position errors over many places [m]."""
+    """Position errors over many positions [m]."""
 
     mean_m: float
     sd_m: float

@@ -1,7 +1,7 @@
-"""The thesis's crater environment simulator: random starfields, a cylinder, and the list of stars visible from a place.
+"""The thesis's crater environment simulator: random starfields, a cylinder, the list of stars visible at a position.
 
 Source: Kua 2008, sections 3.2.1 and 3.2.2. No pixels: stars are identified and detected without error, except for
-`Mistakes`. All random draws depend on (seed, sky, number of the place) only.
+`Mistakes`. All random draws depend on (seed, sky, number of the position) only.
 """
 
 from __future__ import annotations
@@ -70,13 +70,13 @@ def directions(azimuth_rad: Array) -> Array:
 
 
 def draw_places(seed: int, sky: int, start: int, stop: int, radius_m: float = DIAMETER_M / 2) -> Array:
-    """Places number start to stop - 1 (n, 2) [m] of a sky, uniform over the crater's floor."""
+    """Positions number start to stop - 1 (n, 2) [m] of a sky, uniform over the crater's floor."""
     r1, r2 = _random([seed, PLACES, sky], (stop, 2))[start:].T
     return radius_m * np.sqrt(r1)[:, None] * directions(2 * np.pi * r2)
 
 
 def visible_stars(points_m: Array, place_m: Array, radius_m: float) -> Bools:
-    """Which stars (n,), given on the rim's plane, are in sight from a place (2,).
+    """Which stars (n,), given on the rim's plane, are in sight from a position (2,).
 
     The thesis tests against a polygon of 360 points of the rim; it differs from the circle by 0.4 m at most.
     """
@@ -84,7 +84,7 @@ def visible_stars(points_m: Array, place_m: Array, radius_m: float) -> Bools:
 
 
 def crater_edge(cylinder: Cylinder, place_m: Array) -> tuple[Array, Array]:
-    """Azimuths and elevations (361,) [rad] of the rim from a place, at even steps along the rim, closed."""
+    """Azimuths and elevations (361,) [rad] of the rim from a position, at even steps along the rim, closed."""
     rim = cylinder.radius_m * directions(np.linspace(0.0, 2 * np.pi, EDGE_POINTS + 1)) - place_m
     return np.arctan2(rim[:, 0], rim[:, 1]), np.arctan2(cylinder.wall_m, np.hypot(rim[:, 0], rim[:, 1]))
 
@@ -97,7 +97,7 @@ class Mistakes:
     false: float = 1e-6  # for a hidden star
 
     def draw_list(self, in_sight: Bools, seed: int, sky: int, number: int) -> Bools:
-        """Draw the list of place `number`: which stars (n,) are on it."""
+        """Draw the list of position `number`: which stars (n,) are on it."""
         r = _random([seed, MISTAKES, sky, number], (len(in_sight),))
         return np.where(in_sight, r >= self.missed, r < self.false)
 

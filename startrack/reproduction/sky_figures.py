@@ -47,7 +47,7 @@ def fig3_5(context: Context) -> Artefact:
     """One step of the pseudo-gradient."""
     sky = Sky.draw(context.seed, 0)
     points, radius = sky.on_rim_plane(crater()), crater().radius_m
-    views = [visible_stars(points, place, radius) for place in (ESTIMATE_M, EXAMPLE_M)]
+    views = [visible_stars(points, position, radius) for position in (ESTIMATE_M, EXAMPLE_M)]
     centres = np.stack([points[view].mean(axis=0) for view in views])
     step, wanted = centres[0] - centres[1], EXAMPLE_M - ESTIMATE_M
     turn = np.degrees(np.arctan2(wanted[0] * step[1] - wanted[1] * step[0], wanted @ step))
@@ -59,7 +59,7 @@ def fig3_5(context: Context) -> Artefact:
     )
     return _picture(
         "fig3.5", "Example showing pseudo-gradient computation", caption,
-        f"a step of {np.hypot(*step) / 1e3:.2f} km towards a place {np.hypot(*wanted) / 1e3:.2f} km away",
+        f"a step of {np.hypot(*step) / 1e3:.2f} km towards a position {np.hypot(*wanted) / 1e3:.2f} km away",
         partial(_draw_step, points, views, centres, caption),
         {"step_m": step.tolist(), "wanted_m": wanted.tolist()},
     )  # fmt: skip
@@ -109,10 +109,10 @@ def _draw_line(sky: Sky, caption: str) -> bytes:
     cylinder, stars = crater(), fisheye_points(sky.azimuth_rad, sky.elevation_rad)
     points = sky.on_rim_plane(cylinder)
     for axes, east in zip(figure.subplots(2, 4).ravel(), ALONG_KM, strict=True):
-        place = np.array([1e3 * east, 0.0])
-        seen = visible_stars(points, place, cylinder.radius_m)
+        position = np.array([1e3 * east, 0.0])
+        seen = visible_stars(points, position, cylinder.radius_m)
         axes.plot(*stars[seen].T, ".", color=STAR, markersize=1.6)
-        axes.plot(*fisheye_points(*crater_edge(cylinder, place)).T, color=EDGE, linewidth=1.0)
+        axes.plot(*fisheye_points(*crater_edge(cylinder, position)).T, color=EDGE, linewidth=1.0)
         fisheye_axes(axes)
         axes.set_title(f"{east:g} km: {int(seen.sum())} stars", fontsize=9)
     return png_bytes(figure, caption)

@@ -21,7 +21,7 @@ class MethodErrors:
 
     places_m: tuple[Array, ...]  # by sky: (n, 2) [m], where there is an estimate
     errors_m: tuple[Array, ...]  # by sky: (n,) [m]
-    answered: tuple[Bools, ...]  # by sky: settled (kua) or located (ours), for every place
+    answered: tuple[Bools, ...]  # by sky: settled (kua) or located (ours), for every position
     ms_per_fix: float
 
     @property
@@ -31,7 +31,7 @@ class MethodErrors:
 
     @property
     def refused(self) -> int:
-        """Places without an estimate; for the pseudo-gradient, with one that never settled."""
+        """Positions without an estimate; for the pseudo-gradient, with one that never settled."""
         return int(sum((~one).sum() for one in self.answered))
 
     @property
@@ -53,9 +53,9 @@ def collect_errors(context: Context, what: str, by_sky: Sequence[Sequence[Task]]
     found = []
     for key in ERROR_OF[method]:
         pairs = [[_places_and_errors(chunk, key) for chunk in one] for one in chunks]
-        places = tuple(np.concatenate([place for place, _ in one]) for one in pairs)
+        positions = tuple(np.concatenate([position for position, _ in one]) for one in pairs)
         errors = tuple(np.concatenate([error for _, error in one]) for one in pairs)
-        found.append(MethodErrors(places, errors, flags, ms))
+        found.append(MethodErrors(positions, errors, flags, ms))
     return found
 
 

@@ -54,7 +54,7 @@ def _tasks(
 
 
 def _ratio_to_limit(ours: MethodErrors, limit: MethodErrors) -> float:
-    """Mean error of our method over that of the limit, on the places computed for both."""
+    """Mean error of our method over that of the limit, on the positions computed for both."""
     pairs = [
         (fix[: len(best)], best[: len(fix)])
         for fix, best, located in zip(ours.errors_m, limit.errors_m, ours.answered, strict=True)
@@ -107,18 +107,18 @@ def _text(
     )  # fmt: skip
     head = ["Trial", "thesis", "its method, redone", "never settles", "its hull, redone", "ours", "limit"]
     return f"""Position error in metres: mean / standard deviation / largest. {star_count(MAGNITUDE)} stars (magnitude \
-6), perfect lists; {size.per_sky:,} places per starfield for the thesis's methods, the first {size.ours_per_sky:,} of \
-them for ours, {size.bound_per_sky:,} for the limit. The limit is the middle of the cell of places from which exactly \
-the listed stars are in sight. Seed {context.seed}.
+6), perfect lists; {size.per_sky:,} positions per starfield for the thesis's methods, the first {size.ours_per_sky:,} \
+of them for ours, {size.bound_per_sky:,} for the limit. The limit is the middle of the cell of positions from which \
+exactly the listed stars are in sight. Seed {context.seed}.
 
 {markdown_table(head, rows)}
 
-Ours over the limit, on the same places: {ratio:.3f}. Refused by ours: {ours.refused}.
+Ours over the limit, on the same positions: {ratio:.3f}. Refused by ours: {ours.refused}.
 
 A camera two magnitudes deeper ({star_count(DEEP_MAGNITUDE):,} stars, {DEEP_MISTAKES.missed:.0%} of those in sight \
 missed, {DEEP_MISTAKES.false:.0%} of the hidden ones on the list by mistake): ours \
 {format_errors(deep.errors, HUNDREDTHS)} \
-over {len(deep.errors):,} places; refused: {deep.refused}."""
+over {len(deep.errors):,} positions; refused: {deep.refused}."""
 
 
 def _trial_text(trial: published.Errors) -> str:

@@ -88,7 +88,7 @@ class Solution:
 
     @cached_property
     def modes(self) -> QTable | None:
-        """Every place that fits: east, north, weight; heaviest first."""
+        """Every position that fits: east, north, weight; heaviest first."""
         if not isinstance(self.result, Located):
             return None
         from astropy import units as u

@@ -45,7 +45,7 @@ def read_geotiff(path: Path) -> Grid | None:
             page = file.pages.first
             keys, gdal = file.geotiff_metadata, file.gdal_metadata
             if not keys:
-                raise BadInput("bad_terrain", f"{path}: it does not say where on the Moon it lies (no GeoTIFF tags)")
+                raise BadInput("bad_terrain", f"{path}: it has no position on the Moon (no GeoTIFF tags)")
             if not isinstance(keys, dict) or "ModelPixelScale" not in keys or "ModelTiepoint" not in keys:
                 return None
             parameters = _proj_parameters(keys)
@@ -75,7 +75,7 @@ def read_geotiff(path: Path) -> Grid | None:
 
 @contextmanager
 def _silent_tifffile() -> Iterator[None]:
-    """Without tifffile's log of what is wrong with a file: the exception says it."""
+    """Without tifffile's log of errors in a file: the exception has the cause."""
     log = logging.getLogger("tifffile")
     level = log.level
     log.setLevel(logging.CRITICAL + 1)
@@ -90,7 +90,7 @@ def _one_line(cause: Exception) -> str:
 
 
 def _gdal_scale(items: Any) -> tuple[float | None, float]:
-    """SCALE and OFFSET of GDAL's metadata: None where nothing says what one step is, and 0."""
+    """SCALE and OFFSET of GDAL's metadata: None where the step is not known, and 0."""
     if isinstance(items, str):
         items = {e.get("name"): e.text for e in ElementTree.fromstring(items).iter("Item")}
     found = {}
@@ -105,7 +105,7 @@ def _gdal_scale(items: Any) -> tuple[float | None, float]:
 
 
 def _proj_parameters(keys: Mapping[str, Any]) -> dict[str, Any] | None:
-    """PROJ's parameters of GeoTIFF keys; None for projections that only rasterio knows."""
+    """PROJ's parameters of GeoTIFF keys; None for projections that only rasterio reads."""
 
     def number(*names: str, default: float = 0.0) -> float:
         return next((float(keys[name]) for name in names if name in keys), default)

@@ -25,13 +25,13 @@ from startrack.terrain.raster import Raster
 from startrack.types import Array, BadInput, Bools, Ints
 
 LOG = logging.getLogger(__name__)
-FINEST_BOX_M = 0.45  # half side of the smallest boxes of positions: no height map knows its ground better
+FINEST_BOX_M = 0.45  # half side of the smallest boxes of positions: no height map is more accurate
 CELL_M = 200.0  # cells of the table are no wider
 MAX_CELLS_ACROSS = 128
 COMMON_PER_POST = 3.0
 MARGIN = 1.15  # of the search radius: so far is searched, to notice that the camera left the area
 SLOPE_STEP_M = 5.0
-UNKNOWN_FROM = 12  # places across the square that are asked where the maps end
+UNKNOWN_FROM = 12  # points across the square at which the ends of the maps are looked up
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

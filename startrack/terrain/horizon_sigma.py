@@ -11,7 +11,7 @@ from startrack.terrain.horizon_table import ANGLE_STEP_RAD, BEST, BINS, DISTANCE
 from startrack.terrain.tracing import level_for
 from startrack.types import Array
 
-NEAREST_M = 50.0  # crests closer by are not told apart by the table
+NEAREST_M = 50.0  # the table does not distinguish crests closer by
 CORNERS = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
 
 

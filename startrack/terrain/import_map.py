@@ -35,7 +35,7 @@ def import_maps(
     """Write the terrain file `output` and, beside it, a crop of each map: NAME-1.tif, the finest, and so on.
 
     latitude_rad, longitude_rad: the origin. half_m: half the side of each crop about it [m]. radius_m: of the search
-    area. scale, offset_m: of each map, the finest first, where the files themselves do not say. height_sigma_m: error
+    area. scale, offset_m: of each map, the finest first, where the files do not state them. height_sigma_m: error
     of single posts [m]; None estimates it from the roughness of the map that makes the horizon. camera_height_m: above
     the ground [m]. overwrite: replace existing files.
 

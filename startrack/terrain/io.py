@@ -55,9 +55,9 @@ KEYS = Table(
                 "height_sigma_m": Number(low=0.0, high=MAX_LENGTH_M, default=0.0,
                                          description="of single posts, independent of each other"),
                 "horizon_sigma_deg": Number(low=0.0, high=9.99, description="of an error that all azimuths share"),
-                "scale": Number(low=-1e6, high=1e6, description="metres per unit, where the files do not say"),
+                "scale": Number(low=-1e6, high=1e6, description="metres per unit, where the files do not state it"),
                 "offset_m": Number(low=-MAX_LENGTH_M, high=MAX_LENGTH_M,
-                                   description="height of value 0, where the files do not say"),
+                                   description="height of value 0, where the files do not state it"),
             },
         ),
         "rover": Table(

@@ -108,7 +108,7 @@ class Grid:
     projection: Projection
     first_m: tuple[float, float]  # x, y of the first post
     step_m: tuple[float, float]  # from a post to the next, in x and y
-    scale: float | None  # [m]; None where the file does not say
+    scale: float | None  # [m]; None where the file does not state it
     offset_m: float
     no_data: float | None
 

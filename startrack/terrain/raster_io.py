@@ -23,7 +23,7 @@ def read_map(
     path: str | Path, *, scale: float | None = None, offset_m: float | None = None,
     near: tuple[float, float] | None = None,
 ) -> Raster:  # fmt: skip
-    """The height map of a file. scale and offset_m: height = offset + scale x value, where the file does not say.
+    """The height map of a file. scale and offset_m: height = offset + scale x value, unless the file states them.
 
     near: latitude and longitude [rad] about which large maps are cut. Raises BadInput bad_terrain for a file that is
     missing or damaged, or that is no height map of the Moon near there.
@@ -60,7 +60,7 @@ def _raster_of(grid: Grid, path: Path, scale: float | None, offset_m: float | No
     if scale is None and np.issubdtype(values.dtype, np.integer):
         raise BadInput(
             "bad_terrain",
-            f"{path}: it holds whole numbers and no scale: say how many metres one of them is (1 where they are "
+            f"{path}: it holds whole numbers and no scale: give the metres of one unit (1 where they are "
             "metres), with --scale of terrain import or as scale in [dem]",
         )
     scale = 1.0 if scale is None else scale
@@ -113,7 +113,7 @@ def _grid_of(file: Any, path: Path, near: tuple[float, float] | None, hint: str)
     from rasterio.windows import Window
 
     if file.crs is None or file.transform.is_identity:
-        raise BadInput("bad_terrain", f"{path}: it does not say where on the Moon it lies{hint}")
+        raise BadInput("bad_terrain", f"{path}: it has no position on the Moon{hint}")
     t = file.transform
     if t.b or t.d:
         raise BadInput("bad_terrain", f"{path}: a rotated grid; bring it to north up (gdalwarp)")

@@ -34,7 +34,7 @@ def trace_horizons(
 ) -> tuple[Array, Array, Array]:
     """tan of the horizon, its distance [m], and the distance of the maps' end [m] (1e9: beyond the horizon), all (n,).
 
-    The table, if there is one, says where along the rays (n,) the horizon stands.
+    The table, if there is one, gives the distance of the horizon along the rays (n,).
     """
     from startrack.terrain.table_kernel import horizons
 

@@ -91,7 +91,7 @@ class TerrainsByName:
         if name not in self._known:
             try:
                 self._known[name] = load_terrain(name)
-            except BadInput:  # a page must not need more than the results: it says what it leaves out
+            except BadInput:  # the page needs only the results: it states what is missing
                 self._known[name] = None
         return self._known[name]
 
@@ -99,7 +99,7 @@ class TerrainsByName:
 def horizon_deg(terrain: Terrain, east_m: float, north_m: float, count: int) -> list[float] | None:
     """Elevation of the horizon [deg] at `count` azimuths, evenly from 0 to 360 degrees, both ends included.
 
-    None from where it is not known: a place off the map.
+    None from where it is not known: a position off the map.
     """
     azimuths_rad = np.linspace(0.0, 2 * np.pi, count)
     horizon_rad = terrain.horizon_rad(np.broadcast_to([east_m, north_m], (count, 2)), azimuths_rad)

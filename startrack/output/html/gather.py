@@ -24,7 +24,7 @@ class Found:
 
     @property
     def kind(self) -> str:
-        """What its file's name says that it is: fix or identification."""
+        """Kind of the record by its file's name: fix or identification."""
         return "identification" if self.path.name.endswith(KINDS[1]) else "fix"
 
     def companion(self, suffix: str) -> Path:

@@ -1,4 +1,4 @@
-"""The table of a page: one short list per image, and how large the errors are where the true places are known."""
+"""The table of a page: one short list per image, and how large the errors are where the true positions are known."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def _covariance(position: dict[str, Any]) -> tuple[float, float, float] | None:
 def _error_and_nees(
     place: tuple[float | None, float | None], covariance: tuple[float, float, float] | None, real: Place | None
 ) -> tuple[float | None, float | None]:
-    """Distance from the true place [m] and NEES, e^T C^-1 e."""
+    """Distance from the true position [m] and NEES, e^T C^-1 e."""
     if real is None or place[0] is None or place[1] is None:
         return None, None
     east, north = place[0] - real[0], place[1] - real[1]

@@ -70,7 +70,7 @@ def page_text(
         real: the true (east, north) [m] of images by their stems, where a caller knows them.
         images: how many images have their details in the page.
         single: whether the page is about one image, without a list.
-        base: the folder of the results as the page sees it.
+        base: the folder of the results, relative to the page.
     """
     real, terrains = real or {}, TerrainsByName()
     detailed = images_with_details(found, images)
@@ -129,10 +129,10 @@ def _detail(found: Found, terrains: TerrainsByName, size: tuple[int, int, int]) 
 
 
 def _horizon(record: dict[str, Any], terrains: TerrainsByName, azimuths: int) -> list[float] | None:
-    """Of the position, or of the likeliest place; None without a place or where the terrain is not here."""
+    """Of the position, or of the likeliest position; None without a position or where the terrain is not here."""
     modes = record.get("modes")
-    place = section_of(record, "position") or (modes[0] if isinstance(modes, list) and modes else {})
-    east, north = number_of(place, "east_m"), number_of(place, "north_m")
+    position = section_of(record, "position") or (modes[0] if isinstance(modes, list) and modes else {})
+    east, north = number_of(position, "east_m"), number_of(position, "north_m")
     name = _terrain_name(record)
     terrain = terrains.terrain(name) if name and east is not None and record["status"] != "refused" else None
     if terrain is None or east is None or north is None:

@@ -133,8 +133,8 @@ def _facts(value: Inputs) -> Rows:
     found = [("Time", f"{when:%Y-%m-%d  %H:%M:%S} UTC" if when is not None else "not known")]
     if isinstance(value, Located) and value.fix.ambiguous:
         for k, mode in enumerate(value.fix.modes[:MAX_MODES]):
-            place = f"E {mode.east_m:.0f} m   N {mode.north_m:.0f} m   ({100 * mode.weight:.0f} %)"
-            found += [(f"Place {k + 1}", place)]
+            position = f"E {mode.east_m:.0f} m   N {mode.north_m:.0f} m   ({100 * mode.weight:.0f} %)"
+            found += [(f"Position {k + 1}", position)]
     return found + rows("panel", at_stage(value))
 
 
@@ -153,8 +153,8 @@ def _legend(value: Inputs, truth: bool) -> list[tuple[str, Colour, str]]:
         found += [("line", SKYLINE, "skyline of the terrain seen from the position found")]
         found += [("disc", POSITION, "position; circle 95 %, ellipse one sigma")]
     if isinstance(value, Located) and value.fix.ambiguous:
-        found += [("line", SKYLINE, "skyline of the terrain seen from place 1")]
-        found += [("disc", POSITION, "place that fits the stars, with its probability")]
+        found += [("line", SKYLINE, "skyline of the terrain seen from position 1")]
+        found += [("disc", POSITION, "position that fits the stars, with its probability")]
     if truth and value.terrain is not None:
         found += [("plus", TRUTH, "true position (not known to the method)")]
     return found

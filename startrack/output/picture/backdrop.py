@@ -61,7 +61,7 @@ def fit_to_canvas(size_px: tuple[int, int]) -> tuple[float, tuple[int, int]]:
 def backdrop(value: Inputs, size: tuple[int, int], wall: Image | None = None) -> NDArray[np.uint8]:
     """The exposure as (H, W, 3) of the given size (W, H); beyond the image circle is paper.
 
-    `wall` (H, W) is 1 where terrain stands before the sky: it is shown darker than the exposure has it.
+    `wall` (H, W) is 1 where terrain hides the sky: it is shown darker than in the exposure.
     """
     inside_px = np.full(size[::-1], np.inf, dtype=np.float32)
     if value.camera is not None and value.camera.size_px == value.exposure.size_px:

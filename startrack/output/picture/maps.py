@@ -39,7 +39,7 @@ class MapView:
     metres_per_px: float
 
     def at(self, points_m: ArrayLike) -> Array:
-        """Canvas places (..., 2) of points (..., 2), east and north [m]."""
+        """Canvas positions (..., 2) of points (..., 2), east and north [m]."""
         offset = (np.asarray(points_m, dtype=float) - self.centre_m) / self.metres_per_px
         return self.middle + offset * [1.0, -1.0]
 
@@ -64,7 +64,7 @@ def map_view(box: Box, centre_m: tuple[float, float], half_m: float) -> MapView:
 def draw_overview(
     canvas: Canvas, box: Box, terrain: Terrain, fix: Fix | None, ambiguous: bool, truth: ArrayLike | None
 ) -> MapView:
-    """The search area (dashed), the rim of a cylinder or the shape of the ground, and the place or places."""
+    """The search area (dashed), the rim of a cylinder or the shape of the ground, and the position or positions."""
     rim = terrain.rim_radius_m or 0.0
     view = map_view(box, (0.0, 0.0), 1.07 * max(min(terrain.search_radius_m, terrain.reach_m), rim))
     window = canvas.window(box)
@@ -82,31 +82,31 @@ def draw_overview(
         window.plus(view.at(truth), 9.0, TRUTH, 2)
     if fix is not None:
         for k, mode in enumerate(fix.modes if ambiguous else fix.modes[:1]):
-            place = view.at((mode.east_m, mode.north_m))
-            window.circle(place, 5.0, POSITION, -1)
-            window.circle(place, 9.0, POSITION, 2)
+            position = view.at((mode.east_m, mode.north_m))
+            window.circle(position, 5.0, POSITION, -1)
+            window.circle(position, 9.0, POSITION, 2)
             if ambiguous:
-                canvas.label(place, f"{k + 1}: {100 * mode.weight:.0f} %", CAPTION_SIZE, INK, 14.0, box)
+                canvas.label(position, f"{k + 1}: {100 * mode.weight:.0f} %", CAPTION_SIZE, INK, 14.0, box)
     _draw_frame(canvas, view, "search area, north up")
     return view
 
 
 def draw_zoom(canvas: Canvas, box: Box, fix: Fix, truth: ArrayLike | None) -> MapView:
-    """The place with its covariance ellipse (one sigma, filled) and the circle that holds 95 % of the posterior."""
-    place = (float(fix.position_enu_m[0]), float(fix.position_enu_m[1]))
+    """The position with its covariance ellipse (one sigma, filled) and the circle that holds 95 % of the posterior."""
+    position = (float(fix.position_enu_m[0]), float(fix.position_enu_m[1]))
     half = 1.3 * fix.radius95_m
     if truth is not None:  # as far out as that is still a zoom
-        half = max(half, min(1.3 * float(np.linalg.norm(np.subtract(truth, place))), 4 * half))
-    view = map_view(box, place, half)
+        half = max(half, min(1.3 * float(np.linalg.norm(np.subtract(truth, position))), 4 * half))
+    view = map_view(box, position, half)
     window = canvas.window(box)
     window.rectangle(box, MAP)
     _draw_grid(window, view)
-    ellipse = view.at(_ellipse(place, fix.covariance_m2))
+    ellipse = view.at(_ellipse(position, fix.covariance_m2))
     window.area(ellipse, mix_colours(MAP, POSITION, 0.35))
     window.line(ellipse, mix_colours(MAP, POSITION, 0.8))
-    window.circle(view.at(place), fix.radius95_m / view.metres_per_px, POSITION, 2)
-    window.plus(view.at(place), 8.0, INK, 2)
-    if truth is not None and bool(np.all(np.abs(np.subtract(truth, place)) < view.half_m)):
+    window.circle(view.at(position), fix.radius95_m / view.metres_per_px, POSITION, 2)
+    window.plus(view.at(position), 8.0, INK, 2)
+    if truth is not None and bool(np.all(np.abs(np.subtract(truth, position)) < view.half_m)):
         window.plus(view.at(truth), 9.0, TRUTH, 2)
         canvas.label(view.at(truth), "truth", CAPTION_SIZE, TRUTH, 14.0, box)
     _draw_frame(canvas, view, f"95 % within {fix.radius95_m:.3g} m")
@@ -114,12 +114,12 @@ def draw_zoom(canvas: Canvas, box: Box, fix: Fix, truth: ArrayLike | None) -> Ma
 
 
 def draw_leaders(canvas: Canvas, overview: MapView, zoom: MapView) -> None:
-    """Faint lines from the place in the overview to the corners of the zoom below it."""
-    place = overview.at(zoom.centre_m)
+    """Faint lines from the position in the overview to the corners of the zoom below it."""
+    position = overview.at(zoom.centre_m)
     left, top, right, _ = zoom.box
     for corner in ((left, top), (right, top)):
-        toward = np.asarray(corner) - place
-        start = place + 12.0 * toward / np.linalg.norm(toward)
+        toward = np.asarray(corner) - position
+        start = position + 12.0 * toward / np.linalg.norm(toward)
         canvas.line(np.array([start, corner]), FAINT_INK)
 
 
@@ -188,8 +188,8 @@ def draw_residuals(canvas: Canvas, box: Box, fit: AttitudeFit) -> None:
         window.circle(middle, ring * scale, GRID)
     window.line([(left, middle[1]), (right, middle[1])], GRID)
     window.line([(middle[0], top), (middle[0], bottom)], GRID)
-    for place in middle + scale * residual_px:
-        window.circle(place, 2.0, mix_colours(IDENTIFIED, INK, 0.15), -1)
+    for position in middle + scale * residual_px:
+        window.circle(position, 2.0, mix_colours(IDENTIFIED, INK, 0.15), -1)
     canvas.rectangle(box, FAINT_INK, 1)
     canvas.text((left + 12, top + 12), "measured minus predicted", CAPTION_SIZE, DIM_INK, "lt", halo=True)
     canvas.text(

@@ -65,7 +65,7 @@ def _is_within_image_circle(value: Inputs, xy_px: Array) -> Bools:
 
 
 def draw_hidden(canvas: Canvas, view: View, value: Inputs) -> None:
-    """A cross at each of the brighter stars that ought to shine there and do not."""
+    """A cross at each of the brighter stars that the terrain hides."""
     _, xy_px = _hidden_stars(value)
     places = view.at(xy_px[:MAX_CROSSES])
     for rank, place in enumerate(places):

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from startrack.terrain import Terrain
 
 Image = NDArray[np.float32]
-CELL_PX = 2  # the ground is asked for at every second pixel
+CELL_PX = 2  # the ground is computed at every second pixel
 GENTLE_SLOPE = 0.02  # gentler ground looks flat
 RELIEF_LIGHT = 3.0  # slopes that face the light, as a multiple of the floor's colour
 MAX_LEVELS = 12.0

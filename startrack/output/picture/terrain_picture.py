@@ -1,4 +1,4 @@
-"""Pictures of a terrain: its relief with the search area, and the panorama that a place sees."""
+"""Pictures of a terrain: its relief with the search area, and the panorama seen from a position."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ COMPASS = {0: "N", 90: "E", 180: "S", 270: "W"}
 
 
 def relief_picture(terrain: Terrain, place_m: tuple[float, float] | None = None) -> NDArray[np.uint8]:
-    """The relief (H, W, 3), lit from the north-west, with contours, the search area dashed, and the place, if any."""
+    """The relief (H, W, 3), lit from the north-west, with contours, the search area (dashed) and the position."""
     canvas = Canvas(SIZE_PX + round(LEFT_PX), SIZE_PX + round(BELOW_PX))
     box = (LEFT_PX, 8.0, LEFT_PX + SIZE_PX - 9.0, SIZE_PX - 1.0)
     view = draw_overview(canvas, box, terrain, None, False, None)
@@ -66,7 +66,7 @@ def _draw_distances(canvas: Canvas, view: MapView) -> None:
 
 
 def panorama_picture(terrain: Terrain, place_m: tuple[float, float]) -> NDArray[np.uint8]:
-    """The horizon (H, W, 3) from north to north, azimuth to the right, seen by a camera at a place."""
+    """The horizon (H, W, 3) from north to north, azimuth to the right, seen by a camera at a position."""
     width, height = PANORAMA_PX
     canvas = Canvas(width, height)
     azimuth_deg = np.arange(0.0, 360.0 + STEP_DEG / 2, STEP_DEG)

@@ -30,7 +30,7 @@ SMALLEST_RISE_RAD = 0.2  # a lens whose radius stops growing sooner is no lens
 
 
 class Adjustable(Protocol):
-    """What `adjust` changes: State, or another dataclass with its methods (boards, a view of a narrow field)."""
+    """The unknowns of `adjust`: State, or another dataclass with its methods (boards, a view of a narrow field)."""
 
     @property
     def rotations(self) -> Array: ...  # (images, 3, 3)
@@ -125,7 +125,7 @@ class Prior:
 
 @dataclass(frozen=True, kw_only=True)
 class Scheme:
-    """How an adjustment iterates."""
+    """Settings of the iteration of an adjustment."""
 
     loss: Loss = SQUARES
     steps: int = 40
@@ -192,7 +192,7 @@ def adjust(
             lens, poses = equations.solve()
             state = state.step(free, lens, poses)
             if k == scheme.steps - 1 and not scheme.estimates_extra:
-                break  # nobody reads the residual of a few plain steps
+                break  # the residual of a few plain steps is not used
             rays = state.rays_cam(points)
             residual = state.residual_px(points, rays)
         moved = moved + lens

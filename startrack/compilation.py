@@ -67,7 +67,7 @@ def announce_compilation() -> None:
 def is_compiled() -> bool:
     """Whether numba's cache holds localization kernels for this Python.
 
-    For a decision that costs nothing but time if it is wrong: kernels of changed sources count too.
+    For a decision that costs only time if it is wrong: kernels of changed sources count too.
     """
     return any(True for source in (PACKAGE / "localization").glob("*.py") for _ in _indices_of(source))
 

@@ -46,7 +46,7 @@ def binomial_tail(at_least: Ints | int, trials: Ints | int, each: Array | float)
 def log_p_value(matched: Ints | int, predicted: Ints | int, each: Array | float, free: int = PATTERN_MATCHES) -> Array:
     """log P(at least `matched` of `predicted` stars coincide by chance).
 
-    `each`: probability that one star does. `free`: matches that the hypothesis brings about by itself (the stars of
+    `each`: probability that one star does. `free`: matches that the hypothesis itself produces (the stars of
     its pattern, the parameters of a fit); they are taken from both numbers.
     """
     k, n = np.maximum(np.asarray(matched) - free, 0), np.maximum(np.asarray(predicted) - free, 0)

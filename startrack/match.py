@@ -162,7 +162,7 @@ class CandidatePairs:
 
     @cached_property
     def dimming_mag(self) -> Array:
-        """By how much the detection (k,) is fainter than its star, beyond twice the catalogue's sigma."""
+        """Magnitudes (k,) by which a detection is fainter than its star, beyond twice the catalogue's sigma."""
         dimmed = self.scale.measured_mag[self.detection] - self.v_mag
         dimmed[self.scale.saturated[self.detection] & (dimmed > 0)] = 0.0
         beyond: Array = np.copysign(np.maximum(np.abs(dimmed) - 2 * self.v_sigma_mag, 0.0), dimmed)
@@ -191,7 +191,7 @@ class CandidatePairs:
         return np.sort(by_cost[last_of_each(self.detection[by_cost])])
 
     def unambiguous(self, which: Ints, variance_px2: Array, radius_px: float) -> Ints:
-        """Of the one-to-one pairs `which` (m,) those with an unambiguous star; `variance_px2` (m,) is per axis.
+        """The one-to-one pairs `which` (m,) with an unambiguous star; `variance_px2` (m,) is per axis.
 
         Stars within the radius of a detection that have no detection of their own share its light. The detection is
         named after the brightest of them if its position allows that. It is dropped if another star is nearly as

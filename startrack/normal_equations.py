@@ -1,6 +1,6 @@
 """Observations of one lens in many images, and their normal equations, solved by the Schur complement.
 
-The attitudes of different images share only the lens, so that each image's block is eliminated by itself: the cost
+The attitudes of different images share only the lens, so that each image's block is eliminated alone: the cost
 grows linearly with the number of images, where a dense solution grows with its cube.
 """
 
@@ -95,11 +95,11 @@ class NormalEquations:
         )  # fmt: skip
 
     def with_prior(self, precision: Array, offset: Array) -> NormalEquations:
-        """With a prior of the lens parameters: precisions (m,) and expected values minus the current ones (m,)."""
+        """With a prior of the lens parameters: precisions (m,) and expected minus current values (m,)."""
         return replace(self, lens=self.lens + np.diag(precision), lens_right=self.lens_right + precision * offset)
 
     def with_damping(self, damping: float) -> NormalEquations:
-        """With the diagonals multiplied by 1 + damping. Source: Marquardt 1963, J. SIAM 11, 431."""
+        """The equations with the diagonals multiplied by 1 + damping. Source: Marquardt 1963, J. SIAM 11, 431."""
         return replace(
             self,
             lens=self.lens + damping * np.diag(np.diag(self.lens)),

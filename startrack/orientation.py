@@ -84,7 +84,7 @@ def identify_stars(
 
 
 def identify_unknown_lens(detected: Detected, fov_rad: float, catalog: StarCatalog) -> Identified:
-    """As `identify_stars`, with the camera found from the approximate field of view `fov_rad` [rad].
+    """The same as `identify_stars`, with the camera found from the approximate field of view `fov_rad` [rad].
 
     `detected` has the point sources, `catalog` the stars. Raises NotIdentified, TooFewStars.
     """

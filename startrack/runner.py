@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 CONNECT_S = 10.0
 CLOSE_S = 5.0  # for idle processes to end by themselves
 TASK_LIMIT_S = 900.0  # without any result: far above the slowest image, reached only by a process that stands still
-TASKS_PER_PROCESS = 2  # submitted at a time: one in hand and the next
+TASKS_PER_PROCESS = 2  # submitted at a time: one in progress and the next
 TASKS_PER_CLUSTER_THREAD = 4  # submitted at a time: 100,000 tasks take no more memory than a hundred
 DIED = "the process that worked on it died (out of memory?) or stood still, alone as it did beside others"
 DIED_ON_CLUSTER = "the Dask workers that worked on it died, one after the other (out of memory?)"
@@ -84,7 +84,7 @@ class Runner(Generic[Task, Result]):
             self._client = None
 
     def stop(self) -> None:
-        """Start no further task; `results` ends after those in hand. A signal handler may call this."""
+        """Start no further task; `results` ends after the tasks in progress. A signal handler may call this."""
         self._stopping = True
 
     def connect(self) -> Client:
@@ -112,7 +112,7 @@ class Runner(Generic[Task, Result]):
             yield from self._run_in_pool(tasks)
 
     def _run_in_pool(self, tasks: Iterable[Task]) -> Generator[tuple[Task, Result | Died], None, None]:
-        """After a process has died or stood still, the tasks then in hand are repeated one by one to find the cause."""
+        """After a process has died or stood still, the tasks in progress are repeated one by one to find the cause."""
         coming = iter(tasks)
         while True:
             self._pool = self._pool or _Pool(self.jobs)
@@ -132,7 +132,7 @@ class Runner(Generic[Task, Result]):
     def _until_failure(
         self, coming: Iterator[Task], pool: _Pool, most_submitted: int
     ) -> Generator[tuple[Task, Result | Died], None, list[Task]]:
-        """Yield results; return the tasks in hand when a process died or stood still, none if all tasks are done.
+        """Yield results; return the tasks in progress when a process died or stood still, none if all tasks are done.
 
         After a failure, and where the caller stops asking, the pool is closed.
         """
@@ -232,7 +232,7 @@ def _blocked_signals() -> Iterator[None]:
 
 def _begin_process() -> None:
     """The first call in a new process."""
-    for number in SIGNALS:  # sent to the whole process group: the tasks in hand are finished
+    for number in SIGNALS:  # sent to the whole process group: the tasks in progress are finished
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     import cv2
@@ -241,7 +241,7 @@ def _begin_process() -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent has ended, also by kill -9: a resumed run must find nobody at work."""
+    """End this process when its parent has ended, also by kill -9: a resumed run must not find it at work."""
     parent = parent_process()
     if parent is not None:
         wait_for_sentinels([parent.sentinel])

@@ -83,7 +83,7 @@ class Inputs:
 
     @property
     def warnings(self) -> list[str]:
-        """What was found in the image's file and not used."""
+        """Facts in the image's file that were not used."""
         return list(self.exposure.warnings)
 
 
@@ -140,7 +140,7 @@ class Measured(Oriented):
 
     @property
     def warnings(self) -> list[str]:
-        """What was found in the image's file and not used, and the azimuths that the terrain does not cover."""
+        """Facts in the image's file that were not used, and azimuths that the terrain does not cover."""
         return [*self.exposure.warnings, *self.terrain.masked_sectors()]
 
 
@@ -165,7 +165,7 @@ class Located(Measured):
 
     @property
     def message(self) -> str:
-        """How many positions fit, where there are several."""
+        """Number of positions that fit, if there are several."""
         return f"{len(self.fix.modes)} positions fit the stars" if self.fix.ambiguous else ""
 
 
@@ -232,7 +232,7 @@ class Run:
             self._timing_ms[stage] = self._timing_ms.get(stage, 0.0) + 1e3 * (clock.perf_counter() - start)
 
     def step(self, stage: str, function: Callable[..., T], *args: Any) -> T:
-        """As `time`, for a function that returns the next complete value."""
+        """The same as `time`, for a function that returns the next complete value."""
         value = self.time(stage, function, *args)
         self.reached = value
         return value

@@ -81,7 +81,7 @@ def test_a_signal_ends_the_batch_after_the_frames_in_hand_with_tables_of_what_is
     rest, err = process.communicate()
     done = len(rest.splitlines()) + 5
     assert process.returncode == 5
-    assert err.count("finishing the images in hand") == 1
+    assert err.count("finishing the images in progress") == 1
     assert f"{why}: {done} of 400 images done, tables in {out}; the same command without -O goes on" in err
     assert len(Table.read(out / "results.ecsv", format="ascii.ecsv")) == len(list(out.glob("*.fix.json"))) == done
     assert not list(out.glob(".*"))
@@ -124,7 +124,7 @@ def test_a_reader_that_goes_ends_the_batch_early(many, tmp_path):
         process.stdout.close()
         err = process.stderr.read()
     assert process.returncode == 5
-    assert "nobody reads the output any more" in err
+    assert "the output is no longer read" in err
     assert "Traceback" not in err
 
 

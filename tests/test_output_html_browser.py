@@ -296,4 +296,4 @@ def test_ten_thousand_rows_scroll(window):
     assert took_ms < 3000
     w.page.get_by_role("searchbox").fill("00042")
     assert w.page.locator("tbody th[scope=row]").all_inner_texts() == ["n/00042.png"]
-    assert "2,500 with a known place" in w.page.locator("#overview").inner_text()
+    assert "2,500 with a known position" in w.page.locator("#overview").inner_text()

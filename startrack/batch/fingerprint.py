@@ -89,7 +89,7 @@ def _relative_path(image: Path, file: str | Path) -> str:
 
 
 def _cached_sha256(path: Path) -> str:
-    """As `sha256_of`; a height map is read once, not for every image."""
+    """The same as `sha256_of`; a height map is read once, not for every image."""
     try:
         found = path.stat()
     except (OSError, ValueError):

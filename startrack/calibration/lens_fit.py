@@ -90,7 +90,7 @@ def fit_lens(
 def fit_state(
     state: CameraState, points: Observations, *, coefficients: int | None = None, square: bool = False
 ) -> LensFit:
-    """As fit_lens, from a state: that of boards has positions beside the attitudes."""
+    """The same as fit_lens, from a state; that of boards has positions beside the attitudes."""
     if len(points) < FEWEST:
         raise NotIdentified(f"{len(points)} matched stars cannot determine a lens: at least {FEWEST} are needed")
     for _ in range(2):

@@ -165,7 +165,7 @@ def _fit(model: LensModel, start: CameraState, points: Observations, extra_px2: 
 
 
 def _longest_of_the_best(fitted: list[_Fitted], outermost_rad: float) -> _Fitted:
-    """Of the equally good polynomials the longest; in narrow fields the shortest, where the terms are degenerate."""
+    """The longest of the equally good polynomials; in narrow fields, where the terms are degenerate, the shortest."""
     enough = min(RISES_BEYOND_1 * outermost_rad, np.pi - 0.01)
     sound = [f for f in fitted if f.solution.state.camera.lens.max_invertible_rad > enough] or fitted
     least = min(f.score.held_out_chi2 for f in sound)

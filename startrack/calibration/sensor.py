@@ -41,7 +41,7 @@ class SensorProperties:
 
 
 def measure_sensor(joint: JointFit, rings: int) -> SensorProperties:
-    """Sensor properties from the exposures of a calibration; the PSF in so many rings."""
+    """Sensor properties from the exposures of a calibration; the PSF in rings."""
     widths = measure_psf_widths(joint)
     pairs, same_sky = _pairs(joint)
     camera = joint.fit.camera

@@ -40,7 +40,7 @@ class Verification:
 
 
 def verify(exposure: Exposure, camera: Camera, catalog: StarCatalog, site: Site | None = None) -> Verification:
-    """Fit the lens afresh to the picture and compare the maps where both are calibrated.
+    """Fit the lens to the picture and compare the projections where both are calibrated.
 
     Raises BadInput no_time, NotIdentified (also reason mirrored) where the stars cannot be identified with the file.
     """

@@ -151,7 +151,7 @@ def _locate_all(
                 show(record, counts)
     except RunStopped as cause:
         halt.why = str(cause)
-    except KeyboardInterrupt:  # the images in hand are dropped; what is done has its tables all the same
+    except KeyboardInterrupt:  # the images in progress are dropped; the tables contain the finished ones
         halt("interrupted")
     return records, halt.why if len(records) < len(tasks) else None
 

@@ -1,4 +1,4 @@
-"""What a batch prints while it runs, and how signals stop it early."""
+"""Output of a batch while it runs, and its early stop by signals."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from startrack.batch import Rows
 
 SHOWN = ("ok", "ambiguous", "refused", "error")
-FINISHING = b"\nstartrack: finishing the images in hand; Ctrl-C once more drops them\n"
+FINISHING = b"\nstartrack: finishing the images in progress; a second Ctrl-C drops them\n"
 SAME_SIGNAL_S = 1.0  # a second signal within it is the same request: timeout signals process and group
 Counts = Counter[str]  # images by outcome: ok, ambiguous, refused, error; and kept, warned
 Show = Callable[[dict[str, Any], Counts], None]
 
 
 class Halt:
-    """Stops a batch after the images in hand, and keeps the first cause."""
+    """Stops a batch after the images in progress, and keeps the first cause."""
 
     def __init__(self, stop: Callable[[], None]) -> None:
         self.why: str | None = None
@@ -41,7 +41,7 @@ class Halt:
 
 @contextmanager
 def signals_halt(halt: Halt) -> Iterator[None]:
-    """In the block the first Ctrl-C or SIGTERM stops the batch after the images in hand; a later one drops those."""
+    """In the block the first Ctrl-C or SIGTERM stops the batch after the images in progress; a later one drops them."""
     first_s: float | None = None
 
     def on_signal(number: int, _: object) -> None:
@@ -81,7 +81,7 @@ def outcomes_shown(total: int, args: argparse.Namespace, halt: Halt) -> Iterator
                 print(f"{record['image']}: {record['status']} {record['message']}".rstrip(), flush=True)
         except BrokenPipeError:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            halt("nobody reads the output any more")
+            halt("the output is no longer read")
 
     with progress("locate", total, shown=not args.quiet) as bar:
 

@@ -151,7 +151,7 @@ def print_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) -
 
 
 def output_path(args: argparse.Namespace, default: str) -> Path:
-    """Where the result goes, its folder made. Raises BadInput if that is impossible."""
+    """Path of the result; its folder is made. Raises BadInput if that is impossible."""
     path = Path(args.output) if args.output else Path(args.dir) / default
     make_folder(path.parent)
     return path

@@ -108,7 +108,7 @@ def _write_any_text() -> None:
 
 
 def _discard_stdout() -> None:
-    """Send to nowhere what is left in the buffer: its reader has gone, or its disk is full."""
+    """Discard the rest of the buffer: its reader has ended, or its disk is full."""
     try:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (OSError, ValueError):  # not a file, as under a test

@@ -1,4 +1,4 @@
-"""What a terrain needs before its first fix: compiled kernels and, for a height map, the table of its horizons."""
+"""Preparation of a terrain for its first fix: compiled kernels and, for a height map, the table of its horizons."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def compile_kernels(terrain: Terrain) -> None:
         llr=np.repeat([LLR, -LLR], RAYS),
         edge_sigma_rad=np.full(2 * RAYS, EDGE_SIGMA_RAD),
     )
-    with suppress(NotLocated):  # whatever the answer, the kernels are compiled
+    with suppress(NotLocated):  # the kernels are compiled in any case
         ExactPosterior()(evidence, terrain)
 
 

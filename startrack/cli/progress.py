@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
 
 class Progress:
-    """How far a command has come; this one shows nothing."""
+    """Progress of a command; this class shows nothing."""
 
     def advance(self, steps: int = 1, text: str | None = None) -> None:
-        """So many more steps are done; `text` names the current step."""
+        """Further steps are done; `text` names the current step."""
 
     def update(self, completed: int, total: int) -> None:
-        """So many steps are done, of how many."""
+        """Numbers of steps done and of all steps."""
 
 
 class _Bar(Progress):

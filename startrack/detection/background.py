@@ -109,7 +109,7 @@ def _blocks(image: Image, side: int, quantum: float) -> Image:
     Of larger blocks some pixels, spread evenly, are enough: squares of two by two, for colour filters' sake.
 
     Medians of whole numbers are whole numbers, and a spread would be wrong by up to half a step in 8-bit images: the
-    same pattern of part-steps, of mean zero, is added to every block; its variance must be taken away again.
+    same pattern of part-steps, of mean zero, is added to every block; its variance must be subtracted.
     """
     height, width = image.shape
     below, right = -height % side, -width % side
@@ -123,7 +123,7 @@ def _blocks(image: Image, side: int, quantum: float) -> Image:
 
 
 def _clipped_spread(ordered: Image, quantum: np.float32) -> tuple[Image]:
-    """Standard deviation (n,) of rows (n, m) of hardly more than one value, in whose quantiles the noise hides."""
+    """Standard deviation (n,) of rows (n, m) of little more than one value, whose quantiles do not show the noise."""
     middle = ordered[:, ordered.shape[1] // 2, None]
     return (np.clip(ordered, middle - 4 * quantum, middle + 4 * quantum).std(axis=1),)
 

@@ -85,7 +85,7 @@ def clear_of_wings(xy_px: Array, flux: Array, height: Array, sigma: float, thres
 
 
 def peak_heights(fits: PointFits) -> Array:
-    """By how many sigma each source (n) stands out.
+    """Height of each source (n) above its surroundings, in sigma.
 
     Above its surroundings, whose level is known better than that of the stamp, where the stamp by itself shows at least
     OWN_LEVEL_PART of it; by its own stamp alone where the two levels do not agree: on a slope or at the skyline.

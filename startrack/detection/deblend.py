@@ -1,4 +1,4 @@
-"""Fits of all candidates, each with its neighbours' light taken away."""
+"""Fits of all candidates, each with its neighbours' light subtracted."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from startrack.psf import pixel_profile_single
 from startrack.types import Array, Ints
 
 CROWDED_ROUNDS = 3  # of subtracting neighbours and fitting again
-NEIGHBOUR_SIGMA = 0.1  # neighbours' light above this part of a pixel's noise is taken away
+NEIGHBOUR_SIGMA = 0.1  # neighbours' light above this part of a pixel's noise is subtracted
 NEIGHBOUR_ERROR = np.float32(0.1)  # of it is not known: neighbours' fits, and the PSF's wings
 BATCH_PIXELS = 2_000_000  # of neighbours' stamps at a time
 

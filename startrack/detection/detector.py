@@ -37,7 +37,7 @@ from startrack.types import Array, Bools, Detections, Exposure, Ints, TooFewStar
 UNKNOWN_WIDTH_PX = 1.2  # first guess where the camera file does not state the width
 FIRST_PASS_LOWER = 1.1  # units of the filtered noise by which the candidates' threshold is lower than the stars'
 WINGS_SIGMAS = 4.0  # radius of the area that a star covers
-CROWDED_FRACTION = 0.06  # covered by stars: from here up they are taken away before the background is measured again
+CROWDED_FRACTION = 0.06  # covered by stars: from here up they are subtracted before the background is measured again
 NOTHING_SEEN = "no point source stands above the noise: was the lens cap on, or the exposure too short?"
 
 
@@ -124,7 +124,7 @@ class Detector:
         return _Candidates(frame, small, side, sigma, fit_all(small, peaks, sigma / side))
 
     def _detect_again(self, candidates: _Candidates, stars: PointFits) -> tuple[Frame, PointFits]:
-        """The frame and its stars, those known taken away before background and faint ones are measured."""
+        """The frame and its stars, the known ones subtracted before background and faint ones are measured."""
         side, sigma, frame = candidates.side, candidates.sigma, candidates.frame
         frame = _FrameSource(frame.image, frame.dead, candidates.fitted.light_noise).frame(
             sigma, paint_sources(stars, sigma, frame.shape)

@@ -25,7 +25,7 @@ class PointFits:
     chi2_pixel: Array  # (n,) of a single bright pixel instead
     dof: Array  # (n,)
     surround: Array  # (n,) level of the wider surroundings
-    significance: Array  # (n,) matched-filter SNR of the light against nothing but background noise
+    significance: Array  # (n,) matched-filter SNR of the light against background noise alone
     snr: Array  # (n,) matched-filter SNR, the source's own photon noise included
 
     def take(self, which: Ints) -> PointFits:

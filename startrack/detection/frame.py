@@ -1,4 +1,4 @@
-"""What every step of detection looks at: the frame without its background, its noise, its unusable pixels."""
+"""Input of every step of detection: the frame without its background, its noise, its unusable pixels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Image = NDArray[np.float32]
 Pixels = NDArray[np.floating[Any]]  # stamps, in either precision
 SATURATED_FRACTION = 0.98
 MIN_BINNED_SIGMA_PX = 1.8  # from here up the pixels are smaller than need be
-RESIDUAL_FRACTION = 0.1  # fraction of a known star's light that may be left when it is taken away
+RESIDUAL_FRACTION = 0.1  # fraction of a known star's light that may be left when it is subtracted
 MODEL_ERROR = 0.03  # fraction of a star's own light by which real PSFs differ from the Gaussian
 
 
@@ -78,7 +78,7 @@ def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray
 
 
 def electrons_at(exposure: Exposure, camera: Camera, rows: Ints, columns: Ints) -> tuple[Image, NDArray[np.bool_]]:
-    """As `electrons` of an `exposure` and its `camera`, of the pixels (n,) at some rows and columns (n,) only."""
+    """The same as `electrons` of an `exposure` and its `camera`, for the pixels (n,) at `rows` and `columns` (n,)."""
     return _to_electrons(exposure.pixels_adu[rows, columns], exposure, camera)
 
 

@@ -15,7 +15,7 @@ from startrack.psf import filter_kernel
 from startrack.types import Array, Bools, Ints
 
 STRIP_ROWS = 320
-MAX_STAMP_PIXELS = 2_500_000  # of all candidates together: bounds time and memory, whatever the frame holds
+MAX_STAMP_PIXELS = 2_500_000  # of all candidates together: bounds time and memory, for any content of the frame
 MAX_BLOBS = 1000  # saturated; the largest
 MAX_DEAD_GROUPED_PX = 20_000  # pixels up to which they are grouped without looking at the whole mask
 OWN_RESIDUE_SIGMAS = 1.5
@@ -177,7 +177,7 @@ def _saturated_blobs(dead: NDArray[np.bool_] | None, margin: int) -> Array:
 
 
 def _group_touching(row: Ints, column: Ints, width: int) -> tuple[int, Ints]:
-    """How many groups of touching pixels (corners count) there are among a few, and each one's group (n,)."""
+    """Number of groups of touching pixels (corners count) among a few, and the group (n,) of each pixel."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

@@ -1,4 +1,4 @@
-"""Frames whose stars are drawn out into streaks: detection of such frames, and the middles of the streaks."""
+"""Frames whose stars are streaks: detection of such frames, and the middles of the streaks."""
 
 from __future__ import annotations
 

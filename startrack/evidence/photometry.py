@@ -88,7 +88,7 @@ def _order_by_cell(xy_px: Array, shape: tuple[int, ...], side_px: float) -> tupl
 
 
 def _read_only(picture: NDArray[Any]) -> NDArray[Any]:
-    """The image in one block and never writable: each flag and layout would compile the loop once more."""
+    """The image, contiguous and read-only: another layout or flag would compile the loop again."""
     view = np.ascontiguousarray(picture).view()
     view.flags.writeable = False
     return view

@@ -60,7 +60,7 @@ class Skyline:
 
 @dataclass(frozen=True, eq=False)
 class SkyStep:
-    """How much brighter the sky is than the ground at the skyline, by pixels sampled on both sides."""
+    """Brightness of the sky above that of the ground at the skyline, by pixels sampled on both sides."""
 
     horizon: Horizon  # of the position that the step belongs to
     light_e: float  # median pixel of the sky minus that of the ground; 0 where only one of them is in view
@@ -199,7 +199,7 @@ def _px_per_rad(camera: Camera, angle_rad: Array) -> Array:
 
 
 def _step_e(light_e: NDArray[np.float32], above: Bools) -> tuple[float, float]:
-    """How much brighter the pixels (n,) `above` the skyline are than the others, and the standard deviation of that."""
+    """Difference of the pixels (n,) `above` the skyline and the others, and its standard deviation."""
     sides = light_e[above], light_e[~above]
     if not all(map(len, sides)):
         return 0.0, 0.0

@@ -29,7 +29,7 @@ SEEN_LLR = 3.0  # from here on a star counts as seen, from minus this as hidden
 
 @dataclass(frozen=True, kw_only=True)
 class StarPhotometry:
-    """What was expected and measured at each catalogue star in the frame (n); the star table's rows."""
+    """Expected and measured light of each catalogue star in the frame (n); the star table's rows."""
 
     star: Ints  # index into Stars
     xy_px: Array  # (n, 2) predicted
@@ -161,7 +161,7 @@ def stars_in_view(camera: Camera, stars: Stars, R_cam_icrs: Array, faintest_mag:
 
 
 def _max_stars(camera: Camera, area_px: float) -> int:
-    """How many stars fit on the frame, each on an area [px^2] of its own. Stars are sorted, the brightest first."""
+    """Number of stars that fit on the frame, each on its own area [px^2]. Stars are sorted, the brightest first."""
     rho = float(camera.lens.rho(np.array(camera.max_angle_rad)))
     circle = np.pi * camera.focal_px[0] * camera.focal_px[1] * rho**2
     width, height = camera.size_px

@@ -28,7 +28,7 @@ REFUSED = {MINISWHITE: "white-is-zero", 3: "palette", 4: "a mask", 5: "CMYK", 6:
 CHANNELS = {MINISBLACK: 1, MOSAIC: 1, RGB: 3}
 UNCOMPRESSED = 1
 WITHOUT_IMAGECODECS = {UNCOMPRESSED, 8, 32946, 32773}  # deflate twice, PackBits: tifffile needs nothing more for these
-HORIZONTAL = 2  # the predictor it has by itself
+HORIZONTAL = 2  # the predictor that it has itself
 READ = "integers of 8, 16 or 32 bits and floating point"
 TYPES = {"uint8", "uint16", "uint32", "int8", "int16", "int32", "float16", "float32", "float64"}
 

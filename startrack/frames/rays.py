@@ -56,7 +56,7 @@ def aberrate(rays_icrs: ArrayLike, velocity_m_s: ArrayLike) -> Array:
     along = (rays @ beta)[..., None]
     moved = (1.0 + along / (1.0 + inverse_gamma)) * beta
     moved += inverse_gamma * rays
-    # Normalised afresh instead of divided by 1 + n.b: rounding in the catalogue's rays must not accumulate.
+    # Normalised instead of divided by 1 + n.b: rounding in the catalogue's rays must not accumulate.
     moved /= np.sqrt(np.einsum("...i,...i->...", moved, moved))[..., None]
     return np.asarray(moved)
 

@@ -53,7 +53,7 @@ class AttitudeSearch:
     mirrored: list[tuple[Array, Array, int, float]] = field(default_factory=list)  # matches of the other handedness
 
     def hypotheses(self, tolerance_px: float, rough_px: float) -> Iterator[AttitudeHypothesis]:
-        """Attitudes that chance hardly explains.
+        """Attitudes that are unlikely by chance.
 
         First from long triangles of the few brightest detections, then of fainter ones and with more catalogue stars,
         then from triangles that no index lists; last from short ones, for rays in error by `rough_px`: over a short
@@ -132,7 +132,7 @@ class AttitudeSearch:
     def _plausible(
         self, cam: Array, icrs: Array, rays_cam: Array, first: int, tolerance: float
     ) -> Iterator[AttitudeHypothesis]:
-        """Of the attitudes that rotate the rays icrs (m, 3, 3) to cam (m, 3, 3), those that bright stars support."""
+        """Attitudes that rotate the rays icrs (m, 3, 3) to cam (m, 3, 3) and that bright stars support."""
         some, radius = rays_cam[: first + VERIFIED], 2.0 * tolerance
         depth = int(DEPTH_FACTOR * 4 * np.pi / self.patterns.field_sr * len(some))
         for R in self._supported_attitudes(cam, icrs, some[max(first - WINDOW, 0) : first + SIFTED], radius, depth):

@@ -69,7 +69,7 @@ class ShapePatterns:
 
 @dataclass(frozen=True)
 class PatternSizes:
-    """How the catalogue's patterns are chosen for a field of view."""
+    """Numbers of catalogue patterns for a field of view."""
 
     stars: int  # brightest of the whole sky
     longest_side_rad: float

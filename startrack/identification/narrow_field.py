@@ -239,7 +239,7 @@ def _choose_lens(view: PinholeView, xy_px: Array, rays_icrs: Array, sigma_px: fl
 
 
 def _unambiguous(pairs: CandidatePairs, which: Ints, centroids: Centroids) -> Ints:
-    """Of the one-to-one pairs those with an unambiguous star."""
+    """The one-to-one pairs with an unambiguous star."""
     some = centroids.covariance_px2[pairs.detection[which]]
     variance_px2 = 0.5 * (some[:, 0, 0] + some[:, 1, 1]) + SMALLEST_ERROR_PX**2
     return pairs.unambiguous(which, variance_px2, min(BLEND_SIGMAS * centroids.psf_sigma_px, WIDEST_BLEND_PX))

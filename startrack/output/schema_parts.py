@@ -1,4 +1,4 @@
-"""What the schemas are made of."""
+"""Parts of the schemas."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the output quantities are computed from the values of the pipeline, and how some of them are spelled."""
+"""Functions that compute the output quantities from the values of the pipeline, and texts of some of them."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def body_sigmas_deg(value: Measured) -> Array:
 
 
 def predicted_visible(value: Located) -> int:
-    """How many stars of a located `value` whose light was measured stand above the skyline of the fix."""
+    """Number of stars of a located `value` that were measured and are above the skyline of the fix."""
     if value not in _predicted_visible:  # horizons of a height map take time, and several outputs need this number
         light = value.light
         horizon = value.terrain.horizon_rad(np.array([place_m(value.fix)]), light.azimuth_rad)
@@ -141,5 +141,5 @@ def arcsec_text(sigma: list[float]) -> str:
 
 
 def exact_lens_text(included: bool) -> str:
-    """What a sigma of the attitude leaves out, where the camera has no covariance."""
+    """Text for a sigma of the attitude that lacks the lens, because the camera has no covariance."""
     return "" if included else ", the lens taken as exact"

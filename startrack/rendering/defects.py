@@ -8,7 +8,7 @@ from startrack.rendering.psf import splat
 from startrack.rendering.scene import HotPixels
 from startrack.types import Array
 
-HOT_E_PER_S = (50.0, 50_000.0)  # dark current of hot pixels: even in its logarithm, from hardly seen to glaring
+HOT_E_PER_S = (50.0, 50_000.0)  # dark current of hot pixels: even in its logarithm, from barely visible to glaring
 TRACK_MEAN_PX = 6.0  # exponential length: most rays pass steeply, a few graze along the chip
 TRACK_LONGEST_PX = 80.0
 TRACK_E_PER_PX = 150.0  # median charge along a track, log-normal; a muon leaves about 80 e per micrometre of silicon

@@ -74,7 +74,7 @@ class Scene(Value):
 
 @dataclass(frozen=True, kw_only=True)
 class Truth(Value):
-    """What a scorer may compare with: no stage reads it. One row per light source inside the image circle and frame."""
+    """The truth for comparisons; no stage reads it. One row per light source inside the image circle and frame."""
 
     position_enu_m: Array = array(3)
     R_cam_enu: Array = array(3, 3)

@@ -33,7 +33,7 @@ _SKY, _SENSOR, _EXPOSURE = 0, 1, 2
 
 @dataclass(frozen=True, kw_only=True)
 class Series:
-    """Settings of a series of exposures; what is None is drawn from the seed, afresh for each exposure."""
+    """Settings of a series of exposures; fields that are None are drawn from the seed for each exposure."""
 
     camera: Camera
     terrain: Terrain

@@ -14,7 +14,7 @@ from startrack.reproduction.chunks import ChunkStore
 
 @dataclass(frozen=True)
 class Size:
-    """How much is computed: numbers of positions per sky. Smaller sizes are the first part of larger ones."""
+    """Amount of work: numbers of positions per sky. Smaller sizes are the first part of larger ones."""
 
     name: str
     skies: int  # of table 3.1 and figures B.1 to B.10
@@ -29,7 +29,7 @@ class Size:
     traverses: int
 
     def with_ours(self, most: int) -> Size:
-        """This size with our method on at most so many positions per starfield, ten times as many in figure 3.10."""
+        """This size with our method on at most `most` positions per starfield, ten times as many in figure 3.10."""
         per_sky = {name: min(getattr(self, name), most) for name in ("ours_per_sky", "bound_per_sky", "deep_per_sky")}
         return replace(self, **per_sky, ours_one_sky=min(self.ours_one_sky, 10 * most))
 

@@ -26,7 +26,7 @@ class MethodErrors:
 
     @property
     def errors(self) -> Array:
-        """Of all skies (n,) [m]."""
+        """Errors of all skies (n,) [m]."""
         return np.concatenate(self.errors_m)
 
     @property

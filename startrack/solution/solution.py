@@ -72,7 +72,7 @@ class Solution:
 
     @property
     def covariance_m2(self) -> Array | None:
-        """Of (east, north), (2, 2) [m2]."""
+        """Covariance of (east, north), (2, 2) [m2]."""
         fix = self._fix
         return None if fix is None else fix.covariance_m2
 
@@ -109,7 +109,7 @@ class Solution:
 
     @cached_property
     def boresight(self) -> SkyCoord | None:
-        """Where the camera's axis points, ICRS."""
+        """Direction of the camera's axis, ICRS."""
         value = last_value(self.result)
         if not isinstance(value, Oriented):
             return None
@@ -132,11 +132,11 @@ class Solution:
 
     @property
     def warnings(self) -> list[str]:
-        """What was found in the image's file and not used, and the azimuths that the terrain does not cover."""
+        """Facts in the image's file that were not used, and azimuths that the terrain does not cover."""
         return self.result.warnings
 
     def to_dict(self) -> dict[str, Any]:
-        """What `NAME.fix.json` holds, or `NAME.identification.json`, or `NAME.detections.json`."""
+        """Content of `NAME.fix.json`, or `NAME.identification.json`, or `NAME.detections.json`."""
         return record_of(self.result, self.kind)
 
     def write(self, folder: str | os.PathLike[str], *, plots: bool = True, overwrite: bool = False) -> Path:

@@ -61,7 +61,7 @@ class Ellipse(Shown):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Position(Shown):
-    """Where the camera is: the posterior's mean in the terrain's frame `enu`, and how sure that is."""
+    """Position of the camera: the posterior's mean in the terrain's frame `enu`, with its uncertainty."""
 
     east: Quantity  # [m] from the terrain's origin
     north: Quantity  # [m]
@@ -93,7 +93,7 @@ class Position(Shown):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Orientation(Shown):
-    """How the camera is turned to the stars and, with a terrain and a time, how the rover stands."""
+    """Attitude of the camera to the stars and, with a terrain and a time, of the rover."""
 
     rotation: Rotation  # from icrs to cam: rotation.apply(rays_icrs) are rays_cam
     ra: Angle  # of the camera's axis, ICRS
@@ -109,7 +109,7 @@ class Orientation(Shown):
 
 
 def position_of(result: Inputs) -> Position | None:
-    """Of a result whose status is ok."""
+    """Position of a result whose status is ok."""
     if not isinstance(result, Located) or result.fix.ambiguous:
         return None
     fix, terrain = result.fix, result.terrain
@@ -125,7 +125,7 @@ def position_of(result: Inputs) -> Position | None:
 
 
 def orientation_of(result: Inputs) -> Orientation | None:
-    """Of a result whose stars were identified."""
+    """Orientation of a result whose stars were identified."""
     if not isinstance(result, Oriented):
         return None
     attitude = result.attitude

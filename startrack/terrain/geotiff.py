@@ -41,7 +41,7 @@ def read_geotiff(path: Path) -> Grid | None:
     import tifffile
 
     try:
-        with _silent_tifffile(), tifffile.TiffFile(path) as file:
+        with _suppress_tifffile_log(), tifffile.TiffFile(path) as file:
             page = file.pages.first
             keys, gdal = file.geotiff_metadata, file.gdal_metadata
             if not keys:
@@ -74,8 +74,8 @@ def read_geotiff(path: Path) -> Grid | None:
 
 
 @contextmanager
-def _silent_tifffile() -> Iterator[None]:
-    """Without tifffile's log of errors in a file: the exception has the cause."""
+def _suppress_tifffile_log() -> Iterator[None]:
+    """Suppress tifffile's log of errors in a file: the exception has the cause."""
     log = logging.getLogger("tifffile")
     level = log.level
     log.setLevel(logging.CRITICAL + 1)

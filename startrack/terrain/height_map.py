@@ -165,7 +165,7 @@ class HeightMap(Terrain):
     def horizon_bounds_rad(
         self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
     ) -> tuple[Array, Array]:
-        """Bounds of the horizon over boxes [rad]: from the table, and for single rays and small boxes traced anew."""
+        """Bounds of the horizon over boxes [rad]: from the table, and for single rays and small boxes by tracing."""
         centres_m = np.asarray(centres_m, dtype=np.float64)
         shape = np.broadcast_shapes(
             centres_m.shape[:-1], np.shape(half_m), np.shape(azimuths_rad), np.shape(azimuth_half_rad)

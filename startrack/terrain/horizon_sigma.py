@@ -1,4 +1,4 @@
-"""What the posts' errors make of the horizon: the post that makes it moves the crest by its own error."""
+"""Standard deviation of the horizon from the posts' errors: the highest post moves the crest by its own error."""
 
 from __future__ import annotations
 

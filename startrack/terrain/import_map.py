@@ -16,7 +16,7 @@ from startrack.terrain.raster_io import read_map
 from startrack.types import BadInput
 
 RIM_RADII = 1.5  # of the search area: most of the rim is nearer
-MAX_POST_RADII = 0.2  # of the search area: with posts further apart it has hardly any shape
+MAX_POST_RADII = 0.2  # of the search area: with posts further apart its shape is not resolved
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +111,7 @@ def smoothness_warnings(rim: Raster, height_sigma_m: float) -> list[str]:
 
 
 def spacing_warnings(maps: Sequence[Raster], radius_m: float) -> list[str]:
-    """A warning if the posts are so far apart that the search area has hardly any shape."""
+    """A warning if the posts are so far apart that the shape of the search area is not resolved."""
     post_m = min(one.post_m for one in maps)
     if post_m <= MAX_POST_RADII * radius_m:
         return []

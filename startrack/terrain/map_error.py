@@ -50,7 +50,7 @@ def error_between_posts_m(height_map: Raster, spacing: float | None = None) -> f
 def _error_of_posts_further_apart(h: Array, apart: float) -> float:
     """RMS error [m] of a surface drawn smoothly through posts `apart` times as far from each other as the map's.
 
-    The finest levels hold nothing but that surface; the error is measured at the first coarser one.
+    The finest levels contain only that surface; the error is measured at the first coarser one.
     """
     level = max(int(np.ceil(np.log2(apart) - SPACING_TOLERANCE_OCTAVES)), 0)
     step = 2**level
@@ -94,7 +94,7 @@ def _rms(values: Array) -> float:
 def carried_spacing(heights_m: Array) -> float:
     """Spacing [posts] of the ground that a map (rows, columns) carries; 1 where it is as fine as its posts.
 
-    A smooth surface through posts further apart has hardly any power at wavelengths below two of their spacings; one
+    A smooth surface through posts further apart has little power at wavelengths below two of their spacings; one
     with straight lines between them bends only there. NaN are holes.
     """
     return max(_spacing_by_spectrum(heights_m), float(_spacing_by_bends(heights_m)))
@@ -139,7 +139,7 @@ def _power(h: Array) -> Array | None:
 
 
 def _spacing_by_bends(h: Array) -> int:
-    """The widest spacing at which all bends lie at one post, or at two neighbours, of each so many."""
+    """The widest spacing at which all bends lie at one post, or at two neighbours, in each period."""
     return max((s for s in range(2, MAX_SPACING + 1) for lines in (h, h.T) if _bends_at_posts(lines, s)), default=1)
 
 

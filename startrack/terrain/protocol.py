@@ -1,4 +1,4 @@
-"""What a terrain answers: how high the horizon stands, and between which bounds over a box of positions."""
+"""The terrain protocol: elevation of the horizon at a position, and its bounds over a box of positions."""
 
 from __future__ import annotations
 

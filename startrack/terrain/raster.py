@@ -202,7 +202,7 @@ class Raster:
         return np.asarray(top * (1 - down) + bottom * down)
 
     def grid_numbers(self, site: Site) -> Array:
-        """What takes a vector from the Moon's centre in the site's enu axes to (column, row), as 16 numbers.
+        """Projection of a vector from the Moon's centre in the site's enu axes to (column, row), as 16 numbers.
 
         kind, R_projection_enu (9), size along x and y [m], column = (x - n12) n13, row = (y - n14) n15.
         """

@@ -95,7 +95,7 @@ def discard_table(key: str) -> None:
 def single_builder(key: str, name: str) -> Iterator[None]:
     """Within the block this process alone makes the table of the key; others wait until it is done or has died.
 
-    Where files cannot be locked (a read-only folder, some network disks) nobody waits, and each process makes its own.
+    Where files cannot be locked (a read-only folder, some network disks) no process waits, and each makes its own.
     """
     path = path_of(key).with_suffix(".lock")
 

@@ -27,7 +27,7 @@ function showDetail(host, k) {
 
 function leadOf(value) {
   if (known(value("east_m"))) {
-    const error = known(value("error_m")) ? ` The true place is ${say(value("error_m"), 1, "m")} away.` : "";
+    const error = known(value("error_m")) ? ` The true position is ${say(value("error_m"), 1, "m")} away.` : "";
     return `East ${say(value("east_m"), 1, "m")}, north ${say(value("north_m"), 1, "m")}, within ${say(value("radius95_m"), 1, "m")} (95 %).${error}`;
   }
   return value("status") === "ok" ? `${say(value("identified"), 0)} stars named.` : "";
@@ -55,7 +55,7 @@ function leftOut() {
 function pictureCard(detail, stars, name, groups) {
   const view = skyView(detail, stars, name);
   const hint = detail.picture.scale && stars.length ? "Point at a star, or tap it. " : "";
-  const ground = detail.record.modes?.length ? "; orange crosses are stars that should be here and are hidden, the blue line is the skyline of the place found." : ".";
+  const ground = detail.record.modes?.length ? "; orange crosses are stars that should be here and are hidden, the blue line is the skyline at the estimated position." : ".";
   return section("Picture", make("p", { class: "dim" }, `${hint}Green rings are stars with a name, grey rings other point sources${ground}`),
     make("div", { class: "beside" }, view.node, make("div", {}, ...groups.map(([title, body]) => make("div", {}, make("h3", {}, title), body)))));
 }
@@ -63,7 +63,7 @@ function pictureCard(detail, stars, name, groups) {
 function panoramaCard(detail, stars, name) {
   const { total } = detail.stars;
   const cut = total > stars.length ? ` The ${say(stars.length, 0)} brightest of ${say(total, 0)} stars; fainter ones appear as you zoom in.` : " Fainter stars appear as you zoom in.";
-  const line = detail.horizon ? "The blue line is the horizon that the map gives at the place found: seen stars belong above it, hidden ones below." : "The terrain's file was not at hand, so its horizon is left out.";
+  const line = detail.horizon ? "The blue line is the horizon that the map gives at the estimated position: seen stars belong above it, hidden ones below." : "The terrain's file is not available, so its horizon is omitted.";
   return section("Panorama", make("p", { class: "dim" }, line + cut), panoramaView(detail, stars, name).node);
 }
 

@@ -71,7 +71,7 @@ def _text_or_number(text: str, decimals: int | None) -> Any:
 
 
 def _drop_empty_columns(columns: Columns) -> Columns:
-    """Without the columns that hold nothing."""
+    """The columns without the empty ones."""
     return {name: values for name, values in columns.items() if any(value not in (None, "") for value in values)}
 
 

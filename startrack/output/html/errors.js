@@ -1,4 +1,4 @@
-// How large the errors are and whether the stated ones hold, where the true places are known.
+// How large the errors are and whether the stated ones hold, where the true positions are known.
 const DECADES = [];
 for (let power = -3; power < 6; power += 1) DECADES.push(power, power + Math.log10(2), power + Math.log10(5));
 
@@ -7,7 +7,7 @@ function errorsCard(rows, open) {
   const measured = rows.filter((row) => known(value(row, "error_m")));
   const e = page.errors;
   const words = facts([
-    ["Images", `${say(e.count, 0)} with a known place`], ["Error", `${say(e.mean_m, 2, "m")} mean, ${say(e.median_m, 2, "m")} median, ${say(e.largest_m, 2, "m")} largest`],
+    ["Images", `${say(e.count, 0)} with a known position`], ["Error", `${say(e.mean_m, 2, "m")} mean, ${say(e.median_m, 2, "m")} median, ${say(e.largest_m, 2, "m")} largest`],
     ["NEES", known(e.mean_nees) ? `${say(e.mean_nees, 2)} mean; 2 is perfect, less is cautious` : null],
     ["Inside the circle", known(e.inside95) ? `95 %: ${say(100 * e.inside95, 1)} % of images; 99.9 %: ${say(100 * e.inside999, 1)} %` : null],
   ]);
@@ -29,7 +29,7 @@ function circleView(rows, value, open) {
   return new View({
     label: "Error of each image beside its stated 95 percent radius", world: [low, low, high, high], square: false, ratio: 0.75, points, most: 20,
     axes: { x: "error", y: "stated 95 % radius", fixed: DECADES, text: (power) => sayLength(Number((10 ** power).toPrecision(3))) },
-    tell: (point) => tellRow(point.row), open: (point) => open(point.row),
+    describe: (point) => rowText(point.row), open: (point) => open(point.row),
     draw(v, g) {
       g.strokeStyle = colour("skyline");
       g.lineWidth = 1.6;
@@ -48,7 +48,7 @@ function neesView(rows, value, open) {
   const high = Math.min(Math.max(8, 1.05 * (points.at(-1)?.x || 0)), 30);
   return new View({
     label: "NEES of the images, cumulative", world: [0, 0, high, 1], square: false, ratio: 0.75, points, most: 20, axes: { x: "NEES", y: "part of the images below" },
-    tell: (point) => tellRow(point.row), open: (point) => open(point.row),
+    describe: (point) => rowText(point.row), open: (point) => open(point.row),
     draw(v, g) {
       g.strokeStyle = colour("skyline");
       g.lineWidth = 1.6;

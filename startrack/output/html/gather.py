@@ -1,4 +1,4 @@
-"""What a folder of results holds: the images' records, with the paths of what lies beside them."""
+"""Content of a folder of results: the images' records, with the paths of their companions."""
 
 from __future__ import annotations
 

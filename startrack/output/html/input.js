@@ -21,13 +21,13 @@ View.prototype.listen = function listen() {
     this.fingers.delete(event.pointerId);
     if (this.travelled > 6) return;
     const point = this.nearest(...place(event), REACH[event.pointerType] || 12);
-    const again = point && point === this.told;
-    this.tellOf(point, true, event.pointerType !== "mouse");
+    const again = point && point === this.selected;
+    this.select(point, true, event.pointerType !== "mouse");
     if (point && this.open && (event.pointerType === "mouse" || again)) this.open(point);
   });
   canvas.addEventListener("pointercancel", (event) => this.fingers.delete(event.pointerId));
   canvas.addEventListener("pointerleave", (event) => {
-    if (event.pointerType === "mouse" && !this.fingers.size) this.tellOf(null);
+    if (event.pointerType === "mouse" && !this.fingers.size) this.select(null);
   });
   canvas.addEventListener("dblclick", (event) => {
     event.preventDefault();
@@ -39,7 +39,7 @@ View.prototype.listen = function listen() {
 View.prototype.moved = function moved(event, now) {
   const before = this.fingers.get(event.pointerId);
   if (!before) {
-    if (event.pointerType === "mouse") this.tellOf(this.nearest(...now, REACH.mouse));
+    if (event.pointerType === "mouse") this.select(this.nearest(...now, REACH.mouse));
     return;
   }
   const others = [...this.fingers].filter(([id]) => id !== event.pointerId).map(([, at]) => at);
@@ -59,8 +59,8 @@ View.prototype.pressed = function pressed(event) {
   if (event.ctrlKey || event.metaKey || event.altKey) return;
   const acts = {
     "+": () => this.zoomBy(1.4), "=": () => this.zoomBy(1.4), "-": () => this.zoomBy(1 / 1.4), 0: () => this.reset(),
-    n: () => this.step(1), p: () => this.step(-1), Escape: () => this.tellOf(null),
-    Enter: () => this.told && this.open && this.open(this.told),
+    n: () => this.step(1), p: () => this.step(-1), Escape: () => this.select(null),
+    Enter: () => this.selected && this.open && this.open(this.selected),
   };
   if (this.zoom > 1) {
     Object.assign(acts, {

@@ -1,4 +1,4 @@
-// Maps: the search area with what fits, the place with its posterior, and the places of a whole batch.
+// Maps: the search area with what fits, the position with its posterior, and the positions of a batch.
 const METRES = { x: "east", y: "north", left: 72, gap: 60, text: (value, step) => (step >= 1000 ? `${say(value / 1000, 0)} km` : say(value, step < 1 ? 1 : 0, "m")) };
 const reliefs = {};
 
@@ -93,7 +93,7 @@ function drawPosterior(v, g, position) {
   drawDot(g, at, 3.5);
 }
 
-// A word beside a place: on its right, or on its left where there is no room.
+// A word beside a position: on its right, or on its left where there is no room.
 function sideText(v, g, text, [x, y], gap) {
   const right = x + gap + g.measureText(text).width <= v.box[2] - 4;
   g.textAlign = right ? "left" : "right";
@@ -102,18 +102,18 @@ function sideText(v, g, text, [x, y], gap) {
 
 function placesOf(record, real) {
   const places = (record.modes || []).map((mode, k) => ({
-    x: mode.east_m, y: mode.north_m, title: record.modes.length > 1 ? `Place ${k + 1}` : "Posterior's peak",
+    x: mode.east_m, y: mode.north_m, title: record.modes.length > 1 ? `Position ${k + 1}` : "Posterior's peak",
     rows: [["probability", `${say(100 * mode.weight, mode.weight > 0.9995 ? 0 : 1)} %`]], weight: mode.weight,
   }));
   const p = record.position;
   if (p) places.unshift({ x: p.east_m, y: p.north_m, title: "Position", rows: [["95 % within", say(p.radius95_m, 1, "m")], ["99.9 % within", say(p.radius999_m, 1, "m")]] });
-  if (real) places.push({ x: real[0], y: real[1], title: "True place", rows: [["", "not known to the method"]], real: true });
+  if (real) places.push({ x: real[0], y: real[1], title: "True position", rows: [["", "not known to the method"]], real: true });
   return places;
 }
 
-const tellPlace = (place) => [place.title, [["east", say(place.x, 1, "m")], ["north", say(place.y, 1, "m")], ...place.rows]];
+const positionText = (place) => [place.title, [["east", say(place.x, 1, "m")], ["north", say(place.y, 1, "m")], ...place.rows]];
 
-function drawPlaces(v, g, record, places) {
+function drawPositions(v, g, record, places) {
   if (record.position) drawPosterior(v, g, record.position);
   for (const place of places) {
     const at = v.screen(place.x, place.y);
@@ -123,7 +123,7 @@ function drawPlaces(v, g, record, places) {
       ring(g, at, 8, colour("place"), 2);
       g.font = "13px system-ui, sans-serif";
       g.textBaseline = "middle";
-      sideText(v, g, `${place.title.replace("Place ", "")}: ${place.rows[0][1]}`, at, 13);
+      sideText(v, g, `${place.title.replace("Position ", "")}: ${place.rows[0][1]}`, at, 13);
     } else if (!place.weight) ring(g, at, 9, colour("place"), 2);
   }
 }
@@ -134,10 +134,10 @@ function areaView(record, real, name) {
   const reach = Math.max(terrain?.search_m || 0, terrain?.rim_m || 0, terrain?.half_m || 0, ...places.flatMap((one) => [Math.abs(one.x), Math.abs(one.y)]));
   const half = 1.06 * (reach || 1);
   return new View({
-    label: `Search area of ${name}, north up`, world: [-half, -half, half, half], points: places, tell: tellPlace, most: 2000, axes: METRES,
+    label: `Search area of ${name}, north up`, world: [-half, -half, half, half], points: places, describe: positionText, most: 2000, axes: METRES,
     draw(v, g) {
       drawGroundMap(v, g, record.provenance?.terrain);
-      drawPlaces(v, g, record, places);
+      drawPositions(v, g, record, places);
     },
   });
 }
@@ -149,15 +149,15 @@ function placeView(record, real, name) {
   if (real) half = Math.min(Math.max(half, 1.2 * Math.hypot(real[0] - p.east_m, real[1] - p.north_m)), 6 * half);
   return new View({
     label: `Posterior of the position of ${name}`, world: [p.east_m - half, p.north_m - half, p.east_m + half, p.north_m + half],
-    points: places, tell: tellPlace, most: 40, axes: METRES, draw: (v, g) => drawPlaces(v, g, record, places),
+    points: places, describe: positionText, most: 40, axes: METRES, draw: (v, g) => drawPositions(v, g, record, places),
   });
 }
 
 function mapLegend(record, real) {
   const item = (kind, text) => make("li", {}, make("span", { class: `key ${kind}`, "aria-hidden": "true" }), text);
   const posterior = record.position ? [item("solid", "95 % of the posterior"), item("dashed", "99.9 %"), item("filled", "covariance, one sigma")] : [];
-  const others = record.status === "ok" ? [] : [item("dot", "place that fits, with its probability")];
-  return make("ul", { class: "legend" }, ...posterior, ...others, real ? item("plus", "true place") : null);
+  const others = record.status === "ok" ? [] : [item("dot", "position that fits, with its probability")];
+  return make("ul", { class: "legend" }, ...posterior, ...others, real ? item("plus", "true position") : null);
 }
 
 // Every position of a batch on one terrain, joined in the order of time.
@@ -195,12 +195,12 @@ function trajectoryView(rows, terrain, open) {
     }
   };
   return new View({ label: "Positions in the order of time, north up", world: [x - half, y - half, x + half, y + half], points: placed, most: 5000, axes: METRES, draw,
-    tell: (place) => tellRow(place.row), open: (place) => open(place.row) });
+    describe: (place) => rowText(place.row), open: (place) => open(place.row) });
 }
 
 const least = (values) => values.reduce((a, b) => Math.min(a, b), Infinity);
 
-function tellRow(row) {
+function rowText(row) {
   const value = (name) => row[column[name]];
   return [value("image"), [
     ["time", known(value("time_utc")) ? sayTime(value("time_utc")) : null], ["east", say(value("east_m"), 1, "m")],

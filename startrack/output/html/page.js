@@ -57,8 +57,8 @@ function neighbours(k) {
 }
 
 function route() {
-  const asked = /^#i(\d+)$/.exec(window.location.hash);
-  const index = page.single ? 0 : asked && Number(asked[1]) < page.rows.length ? Number(asked[1]) : null;
+  const match = /^#i(\d+)$/.exec(window.location.hash);
+  const index = page.single ? 0 : match && Number(match[1]) < page.rows.length ? Number(match[1]) : null;
   if (index === null && !["", "#all"].includes(window.location.hash) && !detailHost.hidden) return; // #main: stay
   const change = overview.hidden !== (index !== null) || detailHost.dataset.index !== String(index);
   if (!change) return;

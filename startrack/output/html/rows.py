@@ -10,7 +10,7 @@ from startrack.output.html.gather import Found
 from startrack.output.quantities import QUANTITIES, Quantity
 from startrack.output.views import at_record, rows
 
-Place = tuple[float, float]  # east, north [m]
+Position = tuple[float, float]  # east, north [m]
 LISTED = tuple(one for one in QUANTITIES if one.listed is not None)
 COLUMNS = (
     "image", "stem", "status", "reason", "message", "time_utc", "terrain", "cov_ee", "cov_en", "cov_nn", "radius999_m",
@@ -19,7 +19,7 @@ COLUMNS = (
 MESSAGE_LETTERS = 400
 
 
-def row_of(found: Found, real: Place | None, detailed: bool) -> list[Any]:
+def row_of(found: Found, real: Position | None, detailed: bool) -> list[Any]:
     """The values of COLUMNS, None where there is none."""
     record = found.record
     position, stars, provenance = (section_of(record, key) for key in ("position", "stars", "provenance"))
@@ -119,7 +119,7 @@ def _covariance(position: dict[str, Any]) -> tuple[float, float, float] | None:
 
 
 def _error_and_nees(
-    place: tuple[float | None, float | None], covariance: tuple[float, float, float] | None, real: Place | None
+    place: tuple[float | None, float | None], covariance: tuple[float, float, float] | None, real: Position | None
 ) -> tuple[float | None, float | None]:
     """Distance from the true position [m] and NEES, e^T C^-1 e."""
     if real is None or place[0] is None or place[1] is None:

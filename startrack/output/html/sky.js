@@ -2,7 +2,7 @@
 const KINDS = {
   seen: ["seen", "its light is there"],
   hidden: ["hidden", "its light is missing: the ground hides it"],
-  uncertain: ["uncertain", "too faint to tell"],
+  uncertain: ["uncertain", "too faint to decide"],
   unusable: ["unusable", "not measured"],
   identified: ["identified", "a point source has its name"],
   unmatched: ["not matched", "no point source was found there"],
@@ -18,7 +18,7 @@ function starsOf(detail) {
   }));
 }
 
-function tellStar(star) {
+function starText(star) {
   const [word, meaning] = KINDS[star.kind] || [star.kind, ""];
   const light = known(star.flux) ? `${say(star.flux)} ± ${say(star.sigma)} ${star.unit}` : null;
   return [star.name || star.id, [
@@ -34,7 +34,7 @@ function tellStar(star) {
   ]];
 }
 
-// One shape for each kind, so that colour is never needed to tell them apart.
+// One shape for each kind, so that colour is never needed to distinguish them.
 function mark(g, [x, y], kind, r) {
   g.strokeStyle = g.fillStyle = colour(kind === "identified" ? "seen" : kind === "unmatched" ? "uncertain" : kind);
   g.lineWidth = 1.6;
@@ -93,7 +93,7 @@ function skyView(detail, stars, name) {
     { ...star, x: picture.scale * (star.px + 0.5), y: picture.scale * (star.py + 0.5) })) : [];
   const view = new View({
     label: `Annotated picture ${name}`, world: [0, 0, picture.width, picture.height], up: false,
-    ratio: picture.height / picture.width, points: placed, tell: tellStar, most: 24,
+    ratio: picture.height / picture.width, points: placed, describe: starText, most: 24,
     draw(v, g) {
       const [x, y] = v.screen(0, 0);
       const [right, bottom] = v.screen(picture.width, picture.height);
@@ -117,8 +117,8 @@ function panoramaView(detail, stars, name) {
   const deepest = () => (view.width < 600 ? 4.7 : 6) + 1.5 * Math.log2(view.zoom); // fainter stars come with the zoom
   const view = new View({
     shown: (star) => chosen.has(star.kind) && star.mag <= deepest(),
-    label: `Panorama of ${name}: horizon of the place found, and stars by azimuth and elevation`,
-    world: [0, lowest, 360, 90], square: false, ratio: window.innerWidth < 600 ? 0.8 : 0.42, points: placed, tell: tellStar, most: 60,
+    label: `Panorama of ${name}: horizon of the estimated position, and stars by azimuth and elevation`,
+    world: [0, lowest, 360, 90], square: false, ratio: window.innerWidth < 600 ? 0.8 : 0.42, points: placed, describe: starText, most: 60,
     axes: {
       x: "azimuth, north through east", y: "elevation", steps: [[0.1, 0.5, 1, 2, 5, 10, 15, 30, 45, 90], [0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30]],
       gap: 46, names: { 0: "N", 90: "E", 180: "S", 270: "W", 360: "N" }, text: (value, step) => `${say(value, step < 1 ? 1 : 0)}°`,

@@ -1,4 +1,4 @@
-// A drawing that can be zoomed (wheel, pinch, + and -), moved (drag, arrows), reset (double click, 0) and asked about
+// A drawing that can be zoomed (wheel, pinch, + and -), moved (drag, arrows), reset (double click, 0) and queried
 // its points (hover, tap, n and p). World coordinates [x0, y0, x1, y1]; `up` where y grows upward.
 const TICK_FONT = "12px system-ui, sans-serif";
 const NARROW_PX = 480;
@@ -76,7 +76,7 @@ class View {
   reset() {
     this.zoom = 1;
     this.centre = this.middle();
-    this.told = null;
+    this.selected = null;
     this.changed();
   }
 
@@ -117,8 +117,8 @@ class View {
     g.clip();
     if (this.axes) drawGrid(this, g);
     this.draw(this, g);
-    if (this.told) {
-      const at = this.screen(this.told.x, this.told.y);
+    if (this.selected) {
+      const at = this.screen(this.selected.x, this.selected.y);
       ring(g, at, 9, "#000", 4.5); // light on dark, to be seen on any ground
       ring(g, at, 9, "#fff", 2);
     }
@@ -139,14 +139,14 @@ class View {
     return best;
   }
 
-  // Tells of a point; `aloud` to readers of the screen too. What a finger asked for may take the room below the stage.
-  tellOf(point, aloud, tapped) {
-    if (point === this.told) return;
-    this.told = point;
+  // Selects a point and describes it; `aloud` for screen readers too. After a tap the description may stand below the stage.
+  select(point, aloud, tapped) {
+    if (point === this.selected) return;
+    this.selected = point;
     this.tapped = Boolean(tapped);
     this.tip.replaceChildren();
     if (point) {
-      const [title, rows] = this.tell(point);
+      const [title, rows] = this.describe(point);
       this.tip.append(make("strong", {}, title), facts(rows));
       if (aloud) this.live.textContent = `${title}: ${rows.filter(([, v]) => known(v)).map(([k, v]) => `${k} ${v}`).join(", ")}`;
     }
@@ -157,8 +157,8 @@ class View {
   }
 
   placeTip() {
-    this.tip.hidden = !this.told;
-    if (!this.told) return;
+    this.tip.hidden = !this.selected;
+    if (!this.selected) return;
     const below = this.width < NARROW_PX; // there it would hide most of the drawing, and the point itself
     this.tip.classList.toggle("below", below);
     this.tip.classList.toggle("tapped", below && this.tapped);
@@ -166,7 +166,7 @@ class View {
       this.tip.style.left = this.tip.style.top = "";
       return;
     }
-    const [x, y] = this.screen(this.told.x, this.told.y);
+    const [x, y] = this.screen(this.selected.x, this.selected.y);
     const { offsetWidth: w, offsetHeight: h } = this.tip;
     const left = x + 16 + w <= this.width ? x + 16 : x - 16 - w;
     this.tip.style.left = `${Math.min(Math.max(left, 4), Math.max(this.width - w - 4, 4))}px`;
@@ -180,8 +180,8 @@ class View {
       return this.shown(point) && x >= left && x <= right && y >= top && y <= bottom;
     });
     if (!inside.length) return;
-    const next = (inside.indexOf(this.told) + by + inside.length) % inside.length;
-    this.tellOf(inside[this.told || by > 0 ? next : inside.length - 1], true);
+    const next = (inside.indexOf(this.selected) + by + inside.length) % inside.length;
+    this.select(inside[this.selected || by > 0 ? next : inside.length - 1], true);
   }
 }
 

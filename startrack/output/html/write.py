@@ -16,7 +16,7 @@ from startrack.output.html.details import TerrainsByName, ground_map, horizon_de
 from startrack.output.html.gather import Found, folder_of
 from startrack.output.html.rows import (
     COLUMNS,
-    Place,
+    Position,
     errors_of,
     facts_of,
     headings,
@@ -40,7 +40,7 @@ def write_page(
     found: Sequence[Found],
     *,
     unread: Sequence[str] = (),
-    real: Mapping[str, Place] | None = None,
+    real: Mapping[str, Position] | None = None,
     images: int = DEFAULT_IMAGES,
     single: bool = False,
 ) -> None:
@@ -57,7 +57,7 @@ def page_text(
     found: Sequence[Found],
     *,
     unread: Sequence[str] = (),
-    real: Mapping[str, Place] | None = None,
+    real: Mapping[str, Position] | None = None,
     images: int = DEFAULT_IMAGES,
     single: bool = False,
     base: str = ".",
@@ -105,7 +105,7 @@ def page_text(
 
 
 def _relative_url(folder: Path, seen_from: Path) -> str:
-    """Of one folder for links of a page in another; whole where no relative one exists (another drive)."""
+    """Relative URL of a folder for links of a page in another; absolute where none exists (another drive)."""
     try:
         return quote(Path(os.path.relpath(folder, seen_from)).as_posix())
     except ValueError:
@@ -129,7 +129,7 @@ def _detail(found: Found, terrains: TerrainsByName, size: tuple[int, int, int]) 
 
 
 def _horizon(record: dict[str, Any], terrains: TerrainsByName, azimuths: int) -> list[float] | None:
-    """Of the position, or of the likeliest position; None without a position or where the terrain is not here."""
+    """Horizon at the position, or at the likeliest one; None without a position or without the terrain's file."""
     modes = record.get("modes")
     position = section_of(record, "position") or (modes[0] if isinstance(modes, list) and modes else {})
     east, north = number_of(position, "east_m"), number_of(position, "north_m")

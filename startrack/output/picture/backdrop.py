@@ -17,7 +17,7 @@ Image = NDArray[np.float32]
 LONGEST_SIDE_PX = 1400
 SHORTEST_SIDE_PX = 900
 SMOOTHING_PX = (0.5, 3.0)  # of the display, as wide as the PSF within these
-CALM_SNR = 2.6  # fainter light than that is taken for noise and left out
+CALM_SNR = 2.6  # fainter light than that is treated as noise and left out
 KNEE_SNR, GLARE_SNR = 5.0, 400.0  # where the stretch turns from linear to logarithmic, and where it ends
 STAR_PX = 15  # on the canvas: what is wider is no star
 EDGE_PX = 8.0
@@ -33,7 +33,7 @@ MADE_OF_NOISE = 0.6745  # median of the absolute value of a standard normal vari
 
 @dataclass(frozen=True)
 class View:
-    """Where pixels of the exposure lie on the canvas: xy_canvas = origin + scale (xy + 1/2) - 1/2."""
+    """Pixels of the exposure on the canvas: xy_canvas = origin + scale (xy + 1/2) - 1/2."""
 
     scale: float
     origin: tuple[float, float]
@@ -67,7 +67,7 @@ def backdrop(value: Inputs, size: tuple[int, int], wall: Image | None = None) ->
     if value.camera is not None and value.camera.size_px == value.exposure.size_px:
         inside_px = _distance_to_edge_px(value.camera, size)
     sky, light = _background_and_light(value, size, inside_px > EDGE_PX)
-    # Next to the circle's edge the background is not known well, and what is left of it is no light.
+    # Next to the circle's edge the background is not known well, and its residual is not light.
     light *= np.clip(inside_px / np.float32(EDGE_PX), 0, 1)
     shade = None if wall is None else wall * np.float32(WALL_SHADE)
     lit = np.clip(inside_px + np.float32(0.5), 0, 1)

@@ -32,7 +32,7 @@ CAPTION_SIZE = 16.0
 
 @dataclass(frozen=True)
 class MapView:
-    """Where points of enu lie on the canvas; north is up."""
+    """Points of enu on the canvas; north is up."""
 
     box: Box
     centre_m: tuple[float, float]
@@ -145,7 +145,7 @@ def _ellipse(centre_m: tuple[float, float], covariance_m2: Array) -> Array:
 
 
 def grid_lines_m(view: MapView, axis: int) -> Array:
-    """Where the grid's lines stand [m], east (axis 0) or north (1)."""
+    """Coordinates of the grid's lines [m], east (axis 0) or north (1)."""
     step = nice_step(0.7 * float(view.half_m.min()))
     low, high = view.centre_m[axis] - view.half_m[axis], view.centre_m[axis] + view.half_m[axis]
     return np.arange(np.ceil(low / step), high / step) * step

@@ -113,7 +113,7 @@ def _contour_step_m(range_m: float) -> float:
 
 
 def _erode(known: Bools) -> Bools:
-    """Without the cells at the edge: slopes there would be those of a cliff that is not there."""
+    """The mask without the cells at its edge, whose slopes would be those of a cliff that does not exist."""
     return cv2.erode(known.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE) > 0
 
 

@@ -91,7 +91,7 @@ def _average(key, integral, starts, epsilon, sector, low, high, found):  # type:
         found[n] = total
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _integral(key, integral, starts, s, elevation):  # type: ignore[no-untyped-def]
     """The sector's integral at an elevation, linear between the keys."""
     first, last = starts[s], starts[s + 1] - 1

@@ -1,5 +1,7 @@
 """The compiled step of the branch and bound: bounds of the log-likelihood over boxes of positions.
 
+Arrays are copied element by element: numba takes seconds to compile the assignment of a slice.
+
 A box keeps the sums of the rows that are settled over it and a list of its open rows. A row is settled where its
 contribution no longer varies over the box. Rows are compared with disks where the visible ground of each is a disk of
 one radius (`Terrain.visible_disks`), else with bounds of the horizon that the terrain gave for each (box, row) pair.
@@ -99,10 +101,10 @@ def bound_boxes(rows, reach, boxes, centres, half, parent, allowed, strength, we
                 best, certain, prune_nats, negligible_nats):  # fmt: skip
     """Bounds over boxes (n, 2) whose open rows are those of their parents in `boxes`; drop what cannot matter.
 
-    Rows of a strength from `weakest` to below `strongest` are compared with their disks, or with the horizon's bounds
-    low, high (pairs,) and its sigma (pairs,), in the order of `open_pairs`. `best` is the best log-likelihood known,
-    `certain` the logarithm of the mass [m2] that the boxes hold at least. Returns the boxes kept, both of these anew,
-    and the logarithm of a bound of the mass dropped.
+    The rows are in the order of their sectors. Rows of a strength from `weakest` to below `strongest` are compared with
+    their disks, or with the horizon's bounds low, high (pairs,) and its sigma (pairs,), in the order of `open_pairs`.
+    `best` is the best log-likelihood known, `certain` the logarithm of the mass [m2] that the boxes hold at least.
+    Returns the boxes kept, both of these anew, and the logarithm of a bound of the mass dropped.
     """
     sectors = len(rows.ceiling)
     disks = len(rows.disks_m) > 0
@@ -120,8 +122,6 @@ def bound_boxes(rows, reach, boxes, centres, half, parent, allowed, strength, we
     space = max(1024, len(boxes.row) + len(boxes.row) // 2)
     kept_row = np.empty(space, dtype=boxes.row.dtype)
     kept_least, kept_most = np.empty(0 if disks else space), np.empty(0 if disks else space)
-    least, most, at_centre = np.zeros(sectors), np.zeros(sectors), np.zeros(sectors)
-    touched, stamp = np.zeros(sectors, dtype=np.int64), np.zeros(sectors, dtype=np.int64)
     cell = log(4.0 * half * half)
     dropped, enough = -inf, certain - negligible_nats - cell
     certain = -inf
@@ -135,75 +135,80 @@ def bound_boxes(rows, reach, boxes, centres, half, parent, allowed, strength, we
             if not disks:
                 kept_least = _grown(kept_least, used, 2 * (used + count))
                 kept_most = _grown(kept_most, used, 2 * (used + count))
-        kept_sums[n] = boxes.sums[p]
-        dirty, start = 0, used
+        for s in range(sectors):
+            kept_sums[n, s] = boxes.sums[p, s]
+        start, hopeless = used, False
         limit = max(best - prune_nats, enough)
-        gain_needed, lost = boxes.upper[p] - limit, 0.0
-        hopeless = False
-        for q in range(boxes.first[p], boxes.first[p + 1]):
-            if additive and q % DOOM_EVERY == 0 and lost + gain_needed <= 0.0:
-                hopeless = True
-                break
-            k = boxes.row[q]
-            s = rows.sector[k]
-            if stamp[s] != b + 1:
-                stamp[s] = b + 1
-                touched[dirty] = s
-                dirty += 1
-                least[s], most[s], at_centre[s] = 0.0, 0.0, 0.0
-            llr = rows.llr[k]
-            if disks:
-                u, v = x - rows.disks_m[k, 0], y - rows.disks_m[k, 1]
-                d2 = u * u + v * v
-                # No processor predicts which case holds: multiplying by 0 or 1 takes half the time of branches.
-                inside = d2 < inner2
-                open_ = (d2 >= inner2) & (d2 <= outer2)
-                gain = llr * open_
-                kept_sums[n, s] += llr * inside
-                most[s] += gain * (gain > 0.0)
-                least[s] += gain * (gain < 0.0)
-                at_centre[s] += gain * (d2 < r2)
-                lost += min(llr, 0.0) * inside - max(llr, 0.0) * (d2 > outer2)
-                kept_row[used] = k
-                used += open_
-            else:
-                under, over = boxes.least[q], boxes.most[q]
-                if weakest <= strength[k] < strongest:
-                    e, width = rows.elevation_rad[k], sqrt(rows.sigma_rad[k] ** 2 + sigma[pair] ** 2)
-                    if width > 0.0:
-                        above, below = (e - high[pair]) / width, (e - low[pair]) / width
-                        under, over = row_range(llr, rows.extended_nats[k], above, below)
-                    elif e > high[pair]:
-                        under, over = llr, llr
-                    elif e <= low[pair]:
-                        under, over = 0.0, 0.0
-                    pair += 1
-                if over - under < SETTLED_NATS:
-                    kept_sums[n, s] += 0.5 * (under + over)
-                else:
-                    least[s] += under
-                    most[s] += over
-                    kept_row[used], kept_least[used], kept_most[used] = k, under, over
-                    used += 1
-        if hopeless:
-            dropped = _log_add(dropped, boxes.upper[p] + lost + cell)
-            used = start
-            continue
         now, low_total, high_total, centre_total = (
             boxes.settled[p],
             boxes.settled[p],
             boxes.settled[p],
             boxes.settled[p],
         )
-        for t in range(dirty):
-            s = touched[t]
-            before = log_mixture(boxes.sums[p, s], log_keep, log_floor)
-            total = kept_sums[n, s]
-            now += log_mixture(total, log_keep, log_floor) - before
-            low_total += log_mixture(total + least[s], log_keep, log_floor) - before
-            high_total += log_mixture(total + most[s], log_keep, log_floor) - before
+        highest = boxes.upper[p]  # bound of the log-likelihood by what is known of the rows so far
+        q, end = boxes.first[p], boxes.first[p + 1]
+        while q < end and not hopeless:
+            s = rows.sector[boxes.row[q]]
+            sure, least, most, at_centre, most_of_parent, lost = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            while q < end and rows.sector[boxes.row[q]] == s:
+                k = boxes.row[q]
+                llr = rows.llr[k]
+                if disks:
+                    u, v = x - rows.disks_m[k, 0], y - rows.disks_m[k, 1]
+                    d2 = u * u + v * v
+                    # No processor predicts which case holds: multiplying by 0 or 1 takes half the time of branches.
+                    inside = d2 < inner2
+                    open_ = (d2 >= inner2) & (d2 <= outer2)
+                    gain, positive = llr * open_, max(llr, 0.0)
+                    sure += llr * inside
+                    most += gain * (gain > 0.0)
+                    least += gain * (gain < 0.0)
+                    at_centre += gain * (d2 < r2)
+                    most_of_parent += positive
+                    lost += (llr - positive) * inside - positive * (d2 > outer2)
+                    kept_row[used] = k
+                    used += open_
+                    if additive and q % DOOM_EVERY == 0 and highest + lost <= limit:
+                        hopeless = True
+                        break
+                else:
+                    under, over = boxes.least[q], boxes.most[q]
+                    if weakest <= strength[k] < strongest:
+                        e, width = rows.elevation_rad[k], sqrt(rows.sigma_rad[k] ** 2 + sigma[pair] ** 2)
+                        if width > 0.0:
+                            above, below = (e - high[pair]) / width, (e - low[pair]) / width
+                            under, over = row_range(llr, rows.extended_nats[k], above, below)
+                        elif e > high[pair]:
+                            under, over = llr, llr
+                        elif e <= low[pair]:
+                            under, over = 0.0, 0.0
+                        pair += 1
+                    if over - under < SETTLED_NATS:
+                        sure += 0.5 * (under + over)
+                    else:
+                        least += under
+                        most += over
+                        kept_row[used], kept_least[used], kept_most[used] = k, under, over
+                        used += 1
+                q += 1
+            before, total = boxes.sums[p, s], boxes.sums[p, s] + sure
+            kept_sums[n, s] = total
+            known = log_mixture(before, log_keep, log_floor)
+            now += log_mixture(total, log_keep, log_floor) - known
+            low_total += log_mixture(total + least, log_keep, log_floor) - known
+            high_sector = log_mixture(total + most, log_keep, log_floor)
+            high_total += high_sector - known
             if disks:
-                centre_total += log_mixture(total + at_centre[s], log_keep, log_floor) - before
+                centre_total += log_mixture(total + at_centre, log_keep, log_floor) - known
+                if additive:
+                    highest += lost
+                else:
+                    highest += high_sector - log_mixture(before + most_of_parent, log_keep, log_floor)
+                hopeless = hopeless or highest <= limit
+        if hopeless:
+            dropped = _log_add(dropped, max(highest, limit) + cell)
+            used = start
+            continue
         if not allowed[b]:
             low_total, centre_total = -inf, -inf
         best = max(best, low_total)
@@ -213,7 +218,7 @@ def bound_boxes(rows, reach, boxes, centres, half, parent, allowed, strength, we
             dropped = _log_add(dropped, high_total + cell)
             used = start
             continue
-        kept_centres[n] = centres[b]
+        kept_centres[n, 0], kept_centres[n, 1] = x, y
         settled[n], lower[n], upper[n], score[n] = now, low_total, high_total, centre_total
         certain = _log_add(certain, low_total + cell)
         kept_first[n + 1] = used
@@ -240,7 +245,9 @@ def bound_boxes(rows, reach, boxes, centres, half, parent, allowed, strength, we
                     if not disks:
                         kept_least[write_pair + q - begin] = kept_least[q]
                         kept_most[write_pair + q - begin] = kept_most[q]
-                kept_centres[write], kept_sums[write] = kept_centres[b], kept_sums[b]
+                kept_centres[write, 0], kept_centres[write, 1] = kept_centres[b, 0], kept_centres[b, 1]
+                for s in range(sectors):
+                    kept_sums[write, s] = kept_sums[b, s]
                 settled[write], lower[write], upper[write], score[write] = settled[b], lower[b], upper[b], score[b]
             write_pair += end - begin
             write += 1
@@ -292,7 +299,8 @@ def _climb_in_box(rows, sums, row, centre, half, best, reach):
             u, v = x + step * (k // 3 - 1), y + step * (k % 3 - 1)
             if k == 4 or abs(u - centre[0]) > half or abs(v - centre[1]) > half or u * u + v * v >= limit2:
                 continue
-            now[:] = sums
+            for s in range(len(sums)):
+                now[s] = sums[s]
             for q in range(len(row)):
                 a, b = u - rows.disks_m[row[q], 0], v - rows.disks_m[row[q], 1]
                 now[rows.sector[row[q]]] += rows.llr[row[q]] * (a * a + b * b < r2)
@@ -313,7 +321,8 @@ def score_boxes(rows, boxes, horizon, sigma, score):
     log_keep = log1p(-exp(rows.log_floor))
     sums = np.empty(len(rows.ceiling))
     for b in range(len(score)):
-        sums[:] = boxes.sums[b]
+        for s in range(len(sums)):
+            sums[s] = boxes.sums[b, s]
         for q in range(boxes.first[b], boxes.first[b + 1]):
             k = boxes.row[q]
             width = sqrt(rows.sigma_rad[k] ** 2 + sigma[q] ** 2)
@@ -355,7 +364,8 @@ def smaller_sigma(centres, score):
 @njit(cache=True, nogil=True)
 def _grown(a, used, size):
     larger = np.empty(size, dtype=a.dtype)
-    larger[:used] = a[:used]
+    for k in range(used):
+        larger[k] = a[k]
     return larger
 
 
@@ -371,7 +381,8 @@ def score_disks(disks, radius, llr, sector, settled, log_floor, points, found):
     r2, log_keep = radius * radius, log1p(-exp(log_floor))
     sums = np.empty(len(settled))
     for p in range(len(found)):
-        sums[:] = settled
+        for s in range(len(sums)):
+            sums[s] = settled[s]
         for k in range(len(llr)):
             u, v = points[p, 0] - disks[k, 0], points[p, 1] - disks[k, 1]
             sums[sector[k]] += llr[k] * (u * u + v * v < r2)

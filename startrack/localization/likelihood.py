@@ -65,7 +65,7 @@ class PositionLikelihood:
 
     @cached_property
     def rows(self) -> Rows:
-        """The rows for the kernels: as they are where the visible ground is a disk, else in the order of the parts."""
+        """The rows for the kernels, in the order of their sectors, or of the parts of these."""
         e, sectors, disks = self.evidence, self.sectors, None
         if self.terrain.hard_edges and not e.edge_sigma_rad.any():
             disks = self.terrain.visible_disks(e.azimuth_rad, e.elevation_rad)
@@ -73,7 +73,8 @@ class PositionLikelihood:
             e, sector, disks = self.part_sums.evidence, self.part_sums.sector, (NO_DISKS, 0.0)
             ceiling = sectors.ceiling
         elif sectors.epsilon > 0.0:
-            sector, ceiling = sectors.sector, sectors.ceiling
+            e, disks = e.take(sectors.order), (disks[0][sectors.order], disks[1])
+            sector, ceiling = sectors.sector[sectors.order], sectors.ceiling
         else:  # the contributions of all rows are summed: one sector does
             sector, ceiling = np.zeros(len(e), dtype=np.int64), np.zeros(1)
         return Rows(

@@ -130,7 +130,8 @@ def _score_nodes(nodes, rise, llr, extended, sigma, sector, settled, log_floor, 
     scale = (across - 1) / (2 * nodes.half_m)
     sums, up = np.empty(len(settled)), np.empty(1)
     for p in range(len(found)):
-        sums[:] = settled
+        for s in range(len(sums)):
+            sums[s] = settled[s]
         x, y = (
             (points[p, 0] - nodes.east_m + nodes.half_m) * scale,
             (points[p, 1] - nodes.north_m + nodes.half_m) * scale,

@@ -38,7 +38,7 @@ class PrefixSums:
         e = sectors.evidence
         within = e.azimuth_rad / (2 * np.pi) * sectors.count - sectors.sector
         part = sectors.sector * parts + np.clip(within * parts, 0, parts - 1).astype(np.int64)
-        order = elevation_order(e, part)
+        order = sectors.order if parts == 1 else elevation_order(e, part)
         part, llr = part[order], e.llr[order]
         evidence = e.take(order)
         least, most = row_limits(evidence)

@@ -42,9 +42,18 @@ class Sectors:
         return (self.evidence.azimuth_rad / (2 * np.pi) * self.count).astype(np.int64) % self.count
 
     @cached_property
+    def order(self) -> Ints:
+        """Order (n,) of the rows by sector, and from low to high within one."""
+        return elevation_order(self.evidence, self.sector)
+
+    @cached_property
     def ceiling(self) -> Array:
-        """(sectors,) M."""
-        return level_skyline_maximum(self.evidence, self.sector, self.count)
+        """(sectors,) M: largest sum of the llr above one elevation; at least 0 (nothing visible)."""
+        below = np.concatenate([[0.0], np.cumsum(self.evidence.llr[self.order])])
+        ends = np.searchsorted(self.sector[self.order], np.arange(self.count + 1))
+        # Above the lowest ray, above the next, ..., above none: all these sums end at the sector's last ray.
+        least = np.minimum.reduceat(below, ends[:-1])
+        return np.asarray(below[ends[1:]] - np.minimum(least, below[ends[1:]]))
 
     @cached_property
     def log_floor(self) -> float:
@@ -64,16 +73,6 @@ class Sectors:
         return np.asarray(np.log((1.0 - self.epsilon) * np.exp(np.minimum(below, 0.0)) + self.epsilon))
 
 
-def level_skyline_maximum(evidence: Evidence, sector: Ints, count: int) -> Array:
-    """Largest sum (count,) of the llr above one elevation, in each sector; at least 0 (nothing visible)."""
-    order = elevation_order(evidence, sector)
-    below = np.concatenate([[0.0], np.cumsum(evidence.llr[order])])
-    ends = np.searchsorted(sector[order], np.arange(count + 1))
-    # Above the lowest ray, above the next, ..., above none: all these sums end at the sector's last ray.
-    least = np.minimum.reduceat(below, ends[:-1])
-    return np.asarray(below[ends[1:]] - np.minimum(least, below[ends[1:]]))
-
-
 def elevation_order(evidence: Evidence, sector: Ints) -> Ints:
     """Order (n,) of the rows by sector, and from low to high within one."""
     return np.argsort(SECTOR_STEP * sector + evidence.elevation_rad, kind="stable")
@@ -90,7 +89,7 @@ def row_limits(evidence: Evidence) -> tuple[Array, Array]:
     return least, most
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def row_contribution(llr, extended, sigmas_above, hard_above):  # type: ignore[no-untyped-def]
     """Contribution of a row `sigmas_above` the horizon; with `hard_above` 1 or -1 it is wholly visible or hidden.
 
@@ -110,7 +109,7 @@ def row_contribution(llr, extended, sigmas_above, hard_above):  # type: ignore[n
     return value
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def row_range(llr, extended, low, high):  # type: ignore[no-untyped-def]
     """Least and greatest contribution where the row stands between `low` and `high` sigmas above the horizon."""
     a, b = row_contribution(llr, extended, low, 0), row_contribution(llr, extended, high, 0)
@@ -138,7 +137,7 @@ def contributions(llr, extended, elevation, horizon, sigma):  # type: ignore[no-
     return value
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def log_mixture(below, log_keep, log_floor):  # type: ignore[no-untyped-def]
     """log(exp(min(below, 0) + log_keep) + exp(log_floor)); log_floor = -inf means no floor and no ceiling."""
     value = below

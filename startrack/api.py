@@ -86,7 +86,7 @@ def identify(
     flux: ArrayLike | None = None,
     sigma_px: ArrayLike | None = None,
 ) -> Solution | IdentifiedCentroids:
-    """Stars and attitude of an image, or of a list of centroids. No terrain is needed, nor a time.
+    """Stars and attitude of an image, or of a list of centroids. Neither terrain nor time is needed.
 
     Args:
         image: an image, as for `locate`; or centroids (n, 2), x and y in px from the centre of the top-left pixel.

@@ -36,7 +36,7 @@ def choose_cache_folder() -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError:
-        # A fresh folder that only this user can write to: numba unpickles what it finds in its cache.
+        # A fresh folder that only this user can write to: numba unpickles the files in its cache.
         folder = Path(tempfile.mkdtemp(prefix="startrack-numba-"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
     os.environ[VARIABLE] = str(folder)

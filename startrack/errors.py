@@ -15,7 +15,7 @@ EXIT_OK, EXIT_INTERNAL_ERROR, EXIT_REFUSED, EXIT_BAD_INPUT = 0, 1, 3, 4
 class Reason(StrEnum):
     """Why an image has no position, as the result format spells it; each value is also that text.
 
-    `exit_code` is the command's, `meaning` a heading, `advice` what the user can do about it.
+    `exit_code` is the command's, `meaning` a heading, `advice` a text for the user.
     """
 
     exit_code: int

@@ -170,7 +170,7 @@ class CandidatePairs:
 
     @cached_property
     def brightness_misfit(self) -> Array:
-        """Difference in brightness (k,) as a fraction of what is allowed: DIMMED_MAG or BRIGHTER_MAG."""
+        """Difference in brightness (k,) as a fraction of the limit: DIMMED_MAG or BRIGHTER_MAG."""
         return np.maximum(self.dimming_mag / DIMMED_MAG, self.dimming_mag / -BRIGHTER_MAG)
 
     @cached_property

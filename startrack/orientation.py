@@ -30,7 +30,7 @@ NO_TIME = (
     "nothing is guessed"
 )
 NO_SITE = "terrain {} has no site: an image can be located only on ground whose position on a body is known"
-ANYWHERE = Site("moon", 0.0, 0.0)  # stands in for an unknown site: 0.7 arcsec of aberration at most
+ANYWHERE = Site("moon", 0.0, 0.0)  # used for an unknown site: 0.7 arcsec of aberration at most
 
 
 def check_inputs(inputs: Inputs) -> None:

@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 
 CONNECT_S = 10.0
 CLOSE_S = 5.0  # for idle processes to end by themselves
-TASK_LIMIT_S = 900.0  # without any result: far above the slowest image, reached only by a process that stands still
+TASK_LIMIT_S = 900.0  # without any result: far above the slowest image, reached only by a blocked process
 TASKS_PER_PROCESS = 2  # submitted at a time: one in progress and the next
 TASKS_PER_CLUSTER_THREAD = 4  # submitted at a time: 100,000 tasks take no more memory than a hundred
 DIED = "the process that worked on it died (out of memory?) or stood still, alone as it did beside others"
 DIED_ON_CLUSTER = "the Dask workers that worked on it died, one after the other (out of memory?)"
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-NO_TRACKER_WARNINGS = "ignore:resource_tracker"  # Python warns when it removes what a killed process left
+NO_TRACKER_WARNINGS = "ignore:resource_tracker"  # Python warns when it removes files of a killed process
 LOG_OF_CLIENT = "distributed.client"
 
 Task = TypeVar("Task")

@@ -58,7 +58,7 @@ class Settings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)  # eq: arrays have no single answer to ==
 class Inputs:
-    """One exposure and what it is to be solved with. Two values are equal only if they are one object."""
+    """One exposure and the inputs of its solution. Two values are equal only if they are one object."""
 
     exposure: Exposure
     camera: Camera | None = None  # None: not known; `detect` works without, `identify_blind` finds it
@@ -198,7 +198,7 @@ Outcome: TypeAlias = Inputs | Refused  # of a command: Detected, Oriented or Loc
 
 
 def last_value(outcome: Outcome) -> Inputs:
-    """The last complete value of an outcome: itself, or what was reached before it was refused."""
+    """The last complete value of an outcome: itself, or the value reached before a refusal."""
     return outcome.reached if isinstance(outcome, Refused) else outcome
 
 
@@ -209,7 +209,7 @@ def extend(value: Inputs, to: type[T], **more: Any) -> T:
 
 
 def with_timing(outcome: Any, **more_ms: float) -> Any:
-    """The same outcome with wall times [ms] added to those of its stages."""
+    """The same outcome with wall times [ms] added to its stages' times."""
     times = dict(outcome.timing_ms)
     for stage, ms in more_ms.items():
         times[stage] = times.get(stage, 0.0) + ms

@@ -232,6 +232,6 @@ class Fix(Value):
     radius999_m: float
     modes: tuple[Mode, ...]  # heaviest first; weights sum to 1
     ambiguous: bool  # modes outside the main mode's 99.9 % circle hold more than 1 %
-    dropped_mass: float = 0.0  # bound on the posterior probability of what the search pruned
+    dropped_mass: float = 0.0  # bound on the posterior probability that the search dropped
     search: str = "proven"  # no other position fits; "beam": the search ended before that was proven
-    horizon_error_rad: float = 0.0  # by how much the true horizon stands higher than the map's, as far as all around
+    horizon_error_rad: float = 0.0  # common to all azimuths: how much higher the true horizon is than the map's

@@ -1,6 +1,6 @@
 """Throughput from the stars' fluxes: zero point, vignetting, colour term and, on the Earth, extinction.
 
-The fit is bounded to what is physically possible. In a camera that looks at the zenith airmass is a function of the
+The fit is bounded to physically possible values. In a camera that looks at the zenith airmass is a function of the
 angle off the axis, so that extinction and vignetting can be exchanged for each other; a term that the data do not
 determine, or that ends at a bound, is left out, and so is the whole throughput where it fails a held-out test.
 """

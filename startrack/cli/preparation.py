@@ -66,7 +66,7 @@ def compile_kernels(terrain: Terrain) -> None:
 
 @contextmanager
 def _terrain_log(args: argparse.Namespace) -> Iterator[None]:
-    """Print on stderr what the terrain logs in the block: that it begins or waits, and with -v where the table is."""
+    """Print the terrain's log of the block on stderr: begin, wait, and with -v the path of the table."""
     if args.quiet or (sys.stderr.isatty() and not args.verbose):  # a terminal has the bar
         yield
         return

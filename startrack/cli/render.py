@@ -27,7 +27,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add `render` to the commands of the `startrack` parser."""
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "render",
-        help="make synthetic exposures, with the truth beside them",
+        help="make synthetic exposures and files with their truth",
         description="Render the image of a camera on the crater's floor. Position, heading, tilt and time are drawn "
         "from the seed unless they are given. Beside NAME.png: NAME.json (time, exposure, camera, terrain), "
         "NAME.truth.json (pose, settings) and NAME.truth.ecsv (stars).",
@@ -90,11 +90,11 @@ def _add_output(group: Any) -> None:
     where.add_argument("-D", "--dir", default="startrack-out", metavar="OUT", help="folder (default %(default)s)")
     group.add_argument("--format", choices=SUFFIXES, default="png", help="of images in the folder (png)")
     group.add_argument("--truth-mag", type=number, default=8.5, metavar="V", help="faintest star in the table (8.5)")
-    group.add_argument("-O", "--overwrite", action="store_true", help="replace files that are there")
+    group.add_argument("-O", "--overwrite", action="store_true", help="replace existing files")
     group.add_argument("--json", action="store_true", help="one JSON object per image on stdout")
     group.add_argument("--no-plots", action="store_true", help="accepted everywhere; render draws no plots")
     group.add_argument("-v", "--verbose", action="count", default=0, help="tracebacks of internal errors")
-    group.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    group.add_argument("-q", "--quiet", action="store_true", help="print errors only")
 
 
 def _targets(args: argparse.Namespace) -> list[Path]:
@@ -152,7 +152,7 @@ def _series(args: argparse.Namespace) -> Series:
 
 
 def _render_one(args: argparse.Namespace, series: Series, number: int, image: Path) -> dict[str, Any]:
-    """Render, write image, sidecar and truth, and return what is printed about it."""
+    """Render, write image, sidecar and truth, and return the text about it."""
     from startrack.exposure import write_exposure, write_sidecar
     from startrack.rendering import render, write_truth
 

@@ -31,16 +31,16 @@ def add_parser(subparsers: Any) -> None:
         "network. Of a single NAME.fix.json it writes NAME.report.html beside it.",
     )
     parser.add_argument("out", metavar="OUT", help="folder of results, or one NAME.fix.json")
-    parser.add_argument("-o", "--output", metavar="FILE", help="where the page goes")
+    parser.add_argument("-o", "--output", metavar="FILE", help="file of the page")
     parser.add_argument(
         "--images", type=count, default=DEFAULT_IMAGES, metavar="N",
-        help="how many images the page holds with picture and stars (%(default)s); all are in its table",
+        help="number of images with picture and stars (%(default)s); the table contains all",
     )  # fmt: skip
     parser.add_argument(
         "--truth", metavar="FOLDER", help="folder with NAME.truth.json of the images, to show the errors"
     )
     parser.add_argument("-v", "--verbose", action="count", default=0, help="tracebacks of internal errors")
-    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
     parser.set_defaults(run=run)
 
 
@@ -73,7 +73,7 @@ def write_page_of(
 
 
 def _only_tabled(out: str, found: list[Found]) -> list[Found]:
-    """The results without those of a batch that its tables lack; a line on stderr names these."""
+    """The results without results of a batch that its tables lack; a line on stderr names these."""
     from startrack.batch import JOB, tabled_results
 
     known = tabled_results(Path(out))

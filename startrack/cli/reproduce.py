@@ -58,7 +58,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("--json", action="store_true", help="print one JSON object per table or figure")
     parser.add_argument("--no-plots", action="store_true", help="no pictures")
     parser.add_argument("-v", "--verbose", action="count", default=0, help="tracebacks of internal errors")
-    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
     parser.set_defaults(run=run, usage_error=parser.error)
     return parser
 
@@ -71,8 +71,8 @@ def run(args: argparse.Namespace) -> int:
             f"{', '.join(unknown)}: not a table or figure of the thesis; known are {', '.join(NAMES)}, all"
         )
     chosen = NAMES if "all" in args.what else [name for name in NAMES if name in args.what]
-    _require_extra(args, "matplotlib", "plots", "figures are drawn", unless=args.no_plots)
-    _require_extra(args, "distributed", "cluster", "a cluster is reached", unless=args.cluster is None)
+    _require_extra(args, "matplotlib", "plots", "figures need", unless=args.no_plots)
+    _require_extra(args, "distributed", "cluster", "--cluster needs", unless=args.cluster is None)
 
     from startrack.reproduction import ARTEFACTS, FULL, QUICK, ChunkStore, Context, write_artefact
 
@@ -93,8 +93,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _require_extra(args: argparse.Namespace, module: str, extra: str, what: str, *, unless: bool) -> None:
     if not unless and find_spec(module) is None:
-        hint = "" if extra != "plots" else ", or leave them out with --no-plots"
-        args.usage_error(f"{what} with {module}: pip install '.[{extra}]' in a clone of startrack{hint}")
+        hint = "" if extra != "plots" else ", or omit them with --no-plots"
+        args.usage_error(f"{what} {module}: pip install '.[{extra}]' in a clone of startrack{hint}")
 
 
 def _print_artefact(args: argparse.Namespace, artefact: Artefact, size: str, files: list[Path], seconds: float) -> None:

@@ -65,7 +65,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         action.add_argument(
             "-v", "--verbose", action="count", default=0, help="more output; tracebacks of internal errors"
         )
-        action.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+        action.add_argument("-q", "--quiet", action="store_true", help="print errors only")
     show.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the pictures (%(default)s)")
     show.add_argument("--no-plots", action="store_true", help="no pictures")
     parser.set_defaults(run=run)

@@ -58,7 +58,7 @@ def select_stars(fitted: Fitted, width_px: Array, threshold: float) -> Ints:
 
 
 def brightest_per_position(xy_px: Array, flux: Array, closer_px: float) -> Bools:
-    """Which sources (n,) to keep: of those that converged onto one position, the brightest."""
+    """Which sources (n,) to keep: the brightest of all that converged onto one position."""
     from scipy.spatial import cKDTree
 
     rank = np.empty(len(flux), dtype=np.int64)

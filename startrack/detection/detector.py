@@ -1,4 +1,4 @@
-"""Point sources of an exposure: matched filter, PSF fits, and the rejection of what is not a star."""
+"""Point sources of an exposure: matched filter, PSF fits, and the rejection of other sources than stars."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class _Candidates:
 class Detector:
     """Detects point sources: Exposure -> Detections."""
 
-    threshold_snr: float = 5.42  # for a PSF of 1.25 px; for others what gives about as few false stars
+    threshold_snr: float = 5.42  # for a PSF of 1.25 px; for others the threshold with about as few false stars
     max_candidates: int = 15000  # a frame with more peaks is noise, a bright day or a defect: the highest are kept
     psf_sigma_px: float | None = None  # used without measuring it; None: from the camera file and the frame
 
@@ -173,7 +173,7 @@ def _is_flat(image: Image) -> bool:
 
 
 class _FrameSource:
-    """An image with its unusable pixels; backgrounds are worked out once for each size of their blocks."""
+    """An image with its unusable pixels; backgrounds are computed once for each size of their blocks."""
 
     def __init__(self, image: Image, dead: Bools | None, light_noise: LightNoise) -> None:
         self.image, self.dead, self.light_noise = image, dead, light_noise
@@ -181,7 +181,7 @@ class _FrameSource:
         self._kept: dict[int, tuple[Image, Image]] = {}
 
     def frame(self, sigma: float, found: Image | None = None) -> Frame:
-        """The image prepared; background and noise are those of what is behind the stars already `found`."""
+        """The image prepared; the stars already `found` are excluded from background and noise."""
         if found is not None:
             maps = background_and_noise(self.image - found, self.quantum, sigma)
             return Frame(self.image, *maps, self.dead, self.light_noise, found)

@@ -63,7 +63,7 @@ def fit_points(
 
     Only the significance relies on `surround`, which holds `own_part` of the source's own light. Gauss-Newton on the
     pixel-integrated Gaussian from `start_xy_px` (n, 2); steps are limited to half a pixel, so a hopeless source stays
-    near where it was. Weights: the pixels' variance and what the source's own light adds to it.
+    near where it was. Weights: the pixels' variance and the variance of the source's own light.
     """
     from startrack.detection.fit_kernel import fit_stamps
 

@@ -36,7 +36,7 @@ class Peaks:
 def find_peaks(frame: Frame, sigma: float, lowest: float, most: int, known: Array | None = None) -> Peaks:
     """Local maxima of the matched-filter SNR above `lowest`, at most `most` of them: the highest.
 
-    `known` (m, 2): places of stars whose light `frame.found` holds; they come first, the peaks are those of the rest.
+    `known` (m, 2): positions of stars whose light `frame.found` holds; they come first, then the other peaks.
     """
     margin = radius_for(sigma)
     most = min(most, MAX_STAMP_PIXELS // (2 * margin + 1) ** 2)
@@ -122,7 +122,7 @@ def _strip_peaks(
 
 
 def _are_off_known(known: Array, start: Array, sigma: float) -> Bools:
-    """The peaks (n,) that are not on a known star: what is left there is the PSF's misfit."""
+    """The peaks (n,) that are not on a known star: peaks there are the PSF's misfit."""
     from scipy.spatial import cKDTree
 
     return np.asarray(cKDTree(known).query(start)[0] > OWN_RESIDUE_SIGMAS * sigma, dtype=bool)

@@ -10,7 +10,7 @@ import numpy as np
 from startrack.detection.frame import Frame
 from startrack.types import Array, Bools, Ints
 
-PIXEL_SIGMAS = 2.5  # of the lightly smoothed image: what belongs to a streak
+PIXEL_SIGMAS = 2.5  # of the lightly smoothed image: pixels of a streak
 SMOOTH_PX = 1.0
 MIN_AREA_PX, MAX_AREA_PX = 12, 20_000
 BRIGHT_SNR = 15.0  # of the whole streak

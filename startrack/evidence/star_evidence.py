@@ -73,7 +73,7 @@ class StarEvidence:
 
     faintest_snr: float = MIN_SNR
     crowded: float = MIN_PSF_AREAS_PER_STAR
-    capped: bool = True  # False: plain Gaussian ratios, to see what the caps are worth
+    capped: bool = True  # False: plain Gaussian ratios, to measure the effect of the caps
 
     def __call__(
         self,

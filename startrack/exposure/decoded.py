@@ -54,7 +54,7 @@ def grey_float32(stored: NDArray[Any]) -> tuple[NDArray[np.float32], tuple[str, 
     a warning, because their scale is not known. Raises BadInput bad_image for a pixel that is not finite.
     """
     warnings: list[str] = []
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is refused below
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite and are refused below
         if stored.ndim == 3:
             warnings.append(COLOUR_WARNING)
             pixels = stored[..., 0].astype(np.float32)

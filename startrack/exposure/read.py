@@ -44,7 +44,7 @@ def read_exposure(
 
     Pixels (H, W) are the counts in the file [ADU], 16 bits kept; pixel (0, 0) is the first of the first row stored,
     in FITS too; orientation tags are ignored. `time_utc` (mid-exposure), `exposure_s`, `camera` and `terrain` replace
-    the values of sidecar and header, which are then not read. `warnings` lists what was ignored, and why.
+    the values of sidecar and header, which are then not read. `warnings` lists ignored facts and causes.
 
     Raises:
         BadInput: bad_image with file and cause in one line; no_time if a sidecar's time is not UTC.
@@ -92,7 +92,7 @@ def exposure_of(pixels: NDArray[Any], *, time_utc: datetime | None = None, name:
 
 
 def _level_mosaic(decoded: Decoded, facts: Facts) -> tuple[NDArray[np.float32], tuple[str, ...]]:
-    """The pixels, those of a mosaic brought to one level and gain, and a warning if that was done."""
+    """The pixels (a mosaic's at one level and gain), and a warning if they were changed."""
     colour_already = decoded.mosaic is None and COLOUR_WARNING in decoded.warnings
     if colour_already or not (decoded.mosaic or facts.bayer_pattern):
         return decoded.pixels_adu, ()

@@ -26,7 +26,7 @@ PACKED = {".gz": lambda data: gzip.compress(data, compresslevel=1, mtime=0), ".b
 def write_exposure(path: str | os.PathLike[str], exposure: Exposure, *, overwrite: bool = False) -> Path:
     """Write the image by suffix (.png, .tif, .tiff, .fits, .fits.gz, .fits.bz2) with its metadata; return its path.
 
-    PNG holds 16-bit counts (8-bit ones if that is what the exposure was read from), rounded; TIFF and FITS too, or
+    PNG holds 16-bit counts (8-bit ones if the exposure was read from such a file), rounded; TIFF and FITS too, or
     float32 if the pixels are not such counts. Camera and terrain paths are written relative to the file. The same
     exposure gives the same bytes.
 

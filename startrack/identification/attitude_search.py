@@ -145,7 +145,7 @@ class AttitudeSearch:
                 yield AttitudeHypothesis(R, near.ray[on], near.star[on], near if len(some) == len(rays_cam) else None)
 
     def _supported_attitudes(self, cam: Array, icrs: Array, some: Array, radius: float, depth: int) -> Iterator[Array]:
-        """R_cam_icrs of the closest match, which is nearly always right; then of those that detections support."""
+        """R_cam_icrs of the closest match, which is nearly always right, then of matches that detections support."""
         if len(cam):
             yield wahba(cam[0], icrs[0])
         tree = self.patterns.tree(depth)

@@ -231,7 +231,7 @@ def _neighbours(tree: Any, rays_icrs: Array, chord: float, most: int) -> Neighbo
 
 
 def patterns_of(stars: Stars, field_sr: float) -> CatalogPatterns:
-    """The patterns of these stars; those of the last few catalogues and fields are kept."""
+    """The patterns of these stars; patterns of the last few catalogues and fields are kept."""
     key = (_fingerprint_of(stars), field_sr)
     if key not in _CACHE:
         _CACHE[key] = CatalogPatterns(stars, field_sr)

@@ -28,7 +28,7 @@ FIT = Scheme(loss=cauchy_loss(LOSS_CHI2), steps=4, settled_px=1e-3)
 
 @dataclass(frozen=True)
 class GrowthStage:
-    """One step of the growth: which stars take part, the gate, and what is fitted."""
+    """One step of the growth: which stars take part, the gate, and the fitted parameters."""
 
     radius_rad: float  # about the triangle of the hypothesis
     gate_rad: float

@@ -19,8 +19,8 @@ FORMATS = {
 def result_dict(result: Outcome) -> dict[str, Any]:
     """The fix of one image: `position` where the status is ok, `modes` where there are any.
 
-    The record of a refused `result` holds status, reason and message and what was known by then; `null` stands for what
-    was not. Fields in `enu` are absent without terrain and time.
+    The record of a refused `result` holds status, reason, message and the quantities of the stages that have run; other
+    quantities are `null`. Fields in `enu` are absent without terrain and time.
     """
     return _record("fix", result)
 

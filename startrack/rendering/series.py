@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-REACH_V_MAG, REACH_SNR = 6.0, 5.0  # what the default exposure reaches on the axis
+REACH_V_MAG, REACH_SNR = 6.0, 5.0  # reached by the default exposure on the axis
 RANDOM_TIMES = datetime(2024, 1, 1, tzinfo=UTC), datetime(2034, 1, 1, tzinfo=UTC)
 TRIES_FOR_A_PLACE = 1000
 # Streams of the seed. Sky and sensor are the same in every exposure of a series: errors that exposures share.

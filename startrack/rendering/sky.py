@@ -1,4 +1,4 @@
-"""Diffuse light of the sky, and its step down at the skyline to what the wall reflects."""
+"""Diffuse light of the sky, and its step at the skyline down to the light that the wall reflects."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from startrack.types import Array, Bools, Ints
 
 ARCSEC2_PER_SR = (180 * 3600 / np.pi) ** 2
 AZIMUTHS = 1 << 16  # of the horizon's table: 0.0055 degrees, a sixteenth of a pixel of the widest fisheye
-EDGE_REACH_SIGMAS = 4.0  # how far from the skyline its PSF-smoothed step is worked out
+EDGE_REACH_SIGMAS = 4.0  # how far from the skyline its PSF-smoothed step is computed
 TANGENT_NODES_SIGMAS = np.linspace(-3.5, 3.5, 11)  # trapezoid over a Gaussian: exact to 1e-9 for a smooth skyline
 LENS_SAMPLES = 4096
 ROWS_PER_BLOCK = 64
@@ -137,7 +137,7 @@ def _sky_and_mask(scene: Scene) -> tuple[Array, Bools]:
 
 
 def _is_above_horizon(east: Array, north: Array, up: Array, azimuths: Array, tan_horizon: Array) -> Bools:
-    """Whether directions are above the horizon; the azimuth is only worked out where the answer depends on it."""
+    """Whether directions are above the horizon; the azimuth is computed only where the answer depends on it."""
     level = np.hypot(east, north)
     above = up > tan_horizon.max() * level
     unclear = ~above & (up > tan_horizon.min() * level)

@@ -33,7 +33,7 @@ class Bar(Protocol):
     def advance(self, steps: int = 1) -> None: ...
 
 
-Progress = Callable[[str, int], AbstractContextManager[Bar]]  # what is computed, of how many fixes
+Progress = Callable[[str, int], AbstractContextManager[Bar]]  # text and number of fixes of a computation
 
 
 class ChunkStore:
@@ -57,7 +57,7 @@ class ChunkStore:
         self._runner.connect()
 
     def chunks(self, what: str, tasks: Sequence[Task]) -> Iterator[Chunk]:
-        """The chunks of `what` in the order of the tasks; those that are missing are computed. Raises RunStopped."""
+        """The chunks of `what` in the order of the tasks; missing ones are computed. Raises RunStopped."""
         missing = [task for task in tasks if not self._path(task).exists()]
         with self.progress(what, sum(map(len, missing))) as bar:
             for task, chunk in self._runner.results(missing):

@@ -1,4 +1,4 @@
-"""Height maps as terrain: the horizon traced exactly, with a table of bounds that is worked out once and kept."""
+"""Height maps as terrain: the horizon traced exactly, with a table of bounds that is computed once and kept."""
 
 from __future__ import annotations
 
@@ -124,9 +124,9 @@ class HeightMap(Terrain):
         return self._key in cache.TABLES_IN_MEMORY or self.table_path.is_file()
 
     def prepare(self, progress: Progress | None = None) -> None:
-        """Have the table of horizons in memory: from the cache on disk, else worked out and cached.
+        """Have the table of horizons in memory: from the cache on disk, else computed and cached.
 
-        Of several processes that need the same table one works it out, and the others wait for it.
+        If several processes need the same table, one computes it and the others wait.
         """
         if "table" not in self.__dict__:
             self.__dict__["table"] = self._load_or_build_table(progress)
@@ -144,7 +144,7 @@ class HeightMap(Terrain):
         return table
 
     def _build_and_keep_table(self, progress: Progress | None) -> HorizonTable:
-        LOG.info("horizons of %s: worked out now, once; this takes a minute or two", self.name)
+        LOG.info("horizons of %s: computed now, once; this takes a minute or two", self.name)
         start = clock.perf_counter()
         table = self._build_table(progress)
         path = cache.keep_table(self._key, table)
@@ -293,7 +293,7 @@ class HeightMap(Terrain):
     def _build_table(self, progress: Progress | None) -> HorizonTable:
         square = self.square
         centres = square.centres_m
-        wanted = np.hypot(*centres.T) < self.reach_m + 1.42 * square.half_m  # all that hold a place within reach
+        wanted = np.hypot(*centres.T) < self.reach_m + 1.42 * square.half_m  # all that contain a position within reach
         middles = (np.arange(BINS) + 0.5) * 2 * np.pi / BINS
 
         def fill(cells: Ints) -> Array:

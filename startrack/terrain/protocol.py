@@ -34,7 +34,7 @@ class Interpolation(NamedTuple):
 class Terrain(ABC):
     """Ground whose horizon hides stars. Positions are those of the CAMERA, east and north in enu [m].
 
-    A terrain of one's own is a subclass with three methods: `horizon_rad`, `horizon_bounds_rad` and `ground_m`. All
+    A terrain of your own is a subclass with three methods: `horizon_rad`, `horizon_bounds_rad` and `ground_m`. All
     other members have defaults, which describe exact ground that is known everywhere. Methods are elementwise over
     their broadcast arguments. The horizon is an elevation in enu [rad]; a star is visible where its elevation exceeds
     it.
@@ -55,7 +55,7 @@ class Terrain(ABC):
     horizon_cost: float = 1.0  # of one horizon, beside one traced on a height map: the search has a budget of these
     shape_sigma: tuple[float, float] = (0.0, 0.0)  # relative, of steepness and of size: see `reshaped`
     rim_radius_m: float | None = None  # of a circular rim about the origin, drawn on maps instead of the relief
-    table_path: Path | None = None  # file of what `prepare` works out; None where it works out nothing
+    table_path: Path | None = None  # file of the table that `prepare` computes; None where it computes none
 
     @property
     def reach_m(self) -> float:
@@ -113,7 +113,7 @@ class Terrain(ABC):
     def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = 3) -> Terrain:
         """The same ground, prepared for positions within `half_m` of a centre (2,), at the azimuths (n,).
 
-        The terrain itself where horizons cost little; else horizons at `across` x `across` points may be worked out.
+        The terrain itself where horizons cost little; else horizons at `across` x `across` points may be computed.
         """
         return self
 
@@ -146,10 +146,10 @@ class Terrain(ABC):
         return True
 
     def prepare(self, progress: Progress | None = None) -> None:  # noqa: B027 - the default has nothing to do
-        """Work out, once, what the first call of `horizon_bounds_rad` needs."""
+        """Compute, once, the table that the first call of `horizon_bounds_rad` needs."""
 
     def discard_table(self) -> None:  # noqa: B027 - the default has nothing to discard
-        """Forget what `prepare` has worked out, in memory and on disk."""
+        """Discard the table of `prepare`, in memory and on disk."""
 
     def facts(self) -> dict[str, Any]:
         """Facts about the ground that `startrack terrain show` prints, as JSON values; "kind" is one of them."""

@@ -66,7 +66,9 @@ def _raster_of(grid: Grid, path: Path, scale: float | None, offset_m: float | No
     scale = 1.0 if scale is None else scale
     numbers = (*grid.first_m, *grid.step_m, scale, offset)
     if not np.isfinite(numbers).all() or 0.0 in grid.step_m or max(map(abs, numbers)) > 1e12:
-        raise BadInput("bad_terrain", f"{path}: its place, its scale or its offset is no usable number: {numbers}")
+        raise BadInput(
+            "bad_terrain", f"{path}: its position, its scale or its offset is not a usable number: {numbers}"
+        )
     with np.errstate(over="ignore", invalid="ignore"):
         heights = values.astype(np.float64) * scale + offset
     missing = ~(np.abs(heights) < MAX_HEIGHT_M)  # NaN too
@@ -89,14 +91,14 @@ def _read_with_rasterio(path: Path, near: tuple[float, float] | None) -> Grid:
     if find_spec("rasterio") is None or find_spec("pyproj") is None:
         raise BadInput(
             "bad_terrain",
-            f"{path}: no GeoTIFF with its place on the Moon in a known projection and compression; other maps need "
+            f"{path}: not a GeoTIFF on the Moon in a known projection and compression; other maps need "
             "rasterio and pyproj: pip install '.[dem]' in a clone of startrack",
         )
     import rasterio
 
     try:
         with warnings.catch_warnings():
-            # Of files without a place, which have a message of their own; of what PROJ's words lack beside WKT.
+            # About files without a position, which have their own message, and about terms that PROJ lacks beside WKT.
             warnings.simplefilter("ignore")
             with rasterio.open(path) as file:
                 return _grid_of(file, path, near, hint)

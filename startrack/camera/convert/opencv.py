@@ -39,7 +39,7 @@ def from_text(text: str, name: str) -> Camera:
         matrix, distortion = store.getNode("camera_matrix").mat(), store.getNode("distortion_coefficients").mat()
         size = (int(store.getNode("image_width").real()), int(store.getNode("image_height").real()))
         fisheye = store.getNode("fisheye_model").real() == 1
-    except (cv2.error, SystemError) as cause:  # cv2 wraps what its parser throws in a SystemError
+    except (cv2.error, SystemError) as cause:  # cv2 wraps its parser's errors in a SystemError
         raise unreadable_file("OpenCV", cause) from cause
     if matrix is None or matrix.shape != (3, 3) or distortion is None:
         raise unreadable_file("OpenCV", "camera_matrix or distortion_coefficients are missing")

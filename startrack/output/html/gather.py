@@ -88,7 +88,7 @@ def _files(root: Path) -> list[Path]:
 def _record(path: Path) -> dict[str, Any]:
     """The record of a file. Raises ValueError with the cause where it holds none."""
     try:
-        # JSON has no NaN and no infinity, but files written or edited elsewhere may: nothing was known there.
+        # JSON has no NaN and no infinity, but files written or edited elsewhere may: such values are unknown.
         record = json.loads(path.read_text(encoding="utf-8"), parse_constant=lambda _: None, parse_float=_finite)
     except OSError as cause:
         raise ValueError(f"cannot be opened ({cause.strerror})") from cause

@@ -1,4 +1,4 @@
-"""The annotated picture of a result: the exposure with what was found in it, and a panel with maps and quantities."""
+"""The annotated picture of a result: the exposure with stars and skyline, and a panel with maps and quantities."""
 
 from __future__ import annotations
 

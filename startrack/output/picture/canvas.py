@@ -55,7 +55,7 @@ def mix_colours(a: Colour, b: Colour, part_of_b: float) -> Colour:
 
 
 SHIFT_BITS = 4  # OpenCV takes sub-pixel places as integers of 1/16 px
-EDGE_PX = 0.4  # what OpenCV's smoothing adds to the edge of an area
+EDGE_PX = 0.4  # added by OpenCV's smoothing to the edge of an area
 FARTHEST_PX = 30_000.0  # beyond any picture, within OpenCV's range
 Box = tuple[float, float, float, float]  # left, top, right, bottom
 KNOWN_BEYOND_ASCII = "±°·…"

@@ -50,7 +50,7 @@ class MapView:
 
     @property
     def half_m(self) -> Array:
-        """Half of what is shown, east and north [m]."""
+        """Half of the shown extent, east and north [m]."""
         left, top, right, bottom = self.box
         return np.array([right - left, bottom - top]) / 2 * self.metres_per_px
 

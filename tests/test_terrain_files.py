@@ -377,7 +377,7 @@ def test_a_build_says_so_in_one_line_and_an_interrupted_one_is_forgotten(tmp_pat
     heard = capsys.readouterr()
     assert json.loads(heard.out)["known_before"] is False
     assert len(heard.err.splitlines()) == 1
-    assert "hill: worked out now, once" in heard.err
+    assert "hill: computed now, once" in heard.err
     assert [one.suffix for one in table.parent.iterdir()] == [".npz"]
     assert main(["terrain", "build", str(path), "-q", "--force"]) == 0
     assert capsys.readouterr().err == ""

@@ -108,7 +108,7 @@ def test_maps_without_place_of_other_bodies_or_with_holes_are_refused(tmp_path):
 
     path = terrain_file(tmp_path)
     tifffile.imwrite(tmp_path / "hill.tif", np.zeros((50, 50), dtype=np.int16))
-    with pytest.raises(BadInput, match="where on the Moon"):
+    with pytest.raises(BadInput, match="position on the Moon"):
         load_terrain(path)
     (tmp_path / "hill.tif").write_bytes(b"II*\x00 not a tiff")
     with pytest.raises(BadInput, match="can be read"):
@@ -334,7 +334,7 @@ def test_pixels_given_for_the_label_are_said_to_be(tmp_path, capfd):
     with pytest.raises(BadInput, match=r"HILL\.LBL"):
         read_map(tmp_path / "HILL.IMG")
     Image.fromarray(np.zeros((40, 40), dtype=np.uint8)).save(tmp_path / "plain.png")
-    with pytest.raises(BadInput, match="where on the Moon"):
+    with pytest.raises(BadInput, match="position on the Moon"):
         read_map(tmp_path / "plain.png")
     assert capfd.readouterr().err == ""
 

@@ -10,7 +10,7 @@ import numpy as np
 from startrack import pipeline
 from startrack.calibration import Calibration
 from startrack.calibration import calibrate as calibrate_exposures
-from startrack.camera import Camera, load_camera
+from startrack.camera import Camera
 from startrack.catalog import load_catalog
 from startrack.errors import BAD_INPUT_REASONS, BadInput
 from startrack.frames import Site
@@ -20,6 +20,7 @@ from startrack.inputs import (
     angle_rad,
     camera_input,
     exposure_input,
+    load_camera_input,
     settings_input,
     terrain_input,
     time_input,
@@ -156,7 +157,7 @@ def calibrate(
         BadInput: as `locate`.
         NotIdentified: no image's stars could be identified.
     """
-    start = load_camera(camera) if isinstance(camera, str) else camera
+    start = None if camera is None else load_camera_input(camera)
     exposures = [exposure_input(image, None) for image in images]
     fov_rad = None if fov is None else angle_rad(fov)
     return calibrate_exposures(exposures, load_catalog(), camera=start, fov_rad=fov_rad, site=site, name=name)
@@ -188,7 +189,7 @@ def render(
     Raises:
         BadInput: bad_calibration without a sensor, bad_terrain where no camera can stand there.
     """
-    lens = load_camera(camera) if isinstance(camera, str) else camera
+    lens = load_camera_input(camera)
     ground = terrain_input(terrain, None)
     catalog = load_sky_catalog("auto").brighter_than(settings.get("faint_v_mag", Series.faint_v_mag) or np.inf)
     east_m, north_m = position_m if position_m is not None else (None, None)
@@ -225,7 +226,7 @@ def _identify_list(
 
     return identify_centroids(
         np.asarray(xy_px, dtype=float),
-        camera=load_camera(camera) if isinstance(camera, str) else camera,
+        camera=None if camera is None else load_camera_input(camera),
         fov_rad=None if fov is None else angle_rad(fov),
         size_px=size_px,
         flux=flux,

@@ -84,11 +84,16 @@ def camera_input(camera: str | os.PathLike[str] | Camera | None, exposure: Expos
 
     Raises BadInput (no_calibration, bad_calibration).
     """
-    if isinstance(camera, Camera):
-        return camera
     reference = camera if camera is not None else exposure.camera
     if reference is None:
         raise BadInput("no_calibration", "no camera is known: give camera=")
+    return load_camera_input(reference)
+
+
+def load_camera_input(reference: str | os.PathLike[str] | Camera) -> Camera:
+    """The camera that the `reference` is, or that of its file or shipped name. Raises BadInput as `camera_input`."""
+    if isinstance(reference, Camera):
+        return reference
     if not isinstance(reference, str | os.PathLike):
         raise BadInput("bad_calibration", f"{type(reference).__name__} is no camera: give a file, a name or a Camera")
     return load_camera(os.fspath(reference))

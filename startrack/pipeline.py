@@ -43,7 +43,7 @@ def locate(
     """Position and attitude of the camera, or the reason why there is none.
 
     `exposure` must have a time and the image size of the `camera`, `terrain` a site; `catalog` is the list of stars.
-    `settings` exchanges stages. Bad input of an image makes a refusal too: nothing is raised for an image's sake.
+    `settings` exchanges stages. Bad input of an image makes a refusal too: no image raises an exception.
     """
     settings = settings or Settings()
     run = Run(Inputs(exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name))
@@ -54,11 +54,12 @@ def locate(
         oriented = run.step("attitude", solve_orientation, identified)
         measured = run.step("evidence", measure_evidence, oriented, terrain, settings)
         fix = run.time("locate", settings.localizer, measured.evidence(), terrain)
-        step = None if fix.ambiguous else run.time("evidence", sky_step_at, measured, fix)
+        rough = fix.ambiguous or fix.search == "approximate"  # its skyline is not that of the image
+        step = None if rough else run.time("evidence", sky_step_at, measured, fix)
         if step is not None and step.exceeds_noise:
             measured = run.step("evidence", remeasure_near_skyline, measured, fix, step, settings.evidence)
             fix = run.time("locate", settings.localizer, measured.evidence(), terrain)
-        if getattr(settings.localizer, "explains_evidence", True):
+        if fix.search != "approximate":
             run.time("locate", check_consistency, measured.evidence(), fix, terrain)
         sky_mag = step and step.brightness_mag_arcsec2(camera, exposure.exposure_s)
         return run.finish(extend(measured, Located, fix=fix, sky_brightness_mag_arcsec2=sky_mag))

@@ -199,6 +199,14 @@ class Evidence(Value):
     edge_sigma_rad: Array = array("n", default=0.0)  # width of the edge: uncertainty of the elevation, or the PSF
     extended_nats: Array = array("n", default=0.0)  # (light / noise)^2 of extended light; 0: a point source
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not all(np.isfinite(getattr(self, f.name)).all() for f in fields(self)):
+            raise ValueError("Evidence holds an infinite number")
+        wrapped = np.mod(self.azimuth_rad, 2 * np.pi)
+        wrapped.flags.writeable = False
+        object.__setattr__(self, "azimuth_rad", wrapped)
+
     def take(self, which: Any) -> Evidence:
         """The rows that a mask, slice or index array `which` selects."""
         return take_rows(self, which)
@@ -233,5 +241,5 @@ class Fix(Value):
     modes: tuple[Mode, ...]  # heaviest first; weights sum to 1
     ambiguous: bool  # modes outside the main mode's 99.9 % circle hold more than 1 %
     dropped_mass: float = 0.0  # bound on the posterior probability that the search dropped
-    search: str = "proven"  # no other position fits; "beam": the search ended before that was proven
+    search: str = "proven"  # no other position fits; "beam": not proven to the end; "approximate": no posterior
     horizon_error_rad: float = 0.0  # common to all azimuths: how much higher the true horizon is than the map's

@@ -174,8 +174,6 @@ def test_parquet_is_written_with_the_extra_only(done, tmp_path, monkeypatch):
 class FixedPosition:
     """A localizer of one's own."""
 
-    explains_evidence = False
-
     def __call__(self, evidence, terrain):
         return point_fix(np.array([123.0, 45.0]), 10.0, terrain)
 

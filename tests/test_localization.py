@@ -310,3 +310,28 @@ def test_a_smaller_search_area_is_kept_to() -> None:
     # Other boxes, the same posterior.
     sigma = np.sqrt(np.trace(fix.covariance_m2))
     np.testing.assert_allclose(near.position_enu_m, fix.position_enu_m, atol=0.1 * sigma)
+
+
+def test_without_a_proof_sharp_posteriors_are_resolved_all_the_same() -> None:
+    """20,000 rows with hard edges: a few decimetres to metres wide, mean NEES 2 (8 positions: s.d. 0.7)."""
+    nees = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        at = place(rng)
+        evidence = measured(rng, at, TERRAIN, 20_000)
+        fix = ExactPosterior(budget_horizons=50.0)(evidence, ThreeMethods(TERRAIN))
+        d = fix.position_enu_m[:2] - at
+        assert fix.search == "beam"
+        assert np.linalg.norm(d) < fix.radius999_m
+        nees.append(d @ np.linalg.solve(fix.covariance_m2, d))
+    assert np.mean(nees) < 4.0
+
+
+def test_azimuths_may_be_negative_and_numbers_must_be_finite() -> None:
+    rng = np.random.default_rng(16)
+    evidence = measured(rng, place(rng), TERRAIN, 2000)
+    turned = replace(evidence, azimuth_rad=evidence.azimuth_rad - 2 * np.pi)
+    own, other = ExactPosterior()(evidence, TERRAIN), ExactPosterior()(turned, TERRAIN)
+    np.testing.assert_allclose(other.position_enu_m, own.position_enu_m, atol=1e-6)
+    with pytest.raises(ValueError, match="infinite"):
+        replace(evidence, llr=np.full(2000, np.inf))

@@ -13,8 +13,8 @@ from startrack.types import Evidence, Fix
 class Localizer(Protocol):
     """Evidence and terrain to a fix; raises NotLocated.
 
-    Any function will do. A method with an attribute `explains_evidence = False` is an approximation, whose error is
-    larger than the evidence allows: its position is reported without the check that it explains the evidence.
+    Any function will do. A fix whose `search` is "approximate" has a larger error than the evidence allows: its
+    position is reported without the check that it explains the evidence.
     """
 
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix: ...

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -22,8 +21,6 @@ class Hull:
     [1, -2x, -2y] (h^2 + k^2, h, k) = r^2 - x^2 - y^2 is solved in the least-squares sense; the position is (-h, -k).
     Biased: the outermost seen stars stand above the skyline. Source: Kua 2008, eq. 3.1-3.6.
     """
-
-    explains_evidence: ClassVar[bool] = False
 
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
         """The position from the `evidence` in a `terrain` that is a cylinder.

@@ -15,6 +15,8 @@ FIRST_CELLS, MAX_CELLS = 16, 64  # boxes from the middle of a square to its side
 EDGE_MASS = 1e-4  # of a square's probability may lie in its outermost boxes
 REACH_SIGMAS = 5.0  # from the middle of a square to its side, along the longer axis of the mode
 BOXES_PER_SIGMA = 1.0  # of the shorter axis
+LEAST_RESOLVED = 1.5  # boxes within a standard deviation of the shorter axis, else smaller boxes are scored
+MAX_ROUNDS = 10
 NODE_STEP_M, MIN_NODES, MAX_NODES = 12.0, 5, 13  # distance of traced horizons; points along a side
 
 
@@ -25,7 +27,7 @@ def local_posterior(likelihood: PositionLikelihood, guess: Guess, log_open: floa
     """
     modes = guess.points_m[guess.log_likelihood > guess.best - MODE_NATS]
     squares = [_square(likelihood, position) for position in modes]
-    half = min(square[2] for square in squares)
+    half = max(min(square[2] for square in squares), max(square[1] for square in squares) / (4 * MAX_CELLS))
     parts = [_score(likelihood, middle, size, half, NODE_STEP_M) for middle, size, _ in squares]
     centres = np.concatenate([part[0] for part in parts])
     score = np.concatenate([part[1] for part in parts])
@@ -36,23 +38,27 @@ def local_posterior(likelihood: PositionLikelihood, guess: Guess, log_open: floa
 
 def _square(likelihood: PositionLikelihood, position_m: Array) -> tuple[Array, float, float]:
     """Middle (2,) and half side of a square that holds the mode, and half side of boxes that resolve it [m]."""
-    size = FIRST_HALF_M
-    while True:
+    middle, size, grown, finest = position_m, FIRST_HALF_M, False, likelihood.terrain.finest_m
+    for _ in range(MAX_ROUNDS):
         half = size / (2 * FIRST_CELLS)
-        centres, score = _score(likelihood, position_m, size, half, size)
+        centres, score = _score(likelihood, middle, size, half, size)
         if not np.isfinite(score).any():
-            return position_m, size, half
+            return middle, size, half
         weight = np.exp(score - score.max())
         weight /= weight.sum()
-        rim = np.abs(centres - position_m).max(axis=1) > size - 2.5 * half
-        if weight[rim].sum() < EDGE_MASS or size >= LAST_HALF_M:
+        rim = np.abs(centres - middle).max(axis=1) > size - 2.5 * half
+        if weight[rim].sum() >= EDGE_MASS and size < LAST_HALF_M:
+            size, grown = 2 * size, True
+            continue
+        mean = weight @ centres
+        variances = np.linalg.eigvalsh(((centres - mean) * weight[:, None]).T @ (centres - mean))
+        narrow, wide = np.sqrt(np.maximum(variances, half**2 / 3))
+        closer = REACH_SIGMAS * max(wide, half) + half
+        if grown or narrow > 2 * half * LEAST_RESOLVED or half <= finest or closer > 0.8 * size:
             break
-        size *= 2
-    middle = weight @ centres
-    variances = np.linalg.eigvalsh(((centres - middle) * weight[:, None]).T @ (centres - middle))
-    narrow, wide = np.sqrt(np.maximum(variances, half**2 / 3))
-    size = min(REACH_SIGMAS * wide + float(np.abs(middle - position_m).max()), 1.5 * size)
-    return middle, size, max(0.5 * narrow / BOXES_PER_SIGMA, size / (2 * MAX_CELLS), likelihood.terrain.finest_m)
+        middle, size = mean, closer  # too coarse: look closer
+    size = min(REACH_SIGMAS * wide + float(np.abs(mean - middle).max()), 1.5 * size)
+    return mean, size, max(0.5 * narrow / BOXES_PER_SIGMA, finest)
 
 
 def _score(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -23,7 +22,6 @@ class PseudoGradient:
     Algorithm 1. Weak when few stars differ: it may wander until the steps run out.
     """
 
-    explains_evidence: ClassVar[bool] = False
     gain: float = 1.0
     most_steps: int = 200
 

@@ -49,4 +49,5 @@ def point_fix(position_m: Array, sigma_m: float, terrain: Terrain) -> Fix:
         radius999_m=3.717 * sigma_m,
         modes=(Mode(east_m=float(position_m[0]), north_m=float(position_m[1]), weight=1.0),),
         ambiguous=False,
+        search="approximate",
     )

@@ -173,8 +173,9 @@ QUANTITIES: tuple[Quantity, ...] = (
       shown=(Show("text", "position", ", longitude {:.6f}°"), Show("panel", "Lat, lon", "   {:.5f}°"),
              Show("notebook", "longitude", "{:.6f}°"), Show("page", "Longitude", "{:.6f}°"))),
     Q("position.search", "", Located, lambda v: v.fix.search, "`proven`: the search has excluded every other position; "
-      "`beam`: its budget ended before that, and the best position of a beam search is stated",
-      {"enum": ["proven", "beam"]}, optional=True, columns=(Column("search", "%s"),),
+      "`beam`: its budget ended before that, and the posterior near the best positions is stated; "
+      "`approximate`: a method without a posterior",
+      {"enum": ["proven", "beam", "approximate"]}, optional=True, columns=(Column("search", "%s"),),
       shown=(Show("text", "error", "; search {}"), Show("notebook", "search", "{}"), Show("page", "Search", "{}"))),
     Q("modes", "", Located, lambda v: [{"east_m": m.east_m, "north_m": m.north_m, "weight": m.weight}
                                        for m in v.fix.modes],

@@ -56,7 +56,7 @@ def announce_compilation() -> None:
         def on_start(self, event: Any) -> None:
             if not self.made and event.data["dispatcher"].py_func.__module__.startswith("startrack."):
                 self.made = True
-                LOG.warning("compiling for this machine, once: 15 s, for height maps up to a minute")
+                LOG.warning("compiling for this machine, once: about 20 s, for height maps a minute")
 
         def on_end(self, event: Any) -> None:
             """Nothing to do."""

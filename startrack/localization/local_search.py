@@ -10,8 +10,8 @@ from math import floor
 import numpy as np
 from numba import njit
 
-from startrack.localization.box_kernel import log_mixtures, score_disks
 from startrack.localization.prefix_sums import PrefixSums
+from startrack.localization.score_kernel import log_mixtures, score_disks
 from startrack.localization.sector_likelihood import Sectors, contributions, row_contribution
 from startrack.terrain import Terrain
 from startrack.terrain.horizon_kernel import surfaces

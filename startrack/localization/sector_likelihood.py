@@ -151,13 +151,3 @@ def log_mixture(below, log_keep, log_floor):  # type: ignore[no-untyped-def]
             else:
                 value = log_floor + log1p(exp(value - log_floor))
     return value
-
-
-@njit(cache=True, nogil=True)
-def total_log_mixture(sums, ceiling, log_floor):  # type: ignore[no-untyped-def]
-    """Log-likelihood of the sums of contributions (sectors,)."""
-    log_keep = log1p(-exp(log_floor))
-    total = 0.0
-    for s in range(len(sums)):
-        total += log_mixture(sums[s] - ceiling[s], log_keep, log_floor)
-    return total

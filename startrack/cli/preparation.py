@@ -58,7 +58,7 @@ def compile_kernels(terrain: Terrain) -> None:
         azimuth_rad=np.tile(azimuth, 2),
         elevation_rad=np.concatenate([skyline + OFFSET_RAD, skyline - OFFSET_RAD]),
         llr=np.repeat([LLR, -LLR], RAYS),
-        edge_sigma_rad=np.full(2 * RAYS, EDGE_SIGMA_RAD),
+        edge_sigma_rad=np.full(2 * RAYS, 0.0 if terrain.hard_edges else EDGE_SIGMA_RAD),
     )
     with suppress(NotLocated):  # the kernels are compiled in any case
         ExactPosterior()(evidence, terrain)

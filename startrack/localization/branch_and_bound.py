@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 
@@ -33,12 +33,18 @@ LOOK_UP_COST, INTERPOLATION_COST, BOX_COST = 0.08, 0.03, 2.0  # a look-up, an in
 class SearchSettings(Protocol):
     """What the search reads of `ExactPosterior`."""
 
-    prune_nats: float
-    negligible_nats: float
-    finest_m: float
-    boxes_per_sigma: float
-    most_boxes: int
-    budget_horizons: float
+    @property
+    def prune_nats(self) -> float: ...
+    @property
+    def negligible_nats(self) -> float: ...
+    @property
+    def finest_m(self) -> float: ...
+    @property
+    def boxes_per_sigma(self) -> float: ...
+    @property
+    def most_boxes(self) -> int: ...
+    @property
+    def budget_horizons(self) -> float: ...
 
 
 class Explored(NamedTuple):
@@ -137,7 +143,8 @@ class Search:
                 "no camera can stand anywhere in the search area: is [search] max_slope_deg too small?",
                 reason="outside_search_area",
             )
-        lk, kept = self.likelihood, []
+        lk = self.likelihood
+        kept: list[tuple[Array, Array, Ints, Ints]] = []
         for start in range(0, len(centres), BOXES_AT_ONCE):
             some = centres[start : start + BOXES_AT_ONCE]
             first, last = lk.sums.open_rays(self.terrain, some, half)
@@ -156,7 +163,8 @@ class Search:
         few suffice to exclude most boxes.
         """
         sums = self.likelihood.part_sums
-        turns, kept = np.arange(len(sums.ends)) // PARTS % PARTS_TURNS, []
+        turns = np.arange(len(sums.ends)) // PARTS % PARTS_TURNS
+        kept: list[tuple[Array, Array, Ints, Ints]] = []
         for start in range(0, len(centres), BOXES_AT_ONCE):
             some = slice(start, start + BOXES_AT_ONCE)
             at, low, high, upper = centres[some], first[parent[some]], last[parent[some]], np.zeros(0)
@@ -244,7 +252,7 @@ class Search:
         self, boxes: Boxes, centres: Array, half: float, parent: Ints, weakest: float, strongest: float,
         bounds: tuple[Array, ...],
     ) -> Boxes:  # fmt: skip
-        kept, self.best, self.certain, dropped = bound_boxes(
+        kept, self.best, self.certain, dropped = cast(Any, bound_boxes)(
             self.likelihood.rows, self.terrain.reach_m, boxes, centres, half, parent,
             np.asarray(self.terrain.allowed(centres)), self.likelihood.strength, weakest, strongest, *bounds,
             self.best, self.certain, self.settings.prune_nats, self.settings.negligible_nats,

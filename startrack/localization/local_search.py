@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import floor
+from typing import Any, cast
 
 import numpy as np
 from numba import njit
@@ -102,8 +103,8 @@ class LocalLikelihood:
         def score(points_m: Array) -> Array:
             points, found = np.ascontiguousarray(points_m, dtype=np.float64), np.empty(len(points_m))
             if nodes is not None:
-                rise = np.tan(e.elevation_rad)
-                _score_nodes(nodes, rise, e.llr, e.extended_nats, self.sigma_rad, *fixed, points, found)
+                rise, fill = np.tan(e.elevation_rad), cast(Any, _score_nodes)
+                fill(nodes, rise, e.llr, e.extended_nats, self.sigma_rad, *fixed, points, found)
             elif disks is not None:
                 score_disks(*disks, e.llr, *fixed, points, found)
             else:

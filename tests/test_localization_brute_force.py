@@ -116,7 +116,7 @@ def test_the_stated_bound_on_what_was_dropped_holds(seed: int) -> None:
         method = ExactPosterior(
             sector_width_rad=2 * np.pi / SECTORS, sector_epsilon=EPSILON, prune_nats=nats, boxes_per_sigma=2.5
         )
-        centres, half, log_weight, log_dropped, _ = method.explore(evidence, PIT)
+        centres, half, log_weight, log_dropped, *_ = method.explore(evidence, PIT)
         kept = cKDTree(centres).query(places, p=np.inf)[0] <= half
         total = np.log(np.sum(np.exp(log_weight - log_weight.max())) * 4 * half**2) + log_weight.max()
         admitted = np.exp(log_dropped - np.logaddexp(log_dropped, total))

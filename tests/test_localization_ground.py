@@ -218,3 +218,12 @@ def test_an_unfinished_proof_gives_the_posterior_near_the_best_positions(shackle
     away = replace(evidence, azimuth_rad=np.mod(evidence.azimuth_rad + 1.0, 2 * np.pi))
     with pytest.raises(NotLocated, match=r"no position found explains the stars.*the search ended"):
         ExactPosterior(budget_horizons=1.0)(away, shackleton)
+
+
+def test_an_unfinished_proof_with_a_bad_start_climbs_from_the_boxes_that_it_left(shackleton):
+    at = np.array([-60.0, 110.0])
+    evidence = seen_from(shackleton, at, np.random.default_rng(15), 3000, 0.0005)
+    explored = ExactPosterior(budget_horizons=20_000.0).explore(evidence, shackleton, np.array([[1500.0, -900.0]]))
+    assert explored.search == "beam"
+    likeliest = explored.centres_m[np.argmax(explored.log_likelihood)]
+    assert np.linalg.norm(likeliest - at) < 20.0

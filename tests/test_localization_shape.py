@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from startrack.localization import ExactPosterior, check_consistency
+from startrack.localization.branch_and_bound import Explored
 from startrack.localization.consistency import LEAST_EXPLAINED_NATS, explained_by_sector
-from startrack.terrain import Cylinder, load_terrain
+from startrack.localization.nuisance import marginalize_shape
+from startrack.terrain import Cylinder, Terrain, load_terrain
 from startrack.types import Evidence, NotLocated
 
 TRUE = load_terrain("shackleton-thesis")
@@ -83,3 +85,44 @@ def test_a_place_that_explains_the_stars_badly_is_refused() -> None:
     assert explained_by_sector(evidence, aside, TRUE).mean() < LEAST_EXPLAINED_NATS
     with pytest.raises(NotLocated, match=r"explains the stars badly.*most at azimuths"):
         check_consistency(evidence, aside, TRUE)
+
+
+class BiasedCylinder(Cylinder):
+    """A cylinder whose horizon may be too low as a whole, too."""
+
+    common_sigma_rad = float(np.radians(0.03))
+
+
+def test_an_uncertain_shape_and_a_horizon_bias_are_estimated_together() -> None:
+    assert isinstance(TRUE, Cylinder)
+    bias_rad = np.radians(0.02)
+    evidence = evidence_at(PLACES[0], 4)
+    raised = replace(evidence, elevation_rad=evidence.elevation_rad + bias_rad)
+    values = {field.name: getattr(TRUE, field.name) for field in fields(TRUE)}
+    guess = BiasedCylinder(**values | {"depth_sigma_m": 20.0})
+    fix, shape_only = ExactPosterior()(raised, guess), ExactPosterior()(raised, replace(TRUE, depth_sigma_m=20.0))
+    assert np.linalg.norm(fix.position_enu_m[:2] - PLACES[0]) < fix.radius999_m < 200
+    assert fix.horizon_error_rad != 0.0 == shape_only.horizon_error_rad
+
+
+def test_a_shape_that_nothing_explains_has_no_share() -> None:
+    assert isinstance(TRUE, Cylinder)
+    evidence, guess = evidence_at(PLACES[1], 5), replace(TRUE, depth_sigma_m=3.0)
+    whole = ExactPosterior()(evidence, guess)
+    explored_on: list[Terrain] = []
+
+    def explore_all_but_the_first(evidence: Evidence, terrain: Terrain) -> Explored:
+        explored_on.append(terrain)
+        if len(explored_on) == 1:
+            raise NotLocated("no position explains the stars", reason="inconsistent_evidence")
+        return ExactPosterior().explore(evidence, terrain)
+
+    explored, _ = marginalize_shape(explore_all_but_the_first, evidence, guess)
+    likeliest = explored.centres_m[np.argmax(explored.log_likelihood)]
+    assert np.linalg.norm(likeliest - whole.position_enu_m[:2]) < whole.radius999_m
+
+    def refuse(evidence: Evidence, terrain: Terrain) -> Explored:
+        raise NotLocated("no position explains the stars", reason="inconsistent_evidence")
+
+    with pytest.raises(NotLocated, match="no position explains"):
+        marginalize_shape(refuse, evidence, guess)

@@ -55,14 +55,17 @@ class Explored(NamedTuple):
     log_likelihood: Array  # (n,) at the centres
     log_dropped: float  # logarithm of a bound of the mass [m2] that was dropped
     search: str  # "proven" or "beam"
+    horizon_bias_rad: float = 0.0  # how much higher than the terrain's the horizon was taken
 
 
 class BudgetSpent(Exception):
-    """The search has traced as many horizons as it may, and `open_m2` of the area may still matter."""
+    """The search has traced as many horizons as it may, and boxes of `open_m2` may still matter."""
 
-    def __init__(self, open_m2: float, log_open: float) -> None:
-        super().__init__(open_m2, log_open)
-        self.open_m2, self.log_open = open_m2, log_open
+    def __init__(self, centres_m: Array, upper: Array, half_m: float) -> None:
+        super().__init__(len(upper), half_m)
+        self.centres_m = centres_m[np.argsort(-upper, kind="stable")]  # (n, 2) of the boxes, the best bounded first
+        self.open_m2 = len(upper) * 4 * half_m**2
+        self.log_open = log_sum(upper) + float(np.log(4 * half_m**2))  # bound of their mass [m2]
 
 
 @dataclass
@@ -305,14 +308,13 @@ class Search:
     def _spend_on_boxes(self, horizons: float, kept: list[tuple[Array, Array, Ints, Ints]], half: float) -> None:
         self.work += horizons * self.terrain.horizon_cost
         if self.work > self.settings.budget_horizons:
-            upper = np.concatenate([part[1] for part in kept] or [np.zeros(1)])
-            raise BudgetSpent(len(upper) * 4 * half**2, log_sum(upper) + float(np.log(4 * half**2)))
+            centres = np.concatenate([part[0] for part in kept] or [np.zeros((1, 2))])
+            raise BudgetSpent(centres, np.concatenate([part[1] for part in kept] or [np.zeros(1)]), half)
 
     def _spend(self, horizons: float, boxes: Boxes) -> None:
         self.work += horizons * self.terrain.horizon_cost
         if self.work > self.settings.budget_horizons:
-            cell = 4 * boxes.half_m**2
-            raise BudgetSpent(len(boxes.centres_m) * cell, log_sum(boxes.upper) + float(np.log(cell)))
+            raise BudgetSpent(boxes.centres_m, boxes.upper, boxes.half_m)
 
 
 def explains_all_sectors(log_likelihood: float, likelihood: PositionLikelihood) -> bool:

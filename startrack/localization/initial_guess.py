@@ -58,12 +58,16 @@ def beam_search(likelihood: PositionLikelihood) -> Guess:
     """
     found = Guess(np.zeros((0, 2)), np.zeros(0))
     for beam in BEAMS:
-        guess = _climb(likelihood, _last_boxes(likelihood, beam)[:SCORED])
-        if guess.best > found.best:
-            found = guess
+        found = climb_to_best(likelihood, _last_boxes(likelihood, beam), found)
         if found.best > EXPLAINED_NATS * likelihood.sectors.count:
             break
     return found
+
+
+def climb_to_best(likelihood: PositionLikelihood, centres_m: Array, known: Guess) -> Guess:
+    """The best positions near the first of the centres (n, 2) [m], or those `known` if they are better."""
+    guess = _climb(likelihood, centres_m[:SCORED])
+    return guess if guess.best > known.best else known
 
 
 def holds_allowed_ground(terrain: Terrain, centres_m: Array, half_m: float) -> Bools:

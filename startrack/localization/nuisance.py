@@ -11,9 +11,10 @@ from startrack.localization.branch_and_bound import Explored, log_sum
 from startrack.localization.initial_guess import beam_search
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.terrain import Terrain
-from startrack.types import Array, Evidence
+from startrack.types import Array, Evidence, NotLocated
 
-Explore = Callable[[Evidence, Terrain, Array | None], Explored]
+Explore = Callable[[Evidence, Terrain], Explored]
+ExploreFrom = Callable[[Evidence, Terrain, Array | None], Explored]
 
 PRIOR_SIGMAS = 3.0  # half width of the first grid
 BIAS_NEARBY_M = 80.0  # horizons are prepared that far about a position; a position farther off is prepared anew
@@ -81,7 +82,7 @@ def estimate_horizon_bias(likelihood: PositionLikelihood, position_m: Array) -> 
 
 
 def marginalize_horizon_bias(
-    explore: Explore, evidence: Evidence, terrain: Terrain, bias: HorizonBias, others_m: Array
+    explore: ExploreFrom, evidence: Evidence, terrain: Terrain, bias: HorizonBias, others_m: Array
 ) -> Explored:
     """The position's posterior over all biases: explored at the likeliest one, and smeared along the drift.
 
@@ -89,6 +90,7 @@ def marginalize_horizon_bias(
     are further positions that the search begins with.
     """
     found = explore(lower_evidence(evidence, bias.bias_rad), terrain, np.vstack([bias.position_m, others_m]))
+    found = found._replace(horizon_bias_rad=bias.bias_rad)
     keep = found.log_likelihood > np.max(found.log_likelihood, initial=-np.inf) - 20.0
     steps = MIXED_SIGMAS[:, None, None] * bias.sigma_rad * bias.drift_m_per_rad
     if not keep.any() or np.abs(steps).max() < 0.5 * found.half_m:
@@ -105,10 +107,9 @@ def marginalize_shape(explore: Explore, evidence: Evidence, terrain: Terrain) ->
     """The position's posterior over the shapes of a terrain, each with its share of the probability.
 
     Grids of shapes, each with its best position, zoom in on those that matter; over the last grid the exact posteriors
-    are mixed.
+    are mixed. A shape with which no position explains the evidence has no share. Raises NotLocated where all are such.
     """
-    nodes = _shapes_that_matter(evidence, terrain)
-    parts = [explore(evidence, terrain.reshaped(node), None) for node in nodes]
+    nodes, parts = _explore_shapes(explore, evidence, terrain, _shapes_that_matter(evidence, terrain))
     log_prior = np.array([terrain.log_prior(node) for node in nodes])
     logs = [p.log_likelihood + prior + np.log(4 * p.half_m**2) for p, prior in zip(parts, log_prior, strict=True)]
     log_mass = np.array([log_sum(log) for log in logs])
@@ -119,8 +120,27 @@ def marginalize_shape(explore: Explore, evidence: Evidence, terrain: Terrain) ->
     dropped = log_sum(np.array([p.log_dropped + prior for p, prior in zip(parts, log_prior, strict=True)]))
     search = "beam" if any(p.search == "beam" for p in parts) else "proven"
     density = np.concatenate(logs) - np.log(4 * half**2)
-    mixed = Explored(np.concatenate([p.centres_m for p in parts]), half, density, dropped, search)
+    bias = float(share @ [p.horizon_bias_rad for p in parts])
+    mixed = Explored(np.concatenate([p.centres_m for p in parts]), half, density, dropped, search, bias)
     return mixed, ShapeFit(mean, np.einsum("n,ni,nj->ij", share, nodes - mean, nodes - mean))
+
+
+def _explore_shapes(
+    explore: Explore, evidence: Evidence, terrain: Terrain, nodes: Array
+) -> tuple[Array, list[Explored]]:
+    """The shapes (n, 2) that explain the evidence somewhere, and their posteriors."""
+    kept, parts, refused = [], [], None
+    for node in nodes:
+        try:
+            parts.append(explore(evidence, terrain.reshaped(node)))
+            kept.append(node)
+        except NotLocated as refusal:
+            if refusal.reason == "insufficient_geometry":  # its share is not known
+                raise
+            refused = refusal
+    if refused is not None and not parts:
+        raise refused
+    return np.array(kept), parts
 
 
 def _shapes_that_matter(evidence: Evidence, terrain: Terrain) -> Array:

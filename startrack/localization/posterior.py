@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.localization.branch_and_bound import BudgetSpent, Explored, Search, explains_all_sectors, log_sum
-from startrack.localization.initial_guess import beam_search
+from startrack.localization.initial_guess import beam_search, climb_to_best
 from startrack.localization.likelihood import SECTOR_EPSILON, SECTOR_RAD, PositionLikelihood
 from startrack.localization.local_posterior import local_posterior
 from startrack.localization.nuisance import ShapeFit, estimate_horizon_bias, marginalize_horizon_bias, marginalize_shape
@@ -49,27 +49,33 @@ class ExactPosterior:
         count = int(np.count_nonzero(informative))
         if count < MIN_ROWS:
             raise NotLocated(f"only {count} rays carry information about the skyline: expose longer")
-        evidence, bias_rad = evidence if count == len(evidence) else evidence.take(informative), 0.0
+        evidence = evidence if count == len(evidence) else evidence.take(informative)
         if any(terrain.shape_sigma):
-            explored, _ = marginalize_shape(self.explore, evidence, terrain)
-        elif terrain.common_sigma_rad > 0:
-            likelihood = self._likelihood(evidence, terrain)
-            guess = beam_search(likelihood)
-            if not len(guess.points_m):
-                raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
-            bias = estimate_horizon_bias(likelihood, guess.points_m[0])
-            bias_rad = bias.bias_rad
-            explored = marginalize_horizon_bias(self.explore, evidence, terrain, bias, guess.points_m[1:])
+            explored, _ = marginalize_shape(self.explore_biased, evidence, terrain)
         else:
-            explored = self.explore(evidence, terrain)
+            explored = self.explore_biased(evidence, terrain)
         log_mass = log_sum(explored.log_likelihood) + float(np.log(4 * explored.half_m**2))
         dropped = float(np.exp(min(explored.log_dropped - log_mass, 0.0)))
         fix = summarize(explored.centres_m, 2 * explored.half_m, explored.log_likelihood, dropped, terrain)
-        return replace(fix, horizon_error_rad=bias_rad, search=explored.search)
+        return replace(fix, horizon_error_rad=explored.horizon_bias_rad, search=explored.search)
 
     def fit_shape(self, evidence: Evidence, terrain: Terrain) -> ShapeFit:
         """Shape of a `terrain` with an uncertain one, from the `evidence`, estimated together with the position."""
-        return marginalize_shape(self.explore, evidence, terrain)[1]
+        return marginalize_shape(self.explore_biased, evidence, terrain)[1]
+
+    def explore_biased(self, evidence: Evidence, terrain: Terrain) -> Explored:
+        """The posterior on equal boxes, over all horizon biases that the `terrain` allows beside the `evidence`.
+
+        Raises NotLocated as `explore` does, and outside_search_area.
+        """
+        if terrain.common_sigma_rad == 0:
+            return self.explore(evidence, terrain)
+        likelihood = self._likelihood(evidence, terrain)
+        guess = beam_search(likelihood)
+        if not len(guess.points_m):
+            raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
+        bias = estimate_horizon_bias(likelihood, guess.points_m[0])
+        return marginalize_horizon_bias(self.explore, evidence, terrain, bias, guess.points_m[1:])
 
     def explore(self, evidence: Evidence, terrain: Terrain, starts_m: Array | None = None) -> Explored:
         """The posterior on equal boxes from `evidence` on a `terrain`; `starts_m` (n, 2): good positions, if known.
@@ -81,9 +87,12 @@ class ExactPosterior:
         try:
             return search.run()
         except BudgetSpent as spent:
-            best = search.best / likelihood.sectors.count
-            if explains_all_sectors(search.guess.best, likelihood):
-                return local_posterior(likelihood, search.guess, spent.log_open)
+            guess = search.guess
+            if not explains_all_sectors(guess.best, likelihood):
+                guess = climb_to_best(likelihood, spent.centres_m, guess)
+            if explains_all_sectors(guess.best, likelihood):
+                return local_posterior(likelihood, guess, spent.log_open)
+            best = max(search.best, guess.best) / likelihood.sectors.count
             limit = f"the search ended after {search.work:.0f} horizons with {spent.open_m2 / 1e6:.2f} km2 open"
             if best < CONTRADICTED_NATS:
                 raise NotLocated(

@@ -23,7 +23,6 @@ from chain import SENSOR
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.catalog.gaia import load_deep_catalog
-from startrack.detection import electrons
 from startrack.evidence import StarEvidence, StarPhotometry, flux_scale
 from startrack.localization import ExactPosterior
 from startrack.pipeline import Settings, locate
@@ -171,9 +170,8 @@ def _light(
     if certain:
         stars, scale = replace(stars, v_sigma_mag=np.zeros(len(stars))), replace(scale, scatter=0.0)
         extra_px = 0.0
-    image, dead = electrons(result.exposure, result.camera)
     return (settings or StarEvidence())(
-        image, dead, result.detections, result.camera, stars, list(result.bodies),
+        result.detections, result.camera, stars, list(result.bodies),
         result.attitude_fit.attitude.R_cam_icrs, result.R_enu_icrs, scale, extra_px, visible,
     )  # fmt: skip
 

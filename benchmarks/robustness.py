@@ -67,7 +67,7 @@ class Biased:
 
     def __call__(self, *what: Any) -> Any:
         turn = R_from_rotvec(np.radians(np.full(3, self.arcsec) / 3600))
-        return StarEvidence()(*what[:6], turn @ what[6], *what[7:])  # the seventh is the attitude
+        return StarEvidence()(*what[:4], turn @ what[4], *what[5:])  # the fifth is the attitude
 
 
 def ridge(width_deg: float, height_deg: float) -> Callable[[Cylinder], Cylinder]:

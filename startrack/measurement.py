@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from startrack.catalog.gaia import has_deep_catalog, hipparcos_rows_in_deep, load_deep_catalog
-from startrack.detection import electrons, electrons_at
 from startrack.evidence import (
     Skyline,
     SkyStep,
@@ -25,7 +22,7 @@ from startrack.evidence.star_evidence import filtered_noise_e
 from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
 from startrack.stages import Measured, Oriented, Settings, extend
 from startrack.terrain import Terrain
-from startrack.types import Array, BadInput, Bools, Detections, Fix, Ints
+from startrack.types import Array, BadInput, Detections, Fix, Ints
 
 REMEASURED_PX = 12.0  # stars this near the skyline are measured again
 NEIGHBOURS_PX = 10.0  # and with them the stars this much farther away, whose light overlaps theirs
@@ -50,8 +47,7 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
     if settings.deep_stars and oriented.catalog_name == "hipparcos":
         oriented = add_gaia_stars(oriented, terrain.site)
     R = R_enu_icrs(terrain.site, when)
-    image, dead = electrons(oriented.exposure, oriented.camera)
-    light = _photometry(oriented, terrain, R, settings.evidence, image, dead, oriented.detections)
+    light = _photometry(oriented, terrain, R, settings.evidence, oriented.detections)
     return extend(oriented, Measured, terrain=terrain, site=terrain.site, R_enu_icrs=R, light=light)
 
 
@@ -80,8 +76,7 @@ def sky_step_at(measured: Measured, fix: Fix) -> SkyStep | None:
     None where the image does not show that skyline.
     """
     horizon = Skyline.trace(fix.position_enu_m[:2], measured.terrain)
-    sample_e = partial(electrons_at, measured.exposure, measured.camera)
-    return measure_sky_step(sample_e, measured.detections, measured.camera, measured.R_cam_enu, horizon)
+    return measure_sky_step(measured.detections, measured.camera, measured.R_cam_enu, horizon)
 
 
 def remeasure_near_skyline(measured: Measured, fix: Fix, step: SkyStep, photometry: StarEvidence) -> Measured:
@@ -91,8 +86,7 @@ def remeasure_near_skyline(measured: Measured, fix: Fix, step: SkyStep, photomet
     """
     camera, terrain, position_m = measured.camera, measured.terrain, fix.position_enu_m[:2]
     horizon = step.horizon
-    image, dead = electrons(measured.exposure, camera)
-    detections = subtract_sky_step(image, dead, measured.detections, camera, measured.R_cam_enu, horizon)
+    detections = subtract_sky_step(measured.detections, camera, measured.R_cam_enu, horizon)
     axes = np.linalg.cholesky(fix.covariance_m2).T
     reliable = reliable_azimuths(horizon, [Skyline.trace(position_m + axis, terrain) for axis in axes], camera)
     light = measured.light
@@ -105,7 +99,7 @@ def remeasure_near_skyline(measured: Measured, fix: Fix, step: SkyStep, photomet
     by_fix = np.where(above > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)
     visible = np.where(undecided, 1.0 / (1.0 + np.exp(-light.llr)), by_fix)
     newer = _photometry(
-        measured, terrain, measured.R_enu_icrs, photometry, image, dead, detections, light.star[around], visible[around]
+        measured, terrain, measured.R_enu_icrs, photometry, detections, light.star[around], visible[around]
     )
     return replace(measured, light=light.replace_stars(newer, light.star[wanted]))
 
@@ -115,16 +109,12 @@ def _photometry(
     terrain: Terrain,
     R_enu_icrs: Array,
     photometry: StarEvidence,
-    image_e: NDArray[np.float32],
-    dead: Bools,
     detections: Detections,
     only: Ints | None = None,
     visible: Array | None = None,
 ) -> StarPhotometry:
     """Photometry of all stars, or of those with the indices `only`; 0 evidence where the terrain is not known."""
     light = photometry(
-        image_e,
-        dead,
         detections,
         oriented.camera,
         oriented.stars if only is None else oriented.stars.take(only),

@@ -39,8 +39,11 @@ def array(*shape: int | str, dtype: Any = np.float64, default: float | None = No
 
 def take_rows(value: T, which: Any) -> T:
     """The value with all its array fields of common length n cut to a mask, slice or index array."""
-    rows = [f.name for f in fields(value) if f.metadata.get("shape", ())[:1] == ("n",)]  # type: ignore[arg-type]
-    return replace(value, **{name: getattr(value, name)[which] for name in rows})  # type: ignore[type-var]
+    names = [f.name for f in fields(value) if f.metadata.get("shape", ())[:1] == ("n",)]  # type: ignore[arg-type]
+    rows = {name: getattr(value, name)[which] for name in names}
+    for taken in rows.values():
+        taken.flags.writeable = False  # new, and locked: the value need not copy it
+    return replace(value, **rows)  # type: ignore[type-var]
 
 
 def _is_locked(given: Any, dtype: Any) -> bool:
@@ -131,6 +134,8 @@ class Detections(Centroids):
     """Point sources found in an exposure, brightest first, with the images that they were measured against."""
 
     flux_sigma_e: Array = array("n")
+    image_e: NDArray[np.float32]  # (H, W) the exposure [e], pedestal included
+    dead: NDArray[np.bool_]  # (H, W) saturated pixels
     background_e: NDArray[np.float32]  # (H, W) smooth background [e], pedestal included
     noise_e: NDArray[np.float32]  # (H, W) noise of one pixel [e]
 
@@ -203,9 +208,10 @@ class Evidence(Value):
         super().__post_init__()
         if not all(np.isfinite(getattr(self, f.name)).all() for f in fields(self)):
             raise ValueError("Evidence holds an infinite number")
-        wrapped = np.mod(self.azimuth_rad, 2 * np.pi)
-        wrapped.flags.writeable = False
-        object.__setattr__(self, "azimuth_rad", wrapped)
+        if len(self) and not 0.0 <= self.azimuth_rad.min() <= self.azimuth_rad.max() < 2 * np.pi:
+            wrapped = np.mod(self.azimuth_rad, 2 * np.pi)
+            wrapped.flags.writeable = False
+            object.__setattr__(self, "azimuth_rad", wrapped)
 
     def take(self, which: Any) -> Evidence:
         """The rows that a mask, slice or index array `which` selects."""

@@ -23,6 +23,18 @@ SIZE, VARIANCE, READ_NOISE = 1024, 100.0, 2.5
 SCATTER = 0.05
 
 
+def without_sources(
+    image: np.ndarray, noise: np.ndarray, dead: np.ndarray | None = None, sigma_px: float = 1.0
+) -> Detections:
+    """An image (H, W) [e] on no background, with the noise of its pixels (H, W)."""
+    none = np.zeros(0)
+    return Detections(
+        xy_px=np.zeros((0, 2)), covariance_px2=np.zeros((0, 2, 2)), flux_e=none, flux_sigma_e=none, snr=none,
+        saturated=np.zeros(0, bool), psf_sigma_px=sigma_px, image_e=image,
+        dead=np.zeros(image.shape, bool) if dead is None else dead, background_e=np.zeros_like(noise), noise_e=noise,
+    )  # fmt: skip
+
+
 def noisy(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Background-subtracted pixels [e] of the light on a background of the usual variance."""
     background = VARIANCE - READ_NOISE**2
@@ -74,7 +86,7 @@ def measured(
     paint(image, xy, true, sigma)
     sources = Sources(xy_px=xy, flux_e=expected, fraction_sigma=np.full(len(xy), SCATTER), visible=thought)
     noise = np.full((SIZE, SIZE), np.sqrt(VARIANCE), np.float32)
-    light = measure(noisy(image, rng), np.zeros_like(noise), noise, np.zeros((SIZE, SIZE), bool), sources, sigma)
+    light = measure(without_sources(noisy(image, rng), noise, sigma_px=sigma), sources)
     return Measured(expected, true, shines, light, n)
 
 
@@ -172,9 +184,7 @@ def test_a_hot_pixel_near_a_star_is_masked(flux: float, excess: float) -> None:
     spot = np.rint(xy).astype(int) + rng.integers(-3, 4, xy.shape)
     image[spot[:, 1], spot[:, 0]] += excess
     sources = Sources(xy_px=xy, flux_e=expected, fraction_sigma=np.full(len(xy), 0.05), visible=np.full(len(xy), 0.5))
-    light = measure(
-        image, np.zeros_like(image), np.full((SIZE, SIZE), 10.0, np.float32), np.zeros((SIZE, SIZE), bool), sources, 1.0
-    )
+    light = measure(without_sources(image, np.full((SIZE, SIZE), 10.0, np.float32)), sources)
     true = np.where(np.arange(len(xy)) % 2 == 0, flux, 0.0)
     z = (light.flux_e - true) / np.sqrt(light.variance_e2 + light.own_shot * true)
     assert light.usable.mean() > 0.97
@@ -189,7 +199,9 @@ def test_saturated_stamps_are_unusable() -> None:
         xy_px=np.array([[50.0, 50.0], [30.0, 30.0]]), flux_e=np.full(2, 500.0), fraction_sigma=np.zeros(2),
         visible=np.full(2, 0.5),
     )  # fmt: skip
-    light = measure(*np.zeros((2, 100, 100), np.float32), np.full((100, 100), 10.0, np.float32), dead, sources, 1.0)
+    light = measure(
+        without_sources(np.zeros((100, 100), np.float32), np.full((100, 100), 10.0, np.float32), dead), sources
+    )
     assert light.usable.tolist() == [False, True]
     assert all(np.isfinite(getattr(light, name)).all() for name in Photometry.__dataclass_fields__)
 
@@ -197,6 +209,7 @@ def test_saturated_stamps_are_unusable() -> None:
 # The whole of it on a small frame: enu and icrs are the same, the camera looks at the zenith.
 CAMERA = replace(FISHEYE, calibrated_angle_rad=float(np.radians(80.0)))
 R_CAM_ENU = CAMERA.R_body_cam.T @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+BACKGROUND_E = np.float32(94.0)
 SCALE = FluxScale(zero_mag=11.6, trend_per_rad2=0.0, scatter=0.03, stars=100)
 
 
@@ -207,32 +220,25 @@ def random_stars(n: int, rng: np.random.Generator, v_mag: Any = None) -> Stars:
     return stars_at(rays, np.sort(rng.uniform(1, 6, n)) if v_mag is None else v_mag)
 
 
-def frame(stars: Stars, shines: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, Detections]:
-    """Pixels [e] with background, and the detections that carry background and noise."""
+def frame(stars: Stars, shines: np.ndarray, rng: np.random.Generator) -> Detections:
+    """Pixels [e] of stars over a background, which is known."""
     px, inside = CAMERA.project(stars.rays_icrs @ R_CAM_ENU.T)
     light = np.zeros((512, 512))
     on = inside & shines
     paint(light, px[on], 10 ** (-0.4 * (stars.v_mag[on] - SCALE.zero_mag)), 1.0)
-    background = np.full((512, 512), 94.0, np.float32)
-    none = np.zeros(0)
-    detections = Detections(
-        xy_px=np.zeros((0, 2)), covariance_px2=np.zeros((0, 2, 2)), flux_e=none, flux_sigma_e=none, snr=none,
-        saturated=np.zeros(0, bool), psf_sigma_px=1.0, background_e=background,
-        noise_e=np.full((512, 512), 10.0, np.float32),
-    )  # fmt: skip
-    return noisy(light, rng) + background, detections
+    found = without_sources(noisy(light, rng) + BACKGROUND_E, np.full((512, 512), 10.0, np.float32))
+    return replace(found, background_e=np.full((512, 512), BACKGROUND_E))
 
 
 def seen(
     stars: Stars, shines: np.ndarray, rng: np.random.Generator, dead: np.ndarray | None = None, **how: Any
 ) -> StarPhotometry:
-    image, detections = frame(stars, shines, rng)
-    dead = np.zeros(image.shape, bool) if dead is None else dead
+    detections = frame(stars, shines, rng)
+    detections = detections if dead is None else replace(detections, dead=dead)
     settings: dict[str, Any] = {"bodies": [], "place_sigma_px": 0.05} | how
     return StarEvidence()(
-        image, dead, detections, CAMERA, stars, settings["bodies"], R_CAM_ENU, np.eye(3), SCALE,
-        settings["place_sigma_px"],
-    )  # fmt: skip
+        detections, CAMERA, stars, settings["bodies"], R_CAM_ENU, np.eye(3), SCALE, settings["place_sigma_px"]
+    )
 
 
 def test_every_star_in_view_gets_a_verdict() -> None:
@@ -291,11 +297,8 @@ def test_stars_at_the_frame_edge_are_left_out() -> None:
     px = np.array([[255.0, 400.0], [255.0, edge], [255.0, edge - 2]])
     narrow = replace(CAMERA, size_px=(512, 512), focal_px=(500.0, 500.0))  # the frame cuts the circle
     stars = stars_at(narrow.unproject(px), np.array([3.0, 3.1, 3.2]))
-    image = noisy(np.zeros((512, 512)), rng)
-    _, detections = frame(stars, np.zeros(3, bool), rng)
-    detections = replace(detections, background_e=np.zeros((512, 512), np.float32))
-    dead = np.zeros((512, 512), bool)
-    light = StarEvidence()(image, dead, detections, narrow, stars, [], np.eye(3), np.eye(3), SCALE, 0.05)
+    detections = frame(stars, np.zeros(3, bool), rng)
+    light = StarEvidence()(detections, narrow, stars, [], np.eye(3), np.eye(3), SCALE, 0.05)
     assert light.cause.tolist() == ["", "", "off the frame"]
 
 
@@ -331,6 +334,7 @@ def scale_from(
     detections = Detections(
         xy_px=xy, covariance_px2=np.zeros((n, 2, 2)), flux_e=flux, flux_sigma_e=sigma, snr=flux / sigma,
         saturated=np.zeros(n, bool) if saturated is None else saturated, psf_sigma_px=1.0,
+        image_e=np.zeros((2, 2), np.float32), dead=np.zeros((2, 2), bool),
         background_e=np.zeros((2, 2), np.float32), noise_e=np.ones((2, 2), np.float32),
     )  # fmt: skip
     found = Identification(
@@ -405,11 +409,10 @@ def p_log_p(llr: np.ndarray) -> np.ndarray:
 def test_evidence_does_not_depend_on_where_north_is() -> None:
     rng = np.random.default_rng(14)
     stars = random_stars(400, rng)
-    image, detections = frame(stars, np.ones(400, bool), rng)
-    dead = np.zeros(image.shape, bool)
+    detections = frame(stars, np.ones(400, bool), rng)
     turn = Rotation.from_euler("z", 40, degrees=True).as_matrix()  # enu turned against icrs
-    plain = StarEvidence()(image, dead, detections, CAMERA, stars, [], R_CAM_ENU, np.eye(3), SCALE, 0.05)
-    turned = StarEvidence()(image, dead, detections, CAMERA, stars, [], R_CAM_ENU, turn, SCALE, 0.05)
+    plain = StarEvidence()(detections, CAMERA, stars, [], R_CAM_ENU, np.eye(3), SCALE, 0.05)
+    turned = StarEvidence()(detections, CAMERA, stars, [], R_CAM_ENU, turn, SCALE, 0.05)
     assert np.array_equal(plain.llr, turned.llr)
     assert turned.elevation_rad == pytest.approx(plain.elevation_rad, abs=1e-12)
     assert np.radians(40) == pytest.approx((plain.azimuth_rad - turned.azimuth_rad) % (2 * np.pi), abs=1e-9)

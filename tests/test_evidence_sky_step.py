@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -24,12 +25,12 @@ def horizon_at(place):
 
 
 def levelled(image, found, horizon):
-    dead = np.zeros(image.shape, bool)
-    step = measure_sky_step(lambda *at: (image[at], dead[at]), found, CAMERA, R_CAM_ENU, horizon)
+    found = replace(found, image_e=image)
+    step = measure_sky_step(found, CAMERA, R_CAM_ENU, horizon)
     assert step is not None and step.exceeds_noise
     assert step.light_e == pytest.approx(STEP_E, abs=max(4 * step.sigma_e, 0.01 * STEP_E))
     assert 0.05 < step.sigma_e < 0.5
-    return subtract_sky_step(image, dead, found, CAMERA, R_CAM_ENU, horizon)
+    return subtract_sky_step(found, CAMERA, R_CAM_ENU, horizon)
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +47,7 @@ def frame():
     found = Detections(
         xy_px=np.empty((0, 2)), covariance_px2=np.empty((0, 2, 2)), flux_e=np.empty(0), flux_sigma_e=np.empty(0),
         snr=np.empty(0), saturated=np.empty(0, dtype=bool), psf_sigma_px=1.0,
+        image_e=image, dead=np.zeros(image.shape, bool),
         background_e=np.full(image.shape, STEP_E / 2, np.float32), noise_e=np.full(image.shape, NOISE_E, np.float32),
     )  # fmt: skip
     return image, found, above, light

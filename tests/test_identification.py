@@ -84,7 +84,8 @@ def detected(xy_px: np.ndarray, v_mag: np.ndarray, sigma_px: float) -> Detection
     return Detections(
         xy_px=xy_px, covariance_px2=np.tile(sigma_px**2 * np.eye(2), (n, 1, 1)), flux_e=flux,
         flux_sigma_e=np.sqrt(flux + 1e8), snr=flux / np.sqrt(flux + 1e8), saturated=np.zeros(n, dtype=bool),
-        psf_sigma_px=1.0, background_e=np.zeros((2, 2), np.float32), noise_e=np.ones((2, 2), np.float32),
+        psf_sigma_px=1.0, image_e=np.zeros((2, 2), np.float32), dead=np.zeros((2, 2), bool),
+        background_e=np.zeros((2, 2), np.float32), noise_e=np.ones((2, 2), np.float32),
     )  # fmt: skip
 
 

@@ -86,7 +86,8 @@ def detections(xy_px: np.ndarray, flux: np.ndarray, psf_sigma_px: float = 1.0) -
     return Detections(
         xy_px=xy_px, covariance_px2=np.tile(0.04 * np.eye(2), (n, 1, 1)), flux_e=flux,
         flux_sigma_e=np.sqrt(np.abs(flux) + 1), snr=np.sqrt(np.abs(flux)), saturated=np.zeros(n, dtype=bool),
-        psf_sigma_px=psf_sigma_px, background_e=np.zeros((2, 2), np.float32), noise_e=np.ones((2, 2), np.float32),
+        psf_sigma_px=psf_sigma_px, image_e=np.zeros((2, 2), np.float32), dead=np.zeros((2, 2), bool),
+        background_e=np.zeros((2, 2), np.float32), noise_e=np.ones((2, 2), np.float32),
     )  # fmt: skip
 
 

@@ -78,7 +78,7 @@ class Detector:
         candidates = self._candidates(_FrameSource(image, mask_or_none(dead), light_noise), self.psf_sigma_px or known)
         frame, sigma = candidates.frame, candidates.sigma
         if are_elongated(frame, candidates.centres) and (streaks := find_streaks(frame)) is not None:
-            return _detections_of_streaks(frame, streaks)
+            return _detections_of_streaks(frame, dead, streaks)
         stars = self._select_stars(frame, candidates.fitted, candidates.side, sigma)
         if candidates.side > 1 or _covered_fraction(stars, sigma, frame.shape) > CROWDED_FRACTION:
             frame, stars = self._detect_again(candidates, unbin_fits(stars, candidates.side))
@@ -92,6 +92,8 @@ class Detector:
             snr=stars.snr,
             saturated=_saturated_mask(frame, stars),
             psf_sigma_px=sigma,
+            image_e=image,
+            dead=dead,
             background_e=frame.background,
             noise_e=frame.noise,
         )
@@ -153,7 +155,7 @@ class Detector:
         return stars.take(np.flatnonzero(clear))
 
 
-def _detections_of_streaks(frame: Frame, streaks: Streaks) -> Detections:
+def _detections_of_streaks(frame: Frame, dead: Bools, streaks: Streaks) -> Detections:
     """The stars of a frame taken while the camera turned; the PSF's width is that of the whole streak."""
     return Detections(
         xy_px=streaks.xy_px,
@@ -163,6 +165,8 @@ def _detections_of_streaks(frame: Frame, streaks: Streaks) -> Detections:
         snr=streaks.flux / streaks.flux_sigma,
         saturated=np.zeros(len(streaks.flux), dtype=bool),
         psf_sigma_px=float(np.hypot(streaks.width_px, streaks.length_px / np.sqrt(12.0))),
+        image_e=frame.image,
+        dead=dead,
         background_e=frame.background,
         noise_e=frame.noise,
     )

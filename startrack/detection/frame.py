@@ -74,16 +74,7 @@ class Frame:
 
 def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray[np.bool_]]:
     """The exposure in electrons above bias (ADU without the gain of a `camera`), and the mask of saturated pixels."""
-    return _to_electrons(exposure.pixels_adu, exposure, camera)
-
-
-def electrons_at(exposure: Exposure, camera: Camera, rows: Ints, columns: Ints) -> tuple[Image, NDArray[np.bool_]]:
-    """The same as `electrons` of an `exposure` and its `camera`, for the pixels (n,) at `rows` and `columns` (n,)."""
-    return _to_electrons(exposure.pixels_adu[rows, columns], exposure, camera)
-
-
-def _to_electrons(pixels_adu: Image, exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray[np.bool_]]:
-    ceiling = exposure.saturation_adu or np.inf
+    pixels_adu, ceiling = exposure.pixels_adu, exposure.saturation_adu or np.inf
     if camera is None or camera.sensor is None:
         return pixels_adu, pixels_adu >= SATURATED_FRACTION * ceiling
     sensor = camera.sensor

@@ -36,7 +36,6 @@ SIGNIFICANT_SIGMAS = 5.0  # of a step that is stated as the brightness of the sk
 ARCSEC2_PER_SR = (180 * 3600 / np.pi) ** 2
 
 Horizon = Callable[[Array], Array]  # azimuths (n,) to elevations (n,) [rad]
-Sampler = Callable[[Ints, Ints], tuple[NDArray[np.float32], Bools]]  # rows and columns (n,) to electrons and saturated
 
 
 @dataclass(frozen=True)
@@ -87,13 +86,10 @@ class SkyStep:
         return float(-2.5 * np.log10(self.light_e / (arcsec2 * exposure_s * sensor.zero_point_e_per_s)))
 
 
-def measure_sky_step(
-    sample_e: Sampler, detections: Detections, camera: Camera, R_cam_enu: Array, horizon: Horizon
-) -> SkyStep | None:
+def measure_sky_step(detections: Detections, camera: Camera, R_cam_enu: Array, horizon: Horizon) -> SkyStep | None:
     """The step of the sky's light at a `horizon` (azimuths to elevations [rad]); None where it is not in view.
 
-    `sample_e` gives the electrons of pixels and whether they are saturated. Pixels are taken above and below the
-    skyline, which `camera` and `R_cam_enu` place in the image; `detections` has the noise of the pixels.
+    Pixels of the `detections`' image are taken above and below the skyline, which `camera` and `R_cam_enu` place in it.
     """
     azimuth = np.linspace(0.0, 2 * np.pi, STEP_SAMPLES, endpoint=False)
     elevation = horizon(azimuth)
@@ -105,26 +101,20 @@ def measure_sky_step(
     columns, rows = np.rint(xy_px[inside]).astype(np.int64).T
     if not len(rows):
         return None
-    light, saturated = sample_e(rows, columns)
+    light, saturated = detections.image_e[rows, columns], detections.dead[rows, columns]
     above = (STEP_OFFSETS_PX[:, None] > 0) & inside
     light_e, sigma_e = _step_e(light[~saturated], above[inside][~saturated])
     noise_e = float(np.median(detections.noise_e[rows, columns]))
     return SkyStep(horizon, light_e, sigma_e, noise_e, float(np.median(angle[inside.any(axis=0)])))
 
 
-def subtract_sky_step(
-    image_e: NDArray[np.float32],
-    dead: Bools,
-    detections: Detections,
-    camera: Camera,
-    R_cam_enu: Array,
-    horizon: Horizon,
-) -> Detections:
+def subtract_sky_step(detections: Detections, camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Detections:
     """The `detections` with the step at a `horizon` in their background, and the noise on either side of it.
 
-    `image_e` (H, W) in electrons, `dead` (H, W) marks pixels to leave out, `camera` and `R_cam_enu` place the skyline
-    in the image. The step is the median of the pixels at equal distances from the skyline, sector by sector.
+    `camera` and `R_cam_enu` place the skyline in the image. The step is the median of the pixels at equal distances
+    from the skyline, sector by sector.
     """
+    image_e, dead = detections.image_e, detections.dead
     rows, columns = np.divmod(np.flatnonzero(_band(image_e.shape, camera, R_cam_enu, horizon)), image_e.shape[1])
     azimuth, above = _azimuth_and_height(np.stack([columns, rows], axis=1).astype(float), camera, R_cam_enu, horizon)
     near = (np.abs(above) < BAND_PX) & ~dead[rows, columns]

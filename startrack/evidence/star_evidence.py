@@ -77,8 +77,6 @@ class StarEvidence:
 
     def __call__(
         self,
-        image_e: NDArray[np.float32],
-        dead: NDArray[np.bool_],
         detections: Detections,
         camera: Camera,
         stars: Stars,
@@ -92,9 +90,7 @@ class StarEvidence:
         """Photometry of every star in view.
 
         Args:
-            image_e: (H, W) in electrons, background included.
-            dead: (H, W) pixels to leave out.
-            detections: their background, noise and PSF are used.
+            detections: their image, its background and noise, and the PSF are used.
             camera: projects the stars.
             stars: of the catalogue, brightest first.
             bodies: whose glare spoils the stars beside them.
@@ -125,13 +121,13 @@ class StarEvidence:
         measurable = np.flatnonzero(cause != OFF_FRAME)
         if visible is None:
             at = xy[measurable], expected[measurable], fraction[measurable]
-            shining = _guess_visibility(image_e, detections, dead, *at)
+            shining = _guess_visibility(detections, *at)
         else:
             shining = visible[star[measurable]]
         sources = Sources(
             xy_px=xy[measurable], flux_e=expected[measurable], fraction_sigma=fraction[measurable], visible=shining
         )
-        light = measure(image_e, detections.background_e, detections.noise_e, dead, sources, sigma_px)
+        light = measure(detections, sources)
         llr, sigma = _ratios(light, expected[measurable], fraction[measurable], self.capped)
         azimuth, elevation = azel_from_rays(rays_icrs @ R_enu_icrs.T)
         cause[measurable[~light.usable & (cause[measurable] == USABLE)]] = BAD_PIXELS
@@ -168,14 +164,7 @@ def _max_stars(camera: Camera, area_px: float) -> int:
     return max(int(min(circle, width * height) / area_px), 1)
 
 
-def _guess_visibility(
-    image_e: NDArray[np.float32],
-    detections: Detections,
-    dead: NDArray[np.bool_],
-    xy_px: Array,
-    expected_e: Array,
-    fraction: Array,
-) -> Array:
+def _guess_visibility(detections: Detections, xy_px: Array, expected_e: Array, fraction: Array) -> Array:
     """Probability (n,) that each star is visible, before a position is known: by their own flux for the brighter ones.
 
     It weights their light in their neighbours' measurements; one half for the faint ones.
@@ -188,8 +177,7 @@ def _guess_visibility(
         sources = Sources(
             xy_px=xy_px[bright], flux_e=expected_e[bright], fraction_sigma=fraction[bright], visible=alone
         )
-        maps = detections.background_e, detections.noise_e
-        light = measure(image_e, *maps, dead, sources, detections.psf_sigma_px)
+        light = measure(detections, sources)
         llr, _ = _ratios(light, expected_e[bright], fraction[bright])
         shining[bright] = 1.0 / (1.0 + np.exp(-llr))
     return shining

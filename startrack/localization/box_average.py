@@ -48,7 +48,7 @@ class BoxAverage:
         middle = SECTOR_STEP * np.arange(sectors.count)
         key = np.concatenate([sums.key, middle - 0.5 * SECTOR_STEP, middle + 0.5 * SECTOR_STEP])
         value = np.concatenate([below, np.zeros(sectors.count), hidden])  # from the key before up to this one
-        order = np.argsort(key, kind="stable")
+        order = np.argsort(key)
         steps = value[order[1:]] * np.diff(key[order])
         rows = np.bincount(sums.sector, minlength=sectors.count) + 2
         elevation = key[order] - np.repeat(middle, rows)

@@ -24,6 +24,7 @@ MANY_PAIRS = 200_000  # open (box, row) pairs above which horizons at the boxes'
 SOFT_BOXES = 0.3  # of the boxes per sigma suffice where edges are soft: sums of Gaussians converge, and leave no cells
 ACCEPTED_NATS = -1.0  # mean over the sectors, at a position that is answered without a proof: see EXPLAINED_NATS
 UNLIKELY_NATS = 16.0  # boxes that are less likely than the best by more are no part of the posterior
+START_LLR, START_ROWS, START_HALF_M = 4.0, 1000, 3.0  # |llr| and least number of strong rows; their smallest boxes
 NODE_STEP_M, FIRST_NODES_M = 10.0, 12.0  # least distance of traced points; half side of the first boxes worth it
 WORTH_NODES = 12.0  # horizons traced per open pair, which the levels to come would cost anyhow
 PAIRS_NEAR_NODES = 0.97  # of the pairs lie within the points; the others are traced
@@ -84,16 +85,29 @@ class Search:
 
     @classmethod
     def begin(cls, settings: SearchSettings, likelihood: PositionLikelihood, starts_m: Array | None = None) -> Search:
-        """With good positions (n, 2) where some are known, else with the first guess.
-
-        Bounds in closed form cost so little that the search needs no guess.
-        """
+        """With good positions (n, 2) where some are known, else with the first guess."""
         known = np.zeros((0, 2)) if starts_m is None else starts_m[np.asarray(likelihood.terrain.allowed(starts_m))]
+        if likelihood.in_closed_form and not len(known):
+            known = cls._best_of_strong_rows(settings, likelihood)
         if len(known) or likelihood.in_closed_form:
             guess = Guess(known, likelihood.exact_scores(known))
         else:
             guess = beam_search(likelihood)
         return cls(settings, likelihood, guess, likelihood.terrain, best=guess.best)
+
+    @classmethod
+    def _best_of_strong_rows(cls, settings: SearchSettings, likelihood: PositionLikelihood) -> Array:
+        """The position (1, 2) that explains the rows of great |llr| best; (0, 2) where these are few.
+
+        Bounds in closed form cost so little that few rows need no guess. Of many rows the strong ones give one for a
+        fraction of the cost; with it the others exclude most boxes at once.
+        """
+        strong = likelihood.strong(START_LLR, START_ROWS)
+        if strong is likelihood:
+            return np.zeros((0, 2))
+        guess = Guess(np.zeros((0, 2)), np.zeros(0))
+        boxes = cls(settings, strong, guess, strong.terrain)._refine_by_disks(strong.root, START_HALF_M)
+        return boxes.centres_m[np.argsort(-boxes.score)[:1]]
 
     @property
     def terrain(self) -> Terrain:
@@ -102,7 +116,7 @@ class Search:
     def run(self) -> Explored:
         """The posterior. Raises NotLocated, and BudgetSpent where the proof would take too long."""
         if self.likelihood.in_closed_form:
-            boxes = self._refine_by_disks(self.likelihood.root)
+            boxes = self._refine_by_disks(self.likelihood.root, self.settings.finest_m)
         else:
             boxes = self._refine(self._exclude_by_sectors())
         # Which unlikely boxes are left depends on how tight the terrain's bounds are; the likely ones do not.
@@ -191,16 +205,16 @@ class Search:
         self.log_dropped = float(np.logaddexp(self.log_dropped, log_sum(upper[~keep]) + cell))
         return keep, upper[keep]
 
-    def _refine_by_disks(self, boxes: Boxes) -> Boxes:
-        """Quartered until small against the posterior's spread, in compiled steps; see `_refine`."""
+    def _refine_by_disks(self, boxes: Boxes, finest_m: float) -> Boxes:
+        """Quartered until small against the posterior's spread, or `finest_m`, in compiled steps; see `_refine`."""
         s, terrain = self.settings, self.terrain
         while True:
             boxes, self.best, self.certain, dropped = refine_disks(
                 self.likelihood.rows, boxes, terrain.reach_m, self.best, self.certain, s.prune_nats, s.negligible_nats,
-                s.boxes_per_sigma, max(s.finest_m, terrain.finest_m), s.most_boxes,
+                s.boxes_per_sigma, max(finest_m, terrain.finest_m), s.most_boxes,
             )  # fmt: skip
             self.log_dropped = float(np.logaddexp(self.log_dropped, dropped))
-            if self._width_over_limit(boxes) < 1:
+            if boxes.half_m <= finest_m or self._width_over_limit(boxes) < 1:
                 return boxes
 
     def _refine(self, boxes: Boxes) -> Boxes:

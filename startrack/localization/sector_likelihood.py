@@ -75,7 +75,7 @@ class Sectors:
 
 def elevation_order(evidence: Evidence, sector: Ints) -> Ints:
     """Order (n,) of the rows by sector, and from low to high within one."""
-    return np.argsort(SECTOR_STEP * sector + evidence.elevation_rad, kind="stable")
+    return np.argsort(SECTOR_STEP * sector + evidence.elevation_rad)
 
 
 def row_limits(evidence: Evidence) -> tuple[Array, Array]:

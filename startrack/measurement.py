@@ -126,6 +126,5 @@ def _photometry(
         visible,
     )
     light = light if only is None else replace(light, star=only[light.star])
-    masked = terrain.mask_reason(light.azimuth_rad, light.elevation_rad)
-    cause = np.where(light.cause == "", masked, light.cause)
-    return replace(light, cause=cause, llr=np.where(cause == "", light.llr, 0.0))
+    rays = light.azimuth_rad, light.elevation_rad
+    return light if terrain.is_informative(*rays).all() else light.masked(terrain.mask_reason(*rays))

@@ -39,22 +39,39 @@ class StarPhotometry:
     flux_e: Array  # measured
     sigma_e: Array  # of the measured flux without a star
     llr: Array  # 0 where unusable
-    cause: NDArray[np.str_]  # "" where usable, else why not
+    cause_code: NDArray[np.int8]  # index into `causes`; 0 where usable
+    causes: tuple[str, ...]  # why stars are unusable; the first is ""
+
+    @property
+    def cause(self) -> NDArray[np.str_]:
+        """Why each star (n,) is unusable; "" where it is usable."""
+        return np.array(self.causes)[self.cause_code]
 
     @property
     def usable(self) -> Bools:
-        return np.asarray(self.cause == "")
+        """Whether each star (n,) is evidence."""
+        return np.asarray(self.cause_code == USABLE)
+
+    def masked(self, reason: NDArray[np.str_]) -> StarPhotometry:
+        """The same with no evidence where there is a reason (n,) against it; an earlier cause stays."""
+        texts = tuple(np.unique(reason[self.usable & (reason != "")]).tolist())
+        code = self.cause_code.copy()
+        for number, text in enumerate(texts, start=len(self.causes)):
+            code[self.usable & (reason == text)] = number
+        return replace(self, cause_code=code, causes=self.causes + texts, llr=np.where(code == USABLE, self.llr, 0.0))
 
     def replace_stars(self, newer: StarPhotometry, which: Ints) -> StarPhotometry:
         """Replace the rows of the stars `which` by the newer measurement, where both contain the star."""
         there = np.flatnonzero(np.isin(newer.star, which))
         here = np.searchsorted(self.star, newer.star[there])
-        fresh = {}
-        for name in ("flux_e", "sigma_e", "llr", "cause"):
+        causes = self.causes + tuple(text for text in newer.causes if text not in self.causes)
+        fresh = replace(newer, cause_code=np.array([causes.index(text) for text in newer.causes])[newer.cause_code])
+        changed = {}
+        for name in ("flux_e", "sigma_e", "llr", "cause_code"):
             values = getattr(self, name).copy()
-            values[here] = getattr(newer, name)[there]
-            fresh[name] = values
-        return replace(self, **fresh)
+            values[here] = getattr(fresh, name)[there]
+            changed[name] = values
+        return replace(self, **changed, causes=causes)
 
     def evidence(self) -> Evidence:
         """The rays for the localizer."""
@@ -63,7 +80,6 @@ class StarPhotometry:
             azimuth_rad=self.azimuth_rad[use],
             elevation_rad=self.elevation_rad[use],
             llr=self.llr[use],
-            edge_sigma_rad=np.zeros(int(use.sum())),
         )
 
 
@@ -140,7 +156,8 @@ class StarEvidence:
             flux_e=_scatter_rows(light.flux_e, measurable, len(star)),
             sigma_e=_scatter_rows(sigma, measurable, len(star)),
             llr=np.where(cause == USABLE, _scatter_rows(llr, measurable, len(star)), 0.0),
-            cause=np.array([*CAUSES, *(f"beside {body.name}" for body in bodies)])[cause],
+            cause_code=cause,
+            causes=(*CAUSES, *(f"beside {body.name}" for body in bodies)),
         )
 
 

@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from startrack.compilation import announce_compilation
 from startrack.exposure.decoded import (
@@ -21,7 +22,6 @@ from startrack.exposure.decoded import (
     check_size,
     exif_warnings,
     grey_float32,
-    largest_value,
 )
 from startrack.exposure.metadata import HEADER_KEYS
 
@@ -64,15 +64,13 @@ def decode_png(raw: bytes) -> Decoded:
     # Gamma, colour profile and orientation are left out: they cannot change the pixels.
     if interlaced:
         bare = b"".join((raw[:IHDR_END], chunk(b"IDAT", b"".join(picture)), chunk(b"IEND", b"")))
-        stored = cv2.imdecode(np.frombuffer(bare, np.uint8), cv2.IMREAD_UNCHANGED)
+        stored: NDArray[Any] | None = cv2.imdecode(np.frombuffer(bare, np.uint8), cv2.IMREAD_UNCHANGED)
         if stored is None or stored.shape[:2] != (height, width) or stored.dtype.itemsize * 8 != depth:
             raise bad_image(DAMAGED)
     else:
         stored = decode_rows(b"".join(picture), width, height, depth, channels)
-    pixels, colour = grey_float32(stored)
-    return Decoded(
-        pixels_adu=pixels, saturation_adu=largest_value(stored.dtype), header=header, warnings=warnings + colour
-    )
+    pixels, colour = (stored.astype(np.float32, copy=False), ()) if stored.dtype == np.float32 else grey_float32(stored)
+    return Decoded(pixels_adu=pixels, saturation_adu=2.0**depth - 1.0, header=header, warnings=warnings + colour)
 
 
 def add_text(png: bytes, texts: Mapping[str, str]) -> bytes:

@@ -124,12 +124,23 @@ def settings_input(settings: Settings | None) -> Settings | None:
     )
 
 
-def angle_rad(angle: Any) -> float:
-    """An astropy `angle`, or a number of degrees [rad]. Raises BadInput (no_calibration) where it is neither."""
+def field_of_view_rad(fov: Any) -> float:
+    """The argument `fov`, an astropy angle or degrees [rad]. Raises BadInput (no_calibration)."""
+    try:
+        size = angle_rad(fov, "fov")
+    except ValueError as cause:
+        raise BadInput("no_calibration", f"no field of view: {cause}") from cause
+    if not 0 < size <= 2 * math.pi:
+        raise BadInput("no_calibration", f"fov= is {math.degrees(size):g} degrees: give more than 0, at most 360")
+    return size
+
+
+def angle_rad(angle: Any, argument: str) -> float:
+    """An astropy `angle`, or a number of degrees [rad]. Raises ValueError naming the `argument` where it is neither."""
     try:
         size = float(angle.to_value("rad")) if hasattr(angle, "to_value") else math.radians(angle)
     except (TypeError, ValueError) as cause:
-        raise BadInput("no_calibration", f"{angle!r} is no field of view: give degrees or an angle") from cause
-    if not 0 < size <= 2 * math.pi:
-        raise BadInput("no_calibration", f"a field of view of {math.degrees(size):g} degrees: give 0 to 360")
+        raise ValueError(f"{argument}={angle!r}: give degrees or an astropy angle") from cause
+    if not math.isfinite(size):
+        raise ValueError(f"{argument}= is not finite: give degrees or an astropy angle")
     return size

@@ -14,7 +14,7 @@ from startrack.camera import Camera, load_camera
 from startrack.exposure import exposure_of, read_exposure, with_facts
 from startrack.frames import parse_utc
 from startrack.stages import Settings
-from startrack.terrain import Terrain, load_terrain
+from startrack.terrain import Terrain, load_terrain, require_terrain
 from startrack.types import BadInput, Exposure
 
 Image: TypeAlias = str | os.PathLike[str] | ArrayLike | Exposure
@@ -109,9 +109,7 @@ def terrain_input(terrain: str | os.PathLike[str] | Terrain | None, exposure: Ex
         raise BadInput("bad_terrain", "no terrain is known: give terrain=")
     if isinstance(reference, str | os.PathLike):
         return load_terrain(os.fspath(reference))
-    if not hasattr(reference, "horizon_bounds_rad"):
-        raise BadInput("bad_terrain", f"{type(reference).__name__} is no terrain: give a file, a name or a Terrain")
-    return reference
+    return require_terrain(reference)
 
 
 def settings_input(settings: Settings | None) -> Settings | None:

@@ -13,6 +13,7 @@ from startrack.calibration import calibrate as calibrate_exposures
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
 from startrack.errors import BAD_INPUT_REASONS, BadInput
+from startrack.files import file_stem
 from startrack.frames import Site
 from startrack.inputs import (
     Image,
@@ -208,7 +209,7 @@ def render(
         heading_rad=None if heading is None else angle_rad(heading, "heading") % (2 * np.pi),
         **{"catalog": catalog, **settings},
     )
-    scene, rng = series.scene(number, f"{ground.name}-{seed}-{number:03d}")
+    scene, rng = series.scene(number, f"{file_stem(ground.name)}-{seed}-{number:03d}")
     return render_scene(scene, rng=rng)
 
 

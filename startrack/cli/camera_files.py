@@ -61,12 +61,12 @@ def run_convert(args: argparse.Namespace) -> int:
     from startrack.camera.convert import from_text, to_text
     from startrack.camera.convert.intrinsics import decentring_rms_px
     from startrack.camera.io import camera_text
-    from startrack.files import write_atomically
+    from startrack.files import file_stem, write_atomically
 
     if args.to is not None:
         camera = load_camera(args.file)
         text = to_text(camera, args.to)
-        default = DEFAULT_NAMES.get(args.to, f"{camera.name}.yaml")
+        default = DEFAULT_NAMES.get(args.to, f"{file_stem(camera.name)}.yaml")
         lost = decentring_rms_px(camera) if camera.decentring and args.to != "colmap" else 0.0
         note = f"; {args.to} has no decentring: {lost:.2f} px RMS are lost" if lost else ""
     else:

@@ -13,6 +13,7 @@ from startrack.calibration import calibrate as calibrate_exposures
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
 from startrack.errors import BAD_INPUT_REASONS, BadInput
+from startrack.files import file_stem
 from startrack.frames import Site
 from startrack.inputs import (
     Image,
@@ -20,6 +21,7 @@ from startrack.inputs import (
     angle_rad,
     camera_input,
     exposure_input,
+    field_of_view_rad,
     load_camera_input,
     settings_input,
     terrain_input,
@@ -90,7 +92,8 @@ def identify(
     """Stars and attitude of an image, or of a list of centroids. Neither terrain nor time is needed.
 
     Args:
-        image: an image, as for `locate`; or centroids (n, 2), x and y in px from the centre of the top-left pixel.
+        image: an image, as for `locate`; or centroids, an array (n, 2) or a list of pairs, x and y in px from the
+            centre of the top-left pixel.
         camera: the camera, as for `locate`. Of an image it may come from sidecar or header.
         time: middle of the exposure, as for `locate`. None: the catalogue is taken at J2000.0 without aberration.
         fov: instead of a camera, the field of view to 10 %: an angle or degrees; across the frame's width below 100
@@ -104,7 +107,7 @@ def identify(
         `detection` and `star` (indices), `hip`, `attitude`, `camera`.
 
     Raises:
-        ValueError: both `camera` and `fov` are given, or of centroids neither.
+        ValueError: both `camera` and `fov` are given, or of centroids neither; or arrays of a wrong shape.
         BadInput: as `locate`.
         NotIdentified: the centroids are not identified.
     """
@@ -114,7 +117,7 @@ def identify(
         return _identify_list(image, camera, time, fov, size_px, flux, sigma_px)
     exposure = exposure_input(image, time)
     if fov is not None:
-        return _solution(pipeline.identify_blind(exposure, angle_rad(fov), load_catalog()), "identification")
+        return _solution(pipeline.identify_blind(exposure, field_of_view_rad(fov), load_catalog()), "identification")
     return _solution(pipeline.identify(exposure, camera_input(camera, exposure), load_catalog()), "identification")
 
 
@@ -157,9 +160,11 @@ def calibrate(
         BadInput: as `locate`.
         NotIdentified: no image's stars could be identified.
     """
+    if camera is None and fov is None:
+        raise BadInput("no_calibration", "give fov=, or an approximate camera=")
     start = None if camera is None else load_camera_input(camera)
     exposures = [exposure_input(image, None) for image in images]
-    fov_rad = None if fov is None else angle_rad(fov)
+    fov_rad = None if fov is None else field_of_view_rad(fov)
     return calibrate_exposures(exposures, load_catalog(), camera=start, fov_rad=fov_rad, site=site, name=name)
 
 
@@ -188,6 +193,7 @@ def render(
 
     Raises:
         BadInput: bad_calibration without a sensor, bad_terrain where no camera can stand there.
+        ValueError: `heading` is no angle.
     """
     lens = load_camera_input(camera)
     ground = terrain_input(terrain, None)
@@ -200,17 +206,18 @@ def render(
         time_utc=time_input(time),
         east_m=east_m,
         north_m=north_m,
-        heading_rad=None if heading is None else angle_rad(heading) % (2 * np.pi),
+        heading_rad=None if heading is None else angle_rad(heading, "heading") % (2 * np.pi),
         **{"catalog": catalog, **settings},
     )
-    scene, rng = series.scene(number, f"{ground.name}-{seed}-{number:03d}")
+    scene, rng = series.scene(number, f"{file_stem(ground.name)}-{seed}-{number:03d}")
     return render_scene(scene, rng=rng)
 
 
 def _are_centroids(image: Any) -> bool:
-    """Whether an array is a list of centroids (n, 2): no image is two pixels wide."""
-    shape = np.shape(image) if isinstance(image, np.ndarray | list | tuple) else ()
-    return len(shape) == 2 and shape[1] == 2
+    """Whether it is a list of centroids: any list, or an array (n, 2), as no image is two pixels wide, or empty."""
+    if isinstance(image, list | tuple):
+        return True
+    return isinstance(image, np.ndarray) and (image.shape == (0,) or (image.ndim == 2 and image.shape[1] == 2))
 
 
 def _identify_list(
@@ -224,10 +231,12 @@ def _identify_list(
 ) -> IdentifiedCentroids:
     from startrack.identification import identify_centroids
 
+    if camera is None and (fov is None or size_px is None):
+        raise ValueError("centroids: give a camera, or fov= with size_px=")
     return identify_centroids(
-        np.asarray(xy_px, dtype=float),
+        xy_px,
         camera=None if camera is None else load_camera_input(camera),
-        fov_rad=None if fov is None else angle_rad(fov),
+        fov_rad=None if fov is None else field_of_view_rad(fov),
         size_px=size_px,
         flux=flux,
         sigma_px=sigma_px,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 import tomllib
 from collections.abc import Callable, Iterator
@@ -15,6 +16,7 @@ from startrack.errors import BadInput
 
 PACKAGE = Path(__file__).resolve().parent
 MAX_TOML_BYTES = 2**20  # camera and terrain files have a few kilobytes
+MAX_STEM_BYTES = 200  # file systems take names of 255, and a suffix follows
 FilePath = str | os.PathLike[str]
 
 
@@ -92,6 +94,12 @@ def make_folder(folder: FilePath, reason: str = "bad_image") -> Path:
 def printable(name: FilePath) -> str:
     """A file's name as one line of text for messages: undecodable bytes are escaped, white space is one blank."""
     return " ".join(os.fspath(name).encode("utf-8", "backslashreplace").decode().split())
+
+
+def file_stem(name: str) -> str:
+    """The `name` of a camera or terrain as the stem of a file in one folder: without separators and leading dots."""
+    stem = re.sub(r"[/\\\0]", "_", name).lstrip(".")
+    return stem.encode("utf-8", "replace")[:MAX_STEM_BYTES].decode("utf-8", "ignore") or "unnamed"
 
 
 @contextmanager

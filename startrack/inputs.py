@@ -14,7 +14,7 @@ from startrack.camera import Camera, load_camera
 from startrack.exposure import exposure_of, read_exposure, with_facts
 from startrack.frames import parse_utc
 from startrack.stages import Settings
-from startrack.terrain import Terrain, load_terrain
+from startrack.terrain import Terrain, load_terrain, require_terrain
 from startrack.types import BadInput, Exposure
 
 Image: TypeAlias = str | os.PathLike[str] | ArrayLike | Exposure
@@ -109,9 +109,7 @@ def terrain_input(terrain: str | os.PathLike[str] | Terrain | None, exposure: Ex
         raise BadInput("bad_terrain", "no terrain is known: give terrain=")
     if isinstance(reference, str | os.PathLike):
         return load_terrain(os.fspath(reference))
-    if not hasattr(reference, "horizon_bounds_rad"):
-        raise BadInput("bad_terrain", f"{type(reference).__name__} is no terrain: give a file, a name or a Terrain")
-    return reference
+    return require_terrain(reference)
 
 
 def settings_input(settings: Settings | None) -> Settings | None:
@@ -124,12 +122,23 @@ def settings_input(settings: Settings | None) -> Settings | None:
     )
 
 
-def angle_rad(angle: Any) -> float:
-    """An astropy `angle`, or a number of degrees [rad]. Raises BadInput (no_calibration) where it is neither."""
+def field_of_view_rad(fov: Any) -> float:
+    """The argument `fov`, an astropy angle or degrees [rad]. Raises BadInput (no_calibration)."""
+    try:
+        size = angle_rad(fov, "fov")
+    except ValueError as cause:
+        raise BadInput("no_calibration", f"no field of view: {cause}") from cause
+    if not 0 < size <= 2 * math.pi:
+        raise BadInput("no_calibration", f"fov= is {math.degrees(size):g} degrees: give more than 0, at most 360")
+    return size
+
+
+def angle_rad(angle: Any, argument: str) -> float:
+    """An astropy `angle`, or a number of degrees [rad]. Raises ValueError naming the `argument` where it is neither."""
     try:
         size = float(angle.to_value("rad")) if hasattr(angle, "to_value") else math.radians(angle)
     except (TypeError, ValueError) as cause:
-        raise BadInput("no_calibration", f"{angle!r} is no field of view: give degrees or an angle") from cause
-    if not 0 < size <= 2 * math.pi:
-        raise BadInput("no_calibration", f"a field of view of {math.degrees(size):g} degrees: give 0 to 360")
+        raise ValueError(f"{argument}={angle!r}: give degrees or an astropy angle") from cause
+    if not math.isfinite(size):
+        raise ValueError(f"{argument}= is not finite: give degrees or an astropy angle")
     return size

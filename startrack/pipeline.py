@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from startrack.camera import Camera
 from startrack.frames import Site
-from startrack.localization import check_consistency
+from startrack.localization import check_consistency, localizer_name
 from startrack.measurement import measure_evidence, remeasure_near_skyline, sky_step_at
 from startrack.orientation import (
     NO_TIME,
@@ -46,7 +46,11 @@ def locate(
     `settings` exchanges stages. Bad input of an image makes a refusal too: no image raises an exception.
     """
     settings = settings or Settings()
-    run = Run(Inputs(exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name))
+    inputs = Inputs(
+        exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name,
+        localizer_name=localizer_name(settings.localizer),
+    )  # fmt: skip
+    run = Run(inputs)
     try:
         check_inputs(run.reached)
         detected = run.step("detect", detect_sources, run.reached, camera, settings.detector)

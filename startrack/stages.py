@@ -64,6 +64,7 @@ class Inputs:
     camera: Camera | None = None  # None: not known; `detect` works without, `identify_blind` finds it
     terrain: Terrain | None = None  # None: identification or detection only
     catalog_name: str = ""
+    localizer_name: str = ""  # in LOCALIZERS, or of its class or function; empty: identification or detection only
     timing_ms: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))  # stage to wall time [ms]
 
     @property

@@ -246,6 +246,6 @@ class Fix(Value):
     radius999_m: float
     modes: tuple[Mode, ...]  # heaviest first; weights sum to 1
     ambiguous: bool  # modes outside the main mode's 99.9 % circle hold more than 1 %
-    dropped_mass: float = 0.0  # bound on the posterior probability that the search dropped
+    dropped_probability: float | None = None  # bound on the posterior's part that the search left out; None: no search
     search: str = "proven"  # no other position fits; "beam": not proven to the end; "approximate": no posterior
     horizon_error_rad: float = 0.0  # common to all azimuths: how much higher the true horizon is than the map's

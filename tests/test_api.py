@@ -277,5 +277,11 @@ def test_a_field_of_view_stands_in_for_a_camera():
     assert len(found.result.identification.star) > 1000
     with pytest.raises(ValueError, match="exclude each other"):
         startrack.identify(LOWELL, fov=180, camera="lowell-ldt")
-    with pytest.raises(BadInput, match="no field of view"):
+    with pytest.raises(BadInput, match="no field of view: fov='wide'"):
         startrack.identify(IMAGE, fov="wide")
+    with pytest.raises(BadInput, match="fov= is -3 degrees"):
+        startrack.identify(IMAGE, fov=-3)
+    with pytest.raises(BadInput, match=r"give fov=, or an approximate camera="):
+        startrack.calibrate([IMAGE])
+    with pytest.raises(ValueError, match="heading='north'"):
+        startrack.render(heading="north")

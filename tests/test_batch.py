@@ -184,6 +184,8 @@ def test_a_localizer_is_one_class_and_one_line_in_the_list(night, tmp_path, monk
     task = Task("b.png", str(image), str(tmp_path / "b.fix.json"), plots=False)
     record, _ = locate_image(replace(task, localizer="fixed"))
     assert (record["position"]["east_m"], record["position"]["north_m"]) == (123.0, 45.0)
+    assert record["provenance"]["localizer"] == "fixed"
+    assert record["position"]["dropped_probability"] is None
     assert locate_image(replace(task, localizer="fixed")) == (record, True)
     other, kept = locate_image(task)  # by another localizer it is another result
     assert not kept

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,9 +12,10 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from startrack.camera import Camera, Decentring, KannalaBrandt, Pinhole
+from startrack.camera import Camera, Decentring, KannalaBrandt, Pinhole, load_camera
 from startrack.camera.convert import from_text, to_text
 from startrack.camera.convert.intrinsics import decentring_rms_px
+from startrack.cli.main import main
 from startrack.types import BadInput
 
 PROGRAMS = ("ros", "kalibr", "colmap", "opencv")
@@ -124,8 +127,6 @@ def test_formats_without_decentring_lose_what_is_stated(program):
 
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_mirrored_cameras_are_refused(program):
-    from dataclasses import replace
-
     with pytest.raises(BadInput, match="mirrored") as refusal:
         to_text(replace(FISHEYE, mirrored=True), program)
     assert refusal.value.reason == "bad_calibration"
@@ -147,9 +148,41 @@ def test_broken_files_are_refused_by_name(program, spoil):
     assert refusal.value.reason == "bad_calibration"
 
 
+SPOILED = {
+    "ros": [("data: [480.123456789, 0.0", "data: [480.123456789, 0.5", "skewed"), ("equidistant", "fov", "'fov'")],
+    "kalibr": [("intrinsics", "numbers", "'intrinsics' is missing"), ("equidistant", "fov", "'fov'")],
+    "colmap": [("1600 1200", "1600", "parameters has no counterpart"), ("1 OPENCV", "# OPENCV", "no line CAMERA_ID")],
+    "opencv": [("data: [ 480.123456789, 0.0", "data: [ 480.123456789, 0.5", "skewed"), ("rows: 4", "rows: 3", "")],
+}
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_what_is_wrong_with_a_file_is_stated(program):
+    for old, new, cause in SPOILED[program]:
+        text = to_text(FISHEYE, program)
+        assert old in text
+        with pytest.raises(BadInput, match=rf"not a camera file of \w+ that can be used: .*{cause}"):
+            from_text(text.replace(old, new, 1), program, "x")
+
+
+def test_a_ros_name_is_quoted():
+    named = replace(PINHOLE, name='left: "wide" # 2')
+    assert from_text(to_text(named, "ros"), "ros", "other").name == named.name
+
+
 def by_angle(K, k, seen):
     r = np.hypot(seen[:, 0], seen[:, 1])
     theta = np.arctan2(r, seen[:, 2])
     theta_d = theta * (1 + sum(c * theta ** (2 * n + 2) for n, c in enumerate(k)))
     h = np.column_stack([theta_d / r * seen[:, 0], theta_d / r * seen[:, 1], np.ones(len(r))])
     return (h @ K.T)[:, :2]
+
+
+def test_the_flag_names_the_camera_and_its_file_stays_in_the_folder(tmp_path, capsys):
+    (tmp_path / "info.yaml").write_text(to_text(PINHOLE, "ros"))
+    command = ["calibrate", "convert", str(tmp_path / "info.yaml"), "--from", "ros", "-q", "-o"]
+    for words, name in ((["--name", "../mine"], "../mine"), ([], "pinhole")):
+        assert main([*command, str(tmp_path / "out.toml"), *words]) == 0
+        assert load_camera(str(tmp_path / "out.toml")).name == name
+        assert main(["calibrate", "convert", str(tmp_path / "out.toml"), "--to", "ros", "-D", str(tmp_path / "d")]) == 0
+        assert Path(capsys.readouterr().out.strip()).parent == tmp_path / "d"

@@ -10,6 +10,9 @@ from pathlib import Path
 import pytest
 
 from startrack import compilation
+from startrack.localization import posterior
+from startrack.terrain import load_terrain
+from startrack.types import Evidence, NotLocated
 
 ROOT = Path(__file__).parent.parent
 FIRST_USE = """
@@ -47,6 +50,15 @@ def test_compiling_is_announced_once_and_loading_is_not(tmp_path):
         "compiling for this machine, once: about 20 s, for height maps a minute"
     ]
     assert printed_by(script, tmp_path / "cache") == ""
+
+
+def test_a_localizer_called_without_the_pipeline_announces_too(monkeypatch):
+    calls: list[str] = []
+    monkeypatch.setattr(posterior, "announce_compilation", lambda: calls.append("announced"))
+    none = Evidence(azimuth_rad=[], elevation_rad=[], llr=[])
+    with pytest.raises(NotLocated):
+        posterior.ExactPosterior()(none, load_terrain("shackleton-thesis"))
+    assert calls == ["announced"]
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ def test_a_list_in_any_order_is_identified(camera) -> None:
     assert np.mean(truth.star[order][found.detection] == found.star) > 0.995
     assert len(found.detection) > 0.75 * np.count_nonzero(truth.star >= 0)
     assert found.camera is camera
+    assert repr(found).startswith(f"<IdentifiedCentroids: {len(found.star)} stars, rms 0.") and len(repr(found)) < 80
     assert found.false_alarm_probability < 1e-20
     assert np.array_equal(found.hip, sky().hip[found.star])
     turn = truth.R_cam_icrs @ found.attitude.R_cam_icrs.T
@@ -59,3 +60,36 @@ def test_random_centroids_are_refused(known: bool) -> None:
 def test_a_call_without_camera_or_field_says_what_is_missing() -> None:
     with pytest.raises(ValueError, match="fov_rad"):
         identify_centroids(np.zeros((10, 2)))
+
+
+WRONG_LISTS = {
+    "three columns": (np.zeros((9, 3)), {}, r"shape \(9, 3\): give \(n, 2\)"),
+    "one row of numbers": ([1.0, 2.0, 3.0], {}, r"shape \(3,\): give \(n, 2\)"),
+    "rows of unequal length": ([[1.0, 2.0], [3.0]], {}, "rows of equal length"),
+    "texts": (["a.png", "b.png"], {}, "array of numbers"),
+    "infinite": (np.full((9, 2), np.inf), {}, "must be finite"),
+    "too few fluxes": (np.zeros((9, 2)), {"flux": np.ones(8)}, r"flux= has the shape \(8,\): .* each of the 9"),
+    "too many errors": (np.zeros((9, 2)), {"sigma_px": np.ones(10)}, r"sigma_px= has the shape \(10,\)"),
+    "errors of zero": (np.zeros((9, 2)), {"sigma_px": 0.0}, "sigma_px= must be above 0"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_LISTS)
+def test_the_message_about_a_wrong_list_says_what_to_give(case) -> None:
+    xy_px, more, message = WRONG_LISTS[case]
+    with pytest.raises(ValueError, match=message):
+        identify_centroids(xy_px, camera=FISHEYE, stars=sky(), **more)
+
+
+@pytest.mark.parametrize("empty", [[], np.zeros((0, 2))], ids=["list", "array"])
+def test_an_empty_list_has_too_few_stars(empty) -> None:
+    with pytest.raises(NotIdentified, match="0 point sources are too few"):
+        identify_centroids(empty, camera=FISHEYE, stars=sky())
+
+
+def test_an_impossible_field_or_frame_is_named() -> None:
+    xy_px = scattered(FISHEYE, 40, np.random.default_rng(5))
+    with pytest.raises(ValueError, match="fov_rad= is -3"):
+        identify_centroids(xy_px, fov_rad=-3.0, size_px=(1024, 1024), stars=sky())
+    with pytest.raises(ValueError, match="size_px= is"):
+        identify_centroids(xy_px, fov_rad=3.0, size_px=(1024, 0), stars=sky())

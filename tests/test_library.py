@@ -78,8 +78,12 @@ def test_a_list_of_centroids_is_identified_in_one_call():
     assert len(named.hip) > 150 and named.false_alarm_probability < 1e-9
     again = startrack.identify(found.xy_px[:200], flux=found.flux_e[:200], size_px=(2048, 2048), fov=185.0)
     assert np.isin(again.hip, named.hip).mean() > 0.95
-    with pytest.raises(ValueError, match="give a camera"):
+    with pytest.raises(ValueError, match="give a camera, or fov= with size_px="):
         startrack.identify(found.xy_px[:200])
+    with pytest.raises(startrack.errors.NoSolution, match="0 point sources are too few"):
+        startrack.identify([], camera="fisheye-2048")
+    with pytest.raises(ValueError, match=r"shape \(2, 3\): give \(n, 2\)"):
+        startrack.identify([[1, 2, 3], [4, 5, 6]], camera="fisheye-2048")
 
 
 def test_a_calibration_says_what_it_found():

@@ -107,7 +107,7 @@ def test_exact_posterior_equals_brute_force(seed: int, epsilon: float, sigma_rad
     np.testing.assert_allclose(fix.covariance_m2, spread, atol=0.1 * sigma**2 + 0.2)
     distance = np.linalg.norm(grid - fix.position_enu_m[:2], axis=1)
     assert weight[distance < fix.radius95_m].sum() == pytest.approx(0.95, abs=0.03)
-    assert fix.dropped_mass < 1e-3
+    assert fix.dropped_probability < 1e-3
 
 
 @pytest.mark.parametrize("sigma_rad", [0.0, 0.002])

@@ -86,7 +86,7 @@ def test_any_small_problem_agrees_with_the_grid(
         away = np.linalg.norm(places - weight @ places, axis=1)
         assert weight[away < 45].sum() < 0.95  # nothing worth having
         return
-    assert fix.dropped_mass < 1e-3
+    assert fix.dropped_probability < 1e-3
     close = np.linalg.norm(places - fix.position_enu_m[:2], axis=1)
     if len(fix.modes) == 1:
         mean = weight @ places

@@ -172,7 +172,7 @@ def test_posterior_on_ground_equals_a_plain_grid(shackleton, sigma_rad):
     assert np.linalg.norm(fix.position_enu_m[:2] - mean) < 0.1 * sigma
     assert fix.covariance_m2 == pytest.approx(spread, abs=0.12 * sigma**2)
     assert fix.search == ("beam" if sigma_rad else "proven")  # with soft edges all rays near the skyline stay open
-    assert fix.dropped_mass < 1e-3 or sigma_rad
+    assert fix.dropped_probability < 1e-3 or sigma_rad
 
 
 def test_a_common_error_found_is_told_and_not_taken_for_a_wrong_map(shackleton):
@@ -211,7 +211,7 @@ def test_an_unfinished_proof_gives_the_posterior_near_the_best_positions(shackle
     beam = ExactPosterior(budget_horizons=1.0)(evidence, shackleton)
     proven = ExactPosterior(budget_horizons=1e9)(evidence, shackleton)
     assert (proven.search, beam.search) == ("proven", "beam")
-    assert beam.dropped_mass > proven.dropped_mass
+    assert beam.dropped_probability > proven.dropped_probability
     sigma = np.sqrt(np.trace(proven.covariance_m2))
     assert np.linalg.norm(beam.position_enu_m - proven.position_enu_m) < 0.2 * sigma
     np.testing.assert_allclose(beam.covariance_m2, proven.covariance_m2, atol=0.2 * sigma**2)

@@ -42,7 +42,7 @@ def test_one_gaussian() -> None:
     assert fix.radius999_m == pytest.approx(np.percentile(drawn, 99.9), abs=2 * WIDTH_M)
     assert [mode.weight for mode in fix.modes] == pytest.approx([1.0])
     assert not fix.ambiguous
-    assert fix.dropped_mass == 1e-7
+    assert fix.dropped_probability == 1e-7
 
 
 def test_a_faint_second_place_does_not_drag_the_position() -> None:

@@ -20,13 +20,13 @@ from startrack.types import BadInput, Mode
 ARCSEC = np.pi / 648_000
 KEYS = {
     "position": "frame terrain east_m north_m up_m covariance_m2 radius95_m radius999_m latitude_deg longitude_deg "
-    "search",
+    "search dropped_probability",
     "attitude": "quat_xyzw_cam_icrs ra_deg dec_deg roll_deg sigma_arcsec lens_error_included quat_xyzw_body_enu "
     "heading_deg pitch_deg roll_body_deg sigma_heading_deg sigma_pitch_deg sigma_roll_body_deg",
     "stars": "detected identified unexplained predicted_visible rms_px false_alarm_probability",
     "sky": "brightness_mag_arcsec2",
     "timing_ms": "read detect identify attitude evidence locate",
-    "provenance": "version image_sha256 camera terrain catalog time_utc exposure_s",
+    "provenance": "version image_sha256 camera terrain catalog localizer time_utc exposure_s",
 }
 
 
@@ -159,6 +159,12 @@ def test_without_a_terrain_nothing_is_said_in_enu(located):
     assert d["stars"]["predicted_visible"] is None
 
 
+def test_the_bound_of_the_probability_left_out_is_stated(located, fix):
+    assert 0.0 < fix["position"]["dropped_probability"] == located.result.fix.dropped_probability < 0.01
+    point = replace(located.result.fix, search="approximate", dropped_probability=None)
+    assert result_dict(replace(located.result, fix=point))["position"]["dropped_probability"] is None
+
+
 def test_an_ambiguous_result_has_modes_and_no_position(located):
     d = result_dict(ambiguous(located.result))
     assert (d["status"], d["reason"]) == ("ambiguous", "ambiguous")
@@ -180,6 +186,9 @@ def test_a_refused_result_says_why_and_what_is_known(located):
 def test_provenance(located, fix):
     assert fix["provenance"]["time_utc"] == "2030-06-01T00:00:00.000000Z"
     assert fix["provenance"]["catalog"] == "hipparcos"
+    assert fix["provenance"]["localizer"] == "posterior"
+    stars_only = pipeline.identify(located.result.exposure, located.result.camera, load_catalog().brighter_than(7.0))
+    assert identification_dict(stars_only)["provenance"]["localizer"] is None
     unknown = replace(located.result, exposure=replace(located.result.exposure, time_utc=None))
     assert result_dict(unknown)["provenance"]["time_utc"] is None
     assert refused_dict("night/a.png", "bad_image", "it is truncated")["image"] == "a.png"

@@ -49,7 +49,9 @@ def test_other_results(located):
 def test_refusals_are_one_line_with_reason_and_message(located):
     refused = Refused(reason="no_stars", message="the frame\nis flat", reached=located.result)
     assert summary_line(refused, seconds=1.0) == "small  refused  no_stars: the frame is flat"
-    assert refusal_line("night/b.png", "bad_image", "it is truncated") == "b.png  refused  bad_image: it is truncated"
+    line = "b.png  refused  bad_image: it is truncated"
+    assert refusal_line("night/b.png", "bad_image", "it is truncated") == line
+    assert refusal_line("night/b.png", "bad_image", "night/b.png: it is truncated") == line
 
 
 def test_a_heading_of_nearly_a_turn_is_nought(located):

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from startrack.frames import Site
+from startrack.inputs import terrain_input
 from startrack.localization import ExactPosterior
 from startrack.terrain import Cylinder, Terrain, load_terrain
 from startrack.terrain.protocol import ForwardingTerrain
-from startrack.types import Array, Evidence
+from startrack.types import Array, BadInput, Evidence
 
 SITE = Site("moon", np.radians(-89.66), np.radians(129.78))
 AZIMUTHS = np.linspace(0.01, 2 * np.pi, 12, endpoint=False)
@@ -69,6 +70,18 @@ class AttributeWrapper:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.whole, name)
+
+
+class HalfATerrain:
+    """A class with two of the three required methods, and no base class."""
+
+    horizon_rad, ground_m = LevelHorizon.horizon_rad, LevelHorizon.ground_m
+
+
+class Underived(HalfATerrain):
+    """All three, but none of the other members."""
+
+    horizon_bounds_rad = LevelHorizon.horizon_bounds_rad
 
 
 @cache
@@ -204,3 +217,15 @@ def test_a_users_own_terrain_is_searched():
     )  # fmt: skip
     fix = ExactPosterior()(evidence, terrain)
     assert np.hypot(*(fix.position_enu_m[:2] - place)) < fix.radius999_m < 20.0
+
+
+def test_what_is_no_terrain_is_refused_by_the_methods_it_lacks():
+    assert terrain_input(cylinder(), None) is cylinder()
+    wrapped = AttributeWrapper(cylinder())
+    assert terrain_input(wrapped, None) is wrapped
+    with pytest.raises(BadInput, match=r"it has no horizon_bounds_rad\): .* derived from startrack\.Terrain"):
+        terrain_input(HalfATerrain(), None)
+    with pytest.raises(BadInput, match=r"Underived is no terrain: .* derived from startrack\.Terrain"):
+        terrain_input(Underived(), None)
+    with pytest.raises(BadInput, match="ground_m, horizon_bounds_rad, horizon_rad"):
+        terrain_input(7, None)

@@ -11,7 +11,7 @@ import pytest
 import tomli_w
 
 from startrack.cli.main import main
-from startrack.files import data_dir
+from startrack.files import data_dir, file_stem
 from startrack.terrain import load_terrain, terrain_from_dict
 from startrack.terrain.geotiff import write_map
 from startrack.terrain.height_map import HeightMap
@@ -484,3 +484,14 @@ def test_texts_that_no_parser_takes_are_bad_terrain(text, tmp_path):
         with pytest.raises(BadInput) as caught:
             load_terrain(name)
         assert caught.value.reason == "bad_terrain"
+
+
+def test_pictures_stay_in_their_folder_whatever_the_terrain_is_called(tmp_path, capsys):
+    out = tmp_path / "a" / "out"
+    for name, stem in (("../../up", "_.._up"), (str(tmp_path / "root"), None), ("..", "unnamed")):
+        path = terrain_file(tmp_path, name=name)
+        assert main(["terrain", "show", str(path), "-D", str(out), "--json"]) == 0
+        (file,) = json.loads(capsys.readouterr().out)["files"]
+        assert Path(file).resolve().parent == out.resolve()
+        assert stem is None or Path(file).name == f"{stem}.relief.png"
+    assert len(file_stem("\U0001f30b" * 200).encode()) <= 200

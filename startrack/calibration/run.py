@@ -57,7 +57,7 @@ class _IdentifiedFrame:
 class _Run:
     catalog: StarCatalog
     start: Camera | None
-    fov_rad: float | None
+    fov_rad: float  # as stated, or of `start`
     site: Site | None
     progress: Progress
     identified: list[_IdentifiedFrame] = field(default_factory=list)
@@ -95,9 +95,7 @@ def calibrate(
         BadInput: no_time, size_mismatch, no_calibration.
         NotIdentified: the stars of no image are identified.
     """
-    if camera is None and fov_rad is None:
-        raise BadInput("no_calibration", "give the field of view (--fov DEG) or an approximate camera file (-c)")
-    run = _Run(catalog, camera, fov_rad, site, progress)
+    run = _Run(catalog, camera, _field_rad(camera, fov_rad), site, progress)
     frames = _frames(run, exposures)
     _identify_all(run, frames)
     joint = _fit_jointly(run)
@@ -183,14 +181,19 @@ def _first_identification(run: _Run, frame: Frame) -> tuple[Camera, Identificati
     if refusal is not None and run.identified:
         raise refusal
     # An approximate camera with another kind of lens still gives the field of view.
-    fov_rad = run.fov_rad if run.fov_rad is not None else _field_rad(run.start)
-    solution = identify_unknown_lens(frame.sources, frame.size_px, fov_rad, frame.sky.stars)
+    solution = identify_unknown_lens(frame.sources, frame.size_px, run.fov_rad, frame.sky.stars)
     return solution.camera, solution.identification
 
 
-def _field_rad(camera: Camera | None) -> float:
-    """Field of view as `fov_rad` means it: of the image circle where that is wide, else across the frame's width."""
-    assert camera is not None
+def _field_rad(camera: Camera | None, fov_rad: float | None) -> float:
+    """`fov_rad`, or the approximate camera's: of the image circle where that is wide, else across the frame's width.
+
+    Raises BadInput no_calibration where there is neither.
+    """
+    if fov_rad is not None:
+        return fov_rad
+    if camera is None:
+        raise BadInput("no_calibration", "give the field of view (--fov DEG) or an approximate camera file (-c)")
     if 2.0 * camera.max_angle_rad >= WIDE_FIELD_RAD:
         return 2.0 * camera.max_angle_rad
     width, height = camera.size_px

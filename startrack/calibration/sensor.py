@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 from itertools import pairwise
 
 import numpy as np
@@ -112,27 +113,29 @@ def _saturation_level(frames: tuple[Frame, ...]) -> float | None:
 
 def _find_hot_pixels(joint: JointFit) -> Array | None:
     """Pixels (n, 2) that stand out in all frames although the sky has turned; None where it has not."""
-    import cv2
-
     first, R = joint.frames[0], joint.fit.R_cam_icrs
     others = [i for i in range(1, len(joint.frames)) if has_turned(R[0], R[i], first.size_px)]
     if not others:
         return None
-    least: Array | None = None
-    for i in (0, *others):
-        frame = joint.frames[i]
-        image = np.asarray(frame.exposure.pixels_adu)
-        excess = image - cv2.medianBlur(image, 5)
-        noise = 1.4826 * float(np.median(np.abs(excess[::3, ::3]))) or 1.0
-        # The light of a star or planet spreads over neighbouring pixels, that of a hot pixel does not.
-        beside = cv2.filter2D(np.maximum(excess, 0.0), -1, NEIGHBOURS)
-        standing = np.asarray((excess - beside) / noise, dtype=np.float64)
-        for px in frame.sources.xy_px[joint.matches[i].detection]:
-            x, y = np.rint(px).astype(int)
-            reach = STAR_RADIUS_PX
-            standing[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1] = 0.0
-        least = standing if least is None else np.minimum(least, standing)
-    assert least is not None
+    least = reduce(np.minimum, (_excess_sigmas(joint, i) for i in (0, *others)))
     y, x = np.nonzero(least > HOT_SIGMA)
     order = np.argsort(-least[y, x], kind="stable")[:MAX_HOT]
     return np.stack([x[order], y[order]], axis=1).astype(np.float64)
+
+
+def _excess_sigmas(joint: JointFit, i: int) -> Array:
+    """How far each pixel (H, W) of frame `i` exceeds those around it, in sigmas of the noise; 0 at identified stars."""
+    import cv2
+
+    frame = joint.frames[i]
+    image = np.asarray(frame.exposure.pixels_adu)
+    excess = image - cv2.medianBlur(image, 5)
+    noise = 1.4826 * float(np.median(np.abs(excess[::3, ::3]))) or 1.0
+    # The light of a star or planet spreads over neighbouring pixels, that of a hot pixel does not.
+    beside = cv2.filter2D(np.maximum(excess, 0.0), -1, NEIGHBOURS)
+    sigmas = np.asarray((excess - beside) / noise, dtype=np.float64)
+    for px in frame.sources.xy_px[joint.matches[i].detection]:
+        x, y = np.rint(px).astype(int)
+        reach = STAR_RADIUS_PX
+        sigmas[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1] = 0.0
+    return sigmas

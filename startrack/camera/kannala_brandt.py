@@ -94,8 +94,17 @@ class KannalaBrandt(Lens):
     @classmethod
     def fit_start(cls, lens: Lens, size: int) -> KannalaBrandt:
         """The first `size` coefficients of `lens`, zeros where it has none."""
-        k = lens.k if isinstance(lens, KannalaBrandt) else ()
-        return cls((*k, *(MAX_COEFFICIENTS * (0.0,)))[:size])
+        return cls((*super().fit_start(lens, size).k, *(MAX_COEFFICIENTS * (0.0,)))[:size])
+
+    @classmethod
+    def fit_curve(cls, angle_rad: Array, rho: Array, size: int) -> tuple[KannalaBrandt, float]:
+        """The lens of `size` coefficients and the focal length that fit the radii `rho` (n,) at `angle_rad` (n,) best.
+
+        The focal length is in the unit of `rho`.
+        """
+        powers = np.asarray(angle_rad)[:, None] ** (2 * np.arange(size + 1) + 1)
+        c, *_ = np.linalg.lstsq(powers, rho, rcond=None)
+        return cls(tuple((c[1:] / c[0]).tolist())), float(c[0])
 
     @classmethod
     def fit_text(cls, size: int) -> str:

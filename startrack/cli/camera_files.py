@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ def add_parsers(subparsers: Any) -> None:
     direction.add_argument("--to", choices=FORMATS, help="write this format")
     direction.add_argument("--from", dest="source", choices=FORMATS, help="read this format")
     convert.add_argument("-o", "--output", metavar="FILE", help="what to write (default: a file in OUT)")
-    convert.add_argument("--name", help="name of the camera (default: the file's stem)")
+    convert.add_argument("--name", help="name of the camera (default: the one in the file, else its stem)")
     convert.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the results (%(default)s)")
     convert.set_defaults(run=run_convert)
 
@@ -61,16 +62,17 @@ def run_convert(args: argparse.Namespace) -> int:
     from startrack.camera.convert import from_text, to_text
     from startrack.camera.convert.intrinsics import decentring_rms_px
     from startrack.camera.io import camera_text
-    from startrack.files import write_atomically
+    from startrack.files import file_stem, write_atomically
 
     if args.to is not None:
         camera = load_camera(args.file)
         text = to_text(camera, args.to)
-        default = DEFAULT_NAMES.get(args.to, f"{camera.name}.yaml")
+        default = DEFAULT_NAMES.get(args.to, f"{file_stem(camera.name)}.yaml")
         lost = decentring_rms_px(camera) if camera.decentring and args.to != "colmap" else 0.0
         note = f"; {args.to} has no decentring: {lost:.2f} px RMS are lost" if lost else ""
     else:
-        text = camera_text(from_text(_text(args.file), args.source, args.name or Path(args.file).stem))
+        camera = from_text(_text(args.file), args.source, Path(args.file).stem)
+        text = camera_text(replace(camera, name=args.name or camera.name))
         default, note = f"{Path(args.file).stem}.toml", ""
     out = output_path(args, default)
     write_atomically(out, text.encode("utf-8"), overwrite=True)

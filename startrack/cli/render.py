@@ -170,9 +170,8 @@ def _pose(scene: Scene, truth: Truth) -> dict[str, Any]:
     from startrack.frames import format_utc, heading_pitch_roll_from_R_body_enu
 
     heading, pitch, roll = heading_pitch_roll_from_R_body_enu(scene.camera.R_body_cam @ scene.R_cam_enu)
-    assert scene.time_utc is not None
     return {
-        "time_utc": format_utc(scene.time_utc),
+        "time_utc": None if scene.time_utc is None else format_utc(scene.time_utc),
         "exposure_s": scene.exposure_s,
         "east_m": float(truth.position_enu_m[0]),
         "north_m": float(truth.position_enu_m[1]),

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli.common import DEFAULT_OUT
 from startrack.cli.preparation import prepare
 from startrack.cli.terrain_facts import facts_of, lines_of, seen_from
-from startrack.files import make_folder
+from startrack.files import file_stem, make_folder
 
 if TYPE_CHECKING:
     from startrack.terrain import Terrain
@@ -93,10 +93,10 @@ def _show(args: argparse.Namespace) -> int:
 def _pictures(args: argparse.Namespace, terrain: Terrain, position: tuple[float, float] | None) -> list[Path]:
     from startrack.output.picture.terrain_picture import panorama_picture, relief_picture
 
-    out = make_folder(args.dir, "bad_terrain")
-    pictures = {out / f"{terrain.name}.relief.png": relief_picture(terrain, position)}
+    out, stem = make_folder(args.dir, "bad_terrain"), file_stem(terrain.name)
+    pictures = {out / f"{stem}.relief.png": relief_picture(terrain, position)}
     if position is not None:
-        pictures[out / f"{terrain.name}.horizon.png"] = panorama_picture(terrain, position)
+        pictures[out / f"{stem}.horizon.png"] = panorama_picture(terrain, position)
     from PIL import Image
 
     for path, picture in pictures.items():

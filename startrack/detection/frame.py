@@ -59,8 +59,9 @@ class Frame:
         return stamps(self.image, centres, radius) - stamps(self.background, centres, radius)
 
     def light(self, centres: Ints, radius: int) -> Image:
-        """Stamps (n, s, s) of the light of the stars known so far, which there must be."""
-        assert self.found is not None
+        """Stamps (n, s, s) of the light of the stars known so far."""
+        if self.found is None:
+            return np.zeros((len(centres), 2 * radius + 1, 2 * radius + 1), dtype=np.float32)
         return stamps(self.found, centres, radius)
 
     def variance(self, centres: Ints, radius: int) -> Image:

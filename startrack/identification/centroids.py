@@ -11,7 +11,7 @@ from startrack.attitude import AttitudeFit, solve_attitude
 from startrack.camera import Camera
 from startrack.identification.lost_in_space import Identifier
 from startrack.identification.unknown_lens import identify_unknown_lens
-from startrack.types import Attitude, Centroids, Identification, Ints, Stars
+from startrack.types import Array, Attitude, Centroids, Identification, Ints, Stars
 
 DEFAULT_SIGMA_PX = 0.3  # centroid error per axis where none is given
 DEFAULT_PSF_SIGMA_PX = 1.0
@@ -26,6 +26,11 @@ class IdentifiedCentroids:
     stars: Stars  # the catalogue to which its `star` refers
     camera: Camera  # as given, or found (name "unknown", with covariance)
     attitude_fit: AttitudeFit
+
+    def __repr__(self) -> str:
+        """Number of stars, residual and camera: the arrays fill pages."""
+        rms_px = self.attitude_fit.rms_px
+        return f"<IdentifiedCentroids: {len(self.star)} stars, rms {rms_px:.3f} px, camera {self.camera.name!r}>"
 
     @property
     def attitude(self) -> Attitude:
@@ -82,22 +87,21 @@ def identify_centroids(
         identifier: settings of the identification with a camera.
 
     Raises:
-        ValueError: neither a camera, nor a field of view with the frame's size; or lists of different lengths.
+        ValueError: neither a camera, nor a field of view with the frame's size; or arrays of a wrong shape.
         NotIdentified: the stars are not identified; its `reason` is "mirrored" for the mirror image of a known camera.
     """
-    if camera is None and (fov_rad is None or size_px is None):
-        raise ValueError("give a camera, or fov_rad with size_px")
     if stars is None:
         from startrack.catalog import load_catalog
 
         stars = load_catalog().at(None, None)
     sources, order = sorted_centroids(xy_px, flux, sigma_px, saturated, psf_sigma_px)
-    if camera is None:
-        assert size_px is not None and fov_rad is not None
+    if camera is not None:
+        found = (identifier or Identifier())(sources, camera, stars)
+    elif fov_rad is not None and size_px is not None:
         solution = identify_unknown_lens(sources, size_px, fov_rad, stars)
         camera, found = solution.camera, solution.identification
     else:
-        found = (identifier or Identifier())(sources, camera, stars)
+        raise ValueError("give a camera, or fov_rad= with size_px=")
     fit = solve_attitude(
         camera, sources.xy_px[found.detection], sources.covariance_px2[found.detection], stars.rays_icrs[found.star],
         found.R_cam_icrs,
@@ -118,16 +122,21 @@ def sorted_centroids(
     Without fluxes each rank has the magnitude at which a typical sky has as many stars, and the brightness takes no
     part in the matches.
     """
-    xy = np.asarray(xy_px, dtype=np.float64).reshape(-1, 2)
+    xy = _finite("the centroids", xy_px)
+    xy = xy.reshape(0, 2) if xy.shape == (0,) else xy
+    if xy.ndim != 2 or xy.shape[1] != 2:
+        raise ValueError(f"the centroids have the shape {xy.shape}: give (n, 2), x and y [px] of each")
     n = len(xy)
     if flux is None:
         order, brightness_sigma_mag = np.arange(n, dtype=np.int64), np.inf
         light = np.exp(-np.log(10.0) * 0.4 / STAR_COUNT_SLOPE * np.log(np.arange(1, n + 1)))
     else:
-        light, brightness_sigma_mag = np.asarray(flux, dtype=np.float64), 0.0
+        light, brightness_sigma_mag = _one_each("flux", flux, n), 0.0
         order = np.argsort(-light, kind="stable")
-    sigma = np.broadcast_to(np.asarray(DEFAULT_SIGMA_PX if sigma_px is None else sigma_px, dtype=np.float64), n)
-    clipped = np.zeros(n, dtype=bool) if saturated is None else np.asarray(saturated, dtype=bool)
+    sigma = _one_each("sigma_px", DEFAULT_SIGMA_PX if sigma_px is None else sigma_px, n)
+    if (sigma <= 0).any():
+        raise ValueError("sigma_px= must be above 0")
+    clipped = _one_each("saturated", False if saturated is None else saturated, n).astype(bool)
     return Centroids(
         xy_px=xy[order],
         covariance_px2=np.square(sigma[order])[:, None, None] * np.eye(2),
@@ -137,3 +146,22 @@ def sorted_centroids(
         psf_sigma_px=psf_sigma_px,
         brightness_sigma_mag=brightness_sigma_mag,
     ), order
+
+
+def _one_each(name: str, values: ArrayLike, n: int) -> Array:
+    """The values as an array (n,); one number is that of all centroids. Raises ValueError."""
+    given = _finite(f"{name}=", values)
+    if given.shape not in ((), (n,)):
+        raise ValueError(f"{name}= has the shape {given.shape}: give one number for each of the {n} centroids")
+    return np.broadcast_to(given, n)
+
+
+def _finite(name: str, values: ArrayLike) -> Array:
+    """The values as an array. Raises ValueError where they are not numbers, or infinite."""
+    try:
+        given = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as cause:
+        raise ValueError(f"{name} must be an array of numbers, rows of equal length") from cause
+    if not np.isfinite(given).all():
+        raise ValueError(f"{name} must be finite: leave out what was not measured")
+    return given

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.adjust import Prior, Scheme, State, adjust, cauchy_loss
-from startrack.camera import Camera, KannalaBrandt, Pinhole
+from startrack.camera import Camera, KannalaBrandt
+from startrack.camera.lenses import lens_kinds
 from startrack.false_alarm import log_p_value_bound
-from startrack.identification.radial_lens_family import PINHOLE, RadialFamily
 from startrack.match import match_mutual
 from startrack.normal_equations import observations_of_image
 from startrack.types import Array, Ints
@@ -23,6 +23,7 @@ SHAPE_SIGMA = 0.5  # prior of the family's shape
 FOCAL_SIGMA, CENTRE_SIGMA = 0.1, 0.06  # priors, in focal lengths
 K_SIGMA = (0.1, 0.1, 0.05, 0.02)  # priors of the polynomial's coefficients
 STARS_PER_DETECTION = 1.5
+SAME_RADIUS_1 = 1e-12  # relative difference of the radii of lenses that are the same
 FIT = Scheme(loss=cauchy_loss(LOSS_CHI2), steps=4, settled_px=1e-3)
 
 
@@ -152,13 +153,17 @@ def _brightest_in_view(camera: Camera, R: Array, rays_icrs: Array, wanted: int) 
         count *= 4
 
 
-def as_polynomial(camera: Camera, order: int, widest_rad: float) -> Camera:
-    """The camera with its family lens replaced by a Kannala-Brandt lens of `order` coefficients, or by a pinhole."""
-    lens = camera.lens
-    if isinstance(lens, RadialFamily) and lens.shape == PINHOLE:
-        return replace(camera, lens=Pinhole())
-    a = np.linspace(0.02, min(widest_rad, 0.98 * lens.max_invertible_rad), 200)
-    powers = a[:, None] ** (2 * np.arange(order + 1) + 1)
-    c, *_ = np.linalg.lstsq(powers, lens.rho(a), rcond=None)
-    focal = camera.focal_px[0] * float(c[0])
-    return replace(camera, lens=KannalaBrandt(tuple((c[1:] / c[0]).tolist())), focal_px=(focal, focal))
+def with_file_lens(camera: Camera, size: int, widest_rad: float) -> Camera:
+    """The camera with its family lens replaced by one of camera files.
+
+    A lens of fixed shape if it has the same radii up to `widest_rad`, else the Kannala-Brandt lens of `size`
+    coefficients that fits them best.
+    """
+    a = np.linspace(0.02, min(widest_rad, 0.98 * camera.lens.max_invertible_rad), 200)
+    rho = camera.lens.rho(a)
+    for kind in lens_kinds().values():
+        if not kind.parameter_names and np.allclose(kind().rho(a), rho, rtol=SAME_RADIUS_1, atol=0.0):
+            return replace(camera, lens=kind())
+    lens, scale = KannalaBrandt.fit_curve(a, rho, size)
+    focal = scale * camera.focal_px[0]
+    return replace(camera, lens=lens, focal_px=(focal, focal))

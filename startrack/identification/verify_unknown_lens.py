@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.camera import Camera, Pinhole
+from startrack.camera import Camera
 from startrack.false_alarm import coincidence_probability, density_per_sr, log_p_value, log_trials
-from startrack.identification.radial_lens_family import PINHOLE, RadialFamily
-from startrack.identification.region_growing import GrownLens, as_polynomial, fit_camera, match_in_view
+from startrack.identification.region_growing import GrownLens, fit_camera, match_in_view, with_file_lens
 from startrack.match import (
     BRIGHTER_MAG,
     DEPTH_BELOW_THRESHOLD_MAG,
@@ -30,11 +29,11 @@ SMALLEST_RADIUS_PX, RADIUS_SIGMAS = 0.6, 2.5
 ON_PLACE_FRACTION = 0.5  # of the stars near their predicted pixels, where the lens is right
 STARS_OF_A_RING, MAX_RINGS = 8, 12
 FEWEST = 5
-FREE_MATCHES, FREE_MATCHES_PINHOLE = 8, 3  # that a fit of attitude and lens produces by itself
+FREE_MATCHES, FREE_MATCHES_FIXED_LENS = 8, 3  # that a fit of attitude and lens produces by itself
 MIN_TIMES_CHANCE = 3.0  # matches over those expected by chance
 ORDERS = ((150, 4), (60, 3), (25, 2), (0, 1))  # coefficients of the polynomial from this many matches on
-POLYNOMIAL_RMS_1 = 0.9  # a polynomial replaces a pinhole if it leaves less than this part of the residual
 MIN_FOR_CENTRE = 30
+FITTED_BEYOND_1 = 1.3  # of half the field of view: up to here a fitted lens may have stars
 BLEND_SIGMAS, WIDEST_PSF_PX = 3.0, 1.5
 BLEND_FLUX_RATIO = 0.25  # a neighbour with more than this part of a star's flux makes the match ambiguous
 BLEND_MAG = float(-2.5 * np.log10(BLEND_FLUX_RATIO))
@@ -120,13 +119,10 @@ def agreement_of(centroids: Centroids, v_mag: Array, measured_mag: Array) -> flo
 
 def verify(grown: GrownLens, centroids: Centroids, stars: Stars, tried: int, widest_rad: float) -> VerifiedLens | None:
     """The grown lens refined with all stars and verified; None where too few stars agree."""
-    fits = [_refine(c, grown.R_cam_icrs, centroids, stars, widest_rad) for c in _start_lenses(grown, widest_rad)]
-    found = [fit for fit in fits if fit is not None]
-    if not found:
+    refined = _refine(grown, centroids, stars, widest_rad)
+    if refined is None:
         return None
-    camera, R, rms_px = found[0]
-    if len(found) > 1 and found[1][2] < POLYNOMIAL_RMS_1 * rms_px:
-        camera, R, rms_px = found[1]
+    camera, R = refined
     matches = match_by_flux(centroids.take(slice(TESTED)), camera, stars, R, NEAR_PX, 0.0)
     off_axis = camera.angle_rad(centroids.xy_px[matches.detection])
     trusted_rad = trusted_radius(off_axis, matches.distance_px < GATES_PX[-1])
@@ -159,23 +155,11 @@ def significance(hits: int, predicted: int, each: float, free: int) -> float:
     return float(log_p_value(hits, predicted, each, free))
 
 
-def _start_lenses(grown: GrownLens, widest_rad: float) -> list[Camera]:
-    """The lenses to refine: a polynomial; or a pinhole, and a polynomial if there are stars enough for one."""
-    n = len(grown.star)
-    order = next(order for fewest, order in ORDERS if n >= fewest)
-    polynomial = _limit_angles(as_polynomial(grown.camera, order, widest_rad), widest_rad)
-    lens = grown.camera.lens
-    if not (isinstance(lens, RadialFamily) and lens.shape == PINHOLE):
-        return [polynomial]
-    pinhole = _limit_angles(replace(grown.camera, lens=Pinhole()), widest_rad)
-    return [pinhole, polynomial] if n >= ORDERS[-2][0] else [pinhole]
-
-
-def _refine(
-    camera: Camera, R: Array, centroids: Centroids, stars: Stars, widest_rad: float
-) -> tuple[Camera, Array, float] | None:
-    """Camera, attitude and RMS [px] after smaller gates and longer lists; the last matches are by brightness too."""
-    prior = camera
+def _refine(grown: GrownLens, centroids: Centroids, stars: Stars, widest_rad: float) -> tuple[Camera, Array] | None:
+    """Camera and attitude after smaller gates and longer lists; the last matches are by brightness too."""
+    order = next(order for fewest, order in ORDERS if len(grown.star) >= fewest)
+    prior = camera = _limit_angles(with_file_lens(grown.camera, order, widest_rad), widest_rad)
+    R = grown.R_cam_icrs
     for gate_px, count in FITS:
         xy = centroids.xy_px[:count]
         detection, star, _ = match_in_view(camera, R, xy, stars.rays_icrs, gate_px)
@@ -189,13 +173,14 @@ def _refine(
         if len(matches.star) < FEWEST:
             return None
         xy, rays = centroids.xy_px[matches.detection], stars.rays_icrs[matches.star]
-        camera, R, distance = fit_camera(camera, R, xy, rays, _free_parameters(camera, len(rays)), gate_px / 4, prior)
+        camera, R, _ = fit_camera(camera, R, xy, rays, _free_parameters(camera, len(rays)), gate_px / 4, prior)
         camera = _limit_angles(camera, widest_rad)
-    return camera, R, float(np.sqrt(np.mean(distance**2)))
+    return camera, R
 
 
 def _free_parameters(camera: Camera, matched: int) -> tuple[str, ...]:
-    if isinstance(camera.lens, Pinhole):
+    """Those of the lens and, with enough matches, its centre; only the focal length of a lens of fixed shape."""
+    if not camera.lens.parameters:
         return ("f",)
     centre = ("cx", "cy") if matched >= MIN_FOR_CENTRE else ()
     return ("f", *camera.lens.parameters, *centre)
@@ -206,7 +191,7 @@ def _limit_angles(camera: Camera, widest_rad: float) -> Camera:
     width, height = camera.size_px
     corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=float)
     corner_rad = float(np.max(camera.angle_rad(corners)))
-    allowed = max(widest_rad, corner_rad) if isinstance(camera.lens, Pinhole) else widest_rad * 1.3
+    allowed = FITTED_BEYOND_1 * widest_rad if camera.lens.parameters else corner_rad
     widest = min(allowed, corner_rad, camera.lens.max_invertible_rad)
     return replace(camera, max_angle_rad=widest, calibrated_angle_rad=widest)
 
@@ -232,7 +217,7 @@ def _match_field(camera: Camera, R: Array, centroids: Centroids, stars: Stars, t
     rays = camera.unproject(tested.xy_px[camera.angle_rad(tested.xy_px) <= camera.calibrated_angle_rad])
     radius_rad = radius_px * float(camera.mean_scale_rad_per_px(np.array(camera.calibrated_angle_rad / 2)))
     each = some.agreement * float(coincidence_probability(density_per_sr(rays) * np.pi * radius_rad**2))
-    free = FREE_MATCHES_PINHOLE if isinstance(camera.lens, Pinhole) else FREE_MATCHES
+    free = FREE_MATCHES if camera.lens.parameters else FREE_MATCHES_FIXED_LENS
     return VerifiedLens(
         camera=camera,
         R_cam_icrs=R,

@@ -26,4 +26,11 @@ LOCALIZERS: dict[str, type[Localizer]] = {
     "hull": Hull,
 }
 
-__all__ = ["LOCALIZERS", "ExactPosterior", "Hull", "Localizer", "PseudoGradient", "check_consistency"]
+
+def localizer_name(localizer: Localizer) -> str:
+    """The name of a `localizer` in LOCALIZERS; of one that is not listed, that of its class or function."""
+    listed = [name for name, kind in LOCALIZERS.items() if kind is type(localizer)]
+    return listed[0] if listed else getattr(localizer, "__name__", type(localizer).__name__)
+
+
+__all__ = ["LOCALIZERS", "ExactPosterior", "Hull", "Localizer", "PseudoGradient", "check_consistency", "localizer_name"]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from startrack.compilation import announce_compilation
 from startrack.localization.branch_and_bound import BudgetSpent, Explored, Search, explains_all_sectors, log_sum
 from startrack.localization.initial_guess import beam_search, climb_to_best
 from startrack.localization.likelihood import SECTOR_EPSILON, SECTOR_RAD, PositionLikelihood
@@ -44,6 +45,7 @@ class ExactPosterior:
 
         Raises NotLocated: insufficient_geometry, outside_search_area, inconsistent_evidence.
         """
+        announce_compilation()
         informative = (np.abs(evidence.llr) > LEAST_NATS) | (evidence.extended_nats > LEAST_NATS)
         informative &= terrain.is_informative(evidence.azimuth_rad, evidence.elevation_rad)
         count = int(np.count_nonzero(informative))

@@ -13,7 +13,7 @@ NEGLIGIBLE_BOX = 1e-12
 USELESS_FRACTION = 0.5  # a 95 % circle wider than this part of the search radius says nothing worth having
 
 
-def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_mass: float, terrain: Terrain) -> Fix:
+def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_probability: float, terrain: Terrain) -> Fix:
     """Fix from equal boxes (n, 2) of the given width with log-likelihoods (n,).
 
     Position and covariance are those of the heaviest mode: one of half a per cent far away would drag the mean to where
@@ -56,7 +56,7 @@ def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_mass:
         radius999_m=radius999,
         modes=modes,
         ambiguous=ambiguous,
-        dropped_mass=dropped_mass,
+        dropped_probability=dropped_probability,
     )
 
 

@@ -177,6 +177,9 @@ QUANTITIES: tuple[Quantity, ...] = (
       "`approximate`: a method without a posterior",
       {"enum": ["proven", "beam", "approximate"]}, optional=True, columns=(Column("search", "%s"),),
       shown=(Show("text", "error", "; search {}"), Show("notebook", "search", "{}"), Show("page", "Search", "{}"))),
+    Q("position.dropped_probability", "", Located, lambda v: v.fix.dropped_probability,
+      "upper bound of the probability of the positions that the search left out; 1: not bounded; null: a "
+      "method without a posterior", {"anyOf": [CHANCE, {"type": "null"}]}, optional=True),
     Q("modes", "", Located, lambda v: [{"east_m": m.east_m, "north_m": m.north_m, "weight": m.weight}
                                        for m in v.fix.modes],
       "list of `east_m`, `north_m`, `weight`: the positions that fit, heaviest first; weights sum to 1. Ambiguous: "
@@ -289,6 +292,9 @@ QUANTITIES: tuple[Quantity, ...] = (
       lambda v: v.exposure.terrain or (v.terrain.name if v.terrain is not None else None), "terrain file or name", TEXT,
       before=None, columns=(Column("terrain", "%s"),)),
     Q("provenance.catalog", "", Inputs, lambda v: v.catalog_name or None, "star catalogue", TEXT, before=None),
+    Q("provenance.localizer", "", Inputs, lambda v: v.localizer_name or None,
+      "method of localization, by its name for `--localizer`; of one of your own the name of its class or function; "
+      "null: of `identify` and `detect`", TEXT, before=None, optional=True),
     Q("provenance.time_utc", "", Inputs,
       lambda v: None if v.exposure.time_utc is None else format_utc(v.exposure.time_utc),
       "middle of the exposure; null: not known", {"type": "string", "format": "date-time"}, before=None,

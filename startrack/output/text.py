@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from startrack.files import printable
 from startrack.output.record import image_name
 from startrack.output.views import at_stage, rows
 from startrack.stages import STAGES, Outcome, Refused, last_value
@@ -27,8 +28,9 @@ def summary_line(result: Outcome, seconds: float | None = None) -> str:
 
 
 def refusal_line(image: str, reason: str, message: str) -> str:
-    """One line about an `image` that was refused at whatever stage: `reason` and `message`."""
-    return f"{Path(image).name}  refused  {reason}: {' '.join(message.split())}"
+    """One line about an `image` that was refused at whatever stage: `reason` and `message`, its own name left out."""
+    cause = " ".join(message.split()).removeprefix(f"{printable(image)}: ")
+    return f"{Path(image).name}  refused  {reason}: {cause}"
 
 
 def lens_text(camera: Camera) -> str:

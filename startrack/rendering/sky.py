@@ -7,6 +7,7 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.frames import azel_from_rays, rays_from_azel
 from startrack.rendering.scene import Scene
+from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Ints
 
 ARCSEC2_PER_SR = (180 * 3600 / np.pi) ** 2
@@ -55,12 +56,14 @@ def coverage(scene: Scene, xy_px: Ints | Array) -> Array:
     """
     from scipy.special import ndtr
 
+    if scene.terrain is None:
+        return np.ones(len(xy_px))
     sigma = _sigma_px(scene)
     xy_px = np.asarray(xy_px, dtype=np.float64)
     across, slope_rad_per_px = _local_axes(scene, xy_px)
     weights = np.exp(-0.5 * TANGENT_NODES_SIGMAS**2)
     weights /= weights.sum()
-    azimuths, horizon = _horizon_table(scene)
+    azimuths, horizon = _horizon_table(scene.terrain, scene.position_enu_m)
     total = np.zeros(len(xy_px))
     for node, weight in zip(TANGENT_NODES_SIGMAS * sigma, weights, strict=True):
         azimuth, elevation = _azel(scene, xy_px + node * across)
@@ -73,11 +76,10 @@ def _sigma_px(scene: Scene) -> float:
     return float(np.sqrt(scene.sensor.psf_sigma_px**2 + 1 / 12))
 
 
-def _horizon_table(scene: Scene) -> tuple[Array, Array]:
-    """Azimuths from 0 to 2 pi, both ends included, and the horizon there [rad]; the terrain must not be None."""
+def _horizon_table(terrain: Terrain, position_enu_m: Array) -> tuple[Array, Array]:
+    """Azimuths from 0 to 2 pi, both ends included, and the horizon there [rad] seen from the position (3,)."""
     azimuths = np.linspace(0.0, 2 * np.pi, AZIMUTHS + 1)
-    assert scene.terrain is not None
-    horizon = np.asarray(scene.terrain.horizon_rad(scene.position_enu_m[:2], azimuths[:-1]), dtype=np.float64)
+    horizon = np.asarray(terrain.horizon_rad(position_enu_m[:2], azimuths[:-1]), dtype=np.float64)
     return azimuths, np.append(horizon, horizon[0])
 
 
@@ -118,7 +120,7 @@ def _sky_and_mask(scene: Scene) -> tuple[Array, Bools]:
     rho, light, side, axial = _lens_table(scene)
     u = (np.arange(width) - camera.centre_px[0]) / camera.focal_px[0]
     sky, above = np.empty((height, width)), np.ones((height, width), dtype=bool)
-    tan_horizon = None if scene.terrain is None else _tan_table(scene)
+    tan_horizon = None if scene.terrain is None else _tan_table(scene.terrain, scene.position_enu_m)
     hand = -1.0 if camera.mirrored else 1.0
     east, north, up = scene.R_cam_enu.T * [hand, 1.0, 1.0]
     to_east, to_north, _ = scene.sky_gradient * rays_from_azel(scene.sky_gradient_azimuth_rad, 0.0)
@@ -146,8 +148,8 @@ def _is_above_horizon(east: Array, north: Array, up: Array, azimuths: Array, tan
     return above
 
 
-def _tan_table(scene: Scene) -> tuple[Array, Array]:
-    azimuths, horizon = _horizon_table(scene)
+def _tan_table(terrain: Terrain, position_enu_m: Array) -> tuple[Array, Array]:
+    azimuths, horizon = _horizon_table(terrain, position_enu_m)
     return azimuths, np.tan(np.minimum(horizon, 1.5707))
 
 

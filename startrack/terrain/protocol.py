@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.frames import Site
-from startrack.types import Array, Bools
+from startrack.types import Array, BadInput, Bools
 
 Progress = Callable[[int, int], None]  # parts done, of how many
 
@@ -154,6 +154,24 @@ class Terrain(ABC):
     def facts(self) -> dict[str, Any]:
         """Facts about the ground that `startrack terrain show` prints, as JSON values; "kind" is one of them."""
         return {"kind": "other"}
+
+
+def require_terrain(given: Any) -> Terrain:
+    """`given`, if it is a terrain: of a class derived from Terrain, or with every member of one.
+
+    The one check of a user's object: all other code relies on the protocol. Raises BadInput (bad_terrain) that names
+    the required methods which are missing.
+    """
+    members = [name for name in dir(Terrain) if not name.startswith("_")]
+    if isinstance(given, Terrain) or all(hasattr(given, name) for name in members):
+        return given  # type: ignore[no-any-return]
+    missing = [name for name in sorted(Terrain.__abstractmethods__) if not hasattr(given, name)]
+    lacks = f" (it has no {', '.join(missing)})" if missing else ""
+    raise BadInput(
+        "bad_terrain",
+        f"{type(given).__name__} is no terrain{lacks}: give a file, a name, or an object of a class derived from "
+        "startrack.Terrain",
+    )
 
 
 def _forward(name: str) -> Any:

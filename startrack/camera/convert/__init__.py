@@ -10,7 +10,9 @@ from collections.abc import Callable
 
 from startrack.camera import Camera
 from startrack.camera.convert import colmap, kalibr, opencv, ros
+from startrack.types import BadInput
 
+TITLES = {"ros": "ROS", "kalibr": "Kalibr", "colmap": "COLMAP", "opencv": "OpenCV"}
 WRITERS: dict[str, Callable[[Camera], str]] = {
     "ros": ros.to_text,
     "kalibr": kalibr.to_text,
@@ -31,5 +33,13 @@ def to_text(camera: Camera, program: str) -> str:
 
 
 def from_text(text: str, program: str, name: str) -> Camera:
-    """The camera, called `name`, of the `text` of a file of `program`. Raises BadInput bad_calibration."""
-    return READERS[program](text, name)
+    """The camera of the `text` of a file of `program`, called `name` unless the file names it.
+
+    Raises BadInput bad_calibration.
+    """
+    try:
+        return READERS[program](text, name)
+    except (ValueError, KeyError, TypeError) as error:
+        cause = f"{error} is missing" if isinstance(error, KeyError) else error
+        text = f"not a camera file of {TITLES[program]} that can be used: {cause}"
+        raise BadInput("bad_calibration", " ".join(text.split())) from error

@@ -6,7 +6,7 @@ COLMAP's origin is the CORNER of the first pixel, whose centre is at (0.5, 0.5).
 from __future__ import annotations
 
 from startrack.camera import Camera, Decentring
-from startrack.camera.convert.intrinsics import Intrinsics, camera_from_intrinsics, intrinsics_of, unreadable_file
+from startrack.camera.convert.intrinsics import Intrinsics, camera_from_intrinsics, intrinsics_of
 from startrack.types import BadInput
 
 CORNER_PX = 0.5
@@ -40,26 +40,23 @@ def to_text(camera: Camera) -> str:
 
 
 def from_text(text: str, name: str) -> Camera:
-    """The first camera of a cameras.txt file. Raises BadInput bad_calibration."""
-    try:
-        lines = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-        _number, model, width, height, *words = lines[0]
-        values = [float(word) for word in words]
-        if len(values) != COUNTS.get(model, -1):
-            raise ValueError(f"camera model {model} with {len(values)} parameters has no counterpart")
-        if model.startswith("SIMPLE") or model == "RADIAL_FISHEYE":
-            values = [values[0], *values]
-        fx, fy, cx, cy, *rest = values
-        decentring = Decentring()
-        if model == "THIN_PRISM_FISHEYE":
-            k1, k2, p1, p2, k3, k4, sx, sy = rest
-            if sx or sy:
-                raise ValueError("thin-prism coefficients other than 0 have no counterpart")
-            rest, decentring = [k1, k2, k3, k4], Decentring(p1, p2)
-        k = None if model.endswith("PINHOLE") else (*rest, *(4 * (0.0,)))[:4]
-        lens = Intrinsics((int(width), int(height)), (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), k)
-        return camera_from_intrinsics(lens, name, decentring)
-    except BadInput:
-        raise
-    except (ValueError, IndexError) as cause:
-        raise unreadable_file("COLMAP", repr(cause)) from cause
+    """The first camera of a cameras.txt file. Raises ValueError."""
+    lines = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if not lines or len(lines[0]) < 4:
+        raise ValueError("no line CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]")
+    _number, model, width, height, *words = lines[0]
+    values = [float(word) for word in words]
+    if len(values) != COUNTS.get(model, -1):
+        raise ValueError(f"camera model {model} with {len(values)} parameters has no counterpart")
+    if model.startswith("SIMPLE") or model == "RADIAL_FISHEYE":
+        values = [values[0], *values]
+    fx, fy, cx, cy, *rest = values
+    decentring = Decentring()
+    if model == "THIN_PRISM_FISHEYE":
+        k1, k2, p1, p2, k3, k4, sx, sy = rest
+        if sx or sy:
+            raise ValueError("thin-prism coefficients other than 0 have no counterpart")
+        rest, decentring = [k1, k2, k3, k4], Decentring(p1, p2)
+    k = None if model.endswith("PINHOLE") else (*rest, *(4 * (0.0,)))[:4]
+    lens = Intrinsics((int(width), int(height)), (fx, fy), (cx - CORNER_PX, cy - CORNER_PX), k)
+    return camera_from_intrinsics(lens, name, decentring)

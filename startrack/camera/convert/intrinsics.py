@@ -30,9 +30,21 @@ class Intrinsics:
         (fx, fy), (cx, cy) = self.focal_px, self.centre_px
         return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
 
+    @classmethod
+    def from_matrix(cls, size_px: tuple[int, int], matrix: list[float], k: tuple[float, ...] | None) -> Intrinsics:
+        """The numbers of a camera matrix (9,), row by row. Raises ValueError if it is skewed."""
+        fx, skew, cx, _, fy, cy, *_ = matrix
+        if skew:
+            raise ValueError("a skewed camera matrix has no counterpart")
+        return cls(size_px, (fx, fy), (cx, cy), k)
+
+    def coefficients(self, count: int) -> list[float]:
+        """The coefficients of a fisheye, or `count` zeros of a pinhole."""
+        return [0.0] * count if self.k is None else list(self.k)
+
 
 def intrinsics_of(camera: Camera) -> Intrinsics:
-    """The camera's numbers, its decentring left out (see `without_decentring`).
+    """The camera's numbers, its decentring left out.
 
     Raises BadInput bad_calibration for a mirrored camera and for a lens that these formats do not have.
     """
@@ -50,15 +62,10 @@ def intrinsics_of(camera: Camera) -> Intrinsics:
     return Intrinsics(camera.size_px, (fx, fy), (cx, cy), None if model == "pinhole" else coefficients)
 
 
-def without_decentring(camera: Camera) -> Camera:
-    """The camera without its decentring, for formats that have none."""
-    return replace(camera, decentring=Decentring())
-
-
 def decentring_rms_px(camera: Camera) -> float:
-    """RMS difference [px] over the calibrated cap to `without_decentring`, the best rotation removed."""
+    """RMS difference [px] over the calibrated cap to the camera without decentring, the best rotation removed."""
     grid = cap_grid(camera.calibrated_angle_rad)
-    centred = without_decentring(camera)
+    centred = replace(camera, decentring=Decentring())
     difference = (camera.project(grid)[0] - centred.project(grid)[0]).reshape(-1)
     rotation = centred.jacobian_px_per_rad(grid).reshape(-1, 3)
     rest = difference - rotation @ np.linalg.lstsq(rotation, difference, rcond=None)[0]
@@ -89,11 +96,6 @@ def camera_from_intrinsics(numbers: Intrinsics, name: str, decentring: Decentrin
     return replace(camera, max_angle_rad=edge, calibrated_angle_rad=edge)
 
 
-def unreadable_file(program: str, cause: object) -> BadInput:
-    """The exception for a file that is not a camera file of the program."""
-    return BadInput("bad_calibration", f"not a {program} camera file that can be used: {cause}")
-
-
 def read_numbers(values: Any, count: int, key: str) -> list[float]:
     """`count` numbers. Raises ValueError naming the key."""
     if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
@@ -101,10 +103,17 @@ def read_numbers(values: Any, count: int, key: str) -> list[float]:
     return [float(v) for v in values]
 
 
-def check_no_distortion(coefficients: list[float], model: str) -> None:
-    """Raise ValueError if a pinhole has distortion: ours has none."""
-    if any(coefficients):
+def read_distortion(
+    model: str, coefficients: Any, fisheyes: tuple[str, ...], pinholes: tuple[str, ...]
+) -> tuple[float, ...] | None:
+    """k1 to k4 of a fisheye `model`, None for a pinhole without distortion. Raises ValueError for any other."""
+    if model in fisheyes:
+        return tuple(read_numbers(coefficients, FISHEYE_COEFFICIENTS, "distortion coefficients"))
+    if model not in pinholes:
+        raise ValueError(f"the distortion model {model!r} has no counterpart")
+    if any(float(c) for c in coefficients):
         raise ValueError(f"distortion {model} with coefficients other than 0 has no counterpart; fisheye models have")
+    return None
 
 
 def read_yaml(text: str) -> dict[str, Any]:

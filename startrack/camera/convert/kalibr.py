@@ -12,24 +12,20 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.camera.convert.intrinsics import (
-    FISHEYE_COEFFICIENTS,
     Intrinsics,
     camera_from_intrinsics,
-    check_no_distortion,
     intrinsics_of,
+    read_distortion,
     read_numbers,
     read_yaml,
-    unreadable_file,
-    without_decentring,
     yaml_list,
 )
-from startrack.types import BadInput
 
 
 def to_text(camera: Camera) -> str:
     """The camchain file, one camera: cam0."""
-    lens = intrinsics_of(without_decentring(camera))
-    model, coefficients = ("radtan", [0.0] * 4) if lens.k is None else ("equidistant", list(lens.k))
+    lens = intrinsics_of(camera)
+    model, coefficients = "radtan" if lens.k is None else "equidistant", lens.coefficients(4)
     R_cam_body = camera.R_body_cam.T
     rows = "".join(f"  - {yaml_list([*row, 0.0])}\n" for row in R_cam_body.tolist())
     return (
@@ -41,28 +37,20 @@ def to_text(camera: Camera) -> str:
 
 
 def from_text(text: str, name: str) -> Camera:
-    """The first camera of a camchain file. Raises BadInput bad_calibration."""
-    try:
-        chain = read_yaml(text)
-        d = chain.get("cam0", chain)
-        if d["camera_model"] != "pinhole":
-            raise ValueError(f"camera_model {d['camera_model']!r} has no counterpart")
-        fx, fy, cx, cy = read_numbers(d["intrinsics"], 4, "intrinsics")
-        width, height = read_numbers(d["resolution"], 2, "resolution")
-        distortion = [float(v) for v in d.get("distortion_coeffs", [])]
-        k: tuple[float, ...] | None = None
-        if d["distortion_model"] in ("equidistant", "equi"):
-            k = tuple(read_numbers(distortion, FISHEYE_COEFFICIENTS, "distortion_coeffs"))
-        else:
-            check_no_distortion(distortion, str(d["distortion_model"]))
-        camera = camera_from_intrinsics(Intrinsics((int(width), int(height)), (fx, fy), (cx, cy), k), name)
-        if "T_cam_imu" not in d:
-            return camera
-        R_cam_body = np.array([read_numbers(row, 4, "T_cam_imu")[:3] for row in d["T_cam_imu"][:3]])
-        if R_cam_body.shape != (3, 3) or np.abs(R_cam_body @ R_cam_body.T - np.eye(3)).max() > 1e-6:
-            raise ValueError("T_cam_imu holds no rotation")
-        return replace(camera, R_body_cam=R_cam_body.T)
-    except BadInput:
-        raise
-    except (ValueError, KeyError, TypeError) as cause:
-        raise unreadable_file("Kalibr", repr(cause)) from cause
+    """The first camera of a camchain file. Raises ValueError, KeyError, TypeError."""
+    chain = read_yaml(text)
+    d = chain.get("cam0", chain)
+    if d["camera_model"] != "pinhole":
+        raise ValueError(f"camera_model {d['camera_model']!r} has no counterpart")
+    fx, fy, cx, cy = read_numbers(d["intrinsics"], 4, "intrinsics")
+    width, height = read_numbers(d["resolution"], 2, "resolution")
+    k = read_distortion(
+        d["distortion_model"], d.get("distortion_coeffs", []), ("equidistant", "equi"), ("radtan", "none")
+    )
+    camera = camera_from_intrinsics(Intrinsics((int(width), int(height)), (fx, fy), (cx, cy), k), name)
+    if "T_cam_imu" not in d:
+        return camera
+    R_cam_body = np.array([read_numbers(row, 4, "T_cam_imu")[:3] for row in d["T_cam_imu"][:3]])
+    if R_cam_body.shape != (3, 3) or np.abs(R_cam_body @ R_cam_body.T - np.eye(3)).max() > 1e-6:
+        raise ValueError("T_cam_imu holds no rotation")
+    return replace(camera, R_body_cam=R_cam_body.T)

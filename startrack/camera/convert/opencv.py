@@ -7,21 +7,13 @@ k1 to k4. cv2.fisheye itself mirrors rays past 90 degrees: the numbers are right
 from __future__ import annotations
 
 from startrack.camera import Camera
-from startrack.camera.convert.intrinsics import (
-    Intrinsics,
-    camera_from_intrinsics,
-    check_no_distortion,
-    intrinsics_of,
-    unreadable_file,
-    without_decentring,
-)
-from startrack.types import BadInput
+from startrack.camera.convert.intrinsics import Intrinsics, camera_from_intrinsics, intrinsics_of, read_distortion
 
 
 def to_text(camera: Camera) -> str:
     """The FileStorage file as YAML."""
-    lens = intrinsics_of(without_decentring(camera))
-    fisheye, coefficients = (0, [0.0] * 5) if lens.k is None else (1, list(lens.k))
+    lens = intrinsics_of(camera)
+    fisheye, coefficients = 0 if lens.k is None else 1, lens.coefficients(5)
     return (
         f"%YAML:1.0\n---\nimage_width: {lens.size_px[0]}\nimage_height: {lens.size_px[1]}\n"
         f"fisheye_model: {fisheye}\n"
@@ -31,34 +23,20 @@ def to_text(camera: Camera) -> str:
 
 
 def from_text(text: str, name: str) -> Camera:
-    """The camera of a FileStorage file. Raises BadInput bad_calibration."""
+    """The camera of a FileStorage file. Raises ValueError."""
     import cv2
 
     try:
         store = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         matrix, distortion = store.getNode("camera_matrix").mat(), store.getNode("distortion_coefficients").mat()
-        size = (int(store.getNode("image_width").real()), int(store.getNode("image_height").real()))
-        fisheye = store.getNode("fisheye_model").real() == 1
+        size_px = (int(store.getNode("image_width").real()), int(store.getNode("image_height").real()))
+        model = "fisheye" if store.getNode("fisheye_model").real() == 1 else "pinhole"
     except (cv2.error, SystemError) as cause:  # cv2 wraps its parser's errors in a SystemError
-        raise unreadable_file("OpenCV", cause) from cause
+        raise ValueError(str(cause)) from cause
     if matrix is None or matrix.shape != (3, 3) or distortion is None:
-        raise unreadable_file("OpenCV", "camera_matrix or distortion_coefficients are missing")
-    try:
-        coefficients = [float(v) for v in distortion.ravel()]
-        k: tuple[float, ...] | None = tuple(coefficients)
-        if not fisheye:
-            check_no_distortion(coefficients, "of the pinhole model")
-            k = None
-        elif len(coefficients) != 4 or matrix[0, 1]:
-            raise ValueError("a fisheye has four coefficients and no skew")
-        focal, centre = (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2])
-        return camera_from_intrinsics(
-            Intrinsics(size, (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])), k), name
-        )
-    except BadInput:
-        raise
-    except ValueError as cause:
-        raise unreadable_file("OpenCV", cause) from cause
+        raise ValueError("camera_matrix or distortion_coefficients are missing")
+    k = read_distortion(model, distortion.ravel().tolist(), ("fisheye",), ("pinhole",))
+    return camera_from_intrinsics(Intrinsics.from_matrix(size_px, matrix.ravel().tolist(), k), name)
 
 
 def _matrix(rows: int, columns: int, data: list[float]) -> str:

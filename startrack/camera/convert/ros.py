@@ -5,29 +5,28 @@ Pixel (0, 0) is the centre of the first pixel, as here (REP 104, image_geometry,
 
 from __future__ import annotations
 
+import json
+
 from startrack.camera import Camera
 from startrack.camera.convert.intrinsics import (
-    FISHEYE_COEFFICIENTS,
     Intrinsics,
     camera_from_intrinsics,
-    check_no_distortion,
     intrinsics_of,
+    read_distortion,
     read_numbers,
     read_yaml,
-    unreadable_file,
-    without_decentring,
     yaml_list,
 )
-from startrack.types import BadInput
 
 
 def to_text(camera: Camera) -> str:
     """The camera_info file."""
-    lens = intrinsics_of(without_decentring(camera))
-    model, coefficients = ("plumb_bob", [0.0] * 5) if lens.k is None else ("equidistant", list(lens.k))
+    lens = intrinsics_of(camera)
+    model, coefficients = "plumb_bob" if lens.k is None else "equidistant", lens.coefficients(5)
     (fx, fy), (cx, cy) = lens.focal_px, lens.centre_px
+    name = json.dumps(camera.name, ensure_ascii=False)  # a JSON string is one of YAML
     return (
-        f"image_width: {lens.size_px[0]}\nimage_height: {lens.size_px[1]}\ncamera_name: {camera.name}\n"
+        f"image_width: {lens.size_px[0]}\nimage_height: {lens.size_px[1]}\ncamera_name: {name}\n"
         f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: {yaml_list(lens.matrix)}\n"
         f"distortion_model: {model}\n"
         f"distortion_coefficients:\n  rows: 1\n  cols: {len(coefficients)}\n  data: {yaml_list(coefficients)}\n"
@@ -38,26 +37,12 @@ def to_text(camera: Camera) -> str:
 
 
 def from_text(text: str, name: str) -> Camera:
-    """The camera of a camera_info file. Raises BadInput bad_calibration."""
-    try:
-        d = read_yaml(text)
-        fx, skew, cx, _, fy, cy, *_ = read_numbers(d["camera_matrix"]["data"], 9, "camera_matrix")
-        if skew:
-            raise ValueError("a skewed camera_matrix has no counterpart")
-        model = d["distortion_model"]
-        distortion = [float(v) for v in d["distortion_coefficients"]["data"]]
-        size = (int(d["image_width"]), int(d["image_height"]))
-        if model in ("equidistant", "fisheye"):
-            k: tuple[float, ...] | None = tuple(
-                read_numbers(distortion, FISHEYE_COEFFICIENTS, "distortion_coefficients")
-            )
-        elif model in ("plumb_bob", "rational_polynomial"):
-            check_no_distortion(distortion, model)
-            k = None
-        else:
-            raise ValueError(f"distortion_model {model!r} is not known")
-        return camera_from_intrinsics(Intrinsics(size, (fx, fy), (cx, cy), k), str(d.get("camera_name") or name))
-    except BadInput:
-        raise
-    except (ValueError, KeyError, TypeError) as cause:
-        raise unreadable_file("ROS", repr(cause)) from cause
+    """The camera of a camera_info file. Raises ValueError, KeyError, TypeError."""
+    d = read_yaml(text)
+    k = read_distortion(
+        d["distortion_model"], d["distortion_coefficients"]["data"],
+        ("equidistant", "fisheye"), ("plumb_bob", "rational_polynomial"),
+    )  # fmt: skip
+    matrix = read_numbers(d["camera_matrix"]["data"], 9, "camera_matrix")
+    size_px = (int(d["image_width"]), int(d["image_height"]))
+    return camera_from_intrinsics(Intrinsics.from_matrix(size_px, matrix, k), str(d.get("camera_name") or name))

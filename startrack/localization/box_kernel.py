@@ -20,6 +20,7 @@ from startrack.localization.score_kernel import log_mixtures, smaller_sigma
 from startrack.localization.sector_likelihood import log_mixture, row_range
 from startrack.types import Array, Ints
 
+LOG_POINT_M2 = log(100.0)  # boxes of larger area hold more probability: they are dropped at that lower likelihoods
 SETTLED_NATS = 1e-9  # a row whose contribution varies by less over a box is settled there
 DIGITS_NATS = 37.0  # what is smaller than this beside 1 has no digit in a float64
 CLIMB_BELOW = 12.0  # of the radius: half side of the boxes in the best of which the search climbs
@@ -124,6 +125,7 @@ def bound_boxes(rows, reach, boxes, centres, half, parent, allowed, strength, we
     kept_row = np.empty(space, dtype=boxes.row.dtype)
     kept_least, kept_most = np.empty(0 if disks else space), np.empty(0 if disks else space)
     cell = log(4.0 * half * half)
+    prune_nats += max(0.0, cell - LOG_POINT_M2)
     dropped, enough = -inf, certain - negligible_nats - cell
     certain = -inf
     n, used, pair = 0, 0, 0

@@ -7,7 +7,15 @@ from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from startrack.localization.box_kernel import NO_NUMBERS, Boxes, bound_boxes, open_pairs, refine_disks, split_boxes
+from startrack.localization.box_kernel import (
+    LOG_POINT_M2,
+    NO_NUMBERS,
+    Boxes,
+    bound_boxes,
+    open_pairs,
+    refine_disks,
+    split_boxes,
+)
 from startrack.localization.initial_guess import Guess, beam_search, holds_allowed_ground
 from startrack.localization.likelihood import PARTS, PositionLikelihood
 from startrack.localization.summary import smallest_axis
@@ -201,7 +209,7 @@ class Search:
         sure = lower[np.asarray(self.terrain.allowed(centres))]
         self.best = max(self.best, float(sure.max(initial=-np.inf)))
         negligible = log_sum(sure) - settings.negligible_nats
-        keep = upper > max(self.best - settings.prune_nats, negligible)
+        keep = upper > max(self.best - settings.prune_nats - max(0.0, cell - LOG_POINT_M2), negligible)
         self.log_dropped = float(np.logaddexp(self.log_dropped, log_sum(upper[~keep]) + cell))
         return keep, upper[keep]
 

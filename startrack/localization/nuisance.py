@@ -47,7 +47,7 @@ class ShapeFit:
 
 def lower_evidence(evidence: Evidence, bias_rad: float) -> Evidence:
     """The rows as they stand above the map's horizon where the true one is `bias_rad` higher."""
-    return replace(evidence, elevation_rad=evidence.elevation_rad - bias_rad)
+    return replace(evidence, elevation_rad=evidence.elevation_rad - bias_rad) if bias_rad else evidence
 
 
 def estimate_horizon_bias(likelihood: PositionLikelihood, position_m: Array) -> HorizonBias:

@@ -11,95 +11,22 @@ from __future__ import annotations
 
 # mypy: disable-error-code="no-untyped-def"
 from math import exp, inf, log, log1p, sqrt
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from startrack.localization.score_kernel import log_mixtures, smaller_sigma
+from startrack.localization.boxes import Boxes, split_boxes
+from startrack.localization.score_kernel import smaller_sigma
 from startrack.localization.sector_likelihood import log_mixture, row_range
-from startrack.types import Array, Ints
 
 LOG_POINT_M2 = log(100.0)  # boxes of larger area hold more probability: they are dropped at that lower likelihoods
 SETTLED_NATS = 1e-9  # a row whose contribution varies by less over a box is settled there
 DIGITS_NATS = 37.0  # what is smaller than this beside 1 has no digit in a float64
-CLIMB_BELOW = 12.0  # of the radius: half side of the boxes in the best of which the search climbs
-LAST_CLIMB_STEP = 1.0 / 64.0  # of the half side
 DOOM_EVERY = 32  # rows between two tests whether a box can still matter
-NO_NUMBERS = np.zeros(0)
-NO_DISKS = np.zeros((0, 2))
-
-
-class Rows(NamedTuple):
-    """The evidence as the kernels read it."""
-
-    azimuth_rad: Array  # (n,)
-    elevation_rad: Array
-    llr: Array
-    extended_nats: Array
-    sigma_rad: Array  # of the edge, without the terrain's
-    least: Array  # (n,) least contribution
-    most: Array
-    sector: Ints
-    ceiling: Array  # (sectors,)
-    log_floor: float
-    disks_m: Array  # (n, 2) centres of the disks from which the rows are visible; (0, 2): not disks
-    radius_m: float
-
-
-class Boxes(NamedTuple):
-    """Equal boxes of positions that may still matter, with the open rows of each."""
-
-    centres_m: Array  # (n, 2)
-    half_m: float
-    first: Ints  # (n + 1,) where the open rows of each box begin
-    row: Ints  # (pairs,)
-    least: Array  # (pairs,) bounds of the rows' contributions; empty where rows are compared with disks
-    most: Array
-    sums: Array  # (n, sectors) contributions of the settled rows, less the sectors' ceilings
-    settled: Array  # (n,) log-likelihood of these sums
-    lower: Array  # (n,) bounds of the log-likelihood over the box
-    upper: Array
-    score: Array  # (n,) log-likelihood at the centre; -inf where no camera can be; valid only with disks
 
 
 @njit(cache=True, nogil=True)
-def split_boxes(centres, half, reach):
-    """Centres (m, 2) of the quarters that come within reach of the origin, and the box (m,) of each."""
-    quarter = 0.5 * half
-    found = np.empty((4 * len(centres), 2))
-    parent = np.empty(4 * len(centres), dtype=np.int64)
-    n = 0
-    for b in range(len(centres)):
-        for k in range(4):
-            x = centres[b, 0] + (quarter if k % 2 else -quarter)
-            y = centres[b, 1] + (quarter if k // 2 else -quarter)
-            beyond_x, beyond_y = max(abs(x) - quarter, 0.0), max(abs(y) - quarter, 0.0)
-            found[n, 0], found[n, 1], parent[n] = x, y, b
-            n += beyond_x * beyond_x + beyond_y * beyond_y <= reach * reach
-    return found[:n], parent[:n]
-
-
-@njit(cache=True, nogil=True)
-def open_pairs(parent, first, row, strength, weakest, strongest):
-    """Box (m,) and row (m,) of the open pairs with strengths from weakest to below strongest, box by box."""
-    total = 0
-    for b in range(len(parent)):
-        for q in range(first[parent[b]], first[parent[b] + 1]):
-            total += weakest <= strength[row[q]] < strongest
-    box, rows = np.empty(total, dtype=np.int64), np.empty(total, dtype=np.int64)
-    n = 0
-    for b in range(len(parent)):
-        for q in range(first[parent[b]], first[parent[b] + 1]):
-            k = row[q]
-            if weakest <= strength[k] < strongest:
-                box[n], rows[n] = b, k
-                n += 1
-    return box, rows
-
-
-@njit(cache=True, nogil=True)
-def bound_boxes(rows, reach, boxes, centres, half, parent, allowed, strength, weakest, strongest, low, high, sigma,
+def bound_boxes(rows, boxes, centres, half, parent, allowed, strength, weakest, strongest, low, high, sigma,
                 best, certain, prune_nats, negligible_nats):  # fmt: skip
     """Bounds over boxes (n, 2) whose open rows are those of their parents in `boxes`; drop what cannot matter.
 
@@ -226,14 +153,6 @@ def bound_boxes(rows, reach, boxes, centres, half, parent, allowed, strength, we
         certain = _log_add(certain, low_total + cell)
         kept_first[n + 1] = used
         n += 1
-    if disks and n > 0 and half * CLIMB_BELOW < rows.radius_m:
-        top = np.argmax(score[:n])
-        if score[top] > -inf:
-            first, last = kept_first[top], kept_first[top + 1]
-            climbed = _climb_in_box(
-                rows, kept_sums[top], kept_row[first:last], kept_centres[top], half, score[top], reach
-            )
-            best = max(best, climbed)
     # Boxes that were kept before a better position was known may no longer matter.
     enough = certain - negligible_nats - cell
     write, write_pair, begin = 0, 0, 0
@@ -277,7 +196,7 @@ def refine_disks(rows, boxes, reach, best, certain, prune_nats, negligible_nats,
         away2 = centres[:, 0] ** 2 + centres[:, 1] ** 2
         allowed = (away2 < rows.radius_m**2) & (away2 <= reach * reach)
         boxes, best, certain, lost = bound_boxes(
-            rows, reach, boxes, centres, 0.5 * boxes.half_m, parent, allowed, nothing, 0.0, inf, nothing, nothing,
+            rows, boxes, centres, 0.5 * boxes.half_m, parent, allowed, nothing, 0.0, inf, nothing, nothing,
             nothing, best, certain, prune_nats, negligible_nats,
         )  # fmt: skip
         dropped = _log_add(dropped, lost)
@@ -287,35 +206,6 @@ def refine_disks(rows, boxes, reach, best, certain, prune_nats, negligible_nats,
         if 2.0 * boxes.half_m * boxes_per_sigma < smaller_sigma(boxes.centres_m, boxes.score):
             break
     return boxes, best, certain, dropped
-
-
-@njit(cache=True, nogil=True)
-def _climb_in_box(rows, sums, row, centre, half, best, reach):
-    """Best log-likelihood on a climb from the centre of a box that stays in it: only the open rows change there."""
-    r2, log_keep = rows.radius_m * rows.radius_m, log1p(-exp(rows.log_floor))
-    limit2 = min(r2, reach * reach)
-    now = np.empty(len(sums))
-    x, y, step = centre[0], centre[1], 0.5 * half
-    while step > half * LAST_CLIMB_STEP:
-        to_x, to_y = x, y
-        for k in range(9):
-            u, v = x + step * (k // 3 - 1), y + step * (k % 3 - 1)
-            if k == 4 or abs(u - centre[0]) > half or abs(v - centre[1]) > half or u * u + v * v >= limit2:
-                continue
-            for s in range(len(sums)):
-                now[s] = sums[s]
-            for q in range(len(row)):
-                a, b = u - rows.disks_m[row[q], 0], v - rows.disks_m[row[q], 1]
-                now[rows.sector[row[q]]] += rows.llr[row[q]] * (a * a + b * b < r2)
-            total = 0.0
-            for s in range(len(now)):
-                total += log_mixture(now[s], log_keep, rows.log_floor)
-            if total > best:
-                best, to_x, to_y = total, u, v
-        if to_x == x and to_y == y:
-            step *= 0.5
-        x, y = to_x, to_y
-    return best
 
 
 @njit(cache=True, nogil=True)
@@ -330,15 +220,3 @@ def _grown(a, used, size):
 def _log_add(a, b):
     top, low = max(a, b), min(a, b)
     return top if low < top - DIGITS_NATS or low == -inf else top + log1p(exp(low - top))
-
-
-def root_box(rows: Rows, half_m: float) -> Boxes:
-    """One box about the origin with all rows open."""
-    sums = -rows.ceiling[None]
-    settled = log_mixtures(sums[0], rows.log_floor)
-    n, open_pairs_too = len(rows.llr), not len(rows.disks_m)
-    return Boxes(
-        np.zeros((1, 2)), half_m, np.array([0, n]), np.arange(n), rows.least if open_pairs_too else NO_NUMBERS,
-        rows.most if open_pairs_too else NO_NUMBERS, sums, np.array([settled]), np.array([-inf]),
-        np.array([settled + rows.most.sum()]), np.array([-inf]),
-    )  # fmt: skip

@@ -7,15 +7,8 @@ from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from startrack.localization.box_kernel import (
-    LOG_POINT_M2,
-    NO_NUMBERS,
-    Boxes,
-    bound_boxes,
-    open_pairs,
-    refine_disks,
-    split_boxes,
-)
+from startrack.localization.box_kernel import LOG_POINT_M2, bound_boxes, refine_disks
+from startrack.localization.boxes import NO_NUMBERS, Boxes, open_pairs, split_boxes
 from startrack.localization.initial_guess import Guess, beam_search, holds_allowed_ground
 from startrack.localization.likelihood import PARTS, PositionLikelihood
 from startrack.localization.summary import smallest_axis
@@ -105,13 +98,13 @@ class Search:
 
     @classmethod
     def _best_of_strong_rows(cls, settings: SearchSettings, likelihood: PositionLikelihood) -> Array:
-        """The position (1, 2) that explains the rows of great |llr| best; (0, 2) where these are few.
+        """The position (1, 2) that explains the rows of great |llr| best; (0, 2) where these are few, or most rows.
 
         Bounds in closed form cost so little that few rows need no guess. Of many rows the strong ones give one for a
         fraction of the cost; with it the others exclude most boxes at once.
         """
         strong = likelihood.strong(START_LLR, START_ROWS)
-        if strong is likelihood:
+        if 2 * len(strong.evidence) > len(likelihood.evidence):
             return np.zeros((0, 2))
         guess = Guess(np.zeros((0, 2)), np.zeros(0))
         boxes = cls(settings, strong, guess, strong.terrain)._refine_by_disks(strong.root, START_HALF_M)
@@ -278,7 +271,7 @@ class Search:
         bounds: tuple[Array, ...],
     ) -> Boxes:  # fmt: skip
         kept, self.best, self.certain, dropped = cast(Any, bound_boxes)(
-            self.likelihood.rows, self.terrain.reach_m, boxes, centres, half, parent,
+            self.likelihood.rows, boxes, centres, half, parent,
             np.asarray(self.terrain.allowed(centres)), self.likelihood.strength, weakest, strongest, *bounds,
             self.best, self.certain, self.settings.prune_nats, self.settings.negligible_nats,
         )  # fmt: skip

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.localization.box_kernel import split_boxes
+from startrack.localization.boxes import split_boxes
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.local_search import LocalLikelihood
 from startrack.terrain import Terrain

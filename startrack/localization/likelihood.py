@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from startrack.localization.box_average import BoxAverage
-from startrack.localization.box_kernel import NO_DISKS, Boxes, Rows, root_box
+from startrack.localization.boxes import NO_DISKS, Boxes, Rows, root_box
 from startrack.localization.local_search import LocalLikelihood
 from startrack.localization.prefix_sums import PrefixSums
 from startrack.localization.score_kernel import score_boxes, score_disks

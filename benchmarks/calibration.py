@@ -186,7 +186,7 @@ def photograph() -> str:
     start = time.perf_counter()
     found = calibrate([exposure], load_catalog(), fov_rad=np.pi, site=PHOTO_SITE)
     fit = found.joint.fit
-    gates = "all passed" if found.accepted else ", ".join(gate.name for gate in found.failed) + " FAILED"
+    gates = "all passed" if found.accepted else ", ".join(gate.name for gate in found.failed_checks) + " FAILED"
     opposite = next(gate.value for gate in found.checks if gate.name.startswith("opposite"))
     reach = np.degrees(fit.camera.calibrated_angle_rad)
     return (

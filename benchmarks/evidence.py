@@ -27,7 +27,7 @@ from startrack.detection import electrons
 from startrack.evidence import StarEvidence, StarPhotometry, flux_scale
 from startrack.localization import ExactPosterior
 from startrack.pipeline import Settings, locate
-from startrack.rendering import Series, exposure_reaching, render
+from startrack.rendering import Series, exposure_for_snr, render
 from startrack.stages import Located, Measured, last_value
 from startrack.terrain import load_terrain
 from startrack.types import Array, Evidence, Fix, NoSolution
@@ -101,7 +101,7 @@ def one(job: tuple[int, Depth, int]) -> dict[str, dict[str, Any]]:
     camera, terrain = replace(load_camera("fisheye-2048"), sensor=SENSOR), load_terrain("shackleton-thesis")
     series = Series(
         camera=camera, terrain=terrain, catalog=sky, seed=seed, hot_pixels=200, cosmic_rays=30, faint_v_mag=None,
-        exposure_s=exposure_reaching(camera, 22.0, v_mag=depth.v_mag, snr=5.0),
+        exposure_s=exposure_for_snr(camera, 22.0, v_mag=depth.v_mag, snr=5.0),
     )  # fmt: skip
     scene, rng = series.scene(number)
     exposure, truth = render(scene, rng=rng)

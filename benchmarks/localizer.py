@@ -23,7 +23,7 @@ from startrack.reproduction.simulator import (
     PERFECT,
     Sky,
     crater,
-    draw_places,
+    draw_positions,
     visible_stars,
 )
 from startrack.types import Evidence, Fix
@@ -37,7 +37,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--places", type=int, default=300)
     args = parser.parse_args()
-    cylinder, truth, lists = crater(ASPECT_RATIO), draw_places(SEED, 0, 0, args.places), thesis_lists(args.places)
+    cylinder, truth, lists = crater(ASPECT_RATIO), draw_positions(SEED, 0, 0, args.places), thesis_lists(args.places)
     methods: dict[str, tuple[Callable[..., Fix], int]] = {  # and how many of the lists it gets
         "pseudo-gradient (Kua 2008)": (PseudoGradient(), args.places),
         "exact posterior": (ExactPosterior(sector_epsilon=0.0), args.places),
@@ -67,8 +67,8 @@ def main() -> None:
 def thesis_lists(count: int) -> list[Evidence]:
     """Perfect lists of one of the thesis's random skies at random places."""
     sky, cylinder = Sky.draw(SEED, 0, MAGNITUDE), crater(ASPECT_RATIO)
-    points = sky.on_rim_plane(cylinder)
-    seen = [visible_stars(points, place, cylinder.radius_m) for place in draw_places(SEED, 0, 0, count)]
+    points = sky.project_to_rim_plane(cylinder)
+    seen = [visible_stars(points, place, cylinder.radius_m) for place in draw_positions(SEED, 0, 0, count)]
     return [PERFECT.evidence(sky, PERFECT.draw_list(one, SEED, 0, k)) for k, one in enumerate(seen)]
 
 

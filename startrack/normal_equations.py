@@ -87,7 +87,7 @@ class NormalEquations:
     lens_right: Array  # (m,)
     pose_right: Array  # (images, q)
 
-    def minus(self, part: NormalEquations) -> NormalEquations:
+    def subtract(self, part: NormalEquations) -> NormalEquations:
         """These equations without a part of their observations."""
         return NormalEquations(
             self.lens - part.lens, self.lens_pose - part.lens_pose, self.pose - part.pose,

@@ -116,7 +116,7 @@ class Runner(Generic[Task, Result]):
         coming = iter(tasks)
         while True:
             self._pool = self._pool or _Pool(self.jobs)
-            suspects = yield from self._until_failure(coming, self._pool, TASKS_PER_PROCESS * self.jobs)
+            suspects = yield from self._run_until_failure(coming, self._pool, TASKS_PER_PROCESS * self.jobs)
             if not suspects:
                 return
             self._pool = None
@@ -124,12 +124,12 @@ class Runner(Generic[Task, Result]):
             while culprits:
                 single = _Pool(1)
                 try:
-                    culprits = yield from self._until_failure(alone, single, 1)
+                    culprits = yield from self._run_until_failure(alone, single, 1)
                 finally:
                     single.close()
                 yield from ((task, Died(DIED)) for task in culprits)
 
-    def _until_failure(
+    def _run_until_failure(
         self, coming: Iterator[Task], pool: _Pool, most_submitted: int
     ) -> Generator[tuple[Task, Result | Died], None, list[Task]]:
         """Yield results; return the tasks in progress when a process died or stood still, none if all tasks are done.

@@ -223,7 +223,7 @@ class Run:
         self.reached = inputs
         self._timing_ms: dict[str, float] = {}
 
-    def time(self, stage: str, function: Callable[..., R], *args: Any) -> R:
+    def time_stage(self, stage: str, function: Callable[..., R], *args: Any) -> R:
         """The result of `function(*args)`, its time added to that of the `stage`."""
         start = clock.perf_counter()
         try:
@@ -231,9 +231,9 @@ class Run:
         finally:
             self._timing_ms[stage] = self._timing_ms.get(stage, 0.0) + 1e3 * (clock.perf_counter() - start)
 
-    def step(self, stage: str, function: Callable[..., T], *args: Any) -> T:
-        """The same as `time`, for a function that returns the next complete value."""
-        value = self.time(stage, function, *args)
+    def run_stage(self, stage: str, function: Callable[..., T], *args: Any) -> T:
+        """The same as `time_stage`, for a function that returns the next complete value."""
+        value = self.time_stage(stage, function, *args)
         self.reached = value
         return value
 

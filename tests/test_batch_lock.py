@@ -10,15 +10,15 @@ import sys
 import pytest
 from batch_helpers import frames
 
-from startrack.batch import LOCK, only_writer
+from startrack.batch import LOCK, lock_results
 from startrack.cli.main import main
 from startrack.errors import BadInput
 
 HOLD = """
 import sys
 from pathlib import Path
-from startrack.batch import only_writer
-with only_writer(Path(sys.argv[1])): print(flush=True); input()
+from startrack.batch import lock_results
+with lock_results(Path(sys.argv[1])): print(flush=True); input()
 """
 
 
@@ -49,9 +49,9 @@ def test_a_lock_goes_with_a_killed_process(tmp_path):
     first.send_signal(signal.SIGKILL)
     first.communicate()
     assert (tmp_path / LOCK).exists()
-    with only_writer(tmp_path):
+    with lock_results(tmp_path):
         assert (tmp_path / LOCK).read_text() == str(os.getpid())
-        with pytest.raises(BadInput, match=f"process {os.getpid()}"), only_writer(tmp_path):
+        with pytest.raises(BadInput, match=f"process {os.getpid()}"), lock_results(tmp_path):
             pass
     assert not (tmp_path / LOCK).exists()
 
@@ -64,6 +64,6 @@ def test_a_lock_file_of_another_kind_is_bad_input(tmp_path, kind):
         (tmp_path / LOCK).mkdir()
     else:
         (tmp_path / LOCK).symlink_to(target)
-    with pytest.raises(BadInput, match="cannot be used as lock file"), only_writer(tmp_path):
+    with pytest.raises(BadInput, match="cannot be used as lock file"), lock_results(tmp_path):
         pass
     assert target.read_text() == "not ours"

@@ -113,7 +113,7 @@ def test_drawn_corners_are_found_where_they_are(chessboards):
 
 def test_chessboards_give_the_lens(chessboards):
     found = calibrate_board(chessboards, Board(COLUMNS, ROWS))
-    assert found.accepted, found.failed
+    assert found.accepted, found.failed_checks
     assert len(found.images) >= 7
     assert found.fit.held_out_rms_px < 0.3
     assert map_error_px(found.camera) < 0.25
@@ -170,4 +170,4 @@ def test_pictures_without_a_board_are_refused(chessboards):
     assert refusal.value.reason == "no_stars"
     one = calibrate_board(chessboards[:1], Board(COLUMNS, ROWS))
     assert not one.accepted
-    assert one.failed[0].reason == "insufficient_geometry"
+    assert one.failed_checks[0].reason == "insufficient_geometry"

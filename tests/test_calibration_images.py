@@ -40,7 +40,7 @@ def cold(exposure):
 
 
 def test_the_photograph_calibrates_from_cold(cold):
-    assert cold.accepted, [check.name for check in cold.failed]
+    assert cold.accepted, [check.name for check in cold.failed_checks]
     fit = cold.joint.fit
     assert fit.used.sum() >= 1000
     assert fit.held_out_rms_px <= 0.35  # distance, not per axis

@@ -57,7 +57,7 @@ def found(frames):
 
 
 def test_the_lens_is_the_true_one(found):
-    assert found.accepted, found.failed
+    assert found.accepted, found.failed_checks
     moved = difference_px(CAMERA, found.camera, cap_grid(found.camera.calibrated_angle_rad))
     assert np.sqrt(np.mean(np.sum(moved**2, axis=1))) < 0.03
 

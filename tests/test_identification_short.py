@@ -18,7 +18,7 @@ from startrack.identification.attitude_search import AttitudeSearch
 from startrack.identification.index import CatalogPatterns, PerObject
 from startrack.identification.pairs import build_pairs
 from startrack.identification.triangles import sides_of_few, triangles
-from startrack.match import CandidatePairs, PhotometricScale, last_of_each
+from startrack.match import CandidatePairs, PhotometricScale, is_last_occurrence
 from startrack.types import NotIdentified
 
 
@@ -46,7 +46,7 @@ def test_the_stars_of_a_short_list_are_all_but_all_named(false: int) -> None:
 
 
 def test_a_hundred_stars_do_not_need_the_deep_index(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(CatalogPatterns, "deep", None)  # using it would raise
+    monkeypatch.setattr(CatalogPatterns, "deep_index", None)  # using it would raise
     for seed in range(20):
         truth = hundred(100 + seed)
         assert off(Identifier()(truth.detections, FISHEYE, sky()), truth) < 40 * ARCSEC
@@ -172,15 +172,15 @@ BLENDS = {
 def test_a_blend_goes_by_the_name_of_the_plainly_brighter_star(case: str) -> None:
     *listed, named = BLENDS[case]
     pairs = pairs_of(*listed)
-    plain = pairs.unambiguous(pairs.one_to_one, np.full(len(pairs.one_to_one), 0.04), 3.0)
+    plain = pairs.select_unambiguous(pairs.one_to_one_pairs, np.full(len(pairs.one_to_one_pairs), 0.04), 3.0)
     assert len(set(pairs.star[plain].tolist())) == len(set(pairs.detection[plain].tolist())) == len(plain)
     if named is not None:
         assert pairs.star[plain].tolist() == named
 
 
 def test_the_last_of_each_number() -> None:
-    assert last_of_each(np.array([4, 2, 4, 7, 2])).tolist() == [False, False, True, True, True]
-    assert last_of_each(np.zeros(0, dtype=np.int64)).tolist() == []
+    assert is_last_occurrence(np.array([4, 2, 4, 7, 2])).tolist() == [False, False, True, True, True]
+    assert is_last_occurrence(np.zeros(0, dtype=np.int64)).tolist() == []
 
 
 @pytest.mark.parametrize("field_sr", [2 * np.pi, 0.5])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from render_helpers import CRATER, FISHEYE, SENSOR, centroid_px, make_scene, stars_at_azel
 
-from startrack.rendering import exposure_reaching, light_e, truth_of
+from startrack.rendering import exposure_for_snr, light_e, truth_of
 from startrack.types import Body
 
 
@@ -117,7 +117,7 @@ def test_a_planet_is_a_point_in_the_truth_under_its_name():
 def test_the_default_exposure_reaches_five_sigma_at_magnitude_six():
     # SNR by hand: weights = PSF, noise area 1 / sum(P^2), 6.98 e/s of sky with f = 652 px/rad (theory: V 22).
     camera = replace(FISHEYE, focal_px=(652.0, 652.0))
-    t = exposure_reaching(camera, 22.0, v_mag=6.0, snr=5.0)
+    t = exposure_for_snr(camera, 22.0, v_mag=6.0, snr=5.0)
     star = light_e(make_scene(stars_at_azel([0.0], [90.0], [6.0]), camera=camera, exposure_s=t))
     area = star.sum() ** 2 / np.square(star).sum()
     snr = star.sum() / np.sqrt(star.sum() + area * (2.5**2 + 6.98 * t))

@@ -39,7 +39,7 @@ from startrack.reproduction.simulator import (
     crater,
     crater_edge,
     directions,
-    draw_places,
+    draw_positions,
     gaps_m,
     mean_gap_m,
     star_count,
@@ -79,7 +79,7 @@ def test_stars_are_uniform_on_the_hemisphere_and_places_on_the_floor():
     sky = Sky.draw(3, 0, 8.0)
     assert stats.kstest(np.sin(sky.elevation_rad), "uniform").pvalue > 0.01
     assert stats.kstest(sky.azimuth_rad / (2 * np.pi), "uniform").pvalue > 0.01
-    spots = draw_places(3, 0, 0, 5000)
+    spots = draw_positions(3, 0, 0, 5000)
     assert stats.kstest(np.sum(spots**2, axis=1) / 1e8, "uniform").pvalue > 0.01
     assert stats.kstest(np.arctan2(*spots.T) / (2 * np.pi) + 0.5, "uniform").pvalue > 0.01
 
@@ -87,7 +87,7 @@ def test_stars_are_uniform_on_the_hemisphere_and_places_on_the_floor():
 def test_smaller_runs_are_the_beginning_of_larger_ones():
     small, large = Sky.draw(0, 4, 5.0), Sky.draw(0, 4, 7.0)
     np.testing.assert_array_equal(small.elevation_rad, large.elevation_rad[: len(small)])
-    np.testing.assert_array_equal(draw_places(0, 4, 10, 20), draw_places(0, 4, 0, 500)[10:20])
+    np.testing.assert_array_equal(draw_positions(0, 4, 10, 20), draw_positions(0, 4, 0, 500)[10:20])
     whole = compute_chunk(Task(KUA, 0, 1, 0, 12))
     parts = [compute_chunk(Task(KUA, 0, 1, start, start + 6)) for start in (0, 6)]
     np.testing.assert_array_equal(whole["refined_m"], np.concatenate([part["refined_m"] for part in parts]))
@@ -100,8 +100,8 @@ def test_stars_in_sight_are_those_above_the_horizon_and_inside_the_drawn_edge():
     from startrack.reproduction.drawing import fisheye_points
 
     sky, cylinder = Sky.draw(0, 0), crater()
-    for place in draw_places(0, 0, 0, 10):
-        seen = visible_stars(sky.on_rim_plane(cylinder), place, cylinder.radius_m)
+    for place in draw_positions(0, 0, 0, 10):
+        seen = visible_stars(sky.project_to_rim_plane(cylinder), place, cylinder.radius_m)
         horizon = cylinder.horizon_rad(np.tile(place, (len(sky), 1)), sky.azimuth_rad)
         np.testing.assert_array_equal(seen, sky.elevation_rad > horizon)
         polygon = Polygon(fisheye_points(*crater_edge(cylinder, place)))
@@ -136,8 +136,8 @@ def test_the_middle_of_a_cell_with_straight_walls(size):
 def test_the_localizers_give_what_the_table_is_made_of():
     task = Task(KUA, 0, 2, 0, 5)
     chunk, sky, cylinder = compute_chunk(task), Sky.draw(0, 2), crater()
-    for k, place in enumerate(draw_places(0, 2, 0, 5)):
-        evidence = PERFECT.evidence(sky, visible_stars(sky.on_rim_plane(cylinder), place, cylinder.radius_m))
+    for k, place in enumerate(draw_positions(0, 2, 0, 5)):
+        evidence = PERFECT.evidence(sky, visible_stars(sky.project_to_rim_plane(cylinder), place, cylinder.radius_m))
         hull, refined = Hull()(evidence, cylinder), PseudoGradient()(evidence, cylinder)
         np.testing.assert_allclose(hull.position_enu_m[:2], chunk["hull_m"][k], atol=1e-6)
         np.testing.assert_allclose(refined.position_enu_m[:2], chunk["refined_m"][k], atol=1e-6)
@@ -156,8 +156,8 @@ def test_table_3_1_is_within_the_bars(made):
 
 def test_ours_is_the_middle_of_the_exact_cell():
     sky, cylinder = Sky.draw(0, 1), crater()
-    points, off = sky.on_rim_plane(cylinder), []
-    for place in draw_places(0, 1, 0, 10):
+    points, off = sky.project_to_rim_plane(cylinder), []
+    for place in draw_positions(0, 1, 0, 10):
         evidence = PERFECT.evidence(sky, visible_stars(points, place, cylinder.radius_m))
         fix = ExactPosterior()(evidence, cylinder)
         off.append(np.hypot(*(fix.position_enu_m[:2] - cell_centroid(points, place, cylinder.radius_m))))
@@ -182,7 +182,7 @@ def test_the_published_trials_average_to_the_published_overall():
 
 def test_changes_along_the_traverse_are_where_the_view_changes():
     sky, cylinder = Sky.draw(0, 0, 4.0), crater()
-    points, changes = sky.on_rim_plane(cylinder), changes_m(sky, cylinder)
+    points, changes = sky.project_to_rim_plane(cylinder), changes_m(sky, cylinder)
     ends = np.concatenate([[-9999.9], (changes[1:] + changes[:-1]) / 2, [9999.9]])
     views = [visible_stars(points, np.array([east, 0.0]), cylinder.radius_m) for east in ends]
     assert [int(np.sum(a != b)) for a, b in pairwise(views)] == [1] * len(changes)
@@ -234,7 +234,7 @@ def test_names_of_the_command_are_those_that_can_be_made():
     assert tuple(ARTEFACTS) == cli.NAMES
     assert FULL.skies * FULL.per_sky == FULL.one_sky == 100_000  # as in the thesis
     assert QUICK.per_sky < FULL.per_sky
-    fewer = FULL.with_ours(700)
+    fewer = FULL.limit_ours(700)
     assert (fewer.per_sky, fewer.one_sky) == (FULL.per_sky, FULL.one_sky)
     assert (fewer.ours_per_sky, fewer.bound_per_sky, fewer.deep_per_sky, fewer.ours_one_sky) == (700, 700, 500, 7000)
 

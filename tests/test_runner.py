@@ -60,7 +60,7 @@ def test_few_tasks_are_repeated_after_a_death():
         def until_failure():
             from startrack.runner import TASKS_PER_PROCESS, _Pool
 
-            ends.append((yield from runner._until_failure(iter(names), _Pool(JOBS), TASKS_PER_PROCESS * JOBS)))
+            ends.append((yield from runner._run_until_failure(iter(names), _Pool(JOBS), TASKS_PER_PROCESS * JOBS)))
 
         done = [name for name, _ in until_failure()]
     (suspects,) = ends

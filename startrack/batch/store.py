@@ -30,7 +30,7 @@ NEEDED = {  # by the tables, of a record that is ok
 
 
 @contextmanager
-def only_writer(out: Path) -> Iterator[None]:
+def lock_results(out: Path) -> Iterator[None]:
     """Lock the folder `out` of results against other batches.
 
     Raises BadInput (bad_image) if another batch writes to it, or if the lock file cannot be used.

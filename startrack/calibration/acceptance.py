@@ -48,14 +48,14 @@ class Checked:
     checks: tuple[Check, ...]
 
     @property
-    def failed(self) -> tuple[Check, ...]:
+    def failed_checks(self) -> tuple[Check, ...]:
         """The checks that the calibration did not pass."""
         return tuple(check for check in self.checks if not check.passed)
 
     @property
     def accepted(self) -> bool:
         """Whether the camera may be used."""
-        return not self.failed
+        return not self.failed_checks
 
 
 @dataclass(frozen=True)

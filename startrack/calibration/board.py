@@ -103,7 +103,7 @@ def _check_acceptance(fit: LensFit, xy_px: Array, pictures: int) -> tuple[Check,
 
 def board_dict(found: BoardCalibration) -> dict[str, Any]:
     """The calibration's JSON object."""
-    fit, failed = found.fit, found.failed
+    fit, failed = found.fit, found.failed_checks
     return {
         "format": FORMAT,
         "status": "refused" if failed else "ok",
@@ -129,7 +129,7 @@ def board_dict(found: BoardCalibration) -> dict[str, Any]:
 def board_line(found: BoardCalibration, name: str) -> str:
     """Summary in one line."""
     fit, camera = found.fit, found.camera
-    verdict = "ok" if found.accepted else f"refused {found.failed[0].reason}"
+    verdict = "ok" if found.accepted else f"refused {found.failed_checks[0].reason}"
     return (
         f"{name}  {verdict}  {len(found.images)} of {len(found.images) + len(found.refused)} pictures  "
         f"{int(fit.used.sum())} corners  held-out {fit.held_out_rms_px:.2f} px  f {camera.focal_px[0]:.2f} px/rad  "

@@ -40,7 +40,7 @@ class Sky:
     R_enu_icrs: Array | None  # (3, 3) None without a site
 
     @property
-    def refracted(self) -> bool:
+    def includes_refraction(self) -> bool:
         """Whether refraction is in the directions."""
         return self.elevation_rad is not None
 

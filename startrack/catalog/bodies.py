@@ -47,7 +47,7 @@ def bodies(site: Site, time: datetime) -> list[Body]:
     observer_m, velocity_m_s = observer_state(site, time)
     et = et_s(time)
     sources = (source for source in _SOURCES if source.name.lower() != site.body.lower())
-    return [_apparent(source, observer_m, velocity_m_s, et) for source in sources]
+    return [_apparent_body(source, observer_m, velocity_m_s, et) for source in sources]
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class _Source:
     v_mag: Callable[[_View], float]
 
 
-def _apparent(source: _Source, observer_m: Array, velocity_m_s: Array, et: float) -> Body:
+def _apparent_body(source: _Source, observer_m: Array, velocity_m_s: Array, et: float) -> Body:
     light_time_s = 0.0
     for _ in range(3):  # each round shrinks the error by v / c = 1e-4
         body_m, _ = barycentric_state(source.naif, et - light_time_s)

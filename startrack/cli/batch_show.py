@@ -40,7 +40,7 @@ class Halt:
 
 
 @contextmanager
-def signals_halt(halt: Halt) -> Iterator[None]:
+def halt_on_signals(halt: Halt) -> Iterator[None]:
     """In the block the first Ctrl-C or SIGTERM stops the batch after the images in progress; a later one drops them."""
     first_s: float | None = None
 
@@ -66,7 +66,7 @@ def signals_halt(halt: Halt) -> Iterator[None]:
 
 
 @contextmanager
-def outcomes_shown(total: int, args: argparse.Namespace, halt: Halt) -> Iterator[Show]:
+def show_outcomes(total: int, args: argparse.Namespace, halt: Halt) -> Iterator[Show]:
     """A function to call with each record and the counts; a bar on a terminal."""
 
     def print_lines(record: dict[str, Any]) -> None:

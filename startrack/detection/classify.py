@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from startrack.detection.deblend import Fitted, own_light
 from startrack.detection.fit import PointFits, Stamps
-from startrack.detection.frame import Frame, LightNoise, Pixels
+from startrack.detection.frame import Frame, Pixels, SourceNoise
 from startrack.detection.psf_width import BRIGHT_SNR, MIN_BRIGHT
 from startrack.detection.saturated import are_saturated
 from startrack.types import Array, Bools, Ints
@@ -48,16 +48,16 @@ def select_stars(fitted: Fitted, width_px: Array, threshold: float) -> Ints:
     left = np.flatnonzero(stands_out & placed & (fits.chi2 < fits.chi2_pixel))
     if not len(left):
         return left
-    misfit, edge = _psf_and_edge_misfit(fitted.stamps.take(left), fits.take(left), width_px[left], fitted.light_noise)
+    misfit, edge = _psf_and_edge_misfit(fitted.stamps.take(left), fits.take(left), width_px[left], fitted.source_noise)
     unlike_an_edge = fits.chi2[left] < edge + EDGE_MARGIN
     bright = fits.flux[left] > BRIGHT_SNR * np.sqrt(fits.covariance[left, 2, 2])
-    typical = _typical(misfit[unlike_an_edge & bright])
+    typical = _typical_misfit(misfit[unlike_an_edge & bright])
     good_fit = fits.chi2[left] < BAD_FIT_CHI2_PER_DOF * fits.dof[left]
     allowed = np.where(are_saturated(fitted.stamps.take(left)), max(typical, SATURATED_MISFIT), typical)
     return left[unlike_an_edge & (good_fit | (misfit < allowed))]
 
 
-def brightest_per_position(xy_px: Array, flux: Array, closer_px: float) -> Bools:
+def select_brightest_per_position(xy_px: Array, flux: Array, closer_px: float) -> Bools:
     """Which sources (n,) to keep: the brightest of all that converged onto one position."""
     from scipy.spatial import cKDTree
 
@@ -69,7 +69,7 @@ def brightest_per_position(xy_px: Array, flux: Array, closer_px: float) -> Bools
     return ~fainter
 
 
-def clear_of_wings(xy_px: Array, flux: Array, height: Array, sigma: float, threshold: float) -> Bools:
+def reject_wing_misfits(xy_px: Array, flux: Array, height: Array, sigma: float, threshold: float) -> Bools:
     """Which sources (n,) to keep: those hardly above the threshold in a brighter one's wing are its misfit, or a blend.
 
     Two stars that are not resolved are fitted as one, and what that leaves looks like a third.
@@ -111,7 +111,7 @@ def detection_threshold(threshold_snr: float, sigma_px: float, skewness: float) 
 
 def noise_skewness(frame: Frame) -> float:
     """Skewness of the noise of the frame's pixels, by the photons of its background; a usual one without a gain."""
-    if frame.light_noise.per_unit != 1.0:  # not in electrons
+    if frame.source_noise.per_unit != 1.0:  # not in electrons
         return USUAL_SKEWNESS
     some = slice(None, None, 64), slice(None, None, 64)
     noise = float(np.median(frame.noise[some]))
@@ -119,7 +119,7 @@ def noise_skewness(frame: Frame) -> float:
     return min(photons / max(noise, 1e-6) ** 3, LARGEST_SKEWNESS)
 
 
-def _typical(misfit: Array) -> float:
+def _typical_misfit(misfit: Array) -> float:
     """Misfit up to which a source is like the frame's bright ones, where these are rough; 0 where they are not."""
     if len(misfit) < MIN_BRIGHT:
         return 0.0
@@ -127,7 +127,7 @@ def _typical(misfit: Array) -> float:
     return ROUGH_PSF_SPREAD * typical if typical > ROUGH_PSF_MISFIT else 0.0
 
 
-def _psf_and_edge_misfit(s: Stamps, fits: PointFits, width_px: Array, own: LightNoise) -> tuple[Array, Array]:
+def _psf_and_edge_misfit(s: Stamps, fits: PointFits, width_px: Array, own: SourceNoise) -> tuple[Array, Array]:
     """How far the sources (n) are from the Gaussian PSF, and their chi^2 as straight edges or lines instead.
 
     The first is the root of the squared residual beyond the noise over the squared light: 0 for a perfect star, about

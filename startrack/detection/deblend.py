@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.detection.fit import ROUNDS, ROUNDS_AGAIN, PointFits, Stamps, concatenate_fits, fit_points
-from startrack.detection.frame import Frame, LightNoise, Pixels, radius_for
+from startrack.detection.frame import Frame, Pixels, SourceNoise, radius_for
 from startrack.detection.peaks import Peaks
-from startrack.detection.source_noise import measure_light_noise
+from startrack.detection.source_noise import measure_source_noise
 from startrack.psf import pixel_profile_single
 from startrack.types import Array, Ints
 
@@ -25,7 +25,7 @@ class Fitted:
 
     stamps: Stamps
     fits: PointFits
-    light_noise: LightNoise
+    source_noise: SourceNoise
 
 
 def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = None) -> Fitted:
@@ -46,12 +46,12 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
     star, other = _find_pairs(centres, 1.5 * radius + 3.0 * sigma)
     alone = np.ones(len(centres), dtype=bool)
     alone[star[_are_relevant(stamps, fits, star, other, sigma)]] = False
-    light_noise = measure_light_noise(stamps, fits, alone, sigma, frame.light_noise)
-    bright = _find_reweighted(fits, sigma, variance, frame.light_noise, light_noise)
+    source_noise = measure_source_noise(stamps, fits, alone, sigma, frame.source_noise)
+    bright = _find_reweighted(fits, sigma, variance, frame.source_noise, source_noise)
     if len(bright):
         start = fits.xy_px[bright]
         part = _subtract_light(stamps.take(bright), last[bright])
-        again = fit_points(part, start, sigma, light_noise, peaks.own_part, ROUNDS_AGAIN)
+        again = fit_points(part, start, sigma, source_noise, peaks.own_part, ROUNDS_AGAIN)
         fits = fits.with_rows(bright, again)
     for _ in range(CROWDED_ROUNDS):
         crowded, light = _sum_neighbour_light(stamps, fits, star, other, sigma)
@@ -61,15 +61,15 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
             break
         last[crowded] = light
         cleaned = _subtract_light(stamps.take(crowded), light)
-        again = fit_points(cleaned, fits.xy_px[crowded], sigma, light_noise, peaks.own_part, ROUNDS_AGAIN)
+        again = fit_points(cleaned, fits.xy_px[crowded], sigma, source_noise, peaks.own_part, ROUNDS_AGAIN)
         fits = fits.with_rows(crowded, again)
-    return Fitted(stamps, fits, light_noise)
+    return Fitted(stamps, fits, source_noise)
 
 
 def _first_fits(frame: Frame, peaks: Peaks, stamps: Stamps, sigma: float, known: int) -> PointFits:
     """Fits of all candidates, the first of which are `known` already and need less."""
     fits = [
-        fit_points(stamps.take(which), peaks.start_xy_px[which], sigma, frame.light_noise, peaks.own_part, rounds)
+        fit_points(stamps.take(which), peaks.start_xy_px[which], sigma, frame.source_noise, peaks.own_part, rounds)
         for which, rounds in ((slice(0, known), ROUNDS_AGAIN), (slice(known, None), ROUNDS))
         if len(stamps.centres[which])
     ]
@@ -81,7 +81,7 @@ def _subtract_light(stamps: Stamps, light: Pixels) -> Stamps:
     return replace(stamps, data=stamps.data - light, variance=stamps.variance + np.square(NEIGHBOUR_ERROR * light))
 
 
-def _find_reweighted(fits: PointFits, sigma: float, variance: Pixels, was: LightNoise, now: LightNoise) -> Ints:
+def _find_reweighted(fits: PointFits, sigma: float, variance: Pixels, was: SourceNoise, now: SourceNoise) -> Ints:
     """Candidates whose middle pixel has another variance by a tenth with what is known now of the light's noise."""
     light = np.maximum(fits.flux, 0.0) / (2.0 * np.pi * sigma**2 + 1.0)
     dark = variance[:, variance.shape[1] // 2, variance.shape[2] // 2]

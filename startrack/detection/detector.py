@@ -9,11 +9,11 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.detection.background import background_and_noise, block_side, smallest_step
 from startrack.detection.classify import (
-    brightest_per_position,
-    clear_of_wings,
     detection_threshold,
     noise_skewness,
     peak_heights,
+    reject_wing_misfits,
+    select_brightest_per_position,
     select_stars,
 )
 from startrack.detection.deblend import Fitted, fit_all, paint_sources
@@ -21,7 +21,7 @@ from startrack.detection.fit import PointFits, unbin_fits
 from startrack.detection.frame import (
     Frame,
     Image,
-    LightNoise,
+    SourceNoise,
     bin_frame,
     binning_factor,
     electrons,
@@ -74,8 +74,8 @@ class Detector:
         if _is_flat(image):
             raise TooFewStars("the frame is flat: every pixel has the same value (lens cap, or a saturated day sky?)")
         known = camera.sensor.psf_sigma_px if camera is not None and camera.sensor is not None else None
-        light_noise = LightNoise(per_unit=0.0 if known is None else 1.0)
-        candidates = self._candidates(_FrameSource(image, mask_or_none(dead), light_noise), self.psf_sigma_px or known)
+        source_noise = SourceNoise(per_unit=0.0 if known is None else 1.0)
+        candidates = self._candidates(_FrameSource(image, mask_or_none(dead), source_noise), self.psf_sigma_px or known)
         frame, sigma = candidates.frame, candidates.sigma
         if are_elongated(frame, candidates.centres) and (streaks := find_streaks(frame)) is not None:
             return _detections_of_streaks(frame, streaks)
@@ -126,7 +126,7 @@ class Detector:
     def _detect_again(self, candidates: _Candidates, stars: PointFits) -> tuple[Frame, PointFits]:
         """The frame and its stars, the known ones subtracted before background and faint ones are measured."""
         side, sigma, frame = candidates.side, candidates.sigma, candidates.frame
-        frame = _FrameSource(frame.image, frame.dead, candidates.fitted.light_noise).frame(
+        frame = _FrameSource(frame.image, frame.dead, candidates.fitted.source_noise).frame(
             sigma, paint_sources(stars, sigma, frame.shape)
         )
         positions = (stars.xy_px - 0.5 * (side - 1)) / side
@@ -147,9 +147,9 @@ class Detector:
         fits = fitted.fits
         threshold = detection_threshold(self.threshold_snr, sigma / side, noise_skewness(frame) / side)
         good = select_stars(fitted, width_px, threshold)
-        good = good[brightest_per_position(fits.xy_px[good], fits.flux[good], 1.2 * sigma / side)]
+        good = good[select_brightest_per_position(fits.xy_px[good], fits.flux[good], 1.2 * sigma / side)]
         stars = fits.take(good[np.argsort(-fits.flux[good], kind="stable")])
-        clear = clear_of_wings(stars.xy_px, stars.flux, peak_heights(stars), sigma / side, threshold)
+        clear = reject_wing_misfits(stars.xy_px, stars.flux, peak_heights(stars), sigma / side, threshold)
         return stars.take(np.flatnonzero(clear))
 
 
@@ -175,8 +175,8 @@ def _is_flat(image: Image) -> bool:
 class _FrameSource:
     """An image with its unusable pixels; backgrounds are computed once for each size of their blocks."""
 
-    def __init__(self, image: Image, dead: Bools | None, light_noise: LightNoise) -> None:
-        self.image, self.dead, self.light_noise = image, dead, light_noise
+    def __init__(self, image: Image, dead: Bools | None, source_noise: SourceNoise) -> None:
+        self.image, self.dead, self.source_noise = image, dead, source_noise
         self.quantum = smallest_step(image)
         self._kept: dict[int, tuple[Image, Image]] = {}
 
@@ -184,11 +184,11 @@ class _FrameSource:
         """The image prepared; the stars already `found` are excluded from background and noise."""
         if found is not None:
             maps = background_and_noise(self.image - found, self.quantum, sigma)
-            return Frame(self.image, *maps, self.dead, self.light_noise, found)
+            return Frame(self.image, *maps, self.dead, self.source_noise, found)
         side = block_side(sigma)
         if side not in self._kept:
             self._kept[side] = background_and_noise(self.image, self.quantum, sigma)
-        return Frame(self.image, *self._kept[side], self.dead, self.light_noise)
+        return Frame(self.image, *self._kept[side], self.dead, self.source_noise)
 
 
 def _covered_fraction(stars: PointFits, sigma: float, shape: tuple[int, int]) -> float:

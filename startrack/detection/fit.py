@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from startrack.detection.frame import LightNoise, Pixels
+from startrack.detection.frame import Pixels, SourceNoise
 from startrack.types import Array, Bools, Ints
 
 ROUNDS, ROUNDS_AGAIN = 3, 2  # of flux and level, then of all four; where a fit has been before
@@ -57,7 +57,12 @@ class Stamps:
 
 
 def fit_points(
-    stamps: Stamps, start_xy_px: Array, sigma_px: float, light_noise: LightNoise, own_part: float, rounds: int = ROUNDS
+    stamps: Stamps,
+    start_xy_px: Array,
+    sigma_px: float,
+    source_noise: SourceNoise,
+    own_part: float,
+    rounds: int = ROUNDS,
 ) -> PointFits:
     """Position, flux and local level of one point source in each stamp.
 
@@ -71,8 +76,8 @@ def fit_points(
     offset, values, covariance = np.empty((n, 2)), np.empty((n, 8)), np.empty((n, 4, 4))
     usable = ALL_USABLE if stamps.usable is None else stamps.usable
     fit_stamps(
-        stamps.data, stamps.variance, usable, start_xy_px - stamps.centres, sigma_px, light_noise.per_unit,
-        light_noise.model_error, rounds, stamps.surround, offset, values, covariance,
+        stamps.data, stamps.variance, usable, start_xy_px - stamps.centres, sigma_px, source_noise.per_unit,
+        source_noise.model_error, rounds, stamps.surround, offset, values, covariance,
     )  # fmt: skip
     flux, level, chi2, chi2_pixel, count, above, norm, own = np.ascontiguousarray(values.T)
     # The level of the surroundings was taken from pixels that hold the star: it lowers signal by `own_part`, noise by

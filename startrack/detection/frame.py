@@ -22,7 +22,7 @@ MODEL_ERROR = 0.03  # fraction of a star's own light by which real PSFs differ f
 
 
 @dataclass(frozen=True)
-class LightNoise:
+class SourceNoise:
     """Variance that a star's own light adds to that of the pixel: per_unit light + (model_error light)^2."""
 
     per_unit: float = 0.0  # photon noise: 1 for electrons, 1 / gain for ADU, 0 where it is not known
@@ -37,7 +37,7 @@ class Frame:
     background: Image
     noise: Image  # standard deviation of one pixel
     dead: NDArray[np.bool_] | None  # saturated: no weight in fits; None where no pixel is
-    light_noise: LightNoise
+    source_noise: SourceNoise
     found: Image | None = None  # light of the stars known so far, where their wings cover much of the frame
 
     @property
@@ -50,7 +50,7 @@ class Frame:
         residual = self.image[rows] - self.background[rows]
         if self.found is None:
             return np.asarray(cv2.divide(residual, self.noise[rows], dst=residual))
-        light, found = self.light_noise, self.found[rows]
+        light, found = self.source_noise, self.found[rows]
         variance = np.square(self.noise[rows]) + found * (light.per_unit + RESIDUAL_FRACTION**2 * found)
         return np.asarray((residual - found) / np.sqrt(variance))
 
@@ -132,7 +132,7 @@ def bin_frame(frame: Frame, side: int) -> Frame:
     middle = slice(side // 2, height, side), slice(side // 2, width, side)
     background = frame.background[middle] * np.float32(side**2)
     noise = frame.noise[middle] * np.float32(side)
-    return Frame(_sums(frame.image[whole], side), background, noise, dead, frame.light_noise, found)
+    return Frame(_sums(frame.image[whole], side), background, noise, dead, frame.source_noise, found)
 
 
 def _sums(image: Image, side: int) -> Image:

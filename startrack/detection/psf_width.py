@@ -43,7 +43,7 @@ def measure_psf_width(frame: Frame, centres: Ints, fits: PointFits, sigma: float
         return None
     pixels = centres[bright]
     data = frame.data(pixels, radius)
-    weights = 1.0 / (frame.variance(pixels, radius) + np.float32(frame.light_noise.per_unit) * np.maximum(data, 0.0))
+    weights = 1.0 / (frame.variance(pixels, radius) + np.float32(frame.source_noise.per_unit) * np.maximum(data, 0.0))
     offset = fits.xy_px[bright] - pixels
     widths, inside, part = fit_widths(data, weights, offset, sigma * NEAR)
     if inside.mean() < 1.0 - AT_THE_END:
@@ -113,7 +113,7 @@ def guess_psf_width(prepare: Callable[[float], Frame], sigma: float) -> float:
             break
         data, variance = frame.data(centres, radius), frame.variance(centres, radius)
         stamps = Stamps(data, variance, frame.usable(centres, radius), centres, np.zeros(len(centres)))
-        fits = fit_points(stamps, centres.astype(np.float64), sigma, frame.light_noise, 0.0, ROUNDS_AGAIN)
+        fits = fit_points(stamps, centres.astype(np.float64), sigma, frame.source_noise, 0.0, ROUNDS_AGAIN)
         measured = measure_psf_width(frame, centres, fits, sigma)
         if measured is None:
             break

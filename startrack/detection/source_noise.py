@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.detection.fit import PointFits, Stamps
-from startrack.detection.frame import MODEL_ERROR, LightNoise
+from startrack.detection.frame import MODEL_ERROR, SourceNoise
 from startrack.psf import pixel_profile
 from startrack.types import Array, Bools, Ints
 
@@ -19,7 +19,7 @@ MEDIAN_OF_SQUARE = 0.4549  # of a unit Gaussian
 MIN_MODEL_ERROR = 0.005
 
 
-def measure_light_noise(s: Stamps, fits: PointFits, alone: Bools, sigma: float, expected: LightNoise) -> LightNoise:
+def measure_source_noise(s: Stamps, fits: PointFits, alone: Bools, sigma: float, expected: SourceNoise) -> SourceNoise:
     """The noise of the frame's own stars; `expected` where bright stars are too few. Stated photon noise is kept.
 
     From stars `alone` (n,): in bins of a pixel's light, the median squared residual beyond the noise of the dark is
@@ -36,12 +36,12 @@ def measure_light_noise(s: Stamps, fits: PointFits, alone: Bools, sigma: float, 
         return expected
     order = np.argsort(light, kind="stable")
     bins = [part for part in np.array_split(order, BINS) if len(part) >= MIN_IN_BIN]
-    rows = [(np.median(light[part]), *_typical(excess[:, part])) for part in bins]
+    rows = [(np.median(light[part]), *_typical_excess(excess[:, part])) for part in bins]
     level, beyond, error = np.array(rows).T
     return _fit_noise_terms(level, beyond, error, expected)
 
 
-def _fit_noise_terms(level: Array, beyond: Array, error: Array, expected: LightNoise) -> LightNoise:
+def _fit_noise_terms(level: Array, beyond: Array, error: Array, expected: SourceNoise) -> SourceNoise:
     """Weighted least squares for a and b, neither below 0; a is kept where it is known."""
     one, two = level / error, level**2 / error
     per_unit = expected.per_unit
@@ -51,7 +51,7 @@ def _fit_noise_terms(level: Array, beyond: Array, error: Array, expected: LightN
         per_unit, b = np.linalg.solve(normal, right)
         per_unit = float(max(per_unit if b >= 0 else right[0] / normal[0, 0], 0.0))
     b = float(two @ ((beyond - per_unit * level) / error) / (two @ two))
-    return LightNoise(per_unit, float(np.clip(np.sqrt(max(b, 0.0)), MIN_MODEL_ERROR, MODEL_ERROR)))
+    return SourceNoise(per_unit, float(np.clip(np.sqrt(max(b, 0.0)), MIN_MODEL_ERROR, MODEL_ERROR)))
 
 
 def _select_bright(s: Stamps, fits: PointFits, alone: Bools) -> Ints:
@@ -90,7 +90,7 @@ def _excess_variance(s: Stamps, fits: PointFits, sigma: float) -> tuple[Array, A
     return light.reshape(n, -1)[use], np.stack([(squared / (1.0 - leverage))[use], variance[use]]), alike
 
 
-def _typical(squared_and_variance: Array) -> tuple[float, float]:
+def _typical_excess(squared_and_variance: Array) -> tuple[float, float]:
     """Variance beyond the dark pixel's, and its error."""
     total = float(np.median(squared_and_variance[0])) / MEDIAN_OF_SQUARE
     dark = float(np.median(squared_and_variance[1]))

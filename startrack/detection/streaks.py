@@ -75,7 +75,7 @@ def find_streaks(frame: Frame) -> Streaks | None:
     label = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8))[rows, columns].astype(np.int64)
     light = (frame.image[rows, columns] - frame.background[rows, columns]).astype(np.float64)
     variance = np.square(frame.noise[rows, columns].astype(np.float64))
-    variance += frame.light_noise.per_unit * np.maximum(light, 0.0)
+    variance += frame.source_noise.per_unit * np.maximum(light, 0.0)
     blobs = _moments(label, np.stack([columns, rows], axis=1).astype(np.float64), light, variance, count)
     flux, flux_sigma, xy, spread, covariance = blobs
     bright = (area >= MIN_AREA_PX) & (area <= MAX_AREA_PX) & off_border & (flux > BRIGHT_SNR * flux_sigma)
@@ -108,18 +108,18 @@ def find_streaks(frame: Frame) -> Streaks | None:
 def _moments(label: Ints, xy: Array, light: Array, variance: Array, count: int) -> tuple[Array, ...]:
     """Flux (count,), its sigma, middle (count, 2), second moments (count, 2, 2), covariance of the middle."""
 
-    def total(values: Array) -> Array:
+    def total_light(values: Array) -> Array:
         return np.bincount(label, values, count).astype(np.float64)
 
-    flux = np.maximum(total(light), 1e-9)
-    middle = np.stack([total(light * xy[:, 0]), total(light * xy[:, 1])], axis=1) / flux[:, None]
+    flux = np.maximum(total_light(light), 1e-9)
+    middle = np.stack([total_light(light * xy[:, 0]), total_light(light * xy[:, 1])], axis=1) / flux[:, None]
     off = xy - middle[label]
     spread, covariance = np.empty((count, 2, 2)), np.empty((count, 2, 2))
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        spread[:, i, j] = total(light * off[:, i] * off[:, j]) / flux
-        covariance[:, i, j] = total(variance * off[:, i] * off[:, j]) / flux**2
+        spread[:, i, j] = total_light(light * off[:, i] * off[:, j]) / flux
+        covariance[:, i, j] = total_light(variance * off[:, i] * off[:, j]) / flux**2
     covariance += 1e-4 * np.eye(2)  # a hundredth of a pixel for the edges of the mask
-    return flux, np.sqrt(np.maximum(total(variance), 1e-12)), middle, spread, covariance
+    return flux, np.sqrt(np.maximum(total_light(variance), 1e-12)), middle, spread, covariance
 
 
 def _resemble_neighbours(xy: Array, along: Array, length: Array) -> Bools:

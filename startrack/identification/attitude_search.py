@@ -64,7 +64,7 @@ class AttitudeSearch:
         for windows in (brightest, beyond):
             for deep in (False, True):
                 for first, fresh, end in windows:
-                    index = self.patterns.deep if deep else self.patterns.bright
+                    index = self.patterns.deep_index if deep else self.patterns.bright_index
                     yield from self._attitudes_from_triangles(index, first, fresh, end, tolerance)
         yield from self._attitudes_from_pairs(tolerance)
         yield from self._attitudes_from_short_triangles(rough_px * self.scale.axis_rad_per_px)
@@ -73,7 +73,7 @@ class AttitudeSearch:
         """The same for the mirror image, from the triangles of the other handedness met so far."""
         flip = np.array([-1.0, 1.0, 1.0])
         for cam, icrs, first, tolerance in self.mirrored:
-            yield from self._plausible(cam * flip, icrs, self.rays_cam * flip, first, tolerance)
+            yield from self._plausible_attitudes(cam * flip, icrs, self.rays_cam * flip, first, tolerance)
 
     def _prefixes(self) -> Iterator[tuple[int, int, int]]:
         n = len(self.rays_cam)
@@ -108,7 +108,7 @@ class AttitudeSearch:
                 yield from self._test_triangles(few[image + pivot], icrs, np.linalg.det(icrs), 0, tolerance)
 
     def _attitudes_from_short_triangles(self, tolerance: float) -> Iterator[AttitudeHypothesis]:
-        index = self.patterns.deep
+        index = self.patterns.deep_index
         longest = min(ROUGH_REACH_RAD, ROUGH_FRACTION * self.scale.diameter_rad)
         image = triangles(self.rays_cam[:ROUGH_DEPTH], longest, MAX_IMAGE_TRIANGLES)
         left, right = index.candidates(2 * np.sin(image.sides_rad / 2), tolerance, ROUGH_MATCHES_EACH)
@@ -127,9 +127,9 @@ class AttitudeSearch:
         if np.count_nonzero(same) < len(same):
             self.mirrored.append((cam[~same], icrs[~same], first, tolerance))
             cam, icrs = cam[same], icrs[same]
-        yield from self._plausible(cam, icrs, self.rays_cam, first, tolerance)
+        yield from self._plausible_attitudes(cam, icrs, self.rays_cam, first, tolerance)
 
-    def _plausible(
+    def _plausible_attitudes(
         self, cam: Array, icrs: Array, rays_cam: Array, first: int, tolerance: float
     ) -> Iterator[AttitudeHypothesis]:
         """Attitudes that rotate the rays icrs (m, 3, 3) to cam (m, 3, 3) and that bright stars support."""

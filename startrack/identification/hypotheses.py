@@ -10,7 +10,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.false_alarm import PATTERN_MATCHES, log_p_value
-from startrack.identification.index import bright_stars_apart
+from startrack.identification.index import separate_bright_stars
 from startrack.identification.proximity_mask import ProximityMask, proximity_mask
 from startrack.identification.radial_lens_family import RadialFamily, angle
 from startrack.identification.region_growing import LensHypothesis
@@ -106,7 +106,7 @@ def patterns_for(stars: Stars, sizes: PatternSizes) -> ShapePatterns:
 
     key = (sizes, len(stars), hashlib.sha1(np.round(stars.rays_icrs[:500], 3).tobytes()).hexdigest())
     if key not in _CACHE:
-        star = bright_stars_apart(stars, sizes.stars)
+        star = separate_bright_stars(stars, sizes.stars)
         rays = stars.rays_icrs[star]
         found = triangles(rays, sizes.longest_side_rad * (1 + sizes.size_tolerance))
         index = shape_index(found, sizes.shape_tolerance, sizes.size_tolerance)
@@ -207,7 +207,7 @@ class HypothesisSearch:
         )  # fmt: skip
 
 
-def without_clumps(xy_px: Array, smallest_px: float, most: int) -> Ints:
+def remove_clumps(xy_px: Array, smallest_px: float, most: int) -> Ints:
     """Indices of the first (brightest) of the points (n, 2), none closer than `smallest_px` to an earlier one."""
     from scipy.spatial import cKDTree
 

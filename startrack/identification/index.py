@@ -68,7 +68,7 @@ class PixelScale:
         return float(np.sqrt(4 * self.field_sr / np.pi))
 
     @classmethod
-    def of(cls, camera: Camera) -> PixelScale:
+    def measure(cls, camera: Camera) -> PixelScale:
         """Measured on grids of angles and of pixels."""
         axis = camera.unproject(np.array([camera.centre_px]))[0]
         off_axis = np.arctan2(np.hypot(axis[0], axis[1]), axis[2]) + 0.01
@@ -92,7 +92,7 @@ def _field_sr(camera: Camera) -> float:
     return float(np.sum(camera.pixel_solid_angle_sr(angle[lit]) * cell))
 
 
-pixel_scale_of = PerObject(PixelScale.of)
+pixel_scale_of = PerObject(PixelScale.measure)
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,8 @@ class PatternSize:
     """Numbers of stars and of triangles of an index."""
 
     stars_in_field: int
-    fewest: int  # of the whole sky
-    most: int
+    min_stars: int  # of the whole sky
+    max_stars: int
     triangles: int
     widest_rad: float
 
@@ -139,7 +139,9 @@ def build_index(stars: Stars, field_sr: float, size: PatternSize) -> PatternInde
     """The index of the brightest stars (sorted, brightest first) for a camera that sees `field_sr`."""
     from scipy.spatial import cKDTree
 
-    star = bright_stars_apart(stars, int(np.clip(size.stars_in_field * 4 * np.pi / field_sr, size.fewest, size.most)))
+    star = separate_bright_stars(
+        stars, int(np.clip(size.stars_in_field * 4 * np.pi / field_sr, size.min_stars, size.max_stars))
+    )
     rays = stars.rays_icrs[star]
     neighbours = np.sqrt(6 * size.triangles / (CLOSURE_PROBABILITY * len(star)))
     reach = min(
@@ -152,7 +154,7 @@ def build_index(stars: Stars, field_sr: float, size: PatternSize) -> PatternInde
     return PatternIndex(star, rays, float(2 * np.sin(reach / 2)), found.vertices, found.handedness, cKDTree(sides))
 
 
-def bright_stars_apart(stars: Stars, depth: int) -> Ints:
+def separate_bright_stars(stars: Stars, depth: int) -> Ints:
     """Indices of the brightest stars, of each close pair only the brighter: a camera does not resolve them."""
     from scipy.spatial import cKDTree
 
@@ -173,12 +175,12 @@ class CatalogPatterns:
         self._trees: dict[int, Any] = {}
 
     @cached_property
-    def bright(self) -> PatternIndex:
+    def bright_index(self) -> PatternIndex:
         """Triangles of the brightest few stars."""
         return build_index(self.stars, self.field_sr, BRIGHT)
 
     @cached_property
-    def deep(self) -> PatternIndex:
+    def deep_index(self) -> PatternIndex:
         """Triangles of more stars."""
         return build_index(self.stars, self.field_sr, DEEP)
 

@@ -69,11 +69,11 @@ class Identifier:
         )
         tolerance_px, rough_px = self.tolerances_px
         tolerance_px = min(max(tolerance_px, TOLERANCE_SIGMAS * upper_median(frame.variance_px2) ** 0.5), rough_px)
-        found, refusal = self._first_accepted(search.hypotheses(tolerance_px, rough_px), frame, search)
+        found, refusal = self._find_accepted(search.hypotheses(tolerance_px, rough_px), frame, search)
         if found is not None:
             return found
         lenient = replace(self, whole_field=False)
-        if lenient._first_accepted(search.mirrored_hypotheses(), frame.mirrored(), search)[0] is not None:
+        if lenient._find_accepted(search.mirrored_hypotheses(), frame.mirrored(), search)[0] is not None:
             raise NotIdentified(
                 "the image is a mirror image, compared with the camera file: flip the image, or set mirrored = "
                 f"{str(not camera.mirrored).lower()} in the camera file",
@@ -86,7 +86,7 @@ class Identifier:
             tried=search.tried,
         )
 
-    def _first_accepted(
+    def _find_accepted(
         self, hypotheses: Iterable[AttitudeHypothesis], frame: _Frame, search: AttitudeSearch
     ) -> tuple[Identification | None, str]:
         """The first hypothesis that is accepted, or why the last one was not."""
@@ -99,14 +99,14 @@ class Identifier:
             if match is None:
                 continue
             try:
-                return self._accept(match, frame, search.tried), ""
+                return self._accept_match(match, frame, search.tried), ""
             except _WrongCamera:
                 raise
             except NotIdentified as cause:
                 refusal = str(cause)
         return None, refusal
 
-    def _accept(self, match: AttitudeMatch, frame: _Frame, tried: int) -> Identification:
+    def _accept_match(self, match: AttitudeMatch, frame: _Frame, tried: int) -> Identification:
         """The identification of a match; NotIdentified if chance might explain it, or if the camera file is wrong."""
         pairs = match.pairs
         distance = pairs.distance_px[match.matched]
@@ -121,7 +121,7 @@ class Identifier:
             raise NotIdentified(f"the {hits} stars that match might do so by chance", matched=hits)
         if self.whole_field:
             _check_camera(match.on_place[pairs.detection[match.matched] < BRIGHT_DETECTIONS])
-        named = pairs.unambiguous(
+        named = pairs.select_unambiguous(
             match.matched[match.named], match.variance_px2[match.named], BLEND_SIGMAS * frame.centroids.psf_sigma_px
         )
         return Identification(

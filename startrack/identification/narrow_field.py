@@ -95,7 +95,7 @@ class NarrowFieldSearch:
                 if any(np.trace(R.T @ view.R_cam_icrs) > 3.0 - SAME_ATTITUDE_RAD**2 for R in seen):
                     continue
                 seen.append(view.R_cam_icrs)
-                found = self._grow(view)
+                found = self._grow_view(view)
                 if found is not None:
                     yield found
 
@@ -142,7 +142,7 @@ class NarrowFieldSearch:
             left &= ~same[best]
         return views
 
-    def _grow(self, view: PinholeView) -> VerifiedView | None:
+    def _grow_view(self, view: PinholeView) -> VerifiedView | None:
         """The view fitted with more stars and smaller gates, and verified; None where too few stars agree."""
         corner = np.arctan(0.5 * MARGIN * np.hypot(*self.size_px) / view.focal_px)
         near = _star_tree_of(self.stars).query_ball_point(view.R_cam_icrs[2], 2 * np.sin(0.5 * corner))
@@ -191,7 +191,7 @@ def verify_view(
     pairs = _candidate_pairs(view, centroids, stars, tree)
     if pairs is None:
         return None
-    on = _unambiguous(pairs, _pairs_within_gate(pairs), centroids)
+    on = _select_unambiguous(pairs, _pairs_within_gate(pairs), centroids)
     if len(on) < FEWEST:
         return None
     xy_px, rays = centroids.xy_px[pairs.detection[on]], stars.rays_icrs[pairs.star[on]]
@@ -201,7 +201,7 @@ def verify_view(
     if pairs is None:
         return None
     off_axis_px = np.linalg.norm(centroids.xy_px - view.centre_px, axis=1)
-    near = pairs.one_to_one[pairs.detection[pairs.one_to_one] < TESTED]
+    near = pairs.one_to_one_pairs[pairs.detection[pairs.one_to_one_pairs] < TESTED]
     trusted_px = trusted_radius(off_axis_px[pairs.detection[near]], pairs.distance_px[near] < GATE_PX)
     if trusted_px is None:
         return None
@@ -210,7 +210,7 @@ def verify_view(
     if len(on) < FEWEST:
         return None
     log_p = _log_p_value(view, pairs, on, centroids, stars, trusted_px) + log_trials(tried)
-    on = _unambiguous(pairs, on, centroids)
+    on = _select_unambiguous(pairs, on, centroids)
     camera = view.camera()
     trusted_rad = float(camera.angle_rad(view.centre_px + np.array([trusted_px, 0.0])))
     lens = VerifiedLens(
@@ -226,23 +226,23 @@ def verify_view(
 
 def _pairs_within_gate(pairs: CandidatePairs) -> Ints:
     """Indices of the one-to-one pairs closer than the gate."""
-    return pairs.one_to_one[pairs.distance_px[pairs.one_to_one] < GATE_PX]
+    return pairs.one_to_one_pairs[pairs.distance_px[pairs.one_to_one_pairs] < GATE_PX]
 
 
 def _choose_lens(view: PinholeView, xy_px: Array, rays_icrs: Array, sigma_px: float) -> PinholeView:
     """A pinhole, unless the distorted lens fits the stars (n, 3) at the pixels (n, 2) much better."""
     if not view.distortion:
         return view
-    pinhole = view.as_pinhole().fit(xy_px, rays_icrs, sigma_px, distorted=False, steps=2)
+    pinhole = view.to_pinhole().fit(xy_px, rays_icrs, sigma_px, distorted=False, steps=2)
     left = [np.sum(np.square(xy_px - v.project(rays_icrs)[0])) for v in (view, pinhole)]
     return view if len(xy_px) >= MIN_FOR_DISTORTION and left[0] < DISTORTED_RMS_1**2 * left[1] else pinhole
 
 
-def _unambiguous(pairs: CandidatePairs, which: Ints, centroids: Centroids) -> Ints:
+def _select_unambiguous(pairs: CandidatePairs, which: Ints, centroids: Centroids) -> Ints:
     """The one-to-one pairs with an unambiguous star."""
     some = centroids.covariance_px2[pairs.detection[which]]
     variance_px2 = 0.5 * (some[:, 0, 0] + some[:, 1, 1]) + SMALLEST_ERROR_PX**2
-    return pairs.unambiguous(which, variance_px2, min(BLEND_SIGMAS * centroids.psf_sigma_px, WIDEST_BLEND_PX))
+    return pairs.select_unambiguous(which, variance_px2, min(BLEND_SIGMAS * centroids.psf_sigma_px, WIDEST_BLEND_PX))
 
 
 def _candidate_pairs(view: PinholeView, centroids: Centroids, stars: NearStars, tree: Any) -> CandidatePairs | None:

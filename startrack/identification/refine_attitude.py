@@ -69,7 +69,7 @@ class AttitudeRefiner:
             distance = np.sqrt(np.einsum("ni,ni->n", off, off))
             distance[~inside | (distance > GATE_PX)] = np.inf
             pairs = CandidatePairs(detection, star, distance, v_mag, v_sigma_mag, photometry)
-            matched = pairs.one_to_one
+            matched = pairs.one_to_one_pairs
             if len(matched) < FEWEST:
                 return None
             agree, variance = self._select_inliers(pairs, matched)

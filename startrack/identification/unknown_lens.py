@@ -20,8 +20,8 @@ from startrack.identification.hypotheses import (
     Window,
     narrow_sizes,
     patterns_for,
+    remove_clumps,
     wide_sizes,
-    without_clumps,
 )
 from startrack.identification.image_circle import ImageCircle, image_circle
 from startrack.identification.narrow_field import NarrowFieldSearch
@@ -89,7 +89,7 @@ def identify_unknown_lens(
         return solution
     for grown, around in search.grown_lenses():
         lens = verify(grown, centroids, stars.take(around), search.tried, search.widest_rad)
-        if lens is not None and lens.log_p < LOG_FALSE_ALARM and lens.matched >= search.fewest:
+        if lens is not None and lens.log_p < LOG_FALSE_ALARM and lens.matched >= search.min_matches:
             return _solution(lens, around, search, centroids)
     raise NotIdentified(
         f"no lens of {np.degrees(fov_rad):.3g} degrees ({100 * tolerance:.0f} % more or less) explains the "
@@ -105,7 +105,7 @@ def _solve_narrow_field(search: _Search, centroids: Centroids) -> UnknownLensSol
         centroids, search.chosen, search.size_px, search.fov_rad, search.rounded_field_sr(), search.stars
     )
     for view in narrow.views():
-        if view.lens.log_p < LOG_FALSE_ALARM and view.lens.matched >= search.fewest:
+        if view.lens.log_p < LOG_FALSE_ALARM and view.lens.matched >= search.min_matches:
             return _solution(view.lens, view.around, search, centroids)
     search.hypotheses.tried += narrow.tried
     return None
@@ -160,18 +160,18 @@ class _Search:
     ) -> None:  # fmt: skip
         self.size_px, self.fov_rad, self.stars, self.tolerance = size_px, fov_rad, stars, tolerance
         self.wide = fov_rad >= WIDE_FIELD_RAD
-        self.fewest = MIN_WIDE if self.wide else MIN_NARROW
+        self.min_matches = MIN_WIDE if self.wide else MIN_NARROW
         self.circle = image_circle(background) if self.wide and background is not None else None
         self.xy_px = centroids.xy_px
         if self.circle is not None:
             off = np.linalg.norm(self.xy_px - self.circle.centre_px, axis=1)
             self.xy_px = self.xy_px[off < CIRCLE_EDGE * self.circle.radius_px]
         self.narrow = fov_rad <= NARROW_FIELD_RAD
-        self.chosen = without_clumps(self.xy_px, CLUMP_FRACTION * min(size_px), MAX_PATTERN_DETECTIONS)
-        if len(self.chosen) < self.fewest:
+        self.chosen = remove_clumps(self.xy_px, CLUMP_FRACTION * min(size_px), MAX_PATTERN_DETECTIONS)
+        if len(self.chosen) < self.min_matches:
             raise NotIdentified(
                 f"{len(self.chosen)} point sources are too few to identify without a camera file, which takes "
-                f"{self.fewest}: expose longer, or {ADVICE}",
+                f"{self.min_matches}: expose longer, or {ADVICE}",
                 detected=len(centroids),
             )
         self.hypotheses = HypothesisSearch(self.xy_px[self.chosen], size_px)
@@ -191,7 +191,7 @@ class _Search:
         if self.circle is None:
             yield from self._grow_all(self._guesses(), MAX_TRIED)
             return
-        yield from self._grow_all(self._guesses_in(self.circle), MAX_TRIED_IN_CIRCLE)
+        yield from self._grow_all(self._guesses_from_circle(self.circle), MAX_TRIED_IN_CIRCLE)
         yield from self._grow_all(self._guesses(), self.tried + MAX_TRIED_BEYOND)
 
     def _grow_all(self, guesses: list[LensGuess], most_tried: int) -> Iterator[tuple[GrownLens, Ints]]:
@@ -211,7 +211,7 @@ class _Search:
                     around = self._stars_around(R[2])
                     rays = self.stars.rays_icrs if self.wide else self.stars.rays_icrs[around]
                     found = grow(hypothesis, self.xy_px, rays, stages)
-                    if found is not None and (not self.wide or len(found.star) >= self.fewest):
+                    if found is not None and (not self.wide or len(found.star) >= self.min_matches):
                         yield found, around
                 if self.tried > most_tried:
                     return
@@ -243,7 +243,7 @@ class _Search:
         circles = [c * shorter for c in CIRCLES if c * shorter < 0.56 * diagonal]
         return self._fisheye_guesses(circles, centre)
 
-    def _guesses_in(self, circle: ImageCircle) -> list[LensGuess]:
+    def _guesses_from_circle(self, circle: ImageCircle) -> list[LensGuess]:
         """Lenses whose image circle is the visible one, or somewhat larger."""
         return self._fisheye_guesses([c * circle.radius_px for c in SEEN_CIRCLES], circle.centre_px)
 

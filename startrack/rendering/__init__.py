@@ -5,7 +5,7 @@ from startrack.rendering.defects import draw_hot_pixels
 from startrack.rendering.field_stars import concatenate_stars, draw_field_stars, draw_v_errors
 from startrack.rendering.scene import HotPixels, Scene, Truth
 from startrack.rendering.series import Series, load_sky_catalog, sky_turn_rad
-from startrack.rendering.sources import exposure_reaching
+from startrack.rendering.sources import exposure_for_snr
 from startrack.rendering.write import truth_paths, write_truth
 
 __all__ = [
@@ -17,7 +17,7 @@ __all__ = [
     "draw_field_stars",
     "draw_hot_pixels",
     "draw_v_errors",
-    "exposure_reaching",
+    "exposure_for_snr",
     "light_e",
     "load_sky_catalog",
     "render",

@@ -15,7 +15,7 @@ from startrack.frames import R_body_enu_from_heading_pitch_roll, R_enu_icrs, Sit
 from startrack.rendering.defects import draw_hot_pixels
 from startrack.rendering.field_stars import concatenate_stars, draw_field_stars, draw_v_errors
 from startrack.rendering.scene import Scene
-from startrack.rendering.sources import exposure_reaching
+from startrack.rendering.sources import exposure_for_snr
 from startrack.terrain import Terrain
 from startrack.types import Array, BadInput, Stars
 
@@ -65,7 +65,7 @@ class Series:
             return self.exposure_s
         if self.camera.sensor is None:
             raise BadInput("bad_calibration", f"camera {self.camera.name} has no [sensor]: nothing to render with")
-        return exposure_reaching(self.camera, self.sky_v_mag_arcsec2, v_mag=REACH_V_MAG, snr=REACH_SNR)
+        return exposure_for_snr(self.camera, self.sky_v_mag_arcsec2, v_mag=REACH_V_MAG, snr=REACH_SNR)
 
     def scene(self, number: int, name: str = "") -> tuple[Scene, np.random.Generator]:
         """The scene of exposure `number`, called `name`, and the generator to render it with.

@@ -22,7 +22,7 @@ def flux_e(sensor: Sensor, v_mag: Array, angle_rad: Array, exposure_s: float) ->
     return sensor.zero_point_e_per_s * 10 ** (-0.4 * np.asarray(v_mag)) * exposure_s * sensor.throughput(angle_rad)
 
 
-def above_terrain(scene: Scene, rays_enu: Array) -> Bools:
+def is_above_terrain(scene: Scene, rays_enu: Array) -> Bools:
     """Which of the directions (n, 3) no terrain hides: elevation > horizon, a hard edge."""
     if scene.terrain is None:
         return np.ones(len(rays_enu), dtype=bool)
@@ -34,7 +34,7 @@ def add_sources(image_e: Array, scene: Scene) -> None:
     """Add to the image (H, W) [e] the stars and bodies of the scene, trailed where the sky turns visibly."""
     rays_icrs, v_mag = _points(scene)
     rays_enu = rays_icrs @ scene.R_enu_icrs.T
-    turns = _turns(scene)
+    turns = _step_rotations(scene)
     reach_rad = scene.camera.max_angle_rad + float(np.linalg.norm(scene.sky_turn_rad))
     nearby = off_axis_rad(rays_enu @ scene.R_cam_enu.T) <= reach_rad
     rays_enu, v_mag = rays_enu[nearby], v_mag[nearby]
@@ -42,13 +42,13 @@ def add_sources(image_e: Array, scene: Scene) -> None:
         turned_enu = rays_enu @ R_turn.T
         rays_cam = turned_enu @ scene.R_cam_enu.T
         angle = off_axis_rad(rays_cam)
-        shines = (angle <= scene.camera.max_angle_rad) & above_terrain(scene, turned_enu)
+        shines = (angle <= scene.camera.max_angle_rad) & is_above_terrain(scene, turned_enu)
         xy_px, _ = scene.camera.project(rays_cam[shines])
         flux = flux_e(scene.sensor, v_mag[shines], angle[shines], scene.exposure_s / len(turns))
         splat(image_e, xy_px, flux, scene.sensor.psf_sigma_px)
 
 
-def exposure_reaching(camera: Camera, sky_v_mag_arcsec2: float | None, *, v_mag: float, snr: float) -> float:
+def exposure_for_snr(camera: Camera, sky_v_mag_arcsec2: float | None, *, v_mag: float, snr: float) -> float:
     """Seconds in which a star of `v_mag` on the axis reaches the matched-filter ratio `snr`.
 
     `sky_v_mag_arcsec2` is the brightness of the sky (None: black).
@@ -91,7 +91,7 @@ def _body_points(body: Body, focal_px: float) -> tuple[Array, Array]:
     return rays, np.full(count, body.v_mag + 2.5 * np.log10(count))
 
 
-def _turns(scene: Scene) -> list[Array]:
+def _step_rotations(scene: Scene) -> list[Array]:
     """Rotations (3, 3) of the sky at the middles of equal steps of the exposure, relative to mid-exposure."""
     angle = float(np.linalg.norm(scene.sky_turn_rad))
     # Farthest off axis a fisheye stretches the circle around it by up to angle / sin(angle): pi/2 at 90 degrees.

@@ -52,13 +52,13 @@ class Sky:
     @classmethod
     def draw(cls, seed: int, sky: int, magnitude: float = MAGNITUDE) -> Sky:
         """phi = 2 pi r1, theta = arcsin r2, r1 and r2 uniform over [0, 1]: eq. 3.9 and 3.10."""
-        r1, r2 = _random([seed, STARS, sky], (star_count(magnitude), 2)).T
+        r1, r2 = _draw_uniform([seed, STARS, sky], (star_count(magnitude), 2)).T
         return cls(2 * np.pi * r1, np.arcsin(r2))
 
     def __len__(self) -> int:
         return len(self.azimuth_rad)
 
-    def on_rim_plane(self, cylinder: Cylinder) -> Array:
+    def project_to_rim_plane(self, cylinder: Cylinder) -> Array:
         """Points (n, 2) [m]: from p, star i is visible exactly when |p + point_i| < R."""
         rho = cylinder.wall_m / np.tan(self.elevation_rad)
         return rho[:, None] * directions(self.azimuth_rad)
@@ -69,9 +69,9 @@ def directions(azimuth_rad: Array) -> Array:
     return np.stack([np.sin(azimuth_rad), np.cos(azimuth_rad)], axis=-1)
 
 
-def draw_places(seed: int, sky: int, start: int, stop: int, radius_m: float = DIAMETER_M / 2) -> Array:
+def draw_positions(seed: int, sky: int, start: int, stop: int, radius_m: float = DIAMETER_M / 2) -> Array:
     """Positions number start to stop - 1 (n, 2) [m] of a sky, uniform over the crater's floor."""
-    r1, r2 = _random([seed, PLACES, sky], (stop, 2))[start:].T
+    r1, r2 = _draw_uniform([seed, PLACES, sky], (stop, 2))[start:].T
     return radius_m * np.sqrt(r1)[:, None] * directions(2 * np.pi * r2)
 
 
@@ -98,7 +98,7 @@ class Mistakes:
 
     def draw_list(self, in_sight: Bools, seed: int, sky: int, number: int) -> Bools:
         """Draw the list of position `number`: which stars (n,) are on it."""
-        r = _random([seed, MISTAKES, sky, number], (len(in_sight),))
+        r = _draw_uniform([seed, MISTAKES, sky, number], (len(in_sight),))
         return np.where(in_sight, r >= self.missed, r < self.false)
 
     def evidence(self, sky: Sky, listed: Bools) -> Evidence:
@@ -122,7 +122,7 @@ def changes_m(sky: Sky, cylinder: Cylinder) -> Array:
     Star i is visible inside the circle of radius R about -point_i, so the changes are where the line north = 0 crosses
     these circles: exact, where the thesis compares views at steps along the line.
     """
-    east, north = sky.on_rim_plane(cylinder).T
+    east, north = sky.project_to_rim_plane(cylinder).T
     met = np.abs(north) < cylinder.radius_m
     half_chord = np.sqrt(np.square(cylinder.radius_m) - np.square(north[met]))
     crossings = np.concatenate([-east[met] - half_chord, -east[met] + half_chord])
@@ -149,7 +149,7 @@ def change_steps_m(changes: Array, cylinder: Cylinder, step_m: float = STEP_M) -
     return (steps + 1) * step_m - cylinder.radius_m
 
 
-def _random(stream: list[int], shape: tuple[int, ...]) -> Array:
+def _draw_uniform(stream: list[int], shape: tuple[int, ...]) -> Array:
     """Uniform over [0, 1), the same for the same stream; a longer draw begins with the shorter one."""
     rng = np.random.default_rng(stream)
     return rng.random(shape)

@@ -125,7 +125,7 @@ def best_ruststartracker(camera: Camera, stars: Stars, lists: list[StarList]) ->
     return best[1], best[2]
 
 
-def missing() -> list[str]:
+def missing_programs() -> list[str]:
     """A line for each program that is not here."""
     return [] if find_spec("ruststartracker") else ["ruststartracker is not installed: left out"]
 

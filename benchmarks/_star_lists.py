@@ -63,7 +63,7 @@ def star_list(
     seen = seen[: 3 * true + 20]  # the stars are sorted, brightest first
     pairs = cKDTree(px[seen]).query_pairs(CLOSE_PX, output_type="ndarray")
     star = np.delete(seen, pairs.max(axis=1) if len(pairs) else [])[:true]
-    strange = scattered(camera, false + trouble.strangers, rng=rng)
+    strange = random_positions(camera, false + trouble.strangers, rng=rng)
     v = stars.v_mag[star] + rng.normal(0, trouble.scatter_mag, len(star))
     like = v if true else 6 + np.log(rng.random(false)) / 1.08  # the magnitudes of a real sky
     v = np.concatenate([v, rng.choice(like, false), like.min() - 2 * rng.random(trouble.strangers)])
@@ -76,7 +76,7 @@ def star_list(
     return StarList(xy[order], v[order], truth[order], R, noise_px)
 
 
-def scattered(camera: Camera, n: int, *, rng: np.random.Generator) -> np.ndarray:
+def random_positions(camera: Camera, n: int, *, rng: np.random.Generator) -> np.ndarray:
     """Random places (n, 2) within the frame and the image circle."""
     xy = rng.uniform(0, np.array(camera.size_px) - 1, (3 * n + 20, 2))
     return xy[camera.angle_rad(xy) < camera.max_angle_rad][:n]

@@ -143,7 +143,7 @@ def watch(
     """
     begin, peak = time.perf_counter(), 0
     while process.poll() is None:
-        peak = max(peak, sum(map(resident_bytes, family(top or process.pid))))
+        peak = max(peak, sum(map(resident_bytes, process_family(top or process.pid))))
         if time.perf_counter() - begin > most_s:
             os.kill(process.pid, signal.SIGKILL)
         each()
@@ -176,7 +176,7 @@ def run_on_cluster(folder: Path, images: list[Path], out: Path, workers: int) ->
         return watch(process, top=os.getpid(), each=kill_one), killed[0]
 
 
-def family(pid: int) -> list[int]:
+def process_family(pid: int) -> list[int]:
     """The process and all below it (Linux)."""
     found = [pid]
     for parent in found:

@@ -109,7 +109,7 @@ def trial(case: Case, law: str, rng: np.random.Generator) -> Trial:
         quaternion = rng.normal(size=4)
         R.append(R_from_quat_xyzw(quaternion / np.linalg.norm(quaternion)))
         rays.append(seen @ R[-1])
-        xy.append(projected(rho, centre, seen) + rng.normal(0, case.sigma_px, (case.stars, 2)))
+        xy.append(project(rho, centre, seen) + rng.normal(0, case.sigma_px, (case.stars, 2)))
         wrong = rng.permutation(case.stars)[: int(case.wrong * case.stars)]
         xy[-1][wrong] = rng.uniform(0, SIZE_PX[0] - 1, (len(wrong), 2))
     start = time.perf_counter()
@@ -118,13 +118,13 @@ def trial(case: Case, law: str, rng: np.random.Generator) -> Trial:
         state = initial_state(points, SIZE_PX)
         fit = fit_lens(state.camera, state.R_cam_icrs, points)
     else:
-        fit = fit_lens(rough(), np.stack([R_from_rotvec(rng.normal(0, 0.01, 3)) @ r for r in R]), points)
+        fit = fit_lens(approximate_camera(), np.stack([R_from_rotvec(rng.normal(0, 0.01, 3)) @ r for r in R]), points)
     seconds = time.perf_counter() - start
     error, nees, freedom = map_error(fit.camera, rho, centre)
     return Trial(error, nees, freedom, float(np.degrees(fit.camera.calibrated_angle_rad)), seconds)
 
 
-def rough() -> Camera:
+def approximate_camera() -> Camera:
     """The approximate camera: 2 % of focal length and 10 px of centre off."""
     return Camera(
         name="rough", size_px=SIZE_PX, focal_px=(640.0, 640.0), centre_px=(1023.5, 1023.5),
@@ -147,7 +147,7 @@ def even_rays(top_rad: float, count: int, rng: np.random.Generator) -> np.ndarra
     return np.stack([r * np.cos(b), r * np.sin(b), z], axis=1)
 
 
-def projected(rho: Law, centre_px: np.ndarray, rays_cam: np.ndarray) -> np.ndarray:
+def project(rho: Law, centre_px: np.ndarray, rays_cam: np.ndarray) -> np.ndarray:
     """True pixels (n, 2): written out here, not taken from the package."""
     s = np.hypot(rays_cam[:, 0], rays_cam[:, 1])
     return centre_px + FOCAL_PX * (rho(np.arctan2(s, rays_cam[:, 2])) / s)[:, None] * rays_cam[:, :2]
@@ -157,7 +157,7 @@ def map_error(camera: Camera, rho: Law, centre_px: np.ndarray) -> tuple[float, f
     """RMS error [px] with the best rotation removed, its NEES, and the NEES's degrees of freedom."""
     grid = cap_grid(camera.calibrated_angle_rad, MAP_POINTS)
     turn = camera.jacobian_px_per_rad(grid).reshape(-1, 3)
-    error = (camera.project_unlimited(grid) - projected(rho, centre_px, grid)).reshape(-1)
+    error = (camera.project_unlimited(grid) - project(rho, centre_px, grid)).reshape(-1)
     error = error - turn @ np.linalg.lstsq(turn, error, rcond=None)[0]
     order = camera.covariance_order
     lens = lens_jacobian(camera, grid, order).reshape(-1, len(order)) + turn @ compensating_rotation(camera, order)

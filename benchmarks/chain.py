@@ -52,14 +52,14 @@ def main() -> None:
         (args.seed, number) for number in range(args.frames)
     ]  # fmt: skip
     with ProcessPoolExecutor(args.jobs) as pool:
-        rows = list(pool.map(from_file if args.folder else rendered, jobs))
+        rows = list(pool.map(locate_file if args.folder else locate_rendered, jobs))
     body = summary(rows)
     print(body)
     if not args.folder:
         write_section("Chain", f"python benchmarks/chain.py --frames {args.frames}", ("numpy", "scipy"), body)
 
 
-def rendered(job: tuple[int, int]) -> dict[str, Any]:
+def locate_rendered(job: tuple[int, int]) -> dict[str, Any]:
     """One random frame, located."""
     seed, number = job
     camera = replace(load_camera("fisheye-2048"), sensor=SENSOR)
@@ -71,10 +71,10 @@ def rendered(job: tuple[int, int]) -> dict[str, Any]:
     exposure, truth = render(scene, rng=rng)
     start = time.perf_counter()
     result = locate(exposure, camera, terrain, catalog)
-    return scored(result, truth.position_enu_m, truth.R_cam_icrs, time.perf_counter() - start)
+    return score_result(result, truth.position_enu_m, truth.R_cam_icrs, time.perf_counter() - start)
 
 
-def from_file(truth_path: Path) -> dict[str, Any]:
+def locate_file(truth_path: Path) -> dict[str, Any]:
     """One frame of a folder, located."""
     image = next(p for p in truth_path.parent.glob(truth_path.name.replace(".truth.json", ".*")) if p.suffix != ".json")
     truth = json.loads(truth_path.read_text())
@@ -82,10 +82,10 @@ def from_file(truth_path: Path) -> dict[str, Any]:
     start = time.perf_counter()
     result = locate(exposure, load_camera(exposure.camera or ""), load_terrain(exposure.terrain or ""), load_catalog())
     quat = np.array(truth["quat_xyzw_cam_icrs"])
-    return scored(result, np.array(truth["position_enu_m"]), R_from_quat_xyzw(quat), time.perf_counter() - start)
+    return score_result(result, np.array(truth["position_enu_m"]), R_from_quat_xyzw(quat), time.perf_counter() - start)
 
 
-def scored(result: Outcome, position_m: np.ndarray, R_cam_icrs: np.ndarray, seconds: float) -> dict[str, Any]:
+def score_result(result: Outcome, position_m: np.ndarray, R_cam_icrs: np.ndarray, seconds: float) -> dict[str, Any]:
     """Errors of one result."""
     row: dict[str, Any] = {"status": result.status, "reason": result.reason, "seconds": seconds}
     row["stage_ms"] = dict(result.timing_ms)

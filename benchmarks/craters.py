@@ -56,9 +56,10 @@ def main() -> None:
         terrain.prepare()
         rng = np.random.default_rng(args.seed)
         floor, wall = (ROUGH_PLACES, ROUGH_PLACES) if rough else (args.floor, args.wall)
-        places = [*drawn(terrain, floor, FLOOR_DEG, rng), *drawn(terrain, wall, WALL_DEG, rng)]
+        places = [*draw_positions(terrain, floor, FLOOR_DEG, rng), *draw_positions(terrain, wall, WALL_DEG, rng)]
         for number, (place, slope) in enumerate(places):
-            lines.append([name, *one(terrain, place, slope, night(terrain.site, rng), number, args.seed)])
+            when = draw_night(terrain.site, rng)
+            lines.append([name, *measure_position(terrain, place, slope, when, number, args.seed)])
             print(" | ".join(lines[-1]), flush=True)
     head = ["crater", "place, m", "slope, degrees", "horizon, degrees", "result", "error, m", "95 % circle, m",
             "99.9 %, m", "NEES", "s, position", "CPU s, all"]  # fmt: skip
@@ -66,7 +67,7 @@ def main() -> None:
     write_section("Dark craters", command, ("numpy", "scipy", "numba"), table(head, lines))
 
 
-def drawn(
+def draw_positions(
     terrain: HeightMap, count: int, slopes_deg: tuple[float, float], rng: np.random.Generator
 ) -> list[tuple[np.ndarray, float]]:
     """Places (2,) in the search area with slopes in a range, and the slopes in degrees."""
@@ -80,7 +81,7 @@ def drawn(
     return found
 
 
-def night(site: Site, rng: np.random.Generator) -> datetime:
+def draw_night(site: Site, rng: np.random.Generator) -> datetime:
     """A time at which the Sun is down."""
     while True:
         when = datetime(2025, 1, 1, tzinfo=UTC) + timedelta(seconds=float(rng.uniform(0, 8 * 365 * 86_400)))
@@ -89,7 +90,9 @@ def night(site: Site, rng: np.random.Generator) -> datetime:
             return when
 
 
-def one(terrain: HeightMap, place: np.ndarray, slope: float, when: datetime, number: int, seed: int) -> list[str]:
+def measure_position(
+    terrain: HeightMap, place: np.ndarray, slope: float, when: datetime, number: int, seed: int
+) -> list[str]:
     """Render, locate, and say what came of it."""
     camera, catalog = load_camera("fisheye-2048"), load_catalog()
     series = Series(

@@ -62,7 +62,7 @@ def main() -> None:
     jobs = [(args.seed, depth, number) for depth in depths for number in range(depth.frames)]
     rows: dict[tuple[float, str], list[dict[str, Any]]] = {}
     with ProcessPoolExecutor(args.jobs) as pool:
-        for done, (job, lines) in enumerate(zip(jobs, pool.map(one, jobs), strict=True), 1):
+        for done, (job, lines) in enumerate(zip(jobs, pool.map(measure_frame, jobs), strict=True), 1):
             for name, row in lines.items():
                 rows.setdefault((job[1].v_mag, name), []).append(row)
             if done % 20 == 0:
@@ -94,7 +94,7 @@ def line(rows: list[dict[str, Any]]) -> list[str]:
     return [str(len(rows)), str(len(rows) - len(good)), *spread, *inside, circle]
 
 
-def one(job: tuple[int, Depth, int]) -> dict[str, dict[str, Any]]:
+def measure_frame(job: tuple[int, Depth, int]) -> dict[str, dict[str, Any]]:
     """One frame by every method: name to its figures."""
     seed, depth, number = job
     sky, catalog = load_deep_catalog(), load_catalog()
@@ -108,17 +108,17 @@ def one(job: tuple[int, Depth, int]) -> dict[str, dict[str, Any]]:
     place = truth.position_enu_m[:2]
     fast = Settings(localizer=ExactPosterior())
     result = locate(exposure, camera, terrain, catalog, fast)
-    rows = {"full": _scored(_fix(result), place)}
+    rows = {"full": _score_fix(_fix(result), place)}
     value = last_value(result)
     if number < depth.compared and isinstance(value, Measured):
         plain = locate(exposure, camera, terrain, catalog, replace(fast, deep_stars=False))
-        rows["Hipparcos alone"] = _scored(_fix(plain), place)
+        rows["Hipparcos alone"] = _score_fix(_fix(plain), place)
         for name, evidence, localizer in _ablations(value):
             try:
                 fix = localizer(evidence, terrain)
             except NoSolution:
                 fix = None
-            rows[name] = _scored(fix, place)
+            rows[name] = _score_fix(fix, place)
     return rows
 
 
@@ -126,7 +126,7 @@ def _fix(outcome: Any) -> Fix | None:
     return outcome.fix if isinstance(outcome, Located) and not outcome.fix.ambiguous else None
 
 
-def _scored(fix: Fix | None, place_m: Array) -> dict[str, Any]:
+def _score_fix(fix: Fix | None, place_m: Array) -> dict[str, Any]:
     if fix is None:
         return {}
     d = fix.position_enu_m[:2] - place_m
@@ -136,17 +136,17 @@ def _scored(fix: Fix | None, place_m: Array) -> dict[str, Any]:
 
 def _ablations(result: Measured) -> Iterator[tuple[str, Evidence, ExactPosterior]]:
     full = ExactPosterior()
-    yield "without remeasuring near the skyline", _light(result).evidence(), full
-    yield "list at 5 sigma", _listed(result.light, 5.0), full
-    yield "list at 3 sigma", _listed(result.light, 3.0), full
-    lonely = _light(result, visible=np.zeros(len(result.stars)))  # neighbours that never shine
+    yield "without remeasuring near the skyline", _photometry(result).evidence(), full
+    yield "list at 5 sigma", _list_evidence(result.light, 5.0), full
+    yield "list at 3 sigma", _list_evidence(result.light, 3.0), full
+    lonely = _photometry(result, visible=np.zeros(len(result.stars)))  # neighbours that never shine
     yield "without crowding", lonely.evidence(), full
-    yield "without flux uncertainty", _light(result, certain=True).evidence(), full
-    plain = _light(result, settings=StarEvidence(capped=False))
+    yield "without flux uncertainty", _photometry(result, certain=True).evidence(), full
+    plain = _photometry(result, settings=StarEvidence(capped=False))
     yield "without caps", plain.evidence(), replace(full, sector_epsilon=0.0)
 
 
-def _listed(light: StarPhotometry, threshold: float) -> Evidence:
+def _list_evidence(light: StarPhotometry, threshold: float) -> Evidence:
     """What a list says: each star that should pass the threshold either did or did not, and no more."""
     from scipy.stats import norm
 
@@ -162,7 +162,7 @@ def _listed(light: StarPhotometry, threshold: float) -> Evidence:
     )
 
 
-def _light(
+def _photometry(
     result: Measured, *, visible: Array | None = None, certain: bool = False, settings: StarEvidence | None = None
 ) -> StarPhotometry:
     """The frame's evidence once more, with a part left out."""

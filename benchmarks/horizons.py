@@ -37,11 +37,11 @@ def main() -> None:
     args = parser.parse_args()
     lines = []
     for name, half_m in CROPS_M.items():
-        terrain = cropped(name, half_m)
+        terrain = crop_terrain(name, half_m)
         rng = np.random.default_rng(args.seed)
         turn, far = rng.uniform(0, 2 * np.pi, args.places), 0.67 * np.sqrt(rng.random(args.places))
         places = terrain.search_radius_m * far[:, None] * np.column_stack([np.sin(turn), np.cos(turn)])
-        lines += compared(name, terrain, places)
+        lines += compare_methods(name, terrain, places)
         print("\n".join(" ".join(line) for line in lines[-4:]), flush=True)
     body = table(
         ["map", "method", "horizons", "RMS from Embree, degrees", "mean", "largest", "CPU microseconds a horizon"],
@@ -52,7 +52,7 @@ def main() -> None:
     )
 
 
-def cropped(name: str, half_m: float) -> HeightMap:
+def crop_terrain(name: str, half_m: float) -> HeightMap:
     """The terrain with its finest map alone, as far as that matters."""
     whole = load_terrain(name)
     assert isinstance(whole, HeightMap)
@@ -60,13 +60,13 @@ def cropped(name: str, half_m: float) -> HeightMap:
     return replace(whole, maps=(crop,))
 
 
-def compared(name: str, terrain: HeightMap, places: np.ndarray) -> list[list[str]]:
+def compare_methods(name: str, terrain: HeightMap, places: np.ndarray) -> list[list[str]]:
     """One row per method."""
     step_m = terrain.maps[0].post_m / 8
     methods: dict[str, tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], int]] = {
         "startrack": (lambda p, a: terrain.horizon_rad(p[None], a), 1),
-        f"march in steps of {step_m:.0f} m, numba": (lambda p, a: marched_in_numba(terrain, p, a, step_m), 1),
-        f"march in steps of {step_m:.0f} m, numpy": (lambda p, a: marched_in_numpy(terrain, p, a, step_m), NUMPY_EVERY),
+        f"march in steps of {step_m:.0f} m, numba": (lambda p, a: march_numba(terrain, p, a, step_m), 1),
+        f"march in steps of {step_m:.0f} m, numpy": (lambda p, a: march_numpy(terrain, p, a, step_m), NUMPY_EVERY),
     }
     truth, spent, inside = [], 0.0, []
     for place in places:
@@ -101,7 +101,7 @@ def _march(grid, posts, heights, moon, points, up, azimuths, step_m, end_m, tan)
             tan[k] = max(tan[k], (z - up[k]) / s)
 
 
-def marched_in_numba(terrain: HeightMap, place: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
+def march_numba(terrain: HeightMap, place: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
     """Small steps, compiled; the surface is startrack's own."""
     ground, tan = terrain.ground, np.full(len(azimuths), -50.0)
     places = np.repeat(place[None], len(azimuths), axis=0)
@@ -110,7 +110,7 @@ def marched_in_numba(terrain: HeightMap, place: np.ndarray, azimuths: np.ndarray
     return np.arctan(tan)
 
 
-def marched_in_numpy(terrain: HeightMap, place: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
+def march_numpy(terrain: HeightMap, place: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
     """Small steps, a ray at a time, with numpy alone."""
     s, maps = np.arange(step_m, CROPS_M[terrain.name], step_m), list(terrain.maps)
     up = ground_up_m(terrain.site, maps, place) + terrain.camera_height_m

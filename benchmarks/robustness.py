@@ -106,7 +106,7 @@ def main() -> None:
     args = parser.parse_args()
     jobs = [(index, number) for index in range(len(TROUBLES)) for number in range(args.frames)]
     with ProcessPoolExecutor(args.jobs) as pool:
-        rows = list(pool.map(one, jobs, chunksize=4))
+        rows = list(pool.map(measure_frame, jobs, chunksize=4))
     body = table(
         ["trouble", "located", "refused or ambiguous", "mean error, m", "max", "beyond the 99.9 % circle", "caught"],
         [summary(t, [r for (i, _), r in zip(jobs, rows, strict=True) if i == k]) for k, t in enumerate(TROUBLES)],
@@ -115,7 +115,7 @@ def main() -> None:
     write_section("Robustness", f"python benchmarks/robustness.py --frames {args.frames}", ("numpy", "scipy"), body)
 
 
-def one(job: tuple[int, int]) -> dict[str, Any]:
+def measure_frame(job: tuple[int, int]) -> dict[str, Any]:
     """One frame under one trouble."""
     trouble, number = TROUBLES[job[0]], job[1]
     true = load_terrain("shackleton-thesis")

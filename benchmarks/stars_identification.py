@@ -19,7 +19,7 @@ from _identify_peers import (
     Solver,
     best_ruststartracker,
     cedar,
-    missing,
+    missing_programs,
     ruststartracker,
     startrack,
     tetra3rs,
@@ -138,7 +138,7 @@ def main() -> None:
         print("\n".join(" | ".join(line) for line in fresh), flush=True)
     head = ["star lists", "program", "solved", "wrong", "precision", "recall", "ms, median", "startrack's part of it"]
     body = f"startrack: {wrong} wrong answers to {total} lists. Times are of CPU, warm.\n\n{table(head, rows)}\n\n"
-    body += "\n".join([EXPLANATION, *missing()])
+    body += "\n".join([EXPLANATION, *missing_programs()])
     print("\n" + body)
     if args.write:
         packages = tuple(name for name in PEERS if find_spec(name))

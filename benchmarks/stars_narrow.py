@@ -79,9 +79,9 @@ def main() -> None:
     args = parser.parse_args()
     cv2.setNumThreads(1)
     stars = load_catalog().at(None, None)
-    sets = {f"synthetic, {w:g} degrees": synthetic(stars, w, args.frames) for w in WIDTHS_DEG}
+    sets = {f"synthetic, {w:g} degrees": synthetic_pictures(stars, w, args.frames) for w in WIDTHS_DEG}
     sets |= {f"{Path(folder).parent.name}/{Path(folder).name}": photographs(Path(folder)) for folder in args.photos}
-    rows = [row for name, pictures in sets.items() for row in compared(name, pictures, stars)]
+    rows = [row for name, pictures in sets.items() for row in compare_programs(name, pictures, stars)]
     head = ["frames", "program", "solved", "wrong", "detect, ms", "identify, ms", "both, ms", "ours over it"]
     body = (
         "The field of view is told wrong by 0, -8 and +8 % in turn; both may be off by 10 %. tetra3rs with its "
@@ -93,7 +93,7 @@ def main() -> None:
         write_section("Stars: narrow fields", command, ("numpy", "tetra3rs"), body)
 
 
-def compared(name: str, pictures: list[Picture], stars: Stars) -> list[list[str]]:
+def compare_programs(name: str, pictures: list[Picture], stars: Stars) -> list[list[str]]:
     """The rows of one set."""
     widths = [p.fov_deg for p in pictures]
     base = tetra3rs.SolverDatabase.generate_from_gaia(
@@ -101,14 +101,14 @@ def compared(name: str, pictures: list[Picture], stars: Stars) -> list[list[str]
     )
     detector = Detector()
     programs: dict[str, tuple[Finder, Solver]] = {
-        "startrack": (lambda e: detector(e, None), lambda found, p: _ours(found, p, stars)),
-        "tetra3rs, extract_centroids_fast": (_quick, lambda found, p: _tetra3rs(found, p, base)),
-        "tetra3rs, extract_centroids": (_thorough, lambda found, p: _tetra3rs(found, p, base)),
+        "startrack": (lambda e: detector(e, None), lambda found, p: _solve_ours(found, p, stars)),
+        "tetra3rs, extract_centroids_fast": (_extract_quick, lambda found, p: _solve_tetra3rs(found, p, base)),
+        "tetra3rs, extract_centroids": (_extract_thorough, lambda found, p: _solve_tetra3rs(found, p, base)),
     }
     tallies = {program: _run(find, solve, pictures) for program, (find, solve) in programs.items()}
     ours = tallies["startrack"]
     return [
-        [name, program, f"{t.solved} of {len(pictures)}", f"{_wrong(t, ours, pictures)}",
+        [name, program, f"{t.solved} of {len(pictures)}", f"{_count_wrong(t, ours, pictures)}",
          f"{np.median(t.detect_ms):.1f}", f"{np.median(t.solve_ms):.1f}", f"{t.total_ms():.1f}",
          f"{ours.total_ms() / t.total_ms():.1f}"]
         for program, t in tallies.items()
@@ -137,7 +137,7 @@ def _run(find: Finder, solve: Solver, pictures: list[Picture]) -> Tally:
     return tally
 
 
-def _wrong(tally: Tally, other: Tally, pictures: list[Picture]) -> int:
+def _count_wrong(tally: Tally, other: Tally, pictures: list[Picture]) -> int:
     """Answers that look elsewhere than the truth says; of photographs, elsewhere than the other program."""
     wrong = 0
     for axis, reference, picture in zip(tally.axes, other.axes, pictures, strict=True):
@@ -147,21 +147,21 @@ def _wrong(tally: Tally, other: Tally, pictures: list[Picture]) -> int:
     return wrong
 
 
-def _ours(found: object, picture: Picture, stars: Stars) -> np.ndarray | None:
+def _solve_ours(found: object, picture: Picture, stars: Stars) -> np.ndarray | None:
     size = picture.exposure.size_px
     answer = identify_unknown_lens(found, size, np.radians(picture.fov_deg), stars)  # type: ignore[arg-type]
     return np.asarray(answer.identification.R_cam_icrs[2])
 
 
-def _quick(exposure: Exposure) -> object:
+def _extract_quick(exposure: Exposure) -> object:
     return tetra3rs.extract_centroids_fast(np.ascontiguousarray(exposure.pixels_adu), threads=1)
 
 
-def _thorough(exposure: Exposure) -> object:
+def _extract_thorough(exposure: Exposure) -> object:
     return tetra3rs.extract_centroids(np.ascontiguousarray(exposure.pixels_adu), threads=1)
 
 
-def _tetra3rs(found: object, picture: Picture, base: object) -> np.ndarray | None:
+def _solve_tetra3rs(found: object, picture: Picture, base: object) -> np.ndarray | None:
     width, height = picture.exposure.size_px
     answer = base.solve_from_centroids(  # type: ignore[attr-defined]
         found.centroids, fov_estimate_deg=picture.fov_deg, fov_max_error_deg=0.1 * picture.fov_deg,  # type: ignore[attr-defined]
@@ -180,18 +180,18 @@ def photographs(folder: Path) -> list[Picture]:
     ]
 
 
-def synthetic(stars: Stars, width_deg: float, count: int) -> list[Picture]:
+def synthetic_pictures(stars: Stars, width_deg: float, count: int) -> list[Picture]:
     """Frames of a pinhole camera at random attitudes: stars to magnitude 7.5, Poisson and read noise."""
     pictures = []
     for i in range(count):
         rng = np.random.default_rng([17, round(width_deg), i])
         R = Rotation.random(random_state=rng).as_matrix()
-        pixels = _painted(stars, R, np.radians(width_deg), rng)
+        pixels = _paint_frame(stars, R, np.radians(width_deg), rng)
         pictures.append(Picture(Exposure(pixels_adu=pixels), width_deg * OFF[i % len(OFF)], R[2]))
     return pictures
 
 
-def _painted(stars: Stars, R: np.ndarray, fov_rad: float, rng: np.random.Generator) -> np.ndarray:
+def _paint_frame(stars: Stars, R: np.ndarray, fov_rad: float, rng: np.random.Generator) -> np.ndarray:
     width, height = SIZE_PX
     cam = stars.rays_icrs[stars.v_mag < LIMIT_MAG] @ R.T
     v_mag = stars.v_mag[stars.v_mag < LIMIT_MAG]

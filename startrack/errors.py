@@ -1,6 +1,6 @@
-"""The reasons of failures with their exit codes and advice, and the exceptions that carry them.
+"""The reasons of failures with their exit codes and advice, and the exceptions that have them.
 
-Kept apart from the values so that the commands start without numpy. Exit codes, JSON schema, the page's advice and the
+Separate from the values so that the commands start without numpy. Exit codes, JSON schema, the page's advice and the
 table in docs/formats.md are made from `Reason`; a new reason is one entry here.
 """
 

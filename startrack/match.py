@@ -18,8 +18,8 @@ from startrack.types import Array, Bools, Ints
 DEPTH_BELOW_THRESHOLD_MAG = 0.7  # stars this much fainter than the faintest detection may still be detected
 BRIGHTER_MAG = 0.8  # a detection is at most this much brighter than its star
 DIMMED_MAG = 1.6  # and at most this much fainter: haze, branches, the edge of the lens
-PX_PER_MAG = 0.6  # distance that counts as much as one magnitude of disagreement
-DISTINCT_MAG = 0.3  # of stars that share a detection, one this much brighter gives it its name
+PX_PER_MAG = 0.6  # distance with the same cost as a difference of one magnitude
+DISTINCT_MAG = 0.3  # if one of the stars that share a detection is this much brighter, the detection is named after it
 DECISIVE_NATS = 12.0  # log-likelihood ratio that decides between two positions
 SIGNIFICANT_SNR = 10.0  # detections above this should have a catalogue star
 MIN_UNSATURATED = 3  # for the photometric scale; below this, saturated stars are used too
@@ -193,7 +193,7 @@ class CandidatePairs:
     def select_unambiguous(self, which: Ints, variance_px2: Array, radius_px: float) -> Ints:
         """The one-to-one pairs `which` (m,) with an unambiguous star; `variance_px2` (m,) is per axis.
 
-        Stars within the radius of a detection that have no detection of their own share its light. The detection is
+        Stars within the radius of a detection that have no detection of their own are blended with it. The detection is
         named after the brightest of them if its position allows that. It is dropped if another star is nearly as
         bright and the position does not decide between them.
         """

@@ -1,4 +1,4 @@
-"""The values that the stages of the pipeline hand on, each complete, and the settings of the stages.
+"""The complete values that the stages of the pipeline return, and the settings of the stages.
 
     Inputs -> Detected -> Identified -> Oriented -> Measured -> Located, or Refused
 
@@ -122,7 +122,7 @@ class Oriented(Identified):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measured(Oriented):
-    """An attitude above a terrain, with the light measured at every catalogue star in view."""
+    """An attitude above a terrain, with photometry at every catalogue star in view."""
 
     terrain: Terrain
     site: Site  # of the terrain

@@ -35,7 +35,7 @@ def frames(folder: Path, count: int, level: int = 100) -> list[Path]:
     return paths
 
 
-def listed(*names: str, end: str = "\n") -> io.TextIOWrapper:
+def stdin_of(*names: str, end: str = "\n") -> io.TextIOWrapper:
     """Standard input with the images' names."""
     return io.TextIOWrapper(io.BytesIO("".join(name + end for name in names).encode()))
 

@@ -20,7 +20,7 @@ class Located:
 
 
 @pytest.fixture(scope="session")
-def compiled(located: Located) -> None:
+def compiled_kernels(located: Located) -> None:
     """The kernels of a fix on the cylinder are in numba's cache, so that other processes load them."""
 
 

@@ -53,7 +53,7 @@ class Window:
         self.page.goto(path.as_uri())
         self.said.remove(path.as_uri())
 
-    def until(self, condition: str) -> None:
+    def wait_for(self, condition: str) -> None:
         """Wait for a condition in JavaScript. (Playwright's own way polls by eval, which the page's rules forbid.)"""
         for _ in range(600):
             if self.page.evaluate(condition):
@@ -65,7 +65,7 @@ class Window:
         self.page.get_by_role("link", name=name).click()
         self.page.wait_for_selector("#detail h1")
 
-    def star(self, name: str) -> tuple[float, float]:
+    def star_position(self, name: str) -> tuple[float, float]:
         """Where a star of the picture is in the window."""
         self.page.locator("#detail .stage canvas").first.scroll_into_view_if_needed()
         x, y = self.page.evaluate(
@@ -83,6 +83,6 @@ class Window:
     def tip(self) -> str:
         return self.page.locator("#detail .tip").first.inner_text()
 
-    def fits(self) -> bool:
+    def has_no_overflow(self) -> bool:
         """Whether nothing stands out to the right."""
         return self.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")

@@ -29,7 +29,7 @@ def random_rays(n: int, rng: np.random.Generator) -> np.ndarray:
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-def drawn(
+def draw_stars(
     camera: Camera, n: int, rng: np.random.Generator, unknown_px: float = 0.0, heavy: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Centroids (n, 2), their stated covariances, the stars' rays_icrs and the true R_cam_icrs.
@@ -52,10 +52,10 @@ def drawn(
     return px + error, covariance, camera.unproject(px) @ R, R
 
 
-def solved(camera: Camera, seed: int, n: int, **errors: float) -> tuple[AttitudeFit, np.ndarray]:
+def solve_draw(camera: Camera, seed: int, n: int, **errors: float) -> tuple[AttitudeFit, np.ndarray]:
     """The fit from a start 3 arcmin off, and the rotation vector (3,) from it to the truth."""
     rng = np.random.default_rng([seed, n])
-    xy, covariance, rays, R = drawn(camera, n, rng, **errors)
+    xy, covariance, rays, R = draw_stars(camera, n, rng, **errors)
     start = Rotation.from_rotvec(rng.normal(0, 1e-3, 3)).as_matrix() @ R
     fit = solve_attitude(camera, xy, covariance, rays, start)
     return fit, Rotation.from_matrix(R @ fit.attitude.R_cam_icrs.T).as_rotvec()
@@ -65,7 +65,7 @@ def mean_nees(camera: Camera, n: int, draws: int = 100, **errors: float) -> floa
     nees = []
     for seed in range(draws):
         try:
-            fit, w = solved(camera, seed, n, **errors)
+            fit, w = solve_draw(camera, seed, n, **errors)
         except NotIdentified:
             assert n < 10  # a star or two off by chance leaves too few
             continue
@@ -102,7 +102,7 @@ def test_an_error_that_nobody_stated_is_seen_in_the_scatter(n: int, most: float)
     """0.15 px of lens error beyond centroid errors of 0.03 to 0.4 px; six stars can hardly tell."""
     assert 2.3 < mean_nees(FISHEYE, n, 60, unknown_px=0.15) < most
     if n == 300:
-        extra = [solved(FISHEYE, seed, n, unknown_px=0.15)[0].extra_sigma_px for seed in range(10)]
+        extra = [solve_draw(FISHEYE, seed, n, unknown_px=0.15)[0].extra_sigma_px for seed in range(10)]
         assert np.median(extra) == pytest.approx(0.15, rel=0.1)
 
 
@@ -113,7 +113,7 @@ def test_heavy_tails_do_not_make_it_overconfident(n: int, heavy: float) -> None:
 
 def test_gross_outliers_are_left_out_and_do_not_pull() -> None:
     rng = np.random.default_rng(3)
-    xy, covariance, rays, R = drawn(FISHEYE, 100, rng)
+    xy, covariance, rays, R = draw_stars(FISHEYE, 100, rng)
     wrong = rng.permutation(100)[:15]
     xy[wrong] += rng.choice([-1, 1], (15, 2)) * rng.uniform(4, 12, (15, 2))
     fit = solve_attitude(FISHEYE, xy, covariance, rays, R)
@@ -127,7 +127,7 @@ def test_gross_outliers_are_left_out_and_do_not_pull() -> None:
 
 def test_sigma_falls_with_the_number_of_stars_and_roll_is_weak_in_a_narrow_field() -> None:
     def sigmas(camera: Camera, n: int) -> np.ndarray:
-        fits = [solved(camera, seed, n)[0] for seed in range(20)]
+        fits = [solve_draw(camera, seed, n)[0] for seed in range(20)]
         return np.sqrt(np.mean([np.diag(f.attitude.covariance_rad2) for f in fits], axis=0)) / ARCSEC
 
     few, many = sigmas(FISHEYE, 25), sigmas(FISHEYE, 400)
@@ -157,7 +157,7 @@ def test_equal_errors_give_the_textbook_sigma() -> None:
 
 
 def test_fewer_than_three_stars_is_refused() -> None:
-    xy, covariance, rays, R = drawn(FISHEYE, 2, np.random.default_rng(5))
+    xy, covariance, rays, R = draw_stars(FISHEYE, 2, np.random.default_rng(5))
     with pytest.raises(NotIdentified, match="fewer than 3") as caught:
         solve_attitude(FISHEYE, xy, covariance, rays, R)
     assert caught.value.reason == "not_identified"
@@ -174,7 +174,7 @@ def test_an_error_of_the_lens_that_the_camera_file_states_is_in_the_covariance()
     nees, blind = [], []
     for seed in range(60):
         rng = np.random.default_rng([seed, 11])
-        xy, centroids, rays, R = drawn(FISHEYE, 150, rng)
+        xy, centroids, rays, R = draw_stars(FISHEYE, 150, rng)
         error = dict(zip(order, rng.multivariate_normal(np.zeros(5), covariance), strict=True))
         stated = replace(with_update(FISHEYE, error), covariance_order=order, covariance=covariance)
         for camera, found in ((stated, nees), (replace(stated, covariance=None), blind)):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from astropy.table import Table
-from batch_helpers import frames, listed
+from batch_helpers import frames, stdin_of
 
 from startrack.batch import stored_record
 from startrack.cli.main import main
@@ -117,7 +117,7 @@ def test_a_solution_without_one_of_its_files_is_not_whole(folder, companion):
 
 def test_the_tables_hold_one_kind_of_settings(folder, capsys, monkeypatch):
     """A run of one image with another flag: what the other images' results say was made without it."""
-    monkeypatch.setattr("sys.stdin", listed("01.png"))
+    monkeypatch.setattr("sys.stdin", stdin_of("01.png"))
     assert batch(folder, "--exposure", "2", "--files-on-stdin") == 5
     assert "2 results of other settings or contents left out" in capsys.readouterr().err
     assert table(folder) == {"01.png": "refused"}
@@ -125,7 +125,7 @@ def test_the_tables_hold_one_kind_of_settings(folder, capsys, monkeypatch):
 
 def test_the_tables_hold_what_the_images_hold_now(folder, capsys, monkeypatch):
     shutil.copy(folder / "images" / "02.png", folder / "images" / SOLVED)
-    monkeypatch.setattr("sys.stdin", listed("01.png"))
+    monkeypatch.setattr("sys.stdin", stdin_of("01.png"))
     assert batch(folder, "--files-on-stdin") == 5
     assert "1 result of other settings or contents left out" in capsys.readouterr().err
     assert table(folder) == {"01.png": "refused", "02.png": "refused"}
@@ -133,7 +133,7 @@ def test_the_tables_hold_what_the_images_hold_now(folder, capsys, monkeypatch):
 
 def test_a_run_of_some_images_gives_the_tables_of_all(folder, monkeypatch):
     before = table(folder)
-    monkeypatch.setattr("sys.stdin", listed("01.png"))
+    monkeypatch.setattr("sys.stdin", stdin_of("01.png"))
     assert batch(folder, "--files-on-stdin") == 5
     assert table(folder) == before
 
@@ -146,7 +146,7 @@ def test_what_is_no_whole_record_is_none(folder, monkeypatch, text):
     result = folder / "out" / "01.fix.json"
     result.write_text(text)
     assert stored_record(result) is None
-    monkeypatch.setattr("sys.stdin", listed("02.png"))
+    monkeypatch.setattr("sys.stdin", stdin_of("02.png"))
     assert batch(folder, "--files-on-stdin") == 5
     assert list(table(folder)) == [SOLVED, "02.png"]
     assert batch(folder) == 5

@@ -45,7 +45,7 @@ def pixel_rays(dx, dy):
     return TRUTH.unproject(np.stack([x + dx, y + dy], axis=-1))
 
 
-def rays_to_board(pose, rays):
+def board_positions(pose, rays):
     """Places on the board (n, 2) [squares, from the first inner corner] where the rays meet it, and the depth."""
     turn, middle = pose
     R = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()  # board to cam
@@ -54,13 +54,13 @@ def rays_to_board(pose, rays):
     return ((rays * depth[..., None] - origin) @ R)[..., :2], depth
 
 
-def drawn(pose, colour):
+def draw_picture(pose, colour):
     """A picture of the board; `colour` gives brightness at places."""
     step = (np.arange(SUPERSAMPLED) - (SUPERSAMPLED - 1) / 2) / SUPERSAMPLED
     total = np.zeros(SIZE_PX[::-1])
     for dx in step:
         for dy in step:
-            place, depth = rays_to_board(pose, pixel_rays(dx, dy))
+            place, depth = board_positions(pose, pixel_rays(dx, dy))
             total += np.where(depth > 0, colour(place), 0.4)
     noise = np.random.default_rng(3).normal(0, 40, total.shape)
     return Exposure(pixels_adu=(8000 * total / SUPERSAMPLED**2 + 500 + noise).astype(np.float32), name="board")
@@ -100,13 +100,13 @@ def map_error_px(camera):
 
 @pytest.fixture(scope="module")
 def chessboards():
-    return [drawn(pose, chessboard) for pose in POSES]
+    return [draw_picture(pose, chessboard) for pose in POSES]
 
 
 def test_drawn_corners_are_found_where_they_are(chessboards):
     """The drawing and OpenCV's detector agree: what follows rests on both."""
     found = find_corners(chessboards[1], Board(COLUMNS, ROWS))
-    place, _ = rays_to_board(POSES[1], TRUTH.unproject(found.xy_px))
+    place, _ = board_positions(POSES[1], TRUTH.unproject(found.xy_px))
     assert np.median(np.abs(place - np.rint(place))) < 0.005
     assert np.abs(place - np.rint(place)).max() < 0.1
 
@@ -123,7 +123,7 @@ def test_chessboards_give_the_lens(chessboards):
 
 def test_charuco_boards_give_the_lens():
     colour = charuco(COLUMNS + 1, ROWS + 1)
-    pictures = [drawn(pose, colour) for pose in POSES[:8]]
+    pictures = [draw_picture(pose, colour) for pose in POSES[:8]]
     found = calibrate_board(pictures, Board(COLUMNS + 1, ROWS + 1, charuco="DICT_5X5_100"))
     assert len(found.images) >= 5
     assert map_error_px(found.camera) < 0.4
@@ -166,7 +166,7 @@ def test_the_command(chessboards, tmp_path, capsys):
 
 def test_pictures_without_a_board_are_refused(chessboards):
     with pytest.raises(NotIdentified, match="pattern") as refusal:
-        calibrate_board([drawn(POSES[0], lambda place: np.full(place.shape[:-1], 0.5))], Board(COLUMNS, ROWS))
+        calibrate_board([draw_picture(POSES[0], lambda place: np.full(place.shape[:-1], 0.5))], Board(COLUMNS, ROWS))
     assert refusal.value.reason == "no_stars"
     one = calibrate_board(chessboards[:1], Board(COLUMNS, ROWS))
     assert not one.accepted

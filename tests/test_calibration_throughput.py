@@ -51,19 +51,19 @@ def frames():
 
 
 @pytest.fixture(scope="module")
-def found(frames):
+def calibration(frames):
     rough = replace(CAMERA, focal_px=(184.0, 184.0), centre_px=(299.5, 299.5), lens=KannalaBrandt(), sensor=None)
     return calibrate(frames[0], load_catalog().brighter_than(8.0), camera=rough)
 
 
-def test_the_lens_is_the_true_one(found):
-    assert found.accepted, found.failed_checks
-    moved = difference_px(CAMERA, found.camera, cap_grid(found.camera.calibrated_angle_rad))
+def test_the_lens_is_the_true_one(calibration):
+    assert calibration.accepted, calibration.failed_checks
+    moved = difference_px(CAMERA, calibration.camera, cap_grid(calibration.camera.calibrated_angle_rad))
     assert np.sqrt(np.mean(np.sum(moved**2, axis=1))) < 0.03
 
 
-def test_the_sensor_is_the_true_one(found):
-    sensor = found.camera.sensor
+def test_the_sensor_is_the_true_one(calibration):
+    sensor = calibration.camera.sensor
     assert sensor.gain_e_per_adu == pytest.approx(0.5, rel=0.02)
     assert sensor.zero_point_e_per_s == pytest.approx(9000, rel=0.04)
     assert sensor.bias_adu == pytest.approx(202, abs=1)  # dark current of 10 s is in it
@@ -71,25 +71,27 @@ def test_the_sensor_is_the_true_one(found):
     assert sensor.psf_sigma_px == pytest.approx(1.1, rel=0.03)
     angle = np.radians([30, 60, 85])
     np.testing.assert_allclose(sensor.throughput(angle), SENSOR.throughput(angle), atol=0.03)
-    assert found.photometry.properties.psf_by_ring_px == pytest.approx([1.1] * 4, rel=0.06)
+    assert calibration.photometry.properties.psf_by_ring_px == pytest.approx([1.1] * 4, rel=0.06)
 
 
-def test_hot_pixels_are_listed(frames, found):
-    listed = {(int(x), int(y)) for x, y in found.photometry.properties.hot_px}
+def test_hot_pixels_are_listed(frames, calibration):
+    listed = {(int(x), int(y)) for x, y in calibration.photometry.properties.hot_px}
     bright = {px for px, light_e in frames[1].items() if light_e > 400}  # 12 times the noise of the brightest sky
     assert len(bright) >= 20
     assert len(listed & bright) >= 0.9 * len(bright)
     assert len(listed - set(frames[1])) <= 3
 
 
-def test_what_is_given_goes_before_what_is_measured(found):
-    given = measure_photometry(found.joint, KnownSensor(gain_e_per_adu=0.7, read_noise_e=9.0, bias_adu=190.0)).sensor
+def test_what_is_given_goes_before_what_is_measured(calibration):
+    given = measure_photometry(
+        calibration.joint, KnownSensor(gain_e_per_adu=0.7, read_noise_e=9.0, bias_adu=190.0)
+    ).sensor
     assert (given.gain_e_per_adu, given.read_noise_e, given.bias_adu) == (0.7, 9.0, 190.0)
 
 
-def test_without_exposure_times_no_zero_point_is_invented(found):
-    blind = tuple(replace(f, exposure=replace(f.exposure, exposure_s=None)) for f in found.joint.frames)
-    missing = measure_photometry(replace(found.joint, frames=blind), KnownSensor())
+def test_without_exposure_times_no_zero_point_is_invented(calibration):
+    blind = tuple(replace(f, exposure=replace(f.exposure, exposure_s=None)) for f in calibration.joint.frames)
+    missing = measure_photometry(replace(calibration.joint, frames=blind), KnownSensor())
     assert missing.throughput is None
     assert missing.sensor is None
     assert any(re.match("zero point: not measured", note) for note in missing.notes)

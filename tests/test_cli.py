@@ -33,7 +33,7 @@ read_noise_e = 2.5
 """
 FACTS = {"time_utc": "2030-01-01T00:00:00Z", "exposure_s": 1.0, "camera": "small.toml", "terrain": "shackleton-thesis"}
 OK, ERROR, USAGE, REFUSED, BAD_INPUT = 0, 1, 2, 3, 4
-pytestmark = pytest.mark.usefixtures("compiled")  # else the first command announces on stderr that it compiles
+pytestmark = pytest.mark.usefixtures("compiled_kernels")  # else the first command announces on stderr that it compiles
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def write_image(name, pixels, **facts):
     return name
 
 
-def black(name="black.png", shape=(SIZE, SIZE), **facts):
+def black_image(name="black.png", shape=(SIZE, SIZE), **facts):
     return write_image(name, np.zeros(shape, np.uint16), **facts)
 
 
@@ -74,7 +74,7 @@ def stars(name="stars.png", **facts):
     return write_image(name, pixels.round().astype(np.uint16), **facts)
 
 
-def truncated(name="cut.png"):
+def truncated_image(name="cut.png"):
     noise(name)
     whole = Path(name).read_bytes()
     Path(name).write_bytes(whole[: len(whole) // 2])
@@ -113,7 +113,7 @@ def shell(*words, cwd, **environment):
 
 
 def test_a_black_frame_holds_no_stars(folder, capsys):
-    assert reason(capsys, "locate", black()) == (REFUSED, "no_stars")
+    assert reason(capsys, "locate", black_image()) == (REFUSED, "no_stars")
 
 
 def test_a_saturated_frame_holds_no_stars(folder, capsys):
@@ -139,7 +139,7 @@ def test_what_is_no_image_is_bad_input(folder, capsys):
     Path("empty.png").write_bytes(b"")
     Path("text.png").write_text("not a picture")
     Path("folder.png").mkdir()
-    for image in (truncated(), "missing.png", "empty.png", "text.png", "folder.png"):
+    for image in (truncated_image(), "missing.png", "empty.png", "text.png", "folder.png"):
         assert reason(capsys, "locate", image) == (BAD_INPUT, "bad_image"), image
 
 
@@ -192,7 +192,7 @@ def test_identify_and_detect_need_no_time_and_detect_no_camera(folder, capsys):
     [("ok", OK), ("ok dark", REFUSED), ("dark cut ok", BAD_INPUT), ("cut ok dark ok", BAD_INPUT), ("ok ok", OK)],
 )
 def test_the_exit_code_is_that_of_the_worst_image(folder, capsys, kinds, expected):
-    make = {"ok": stars, "dark": black, "cut": truncated}
+    make = {"ok": stars, "dark": black_image, "cut": truncated_image}
     images = [make[kind](f"{k}-{kind}.png") for k, kind in enumerate(kinds.split())]
     code, lines, err = run(capsys, "detect", *images, "--json", "--no-plots")
     assert (code, err) == (expected, "")
@@ -202,7 +202,7 @@ def test_the_exit_code_is_that_of_the_worst_image(folder, capsys, kinds, expecte
 
 
 def test_without_json_there_is_one_line_for_each_image(folder, capsys):
-    code, lines, err = run(capsys, "detect", stars(), black(), "missing.png", "--no-plots")
+    code, lines, err = run(capsys, "detect", stars(), black_image(), "missing.png", "--no-plots")
     assert (code, err) == (BAD_INPUT, "")
     starts = [["stars.png", "ok"], ["black.png", "refused"], ["missing.png", "refused"]]
     assert [line.split()[:2] for line in lines] == starts
@@ -250,7 +250,7 @@ def test_a_result_is_renewed_but_never_that_of_another_image(folder, capsys):
 
 
 def test_a_refused_image_leaves_its_reason_in_the_file_too(folder, capsys):
-    assert reason(capsys, "locate", black()) == (REFUSED, "no_stars")
+    assert reason(capsys, "locate", black_image()) == (REFUSED, "no_stars")
     record = json.loads(Path("startrack-out/black.fix.json").read_text())
     assert (record["status"], record["reason"]) == ("refused", "no_stars")
     assert record["provenance"]["time_utc"] == "2030-01-01T00:00:00.000000Z"
@@ -306,7 +306,7 @@ def test_a_folder_that_takes_no_results_is_named_before_any_work(folder, capsys,
 
 
 def test_no_refusal_shows_a_traceback(folder):
-    images = [truncated(), black(), noise(), "missing.png", stars("s.png", time_utc=None)]
+    images = [truncated_image(), black_image(), noise(), "missing.png", stars("s.png", time_utc=None)]
     done = shell("locate", *images, "--no-plots", cwd=folder)
     assert done.returncode == BAD_INPUT
     assert len(done.stdout.splitlines()) == len(images)
@@ -330,7 +330,7 @@ def test_a_plain_terminal_is_enough(folder):
 
 
 def test_a_name_beyond_ascii_under_an_ascii_locale(folder):
-    black("spä✶.png")
+    black_image("spä✶.png")
     ascii_locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     done = shell("detect", "spä✶.png", "--no-plots", cwd=folder, **ascii_locale)
     assert (done.returncode, done.stderr) == (REFUSED, "")

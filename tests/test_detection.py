@@ -32,20 +32,20 @@ def camera(sigma: float) -> Camera:
 
 
 @lru_cache(maxsize=16)
-def found(sigma: float, known: bool = True) -> Detections:
+def detect_field(sigma: float, known: bool = True) -> Detections:
     return Detector()(field(sigma).exposure, camera(sigma) if known else None)
 
 
-def matched(sigma: float, low: float, high: float, known: bool = True) -> tuple[np.ndarray, np.ndarray]:
+def match_field(sigma: float, low: float, high: float, known: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """True stars of these signal-to-noise ratios, and their detections."""
-    stars, detections = field(sigma), found(sigma, known)
+    stars, detections = field(sigma), detect_field(sigma, known)
     distance, nearest = cKDTree(detections.xy_px).query(stars.xy_px)
     which = np.flatnonzero((distance < 2.0) & (stars.snr >= low) & (stars.snr < high))
     return which, nearest[which]
 
 
 @lru_cache(maxsize=4)
-def every_bound(sigma: float) -> np.ndarray:
+def all_bounds(sigma: float) -> np.ndarray:
     stars = field(sigma)
     pairs = zip(stars.xy_px, stars.flux, strict=True)
     return np.array([np.diag(cramer_rao(xy - np.rint(xy), flux, sigma, VARIANCE)) for xy, flux in pairs])
@@ -53,15 +53,15 @@ def every_bound(sigma: float) -> np.ndarray:
 
 def bounds(sigma: float, which: np.ndarray) -> np.ndarray:
     """Cramer-Rao variances (n, 4) of x, y, flux and level."""
-    return every_bound(sigma)[which]
+    return all_bounds(sigma)[which]
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["camera file", "nothing known"])
 @pytest.mark.parametrize(("low", "high"), BINS)
 @pytest.mark.parametrize("sigma", SIGMAS)
 def test_centroids_reach_the_cramer_rao_bound(sigma: float, low: int, high: int, known: bool) -> None:
-    which, d = matched(sigma, low, high, known)
-    error = found(sigma, known).xy_px[d] - field(sigma).xy_px[which]
+    which, d = match_field(sigma, low, high, known)
+    error = detect_field(sigma, known).xy_px[d] - field(sigma).xy_px[which]
     bound = bounds(sigma, which)[:, :2]
     assert len(which) > 250
     assert np.sqrt(np.mean(error**2 / bound)) < 1.10  # measured: 0.97-1.06; one part in 25 is the statistics
@@ -76,9 +76,9 @@ def test_centroids_reach_the_cramer_rao_bound(sigma: float, low: int, high: int,
 @pytest.mark.parametrize(("low", "high"), [(7, 10), *BINS])
 @pytest.mark.parametrize("sigma", SIGMAS)
 def test_covariances_are_those_of_the_errors(sigma: float, low: int, high: int) -> None:
-    which, d = matched(sigma, low, high)
-    error = found(sigma).xy_px[d] - field(sigma).xy_px[which]
-    chi2 = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found(sigma).covariance_px2[d]), error).mean()
+    which, d = match_field(sigma, low, high)
+    error = detect_field(sigma).xy_px[d] - field(sigma).xy_px[which]
+    chi2 = np.einsum("ni,nij,nj->n", error, np.linalg.inv(detect_field(sigma).covariance_px2[d]), error).mean()
     # 2 is right. Bright stars carry a floor of 3 % of their light for PSFs that are not quite Gaussian.
     assert 1.3 < chi2 < 2.35
 
@@ -86,9 +86,9 @@ def test_covariances_are_those_of_the_errors(sigma: float, low: int, high: int) 
 @pytest.mark.parametrize("sigma", SIGMAS)
 def test_fluxes_are_unbiased_and_their_sigmas_right(sigma: float) -> None:
     for low, high in BINS:
-        which, d = matched(sigma, low, high)
-        off = found(sigma).flux_e[d] - field(sigma).flux[which]
-        z = off / found(sigma).flux_sigma_e[d]
+        which, d = match_field(sigma, low, high)
+        off = detect_field(sigma).flux_e[d] - field(sigma).flux[which]
+        z = off / detect_field(sigma).flux_sigma_e[d]
         relative = np.mean(off / field(sigma).flux[which])
         assert abs(relative) < 0.01
         assert abs(np.median(off / field(sigma).flux[which])) < 0.01
@@ -98,20 +98,20 @@ def test_fluxes_are_unbiased_and_their_sigmas_right(sigma: float) -> None:
 
 @pytest.mark.parametrize("sigma", SIGMAS)
 def test_snr_is_that_of_the_matched_filter_with_the_true_psf(sigma: float) -> None:
-    which, d = matched(sigma, 15, 110)
-    assert np.median(found(sigma).snr[d] / field(sigma).snr[which]) == pytest.approx(1.0, abs=0.03)
+    which, d = match_field(sigma, 15, 110)
+    assert np.median(detect_field(sigma).snr[d] / field(sigma).snr[which]) == pytest.approx(1.0, abs=0.03)
 
 
 def test_without_a_gain_fluxes_are_in_the_images_own_unit() -> None:
     stars = field(1.0)
     doubled = replace(stars.exposure, pixels_adu=2 * stars.exposure.pixels_adu + 300)
-    plain, again = found(1.0, known=False), Detector()(doubled)
+    plain, again = detect_field(1.0, known=False), Detector()(doubled)
     assert len(again) == pytest.approx(len(plain), abs=3)
     assert np.median(again.flux_e[:400]) == pytest.approx(2 * np.median(plain.flux_e[:400]), rel=1e-3)
     with_gain = replace(camera(1.0), sensor=replace(camera(1.0).sensor, gain_e_per_adu=0.5, bias_adu=300.0))
     known = Detector()(doubled, with_gain)
-    assert known.flux_e == pytest.approx(found(1.0).flux_e, rel=1e-4)
-    assert known.xy_px == pytest.approx(found(1.0).xy_px, abs=1e-4)
+    assert known.flux_e == pytest.approx(detect_field(1.0).flux_e, rel=1e-4)
+    assert known.xy_px == pytest.approx(detect_field(1.0).xy_px, abs=1e-4)
 
 
 @pytest.mark.parametrize("sigma", SIGMAS)
@@ -282,7 +282,7 @@ def test_close_pairs_are_parted_or_left_alone() -> None:
 
 
 def test_detections_come_brightest_first_and_only_once() -> None:
-    detections = found(1.0)
+    detections = detect_field(1.0)
     assert np.all(np.diff(detections.flux_e) <= 0)
     assert len(cKDTree(detections.xy_px).query_pairs(1.2)) == 0
     assert detections.background_e.shape == detections.noise_e.shape == (SIZE, SIZE)
@@ -302,7 +302,7 @@ def test_no_worse_than_sep(sigma: float) -> None:
                                     subpix=5)  # fmt: skip
     xs, ys, _ = sep.winpos(image, objects["x"], objects["y"], 2 / 2.35 * half_light)
     theirs = cKDTree(np.stack([xs, ys], axis=1))
-    ours = cKDTree(found(sigma).xy_px)
+    ours = cKDTree(detect_field(sigma).xy_px)
     for low, high in BINS:
         chosen = stars.xy_px[(stars.snr >= low) & (stars.snr < high)]
         mine, other = ours.query(chosen)[0], theirs.query(chosen)[0]

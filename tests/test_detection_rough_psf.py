@@ -24,7 +24,7 @@ def pixel_gaussian(xy, flux, sigma_px=SIGMA_PX):
     return frame
 
 
-def trailed(xy, flux, length_px, steps=15):
+def trail_stars(xy, flux, length_px, steps=15):
     """The same stars, each drawn along a line whose direction changes over the frame."""
     turn = np.pi * xy[:, 0] / SIZE
     along = np.stack([np.cos(turn), np.sin(turn)], axis=1)
@@ -40,7 +40,7 @@ def test_bright_trailed_stars_are_stars_and_hot_pixels_are_not(length_px):
     flux = np.geomspace(2e3, 3e5, len(xy))
     hot = rng.integers(20, SIZE - 20, (150, 2))
     hot = hot[cKDTree(xy).query(hot)[0] > 10]
-    frame = 2400 + trailed(xy, flux, length_px) + rng.normal(0, 40, (SIZE, SIZE))
+    frame = 2400 + trail_stars(xy, flux, length_px) + rng.normal(0, 40, (SIZE, SIZE))
     frame[hot[:, 1], hot[:, 0]] += rng.uniform(1e3, 5e4, len(hot))
     found = Detector()(Exposure(pixels_adu=np.clip(frame, 0, 65535).round(), saturation_adu=65535.0))
 

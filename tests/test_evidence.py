@@ -23,7 +23,7 @@ SIZE, VARIANCE, READ_NOISE = 1024, 100.0, 2.5
 SCATTER = 0.05
 
 
-def noisy(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def add_noise(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Background-subtracted pixels [e] of the light on a background of the usual variance."""
     background = VARIANCE - READ_NOISE**2
     return (rng.poisson(light + background) - background + rng.normal(0, READ_NOISE, light.shape)).astype(np.float32)
@@ -52,7 +52,7 @@ class Measured:
         return visibility_llr(m.flux_e, self.expected, np.sqrt(hidden), np.sqrt(shining))
 
 
-def measured(
+def measure_pairs(
     sigma: float, shining: float, *, rng: np.random.Generator, neighbours: tuple[float, float] | None = None,
     faintest: float = 30.0, brightest: float = 3000.0, spacing: int = 20,
 ) -> Measured:  # fmt: skip
@@ -74,7 +74,7 @@ def measured(
     paint(image, xy, true, sigma)
     sources = Sources(xy_px=xy, flux_e=expected, fraction_sigma=np.full(len(xy), SCATTER), visible=thought)
     noise = np.full((SIZE, SIZE), np.sqrt(VARIANCE), np.float32)
-    light = measure(noisy(image, rng), np.zeros_like(noise), noise, np.zeros((SIZE, SIZE), bool), sources, sigma)
+    light = measure(add_noise(image, rng), np.zeros_like(noise), noise, np.zeros((SIZE, SIZE), bool), sources, sigma)
     return Measured(expected, true, shines, light, n)
 
 
@@ -87,7 +87,7 @@ def measured(
 def test_photometry_is_unbiased_and_its_variance_right(
     sigma: float, shining: float, neighbours: tuple[float, float] | None
 ) -> None:
-    got = measured(sigma, shining, rng=np.random.default_rng(1), neighbours=neighbours)
+    got = measure_pairs(sigma, shining, rng=np.random.default_rng(1), neighbours=neighbours)
     z = got.z()
     assert len(z) > 0.97 * got.firsts
     assert abs(z.mean()) < 0.07  # 2500 stars: 3.5 of its own standard deviations
@@ -102,7 +102,7 @@ def test_photometry_is_unbiased_and_its_variance_right(
 @pytest.mark.parametrize("sigma", [0.7, 1.0, 1.5])
 def test_photometry_wastes_no_light(sigma: float) -> None:
     """Variance of hidden stars against the Cramer-Rao bound with the place known and the level free."""
-    got = measured(sigma, 0.0, rng=np.random.default_rng(2))
+    got = measure_pairs(sigma, 0.0, rng=np.random.default_rng(2))
     p = cramer_rao(np.zeros(2), 1e-6, sigma, VARIANCE)  # no light: place and flux do not mix
     bound = p[2, 2]
     assert np.median(got.light.variance_e2) < 1.25 * bound  # the stamp is small: the level costs some
@@ -115,7 +115,7 @@ def test_ratios_mean_what_they_say(neighbours: tuple[float, float] | None) -> No
     rng = np.random.default_rng(3)
     llr, shines = [], []
     for _ in range(3):
-        got = measured(
+        got = measure_pairs(
             1.0, 0.5, rng=rng, neighbours=neighbours, faintest=10, brightest=600, spacing=20 if neighbours else 15
         )
         use = got.light.usable[: got.firsts]
@@ -168,7 +168,7 @@ def test_a_hot_pixel_near_a_star_is_masked(flux: float, excess: float) -> None:
     expected = np.full(len(xy), flux)
     image = np.zeros((SIZE, SIZE))
     paint(image, xy[::2], expected[::2], 1.0)  # every other star shines
-    image = noisy(image, rng)
+    image = add_noise(image, rng)
     spot = np.rint(xy).astype(int) + rng.integers(-3, 4, xy.shape)
     image[spot[:, 1], spot[:, 0]] += excess
     sources = Sources(xy_px=xy, flux_e=expected, fraction_sigma=np.full(len(xy), 0.05), visible=np.full(len(xy), 0.5))
@@ -220,10 +220,10 @@ def frame(stars: Stars, shines: np.ndarray, rng: np.random.Generator) -> tuple[n
         saturated=np.zeros(0, bool), psf_sigma_px=1.0, background_e=background,
         noise_e=np.full((512, 512), 10.0, np.float32),
     )  # fmt: skip
-    return noisy(light, rng) + background, detections
+    return add_noise(light, rng) + background, detections
 
 
-def seen(
+def measure_frame(
     stars: Stars, shines: np.ndarray, rng: np.random.Generator, dead: np.ndarray | None = None, **how: Any
 ) -> StarPhotometry:
     image, detections = frame(stars, shines, rng)
@@ -239,7 +239,7 @@ def test_every_star_in_view_gets_a_verdict() -> None:
     rng = np.random.default_rng(5)
     stars = random_stars(1500, rng)
     shines = stars.rays_icrs[:, 0] > 0  # a wall in the west
-    light = seen(stars, shines, rng)
+    light = measure_frame(stars, shines, rng)
     _, inside = CAMERA.project(stars.rays_icrs @ R_CAM_ENU.T)
     assert set(light.star.tolist()) == set(np.flatnonzero(inside & (stars.v_mag < 8)).tolist())
     azimuth, elevation = azel_from_rays(stars.rays_icrs[light.star])
@@ -269,7 +269,7 @@ def test_why_stars_cannot_be_used() -> None:
     dead = np.zeros((512, 512), bool)
     x, y = np.rint(px[inside & (stars.rays_icrs[:, 2] > 0.5)][7]).astype(int)
     dead[y - 3 : y + 4, x - 3 : x + 4] = True
-    light = seen(stars, np.ones(len(stars), bool), rng, dead, bodies=[venus])
+    light = measure_frame(stars, np.ones(len(stars), bool), rng, dead, bodies=[venus])
     cause = {int(s): str(c) for s, c in zip(light.star, light.cause, strict=True)}
     assert cause[20] == "beside Venus"
     beside = [s for s, c in cause.items() if c == "beside Venus"]
@@ -291,7 +291,7 @@ def test_stars_at_the_frame_edge_are_left_out() -> None:
     px = np.array([[255.0, 400.0], [255.0, edge], [255.0, edge - 2]])
     narrow = replace(CAMERA, size_px=(512, 512), focal_px=(500.0, 500.0))  # the frame cuts the circle
     stars = stars_at(narrow.unproject(px), np.array([3.0, 3.1, 3.2]))
-    image = noisy(np.zeros((512, 512)), rng)
+    image = add_noise(np.zeros((512, 512)), rng)
     _, detections = frame(stars, np.zeros(3, bool), rng)
     detections = replace(detections, background_e=np.zeros((512, 512), np.float32))
     dead = np.zeros((512, 512), bool)
@@ -301,9 +301,9 @@ def test_stars_at_the_frame_edge_are_left_out() -> None:
 
 def test_one_lonely_star_and_none_at_all() -> None:
     rng = np.random.default_rng(8)
-    lonely = seen(stars_at([[0.0, 0.3, 0.95]], [3.0]), np.ones(1, bool), rng)
+    lonely = measure_frame(stars_at([[0.0, 0.3, 0.95]], [3.0]), np.ones(1, bool), rng)
     assert lonely.llr[0] > 6
-    below = seen(stars_at([[0.0, 0.0, -1.0]], [3.0]), np.ones(1, bool), rng)
+    below = measure_frame(stars_at([[0.0, 0.0, -1.0]], [3.0]), np.ones(1, bool), rng)
     assert len(below.star) == len(below.evidence()) == 0
 
 
@@ -315,8 +315,8 @@ def test_uncertain_stars_say_less_when_missing() -> None:
     steady = stars_at(rays, np.full(len(rays), 4.0))
     variable = replace(steady, v_sigma_mag=np.full(len(rays), 0.5))
     hidden = np.zeros(len(rays), bool)
-    sure = seen(steady, hidden, np.random.default_rng(10)).llr
-    unsure = seen(variable, hidden, np.random.default_rng(10)).llr
+    sure = measure_frame(steady, hidden, np.random.default_rng(10)).llr
+    unsure = measure_frame(variable, hidden, np.random.default_rng(10)).llr
     assert np.median(sure) < -5
     assert np.median(unsure) > 0.75 * np.median(sure)
 

@@ -23,7 +23,7 @@ def horizon_at(place):
     return partial(CRATER.horizon_rad, np.asarray(place)[None, :])
 
 
-def levelled(image, found, horizon):
+def subtract_step(image, found, horizon):
     dead = np.zeros(image.shape, bool)
     step = measure_sky_step(lambda *at: (image[at], dead[at]), found, CAMERA, R_CAM_ENU, horizon)
     assert step is not None and step.exceeds_noise
@@ -53,7 +53,7 @@ def frame():
 
 def test_the_step_goes_and_each_side_has_its_own_noise(frame):
     image, found, above, light = frame
-    better = levelled(image, found, horizon_at(PLACE))
+    better = subtract_step(image, found, horizon_at(PLACE))
     inner = np.abs(above) < 8
     assert np.sqrt(np.mean((found.background_e - light)[inner] ** 2)) > 30
     assert np.sqrt(np.mean((better.background_e - light)[inner] ** 2)) < 3
@@ -66,7 +66,7 @@ def test_a_skyline_a_little_off_gives_the_same_background(frame):
     """An error of the fix shifts the profile's own origin, not the light that is taken out."""
     image, found, above, light = frame
     aside = horizon_at(PLACE + np.array([12.0, -8.0]))
-    better = levelled(image, found, aside)
+    better = subtract_step(image, found, aside)
     assert np.sqrt(np.mean((better.background_e - light)[np.abs(above) < 6] ** 2)) < 4
 
 

@@ -31,10 +31,10 @@ def test_permission_denied(tmp_path, monkeypatch):
     path = tmp_path / "frame.png"
     path.write_bytes(WHOLE)
 
-    def denied(*_args, **_keywords):
+    def deny_access(*_args, **_keywords):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("pathlib.Path.read_bytes", denied)
+    monkeypatch.setattr("pathlib.Path.read_bytes", deny_access)
     with pytest.raises(BadInput, match="Permission denied"):
         read_exposure(path)
 

@@ -41,15 +41,15 @@ def colours(tmp_path_factory) -> Path:
     return path
 
 
-def with_sidecar(image: Path, **more: str) -> Path:
+def add_sidecar(image: Path, **more: str) -> Path:
     facts = json.loads(SAMPLE.with_suffix(".json").read_text())
     image.with_suffix(".json").write_text(json.dumps(facts | more))
     return image
 
 
 def test_a_mosaic_is_located_and_shows_more_stars_than_its_raw_pixels(colours):
-    plain = startrack.locate(with_sidecar(colours))
-    solution = startrack.locate(with_sidecar(colours, bayer_pattern="RGGB"))
+    plain = startrack.locate(add_sidecar(colours))
+    solution = startrack.locate(add_sidecar(colours, bayer_pattern="RGGB"))
     truth = json.loads(SAMPLE.with_suffix(".truth.json").read_text())["position_enu_m"]
     assert solution and solution.result.identification is not None and plain.result.identification is not None
     assert len(solution.result.identification.star) > 2 * len(plain.result.identification.star)
@@ -58,7 +58,7 @@ def test_a_mosaic_is_located_and_shows_more_stars_than_its_raw_pixels(colours):
 
 
 def test_levels_become_one_and_gains_are_found(colours):
-    pixels = read_exposure(with_sidecar(colours)).pixels_adu
+    pixels = read_exposure(add_sidecar(colours)).pixels_adu
     even = equalize_mosaic(pixels, 65535.0)
     middles = [np.median(even[i:400:2, j:400:2]) for (i, j), _ in PATTERN]
     assert np.ptp(middles) < 1.0 < np.ptp([np.median(pixels[i:400:2, j:400:2]) for (i, j), _ in PATTERN])
@@ -80,7 +80,7 @@ def test_saturated_pixels_stay_saturated():
 @pytest.mark.parametrize("pattern", ["RGBW", "RBGG", "GGRB", "mono", 3])
 def test_other_patterns_are_refused_in_a_sidecar(colours, pattern):
     with pytest.raises(BadInput, match="bayer_pattern must be RGGB or BGGR or GRBG or GBRG"):
-        read_exposure(with_sidecar(colours, bayer_pattern=pattern))
+        read_exposure(add_sidecar(colours, bayer_pattern=pattern))
 
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG", " grbg "])

@@ -39,17 +39,17 @@ class Frame:
     star: np.ndarray  # true index into sky() of each detection, -1 for a false one
     R_cam_icrs: np.ndarray
 
-    def clear(self, camera: Camera) -> np.ndarray:
+    def clear_stars(self, camera: Camera) -> np.ndarray:
         """True stars with no other within 3.6 px that is at most 1.5 mag fainter: their name is plain."""
         px, inside = camera.project(sky().rays_icrs @ self.R_cam_icrs.T)
         seen = np.flatnonzero(inside)
         near = cKDTree(px[seen]).query_ball_point(self.detections.xy_px, 3.6)
         v = sky().v_mag
 
-        def alone(s: int, others: list[int]) -> bool:
+        def is_alone(s: int, others: list[int]) -> bool:
             return s >= 0 and not any(seen[j] != s and v[seen[j]] < v[s] + 1.5 for j in others)
 
-        return np.array([alone(s, others) for s, others in zip(self.star, near, strict=True)])
+        return np.array([is_alone(s, others) for s, others in zip(self.star, near, strict=True)])
 
 
 def frame(
@@ -64,21 +64,21 @@ def frame(
     side = (px[star] - camera.centre_px) @ rng.normal(size=2)
     star = star[side >= np.quantile(side, hidden)][:brightest]
     star = star if some is None else np.sort(rng.permutation(star)[:some])
-    wrong = scattered(camera, round(false * len(star)), rng)
+    wrong = random_positions(camera, round(false * len(star)), rng)
     xy = np.concatenate([px[star] + rng.normal(0, noise_px, (len(star), 2)), wrong])
     v = sky().v_mag[star] + rng.normal(0, 0.1, len(star))
     v = np.concatenate([v, rng.choice(v, len(wrong))])
     order = np.argsort(v)
     truth = np.concatenate([star, np.full(len(wrong), -1)])
-    return Frame(detected(xy[order], v[order], noise_px), truth[order], R)
+    return Frame(make_detections(xy[order], v[order], noise_px), truth[order], R)
 
 
-def scattered(camera: Camera, n: int, rng: np.random.Generator) -> np.ndarray:
+def random_positions(camera: Camera, n: int, rng: np.random.Generator) -> np.ndarray:
     xy = rng.uniform(0, np.array(camera.size_px) - 1, (3 * n + 10, 2))
     return xy[camera.angle_rad(xy) < camera.max_angle_rad][:n]
 
 
-def detected(xy_px: np.ndarray, v_mag: np.ndarray, sigma_px: float) -> Detections:
+def make_detections(xy_px: np.ndarray, v_mag: np.ndarray, sigma_px: float) -> Detections:
     """Detections, brightest first, from places and magnitudes."""
     n, flux = len(xy_px), 10 ** (-0.4 * (v_mag - ZERO_MAG))
     return Detections(
@@ -88,7 +88,7 @@ def detected(xy_px: np.ndarray, v_mag: np.ndarray, sigma_px: float) -> Detection
     )  # fmt: skip
 
 
-def off(found: Identification, truth: Frame) -> float:
+def attitude_error_rad(found: Identification, truth: Frame) -> float:
     """Attitude error [rad]."""
     return float(Rotation.from_matrix(truth.R_cam_icrs @ found.R_cam_icrs.T).magnitude())
 
@@ -111,12 +111,12 @@ def test_random_attitudes_are_identified(case: str) -> None:
     for seed in range(3 if camera is FISHEYE else 1):
         truth = frame(camera, seed, **how)
         found = Identifier()(truth.detections, camera, sky())
-        assert off(found, truth) < arcsec * ARCSEC
+        assert attitude_error_rad(found, truth) < arcsec * ARCSEC
         assert found.false_alarm_probability < 1e-30
         assert len(set(found.star.tolist())) == len(set(found.detection.tolist())) == len(found)  # one to one
         right += int(np.count_nonzero(truth.star[found.detection] == found.star))
         named += len(found)
-        clear = truth.clear(camera)
+        clear = truth.clear_stars(camera)
         plain += int(clear.sum())
         plain_named += int(clear[found.detection].sum())
     assert right >= 0.995 * named  # precision
@@ -142,7 +142,7 @@ def test_a_handful_of_stars_is_enough(case: str) -> None:
         except NotIdentified:
             continue
         solved += 1
-        assert off(found, truth) < 200 * ARCSEC
+        assert attitude_error_rad(found, truth) < 200 * ARCSEC
         assert np.array_equal(truth.star[found.detection], found.star)
         assert found.false_alarm_probability < 1e-9
     assert solved == 6
@@ -159,22 +159,22 @@ def test_ten_stars_in_a_narrow_field() -> None:
 @pytest.mark.parametrize("clustered", [False, True], ids=["uniform", "clustered"])
 def test_a_sky_of_chance_is_refused(count: int, clustered: bool) -> None:
     rng = np.random.default_rng(count)
-    xy = scattered(FISHEYE, count, rng)
+    xy = random_positions(FISHEYE, count, rng)
     if clustered:
         middles = rng.uniform(500, 1500, (5, 2))
         xy = middles[rng.integers(5, size=count)] + rng.normal(0, 90, (count, 2))
     v = np.sort(6 + np.log(rng.random(len(xy))) / 1.08)  # the magnitudes of a real sky
     with pytest.raises(NotIdentified, match="chance") as caught:
-        Identifier()(detected(xy, v, 0.2), FISHEYE, sky())
+        Identifier()(make_detections(xy, v, 0.2), FISHEYE, sky())
     assert caught.value.reason == "not_identified"
     assert caught.value.evidence["detected"] == count
 
 
 def test_chance_in_a_narrow_field_is_refused() -> None:
     rng = np.random.default_rng(3)
-    xy = scattered(NARROW, 60, rng)
+    xy = random_positions(NARROW, 60, rng)
     with pytest.raises(NotIdentified, match="chance"):
-        Identifier()(detected(xy, np.sort(rng.uniform(3, 8, len(xy))), 0.2), NARROW, sky())
+        Identifier()(make_detections(xy, np.sort(rng.uniform(3, 8, len(xy))), 0.2), NARROW, sky())
 
 
 ODDS = {"wide": (FISHEYE, 10.0, 1.0, 400), "narrow": (NARROW, 2.0, 0.15, 8000)}  # cap and radius [deg], stars
@@ -189,7 +189,7 @@ def test_the_stated_odds_of_chance_are_true(clustered: bool, field: str) -> None
     bright = sky().rays_icrs[:stars]
     radius, p_values = np.radians(radius_deg), []
     for _ in range(12):
-        xy = scattered(camera, 150, rng)
+        xy = random_positions(camera, 150, rng)
         if clustered:
             xy = rng.uniform(0.3, 0.7, (6, 2))[rng.integers(6, size=150)] * width
             xy += rng.normal(0, 0.06 * width, (150, 2))
@@ -217,7 +217,7 @@ def test_a_mirrored_frame_is_named_as_such() -> None:
         Identifier()(mirrored, FISHEYE, sky())
     assert caught.value.reason == "mirrored"
     found = Identifier()(mirrored, replace(FISHEYE, mirrored=True), sky())
-    assert off(found, truth) < 30 * ARCSEC
+    assert attitude_error_rad(found, truth) < 30 * ARCSEC
 
 
 @pytest.mark.parametrize("error", [0.97, 0.99, 1.01, 1.03])
@@ -233,39 +233,39 @@ def test_a_slightly_wrong_focal_length_does_no_great_harm() -> None:
     truth = frame(FISHEYE, 0)
     found = Identifier()(truth.detections, replace(FISHEYE, focal_px=(652.65, 652.65)), sky())  # 1.5 px at the rim
     assert np.mean(truth.star[found.detection] == found.star) > 0.99
-    assert off(found, truth) < 250 * ARCSEC
+    assert attitude_error_rad(found, truth) < 250 * ARCSEC
 
 
 def test_a_rough_camera_may_be_used_to_begin_a_calibration() -> None:
     truth, wrong = frame(FISHEYE, 0), replace(FISHEYE, focal_px=(650.0, 650.0))
     found = Identifier(whole_field=False)(truth.detections, wrong, sky())
     assert np.mean(truth.star[found.detection] == found.star) > 0.95
-    assert off(found, truth) < np.radians(1)
+    assert attitude_error_rad(found, truth) < np.radians(1)
 
 
 @pytest.mark.parametrize("count", [0, 1, 5])
 def test_too_few_detections_say_so(count: int) -> None:
-    xy = scattered(FISHEYE, 50, np.random.default_rng(5))[:count]
+    xy = random_positions(FISHEYE, 50, np.random.default_rng(5))[:count]
     with pytest.raises(NotIdentified, match=f"{count} point sources are too few"):
-        Identifier()(detected(xy, np.linspace(1, 3, count), 0.2), FISHEYE, sky())
+        Identifier()(make_detections(xy, np.linspace(1, 3, count), 0.2), FISHEYE, sky())
 
 
 def test_detections_outside_the_image_circle_are_ignored() -> None:
     truth = frame(FISHEYE, 2)
     corner = np.stack([np.linspace(1, 120, 200), np.linspace(120, 1, 200)], axis=1)
     v = np.concatenate([np.full(200, -5.0), -2.5 * np.log10(truth.detections.flux_e) + ZERO_MAG])
-    crowded = detected(np.concatenate([corner, truth.detections.xy_px]), v, 0.2)
+    crowded = make_detections(np.concatenate([corner, truth.detections.xy_px]), v, 0.2)
     found = Identifier()(crowded, FISHEYE, sky())
-    assert off(found, truth) < 30 * ARCSEC
+    assert attitude_error_rad(found, truth) < 30 * ARCSEC
     assert found.detection.min() >= 200
 
 
 def test_bright_lights_that_are_no_stars_are_counted_as_unexplained() -> None:
     truth = frame(FISHEYE, 3, false=0.0)
-    strangers = scattered(FISHEYE, 9, np.random.default_rng(6))
+    strangers = random_positions(FISHEYE, 9, np.random.default_rng(6))
     v = np.concatenate([np.full(9, -3.0), -2.5 * np.log10(truth.detections.flux_e) + ZERO_MAG])
-    found = Identifier()(detected(np.concatenate([strangers, truth.detections.xy_px]), v, 0.2), FISHEYE, sky())
-    assert off(found, truth) < 30 * ARCSEC
+    found = Identifier()(make_detections(np.concatenate([strangers, truth.detections.xy_px]), v, 0.2), FISHEYE, sky())
+    assert attitude_error_rad(found, truth) < 30 * ARCSEC
     assert 7 <= found.unexplained <= 9  # one or two of them may lie beside a faint star
     assert not np.isin(found.detection, np.arange(9)).any()
 
@@ -276,7 +276,7 @@ def test_saturated_stars_may_be_brighter_than_they_look() -> None:
     clipped = np.minimum(d.flux_e, 3e5)
     dull = replace(d, flux_e=clipped, saturated=d.flux_e > 3e5)
     found = Identifier()(dull, FISHEYE, sky())
-    bright = np.flatnonzero((d.flux_e > 3e5) & truth.clear(FISHEYE))
+    bright = np.flatnonzero((d.flux_e > 3e5) & truth.clear_stars(FISHEYE))
     assert len(bright) > 40
     assert np.isin(bright, found.detection).mean() > 0.95
 

@@ -52,7 +52,7 @@ def layer(room: str) -> int:
     return next(k for k, names in enumerate(LAYERS) if room in names)
 
 
-def imported(tree: ast.AST, package: tuple[str, ...]) -> Iterator[str]:
+def imported_names(tree: ast.AST, package: tuple[str, ...]) -> Iterator[str]:
     """Dotted names of all modules that a source imports, wherever it does; `package` resolves relative ones."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -71,7 +71,7 @@ def edges() -> list[tuple[Path, str, str]]:
         if path in (ROOT / "__init__.py", ROOT / "__main__.py"):  # the front doors
             continue
         package = ("startrack", *path.relative_to(ROOT).parent.parts)
-        for name in imported(ast.parse(path.read_text(encoding="utf-8")), package):
+        for name in imported_names(ast.parse(path.read_text(encoding="utf-8")), package):
             parts = name.split(".")
             if parts[0] == "startrack" and len(parts) > 1 and parts[1] in rooms() and parts[1] != room_of(path):
                 found.append((path, room_of(path), parts[1]))
@@ -114,7 +114,7 @@ def test_each_exception_is_still_needed():
     ],
 )
 def test_the_check_sees_every_way_to_import(source, room, other):
-    names = [name.split(".")[1] for name in imported(ast.parse(source), ("startrack", room))]
+    names = [name.split(".")[1] for name in imported_names(ast.parse(source), ("startrack", room))]
     assert names == [other]
     assert violations([(ROOT / room / "x.py", room, other)]) != []
 
@@ -130,7 +130,7 @@ def top_level_imports(path: Path) -> set[str]:
     """Modules that are loaded as soon as the file is imported (not within a function or under TYPE_CHECKING)."""
     body = ast.parse(path.read_text(encoding="utf-8")).body
     now = ast.Module([node for node in body if isinstance(node, ast.Import | ast.ImportFrom)], type_ignores=[])
-    return {name.split(".")[0] for name in imported(now, ("startrack", *path.relative_to(ROOT).parent.parts))}
+    return {name.split(".")[0] for name in imported_names(now, ("startrack", *path.relative_to(ROOT).parent.parts))}
 
 
 def test_heavy_modules_are_imported_where_they_are_used():

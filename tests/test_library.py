@@ -42,7 +42,7 @@ def submodules() -> list[types.ModuleType]:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def everything_is_imported() -> list[types.ModuleType]:
+def import_everything() -> list[types.ModuleType]:
     """A submodule of the same name as a function would now stand in its place."""
     return submodules()
 

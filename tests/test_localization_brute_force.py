@@ -53,7 +53,7 @@ def log_likelihood(places: np.ndarray, evidence: Evidence, capped: bool) -> np.n
     return total
 
 
-def rays_seen(at_m: np.ndarray, n: int, sigma_rad: float, rng: np.random.Generator) -> Evidence:
+def simulate_rays(at_m: np.ndarray, n: int, sigma_rad: float, rng: np.random.Generator) -> Evidence:
     """Rays of signal-to-noise ratio 1 to 4, measured from the place."""
     azimuth, elevation = 2 * np.pi * rng.random(n), np.radians(rng.uniform(5, 75, n))
     snr = rng.uniform(1, 4, n)
@@ -74,7 +74,7 @@ def test_any_small_problem_agrees_with_the_grid(
     seed: int, east: float, north: float, n: int, sigma_rad: float, capped: bool
 ) -> None:
     rng = np.random.default_rng(seed)
-    evidence = rays_seen(np.array([east, north]), n, sigma_rad, rng)
+    evidence = simulate_rays(np.array([east, north]), n, sigma_rad, rng)
     places = grid()
     log = log_likelihood(places, evidence, capped)
     weight = np.exp(log - log.max())
@@ -107,7 +107,7 @@ def test_any_small_problem_agrees_with_the_grid(
 def test_the_stated_bound_on_what_was_dropped_holds(seed: int) -> None:
     """With boxes given up ever more rashly, the probability really lost stays below what is admitted."""
     rng = np.random.default_rng(seed)
-    evidence = rays_seen(rng.uniform(-50, 50, 2), 120, 0.0, rng)
+    evidence = simulate_rays(rng.uniform(-50, 50, 2), 120, 0.0, rng)
     places = grid()
     log = log_likelihood(places, evidence, capped=True)
     weight = np.exp(log - log.max())
@@ -126,7 +126,7 @@ def test_the_stated_bound_on_what_was_dropped_holds(seed: int) -> None:
 
 @pytest.mark.parametrize("n", [1, 5, 7])
 def test_a_few_rays_are_refused(n: int) -> None:
-    evidence = rays_seen(np.zeros(2), n, 0.0, np.random.default_rng(1))
+    evidence = simulate_rays(np.zeros(2), n, 0.0, np.random.default_rng(1))
     with pytest.raises(NotLocated, match=f"only {n} rays") as caught:
         ExactPosterior()(evidence, PIT)
     assert caught.value.reason == "insufficient_geometry"

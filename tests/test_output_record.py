@@ -35,11 +35,11 @@ def fix(located):
     return result_dict(located.result)
 
 
-def without_terrain(result):
+def remove_terrain(result):
     return extend(result, Oriented, terrain=None, bodies=())
 
 
-def ambiguous(result):
+def make_ambiguous(result):
     modes = (Mode(east_m=6000.0, north_m=-2500.0, weight=0.7), Mode(east_m=-3000.0, north_m=4000.0, weight=0.3))
     fix = replace(result.fix, modes=modes, ambiguous=True)
     return replace(result, fix=fix)
@@ -152,7 +152,7 @@ def test_detections_are_brightest_first(located):
 
 
 def test_without_a_terrain_nothing_is_said_in_enu(located):
-    d = result_dict(without_terrain(located.result))
+    d = result_dict(remove_terrain(located.result))
     without = {key for key in KEYS["attitude"].split() if "body" in key or "heading" in key or "pitch" in key}
     assert set(d["attitude"]) == set(KEYS["attitude"].split()) - without
     assert "position" not in d
@@ -160,7 +160,7 @@ def test_without_a_terrain_nothing_is_said_in_enu(located):
 
 
 def test_an_ambiguous_result_has_modes_and_no_position(located):
-    d = result_dict(ambiguous(located.result))
+    d = result_dict(make_ambiguous(located.result))
     assert (d["status"], d["reason"]) == ("ambiguous", "ambiguous")
     assert "position" not in d
     assert sum(mode["weight"] for mode in d["modes"]) == pytest.approx(1.0)

@@ -54,15 +54,15 @@ TINY = replace(SMALL, skies=3, per_sky=8, ours_per_sky=4, bound_per_sky=4, deep_
 
 
 @contextmanager
-def silent(what, total):
+def hide_progress(what, total):
     yield Progress()
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def small_run(tmp_path_factory):
     """Every table and figure of a small run, with its files."""
     out = tmp_path_factory.mktemp("reproduced")
-    with ChunkStore(out, jobs=1, progress=silent) as store:
+    with ChunkStore(out, jobs=1, progress=hide_progress) as store:
         artefacts = {name: make(Context(SMALL, 0, store)) for name, make in ARTEFACTS.items()}
     return {name: (artefact, write_artefact(artefact, out, plots=True)) for name, artefact in artefacts.items()}
 
@@ -143,8 +143,8 @@ def test_the_localizers_give_what_the_table_is_made_of():
         np.testing.assert_allclose(refined.position_enu_m[:2], chunk["refined_m"][k], atol=1e-6)
 
 
-def test_table_3_1_is_within_the_bars(made):
-    values = made["table3.1"][0].values
+def test_table_3_1_is_within_the_bars(small_run):
+    values = small_run["table3.1"][0].values
     assert 30 <= values["reproduced"]["descent"]["mean_m"] <= 38  # thesis 34.2
     assert 25 <= values["reproduced"]["descent"]["sd_m"] <= 36  # 31.1
     assert 0.003 <= values["reproduced"]["never_settle"] <= 0.012  # 0.006
@@ -164,8 +164,8 @@ def test_ours_is_the_middle_of_the_exact_cell():
     assert np.median(off) < 0.3
 
 
-def test_skyline_is_better_near_the_centre_and_stars_near_the_wall(made):
-    artefact = made["fig3.10"][0]
+def test_skyline_is_better_near_the_centre_and_stars_near_the_wall(small_run):
+    artefact = small_run["fig3.10"][0]
     columns = {column.name: [float(v) for v in column.values] for column in artefact.columns}
     assert columns["hull_mean"][-1] > 2 * columns["hull_mean"][0]
     assert columns["descent_mean"][0] > 2 * columns["descent_mean"][-1]
@@ -202,8 +202,8 @@ def test_distances_between_changes_are_the_thesis_s():
 
 
 @pytest.mark.parametrize("name", cli.NAMES)
-def test_each_table_and_figure_is_written(made, name):
-    artefact, files = made[name]
+def test_each_table_and_figure_is_written(small_run, name):
+    artefact, files = small_run[name]
     pictures = [path for path in files if path.suffix == ".png"]
     assert len(pictures) == {"table3.1": 0, "figB": 10, "fig3.10": 2}.get(name, 1)
     for path in pictures:
@@ -219,11 +219,11 @@ def test_each_table_and_figure_is_written(made, name):
         assert "thesis" in text and artefact.values["thesis"]
 
 
-def test_tables_are_read_by_astropy(made):
+def test_tables_are_read_by_astropy(small_run):
     from astropy import units
     from astropy.table import QTable
 
-    tables = {p.name: QTable.read(p) for _, files in made.values() for p in files if p.suffix == ".ecsv"}
+    tables = {p.name: QTable.read(p) for _, files in small_run.values() for p in files if p.suffix == ".ecsv"}
     assert set(tables) >= {"table3.1.ecsv", "fig3.7.ecsv", "fig3.9.ecsv", "magnitude.ecsv", "figA.2.ecsv"}
     assert len(tables["table3.1.ecsv"]) == 10
     thesis = tables["table3.1.ecsv"]["thesis_mean"]
@@ -277,19 +277,19 @@ def test_a_stopped_run_goes_on_from_where_it_was(tmp_path, monkeypatch):
     wanted = [task for sky in range(4) for task in tasks_of(KUA, 0, sky, 3)]
     computed = []
 
-    def stopping(task):
+    def stop_after(task):
         if len(computed) == 2:
             raise KeyboardInterrupt
         computed.append(task)
         return compute_chunk(task)
 
-    monkeypatch.setattr(chunks, "compute_chunk", stopping)
-    with ChunkStore(tmp_path, jobs=1, progress=silent) as store, pytest.raises(KeyboardInterrupt):
+    monkeypatch.setattr(chunks, "compute_chunk", stop_after)
+    with ChunkStore(tmp_path, jobs=1, progress=hide_progress) as store, pytest.raises(KeyboardInterrupt):
         list(store.chunks("stopped", wanted))
     assert len(list((tmp_path / chunks.FOLDER).iterdir())) == 2  # whole chunks only, no temporary files
     computed.clear()
     monkeypatch.setattr(chunks, "compute_chunk", lambda task: computed.append(task) or compute_chunk(task))
-    with ChunkStore(tmp_path, jobs=1, progress=silent) as store:
+    with ChunkStore(tmp_path, jobs=1, progress=hide_progress) as store:
         computed_chunks = list(store.chunks("resumed", wanted))
         assert computed == wanted[2:]
         assert len(list(store.chunks("again", wanted))) == 4 and computed == wanted[2:]

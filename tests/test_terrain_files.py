@@ -365,11 +365,11 @@ def test_a_build_says_so_in_one_line_and_an_interrupted_one_is_forgotten(tmp_pat
     terrain = load_terrain(path)
     assert isinstance(terrain, HeightMap)
 
-    def interrupted(done: int, total: int) -> None:
+    def interrupt(done: int, total: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        terrain.prepare(interrupted)
+        terrain.prepare(interrupt)
     table = terrain.table_path
     assert not list(table.parent.iterdir())
     table.with_suffix(".lock").touch()  # left by one that was killed

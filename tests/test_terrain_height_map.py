@@ -60,7 +60,7 @@ def test_horizon_from_the_floor_is_that_of_another_program():
     assert turned.std() > 0.3  # a mirrored map would be noticed
 
 
-def marched_rad(terrain: HeightMap, place: np.ndarray, azimuth: float, step_m: float, end_m: float) -> float:
+def march_horizon_rad(terrain: HeightMap, place: np.ndarray, azimuth: float, step_m: float, end_m: float) -> float:
     """The horizon by small steps, with the numpy surface of `ground_up_m`."""
     s = np.concatenate([np.arange(step_m / 16, 400.0, step_m / 16), np.arange(400.0, end_m, step_m)])
     points = place + s[:, None] * np.array([np.sin(azimuth), np.cos(azimuth)])
@@ -75,7 +75,7 @@ def test_horizons_are_those_of_small_steps(name):
     rng = np.random.default_rng(1)
     places, azimuths = rng.uniform(-6000, 6000, (25, 2)), rng.uniform(0, 2 * np.pi, 25)
     found = terrain.horizon_rad(places, azimuths)
-    slow = [marched_rad(terrain, p, a, 4.0, 30_000.0) for p, a in zip(places, azimuths, strict=True)]
+    slow = [march_horizon_rad(terrain, p, a, 4.0, 30_000.0) for p, a in zip(places, azimuths, strict=True)]
     off = np.degrees(found - slow)
     assert np.sqrt(np.mean(off**2)) < 0.002
     assert off.min() > -0.002  # small steps can only miss the top
@@ -112,7 +112,10 @@ def test_bounds_hold_the_horizons_of_small_steps(shackleton, half, turn):
     low, high = small.horizon_bounds_rad(centres, np.array(half), azimuths, turn)
     places = centres[:, None] + rng.uniform(-half, half, (20, 8, 2))
     turned = azimuths[:, None] + rng.uniform(-turn, turn, (20, 8))
-    slow = [marched_rad(small, p, a, 8.0, 30_000.0) for p, a in zip(places.reshape(-1, 2), turned.ravel(), strict=True)]
+    slow = [
+        march_horizon_rad(small, p, a, 8.0, 30_000.0)
+        for p, a in zip(places.reshape(-1, 2), turned.ravel(), strict=True)
+    ]
     horizon = np.array(slow).reshape(20, 8)
     ok = small.allowed(places)
     assert ok.mean() > 0.9

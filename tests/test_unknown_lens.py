@@ -90,7 +90,7 @@ def detections(xy_px: np.ndarray, flux: np.ndarray, psf_sigma_px: float = 1.0) -
     )  # fmt: skip
 
 
-def listed(name: str) -> Detections:
+def photograph_detections(name: str) -> Detections:
     """A real photograph's point sources."""
     with (DATA / name).open(encoding="utf-8") as file:
         lines = file.readlines()
@@ -171,7 +171,7 @@ def test_too_few_stars_are_refused_at_once() -> None:
 def test_narrow_photographs_agree_with_two_other_solvers(
     name: str, ra_deg: float, dec_deg: float, arcsec: float
 ) -> None:
-    seen = listed(name)
+    seen = photograph_detections(name)
     for fov in (10.4, 11.4, 12.4):
         found = identify_unknown_lens(seen, (1024, 768), np.radians(fov), sky())
         assert boresight_off_rad(found, ra_deg, dec_deg) < arcsec * ARCSEC
@@ -182,11 +182,11 @@ def test_narrow_photographs_agree_with_two_other_solvers(
 
 def test_an_overcast_photograph_is_refused() -> None:
     with pytest.raises(NotIdentified, match="better than chance"):
-        identify_unknown_lens(listed("overcast.csv"), (1392, 1040), np.pi, sky())
+        identify_unknown_lens(photograph_detections("overcast.csv"), (1392, 1040), np.pi, sky())
 
 
 def test_a_moonlit_photograph_is_identified() -> None:
-    found = identify_unknown_lens(listed("moonlit.csv"), (1392, 1040), np.pi, sky())
+    found = identify_unknown_lens(photograph_detections("moonlit.csv"), (1392, 1040), np.pi, sky())
     assert len(found.identification) >= 300
     assert found.camera.focal_px[0] == pytest.approx(337.2, abs=1.0)  # of the same camera on another night
     assert found.camera.centre_px == pytest.approx((709.7, 489.7), abs=1.0)

@@ -1,4 +1,4 @@
-"""Whole folders of images: found, located side by side, taken up again, and gathered into tables."""
+"""Batches: find the images of a folder, locate them in parallel, resume a stopped run, write tables."""
 
 from startrack.batch.find import Image, images_under, listed_images
 from startrack.batch.store import (

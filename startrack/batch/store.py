@@ -15,7 +15,7 @@ from startrack.errors import BadInput
 from startrack.files import Locked, hold_lock
 from startrack.output.write import COMPANIONS
 
-JOB = "job_sha256"  # hash of a result's inputs: content of its files, flags, version; null: repeat it
+JOB = "job_sha256"  # hash of a result's inputs (content of its files, flags, version); null: the next run repeats it
 INPUTS = "inputs"  # camera and terrain files that the result was made with: path from the image to SHA-256
 MANIFEST = "manifest.json"
 LOCK = ".startrack-batch.lock"

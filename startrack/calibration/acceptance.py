@@ -89,7 +89,7 @@ def rings_and_sectors(camera: Camera, points: Observations) -> tuple[Array, Ints
 def joint_log_p_value(joint: JointFit) -> float:
     """Log-probability (natural) of as many matches by chance.
 
-    The number expected by chance is measured: by the same matching at attitudes that are certainly wrong.
+    The number expected by chance is measured by the same matching at certainly wrong attitudes.
     """
     camera, within = joint.fit.camera, joint.fit.camera.calibrated_angle_rad
     found = sum(map(len, joint.matches))
@@ -112,7 +112,7 @@ def mirrored_residual_px(joint: JointFit) -> float:
 
 
 def check_acceptance(joint: JointFit) -> tuple[Check, ...]:
-    """All checks, the most telling first."""
+    """All checks, the most informative first."""
     fit, matches = joint.fit, joint.matches
     stars = int(fit.used.sum())
     fraction = float(np.average([m.fraction for m in matches], weights=[max(len(m), 1) for m in matches]))

@@ -81,7 +81,7 @@ def _calibrate_corners(
 
 
 def _check_acceptance(fit: LensFit, xy_px: Array, pictures: int) -> tuple[Check, ...]:
-    """All checks, the most telling first."""
+    """All checks, the most informative first."""
     camera = fit.camera
     angle = camera.angle_rad(xy_px[fit.used])
     ring = np.clip((RINGS * angle / camera.calibrated_angle_rad).astype(int), 0, RINGS - 1)

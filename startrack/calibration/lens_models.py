@@ -13,10 +13,10 @@ from startrack.normal_equations import Observations
 from startrack.types import Array, Ints
 
 FOLDS = 10
-EQUALLY_GOOD_CHI2 = 4.0  # a longer polynomial this little worse is chosen: its covariance holds up to the edge
-RISES_BEYOND_1 = 1.1  # of the outermost star's angle: up to here the polynomial must rise
+EQUALLY_GOOD_CHI2 = 4.0  # up to this difference the longer polynomial is chosen: its covariance is valid up to the edge
+RISES_BEYOND_1 = 1.1  # of the outermost star's angle: the polynomial must increase up to there
 NARROW_RAD = np.radians(30.0)
-EXTENSION_CHI2 = 15.0  # fall of the held-out chi-square that justifies decentring, or pixels that are not square
+EXTENSION_CHI2 = 15.0  # decrease of the held-out chi-square that justifies decentring or oblong pixels
 LEAST_SQUARES = Scheme(loss=SQUARES)
 
 

@@ -67,7 +67,7 @@ def _block_statistics(a: Array, b: Array) -> tuple[Array, Array]:
     step = np.diff(split_blocks(a - b), axis=2).reshape(-1, BLOCK_PX * (BLOCK_PX - 1))
     step -= np.median(step, axis=1, keepdims=True)
     variance = np.square(1.4826 * np.median(np.abs(step), axis=1))
-    for _ in range(CLIPS):  # to the core of the distribution, without stars
+    for _ in range(CLIPS):  # clipped to the core of the distribution, without stars
         core = np.square(step) < CORE_SIGMA**2 * variance[:, None]
         variance = np.sum(np.square(step) * core, axis=1) / np.maximum(core.sum(axis=1), 1) / CORE_VARIANCE_1
     level = 0.5 * np.median(split_blocks(a) + split_blocks(b), axis=(1, 2))

@@ -41,7 +41,7 @@ class Halt:
 
 @contextmanager
 def halt_on_signals(halt: Halt) -> Iterator[None]:
-    """In the block the first Ctrl-C or SIGTERM stops the batch after the images in progress; a later one drops them."""
+    """In the block the first Ctrl-C or SIGTERM stops the batch after the images in progress, a later one at once."""
     first_s: float | None = None
 
     def on_signal(number: int, _: object) -> None:

@@ -1,4 +1,4 @@
-"""Fits of all candidates, each with its neighbours' light subtracted."""
+"""Fits of all candidates, each with the flux of its neighbours subtracted."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from startrack.psf import pixel_profile_single
 from startrack.types import Array, Ints
 
 CROWDED_ROUNDS = 3  # of subtracting neighbours and fitting again
-NEIGHBOUR_SIGMA = 0.1  # neighbours' light above this part of a pixel's noise is subtracted
-NEIGHBOUR_ERROR = np.float32(0.1)  # of it is not known: neighbours' fits, and the PSF's wings
+NEIGHBOUR_SIGMA = 0.1  # of a pixel's noise: a neighbour's signal above this is subtracted
+NEIGHBOUR_ERROR = np.float32(0.1)  # relative error of that signal: neighbours' fits, and the PSF's wings
 BATCH_PIXELS = 2_000_000  # of neighbours' stamps at a time
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """All candidates (n) with their stamps and fits, and the noise of the light of the stars themselves."""
+    """All candidates (n) with their stamps and fits, and the noise of the sources' own signal."""
 
     stamps: Stamps
     fits: PointFits
@@ -29,15 +29,12 @@ class Fitted:
 
 
 def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = None) -> Fitted:
-    """Fits of all candidates; of the stars already `known`, whose light `frame.found` holds, only once more.
-
-    The known ones are the first of the peaks.
-    """
+    """Fits of all candidates. `known`: earlier fits of the first peaks, refined once; `frame.found` contains them."""
     radius = radius_for(sigma)
     centres = peaks.centres
     data, variance, usable = frame.data(centres, radius), frame.variance(centres, radius), frame.usable(centres, radius)
     stamps = Stamps(data, variance, usable, centres, peaks.surround)
-    last = np.zeros_like(data)  # neighbours' light with which each was fitted
+    last = np.zeros_like(data)  # neighbours' signal subtracted in the last fit
     if known is not None and frame.found is not None:
         last = frame.light(centres, radius)
         last[: len(known.flux)] -= own_light(centres[: len(known.flux)], known, sigma, radius)
@@ -67,7 +64,7 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
 
 
 def _first_fits(frame: Frame, peaks: Peaks, stamps: Stamps, sigma: float, known: int) -> PointFits:
-    """Fits of all candidates, the first of which are `known` already and need less."""
+    """Fits of all candidates; the first ones start from the `known` fits and need fewer iterations."""
     fits = [
         fit_points(stamps.take(which), peaks.start_xy_px[which], sigma, frame.source_noise, peaks.own_part, rounds)
         for which, rounds in ((slice(0, known), ROUNDS_AGAIN), (slice(known, None), ROUNDS))
@@ -77,12 +74,12 @@ def _first_fits(frame: Frame, peaks: Peaks, stamps: Stamps, sigma: float, known:
 
 
 def _subtract_light(stamps: Stamps, light: Pixels) -> Stamps:
-    """The stamps without their neighbours' light, of which a part is not known."""
+    """The stamps with the neighbours' signal subtracted; its error is added to the variance."""
     return replace(stamps, data=stamps.data - light, variance=stamps.variance + np.square(NEIGHBOUR_ERROR * light))
 
 
 def _find_reweighted(fits: PointFits, sigma: float, variance: Pixels, was: SourceNoise, now: SourceNoise) -> Ints:
-    """Candidates whose middle pixel has another variance by a tenth with what is known now of the light's noise."""
+    """Candidates whose middle pixel's variance changes by more than a tenth with the measured source noise."""
     light = np.maximum(fits.flux, 0.0) / (2.0 * np.pi * sigma**2 + 1.0)
     dark = variance[:, variance.shape[1] // 2, variance.shape[2] // 2]
     before, after = (dark + light * (n.per_unit + n.model_error**2 * light) for n in (was, now))
@@ -90,7 +87,7 @@ def _find_reweighted(fits: PointFits, sigma: float, variance: Pixels, was: Sourc
 
 
 def _find_pairs(centres: Ints, reach_px: float) -> tuple[Ints, Ints]:
-    """Each candidate that has another one within reach, ascending, and that other one: both (m,)."""
+    """Pairs (m,), (m,) of a candidate and a neighbour whose stamps overlap, sorted by the candidate."""
     from scipy.spatial import cKDTree
 
     pairs = cKDTree(centres).query_pairs(reach_px, output_type="ndarray")
@@ -100,7 +97,7 @@ def _find_pairs(centres: Ints, reach_px: float) -> tuple[Ints, Ints]:
 
 
 def _sum_neighbour_light(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> tuple[Ints, Pixels]:
-    """The candidates (k,) into whose stamps others put light that counts, and that light (k, s, s)."""
+    """The candidates (k,) whose stamps contain relevant signal of neighbours, and that signal (k, s, s)."""
     side = s.data.shape[1]
     radius = side // 2
     counts = _are_relevant(s, fits, star, other, sigma)
@@ -128,7 +125,7 @@ def _sum_neighbour_light(s: Stamps, fits: PointFits, star: Ints, other: Ints, si
 
 
 def _are_relevant(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> Array:
-    """Which pairs (m,) can matter: the neighbour's light at the stamp's nearest pixel against the middle's noise."""
+    """Which pairs (m,) are relevant: the neighbour's signal at the stamp's nearest pixel exceeds the noise limit."""
     radius = s.data.shape[1] // 2
     beyond = np.maximum(np.abs(fits.xy_px[other] - s.centres[star]) - radius - 0.5, 0.0)
     wing = np.exp(-0.5 * np.sum(np.square(beyond), axis=1) / (sigma**2 + 0.1))
@@ -138,7 +135,7 @@ def _are_relevant(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: fl
 
 
 def own_light(centres: Ints, fits: PointFits, sigma: float | Array, radius: int) -> Pixels:
-    """Light (n, s, s) of each source in its own stamp."""
+    """Signal (n, s, s) of each source in its own stamp."""
     offset = fits.xy_px - centres
     px, _ = pixel_profile_single(offset[:, 0], sigma, radius)
     py, _ = pixel_profile_single(offset[:, 1], sigma, radius)
@@ -147,7 +144,7 @@ def own_light(centres: Ints, fits: PointFits, sigma: float | Array, radius: int)
 
 
 def paint_sources(fits: PointFits, sigma: float, shape: tuple[int, int]) -> Pixels:
-    """Light (H, W) of the fitted sources, to 5 sigma."""
+    """Image (H, W) of the fitted sources, to 5 sigma."""
     radius = int(np.ceil(5.0 * sigma))
     side = 2 * radius + 1
     image = np.zeros((shape[0] + 2 * side, shape[1] + 2 * side), dtype=np.float32)

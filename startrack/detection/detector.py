@@ -35,15 +35,17 @@ from startrack.detection.streaks import Streaks, are_elongated, find_streaks
 from startrack.types import Array, Bools, Detections, Exposure, Ints, TooFewStars
 
 UNKNOWN_WIDTH_PX = 1.2  # first guess where the camera file does not state the width
-FIRST_PASS_LOWER = 1.1  # units of the filtered noise by which the candidates' threshold is lower than the stars'
+FIRST_PASS_LOWER = 1.1  # sigma of the filtered noise: threshold of the stars minus that of the candidates
 WINGS_SIGMAS = 4.0  # radius of the area that a star covers
-CROWDED_FRACTION = 0.06  # covered by stars: from here up they are subtracted before the background is measured again
+CROWDED_FRACTION = (
+    0.06  # of the frame covered by stars, above which they are subtracted to measure the background again
+)
 NOTHING_SEEN = "no point source stands above the noise: was the lens cap on, or the exposure too short?"
 
 
 @dataclass(frozen=True)
 class _Candidates:
-    """A frame, the same with its pixels added together `side` by `side`, and the candidates there with their fits."""
+    """A frame, the same frame binned by `side`, and the candidates in it with their fits."""
 
     frame: Frame
     small: Frame
@@ -61,14 +63,14 @@ class _Candidates:
 class Detector:
     """Detects point sources: Exposure -> Detections."""
 
-    threshold_snr: float = 5.42  # for a PSF of 1.25 px; for others the threshold with about as few false stars
+    threshold_snr: float = 5.42  # for a PSF of 1.25 px; scaled to an equal rate of false stars for other widths
     max_candidates: int = 15000  # a frame with more peaks is noise, a bright day or a defect: the highest are kept
     psf_sigma_px: float | None = None  # used without measuring it; None: from the camera file and the frame
 
     def __call__(self, exposure: Exposure, camera: Camera | None = None) -> Detections:
         """Point sources of an `exposure`, brightest first; fluxes in electrons with the camera's gain, else in ADU.
 
-        Raises TooFewStars (reason no_stars) where the frame holds no point source at all.
+        Raises TooFewStars (reason no_stars) if the frame has no point source.
         """
         image, dead = electrons(exposure, camera)
         if _is_flat(image):
@@ -97,7 +99,7 @@ class Detector:
         )
 
     def _candidates(self, source: _FrameSource, expected: float | None) -> _Candidates:
-        """Candidates and their fits, with the PSF's width as the frame shows it."""
+        """Candidates and their fits, with the PSF width measured in the frame."""
         if expected is None:
             return self._candidates_at(source, guess_psf_width(source.frame, UNKNOWN_WIDTH_PX))
         candidates = self._candidates_at(source, expected)
@@ -114,7 +116,7 @@ class Detector:
         return self._candidates_at(source, guess_psf_width(source.frame, measured * candidates.side))
 
     def _candidates_at(self, source: _FrameSource, sigma: float) -> _Candidates:
-        """Candidates and their fits; where the PSF is wide, in the frame whose pixels are added together."""
+        """Candidates and their fits; where the PSF is wide, in the binned frame."""
         side = binning_factor(sigma)
         frame = source.frame(sigma)
         small = bin_frame(frame, side)
@@ -124,7 +126,7 @@ class Detector:
         return _Candidates(frame, small, side, sigma, fit_all(small, peaks, sigma / side))
 
     def _detect_again(self, candidates: _Candidates, stars: PointFits) -> tuple[Frame, PointFits]:
-        """The frame and its stars, the known ones subtracted before background and faint ones are measured."""
+        """The frame and its stars; known stars are subtracted before the background and faint stars are measured."""
         side, sigma, frame = candidates.side, candidates.sigma, candidates.frame
         frame = _FrameSource(frame.image, frame.dead, candidates.fitted.source_noise).frame(
             sigma, paint_sources(stars, sigma, frame.shape)
@@ -137,12 +139,12 @@ class Detector:
         return frame, self._select_stars(frame, fit_all(frame, peaks, sigma, known=stars), 1, sigma)
 
     def _find_peaks(self, frame: Frame, small: Frame, side: int, sigma: float, known: Array | None = None) -> Peaks:
-        """Candidates in a frame's small one: a star between pixels shows less in the filtered image than its fit."""
+        """Candidates in the binned frame; their threshold is lower: the filtered image is sampled at pixels only."""
         lowest = detection_threshold(self.threshold_snr, sigma, noise_skewness(frame)) - FIRST_PASS_LOWER
         return find_peaks(small, sigma / side, lowest, self.max_candidates, known)
 
     def _select_stars(self, frame: Frame, fitted: Fitted, side: int, sigma: float) -> PointFits:
-        """The point sources among the candidates, in a frame's small one, brightest first."""
+        """The point sources among the candidates of the binned frame, brightest first."""
         fitted, width_px = refit_saturated(fitted, sigma / side)
         fits = fitted.fits
         threshold = detection_threshold(self.threshold_snr, sigma / side, noise_skewness(frame) / side)
@@ -154,7 +156,7 @@ class Detector:
 
 
 def _detections_of_streaks(frame: Frame, streaks: Streaks) -> Detections:
-    """The stars of a frame taken while the camera turned; the PSF's width is that of the whole streak."""
+    """The stars of a frame taken by a rotating camera; the PSF width is that of the whole streak."""
     return Detections(
         xy_px=streaks.xy_px,
         covariance_px2=streaks.covariance_px2,
@@ -173,7 +175,7 @@ def _is_flat(image: Image) -> bool:
 
 
 class _FrameSource:
-    """An image with its unusable pixels; backgrounds are computed once for each size of their blocks."""
+    """An image with its unusable pixels; backgrounds are computed once for each block size."""
 
     def __init__(self, image: Image, dead: Bools | None, source_noise: SourceNoise) -> None:
         self.image, self.dead, self.source_noise = image, dead, source_noise
@@ -181,7 +183,7 @@ class _FrameSource:
         self._kept: dict[int, tuple[Image, Image]] = {}
 
     def frame(self, sigma: float, found: Image | None = None) -> Frame:
-        """The image prepared; the stars already `found` are excluded from background and noise."""
+        """The prepared frame; stars in `found` are excluded from background and noise."""
         if found is not None:
             maps = background_and_noise(self.image - found, self.quantum, sigma)
             return Frame(self.image, *maps, self.dead, self.source_noise, found)
@@ -192,7 +194,7 @@ class _FrameSource:
 
 
 def _covered_fraction(stars: PointFits, sigma: float, shape: tuple[int, int]) -> float:
-    """Part of the frame that the wings of its stars cover, overlaps counted twice."""
+    """Fraction of the frame that the wings of its stars cover, overlaps counted twice."""
     return float(len(stars.flux) * np.pi * np.square(WINGS_SIGMAS * sigma) / (shape[0] * shape[1]))
 
 

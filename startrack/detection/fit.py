@@ -9,7 +9,7 @@ import numpy as np
 from startrack.detection.frame import Pixels, SourceNoise
 from startrack.types import Array, Bools, Ints
 
-ROUNDS, ROUNDS_AGAIN = 3, 2  # of flux and level, then of all four; where a fit has been before
+ROUNDS, ROUNDS_AGAIN = 3, 2  # iterations of a first fit, and of a repeated one
 ALL_USABLE = np.zeros((0, 0, 0), dtype=np.bool_)
 
 
@@ -25,7 +25,7 @@ class PointFits:
     chi2_pixel: Array  # (n,) of a single bright pixel instead
     dof: Array  # (n,)
     surround: Array  # (n,) level of the wider surroundings
-    significance: Array  # (n,) matched-filter SNR of the light against background noise alone
+    significance: Array  # (n,) matched-filter SNR against background noise alone
     snr: Array  # (n,) matched-filter SNR, the source's own photon noise included
 
     def take(self, which: Ints) -> PointFits:
@@ -33,7 +33,7 @@ class PointFits:
         return PointFits(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
     def with_rows(self, which: Ints, others: PointFits) -> PointFits:
-        """These fits with those at the indices exchanged for the `others`."""
+        """These fits with `others` at the indices `which`."""
         values = {f.name: getattr(self, f.name).copy() for f in fields(self)}
         for name, value in values.items():
             value[which] = getattr(others, name)
@@ -98,12 +98,12 @@ def fit_points(
 
 
 def concatenate_fits(parts: list[PointFits]) -> PointFits:
-    """The fits of all parts, one after the other."""
+    """The fits of all parts in one value."""
     return PointFits(**{f.name: np.concatenate([getattr(b, f.name) for b in parts]) for f in fields(PointFits)})
 
 
 def unbin_fits(fits: PointFits, side: int) -> PointFits:
-    """Fits in a binned frame as they are in the frame itself: positions and their errors; levels per pixel."""
+    """Fits in a binned frame converted to the frame itself: positions, their errors, and levels per pixel."""
     if side == 1:
         return fits
     unit = np.array([side, side, 1.0, 1.0 / side**2])

@@ -16,23 +16,27 @@ BRIGHT_SNR = 12.0  # of the sources from which the width is measured
 WIDTH_TOLERANCE = 0.12  # a measured PSF that differs by more than this fraction from the expected one replaces it
 WIDTH_ROUNDS = 4  # a stamp of the wrong size measures a much wider PSF too small
 BRIGHT_PIXEL_SIGMAS, MAX_BRIGHT_PIXELS, MIN_BRIGHT_PIXELS = 8.0, 64, 30
-MIN_BESIDE, MIN_FALL, MAX_FALL = 0.02, 0.05, 3.5  # light beside a peak; its fall for 4.5 px and 0.45 px
+MIN_BESIDE, MIN_FALL, MAX_FALL = (
+    0.02,
+    0.05,
+    3.5,
+)  # relative signal beside a peak; its logarithmic fall for 4.5 px and 0.45 px
 MIN_BRIGHT = 8
 MAX_BRIGHT, MAX_BRIGHT_ALL_WIDTHS = 100, 40  # the second where many widths are tried
 NEAR = np.geomspace(0.72, 1.4, 8)  # widths tried first, in units of the expected one
 WIDTHS_PX = np.geomspace(0.3, 8.0, 22)
 NARROWER_IS_A_PIXEL_PX = 0.45  # hot pixels fit the narrowest profile
-AT_THE_END = 0.3  # part of the sources that the widths tried first may fail to hold
-STAR_LIKE = 0.75  # of a stamp's variance beyond the noise that a star of the best width explains; clouds: 0.2 to 0.5
-SHARP_RATIO = 0.6  # sources narrower than this part of the typical width are stars among something else
-SHARP_FRACTION = 0.1  # of the sources, from which these are no accident
+AT_THE_END = 0.3  # largest fraction of sources with a best width at the end of NEAR
+STAR_LIKE = 0.75  # fraction of a stamp's variance beyond the noise that a star explains; clouds: 0.2 to 0.5
+SHARP_RATIO = 0.6  # of the typical width: narrower sources are stars among clouds
+SHARP_FRACTION = 0.1  # of the sources: smallest number of narrow ones that is significant
 
 
 def measure_psf_width(frame: Frame, centres: Ints, fits: PointFits, sigma: float) -> float | None:
     """Typical PSF sigma [px] of the bright sources that are like stars; None where there are too few.
 
-    Clouds, moonlight and branches give bumps of any width, wider ones with a wider filter: bumps that no Gaussian
-    explains are left out, and of two kinds of width the sharper one belongs to the stars.
+    Clouds, moonlight and branches give peaks of any width, wider ones with a wider filter. Peaks that no Gaussian fits
+    are left out; if two groups of widths remain, the narrower one is the stars'.
     """
     radius = radius_for(sigma)
     bright = np.flatnonzero((fits.snr > BRIGHT_SNR) & (fits.chi2 < fits.chi2_pixel))
@@ -57,10 +61,11 @@ def measure_psf_width(frame: Frame, centres: Ints, fits: PointFits, sigma: float
 
 
 def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array) -> tuple[Array, Bools, Array]:
-    """Best-fitting PSF sigma (n,) [px] of each stamp among `widths_px` (m,), geometric; whether it is not the last;
-    and the part of the stamp's variance beyond the noise that it explains, about 1 for a star.
+    """Best-fitting PSF sigma (n,) [px] of each stamp among `widths_px` (m,), a geometric series.
 
-    Refined by a parabola through chi^2; flux and level are free, the position is `offset_px` from the middle pixel.
+    Also returns whether the best width is not the last one, and the fraction of the stamp's variance beyond the noise
+    that the fit explains, about 1 for a star. Refined by a parabola through chi^2; flux and level are free, the
+    position is `offset_px` from the middle pixel.
     """
     radius, m = data.shape[1] // 2, len(widths_px)
     moment = weights * data
@@ -71,7 +76,7 @@ def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array
         profiles.append(profile.reshape(len(data), m, 2 * radius + 1))
     px, py = profiles
     ss, s1, sd = _sums(weights, py * py, px * px), _sums(weights, py, px), _sums(moment, py, px)
-    # chi^2 falls by this much for a star of each width on a level background.
+    # Reduction of chi^2 by a star of each width on a constant background.
     part, excess = ss - s1 * s1 / total[:, None], sd - s1 * (light / total)[:, None]
     explained = np.square(excess) / np.maximum(part, 1e-30)
     best = np.argmax(explained, axis=1)
@@ -94,9 +99,9 @@ def _sums(stamp: Pixels, down: Pixels, across: Pixels) -> Array:
 
 
 def guess_psf_width(prepare: Callable[[float], Frame], sigma: float) -> float:
-    """PSF sigma [px] by the brightest pixels, from a first guess, which is kept where they give no width.
+    """PSF sigma [px] from the brightest pixels; the first guess if they give none.
 
-    `prepare` gives the frame with the background for a PSF of that width.
+    `prepare` returns the frame with the background for a given PSF width.
     """
     frame = prepare(sigma)
     pixels = bright_pixels(frame, BRIGHT_PIXEL_SIGMAS, MAX_BRIGHT_PIXELS, 1)
@@ -125,10 +130,10 @@ def guess_psf_width(prepare: Callable[[float], Frame], sigma: float) -> float:
 
 
 def _width_by_fall(frame: Frame, pixels: Ints) -> float | None:
-    """About the PSF sigma [px] of sources whose brightest pixels (n, 2) lie off the border; None where they are odd.
+    """Approximate PSF sigma [px] of sources with brightest pixels (n, 2) off the border; None outside the valid range.
 
-    Of a Gaussian of variance s^2 the values left and right of a pixel have the product of its square and exp(-1 / s^2),
-    wherever the middle is.
+    For a Gaussian of variance s^2 the product of the values left and right of a pixel is the square of the pixel's
+    value times exp(-1 / s^2), independent of the centre.
     """
     light = np.maximum(frame.data(pixels, 1), 0.0)
     peak = np.maximum(light[:, 1, 1], 1e-9)

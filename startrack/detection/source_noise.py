@@ -1,4 +1,4 @@
-"""The noise of the stars' own light, measured from the residuals of the bright ones: photon noise and PSF misfit."""
+"""Noise of the sources' own signal from the residuals of bright stars: photon noise and PSF misfit."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from startrack.types import Array, Bools, Ints
 
 BRIGHT_SNR = 15.0
 MIN_STARS, MAX_STARS = 20, 120
-FAINT_FRACTION = 0.3  # of the pixel's variance: pixels with less of the star's light are left out
-MAX_LEVERAGE = 0.5  # pixels that the fit follows hide their noise
+FAINT_FRACTION = 0.3  # of the pixel's variance: pixels with less signal are left out
+MAX_LEVERAGE = 0.5  # residuals of pixels with a larger leverage do not show the noise
 BINS, MIN_IN_BIN = 12, 15
 MAX_ALIKE = 2.0
 MEDIAN_OF_SQUARE = 0.4549  # of a unit Gaussian
@@ -20,11 +20,11 @@ MIN_MODEL_ERROR = 0.005
 
 
 def measure_source_noise(s: Stamps, fits: PointFits, alone: Bools, sigma: float, expected: SourceNoise) -> SourceNoise:
-    """The noise of the frame's own stars; `expected` where bright stars are too few. Stated photon noise is kept.
+    """The source noise of the frame; `expected` where bright stars are too few. Stated photon noise is kept.
 
-    From stars `alone` (n,): in bins of a pixel's light, the median squared residual beyond the noise of the dark is
-    a light + b light^2. The PSF's misfit is never taken to be larger than expected. Where residuals of different stars
-    are alike, the PSF differs from the model, and unknown photon noise cannot be separated from that.
+    From isolated stars `alone` (n,): in bins of a pixel's signal s, the median squared residual minus the variance
+    without the star is a s + b s^2. The PSF misfit is at most the expected one. If the residuals of different stars are
+    correlated, the PSF differs from the model, and unknown photon noise cannot be separated from that.
     """
     bright = _select_bright(s, fits, alone)
     if len(bright) < MIN_STARS:
@@ -59,13 +59,13 @@ def _select_bright(s: Stamps, fits: PointFits, alone: Bools) -> Ints:
     if s.usable is not None:
         good &= s.usable.all(axis=(1, 2))
     which = np.flatnonzero(good)
-    # Some of every brightness: the brightest show the PSF's misfit, the others photon noise.
+    # Stars of every brightness: the brightest determine the PSF misfit, the others the photon noise.
     return which[np.argsort(-fits.snr[which], kind="stable")][:: max(1, len(which) // MAX_STARS)]
 
 
 def _excess_variance(s: Stamps, fits: PointFits, sigma: float) -> tuple[Array, Array, float]:
-    """Light (m,) of the stars' pixels; (2, m) squared residuals (what the fit took of them given back) and variances;
-    and how alike the stars' residuals are: 1 for independent ones.
+    """Signal (m,) of the stars' pixels, squared residuals (leverage corrected) and variances (2, m), and the
+    correlation of the stars' residuals: 1 for independent ones.
     """
     radius = s.data.shape[1] // 2
     offset, n = fits.xy_px - s.centres, len(s.data)
@@ -85,13 +85,13 @@ def _excess_variance(s: Stamps, fits: PointFits, sigma: float) -> tuple[Array, A
     relative = residual / flux[:, :, 0]
     relative /= np.maximum(
         np.sqrt(np.mean(np.square(relative), axis=1, keepdims=True)), 1e-30
-    )  # each star counts alike
+    )  # equal weight for each star
     alike = float(np.sum(np.square(relative.sum(axis=0))) / np.sum(np.square(relative)))
     return light.reshape(n, -1)[use], np.stack([(squared / (1.0 - leverage))[use], variance[use]]), alike
 
 
 def _typical_excess(squared_and_variance: Array) -> tuple[float, float]:
-    """Variance beyond the dark pixel's, and its error."""
+    """Excess variance over that of a pixel without the star, and its error."""
     total = float(np.median(squared_and_variance[0])) / MEDIAN_OF_SQUARE
     dark = float(np.median(squared_and_variance[1]))
     return total - dark, max(total, dark) * 2.0 / np.sqrt(squared_and_variance.shape[1])

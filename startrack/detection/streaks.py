@@ -14,7 +14,7 @@ PIXEL_SIGMAS = 2.5  # of the lightly smoothed image: pixels of a streak
 SMOOTH_PX = 1.0
 MIN_AREA_PX, MAX_AREA_PX = 12, 20_000
 BRIGHT_SNR = 15.0  # of the whole streak
-MIN_STARS = 6  # streaks that agree with each other
+MIN_STARS = 6  # streaks of similar direction and length
 LONG_PX, SLENDER = 4.5, 2.5  # shortest streak, and its length over its width
 SAME_DIRECTION, SAME_LENGTH = np.cos(np.radians(15.0)), 0.3
 ELONGATION_RADIUS_PX, ELONGATION_PEAKS, ELONGATION_SIGMAS, ELONGATION_PX2, ELONGATION_RATIO = 7, 100, 4.0, 2.2, 2.2
@@ -35,7 +35,7 @@ class Streaks:
 
 
 def are_elongated(frame: Frame, centres: Ints) -> bool:
-    """Whether the highest peaks (n, 2) are parts of long sources rather than round ones: a quick test."""
+    """Whether the highest peaks (n, 2) are parts of elongated sources: a quick test."""
     height, width = frame.shape
     margin = np.minimum(centres, np.array([width, height]) - 1 - centres).min(axis=1)
     centres = centres[margin >= ELONGATION_RADIUS_PX][:ELONGATION_PEAKS]
@@ -53,11 +53,11 @@ def are_elongated(frame: Frame, centres: Ints) -> bool:
 
 
 def find_streaks(frame: Frame) -> Streaks | None:
-    """The frame's streaks where most of its bright blobs are streaks like their neighbours'; else None.
+    """The frame's streaks if most of its bright sources are streaks similar to their neighbours; else None.
 
-    The middle of a streak's light is where the star stood at mid-exposure, if the camera turned evenly and the sky was
-    equally clear all the time; a hundredth of the length is allowed for what was not. Tracks of particles have all
-    directions and lengths, and are not streaks of stars.
+    The centroid of a streak is the star's position at mid-exposure if rotation and transparency were constant; a
+    hundredth of the length is added to its error for variations. Particle tracks have random directions and lengths,
+    and are rejected.
     """
     height, width = frame.shape
     whole = frame.standardise(slice(0, height))
@@ -118,7 +118,7 @@ def _moments(label: Ints, xy: Array, light: Array, variance: Array, count: int) 
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
         spread[:, i, j] = total_light(light * off[:, i] * off[:, j]) / flux
         covariance[:, i, j] = total_light(variance * off[:, i] * off[:, j]) / flux**2
-    covariance += 1e-4 * np.eye(2)  # a hundredth of a pixel for the edges of the mask
+    covariance += 1e-4 * np.eye(2)  # 0.01 px for the edges of the mask
     return flux, np.sqrt(np.maximum(total_light(variance), 1e-12)), middle, spread, covariance
 
 
@@ -129,7 +129,7 @@ def _resemble_neighbours(xy: Array, along: Array, length: Array) -> Bools:
     _, near = cKDTree(xy).query(xy, k=min(4, len(xy)))
     off = xy[near[:, 1:]] - xy[:, None]
     off /= np.maximum(np.linalg.norm(off, axis=-1, keepdims=True), 1e-9)
-    # Pieces of one long edge follow each other in their own direction; of stars one in six does.
+    # Parts of one long edge lie in line with their direction; neighbouring stars do so in one of six cases.
     in_line = np.abs(np.einsum("ni,nki->nk", along, off)) > SAME_DIRECTION
     if in_line[:, 0].mean() > IN_LINE_FRACTION:
         return np.zeros(len(xy), dtype=bool)

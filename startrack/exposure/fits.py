@@ -86,7 +86,7 @@ def _has_end(block: bytes) -> bool:
 def _check_headers(raw: bytes) -> None:
     """Refuse numbers of axes, fields and pixels that a reader would loop over or allocate for minutes.
 
-    Header by header, before a reader sees the file; it stops at the first header that is not complete in `raw`.
+    Checks header by header before a reader opens the file; stops at the first header that is not complete in `raw`.
     """
     at = 0
     while raw[at : at + 8] in (b"SIMPLE  ", b"XTENSION"):

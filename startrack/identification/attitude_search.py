@@ -21,14 +21,14 @@ PREFIXES = (0, 7, 10, 14, 20, 28)  # number of brightest detections that form tr
 WINDOW, FRESH = 24, 12  # ranks of brightness that form triangles beyond these, and how many of them are new
 DEEPEST_RANK = 240
 ROUGH_DEPTH, ROUGH_REACH_RAD, ROUGH_FRACTION = 120, np.radians(20.0), 0.4
-PIVOTS = 16  # brightest detections about which triangles that no index lists are tried
+PIVOTS = 16  # brightest detections about which triangles of catalogue pairs are tried
 MATCHES_EACH, ROUGH_MATCHES_EACH = 3, 8  # catalogue triangles looked up for a triangle of detections
 MAX_IMAGE_TRIANGLES, MAX_ROUGH = 20_000, 3000  # short triangles of detections; their matches that are tried
 VERIFIED = 256  # detections tested against the stars
-SIFTED, SIFTED_AT_ONCE = 64, 64  # detections that test a crowd of hypotheses first; hypotheses tested together
+PRETESTED, PRETEST_BATCH = 64, 64  # detections in the first test of many hypotheses; hypotheses tested together
 DEPTH_FACTOR = 4  # catalogue stars per detection (of the whole sky): some are hidden or too faint
 MIN_HITS = 6
-PLAUSIBLE = 1e-2  # expected false alarms below which a hypothesis is refined; then the real limit decides
+PLAUSIBLE = 1e-2  # expected false alarms below which a hypothesis is refined; the final limit is tested later
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class AttitudeSearch:
         """Attitudes that are unlikely by chance.
 
         First from long triangles of the few brightest detections, then of fainter ones and with more catalogue stars,
-        then from triangles that no index lists; last from short ones, for rays in error by `rough_px`: over a short
-        distance a rough calibration is still good.
+        then from triangles assembled from catalogue pairs; last from short ones, for rays with errors of `rough_px`:
+        over short distances a rough calibration is still accurate.
         """
         brightest, beyond = list(self._prefixes()), list(self._windows())
         tolerance = tolerance_px * self.scale.axis_rad_per_px
@@ -70,7 +70,7 @@ class AttitudeSearch:
         yield from self._attitudes_from_short_triangles(rough_px * self.scale.axis_rad_per_px)
 
     def mirrored_hypotheses(self) -> Iterator[AttitudeHypothesis]:
-        """The same for the mirror image, from the triangles of the other handedness met so far."""
+        """The same for the mirror image, from the stored triangles of the other handedness."""
         flip = np.array([-1.0, 1.0, 1.0])
         for cam, icrs, first, tolerance in self.mirrored:
             yield from self._plausible_attitudes(cam * flip, icrs, self.rays_cam * flip, first, tolerance)
@@ -135,7 +135,7 @@ class AttitudeSearch:
         """Attitudes that rotate the rays icrs (m, 3, 3) to cam (m, 3, 3) and that bright stars support."""
         some, radius = rays_cam[: first + VERIFIED], 2.0 * tolerance
         depth = int(DEPTH_FACTOR * 4 * np.pi / self.patterns.field_sr * len(some))
-        for R in self._supported_attitudes(cam, icrs, some[max(first - WINDOW, 0) : first + SIFTED], radius, depth):
+        for R in self._supported_attitudes(cam, icrs, some[max(first - WINDOW, 0) : first + PRETESTED], radius, depth):
             near = self.patterns.neighbours(some @ R, self.neighbour_radius_rad, depth)
             on = near.chord < radius
             hits = min(int(np.count_nonzero(on)), len(some))
@@ -149,8 +149,8 @@ class AttitudeSearch:
         if len(cam):
             yield wahba(cam[0], icrs[0])
         tree = self.patterns.tree(depth)
-        for start in range(1, len(cam), SIFTED_AT_ONCE):
-            R = wahba(cam[start : start + SIFTED_AT_ONCE], icrs[start : start + SIFTED_AT_ONCE])
+        for start in range(1, len(cam), PRETEST_BATCH):
+            R = wahba(cam[start : start + PRETEST_BATCH], icrs[start : start + PRETEST_BATCH])
             distance = tree.query(some @ R, distance_upper_bound=radius)[0]
             hits = np.count_nonzero(distance < radius, axis=1)
             best = np.argsort(-hits, kind="stable")

@@ -25,11 +25,11 @@ CLOSE_PAIR_RAD = np.radians(0.05)  # stars this close are one detection
 SHALLOWEST_TREE = 1000  # brightest stars in the smallest tree; each next one holds twice as many
 NEIGHBOURS_OF_RAY = 10  # looked up at once; more only in clusters
 CACHED_PATTERNS = 4
-LONGEST_SIDE_OF_FIELD = 0.8  # of a field's diameter: sides that often fit into it
+LONGEST_SIDE_OF_FIELD = 0.8  # of a field's diameter: longer sides seldom fit into it
 CLOSURE_PROBABILITY = 0.59  # that two neighbours of a star in the plane are neighbours of each other
 SCALE_GRID = 33  # pixels per axis at which the solid angle of the field is summed
 SCALE_ANGLES = 64
-LARGEST_SCALE_1 = 3.0  # of the scale on the axis: a lens that bends its edge is not followed further
+LARGEST_SCALE_1 = 3.0  # limit of the scale over that on the axis, for lenses strongly compressed at the edge
 
 Computed = TypeVar("Computed")
 
@@ -69,7 +69,7 @@ class PixelScale:
 
     @classmethod
     def measure(cls, camera: Camera) -> PixelScale:
-        """Measured on grids of angles and of pixels."""
+        """The scale of a camera, measured on grids of angles and of pixels."""
         axis = camera.unproject(np.array([camera.centre_px]))[0]
         off_axis = np.arctan2(np.hypot(axis[0], axis[1]), axis[2]) + 0.01
         angle = np.linspace(0.01, min(camera.max_angle_rad, camera.lens.max_invertible_rad) - 1e-3, SCALE_ANGLES)
@@ -155,7 +155,7 @@ def build_index(stars: Stars, field_sr: float, size: PatternSize) -> PatternInde
 
 
 def separate_bright_stars(stars: Stars, depth: int) -> Ints:
-    """Indices of the brightest stars, of each close pair only the brighter: a camera does not resolve them."""
+    """Indices of the brightest stars; of each close pair only the brighter, as a camera does not resolve them."""
     from scipy.spatial import cKDTree
 
     rays = stars.rays_icrs[: 2 * depth]

@@ -44,7 +44,7 @@ VIEWS_OF_ROUND = 4
 # bound of the matches in the inner half of the gate.
 STAGES = ((60, 1.5, 0.010, 6.0, -4.0), (120, 1.5, 0.005, 4.0, -8.0), (400, 2.0, 0.0, 2.5, -10.0))
 STEPS = 2
-MARGIN = 1.15  # about the frame, for the focal length is not known
+MARGIN = 1.15  # of the frame: the focal length is not known
 GATE_PX = 1.5
 SCALE_MATCHES = 200  # brightest, for the photometric scale
 SMALLEST_ERROR_PX = 0.1  # of a centroid against the lens
@@ -100,7 +100,7 @@ class NarrowFieldSearch:
                     yield found
 
     def _voted_views(self, patterns: ShapePatterns, xy_px: Array) -> list[PinholeView]:
-        """The few views on which most of the likely triangles agree."""
+        """The views with the largest number of agreeing triangles."""
         centre = (0.5 * (self.size_px[0] - 1), 0.5 * (self.size_px[1] - 1))
         image = triangles(family_rays(xy_px, centre, self.focal_px, PINHOLE), patterns.longest_side_rad)
         left, right = patterns.triangles.candidates(image)
@@ -109,7 +109,7 @@ class NarrowFieldSearch:
             return []
         catalogue = patterns.triangles.triangles
         mirrored = image.handedness[left] != catalogue.handedness[right]
-        # The pairs (detection, star) of a wrong triangle occur once, those of a right one in all right triangles.
+        # A pair (detection, star) of a wrong triangle occurs once, a right one in many triangles.
         pair = (image.vertices[left] + len(xy_px) * mirrored[:, None]) * len(patterns.star) + catalogue.vertices[right]
         votes = np.bincount(pair.ravel())[pair].min(axis=1)
         most = np.argsort(-votes, kind="stable")[:MAX_VOTED]

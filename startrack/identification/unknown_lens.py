@@ -42,8 +42,8 @@ LOG_PLAUSIBLE = -11.0  # log p-value of a hypothesis that is grown: random skies
 LOG_FALSE_ALARM = float(np.log(1e-9))
 MAX_TRIED = 600_000  # patterns; a search without an answer ends here, after some seconds
 MAX_TRIED_IN_CIRCLE = 250_000  # where the image circle is seen: real photographs take 1000 to 110,000
-MAX_TRIED_BEYOND = 100_000  # further patterns without the image circle, in case that it is something else
-FIELD_MARGIN = 1.3  # about a narrow field, for its focal length and centre are not known
+MAX_TRIED_BEYOND = 100_000  # further patterns without the image circle, in case the disc found is not it
+FIELD_MARGIN = 1.3  # of a narrow field: its focal length and centre are not known
 CLUMP_FRACTION = 0.01  # of the frame: detections used for patterns are no closer
 CIRCLES = (0.5, 0.62, 0.42, 0.78, 1.0)  # radius of the image circle over the frame's shorter side
 SEEN_CIRCLES = (1.0, 1.25)  # radius at half the field over that of the visible disc: a dome may hide the horizon
@@ -100,7 +100,7 @@ def identify_unknown_lens(
 
 
 def _solve_narrow_field(search: _Search, centroids: Centroids) -> UnknownLensSolution | None:
-    """A narrow field by the votes of its brightest stars' triangles; None where they do not suffice."""
+    """A narrow field by votes of the triangles of its brightest stars; None where they do not suffice."""
     narrow = NarrowFieldSearch(
         centroids, search.chosen, search.size_px, search.fov_rad, search.rounded_field_sr(), search.stars
     )
@@ -233,7 +233,7 @@ class _Search:
         return np.flatnonzero(self.stars.rays_icrs @ axis_icrs > np.cos(corner * FIELD_MARGIN))
 
     def _guesses(self) -> list[LensGuess]:
-        """Lenses to begin with: shapes and focal lengths, the likelier first."""
+        """Initial lenses: shapes and focal lengths, the likelier first."""
         width, height = self.size_px
         centre = ((width - 1) / 2, (height - 1) / 2)
         if not self.wide:

@@ -37,7 +37,7 @@ def render(scene: Scene, *, rng: np.random.Generator) -> tuple[Exposure, Truth]:
 
 
 def light_e(scene: Scene) -> Array:
-    """Mean electrons (H, W) that the scene's light leaves: diffuse sky and wall, stars, bodies; no noise, no dark."""
+    """Mean photoelectrons (H, W) of the scene: diffuse sky and wall, stars, bodies; no noise, no dark current."""
     image_e = diffuse_e(scene)
     add_sources(image_e, scene)
     return image_e

@@ -37,7 +37,7 @@ class Scene(Value):
     position_enu_m: Array = array(3)  # the camera's centre
     R_cam_enu: Array = array(3, 3)
     R_enu_icrs: Array = array(3, 3)  # at mid-exposure
-    sky_turn_rad: Array = field(  # rotation vector in enu by which the stars turn from start to end
+    sky_rotvec_rad: Array = field(  # rotation vector in enu of the stars from start to end
         default_factory=lambda: np.zeros(3), metadata={"shape": (3,), "dtype": np.float64}
     )
     exposure_s: float

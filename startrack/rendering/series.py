@@ -95,7 +95,7 @@ class Series:
             position_enu_m=np.append(place_m, height_m),
             R_cam_enu=self.camera.R_body_cam.T @ R_body_enu_from_heading_pitch_roll(heading, pitch, roll),
             R_enu_icrs=R_enu_icrs(site, time),
-            sky_turn_rad=sky_turn_rad(site, time, exposure_s),
+            sky_rotvec_rad=sky_rotvec_rad(site, time, exposure_s),
             exposure_s=exposure_s,
             sky_v_mag_arcsec2=self.sky_v_mag_arcsec2,
             sky_gradient=self.sky_gradient,
@@ -111,7 +111,7 @@ class Series:
         return scene, rng
 
     def _pose(self, rng: np.random.Generator) -> tuple[datetime, Array, float, float, float]:
-        """Time, position (2,) [m], heading, pitch and roll [rad]. All are drawn: giving one leaves the others."""
+        """Time, position (2,) [m], heading, pitch and roll [rad]. All are drawn: a given one does not change others."""
         first, last = RANDOM_TIMES
         time = first + timedelta(microseconds=int(rng.integers((last - first) // timedelta(microseconds=1))))
         position = _random_position(self.terrain, rng)
@@ -126,7 +126,7 @@ class Series:
         )
 
     def _sky(self, site: Site, time: datetime) -> tuple[Stars, Array]:
-        """Apparent stars, the lacking ones after the catalogue's, and their magnitude errors (n,)."""
+        """Apparent stars, first those of the catalogue, then the random ones, and their magnitude errors (n,)."""
         rng = np.random.default_rng([self.seed, _SKY])
         stars = self.catalog.at(time, observer_velocity_m_s(site, time))
         errors = np.zeros(len(stars))
@@ -150,10 +150,10 @@ def load_sky_catalog(stars: str) -> StarCatalog:
     return load_deep_catalog() if stars == "gaia" or (stars == "auto" and has_deep_catalog()) else load_catalog()
 
 
-def sky_turn_rad(site: Site, time: datetime, exposure_s: float) -> Array:
+def sky_rotvec_rad(site: Site, time: datetime, exposure_s: float) -> Array:
     """Rotation vector (3,) in enu of the stars at a `site` over an exposure of `exposure_s` about `time`.
 
-    R_enu_icrs(end) = exp(turn) R_enu_icrs(start); exposures under half a turn of the sky.
+    R_enu_icrs(end) = exp([rotvec]x) R_enu_icrs(start); for exposures under half a rotation of the sky.
     """
     half = timedelta(seconds=exposure_s / 2)
     R = R_enu_icrs(site, time + half) @ R_enu_icrs(site, time - half).T

@@ -1,4 +1,4 @@
-"""Diffuse light of the sky, and its step at the skyline down to the light that the wall reflects."""
+"""Diffuse brightness of the sky, and its step at the skyline to the brightness of the wall."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from startrack.types import Array, Bools, Ints
 
 ARCSEC2_PER_SR = (180 * 3600 / np.pi) ** 2
 AZIMUTHS = 1 << 16  # of the horizon's table: 0.0055 degrees, a sixteenth of a pixel of the widest fisheye
-EDGE_REACH_SIGMAS = 4.0  # how far from the skyline its PSF-smoothed step is computed
+EDGE_REACH_SIGMAS = 4.0  # distance from the skyline up to which the PSF-smoothed step is computed
 TANGENT_NODES_SIGMAS = np.linspace(-3.5, 3.5, 11)  # trapezoid over a Gaussian: exact to 1e-9 for a smooth skyline
 LENS_SAMPLES = 4096
 ROWS_PER_BLOCK = 64
@@ -50,8 +50,8 @@ def coverage(scene: Scene, xy_px: Ints | Array) -> Array:
     """Fraction (n,) of the PSF about each pixel (n, 2) that lies above the skyline; for pixels near the skyline.
 
     In the pixel plane, r the direction in which the azimuth stands still and t the one across it:
-    c = integral over t of N(t; 0, s) Phi((elevation - H(azimuth)) / (s d elevation/dr)), both taken at t. So a jagged
-    skyline is followed as finely as the PSF can show; s^2 = psf_sigma^2 + 1/12 stands for the pixel's own width.
+    c = integral over t of N(t; 0, s) Phi((elevation - H(azimuth)) / (s d elevation/dr)), both evaluated at t. A jagged
+    skyline is resolved to the width of the PSF; s^2 = psf_sigma^2 + 1/12 includes the pixel's own width.
     """
     from scipy.special import ndtr
 
@@ -94,8 +94,8 @@ def _local_axes(scene: Scene, xy_px: Array) -> tuple[Array, Array]:
     for axis in np.eye(2):
         azimuth1, elevation1 = _azel(scene, xy_px + GRADIENT_STEP_PX * axis)
         azimuth0, elevation0 = _azel(scene, xy_px - GRADIENT_STEP_PX * axis)
-        turn = (azimuth1 - azimuth0 + np.pi) % (2 * np.pi) - np.pi
-        slopes.append((turn / (2 * GRADIENT_STEP_PX), (elevation1 - elevation0) / (2 * GRADIENT_STEP_PX)))
+        azimuth_step = (azimuth1 - azimuth0 + np.pi) % (2 * np.pi) - np.pi
+        slopes.append((azimuth_step / (2 * GRADIENT_STEP_PX), (elevation1 - elevation0) / (2 * GRADIENT_STEP_PX)))
     (azimuth_x, elevation_x), (azimuth_y, elevation_y) = slopes
     length = np.maximum(np.hypot(azimuth_x, azimuth_y), 1e-12)
     across = np.stack([azimuth_x, azimuth_y], axis=-1) / length[:, None]

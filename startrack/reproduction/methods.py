@@ -50,7 +50,7 @@ def tasks_of(
     method: str, seed: int, sky: int, count: int, *, magnitude: float = MAGNITUDE, aspect_ratio: float = ASPECT_RATIO,
     mistakes: Mistakes = PERFECT,
 ) -> list[Task]:  # fmt: skip
-    """The first `count` places of a sky, in chunks."""
+    """The first `count` positions of a sky, in chunks."""
     step = FIXES_PER_CHUNK[method]
     starts = range(0, count, step)
     return [

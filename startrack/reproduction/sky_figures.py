@@ -21,8 +21,8 @@ from startrack.reproduction.drawing import (
 from startrack.reproduction.simulator import Sky, crater, crater_edge, directions, star_count, visible_stars
 from startrack.types import Array
 
-ALONG_KM = (-9.0, -6.0, -3.0, 0.0, 3.0, 6.0, 9.0, 9.9)  # places of figure 3.3
-EXAMPLE_M = np.array([5000.0, 2000.0])  # of figure 3.6, and the true place of figure 3.5
+ALONG_KM = (-9.0, -6.0, -3.0, 0.0, 3.0, 6.0, 9.0, 9.9)  # positions of figure 3.3
+EXAMPLE_M = np.array([5000.0, 2000.0])  # of figure 3.6, and the true position of figure 3.5
 ESTIMATE_M = np.array([-3000.0, -1500.0])  # of figure 3.5: far from the true position, so that the vector is visible
 
 

@@ -58,7 +58,7 @@ def _ratio_to_limit(ours: MethodErrors, limit: MethodErrors) -> float:
     pairs = [
         (fix[: len(best)], best[: len(fix)])
         for fix, best, located in zip(ours.errors_m, limit.errors_m, ours.answered, strict=True)
-        if located.all()  # otherwise the places of both differ
+        if located.all()  # otherwise the positions of both differ
     ]
     return float(np.concatenate([fix for fix, _ in pairs]).mean() / np.concatenate([best for _, best in pairs]).mean())
 

@@ -98,7 +98,7 @@ def test_the_covariance_is_right_where_the_centroids_are(camera: Camera, n: int)
 
 
 @pytest.mark.parametrize(("n", "most"), [(6, 6.5), (20, 4.5), (60, 3.6), (300, 3.6)])
-def test_an_error_that_nobody_stated_is_seen_in_the_scatter(n: int, most: float) -> None:
+def test_unstated_errors_are_estimated_from_the_scatter(n: int, most: float) -> None:
     """0.15 px of lens error beyond centroid errors of 0.03 to 0.4 px; six stars can hardly tell."""
     assert 2.3 < mean_nees(FISHEYE, n, 60, unknown_px=0.15) < most
     if n == 300:
@@ -111,7 +111,7 @@ def test_heavy_tails_do_not_make_it_overconfident(n: int, heavy: float) -> None:
     assert mean_nees(FISHEYE, n, 60, heavy=heavy) < 4.0
 
 
-def test_gross_outliers_are_left_out_and_do_not_pull() -> None:
+def test_gross_outliers_are_rejected_without_bias() -> None:
     rng = np.random.default_rng(3)
     xy, covariance, rays, R = draw_stars(FISHEYE, 100, rng)
     wrong = rng.permutation(100)[:15]
@@ -164,7 +164,7 @@ def test_fewer_than_three_stars_is_refused() -> None:
     assert caught.value.evidence["matched"] == 2
 
 
-def test_an_error_of_the_lens_that_the_camera_file_states_is_in_the_covariance() -> None:
+def test_stated_lens_errors_are_in_the_covariance() -> None:
     """Lenses drawn from the file's covariance: the scatter of the stars' places shows nothing of their turn."""
     order = ("fx", "fy", "cx", "cy", "k1")
     spread = np.diag([0.5, 0.5, 1.0, 1.0, 2e-4]) @ np.array(

@@ -112,7 +112,7 @@ def test_named_images_must_lie_in_the_folder(night, monkeypatch):
         listed_images(night / "images", ["../small.toml"])
 
 
-def test_the_tables_say_what_the_results_say(night, batch_output):
+def test_the_tables_agree_with_the_results(night, batch_output):
     table = QTable.read(batch_output / "results.ecsv", format="ascii.ecsv")
     assert list(table["image"]) == ["a 1.png", "broken.png", "späti/a 1.png", "späti/b.png"]
     assert list(table["status"]) == ["ok", "refused", "ok", "ok"]
@@ -213,7 +213,7 @@ def test_several_processes_and_a_second_run_give_the_same_bytes(night, batch_out
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*.fix.json")} == before
 
 
-def test_what_was_lost_or_half_written_is_done_again_and_nothing_else(night, batch_output):
+def test_only_missing_or_incomplete_results_are_repeated(night, batch_output):
     out = night / "torn"
     shutil.copytree(batch_output, out)
     (out / "results.ecsv").unlink()
@@ -240,7 +240,7 @@ def test_a_changed_sidecar_or_flag_is_another_task(night, tmp_path):
     assert (refused["status"], refused["reason"]) == ("refused", "no_calibration")
 
 
-def test_dask_gives_the_same_as_the_local_run_though_a_worker_is_killed(night, batch_output, monkeypatch):
+def test_dask_with_a_killed_worker_equals_the_local_run(night, batch_output, monkeypatch):
     distributed = pytest.importorskip("distributed")
     out, killed = night / "dask", []
     with distributed.LocalCluster(2, processes=True, threads_per_worker=1, dashboard_address=None) as cluster:
@@ -263,7 +263,7 @@ def test_dask_gives_the_same_as_the_local_run_though_a_worker_is_killed(night, b
     assert tables(out) == tables(batch_output)
 
 
-def test_killed_at_any_moment_a_batch_is_taken_up_again(night, batch_output):
+def test_a_batch_killed_at_any_time_is_resumed(night, batch_output):
     out, command = night / "killed", [sys.executable, "-m", "startrack.cli.main", "batch", str(night / "images"), "-q"]
     for results in (1, 2):
         process = subprocess.Popen([*command, "-D", str(out), "-j", "2"])

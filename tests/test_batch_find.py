@@ -59,7 +59,7 @@ def test_a_pipe_is_no_image_and_a_link_to_nothing_is_one(tmp_path):
 
 
 @pytest.mark.parametrize("end", ["\n", "\0"])
-def test_an_image_that_is_gone_when_its_turn_comes_is_refused_alone(tmp_path, monkeypatch, end):
+def test_an_image_deleted_during_the_run_is_refused_alone(tmp_path, monkeypatch, end):
     frames(tmp_path / "images", 2)
     monkeypatch.setattr("sys.stdin", stdin_of("00.png", "gone.png", "gone.png", "gone.fits", end=end))
     out = str(tmp_path / "out")

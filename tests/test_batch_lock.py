@@ -31,7 +31,7 @@ def holder(out) -> subprocess.Popen[str]:
     return process
 
 
-def test_a_second_batch_is_told_of_the_first_and_touches_nothing(tmp_path, capsys):
+def test_a_second_batch_is_refused_and_changes_nothing(tmp_path, capsys):
     frames(tmp_path / "images", 1)
     out = tmp_path / "out"
     out.mkdir()
@@ -44,7 +44,7 @@ def test_a_second_batch_is_told_of_the_first_and_touches_nothing(tmp_path, capsy
     assert main(["batch", str(tmp_path / "images"), "-D", str(out), "-j", "1", "-q"]) == 5
 
 
-def test_a_lock_goes_with_a_killed_process(tmp_path):
+def test_a_lock_is_released_with_a_killed_process(tmp_path):
     first = holder(tmp_path)
     first.send_signal(signal.SIGKILL)
     first.communicate()

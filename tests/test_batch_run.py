@@ -66,7 +66,7 @@ def many_frames(tmp_path_factory) -> Path:
         ([signal.SIGTERM], True, "terminated"),  # as systemd and Slurm do
     ],
 )
-def test_a_signal_ends_the_batch_after_the_frames_in_hand_with_tables_of_what_is_done(
+def test_a_signal_ends_the_batch_after_the_frames_in_progress_and_writes_the_tables(
     many_frames, tmp_path, wishes, to_the_group, why
 ):
     out = tmp_path / "out"
@@ -99,7 +99,7 @@ def test_an_early_signal_ends_the_batch_at_once(many_frames, tmp_path, delay_s):
         assert "images done" in err
 
 
-def test_a_later_signal_drops_the_images_in_hand_and_writes_the_tables(tmp_path, monkeypatch):
+def test_a_later_signal_drops_the_images_in_progress_and_writes_the_tables(tmp_path, monkeypatch):
     """The wish is made from within, so that it comes between two images."""
     frames(tmp_path / "images", 40)
     monkeypatch.setattr("startrack.cli.batch_show.SAME_SIGNAL_S", -1.0)
@@ -117,7 +117,7 @@ def test_a_later_signal_drops_the_images_in_hand_and_writes_the_tables(tmp_path,
     assert len(list(out.glob("*.fix.json"))) < 40
 
 
-def test_a_reader_that_goes_ends_the_batch_early(many_frames, tmp_path):
+def test_a_closed_pipe_ends_the_batch_early(many_frames, tmp_path):
     with start_batch(many_frames, "-D", str(tmp_path / "out"), "-j", "1", "--json", "--no-plots") as process:
         assert process.stdout is not None and process.stderr is not None
         assert json.loads(process.stdout.readline())["image"] == "00.png"
@@ -128,7 +128,7 @@ def test_a_reader_that_goes_ends_the_batch_early(many_frames, tmp_path):
     assert "Traceback" not in err
 
 
-def test_a_reader_that_goes_ends_the_image_commands_early_too(many_frames, tmp_path):
+def test_a_closed_pipe_ends_the_image_commands_early(many_frames, tmp_path):
     images = sorted(str(path) for path in many_frames.glob("*.png"))[:300]
     command = [sys.executable, "-m", "startrack.cli.main", "detect", *images, "-D", str(tmp_path / "out"), "--no-plots"]
     with subprocess.Popen([*command, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
@@ -159,7 +159,7 @@ def test_a_full_disk_ends_the_batch_with_one_message(tmp_path):
     assert len(Table.read(tmp_path / "out" / "results.ecsv", format="ascii.ecsv")) == 4
 
 
-def test_a_folder_that_cannot_be_written_is_said_at_once(tmp_path, capsys):
+def test_a_read_only_folder_is_reported_at_once(tmp_path, capsys):
     frames(tmp_path / "images", 1)
     assert main(["batch", str(tmp_path / "images"), "-D", "/proc"]) == 4
     assert "/proc: results cannot be written" in capsys.readouterr().err

@@ -65,7 +65,7 @@ def test_chance_gives_no_such_number_of_matches(cold_calibration):
     assert joint_log_p_value(cold_calibration.joint) < np.log(1e-100)
 
 
-def test_the_mirror_image_is_solved_and_said_to_be_one(exposure):
+def test_the_mirror_image_is_solved_and_reported_as_mirrored(exposure):
     flipped = replace(exposure, pixels_adu=exposure.pixels_adu[:, ::-1].copy())
     found = calibrate([flipped], load_catalog().brighter_than(7.0), camera=load_camera("lowell-ldt"), site=SITE)
     assert found.accepted
@@ -129,7 +129,7 @@ def test_the_command_writes_camera_record_and_report(written_files):
     assert (written_files / "new.report.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_sensor_is_measured_where_the_picture_tells(written_files):
+def test_the_sensor_is_measured_where_the_picture_allows(written_files):
     sensor = load_camera(written_files / "new.toml").sensor
     assert sensor is not None
     assert sensor.gain_e_per_adu == 0.4  # given
@@ -193,7 +193,7 @@ def test_convert_by_command(written_files, capsys):
         (["--fov", "-3"], 2),
     ],
 )
-def test_misuse_is_told(words, code, tmp_path, capsys):
+def test_wrong_usage_is_refused(words, code, tmp_path, capsys):
     image = tmp_path / "sky.fits.bz2"
     image.write_bytes(PHOTO.read_bytes())
     if code == 2:

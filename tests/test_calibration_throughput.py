@@ -82,7 +82,7 @@ def test_hot_pixels_are_listed(frames, calibration):
     assert len(listed - set(frames[1])) <= 3
 
 
-def test_what_is_given_goes_before_what_is_measured(calibration):
+def test_given_values_replace_measured_ones(calibration):
     given = measure_photometry(
         calibration.joint, KnownSensor(gain_e_per_adu=0.7, read_noise_e=9.0, bias_adu=190.0)
     ).sensor
@@ -97,7 +97,7 @@ def test_without_exposure_times_no_zero_point_is_invented(calibration):
     assert any(re.match("zero point: not measured", note) for note in missing.notes)
 
 
-def test_photon_transfer_on_plain_light():
+def test_photon_transfer_on_flat_fields():
     rng = np.random.default_rng(0)
     light_e = np.linspace(50, 4000, 512)[None, :] * np.ones((512, 1))
 
@@ -145,7 +145,7 @@ def star_fluxes(
     return StarFluxes(gain + offset_mag * (image == 1), np.full(n, 0.08), angle, b_v, air, image)
 
 
-def test_throughput_and_extinction_are_recovered_where_they_can_be_told_apart():
+def test_throughput_and_extinction_are_recovered_where_distinguishable():
     fit = fit_throughput(star_fluxes(), np.radians(80))
     assert fit.throughput.extinction_mag == pytest.approx(0.25, abs=0.04)
     assert 2.5 * np.log10(fit.throughput.zero_point_adu_per_s) == pytest.approx(10.0, abs=0.06)
@@ -165,7 +165,7 @@ def test_a_zenith_camera_gets_no_impossible_extinction_or_vignetting(seed):
     assert fit.warnings
 
 
-def test_a_lens_that_brightens_its_edge_is_not_believed():
+def test_a_lens_brighter_at_its_edge_is_rejected():
     fit = fit_throughput(star_fluxes(extinction=0.0, edge=2.5), np.radians(80))
     assert fit.throughput is None
     assert any("vignetting is not physical" in warning for warning in fit.warnings)

@@ -122,7 +122,7 @@ def test_earthlight_at_the_lunar_pole_is_as_bright_as_it_should_be() -> None:
 
 
 @pytest.mark.parametrize("site", MOON_SITES + EARTH_SITES)
-def test_a_sites_own_body_is_never_a_light(site: Site) -> None:
+def test_a_sites_own_body_is_not_listed(site: Site) -> None:
     names = [body.name for body in bodies(site, TIMES[0])]
     assert len(names) == len(set(names)) == 9
     assert site.body.capitalize() not in names

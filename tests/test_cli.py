@@ -159,7 +159,7 @@ def test_what_is_no_image_is_bad_input(folder, capsys):
         ({"terrain": "broken.toml"}, "bad_terrain"),
     ],
 )
-def test_facts_that_lack_or_are_wrong_are_named(folder, capsys, facts, expected):
+def test_missing_or_wrong_facts_are_named(folder, capsys, facts, expected):
     Path("broken.toml").write_text("format = 1\nsize_px = [")
     assert reason(capsys, "locate", stars(**facts)) == (BAD_INPUT, expected)
 
@@ -273,7 +273,7 @@ def test_the_same_image_gives_the_same_bytes(folder, capsys):
 
 
 @pytest.mark.parametrize("words", ["", "nothing", "locate", "locate x.png --nothing", "schema nothing", "render -n -1"])
-def test_wrong_usage_is_two_and_says_how(folder, words):
+def test_wrong_usage_has_exit_code_2_and_advice(folder, words):
     done = shell(*words.split(), cwd=folder)
     assert done.returncode == USAGE
     assert "usage: startrack" in done.stdout + done.stderr
@@ -313,7 +313,7 @@ def test_no_refusal_shows_a_traceback(folder):
     assert done.stderr == ""
 
 
-def test_output_that_cannot_be_written_is_said_in_one_line(folder):
+def test_unwritable_output_is_reported_in_one_line(folder):
     stars()
     Path("file").write_text("")
     done = shell("detect", "stars.png", "-D", "file/below", cwd=folder)
@@ -446,7 +446,7 @@ def test_the_samples_are_located_without_a_flag(folder, capsys, name):
     assert position["up_m"] == pytest.approx(1.5)
 
 
-def test_a_wrong_time_turns_the_place_about_the_axis_of_a_round_crater(folder, capsys):
+def test_a_wrong_time_rotates_the_position_about_the_axis_of_a_round_crater(folder, capsys):
     """Near the pole six hours turn the sky by 3.3 degrees about the zenith, and in a round crater nothing tells.
 
     The Moon's rotation: 13.17635815 degrees a day (IAU 2015 report, Archinal et al. 2018, table 2).

@@ -84,7 +84,7 @@ def test_added_and_removed_keys_are_listed(write_version):
     assert "- added: [].x_px (1)" in text and "- removed: [].x_px (1)" in text
 
 
-def test_a_changed_status_is_told(write_version):
+def test_a_changed_status_is_reported(write_version):
     refused = {key: FIX[key] for key in FIX if key != "position"} | {"status": "refused", "reason": "no_stars"}
     code, text = compare(write_version("old"), write_version("new", refused))
     assert code == 1

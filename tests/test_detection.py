@@ -180,7 +180,7 @@ def test_a_bad_column_and_row_give_few_false_stars(sigma: float, most: int) -> N
 
 
 @pytest.mark.parametrize("sigma", SIGMAS)
-def test_stars_above_a_bright_skyline_keep_their_places(sigma: float) -> None:
+def test_stars_above_a_bright_skyline_keep_their_positions(sigma: float) -> None:
     rng = np.random.default_rng(8)
     xy = rng.uniform(130, 890, (150, 2))
     clear = np.hypot(*(xy - [512, 480]).T) < 385
@@ -262,7 +262,7 @@ def test_a_wrong_psf_in_the_camera_file_is_corrected() -> None:
         assert detections.psf_sigma_px == pytest.approx(1.0, rel=0.03)
 
 
-def test_close_pairs_are_parted_or_left_alone() -> None:
+def test_close_pairs_are_fitted_separately() -> None:
     """Two stars 3.5 sigma apart: each is found, and neither drags the other along."""
     rng = np.random.default_rng(12)
     middle = np.stack(np.meshgrid(np.arange(40, 990, 50), np.arange(40, 990, 50)), axis=-1).reshape(-1, 2)
@@ -322,7 +322,7 @@ def test_a_flat_frame_has_no_stars(value: float) -> None:
         assert caught.value.reason == "no_stars"
 
 
-def test_a_black_noisy_frame_has_no_stars_and_says_what_to_do() -> None:
+def test_a_black_noisy_frame_has_no_stars_and_gives_advice() -> None:
     rng = np.random.default_rng(14)
     dark = np.rint(np.maximum(rng.normal(100, 2.5, (512, 512)), 0)).astype(np.float32)
     with pytest.raises(TooFewStars, match="lens cap") as caught:

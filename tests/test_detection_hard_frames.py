@@ -61,7 +61,7 @@ def test_bit_depths(bits: int) -> None:
 
 
 @pytest.mark.parametrize("sigma", [1.2, 2.5])
-def test_a_crowd_hides_few_of_its_faint_stars(sigma: float) -> None:
+def test_few_faint_stars_are_lost_in_crowded_frames(sigma: float) -> None:
     """Wings of a thousand bright stars cover a tenth to half of the frame and would raise background and noise."""
     rng = np.random.default_rng(3)
     xy = rng.uniform(20, SIZE - 20, (1500 if sigma < 2 else 700, 2))
@@ -169,7 +169,7 @@ def noise_of_kind(kind: str, rng: np.random.Generator) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["uniform", "two values", "spiky"])
-def test_nothing_but_noise_is_soon_over(kind: str) -> None:
+def test_pure_noise_ends_quickly(kind: str) -> None:
     frame = noise_of_kind(kind, np.random.default_rng(8)).astype(np.float32)
     start = time.process_time()
     try:

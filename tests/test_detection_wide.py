@@ -38,7 +38,7 @@ def test_centroids_and_covariances_of_wide_stars(sigma: float, known: bool) -> N
     assert found.background_e.shape == (SIZE, SIZE)
 
 
-def test_binned_frames_keep_light_and_noise() -> None:
+def test_binned_frames_keep_flux_and_noise() -> None:
     rng = np.random.default_rng(2)
     image = rng.poisson(50.0, (201, 303)).astype(np.float32)
     dead = np.zeros(image.shape, dtype=bool)
@@ -72,7 +72,7 @@ def test_bright_pixels_are_those_of_stars_not_hot_ones() -> None:
     assert sorted(map(tuple, bright_pixels(frame, 8.0, 10, 1).tolist())) == sorted(places)
 
 
-def test_skew_noise_asks_for_more_and_wide_stars_for_less() -> None:
+def test_skew_noise_raises_the_threshold_and_wide_stars_lower_it() -> None:
     usual = detection_threshold(5.42, 1.25, 0.088)
     assert usual == pytest.approx(5.42, abs=0.03)
     assert detection_threshold(5.42, 1.25, 0.2) > usual > detection_threshold(5.42, 1.25, 0.0) > 5.0

@@ -100,7 +100,7 @@ def test_photometry_is_unbiased_and_its_variance_right(
 
 
 @pytest.mark.parametrize("sigma", [0.7, 1.0, 1.5])
-def test_photometry_wastes_no_light(sigma: float) -> None:
+def test_photometry_is_near_the_cramer_rao_bound(sigma: float) -> None:
     """Variance of hidden stars against the Cramer-Rao bound with the place known and the level free."""
     got = measure_pairs(sigma, 0.0, rng=np.random.default_rng(2))
     p = cramer_rao(np.zeros(2), 1e-6, sigma, VARIANCE)  # no light: place and flux do not mix
@@ -110,7 +110,7 @@ def test_photometry_wastes_no_light(sigma: float) -> None:
 
 
 @pytest.mark.parametrize("neighbours", [None, (0.5, 0.5)], ids=["alone", "beside who knows"])
-def test_ratios_mean_what_they_say(neighbours: tuple[float, float] | None) -> None:
+def test_ratios_are_calibrated(neighbours: tuple[float, float] | None) -> None:
     """Of the stars with ratio l, as many shine as the logistic of l says (half of all do)."""
     rng = np.random.default_rng(3)
     llr, shines = [], []
@@ -142,7 +142,7 @@ def test_the_ratio_is_that_of_the_stated_densities() -> None:
     assert got[0] == pytest.approx(np.log(shines / hides), rel=1e-9)
 
 
-def test_the_ratio_rises_with_the_light_and_is_capped() -> None:
+def test_the_ratio_rises_with_the_flux_and_is_capped() -> None:
     flux = np.linspace(-100, 400, 501)
     ratio = visibility_llr(flux, np.full(501, 200.0), np.full(501, 20.0), np.full(501, 30.0))
     assert np.all(np.diff(ratio[(flux >= 20) & (flux <= 200)]) > 0)
@@ -154,7 +154,7 @@ def test_the_ratio_rises_with_the_light_and_is_capped() -> None:
     assert np.all(np.abs(odd) < 1.0)
 
 
-def test_a_star_too_faint_to_tell_says_nothing() -> None:
+def test_a_star_far_below_the_noise_has_no_evidence() -> None:
     ratio = visibility_llr(np.array([-30.0, 0.0, 30.0]), np.full(3, 0.01), np.full(3, 20.0), np.full(3, 20.0))
     assert np.abs(ratio).max() < 0.01
 
@@ -235,7 +235,7 @@ def measure_frame(
     )  # fmt: skip
 
 
-def test_every_star_in_view_gets_a_verdict() -> None:
+def test_every_star_in_view_gets_a_ratio() -> None:
     rng = np.random.default_rng(5)
     stars = random_stars(1500, rng)
     shines = stars.rays_icrs[:, 0] > 0  # a wall in the west
@@ -307,7 +307,7 @@ def test_one_lonely_star_and_none_at_all() -> None:
     assert len(below.star) == len(below.evidence()) == 0
 
 
-def test_uncertain_stars_say_less_when_missing() -> None:
+def test_uncertain_stars_have_weaker_evidence_when_missing() -> None:
     """A variable star that is not seen may just be faint today."""
     rng = np.random.default_rng(9)
     rays = random_stars(300, rng).rays_icrs
@@ -356,7 +356,7 @@ def test_the_scale_is_found_with_its_scatter() -> None:
     assert scale_from(v, low, saturated=clipped).zero_mag == pytest.approx(13.0, abs=0.015)
 
 
-def test_vignetting_that_the_camera_file_misses_is_seen_and_carried() -> None:
+def test_unstated_vignetting_is_estimated_and_applied() -> None:
     rng = np.random.default_rng(13)
     xy = rng.uniform(60, 450, (500, 2))
     angle = CAMERA.angle_rad(xy)

@@ -51,7 +51,7 @@ def frame():
     return image, found, above, light
 
 
-def test_the_step_goes_and_each_side_has_its_own_noise(frame):
+def test_the_step_is_subtracted_and_each_side_has_its_own_noise(frame):
     image, found, above, light = frame
     better = subtract_step(image, found, horizon_at(PLACE))
     inner = np.abs(above) < 8

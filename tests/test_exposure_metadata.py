@@ -75,7 +75,7 @@ def test_flags_go_before_sidecar(image, sidecar):
         assert {key: getattr(exposure, key) for key in flags} == flags
 
 
-def test_a_fact_given_by_flag_is_not_even_looked_at_below(image, sidecar):
+def test_a_fact_given_by_flag_is_not_read_elsewhere(image, sidecar):
     sidecar({"time_utc": "2031-03-26T20:58:11+02:00"})
     with pytest.raises(BadInput, match="local time") as caught:
         read_exposure(image)

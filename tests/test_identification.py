@@ -157,7 +157,7 @@ def test_ten_stars_in_a_narrow_field() -> None:
 
 @pytest.mark.parametrize("count", [20, 300])
 @pytest.mark.parametrize("clustered", [False, True], ids=["uniform", "clustered"])
-def test_a_sky_of_chance_is_refused(count: int, clustered: bool) -> None:
+def test_random_detections_are_refused(count: int, clustered: bool) -> None:
     rng = np.random.default_rng(count)
     xy = random_positions(FISHEYE, count, rng)
     if clustered:
@@ -170,7 +170,7 @@ def test_a_sky_of_chance_is_refused(count: int, clustered: bool) -> None:
     assert caught.value.evidence["detected"] == count
 
 
-def test_chance_in_a_narrow_field_is_refused() -> None:
+def test_random_detections_in_a_narrow_field_are_refused() -> None:
     rng = np.random.default_rng(3)
     xy = random_positions(NARROW, 60, rng)
     with pytest.raises(NotIdentified, match="chance"):
@@ -182,7 +182,7 @@ ODDS = {"wide": (FISHEYE, 10.0, 1.0, 400), "narrow": (NARROW, 2.0, 0.15, 8000)} 
 
 @pytest.mark.parametrize("field", ODDS)
 @pytest.mark.parametrize("clustered", [False, True], ids=["uniform", "clustered"])
-def test_the_stated_odds_of_chance_are_true(clustered: bool, field: str) -> None:
+def test_stated_false_alarm_probabilities_are_true(clustered: bool, field: str) -> None:
     """p-values of random attitudes over random detections: at least as large as they should be, and not much more."""
     camera, cap_deg, radius_deg, stars = ODDS[field]
     rng, width = np.random.default_rng(4), camera.size_px[0]
@@ -229,7 +229,7 @@ def test_a_wrong_focal_length_is_refused(error: float) -> None:
     assert caught.value.reason == "not_identified"
 
 
-def test_a_slightly_wrong_focal_length_does_no_great_harm() -> None:
+def test_a_slightly_wrong_focal_length_gives_a_small_error() -> None:
     truth = frame(FISHEYE, 0)
     found = Identifier()(truth.detections, replace(FISHEYE, focal_px=(652.65, 652.65)), sky())  # 1.5 px at the rim
     assert np.mean(truth.star[found.detection] == found.star) > 0.99
@@ -244,7 +244,7 @@ def test_a_rough_camera_may_be_used_to_begin_a_calibration() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 5])
-def test_too_few_detections_say_so(count: int) -> None:
+def test_too_few_detections_are_refused(count: int) -> None:
     xy = random_positions(FISHEYE, 50, np.random.default_rng(5))[:count]
     with pytest.raises(NotIdentified, match=f"{count} point sources are too few"):
         Identifier()(make_detections(xy, np.linspace(1, 3, count), 0.2), FISHEYE, sky())
@@ -260,7 +260,7 @@ def test_detections_outside_the_image_circle_are_ignored() -> None:
     assert found.detection.min() >= 200
 
 
-def test_bright_lights_that_are_no_stars_are_counted_as_unexplained() -> None:
+def test_bright_false_detections_are_counted_as_unexplained() -> None:
     truth = frame(FISHEYE, 3, false=0.0)
     strangers = random_positions(FISHEYE, 9, np.random.default_rng(6))
     v = np.concatenate([np.full(9, -3.0), -2.5 * np.log10(truth.detections.flux_e) + ZERO_MAG])
@@ -315,7 +315,7 @@ def test_triangles_are_all_that_there_are() -> None:
         assert handed == np.sign(np.dot(rays[a], np.cross(rays[b], rays[c])))
 
 
-def test_triangles_keep_their_sides_under_rotation_and_lose_their_hand_in_a_mirror() -> None:
+def test_triangles_keep_their_sides_under_rotation_and_change_handedness_in_a_mirror() -> None:
     rays = rays_about(15, 0.5, 2)
     plain = triangles(rays, 0.6)
     turned = triangles(rays @ Rotation.random(random_state=3).as_matrix().T, 0.6)

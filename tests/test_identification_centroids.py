@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_identification import ARCSEC, FISHEYE, NARROW, frame, scattered, sky
+from test_identification import ARCSEC, FISHEYE, NARROW, frame, random_positions, sky
 
 from startrack.identification import identify_centroids
 from startrack.types import NotIdentified
@@ -51,7 +51,7 @@ def test_a_field_of_view_is_enough(known: bool) -> None:
 @pytest.mark.parametrize("known", [True, False], ids=["fluxes", "order"])
 def test_random_centroids_are_refused(known: bool) -> None:
     rng = np.random.default_rng(4)
-    xy = scattered(FISHEYE, 80, rng)
+    xy = random_positions(FISHEYE, 80, rng)
     with pytest.raises(NotIdentified, match="chance"):
         identify_centroids(xy, flux=rng.pareto(1.5, len(xy)) if known else None, camera=FISHEYE, stars=sky())
 

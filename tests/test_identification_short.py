@@ -44,7 +44,7 @@ def _skip_attempts(search: AttitudeSearch, tried: int, attitudes: Iterator) -> I
 
 
 @pytest.mark.parametrize("false", [20, 320])
-def test_the_stars_of_a_short_list_are_all_but_all_named(false: int) -> None:
+def test_nearly_all_stars_of_a_short_list_are_identified(false: int) -> None:
     named = there = 0
     for seed in range(10):
         truth = hundred_stars(seed, false)
@@ -134,7 +134,7 @@ def test_the_sides_of_few_are_those_of_the_general_search(fresh: int) -> None:
         assert few[tuple(sorted(v))] == pytest.approx(sides, abs=1e-14)
 
 
-def test_turns_are_the_best_rotations() -> None:
+def test_wahba_solutions_are_the_best_rotations() -> None:
     rng = np.random.default_rng(6)
     icrs = rng.normal(size=(5, 40, 3))
     icrs /= np.linalg.norm(icrs, axis=-1, keepdims=True)
@@ -146,7 +146,7 @@ def test_turns_are_the_best_rotations() -> None:
     assert np.linalg.det(wahba(flat @ R.T, flat)) == pytest.approx(1)
 
 
-def test_facts_are_kept_per_object_and_forgotten_with_it() -> None:
+def test_values_kept_per_object_are_released_with_it() -> None:
     calls: list[object] = []
 
     class Thing:
@@ -180,7 +180,7 @@ BLENDS = {
 
 
 @pytest.mark.parametrize("case", BLENDS)
-def test_a_blend_goes_by_the_name_of_the_plainly_brighter_star(case: str) -> None:
+def test_a_blend_is_named_after_the_clearly_brighter_star(case: str) -> None:
     *listed, named = BLENDS[case]
     pairs = pairs_of(*listed)
     plain = pairs.select_unambiguous(pairs.one_to_one_pairs, np.full(len(pairs.one_to_one_pairs), 0.04), 3.0)
@@ -189,7 +189,7 @@ def test_a_blend_goes_by_the_name_of_the_plainly_brighter_star(case: str) -> Non
         assert pairs.star[plain].tolist() == named
 
 
-def test_the_last_of_each_number() -> None:
+def test_is_last_occurrence() -> None:
     assert is_last_occurrence(np.array([4, 2, 4, 7, 2])).tolist() == [False, False, True, True, True]
     assert is_last_occurrence(np.zeros(0, dtype=np.int64)).tolist() == []
 

@@ -119,7 +119,7 @@ def test_the_check_sees_every_way_to_import(source, room, other):
     assert violations([(ROOT / room / "x.py", room, other)]) != []
 
 
-def test_nobody_reads_the_truth_but_the_renderer():
+def test_only_the_renderer_reads_the_truth():
     """The truth beside a rendered image is for tests and scorers: no stage knows of it."""
     truth = re.compile(r"\bTruth\b|\.truth\b")
     readers = {room_of(path) for path in ROOT.rglob("*.py") if truth.search(path.read_text(encoding="utf-8"))}

@@ -82,7 +82,7 @@ def test_a_list_of_centroids_is_identified_in_one_call():
         startrack.identify(found.xy_px[:200])
 
 
-def test_a_calibration_says_what_it_found():
+def test_a_calibration_prints_its_result():
     found = startrack.calibrate(["sample_images/lowell-2018-08-06.fits.bz2"], fov=180.0, name="lowell")
     assert found.camera.name == "lowell" and found.checks
 

@@ -74,7 +74,7 @@ def test_contract_of_every_localizer(method: Localizer, mean_m: float, most_m: f
 
 
 @pytest.mark.parametrize("method", [ExactPosterior(), PseudoGradient(), Hull()])
-def test_nothing_to_see_is_refused_by_every_localizer(method: Localizer) -> None:
+def test_empty_evidence_is_refused_by_every_localizer(method: Localizer) -> None:
     none = np.zeros(0)
     with pytest.raises(NotLocated):
         method(Evidence(azimuth_rad=none, elevation_rad=none, llr=none, edge_sigma_rad=none), TERRAIN)
@@ -169,7 +169,7 @@ def test_errors_are_as_large_as_stated() -> None:
 
 
 @pytest.mark.parametrize("terrain", [TERRAIN, ThreeMethods(TERRAIN)], ids=["disks", "bounds"])
-def test_two_places_that_fit_are_both_named(terrain: Terrain) -> None:
+def test_two_positions_that_fit_are_both_modes(terrain: Terrain) -> None:
     """Stars due east and due west only: a place and its mirror image to the south see the same horizon there."""
     rng = np.random.default_rng(3)
     n, at = 1500, np.array([2000.0, 6000.0])
@@ -293,7 +293,7 @@ def whole_sky(seed: int, n: int = 1500) -> Evidence:
     )
 
 
-def test_rays_below_the_horizontal_never_shine_and_do_no_harm() -> None:
+def test_rays_below_the_horizontal_are_never_visible() -> None:
     evidence = whole_sky(3)
     above = evidence.elevation_rad > 0
     kept = evidence.take(above)
@@ -312,7 +312,7 @@ def test_a_smaller_search_area_is_kept_to() -> None:
     np.testing.assert_allclose(near.position_enu_m, fix.position_enu_m, atol=0.1 * sigma)
 
 
-def test_without_a_proof_sharp_posteriors_are_resolved_all_the_same() -> None:
+def test_sharp_posteriors_are_resolved_without_a_proof() -> None:
     """20,000 rows with hard edges: a few decimetres to metres wide, mean NEES 2 (8 positions: s.d. 0.7)."""
     nees = []
     for seed in range(8):

@@ -68,7 +68,7 @@ def test_between_traced_points_the_horizon_is_the_traced_one_and_bounds_hold(sha
 
 
 @pytest.mark.parametrize("sigma_rad", [0.0, 0.001])
-def test_the_vicinity_scores_places_as_all_rays_do(shackleton, sigma_rad):
+def test_scores_of_the_local_search_equal_those_of_all_rays(shackleton, sigma_rad):
     rng = np.random.default_rng(2)
     place = np.array([-80.0, 30.0])
     evidence = simulate_rays(shackleton, place, rng, 3000, sigma_rad)
@@ -86,7 +86,7 @@ def test_the_vicinity_scores_places_as_all_rays_do(shackleton, sigma_rad):
     assert np.allclose(plain.climb(place, 16.0, 0.5)[0], top, atol=1.0)
 
 
-def test_a_box_is_blurred_as_horizons_drawn_between_its_bounds_are(shackleton):
+def test_box_averages_equal_those_of_random_horizons_between_the_bounds(shackleton):
     rng = np.random.default_rng(6)
     evidence = simulate_rays(shackleton, np.array([-80.0, 30.0]), rng, 3000, 0.0)
     likelihood = PositionLikelihood.from_evidence(evidence, shackleton)
@@ -119,7 +119,7 @@ def test_the_beam_search_ends_near_the_top(shackleton):
         assert np.linalg.norm(guess.points_m[0] - place) < 30.0
 
 
-def test_stars_of_another_place_or_time_are_refused(shackleton):
+def test_stars_of_another_position_or_time_are_refused(shackleton):
     rng = np.random.default_rng(8)
     evidence = simulate_rays(shackleton, np.array([50.0, -120.0]), rng, 3000, 0.0005)
     assert ExactPosterior()(evidence, shackleton).radius95_m < 50.0
@@ -129,7 +129,7 @@ def test_stars_of_another_place_or_time_are_refused(shackleton):
     assert refused.value.reason == "inconsistent_evidence"
 
 
-def test_contradictions_are_counted_apart():
+def test_contradictions_are_counted_separately():
     by_sector = np.zeros(240)
     assert contradicted_stretches(by_sector) == []
     by_sector[[238, 239, 0, 1, 3]] = -9.0  # a ridge across north, with a gap in it
@@ -175,7 +175,7 @@ def test_posterior_on_ground_equals_a_plain_grid(shackleton, sigma_rad):
     assert fix.dropped_mass < 1e-3 or sigma_rad
 
 
-def test_a_common_error_found_is_told_and_not_taken_for_a_wrong_map(shackleton):
+def test_a_common_error_is_reported_and_not_taken_for_a_wrong_map(shackleton):
     rng, error = np.random.default_rng(4), np.radians(0.08)
     unsure = replace(shackleton, horizon_sigma_common_rad=np.radians(0.1))
     evidence = lower_evidence(simulate_rays(shackleton, np.array([50.0, -90.0]), rng, 4000, 0.0), -error)
@@ -184,7 +184,7 @@ def test_a_common_error_found_is_told_and_not_taken_for_a_wrong_map(shackleton):
     check_consistency(evidence, fix, unsure)
 
 
-def test_a_sky_turned_by_a_wrong_clock_shows(shackleton):
+def test_a_sky_rotated_by_a_wrong_clock_is_noticed(shackleton):
     rng = np.random.default_rng(5)
     place = np.array([50.0, -90.0])
     evidence = simulate_rays(shackleton, place, rng, 12_000, 0.0)

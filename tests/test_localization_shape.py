@@ -61,7 +61,7 @@ def test_an_uncertain_depth_is_found_with_the_position(place_m: tuple[float, flo
     assert crater.diameter_m == pytest.approx(guess.diameter_m)
 
 
-def test_the_size_of_a_crater_cannot_be_seen_and_is_not_pretended() -> None:
+def test_the_size_of_a_crater_is_not_estimated() -> None:
     # A crater twice as large and as deep looks the same: only the ratio is measured, the scale stays as given.
     assert isinstance(TRUE, Cylinder)
     evidence = evidence_at((4000.0, 3000.0), 4)
@@ -74,7 +74,7 @@ def test_the_size_of_a_crater_cannot_be_seen_and_is_not_pretended() -> None:
     assert np.sqrt(fit.covariance[0, 0]) < 0.003  # of depth over diameter
 
 
-def test_a_place_that_explains_the_stars_badly_is_refused() -> None:
+def test_a_position_that_explains_the_stars_badly_is_refused() -> None:
     """The evidence of one place, and a fix elsewhere that no single star contradicts clearly."""
     evidence = evidence_at(PLACES[0], seed=3)
     fix = ExactPosterior()(evidence, TRUE)

@@ -59,7 +59,7 @@ def window(chromium, folder) -> Iterator[Any]:
         assert said == []  # no error, no warning, and no request but for the page itself
 
 
-def test_hover_tells_of_a_star_and_the_wheel_zooms_where_it_points(window):
+def test_hover_shows_a_star_and_the_wheel_zooms_at_the_pointer(window):
     w = window()
     w.open("small.png")
     x, y = w.star_position("Canopus")
@@ -167,7 +167,7 @@ def test_the_ways_out_of_an_image_stand_in_one_line(window, size):
     assert boxes[2]["x"] - boxes[1]["x"] - boxes[1]["width"] >= 16
 
 
-def test_an_ambiguous_image_shows_every_place_and_its_warnings(window):
+def test_an_ambiguous_image_shows_every_mode_and_its_warnings(window):
     w = window()
     w.open("night 1/two.png")
     places = w.page.locator(".why li").all_inner_texts()

@@ -77,7 +77,7 @@ def test_latitude_and_longitude_are_as_far_from_the_origin_as_the_position(fix):
     assert arc_m == pytest.approx(np.hypot(position["east_m"], position["north_m"]), abs=0.1)
 
 
-def test_the_quaternion_is_scipys_and_turns_icrs_to_camera(fix, located):
+def test_the_quaternion_is_scipys_and_rotates_icrs_to_camera(fix, located):
     R = Rotation.from_quat(fix["attitude"]["quat_xyzw_cam_icrs"])
     error = (R * Rotation.from_matrix(located.truth.R_cam_icrs).inv()).magnitude()
     assert error < 20 * ARCSEC
@@ -124,7 +124,7 @@ def test_star_counts(fix, located):
     assert stars["predicted_visible"] == pytest.approx(sum(star in visible for star in measured), abs=8)
 
 
-def test_matches_are_measured_places_of_the_stars_they_name(located):
+def test_matches_are_the_measured_positions_of_their_stars(located):
     d = identification_dict(located.result)
     assert d["format"] == "startrack.identification/1"
     assert "position" not in d
@@ -151,7 +151,7 @@ def test_detections_are_brightest_first(located):
     assert flux[:50].min() > np.median(flux)
 
 
-def test_without_a_terrain_nothing_is_said_in_enu(located):
+def test_without_a_terrain_there_are_no_values_in_enu(located):
     d = result_dict(remove_terrain(located.result))
     without = {key for key in KEYS["attitude"].split() if "body" in key or "heading" in key or "pitch" in key}
     assert set(d["attitude"]) == set(KEYS["attitude"].split()) - without
@@ -166,7 +166,7 @@ def test_an_ambiguous_result_has_modes_and_no_position(located):
     assert sum(mode["weight"] for mode in d["modes"]) == pytest.approx(1.0)
 
 
-def test_a_refused_result_says_why_and_what_is_known(located):
+def test_a_refused_result_has_its_reason_and_the_known_values(located):
     d = result_dict(flat_frame(located.result))
     assert (d["status"], d["reason"]) == ("refused", "no_stars")
     assert "flat" in d["message"]
@@ -191,7 +191,7 @@ def test_an_unknown_time_widens_the_attitude(located, fix):
     np.testing.assert_allclose(sigma, np.hypot(fix["attitude"]["sigma_arcsec"], 60.0), rtol=1e-9)
 
 
-def test_sigma_says_whether_the_lens_is_in_it(located, fix):
+def test_sigma_states_whether_it_includes_the_lens(located, fix):
     assert fix["attitude"]["lens_error_included"] is False
     assert "taken as exact" in verbose_text(located.result)
     camera = located.result.camera

@@ -89,7 +89,7 @@ def test_a_spoiled_result_does_not_fit(located, kind, spoil, message):
         fits_schema(kind, record)
 
 
-def test_no_position_where_several_places_fit(located):
+def test_no_position_where_several_positions_fit(located):
     records = [record for kind, record in results(located.result) if kind == "fix" and "position" not in record]
     for record in records:
         with pytest.raises(ValidationError):

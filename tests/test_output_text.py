@@ -52,14 +52,14 @@ def test_refusals_are_one_line_with_reason_and_message(located):
     assert refusal_line("night/b.png", "bad_image", "it is truncated") == "b.png  refused  bad_image: it is truncated"
 
 
-def test_a_heading_of_nearly_a_turn_is_nought(located):
+def test_a_heading_of_nearly_360_degrees_is_0(located):
     from startrack.output.values import Angle
 
     assert f"{Angle(359.99999):.1f}" == "0.0"
     assert f"{Angle(57.2957795):.3f}" == "57.296"
 
 
-def test_more_lines_for_those_who_ask(located):
+def test_verbose_gives_more_lines(located):
     text = verbose_text(located.result)
     assert all(line.startswith("  ") for line in text.splitlines())
     for part in ("position   E ", "latitude -89.", "error      sigma", "boresight  RA", "heading ", "identified"):

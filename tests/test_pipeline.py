@@ -53,7 +53,7 @@ def directions(located: Any) -> tuple[np.ndarray, np.ndarray]:
     return azel_from_rays(rays @ (known.attitude.R_cam_icrs @ known.R_enu_icrs.T))
 
 
-def test_place_and_attitude_are_found_to_within_what_is_stated(located: Any) -> None:
+def test_position_and_attitude_are_within_the_stated_errors(located: Any) -> None:
     result, truth = located.result, located.truth
     assert covers_truth(result, located)
     assert np.linalg.norm(miss(result, located)) < 12.0  # m; a perfect list of magnitude 6 allows 18 on average
@@ -77,7 +77,7 @@ def test_the_same_input_gives_the_same_answer(located: Any, catalog: StarCatalog
     assert np.array_equal(once.attitude.R_cam_icrs, twice.attitude.R_cam_icrs)
 
 
-def test_turning_the_camera_turns_the_attitude_and_not_the_place(located: Any, catalog: StarCatalog) -> None:
+def test_rotating_the_camera_rotates_the_attitude_and_keeps_the_position(located: Any, catalog: StarCatalog) -> None:
     turned = locate_again(located, catalog, np.rot90(located.result.exposure.pixels_adu))
     assert covers_truth(turned, located)
     assert np.linalg.norm(miss(turned, located) - miss(located.result, located)) < 3.0
@@ -100,13 +100,13 @@ def test_the_wrong_crater_is_refused(located: Any, catalog: StarCatalog, terrain
     assert (result.status, result.reason) == ("refused", "inconsistent_evidence")
 
 
-def test_a_place_beyond_the_search_area_is_refused(located: Any, catalog: StarCatalog) -> None:
+def test_a_position_beyond_the_search_area_is_refused(located: Any, catalog: StarCatalog) -> None:
     result = locate_again(located, catalog, search_radius_m=4000.0)  # the camera is 6.5 km from the middle
     assert (result.status, result.reason) == ("refused", "outside_search_area")
     assert "4000 m" in result.message
 
 
-def test_hot_pixels_do_not_move_the_place(located: Any, catalog: StarCatalog) -> None:
+def test_hot_pixels_do_not_shift_the_position(located: Any, catalog: StarCatalog) -> None:
     rng = np.random.default_rng(1)
     pixels = located.result.exposure.pixels_adu.copy()
     x, y = rng.integers(0, 1024, (2, 600))
@@ -117,7 +117,7 @@ def test_hot_pixels_do_not_move_the_place(located: Any, catalog: StarCatalog) ->
 
 
 @pytest.mark.parametrize("width_deg", [5, 20])
-def test_a_boulder_does_not_move_the_place(located: Any, catalog: StarCatalog, width_deg: float) -> None:
+def test_a_boulder_does_not_shift_the_position(located: Any, catalog: StarCatalog, width_deg: float) -> None:
     rng = np.random.default_rng(2)
     azimuth, elevation = directions(located)
     pixels = located.result.exposure.pixels_adu.copy()
@@ -129,7 +129,7 @@ def test_a_boulder_does_not_move_the_place(located: Any, catalog: StarCatalog, w
     assert np.linalg.norm(miss(result, located) - miss(located.result, located)) < 6.0
 
 
-def test_glow_over_a_part_of_the_picture_only_costs_certainty(located: Any, catalog: StarCatalog) -> None:
+def test_glow_over_a_part_of_the_picture_only_increases_the_uncertainty(located: Any, catalog: StarCatalog) -> None:
     y, x = np.mgrid[:1024, :1024]
     glow = 2000.0 * np.exp(-((x - 300) ** 2 + (y - 700) ** 2) / 2 / 150.0**2)
     rng = np.random.default_rng(3)
@@ -159,7 +159,7 @@ def test_what_is_missing_or_does_not_fit_is_named(located: Any, catalog: StarCat
     assert "1024 x 1023" in cut.message
 
 
-def test_identify_without_a_time_says_how_much_less_it_knows(located: Any, catalog: StarCatalog) -> None:
+def test_identify_without_a_time_states_a_larger_sigma(located: Any, catalog: StarCatalog) -> None:
     known = located.result
     result = pipeline.identify(replace(known.exposure, time_utc=None), known.camera, catalog)
     assert result.status == "ok"

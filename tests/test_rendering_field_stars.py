@@ -58,7 +58,7 @@ def test_errors_are_the_catalogues_and_the_scatter_in_quadrature():
     assert errors[n // 2 :].std() == pytest.approx(0.05, rel=0.02)
 
 
-def test_the_sky_turns_once_a_sidereal_day_westward():
+def test_the_sky_rotates_once_a_sidereal_day_westward():
     site = Site("earth", np.radians(40.0), 0.0)
     turn = sky_rotvec_rad(site, TIME, 600.0)
     assert np.linalg.norm(turn) == pytest.approx(7.292115e-5 * 600, rel=1e-4)
@@ -68,11 +68,11 @@ def test_the_sky_turns_once_a_sidereal_day_westward():
     )
 
 
-def test_the_moons_sky_turns_half_a_degree_an_hour():
+def test_the_moons_sky_rotates_half_a_degree_an_hour():
     assert np.degrees(np.linalg.norm(sky_rotvec_rad(SITE, TIME, 3600.0))) == pytest.approx(0.549, abs=0.002)
 
 
-def test_the_turn_carries_the_start_into_the_end():
+def test_the_rotation_vector_maps_the_start_to_the_end():
     from datetime import timedelta
 
     site, half = Site("earth", np.radians(-20.0), 1.0), timedelta(seconds=900)

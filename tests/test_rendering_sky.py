@@ -25,7 +25,7 @@ def test_sky_of_magnitude_22_on_the_axis_by_hand():
 
 
 @pytest.mark.parametrize("k", [(), (-0.03, 0.004, -0.001)])
-def test_the_whole_image_circle_holds_the_light_of_its_solid_angle(k):
+def test_the_flux_of_the_image_circle_is_that_of_its_solid_angle(k):
     # Independent of the lens: 2 pi (1 - cos 85) sr, whatever each pixel's share.
     camera = replace(FISHEYE, lens=KannalaBrandt(k))
     total = light_e(make_scene(camera=camera, sky_v_mag_arcsec2=20.0)).sum()
@@ -114,7 +114,7 @@ def test_a_ragged_skyline_against_brute_force():
     assert abs(np.mean(coverage(scene, pixels) - expected)) < 0.001
 
 
-def test_the_wall_shines_as_it_reflects_and_nothing_does_off_the_image_circle():
+def test_the_wall_reflects_and_the_frame_is_dark_off_the_image_circle():
     scene = make_scene(sky_v_mag_arcsec2=20.0, terrain=CRATER, position_enu_m=PLACE, wall_reflectance=0.1)
     image, sky = light_e(scene), light_e(replace(scene, terrain=None))
     rows = slice(255, 256)

@@ -75,7 +75,7 @@ def test_star_counts_are_liebes():
     assert star_count(2.0) == 28
 
 
-def test_stars_are_uniform_on_the_hemisphere_and_places_on_the_floor():
+def test_stars_are_uniform_on_the_hemisphere_and_positions_on_the_floor():
     sky = Sky.draw(3, 0, 8.0)
     assert stats.kstest(np.sin(sky.elevation_rad), "uniform").pvalue > 0.01
     assert stats.kstest(sky.azimuth_rad / (2 * np.pi), "uniform").pvalue > 0.01
@@ -109,7 +109,7 @@ def test_stars_in_sight_are_those_above_the_horizon_and_inside_the_drawn_edge():
         assert np.sum(inside != seen) <= 2  # a polygon of 360 points is not quite the circle
 
 
-def test_lists_are_as_wrong_as_they_say():
+def test_lists_have_the_stated_error_rates():
     in_sight = np.repeat([True, False], 20_000)
     listed = Mistakes(missed=0.1, false=0.02).draw_list(in_sight, 0, 0, 0)
     assert np.mean(~listed[in_sight]) == pytest.approx(0.1, abs=0.008)
@@ -337,7 +337,7 @@ def test_usage(tmp_path, monkeypatch, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_place_that_cannot_be_written_is_named_at_once(tmp_path, capsys):
+def test_a_read_only_output_folder_is_named_at_once(tmp_path, capsys):
     (tmp_path / "file").write_text("in the way")
     assert main(["reproduce", "-D", str(tmp_path / "file"), "--full"]) == 4
     assert str(tmp_path / "file") in capsys.readouterr().err

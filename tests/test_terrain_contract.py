@@ -140,7 +140,7 @@ def test_all_methods_broadcast(name):
 
 
 @every_terrain
-def test_every_member_is_there_and_says_what_the_ground_is(name):
+def test_every_member_exists_and_describes_the_ground(name):
     terrain = MAKERS[name]()
     for member in MEMBERS:
         assert getattr(terrain, member, None) is not None or member in ("site", "rim_radius_m", "table_path")
@@ -165,7 +165,7 @@ def test_every_member_is_there_and_says_what_the_ground_is(name):
 
 @pytest.mark.parametrize("whole", [cylinder, height_map])
 @pytest.mark.parametrize("wrapper", [ForwardingTerrain, AttributeWrapper])
-def test_a_wrapper_answers_as_the_terrain_does(whole, wrapper):
+def test_a_wrapper_returns_the_values_of_the_terrain(whole, wrapper):
     terrain, rng = whole(), np.random.default_rng(3)
     wrapped = wrapper(terrain)
     points, azimuths = rng.uniform(-200, 200, (20, 2)), rng.uniform(0, 2 * np.pi, 20)

@@ -188,7 +188,7 @@ def evidence_at(terrain, place, rng, error_rad=0.0, rays=4000) -> Evidence:
     return Evidence(azimuth_rad=azimuth, elevation_rad=elevation, llr=llr, edge_sigma_rad=np.full(rays, 1e-5))
 
 
-def test_a_place_is_found_within_its_stated_error(shackleton):
+def test_a_position_is_found_within_its_stated_error(shackleton):
     exact = replace(shackleton, height_sigma_m=0.0, horizon_sigma_common_rad=0.0)
     rng, nees = np.random.default_rng(4), []
     for _ in range(4):
@@ -201,7 +201,7 @@ def test_a_place_is_found_within_its_stated_error(shackleton):
     assert 0.3 < np.mean(nees) < 5
 
 
-def test_a_common_error_is_estimated_with_the_place_and_widens_its_covariance(shackleton):
+def test_a_common_error_is_estimated_with_the_position_and_widens_its_covariance(shackleton):
     rng, place, error = np.random.default_rng(5), np.array([420.0, -130.0]), np.radians(0.08)
     evidence = evidence_at(shackleton, place, rng, error)
     unknown = replace(shackleton, height_sigma_m=0.0, horizon_sigma_common_rad=np.radians(0.1))
@@ -240,7 +240,7 @@ def test_rays_that_run_off_the_map_give_no_evidence(shackleton):
         ExactPosterior()(blind, small)
 
 
-def test_glare_takes_the_evidence_of_its_azimuths(shackleton):
+def test_glare_removes_the_evidence_of_its_azimuths(shackleton):
     lit = replace(shackleton, glare_rad=((np.radians(350), np.radians(20)),))
     told = lit.is_informative(np.radians([349.0, 351.0, 0.0, 19.0, 21.0, 180.0]), np.full(6, 0.5))
     assert told.tolist() == [True, False, False, False, True, True]
@@ -250,7 +250,7 @@ def test_glare_takes_the_evidence_of_its_azimuths(shackleton):
     assert line.startswith("azimuths 350 to 20 degrees: no evidence")
 
 
-def test_azimuths_where_the_maps_end_are_told_as_ranges(shackleton):
+def test_azimuths_where_the_maps_end_are_listed_as_ranges(shackleton):
     """A map that ends close by in the east and far off elsewhere."""
     whole = shackleton.maps[0].crop_around(shackleton.site.latitude_rad, shackleton.site.longitude_rad, 30_000.0)
     azimuth = np.radians(np.arange(0.5, 360))

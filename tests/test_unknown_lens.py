@@ -214,7 +214,7 @@ def test_a_photograph_is_identified_cold(photo) -> None:
     assert result.camera.calibrated_angle_rad > np.radians(70)
 
 
-def test_its_mirror_image_half_covered_is_said_to_be_mirrored(photo, tmp_path, capsys) -> None:
+def test_its_half_covered_mirror_image_is_reported_as_mirrored(photo, tmp_path, capsys) -> None:
     from PIL import Image
 
     pixels = photo.pixels_adu[:, ::-1].copy()
@@ -232,7 +232,7 @@ def test_its_mirror_image_half_covered_is_said_to_be_mirrored(photo, tmp_path, c
     assert record["camera"]["focal_px"][0] == pytest.approx(337.2, abs=1.5)
 
 
-def test_the_map_of_the_sky_is_that_of_a_search() -> None:
+def test_the_proximity_mask_equals_a_search() -> None:
     rng = np.random.default_rng(1)
     rays, asked = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in rng.normal(size=(2, 3000, 3)))
     near = proximity_mask(rays[:400], np.radians(1.5))
@@ -243,7 +243,7 @@ def test_the_map_of_the_sky_is_that_of_a_search() -> None:
 
 
 @pytest.mark.parametrize(("name", "lists"), [("equisolid, mirrored", 30), ("70 degrees", 12), ("20 degrees", 12)])
-def test_the_attitude_is_as_sure_as_it_says_though_the_lens_comes_from_the_same_stars(name: str, lists: int) -> None:
+def test_the_attitude_sigma_is_right_with_a_lens_from_the_same_stars(name: str, lists: int) -> None:
     camera, picture_of, fov = LENSES[name]
     nees = []
     for seed in range(100, 100 + lists):

@@ -1,4 +1,4 @@
-"""cedar-solve, in an environment of its own: reads a star list per line, writes what it says and the CPU time.
+"""cedar-solve, in an environment of its own: reads a star list per line, writes the solution and the CPU time.
 
 It pins numpy 1: python -m venv PLACE && PLACE/bin/pip install cedar-solve. Run by _identify_peers.py.
 """

@@ -26,7 +26,7 @@ from startrack.types import NotIdentified, Stars
 
 @dataclass(frozen=True)
 class Answer:
-    """What an identifier says."""
+    """The result of an identifier."""
 
     R_cam_icrs: np.ndarray
     detection: np.ndarray
@@ -44,7 +44,7 @@ class Elsewhere:
 NO_NAMES = np.zeros(0, dtype=np.int64)
 Solver = Callable[
     [StarList], Callable[[], Answer | Elsewhere | None]
-]  # what is prepared outside the clock, and what is timed
+]  # preparation, which is not timed, and the timed part
 
 
 def startrack(camera: Camera, stars: Stars) -> Solver:
@@ -67,7 +67,7 @@ def startrack(camera: Camera, stars: Stars) -> Solver:
 
 
 def ruststartracker(camera: Camera, stars: Stars, v_limit: float, reach_rad: float) -> Solver:
-    """ruststartracker's matcher, fed with unit vectors: 8 matches, its catalogue the stars that the lists may hold."""
+    """ruststartracker's matcher with unit vectors as input: 8 matches; its catalogue has the stars of the lists."""
     import ruststartracker as peer
 
     tracker = _tracker(camera.size_px, stars, v_limit, reach_rad)
@@ -89,7 +89,7 @@ def ruststartracker(camera: Camera, stars: Stars, v_limit: float, reach_rad: flo
 
 
 def _tracker(size_px: tuple[int, int], stars: Stars, v_limit: float, reach_rad: float) -> Any:
-    """Its catalogue with the index; kept, for it takes a while."""
+    """Its catalogue with the index; cached, because it takes seconds."""
     import ruststartracker as peer
 
     if (v_limit, reach_rad) not in _KEPT:
@@ -106,7 +106,7 @@ _KEPT: dict[tuple[float, float], Any] = {}
 
 
 def best_ruststartracker(camera: Camera, stars: Stars, lists: list[StarList]) -> tuple[Solver, str]:
-    """The quickest of some settings that solve the most of these lists."""
+    """The fastest of the settings that solve most of these lists."""
     import time
 
     best: tuple[tuple[float, float], Solver, str] | None = None
@@ -126,7 +126,7 @@ def best_ruststartracker(camera: Camera, stars: Stars, lists: list[StarList]) ->
 
 
 def missing_programs() -> list[str]:
-    """A line for each program that is not here."""
+    """A line for each program that is not installed."""
     return [] if find_spec("ruststartracker") else ["ruststartracker is not installed: left out"]
 
 

@@ -26,7 +26,7 @@ def output_files(folder: Path) -> dict[str, Path]:
 
 
 def read_values(path: Path) -> dict[str, Any]:
-    """All values of a file, without what is ignored; those of text tables are texts as printed."""
+    """All values of a file except ignored ones; those of text tables are texts as printed."""
     if path.suffix in TEXT_TABLES:
         return dict(_flatten(_read_text_table(path)))
     if path.suffix in (".wcs", ".corr"):
@@ -54,7 +54,7 @@ def _flatten(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _labels(rows: list[Any]) -> list[Any]:
-    """What the elements of a list are called: by the first key whose values are given and unique, else by number."""
+    """Labels of the elements of a list: values of the first key that are present and unique, else numbers."""
     if rows and all(isinstance(row, dict) for row in rows):
         for name in LABELS:
             values = [row.get(name) for row in rows]

@@ -16,7 +16,7 @@ NO_STARS = np.zeros((0, 2))
 
 
 def startrack(image: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Ours, with a camera file that knows the gain and the PSF."""
+    """Ours, with a camera file with gain and PSF."""
     height, width = image.shape
     sensor = Sensor(zero_point_e_per_s=1e5, psf_sigma_px=sigma_px)
     camera = Camera(

@@ -82,7 +82,7 @@ def measure_runs(folder: Path, images: list[Path], single: int) -> tuple[list[li
 
 
 def render_frames(folder: Path, count: int) -> list[Path]:
-    """Render the frames that are not there yet; the paths of all."""
+    """Render the frames that do not exist yet; the paths of all."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     paths = [folder / "images" / f"{k // 100:02d}" / f"frame-{k:04d}.png" for k in range(count)]
     todo = [(path, k) for k, path in enumerate(paths) if not path.with_suffix(".json").exists()]
@@ -137,7 +137,7 @@ def run(folder: Path, images: list[Path], out: Path, jobs: int) -> Run:
 def watch(
     process: subprocess.Popen[str], most_s: float = np.inf, top: int | None = None, each: Callable[[], None] = int
 ) -> Run:
-    """Its time, and the peak memory of the processes below `top` (itself); killed with -9 after `most_s`.
+    """Time of a process, and the peak memory of the processes below `top` (itself); killed with -9 after `most_s`.
 
     `each` is called at every poll.
     """

@@ -49,7 +49,7 @@ class Case:
     frames: int
     stars: int
     sigma_px: float
-    wrong: float = 0.0  # part of the matches that are wrong
+    wrong: float = 0.0  # fraction of wrong matches
     top_deg: float | None = None
     from_nothing: bool = False  # no approximate camera: only the matches
 
@@ -100,7 +100,7 @@ def trials(case: Case, law: str, count: int, seed: int) -> Iterator[Trial]:
 
 
 def trial(case: Case, law: str, rng: np.random.Generator) -> Trial:
-    """One of them."""
+    """One calibration of a random camera under a random sky."""
     rho, centre = LAWS[law] or random_law(rng), 1023.5 + rng.normal(0, 10, 2)
     top = np.radians(case.top_deg or TOP_DEG.get(law, 90.0))
     xy, rays, R = [], [], []
@@ -133,7 +133,7 @@ def approximate_camera() -> Camera:
 
 
 def random_law(rng: np.random.Generator) -> Law:
-    """A Kannala-Brandt lens that rises to 100 degrees."""
+    """A Kannala-Brandt lens whose radius increases up to 100 degrees."""
     while True:
         lens = KannalaBrandt(tuple(rng.normal(0, [0.05, 0.02, 0.008, 0.002])))
         if lens.max_invertible_rad > np.radians(100):
@@ -148,7 +148,7 @@ def even_rays(top_rad: float, count: int, rng: np.random.Generator) -> np.ndarra
 
 
 def project(rho: Law, centre_px: np.ndarray, rays_cam: np.ndarray) -> np.ndarray:
-    """True pixels (n, 2): written out here, not taken from the package."""
+    """True pixels (n, 2), computed independently of the package."""
     s = np.hypot(rays_cam[:, 0], rays_cam[:, 1])
     return centre_px + FOCAL_PX * (rho(np.arctan2(s, rays_cam[:, 2])) / s)[:, None] * rays_cam[:, :2]
 

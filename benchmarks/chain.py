@@ -4,8 +4,8 @@
     python benchmarks/chain.py --folder FRAMES   frames with sidecar and truth, from any renderer (nothing is written)
 
 Conditions: 2048 px fisheye, V 6 on the axis at 5 sigma, the real sky with stars that the catalogue lacks, 3 % scatter
-of the fluxes beside the catalogue's own errors, hot pixels, cosmic rays, random places, dates 2024-2034, headings, tilt
-to 5 degrees.
+of the fluxes beside the catalogue's own errors, hot pixels, cosmic rays, random positions, dates 2024-2034, headings,
+tilt to 5 degrees.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
-"""Dark craters from their shipped maps, from pixels: places on floor and wall, no prior, by night.
+"""Dark craters from their shipped maps, from pixels: positions on floor and wall, no prior, by night.
 
     python benchmarks/craters.py [--terrain haworth de-gerlache kepler rough] [--floor 3] [--wall 2]
 
-"rough" is a map of a user's own (_rough_map.py), kept in a temporary folder; it gets 5 places on the floor and 5 on
-the wall.
+"rough" is a user's own map (_rough_map.py), kept in a temporary folder; it gets 5 positions on the floor and 5 on the
+wall.
 
 fisheye-2048 with its own sensor and default exposure (V 6 on the axis at 5 sigma), the sky, defects and headings as
 `startrack render` has them. Floor: slopes below 15 degrees; wall: 15 to 40. Times between 2025 and 2032 with the Sun
-below the horizon of a plain (half a degree above it in the polar craters, whose rims hide it). The Earth is up in
-Kepler always, in the others now and then.
+below the horizon of a plain (half a degree above it in the polar craters, whose rims hide it). The Earth is always up
+in Kepler, sometimes in the others.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def main() -> None:
 def draw_positions(
     terrain: HeightMap, count: int, slopes_deg: tuple[float, float], rng: np.random.Generator
 ) -> list[tuple[np.ndarray, float]]:
-    """Places (2,) in the search area with slopes in a range, and the slopes in degrees."""
+    """Positions (2,) in the search area with slopes in a range, and the slopes in degrees."""
     found: list[tuple[np.ndarray, float]] = []
     while len(found) < count:
         turn, far = rng.uniform(0, 2 * np.pi), terrain.search_radius_m * np.sqrt(rng.random())
@@ -93,7 +93,7 @@ def draw_night(site: Site, rng: np.random.Generator) -> datetime:
 def measure_position(
     terrain: HeightMap, place: np.ndarray, slope: float, when: datetime, number: int, seed: int
 ) -> list[str]:
-    """Render, locate, and say what came of it."""
+    """Render and locate one exposure; a row of the table."""
     camera, catalog = load_camera("fisheye-2048"), load_catalog()
     series = Series(
         camera=camera, terrain=terrain, catalog=catalog.brighter_than(10.0), seed=seed, time_utc=when,

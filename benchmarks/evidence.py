@@ -1,11 +1,11 @@
-"""What each part of the evidence buys, and what a longer exposure buys: from pixels to position, in one table each.
+"""Effect of each part of the evidence, and of a longer exposure: from pixels to position, in one table each.
 
     python benchmarks/evidence.py --frames 300 --deep-frames 100
 
-The true sky is Hipparcos and the Gaia stars that it lacks (extra `deep`); the locator takes Gaia's only where the frame
-is deep enough. "full" is what `locate` does; each other line leaves one part out, and the second measurement near the
-skyline too. 2048 px fisheye, 3 % scatter of the fluxes beside the catalogue's own errors, hot pixels, cosmic rays,
-random places, dates, headings, tilt to 5 degrees. All lines of a table see the same frames, or the first of them.
+The true sky is Hipparcos and the Gaia stars that it lacks (extra `deep`); the locator uses Gaia's only where the frame
+is deep enough. "full" is the method of `locate`; each other line omits one part, and the second measurement near the
+skyline. 2048 px fisheye, 3 % scatter of the fluxes beside the catalogue's own errors, hot pixels, cosmic rays, random
+positions, dates, headings, tilt to 5 degrees. All lines of a table use the same frames, or the first of them.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from startrack.types import Array, Evidence, Fix, NoSolution
 
 CHI2_2 = {"50": 1.3863, "95": 5.9915, "99.9": 13.8155}  # of two degrees of freedom
 LISTS = {"full": "as deep as the frame", "Hipparcos alone": "Hipparcos alone"}
-CERTAIN = 9.0  # nats: what a list says at most of one star
+CERTAIN = 9.0  # nats: largest evidence of a list for one star
 
 
 @dataclass(frozen=True)
 class Depth:
-    """How deep the frames are, and which lists look at them."""
+    """Depth of the frames, and the catalogues used for them."""
 
     v_mag: float
     frames: int
-    compared: int = 0  # the first ones are looked at with parts left out, and with Hipparcos alone
+    compared: int = 0  # number of frames evaluated with parts left out, and with Hipparcos alone
 
 
 def main() -> None:
@@ -139,7 +139,7 @@ def _ablations(result: Measured) -> Iterator[tuple[str, Evidence, ExactPosterior
     yield "without remeasuring near the skyline", _photometry(result).evidence(), full
     yield "list at 5 sigma", _list_evidence(result.light, 5.0), full
     yield "list at 3 sigma", _list_evidence(result.light, 3.0), full
-    lonely = _photometry(result, visible=np.zeros(len(result.stars)))  # neighbours that never shine
+    lonely = _photometry(result, visible=np.zeros(len(result.stars)))  # neighbours that are never visible
     yield "without crowding", lonely.evidence(), full
     yield "without flux uncertainty", _photometry(result, certain=True).evidence(), full
     plain = _photometry(result, settings=StarEvidence(capped=False))
@@ -147,7 +147,7 @@ def _ablations(result: Measured) -> Iterator[tuple[str, Evidence, ExactPosterior
 
 
 def _list_evidence(light: StarPhotometry, threshold: float) -> Evidence:
-    """What a list says: each star that should pass the threshold either did or did not, and no more."""
+    """Evidence of a list: whether each star expected above the threshold was detected, and nothing else."""
     from scipy.stats import norm
 
     use = light.usable & (light.expected_e > threshold * light.sigma_e)

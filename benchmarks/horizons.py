@@ -2,9 +2,9 @@
 
     python benchmarks/horizons.py [--places 5]
 
-Random places of the inner two thirds of the search area (floor and wall), 720 azimuths each, on one core. The surface:
-bilinear between posts in the map's own projection. Embree sees triangles of 48 m (Kepler 24 m; 7 m
-within 900 m), and halves down to the elevation where rays begin to miss; its scene's making is not in its time.
+Random positions in the inner two thirds of the search area (floor and wall), 720 azimuths each, on one core. The
+surface: bilinear between posts in the map's own projection. Embree gets triangles of 48 m (Kepler 24 m; 7 m
+within 900 m) and finds the horizon by bisection in elevation; the time for building its scene is not included.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def crop_terrain(name: str, half_m: float) -> HeightMap:
-    """The terrain with its finest map alone, as far as that matters."""
+    """The terrain with a crop of its finest map alone."""
     whole = load_terrain(name)
     assert isinstance(whole, HeightMap)
     crop = whole.maps[0].crop_around(whole.site.latitude_rad, whole.site.longitude_rad, half_m)
@@ -75,7 +75,7 @@ def compare_methods(name: str, terrain: HeightMap, places: np.ndarray) -> list[l
         truth.append(embree.horizon_rad(AZIMUTHS_RAD))
         spent += time.process_time() - start
         _, distance, edge = terrain.horizons(place[None], AZIMUTHS_RAD)
-        inside.append(distance < edge - 2 * terrain.maps[0].post_m)  # where the crop ends, its last cell is nobody's
+        inside.append(distance < edge - 2 * terrain.maps[0].post_m)  # without the last cell of the crop
     count = len(places) * len(AZIMUTHS_RAD)
     rows = [[name, "Embree", str(count), "-", "-", "-", f"{1e6 * spent / count:.0f}"]]
     for method, (function, every) in methods.items():

@@ -1,4 +1,4 @@
-"""What the fix does when the world is not as told: from pixels, one kind of trouble at a time.
+"""Fixes with wrong inputs or disturbed scenes: from pixels, one kind of trouble at a time.
 
     python benchmarks/robustness.py --frames 16
 
@@ -35,7 +35,7 @@ BOULDER_AZIMUTH_RAD = np.radians(75.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Obstructed(Cylinder):
-    """The crater with a ridge that no map shows: `width` of azimuth, `height` above the crater's own horizon."""
+    """The crater with an unmapped ridge: `width` of azimuth, `height` above the crater's own horizon."""
 
     width_rad: float
     height_rad: float
@@ -48,20 +48,20 @@ class Obstructed(Cylinder):
 
 @dataclass(frozen=True)
 class Trouble:
-    """How the world differs from what the locator is told."""
+    """Difference between the true scene and the inputs of the locator."""
 
     name: str
     world: Callable[[Cylinder], Cylinder] = lambda crater: crater
     told: Callable[[Cylinder], Cylinder] = lambda crater: crater
     clock_s: float = 0.0
     tilt_deg: float = 5.0
-    swapped: float = 0.0  # part of the catalogue's stars whose identities are mixed up
+    swapped: float = 0.0  # fraction of the catalogue's stars with exchanged identities
     attitude_bias_arcsec: float = 0.0  # about each axis of the camera
 
 
 @dataclass(frozen=True)
 class Biased:
-    """The evidence taken at an attitude that is wrong by a rotation."""
+    """The evidence measured at an attitude with an error."""
 
     arcsec: float
 
@@ -99,7 +99,7 @@ TROUBLES = (
 
 
 def main() -> None:
-    """Run all troubles on the same places and write the section."""
+    """Run all troubles at the same positions and write the section."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=16)
     parser.add_argument("-j", "--jobs", type=int, default=2)

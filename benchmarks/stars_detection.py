@@ -30,7 +30,7 @@ PEERS = ("numpy", "opencv-contrib-python-headless", "sep", "photutils", "tetra3r
 
 @dataclass
 class Tally:
-    """What one detector did over the frames of one PSF width."""
+    """Results of one detector on the frames of one PSF width."""
 
     ms_per_mpx: list[float] = field(default_factory=list)
     snr: list[np.ndarray] = field(default_factory=list)
@@ -40,7 +40,7 @@ class Tally:
     mpx: float = 0.0
 
     def completeness(self, low: float, high: float) -> float:
-        """Completeness [%] among stars alone with these SNR."""
+        """Completeness [%] among isolated stars with these SNR."""
         snr, error = np.concatenate(self.snr), np.concatenate(self.error)
         return 100 * float(np.isfinite(error[(snr >= low) & (snr < high), 0]).mean())
 

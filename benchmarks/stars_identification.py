@@ -50,7 +50,7 @@ class Case:
 
 @dataclass
 class Tally:
-    """What one program made of a case."""
+    """Results of one program on a case."""
 
     lists: int = 0
     solved: int = 0

@@ -45,7 +45,7 @@ WRONG_DEG = 0.2  # boresight
 
 @dataclass
 class Tally:
-    """What one program did with one set of frames."""
+    """Results of one program on one set of frames."""
 
     detect_ms: list[float] = field(default_factory=list)
     solve_ms: list[float] = field(default_factory=list)
@@ -59,7 +59,7 @@ class Tally:
 
 @dataclass(frozen=True)
 class Picture:
-    """An exposure, the field of view that is told, and where it looks if that is known."""
+    """An exposure, its stated field of view, and its boresight if known."""
 
     exposure: Exposure
     fov_deg: float
@@ -84,7 +84,7 @@ def main() -> None:
     rows = [row for name, pictures in sets.items() for row in compare_programs(name, pictures, stars)]
     head = ["frames", "program", "solved", "wrong", "detect, ms", "identify, ms", "both, ms", "ours over it"]
     body = (
-        "The field of view is told wrong by 0, -8 and +8 % in turn; both may be off by 10 %. tetra3rs with its "
+        "The stated field of view is wrong by 0, -8 and +8 % in turn; both may be off by 10 %. tetra3rs with its "
         f"database for these widths, made beforehand; its quick and its thorough extraction.\n\n{table(head, rows)}"
     )
     print(body)
@@ -138,7 +138,7 @@ def _run(find: Finder, solve: Solver, pictures: list[Picture]) -> Tally:
 
 
 def _count_wrong(tally: Tally, other: Tally, pictures: list[Picture]) -> int:
-    """Answers that look elsewhere than the truth says; of photographs, elsewhere than the other program."""
+    """Answers whose boresight differs from the truth or, for photographs, from that of the other program."""
     wrong = 0
     for axis, reference, picture in zip(tally.axes, other.axes, pictures, strict=True):
         truth = picture.axis if picture.axis is not None else reference
@@ -171,7 +171,7 @@ def _solve_tetra3rs(found: object, picture: Picture, base: object) -> np.ndarray
 
 
 def photographs(folder: Path) -> list[Picture]:
-    """Those of the folder whose field of view is known."""
+    """Photographs in the folder whose field of view is known."""
     paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".png", ".tiff", ".bmp"))
     known = [(p, next((w for start, w in FIELDS_DEG.items() if p.name.startswith(start)), None)) for p in paths]
     return [

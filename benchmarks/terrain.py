@@ -1,9 +1,9 @@
-"""Height maps: places on a crater's floor, from pixels, with the true map and with a degraded one.
+"""Height maps: positions on a crater's floor, from pixels, with the true map and with a degraded one.
 
     python benchmarks/terrain.py [--terrain shackleton] [--frames 20] [--radius 4000]
 
-The degraded map has errors of 5 m (s.d.) at every post and shows the whole horizon 0.08 degrees too low; its file says
-so (height_sigma_m = 5, horizon_sigma_deg = 0.08). Conditions as in chain.py; places with a slope below 15 degrees.
+The degraded map has errors of 5 m (s.d.) at every post and a horizon 0.08 degrees too low; its file states both
+(height_sigma_m = 5, horizon_sigma_deg = 0.08). Conditions as in chain.py; positions with a slope below 15 degrees.
 """
 
 from __future__ import annotations
@@ -63,19 +63,19 @@ def main() -> None:
 
 
 def replace_settings(terrain: Any, **changes: Any) -> HeightMap:
-    """The terrain with other settings, its horizons not taken over."""
+    """The terrain with other settings and a horizon table of its own."""
     made = replace(terrain, **changes)
     made.prepare()
     return made
 
 
 def replace_sigma(terrain: HeightMap, height_sigma_m: float, common_rad: float) -> HeightMap:
-    """The same map, said to be so good."""
+    """The same map with other stated errors."""
     return replace_settings(terrain, height_sigma_m=height_sigma_m, horizon_sigma_common_rad=common_rad)
 
 
 def degrade_map(terrain: HeightMap, seed: int) -> HeightMap:
-    """A map with errors at every post, that says so."""
+    """A map with errors at every post, which it states."""
     rng = np.random.default_rng(seed)
     maps = [
         replace(m, heights_m=(m.heights_m + rng.normal(0.0, NOISE_M, m.heights_m.shape)).astype(np.float32))
@@ -100,7 +100,7 @@ def load_or_observe(folder: Path | None, terrain: HeightMap, seed: int, number: 
 
 
 def observe_frame(terrain: HeightMap, seed: int, number: int) -> tuple[Evidence, np.ndarray]:
-    """Evidence of one random frame, through the whole chain, and the true place."""
+    """Evidence of one random frame, through the whole chain, and the true position."""
     camera, catalog = replace(load_camera("fisheye-2048"), sensor=SENSOR), load_catalog()
     series = Series(
         camera=camera, terrain=terrain, catalog=catalog, seed=seed, exposure_s=10.0, hot_pixels=200, cosmic_rays=30
@@ -114,7 +114,7 @@ def observe_frame(terrain: HeightMap, seed: int, number: int) -> tuple[Evidence,
 
 
 def score_fix(evidence: Evidence, terrain: HeightMap, place: np.ndarray) -> dict[str, Any]:
-    """Error, what the fix says of it, and how long it took."""
+    """Error, stated uncertainty and time of a fix."""
     start, cpu = time.perf_counter(), time.process_time()
     try:
         fix: Fix = ExactPosterior()(evidence, terrain)

@@ -34,8 +34,8 @@ def draw_stars(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Centroids (n, 2), their stated covariances, the stars' rays_icrs and the true R_cam_icrs.
 
-    `unknown_px`: error of every centroid that the covariances do not tell; `heavy`: part of the stars with an error
-    from Student's t distribution of two degrees of freedom, 0.6 px wide.
+    `unknown_px`: error of every centroid that the covariances do not contain; `heavy`: fraction of the stars with an
+    error from Student's t distribution of two degrees of freedom, 0.6 px wide.
     """
     width, height = camera.size_px
     px = rng.uniform(0, [width - 1, height - 1], (4 * n, 2))
@@ -67,7 +67,7 @@ def mean_nees(camera: Camera, n: int, draws: int = 100, **errors: float) -> floa
         try:
             fit, w = solve_draw(camera, seed, n, **errors)
         except NotIdentified:
-            assert n < 10  # a star or two off by chance leaves too few
+            assert n < 10  # one or two random outliers leave too few stars
             continue
         nees.append(w @ np.linalg.solve(fit.attitude.covariance_rad2, w))
     assert len(nees) > 0.95 * draws
@@ -93,13 +93,13 @@ def test_perfect_centroids_give_the_perfect_attitude(camera: Camera) -> None:
 @pytest.mark.parametrize("camera", [FISHEYE, NARROW], ids=lambda c: c.name)
 @pytest.mark.parametrize("n", [4, 10, 30, 100, 500, 2000])
 def test_the_covariance_is_right_where_the_centroids_are(camera: Camera, n: int) -> None:
-    # 3 is right, and the statistics of 60 to 200 draws leave 0.17 to 0.3; an allowance for the unknown takes some off.
+    # 3 is right; the statistical error of 60 to 200 draws is 0.17 to 0.3, and the extra variance lowers it a little.
     assert 2.2 < mean_nees(camera, n, {4: 200, 10: 150, 2000: 40}.get(n, 60)) < (3.5 if n < 2000 else 3.8)
 
 
 @pytest.mark.parametrize(("n", "most"), [(6, 6.5), (20, 4.5), (60, 3.6), (300, 3.6)])
 def test_unstated_errors_are_estimated_from_the_scatter(n: int, most: float) -> None:
-    """0.15 px of lens error beyond centroid errors of 0.03 to 0.4 px; six stars can hardly tell."""
+    """0.15 px of lens error beyond centroid errors of 0.03 to 0.4 px; six stars hardly determine it."""
     assert 2.3 < mean_nees(FISHEYE, n, 60, unknown_px=0.15) < most
     if n == 300:
         extra = [solve_draw(FISHEYE, seed, n, unknown_px=0.15)[0].extra_sigma_px for seed in range(10)]
@@ -131,9 +131,9 @@ def test_sigma_falls_with_the_number_of_stars_and_roll_is_weak_in_a_narrow_field
         return np.sqrt(np.mean([np.diag(f.attitude.covariance_rad2) for f in fits], axis=0)) / ARCSEC
 
     few, many = sigmas(FISHEYE, 25), sigmas(FISHEYE, 400)
-    assert few / many == pytest.approx(4.0, rel=0.4)  # luck in the few best of 25 stars
+    assert few / many == pytest.approx(4.0, rel=0.4)  # 25 stars scatter
     narrow = sigmas(NARROW, 25)
-    assert narrow[2] > 5 * narrow[:2].max()  # about the boresight: 20 degrees of field hold little of a turn
+    assert narrow[2] > 5 * narrow[:2].max()  # about the boresight: roll is poorly determined in a field of 20 degrees
 
 
 def test_equal_errors_give_the_textbook_sigma() -> None:
@@ -165,7 +165,7 @@ def test_fewer_than_three_stars_is_refused() -> None:
 
 
 def test_stated_lens_errors_are_in_the_covariance() -> None:
-    """Lenses drawn from the file's covariance: the scatter of the stars' places shows nothing of their turn."""
+    """Lenses drawn from the file's covariance: the scatter of the residuals does not contain the attitude error."""
     order = ("fx", "fy", "cx", "cy", "k1")
     spread = np.diag([0.5, 0.5, 1.0, 1.0, 2e-4]) @ np.array(
         [[1, 0.999, 0, 0, -0.9], [0.999, 1, 0, 0, -0.9], [0, 0, 1, 0.2, 0], [0, 0, 0.2, 1, 0], [-0.9, -0.9, 0, 0, 1]]

@@ -1,4 +1,4 @@
-"""The library's front door: paths, arrays and astropy's types in, a solution that prints itself out."""
+"""The library's functions: paths, arrays and astropy's types as input, solutions with a printed form as output."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_writing_replaces_what_an_earlier_result_left(solution, tmp_path):
     assert not stale[0].exists()
     assert all(path.read_bytes() != b"of an earlier run" for path in stale[1:])
     assert (tmp_path / "near-wall-2.wcs").read_text() == "of another image"
-    solution.write(tmp_path, plots=False)  # the same image's: renewed
+    solution.write(tmp_path, plots=False)  # of the same image: replaced
     refused = startrack.locate(read_exposure(IMAGE), time="2030-01-01T00:00:00Z")
     result = Refused(reason="no_stars", message="", reached=extend(last_value(refused.result), Oriented))
     refused = replace(refused, result=result)
@@ -250,7 +250,7 @@ def test_numpy_times_are_utc(unit):
 def test_astropy_times_keep_their_microseconds():
     time = Time("2029-09-08T03:12:45.123456")
     assert time_input(time) == time_input(time.tdb) == datetime(2029, 9, 8, 3, 12, 45, 123456, tzinfo=UTC)
-    assert time.precision == 3  # the caller's own is left as it was
+    assert time.precision == 3  # the caller's object is unchanged
 
 
 def test_fractions_are_no_counts(tmp_path):

@@ -1,4 +1,4 @@
-"""Folders of images: what is found, what is kept, and the same tables however the work was cut up."""
+"""Batches of images: finding, resuming, and equal tables for any division of the work."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ TABLES = ("results.ecsv", "results.parquet", "trajectory.tum", "manifest.json")
 
 @pytest.fixture(scope="module")
 def night(tmp_path_factory) -> Path:
-    """Three small frames of one crater in a tree, a file that is no image, and what no batch should touch."""
+    """Three small frames of one crater in a tree, a file that is no image, and files that a batch must not read."""
     root = tmp_path_factory.mktemp("night")
     camera = replace(
         load_camera("fisheye-2048"), name="small", size_px=(768, 768), focal_px=(244.0, 244.0), centre_px=(383.5, 383.5)
@@ -62,14 +62,14 @@ def night(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def batch_output(night) -> Path:
-    """The batch, undisturbed, on one core."""
+    """The complete batch on one core."""
     out = night / "out"
     assert main(["batch", str(night / "images"), "-D", str(out), "-j", "1", "-q"]) == 5  # broken.png is not solved
     return out
 
 
 def children(pid: int) -> list[int]:
-    path = Path(f"/proc/{pid}/task/{pid}/children")  # Linux; elsewhere nothing is asked
+    path = Path(f"/proc/{pid}/task/{pid}/children")  # Linux; elsewhere not checked
     return [int(one) for one in path.read_text().split()] if path.exists() else []
 
 
@@ -172,7 +172,7 @@ def test_parquet_is_written_with_the_extra_only(batch_output, tmp_path, monkeypa
 
 
 class FixedPosition:
-    """A localizer of one's own."""
+    """A user's own localizer."""
 
     def __call__(self, evidence, terrain):
         return point_fix(np.array([123.0, 45.0]), 10.0, terrain)
@@ -185,7 +185,7 @@ def test_a_localizer_is_one_class_and_one_line_in_the_list(night, tmp_path, monk
     record, _ = locate_image(replace(task, localizer="fixed"))
     assert (record["position"]["east_m"], record["position"]["north_m"]) == (123.0, 45.0)
     assert locate_image(replace(task, localizer="fixed")) == (record, True)
-    other, kept = locate_image(task)  # by another localizer it is another result
+    other, kept = locate_image(task)  # another localizer gives another result
     assert not kept
     assert other["position"]["east_m"] != 123.0
     assert main(["locate", str(image), "--localizer", "fixed", "-D", str(tmp_path), "--json", "--no-plots"]) == 0
@@ -255,7 +255,7 @@ def test_dask_with_a_killed_worker_equals_the_local_run(night, batch_output, mon
 
         killer = threading.Thread(target=kill_a_busy_worker)
         killer.start()
-        monkeypatch.chdir(night)  # where the workers are not
+        monkeypatch.chdir(night)  # the workers run in another folder
         command = ["batch", "images", "-D", out.name, "-q", "--cluster", cluster.scheduler_address]
         assert main(command) == 5
         killer.join()
@@ -276,6 +276,6 @@ def test_a_batch_killed_at_any_time_is_resumed(night, batch_output):
             if not any(map(is_alive, workers)):
                 break
             time.sleep(0.1)
-        assert not any(map(is_alive, workers))  # nobody is left at work when the run is taken up again
+        assert not any(map(is_alive, workers))  # no worker is left when the run is resumed
     assert main(["batch", str(night / "images"), "-D", str(out), "-j", "2", "-q"]) == 5
     assert tables(out) == tables(batch_output)

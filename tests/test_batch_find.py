@@ -1,4 +1,4 @@
-"""Which files a batch takes for its images, however they lie and are listed, and what their results are called."""
+"""The images of a batch for every layout and list, and the names of their results."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ with lock_results(Path(sys.argv[1])): print(flush=True); input()
 
 
 def holder(out) -> subprocess.Popen[str]:
-    """A process that holds the folder, and does."""
+    """A process that holds the lock of the folder."""
     command = [sys.executable, "-c", HOLD, str(out)]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None

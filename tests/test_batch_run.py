@@ -1,4 +1,4 @@
-"""A batch that cannot simply go on: processes that die, a disk that is full, a reader that has gone, Ctrl-C."""
+"""Interrupted batches: processes that die, a full disk, a closed pipe, Ctrl-C."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("compiled_kernels")  # else the first comma
 
 
 def start_batch(folder: Path, *flags: str, before: str = "") -> subprocess.Popen[str]:
-    """The command in a shell's process, which `before` may have prepared."""
+    """The command in a shell, after the shell command `before`."""
     command = [sys.executable, "-m", "startrack.cli.main", "batch", str(folder), *flags]
     shell = ["bash", "-c", f'{before} exec "$@"', "bash", *command]
     return subprocess.Popen(shell, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
@@ -52,7 +52,7 @@ def test_a_cluster_is_an_address_and_has_its_own_processes(tmp_path, capsys, fla
 
 @pytest.fixture(scope="module")
 def many_frames(tmp_path_factory) -> Path:
-    """A folder with more frames than a batch does before it is stopped."""
+    """A folder with more frames than a batch can locate before it is stopped."""
     folder = tmp_path_factory.mktemp("many")
     frames(folder, 400)
     return folder
@@ -100,7 +100,7 @@ def test_an_early_signal_ends_the_batch_at_once(many_frames, tmp_path, delay_s):
 
 
 def test_a_later_signal_drops_the_images_in_progress_and_writes_the_tables(tmp_path, monkeypatch):
-    """The wish is made from within, so that it comes between two images."""
+    """The signal is raised inside the process, so that it arrives between two images."""
     frames(tmp_path / "images", 40)
     monkeypatch.setattr("startrack.cli.batch_show.SAME_SIGNAL_S", -1.0)
     told = []
@@ -148,7 +148,7 @@ def test_with_json_nothing_else_is_printed(tmp_path, capsys):
 
 
 def test_a_full_disk_ends_the_batch_with_one_message(tmp_path):
-    """A limit on the size of files stands in for the disk's: once it is lifted, the same command goes on."""
+    """A limit on file sizes simulates the full disk: after it is lifted, the same command continues."""
     frames(tmp_path / "images", 4)
     flags = "-D", str(tmp_path / "out"), "-j", "1"
     full = start_batch(tmp_path / "images", *flags, before="ulimit -f 8;")

@@ -1,4 +1,4 @@
-"""What a batch solved stays until something as good takes its place, and its tables never mix settings or contents."""
+"""Solutions of a batch stay until an equally good result replaces them; its tables never mix settings or contents."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def batch_done(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def folder(batch_done, tmp_path) -> Path:
-    """A copy of it, to be spoilt."""
+    """A copy of it for destructive changes."""
     return Path(shutil.copytree(batch_done, tmp_path / "copy"))
 
 
@@ -116,7 +116,7 @@ def test_a_solution_without_one_of_its_files_is_incomplete(folder, companion):
 
 
 def test_the_tables_hold_one_kind_of_settings(folder, capsys, monkeypatch):
-    """A run of one image with another flag: what the other images' results say was made without it."""
+    """A run of one image with another flag: the other images' results were made without it."""
     monkeypatch.setattr("sys.stdin", stdin_of("01.png"))
     assert batch(folder, "--exposure", "2", "--files-on-stdin") == 5
     assert "2 results of other settings or contents left out" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""What a batch keeps of earlier runs: what still holds, and nothing else."""
+"""Results of earlier runs that a batch keeps: the valid ones only."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ TRUTH = Camera(
 )  # fmt: skip
 COLUMNS, ROWS = 9, 6
 SUPERSAMPLED = 2
-POSES = (  # turn of the board about cam axes [degrees], place of its middle [squares]
+POSES = (  # rotation of the board about cam axes [degrees], position of its centre [squares]
     ((0, 0, 0), (0, 0, 5.5)),
     ((35, 0, 10), (-2, 0, 5.0)),
     ((-35, 10, 0), (2.5, 0.5, 5.0)),
@@ -46,7 +46,7 @@ def pixel_rays(dx, dy):
 
 
 def board_positions(pose, rays):
-    """Places on the board (n, 2) [squares, from the first inner corner] where the rays meet it, and the depth."""
+    """Intersections (n, 2) of the rays with the board [squares, from the first inner corner], and their depth."""
     turn, middle = pose
     R = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()  # board to cam
     origin = np.array(middle) - R @ [(COLUMNS - 1) / 2, (ROWS - 1) / 2, 0.0]
@@ -55,7 +55,7 @@ def board_positions(pose, rays):
 
 
 def draw_picture(pose, colour):
-    """A picture of the board; `colour` gives brightness at places."""
+    """A picture of the board; `colour` gives the brightness at positions on it."""
     step = (np.arange(SUPERSAMPLED) - (SUPERSAMPLED - 1) / 2) / SUPERSAMPLED
     total = np.zeros(SIZE_PX[::-1])
     for dx in step:
@@ -104,7 +104,7 @@ def chessboards():
 
 
 def test_drawn_corners_are_found_where_they_are(chessboards):
-    """The drawing and OpenCV's detector agree: what follows rests on both."""
+    """The drawing and OpenCV's detector agree; the other tests rely on both."""
     found = find_corners(chessboards[1], Board(COLUMNS, ROWS))
     place, _ = board_positions(POSES[1], TRUTH.unproject(found.xy_px))
     assert np.median(np.abs(place - np.rint(place))) < 0.005

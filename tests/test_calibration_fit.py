@@ -104,7 +104,7 @@ def test_from_matches_alone_of_which_a_fifth_is_wrong(law, mirrored):
     rng = np.random.default_rng(1)
     xy[0][:10] = rng.uniform(0, 2047, (10, 2))
     xy[0][10:20] += rng.uniform(-12, 12, (10, 2))
-    points = observations(xy, rays)  # not even the centroids' errors are told
+    points = observations(xy, rays)  # without the centroids' errors
     start = initial_state(points, SIZE_PX)
     fit = fit_lens(start.camera, start.R_cam_icrs, points)
     assert fit.camera.mirrored == mirrored
@@ -148,7 +148,7 @@ def test_stars_inside_60_degrees_calibrate_60_degrees():
     assert np.degrees(camera.calibrated_angle_rad) == pytest.approx(59.5, abs=1.0)
     edge = np.array([[np.sin(a), 0, np.cos(a)] for a in np.radians([59, 80, 90])])
     inside, beyond, far = camera.projection_sigma_px(edge)
-    assert inside < 0.15 < beyond < far  # and what lies beyond is not hidden
+    assert inside < 0.15 < beyond < far  # the error beyond is stated too
 
 
 def test_a_few_stars_beyond_a_gap_do_not_stretch_the_calibrated_angle():

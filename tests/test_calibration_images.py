@@ -1,4 +1,4 @@
-"""`startrack calibrate` on pictures: a real all-sky photograph from cold, and rendered frames with known truth."""
+"""`startrack calibrate` on pictures: a real all-sky photograph without a camera file, and rendered frames."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def exposure():
 
 @pytest.fixture(scope="module")
 def cold_calibration(exposure):
-    """From nothing but "about 180 degrees"."""
+    """Calibration from the field of view of about 180 degrees alone."""
     return calibrate([exposure], load_catalog().brighter_than(8.0), fov_rad=np.pi, site=SITE, name="cold")
 
 
@@ -97,7 +97,7 @@ def test_noise_is_refused_with_advice(exposure):
 
 @pytest.fixture(scope="module")
 def written_files(tmp_path_factory):
-    """What the command writes for the photograph, from a camera file that is 2 % and 6 px off."""
+    """Output of the command for the photograph, from a camera file that is 2 % and 6 px off."""
     folder = tmp_path_factory.mktemp("calibration")
     camera = load_camera("lowell-ldt")
     rough = replace(camera, focal_px=(343.0, 343.0), centre_px=(camera.centre_px[0] + 6, camera.centre_px[1] - 5))

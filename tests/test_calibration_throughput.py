@@ -35,7 +35,7 @@ EXPOSURE_S = 10.0
 
 @pytest.fixture(scope="module")
 def frames():
-    """Two frames of one sky and one 30 hours later, on open ground, and the hot pixels with their light [e]."""
+    """Two frames of one sky and one 30 hours later, on open ground, and the hot pixels with their charge [e]."""
     start = datetime(2030, 6, 1, tzinfo=UTC)
     exposures = []
     for number, later in enumerate((timedelta(0), timedelta(0), timedelta(hours=30))):
@@ -112,7 +112,7 @@ def test_photon_transfer_on_flat_fields():
     assert transfer.read_noise_e(300.0) == pytest.approx(8.0, rel=0.25)
     assert fit_photon_transfer([]) is None
     dark = Exposure(pixels_adu=rng.normal(300, 5, (512, 512)).astype(np.float32))
-    assert fit_photon_transfer([(dark, dark)]) is None  # no range of light
+    assert fit_photon_transfer([(dark, dark)]) is None  # no range of levels
 
 
 def test_airmass():
@@ -133,7 +133,7 @@ def star_fluxes(
     images: int = 3, stars: int = 200, extinction: float = 0.25, edge: float = 0.7, offset_mag: float = 0.0,
     varied: bool = True, seed: int = 0,
 ) -> StarFluxes:  # fmt: skip
-    """Fluxes through a lens that dims its edge, under air; without `varied` airmass is a function of the angle."""
+    """Fluxes through a lens darker at its edge, and air; without `varied` airmass is a function of the angle."""
     rng = np.random.default_rng(seed)
     n = images * stars
     angle, b_v = np.radians(80) * np.sqrt(rng.random(n)), rng.normal(0.6, 0.4, n)

@@ -37,7 +37,7 @@ GOOD: dict[str, Any] = {
 
 
 def change_key(path: str, value: Any) -> dict[str, Any]:
-    """The good file with one key set, or with None: taken away."""
+    """The valid file with one key set, or removed if the value is None."""
     d = copy.deepcopy(GOOD)
     *tables, key = path.split(".")
     table = d
@@ -164,7 +164,7 @@ def test_a_missing_file_is_no_calibration(tmp_path: Path) -> None:
             load_camera(name)
         assert caught.value.reason == "no_calibration"
         assert str(name) in str(caught.value)
-    with pytest.raises(BadInput, match="fisheye-2048"):  # says what there is
+    with pytest.raises(BadInput, match="fisheye-2048"):  # lists the shipped ones
         load_camera("fisheye")
 
 

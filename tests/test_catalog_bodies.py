@@ -86,7 +86,7 @@ def test_azimuth_and_elevation_agree_with_skyfield(site: Site, time: datetime) -
     for body in bodies(site, time)[3:]:
         elevation, azimuth, _ = skyfield_position(site, time, body.name).apparent().altaz()
         theirs = rays_from_azel(azimuth.radians, elevation.radians)
-        # With another table of UT1 and no polar motion, Skyfield's Earth turns up to 0.3 s apart from ours.
+        # With another table of UT1 and no polar motion, Skyfield's Earth rotation differs by up to 0.3 s from ours.
         limit_arcsec = 0.2 if site.body == "moon" else 5
         assert angle_between_rad(R @ body.ray_icrs, theirs) < limit_arcsec * ARCSEC_RAD, body.name
 

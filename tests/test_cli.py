@@ -1,4 +1,4 @@
-"""The commands as a script meets them: exit codes, refusals, what is printed and what is written."""
+"""The commands as used by scripts: exit codes, refusals, printed and written output."""
 
 import json
 import os
@@ -65,7 +65,7 @@ def noise(name="noise.png", seed=1, **facts):
 
 
 def stars(name="stars.png", **facts):
-    """A handful of point sources that are no part of the sky: enough for `detect`, not for `identify`."""
+    """A few random point sources: enough for `detect`, not for `identify`."""
     rng = np.random.default_rng(2)
     y, x = np.mgrid[:SIZE, :SIZE]
     pixels = rng.normal(200, 12, (SIZE, SIZE))
@@ -89,7 +89,7 @@ def run(capsys, *words):
 
 
 def reason(capsys, *words):
-    """Exit code and reason of one image, with the file that was written beside what was printed."""
+    """Exit code and reason of one image; the written file must agree with the printed record."""
     code, lines, err = run(capsys, *words, "--json", "--no-plots")
     assert err == ""
     (line,) = lines
@@ -384,7 +384,7 @@ def test_a_full_disk_behind_stdout_is_named(folder):
 
 
 def test_shell_completion_knows_the_commands(folder, tmp_path):
-    """As bash asks through argcomplete: the answer comes on descriptor 8."""
+    """As bash calls argcomplete: the completions are written to descriptor 8."""
     pytest.importorskip("argcomplete", reason="the extra `completion` is not installed")
     answer = tmp_path / "answer"
     words = {"COMP_LINE": "startrack loc", "COMP_POINT": "13", "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n"}
@@ -447,7 +447,7 @@ def test_the_samples_are_located_without_a_flag(folder, capsys, name):
 
 
 def test_a_wrong_time_rotates_the_position_about_the_axis_of_a_round_crater(folder, capsys):
-    """Near the pole six hours turn the sky by 3.3 degrees about the zenith, and in a round crater nothing tells.
+    """Near the pole the sky rotates by 3.3 degrees in six hours; in a round crater this is not noticeable.
 
     The Moon's rotation: 13.17635815 degrees a day (IAU 2015 report, Archinal et al. 2018, table 2).
     """

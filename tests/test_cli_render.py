@@ -106,7 +106,7 @@ def test_the_files_agree_with_each_other_and_with_the_sky(folder):
     px, _ = camera.project(stars.rays_icrs[[row_of[table["catalog_id"][k]] for k in hip]] @ R_cam_icrs.T)
     np.testing.assert_allclose(np.column_stack([table["x_px"], table["y_px"]])[hip], px, atol=1e-4)
 
-    # The light is where the truth says, and not where it says that the wall is.
+    # Stars are at the positions of the truth, and absent where the truth has the wall.
     pixels = exposure.pixels_adu
     snr = (pixels[np.rint(table["y_px"]).astype(int), np.rint(table["x_px"]).astype(int)] - np.median(pixels)) / 6
     bright = table["v_mag"] < 3.5

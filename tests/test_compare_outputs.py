@@ -1,4 +1,4 @@
-"""benchmarks/compare_outputs.py: what differs between two folders of outputs is found and told."""
+"""benchmarks/compare_outputs.py: differences between two folders of outputs are found and reported."""
 
 import json
 import subprocess

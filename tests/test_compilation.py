@@ -67,7 +67,7 @@ def test_without_any_folder_the_kernels_are_kept_for_the_process(read_only_packa
     compilation.choose_cache_folder()
     folder = Path(os.environ.pop("NUMBA_CACHE_DIR"))
     assert folder.is_dir()
-    assert folder.stat().st_mode & 0o077 == 0  # numba unpickles what it finds there
+    assert folder.stat().st_mode & 0o077 == 0  # numba unpickles the files in it
     folder.rmdir()
 
 

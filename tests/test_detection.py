@@ -1,4 +1,4 @@
-"""Detection against the Cramer-Rao bound, against sep, and against everything in a frame that is not a star."""
+"""Detection against the Cramer-Rao bound, against sep, and on sources that are not stars."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ def test_centroids_reach_the_cramer_rao_bound(sigma: float, low: int, high: int,
     error = detect_field(sigma, known).xy_px[d] - field(sigma).xy_px[which]
     bound = bounds(sigma, which)[:, :2]
     assert len(which) > 250
-    assert np.sqrt(np.mean(error**2 / bound)) < 1.10  # measured: 0.97-1.06; one part in 25 is the statistics
-    # No pull towards pixel centres or edges, in px: the mean error, and its slope over the pixel's phase.
+    assert np.sqrt(np.mean(error**2 / bound)) < 1.10  # measured: 0.97-1.06; the statistical error is 4 %
+    # No bias towards pixel centres or edges [px]: the mean error, and its slope over the pixel phase.
     assert np.abs(error.mean(axis=0)).max() < 4 * np.sqrt(bound.mean() / len(which))
     phase = field(sigma).xy_px[which] - np.rint(field(sigma).xy_px[which])
     for axis in range(2):
@@ -79,7 +79,7 @@ def test_covariances_are_those_of_the_errors(sigma: float, low: int, high: int) 
     which, d = match_field(sigma, low, high)
     error = detect_field(sigma).xy_px[d] - field(sigma).xy_px[which]
     chi2 = np.einsum("ni,nij,nj->n", error, np.linalg.inv(detect_field(sigma).covariance_px2[d]), error).mean()
-    # 2 is right. Bright stars carry a floor of 3 % of their light for PSFs that are not quite Gaussian.
+    # 2 is right. The stated errors of bright stars include 3 % of their flux for PSFs that differ from the Gaussian.
     assert 1.3 < chi2 < 2.35
 
 
@@ -168,7 +168,7 @@ BACKGROUNDS = {
 @pytest.mark.parametrize("sigma", [0.7, 1.0, 1.5, None])
 @pytest.mark.parametrize("name", BACKGROUNDS)
 def test_slopes_and_edges_are_no_stars(name: str, sigma: float | None) -> None:
-    # A long edge may give a noise peak its chance; a detector that takes edges for stars finds dozens to hundreds.
+    # A long edge may add a false star; a detector that accepts edges finds dozens to hundreds.
     assert count(noise_frame(BACKGROUNDS[name], np.random.default_rng(7)), sigma) <= 3
 
 
@@ -239,7 +239,7 @@ def test_saturated_stars_are_found_and_marked(sigma: float) -> None:
     marked = detections.saturated[nearest]
     assert marked[peak >= ceiling].mean() > 0.9
     assert not marked[peak < 0.9 * ceiling].any()
-    # The wings still tell place and brightness.
+    # The wings still determine position and flux.
     gone = peak >= ceiling
     assert gone.sum() >= 40
     assert distance[gone].max() < 0.05
@@ -263,7 +263,7 @@ def test_a_wrong_psf_in_the_camera_file_is_corrected() -> None:
 
 
 def test_close_pairs_are_fitted_separately() -> None:
-    """Two stars 3.5 sigma apart: each is found, and neither drags the other along."""
+    """Two stars 3.5 sigma apart are both found, and their positions are not biased."""
     rng = np.random.default_rng(12)
     middle = np.stack(np.meshgrid(np.arange(40, 990, 50), np.arange(40, 990, 50)), axis=-1).reshape(-1, 2)
     turn = rng.uniform(0, 2 * np.pi, len(middle))
@@ -347,7 +347,7 @@ def test_small_and_odd_frames(shape: tuple[int, int]) -> None:
 
 
 def test_the_painter_and_its_bound_agree_with_a_plain_least_squares_fit() -> None:
-    """The yardstick itself: scipy's fit of painted stars scatters by the bound that the tests rely on."""
+    """scipy's fit of painted stars scatters by the Cramer-Rao bound that the tests use."""
     from scipy.optimize import least_squares
 
     rng = np.random.default_rng(17)

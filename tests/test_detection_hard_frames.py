@@ -1,4 +1,4 @@
-"""Detection where frames are not kind: few bits, crowds, moonlight, blooming, streaks, defocus, nothing but noise."""
+"""Detection in difficult frames: few bits, crowding, moonlight, blooming, streaks, defocus, pure noise."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def jittered_grid(spacing: float, rng: np.random.Generator, margin: float = 40.0
 
 @pytest.mark.parametrize(("sigma_adu", "level"), [(0.4, 3.3), (0.7, 12.6), (2.2, 3.7), (5.0, 20.2)])
 def test_noise_of_images_with_few_values(sigma_adu: float, level: float) -> None:
-    """Medians of whole numbers are whole numbers: the spread of an 8-bit image was wrong by up to a half."""
+    """Medians of integers are integers: the noise of an 8-bit image must not be quantised."""
     rng = np.random.default_rng(1)
     image = np.maximum(np.rint(rng.normal(level, sigma_adu, (512, 512))), 0).astype(np.float32)
     background, noise = background_and_noise(image, 1.0, 1.0)
@@ -62,7 +62,7 @@ def test_bit_depths(bits: int) -> None:
 
 @pytest.mark.parametrize("sigma", [1.2, 2.5])
 def test_few_faint_stars_are_lost_in_crowded_frames(sigma: float) -> None:
-    """Wings of a thousand bright stars cover a tenth to half of the frame and would raise background and noise."""
+    """The wings of a thousand bright stars cover a tenth to half of the frame and would bias background and noise."""
     rng = np.random.default_rng(3)
     xy = rng.uniform(20, SIZE - 20, (1500 if sigma < 2 else 700, 2))
     flux = np.exp(rng.uniform(np.log(600 * sigma), np.log(2e5), len(xy)))
@@ -80,7 +80,7 @@ def test_few_faint_stars_are_lost_in_crowded_frames(sigma: float) -> None:
 
 
 def test_moonlight() -> None:
-    """A glow of 20,000 electrons that falls to a hundred, with photon noise to match."""
+    """A glow that falls from 20,000 electrons to a hundred, with its photon noise."""
     rng = np.random.default_rng(4)
     y, x = np.mgrid[:SIZE, :SIZE]
     glow = 100 + 20_000 * np.exp(-np.hypot(x - 200, y - 300) / 150)
@@ -97,7 +97,7 @@ def test_moonlight() -> None:
 
 
 def test_bloomed_stars_do_not_spoil_their_neighbourhood() -> None:
-    """Columns of saturated pixels above and below bright stars, as some sensors show: the other stars stay."""
+    """Columns of saturated pixels above and below bright stars (blooming): the other stars are still detected."""
     rng = np.random.default_rng(5)
     xy = jittered_grid(60, rng)
     flux = np.full(len(xy), flux_of(30.0, 1.2, VARIANCE))
@@ -116,7 +116,7 @@ def test_bloomed_stars_do_not_spoil_their_neighbourhood() -> None:
 
 
 def draw_streaks(length_px: float, sigma: float, rng: np.random.Generator) -> tuple[Exposure, np.ndarray, np.ndarray]:
-    """Streaks that turn about the frame's corner, the places at mid-exposure, and the fluxes."""
+    """Streaks of a rotation about the frame's corner, the positions at mid-exposure, and the fluxes."""
     xy = jittered_grid(max(50, 1.6 * length_px), rng, margin=40 + length_px)
     flux = np.exp(rng.uniform(np.log(4e3), np.log(6e4), len(xy)))
     along = np.stack([-xy[:, 1], xy[:, 0]], axis=1) / np.linalg.norm(xy, axis=1, keepdims=True)
@@ -135,17 +135,17 @@ def test_streaked_stars_are_where_they_stood_at_mid_exposure(length_px: float, r
     distance, nearest = cKDTree(found.xy_px).query(xy)
     near = distance < 1.0
     assert near.mean() > 0.95
-    assert np.count_nonzero(cKDTree(xy).query(found.xy_px)[0] > 2) <= 0.02 * len(xy)  # no streak counts twice
+    assert np.count_nonzero(cKDTree(xy).query(found.xy_px)[0] > 2) <= 0.02 * len(xy)  # no streak is detected twice
     error = found.xy_px[nearest[near]] - xy[near]
     assert np.sqrt(np.mean(error**2)) < rms_px
     chi2 = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance_px2[nearest[near]]), error)
-    assert chi2.mean() < 2 * 1.5  # honest, or a little careful
+    assert chi2.mean() < 2 * 1.5  # right, or slightly too large
     assert np.median(found.flux_e[nearest[near]] / flux[near]) == pytest.approx(1.0, abs=0.08)
 
 
 @pytest.mark.parametrize("gain", [0.5, 2.0])
 def test_photon_noise_of_an_unknown_gain_is_measured(gain: float) -> None:
-    """Without a camera file: errors of bright stars as stated, and centroids at the bound that knows the gain."""
+    """Without a camera file: errors of bright stars as stated, and centroids at the bound for a known gain."""
     rng = np.random.default_rng(7)
     stars = isolated_stars(1.2, 100.0, 3.0, (15, 250), rng=rng, size=SIZE, spacing=32)
     found = Detector()(replace(stars.exposure, pixels_adu=stars.exposure.pixels_adu / np.float32(gain) + 50))

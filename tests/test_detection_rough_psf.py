@@ -1,4 +1,4 @@
-"""Stars that are not the Gaussian PSF: trails of an undersampled lens, among hot pixels."""
+"""Stars that differ from the Gaussian PSF: trails of an undersampled lens, among hot pixels."""
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def test_bright_trailed_stars_are_stars_and_hot_pixels_are_not(length_px):
 
 
 def test_a_bright_star_of_a_real_lens_clipped_in_two_pixels_is_found():
-    """Its wings are wider than the Gaussian of the whole stars; hidden middles do not make it another thing."""
+    """Its wings are wider than the Gaussian of unsaturated stars; it must not be rejected for that."""
     rng = np.random.default_rng(8)
     xy = rng.uniform(20, SIZE - 20, (120, 2))
     xy = xy[cKDTree(xy).query(xy, k=2)[0][:, 1] > 14]
@@ -65,5 +65,5 @@ def test_a_bright_star_of_a_real_lens_clipped_in_two_pixels_is_found():
     distance, nearest = cKDTree(found.xy_px).query(xy)
     assert distance[at].max() < 0.2
     assert found.saturated[nearest[at]].all()
-    assert np.abs(found.flux_e[nearest[at]] / 3.4e5 - 1).max() < 0.35  # what is hidden is guessed from the wings
+    assert np.abs(found.flux_e[nearest[at]] / 3.4e5 - 1).max() < 0.35  # the saturated part is estimated from the wings
     assert np.count_nonzero(cKDTree(xy).query(found.xy_px)[0] > 3) <= 2

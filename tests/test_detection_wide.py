@@ -1,4 +1,4 @@
-"""Wide PSFs, found in frames whose pixels are added together and fitted in the frame itself; and its parts."""
+"""Wide PSFs, detected in binned frames and fitted in the frame itself; and parts of the detector."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_centroids_and_covariances_of_wide_stars(sigma: float, known: bool) -> N
     pairs = zip(stars.xy_px[bright], stars.flux[bright], strict=True)
     bound = np.array([np.diag(cramer_rao(xy - np.rint(xy), flux, sigma, variance))[:2] for xy, flux in pairs])
     assert bright.sum() > 150
-    assert np.sqrt(np.mean(error**2 / bound)) < 1.15  # one part in 20 is the statistics
+    assert np.sqrt(np.mean(error**2 / bound)) < 1.15  # the statistical error is 5 %
     chi2 = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance_px2[nearest[bright]]), error)
     assert 1.5 < chi2.mean() < 2.6
     assert found.background_e.shape == (SIZE, SIZE)

@@ -1,4 +1,4 @@
-"""Evidence: forced photometry of painted stars, and log-likelihood ratios that mean what they say."""
+"""Evidence: forced photometry of painted stars, and calibrated log-likelihood ratios."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ SCATTER = 0.05
 
 
 def add_noise(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Background-subtracted pixels [e] of the light on a background of the usual variance."""
+    """Background-subtracted pixels [e] of the signal on a background of the usual variance."""
     background = VARIANCE - READ_NOISE**2
     return (rng.poisson(light + background) - background + rng.normal(0, READ_NOISE, light.shape)).astype(np.float32)
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Stars (n), where the first of each pair come first, and what was measured of them."""
+    """Stars (n), first stars of the pairs first, and their photometry."""
 
     expected: np.ndarray
     true: np.ndarray
@@ -101,11 +101,11 @@ def test_photometry_is_unbiased_and_its_variance_right(
 
 @pytest.mark.parametrize("sigma", [0.7, 1.0, 1.5])
 def test_photometry_is_near_the_cramer_rao_bound(sigma: float) -> None:
-    """Variance of hidden stars against the Cramer-Rao bound with the place known and the level free."""
+    """Variance of hidden stars against the Cramer-Rao bound with known position and free level."""
     got = measure_pairs(sigma, 0.0, rng=np.random.default_rng(2))
-    p = cramer_rao(np.zeros(2), 1e-6, sigma, VARIANCE)  # no light: place and flux do not mix
+    p = cramer_rao(np.zeros(2), 1e-6, sigma, VARIANCE)  # no flux: position and flux are not correlated
     bound = p[2, 2]
-    assert np.median(got.light.variance_e2) < 1.25 * bound  # the stamp is small: the level costs some
+    assert np.median(got.light.variance_e2) < 1.25 * bound  # the stamp is small: the level adds to the variance
     assert np.median(got.light.variance_e2) > 0.97 * bound
 
 
@@ -127,7 +127,7 @@ def test_ratios_are_calibrated(neighbours: tuple[float, float] | None) -> None:
         p = expit(ratio[some])
         assert some.sum() >= 100
         assert abs(yes[some].sum() - p.sum()) < 3.5 * np.sqrt(np.sum(p * (1 - p))), (low, high)
-    # Beyond, an allowance for oddities holds the ratios back: never more sure than right.
+    # Beyond, the ratios are capped for outliers: never overconfident.
     for sure, wrong in ((ratio > 4, ~yes), (ratio < -4, yes)):
         p = expit(-np.abs(ratio[sure])).sum()
         assert np.count_nonzero(wrong[sure]) <= p + 3.5 * np.sqrt(p)
@@ -149,7 +149,7 @@ def test_the_ratio_rises_with_the_flux_and_is_capped() -> None:
     assert np.abs(ratio).max() <= CAP
     assert ratio[flux == 200][0] > 6
     assert ratio[flux == 0][0] == pytest.approx(np.log(2e-3), abs=0.5)  # a star may be missing for other reasons
-    # A flash a hundred times brighter than the star, or a hole much darker than the wall, is no witness of either.
+    # A flux a hundred times that of the star, or one far below the wall's, is evidence of neither.
     odd = visibility_llr(np.array([2e4, -500.0]), np.full(2, 200.0), np.full(2, 20.0), np.full(2, 30.0))
     assert np.all(np.abs(odd) < 1.0)
 
@@ -179,7 +179,7 @@ def test_a_hot_pixel_near_a_star_is_masked(flux: float, excess: float) -> None:
     z = (light.flux_e - true) / np.sqrt(light.variance_e2 + light.own_shot * true)
     assert light.usable.mean() > 0.97
     assert np.mean(np.abs(z[light.usable]) > 5) < 0.005
-    assert z[light.usable].std() < 1.15  # ten sigma on the very middle of a star may pass for a part of it
+    assert z[light.usable].std() < 1.15  # ten sigma at the centre of a star may count as its flux
 
 
 def test_saturated_stamps_are_unusable() -> None:
@@ -308,7 +308,7 @@ def test_one_lonely_star_and_none_at_all() -> None:
 
 
 def test_uncertain_stars_have_weaker_evidence_when_missing() -> None:
-    """A variable star that is not seen may just be faint today."""
+    """A variable star that is not detected may be at its minimum."""
     rng = np.random.default_rng(9)
     rays = random_stars(300, rng).rays_icrs
     rays = rays[(rays[:, 2] > 0.3) & (rays[:, 2] < 0.95)]
@@ -377,7 +377,7 @@ def test_a_few_stars_give_a_scale_too(n: int) -> None:
 
 
 def test_evidence_of_a_rendered_crater(located: Any) -> None:
-    """The pipeline's own evidence against the renderer's truth: sure ratios are right, all are calibrated."""
+    """The pipeline's evidence against the renderer's truth: large ratios are right, all are calibrated."""
     light, truth = located.result.light, located.truth
     stars = located.result.stars
     hidden = dict(zip(truth.sources.catalog_id.tolist(), truth.hidden.tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""What the camera file's own uncertainty does to the evidence."""
+"""Effect of the camera file's uncertainty on the evidence."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever happens to a file on its way, the reader answers with pixels or with `BadInput`; a cut is always seen."""
+"""Damaged files: the reader returns pixels or raises `BadInput`; truncation is always noticed."""
 
 import bz2
 import gzip

@@ -1,4 +1,4 @@
-"""FITS files written by astropy: read as astropy means them, or refused with the cause."""
+"""FITS files written by astropy: read as astropy does, or refused with the cause."""
 
 import bz2
 import gzip

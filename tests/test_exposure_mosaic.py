@@ -17,9 +17,9 @@ from startrack.types import BadInput, Exposure
 
 SAMPLE = Path(__file__).parents[1] / "sample_images" / "near-wall"
 PATTERN = (((0, 0), "R"), ((0, 1), "G"), ((1, 0), "G"), ((1, 1), "B"))
-GAIN = {"R": 0.45, "G": 1.0, "B": 0.6}  # of the stars' light
+GAIN = {"R": 0.45, "G": 1.0, "B": 0.6}  # relative flux of the stars
 SKY_E = {"R": 20.0, "G": 8.0, "B": 3.0}
-DNG_TAGS = [  # what the DNG standard asks of a mosaic: version, pattern, white, black, model, colour matrix, illuminant
+DNG_TAGS = [  # required by the DNG standard: version, pattern, white, black, model, colour matrix, illuminant
     (50706, "B", 4, (1, 4, 0, 0), True), (50707, "B", 4, (1, 1, 0, 0), True), (33421, "H", 2, (2, 2), True),
     (33422, "B", 4, (0, 1, 1, 2), True), (50717, "I", 1, (4095,), True), (50714, "H", 1, (64,), True),
     (50708, "s", 0, "Test", True), (50721, "2i", 9, (1, 1, 0, 1, 0, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0, 1, 1, 1), True),
@@ -91,7 +91,7 @@ def test_the_four_patterns_are_taken(tmp_path, pattern):
 
 
 def test_a_tiff_mosaic_and_a_camera_raw_file_give_the_sensors_counts(tmp_path):
-    counts = np.random.default_rng(0).integers(200, 4000, (64, 96)).astype(np.uint16)  # too small to be evened out
+    counts = np.random.default_rng(0).integers(200, 4000, (64, 96)).astype(np.uint16)  # too small to be equalised
     tifffile.imwrite(tmp_path / "a.tif", counts, photometric=32803)
     pytest.importorskip("rawpy", reason="camera raw files need the extra raw")
     tifffile.imwrite(tmp_path / "b.dng", counts, photometric=32803, extratags=DNG_TAGS, subfiletype=0)

@@ -245,7 +245,7 @@ def test_jpeg_thumbnail_does_not_hide_the_missing_end(cause):
 @pytest.mark.parametrize("options", [{}, {"progressive": True}, {"restart_marker_rows": 1}, {"mode": "RGB"}])
 @pytest.mark.parametrize("kept", [0.3, 0.6, 0.97])
 def test_jpeg_cut_and_closed_with_an_end_marker(cause, options, kept):
-    """Pillow and OpenCV both make up a flat rest, without a word."""
+    """Pillow and OpenCV both fill the missing part with a constant, without an error."""
     whole = encode_image(FRAME8, "JPEG", **options)
     scan = whole.index(b"\xff\xda") + 14
     cut = whole[: scan + round(kept * (len(whole) - 2 - scan))] + b"\xff\xd9"

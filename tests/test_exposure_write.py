@@ -1,4 +1,4 @@
-"""What is written is read back, by us and by others; nothing is ever half-written."""
+"""Written files are read back, by startrack and by others; no file is ever incomplete."""
 
 import errno
 import io

@@ -1,4 +1,4 @@
-"""Time, directions, quaternions and places: the frames that need no ephemeris."""
+"""Time, directions, quaternions and positions: the frames that need no ephemeris."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Identification on synthetic detections of the real catalogue: who is who, and when to say "not identified"."""
+"""Identification on synthetic detections of the real catalogue: right names, and refusals."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Frame:
     R_cam_icrs: np.ndarray
 
     def clear_stars(self, camera: Camera) -> np.ndarray:
-        """True stars with no other within 3.6 px that is at most 1.5 mag fainter: their name is plain."""
+        """True stars with no other within 3.6 px that is at most 1.5 mag fainter: not blended."""
         px, inside = camera.project(sky().rays_icrs @ self.R_cam_icrs.T)
         seen = np.flatnonzero(inside)
         near = cKDTree(px[seen]).query_ball_point(self.detections.xy_px, 3.6)
@@ -56,7 +56,7 @@ def frame(
     camera: Camera, seed: int, limit: float = 6.0, false: float = 0.2, hidden: float = 0.5, noise_px: float = 0.2,
     brightest: int | None = None, some: int | None = None,
 ) -> Frame:  # fmt: skip
-    """Stars above the limit at a random attitude, one side of the field hidden, false ones strewn among them."""
+    """Stars above the limit at a random attitude, one side of the field hidden, with random false stars."""
     rng = np.random.default_rng([seed, camera.size_px[0]])
     R = Rotation.random(random_state=rng).as_matrix()
     px, inside = camera.project(sky().rays_icrs @ R.T)
@@ -79,7 +79,7 @@ def random_positions(camera: Camera, n: int, rng: np.random.Generator) -> np.nda
 
 
 def make_detections(xy_px: np.ndarray, v_mag: np.ndarray, sigma_px: float) -> Detections:
-    """Detections, brightest first, from places and magnitudes."""
+    """Detections, brightest first, from positions and magnitudes."""
     n, flux = len(xy_px), 10 ** (-0.4 * (v_mag - ZERO_MAG))
     return Detections(
         xy_px=xy_px, covariance_px2=np.tile(sigma_px**2 * np.eye(2), (n, 1, 1)), flux_e=flux,
@@ -183,7 +183,7 @@ ODDS = {"wide": (FISHEYE, 10.0, 1.0, 400), "narrow": (NARROW, 2.0, 0.15, 8000)} 
 @pytest.mark.parametrize("field", ODDS)
 @pytest.mark.parametrize("clustered", [False, True], ids=["uniform", "clustered"])
 def test_stated_false_alarm_probabilities_are_true(clustered: bool, field: str) -> None:
-    """p-values of random attitudes over random detections: at least as large as they should be, and not much more."""
+    """p-values of random attitudes over random detections: at least as large as the true ones, and not much larger."""
     camera, cap_deg, radius_deg, stars = ODDS[field]
     rng, width = np.random.default_rng(4), camera.size_px[0]
     bright = sky().rays_icrs[:stars]
@@ -222,7 +222,7 @@ def test_a_mirrored_frame_is_named_as_such() -> None:
 
 @pytest.mark.parametrize("error", [0.97, 0.99, 1.01, 1.03])
 def test_a_wrong_focal_length_is_refused(error: float) -> None:
-    """Triangles of neighbours still match a per cent or three off; the attitude would be a degree or three off."""
+    """Triangles of neighbours match at focal lengths 1 to 3 % off; the attitude would be 1 to 3 degrees off."""
     wrong = replace(FISHEYE, focal_px=(652.0 * error, 652.0 * error))
     with pytest.raises(NotIdentified, match=r"calibration of this lens|camera file right") as caught:
         Identifier()(frame(FISHEYE, 0).detections, wrong, sky())

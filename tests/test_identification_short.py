@@ -1,4 +1,4 @@
-"""Short lists: named wholly and at once; the parts of the search are what they say."""
+"""Short lists: identified completely and quickly; and parts of the search."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The image circle that a frame shows, and a photograph of another camera that needs it."""
+"""Detection of the image circle in a frame, and a photograph of another camera that needs it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_the_disc_of_the_sky_is_found(centre: tuple[float, float], radius: float
     found = image_circle(disc(centre, radius, rng=np.random.default_rng(3), trees=trees))
     assert found is not None
     assert found.centre_px == pytest.approx(centre, abs=0.075 * radius)
-    assert found.radius_px == pytest.approx(radius, rel=0.05)  # a search stands errors of 0.13
+    assert found.radius_px == pytest.approx(radius, rel=0.05)  # the search tolerates errors of 0.13
 
 
 def test_a_frame_full_of_sky_has_no_disc() -> None:

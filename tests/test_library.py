@@ -1,4 +1,4 @@
-"""What `import startrack` offers: every public name, after every submodule was imported, and described parameters."""
+"""The public names of `startrack` after every submodule was imported, and documentation of their parameters."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def submodules() -> list[types.ModuleType]:
 
 @pytest.fixture(scope="module", autouse=True)
 def import_everything() -> list[types.ModuleType]:
-    """A submodule of the same name as a function would now stand in its place."""
+    """A submodule with the name of a function would now replace it."""
     return submodules()
 
 

@@ -40,7 +40,7 @@ def perfect_list(rng: np.random.Generator, at_m: Array, n: int = THESIS_STARS) -
 
 
 def measure_stars(rng: np.random.Generator, at_m: Array, terrain: Cylinder, n: int, sigma_rad: float = 0.0) -> Evidence:
-    """Stars of SNR 1 to 4, each with a noisy light measurement."""
+    """Stars of SNR 1 to 4, each with a noisy flux measurement."""
     azimuth, elevation = sky(rng, n)
     snr = 1 + 3 * rng.random(n)
     edge = elevation + sigma_rad * rng.standard_normal(n)
@@ -57,7 +57,7 @@ def measure_stars(rng: np.random.Generator, at_m: Array, terrain: Cylinder, n: i
     ids=["exact", "pseudo-gradient", "hull"],
 )
 def test_contract_of_every_localizer(method: Localizer, mean_m: float, most_m: float) -> None:
-    """On the thesis's perfect lists each method reaches its known error, and says what a fix must say."""
+    """On the thesis's perfect lists each method has its known error and returns a complete fix."""
     errors = []
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -170,7 +170,7 @@ def test_errors_are_as_large_as_stated() -> None:
 
 @pytest.mark.parametrize("terrain", [TERRAIN, ThreeMethods(TERRAIN)], ids=["disks", "bounds"])
 def test_two_positions_that_fit_are_both_modes(terrain: Terrain) -> None:
-    """Stars due east and due west only: a place and its mirror image to the south see the same horizon there."""
+    """Stars due east and due west only: a position and its mirror image to the south have the same horizon there."""
     rng = np.random.default_rng(3)
     n, at = 1500, np.array([2000.0, 6000.0])
     azimuth = np.where(rng.random(n) < 0.5, np.pi / 2, 3 * np.pi / 2)
@@ -243,7 +243,7 @@ def test_pixels_of_the_sky_and_several_exposures_are_rows_like_any_other() -> No
     stars = measure_stars(rng, at, TERRAIN, 1500)
     azimuth, sigma = 2 * np.pi * rng.random(4000), np.full(4000, 0.001)
     elevation = TERRAIN.horizon_rad(at[None], azimuth) + rng.uniform(-0.01, 0.01, 4000)
-    step = 0.5  # of the sky's light, in sigmas of a pixel
+    step = 0.5  # of the sky brightness, in sigmas of a pixel
     visible = slow_visible(elevation - TERRAIN.horizon_rad(at[None], azimuth), sigma)
     light = step * visible + rng.standard_normal(4000)
     pixels = Evidence(
@@ -272,7 +272,7 @@ def test_a_boulder_costs_no_more_than_its_sectors() -> None:
     hidden = replace(evidence, llr=llr)
     fix = ExactPosterior()(hidden, TERRAIN)
     assert np.linalg.norm(fix.position_enu_m[:2] - at) < fix.radius999_m
-    # What the dark sectors can say against the place is bounded: 14 sectors of 1.5 degrees at ln(1e-4) each.
+    # The evidence of the dark sectors is bounded: 14 sectors of 1.5 degrees at ln(1e-4) each.
     sectors = Sectors.from_evidence(hidden, float(np.radians(1.5)), 1e-4)
     clear = Sectors.from_evidence(evidence, float(np.radians(1.5)), 1e-4)
     loss = slow_scores(at[None], evidence, TERRAIN, clear)[0] - slow_scores(at[None], hidden, TERRAIN, sectors)[0]
@@ -280,7 +280,7 @@ def test_a_boulder_costs_no_more_than_its_sectors() -> None:
 
 
 def whole_sky(seed: int, n: int = 1500) -> Evidence:
-    """Stars with SNR 0.5 to 6 measured from a random place."""
+    """Stars with SNR 0.5 to 6 measured from a random position."""
     rng = np.random.default_rng(seed)
     azimuth, elevation = 2 * np.pi * rng.random(n), np.arcsin(2 * rng.random(n) - 1)
     at = 9000 * np.sqrt(rng.random()) * np.array([1.0, 0.0])

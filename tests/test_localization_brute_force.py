@@ -54,7 +54,7 @@ def log_likelihood(places: np.ndarray, evidence: Evidence, capped: bool) -> np.n
 
 
 def simulate_rays(at_m: np.ndarray, n: int, sigma_rad: float, rng: np.random.Generator) -> Evidence:
-    """Rays of signal-to-noise ratio 1 to 4, measured from the place."""
+    """Rays of signal-to-noise ratio 1 to 4, measured from a position."""
     azimuth, elevation = 2 * np.pi * rng.random(n), np.radians(rng.uniform(5, 75, n))
     snr = rng.uniform(1, 4, n)
     edge = elevation + sigma_rad * rng.normal(size=n)
@@ -84,7 +84,7 @@ def test_any_small_problem_agrees_with_the_grid(
         fix = method(evidence, PIT)
     except NotLocated:
         away = np.linalg.norm(places - weight @ places, axis=1)
-        assert weight[away < 45].sum() < 0.95  # nothing worth having
+        assert weight[away < 45].sum() < 0.95  # a posterior too wide for a fix
         return
     assert fix.dropped_mass < 1e-3
     close = np.linalg.norm(places - fix.position_enu_m[:2], axis=1)
@@ -105,7 +105,7 @@ def test_any_small_problem_agrees_with_the_grid(
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_stated_bound_on_what_was_dropped_holds(seed: int) -> None:
-    """With boxes given up ever more rashly, the probability really lost stays below what is admitted."""
+    """For every pruning threshold the lost probability is below the stated bound."""
     rng = np.random.default_rng(seed)
     evidence = simulate_rays(rng.uniform(-50, 50, 2), 120, 0.0, rng)
     places = grid()
@@ -133,7 +133,7 @@ def test_a_few_rays_are_refused(n: int) -> None:
 
 
 def thesis_list(rng: np.random.Generator) -> tuple[Evidence, np.ndarray]:
-    """2142 stars, uniform over the sky, and which of them a place uniform on the floor sees."""
+    """2142 stars, uniform over the sky, and which of them are visible from a position uniform on the floor."""
     azimuth, elevation = 2 * np.pi * rng.random(2142), np.arcsin(rng.random(2142))
     r, turn = THESIS.radius_m * np.sqrt(rng.random()), 2 * np.pi * rng.random()
     at = r * np.array([np.sin(turn), np.cos(turn)])

@@ -1,4 +1,4 @@
-"""Places on real ground: interpolated horizons, the posterior against a plain grid, wrong clocks."""
+"""Positions on real ground: interpolated horizons, the posterior against a plain grid, wrong clocks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From weighted boxes to a fix: circles that hold what they say, modes that are modes."""
+"""From weighted boxes to a fix: probabilities of the circles, and modes."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_most_of_the_posterior_outside_the_search_area_is_refused() -> None:
     with pytest.raises(NotLocated, match="3000 m") as caught:
         summarize(centres, WIDTH_M, log, 0.0, replace(TERRAIN, search_radius_m=3000.0))
     assert caught.value.reason == "outside_search_area"
-    # A place just inside keeps only what is inside.
+    # Near the border only the probability inside the search area counts.
     centres, log = blob((2990.0, 0.0), (20.0, 20.0), 1.0)
     fix = summarize(centres, WIDTH_M, log, 0.0, replace(TERRAIN, search_radius_m=3000.0))
     assert fix.position_enu_m[0] < 2985.0

@@ -1,4 +1,4 @@
-"""Orientation and motion of Moon and Earth, against an independent program, Skyfield, astropy and the plain laws."""
+"""Orientation and motion of Moon and Earth, against an independent program, Skyfield, astropy and physical laws."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_stars_on_earth_agree_with_astropy(site: Site, time: datetime) -> None:
         away_from_sun = angle_between_rad(rays, get_sun(when).cartesian.xyz.value) > np.radians(30)
     theirs = rays_from_azel(seen.az.rad, seen.alt.rad)
     assert away_from_sun.sum() > 25
-    # Light bends by up to 15 mas at 30 degrees from the Sun, which we leave out.
+    # The Sun bends light by up to 15 mas at 30 degrees; this is neglected.
     assert angle_between_rad(ours, theirs)[away_from_sun].max() < 0.03 * ARCSEC_RAD
 
 

@@ -1,4 +1,4 @@
-"""The annotated picture: marks stand where geometry from elsewhere says, and every kind of result can be drawn."""
+"""The annotated picture: marks at independently computed positions, and drawings of every kind of result."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from startrack.types import Mode
 
 
 def has_colour_near(picture, place, colour, reach=2, tolerance=60):
-    """Whether a pixel within `reach` of the place has the colour, or nearly."""
+    """Whether a pixel within `reach` of the position has nearly the colour."""
     x, y = np.rint(place).astype(int)
     patch = picture[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1].astype(int)
     return bool((np.abs(patch - colour).sum(axis=-1) < tolerance).any())

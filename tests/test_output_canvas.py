@@ -1,4 +1,4 @@
-"""What pictures are made of: places to a fraction of a pixel, labels that keep apart, maps with north up."""
+"""Elements of pictures: positions to a fraction of a pixel, labels without overlap, maps with north up."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page: whole in itself, true to the results, safe with any text, and the same bytes for the same results."""
+"""The page: self-contained, in agreement with the results, safe with any text, and reproducible to the byte."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page in a real browser: hover, zoom, fingers, keys, sorting and filtering, and no word on the console."""
+"""The page in a real browser: hover, zoom, touch, keys, sorting and filtering, and an empty console."""
 
 from __future__ import annotations
 
@@ -270,7 +270,7 @@ def test_an_image_without_details_leads_to_its_result_of_either_kind(window, fol
 
 
 def linked_files(w: Window, image: str) -> list[Path]:
-    """The files that the page of an image leads to."""
+    """The files that the page of an image links to."""
     w.open(image)
     addresses = w.page.evaluate("[...document.querySelectorAll('.files a')].map(a => a.href)")
     return [Path(unquote(urlsplit(address).path)) for address in addresses]

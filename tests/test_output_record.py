@@ -118,7 +118,7 @@ def test_star_counts(fix, located):
     assert stars["identified"] == len(result.identification) > 500
     assert 0 < stars["rms_px"] < 0.5
     assert 0 <= stars["false_alarm_probability"] < 1e-9
-    # The renderer knows which stars the wall hides; the place found may turn a few of them.
+    # The truth states which stars the wall hides; the position found may change a few of them.
     visible = set(located.truth.sources.catalog_id[~located.truth.hidden].tolist())
     measured = result.stars.catalog_id[result.light.star[result.light.usable]].tolist()
     assert stars["predicted_visible"] == pytest.approx(sum(star in visible for star in measured), abs=8)
@@ -200,7 +200,7 @@ def test_sigma_states_whether_it_includes_the_lens(located, fix):
     attitude = result_dict(result)["attitude"]
     assert attitude["lens_error_included"] is True
     assert "taken as exact" not in verbose_text(result)
-    # A centre 0.3 px aside is the camera turned by that about y, as far as 90 degrees off the axis let it be told.
+    # A shift of the centre by 0.3 px resembles a rotation about y; only stars far off the axis distinguish the two.
     px_arcsec = 1 / camera.focal_px[0] / ARCSEC
     assert attitude["sigma_arcsec"][1] > 0.15 * px_arcsec > 2 * fix["attitude"]["sigma_arcsec"][1]
 

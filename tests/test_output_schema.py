@@ -1,4 +1,4 @@
-"""The JSON schemas: real files fit them, spoiled ones do not, and they name every key."""
+"""The JSON schemas: valid files fit them, changed ones do not, and they contain every key."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The star table: astropy reads back what was measured, and the renderer's truth agrees with its verdicts."""
+"""The star table: astropy reads back the measured values, and its status agrees with the renderer's truth."""
 
 from __future__ import annotations
 

@@ -78,4 +78,4 @@ def test_verbose_gives_more_lines(located):
 
 def test_probabilities_too_small_for_a_float():
     assert chance_text(2.17e-12) == "2e-12"
-    assert chance_text(1e-300) == chance_text(0.0) == "below 1e-100"  # how tiny, no model knows
+    assert chance_text(1e-300) == chance_text(0.0) == "below 1e-100"  # smaller values are beyond the model

@@ -1,4 +1,4 @@
-"""The whole chain on one rendered exposure, and on what may go wrong with it."""
+"""The whole chain on one rendered exposure, and on disturbed versions of it."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_rotating_the_camera_rotates_the_attitude_and_keeps_the_position(located
     turned = locate_again(located, catalog, np.rot90(located.result.exposure.pixels_adu))
     assert covers_truth(turned, located)
     assert np.linalg.norm(miss(turned, located) - miss(located.result, located)) < 3.0
-    # The picture counter-clockwise by 90 degrees: what was on the right, cam x, is now at the top, -cam y.
+    # The picture rotated counter-clockwise by 90 degrees: the right side, cam x, is now at the top, -cam y.
     quarter = Rotation.from_euler("z", -90, degrees=True).as_matrix()
     off = quarter @ located.result.attitude.R_cam_icrs @ turned.attitude.R_cam_icrs.T
     assert Rotation.from_matrix(off).magnitude() < 5 * ARCSEC

@@ -1,4 +1,4 @@
-"""README.md and docs/: what they show is run, and what they name is there."""
+"""README.md and docs/: the commands shown are run, and the names mentioned exist."""
 
 import importlib.util
 import json
@@ -39,7 +39,7 @@ def replace_figures(line):
 
 
 def figures(text):
-    """The numbers of a result's line: east, north, radius [m], 95, heading [deg], stars; not how long it took."""
+    """The numbers of a result's line: east, north, radius [m], 95, heading [deg], stars; without the time taken."""
     return [float(number) for number in re.findall(r"-?\d+(?:\.\d+)?", text)][:-1]
 
 

@@ -1,4 +1,4 @@
-"""What the sky has beyond the catalogue, and how it turns."""
+"""Stars beyond the catalogue, and the rotation of the sky."""
 
 from datetime import UTC, datetime
 
@@ -62,7 +62,7 @@ def test_the_sky_rotates_once_a_sidereal_day_westward():
     site = Site("earth", np.radians(40.0), 0.0)
     turn = sky_rotvec_rad(site, TIME, 600.0)
     assert np.linalg.norm(turn) == pytest.approx(7.292115e-5 * 600, rel=1e-4)
-    # Stars turn about the celestial pole (north, 40 degrees up) against the Earth's spin.
+    # Stars rotate about the celestial pole (north, 40 degrees up) against the Earth's rotation.
     np.testing.assert_allclose(
         turn / np.linalg.norm(turn), [0, -np.cos(np.radians(40)), -np.sin(np.radians(40))], atol=2e-3
     )

@@ -1,4 +1,4 @@
-"""The renderer's PSF against integrals that others work out."""
+"""The renderer's PSF against integrals by photutils and SciPy."""
 
 import numpy as np
 import pytest

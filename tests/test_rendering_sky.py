@@ -96,7 +96,7 @@ def test_a_ragged_skyline_against_brute_force():
     elevation = Ragged().horizon_rad(None, azimuth) + rng.normal(0, 1 / 160, 60)
     rays = np.stack([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], -1)
     pixels = np.rint(FISHEYE.project(rays @ scene.R_cam_enu.T)[0])
-    # Light of each point of a fine grid, spread by the PSF and collected by the square pixel.
+    # Brightness at each point of a fine grid, convolved with the PSF and integrated over the square pixel.
     from scipy.special import ndtr
 
     offset = (np.arange(240) + 0.5) / 240 * 12 - 6
@@ -121,7 +121,7 @@ def test_the_wall_reflects_and_the_frame_is_dark_off_the_image_circle():
     wall = image[rows, 255 - int(160 * np.radians(82))]  # east, 8 degrees up: the rim is far above
     assert wall / sky[rows, 255 - int(160 * np.radians(82))] == pytest.approx(0.1, rel=1e-9)
     assert image[5, 5] == 0
-    # The rim of the circle is as soft as the PSF: half the light at 85 degrees, 237.36 px from the centre.
+    # The edge of the circle is as wide as the PSF: half the brightness at 85 degrees, 237.36 px from the centre.
     assert bilinear(sky, np.array([[255.5 + 160 * np.radians(85), 255.5]]))[0] / sky[255, 255 + 233] == pytest.approx(
         0.5, abs=0.02
     )

@@ -1,4 +1,4 @@
-"""Stars and bodies: where they fall, how bright, and what hides or trails them."""
+"""Stars and bodies: positions, fluxes, visibility and trails."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The thesis's simulator, its methods and ours in it: statistics, figures, and runs that can be stopped."""
+"""The thesis's simulator with its methods and ours: statistics, figures, and resumed runs."""
 
 import io
 import json

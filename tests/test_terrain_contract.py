@@ -23,7 +23,7 @@ INTERPOLATED_RAD = 1e-4  # MAX_BEND_TAN of horizon_interpolator
 
 
 class LevelHorizon(Terrain):
-    """A user's own terrain with the three required methods: the same horizon from everywhere."""
+    """A user's own terrain with the three required methods: the same horizon at every position."""
 
     search_radius_m = 300.0
 
@@ -90,7 +90,7 @@ MAKERS: dict[str, Callable[[], Any]] = {
     "attributes of a cylinder": lambda: AttributeWrapper(cylinder()),
     "attributes of a height map": lambda: AttributeWrapper(height_map()),
     "a user's own": LevelHorizon,
-    "a user's own that tells positions": FacingWall,
+    "a user's own that depends on position": FacingWall,
 }
 every_terrain = pytest.mark.parametrize("name", MAKERS)
 MEMBERS = [name for name in dir(Terrain) if not name.startswith("_")]

@@ -1,4 +1,4 @@
-"""Terrain files with height maps: what is read, what is refused, and the command that makes and shows them."""
+"""Terrain files with height maps: reading, refusals, and the command that makes and shows them."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_shipped_maps_load(name):
     assert terrain.name == name
     ground = terrain.ground_m(np.zeros((1, 2)))[0]
     floors = {"shackleton": -2720, "haworth": -3377, "faustini": -2707, "de-gerlache": -1115, "kepler": -2900}
-    assert ground == pytest.approx(floors[name], abs=250)  # what others give for the craters' floors
+    assert ground == pytest.approx(floors[name], abs=250)  # published heights of the craters' floors
 
 
 def test_every_key_reaches_the_terrain(tmp_path):
@@ -168,7 +168,7 @@ def test_rasterio_reads_projections_that_the_tags_lack(tmp_path):
 
 
 def test_a_cloud_optimised_geotiff_is_read(tmp_path):
-    """Tiled, compressed, with overviews, whole numbers with scale, offset and no-data, as agencies hand them out."""
+    """Tiled, compressed, with overviews, integers with scale, offset and no-data, as published by agencies."""
     rasterio = pytest.importorskip("rasterio")
     from rasterio.enums import Resampling
     from rasterio.shutil import copy
@@ -300,7 +300,7 @@ def test_whole_numbers_without_a_scale_are_not_taken_for_metres(tmp_path, capsys
 
 
 def test_the_error_of_posts_is_estimated_from_the_map(tmp_path, capsys):
-    """Rough ground known everywhere: what import takes for a grid is what lies between its posts, within a third."""
+    """Known rough ground: the estimated error of a grid is that of the interpolation between its posts to a third."""
     rng = np.random.default_rng(3)
     wave = np.hypot(*np.meshgrid(np.fft.fftfreq(1025), np.fft.fftfreq(1025)))
     wave[0, 0] = np.inf
@@ -440,7 +440,7 @@ def damaged_maps(folder: Path) -> list[Path]:
 
 
 def test_damaged_maps_are_refused_and_named_or_read(tmp_path, capfd):
-    """A flipped byte among the heights cannot be noticed; whatever is noticed is bad_terrain in one line."""
+    """A flipped byte among the heights cannot be noticed; other damage is bad_terrain in one line."""
     path, refusals = terrain_file(tmp_path, dem={"scale": 0.02}), []
     for damaged in damaged_maps(tmp_path):
         path.write_text(tomli_w.dumps({**HILL, "dem": {"file": damaged.name, "scale": 0.02}}))

@@ -92,7 +92,7 @@ def test_the_table_changes_no_horizon(shackleton):
 
 
 def test_far_crests_are_found_with_the_table_too():
-    """From Haworth's wall the horizon in the south stands 50 to 60 km off."""
+    """From Haworth's wall the horizon in the south is 50 to 60 km away."""
     terrain = load_terrain("haworth")
     latitude, longitude = latlon_from_enu(terrain.site, 7082.0, 12_306.0, 0.0)
     site = Site("moon", float(latitude), float(longitude))
@@ -149,7 +149,7 @@ def test_the_table_is_kept_and_found_again_by_content(shackleton):
 
 
 def test_of_two_that_need_a_table_one_makes_it(shackleton, monkeypatch):
-    """Each stands for a process: locks are of open files, not of processes."""
+    """Each thread represents a process: locks belong to open files, not to processes."""
     made, build = [], HeightMap._build_table
 
     def slow(terrain, progress):
@@ -180,7 +180,7 @@ def test_each_variant_of_a_terrain_keeps_its_own_table(shackleton):
 
 
 def evidence_at(terrain, place, rng, error_rad=0.0, rays=4000) -> Evidence:
-    """Rays near the skyline of a place, each sure of itself but for one in a hundred."""
+    """Rays near the skyline of a position, with large ratios, of which one in a hundred is wrong."""
     azimuth = rng.uniform(0, 2 * np.pi, rays)
     horizon = terrain.horizon_rad(np.asarray(place)[None], azimuth) + error_rad
     elevation = horizon + rng.uniform(-0.1, 0.1, rays)
@@ -311,7 +311,7 @@ def test_ground_is_the_maps_height_on_the_sphere():
     ground = terrain.ground_m(np.array([[0.0, 0.0], [3000.0, 4000.0]]))
     assert ground[0] == pytest.approx(-1000.0, abs=1e-6)
     assert ground[1] == pytest.approx(np.sqrt(1_736_400.0**2 - 5000.0**2) - 1_737_400.0, abs=1e-3)
-    there = replace(terrain, camera_height_m=300.0)  # nothing is made up beyond the map's end, 20 km off
+    there = replace(terrain, camera_height_m=300.0)  # no ground beyond the map's end, 20 km off
     assert there.horizon_rad(np.zeros(2), np.array([np.pi / 4]))[0] == pytest.approx(-0.0205, abs=0.001)
     # On a smooth sphere the horizon dips by sqrt(2 h / R); here seen to where the map ends or beyond
     dip = terrain.horizon_rad(np.zeros(2), np.array([1.0]))[0]

@@ -1,4 +1,4 @@
-"""What a height map says about its own error: as it is, interpolated, and without heights."""
+"""Error estimates of height maps: measured, interpolated, and without heights."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def estimate_errors() -> Array:
 
 
 def interpolate_ground(ground: Array, every: int, order: int) -> Array:
-    """Every so many posts, and between them the spline of that order again."""
+    """The ground sampled at every n-th post and interpolated by a spline of the given order."""
     posts = ground[::every, ::every]
     at = [np.arange((n - 1) * every + 1) / every for n in posts.shape]
     return np.asarray(map_coordinates(posts, np.meshgrid(*at, indexing="ij"), order=order, mode="nearest"))

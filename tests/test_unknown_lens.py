@@ -63,7 +63,7 @@ def picture(
 ) -> tuple[Detections, np.ndarray, np.ndarray]:  # fmt: skip
     """Detections at a random attitude, the true star of each (-1: none), and that attitude.
 
-    One side of the sky is hidden, false stars are strewn over it, and `hot` pixels are brighter than any star.
+    One side of the sky is hidden, random false stars are added, and `hot` pixels are brighter than any star.
     """
     rng = np.random.default_rng([seed, 7])
     R = Rotation.random(random_state=rng).as_matrix()
@@ -140,7 +140,7 @@ def test_the_lens_is_found_with_the_stars(case: str, wrong_by: float) -> None:
     assert names.false_alarm_probability < 1e-9
     assert found.camera.mirrored == camera.mirrored
     assert found.camera.lens.model == ("pinhole" if fov <= 40 else "kannala_brandt")
-    # The map, not its parameters: where the lens is said to be known, its pixels are those of the true one.
+    # The projection, not its parameters: inside the calibrated angle the pixels are those of the true lens.
     angle = np.linspace(0, min(found.camera.calibrated_angle_rad, camera.max_angle_rad) * 0.95, 50)
     radii = [c.focal_px[0] * c.lens.rho(angle) for c in (found.camera, camera)]
     assert np.abs(radii[0] - radii[1]).max() < 2.0

@@ -1,4 +1,4 @@
-"""Narrow fields of unknown width: the votes of triangles, lenses that bend, and what must not be answered."""
+"""Narrow fields of unknown width: the votes of triangles, distorted lenses, and refusals."""
 
 from __future__ import annotations
 

@@ -95,10 +95,14 @@ def joint_log_p_value(joint: JointFit) -> float:
     found = sum(map(len, joint.matches))
     wrong = [
         sum(
-            len(match_frame(frame, camera, R_from_rotvec(np.array([0.0, 0.3 * turn, turn])) @ R, within, joint.gate_px))
+            len(
+                match_frame(
+                    frame, camera, R_from_rotvec(np.array([0.0, 0.3 * angle, angle])) @ R, within, joint.gate_px
+                )
+            )
             for frame, R in zip(joint.frames, joint.fit.R_cam_icrs, strict=True)
         )
-        for turn in WRONG_ROTATIONS_RAD
+        for angle in WRONG_ROTATIONS_RAD
     ]
     return log_p_value_poisson(found, max(float(np.mean(wrong)), MIN_BY_CHANCE))
 

@@ -68,9 +68,9 @@ def _pairs(joint: JointFit) -> tuple[list[tuple[Exposure, Exposure]], bool]:
     still: list[tuple[Exposure, Exposure]] = []
     moving: list[tuple[Exposure, Exposure]] = []
     for i, (a, b) in enumerate(pairwise(frames)):
-        turn = R[i + 1] @ R[i].T
-        angle = float(np.linalg.norm(turn - turn.T) / np.sqrt(8.0))
-        near = angle * max(joint.fit.camera.focal_px) < STILL_PX and np.trace(turn) > 0
+        rotation = R[i + 1] @ R[i].T
+        angle = float(np.linalg.norm(rotation - rotation.T) / np.sqrt(8.0))
+        near = angle * max(joint.fit.camera.focal_px) < STILL_PX and np.trace(rotation) > 0
         (still if near else moving).append((a.exposure, b.exposure))
     return (still, True) if still else (moving, False)
 
@@ -129,8 +129,8 @@ def _find_hot_pixels(joint: JointFit) -> Array | None:
         standing = np.asarray((excess - beside) / noise, dtype=np.float64)
         for px in frame.sources.xy_px[joint.matches[i].detection]:
             x, y = np.rint(px).astype(int)
-            reach = STAR_RADIUS_PX
-            standing[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1] = 0.0
+            radius = STAR_RADIUS_PX
+            standing[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1] = 0.0
         least = standing if least is None else np.minimum(least, standing)
     assert least is not None
     y, x = np.nonzero(least > HOT_SIGMA)

@@ -241,8 +241,8 @@ def _remove_paths(facts: dict[str, Any]) -> dict[str, str]:
 
 def _address(text: str) -> str:
     """Address of a Dask scheduler, as an argparse type."""
-    scheme, _, place = text.rpartition("://")
-    host, _, port = place.rpartition(":")
+    scheme, _, address = text.rpartition("://")
+    host, _, port = address.rpartition(":")
     if scheme not in SCHEMES or not host or not port.isdecimal() or not 0 < int(port) < 2**16:
         raise argparse.ArgumentTypeError(f"{text!r} is not the address of a Dask scheduler such as tcp://host:8786")
     return text

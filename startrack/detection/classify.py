@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.detection.deblend import Fitted, own_light
+from startrack.detection.deblend import Fitted, own_signal
 from startrack.detection.fit import PointFits, Stamps
 from startrack.detection.frame import Frame, Pixels, SourceNoise
 from startrack.detection.psf_width import BRIGHT_SNR, MIN_BRIGHT
@@ -133,11 +133,11 @@ def _psf_and_edge_misfit(s: Stamps, fits: PointFits, width_px: Array, own: Sourc
     The misfit is the root of the squared residual beyond the noise over the squared signal: 0 for a perfect star, about
     0.6 for a single bright pixel.
     """
-    light = own_light(s.centres, fits, width_px, s.data.shape[1] // 2)
-    noise = s.variance + np.float32(own.per_unit) * light
-    excess = np.square(s.data - light - fits.level[:, None, None].astype(np.float32)) - noise
-    weights = 1.0 / (noise + np.square(np.float32(own.model_error) * light))
-    squared = np.square(light)
+    signal = own_signal(s.centres, fits, width_px, s.data.shape[1] // 2)
+    noise = s.variance + np.float32(own.per_unit) * signal
+    excess = np.square(s.data - signal - fits.level[:, None, None].astype(np.float32)) - noise
+    weights = 1.0 / (noise + np.square(np.float32(own.model_error) * signal))
+    squared = np.square(signal)
     if s.usable is not None:
         excess, weights, squared = excess * s.usable, weights * s.usable, squared * s.usable
     total = squared.sum(axis=(1, 2), dtype=np.float64)
@@ -159,8 +159,8 @@ def edge_chi2(data: Pixels, weights: Pixels) -> Array:
     w = weights.reshape(n, -1).astype(np.float32)
     flat = data.reshape(n, -1).astype(np.float32)
     moment = w * flat
-    total, light = w @ stripes, moment @ stripes
-    explained = np.add.reduceat(light * light / np.maximum(total, 1e-30), starts, axis=1) - counts
+    total, signal = w @ stripes, moment @ stripes
+    explained = np.add.reduceat(signal * signal / np.maximum(total, 1e-30), starts, axis=1) - counts
     return np.asarray(np.sum(moment * flat, axis=1) - explained.max(axis=1), dtype=np.float64)
 
 

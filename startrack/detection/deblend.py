@@ -36,10 +36,10 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
     stamps = Stamps(data, variance, usable, centres, peaks.surround)
     last = np.zeros_like(data)  # neighbours' signal subtracted in the last fit
     if known is not None and frame.found is not None:
-        last = frame.light(centres, radius)
-        last[: len(known.flux)] -= own_light(centres[: len(known.flux)], known, sigma, radius)
+        last = frame.found_signal(centres, radius)
+        last[: len(known.flux)] -= own_signal(centres[: len(known.flux)], known, sigma, radius)
         last[np.square(last).max(axis=(1, 2)) <= NEIGHBOUR_SIGMA**2 * variance[:, radius, radius]] = 0.0
-    fits = _first_fits(frame, peaks, _subtract_light(stamps, last), sigma, 0 if known is None else len(known.flux))
+    fits = _first_fits(frame, peaks, _subtract_neighbours(stamps, last), sigma, 0 if known is None else len(known.flux))
     star, other = _find_pairs(centres, 1.5 * radius + 3.0 * sigma)
     alone = np.ones(len(centres), dtype=bool)
     alone[star[_are_relevant(stamps, fits, star, other, sigma)]] = False
@@ -47,17 +47,17 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
     bright = _find_reweighted(fits, sigma, variance, frame.source_noise, source_noise)
     if len(bright):
         start = fits.xy_px[bright]
-        part = _subtract_light(stamps.take(bright), last[bright])
+        part = _subtract_neighbours(stamps.take(bright), last[bright])
         again = fit_points(part, start, sigma, source_noise, peaks.own_part, ROUNDS_AGAIN)
         fits = fits.with_rows(bright, again)
     for _ in range(CROWDED_ROUNDS):
-        crowded, light = _sum_neighbour_light(stamps, fits, star, other, sigma)
-        changed = (np.square(light - last[crowded]) > NEIGHBOUR_SIGMA**2 * variance[crowded]).any(axis=(1, 2))
-        crowded, light = crowded[changed], light[changed]
+        crowded, signal = _sum_neighbour_signal(stamps, fits, star, other, sigma)
+        changed = (np.square(signal - last[crowded]) > NEIGHBOUR_SIGMA**2 * variance[crowded]).any(axis=(1, 2))
+        crowded, signal = crowded[changed], signal[changed]
         if not len(crowded):
             break
-        last[crowded] = light
-        cleaned = _subtract_light(stamps.take(crowded), light)
+        last[crowded] = signal
+        cleaned = _subtract_neighbours(stamps.take(crowded), signal)
         again = fit_points(cleaned, fits.xy_px[crowded], sigma, source_noise, peaks.own_part, ROUNDS_AGAIN)
         fits = fits.with_rows(crowded, again)
     return Fitted(stamps, fits, source_noise)
@@ -73,16 +73,16 @@ def _first_fits(frame: Frame, peaks: Peaks, stamps: Stamps, sigma: float, known:
     return concatenate_fits(fits)
 
 
-def _subtract_light(stamps: Stamps, light: Pixels) -> Stamps:
+def _subtract_neighbours(stamps: Stamps, signal: Pixels) -> Stamps:
     """The stamps with the neighbours' signal subtracted; its error is added to the variance."""
-    return replace(stamps, data=stamps.data - light, variance=stamps.variance + np.square(NEIGHBOUR_ERROR * light))
+    return replace(stamps, data=stamps.data - signal, variance=stamps.variance + np.square(NEIGHBOUR_ERROR * signal))
 
 
 def _find_reweighted(fits: PointFits, sigma: float, variance: Pixels, was: SourceNoise, now: SourceNoise) -> Ints:
     """Candidates whose middle pixel's variance changes by more than a tenth with the measured source noise."""
-    light = np.maximum(fits.flux, 0.0) / (2.0 * np.pi * sigma**2 + 1.0)
+    signal = np.maximum(fits.flux, 0.0) / (2.0 * np.pi * sigma**2 + 1.0)
     dark = variance[:, variance.shape[1] // 2, variance.shape[2] // 2]
-    before, after = (dark + light * (n.per_unit + n.model_error**2 * light) for n in (was, now))
+    before, after = (dark + signal * (n.per_unit + n.model_error**2 * signal) for n in (was, now))
     return np.flatnonzero(np.abs(after - before) > 0.1 * before)
 
 
@@ -96,13 +96,13 @@ def _find_pairs(centres: Ints, reach_px: float) -> tuple[Ints, Ints]:
     return both[:, 0], both[:, 1]
 
 
-def _sum_neighbour_light(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> tuple[Ints, Pixels]:
+def _sum_neighbour_signal(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> tuple[Ints, Pixels]:
     """The candidates (k,) whose stamps contain relevant signal of neighbours, and that signal (k, s, s)."""
     side = s.data.shape[1]
     radius = side // 2
     counts = _are_relevant(s, fits, star, other, sigma)
     star, other = star[counts], other[counts]
-    crowded, light = [np.zeros(0, dtype=np.int64)], [np.zeros((0, side, side), dtype=np.float32)]
+    crowded, signal = [np.zeros(0, dtype=np.int64)], [np.zeros((0, side, side), dtype=np.float32)]
     firsts = np.flatnonzero(np.diff(star, prepend=-1))
     pairs_at_a_time = max(1, BATCH_PIXELS // (side * side))
     while len(firsts):
@@ -119,9 +119,9 @@ def _sum_neighbour_light(s: Stamps, fits: PointFits, star: Ints, other: Ints, si
         who = star[firsts[:end]]
         matters = (np.square(sums) > NEIGHBOUR_SIGMA**2 * s.variance[who]).any(axis=(1, 2))
         crowded.append(who[matters])
-        light.append(sums[matters])
+        signal.append(sums[matters])
         firsts = firsts[end:]
-    return np.concatenate(crowded), np.concatenate(light)
+    return np.concatenate(crowded), np.concatenate(signal)
 
 
 def _are_relevant(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> Array:
@@ -134,7 +134,7 @@ def _are_relevant(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: fl
     return np.asarray(fits.flux[other] * top * wing > 0.3 * NEIGHBOUR_SIGMA * noise)
 
 
-def own_light(centres: Ints, fits: PointFits, sigma: float | Array, radius: int) -> Pixels:
+def own_signal(centres: Ints, fits: PointFits, sigma: float | Array, radius: int) -> Pixels:
     """Signal (n, s, s) of each source in its own stamp."""
     offset = fits.xy_px - centres
     px, _ = pixel_profile_single(offset[:, 0], sigma, radius)
@@ -153,6 +153,8 @@ def paint_sources(fits: PointFits, sigma: float, shape: tuple[int, int]) -> Pixe
     for at in range(0, len(centres), size):
         here = np.arange(at, min(at + size, len(centres)))
         corners = centres[here] + side - radius
-        for (column, row), light in zip(corners, own_light(centres[here], fits.take(here), sigma, radius), strict=True):
-            image[row : row + side, column : column + side] += light
+        for (column, row), signal in zip(
+            corners, own_signal(centres[here], fits.take(here), sigma, radius), strict=True
+        ):
+            image[row : row + side, column : column + side] += signal
     return image[side:-side, side:-side]

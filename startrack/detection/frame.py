@@ -50,15 +50,15 @@ class Frame:
         residual = self.image[rows] - self.background[rows]
         if self.found is None:
             return np.asarray(cv2.divide(residual, self.noise[rows], dst=residual))
-        light, found = self.source_noise, self.found[rows]
-        variance = np.square(self.noise[rows]) + found * (light.per_unit + RESIDUAL_FRACTION**2 * found)
+        own, found = self.source_noise, self.found[rows]
+        variance = np.square(self.noise[rows]) + found * (own.per_unit + RESIDUAL_FRACTION**2 * found)
         return np.asarray((residual - found) / np.sqrt(variance))
 
     def data(self, centres: Ints, radius: int) -> Image:
         """Stamps (n, s, s) without their background."""
         return stamps(self.image, centres, radius) - stamps(self.background, centres, radius)
 
-    def light(self, centres: Ints, radius: int) -> Image:
+    def found_signal(self, centres: Ints, radius: int) -> Image:
         """Stamps (n, s, s) of the signal of the known stars; `found` must not be None."""
         assert self.found is not None
         return stamps(self.found, centres, radius)

@@ -69,7 +69,7 @@ def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array
     """
     radius, m = data.shape[1] // 2, len(widths_px)
     moment = weights * data
-    total, light = weights.sum(axis=(1, 2)).astype(np.float64), moment.sum(axis=(1, 2)).astype(np.float64)
+    total, signal = weights.sum(axis=(1, 2)).astype(np.float64), moment.sum(axis=(1, 2)).astype(np.float64)
     profiles = []
     for axis in range(2):
         profile, _ = pixel_profile_single(np.repeat(offset_px[:, axis], m), np.tile(widths_px, len(data)), radius)
@@ -77,7 +77,7 @@ def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array
     px, py = profiles
     ss, s1, sd = _sums(weights, py * py, px * px), _sums(weights, py, px), _sums(moment, py, px)
     # Reduction of chi^2 by a star of each width on a constant background.
-    part, excess = ss - s1 * s1 / total[:, None], sd - s1 * (light / total)[:, None]
+    part, excess = ss - s1 * s1 / total[:, None], sd - s1 * (signal / total)[:, None]
     explained = np.square(excess) / np.maximum(part, 1e-30)
     best = np.argmax(explained, axis=1)
     inside = (best > 0) & (best < len(widths_px) - 1)
@@ -87,7 +87,7 @@ def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array
     bend = 2 * middle - left - right
     shift = np.divide(0.5 * (right - left), bend, out=np.zeros_like(bend), where=bend > 0)
     log_width = np.log(widths_px)
-    variance = np.einsum("nij,nij->n", moment, data, dtype=np.float64) - light * light / total
+    variance = np.einsum("nij,nij->n", moment, data, dtype=np.float64) - signal * signal / total
     beyond_noise = np.maximum(variance - data[0].size, 1e-30)
     widths = np.exp(log_width[best] + np.clip(shift, -1, 1) * (log_width[1] - log_width[0]))
     return widths, inside, middle / np.maximum(beyond_noise, 0.5 * middle)
@@ -135,9 +135,9 @@ def _width_by_fall(frame: Frame, pixels: Ints) -> float | None:
     For a Gaussian of variance s^2 the product of the values left and right of a pixel is the square of the pixel's
     value times exp(-1 / s^2), independent of the centre.
     """
-    light = np.maximum(frame.data(pixels, 1), 0.0)
-    peak = np.maximum(light[:, 1, 1], 1e-9)
-    beside = np.stack([light[:, 1, 0], light[:, 1, 2], light[:, 0, 1], light[:, 2, 1]], axis=1) / peak[:, None]
+    signal = np.maximum(frame.data(pixels, 1), 0.0)
+    peak = np.maximum(signal[:, 1, 1], 1e-9)
+    beside = np.stack([signal[:, 1, 0], signal[:, 1, 2], signal[:, 0, 1], signal[:, 2, 1]], axis=1) / peak[:, None]
     falls = -0.5 * float(np.median(np.log(np.maximum(beside, MIN_BESIDE)).sum(axis=1)))
     if not MIN_FALL < falls < MAX_FALL:
         return None

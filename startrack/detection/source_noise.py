@@ -29,14 +29,14 @@ def measure_source_noise(s: Stamps, fits: PointFits, alone: Bools, sigma: float,
     bright = _select_bright(s, fits, alone)
     if len(bright) < MIN_STARS:
         return expected
-    light, excess, alike = _excess_variance(s.take(bright), fits.take(bright), sigma)
+    signal, excess, alike = _excess_variance(s.take(bright), fits.take(bright), sigma)
     if expected.per_unit == 0.0 and alike > MAX_ALIKE:
         return expected
-    if len(light) < BINS * MIN_IN_BIN:
+    if len(signal) < BINS * MIN_IN_BIN:
         return expected
-    order = np.argsort(light, kind="stable")
+    order = np.argsort(signal, kind="stable")
     bins = [part for part in np.array_split(order, BINS) if len(part) >= MIN_IN_BIN]
-    rows = [(np.median(light[part]), *_typical_excess(excess[:, part])) for part in bins]
+    rows = [(np.median(signal[part]), *_typical_excess(excess[:, part])) for part in bins]
     level, beyond, error = np.array(rows).T
     return _fit_noise_terms(level, beyond, error, expected)
 
@@ -73,21 +73,21 @@ def _excess_variance(s: Stamps, fits: PointFits, sigma: float) -> tuple[Array, A
     py, dy = pixel_profile(offset[:, 1], sigma, radius)
     flux = np.maximum(fits.flux, 0.0)[:, None, None]
     shape = py[:, :, None] * px[:, None, :]
-    light = flux * shape
+    signal = flux * shape
     gradient = [flux * py[:, :, None] * dx[:, None, :], flux * dy[:, :, None] * px[:, None, :], shape, 1.0 + 0 * shape]
     g = np.stack([q.reshape(n, -1) for q in gradient], axis=1)
-    residual = (s.data - light - fits.level[:, None, None]).reshape(n, -1)
+    residual = (s.data - signal - fits.level[:, None, None]).reshape(n, -1)
     squared = np.square(residual)
     variance = s.variance.reshape(n, -1).astype(np.float64)
-    seen = np.maximum(squared, variance + np.square(MODEL_ERROR * light.reshape(n, -1)))
+    seen = np.maximum(squared, variance + np.square(MODEL_ERROR * signal.reshape(n, -1)))
     leverage = np.sum(g * np.matmul(fits.covariance, g), axis=1) / seen
-    use = (light.reshape(n, -1) > FAINT_FRACTION * variance) & (leverage < MAX_LEVERAGE)
+    use = (signal.reshape(n, -1) > FAINT_FRACTION * variance) & (leverage < MAX_LEVERAGE)
     relative = residual / flux[:, :, 0]
     relative /= np.maximum(
         np.sqrt(np.mean(np.square(relative), axis=1, keepdims=True)), 1e-30
     )  # equal weight for each star
     alike = float(np.sum(np.square(relative.sum(axis=0))) / np.sum(np.square(relative)))
-    return light.reshape(n, -1)[use], np.stack([(squared / (1.0 - leverage))[use], variance[use]]), alike
+    return signal.reshape(n, -1)[use], np.stack([(squared / (1.0 - leverage))[use], variance[use]]), alike
 
 
 def _typical_excess(squared_and_variance: Array) -> tuple[float, float]:

@@ -26,7 +26,7 @@ STREAKED_FRACTION = 0.6  # of the bright blobs
 class Streaks:
     """Streaks (n), brightest first."""
 
-    xy_px: Array  # (n, 2) middle of the light
+    xy_px: Array  # (n, 2) middle of the signal
     covariance_px2: Array  # (n, 2, 2)
     flux: Array
     flux_sigma: Array
@@ -41,12 +41,12 @@ def are_elongated(frame: Frame, centres: Ints) -> bool:
     centres = centres[margin >= ELONGATION_RADIUS_PX][:ELONGATION_PEAKS]
     if len(centres) < MIN_STARS:
         return False
-    light, noise = frame.data(centres, ELONGATION_RADIUS_PX), np.sqrt(frame.variance(centres, ELONGATION_RADIUS_PX))
-    light = np.where(light > ELONGATION_SIGMAS * noise, light, 0.0)
+    signal, noise = frame.data(centres, ELONGATION_RADIUS_PX), np.sqrt(frame.variance(centres, ELONGATION_RADIUS_PX))
+    signal = np.where(signal > ELONGATION_SIGMAS * noise, signal, 0.0)
     offset = np.arange(-ELONGATION_RADIUS_PX, ELONGATION_RADIUS_PX + 1)
     x, y = np.meshgrid(offset, offset)
-    total = np.maximum(light.sum(axis=(1, 2)), 1e-9)
-    xx, xy, yy = (np.sum(light * q, axis=(1, 2)) / total for q in (x * x, x * y, y * y))
+    total = np.maximum(signal.sum(axis=(1, 2)), 1e-9)
+    xx, xy, yy = (np.sum(signal * q, axis=(1, 2)) / total for q in (x * x, x * y, y * y))
     trace, spread = xx + yy, np.hypot(xx - yy, 2.0 * xy)
     long = (trace + spread) > ELONGATION_RATIO * (trace - spread + 0.2)
     return bool(np.mean(long & (trace + spread > 2.0 * ELONGATION_PX2)) > 0.5)
@@ -73,10 +73,10 @@ def find_streaks(frame: Frame) -> Streaks | None:
     off_border &= (left + stats[:, cv2.CC_STAT_WIDTH] < width - 1) & (top + stats[:, cv2.CC_STAT_HEIGHT] < height - 1)
     rows, columns = np.nonzero(cv2.dilate(mask, np.ones((3, 3), np.uint8)))
     label = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8))[rows, columns].astype(np.int64)
-    light = (frame.image[rows, columns] - frame.background[rows, columns]).astype(np.float64)
+    signal = (frame.image[rows, columns] - frame.background[rows, columns]).astype(np.float64)
     variance = np.square(frame.noise[rows, columns].astype(np.float64))
-    variance += frame.source_noise.per_unit * np.maximum(light, 0.0)
-    blobs = _moments(label, np.stack([columns, rows], axis=1).astype(np.float64), light, variance, count)
+    variance += frame.source_noise.per_unit * np.maximum(signal, 0.0)
+    blobs = _moments(label, np.stack([columns, rows], axis=1).astype(np.float64), signal, variance, count)
     flux, flux_sigma, xy, spread, covariance = blobs
     bright = (area >= MIN_AREA_PX) & (area <= MAX_AREA_PX) & off_border & (flux > BRIGHT_SNR * flux_sigma)
     bright[0] = False
@@ -105,21 +105,21 @@ def find_streaks(frame: Frame) -> Streaks | None:
     )  # fmt: skip
 
 
-def _moments(label: Ints, xy: Array, light: Array, variance: Array, count: int) -> tuple[Array, ...]:
+def _moments(label: Ints, xy: Array, signal: Array, variance: Array, count: int) -> tuple[Array, ...]:
     """Flux (count,), its sigma, middle (count, 2), second moments (count, 2, 2), covariance of the middle."""
 
-    def total_light(values: Array) -> Array:
+    def sum_by_label(values: Array) -> Array:
         return np.bincount(label, values, count).astype(np.float64)
 
-    flux = np.maximum(total_light(light), 1e-9)
-    middle = np.stack([total_light(light * xy[:, 0]), total_light(light * xy[:, 1])], axis=1) / flux[:, None]
+    flux = np.maximum(sum_by_label(signal), 1e-9)
+    middle = np.stack([sum_by_label(signal * xy[:, 0]), sum_by_label(signal * xy[:, 1])], axis=1) / flux[:, None]
     off = xy - middle[label]
     spread, covariance = np.empty((count, 2, 2)), np.empty((count, 2, 2))
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        spread[:, i, j] = total_light(light * off[:, i] * off[:, j]) / flux
-        covariance[:, i, j] = total_light(variance * off[:, i] * off[:, j]) / flux**2
+        spread[:, i, j] = sum_by_label(signal * off[:, i] * off[:, j]) / flux
+        covariance[:, i, j] = sum_by_label(variance * off[:, i] * off[:, j]) / flux**2
     covariance += 1e-4 * np.eye(2)  # 0.01 px for the edges of the mask
-    return flux, np.sqrt(np.maximum(total_light(variance), 1e-12)), middle, spread, covariance
+    return flux, np.sqrt(np.maximum(sum_by_label(variance), 1e-12)), middle, spread, covariance
 
 
 def _resemble_neighbours(xy: Array, along: Array, length: Array) -> Bools:

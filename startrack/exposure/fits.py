@@ -139,8 +139,8 @@ def _check_complete(units: Any, raw: bytes) -> None:
     """Check that the file holds every unit with its padding, and nothing else: astropy only warns."""
     end = 0
     for index in range(len(units)):
-        place = units.fileinfo(index)
-        end = max(end, place["datLoc"] + place["datSpan"])
+        span = units.fileinfo(index)
+        end = max(end, span["datLoc"] + span["datSpan"])
     if end > len(raw):
         raise bad_image("truncated FITS: the file ends before its data do")
     if raw[end:].strip(b"\0 "):

@@ -137,12 +137,12 @@ class AttitudeSearch:
         depth = int(DEPTH_FACTOR * 4 * np.pi / self.patterns.field_sr * len(some))
         for R in self._supported_attitudes(cam, icrs, some[max(first - WINDOW, 0) : first + PRETESTED], radius, depth):
             near = self.patterns.neighbours(some @ R, self.neighbour_radius_rad, depth)
-            on = near.chord < radius
-            hits = min(int(np.count_nonzero(on)), len(some))
+            hit = near.chord < radius
+            hits = min(int(np.count_nonzero(hit)), len(some))
             if hits < MIN_HITS:
                 continue
             if self._false_alarms(hits - PATTERN_MATCHES, len(some), near.depth, radius) < PLAUSIBLE:
-                yield AttitudeHypothesis(R, near.ray[on], near.star[on], near if len(some) == len(rays_cam) else None)
+                yield AttitudeHypothesis(R, near.ray[hit], near.star[hit], near if len(some) == len(rays_cam) else None)
 
     def _supported_attitudes(self, cam: Array, icrs: Array, some: Array, radius: float, depth: int) -> Iterator[Array]:
         """R_cam_icrs of the closest match, which is nearly always right, then of matches that detections support."""

@@ -144,14 +144,16 @@ def build_index(stars: Stars, field_sr: float, size: PatternSize) -> PatternInde
     )
     rays = stars.rays_icrs[star]
     neighbours = np.sqrt(6 * size.triangles / (CLOSURE_PROBABILITY * len(star)))
-    reach = min(
+    longest_side = min(
         size.widest_rad,
         2 * np.arcsin(np.sqrt(min(neighbours / len(star), 1.0))),
         LONGEST_SIDE_OF_FIELD * np.sqrt(4 * field_sr / np.pi),
     )
-    found = triangles(rays, reach)
+    found = triangles(rays, longest_side)
     sides = 2 * np.sin(found.sides_rad / 2)
-    return PatternIndex(star, rays, float(2 * np.sin(reach / 2)), found.vertices, found.handedness, cKDTree(sides))
+    return PatternIndex(
+        star, rays, float(2 * np.sin(longest_side / 2)), found.vertices, found.handedness, cKDTree(sides)
+    )
 
 
 def separate_bright_stars(stars: Stars, depth: int) -> Ints:

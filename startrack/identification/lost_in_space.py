@@ -176,10 +176,10 @@ def _check_camera(inlier: Bools) -> None:
 
     Such a camera file fits only a part of the field and biases the attitude: by 0.8 degrees for 1 % of focal length.
     """
-    on, near = int(np.count_nonzero(inlier)), len(inlier)
-    if on < INLIER_FRACTION * near - 3.0 * np.sqrt(INLIER_FRACTION * (1 - INLIER_FRACTION) * near):
+    inliers, near = int(np.count_nonzero(inlier)), len(inlier)
+    if inliers < INLIER_FRACTION * near - 3.0 * np.sqrt(INLIER_FRACTION * (1 - INLIER_FRACTION) * near):
         raise _WrongCamera(
-            f"only {on} of {near} bright stars lie within {INLIER_PX:g} px of where the camera file puts "
+            f"only {inliers} of {near} bright stars lie within {INLIER_PX:g} px of where the camera file puts "
             f"them, the others up to {GATE_PX:g} px off: it is not the calibration of this lens",
-            matched=on,
+            matched=inliers,
         )

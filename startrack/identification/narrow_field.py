@@ -191,11 +191,11 @@ def verify_view(
     pairs = _candidate_pairs(view, centroids, stars, tree)
     if pairs is None:
         return None
-    on = _select_unambiguous(pairs, _pairs_within_gate(pairs), centroids)
-    if len(on) < FEWEST:
+    chosen = _select_unambiguous(pairs, _pairs_within_gate(pairs), centroids)
+    if len(chosen) < FEWEST:
         return None
-    xy_px, rays = centroids.xy_px[pairs.detection[on]], stars.rays_icrs[pairs.star[on]]
-    view = view.fit(xy_px, rays, GATE_PX / 4, distorted=len(on) >= MIN_FOR_DISTORTION)
+    xy_px, rays = centroids.xy_px[pairs.detection[chosen]], stars.rays_icrs[pairs.star[chosen]]
+    view = view.fit(xy_px, rays, GATE_PX / 4, distorted=len(chosen) >= MIN_FOR_DISTORTION)
     view = _choose_lens(view, xy_px, rays, GATE_PX / 4)
     pairs = _candidate_pairs(view, centroids, stars, tree)
     if pairs is None:
@@ -205,19 +205,19 @@ def verify_view(
     trusted_px = trusted_radius(off_axis_px[pairs.detection[near]], pairs.distance_px[near] < GATE_PX)
     if trusted_px is None:
         return None
-    on = _pairs_within_gate(pairs)
-    on = on[off_axis_px[pairs.detection[on]] <= trusted_px]
-    if len(on) < FEWEST:
+    chosen = _pairs_within_gate(pairs)
+    chosen = chosen[off_axis_px[pairs.detection[chosen]] <= trusted_px]
+    if len(chosen) < FEWEST:
         return None
-    log_p = _log_p_value(view, pairs, on, centroids, stars, trusted_px) + log_trials(tried)
-    on = _select_unambiguous(pairs, on, centroids)
+    log_p = _log_p_value(view, pairs, chosen, centroids, stars, trusted_px) + log_trials(tried)
+    chosen = _select_unambiguous(pairs, chosen, centroids)
     camera = view.camera()
     trusted_rad = float(camera.angle_rad(view.centre_px + np.array([trusted_px, 0.0])))
     lens = VerifiedLens(
         camera=replace(camera, calibrated_angle_rad=min(trusted_rad, camera.max_angle_rad)),
         R_cam_icrs=view.R_cam_icrs,
-        detection=pairs.detection[on],
-        star=pairs.star[on],
+        detection=pairs.detection[chosen],
+        star=pairs.star[chosen],
         log_p=log_p,
         unexplained=pairs.count_unexplained(centroids.snr, GATE_PX),
     )
@@ -266,13 +266,13 @@ def _candidate_pairs(view: PinholeView, centroids: Centroids, stars: NearStars, 
 
 
 def _log_p_value(
-    view: PinholeView, pairs: CandidatePairs, on: Ints, centroids: Centroids, stars: NearStars, trusted_px: float
+    view: PinholeView, pairs: CandidatePairs, chosen: Ints, centroids: Centroids, stars: NearStars, trusted_px: float
 ) -> float:
-    """Log p-value of the pairs `on` of the brightest detections, up to `trusted_px` from the centre."""
+    """Log p-value of the pairs `chosen` of the brightest detections, up to `trusted_px` from the centre."""
     xy_px = centroids.xy_px[:TESTED]
-    rms_px = float(np.sqrt(np.mean(np.square(pairs.distance_px[on]))))
+    rms_px = float(np.sqrt(np.mean(np.square(pairs.distance_px[chosen]))))
     radius_px = float(np.clip(RADIUS_SIGMAS * rms_px, SMALLEST_RADIUS_PX, GATE_PX))
-    hits = int(np.count_nonzero((pairs.detection[on] < len(xy_px)) & (pairs.distance_px[on] < radius_px)))
+    hits = int(np.count_nonzero((pairs.detection[chosen] < len(xy_px)) & (pairs.distance_px[chosen] < radius_px)))
     measured = pairs.scale.measured_mag[: len(xy_px)]
     px, inside = view.project(stars.rays_icrs)
     inside &= np.linalg.norm(px - view.centre_px, axis=1) <= trusted_px

@@ -82,11 +82,11 @@ def _body_points(body: Body, focal_px: float) -> tuple[Array, Array]:
     count = max(1, int(np.ceil(np.pi * (radius * focal_px / DISK_STEP_PX) ** 2)))
     k = np.arange(count)
     distance = radius * np.sqrt((k + 0.5) / count) if count > 1 else np.zeros(1)
-    turn = k * np.pi * (3 - np.sqrt(5))
+    angle = k * np.pi * (3 - np.sqrt(5))
     centre = body.ray_icrs / np.linalg.norm(body.ray_icrs)
     across = np.cross(centre, np.eye(3)[np.argmin(np.abs(centre))])
     across /= np.linalg.norm(across)
-    offsets = np.cos(turn)[:, None] * across + np.sin(turn)[:, None] * np.cross(centre, across)
+    offsets = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(centre, across)
     rays = np.cos(distance)[:, None] * centre + np.sin(distance)[:, None] * offsets
     return rays, np.full(count, body.v_mag + 2.5 * np.log10(count))
 

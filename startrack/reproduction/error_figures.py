@@ -38,7 +38,7 @@ def fig3_4(context: Context) -> Artefact:
         line=f"skyline estimate {hull.errors.mean():.0f} m (thesis 637)",
         text=f"{caption}\n\n{_ring_table({'skyline estimate': hull})}",
         columns=_ring_columns({"hull": hull}),
-        pictures={"fig3.4": partial(error_map, hull.places_m[0], hull.errors, "Skyline estimate", caption)},
+        pictures={"fig3.4": partial(error_map, hull.positions_m[0], hull.errors, "Skyline estimate", caption)},
         values={"thesis": vars(published.HULL), "reproduced": statistics(hull.errors)},
         timing_ms={"hull_and_descent": hull.ms_per_fix},
     )
@@ -72,8 +72,8 @@ def fig3_10(context: Context) -> Artefact:
         text=f"{caption} {settling}\n\n{of_ours}\n\n{_ring_table(rings)}",
         columns=_ring_columns({"hull": hull, "descent": descent, "ours": ours}),
         pictures={
-            "fig3.10": partial(error_map, descent.places_m[0], descent.errors, "Pseudo-gradient", caption),
-            "fig3.10.ours": partial(error_map, ours.places_m[0], ours.errors, "Ours", of_ours),
+            "fig3.10": partial(error_map, descent.positions_m[0], descent.errors, "Pseudo-gradient", caption),
+            "fig3.10.ours": partial(error_map, ours.positions_m[0], ours.errors, "Ours", of_ours),
         },
         values={
             "thesis": {**vars(published.OVERALL), "never_settle": published.NEVER_SETTLE},
@@ -98,7 +98,7 @@ def fig_b(context: Context) -> Artefact:
             f"thesis {trial.mean_m} / {trial.sd_m} / {trial.max_m} m."
         )
         pictures[f"figB.{k + 1}"] = partial(
-            error_map, descent.places_m[k], descent.errors_m[k], f"Starfield {k + 1}", captions[-1]
+            error_map, descent.positions_m[k], descent.errors_m[k], f"Starfield {k + 1}", captions[-1]
         )
     return Artefact(
         name="figB",
@@ -116,7 +116,7 @@ def fig_b(context: Context) -> Artefact:
 
 def _ring_means(method: MethodErrors) -> list[float | None]:
     """Mean error [m] by distance from the centre; None where there is no position."""
-    distance = np.concatenate([np.hypot(*positions.T) for positions in method.places_m]) / 1e3
+    distance = np.concatenate([np.hypot(*positions.T) for positions in method.positions_m]) / 1e3
     rings = [(distance >= a) & (distance < b) for a, b in pairwise(RINGS_KM)]
     return [float(method.errors[ring].mean()) if ring.any() else None for ring in rings]
 

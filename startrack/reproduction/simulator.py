@@ -17,7 +17,7 @@ from startrack.types import Array, Bools, Evidence
 DIAMETER_M, DEPTH_M = 20_000.0, 2_000.0  # Shackleton as the thesis has it (section 3.3)
 MAGNITUDE = 6.0
 ASPECT_RATIO = DIAMETER_M / DEPTH_M
-STARS, PLACES, MISTAKES = 1, 2, 3  # streams of random numbers
+STARS, POSITIONS, MISTAKES = 1, 2, 3  # streams of random numbers
 EDGE_POINTS = 360  # of the drawn crater edge (section 3.2.1)
 STEP_M = 5.0  # of the traverse through the middle of the crater (section 3.2.2)
 SHACKLETON = Site(body="moon", latitude_rad=float(np.radians(-89.66)), longitude_rad=float(np.radians(129.78)))
@@ -71,21 +71,23 @@ def directions(azimuth_rad: Array) -> Array:
 
 def draw_positions(seed: int, sky: int, start: int, stop: int, radius_m: float = DIAMETER_M / 2) -> Array:
     """Positions number start to stop - 1 (n, 2) [m] of a sky, uniform over the crater's floor."""
-    r1, r2 = _draw_uniform([seed, PLACES, sky], (stop, 2))[start:].T
+    r1, r2 = _draw_uniform([seed, POSITIONS, sky], (stop, 2))[start:].T
     return radius_m * np.sqrt(r1)[:, None] * directions(2 * np.pi * r2)
 
 
-def visible_stars(points_m: Array, place_m: Array, radius_m: float) -> Bools:
+def visible_stars(points_m: Array, position_m: Array, radius_m: float) -> Bools:
     """Which stars (n,), given on the rim's plane, are in sight from a position (2,).
 
     The thesis tests against a polygon of 360 points of the rim; it differs from the circle by 0.4 m at most.
     """
-    return np.asarray(np.square(points_m[:, 0] + place_m[0]) + np.square(points_m[:, 1] + place_m[1]) < radius_m**2)
+    return np.asarray(
+        np.square(points_m[:, 0] + position_m[0]) + np.square(points_m[:, 1] + position_m[1]) < radius_m**2
+    )
 
 
-def crater_edge(cylinder: Cylinder, place_m: Array) -> tuple[Array, Array]:
+def crater_edge(cylinder: Cylinder, position_m: Array) -> tuple[Array, Array]:
     """Azimuths and elevations (361,) [rad] of the rim from a position, at even steps along the rim, closed."""
-    rim = cylinder.radius_m * directions(np.linspace(0.0, 2 * np.pi, EDGE_POINTS + 1)) - place_m
+    rim = cylinder.radius_m * directions(np.linspace(0.0, 2 * np.pi, EDGE_POINTS + 1)) - position_m
     return np.arctan2(rim[:, 0], rim[:, 1]), np.arctan2(cylinder.wall_m, np.hypot(rim[:, 0], rim[:, 1]))
 
 

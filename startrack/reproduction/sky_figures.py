@@ -50,11 +50,11 @@ def fig3_5(context: Context) -> Artefact:
     views = [visible_stars(points, position, radius) for position in (ESTIMATE_M, EXAMPLE_M)]
     centres = np.stack([points[view].mean(axis=0) for view in views])
     step, wanted = centres[0] - centres[1], EXAMPLE_M - ESTIMATE_M
-    turn = np.degrees(np.arctan2(wanted[0] * step[1] - wanted[1] * step[0], wanted @ step))
+    angle = np.degrees(np.arctan2(wanted[0] * step[1] - wanted[1] * step[0], wanted @ step))
     caption = (
         "Figure 3.5: Example showing pseudo-gradient computation, on the plane of the rim. The red dots indicate the "
         f"centers of mass of the two views. The vector created from those points forms the pseudo-gradient: "
-        f"{np.hypot(*step) / 1e3:.2f} km where {np.hypot(*wanted) / 1e3:.2f} km are wanted, {abs(turn):.1f} degrees "
+        f"{np.hypot(*step) / 1e3:.2f} km where {np.hypot(*wanted) / 1e3:.2f} km are wanted, {abs(angle):.1f} degrees "
         "off."
     )
     return _picture(

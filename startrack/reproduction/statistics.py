@@ -19,7 +19,7 @@ ANSWERED = {"kua": "settled", "ours": "located", "bound": None}
 class MethodErrors:
     """Errors of one estimate."""
 
-    places_m: tuple[Array, ...]  # by sky: (n, 2) [m], where there is an estimate
+    positions_m: tuple[Array, ...]  # by sky: (n, 2) [m], where there is an estimate
     errors_m: tuple[Array, ...]  # by sky: (n,) [m]
     answered: tuple[Bools, ...]  # by sky: settled (kua) or located (ours), for every position
     ms_per_fix: float

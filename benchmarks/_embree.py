@@ -21,13 +21,13 @@ NEAR_M, NEAR_SIDE_M, FAR_SIDE_M = 900.0, 7.5, 48.0  # sides of the triangles
 class EmbreeHorizons:
     """Elevations of the horizon seen from a position on the ground."""
 
-    def __init__(self, terrain: HeightMap, place_m: np.ndarray) -> None:
-        up = float(terrain.ground_m(place_m)) + terrain.camera_height_m
-        self.eye = np.array([*place_m, up])
+    def __init__(self, terrain: HeightMap, position_m: np.ndarray) -> None:
+        up = float(terrain.ground_m(position_m)) + terrain.camera_height_m
+        self.eye = np.array([*position_m, up])
         finest = terrain.maps[0]
         rows, columns = (n - 1 for n in finest.heights_m.shape)
         cells = np.stack(np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"), axis=-1).reshape(-1, 2)
-        away = np.hypot(*(vertices(terrain, cells + 0.5)[:, :2] - place_m).T)
+        away = np.hypot(*(vertices(terrain, cells + 0.5)[:, :2] - position_m).T)
         self.scene = EmbreeScene(robust=True)
         near = away < NEAR_M
         self.meshes = [

@@ -76,7 +76,7 @@ CASES = (
 def main() -> None:
     """Run, print and write the section."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--trials", type=int, default=200, help="per case; the lenses take turns")
+    parser.add_argument("--trials", type=int, default=200, help="per case; the lenses alternate")
     parser.add_argument("--seed", type=int, default=2026)
     args = parser.parse_args()
     rows = []
@@ -156,11 +156,11 @@ def project(rho: Law, centre_px: np.ndarray, rays_cam: np.ndarray) -> np.ndarray
 def map_error(camera: Camera, rho: Law, centre_px: np.ndarray) -> tuple[float, float, int]:
     """RMS error [px] with the best rotation removed, its NEES, and the NEES's degrees of freedom."""
     grid = cap_grid(camera.calibrated_angle_rad, MAP_POINTS)
-    turn = camera.jacobian_px_per_rad(grid).reshape(-1, 3)
+    rotation = camera.jacobian_px_per_rad(grid).reshape(-1, 3)
     error = (camera.project_unlimited(grid) - project(rho, centre_px, grid)).reshape(-1)
-    error = error - turn @ np.linalg.lstsq(turn, error, rcond=None)[0]
+    error = error - rotation @ np.linalg.lstsq(rotation, error, rcond=None)[0]
     order = camera.covariance_order
-    lens = lens_jacobian(camera, grid, order).reshape(-1, len(order)) + turn @ compensating_rotation(camera, order)
+    lens = lens_jacobian(camera, grid, order).reshape(-1, len(order)) + rotation @ compensating_rotation(camera, order)
     covariance = camera.covariance
     if camera.focal_px[0] == camera.focal_px[1]:  # square pixels: fx and fy are one unknown
         lens = np.concatenate([lens[:, :1] + lens[:, 1:2], lens[:, 2:]], axis=1)

@@ -35,7 +35,7 @@ from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
 
 FLOOR_DEG, WALL_DEG = (0.0, 15.0), (15.0, 40.0)
-ROUGH_PLACES = 5  # each on floor and wall
+ROUGH_POSITIONS = 5  # each on floor and wall
 HIGHEST_SUN = {True: np.sin(np.radians(0.5)), False: np.sin(np.radians(-3.0))}  # in polar craters, elsewhere
 POLAR_RAD = np.radians(60)
 
@@ -55,11 +55,11 @@ def main() -> None:
         assert isinstance(terrain, HeightMap)
         terrain.prepare()
         rng = np.random.default_rng(args.seed)
-        floor, wall = (ROUGH_PLACES, ROUGH_PLACES) if rough else (args.floor, args.wall)
-        places = [*draw_positions(terrain, floor, FLOOR_DEG, rng), *draw_positions(terrain, wall, WALL_DEG, rng)]
-        for number, (place, slope) in enumerate(places):
+        floor, wall = (ROUGH_POSITIONS, ROUGH_POSITIONS) if rough else (args.floor, args.wall)
+        positions = [*draw_positions(terrain, floor, FLOOR_DEG, rng), *draw_positions(terrain, wall, WALL_DEG, rng)]
+        for number, (position, slope) in enumerate(positions):
             when = draw_night(terrain.site, rng)
-            lines.append([name, *measure_position(terrain, place, slope, when, number, args.seed)])
+            lines.append([name, *measure_position(terrain, position, slope, when, number, args.seed)])
             print(" | ".join(lines[-1]), flush=True)
     head = ["crater", "place, m", "slope, degrees", "horizon, degrees", "result", "error, m", "95 % circle, m",
             "99.9 %, m", "NEES", "s, position", "CPU s, all"]  # fmt: skip
@@ -73,11 +73,11 @@ def draw_positions(
     """Positions (2,) in the search area with slopes in a range, and the slopes in degrees."""
     found: list[tuple[np.ndarray, float]] = []
     while len(found) < count:
-        turn, far = rng.uniform(0, 2 * np.pi), terrain.search_radius_m * np.sqrt(rng.random())
-        place = far * np.array([np.sin(turn), np.cos(turn)])
-        slope = float(np.degrees(terrain.slope_rad(place)))
+        azimuth, distance = rng.uniform(0, 2 * np.pi), terrain.search_radius_m * np.sqrt(rng.random())
+        position = distance * np.array([np.sin(azimuth), np.cos(azimuth)])
+        slope = float(np.degrees(terrain.slope_rad(position)))
         if slopes_deg[0] <= slope < slopes_deg[1]:
-            found.append((place, slope))
+            found.append((position, slope))
     return found
 
 
@@ -91,26 +91,26 @@ def draw_night(site: Site, rng: np.random.Generator) -> datetime:
 
 
 def measure_position(
-    terrain: HeightMap, place: np.ndarray, slope: float, when: datetime, number: int, seed: int
+    terrain: HeightMap, position: np.ndarray, slope: float, when: datetime, number: int, seed: int
 ) -> list[str]:
     """Render and locate one exposure; a row of the table."""
     camera, catalog = load_camera("fisheye-2048"), load_catalog()
     series = Series(
         camera=camera, terrain=terrain, catalog=catalog.brighter_than(10.0), seed=seed, time_utc=when,
-        east_m=float(place[0]), north_m=float(place[1]),
+        east_m=float(position[0]), north_m=float(position[1]),
     )  # fmt: skip
     scene, rng = series.scene(number, f"frame-{number:03d}")
     exposure, _ = render(scene, rng=rng)
     start = time.process_time()
     result = locate(exposure, camera, terrain, catalog)
     spent = time.process_time() - start
-    horizon = np.degrees(terrain.horizon_rad(place[None], np.radians(np.arange(360.0))))
-    where = [f"E {place[0]:.0f} N {place[1]:.0f}", f"{slope:.0f}", f"{horizon.min():.1f} to {horizon.max():.1f}"]
+    horizon = np.degrees(terrain.horizon_rad(position[None], np.radians(np.arange(360.0))))
+    where = [f"E {position[0]:.0f} N {position[1]:.0f}", f"{slope:.0f}", f"{horizon.min():.1f} to {horizon.max():.1f}"]
     times = [f"{result.timing_ms.get('locate', 0.0) / 1e3:.1f}", f"{spent:.1f}"]
     if not isinstance(result, Located) or result.status != "ok":
         return [*where, result.reason or result.status, *["-"] * 4, *times]
     fix: Any = result.fix
-    off = fix.position_enu_m[:2] - place
+    off = fix.position_enu_m[:2] - position
     nees = float(off @ np.linalg.solve(fix.covariance_m2, off))
     numbers = (float(np.hypot(*off)), fix.radius95_m, fix.radius999_m)
     return [*where, result.status, *[f"{value:.1f}" for value in numbers], f"{nees:.2f}", *times]

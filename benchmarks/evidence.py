@@ -105,20 +105,20 @@ def measure_frame(job: tuple[int, Depth, int]) -> dict[str, dict[str, Any]]:
     )  # fmt: skip
     scene, rng = series.scene(number)
     exposure, truth = render(scene, rng=rng)
-    place = truth.position_enu_m[:2]
+    position = truth.position_enu_m[:2]
     fast = Settings(localizer=ExactPosterior())
     result = locate(exposure, camera, terrain, catalog, fast)
-    rows = {"full": _score_fix(_fix(result), place)}
+    rows = {"full": _score_fix(_fix(result), position)}
     value = last_value(result)
     if number < depth.compared and isinstance(value, Measured):
         plain = locate(exposure, camera, terrain, catalog, replace(fast, deep_stars=False))
-        rows["Hipparcos alone"] = _score_fix(_fix(plain), place)
+        rows["Hipparcos alone"] = _score_fix(_fix(plain), position)
         for name, evidence, localizer in _ablations(value):
             try:
                 fix = localizer(evidence, terrain)
             except NoSolution:
                 fix = None
-            rows[name] = _score_fix(fix, place)
+            rows[name] = _score_fix(fix, position)
     return rows
 
 
@@ -126,10 +126,10 @@ def _fix(outcome: Any) -> Fix | None:
     return outcome.fix if isinstance(outcome, Located) and not outcome.fix.ambiguous else None
 
 
-def _score_fix(fix: Fix | None, place_m: Array) -> dict[str, Any]:
+def _score_fix(fix: Fix | None, position_m: Array) -> dict[str, Any]:
     if fix is None:
         return {}
-    d = fix.position_enu_m[:2] - place_m
+    d = fix.position_enu_m[:2] - position_m
     error = float(np.hypot(*d))
     return {"error_m": error, "nees": float(d @ np.linalg.solve(fix.covariance_m2, d)), "in95": error < fix.radius95_m}
 
@@ -146,17 +146,18 @@ def _ablations(result: Measured) -> Iterator[tuple[str, Evidence, ExactPosterior
     yield "without caps", plain.evidence(), replace(full, sector_epsilon=0.0)
 
 
-def _list_evidence(light: StarPhotometry, threshold: float) -> Evidence:
+def _list_evidence(photometry: StarPhotometry, threshold: float) -> Evidence:
     """Evidence of a list: whether each star expected above the threshold was detected, and nothing else."""
     from scipy.stats import norm
 
-    use = light.usable & (light.expected_e > threshold * light.sigma_e)
-    expected, seen = light.expected_e[use] / light.sigma_e[use], light.flux_e[use] > threshold * light.sigma_e[use]
+    use = photometry.usable & (photometry.expected_e > threshold * photometry.sigma_e)
+    expected = photometry.expected_e[use] / photometry.sigma_e[use]
+    seen = photometry.flux_e[use] > threshold * photometry.sigma_e[use]
     present = norm.logsf(threshold - expected) - norm.logsf(threshold)
     absent = norm.logcdf(threshold - expected) - norm.logcdf(threshold)
     return Evidence(
-        azimuth_rad=light.azimuth_rad[use],
-        elevation_rad=light.elevation_rad[use],
+        azimuth_rad=photometry.azimuth_rad[use],
+        elevation_rad=photometry.elevation_rad[use],
         llr=np.clip(np.where(seen, present, absent), -CERTAIN, CERTAIN),
         edge_sigma_rad=np.zeros(int(use.sum())),
     )

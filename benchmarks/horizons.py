@@ -39,9 +39,9 @@ def main() -> None:
     for name, half_m in CROPS_M.items():
         terrain = crop_terrain(name, half_m)
         rng = np.random.default_rng(args.seed)
-        turn, far = rng.uniform(0, 2 * np.pi, args.places), 0.67 * np.sqrt(rng.random(args.places))
-        places = terrain.search_radius_m * far[:, None] * np.column_stack([np.sin(turn), np.cos(turn)])
-        lines += compare_methods(name, terrain, places)
+        azimuth, distance = rng.uniform(0, 2 * np.pi, args.places), 0.67 * np.sqrt(rng.random(args.places))
+        positions = terrain.search_radius_m * distance[:, None] * np.column_stack([np.sin(azimuth), np.cos(azimuth)])
+        lines += compare_methods(name, terrain, positions)
         print("\n".join(" ".join(line) for line in lines[-4:]), flush=True)
     body = table(
         ["map", "method", "horizons", "RMS from Embree, degrees", "mean", "largest", "CPU microseconds a horizon"],
@@ -60,7 +60,7 @@ def crop_terrain(name: str, half_m: float) -> HeightMap:
     return replace(whole, maps=(crop,))
 
 
-def compare_methods(name: str, terrain: HeightMap, places: np.ndarray) -> list[list[str]]:
+def compare_methods(name: str, terrain: HeightMap, positions: np.ndarray) -> list[list[str]]:
     """One row per method."""
     step_m = terrain.maps[0].post_m / 8
     methods: dict[str, tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], int]] = {
@@ -69,19 +69,19 @@ def compare_methods(name: str, terrain: HeightMap, places: np.ndarray) -> list[l
         f"march in steps of {step_m:.0f} m, numpy": (lambda p, a: march_numpy(terrain, p, a, step_m), NUMPY_EVERY),
     }
     truth, spent, inside = [], 0.0, []
-    for place in places:
-        embree = EmbreeHorizons(terrain, place)
+    for position in positions:
+        embree = EmbreeHorizons(terrain, position)
         start = time.process_time()
         truth.append(embree.horizon_rad(AZIMUTHS_RAD))
         spent += time.process_time() - start
-        _, distance, edge = terrain.horizons(place[None], AZIMUTHS_RAD)
+        _, distance, edge = terrain.horizons(position[None], AZIMUTHS_RAD)
         inside.append(distance < edge - 2 * terrain.maps[0].post_m)  # without the last cell of the crop
-    count = len(places) * len(AZIMUTHS_RAD)
+    count = len(positions) * len(AZIMUTHS_RAD)
     rows = [[name, "Embree", str(count), "-", "-", "-", f"{1e6 * spent / count:.0f}"]]
     for method, (function, every) in methods.items():
-        function(places[0], AZIMUTHS_RAD[:2])  # compiles
+        function(positions[0], AZIMUTHS_RAD[:2])  # compiles
         start = time.process_time()
-        found = [function(place, AZIMUTHS_RAD[::every]) for place in places]
+        found = [function(position, AZIMUTHS_RAD[::every]) for position in positions]
         spent = time.process_time() - start
         off = np.degrees(
             np.concatenate([(f - t[::every])[i[::every]] for f, t, i in zip(found, truth, inside, strict=True)])
@@ -101,22 +101,22 @@ def _march(grid, posts, heights, moon, points, up, azimuths, step_m, end_m, tan)
             tan[k] = max(tan[k], (z - up[k]) / s)
 
 
-def march_numba(terrain: HeightMap, place: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
+def march_numba(terrain: HeightMap, position: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
     """Small steps, compiled; the surface is startrack's own."""
     ground, tan = terrain.ground, np.full(len(azimuths), -50.0)
-    places = np.repeat(place[None], len(azimuths), axis=0)
-    up, end = terrain.ground_m(places) + terrain.camera_height_m, CROPS_M[terrain.name]
-    _march(ground.grid, ground.posts, ground.heights, ground.radius_m, places, up, azimuths, step_m, end, tan)
+    positions = np.repeat(position[None], len(azimuths), axis=0)
+    up, end = terrain.ground_m(positions) + terrain.camera_height_m, CROPS_M[terrain.name]
+    _march(ground.grid, ground.posts, ground.heights, ground.radius_m, positions, up, azimuths, step_m, end, tan)
     return np.arctan(tan)
 
 
-def march_numpy(terrain: HeightMap, place: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
+def march_numpy(terrain: HeightMap, position: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
     """Small steps, a ray at a time, with numpy alone."""
     s, maps = np.arange(step_m, CROPS_M[terrain.name], step_m), list(terrain.maps)
-    up = ground_up_m(terrain.site, maps, place) + terrain.camera_height_m
+    up = ground_up_m(terrain.site, maps, position) + terrain.camera_height_m
     found = np.empty(len(azimuths))
     for k, azimuth in enumerate(azimuths):
-        z = ground_up_m(terrain.site, maps, place + s[:, None] * np.array([np.sin(azimuth), np.cos(azimuth)]))
+        z = ground_up_m(terrain.site, maps, position + s[:, None] * np.array([np.sin(azimuth), np.cos(azimuth)]))
         found[k] = np.arctan(np.nanmax((z - up) / s))
     return found
 

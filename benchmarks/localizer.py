@@ -68,13 +68,13 @@ def thesis_lists(count: int) -> list[Evidence]:
     """Perfect lists of one of the thesis's random skies at random positions."""
     sky, cylinder = Sky.draw(SEED, 0, MAGNITUDE), crater(ASPECT_RATIO)
     points = sky.project_to_rim_plane(cylinder)
-    seen = [visible_stars(points, place, cylinder.radius_m) for place in draw_positions(SEED, 0, 0, count)]
+    seen = [visible_stars(points, position, cylinder.radius_m) for position in draw_positions(SEED, 0, 0, count)]
     return [PERFECT.evidence(sky, PERFECT.draw_list(one, SEED, 0, k)) for k, one in enumerate(seen)]
 
 
-def error_m(fix: Fix, place_m: np.ndarray) -> float:
+def error_m(fix: Fix, position_m: np.ndarray) -> float:
     """Distance of a fix from the truth."""
-    return float(np.linalg.norm(fix.position_enu_m[:2] - place_m))
+    return float(np.linalg.norm(fix.position_enu_m[:2] - position_m))
 
 
 if __name__ == "__main__":

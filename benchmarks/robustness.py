@@ -52,7 +52,7 @@ class Trouble:
 
     name: str
     world: Callable[[Cylinder], Cylinder] = lambda crater: crater
-    told: Callable[[Cylinder], Cylinder] = lambda crater: crater
+    stated: Callable[[Cylinder], Cylinder] = lambda crater: crater
     clock_s: float = 0.0
     tilt_deg: float = 5.0
     swapped: float = 0.0  # fraction of the catalogue's stars with exchanged identities
@@ -66,8 +66,8 @@ class Biased:
     arcsec: float
 
     def __call__(self, *what: Any) -> Any:
-        turn = R_from_rotvec(np.radians(np.full(3, self.arcsec) / 3600))
-        return StarEvidence()(*what[:6], turn @ what[6], *what[7:])  # the seventh is the attitude
+        rotation = R_from_rotvec(np.radians(np.full(3, self.arcsec) / 3600))
+        return StarEvidence()(*what[:6], rotation @ what[6], *what[7:])  # the seventh is the attitude
 
 
 def ridge(width_deg: float, height_deg: float) -> Callable[[Cylinder], Cylinder]:
@@ -81,13 +81,13 @@ TROUBLES = (
     Trouble("none"),
     Trouble("ridge of 5 by 5 degrees", world=ridge(5, 5)),
     Trouble("ridge of 20 by 10 degrees", world=ridge(20, 10)),
-    Trouble("depth 1 % too large", told=lambda c: replace(c, depth_m=1.01 * c.depth_m)),
-    Trouble("depth 1 % too small", told=lambda c: replace(c, depth_m=0.99 * c.depth_m)),
-    Trouble("diameter 1 % too large", told=lambda c: replace(c, diameter_m=1.01 * c.diameter_m)),
-    Trouble("diameter 1 % too small", told=lambda c: replace(c, diameter_m=0.99 * c.diameter_m)),
+    Trouble("depth 1 % too large", stated=lambda c: replace(c, depth_m=1.01 * c.depth_m)),
+    Trouble("depth 1 % too small", stated=lambda c: replace(c, depth_m=0.99 * c.depth_m)),
+    Trouble("diameter 1 % too large", stated=lambda c: replace(c, diameter_m=1.01 * c.diameter_m)),
+    Trouble("diameter 1 % too small", stated=lambda c: replace(c, diameter_m=0.99 * c.diameter_m)),
     Trouble(
         "depth 1 % too large, depth_sigma_m 20",
-        told=lambda c: replace(c, depth_m=1.01 * c.depth_m, depth_sigma_m=0.01 * c.depth_m),
+        stated=lambda c: replace(c, depth_m=1.01 * c.depth_m, depth_sigma_m=0.01 * c.depth_m),
     ),
     Trouble("clock wrong by one hour", clock_s=3600.0),
     Trouble("3 % of identities wrong", swapped=0.03),
@@ -136,7 +136,7 @@ def measure_frame(job: tuple[int, int]) -> dict[str, Any]:
         catalog = replace(catalog, rays_icrs=rays)
     evidence = Biased(trouble.attitude_bias_arcsec) if trouble.attitude_bias_arcsec else StarEvidence()
     settings = Settings(localizer=ExactPosterior(), evidence=evidence)  # type: ignore[arg-type]
-    result = locate(exposure, scene.camera, trouble.told(true), catalog, settings)
+    result = locate(exposure, scene.camera, trouble.stated(true), catalog, settings)
     if not isinstance(result, Located) or result.status != "ok":
         return {"status": result.status, "reason": result.reason}
     error = float(np.linalg.norm((result.fix.position_enu_m - truth.position_enu_m)[:2]))

@@ -37,7 +37,7 @@ FIELDS_DEG = {  # across the width
     "test": 10.9, "hale_bopp": 15.4, "virgo": 20.2,
 }  # fmt: skip
 WIDTHS_DEG = (10.0, 15.0, 20.0, 30.0)  # of the synthetic frames
-OFF = (1.0, 0.92, 1.08)  # field of view given over the true one, by turns
+OFF = (1.0, 0.92, 1.08)  # stated over true field of view, cycled
 SIZE_PX, SIGMA_PX, LIMIT_MAG, FLUX_AT_LIMIT_E = (1024, 768), 1.1, 7.5, 450.0
 RUNS = 5
 WRONG_DEG = 0.2  # boresight

@@ -50,9 +50,9 @@ def main() -> None:
         maps["degraded, and known to be"] = (degrade_map(true, args.seed), BIAS_RAD)
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in maps}
     for number in range(args.frames):
-        evidence, place = load_or_observe(args.keep, true, args.seed, number)
+        evidence, position = load_or_observe(args.keep, true, args.seed, number)
         for name, (terrain, bias) in maps.items():
-            rows[name].append(score_fix(lower_evidence(evidence, -bias), terrain, place))
+            rows[name].append(score_fix(lower_evidence(evidence, -bias), terrain, position))
             print(number, name, rows[name][-1], flush=True)
     body = summary(rows)
     print(body)
@@ -113,7 +113,7 @@ def observe_frame(terrain: HeightMap, seed: int, number: int) -> tuple[Evidence,
     return value.evidence(), np.asarray(truth.position_enu_m)
 
 
-def score_fix(evidence: Evidence, terrain: HeightMap, place: np.ndarray) -> dict[str, Any]:
+def score_fix(evidence: Evidence, terrain: HeightMap, position: np.ndarray) -> dict[str, Any]:
     """Error, stated uncertainty and time of a fix."""
     start, cpu = time.perf_counter(), time.process_time()
     try:
@@ -122,7 +122,7 @@ def score_fix(evidence: Evidence, terrain: HeightMap, place: np.ndarray) -> dict
         took, cpu = time.perf_counter() - start, time.process_time() - cpu
     except NoSolution as cause:
         return {"status": cause.reason}
-    off = fix.position_enu_m[:2] - place[:2]
+    off = fix.position_enu_m[:2] - position[:2]
     return {
         "status": "ambiguous" if fix.ambiguous else "ok", "error_m": round(float(np.hypot(*off)), 2),
         "nees": round(float(off @ np.linalg.solve(fix.covariance_m2, off)), 2),

@@ -106,7 +106,7 @@ def reason_of(code: str) -> Reason:
 
 
 def exit_code_of(reason: str | None) -> int:
-    """Exit code of an image's `reason`; 0 for None, which stands for a solution."""
+    """Exit code of an image's `reason`; 0 for None, which means a solution."""
     return EXIT_OK if reason is None else reason_of(reason).exit_code
 
 

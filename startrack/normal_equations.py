@@ -15,7 +15,7 @@ import numpy as np
 
 from startrack.types import Array, Ints, Value, array
 
-RIDGE_1 = 1e-14  # relative to the diagonal; a parameter that nothing constrains stays solvable
+RIDGE_1 = 1e-14  # relative to the diagonal; the system stays solvable with unconstrained parameters
 TINY = 1e-300
 
 

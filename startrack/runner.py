@@ -45,7 +45,7 @@ class RunStopped(Exception):
 
 @dataclass(frozen=True)
 class Died:
-    """In place of the result of a task that ended or blocked every process which worked on it."""
+    """Result of a task that ended or blocked every process which worked on it."""
 
     cause: str
 
@@ -182,7 +182,7 @@ class Runner(Generic[Task, Result]):
 
 
 class _Pool:
-    """Processes with one thread each, that neither Ctrl-C nor SIGTERM reaches and that end with this process."""
+    """Processes with one thread each that ignore Ctrl-C and SIGTERM and end with this process."""
 
     def __init__(self, jobs: int) -> None:
         for name in THREAD_LIMITS:  # inherited when the processes load NumPy: the other cores do other tasks

@@ -130,7 +130,7 @@ def _image_names(root: Path, excluded: str | None) -> list[str]:
 
 
 def _is_file(folder: Path, name: str) -> bool:
-    """Not a pipe, which would block the reader. A link to nothing is an image that will be refused."""
+    """Whether it is no pipe, which would block the reader. A broken link is an image that will be refused."""
     try:
         return stat.S_ISREG((folder / name).stat().st_mode)
     except OSError:

@@ -51,7 +51,7 @@ WIDEST_GAP_RAD = np.radians(8.0)
 class LensFit:
     """A fitted camera with its attitudes, and the quality of the fit."""
 
-    camera: Camera  # with covariance; calibrated as far as stars reach
+    camera: Camera  # with covariance; calibrated up to the outermost stars
     R_cam_icrs: Array  # (images, 3, 3); of boards R_cam_board
     pose_covariance_rad2: Array  # (images, 3, 3); of boards (images, 6, 6), with the positions [squares]
     residual_px: Array  # (n, 2) measured minus predicted, of all observations

@@ -14,7 +14,7 @@ from startrack.calibration.region_growing import JointFit
 from startrack.camera import Camera
 from startrack.types import Array, Bools, Exposure, Ints
 
-DARK_BEYOND_1 = 1.06  # of the image circle's radius: no light falls beyond
+DARK_BEYOND_1 = 1.06  # of the image circle's radius: the sensor is dark beyond
 MIN_DARK = 4000
 LARGEST_DARK_SPREAD_1 = 0.2  # of the levels of the dark corners, over their difference from the sky
 MIN_SATURATED = 12
@@ -111,7 +111,7 @@ def _saturation_level(frames: tuple[Frame, ...]) -> float | None:
 
 
 def _find_hot_pixels(joint: JointFit) -> Array | None:
-    """Pixels (n, 2) that stand out in all frames although the sky has turned; None where it has not."""
+    """Pixels (n, 2) above the noise in all frames although the sky has rotated; None where it has not."""
     import cv2
 
     first, R = joint.frames[0], joint.fit.R_cam_icrs
@@ -124,7 +124,7 @@ def _find_hot_pixels(joint: JointFit) -> Array | None:
         image = np.asarray(frame.exposure.pixels_adu)
         excess = image - cv2.medianBlur(image, 5)
         noise = 1.4826 * float(np.median(np.abs(excess[::3, ::3]))) or 1.0
-        # The light of a star or planet spreads over neighbouring pixels, that of a hot pixel does not.
+        # A star or planet spreads over neighbouring pixels, a hot pixel does not.
         beside = cv2.filter2D(np.maximum(excess, 0.0), -1, NEIGHBOURS)
         standing = np.asarray((excess - beside) / noise, dtype=np.float64)
         for px in frame.sources.xy_px[joint.matches[i].detection]:

@@ -16,7 +16,7 @@ from startrack.catalog import StarCatalog
 from startrack.frames import Site
 from startrack.types import Array, Exposure, NotIdentified
 
-ALLOWED_PX = 0.3  # RMS change of the map without consequence: a tenth of it reaches the position
+ALLOWED_PX = 0.3  # acceptable RMS change of the projection: a tenth of it propagates to the position
 SIGNIFICANT_SIGMAS = 3.0
 
 

@@ -61,7 +61,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def add_site_flags(parser: argparse.ArgumentParser) -> None:
-    """Flags for the time, the length and the place of exposures of the sky."""
+    """Flags for the time, the duration and the site of exposures of the sky."""
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601 (one image only)")
     parser.add_argument("--exposure", type=positive_number, metavar="S", help="exposure time in seconds")
     parser.add_argument("--site", metavar="LAT,LON[,M]", help="site on the Earth, in degrees and metres, to correct "

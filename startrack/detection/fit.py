@@ -66,9 +66,9 @@ def fit_points(
 ) -> PointFits:
     """Position, flux and local level of one point source in each stamp.
 
-    Only the significance relies on `surround`, which holds `own_part` of the source's own light. Gauss-Newton on the
-    pixel-integrated Gaussian from `start_xy_px` (n, 2); steps are limited to half a pixel, so a hopeless source stays
-    near where it was. Weights: the pixels' variance and the variance of the source's own light.
+    Only the significance relies on `surround`, which contains `own_part` of the source's signal. Gauss-Newton on the
+    pixel-integrated Gaussian from `start_xy_px` (n, 2); steps are limited to half a pixel, so that diverging fits stay
+    near their start. Weights: the pixels' variance and the variance of the source's own signal.
     """
     from startrack.detection.fit_kernel import fit_stamps
 

@@ -26,7 +26,7 @@ STREAKED_FRACTION = 0.6  # of the bright blobs
 class Streaks:
     """Streaks (n), brightest first."""
 
-    xy_px: Array  # (n, 2) middle of the signal
+    xy_px: Array  # (n, 2) centroids
     covariance_px2: Array  # (n, 2, 2)
     flux: Array
     flux_sigma: Array

@@ -68,7 +68,7 @@ ADVICE = "is the field of view right, is this the night sky, and in focus? With 
 class UnknownLensSolution:
     """The lens and the identification that it was found with."""
 
-    camera: Camera  # name "unknown"; calibrated as far out as its stars reach; with the covariance of its fit
+    camera: Camera  # name "unknown"; calibrated up to its outermost stars; with the covariance of its fit
     identification: Identification
 
 

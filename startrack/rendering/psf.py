@@ -1,4 +1,4 @@
-"""Points of light spread over pixels.
+"""Images of point sources.
 
 The estimator's PSF is deliberately not used here: a half-pixel error in it must not cancel against the renderer's.
 """
@@ -53,7 +53,7 @@ def stamp_radius_px(flux_e: Array, sigma_px: float) -> Array:
 
 
 def _profile(centres_px: Array, sigma_px: float, radius: int, size: int) -> tuple[Array, Array]:
-    """Pixel numbers (n, 2 r + 1) and the fractions of light in them; zero, and a legal number, off the frame."""
+    """Pixel numbers (n, 2 r + 1) and the fractions of the flux in them; zero, and a legal number, off the frame."""
     from scipy.special import ndtr
 
     pixels = np.rint(centres_px).astype(np.int64)[:, None] + np.arange(-radius, radius + 1)

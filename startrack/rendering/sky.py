@@ -31,7 +31,7 @@ def sky_e_per_s(camera: Camera, sky_v_mag_arcsec2: float | None, angle_rad: Arra
 
 
 def diffuse_e(scene: Scene) -> Array:
-    """Electrons (H, W) float64 of diffuse light: sky above the skyline, wall below it, nothing off the image circle.
+    """Electrons (H, W) float64 of diffuse light: sky above the skyline, wall below it, zero off the image circle.
 
     sky x (wall + (1 - wall) c), c the fraction of the pixel's PSF that lies above the skyline.
     """
@@ -49,7 +49,7 @@ def diffuse_e(scene: Scene) -> Array:
 def coverage(scene: Scene, xy_px: Ints | Array) -> Array:
     """Fraction (n,) of the PSF about each pixel (n, 2) that lies above the skyline; for pixels near the skyline.
 
-    In the pixel plane, r the direction in which the azimuth stands still and t the one across it:
+    In the pixel plane, r the direction of constant azimuth and t the one across it:
     c = integral over t of N(t; 0, s) Phi((elevation - H(azimuth)) / (s d elevation/dr)), both evaluated at t. A jagged
     skyline is resolved to the width of the PSF; s^2 = psf_sigma^2 + 1/12 includes the pixel's own width.
     """

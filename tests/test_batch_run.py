@@ -103,11 +103,11 @@ def test_a_later_signal_drops_the_images_in_progress_and_writes_the_tables(tmp_p
     """The signal is raised inside the process, so that it arrives between two images."""
     frames(tmp_path / "images", 40)
     monkeypatch.setattr("startrack.cli.batch_show.SAME_SIGNAL_S", -1.0)
-    told = []
+    results = []
 
     def interrupt(*_: object, **__: object) -> None:
-        told.append(1)
-        if len(told) in (3, 4):
+        results.append(1)
+        if len(results) in (3, 4):
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr("builtins.print", interrupt)

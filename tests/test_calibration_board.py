@@ -47,8 +47,8 @@ def pixel_rays(dx, dy):
 
 def board_positions(pose, rays):
     """Intersections (n, 2) of the rays with the board [squares, from the first inner corner], and their depth."""
-    turn, middle = pose
-    R = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()  # board to cam
+    rotation_deg, middle = pose
+    R = Rotation.from_euler("xyz", rotation_deg, degrees=True).as_matrix()  # board to cam
     origin = np.array(middle) - R @ [(COLUMNS - 1) / 2, (ROWS - 1) / 2, 0.0]
     depth = (origin @ R[:, 2]) / (rays @ R[:, 2])
     return ((rays * depth[..., None] - origin) @ R)[..., :2], depth
@@ -60,14 +60,14 @@ def draw_picture(pose, colour):
     total = np.zeros(SIZE_PX[::-1])
     for dx in step:
         for dy in step:
-            place, depth = board_positions(pose, pixel_rays(dx, dy))
-            total += np.where(depth > 0, colour(place), 0.4)
+            position, depth = board_positions(pose, pixel_rays(dx, dy))
+            total += np.where(depth > 0, colour(position), 0.4)
     noise = np.random.default_rng(3).normal(0, 40, total.shape)
     return Exposure(pixels_adu=(8000 * total / SUPERSAMPLED**2 + 500 + noise).astype(np.float32), name="board")
 
 
-def chessboard(place):
-    column, row = np.floor(place[..., 0]) + 1, np.floor(place[..., 1]) + 1
+def chessboard(position):
+    column, row = np.floor(position[..., 0]) + 1, np.floor(position[..., 1]) + 1
     inside = (column >= 0) & (column <= COLUMNS) & (row >= 0) & (row <= ROWS)
     return np.where(inside, (column + row) % 2, 1.0)
 
@@ -78,8 +78,8 @@ def charuco(columns, rows):
     pattern = cv2.aruco.CharucoBoard((columns, rows), 1.0, 0.75, dictionary)
     picture = pattern.generateImage((columns * side, rows * side), marginSize=0).astype(float) / 255.0
 
-    def colour(place):
-        x, y = (np.floor((place[..., k] + 1) * side).astype(int) for k in (0, 1))
+    def colour(position):
+        x, y = (np.floor((position[..., k] + 1) * side).astype(int) for k in (0, 1))
         inside = (x >= 0) & (y >= 0) & (x < columns * side) & (y < rows * side)
         return np.where(inside, picture[np.clip(y, 0, rows * side - 1), np.clip(x, 0, columns * side - 1)], 1.0)
 
@@ -93,8 +93,8 @@ def map_error_px(camera):
     rays = np.stack([np.sqrt(1 - z * z) * np.cos(b), np.sqrt(1 - z * z) * np.sin(b), z], axis=1)
     rays = rays[TRUTH.project(rays)[1]]
     miss = (camera.project(rays)[0] - TRUTH.project(rays)[0]).ravel()
-    turn = TRUTH.jacobian_px_per_rad(rays).reshape(-1, 3)
-    miss -= turn @ np.linalg.lstsq(turn, miss, rcond=None)[0]
+    by_rotation = TRUTH.jacobian_px_per_rad(rays).reshape(-1, 3)
+    miss -= by_rotation @ np.linalg.lstsq(by_rotation, miss, rcond=None)[0]
     return float(np.sqrt(2 * np.mean(miss**2)))
 
 
@@ -106,9 +106,9 @@ def chessboards():
 def test_drawn_corners_are_found_where_they_are(chessboards):
     """The drawing and OpenCV's detector agree; the other tests rely on both."""
     found = find_corners(chessboards[1], Board(COLUMNS, ROWS))
-    place, _ = board_positions(POSES[1], TRUTH.unproject(found.xy_px))
-    assert np.median(np.abs(place - np.rint(place))) < 0.005
-    assert np.abs(place - np.rint(place)).max() < 0.1
+    position, _ = board_positions(POSES[1], TRUTH.unproject(found.xy_px))
+    assert np.median(np.abs(position - np.rint(position))) < 0.005
+    assert np.abs(position - np.rint(position)).max() < 0.1
 
 
 def test_chessboards_give_the_lens(chessboards):
@@ -166,7 +166,9 @@ def test_the_command(chessboards, tmp_path, capsys):
 
 def test_pictures_without_a_board_are_refused(chessboards):
     with pytest.raises(NotIdentified, match="pattern") as refusal:
-        calibrate_board([draw_picture(POSES[0], lambda place: np.full(place.shape[:-1], 0.5))], Board(COLUMNS, ROWS))
+        calibrate_board(
+            [draw_picture(POSES[0], lambda position: np.full(position.shape[:-1], 0.5))], Board(COLUMNS, ROWS)
+        )
     assert refusal.value.reason == "no_stars"
     one = calibrate_board(chessboards[:1], Board(COLUMNS, ROWS))
     assert not one.accepted

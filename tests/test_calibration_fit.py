@@ -74,11 +74,11 @@ def map_error_px(camera, law, **kind):
     rays = even_rays(np.degrees(camera.calibrated_angle_rad), 3000, np.random.default_rng(0))
     miss = (camera.project_unlimited(rays) - pixels(LAWS[law], rays, **kind)).ravel()
     step = 1e-6
-    turn = np.stack(
+    by_rotation = np.stack(
         [(camera.project_unlimited(Rotation.from_rotvec(w).apply(rays)) - camera.project_unlimited(rays)).ravel() / step
          for w in step * np.eye(3)], axis=1,
     )  # fmt: skip
-    miss -= turn @ np.linalg.lstsq(turn, miss, rcond=None)[0]
+    miss -= by_rotation @ np.linalg.lstsq(by_rotation, miss, rcond=None)[0]
     return np.sqrt(2 * np.mean(miss**2))
 
 
@@ -122,10 +122,10 @@ def test_the_covariance_is_as_large_as_the_errors():
         camera = fit_simulated("kannala_brandt", 1, 100, 0.2, seed).camera
         assert camera.focal_px[0] == camera.focal_px[1]
         order = camera.covariance_order
-        turn = camera.jacobian_px_per_rad(rays).reshape(-1, 3)
+        by_rotation = camera.jacobian_px_per_rad(rays).reshape(-1, 3)
         lens = lens_jacobian(camera, rays, order).reshape(-1, len(order))
         miss = (camera.project_unlimited(rays) - pixels(LAWS["kannala_brandt"], rays)).ravel()
-        lens, miss = (v - turn @ np.linalg.lstsq(turn, v, rcond=None)[0] for v in (lens, miss))
+        lens, miss = (v - by_rotation @ np.linalg.lstsq(by_rotation, v, rcond=None)[0] for v in (lens, miss))
         lens = np.concatenate([lens[:, :1] + lens[:, 1:2], lens[:, 2:]], axis=1)
         covariance = np.delete(np.delete(camera.covariance, 1, 0), 1, 1)
         u, s, _ = np.linalg.svd(lens @ np.linalg.cholesky(covariance), full_matrices=False)
@@ -202,7 +202,7 @@ def test_derivatives_of_a_decentred_mirrored_lens():
 
     numeric = [(pixels_after(name, step) - pixels_after(name, -step)) / (2 * step) for name in order]
     np.testing.assert_allclose(lens_jacobian(camera, rays, order), np.stack(numeric, axis=-1), atol=2e-6)
-    turned = [
+    shifted = [
         (
             camera.project(Rotation.from_rotvec(w).apply(rays))[0]
             - camera.project(Rotation.from_rotvec(-w).apply(rays))[0]
@@ -210,7 +210,7 @@ def test_derivatives_of_a_decentred_mirrored_lens():
         / (2 * step)
         for w in step * np.eye(3)
     ]
-    np.testing.assert_allclose(camera.jacobian_px_per_rad(rays), np.stack(turned, axis=-1), atol=2e-6)
+    np.testing.assert_allclose(camera.jacobian_px_per_rad(rays), np.stack(shifted, axis=-1), atol=2e-6)
 
 
 def test_narrow_fields_get_a_pinhole_or_a_short_polynomial():

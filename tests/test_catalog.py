@@ -103,8 +103,8 @@ def test_stars_without_a_hipparcos_number(catalog: StarCatalog) -> None:
     stars = catalog.at(None, None)
     (i,) = np.flatnonzero(stars.catalog_id == "HR 4210")  # eta Car, SIMBAD
     assert stars.hip[i] == 0
-    place = ray(15 * sexagesimal("10 45 03.546"), sexagesimal("-59 41 03.95"))
-    assert angle_between_rad(stars.rays_icrs[i], place) / MAS < 1500
+    position = ray(15 * sexagesimal("10 45 03.546"), sexagesimal("-59 41 03.95"))
+    assert angle_between_rad(stars.rays_icrs[i], position) / MAS < 1500
     assert 3.8 < stars.v_mag[i] < 4.6
 
 

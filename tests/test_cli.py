@@ -456,9 +456,11 @@ def test_a_wrong_time_rotates_the_position_about_the_axis_of_a_round_crater(fold
     code, (line,), _ = run(capsys, "locate", image, "--time", "2029-09-08T09:12:45Z", "--json", "--no-plots")
     assert code == OK
     found, attitude = json.loads(line)["position"], json.loads(line)["attitude"]
-    turn = np.degrees(np.arctan2(found["east_m"], found["north_m"]) - np.arctan2(truth["east_m"], truth["north_m"]))
+    rotation_deg = np.degrees(
+        np.arctan2(found["east_m"], found["north_m"]) - np.arctan2(truth["east_m"], truth["north_m"])
+    )
     expected = 13.17635815 * 6 / 24
-    assert abs(turn) == pytest.approx(expected, abs=0.2)
-    assert attitude["heading_deg"] - truth["heading_deg"] == pytest.approx(turn, abs=0.2)
+    assert abs(rotation_deg) == pytest.approx(expected, abs=0.2)
+    assert attitude["heading_deg"] - truth["heading_deg"] == pytest.approx(rotation_deg, abs=0.2)
     true_m, found_m = (np.hypot(place["east_m"], place["north_m"]) for place in (truth, found))
     assert found_m == pytest.approx(true_m, abs=20)

@@ -257,8 +257,8 @@ def test_an_unknown_psf_is_measured(sigma: float) -> None:
 
 
 def test_a_wrong_psf_in_the_camera_file_is_corrected() -> None:
-    for told in (0.7, 1.6):
-        detections = Detector()(field(1.0).exposure, camera(told))
+    for stated in (0.7, 1.6):
+        detections = Detector()(field(1.0).exposure, camera(stated))
         assert detections.psf_sigma_px == pytest.approx(1.0, rel=0.03)
 
 
@@ -266,19 +266,19 @@ def test_close_pairs_are_fitted_separately() -> None:
     """Two stars 3.5 sigma apart are both found, and their positions are not biased."""
     rng = np.random.default_rng(12)
     middle = np.stack(np.meshgrid(np.arange(40, 990, 50), np.arange(40, 990, 50)), axis=-1).reshape(-1, 2)
-    turn = rng.uniform(0, 2 * np.pi, len(middle))
-    half = 1.75 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    direction = rng.uniform(0, 2 * np.pi, len(middle))
+    half = 1.75 * np.stack([np.cos(direction), np.sin(direction)], axis=1)
     xy = np.concatenate([middle + half, middle - half])
     flux = np.full(len(xy), flux_of(40, 1.0, VARIANCE))
     image = np.full((SIZE, SIZE), BACKGROUND)
     paint(image, xy, flux, 1.0)
     detections = Detector()(noise_frame(image, rng), camera(1.0))
     distance, nearest = cKDTree(detections.xy_px).query(xy)
-    parted = distance < 0.3
-    assert parted.mean() > 0.95
+    separated = distance < 0.3
+    assert separated.mean() > 0.95
     alone = np.sqrt(np.diag(cramer_rao(np.zeros(2), flux[0], 1.0, VARIANCE))[0])
-    assert np.sqrt(np.mean(distance[parted] ** 2) / 2) < 2.0 * alone
-    assert np.median(detections.flux_e[nearest][parted]) == pytest.approx(flux[0], rel=0.03)
+    assert np.sqrt(np.mean(distance[separated] ** 2) / 2) < 2.0 * alone
+    assert np.median(detections.flux_e[nearest][separated]) == pytest.approx(flux[0], rel=0.03)
 
 
 def test_detections_come_brightest_first_and_only_once() -> None:

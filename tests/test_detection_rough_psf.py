@@ -26,8 +26,8 @@ def pixel_gaussian(xy, flux, sigma_px=SIGMA_PX):
 
 def trail_stars(xy, flux, length_px, steps=15):
     """The same stars, each drawn along a line whose direction changes over the frame."""
-    turn = np.pi * xy[:, 0] / SIZE
-    along = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    direction = np.pi * xy[:, 0] / SIZE
+    along = np.stack([np.cos(direction), np.sin(direction)], axis=1)
     shifts = np.linspace(-0.5, 0.5, steps) * length_px
     return sum(pixel_gaussian(xy + s * along, flux / steps) for s in shifts)
 

@@ -63,13 +63,13 @@ def test_touching_pixels_are_grouped_as_opencv_groups_them() -> None:
 
 def test_bright_pixels_are_those_of_stars_not_hot_ones() -> None:
     image = np.random.default_rng(4).normal(0, 1, (200, 300)).astype(np.float32)
-    places = [(40, 50), (100, 120), (220, 150)]
-    for x, y in places:
+    positions = [(40, 50), (100, 120), (220, 150)]
+    for x, y in positions:
         image[y - 1 : y + 2, x - 1 : x + 2] += 15
         image[y, x] += 20
     image[70, 70] = 200.0
     frame = Frame(image, np.zeros_like(image), np.ones_like(image), None, SourceNoise())
-    assert sorted(map(tuple, bright_pixels(frame, 8.0, 10, 1).tolist())) == sorted(places)
+    assert sorted(map(tuple, bright_pixels(frame, 8.0, 10, 1).tolist())) == sorted(positions)
 
 
 def test_skew_noise_raises_the_threshold_and_wide_stars_lower_it() -> None:

@@ -229,7 +229,7 @@ def test_only_quaternions_become_rotations(quat: list[float]) -> None:
         R_from_quat_xyzw(quat)
 
 
-# --- places ---------------------------------------------------------------------------------------------------------
+# --- positions -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("body", ["moon", "earth"])
@@ -241,9 +241,9 @@ def test_latlon_round_trips(
     body: str, latitude_rad: float, longitude_rad: float, east_m: float, north_m: float, up_m: float
 ) -> None:
     site = Site(body, latitude_rad, longitude_rad, 120.0)
-    place = latlon_from_enu(site, east_m, north_m, up_m)
+    position = latlon_from_enu(site, east_m, north_m, up_m)
     # Two heights on the same vertical: the one through the point must pass within a millimetre of it.
-    low_m, high_m = enu_from_latlon(site, *place, np.array([-6e3, 6e3]))
+    low_m, high_m = enu_from_latlon(site, *position, np.array([-6e3, 6e3]))
     vertical = (high_m - low_m) / np.linalg.norm(high_m - low_m)
     point_m = np.array([east_m, north_m, up_m])
     assert np.linalg.norm(np.cross(point_m - low_m, vertical)) < 1e-3

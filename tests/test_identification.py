@@ -177,14 +177,14 @@ def test_random_detections_in_a_narrow_field_are_refused() -> None:
         Identifier()(make_detections(xy, np.sort(rng.uniform(3, 8, len(xy))), 0.2), NARROW, sky())
 
 
-ODDS = {"wide": (FISHEYE, 10.0, 1.0, 400), "narrow": (NARROW, 2.0, 0.15, 8000)}  # cap and radius [deg], stars
+CHANCE_FIELDS = {"wide": (FISHEYE, 10.0, 1.0, 400), "narrow": (NARROW, 2.0, 0.15, 8000)}  # cap and radius [deg], stars
 
 
-@pytest.mark.parametrize("field", ODDS)
+@pytest.mark.parametrize("field", CHANCE_FIELDS)
 @pytest.mark.parametrize("clustered", [False, True], ids=["uniform", "clustered"])
 def test_stated_false_alarm_probabilities_are_true(clustered: bool, field: str) -> None:
     """p-values of random attitudes over random detections: at least as large as the true ones, and not much larger."""
-    camera, cap_deg, radius_deg, stars = ODDS[field]
+    camera, cap_deg, radius_deg, stars = CHANCE_FIELDS[field]
     rng, width = np.random.default_rng(4), camera.size_px[0]
     bright = sky().rays_icrs[:stars]
     radius, p_values = np.radians(radius_deg), []
@@ -292,8 +292,8 @@ def rays_about(n: int, half_rad: float, seed: int) -> np.ndarray:
     """Random rays within an angle of the z axis."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(np.cos(half_rad), 1, n)
-    turn = rng.uniform(0, 2 * np.pi, n)
-    return np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
+    azimuth = rng.uniform(0, 2 * np.pi, n)
+    return np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1)
 
 
 def test_triangles_are_all_that_there_are() -> None:
@@ -318,10 +318,10 @@ def test_triangles_are_all_that_there_are() -> None:
 def test_triangles_keep_their_sides_under_rotation_and_change_handedness_in_a_mirror() -> None:
     rays = rays_about(15, 0.5, 2)
     plain = triangles(rays, 0.6)
-    turned = triangles(rays @ Rotation.random(random_state=3).as_matrix().T, 0.6)
-    assert np.array_equal(turned.vertices, plain.vertices)
-    assert turned.sides_rad == pytest.approx(plain.sides_rad, abs=1e-12)
-    assert np.array_equal(turned.handedness, plain.handedness)
+    rotated = triangles(rays @ Rotation.random(random_state=3).as_matrix().T, 0.6)
+    assert np.array_equal(rotated.vertices, plain.vertices)
+    assert rotated.sides_rad == pytest.approx(plain.sides_rad, abs=1e-12)
+    assert np.array_equal(rotated.handedness, plain.handedness)
     assert np.array_equal(triangles(rays * [-1, 1, 1], 0.6).handedness, -plain.handedness)
 
 

@@ -22,8 +22,8 @@ def test_a_list_in_any_order_is_identified(camera) -> None:
     assert found.camera is camera
     assert found.false_alarm_probability < 1e-20
     assert np.array_equal(found.hip, sky().hip[found.star])
-    turn = truth.R_cam_icrs @ found.attitude.R_cam_icrs.T
-    off = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    error = truth.R_cam_icrs @ found.attitude.R_cam_icrs.T
+    off = np.array([error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]]) / 2
     assert off @ np.linalg.solve(found.attitude.covariance_rad2, off) < 25
     assert np.linalg.norm(off) < 60 * ARCSEC
 

@@ -24,9 +24,9 @@ def disc(centre: tuple[float, float], radius: float, *, rng: np.random.Generator
     """A vignetted sky (480, 640) with moonlight on one side, over a pedestal; `trees` hide that part of its edge."""
     y, x = np.mgrid[0:480, 0:640]
     off = np.hypot(x - centre[0], y - centre[1])
-    turn = (np.arctan2(y - centre[1], x - centre[0]) / (2 * np.pi)) % 1
+    direction = (np.arctan2(y - centre[1], x - centre[0]) / (2 * np.pi)) % 1
     sky = 300 * (1 - 0.4 * (off / radius) ** 2) * (1 + 0.5 * x / 640)
-    lit = (off < radius) & ~((turn < trees) & (off > 0.8 * radius))
+    lit = (off < radius) & ~((direction < trees) & (off > 0.8 * radius))
     return (2000 + np.where(lit, sky, 0) + rng.normal(0, 5, (480, 640))).astype(np.float32)
 
 

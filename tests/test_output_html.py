@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from astropy.table import Table
-from page_helpers import NASTY, results_in
+from html_helpers import NASTY, results_in
 
 from startrack.cli.main import main
 from startrack.cli.report import write_page_of_images

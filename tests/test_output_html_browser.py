@@ -10,7 +10,7 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import pytest
-from page_helpers import DESKTOP, NASTY, PHONE, SMALL, Window, results_in
+from html_helpers import DESKTOP, NASTY, PHONE, SMALL, Window, results_in
 
 from startrack.output.html import page_text, results_under, write_page
 from startrack.output.html.gather import Found

@@ -60,11 +60,11 @@ def test_errors_are_the_catalogues_and_the_scatter_in_quadrature():
 
 def test_the_sky_rotates_once_a_sidereal_day_westward():
     site = Site("earth", np.radians(40.0), 0.0)
-    turn = sky_rotvec_rad(site, TIME, 600.0)
-    assert np.linalg.norm(turn) == pytest.approx(7.292115e-5 * 600, rel=1e-4)
+    rotvec = sky_rotvec_rad(site, TIME, 600.0)
+    assert np.linalg.norm(rotvec) == pytest.approx(7.292115e-5 * 600, rel=1e-4)
     # Stars rotate about the celestial pole (north, 40 degrees up) against the Earth's rotation.
     np.testing.assert_allclose(
-        turn / np.linalg.norm(turn), [0, -np.cos(np.radians(40)), -np.sin(np.radians(40))], atol=2e-3
+        rotvec / np.linalg.norm(rotvec), [0, -np.cos(np.radians(40)), -np.sin(np.radians(40))], atol=2e-3
     )
 
 

@@ -77,8 +77,8 @@ def test_nothing_shines_beyond_the_image_circle():
 
 
 def test_a_trail_is_as_long_as_the_skys_rotation_and_centred_on_mid_exposure():
-    turn = np.array([0.0, 0.0, 0.06])  # about the zenith: a star at 45 degrees runs along a circle around it
-    scene = make_scene(stars_at_azel([90.0], [45.0], [0.0]), sky_rotvec_rad=turn)
+    rotvec = np.array([0.0, 0.0, 0.06])  # about the zenith: a star at 45 degrees runs along a circle around it
+    scene = make_scene(stars_at_azel([90.0], [45.0], [0.0]), sky_rotvec_rad=rotvec)
     image = light_e(scene)
     y, x = np.indices(image.shape)
     cx, cy = centroid_px(image)

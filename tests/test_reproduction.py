@@ -100,11 +100,11 @@ def test_stars_in_sight_are_those_above_the_horizon_and_inside_the_drawn_edge():
     from startrack.reproduction.drawing import fisheye_points
 
     sky, cylinder = Sky.draw(0, 0), crater()
-    for place in draw_positions(0, 0, 0, 10):
-        seen = visible_stars(sky.project_to_rim_plane(cylinder), place, cylinder.radius_m)
-        horizon = cylinder.horizon_rad(np.tile(place, (len(sky), 1)), sky.azimuth_rad)
+    for position in draw_positions(0, 0, 0, 10):
+        seen = visible_stars(sky.project_to_rim_plane(cylinder), position, cylinder.radius_m)
+        horizon = cylinder.horizon_rad(np.tile(position, (len(sky), 1)), sky.azimuth_rad)
         np.testing.assert_array_equal(seen, sky.elevation_rad > horizon)
-        polygon = Polygon(fisheye_points(*crater_edge(cylinder, place)))
+        polygon = Polygon(fisheye_points(*crater_edge(cylinder, position)))
         inside = polygon.contains_points(fisheye_points(sky.azimuth_rad, sky.elevation_rad))
         assert np.sum(inside != seen) <= 2  # a polygon of 360 points is not quite the circle
 
@@ -136,8 +136,8 @@ def test_the_middle_of_a_cell_with_straight_walls(size):
 def test_the_localizers_give_what_the_table_is_made_of():
     task = Task(KUA, 0, 2, 0, 5)
     chunk, sky, cylinder = compute_chunk(task), Sky.draw(0, 2), crater()
-    for k, place in enumerate(draw_positions(0, 2, 0, 5)):
-        evidence = PERFECT.evidence(sky, visible_stars(sky.project_to_rim_plane(cylinder), place, cylinder.radius_m))
+    for k, position in enumerate(draw_positions(0, 2, 0, 5)):
+        evidence = PERFECT.evidence(sky, visible_stars(sky.project_to_rim_plane(cylinder), position, cylinder.radius_m))
         hull, refined = Hull()(evidence, cylinder), PseudoGradient()(evidence, cylinder)
         np.testing.assert_allclose(hull.position_enu_m[:2], chunk["hull_m"][k], atol=1e-6)
         np.testing.assert_allclose(refined.position_enu_m[:2], chunk["refined_m"][k], atol=1e-6)
@@ -157,10 +157,10 @@ def test_table_3_1_is_within_the_bars(small_run):
 def test_ours_is_the_middle_of_the_exact_cell():
     sky, cylinder = Sky.draw(0, 1), crater()
     points, off = sky.project_to_rim_plane(cylinder), []
-    for place in draw_positions(0, 1, 0, 10):
-        evidence = PERFECT.evidence(sky, visible_stars(points, place, cylinder.radius_m))
+    for position in draw_positions(0, 1, 0, 10):
+        evidence = PERFECT.evidence(sky, visible_stars(points, position, cylinder.radius_m))
         fix = ExactPosterior()(evidence, cylinder)
-        off.append(np.hypot(*(fix.position_enu_m[:2] - cell_centroid(points, place, cylinder.radius_m))))
+        off.append(np.hypot(*(fix.position_enu_m[:2] - cell_centroid(points, position, cylinder.radius_m))))
     assert np.median(off) < 0.3
 
 

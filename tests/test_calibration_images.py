@@ -167,7 +167,7 @@ def test_a_lens_that_has_changed_does_not_verify(written_files, exposure):
     camera = load_camera(written_files / "new.toml")
     moved = replace(camera, focal_px=(camera.focal_px[0] * 1.004, camera.focal_px[1] * 1.004))
     found = verify(exposure, moved, load_catalog().brighter_than(7.0), SITE)
-    assert not found.fits
+    assert not found.is_valid
     record = verify_dict(found)
     assert record["reason"] == "inconsistent_evidence"
     assert record["focal_change"] == pytest.approx(-0.004, abs=0.0015)

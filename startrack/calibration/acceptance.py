@@ -27,7 +27,7 @@ STARS_PER_RING = 3
 STARS_PER_SECTOR = 2
 MIN_SECTORS = 5
 WRONG_ROTATIONS_RAD = tuple(np.radians((-31.0, -17.0, 13.0, 29.0)))  # attitudes at which only chance matches
-MIN_BY_CHANCE = 0.5
+MIN_CHANCE_MATCHES = 0.5
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def joint_log_p_value(joint: JointFit) -> float:
         )
         for angle in WRONG_ROTATIONS_RAD
     ]
-    return log_p_value_poisson(found, max(float(np.mean(wrong)), MIN_BY_CHANCE))
+    return log_p_value_poisson(found, max(float(np.mean(wrong)), MIN_CHANCE_MATCHES))
 
 
 def mirrored_residual_px(joint: JointFit) -> float:

@@ -18,7 +18,7 @@ BLEND_MAG = 2.0  # a neighbour less than this fainter than the star shifts its c
 BLEND_SIGMAS = 3.5  # of the PSF
 DEPTH_MAG = 0.5  # stars are predicted to this much below the faintest source
 SCALE_STARS = 4000  # brightest stars used for the zero point
-MIN_FOR_SHAPE = 30
+MIN_STARS_FOR_SHAPE = 30
 NEAR_CURVE_MAG = 1.2  # stars with a zero point this close to the curve are used in its fit
 CURVE_ROUNDS = 4
 SECURE_MAG = 0.7  # a star this much brighter than the frame's limit is detected where the sky is open
@@ -121,11 +121,11 @@ def _fit_parabola(angle_rad: Array, zero_mag: Array) -> Callable[[Array], Array]
     if not len(zero_mag):
         return np.poly1d([0.0])
     fit = np.poly1d([float(np.median(zero_mag))])
-    if len(zero_mag) < MIN_FOR_SHAPE:
+    if len(zero_mag) < MIN_STARS_FOR_SHAPE:
         return fit
     for _ in range(CURVE_ROUNDS):
         close = np.abs(zero_mag - fit(angle_rad)) < NEAR_CURVE_MAG
-        if close.sum() < MIN_FOR_SHAPE:
+        if close.sum() < MIN_STARS_FOR_SHAPE:
             break
         fit = np.poly1d(np.polyfit(angle_rad[close], zero_mag[close], 2))
     low, high = np.min(angle_rad), np.max(angle_rad)

@@ -29,7 +29,7 @@ FOLDS = 5
 LARGEST_HELD_OUT_MAG = 0.4  # median scatter of held-out stars
 LARGEST_HELD_OUT_RATIO = 1.5  # of held-out scatter to that of the fit
 LARGEST_IMAGE_OFFSET_MAG = 0.15  # of an image's zero point from the common one: clouds, or twilight
-MIN_OF_IMAGE = 10
+MIN_STARS_PER_IMAGE = 10
 NORMAL_BY_MAD = 1.4826
 
 
@@ -150,7 +150,7 @@ def _failures(stars: StarFluxes, terms: list[str], fit: _Fit) -> list[str]:
     offsets = [
         float(np.median(residual[stars.image == i]))
         for i, count in enumerate(np.bincount(stars.image))
-        if count >= MIN_OF_IMAGE
+        if count >= MIN_STARS_PER_IMAGE
     ]
     if len(offsets) > 1 and (largest := float(np.max(np.abs(offsets)))) > LARGEST_IMAGE_OFFSET_MAG:
         failures.append(f"the zero points of the images differ by up to {largest:.2f} mag from their mean: clouds?")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from startrack.detection.deblend import Fitted, own_signal
 from startrack.detection.fit import PointFits, Stamps
 from startrack.detection.frame import Frame, Pixels, SourceNoise
-from startrack.detection.psf_width import BRIGHT_SNR, MIN_BRIGHT
+from startrack.detection.psf_width import BRIGHT_SNR, MIN_BRIGHT_SOURCES
 from startrack.detection.saturated import are_saturated
 from startrack.types import Array, Bools, Ints
 
@@ -121,7 +121,7 @@ def noise_skewness(frame: Frame) -> float:
 
 def _typical_misfit(misfit: Array) -> float:
     """Largest accepted misfit from the frame's bright sources; 0 where these fit the Gaussian."""
-    if len(misfit) < MIN_BRIGHT:
+    if len(misfit) < MIN_BRIGHT_SOURCES:
         return 0.0
     typical = float(np.median(misfit))
     return ROUGH_PSF_SPREAD * typical if typical > ROUGH_PSF_MISFIT else 0.0

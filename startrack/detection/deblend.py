@@ -32,7 +32,11 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
     """Fits of all candidates. `known`: earlier fits of the first peaks, refined once; `frame.found` contains them."""
     radius = radius_for(sigma)
     centres = peaks.centres
-    data, variance, usable = frame.data(centres, radius), frame.variance(centres, radius), frame.usable(centres, radius)
+    data, variance, usable = (
+        frame.data(centres, radius),
+        frame.variance(centres, radius),
+        frame.usable_pixels(centres, radius),
+    )
     stamps = Stamps(data, variance, usable, centres, peaks.surround)
     last = np.zeros_like(data)  # neighbours' signal subtracted in the last fit
     if known is not None and frame.found is not None:

@@ -67,7 +67,7 @@ class Frame:
         """Stamps (n, s, s) of the pixels' variance without the sources' own signal."""
         return np.square(stamps(self.noise, centres, radius))
 
-    def usable(self, centres: Ints, radius: int) -> Bools | None:
+    def usable_pixels(self, centres: Ints, radius: int) -> Bools | None:
         """Stamps (n, s, s) of the pixels that may be used; None where all may."""
         return None if self.dead is None else ~stamps(self.dead, centres, radius)
 

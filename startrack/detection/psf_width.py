@@ -21,12 +21,12 @@ MIN_BESIDE, MIN_FALL, MAX_FALL = (
     0.05,
     3.5,
 )  # relative signal beside a peak; its logarithmic fall for 4.5 px and 0.45 px
-MIN_BRIGHT = 8
-MAX_BRIGHT, MAX_BRIGHT_ALL_WIDTHS = 100, 40  # the second where many widths are tried
-NEAR = np.geomspace(0.72, 1.4, 8)  # widths tried first, in units of the expected one
+MIN_BRIGHT_SOURCES = 8
+MAX_BRIGHT_SOURCES, MAX_SOURCES_ALL_WIDTHS = 100, 40  # the second where many widths are tried
+NEAR_WIDTHS = np.geomspace(0.72, 1.4, 8)  # widths tried first, in units of the expected one
 WIDTHS_PX = np.geomspace(0.3, 8.0, 22)
 NARROWER_IS_A_PIXEL_PX = 0.45  # hot pixels fit the narrowest profile
-AT_THE_END = 0.3  # largest fraction of sources with a best width at the end of NEAR
+MAX_END_FRACTION = 0.3  # largest fraction of sources with a best width at the end of NEAR_WIDTHS
 STAR_LIKE = 0.75  # fraction of a stamp's variance beyond the noise that a star explains; clouds: 0.2 to 0.5
 SHARP_RATIO = 0.6  # of the typical width: narrower sources are stars among clouds
 SHARP_FRACTION = 0.1  # of the sources: smallest number of narrow ones that is significant
@@ -41,23 +41,23 @@ def measure_psf_width(frame: Frame, centres: Ints, fits: PointFits, sigma: float
     radius = radius_for(sigma)
     bright = np.flatnonzero((fits.snr > BRIGHT_SNR) & (fits.chi2 < fits.chi2_pixel))
     bright = bright[np.argsort(-fits.snr[bright], kind="stable")]
-    usable = frame.usable(centres[bright], radius)
-    bright = (bright if usable is None else bright[usable.all(axis=(1, 2))])[:MAX_BRIGHT]
-    if len(bright) < MIN_BRIGHT:
+    usable = frame.usable_pixels(centres[bright], radius)
+    bright = (bright if usable is None else bright[usable.all(axis=(1, 2))])[:MAX_BRIGHT_SOURCES]
+    if len(bright) < MIN_BRIGHT_SOURCES:
         return None
     pixels = centres[bright]
     data = frame.data(pixels, radius)
     weights = 1.0 / (frame.variance(pixels, radius) + np.float32(frame.source_noise.per_unit) * np.maximum(data, 0.0))
     offset = fits.xy_px[bright] - pixels
-    widths, inside, part = fit_widths(data, weights, offset, sigma * NEAR)
-    if inside.mean() < 1.0 - AT_THE_END:
-        few = slice(0, MAX_BRIGHT_ALL_WIDTHS)
+    widths, inside, part = fit_widths(data, weights, offset, sigma * NEAR_WIDTHS)
+    if inside.mean() < 1.0 - MAX_END_FRACTION:
+        few = slice(0, MAX_SOURCES_ALL_WIDTHS)
         widths, inside, part = fit_widths(data[few], weights[few], offset[few], WIDTHS_PX)
     widths = widths[inside & (part > STAR_LIKE) & (widths > NARROWER_IS_A_PIXEL_PX)]
-    if len(widths) < MIN_BRIGHT:
+    if len(widths) < MIN_BRIGHT_SOURCES:
         return None
     sharp = widths[widths < SHARP_RATIO * np.median(widths)]
-    return float(np.median(sharp if len(sharp) >= max(MIN_BRIGHT, SHARP_FRACTION * len(widths)) else widths))
+    return float(np.median(sharp if len(sharp) >= max(MIN_BRIGHT_SOURCES, SHARP_FRACTION * len(widths)) else widths))
 
 
 def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array) -> tuple[Array, Bools, Array]:
@@ -117,7 +117,7 @@ def guess_psf_width(prepare: Callable[[float], Frame], sigma: float) -> float:
         if not len(centres):
             break
         data, variance = frame.data(centres, radius), frame.variance(centres, radius)
-        stamps = Stamps(data, variance, frame.usable(centres, radius), centres, np.zeros(len(centres)))
+        stamps = Stamps(data, variance, frame.usable_pixels(centres, radius), centres, np.zeros(len(centres)))
         fits = fit_points(stamps, centres.astype(np.float64), sigma, frame.source_noise, 0.0, ROUNDS_AGAIN)
         measured = measure_psf_width(frame, centres, fits, sigma)
         if measured is None:

@@ -13,8 +13,8 @@ BRIGHT_SNR = 15.0
 MIN_STARS, MAX_STARS = 20, 120
 FAINT_FRACTION = 0.3  # of the pixel's variance: pixels with less signal are left out
 MAX_LEVERAGE = 0.5  # residuals of pixels with a larger leverage do not show the noise
-BINS, MIN_IN_BIN = 12, 15
-MAX_ALIKE = 2.0
+BINS, MIN_PIXELS_PER_BIN = 12, 15
+MAX_CORRELATION = 2.0
 MEDIAN_OF_SQUARE = 0.4549  # of a unit Gaussian
 MIN_MODEL_ERROR = 0.005
 
@@ -29,13 +29,13 @@ def measure_source_noise(s: Stamps, fits: PointFits, alone: Bools, sigma: float,
     bright = _select_bright(s, fits, alone)
     if len(bright) < MIN_STARS:
         return expected
-    signal, excess, alike = _excess_variance(s.take(bright), fits.take(bright), sigma)
-    if expected.per_unit == 0.0 and alike > MAX_ALIKE:
+    signal, excess, correlation = _excess_variance(s.take(bright), fits.take(bright), sigma)
+    if expected.per_unit == 0.0 and correlation > MAX_CORRELATION:
         return expected
-    if len(signal) < BINS * MIN_IN_BIN:
+    if len(signal) < BINS * MIN_PIXELS_PER_BIN:
         return expected
     order = np.argsort(signal, kind="stable")
-    bins = [part for part in np.array_split(order, BINS) if len(part) >= MIN_IN_BIN]
+    bins = [part for part in np.array_split(order, BINS) if len(part) >= MIN_PIXELS_PER_BIN]
     rows = [(np.median(signal[part]), *_typical_excess(excess[:, part])) for part in bins]
     level, beyond, error = np.array(rows).T
     return _fit_noise_terms(level, beyond, error, expected)
@@ -86,8 +86,8 @@ def _excess_variance(s: Stamps, fits: PointFits, sigma: float) -> tuple[Array, A
     relative /= np.maximum(
         np.sqrt(np.mean(np.square(relative), axis=1, keepdims=True)), 1e-30
     )  # equal weight for each star
-    alike = float(np.sum(np.square(relative.sum(axis=0))) / np.sum(np.square(relative)))
-    return signal.reshape(n, -1)[use], np.stack([(squared / (1.0 - leverage))[use], variance[use]]), alike
+    correlation = float(np.sum(np.square(relative.sum(axis=0))) / np.sum(np.square(relative)))
+    return signal.reshape(n, -1)[use], np.stack([(squared / (1.0 - leverage))[use], variance[use]]), correlation
 
 
 def _typical_excess(squared_and_variance: Array) -> tuple[float, float]:

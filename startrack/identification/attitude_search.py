@@ -18,14 +18,17 @@ from startrack.identification.triangles import sides_of_few, triangles
 from startrack.types import Array, Ints
 
 PREFIXES = (0, 7, 10, 14, 20, 28)  # number of brightest detections that form triangles, round by round
-WINDOW, FRESH = 24, 12  # ranks of brightness that form triangles beyond these, and how many of them are new
+WINDOW_RANKS, NEW_RANKS = 24, 12  # ranks of brightness that form triangles beyond these, and how many of them are new
 DEEPEST_RANK = 240
 ROUGH_DEPTH, ROUGH_REACH_RAD, ROUGH_FRACTION = 120, np.radians(20.0), 0.4
 PIVOTS = 16  # brightest detections about which triangles of catalogue pairs are tried
 MATCHES_EACH, ROUGH_MATCHES_EACH = 3, 8  # catalogue triangles looked up for a triangle of detections
 MAX_IMAGE_TRIANGLES, MAX_ROUGH = 20_000, 3000  # short triangles of detections; their matches that are tried
-VERIFIED = 256  # detections tested against the stars
-PRETESTED, PRETEST_BATCH = 64, 64  # detections in the first test of many hypotheses; hypotheses tested together
+VERIFIED_DETECTIONS = 256  # detections tested against the stars
+PRETESTED_DETECTIONS, PRETEST_BATCH = (
+    64,
+    64,
+)  # detections in the first test of many hypotheses; hypotheses tested together
 DEPTH_FACTOR = 4  # catalogue stars per detection (of the whole sky): some are hidden or too faint
 MIN_HITS = 6
 PLAUSIBLE = 1e-2  # expected false alarms below which a hypothesis is refined; the final limit is tested later
@@ -81,8 +84,11 @@ class AttitudeSearch:
 
     def _windows(self) -> Iterator[tuple[int, int, int]]:
         n = min(len(self.rays_cam), DEEPEST_RANK)
-        start = PREFIXES[-1] - (WINDOW - FRESH)
-        return ((k, WINDOW - FRESH, min(k + WINDOW, n)) for k in range(start, n - WINDOW + FRESH, FRESH))
+        start = PREFIXES[-1] - (WINDOW_RANKS - NEW_RANKS)
+        return (
+            (k, WINDOW_RANKS - NEW_RANKS, min(k + WINDOW_RANKS, n))
+            for k in range(start, n - WINDOW_RANKS + NEW_RANKS, NEW_RANKS)
+        )
 
     def _attitudes_from_triangles(
         self, index: PatternIndex, first: int, fresh: int, end: int, tolerance: float
@@ -133,9 +139,11 @@ class AttitudeSearch:
         self, cam: Array, icrs: Array, rays_cam: Array, first: int, tolerance: float
     ) -> Iterator[AttitudeHypothesis]:
         """Attitudes that rotate the rays icrs (m, 3, 3) to cam (m, 3, 3) and that bright stars support."""
-        some, radius = rays_cam[: first + VERIFIED], 2.0 * tolerance
+        some, radius = rays_cam[: first + VERIFIED_DETECTIONS], 2.0 * tolerance
         depth = int(DEPTH_FACTOR * 4 * np.pi / self.patterns.field_sr * len(some))
-        for R in self._supported_attitudes(cam, icrs, some[max(first - WINDOW, 0) : first + PRETESTED], radius, depth):
+        for R in self._supported_attitudes(
+            cam, icrs, some[max(first - WINDOW_RANKS, 0) : first + PRETESTED_DETECTIONS], radius, depth
+        ):
             near = self.patterns.neighbours(some @ R, self.neighbour_radius_rad, depth)
             hit = near.chord < radius
             hits = min(int(np.count_nonzero(hit)), len(some))

@@ -27,7 +27,10 @@ LOCAL_SIDES = 1.2  # of the longest side, about the triangle: within it an imper
 CANDIDATES_AT_ONCE = 20_000
 MAX_HYPOTHESES = 6  # of one lens and window; the true one is nearly always the likeliest
 MAX_DETECTIONS = 100
-VERIFIED = ((24, -1.5), (48, -4.0))  # detections tested against the stars; log p-value below which the test goes on
+VERIFICATION_STAGES = (
+    (24, -1.5),
+    (48, -4.0),
+)  # detections tested against the stars; log p-value below which the test goes on
 MAX_VERIFIED = 80
 CACHED_PATTERNS = 6
 
@@ -166,7 +169,7 @@ class HypothesisSearch:
         middle /= np.linalg.norm(middle, axis=1, keepdims=True)
         alive = np.arange(len(R))
         log_p = np.zeros(len(R))
-        for verified, limit in (*VERIFIED, (MAX_VERIFIED, most_log_p)):
+        for verified, limit in (*VERIFICATION_STAGES, (MAX_VERIFIED, most_log_p)):
             deeper = self._log_p_value(
                 patterns, xy_px[:verified], R[alive], guess, focal[alive], mirrored[alive], middle[alive]
             )

@@ -73,7 +73,7 @@ class Identifier:
         if found is not None:
             return found
         lenient = replace(self, whole_field=False)
-        if lenient._find_accepted(search.mirrored_hypotheses(), frame.mirrored(), search)[0] is not None:
+        if lenient._find_accepted(search.mirrored_hypotheses(), frame.mirror_frame(), search)[0] is not None:
             raise NotIdentified(
                 "the image is a mirror image, compared with the camera file: flip the image, or set mirrored = "
                 f"{str(not camera.mirrored).lower()} in the camera file",
@@ -160,7 +160,7 @@ class _Frame:
         covariance = self.centroids.covariance_px2
         self.variance_px2 = 0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1])  # mean of both axes
 
-    def mirrored(self) -> _Frame:
+    def mirror_frame(self) -> _Frame:
         """The same detections seen by the mirror-image camera."""
         camera = replace(self.camera, mirrored=not self.camera.mirrored)
         rays_cam = camera.unproject(self.centroids.xy_px)

@@ -88,14 +88,14 @@ def identify_unknown_lens(
     if search.narrow and (solution := _solve_narrow_field(search, centroids)) is not None:
         return solution
     for grown, around in search.grown_lenses():
-        lens = verify(grown, centroids, stars.take(around), search.tried, search.widest_rad)
+        lens = verify(grown, centroids, stars.take(around), search.patterns_tried, search.widest_rad)
         if lens is not None and lens.log_p < LOG_FALSE_ALARM and lens.matched >= search.min_matches:
             return _solution(lens, around, search, centroids)
     raise NotIdentified(
         f"no lens of {np.degrees(fov_rad):.3g} degrees ({100 * tolerance:.0f} % more or less) explains the "
-        f"{len(centroids)} point sources better than chance ({search.tried} patterns tried): {ADVICE}",
+        f"{len(centroids)} point sources better than chance ({search.patterns_tried} patterns tried): {ADVICE}",
         detected=len(centroids),
-        tried=search.tried,
+        tried=search.patterns_tried,
     )
 
 
@@ -177,7 +177,7 @@ class _Search:
         self.hypotheses = HypothesisSearch(self.xy_px[self.chosen], size_px)
 
     @property
-    def tried(self) -> int:
+    def patterns_tried(self) -> int:
         """Number of patterns tried so far."""
         return self.hypotheses.tried
 
@@ -192,7 +192,7 @@ class _Search:
             yield from self._grow_all(self._guesses(), MAX_TRIED)
             return
         yield from self._grow_all(self._guesses_from_circle(self.circle), MAX_TRIED_IN_CIRCLE)
-        yield from self._grow_all(self._guesses(), self.tried + MAX_TRIED_BEYOND)
+        yield from self._grow_all(self._guesses(), self.patterns_tried + MAX_TRIED_BEYOND)
 
     def _grow_all(self, guesses: list[LensGuess], most_tried: int) -> Iterator[tuple[GrownLens, Ints]]:
         """`grown_lenses` of these guesses, until so many patterns have been tried."""
@@ -213,7 +213,7 @@ class _Search:
                     found = grow(hypothesis, self.xy_px, rays, stages)
                     if found is not None and (not self.wide or len(found.star) >= self.min_matches):
                         yield found, around
-                if self.tried > most_tried:
+                if self.patterns_tried > most_tried:
                     return
 
     def _rounds(self) -> Iterator[tuple[PatternSizes, Window]]:

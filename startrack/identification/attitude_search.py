@@ -20,7 +20,7 @@ from startrack.types import Array, Ints
 PREFIXES = (0, 7, 10, 14, 20, 28)  # number of brightest detections that form triangles, round by round
 WINDOW_RANKS, NEW_RANKS = 24, 12  # ranks of brightness that form triangles beyond these, and how many of them are new
 DEEPEST_RANK = 240
-ROUGH_DEPTH, ROUGH_REACH_RAD, ROUGH_FRACTION = 120, np.radians(20.0), 0.4
+ROUGH_DEPTH, ROUGH_SIDE_RAD, ROUGH_FRACTION = 120, np.radians(20.0), 0.4
 PIVOTS = 16  # brightest detections about which triangles of catalogue pairs are tried
 MATCHES_EACH, ROUGH_MATCHES_EACH = 3, 8  # catalogue triangles looked up for a triangle of detections
 MAX_IMAGE_TRIANGLES, MAX_ROUGH = 20_000, 3000  # short triangles of detections; their matches that are tried
@@ -115,7 +115,7 @@ class AttitudeSearch:
 
     def _attitudes_from_short_triangles(self, tolerance: float) -> Iterator[AttitudeHypothesis]:
         index = self.patterns.deep_index
-        longest = min(ROUGH_REACH_RAD, ROUGH_FRACTION * self.scale.diameter_rad)
+        longest = min(ROUGH_SIDE_RAD, ROUGH_FRACTION * self.scale.diameter_rad)
         image = triangles(self.rays_cam[:ROUGH_DEPTH], longest, MAX_IMAGE_TRIANGLES)
         left, right = index.candidates(2 * np.sin(image.sides_rad / 2), tolerance, ROUGH_MATCHES_EACH)
         self.tried += max(len(left) - MAX_ROUGH, 0)

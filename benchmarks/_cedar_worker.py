@@ -1,4 +1,4 @@
-"""cedar-solve, in an environment of its own: reads a star list per line, writes what it says and the CPU time.
+"""cedar-solve, in an environment of its own: reads a star list per line, writes the solution and the CPU time.
 
 It pins numpy 1: python -m venv PLACE && PLACE/bin/pip install cedar-solve. Run by _identify_peers.py.
 """
@@ -15,11 +15,11 @@ logging.disable(logging.CRITICAL)
 solver = tetra3.Tetra3("default_database")
 print("ready", flush=True)
 for line in sys.stdin:
-    asked = json.loads(line)
-    centroids = np.array(asked["xy_px"])[:, ::-1]
+    request = json.loads(line)
+    centroids, fov_deg = np.array(request["xy_px"])[:, ::-1], request["fov_deg"]
     start = time.process_time()
     found = solver.solve_from_centroids(
-        centroids, tuple(asked["size_px"][::-1]), fov_estimate=asked["fov_deg"], fov_max_error=0.02 * asked["fov_deg"]
+        centroids, tuple(request["size_px"][::-1]), fov_estimate=fov_deg, fov_max_error=0.02 * fov_deg
     )
     ms = 1e3 * (time.process_time() - start)
     print(json.dumps({"ms": ms, **{key: found[key] for key in ("RA", "Dec", "Roll")}}), flush=True)

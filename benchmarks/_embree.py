@@ -1,7 +1,7 @@
-"""Horizons by Embree, a ray engine of others: rays are shot, and the elevation where they begin to miss is halved down.
+"""Horizons by Embree, an independent ray tracer: bisection in elevation between rays that hit and rays that miss.
 
-The surface is that of the terrain's finest map, each bilinear cell as n x n x 2 triangles: the nearer the finer, for
-the camera stands 1.5 m above the ground, and a decimetre 50 m off is a tenth of a degree.
+The surface is that of the terrain's finest map, each bilinear cell as n x n x 2 triangles, finer near the camera: the
+camera stands 1.5 m above the ground, and 0.1 m at a distance of 50 m is a tenth of a degree.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ NEAR_M, NEAR_SIDE_M, FAR_SIDE_M = 900.0, 7.5, 48.0  # sides of the triangles
 
 
 class EmbreeHorizons:
-    """Elevations of the horizon seen from a place on the ground."""
+    """Elevations of the horizon seen from a position on the ground."""
 
-    def __init__(self, terrain: HeightMap, place_m: np.ndarray) -> None:
-        up = float(terrain.ground_m(place_m)) + terrain.camera_height_m
-        self.eye = np.array([*place_m, up])
+    def __init__(self, terrain: HeightMap, position_m: np.ndarray) -> None:
+        up = float(terrain.ground_m(position_m)) + terrain.camera_height_m
+        self.eye = np.array([*position_m, up])
         finest = terrain.maps[0]
         rows, columns = (n - 1 for n in finest.heights_m.shape)
         cells = np.stack(np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"), axis=-1).reshape(-1, 2)
-        away = np.hypot(*(vertices(terrain, cells + 0.5)[:, :2] - place_m).T)
+        away = np.hypot(*(vertices(terrain, cells + 0.5)[:, :2] - position_m).T)
         self.scene = EmbreeScene(robust=True)
         near = away < NEAR_M
         self.meshes = [
@@ -56,7 +56,7 @@ def vertices(terrain: HeightMap, row_column: np.ndarray) -> np.ndarray:
 
 
 def mesh(terrain: HeightMap, cells: np.ndarray, cut: int, eye_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) reckoned from the eye [m], float32, and triangles (m, 3) of cells (k, 2)."""
+    """Vertices (n, 3) relative to the camera [m], float32, and triangles (m, 3) of cells (k, 2)."""
     line = np.arange(cut + 1) / cut
     inside = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
     points = vertices(terrain, cells[:, None, :] + np.minimum(inside, 1 - 1e-9)) - eye_m

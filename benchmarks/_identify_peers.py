@@ -26,7 +26,7 @@ from startrack.types import NotIdentified, Stars
 
 @dataclass(frozen=True)
 class Answer:
-    """What an identifier says."""
+    """The result of an identifier."""
 
     R_cam_icrs: np.ndarray
     detection: np.ndarray
@@ -44,7 +44,7 @@ class Elsewhere:
 NO_NAMES = np.zeros(0, dtype=np.int64)
 Solver = Callable[
     [StarList], Callable[[], Answer | Elsewhere | None]
-]  # what is prepared outside the clock, and what is timed
+]  # preparation, which is not timed, and the timed part
 
 
 def startrack(camera: Camera, stars: Stars) -> Solver:
@@ -66,11 +66,11 @@ def startrack(camera: Camera, stars: Stars) -> Solver:
     return prepare
 
 
-def ruststartracker(camera: Camera, stars: Stars, v_limit: float, reach_rad: float) -> Solver:
-    """ruststartracker's matcher, fed with unit vectors: 8 matches, its catalogue the stars that the lists may hold."""
+def ruststartracker(camera: Camera, stars: Stars, v_limit: float, radius_rad: float) -> Solver:
+    """ruststartracker's matcher with unit vectors as input: 8 matches; its catalogue has the stars of the lists."""
     import ruststartracker as peer
 
-    tracker = _tracker(camera.size_px, stars, v_limit, reach_rad)
+    tracker = _tracker(camera.size_px, stars, v_limit, radius_rad)
 
     def prepare(listed: StarList) -> Callable[[], Answer | None]:
         rays = camera.unproject(listed.xy_px)
@@ -88,30 +88,30 @@ def ruststartracker(camera: Camera, stars: Stars, v_limit: float, reach_rad: flo
     return prepare
 
 
-def _tracker(size_px: tuple[int, int], stars: Stars, v_limit: float, reach_rad: float) -> Any:
-    """Its catalogue with the index; kept, for it takes a while."""
+def _tracker(size_px: tuple[int, int], stars: Stars, v_limit: float, radius_rad: float) -> Any:
+    """Its catalogue with the index; cached, because it takes seconds."""
     import ruststartracker as peer
 
-    if (v_limit, reach_rad) not in _KEPT:
+    if (v_limit, radius_rad) not in _TRACKERS:
         count = int(np.searchsorted(stars.v_mag, v_limit + 1.5))
         plain = peer.CameraParameters(np.diag([650.0, 650.0, 1.0]).astype(np.float32), size_px, None)
-        _KEPT[v_limit, reach_rad] = peer.StarTracker(
+        _TRACKERS[v_limit, radius_rad] = peer.StarTracker(
             stars.rays_icrs[:count], stars.v_mag[:count], plain, max_lookup_magnitude=v_limit,
-            max_inter_star_angle=reach_rad, inter_star_angle_tolerance=1e-3, n_minimum_matches=8, timeout_secs=2.0,
+            max_inter_star_angle=radius_rad, inter_star_angle_tolerance=1e-3, n_minimum_matches=8, timeout_secs=2.0,
         )  # fmt: skip
-    return _KEPT[v_limit, reach_rad]
+    return _TRACKERS[v_limit, radius_rad]
 
 
-_KEPT: dict[tuple[float, float], Any] = {}
+_TRACKERS: dict[tuple[float, float], Any] = {}
 
 
 def best_ruststartracker(camera: Camera, stars: Stars, lists: list[StarList]) -> tuple[Solver, str]:
-    """The quickest of some settings that solve the most of these lists."""
+    """The fastest of the settings that solve most of these lists."""
     import time
 
     best: tuple[tuple[float, float], Solver, str] | None = None
-    for v_limit, reach_deg in product((3.5, 4.5), (40.0, 60.0)):
-        solver = ruststartracker(camera, stars, v_limit, np.radians(reach_deg))
+    for v_limit, radius_deg in product((3.5, 4.5), (40.0, 60.0)):
+        solver = ruststartracker(camera, stars, v_limit, np.radians(radius_deg))
         spent, solved = [], 0
         for listed in lists:
             solve = solver(listed)
@@ -120,13 +120,13 @@ def best_ruststartracker(camera: Camera, stars: Stars, lists: list[StarList]) ->
             spent.append(time.process_time() - start)
         score = (-solved, float(np.median(spent)))
         if best is None or score < best[0]:
-            best = (score, solver, f"V < {v_limit:g}, {reach_deg:g} degrees")
+            best = (score, solver, f"V < {v_limit:g}, {radius_deg:g} degrees")
     assert best is not None
     return best[1], best[2]
 
 
-def missing() -> list[str]:
-    """A line for each program that is not here."""
+def missing_programs() -> list[str]:
+    """A line for each program that is not installed."""
     return [] if find_spec("ruststartracker") else ["ruststartracker is not installed: left out"]
 
 
@@ -169,23 +169,23 @@ def cedar(python: str, camera: Camera, field_rad: float) -> Solver:
     stdout.readline()
 
     def prepare(listed: StarList) -> Callable[[], Elsewhere]:
-        asked = {"xy_px": listed.xy_px.tolist(), "size_px": camera.size_px, "fov_deg": float(np.degrees(field_rad))}
+        request = {"xy_px": listed.xy_px.tolist(), "size_px": camera.size_px, "fov_deg": float(np.degrees(field_rad))}
 
         def solve() -> Elsewhere:
-            stdin.write(json.dumps(asked) + "\n")
+            stdin.write(json.dumps(request) + "\n")
             stdin.flush()
-            said = json.loads(stdout.readline())
-            answer = None if said["RA"] is None else Answer(_attitude(said), NO_NAMES, NO_NAMES)
-            return Elsewhere(answer, said["ms"])
+            reply = json.loads(stdout.readline())
+            answer = None if reply["RA"] is None else Answer(_attitude(reply), NO_NAMES, NO_NAMES)
+            return Elsewhere(answer, reply["ms"])
 
         return solve
 
     return prepare
 
 
-def _attitude(said: dict[str, float]) -> np.ndarray:
+def _attitude(reply: dict[str, float]) -> np.ndarray:
     """R_cam_icrs from the boresight and the angle of the image's top against north."""
-    ra, dec, roll = np.radians([said["RA"], said["Dec"], said["Roll"]])
+    ra, dec, roll = np.radians([reply["RA"], reply["Dec"], reply["Roll"]])
     ahead = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     north = np.cross(ahead, east)

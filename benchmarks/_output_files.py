@@ -26,27 +26,27 @@ def output_files(folder: Path) -> dict[str, Path]:
 
 
 def read_values(path: Path) -> dict[str, Any]:
-    """All values of a file, without what is ignored; those of text tables are texts as printed."""
+    """All values of a file except ignored ones; those of text tables are texts as printed."""
     if path.suffix in TEXT_TABLES:
-        return dict(_flat(_text_table(path)))
+        return dict(_flatten(_read_text_table(path)))
     if path.suffix in (".wcs", ".corr"):
-        return dict(_flat(_fits(path)))
+        return dict(_flatten(_read_fits(path)))
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".toml":
-        return dict(_flat(tomllib.loads(text)))
+        return dict(_flatten(tomllib.loads(text)))
     if path.suffix == ".jsonl":
-        return dict(_flat([json.loads(line) for line in text.splitlines()]))
-    return dict(_flat(json.loads(text)))
+        return dict(_flatten([json.loads(line) for line in text.splitlines()]))
+    return dict(_flatten(json.loads(text)))
 
 
-def _flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+def _flatten(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
     if isinstance(value, dict):
         for name, inner in value.items():
             if name not in IGNORED_KEYS:
-                yield from _flat(inner, f"{key}.{name}" if key else str(name))
+                yield from _flatten(inner, f"{key}.{name}" if key else str(name))
     elif isinstance(value, list):
         for label, inner in zip(_labels(value), value, strict=True):
-            yield from _flat(inner, f"{key}[{label}]")
+            yield from _flatten(inner, f"{key}[{label}]")
     elif isinstance(value, str):
         yield key, re.sub(r"(?<![\w.])/(?:[^\s/'\"]+/)+", "", value)  # without the folders of absolute paths
     else:
@@ -54,7 +54,7 @@ def _flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _labels(rows: list[Any]) -> list[Any]:
-    """What the elements of a list are called: by the first key whose values are given and unique, else by number."""
+    """Labels of the elements of a list: values of the first key that are present and unique, else numbers."""
     if rows and all(isinstance(row, dict) for row in rows):
         for name in LABELS:
             values = [row.get(name) for row in rows]
@@ -63,7 +63,7 @@ def _labels(rows: list[Any]) -> list[Any]:
     return list(range(len(rows)))
 
 
-def _text_table(path: Path) -> list[dict[str, str]]:
+def _read_text_table(path: Path) -> list[dict[str, str]]:
     """The rows of an ECSV, CSV or TUM file; lines that start with # are comments."""
     lines = path.read_text(encoding="utf-8").splitlines()
     comma = path.suffix == ".csv" or any(line.startswith("# delimiter: ','") for line in lines[:20])
@@ -72,7 +72,7 @@ def _text_table(path: Path) -> list[dict[str, str]]:
     return [dict(zip(head, row, strict=True)) for row in rows]
 
 
-def _fits(path: Path) -> dict[str, Any]:
+def _read_fits(path: Path) -> dict[str, Any]:
     """Primary header and, if there is one, the table of the first extension."""
     from astropy.io import fits  # here, since it takes most of a second
 

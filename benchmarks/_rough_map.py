@@ -1,4 +1,4 @@
-"""A rough map of a user's own: a crater of 9 km with fractal roughness, brought in by `startrack terrain import`.
+"""A user's own rough map: a crater of 9 km with fractal roughness, imported by `startrack terrain import`.
 
     python benchmarks/_rough_map.py FOLDER
 
@@ -30,7 +30,7 @@ SEED = 30
 
 
 def rough_terrain(folder: Path) -> Path:
-    """The terrain file in the folder, made where it is not there."""
+    """The terrain file in the folder; it is made if it does not exist."""
     terrain, source = folder / "rough.toml", folder / "rough-source.tif"
     if terrain.exists():
         return terrain

@@ -25,7 +25,7 @@ class Frame:
     xy_px: np.ndarray  # (n, 2)
     snr: np.ndarray  # (n,) of a matched filter with the true PSF, the star's own photon noise included
     bound_px: np.ndarray  # (n,) Cramer-Rao bound of one coordinate, flux and level unknown
-    alone: np.ndarray  # (n,) no neighbour and no border near
+    alone: np.ndarray  # (n,) without a near neighbour or border
 
 
 def profiles(offset_px: np.ndarray, sigma_px: float, radius: int) -> tuple[np.ndarray, np.ndarray]:
@@ -38,7 +38,7 @@ def profiles(offset_px: np.ndarray, sigma_px: float, radius: int) -> tuple[np.nd
 def star_frame(
     sigma_px: float, stars: int, snr_range: tuple[float, float], *, rng: np.random.Generator, size_px: int = 2048
 ) -> Frame:
-    """`stars` at random places, their SNR spread evenly in the logarithm over `snr_range`."""
+    """`stars` at random positions, their SNR uniform in the logarithm over `snr_range`."""
     xy = rng.uniform(0, size_px - 1, (stars, 2))
     pixel = np.rint(xy).astype(int)
     radius = int(np.ceil(5 * sigma_px)) + 1

@@ -1,6 +1,6 @@
 """Star lists for the identification benchmark: catalogue stars at a random attitude, noise, false stars, an order.
 
-Two stars within CLOSE_PX are one light: the list holds them once, under the brighter one's name.
+Two stars within CLOSE_PX are blended: the list holds them once, under the brighter one's name.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class StarList:
     noise_px: float
 
     def detections(self) -> Detections:
-        """As the package's detector would give them."""
+        """The list in the form of the package's detector."""
         n, flux = len(self.xy_px), 10 ** (-0.4 * (self.v_mag - ZERO_MAG))
         return Detections(
             xy_px=self.xy_px, covariance_px2=np.tile(self.noise_px**2 * np.eye(2), (n, 1, 1)), flux_e=flux,
@@ -42,12 +42,12 @@ class StarList:
 
 @dataclass(frozen=True)
 class Trouble:
-    """What befalls a list."""
+    """Disturbances of a list."""
 
     hidden: float = 0.0  # part of the stars, on one side of the field
     scatter_mag: float = SCATTER_MAG
-    strangers: int = 0  # lights brighter than any star: planets, lamps, hot pixels
-    mirrored: bool = False  # the image is a mirror image of what the camera says: no answer is right
+    strangers: int = 0  # sources brighter than any star: planets, lamps, hot pixels
+    mirrored: bool = False  # the image is a mirror image, contrary to the camera: no answer is right
 
 
 def star_list(
@@ -64,7 +64,7 @@ def star_list(
     seen = seen[: 3 * true + 20]  # the stars are sorted, brightest first
     pairs = cKDTree(px[seen]).query_pairs(CLOSE_PX, output_type="ndarray")
     star = np.delete(seen, pairs.max(axis=1) if len(pairs) else [])[:true]
-    strange = scattered(camera, false + trouble.strangers, rng=rng)
+    strange = random_positions(camera, false + trouble.strangers, rng=rng)
     v = stars.v_mag[star] + rng.normal(0, trouble.scatter_mag, len(star))
     like = v if true else 6 + np.log(rng.random(false)) / 1.08  # the magnitudes of a real sky
     v = np.concatenate([v, rng.choice(like, false), like.min() - 2 * rng.random(trouble.strangers)])
@@ -77,7 +77,7 @@ def star_list(
     return StarList(xy[order], v[order], truth[order], R, noise_px)
 
 
-def scattered(camera: Camera, n: int, *, rng: np.random.Generator) -> np.ndarray:
-    """Random places (n, 2) within the frame and the image circle."""
+def random_positions(camera: Camera, n: int, *, rng: np.random.Generator) -> np.ndarray:
+    """Random positions (n, 2) within the frame and the image circle."""
     xy = rng.uniform(0, np.array(camera.size_px) - 1, (3 * n + 20, 2))
     return xy[camera.angle_rad(xy) < camera.max_angle_rad][:n]

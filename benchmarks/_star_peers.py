@@ -16,23 +16,23 @@ NO_STARS = np.zeros((0, 2))
 
 
 def startrack(image: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Ours, with a camera file that knows the gain and the PSF."""
+    """Ours, with a camera file with gain and PSF."""
     height, width = image.shape
     sensor = Sensor(zero_point_e_per_s=1e5, psf_sigma_px=sigma_px)
     camera = Camera(
         name="plain", size_px=(width, height), focal_px=(600.0, 600.0), centre_px=(width / 2, height / 2),
         max_angle_rad=1.6, calibrated_angle_rad=1.6, sensor=sensor,
     )  # fmt: skip
-    return _ours(image, camera)
+    return _detect_ours(image, camera)
 
 
 def startrack_blind(image: np.ndarray, sigma_px: float) -> np.ndarray:
     """Ours without a camera file: gain unknown, PSF measured from the image."""
     del sigma_px
-    return _ours(image, None)
+    return _detect_ours(image, None)
 
 
-def _ours(image: np.ndarray, camera: Camera | None) -> np.ndarray:
+def _detect_ours(image: np.ndarray, camera: Camera | None) -> np.ndarray:
     try:
         return np.asarray(Detector()(Exposure(pixels_adu=image, saturation_adu=65535.0), camera).xy_px)
     except TooFewStars:
@@ -90,7 +90,7 @@ def blurred_components(image: np.ndarray, sigma_px: float) -> np.ndarray:
     return np.stack([s / total for s in sums], axis=1)
 
 
-def available() -> dict[str, Finder]:
+def available_finders() -> dict[str, Finder]:
     """Name to detector of those that are installed; ours first."""
     from importlib.util import find_spec
 

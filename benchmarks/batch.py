@@ -82,7 +82,7 @@ def measure_runs(folder: Path, images: list[Path], single: int) -> tuple[list[li
 
 
 def render_frames(folder: Path, count: int) -> list[Path]:
-    """Render the frames that are not there yet; the paths of all."""
+    """Render the frames that do not exist yet; the paths of all."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     paths = [folder / "images" / f"{k // 100:02d}" / f"frame-{k:04d}.png" for k in range(count)]
     todo = [(path, k) for k, path in enumerate(paths) if not path.with_suffix(".json").exists()]
@@ -137,13 +137,13 @@ def run(folder: Path, images: list[Path], out: Path, jobs: int) -> Run:
 def watch(
     process: subprocess.Popen[str], most_s: float = np.inf, top: int | None = None, each: Callable[[], None] = int
 ) -> Run:
-    """Its time, and the peak memory of the processes below `top` (itself); killed with -9 after `most_s`.
+    """Time of a process, and the peak memory of the processes below `top` (itself); killed with -9 after `most_s`.
 
     `each` is called at every poll.
     """
     begin, peak = time.perf_counter(), 0
     while process.poll() is None:
-        peak = max(peak, sum(map(resident_bytes, family(top or process.pid))))
+        peak = max(peak, sum(map(resident_bytes, process_family(top or process.pid))))
         if time.perf_counter() - begin > most_s:
             os.kill(process.pid, signal.SIGKILL)
         each()
@@ -176,7 +176,7 @@ def run_on_cluster(folder: Path, images: list[Path], out: Path, workers: int) ->
         return watch(process, top=os.getpid(), each=kill_one), killed[0]
 
 
-def family(pid: int) -> list[int]:
+def process_family(pid: int) -> list[int]:
     """The process and all below it (Linux)."""
     found = [pid]
     for parent in found:

@@ -4,8 +4,8 @@
     python benchmarks/chain.py --folder FRAMES   frames with sidecar and truth, from any renderer (nothing is written)
 
 Conditions: 2048 px fisheye, V 6 on the axis at 5 sigma, the real sky with stars that the catalogue lacks, 3 % scatter
-of the fluxes beside the catalogue's own errors, hot pixels, cosmic rays, random places, dates 2024-2034, headings, tilt
-to 5 degrees.
+of the fluxes beside the catalogue's own errors, hot pixels, cosmic rays, random positions, dates 2024-2034, headings,
+tilt to 5 degrees.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ def main() -> None:
         (args.seed, number) for number in range(args.frames)
     ]  # fmt: skip
     with ProcessPoolExecutor(args.jobs) as pool:
-        rows = list(pool.map(from_file if args.folder else rendered, jobs))
+        rows = list(pool.map(locate_file if args.folder else locate_rendered, jobs))
     body = summary(rows)
     print(body)
     if not args.folder:
         write_section("Chain", f"python benchmarks/chain.py --frames {args.frames}", ("numpy", "scipy"), body)
 
 
-def rendered(job: tuple[int, int]) -> dict[str, Any]:
+def locate_rendered(job: tuple[int, int]) -> dict[str, Any]:
     """One random frame, located."""
     seed, number = job
     camera = replace(load_camera("fisheye-2048"), sensor=SENSOR)
@@ -71,10 +71,10 @@ def rendered(job: tuple[int, int]) -> dict[str, Any]:
     exposure, truth = render(scene, rng=rng)
     start = time.perf_counter()
     result = locate(exposure, camera, terrain, catalog)
-    return scored(result, truth.position_enu_m, truth.R_cam_icrs, time.perf_counter() - start)
+    return score_result(result, truth.position_enu_m, truth.R_cam_icrs, time.perf_counter() - start)
 
 
-def from_file(truth_path: Path) -> dict[str, Any]:
+def locate_file(truth_path: Path) -> dict[str, Any]:
     """One frame of a folder, located."""
     image = next(p for p in truth_path.parent.glob(truth_path.name.replace(".truth.json", ".*")) if p.suffix != ".json")
     truth = json.loads(truth_path.read_text())
@@ -82,17 +82,18 @@ def from_file(truth_path: Path) -> dict[str, Any]:
     start = time.perf_counter()
     result = locate(exposure, load_camera(exposure.camera or ""), load_terrain(exposure.terrain or ""), load_catalog())
     quat = np.array(truth["quat_xyzw_cam_icrs"])
-    return scored(result, np.array(truth["position_enu_m"]), R_from_quat_xyzw(quat), time.perf_counter() - start)
+    return score_result(result, np.array(truth["position_enu_m"]), R_from_quat_xyzw(quat), time.perf_counter() - start)
 
 
-def scored(result: Outcome, position_m: np.ndarray, R_cam_icrs: np.ndarray, seconds: float) -> dict[str, Any]:
+def score_result(result: Outcome, position_m: np.ndarray, R_cam_icrs: np.ndarray, seconds: float) -> dict[str, Any]:
     """Errors of one result."""
     row: dict[str, Any] = {"status": result.status, "reason": result.reason, "seconds": seconds}
     row["stage_ms"] = dict(result.timing_ms)
     value = last_value(result)
     if isinstance(value, Oriented):
-        turn = R_cam_icrs @ value.attitude.R_cam_icrs.T
-        w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+        rotation = R_cam_icrs @ value.attitude.R_cam_icrs.T
+        antisymmetric = 0.5 * (rotation - rotation.T)
+        w = antisymmetric[[2, 0, 1], [1, 2, 0]]
         row["attitude_arcsec"] = float(np.linalg.norm(w) * ARCSEC)
         row["attitude_nees"] = float(w @ np.linalg.solve(value.attitude.covariance_rad2, w))
         row["wrong"], row["matches"] = wrong_identities(value, R_cam_icrs)
@@ -116,13 +117,13 @@ def wrong_identities(result: Identified, R_cam_icrs: np.ndarray) -> tuple[int, i
 
 def peers(result: Located, position_m: np.ndarray) -> dict[str, float]:
     """The thesis's methods on this frame's own list: catalogue stars to the detection limit, seen when identified."""
-    light = result.light
-    seen = np.isin(light.star, result.identification.star)
-    listed = seen | (light.expected_e > 5.0 * np.maximum(light.sigma_e, 1e-9))
-    listed &= light.usable & (light.elevation_rad > np.radians(3.0))
+    photometry = result.light
+    seen = np.isin(photometry.star, result.identification.star)
+    listed = seen | (photometry.expected_e > 5.0 * np.maximum(photometry.sigma_e, 1e-9))
+    listed &= photometry.usable & (photometry.elevation_rad > np.radians(3.0))
     evidence = Evidence(
-        azimuth_rad=light.azimuth_rad[listed],
-        elevation_rad=light.elevation_rad[listed],
+        azimuth_rad=photometry.azimuth_rad[listed],
+        elevation_rad=photometry.elevation_rad[listed],
         llr=np.where(seen[listed], 9.0, -9.0),
         edge_sigma_rad=np.zeros(int(listed.sum())),
     )
@@ -154,12 +155,12 @@ def summary(rows: list[dict[str, Any]]) -> str:
     nees = column("nees")
     ok, ambiguous = (sum(row["status"] == status for row in rows) for status in ("ok", "ambiguous"))
     wrong, matches = int(column("wrong").sum()), int(column("matches").sum())
-    arcsec, turn = float(np.median(column("attitude_arcsec"))), float(column("attitude_nees").mean())
+    arcsec, attitude_nees = float(np.median(column("attitude_arcsec"))), float(column("attitude_nees").mean())
     in95, in999 = 100 * float(column("in95").mean()), 100 * float(column("in999").mean())
     figures = [
         ["frames", f"{len(rows)}: {ok} ok, {ambiguous} ambiguous"],
         ["identified", f"{len(column('matches'))}; wrong identities {wrong} of {matches}"],
-        ["attitude", f"median {arcsec:.2f} arcsec, mean NEES {turn:.2f} (3 is perfect)"],
+        ["attitude", f"median {arcsec:.2f} arcsec, mean NEES {attitude_nees:.2f} (3 is perfect)"],
         ["position NEES", f"mean {nees.mean():.2f} (2 is perfect), median {np.median(nees):.2f}"],
         ["inside the stated circles", f"95 %: {in95:.0f} %, 99.9 %: {in999:.1f} %"],
         ["ms (median)", ", ".join(stages())],

@@ -5,8 +5,8 @@
 Read are JSON and JSON lines, ECSV, CSV and TUM tables, TOML, and the FITS files .wcs and .corr; hidden files, pictures,
 Markdown and Parquet (which repeats results.ecsv) are not. Numbers are equal within the relative tolerance or the
 absolute floor. Numbers of text tables are printed with a few digits: those that differ by one unit of the last digit
-are counted apart ("last digit") and are no failure. Left out are times of running, versions, hashes of jobs and of
-their inputs, and the folders of paths. Rows and objects are paired by name (catalog_id, image, hip, ...) where that is
+are counted separately ("last digit") and are no failure. Left out are run times, versions, hashes of jobs and of their
+inputs, and the folders of paths. Rows and objects are paired by name (catalog_id, image, hip, ...) where that is
 unique, else by number. Keys and rows that are on one side only are listed, and are no failure.
 
 Exit code 0: all equal; 1: a value differs, or a file of OLD is not in NEW; 2: nothing to compare.
@@ -145,7 +145,7 @@ def size(relative: float) -> str:
 
 
 def details(result: Compared) -> list[str]:
-    """What differs, one line for each kind of key (a column, say), and the keys on one side only."""
+    """The differences, one line for each kind of key (such as a column), and the keys on one side only."""
     kinds: dict[str, list[Difference]] = {}
     for difference in result.differ:
         kinds.setdefault(kind(difference.key), []).append(difference)

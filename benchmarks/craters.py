@@ -1,14 +1,14 @@
-"""Dark craters from their shipped maps, from pixels: places on floor and wall, no prior, by night.
+"""Dark craters from their shipped maps, from pixels: positions on floor and wall, no prior, by night.
 
     python benchmarks/craters.py [--terrain haworth de-gerlache kepler rough] [--floor 3] [--wall 2]
 
-"rough" is a map of a user's own (_rough_map.py), kept in a temporary folder; it gets 5 places on the floor and 5 on
-the wall.
+"rough" is a user's own map (_rough_map.py), kept in a temporary folder; it gets 5 positions on the floor and 5 on the
+wall.
 
 fisheye-2048 with its own sensor and default exposure (V 6 on the axis at 5 sigma), the sky, defects and headings as
 `startrack render` has them. Floor: slopes below 15 degrees; wall: 15 to 40. Times between 2025 and 2032 with the Sun
-below the horizon of a plain (half a degree above it in the polar craters, whose rims hide it). The Earth is up in
-Kepler always, in the others now and then.
+below the horizon of a plain (half a degree above it in the polar craters, whose rims hide it). The Earth is always up
+in Kepler, sometimes in the others.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
 
 FLOOR_DEG, WALL_DEG = (0.0, 15.0), (15.0, 40.0)
-ROUGH_PLACES = 5  # each on floor and wall
+ROUGH_POSITIONS = 5  # each on floor and wall
 HIGHEST_SUN = {True: np.sin(np.radians(0.5)), False: np.sin(np.radians(-3.0))}  # in polar craters, elsewhere
 POLAR_RAD = np.radians(60)
 
@@ -55,10 +55,11 @@ def main() -> None:
         assert isinstance(terrain, HeightMap)
         terrain.prepare()
         rng = np.random.default_rng(args.seed)
-        floor, wall = (ROUGH_PLACES, ROUGH_PLACES) if rough else (args.floor, args.wall)
-        places = [*drawn(terrain, floor, FLOOR_DEG, rng), *drawn(terrain, wall, WALL_DEG, rng)]
-        for number, (place, slope) in enumerate(places):
-            lines.append([name, *one(terrain, place, slope, night(terrain.site, rng), number, args.seed)])
+        floor, wall = (ROUGH_POSITIONS, ROUGH_POSITIONS) if rough else (args.floor, args.wall)
+        positions = [*draw_positions(terrain, floor, FLOOR_DEG, rng), *draw_positions(terrain, wall, WALL_DEG, rng)]
+        for number, (position, slope) in enumerate(positions):
+            when = draw_night(terrain.site, rng)
+            lines.append([name, *measure_position(terrain, position, slope, when, number, args.seed)])
             print(" | ".join(lines[-1]), flush=True)
     head = ["crater", "place, m", "slope, degrees", "horizon, degrees", "result", "error, m", "95 % circle, m",
             "99.9 %, m", "NEES", "s, position", "CPU s, all"]  # fmt: skip
@@ -66,21 +67,21 @@ def main() -> None:
     write_section("Dark craters", command, ("numpy", "scipy", "numba"), table(head, lines))
 
 
-def drawn(
+def draw_positions(
     terrain: HeightMap, count: int, slopes_deg: tuple[float, float], rng: np.random.Generator
 ) -> list[tuple[np.ndarray, float]]:
-    """Places (2,) in the search area with slopes in a range, and the slopes in degrees."""
+    """Positions (2,) in the search area with slopes in a range, and the slopes in degrees."""
     found: list[tuple[np.ndarray, float]] = []
     while len(found) < count:
-        turn, far = rng.uniform(0, 2 * np.pi), terrain.search_radius_m * np.sqrt(rng.random())
-        place = far * np.array([np.sin(turn), np.cos(turn)])
-        slope = float(np.degrees(terrain.slope_rad(place)))
+        azimuth, distance = rng.uniform(0, 2 * np.pi), terrain.search_radius_m * np.sqrt(rng.random())
+        position = distance * np.array([np.sin(azimuth), np.cos(azimuth)])
+        slope = float(np.degrees(terrain.slope_rad(position)))
         if slopes_deg[0] <= slope < slopes_deg[1]:
-            found.append((place, slope))
+            found.append((position, slope))
     return found
 
 
-def night(site: Site, rng: np.random.Generator) -> datetime:
+def draw_night(site: Site, rng: np.random.Generator) -> datetime:
     """A time at which the Sun is down."""
     while True:
         when = datetime(2025, 1, 1, tzinfo=UTC) + timedelta(seconds=float(rng.uniform(0, 8 * 365 * 86_400)))
@@ -89,25 +90,27 @@ def night(site: Site, rng: np.random.Generator) -> datetime:
             return when
 
 
-def one(terrain: HeightMap, place: np.ndarray, slope: float, when: datetime, number: int, seed: int) -> list[str]:
-    """Render, locate, and say what came of it."""
+def measure_position(
+    terrain: HeightMap, position: np.ndarray, slope: float, when: datetime, number: int, seed: int
+) -> list[str]:
+    """Render and locate one exposure; a row of the table."""
     camera, catalog = load_camera("fisheye-2048"), load_catalog()
     series = Series(
         camera=camera, terrain=terrain, catalog=catalog.brighter_than(10.0), seed=seed, time_utc=when,
-        east_m=float(place[0]), north_m=float(place[1]),
+        east_m=float(position[0]), north_m=float(position[1]),
     )  # fmt: skip
     scene, rng = series.scene(number, f"frame-{number:03d}")
     exposure, _ = render(scene, rng=rng)
     start = time.process_time()
     result = locate(exposure, camera, terrain, catalog)
     spent = time.process_time() - start
-    horizon = np.degrees(terrain.horizon_rad(place[None], np.radians(np.arange(360.0))))
-    where = [f"E {place[0]:.0f} N {place[1]:.0f}", f"{slope:.0f}", f"{horizon.min():.1f} to {horizon.max():.1f}"]
+    horizon = np.degrees(terrain.horizon_rad(position[None], np.radians(np.arange(360.0))))
+    where = [f"E {position[0]:.0f} N {position[1]:.0f}", f"{slope:.0f}", f"{horizon.min():.1f} to {horizon.max():.1f}"]
     times = [f"{result.timing_ms.get('locate', 0.0) / 1e3:.1f}", f"{spent:.1f}"]
     if not isinstance(result, Located) or result.status != "ok":
         return [*where, result.reason or result.status, *["-"] * 4, *times]
     fix: Any = result.fix
-    off = fix.position_enu_m[:2] - place
+    off = fix.position_enu_m[:2] - position
     nees = float(off @ np.linalg.solve(fix.covariance_m2, off))
     numbers = (float(np.hypot(*off)), fix.radius95_m, fix.radius999_m)
     return [*where, result.status, *[f"{value:.1f}" for value in numbers], f"{nees:.2f}", *times]

@@ -1,11 +1,11 @@
-"""What each part of the evidence buys, and what a longer exposure buys: from pixels to position, in one table each.
+"""Effect of each part of the evidence, and of a longer exposure: from pixels to position, in one table each.
 
     python benchmarks/evidence.py --frames 300 --deep-frames 100
 
-The true sky is Hipparcos and the Gaia stars that it lacks (extra `deep`); the locator takes Gaia's only where the frame
-is deep enough. "full" is what `locate` does; each other line leaves one part out, and the second measurement near the
-skyline too. 2048 px fisheye, 3 % scatter of the fluxes beside the catalogue's own errors, hot pixels, cosmic rays,
-random places, dates, headings, tilt to 5 degrees. All lines of a table see the same frames, or the first of them.
+The true sky is Hipparcos and the Gaia stars that it lacks (extra `deep`); the locator uses Gaia's only where the frame
+is deep enough. "full" is the method of `locate`; each other line omits one part, and the second measurement near the
+skyline. 2048 px fisheye, 3 % scatter of the fluxes beside the catalogue's own errors, hot pixels, cosmic rays, random
+positions, dates, headings, tilt to 5 degrees. All lines of a table use the same frames, or the first of them.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from startrack.catalog.gaia import load_deep_catalog
 from startrack.evidence import StarEvidence, StarPhotometry, flux_scale
 from startrack.localization import ExactPosterior
 from startrack.pipeline import Settings, locate
-from startrack.rendering import Series, exposure_reaching, render
+from startrack.rendering import Series, exposure_for_snr, render
 from startrack.stages import Located, Measured, last_value
 from startrack.terrain import load_terrain
 from startrack.types import Array, Evidence, Fix, NoSolution
 
 CHI2_2 = {"50": 1.3863, "95": 5.9915, "99.9": 13.8155}  # of two degrees of freedom
 LISTS = {"full": "as deep as the frame", "Hipparcos alone": "Hipparcos alone"}
-CERTAIN = 9.0  # nats: what a list says at most of one star
+CERTAIN = 9.0  # nats: largest evidence of a list for one star
 
 
 @dataclass(frozen=True)
 class Depth:
-    """How deep the frames are, and which lists look at them."""
+    """Depth of the frames, and the catalogues used for them."""
 
     v_mag: float
     frames: int
-    compared: int = 0  # the first ones are looked at with parts left out, and with Hipparcos alone
+    compared: int = 0  # number of frames evaluated with parts left out, and with Hipparcos alone
 
 
 def main() -> None:
@@ -61,7 +61,7 @@ def main() -> None:
     jobs = [(args.seed, depth, number) for depth in depths for number in range(depth.frames)]
     rows: dict[tuple[float, str], list[dict[str, Any]]] = {}
     with ProcessPoolExecutor(args.jobs) as pool:
-        for done, (job, lines) in enumerate(zip(jobs, pool.map(one, jobs), strict=True), 1):
+        for done, (job, lines) in enumerate(zip(jobs, pool.map(measure_frame, jobs), strict=True), 1):
             for name, row in lines.items():
                 rows.setdefault((job[1].v_mag, name), []).append(row)
             if done % 20 == 0:
@@ -93,31 +93,31 @@ def line(rows: list[dict[str, Any]]) -> list[str]:
     return [str(len(rows)), str(len(rows) - len(good)), *spread, *inside, circle]
 
 
-def one(job: tuple[int, Depth, int]) -> dict[str, dict[str, Any]]:
+def measure_frame(job: tuple[int, Depth, int]) -> dict[str, dict[str, Any]]:
     """One frame by every method: name to its figures."""
     seed, depth, number = job
     sky, catalog = load_deep_catalog(), load_catalog()
     camera, terrain = replace(load_camera("fisheye-2048"), sensor=SENSOR), load_terrain("shackleton-thesis")
     series = Series(
         camera=camera, terrain=terrain, catalog=sky, seed=seed, hot_pixels=200, cosmic_rays=30, faint_v_mag=None,
-        exposure_s=exposure_reaching(camera, 22.0, v_mag=depth.v_mag, snr=5.0),
+        exposure_s=exposure_for_snr(camera, 22.0, v_mag=depth.v_mag, snr=5.0),
     )  # fmt: skip
     scene, rng = series.scene(number)
     exposure, truth = render(scene, rng=rng)
-    place = truth.position_enu_m[:2]
+    position = truth.position_enu_m[:2]
     fast = Settings(localizer=ExactPosterior())
     result = locate(exposure, camera, terrain, catalog, fast)
-    rows = {"full": _scored(_fix(result), place)}
+    rows = {"full": _score_fix(_fix(result), position)}
     value = last_value(result)
     if number < depth.compared and isinstance(value, Measured):
         plain = locate(exposure, camera, terrain, catalog, replace(fast, deep_stars=False))
-        rows["Hipparcos alone"] = _scored(_fix(plain), place)
+        rows["Hipparcos alone"] = _score_fix(_fix(plain), position)
         for name, evidence, localizer in _ablations(value):
             try:
                 fix = localizer(evidence, terrain)
             except NoSolution:
                 fix = None
-            rows[name] = _scored(fix, place)
+            rows[name] = _score_fix(fix, position)
     return rows
 
 
@@ -125,43 +125,44 @@ def _fix(outcome: Any) -> Fix | None:
     return outcome.fix if isinstance(outcome, Located) and not outcome.fix.ambiguous else None
 
 
-def _scored(fix: Fix | None, place_m: Array) -> dict[str, Any]:
+def _score_fix(fix: Fix | None, position_m: Array) -> dict[str, Any]:
     if fix is None:
         return {}
-    d = fix.position_enu_m[:2] - place_m
+    d = fix.position_enu_m[:2] - position_m
     error = float(np.hypot(*d))
     return {"error_m": error, "nees": float(d @ np.linalg.solve(fix.covariance_m2, d)), "in95": error < fix.radius95_m}
 
 
 def _ablations(result: Measured) -> Iterator[tuple[str, Evidence, ExactPosterior]]:
     full = ExactPosterior()
-    yield "without remeasuring near the skyline", _light(result).evidence(), full
-    yield "list at 5 sigma", _listed(result.light, 5.0), full
-    yield "list at 3 sigma", _listed(result.light, 3.0), full
-    lonely = _light(result, visible=np.zeros(len(result.stars)))  # neighbours that never shine
+    yield "without remeasuring near the skyline", _photometry(result).evidence(), full
+    yield "list at 5 sigma", _list_evidence(result.light, 5.0), full
+    yield "list at 3 sigma", _list_evidence(result.light, 3.0), full
+    lonely = _photometry(result, visible=np.zeros(len(result.stars)))  # neighbours that are never visible
     yield "without crowding", lonely.evidence(), full
-    yield "without flux uncertainty", _light(result, certain=True).evidence(), full
-    plain = _light(result, settings=StarEvidence(capped=False))
+    yield "without flux uncertainty", _photometry(result, certain=True).evidence(), full
+    plain = _photometry(result, settings=StarEvidence(capped=False))
     yield "without caps", plain.evidence(), replace(full, sector_epsilon=0.0)
 
 
-def _listed(light: StarPhotometry, threshold: float) -> Evidence:
-    """What a list says: each star that should pass the threshold either did or did not, and no more."""
+def _list_evidence(photometry: StarPhotometry, threshold: float) -> Evidence:
+    """Evidence of a list: whether each star expected above the threshold was detected, and nothing else."""
     from scipy.stats import norm
 
-    use = light.usable & (light.expected_e > threshold * light.sigma_e)
-    expected, seen = light.expected_e[use] / light.sigma_e[use], light.flux_e[use] > threshold * light.sigma_e[use]
+    use = photometry.usable & (photometry.expected_e > threshold * photometry.sigma_e)
+    expected = photometry.expected_e[use] / photometry.sigma_e[use]
+    seen = photometry.flux_e[use] > threshold * photometry.sigma_e[use]
     present = norm.logsf(threshold - expected) - norm.logsf(threshold)
     absent = norm.logcdf(threshold - expected) - norm.logcdf(threshold)
     return Evidence(
-        azimuth_rad=light.azimuth_rad[use],
-        elevation_rad=light.elevation_rad[use],
+        azimuth_rad=photometry.azimuth_rad[use],
+        elevation_rad=photometry.elevation_rad[use],
         llr=np.clip(np.where(seen, present, absent), -CERTAIN, CERTAIN),
         edge_sigma_rad=np.zeros(int(use.sum())),
     )
 
 
-def _light(
+def _photometry(
     result: Measured, *, visible: Array | None = None, certain: bool = False, settings: StarEvidence | None = None
 ) -> StarPhotometry:
     """The frame's evidence once more, with a part left out."""

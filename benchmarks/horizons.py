@@ -2,9 +2,9 @@
 
     python benchmarks/horizons.py [--places 5]
 
-Random places of the inner two thirds of the search area (floor and wall), 720 azimuths each, on one core. The surface:
-bilinear between posts in the map's own projection. Embree sees triangles of 48 m (Kepler 24 m; 7 m
-within 900 m), and halves down to the elevation where rays begin to miss; its scene's making is not in its time.
+Random positions in the inner two thirds of the search area (floor and wall), 720 azimuths each, on one core. The
+surface: bilinear between posts in the map's own projection. Embree gets triangles of 48 m (Kepler 24 m; 7 m
+within 900 m) and finds the horizon by bisection in elevation; the time for building its scene is not included.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ def main() -> None:
     args = parser.parse_args()
     lines = []
     for name, half_m in CROPS_M.items():
-        terrain = cropped(name, half_m)
+        terrain = crop_terrain(name, half_m)
         rng = np.random.default_rng(args.seed)
-        turn, far = rng.uniform(0, 2 * np.pi, args.places), 0.67 * np.sqrt(rng.random(args.places))
-        places = terrain.search_radius_m * far[:, None] * np.column_stack([np.sin(turn), np.cos(turn)])
-        lines += compared(name, terrain, places)
+        azimuth, distance = rng.uniform(0, 2 * np.pi, args.places), 0.67 * np.sqrt(rng.random(args.places))
+        positions = terrain.search_radius_m * distance[:, None] * np.column_stack([np.sin(azimuth), np.cos(azimuth)])
+        lines += compare_methods(name, terrain, positions)
         print("\n".join(" ".join(line) for line in lines[-4:]), flush=True)
     body = table(
         ["map", "method", "horizons", "RMS from Embree, degrees", "mean", "largest", "CPU microseconds a horizon"],
@@ -52,36 +52,36 @@ def main() -> None:
     )
 
 
-def cropped(name: str, half_m: float) -> HeightMap:
-    """The terrain with its finest map alone, as far as that matters."""
+def crop_terrain(name: str, half_m: float) -> HeightMap:
+    """The terrain with a crop of its finest map alone."""
     whole = load_terrain(name)
     assert isinstance(whole, HeightMap)
     crop = whole.maps[0].crop_around(whole.site.latitude_rad, whole.site.longitude_rad, half_m)
     return replace(whole, maps=(crop,))
 
 
-def compared(name: str, terrain: HeightMap, places: np.ndarray) -> list[list[str]]:
+def compare_methods(name: str, terrain: HeightMap, positions: np.ndarray) -> list[list[str]]:
     """One row per method."""
     step_m = terrain.maps[0].post_m / 8
     methods: dict[str, tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], int]] = {
         "startrack": (lambda p, a: terrain.horizon_rad(p[None], a), 1),
-        f"march in steps of {step_m:.0f} m, numba": (lambda p, a: marched_in_numba(terrain, p, a, step_m), 1),
-        f"march in steps of {step_m:.0f} m, numpy": (lambda p, a: marched_in_numpy(terrain, p, a, step_m), NUMPY_EVERY),
+        f"march in steps of {step_m:.0f} m, numba": (lambda p, a: march_numba(terrain, p, a, step_m), 1),
+        f"march in steps of {step_m:.0f} m, numpy": (lambda p, a: march_numpy(terrain, p, a, step_m), NUMPY_EVERY),
     }
     truth, spent, inside = [], 0.0, []
-    for place in places:
-        embree = EmbreeHorizons(terrain, place)
+    for position in positions:
+        embree = EmbreeHorizons(terrain, position)
         start = time.process_time()
         truth.append(embree.horizon_rad(AZIMUTHS_RAD))
         spent += time.process_time() - start
-        _, distance, edge = terrain.horizons(place[None], AZIMUTHS_RAD)
-        inside.append(distance < edge - 2 * terrain.maps[0].post_m)  # where the crop ends, its last cell is nobody's
-    count = len(places) * len(AZIMUTHS_RAD)
+        _, distance, edge = terrain.horizons(position[None], AZIMUTHS_RAD)
+        inside.append(distance < edge - 2 * terrain.maps[0].post_m)  # without the last cell of the crop
+    count = len(positions) * len(AZIMUTHS_RAD)
     rows = [[name, "Embree", str(count), "-", "-", "-", f"{1e6 * spent / count:.0f}"]]
     for method, (function, every) in methods.items():
-        function(places[0], AZIMUTHS_RAD[:2])  # compiles
+        function(positions[0], AZIMUTHS_RAD[:2])  # compiles
         start = time.process_time()
-        found = [function(place, AZIMUTHS_RAD[::every]) for place in places]
+        found = [function(position, AZIMUTHS_RAD[::every]) for position in positions]
         spent = time.process_time() - start
         off = np.degrees(
             np.concatenate([(f - t[::every])[i[::every]] for f, t, i in zip(found, truth, inside, strict=True)])
@@ -101,22 +101,22 @@ def _march(grid, posts, heights, moon, points, up, azimuths, step_m, end_m, tan)
             tan[k] = max(tan[k], (z - up[k]) / s)
 
 
-def marched_in_numba(terrain: HeightMap, place: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
+def march_numba(terrain: HeightMap, position: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
     """Small steps, compiled; the surface is startrack's own."""
     ground, tan = terrain.ground, np.full(len(azimuths), -50.0)
-    places = np.repeat(place[None], len(azimuths), axis=0)
-    up, end = terrain.ground_m(places) + terrain.camera_height_m, CROPS_M[terrain.name]
-    _march(ground.grid, ground.posts, ground.heights, ground.radius_m, places, up, azimuths, step_m, end, tan)
+    positions = np.repeat(position[None], len(azimuths), axis=0)
+    up, end = terrain.ground_m(positions) + terrain.camera_height_m, CROPS_M[terrain.name]
+    _march(ground.grid, ground.posts, ground.heights, ground.radius_m, positions, up, azimuths, step_m, end, tan)
     return np.arctan(tan)
 
 
-def marched_in_numpy(terrain: HeightMap, place: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
+def march_numpy(terrain: HeightMap, position: np.ndarray, azimuths: np.ndarray, step_m: float) -> np.ndarray:
     """Small steps, a ray at a time, with numpy alone."""
     s, maps = np.arange(step_m, CROPS_M[terrain.name], step_m), list(terrain.maps)
-    up = ground_up_m(terrain.site, maps, place) + terrain.camera_height_m
+    up = ground_up_m(terrain.site, maps, position) + terrain.camera_height_m
     found = np.empty(len(azimuths))
     for k, azimuth in enumerate(azimuths):
-        z = ground_up_m(terrain.site, maps, place + s[:, None] * np.array([np.sin(azimuth), np.cos(azimuth)]))
+        z = ground_up_m(terrain.site, maps, position + s[:, None] * np.array([np.sin(azimuth), np.cos(azimuth)]))
         found[k] = np.arctan(np.nanmax((z - up) / s))
     return found
 

@@ -2,8 +2,8 @@
 
     python benchmarks/localizer.py --places 300
 
-Every method gets the same evidence (2142 stars, perfect lists) and gives a Fix; rounds alternate, so that a busy
-machine disturbs all alike, and the ratio is the median over the rounds. The pseudo-gradient is vectorised and stops as
+Every method gets the same evidence (2142 stars, perfect lists) and returns a Fix; the methods alternate, so that a busy
+machine affects all equally, and the ratio is the median over the rounds. The pseudo-gradient is vectorised and stops as
 soon as its two sets of stars agree.
 """
 
@@ -23,7 +23,7 @@ from startrack.reproduction.simulator import (
     PERFECT,
     Sky,
     crater,
-    draw_places,
+    draw_positions,
     visible_stars,
 )
 from startrack.types import Evidence, Fix
@@ -37,8 +37,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--places", type=int, default=300)
     args = parser.parse_args()
-    cylinder, truth, lists = crater(ASPECT_RATIO), draw_places(SEED, 0, 0, args.places), thesis_lists(args.places)
-    methods: dict[str, tuple[Callable[..., Fix], int]] = {  # and how many of the lists it gets
+    cylinder, truth, lists = crater(ASPECT_RATIO), draw_positions(SEED, 0, 0, args.places), thesis_lists(args.places)
+    methods: dict[str, tuple[Callable[..., Fix], int]] = {  # and the number of lists
         "pseudo-gradient (Kua 2008)": (PseudoGradient(), args.places),
         "exact posterior": (ExactPosterior(sector_epsilon=0.0), args.places),
         "the same, with floors for unmapped obstacles": (ExactPosterior(), args.places),
@@ -47,7 +47,7 @@ def main() -> None:
     errors = {
         name: np.mean([error_m(method(e, cylinder), p) for e, p in zip(lists[:n], truth[:n], strict=True)])
         for name, (method, n) in methods.items()
-    }  # and whatever has to be compiled is, before the clock starts
+    }  # kernels are compiled before the timing
     for _ in range(ROUNDS):
         for name, (method, n) in methods.items():
             start = time.thread_time()
@@ -65,16 +65,16 @@ def main() -> None:
 
 
 def thesis_lists(count: int) -> list[Evidence]:
-    """Perfect lists of one of the thesis's random skies at random places."""
+    """Perfect lists of one of the thesis's random skies at random positions."""
     sky, cylinder = Sky.draw(SEED, 0, MAGNITUDE), crater(ASPECT_RATIO)
-    points = sky.on_rim_plane(cylinder)
-    seen = [visible_stars(points, place, cylinder.radius_m) for place in draw_places(SEED, 0, 0, count)]
+    points = sky.project_to_rim_plane(cylinder)
+    seen = [visible_stars(points, position, cylinder.radius_m) for position in draw_positions(SEED, 0, 0, count)]
     return [PERFECT.evidence(sky, PERFECT.draw_list(one, SEED, 0, k)) for k, one in enumerate(seen)]
 
 
-def error_m(fix: Fix, place_m: np.ndarray) -> float:
+def error_m(fix: Fix, position_m: np.ndarray) -> float:
     """Distance of a fix from the truth."""
-    return float(np.linalg.norm(fix.position_enu_m[:2] - place_m))
+    return float(np.linalg.norm(fix.position_enu_m[:2] - position_m))
 
 
 if __name__ == "__main__":

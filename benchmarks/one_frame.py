@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def locate(image: str) -> Any:
-    """The frame's solution; what the chain reports of its stages is CPU time here."""
+    """The frame's solution; the stage times of the chain are CPU times here."""
     with mock.patch("time.perf_counter", time.process_time):
         solution = startrack.locate(image)
     if not solution:

@@ -1,4 +1,4 @@
-"""What the fix does when the world is not as told: from pixels, one kind of trouble at a time.
+"""Fixes with wrong inputs or disturbed scenes: from pixels, one kind of trouble at a time.
 
     python benchmarks/robustness.py --frames 16
 
@@ -35,7 +35,7 @@ BOULDER_AZIMUTH_RAD = np.radians(75.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Obstructed(Cylinder):
-    """The crater with a ridge that no map shows: `width` of azimuth, `height` above the crater's own horizon."""
+    """The crater with an unmapped ridge: `width` of azimuth, `height` above the crater's own horizon."""
 
     width_rad: float
     height_rad: float
@@ -48,20 +48,20 @@ class Obstructed(Cylinder):
 
 @dataclass(frozen=True)
 class Trouble:
-    """How the world differs from what the locator is told."""
+    """Difference between the true scene and the inputs of the locator."""
 
     name: str
     world: Callable[[Cylinder], Cylinder] = lambda crater: crater
-    told: Callable[[Cylinder], Cylinder] = lambda crater: crater
+    stated: Callable[[Cylinder], Cylinder] = lambda crater: crater
     clock_s: float = 0.0
     tilt_deg: float = 5.0
-    swapped: float = 0.0  # part of the catalogue's stars whose identities are mixed up
+    swapped: float = 0.0  # fraction of the catalogue's stars with exchanged identities
     attitude_bias_arcsec: float = 0.0  # about each axis of the camera
 
 
 @dataclass(frozen=True)
 class Biased:
-    """The evidence taken at an attitude that is wrong by a rotation."""
+    """The evidence measured at an attitude with an error."""
 
     arcsec: float
 
@@ -81,13 +81,13 @@ TROUBLES = (
     Trouble("none"),
     Trouble("ridge of 5 by 5 degrees", world=ridge(5, 5)),
     Trouble("ridge of 20 by 10 degrees", world=ridge(20, 10)),
-    Trouble("depth 1 % too large", told=lambda c: replace(c, depth_m=1.01 * c.depth_m)),
-    Trouble("depth 1 % too small", told=lambda c: replace(c, depth_m=0.99 * c.depth_m)),
-    Trouble("diameter 1 % too large", told=lambda c: replace(c, diameter_m=1.01 * c.diameter_m)),
-    Trouble("diameter 1 % too small", told=lambda c: replace(c, diameter_m=0.99 * c.diameter_m)),
+    Trouble("depth 1 % too large", stated=lambda c: replace(c, depth_m=1.01 * c.depth_m)),
+    Trouble("depth 1 % too small", stated=lambda c: replace(c, depth_m=0.99 * c.depth_m)),
+    Trouble("diameter 1 % too large", stated=lambda c: replace(c, diameter_m=1.01 * c.diameter_m)),
+    Trouble("diameter 1 % too small", stated=lambda c: replace(c, diameter_m=0.99 * c.diameter_m)),
     Trouble(
         "depth 1 % too large, depth_sigma_m 20",
-        told=lambda c: replace(c, depth_m=1.01 * c.depth_m, depth_sigma_m=0.01 * c.depth_m),
+        stated=lambda c: replace(c, depth_m=1.01 * c.depth_m, depth_sigma_m=0.01 * c.depth_m),
     ),
     Trouble("clock wrong by one hour", clock_s=3600.0),
     Trouble("3 % of identities wrong", swapped=0.03),
@@ -99,14 +99,14 @@ TROUBLES = (
 
 
 def main() -> None:
-    """Run all troubles on the same places and write the section."""
+    """Run all troubles at the same positions and write the section."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=16)
     parser.add_argument("-j", "--jobs", type=int, default=2)
     args = parser.parse_args()
     jobs = [(index, number) for index in range(len(TROUBLES)) for number in range(args.frames)]
     with ProcessPoolExecutor(args.jobs) as pool:
-        rows = list(pool.map(one, jobs, chunksize=4))
+        rows = list(pool.map(measure_frame, jobs, chunksize=4))
     body = table(
         ["trouble", "located", "refused or ambiguous", "mean error, m", "max", "beyond the 99.9 % circle", "caught"],
         [summary(t, [r for (i, _), r in zip(jobs, rows, strict=True) if i == k]) for k, t in enumerate(TROUBLES)],
@@ -115,7 +115,7 @@ def main() -> None:
     write_section("Robustness", f"python benchmarks/robustness.py --frames {args.frames}", ("numpy", "scipy"), body)
 
 
-def one(job: tuple[int, int]) -> dict[str, Any]:
+def measure_frame(job: tuple[int, int]) -> dict[str, Any]:
     """One frame under one trouble."""
     trouble, number = TROUBLES[job[0]], job[1]
     true = load_terrain("shackleton-thesis")
@@ -136,7 +136,7 @@ def one(job: tuple[int, int]) -> dict[str, Any]:
         catalog = replace(catalog, rays_icrs=rays)
     evidence = Biased(trouble.attitude_bias_arcsec) if trouble.attitude_bias_arcsec else StarEvidence()
     settings = Settings(localizer=ExactPosterior(), evidence=evidence)  # type: ignore[arg-type]
-    result = locate(exposure, scene.camera, trouble.told(true), catalog, settings)
+    result = locate(exposure, scene.camera, trouble.stated(true), catalog, settings)
     if not isinstance(result, Located) or result.status != "ok":
         return {"status": result.status, "reason": result.reason}
     error = float(np.linalg.norm((result.fix.position_enu_m - truth.position_enu_m)[:2]))

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from _results import table, write_section
 from _star_frames import Frame, star_frame
-from _star_peers import Finder, available
+from _star_peers import Finder, available_finders
 from scipy.spatial import cKDTree
 
 WIDTHS_PX = (0.6, 0.8, 1.0, 1.2, 2.0, 3.0)
@@ -30,7 +30,7 @@ PEERS = ("numpy", "opencv-contrib-python-headless", "sep", "photutils", "tetra3r
 
 @dataclass
 class Tally:
-    """What one detector did over the frames of one PSF width."""
+    """Results of one detector on the frames of one PSF width."""
 
     ms_per_mpx: list[float] = field(default_factory=list)
     snr: list[np.ndarray] = field(default_factory=list)
@@ -39,8 +39,8 @@ class Tally:
     false: int = 0
     mpx: float = 0.0
 
-    def found(self, low: float, high: float) -> float:
-        """Completeness [%] among stars alone with these SNR."""
+    def completeness(self, low: float, high: float) -> float:
+        """Completeness [%] among isolated stars with these SNR."""
         snr, error = np.concatenate(self.snr), np.concatenate(self.error)
         return 100 * float(np.isfinite(error[(snr >= low) & (snr < high), 0]).mean())
 
@@ -60,7 +60,7 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="put the tables into RESULTS.md")
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    finders = available()
+    finders = available_finders()
     body = [_main_table(finders, args.frames), _widths_table(finders, max(2, args.frames // 4))]
     print("\n\n".join(body))
     if args.write:
@@ -84,7 +84,7 @@ def _main_table(finders: dict[str, Finder], frames: int) -> str:
     peer = np.median(tallies["sep + winpos"].ms_per_mpx) if "sep + winpos" in tallies else np.nan
     rows = [
         [name, f"{np.median(t.ms_per_mpx):.1f}", f"{np.median(t.ms_per_mpx) / peer:.2f}",
-         " / ".join(f"{t.found(*b):.0f}" for b in FAINT_BINS), f"{4.194 * t.false / t.mpx:.2f}",
+         " / ".join(f"{t.completeness(*b):.0f}" for b in FAINT_BINS), f"{4.194 * t.false / t.mpx:.2f}",
          " / ".join(f"{t.rms_to_bound(*b):.2f}" for b in BRIGHT_BINS)]
         for name, t in tallies.items()
     ]  # fmt: skip
@@ -99,7 +99,8 @@ def _widths_table(finders: dict[str, Finder], frames: int) -> str:
         tallies = _run({name: finders[name] for name in names}, width, frames)
         for name, t in tallies.items():
             rows.append([
-                f"{width}", name, f"{t.found(5, 7):.0f} / {t.found(7, 10):.0f}", f"{4.194 * t.false / t.mpx:.2f}",
+                f"{width}", name, f"{t.completeness(5, 7):.0f} / {t.completeness(7, 10):.0f}",
+                f"{4.194 * t.false / t.mpx:.2f}",
                 " / ".join(f"{t.rms_to_bound(*b):.2f}" for b in BRIGHT_BINS), f"{np.median(t.ms_per_mpx):.1f}",
             ])  # fmt: skip
     head = [

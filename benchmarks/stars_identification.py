@@ -19,7 +19,7 @@ from _identify_peers import (
     Solver,
     best_ruststartracker,
     cedar,
-    missing,
+    missing_programs,
     ruststartracker,
     startrack,
     tetra3rs,
@@ -50,7 +50,7 @@ class Case:
 
 @dataclass
 class Tally:
-    """What one program made of a case."""
+    """Results of one program on a case."""
 
     lists: int = 0
     solved: int = 0
@@ -138,7 +138,7 @@ def main() -> None:
         print("\n".join(" | ".join(line) for line in fresh), flush=True)
     head = ["star lists", "program", "solved", "wrong", "precision", "recall", "ms, median", "startrack's part of it"]
     body = f"startrack: {wrong} wrong answers to {total} lists. Times are of CPU, warm.\n\n{table(head, rows)}\n\n"
-    body += "\n".join([EXPLANATION, *missing()])
+    body += "\n".join([EXPLANATION, *missing_programs()])
     print("\n" + body)
     if args.write:
         packages = tuple(name for name in PEERS if find_spec(name))
@@ -148,10 +148,10 @@ def main() -> None:
 
 
 EXPLANATION = (
-    "Brightness is scattered by 0.1 mag if nothing else is said; false stars are as bright as true ones, at random "
-    "places; stars within 3 px are one light. Wrong: off by more than 0.2 degrees, or any answer where there are no "
+    "Brightness is scattered by 0.1 mag unless stated; false stars are as bright as true ones, at random "
+    "positions; stars within 3 px are blended. Wrong: off by more than 0.2 degrees, or any answer where there are no "
     "stars, or a mirror image. Recall counts all true stars, of refused lists too. ruststartracker's time depends on "
-    "the depth and reach of its index: first the quickest of four settings that solves most of the lists, chosen on "
+    "the depth and angle of its index: first the fastest of four settings that solves most of the lists, chosen on "
     "five of them, then deeper ones. Peers stop where their time for a kind of list is spent. tetra3rs has no "
     "fisheyes, and names from another catalogue; so does cedar-solve, which runs in an environment of its own."
 )
@@ -174,7 +174,7 @@ def solvers(case: Case, stars: Stars, lists: list[StarList], cedar_python: str |
 
 
 def run(solver: Solver, lists: list[StarList], most_s: float) -> Tally:
-    """All lists, one after the other, as far as the time reaches."""
+    """All lists, one after the other, until the time is spent."""
     tally = Tally()
     solver(lists[0])()  # indices are built
     for listed in lists:

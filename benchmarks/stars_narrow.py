@@ -37,7 +37,7 @@ FIELDS_DEG = {  # across the width
     "test": 10.9, "hale_bopp": 15.4, "virgo": 20.2,
 }  # fmt: skip
 WIDTHS_DEG = (10.0, 15.0, 20.0, 30.0)  # of the synthetic frames
-OFF = (1.0, 0.92, 1.08)  # field of view given over the true one, by turns
+OFF = (1.0, 0.92, 1.08)  # stated over true field of view, cycled
 SIZE_PX, SIGMA_PX, LIMIT_MAG, FLUX_AT_LIMIT_E = (1024, 768), 1.1, 7.5, 450.0
 RUNS = 5
 WRONG_DEG = 0.2  # boresight
@@ -45,7 +45,7 @@ WRONG_DEG = 0.2  # boresight
 
 @dataclass
 class Tally:
-    """What one program did with one set of frames."""
+    """Results of one program on one set of frames."""
 
     detect_ms: list[float] = field(default_factory=list)
     solve_ms: list[float] = field(default_factory=list)
@@ -59,7 +59,7 @@ class Tally:
 
 @dataclass(frozen=True)
 class Picture:
-    """An exposure, the field of view that is told, and where it looks if that is known."""
+    """An exposure, its stated field of view, and its boresight if known."""
 
     exposure: Exposure
     fov_deg: float
@@ -79,12 +79,12 @@ def main() -> None:
     args = parser.parse_args()
     cv2.setNumThreads(1)
     stars = load_catalog().at(None, None)
-    sets = {f"synthetic, {w:g} degrees": synthetic(stars, w, args.frames) for w in WIDTHS_DEG}
+    sets = {f"synthetic, {w:g} degrees": synthetic_pictures(stars, w, args.frames) for w in WIDTHS_DEG}
     sets |= {f"{Path(folder).parent.name}/{Path(folder).name}": photographs(Path(folder)) for folder in args.photos}
-    rows = [row for name, pictures in sets.items() for row in compared(name, pictures, stars)]
+    rows = [row for name, pictures in sets.items() for row in compare_programs(name, pictures, stars)]
     head = ["frames", "program", "solved", "wrong", "detect, ms", "identify, ms", "both, ms", "ours over it"]
     body = (
-        "The field of view is told wrong by 0, -8 and +8 % in turn; both may be off by 10 %. tetra3rs with its "
+        "The stated field of view is wrong by 0, -8 and +8 % in turn; both may be off by 10 %. tetra3rs with its "
         f"database for these widths, made beforehand; its quick and its thorough extraction.\n\n{table(head, rows)}"
     )
     print(body)
@@ -93,7 +93,7 @@ def main() -> None:
         write_section("Stars: narrow fields", command, ("numpy", "tetra3rs"), body)
 
 
-def compared(name: str, pictures: list[Picture], stars: Stars) -> list[list[str]]:
+def compare_programs(name: str, pictures: list[Picture], stars: Stars) -> list[list[str]]:
     """The rows of one set."""
     widths = [p.fov_deg for p in pictures]
     base = tetra3rs.SolverDatabase.generate_from_gaia(
@@ -101,14 +101,14 @@ def compared(name: str, pictures: list[Picture], stars: Stars) -> list[list[str]
     )
     detector = Detector()
     programs: dict[str, tuple[Finder, Solver]] = {
-        "startrack": (lambda e: detector(e, None), lambda found, p: _ours(found, p, stars)),
-        "tetra3rs, extract_centroids_fast": (_quick, lambda found, p: _tetra3rs(found, p, base)),
-        "tetra3rs, extract_centroids": (_thorough, lambda found, p: _tetra3rs(found, p, base)),
+        "startrack": (lambda e: detector(e, None), lambda found, p: _solve_ours(found, p, stars)),
+        "tetra3rs, extract_centroids_fast": (_extract_quick, lambda found, p: _solve_tetra3rs(found, p, base)),
+        "tetra3rs, extract_centroids": (_extract_thorough, lambda found, p: _solve_tetra3rs(found, p, base)),
     }
     tallies = {program: _run(find, solve, pictures) for program, (find, solve) in programs.items()}
     ours = tallies["startrack"]
     return [
-        [name, program, f"{t.solved} of {len(pictures)}", f"{_wrong(t, ours, pictures)}",
+        [name, program, f"{t.solved} of {len(pictures)}", f"{_count_wrong(t, ours, pictures)}",
          f"{np.median(t.detect_ms):.1f}", f"{np.median(t.solve_ms):.1f}", f"{t.total_ms():.1f}",
          f"{ours.total_ms() / t.total_ms():.1f}"]
         for program, t in tallies.items()
@@ -137,8 +137,8 @@ def _run(find: Finder, solve: Solver, pictures: list[Picture]) -> Tally:
     return tally
 
 
-def _wrong(tally: Tally, other: Tally, pictures: list[Picture]) -> int:
-    """Answers that look elsewhere than the truth says; of photographs, elsewhere than the other program."""
+def _count_wrong(tally: Tally, other: Tally, pictures: list[Picture]) -> int:
+    """Answers whose boresight differs from the truth or, for photographs, from that of the other program."""
     wrong = 0
     for axis, reference, picture in zip(tally.axes, other.axes, pictures, strict=True):
         truth = picture.axis if picture.axis is not None else reference
@@ -147,21 +147,21 @@ def _wrong(tally: Tally, other: Tally, pictures: list[Picture]) -> int:
     return wrong
 
 
-def _ours(found: object, picture: Picture, stars: Stars) -> np.ndarray | None:
+def _solve_ours(found: object, picture: Picture, stars: Stars) -> np.ndarray | None:
     size = picture.exposure.size_px
     answer = identify_unknown_lens(found, size, np.radians(picture.fov_deg), stars)  # type: ignore[arg-type]
     return np.asarray(answer.identification.R_cam_icrs[2])
 
 
-def _quick(exposure: Exposure) -> object:
+def _extract_quick(exposure: Exposure) -> object:
     return tetra3rs.extract_centroids_fast(np.ascontiguousarray(exposure.pixels_adu), threads=1)
 
 
-def _thorough(exposure: Exposure) -> object:
+def _extract_thorough(exposure: Exposure) -> object:
     return tetra3rs.extract_centroids(np.ascontiguousarray(exposure.pixels_adu), threads=1)
 
 
-def _tetra3rs(found: object, picture: Picture, base: object) -> np.ndarray | None:
+def _solve_tetra3rs(found: object, picture: Picture, base: object) -> np.ndarray | None:
     width, height = picture.exposure.size_px
     answer = base.solve_from_centroids(  # type: ignore[attr-defined]
         found.centroids, fov_estimate_deg=picture.fov_deg, fov_max_error_deg=0.1 * picture.fov_deg,  # type: ignore[attr-defined]
@@ -171,7 +171,7 @@ def _tetra3rs(found: object, picture: Picture, base: object) -> np.ndarray | Non
 
 
 def photographs(folder: Path) -> list[Picture]:
-    """Those of the folder whose field of view is known."""
+    """Photographs in the folder whose field of view is known."""
     paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".png", ".tiff", ".bmp"))
     known = [(p, next((w for start, w in FIELDS_DEG.items() if p.name.startswith(start)), None)) for p in paths]
     return [
@@ -180,18 +180,18 @@ def photographs(folder: Path) -> list[Picture]:
     ]
 
 
-def synthetic(stars: Stars, width_deg: float, count: int) -> list[Picture]:
+def synthetic_pictures(stars: Stars, width_deg: float, count: int) -> list[Picture]:
     """Frames of a pinhole camera at random attitudes: stars to magnitude 7.5, Poisson and read noise."""
     pictures = []
     for i in range(count):
         rng = np.random.default_rng([17, round(width_deg), i])
         R = Rotation.random(random_state=rng).as_matrix()
-        pixels = _painted(stars, R, np.radians(width_deg), rng)
+        pixels = _paint_frame(stars, R, np.radians(width_deg), rng)
         pictures.append(Picture(Exposure(pixels_adu=pixels), width_deg * OFF[i % len(OFF)], R[2]))
     return pictures
 
 
-def _painted(stars: Stars, R: np.ndarray, fov_rad: float, rng: np.random.Generator) -> np.ndarray:
+def _paint_frame(stars: Stars, R: np.ndarray, fov_rad: float, rng: np.random.Generator) -> np.ndarray:
     width, height = SIZE_PX
     cam = stars.rays_icrs[stars.v_mag < LIMIT_MAG] @ R.T
     v_mag = stars.v_mag[stars.v_mag < LIMIT_MAG]

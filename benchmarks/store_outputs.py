@@ -1,7 +1,7 @@
-"""Store what the commands of one version give, for benchmarks/compare_outputs.py.
+"""Store the outputs of the commands of one version, for benchmarks/compare_outputs.py.
 
-    OLD/python benchmarks/store_outputs.py /tmp/old --frames /work/shared/scenes/thesis
-    NEW/python benchmarks/store_outputs.py /tmp/new --frames /work/shared/scenes/thesis --batch /tmp/old/frames
+    OLD/python benchmarks/store_outputs.py /tmp/old --frames SCENES
+    NEW/python benchmarks/store_outputs.py /tmp/new --frames SCENES --batch /tmp/old/frames
     NEW/python benchmarks/compare_outputs.py /tmp/old /tmp/new
 
 Runs the command `startrack` that lies beside the interpreter, one process at a time, and imports nothing of the

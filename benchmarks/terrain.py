@@ -1,9 +1,9 @@
-"""Height maps: places on a crater's floor, from pixels, with the true map and with a degraded one.
+"""Height maps: positions on a crater's floor, from pixels, with the true map and with a degraded one.
 
     python benchmarks/terrain.py [--terrain shackleton] [--frames 20] [--radius 4000]
 
-The degraded map has errors of 5 m (s.d.) at every post and shows the whole horizon 0.08 degrees too low; its file says
-so (height_sigma_m = 5, horizon_sigma_deg = 0.08). Conditions as in chain.py; places with a slope below 15 degrees.
+The degraded map has errors of 5 m (s.d.) at every post and a horizon 0.08 degrees too low; its file states both
+(height_sigma_m = 5, horizon_sigma_deg = 0.08). Conditions as in chain.py; positions with a slope below 15 degrees.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ def main() -> None:
     parser.add_argument("--no-degraded", action="store_true")
     parser.add_argument("--keep", type=Path, help="folder where the frames' evidence is kept, and taken from if there")
     args = parser.parse_args()
-    true = fresh(load_terrain(args.terrain), search_radius_m=args.radius, most_slope_rad=SLOPE_RAD)
+    true = replace_settings(load_terrain(args.terrain), search_radius_m=args.radius, most_slope_rad=SLOPE_RAD)
     maps = {"the map as it is": (replace_sigma(true, 0.0, 0.0), 0.0), "the shipped file's errors": (true, 0.0)}
     if not args.no_degraded:
-        maps["degraded, and known to be"] = (degraded(true, args.seed), BIAS_RAD)
+        maps["degraded, and known to be"] = (degrade_map(true, args.seed), BIAS_RAD)
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in maps}
     for number in range(args.frames):
-        evidence, place = kept(args.keep, true, args.seed, number)
+        evidence, position = load_or_observe(args.keep, true, args.seed, number)
         for name, (terrain, bias) in maps.items():
-            rows[name].append(scored(lower_evidence(evidence, -bias), terrain, place))
+            rows[name].append(score_fix(lower_evidence(evidence, -bias), terrain, position))
             print(number, name, rows[name][-1], flush=True)
     body = summary(rows)
     print(body)
@@ -62,45 +62,45 @@ def main() -> None:
     )  # fmt: skip
 
 
-def fresh(terrain: Any, **changes: Any) -> HeightMap:
-    """The terrain with other settings, its horizons not taken over."""
+def replace_settings(terrain: Any, **changes: Any) -> HeightMap:
+    """The terrain with other settings and a horizon table of its own."""
     made = replace(terrain, **changes)
     made.prepare()
     return made
 
 
 def replace_sigma(terrain: HeightMap, height_sigma_m: float, common_rad: float) -> HeightMap:
-    """The same map, said to be so good."""
-    return fresh(terrain, height_sigma_m=height_sigma_m, horizon_sigma_common_rad=common_rad)
+    """The same map with other stated errors."""
+    return replace_settings(terrain, height_sigma_m=height_sigma_m, horizon_sigma_common_rad=common_rad)
 
 
-def degraded(terrain: HeightMap, seed: int) -> HeightMap:
-    """A map with errors at every post, that says so."""
+def degrade_map(terrain: HeightMap, seed: int) -> HeightMap:
+    """A map with errors at every post, which it states."""
     rng = np.random.default_rng(seed)
     maps = [
         replace(m, heights_m=(m.heights_m + rng.normal(0.0, NOISE_M, m.heights_m.shape)).astype(np.float32))
         for m in terrain.maps
     ]
-    return fresh(
+    return replace_settings(
         terrain, maps=tuple(maps), height_sigma_m=NOISE_M, horizon_sigma_common_rad=BIAS_RAD,
         most_slope_rad=SLOPE_RAD + SLOPE_ERROR_RAD,
     )  # fmt: skip
 
 
-def kept(folder: Path | None, terrain: HeightMap, seed: int, number: int) -> tuple[Evidence, np.ndarray]:
-    """`observed`, from a file where there is one."""
+def load_or_observe(folder: Path | None, terrain: HeightMap, seed: int, number: int) -> tuple[Evidence, np.ndarray]:
+    """`observe_frame`, or its stored result if a file exists."""
     if folder is None:
-        return observed(terrain, seed, number)
+        return observe_frame(terrain, seed, number)
     path = folder / f"{terrain.name}-{seed}-{number:03d}.pkl"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(pickle.dumps(observed(terrain, seed, number)))
+        path.write_bytes(pickle.dumps(observe_frame(terrain, seed, number)))
     found: tuple[Evidence, np.ndarray] = pickle.loads(path.read_bytes())
     return found
 
 
-def observed(terrain: HeightMap, seed: int, number: int) -> tuple[Evidence, np.ndarray]:
-    """Evidence of one random frame, through the whole chain, and the true place."""
+def observe_frame(terrain: HeightMap, seed: int, number: int) -> tuple[Evidence, np.ndarray]:
+    """Evidence of one random frame, through the whole chain, and the true position."""
     camera, catalog = replace(load_camera("fisheye-2048"), sensor=SENSOR), load_catalog()
     series = Series(
         camera=camera, terrain=terrain, catalog=catalog, seed=seed, exposure_s=10.0, hot_pixels=200, cosmic_rays=30
@@ -113,8 +113,8 @@ def observed(terrain: HeightMap, seed: int, number: int) -> tuple[Evidence, np.n
     return value.evidence(), np.asarray(truth.position_enu_m)
 
 
-def scored(evidence: Evidence, terrain: HeightMap, place: np.ndarray) -> dict[str, Any]:
-    """Error, what the fix says of it, and how long it took."""
+def score_fix(evidence: Evidence, terrain: HeightMap, position: np.ndarray) -> dict[str, Any]:
+    """Error, stated uncertainty and time of a fix."""
     start, cpu = time.perf_counter(), time.process_time()
     try:
         fix: Fix = ExactPosterior()(evidence, terrain)
@@ -122,7 +122,7 @@ def scored(evidence: Evidence, terrain: HeightMap, place: np.ndarray) -> dict[st
         took, cpu = time.perf_counter() - start, time.process_time() - cpu
     except NoSolution as cause:
         return {"status": cause.reason}
-    off = fix.position_enu_m[:2] - place[:2]
+    off = fix.position_enu_m[:2] - position[:2]
     return {
         "status": "ambiguous" if fix.ambiguous else "ok", "error_m": round(float(np.hypot(*off)), 2),
         "nees": round(float(off @ np.linalg.solve(fix.covariance_m2, off)), 2),

@@ -21,16 +21,16 @@ from startrack.normal_equations import NormalEquations, Observations, Terms
 from startrack.types import Array, NotIdentified
 
 CHI2_2DOF_MEDIAN = 1.3863
-OUTLIER_CHI2 = 16.0  # 4 sigma in each axis: one good star in 3000 is lost
-HUBER_SIGMAS = 2.5  # from here the pull of an observation no longer grows
+OUTLIER_CHI2 = 16.0  # 4 sigma in each axis: rejects one good star in 3000
+HUBER_SIGMAS = 2.5  # residual beyond which the influence of an observation is constant
 MIN_STARS = 3
 SMALLEST_EXTRA_PX2, LARGEST_EXTRA_PX2 = 1e-6, 1e8
 SMALLEST_DAMPING, FIRST_DAMPING, MAX_DAMPING = 1e-12, 1e-6, 1e6
-SMALLEST_RISE_RAD = 0.2  # a lens whose radius stops growing sooner is no lens
+SMALLEST_RISE_RAD = 0.2  # angle up to which the radius of a valid lens must increase
 
 
 class Adjustable(Protocol):
-    """The unknowns of `adjust`: State, or another dataclass with its methods (boards, a view of a narrow field)."""
+    """Interface of the unknowns of `adjust`: State, or a state of boards or of a narrow field."""
 
     @property
     def rotations(self) -> Array: ...  # (images, 3, 3)
@@ -97,7 +97,7 @@ class Loss(NamedTuple):
 
 
 def cauchy_loss(scale_chi2: float) -> Loss:
-    """Cauchy's loss: the weight is halved at the chi-square `scale_chi2`, and wrong matches lose their pull."""
+    """Cauchy's loss: the weight is halved at the chi-square `scale_chi2`, and tends to 0 for wrong matches."""
     return Loss(lambda chi2: scale_chi2 * np.log1p(chi2 / scale_chi2), lambda chi2: 1.0 / (1.0 + chi2 / scale_chi2))
 
 
@@ -265,8 +265,8 @@ def extra_variance_px2(
     """Variance per axis [px^2] to add to every centroid so that the chi-square is as expected; at least 1e-6.
 
     The median of the residuals' chi-squares (n,) is compared with that of two degrees of freedom; `by_sum`: their sum
-    with the degrees of freedom, for residuals without outliers. `parameters`: number of fitted parameters, whose
-    share the residuals (n, 2) lack.
+    with the degrees of freedom, for residuals without outliers. `parameters`: number of fitted parameters, which
+    are subtracted from the degrees of freedom of the residuals (n, 2).
     """
     from scipy.optimize import brentq
 

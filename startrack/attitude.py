@@ -33,8 +33,9 @@ def solve_attitude(
     """Attitude that fits measured pixels (n, 2) with covariances (n, 2, 2) of stars (n, 3), outliers rejected.
 
     `R_cam_icrs` (3, 3): a start within some pixels. The scatter of the residuals sets an error common to all stars,
-    which is added to every centroid. The uncertainty of the lens (the camera's covariance) turns all stars alike, so
-    that no scatter shows it: it is added to the attitude's covariance. Raises NotIdentified with fewer than 3 stars.
+    which is added to every centroid. An error of the lens (the camera's covariance) shifts the stars together, so that
+    the scatter does not contain it: it is added to the attitude's covariance. Raises NotIdentified with fewer than 3
+    stars.
     """
     if len(xy_px) < MIN_STARS:
         raise NotIdentified("fewer than 3 stars agree on an attitude", matched=len(xy_px))
@@ -58,8 +59,8 @@ def solve_attitude(
 def _attitude_covariance(jacobian: Array, inverse: Array, weight: Array, residual_px: Array) -> Array:
     """Covariance (3, 3) from the stated errors, or from the scatter of the residuals where that is larger.
 
-    The second is the sandwich H^-1 (sum s s^T) H^-1 of the stars' scores s: it holds for heavy tails and for centroid
-    errors larger than stated, but is noisy with few stars.
+    The second is the sandwich H^-1 (sum s s^T) H^-1 of the stars' scores s: it is valid for heavy tails and for
+    centroid errors larger than stated, but is noisy with few stars.
     """
     stated = np.linalg.inv(np.einsum("nia,nij,njb->ab", jacobian, inverse, jacobian, optimize=True))
     n = len(residual_px)
@@ -80,7 +81,7 @@ def _attitude_covariance_by_lens(camera: Camera, rays_cam: Array, jacobian: Arra
     if camera.covariance is None:
         return np.zeros((3, 3))
     weighted = np.einsum("nia,nij->naj", jacobian, weight)
-    by_turn = np.einsum("naj,njb->ab", weighted, jacobian)
+    by_rotation = np.einsum("naj,njb->ab", weighted, jacobian)
     by_lens = np.einsum("naj,njm->am", weighted, lens_jacobian(camera, rays_cam, camera.covariance_order))
-    response = np.linalg.solve(by_turn, by_lens)
+    response = np.linalg.solve(by_rotation, by_lens)
     return np.asarray(response @ camera.covariance @ response.T)

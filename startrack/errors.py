@@ -1,6 +1,6 @@
-"""The reasons of failures with their exit codes and advice, and the exceptions that carry them.
+"""The reasons of failures with their exit codes and advice, and the exceptions that have them.
 
-Kept apart from the values so that the commands start without numpy. Exit codes, JSON schema, the page's advice and the
+Separate from the values so that the commands start without numpy. Exit codes, JSON schema, the page's advice and the
 table in docs/formats.md are made from `Reason`; a new reason is one entry here.
 """
 
@@ -106,7 +106,7 @@ def reason_of(code: str) -> Reason:
 
 
 def exit_code_of(reason: str | None) -> int:
-    """Exit code of an image's `reason`; 0 for None, which stands for a solution."""
+    """Exit code of an image's `reason`; 0 for None, which means a solution."""
     return EXIT_OK if reason is None else reason_of(reason).exit_code
 
 

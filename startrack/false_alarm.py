@@ -2,8 +2,8 @@
 
 A predicted star coincides by chance with a detection of its brightness with some probability p. Of n predicted stars
 k or more then coincide with the probability of a binomial tail. The detections are clustered (walls, clouds and trees
-leave parts of the field empty), so p follows from the density met at the detections themselves. Every hypothesis that
-was tried multiplies the probability. All logarithms are natural.
+leave parts of the field empty), so p follows from the density at the detections themselves. The probability is
+multiplied by the number of hypotheses tried. All logarithms are natural.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def log_p_value_bound(distance_px: Array, gate_px: float, predicted: int, densit
 def expected_false_alarms(tried: int, matched: Ints | int, rays: int, each: float) -> Array:
     """Expected number of the `tried` hypotheses at which chance makes `matched` of the rays coincide with stars.
 
-    Here the rays of the detections are the trials, their pattern's own three left out of `rays`.
+    Here the trials are the `rays` of the detections, without the three of the pattern.
     """
     return tried * binomial_tail(matched, rays - PATTERN_MATCHES, each)
 

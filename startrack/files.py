@@ -165,7 +165,7 @@ def hold_lock(path: FilePath, *, wait: bool = True, on_wait: Callable[[], None] 
             file.write_text(str(os.getpid()), encoding="ascii")
         yield
     finally:
-        with suppress(OSError):  # Windows keeps open files; a file that is left behind locks nobody out
+        with suppress(OSError):  # Windows keeps open files; a remaining file is not a lock
             file.unlink()
         lock.release()
 

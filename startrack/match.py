@@ -2,7 +2,7 @@
 
 Three steps are common to all callers: each star takes its nearest detection within a gate; pairs of different
 brightness are dropped; each detection keeps its nearest star. Two policies exist for stars that share one detection:
-`match_by_brightness` drops them, `CandidatePairs.unambiguous` names the detection after the brightest of them.
+`match_by_brightness` drops them, `CandidatePairs.select_unambiguous` names the detection after the brightest of them.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from startrack.types import Array, Bools, Ints
 DEPTH_BELOW_THRESHOLD_MAG = 0.7  # stars this much fainter than the faintest detection may still be detected
 BRIGHTER_MAG = 0.8  # a detection is at most this much brighter than its star
 DIMMED_MAG = 1.6  # and at most this much fainter: haze, branches, the edge of the lens
-PX_PER_MAG = 0.6  # distance that counts as much as one magnitude of disagreement
-DISTINCT_MAG = 0.3  # of stars that share a detection, one this much brighter gives it its name
+PX_PER_MAG = 0.6  # distance with the same cost as a difference of one magnitude
+DISTINCT_MAG = 0.3  # if one of the stars that share a detection is this much brighter, the detection is named after it
 DECISIVE_NATS = 12.0  # log-likelihood ratio that decides between two positions
 SIGNIFICANT_SNR = 10.0  # detections above this should have a catalogue star
 MIN_UNSATURATED = 3  # for the photometric scale; below this, saturated stars are used too
@@ -36,7 +36,7 @@ def upper_median(values: Array) -> float:
     return float(np.sort(values)[len(values) // 2])
 
 
-def last_of_each(numbers: Ints) -> Bools:
+def is_last_occurrence(numbers: Ints) -> Bools:
     """Whether each of the numbers (n,), all at least 0, occurs at no later index."""
     index = np.arange(len(numbers))
     last = np.empty(numbers.max(initial=-1) + 1, dtype=np.int64)
@@ -45,7 +45,7 @@ def last_of_each(numbers: Ints) -> Bools:
     return standing
 
 
-def closest_of_each(detection: Ints, distance: Array) -> Ints:
+def select_closest(detection: Ints, distance: Array) -> Ints:
     """Ascending indices into the pairs (n,) of the pair with the smallest distance for each detection."""
     order = np.lexsort((distance, detection))
     return np.sort(order[np.flatnonzero(np.diff(detection[order], prepend=-1))])
@@ -94,7 +94,7 @@ def match_by_brightness(
     agree = np.abs(fainter) < np.hypot(tolerance_mag, 2.0 * star_sigma_mag[star])
     agree |= saturated[detection] & (fainter < 0)
     star, detection, distance = star[agree], detection[agree], distance[agree]
-    keep = closest_of_each(detection, distance)
+    keep = select_closest(detection, distance)
     return detection[keep], star[keep], distance[keep]
 
 
@@ -174,26 +174,26 @@ class CandidatePairs:
         return np.maximum(self.dimming_mag / DIMMED_MAG, self.dimming_mag / -BRIGHTER_MAG)
 
     @cached_property
-    def agrees(self) -> Bools:
+    def agrees_in_brightness(self) -> Bools:
         """Whether star and detection (k,) may be equally bright."""
         return self.brightness_misfit < 1.0
 
     @cached_property
-    def one_to_one(self) -> Ints:
+    def one_to_one_pairs(self) -> Ints:
         """Ascending indices of the pairs that are each other's nearest and agree in brightness.
 
         Distance and difference in brightness are added, PX_PER_MAG for a magnitude.
         """
         by_cost = np.argsort(-self.distance_px - PX_PER_MAG * np.abs(self.dimming_mag))
         by_cost = by_cost[np.isfinite(self.distance_px[by_cost])]
-        by_cost = by_cost[last_of_each(self.star[by_cost])]
-        by_cost = by_cost[self.agrees[by_cost]]
-        return np.sort(by_cost[last_of_each(self.detection[by_cost])])
+        by_cost = by_cost[is_last_occurrence(self.star[by_cost])]
+        by_cost = by_cost[self.agrees_in_brightness[by_cost]]
+        return np.sort(by_cost[is_last_occurrence(self.detection[by_cost])])
 
-    def unambiguous(self, which: Ints, variance_px2: Array, radius_px: float) -> Ints:
+    def select_unambiguous(self, which: Ints, variance_px2: Array, radius_px: float) -> Ints:
         """The one-to-one pairs `which` (m,) with an unambiguous star; `variance_px2` (m,) is per axis.
 
-        Stars within the radius of a detection that have no detection of their own share its light. The detection is
+        Stars within the radius of a detection that have no detection of their own are blended with it. The detection is
         named after the brightest of them if its position allows that. It is dropped if another star is nearly as
         bright and the position does not decide between them.
         """
@@ -220,7 +220,7 @@ class CandidatePairs:
     def _is_decided(self, own: int, group: Ints, variance_px2: float) -> bool:
         """Whether the pair `own` explains its detection, and no nearly as bright star of the pairs `group` does."""
         squared = np.square(self.distance_px[group]) - self.distance_px[own] ** 2
-        if squared.min(initial=0.0) < -2 * DECISIVE_NATS * variance_px2 or not self.agrees[own]:
+        if squared.min(initial=0.0) < -2 * DECISIVE_NATS * variance_px2 or not self.agrees_in_brightness[own]:
             return False
         rivals = (self.v_mag[group] < self.v_mag[own] + DISTINCT_MAG) & (self.star[group] != self.star[own])
         return not np.any(squared[rivals] < 2 * DECISIVE_NATS * variance_px2)

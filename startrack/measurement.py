@@ -25,14 +25,14 @@ from startrack.terrain import Terrain
 from startrack.types import Array, BadInput, Detections, Fix, Ints
 
 REMEASURED_PX = 12.0  # stars this near the skyline are measured again
-NEIGHBOURS_PX = 10.0  # and with them the stars this much farther away, whose light overlaps theirs
+NEIGHBOURS_PX = 10.0  # and with them the stars up to this distance from them, whose PSFs overlap theirs
 UNDECIDED_PX = 2.0  # farther from the skyline than this, the fix decides which stars are visible
 CERTAIN_PROBABILITY = 0.99  # of being visible, or hidden, for the stars that the fix decides
 COMPLETE_V_MAG = 6.5  # frames with 5 sigma at this magnitude show many stars that Hipparcos lacks
 
 
 def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -> Measured:
-    """The light at every catalogue star in view, above a terrain.
+    """Photometry at every catalogue star in view, above a terrain.
 
     `oriented` is the exposure with its attitude; its time must be known. `settings` has the photometry, and whether
     Gaia's stars are used. Raises BadInput (bad_terrain, no_time) where the frame `enu` cannot be related to the stars.
@@ -71,16 +71,16 @@ def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
 
 
 def sky_step_at(measured: Measured, fix: Fix) -> SkyStep | None:
-    """The step of the sky's light at the skyline that the terrain shows from a `fix` found with `measured`.
+    """The step of the sky brightness at the terrain's skyline seen from a `fix` found with `measured`.
 
-    None where the image does not show that skyline.
+    None if the image does not contain that skyline.
     """
     horizon = Skyline.trace(fix.position_enu_m[:2], measured.terrain)
     return measure_sky_step(measured.detections, measured.camera, measured.R_cam_enu, horizon)
 
 
 def remeasure_near_skyline(measured: Measured, fix: Fix, step: SkyStep, photometry: StarEvidence) -> Measured:
-    """The stars near the skyline of a `fix` measured again, with the `step` of the sky's light taken out.
+    """The stars near the skyline of a `fix` measured again, with the `step` of the sky brightness subtracted.
 
     `fix` is a position found with `measured`, `photometry` the settings of the measurement.
     """
@@ -93,7 +93,7 @@ def remeasure_near_skyline(measured: Measured, fix: Fix, step: SkyStep, photomet
     azimuth, elevation = light.azimuth_rad, light.elevation_rad
     wanted = near_skyline(azimuth, elevation, camera, horizon, REMEASURED_PX) & reliable(azimuth)
     around = near_skyline(azimuth, elevation, camera, horizon, REMEASURED_PX + NEIGHBOURS_PX)
-    # The fix shows which neighbours are visible better than their own faint light, but not next to the skyline.
+    # The fix determines the visibility of neighbours better than their faint flux does, except next to the skyline.
     above = elevation - horizon(azimuth)
     undecided = near_skyline(azimuth, elevation, camera, horizon, UNDECIDED_PX) | ~reliable(azimuth)
     by_fix = np.where(above > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)

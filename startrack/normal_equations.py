@@ -1,7 +1,7 @@
 """Observations of one lens in many images, and their normal equations, solved by the Schur complement.
 
-The attitudes of different images share only the lens, so that each image's block is eliminated alone: the cost
-grows linearly with the number of images, where a dense solution grows with its cube.
+The images have only the lens in common, so that each image's attitude is eliminated alone: the cost grows linearly
+with the number of images; that of a dense solution grows with its cube.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from startrack.types import Array, Ints, Value, array
 
-RIDGE_1 = 1e-14  # relative to the diagonal; a parameter that nothing constrains stays solvable
+RIDGE_1 = 1e-14  # relative to the diagonal; the system stays solvable with unconstrained parameters
 TINY = 1e-300
 
 
@@ -87,7 +87,7 @@ class NormalEquations:
     lens_right: Array  # (m,)
     pose_right: Array  # (images, q)
 
-    def minus(self, part: NormalEquations) -> NormalEquations:
+    def subtract(self, part: NormalEquations) -> NormalEquations:
         """These equations without a part of their observations."""
         return NormalEquations(
             self.lens - part.lens, self.lens_pose - part.lens_pose, self.pose - part.pose,
@@ -161,7 +161,7 @@ class NormalEquations:
 class Terms:
     """Derivatives of the observations' pixels by the lens parameters (n, 2, m) and by their image's pose (n, 2, q).
 
-    q is 3 where only the camera turns (stars), and 6 where a board has a position too.
+    q is 3 for attitudes (stars), and 6 for poses of boards, which have a position too.
     """
 
     lens: Array

@@ -51,7 +51,7 @@ def check_inputs(inputs: Inputs) -> None:
 def detect_sources(inputs: Inputs, camera: Camera | None, detector: Detector) -> Detected:
     """The point sources. Raises BadInput bad_image for fractions where the camera's levels are in counts.
 
-    `detector` finds them in the exposure of `inputs`; with a `camera` its levels turn counts into electrons.
+    `detector` finds them in the exposure of `inputs`; the levels of a `camera` convert counts to electrons.
     """
     announce_compilation()
     stated = camera is not None and camera.sensor is not None

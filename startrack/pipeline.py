@@ -53,18 +53,20 @@ def locate(
     run = Run(inputs)
     try:
         check_inputs(run.reached)
-        detected = run.step("detect", detect_sources, run.reached, camera, settings.detector)
-        identified = run.step("identify", identify_stars, detected, camera, catalog, settings.identifier, terrain.site)
-        oriented = run.step("attitude", solve_orientation, identified)
-        measured = run.step("evidence", measure_evidence, oriented, terrain, settings)
-        fix = run.time("locate", settings.localizer, measured.evidence(), terrain)
+        detected = run.run_stage("detect", detect_sources, run.reached, camera, settings.detector)
+        identified = run.run_stage(
+            "identify", identify_stars, detected, camera, catalog, settings.identifier, terrain.site
+        )
+        oriented = run.run_stage("attitude", solve_orientation, identified)
+        measured = run.run_stage("evidence", measure_evidence, oriented, terrain, settings)
+        fix = run.time_stage("locate", settings.localizer, measured.evidence(), terrain)
         rough = fix.ambiguous or fix.search == "approximate"  # its skyline is not that of the image
-        step = None if rough else run.time("evidence", sky_step_at, measured, fix)
+        step = None if rough else run.time_stage("evidence", sky_step_at, measured, fix)
         if step is not None and step.exceeds_noise:
-            measured = run.step("evidence", remeasure_near_skyline, measured, fix, step, settings.evidence)
-            fix = run.time("locate", settings.localizer, measured.evidence(), terrain)
+            measured = run.run_stage("evidence", remeasure_near_skyline, measured, fix, step, settings.evidence)
+            fix = run.time_stage("locate", settings.localizer, measured.evidence(), terrain)
         if fix.search != "approximate":
-            run.time("locate", check_consistency, measured.evidence(), fix, terrain)
+            run.time_stage("locate", check_consistency, measured.evidence(), fix, terrain)
         sky_mag = step and step.brightness_mag_arcsec2(camera, exposure.exposure_s)
         return run.finish(extend(measured, Located, fix=fix, sky_brightness_mag_arcsec2=sky_mag))
     except (BadInput, NoSolution) as refusal:
@@ -102,9 +104,9 @@ def identify(
     run = Run(Inputs(exposure=exposure, camera=camera, catalog_name=catalog.name))
     try:
         check_inputs(run.reached)
-        detected = run.step("detect", detect_sources, run.reached, camera, settings.detector)
-        identified = run.step("identify", identify_stars, detected, camera, catalog, settings.identifier, site)
-        return run.finish(run.step("attitude", solve_orientation, identified))
+        detected = run.run_stage("detect", detect_sources, run.reached, camera, settings.detector)
+        identified = run.run_stage("identify", identify_stars, detected, camera, catalog, settings.identifier, site)
+        return run.finish(run.run_stage("attitude", solve_orientation, identified))
     except (BadInput, NoSolution) as refusal:
         return run.refuse(refusal)
 
@@ -119,9 +121,9 @@ def identify_blind(
     """
     run = Run(Inputs(exposure=exposure, catalog_name=catalog.name))
     try:
-        detected = run.step("detect", detect_sources, run.reached, None, (settings or Settings()).detector)
-        identified = run.step("identify", identify_unknown_lens, detected, fov_rad, catalog)
-        return run.finish(run.step("attitude", solve_orientation, identified))
+        detected = run.run_stage("detect", detect_sources, run.reached, None, (settings or Settings()).detector)
+        identified = run.run_stage("identify", identify_unknown_lens, detected, fov_rad, catalog)
+        return run.finish(run.run_stage("attitude", solve_orientation, identified))
     except (BadInput, NoSolution) as refusal:
         return run.refuse(refusal)
 
@@ -130,6 +132,8 @@ def detect(exposure: Exposure, camera: Camera | None, settings: Settings | None 
     """Point sources of an `exposure`; `camera` (None: not known) gives fluxes in electrons, `settings` the detector."""
     run = Run(Inputs(exposure=exposure, camera=camera))
     try:
-        return run.finish(run.step("detect", detect_sources, run.reached, camera, (settings or Settings()).detector))
+        return run.finish(
+            run.run_stage("detect", detect_sources, run.reached, camera, (settings or Settings()).detector)
+        )
     except (BadInput, NoSolution) as refusal:
         return run.refuse(refusal)

@@ -45,7 +45,7 @@ class RunStopped(Exception):
 
 @dataclass(frozen=True)
 class Died:
-    """In place of the result of a task that ended or blocked every process which worked on it."""
+    """Result of a task that ended or blocked every process which worked on it."""
 
     cause: str
 
@@ -112,11 +112,11 @@ class Runner(Generic[Task, Result]):
             yield from self._run_in_pool(tasks)
 
     def _run_in_pool(self, tasks: Iterable[Task]) -> Generator[tuple[Task, Result | Died], None, None]:
-        """After a process has died or stood still, the tasks in progress are repeated one by one to find the cause."""
+        """After a process has died or blocked, the tasks in progress are repeated one by one to find the cause."""
         coming = iter(tasks)
         while True:
             self._pool = self._pool or _Pool(self.jobs)
-            suspects = yield from self._until_failure(coming, self._pool, TASKS_PER_PROCESS * self.jobs)
+            suspects = yield from self._run_until_failure(coming, self._pool, TASKS_PER_PROCESS * self.jobs)
             if not suspects:
                 return
             self._pool = None
@@ -124,17 +124,17 @@ class Runner(Generic[Task, Result]):
             while culprits:
                 single = _Pool(1)
                 try:
-                    culprits = yield from self._until_failure(alone, single, 1)
+                    culprits = yield from self._run_until_failure(alone, single, 1)
                 finally:
                     single.close()
                 yield from ((task, Died(DIED)) for task in culprits)
 
-    def _until_failure(
+    def _run_until_failure(
         self, coming: Iterator[Task], pool: _Pool, most_submitted: int
     ) -> Generator[tuple[Task, Result | Died], None, list[Task]]:
-        """Yield results; return the tasks in progress when a process died or stood still, none if all tasks are done.
+        """Yield results; return the tasks in progress when a process died or blocked, none if all tasks are done.
 
-        After a failure, and where the caller stops asking, the pool is closed.
+        The pool is closed after a failure, and when the caller closes the generator.
         """
         waiting: dict[Future[Result], Task] = {}
         try:
@@ -182,7 +182,7 @@ class Runner(Generic[Task, Result]):
 
 
 class _Pool:
-    """Processes with one thread each, that neither Ctrl-C nor SIGTERM reaches and that end with this process."""
+    """Processes with one thread each that ignore Ctrl-C and SIGTERM and end with this process."""
 
     def __init__(self, jobs: int) -> None:
         for name in THREAD_LIMITS:  # inherited when the processes load NumPy: the other cores do other tasks
@@ -205,7 +205,7 @@ class _Pool:
             return broken
 
     def close(self, *, kill: bool = False) -> None:
-        """End the processes: at once with `kill`, otherwise when they are idle; one that stands still is killed."""
+        """End the processes: at once with `kill`, otherwise when they are idle; a blocked one is killed."""
         self._executor.shutdown(wait=False, cancel_futures=True)
         alive = [process for process in active_children() if process not in self._others]
         deadline_s = time.monotonic() + (0.0 if kill else CLOSE_S)

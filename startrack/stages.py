@@ -1,4 +1,4 @@
-"""The values that the stages of the pipeline hand on, each complete, and the settings of the stages.
+"""The complete values that the stages of the pipeline return, and the settings of the stages.
 
     Inputs -> Detected -> Identified -> Oriented -> Measured -> Located, or Refused
 
@@ -123,7 +123,7 @@ class Oriented(Identified):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measured(Oriented):
-    """An attitude above a terrain, with the light measured at every catalogue star in view."""
+    """An attitude above a terrain, with photometry at every catalogue star in view."""
 
     terrain: Terrain
     site: Site  # of the terrain
@@ -224,7 +224,7 @@ class Run:
         self.reached = inputs
         self._timing_ms: dict[str, float] = {}
 
-    def time(self, stage: str, function: Callable[..., R], *args: Any) -> R:
+    def time_stage(self, stage: str, function: Callable[..., R], *args: Any) -> R:
         """The result of `function(*args)`, its time added to that of the `stage`."""
         start = clock.perf_counter()
         try:
@@ -232,9 +232,9 @@ class Run:
         finally:
             self._timing_ms[stage] = self._timing_ms.get(stage, 0.0) + 1e3 * (clock.perf_counter() - start)
 
-    def step(self, stage: str, function: Callable[..., T], *args: Any) -> T:
-        """The same as `time`, for a function that returns the next complete value."""
-        value = self.time(stage, function, *args)
+    def run_stage(self, stage: str, function: Callable[..., T], *args: Any) -> T:
+        """The same as `time_stage`, for a function that returns the next complete value."""
+        value = self.time_stage(stage, function, *args)
         self.reached = value
         return value
 

@@ -47,7 +47,7 @@ def take_rows(value: T, which: Any) -> T:
 
 
 def _is_locked(given: Any, dtype: Any) -> bool:
-    """Whether nothing can change an array of this kind of numbers any more: it then needs no copy."""
+    """Whether an array is immutable and of this type of numbers: it then needs no copy."""
     if type(given) is not np.ndarray or given.flags.writeable or not given.flags.c_contiguous:
         return False
     base = given.base
@@ -191,7 +191,7 @@ class Identification(Value):
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence(Value):
-    """Rays, each with a log-likelihood ratio l: light comes from there, against: the terrain is there.
+    """Rays, each with a log-likelihood ratio l: visible sky against hidden by the terrain.
 
     Rows may come from stars, from pixels of the diffuse sky, and from several exposures. With V the fraction of the
     ray above the horizon (a step, or Phi((elevation - horizon) / sigma)) a row contributes
@@ -229,7 +229,7 @@ class Evidence(Value):
 
 @dataclass(frozen=True, kw_only=True)
 class Mode(Value):
-    """One connected place of the posterior."""
+    """One connected region of the posterior."""
 
     east_m: float
     north_m: float

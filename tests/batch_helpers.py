@@ -24,7 +24,7 @@ FACTS = {"time_utc": "2030-01-01T00:00:00Z", "exposure_s": 1.0, "camera": "small
 
 
 def frames(folder: Path, count: int, level: int = 100) -> list[Path]:
-    """Frames of the lens cap, each with other noise: refused for want of stars, and that within milliseconds."""
+    """Frames of the lens cap, each with other noise: refused for lack of stars within milliseconds."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "small.toml").write_text(CAMERA)
     paths = [folder / f"{number:02d}.png" for number in range(count)]
@@ -35,7 +35,7 @@ def frames(folder: Path, count: int, level: int = 100) -> list[Path]:
     return paths
 
 
-def listed(*names: str, end: str = "\n") -> io.TextIOWrapper:
+def stdin_of(*names: str, end: str = "\n") -> io.TextIOWrapper:
     """Standard input with the images' names."""
     return io.TextIOWrapper(io.BytesIO("".join(name + end for name in names).encode()))
 

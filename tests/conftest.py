@@ -1,4 +1,4 @@
-"""What several test files share."""
+"""Fixtures of several test files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 @dataclass(frozen=True)
 class Located:
-    """A small rendered exposure, the pipeline's result for it, and what is true of it."""
+    """A small rendered exposure, the pipeline's result for it, and its truth."""
 
     result: Any  # pipeline.Result
     truth: Any  # render.Truth
@@ -20,13 +20,13 @@ class Located:
 
 
 @pytest.fixture(scope="session")
-def compiled(located: Located) -> None:
+def compiled_kernels(located: Located) -> None:
     """The kernels of a fix on the cylinder are in numba's cache, so that other processes load them."""
 
 
 @pytest.fixture(scope="session")
 def located() -> Located:
-    """A 1024 px fisheye 6.5 km off the middle of the thesis's crater, seen and located."""
+    """A rendered and located exposure of a 1024 px fisheye, 6.5 km off the middle of the thesis's crater."""
     from startrack import pipeline
     from startrack.camera import load_camera
     from startrack.catalog import load_catalog

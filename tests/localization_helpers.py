@@ -1,4 +1,4 @@
-"""The log-likelihood of positions written out in numpy, row by row: what the kernels are tested against."""
+"""The log-likelihood of positions written out in numpy, row by row: the reference of the kernels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from startrack.types import Array, Evidence
 
 
 def slow_contributions(evidence: Evidence, margin_rad: Array, sigma_rad: Array) -> Array:
-    """Contributions (..., n) of rows that stand so far above the horizon."""
+    """Contributions (..., n) of rows at these margins above the horizon."""
     soft = sigma_rad > 0
     visible = np.where(soft, ndtr(margin_rad / np.where(soft, sigma_rad, 1.0)), margin_rad > 0)
     llr, extended = evidence.llr, evidence.extended_nats
@@ -32,7 +32,7 @@ def slow_scores(points_m: Array, evidence: Evidence, terrain: Terrain, sectors: 
 
 
 class Delegating:
-    """A terrain that passes everything on, and is of no class that the package knows."""
+    """A terrain that forwards every call, of a class unknown to the package."""
 
     def __init__(self, whole: Terrain) -> None:
         self._whole = whole

@@ -1,4 +1,4 @@
-"""Small scenes for the renderer's tests: a 512 px fisheye, a few stars, no surprises."""
+"""Small scenes for the renderer's tests: a 512 px fisheye and a few stars."""
 
 from __future__ import annotations
 
@@ -66,6 +66,6 @@ def make_scene(stars: Stars | None = None, *, heading_pitch_roll_deg: Any = (0.0
 
 
 def centroid_px(image: Any) -> Any:
-    """Light-weighted mean (x, y) of an image without background."""
+    """Flux-weighted mean (x, y) of an image without background."""
     y, x = np.indices(image.shape)
     return np.array([(image * x).sum(), (image * y).sum()]) / image.sum()

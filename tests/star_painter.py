@@ -1,6 +1,6 @@
-"""Stars painted by scipy's normal distribution function, and the Cramer-Rao bound of what can be known of them.
+"""Stars painted by scipy's normal distribution function, and the Cramer-Rao bound of their parameters.
 
-Shares no code with the package, so that a mistake in its PSF cannot hide.
+Shares no code with the package, so that a mistake in its PSF is noticed.
 """
 
 from __future__ import annotations

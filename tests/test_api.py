@@ -1,4 +1,4 @@
-"""The library's front door: paths, arrays and astropy's types in, a solution that prints itself out."""
+"""The library's functions: paths, arrays and astropy's types as input, solutions with a printed form as output."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_it_prints_itself(solution, tmp_path):
     assert solution.to_dict()["position"]["frame"] == "enu"
 
 
-def test_the_position_has_units_and_says_how_sure_it_is(solution):
+def test_the_position_has_units_and_an_uncertainty(solution):
     p, record = solution.position, solution.to_dict()["position"]
     assert (p.east.unit, p.covariance.unit, p.latitude.unit) == (u.m, u.m**2, u.deg)
     np.testing.assert_allclose(u.Quantity([p.east, p.north, p.up]).to_value("m"), solution.position_m)
@@ -106,7 +106,7 @@ def test_writing_replaces_what_an_earlier_result_left(solution, tmp_path):
     assert not stale[0].exists()
     assert all(path.read_bytes() != b"of an earlier run" for path in stale[1:])
     assert (tmp_path / "near-wall-2.wcs").read_text() == "of another image"
-    solution.write(tmp_path, plots=False)  # the same image's: renewed
+    solution.write(tmp_path, plots=False)  # of the same image: replaced
     refused = startrack.locate(read_exposure(IMAGE), time="2030-01-01T00:00:00Z")
     result = Refused(reason="no_stars", message="", reached=extend(last_value(refused.result), Oriented))
     refused = replace(refused, result=result)
@@ -114,7 +114,7 @@ def test_writing_replaces_what_an_earlier_result_left(solution, tmp_path):
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["near-wall-2.wcs", "near-wall.fix.json"]
 
 
-def test_a_result_of_another_image_is_kept_unless_asked(tmp_path):
+def test_a_result_of_another_image_is_kept_without_overwrite(tmp_path):
     first, second = (startrack.detect(np.full((64, 64), level, np.uint16)) for level in (300, 301))
     path = first.write(tmp_path)
     kept = path.read_bytes()
@@ -150,7 +150,7 @@ def test_identify_and_detect_leave_the_files_of_locate_alone(solution, tmp_path)
     assert own == {"detections.json", "detections.annotated.png", *(f"identification.{kind}" for kind in kinds)}
 
 
-def test_a_picture_without_stars_says_why():
+def test_a_picture_without_stars_has_a_reason():
     flat = startrack.locate(
         np.full((2048, 2048), 300, np.uint16), camera="fisheye-2048", terrain="shackleton-thesis",
         time="2030-01-01T00:00:00Z",
@@ -160,7 +160,7 @@ def test_a_picture_without_stars_says_why():
     assert flat.position_m is None
 
 
-def test_what_is_missing_is_asked_for():
+def test_missing_inputs_are_named():
     pixels = np.zeros((64, 64), np.uint16)
     with pytest.raises(BadInput, match="give time=,") as timeless:
         startrack.locate(pixels, camera="fisheye-2048", terrain="shackleton-thesis")
@@ -198,7 +198,7 @@ def test_importing_startrack_loads_nothing_heavy():
         ({"image": IMAGE, "terrain": 5}, "bad_terrain"),
     ],
 )
-def test_odd_things_are_refused_with_a_reason(given, reason):
+def test_invalid_inputs_are_refused_with_a_reason(given, reason):
     with pytest.raises(BadInput) as caught:
         startrack.locate(**given)
     assert caught.value.reason == reason
@@ -250,7 +250,7 @@ def test_numpy_times_are_utc(unit):
 def test_astropy_times_keep_their_microseconds():
     time = Time("2029-09-08T03:12:45.123456")
     assert time_input(time) == time_input(time.tdb) == datetime(2029, 9, 8, 3, 12, 45, 123456, tzinfo=UTC)
-    assert time.precision == 3  # the caller's own is left as it was
+    assert time.precision == 3  # the caller's object is unchanged
 
 
 def test_fractions_are_no_counts(tmp_path):
@@ -270,7 +270,7 @@ def test_fractions_are_no_counts(tmp_path):
         startrack.detect(scaled, camera="fisheye-2048")
 
 
-def test_a_field_of_view_stands_in_for_a_camera():
+def test_a_field_of_view_replaces_a_camera():
     found = startrack.identify(LOWELL, fov=180 * u.deg)
     assert found
     assert found.result.camera is not None

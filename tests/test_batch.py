@@ -1,4 +1,4 @@
-"""Folders of images: what is found, what is kept, and the same tables however the work was cut up."""
+"""Batches of images: finding, resuming, and equal tables for any division of the work."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ TABLES = ("results.ecsv", "results.parquet", "trajectory.tum", "manifest.json")
 
 @pytest.fixture(scope="module")
 def night(tmp_path_factory) -> Path:
-    """Three small frames of one crater in a tree, a file that is no image, and what no batch should touch."""
+    """Three small frames of one crater in a tree, a file that is no image, and files that a batch must not read."""
     root = tmp_path_factory.mktemp("night")
     camera = replace(
         load_camera("fisheye-2048"), name="small", size_px=(768, 768), focal_px=(244.0, 244.0), centre_px=(383.5, 383.5)
@@ -61,19 +61,19 @@ def night(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def done(night) -> Path:
-    """The batch, undisturbed, on one core."""
+def batch_output(night) -> Path:
+    """The complete batch on one core."""
     out = night / "out"
     assert main(["batch", str(night / "images"), "-D", str(out), "-j", "1", "-q"]) == 5  # broken.png is not solved
     return out
 
 
 def children(pid: int) -> list[int]:
-    path = Path(f"/proc/{pid}/task/{pid}/children")  # Linux; elsewhere nothing is asked
+    path = Path(f"/proc/{pid}/task/{pid}/children")  # Linux; elsewhere not checked
     return [int(one) for one in path.read_text().split()] if path.exists() else []
 
 
-def alive(pid: int) -> bool:
+def is_alive(pid: int) -> bool:
     try:
         return ") Z " not in Path(f"/proc/{pid}/stat").read_text()
     except OSError:
@@ -112,24 +112,24 @@ def test_named_images_must_lie_in_the_folder(night, monkeypatch):
         listed_images(night / "images", ["../small.toml"])
 
 
-def test_the_tables_say_what_the_results_say(night, done):
-    table = QTable.read(done / "results.ecsv", format="ascii.ecsv")
+def test_the_tables_agree_with_the_results(night, batch_output):
+    table = QTable.read(batch_output / "results.ecsv", format="ascii.ecsv")
     assert list(table["image"]) == ["a 1.png", "broken.png", "späti/a 1.png", "späti/b.png"]
     assert list(table["status"]) == ["ok", "refused", "ok", "ok"]
-    parquet = pq.read_table(done / "results.parquet").to_pydict()
+    parquet = pq.read_table(batch_output / "results.parquet").to_pydict()
     for number, row in enumerate((0, 2, 3)):
         truth = json.loads((night / f"truth-{number}.json").read_text())
         east, north = table["east_m"][row].to_value("m"), table["north_m"][row].to_value("m")
         assert np.hypot(east - truth[0], north - truth[1]) < table["radius999_m"][row].to_value("m")
         assert parquet["east_m"][row] == pytest.approx(east, abs=1e-4)
     assert parquet["east_m"][1] is None
-    manifest = json.loads((done / "manifest.json").read_text())
+    manifest = json.loads((batch_output / "manifest.json").read_text())
     assert [image["status"] for image in manifest["images"]] == ["ok", "refused", "ok", "ok"]
-    assert str(night) not in (done / "manifest.json").read_text() + (done / "results.ecsv").read_text()
+    assert str(night) not in (batch_output / "manifest.json").read_text() + (batch_output / "results.ecsv").read_text()
 
 
-def test_the_trajectory_is_of_poses_in_the_order_of_time(done):
-    lines = np.loadtxt(done / "trajectory.tum")
+def test_the_trajectory_is_of_poses_in_the_order_of_time(batch_output):
+    lines = np.loadtxt(batch_output / "trajectory.tum")
     assert lines.shape == (3, 8)
     assert np.all(np.diff(lines[:, 0]) > 0)
     np.testing.assert_allclose(np.linalg.norm(lines[:, 4:], axis=1), 1.0, atol=1e-8)
@@ -139,11 +139,11 @@ def records_in(out: Path) -> list[dict]:
     return [json.loads(path.read_text()) for path in sorted(out.rglob("*.fix.json"))]
 
 
-def test_a_trajectory_holds_poses_above_one_terrain(done, tmp_path):
+def test_a_trajectory_holds_poses_above_one_terrain(batch_output, tmp_path):
     """Coordinates of different terrains have different origins: one file each."""
-    records = records_in(done)
+    records = records_in(batch_output)
     write_tables(tmp_path, records, {})
-    assert (tmp_path / "trajectory.tum").read_bytes() == (done / "trajectory.tum").read_bytes()
+    assert (tmp_path / "trajectory.tum").read_bytes() == (batch_output / "trajectory.tum").read_bytes()
     first, *others = [record for record in records if record["status"] == "ok"]
     first["provenance"]["terrain"] = "/somewhere/other.toml"
     write_tables(tmp_path, records, {})
@@ -162,17 +162,17 @@ def test_a_trajectory_holds_poses_above_one_terrain(done, tmp_path):
     assert {"trajectory-t.tum", "trajectory-t-2.tum"} <= {path.name for path in tmp_path.glob("*.tum")}
 
 
-def test_parquet_is_written_with_the_extra_only(done, tmp_path, monkeypatch):
-    write_tables(tmp_path, records_in(done), {})
+def test_parquet_is_written_with_the_extra_only(batch_output, tmp_path, monkeypatch):
+    write_tables(tmp_path, records_in(batch_output), {})
     assert (tmp_path / "results.parquet").exists()
     monkeypatch.setattr("startrack.batch.tables.find_spec", lambda name: None)
-    write_tables(tmp_path, records_in(done), {})
+    write_tables(tmp_path, records_in(batch_output), {})
     assert not (tmp_path / "results.parquet").exists()  # the one of the earlier run would be out of date
     assert (tmp_path / "results.ecsv").exists()
 
 
 class FixedPosition:
-    """A localizer of one's own."""
+    """A user's own localizer."""
 
     def __call__(self, evidence, terrain):
         return point_fix(np.array([123.0, 45.0]), 10.0, terrain)
@@ -187,7 +187,7 @@ def test_a_localizer_is_one_class_and_one_line_in_the_list(night, tmp_path, monk
     assert record["provenance"]["localizer"] == "fixed"
     assert record["position"]["dropped_probability"] is None
     assert locate_image(replace(task, localizer="fixed")) == (record, True)
-    other, kept = locate_image(task)  # by another localizer it is another result
+    other, kept = locate_image(task)  # another localizer gives another result
     assert not kept
     assert other["position"]["east_m"] != 123.0
     assert main(["locate", str(image), "--localizer", "fixed", "-D", str(tmp_path), "--json", "--no-plots"]) == 0
@@ -205,24 +205,24 @@ def test_batch_takes_a_localizer_by_name(night, tmp_path, capsys):
     assert "known are posterior, pseudo-gradient, hull" in capsys.readouterr().err
 
 
-def test_several_processes_and_a_second_run_give_the_same_bytes(night, done, capsys):
+def test_several_processes_and_a_second_run_give_the_same_bytes(night, batch_output, capsys):
     out = night / "two"
     assert main(["batch", str(night / "images"), "-D", str(out), "-j", "2", "-q"]) == 5
-    assert tables(out) == tables(done)
+    assert tables(out) == tables(batch_output)
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*.fix.json")}
     assert main(["batch", str(night / "images"), "-D", str(out), "-j", "2"]) == 5
     assert "(4 were there already)" in capsys.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*.fix.json")} == before
 
 
-def test_what_was_lost_or_half_written_is_done_again_and_nothing_else(night, done):
+def test_only_missing_or_incomplete_results_are_repeated(night, batch_output):
     out = night / "torn"
-    shutil.copytree(done, out)
+    shutil.copytree(batch_output, out)
     (out / "results.ecsv").unlink()
     (out / "späti" / "b.fix.json").write_text('{"format": "startrack.fix/1", "ima')
     kept = (out / "a 1.fix.json").stat().st_mtime_ns
     assert main(["batch", str(night / "images"), "-D", str(out), "-j", "1", "-q"]) == 5
-    assert tables(out) == tables(done)
+    assert tables(out) == tables(batch_output)
     assert (out / "a 1.fix.json").stat().st_mtime_ns == kept
 
 
@@ -242,7 +242,7 @@ def test_a_changed_sidecar_or_flag_is_another_task(night, tmp_path):
     assert (refused["status"], refused["reason"]) == ("refused", "no_calibration")
 
 
-def test_dask_gives_the_same_as_the_local_run_though_a_worker_is_killed(night, done, monkeypatch):
+def test_dask_with_a_killed_worker_equals_the_local_run(night, batch_output, monkeypatch):
     distributed = pytest.importorskip("distributed")
     out, killed = night / "dask", []
     with distributed.LocalCluster(2, processes=True, threads_per_worker=1, dashboard_address=None) as cluster:
@@ -257,15 +257,15 @@ def test_dask_gives_the_same_as_the_local_run_though_a_worker_is_killed(night, d
 
         killer = threading.Thread(target=kill_a_busy_worker)
         killer.start()
-        monkeypatch.chdir(night)  # where the workers are not
+        monkeypatch.chdir(night)  # the workers run in another folder
         command = ["batch", "images", "-D", out.name, "-q", "--cluster", cluster.scheduler_address]
         assert main(command) == 5
         killer.join()
     assert killed
-    assert tables(out) == tables(done)
+    assert tables(out) == tables(batch_output)
 
 
-def test_killed_at_any_moment_a_batch_is_taken_up_again(night, done):
+def test_a_batch_killed_at_any_time_is_resumed(night, batch_output):
     out, command = night / "killed", [sys.executable, "-m", "startrack.cli.main", "batch", str(night / "images"), "-q"]
     for results in (1, 2):
         process = subprocess.Popen([*command, "-D", str(out), "-j", "2"])
@@ -275,9 +275,9 @@ def test_killed_at_any_moment_a_batch_is_taken_up_again(night, done):
         process.kill()
         process.wait()
         for _ in range(100):
-            if not any(map(alive, workers)):
+            if not any(map(is_alive, workers)):
                 break
             time.sleep(0.1)
-        assert not any(map(alive, workers))  # nobody is left at work when the run is taken up again
+        assert not any(map(is_alive, workers))  # no worker is left when the run is resumed
     assert main(["batch", str(night / "images"), "-D", str(out), "-j", "2", "-q"]) == 5
-    assert tables(out) == tables(done)
+    assert tables(out) == tables(batch_output)

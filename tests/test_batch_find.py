@@ -1,4 +1,4 @@
-"""Which files a batch takes for its images, however they lie and are listed, and what their results are called."""
+"""The images of a batch for every layout and list, and the names of their results."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 
 import pytest
 from astropy.table import Table
-from batch_helpers import frames, listed, task_of
+from batch_helpers import frames, stdin_of, task_of
 
 from startrack.batch import images_under, locate_image
 from startrack.batch.find import result_stems
@@ -59,9 +59,9 @@ def test_a_pipe_is_no_image_and_a_link_to_nothing_is_one(tmp_path):
 
 
 @pytest.mark.parametrize("end", ["\n", "\0"])
-def test_an_image_that_is_gone_when_its_turn_comes_is_refused_alone(tmp_path, monkeypatch, end):
+def test_an_image_deleted_during_the_run_is_refused_alone(tmp_path, monkeypatch, end):
     frames(tmp_path / "images", 2)
-    monkeypatch.setattr("sys.stdin", listed("00.png", "gone.png", "gone.png", "gone.fits", end=end))
+    monkeypatch.setattr("sys.stdin", stdin_of("00.png", "gone.png", "gone.png", "gone.fits", end=end))
     out = str(tmp_path / "out")
     assert main(["batch", str(tmp_path / "images"), "-D", out, "--files-on-stdin", "-j", "1", "--no-plots", "-q"]) == 5
     table = Table.read(tmp_path / "out" / "results.ecsv", format="ascii.ecsv")

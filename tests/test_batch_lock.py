@@ -10,20 +10,20 @@ import sys
 import pytest
 from batch_helpers import frames
 
-from startrack.batch import LOCK, only_writer
+from startrack.batch import LOCK, lock_results
 from startrack.cli.main import main
 from startrack.errors import BadInput
 
 HOLD = """
 import sys
 from pathlib import Path
-from startrack.batch import only_writer
-with only_writer(Path(sys.argv[1])): print(flush=True); input()
+from startrack.batch import lock_results
+with lock_results(Path(sys.argv[1])): print(flush=True); input()
 """
 
 
 def holder(out) -> subprocess.Popen[str]:
-    """A process that holds the folder, and does."""
+    """A process that holds the lock of the folder."""
     command = [sys.executable, "-c", HOLD, str(out)]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -31,7 +31,7 @@ def holder(out) -> subprocess.Popen[str]:
     return process
 
 
-def test_a_second_batch_is_told_of_the_first_and_touches_nothing(tmp_path, capsys):
+def test_a_second_batch_is_refused_and_changes_nothing(tmp_path, capsys):
     frames(tmp_path / "images", 1)
     out = tmp_path / "out"
     out.mkdir()
@@ -44,14 +44,14 @@ def test_a_second_batch_is_told_of_the_first_and_touches_nothing(tmp_path, capsy
     assert main(["batch", str(tmp_path / "images"), "-D", str(out), "-j", "1", "-q"]) == 5
 
 
-def test_a_lock_goes_with_a_killed_process(tmp_path):
+def test_a_lock_is_released_with_a_killed_process(tmp_path):
     first = holder(tmp_path)
     first.send_signal(signal.SIGKILL)
     first.communicate()
     assert (tmp_path / LOCK).exists()
-    with only_writer(tmp_path):
+    with lock_results(tmp_path):
         assert (tmp_path / LOCK).read_text() == str(os.getpid())
-        with pytest.raises(BadInput, match=f"process {os.getpid()}"), only_writer(tmp_path):
+        with pytest.raises(BadInput, match=f"process {os.getpid()}"), lock_results(tmp_path):
             pass
     assert not (tmp_path / LOCK).exists()
 
@@ -64,6 +64,6 @@ def test_a_lock_file_of_another_kind_is_bad_input(tmp_path, kind):
         (tmp_path / LOCK).mkdir()
     else:
         (tmp_path / LOCK).symlink_to(target)
-    with pytest.raises(BadInput, match="cannot be used as lock file"), only_writer(tmp_path):
+    with pytest.raises(BadInput, match="cannot be used as lock file"), lock_results(tmp_path):
         pass
     assert target.read_text() == "not ours"

@@ -1,4 +1,4 @@
-"""A batch that cannot simply go on: processes that die, a disk that is full, a reader that has gone, Ctrl-C."""
+"""Interrupted batches: processes that die, a full disk, a closed pipe, Ctrl-C."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from batch_helpers import frames
 
 from startrack.cli.main import main
 
-pytestmark = pytest.mark.usefixtures("compiled")  # else the first command announces on stderr that it compiles
+pytestmark = pytest.mark.usefixtures("compiled_kernels")  # else the first command announces on stderr that it compiles
 
 
-def begun(folder: Path, *flags: str, before: str = "") -> subprocess.Popen[str]:
-    """The command in a shell's process, which `before` may have prepared."""
+def start_batch(folder: Path, *flags: str, before: str = "") -> subprocess.Popen[str]:
+    """The command in a shell, after the shell command `before`."""
     command = [sys.executable, "-m", "startrack.cli.main", "batch", str(folder), *flags]
     shell = ["bash", "-c", f'{before} exec "$@"', "bash", *command]
     return subprocess.Popen(shell, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
@@ -51,8 +51,8 @@ def test_a_cluster_is_an_address_and_has_its_own_processes(tmp_path, capsys, fla
 
 
 @pytest.fixture(scope="module")
-def many(tmp_path_factory) -> Path:
-    """A folder with more frames than a batch does before it is stopped."""
+def many_frames(tmp_path_factory) -> Path:
+    """A folder with more frames than a batch can locate before it is stopped."""
     folder = tmp_path_factory.mktemp("many")
     frames(folder, 400)
     return folder
@@ -66,11 +66,11 @@ def many(tmp_path_factory) -> Path:
         ([signal.SIGTERM], True, "terminated"),  # as systemd and Slurm do
     ],
 )
-def test_a_signal_ends_the_batch_after_the_frames_in_hand_with_tables_of_what_is_done(
-    many, tmp_path, wishes, to_the_group, why
+def test_a_signal_ends_the_batch_after_the_frames_in_progress_and_writes_the_tables(
+    many_frames, tmp_path, wishes, to_the_group, why
 ):
     out = tmp_path / "out"
-    process = begun(many, "-D", str(out), "-j", "2", "-O", "-v", "--no-plots")
+    process = start_batch(many_frames, "-D", str(out), "-j", "2", "-O", "-v", "--no-plots")
     assert process.stdout is not None
     for _ in range(5):
         process.stdout.readline()
@@ -88,9 +88,9 @@ def test_a_signal_ends_the_batch_after_the_frames_in_hand_with_tables_of_what_is
 
 
 @pytest.mark.parametrize("delay_s", [0.1, 0.4, 0.8])
-def test_an_early_signal_ends_the_batch_at_once(many, tmp_path, delay_s):
+def test_an_early_signal_ends_the_batch_at_once(many_frames, tmp_path, delay_s):
     """While the program is loaded, and while its processes start."""
-    with begun(many, "-D", str(tmp_path / "out"), "-j", "2", "-O", "--no-plots") as process:
+    with start_batch(many_frames, "-D", str(tmp_path / "out"), "-j", "2", "-O", "--no-plots") as process:
         time.sleep(delay_s)
         os.killpg(process.pid, signal.SIGINT)
         _, err = process.communicate(timeout=120)
@@ -99,26 +99,26 @@ def test_an_early_signal_ends_the_batch_at_once(many, tmp_path, delay_s):
         assert "images done" in err
 
 
-def test_a_later_signal_drops_the_images_in_hand_and_writes_the_tables(tmp_path, monkeypatch):
-    """The wish is made from within, so that it comes between two images."""
+def test_a_later_signal_drops_the_images_in_progress_and_writes_the_tables(tmp_path, monkeypatch):
+    """The signal is raised inside the process, so that it arrives between two images."""
     frames(tmp_path / "images", 40)
     monkeypatch.setattr("startrack.cli.batch_show.SAME_SIGNAL_S", -1.0)
-    told = []
+    results = []
 
-    def wish(*_: object, **__: object) -> None:
-        told.append(1)
-        if len(told) in (3, 4):
+    def interrupt(*_: object, **__: object) -> None:
+        results.append(1)
+        if len(results) in (3, 4):
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("builtins.print", wish)
+    monkeypatch.setattr("builtins.print", interrupt)
     out = tmp_path / "out"
     assert main(["batch", str(tmp_path / "images"), "-D", str(out), "-j", "1", "-v", "--no-plots"]) == 5
     assert len(Table.read(out / "results.ecsv", format="ascii.ecsv")) == len(list(out.glob("*.fix.json")))
     assert len(list(out.glob("*.fix.json"))) < 40
 
 
-def test_a_reader_that_goes_ends_the_batch_early(many, tmp_path):
-    with begun(many, "-D", str(tmp_path / "out"), "-j", "1", "--json", "--no-plots") as process:
+def test_a_closed_pipe_ends_the_batch_early(many_frames, tmp_path):
+    with start_batch(many_frames, "-D", str(tmp_path / "out"), "-j", "1", "--json", "--no-plots") as process:
         assert process.stdout is not None and process.stderr is not None
         assert json.loads(process.stdout.readline())["image"] == "00.png"
         process.stdout.close()
@@ -128,8 +128,8 @@ def test_a_reader_that_goes_ends_the_batch_early(many, tmp_path):
     assert "Traceback" not in err
 
 
-def test_a_reader_that_goes_ends_the_image_commands_early_too(many, tmp_path):
-    images = sorted(str(path) for path in many.glob("*.png"))[:300]
+def test_a_closed_pipe_ends_the_image_commands_early(many_frames, tmp_path):
+    images = sorted(str(path) for path in many_frames.glob("*.png"))[:300]
     command = [sys.executable, "-m", "startrack.cli.main", "detect", *images, "-D", str(tmp_path / "out"), "--no-plots"]
     with subprocess.Popen([*command, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None and process.stderr is not None
@@ -148,10 +148,10 @@ def test_with_json_nothing_else_is_printed(tmp_path, capsys):
 
 
 def test_a_full_disk_ends_the_batch_with_one_message(tmp_path):
-    """A limit on the size of files stands in for the disk's: once it is lifted, the same command goes on."""
+    """A limit on file sizes simulates the full disk: after it is lifted, the same command continues."""
     frames(tmp_path / "images", 4)
     flags = "-D", str(tmp_path / "out"), "-j", "1"
-    full = begun(tmp_path / "images", *flags, before="ulimit -f 8;")
+    full = start_batch(tmp_path / "images", *flags, before="ulimit -f 8;")
     out, err = full.communicate()
     assert (full.returncode, out, len(err.splitlines())) == (5, "", 1)
     assert "cannot be written (File too large): 0 of 4 images done" in err
@@ -159,7 +159,7 @@ def test_a_full_disk_ends_the_batch_with_one_message(tmp_path):
     assert len(Table.read(tmp_path / "out" / "results.ecsv", format="ascii.ecsv")) == 4
 
 
-def test_a_folder_that_cannot_be_written_is_said_at_once(tmp_path, capsys):
+def test_a_read_only_folder_is_reported_at_once(tmp_path, capsys):
     frames(tmp_path / "images", 1)
     assert main(["batch", str(tmp_path / "images"), "-D", "/proc"]) == 4
     assert "/proc: results cannot be written" in capsys.readouterr().err

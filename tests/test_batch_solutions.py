@@ -1,4 +1,4 @@
-"""What a batch solved stays until something as good takes its place, and its tables never mix settings or contents."""
+"""Solutions of a batch stay until an equally good result replaces them; its tables never mix settings or contents."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from astropy.table import Table
-from batch_helpers import frames, listed
+from batch_helpers import frames, stdin_of
 
 from startrack.batch import stored_record
 from startrack.cli.main import main
@@ -32,7 +32,7 @@ def batch_done(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def folder(batch_done, tmp_path) -> Path:
-    """A copy of it, to be spoilt."""
+    """A copy of it for destructive changes."""
     return Path(shutil.copytree(batch_done, tmp_path / "copy"))
 
 
@@ -54,7 +54,7 @@ def result_in_manifest(root: Path) -> str | None:
 
 
 @pytest.mark.parametrize("flags", [("-c", "nowhere.toml"), ("-t", "nowhere.toml"), ("-c", "no-such-name")])
-def test_a_file_that_a_flag_names_is_read_before_anything_is_touched(folder, capsys, flags):
+def test_files_of_flags_are_read_before_anything_changes(folder, capsys, flags):
     before = {path: path.read_bytes() for path in (folder / "out").iterdir()}
     assert batch(folder, *flags) == 4
     assert flags[1] in capsys.readouterr().err
@@ -75,7 +75,7 @@ def break_the_image(folder: Path) -> None:
 
 @pytest.mark.parametrize("spoil", [lose_the_camera, lose_the_sidecar, break_the_image])
 @pytest.mark.parametrize("flags", [(), ("-O",)])
-def test_an_input_that_cannot_be_used_costs_no_solution(folder, capsys, spoil, flags):
+def test_an_unusable_input_keeps_the_earlier_solution(folder, capsys, spoil, flags):
     before = files(folder)
     spoil(folder)
     assert batch(folder, *flags) == 5
@@ -85,7 +85,7 @@ def test_an_input_that_cannot_be_used_costs_no_solution(folder, capsys, spoil, f
     assert result_in_manifest(folder) is None
 
 
-def test_an_input_that_is_back_finds_its_solution(folder, capsys):
+def test_a_restored_input_reuses_its_solution(folder, capsys):
     camera = (folder / "camera.toml").read_bytes()
     lose_the_camera(folder)
     assert batch(folder) == 5
@@ -96,7 +96,7 @@ def test_an_input_that_is_back_finds_its_solution(folder, capsys):
     assert (table(folder)[SOLVED], result_in_manifest(folder)) == ("ok", "00.fix.json")
 
 
-def test_a_refusal_for_want_of_stars_replaces_a_solution(folder):
+def test_a_refusal_for_lack_of_stars_replaces_a_solution(folder):
     shutil.copy(folder / "images" / "01.png", folder / "images" / SOLVED)
     shutil.copy(folder / "images" / "01.json", folder / "images" / "00.json")
     assert batch(folder) == 5
@@ -105,7 +105,7 @@ def test_a_refusal_for_want_of_stars_replaces_a_solution(folder):
 
 
 @pytest.mark.parametrize("companion", ["00.stars.ecsv", "00.annotated.png", "00.wcs", "00.corr"])
-def test_a_solution_without_one_of_its_files_is_not_whole(folder, companion):
+def test_a_solution_without_one_of_its_files_is_incomplete(folder, companion):
     from startrack.batch.store import has_companions
 
     record, result = stored_record(folder / "out" / "00.fix.json"), folder / "out" / "00.fix.json"
@@ -116,8 +116,8 @@ def test_a_solution_without_one_of_its_files_is_not_whole(folder, companion):
 
 
 def test_the_tables_hold_one_kind_of_settings(folder, capsys, monkeypatch):
-    """A run of one image with another flag: what the other images' results say was made without it."""
-    monkeypatch.setattr("sys.stdin", listed("01.png"))
+    """A run of one image with another flag: the other images' results were made without it."""
+    monkeypatch.setattr("sys.stdin", stdin_of("01.png"))
     assert batch(folder, "--exposure", "2", "--files-on-stdin") == 5
     assert "2 results of other settings or contents left out" in capsys.readouterr().err
     assert table(folder) == {"01.png": "refused"}
@@ -125,7 +125,7 @@ def test_the_tables_hold_one_kind_of_settings(folder, capsys, monkeypatch):
 
 def test_the_tables_hold_what_the_images_hold_now(folder, capsys, monkeypatch):
     shutil.copy(folder / "images" / "02.png", folder / "images" / SOLVED)
-    monkeypatch.setattr("sys.stdin", listed("01.png"))
+    monkeypatch.setattr("sys.stdin", stdin_of("01.png"))
     assert batch(folder, "--files-on-stdin") == 5
     assert "1 result of other settings or contents left out" in capsys.readouterr().err
     assert table(folder) == {"01.png": "refused", "02.png": "refused"}
@@ -133,7 +133,7 @@ def test_the_tables_hold_what_the_images_hold_now(folder, capsys, monkeypatch):
 
 def test_a_run_of_some_images_gives_the_tables_of_all(folder, monkeypatch):
     before = table(folder)
-    monkeypatch.setattr("sys.stdin", listed("01.png"))
+    monkeypatch.setattr("sys.stdin", stdin_of("01.png"))
     assert batch(folder, "--files-on-stdin") == 5
     assert table(folder) == before
 
@@ -142,18 +142,18 @@ def test_a_run_of_some_images_gives_the_tables_of_all(folder, monkeypatch):
     "text",
     ['{"foo": 1}', '{"image": "01.png", "status": "ok", "reason": null}', "[]", '{"image": 1, "status": {}}'],
 )
-def test_what_is_no_whole_record_is_none(folder, monkeypatch, text):
+def test_incomplete_records_are_not_used(folder, monkeypatch, text):
     result = folder / "out" / "01.fix.json"
     result.write_text(text)
     assert stored_record(result) is None
-    monkeypatch.setattr("sys.stdin", listed("02.png"))
+    monkeypatch.setattr("sys.stdin", stdin_of("02.png"))
     assert batch(folder, "--files-on-stdin") == 5
     assert list(table(folder)) == [SOLVED, "02.png"]
     assert batch(folder) == 5
     assert stored_record(result)["reason"] == "no_stars"
 
 
-def test_warnings_are_counted_and_told_when_asked_for(folder, capsys):
+def test_warnings_are_counted_and_shown_with_verbose(folder, capsys):
     sidecar = folder / "images" / "01.json"
     sidecar.write_text(json.dumps(json.loads(sidecar.read_text()) | {"exposuer_s": 1.0}))
     assert batch(folder) == 5

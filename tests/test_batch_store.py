@@ -1,4 +1,4 @@
-"""What a batch keeps of earlier runs: what still holds, and nothing else."""
+"""Results of earlier runs that a batch keeps: the valid ones only."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ dem = {file = "heights.tif"}
 
 
 @pytest.mark.parametrize(("missing", "reason"), [("camera", "no_calibration"), ("terrain", "bad_terrain")])
-def test_a_refusal_ends_when_the_missing_file_is_there(tmp_path, missing, reason):
+def test_a_refused_image_is_repeated_when_the_missing_file_exists(tmp_path, missing, reason):
     (image,) = frames(tmp_path, 1)
     image.with_suffix(".json").write_text(json.dumps(FACTS | {missing: "later.toml"}))
     task = task_of(image, tmp_path)
@@ -35,7 +35,7 @@ def test_a_refusal_ends_when_the_missing_file_is_there(tmp_path, missing, reason
     assert not locate_image(task)[1]
 
 
-def test_a_refusal_ends_when_the_missing_height_map_is_there(tmp_path):
+def test_a_refused_image_is_repeated_when_the_missing_height_map_exists(tmp_path):
     (image,) = frames(tmp_path, 1)
     (tmp_path / "dem.toml").write_text(DEM)
     image.with_suffix(".json").write_text(json.dumps(FACTS | {"terrain": "dem.toml"}))
@@ -67,7 +67,7 @@ def test_a_result_that_could_not_be_written_is_always_tried_again(tmp_path):
     assert not locate_image(task)[1]
 
 
-def test_an_early_refusal_says_of_which_file_it_is(tmp_path):
+def test_an_early_refusal_has_the_hash_of_its_file(tmp_path):
     (image,) = frames(tmp_path, 1)
     image.with_suffix(".json").write_text(json.dumps(FACTS | {"camera": "nowhere.toml"}))
     early, _ = locate_image(task_of(image, tmp_path))
@@ -94,7 +94,7 @@ def batch(*words: object) -> int:
     return main(["batch", *map(str, words), "-j", "1", "--no-plots", "-q"])
 
 
-def test_a_batch_of_other_images_is_not_replaced_unasked(tmp_path, capsys):
+def test_a_batch_of_other_images_is_not_replaced_without_overwrite(tmp_path, capsys):
     frames(tmp_path / "monday", 2)
     frames(tmp_path / "tuesday", 2, level=120)
     out = tmp_path / "out"

@@ -26,7 +26,7 @@ TRUTH = Camera(
 )  # fmt: skip
 COLUMNS, ROWS = 9, 6
 SUPERSAMPLED = 2
-POSES = (  # turn of the board about cam axes [degrees], place of its middle [squares]
+POSES = (  # rotation of the board about cam axes [degrees], position of its centre [squares]
     ((0, 0, 0), (0, 0, 5.5)),
     ((35, 0, 10), (-2, 0, 5.0)),
     ((-35, 10, 0), (2.5, 0.5, 5.0)),
@@ -45,29 +45,29 @@ def pixel_rays(dx, dy):
     return TRUTH.unproject(np.stack([x + dx, y + dy], axis=-1))
 
 
-def rays_to_board(pose, rays):
-    """Places on the board (n, 2) [squares, from the first inner corner] where the rays meet it, and the depth."""
-    turn, middle = pose
-    R = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()  # board to cam
+def board_positions(pose, rays):
+    """Intersections (n, 2) of the rays with the board [squares, from the first inner corner], and their depth."""
+    rotation_deg, middle = pose
+    R = Rotation.from_euler("xyz", rotation_deg, degrees=True).as_matrix()  # board to cam
     origin = np.array(middle) - R @ [(COLUMNS - 1) / 2, (ROWS - 1) / 2, 0.0]
     depth = (origin @ R[:, 2]) / (rays @ R[:, 2])
     return ((rays * depth[..., None] - origin) @ R)[..., :2], depth
 
 
-def drawn(pose, colour):
-    """A picture of the board; `colour` gives brightness at places."""
+def draw_picture(pose, colour):
+    """A picture of the board; `colour` gives the brightness at positions on it."""
     step = (np.arange(SUPERSAMPLED) - (SUPERSAMPLED - 1) / 2) / SUPERSAMPLED
     total = np.zeros(SIZE_PX[::-1])
     for dx in step:
         for dy in step:
-            place, depth = rays_to_board(pose, pixel_rays(dx, dy))
-            total += np.where(depth > 0, colour(place), 0.4)
+            position, depth = board_positions(pose, pixel_rays(dx, dy))
+            total += np.where(depth > 0, colour(position), 0.4)
     noise = np.random.default_rng(3).normal(0, 40, total.shape)
     return Exposure(pixels_adu=(8000 * total / SUPERSAMPLED**2 + 500 + noise).astype(np.float32), name="board")
 
 
-def chessboard(place):
-    column, row = np.floor(place[..., 0]) + 1, np.floor(place[..., 1]) + 1
+def chessboard(position):
+    column, row = np.floor(position[..., 0]) + 1, np.floor(position[..., 1]) + 1
     inside = (column >= 0) & (column <= COLUMNS) & (row >= 0) & (row <= ROWS)
     return np.where(inside, (column + row) % 2, 1.0)
 
@@ -78,8 +78,8 @@ def charuco(columns, rows):
     pattern = cv2.aruco.CharucoBoard((columns, rows), 1.0, 0.75, dictionary)
     picture = pattern.generateImage((columns * side, rows * side), marginSize=0).astype(float) / 255.0
 
-    def colour(place):
-        x, y = (np.floor((place[..., k] + 1) * side).astype(int) for k in (0, 1))
+    def colour(position):
+        x, y = (np.floor((position[..., k] + 1) * side).astype(int) for k in (0, 1))
         inside = (x >= 0) & (y >= 0) & (x < columns * side) & (y < rows * side)
         return np.where(inside, picture[np.clip(y, 0, rows * side - 1), np.clip(x, 0, columns * side - 1)], 1.0)
 
@@ -93,27 +93,27 @@ def map_error_px(camera):
     rays = np.stack([np.sqrt(1 - z * z) * np.cos(b), np.sqrt(1 - z * z) * np.sin(b), z], axis=1)
     rays = rays[TRUTH.project(rays)[1]]
     miss = (camera.project(rays)[0] - TRUTH.project(rays)[0]).ravel()
-    turn = TRUTH.jacobian_px_per_rad(rays).reshape(-1, 3)
-    miss -= turn @ np.linalg.lstsq(turn, miss, rcond=None)[0]
+    by_rotation = TRUTH.jacobian_px_per_rad(rays).reshape(-1, 3)
+    miss -= by_rotation @ np.linalg.lstsq(by_rotation, miss, rcond=None)[0]
     return float(np.sqrt(2 * np.mean(miss**2)))
 
 
 @pytest.fixture(scope="module")
 def chessboards():
-    return [drawn(pose, chessboard) for pose in POSES]
+    return [draw_picture(pose, chessboard) for pose in POSES]
 
 
 def test_drawn_corners_are_found_where_they_are(chessboards):
-    """The drawing and OpenCV's detector agree: what follows rests on both."""
+    """The drawing and OpenCV's detector agree; the other tests rely on both."""
     found = find_corners(chessboards[1], Board(COLUMNS, ROWS))
-    place, _ = rays_to_board(POSES[1], TRUTH.unproject(found.xy_px))
-    assert np.median(np.abs(place - np.rint(place))) < 0.005
-    assert np.abs(place - np.rint(place)).max() < 0.1
+    position, _ = board_positions(POSES[1], TRUTH.unproject(found.xy_px))
+    assert np.median(np.abs(position - np.rint(position))) < 0.005
+    assert np.abs(position - np.rint(position)).max() < 0.1
 
 
 def test_chessboards_give_the_lens(chessboards):
     found = calibrate_board(chessboards, Board(COLUMNS, ROWS))
-    assert found.accepted, found.failed
+    assert found.accepted, found.failed_checks
     assert len(found.images) >= 7
     assert found.fit.held_out_rms_px < 0.3
     assert map_error_px(found.camera) < 0.25
@@ -123,7 +123,7 @@ def test_chessboards_give_the_lens(chessboards):
 
 def test_charuco_boards_give_the_lens():
     colour = charuco(COLUMNS + 1, ROWS + 1)
-    pictures = [drawn(pose, colour) for pose in POSES[:8]]
+    pictures = [draw_picture(pose, colour) for pose in POSES[:8]]
     found = calibrate_board(pictures, Board(COLUMNS + 1, ROWS + 1, charuco="DICT_5X5_100"))
     assert len(found.images) >= 5
     assert map_error_px(found.camera) < 0.4
@@ -166,8 +166,10 @@ def test_the_command(chessboards, tmp_path, capsys):
 
 def test_pictures_without_a_board_are_refused(chessboards):
     with pytest.raises(NotIdentified, match="pattern") as refusal:
-        calibrate_board([drawn(POSES[0], lambda place: np.full(place.shape[:-1], 0.5))], Board(COLUMNS, ROWS))
+        calibrate_board(
+            [draw_picture(POSES[0], lambda position: np.full(position.shape[:-1], 0.5))], Board(COLUMNS, ROWS)
+        )
     assert refusal.value.reason == "no_stars"
     one = calibrate_board(chessboards[:1], Board(COLUMNS, ROWS))
     assert not one.accepted
-    assert one.failed[0].reason == "insufficient_geometry"
+    assert one.failed_checks[0].reason == "insufficient_geometry"

@@ -75,7 +75,7 @@ def test_ros_file_read_with_its_own_formula():
     d = yaml.safe_load(to_text(FISHEYE, "ros"))
     assert d["distortion_model"] == "equidistant"
     K, D = np.reshape(d["camera_matrix"]["data"], (3, 3)), d["distortion_coefficients"]["data"]
-    np.testing.assert_allclose(by_angle(K, D, rays(1.4)), FISHEYE.project(rays(1.4))[0], atol=1e-9)
+    np.testing.assert_allclose(project_by_angle(K, D, rays(1.4)), FISHEYE.project(rays(1.4))[0], atol=1e-9)
     P = np.reshape(d["projection_matrix"]["data"], (3, 4))
     np.testing.assert_array_equal(P[:, :3], K)
     assert (d["image_width"], d["image_height"]) == FISHEYE.size_px
@@ -85,7 +85,9 @@ def test_kalibr_file_read_with_its_own_formula():
     d = yaml.safe_load(to_text(FISHEYE, "kalibr"))["cam0"]
     fu, fv, pu, pv = d["intrinsics"]
     K = np.array([[fu, 0, pu], [0, fv, pv], [0, 0, 1]])
-    np.testing.assert_allclose(by_angle(K, d["distortion_coeffs"], rays(1.4)), FISHEYE.project(rays(1.4))[0], atol=1e-9)
+    np.testing.assert_allclose(
+        project_by_angle(K, d["distortion_coeffs"], rays(1.4)), FISHEYE.project(rays(1.4))[0], atol=1e-9
+    )
     assert tuple(d["resolution"]) == FISHEYE.size_px
     T_cam_body = np.array(d["T_cam_imu"])
     ray_body = np.array([0.3, -0.4, 0.5, 0.0])  # a direction takes no part in the translation
@@ -97,7 +99,7 @@ def test_colmap_counts_from_the_corner_of_the_first_pixel():
     assert line[:4] == ["1", "OPENCV_FISHEYE", "1600", "1200"]
     fx, fy, cx, cy, *k = map(float, line[4:])
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    np.testing.assert_allclose(by_angle(K, k, rays(1.4)), FISHEYE.project(rays(1.4))[0] + 0.5, atol=1e-9)
+    np.testing.assert_allclose(project_by_angle(K, k, rays(1.4)), FISHEYE.project(rays(1.4))[0] + 0.5, atol=1e-9)
 
 
 def test_colmap_thin_prism_fisheye_holds_a_decentred_lens():
@@ -170,7 +172,7 @@ def test_a_ros_name_is_quoted():
     assert from_text(to_text(named, "ros"), "ros", "other").name == named.name
 
 
-def by_angle(K, k, seen):
+def project_by_angle(K, k, seen):
     r = np.hypot(seen[:, 0], seen[:, 1])
     theta = np.arctan2(r, seen[:, 2])
     theta_d = theta * (1 + sum(c * theta ** (2 * n + 2) for n, c in enumerate(k)))

@@ -1,4 +1,4 @@
-"""`startrack calibrate` on pictures: a real all-sky photograph from cold, and rendered frames with known truth."""
+"""`startrack calibrate` on pictures: a real all-sky photograph without a camera file, and rendered frames."""
 
 from __future__ import annotations
 
@@ -34,26 +34,26 @@ def exposure():
 
 
 @pytest.fixture(scope="module")
-def cold(exposure):
-    """From nothing but "about 180 degrees"."""
+def cold_calibration(exposure):
+    """Calibration from the field of view of about 180 degrees alone."""
     return calibrate([exposure], load_catalog().brighter_than(8.0), fov_rad=np.pi, site=SITE, name="cold")
 
 
-def test_the_photograph_calibrates_from_cold(cold):
-    assert cold.accepted, [check.name for check in cold.failed]
-    fit = cold.joint.fit
+def test_the_photograph_calibrates_from_cold(cold_calibration):
+    assert cold_calibration.accepted, [check.name for check in cold_calibration.failed_checks]
+    fit = cold_calibration.joint.fit
     assert fit.used.sum() >= 1000
     assert fit.held_out_rms_px <= 0.35  # distance, not per axis
-    assert np.degrees(cold.camera.calibrated_angle_rad) == pytest.approx(83, abs=2)
-    assert cold.camera.decentring  # by 0.3 px: without it the held-out RMS is 0.34 px
-    assert not cold.camera.mirrored
+    assert np.degrees(cold_calibration.camera.calibrated_angle_rad) == pytest.approx(83, abs=2)
+    assert cold_calibration.camera.decentring  # by 0.3 px: without it the held-out RMS is 0.34 px
+    assert not cold_calibration.camera.mirrored
 
 
-def test_its_stars_are_those_that_were_named_without_startrack(cold):
+def test_its_stars_are_those_that_were_named_without_startrack(cold_calibration):
     with REFERENCE.open() as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     px = np.array([[float(row["x_px"]), float(row["y_px"])] for row in rows])
-    frame, matched = cold.joint.frames[0], cold.joint.matches[0]
+    frame, matched = cold_calibration.joint.frames[0], cold_calibration.joint.matches[0]
     distance, nearest = cKDTree(px).query(frame.sources.xy_px[matched.detection])
     both = distance < 1.5
     assert both.sum() >= 380
@@ -61,11 +61,11 @@ def test_its_stars_are_those_that_were_named_without_startrack(cold):
     assert np.mean(frame.sky.stars.hip[matched.star][both] == names[nearest[both]]) >= 0.995
 
 
-def test_chance_gives_no_such_number_of_matches(cold):
-    assert joint_log_p_value(cold.joint) < np.log(1e-100)
+def test_chance_gives_no_such_number_of_matches(cold_calibration):
+    assert joint_log_p_value(cold_calibration.joint) < np.log(1e-100)
 
 
-def test_the_mirror_image_is_solved_and_said_to_be_one(exposure):
+def test_the_mirror_image_is_solved_and_reported_as_mirrored(exposure):
     flipped = replace(exposure, pixels_adu=exposure.pixels_adu[:, ::-1].copy())
     found = calibrate([flipped], load_catalog().brighter_than(7.0), camera=load_camera("lowell-ldt"), site=SITE)
     assert found.accepted
@@ -96,8 +96,8 @@ def test_noise_is_refused_with_advice(exposure):
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    """What the command writes for the photograph, from a camera file that is 2 % and 6 px off."""
+def written_files(tmp_path_factory):
+    """Output of the command for the photograph, from a camera file that is 2 % and 6 px off."""
     folder = tmp_path_factory.mktemp("calibration")
     camera = load_camera("lowell-ldt")
     rough = replace(camera, focal_px=(343.0, 343.0), centre_px=(camera.centre_px[0] + 6, camera.centre_px[1] - 5))
@@ -114,34 +114,34 @@ def written(tmp_path_factory):
     return folder
 
 
-def test_the_command_writes_camera_record_and_report(written):
-    camera = load_camera(written / "new.toml")
+def test_the_command_writes_camera_record_and_report(written_files):
+    camera = load_camera(written_files / "new.toml")
     assert camera.covariance_order[:4] == ("fx", "fy", "cx", "cy")
     rays = camera.unproject(np.array([[709.0, 489.0], [1100.0, 489.0], [709.0, 60.0]]))
     assert 0 < camera.projection_sigma_px(rays).max() < 0.05
-    record = json.loads((written / "new.calibration.json").read_text())
+    record = json.loads((written_files / "new.calibration.json").read_text())
     assert (record["status"], record["reason"]) == ("ok", None)
     assert record["lens"]["held_out_rms_px"] < 0.35
     assert all(gate["passed"] for gate in record["gates"])
-    page = (written / "new.report.html").read_text()
+    page = (written_files / "new.report.html").read_text()
     assert "accepted" in page
     assert not re.search(r'(src|href)="(?!data:)', page)  # nothing is fetched
-    assert (written / "new.report.png").read_bytes().startswith(b"\x89PNG")
+    assert (written_files / "new.report.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_sensor_is_measured_where_the_picture_tells(written):
-    sensor = load_camera(written / "new.toml").sensor
+def test_the_sensor_is_measured_where_the_picture_allows(written_files):
+    sensor = load_camera(written_files / "new.toml").sensor
     assert sensor is not None
     assert sensor.gain_e_per_adu == 0.4  # given
     assert 2300 < sensor.bias_adu < 2450  # dark corners; the frame's own minimum is 2192
     assert sensor.vignetting[0] < 0
-    notes = json.loads((written / "new.calibration.json").read_text())["photometry"]["notes"]
+    notes = json.loads((written_files / "new.calibration.json").read_text())["photometry"]["notes"]
     assert any("read noise: not measured" in note for note in notes)
 
 
-def test_every_key_of_the_record_is_explained(written):
+def test_every_key_of_the_record_is_explained(written_files):
     formats = (ROOT / "docs/formats.md").read_text(encoding="utf-8")
-    record = json.loads((written / "new.calibration.json").read_text())
+    record = json.loads((written_files / "new.calibration.json").read_text())
     keys = (
         (set(record) - {"lens", "coverage"})
         | set(record["gates"][0])
@@ -153,35 +153,35 @@ def test_every_key_of_the_record_is_explained(written):
     assert [key for key in sorted(keys) if f"`{key}`" not in formats] == []
 
 
-def test_verify_and_show(written, capsys):
+def test_verify_and_show(written_files, capsys):
     photo, site = str(PHOTO), "--site=34.7443,-111.4223,2361"
-    assert main(["calibrate", "verify", photo, "-c", str(written / "new.toml"), site, "--json"]) == 0
+    assert main(["calibrate", "verify", photo, "-c", str(written_files / "new.toml"), site, "--json"]) == 0
     record = json.loads(capsys.readouterr().out)
     assert record["status"] == "ok"
     assert record["map_change_px"] < 0.05
-    assert main(["calibrate", "show", str(written / "new.toml")]) == 0
+    assert main(["calibrate", "show", str(written_files / "new.toml")]) == 0
     assert "decentring" in capsys.readouterr().out
 
 
-def test_a_lens_that_has_changed_does_not_verify(written, exposure):
-    camera = load_camera(written / "new.toml")
+def test_a_lens_that_has_changed_does_not_verify(written_files, exposure):
+    camera = load_camera(written_files / "new.toml")
     moved = replace(camera, focal_px=(camera.focal_px[0] * 1.004, camera.focal_px[1] * 1.004))
     found = verify(exposure, moved, load_catalog().brighter_than(7.0), SITE)
-    assert not found.fits
+    assert not found.is_valid
     record = verify_dict(found)
     assert record["reason"] == "inconsistent_evidence"
     assert record["focal_change"] == pytest.approx(-0.004, abs=0.0015)
     assert record["map_change_px"] > 0.4
 
 
-def test_convert_by_command(written, capsys):
-    new, back = str(written / "new.toml"), str(written / "back.toml")
-    assert main(["calibrate", "convert", new, "--to", "colmap", "-o", str(written / "cameras.txt")]) == 0
-    assert main(["calibrate", "convert", str(written / "cameras.txt"), "--from", "colmap", "-o", back]) == 0
+def test_convert_by_command(written_files, capsys):
+    new, back = str(written_files / "new.toml"), str(written_files / "back.toml")
+    assert main(["calibrate", "convert", new, "--to", "colmap", "-o", str(written_files / "cameras.txt")]) == 0
+    assert main(["calibrate", "convert", str(written_files / "cameras.txt"), "--from", "colmap", "-o", back]) == 0
     one, other = load_camera(new), load_camera(back)
     px = np.array([[300.0, 500.0], [710.0, 100.0], [1100.0, 700.0]])
     np.testing.assert_allclose(other.project(one.unproject(px))[0], px, atol=1e-6)
-    assert main(["calibrate", "convert", new, "--to", "ros", "-o", str(written / "ros.yaml")]) == 0
+    assert main(["calibrate", "convert", new, "--to", "ros", "-o", str(written_files / "ros.yaml")]) == 0
     assert "no decentring" in capsys.readouterr().out
 
 
@@ -193,7 +193,7 @@ def test_convert_by_command(written, capsys):
         (["--fov", "-3"], 2),
     ],
 )
-def test_misuse_is_told(words, code, tmp_path, capsys):
+def test_wrong_usage_is_refused(words, code, tmp_path, capsys):
     image = tmp_path / "sky.fits.bz2"
     image.write_bytes(PHOTO.read_bytes())
     if code == 2:

@@ -35,7 +35,7 @@ EXPOSURE_S = 10.0
 
 @pytest.fixture(scope="module")
 def frames():
-    """Two frames of one sky and one 30 hours later, on open ground, and the hot pixels with their light [e]."""
+    """Two frames of one sky and one 30 hours later, on open ground, and the hot pixels with their charge [e]."""
     start = datetime(2030, 6, 1, tzinfo=UTC)
     exposures = []
     for number, later in enumerate((timedelta(0), timedelta(0), timedelta(hours=30))):
@@ -51,19 +51,19 @@ def frames():
 
 
 @pytest.fixture(scope="module")
-def found(frames):
+def calibration(frames):
     rough = replace(CAMERA, focal_px=(184.0, 184.0), centre_px=(299.5, 299.5), lens=KannalaBrandt(), sensor=None)
     return calibrate(frames[0], load_catalog().brighter_than(8.0), camera=rough)
 
 
-def test_the_lens_is_the_true_one(found):
-    assert found.accepted, found.failed
-    moved = difference_px(CAMERA, found.camera, cap_grid(found.camera.calibrated_angle_rad))
+def test_the_lens_is_the_true_one(calibration):
+    assert calibration.accepted, calibration.failed_checks
+    moved = difference_px(CAMERA, calibration.camera, cap_grid(calibration.camera.calibrated_angle_rad))
     assert np.sqrt(np.mean(np.sum(moved**2, axis=1))) < 0.03
 
 
-def test_the_sensor_is_the_true_one(found):
-    sensor = found.camera.sensor
+def test_the_sensor_is_the_true_one(calibration):
+    sensor = calibration.camera.sensor
     assert sensor.gain_e_per_adu == pytest.approx(0.5, rel=0.02)
     assert sensor.zero_point_e_per_s == pytest.approx(9000, rel=0.04)
     assert sensor.bias_adu == pytest.approx(202, abs=1)  # dark current of 10 s is in it
@@ -71,31 +71,33 @@ def test_the_sensor_is_the_true_one(found):
     assert sensor.psf_sigma_px == pytest.approx(1.1, rel=0.03)
     angle = np.radians([30, 60, 85])
     np.testing.assert_allclose(sensor.throughput(angle), SENSOR.throughput(angle), atol=0.03)
-    assert found.photometry.properties.psf_by_ring_px == pytest.approx([1.1] * 4, rel=0.06)
+    assert calibration.photometry.properties.psf_by_ring_px == pytest.approx([1.1] * 4, rel=0.06)
 
 
-def test_hot_pixels_are_listed(frames, found):
-    listed = {(int(x), int(y)) for x, y in found.photometry.properties.hot_px}
+def test_hot_pixels_are_listed(frames, calibration):
+    listed = {(int(x), int(y)) for x, y in calibration.photometry.properties.hot_px}
     bright = {px for px, light_e in frames[1].items() if light_e > 400}  # 12 times the noise of the brightest sky
     assert len(bright) >= 20
     assert len(listed & bright) >= 0.9 * len(bright)
     assert len(listed - set(frames[1])) <= 3
 
 
-def test_what_is_given_goes_before_what_is_measured(found):
-    given = measure_photometry(found.joint, KnownSensor(gain_e_per_adu=0.7, read_noise_e=9.0, bias_adu=190.0)).sensor
+def test_given_values_replace_measured_ones(calibration):
+    given = measure_photometry(
+        calibration.joint, KnownSensor(gain_e_per_adu=0.7, read_noise_e=9.0, bias_adu=190.0)
+    ).sensor
     assert (given.gain_e_per_adu, given.read_noise_e, given.bias_adu) == (0.7, 9.0, 190.0)
 
 
-def test_without_exposure_times_no_zero_point_is_invented(found):
-    blind = tuple(replace(f, exposure=replace(f.exposure, exposure_s=None)) for f in found.joint.frames)
-    missing = measure_photometry(replace(found.joint, frames=blind), KnownSensor())
+def test_without_exposure_times_no_zero_point_is_invented(calibration):
+    blind = tuple(replace(f, exposure=replace(f.exposure, exposure_s=None)) for f in calibration.joint.frames)
+    missing = measure_photometry(replace(calibration.joint, frames=blind), KnownSensor())
     assert missing.throughput is None
     assert missing.sensor is None
     assert any(re.match("zero point: not measured", note) for note in missing.notes)
 
 
-def test_photon_transfer_on_plain_light():
+def test_photon_transfer_on_flat_fields():
     rng = np.random.default_rng(0)
     light_e = np.linspace(50, 4000, 512)[None, :] * np.ones((512, 1))
 
@@ -110,7 +112,7 @@ def test_photon_transfer_on_plain_light():
     assert transfer.read_noise_e(300.0) == pytest.approx(8.0, rel=0.25)
     assert fit_photon_transfer([]) is None
     dark = Exposure(pixels_adu=rng.normal(300, 5, (512, 512)).astype(np.float32))
-    assert fit_photon_transfer([(dark, dark)]) is None  # no range of light
+    assert fit_photon_transfer([(dark, dark)]) is None  # no range of levels
 
 
 def test_airmass():
@@ -131,7 +133,7 @@ def star_fluxes(
     images: int = 3, stars: int = 200, extinction: float = 0.25, edge: float = 0.7, offset_mag: float = 0.0,
     varied: bool = True, seed: int = 0,
 ) -> StarFluxes:  # fmt: skip
-    """Fluxes through a lens that dims its edge, under air; without `varied` airmass is a function of the angle."""
+    """Fluxes through a lens darker at its edge, and air; without `varied` airmass is a function of the angle."""
     rng = np.random.default_rng(seed)
     n = images * stars
     angle, b_v = np.radians(80) * np.sqrt(rng.random(n)), rng.normal(0.6, 0.4, n)
@@ -143,7 +145,7 @@ def star_fluxes(
     return StarFluxes(gain + offset_mag * (image == 1), np.full(n, 0.08), angle, b_v, air, image)
 
 
-def test_throughput_and_extinction_are_recovered_where_they_can_be_told_apart():
+def test_throughput_and_extinction_are_recovered_where_distinguishable():
     fit = fit_throughput(star_fluxes(), np.radians(80))
     assert fit.throughput.extinction_mag == pytest.approx(0.25, abs=0.04)
     assert 2.5 * np.log10(fit.throughput.zero_point_adu_per_s) == pytest.approx(10.0, abs=0.06)
@@ -163,7 +165,7 @@ def test_a_zenith_camera_gets_no_impossible_extinction_or_vignetting(seed):
     assert fit.warnings
 
 
-def test_a_lens_that_brightens_its_edge_is_not_believed():
+def test_a_lens_brighter_at_its_edge_is_rejected():
     fit = fit_throughput(star_fluxes(extinction=0.0, edge=2.5), np.radians(80))
     assert fit.throughput is None
     assert any("vignetting is not physical" in warning for warning in fit.warnings)

@@ -56,7 +56,7 @@ every_camera = pytest.mark.parametrize("cam", CAMERAS.values(), ids=CAMERAS)
 
 
 def rays_at(angle_rad: np.ndarray, around_rad: np.ndarray) -> np.ndarray:
-    """Rays (..., 3) at angles off the axis, `around_rad` turning from image right to image bottom."""
+    """Rays (..., 3) at angles off the axis; `around_rad` increases from image right to image bottom."""
     side = np.sin(angle_rad)
     return np.stack([side * np.cos(around_rad), side * np.sin(around_rad), np.cos(angle_rad)], axis=-1)
 

@@ -36,8 +36,8 @@ GOOD: dict[str, Any] = {
 }  # fmt: skip
 
 
-def changed(path: str, value: Any) -> dict[str, Any]:
-    """The good file with one key set, or with None: taken away."""
+def change_key(path: str, value: Any) -> dict[str, Any]:
+    """The valid file with one key set, or removed if the value is None."""
     d = copy.deepcopy(GOOD)
     *tables, key = path.split(".")
     table = d
@@ -50,7 +50,7 @@ def changed(path: str, value: Any) -> dict[str, Any]:
     return d
 
 
-def same(a: Camera, b: Camera) -> None:
+def assert_same(a: Camera, b: Camera) -> None:
     for name in Camera.__dataclass_fields__:
         if name in ("R_body_cam", "covariance"):
             continue
@@ -65,9 +65,9 @@ def same(a: Camera, b: Camera) -> None:
 def test_shipped_cameras_load_and_survive_a_round_trip(path: Path, tmp_path: Path) -> None:
     camera = load_camera(path.stem)
     assert camera.name == path.stem
-    same(camera, load_camera(path))
+    assert_same(camera, load_camera(path))
     save_camera(camera, tmp_path / "again.toml")
-    same(camera, load_camera(tmp_path / "again.toml"))
+    assert_same(camera, load_camera(tmp_path / "again.toml"))
     assert camera.calibrated_angle_rad <= camera.max_angle_rad
 
 
@@ -86,7 +86,7 @@ def test_every_key_reaches_the_camera(tmp_path: Path) -> None:
     assert camera.covariance is not None
     assert camera.covariance.tolist() == GOOD["covariance"]["matrix"]
     save_camera(camera, tmp_path / "c.toml")
-    same(camera, load_camera(tmp_path / "c.toml"))
+    assert_same(camera, load_camera(tmp_path / "c.toml"))
     assert set(tomllib.loads((tmp_path / "c.toml").read_text())) == set(GOOD)
 
 
@@ -103,7 +103,7 @@ def test_defaults_are_those_of_the_format() -> None:
 
 
 def test_integers_are_numbers() -> None:
-    d = changed("focal_px", [300, 301]) | {"max_angle_deg": 92, "centre_px": [500, 400], "k": [0, 0]}
+    d = change_key("focal_px", [300, 301]) | {"max_angle_deg": 92, "centre_px": [500, 400], "k": [0, 0]}
     assert camera_from_dict(d).centre_px == (500.0, 400.0)
 
 
@@ -141,7 +141,7 @@ BAD = [
 @pytest.mark.parametrize(("path", "value"), BAD, ids=lambda v: str(v)[:30])
 def test_a_wrong_key_is_refused_and_named(path: str, value: Any, tmp_path: Path) -> None:
     file = tmp_path / "bad.toml"
-    file.write_text(tomli_w.dumps(changed(path, value)))
+    file.write_text(tomli_w.dumps(change_key(path, value)))
     with pytest.raises(BadInput) as caught:
         load_camera(file)
     assert caught.value.reason == "bad_calibration"
@@ -152,10 +152,10 @@ def test_a_wrong_key_is_refused_and_named(path: str, value: Any, tmp_path: Path)
 
 def test_a_circle_beyond_the_turning_point_is_refused() -> None:
     with pytest.raises(BadInput, match=r"max_angle_deg.*95\.4") as caught:
-        camera_from_dict(changed("k", [-0.12]) | {"max_angle_deg": 96.0})
+        camera_from_dict(change_key("k", [-0.12]) | {"max_angle_deg": 96.0})
     assert caught.value.reason == "bad_calibration"
     with pytest.raises(BadInput, match="max_angle_deg"):
-        camera_from_dict(changed("model", "pinhole") | {"k": [], "max_angle_deg": 90.0})
+        camera_from_dict(change_key("model", "pinhole") | {"k": [], "max_angle_deg": 90.0})
 
 
 def test_a_missing_file_is_no_calibration(tmp_path: Path) -> None:
@@ -164,7 +164,7 @@ def test_a_missing_file_is_no_calibration(tmp_path: Path) -> None:
             load_camera(name)
         assert caught.value.reason == "no_calibration"
         assert str(name) in str(caught.value)
-    with pytest.raises(BadInput, match="fisheye-2048"):  # says what there is
+    with pytest.raises(BadInput, match="fisheye-2048"):  # lists the shipped ones
         load_camera("fisheye")
 
 

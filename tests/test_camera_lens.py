@@ -78,7 +78,7 @@ ORDER = ("fx", "fy", "cx", "cy", "m", "p1", "p2")
 
 
 @pytest.fixture(autouse=True)
-def listed(monkeypatch: pytest.MonkeyPatch) -> None:
+def register_lenses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lenses, "LENSES", (*lenses.LENSES, Sine))
 
 
@@ -185,7 +185,7 @@ def test_formats_without_this_lens_refuse_it() -> None:
             to_text(replace(CAMERA, mirrored=False), program)
 
 
-def calibrated(stars: int = 400, frames: int = 4, sigma_px: float = 0.1) -> tuple[Camera, tuple[str, ...]]:
+def calibrate_simulated(stars: int = 400, frames: int = 4, sigma_px: float = 0.1) -> tuple[Camera, tuple[str, ...]]:
     """Camera and candidates from simulated stars of CAMERA, from a rough equidistant start."""
     rng = np.random.default_rng(5)
     camera = replace(CAMERA, focal_px=(652.0, 652.0), mirrored=False)
@@ -200,7 +200,7 @@ def calibrated(stars: int = 400, frames: int = 4, sigma_px: float = 0.1) -> tupl
 
 
 def test_calibration_tries_it_beside_the_others() -> None:
-    camera, candidates = calibrated()
+    camera, candidates = calibrate_simulated()
     assert "sine with m" in candidates and "Kannala-Brandt with 4 k" in candidates
     assert "pinhole" not in candidates  # stars beyond 65 degrees
     truth = replace(CAMERA, focal_px=(652.0, 652.0), mirrored=False)
@@ -210,7 +210,7 @@ def test_calibration_tries_it_beside_the_others() -> None:
 
 def test_calibration_of_it_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(lenses, "LENSES", (Sine,))
-    camera, candidates = calibrated()
+    camera, candidates = calibrate_simulated()
     assert candidates == ("sine with m",)
     assert camera.covariance is not None and camera.covariance_order == ("fx", "fy", "cx", "cy", "m")
     sigma = float(np.sqrt(camera.covariance[4, 4]))

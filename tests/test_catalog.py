@@ -1,4 +1,4 @@
-"""The Hipparcos catalogue against published places, astropy and other catalogues' counts."""
+"""The Hipparcos catalogue against published positions, astropy and other catalogues' counts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from startrack.frames import angle_between_rad
 MAS = np.pi / 648_000_000
 DATE = datetime(2026, 11, 20, 6, 0, tzinfo=UTC)
 
-# HIP, ICRS J2000.0 place (SIMBAD, after van Leeuwen 2007), V and B-V (ESA 1997)
+# HIP, ICRS J2000.0 position (SIMBAD, after van Leeuwen 2007), V and B-V (ESA 1997)
 FAMOUS = {
     "Sirius": (32349, "06 45 08.91728", "-16 42 58.0171", -1.44, 0.009),
     "Canopus": (30438, "06 23 57.10988", "-52 41 44.3810", -0.62, 0.164),
@@ -70,7 +70,7 @@ def test_every_row_is_there(catalog: StarCatalog) -> None:
     assert np.sum(catalog.hip > 0) == 117_955 + 4
     assert len(catalog) == 117_955 + 4 + 18
     assert len(np.unique(catalog.catalog_id)) == len(catalog)
-    assert not np.any(catalog.hip == 120412)  # no place is known
+    assert not np.any(catalog.hip == 120412)  # no position is known
 
 
 def test_counts_agree_with_an_independent_list(catalog: StarCatalog) -> None:
@@ -103,8 +103,8 @@ def test_stars_without_a_hipparcos_number(catalog: StarCatalog) -> None:
     stars = catalog.at(None, None)
     (i,) = np.flatnonzero(stars.catalog_id == "HR 4210")  # eta Car, SIMBAD
     assert stars.hip[i] == 0
-    place = ray(15 * sexagesimal("10 45 03.546"), sexagesimal("-59 41 03.95"))
-    assert angle_between_rad(stars.rays_icrs[i], place) / MAS < 1500
+    position = ray(15 * sexagesimal("10 45 03.546"), sexagesimal("-59 41 03.95"))
+    assert angle_between_rad(stars.rays_icrs[i], position) / MAS < 1500
     assert 3.8 < stars.v_mag[i] < 4.6
 
 

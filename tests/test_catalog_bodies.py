@@ -42,7 +42,7 @@ def skyfield_world():
     return ephemeris, constants, load.timescale(builtin=True)
 
 
-def seen_by_skyfield(site: Site, time: datetime, name: str):
+def skyfield_position(site: Site, time: datetime, name: str):
     """Skyfield's astrometric position of the body from the site."""
     from skyfield.api import wgs84
 
@@ -73,7 +73,7 @@ def test_apparent_directions_agree_with_skyfield(site: Site, time: datetime) -> 
     sky = bodies(site, time)
     sun_ray = sky[0].ray_icrs
     for body in sky:
-        theirs_m = seen_by_skyfield(site, time, body.name).apparent().position.m
+        theirs_m = skyfield_position(site, time, body.name).apparent().position.m
         # The Sun bends light by 1.8 arcsec at its edge and 0.1 at five degrees; that is left out.
         near_sun = 0 < angle_between_rad(body.ray_icrs, sun_ray) < np.radians(10)
         assert angle_between_rad(body.ray_icrs, theirs_m) < (2 if near_sun else 0.05) * ARCSEC_RAD, body.name
@@ -84,9 +84,9 @@ def test_apparent_directions_agree_with_skyfield(site: Site, time: datetime) -> 
 def test_azimuth_and_elevation_agree_with_skyfield(site: Site, time: datetime) -> None:
     R = R_enu_icrs(site, time)
     for body in bodies(site, time)[3:]:
-        elevation, azimuth, _ = seen_by_skyfield(site, time, body.name).apparent().altaz()
+        elevation, azimuth, _ = skyfield_position(site, time, body.name).apparent().altaz()
         theirs = rays_from_azel(azimuth.radians, elevation.radians)
-        # With another table of UT1 and no polar motion, Skyfield's Earth turns up to 0.3 s apart from ours.
+        # With another table of UT1 and no polar motion, Skyfield's Earth rotation differs by up to 0.3 s from ours.
         limit_arcsec = 0.2 if site.body == "moon" else 5
         assert angle_between_rad(R @ body.ray_icrs, theirs) < limit_arcsec * ARCSEC_RAD, body.name
 
@@ -99,7 +99,7 @@ def test_magnitudes_agree_with_skyfield(site: Site, time: datetime) -> None:
     for body in bodies(site, time):
         if body.name in ("Sun", "Moon"):
             continue
-        position = seen_by_skyfield(site, time, body.name)
+        position = skyfield_position(site, time, body.name)
         # Skyfield takes the barycentre for the Sun, worth 0.1 mag of Mercury: give it the Sun for a barycentre.
         position.center_barycentric = position.center_barycentric - skyfield_world()[0]["sun"].at(position.t)
         assert body.v_mag == pytest.approx(planetary_magnitude(position), abs=0.005), body.name
@@ -122,7 +122,7 @@ def test_earthlight_at_the_lunar_pole_is_as_bright_as_it_should_be() -> None:
 
 
 @pytest.mark.parametrize("site", MOON_SITES + EARTH_SITES)
-def test_a_sites_own_body_is_never_a_light(site: Site) -> None:
+def test_a_sites_own_body_is_not_listed(site: Site) -> None:
     names = [body.name for body in bodies(site, TIMES[0])]
     assert len(names) == len(set(names)) == 9
     assert site.body.capitalize() not in names

@@ -1,4 +1,4 @@
-"""The commands as a script meets them: exit codes, refusals, what is printed and what is written."""
+"""The commands as used by scripts: exit codes, refusals, printed and written output."""
 
 import json
 import os
@@ -33,7 +33,7 @@ read_noise_e = 2.5
 """
 FACTS = {"time_utc": "2030-01-01T00:00:00Z", "exposure_s": 1.0, "camera": "small.toml", "terrain": "shackleton-thesis"}
 OK, ERROR, USAGE, REFUSED, BAD_INPUT = 0, 1, 2, 3, 4
-pytestmark = pytest.mark.usefixtures("compiled")  # else the first command announces on stderr that it compiles
+pytestmark = pytest.mark.usefixtures("compiled_kernels")  # else the first command announces on stderr that it compiles
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def write_image(name, pixels, **facts):
     return name
 
 
-def black(name="black.png", shape=(SIZE, SIZE), **facts):
+def black_image(name="black.png", shape=(SIZE, SIZE), **facts):
     return write_image(name, np.zeros(shape, np.uint16), **facts)
 
 
@@ -65,7 +65,7 @@ def noise(name="noise.png", seed=1, **facts):
 
 
 def stars(name="stars.png", **facts):
-    """A handful of point sources that are no part of the sky: enough for `detect`, not for `identify`."""
+    """A few random point sources: enough for `detect`, not for `identify`."""
     rng = np.random.default_rng(2)
     y, x = np.mgrid[:SIZE, :SIZE]
     pixels = rng.normal(200, 12, (SIZE, SIZE))
@@ -74,7 +74,7 @@ def stars(name="stars.png", **facts):
     return write_image(name, pixels.round().astype(np.uint16), **facts)
 
 
-def truncated(name="cut.png"):
+def truncated_image(name="cut.png"):
     noise(name)
     whole = Path(name).read_bytes()
     Path(name).write_bytes(whole[: len(whole) // 2])
@@ -89,7 +89,7 @@ def run(capsys, *words):
 
 
 def reason(capsys, *words):
-    """Exit code and reason of one image, with the file that was written beside what was printed."""
+    """Exit code and reason of one image; the written file must agree with the printed record."""
     code, lines, err = run(capsys, *words, "--json", "--no-plots")
     assert err == ""
     (line,) = lines
@@ -113,7 +113,7 @@ def shell(*words, cwd, **environment):
 
 
 def test_a_black_frame_holds_no_stars(folder, capsys):
-    assert reason(capsys, "locate", black()) == (REFUSED, "no_stars")
+    assert reason(capsys, "locate", black_image()) == (REFUSED, "no_stars")
 
 
 def test_a_saturated_frame_holds_no_stars(folder, capsys):
@@ -139,7 +139,7 @@ def test_what_is_no_image_is_bad_input(folder, capsys):
     Path("empty.png").write_bytes(b"")
     Path("text.png").write_text("not a picture")
     Path("folder.png").mkdir()
-    for image in (truncated(), "missing.png", "empty.png", "text.png", "folder.png"):
+    for image in (truncated_image(), "missing.png", "empty.png", "text.png", "folder.png"):
         assert reason(capsys, "locate", image) == (BAD_INPUT, "bad_image"), image
 
 
@@ -159,7 +159,7 @@ def test_what_is_no_image_is_bad_input(folder, capsys):
         ({"terrain": "broken.toml"}, "bad_terrain"),
     ],
 )
-def test_facts_that_lack_or_are_wrong_are_named(folder, capsys, facts, expected):
+def test_missing_or_wrong_facts_are_named(folder, capsys, facts, expected):
     Path("broken.toml").write_text("format = 1\nsize_px = [")
     assert reason(capsys, "locate", stars(**facts)) == (BAD_INPUT, expected)
 
@@ -192,7 +192,7 @@ def test_identify_and_detect_need_no_time_and_detect_no_camera(folder, capsys):
     [("ok", OK), ("ok dark", REFUSED), ("dark cut ok", BAD_INPUT), ("cut ok dark ok", BAD_INPUT), ("ok ok", OK)],
 )
 def test_the_exit_code_is_that_of_the_worst_image(folder, capsys, kinds, expected):
-    make = {"ok": stars, "dark": black, "cut": truncated}
+    make = {"ok": stars, "dark": black_image, "cut": truncated_image}
     images = [make[kind](f"{k}-{kind}.png") for k, kind in enumerate(kinds.split())]
     code, lines, err = run(capsys, "detect", *images, "--json", "--no-plots")
     assert (code, err) == (expected, "")
@@ -202,7 +202,7 @@ def test_the_exit_code_is_that_of_the_worst_image(folder, capsys, kinds, expecte
 
 
 def test_without_json_there_is_one_line_for_each_image(folder, capsys):
-    code, lines, err = run(capsys, "detect", stars(), black(), "missing.png", "--no-plots")
+    code, lines, err = run(capsys, "detect", stars(), black_image(), "missing.png", "--no-plots")
     assert (code, err) == (BAD_INPUT, "")
     starts = [["stars.png", "ok"], ["black.png", "refused"], ["missing.png", "refused"]]
     assert [line.split()[:2] for line in lines] == starts
@@ -250,7 +250,7 @@ def test_a_result_is_renewed_but_never_that_of_another_image(folder, capsys):
 
 
 def test_a_refused_image_leaves_its_reason_in_the_file_too(folder, capsys):
-    assert reason(capsys, "locate", black()) == (REFUSED, "no_stars")
+    assert reason(capsys, "locate", black_image()) == (REFUSED, "no_stars")
     record = json.loads(Path("startrack-out/black.fix.json").read_text())
     assert (record["status"], record["reason"]) == ("refused", "no_stars")
     assert record["provenance"]["time_utc"] == "2030-01-01T00:00:00.000000Z"
@@ -273,7 +273,7 @@ def test_the_same_image_gives_the_same_bytes(folder, capsys):
 
 
 @pytest.mark.parametrize("words", ["", "nothing", "locate", "locate x.png --nothing", "schema nothing", "render -n -1"])
-def test_wrong_usage_is_two_and_says_how(folder, words):
+def test_wrong_usage_has_exit_code_2_and_advice(folder, words):
     done = shell(*words.split(), cwd=folder)
     assert done.returncode == USAGE
     assert "usage: startrack" in done.stdout + done.stderr
@@ -306,14 +306,14 @@ def test_a_folder_that_takes_no_results_is_named_before_any_work(folder, capsys,
 
 
 def test_no_refusal_shows_a_traceback(folder):
-    images = [truncated(), black(), noise(), "missing.png", stars("s.png", time_utc=None)]
+    images = [truncated_image(), black_image(), noise(), "missing.png", stars("s.png", time_utc=None)]
     done = shell("locate", *images, "--no-plots", cwd=folder)
     assert done.returncode == BAD_INPUT
     assert len(done.stdout.splitlines()) == len(images)
     assert done.stderr == ""
 
 
-def test_output_that_cannot_be_written_is_said_in_one_line(folder):
+def test_unwritable_output_is_reported_in_one_line(folder):
     stars()
     Path("file").write_text("")
     done = shell("detect", "stars.png", "-D", "file/below", cwd=folder)
@@ -330,7 +330,7 @@ def test_a_plain_terminal_is_enough(folder):
 
 
 def test_a_name_beyond_ascii_under_an_ascii_locale(folder):
-    black("spä✶.png")
+    black_image("spä✶.png")
     ascii_locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     done = shell("detect", "spä✶.png", "--no-plots", cwd=folder, **ascii_locale)
     assert (done.returncode, done.stderr) == (REFUSED, "")
@@ -384,7 +384,7 @@ def test_a_full_disk_behind_stdout_is_named(folder):
 
 
 def test_shell_completion_knows_the_commands(folder, tmp_path):
-    """As bash asks through argcomplete: the answer comes on descriptor 8."""
+    """As bash calls argcomplete: the completions are written to descriptor 8."""
     pytest.importorskip("argcomplete", reason="the extra `completion` is not installed")
     answer = tmp_path / "answer"
     words = {"COMP_LINE": "startrack loc", "COMP_POINT": "13", "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n"}
@@ -446,8 +446,8 @@ def test_the_samples_are_located_without_a_flag(folder, capsys, name):
     assert position["up_m"] == pytest.approx(1.5)
 
 
-def test_a_wrong_time_turns_the_place_about_the_axis_of_a_round_crater(folder, capsys):
-    """Near the pole six hours turn the sky by 3.3 degrees about the zenith, and in a round crater nothing tells.
+def test_a_wrong_time_rotates_the_position_about_the_axis_of_a_round_crater(folder, capsys):
+    """Near the pole the sky rotates by 3.3 degrees in six hours; in a round crater this is not noticeable.
 
     The Moon's rotation: 13.17635815 degrees a day (IAU 2015 report, Archinal et al. 2018, table 2).
     """
@@ -456,9 +456,11 @@ def test_a_wrong_time_turns_the_place_about_the_axis_of_a_round_crater(folder, c
     code, (line,), _ = run(capsys, "locate", image, "--time", "2029-09-08T09:12:45Z", "--json", "--no-plots")
     assert code == OK
     found, attitude = json.loads(line)["position"], json.loads(line)["attitude"]
-    turn = np.degrees(np.arctan2(found["east_m"], found["north_m"]) - np.arctan2(truth["east_m"], truth["north_m"]))
+    rotation_deg = np.degrees(
+        np.arctan2(found["east_m"], found["north_m"]) - np.arctan2(truth["east_m"], truth["north_m"])
+    )
     expected = 13.17635815 * 6 / 24
-    assert abs(turn) == pytest.approx(expected, abs=0.2)
-    assert attitude["heading_deg"] - truth["heading_deg"] == pytest.approx(turn, abs=0.2)
+    assert abs(rotation_deg) == pytest.approx(expected, abs=0.2)
+    assert attitude["heading_deg"] - truth["heading_deg"] == pytest.approx(rotation_deg, abs=0.2)
     true_m, found_m = (np.hypot(place["east_m"], place["north_m"]) for place in (truth, found))
     assert found_m == pytest.approx(true_m, abs=20)

@@ -106,7 +106,7 @@ def test_the_files_agree_with_each_other_and_with_the_sky(folder):
     px, _ = camera.project(stars.rays_icrs[[row_of[table["catalog_id"][k]] for k in hip]] @ R_cam_icrs.T)
     np.testing.assert_allclose(np.column_stack([table["x_px"], table["y_px"]])[hip], px, atol=1e-4)
 
-    # The light is where the truth says, and not where it says that the wall is.
+    # Stars are at the positions of the truth, and absent where the truth has the wall.
     pixels = exposure.pixels_adu
     snr = (pixels[np.rint(table["y_px"]).astype(int), np.rint(table["x_px"]).astype(int)] - np.median(pixels)) / 6
     bright = table["v_mag"] < 3.5
@@ -154,7 +154,7 @@ def test_flux_scatter_zero_and_no_faint_stars_give_the_catalogues_own_sky(folder
     assert '"FIELD' in (folder / "b.truth.ecsv").read_text()
 
 
-def test_what_is_there_is_not_overwritten_unasked_and_nothing_is_left_half_done(folder):
+def test_existing_files_are_not_overwritten_and_no_partial_output_remains(folder):
     (folder / "x.truth.json").write_text("mine")
     with pytest.raises(BadInput, match=r"x\.truth\.json: exists") as refusal:
         render("-o", "x.png")
@@ -202,7 +202,7 @@ def test_the_sky_has_gaias_stars_where_they_are_installed_and_the_truth_names_th
     assert (folder / "gaia.png").read_bytes() == (folder / "auto.png").read_bytes()
 
 
-def test_without_gaias_stars_the_sky_has_hipparcos_and_asking_for_them_is_refused(folder, monkeypatch):
+def test_without_gaias_stars_the_sky_has_hipparcos_and_requesting_them_is_refused(folder, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert render("--stars", "auto", "-o", "plain.png") == 0
     assert json.loads((folder / "plain.truth.json").read_text())["catalog"] == "hipparcos"

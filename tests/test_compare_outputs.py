@@ -1,4 +1,4 @@
-"""benchmarks/compare_outputs.py: what differs between two folders of outputs is found and told."""
+"""benchmarks/compare_outputs.py: differences between two folders of outputs are found and reported."""
 
 import json
 import subprocess
@@ -26,7 +26,7 @@ HIP 2,20.500,glare
 
 
 @pytest.fixture
-def stored(tmp_path):
+def write_version(tmp_path):
     """Writes the fix and the star table of one version, and returns the folder."""
 
     def write(name, fix=FIX, stars=STARS):
@@ -45,44 +45,48 @@ def compare(*words):
     return run.returncode, run.stdout
 
 
-def test_identical_folders_are_equal(stored):
-    code, text = compare(stored("old"), stored("new"))
+def test_identical_folders_are_equal(write_version):
+    code, text = compare(write_version("old"), write_version("new"))
     assert code == 0
     assert "| locate/a.fix.json | 10 | 0 | 0 | - | ok | 0 |" in text
     assert "| locate/a.stars.ecsv | 6 | 0 | 0 | - | - | - |" in text
 
 
-def test_times_versions_and_folders_are_not_compared(stored):
+def test_times_versions_and_folders_are_not_compared(write_version):
     other = {"timing_ms": {"detect": 1.0}, "provenance": {"version": "2", "camera": "/home/new/camera.toml"}}
-    assert compare(stored("old"), stored("new", FIX | other))[0] == 0
+    assert compare(write_version("old"), write_version("new", FIX | other))[0] == 0
 
 
-def test_a_changed_number_is_found(stored):
+def test_a_changed_number_is_found(write_version):
     moved = FIX | {"position": FIX["position"] | {"east_m": 427.1605, "north_m": -324.7067}}
-    code, text = compare(stored("old"), stored("new", moved))
+    code, text = compare(write_version("old"), write_version("new", moved))
     assert code == 1
     assert "| locate/a.fix.json | 10 | 2 | 0 | 1.2e-02 position.north_m | ok | 5 |" in text
     assert "position.east_m: 1, largest 7.0e-03: 424.1605 -> 427.1605" in text
-    assert compare(stored("older"), stored("newer", moved), "--tolerance", "0.02")[0] == 0
+    assert compare(write_version("older"), write_version("newer", moved), "--tolerance", "0.02")[0] == 0
 
 
-def test_objects_and_rows_are_paired_by_name(stored):
+def test_objects_and_rows_are_paired_by_name(write_version):
     turned = FIX | {"matches": FIX["matches"][::-1]}
     stars = STARS.splitlines()
-    code, _ = compare(stored("old"), stored("new", turned, "\n".join([*stars[:4], stars[5], stars[4]]) + "\n"))
+    code, _ = compare(
+        write_version("old"), write_version("new", turned, "\n".join([*stars[:4], stars[5], stars[4]]) + "\n")
+    )
     assert code == 0
 
 
-def test_added_and_removed_keys_are_listed(stored):
-    code, text = compare(stored("old"), stored("new", FIX | {"covered": 0.5}, STARS.replace("HIP 2", "HIP 3")))
+def test_added_and_removed_keys_are_listed(write_version):
+    code, text = compare(
+        write_version("old"), write_version("new", FIX | {"covered": 0.5}, STARS.replace("HIP 2", "HIP 3"))
+    )
     assert code == 0
     assert "- added: covered (1)" in text
     assert "- added: [].x_px (1)" in text and "- removed: [].x_px (1)" in text
 
 
-def test_a_changed_status_is_told(stored):
+def test_a_changed_status_is_reported(write_version):
     refused = {key: FIX[key] for key in FIX if key != "position"} | {"status": "refused", "reason": "no_stars"}
-    code, text = compare(stored("old"), stored("new", refused))
+    code, text = compare(write_version("old"), write_version("new", refused))
     assert code == 1
     assert "| ok -> refused no_stars | - |" in text
 
@@ -91,14 +95,14 @@ def test_a_changed_status_is_told(stored):
     ("printed", "code", "differ", "last"),
     [("20.501", 0, 0, 1), ("20.502", 1, 1, 0), ("21", 1, 1, 0), ("", 1, 1, 0), ("inf", 1, 1, 0)],
 )
-def test_a_last_digit_of_a_table_is_no_difference(stored, printed, code, differ, last):
-    result, text = compare(stored("old"), stored("new", stars=STARS.replace("20.500", printed)))
+def test_a_last_digit_of_a_table_is_no_difference(write_version, printed, code, differ, last):
+    result, text = compare(write_version("old"), write_version("new", stars=STARS.replace("20.500", printed)))
     assert result == code
     assert f"| locate/a.stars.ecsv | 6 | {differ} | {last} |" in text
 
 
-def test_a_missing_file_is_a_failure(stored):
-    old, new = stored("old"), stored("new")
+def test_a_missing_file_is_a_failure(write_version):
+    old, new = write_version("old"), write_version("new")
     (new / "locate/a.stars.ecsv").unlink()
     code, text = compare(old, new)
     assert code == 1

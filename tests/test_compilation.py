@@ -36,7 +36,7 @@ kernel(1)
 """
 
 
-def printed_by(script: Path, cache: Path) -> str:
+def run_script(script: Path, cache: Path) -> str:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(cache)}
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=environment)
     assert (done.returncode, done.stdout) == (0, "")
@@ -46,10 +46,10 @@ def printed_by(script: Path, cache: Path) -> str:
 def test_compiling_is_announced_once_and_loading_is_not(tmp_path):
     script = tmp_path / "first_use.py"
     script.write_text(FIRST_USE)
-    assert printed_by(script, tmp_path / "cache").splitlines() == [
+    assert run_script(script, tmp_path / "cache").splitlines() == [
         "compiling for this machine, once: about 20 s, for height maps a minute"
     ]
-    assert printed_by(script, tmp_path / "cache") == ""
+    assert run_script(script, tmp_path / "cache") == ""
 
 
 def test_a_localizer_called_without_the_pipeline_announces_too(monkeypatch):
@@ -62,24 +62,24 @@ def test_a_localizer_called_without_the_pipeline_announces_too(monkeypatch):
 
 
 @pytest.fixture
-def read_only(monkeypatch, tmp_path):
+def read_only_package(monkeypatch, tmp_path):
     """An installation that cannot be written to, for a user with a home."""
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(compilation.os, "access", lambda path, mode: False)
 
 
-def test_kernels_of_a_read_only_installation_are_kept_in_the_users_cache(read_only, tmp_path):
+def test_kernels_of_a_read_only_installation_are_kept_in_the_users_cache(read_only_package, tmp_path):
     compilation.choose_cache_folder()
     assert os.environ.pop("NUMBA_CACHE_DIR") == str(tmp_path / "cache" / "startrack" / "numba")
 
 
-def test_without_any_folder_the_kernels_are_kept_for_the_process(read_only, tmp_path):
+def test_without_any_folder_the_kernels_are_kept_for_the_process(read_only_package, tmp_path):
     (tmp_path / "cache").write_text("no folder")
     compilation.choose_cache_folder()
     folder = Path(os.environ.pop("NUMBA_CACHE_DIR"))
     assert folder.is_dir()
-    assert folder.stat().st_mode & 0o077 == 0  # numba unpickles what it finds there
+    assert folder.stat().st_mode & 0o077 == 0  # numba unpickles the files in it
     folder.rmdir()
 
 

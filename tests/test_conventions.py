@@ -1,4 +1,4 @@
-"""CONVENTIONS.md, row by row: on the values themselves where they can be computed, on the source where they cannot."""
+"""CONVENTIONS.md, row by row: tested on computed values where possible, else on the source."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_rotation_labels_cancel() -> None:
 
 
 def test_rotations_act_on_vectors_not_on_axes() -> None:
-    """The Earth's pole stands due north at the height of the latitude, and the Sun due south at noon."""
+    """The Earth's pole is due north at an elevation equal to the latitude, and the Sun due south at noon."""
     R_enu_icrs = frames.R_enu_icrs(GREENWICH, TIME)
     azimuth, elevation = frames.azel_from_rays(R_enu_icrs @ [0.0, 0.0, 1.0])
     # Precession has moved the pole by 0.15 degrees since 2000.
@@ -220,7 +220,7 @@ def test_randomness_is_explicit() -> None:
 
 
 UNITS = re.compile(r"_(m|s|rad|px|adu|e|mag|m2|px2|rad2|m_s|e_per_s|e_per_adu|e_per_px)$")
-# Pure numbers, and what says its frame instead of a unit.
+# Pure numbers, and names with a frame instead of a unit.
 UNITLESS = re.compile(r"^(R_\w+_\w+|rays?_(icrs|enu|cam|body)|\w*(snr|llr|nats|weight|probability|mass))$")
 
 

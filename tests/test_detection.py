@@ -1,4 +1,4 @@
-"""Detection against the Cramer-Rao bound, against sep, and against everything in a frame that is not a star."""
+"""Detection against the Cramer-Rao bound, against sep, and on sources that are not stars."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ def camera(sigma: float) -> Camera:
 
 
 @lru_cache(maxsize=16)
-def found(sigma: float, known: bool = True) -> Detections:
+def detect_field(sigma: float, known: bool = True) -> Detections:
     return Detector()(field(sigma).exposure, camera(sigma) if known else None)
 
 
-def matched(sigma: float, low: float, high: float, known: bool = True) -> tuple[np.ndarray, np.ndarray]:
+def match_field(sigma: float, low: float, high: float, known: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """True stars of these signal-to-noise ratios, and their detections."""
-    stars, detections = field(sigma), found(sigma, known)
+    stars, detections = field(sigma), detect_field(sigma, known)
     distance, nearest = cKDTree(detections.xy_px).query(stars.xy_px)
     which = np.flatnonzero((distance < 2.0) & (stars.snr >= low) & (stars.snr < high))
     return which, nearest[which]
 
 
 @lru_cache(maxsize=4)
-def every_bound(sigma: float) -> np.ndarray:
+def all_bounds(sigma: float) -> np.ndarray:
     stars = field(sigma)
     pairs = zip(stars.xy_px, stars.flux, strict=True)
     return np.array([np.diag(cramer_rao(xy - np.rint(xy), flux, sigma, VARIANCE)) for xy, flux in pairs])
@@ -53,19 +53,19 @@ def every_bound(sigma: float) -> np.ndarray:
 
 def bounds(sigma: float, which: np.ndarray) -> np.ndarray:
     """Cramer-Rao variances (n, 4) of x, y, flux and level."""
-    return every_bound(sigma)[which]
+    return all_bounds(sigma)[which]
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["camera file", "nothing known"])
 @pytest.mark.parametrize(("low", "high"), BINS)
 @pytest.mark.parametrize("sigma", SIGMAS)
 def test_centroids_reach_the_cramer_rao_bound(sigma: float, low: int, high: int, known: bool) -> None:
-    which, d = matched(sigma, low, high, known)
-    error = found(sigma, known).xy_px[d] - field(sigma).xy_px[which]
+    which, d = match_field(sigma, low, high, known)
+    error = detect_field(sigma, known).xy_px[d] - field(sigma).xy_px[which]
     bound = bounds(sigma, which)[:, :2]
     assert len(which) > 250
-    assert np.sqrt(np.mean(error**2 / bound)) < 1.10  # measured: 0.97-1.06; one part in 25 is the statistics
-    # No pull towards pixel centres or edges, in px: the mean error, and its slope over the pixel's phase.
+    assert np.sqrt(np.mean(error**2 / bound)) < 1.10  # measured: 0.97-1.06; the statistical error is 4 %
+    # No bias towards pixel centres or edges [px]: the mean error, and its slope over the pixel phase.
     assert np.abs(error.mean(axis=0)).max() < 4 * np.sqrt(bound.mean() / len(which))
     phase = field(sigma).xy_px[which] - np.rint(field(sigma).xy_px[which])
     for axis in range(2):
@@ -76,19 +76,19 @@ def test_centroids_reach_the_cramer_rao_bound(sigma: float, low: int, high: int,
 @pytest.mark.parametrize(("low", "high"), [(7, 10), *BINS])
 @pytest.mark.parametrize("sigma", SIGMAS)
 def test_covariances_are_those_of_the_errors(sigma: float, low: int, high: int) -> None:
-    which, d = matched(sigma, low, high)
-    error = found(sigma).xy_px[d] - field(sigma).xy_px[which]
-    chi2 = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found(sigma).covariance_px2[d]), error).mean()
-    # 2 is right. Bright stars carry a floor of 3 % of their light for PSFs that are not quite Gaussian.
+    which, d = match_field(sigma, low, high)
+    error = detect_field(sigma).xy_px[d] - field(sigma).xy_px[which]
+    chi2 = np.einsum("ni,nij,nj->n", error, np.linalg.inv(detect_field(sigma).covariance_px2[d]), error).mean()
+    # 2 is right. The stated errors of bright stars include 3 % of their flux for PSFs that differ from the Gaussian.
     assert 1.3 < chi2 < 2.35
 
 
 @pytest.mark.parametrize("sigma", SIGMAS)
 def test_fluxes_are_unbiased_and_their_sigmas_right(sigma: float) -> None:
     for low, high in BINS:
-        which, d = matched(sigma, low, high)
-        off = found(sigma).flux_e[d] - field(sigma).flux[which]
-        z = off / found(sigma).flux_sigma_e[d]
+        which, d = match_field(sigma, low, high)
+        off = detect_field(sigma).flux_e[d] - field(sigma).flux[which]
+        z = off / detect_field(sigma).flux_sigma_e[d]
         relative = np.mean(off / field(sigma).flux[which])
         assert abs(relative) < 0.01
         assert abs(np.median(off / field(sigma).flux[which])) < 0.01
@@ -98,20 +98,20 @@ def test_fluxes_are_unbiased_and_their_sigmas_right(sigma: float) -> None:
 
 @pytest.mark.parametrize("sigma", SIGMAS)
 def test_snr_is_that_of_the_matched_filter_with_the_true_psf(sigma: float) -> None:
-    which, d = matched(sigma, 15, 110)
-    assert np.median(found(sigma).snr[d] / field(sigma).snr[which]) == pytest.approx(1.0, abs=0.03)
+    which, d = match_field(sigma, 15, 110)
+    assert np.median(detect_field(sigma).snr[d] / field(sigma).snr[which]) == pytest.approx(1.0, abs=0.03)
 
 
 def test_without_a_gain_fluxes_are_in_the_images_own_unit() -> None:
     stars = field(1.0)
     doubled = replace(stars.exposure, pixels_adu=2 * stars.exposure.pixels_adu + 300)
-    plain, again = found(1.0, known=False), Detector()(doubled)
+    plain, again = detect_field(1.0, known=False), Detector()(doubled)
     assert len(again) == pytest.approx(len(plain), abs=3)
     assert np.median(again.flux_e[:400]) == pytest.approx(2 * np.median(plain.flux_e[:400]), rel=1e-3)
     with_gain = replace(camera(1.0), sensor=replace(camera(1.0).sensor, gain_e_per_adu=0.5, bias_adu=300.0))
     known = Detector()(doubled, with_gain)
-    assert known.flux_e == pytest.approx(found(1.0).flux_e, rel=1e-4)
-    assert known.xy_px == pytest.approx(found(1.0).xy_px, abs=1e-4)
+    assert known.flux_e == pytest.approx(detect_field(1.0).flux_e, rel=1e-4)
+    assert known.xy_px == pytest.approx(detect_field(1.0).xy_px, abs=1e-4)
 
 
 @pytest.mark.parametrize("sigma", SIGMAS)
@@ -168,7 +168,7 @@ BACKGROUNDS = {
 @pytest.mark.parametrize("sigma", [0.7, 1.0, 1.5, None])
 @pytest.mark.parametrize("name", BACKGROUNDS)
 def test_slopes_and_edges_are_no_stars(name: str, sigma: float | None) -> None:
-    # A long edge may give a noise peak its chance; a detector that takes edges for stars finds dozens to hundreds.
+    # A long edge may add a false star; a detector that accepts edges finds dozens to hundreds.
     assert count(noise_frame(BACKGROUNDS[name], np.random.default_rng(7)), sigma) <= 3
 
 
@@ -180,7 +180,7 @@ def test_a_bad_column_and_row_give_few_false_stars(sigma: float, most: int) -> N
 
 
 @pytest.mark.parametrize("sigma", SIGMAS)
-def test_stars_above_a_bright_skyline_keep_their_places(sigma: float) -> None:
+def test_stars_above_a_bright_skyline_keep_their_positions(sigma: float) -> None:
     rng = np.random.default_rng(8)
     xy = rng.uniform(130, 890, (150, 2))
     clear = np.hypot(*(xy - [512, 480]).T) < 385
@@ -239,7 +239,7 @@ def test_saturated_stars_are_found_and_marked(sigma: float) -> None:
     marked = detections.saturated[nearest]
     assert marked[peak >= ceiling].mean() > 0.9
     assert not marked[peak < 0.9 * ceiling].any()
-    # The wings still tell place and brightness.
+    # The wings still determine position and flux.
     gone = peak >= ceiling
     assert gone.sum() >= 40
     assert distance[gone].max() < 0.05
@@ -257,32 +257,32 @@ def test_an_unknown_psf_is_measured(sigma: float) -> None:
 
 
 def test_a_wrong_psf_in_the_camera_file_is_corrected() -> None:
-    for told in (0.7, 1.6):
-        detections = Detector()(field(1.0).exposure, camera(told))
+    for stated in (0.7, 1.6):
+        detections = Detector()(field(1.0).exposure, camera(stated))
         assert detections.psf_sigma_px == pytest.approx(1.0, rel=0.03)
 
 
-def test_close_pairs_are_parted_or_left_alone() -> None:
-    """Two stars 3.5 sigma apart: each is found, and neither drags the other along."""
+def test_close_pairs_are_fitted_separately() -> None:
+    """Two stars 3.5 sigma apart are both found, and their positions are not biased."""
     rng = np.random.default_rng(12)
     middle = np.stack(np.meshgrid(np.arange(40, 990, 50), np.arange(40, 990, 50)), axis=-1).reshape(-1, 2)
-    turn = rng.uniform(0, 2 * np.pi, len(middle))
-    half = 1.75 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    direction = rng.uniform(0, 2 * np.pi, len(middle))
+    half = 1.75 * np.stack([np.cos(direction), np.sin(direction)], axis=1)
     xy = np.concatenate([middle + half, middle - half])
     flux = np.full(len(xy), flux_of(40, 1.0, VARIANCE))
     image = np.full((SIZE, SIZE), BACKGROUND)
     paint(image, xy, flux, 1.0)
     detections = Detector()(noise_frame(image, rng), camera(1.0))
     distance, nearest = cKDTree(detections.xy_px).query(xy)
-    parted = distance < 0.3
-    assert parted.mean() > 0.95
+    separated = distance < 0.3
+    assert separated.mean() > 0.95
     alone = np.sqrt(np.diag(cramer_rao(np.zeros(2), flux[0], 1.0, VARIANCE))[0])
-    assert np.sqrt(np.mean(distance[parted] ** 2) / 2) < 2.0 * alone
-    assert np.median(detections.flux_e[nearest][parted]) == pytest.approx(flux[0], rel=0.03)
+    assert np.sqrt(np.mean(distance[separated] ** 2) / 2) < 2.0 * alone
+    assert np.median(detections.flux_e[nearest][separated]) == pytest.approx(flux[0], rel=0.03)
 
 
 def test_detections_come_brightest_first_and_only_once() -> None:
-    detections = found(1.0)
+    detections = detect_field(1.0)
     assert np.all(np.diff(detections.flux_e) <= 0)
     assert len(cKDTree(detections.xy_px).query_pairs(1.2)) == 0
     assert detections.background_e.shape == detections.noise_e.shape == (SIZE, SIZE)
@@ -302,7 +302,7 @@ def test_no_worse_than_sep(sigma: float) -> None:
                                     subpix=5)  # fmt: skip
     xs, ys, _ = sep.winpos(image, objects["x"], objects["y"], 2 / 2.35 * half_light)
     theirs = cKDTree(np.stack([xs, ys], axis=1))
-    ours = cKDTree(found(sigma).xy_px)
+    ours = cKDTree(detect_field(sigma).xy_px)
     for low, high in BINS:
         chosen = stars.xy_px[(stars.snr >= low) & (stars.snr < high)]
         mine, other = ours.query(chosen)[0], theirs.query(chosen)[0]
@@ -322,7 +322,7 @@ def test_a_flat_frame_has_no_stars(value: float) -> None:
         assert caught.value.reason == "no_stars"
 
 
-def test_a_black_noisy_frame_has_no_stars_and_says_what_to_do() -> None:
+def test_a_black_noisy_frame_has_no_stars_and_gives_advice() -> None:
     rng = np.random.default_rng(14)
     dark = np.rint(np.maximum(rng.normal(100, 2.5, (512, 512)), 0)).astype(np.float32)
     with pytest.raises(TooFewStars, match="lens cap") as caught:
@@ -347,7 +347,7 @@ def test_small_and_odd_frames(shape: tuple[int, int]) -> None:
 
 
 def test_the_painter_and_its_bound_agree_with_a_plain_least_squares_fit() -> None:
-    """The yardstick itself: scipy's fit of painted stars scatters by the bound that the tests rely on."""
+    """scipy's fit of painted stars scatters by the Cramer-Rao bound that the tests use."""
     from scipy.optimize import least_squares
 
     rng = np.random.default_rng(17)

@@ -1,4 +1,4 @@
-"""Detection where frames are not kind: few bits, crowds, moonlight, blooming, streaks, defocus, nothing but noise."""
+"""Detection in difficult frames: few bits, crowding, moonlight, blooming, streaks, defocus, pure noise."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ SIZE = 1024
 VARIANCE = 100.0 + 3.0**2
 
 
-def exposed(mean: np.ndarray, rng: np.random.Generator, ceiling: float = 65535.0) -> Exposure:
+def expose(mean: np.ndarray, rng: np.random.Generator, ceiling: float = 65535.0) -> Exposure:
     counts = np.rint(rng.poisson(mean) + rng.normal(0, 3.0, mean.shape))
     return Exposure(pixels_adu=np.clip(counts, 0, ceiling).astype(np.float32), saturation_adu=ceiling)
 
 
-def jittered(spacing: float, rng: np.random.Generator, margin: float = 40.0) -> np.ndarray:
+def jittered_grid(spacing: float, rng: np.random.Generator, margin: float = 40.0) -> np.ndarray:
     grid = np.arange(margin, SIZE - margin, spacing)
     xy = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
     return xy + rng.uniform(-4, 4, xy.shape)
@@ -31,7 +31,7 @@ def jittered(spacing: float, rng: np.random.Generator, margin: float = 40.0) -> 
 
 @pytest.mark.parametrize(("sigma_adu", "level"), [(0.4, 3.3), (0.7, 12.6), (2.2, 3.7), (5.0, 20.2)])
 def test_noise_of_images_with_few_values(sigma_adu: float, level: float) -> None:
-    """Medians of whole numbers are whole numbers: the spread of an 8-bit image was wrong by up to a half."""
+    """Medians of integers are integers: the noise of an 8-bit image must not be quantised."""
     rng = np.random.default_rng(1)
     image = np.maximum(np.rint(rng.normal(level, sigma_adu, (512, 512))), 0).astype(np.float32)
     background, noise = background_and_noise(image, 1.0, 1.0)
@@ -61,14 +61,14 @@ def test_bit_depths(bits: int) -> None:
 
 
 @pytest.mark.parametrize("sigma", [1.2, 2.5])
-def test_a_crowd_hides_few_of_its_faint_stars(sigma: float) -> None:
-    """Wings of a thousand bright stars cover a tenth to half of the frame and would raise background and noise."""
+def test_few_faint_stars_are_lost_in_crowded_frames(sigma: float) -> None:
+    """The wings of a thousand bright stars cover a tenth to half of the frame and would bias background and noise."""
     rng = np.random.default_rng(3)
     xy = rng.uniform(20, SIZE - 20, (1500 if sigma < 2 else 700, 2))
     flux = np.exp(rng.uniform(np.log(600 * sigma), np.log(2e5), len(xy)))
     image = np.full((SIZE, SIZE), 100.0)
     paint(image, xy, flux, sigma)
-    found = Detector()(exposed(image, rng), plain_camera((SIZE, SIZE), sigma))
+    found = Detector()(expose(image, rng), plain_camera((SIZE, SIZE), sigma))
     alone = cKDTree(xy).query(xy, k=2)[0][:, 1] > 5 * sigma
     faint = alone & (flux < 2 * flux_of(10.0, sigma, VARIANCE)) & (flux > flux_of(8.0, sigma, VARIANCE))
     seen = cKDTree(found.xy_px).query(xy)[0] < 1.5 * sigma
@@ -80,16 +80,16 @@ def test_a_crowd_hides_few_of_its_faint_stars(sigma: float) -> None:
 
 
 def test_moonlight() -> None:
-    """A glow of 20,000 electrons that falls to a hundred, with photon noise to match."""
+    """A glow that falls from 20,000 electrons to a hundred, with its photon noise."""
     rng = np.random.default_rng(4)
     y, x = np.mgrid[:SIZE, :SIZE]
     glow = 100 + 20_000 * np.exp(-np.hypot(x - 200, y - 300) / 150)
-    xy = jittered(45, rng)
+    xy = jittered_grid(45, rng)
     local = glow[np.rint(xy[:, 1]).astype(int), np.rint(xy[:, 0]).astype(int)]
     flux = np.array([flux_of(12.0, 1.2, v + 9) for v in local])
     image = glow.copy()
     paint(image, xy, flux, 1.2)
-    found = Detector()(exposed(image, rng), plain_camera((SIZE, SIZE), 1.2))
+    found = Detector()(expose(image, rng), plain_camera((SIZE, SIZE), 1.2))
     distance, _ = cKDTree(found.xy_px).query(xy)
     assert np.mean(distance < 1.0) > 0.97
     assert np.sqrt(np.mean(distance[distance < 1.0] ** 2 / 2)) < 0.18  # 0.12 at the bound
@@ -97,13 +97,13 @@ def test_moonlight() -> None:
 
 
 def test_bloomed_stars_do_not_spoil_their_neighbourhood() -> None:
-    """Columns of saturated pixels above and below bright stars, as some sensors show: the other stars stay."""
+    """Columns of saturated pixels above and below bright stars (blooming): the other stars are still detected."""
     rng = np.random.default_rng(5)
-    xy = jittered(60, rng)
+    xy = jittered_grid(60, rng)
     flux = np.full(len(xy), flux_of(30.0, 1.2, VARIANCE))
     image = np.full((SIZE, SIZE), 100.0)
     paint(image, xy, flux, 1.2)
-    exposure = exposed(image, rng)
+    exposure = expose(image, rng)
     pixels = exposure.pixels_adu.copy()
     bloomed = np.stack([np.arange(75, 1000, 150), np.full(7, 500) + np.arange(7) * 3], axis=1)
     for column, row in bloomed:
@@ -115,37 +115,37 @@ def test_bloomed_stars_do_not_spoil_their_neighbourhood() -> None:
     assert np.count_nonzero(cKDTree(xy).query(found.xy_px)[0] > 3) <= 3
 
 
-def drawn_out(length_px: float, sigma: float, rng: np.random.Generator) -> tuple[Exposure, np.ndarray, np.ndarray]:
-    """Streaks that turn about the frame's corner, the places at mid-exposure, and the fluxes."""
-    xy = jittered(max(50, 1.6 * length_px), rng, margin=40 + length_px)
+def draw_streaks(length_px: float, sigma: float, rng: np.random.Generator) -> tuple[Exposure, np.ndarray, np.ndarray]:
+    """Streaks of a rotation about the frame's corner, the positions at mid-exposure, and the fluxes."""
+    xy = jittered_grid(max(50, 1.6 * length_px), rng, margin=40 + length_px)
     flux = np.exp(rng.uniform(np.log(4e3), np.log(6e4), len(xy)))
     along = np.stack([-xy[:, 1], xy[:, 0]], axis=1) / np.linalg.norm(xy, axis=1, keepdims=True)
     image, steps = np.full((SIZE, SIZE), 100.0), max(1, int(3 * length_px))
     for t in (np.arange(steps) + 0.5) / steps - 0.5:
         paint(image, xy + t * length_px * along, flux / steps, sigma)
-    return exposed(image, rng), xy, flux
+    return expose(image, rng), xy, flux
 
 
 @pytest.mark.parametrize(("length_px", "rms_px"), [(2.0, 0.04), (4.0, 0.05), (8.0, 0.10), (20.0, 0.20)])
 @pytest.mark.parametrize("sigma", [0.8, 1.2])
 def test_streaked_stars_are_where_they_stood_at_mid_exposure(length_px: float, rms_px: float, sigma: float) -> None:
     rng = np.random.default_rng(6)
-    exposure, xy, flux = drawn_out(length_px, sigma, rng)
+    exposure, xy, flux = draw_streaks(length_px, sigma, rng)
     found = Detector()(exposure, plain_camera((SIZE, SIZE), sigma))
     distance, nearest = cKDTree(found.xy_px).query(xy)
     near = distance < 1.0
     assert near.mean() > 0.95
-    assert np.count_nonzero(cKDTree(xy).query(found.xy_px)[0] > 2) <= 0.02 * len(xy)  # no streak counts twice
+    assert np.count_nonzero(cKDTree(xy).query(found.xy_px)[0] > 2) <= 0.02 * len(xy)  # no streak is detected twice
     error = found.xy_px[nearest[near]] - xy[near]
     assert np.sqrt(np.mean(error**2)) < rms_px
     chi2 = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance_px2[nearest[near]]), error)
-    assert chi2.mean() < 2 * 1.5  # honest, or a little careful
+    assert chi2.mean() < 2 * 1.5  # right, or slightly too large
     assert np.median(found.flux_e[nearest[near]] / flux[near]) == pytest.approx(1.0, abs=0.08)
 
 
 @pytest.mark.parametrize("gain", [0.5, 2.0])
 def test_photon_noise_of_an_unknown_gain_is_measured(gain: float) -> None:
-    """Without a camera file: errors of bright stars as stated, and centroids at the bound that knows the gain."""
+    """Without a camera file: errors of bright stars as stated, and centroids at the bound for a known gain."""
     rng = np.random.default_rng(7)
     stars = isolated_stars(1.2, 100.0, 3.0, (15, 250), rng=rng, size=SIZE, spacing=32)
     found = Detector()(replace(stars.exposure, pixels_adu=stars.exposure.pixels_adu / np.float32(gain) + 50))
@@ -169,7 +169,7 @@ def noise_of_kind(kind: str, rng: np.random.Generator) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["uniform", "two values", "spiky"])
-def test_nothing_but_noise_is_soon_over(kind: str) -> None:
+def test_pure_noise_ends_quickly(kind: str) -> None:
     frame = noise_of_kind(kind, np.random.default_rng(8)).astype(np.float32)
     start = time.process_time()
     try:

@@ -1,4 +1,4 @@
-"""Stars that are not the Gaussian PSF: trails of an undersampled lens, among hot pixels."""
+"""Stars that differ from the Gaussian PSF: trails of an undersampled lens, among hot pixels."""
 
 import numpy as np
 import pytest
@@ -24,10 +24,10 @@ def pixel_gaussian(xy, flux, sigma_px=SIGMA_PX):
     return frame
 
 
-def trailed(xy, flux, length_px, steps=15):
+def trail_stars(xy, flux, length_px, steps=15):
     """The same stars, each drawn along a line whose direction changes over the frame."""
-    turn = np.pi * xy[:, 0] / SIZE
-    along = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    direction = np.pi * xy[:, 0] / SIZE
+    along = np.stack([np.cos(direction), np.sin(direction)], axis=1)
     shifts = np.linspace(-0.5, 0.5, steps) * length_px
     return sum(pixel_gaussian(xy + s * along, flux / steps) for s in shifts)
 
@@ -40,7 +40,7 @@ def test_bright_trailed_stars_are_stars_and_hot_pixels_are_not(length_px):
     flux = np.geomspace(2e3, 3e5, len(xy))
     hot = rng.integers(20, SIZE - 20, (150, 2))
     hot = hot[cKDTree(xy).query(hot)[0] > 10]
-    frame = 2400 + trailed(xy, flux, length_px) + rng.normal(0, 40, (SIZE, SIZE))
+    frame = 2400 + trail_stars(xy, flux, length_px) + rng.normal(0, 40, (SIZE, SIZE))
     frame[hot[:, 1], hot[:, 0]] += rng.uniform(1e3, 5e4, len(hot))
     found = Detector()(Exposure(pixels_adu=np.clip(frame, 0, 65535).round(), saturation_adu=65535.0))
 
@@ -51,7 +51,7 @@ def test_bright_trailed_stars_are_stars_and_hot_pixels_are_not(length_px):
 
 
 def test_a_bright_star_of_a_real_lens_clipped_in_two_pixels_is_found():
-    """Its wings are wider than the Gaussian of the whole stars; hidden middles do not make it another thing."""
+    """Its wings are wider than the Gaussian of unsaturated stars; it must not be rejected for that."""
     rng = np.random.default_rng(8)
     xy = rng.uniform(20, SIZE - 20, (120, 2))
     xy = xy[cKDTree(xy).query(xy, k=2)[0][:, 1] > 14]
@@ -65,5 +65,5 @@ def test_a_bright_star_of_a_real_lens_clipped_in_two_pixels_is_found():
     distance, nearest = cKDTree(found.xy_px).query(xy)
     assert distance[at].max() < 0.2
     assert found.saturated[nearest[at]].all()
-    assert np.abs(found.flux_e[nearest[at]] / 3.4e5 - 1).max() < 0.35  # what is hidden is guessed from the wings
+    assert np.abs(found.flux_e[nearest[at]] / 3.4e5 - 1).max() < 0.35  # the saturated part is estimated from the wings
     assert np.count_nonzero(cKDTree(xy).query(found.xy_px)[0] > 3) <= 2

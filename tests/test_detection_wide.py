@@ -1,4 +1,4 @@
-"""Wide PSFs, found in frames whose pixels are added together and fitted in the frame itself; and its parts."""
+"""Wide PSFs, detected in binned frames and fitted in the frame itself; and parts of the detector."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from star_painter import cramer_rao, isolated_stars, plain_camera
 
 from startrack.detection import Detector
 from startrack.detection.classify import detection_threshold
-from startrack.detection.frame import Frame, LightNoise, bin_frame, binning_factor
+from startrack.detection.frame import Frame, SourceNoise, bin_frame, binning_factor
 from startrack.detection.peaks import _group_touching, bright_pixels
 
 SIZE = 1024
@@ -32,19 +32,19 @@ def test_centroids_and_covariances_of_wide_stars(sigma: float, known: bool) -> N
     pairs = zip(stars.xy_px[bright], stars.flux[bright], strict=True)
     bound = np.array([np.diag(cramer_rao(xy - np.rint(xy), flux, sigma, variance))[:2] for xy, flux in pairs])
     assert bright.sum() > 150
-    assert np.sqrt(np.mean(error**2 / bound)) < 1.15  # one part in 20 is the statistics
+    assert np.sqrt(np.mean(error**2 / bound)) < 1.15  # the statistical error is 5 %
     chi2 = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance_px2[nearest[bright]]), error)
     assert 1.5 < chi2.mean() < 2.6
     assert found.background_e.shape == (SIZE, SIZE)
 
 
-def test_binned_frames_keep_light_and_noise() -> None:
+def test_binned_frames_keep_flux_and_noise() -> None:
     rng = np.random.default_rng(2)
     image = rng.poisson(50.0, (201, 303)).astype(np.float32)
     dead = np.zeros(image.shape, dtype=bool)
     dead[11, 20] = True
     flat = np.ones_like(image)
-    small = bin_frame(Frame(image, 50 * flat, np.sqrt(50) * flat, dead, LightNoise()), 4)
+    small = bin_frame(Frame(image, 50 * flat, np.sqrt(50) * flat, dead, SourceNoise()), 4)
     assert small.shape == (50, 75)
     assert small.image[3, 5] == pytest.approx(image[12:16, 20:24].sum())
     assert np.std(small.image - small.background) == pytest.approx(float(small.noise[0, 0]), rel=0.05)
@@ -63,16 +63,16 @@ def test_touching_pixels_are_grouped_as_opencv_groups_them() -> None:
 
 def test_bright_pixels_are_those_of_stars_not_hot_ones() -> None:
     image = np.random.default_rng(4).normal(0, 1, (200, 300)).astype(np.float32)
-    places = [(40, 50), (100, 120), (220, 150)]
-    for x, y in places:
+    positions = [(40, 50), (100, 120), (220, 150)]
+    for x, y in positions:
         image[y - 1 : y + 2, x - 1 : x + 2] += 15
         image[y, x] += 20
     image[70, 70] = 200.0
-    frame = Frame(image, np.zeros_like(image), np.ones_like(image), None, LightNoise())
-    assert sorted(map(tuple, bright_pixels(frame, 8.0, 10, 1).tolist())) == sorted(places)
+    frame = Frame(image, np.zeros_like(image), np.ones_like(image), None, SourceNoise())
+    assert sorted(map(tuple, bright_pixels(frame, 8.0, 10, 1).tolist())) == sorted(positions)
 
 
-def test_skew_noise_asks_for_more_and_wide_stars_for_less() -> None:
+def test_skew_noise_raises_the_threshold_and_wide_stars_lower_it() -> None:
     usual = detection_threshold(5.42, 1.25, 0.088)
     assert usual == pytest.approx(5.42, abs=0.03)
     assert detection_threshold(5.42, 1.25, 0.2) > usual > detection_threshold(5.42, 1.25, 0.0) > 5.0

@@ -1,4 +1,4 @@
-"""Evidence: forced photometry of painted stars, and log-likelihood ratios that mean what they say."""
+"""Evidence: forced photometry of painted stars, and calibrated log-likelihood ratios."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def without_sources(
     )  # fmt: skip
 
 
-def noisy(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def add_noise(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Background-subtracted pixels [e] of the light on a background of the usual variance."""
     background = VARIANCE - READ_NOISE**2
     return (rng.poisson(light + background) - background + rng.normal(0, READ_NOISE, light.shape)).astype(np.float32)
@@ -43,7 +43,7 @@ def noisy(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Measured:
-    """Stars (n), where the first of each pair come first, and what was measured of them."""
+    """Stars (n), first stars of the pairs first, and their photometry."""
 
     expected: np.ndarray
     true: np.ndarray
@@ -64,7 +64,7 @@ class Measured:
         return visibility_llr(m.flux_e, self.expected, np.sqrt(hidden), np.sqrt(shining))
 
 
-def measured(
+def measure_pairs(
     sigma: float, shining: float, *, rng: np.random.Generator, neighbours: tuple[float, float] | None = None,
     faintest: float = 30.0, brightest: float = 3000.0, spacing: int = 20,
 ) -> Measured:  # fmt: skip
@@ -86,7 +86,7 @@ def measured(
     paint(image, xy, true, sigma)
     sources = Sources(xy_px=xy, flux_e=expected, fraction_sigma=np.full(len(xy), SCATTER), visible=thought)
     noise = np.full((SIZE, SIZE), np.sqrt(VARIANCE), np.float32)
-    light = measure(without_sources(noisy(image, rng), noise, sigma_px=sigma), sources)
+    light = measure(without_sources(add_noise(image, rng), noise, sigma_px=sigma), sources)
     return Measured(expected, true, shines, light, n)
 
 
@@ -99,7 +99,7 @@ def measured(
 def test_photometry_is_unbiased_and_its_variance_right(
     sigma: float, shining: float, neighbours: tuple[float, float] | None
 ) -> None:
-    got = measured(sigma, shining, rng=np.random.default_rng(1), neighbours=neighbours)
+    got = measure_pairs(sigma, shining, rng=np.random.default_rng(1), neighbours=neighbours)
     z = got.z()
     assert len(z) > 0.97 * got.firsts
     assert abs(z.mean()) < 0.07  # 2500 stars: 3.5 of its own standard deviations
@@ -112,22 +112,22 @@ def test_photometry_is_unbiased_and_its_variance_right(
 
 
 @pytest.mark.parametrize("sigma", [0.7, 1.0, 1.5])
-def test_photometry_wastes_no_light(sigma: float) -> None:
-    """Variance of hidden stars against the Cramer-Rao bound with the place known and the level free."""
-    got = measured(sigma, 0.0, rng=np.random.default_rng(2))
-    p = cramer_rao(np.zeros(2), 1e-6, sigma, VARIANCE)  # no light: place and flux do not mix
+def test_photometry_is_near_the_cramer_rao_bound(sigma: float) -> None:
+    """Variance of hidden stars against the Cramer-Rao bound with known position and free level."""
+    got = measure_pairs(sigma, 0.0, rng=np.random.default_rng(2))
+    p = cramer_rao(np.zeros(2), 1e-6, sigma, VARIANCE)  # no flux: position and flux are not correlated
     bound = p[2, 2]
-    assert np.median(got.light.variance_e2) < 1.25 * bound  # the stamp is small: the level costs some
+    assert np.median(got.light.variance_e2) < 1.25 * bound  # the stamp is small: the level adds to the variance
     assert np.median(got.light.variance_e2) > 0.97 * bound
 
 
 @pytest.mark.parametrize("neighbours", [None, (0.5, 0.5)], ids=["alone", "beside who knows"])
-def test_ratios_mean_what_they_say(neighbours: tuple[float, float] | None) -> None:
+def test_ratios_are_calibrated(neighbours: tuple[float, float] | None) -> None:
     """Of the stars with ratio l, as many shine as the logistic of l says (half of all do)."""
     rng = np.random.default_rng(3)
     llr, shines = [], []
     for _ in range(3):
-        got = measured(
+        got = measure_pairs(
             1.0, 0.5, rng=rng, neighbours=neighbours, faintest=10, brightest=600, spacing=20 if neighbours else 15
         )
         use = got.light.usable[: got.firsts]
@@ -139,7 +139,7 @@ def test_ratios_mean_what_they_say(neighbours: tuple[float, float] | None) -> No
         p = expit(ratio[some])
         assert some.sum() >= 100
         assert abs(yes[some].sum() - p.sum()) < 3.5 * np.sqrt(np.sum(p * (1 - p))), (low, high)
-    # Beyond, an allowance for oddities holds the ratios back: never more sure than right.
+    # Beyond, the ratios are capped for outliers: never overconfident.
     for sure, wrong in ((ratio > 4, ~yes), (ratio < -4, yes)):
         p = expit(-np.abs(ratio[sure])).sum()
         assert np.count_nonzero(wrong[sure]) <= p + 3.5 * np.sqrt(p)
@@ -154,19 +154,19 @@ def test_the_ratio_is_that_of_the_stated_densities() -> None:
     assert got[0] == pytest.approx(np.log(shines / hides), rel=1e-9)
 
 
-def test_the_ratio_rises_with_the_light_and_is_capped() -> None:
+def test_the_ratio_rises_with_the_flux_and_is_capped() -> None:
     flux = np.linspace(-100, 400, 501)
     ratio = visibility_llr(flux, np.full(501, 200.0), np.full(501, 20.0), np.full(501, 30.0))
     assert np.all(np.diff(ratio[(flux >= 20) & (flux <= 200)]) > 0)
     assert np.abs(ratio).max() <= CAP
     assert ratio[flux == 200][0] > 6
     assert ratio[flux == 0][0] == pytest.approx(np.log(2e-3), abs=0.5)  # a star may be missing for other reasons
-    # A flash a hundred times brighter than the star, or a hole much darker than the wall, is no witness of either.
+    # A flux a hundred times that of the star, or one far below the wall's, is evidence of neither.
     odd = visibility_llr(np.array([2e4, -500.0]), np.full(2, 200.0), np.full(2, 20.0), np.full(2, 30.0))
     assert np.all(np.abs(odd) < 1.0)
 
 
-def test_a_star_too_faint_to_tell_says_nothing() -> None:
+def test_a_star_far_below_the_noise_has_no_evidence() -> None:
     ratio = visibility_llr(np.array([-30.0, 0.0, 30.0]), np.full(3, 0.01), np.full(3, 20.0), np.full(3, 20.0))
     assert np.abs(ratio).max() < 0.01
 
@@ -180,7 +180,7 @@ def test_a_hot_pixel_near_a_star_is_masked(flux: float, excess: float) -> None:
     expected = np.full(len(xy), flux)
     image = np.zeros((SIZE, SIZE))
     paint(image, xy[::2], expected[::2], 1.0)  # every other star shines
-    image = noisy(image, rng)
+    image = add_noise(image, rng)
     spot = np.rint(xy).astype(int) + rng.integers(-3, 4, xy.shape)
     image[spot[:, 1], spot[:, 0]] += excess
     sources = Sources(xy_px=xy, flux_e=expected, fraction_sigma=np.full(len(xy), 0.05), visible=np.full(len(xy), 0.5))
@@ -189,7 +189,7 @@ def test_a_hot_pixel_near_a_star_is_masked(flux: float, excess: float) -> None:
     z = (light.flux_e - true) / np.sqrt(light.variance_e2 + light.own_shot * true)
     assert light.usable.mean() > 0.97
     assert np.mean(np.abs(z[light.usable]) > 5) < 0.005
-    assert z[light.usable].std() < 1.15  # ten sigma on the very middle of a star may pass for a part of it
+    assert z[light.usable].std() < 1.15  # ten sigma at the centre of a star may count as its flux
 
 
 def test_saturated_stamps_are_unusable() -> None:
@@ -226,11 +226,11 @@ def frame(stars: Stars, shines: np.ndarray, rng: np.random.Generator) -> Detecti
     light = np.zeros((512, 512))
     on = inside & shines
     paint(light, px[on], 10 ** (-0.4 * (stars.v_mag[on] - SCALE.zero_mag)), 1.0)
-    found = without_sources(noisy(light, rng) + BACKGROUND_E, np.full((512, 512), 10.0, np.float32))
+    found = without_sources(add_noise(light, rng) + BACKGROUND_E, np.full((512, 512), 10.0, np.float32))
     return replace(found, background_e=np.full((512, 512), BACKGROUND_E))
 
 
-def seen(
+def measure_frame(
     stars: Stars, shines: np.ndarray, rng: np.random.Generator, dead: np.ndarray | None = None, **how: Any
 ) -> StarPhotometry:
     detections = frame(stars, shines, rng)
@@ -241,11 +241,11 @@ def seen(
     )
 
 
-def test_every_star_in_view_gets_a_verdict() -> None:
+def test_every_star_in_view_gets_a_ratio() -> None:
     rng = np.random.default_rng(5)
     stars = random_stars(1500, rng)
     shines = stars.rays_icrs[:, 0] > 0  # a wall in the west
-    light = seen(stars, shines, rng)
+    light = measure_frame(stars, shines, rng)
     _, inside = CAMERA.project(stars.rays_icrs @ R_CAM_ENU.T)
     assert set(light.star.tolist()) == set(np.flatnonzero(inside & (stars.v_mag < 8)).tolist())
     azimuth, elevation = azel_from_rays(stars.rays_icrs[light.star])
@@ -275,7 +275,7 @@ def test_why_stars_cannot_be_used() -> None:
     dead = np.zeros((512, 512), bool)
     x, y = np.rint(px[inside & (stars.rays_icrs[:, 2] > 0.5)][7]).astype(int)
     dead[y - 3 : y + 4, x - 3 : x + 4] = True
-    light = seen(stars, np.ones(len(stars), bool), rng, dead, bodies=[venus])
+    light = measure_frame(stars, np.ones(len(stars), bool), rng, dead, bodies=[venus])
     cause = {int(s): str(c) for s, c in zip(light.star, light.cause, strict=True)}
     assert cause[20] == "beside Venus"
     beside = [s for s, c in cause.items() if c == "beside Venus"]
@@ -304,22 +304,22 @@ def test_stars_at_the_frame_edge_are_left_out() -> None:
 
 def test_one_lonely_star_and_none_at_all() -> None:
     rng = np.random.default_rng(8)
-    lonely = seen(stars_at([[0.0, 0.3, 0.95]], [3.0]), np.ones(1, bool), rng)
+    lonely = measure_frame(stars_at([[0.0, 0.3, 0.95]], [3.0]), np.ones(1, bool), rng)
     assert lonely.llr[0] > 6
-    below = seen(stars_at([[0.0, 0.0, -1.0]], [3.0]), np.ones(1, bool), rng)
+    below = measure_frame(stars_at([[0.0, 0.0, -1.0]], [3.0]), np.ones(1, bool), rng)
     assert len(below.star) == len(below.evidence()) == 0
 
 
-def test_uncertain_stars_say_less_when_missing() -> None:
-    """A variable star that is not seen may just be faint today."""
+def test_uncertain_stars_have_weaker_evidence_when_missing() -> None:
+    """A variable star that is not detected may be at its minimum."""
     rng = np.random.default_rng(9)
     rays = random_stars(300, rng).rays_icrs
     rays = rays[(rays[:, 2] > 0.3) & (rays[:, 2] < 0.95)]
     steady = stars_at(rays, np.full(len(rays), 4.0))
     variable = replace(steady, v_sigma_mag=np.full(len(rays), 0.5))
     hidden = np.zeros(len(rays), bool)
-    sure = seen(steady, hidden, np.random.default_rng(10)).llr
-    unsure = seen(variable, hidden, np.random.default_rng(10)).llr
+    sure = measure_frame(steady, hidden, np.random.default_rng(10)).llr
+    unsure = measure_frame(variable, hidden, np.random.default_rng(10)).llr
     assert np.median(sure) < -5
     assert np.median(unsure) > 0.75 * np.median(sure)
 
@@ -360,7 +360,7 @@ def test_the_scale_is_found_with_its_scatter() -> None:
     assert scale_from(v, low, saturated=clipped).zero_mag == pytest.approx(13.0, abs=0.015)
 
 
-def test_vignetting_that_the_camera_file_misses_is_seen_and_carried() -> None:
+def test_unstated_vignetting_is_estimated_and_applied() -> None:
     rng = np.random.default_rng(13)
     xy = rng.uniform(60, 450, (500, 2))
     angle = CAMERA.angle_rad(xy)
@@ -381,7 +381,7 @@ def test_a_few_stars_give_a_scale_too(n: int) -> None:
 
 
 def test_evidence_of_a_rendered_crater(located: Any) -> None:
-    """The pipeline's own evidence against the renderer's truth: sure ratios are right, all are calibrated."""
+    """The pipeline's evidence against the renderer's truth: large ratios are right, all are calibrated."""
     light, truth = located.result.light, located.truth
     stars = located.result.stars
     hidden = dict(zip(truth.sources.catalog_id.tolist(), truth.hidden.tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""What the camera file's own uncertainty does to the evidence."""
+"""Effect of the camera file's uncertainty on the evidence."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def photometry(result):
     return measure_evidence(result, result.terrain, Settings(deep_stars=False)).light
 
 
-def test_an_uncertain_lens_makes_stars_at_the_rim_say_less(located):
+def test_an_uncertain_lens_weakens_the_evidence_at_the_rim(located):
     sure = photometry(located.result)
     camera = with_covariance(located.result.camera, 2.0)
     doubtful = photometry(replace(located.result, camera=camera))

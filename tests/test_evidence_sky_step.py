@@ -1,4 +1,4 @@
-"""The step of the sky's own light at the skyline: measured, taken out, and left alone where it is not known."""
+"""The step of the sky brightness at the skyline: measured, subtracted, and not changed where it is not known."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def horizon_at(place):
     return partial(CRATER.horizon_rad, np.asarray(place)[None, :])
 
 
-def levelled(image, found, horizon):
+def subtract_step(image, found, horizon):
     found = replace(found, image_e=image)
     step = measure_sky_step(found, CAMERA, R_CAM_ENU, horizon)
     assert step is not None and step.exceeds_noise
@@ -53,9 +53,9 @@ def frame():
     return image, found, above, light
 
 
-def test_the_step_goes_and_each_side_has_its_own_noise(frame):
+def test_the_step_is_subtracted_and_each_side_has_its_own_noise(frame):
     image, found, above, light = frame
-    better = levelled(image, found, horizon_at(PLACE))
+    better = subtract_step(image, found, horizon_at(PLACE))
     inner = np.abs(above) < 8
     assert np.sqrt(np.mean((found.background_e - light)[inner] ** 2)) > 30
     assert np.sqrt(np.mean((better.background_e - light)[inner] ** 2)) < 3
@@ -65,10 +65,10 @@ def test_the_step_goes_and_each_side_has_its_own_noise(frame):
 
 
 def test_a_skyline_a_little_off_gives_the_same_background(frame):
-    """An error of the fix shifts the profile's own origin, not the light that is taken out."""
+    """An error of the fix shifts the profile's origin, not the subtracted step."""
     image, found, above, light = frame
     aside = horizon_at(PLACE + np.array([12.0, -8.0]))
-    better = levelled(image, found, aside)
+    better = subtract_step(image, found, aside)
     assert np.sqrt(np.mean((better.background_e - light)[np.abs(above) < 6] ** 2)) < 4
 
 
@@ -79,7 +79,9 @@ def test_right_below_a_wall_the_skyline_is_not_known():
     wall = horizon_at([9850.0, 0.0])
     known = reliable_azimuths(wall, [horizon_at([9852.0, 0.0]), horizon_at([9850.0, 2.0])], CAMERA)(azimuth)
     assert known[250:290].all()  # the far rim
-    assert not known[np.r_[0:5, 355:360, 175:185]].any()  # along the wall, north and south: there it turns fastest
+    assert not known[
+        np.r_[0:5, 355:360, 175:185]
+    ].any()  # along the wall, north and south: the skyline changes fastest there
 
 
 def test_near_means_pixels():

@@ -1,4 +1,4 @@
-"""Whatever happens to a file on its way, the reader answers with pixels or with `BadInput`; a cut is always seen."""
+"""Damaged files: the reader returns pixels or raises `BadInput`; truncation is always noticed."""
 
 import bz2
 import gzip
@@ -19,42 +19,42 @@ from startrack.types import BadInput
 FRAME = np.random.default_rng(3).normal(1000, 50, (40, 60)).astype(np.uint16)
 
 
-def by_pillow(image, kind, **options):
+def encode_pillow(image, kind, **options):
     file = io.BytesIO()
     Image.fromarray(image).save(file, kind, **options)
     return file.getvalue()
 
 
-def by_tifffile(**options):
+def encode_tifffile(**options):
     file = io.BytesIO()
     tifffile.imwrite(file, FRAME, **options)
     return file.getvalue()
 
 
-def by_astropy(*units):
+def encode_astropy(*units):
     file = io.BytesIO()
     fits.HDUList(list(units)).writeto(file)
     return file.getvalue()
 
 
 FILES = {
-    "png": by_pillow(FRAME, "PNG"),
-    "jpeg": by_pillow((FRAME // 8).astype(np.uint8), "JPEG"),
-    "jpeg progressive": by_pillow((FRAME // 8).astype(np.uint8), "JPEG", progressive=True),
-    "tiff": by_tifffile(),
-    "tiff deflate": by_tifffile(compression="zlib", rowsperstrip=8),
-    "tiff tiles": by_tifffile(tile=(16, 16)),
-    "tiff LZW": by_pillow(FRAME, "TIFF", compression="tiff_lzw"),
-    "fits": by_astropy(fits.PrimaryHDU(FRAME)),
-    "fits extension": by_astropy(fits.PrimaryHDU(), fits.ImageHDU(FRAME)),
-    "fits fz": by_astropy(fits.PrimaryHDU(), fits.CompImageHDU(FRAME)),
-    "fits gz": gzip.compress(by_astropy(fits.PrimaryHDU(FRAME)), mtime=0),
-    "fits bz2": bz2.compress(by_astropy(fits.PrimaryHDU(FRAME))),
+    "png": encode_pillow(FRAME, "PNG"),
+    "jpeg": encode_pillow((FRAME // 8).astype(np.uint8), "JPEG"),
+    "jpeg progressive": encode_pillow((FRAME // 8).astype(np.uint8), "JPEG", progressive=True),
+    "tiff": encode_tifffile(),
+    "tiff deflate": encode_tifffile(compression="zlib", rowsperstrip=8),
+    "tiff tiles": encode_tifffile(tile=(16, 16)),
+    "tiff LZW": encode_pillow(FRAME, "TIFF", compression="tiff_lzw"),
+    "fits": encode_astropy(fits.PrimaryHDU(FRAME)),
+    "fits extension": encode_astropy(fits.PrimaryHDU(), fits.ImageHDU(FRAME)),
+    "fits fz": encode_astropy(fits.PrimaryHDU(), fits.CompImageHDU(FRAME)),
+    "fits gz": gzip.compress(encode_astropy(fits.PrimaryHDU(FRAME)), mtime=0),
+    "fits bz2": bz2.compress(encode_astropy(fits.PrimaryHDU(FRAME))),
 }
 
 
 @pytest.fixture
-def survives(tmp_path):
+def is_read(tmp_path):
     """True if the bytes are read; False if they are refused as they should be."""
 
     def check(raw):
@@ -76,17 +76,17 @@ def survives(tmp_path):
 
 
 @pytest.mark.parametrize("kind", FILES)
-def test_every_cut_is_refused(survives, kind, capfd):
+def test_every_cut_is_refused(is_read, kind, capfd):
     whole = FILES[kind]
-    assert survives(whole)
+    assert is_read(whole)
     rng = np.random.default_rng(1)
     cuts = {*range(len(whole) - 12, len(whole)), *rng.integers(0, len(whole), 40).tolist()}
-    assert [cut for cut in cuts if survives(whole[:cut])] == []
+    assert [cut for cut in cuts if is_read(whole[:cut])] == []
     assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("kind", FILES)
-def test_flipped_bytes_never_crash(survives, kind):
+def test_flipped_bytes_never_crash(is_read, kind):
     rng = np.random.default_rng(2)
     refused = 0
     for trial in range(80):
@@ -94,7 +94,7 @@ def test_flipped_bytes_never_crash(survives, kind):
         reach = len(raw) if trial % 2 else min(400, len(raw))  # every other time the header
         for _ in range(rng.integers(1, 6)):
             raw[rng.integers(reach)] = rng.integers(256)
-        refused += not survives(bytes(raw))
+        refused += not is_read(bytes(raw))
     assert refused > 0
 
 
@@ -113,7 +113,7 @@ def test_formats_with_checksums_never_show_wrong_pixels(tmp_path, kind):
         np.testing.assert_array_equal(exposure.pixels_adu, FRAME)
 
 
-def test_damage_behind_good_checksums_of_a_png(survives):
+def test_damage_behind_good_checksums_of_a_png(is_read):
     """Chunks rewritten with fitting checksums reach the decoders of text, EXIF and pixels."""
     whole = FILES["png"]
     data_at = whole.index(b"IDAT")
@@ -130,13 +130,13 @@ def test_damage_behind_good_checksums_of_a_png(survives):
         b"IEND": b"",
     }
 
-    def assembled(bodies):
+    def assemble_png(bodies):
         return SIGNATURE + b"".join(chunk(kind, bytes(body)) for kind, body in bodies.items())
 
-    assert survives(assembled(parts))
+    assert is_read(assemble_png(parts))
     rng = np.random.default_rng(6)
     for _ in range(150):
         bodies = {kind: bytearray(body) for kind, body in parts.items()}
         kind = list(parts)[rng.integers(6)]
         bodies[kind][rng.integers(len(bodies[kind]))] = rng.integers(256)
-        survives(assembled(bodies))
+        is_read(assemble_png(bodies))

@@ -1,4 +1,4 @@
-"""What is not an image file at all, odd names, and what reading costs."""
+"""Files that are no images, unusual names, and the time of reading."""
 
 import hashlib
 import os
@@ -27,14 +27,14 @@ def test_what_is_no_file(tmp_path, target):
 
 
 def test_permission_denied(tmp_path, monkeypatch):
-    """Root may read anything, so the refusal of the system is played."""
+    """Root may read any file, so the error of the system is simulated."""
     path = tmp_path / "frame.png"
     path.write_bytes(WHOLE)
 
-    def denied(*_args, **_keywords):
+    def deny_access(*_args, **_keywords):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("pathlib.Path.read_bytes", denied)
+    monkeypatch.setattr("pathlib.Path.read_bytes", deny_access)
     with pytest.raises(BadInput, match="Permission denied"):
         read_exposure(path)
 

@@ -1,4 +1,4 @@
-"""FITS files written by astropy: read as astropy means them, or refused with the cause."""
+"""FITS files written by astropy: read as astropy does, or refused with the cause."""
 
 import bz2
 import gzip
@@ -17,14 +17,14 @@ SIGNED = FRAME.view(np.int16)
 TABLE = fits.BinTableHDU.from_columns([fits.Column("flux", "E", array=np.arange(3.0))])
 
 
-def written(*units, **options):
+def fits_bytes(*units, **options):
     """FITS bytes; None stands for an empty primary unit."""
     file = io.BytesIO()
     fits.HDUList([fits.PrimaryHDU() if unit is None else unit for unit in units]).writeto(file, **options)
     return file.getvalue()
 
 
-def declared(**cards):
+def header_bytes(**cards):
     """Header that astropy would not write, without data."""
     lines = [f"{'SIMPLE':8}= {'T':>20}", *(f"{key:8}= {value:>20}" for key, value in cards.items()), "END"]
     return "".join(line.ljust(80) for line in lines).encode().ljust(2880)
@@ -32,24 +32,24 @@ def declared(**cards):
 
 @pytest.fixture
 def read(tmp_path):
-    def from_bytes(raw, name="frame.fits"):
+    def read_bytes(raw, name="frame.fits"):
         path = tmp_path / name
         path.write_bytes(raw)
         return read_exposure(path)
 
-    return from_bytes
+    return read_bytes
 
 
 @pytest.fixture
 def cause(read):
-    def of(raw):
+    def refusal_cause(raw):
         with pytest.raises(BadInput) as caught:
             read(raw)
         assert caught.value.reason == "bad_image"
         assert "\n" not in str(caught.value)
         return str(caught.value)
 
-    return of
+    return refusal_cause
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def cause(read):
     ],
 )
 def test_pixels(read, units, expected, saturation):
-    exposure = read(written(*units))
+    exposure = read(fits_bytes(*units))
     assert exposure.pixels_adu.dtype == np.float32
     assert exposure.pixels_adu.dtype.isnative
     np.testing.assert_array_equal(exposure.pixels_adu, expected)
@@ -80,7 +80,7 @@ def test_pixels(read, units, expected, saturation):
 
 def test_the_first_stored_row_is_row_zero(read):
     """FITS pixel (x + 1, y + 1) is ours (x, y): no flip."""
-    raw = written(fits.PrimaryHDU(FRAME))
+    raw = fits_bytes(fits.PrimaryHDU(FRAME))
     stored_first = np.frombuffer(raw, ">i2", count=47, offset=2880).astype(int) + 32768
     np.testing.assert_array_equal(read(raw).pixels_adu[0], stored_first)
 
@@ -88,32 +88,32 @@ def test_the_first_stored_row_is_row_zero(read):
 def test_bscale_and_bzero(read):
     unit = fits.PrimaryHDU(SIGNED, do_not_scale_image_data=True)
     unit.header["BSCALE"], unit.header["BZERO"] = 2.0, 10.0
-    exposure = read(written(unit))
+    exposure = read(fits_bytes(unit))
     np.testing.assert_array_equal(exposure.pixels_adu, SIGNED * 2.0 + 10.0)
     assert exposure.saturation_adu == 32767 * 2 + 10
 
 
 @pytest.mark.parametrize(("pack", "suffix"), [(gzip.compress, "gz"), (bz2.compress, "bz2")])
 def test_packed(read, pack, suffix):
-    exposure = read(pack(written(fits.PrimaryHDU(FRAME))), f"night 1.5.fits.{suffix}")
+    exposure = read(pack(fits_bytes(fits.PrimaryHDU(FRAME))), f"night 1.5.fits.{suffix}")
     np.testing.assert_array_equal(exposure.pixels_adu, FRAME)
     assert exposure.name == "night 1.5"
 
 
-def undefined():
+def undefined_image():
     unit = fits.PrimaryHDU(SIGNED.copy())
     unit.header["BLANK"] = int(SIGNED[4, 7])
-    return written(unit)
+    return fits_bytes(unit)
 
 
-def with_nan():
+def nan_image():
     pixels = FRAME.astype(np.float32)
     pixels[2, 3] = np.nan
-    return written(fits.PrimaryHDU(pixels))
+    return fits_bytes(fits.PrimaryHDU(pixels))
 
 
-def damaged_below_its_checksum():
-    raw = bytearray(written(fits.PrimaryHDU(FRAME), checksum=True))
+def damaged_data():
+    raw = bytearray(fits_bytes(fits.PrimaryHDU(FRAME), checksum=True))
     raw[2880 + 101] ^= 4
     return bytes(raw)
 
@@ -121,42 +121,50 @@ def damaged_below_its_checksum():
 @pytest.mark.parametrize(
     ("raw", "why"),
     [
-        (written(None), "no image"),
-        (written(None, TABLE), "no image"),
-        (written(fits.PrimaryHDU(np.stack([FRAME] * 3))), "a cube (47 x 31 x 3)"),
-        (written(fits.PrimaryHDU(FRAME[0])), "a spectrum (47)"),
-        (written(None, fits.ImageHDU(FRAME, name="A"), fits.ImageHDU(FRAME)), "2 images (A 47 x 31, unnamed 47 x 31)"),
-        (with_nan(), "1 of 1457 pixels are NaN"),
-        (undefined(), "pixels are NaN"),
-        (damaged_below_its_checksum(), "DATASUM"),
-        (written(fits.PrimaryHDU(FRAME)) + b"x" * 2880, "damaged"),
-        (written(fits.PrimaryHDU(FRAME))[:-1], "truncated"),
-        (written(fits.PrimaryHDU(FRAME))[:3000], "truncated"),
-        (written(fits.PrimaryHDU(FRAME))[:800], "truncated"),
-        (written(None, fits.ImageHDU(FRAME))[:4000], "truncated"),
-        (gzip.compress(written(fits.PrimaryHDU(FRAME)), mtime=0)[:-9], "truncated"),
-        (bz2.compress(written(fits.PrimaryHDU(FRAME)))[:-9], "truncated"),
+        (fits_bytes(None), "no image"),
+        (fits_bytes(None, TABLE), "no image"),
+        (fits_bytes(fits.PrimaryHDU(np.stack([FRAME] * 3))), "a cube (47 x 31 x 3)"),
+        (fits_bytes(fits.PrimaryHDU(FRAME[0])), "a spectrum (47)"),
+        (
+            fits_bytes(None, fits.ImageHDU(FRAME, name="A"), fits.ImageHDU(FRAME)),
+            "2 images (A 47 x 31, unnamed 47 x 31)",
+        ),
+        (nan_image(), "1 of 1457 pixels are NaN"),
+        (undefined_image(), "pixels are NaN"),
+        (damaged_data(), "DATASUM"),
+        (fits_bytes(fits.PrimaryHDU(FRAME)) + b"x" * 2880, "damaged"),
+        (fits_bytes(fits.PrimaryHDU(FRAME))[:-1], "truncated"),
+        (fits_bytes(fits.PrimaryHDU(FRAME))[:3000], "truncated"),
+        (fits_bytes(fits.PrimaryHDU(FRAME))[:800], "truncated"),
+        (fits_bytes(None, fits.ImageHDU(FRAME))[:4000], "truncated"),
+        (gzip.compress(fits_bytes(fits.PrimaryHDU(FRAME)), mtime=0)[:-9], "truncated"),
+        (bz2.compress(fits_bytes(fits.PrimaryHDU(FRAME)))[:-9], "truncated"),
         (gzip.compress(b"a packed text", mtime=0), "without FITS data"),
-        (declared(BITPIX=16, NAXIS=2, NAXIS1=20000, NAXIS2=20000) + bytes(2880), "400.0 Mpx"),
-        (gzip.compress(declared(BITPIX=16, NAXIS=2, NAXIS1=20000, NAXIS2=20000) + bytes(2880), mtime=0), "400.0 Mpx"),
-        (declared(BITPIX=16, NAXIS=2, NAXIS1=-5, NAXIS2=20) + bytes(2880), "no pixels"),
-        (declared(BITPIX=17, NAXIS=2, NAXIS1=5, NAXIS2=20) + bytes(2880), "damaged"),
+        (header_bytes(BITPIX=16, NAXIS=2, NAXIS1=20000, NAXIS2=20000) + bytes(2880), "400.0 Mpx"),
+        (
+            gzip.compress(header_bytes(BITPIX=16, NAXIS=2, NAXIS1=20000, NAXIS2=20000) + bytes(2880), mtime=0),
+            "400.0 Mpx",
+        ),
+        (header_bytes(BITPIX=16, NAXIS=2, NAXIS1=-5, NAXIS2=20) + bytes(2880), "no pixels"),
+        (header_bytes(BITPIX=17, NAXIS=2, NAXIS1=5, NAXIS2=20) + bytes(2880), "damaged"),
     ],
 )
 def test_refused_with_the_cause(cause, raw, why):
     assert why in cause(raw)
 
 
-def with_cards(**cards):
+def image_with_cards(**cards):
     unit = fits.PrimaryHDU(FRAME)
     for key, value in cards.items():
         unit.header[key.replace("_", "-")] = value
-    return written(unit)
+    return fits_bytes(unit)
 
 
 def test_facts_of_the_header(read, tmp_path):
     exposure = read(
-        with_cards(DATE_OBS="2018-08-06T05:17:04.752", EXPTIME=60, STCAMERA="calib/all sky.toml", STTERRAI="shackleton")
+        image_with_cards(
+            DATE_OBS="2018-08-06T05:17:04.752", EXPTIME=60, STCAMERA="calib/all sky.toml", STTERRAI="shackleton"
+        )
     )
     assert exposure.time_utc.isoformat() == "2018-08-06T05:17:34.752000+00:00"
     assert exposure.exposure_s == 60.0
@@ -166,12 +174,12 @@ def test_facts_of_the_header(read, tmp_path):
 
 
 def test_date_avg_goes_before_date_obs(read):
-    exposure = read(with_cards(DATE_OBS="2018-08-06T05:17:04", DATE_AVG="2018-08-06T05:18:00", EXPTIME=60.0))
+    exposure = read(image_with_cards(DATE_OBS="2018-08-06T05:17:04", DATE_AVG="2018-08-06T05:18:00", EXPTIME=60.0))
     assert exposure.time_utc.isoformat() == "2018-08-06T05:18:00+00:00"
 
 
 def test_a_card_that_names_the_hardware_is_not_the_camera_file(read):
-    assert read(with_cards(CAMERA="SX Superstar", TERRAIN="rocks")).camera is None
+    assert read(image_with_cards(CAMERA="SX Superstar", TERRAIN="rocks")).camera is None
 
 
 def test_facts_of_the_primary_header_hold_for_an_extension(read):
@@ -180,7 +188,7 @@ def test_facts_of_the_primary_header_hold_for_an_extension(read):
     primary.header["DATE-AVG"] = "2018-08-06T05:18:00"
     image = fits.ImageHDU(FRAME)
     image.header["EXPTIME"] = 5
-    exposure = read(written(primary, image))
+    exposure = read(fits_bytes(primary, image))
     assert exposure.exposure_s == 5.0
     assert exposure.time_utc is not None
 
@@ -198,18 +206,18 @@ def test_facts_of_the_primary_header_hold_for_an_extension(read):
     ],
 )
 def test_a_time_that_is_not_known_stays_unknown_and_is_explained(read, cards, note):
-    exposure = read(with_cards(**cards))
+    exposure = read(image_with_cards(**cards))
     assert exposure.time_utc is None
     assert note in " ".join(exposure.warnings)
 
 
 def test_an_unusable_date_avg_leaves_date_obs(read):
-    exposure = read(with_cards(DATE_AVG="yesterday", DATE_OBS="2018-08-06T05:17:00", EXPTIME=60, TIMESYS="UTC"))
+    exposure = read(image_with_cards(DATE_AVG="yesterday", DATE_OBS="2018-08-06T05:17:00", EXPTIME=60, TIMESYS="UTC"))
     assert exposure.time_utc.isoformat() == "2018-08-06T05:17:30+00:00"
     assert "DATE-AVG not used" in exposure.warnings[0]
 
 
-def patched(raw, card, value, nth=0):
+def patch_card(raw, card, value, nth=0):
     """The file with the value of its nth card of that name replaced."""
     at = -1
     for _ in range(nth + 1):
@@ -220,13 +228,13 @@ def patched(raw, card, value, nth=0):
 @pytest.mark.parametrize(
     "raw",
     [
-        patched(written(fits.PrimaryHDU(FRAME)), "NAXIS", 10**9),
-        patched(written(fits.PrimaryHDU(FRAME)), "NAXIS", -2),
-        patched(written(fits.PrimaryHDU(FRAME)), "NAXIS1", 10**9),
-        patched(written(None, fits.ImageHDU(FRAME)), "NAXIS", 10**9, nth=1),
-        patched(written(fits.PrimaryHDU(FRAME), TABLE), "TFIELDS", 10**9),
-        patched(written(fits.PrimaryHDU(FRAME), TABLE), "GCOUNT", -(10**9)),
-        gzip.compress(patched(written(fits.PrimaryHDU(FRAME)), "NAXIS", 10**9), mtime=0),
+        patch_card(fits_bytes(fits.PrimaryHDU(FRAME)), "NAXIS", 10**9),
+        patch_card(fits_bytes(fits.PrimaryHDU(FRAME)), "NAXIS", -2),
+        patch_card(fits_bytes(fits.PrimaryHDU(FRAME)), "NAXIS1", 10**9),
+        patch_card(fits_bytes(None, fits.ImageHDU(FRAME)), "NAXIS", 10**9, nth=1),
+        patch_card(fits_bytes(fits.PrimaryHDU(FRAME), TABLE), "TFIELDS", 10**9),
+        patch_card(fits_bytes(fits.PrimaryHDU(FRAME), TABLE), "GCOUNT", -(10**9)),
+        gzip.compress(patch_card(fits_bytes(fits.PrimaryHDU(FRAME)), "NAXIS", 10**9), mtime=0),
     ],
     ids=["axes", "negative axes", "width", "axes of an extension", "fields", "negative size", "packed"],
 )
@@ -240,4 +248,4 @@ def test_huge_numbers_in_a_header_are_refused_at_once(read, raw):
 
 def test_a_compressed_image_without_rows_is_refused(read):
     with pytest.raises(BadInput, match="damaged FITS"):
-        read(patched(written(None, fits.CompImageHDU(FRAME)), "NAXIS2", 0))
+        read(patch_card(fits_bytes(None, fits.CompImageHDU(FRAME)), "NAXIS2", 0))

@@ -19,7 +19,7 @@ MID = datetime(2031, 3, 26, 20, 58, 11, 966208, tzinfo=UTC)
 
 @pytest.fixture
 def image(tmp_path):
-    """A PNG that says everything about itself."""
+    """A PNG with all metadata in its header."""
     text = PngImagePlugin.PngInfo()
     for key, value in {
         "DATE-OBS": "2020-01-01T00:00:00",
@@ -75,7 +75,7 @@ def test_flags_go_before_sidecar(image, sidecar):
         assert {key: getattr(exposure, key) for key in flags} == flags
 
 
-def test_a_fact_given_by_flag_is_not_even_looked_at_below(image, sidecar):
+def test_a_fact_given_by_flag_is_not_read_elsewhere(image, sidecar):
     sidecar({"time_utc": "2031-03-26T20:58:11+02:00"})
     with pytest.raises(BadInput, match="local time") as caught:
         read_exposure(image)
@@ -84,7 +84,7 @@ def test_a_fact_given_by_flag_is_not_even_looked_at_below(image, sidecar):
 
 
 def test_the_exposure_that_holds_moves_the_middle(image, sidecar):
-    """DATE-OBS is a start: half of the exposure that is believed comes on top, whoever said it."""
+    """DATE-OBS is the start: half of the resolved exposure time is added, whatever its source."""
     start = datetime(2020, 1, 1, tzinfo=UTC)
     assert read_exposure(image, exposure_s=8.0).time_utc == start + timedelta(seconds=4)
     sidecar({"exposure_s": 6})

@@ -17,9 +17,9 @@ from startrack.types import BadInput, Exposure
 
 SAMPLE = Path(__file__).parents[1] / "sample_images" / "near-wall"
 PATTERN = (((0, 0), "R"), ((0, 1), "G"), ((1, 0), "G"), ((1, 1), "B"))
-GAIN = {"R": 0.45, "G": 1.0, "B": 0.6}  # of the stars' light
+GAIN = {"R": 0.45, "G": 1.0, "B": 0.6}  # relative flux of the stars
 SKY_E = {"R": 20.0, "G": 8.0, "B": 3.0}
-DNG_TAGS = [  # what the DNG standard asks of a mosaic: version, pattern, white, black, model, colour matrix, illuminant
+DNG_TAGS = [  # required by the DNG standard: version, pattern, white, black, model, colour matrix, illuminant
     (50706, "B", 4, (1, 4, 0, 0), True), (50707, "B", 4, (1, 1, 0, 0), True), (33421, "H", 2, (2, 2), True),
     (33422, "B", 4, (0, 1, 1, 2), True), (50717, "I", 1, (4095,), True), (50714, "H", 1, (64,), True),
     (50708, "s", 0, "Test", True), (50721, "2i", 9, (1, 1, 0, 1, 0, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0, 1, 1, 1), True),
@@ -41,15 +41,15 @@ def colours(tmp_path_factory) -> Path:
     return path
 
 
-def with_sidecar(image: Path, **more: str) -> Path:
+def add_sidecar(image: Path, **more: str) -> Path:
     facts = json.loads(SAMPLE.with_suffix(".json").read_text())
     image.with_suffix(".json").write_text(json.dumps(facts | more))
     return image
 
 
 def test_a_mosaic_is_located_and_shows_more_stars_than_its_raw_pixels(colours):
-    plain = startrack.locate(with_sidecar(colours))
-    solution = startrack.locate(with_sidecar(colours, bayer_pattern="RGGB"))
+    plain = startrack.locate(add_sidecar(colours))
+    solution = startrack.locate(add_sidecar(colours, bayer_pattern="RGGB"))
     truth = json.loads(SAMPLE.with_suffix(".truth.json").read_text())["position_enu_m"]
     assert solution and solution.result.identification is not None and plain.result.identification is not None
     assert len(solution.result.identification.star) > 2 * len(plain.result.identification.star)
@@ -58,7 +58,7 @@ def test_a_mosaic_is_located_and_shows_more_stars_than_its_raw_pixels(colours):
 
 
 def test_levels_become_one_and_gains_are_found(colours):
-    pixels = read_exposure(with_sidecar(colours)).pixels_adu
+    pixels = read_exposure(add_sidecar(colours)).pixels_adu
     even = equalize_mosaic(pixels, 65535.0)
     middles = [np.median(even[i:400:2, j:400:2]) for (i, j), _ in PATTERN]
     assert np.ptp(middles) < 1.0 < np.ptp([np.median(pixels[i:400:2, j:400:2]) for (i, j), _ in PATTERN])
@@ -80,7 +80,7 @@ def test_saturated_pixels_stay_saturated():
 @pytest.mark.parametrize("pattern", ["RGBW", "RBGG", "GGRB", "mono", 3])
 def test_other_patterns_are_refused_in_a_sidecar(colours, pattern):
     with pytest.raises(BadInput, match="bayer_pattern must be RGGB or BGGR or GRBG or GBRG"):
-        read_exposure(with_sidecar(colours, bayer_pattern=pattern))
+        read_exposure(add_sidecar(colours, bayer_pattern=pattern))
 
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG", " grbg "])
@@ -91,7 +91,7 @@ def test_the_four_patterns_are_taken(tmp_path, pattern):
 
 
 def test_a_tiff_mosaic_and_a_camera_raw_file_give_the_sensors_counts(tmp_path):
-    counts = np.random.default_rng(0).integers(200, 4000, (64, 96)).astype(np.uint16)  # too small to be evened out
+    counts = np.random.default_rng(0).integers(200, 4000, (64, 96)).astype(np.uint16)  # too small to be equalised
     tifffile.imwrite(tmp_path / "a.tif", counts, photometric=32803)
     pytest.importorskip("rawpy", reason="camera raw files need the extra raw")
     tifffile.imwrite(tmp_path / "b.dng", counts, photometric=32803, extratags=DNG_TAGS, subfiletype=0)

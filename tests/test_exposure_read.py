@@ -20,7 +20,7 @@ FRAME16 = RNG.integers(0, 65536, (37, 53)).astype(np.uint16)
 FRAME8 = RNG.integers(0, 256, (37, 53)).astype(np.uint8)
 
 
-def encoded(image, kind, mode=None, **options):
+def encode_image(image, kind, mode=None, **options):
     file = io.BytesIO()
     picture = Image.fromarray(image)
     (picture.convert(mode) if mode else picture).save(file, kind, **options)
@@ -46,17 +46,17 @@ def png(*chunks, image=FRAME16):
 
 @pytest.fixture
 def read(tmp_path):
-    def from_bytes(raw, name="frame.png"):
+    def read_bytes(raw, name="frame.png"):
         path = tmp_path / name
         path.write_bytes(raw)
         return read_exposure(path)
 
-    return from_bytes
+    return read_bytes
 
 
 @pytest.fixture
 def cause(read):
-    def of(raw, name="frame.png"):
+    def refusal_cause(raw, name="frame.png"):
         with pytest.raises(BadInput) as caught:
             read(raw, name)
         assert caught.value.reason == "bad_image"
@@ -65,14 +65,14 @@ def cause(read):
         assert name in message
         return message
 
-    return of
+    return refusal_cause
 
 
 @pytest.mark.parametrize(
     ("raw", "expected", "saturation"),
     [
-        (encoded(FRAME16, "PNG"), FRAME16, 65535),
-        (encoded(FRAME8, "PNG"), FRAME8, 255),
+        (encode_image(FRAME16, "PNG"), FRAME16, 65535),
+        (encode_image(FRAME8, "PNG"), FRAME8, 255),
         (cv2.imencode(".png", FRAME16)[1].tobytes(), FRAME16, 65535),
         (png(chunk(b"gAMA", struct.pack(">I", 45455)), chunk(b"sBIT", b"\x0c")), FRAME16, 65535),
         (tiff(FRAME16), FRAME16, 65535),
@@ -82,10 +82,10 @@ def cause(read):
         (tiff(FRAME16.view(np.int16)), FRAME16.view(np.int16), 32767),
         (tiff(FRAME16.astype(np.float32) / 7), FRAME16.astype(np.float32) / 7, None),
         (tiff(FRAME16.astype(np.float64)), FRAME16, None),
-        (encoded(FRAME16, "TIFF"), FRAME16, 65535),
-        (encoded(FRAME16, "TIFF", compression="tiff_lzw"), FRAME16, 65535),
-        (encoded(FRAME16, "TIFF", compression="packbits"), FRAME16, 65535),
-        (encoded(FRAME8, "TIFF"), FRAME8, 255),
+        (encode_image(FRAME16, "TIFF"), FRAME16, 65535),
+        (encode_image(FRAME16, "TIFF", compression="tiff_lzw"), FRAME16, 65535),
+        (encode_image(FRAME16, "TIFF", compression="packbits"), FRAME16, 65535),
+        (encode_image(FRAME8, "TIFF"), FRAME8, 255),
     ],
 )
 def test_every_bit_is_kept(read, raw, expected, saturation):
@@ -109,7 +109,7 @@ def test_interlaced_png(read):
 
 def test_jpeg_is_what_pillow_decodes(read):
     smooth = cv2.GaussianBlur(FRAME8, (0, 0), 3)
-    raw = encoded(smooth, "JPEG", quality=95, comment=b"EXPTIME = 2.5")
+    raw = encode_image(smooth, "JPEG", quality=95, comment=b"EXPTIME = 2.5")
     exposure = read(raw, "frame.jpg")
     np.testing.assert_array_equal(exposure.pixels_adu, np.asarray(Image.open(io.BytesIO(raw))))
     assert np.abs(exposure.pixels_adu - smooth).max() < 8
@@ -139,7 +139,7 @@ def test_equal_channels_give_the_channel_exactly(read):
 def test_orientation_is_ignored_with_a_warning(read, kind):
     exif = Image.Exif()
     exif[0x0112] = 6
-    raw = tiff(FRAME8, extratags=[(274, "H", 1, 6, True)]) if kind == "TIFF" else encoded(FRAME8, kind, exif=exif)
+    raw = tiff(FRAME8, extratags=[(274, "H", 1, 6, True)]) if kind == "TIFF" else encode_image(FRAME8, kind, exif=exif)
     exposure = read(raw)
     assert exposure.size_px == (53, 37)
     if kind != "JPEG":
@@ -156,23 +156,23 @@ def test_unreadable_exif_costs_a_warning_only(read):
 @pytest.mark.parametrize(
     ("raw", "why"),
     [
-        (encoded(FRAME8, "PNG", "RGBA"), "alpha"),
-        (encoded(FRAME8, "PNG", "LA"), "alpha"),
+        (encode_image(FRAME8, "PNG", "RGBA"), "alpha"),
+        (encode_image(FRAME8, "PNG", "LA"), "alpha"),
         (png(chunk(b"tRNS", b"\0\1")), "alpha"),
-        (encoded(FRAME8, "PNG", "P"), "palette"),
-        (encoded(FRAME8 > 99, "PNG"), "1 bits"),
+        (encode_image(FRAME8, "PNG", "P"), "palette"),
+        (encode_image(FRAME8 > 99, "PNG"), "1 bits"),
         (png(chunk(b"acTL", bytes(8))), "animated"),
         (png(chunk(b"ABCD", b"")), "feature"),
-        (encoded(FRAME8, "JPEG", "CMYK"), "CMYK"),
+        (encode_image(FRAME8, "JPEG", "CMYK"), "CMYK"),
         (tiff(np.stack([FRAME16] * 4, -1), photometric="rgb", extrasamples=["unassalpha"]), "alpha"),
         (tiff(np.stack([FRAME8] * 4, -1), photometric="separated"), "CMYK"),
-        (encoded(FRAME8, "TIFF", "P"), "palette"),
+        (encode_image(FRAME8, "TIFF", "P"), "palette"),
         (tiff(FRAME16, photometric="miniswhite"), "white-is-zero"),
         (tiff(np.stack([FRAME16] * 4), photometric="minisblack"), "4 pictures"),
         (tiff(np.stack([FRAME16] * 4), imagej=True), "pictures"),
         (tiff(FRAME16.astype(np.complex64)), "complex64"),
-        (encoded(FRAME8, "GIF"), "not a PNG, TIFF, JPEG or FITS"),
-        (encoded(FRAME8, "BMP"), "not a PNG, TIFF, JPEG or FITS"),
+        (encode_image(FRAME8, "GIF"), "not a PNG, TIFF, JPEG or FITS"),
+        (encode_image(FRAME8, "BMP"), "not a PNG, TIFF, JPEG or FITS"),
         (b"a text file, not a picture\n", "not a PNG, TIFF, JPEG or FITS"),
         (b"", "empty"),
     ],
@@ -188,7 +188,7 @@ def test_pixels_that_are_no_numbers_are_refused_and_counted(cause):
     assert f"1 of {holes.size} pixels" in cause(tiff(np.where(np.arange(53) + 53 * np.arange(37)[:, None], 1.0, 1e300)))
 
 
-def tiff_claiming(width, height):
+def tiff_header(width, height):
     """Both sizes are 32-bit entries when tifffile writes BigTIFF; tags: 256 ImageWidth, 257 ImageLength."""
     raw = bytearray(tiff(FRAME16, bigtiff=True))
     for tag, value in ((256, width), (257, height)):
@@ -197,8 +197,8 @@ def tiff_claiming(width, height):
     return bytes(raw)
 
 
-def jpeg_claiming(width, height):
-    raw = bytearray(encoded(FRAME8, "JPEG"))
+def jpeg_header(width, height):
+    raw = bytearray(encode_image(FRAME8, "JPEG"))
     at = raw.index(b"\xff\xc0")
     raw[at + 5 : at + 9] = struct.pack(">HH", height, width)
     return bytes(raw)
@@ -208,8 +208,8 @@ def jpeg_claiming(width, height):
     "raw",
     [
         SIGNATURE + ihdr(20000, 20000) + chunk(b"IDAT", zlib.compress(bytes(10**6))) + chunk(b"IEND", b""),
-        tiff_claiming(20000, 20000),
-        jpeg_claiming(20000, 20000),
+        tiff_header(20000, 20000),
+        jpeg_header(20000, 20000),
     ],
 )
 def test_bombs_are_refused_from_their_header(cause, raw):
@@ -220,7 +220,7 @@ def test_bombs_are_refused_from_their_header(cause, raw):
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG", "TIFF"])
 def test_the_cap_is_ours_and_not_pillows(read, monkeypatch, kind):
-    raw = encoded(FRAME8, kind)
+    raw = encode_image(FRAME8, kind)
     monkeypatch.setattr("PIL.Image.MAX_IMAGE_PIXELS", 100)
     assert read(raw).size_px == (53, 37)
 
@@ -238,15 +238,15 @@ def test_truncated_multi_page_tiff_does_not_pass_for_a_single_picture(cause):
 
 def test_jpeg_thumbnail_does_not_hide_the_missing_end(cause):
     """An EXIF thumbnail ends with the same marker as the picture."""
-    whole = encoded(FRAME8, "JPEG", comment=encoded(FRAME8[:8, :8], "JPEG"))
+    whole = encode_image(FRAME8, "JPEG", comment=encode_image(FRAME8[:8, :8], "JPEG"))
     assert "truncated" in cause(whole[:-2])
 
 
 @pytest.mark.parametrize("options", [{}, {"progressive": True}, {"restart_marker_rows": 1}, {"mode": "RGB"}])
 @pytest.mark.parametrize("kept", [0.3, 0.6, 0.97])
 def test_jpeg_cut_and_closed_with_an_end_marker(cause, options, kept):
-    """Pillow and OpenCV both make up a flat rest, without a word."""
-    whole = encoded(FRAME8, "JPEG", **options)
+    """Pillow and OpenCV both fill the missing part with a constant, without an error."""
+    whole = encode_image(FRAME8, "JPEG", **options)
     scan = whole.index(b"\xff\xda") + 14
     cut = whole[: scan + round(kept * (len(whole) - 2 - scan))] + b"\xff\xd9"
     Image.open(io.BytesIO(cut)).load()

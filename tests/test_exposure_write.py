@@ -1,4 +1,4 @@
-"""What is written is read back, by us and by others; nothing is ever half-written."""
+"""Written files are read back, by startrack and by others; no file is ever incomplete."""
 
 import errno
 import io
@@ -117,7 +117,7 @@ def test_unicode_in_a_path(tmp_path, suffix):
     assert read_exposure(write_exposure(tmp_path / f"f{suffix}", exposure)).camera == exposure.camera
 
 
-def test_fits_holds_ascii_only_and_says_so(tmp_path):
+def test_fits_refuses_names_beyond_ascii(tmp_path):
     with pytest.raises(BadInput, match="ASCII"):
         write_exposure(tmp_path / "f.fits", exposure_of(FRAME, camera=str(tmp_path / "Kamera ü.toml")))
     assert list(tmp_path.iterdir()) == []
@@ -158,7 +158,7 @@ def test_relative_paths_hold_through_a_symbolic_link(tmp_path, exposure):
         assert os.path.realpath(camera) == os.path.realpath(exposure.camera)
 
 
-def test_an_existing_file_is_kept_unless_told_otherwise(tmp_path, exposure):
+def test_an_existing_file_is_kept_without_overwrite(tmp_path, exposure):
     path, sidecar = tmp_path / "frame.png", tmp_path / "frame.json"
     for file, write in ((path, write_exposure), (sidecar, write_sidecar)):
         file.write_text("mine")

@@ -15,7 +15,7 @@ from startrack.false_alarm import (
     log_p_value_bound,
     log_p_value_poisson,
 )
-from startrack.match import closest_of_each, match_mutual, match_nearest
+from startrack.match import match_mutual, match_nearest, select_closest
 
 
 def test_binomial_and_poisson_tails_are_those_of_scipy() -> None:
@@ -82,7 +82,7 @@ def test_nearest_matches_are_those_of_a_brute_force_search(gate: float) -> None:
     assert mutual <= brute_force_nearest(xy, px, gate)
 
 
-def test_the_closest_of_each_detection() -> None:
+def test_select_closest() -> None:
     detection, distance = np.array([3, 1, 3, 1, 2]), np.array([0.5, 0.2, 0.1, 0.4, 0.9])
-    assert closest_of_each(detection, distance).tolist() == [1, 2, 4]
-    assert closest_of_each(np.zeros(0, dtype=np.int64), np.zeros(0)).tolist() == []
+    assert select_closest(detection, distance).tolist() == [1, 2, 4]
+    assert select_closest(np.zeros(0, dtype=np.int64), np.zeros(0)).tolist() == []

@@ -1,4 +1,4 @@
-"""Time, directions, quaternions and places: the frames that need no ephemeris."""
+"""Time, directions, quaternions and positions: the frames that need no ephemeris."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_other_times_are_refused_as_no_time(text: object) -> None:
 
 
 @pytest.mark.parametrize("text", ["1500-01-01", "2026-03-01", "20260301", "2026-03-01Z"])
-def test_a_date_alone_is_said_to_lack_its_time_of_day(text: str) -> None:
+def test_a_date_without_time_of_day_is_refused_with_advice(text: str) -> None:
     with pytest.raises(BadInput, match="date without a time of day") as error:
         parse_utc(text)
     assert error.value.reason == "no_time"
@@ -125,7 +125,7 @@ def test_azel_round_trips(azimuth_rad: float, elevation_rad: float) -> None:
     assert abs(elevation - elevation_rad) < 1e-12
 
 
-def test_azimuth_stays_below_a_full_turn() -> None:
+def test_azimuth_stays_below_360_degrees() -> None:
     azimuth, _ = azel_from_rays([[-1e-20, 1.0, 0.0], [-0.0, 1.0, 0.0], [-1e-3, 1.0, 0.0]])
     assert (azimuth >= 0).all()
     assert (azimuth < 2 * np.pi).all()
@@ -210,7 +210,7 @@ def test_quaternions_agree_with_scipy() -> None:
 
 @pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 2, 0.5], [-1, 1e-9, 0]])
 @pytest.mark.parametrize("turn_rad", [0.0, 1e-9, np.pi - 1e-9, np.pi])
-def test_quaternions_hold_at_no_turn_and_half_a_turn(axis: list[float], turn_rad: float) -> None:
+def test_quaternions_of_rotations_by_0_and_180_degrees(axis: list[float], turn_rad: float) -> None:
     R = Rotation.from_rotvec(turn_rad * np.array(axis) / np.linalg.norm(axis)).as_matrix()
     quat = quat_xyzw_from_R(R)
     assert quat[3] >= 0
@@ -229,7 +229,7 @@ def test_only_quaternions_become_rotations(quat: list[float]) -> None:
         R_from_quat_xyzw(quat)
 
 
-# --- places ---------------------------------------------------------------------------------------------------------
+# --- positions -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("body", ["moon", "earth"])
@@ -241,9 +241,9 @@ def test_latlon_round_trips(
     body: str, latitude_rad: float, longitude_rad: float, east_m: float, north_m: float, up_m: float
 ) -> None:
     site = Site(body, latitude_rad, longitude_rad, 120.0)
-    place = latlon_from_enu(site, east_m, north_m, up_m)
+    position = latlon_from_enu(site, east_m, north_m, up_m)
     # Two heights on the same vertical: the one through the point must pass within a millimetre of it.
-    low_m, high_m = enu_from_latlon(site, *place, np.array([-6e3, 6e3]))
+    low_m, high_m = enu_from_latlon(site, *position, np.array([-6e3, 6e3]))
     vertical = (high_m - low_m) / np.linalg.norm(high_m - low_m)
     point_m = np.array([east_m, north_m, up_m])
     assert np.linalg.norm(np.cross(point_m - low_m, vertical)) < 1e-3

@@ -1,4 +1,4 @@
-"""Rotations against SciPy: Wahba's problem, rotation vectors; heading, pitch and roll against a sketch."""
+"""Rotations against SciPy: Wahba's problem, rotation vectors; heading, pitch and roll by hand."""
 
 import numpy as np
 import pytest
@@ -65,7 +65,7 @@ def test_wahba_agrees_with_scipy(n: int) -> None:
 def test_wahba_in_batches_and_never_a_mirror() -> None:
     rng = np.random.default_rng(1)
     icrs, weights = np.stack([random_rays(3, rng) for _ in range(50)]), np.ones((50, 3))
-    cam = icrs * [-1, 1, 1]  # a mirror image: the best proper rotation is asked for
+    cam = icrs * [-1, 1, 1]  # a mirror image: the best proper rotation is wanted
     batch = wahba(cam, icrs, weights)
     assert np.linalg.det(batch) == pytest.approx(1.0)
     each = [wahba(c, i, w) for c, i, w in zip(cam, icrs, weights, strict=True)]

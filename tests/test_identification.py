@@ -1,4 +1,4 @@
-"""Identification on synthetic detections of the real catalogue: who is who, and when to say "not identified"."""
+"""Identification on synthetic detections of the real catalogue: right names, and refusals."""
 
 from __future__ import annotations
 
@@ -39,24 +39,24 @@ class Frame:
     star: np.ndarray  # true index into sky() of each detection, -1 for a false one
     R_cam_icrs: np.ndarray
 
-    def clear(self, camera: Camera) -> np.ndarray:
-        """True stars with no other within 3.6 px that is at most 1.5 mag fainter: their name is plain."""
+    def clear_stars(self, camera: Camera) -> np.ndarray:
+        """True stars with no other within 3.6 px that is at most 1.5 mag fainter: not blended."""
         px, inside = camera.project(sky().rays_icrs @ self.R_cam_icrs.T)
         seen = np.flatnonzero(inside)
         near = cKDTree(px[seen]).query_ball_point(self.detections.xy_px, 3.6)
         v = sky().v_mag
 
-        def alone(s: int, others: list[int]) -> bool:
+        def is_alone(s: int, others: list[int]) -> bool:
             return s >= 0 and not any(seen[j] != s and v[seen[j]] < v[s] + 1.5 for j in others)
 
-        return np.array([alone(s, others) for s, others in zip(self.star, near, strict=True)])
+        return np.array([is_alone(s, others) for s, others in zip(self.star, near, strict=True)])
 
 
 def frame(
     camera: Camera, seed: int, limit: float = 6.0, false: float = 0.2, hidden: float = 0.5, noise_px: float = 0.2,
     brightest: int | None = None, some: int | None = None,
 ) -> Frame:  # fmt: skip
-    """Stars above the limit at a random attitude, one side of the field hidden, false ones strewn among them."""
+    """Stars above the limit at a random attitude, one side of the field hidden, with random false stars."""
     rng = np.random.default_rng([seed, camera.size_px[0]])
     R = Rotation.random(random_state=rng).as_matrix()
     px, inside = camera.project(sky().rays_icrs @ R.T)
@@ -64,22 +64,22 @@ def frame(
     side = (px[star] - camera.centre_px) @ rng.normal(size=2)
     star = star[side >= np.quantile(side, hidden)][:brightest]
     star = star if some is None else np.sort(rng.permutation(star)[:some])
-    wrong = scattered(camera, round(false * len(star)), rng)
+    wrong = random_positions(camera, round(false * len(star)), rng)
     xy = np.concatenate([px[star] + rng.normal(0, noise_px, (len(star), 2)), wrong])
     v = sky().v_mag[star] + rng.normal(0, 0.1, len(star))
     v = np.concatenate([v, rng.choice(v, len(wrong))])
     order = np.argsort(v)
     truth = np.concatenate([star, np.full(len(wrong), -1)])
-    return Frame(detected(xy[order], v[order], noise_px), truth[order], R)
+    return Frame(make_detections(xy[order], v[order], noise_px), truth[order], R)
 
 
-def scattered(camera: Camera, n: int, rng: np.random.Generator) -> np.ndarray:
+def random_positions(camera: Camera, n: int, rng: np.random.Generator) -> np.ndarray:
     xy = rng.uniform(0, np.array(camera.size_px) - 1, (3 * n + 10, 2))
     return xy[camera.angle_rad(xy) < camera.max_angle_rad][:n]
 
 
-def detected(xy_px: np.ndarray, v_mag: np.ndarray, sigma_px: float) -> Detections:
-    """Detections, brightest first, from places and magnitudes."""
+def make_detections(xy_px: np.ndarray, v_mag: np.ndarray, sigma_px: float) -> Detections:
+    """Detections, brightest first, from positions and magnitudes."""
     n, flux = len(xy_px), 10 ** (-0.4 * (v_mag - ZERO_MAG))
     return Detections(
         xy_px=xy_px, covariance_px2=np.tile(sigma_px**2 * np.eye(2), (n, 1, 1)), flux_e=flux,
@@ -89,7 +89,7 @@ def detected(xy_px: np.ndarray, v_mag: np.ndarray, sigma_px: float) -> Detection
     )  # fmt: skip
 
 
-def off(found: Identification, truth: Frame) -> float:
+def attitude_error_rad(found: Identification, truth: Frame) -> float:
     """Attitude error [rad]."""
     return float(Rotation.from_matrix(truth.R_cam_icrs @ found.R_cam_icrs.T).magnitude())
 
@@ -112,12 +112,12 @@ def test_random_attitudes_are_identified(case: str) -> None:
     for seed in range(3 if camera is FISHEYE else 1):
         truth = frame(camera, seed, **how)
         found = Identifier()(truth.detections, camera, sky())
-        assert off(found, truth) < arcsec * ARCSEC
+        assert attitude_error_rad(found, truth) < arcsec * ARCSEC
         assert found.false_alarm_probability < 1e-30
         assert len(set(found.star.tolist())) == len(set(found.detection.tolist())) == len(found)  # one to one
         right += int(np.count_nonzero(truth.star[found.detection] == found.star))
         named += len(found)
-        clear = truth.clear(camera)
+        clear = truth.clear_stars(camera)
         plain += int(clear.sum())
         plain_named += int(clear[found.detection].sum())
     assert right >= 0.995 * named  # precision
@@ -143,7 +143,7 @@ def test_a_handful_of_stars_is_enough(case: str) -> None:
         except NotIdentified:
             continue
         solved += 1
-        assert off(found, truth) < 200 * ARCSEC
+        assert attitude_error_rad(found, truth) < 200 * ARCSEC
         assert np.array_equal(truth.star[found.detection], found.star)
         assert found.false_alarm_probability < 1e-9
     assert solved == 6
@@ -158,39 +158,39 @@ def test_ten_stars_in_a_narrow_field() -> None:
 
 @pytest.mark.parametrize("count", [20, 300])
 @pytest.mark.parametrize("clustered", [False, True], ids=["uniform", "clustered"])
-def test_a_sky_of_chance_is_refused(count: int, clustered: bool) -> None:
+def test_random_detections_are_refused(count: int, clustered: bool) -> None:
     rng = np.random.default_rng(count)
-    xy = scattered(FISHEYE, count, rng)
+    xy = random_positions(FISHEYE, count, rng)
     if clustered:
         middles = rng.uniform(500, 1500, (5, 2))
         xy = middles[rng.integers(5, size=count)] + rng.normal(0, 90, (count, 2))
     v = np.sort(6 + np.log(rng.random(len(xy))) / 1.08)  # the magnitudes of a real sky
     with pytest.raises(NotIdentified, match="chance") as caught:
-        Identifier()(detected(xy, v, 0.2), FISHEYE, sky())
+        Identifier()(make_detections(xy, v, 0.2), FISHEYE, sky())
     assert caught.value.reason == "not_identified"
     assert caught.value.evidence["detected"] == count
 
 
-def test_chance_in_a_narrow_field_is_refused() -> None:
+def test_random_detections_in_a_narrow_field_are_refused() -> None:
     rng = np.random.default_rng(3)
-    xy = scattered(NARROW, 60, rng)
+    xy = random_positions(NARROW, 60, rng)
     with pytest.raises(NotIdentified, match="chance"):
-        Identifier()(detected(xy, np.sort(rng.uniform(3, 8, len(xy))), 0.2), NARROW, sky())
+        Identifier()(make_detections(xy, np.sort(rng.uniform(3, 8, len(xy))), 0.2), NARROW, sky())
 
 
-ODDS = {"wide": (FISHEYE, 10.0, 1.0, 400), "narrow": (NARROW, 2.0, 0.15, 8000)}  # cap and radius [deg], stars
+CHANCE_FIELDS = {"wide": (FISHEYE, 10.0, 1.0, 400), "narrow": (NARROW, 2.0, 0.15, 8000)}  # cap and radius [deg], stars
 
 
-@pytest.mark.parametrize("field", ODDS)
+@pytest.mark.parametrize("field", CHANCE_FIELDS)
 @pytest.mark.parametrize("clustered", [False, True], ids=["uniform", "clustered"])
-def test_the_stated_odds_of_chance_are_true(clustered: bool, field: str) -> None:
-    """p-values of random attitudes over random detections: at least as large as they should be, and not much more."""
-    camera, cap_deg, radius_deg, stars = ODDS[field]
+def test_stated_false_alarm_probabilities_are_true(clustered: bool, field: str) -> None:
+    """p-values of random attitudes over random detections: at least as large as the true ones, and not much larger."""
+    camera, cap_deg, radius_deg, stars = CHANCE_FIELDS[field]
     rng, width = np.random.default_rng(4), camera.size_px[0]
     bright = sky().rays_icrs[:stars]
     radius, p_values = np.radians(radius_deg), []
     for _ in range(12):
-        xy = scattered(camera, 150, rng)
+        xy = random_positions(camera, 150, rng)
         if clustered:
             xy = rng.uniform(0.3, 0.7, (6, 2))[rng.integers(6, size=150)] * width
             xy += rng.normal(0, 0.06 * width, (150, 2))
@@ -218,55 +218,55 @@ def test_a_mirrored_frame_is_named_as_such() -> None:
         Identifier()(mirrored, FISHEYE, sky())
     assert caught.value.reason == "mirrored"
     found = Identifier()(mirrored, replace(FISHEYE, mirrored=True), sky())
-    assert off(found, truth) < 30 * ARCSEC
+    assert attitude_error_rad(found, truth) < 30 * ARCSEC
 
 
 @pytest.mark.parametrize("error", [0.97, 0.99, 1.01, 1.03])
 def test_a_wrong_focal_length_is_refused(error: float) -> None:
-    """Triangles of neighbours still match a per cent or three off; the attitude would be a degree or three off."""
+    """Triangles of neighbours match at focal lengths 1 to 3 % off; the attitude would be 1 to 3 degrees off."""
     wrong = replace(FISHEYE, focal_px=(652.0 * error, 652.0 * error))
     with pytest.raises(NotIdentified, match=r"calibration of this lens|camera file right") as caught:
         Identifier()(frame(FISHEYE, 0).detections, wrong, sky())
     assert caught.value.reason == "not_identified"
 
 
-def test_a_slightly_wrong_focal_length_does_no_great_harm() -> None:
+def test_a_slightly_wrong_focal_length_gives_a_small_error() -> None:
     truth = frame(FISHEYE, 0)
     found = Identifier()(truth.detections, replace(FISHEYE, focal_px=(652.65, 652.65)), sky())  # 1.5 px at the rim
     assert np.mean(truth.star[found.detection] == found.star) > 0.99
-    assert off(found, truth) < 250 * ARCSEC
+    assert attitude_error_rad(found, truth) < 250 * ARCSEC
 
 
 def test_a_rough_camera_may_be_used_to_begin_a_calibration() -> None:
     truth, wrong = frame(FISHEYE, 0), replace(FISHEYE, focal_px=(650.0, 650.0))
     found = Identifier(whole_field=False)(truth.detections, wrong, sky())
     assert np.mean(truth.star[found.detection] == found.star) > 0.95
-    assert off(found, truth) < np.radians(1)
+    assert attitude_error_rad(found, truth) < np.radians(1)
 
 
 @pytest.mark.parametrize("count", [0, 1, 5])
-def test_too_few_detections_say_so(count: int) -> None:
-    xy = scattered(FISHEYE, 50, np.random.default_rng(5))[:count]
+def test_too_few_detections_are_refused(count: int) -> None:
+    xy = random_positions(FISHEYE, 50, np.random.default_rng(5))[:count]
     with pytest.raises(NotIdentified, match=f"{count} point sources are too few"):
-        Identifier()(detected(xy, np.linspace(1, 3, count), 0.2), FISHEYE, sky())
+        Identifier()(make_detections(xy, np.linspace(1, 3, count), 0.2), FISHEYE, sky())
 
 
 def test_detections_outside_the_image_circle_are_ignored() -> None:
     truth = frame(FISHEYE, 2)
     corner = np.stack([np.linspace(1, 120, 200), np.linspace(120, 1, 200)], axis=1)
     v = np.concatenate([np.full(200, -5.0), -2.5 * np.log10(truth.detections.flux_e) + ZERO_MAG])
-    crowded = detected(np.concatenate([corner, truth.detections.xy_px]), v, 0.2)
+    crowded = make_detections(np.concatenate([corner, truth.detections.xy_px]), v, 0.2)
     found = Identifier()(crowded, FISHEYE, sky())
-    assert off(found, truth) < 30 * ARCSEC
+    assert attitude_error_rad(found, truth) < 30 * ARCSEC
     assert found.detection.min() >= 200
 
 
-def test_bright_lights_that_are_no_stars_are_counted_as_unexplained() -> None:
+def test_bright_false_detections_are_counted_as_unexplained() -> None:
     truth = frame(FISHEYE, 3, false=0.0)
-    strangers = scattered(FISHEYE, 9, np.random.default_rng(6))
+    strangers = random_positions(FISHEYE, 9, np.random.default_rng(6))
     v = np.concatenate([np.full(9, -3.0), -2.5 * np.log10(truth.detections.flux_e) + ZERO_MAG])
-    found = Identifier()(detected(np.concatenate([strangers, truth.detections.xy_px]), v, 0.2), FISHEYE, sky())
-    assert off(found, truth) < 30 * ARCSEC
+    found = Identifier()(make_detections(np.concatenate([strangers, truth.detections.xy_px]), v, 0.2), FISHEYE, sky())
+    assert attitude_error_rad(found, truth) < 30 * ARCSEC
     assert 7 <= found.unexplained <= 9  # one or two of them may lie beside a faint star
     assert not np.isin(found.detection, np.arange(9)).any()
 
@@ -277,7 +277,7 @@ def test_saturated_stars_may_be_brighter_than_they_look() -> None:
     clipped = np.minimum(d.flux_e, 3e5)
     dull = replace(d, flux_e=clipped, saturated=d.flux_e > 3e5)
     found = Identifier()(dull, FISHEYE, sky())
-    bright = np.flatnonzero((d.flux_e > 3e5) & truth.clear(FISHEYE))
+    bright = np.flatnonzero((d.flux_e > 3e5) & truth.clear_stars(FISHEYE))
     assert len(bright) > 40
     assert np.isin(bright, found.detection).mean() > 0.95
 
@@ -293,8 +293,8 @@ def rays_about(n: int, half_rad: float, seed: int) -> np.ndarray:
     """Random rays within an angle of the z axis."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(np.cos(half_rad), 1, n)
-    turn = rng.uniform(0, 2 * np.pi, n)
-    return np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
+    azimuth = rng.uniform(0, 2 * np.pi, n)
+    return np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1)
 
 
 def test_triangles_are_all_that_there_are() -> None:
@@ -316,13 +316,13 @@ def test_triangles_are_all_that_there_are() -> None:
         assert handed == np.sign(np.dot(rays[a], np.cross(rays[b], rays[c])))
 
 
-def test_triangles_keep_their_sides_under_rotation_and_lose_their_hand_in_a_mirror() -> None:
+def test_triangles_keep_their_sides_under_rotation_and_change_handedness_in_a_mirror() -> None:
     rays = rays_about(15, 0.5, 2)
     plain = triangles(rays, 0.6)
-    turned = triangles(rays @ Rotation.random(random_state=3).as_matrix().T, 0.6)
-    assert np.array_equal(turned.vertices, plain.vertices)
-    assert turned.sides_rad == pytest.approx(plain.sides_rad, abs=1e-12)
-    assert np.array_equal(turned.handedness, plain.handedness)
+    rotated = triangles(rays @ Rotation.random(random_state=3).as_matrix().T, 0.6)
+    assert np.array_equal(rotated.vertices, plain.vertices)
+    assert rotated.sides_rad == pytest.approx(plain.sides_rad, abs=1e-12)
+    assert np.array_equal(rotated.handedness, plain.handedness)
     assert np.array_equal(triangles(rays * [-1, 1, 1], 0.6).handedness, -plain.handedness)
 
 

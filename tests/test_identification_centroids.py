@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_identification import ARCSEC, FISHEYE, NARROW, frame, scattered, sky
+from test_identification import ARCSEC, FISHEYE, NARROW, frame, random_positions, sky
 
 from startrack.identification import identify_centroids
 from startrack.types import NotIdentified
@@ -23,8 +23,8 @@ def test_a_list_in_any_order_is_identified(camera) -> None:
     assert repr(found).startswith(f"<IdentifiedCentroids: {len(found.star)} stars, rms 0.") and len(repr(found)) < 80
     assert found.false_alarm_probability < 1e-20
     assert np.array_equal(found.hip, sky().hip[found.star])
-    turn = truth.R_cam_icrs @ found.attitude.R_cam_icrs.T
-    off = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    error = truth.R_cam_icrs @ found.attitude.R_cam_icrs.T
+    off = np.array([error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]]) / 2
     assert off @ np.linalg.solve(found.attitude.covariance_rad2, off) < 25
     assert np.linalg.norm(off) < 60 * ARCSEC
 
@@ -52,7 +52,7 @@ def test_a_field_of_view_is_enough(known: bool) -> None:
 @pytest.mark.parametrize("known", [True, False], ids=["fluxes", "order"])
 def test_random_centroids_are_refused(known: bool) -> None:
     rng = np.random.default_rng(4)
-    xy = scattered(FISHEYE, 80, rng)
+    xy = random_positions(FISHEYE, 80, rng)
     with pytest.raises(NotIdentified, match="chance"):
         identify_centroids(xy, flux=rng.pareto(1.5, len(xy)) if known else None, camera=FISHEYE, stars=sky())
 
@@ -88,7 +88,7 @@ def test_an_empty_list_has_too_few_stars(empty) -> None:
 
 
 def test_an_impossible_field_or_frame_is_named() -> None:
-    xy_px = scattered(FISHEYE, 40, np.random.default_rng(5))
+    xy_px = random_positions(FISHEYE, 40, np.random.default_rng(5))
     with pytest.raises(ValueError, match="fov_rad= is -3"):
         identify_centroids(xy_px, fov_rad=-3.0, size_px=(1024, 1024), stars=sky())
     with pytest.raises(ValueError, match="size_px= is"):

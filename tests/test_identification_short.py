@@ -1,4 +1,4 @@
-"""Short lists: named wholly and at once; the parts of the search are what they say."""
+"""Short lists: identified completely and quickly; and parts of the search."""
 
 from __future__ import annotations
 
@@ -10,7 +10,18 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from test_identification import ARCSEC, FISHEYE, NARROW, Frame, detected, frame, off, rays_about, scattered, sky
+from test_identification import (
+    ARCSEC,
+    FISHEYE,
+    NARROW,
+    Frame,
+    attitude_error_rad,
+    frame,
+    make_detections,
+    random_positions,
+    rays_about,
+    sky,
+)
 
 from startrack.frames import R_from_rotvec, wahba
 from startrack.identification import Identifier
@@ -18,58 +29,58 @@ from startrack.identification.attitude_search import AttitudeSearch
 from startrack.identification.index import CatalogPatterns, PerObject
 from startrack.identification.pairs import build_pairs
 from startrack.identification.triangles import sides_of_few, triangles
-from startrack.match import CandidatePairs, PhotometricScale, last_of_each
+from startrack.match import CandidatePairs, PhotometricScale, is_last_occurrence
 from startrack.types import NotIdentified
 
 
-def hundred(seed: int, false: int = 20, true: int = 80, noise_px: float = 0.2) -> Frame:
+def hundred_stars(seed: int, false: int = 20, true: int = 80, noise_px: float = 0.2) -> Frame:
     """The brightest stars of half the sky, and false ones like them."""
     return frame(FISHEYE, seed, brightest=true, hidden=0.0, false=false / true, noise_px=noise_px)
 
 
-def _after(search: AttitudeSearch, tried: int, attitudes: Iterator) -> Iterator:
+def _skip_attempts(search: AttitudeSearch, tried: int, attitudes: Iterator) -> Iterator:
     search.tried += tried
     return attitudes
 
 
 @pytest.mark.parametrize("false", [20, 320])
-def test_the_stars_of_a_short_list_are_all_but_all_named(false: int) -> None:
+def test_nearly_all_stars_of_a_short_list_are_identified(false: int) -> None:
     named = there = 0
     for seed in range(10):
-        truth = hundred(seed, false)
+        truth = hundred_stars(seed, false)
         found = Identifier()(truth.detections, FISHEYE, sky())
         assert found.false_alarm_probability < 1e-30
-        assert off(found, truth) < 40 * ARCSEC
+        assert attitude_error_rad(found, truth) < 40 * ARCSEC
         assert np.array_equal(truth.star[found.detection], found.star)
         named, there = named + len(found), there + np.count_nonzero(truth.star >= 0)
     assert named >= 0.99 * there
 
 
 def test_a_hundred_stars_do_not_need_the_deep_index(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(CatalogPatterns, "deep", None)  # using it would raise
+    monkeypatch.setattr(CatalogPatterns, "deep_index", None)  # using it would raise
     for seed in range(20):
-        truth = hundred(100 + seed)
-        assert off(Identifier()(truth.detections, FISHEYE, sky()), truth) < 40 * ARCSEC
+        truth = hundred_stars(100 + seed)
+        assert attitude_error_rad(Identifier()(truth.detections, FISHEYE, sky()), truth) < 40 * ARCSEC
 
 
 def test_every_hypothesis_counts_against_the_answer() -> None:
-    xy = scattered(FISHEYE, 60, np.random.default_rng(1))
+    xy = random_positions(FISHEYE, 60, np.random.default_rng(1))
     with pytest.raises(NotIdentified, match="chance") as caught:
-        Identifier()(detected(xy, np.linspace(1, 4, len(xy)), 0.2), FISHEYE, sky())
+        Identifier()(make_detections(xy, np.linspace(1, 4, len(xy)), 0.2), FISHEYE, sky())
     assert caught.value.evidence["tried"] > 50
-    true = hundred(2)
+    true = hundred_stars(2)
     few = Identifier()(true.detections, FISHEYE, sky())
     search = AttitudeSearch.hypotheses
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(AttitudeSearch, "hypotheses", lambda self, *how: _after(self, 10**6, search(self, *how)))
+        patch.setattr(AttitudeSearch, "hypotheses", lambda self, *how: _skip_attempts(self, 10**6, search(self, *how)))
         many = Identifier()(true.detections, FISHEYE, sky())
     assert many.false_alarm_probability >= few.false_alarm_probability
 
 
 def test_the_search_takes_a_fraction_of_a_second_to_refuse() -> None:
     rng = np.random.default_rng(7)
-    xy = scattered(FISHEYE, 100, rng)
-    sources = detected(xy, np.sort(6 + np.log(rng.random(100)) / 1.08), 0.2)
+    xy = random_positions(FISHEYE, 100, rng)
+    sources = make_detections(xy, np.sort(6 + np.log(rng.random(100)) / 1.08), 0.2)
     for timed in (False, True):  # the first builds the index
         start = time.process_time()
         with pytest.raises(NotIdentified):
@@ -78,17 +89,17 @@ def test_the_search_takes_a_fraction_of_a_second_to_refuse() -> None:
 
 
 def test_detections_outside_the_circle_keep_their_numbers_on_the_quick_path() -> None:
-    truth = hundred(3)
+    truth = hundred_stars(3)
     corner = np.stack([np.linspace(1, 90, 40), np.linspace(90, 1, 40)], axis=1)
     v = np.concatenate([np.full(40, -3.0), 18.0 - 2.5 * np.log10(truth.detections.flux_e)])
-    found = Identifier()(detected(np.concatenate([corner, truth.detections.xy_px]), v, 0.2), FISHEYE, sky())
+    found = Identifier()(make_detections(np.concatenate([corner, truth.detections.xy_px]), v, 0.2), FISHEYE, sky())
     plain = Identifier()(truth.detections, FISHEYE, sky())
     assert np.array_equal(found.detection, plain.detection + 40)
     assert found.unexplained == plain.unexplained + 40
 
 
 def test_a_mirrored_short_list_is_named_as_such() -> None:
-    truth = hundred(4)
+    truth = hundred_stars(4)
     with pytest.raises(NotIdentified, match="mirror image"):
         Identifier()(truth.detections, replace(FISHEYE, mirrored=True), sky())
 
@@ -123,7 +134,7 @@ def test_the_sides_of_few_are_those_of_the_general_search(fresh: int) -> None:
         assert few[tuple(sorted(v))] == pytest.approx(sides, abs=1e-14)
 
 
-def test_turns_are_the_best_rotations() -> None:
+def test_wahba_solutions_are_the_best_rotations() -> None:
     rng = np.random.default_rng(6)
     icrs = rng.normal(size=(5, 40, 3))
     icrs /= np.linalg.norm(icrs, axis=-1, keepdims=True)
@@ -135,7 +146,7 @@ def test_turns_are_the_best_rotations() -> None:
     assert np.linalg.det(wahba(flat @ R.T, flat)) == pytest.approx(1)
 
 
-def test_facts_are_kept_per_object_and_forgotten_with_it() -> None:
+def test_values_kept_per_object_are_released_with_it() -> None:
     calls: list[object] = []
 
     class Thing:
@@ -169,18 +180,18 @@ BLENDS = {
 
 
 @pytest.mark.parametrize("case", BLENDS)
-def test_a_blend_goes_by_the_name_of_the_plainly_brighter_star(case: str) -> None:
+def test_a_blend_is_named_after_the_clearly_brighter_star(case: str) -> None:
     *listed, named = BLENDS[case]
     pairs = pairs_of(*listed)
-    plain = pairs.unambiguous(pairs.one_to_one, np.full(len(pairs.one_to_one), 0.04), 3.0)
+    plain = pairs.select_unambiguous(pairs.one_to_one_pairs, np.full(len(pairs.one_to_one_pairs), 0.04), 3.0)
     assert len(set(pairs.star[plain].tolist())) == len(set(pairs.detection[plain].tolist())) == len(plain)
     if named is not None:
         assert pairs.star[plain].tolist() == named
 
 
-def test_the_last_of_each_number() -> None:
-    assert last_of_each(np.array([4, 2, 4, 7, 2])).tolist() == [False, False, True, True, True]
-    assert last_of_each(np.zeros(0, dtype=np.int64)).tolist() == []
+def test_is_last_occurrence() -> None:
+    assert is_last_occurrence(np.array([4, 2, 4, 7, 2])).tolist() == [False, False, True, True, True]
+    assert is_last_occurrence(np.zeros(0, dtype=np.int64)).tolist() == []
 
 
 @pytest.mark.parametrize("field_sr", [2 * np.pi, 0.5])

@@ -1,4 +1,4 @@
-"""The image circle that a frame shows, and a photograph of another camera that needs it."""
+"""Detection of the image circle in a frame, and a photograph of another camera that needs it."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def disc(centre: tuple[float, float], radius: float, *, rng: np.random.Generator
     """A vignetted sky (480, 640) with moonlight on one side, over a pedestal; `trees` hide that part of its edge."""
     y, x = np.mgrid[0:480, 0:640]
     off = np.hypot(x - centre[0], y - centre[1])
-    turn = (np.arctan2(y - centre[1], x - centre[0]) / (2 * np.pi)) % 1
+    direction = (np.arctan2(y - centre[1], x - centre[0]) / (2 * np.pi)) % 1
     sky = 300 * (1 - 0.4 * (off / radius) ** 2) * (1 + 0.5 * x / 640)
-    lit = (off < radius) & ~((turn < trees) & (off > 0.8 * radius))
+    lit = (off < radius) & ~((direction < trees) & (off > 0.8 * radius))
     return (2000 + np.where(lit, sky, 0) + rng.normal(0, 5, (480, 640))).astype(np.float32)
 
 
@@ -37,7 +37,7 @@ def test_the_disc_of_the_sky_is_found(centre: tuple[float, float], radius: float
     found = image_circle(disc(centre, radius, rng=np.random.default_rng(3), trees=trees))
     assert found is not None
     assert found.centre_px == pytest.approx(centre, abs=0.075 * radius)
-    assert found.radius_px == pytest.approx(radius, rel=0.05)  # a search stands errors of 0.13
+    assert found.radius_px == pytest.approx(radius, rel=0.05)  # the search tolerates errors of 0.13
 
 
 def test_a_frame_full_of_sky_has_no_disc() -> None:

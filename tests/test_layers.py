@@ -1,4 +1,4 @@
-"""The house's rule of imports: strictly downward, stages side by side do not know each other; and a light start."""
+"""Import rules: strictly downward, no imports between stages of one layer; and fast start-up."""
 
 import ast
 import json
@@ -15,7 +15,7 @@ import startrack
 
 ROOT = Path(startrack.__file__).parent
 
-LAYERS = (  # lowest first; a room imports from lower layers only
+LAYERS = (  # lowest first; a package imports from lower layers only
     {"errors"},
     {"types", "files", "declaration"},
     {"frames", "runner", "compilation"},
@@ -32,11 +32,11 @@ LAYERS = (  # lowest first; a room imports from lower layers only
     {"reproduction", "batch", "api"},
     {"cli"},
 )
-ALLOWED: set[tuple[str, str]] = set()  # rooms of one layer that may import each other all the same
+ALLOWED: set[tuple[str, str]] = set()  # exceptions: (package, package of the same or a higher layer)
 HEAVY = (
     "astropy", "cv2", "lunarsky", "matplotlib", "PIL", "rich", "scipy", "skimage", "skyfield", "spiceypy", "tifffile",
 )  # fmt: skip
-CV2_ROOMS = {"detection", "evidence", "exposure", "output"}  # image processing, where cv2 is the room's own tool
+CV2_ROOMS = {"detection", "evidence", "exposure", "output"}  # image processing: cv2 may be imported at the top
 
 
 def room_of(path: Path) -> str:
@@ -52,7 +52,7 @@ def layer(room: str) -> int:
     return next(k for k, names in enumerate(LAYERS) if room in names)
 
 
-def imported(tree: ast.AST, package: tuple[str, ...]) -> Iterator[str]:
+def imported_names(tree: ast.AST, package: tuple[str, ...]) -> Iterator[str]:
     """Dotted names of all modules that a source imports, wherever it does; `package` resolves relative ones."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -65,13 +65,13 @@ def imported(tree: ast.AST, package: tuple[str, ...]) -> Iterator[str]:
 
 @lru_cache
 def edges() -> list[tuple[Path, str, str]]:
-    """(file, its room, room it imports) for every import between rooms."""
+    """(file, its package, imported package) for every import between packages."""
     found = []
     for path in sorted(ROOT.rglob("*.py")):
-        if path in (ROOT / "__init__.py", ROOT / "__main__.py"):  # the front doors
+        if path in (ROOT / "__init__.py", ROOT / "__main__.py"):  # the entry points
             continue
         package = ("startrack", *path.relative_to(ROOT).parent.parts)
-        for name in imported(ast.parse(path.read_text(encoding="utf-8")), package):
+        for name in imported_names(ast.parse(path.read_text(encoding="utf-8")), package):
             parts = name.split(".")
             if parts[0] == "startrack" and len(parts) > 1 and parts[1] in rooms() and parts[1] != room_of(path):
                 found.append((path, room_of(path), parts[1]))
@@ -95,7 +95,7 @@ def test_every_room_has_its_layer():
 
 def test_imports_run_strictly_downward():
     found = edges()
-    assert len(found) > 100  # the reading of the sources works
+    assert len(found) > 100  # the sources were read
     assert violations(found) == []
 
 
@@ -114,23 +114,23 @@ def test_each_exception_is_still_needed():
     ],
 )
 def test_the_check_sees_every_way_to_import(source, room, other):
-    names = [name.split(".")[1] for name in imported(ast.parse(source), ("startrack", room))]
+    names = [name.split(".")[1] for name in imported_names(ast.parse(source), ("startrack", room))]
     assert names == [other]
     assert violations([(ROOT / room / "x.py", room, other)]) != []
 
 
-def test_nobody_reads_the_truth_but_the_renderer():
-    """The truth beside a rendered image is for tests and scorers: no stage knows of it."""
+def test_only_the_renderer_reads_the_truth():
+    """The truth beside a rendered image is for tests and scorers: no stage reads it."""
     truth = re.compile(r"\bTruth\b|\.truth\b")
     readers = {room_of(path) for path in ROOT.rglob("*.py") if truth.search(path.read_text(encoding="utf-8"))}
     assert readers <= {"rendering", "cli", "api"}
 
 
 def top_level_imports(path: Path) -> set[str]:
-    """Modules that are loaded as soon as the file is imported (not within a function or under TYPE_CHECKING)."""
+    """Modules that are imported with the file (not within a function or under TYPE_CHECKING)."""
     body = ast.parse(path.read_text(encoding="utf-8")).body
     now = ast.Module([node for node in body if isinstance(node, ast.Import | ast.ImportFrom)], type_ignores=[])
-    return {name.split(".")[0] for name in imported(now, ("startrack", *path.relative_to(ROOT).parent.parts))}
+    return {name.split(".")[0] for name in imported_names(now, ("startrack", *path.relative_to(ROOT).parent.parts))}
 
 
 def test_heavy_modules_are_imported_where_they_are_used():

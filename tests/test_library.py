@@ -1,4 +1,4 @@
-"""What `import startrack` offers: every public name, after every submodule was imported, and described parameters."""
+"""The public names of `startrack` after every submodule was imported, and documentation of their parameters."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def submodules() -> list[types.ModuleType]:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def everything_is_imported() -> list[types.ModuleType]:
-    """A submodule of the same name as a function would now stand in its place."""
+def import_everything() -> list[types.ModuleType]:
+    """A submodule with the name of a function would now replace it."""
     return submodules()
 
 
@@ -86,7 +86,7 @@ def test_a_list_of_centroids_is_identified_in_one_call():
         startrack.identify([[1, 2, 3], [4, 5, 6]], camera="fisheye-2048")
 
 
-def test_a_calibration_says_what_it_found():
+def test_a_calibration_prints_its_result():
     found = startrack.calibrate(["sample_images/lowell-2018-08-06.fits.bz2"], fov=180.0, name="lowell")
     assert found.camera.name == "lowell" and found.checks
 

@@ -26,7 +26,7 @@ def sky(rng: np.random.Generator, n: int) -> tuple[Array, Array]:
     return 2 * np.pi * rng.random(n), np.arcsin(rng.random(n))
 
 
-def place(rng: np.random.Generator, terrain: Cylinder = TERRAIN) -> Array:
+def random_position(rng: np.random.Generator, terrain: Cylinder = TERRAIN) -> Array:
     r, b = 0.98 * terrain.radius_m * np.sqrt(rng.random()), 2 * np.pi * rng.random()
     return r * np.array([np.sin(b), np.cos(b)])
 
@@ -39,8 +39,8 @@ def perfect_list(rng: np.random.Generator, at_m: Array, n: int = THESIS_STARS) -
     )
 
 
-def measured(rng: np.random.Generator, at_m: Array, terrain: Cylinder, n: int, sigma_rad: float = 0.0) -> Evidence:
-    """Stars of SNR 1 to 4, each with a noisy light measurement."""
+def measure_stars(rng: np.random.Generator, at_m: Array, terrain: Cylinder, n: int, sigma_rad: float = 0.0) -> Evidence:
+    """Stars of SNR 1 to 4, each with a noisy flux measurement."""
     azimuth, elevation = sky(rng, n)
     snr = 1 + 3 * rng.random(n)
     edge = elevation + sigma_rad * rng.standard_normal(n)
@@ -57,11 +57,11 @@ def measured(rng: np.random.Generator, at_m: Array, terrain: Cylinder, n: int, s
     ids=["exact", "pseudo-gradient", "hull"],
 )
 def test_contract_of_every_localizer(method: Localizer, mean_m: float, most_m: float) -> None:
-    """On the thesis's perfect lists each method reaches its known error, and says what a fix must say."""
+    """On the thesis's perfect lists each method has its known error and returns a complete fix."""
     errors = []
     for seed in range(40):
         rng = np.random.default_rng(seed)
-        at = place(rng)
+        at = random_position(rng)
         fix = method(perfect_list(rng, at), TERRAIN)
         errors.append(np.linalg.norm(fix.position_enu_m[:2] - at))
         assert fix.position_enu_m[2] == TERRAIN.camera_height_m
@@ -74,7 +74,7 @@ def test_contract_of_every_localizer(method: Localizer, mean_m: float, most_m: f
 
 
 @pytest.mark.parametrize("method", [ExactPosterior(), PseudoGradient(), Hull()])
-def test_nothing_to_see_is_refused_by_every_localizer(method: Localizer) -> None:
+def test_empty_evidence_is_refused_by_every_localizer(method: Localizer) -> None:
     none = np.zeros(0)
     with pytest.raises(NotLocated):
         method(Evidence(azimuth_rad=none, elevation_rad=none, llr=none, edge_sigma_rad=none), TERRAIN)
@@ -89,7 +89,7 @@ SMALL = replace(TERRAIN, diameter_m=400.0, depth_m=60.0, search_radius_m=200.0)
 def test_exact_posterior_equals_brute_force(seed: int, epsilon: float, sigma_rad: float) -> None:
     """Mean, covariance and the 95 % circle of a grid of 1 m over the whole floor of a small crater."""
     rng = np.random.default_rng(seed)
-    evidence = measured(rng, place(rng, SMALL), SMALL, 250, sigma_rad)
+    evidence = measure_stars(rng, random_position(rng, SMALL), SMALL, 250, sigma_rad)
     method = ExactPosterior(sector_epsilon=epsilon)
     fix = method(evidence, SMALL)
     line = np.arange(-200.0, 200.0, 1.0) + 0.5
@@ -114,7 +114,7 @@ def test_exact_posterior_equals_brute_force(seed: int, epsilon: float, sigma_rad
 def test_bounds_hold_at_random_positions_of_every_box(sigma_rad: float) -> None:
     """Bounds by sectors, by parts of sectors, by rows, and of quarters."""
     rng = np.random.default_rng(8)
-    evidence = measured(rng, place(rng), TERRAIN, 400, sigma_rad)
+    evidence = measure_stars(rng, random_position(rng), TERRAIN, 400, sigma_rad)
     likelihood = PositionLikelihood.from_evidence(evidence, ThreeMethods(TERRAIN))
     search = Search(ExactPosterior(prune_nats=np.inf, negligible_nats=np.inf), likelihood, NO_GUESS, likelihood.terrain)
     centres = np.array([[1000.0, 2000.0], [-7000.0, 3000.0], [6500.0, -6500.0]])
@@ -135,8 +135,8 @@ def test_bounds_hold_at_random_positions_of_every_box(sigma_rad: float) -> None:
 @pytest.mark.parametrize("wrapper", WRAPPERS)
 def test_a_wrapped_terrain_gives_the_terrains_own_fix(wrapper: type, sigma_rad: float) -> None:
     rng = np.random.default_rng(9)
-    at = place(rng)
-    evidence = measured(rng, at, TERRAIN, 3000, sigma_rad)
+    at = random_position(rng)
+    evidence = measure_stars(rng, at, TERRAIN, 3000, sigma_rad)
     own, wrapped = ExactPosterior()(evidence, TERRAIN), ExactPosterior()(evidence, wrapper(TERRAIN))
     np.testing.assert_allclose(wrapped.position_enu_m, own.position_enu_m, atol=1e-6)
     np.testing.assert_allclose(wrapped.covariance_m2, own.covariance_m2, rtol=1e-6)
@@ -149,7 +149,7 @@ def test_positions_beside_the_wall_and_deep_evidence_are_located() -> None:
         rng = np.random.default_rng(seed)
         turn = 2 * np.pi * rng.random()
         at = (TERRAIN.radius_m - 50 * rng.random()) * np.array([np.sin(turn), np.cos(turn)])
-        fix = ExactPosterior()(measured(rng, at, TERRAIN, n), TERRAIN)
+        fix = ExactPosterior()(measure_stars(rng, at, TERRAIN, n), TERRAIN)
         assert np.linalg.norm(fix.position_enu_m[:2] - at) < fix.radius999_m
         assert fix.search == "proven"
 
@@ -159,8 +159,8 @@ def test_errors_are_as_large_as_stated() -> None:
     nees, within = [], []
     for seed in range(150):
         rng = np.random.default_rng(1000 + seed)
-        at = place(rng)
-        fix = ExactPosterior()(measured(rng, at, TERRAIN, 3000), TERRAIN)
+        at = random_position(rng)
+        fix = ExactPosterior()(measure_stars(rng, at, TERRAIN, 3000), TERRAIN)
         d = fix.position_enu_m[:2] - at
         nees.append(d @ np.linalg.solve(fix.covariance_m2, d))
         within.append(np.linalg.norm(d) < fix.radius95_m)
@@ -169,8 +169,8 @@ def test_errors_are_as_large_as_stated() -> None:
 
 
 @pytest.mark.parametrize("terrain", [TERRAIN, ThreeMethods(TERRAIN)], ids=["disks", "bounds"])
-def test_two_places_that_fit_are_both_named(terrain: Terrain) -> None:
-    """Stars due east and due west only: a place and its mirror image to the south see the same horizon there."""
+def test_two_positions_that_fit_are_both_modes(terrain: Terrain) -> None:
+    """Stars due east and due west only: a position and its mirror image to the south have the same horizon there."""
     rng = np.random.default_rng(3)
     n, at = 1500, np.array([2000.0, 6000.0])
     azimuth = np.where(rng.random(n) < 0.5, np.pi / 2, 3 * np.pi / 2)
@@ -240,10 +240,10 @@ def test_pixels_of_the_sky_and_several_exposures_are_rows_like_any_other() -> No
     """Extended light beside stars, from two exposures in one value, locates better than the stars alone."""
     rng = np.random.default_rng(13)
     at = np.array([3000.0, -1500.0])
-    stars = measured(rng, at, TERRAIN, 1500)
+    stars = measure_stars(rng, at, TERRAIN, 1500)
     azimuth, sigma = 2 * np.pi * rng.random(4000), np.full(4000, 0.001)
     elevation = TERRAIN.horizon_rad(at[None], azimuth) + rng.uniform(-0.01, 0.01, 4000)
-    step = 0.5  # of the sky's light, in sigmas of a pixel
+    step = 0.5  # of the sky brightness, in sigmas of a pixel
     visible = slow_visible(elevation - TERRAIN.horizon_rad(at[None], azimuth), sigma)
     light = step * visible + rng.standard_normal(4000)
     pixels = Evidence(
@@ -266,13 +266,13 @@ def test_a_boulder_costs_no_more_than_its_sectors() -> None:
     """Twenty degrees of azimuth wholly dark: the fix stays where it is."""
     rng = np.random.default_rng(7)
     at = np.array([-2500.0, 4000.0])
-    evidence = measured(rng, at, TERRAIN, 6000)
+    evidence = measure_stars(rng, at, TERRAIN, 6000)
     dark = (np.degrees(evidence.azimuth_rad) < 20) & (evidence.elevation_rad < np.radians(30))
     llr = np.where(dark, -9.0, evidence.llr)
     hidden = replace(evidence, llr=llr)
     fix = ExactPosterior()(hidden, TERRAIN)
     assert np.linalg.norm(fix.position_enu_m[:2] - at) < fix.radius999_m
-    # What the dark sectors can say against the place is bounded: 14 sectors of 1.5 degrees at ln(1e-4) each.
+    # The evidence of the dark sectors is bounded: 14 sectors of 1.5 degrees at ln(1e-4) each.
     sectors = Sectors.from_evidence(hidden, float(np.radians(1.5)), 1e-4)
     clear = Sectors.from_evidence(evidence, float(np.radians(1.5)), 1e-4)
     loss = slow_scores(at[None], evidence, TERRAIN, clear)[0] - slow_scores(at[None], hidden, TERRAIN, sectors)[0]
@@ -280,7 +280,7 @@ def test_a_boulder_costs_no_more_than_its_sectors() -> None:
 
 
 def whole_sky(seed: int, n: int = 1500) -> Evidence:
-    """Stars with SNR 0.5 to 6 measured from a random place."""
+    """Stars with SNR 0.5 to 6 measured from a random position."""
     rng = np.random.default_rng(seed)
     azimuth, elevation = 2 * np.pi * rng.random(n), np.arcsin(2 * rng.random(n) - 1)
     at = 9000 * np.sqrt(rng.random()) * np.array([1.0, 0.0])
@@ -293,7 +293,7 @@ def whole_sky(seed: int, n: int = 1500) -> Evidence:
     )
 
 
-def test_rays_below_the_horizontal_never_shine_and_do_no_harm() -> None:
+def test_rays_below_the_horizontal_are_never_visible() -> None:
     evidence = whole_sky(3)
     above = evidence.elevation_rad > 0
     kept = evidence.take(above)
@@ -312,13 +312,13 @@ def test_a_smaller_search_area_is_kept_to() -> None:
     np.testing.assert_allclose(near.position_enu_m, fix.position_enu_m, atol=0.1 * sigma)
 
 
-def test_without_a_proof_sharp_posteriors_are_resolved_all_the_same() -> None:
+def test_sharp_posteriors_are_resolved_without_a_proof() -> None:
     """20,000 rows with hard edges: a few decimetres to metres wide, mean NEES 2 (8 positions: s.d. 0.7)."""
     nees = []
     for seed in range(8):
         rng = np.random.default_rng(seed)
-        at = place(rng)
-        evidence = measured(rng, at, TERRAIN, 20_000)
+        at = random_position(rng)
+        evidence = measure_stars(rng, at, TERRAIN, 20_000)
         fix = ExactPosterior(budget_horizons=50.0)(evidence, ThreeMethods(TERRAIN))
         d = fix.position_enu_m[:2] - at
         assert fix.search == "beam"
@@ -329,7 +329,7 @@ def test_without_a_proof_sharp_posteriors_are_resolved_all_the_same() -> None:
 
 def test_azimuths_may_be_negative_and_numbers_must_be_finite() -> None:
     rng = np.random.default_rng(16)
-    evidence = measured(rng, place(rng), TERRAIN, 2000)
+    evidence = measure_stars(rng, random_position(rng), TERRAIN, 2000)
     turned = replace(evidence, azimuth_rad=evidence.azimuth_rad - 2 * np.pi)
     own, other = ExactPosterior()(evidence, TERRAIN), ExactPosterior()(turned, TERRAIN)
     np.testing.assert_allclose(other.position_enu_m, own.position_enu_m, atol=1e-6)

@@ -53,8 +53,8 @@ def log_likelihood(places: np.ndarray, evidence: Evidence, capped: bool) -> np.n
     return total
 
 
-def rays_seen(at_m: np.ndarray, n: int, sigma_rad: float, rng: np.random.Generator) -> Evidence:
-    """Rays of signal-to-noise ratio 1 to 4, measured from the place."""
+def simulate_rays(at_m: np.ndarray, n: int, sigma_rad: float, rng: np.random.Generator) -> Evidence:
+    """Rays of signal-to-noise ratio 1 to 4, measured from a position."""
     azimuth, elevation = 2 * np.pi * rng.random(n), np.radians(rng.uniform(5, 75, n))
     snr = rng.uniform(1, 4, n)
     edge = elevation + sigma_rad * rng.normal(size=n)
@@ -74,7 +74,7 @@ def test_any_small_problem_agrees_with_the_grid(
     seed: int, east: float, north: float, n: int, sigma_rad: float, capped: bool
 ) -> None:
     rng = np.random.default_rng(seed)
-    evidence = rays_seen(np.array([east, north]), n, sigma_rad, rng)
+    evidence = simulate_rays(np.array([east, north]), n, sigma_rad, rng)
     places = grid()
     log = log_likelihood(places, evidence, capped)
     weight = np.exp(log - log.max())
@@ -84,7 +84,7 @@ def test_any_small_problem_agrees_with_the_grid(
         fix = method(evidence, PIT)
     except NotLocated:
         away = np.linalg.norm(places - weight @ places, axis=1)
-        assert weight[away < 45].sum() < 0.95  # nothing worth having
+        assert weight[away < 45].sum() < 0.95  # a posterior too wide for a fix
         return
     assert fix.dropped_probability < 1e-3
     close = np.linalg.norm(places - fix.position_enu_m[:2], axis=1)
@@ -105,9 +105,9 @@ def test_any_small_problem_agrees_with_the_grid(
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_stated_bound_on_what_was_dropped_holds(seed: int) -> None:
-    """With boxes given up ever more rashly, the probability really lost stays below what is admitted."""
+    """For every pruning threshold the lost probability is below the stated bound."""
     rng = np.random.default_rng(seed)
-    evidence = rays_seen(rng.uniform(-50, 50, 2), 120, 0.0, rng)
+    evidence = simulate_rays(rng.uniform(-50, 50, 2), 120, 0.0, rng)
     places = grid()
     log = log_likelihood(places, evidence, capped=True)
     weight = np.exp(log - log.max())
@@ -126,14 +126,14 @@ def test_the_stated_bound_on_what_was_dropped_holds(seed: int) -> None:
 
 @pytest.mark.parametrize("n", [1, 5, 7])
 def test_a_few_rays_are_refused(n: int) -> None:
-    evidence = rays_seen(np.zeros(2), n, 0.0, np.random.default_rng(1))
+    evidence = simulate_rays(np.zeros(2), n, 0.0, np.random.default_rng(1))
     with pytest.raises(NotLocated, match=f"only {n} rays") as caught:
         ExactPosterior()(evidence, PIT)
     assert caught.value.reason == "insufficient_geometry"
 
 
 def thesis_list(rng: np.random.Generator) -> tuple[Evidence, np.ndarray]:
-    """2142 stars, uniform over the sky, and which of them a place uniform on the floor sees."""
+    """2142 stars, uniform over the sky, and which of them are visible from a position uniform on the floor."""
     azimuth, elevation = 2 * np.pi * rng.random(2142), np.arcsin(rng.random(2142))
     r, turn = THESIS.radius_m * np.sqrt(rng.random()), 2 * np.pi * rng.random()
     at = r * np.array([np.sin(turn), np.cos(turn)])

@@ -1,4 +1,4 @@
-"""Places on real ground: interpolated horizons, the posterior against a plain grid, wrong clocks."""
+"""Positions on real ground: interpolated horizons, the posterior against a plain grid, wrong clocks."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def shackleton() -> HeightMap:
     return terrain
 
 
-def seen_from(terrain: HeightMap, place: Array, rng: np.random.Generator, rays: int, sigma_rad: float) -> Evidence:
+def simulate_rays(terrain: HeightMap, place: Array, rng: np.random.Generator, rays: int, sigma_rad: float) -> Evidence:
     """Rays of signal-to-noise ratio 1 to 4 near the skyline."""
     azimuth = rng.uniform(0, 2 * np.pi, rays)
     horizon = terrain.horizon_rad(place[None], azimuth)
@@ -68,10 +68,10 @@ def test_between_traced_points_the_horizon_is_the_traced_one_and_bounds_hold(sha
 
 
 @pytest.mark.parametrize("sigma_rad", [0.0, 0.001])
-def test_the_vicinity_scores_places_as_all_rays_do(shackleton, sigma_rad):
+def test_scores_of_the_local_search_equal_those_of_all_rays(shackleton, sigma_rad):
     rng = np.random.default_rng(2)
     place = np.array([-80.0, 30.0])
-    evidence = seen_from(shackleton, place, rng, 3000, sigma_rad)
+    evidence = simulate_rays(shackleton, place, rng, 3000, sigma_rad)
     likelihood = PositionLikelihood.from_evidence(evidence, shackleton)
     about = likelihood.near(place, 40.0)
     places = place + rng.uniform(-35, 35, (50, 2))
@@ -86,9 +86,9 @@ def test_the_vicinity_scores_places_as_all_rays_do(shackleton, sigma_rad):
     assert np.allclose(plain.climb(place, 16.0, 0.5)[0], top, atol=1.0)
 
 
-def test_a_box_is_blurred_as_horizons_drawn_between_its_bounds_are(shackleton):
+def test_box_averages_equal_those_of_random_horizons_between_the_bounds(shackleton):
     rng = np.random.default_rng(6)
-    evidence = seen_from(shackleton, np.array([-80.0, 30.0]), rng, 3000, 0.0)
+    evidence = simulate_rays(shackleton, np.array([-80.0, 30.0]), rng, 3000, 0.0)
     likelihood = PositionLikelihood.from_evidence(evidence, shackleton)
     sectors = likelihood.sectors
     centres, half = np.array([[-90.0, 40.0], [150.0, -20.0]]), 40.0
@@ -112,16 +112,16 @@ def test_the_beam_search_ends_near_the_top(shackleton):
     for seed in range(6):
         rng = np.random.default_rng([7, seed])
         place = rng.uniform(-200, 200, 2)
-        evidence = seen_from(shackleton, place, rng, 1500, 0.0005)
+        evidence = simulate_rays(shackleton, place, rng, 1500, 0.0005)
         likelihood = PositionLikelihood.from_evidence(evidence, shackleton)
         guess = beam_search(likelihood)
         assert guess.best > likelihood.exact_scores(place[None])[0] - 2.0
         assert np.linalg.norm(guess.points_m[0] - place) < 30.0
 
 
-def test_stars_of_another_place_or_time_are_refused(shackleton):
+def test_stars_of_another_position_or_time_are_refused(shackleton):
     rng = np.random.default_rng(8)
-    evidence = seen_from(shackleton, np.array([50.0, -120.0]), rng, 3000, 0.0005)
+    evidence = simulate_rays(shackleton, np.array([50.0, -120.0]), rng, 3000, 0.0005)
     assert ExactPosterior()(evidence, shackleton).radius95_m < 50.0
     turned = replace(evidence, azimuth_rad=np.mod(evidence.azimuth_rad + np.radians(60), 2 * np.pi))
     with pytest.raises(NotLocated, match="explains the stars") as refused:
@@ -129,7 +129,7 @@ def test_stars_of_another_place_or_time_are_refused(shackleton):
     assert refused.value.reason == "inconsistent_evidence"
 
 
-def test_contradictions_are_counted_apart():
+def test_contradictions_are_counted_separately():
     by_sector = np.zeros(240)
     assert contradicted_stretches(by_sector) == []
     by_sector[[238, 239, 0, 1, 3]] = -9.0  # a ridge across north, with a gap in it
@@ -145,7 +145,7 @@ def test_no_allowed_ground_is_given_up(shackleton):
     limited = replace(shackleton, most_slope_rad=np.radians(np.quantile(slopes, 0.02)))
     places = np.random.default_rng(10).uniform(-200, 200, (20_000, 2))
     place = places[np.asarray(limited.allowed(places))][0]
-    evidence = seen_from(shackleton, place, np.random.default_rng(11), 1500, 0.0005)
+    evidence = simulate_rays(shackleton, place, np.random.default_rng(11), 1500, 0.0005)
     fix = ExactPosterior()(evidence, limited)
     assert np.linalg.norm(fix.position_enu_m[:2] - place) < max(fix.radius999_m, 1.0)
     with pytest.raises(NotLocated, match="max_slope_deg"):
@@ -156,7 +156,7 @@ def test_no_allowed_ground_is_given_up(shackleton):
 def test_posterior_on_ground_equals_a_plain_grid(shackleton, sigma_rad):
     rng = np.random.default_rng(3)
     place = np.array([120.0, 60.0])
-    evidence = seen_from(shackleton, place, rng, 1500, sigma_rad)
+    evidence = simulate_rays(shackleton, place, rng, 1500, sigma_rad)
     fix = ExactPosterior()(evidence, shackleton)
     step = float(np.sqrt(np.linalg.eigvalsh(fix.covariance_m2)[0])) / 3
     reach = 4.5 * float(np.sqrt(np.linalg.eigvalsh(fix.covariance_m2)[1]))
@@ -175,19 +175,19 @@ def test_posterior_on_ground_equals_a_plain_grid(shackleton, sigma_rad):
     assert fix.dropped_probability < 1e-3 or sigma_rad
 
 
-def test_a_common_error_found_is_told_and_not_taken_for_a_wrong_map(shackleton):
+def test_a_common_error_is_reported_and_not_taken_for_a_wrong_map(shackleton):
     rng, error = np.random.default_rng(4), np.radians(0.08)
     unsure = replace(shackleton, horizon_sigma_common_rad=np.radians(0.1))
-    evidence = lower_evidence(seen_from(shackleton, np.array([50.0, -90.0]), rng, 4000, 0.0), -error)
+    evidence = lower_evidence(simulate_rays(shackleton, np.array([50.0, -90.0]), rng, 4000, 0.0), -error)
     fix = ExactPosterior()(evidence, unsure)
     assert fix.horizon_error_rad == pytest.approx(error, abs=np.radians(0.02))
     check_consistency(evidence, fix, unsure)
 
 
-def test_a_sky_turned_by_a_wrong_clock_shows(shackleton):
+def test_a_sky_rotated_by_a_wrong_clock_is_noticed(shackleton):
     rng = np.random.default_rng(5)
     place = np.array([50.0, -90.0])
-    evidence = seen_from(shackleton, place, rng, 12_000, 0.0)
+    evidence = simulate_rays(shackleton, place, rng, 12_000, 0.0)
     for turn, refused in ((0.0, False), (np.radians(1.1), True)):
         turned = replace(evidence, azimuth_rad=np.mod(evidence.azimuth_rad + turn, 2 * np.pi))
         found, gain = best_turn(PositionLikelihood.from_evidence(turned, shackleton), place)
@@ -200,14 +200,14 @@ def test_a_sky_turned_by_a_wrong_clock_shows(shackleton):
 
 @pytest.mark.parametrize("wrapper", WRAPPERS)
 def test_a_wrapped_map_gives_the_maps_own_fix(shackleton, wrapper):
-    evidence = seen_from(shackleton, np.array([-60.0, 110.0]), np.random.default_rng(14), 3000, 0.0005)
+    evidence = simulate_rays(shackleton, np.array([-60.0, 110.0]), np.random.default_rng(14), 3000, 0.0005)
     own, wrapped = ExactPosterior()(evidence, shackleton), ExactPosterior()(evidence, wrapper(shackleton))
     atol = 1e-6 if wrapper is not WRAPPERS[-1] else 0.3  # which traces every horizon, and interpolates none
     np.testing.assert_allclose(wrapped.position_enu_m[:2], own.position_enu_m[:2], atol=atol)
 
 
 def test_an_unfinished_proof_gives_the_posterior_near_the_best_positions(shackleton):
-    evidence = seen_from(shackleton, np.array([-60.0, 110.0]), np.random.default_rng(15), 3000, 0.0005)
+    evidence = simulate_rays(shackleton, np.array([-60.0, 110.0]), np.random.default_rng(15), 3000, 0.0005)
     beam = ExactPosterior(budget_horizons=1.0)(evidence, shackleton)
     proven = ExactPosterior(budget_horizons=1e9)(evidence, shackleton)
     assert (proven.search, beam.search) == ("proven", "beam")
@@ -222,7 +222,7 @@ def test_an_unfinished_proof_gives_the_posterior_near_the_best_positions(shackle
 
 def test_an_unfinished_proof_with_a_bad_start_climbs_from_the_boxes_that_it_left(shackleton):
     at = np.array([-60.0, 110.0])
-    evidence = seen_from(shackleton, at, np.random.default_rng(15), 3000, 0.0005)
+    evidence = simulate_rays(shackleton, at, np.random.default_rng(15), 3000, 0.0005)
     explored = ExactPosterior(budget_horizons=20_000.0).explore(evidence, shackleton, np.array([[1500.0, -900.0]]))
     assert explored.search == "beam"
     likeliest = explored.centres_m[np.argmax(explored.log_likelihood)]

@@ -1,4 +1,4 @@
-"""A crater of uncertain depth and width: estimated with the position, and a wrong one is not believed."""
+"""A crater of uncertain depth and width: estimated with the position; a wrong shape is refused."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PLACES = [(3000.0, -2000.0), (-6500.0, 1000.0), (500.0, 400.0)]
 
 
 def evidence_at(place_m: tuple[float, float], seed: int) -> Evidence:
-    """Six thousand stars over the sky, each with a noisy measurement of its light: SNR 1 to 8."""
+    """Six thousand stars over the sky, each with a noisy flux measurement: SNR 1 to 8."""
     assert isinstance(TRUE, Cylinder)
     rng = np.random.default_rng(seed)
     n = 6000
@@ -63,8 +63,8 @@ def test_an_uncertain_depth_is_found_with_the_position(place_m: tuple[float, flo
     assert crater.diameter_m == pytest.approx(guess.diameter_m)
 
 
-def test_the_size_of_a_crater_cannot_be_seen_and_is_not_pretended() -> None:
-    # A crater twice as large and as deep looks the same: only the ratio is measured, the scale stays as given.
+def test_the_size_of_a_crater_is_not_estimated() -> None:
+    # A crater twice as large and as deep has the same horizon: only the ratio is measured, the scale stays as given.
     assert isinstance(TRUE, Cylinder)
     evidence = evidence_at((4000.0, 3000.0), 4)
     guess = replace(TRUE, depth_sigma_m=20.0, diameter_sigma_m=200.0, search_radius_m=11000.0)
@@ -76,8 +76,8 @@ def test_the_size_of_a_crater_cannot_be_seen_and_is_not_pretended() -> None:
     assert np.sqrt(fit.covariance[0, 0]) < 0.003  # of depth over diameter
 
 
-def test_a_place_that_explains_the_stars_badly_is_refused() -> None:
-    """The evidence of one place, and a fix elsewhere that no single star contradicts clearly."""
+def test_a_position_that_explains_the_stars_badly_is_refused() -> None:
+    """The evidence of one position, and a fix elsewhere that no single star contradicts clearly."""
     evidence = evidence_at(PLACES[0], seed=3)
     fix = ExactPosterior()(evidence, TRUE)
     assert explained_by_sector(evidence, fix, TRUE).mean() > -1.0

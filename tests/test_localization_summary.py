@@ -1,4 +1,4 @@
-"""From weighted boxes to a fix: circles that hold what they say, modes that are modes."""
+"""From weighted boxes to a fix: probabilities of the circles, and modes."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_one_gaussian() -> None:
     assert fix.dropped_probability == 1e-7
 
 
-def test_a_faint_second_place_does_not_drag_the_position() -> None:
+def test_a_weak_second_mode_does_not_shift_the_position() -> None:
     fix = fix_of(blob((3000.0, 2000.0), (6.0, 6.0), 0.995), blob((-5000.0, -3000.0), (6.0, 6.0), 0.005))
     assert not fix.ambiguous  # less than 1 %
     assert fix.position_enu_m[:2] == pytest.approx([3000.0, 2000.0], abs=1.0)  # the mean of both is 47 m away
@@ -55,7 +55,7 @@ def test_a_faint_second_place_does_not_drag_the_position() -> None:
     assert [round(mode.weight, 4) for mode in fix.modes] == [0.995, 0.005]
 
 
-def test_a_second_place_of_a_few_per_cent_is_ambiguous() -> None:
+def test_a_second_mode_of_a_few_per_cent_is_ambiguous() -> None:
     fix = fix_of(
         blob((3000.0, 2000.0), (6.0, 6.0), 0.6), blob((3000.0, -2000.0), (8.0, 4.0), 0.37),
         blob((-100.0, 0.0), (5.0, 5.0), 0.03),
@@ -65,7 +65,7 @@ def test_a_second_place_of_a_few_per_cent_is_ambiguous() -> None:
     assert [m.weight for m in fix.modes] == pytest.approx([0.6, 0.37, 0.03], abs=1e-3)
 
 
-def test_a_long_thin_posterior_is_one_place() -> None:
+def test_a_long_thin_posterior_is_one_mode() -> None:
     fix = fix_of(blob((0.0, 1000.0), (300.0, 3.0), 1.0))
     assert len(fix.modes) == 1
     assert not fix.ambiguous
@@ -73,7 +73,7 @@ def test_a_long_thin_posterior_is_one_place() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 400), st.floats(0.1, 6.0))
-def test_circles_hold_what_they_say(seed: int, n: int, spread: float) -> None:
+def test_circles_contain_their_probability(seed: int, n: int, spread: float) -> None:
     """Any weights on any boxes: the circles hold 95 and 99.9 %, and no much smaller ones would."""
     rng = np.random.default_rng(seed)
     cells = np.unique(rng.integers(-15, 16, (n, 2)), axis=0)
@@ -96,7 +96,7 @@ def test_most_of_the_posterior_outside_the_search_area_is_refused() -> None:
     with pytest.raises(NotLocated, match="3000 m") as caught:
         summarize(centres, WIDTH_M, log, 0.0, replace(TERRAIN, search_radius_m=3000.0))
     assert caught.value.reason == "outside_search_area"
-    # A place just inside keeps only what is inside.
+    # Near the border only the probability inside the search area counts.
     centres, log = blob((2990.0, 0.0), (20.0, 20.0), 1.0)
     fix = summarize(centres, WIDTH_M, log, 0.0, replace(TERRAIN, search_radius_m=3000.0))
     assert fix.position_enu_m[0] < 2985.0

@@ -1,4 +1,4 @@
-"""Orientation and motion of Moon and Earth, against an independent program, Skyfield, astropy and the plain laws."""
+"""Orientation and motion of Moon and Earth, against an independent program, Skyfield, astropy and physical laws."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ TIMES = [
 ]
 
 
-def turn_rad(R: np.ndarray, S: np.ndarray) -> float:
+def rotation_angle_rad(R: np.ndarray, S: np.ndarray) -> float:
     """Angle of the rotation that leads from S to R."""
     D = R @ S.T
     return float(np.arctan2(np.linalg.norm([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]]), np.trace(D) - 1))
@@ -71,7 +71,7 @@ def test_moon_orientation_agrees_with_an_independent_renderer() -> None:
     for frame in record["frames"]:
         R_enu_cam = np.array(frame["R_cam_enu"]).T
         theirs = R_enu_cam @ R_from_quat_xyzw(frame["quat_xyzw_cam_icrs"])
-        assert turn_rad(R_enu_icrs(site, parse_utc(frame["time_utc"])), theirs) < 1e-3 * ARCSEC_RAD
+        assert rotation_angle_rad(R_enu_icrs(site, parse_utc(frame["time_utc"])), theirs) < 1e-3 * ARCSEC_RAD
 
 
 @pytest.mark.parametrize("time", TIMES)
@@ -80,7 +80,7 @@ def test_moon_orientation_agrees_with_skyfield(time: datetime) -> None:
 
     _, _, frame = skyfield_moon()
     theirs = frame.rotation_at(load.timescale(builtin=True).from_datetime(time))
-    assert turn_rad(R_mcmf_icrs(time), theirs) < 1e-3 * ARCSEC_RAD
+    assert rotation_angle_rad(R_mcmf_icrs(time), theirs) < 1e-3 * ARCSEC_RAD
 
 
 def test_zenith_of_shackleton_is_near_the_south_ecliptic_pole() -> None:
@@ -126,7 +126,7 @@ def test_stars_on_earth_agree_with_astropy(site: Site, time: datetime) -> None:
         away_from_sun = angle_between_rad(rays, get_sun(when).cartesian.xyz.value) > np.radians(30)
     theirs = rays_from_azel(seen.az.rad, seen.alt.rad)
     assert away_from_sun.sum() > 25
-    # Light bends by up to 15 mas at 30 degrees from the Sun, which we leave out.
+    # The Sun bends light by up to 15 mas at 30 degrees; this is neglected.
     assert angle_between_rad(ours, theirs)[away_from_sun].max() < 0.03 * ARCSEC_RAD
 
 
@@ -155,7 +155,7 @@ def test_earth_orientation_crosses_a_leap_second_with_astropy() -> None:
             when = Time(time.replace(tzinfo=None), scale="utc")
             x, y = (float(angle.to_value("rad")) for angle in iers.earth_orientation_table.get().pm_xy(when))
             theirs = erfa.c2t06a(when.tt.jd1, when.tt.jd2, when.ut1.jd1, when.ut1.jd2, x, y)
-        assert turn_rad(R_itrs_icrs(time), theirs) < 5e-3 * ARCSEC_RAD
+        assert rotation_angle_rad(R_itrs_icrs(time), theirs) < 5e-3 * ARCSEC_RAD
 
 
 @pytest.mark.parametrize("time", [datetime(1965, 5, 6, tzinfo=UTC), datetime(2045, 5, 6, tzinfo=UTC)])
@@ -164,7 +164,7 @@ def test_earth_beyond_the_table_degrades_but_answers(time: datetime) -> None:
 
     days = (time - datetime(2000, 1, 1, 12, tzinfo=UTC)) / timedelta(days=1)
     ut1_as_utc = erfa.c2t06a(2451545.0, days, 2451545.0, days, 0.0, 0.0)
-    assert turn_rad(R_itrs_icrs(time), ut1_as_utc) < 15 * ARCSEC_RAD
+    assert rotation_angle_rad(R_itrs_icrs(time), ut1_as_utc) < 15 * ARCSEC_RAD
 
 
 # --- laws on both bodies --------------------------------------------------------------------------------------------

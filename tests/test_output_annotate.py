@@ -1,4 +1,4 @@
-"""The annotated picture: marks stand where geometry from elsewhere says, and every kind of result can be drawn."""
+"""The annotated picture: marks at independently computed positions, and drawings of every kind of result."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from startrack.stages import Detected, Inputs, Measured, Oriented, Refused, exte
 from startrack.types import Mode
 
 
-def near(picture, place, colour, reach=2, tolerance=60):
-    """Whether a pixel within `reach` of the place has the colour, or nearly."""
+def has_colour_near(picture, place, colour, reach=2, tolerance=60):
+    """Whether a pixel within `reach` of the position has nearly the colour."""
     x, y = np.rint(place).astype(int)
     patch = picture[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1].astype(int)
     return bool((np.abs(patch - colour).sum(axis=-1) < tolerance).any())
@@ -39,7 +39,7 @@ def render_stars(shape, centres, fluxes, sigma_px):
     return light
 
 
-def count(picture, colour, tolerance=30):
+def count_pixels(picture, colour, tolerance=30):
     return int((np.abs(picture.astype(int) - colour).sum(axis=-1) < tolerance).sum())
 
 
@@ -74,8 +74,8 @@ def test_the_skyline_is_where_the_true_wall_is(picture, view, located):
     rays = np.stack([np.sin(azimuth) * level, np.cos(azimuth) * level, np.sin(elevation)], axis=-1)
     xy_px, inside = camera.project(rays @ located.truth.R_cam_enu.T)
     assert inside.all()
-    assert np.mean([near(picture, place, SKYLINE) for place in view.at(xy_px)]) > 0.9
-    astray = [near(picture, place, SKYLINE) for place in view.at(xy_px + 12.0)]
+    assert np.mean([has_colour_near(picture, place, SKYLINE) for place in view.at(xy_px)]) > 0.9
+    astray = [has_colour_near(picture, place, SKYLINE) for place in view.at(xy_px + 12.0)]
     assert np.mean(astray) < 0.5
 
 
@@ -84,10 +84,12 @@ def test_identified_stars_have_a_green_ring_and_hidden_ones_a_cross(picture, vie
     ringed = []
     for k in np.sort(result.identification.detection)[:40]:  # the brightest: rings of faint ones fade
         at = view.at(result.detections.xy_px[k])
-        ringed.append(any(near(picture, at + np.array([0.0, r]), IDENTIFIED, tolerance=120) for r in range(5, 11)))
+        ringed.append(
+            any(has_colour_near(picture, at + np.array([0.0, r]), IDENTIFIED, tolerance=120) for r in range(5, 11))
+        )
     assert np.mean(ringed) > 0.8
     hidden = np.flatnonzero(result.light.llr < -3.0)[:10]
-    assert np.mean([near(picture, place, HIDDEN) for place in view.at(result.light.xy_px[hidden])]) > 0.8
+    assert np.mean([has_colour_near(picture, place, HIDDEN) for place in view.at(result.light.xy_px[hidden])]) > 0.8
 
 
 def test_beyond_the_image_circle_is_paper(picture, view, located):
@@ -124,31 +126,31 @@ def test_detections_beyond_the_image_circle_are_not_drawn(located, view):
 
 
 def test_truth_is_drawn_only_when_given(picture, located):
-    assert count(picture, TRUTH) == 0
+    assert count_pixels(picture, TRUTH) == 0
     given = annotate(located.result, tuple(located.truth.position_enu_m[:2]))
-    assert count(given[:, -PANEL_WIDTH:], TRUTH) > 20
+    assert count_pixels(given[:, -PANEL_WIDTH:], TRUTH) > 20
 
 
 def test_every_kind_of_result_can_be_drawn(located):
     result = located.result
     modes = (Mode(east_m=6000.0, north_m=-2500.0, weight=0.7), Mode(east_m=-3000.0, north_m=4000.0, weight=0.3))
 
-    def refused(reason, message, stage):
+    def make_refusal(reason, message, stage):
         return Refused(reason=reason, message=message, reached=extend(result, stage))
 
     badge = np.s_[20:70, -200:]
     cases = {
         "ambiguous": replace(result, fix=replace(result.fix, modes=modes, ambiguous=True)),
-        "inconsistent": refused("inconsistent_evidence", "m " * 400, Measured),
-        "not identified": refused("not_identified", "why", Detected),
-        "no stars": refused("no_stars", "", Inputs),
+        "inconsistent": make_refusal("inconsistent_evidence", "m " * 400, Measured),
+        "not identified": make_refusal("not_identified", "why", Detected),
+        "no stars": make_refusal("no_stars", "", Inputs),
         "identified": extend(result, Oriented, terrain=None, bodies=()),
         "detected": extend(result, Detected, camera=None, terrain=None),
     }
     for name, one in cases.items():
         drawn = annotate(one)
-        assert count(drawn[badge], STATUS[one.status]) > 500, name
-    assert count(annotate(cases["ambiguous"])[:, -PANEL_WIDTH:], POSITION) > 2 * 60
+        assert count_pixels(drawn[badge], STATUS[one.status]) > 500, name
+    assert count_pixels(annotate(cases["ambiguous"])[:, -PANEL_WIDTH:], POSITION) > 2 * 60
 
 
 def test_an_image_of_another_size_than_the_cameras(located):
@@ -170,7 +172,7 @@ def test_a_narrow_camera_that_sees_no_skyline(located):
         lens=Pinhole(),
     )
     result = replace(located.result, camera=camera)
-    assert count(annotate(result)[:, :1024], SKYLINE) == 0
+    assert count_pixels(annotate(result)[:, :1024], SKYLINE) == 0
 
 
 def test_a_name_that_the_font_cannot_write(located):

@@ -1,4 +1,4 @@
-"""What pictures are made of: places to a fraction of a pixel, labels that keep apart, maps with north up."""
+"""Elements of pictures: positions to a fraction of a pixel, labels without overlap, maps with north up."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_shapes_stand_at_fractions_of_a_pixel(place, draw):
     np.testing.assert_allclose(centroid(canvas.pixels), place, atol=0.27 if draw in ("ring", "curve") else 0.1)
 
 
-def test_a_window_clips_and_keeps_places():
+def test_a_window_clips_and_keeps_positions():
     canvas = Canvas(100, 80, (0, 0, 0))
     window = canvas.window((20, 10, 59, 49))
     window.circle((40.0, 30.0), 5.0, WHITE, -1)

@@ -1,4 +1,4 @@
-"""The page: whole in itself, true to the results, safe with any text, and the same bytes for the same results."""
+"""The page: self-contained, in agreement with the results, safe with any text, and reproducible to the byte."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from astropy.table import Table
-from page_helpers import NASTY, results_in
+from html_helpers import NASTY, results_in
 
 from startrack.cli.main import main
 from startrack.cli.report import write_page_of_images
@@ -87,7 +87,7 @@ def test_the_page_is_whole_in_itself(text):
     assert "default-src 'none'" in policy and "http" not in policy
 
 
-def test_texts_of_results_cannot_leave_their_place(text, results):
+def test_texts_of_results_are_escaped(text, results):
     page = Structure(text)
     names = [attrs.get("id") for tag, attrs in page.tags if tag == "script"]
     assert names == ["results", "detail-0", "detail-1", "detail-2", "detail-3", None]
@@ -103,7 +103,7 @@ def test_the_same_results_give_the_same_bytes(text, results):
     assert page_text(found, unread=unread, real={"small": (6010.0, -2507.0)}) == text
 
 
-def test_rows_hold_what_the_results_say(text, results, located):
+def test_rows_agree_with_the_results(text, results, located):
     head = data_of(text, "results")
     rows = {row[1]: dict(zip(head["columns"], row, strict=True)) for row in head["rows"]}
     assert list(rows) == ["bad", "dark", "night 1/two", "small"]
@@ -136,7 +136,7 @@ def test_stars_are_those_of_the_star_table(text, results):
         np.testing.assert_allclose(given, np.ma.filled(table[column][:count], np.nan), atol=tolerance)
 
 
-def test_stars_lie_on_their_light_in_the_picture(text):
+def test_stars_lie_on_their_image_in_the_picture(text):
     detail = data_of(text, "detail-3")
     picture, columns = detail["picture"], detail["stars"]["columns"]
     kind, encoded = picture["src"].split(",")
@@ -202,7 +202,7 @@ def test_a_height_map_is_shaded_and_see_through_where_it_ends():
     assert 20 < np.std(relief[away_m < -3 * cell_m][:, 0]) < 100  # light and shade
 
 
-def test_every_reason_has_words():
+def test_every_reason_has_a_text():
     formats = (Path(__file__).parent.parent / "docs/formats.md").read_text(encoding="utf-8")
     reasons = set(re.findall(r"^\| `(\w+)` \| [134] \|", formats, flags=re.MULTILINE))
     assert reasons == {one.value for one in Reason}
@@ -230,7 +230,7 @@ def test_files_that_are_no_results_are_named(tmp_path, capsys, damage):
     assert "no result there can be read: x.fix.json" in capsys.readouterr().err
 
 
-def test_the_command_reads_the_folder_of_true_places(results, tmp_path, capsys):
+def test_the_command_reads_the_folder_of_true_positions(results, tmp_path, capsys):
     truth = tmp_path / "truth"
     truth.mkdir()
     (truth / "small.truth.json").write_text('{"position_enu_m": [6000.0, -2500.0, 1.5]}')

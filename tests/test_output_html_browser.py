@@ -1,4 +1,4 @@
-"""The page in a real browser: hover, zoom, fingers, keys, sorting and filtering, and no word on the console."""
+"""The page in a real browser: hover, zoom, touch, keys, sorting and filtering, and an empty console."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import pytest
-from page_helpers import DESKTOP, NASTY, PHONE, SMALL, Window, results_in
+from html_helpers import DESKTOP, NASTY, PHONE, SMALL, Window, results_in
 
 from startrack.output.html import page_text, results_under, write_page
 from startrack.output.html.gather import Found
@@ -59,24 +59,24 @@ def window(chromium, folder) -> Iterator[Any]:
         assert said == []  # no error, no warning, and no request but for the page itself
 
 
-def test_hover_tells_of_a_star_and_the_wheel_zooms_where_it_points(window):
+def test_hover_shows_a_star_and_the_wheel_zooms_at_the_pointer(window):
     w = window()
     w.open("small.png")
-    x, y = w.star("Canopus")
+    x, y = w.star_position("Canopus")
     assert not w.page.locator("#detail .tip").first.is_visible()
     w.page.mouse.move(x + 3, y + 2)
     w.page.wait_for_selector("#detail .tip:not([hidden])")
     for words in ("Canopus", "HIP 30438", "V −0.62", "seen", "its light is there", "evidence", "azimuth"):
         assert words in w.tip()
     w.page.mouse.wheel(0, -400)
-    w.until("document.querySelector('#detail .stage').dataset.zoom > 2")
-    assert w.star("Canopus") == pytest.approx((x, y), abs=4)
-    before = w.star("Canopus")
+    w.wait_for("document.querySelector('#detail .stage').dataset.zoom > 2")
+    assert w.star_position("Canopus") == pytest.approx((x, y), abs=4)
+    before = w.star_position("Canopus")
     w.page.mouse.down()
     w.page.mouse.move(before[0] + 80, before[1] - 50, steps=4)
     w.page.mouse.up()
-    assert w.star("Canopus") == pytest.approx((before[0] + 75, before[1] - 50), abs=6)
-    w.page.mouse.dblclick(*w.star("Canopus"))
+    assert w.star_position("Canopus") == pytest.approx((before[0] + 75, before[1] - 50), abs=6)
+    w.page.mouse.dblclick(*w.star_position("Canopus"))
     assert w.zoom == 1
 
 
@@ -102,7 +102,7 @@ def test_keys_zoom_move_and_step_through_the_stars(window):
 def test_fingers_tap_and_pinch(window):
     w = window(PHONE)
     w.open("small.png")
-    x, y = w.star("Canopus")
+    x, y = w.star_position("Canopus")
     w.page.touchscreen.tap(x, y)
     w.page.wait_for_selector("#detail .tip:not([hidden])")
     assert "magnitude" in w.tip()
@@ -110,7 +110,7 @@ def test_fingers_tap_and_pinch(window):
     assert box["x"] >= 0 and box["x"] + box["width"] <= PHONE[0]
     assert box["y"] >= stage["y"] + stage["height"]  # the picture and the star stay in sight
     assert box["y"] + box["height"] <= PHONE[1]
-    x, y = w.star("Canopus")
+    x, y = w.star_position("Canopus")
     session = w.context.new_cdp_session(w.page)
     for apart, kind in ((20, "touchStart"), (30, "touchMove"), (60, "touchMove"), (60, "touchEnd")):
         points = [{"x": x - apart, "y": y, "id": 0}, {"x": x + apart, "y": y, "id": 1}]
@@ -121,11 +121,11 @@ def test_fingers_tap_and_pinch(window):
 @pytest.mark.parametrize(("size", "scheme"), [(DESKTOP, "light"), (PHONE, "dark"), (SMALL, "light")])
 def test_nothing_stands_out_sideways(window, size, scheme):
     w = window(size, scheme=scheme)
-    assert w.fits()
+    assert w.has_no_overflow()
     for index in range(4):
         w.page.evaluate("k => { location.hash = `#i${k}` }", index)
-        w.until(f"document.getElementById('detail').dataset.index === '{index}'")
-        assert w.fits()
+        w.wait_for(f"document.getElementById('detail').dataset.index === '{index}'")
+        assert w.has_no_overflow()
     luminance = w.page.evaluate(
         "getComputedStyle(document.body).backgroundColor.match(/\\d+/g).reduce((a, b) => a + +b, 0)"
     )
@@ -167,7 +167,7 @@ def test_the_ways_out_of_an_image_stand_in_one_line(window, size):
     assert boxes[2]["x"] - boxes[1]["x"] - boxes[1]["width"] >= 16
 
 
-def test_an_ambiguous_image_shows_every_place_and_its_warnings(window):
+def test_an_ambiguous_image_shows_every_mode_and_its_warnings(window):
     w = window()
     w.open("night 1/two.png")
     places = w.page.locator(".why li").all_inner_texts()
@@ -182,13 +182,13 @@ def test_an_ambiguous_image_shows_every_place_and_its_warnings(window):
 def test_a_magnified_pixel_of_the_picture_looks_like_one(window):
     w = window()
     w.open("small.png")
-    x, y = w.star("Canopus")
+    x, y = w.star_position("Canopus")
     w.page.evaluate(
         "([x, y]) => { const c = document.querySelector('#detail .stage canvas'), f = c.getBoundingClientRect();"
         "c.view.zoomBy(20, x - f.left, y - f.top) }", [x, y],
     )  # fmt: skip
-    w.until("document.querySelector('#detail .stage').dataset.zoom > 19")
-    w.until("!document.querySelector('#detail .stage canvas').view.waiting")
+    w.wait_for("document.querySelector('#detail .stage').dataset.zoom > 19")
+    w.wait_for("!document.querySelector('#detail .stage canvas').view.waiting")
     steps, pixel_px = w.page.evaluate(
         "() => { const c = document.querySelector('#detail .stage canvas'), side = 200;"
         "const { data } = c.getContext('2d').getImageData(c.width / 2 - side / 2, c.height / 2 - side / 2, side, side);"
@@ -254,7 +254,7 @@ def test_links_lead_from_the_page_to_the_results(window, folder):
     place.mkdir()
     found, _ = results_under(folder)
     write_page(place / "rep.html", found)
-    files = linked(window(name="other # place/rep.html"), "night 1/two.png")
+    files = linked_files(window(name="other # place/rep.html"), "night 1/two.png")
     assert len(files) == 3 and all(file.is_file() for file in files)
     assert files[0].samefile(folder / "night 1/two.fix.json")
 
@@ -265,12 +265,12 @@ def test_an_image_without_details_leads_to_its_result_of_either_kind(window, fol
     shutil.copy(folder / "dark.fix.json", place / "dark.identification.json")
     found, _ = results_under(place)
     write_page(place / "rep.html", found, images=0)
-    (file,) = linked(window(name="stars alone/rep.html"), "dark.png")
+    (file,) = linked_files(window(name="stars alone/rep.html"), "dark.png")
     assert file.samefile(found[0].path)
 
 
-def linked(w: Window, image: str) -> list[Path]:
-    """The files that the page of an image leads to."""
+def linked_files(w: Window, image: str) -> list[Path]:
+    """The files that the page of an image links to."""
     w.open(image)
     addresses = w.page.evaluate("[...document.querySelectorAll('.files a')].map(a => a.href)")
     return [Path(unquote(urlsplit(address).path)) for address in addresses]

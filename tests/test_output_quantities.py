@@ -1,4 +1,4 @@
-"""The table of output quantities: a new one is one entry, and those that were added that way are right."""
+"""The table of output quantities: a new quantity is one entry; and values of some quantities."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_sigmas_of_the_body_are_those_of_a_monte_carlo(located, pitch_deg):
 
 
 def test_the_sky_is_as_bright_as_it_was_rendered(located):
-    """22 mag/arcsec2 of which the wall reflects 4 %; what is left of the stars' light adds some hundredths."""
+    """22 mag/arcsec2, of which the wall reflects 4 %; residuals of the stars add some hundredths."""
     found = result_dict(located.result)["sky"]["brightness_mag_arcsec2"]
     assert found == pytest.approx(22.0 - 2.5 * np.log10(0.96), abs=0.12)
 

@@ -35,11 +35,11 @@ def fix(located):
     return result_dict(located.result)
 
 
-def without_terrain(result):
+def remove_terrain(result):
     return extend(result, Oriented, terrain=None, bodies=())
 
 
-def ambiguous(result):
+def make_ambiguous(result):
     modes = (Mode(east_m=6000.0, north_m=-2500.0, weight=0.7), Mode(east_m=-3000.0, north_m=4000.0, weight=0.3))
     fix = replace(result.fix, modes=modes, ambiguous=True)
     return replace(result, fix=fix)
@@ -77,7 +77,7 @@ def test_latitude_and_longitude_are_as_far_from_the_origin_as_the_position(fix):
     assert arc_m == pytest.approx(np.hypot(position["east_m"], position["north_m"]), abs=0.1)
 
 
-def test_the_quaternion_is_scipys_and_turns_icrs_to_camera(fix, located):
+def test_the_quaternion_is_scipys_and_rotates_icrs_to_camera(fix, located):
     R = Rotation.from_quat(fix["attitude"]["quat_xyzw_cam_icrs"])
     error = (R * Rotation.from_matrix(located.truth.R_cam_icrs).inv()).magnitude()
     assert error < 20 * ARCSEC
@@ -118,13 +118,13 @@ def test_star_counts(fix, located):
     assert stars["identified"] == len(result.identification) > 500
     assert 0 < stars["rms_px"] < 0.5
     assert 0 <= stars["false_alarm_probability"] < 1e-9
-    # The renderer knows which stars the wall hides; the place found may turn a few of them.
+    # The truth states which stars the wall hides; the position found may change a few of them.
     visible = set(located.truth.sources.catalog_id[~located.truth.hidden].tolist())
     measured = result.stars.catalog_id[result.light.star[result.light.usable]].tolist()
     assert stars["predicted_visible"] == pytest.approx(sum(star in visible for star in measured), abs=8)
 
 
-def test_matches_are_measured_places_of_the_stars_they_name(located):
+def test_matches_are_the_measured_positions_of_their_stars(located):
     d = identification_dict(located.result)
     assert d["format"] == "startrack.identification/1"
     assert "position" not in d
@@ -151,8 +151,8 @@ def test_detections_are_brightest_first(located):
     assert flux[:50].min() > np.median(flux)
 
 
-def test_without_a_terrain_nothing_is_said_in_enu(located):
-    d = result_dict(without_terrain(located.result))
+def test_without_a_terrain_there_are_no_values_in_enu(located):
+    d = result_dict(remove_terrain(located.result))
     without = {key for key in KEYS["attitude"].split() if "body" in key or "heading" in key or "pitch" in key}
     assert set(d["attitude"]) == set(KEYS["attitude"].split()) - without
     assert "position" not in d
@@ -166,13 +166,13 @@ def test_the_bound_of_the_probability_left_out_is_stated(located, fix):
 
 
 def test_an_ambiguous_result_has_modes_and_no_position(located):
-    d = result_dict(ambiguous(located.result))
+    d = result_dict(make_ambiguous(located.result))
     assert (d["status"], d["reason"]) == ("ambiguous", "ambiguous")
     assert "position" not in d
     assert sum(mode["weight"] for mode in d["modes"]) == pytest.approx(1.0)
 
 
-def test_a_refused_result_says_why_and_what_is_known(located):
+def test_a_refused_result_has_its_reason_and_the_known_values(located):
     d = result_dict(flat_frame(located.result))
     assert (d["status"], d["reason"]) == ("refused", "no_stars")
     assert "flat" in d["message"]
@@ -200,7 +200,7 @@ def test_an_unknown_time_widens_the_attitude(located, fix):
     np.testing.assert_allclose(sigma, np.hypot(fix["attitude"]["sigma_arcsec"], 60.0), rtol=1e-9)
 
 
-def test_sigma_says_whether_the_lens_is_in_it(located, fix):
+def test_sigma_states_whether_it_includes_the_lens(located, fix):
     assert fix["attitude"]["lens_error_included"] is False
     assert "taken as exact" in verbose_text(located.result)
     camera = located.result.camera
@@ -209,7 +209,7 @@ def test_sigma_says_whether_the_lens_is_in_it(located, fix):
     attitude = result_dict(result)["attitude"]
     assert attitude["lens_error_included"] is True
     assert "taken as exact" not in verbose_text(result)
-    # A centre 0.3 px aside is the camera turned by that about y, as far as 90 degrees off the axis let it be told.
+    # A shift of the centre by 0.3 px resembles a rotation about y; only stars far off the axis distinguish the two.
     px_arcsec = 1 / camera.focal_px[0] / ARCSEC
     assert attitude["sigma_arcsec"][1] > 0.15 * px_arcsec > 2 * fix["attitude"]["sigma_arcsec"][1]
 

@@ -1,4 +1,4 @@
-"""The JSON schemas: real files fit them, spoiled ones do not, and they name every key."""
+"""The JSON schemas: valid files fit them, changed ones do not, and they contain every key."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from startrack.stages import Measured, Oriented, Refused, extend
 from startrack.types import Mode
 
 
-def fits(kind, value):
+def fits_schema(kind, value):
     Draft202012Validator(SCHEMAS[kind], format_checker=Draft202012Validator.FORMAT_CHECKER).validate(value)
 
 
@@ -57,8 +57,8 @@ def test_each_schema_is_one(kind):
 
 def test_results_fit_and_have_no_key_that_the_schema_does_not_name(located):
     for kind, record in results(located.result):
-        fits(kind, record)
-        fits(kind, json.loads(json.dumps(record)))
+        fits_schema(kind, record)
+        fits_schema(kind, json.loads(json.dumps(record)))
         assert unknown_keys(record, SCHEMAS[kind]) == []
 
 
@@ -83,17 +83,17 @@ SPOILED = [
 def test_a_spoiled_result_does_not_fit(located, kind, spoil, message):
     make = {"fix": result_dict, "identification": identification_dict, "detection": detection_dict}[kind]
     record = deepcopy(make(located.result))
-    fits(kind, record)
+    fits_schema(kind, record)
     spoil(record)
     with pytest.raises(ValidationError, match=message):
-        fits(kind, record)
+        fits_schema(kind, record)
 
 
-def test_no_position_where_several_places_fit(located):
+def test_no_position_where_several_positions_fit(located):
     records = [record for kind, record in results(located.result) if kind == "fix" and "position" not in record]
     for record in records:
         with pytest.raises(ValidationError):
-            fits("fix", {**record, "position": result_dict(located.result)["position"]})
+            fits_schema("fix", {**record, "position": result_dict(located.result)["position"]})
     assert {record["status"] for record in records} == {"ambiguous", "refused"}
 
 
@@ -103,16 +103,16 @@ def test_shipped_cameras_and_terrains_fit():
         assert files
         for path in files:
             value = tomllib.loads(path.read_text(encoding="utf-8"))
-            fits(kind, value)
+            fits_schema(kind, value)
             assert unknown_keys(value, SCHEMAS[kind]) == []
 
 
 def test_written_cameras_sidecars_and_truths_fit(located, tmp_path):
-    fits("camera", camera_to_dict(located.result.camera))
+    fits_schema("camera", camera_to_dict(located.result.camera))
     sidecar = write_sidecar(tmp_path / "a.png", located.result.exposure)
-    fits("sidecar", json.loads(sidecar.read_text(encoding="utf-8")))
+    fits_schema("sidecar", json.loads(sidecar.read_text(encoding="utf-8")))
     pose, _ = write_truth(tmp_path / "a.png", located.truth, {"seed": 7}, to_v_mag=5.0)
-    fits("truth", json.loads(pose.read_text(encoding="utf-8")))
+    fits_schema("truth", json.loads(pose.read_text(encoding="utf-8")))
 
 
 @pytest.mark.parametrize(
@@ -130,4 +130,4 @@ def test_written_cameras_sidecars_and_truths_fit(located, tmp_path):
 )
 def test_wrong_files_do_not_fit(kind, text):
     with pytest.raises(ValidationError):
-        fits(kind, tomllib.loads(text))
+        fits_schema(kind, tomllib.loads(text))

@@ -1,4 +1,4 @@
-"""The star table: astropy reads back what was measured, and the renderer's truth agrees with its verdicts."""
+"""The star table: astropy reads back the measured values, and its status agrees with the renderer's truth."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_what_was_not_measured_is_masked(table, located):
     assert set(table["cause"][unusable]) <= set(result.light.cause.tolist())
 
 
-def test_the_verdicts_are_true(table, located):
+def test_the_status_agrees_with_the_truth(table, located):
     truth = dict(zip(located.truth.sources.catalog_id.tolist(), located.truth.hidden.tolist(), strict=True))
     for status, is_hidden in (("seen", False), ("hidden", True)):
         ids = table["catalog_id"][table["status"] == status].tolist()

@@ -54,14 +54,14 @@ def test_refusals_are_one_line_with_reason_and_message(located):
     assert refusal_line("night/b.png", "bad_image", "night/b.png: it is truncated") == line
 
 
-def test_a_heading_of_nearly_a_turn_is_nought(located):
+def test_a_heading_of_nearly_360_degrees_is_0(located):
     from startrack.output.values import Angle
 
     assert f"{Angle(359.99999):.1f}" == "0.0"
     assert f"{Angle(57.2957795):.3f}" == "57.296"
 
 
-def test_more_lines_for_those_who_ask(located):
+def test_verbose_gives_more_lines(located):
     text = verbose_text(located.result)
     assert all(line.startswith("  ") for line in text.splitlines())
     for part in ("position   E ", "latitude -89.", "error      sigma", "boresight  RA", "heading ", "identified"):
@@ -80,4 +80,4 @@ def test_more_lines_for_those_who_ask(located):
 
 def test_probabilities_too_small_for_a_float():
     assert chance_text(2.17e-12) == "2e-12"
-    assert chance_text(1e-300) == chance_text(0.0) == "below 1e-100"  # how tiny, no model knows
+    assert chance_text(1e-300) == chance_text(0.0) == "below 1e-100"  # smaller values are beyond the model

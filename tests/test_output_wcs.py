@@ -34,7 +34,7 @@ CAMERAS = [FISHEYE, EQUIDISTANT, NARROW, replace(NARROW, name="mirrored", mirror
 
 def read_back(camera: Camera, R_cam_icrs: np.ndarray) -> WCS:
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # a header that astropy has to mend is wrong
+        warnings.simplefilter("error")  # a header that astropy has to correct is wrong
         warnings.filterwarnings("ignore", message="The WCS transformation has more axes")  # no pixels in a .wcs file
         header = fits.Header.fromstring(header_block(wcs_cards(camera, R_cam_icrs)).decode("ascii"))
         return WCS(header)
@@ -78,7 +78,7 @@ def test_identify_writes_world_coordinates_on_which_catalogue_stars_fall(tmp_pat
     assert len(corr) > 1000
     x, y = wcs.all_world2pix(corr["index_ra"], corr["index_dec"], 1)
     off = np.hypot(x - corr["index_x"], y - corr["index_y"])
-    assert off.max() < 0.1  # aberration over the whole sky: a turn takes out its mean
+    assert off.max() < 0.1  # aberration over the whole sky: the fitted rotation removes its mean
     error = np.hypot(x - corr["field_x"], y - corr["field_y"])
     assert np.median(error) < 0.25  # most are faint
     sky = wcs.all_pix2world(np.stack([corr["field_x"], corr["field_y"]], axis=1), 1)

@@ -1,4 +1,4 @@
-"""The whole chain on one rendered exposure, and on what may go wrong with it."""
+"""The whole chain on one rendered exposure, and on disturbed versions of it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def catalog() -> StarCatalog:
     return load_catalog().brighter_than(7.0)
 
 
-def again(located: Any, catalog: StarCatalog, pixels: np.ndarray | None = None, **terrain: float) -> Outcome:
+def locate_again(located: Any, catalog: StarCatalog, pixels: np.ndarray | None = None, **terrain: float) -> Outcome:
     """The same exposure located once more, with other pixels or in another crater."""
     known = located.result
     exposure = known.exposure if pixels is None else replace(known.exposure, pixels_adu=pixels.astype(np.float32))
@@ -37,7 +37,7 @@ def miss(result: Outcome, located: Any) -> np.ndarray:
     return result.fix.position_enu_m[:2] - located.truth.position_enu_m[:2]
 
 
-def holds(result: Outcome, located: Any) -> bool:
+def covers_truth(result: Outcome, located: Any) -> bool:
     """Whether the stated covariance and the 99.9 % circle hold the truth."""
     error, fix = miss(result, located), result.fix
     nees = error @ np.linalg.solve(fix.covariance_m2, error)
@@ -53,9 +53,9 @@ def directions(located: Any) -> tuple[np.ndarray, np.ndarray]:
     return azel_from_rays(rays @ (known.attitude.R_cam_icrs @ known.R_enu_icrs.T))
 
 
-def test_place_and_attitude_are_found_to_within_what_is_stated(located: Any) -> None:
+def test_position_and_attitude_are_within_the_stated_errors(located: Any) -> None:
     result, truth = located.result, located.truth
-    assert holds(result, located)
+    assert covers_truth(result, located)
     assert np.linalg.norm(miss(result, located)) < 12.0  # m; a perfect list of magnitude 6 allows 18 on average
     assert result.fix.radius95_m < 25.0
     assert result.fix.position_enu_m[2] == truth.position_enu_m[2]
@@ -71,24 +71,24 @@ def test_place_and_attitude_are_found_to_within_what_is_stated(located: Any) -> 
 
 
 def test_the_same_input_gives_the_same_answer(located: Any, catalog: StarCatalog) -> None:
-    once, twice = again(located, catalog), located.result
+    once, twice = locate_again(located, catalog), located.result
     assert np.array_equal(once.fix.position_enu_m, twice.fix.position_enu_m)
     assert np.array_equal(once.fix.covariance_m2, twice.fix.covariance_m2)
     assert np.array_equal(once.attitude.R_cam_icrs, twice.attitude.R_cam_icrs)
 
 
-def test_turning_the_camera_turns_the_attitude_and_not_the_place(located: Any, catalog: StarCatalog) -> None:
-    turned = again(located, catalog, np.rot90(located.result.exposure.pixels_adu))
-    assert holds(turned, located)
+def test_rotating_the_camera_rotates_the_attitude_and_keeps_the_position(located: Any, catalog: StarCatalog) -> None:
+    turned = locate_again(located, catalog, np.rot90(located.result.exposure.pixels_adu))
+    assert covers_truth(turned, located)
     assert np.linalg.norm(miss(turned, located) - miss(located.result, located)) < 3.0
-    # The picture counter-clockwise by 90 degrees: what was on the right, cam x, is now at the top, -cam y.
+    # The picture rotated counter-clockwise by 90 degrees: the right side, cam x, is now at the top, -cam y.
     quarter = Rotation.from_euler("z", -90, degrees=True).as_matrix()
     off = quarter @ located.result.attitude.R_cam_icrs @ turned.attitude.R_cam_icrs.T
     assert Rotation.from_matrix(off).magnitude() < 5 * ARCSEC
 
 
 def test_a_mirrored_picture_is_refused_as_such(located: Any, catalog: StarCatalog) -> None:
-    result = again(located, catalog, located.result.exposure.pixels_adu[:, ::-1])
+    result = locate_again(located, catalog, located.result.exposure.pixels_adu[:, ::-1])
     assert (result.status, result.reason) == ("refused", "mirrored")
 
 
@@ -96,56 +96,56 @@ def test_a_mirrored_picture_is_refused_as_such(located: Any, catalog: StarCatalo
     "terrain", [{"depth_m": 1800.0}, {"depth_m": 2200.0}, {"diameter_m": 23e3, "search_radius_m": 11.5e3}], ids=str
 )
 def test_the_wrong_crater_is_refused(located: Any, catalog: StarCatalog, terrain: dict[str, float]) -> None:
-    result = again(located, catalog, **terrain)
+    result = locate_again(located, catalog, **terrain)
     assert (result.status, result.reason) == ("refused", "inconsistent_evidence")
 
 
-def test_a_place_beyond_the_search_area_is_refused(located: Any, catalog: StarCatalog) -> None:
-    result = again(located, catalog, search_radius_m=4000.0)  # the camera is 6.5 km from the middle
+def test_a_position_beyond_the_search_area_is_refused(located: Any, catalog: StarCatalog) -> None:
+    result = locate_again(located, catalog, search_radius_m=4000.0)  # the camera is 6.5 km from the middle
     assert (result.status, result.reason) == ("refused", "outside_search_area")
     assert "4000 m" in result.message
 
 
-def test_hot_pixels_do_not_move_the_place(located: Any, catalog: StarCatalog) -> None:
+def test_hot_pixels_do_not_shift_the_position(located: Any, catalog: StarCatalog) -> None:
     rng = np.random.default_rng(1)
     pixels = located.result.exposure.pixels_adu.copy()
     x, y = rng.integers(0, 1024, (2, 600))
     pixels[y, x] += rng.uniform(500, 50_000, 600)
-    result = again(located, catalog, np.minimum(pixels, 65535))
-    assert holds(result, located)
+    result = locate_again(located, catalog, np.minimum(pixels, 65535))
+    assert covers_truth(result, located)
     assert np.linalg.norm(miss(result, located) - miss(located.result, located)) < 3.0
 
 
 @pytest.mark.parametrize("width_deg", [5, 20])
-def test_a_boulder_does_not_move_the_place(located: Any, catalog: StarCatalog, width_deg: float) -> None:
+def test_a_boulder_does_not_shift_the_position(located: Any, catalog: StarCatalog, width_deg: float) -> None:
     rng = np.random.default_rng(2)
     azimuth, elevation = directions(located)
     pixels = located.result.exposure.pixels_adu.copy()
     wall = pixels[(elevation > 0) & (elevation < np.radians(3))]
     boulder = (np.degrees(azimuth) < width_deg) & (elevation < np.radians(35))
     pixels[boulder] = rng.choice(wall, boulder.sum())
-    result = again(located, catalog, pixels)
-    assert holds(result, located)
+    result = locate_again(located, catalog, pixels)
+    assert covers_truth(result, located)
     assert np.linalg.norm(miss(result, located) - miss(located.result, located)) < 6.0
 
 
-def test_glow_over_a_part_of_the_picture_only_costs_certainty(located: Any, catalog: StarCatalog) -> None:
+def test_glow_over_a_part_of_the_picture_only_increases_the_uncertainty(located: Any, catalog: StarCatalog) -> None:
     y, x = np.mgrid[:1024, :1024]
     glow = 2000.0 * np.exp(-((x - 300) ** 2 + (y - 700) ** 2) / 2 / 150.0**2)
     rng = np.random.default_rng(3)
-    result = again(located, catalog, located.result.exposure.pixels_adu + rng.poisson(glow))
-    assert holds(result, located)
+    result = locate_again(located, catalog, located.result.exposure.pixels_adu + rng.poisson(glow))
+    assert covers_truth(result, located)
 
 
 def test_a_lens_cap_and_a_foreign_picture_are_refused(located: Any, catalog: StarCatalog) -> None:
     rng = np.random.default_rng(4)
     dark = np.rint(rng.normal(103, 3, (1024, 1024)))
-    capped = again(located, catalog, dark)
+    capped = locate_again(located, catalog, dark)
     assert (capped.status, capped.reason) in {("refused", "no_stars"), ("refused", "not_identified")}
     lamps = dark.copy()
     for x, y in rng.integers(40, 980, (60, 2)):
         lamps[y - 1 : y + 2, x - 1 : x + 2] += [[60, 200, 60], [200, 700, 200], [60, 200, 60]]
-    strange = again(located, catalog, lamps)
+    strange = locate_again(located, catalog, lamps)
     assert (strange.status, strange.reason) == ("refused", "not_identified")
 
 
@@ -159,7 +159,7 @@ def test_what_is_missing_or_does_not_fit_is_named(located: Any, catalog: StarCat
     assert "1024 x 1023" in cut.message
 
 
-def test_identify_without_a_time_says_how_much_less_it_knows(located: Any, catalog: StarCatalog) -> None:
+def test_identify_without_a_time_states_a_larger_sigma(located: Any, catalog: StarCatalog) -> None:
     known = located.result
     result = pipeline.identify(replace(known.exposure, time_utc=None), known.camera, catalog)
     assert result.status == "ok"

@@ -44,7 +44,7 @@ def test_each_star_may_have_its_own_width() -> None:
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.7, 1.0, 1.5, 4.0])
-def test_the_stamp_holds_the_light_and_the_kernel_is_even(sigma: float) -> None:
+def test_the_stamp_holds_the_flux_and_the_kernel_is_symmetric(sigma: float) -> None:
     kernel = filter_kernel(sigma)
     assert len(kernel) == 2 * stamp_radius(sigma) + 1 >= 5
     assert kernel.dtype == np.float32

@@ -1,4 +1,4 @@
-"""README.md and docs/: what they show is run, and what they name is there."""
+"""README.md and docs/: the commands shown are run, and the names mentioned exist."""
 
 import importlib.util
 import json
@@ -27,25 +27,25 @@ def blocks(text, language):
     return re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
 
 
-def marked(name):
+def marked_line(name):
     """The one line of the block after <!-- name -->."""
     (block,) = re.findall(rf"<!-- {name} -->\n```sh\n(.*?)```", README, flags=re.DOTALL)
     (line,) = block.strip().splitlines()
     return line
 
 
-def without_figures(line):
+def replace_figures(line):
     return re.sub(r"-?\d+(\.\d+)?", "#", line)
 
 
 def figures(text):
-    """The numbers of a result's line: east, north, radius [m], 95, heading [deg], stars; not how long it took."""
+    """The numbers of a result's line: east, north, radius [m], 95, heading [deg], stars; without the time taken."""
     return [float(number) for number in re.findall(r"-?\d+(?:\.\d+)?", text)][:-1]
 
 
 def same_result(printed, shown):
     """Equal but for the time taken, and for the last digit, which another processor may round otherwise."""
-    assert without_figures(printed) == without_figures(shown)
+    assert replace_figures(printed) == replace_figures(shown)
     assert figures(printed) == pytest.approx(figures(shown), abs=0.11)
 
 
@@ -58,7 +58,7 @@ def clone(tmp_path, monkeypatch):
 
 
 def test_the_locate_command_prints_what_the_page_shows(clone, capsys):
-    words = shlex.split(marked("locate").split("&&")[-1])
+    words = shlex.split(marked_line("locate").split("&&")[-1])
     assert words[0] == ".venv/bin/startrack"
     assert main(words[1:]) == 0
     printed = capsys.readouterr().out.strip()
@@ -107,13 +107,13 @@ def test_python_of_the_page_runs(page, monkeypatch, capsys):
     printed = capsys.readouterr().out.splitlines()[: len(shown)]
     same_result(printed[0], shown[0])
     for now, then in zip(printed[1:], shown[1:], strict=True):
-        assert without_figures(now) == without_figures(then)
+        assert replace_figures(now) == replace_figures(then)
         assert figures(now + " 0") == pytest.approx(figures(then + " 0"), abs=0.011)
 
 
 def test_ci_runs_the_command_of_the_page():
     """.ci/run takes the line out of the page; here only that it finds the right one."""
-    line = marked("test")
+    line = marked_line("test")
     script = (ROOT / ".ci/run").read_text(encoding="utf-8")
     (sed,) = re.findall(r"\$\((sed .*README\.md)\)", script)
     found = subprocess.run(["bash", "-c", sed], cwd=ROOT, capture_output=True, text=True, check=True).stdout
@@ -139,7 +139,7 @@ def test_rooms_of_the_page_are_the_rooms():
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_links_lead_somewhere(page):
+def test_links_have_targets(page):
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
         if "://" not in target:
             assert (page.parent / target).exists(), target
@@ -155,11 +155,11 @@ def test_camera_and_terrain_of_the_format_page_are_the_shipped_ones():
     assert terrain_from_dict(terrain).name == "shackleton-thesis"
 
 
-def leaves(value, before=""):
+def leaf_keys(value, before=""):
     """Keys as the page writes them: of nested dictionaries with dots, of lists of dictionaries by themselves."""
     for key, inner in value.items():
         if isinstance(inner, dict) and before + key not in LISTED_IN_ONE_ROW:
-            yield from leaves(inner, f"{before}{key}.")
+            yield from leaf_keys(inner, f"{before}{key}.")
             continue
         yield before + key
         if isinstance(inner, dict):
@@ -175,7 +175,7 @@ def test_every_key_that_is_written_is_explained(clone, capsys, command):
     name, image = command.split()
     assert main([name, f"sample_images/{image}", "--json", "--no-plots"]) == 0
     record = json.loads(capsys.readouterr().out)
-    assert [key for key in leaves(record) if f"`{key}`" not in FORMATS] == []
+    assert [key for key in leaf_keys(record) if f"`{key}`" not in FORMATS] == []
     assert f"`{record['format']}`" in FORMATS
     tables = list((clone / "startrack-out").glob("*.stars.ecsv"))
     for table in tables:

@@ -1,4 +1,4 @@
-"""What the sky has beyond the catalogue, and how it turns."""
+"""Stars beyond the catalogue, and the rotation of the sky."""
 
 from datetime import UTC, datetime
 
@@ -8,7 +8,7 @@ from render_helpers import SITE, stars_at
 
 from startrack.catalog import load_catalog
 from startrack.frames import R_enu_icrs, R_from_rotvec, Site
-from startrack.rendering import concatenate_stars, draw_field_stars, draw_v_errors, sky_turn_rad
+from startrack.rendering import concatenate_stars, draw_field_stars, draw_v_errors, sky_rotvec_rad
 from startrack.types import Stars
 
 TIME = datetime(2026, 3, 1, 12, tzinfo=UTC)
@@ -58,23 +58,23 @@ def test_errors_are_the_catalogues_and_the_scatter_in_quadrature():
     assert errors[n // 2 :].std() == pytest.approx(0.05, rel=0.02)
 
 
-def test_the_sky_turns_once_a_sidereal_day_westward():
+def test_the_sky_rotates_once_a_sidereal_day_westward():
     site = Site("earth", np.radians(40.0), 0.0)
-    turn = sky_turn_rad(site, TIME, 600.0)
-    assert np.linalg.norm(turn) == pytest.approx(7.292115e-5 * 600, rel=1e-4)
-    # Stars turn about the celestial pole (north, 40 degrees up) against the Earth's spin.
+    rotvec = sky_rotvec_rad(site, TIME, 600.0)
+    assert np.linalg.norm(rotvec) == pytest.approx(7.292115e-5 * 600, rel=1e-4)
+    # Stars rotate about the celestial pole (north, 40 degrees up) against the Earth's rotation.
     np.testing.assert_allclose(
-        turn / np.linalg.norm(turn), [0, -np.cos(np.radians(40)), -np.sin(np.radians(40))], atol=2e-3
+        rotvec / np.linalg.norm(rotvec), [0, -np.cos(np.radians(40)), -np.sin(np.radians(40))], atol=2e-3
     )
 
 
-def test_the_moons_sky_turns_half_a_degree_an_hour():
-    assert np.degrees(np.linalg.norm(sky_turn_rad(SITE, TIME, 3600.0))) == pytest.approx(0.549, abs=0.002)
+def test_the_moons_sky_rotates_half_a_degree_an_hour():
+    assert np.degrees(np.linalg.norm(sky_rotvec_rad(SITE, TIME, 3600.0))) == pytest.approx(0.549, abs=0.002)
 
 
-def test_the_turn_carries_the_start_into_the_end():
+def test_the_rotation_vector_maps_the_start_to_the_end():
     from datetime import timedelta
 
     site, half = Site("earth", np.radians(-20.0), 1.0), timedelta(seconds=900)
-    R = R_from_rotvec(sky_turn_rad(site, TIME, 1800.0))
+    R = R_from_rotvec(sky_rotvec_rad(site, TIME, 1800.0))
     np.testing.assert_allclose(R @ R_enu_icrs(site, TIME - half), R_enu_icrs(site, TIME + half), atol=1e-12)

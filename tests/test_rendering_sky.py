@@ -25,7 +25,7 @@ def test_sky_of_magnitude_22_on_the_axis_by_hand():
 
 
 @pytest.mark.parametrize("k", [(), (-0.03, 0.004, -0.001)])
-def test_the_whole_image_circle_holds_the_light_of_its_solid_angle(k):
+def test_the_flux_of_the_image_circle_is_that_of_its_solid_angle(k):
     # Independent of the lens: 2 pi (1 - cos 85) sr, whatever each pixel's share.
     camera = replace(FISHEYE, lens=KannalaBrandt(k))
     total = light_e(make_scene(camera=camera, sky_v_mag_arcsec2=20.0)).sum()
@@ -96,7 +96,7 @@ def test_a_ragged_skyline_against_brute_force():
     elevation = Ragged().horizon_rad(None, azimuth) + rng.normal(0, 1 / 160, 60)
     rays = np.stack([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], -1)
     pixels = np.rint(FISHEYE.project(rays @ scene.R_cam_enu.T)[0])
-    # Light of each point of a fine grid, spread by the PSF and collected by the square pixel.
+    # Brightness at each point of a fine grid, convolved with the PSF and integrated over the square pixel.
     from scipy.special import ndtr
 
     offset = (np.arange(240) + 0.5) / 240 * 12 - 6
@@ -114,14 +114,14 @@ def test_a_ragged_skyline_against_brute_force():
     assert abs(np.mean(coverage(scene, pixels) - expected)) < 0.001
 
 
-def test_the_wall_shines_as_it_reflects_and_nothing_does_off_the_image_circle():
+def test_the_wall_reflects_and_the_frame_is_dark_off_the_image_circle():
     scene = make_scene(sky_v_mag_arcsec2=20.0, terrain=CRATER, position_enu_m=PLACE, wall_reflectance=0.1)
     image, sky = light_e(scene), light_e(replace(scene, terrain=None))
     rows = slice(255, 256)
     wall = image[rows, 255 - int(160 * np.radians(82))]  # east, 8 degrees up: the rim is far above
     assert wall / sky[rows, 255 - int(160 * np.radians(82))] == pytest.approx(0.1, rel=1e-9)
     assert image[5, 5] == 0
-    # The rim of the circle is as soft as the PSF: half the light at 85 degrees, 237.36 px from the centre.
+    # The edge of the circle is as wide as the PSF: half the brightness at 85 degrees, 237.36 px from the centre.
     assert bilinear(sky, np.array([[255.5 + 160 * np.radians(85), 255.5]]))[0] / sky[255, 255 + 233] == pytest.approx(
         0.5, abs=0.02
     )

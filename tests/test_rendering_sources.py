@@ -1,4 +1,4 @@
-"""Stars and bodies: where they fall, how bright, and what hides or trails them."""
+"""Stars and bodies: positions, fluxes, visibility and trails."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from render_helpers import CRATER, FISHEYE, SENSOR, centroid_px, make_scene, stars_at_azel
 
-from startrack.rendering import exposure_reaching, light_e, truth_of
+from startrack.rendering import exposure_for_snr, light_e, truth_of
 from startrack.types import Body
 
 
@@ -19,7 +19,7 @@ def test_flux_of_a_star_is_zero_point_times_exposure_times_throughput():
     np.testing.assert_allclose(truth_of(scene).flux_e, expected, rtol=1e-12)
 
 
-def test_magnitude_errors_change_the_light_but_not_the_truth():
+def test_magnitude_errors_change_the_flux_but_not_the_truth():
     scene = make_scene(stars_at_azel([40.0], [50.0], [4.0]))
     brighter = replace(scene, v_error_mag=np.array([-0.1]))
     assert light_e(brighter).sum() / light_e(scene).sum() == pytest.approx(10**0.04, rel=1e-4)
@@ -58,7 +58,7 @@ def test_mirrored_camera_gives_the_mirror_image():
     np.testing.assert_allclose(mirrored, plain[:, ::-1], atol=1e-6)
 
 
-def test_the_terrain_hides_stars_and_the_truth_says_which():
+def test_the_terrain_hides_stars_and_the_truth_states_which():
     # At the middle of the crater the rim stands at atan(1998.5 / 10000) = 11.302 degrees.
     rim = np.degrees(np.arctan2(1998.5, 10_000))
     stars = stars_at_azel([10.0, 100.0, 200.0], [rim - 0.01, rim + 0.01, 60.0], [2.0, 2.0, 2.0])
@@ -76,9 +76,9 @@ def test_nothing_shines_beyond_the_image_circle():
     assert light_e(scene).sum() == pytest.approx(44_000, rel=1e-3)
 
 
-def test_a_trail_is_as_long_as_the_skys_turn_and_centred_on_mid_exposure():
-    turn = np.array([0.0, 0.0, 0.06])  # about the zenith: a star at 45 degrees runs along a circle around it
-    scene = make_scene(stars_at_azel([90.0], [45.0], [0.0]), sky_turn_rad=turn)
+def test_a_trail_is_as_long_as_the_skys_rotation_and_centred_on_mid_exposure():
+    rotvec = np.array([0.0, 0.0, 0.06])  # about the zenith: a star at 45 degrees runs along a circle around it
+    scene = make_scene(stars_at_azel([90.0], [45.0], [0.0]), sky_rotvec_rad=rotvec)
     image = light_e(scene)
     y, x = np.indices(image.shape)
     cx, cy = centroid_px(image)
@@ -117,7 +117,7 @@ def test_a_planet_is_a_point_in_the_truth_under_its_name():
 def test_the_default_exposure_reaches_five_sigma_at_magnitude_six():
     # SNR by hand: weights = PSF, noise area 1 / sum(P^2), 6.98 e/s of sky with f = 652 px/rad (theory: V 22).
     camera = replace(FISHEYE, focal_px=(652.0, 652.0))
-    t = exposure_reaching(camera, 22.0, v_mag=6.0, snr=5.0)
+    t = exposure_for_snr(camera, 22.0, v_mag=6.0, snr=5.0)
     star = light_e(make_scene(stars_at_azel([0.0], [90.0], [6.0]), camera=camera, exposure_s=t))
     area = star.sum() ** 2 / np.square(star).sum()
     snr = star.sum() / np.sqrt(star.sum() + area * (2.5**2 + 6.98 * t))

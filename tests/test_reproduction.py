@@ -1,4 +1,4 @@
-"""The thesis's simulator, its methods and ours in it: statistics, figures, and runs that can be stopped."""
+"""The thesis's simulator with its methods and ours: statistics, figures, and resumed runs."""
 
 import io
 import json
@@ -39,7 +39,7 @@ from startrack.reproduction.simulator import (
     crater,
     crater_edge,
     directions,
-    draw_places,
+    draw_positions,
     gaps_m,
     mean_gap_m,
     star_count,
@@ -54,15 +54,15 @@ TINY = replace(SMALL, skies=3, per_sky=8, ours_per_sky=4, bound_per_sky=4, deep_
 
 
 @contextmanager
-def silent(what, total):
+def hide_progress(what, total):
     yield Progress()
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def small_run(tmp_path_factory):
     """Every table and figure of a small run, with its files."""
     out = tmp_path_factory.mktemp("reproduced")
-    with ChunkStore(out, jobs=1, progress=silent) as store:
+    with ChunkStore(out, jobs=1, progress=hide_progress) as store:
         artefacts = {name: make(Context(SMALL, 0, store)) for name, make in ARTEFACTS.items()}
     return {name: (artefact, write_artefact(artefact, out, plots=True)) for name, artefact in artefacts.items()}
 
@@ -75,11 +75,11 @@ def test_star_counts_are_liebes():
     assert star_count(2.0) == 28
 
 
-def test_stars_are_uniform_on_the_hemisphere_and_places_on_the_floor():
+def test_stars_are_uniform_on_the_hemisphere_and_positions_on_the_floor():
     sky = Sky.draw(3, 0, 8.0)
     assert stats.kstest(np.sin(sky.elevation_rad), "uniform").pvalue > 0.01
     assert stats.kstest(sky.azimuth_rad / (2 * np.pi), "uniform").pvalue > 0.01
-    spots = draw_places(3, 0, 0, 5000)
+    spots = draw_positions(3, 0, 0, 5000)
     assert stats.kstest(np.sum(spots**2, axis=1) / 1e8, "uniform").pvalue > 0.01
     assert stats.kstest(np.arctan2(*spots.T) / (2 * np.pi) + 0.5, "uniform").pvalue > 0.01
 
@@ -87,7 +87,7 @@ def test_stars_are_uniform_on_the_hemisphere_and_places_on_the_floor():
 def test_smaller_runs_are_the_beginning_of_larger_ones():
     small, large = Sky.draw(0, 4, 5.0), Sky.draw(0, 4, 7.0)
     np.testing.assert_array_equal(small.elevation_rad, large.elevation_rad[: len(small)])
-    np.testing.assert_array_equal(draw_places(0, 4, 10, 20), draw_places(0, 4, 0, 500)[10:20])
+    np.testing.assert_array_equal(draw_positions(0, 4, 10, 20), draw_positions(0, 4, 0, 500)[10:20])
     whole = compute_chunk(Task(KUA, 0, 1, 0, 12))
     parts = [compute_chunk(Task(KUA, 0, 1, start, start + 6)) for start in (0, 6)]
     np.testing.assert_array_equal(whole["refined_m"], np.concatenate([part["refined_m"] for part in parts]))
@@ -100,16 +100,16 @@ def test_stars_in_sight_are_those_above_the_horizon_and_inside_the_drawn_edge():
     from startrack.reproduction.drawing import fisheye_points
 
     sky, cylinder = Sky.draw(0, 0), crater()
-    for place in draw_places(0, 0, 0, 10):
-        seen = visible_stars(sky.on_rim_plane(cylinder), place, cylinder.radius_m)
-        horizon = cylinder.horizon_rad(np.tile(place, (len(sky), 1)), sky.azimuth_rad)
+    for position in draw_positions(0, 0, 0, 10):
+        seen = visible_stars(sky.project_to_rim_plane(cylinder), position, cylinder.radius_m)
+        horizon = cylinder.horizon_rad(np.tile(position, (len(sky), 1)), sky.azimuth_rad)
         np.testing.assert_array_equal(seen, sky.elevation_rad > horizon)
-        polygon = Polygon(fisheye_points(*crater_edge(cylinder, place)))
+        polygon = Polygon(fisheye_points(*crater_edge(cylinder, position)))
         inside = polygon.contains_points(fisheye_points(sky.azimuth_rad, sky.elevation_rad))
         assert np.sum(inside != seen) <= 2  # a polygon of 360 points is not quite the circle
 
 
-def test_lists_are_as_wrong_as_they_say():
+def test_lists_have_the_stated_error_rates():
     in_sight = np.repeat([True, False], 20_000)
     listed = Mistakes(missed=0.1, false=0.02).draw_list(in_sight, 0, 0, 0)
     assert np.mean(~listed[in_sight]) == pytest.approx(0.1, abs=0.008)
@@ -136,15 +136,15 @@ def test_the_middle_of_a_cell_with_straight_walls(size):
 def test_the_localizers_give_what_the_table_is_made_of():
     task = Task(KUA, 0, 2, 0, 5)
     chunk, sky, cylinder = compute_chunk(task), Sky.draw(0, 2), crater()
-    for k, place in enumerate(draw_places(0, 2, 0, 5)):
-        evidence = PERFECT.evidence(sky, visible_stars(sky.on_rim_plane(cylinder), place, cylinder.radius_m))
+    for k, position in enumerate(draw_positions(0, 2, 0, 5)):
+        evidence = PERFECT.evidence(sky, visible_stars(sky.project_to_rim_plane(cylinder), position, cylinder.radius_m))
         hull, refined = Hull()(evidence, cylinder), PseudoGradient()(evidence, cylinder)
         np.testing.assert_allclose(hull.position_enu_m[:2], chunk["hull_m"][k], atol=1e-6)
         np.testing.assert_allclose(refined.position_enu_m[:2], chunk["refined_m"][k], atol=1e-6)
 
 
-def test_table_3_1_is_within_the_bars(made):
-    values = made["table3.1"][0].values
+def test_table_3_1_is_within_the_bars(small_run):
+    values = small_run["table3.1"][0].values
     assert 30 <= values["reproduced"]["descent"]["mean_m"] <= 38  # thesis 34.2
     assert 25 <= values["reproduced"]["descent"]["sd_m"] <= 36  # 31.1
     assert 0.003 <= values["reproduced"]["never_settle"] <= 0.012  # 0.006
@@ -156,16 +156,16 @@ def test_table_3_1_is_within_the_bars(made):
 
 def test_ours_is_the_middle_of_the_exact_cell():
     sky, cylinder = Sky.draw(0, 1), crater()
-    points, off = sky.on_rim_plane(cylinder), []
-    for place in draw_places(0, 1, 0, 10):
-        evidence = PERFECT.evidence(sky, visible_stars(points, place, cylinder.radius_m))
+    points, off = sky.project_to_rim_plane(cylinder), []
+    for position in draw_positions(0, 1, 0, 10):
+        evidence = PERFECT.evidence(sky, visible_stars(points, position, cylinder.radius_m))
         fix = ExactPosterior()(evidence, cylinder)
-        off.append(np.hypot(*(fix.position_enu_m[:2] - cell_centroid(points, place, cylinder.radius_m))))
+        off.append(np.hypot(*(fix.position_enu_m[:2] - cell_centroid(points, position, cylinder.radius_m))))
     assert np.median(off) < 0.3
 
 
-def test_skyline_is_better_near_the_centre_and_stars_near_the_wall(made):
-    artefact = made["fig3.10"][0]
+def test_skyline_is_better_near_the_centre_and_stars_near_the_wall(small_run):
+    artefact = small_run["fig3.10"][0]
     columns = {column.name: [float(v) for v in column.values] for column in artefact.columns}
     assert columns["hull_mean"][-1] > 2 * columns["hull_mean"][0]
     assert columns["descent_mean"][0] > 2 * columns["descent_mean"][-1]
@@ -182,7 +182,7 @@ def test_the_published_trials_average_to_the_published_overall():
 
 def test_changes_along_the_traverse_are_where_the_view_changes():
     sky, cylinder = Sky.draw(0, 0, 4.0), crater()
-    points, changes = sky.on_rim_plane(cylinder), changes_m(sky, cylinder)
+    points, changes = sky.project_to_rim_plane(cylinder), changes_m(sky, cylinder)
     ends = np.concatenate([[-9999.9], (changes[1:] + changes[:-1]) / 2, [9999.9]])
     views = [visible_stars(points, np.array([east, 0.0]), cylinder.radius_m) for east in ends]
     assert [int(np.sum(a != b)) for a, b in pairwise(views)] == [1] * len(changes)
@@ -202,8 +202,8 @@ def test_distances_between_changes_are_the_thesis_s():
 
 
 @pytest.mark.parametrize("name", cli.NAMES)
-def test_each_table_and_figure_is_written(made, name):
-    artefact, files = made[name]
+def test_each_table_and_figure_is_written(small_run, name):
+    artefact, files = small_run[name]
     pictures = [path for path in files if path.suffix == ".png"]
     assert len(pictures) == {"table3.1": 0, "figB": 10, "fig3.10": 2}.get(name, 1)
     for path in pictures:
@@ -219,11 +219,11 @@ def test_each_table_and_figure_is_written(made, name):
         assert "thesis" in text and artefact.values["thesis"]
 
 
-def test_tables_are_read_by_astropy(made):
+def test_tables_are_read_by_astropy(small_run):
     from astropy import units
     from astropy.table import QTable
 
-    tables = {p.name: QTable.read(p) for _, files in made.values() for p in files if p.suffix == ".ecsv"}
+    tables = {p.name: QTable.read(p) for _, files in small_run.values() for p in files if p.suffix == ".ecsv"}
     assert set(tables) >= {"table3.1.ecsv", "fig3.7.ecsv", "fig3.9.ecsv", "magnitude.ecsv", "figA.2.ecsv"}
     assert len(tables["table3.1.ecsv"]) == 10
     thesis = tables["table3.1.ecsv"]["thesis_mean"]
@@ -234,7 +234,7 @@ def test_names_of_the_command_are_those_that_can_be_made():
     assert tuple(ARTEFACTS) == cli.NAMES
     assert FULL.skies * FULL.per_sky == FULL.one_sky == 100_000  # as in the thesis
     assert QUICK.per_sky < FULL.per_sky
-    fewer = FULL.with_ours(700)
+    fewer = FULL.limit_ours(700)
     assert (fewer.per_sky, fewer.one_sky) == (FULL.per_sky, FULL.one_sky)
     assert (fewer.ours_per_sky, fewer.bound_per_sky, fewer.deep_per_sky, fewer.ours_one_sky) == (700, 700, 500, 7000)
 
@@ -277,19 +277,19 @@ def test_a_stopped_run_goes_on_from_where_it_was(tmp_path, monkeypatch):
     wanted = [task for sky in range(4) for task in tasks_of(KUA, 0, sky, 3)]
     computed = []
 
-    def stopping(task):
+    def stop_after(task):
         if len(computed) == 2:
             raise KeyboardInterrupt
         computed.append(task)
         return compute_chunk(task)
 
-    monkeypatch.setattr(chunks, "compute_chunk", stopping)
-    with ChunkStore(tmp_path, jobs=1, progress=silent) as store, pytest.raises(KeyboardInterrupt):
+    monkeypatch.setattr(chunks, "compute_chunk", stop_after)
+    with ChunkStore(tmp_path, jobs=1, progress=hide_progress) as store, pytest.raises(KeyboardInterrupt):
         list(store.chunks("stopped", wanted))
     assert len(list((tmp_path / chunks.FOLDER).iterdir())) == 2  # whole chunks only, no temporary files
     computed.clear()
     monkeypatch.setattr(chunks, "compute_chunk", lambda task: computed.append(task) or compute_chunk(task))
-    with ChunkStore(tmp_path, jobs=1, progress=silent) as store:
+    with ChunkStore(tmp_path, jobs=1, progress=hide_progress) as store:
         computed_chunks = list(store.chunks("resumed", wanted))
         assert computed == wanted[2:]
         assert len(list(store.chunks("again", wanted))) == 4 and computed == wanted[2:]
@@ -337,7 +337,7 @@ def test_usage(tmp_path, monkeypatch, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_place_that_cannot_be_written_is_named_at_once(tmp_path, capsys):
+def test_a_read_only_output_folder_is_named_at_once(tmp_path, capsys):
     (tmp_path / "file").write_text("in the way")
     assert main(["reproduce", "-D", str(tmp_path / "file"), "--full"]) == 4
     assert str(tmp_path / "file") in capsys.readouterr().err

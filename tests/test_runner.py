@@ -1,4 +1,4 @@
-"""Tasks in processes and on Dask: some kill their process, some block it, and the others are done all the same."""
+"""Tasks in processes and on Dask: some kill or block their process, and the others are still done."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ JOBS = 2
 
 
 def work(name: str) -> tuple[str, int]:
-    """A moment of work; the name says whether the process dies of it, or stops for ever."""
+    """A short task; by its name the process is killed, or blocked for ever."""
     time.sleep(0.02)
     if "deadly" in name:
         os._exit(9)
@@ -44,8 +44,8 @@ def test_a_task_that_kills_its_process_costs_the_others_nothing():
     names[5], names[40] = "05-deadly", "40-deadly"
     done = outcomes(Runner(work, jobs=JOBS), names)
     assert [name for name in names if isinstance(done[name], Died)] == ["05-deadly", "40-deadly"]
-    # Those in hand at a death are done one at a time, by one process until it dies and by one after it; then the
-    # processes work side by side again.
+    # Tasks in progress at a death are done one at a time, by one process until it dies and by one after it; then the
+    # processes work in parallel again.
     processes = {outcome[1] for outcome in done.values() if not isinstance(outcome, Died)}
     assert len(processes) <= 3 * JOBS + 2 * 2
 
@@ -60,7 +60,7 @@ def test_few_tasks_are_repeated_after_a_death():
         def until_failure():
             from startrack.runner import TASKS_PER_PROCESS, _Pool
 
-            ends.append((yield from runner._until_failure(iter(names), _Pool(JOBS), TASKS_PER_PROCESS * JOBS)))
+            ends.append((yield from runner._run_until_failure(iter(names), _Pool(JOBS), TASKS_PER_PROCESS * JOBS)))
 
         done = [name for name, _ in until_failure()]
     (suspects,) = ends
@@ -69,7 +69,7 @@ def test_few_tasks_are_repeated_after_a_death():
     assert not {*done} & {*suspects}
 
 
-def test_a_stopped_process_does_not_hold_the_end():
+def test_a_stopped_process_does_not_block_the_end():
     start = time.monotonic()
     done = outcomes(Runner(work, jobs=JOBS, limit_s=10.0), ["0", "1-stopping", "2", "3"])
     assert [name for name, outcome in done.items() if isinstance(outcome, Died)] == ["1-stopping"]
@@ -133,7 +133,7 @@ def test_a_task_that_died_is_an_internal_error_of_its_image(tmp_path):
 
 
 def test_a_scheduler_that_goes_stops_the_run():
-    """It ends, as far as the client can tell, after the first outcome."""
+    """For the client it ends after the first outcome."""
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(1, processes=True, threads_per_worker=1, dashboard_address=None) as cluster:
         results = Runner(work, cluster=cluster.scheduler_address).results([str(number) for number in range(200)])

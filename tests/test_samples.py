@@ -1,4 +1,4 @@
-"""The samples in the repository: they name their own facts, and what is known about them is said truly."""
+"""The samples in the repository: their metadata, and their truth."""
 
 import importlib.util
 import json

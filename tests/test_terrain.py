@@ -44,7 +44,7 @@ TERRAINS: dict[str, Terrain] = {
 every_terrain = pytest.mark.parametrize("terrain", TERRAINS.values(), ids=TERRAINS)
 
 
-def allowed_places(terrain: Terrain, n: int, seed: int) -> np.ndarray:
+def allowed_positions(terrain: Terrain, n: int, seed: int) -> np.ndarray:
     places = np.random.default_rng(seed).uniform(-terrain.reach_m, terrain.reach_m, (8 * n, 2))
     return places[np.asarray(terrain.allowed(places))][:n]
 
@@ -72,7 +72,7 @@ def test_bounds_hold_the_horizon_of_every_allowed_point(
 
 @every_terrain
 def test_bounds_close_in_on_the_horizon(terrain: Terrain) -> None:
-    places = allowed_places(terrain, 200, 1)
+    places = allowed_positions(terrain, 200, 1)
     azimuth = np.random.default_rng(2).uniform(0, 2 * np.pi, 200)
     horizon = terrain.horizon_rad(places, azimuth)
     widths = []
@@ -92,7 +92,7 @@ def test_bounds_close_in_on_the_horizon(terrain: Terrain) -> None:
 
 @every_terrain
 def test_methods_are_elementwise_and_broadcast(terrain: Terrain) -> None:
-    places = allowed_places(terrain, 7, 3)
+    places = allowed_positions(terrain, 7, 3)
     azimuth = np.linspace(0, 6, 7)
     whole = terrain.horizon_rad(places, azimuth)
     assert whole.shape == (7,)
@@ -122,7 +122,7 @@ def test_methods_are_elementwise_and_broadcast(terrain: Terrain) -> None:
 def test_the_search_area_lies_within_the_searched_square(terrain: Terrain) -> None:
     assert terrain.reach_m > 0
     assert np.asarray(terrain.allowed(np.zeros((1, 2)))).all()
-    places = allowed_places(terrain, 1000, 4)
+    places = allowed_positions(terrain, 1000, 4)
     assert len(places) == 1000
     inside = np.hypot(places[:, 0], places[:, 1]) <= terrain.search_radius_m
     assert inside.mean() > 0.4
@@ -135,7 +135,7 @@ def test_the_search_area_lies_within_the_searched_square(terrain: Terrain) -> No
 def test_cylinder_agrees_with_rays_traced_to_a_polygonal_wall(name: str) -> None:
     crater = TERRAINS[name]
     assert isinstance(crater, Cylinder)
-    places = allowed_places(crater, 60, 6)
+    places = allowed_positions(crater, 60, 6)
     rng = np.random.default_rng(7)
     for place in places:
         azimuth = rng.uniform(0, 2 * np.pi)
@@ -187,7 +187,7 @@ GOOD: dict[str, Any] = {
 }  # fmt: skip
 
 
-def changed(path: str, value: Any) -> dict[str, Any]:
+def change_key(path: str, value: Any) -> dict[str, Any]:
     d = copy.deepcopy(GOOD)
     *tables, key = path.split(".")
     table = d
@@ -207,7 +207,7 @@ def test_every_key_reaches_the_terrain() -> None:
         camera_height_m=2.0, search_radius_m=900.0,
     )  # fmt: skip
     assert crater.reach_m == 1000.0
-    earth = terrain_from_dict(changed("origin.height_m", 120.0) | {"body": "earth"})
+    earth = terrain_from_dict(change_key("origin.height_m", 120.0) | {"body": "earth"})
     assert (earth.site.body, earth.site.height_m) == ("earth", 120.0)
     least = {key: GOOD[key] for key in ("body", "origin", "cylinder")}
     assert terrain_from_dict(least, "plain").name == "plain"
@@ -238,7 +238,7 @@ BAD = [
 @pytest.mark.parametrize(("path", "value", "named"), BAD, ids=lambda v: str(v)[:30])
 def test_a_wrong_key_is_refused_and_named(path: str, value: Any, named: str, tmp_path: Path) -> None:
     file = tmp_path / "bad.toml"
-    file.write_text(tomli_w.dumps(changed(path, value)))
+    file.write_text(tomli_w.dumps(change_key(path, value)))
     with pytest.raises(BadInput, match=named) as caught:
         load_terrain(file)
     assert caught.value.reason == "bad_terrain"

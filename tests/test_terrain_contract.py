@@ -24,7 +24,7 @@ INTERPOLATED_RAD = 1e-4  # MAX_BEND_TAN of horizon_interpolator
 
 
 class LevelHorizon(Terrain):
-    """A user's own terrain with the three required methods: the same horizon from everywhere."""
+    """A user's own terrain with the three required methods: the same horizon at every position."""
 
     search_radius_m = 300.0
 
@@ -103,7 +103,7 @@ MAKERS: dict[str, Callable[[], Any]] = {
     "attributes of a cylinder": lambda: AttributeWrapper(cylinder()),
     "attributes of a height map": lambda: AttributeWrapper(height_map()),
     "a user's own": LevelHorizon,
-    "a user's own that tells positions": FacingWall,
+    "a user's own that depends on position": FacingWall,
 }
 every_terrain = pytest.mark.parametrize("name", MAKERS)
 MEMBERS = [name for name in dir(Terrain) if not name.startswith("_")]
@@ -153,7 +153,7 @@ def test_all_methods_broadcast(name):
 
 
 @every_terrain
-def test_every_member_is_there_and_says_what_the_ground_is(name):
+def test_every_member_exists_and_describes_the_ground(name):
     terrain = MAKERS[name]()
     for member in MEMBERS:
         assert getattr(terrain, member, None) is not None or member in ("site", "rim_radius_m", "table_path")
@@ -178,7 +178,7 @@ def test_every_member_is_there_and_says_what_the_ground_is(name):
 
 @pytest.mark.parametrize("whole", [cylinder, height_map])
 @pytest.mark.parametrize("wrapper", [ForwardingTerrain, AttributeWrapper])
-def test_a_wrapper_answers_as_the_terrain_does(whole, wrapper):
+def test_a_wrapper_returns_the_values_of_the_terrain(whole, wrapper):
     terrain, rng = whole(), np.random.default_rng(3)
     wrapped = wrapper(terrain)
     points, azimuths = rng.uniform(-200, 200, (20, 2)), rng.uniform(0, 2 * np.pi, 20)

@@ -1,4 +1,4 @@
-"""The shipped craters: places are found from rays about their skylines, with the errors that the files state."""
+"""The shipped craters: positions are found from rays about their skylines, with the errors that the files state."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from startrack.localization import ExactPosterior, check_consistency
 from startrack.terrain import load_terrain
 from startrack.types import Evidence
 
-PLACES = {  # east and north [m]: the area that is searched lies about them
+PLACES = {  # east and north [m]: centres of the search areas
     "haworth floor": (-2515.0, 5192.0), "de-gerlache floor": (-434.0, -6059.0), "faustini floor": (1000.0, -2000.0),
     "kepler floor": (-521.0, -7271.0), "kepler wall": (9647.0, -1547.0),
 }  # fmt: skip
@@ -24,11 +24,11 @@ def _own_cache(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("where", PLACES)
-def test_a_place_in_a_shipped_crater_is_found(where):
+def test_a_position_in_a_shipped_crater_is_found(where):
     terrain = load_terrain(where.split()[0])
     latitude, longitude = latlon_from_enu(terrain.site, *PLACES[where], 0.0)
     terrain = replace(terrain, site=Site("moon", float(latitude), float(longitude)), search_radius_m=250.0)
-    rays = 1200 if where.startswith("kepler") else 3000  # wide craters with low rims tell less
+    rays = 1200 if where.startswith("kepler") else 3000  # wide craters with low rims give less information
     rng, place = np.random.default_rng(3), np.array([110.0, -70.0])
     azimuth = rng.uniform(0, 2 * np.pi, rays)
     above = rng.uniform(-0.1, 0.1, rays)

@@ -1,4 +1,4 @@
-"""Terrain files with height maps: what is read, what is refused, and the command that makes and shows them."""
+"""Terrain files with height maps: reading, refusals, and the command that makes and shows them."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_shipped_maps_load(name):
     assert terrain.name == name
     ground = terrain.ground_m(np.zeros((1, 2)))[0]
     floors = {"shackleton": -2720, "haworth": -3377, "faustini": -2707, "de-gerlache": -1115, "kepler": -2900}
-    assert ground == pytest.approx(floors[name], abs=250)  # what others give for the craters' floors
+    assert ground == pytest.approx(floors[name], abs=250)  # published heights of the craters' floors
 
 
 def test_every_key_reaches_the_terrain(tmp_path):
@@ -103,7 +103,7 @@ def test_what_cannot_be_used_is_refused_and_named(changes, named, tmp_path):
     assert caught.value.reason == "bad_terrain"
 
 
-def test_maps_without_place_of_other_bodies_or_with_holes_are_refused(tmp_path):
+def test_maps_without_position_of_other_bodies_or_with_holes_are_refused(tmp_path):
     import tifffile
 
     path = terrain_file(tmp_path)
@@ -152,7 +152,7 @@ def test_maps_survive_the_file_and_rasterio_reads_the_same(projection, tmp_path)
     assert dumb.xy_from_latlon(*place)[0] == pytest.approx(projection.xy_from_latlon(*place)[0], abs=1e-3)
 
 
-def test_rasterio_reads_what_the_tags_do_not_tell(tmp_path):
+def test_rasterio_reads_projections_that_the_tags_lack(tmp_path):
     rasterio = pytest.importorskip("rasterio")
     wkt = rasterio.crs.CRS.from_proj4("+proj=stere +lat_0=-90 +lon_0=0 +R=1737400 +units=m")
     m = hill()
@@ -168,7 +168,7 @@ def test_rasterio_reads_what_the_tags_do_not_tell(tmp_path):
 
 
 def test_a_cloud_optimised_geotiff_is_read(tmp_path):
-    """Tiled, compressed, with overviews, whole numbers with scale, offset and no-data, as agencies hand them out."""
+    """Tiled, compressed, with overviews, integers with scale, offset and no-data, as published by agencies."""
     rasterio = pytest.importorskip("rasterio")
     from rasterio.enums import Resampling
     from rasterio.shutil import copy
@@ -299,8 +299,8 @@ def test_whole_numbers_without_a_scale_are_not_taken_for_metres(tmp_path, capsys
     assert read_map(tmp_path / "said.tif").heights_m.max() == pytest.approx(1600, abs=5)
 
 
-def test_the_error_of_posts_is_told_by_the_map_where_nobody_says(tmp_path, capsys):
-    """Rough ground known everywhere: what import takes for a grid is what lies between its posts, within a third."""
+def test_the_error_of_posts_is_estimated_from_the_map(tmp_path, capsys):
+    """Known rough ground: the estimated error of a grid is that of the interpolation between its posts to a third."""
     rng = np.random.default_rng(3)
     wave = np.hypot(*np.meshgrid(np.fft.fftfreq(1025), np.fft.fftfreq(1025)))
     wave[0, 0] = np.inf
@@ -326,7 +326,7 @@ def test_the_error_of_posts_is_told_by_the_map_where_nobody_says(tmp_path, capsy
     assert all(0.66 < ratio < 1.5 for ratio in taken.values()), taken
 
 
-def test_pixels_given_for_the_label_are_said_to_be(tmp_path, capfd):
+def test_pixels_without_their_label_are_refused_with_advice(tmp_path, capfd):
     pytest.importorskip("rasterio")
     from PIL import Image
 
@@ -339,7 +339,7 @@ def test_pixels_given_for_the_label_are_said_to_be(tmp_path, capfd):
     assert capfd.readouterr().err == ""
 
 
-def test_show_speaks_in_words_and_units(tmp_path, capsys):
+def test_show_prints_words_and_units(tmp_path, capsys):
     path = terrain_file(tmp_path)
     assert main(["terrain", "show", str(path), "--no-plots", "--at", "100", "-50"]) == 0
     said = capsys.readouterr().out
@@ -360,16 +360,16 @@ def test_a_folder_that_takes_no_pictures_is_named_before_any_work(tmp_path, caps
         assert "written to this folder" in said
 
 
-def test_a_build_says_so_in_one_line_and_an_interrupted_one_is_forgotten(tmp_path, capsys, monkeypatch):
+def test_a_build_prints_one_line_and_an_interrupted_one_is_discarded(tmp_path, capsys, monkeypatch):
     path = terrain_file(tmp_path)
     terrain = load_terrain(path)
     assert isinstance(terrain, HeightMap)
 
-    def interrupted(done: int, total: int) -> None:
+    def interrupt(done: int, total: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        terrain.prepare(interrupted)
+        terrain.prepare(interrupt)
     table = terrain.table_path
     assert not list(table.parent.iterdir())
     table.with_suffix(".lock").touch()  # left by one that was killed
@@ -440,7 +440,7 @@ def damaged_maps(folder: Path) -> list[Path]:
 
 
 def test_damaged_maps_are_refused_and_named_or_read(tmp_path, capfd):
-    """A flipped byte among the heights cannot be noticed; whatever is noticed is bad_terrain in one line."""
+    """A flipped byte among the heights cannot be noticed; other damage is bad_terrain in one line."""
     path, refusals = terrain_file(tmp_path, dem={"scale": 0.02}), []
     for damaged in damaged_maps(tmp_path):
         path.write_text(tomli_w.dumps({**HILL, "dem": {"file": damaged.name, "scale": 0.02}}))

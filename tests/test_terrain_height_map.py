@@ -60,7 +60,7 @@ def test_horizon_from_the_floor_is_that_of_another_program():
     assert turned.std() > 0.3  # a mirrored map would be noticed
 
 
-def marched_rad(terrain: HeightMap, place: np.ndarray, azimuth: float, step_m: float, end_m: float) -> float:
+def march_horizon_rad(terrain: HeightMap, place: np.ndarray, azimuth: float, step_m: float, end_m: float) -> float:
     """The horizon by small steps, with the numpy surface of `ground_up_m`."""
     s = np.concatenate([np.arange(step_m / 16, 400.0, step_m / 16), np.arange(400.0, end_m, step_m)])
     points = place + s[:, None] * np.array([np.sin(azimuth), np.cos(azimuth)])
@@ -75,7 +75,7 @@ def test_horizons_are_those_of_small_steps(name):
     rng = np.random.default_rng(1)
     places, azimuths = rng.uniform(-6000, 6000, (25, 2)), rng.uniform(0, 2 * np.pi, 25)
     found = terrain.horizon_rad(places, azimuths)
-    slow = [marched_rad(terrain, p, a, 4.0, 30_000.0) for p, a in zip(places, azimuths, strict=True)]
+    slow = [march_horizon_rad(terrain, p, a, 4.0, 30_000.0) for p, a in zip(places, azimuths, strict=True)]
     off = np.degrees(found - slow)
     assert np.sqrt(np.mean(off**2)) < 0.002
     assert off.min() > -0.002  # small steps can only miss the top
@@ -92,7 +92,7 @@ def test_the_table_changes_no_horizon(shackleton):
 
 
 def test_far_crests_are_found_with_the_table_too():
-    """From Haworth's wall the horizon in the south stands 50 to 60 km off."""
+    """From Haworth's wall the horizon in the south is 50 to 60 km away."""
     terrain = load_terrain("haworth")
     latitude, longitude = latlon_from_enu(terrain.site, 7082.0, 12_306.0, 0.0)
     site = Site("moon", float(latitude), float(longitude))
@@ -112,7 +112,10 @@ def test_bounds_hold_the_horizons_of_small_steps(shackleton, half, turn):
     low, high = small.horizon_bounds_rad(centres, np.array(half), azimuths, turn)
     places = centres[:, None] + rng.uniform(-half, half, (20, 8, 2))
     turned = azimuths[:, None] + rng.uniform(-turn, turn, (20, 8))
-    slow = [marched_rad(small, p, a, 8.0, 30_000.0) for p, a in zip(places.reshape(-1, 2), turned.ravel(), strict=True)]
+    slow = [
+        march_horizon_rad(small, p, a, 8.0, 30_000.0)
+        for p, a in zip(places.reshape(-1, 2), turned.ravel(), strict=True)
+    ]
     horizon = np.array(slow).reshape(20, 8)
     ok = small.allowed(places)
     assert ok.mean() > 0.9
@@ -146,7 +149,7 @@ def test_the_table_is_kept_and_found_again_by_content(shackleton):
 
 
 def test_of_two_that_need_a_table_one_makes_it(shackleton, monkeypatch):
-    """Each stands for a process: locks are of open files, not of processes."""
+    """Each thread represents a process: locks belong to open files, not to processes."""
     made, build = [], HeightMap._build_table
 
     def slow(terrain, progress):
@@ -177,7 +180,7 @@ def test_each_variant_of_a_terrain_keeps_its_own_table(shackleton):
 
 
 def evidence_at(terrain, place, rng, error_rad=0.0, rays=4000) -> Evidence:
-    """Rays near the skyline of a place, each sure of itself but for one in a hundred."""
+    """Rays near the skyline of a position, with large ratios, of which one in a hundred is wrong."""
     azimuth = rng.uniform(0, 2 * np.pi, rays)
     horizon = terrain.horizon_rad(np.asarray(place)[None], azimuth) + error_rad
     elevation = horizon + rng.uniform(-0.1, 0.1, rays)
@@ -185,7 +188,7 @@ def evidence_at(terrain, place, rng, error_rad=0.0, rays=4000) -> Evidence:
     return Evidence(azimuth_rad=azimuth, elevation_rad=elevation, llr=llr, edge_sigma_rad=np.full(rays, 1e-5))
 
 
-def test_a_place_is_found_within_its_stated_error(shackleton):
+def test_a_position_is_found_within_its_stated_error(shackleton):
     exact = replace(shackleton, height_sigma_m=0.0, horizon_sigma_common_rad=0.0)
     rng, nees = np.random.default_rng(4), []
     for _ in range(4):
@@ -198,7 +201,7 @@ def test_a_place_is_found_within_its_stated_error(shackleton):
     assert 0.3 < np.mean(nees) < 5
 
 
-def test_a_common_error_is_estimated_with_the_place_and_widens_its_covariance(shackleton):
+def test_a_common_error_is_estimated_with_the_position_and_widens_its_covariance(shackleton):
     rng, place, error = np.random.default_rng(5), np.array([420.0, -130.0]), np.radians(0.08)
     evidence = evidence_at(shackleton, place, rng, error)
     unknown = replace(shackleton, height_sigma_m=0.0, horizon_sigma_common_rad=np.radians(0.1))
@@ -237,7 +240,7 @@ def test_rays_that_run_off_the_map_give_no_evidence(shackleton):
         ExactPosterior()(blind, small)
 
 
-def test_glare_takes_the_evidence_of_its_azimuths(shackleton):
+def test_glare_removes_the_evidence_of_its_azimuths(shackleton):
     lit = replace(shackleton, glare_rad=((np.radians(350), np.radians(20)),))
     told = lit.is_informative(np.radians([349.0, 351.0, 0.0, 19.0, 21.0, 180.0]), np.full(6, 0.5))
     assert told.tolist() == [True, False, False, False, True, True]
@@ -247,7 +250,7 @@ def test_glare_takes_the_evidence_of_its_azimuths(shackleton):
     assert line.startswith("azimuths 350 to 20 degrees: no evidence")
 
 
-def test_azimuths_where_the_maps_end_are_told_as_ranges(shackleton):
+def test_azimuths_where_the_maps_end_are_listed_as_ranges(shackleton):
     """A map that ends close by in the east and far off elsewhere."""
     whole = shackleton.maps[0].crop_around(shackleton.site.latitude_rad, shackleton.site.longitude_rad, 30_000.0)
     azimuth = np.radians(np.arange(0.5, 360))
@@ -308,7 +311,7 @@ def test_ground_is_the_maps_height_on_the_sphere():
     ground = terrain.ground_m(np.array([[0.0, 0.0], [3000.0, 4000.0]]))
     assert ground[0] == pytest.approx(-1000.0, abs=1e-6)
     assert ground[1] == pytest.approx(np.sqrt(1_736_400.0**2 - 5000.0**2) - 1_737_400.0, abs=1e-3)
-    there = replace(terrain, camera_height_m=300.0)  # nothing is made up beyond the map's end, 20 km off
+    there = replace(terrain, camera_height_m=300.0)  # no ground beyond the map's end, 20 km off
     assert there.horizon_rad(np.zeros(2), np.array([np.pi / 4]))[0] == pytest.approx(-0.0205, abs=0.001)
     # On a smooth sphere the horizon dips by sqrt(2 h / R); here seen to where the map ends or beyond
     dip = terrain.horizon_rad(np.zeros(2), np.array([1.0]))[0]

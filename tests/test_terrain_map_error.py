@@ -1,4 +1,4 @@
-"""What a height map says about its own error: as it is, interpolated, and without heights."""
+"""Error estimates of height maps: measured, interpolated, and without heights."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def grid(heights_m: Array, post_m: float = 100.0) -> Raster:
     )  # fmt: skip
 
 
-def rough(exponent: float) -> Array:
+def rough_ground(exponent: float) -> Array:
     """Self-affine ground, (500, 500), with that Hurst exponent."""
     rng = np.random.default_rng(1)
     wave = np.hypot(*np.meshgrid(np.fft.fftfreq(512), np.fft.rfftfreq(512), indexing="ij"))
@@ -33,27 +33,27 @@ def rough(exponent: float) -> Array:
     return np.asarray(ground * 10 / np.diff(ground, axis=0).std())
 
 
-def measured() -> Array:
+def estimate_errors() -> Array:
     terrain = load_terrain("shackleton")
     at = terrain.site.latitude_rad, terrain.site.longitude_rad
     return np.asarray(terrain.maps[0].crop_around(*at, 60_000.0).heights_m, dtype=np.float64)
 
 
-def interpolated(ground: Array, every: int, order: int) -> Array:
-    """Every so many posts, and between them the spline of that order again."""
+def interpolate_ground(ground: Array, every: int, order: int) -> Array:
+    """The ground sampled at every n-th post and interpolated by a spline of the given order."""
     posts = ground[::every, ::every]
     at = [np.arange((n - 1) * every + 1) / every for n in posts.shape]
     return np.asarray(map_coordinates(posts, np.meshgrid(*at, indexing="ij"), order=order, mode="nearest"))
 
 
-GROUNDS = [rough(0.8), rough(0.95), measured()]
+GROUNDS = [rough_ground(0.8), rough_ground(0.95), estimate_errors()]
 
 
 @pytest.mark.parametrize("ground", GROUNDS, ids=["rough 0.8", "rough 0.95", "240 m map"])
 @pytest.mark.parametrize("order", [1, 3])
 @pytest.mark.parametrize("every", [2, 4])
 def test_the_error_of_an_interpolated_map_is_that_of_what_it_was_made_from(ground, order, every):
-    made = interpolated(ground, every, order)
+    made = interpolate_ground(ground, every, order)
     off = (made - ground[: made.shape[0], : made.shape[1]])[8:-8, 8:-8]
     true = float(np.sqrt(np.mean(off**2)))
     assert 1 / 1.5 < error_between_posts_m(grid(made)) / true < 1.5
@@ -91,7 +91,7 @@ def test_holes_are_left_out():
 
 
 def test_import_warns_of_an_interpolated_map(tmp_path, capsys):
-    made = interpolated(GROUNDS[0][:161, :161], 4, 3)
+    made = interpolate_ground(GROUNDS[0][:161, :161], 4, 3)
     for name, heights in (("made", made), ("ground", GROUNDS[0][:161, :161])):
         write_map(tmp_path / f"{name}.tif", grid(heights))
         words = ["--latitude", "-90", "--longitude", "0", "--radius", "2000", "--half", "7900", "--json"]

@@ -63,7 +63,7 @@ def picture(
 ) -> tuple[Detections, np.ndarray, np.ndarray]:  # fmt: skip
     """Detections at a random attitude, the true star of each (-1: none), and that attitude.
 
-    One side of the sky is hidden, false stars are strewn over it, and `hot` pixels are brighter than any star.
+    One side of the sky is hidden, random false stars are added, and `hot` pixels are brighter than any star.
     """
     rng = np.random.default_rng([seed, 7])
     R = Rotation.random(random_state=rng).as_matrix()
@@ -91,7 +91,7 @@ def detections(xy_px: np.ndarray, flux: np.ndarray, psf_sigma_px: float = 1.0) -
     )  # fmt: skip
 
 
-def listed(name: str) -> Detections:
+def photograph_detections(name: str) -> Detections:
     """A real photograph's point sources."""
     with (DATA / name).open(encoding="utf-8") as file:
         lines = file.readlines()
@@ -141,7 +141,7 @@ def test_the_lens_is_found_with_the_stars(case: str, wrong_by: float) -> None:
     assert names.false_alarm_probability < 1e-9
     assert found.camera.mirrored == camera.mirrored
     assert found.camera.lens.model == ("pinhole" if fov <= 40 else "kannala_brandt")
-    # The map, not its parameters: where the lens is said to be known, its pixels are those of the true one.
+    # The projection, not its parameters: inside the calibrated angle the pixels are those of the true lens.
     angle = np.linspace(0, min(found.camera.calibrated_angle_rad, camera.max_angle_rad) * 0.95, 50)
     radii = [c.focal_px[0] * c.lens.rho(angle) for c in (found.camera, camera)]
     assert np.abs(radii[0] - radii[1]).max() < 2.0
@@ -172,7 +172,7 @@ def test_too_few_stars_are_refused_at_once() -> None:
 def test_narrow_photographs_agree_with_two_other_solvers(
     name: str, ra_deg: float, dec_deg: float, arcsec: float
 ) -> None:
-    seen = listed(name)
+    seen = photograph_detections(name)
     for fov in (10.4, 11.4, 12.4):
         found = identify_unknown_lens(seen, (1024, 768), np.radians(fov), sky())
         assert boresight_off_rad(found, ra_deg, dec_deg) < arcsec * ARCSEC
@@ -183,11 +183,11 @@ def test_narrow_photographs_agree_with_two_other_solvers(
 
 def test_an_overcast_photograph_is_refused() -> None:
     with pytest.raises(NotIdentified, match="better than chance"):
-        identify_unknown_lens(listed("overcast.csv"), (1392, 1040), np.pi, sky())
+        identify_unknown_lens(photograph_detections("overcast.csv"), (1392, 1040), np.pi, sky())
 
 
 def test_a_moonlit_photograph_is_identified() -> None:
-    found = identify_unknown_lens(listed("moonlit.csv"), (1392, 1040), np.pi, sky())
+    found = identify_unknown_lens(photograph_detections("moonlit.csv"), (1392, 1040), np.pi, sky())
     assert len(found.identification) >= 300
     assert found.camera.focal_px[0] == pytest.approx(337.2, abs=1.0)  # of the same camera on another night
     assert found.camera.centre_px == pytest.approx((709.7, 489.7), abs=1.0)
@@ -215,7 +215,7 @@ def test_a_photograph_is_identified_cold(photo) -> None:
     assert result.camera.calibrated_angle_rad > np.radians(70)
 
 
-def test_its_mirror_image_half_covered_is_said_to_be_mirrored(photo, tmp_path, capsys) -> None:
+def test_its_half_covered_mirror_image_is_reported_as_mirrored(photo, tmp_path, capsys) -> None:
     from PIL import Image
 
     pixels = photo.pixels_adu[:, ::-1].copy()
@@ -233,7 +233,7 @@ def test_its_mirror_image_half_covered_is_said_to_be_mirrored(photo, tmp_path, c
     assert record["camera"]["focal_px"][0] == pytest.approx(337.2, abs=1.5)
 
 
-def test_the_map_of_the_sky_is_that_of_a_search() -> None:
+def test_the_proximity_mask_equals_a_search() -> None:
     rng = np.random.default_rng(1)
     rays, asked = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in rng.normal(size=(2, 3000, 3)))
     near = proximity_mask(rays[:400], np.radians(1.5))
@@ -244,7 +244,7 @@ def test_the_map_of_the_sky_is_that_of_a_search() -> None:
 
 
 @pytest.mark.parametrize(("name", "lists"), [("equisolid, mirrored", 30), ("70 degrees", 12), ("20 degrees", 12)])
-def test_the_attitude_is_as_sure_as_it_says_though_the_lens_comes_from_the_same_stars(name: str, lists: int) -> None:
+def test_the_attitude_sigma_is_right_with_a_lens_from_the_same_stars(name: str, lists: int) -> None:
     camera, picture_of, fov = LENSES[name]
     nees = []
     for seed in range(100, 100 + lists):

@@ -1,4 +1,4 @@
-"""Narrow fields of unknown width: the votes of triangles, lenses that bend, and what must not be answered."""
+"""Narrow fields of unknown width: the votes of triangles, distorted lenses, and refusals."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_the_first_view_voted_for_is_right(seed: int, wrong_by: float, mirrored:
 
 
 @pytest.mark.parametrize("bend_px", [-12.0, 12.0])
-def test_a_narrow_lens_that_bends_is_not_called_a_pinhole(bend_px: float) -> None:
+def test_a_distorted_narrow_lens_is_not_fitted_as_a_pinhole(bend_px: float) -> None:
     half = np.radians(15)
     focal = 700 / np.tan(half)
     bend = bend_px / focal / half**3
@@ -56,7 +56,7 @@ def test_a_narrow_lens_that_bends_is_not_called_a_pinhole(bend_px: float) -> Non
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_noise_in_heaps_or_not_is_nowhere_near_an_answer(seed: int) -> None:
+def test_noise_with_or_without_clumps_is_far_from_acceptance(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(20, 600))
     heaps = rng.uniform(0, 1, (max(n // 12, 2), 2)) * SIZE
@@ -71,7 +71,7 @@ def test_noise_in_heaps_or_not_is_nowhere_near_an_answer(seed: int) -> None:
     assert narrow.tried > 1000
 
 
-def test_similar_triangles_are_those_of_a_comparison_of_all_with_all() -> None:
+def test_similar_triangles_equal_those_of_an_exhaustive_comparison() -> None:
     rng = np.random.default_rng(1)
     rays = rng.normal(size=(150, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The wheel: what is in it, and that it works away from the checkout."""
+"""The wheel: its content, and its use outside the checkout."""
 
 import json
 import os
@@ -25,7 +25,7 @@ def wheel(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def unpacked(wheel, tmp_path_factory):
+def unpacked_wheel(wheel, tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(folder)
@@ -37,7 +37,7 @@ def names(wheel):
         return set(archive.namelist())
 
 
-def elsewhere(unpacked, folder, *words):
+def run_elsewhere(unpacked, folder, *words):
     """`python words` with the wheel's content alone, in another folder."""
     done = subprocess.run(
         [sys.executable, *words], cwd=folder, capture_output=True, text=True,
@@ -66,18 +66,18 @@ def test_nothing_else_is_inside(wheel):
     assert wheel.stat().st_size < 5e6
 
 
-def test_it_works_away_from_the_checkout(unpacked, tmp_path):
-    where = elsewhere(unpacked, tmp_path, "-c", "import startrack; print(startrack.__file__)").strip()
-    assert Path(where).is_relative_to(unpacked)
+def test_it_works_away_from_the_checkout(unpacked_wheel, tmp_path):
+    where = run_elsewhere(unpacked_wheel, tmp_path, "-c", "import startrack; print(startrack.__file__)").strip()
+    assert Path(where).is_relative_to(unpacked_wheel)
     image = str(ROOT / "sample_images/near-wall.png")
-    out = elsewhere(unpacked, tmp_path, "-m", "startrack.cli.main", "locate", image, "--json", "--no-plots")
+    out = run_elsewhere(unpacked_wheel, tmp_path, "-m", "startrack.cli.main", "locate", image, "--json", "--no-plots")
     position = json.loads(out)["position"]
     assert abs(position["east_m"] + 6900) < 40
     assert abs(position["north_m"] - 4700) < 40
 
 
-def test_every_shipped_file_is_read_from_it(unpacked, tmp_path):
-    out = elsewhere(unpacked, tmp_path, "-m", "startrack.cli.main", "doctor")
+def test_every_shipped_file_is_read_from_it(unpacked_wheel, tmp_path):
+    out = run_elsewhere(unpacked_wheel, tmp_path, "-m", "startrack.cli.main", "doctor")
     for kind in ("calib", "terrain"):
         for path in (ROOT / kind).glob("*.toml"):
             assert path.stem in out

@@ -1,11 +1,11 @@
-"""Whole folders of images: found, located side by side, taken up again, and gathered into tables."""
+"""Batches: find the images of a folder, locate them in parallel, resume a stopped run, write tables."""
 
 from startrack.batch.find import Image, images_under, listed_images
 from startrack.batch.store import (
     JOB,
     LOCK,
     belongs_to_other_images,
-    only_writer,
+    lock_results,
     record_path,
     stored_record,
     tabled_results,
@@ -27,7 +27,7 @@ __all__ = [
     "listed_images",
     "locate_image",
     "locate_images",
-    "only_writer",
+    "lock_results",
     "record_path",
     "stored_record",
     "table_rows",

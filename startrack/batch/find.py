@@ -112,10 +112,10 @@ def _image_names(root: Path, excluded: str | None) -> list[str]:
     top = os.path.realpath(root)
     entered, found = {top}, []
 
-    def is_entered(place: Path) -> bool:
-        real = os.path.realpath(place)
-        inside_by_link = place.is_symlink() and Path(real).is_relative_to(top)
-        if place.name.startswith(".") or real == excluded or real in entered or inside_by_link:
+    def is_entered(path: Path) -> bool:
+        real = os.path.realpath(path)
+        inside_by_link = path.is_symlink() and Path(real).is_relative_to(top)
+        if path.name.startswith(".") or real == excluded or real in entered or inside_by_link:
             return False
         entered.add(real)
         return True
@@ -130,7 +130,7 @@ def _image_names(root: Path, excluded: str | None) -> list[str]:
 
 
 def _is_file(folder: Path, name: str) -> bool:
-    """Not a pipe, which would block the reader. A link to nothing is an image that will be refused."""
+    """Whether it is no pipe, which would block the reader. A broken link is an image that will be refused."""
     try:
         return stat.S_ISREG((folder / name).stat().st_mode)
     except OSError:

@@ -15,7 +15,7 @@ from startrack.errors import BadInput
 from startrack.files import Locked, hold_lock
 from startrack.output.write import COMPANIONS
 
-JOB = "job_sha256"  # hash of a result's inputs: content of its files, flags, version; null: repeat it
+JOB = "job_sha256"  # hash of a result's inputs (content of its files, flags, version); null: the next run repeats it
 INPUTS = "inputs"  # camera and terrain files that the result was made with: path from the image to SHA-256
 MANIFEST = "manifest.json"
 LOCK = ".startrack-batch.lock"
@@ -30,7 +30,7 @@ NEEDED = {  # by the tables, of a record that is ok
 
 
 @contextmanager
-def only_writer(out: Path) -> Iterator[None]:
+def lock_results(out: Path) -> Iterator[None]:
     """Lock the folder `out` of results against other batches.
 
     Raises BadInput (bad_image) if another batch writes to it, or if the lock file cannot be used.

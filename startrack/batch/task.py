@@ -100,7 +100,7 @@ def _key(task: Task, sha256: str) -> str:
 def _locate_and_write(task: Task, sha256: str, key: str) -> dict[str, Any]:
     """Locate the image and write its record and companions, unless an input is at fault and a solution exists already.
 
-    Former files are removed before new ones are written, so that no mixture of both is taken for a result.
+    Former files are removed before new ones are written, so that no result consists of both.
     """
     from startrack.output import result_dict, write_json, write_results
 

@@ -27,7 +27,7 @@ STARS_PER_RING = 3
 STARS_PER_SECTOR = 2
 MIN_SECTORS = 5
 WRONG_ROTATIONS_RAD = tuple(np.radians((-31.0, -17.0, 13.0, 29.0)))  # attitudes at which only chance matches
-MIN_BY_CHANCE = 0.5
+MIN_CHANCE_MATCHES = 0.5
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ class Checked:
     checks: tuple[Check, ...]
 
     @property
-    def failed(self) -> tuple[Check, ...]:
+    def failed_checks(self) -> tuple[Check, ...]:
         """The checks that the calibration did not pass."""
         return tuple(check for check in self.checks if not check.passed)
 
     @property
     def accepted(self) -> bool:
         """Whether the camera may be used."""
-        return not self.failed
+        return not self.failed_checks
 
 
 @dataclass(frozen=True)
@@ -89,18 +89,22 @@ def rings_and_sectors(camera: Camera, points: Observations) -> tuple[Array, Ints
 def joint_log_p_value(joint: JointFit) -> float:
     """Log-probability (natural) of as many matches by chance.
 
-    The number expected by chance is measured: by the same matching at attitudes that are certainly wrong.
+    The number expected by chance is measured by the same matching at certainly wrong attitudes.
     """
     camera, within = joint.fit.camera, joint.fit.camera.calibrated_angle_rad
     found = sum(map(len, joint.matches))
     wrong = [
         sum(
-            len(match_frame(frame, camera, R_from_rotvec(np.array([0.0, 0.3 * turn, turn])) @ R, within, joint.gate_px))
+            len(
+                match_frame(
+                    frame, camera, R_from_rotvec(np.array([0.0, 0.3 * angle, angle])) @ R, within, joint.gate_px
+                )
+            )
             for frame, R in zip(joint.frames, joint.fit.R_cam_icrs, strict=True)
         )
-        for turn in WRONG_ROTATIONS_RAD
+        for angle in WRONG_ROTATIONS_RAD
     ]
-    return log_p_value_poisson(found, max(float(np.mean(wrong)), MIN_BY_CHANCE))
+    return log_p_value_poisson(found, max(float(np.mean(wrong)), MIN_CHANCE_MATCHES))
 
 
 def mirrored_residual_px(joint: JointFit) -> float:
@@ -112,7 +116,7 @@ def mirrored_residual_px(joint: JointFit) -> float:
 
 
 def check_acceptance(joint: JointFit) -> tuple[Check, ...]:
-    """All checks, the most telling first."""
+    """All checks, the most informative first."""
     fit, matches = joint.fit, joint.matches
     stars = int(fit.used.sum())
     fraction = float(np.average([m.fraction for m in matches], weights=[max(len(m), 1) for m in matches]))

@@ -81,7 +81,7 @@ def _calibrate_corners(
 
 
 def _check_acceptance(fit: LensFit, xy_px: Array, pictures: int) -> tuple[Check, ...]:
-    """All checks, the most telling first."""
+    """All checks, the most informative first."""
     camera = fit.camera
     angle = camera.angle_rad(xy_px[fit.used])
     ring = np.clip((RINGS * angle / camera.calibrated_angle_rad).astype(int), 0, RINGS - 1)
@@ -103,7 +103,7 @@ def _check_acceptance(fit: LensFit, xy_px: Array, pictures: int) -> tuple[Check,
 
 def board_dict(found: BoardCalibration) -> dict[str, Any]:
     """The calibration's JSON object."""
-    fit, failed = found.fit, found.failed
+    fit, failed = found.fit, found.failed_checks
     return {
         "format": FORMAT,
         "status": "refused" if failed else "ok",
@@ -129,7 +129,7 @@ def board_dict(found: BoardCalibration) -> dict[str, Any]:
 def board_line(found: BoardCalibration, name: str) -> str:
     """Summary in one line."""
     fit, camera = found.fit, found.camera
-    verdict = "ok" if found.accepted else f"refused {found.failed[0].reason}"
+    verdict = "ok" if found.accepted else f"refused {found.failed_checks[0].reason}"
     return (
         f"{name}  {verdict}  {len(found.images)} of {len(found.images) + len(found.refused)} pictures  "
         f"{int(fit.used.sum())} corners  held-out {fit.held_out_rms_px:.2f} px  f {camera.focal_px[0]:.2f} px/rad  "

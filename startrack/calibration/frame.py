@@ -23,7 +23,7 @@ LOWEST_RAD = np.radians(3.0)  # on the Earth; below it refraction is not predict
 SEA_LEVEL_HPA, SCALE_HEIGHT_M = 1010.0, 8430.0  # average air
 DEFAULT_SITE = Site("moon", 0.0, 0.0)  # without a site; at most 0.7 arcsec of aberration off
 SAME_PX = 0.7
-TURNED_PX = 4.0  # motion of the sky in the image from which a source at the same pixel is not a star
+TURNED_PX = 4.0  # motion of the sky above which a source that keeps its pixel is not a star
 NO_TIME = (
     "the mid-exposure time is not known: give --time UTC, a sidecar NAME.json with time_utc, or a header with it; "
     "nothing is guessed"
@@ -40,7 +40,7 @@ class Sky:
     R_enu_icrs: Array | None  # (3, 3) None without a site
 
     @property
-    def refracted(self) -> bool:
+    def includes_refraction(self) -> bool:
         """Whether refraction is in the directions."""
         return self.elevation_rad is not None
 

@@ -36,13 +36,13 @@ from startrack.camera.parameters import with_covariance
 from startrack.normal_equations import Observations
 from startrack.types import Array, Bools, NotIdentified
 
-FEWEST = 12
-OUTLIER_CHI2 = 20.0  # two axes: one good star in 20,000 is lost
+MIN_STARS = 12
+OUTLIER_CHI2 = 20.0  # two axes: rejects one good star in 20,000
 CAUCHY_CHI2 = 5.0  # chi-square at which the robust loss has halved a star's weight
-ROBUST = Scheme(loss=cauchy_loss(CAUCHY_CHI2), settled_px=2e-3)  # it only separates wrong matches from right ones
+ROBUST = Scheme(loss=cauchy_loss(CAUCHY_CHI2), settled_px=2e-3)  # this fit only separates wrong matches from right ones
 ROBUST_ROUNDS = 4
 FIRST_SIGMA_PX = 1.0
-SCATTER_SIGMAS = 3.0  # chi-square beyond which the stated centroid errors are not believed
+SCATTER_SIGMAS = 3.0  # deviation of chi-square above which the stated centroid errors are scaled
 MIN_BEYOND, FRACTION_BEYOND = 3, 0.01  # stars at the calibrated angle or farther off the axis
 WIDEST_GAP_RAD = np.radians(8.0)
 
@@ -51,7 +51,7 @@ WIDEST_GAP_RAD = np.radians(8.0)
 class LensFit:
     """A fitted camera with its attitudes, and the quality of the fit."""
 
-    camera: Camera  # with covariance; calibrated as far as stars reach
+    camera: Camera  # with covariance; calibrated up to the outermost stars
     R_cam_icrs: Array  # (images, 3, 3); of boards R_cam_board
     pose_covariance_rad2: Array  # (images, 3, 3); of boards (images, 6, 6), with the positions [squares]
     residual_px: Array  # (n, 2) measured minus predicted, of all observations
@@ -91,19 +91,19 @@ def fit_state(
     state: CameraState, points: Observations, *, coefficients: int | None = None, square: bool = False
 ) -> LensFit:
     """The same as fit_lens, from a state; that of boards has positions beside the attitudes."""
-    if len(points) < FEWEST:
-        raise NotIdentified(f"{len(points)} matched stars cannot determine a lens: at least {FEWEST} are needed")
+    if len(points) < MIN_STARS:
+        raise NotIdentified(f"{len(points)} matched stars cannot determine a lens: at least {MIN_STARS} are needed")
     for _ in range(2):
         robust, extra_px2 = _fit_robustly(state, points, coefficients)
         inverse = inverse_covariance(points.covariance_px2, extra_px2)
         used = chi_square(robust.residual_px, inverse) < OUTLIER_CHI2
         good = points.take(used)
-        if len(good) < FEWEST:
+        if len(good) < MIN_STARS:
             raise NotIdentified(f"only {len(good)} of {len(points)} matched stars agree on a lens", matched=len(good))
         model, best, candidates = best_model(robust.state, good, extra_px2, coefficients, square)
         if extensions_of(best.state.camera) == extensions_of(state.camera):
             break
-        state = best.state  # outliers were rejected with a poorer model: repeat with the better one
+        state = best.state  # the outliers were rejected with a simpler model: repeat with the chosen one
     return _finish(model, best, points, used, candidates)
 
 

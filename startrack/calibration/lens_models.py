@@ -13,10 +13,10 @@ from startrack.normal_equations import Observations
 from startrack.types import Array, Ints
 
 FOLDS = 10
-EQUALLY_GOOD_CHI2 = 4.0  # a longer polynomial this little worse is chosen: its covariance holds up to the edge
-RISES_BEYOND_1 = 1.1  # of the outermost star's angle: up to here the polynomial must rise
+EQUALLY_GOOD_CHI2 = 4.0  # up to this difference the longer polynomial is chosen: its covariance is valid up to the edge
+RISES_BEYOND_1 = 1.1  # of the outermost star's angle: the polynomial must increase up to there
 NARROW_RAD = np.radians(30.0)
-EXTENSION_CHI2 = 15.0  # fall of the held-out chi-square that justifies decentring, or pixels that are not square
+EXTENSION_CHI2 = 15.0  # decrease of the held-out chi-square that justifies decentring or oblong pixels
 LEAST_SQUARES = Scheme(loss=SQUARES)
 
 
@@ -39,7 +39,7 @@ def held_out_residual_px(solution: Solution, fold: Ints) -> Array:
         if not len(held):
             continue
         part = terms.take(held)
-        rest = solution.equations.minus(part.normal_equations(solution.weight[held], solution.residual_px[held]))
+        rest = solution.equations.subtract(part.normal_equations(solution.weight[held], solution.residual_px[held]))
         out[held] -= part.shift_px(*rest.solve())
     return out
 
@@ -134,7 +134,7 @@ def best_model(
     else:
         models = [LensModel(lens=default_lens(), size=default_lens().fit_size(coefficients))]
     fitted = [fit(model, state) for model in models]
-    chosen = _longest_of_the_best(fitted, float(off_axis.max()))
+    chosen = _choose_longest(fitted, float(off_axis.max()))
     for _ in range(0 if square else 2):
         more = [fit(model, chosen.solution.state) for model in _extensions(chosen.model)]
         fitted += more
@@ -164,7 +164,7 @@ def _fit(model: LensModel, start: CameraState, points: Observations, extra_px2: 
     return _Fitted(model, solution, score)
 
 
-def _longest_of_the_best(fitted: list[_Fitted], outermost_rad: float) -> _Fitted:
+def _choose_longest(fitted: list[_Fitted], outermost_rad: float) -> _Fitted:
     """The longest of the equally good polynomials; in narrow fields, where the terms are degenerate, the shortest."""
     enough = min(RISES_BEYOND_1 * outermost_rad, np.pi - 0.01)
     sound = [f for f in fitted if f.solution.state.camera.lens.max_invertible_rad > enough] or fitted

@@ -17,9 +17,9 @@ TOLERANCE_MAG = 0.9
 BLEND_MAG = 2.0  # a neighbour less than this fainter than the star shifts its centroid
 BLEND_SIGMAS = 3.5  # of the PSF
 DEPTH_MAG = 0.5  # stars are predicted to this much below the faintest source
-SCALE_STARS = 4000  # brightest stars that give the zero point
-MIN_FOR_SHAPE = 30
-NEAR_CURVE_MAG = 1.2  # a star's zero point this close to the curve takes part in its fit
+SCALE_STARS = 4000  # brightest stars used for the zero point
+MIN_STARS_FOR_SHAPE = 30
+NEAR_CURVE_MAG = 1.2  # stars with a zero point this close to the curve are used in its fit
 CURVE_ROUNDS = 4
 SECURE_MAG = 0.7  # a star this much brighter than the frame's limit is detected where the sky is open
 LIMIT_QUANTILE = 0.85
@@ -33,7 +33,7 @@ class FrameMatches:
     detection: Ints  # (n,) indices into the frame's sources
     star: Ints  # (n,) indices into the frame's sky
     expected: int  # bright stars predicted where the sky is open
-    expected_found: int  # of them, those with a source of their brightness
+    expected_found: int  # those with a source of equal brightness
     significant: int  # bright sources within the angle searched
     significant_matched: int
 
@@ -42,7 +42,7 @@ class FrameMatches:
 
     @property
     def fraction(self) -> float:
-        """The larger of: bright stars that have a source, bright sources that have a star.
+        """The larger of two fractions: bright stars with a source, and bright sources with a star.
 
         Clouds and trees reduce the first, hot pixels and lamps the second, a wrong lens both.
         """
@@ -121,11 +121,11 @@ def _fit_parabola(angle_rad: Array, zero_mag: Array) -> Callable[[Array], Array]
     if not len(zero_mag):
         return np.poly1d([0.0])
     fit = np.poly1d([float(np.median(zero_mag))])
-    if len(zero_mag) < MIN_FOR_SHAPE:
+    if len(zero_mag) < MIN_STARS_FOR_SHAPE:
         return fit
     for _ in range(CURVE_ROUNDS):
         close = np.abs(zero_mag - fit(angle_rad)) < NEAR_CURVE_MAG
-        if close.sum() < MIN_FOR_SHAPE:
+        if close.sum() < MIN_STARS_FOR_SHAPE:
             break
         fit = np.poly1d(np.polyfit(angle_rad[close], zero_mag[close], 2))
     low, high = np.min(angle_rad), np.max(angle_rad)

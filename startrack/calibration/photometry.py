@@ -1,4 +1,4 @@
-"""The [sensor] table of a camera file from a calibration; what could not be measured is named, not invented."""
+"""The [sensor] table of a camera file from a calibration; missing properties are named in notes."""
 
 from __future__ import annotations
 

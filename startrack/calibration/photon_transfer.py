@@ -60,17 +60,17 @@ def _block_statistics(a: Array, b: Array) -> tuple[Array, Array]:
     """
     height, width = (n // BLOCK_PX * BLOCK_PX for n in a.shape)
 
-    def cut(image: Array) -> Array:
+    def split_blocks(image: Array) -> Array:
         rows = image[:height, :width].reshape(height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX)
         return rows.transpose(0, 2, 1, 3).reshape(-1, BLOCK_PX, BLOCK_PX)
 
-    step = np.diff(cut(a - b), axis=2).reshape(-1, BLOCK_PX * (BLOCK_PX - 1))
+    step = np.diff(split_blocks(a - b), axis=2).reshape(-1, BLOCK_PX * (BLOCK_PX - 1))
     step -= np.median(step, axis=1, keepdims=True)
     variance = np.square(1.4826 * np.median(np.abs(step), axis=1))
-    for _ in range(CLIPS):  # to the core of the distribution, without stars
+    for _ in range(CLIPS):  # clipped to the core of the distribution, without stars
         core = np.square(step) < CORE_SIGMA**2 * variance[:, None]
         variance = np.sum(np.square(step) * core, axis=1) / np.maximum(core.sum(axis=1), 1) / CORE_VARIANCE_1
-    level = 0.5 * np.median(cut(a) + cut(b), axis=(1, 2))
+    level = 0.5 * np.median(split_blocks(a) + split_blocks(b), axis=(1, 2))
     return level, variance / 4.0
 
 

@@ -20,7 +20,7 @@ MAP_ANGLES = 10
 
 def calibration_dict(calibration: Calibration) -> dict[str, Any]:
     """The calibration's JSON object, with the camera only if all checks passed."""
-    fit, failed = calibration.joint.fit, calibration.failed
+    fit, failed = calibration.joint.fit, calibration.failed_checks
     cover, refracted = star_coverage(calibration.joint), _is_refracted(calibration)
     return {
         "format": FORMAT,
@@ -70,7 +70,8 @@ def refusal_dict(reason: str, text: str, refused: tuple[RefusedImage, ...] = ())
 def message(calibration: Calibration) -> str:
     """Failed checks and advice; empty where the calibration is accepted."""
     return "; ".join(
-        f"{check.name} is {check.value:.3g}, required {check.limit}: {check.advice}" for check in calibration.failed
+        f"{check.name} is {check.value:.3g}, required {check.limit}: {check.advice}"
+        for check in calibration.failed_checks
     )
 
 
@@ -78,7 +79,7 @@ def summary(calibration: Calibration, name: str) -> str:
     """Summary in one line."""
     camera, fit = calibration.camera, calibration.joint.fit
     images = len(calibration.joint.frames)
-    head = f"{name}  {'ok' if calibration.accepted else 'refused ' + calibration.failed[0].reason}"
+    head = f"{name}  {'ok' if calibration.accepted else 'refused ' + calibration.failed_checks[0].reason}"
     return (
         f"{head}  {images} of {images + len(calibration.refused)} images  {int(fit.used.sum())} stars  "
         f"held-out {fit.held_out_rms_px:.2f} px ({fit.held_out_rms_px * arcmin_per_px(camera):.2f}')  "
@@ -93,7 +94,7 @@ def arcmin_per_px(camera: Camera) -> float:
 
 
 def _is_refracted(calibration: Calibration) -> bool:
-    return all(frame.sky.refracted for frame in calibration.joint.frames)
+    return all(frame.sky.includes_refraction for frame in calibration.joint.frames)
 
 
 def _json_number(value: float) -> float:

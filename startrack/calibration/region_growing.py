@@ -7,23 +7,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.calibration.frame import Frame
-from startrack.calibration.lens_fit import FEWEST, LensFit, fit_lens
+from startrack.calibration.lens_fit import MIN_STARS, LensFit, fit_lens
 from startrack.calibration.matching import FrameMatches, match_frame
 from startrack.camera import Camera
 from startrack.normal_equations import Observations
 from startrack.types import Array, Ints, NotIdentified
 
-RING_RAD = np.radians(8.0)  # by which the field grows
+RING_RAD = np.radians(8.0)  # width of the ring added in each round
 SMALLEST_GROWTH_RAD = np.radians(0.5)
 FIRST_GATE_PX = 6.0
-BRIGHTEST_SOURCES = 1000  # hot pixels may outnumber the bright stars
+BRIGHTEST_SOURCES = 1000  # sources used; hot pixels may outnumber the bright stars
 GATES_PX = (4.0, 3.0, 2.0)
 GATE_SIGMAS = 4.5  # of the residuals, for the last gates
 NARROWEST_GATE_PX = 0.8
 GROWTH_ROUNDS = 16
 FINAL_ROUNDS = 8
 SETTLED_FRACTION = 0.003  # change of the number of matches
-MANY_STARS = 100  # from which the order follows from the angle alone
+ALL_ORDERS_STARS = 100  # number of stars from which the order of the polynomial follows from the angle alone
 MIN_FOR_POLYNOMIAL = 25
 DEGREES_PER_COEFFICIENT = 25
 KNOWN_QUANTILE = 0.95
@@ -31,7 +31,7 @@ KNOWN_QUANTILE = 0.95
 
 @dataclass(frozen=True)
 class JointFit:
-    """The lens of several frames with the matches that it rests on."""
+    """The lens of several frames with the matches that it was fitted to."""
 
     frames: tuple[Frame, ...]
     matches: tuple[FrameMatches, ...]
@@ -45,7 +45,7 @@ def grow_from_matches(
 ) -> tuple[Camera, Array]:
     """Camera and attitude of one frame, grown ring by ring from the matches (star, detection) to the edge of the frame.
 
-    Only bright sources take part: with all of them a gate this wide would match wrong stars as often as right ones.
+    Only bright sources are used: with all of them a gate this wide would give as many wrong matches as right ones.
     Raises NotIdentified where too few stars agree.
     """
     frame = replace(frame, sources=frame.sources.take(slice(BRIGHTEST_SOURCES)))
@@ -58,7 +58,7 @@ def grow_from_matches(
     for _ in range(GROWTH_ROUNDS):
         within = known + RING_RAD
         matched = match_frame(frame, fit.camera, fit.R_cam_icrs[0], within, FIRST_GATE_PX)
-        if len(matched) < FEWEST:
+        if len(matched) < MIN_STARS:
             break
         fit = _fit((frame,), (matched,), fit.camera, fit.R_cam_icrs, coefficients=_coefficients(within, len(matched)))
         reached = fit.camera.calibrated_angle_rad
@@ -81,7 +81,7 @@ def fit_frames(frames: tuple[Frame, ...], camera: Camera, R_cam_icrs: Array) -> 
         matches = tuple(
             match_frame(frame, camera, R, within, gate_px) for frame, R in zip(frames, R_cam_icrs, strict=True)
         )
-        fit = _fit(frames, matches, camera, R_cam_icrs, _coefficients(within, MANY_STARS) if first else None)
+        fit = _fit(frames, matches, camera, R_cam_icrs, _coefficients(within, ALL_ORDERS_STARS) if first else None)
         camera, R_cam_icrs = fit.camera, fit.R_cam_icrs
         total = sum(map(len, matches))
         if k > len(GATES_PX) and abs(total - before) <= SETTLED_FRACTION * total:

@@ -161,7 +161,7 @@ def _pictures_table(calibration: Calibration) -> str:
         ]
         for r in calibration.refused
     ]
-    air = all(frame.sky.refracted for frame in joint.frames)
+    air = all(frame.sky.includes_refraction for frame in joint.frames)
     note = "Refraction is taken out." if air else (
         "No site on the Earth was given: of pictures taken through air this lens contains the refraction (up to half a "
         "degree at the horizon). Give --site."

@@ -1,4 +1,4 @@
-"""Calibration from exposures: detect, identify, grow the lens outwards, fit all frames together, check."""
+"""Calibration from exposures: detection, identification, region growing, joint fit of all frames, acceptance."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from startrack.identification import Identifier, identify_unknown_lens
 from startrack.types import Array, BadInput, Exposure, Identification, NoSolution, NotIdentified
 
 WIDE_FIELD_RAD = np.radians(100.0)  # from here up a field of view is that of the image circle
-BRIGHTEST_IDENTIFIED = 100  # the inner half of them is the start of the region growing
+BRIGHTEST_IDENTIFIED = 100  # the region growing starts from the inner half of these stars
 Progress = Callable[[str], None]
 
 
@@ -34,7 +34,7 @@ class RefusedImage:
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration(Checked):
-    """The camera, the fit that it rests on, and its acceptance checks."""
+    """The camera, its fit, and its acceptance checks."""
 
     camera: Camera
     joint: JointFit
@@ -233,7 +233,7 @@ def _fit_jointly(run: _Run) -> JointFit:
 
 
 def _max_angle_rad(fitted: Camera, start: Camera | None, fov_rad: float | None) -> float:
-    """Edge of the image circle: as given, else the frame's corner; at most where the polynomial turns."""
+    """Edge of the image circle: as given, else the frame's corner; at most the turning point of the polynomial."""
     width, height = fitted.size_px
     corners = np.array([[-0.5, -0.5], [width - 0.5, -0.5], [-0.5, height - 0.5], [width - 0.5, height - 0.5]])
     edge = float(np.max(fitted.angle_rad(corners)))

@@ -15,13 +15,13 @@ from startrack.calibration.region_growing import JointFit
 from startrack.camera import Camera
 from startrack.types import Array, Bools, Exposure, Ints
 
-DARK_BEYOND_1 = 1.06  # of the image circle's radius: no light falls beyond
-MIN_DARK = 4000
+DARK_BEYOND_1 = 1.06  # of the image circle's radius: the sensor is dark beyond
+MIN_DARK_PIXELS = 4000
 LARGEST_DARK_SPREAD_1 = 0.2  # of the levels of the dark corners, over their difference from the sky
-MIN_SATURATED = 12
-MIN_WIDTHS = 5
+MIN_SATURATED_PIXELS = 12
+MIN_STARS_FOR_WIDTH = 5
 HOT_SIGMA = 8.0
-MAX_HOT = 20_000
+MAX_HOT_PIXELS = 20_000
 STAR_RADIUS_PX = 3
 STILL_PX = 0.3
 NEIGHBOURS = np.array([[0, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0]])  # twice the mean of the four
@@ -48,7 +48,7 @@ def measure_sensor(joint: JointFit, rings: int) -> SensorProperties:
     camera = joint.fit.camera
     edges = np.linspace(0.0, camera.calibrated_angle_rad, rings + 1)
     by_ring = tuple(
-        float(np.median(widths.sigma_px[inside])) if inside.sum() >= MIN_WIDTHS else None
+        float(np.median(widths.sigma_px[inside])) if inside.sum() >= MIN_STARS_FOR_WIDTH else None
         for inside in ((widths.angle_rad >= a) & (widths.angle_rad < b) for a, b in pairwise(edges))
     )
     return SensorProperties(
@@ -56,8 +56,8 @@ def measure_sensor(joint: JointFit, rings: int) -> SensorProperties:
         same_sky=same_sky,
         bias_adu=_dark_level(joint.frames, camera),
         saturation_adu=_saturation_level(joint.frames),
-        psf_sigma_px=float(np.median(widths.sigma_px)) if len(widths.sigma_px) >= MIN_WIDTHS else None,
-        flux_ratio=float(np.median(widths.flux_ratio)) if len(widths.sigma_px) >= MIN_WIDTHS else 1.0,
+        psf_sigma_px=float(np.median(widths.sigma_px)) if len(widths.sigma_px) >= MIN_STARS_FOR_WIDTH else None,
+        flux_ratio=float(np.median(widths.flux_ratio)) if len(widths.sigma_px) >= MIN_STARS_FOR_WIDTH else 1.0,
         psf_by_ring_px=by_ring,
         hot_px=_find_hot_pixels(joint),
     )
@@ -69,9 +69,9 @@ def _pairs(joint: JointFit) -> tuple[list[tuple[Exposure, Exposure]], bool]:
     still: list[tuple[Exposure, Exposure]] = []
     moving: list[tuple[Exposure, Exposure]] = []
     for i, (a, b) in enumerate(pairwise(frames)):
-        turn = R[i + 1] @ R[i].T
-        angle = float(np.linalg.norm(turn - turn.T) / np.sqrt(8.0))
-        near = angle * max(joint.fit.camera.focal_px) < STILL_PX and np.trace(turn) > 0
+        rotation = R[i + 1] @ R[i].T
+        angle = float(np.linalg.norm(rotation - rotation.T) / np.sqrt(8.0))
+        near = angle * max(joint.fit.camera.focal_px) < STILL_PX and np.trace(rotation) > 0
         (still if near else moving).append((a.exposure, b.exposure))
     return (still, True) if still else (moving, False)
 
@@ -87,7 +87,7 @@ def _dark_level(frames: tuple[Frame, ...], camera: Camera) -> float | None:
     off = np.hypot((x - camera.centre_px[0]) / fx, (y - camera.centre_px[1]) / fy)
     rim = float(camera.lens.rho(np.array(camera.max_angle_rad)))
     dark, lit = off > DARK_BEYOND_1 * rim, off < 0.8 * rim
-    if np.count_nonzero(dark) < MIN_DARK // 16:
+    if np.count_nonzero(dark) < MIN_DARK_PIXELS // 16:
         return None
     levels = []
     for frame in frames:
@@ -108,7 +108,7 @@ def _saturation_level(frames: tuple[Frame, ...]) -> float | None:
     """The largest value [ADU], where several pixels share it; None where nothing is saturated."""
     top = max(float(frame.exposure.pixels_adu.max()) for frame in frames)
     count = sum(int(np.count_nonzero(frame.exposure.pixels_adu >= top)) for frame in frames)
-    return top if count >= MIN_SATURATED else None
+    return top if count >= MIN_SATURATED_PIXELS else None
 
 
 def _find_hot_pixels(joint: JointFit) -> Array | None:
@@ -119,7 +119,7 @@ def _find_hot_pixels(joint: JointFit) -> Array | None:
         return None
     least = reduce(np.minimum, (_excess_sigmas(joint, i) for i in (0, *others)))
     y, x = np.nonzero(least > HOT_SIGMA)
-    order = np.argsort(-least[y, x], kind="stable")[:MAX_HOT]
+    order = np.argsort(-least[y, x], kind="stable")[:MAX_HOT_PIXELS]
     return np.stack([x[order], y[order]], axis=1).astype(np.float64)
 
 

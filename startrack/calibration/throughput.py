@@ -16,12 +16,12 @@ from startrack.types import Array, Ints
 
 MIN_STARS = 30
 BRIGHT_SNR = 10.0
-LOSS_MAG = 0.2  # residual from which a star's pull no longer grows
+LOSS_MAG = 0.2  # residual beyond which a star's influence is constant
 PHOTOMETRY_MAG = 0.05  # error of a star's magnitude beyond catalogue and noise
 LARGEST_TERM_SIGMA_MAG = 0.03  # per airmass, or per B-V: a term with a larger sigma is left out
 TYPICAL_B_V = 0.6
 LOWEST_ELEVATION_RAD = np.radians(8.0)
-THROUGHPUT_1 = (0.05, 1.1)  # relative to the axis, up to the calibrated angle: a lens dims its edge
+THROUGHPUT_1 = (0.05, 1.1)  # relative to the axis, up to the calibrated angle: a lens is darker at its edge
 EXTINCTION_MAG = (0.0, 1.5)  # per airmass; 0.1 to 0.5 in clear air
 COLOUR_MAG = (-1.0, 1.0)  # per B-V
 AT_BOUND_1 = 1e-3  # of the range of a term
@@ -29,7 +29,7 @@ FOLDS = 5
 LARGEST_HELD_OUT_MAG = 0.4  # median scatter of held-out stars
 LARGEST_HELD_OUT_RATIO = 1.5  # of held-out scatter to that of the fit
 LARGEST_IMAGE_OFFSET_MAG = 0.15  # of an image's zero point from the common one: clouds, or twilight
-MIN_OF_IMAGE = 10
+MIN_STARS_PER_IMAGE = 10
 NORMAL_BY_MAD = 1.4826
 
 
@@ -150,7 +150,7 @@ def _failures(stars: StarFluxes, terms: list[str], fit: _Fit) -> list[str]:
     offsets = [
         float(np.median(residual[stars.image == i]))
         for i, count in enumerate(np.bincount(stars.image))
-        if count >= MIN_OF_IMAGE
+        if count >= MIN_STARS_PER_IMAGE
     ]
     if len(offsets) > 1 and (largest := float(np.max(np.abs(offsets)))) > LARGEST_IMAGE_OFFSET_MAG:
         failures.append(f"the zero points of the images differ by up to {largest:.2f} mag from their mean: clouds?")

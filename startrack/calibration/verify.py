@@ -16,7 +16,7 @@ from startrack.catalog import StarCatalog
 from startrack.frames import Site
 from startrack.types import Array, Exposure, NotIdentified
 
-ALLOWED_PX = 0.3  # RMS change of the map without consequence: a tenth of it reaches the position
+ALLOWED_PX = 0.3  # acceptable RMS change of the projection: a tenth of it propagates to the position
 SIGNIFICANT_SIGMAS = 3.0
 
 
@@ -34,7 +34,7 @@ class Verification:
     largest_px: float
 
     @property
-    def fits(self) -> bool:
+    def is_valid(self) -> bool:
         """Whether the file can still be used."""
         return self.change_px <= max(ALLOWED_PX, SIGNIFICANT_SIGMAS * self.change_sigma_px)
 
@@ -79,9 +79,9 @@ def verify_dict(found: Verification) -> dict[str, Any]:
     return {
         "format": "startrack.verification/1",
         "image": found.image,
-        "status": "ok" if found.fits else "refused",
-        "reason": None if found.fits else "inconsistent_evidence",
-        "message": "" if found.fits else "the lens has changed: calibrate again",
+        "status": "ok" if found.is_valid else "refused",
+        "reason": None if found.is_valid else "inconsistent_evidence",
+        "message": "" if found.is_valid else "the lens has changed: calibrate again",
         "camera": old.name,
         "stars": found.stars,
         "rms_px": found.rms_px,
@@ -95,7 +95,7 @@ def verify_dict(found: Verification) -> dict[str, Any]:
 
 def verify_line(found: Verification) -> str:
     """Summary in one line."""
-    verdict = "ok" if found.fits else "refused inconsistent_evidence: the lens has changed, calibrate again:"
+    verdict = "ok" if found.is_valid else "refused inconsistent_evidence: the lens has changed, calibrate again:"
     return (
         f"{found.image}  {verdict}  {found.stars} stars  map changed by {found.change_px:.2f} px RMS "
         f"(± {found.change_sigma_px:.2f}), {found.largest_px:.2f} px at most"

@@ -30,12 +30,12 @@ _NAIF_SUN = 10
 def bodies(site: Site, time: datetime) -> list[Body]:
     """Sun, Mercury to Neptune, and Earth or Moon, as seen from the site: apparent directions and V magnitudes.
 
-    Always all of them, from the Sun outwards, whether above the horizon or below, but never the site's own body.
+    Always all of them, from the Sun outwards, above the horizon or below, except the site's own body.
     The direction is to the body's centre from the site itself (not from its body's centre), with light time and
     aberration, without refraction and without the Sun's bending of light. Mars and the outer planets are their
     systems' barycentres (within 0.1 arcsec of the planet, for Jupiter and Saturn); their satellites are not listed.
-    Magnitudes are good to 0.05, Mars to 0.15 as its face turns, the Earth with its weather and the Moon to 0.3 or so
-    and worse as thin crescents.
+    Magnitudes are good to 0.05, for Mars to 0.15 (rotation), for the Earth (weather) and the Moon to about 0.3, and
+    less as thin crescents.
 
     Raises:
         BadInput: "no_time" outside the years that the ephemeris covers (1900 to 2050).
@@ -47,7 +47,7 @@ def bodies(site: Site, time: datetime) -> list[Body]:
     observer_m, velocity_m_s = observer_state(site, time)
     et = et_s(time)
     sources = (source for source in _SOURCES if source.name.lower() != site.body.lower())
-    return [_apparent(source, observer_m, velocity_m_s, et) for source in sources]
+    return [_apparent_body(source, observer_m, velocity_m_s, et) for source in sources]
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class _Source:
     v_mag: Callable[[_View], float]
 
 
-def _apparent(source: _Source, observer_m: Array, velocity_m_s: Array, et: float) -> Body:
+def _apparent_body(source: _Source, observer_m: Array, velocity_m_s: Array, et: float) -> Body:
     light_time_s = 0.0
     for _ in range(3):  # each round shrinks the error by v / c = 1e-4
         body_m, _ = barycentric_state(source.naif, et - light_time_s)
@@ -108,7 +108,7 @@ def _mercury(view: _View) -> float:
 
 
 def _venus(view: _View) -> float:
-    """Equations 3 (to 163.7 degrees) and 4 (beyond, where the atmosphere's glow takes over)."""
+    """Equations 3 (to 163.7 degrees) and 4 (beyond, where the atmosphere dominates)."""
     if view.phase_deg < 163.7:
         return float(
             -4.384 + view.distances_mag + polyval(view.phase_deg, [0, -1.044e-3, 3.687e-4, -2.814e-6, 8.938e-9])

@@ -72,9 +72,9 @@ class StarCatalog(Value):
 
     def brighter_than(self, v_mag: float) -> StarCatalog:
         """The stars with V < v_mag."""
-        return self._first(int(np.searchsorted(self.v_mag, v_mag, side="left")))
+        return self._take_first(int(np.searchsorted(self.v_mag, v_mag, side="left")))
 
-    def _first(self, n: int) -> StarCatalog:
+    def _take_first(self, n: int) -> StarCatalog:
         kept = {f: getattr(self, f)[:n] for f in self.__dataclass_fields__ if getattr(getattr(self, f), "ndim", 0)}
         return replace(self, **kept)
 

@@ -1,1 +1,1 @@
-"""The commands: arguments, degrees, printing and exit codes; nothing else."""
+"""The commands: arguments, degrees, printing and exit codes."""

@@ -11,9 +11,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.batch_show import Counts, Halt, omission_lines, outcomes_shown, signals_halt, summary
+from startrack.cli.batch_show import Counts, Halt, halt_on_signals, omission_lines, show_outcomes, summary
 from startrack.cli.common import DEFAULT_OUT, add_fact_flags, add_localizer_flag, cores, flag_facts, localizer_of
-from startrack.cli.flag_types import at_least_one
+from startrack.cli.flag_types import positive_count
 from startrack.cli.preparation import compile_kernels, prepare_reference
 from startrack.compilation import is_compiled
 from startrack.errors import INTERNAL_ERROR, BadInput
@@ -44,7 +44,7 @@ def add_parser(subparsers: Any) -> None:
     add_localizer_flag(parser)
     workers = parser.add_mutually_exclusive_group()
     workers.add_argument(
-        "-j", "--jobs", type=at_least_one, default=None, metavar="N", help="processes (default: all cores)"
+        "-j", "--jobs", type=positive_count, default=None, metavar="N", help="processes (default: all cores)"
     )
     workers.add_argument(
         "--cluster", type=_address, metavar="ADDRESS", help="a Dask cluster to use instead (extra: cluster)"
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     """0 if every image is solved, 5 if some are not or the run was stopped, 1 after an internal error."""
     if args.cluster is not None and find_spec("distributed") is None:
         args.usage_error("--cluster needs distributed: pip install '.[cluster]' in a clone of startrack")
-    from startrack.batch import images_under, listed_images, only_writer
+    from startrack.batch import images_under, listed_images, lock_results
 
     facts = _facts(args)
     localizer_of(args)
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
             "with time_utc"
         )
     out = make_folder(args.dir)
-    with only_writer(out):
+    with lock_results(out):
         return _run(found, whole, out, facts, args)
 
 
@@ -102,7 +102,7 @@ def _run(
     counts = Counts()
     runner: Runner[Task, ImageDone] = Runner(locate_image, jobs=args.jobs or cores(), cluster=args.cluster)
     halt = Halt(runner.stop)
-    with signals_halt(halt):
+    with halt_on_signals(halt):
         with runner:
             records, stopped = _locate_all(runner, tasks, counts, halt, args)
         try:
@@ -110,7 +110,7 @@ def _run(
                 out,
                 _tasks(sorted({*whole, *found}), out, facts, args),
                 records,
-                {**_without_paths(facts), "localizer": args.localizer, "plots": not args.no_plots},
+                {**_remove_paths(facts), "localizer": args.localizer, "plots": not args.no_plots},
             )
             tables = f"tables in {out}" + (
                 "" if has_parquet() else " (no results.parquet: the extra parquet is missing)"
@@ -142,7 +142,7 @@ def _locate_all(
 
     records: list[dict[str, Any]] = []
     try:
-        with outcomes_shown(len(tasks), args, halt) as show, closing(locate_images(runner, tasks)) as outcomes:
+        with show_outcomes(len(tasks), args, halt) as show, closing(locate_images(runner, tasks)) as outcomes:
             for record, kept in outcomes:
                 records.append(table_values(record))
                 counts["error" if record["reason"] == INTERNAL_ERROR else str(record["status"])] += 1
@@ -234,15 +234,15 @@ def _write_tables(
         print(f"startrack: {line}", file=sys.stderr)
 
 
-def _without_paths(facts: dict[str, Any]) -> dict[str, str]:
+def _remove_paths(facts: dict[str, Any]) -> dict[str, str]:
     """The facts of flags for the manifest, without paths of this machine."""
     return {key: Path(value).name if key in ("camera", "terrain") else str(value) for key, value in facts.items()}
 
 
 def _address(text: str) -> str:
     """Address of a Dask scheduler, as an argparse type."""
-    scheme, _, place = text.rpartition("://")
-    host, _, port = place.rpartition(":")
+    scheme, _, address = text.rpartition("://")
+    host, _, port = address.rpartition(":")
     if scheme not in SCHEMES or not host or not port.isdecimal() or not 0 < int(port) < 2**16:
         raise argparse.ArgumentTypeError(f"{text!r} is not the address of a Dask scheduler such as tcp://host:8786")
     return text

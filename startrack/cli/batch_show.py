@@ -40,8 +40,8 @@ class Halt:
 
 
 @contextmanager
-def signals_halt(halt: Halt) -> Iterator[None]:
-    """In the block the first Ctrl-C or SIGTERM stops the batch after the images in progress; a later one drops them."""
+def halt_on_signals(halt: Halt) -> Iterator[None]:
+    """In the block the first Ctrl-C or SIGTERM stops the batch after the images in progress, a later one at once."""
     first_s: float | None = None
 
     def on_signal(number: int, _: object) -> None:
@@ -66,7 +66,7 @@ def signals_halt(halt: Halt) -> Iterator[None]:
 
 
 @contextmanager
-def outcomes_shown(total: int, args: argparse.Namespace, halt: Halt) -> Iterator[Show]:
+def show_outcomes(total: int, args: argparse.Namespace, halt: Halt) -> Iterator[Show]:
     """A function to call with each record and the counts; a bar on a terminal."""
 
     def print_lines(record: dict[str, Any]) -> None:

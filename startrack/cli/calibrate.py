@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import DEFAULT_OUT, read
-from startrack.cli.flag_types import amount, field_of_view_rad, number, positive
+from startrack.cli.flag_types import amount, field_of_view_rad, number, positive_number
 from startrack.cli.progress import progress
 from startrack.compilation import announce_compilation
 from startrack.errors import NoSolution, exit_code_of
@@ -51,7 +51,7 @@ def add_parser(subparsers: Any) -> None:
                         "width; from 100 up: of the image circle")  # fmt: skip
     add_site_flags(parser)
     sensor = parser.add_argument_group("sensor, if the exposures do not show it")
-    sensor.add_argument("--gain", type=positive, metavar="E", help="electrons per ADU")
+    sensor.add_argument("--gain", type=positive_number, metavar="E", help="electrons per ADU")
     sensor.add_argument("--read-noise", type=amount, metavar="E", help="read noise, electrons")
     sensor.add_argument("--bias", type=number, metavar="ADU", help="level without light")
     add_camera_output_flags(parser)
@@ -61,9 +61,9 @@ def add_parser(subparsers: Any) -> None:
 
 
 def add_site_flags(parser: argparse.ArgumentParser) -> None:
-    """Flags for the time, the length and the place of exposures of the sky."""
+    """Flags for the time, the duration and the site of exposures of the sky."""
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601 (one image only)")
-    parser.add_argument("--exposure", type=positive, metavar="S", help="exposure time in seconds")
+    parser.add_argument("--exposure", type=positive_number, metavar="S", help="exposure time in seconds")
     parser.add_argument("--site", metavar="LAT,LON[,M]", help="site on the Earth, in degrees and metres, to correct "
                         "for refraction (--site=-30.2,...)")  # fmt: skip
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file whose origin is the site")
@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
     exposures = [read(path, args) for path in args.images]
     announce_compilation()
     start = approximate_camera(args, exposures)
-    with steps_shown(args, 2 * len(exposures) + 3) as show_step:
+    with show_steps(args, 2 * len(exposures) + 3) as show_step:
         try:
             found = calibrate(
                 exposures,
@@ -181,7 +181,7 @@ def site_of(args: argparse.Namespace, exposures: list[Exposure]) -> Site | None:
 
 
 @contextmanager
-def steps_shown(args: argparse.Namespace, steps: int) -> Iterator[Callable[[str], None]]:
+def show_steps(args: argparse.Namespace, steps: int) -> Iterator[Callable[[str], None]]:
     """A bar over the steps; the function to call with the name of each."""
     with progress("calibrate", steps, shown=not (args.quiet or args.json)) as bar:
         yield lambda text: bar.advance(text=text)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from startrack.cli.calibrate import add_camera_output_flags, output_path, print_outcome, steps_shown
+from startrack.cli.calibrate import add_camera_output_flags, output_path, print_outcome, show_steps
 from startrack.cli.common import read
 from startrack.errors import NoSolution
 
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
         args.usage_error("--pattern CxR is needed: inner corners of a chessboard, squares of a ChArUco board")
     out = output_path(args, "camera.toml")
     exposures = [read(path, args) for path in args.images]
-    with steps_shown(args, len(exposures) + 1) as show_step:
+    with show_steps(args, len(exposures) + 1) as show_step:
         try:
             pattern = Board(columns, rows, args.charuco, args.marker)
             found = calibrate_board(exposures, pattern, name=args.name or out.stem, progress=show_step)

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from startrack.cli.calibrate import add_print_flags, add_site_flags, output_path, print_outcome, site_of, steps_shown
+from startrack.cli.calibrate import add_print_flags, add_site_flags, output_path, print_outcome, show_steps, site_of
 from startrack.cli.common import DEFAULT_OUT, read
 from startrack.errors import BadInput, NoSolution
 
@@ -93,7 +93,7 @@ def run_verify(args: argparse.Namespace) -> int:
         named = args.camera or exposure.camera
         if named is None:
             raise BadInput("no_calibration", "no camera file to verify is known: give -c FILE")
-        with steps_shown(args, 1) as show_step:
+        with show_steps(args, 1) as show_step:
             try:
                 show_step(f"verifying with {exposure.name}")
                 found = verify(exposure, load_camera(named), load_catalog(), site_of(args, [exposure]))

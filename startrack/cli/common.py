@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.flag_types import positive
+from startrack.cli.flag_types import positive_number
 from startrack.errors import INTERNAL_ERROR, BadInput, exit_code_of
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def add_fact_flags(parser: argparse.ArgumentParser) -> None:
     """Flags for facts that images may lack."""
     parser.add_argument("-c", "--camera", metavar="FILE", help="camera file, or the name of a shipped one")
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601")
-    parser.add_argument("--exposure", type=positive, metavar="S", help="exposure time in seconds")
+    parser.add_argument("--exposure", type=positive_number, metavar="S", help="exposure time in seconds")
 
 
 def add_localizer_flag(parser: argparse.ArgumentParser) -> None:

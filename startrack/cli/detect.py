@@ -25,10 +25,10 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Detect in every image; the exit code of the worst."""
-    return run_images(args, FORMAT, lambda path, stem: _one(path, stem, args))
+    return run_images(args, FORMAT, lambda path, stem: _detect_image(path, stem, args))
 
 
-def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
+def _detect_image(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     from startrack.output import summary_line, write_results
     from startrack.pipeline import detect
     from startrack.stages import with_timing

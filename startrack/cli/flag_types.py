@@ -24,7 +24,7 @@ def amount(text: str) -> float:
     return number(text)
 
 
-def positive(text: str) -> float:
+def positive_number(text: str) -> float:
     """A number above 0."""
     if number(text) <= 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not above 0")
@@ -42,7 +42,7 @@ def count(text: str) -> int:
     return value
 
 
-def at_least_one(text: str) -> int:
+def positive_count(text: str) -> int:
     """A whole number from 1 up."""
     if count(text) == 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not above 0")

@@ -41,10 +41,10 @@ def run(args: argparse.Namespace) -> int:
     """Identify every image; the exit code of the worst."""
     if args.fov is not None and args.camera is not None:
         args.usage_error("--fov is for an unknown lens, -c for a known one: give one of them")
-    return run_images(args, FORMAT, lambda path, stem: _one(path, stem, args))
+    return run_images(args, FORMAT, lambda path, stem: _identify_image(path, stem, args))
 
 
-def _one(path: str, stem: str, args: argparse.Namespace) -> Outcome:
+def _identify_image(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     from startrack.catalog import load_catalog
     from startrack.output import (
         lens_text,

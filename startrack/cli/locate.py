@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     from startrack.pipeline import Settings
 
     settings = Settings(localizer=localizer_of(args)())
-    code = run_images(args, FORMAT, lambda path, stem: _one(path, stem, args, settings))
+    code = run_images(args, FORMAT, lambda path, stem: _locate_image(path, stem, args, settings))
     if args.report:
         from startrack.cli.report import write_page_of_images
 
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     return code
 
 
-def _one(path: str, stem: str, args: argparse.Namespace, settings: Settings) -> Outcome:
+def _locate_image(path: str, stem: str, args: argparse.Namespace, settings: Settings) -> Outcome:
     from startrack.output import summary_line, verbose_text, write_results
     from startrack.pipeline import locate_exposure
     from startrack.stages import with_timing

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Progress:
-    """Progress of a command; this class shows nothing."""
+    """Progress of a command without output."""
 
     def advance(self, steps: int = 1, text: str | None = None) -> None:
         """Further steps are done; `text` names the current step."""

@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.flag_types import amount, at_least_one, count, number, positive
+from startrack.cli.flag_types import amount, count, number, positive_count, positive_number
 from startrack.cli.progress import progress
 from startrack.errors import BadInput
 
@@ -35,7 +35,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("-c", "--camera", default="fisheye-2048", metavar="FILE", help="default %(default)s")
     parser.add_argument("-t", "--terrain", default="shackleton-thesis", metavar="FILE", help="default %(default)s")
     parser.add_argument("--seed", type=count, default=0, metavar="N", help="same seed, same bytes (default 0)")
-    parser.add_argument("-n", "--count", type=at_least_one, default=1, metavar="N", help="images (default 1)")
+    parser.add_argument("-n", "--count", type=positive_count, default=1, metavar="N", help="images (default 1)")
     _add_pose(parser.add_argument_group("pose and time (what is not given is drawn from the seed)"))
     _add_light(parser.add_argument_group("light and defects"))
     _add_output(parser.add_argument_group("output"))
@@ -71,7 +71,7 @@ def _add_light(group: Any) -> None:
     help_faint = "no stars fainter than this; down to it, stars that Hipparcos lacks are drawn at random (FIELD n) (10)"
     help_stars = "whose stars the sky has (auto: Gaia's where the extra `deep` is installed)"
     help_scatter = "of each star's flux, beyond the catalogue's own errors (0.03); 0 turns both off"
-    group.add_argument("--exposure", type=positive, metavar="S", help=help_exposure)
+    group.add_argument("--exposure", type=positive_number, metavar="S", help=help_exposure)
     group.add_argument("--sky-mag", type=number, default=22.0, metavar="V", help="diffuse sky per arcsec^2 (22.0)")
     group.add_argument("--sky-gradient", type=number, default=0.0, metavar="F", help="its slope to the horizon (0)")
     group.add_argument("--sky-gradient-azimuth", type=number, default=0.0, metavar="DEG", help="where it rises to (0)")

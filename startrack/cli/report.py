@@ -66,13 +66,13 @@ def write_page_of(
     found, unread = results_under(out)
     for line in unread:
         print(f"startrack: left out {line}", file=sys.stderr)
-    found = _only_tabled(out, found)
+    found = _select_tabled(out, found)
     path = Path(output) if output else Path(out) / PAGE
     write_page(path, found, unread=unread, real=_true_positions(found, truth), images=images)
     return path
 
 
-def _only_tabled(out: str, found: list[Found]) -> list[Found]:
+def _select_tabled(out: str, found: list[Found]) -> list[Found]:
     """The results without results of a batch that its tables lack; a line on stderr names these."""
     from startrack.batch import JOB, tabled_results
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import DEFAULT_OUT, cores
-from startrack.cli.flag_types import at_least_one, count
+from startrack.cli.flag_types import count, positive_count
 from startrack.cli.progress import progress
 from startrack.compilation import announce_compilation
 from startrack.files import make_folder
@@ -45,12 +45,12 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     size.add_argument("--full", action="store_true", help="as in the thesis: 10 x 10,000, and 100,000 positions")
     parser.add_argument(
         "--ours",
-        type=at_least_one,
+        type=positive_count,
         metavar="N",
         help="our method on at most N positions per starfield, 10 N in figure 3.10",
     )
     parser.add_argument(
-        "-j", "--jobs", type=at_least_one, default=None, metavar="N", help="processes (default: all cores)"
+        "-j", "--jobs", type=positive_count, default=None, metavar="N", help="processes (default: all cores)"
     )
     parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask cluster to use instead (extra: cluster)")
     parser.add_argument("--seed", type=count, default=0, metavar="N", help="same seed, same files (default 0)")
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     out, size = make_folder(args.dir), FULL if args.full else QUICK
     announce_compilation()
     if args.ours is not None:
-        size = size.with_ours(args.ours)
+        size = size.limit_ours(args.ours)
     with ChunkStore(out, jobs=args.jobs or cores(), progress=progress, cluster=args.cluster) as store:
         if args.cluster is not None:
             store.connect()

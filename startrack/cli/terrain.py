@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import DEFAULT_OUT
 from startrack.cli.preparation import prepare
-from startrack.cli.terrain_facts import facts_of, lines_of, seen_from
+from startrack.cli.terrain_facts import facts_of, lines_of, view_facts
 from startrack.files import file_stem, make_folder
 
 if TYPE_CHECKING:
@@ -75,15 +75,15 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> int:
     """Run the action; 0."""
-    return {"show": _show, "build": _build, "import": _import}[args.action](args)
+    return {"show": _show_terrain, "build": _build_tables, "import": _import_map}[args.action](args)
 
 
-def _show(args: argparse.Namespace) -> int:
+def _show_terrain(args: argparse.Namespace) -> int:
     from startrack.terrain import load_terrain
 
     terrain = load_terrain(args.terrain)
     position = None if args.at is None else (args.at[0], args.at[1])
-    facts = facts_of(terrain) | seen_from(terrain, position)
+    facts = facts_of(terrain) | view_facts(terrain, position)
     if not args.no_plots:
         facts["files"] = [str(path) for path in _pictures(args, terrain, position)]
     _print_facts(args, facts)
@@ -104,7 +104,7 @@ def _pictures(args: argparse.Namespace, terrain: Terrain, position: tuple[float,
     return list(pictures)
 
 
-def _build(args: argparse.Namespace) -> int:
+def _build_tables(args: argparse.Namespace) -> int:
     from startrack.terrain import load_terrain
 
     for name in args.terrain:
@@ -122,7 +122,7 @@ def _build(args: argparse.Namespace) -> int:
     return 0
 
 
-def _import(args: argparse.Namespace) -> int:
+def _import_map(args: argparse.Namespace) -> int:
     from startrack.terrain import load_terrain
     from startrack.terrain.import_map import import_maps
 

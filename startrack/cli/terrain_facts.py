@@ -34,7 +34,7 @@ def site_of(terrain: Terrain) -> Site:
     return terrain.site
 
 
-def seen_from(terrain: Terrain, position: tuple[float, float] | None) -> dict[str, Any]:
+def view_facts(terrain: Terrain, position: tuple[float, float] | None) -> dict[str, Any]:
     """Ground and horizon at a position (east, north) [m]. Raises BadInput outside the terrain."""
     if position is None:
         return {}
@@ -59,7 +59,8 @@ def lines_of(facts: dict[str, Any]) -> Iterator[str]:
     """The properties that `facts` holds, as lines with units."""
     yield facts["name"]
     if "body" in facts:
-        yield f"  origin    {_place(facts['latitude_deg'], facts['longitude_deg'])}, on the {facts['body'].title()}"
+        origin = _latlon_text(facts["latitude_deg"], facts["longitude_deg"])
+        yield f"  origin    {origin}, on the {facts['body'].title()}"
         yield (
             f"  search    within {facts['search_radius_m']:g} m of the origin, the camera "
             f"{facts['camera_height_m']:g} m above the ground"
@@ -73,7 +74,7 @@ def lines_of(facts: dict[str, Any]) -> Iterator[str]:
             f"heights {m['lowest_m']:g} to {m['highest_m']:g} m"
         )
     if "height_sigma_m" in facts:
-        yield f"  errors    {_errors(facts)}"
+        yield f"  errors    {_errors_text(facts)}"
     if facts.get("horizons") and "seconds" in facts:
         how = "were known" if facts["known_before"] else f"computed in {facts['seconds']:g} s"
         yield f"  horizons  {how}: {facts['horizons']}"
@@ -85,21 +86,22 @@ def lines_of(facts: dict[str, Any]) -> Iterator[str]:
     if "ground_m" in facts:
         yield (
             f"  position     E {facts['east_m']:g} m, N {facts['north_m']:g} m: "
-            f"{_place(facts['place_latitude_deg'], facts['place_longitude_deg'])}, ground at {facts['ground_m']:g} m, "
+            f"{_latlon_text(facts['place_latitude_deg'], facts['place_longitude_deg'])}, "
+            f"ground at {facts['ground_m']:g} m, "
             f"horizon {facts['horizon_min_deg']:g} to {facts['horizon_max_deg']:g} degrees"
         )
     for file in facts.get("files", ()):
         yield f"  written   {file}"
 
 
-def _errors(facts: dict[str, Any]) -> str:
+def _errors_text(facts: dict[str, Any]) -> str:
     shared = facts["horizon_sigma_deg"]
     all_around = "three times what these make of it" if shared is None else f"{shared:g} degrees"
     source = {"map": " (from the map's roughness)"}.get(facts.get("sigma_from", ""), "")
     return f"of single posts {facts['height_sigma_m']:g} m{source}; shared by the whole horizon {all_around}"
 
 
-def _place(latitude_deg: float, longitude_deg: float) -> str:
+def _latlon_text(latitude_deg: float, longitude_deg: float) -> str:
     return (
         f"{abs(latitude_deg):.5f} {'N' if latitude_deg >= 0 else 'S'}, "
         f"{abs(longitude_deg):.5f} {'E' if longitude_deg >= 0 else 'W'}"

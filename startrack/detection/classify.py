@@ -1,4 +1,4 @@
-"""Selection of point sources among the fitted candidates, by height, likeness to the PSF, and no edge or hot pixel."""
+"""Selection of point sources among the fitted candidates by significance and shape, without edges and hot pixels."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.detection.deblend import Fitted, own_light
+from startrack.detection.deblend import Fitted, own_signal
 from startrack.detection.fit import PointFits, Stamps
-from startrack.detection.frame import Frame, LightNoise, Pixels
-from startrack.detection.psf_width import BRIGHT_SNR, MIN_BRIGHT
+from startrack.detection.frame import Frame, Pixels, SourceNoise
+from startrack.detection.psf_width import BRIGHT_SNR, MIN_BRIGHT_SOURCES
 from startrack.detection.saturated import are_saturated
 from startrack.types import Array, Bools, Ints
 
 WIDTHS_PX = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0)
-HEIGHTS = (5.80, 5.70, 5.54, 5.43, 5.33, 5.18, 5.09)  # measured at USUAL_SKEWNESS: alike in false stars
+HEIGHTS = (5.80, 5.70, 5.54, 5.43, 5.33, 5.18, 5.09)  # measured at USUAL_SKEWNESS: equal rates of false stars
 HEIGHT_AT_NOMINAL = 5.42
-USUAL_SKEWNESS, LARGEST_SKEWNESS = 0.088, 0.3  # the first is that of 100 photons and 3 electrons of read noise
-FILTERED_SKEWNESS = 0.376  # 2 / (3 sqrt(pi)): part that a matched filter of 1 px leaves
-NOISE_TOO_SMALL = 0.17  # part of the skewness by which the noise is measured too small
-OWN_LEVEL_FRACTION = 0.8  # of the threshold that a source must reach by its own stamp alone, everywhere
-UNEVEN_SIGMA = 2.5  # difference of the stamp's level and that of its surroundings where these are not to be trusted
-EDGE_MARGIN = 8.0  # chi^2 by which an edge must explain a stamp better: noise alone gives faint stars less
+USUAL_SKEWNESS, LARGEST_SKEWNESS = 0.088, 0.3  # the first: 100 photons and 3 electrons of read noise
+FILTERED_SKEWNESS = 0.376  # 2 / (3 sqrt(pi)): fraction that remains after a matched filter of 1 px
+NOISE_TOO_SMALL = 0.17  # relative underestimate of the noise per unit of skewness
+OWN_LEVEL_FRACTION = 0.8  # of the threshold: required of every source with the level of its stamp alone
+UNEVEN_SIGMA = 2.5  # difference between the levels of stamp and surroundings above which the latter is not used
+EDGE_MARGIN = 8.0  # chi^2 by which an edge must fit better than a star: noise alone gives faint stars less
 BAD_FIT_CHI2_PER_DOF = 4.0
-ROUGH_PSF_MISFIT = 0.06  # from here up stars are compared with the frame's own bright stars, not with the Gaussian
-ROUGH_PSF_SPREAD = 2.0  # times the typical misfit that a star of such a frame may have
-SATURATED_MISFIT = 0.2  # of a star that shows only its wings, which are the least Gaussian
-EDGE_DIRECTIONS = 8  # of the straight edges or lines tried
+ROUGH_PSF_MISFIT = 0.06  # typical misfit above which stars are compared with the frame's bright stars
+ROUGH_PSF_SPREAD = 2.0  # largest misfit of a star in such a frame over the typical one
+SATURATED_MISFIT = 0.2  # largest misfit of a star measured by its wings, which differ most from the Gaussian
+EDGE_DIRECTIONS = 8  # directions of straight edges or lines that are fitted
 LARGEST_SIGMA_PX = 2.0  # of the position
 WING_SIGMAS, WING_BRIGHTER, WING_HEIGHT = (
     3.0,
@@ -37,10 +37,10 @@ WING_SIGMAS, WING_BRIGHTER, WING_HEIGHT = (
 
 
 def select_stars(fitted: Fitted, width_px: Array, threshold: float) -> Ints:
-    """Indices (k,) of the candidates, fitted with widths (n,), that are point sources and stand out by the threshold.
+    """Indices (k,) of the candidates (n,) that are point sources above the threshold; `width_px` (n,): fitted widths.
 
-    Where the bright sources of the frame all differ from the Gaussian (trails, coma, a real lens), no bright star would
-    pass by its chi^2; there a source passes whose misfit is like theirs.
+    If all bright sources of the frame differ from the Gaussian (trails, coma, a real lens), no bright star passes the
+    chi^2 test; then sources with a similar misfit pass.
     """
     fits = fitted.fits
     stands_out = peak_heights(fits) >= threshold
@@ -48,17 +48,17 @@ def select_stars(fitted: Fitted, width_px: Array, threshold: float) -> Ints:
     left = np.flatnonzero(stands_out & placed & (fits.chi2 < fits.chi2_pixel))
     if not len(left):
         return left
-    misfit, edge = _psf_and_edge_misfit(fitted.stamps.take(left), fits.take(left), width_px[left], fitted.light_noise)
+    misfit, edge = _psf_and_edge_misfit(fitted.stamps.take(left), fits.take(left), width_px[left], fitted.source_noise)
     unlike_an_edge = fits.chi2[left] < edge + EDGE_MARGIN
     bright = fits.flux[left] > BRIGHT_SNR * np.sqrt(fits.covariance[left, 2, 2])
-    typical = _typical(misfit[unlike_an_edge & bright])
+    typical = _typical_misfit(misfit[unlike_an_edge & bright])
     good_fit = fits.chi2[left] < BAD_FIT_CHI2_PER_DOF * fits.dof[left]
     allowed = np.where(are_saturated(fitted.stamps.take(left)), max(typical, SATURATED_MISFIT), typical)
     return left[unlike_an_edge & (good_fit | (misfit < allowed))]
 
 
-def brightest_per_position(xy_px: Array, flux: Array, closer_px: float) -> Bools:
-    """Which sources (n,) to keep: the brightest of all that converged onto one position."""
+def select_brightest_per_position(xy_px: Array, flux: Array, closer_px: float) -> Bools:
+    """Which sources (n,) to keep: of several that converged to one position the brightest."""
     from scipy.spatial import cKDTree
 
     rank = np.empty(len(flux), dtype=np.int64)
@@ -69,10 +69,10 @@ def brightest_per_position(xy_px: Array, flux: Array, closer_px: float) -> Bools
     return ~fainter
 
 
-def clear_of_wings(xy_px: Array, flux: Array, height: Array, sigma: float, threshold: float) -> Bools:
-    """Which sources (n,) to keep: those hardly above the threshold in a brighter one's wing are its misfit, or a blend.
+def reject_wing_misfits(xy_px: Array, flux: Array, height: Array, sigma: float, threshold: float) -> Bools:
+    """Which sources (n,) to keep: sources near the threshold in the wing of a brighter one are rejected.
 
-    Two stars that are not resolved are fitted as one, and what that leaves looks like a third.
+    Such a source is a residual of the PSF or of a blend: two unresolved stars are fitted as one.
     """
     from scipy.spatial import cKDTree
 
@@ -87,8 +87,8 @@ def clear_of_wings(xy_px: Array, flux: Array, height: Array, sigma: float, thres
 def peak_heights(fits: PointFits) -> Array:
     """Height of each source (n) above its surroundings, in sigma.
 
-    Above its surroundings, whose level is known better than that of the stamp, where the stamp by itself shows at least
-    OWN_LEVEL_PART of it; by its own stamp alone where the two levels do not agree: on a slope or at the skyline.
+    The level of the surroundings is more precise than that of the stamp; it is used up to 1 / OWN_LEVEL_FRACTION of the
+    height from the stamp alone. If the two levels disagree (a slope, the skyline), the stamp alone is used.
     """
     by_itself = fits.flux / np.sqrt(fits.covariance[:, 2, 2])
     even = np.abs(fits.level - fits.surround) < UNEVEN_SIGMA * np.sqrt(fits.covariance[:, 3, 3])
@@ -96,12 +96,12 @@ def peak_heights(fits: PointFits) -> Array:
 
 
 def detection_threshold(threshold_snr: float, sigma_px: float, skewness: float) -> float:
-    """Height that gives about as many false peaks, whatever the PSF's width and the skewness of the pixels' noise.
+    """Height with an equal rate of false peaks for every PSF width and every skewness of the pixel noise.
 
-    That is 0.3 to 0.6 in 4 Mpx at the default. A narrower PSF has more independent positions for false stars, down to
-    where the number of pixels limits it; a wider one has fewer, but more crowded sources. Photons' noise is skew:
-    its bright tail is heavier than a Gaussian's (the first term of Cornish and Fisher's expansion, with what the filter
-    leaves of the skewness), and its quantiles below the median, from which the noise is taken, lie closer together.
+    The rate is 0.3 to 0.6 in 4 Mpx at the default. A narrower PSF has more independent positions for false stars, up to
+    the number of pixels; a wider one has fewer, but its sources overlap more. Photon noise is skew: its bright tail is
+    heavier than a Gaussian's (first term of the Cornish-Fisher expansion with the skewness after filtering), and its
+    quantiles below the median, from which the noise is measured, lie closer together.
     """
     height = float(np.interp(np.log(sigma_px), np.log(WIDTHS_PX), HEIGHTS))
     filtered = FILTERED_SKEWNESS / np.sqrt(sigma_px**2 + 1.0 / 12.0)
@@ -110,8 +110,8 @@ def detection_threshold(threshold_snr: float, sigma_px: float, skewness: float) 
 
 
 def noise_skewness(frame: Frame) -> float:
-    """Skewness of the noise of the frame's pixels, by the photons of its background; a usual one without a gain."""
-    if frame.light_noise.per_unit != 1.0:  # not in electrons
+    """Skewness of the pixel noise, from the photons of the background; USUAL_SKEWNESS without a gain."""
+    if frame.source_noise.per_unit != 1.0:  # not in electrons
         return USUAL_SKEWNESS
     some = slice(None, None, 64), slice(None, None, 64)
     noise = float(np.median(frame.noise[some]))
@@ -119,25 +119,25 @@ def noise_skewness(frame: Frame) -> float:
     return min(photons / max(noise, 1e-6) ** 3, LARGEST_SKEWNESS)
 
 
-def _typical(misfit: Array) -> float:
-    """Misfit up to which a source is like the frame's bright ones, where these are rough; 0 where they are not."""
-    if len(misfit) < MIN_BRIGHT:
+def _typical_misfit(misfit: Array) -> float:
+    """Largest accepted misfit from the frame's bright sources; 0 where these fit the Gaussian."""
+    if len(misfit) < MIN_BRIGHT_SOURCES:
         return 0.0
     typical = float(np.median(misfit))
     return ROUGH_PSF_SPREAD * typical if typical > ROUGH_PSF_MISFIT else 0.0
 
 
-def _psf_and_edge_misfit(s: Stamps, fits: PointFits, width_px: Array, own: LightNoise) -> tuple[Array, Array]:
-    """How far the sources (n) are from the Gaussian PSF, and their chi^2 as straight edges or lines instead.
+def _psf_and_edge_misfit(s: Stamps, fits: PointFits, width_px: Array, own: SourceNoise) -> tuple[Array, Array]:
+    """Misfit of the sources (n) to the Gaussian PSF, and their chi^2 as straight edges or lines.
 
-    The first is the root of the squared residual beyond the noise over the squared light: 0 for a perfect star, about
+    The misfit is the root of the squared residual beyond the noise over the squared signal: 0 for a perfect star, about
     0.6 for a single bright pixel.
     """
-    light = own_light(s.centres, fits, width_px, s.data.shape[1] // 2)
-    noise = s.variance + np.float32(own.per_unit) * light
-    excess = np.square(s.data - light - fits.level[:, None, None].astype(np.float32)) - noise
-    weights = 1.0 / (noise + np.square(np.float32(own.model_error) * light))
-    squared = np.square(light)
+    signal = own_signal(s.centres, fits, width_px, s.data.shape[1] // 2)
+    noise = s.variance + np.float32(own.per_unit) * signal
+    excess = np.square(s.data - signal - fits.level[:, None, None].astype(np.float32)) - noise
+    weights = 1.0 / (noise + np.square(np.float32(own.model_error) * signal))
+    squared = np.square(signal)
     if s.usable is not None:
         excess, weights, squared = excess * s.usable, weights * s.usable, squared * s.usable
     total = squared.sum(axis=(1, 2), dtype=np.float64)
@@ -148,24 +148,25 @@ def _psf_and_edge_misfit(s: Stamps, fits: PointFits, width_px: Array, own: Light
 def edge_chi2(data: Pixels, weights: Pixels) -> Array:
     """chi^2 (n,) of stamps (n, s, s) as straight stripes of any brightness, in the best of eight directions.
 
-    Larger by the number of stripes than the least squares' own, so that many stripes are no better than few.
-
-    A skyline, the edge of the image circle, a bad column, a satellite's trail: what varies in one direction only.
+    The model covers sources that vary in one direction only: a skyline, the edge of the image circle, a bad column, a
+    satellite's trail. The number of stripes is added to chi^2 so that many stripes are not preferred to few.
     """
     n, side = len(data), data.shape[1]
     stripes, starts = _stripes(side)
-    counts = np.diff(starts, append=stripes.shape[1]).astype(np.float32)  # of stripes: noise alone explains as much
+    counts = np.diff(starts, append=stripes.shape[1]).astype(
+        np.float32
+    )  # number of stripes: expected reduction of chi^2 by noise
     w = weights.reshape(n, -1).astype(np.float32)
     flat = data.reshape(n, -1).astype(np.float32)
     moment = w * flat
-    total, light = w @ stripes, moment @ stripes
-    explained = np.add.reduceat(light * light / np.maximum(total, 1e-30), starts, axis=1) - counts
+    total, signal = w @ stripes, moment @ stripes
+    explained = np.add.reduceat(signal * signal / np.maximum(total, 1e-30), starts, axis=1) - counts
     return np.asarray(np.sum(moment * flat, axis=1) - explained.max(axis=1), dtype=np.float64)
 
 
 @lru_cache(maxsize=16)
 def _stripes(side: int) -> tuple[NDArray[np.float32], Ints]:
-    """Which pixel lies in which stripe of one pixel's width (s^2, m): 0 or 1; and each direction's first stripe."""
+    """Membership (s^2, m), 0 or 1, of pixels in stripes one pixel wide, and each direction's first stripe."""
     offset = np.arange(side) - side // 2
     x, y = np.tile(offset, side), np.repeat(offset, side)
     masks = []

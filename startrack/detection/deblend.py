@@ -1,4 +1,4 @@
-"""Fits of all candidates, each with its neighbours' light subtracted."""
+"""Fits of all candidates, each with the flux of its neighbours subtracted."""
 
 from __future__ import annotations
 
@@ -7,90 +7,91 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.detection.fit import ROUNDS, ROUNDS_AGAIN, PointFits, Stamps, concatenate_fits, fit_points
-from startrack.detection.frame import Frame, LightNoise, Pixels, radius_for
+from startrack.detection.frame import Frame, Pixels, SourceNoise, radius_for
 from startrack.detection.peaks import Peaks
-from startrack.detection.source_noise import measure_light_noise
+from startrack.detection.source_noise import measure_source_noise
 from startrack.psf import pixel_profile_single
 from startrack.types import Array, Ints
 
 CROWDED_ROUNDS = 3  # of subtracting neighbours and fitting again
-NEIGHBOUR_SIGMA = 0.1  # neighbours' light above this part of a pixel's noise is subtracted
-NEIGHBOUR_ERROR = np.float32(0.1)  # of it is not known: neighbours' fits, and the PSF's wings
+NEIGHBOUR_SIGMA = 0.1  # of a pixel's noise: a neighbour's signal above this is subtracted
+NEIGHBOUR_ERROR = np.float32(0.1)  # relative error of that signal: neighbours' fits, and the PSF's wings
 BATCH_PIXELS = 2_000_000  # of neighbours' stamps at a time
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """All candidates (n) with their stamps and fits, and the noise of the light of the stars themselves."""
+    """All candidates (n) with their stamps and fits, and the noise of the sources' own signal."""
 
     stamps: Stamps
     fits: PointFits
-    light_noise: LightNoise
+    source_noise: SourceNoise
 
 
 def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = None) -> Fitted:
-    """Fits of all candidates; of the stars already `known`, whose light `frame.found` holds, only once more.
-
-    The known ones are the first of the peaks.
-    """
+    """Fits of all candidates. `known`: earlier fits of the first peaks, refined once; `frame.found` contains them."""
     radius = radius_for(sigma)
     centres = peaks.centres
-    data, variance, usable = frame.data(centres, radius), frame.variance(centres, radius), frame.usable(centres, radius)
+    data, variance, usable = (
+        frame.data(centres, radius),
+        frame.variance(centres, radius),
+        frame.usable_pixels(centres, radius),
+    )
     stamps = Stamps(data, variance, usable, centres, peaks.surround)
-    last = np.zeros_like(data)  # neighbours' light with which each was fitted
+    last = np.zeros_like(data)  # neighbours' signal subtracted in the last fit
     if known is not None and frame.found is not None:
-        last = frame.light(centres, radius)
-        last[: len(known.flux)] -= own_light(centres[: len(known.flux)], known, sigma, radius)
+        last = frame.found_signal(centres, radius)
+        last[: len(known.flux)] -= own_signal(centres[: len(known.flux)], known, sigma, radius)
         last[np.square(last).max(axis=(1, 2)) <= NEIGHBOUR_SIGMA**2 * variance[:, radius, radius]] = 0.0
-    fits = _first_fits(frame, peaks, _subtract_light(stamps, last), sigma, 0 if known is None else len(known.flux))
+    fits = _first_fits(frame, peaks, _subtract_neighbours(stamps, last), sigma, 0 if known is None else len(known.flux))
     star, other = _find_pairs(centres, 1.5 * radius + 3.0 * sigma)
     alone = np.ones(len(centres), dtype=bool)
     alone[star[_are_relevant(stamps, fits, star, other, sigma)]] = False
-    light_noise = measure_light_noise(stamps, fits, alone, sigma, frame.light_noise)
-    bright = _find_reweighted(fits, sigma, variance, frame.light_noise, light_noise)
+    source_noise = measure_source_noise(stamps, fits, alone, sigma, frame.source_noise)
+    bright = _find_reweighted(fits, sigma, variance, frame.source_noise, source_noise)
     if len(bright):
         start = fits.xy_px[bright]
-        part = _subtract_light(stamps.take(bright), last[bright])
-        again = fit_points(part, start, sigma, light_noise, peaks.own_part, ROUNDS_AGAIN)
+        part = _subtract_neighbours(stamps.take(bright), last[bright])
+        again = fit_points(part, start, sigma, source_noise, peaks.own_part, ROUNDS_AGAIN)
         fits = fits.with_rows(bright, again)
     for _ in range(CROWDED_ROUNDS):
-        crowded, light = _sum_neighbour_light(stamps, fits, star, other, sigma)
-        changed = (np.square(light - last[crowded]) > NEIGHBOUR_SIGMA**2 * variance[crowded]).any(axis=(1, 2))
-        crowded, light = crowded[changed], light[changed]
+        crowded, signal = _sum_neighbour_signal(stamps, fits, star, other, sigma)
+        changed = (np.square(signal - last[crowded]) > NEIGHBOUR_SIGMA**2 * variance[crowded]).any(axis=(1, 2))
+        crowded, signal = crowded[changed], signal[changed]
         if not len(crowded):
             break
-        last[crowded] = light
-        cleaned = _subtract_light(stamps.take(crowded), light)
-        again = fit_points(cleaned, fits.xy_px[crowded], sigma, light_noise, peaks.own_part, ROUNDS_AGAIN)
+        last[crowded] = signal
+        cleaned = _subtract_neighbours(stamps.take(crowded), signal)
+        again = fit_points(cleaned, fits.xy_px[crowded], sigma, source_noise, peaks.own_part, ROUNDS_AGAIN)
         fits = fits.with_rows(crowded, again)
-    return Fitted(stamps, fits, light_noise)
+    return Fitted(stamps, fits, source_noise)
 
 
 def _first_fits(frame: Frame, peaks: Peaks, stamps: Stamps, sigma: float, known: int) -> PointFits:
-    """Fits of all candidates, the first of which are `known` already and need less."""
+    """Fits of all candidates; the first ones start from the `known` fits and need fewer iterations."""
     fits = [
-        fit_points(stamps.take(which), peaks.start_xy_px[which], sigma, frame.light_noise, peaks.own_part, rounds)
+        fit_points(stamps.take(which), peaks.start_xy_px[which], sigma, frame.source_noise, peaks.own_part, rounds)
         for which, rounds in ((slice(0, known), ROUNDS_AGAIN), (slice(known, None), ROUNDS))
         if len(stamps.centres[which])
     ]
     return concatenate_fits(fits)
 
 
-def _subtract_light(stamps: Stamps, light: Pixels) -> Stamps:
-    """The stamps without their neighbours' light, of which a part is not known."""
-    return replace(stamps, data=stamps.data - light, variance=stamps.variance + np.square(NEIGHBOUR_ERROR * light))
+def _subtract_neighbours(stamps: Stamps, signal: Pixels) -> Stamps:
+    """The stamps with the neighbours' signal subtracted; its error is added to the variance."""
+    return replace(stamps, data=stamps.data - signal, variance=stamps.variance + np.square(NEIGHBOUR_ERROR * signal))
 
 
-def _find_reweighted(fits: PointFits, sigma: float, variance: Pixels, was: LightNoise, now: LightNoise) -> Ints:
-    """Candidates whose middle pixel has another variance by a tenth with what is known now of the light's noise."""
-    light = np.maximum(fits.flux, 0.0) / (2.0 * np.pi * sigma**2 + 1.0)
+def _find_reweighted(fits: PointFits, sigma: float, variance: Pixels, was: SourceNoise, now: SourceNoise) -> Ints:
+    """Candidates whose middle pixel's variance changes by more than a tenth with the measured source noise."""
+    signal = np.maximum(fits.flux, 0.0) / (2.0 * np.pi * sigma**2 + 1.0)
     dark = variance[:, variance.shape[1] // 2, variance.shape[2] // 2]
-    before, after = (dark + light * (n.per_unit + n.model_error**2 * light) for n in (was, now))
+    before, after = (dark + signal * (n.per_unit + n.model_error**2 * signal) for n in (was, now))
     return np.flatnonzero(np.abs(after - before) > 0.1 * before)
 
 
 def _find_pairs(centres: Ints, reach_px: float) -> tuple[Ints, Ints]:
-    """Each candidate that has another one within reach, ascending, and that other one: both (m,)."""
+    """Pairs (m,), (m,) of a candidate and a neighbour whose stamps overlap, sorted by the candidate."""
     from scipy.spatial import cKDTree
 
     pairs = cKDTree(centres).query_pairs(reach_px, output_type="ndarray")
@@ -99,13 +100,13 @@ def _find_pairs(centres: Ints, reach_px: float) -> tuple[Ints, Ints]:
     return both[:, 0], both[:, 1]
 
 
-def _sum_neighbour_light(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> tuple[Ints, Pixels]:
-    """The candidates (k,) into whose stamps others put light that counts, and that light (k, s, s)."""
+def _sum_neighbour_signal(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> tuple[Ints, Pixels]:
+    """The candidates (k,) whose stamps contain relevant signal of neighbours, and that signal (k, s, s)."""
     side = s.data.shape[1]
     radius = side // 2
     counts = _are_relevant(s, fits, star, other, sigma)
     star, other = star[counts], other[counts]
-    crowded, light = [np.zeros(0, dtype=np.int64)], [np.zeros((0, side, side), dtype=np.float32)]
+    crowded, signal = [np.zeros(0, dtype=np.int64)], [np.zeros((0, side, side), dtype=np.float32)]
     firsts = np.flatnonzero(np.diff(star, prepend=-1))
     pairs_at_a_time = max(1, BATCH_PIXELS // (side * side))
     while len(firsts):
@@ -122,13 +123,13 @@ def _sum_neighbour_light(s: Stamps, fits: PointFits, star: Ints, other: Ints, si
         who = star[firsts[:end]]
         matters = (np.square(sums) > NEIGHBOUR_SIGMA**2 * s.variance[who]).any(axis=(1, 2))
         crowded.append(who[matters])
-        light.append(sums[matters])
+        signal.append(sums[matters])
         firsts = firsts[end:]
-    return np.concatenate(crowded), np.concatenate(light)
+    return np.concatenate(crowded), np.concatenate(signal)
 
 
 def _are_relevant(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: float) -> Array:
-    """Which pairs (m,) can matter: the neighbour's light at the stamp's nearest pixel against the middle's noise."""
+    """Which pairs (m,) are relevant: the neighbour's signal at the stamp's nearest pixel exceeds the noise limit."""
     radius = s.data.shape[1] // 2
     beyond = np.maximum(np.abs(fits.xy_px[other] - s.centres[star]) - radius - 0.5, 0.0)
     wing = np.exp(-0.5 * np.sum(np.square(beyond), axis=1) / (sigma**2 + 0.1))
@@ -137,8 +138,8 @@ def _are_relevant(s: Stamps, fits: PointFits, star: Ints, other: Ints, sigma: fl
     return np.asarray(fits.flux[other] * top * wing > 0.3 * NEIGHBOUR_SIGMA * noise)
 
 
-def own_light(centres: Ints, fits: PointFits, sigma: float | Array, radius: int) -> Pixels:
-    """Light (n, s, s) of each source in its own stamp."""
+def own_signal(centres: Ints, fits: PointFits, sigma: float | Array, radius: int) -> Pixels:
+    """Signal (n, s, s) of each source in its own stamp."""
     offset = fits.xy_px - centres
     px, _ = pixel_profile_single(offset[:, 0], sigma, radius)
     py, _ = pixel_profile_single(offset[:, 1], sigma, radius)
@@ -147,7 +148,7 @@ def own_light(centres: Ints, fits: PointFits, sigma: float | Array, radius: int)
 
 
 def paint_sources(fits: PointFits, sigma: float, shape: tuple[int, int]) -> Pixels:
-    """Light (H, W) of the fitted sources, to 5 sigma."""
+    """Image (H, W) of the fitted sources, to 5 sigma."""
     radius = int(np.ceil(5.0 * sigma))
     side = 2 * radius + 1
     image = np.zeros((shape[0] + 2 * side, shape[1] + 2 * side), dtype=np.float32)
@@ -156,6 +157,8 @@ def paint_sources(fits: PointFits, sigma: float, shape: tuple[int, int]) -> Pixe
     for at in range(0, len(centres), size):
         here = np.arange(at, min(at + size, len(centres)))
         corners = centres[here] + side - radius
-        for (column, row), light in zip(corners, own_light(centres[here], fits.take(here), sigma, radius), strict=True):
-            image[row : row + side, column : column + side] += light
+        for (column, row), signal in zip(
+            corners, own_signal(centres[here], fits.take(here), sigma, radius), strict=True
+        ):
+            image[row : row + side, column : column + side] += signal
     return image[side:-side, side:-side]

@@ -9,11 +9,11 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.detection.background import background_and_noise, block_side, smallest_step
 from startrack.detection.classify import (
-    brightest_per_position,
-    clear_of_wings,
     detection_threshold,
     noise_skewness,
     peak_heights,
+    reject_wing_misfits,
+    select_brightest_per_position,
     select_stars,
 )
 from startrack.detection.deblend import Fitted, fit_all, paint_sources
@@ -21,7 +21,7 @@ from startrack.detection.fit import PointFits, unbin_fits
 from startrack.detection.frame import (
     Frame,
     Image,
-    LightNoise,
+    SourceNoise,
     bin_frame,
     binning_factor,
     electrons,
@@ -35,15 +35,17 @@ from startrack.detection.streaks import Streaks, are_elongated, find_streaks
 from startrack.types import Array, Bools, Detections, Exposure, Ints, TooFewStars
 
 UNKNOWN_WIDTH_PX = 1.2  # first guess where the camera file does not state the width
-FIRST_PASS_LOWER = 1.1  # units of the filtered noise by which the candidates' threshold is lower than the stars'
+FIRST_PASS_LOWER = 1.1  # sigma of the filtered noise: threshold of the stars minus that of the candidates
 WINGS_SIGMAS = 4.0  # radius of the area that a star covers
-CROWDED_FRACTION = 0.06  # covered by stars: from here up they are subtracted before the background is measured again
+CROWDED_FRACTION = (
+    0.06  # of the frame covered by stars, above which they are subtracted to measure the background again
+)
 NOTHING_SEEN = "no point source stands above the noise: was the lens cap on, or the exposure too short?"
 
 
 @dataclass(frozen=True)
 class _Candidates:
-    """A frame, the same with its pixels added together `side` by `side`, and the candidates there with their fits."""
+    """A frame, the same frame binned by `side`, and the candidates in it with their fits."""
 
     frame: Frame
     small: Frame
@@ -61,21 +63,21 @@ class _Candidates:
 class Detector:
     """Detects point sources: Exposure -> Detections."""
 
-    threshold_snr: float = 5.42  # for a PSF of 1.25 px; for others the threshold with about as few false stars
+    threshold_snr: float = 5.42  # for a PSF of 1.25 px; scaled to an equal rate of false stars for other widths
     max_candidates: int = 15000  # a frame with more peaks is noise, a bright day or a defect: the highest are kept
     psf_sigma_px: float | None = None  # used without measuring it; None: from the camera file and the frame
 
     def __call__(self, exposure: Exposure, camera: Camera | None = None) -> Detections:
         """Point sources of an `exposure`, brightest first; fluxes in electrons with the camera's gain, else in ADU.
 
-        Raises TooFewStars (reason no_stars) where the frame holds no point source at all.
+        Raises TooFewStars (reason no_stars) if the frame has no point source.
         """
         image, dead = electrons(exposure, camera)
         if _is_flat(image):
             raise TooFewStars("the frame is flat: every pixel has the same value (lens cap, or a saturated day sky?)")
         known = camera.sensor.psf_sigma_px if camera is not None and camera.sensor is not None else None
-        light_noise = LightNoise(per_unit=0.0 if known is None else 1.0)
-        candidates = self._candidates(_FrameSource(image, mask_or_none(dead), light_noise), self.psf_sigma_px or known)
+        source_noise = SourceNoise(per_unit=0.0 if known is None else 1.0)
+        candidates = self._candidates(_FrameSource(image, mask_or_none(dead), source_noise), self.psf_sigma_px or known)
         frame, sigma = candidates.frame, candidates.sigma
         if are_elongated(frame, candidates.centres) and (streaks := find_streaks(frame)) is not None:
             return _detections_of_streaks(frame, dead, streaks)
@@ -99,7 +101,7 @@ class Detector:
         )
 
     def _candidates(self, source: _FrameSource, expected: float | None) -> _Candidates:
-        """Candidates and their fits, with the PSF's width as the frame shows it."""
+        """Candidates and their fits, with the PSF width measured in the frame."""
         if expected is None:
             return self._candidates_at(source, guess_psf_width(source.frame, UNKNOWN_WIDTH_PX))
         candidates = self._candidates_at(source, expected)
@@ -116,7 +118,7 @@ class Detector:
         return self._candidates_at(source, guess_psf_width(source.frame, measured * candidates.side))
 
     def _candidates_at(self, source: _FrameSource, sigma: float) -> _Candidates:
-        """Candidates and their fits; where the PSF is wide, in the frame whose pixels are added together."""
+        """Candidates and their fits; where the PSF is wide, in the binned frame."""
         side = binning_factor(sigma)
         frame = source.frame(sigma)
         small = bin_frame(frame, side)
@@ -126,9 +128,9 @@ class Detector:
         return _Candidates(frame, small, side, sigma, fit_all(small, peaks, sigma / side))
 
     def _detect_again(self, candidates: _Candidates, stars: PointFits) -> tuple[Frame, PointFits]:
-        """The frame and its stars, the known ones subtracted before background and faint ones are measured."""
+        """The frame and its stars; known stars are subtracted before the background and faint stars are measured."""
         side, sigma, frame = candidates.side, candidates.sigma, candidates.frame
-        frame = _FrameSource(frame.image, frame.dead, candidates.fitted.light_noise).frame(
+        frame = _FrameSource(frame.image, frame.dead, candidates.fitted.source_noise).frame(
             sigma, paint_sources(stars, sigma, frame.shape)
         )
         positions = (stars.xy_px - 0.5 * (side - 1)) / side
@@ -139,24 +141,24 @@ class Detector:
         return frame, self._select_stars(frame, fit_all(frame, peaks, sigma, known=stars), 1, sigma)
 
     def _find_peaks(self, frame: Frame, small: Frame, side: int, sigma: float, known: Array | None = None) -> Peaks:
-        """Candidates in a frame's small one: a star between pixels shows less in the filtered image than its fit."""
+        """Candidates in the binned frame; their threshold is lower: the filtered image is sampled at pixels only."""
         lowest = detection_threshold(self.threshold_snr, sigma, noise_skewness(frame)) - FIRST_PASS_LOWER
         return find_peaks(small, sigma / side, lowest, self.max_candidates, known)
 
     def _select_stars(self, frame: Frame, fitted: Fitted, side: int, sigma: float) -> PointFits:
-        """The point sources among the candidates, in a frame's small one, brightest first."""
+        """The point sources among the candidates of the binned frame, brightest first."""
         fitted, width_px = refit_saturated(fitted, sigma / side)
         fits = fitted.fits
         threshold = detection_threshold(self.threshold_snr, sigma / side, noise_skewness(frame) / side)
         good = select_stars(fitted, width_px, threshold)
-        good = good[brightest_per_position(fits.xy_px[good], fits.flux[good], 1.2 * sigma / side)]
+        good = good[select_brightest_per_position(fits.xy_px[good], fits.flux[good], 1.2 * sigma / side)]
         stars = fits.take(good[np.argsort(-fits.flux[good], kind="stable")])
-        clear = clear_of_wings(stars.xy_px, stars.flux, peak_heights(stars), sigma / side, threshold)
+        clear = reject_wing_misfits(stars.xy_px, stars.flux, peak_heights(stars), sigma / side, threshold)
         return stars.take(np.flatnonzero(clear))
 
 
 def _detections_of_streaks(frame: Frame, dead: Bools, streaks: Streaks) -> Detections:
-    """The stars of a frame taken while the camera turned; the PSF's width is that of the whole streak."""
+    """The stars of a frame taken by a rotating camera; the PSF width is that of the whole streak."""
     return Detections(
         xy_px=streaks.xy_px,
         covariance_px2=streaks.covariance_px2,
@@ -177,26 +179,26 @@ def _is_flat(image: Image) -> bool:
 
 
 class _FrameSource:
-    """An image with its unusable pixels; backgrounds are computed once for each size of their blocks."""
+    """An image with its unusable pixels; backgrounds are computed once for each block size."""
 
-    def __init__(self, image: Image, dead: Bools | None, light_noise: LightNoise) -> None:
-        self.image, self.dead, self.light_noise = image, dead, light_noise
+    def __init__(self, image: Image, dead: Bools | None, source_noise: SourceNoise) -> None:
+        self.image, self.dead, self.source_noise = image, dead, source_noise
         self.quantum = smallest_step(image)
         self._kept: dict[int, tuple[Image, Image]] = {}
 
     def frame(self, sigma: float, found: Image | None = None) -> Frame:
-        """The image prepared; the stars already `found` are excluded from background and noise."""
+        """The prepared frame; stars in `found` are excluded from background and noise."""
         if found is not None:
             maps = background_and_noise(self.image - found, self.quantum, sigma)
-            return Frame(self.image, *maps, self.dead, self.light_noise, found)
+            return Frame(self.image, *maps, self.dead, self.source_noise, found)
         side = block_side(sigma)
         if side not in self._kept:
             self._kept[side] = background_and_noise(self.image, self.quantum, sigma)
-        return Frame(self.image, *self._kept[side], self.dead, self.light_noise)
+        return Frame(self.image, *self._kept[side], self.dead, self.source_noise)
 
 
 def _covered_fraction(stars: PointFits, sigma: float, shape: tuple[int, int]) -> float:
-    """Part of the frame that the wings of its stars cover, overlaps counted twice."""
+    """Fraction of the frame that the wings of its stars cover, overlaps counted twice."""
     return float(len(stars.flux) * np.pi * np.square(WINGS_SIGMAS * sigma) / (shape[0] * shape[1]))
 
 

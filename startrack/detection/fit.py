@@ -6,10 +6,10 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from startrack.detection.frame import LightNoise, Pixels
+from startrack.detection.frame import Pixels, SourceNoise
 from startrack.types import Array, Bools, Ints
 
-ROUNDS, ROUNDS_AGAIN = 3, 2  # of flux and level, then of all four; where a fit has been before
+ROUNDS, ROUNDS_AGAIN = 3, 2  # iterations of a first fit, and of a repeated one
 ALL_USABLE = np.zeros((0, 0, 0), dtype=np.bool_)
 
 
@@ -25,7 +25,7 @@ class PointFits:
     chi2_pixel: Array  # (n,) of a single bright pixel instead
     dof: Array  # (n,)
     surround: Array  # (n,) level of the wider surroundings
-    significance: Array  # (n,) matched-filter SNR of the light against background noise alone
+    significance: Array  # (n,) matched-filter SNR against background noise alone
     snr: Array  # (n,) matched-filter SNR, the source's own photon noise included
 
     def take(self, which: Ints) -> PointFits:
@@ -33,7 +33,7 @@ class PointFits:
         return PointFits(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
     def with_rows(self, which: Ints, others: PointFits) -> PointFits:
-        """These fits with those at the indices exchanged for the `others`."""
+        """These fits with `others` at the indices `which`."""
         values = {f.name: getattr(self, f.name).copy() for f in fields(self)}
         for name, value in values.items():
             value[which] = getattr(others, name)
@@ -57,13 +57,18 @@ class Stamps:
 
 
 def fit_points(
-    stamps: Stamps, start_xy_px: Array, sigma_px: float, light_noise: LightNoise, own_part: float, rounds: int = ROUNDS
+    stamps: Stamps,
+    start_xy_px: Array,
+    sigma_px: float,
+    source_noise: SourceNoise,
+    own_part: float,
+    rounds: int = ROUNDS,
 ) -> PointFits:
     """Position, flux and local level of one point source in each stamp.
 
-    Only the significance relies on `surround`, which holds `own_part` of the source's own light. Gauss-Newton on the
-    pixel-integrated Gaussian from `start_xy_px` (n, 2); steps are limited to half a pixel, so a hopeless source stays
-    near where it was. Weights: the pixels' variance and the variance of the source's own light.
+    Only the significance relies on `surround`, which contains `own_part` of the source's signal. Gauss-Newton on the
+    pixel-integrated Gaussian from `start_xy_px` (n, 2); steps are limited to half a pixel, so that diverging fits stay
+    near their start. Weights: the pixels' variance and the variance of the source's own signal.
     """
     from startrack.detection.fit_kernel import fit_stamps
 
@@ -71,8 +76,8 @@ def fit_points(
     offset, values, covariance = np.empty((n, 2)), np.empty((n, 8)), np.empty((n, 4, 4))
     usable = ALL_USABLE if stamps.usable is None else stamps.usable
     fit_stamps(
-        stamps.data, stamps.variance, usable, start_xy_px - stamps.centres, sigma_px, light_noise.per_unit,
-        light_noise.model_error, rounds, stamps.surround, offset, values, covariance,
+        stamps.data, stamps.variance, usable, start_xy_px - stamps.centres, sigma_px, source_noise.per_unit,
+        source_noise.model_error, rounds, stamps.surround, offset, values, covariance,
     )  # fmt: skip
     flux, level, chi2, chi2_pixel, count, above, norm, own = np.ascontiguousarray(values.T)
     # The level of the surroundings was taken from pixels that hold the star: it lowers signal by `own_part`, noise by
@@ -93,12 +98,12 @@ def fit_points(
 
 
 def concatenate_fits(parts: list[PointFits]) -> PointFits:
-    """The fits of all parts, one after the other."""
+    """The fits of all parts in one value."""
     return PointFits(**{f.name: np.concatenate([getattr(b, f.name) for b in parts]) for f in fields(PointFits)})
 
 
 def unbin_fits(fits: PointFits, side: int) -> PointFits:
-    """Fits in a binned frame as they are in the frame itself: positions and their errors; levels per pixel."""
+    """Fits in a binned frame converted to the frame itself: positions, their errors, and levels per pixel."""
     if side == 1:
         return fits
     unit = np.array([side, side, 1.0, 1.0 / side**2])

@@ -16,14 +16,14 @@ from startrack.types import Bools, Exposure, Ints
 Image = NDArray[np.float32]
 Pixels = NDArray[np.floating[Any]]  # stamps, in either precision
 SATURATED_FRACTION = 0.98
-MIN_BINNED_SIGMA_PX = 1.8  # from here up the pixels are smaller than need be
-RESIDUAL_FRACTION = 0.1  # fraction of a known star's light that may be left when it is subtracted
-MODEL_ERROR = 0.03  # fraction of a star's own light by which real PSFs differ from the Gaussian
+MIN_BINNED_SIGMA_PX = 1.8  # PSF width from which the frame is binned
+RESIDUAL_FRACTION = 0.1  # of a known star's signal: error of its subtraction
+MODEL_ERROR = 0.03  # of a star's signal: difference between real PSFs and the Gaussian
 
 
 @dataclass(frozen=True)
-class LightNoise:
-    """Variance that a star's own light adds to that of the pixel: per_unit light + (model_error light)^2."""
+class SourceNoise:
+    """Variance that a source's own signal s adds to a pixel: per_unit s + (model_error s)^2."""
 
     per_unit: float = 0.0  # photon noise: 1 for electrons, 1 / gain for ADU, 0 where it is not known
     model_error: float = MODEL_ERROR
@@ -37,8 +37,8 @@ class Frame:
     background: Image
     noise: Image  # standard deviation of one pixel
     dead: NDArray[np.bool_] | None  # saturated: no weight in fits; None where no pixel is
-    light_noise: LightNoise
-    found: Image | None = None  # light of the stars known so far, where their wings cover much of the frame
+    source_noise: SourceNoise
+    found: Image | None = None  # signal of the known stars, where their wings cover much of the frame
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -46,29 +46,29 @@ class Frame:
         return self.image.shape[0], self.image.shape[1]
 
     def standardise(self, rows: slice) -> Image:
-        """Some rows without their background and the stars known so far, in units of the noise of both."""
+        """Rows minus background and known stars, in units of the noise of both."""
         residual = self.image[rows] - self.background[rows]
         if self.found is None:
             return np.asarray(cv2.divide(residual, self.noise[rows], dst=residual))
-        light, found = self.light_noise, self.found[rows]
-        variance = np.square(self.noise[rows]) + found * (light.per_unit + RESIDUAL_FRACTION**2 * found)
+        own, found = self.source_noise, self.found[rows]
+        variance = np.square(self.noise[rows]) + found * (own.per_unit + RESIDUAL_FRACTION**2 * found)
         return np.asarray((residual - found) / np.sqrt(variance))
 
     def data(self, centres: Ints, radius: int) -> Image:
         """Stamps (n, s, s) without their background."""
         return stamps(self.image, centres, radius) - stamps(self.background, centres, radius)
 
-    def light(self, centres: Ints, radius: int) -> Image:
-        """Stamps (n, s, s) of the light of the stars known so far."""
+    def found_signal(self, centres: Ints, radius: int) -> Image:
+        """Stamps (n, s, s) of the signal of the known stars."""
         if self.found is None:
             return np.zeros((len(centres), 2 * radius + 1, 2 * radius + 1), dtype=np.float32)
         return stamps(self.found, centres, radius)
 
     def variance(self, centres: Ints, radius: int) -> Image:
-        """Stamps (n, s, s) of the pixels' variance, the stars' own light not included."""
+        """Stamps (n, s, s) of the pixels' variance without the sources' own signal."""
         return np.square(stamps(self.noise, centres, radius))
 
-    def usable(self, centres: Ints, radius: int) -> Bools | None:
+    def usable_pixels(self, centres: Ints, radius: int) -> Bools | None:
         """Stamps (n, s, s) of the pixels that may be used; None where all may."""
         return None if self.dead is None else ~stamps(self.dead, centres, radius)
 
@@ -103,14 +103,14 @@ def radius_for(sigma_px: float) -> int:
 
 
 def binning_factor(sigma_px: float) -> int:
-    """Side of the squares: a power of two that leaves a PSF of 0.9 px or more."""
+    """Side of the squares: a power of two; the binned PSF is 0.9 px or wider."""
     return 1 if sigma_px < MIN_BINNED_SIGMA_PX else int(2 ** np.floor(np.log2(2.0 * sigma_px / MIN_BINNED_SIGMA_PX)))
 
 
 def bin_frame(frame: Frame, side: int) -> Frame:
-    """The frame of the sums of squares (what does not fill a square at the right and below is left out).
+    """The frame binned by sums over squares; incomplete squares at the right and lower borders are left out.
 
-    A square is unusable where any of its pixels is.
+    A square is unusable if any of its pixels is.
     """
     if side == 1:
         return frame
@@ -120,11 +120,11 @@ def bin_frame(frame: Frame, side: int) -> Frame:
     if frame.dead is not None:
         dead = np.asarray(frame.dead[whole].reshape(height // side, side, width // side, side).any(axis=(1, 3)))
     found = None if frame.found is None else _sums(frame.found[whole], side)
-    # Background and noise are smooth: one pixel of a square is as good as their mean.
+    # Background and noise are smooth: one pixel of a square represents its mean.
     middle = slice(side // 2, height, side), slice(side // 2, width, side)
     background = frame.background[middle] * np.float32(side**2)
     noise = frame.noise[middle] * np.float32(side)
-    return Frame(_sums(frame.image[whole], side), background, noise, dead, frame.light_noise, found)
+    return Frame(_sums(frame.image[whole], side), background, noise, dead, frame.source_noise, found)
 
 
 def _sums(image: Image, side: int) -> Image:

@@ -16,63 +16,68 @@ BRIGHT_SNR = 12.0  # of the sources from which the width is measured
 WIDTH_TOLERANCE = 0.12  # a measured PSF that differs by more than this fraction from the expected one replaces it
 WIDTH_ROUNDS = 4  # a stamp of the wrong size measures a much wider PSF too small
 BRIGHT_PIXEL_SIGMAS, MAX_BRIGHT_PIXELS, MIN_BRIGHT_PIXELS = 8.0, 64, 30
-MIN_BESIDE, MIN_FALL, MAX_FALL = 0.02, 0.05, 3.5  # light beside a peak; its fall for 4.5 px and 0.45 px
-MIN_BRIGHT = 8
-MAX_BRIGHT, MAX_BRIGHT_ALL_WIDTHS = 100, 40  # the second where many widths are tried
-NEAR = np.geomspace(0.72, 1.4, 8)  # widths tried first, in units of the expected one
+MIN_BESIDE, MIN_FALL, MAX_FALL = (
+    0.02,
+    0.05,
+    3.5,
+)  # relative signal beside a peak; its logarithmic fall for 4.5 px and 0.45 px
+MIN_BRIGHT_SOURCES = 8
+MAX_BRIGHT_SOURCES, MAX_SOURCES_ALL_WIDTHS = 100, 40  # the second where many widths are tried
+NEAR_WIDTHS = np.geomspace(0.72, 1.4, 8)  # widths tried first, in units of the expected one
 WIDTHS_PX = np.geomspace(0.3, 8.0, 22)
 NARROWER_IS_A_PIXEL_PX = 0.45  # hot pixels fit the narrowest profile
-AT_THE_END = 0.3  # part of the sources that the widths tried first may fail to hold
-STAR_LIKE = 0.75  # of a stamp's variance beyond the noise that a star of the best width explains; clouds: 0.2 to 0.5
-SHARP_RATIO = 0.6  # sources narrower than this part of the typical width are stars among something else
-SHARP_FRACTION = 0.1  # of the sources, from which these are no accident
+MAX_END_FRACTION = 0.3  # largest fraction of sources with a best width at the end of NEAR_WIDTHS
+STAR_LIKE = 0.75  # fraction of a stamp's variance beyond the noise that a star explains; clouds: 0.2 to 0.5
+SHARP_RATIO = 0.6  # of the typical width: narrower sources are stars among clouds
+SHARP_FRACTION = 0.1  # of the sources: smallest number of narrow ones that is significant
 
 
 def measure_psf_width(frame: Frame, centres: Ints, fits: PointFits, sigma: float) -> float | None:
     """Typical PSF sigma [px] of the bright sources that are like stars; None where there are too few.
 
-    Clouds, moonlight and branches give bumps of any width, wider ones with a wider filter: bumps that no Gaussian
-    explains are left out, and of two kinds of width the sharper one belongs to the stars.
+    Clouds, moonlight and branches give peaks of any width, wider ones with a wider filter. Peaks that no Gaussian fits
+    are left out; if two groups of widths remain, the narrower one is the stars'.
     """
     radius = radius_for(sigma)
     bright = np.flatnonzero((fits.snr > BRIGHT_SNR) & (fits.chi2 < fits.chi2_pixel))
     bright = bright[np.argsort(-fits.snr[bright], kind="stable")]
-    usable = frame.usable(centres[bright], radius)
-    bright = (bright if usable is None else bright[usable.all(axis=(1, 2))])[:MAX_BRIGHT]
-    if len(bright) < MIN_BRIGHT:
+    usable = frame.usable_pixels(centres[bright], radius)
+    bright = (bright if usable is None else bright[usable.all(axis=(1, 2))])[:MAX_BRIGHT_SOURCES]
+    if len(bright) < MIN_BRIGHT_SOURCES:
         return None
     pixels = centres[bright]
     data = frame.data(pixels, radius)
-    weights = 1.0 / (frame.variance(pixels, radius) + np.float32(frame.light_noise.per_unit) * np.maximum(data, 0.0))
+    weights = 1.0 / (frame.variance(pixels, radius) + np.float32(frame.source_noise.per_unit) * np.maximum(data, 0.0))
     offset = fits.xy_px[bright] - pixels
-    widths, inside, part = fit_widths(data, weights, offset, sigma * NEAR)
-    if inside.mean() < 1.0 - AT_THE_END:
-        few = slice(0, MAX_BRIGHT_ALL_WIDTHS)
+    widths, inside, part = fit_widths(data, weights, offset, sigma * NEAR_WIDTHS)
+    if inside.mean() < 1.0 - MAX_END_FRACTION:
+        few = slice(0, MAX_SOURCES_ALL_WIDTHS)
         widths, inside, part = fit_widths(data[few], weights[few], offset[few], WIDTHS_PX)
     widths = widths[inside & (part > STAR_LIKE) & (widths > NARROWER_IS_A_PIXEL_PX)]
-    if len(widths) < MIN_BRIGHT:
+    if len(widths) < MIN_BRIGHT_SOURCES:
         return None
     sharp = widths[widths < SHARP_RATIO * np.median(widths)]
-    return float(np.median(sharp if len(sharp) >= max(MIN_BRIGHT, SHARP_FRACTION * len(widths)) else widths))
+    return float(np.median(sharp if len(sharp) >= max(MIN_BRIGHT_SOURCES, SHARP_FRACTION * len(widths)) else widths))
 
 
 def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array) -> tuple[Array, Bools, Array]:
-    """Best-fitting PSF sigma (n,) [px] of each stamp among `widths_px` (m,), geometric; whether it is not the last;
-    and the part of the stamp's variance beyond the noise that it explains, about 1 for a star.
+    """Best-fitting PSF sigma (n,) [px] of each stamp among `widths_px` (m,), a geometric series.
 
-    Refined by a parabola through chi^2; flux and level are free, the position is `offset_px` from the middle pixel.
+    Also returns whether the best width is not the last one, and the fraction of the stamp's variance beyond the noise
+    that the fit explains, about 1 for a star. Refined by a parabola through chi^2; flux and level are free, the
+    position is `offset_px` from the middle pixel.
     """
     radius, m = data.shape[1] // 2, len(widths_px)
     moment = weights * data
-    total, light = weights.sum(axis=(1, 2)).astype(np.float64), moment.sum(axis=(1, 2)).astype(np.float64)
+    total, signal = weights.sum(axis=(1, 2)).astype(np.float64), moment.sum(axis=(1, 2)).astype(np.float64)
     profiles = []
     for axis in range(2):
         profile, _ = pixel_profile_single(np.repeat(offset_px[:, axis], m), np.tile(widths_px, len(data)), radius)
         profiles.append(profile.reshape(len(data), m, 2 * radius + 1))
     px, py = profiles
     ss, s1, sd = _sums(weights, py * py, px * px), _sums(weights, py, px), _sums(moment, py, px)
-    # chi^2 falls by this much for a star of each width on a level background.
-    part, excess = ss - s1 * s1 / total[:, None], sd - s1 * (light / total)[:, None]
+    # Reduction of chi^2 by a star of each width on a constant background.
+    part, excess = ss - s1 * s1 / total[:, None], sd - s1 * (signal / total)[:, None]
     explained = np.square(excess) / np.maximum(part, 1e-30)
     best = np.argmax(explained, axis=1)
     inside = (best > 0) & (best < len(widths_px) - 1)
@@ -82,7 +87,7 @@ def fit_widths(data: Pixels, weights: Pixels, offset_px: Array, widths_px: Array
     bend = 2 * middle - left - right
     shift = np.divide(0.5 * (right - left), bend, out=np.zeros_like(bend), where=bend > 0)
     log_width = np.log(widths_px)
-    variance = np.einsum("nij,nij->n", moment, data, dtype=np.float64) - light * light / total
+    variance = np.einsum("nij,nij->n", moment, data, dtype=np.float64) - signal * signal / total
     beyond_noise = np.maximum(variance - data[0].size, 1e-30)
     widths = np.exp(log_width[best] + np.clip(shift, -1, 1) * (log_width[1] - log_width[0]))
     return widths, inside, middle / np.maximum(beyond_noise, 0.5 * middle)
@@ -94,9 +99,9 @@ def _sums(stamp: Pixels, down: Pixels, across: Pixels) -> Array:
 
 
 def guess_psf_width(prepare: Callable[[float], Frame], sigma: float) -> float:
-    """PSF sigma [px] by the brightest pixels, from a first guess, which is kept where they give no width.
+    """PSF sigma [px] from the brightest pixels; the first guess if they give none.
 
-    `prepare` gives the frame with the background for a PSF of that width.
+    `prepare` returns the frame with the background for a given PSF width.
     """
     frame = prepare(sigma)
     pixels = bright_pixels(frame, BRIGHT_PIXEL_SIGMAS, MAX_BRIGHT_PIXELS, 1)
@@ -112,8 +117,8 @@ def guess_psf_width(prepare: Callable[[float], Frame], sigma: float) -> float:
         if not len(centres):
             break
         data, variance = frame.data(centres, radius), frame.variance(centres, radius)
-        stamps = Stamps(data, variance, frame.usable(centres, radius), centres, np.zeros(len(centres)))
-        fits = fit_points(stamps, centres.astype(np.float64), sigma, frame.light_noise, 0.0, ROUNDS_AGAIN)
+        stamps = Stamps(data, variance, frame.usable_pixels(centres, radius), centres, np.zeros(len(centres)))
+        fits = fit_points(stamps, centres.astype(np.float64), sigma, frame.source_noise, 0.0, ROUNDS_AGAIN)
         measured = measure_psf_width(frame, centres, fits, sigma)
         if measured is None:
             break
@@ -125,14 +130,14 @@ def guess_psf_width(prepare: Callable[[float], Frame], sigma: float) -> float:
 
 
 def _width_by_fall(frame: Frame, pixels: Ints) -> float | None:
-    """About the PSF sigma [px] of sources whose brightest pixels (n, 2) lie off the border; None where they are odd.
+    """Approximate PSF sigma [px] of sources with brightest pixels (n, 2) off the border; None outside the valid range.
 
-    Of a Gaussian of variance s^2 the values left and right of a pixel have the product of its square and exp(-1 / s^2),
-    wherever the middle is.
+    For a Gaussian of variance s^2 the product of the values left and right of a pixel is the square of the pixel's
+    value times exp(-1 / s^2), independent of the centre.
     """
-    light = np.maximum(frame.data(pixels, 1), 0.0)
-    peak = np.maximum(light[:, 1, 1], 1e-9)
-    beside = np.stack([light[:, 1, 0], light[:, 1, 2], light[:, 0, 1], light[:, 2, 1]], axis=1) / peak[:, None]
+    signal = np.maximum(frame.data(pixels, 1), 0.0)
+    peak = np.maximum(signal[:, 1, 1], 1e-9)
+    beside = np.stack([signal[:, 1, 0], signal[:, 1, 2], signal[:, 0, 1], signal[:, 2, 1]], axis=1) / peak[:, None]
     falls = -0.5 * float(np.median(np.log(np.maximum(beside, MIN_BESIDE)).sum(axis=1)))
     if not MIN_FALL < falls < MAX_FALL:
         return None

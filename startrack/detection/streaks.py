@@ -14,7 +14,7 @@ PIXEL_SIGMAS = 2.5  # of the lightly smoothed image: pixels of a streak
 SMOOTH_PX = 1.0
 MIN_AREA_PX, MAX_AREA_PX = 12, 20_000
 BRIGHT_SNR = 15.0  # of the whole streak
-MIN_STARS = 6  # streaks that agree with each other
+MIN_STARS = 6  # streaks of similar direction and length
 LONG_PX, SLENDER = 4.5, 2.5  # shortest streak, and its length over its width
 SAME_DIRECTION, SAME_LENGTH = np.cos(np.radians(15.0)), 0.3
 ELONGATION_RADIUS_PX, ELONGATION_PEAKS, ELONGATION_SIGMAS, ELONGATION_PX2, ELONGATION_RATIO = 7, 100, 4.0, 2.2, 2.2
@@ -26,7 +26,7 @@ STREAKED_FRACTION = 0.6  # of the bright blobs
 class Streaks:
     """Streaks (n), brightest first."""
 
-    xy_px: Array  # (n, 2) middle of the light
+    xy_px: Array  # (n, 2) centroids
     covariance_px2: Array  # (n, 2, 2)
     flux: Array
     flux_sigma: Array
@@ -35,29 +35,29 @@ class Streaks:
 
 
 def are_elongated(frame: Frame, centres: Ints) -> bool:
-    """Whether the highest peaks (n, 2) are parts of long sources rather than round ones: a quick test."""
+    """Whether the highest peaks (n, 2) are parts of elongated sources: a quick test."""
     height, width = frame.shape
     margin = np.minimum(centres, np.array([width, height]) - 1 - centres).min(axis=1)
     centres = centres[margin >= ELONGATION_RADIUS_PX][:ELONGATION_PEAKS]
     if len(centres) < MIN_STARS:
         return False
-    light, noise = frame.data(centres, ELONGATION_RADIUS_PX), np.sqrt(frame.variance(centres, ELONGATION_RADIUS_PX))
-    light = np.where(light > ELONGATION_SIGMAS * noise, light, 0.0)
+    signal, noise = frame.data(centres, ELONGATION_RADIUS_PX), np.sqrt(frame.variance(centres, ELONGATION_RADIUS_PX))
+    signal = np.where(signal > ELONGATION_SIGMAS * noise, signal, 0.0)
     offset = np.arange(-ELONGATION_RADIUS_PX, ELONGATION_RADIUS_PX + 1)
     x, y = np.meshgrid(offset, offset)
-    total = np.maximum(light.sum(axis=(1, 2)), 1e-9)
-    xx, xy, yy = (np.sum(light * q, axis=(1, 2)) / total for q in (x * x, x * y, y * y))
+    total = np.maximum(signal.sum(axis=(1, 2)), 1e-9)
+    xx, xy, yy = (np.sum(signal * q, axis=(1, 2)) / total for q in (x * x, x * y, y * y))
     trace, spread = xx + yy, np.hypot(xx - yy, 2.0 * xy)
     long = (trace + spread) > ELONGATION_RATIO * (trace - spread + 0.2)
     return bool(np.mean(long & (trace + spread > 2.0 * ELONGATION_PX2)) > 0.5)
 
 
 def find_streaks(frame: Frame) -> Streaks | None:
-    """The frame's streaks where most of its bright blobs are streaks like their neighbours'; else None.
+    """The frame's streaks if most of its bright sources are streaks similar to their neighbours; else None.
 
-    The middle of a streak's light is where the star stood at mid-exposure, if the camera turned evenly and the sky was
-    equally clear all the time; a hundredth of the length is allowed for what was not. Tracks of particles have all
-    directions and lengths, and are not streaks of stars.
+    The centroid of a streak is the star's position at mid-exposure if rotation and transparency were constant; a
+    hundredth of the length is added to its error for variations. Particle tracks have random directions and lengths,
+    and are rejected.
     """
     height, width = frame.shape
     whole = frame.standardise(slice(0, height))
@@ -73,10 +73,10 @@ def find_streaks(frame: Frame) -> Streaks | None:
     off_border &= (left + stats[:, cv2.CC_STAT_WIDTH] < width - 1) & (top + stats[:, cv2.CC_STAT_HEIGHT] < height - 1)
     rows, columns = np.nonzero(cv2.dilate(mask, np.ones((3, 3), np.uint8)))
     label = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8))[rows, columns].astype(np.int64)
-    light = (frame.image[rows, columns] - frame.background[rows, columns]).astype(np.float64)
+    signal = (frame.image[rows, columns] - frame.background[rows, columns]).astype(np.float64)
     variance = np.square(frame.noise[rows, columns].astype(np.float64))
-    variance += frame.light_noise.per_unit * np.maximum(light, 0.0)
-    blobs = _moments(label, np.stack([columns, rows], axis=1).astype(np.float64), light, variance, count)
+    variance += frame.source_noise.per_unit * np.maximum(signal, 0.0)
+    blobs = _moments(label, np.stack([columns, rows], axis=1).astype(np.float64), signal, variance, count)
     flux, flux_sigma, xy, spread, covariance = blobs
     bright = (area >= MIN_AREA_PX) & (area <= MAX_AREA_PX) & off_border & (flux > BRIGHT_SNR * flux_sigma)
     bright[0] = False
@@ -105,21 +105,21 @@ def find_streaks(frame: Frame) -> Streaks | None:
     )  # fmt: skip
 
 
-def _moments(label: Ints, xy: Array, light: Array, variance: Array, count: int) -> tuple[Array, ...]:
+def _moments(label: Ints, xy: Array, signal: Array, variance: Array, count: int) -> tuple[Array, ...]:
     """Flux (count,), its sigma, middle (count, 2), second moments (count, 2, 2), covariance of the middle."""
 
-    def total(values: Array) -> Array:
+    def sum_by_label(values: Array) -> Array:
         return np.bincount(label, values, count).astype(np.float64)
 
-    flux = np.maximum(total(light), 1e-9)
-    middle = np.stack([total(light * xy[:, 0]), total(light * xy[:, 1])], axis=1) / flux[:, None]
+    flux = np.maximum(sum_by_label(signal), 1e-9)
+    middle = np.stack([sum_by_label(signal * xy[:, 0]), sum_by_label(signal * xy[:, 1])], axis=1) / flux[:, None]
     off = xy - middle[label]
     spread, covariance = np.empty((count, 2, 2)), np.empty((count, 2, 2))
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        spread[:, i, j] = total(light * off[:, i] * off[:, j]) / flux
-        covariance[:, i, j] = total(variance * off[:, i] * off[:, j]) / flux**2
-    covariance += 1e-4 * np.eye(2)  # a hundredth of a pixel for the edges of the mask
-    return flux, np.sqrt(np.maximum(total(variance), 1e-12)), middle, spread, covariance
+        spread[:, i, j] = sum_by_label(signal * off[:, i] * off[:, j]) / flux
+        covariance[:, i, j] = sum_by_label(variance * off[:, i] * off[:, j]) / flux**2
+    covariance += 1e-4 * np.eye(2)  # 0.01 px for the edges of the mask
+    return flux, np.sqrt(np.maximum(sum_by_label(variance), 1e-12)), middle, spread, covariance
 
 
 def _resemble_neighbours(xy: Array, along: Array, length: Array) -> Bools:
@@ -129,7 +129,7 @@ def _resemble_neighbours(xy: Array, along: Array, length: Array) -> Bools:
     _, near = cKDTree(xy).query(xy, k=min(4, len(xy)))
     off = xy[near[:, 1:]] - xy[:, None]
     off /= np.maximum(np.linalg.norm(off, axis=-1, keepdims=True), 1e-9)
-    # Pieces of one long edge follow each other in their own direction; of stars one in six does.
+    # Parts of one long edge lie in line with their direction; neighbouring stars do so in one of six cases.
     in_line = np.abs(np.einsum("ni,nki->nk", along, off)) > SAME_DIRECTION
     if in_line[:, 0].mean() > IN_LINE_FRACTION:
         return np.zeros(len(xy), dtype=bool)

@@ -86,7 +86,7 @@ def _has_end(block: bytes) -> bool:
 def _check_headers(raw: bytes) -> None:
     """Refuse numbers of axes, fields and pixels that a reader would loop over or allocate for minutes.
 
-    Header by header, before a reader sees the file; it stops at the first header that is not complete in `raw`.
+    Checks header by header before a reader opens the file; stops at the first header that is not complete in `raw`.
     """
     at = 0
     while raw[at : at + 8] in (b"SIMPLE  ", b"XTENSION"):
@@ -139,8 +139,8 @@ def _check_complete(units: Any, raw: bytes) -> None:
     """Check that the file holds every unit with its padding, and nothing else: astropy only warns."""
     end = 0
     for index in range(len(units)):
-        place = units.fileinfo(index)
-        end = max(end, place["datLoc"] + place["datSpan"])
+        span = units.fileinfo(index)
+        end = max(end, span["datLoc"] + span["datSpan"])
     if end > len(raw):
         raise bad_image("truncated FITS: the file ends before its data do")
     if raw[end:].strip(b"\0 "):

@@ -1,6 +1,6 @@
 """JPEG: read by Pillow, which refuses a truncated file.
 
-OpenCV returns a truncated JPEG with flat grey in place of the missing part, which would be taken for a wall that hides
+OpenCV returns a truncated JPEG with flat grey in place of the missing part, which would look like a wall that hides
 stars. Pillow does the same if an end marker follows the cut, so the picture is decoded twice (see FILLER).
 """
 

@@ -127,8 +127,8 @@ def sidecars(image: Path) -> list[Path]:
 
 def sidecar_of(image: Path) -> Path | None:
     """The sidecar of the image if there is one. Cameras that write NAME.PNG write NAME.JSON."""
-    places = (place for path in sidecars(image) for place in (path, path.with_suffix(".JSON")))
-    return next((place for place in places if os.path.isfile(place)), None)
+    candidates = (candidate for path in sidecars(image) for candidate in (path, path.with_suffix(".JSON")))
+    return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
 
 
 def _stems(image: Path) -> list[str]:

@@ -51,7 +51,7 @@ def decode_camera_raw(raw: bytes) -> Decoded:
 
 
 def equalize_mosaic(pixels_adu: Picture, saturation_adu: float | None) -> Picture:
-    """The mosaic `pixels_adu` (H, W) as if all pixels had one filter; those at `saturation_adu` stay saturated."""
+    """The mosaic `pixels_adu` (H, W) scaled to one level and gain; pixels at `saturation_adu` stay saturated."""
     if min(pixels_adu.shape) < 4 * BLOCK_PX:
         return pixels_adu  # too small to hold stars of every phase
     levels = [_block_medians(pixels_adu[i::2, j::2]) for i, j in PHASES]

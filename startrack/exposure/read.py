@@ -124,7 +124,7 @@ def _decode(raw: bytes, camera_raw: bool) -> Decoded:
 
     Raises BadInput bad_image; whatever else a decoder raises for damaged bytes is turned into it.
     """
-    kind, decode = "image", _unknown
+    kind, decode = "image", _refuse_unknown
     try:
         if camera_raw:
             from startrack.exposure.mosaic import decode_camera_raw
@@ -155,5 +155,5 @@ def _decode(raw: bytes, camera_raw: bool) -> Decoded:
         raise bad_image(f"truncated or damaged {kind} ({type(error).__name__}: {str(error)[:200]})") from error
 
 
-def _unknown(raw: bytes) -> Decoded:
+def _refuse_unknown(raw: bytes) -> Decoded:
     raise bad_image("is not a PNG, TIFF, JPEG or FITS file, nor named as a camera raw file")

@@ -135,7 +135,7 @@ def _pixels(page: Any, raw: bytes) -> NDArray[Any]:
 def _pixels_by_opencv(raw: bytes, compression: Any) -> NDArray[Any]:
     import cv2
 
-    with _quiet(cv2):
+    with _silence_opencv(cv2):
         stored = cv2.imdecode(np.frombuffer(raw, np.uint8), cv2.IMREAD_UNCHANGED)
     if stored is None:
         raise bad_image(f"TIFF is damaged or its compression ({compression!r}) is unknown here; save it uncompressed")
@@ -143,7 +143,7 @@ def _pixels_by_opencv(raw: bytes, compression: Any) -> NDArray[Any]:
 
 
 @contextmanager
-def _quiet(cv2: Any) -> Iterator[None]:
+def _silence_opencv(cv2: Any) -> Iterator[None]:
     """Keep OpenCV from printing about a failed decoding: the exception has the cause."""
     log = cv2.utils.logging
     level = log.setLogLevel(log.LOG_LEVEL_SILENT)

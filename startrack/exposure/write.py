@@ -58,8 +58,8 @@ def write_sidecar(image: str | os.PathLike[str], facts: Facts | Exposure, *, ove
     values = {
         "time_utc": None if facts.time_utc is None else format_utc(facts.time_utc),
         "exposure_s": facts.exposure_s,
-        "camera": _relative(facts.camera, target.parent),
-        "terrain": _relative(facts.terrain, target.parent),
+        "camera": _relative_path(facts.camera, target.parent),
+        "terrain": _relative_path(facts.terrain, target.parent),
         "bayer_pattern": facts.bayer_pattern if isinstance(facts, Facts) else None,
     }
     text = json.dumps({k: v for k, v in values.items() if v is not None}, ensure_ascii=False, allow_nan=False)
@@ -79,13 +79,13 @@ def header_entries(exposure: Exposure, folder: Path) -> dict[str, str | float]:
     if exposure.exposure_s is not None:
         entries["EXPTIME"] = float(exposure.exposure_s)
     for key, reference in (("STCAMERA", exposure.camera), ("STTERRAI", exposure.terrain)):
-        relative = _relative(reference, folder)
+        relative = _relative_path(reference, folder)
         if relative is not None:
             entries[key] = relative
     return entries
 
 
-def _relative(reference: str | None, folder: Path) -> str | None:
+def _relative_path(reference: str | None, folder: Path) -> str | None:
     """A path as seen from `folder`, with forward slashes; a shipped name as it is."""
     if reference is None or not is_path(reference):
         return reference

@@ -75,7 +75,7 @@ def refract_rad(elevation_rad: ArrayLike, pressure_hpa: float = 1010.0, temperat
     air = pressure_hpa / 1010.0 * 283.0 / (273.0 + temperature_c)
     start_deg = np.degrees(np.maximum(true_rad, np.radians(-1.0)))
     lift_arcmin = np.zeros_like(start_deg)
-    for _ in range(12):  # the lift falls by at most 0.2 arcmin per arcmin: twelve rounds leave nothing
+    for _ in range(12):  # the lift falls by at most 0.2 arcmin per arcmin: twelve rounds converge
         h = start_deg + lift_arcmin / 60.0
         r = 1.0 / np.tan(np.radians(h + 7.31 / (h + 4.4)))
         lift_arcmin = air * (r - 0.06 * np.sin(np.radians(14.7 * r + 13.0)))

@@ -126,10 +126,10 @@ def _coverage_et_s() -> tuple[float, float]:
 def _close_before_forks() -> None:
     """Registered once, at the first use: parent and child each load the kernels again when they next need them."""
     if hasattr(os, "register_at_fork"):
-        os.register_at_fork(before=_close, after_in_parent=_lock.release, after_in_child=_lock.release)
+        os.register_at_fork(before=_close_kernels, after_in_parent=_lock.release, after_in_child=_lock.release)
 
 
-def _close() -> None:
+def _close_kernels() -> None:
     import spiceypy
 
     _lock.acquire()  # held across the fork, so that no other thread is inside SPICE at that moment

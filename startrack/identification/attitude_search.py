@@ -18,17 +18,20 @@ from startrack.identification.triangles import sides_of_few, triangles
 from startrack.types import Array, Ints
 
 PREFIXES = (0, 7, 10, 14, 20, 28)  # number of brightest detections that form triangles, round by round
-WINDOW, FRESH = 24, 12  # ranks of brightness that form triangles beyond these, and how many of them are new
+WINDOW_RANKS, NEW_RANKS = 24, 12  # ranks of brightness that form triangles beyond these, and how many of them are new
 DEEPEST_RANK = 240
-ROUGH_DEPTH, ROUGH_REACH_RAD, ROUGH_FRACTION = 120, np.radians(20.0), 0.4
-PIVOTS = 16  # brightest detections about which triangles that no index lists are tried
+ROUGH_DEPTH, ROUGH_SIDE_RAD, ROUGH_FRACTION = 120, np.radians(20.0), 0.4
+PIVOTS = 16  # brightest detections about which triangles of catalogue pairs are tried
 MATCHES_EACH, ROUGH_MATCHES_EACH = 3, 8  # catalogue triangles looked up for a triangle of detections
 MAX_IMAGE_TRIANGLES, MAX_ROUGH = 20_000, 3000  # short triangles of detections; their matches that are tried
-VERIFIED = 256  # detections tested against the stars
-SIFTED, SIFTED_AT_ONCE = 64, 64  # detections that test a crowd of hypotheses first; hypotheses tested together
+VERIFIED_DETECTIONS = 256  # detections tested against the stars
+PRETESTED_DETECTIONS, PRETEST_BATCH = (
+    64,
+    64,
+)  # detections in the first test of many hypotheses; hypotheses tested together
 DEPTH_FACTOR = 4  # catalogue stars per detection (of the whole sky): some are hidden or too faint
 MIN_HITS = 6
-PLAUSIBLE = 1e-2  # expected false alarms below which a hypothesis is refined; then the real limit decides
+PLAUSIBLE = 1e-2  # expected false alarms below which a hypothesis is refined; the final limit is tested later
 
 
 @dataclass(frozen=True)
@@ -56,24 +59,24 @@ class AttitudeSearch:
         """Attitudes that are unlikely by chance.
 
         First from long triangles of the few brightest detections, then of fainter ones and with more catalogue stars,
-        then from triangles that no index lists; last from short ones, for rays in error by `rough_px`: over a short
-        distance a rough calibration is still good.
+        then from triangles assembled from catalogue pairs; last from short ones, for rays with errors of `rough_px`:
+        over short distances a rough calibration is still accurate.
         """
         brightest, beyond = list(self._prefixes()), list(self._windows())
         tolerance = tolerance_px * self.scale.axis_rad_per_px
         for windows in (brightest, beyond):
             for deep in (False, True):
                 for first, fresh, end in windows:
-                    index = self.patterns.deep if deep else self.patterns.bright
+                    index = self.patterns.deep_index if deep else self.patterns.bright_index
                     yield from self._attitudes_from_triangles(index, first, fresh, end, tolerance)
         yield from self._attitudes_from_pairs(tolerance)
         yield from self._attitudes_from_short_triangles(rough_px * self.scale.axis_rad_per_px)
 
     def mirrored_hypotheses(self) -> Iterator[AttitudeHypothesis]:
-        """The same for the mirror image, from the triangles of the other handedness met so far."""
+        """The same for the mirror image, from the stored triangles of the other handedness."""
         flip = np.array([-1.0, 1.0, 1.0])
         for cam, icrs, first, tolerance in self.mirrored:
-            yield from self._plausible(cam * flip, icrs, self.rays_cam * flip, first, tolerance)
+            yield from self._plausible_attitudes(cam * flip, icrs, self.rays_cam * flip, first, tolerance)
 
     def _prefixes(self) -> Iterator[tuple[int, int, int]]:
         n = len(self.rays_cam)
@@ -81,8 +84,11 @@ class AttitudeSearch:
 
     def _windows(self) -> Iterator[tuple[int, int, int]]:
         n = min(len(self.rays_cam), DEEPEST_RANK)
-        start = PREFIXES[-1] - (WINDOW - FRESH)
-        return ((k, WINDOW - FRESH, min(k + WINDOW, n)) for k in range(start, n - WINDOW + FRESH, FRESH))
+        start = PREFIXES[-1] - (WINDOW_RANKS - NEW_RANKS)
+        return (
+            (k, WINDOW_RANKS - NEW_RANKS, min(k + WINDOW_RANKS, n))
+            for k in range(start, n - WINDOW_RANKS + NEW_RANKS, NEW_RANKS)
+        )
 
     def _attitudes_from_triangles(
         self, index: PatternIndex, first: int, fresh: int, end: int, tolerance: float
@@ -108,8 +114,8 @@ class AttitudeSearch:
                 yield from self._test_triangles(few[image + pivot], icrs, np.linalg.det(icrs), 0, tolerance)
 
     def _attitudes_from_short_triangles(self, tolerance: float) -> Iterator[AttitudeHypothesis]:
-        index = self.patterns.deep
-        longest = min(ROUGH_REACH_RAD, ROUGH_FRACTION * self.scale.diameter_rad)
+        index = self.patterns.deep_index
+        longest = min(ROUGH_SIDE_RAD, ROUGH_FRACTION * self.scale.diameter_rad)
         image = triangles(self.rays_cam[:ROUGH_DEPTH], longest, MAX_IMAGE_TRIANGLES)
         left, right = index.candidates(2 * np.sin(image.sides_rad / 2), tolerance, ROUGH_MATCHES_EACH)
         self.tried += max(len(left) - MAX_ROUGH, 0)
@@ -127,30 +133,32 @@ class AttitudeSearch:
         if np.count_nonzero(same) < len(same):
             self.mirrored.append((cam[~same], icrs[~same], first, tolerance))
             cam, icrs = cam[same], icrs[same]
-        yield from self._plausible(cam, icrs, self.rays_cam, first, tolerance)
+        yield from self._plausible_attitudes(cam, icrs, self.rays_cam, first, tolerance)
 
-    def _plausible(
+    def _plausible_attitudes(
         self, cam: Array, icrs: Array, rays_cam: Array, first: int, tolerance: float
     ) -> Iterator[AttitudeHypothesis]:
         """Attitudes that rotate the rays icrs (m, 3, 3) to cam (m, 3, 3) and that bright stars support."""
-        some, radius = rays_cam[: first + VERIFIED], 2.0 * tolerance
+        some, radius = rays_cam[: first + VERIFIED_DETECTIONS], 2.0 * tolerance
         depth = int(DEPTH_FACTOR * 4 * np.pi / self.patterns.field_sr * len(some))
-        for R in self._supported_attitudes(cam, icrs, some[max(first - WINDOW, 0) : first + SIFTED], radius, depth):
+        for R in self._supported_attitudes(
+            cam, icrs, some[max(first - WINDOW_RANKS, 0) : first + PRETESTED_DETECTIONS], radius, depth
+        ):
             near = self.patterns.neighbours(some @ R, self.neighbour_radius_rad, depth)
-            on = near.chord < radius
-            hits = min(int(np.count_nonzero(on)), len(some))
+            hit = near.chord < radius
+            hits = min(int(np.count_nonzero(hit)), len(some))
             if hits < MIN_HITS:
                 continue
             if self._false_alarms(hits - PATTERN_MATCHES, len(some), near.depth, radius) < PLAUSIBLE:
-                yield AttitudeHypothesis(R, near.ray[on], near.star[on], near if len(some) == len(rays_cam) else None)
+                yield AttitudeHypothesis(R, near.ray[hit], near.star[hit], near if len(some) == len(rays_cam) else None)
 
     def _supported_attitudes(self, cam: Array, icrs: Array, some: Array, radius: float, depth: int) -> Iterator[Array]:
         """R_cam_icrs of the closest match, which is nearly always right, then of matches that detections support."""
         if len(cam):
             yield wahba(cam[0], icrs[0])
         tree = self.patterns.tree(depth)
-        for start in range(1, len(cam), SIFTED_AT_ONCE):
-            R = wahba(cam[start : start + SIFTED_AT_ONCE], icrs[start : start + SIFTED_AT_ONCE])
+        for start in range(1, len(cam), PRETEST_BATCH):
+            R = wahba(cam[start : start + PRETEST_BATCH], icrs[start : start + PRETEST_BATCH])
             distance = tree.query(some @ R, distance_upper_bound=radius)[0]
             hits = np.count_nonzero(distance < radius, axis=1)
             best = np.argsort(-hits, kind="stable")

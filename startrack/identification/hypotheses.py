@@ -10,7 +10,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.false_alarm import PATTERN_MATCHES, log_p_value
-from startrack.identification.index import bright_stars_apart
+from startrack.identification.index import separate_bright_stars
 from startrack.identification.proximity_mask import ProximityMask, proximity_mask
 from startrack.identification.radial_lens_family import RadialFamily, angle
 from startrack.identification.region_growing import LensHypothesis
@@ -27,7 +27,10 @@ LOCAL_SIDES = 1.2  # of the longest side, about the triangle: within it an imper
 CANDIDATES_AT_ONCE = 20_000
 MAX_HYPOTHESES = 6  # of one lens and window; the true one is nearly always the likeliest
 MAX_DETECTIONS = 100
-VERIFIED = ((24, -1.5), (48, -4.0))  # detections tested against the stars; log p-value below which the test goes on
+VERIFICATION_STAGES = (
+    (24, -1.5),
+    (48, -4.0),
+)  # detections tested against the stars; log p-value below which the test goes on
 MAX_VERIFIED = 80
 CACHED_PATTERNS = 6
 
@@ -106,7 +109,7 @@ def patterns_for(stars: Stars, sizes: PatternSizes) -> ShapePatterns:
 
     key = (sizes, len(stars), hashlib.sha1(np.round(stars.rays_icrs[:500], 3).tobytes()).hexdigest())
     if key not in _CACHE:
-        star = bright_stars_apart(stars, sizes.stars)
+        star = separate_bright_stars(stars, sizes.stars)
         rays = stars.rays_icrs[star]
         found = triangles(rays, sizes.longest_side_rad * (1 + sizes.size_tolerance))
         index = shape_index(found, sizes.shape_tolerance, sizes.size_tolerance)
@@ -166,7 +169,7 @@ class HypothesisSearch:
         middle /= np.linalg.norm(middle, axis=1, keepdims=True)
         alive = np.arange(len(R))
         log_p = np.zeros(len(R))
-        for verified, limit in (*VERIFIED, (MAX_VERIFIED, most_log_p)):
+        for verified, limit in (*VERIFICATION_STAGES, (MAX_VERIFIED, most_log_p)):
             deeper = self._log_p_value(
                 patterns, xy_px[:verified], R[alive], guess, focal[alive], mirrored[alive], middle[alive]
             )
@@ -207,7 +210,7 @@ class HypothesisSearch:
         )  # fmt: skip
 
 
-def without_clumps(xy_px: Array, smallest_px: float, most: int) -> Ints:
+def remove_clumps(xy_px: Array, smallest_px: float, most: int) -> Ints:
     """Indices of the first (brightest) of the points (n, 2), none closer than `smallest_px` to an earlier one."""
     from scipy.spatial import cKDTree
 

@@ -25,11 +25,11 @@ CLOSE_PAIR_RAD = np.radians(0.05)  # stars this close are one detection
 SHALLOWEST_TREE = 1000  # brightest stars in the smallest tree; each next one holds twice as many
 NEIGHBOURS_OF_RAY = 10  # looked up at once; more only in clusters
 CACHED_PATTERNS = 4
-LONGEST_SIDE_OF_FIELD = 0.8  # of a field's diameter: sides that often fit into it
+LONGEST_SIDE_OF_FIELD = 0.8  # of a field's diameter: longer sides seldom fit into it
 CLOSURE_PROBABILITY = 0.59  # that two neighbours of a star in the plane are neighbours of each other
 SCALE_GRID = 33  # pixels per axis at which the solid angle of the field is summed
 SCALE_ANGLES = 64
-LARGEST_SCALE_1 = 3.0  # of the scale on the axis: a lens that bends its edge is not followed further
+LARGEST_SCALE_1 = 3.0  # limit of the scale over that on the axis, for lenses strongly compressed at the edge
 
 Computed = TypeVar("Computed")
 
@@ -68,8 +68,8 @@ class PixelScale:
         return float(np.sqrt(4 * self.field_sr / np.pi))
 
     @classmethod
-    def of(cls, camera: Camera) -> PixelScale:
-        """Measured on grids of angles and of pixels."""
+    def measure(cls, camera: Camera) -> PixelScale:
+        """The scale of a camera, measured on grids of angles and of pixels."""
         axis = camera.unproject(np.array([camera.centre_px]))[0]
         off_axis = np.arctan2(np.hypot(axis[0], axis[1]), axis[2]) + 0.01
         angle = np.linspace(0.01, min(camera.max_angle_rad, camera.lens.max_invertible_rad) - 1e-3, SCALE_ANGLES)
@@ -92,7 +92,7 @@ def _field_sr(camera: Camera) -> float:
     return float(np.sum(camera.pixel_solid_angle_sr(angle[lit]) * cell))
 
 
-pixel_scale_of = PerObject(PixelScale.of)
+pixel_scale_of = PerObject(PixelScale.measure)
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,8 @@ class PatternSize:
     """Numbers of stars and of triangles of an index."""
 
     stars_in_field: int
-    fewest: int  # of the whole sky
-    most: int
+    min_stars: int  # of the whole sky
+    max_stars: int
     triangles: int
     widest_rad: float
 
@@ -139,21 +139,25 @@ def build_index(stars: Stars, field_sr: float, size: PatternSize) -> PatternInde
     """The index of the brightest stars (sorted, brightest first) for a camera that sees `field_sr`."""
     from scipy.spatial import cKDTree
 
-    star = bright_stars_apart(stars, int(np.clip(size.stars_in_field * 4 * np.pi / field_sr, size.fewest, size.most)))
+    star = separate_bright_stars(
+        stars, int(np.clip(size.stars_in_field * 4 * np.pi / field_sr, size.min_stars, size.max_stars))
+    )
     rays = stars.rays_icrs[star]
     neighbours = np.sqrt(6 * size.triangles / (CLOSURE_PROBABILITY * len(star)))
-    reach = min(
+    longest_side = min(
         size.widest_rad,
         2 * np.arcsin(np.sqrt(min(neighbours / len(star), 1.0))),
         LONGEST_SIDE_OF_FIELD * np.sqrt(4 * field_sr / np.pi),
     )
-    found = triangles(rays, reach)
+    found = triangles(rays, longest_side)
     sides = 2 * np.sin(found.sides_rad / 2)
-    return PatternIndex(star, rays, float(2 * np.sin(reach / 2)), found.vertices, found.handedness, cKDTree(sides))
+    return PatternIndex(
+        star, rays, float(2 * np.sin(longest_side / 2)), found.vertices, found.handedness, cKDTree(sides)
+    )
 
 
-def bright_stars_apart(stars: Stars, depth: int) -> Ints:
-    """Indices of the brightest stars, of each close pair only the brighter: a camera does not resolve them."""
+def separate_bright_stars(stars: Stars, depth: int) -> Ints:
+    """Indices of the brightest stars; of each close pair only the brighter, as a camera does not resolve them."""
     from scipy.spatial import cKDTree
 
     rays = stars.rays_icrs[: 2 * depth]
@@ -173,12 +177,12 @@ class CatalogPatterns:
         self._trees: dict[int, Any] = {}
 
     @cached_property
-    def bright(self) -> PatternIndex:
+    def bright_index(self) -> PatternIndex:
         """Triangles of the brightest few stars."""
         return build_index(self.stars, self.field_sr, BRIGHT)
 
     @cached_property
-    def deep(self) -> PatternIndex:
+    def deep_index(self) -> PatternIndex:
         """Triangles of more stars."""
         return build_index(self.stars, self.field_sr, DEEP)
 

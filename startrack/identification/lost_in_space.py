@@ -22,7 +22,7 @@ from startrack.identification.refine_attitude import (
     BLEND_SIGMAS,
     FIRST_GATE_PX,
     GATE_PX,
-    ON_PLACE_PX,
+    INLIER_PX,
     AttitudeMatch,
     AttitudeRefiner,
     neighbour_radius_px,
@@ -33,7 +33,7 @@ from startrack.types import Array, Bools, Centroids, Identification, Ints, NotId
 MIN_MATCHES = 6
 SMALLEST_RADIUS_PX = 0.5
 BRIGHT_DETECTIONS = 300  # brightest detections that decide whether the camera file is right
-ON_PLACE_FRACTION = 0.7  # of the stars within GATE_PX that lie within ON_PLACE_PX if the camera file is right
+INLIER_FRACTION = 0.7  # of the stars within GATE_PX that lie within INLIER_PX if the camera file is right
 MAX_REFINED = 40
 TOLERANCE_SIGMAS = 3.0
 LOCAL_FRACTION = 0.1  # of the field's diameter: radius of the caps in which the density of detections is measured
@@ -69,11 +69,11 @@ class Identifier:
         )
         tolerance_px, rough_px = self.tolerances_px
         tolerance_px = min(max(tolerance_px, TOLERANCE_SIGMAS * upper_median(frame.variance_px2) ** 0.5), rough_px)
-        found, refusal = self._first_accepted(search.hypotheses(tolerance_px, rough_px), frame, search)
+        found, refusal = self._find_accepted(search.hypotheses(tolerance_px, rough_px), frame, search)
         if found is not None:
             return found
         lenient = replace(self, whole_field=False)
-        if lenient._first_accepted(search.mirrored_hypotheses(), frame.mirrored(), search)[0] is not None:
+        if lenient._find_accepted(search.mirrored_hypotheses(), frame.mirror_frame(), search)[0] is not None:
             raise NotIdentified(
                 "the image is a mirror image, compared with the camera file: flip the image, or set mirrored = "
                 f"{str(not camera.mirrored).lower()} in the camera file",
@@ -86,7 +86,7 @@ class Identifier:
             tried=search.tried,
         )
 
-    def _first_accepted(
+    def _find_accepted(
         self, hypotheses: Iterable[AttitudeHypothesis], frame: _Frame, search: AttitudeSearch
     ) -> tuple[Identification | None, str]:
         """The first hypothesis that is accepted, or why the last one was not."""
@@ -99,14 +99,14 @@ class Identifier:
             if match is None:
                 continue
             try:
-                return self._accept(match, frame, search.tried), ""
+                return self._accept_match(match, frame, search.tried), ""
             except _WrongCamera:
                 raise
             except NotIdentified as cause:
                 refusal = str(cause)
         return None, refusal
 
-    def _accept(self, match: AttitudeMatch, frame: _Frame, tried: int) -> Identification:
+    def _accept_match(self, match: AttitudeMatch, frame: _Frame, tried: int) -> Identification:
         """The identification of a match; NotIdentified if chance might explain it, or if the camera file is wrong."""
         pairs = match.pairs
         distance = pairs.distance_px[match.matched]
@@ -120,8 +120,8 @@ class Identifier:
         if log_p > np.log(self.max_false_alarm):
             raise NotIdentified(f"the {hits} stars that match might do so by chance", matched=hits)
         if self.whole_field:
-            _check_camera(match.on_place[pairs.detection[match.matched] < BRIGHT_DETECTIONS])
-        named = pairs.unambiguous(
+            _check_camera(match.inlier[pairs.detection[match.matched] < BRIGHT_DETECTIONS])
+        named = pairs.select_unambiguous(
             match.matched[match.named], match.variance_px2[match.named], BLEND_SIGMAS * frame.centroids.psf_sigma_px
         )
         return Identification(
@@ -129,7 +129,7 @@ class Identifier:
             star=pairs.star[named],
             R_cam_icrs=match.R_cam_icrs,
             false_alarm_probability=probability(log_p),
-            unexplained=pairs.count_unexplained(frame.centroids.snr, ON_PLACE_PX) + frame.significant_outside,
+            unexplained=pairs.count_unexplained(frame.centroids.snr, INLIER_PX) + frame.significant_outside,
         )
 
     def _log_p_value(self, match: AttitudeMatch, hits: int, radius_px: float, frame: _Frame) -> float:
@@ -160,7 +160,7 @@ class _Frame:
         covariance = self.centroids.covariance_px2
         self.variance_px2 = 0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1])  # mean of both axes
 
-    def mirrored(self) -> _Frame:
+    def mirror_frame(self) -> _Frame:
         """The same detections seen by the mirror-image camera."""
         camera = replace(self.camera, mirrored=not self.camera.mirrored)
         rays_cam = camera.unproject(self.centroids.xy_px)
@@ -171,15 +171,15 @@ class _WrongCamera(NotIdentified):
     """The attitude is found, but the camera file is not the calibration of this lens."""
 
 
-def _check_camera(on_place: Bools) -> None:
-    """Raise where many bright stars lie within GATE_PX of their predicted pixel, but not on it (n,).
+def _check_camera(inlier: Bools) -> None:
+    """Raise if many bright stars lie within GATE_PX of their predicted pixel, but not within INLIER_PX (n,).
 
-    Such a camera file fits a patch of the sky only, and biases the attitude: by 0.8 degrees for 1 % of focal length.
+    Such a camera file fits only a part of the field and biases the attitude: by 0.8 degrees for 1 % of focal length.
     """
-    on, near = int(np.count_nonzero(on_place)), len(on_place)
-    if on < ON_PLACE_FRACTION * near - 3.0 * np.sqrt(ON_PLACE_FRACTION * (1 - ON_PLACE_FRACTION) * near):
+    inliers, near = int(np.count_nonzero(inlier)), len(inlier)
+    if inliers < INLIER_FRACTION * near - 3.0 * np.sqrt(INLIER_FRACTION * (1 - INLIER_FRACTION) * near):
         raise _WrongCamera(
-            f"only {on} of {near} bright stars lie within {ON_PLACE_PX:g} px of where the camera file puts "
+            f"only {inliers} of {near} bright stars lie within {INLIER_PX:g} px of where the camera file puts "
             f"them, the others up to {GATE_PX:g} px off: it is not the calibration of this lens",
-            matched=on,
+            matched=inliers,
         )

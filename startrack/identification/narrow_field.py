@@ -44,7 +44,7 @@ VIEWS_OF_ROUND = 4
 # bound of the matches in the inner half of the gate.
 STAGES = ((60, 1.5, 0.010, 6.0, -4.0), (120, 1.5, 0.005, 4.0, -8.0), (400, 2.0, 0.0, 2.5, -10.0))
 STEPS = 2
-MARGIN = 1.15  # about the frame, for the focal length is not known
+MARGIN = 1.15  # of the frame: the focal length is not known
 GATE_PX = 1.5
 SCALE_MATCHES = 200  # brightest, for the photometric scale
 SMALLEST_ERROR_PX = 0.1  # of a centroid against the lens
@@ -95,12 +95,12 @@ class NarrowFieldSearch:
                 if any(np.trace(R.T @ view.R_cam_icrs) > 3.0 - SAME_ATTITUDE_RAD**2 for R in seen):
                     continue
                 seen.append(view.R_cam_icrs)
-                found = self._grow(view)
+                found = self._grow_view(view)
                 if found is not None:
                     yield found
 
     def _voted_views(self, patterns: ShapePatterns, xy_px: Array) -> list[PinholeView]:
-        """The few views on which most of the likely triangles agree."""
+        """The views with the largest number of agreeing triangles."""
         centre = (0.5 * (self.size_px[0] - 1), 0.5 * (self.size_px[1] - 1))
         image = triangles(family_rays(xy_px, centre, self.focal_px, PINHOLE), patterns.longest_side_rad)
         left, right = patterns.triangles.candidates(image)
@@ -109,7 +109,7 @@ class NarrowFieldSearch:
             return []
         catalogue = patterns.triangles.triangles
         mirrored = image.handedness[left] != catalogue.handedness[right]
-        # The pairs (detection, star) of a wrong triangle occur once, those of a right one in all right triangles.
+        # A pair (detection, star) of a wrong triangle occurs once, a right one in many triangles.
         pair = (image.vertices[left] + len(xy_px) * mirrored[:, None]) * len(patterns.star) + catalogue.vertices[right]
         votes = np.bincount(pair.ravel())[pair].min(axis=1)
         most = np.argsort(-votes, kind="stable")[:MAX_VOTED]
@@ -142,7 +142,7 @@ class NarrowFieldSearch:
             left &= ~same[best]
         return views
 
-    def _grow(self, view: PinholeView) -> VerifiedView | None:
+    def _grow_view(self, view: PinholeView) -> VerifiedView | None:
         """The view fitted with more stars and smaller gates, and verified; None where too few stars agree."""
         corner = np.arctan(0.5 * MARGIN * np.hypot(*self.size_px) / view.focal_px)
         near = _star_tree_of(self.stars).query_ball_point(view.R_cam_icrs[2], 2 * np.sin(0.5 * corner))
@@ -191,33 +191,33 @@ def verify_view(
     pairs = _candidate_pairs(view, centroids, stars, tree)
     if pairs is None:
         return None
-    on = _unambiguous(pairs, _pairs_within_gate(pairs), centroids)
-    if len(on) < FEWEST:
+    chosen = _select_unambiguous(pairs, _pairs_within_gate(pairs), centroids)
+    if len(chosen) < FEWEST:
         return None
-    xy_px, rays = centroids.xy_px[pairs.detection[on]], stars.rays_icrs[pairs.star[on]]
-    view = view.fit(xy_px, rays, GATE_PX / 4, distorted=len(on) >= MIN_FOR_DISTORTION)
+    xy_px, rays = centroids.xy_px[pairs.detection[chosen]], stars.rays_icrs[pairs.star[chosen]]
+    view = view.fit(xy_px, rays, GATE_PX / 4, distorted=len(chosen) >= MIN_FOR_DISTORTION)
     view = _choose_lens(view, xy_px, rays, GATE_PX / 4)
     pairs = _candidate_pairs(view, centroids, stars, tree)
     if pairs is None:
         return None
     off_axis_px = np.linalg.norm(centroids.xy_px - view.centre_px, axis=1)
-    near = pairs.one_to_one[pairs.detection[pairs.one_to_one] < TESTED]
+    near = pairs.one_to_one_pairs[pairs.detection[pairs.one_to_one_pairs] < TESTED]
     trusted_px = trusted_radius(off_axis_px[pairs.detection[near]], pairs.distance_px[near] < GATE_PX)
     if trusted_px is None:
         return None
-    on = _pairs_within_gate(pairs)
-    on = on[off_axis_px[pairs.detection[on]] <= trusted_px]
-    if len(on) < FEWEST:
+    chosen = _pairs_within_gate(pairs)
+    chosen = chosen[off_axis_px[pairs.detection[chosen]] <= trusted_px]
+    if len(chosen) < FEWEST:
         return None
-    log_p = _log_p_value(view, pairs, on, centroids, stars, trusted_px) + log_trials(tried)
-    on = _unambiguous(pairs, on, centroids)
+    log_p = _log_p_value(view, pairs, chosen, centroids, stars, trusted_px) + log_trials(tried)
+    chosen = _select_unambiguous(pairs, chosen, centroids)
     camera = view.camera()
     trusted_rad = float(camera.angle_rad(view.centre_px + np.array([trusted_px, 0.0])))
     lens = VerifiedLens(
         camera=replace(camera, calibrated_angle_rad=min(trusted_rad, camera.max_angle_rad)),
         R_cam_icrs=view.R_cam_icrs,
-        detection=pairs.detection[on],
-        star=pairs.star[on],
+        detection=pairs.detection[chosen],
+        star=pairs.star[chosen],
         log_p=log_p,
         unexplained=pairs.count_unexplained(centroids.snr, GATE_PX),
     )
@@ -226,23 +226,23 @@ def verify_view(
 
 def _pairs_within_gate(pairs: CandidatePairs) -> Ints:
     """Indices of the one-to-one pairs closer than the gate."""
-    return pairs.one_to_one[pairs.distance_px[pairs.one_to_one] < GATE_PX]
+    return pairs.one_to_one_pairs[pairs.distance_px[pairs.one_to_one_pairs] < GATE_PX]
 
 
 def _choose_lens(view: PinholeView, xy_px: Array, rays_icrs: Array, sigma_px: float) -> PinholeView:
     """A pinhole, unless the distorted lens fits the stars (n, 3) at the pixels (n, 2) much better."""
     if not view.distortion:
         return view
-    pinhole = view.as_pinhole().fit(xy_px, rays_icrs, sigma_px, distorted=False, steps=2)
+    pinhole = view.to_pinhole().fit(xy_px, rays_icrs, sigma_px, distorted=False, steps=2)
     left = [np.sum(np.square(xy_px - v.project(rays_icrs)[0])) for v in (view, pinhole)]
     return view if len(xy_px) >= MIN_FOR_DISTORTION and left[0] < DISTORTED_RMS_1**2 * left[1] else pinhole
 
 
-def _unambiguous(pairs: CandidatePairs, which: Ints, centroids: Centroids) -> Ints:
+def _select_unambiguous(pairs: CandidatePairs, which: Ints, centroids: Centroids) -> Ints:
     """The one-to-one pairs with an unambiguous star."""
     some = centroids.covariance_px2[pairs.detection[which]]
     variance_px2 = 0.5 * (some[:, 0, 0] + some[:, 1, 1]) + SMALLEST_ERROR_PX**2
-    return pairs.unambiguous(which, variance_px2, min(BLEND_SIGMAS * centroids.psf_sigma_px, WIDEST_BLEND_PX))
+    return pairs.select_unambiguous(which, variance_px2, min(BLEND_SIGMAS * centroids.psf_sigma_px, WIDEST_BLEND_PX))
 
 
 def _candidate_pairs(view: PinholeView, centroids: Centroids, stars: NearStars, tree: Any) -> CandidatePairs | None:
@@ -266,13 +266,13 @@ def _candidate_pairs(view: PinholeView, centroids: Centroids, stars: NearStars, 
 
 
 def _log_p_value(
-    view: PinholeView, pairs: CandidatePairs, on: Ints, centroids: Centroids, stars: NearStars, trusted_px: float
+    view: PinholeView, pairs: CandidatePairs, chosen: Ints, centroids: Centroids, stars: NearStars, trusted_px: float
 ) -> float:
-    """Log p-value of the pairs `on` of the brightest detections, up to `trusted_px` from the centre."""
+    """Log p-value of the pairs `chosen` of the brightest detections, up to `trusted_px` from the centre."""
     xy_px = centroids.xy_px[:TESTED]
-    rms_px = float(np.sqrt(np.mean(np.square(pairs.distance_px[on]))))
+    rms_px = float(np.sqrt(np.mean(np.square(pairs.distance_px[chosen]))))
     radius_px = float(np.clip(RADIUS_SIGMAS * rms_px, SMALLEST_RADIUS_PX, GATE_PX))
-    hits = int(np.count_nonzero((pairs.detection[on] < len(xy_px)) & (pairs.distance_px[on] < radius_px)))
+    hits = int(np.count_nonzero((pairs.detection[chosen] < len(xy_px)) & (pairs.distance_px[chosen] < radius_px)))
     measured = pairs.scale.measured_mag[: len(xy_px)]
     px, inside = view.project(stars.rays_icrs)
     inside &= np.linalg.norm(px - view.centre_px, axis=1) <= trusted_px

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.identification.index import bright_stars_apart
+from startrack.identification.index import separate_bright_stars
 from startrack.types import Array, Ints, Stars
 
 PAIRS_WANTED = 180_000
@@ -64,7 +64,7 @@ def build_pairs(stars: Stars, field_sr: float) -> PairIndex:
     diameter = 2 * np.arccos(np.clip(1 - field_sr / (2 * np.pi), -1, 1))
     widest = min(WIDEST_RAD, float(diameter))
     within = 0.5 * (1 - np.cos(widest))  # fraction of the sphere that contains a star's partners
-    star = bright_stars_apart(stars, int(min(np.sqrt(2 * PAIRS_WANTED / within), DEEPEST)))
+    star = separate_bright_stars(stars, int(min(np.sqrt(2 * PAIRS_WANTED / within), DEEPEST)))
     rays = stars.rays_icrs[star]
     pairs = cKDTree(rays).query_pairs(2 * np.sin(widest / 2), output_type="ndarray").astype(np.int64)
     pairs = np.concatenate([pairs, pairs[:, ::-1]])

@@ -67,7 +67,7 @@ class PinholeView:
         found: PinholeView = adjust(self, points, free, scheme).state
         return found
 
-    def as_pinhole(self) -> PinholeView:
+    def to_pinhole(self) -> PinholeView:
         """The same view by a pinhole."""
         return replace(self, distortion=0.0)
 
@@ -91,7 +91,7 @@ class PinholeView:
         pose[:, 1, 0], pose[:, 1, 1], pose[:, 1, 2] = -fy * (1 + v * v), fy * u * v, fy * u
         signed = plane * self._signed_focal_px
         by_lens = np.empty((len(u), 2, len(free)))
-        by_lens[:, :, 0] = signed * self._stretch(plane)[:, None]
+        by_lens[:, :, 0] = signed * self._radius_ratio(plane)[:, None]
         if len(free) > 1:
             by_lens[:, :, 1] = signed * _cube(plane)[:, None]
         return Terms(by_lens, pose, points.image, 1)
@@ -123,9 +123,9 @@ class PinholeView:
         return np.array([-self.focal_px if self.mirrored else self.focal_px, self.focal_px])
 
     def _pixels(self, plane: Array) -> Array:
-        return np.asarray(plane * self._stretch(plane)[:, None] * self._signed_focal_px + self.centre_px)
+        return np.asarray(plane * self._radius_ratio(plane)[:, None] * self._signed_focal_px + self.centre_px)
 
-    def _stretch(self, plane: Array) -> Array:
+    def _radius_ratio(self, plane: Array) -> Array:
         """Radius over that of a pinhole (n,), at positions (n, 2) of the pinhole's plane."""
         return 1.0 + self.distortion * _cube(plane) if self.distortion else np.ones(len(plane))
 

@@ -14,13 +14,13 @@ from startrack.identification.index import CatalogPatterns, pixel_scale_of
 from startrack.match import CandidatePairs, PhotometricScale, upper_median
 from startrack.types import Array, Bools, Centroids, Ints
 
-FEWEST = 6
+MIN_MATCHES = 6
 FIRST_GATE_PX, GATE_PX = 3.0, 6.0
-ON_PLACE_PX, ON_PLACE_CHI2 = 1.5, 16.0  # distance of a detection from its star; the larger limit counts
+INLIER_PX, INLIER_CHI2 = 1.5, 16.0  # largest distance of a detection from its star; the larger limit applies
 BLEND_SIGMAS = 3.0  # of the PSF: radius within which stars share one detection
-ROUNDS = 4  # of matching and rotating; one is enough where the bright stars have settled the attitude
+ROUNDS = 4  # of matching and rotating; one suffices if the bright stars determine the attitude
 SETTLED_PX = 0.15
-MAX_STRAYED_PX = 0.7  # change of the attitude up to which the neighbours need not be looked up again
+MAX_DRIFT_PX = 0.7  # change of the attitude up to which the neighbours remain valid
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class AttitudeMatch:
     pairs: CandidatePairs
     matched: Ints  # (m,) indices of pairs: mutually nearest, agreeing in brightness, within GATE_PX
     named: Bools  # (m,) close enough to be identified
-    on_place: Bools  # (m,) as close as the stated centroid errors predict
+    inlier: Bools  # (m,) as close as the stated centroid errors predict
     variance_px2: Array  # (m,) per axis, the error common to all stars added
     visible_v_mag: Array  # of the stars in the image circle that are bright enough to be detected
 
@@ -55,8 +55,8 @@ class AttitudeRefiner:
         )
         limit, complete = np.searchsorted(stars.v_mag, [photometry.limit_mag, photometry.complete_mag]).tolist()
         near = hypothesis.near
-        strayed_px = np.abs(hypothesis.R_cam_icrs - R).max() / scale.axis_rad_per_px
-        if near is None or near.depth < limit or strayed_px > MAX_STRAYED_PX:
+        drift_px = np.abs(hypothesis.R_cam_icrs - R).max() / scale.axis_rad_per_px
+        if near is None or near.depth < limit or drift_px > MAX_DRIFT_PX:
             radius_rad = neighbour_radius_px(d.psf_sigma_px) * scale.largest_rad_per_px
             near = self.patterns.neighbours(self.rays_cam @ R, radius_rad, limit)
         detection, star = near.ray, near.star
@@ -69,12 +69,12 @@ class AttitudeRefiner:
             distance = np.sqrt(np.einsum("ni,ni->n", off, off))
             distance[~inside | (distance > GATE_PX)] = np.inf
             pairs = CandidatePairs(detection, star, distance, v_mag, v_sigma_mag, photometry)
-            matched = pairs.one_to_one
-            if len(matched) < FEWEST:
+            matched = pairs.one_to_one_pairs
+            if len(matched) < MIN_MATCHES:
                 return None
             agree, variance = self._select_inliers(pairs, matched)
             used = matched[agree]
-            if len(used) < FEWEST:
+            if len(used) < MIN_MATCHES:
                 return None
             refined = wahba(self.rays_cam[detection[used]] / variance[agree][:, None], rays_icrs[used])
             if np.abs(refined - R).max() / scale.axis_rad_per_px < SETTLED_PX:
@@ -82,10 +82,10 @@ class AttitudeRefiner:
             R = refined
         visible = stars.rays_icrs[:complete] @ R[2] > np.cos(self.camera.max_angle_rad)
         squared, misfit = np.square(pairs.distance_px[matched]), pairs.brightness_misfit[matched]
-        on_place = squared < np.maximum(ON_PLACE_PX**2, ON_PLACE_CHI2 * self.variance_px2[detection[matched]])
+        inlier = squared < np.maximum(INLIER_PX**2, INLIER_CHI2 * self.variance_px2[detection[matched]])
         # Position and brightness may not both be at the edge of what is allowed.
-        named = on_place & agree & (squared / (OUTLIER_CHI2 * variance) + misfit * misfit < 1.0)
-        return AttitudeMatch(refined, pairs, matched, named, on_place, variance, stars.v_mag[:complete][visible])
+        named = inlier & agree & (squared / (OUTLIER_CHI2 * variance) + misfit * misfit < 1.0)
+        return AttitudeMatch(refined, pairs, matched, named, inlier, variance, stars.v_mag[:complete][visible])
 
     def _select_inliers(self, pairs: CandidatePairs, which: Ints) -> tuple[Bools, Array]:
         """Which of the pairs are no outliers, and their variance per axis [px^2], the common error added.

@@ -20,8 +20,8 @@ from startrack.identification.hypotheses import (
     Window,
     narrow_sizes,
     patterns_for,
+    remove_clumps,
     wide_sizes,
-    without_clumps,
 )
 from startrack.identification.image_circle import ImageCircle, image_circle
 from startrack.identification.narrow_field import NarrowFieldSearch
@@ -42,8 +42,8 @@ LOG_PLAUSIBLE = -11.0  # log p-value of a hypothesis that is grown: random skies
 LOG_FALSE_ALARM = float(np.log(1e-9))
 MAX_TRIED = 600_000  # patterns; a search without an answer ends here, after some seconds
 MAX_TRIED_IN_CIRCLE = 250_000  # where the image circle is seen: real photographs take 1000 to 110,000
-MAX_TRIED_BEYOND = 100_000  # further patterns without the image circle, in case that it is something else
-FIELD_MARGIN = 1.3  # about a narrow field, for its focal length and centre are not known
+MAX_TRIED_BEYOND = 100_000  # further patterns without the image circle, in case the disc found is not it
+FIELD_MARGIN = 1.3  # of a narrow field: its focal length and centre are not known
 CLUMP_FRACTION = 0.01  # of the frame: detections used for patterns are no closer
 CIRCLES = (0.5, 0.62, 0.42, 0.78, 1.0)  # radius of the image circle over the frame's shorter side
 SEEN_CIRCLES = (1.0, 1.25)  # radius at half the field over that of the visible disc: a dome may hide the horizon
@@ -68,7 +68,7 @@ ADVICE = "is the field of view right, is this the night sky, and in focus? With 
 class UnknownLensSolution:
     """The lens and the identification that it was found with."""
 
-    camera: Camera  # name "unknown"; calibrated as far out as its stars reach; with the covariance of its fit
+    camera: Camera  # name "unknown"; calibrated up to its outermost stars; with the covariance of its fit
     identification: Identification
 
 
@@ -92,24 +92,24 @@ def identify_unknown_lens(
     if search.narrow and (solution := _solve_narrow_field(search, centroids)) is not None:
         return solution
     for grown, around in search.grown_lenses():
-        lens = verify(grown, centroids, stars.take(around), search.tried, search.widest_rad)
-        if lens is not None and lens.log_p < LOG_FALSE_ALARM and lens.matched >= search.fewest:
+        lens = verify(grown, centroids, stars.take(around), search.patterns_tried, search.widest_rad)
+        if lens is not None and lens.log_p < LOG_FALSE_ALARM and lens.matched >= search.min_matches:
             return _solution(lens, around, search, centroids)
     raise NotIdentified(
         f"no lens of {np.degrees(fov_rad):.3g} degrees ({100 * tolerance:.0f} % more or less) explains the "
-        f"{len(centroids)} point sources better than chance ({search.tried} patterns tried): {ADVICE}",
+        f"{len(centroids)} point sources better than chance ({search.patterns_tried} patterns tried): {ADVICE}",
         detected=len(centroids),
-        tried=search.tried,
+        tried=search.patterns_tried,
     )
 
 
 def _solve_narrow_field(search: _Search, centroids: Centroids) -> UnknownLensSolution | None:
-    """A narrow field by the votes of its brightest stars' triangles; None where they do not suffice."""
+    """A narrow field by votes of the triangles of its brightest stars; None where they do not suffice."""
     narrow = NarrowFieldSearch(
         centroids, search.chosen, search.size_px, search.fov_rad, search.rounded_field_sr(), search.stars
     )
     for view in narrow.views():
-        if view.lens.log_p < LOG_FALSE_ALARM and view.lens.matched >= search.fewest:
+        if view.lens.log_p < LOG_FALSE_ALARM and view.lens.matched >= search.min_matches:
             return _solution(view.lens, view.around, search, centroids)
     search.hypotheses.tried += narrow.tried
     return None
@@ -164,24 +164,24 @@ class _Search:
     ) -> None:  # fmt: skip
         self.size_px, self.fov_rad, self.stars, self.tolerance = size_px, fov_rad, stars, tolerance
         self.wide = fov_rad >= WIDE_FIELD_RAD
-        self.fewest = MIN_WIDE if self.wide else MIN_NARROW
+        self.min_matches = MIN_WIDE if self.wide else MIN_NARROW
         self.circle = image_circle(background) if self.wide and background is not None else None
         self.xy_px = centroids.xy_px
         if self.circle is not None:
             off = np.linalg.norm(self.xy_px - self.circle.centre_px, axis=1)
             self.xy_px = self.xy_px[off < CIRCLE_EDGE * self.circle.radius_px]
         self.narrow = fov_rad <= NARROW_FIELD_RAD
-        self.chosen = without_clumps(self.xy_px, CLUMP_FRACTION * min(size_px), MAX_PATTERN_DETECTIONS)
-        if len(self.chosen) < self.fewest:
+        self.chosen = remove_clumps(self.xy_px, CLUMP_FRACTION * min(size_px), MAX_PATTERN_DETECTIONS)
+        if len(self.chosen) < self.min_matches:
             raise NotIdentified(
                 f"{len(self.chosen)} point sources are too few to identify without a camera file, which takes "
-                f"{self.fewest}: expose longer, or {ADVICE}",
+                f"{self.min_matches}: expose longer, or {ADVICE}",
                 detected=len(centroids),
             )
         self.hypotheses = HypothesisSearch(self.xy_px[self.chosen], size_px)
 
     @property
-    def tried(self) -> int:
+    def patterns_tried(self) -> int:
         """Number of patterns tried so far."""
         return self.hypotheses.tried
 
@@ -195,8 +195,8 @@ class _Search:
         if self.circle is None:
             yield from self._grow_all(self._guesses(), MAX_TRIED)
             return
-        yield from self._grow_all(self._guesses_in(self.circle), MAX_TRIED_IN_CIRCLE)
-        yield from self._grow_all(self._guesses(), self.tried + MAX_TRIED_BEYOND)
+        yield from self._grow_all(self._guesses_from_circle(self.circle), MAX_TRIED_IN_CIRCLE)
+        yield from self._grow_all(self._guesses(), self.patterns_tried + MAX_TRIED_BEYOND)
 
     def _grow_all(self, guesses: list[LensGuess], most_tried: int) -> Iterator[tuple[GrownLens, Ints]]:
         """`grown_lenses` of these guesses, until so many patterns have been tried."""
@@ -215,9 +215,9 @@ class _Search:
                     around = self._stars_around(R[2])
                     rays = self.stars.rays_icrs if self.wide else self.stars.rays_icrs[around]
                     found = grow(hypothesis, self.xy_px, rays, stages)
-                    if found is not None and (not self.wide or len(found.star) >= self.fewest):
+                    if found is not None and (not self.wide or len(found.star) >= self.min_matches):
                         yield found, around
-                if self.tried > most_tried:
+                if self.patterns_tried > most_tried:
                     return
 
     def _rounds(self) -> Iterator[tuple[PatternSizes, Window]]:
@@ -237,7 +237,7 @@ class _Search:
         return np.flatnonzero(self.stars.rays_icrs @ axis_icrs > np.cos(corner * FIELD_MARGIN))
 
     def _guesses(self) -> list[LensGuess]:
-        """Lenses to begin with: shapes and focal lengths, the likelier first."""
+        """Initial lenses: shapes and focal lengths, the likelier first."""
         width, height = self.size_px
         centre = ((width - 1) / 2, (height - 1) / 2)
         if not self.wide:
@@ -247,7 +247,7 @@ class _Search:
         circles = [c * shorter for c in CIRCLES if c * shorter < 0.56 * diagonal]
         return self._fisheye_guesses(circles, centre)
 
-    def _guesses_in(self, circle: ImageCircle) -> list[LensGuess]:
+    def _guesses_from_circle(self, circle: ImageCircle) -> list[LensGuess]:
         """Lenses whose image circle is the visible one, or somewhat larger."""
         return self._fisheye_guesses([c * circle.radius_px for c in SEEN_CIRCLES], circle.centre_px)
 

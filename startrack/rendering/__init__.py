@@ -1,11 +1,11 @@
-"""Catalogue, camera, terrain and a true pose in; an exposure and the truth about it out."""
+"""Rendering: an exposure and its truth from catalogue, camera, terrain and a true pose."""
 
 from startrack.rendering.compose import light_e, render, truth_of
 from startrack.rendering.defects import draw_hot_pixels
 from startrack.rendering.field_stars import concatenate_stars, draw_field_stars, draw_v_errors
 from startrack.rendering.scene import HotPixels, Scene, Truth
-from startrack.rendering.series import Series, load_sky_catalog, sky_turn_rad
-from startrack.rendering.sources import exposure_reaching
+from startrack.rendering.series import Series, load_sky_catalog, sky_rotvec_rad
+from startrack.rendering.sources import exposure_for_snr
 from startrack.rendering.write import truth_paths, write_truth
 
 __all__ = [
@@ -17,11 +17,11 @@ __all__ = [
     "draw_field_stars",
     "draw_hot_pixels",
     "draw_v_errors",
-    "exposure_reaching",
+    "exposure_for_snr",
     "light_e",
     "load_sky_catalog",
     "render",
-    "sky_turn_rad",
+    "sky_rotvec_rad",
     "truth_of",
     "truth_paths",
     "write_truth",

@@ -10,7 +10,7 @@ from startrack.rendering.field_stars import concatenate_stars
 from startrack.rendering.scene import Scene, Truth
 from startrack.rendering.sensor import ADC_MAX_ADU, read_out
 from startrack.rendering.sky import diffuse_e
-from startrack.rendering.sources import above_terrain, add_sources, flux_e
+from startrack.rendering.sources import add_sources, flux_e, is_above_terrain
 from startrack.types import Array, Exposure, Stars
 
 
@@ -37,7 +37,7 @@ def render(scene: Scene, *, rng: np.random.Generator) -> tuple[Exposure, Truth]:
 
 
 def light_e(scene: Scene) -> Array:
-    """Mean electrons (H, W) that the scene's light leaves: diffuse sky and wall, stars, bodies; no noise, no dark."""
+    """Mean photoelectrons (H, W) of the scene: diffuse sky and wall, stars, bodies; no noise, no dark current."""
     image_e = diffuse_e(scene)
     add_sources(image_e, scene)
     return image_e
@@ -57,7 +57,7 @@ def truth_of(scene: Scene) -> Truth:
         sources=sources,
         xy_px=xy_px[inside],
         flux_e=flux_e(scene.sensor, sources.v_mag, off_axis_rad(rays_cam[inside]), scene.exposure_s),
-        hidden=~above_terrain(scene, rays_enu),
+        hidden=~is_above_terrain(scene, rays_enu),
     )
 
 

@@ -41,11 +41,11 @@ def add_cosmic_rays(image_e: Array, count: int, *, rng: np.random.Generator) -> 
     height, width = image_e.shape
     for _ in range(count):
         centre = rng.uniform([-0.5, -0.5], [width - 0.5, height - 0.5])
-        turn = rng.uniform(0, np.pi)
+        direction = rng.uniform(0, np.pi)
         length = min(rng.exponential(TRACK_MEAN_PX), TRACK_LONGEST_PX)
         e_per_px = TRACK_E_PER_PX * np.exp(TRACK_LOG_SIGMA * rng.standard_normal())
         points = max(1, int(np.ceil(length / TRACK_STEP_PX)))
         along = (np.arange(points) + 0.5) / points * length - length / 2
-        xy_px = centre + along[:, None] * np.array([np.cos(turn), np.sin(turn)])
+        xy_px = centre + along[:, None] * np.array([np.cos(direction), np.sin(direction)])
         # A steep ray still crosses the depth of one pixel.
         splat(image_e, xy_px, np.full(points, e_per_px * max(length, 1.0) / points), TRACK_SIGMA_PX)

@@ -26,8 +26,8 @@ def draw_field_stars(stars: Stars, to_v_mag: float, *, rng: np.random.Generator)
     """Random stars (from `rng`) that the catalogue `stars` lacks, to `to_v_mag`: ids "FIELD n", hip 0, brightest first.
 
     In each quarter of a magnitude from FIRST_LACKING_MAG on, as many as the counts N(V) above exceed the catalogue's,
-    and never under 1 % of the catalogue's. They crowd where the catalogue does: each lies about a randomly chosen
-    catalogue star; without any, anywhere.
+    and at least 1 % of the catalogue's. They follow the density of the catalogue: each lies near a randomly chosen
+    catalogue star; uniform without catalogue stars.
     """
     edges = np.arange(FIRST_LACKING_MAG, to_v_mag + 1e-9, BIN_MAG)
     if len(edges) < 2:

@@ -1,4 +1,4 @@
-"""Points of light spread over pixels.
+"""Images of point sources.
 
 The estimator's PSF is deliberately not used here: a half-pixel error in it must not cancel against the renderer's.
 """
@@ -48,12 +48,12 @@ def stamp_radius_px(flux_e: Array, sigma_px: float) -> Array:
     """Half widths (n,) [px, whole] of the stamps outside which a source leaves under INVISIBLE_E_PER_PX in a pixel."""
     wide2 = sigma_px**2 + 1 / 12  # the pixel's own second moment widens the PSF
     peak = np.maximum(np.asarray(flux_e) / (2 * math.pi * wide2), INVISIBLE_E_PER_PX)
-    reach = np.sqrt(2 * wide2 * np.log(peak / INVISIBLE_E_PER_PX))
-    return np.maximum(np.ceil(reach).astype(np.int64), min(MIN_RADIUS_PX, math.ceil(4 * sigma_px)))
+    radius = np.sqrt(2 * wide2 * np.log(peak / INVISIBLE_E_PER_PX))
+    return np.maximum(np.ceil(radius).astype(np.int64), min(MIN_RADIUS_PX, math.ceil(4 * sigma_px)))
 
 
 def _profile(centres_px: Array, sigma_px: float, radius: int, size: int) -> tuple[Array, Array]:
-    """Pixel numbers (n, 2 r + 1) and the fractions of light in them; zero, and a legal number, off the frame."""
+    """Pixel numbers (n, 2 r + 1) and the fractions of the flux in them; zero, and a legal number, off the frame."""
     from scipy.special import ndtr
 
     pixels = np.rint(centres_px).astype(np.int64)[:, None] + np.arange(-radius, radius + 1)

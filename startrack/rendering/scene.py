@@ -20,7 +20,7 @@ class HotPixels(Value):
     dark_e_per_s: Array = array("n")  # beyond the sensor's own
 
     @staticmethod
-    def none() -> HotPixels:
+    def create_empty() -> HotPixels:
         """A sensor without any."""
         return HotPixels(xy_px=np.empty((0, 2), dtype=np.int64), dark_e_per_s=np.empty(0))
 
@@ -37,7 +37,7 @@ class Scene(Value):
     position_enu_m: Array = array(3)  # the camera's centre
     R_cam_enu: Array = array(3, 3)
     R_enu_icrs: Array = array(3, 3)  # at mid-exposure
-    sky_turn_rad: Array = field(  # rotation vector in enu by which the stars turn from start to end
+    sky_rotvec_rad: Array = field(  # rotation vector in enu of the stars from start to end
         default_factory=lambda: np.zeros(3), metadata={"shape": (3,), "dtype": np.float64}
     )
     exposure_s: float
@@ -45,7 +45,7 @@ class Scene(Value):
     sky_gradient: float = 0.0  # s: the sky is 1 + s cos(elevation) cos(azimuth - sky_gradient_azimuth_rad) of that
     sky_gradient_azimuth_rad: float = 0.0
     wall_reflectance: float = 0.04  # light of the terrain, as a fraction of the sky's
-    hot_pixels: HotPixels = field(default_factory=HotPixels.none)
+    hot_pixels: HotPixels = field(default_factory=HotPixels.create_empty)
     cosmic_rays: int = 0  # tracks in this exposure
     name: str = ""
     time_utc: datetime | None = None  # mid-exposure

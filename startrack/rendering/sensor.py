@@ -9,7 +9,7 @@ from startrack.camera import Sensor
 from startrack.types import Array
 
 ADC_MAX_ADU = 65535.0  # 16 bits
-POISSON_UP_TO_E = 64.0  # above it the normal distribution stands in (skewness under 1/8), five times as fast
+POISSON_UP_TO_E = 64.0  # above it the normal distribution is used (skewness under 1/8), five times as fast
 
 
 def photons(mean_e: Array, *, rng: np.random.Generator) -> NDArray[np.float32]:

@@ -15,7 +15,7 @@ from startrack.frames import R_body_enu_from_heading_pitch_roll, R_enu_icrs, Sit
 from startrack.rendering.defects import draw_hot_pixels
 from startrack.rendering.field_stars import concatenate_stars, draw_field_stars, draw_v_errors
 from startrack.rendering.scene import Scene
-from startrack.rendering.sources import exposure_reaching
+from startrack.rendering.sources import exposure_for_snr
 from startrack.terrain import Terrain
 from startrack.types import Array, BadInput, Stars
 
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-REACH_V_MAG, REACH_SNR = 6.0, 5.0  # reached by the default exposure on the axis
+EXPOSURE_V_MAG, EXPOSURE_SNR = 6.0, 5.0  # magnitude and SNR on the axis that define the default exposure
 RANDOM_TIMES = datetime(2024, 1, 1, tzinfo=UTC), datetime(2034, 1, 1, tzinfo=UTC)
-TRIES_FOR_A_PLACE = 1000
+MAX_POSITION_TRIES = 1000
 # Streams of the seed. Sky and sensor are the same in every exposure of a series: errors that exposures share.
 _SKY, _SENSOR, _EXPOSURE = 0, 1, 2
 
@@ -65,7 +65,7 @@ class Series:
             return self.exposure_s
         if self.camera.sensor is None:
             raise BadInput("bad_calibration", f"camera {self.camera.name} has no [sensor]: nothing to render with")
-        return exposure_reaching(self.camera, self.sky_v_mag_arcsec2, v_mag=REACH_V_MAG, snr=REACH_SNR)
+        return exposure_for_snr(self.camera, self.sky_v_mag_arcsec2, v_mag=EXPOSURE_V_MAG, snr=EXPOSURE_SNR)
 
     def scene(self, number: int, name: str = "") -> tuple[Scene, np.random.Generator]:
         """The scene of exposure `number`, called `name`, and the generator to render it with.
@@ -74,17 +74,17 @@ class Series:
             BadInput: bad_terrain when no position can be found, no_time outside the ephemeris.
         """
         rng = np.random.default_rng([self.seed, _EXPOSURE, number])
-        time, place_m, heading, pitch, roll = self._pose(rng)
-        if not bool(self.terrain.allowed(place_m[None])[0]):
+        time, position_m, heading, pitch, roll = self._pose(rng)
+        if not bool(self.terrain.allowed(position_m[None])[0]):
             raise BadInput(
                 "bad_terrain",
-                f"{self.terrain.name}: no camera can stand at {place_m[0]:.0f} m east, {place_m[1]:.0f} north",
+                f"{self.terrain.name}: no camera can stand at {position_m[0]:.0f} m east, {position_m[1]:.0f} north",
             )
         site, exposure_s = self.terrain.site, self.exposure_used_s
         if site is None:
             raise BadInput("bad_terrain", f"terrain {self.terrain.name} has no site: its sky is not known")
         stars, v_error_mag = self._sky(site, time)
-        height_m = float(self.terrain.ground_m(place_m[None])[0]) + self.terrain.camera_height_m
+        height_m = float(self.terrain.ground_m(position_m[None])[0]) + self.terrain.camera_height_m
         sensor_rng = np.random.default_rng([self.seed, _SENSOR])
         scene = Scene(
             camera=self.camera,
@@ -92,10 +92,10 @@ class Series:
             stars=stars,
             v_error_mag=v_error_mag,
             bodies=tuple(bodies(site, time)),
-            position_enu_m=np.append(place_m, height_m),
+            position_enu_m=np.append(position_m, height_m),
             R_cam_enu=self.camera.R_body_cam.T @ R_body_enu_from_heading_pitch_roll(heading, pitch, roll),
             R_enu_icrs=R_enu_icrs(site, time),
-            sky_turn_rad=sky_turn_rad(site, time, exposure_s),
+            sky_rotvec_rad=sky_rotvec_rad(site, time, exposure_s),
             exposure_s=exposure_s,
             sky_v_mag_arcsec2=self.sky_v_mag_arcsec2,
             sky_gradient=self.sky_gradient,
@@ -111,7 +111,7 @@ class Series:
         return scene, rng
 
     def _pose(self, rng: np.random.Generator) -> tuple[datetime, Array, float, float, float]:
-        """Time, position (2,) [m], heading, pitch and roll [rad]. All are drawn: giving one leaves the others."""
+        """Time, position (2,) [m], heading, pitch and roll [rad]. All are drawn: a given one does not change others."""
         first, last = RANDOM_TIMES
         time = first + timedelta(microseconds=int(rng.integers((last - first) // timedelta(microseconds=1))))
         position = _random_position(self.terrain, rng)
@@ -126,7 +126,7 @@ class Series:
         )
 
     def _sky(self, site: Site, time: datetime) -> tuple[Stars, Array]:
-        """Apparent stars, the lacking ones after the catalogue's, and their magnitude errors (n,)."""
+        """Apparent stars, first those of the catalogue, then the random ones, and their magnitude errors (n,)."""
         rng = np.random.default_rng([self.seed, _SKY])
         stars = self.catalog.at(time, observer_velocity_m_s(site, time))
         errors = np.zeros(len(stars))
@@ -150,10 +150,10 @@ def load_sky_catalog(stars: str) -> StarCatalog:
     return load_deep_catalog() if stars == "gaia" or (stars == "auto" and has_deep_catalog()) else load_catalog()
 
 
-def sky_turn_rad(site: Site, time: datetime, exposure_s: float) -> Array:
+def sky_rotvec_rad(site: Site, time: datetime, exposure_s: float) -> Array:
     """Rotation vector (3,) in enu of the stars at a `site` over an exposure of `exposure_s` about `time`.
 
-    R_enu_icrs(end) = exp(turn) R_enu_icrs(start); exposures under half a turn of the sky.
+    R_enu_icrs(end) = exp([rotvec]x) R_enu_icrs(start); for exposures under half a rotation of the sky.
     """
     half = timedelta(seconds=exposure_s / 2)
     R = R_enu_icrs(site, time + half) @ R_enu_icrs(site, time - half).T
@@ -164,9 +164,9 @@ def sky_turn_rad(site: Site, time: datetime, exposure_s: float) -> Array:
 
 def _random_position(terrain: Terrain, rng: np.random.Generator) -> Array:
     """A position (2,) [m], uniform over the part of the search area where the camera can stand."""
-    for _ in range(TRIES_FOR_A_PLACE):
-        turn = rng.uniform(0, 2 * np.pi)
-        position = terrain.search_radius_m * np.sqrt(rng.random()) * np.array([np.sin(turn), np.cos(turn)])
+    for _ in range(MAX_POSITION_TRIES):
+        azimuth = rng.uniform(0, 2 * np.pi)
+        position = terrain.search_radius_m * np.sqrt(rng.random()) * np.array([np.sin(azimuth), np.cos(azimuth)])
         if bool(terrain.allowed(position[None])[0]):
             return position
     raise BadInput("bad_terrain", f"{terrain.name}: nowhere in its search area can the camera stand")

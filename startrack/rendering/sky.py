@@ -1,4 +1,4 @@
-"""Diffuse light of the sky, and its step at the skyline down to the light that the wall reflects."""
+"""Diffuse brightness of the sky, and its step at the skyline to the brightness of the wall."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from startrack.types import Array, Bools, Ints
 
 ARCSEC2_PER_SR = (180 * 3600 / np.pi) ** 2
 AZIMUTHS = 1 << 16  # of the horizon's table: 0.0055 degrees, a sixteenth of a pixel of the widest fisheye
-EDGE_REACH_SIGMAS = 4.0  # how far from the skyline its PSF-smoothed step is computed
+EDGE_WIDTH_SIGMAS = 4.0  # distance from the skyline up to which the PSF-smoothed step is computed
 TANGENT_NODES_SIGMAS = np.linspace(-3.5, 3.5, 11)  # trapezoid over a Gaussian: exact to 1e-9 for a smooth skyline
 LENS_SAMPLES = 4096
 ROWS_PER_BLOCK = 64
@@ -32,7 +32,7 @@ def sky_e_per_s(camera: Camera, sky_v_mag_arcsec2: float | None, angle_rad: Arra
 
 
 def diffuse_e(scene: Scene) -> Array:
-    """Electrons (H, W) float64 of diffuse light: sky above the skyline, wall below it, nothing off the image circle.
+    """Electrons (H, W) float64 of diffuse light: sky above the skyline, wall below it, zero off the image circle.
 
     sky x (wall + (1 - wall) c), c the fraction of the pixel's PSF that lies above the skyline.
     """
@@ -50,9 +50,9 @@ def diffuse_e(scene: Scene) -> Array:
 def coverage(scene: Scene, xy_px: Ints | Array) -> Array:
     """Fraction (n,) of the PSF about each pixel (n, 2) that lies above the skyline; for pixels near the skyline.
 
-    In the pixel plane, r the direction in which the azimuth stands still and t the one across it:
-    c = integral over t of N(t; 0, s) Phi((elevation - H(azimuth)) / (s d elevation/dr)), both taken at t. So a jagged
-    skyline is followed as finely as the PSF can show; s^2 = psf_sigma^2 + 1/12 stands for the pixel's own width.
+    In the pixel plane, r the direction of constant azimuth and t the one across it:
+    c = integral over t of N(t; 0, s) Phi((elevation - H(azimuth)) / (s d elevation/dr)), both evaluated at t. A jagged
+    skyline is resolved to the width of the PSF; s^2 = psf_sigma^2 + 1/12 includes the pixel's own width.
     """
     from scipy.special import ndtr
 
@@ -96,8 +96,8 @@ def _local_axes(scene: Scene, xy_px: Array) -> tuple[Array, Array]:
     for axis in np.eye(2):
         azimuth1, elevation1 = _azel(scene, xy_px + GRADIENT_STEP_PX * axis)
         azimuth0, elevation0 = _azel(scene, xy_px - GRADIENT_STEP_PX * axis)
-        turn = (azimuth1 - azimuth0 + np.pi) % (2 * np.pi) - np.pi
-        slopes.append((turn / (2 * GRADIENT_STEP_PX), (elevation1 - elevation0) / (2 * GRADIENT_STEP_PX)))
+        azimuth_step = (azimuth1 - azimuth0 + np.pi) % (2 * np.pi) - np.pi
+        slopes.append((azimuth_step / (2 * GRADIENT_STEP_PX), (elevation1 - elevation0) / (2 * GRADIENT_STEP_PX)))
     (azimuth_x, elevation_x), (azimuth_y, elevation_y) = slopes
     length = np.maximum(np.hypot(azimuth_x, azimuth_y), 1e-12)
     across = np.stack([azimuth_x, azimuth_y], axis=-1) / length[:, None]
@@ -105,11 +105,11 @@ def _local_axes(scene: Scene, xy_px: Array) -> tuple[Array, Array]:
 
 
 def _skyline_pixels(above: Bools, sigma_px: float) -> Bools:
-    """Pixels (H, W) with both sky and wall within reach of the PSF."""
+    """Pixels (H, W) with both sky and wall within the width of the PSF."""
     import cv2
 
-    reach = int(np.ceil(EDGE_REACH_SIGMAS * sigma_px)) + 1
-    kernel = np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)
+    half_px = int(np.ceil(EDGE_WIDTH_SIGMAS * sigma_px)) + 1
+    kernel = np.ones((2 * half_px + 1, 2 * half_px + 1), dtype=np.uint8)
     mask = above.astype(np.uint8)
     return cv2.dilate(mask, kernel) != cv2.erode(mask, kernel)
 
@@ -117,7 +117,7 @@ def _skyline_pixels(above: Bools, sigma_px: float) -> Bools:
 def _sky_and_mask(scene: Scene) -> tuple[Array, Bools]:
     """Sky light (H, W) [e] with no terrain before it, and whether the pixel's centre is above the skyline (H, W)."""
     camera, (width, height) = scene.camera, scene.camera.size_px
-    rho, light, side, axial = _lens_table(scene)
+    rho, sky_e, side, axial = _lens_table(scene)
     u = (np.arange(width) - camera.centre_px[0]) / camera.focal_px[0]
     sky, above = np.empty((height, width)), np.ones((height, width), dtype=bool)
     tan_horizon = None if scene.terrain is None else _tan_table(scene.terrain, scene.position_enu_m)
@@ -128,7 +128,7 @@ def _sky_and_mask(scene: Scene) -> tuple[Array, Bools]:
         rows = slice(top, min(top + ROWS_PER_BLOCK, height))
         v = ((np.arange(rows.start, rows.stop) - camera.centre_px[1]) / camera.focal_px[1])[:, None]
         r = np.sqrt(u * u + v * v)
-        sky[rows] = np.interp(r, rho, light, right=0.0)
+        sky[rows] = np.interp(r, rho, sky_e, right=0.0)
         s, c = np.interp(r, rho, side), np.interp(r, rho, axial)
         e, n, h = ((axis[0] * u + axis[1] * v) * s + axis[2] * c for axis in (east, north, up))
         if scene.sky_gradient:
@@ -165,5 +165,5 @@ def _lens_table(scene: Scene) -> tuple[Array, Array, Array, Array]:
     angle = np.linspace(1e-6, top, LENS_SAMPLES)
     rho = camera.lens.rho(angle)
     rim_px = (camera.lens.rho(np.array(min(camera.max_angle_rad, top))) - rho) * np.mean(camera.focal_px)
-    light = sky_e_per_s(camera, scene.sky_v_mag_arcsec2, angle) * scene.exposure_s * ndtr(rim_px / _sigma_px(scene))
-    return rho, light, np.sin(angle) / rho, np.cos(angle)
+    sky_e = sky_e_per_s(camera, scene.sky_v_mag_arcsec2, angle) * scene.exposure_s * ndtr(rim_px / _sigma_px(scene))
+    return rho, sky_e, np.sin(angle) / rho, np.cos(angle)

@@ -1,4 +1,4 @@
-"""Light of stars and bodies: which reach the camera, where they fall and how many electrons they leave."""
+"""Stars and bodies in the image: their visibility, pixels and electrons."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def flux_e(sensor: Sensor, v_mag: Array, angle_rad: Array, exposure_s: float) ->
     return sensor.zero_point_e_per_s * 10 ** (-0.4 * np.asarray(v_mag)) * exposure_s * sensor.throughput(angle_rad)
 
 
-def above_terrain(scene: Scene, rays_enu: Array) -> Bools:
-    """Which of the directions (n, 3) no terrain hides: elevation > horizon, a hard edge."""
+def is_above_terrain(scene: Scene, rays_enu: Array) -> Bools:
+    """Whether the directions (n, 3) are above the horizon of the terrain, a hard edge."""
     if scene.terrain is None:
         return np.ones(len(rays_enu), dtype=bool)
     azimuth, elevation = azel_from_rays(rays_enu)
@@ -31,24 +31,24 @@ def above_terrain(scene: Scene, rays_enu: Array) -> Bools:
 
 
 def add_sources(image_e: Array, scene: Scene) -> None:
-    """Add to the image (H, W) [e] the stars and bodies of the scene, trailed where the sky turns visibly."""
+    """Add to the image (H, W) [e] the stars and bodies of the scene, trailed where the sky's rotation is visible."""
     rays_icrs, v_mag = _points(scene)
     rays_enu = rays_icrs @ scene.R_enu_icrs.T
-    turns = _turns(scene)
-    reach_rad = scene.camera.max_angle_rad + float(np.linalg.norm(scene.sky_turn_rad))
-    nearby = off_axis_rad(rays_enu @ scene.R_cam_enu.T) <= reach_rad
+    rotations = _step_rotations(scene)
+    limit_rad = scene.camera.max_angle_rad + float(np.linalg.norm(scene.sky_rotvec_rad))
+    nearby = off_axis_rad(rays_enu @ scene.R_cam_enu.T) <= limit_rad
     rays_enu, v_mag = rays_enu[nearby], v_mag[nearby]
-    for R_turn in turns:
-        turned_enu = rays_enu @ R_turn.T
-        rays_cam = turned_enu @ scene.R_cam_enu.T
+    for rotation in rotations:
+        rotated_enu = rays_enu @ rotation.T
+        rays_cam = rotated_enu @ scene.R_cam_enu.T
         angle = off_axis_rad(rays_cam)
-        shines = (angle <= scene.camera.max_angle_rad) & above_terrain(scene, turned_enu)
+        shines = (angle <= scene.camera.max_angle_rad) & is_above_terrain(scene, rotated_enu)
         xy_px, _ = scene.camera.project(rays_cam[shines])
-        flux = flux_e(scene.sensor, v_mag[shines], angle[shines], scene.exposure_s / len(turns))
+        flux = flux_e(scene.sensor, v_mag[shines], angle[shines], scene.exposure_s / len(rotations))
         splat(image_e, xy_px, flux, scene.sensor.psf_sigma_px)
 
 
-def exposure_reaching(camera: Camera, sky_v_mag_arcsec2: float | None, *, v_mag: float, snr: float) -> float:
+def exposure_for_snr(camera: Camera, sky_v_mag_arcsec2: float | None, *, v_mag: float, snr: float) -> float:
     """Seconds in which a star of `v_mag` on the axis reaches the matched-filter ratio `snr`.
 
     `sky_v_mag_arcsec2` is the brightness of the sky (None: black).
@@ -82,21 +82,21 @@ def _body_points(body: Body, focal_px: float) -> tuple[Array, Array]:
     count = max(1, int(np.ceil(np.pi * (radius * focal_px / DISK_STEP_PX) ** 2)))
     k = np.arange(count)
     distance = radius * np.sqrt((k + 0.5) / count) if count > 1 else np.zeros(1)
-    turn = k * np.pi * (3 - np.sqrt(5))
+    angle = k * np.pi * (3 - np.sqrt(5))
     centre = body.ray_icrs / np.linalg.norm(body.ray_icrs)
     across = np.cross(centre, np.eye(3)[np.argmin(np.abs(centre))])
     across /= np.linalg.norm(across)
-    offsets = np.cos(turn)[:, None] * across + np.sin(turn)[:, None] * np.cross(centre, across)
+    offsets = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(centre, across)
     rays = np.cos(distance)[:, None] * centre + np.sin(distance)[:, None] * offsets
     return rays, np.full(count, body.v_mag + 2.5 * np.log10(count))
 
 
-def _turns(scene: Scene) -> list[Array]:
+def _step_rotations(scene: Scene) -> list[Array]:
     """Rotations (3, 3) of the sky at the middles of equal steps of the exposure, relative to mid-exposure."""
-    angle = float(np.linalg.norm(scene.sky_turn_rad))
+    angle = float(np.linalg.norm(scene.sky_rotvec_rad))
     # Farthest off axis a fisheye stretches the circle around it by up to angle / sin(angle): pi/2 at 90 degrees.
     motion_px = angle * max(scene.camera.focal_px) * np.pi / 2
     if motion_px < TRAIL_VISIBLE_PX:
         return [np.eye(3)]
     steps = int(np.ceil(motion_px / TRAIL_STEP_PX))
-    return [R_from_rotvec(scene.sky_turn_rad * ((k + 0.5) / steps - 0.5)) for k in range(steps)]
+    return [R_from_rotvec(scene.sky_rotvec_rad * ((k + 0.5) / steps - 0.5)) for k in range(steps)]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from startrack.reproduction.artefact import FULL, QUICK, Artefact, Context, Size, write_artefact
 from startrack.reproduction.chunks import ChunkStore
 from startrack.reproduction.distance_figures import fig3_7, fig3_8, fig3_9, fig_a2
-from startrack.reproduction.error_figures import by_aspect_ratio, by_magnitude, fig3_4, fig3_10, fig_b
+from startrack.reproduction.error_figures import aspect_ratio_sweep, fig3_4, fig3_10, fig_b, magnitude_sweep
 from startrack.reproduction.sky_figures import fig3_3, fig3_5, fig3_6, fig_a1
 from startrack.reproduction.table31 import table31
 
@@ -24,8 +24,8 @@ ARTEFACTS: dict[str, Callable[[Context], Artefact]] = {
     "figA.1": fig_a1,
     "figA.2": fig_a2,
     "figB": fig_b,
-    "magnitude": by_magnitude,
-    "aspect": by_aspect_ratio,
+    "magnitude": magnitude_sweep,
+    "aspect": aspect_ratio_sweep,
 }
 
 __all__ = ["ARTEFACTS", "FULL", "QUICK", "Artefact", "ChunkStore", "Context", "Size", "write_artefact"]

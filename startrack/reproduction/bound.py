@@ -20,7 +20,7 @@ def cell_centroid(points_m: Array, position_m: Array, radius_m: float) -> Array:
     """Centroid (2,) [m] of the cell around a position (2,), the least-squares estimate from a perfect list.
 
     Stars (n, 2) as points on the rim's plane. The window grows until the cell does not touch its border, then shrinks
-    to the cell; a part of the cell beyond a gap as wide as the window is not seen.
+    to the cell; a part of the cell beyond a gap as wide as the window is not included.
     """
     seen = visible_stars(points_m, position_m, radius_m)
     low, high = position_m - FIRST_HALF_M, position_m + FIRST_HALF_M

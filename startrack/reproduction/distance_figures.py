@@ -41,7 +41,7 @@ def fig3_7(context: Context) -> Artefact:
     axis = "Minimum Detected Magnitude"
     return _artefact(
         "fig3.7", "Effects of changing the star detection limit", caption, "magnitude", MAGNITUDES, curves, six,
-        partial(_draw_two, MAGNITUDES, curves, axis, (700.0, 7000.0), False, caption),
+        partial(_draw_panels, MAGNITUDES, curves, axis, (700.0, 7000.0), False, caption),
     )  # fmt: skip
 
 
@@ -58,7 +58,7 @@ def fig3_9(context: Context) -> Artefact:
     axis = "Crater Aspect Ratio (Diameter:Depth)"
     return _artefact(
         "fig3.9", "Effects of changing the crater aspect ratio", caption, "aspect_ratio", ASPECT_RATIOS, curves, ten,
-        partial(_draw_two, ASPECT_RATIOS, curves, axis, (250.0, 8000.0), True, caption),
+        partial(_draw_panels, ASPECT_RATIOS, curves, axis, (250.0, 8000.0), True, caption),
     )  # fmt: skip
 
 
@@ -127,7 +127,7 @@ def _artefact(
     )
 
 
-def _draw_two(x: Array, curves: Array, axis: str, tops: tuple[float, float], log: bool, caption: str) -> bytes:
+def _draw_panels(x: Array, curves: Array, axis: str, tops: tuple[float, float], log: bool, caption: str) -> bytes:
     figure = new_figure(7.0, 8.6)
     for k, (axes, top, word) in enumerate(zip(figure.subplots(2, 1), tops, ("Mean", "Maximum"), strict=True)):
         axes.fill_between(x, curves[..., k].min(axis=1), curves[..., k].max(axis=1), color=STAR, alpha=0.15, lw=0)

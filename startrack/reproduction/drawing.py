@@ -58,14 +58,14 @@ def fisheye_axes(axes: Axes) -> None:
         spine.set_visible(False)
 
 
-def error_map(places_m: Array, errors_m: Array, title: str, caption: str) -> bytes:
+def error_map(positions_m: Array, errors_m: Array, title: str, caption: str) -> bytes:
     """Position errors over the crater's floor, point size and colour scaled to the error."""
     figure = new_figure(7.0, 6.6)
     axes = figure.subplots()
     order = np.argsort(errors_m, kind="stable")  # the large ones on top
     share = errors_m[order] / errors_m.max()
     area = (0.6 + 28.0 * share**1.5) * min(2.0, (2e4 / len(order)) ** 0.5)
-    east, north = places_m[order].T / 1e3
+    east, north = positions_m[order].T / 1e3
     points = axes.scatter(east, north, s=area, c=errors_m[order], cmap="turbo", linewidths=0)
     _floor(axes, title)
     figure.colorbar(points, ax=axes, label="position error (m)", shrink=0.85)

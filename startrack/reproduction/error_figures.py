@@ -38,7 +38,7 @@ def fig3_4(context: Context) -> Artefact:
         line=f"skyline estimate {hull.errors.mean():.0f} m (thesis 637)",
         text=f"{caption}\n\n{_ring_table({'skyline estimate': hull})}",
         columns=_ring_columns({"hull": hull}),
-        pictures={"fig3.4": partial(error_map, hull.places_m[0], hull.errors, "Skyline estimate", caption)},
+        pictures={"fig3.4": partial(error_map, hull.positions_m[0], hull.errors, "Skyline estimate", caption)},
         values={"thesis": vars(published.HULL), "reproduced": statistics(hull.errors)},
         timing_ms={"hull_and_descent": hull.ms_per_fix},
     )
@@ -72,13 +72,13 @@ def fig3_10(context: Context) -> Artefact:
         text=f"{caption} {settling}\n\n{of_ours}\n\n{_ring_table(rings)}",
         columns=_ring_columns({"hull": hull, "descent": descent, "ours": ours}),
         pictures={
-            "fig3.10": partial(error_map, descent.places_m[0], descent.errors, "Pseudo-gradient", caption),
-            "fig3.10.ours": partial(error_map, ours.places_m[0], ours.errors, "Ours", of_ours),
+            "fig3.10": partial(error_map, descent.positions_m[0], descent.errors, "Pseudo-gradient", caption),
+            "fig3.10.ours": partial(error_map, ours.positions_m[0], ours.errors, "Ours", of_ours),
         },
         values={
             "thesis": {**vars(published.OVERALL), "never_settle": published.NEVER_SETTLE},
             "reproduced": {**statistics(descent.errors), "never_settle": descent.refused_fraction},
-            "ours": {**statistics(ours.errors), "refused": ours.refused},
+            "ours": {**statistics(ours.errors), "refused": ours.refused_count},
         },
         timing_ms={"hull_and_descent": descent.ms_per_fix, "ours": ours.ms_per_fix},
     )
@@ -98,7 +98,7 @@ def fig_b(context: Context) -> Artefact:
             f"thesis {trial.mean_m} / {trial.sd_m} / {trial.max_m} m."
         )
         pictures[f"figB.{k + 1}"] = partial(
-            error_map, descent.places_m[k], descent.errors_m[k], f"Starfield {k + 1}", captions[-1]
+            error_map, descent.positions_m[k], descent.errors_m[k], f"Starfield {k + 1}", captions[-1]
         )
     return Artefact(
         name="figB",
@@ -116,7 +116,7 @@ def fig_b(context: Context) -> Artefact:
 
 def _ring_means(method: MethodErrors) -> list[float | None]:
     """Mean error [m] by distance from the centre; None where there is no position."""
-    distance = np.concatenate([np.hypot(*positions.T) for positions in method.places_m]) / 1e3
+    distance = np.concatenate([np.hypot(*positions.T) for positions in method.positions_m]) / 1e3
     rings = [(distance >= a) & (distance < b) for a, b in pairwise(RINGS_KM)]
     return [float(method.errors[ring].mean()) if ring.any() else None for ring in rings]
 
@@ -144,7 +144,7 @@ def _ring_columns(methods: dict[str, MethodErrors]) -> tuple[Column, ...]:
     return tuple(columns)
 
 
-def by_magnitude(context: Context) -> Artefact:
+def magnitude_sweep(context: Context) -> Artefact:
     """Position error against the faintest magnitude."""
     rows = [_sweep_row(context, f"magnitude {value:g}", value, 10.0) for value in SWEEP_MAGNITUDES]
     extra = [f"{star_count(value):,}" for value in SWEEP_MAGNITUDES]
@@ -155,7 +155,7 @@ def by_magnitude(context: Context) -> Artefact:
     )  # fmt: skip
 
 
-def by_aspect_ratio(context: Context) -> Artefact:
+def aspect_ratio_sweep(context: Context) -> Artefact:
     """Position error against the crater's aspect ratio."""
     rows = [_sweep_row(context, f"aspect ratio {value:g}", MAGNITUDE, value) for value in SWEEP_ASPECT_RATIOS]
     extra = [f"{20_000 / value:,.0f} m" for value in SWEEP_ASPECT_RATIOS]
@@ -185,7 +185,7 @@ def _sweep_artefact(
     means = np.array([[one.errors.mean() for one in row] for row in rows])
     cells = [
         [f"{value:g}", more, *(f"{mean:.3g}" for mean in means[k]), f"{100 * rows[k][1].refused_fraction:.1f} %",
-         rows[k][2].refused]
+         rows[k][2].refused_count]
         for k, (value, more) in enumerate(zip(x, extra, strict=True))
     ]  # fmt: skip
     table = markdown_table(
@@ -201,7 +201,7 @@ def _sweep_artefact(
     for k, method in enumerate(SWEEP_METHODS):
         columns.append(Column(f"{method.replace('-', '_')}_mean", means[:, k], unit="m", form="%.3f"))
     columns.append(Column("never_settles", [row[1].refused_fraction for row in rows], form="%.5f"))
-    columns.append(Column("refused_by_ours", [row[2].refused for row in rows], "int64", form="%d"))
+    columns.append(Column("refused_by_ours", [row[2].refused_count for row in rows], "int64", form="%d"))
     return Artefact(
         name=name,
         title=title,
@@ -215,7 +215,7 @@ def _sweep_artefact(
                 head[0].replace(" ", "_"): list(x),
                 "mean_m": means[:, 2].tolist(),
                 "limit_m": means[:, 3].tolist(),
-                "refused": [row[2].refused for row in rows],
+                "refused": [row[2].refused_count for row in rows],
             },
         },
     )

@@ -18,7 +18,7 @@ from startrack.reproduction.simulator import (
     Mistakes,
     Sky,
     crater,
-    draw_places,
+    draw_positions,
     visible_stars,
 )
 from startrack.terrain import Cylinder
@@ -50,7 +50,7 @@ def tasks_of(
     method: str, seed: int, sky: int, count: int, *, magnitude: float = MAGNITUDE, aspect_ratio: float = ASPECT_RATIO,
     mistakes: Mistakes = PERFECT,
 ) -> list[Task]:  # fmt: skip
-    """The first `count` places of a sky, in chunks."""
+    """The first `count` positions of a sky, in chunks."""
     step = FIXES_PER_CHUNK[method]
     starts = range(0, count, step)
     return [
@@ -66,21 +66,21 @@ def compute_chunk(task: Task) -> Chunk:
     `nees` (m,), the squared error over the stated covariance, and `ambiguous` (m,). cell: `centroid_m` (n, 2).
     """
     sky, cylinder = Sky.draw(task.seed, task.sky, task.magnitude), crater(task.aspect_ratio)
-    points = sky.on_rim_plane(cylinder)
-    truth = draw_places(task.seed, task.sky, task.start, task.stop)
+    points = sky.project_to_rim_plane(cylinder)
+    truth = draw_positions(task.seed, task.sky, task.start, task.stop)
     seen = [visible_stars(points, position, cylinder.radius_m) for position in truth]
     if task.method == KUA:
-        own = _kua(points, seen, cylinder.wall_m, cylinder.radius_m)
+        own = _solve_kua(points, seen, cylinder.wall_m, cylinder.radius_m)
     elif task.method == BOUND:
         start = time.thread_time()
         own = {"centroid_m": np.stack([cell_centroid(points, position, cylinder.radius_m) for position in truth])}
         own["seconds"] = np.array([time.thread_time() - start])
     else:
-        own = _ours(task, sky, seen, truth)
+        own = _solve_ours(task, sky, seen, truth)
     return {"truth_m": truth, **own}
 
 
-def _kua(points: Array, seen: list[Bools], wall_m: float, radius_m: float) -> Chunk:
+def _solve_kua(points: Array, seen: list[Bools], wall_m: float, radius_m: float) -> Chunk:
     method, start = PseudoGradient(), time.thread_time()
     hull = np.stack([hull_position(points[one], wall_m, radius_m) for one in seen])
     ends = [
@@ -95,7 +95,7 @@ def _kua(points: Array, seen: list[Bools], wall_m: float, radius_m: float) -> Ch
     }
 
 
-def _ours(task: Task, sky: Sky, seen: list[Bools], truth: Array) -> Chunk:
+def _solve_ours(task: Task, sky: Sky, seen: list[Bools], truth: Array) -> Chunk:
     # The simulator has no boulders that the map lacks, so the evidence of a sector needs no cap.
     localizer = ExactPosterior(sector_epsilon=0.0)
     cylinder = crater(task.aspect_ratio)

@@ -17,7 +17,7 @@ from startrack.types import Array, Bools, Evidence
 DIAMETER_M, DEPTH_M = 20_000.0, 2_000.0  # Shackleton as the thesis has it (section 3.3)
 MAGNITUDE = 6.0
 ASPECT_RATIO = DIAMETER_M / DEPTH_M
-STARS, PLACES, MISTAKES = 1, 2, 3  # streams of random numbers
+STARS, POSITIONS, MISTAKES = 1, 2, 3  # streams of random numbers
 EDGE_POINTS = 360  # of the drawn crater edge (section 3.2.1)
 STEP_M = 5.0  # of the traverse through the middle of the crater (section 3.2.2)
 SHACKLETON = Site(body="moon", latitude_rad=float(np.radians(-89.66)), longitude_rad=float(np.radians(129.78)))
@@ -52,13 +52,13 @@ class Sky:
     @classmethod
     def draw(cls, seed: int, sky: int, magnitude: float = MAGNITUDE) -> Sky:
         """phi = 2 pi r1, theta = arcsin r2, r1 and r2 uniform over [0, 1]: eq. 3.9 and 3.10."""
-        r1, r2 = _random([seed, STARS, sky], (star_count(magnitude), 2)).T
+        r1, r2 = _draw_uniform([seed, STARS, sky], (star_count(magnitude), 2)).T
         return cls(2 * np.pi * r1, np.arcsin(r2))
 
     def __len__(self) -> int:
         return len(self.azimuth_rad)
 
-    def on_rim_plane(self, cylinder: Cylinder) -> Array:
+    def project_to_rim_plane(self, cylinder: Cylinder) -> Array:
         """Points (n, 2) [m]: from p, star i is visible exactly when |p + point_i| < R."""
         rho = cylinder.wall_m / np.tan(self.elevation_rad)
         return rho[:, None] * directions(self.azimuth_rad)
@@ -69,23 +69,25 @@ def directions(azimuth_rad: Array) -> Array:
     return np.stack([np.sin(azimuth_rad), np.cos(azimuth_rad)], axis=-1)
 
 
-def draw_places(seed: int, sky: int, start: int, stop: int, radius_m: float = DIAMETER_M / 2) -> Array:
+def draw_positions(seed: int, sky: int, start: int, stop: int, radius_m: float = DIAMETER_M / 2) -> Array:
     """Positions number start to stop - 1 (n, 2) [m] of a sky, uniform over the crater's floor."""
-    r1, r2 = _random([seed, PLACES, sky], (stop, 2))[start:].T
+    r1, r2 = _draw_uniform([seed, POSITIONS, sky], (stop, 2))[start:].T
     return radius_m * np.sqrt(r1)[:, None] * directions(2 * np.pi * r2)
 
 
-def visible_stars(points_m: Array, place_m: Array, radius_m: float) -> Bools:
+def visible_stars(points_m: Array, position_m: Array, radius_m: float) -> Bools:
     """Which stars (n,), given on the rim's plane, are in sight from a position (2,).
 
     The thesis tests against a polygon of 360 points of the rim; it differs from the circle by 0.4 m at most.
     """
-    return np.asarray(np.square(points_m[:, 0] + place_m[0]) + np.square(points_m[:, 1] + place_m[1]) < radius_m**2)
+    return np.asarray(
+        np.square(points_m[:, 0] + position_m[0]) + np.square(points_m[:, 1] + position_m[1]) < radius_m**2
+    )
 
 
-def crater_edge(cylinder: Cylinder, place_m: Array) -> tuple[Array, Array]:
+def crater_edge(cylinder: Cylinder, position_m: Array) -> tuple[Array, Array]:
     """Azimuths and elevations (361,) [rad] of the rim from a position, at even steps along the rim, closed."""
-    rim = cylinder.radius_m * directions(np.linspace(0.0, 2 * np.pi, EDGE_POINTS + 1)) - place_m
+    rim = cylinder.radius_m * directions(np.linspace(0.0, 2 * np.pi, EDGE_POINTS + 1)) - position_m
     return np.arctan2(rim[:, 0], rim[:, 1]), np.arctan2(cylinder.wall_m, np.hypot(rim[:, 0], rim[:, 1]))
 
 
@@ -98,7 +100,7 @@ class Mistakes:
 
     def draw_list(self, in_sight: Bools, seed: int, sky: int, number: int) -> Bools:
         """Draw the list of position `number`: which stars (n,) are on it."""
-        r = _random([seed, MISTAKES, sky, number], (len(in_sight),))
+        r = _draw_uniform([seed, MISTAKES, sky, number], (len(in_sight),))
         return np.where(in_sight, r >= self.missed, r < self.false)
 
     def evidence(self, sky: Sky, listed: Bools) -> Evidence:
@@ -122,7 +124,7 @@ def changes_m(sky: Sky, cylinder: Cylinder) -> Array:
     Star i is visible inside the circle of radius R about -point_i, so the changes are where the line north = 0 crosses
     these circles: exact, where the thesis compares views at steps along the line.
     """
-    east, north = sky.on_rim_plane(cylinder).T
+    east, north = sky.project_to_rim_plane(cylinder).T
     met = np.abs(north) < cylinder.radius_m
     half_chord = np.sqrt(np.square(cylinder.radius_m) - np.square(north[met]))
     crossings = np.concatenate([-east[met] - half_chord, -east[met] + half_chord])
@@ -149,7 +151,7 @@ def change_steps_m(changes: Array, cylinder: Cylinder, step_m: float = STEP_M) -
     return (steps + 1) * step_m - cylinder.radius_m
 
 
-def _random(stream: list[int], shape: tuple[int, ...]) -> Array:
+def _draw_uniform(stream: list[int], shape: tuple[int, ...]) -> Array:
     """Uniform over [0, 1), the same for the same stream; a longer draw begins with the shorter one."""
     rng = np.random.default_rng(stream)
     return rng.random(shape)

@@ -21,15 +21,15 @@ from startrack.reproduction.drawing import (
 from startrack.reproduction.simulator import Sky, crater, crater_edge, directions, star_count, visible_stars
 from startrack.types import Array
 
-ALONG_KM = (-9.0, -6.0, -3.0, 0.0, 3.0, 6.0, 9.0, 9.9)  # places of figure 3.3
-EXAMPLE_M = np.array([5000.0, 2000.0])  # of figure 3.6, and the true place of figure 3.5
+ALONG_KM = (-9.0, -6.0, -3.0, 0.0, 3.0, 6.0, 9.0, 9.9)  # positions of figure 3.3
+EXAMPLE_M = np.array([5000.0, 2000.0])  # of figure 3.6, and the true position of figure 3.5
 ESTIMATE_M = np.array([-3000.0, -1500.0])  # of figure 3.5: far from the true position, so that the vector is visible
 
 
 def fig3_3(context: Context) -> Artefact:
     """Viewed starfields along the centreline."""
     sky = Sky.draw(context.seed, 0)
-    points = sky.on_rim_plane(crater())
+    points = sky.project_to_rim_plane(crater())
     counts = [int(visible_stars(points, np.array([1e3 * east, 0.0]), crater().radius_m).sum()) for east in ALONG_KM]
     caption = (
         "Figure 3.3: Viewed starfields at different positions along the centerline of the crater. The green line "
@@ -46,15 +46,15 @@ def fig3_3(context: Context) -> Artefact:
 def fig3_5(context: Context) -> Artefact:
     """One step of the pseudo-gradient."""
     sky = Sky.draw(context.seed, 0)
-    points, radius = sky.on_rim_plane(crater()), crater().radius_m
+    points, radius = sky.project_to_rim_plane(crater()), crater().radius_m
     views = [visible_stars(points, position, radius) for position in (ESTIMATE_M, EXAMPLE_M)]
     centres = np.stack([points[view].mean(axis=0) for view in views])
     step, wanted = centres[0] - centres[1], EXAMPLE_M - ESTIMATE_M
-    turn = np.degrees(np.arctan2(wanted[0] * step[1] - wanted[1] * step[0], wanted @ step))
+    angle = np.degrees(np.arctan2(wanted[0] * step[1] - wanted[1] * step[0], wanted @ step))
     caption = (
         "Figure 3.5: Example showing pseudo-gradient computation, on the plane of the rim. The red dots indicate the "
         f"centers of mass of the two views. The vector created from those points forms the pseudo-gradient: "
-        f"{np.hypot(*step) / 1e3:.2f} km where {np.hypot(*wanted) / 1e3:.2f} km are wanted, {abs(turn):.1f} degrees "
+        f"{np.hypot(*step) / 1e3:.2f} km where {np.hypot(*wanted) / 1e3:.2f} km are wanted, {abs(angle):.1f} degrees "
         "off."
     )
     return _picture(
@@ -68,7 +68,7 @@ def fig3_5(context: Context) -> Artefact:
 def fig3_6(context: Context) -> Artefact:
     """The visible part of the starfield."""
     sky = Sky.draw(context.seed, 0)
-    in_sight = int(visible_stars(sky.on_rim_plane(crater()), EXAMPLE_M, crater().radius_m).sum())
+    in_sight = int(visible_stars(sky.project_to_rim_plane(crater()), EXAMPLE_M, crater().radius_m).sum())
     caption = (
         "Figure 3.6: Example showing viewed starfield computation. The green line is the crater edge projected onto "
         f"the entire starfield. Stars within the crater edge are the viewed stars: {in_sight} of {len(sky)}."
@@ -107,7 +107,7 @@ def _picture(name: str, title: str, caption: str, line: str, draw: Any, values: 
 def _draw_line(sky: Sky, caption: str) -> bytes:
     figure = new_figure(10.0, 5.9)
     cylinder, stars = crater(), fisheye_points(sky.azimuth_rad, sky.elevation_rad)
-    points = sky.on_rim_plane(cylinder)
+    points = sky.project_to_rim_plane(cylinder)
     for axes, east in zip(figure.subplots(2, 4).ravel(), ALONG_KM, strict=True):
         position = np.array([1e3 * east, 0.0])
         seen = visible_stars(points, position, cylinder.radius_m)
@@ -144,7 +144,7 @@ def _draw_view(sky: Sky, caption: str) -> bytes:
     figure = new_figure(6.4, 6.8)
     axes, cylinder = figure.subplots(), crater()
     stars = fisheye_points(sky.azimuth_rad, sky.elevation_rad)
-    seen = visible_stars(sky.on_rim_plane(cylinder), EXAMPLE_M, cylinder.radius_m)
+    seen = visible_stars(sky.project_to_rim_plane(cylinder), EXAMPLE_M, cylinder.radius_m)
     axes.plot(*stars[~seen].T, ".", color=OTHER_STAR, markersize=3)
     axes.plot(*stars[seen].T, ".", color=STAR, markersize=3)
     axes.plot(*fisheye_points(*crater_edge(cylinder, EXAMPLE_M)).T, color=EDGE, linewidth=1.5)

@@ -19,7 +19,7 @@ ANSWERED = {"kua": "settled", "ours": "located", "bound": None}
 class MethodErrors:
     """Errors of one estimate."""
 
-    places_m: tuple[Array, ...]  # by sky: (n, 2) [m], where there is an estimate
+    positions_m: tuple[Array, ...]  # by sky: (n, 2) [m], where there is an estimate
     errors_m: tuple[Array, ...]  # by sky: (n,) [m]
     answered: tuple[Bools, ...]  # by sky: settled (kua) or located (ours), for every position
     ms_per_fix: float
@@ -30,13 +30,13 @@ class MethodErrors:
         return np.concatenate(self.errors_m)
 
     @property
-    def refused(self) -> int:
+    def refused_count(self) -> int:
         """Positions without an estimate; for the pseudo-gradient, with one that never settled."""
         return int(sum((~one).sum() for one in self.answered))
 
     @property
     def refused_fraction(self) -> float:
-        return self.refused / max(sum(map(len, self.answered)), 1)
+        return self.refused_count / max(sum(map(len, self.answered)), 1)
 
 
 def collect_errors(context: Context, what: str, by_sky: Sequence[Sequence[Task]]) -> list[MethodErrors]:
@@ -52,14 +52,14 @@ def collect_errors(context: Context, what: str, by_sky: Sequence[Sequence[Task]]
     flags = tuple(np.concatenate([chunk[flag] for chunk in one]) for one in chunks) if flag else ()
     found = []
     for key in ERROR_OF[method]:
-        pairs = [[_places_and_errors(chunk, key) for chunk in one] for one in chunks]
+        pairs = [[_positions_and_errors(chunk, key) for chunk in one] for one in chunks]
         positions = tuple(np.concatenate([position for position, _ in one]) for one in pairs)
         errors = tuple(np.concatenate([error for _, error in one]) for one in pairs)
         found.append(MethodErrors(positions, errors, flags, ms))
     return found
 
 
-def _places_and_errors(chunk: Chunk, key: str) -> tuple[Array, Array]:
+def _positions_and_errors(chunk: Chunk, key: str) -> tuple[Array, Array]:
     truth = chunk["truth_m"][chunk["located"]] if "located" in chunk else chunk["truth_m"]
     return truth, np.hypot(*(chunk[key] - truth).T)
 

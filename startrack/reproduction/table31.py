@@ -58,7 +58,7 @@ def _ratio_to_limit(ours: MethodErrors, limit: MethodErrors) -> float:
     pairs = [
         (fix[: len(best)], best[: len(fix)])
         for fix, best, located in zip(ours.errors_m, limit.errors_m, ours.answered, strict=True)
-        if located.all()  # otherwise the places of both differ
+        if located.all()  # otherwise the positions of both differ
     ]
     return float(np.concatenate([fix for fix, _ in pairs]).mean() / np.concatenate([best for _, best in pairs]).mean())
 
@@ -80,10 +80,10 @@ def _values(
             "trials": [statistics(errors) for errors in descent.errors_m],
         },
         "ours": {
-            "same_lists": {**statistics(ours.errors), "refused": ours.refused},
+            "same_lists": {**statistics(ours.errors), "refused": ours.refused_count},
             "limit": statistics(limit.errors),
             "over_limit": ratio,
-            "magnitude_8": {**statistics(deep.errors), "refused": deep.refused},
+            "magnitude_8": {**statistics(deep.errors), "refused": deep.refused_count},
         },
     }
 
@@ -113,12 +113,12 @@ exactly the listed stars are in sight. Seed {context.seed}.
 
 {markdown_table(head, rows)}
 
-Ours over the limit, on the same positions: {ratio:.3f}. Refused by ours: {ours.refused}.
+Ours over the limit, on the same positions: {ratio:.3f}. Refused by ours: {ours.refused_count}.
 
 A camera two magnitudes deeper ({star_count(DEEP_MAGNITUDE):,} stars, {DEEP_MISTAKES.missed:.0%} of those in sight \
 missed, {DEEP_MISTAKES.false:.0%} of the hidden ones on the list by mistake): ours \
 {format_errors(deep.errors, HUNDREDTHS)} \
-over {len(deep.errors):,} positions; refused: {deep.refused}."""
+over {len(deep.errors):,} positions; refused: {deep.refused_count}."""
 
 
 def _trial_text(trial: published.Errors) -> str:

@@ -151,7 +151,7 @@ class Solution:
         before `identify` before `detect`) stay, and this one's then have its kind in their names.
 
         Raises:
-            BadInput: bad_image where nothing can be written, or where the record of another image is there.
+            BadInput: bad_image if the files cannot be written, or the record of another image exists.
         """
         path = Path(folder) / f"{self.result.exposure.name or 'image'}.{self.kind}.json"
         remedy = "write elsewhere, or with overwrite=True"

@@ -1,4 +1,4 @@
-"""A folder of results to make pages of, as `locate` and `batch` leave it, and a window that shows such a page."""
+"""A folder of results as `locate` and `batch` write it, and a browser window that shows its page."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def results_in(out: Path, located: Any) -> Path:
 
 
 class Window:
-    """A page that is open, with all that it said on the console."""
+    """An open page with its messages on the console."""
 
     def __init__(self, chromium: Any, path: Path, size: tuple[int, int], scheme: str = "light") -> None:
         touch = size != DESKTOP
@@ -53,7 +53,7 @@ class Window:
         self.page.goto(path.as_uri())
         self.said.remove(path.as_uri())
 
-    def until(self, condition: str) -> None:
+    def wait_for(self, condition: str) -> None:
         """Wait for a condition in JavaScript. (Playwright's own way polls by eval, which the page's rules forbid.)"""
         for _ in range(600):
             if self.page.evaluate(condition):
@@ -65,8 +65,8 @@ class Window:
         self.page.get_by_role("link", name=name).click()
         self.page.wait_for_selector("#detail h1")
 
-    def star(self, name: str) -> tuple[float, float]:
-        """Where a star of the picture is in the window."""
+    def star_position(self, name: str) -> tuple[float, float]:
+        """Position in the window of a star of the picture."""
         self.page.locator("#detail .stage canvas").first.scroll_into_view_if_needed()
         x, y = self.page.evaluate(
             "name => { const c = document.querySelector('#detail .stage canvas'); const f = c.getBoundingClientRect();"
@@ -83,6 +83,6 @@ class Window:
     def tip(self) -> str:
         return self.page.locator("#detail .tip").first.inner_text()
 
-    def fits(self) -> bool:
-        """Whether nothing stands out to the right."""
+    def has_no_overflow(self) -> bool:
+        """Whether no element extends beyond the right edge."""
         return self.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")

@@ -7,16 +7,19 @@ cache beside the package; where that folder is read-only, NUMBA_CACHE_DIR is set
 from __future__ import annotations
 
 import atexit
+import hashlib
 import logging
 import os
 import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from startrack import __version__
 from startrack.files import PACKAGE
 
 LOG = logging.getLogger(__name__)
@@ -64,6 +67,29 @@ def announce_compilation() -> None:
     event.register("numba:compile", Announcement())
 
 
+def discard_stale_kernels() -> None:
+    """Have numba forget the kernels that it compiled from other sources of startrack than these.
+
+    numba compares only the file of a kernel itself, by size and time, and neither those of the kernels that it calls
+    nor the types of its arguments. Called before numba loads.
+    """
+    key = hashlib.sha256(__version__.encode())
+    for source in sorted(PACKAGE.rglob("*.py")):
+        status = source.stat()
+        key.update(f"{source.name} {status.st_size} {status.st_mtime_ns}".encode())
+    folder = os.environ.get(VARIABLE)
+    name = f"startrack-{hashlib.sha256(str(PACKAGE).encode()).hexdigest()[:12]}.key"
+    file = Path(folder or PACKAGE / "__pycache__") / name
+    with suppress(OSError):  # another process may be doing the same
+        if file.is_file() and file.read_text() == key.hexdigest():
+            return
+        for source in PACKAGE.rglob("*.py"):
+            for index in _indices_of(source):
+                index.unlink(missing_ok=True)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(key.hexdigest())
+
+
 def is_compiled() -> bool:
     """Whether numba's cache holds localization kernels for this Python.
 
@@ -76,4 +102,7 @@ def _indices_of(source: Path) -> Iterator[Path]:
     """numba's index files of a source: MODULE.FUNCTION-LINE.pyXY.nbi, in __pycache__ or below NUMBA_CACHE_DIR."""
     name = f"{source.stem}.*.py{sys.version_info.major}{sys.version_info.minor}.nbi"
     folder = os.environ.get(VARIABLE)
-    return Path(folder).glob(f"*/{name}") if folder else (source.parent / "__pycache__").glob(name)
+    if not folder:
+        return (source.parent / "__pycache__").glob(name)
+    of_parent = hashlib.sha1(str(source.parent).encode(), usedforsecurity=False).hexdigest()
+    return (Path(folder) / f"{source.parent.name}_{of_parent}").glob(name)

@@ -88,3 +88,41 @@ def test_a_folder_that_the_user_names_is_kept(monkeypatch):
     monkeypatch.setattr(compilation.os, "access", lambda path, mode: False)
     compilation.choose_cache_folder()
     assert os.environ["NUMBA_CACHE_DIR"] == "mine"
+
+
+@pytest.fixture
+def cached_kernel(monkeypatch, tmp_path):
+    """A package of one module with the index of a compiled kernel beside it."""
+    package = tmp_path / "package"
+    index = package / "__pycache__" / f"module.kernel-1.py{sys.version_info.major}{sys.version_info.minor}.nbi"
+    index.parent.mkdir(parents=True)
+    (package / "module.py").write_text("x = 1\n")
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr(compilation, "PACKAGE", package)
+    compilation.discard_stale_kernels()
+    index.write_bytes(b"compiled")
+    return index
+
+
+def test_kernels_stay_while_the_sources_do(cached_kernel):
+    compilation.discard_stale_kernels()
+    assert cached_kernel.exists()
+
+
+@pytest.mark.parametrize("change", ["text", "file", "version"])
+def test_kernels_of_other_sources_are_forgotten(cached_kernel, monkeypatch, change):
+    package = cached_kernel.parent.parent
+    if change == "text":
+        (package / "module.py").write_text("x = 22\n")
+    elif change == "file":
+        (package / "other.py").write_text("y = 1\n")
+    else:
+        monkeypatch.setattr(compilation, "__version__", "another")
+    compilation.discard_stale_kernels()
+    assert not cached_kernel.exists()
+
+
+def test_every_kernel_is_compiled_by_the_checked_cache():
+    sources = (ROOT / "startrack").rglob("*.py")
+    direct = [path.stem for path in sources if "from numba import" in path.read_text(encoding="utf-8")]
+    assert direct == ["kernels"]

@@ -19,6 +19,7 @@ LAYERS = (  # lowest first; a package imports from lower layers only
     {"errors"},
     {"types", "files", "declaration"},
     {"frames", "runner", "compilation"},
+    {"kernels"},
     {"psf", "catalog", "camera", "terrain", "exposure"},
     {"match", "normal_equations", "false_alarm"},
     {"adjust"},

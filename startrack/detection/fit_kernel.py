@@ -6,8 +6,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from startrack.kernels import njit
 from startrack.psf import ERF_COEFFICIENTS, ERF_T
 
 MAX_STEP_PX = 0.5

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
-from numba import njit
+
+from startrack.kernels import njit
 
 OUTLIER_SIGMA = 5.0
 MODEL_ERROR = 0.05  # of a star's light, pixel by pixel: the real PSF is not quite the Gaussian

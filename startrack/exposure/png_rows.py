@@ -5,10 +5,10 @@ from __future__ import annotations
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
 from isal import isal_zlib
-from numba import njit
 from numpy.typing import NDArray
 
 from startrack.exposure.decoded import bad_image
+from startrack.kernels import njit
 
 DAMAGED = "damaged PNG: its picture data cannot be decoded"
 

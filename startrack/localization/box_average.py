@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from math import log
 
 import numpy as np
-from numba import njit
 
+from startrack.kernels import njit
 from startrack.localization.prefix_sums import PrefixSums
 from startrack.localization.sector_likelihood import SECTOR_STEP, Sectors
 from startrack.terrain import Terrain

@@ -13,8 +13,8 @@ from __future__ import annotations
 from math import exp, inf, log, log1p, sqrt
 
 import numpy as np
-from numba import njit
 
+from startrack.kernels import njit
 from startrack.localization.boxes import Boxes, split_boxes
 from startrack.localization.score_kernel import smaller_sigma
 from startrack.localization.sector_likelihood import log_mixture, row_range

@@ -7,8 +7,8 @@ from math import inf
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from startrack.kernels import njit
 from startrack.localization.score_kernel import log_mixtures
 from startrack.types import Array, Ints
 

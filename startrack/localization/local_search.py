@@ -9,8 +9,8 @@ from math import floor
 from typing import Any, cast
 
 import numpy as np
-from numba import njit
 
+from startrack.kernels import njit
 from startrack.localization.prefix_sums import PrefixSums
 from startrack.localization.score_kernel import log_mixtures, score_disks
 from startrack.localization.sector_likelihood import Sectors, contributions, row_contribution

@@ -6,8 +6,8 @@ from __future__ import annotations
 from math import exp, inf, log1p, sqrt
 
 import numpy as np
-from numba import njit
 
+from startrack.kernels import njit
 from startrack.localization.sector_likelihood import log_mixture, row_contribution
 
 

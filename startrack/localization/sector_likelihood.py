@@ -7,8 +7,8 @@ from functools import cached_property
 from math import erfc, exp, expm1, inf, log, log1p, sqrt
 
 import numpy as np
-from numba import njit
 
+from startrack.kernels import njit
 from startrack.types import Array, Evidence, Ints
 
 SECTOR_STEP = 10.0  # between the keys of neighbouring sectors: more than any two elevations differ [rad]

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
-from numba import njit
+
+from startrack.kernels import njit
 
 SPHERE_M = 1_737_400.0
 LOWEST_TAN = -50.0

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
-from numba import njit
 
+from startrack.kernels import njit
 from startrack.terrain.bounds_kernel import bounds, box_height_bounds
 from startrack.terrain.horizon_kernel import FAR_M, horizon, surfaces
 from startrack.terrain.horizon_table import ANGLE_STEP_RAD, BINS, DISTANCE_STEP_M, FARTHEST, NOT_KNOWN_M, RISE_STEP

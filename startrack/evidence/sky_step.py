@@ -151,10 +151,10 @@ def reliable_azimuths(horizon: Horizon, shifted: list[Horizon], camera: Camera) 
     steep = np.abs(np.roll(here, -1) - np.roll(here, 1)) / (2 * run)
     good = (shift_px < MAX_SHIFT_PX) & (steep < MAX_SLOPE)
 
-    def known(azimuth_rad: Array) -> Bools:
+    def is_reliable(azimuth_rad: Array) -> Bools:
         return np.asarray(good[np.rint(azimuth_rad / (2 * np.pi) * SKYLINE_POINTS).astype(np.int64) % SKYLINE_POINTS])
 
-    return known
+    return is_reliable
 
 
 def near_skyline(azimuth_rad: Array, elevation_rad: Array, camera: Camera, horizon: Horizon, within_px: float) -> Bools:

@@ -61,10 +61,10 @@ def bound_boxes(rows, boxes, centres, half, parent, allowed, strength, weakest, 
         x, y = centres[b, 0], centres[b, 1]
         count = boxes.first[p + 1] - boxes.first[p]
         if used + count > len(kept_row):
-            kept_row = _grown(kept_row, used, 2 * (used + count))
+            kept_row = _enlarge_array(kept_row, used, 2 * (used + count))
             if not disks:
-                kept_least = _grown(kept_least, used, 2 * (used + count))
-                kept_most = _grown(kept_most, used, 2 * (used + count))
+                kept_least = _enlarge_array(kept_least, used, 2 * (used + count))
+                kept_most = _enlarge_array(kept_most, used, 2 * (used + count))
         for s in range(sectors):
             kept_sums[n, s] = boxes.sums[p, s]
         start, hopeless = used, False
@@ -209,7 +209,7 @@ def refine_disks(rows, boxes, reach, best, certain, prune_nats, negligible_nats,
 
 
 @njit(cache=True, nogil=True)
-def _grown(a, used, size):
+def _enlarge_array(a, used, size):
     larger = np.empty(size, dtype=a.dtype)
     for k in range(used):
         larger[k] = a[k]

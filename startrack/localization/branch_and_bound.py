@@ -21,7 +21,7 @@ PARTS_BELOW_M, PARTS_FROM, PARTS_TO = 60.0, 600, 4000  # half side, and numbers 
 PARTS_TURNS = 6
 LOOKED_UP_RAD = np.radians(0.26)  # height maps look up what is as wide as that, and trace what is narrower
 LLR_TIERS = ((4.0, np.inf), (2.0, 4.0), (1.0, 2.0), (0.0, 1.0))  # |llr| of rows that are bounded in turns
-MANY_PAIRS = 200_000  # open (box, row) pairs above which horizons at the boxes' centres cost more than they gain
+MAX_SCORED_PAIRS = 200_000  # open (box, row) pairs above which horizons at the boxes' centres cost more than they gain
 SOFT_BOXES = 0.3  # of the boxes per sigma suffice where edges are soft: sums of Gaussians converge, and leave no cells
 ACCEPTED_NATS = -1.0  # mean over the sectors, at a position that is answered without a proof: see EXPLAINED_NATS
 UNLIKELY_NATS = 16.0  # boxes that are less likely than the best by more are no part of the posterior
@@ -222,7 +222,7 @@ class Search:
         """Quartered until small against the posterior's spread."""
         while True:
             last = False
-            if len(boxes.row) <= MANY_PAIRS or not self._may_split(boxes):
+            if len(boxes.row) <= MAX_SCORED_PAIRS or not self._may_split(boxes):
                 boxes = self._with_scores(boxes)
                 width = self._width_over_limit(boxes)
                 if width < 1:

@@ -21,7 +21,7 @@ SECTOR_CONTRADICTED = 0.2  # part of a sector's sure rays that contradict the fi
 MIN_IN_SECTOR = 3
 
 USUAL_HORIZON_RAD = 0.3  # sin H cos H of a crater's rim at 20 degrees: d(tan H) / tan H = dH / (sin H cos H)
-LEAST_EXPLAINED_NATS = -0.75  # 0 to -0.35 at the right place, up to 0.5 lower with a ridge on no map; -9.2 the worst
+MIN_EXPLAINED_NATS = -0.75  # 0 to -0.35 at the right place, up to 0.5 lower with a ridge on no map; -9.2 the worst
 CONTRADICTED_NATS = -3.0  # of one sector
 NAMED_STRETCHES = 3
 MAX_SEPARATE = 7  # at right positions 0 to 3 were seen, and 9 or more where the sky was turned by 6 degrees and more
@@ -48,10 +48,10 @@ def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain) -> None:
     stretches = contradicted_stretches(by_sector)
     contradicted = contradicted_part(evidence, fix, terrain)
     if contradicted > MAX_CONTRADICTED_PART:
-        raise _inconsistent(f"{100 * contradicted:.0f} % of the horizon contradicts the best position", stretches)
+        raise _inconsistency(f"{100 * contradicted:.0f} % of the horizon contradicts the best position", stretches)
     explained = float(by_sector.mean())
-    if explained < LEAST_EXPLAINED_NATS:
-        raise _inconsistent(
+    if explained < MIN_EXPLAINED_NATS:
+        raise _inconsistency(
             f"the best position explains the stars badly ({explained:.1f} nats a sector; usual: 0 to -0.3)", stretches
         )
     if len(stretches) > MAX_SEPARATE and not terrain.axisymmetric:
@@ -218,7 +218,7 @@ def _refitted_gain(likelihood: PositionLikelihood, position_m: Array, changed: E
     return float(scores[0] - scores[1])
 
 
-def _inconsistent(cause: str, stretches: list[tuple[int, int]]) -> NotLocated:
+def _inconsistency(cause: str, stretches: list[tuple[int, int]]) -> NotLocated:
     return NotLocated(
         f"{cause}{_at_azimuths(stretches)}: wrong terrain, time or camera file, or something on no map?",
         reason="inconsistent_evidence",

@@ -38,13 +38,13 @@ def hull_position(points_m: Array, wall_m: float, radius_m: float) -> Array:
 
     if len(points_m) < 3:
         raise NotLocated(f"{len(points_m)} seen stars make no hull")
-    x, y = points_m[ConvexHull(_equidistant(points_m, wall_m)).vertices].T
+    x, y = points_m[ConvexHull(_project_equidistant(points_m, wall_m)).vertices].T
     a = np.stack([np.ones_like(x), -2 * x, -2 * y], axis=1)
     q, *_ = np.linalg.lstsq(a, radius_m**2 - x * x - y * y, rcond=None)
     return -q[1:]
 
 
-def _equidistant(points_m: Array, wall_m: float) -> Array:
+def _project_equidistant(points_m: Array, wall_m: float) -> Array:
     """The stars (n, 2) as an ideal fisheye shows them: zenith distance [rad] times the horizontal direction.
 
     The plane decides which stars make the hull, and the thesis does not name it. Mean errors in its crater: rim plane

@@ -15,7 +15,7 @@ FIRST_CELLS, MAX_CELLS = 16, 64  # boxes from the middle of a square to its side
 EDGE_MASS = 1e-4  # of a square's probability may lie in its outermost boxes
 REACH_SIGMAS = 5.0  # from the middle of a square to its side, along the longer axis of the mode
 BOXES_PER_SIGMA = 1.0  # of the shorter axis
-LEAST_RESOLVED = 1.5  # boxes within a standard deviation of the shorter axis, else smaller boxes are scored
+MIN_BOXES_PER_SIGMA = 1.5  # boxes within a standard deviation of the shorter axis, else smaller boxes are scored
 MAX_ROUNDS = 10
 NODE_STEP_M, MIN_NODES, MAX_NODES = 12.0, 5, 13  # distance of traced horizons; points along a side
 
@@ -54,7 +54,7 @@ def _square(likelihood: PositionLikelihood, position_m: Array) -> tuple[Array, f
         variances = np.linalg.eigvalsh(((centres - mean) * weight[:, None]).T @ (centres - mean))
         narrow, wide = np.sqrt(np.maximum(variances, half**2 / 3))
         closer = REACH_SIGMAS * max(wide, half) + half
-        if grown or narrow > 2 * half * LEAST_RESOLVED or half <= finest or closer > 0.8 * size:
+        if grown or narrow > 2 * half * MIN_BOXES_PER_SIGMA or half <= finest or closer > 0.8 * size:
             break
         middle, size = mean, closer  # too coarse: look closer
     size = min(REACH_SIGMAS * wide + float(np.abs(mean - middle).max()), 1.5 * size)

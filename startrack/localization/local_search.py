@@ -83,7 +83,7 @@ class LocalLikelihood:
                 step /= 2
         return position, best
 
-    def on(self, terrain: Terrain) -> LocalLikelihood:
+    def with_terrain(self, terrain: Terrain) -> LocalLikelihood:
         """The same rows on another terrain, whose horizon differs by no more than the leeway."""
         ground = terrain.near(self.centre_m, self.half_m, self.evidence.azimuth_rad)
         return replace(self, terrain=terrain, ground=ground)

@@ -154,7 +154,7 @@ def _shapes_that_matter(evidence: Evidence, terrain: Terrain) -> Array:
 
     def fits(nodes: Array) -> Array:
         nonlocal position
-        found = [local.on(terrain.reshaped(node)).climb(position, *SHAPE_STEPS_M) for node in nodes]
+        found = [local.with_terrain(terrain.reshaped(node)).climb(position, *SHAPE_STEPS_M) for node in nodes]
         scores = np.array([fit + terrain.log_prior(node) for (_, fit), node in zip(found, nodes, strict=True)])
         position = found[int(np.argmax(scores))][0]
         return scores

@@ -17,7 +17,7 @@ from startrack.terrain import Terrain
 from startrack.types import Array, Evidence, Fix, NotLocated
 
 MIN_ROWS = 8
-LEAST_NATS = 1e-3  # |llr| below which a row is left out
+MIN_ROW_NATS = 1e-3  # |llr| below which a row is left out
 CONTRADICTED_NATS = -1.7  # mean over the sectors at the best position; -0.5 is usual, and -9.2 the least possible
 
 
@@ -46,7 +46,7 @@ class ExactPosterior:
         Raises NotLocated: insufficient_geometry, outside_search_area, inconsistent_evidence.
         """
         announce_compilation()
-        informative = (np.abs(evidence.llr) > LEAST_NATS) | (evidence.extended_nats > LEAST_NATS)
+        informative = (np.abs(evidence.llr) > MIN_ROW_NATS) | (evidence.extended_nats > MIN_ROW_NATS)
         informative &= terrain.is_informative(evidence.azimuth_rad, evidence.elevation_rad)
         count = int(np.count_nonzero(informative))
         if count < MIN_ROWS:

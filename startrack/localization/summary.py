@@ -36,7 +36,7 @@ def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_proba
     centres_m, weight = centres_m[keep], weight[keep] / weight[keep].sum()
     mean, covariance = _moments(centres_m, weight, width_m)
     label = _modes(centres_m, weight, width_m, covariance)
-    modes = _described(centres_m, weight, label)
+    modes = _list_modes(centres_m, weight, label)
     if label.any():
         main = label == np.argmax(np.bincount(label, weights=weight))
         mean, covariance = _moments(centres_m[main], weight[main], width_m)
@@ -107,7 +107,7 @@ def _modes(centres_m: Array, weight: Array, width_m: float, covariance: Array) -
         heaviest = label == np.argmax(np.bincount(label, weights=weight))
         _, covariance = _moments(centres_m[heaviest], weight[heaviest], width_m)
         gap = max(1.5 * width_m, sigmas * float(np.sqrt(np.linalg.eigvalsh(covariance)[1])))
-        label = _linked(centres_m, gap)
+        label = _link_boxes(centres_m, gap)
     return label
 
 
@@ -117,7 +117,7 @@ def _in_one_piece(centres_m: Array, covariance: Array, width_m: float) -> bool:
     return bool(np.diff(along).max(initial=0.0) < 1.5 * width_m)
 
 
-def _linked(points_m: Array, gap_m: float) -> Ints:
+def _link_boxes(points_m: Array, gap_m: float) -> Ints:
     """Labels (n,) of the connected groups of points closer than the gap.
 
     Points are first put into cells of the gap's size, so the cost does not grow with the number of pairs.
@@ -138,7 +138,7 @@ def _linked(points_m: Array, gap_m: float) -> Ints:
     return np.asarray(connected_components(graph, directed=False)[1])[of].astype(np.int64)
 
 
-def _described(centres_m: Array, weight: Array, label: Ints) -> tuple[Mode, ...]:
+def _list_modes(centres_m: Array, weight: Array, label: Ints) -> tuple[Mode, ...]:
     mass = np.bincount(label, weights=weight)
     east = np.bincount(label, weights=weight * centres_m[:, 0]) / np.maximum(mass, 1e-300)
     north = np.bincount(label, weights=weight * centres_m[:, 1]) / np.maximum(mass, 1e-300)

@@ -182,44 +182,44 @@ def _geo_keys(p: Projection) -> tuple[list[tuple[int, int, int, int]], list[floa
     doubles: list[float] = []
     keys: list[tuple[int, int, int, int]] = []
 
-    def short(key: int, value: int) -> None:
+    def add_short(key: int, value: int) -> None:
         keys.append((key, 0, 1, value))
 
-    def double(key: int, value: float) -> None:
+    def add_double(key: int, value: float) -> None:
         keys.append((key, DOUBLES_TAG, 1, len(doubles)))
         doubles.append(float(value))
 
     degrees = p.kind == EQUIRECTANGULAR and p.scale_y != 1.0  # latitude and longitude themselves
-    short(1024, 2 if degrees else 1)
-    short(1025, 1)
-    short(2048, USER_DEFINED)
+    add_short(1024, 2 if degrees else 1)
+    add_short(1025, 1)
+    add_short(2048, USER_DEFINED)
     keys.append((2049, ASCII_TAG, len(text), 0))
-    short(2050, USER_DEFINED)
-    short(2054, DEGREE)
-    short(2056, USER_DEFINED)
-    double(2057, p.radius_m)
-    double(2058, p.radius_m)
+    add_short(2050, USER_DEFINED)
+    add_short(2054, DEGREE)
+    add_short(2056, USER_DEFINED)
+    add_double(2057, p.radius_m)
+    add_double(2058, p.radius_m)
     if degrees:
         return keys, doubles, text
-    short(3072, USER_DEFINED)
-    short(3074, USER_DEFINED)
-    short(3075, {STEREOGRAPHIC: 14, ORTHOGRAPHIC: 21, EQUIRECTANGULAR: 17}[p.kind])
-    short(3076, METRE)
+    add_short(3072, USER_DEFINED)
+    add_short(3074, USER_DEFINED)
+    add_short(3075, {STEREOGRAPHIC: 14, ORTHOGRAPHIC: 21, EQUIRECTANGULAR: 17}[p.kind])
+    add_short(3076, METRE)
     latitude, longitude = np.degrees(p.latitude_rad), np.degrees(p.longitude_rad)
     polar = p.kind == STEREOGRAPHIC and abs(latitude) == 90.0
     if polar:
         keys[[key[0] for key in keys].index(3075)] = (3075, 0, 1, 15)
-        double(3081, latitude)
-        double(3095, longitude)
-        double(3092, p.scale)
+        add_double(3081, latitude)
+        add_double(3095, longitude)
+        add_double(3092, p.scale)
     elif p.kind == EQUIRECTANGULAR:
-        double(3078, np.degrees(np.arccos(p.scale)))
-        double(3088, longitude)
-        double(3089, 0.0)
+        add_double(3078, np.degrees(np.arccos(p.scale)))
+        add_double(3088, longitude)
+        add_double(3089, 0.0)
     else:
-        double(3088, longitude)
-        double(3089, latitude)
-        double(3092, p.scale)
-    double(3082, p.false_x_m)
-    double(3083, p.false_y_m)
+        add_double(3088, longitude)
+        add_double(3089, latitude)
+        add_double(3092, p.scale)
+    add_double(3082, p.false_x_m)
+    add_double(3083, p.false_y_m)
     return keys, doubles, text

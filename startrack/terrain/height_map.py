@@ -170,8 +170,8 @@ class HeightMap(Terrain):
         shape = np.broadcast_shapes(
             centres_m.shape[:-1], np.shape(half_m), np.shape(azimuths_rad), np.shape(azimuth_half_rad)
         )
-        centres = _flat(centres_m, (*shape, 2)).reshape(-1, 2)
-        half, azimuths, turn = (_flat(a, shape).ravel() for a in (half_m, azimuths_rad, azimuth_half_rad))
+        centres = _flatten(centres_m, (*shape, 2)).reshape(-1, 2)
+        half, azimuths, turn = (_flatten(a, shape).ravel() for a in (half_m, azimuths_rad, azimuth_half_rad))
         table = self.table
         low, high = np.empty(len(half)), np.empty(len(half))
         traced = (turn < 0.25 * 2 * np.pi / BINS) & (half < table.square.half_m)
@@ -182,10 +182,12 @@ class HeightMap(Terrain):
         else:
             for kind in np.unique(half[~traced]):
                 which = ~traced & (half == kind)
-                low[which], high[which] = self._some(
+                low[which], high[which] = self._bounds_of_some(
                     tracing.look_up_sector_bounds, centres, half, azimuths, turn, which
                 )
-            low[traced], high[traced] = self._some(tracing.trace_box_bounds, centres, half, azimuths, turn, traced)
+            low[traced], high[traced] = self._bounds_of_some(
+                tracing.trace_box_bounds, centres, half, azimuths, turn, traced
+            )
         return low.reshape(shape), high.reshape(shape)
 
     def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
@@ -277,13 +279,15 @@ class HeightMap(Terrain):
         """tan, distance, and distance of the maps' end, of each point and azimuth."""
         points_m = np.asarray(points_m, dtype=np.float64)
         shape = np.broadcast_shapes(points_m.shape[:-1], np.shape(azimuths_rad))
-        points = _flat(points_m, (*shape, 2)).reshape(-1, 2)
+        points = _flatten(points_m, (*shape, 2)).reshape(-1, 2)
         found = tracing.trace_horizons(
-            self, cache.TABLES_IN_MEMORY.get(self._key), points, _flat(azimuths_rad, shape).ravel()
+            self, cache.TABLES_IN_MEMORY.get(self._key), points, _flatten(azimuths_rad, shape).ravel()
         )
         return tuple(a.reshape(shape) for a in found)  # type: ignore[return-value]
 
-    def _some(self, bounds: Any, centres: Array, half: Array, azimuths: Array, turn: Array, which: Bools) -> Any:
+    def _bounds_of_some(
+        self, bounds: Any, centres: Array, half: Array, azimuths: Array, turn: Array, which: Bools
+    ) -> Any:
         low, high = np.empty(int(which.sum())), np.empty(int(which.sum()))
         if len(low):
             parts = (np.ascontiguousarray(a[which]) for a in (centres, half, azimuths, turn))
@@ -323,5 +327,5 @@ class HeightMap(Terrain):
         return not np.isnan(ground_up_m(self.site, list(self.maps), points)).any()
 
 
-def _flat(a: Any, shape: tuple[int, ...]) -> Array:
+def _flatten(a: Any, shape: tuple[int, ...]) -> Array:
     return np.ascontiguousarray(np.broadcast_to(np.asarray(a, dtype=np.float64), shape))

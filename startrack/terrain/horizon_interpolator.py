@@ -25,8 +25,8 @@ class HorizonInterpolator(ForwardingTerrain):
     """The terrain near a centre, with fast horizons at the azimuths that it was made for; else as `whole`.
 
     A crest at the distance d is seen higher as the camera's own ground falls: tan H + z / d bends much less from point
-    to point than tan H, and is bilinear between traced nodes. Its error is below `rough`, which the nodes themselves
-    show. Azimuths with a larger one are traced.
+    to point than tan H, and is bilinear between traced nodes. Its error is below `interpolation_error`, which the nodes
+    themselves show. Azimuths with a larger one are traced.
     """
 
     whole: HeightMap
@@ -67,7 +67,7 @@ class HorizonInterpolator(ForwardingTerrain):
         return self._traced_nodes[2]
 
     @cached_property
-    def rough(self) -> Array:
+    def interpolation_error(self) -> Array:
         """(n,) largest error of the bilinear nodes between the nodes.
 
         A smooth bend errs by an eighth of the second differences, a change from one crest to another by all of one.
@@ -77,7 +77,7 @@ class HorizonInterpolator(ForwardingTerrain):
 
     @cached_property
     def _smooth(self) -> Bools:
-        return np.asarray(self.rough < np.maximum(MAX_BEND_TAN, MAX_BEND_SIGMAS * self._sigma_rad))
+        return np.asarray(self.interpolation_error < np.maximum(MAX_BEND_TAN, MAX_BEND_SIGMAS * self._sigma_rad))
 
     def interpolation(self, azimuths_rad: Array) -> Interpolation:
         """See `Terrain`; all azimuths must be among those named."""

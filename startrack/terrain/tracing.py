@@ -86,7 +86,7 @@ def interpolate_bounds(near: HorizonInterpolator, centres: Array, half: float, c
     from startrack.terrain import horizon_kernel
 
     low, high = np.empty(len(column)), np.empty(len(column))
-    where = near.rough, near.middle_up_m, *near.centre_m, near.half_m
+    where = near.interpolation_error, near.middle_up_m, *near.centre_m, near.half_m
     fill: Any = horizon_kernel.interpolate_bounds
     fill(near.whole.ground, near.nodes, near.per_height, *where, centres, half, column, low, high)
     return low, high

@@ -174,7 +174,7 @@ def best_stretch(likelihood: PositionLikelihood, position_m: Array) -> tuple[flo
         sizes = STRETCHES
     if gain > STRETCH_GAIN_NATS and not likelihood.in_closed_form:
         e = likelihood.evidence
-        gain = _refitted_gain(likelihood, position_m, replace(e, elevation_rad=_lowered_rad(e, best)), at)
+        gain = min(gain, _refitted_gain(likelihood, position_m, replace(e, elevation_rad=_lowered_rad(e, best)), at))
     return best, gain
 
 
@@ -194,7 +194,7 @@ def best_turn(likelihood: PositionLikelihood, position_m: Array) -> tuple[float,
             best, gain, at = float(turn), fit - plain, position
     if gain > TURN_GAIN_NATS:
         e = likelihood.evidence
-        gain = _refitted_gain(likelihood, position_m, replace(e, azimuth_rad=e.azimuth_rad + best), at)
+        gain = min(gain, _refitted_gain(likelihood, position_m, replace(e, azimuth_rad=e.azimuth_rad + best), at))
     return best, gain
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from startrack.catalog import load_catalog
 from startrack.catalog.gaia import has_deep_catalog, hipparcos_rows_in_deep, load_deep_catalog
 from startrack.evidence import (
     Skyline,
@@ -44,7 +45,7 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
         )
     if when is None:
         raise BadInput("no_time", "the mid-exposure time is not known")
-    if settings.deep_stars and oriented.catalog_name == "hipparcos":
+    if settings.deep_stars:
         oriented = add_gaia_stars(oriented, terrain.site)
     R = R_enu_icrs(terrain.site, when)
     light = _photometry(oriented, terrain, R, settings.evidence, oriented.detections)
@@ -54,8 +55,11 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
 def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
     """The same stars in the deeper Gaia list, if that is installed and the frame is deep enough to need it.
 
-    `site` is where the camera stands, for the aberration. Returns `oriented` itself where nothing changes.
+    `site` is where the camera stands, for the aberration. Returns `oriented` itself where nothing changes: also with
+    stars that are not the whole shipped catalogue, which are a choice of the caller's.
     """
+    if not np.array_equal(oriented.stars.hip, load_catalog().hip):
+        return oriented
     found, when = oriented.identification, oriented.exposure.time_utc
     scale = flux_scale(oriented.detections, oriented.camera, oriented.stars, found)
     limiting_mag = scale.zero_mag - 2.5 * np.log10(5.0 * filtered_noise_e(oriented.detections))

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from startrack import measurement
+from startrack.catalog import load_catalog
 from startrack.measurement import measure_evidence
 from startrack.stages import Settings
 
@@ -43,3 +45,17 @@ def test_no_evidence_beyond_the_calibrated_angle(located):
     assert beyond.sum() > 100
     assert not light.usable[beyond].any()
     assert np.all(light.llr[beyond] == 0)
+
+
+def test_gaia_stars_are_added_to_the_whole_catalogue_only(located, monkeypatch):
+    monkeypatch.setattr(measurement, "COMPLETE_V_MAG", -10.0)  # as if every frame were deep enough
+    result, site = located.result, located.result.site
+    whole = load_catalog().at(result.exposure.time_utc, None)
+    number = np.searchsorted(np.sort(whole.hip), result.stars.hip[result.identification.star])
+    rows = np.argsort(whole.hip)[number]
+    full = replace(result, stars=whole, identification=replace(result.identification, star=rows))
+    deep = measurement.add_gaia_stars(full, site)
+    assert deep.catalog_name == "hipparcos+gaia"
+    assert np.array_equal(deep.stars.hip[deep.identification.star], whole.hip[rows])
+    part = replace(full, stars=whole.take(slice(0, len(whole) - 1)))
+    assert measurement.add_gaia_stars(part, site) is part

@@ -83,7 +83,7 @@ def test_a_position_that_explains_the_stars_badly_is_refused() -> None:
     assert explained_by_sector(evidence, fix, TRUE).mean() > -1.0
     aside = replace(fix, position_enu_m=fix.position_enu_m + np.array([1500.0, 0.0, 0.0]))
     assert explained_by_sector(evidence, aside, TRUE).mean() < MIN_EXPLAINED_NATS
-    with pytest.raises(NotLocated, match=r"explains the stars badly.*most at azimuths"):
+    with pytest.raises(NotLocated, match=r"explains the strongest rows badly.*most at azimuths"):
         check_consistency(evidence, aside, TRUE)
 
 
@@ -126,3 +126,24 @@ def test_a_shape_that_nothing_explains_has_no_share() -> None:
 
     with pytest.raises(NotLocated, match="no position explains"):
         marginalize_shape(refuse, evidence, guess)
+
+
+@pytest.mark.parametrize("coverage_deg", [30.0, 60.0])
+def test_errors_of_the_horizon_in_a_part_of_the_view_are_refused(coverage_deg: float) -> None:
+    """Directions without stars do not count as explained."""
+    refused = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        at = np.array([2500.0, -1800.0])
+        azimuth, elevation = rng.uniform(0, np.radians(coverage_deg), 6000), np.arcsin(rng.random(6000))
+        sector_error = np.radians(0.4) * rng.standard_normal(240)
+        horizon = TRUE.horizon_rad(at[None], azimuth) + sector_error[(azimuth / (2 * np.pi) * 240).astype(int)]
+        snr = 8 * rng.random(6000) ** 2 + 1
+        flux = snr * (elevation > horizon) + rng.standard_normal(6000)
+        llr = np.clip(snr * flux - snr**2 / 2, -9, 9)
+        evidence = Evidence(azimuth_rad=azimuth, elevation_rad=elevation, llr=llr)
+        try:
+            check_consistency(evidence, ExactPosterior()(evidence, TRUE), TRUE)
+        except NotLocated:
+            refused += 1
+    assert refused == 6

@@ -23,7 +23,7 @@ LOOKED_UP_RAD = np.radians(0.26)  # height maps look up what is as wide as that,
 LLR_TIERS = ((4.0, np.inf), (2.0, 4.0), (1.0, 2.0), (0.0, 1.0))  # |llr| of rows that are bounded in turns
 MAX_SCORED_PAIRS = 200_000  # open (box, row) pairs above which horizons at the boxes' centres cost more than they gain
 SOFT_BOXES = 0.3  # of the boxes per sigma suffice where edges are soft: sums of Gaussians converge, and leave no cells
-ACCEPTED_NATS = -1.0  # mean over the sectors, at a position that is answered without a proof: see EXPLAINED_NATS
+ACCEPTED_NATS = -1.0  # mean over the sectors with rows, of a position answered without a proof: see EXPLAINED_NATS
 UNLIKELY_NATS = 16.0  # boxes that are less likely than the best by more are no part of the posterior
 START_LLR, START_ROWS, START_HALF_M = 4.0, 1000, 3.0  # |llr| and least number of strong rows; their smallest boxes
 NODE_STEP_M, FIRST_NODES_M = 10.0, 12.0  # least distance of traced points; half side of the first boxes worth it
@@ -334,7 +334,7 @@ class Search:
 
 def explains_all_sectors(log_likelihood: float, likelihood: PositionLikelihood) -> bool:
     """Whether a position explains the evidence as well as a true one: positions hundreds of metres away do not."""
-    return log_likelihood > ACCEPTED_NATS * likelihood.sectors.count
+    return log_likelihood > ACCEPTED_NATS * likelihood.sectors.occupied
 
 
 def log_sum(values: Array) -> float:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from startrack.localization.likelihood import SECTOR_EPSILON, SECTOR_RAD, PositionLikelihood
-from startrack.localization.nuisance import lower_evidence
+from startrack.localization.nuisance import STEEPNESS_LEEWAY, lower_evidence
 from startrack.localization.sector_likelihood import Sectors, contributions
 from startrack.terrain import Terrain
 from startrack.types import Array, Evidence, Fix, NotLocated
@@ -28,7 +28,6 @@ MAX_SEPARATE = 7  # at right positions 0 to 3 were seen, and 9 or more where the
 
 STRETCHES = (0.005, 0.01, 0.015, 0.025, 0.05, 0.1)  # relative, both ways
 SMALL_STRETCHES = 4  # of these: the others are tried only where these gain
-STRETCH_LEEWAY = 0.35  # d(tan H) / tan H = dH / (sin H cos H), at rims up to 20 degrees
 STRETCH_NEARBY_M = 80.0
 STRETCH_GAIN_NATS = 4.5  # a true map gains more in 1 of 370; of 240 images with maps 1 % off the least gain was 7.6
 STRETCH_SIGMAS = 3.0  # of what the terrain file itself admits
@@ -49,10 +48,11 @@ def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain) -> None:
     contradicted = contradicted_part(evidence, fix, terrain)
     if contradicted > MAX_CONTRADICTED_PART:
         raise _inconsistency(f"{100 * contradicted:.0f} % of the horizon contradicts the best position", stretches)
-    explained = float(by_sector.mean())
+    explained = explained_nats(evidence, fix, terrain)
     if explained < MIN_EXPLAINED_NATS:
         raise _inconsistency(
-            f"the best position explains the stars badly ({explained:.1f} nats a sector; usual: 0 to -0.3)", stretches
+            f"the best position explains the strongest rows badly ({explained:.1f} nats a sector; usual: 0 to -0.3)",
+            stretches,
         )
     if len(stretches) > MAX_SEPARATE and not terrain.axisymmetric:
         raise NotLocated(
@@ -115,6 +115,18 @@ def explained_by_sector(evidence: Evidence, fix: Fix, terrain: Terrain) -> Array
     return sectors.by_sector(sums)
 
 
+def explained_nats(evidence: Evidence, fix: Fix, terrain: Terrain) -> float:
+    """Mean of `explained_by_sector` over the sectors with rows of great |llr| near the skyline of the fix.
+
+    The others, such as those outside the picture, can contradict no position.
+    """
+    rows, horizon = _sure_rows(evidence, fix, terrain)
+    near = np.abs(rows.elevation_rad - horizon) < NEAR_SKYLINE_RAD
+    sector = Sectors.from_evidence(rows, SECTOR_RAD, SECTOR_EPSILON).sector[near]
+    by_sector = explained_by_sector(evidence, fix, terrain)
+    return float(by_sector[np.unique(sector)].mean()) if len(sector) else 0.0
+
+
 def contradicted_stretches(by_sector: Array) -> list[tuple[int, int]]:
     """First sector and number of each run that contradicts the fix; a single good one between them is no gap.
 
@@ -157,7 +169,7 @@ def best_stretch(likelihood: PositionLikelihood, position_m: Array) -> tuple[flo
     wrong position cannot. Large stretches are tried only where small ones gain, and more of them than less.
     """
     best, gain, at, sizes = 1.0, 0.0, position_m, STRETCHES[:SMALL_STRETCHES]
-    for leeway in (sizes[-1] * STRETCH_LEEWAY, STRETCHES[-1] * STRETCH_LEEWAY):
+    for leeway in (sizes[-1] * STEEPNESS_LEEWAY, STRETCHES[-1] * STEEPNESS_LEEWAY):
         local = likelihood.near(position_m, STRETCH_NEARBY_M, leeway)
         if not len(local.evidence):
             break
@@ -211,10 +223,8 @@ def _refitted_gain(likelihood: PositionLikelihood, position_m: Array, changed: E
     scores = []
     for evidence, start_m in ((changed, at_m), (likelihood.evidence, position_m)):
         one = PositionLikelihood.from_evidence(evidence, likelihood.terrain)
-        strong, way = one.strong(REFIT_LLR, REFIT_ROWS), [start_m]
-        for nearby_m, first_step_m, across in REFITS:
-            way.append(strong.near(way[-1], nearby_m, across=across).climb(way[-1], first_step_m, LAST_REFIT_M)[0])
-        scores.append(one.exact_scores(np.array(way)).max())
+        way, _ = one.strong(REFIT_LLR, REFIT_ROWS).climb(start_m, REFITS, LAST_REFIT_M)
+        scores.append(one.exact_scores(way).max())
     return float(scores[0] - scores[1])
 
 

@@ -16,7 +16,7 @@ FIRST_ACROSS = 8  # boxes along each side of the searched square at the beginnin
 SMALL_BOX_M = 20.0  # half side up to which boxes are tested for allowed ground point by point
 TRACED_BELOW_M = 400.0  # half side; the horizons of smaller boxes may be traced instead of looked up
 LAST_HALF_M = {False: 20.0, True: 12.0}  # half side of the last boxes, looked up or traced; smaller ones rank no better
-EXPLAINED_NATS = -0.8  # mean over the sectors; -0.2 to -0.65 at true positions, -1.2 at the best false one seen
+EXPLAINED_NATS = -0.8  # mean over the sectors with rows; true positions: -0.2 to -0.65, the best false one seen: -1.2
 SCORED = 16  # of the last boxes, row by row
 CANDIDATES, APART_M = 3, 60.0  # positions that are climbed from, and how far they are apart
 LAST_STEP_M = 0.5
@@ -59,7 +59,7 @@ def beam_search(likelihood: PositionLikelihood) -> Guess:
     found = Guess(np.zeros((0, 2)), np.zeros(0))
     for beam in BEAMS:
         found = climb_to_best(likelihood, _last_boxes(likelihood, beam), found)
-        if found.best > EXPLAINED_NATS * likelihood.sectors.count:
+        if found.best > EXPLAINED_NATS * likelihood.sectors.occupied:
             break
     return found
 
@@ -105,11 +105,8 @@ def _climb(likelihood: PositionLikelihood, centres_m: Array) -> Guess:
     strong = likelihood.strong(STRONG_LLR, MANY_ROWS)
     points: list[Array] = []
     for box in _distinct(centres_m, np.argsort(-strong.exact_scores(centres_m), kind="stable")):
-        way = [centres_m[box]]
-        for nearby_m, first_step_m, across in CLIMBS:
-            local = strong.near(way[-1], nearby_m, across=across)
-            way.append(local.climb(way[-1], first_step_m, LAST_STEP_M)[0])
-        points.extend(_allowed_near(np.array(way), local, likelihood.terrain))
+        way, local = strong.climb(centres_m[box], CLIMBS, LAST_STEP_M)
+        points.extend(_allowed_near(way, local, likelihood.terrain))
     found = np.array(points).reshape(-1, 2)
     score = likelihood.exact_scores(found)
     best = np.array(_distinct(found, np.argsort(-score, kind="stable")), dtype=np.int64)

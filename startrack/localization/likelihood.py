@@ -125,6 +125,19 @@ class PositionLikelihood:
         score_boxes(self.rows, boxes, at.horizon_rad(centres, azimuth), at.horizon_sigma_rad(centres, azimuth), score)
         return score
 
+    def climb(
+        self, start_m: Array, steps: tuple[tuple[float, float, int], ...], last_step_m: float
+    ) -> tuple[Array, LocalLikelihood]:
+        """The start (2,) and a better position after each of the steps, (n + 1, 2), and the last neighbourhood.
+
+        `steps`: half side of the neighbourhood [m], first step [m], points across where horizons are traced.
+        """
+        way = [start_m]
+        for nearby_m, first_step_m, across in steps:
+            local = self.near(way[-1], nearby_m, across=across)
+            way.append(local.climb(way[-1], first_step_m, last_step_m)[0])
+        return np.array(way), local
+
     def near(self, centre_m: Array, half_m: float, leeway_rad: float = 0.0, across: int = 3) -> LocalLikelihood:
         """The same within `half_m` of a position (2,), for elevations that change by no more than the leeway [rad]."""
         return LocalLikelihood.near(self.sectors, self.sums, self.terrain, centre_m, half_m, leeway_rad, across)

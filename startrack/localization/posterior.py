@@ -94,7 +94,7 @@ class ExactPosterior:
                 guess = climb_to_best(likelihood, spent.centres_m, guess)
             if explains_all_sectors(guess.best, likelihood):
                 return local_posterior(likelihood, guess, spent.log_open)
-            best = max(search.best, guess.best) / likelihood.sectors.count
+            best = max(search.best, guess.best) / likelihood.sectors.occupied
             limit = f"the search ended after {search.work:.0f} horizons with {spent.open_m2 / 1e6:.2f} km2 open"
             if best < CONTRADICTED_NATS:
                 raise NotLocated(

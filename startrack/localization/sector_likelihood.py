@@ -42,6 +42,11 @@ class Sectors:
         return (self.evidence.azimuth_rad / (2 * np.pi) * self.count).astype(np.int64) % self.count
 
     @cached_property
+    def occupied(self) -> int:
+        """Number of sectors that hold rows; at least 1."""
+        return max(int(np.count_nonzero(np.bincount(self.sector))), 1)
+
+    @cached_property
     def order(self) -> Ints:
         """Order (n,) of the rows by sector, and from low to high within one."""
         return elevation_order(self.evidence, self.sector)

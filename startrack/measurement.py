@@ -89,17 +89,18 @@ def remeasure_near_skyline(measured: Measured, fix: Fix, step: SkyStep, photomet
     `fix` is a position found with `measured`, `photometry` the settings of the measurement.
     """
     camera, terrain, position_m = measured.camera, measured.terrain, fix.position_enu_m[:2]
+    R = measured.R_cam_enu
     horizon = step.horizon
-    detections = subtract_sky_step(measured.detections, camera, measured.R_cam_enu, horizon)
+    detections = subtract_sky_step(measured.detections, camera, R, horizon)
     axes = np.linalg.cholesky(fix.covariance_m2).T
-    reliable = reliable_azimuths(horizon, [Skyline.trace(position_m + axis, terrain) for axis in axes], camera)
+    reliable = reliable_azimuths(horizon, [Skyline.trace(position_m + axis, terrain) for axis in axes], camera, R)
     light = measured.light
     azimuth, elevation = light.azimuth_rad, light.elevation_rad
-    wanted = near_skyline(azimuth, elevation, camera, horizon, REMEASURED_PX) & reliable(azimuth)
-    around = near_skyline(azimuth, elevation, camera, horizon, REMEASURED_PX + NEIGHBOURS_PX)
+    wanted = near_skyline(azimuth, elevation, camera, R, horizon, REMEASURED_PX) & reliable(azimuth)
+    around = near_skyline(azimuth, elevation, camera, R, horizon, REMEASURED_PX + NEIGHBOURS_PX)
     # The fix determines the visibility of neighbours better than their faint flux does, except next to the skyline.
     above = elevation - horizon(azimuth)
-    undecided = near_skyline(azimuth, elevation, camera, horizon, UNDECIDED_PX) | ~reliable(azimuth)
+    undecided = near_skyline(azimuth, elevation, camera, R, horizon, UNDECIDED_PX) | ~reliable(azimuth)
     by_fix = np.where(above > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)
     visible = np.where(undecided, 1.0 / (1.0 + np.exp(-light.llr)), by_fix)
     newer = _photometry(

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from startrack.camera import load_camera
+from startrack.camera import Camera, Pinhole, load_camera
 from startrack.evidence import measure_sky_step, near_skyline, reliable_azimuths, subtract_sky_step
 from startrack.evidence.sky_step import _azimuth_and_height
 from startrack.terrain import load_terrain
@@ -72,19 +72,31 @@ def test_a_skyline_a_little_off_gives_the_same_background(frame):
     assert np.sqrt(np.mean((better.background_e - light)[np.abs(above) < 6] ** 2)) < 4
 
 
+def test_distances_from_the_skyline_are_pixels_in_every_lens():
+    """A pinhole's pixels are four times finer at 60 degrees off the axis than on it."""
+    pinhole = Camera(
+        name="pinhole", size_px=(4000, 4000), focal_px=(1000.0, 1000.0), centre_px=(1999.5, 1999.5),
+        max_angle_rad=np.radians(62.0), calibrated_angle_rad=np.radians(62.0), lens=Pinhole(),
+    )  # fmt: skip
+    for skyline_rad in np.radians([30.0, 85.0]):
+        horizon = partial(np.full_like, fill_value=skyline_rad)
+        px_rad = np.sin(skyline_rad) ** 2 / 1000.0
+        elevation = skyline_rad + np.array([11.0, 13.0]) * px_rad
+        assert near_skyline(np.zeros(2), elevation, pinhole, R_CAM_ENU, horizon, 12.0).tolist() == [True, False]
+
+
 def test_right_below_a_wall_the_skyline_is_not_known():
     azimuth = np.linspace(0, 2 * np.pi, 360, endpoint=False)
     middle = horizon_at([0.0, 0.0])
-    assert reliable_azimuths(middle, [horizon_at([4.0, 0.0]), horizon_at([0.0, 4.0])], CAMERA)(azimuth).all()
+    assert reliable_azimuths(middle, [horizon_at([4.0, 0.0]), horizon_at([0.0, 4.0])], CAMERA, R_CAM_ENU)(azimuth).all()
     wall = horizon_at([9850.0, 0.0])
-    known = reliable_azimuths(wall, [horizon_at([9852.0, 0.0]), horizon_at([9850.0, 2.0])], CAMERA)(azimuth)
+    known = reliable_azimuths(wall, [horizon_at([9852.0, 0.0]), horizon_at([9850.0, 2.0])], CAMERA, R_CAM_ENU)(azimuth)
     assert known[250:290].all()  # the far rim
-    assert not known[
-        np.r_[0:5, 355:360, 175:185]
-    ].any()  # along the wall, north and south: the skyline changes fastest there
+    along_the_wall = np.r_[0:5, 355:360, 175:185]  # north and south: the skyline changes fastest there
+    assert not known[along_the_wall].any()
 
 
 def test_near_means_pixels():
     azimuth = np.zeros(3)
     height = CRATER.horizon_rad(PLACE[None], np.zeros(1))[0] + np.array([-20, 0, 20]) / 652.0
-    assert near_skyline(azimuth, height, CAMERA, horizon_at(PLACE), 12.0).tolist() == [False, True, False]
+    assert near_skyline(azimuth, height, CAMERA, R_CAM_ENU, horizon_at(PLACE), 12.0).tolist() == [False, True, False]

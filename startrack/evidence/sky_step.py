@@ -136,16 +136,18 @@ def subtract_sky_step(detections: Detections, camera: Camera, R_cam_enu: Array, 
     return replace(detections, background_e=background, noise_e=noise)
 
 
-def reliable_azimuths(horizon: Horizon, shifted: list[Horizon], camera: Camera) -> Callable[[Array], Bools]:
+def reliable_azimuths(
+    horizon: Horizon, shifted: list[Horizon], camera: Camera, R_cam_enu: Array
+) -> Callable[[Array], Bools]:
     """A function of azimuths (n,): whether the skyline there is level enough and known to a part of a pixel.
 
     `horizon` is that of the position, `shifted` those one sigma of the position away, along each axis of its
-    covariance; `camera` gives the scale of a pixel. Right below a wall a small shift turns the whole skyline: no step
-    of light can be subtracted there.
+    covariance; `camera` and `R_cam_enu` give the scale of a pixel. Right below a wall a small shift
+    turns the whole skyline: no step of light can be subtracted there.
     """
     azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS, endpoint=False)
     here = horizon(azimuth)
-    px_per_rad = max(camera.focal_px)
+    px_per_rad = _px_per_rad_at(azimuth, here, camera, R_cam_enu)
     shift_px = np.sqrt(sum(np.square(other(azimuth) - here) for other in shifted)) * px_per_rad
     run = 2 * np.pi / SKYLINE_POINTS * np.cos(here)
     steep = np.abs(np.roll(here, -1) - np.roll(here, 1)) / (2 * run)
@@ -157,13 +159,15 @@ def reliable_azimuths(horizon: Horizon, shifted: list[Horizon], camera: Camera) 
     return is_reliable
 
 
-def near_skyline(azimuth_rad: Array, elevation_rad: Array, camera: Camera, horizon: Horizon, within_px: float) -> Bools:
+def near_skyline(
+    azimuth_rad: Array, elevation_rad: Array, camera: Camera, R_cam_enu: Array, horizon: Horizon, within_px: float
+) -> Bools:
     """Which directions (n,), `azimuth_rad` and `elevation_rad`, lie within `within_px` pixels of a `horizon`.
 
-    The scale is that of the `camera` half way to its edge.
+    `camera` and `R_cam_enu` give the scale of a pixel in each direction.
     """
-    scale = float(camera.mean_scale_rad_per_px(np.array(camera.max_angle_rad / 2)))
-    return np.asarray(np.abs(elevation_rad - horizon(azimuth_rad)) < within_px * scale)
+    px_per_rad = _px_per_rad_at(azimuth_rad, elevation_rad, camera, R_cam_enu)
+    return np.asarray(np.abs(elevation_rad - horizon(azimuth_rad)) * px_per_rad < within_px)
 
 
 def _band(shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Bools:
@@ -181,6 +185,13 @@ def _azimuth_and_height(xy_px: Array, camera: Camera, R_cam_enu: Array, horizon:
     """Azimuth [rad] and height above the skyline [px] of pixels (n, 2)."""
     azimuth, elevation = azel_from_rays(camera.unproject(xy_px) @ R_cam_enu)
     return azimuth, (elevation - horizon(azimuth)) * _px_per_rad(camera, camera.angle_rad(xy_px))
+
+
+def _px_per_rad_at(azimuth_rad: Array, elevation_rad: Array, camera: Camera, R_cam_enu: Array) -> Array:
+    """Scale of the image (n,) in directions of enu; beyond the lens's view that of its edge."""
+    rays_cam = rays_from_azel(azimuth_rad, elevation_rad) @ R_cam_enu.T
+    angle = np.arctan2(np.hypot(rays_cam[:, 0], rays_cam[:, 1]), rays_cam[:, 2])
+    return _px_per_rad(camera, np.minimum(angle, camera.max_angle_rad))
 
 
 def _px_per_rad(camera: Camera, angle_rad: Array) -> Array:

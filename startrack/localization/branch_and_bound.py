@@ -87,9 +87,10 @@ class Search:
     @classmethod
     def begin(cls, settings: SearchSettings, likelihood: PositionLikelihood, starts_m: Array | None = None) -> Search:
         """With good positions (n, 2) where some are known, else with the first guess."""
-        known = np.zeros((0, 2)) if starts_m is None else starts_m[np.asarray(likelihood.terrain.allowed(starts_m))]
+        known = np.zeros((0, 2)) if starts_m is None else starts_m
         if likelihood.in_closed_form and not len(known):
             known = cls._best_of_strong_rows(settings, likelihood)
+        known = known[np.asarray(likelihood.terrain.allowed(known))]
         if len(known) or likelihood.in_closed_form:
             guess = Guess(known, likelihood.exact_scores(known))
         else:

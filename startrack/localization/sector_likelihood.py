@@ -14,6 +14,7 @@ from startrack.types import Array, Evidence, Ints
 SECTOR_STEP = 10.0  # between the keys of neighbouring sectors: more than any two elevations differ [rad]
 CERTAIN_SIGMAS = 6.0  # a ray farther than this from the horizon is visible or hidden for certain: to 1e-9
 EDGE_SIGMAS = 8.0  # beyond this the edge of a single row is not computed
+CEILING_STEP = 0.01  # of the edge's width: last step to the best level skyline
 NEGLIGIBLE_NATS = 14.0  # e^-14 beside 1 is left out: a millionth
 
 
@@ -53,7 +54,12 @@ class Sectors:
 
     @cached_property
     def ceiling(self) -> Array:
-        """(sectors,) M: largest sum of the llr above one elevation; at least 0 (nothing visible)."""
+        """(sectors,) M: largest sum of contributions above one elevation; at least 0 (nothing visible)."""
+        if self.evidence.extended_nats.any():
+            rows = self.evidence.take(self.order)
+            found, ends = np.zeros(self.count), np.searchsorted(self.sector[self.order], np.arange(self.count + 1))
+            soft_ceilings(rows.elevation_rad, rows.llr, rows.extended_nats, rows.edge_sigma_rad, ends, found)
+            return found
         below = np.concatenate([[0.0], np.cumsum(self.evidence.llr[self.order])])
         ends = np.searchsorted(self.sector[self.order], np.arange(self.count + 1))
         # Above the lowest ray, above the next, ..., above none: all these sums end at the sector's last ray.
@@ -140,6 +146,48 @@ def contributions(llr, extended, elevation, horizon, sigma):  # type: ignore[no-
         else:
             value[k] = llr[k] if margin > 0.0 else 0.0
     return value
+
+
+@njit(cache=True, nogil=True)
+def soft_ceilings(elevation, llr, extended, sigma, ends, found):  # type: ignore[no-untyped-def]
+    """Fill found (sectors,) with the largest sum of contributions of a sector's rows above one level skyline.
+
+    The rows are in the order of their sectors and ascend in each; `ends` (sectors + 1,) are their bounds. The skyline
+    is tried below all rows and at every row, and then shifted in ever smaller steps from the best one.
+    """
+    for s in range(len(found)):
+        first, last = ends[s], ends[s + 1]
+        at, step, best = 0.0, 0.0, 0.0
+        for k in range(first, last):
+            best += llr[k]
+        best = max(best, 0.0)
+        for k in range(first, last):
+            value = _level_sum(elevation, llr, extended, sigma, first, last, elevation[k])
+            if value > best:
+                best, at, step = value, elevation[k], sigma[k]
+        smallest = CEILING_STEP * step
+        while step > smallest:
+            higher = _level_sum(elevation, llr, extended, sigma, first, last, at + step)
+            lower = _level_sum(elevation, llr, extended, sigma, first, last, at - step)
+            if max(higher, lower) > best:
+                at += step if higher > lower else -step
+                best = max(higher, lower)
+            else:
+                step *= 0.5
+        found[s] = best
+
+
+@njit(cache=True, nogil=True)
+def _level_sum(elevation, llr, extended, sigma, first, last, horizon):  # type: ignore[no-untyped-def]
+    """Sum of contributions of the rows from first to last where the skyline is level at that elevation."""
+    total = 0.0
+    for k in range(first, last):
+        margin = elevation[k] - horizon
+        if sigma[k] > 0.0:
+            total += row_contribution(llr[k], extended[k], margin / sigma[k], 0)
+        elif margin > 0.0:
+            total += llr[k]
+    return total
 
 
 @njit(cache=True, nogil=True)

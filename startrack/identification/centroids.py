@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,7 +12,7 @@ from startrack.attitude import AttitudeFit, solve_attitude
 from startrack.camera import Camera
 from startrack.identification.lost_in_space import Identifier
 from startrack.identification.unknown_lens import identify_unknown_lens
-from startrack.types import Array, Attitude, Centroids, Identification, Ints, Stars
+from startrack.types import Array, Attitude, Centroids, Identification, Ints, NotIdentified, Stars
 
 DEFAULT_SIGMA_PX = 0.3  # centroid error per axis where none is given
 DEFAULT_PSF_SIGMA_PX = 1.0
@@ -96,8 +97,10 @@ def identify_centroids(
         stars = load_catalog().at(None, None)
     sources, order = sorted_centroids(xy_px, flux, sigma_px, saturated, psf_sigma_px)
     if camera is not None:
+        _require_in_frame(sources.xy_px, camera.size_px)
         found = (identifier or Identifier())(sources, camera, stars)
     elif fov_rad is not None and size_px is not None:
+        _require_in_frame(sources.xy_px, _frame_size_px(size_px))
         solution = identify_unknown_lens(sources, size_px, fov_rad, stars)
         camera, found = solution.camera, solution.identification
     else:
@@ -146,6 +149,29 @@ def sorted_centroids(
         psf_sigma_px=psf_sigma_px,
         brightness_sigma_mag=brightness_sigma_mag,
     ), order
+
+
+def _frame_size_px(size_px: Any) -> tuple[int, int]:
+    """The size (W, H) of a frame as given. Raises ValueError where it is no pair of numbers of at least 1."""
+    try:
+        width, height = size_px
+        possible = width >= 1 and height >= 1
+    except (TypeError, ValueError):
+        possible = False
+    if not possible:
+        raise ValueError(f"size_px= is {size_px!r}: give width and height [px]")
+    return width, height
+
+
+def _require_in_frame(xy_px: Array, size_px: tuple[int, int]) -> None:
+    """Raise NotIdentified where there are centroids (n, 2), but none in the frame of `size_px` (W, H)."""
+    in_frame = np.all((xy_px >= -0.5) & (xy_px <= np.array(size_px) - 0.5), axis=1)
+    if len(xy_px) and not in_frame.any():
+        raise NotIdentified(
+            f"none of the {len(xy_px)} centroids lies in the frame of {size_px[0]} x {size_px[1]} px: give x and y in "
+            "px of this frame, from the centre of its top-left pixel",
+            detected=0,
+        )
 
 
 def _one_each(name: str, values: ArrayLike, n: int) -> Array:

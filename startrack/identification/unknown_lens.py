@@ -82,12 +82,10 @@ def identify_unknown_lens(
     whether the frame clips it or not. `stars` are sorted, brightest first. `background` (H, W): smooth background of
     the frame, in which the image circle of a fisheye lens is looked for; it narrows the search. An answer is accepted
     where chance would give as many coincidences with a probability below 1e-9, all trials included. Raises
-    NotIdentified, and ValueError for an impossible field of view or frame.
+    NotIdentified, and ValueError for an impossible field of view.
     """
     if not 0 < fov_rad <= 2 * np.pi:
         raise ValueError(f"fov_rad= is {fov_rad:g}: give radians, more than 0, at most 2 pi")
-    if len(size_px) != 2 or min(size_px) < 1:
-        raise ValueError(f"size_px= is {size_px}: give width and height [px]")
     search = _Search(centroids, size_px, fov_rad, stars, tolerance, background)
     if search.narrow and (solution := _solve_narrow_field(search, centroids)) is not None:
         return solution

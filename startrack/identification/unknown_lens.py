@@ -196,7 +196,7 @@ class _Search:
         yield from self._grow_all(self._guesses_from_circle(self.circle), MAX_TRIED_IN_CIRCLE)
         yield from self._grow_all(self._guesses(), self.patterns_tried + MAX_TRIED_BEYOND)
 
-    def _grow_all(self, guesses: list[LensGuess], most_tried: int) -> Iterator[tuple[GrownLens, Ints]]:
+    def _grow_all(self, guesses: list[LensGuess], max_tried: int) -> Iterator[tuple[GrownLens, Ints]]:
         """`grown_lenses` of these guesses, until so many patterns have been tried."""
         stages = self._stages()
         for sizes, window in self._rounds():
@@ -215,7 +215,7 @@ class _Search:
                     found = grow(hypothesis, self.xy_px, rays, stages)
                     if found is not None and (not self.wide or len(found.star) >= self.min_matches):
                         yield found, around
-                if self.patterns_tried > most_tried:
+                if self.patterns_tried > max_tried:
                     return
 
     def _rounds(self) -> Iterator[tuple[PatternSizes, Window]]:

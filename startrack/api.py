@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Generator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 __all__ = ["calibrate", "detect", "identify", "locate", "render"]
 
 ARGUMENT_OF_FLAG = {"--time UTC": "time="}  # messages of the stages name the flags of the commands
+MAX_LIST_COLUMNS = 4  # x, y, flux and error: an array (n, 4) is no image
 
 
 def locate(
@@ -98,7 +100,7 @@ def identify(
         time: middle of the exposure, as for `locate`. None: the catalogue is taken at J2000.0 without aberration.
         fov: instead of a camera, the field of view to 10 %: an angle or degrees; across the frame's width below 100
             degrees, else across the image circle. The lens is then found with the stars.
-        size_px: of centroids: width and height of the frame; needed with `fov`.
+        size_px: of centroids: width and height of the frame; needed with `fov`, and given with nothing else.
         flux: of centroids: (n,) in any linear unit. None: they are sorted, brightest first.
         sigma_px: of centroids: error per axis, one number or (n,). None: 0.3 px.
 
@@ -107,13 +109,18 @@ def identify(
         `detection` and `star` (indices), `hip`, `attitude`, `camera`.
 
     Raises:
-        ValueError: both `camera` and `fov` are given, or of centroids neither; or arrays of a wrong shape.
+        ValueError: both `camera` and `fov` are given, or of centroids neither; arrays of a wrong shape or type; of an
+            image `size_px`, `flux` or `sigma_px`; `size_px` with `camera`.
         BadInput: as `locate`.
         NotIdentified: the centroids are not identified.
     """
     if fov is not None and camera is not None:
         raise ValueError("camera= and fov= exclude each other: with fov= the lens is found, with camera= it is known")
-    if size_px is not None or flux is not None or _are_centroids(image):
+    of_list = {"size_px": size_px, "flux": flux, "sigma_px": sigma_px}
+    given = [f"{name}=" for name, value in of_list.items() if value is not None]
+    if given and isinstance(image, str | os.PathLike | Exposure):
+        raise ValueError(f"{' and '.join(given)}: for lists of centroids only, and this is an image")
+    if given or _are_centroids(image):
         return _identify_list(image, camera, time, fov, size_px, flux, sigma_px)
     exposure = exposure_input(image, time)
     if fov is not None:
@@ -214,10 +221,14 @@ def render(
 
 
 def _are_centroids(image: Any) -> bool:
-    """Whether it is a list of centroids: any list, or an array (n, 2), as no image is two pixels wide, or empty."""
-    if isinstance(image, list | tuple):
+    """Whether it is meant as a list of centroids, which need not be a valid one.
+
+    That is any list or iterator of pairs, and an array that is empty, or narrower than any image.
+    """
+    if isinstance(image, list | tuple | zip | map | Generator):
         return True
-    return isinstance(image, np.ndarray) and (image.shape == (0,) or (image.ndim == 2 and image.shape[1] == 2))
+    shape = image.shape if isinstance(image, np.ndarray) else None
+    return shape is not None and (shape == (0,) or (len(shape) == 2 and 2 <= shape[1] <= MAX_LIST_COLUMNS))
 
 
 def _identify_list(

@@ -74,6 +74,16 @@ def read_toml(path: Path, reason: str) -> dict[str, Any]:
         raise BadInput(reason, " ".join(f"{path}: not a TOML file: {str(cause)[:200]}".split())) from cause
 
 
+def existing_folder(folder: FilePath, content: str = "") -> Path:
+    """Path of a user's folder. Raises BadInput bad_image, naming the expected `content`, if it is a file or missing."""
+    path = Path(folder)
+    if not path.is_dir():
+        of_content = f" of {content}" if content else ""
+        cause = "is a file, not a folder" if path.exists() else "no such folder"
+        raise BadInput("bad_image", f"{printable(path)}: {cause}{of_content}")
+    return path
+
+
 def make_folder(folder: FilePath, reason: str = "bad_image") -> Path:
     """Make a folder for results and check that files can be written there, before anything is computed.
 

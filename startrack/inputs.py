@@ -35,6 +35,8 @@ def exposure_input(image: Image, time: Time) -> Exposure:
         pixels = np.asanyarray(image)  # a plain array would have lost its mask
     except (TypeError, ValueError) as cause:
         raise BadInput("bad_image", f"{type(image).__name__} is neither a file nor an array of pixels") from cause
+    if pixels.dtype == object and pixels.ndim == 0:  # one object that is no sequence
+        raise BadInput("bad_image", f"{type(image).__name__} is neither a file nor an array of pixels")
     masked = np.count_nonzero(getattr(pixels, "mask", False))
     if masked:
         raise BadInput(

@@ -218,7 +218,7 @@ class Evidence(Value):
         return take_rows(self, which)
 
     @classmethod
-    def joined(cls, *parts: Evidence) -> Evidence:
+    def concatenate(cls, *parts: Evidence) -> Evidence:
         """The rows of all `parts`, of several sources or exposures, in one value."""
         names = [f.name for f in fields(cls)]
         return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})

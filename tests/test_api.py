@@ -210,6 +210,31 @@ def test_the_same_rule_holds_for_stars_alone():
     assert caught.value.reason == "size_mismatch"
 
 
+WRONG_LISTS = {
+    "columns": ({"image": np.ones((200, 3)), "camera": "fisheye-2048"}, r"shape \(200, 3\): .* flux=table\[:, 2\]"),
+    "generator": ({"image": ((x, x) for x in range(9)), "camera": "fisheye-2048"}, "this is generator"),
+    "pairs": ({"image": zip([1, 2], [3, 4], strict=True), "camera": "fisheye-2048"}, "this is zip"),
+    "two sizes": ({"image": np.ones((9, 2)), "camera": "fisheye-2048", "size_px": (10, 10)}, "camera has its own"),
+    "flux of a file": (
+        {"image": IMAGE, "flux": [1.0], "size_px": (9, 9)},
+        "^size_px= and flux=: for lists of centroids",
+    ),
+    "error of a path": ({"image": Path(IMAGE), "sigma_px": 0.2}, "^sigma_px=: for lists of centroids only"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_LISTS)
+def test_the_message_about_centroids_says_what_to_give(case):
+    given, message = WRONG_LISTS[case]
+    with pytest.raises(ValueError, match=message):
+        startrack.identify(**given)
+
+
+def test_what_is_no_image_is_named_by_its_type():
+    with pytest.raises(BadInput, match=r"^generator is neither a file nor an array"):
+        startrack.detect(x for x in range(9))
+
+
 def test_settings_are_settings():
     with pytest.raises(TypeError, match=r"settings= is of type dict: give startrack\.pipeline\.Settings"):
         startrack.locate(IMAGE, settings={"a": 1})

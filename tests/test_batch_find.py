@@ -13,6 +13,7 @@ from startrack.batch import images_under, locate_image
 from startrack.batch.find import result_stems
 from startrack.cli.main import main
 from startrack.exposure import read_exposure
+from startrack.types import BadInput
 
 
 def names(folder, *apart) -> list[str]:
@@ -81,6 +82,14 @@ def test_one_time_is_not_given_to_many_images(tmp_path, capsys):
     assert main([*command, "--time", "2031-03-26T20:58:11Z"]) == 5
     record = json.loads((tmp_path / "out" / "00.fix.json").read_text())
     assert record["provenance"]["time_utc"].startswith("2031-03-26T20:58:11")
+
+
+def test_a_file_in_place_of_the_folder_is_named(tmp_path):
+    (tmp_path / "one.png").write_bytes(b"")
+    with pytest.raises(BadInput, match=r"one\.png: is a file, not a folder"):
+        images_under(tmp_path / "one.png")
+    with pytest.raises(BadInput, match="nothing: no such folder"):
+        images_under(tmp_path / "nothing")
 
 
 def test_no_folder_of_results_is_made_for_no_images(tmp_path):

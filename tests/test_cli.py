@@ -281,6 +281,33 @@ def test_wrong_usage_has_exit_code_2_and_advice(folder, words):
 
 
 @pytest.mark.parametrize(
+    ("words", "usage"),
+    [
+        ("locate x.png -o y", "usage: startrack locate "),
+        ("calibrate show x.toml --nothing", "usage: startrack calibrate show "),
+        ("terrain build x --nothing", "usage: startrack terrain build "),
+        ("--nothing locate x.png", "usage: startrack [-h]"),
+    ],
+)
+def test_an_unknown_flag_shows_the_usage_of_its_command(capsys, words, usage):
+    with pytest.raises(SystemExit) as end:
+        main(words.split())
+    said = capsys.readouterr().err
+    assert end.value.code == USAGE
+    assert said.startswith(usage) and f"unrecognized arguments: {'-o y' if '-o' in words else '--nothing'}\n" in said
+
+
+@pytest.mark.parametrize("word", ["lcoate", "verify"])
+def test_an_unknown_command_shows_the_names_of_the_commands(capsys, word):
+    with pytest.raises(SystemExit) as end:
+        main([word, "x.png"])
+    said = capsys.readouterr().err
+    assert end.value.code == USAGE
+    assert f"no command is called '{word}'; there are: locate, batch, identify," in said
+    assert "calibrate verify" not in said
+
+
+@pytest.mark.parametrize(
     ("words", "said"),
     [
         ("identify stars.png --fov 180 -c fisheye-2048", "give one of them"),

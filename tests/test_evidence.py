@@ -235,9 +235,9 @@ def measure_frame(
 ) -> StarPhotometry:
     detections = frame(stars, shines, rng)
     detections = detections if dead is None else replace(detections, dead=dead)
-    settings: dict[str, Any] = {"bodies": [], "place_sigma_px": 0.05} | how
+    settings: dict[str, Any] = {"bodies": [], "position_sigma_px": 0.05} | how
     return StarEvidence()(
-        detections, CAMERA, stars, settings["bodies"], R_CAM_ENU, np.eye(3), SCALE, settings["place_sigma_px"]
+        detections, CAMERA, stars, settings["bodies"], R_CAM_ENU, np.eye(3), SCALE, settings["position_sigma_px"]
     )
 
 

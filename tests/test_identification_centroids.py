@@ -66,7 +66,14 @@ WRONG_LISTS = {
     "three columns": (np.zeros((9, 3)), {}, r"shape \(9, 3\): give \(n, 2\)"),
     "one row of numbers": ([1.0, 2.0, 3.0], {}, r"shape \(3,\): give \(n, 2\)"),
     "rows of unequal length": ([[1.0, 2.0], [3.0]], {}, "rows of equal length"),
+    "fluxes in a column": (np.zeros((9, 3)), {}, r"by their names, such as flux=table\[:, 2\]"),
     "texts": (["a.png", "b.png"], {}, "array of numbers"),
+    "numbers as texts": ([["1", "2"], ["3", "4"]], {}, "each of them real; this is an array of <U1"),
+    "complex numbers": (np.zeros((9, 2), complex), {}, "each of them real; this is an array of complex128"),
+    "a generator": (((x, x) for x in range(9)), {}, "a list or an array of numbers, .* this is generator"),
+    "complex fluxes": (np.zeros((9, 2)), {"flux": np.ones(9, complex)}, "flux= must be .* real"),
+    "a size beside the camera": (np.zeros((9, 2)), {"size_px": (10, 10)}, "the camera has its own"),
+    "a field beside the camera": (np.zeros((9, 2)), {"fov_rad": 3.0}, "the camera has its own"),
     "infinite": (np.full((9, 2), np.inf), {}, "must be finite"),
     "too few fluxes": (np.zeros((9, 2)), {"flux": np.ones(8)}, r"flux= has the shape \(8,\): .* each of the 9"),
     "too many errors": (np.zeros((9, 2)), {"sigma_px": np.ones(10)}, r"sigma_px= has the shape \(10,\)"),
@@ -87,9 +94,26 @@ def test_an_empty_list_has_too_few_stars(empty) -> None:
         identify_centroids(empty, camera=FISHEYE, stars=sky())
 
 
+@pytest.mark.parametrize("lens", [{"camera": FISHEYE}, {"fov_rad": 3.0, "size_px": FISHEYE.size_px}], ids=list)
+def test_centroids_of_another_frame_are_named(lens) -> None:
+    xy_px = random_positions(FISHEYE, 200, np.random.default_rng(6)) + 5000.0
+    width, height = FISHEYE.size_px
+    with pytest.raises(NotIdentified, match=f"none of the 200 centroids lies in the frame of {width} x {height} px"):
+        identify_centroids(xy_px, stars=sky(), **lens)
+
+
+def test_centroids_outside_the_image_circle_are_named() -> None:
+    """In the corners of the frame the fisheye shows no sky."""
+    xy_px = np.random.default_rng(7).uniform(0.0, 40.0, (50, 2))
+    with pytest.raises(NotIdentified, match="only 0 of 50 point sources lie in the image circle of camera"):
+        identify_centroids(xy_px, camera=FISHEYE, stars=sky())
+
+
 def test_an_impossible_field_or_frame_is_named() -> None:
     xy_px = random_positions(FISHEYE, 40, np.random.default_rng(5))
     with pytest.raises(ValueError, match="fov_rad= is -3"):
         identify_centroids(xy_px, fov_rad=-3.0, size_px=(1024, 1024), stars=sky())
     with pytest.raises(ValueError, match="size_px= is"):
         identify_centroids(xy_px, fov_rad=3.0, size_px=(1024, 0), stars=sky())
+    with pytest.raises(ValueError, match="size_px= is 1024: give width and height"):
+        identify_centroids(xy_px, fov_rad=3.0, size_px=1024, stars=sky())  # type: ignore[arg-type]

@@ -250,7 +250,7 @@ def test_pixels_of_the_sky_and_several_exposures_are_rows_like_any_other() -> No
         azimuth_rad=azimuth, elevation_rad=elevation, llr=step * light - step**2 / 2, edge_sigma_rad=sigma,
         extended_nats=np.full(4000, step**2),
     )  # fmt: skip
-    both = Evidence.joined(stars, pixels)
+    both = Evidence.concatenate(stars, pixels)
     alone, together = ExactPosterior()(stars, TERRAIN), ExactPosterior()(both, TERRAIN)
     assert np.trace(together.covariance_m2) < 0.5 * np.trace(alone.covariance_m2)
     assert np.linalg.norm(together.position_enu_m[:2] - at) < together.radius999_m

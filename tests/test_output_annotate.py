@@ -74,8 +74,8 @@ def test_the_skyline_is_where_the_true_wall_is(picture, view, located):
     rays = np.stack([np.sin(azimuth) * level, np.cos(azimuth) * level, np.sin(elevation)], axis=-1)
     xy_px, inside = camera.project(rays @ located.truth.R_cam_enu.T)
     assert inside.all()
-    assert np.mean([has_colour_near(picture, place, SKYLINE) for place in view.at(xy_px)]) > 0.9
-    astray = [has_colour_near(picture, place, SKYLINE) for place in view.at(xy_px + 12.0)]
+    assert np.mean([has_colour_near(picture, place, SKYLINE) for place in view.canvas_px(xy_px)]) > 0.9
+    astray = [has_colour_near(picture, place, SKYLINE) for place in view.canvas_px(xy_px + 12.0)]
     assert np.mean(astray) < 0.5
 
 
@@ -83,13 +83,15 @@ def test_identified_stars_have_a_green_ring_and_hidden_ones_a_cross(picture, vie
     result = located.result
     ringed = []
     for k in np.sort(result.identification.detection)[:40]:  # the brightest: rings of faint ones fade
-        at = view.at(result.detections.xy_px[k])
+        at = view.canvas_px(result.detections.xy_px[k])
         ringed.append(
             any(has_colour_near(picture, at + np.array([0.0, r]), IDENTIFIED, tolerance=120) for r in range(5, 11))
         )
     assert np.mean(ringed) > 0.8
     hidden = np.flatnonzero(result.light.llr < -3.0)[:10]
-    assert np.mean([has_colour_near(picture, place, HIDDEN) for place in view.at(result.light.xy_px[hidden])]) > 0.8
+    assert (
+        np.mean([has_colour_near(picture, place, HIDDEN) for place in view.canvas_px(result.light.xy_px[hidden])]) > 0.8
+    )
 
 
 def test_beyond_the_image_circle_is_paper(picture, view, located):
@@ -121,7 +123,7 @@ def test_detections_beyond_the_image_circle_are_not_drawn(located, view):
         star=located.result.identification.star[located.result.identification.detection != 0],
     )
     drawn = annotate(replace(located.result, detections=astray, identification=others))
-    x, y = np.rint(view.at((20.0, 20.0))).astype(int)
+    x, y = np.rint(view.canvas_px((20.0, 20.0))).astype(int)
     assert np.ptp(drawn[y - 12 : y + 13, x - 12 : x + 13].reshape(-1, 3), axis=0).max() == 0
 
 

@@ -103,13 +103,13 @@ def test_wrapping():
 def test_the_view_keeps_pixel_centres():
     """Half a pixel beyond the corners of the exposure is half a canvas pixel beyond those of the picture."""
     view = View(0.5, (10.0, 20.0), (50, 40))
-    np.testing.assert_allclose(view.at([[-0.5, -0.5], [99.5, 79.5]]), [[9.5, 19.5], [59.5, 59.5]])
+    np.testing.assert_allclose(view.canvas_px([[-0.5, -0.5], [99.5, 79.5]]), [[9.5, 19.5], [59.5, 59.5]])
 
 
 def test_north_is_up_and_east_is_right():
     view = map_view((100, 200, 500, 400), (1000.0, -500.0), 50.0)
-    np.testing.assert_allclose(view.at((1000.0, -500.0)), (300.0, 300.0))
-    np.testing.assert_allclose(view.at((1050.0, -450.0)), (400.0, 200.0))
+    np.testing.assert_allclose(view.canvas_px((1000.0, -500.0)), (300.0, 300.0))
+    np.testing.assert_allclose(view.canvas_px((1050.0, -450.0)), (400.0, 200.0))
 
 
 @pytest.mark.parametrize(("length", "step"), [(9.99, 5.0), (10.0, 10.0), (0.3, 0.2), (7300.0, 5000.0), (0.0199, 0.01)])

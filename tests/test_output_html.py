@@ -243,7 +243,9 @@ def test_the_command_reads_the_folder_of_true_positions(results, tmp_path, capsy
     (truth / "small.truth.json").write_text("{}")
     assert main(["report", str(results), "--truth", str(truth), "-o", str(page)]) == 4
     assert main(["report", str(results), "--truth", str(tmp_path / "none")]) == 4
-    assert "no such folder" in capsys.readouterr().err
+    assert "no such folder of truth" in capsys.readouterr().err
+    assert main(["report", str(results), "--truth", str(page)]) == 4
+    assert "is a file, not a folder of truth" in capsys.readouterr().err
 
 
 def test_where_pages_go(results, tmp_path, capsys):

@@ -207,16 +207,66 @@ def test_height_maps_state_whether_their_horizon_is_exact(sigma_m):
     assert terrain.max_horizon_sigma_rad(np.zeros(2), 50.0, AZIMUTHS, 0.01) == pytest.approx(sigma, rel=0.5)
 
 
-def test_a_users_own_terrain_is_searched():
-    terrain, rng, place = FacingWall(), np.random.default_rng(4), np.array([80.0, -120.0])
+def evidence_from(terrain: Terrain, position_m: Array) -> Evidence:
+    """Rays above and below the horizon of a position (2,)."""
+    rng = np.random.default_rng(4)
     azimuth = rng.uniform(0, 2 * np.pi, 1500)
     above = rng.uniform(-0.05, 0.05, 1500)
-    evidence = Evidence(
-        azimuth_rad=azimuth, elevation_rad=terrain.horizon_rad(place, azimuth) + above,
+    return Evidence(
+        azimuth_rad=azimuth, elevation_rad=terrain.horizon_rad(position_m, azimuth) + above,
         llr=np.where(above > 0, 3.0, -3.0), edge_sigma_rad=np.zeros(1500),
     )  # fmt: skip
-    fix = ExactPosterior()(evidence, terrain)
-    assert np.hypot(*(fix.position_enu_m[:2] - place)) < fix.radius999_m < 20.0
+
+
+def test_a_users_own_terrain_is_searched():
+    terrain, position_m = FacingWall(), np.array([80.0, -120.0])
+    fix = ExactPosterior()(evidence_from(terrain, position_m), terrain)
+    assert np.hypot(*(fix.position_enu_m[:2] - position_m)) < fix.radius999_m < 20.0
+
+
+class NaNHorizon(FacingWall):
+    """Its bounds are right; of its horizons those to the east are NaN."""
+
+    name = "broken"
+
+    def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        right = super().horizon_rad(points_m, azimuths_rad)
+        return np.where(np.sin(azimuths_rad) > 0.5, np.nan, right)
+
+
+class NaNBounds(NaNHorizon):
+    """Its bounds are NaN as well."""
+
+    def horizon_bounds_rad(self, *box: Any) -> tuple[Array, Array]:
+        low, high = super().horizon_bounds_rad(*box)
+        return low * np.nan, high * np.nan
+
+
+class SwappedBounds(FacingWall):
+    """The greatest horizon before the least."""
+
+    name = "broken"
+
+    def horizon_bounds_rad(self, *box: Any) -> tuple[Array, Array]:
+        low, high = super().horizon_bounds_rad(*box)
+        return high, low
+
+
+@pytest.mark.parametrize("common_sigma_rad", [0.0, 1e-3])
+@pytest.mark.parametrize(
+    ("broken", "fault"),
+    [
+        (NaNHorizon, r"'broken' \(NaNHorizon\): horizon_rad gives NaN or infinity for \d+ of \d+ rays"),
+        (NaNBounds, r"'broken' \(NaNBounds\): horizon_bounds_rad gives NaN for"),
+        (SwappedBounds, r"'broken' \(SwappedBounds\): horizon_bounds_rad gives least horizons above the greatest"),
+    ],
+)
+def test_an_error_in_a_users_terrain_is_named_by_its_method(broken, fault, common_sigma_rad):
+    terrain = broken()
+    terrain.common_sigma_rad = common_sigma_rad
+    with pytest.raises(BadInput, match=fault) as caught:
+        ExactPosterior()(evidence_from(FacingWall(), np.array([80.0, -120.0])), terrain)
+    assert caught.value.reason == "bad_terrain"
 
 
 def test_what_is_no_terrain_is_refused_by_the_methods_it_lacks():

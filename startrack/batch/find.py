@@ -11,6 +11,7 @@ from itertools import count
 from pathlib import Path, PurePosixPath
 
 from startrack.exposure.metadata import PACKING_SUFFIXES, PICTURE_SUFFIXES
+from startrack.files import existing_folder
 from startrack.types import BadInput
 
 OWN_PICTURES = (".annotated.png",)
@@ -29,11 +30,9 @@ def images_under(folder: str | os.PathLike[str], excluded: str | os.PathLike[str
     """Every image of the tree, sorted by name.
 
     Links to folders outside the tree are followed, each folder once. Hidden files and folders, the folder `excluded`
-    and anything but regular files are left out. Raises BadInput (bad_image) if there is no such folder.
+    and anything but regular files are left out. Raises BadInput (bad_image) if `folder` is none.
     """
-    root = Path(folder)
-    if not root.is_dir():
-        raise BadInput("bad_image", f"{folder}: no such folder")
+    root = existing_folder(folder)
     return _images(root, _image_names(root, None if excluded is None else os.path.realpath(excluded)))
 
 

@@ -11,6 +11,7 @@ import logging
 import os
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from startrack import __version__
 from startrack.errors import BadInput, NoSolution
@@ -38,7 +39,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         _write_any_text()
         parser = _parser()
         _offer_completion(parser)
-        args = parser.parse_args(_joined_action(sys.argv[1:] if argv is None else argv))
+        words = _joined_action(sys.argv[1:] if argv is None else argv)
+        if words and not words[0].startswith("-") and words[0].split()[0] not in COMMANDS:
+            parser.error(f"no command is called {words[0]!r}; there are: {', '.join(COMMANDS)}")
+        args = parser.parse_args(words)
         if not args.command:
             parser.print_help()
             return USAGE
@@ -72,8 +76,19 @@ def _run(args: argparse.Namespace) -> int:
         )
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser, also of each command, that reports unknown arguments with its own usage."""
+
+    def parse_known_args(self, *given: Any, **more: Any) -> Any:
+        """As `argparse`, but an argument that is not known is an error: the parser of all commands does not get it."""
+        found, unknown = super().parse_known_args(*given, **more)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return found, unknown
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="startrack",
         description="Rover position and attitude from one star exposure.",
         epilog=EPILOG,

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from startrack.cli.flag_types import count
 from startrack.errors import BadInput
+from startrack.files import existing_folder
 
 if TYPE_CHECKING:
     from startrack.output.html import Found
@@ -108,9 +109,8 @@ def _true_positions(found: Sequence[Found], folder: str | None) -> dict[str, tup
     """True (east, north) [m] by the results' stems, where the folder has them."""
     if folder is None:
         return {}
-    if not Path(folder).is_dir():
-        raise BadInput("bad_image", f"{folder}: no such folder of truth")
-    positions = {one.stem: _true_position(Path(folder), one) for one in found}
+    root = existing_folder(folder, "truth")
+    positions = {one.stem: _true_position(root, one) for one in found}
     return {stem: position for stem, position in positions.items() if position is not None}
 
 

@@ -45,10 +45,10 @@ class Skyline:
     elevation_rad: Array
 
     @classmethod
-    def trace(cls, place_m: Array, terrain: Terrain) -> Skyline:
-        """The horizon of a `terrain` at `place_m` (2,), traced once: on a height map that takes time."""
+    def trace(cls, position_m: Array, terrain: Terrain) -> Skyline:
+        """The horizon of a `terrain` at `position_m` (2,), traced once: on a height map that takes time."""
         azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_SAMPLES, endpoint=False)
-        return cls(terrain.horizon_rad(np.asarray(place_m)[None, :], azimuth))
+        return cls(terrain.horizon_rad(np.asarray(position_m)[None, :], azimuth))
 
     def __call__(self, azimuth_rad: Array) -> Array:
         at = np.mod(azimuth_rad, 2 * np.pi) * (len(self.elevation_rad) / (2 * np.pi))

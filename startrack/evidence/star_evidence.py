@@ -100,7 +100,7 @@ class StarEvidence:
         R_cam_icrs: Array,
         R_enu_icrs: Array,
         scale: FluxScale,
-        place_sigma_px: float,
+        position_sigma_px: float,
         visible: Array | None = None,
     ) -> StarPhotometry:
         """Photometry of every star in view.
@@ -113,7 +113,7 @@ class StarEvidence:
             R_cam_icrs: (3, 3).
             R_enu_icrs: (3, 3).
             scale: of the fluxes.
-            place_sigma_px: error of the predicted pixels per axis.
+            position_sigma_px: error of the predicted pixels per axis.
             visible: (len(stars),) probability that each star is visible where that is known already; it is used for
                 the star's light in its neighbours' measurements only.
         """
@@ -128,7 +128,7 @@ class StarEvidence:
         angle = np.arctan2(np.hypot(rays_cam[:, 0], rays_cam[:, 1]), rays_cam[:, 2])
         expected = scale.flux_e(stars.v_mag[star], angle, camera)
         # A misplaced profile loses light. The rays do not depend on the lens: they are the catalogue's.
-        misplaced2 = place_sigma_px**2 + (
+        misplaced2 = position_sigma_px**2 + (
             np.square(camera.projection_sigma_px(rays_cam)) if camera.covariance_order else 0.0
         )
         blur = misplaced2 / (2 * sigma_px) ** 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,7 +12,7 @@ from startrack.attitude import AttitudeFit, solve_attitude
 from startrack.camera import Camera
 from startrack.identification.lost_in_space import Identifier
 from startrack.identification.unknown_lens import identify_unknown_lens
-from startrack.types import Array, Attitude, Centroids, Identification, Ints, Stars
+from startrack.types import Array, Attitude, Centroids, Identification, Ints, NotIdentified, Stars
 
 DEFAULT_SIGMA_PX = 0.3  # centroid error per axis where none is given
 DEFAULT_PSF_SIGMA_PX = 1.0
@@ -76,9 +77,9 @@ def identify_centroids(
     Args:
         xy_px: centroids (n, 2); (0, 0) is the centre of the top-left pixel, x right, y down.
         camera: the calibrated camera; None: the lens is found too, and `fov_rad` and `size_px` are needed.
-        fov_rad: field of view to about 10 %. Below 100 degrees the angle across the frame's width, from there up that
-            of the image circle.
-        size_px: width and height of the frame.
+        fov_rad: field of view to about 10 %, not with `camera`. Below 100 degrees the angle across the frame's width,
+            from there up that of the image circle.
+        size_px: width and height of the frame, not with `camera`.
         flux: (n,) in any linear unit. None: the brightness is not known and the list is sorted, brightest first.
         sigma_px: centroid error per axis, one number or (n,); None: 0.3 px.
         saturated: (n,) True where the flux is a lower limit; None: nowhere.
@@ -87,7 +88,8 @@ def identify_centroids(
         identifier: settings of the identification with a camera.
 
     Raises:
-        ValueError: neither a camera, nor a field of view with the frame's size; or arrays of a wrong shape.
+        ValueError: neither a camera, nor a field of view with the frame's size, or both; or arrays of a wrong shape or
+            type.
         NotIdentified: the stars are not identified; its `reason` is "mirrored" for the mirror image of a known camera.
     """
     if stars is None:
@@ -96,8 +98,12 @@ def identify_centroids(
         stars = load_catalog().at(None, None)
     sources, order = sorted_centroids(xy_px, flux, sigma_px, saturated, psf_sigma_px)
     if camera is not None:
+        if fov_rad is not None or size_px is not None:
+            raise ValueError("with camera= neither a field of view nor size_px= is given: the camera has its own")
+        _require_in_frame(sources.xy_px, camera.size_px)
         found = (identifier or Identifier())(sources, camera, stars)
     elif fov_rad is not None and size_px is not None:
+        _require_in_frame(sources.xy_px, _frame_size_px(size_px))
         solution = identify_unknown_lens(sources, size_px, fov_rad, stars)
         camera, found = solution.camera, solution.identification
     else:
@@ -122,10 +128,11 @@ def sorted_centroids(
     Without fluxes each rank has the magnitude at which a typical sky has as many stars, and the brightness takes no
     part in the matches.
     """
-    xy = _finite("the centroids", xy_px)
+    xy = _real_numbers("the centroids", xy_px)
     xy = xy.reshape(0, 2) if xy.shape == (0,) else xy
     if xy.ndim != 2 or xy.shape[1] != 2:
-        raise ValueError(f"the centroids have the shape {xy.shape}: give (n, 2), x and y [px] of each")
+        more = ", and further columns by their names, such as flux=table[:, 2]" if xy.shape[1:] in ((3,), (4,)) else ""
+        raise ValueError(f"the centroids have the shape {xy.shape}: give (n, 2), x and y [px] of each{more}")
     n = len(xy)
     if flux is None:
         order, brightness_sigma_mag = np.arange(n, dtype=np.int64), np.inf
@@ -148,20 +155,46 @@ def sorted_centroids(
     ), order
 
 
+def _frame_size_px(size_px: Any) -> tuple[int, int]:
+    """The size (W, H) of a frame as given. Raises ValueError where it is no pair of numbers of at least 1."""
+    try:
+        width, height = size_px
+        possible = width >= 1 and height >= 1
+    except (TypeError, ValueError):
+        possible = False
+    if not possible:
+        raise ValueError(f"size_px= is {size_px!r}: give width and height [px]")
+    return width, height
+
+
+def _require_in_frame(xy_px: Array, size_px: tuple[int, int]) -> None:
+    """Raise NotIdentified where there are centroids (n, 2), but none in the frame of `size_px` (W, H)."""
+    in_frame = np.all((xy_px >= -0.5) & (xy_px <= np.array(size_px) - 0.5), axis=1)
+    if len(xy_px) and not in_frame.any():
+        raise NotIdentified(
+            f"none of the {len(xy_px)} centroids lies in the frame of {size_px[0]} x {size_px[1]} px: give x and y in "
+            "px of this frame, from the centre of its top-left pixel",
+            detected=0,
+        )
+
+
 def _one_each(name: str, values: ArrayLike, n: int) -> Array:
     """The values as an array (n,); one number is that of all centroids. Raises ValueError."""
-    given = _finite(f"{name}=", values)
+    given = _real_numbers(f"{name}=", values)
     if given.shape not in ((), (n,)):
         raise ValueError(f"{name}= has the shape {given.shape}: give one number for each of the {n} centroids")
     return np.broadcast_to(given, n)
 
 
-def _finite(name: str, values: ArrayLike) -> Array:
-    """The values as an array. Raises ValueError where they are not numbers, or infinite."""
+def _real_numbers(name: str, values: ArrayLike) -> Array:
+    """The values as an array. Raises ValueError where they are not real numbers, or not finite."""
     try:
-        given = np.asarray(values, dtype=np.float64)
+        given = np.asarray(values)
     except (TypeError, ValueError) as cause:
         raise ValueError(f"{name} must be an array of numbers, rows of equal length") from cause
+    if given.dtype.kind not in "biuf":
+        kind = type(values).__name__ if given.ndim == 0 else f"an array of {given.dtype}"
+        raise ValueError(f"{name} must be a list or an array of numbers, each of them real; this is {kind}")
     if not np.isfinite(given).all():
         raise ValueError(f"{name} must be finite: leave out what was not measured")
-    return given
+    return given.astype(np.float64)

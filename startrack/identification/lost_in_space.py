@@ -61,8 +61,7 @@ class Identifier:
         rays_cam = camera.unproject(centroids.xy_px)
         inside = np.flatnonzero(rays_cam[:, 2] >= np.cos(camera.max_angle_rad))
         if len(inside) < MIN_MATCHES:
-            few = f"{len(inside)} point sources are too few to identify: expose longer"
-            raise NotIdentified(few, detected=len(inside))
+            raise NotIdentified(_describe_few(len(inside), len(centroids), camera), detected=len(inside))
         frame = _Frame(centroids, inside, rays_cam[inside], patterns, camera, scale)
         search = AttitudeSearch(
             frame.rays_cam, patterns, scale, neighbour_radius_px(centroids.psf_sigma_px) * scale.largest_rad_per_px
@@ -165,6 +164,17 @@ class _Frame:
         camera = replace(self.camera, mirrored=not self.camera.mirrored)
         rays_cam = camera.unproject(self.centroids.xy_px)
         return _Frame(self.centroids, np.arange(len(rays_cam)), rays_cam, self.patterns, camera, self.scale)
+
+
+def _describe_few(inside: int, given: int, camera: Camera) -> str:
+    """Why the `inside` of the `given` point sources, those within the camera's image circle, do not suffice."""
+    if given < MIN_MATCHES:
+        return f"{given} point sources are too few to identify: expose longer"
+    return (
+        f"only {inside} of {given} point sources lie in the image circle of camera {camera.name!r} "
+        f"({np.degrees(camera.max_angle_rad):.4g} degrees from its axis, in {camera.size_px[0]} x "
+        f"{camera.size_px[1]} px), too few to identify: is it the camera file of these pixels?"
+    )
 
 
 class _WrongCamera(NotIdentified):

@@ -82,12 +82,10 @@ def identify_unknown_lens(
     whether the frame clips it or not. `stars` are sorted, brightest first. `background` (H, W): smooth background of
     the frame, in which the image circle of a fisheye lens is looked for; it narrows the search. An answer is accepted
     where chance would give as many coincidences with a probability below 1e-9, all trials included. Raises
-    NotIdentified, and ValueError for an impossible field of view or frame.
+    NotIdentified, and ValueError for an impossible field of view.
     """
     if not 0 < fov_rad <= 2 * np.pi:
         raise ValueError(f"fov_rad= is {fov_rad:g}: give radians, more than 0, at most 2 pi")
-    if len(size_px) != 2 or min(size_px) < 1:
-        raise ValueError(f"size_px= is {size_px}: give width and height [px]")
     search = _Search(centroids, size_px, fov_rad, stars, tolerance, background)
     if search.narrow and (solution := _solve_narrow_field(search, centroids)) is not None:
         return solution
@@ -198,7 +196,7 @@ class _Search:
         yield from self._grow_all(self._guesses_from_circle(self.circle), MAX_TRIED_IN_CIRCLE)
         yield from self._grow_all(self._guesses(), self.patterns_tried + MAX_TRIED_BEYOND)
 
-    def _grow_all(self, guesses: list[LensGuess], most_tried: int) -> Iterator[tuple[GrownLens, Ints]]:
+    def _grow_all(self, guesses: list[LensGuess], max_tried: int) -> Iterator[tuple[GrownLens, Ints]]:
         """`grown_lenses` of these guesses, until so many patterns have been tried."""
         stages = self._stages()
         for sizes, window in self._rounds():
@@ -217,7 +215,7 @@ class _Search:
                     found = grow(hypothesis, self.xy_px, rays, stages)
                     if found is not None and (not self.wide or len(found.star) >= self.min_matches):
                         yield found, around
-                if self.patterns_tried > most_tried:
+                if self.patterns_tried > max_tried:
                     return
 
     def _rounds(self) -> Iterator[tuple[PatternSizes, Window]]:

@@ -10,7 +10,7 @@ import numpy as np
 from startrack.kernels import njit
 from startrack.localization.prefix_sums import PrefixSums
 from startrack.localization.sector_likelihood import SECTOR_STEP, Sectors
-from startrack.terrain import Terrain
+from startrack.terrain import Terrain, require_bounds
 from startrack.types import Array, Evidence, Ints
 
 NARROWEST_RAD = 1e-6
@@ -70,6 +70,7 @@ class BoxAverage:
             low, high = middle - width, middle + width
         else:
             low, high = terrain.horizon_bounds_rad(boxes, np.array(half_m), azimuth, within)
+            require_bounds(terrain, low, high)
         if not terrain.hard_edges:
             wider = terrain.max_horizon_sigma_rad(boxes, half_m, azimuth, within)
             low, high = low - wider, high + wider

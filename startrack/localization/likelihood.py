@@ -13,7 +13,7 @@ from startrack.localization.local_search import LocalLikelihood
 from startrack.localization.prefix_sums import PrefixSums
 from startrack.localization.score_kernel import score_boxes, score_disks
 from startrack.localization.sector_likelihood import Sectors, row_limits
-from startrack.terrain import Terrain
+from startrack.terrain import Terrain, require_horizons
 from startrack.types import Array, Evidence, Ints
 
 SECTOR_RAD, SECTOR_EPSILON = float(np.radians(1.5)), 1e-4  # width of a sector; probability that one is wholly wrong
@@ -121,8 +121,9 @@ class PositionLikelihood:
         box = np.repeat(np.arange(len(boxes.centres_m)), np.diff(boxes.first))
         centres, azimuth = boxes.centres_m[box], self.rows.azimuth_rad[boxes.row]
         at = ground or self.terrain
-        score = np.empty(len(boxes.centres_m))
-        score_boxes(self.rows, boxes, at.horizon_rad(centres, azimuth), at.horizon_sigma_rad(centres, azimuth), score)
+        score, horizon = np.empty(len(boxes.centres_m)), at.horizon_rad(centres, azimuth)
+        require_horizons(at, centres, horizon)
+        score_boxes(self.rows, boxes, horizon, at.horizon_sigma_rad(centres, azimuth), score)
         return score
 
     def climb(

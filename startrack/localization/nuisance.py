@@ -56,18 +56,18 @@ def estimate_horizon_bias(likelihood: PositionLikelihood, position_m: Array) -> 
     first_step, next_step, last_step = BIAS_STEPS_M
     centre, step = position_m, first_step
     local = likelihood.near(centre, BIAS_NEARBY_M, PRIOR_SIGMAS * prior)
-    places = np.zeros((0, 2))
+    positions_m = np.zeros((0, 2))
 
     def fits(nodes: Array) -> Array:
-        nonlocal centre, step, local, position_m, places
+        nonlocal centre, step, local, position_m, positions_m
         if np.abs(position_m - centre).max() > BIAS_NEARBY_M:
             centre = position_m
             local = likelihood.near(centre, BIAS_NEARBY_M, PRIOR_SIGMAS * prior)
         e = local.evidence.elevation_rad
         found = [local.climb(position_m, step, last_step, e - bias) for bias in nodes[:, 0]]
-        places = np.array([place for place, _ in found])
+        positions_m = np.array([point for point, _ in found])
         scores = np.array([fit for _, fit in found]) - 0.5 * (nodes[:, 0] / prior) ** 2
-        position_m, step = places[int(np.argmax(scores))], next_step
+        position_m, step = positions_m[int(np.argmax(scores))], next_step
         return scores
 
     nodes, scores = zoom_grid(fits, np.array([PRIOR_SIGMAS * prior]), *BIAS_GRID)
@@ -77,8 +77,8 @@ def estimate_horizon_bias(likelihood: PositionLikelihood, position_m: Array) -> 
     bias = float(weight @ biases)
     off = biases - bias
     variance = float(weight @ off**2) + (biases[1] - biases[0]) ** 2 / 12
-    place = weight @ places
-    return HorizonBias(bias, float(np.sqrt(variance)), place, (weight * off) @ (places - place) / variance)
+    mean_m = weight @ positions_m
+    return HorizonBias(bias, float(np.sqrt(variance)), mean_m, (weight * off) @ (positions_m - mean_m) / variance)
 
 
 def marginalize_horizon_bias(

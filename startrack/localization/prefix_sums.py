@@ -13,7 +13,7 @@ from startrack.localization.sector_likelihood import (
     elevation_order,
     row_limits,
 )
-from startrack.terrain import Terrain
+from startrack.terrain import Terrain, require_bounds
 from startrack.types import Array, Bools, Evidence, Ints
 
 ROUNDING = 1e-9  # of the keys
@@ -69,6 +69,7 @@ class PrefixSums:
         middle = (2 * np.arange(count) + 1) * np.pi / count
         boxes = centres_m[:, None, :]
         low, high = terrain.horizon_bounds_rad(boxes, np.array(half_m), middle, np.pi / count)
+        require_bounds(terrain, low, high)
         map_sigma = terrain.max_horizon_sigma_rad(boxes, half_m, middle, np.pi / count)
         margin = leeway_rad + CERTAIN_SIGMAS * np.hypot(self.sigma_rad, map_sigma)
         step = SECTOR_STEP * np.arange(count)

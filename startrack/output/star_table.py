@@ -107,14 +107,18 @@ def _measured_px_texts(value: Identified, star: Ints) -> tuple[list[str], list[s
 def _light_columns(light: StarPhotometry, unit: str) -> Sequence[Column]:
     usable = light.usable.tolist()
 
-    def measured(form: str, values: Array) -> list[str]:
+    def format_usable(form: str, values: Array) -> list[str]:
         return [form % value if known else "" for value, known in zip(values.tolist(), usable, strict=True)]
 
     return [
         Column("expected_e", light.expected_e, "float64", unit, "%.6g", "flux if nothing hides it"),
-        Column("flux_e", measured("%.6g", light.flux_e), "float64", unit, "%s", "measured at the predicted position"),
-        Column("sigma_e", measured("%.6g", light.sigma_e), "float64", unit, "%s", "of flux_e without a star"),
-        Column("evidence", measured("%.3f", light.llr), description="ln p(light | visible) - ln p(light | hidden)"),
+        Column(
+            "flux_e", format_usable("%.6g", light.flux_e), "float64", unit, "%s", "measured at the predicted position"
+        ),
+        Column("sigma_e", format_usable("%.6g", light.sigma_e), "float64", unit, "%s", "of flux_e without a star"),
+        Column(
+            "evidence", format_usable("%.3f", light.llr), description="ln p(light | visible) - ln p(light | hidden)"
+        ),
         Column("status", status_of(light), "string", description="seen, hidden, uncertain or unusable"),
         Column("cause", light.cause, "string", description="why it is unusable"),
     ]

@@ -27,7 +27,7 @@ class Angle(float):
         return format(0.0, spec) if text == format(360.0, spec) else text
 
 
-def place_m(fix: Fix) -> tuple[float, float]:
+def best_position_m(fix: Fix) -> tuple[float, float]:
     """East and north [m] of the position of a `fix`, or of its heaviest mode where several positions fit."""
     if fix.ambiguous:
         return fix.modes[0].east_m, fix.modes[0].north_m
@@ -74,7 +74,7 @@ def predicted_visible(value: Located) -> int:
     """Number of stars of a located `value` that were measured and are above the skyline of the fix."""
     if value not in _predicted_visible:  # horizons of a height map take time, and several outputs need this number
         light = value.light
-        horizon = value.terrain.horizon_rad(np.array([place_m(value.fix)]), light.azimuth_rad)
+        horizon = value.terrain.horizon_rad(np.array([best_position_m(value.fix)]), light.azimuth_rad)
         _predicted_visible[value] = int((light.usable & (light.elevation_rad > horizon)).sum())
     return _predicted_visible[value]
 

@@ -17,30 +17,30 @@ def at_stage(value: Inputs) -> At:
     """From the path of a quantity to its value in a `value` of the pipeline; None where it is not determined there."""
     known: dict[str, Any] = {}
 
-    def at(path: str) -> Any:
+    def value_at(path: str) -> Any:
         if path not in known:
             one = BY_PATH[path]
             if one.derived:
-                known[path] = one.value(at) if isinstance(value, one.since) else None
+                known[path] = one.value(value_at) if isinstance(value, one.since) else None
             else:
                 known[path] = one.value(value) if _is_determined(one, value) else None
         return known[path]
 
-    return at
+    return value_at
 
 
 def at_record(result: Mapping[str, Any]) -> At:
     """From the path of a quantity to its value in a `result` record; None where that lacks it or has another type."""
 
-    def at(path: str) -> Any:
+    def value_at(path: str) -> Any:
         one = BY_PATH[path]
         if one.derived:
-            return one.value(at)
+            return one.value(value_at)
         part = result.get(one.section) if one.section else result
         value = part.get(one.key) if isinstance(part, Mapping) else None
         return value if _has_type(value, one.schema) else None
 
-    return at
+    return value_at
 
 
 def rows(place: str, at: At, sections: Collection[str] | None = None) -> Rows:

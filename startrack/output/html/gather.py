@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from startrack.files import existing_folder
 from startrack.types import BadInput
 
 KINDS = (".fix.json", ".identification.json")  # of one image the first that is there counts
@@ -37,9 +38,7 @@ def results_under(folder: str | os.PathLike[str]) -> tuple[list[Found], list[str
 
     Raises BadInput (bad_image, for lack of a better code) where there is no folder or no result in it.
     """
-    root = Path(folder)
-    if not root.is_dir():
-        raise BadInput("bad_image", f"{folder}: no such folder of results")
+    root = existing_folder(folder, "results")
     found, unread = [], []
     for path in _files(root):
         name = path.relative_to(root).as_posix()

@@ -23,9 +23,9 @@ def row_of(found: Found, real: Position | None, detailed: bool) -> list[Any]:
     """The values of COLUMNS, None where there is none."""
     record = found.record
     position, stars, provenance = (section_of(record, key) for key in ("position", "stars", "provenance"))
-    place = number_of(position, "east_m"), number_of(position, "north_m")
+    position_m = number_of(position, "east_m"), number_of(position, "north_m")
     covariance = _covariance(position)
-    error_m, nees = _error_and_nees(place, covariance, real)
+    error_m, nees = _error_and_nees(position_m, covariance, real)
     east_m, north_m = real or (None, None)
     return [
         record["image"], found.stem, record["status"], record.get("reason"),
@@ -119,12 +119,12 @@ def _covariance(position: dict[str, Any]) -> tuple[float, float, float] | None:
 
 
 def _error_and_nees(
-    place: tuple[float | None, float | None], covariance: tuple[float, float, float] | None, real: Position | None
+    position_m: tuple[float | None, float | None], covariance: tuple[float, float, float] | None, real: Position | None
 ) -> tuple[float | None, float | None]:
     """Distance from the true position [m] and NEES, e^T C^-1 e."""
-    if real is None or place[0] is None or place[1] is None:
+    if real is None or position_m[0] is None or position_m[1] is None:
         return None, None
-    east, north = place[0] - real[0], place[1] - real[1]
+    east, north = position_m[0] - real[0], position_m[1] - real[1]
     ee, en, nn = covariance or (0.0, 0.0, 0.0)
     determinant = ee * nn - en * en
     nees = (nn * east**2 - 2 * en * east * north + ee * north**2) / determinant if determinant > 0 else None

@@ -51,7 +51,7 @@ class View {
       (top + bottom) / 2 + (y - this.centre[1]) * this.perY * this.zoom * (this.up ? -1 : 1)];
   }
 
-  at(sx, sy) {
+  pointAt(sx, sy) {
     const [left, top, right, bottom] = this.box;
     return [this.centre[0] + (sx - (left + right) / 2) / (this.perX * this.zoom),
       this.centre[1] + (sy - (top + bottom) / 2) / (this.perY * this.zoom) * (this.up ? -1 : 1)];
@@ -60,9 +60,9 @@ class View {
   zoomBy(factor, sx, sy) {
     if (!this.box) return;
     const here = [sx ?? (this.box[0] + this.box[2]) / 2, sy ?? (this.box[1] + this.box[3]) / 2];
-    const before = this.at(...here);
+    const before = this.pointAt(...here);
     this.zoom = Math.min(Math.max(this.zoom * factor, 1), this.most);
-    const after = this.at(...here);
+    const after = this.pointAt(...here);
     this.centre = [this.centre[0] + before[0] - after[0], this.centre[1] + before[1] - after[1]];
     this.changed();
   }
@@ -197,7 +197,7 @@ function ring(g, [x, y], radius, stroke, width) {
 }
 
 function ticks(view, axis) {
-  const [a, b] = [view.at(view.box[0], view.box[3])[axis], view.at(view.box[2], view.box[1])[axis]];
+  const [a, b] = [view.pointAt(view.box[0], view.box[3])[axis], view.pointAt(view.box[2], view.box[1])[axis]];
   const pixels = axis ? view.box[3] - view.box[1] : view.box[2] - view.box[0];
   if (view.axes.fixed) return [view.axes.fixed.filter((value) => value >= Math.min(a, b) && value <= Math.max(a, b)), 1];
   const given = axis ? view.axes.steps?.[1] : view.axes.steps?.[0];

@@ -39,8 +39,8 @@ class View:
     origin: tuple[float, float]
     size: tuple[int, int]  # (W, H) on the canvas
 
-    def at(self, xy_px: ArrayLike) -> Array:
-        """Canvas places (..., 2) of pixels (..., 2)."""
+    def canvas_px(self, xy_px: ArrayLike) -> Array:
+        """Canvas pixels (..., 2) of pixels (..., 2)."""
         return np.asarray(self.origin) + self.scale * (np.asarray(xy_px, dtype=float) + 0.5) - 0.5
 
     @property

@@ -38,8 +38,8 @@ class MapView:
     centre_m: tuple[float, float]
     metres_per_px: float
 
-    def at(self, points_m: ArrayLike) -> Array:
-        """Canvas positions (..., 2) of points (..., 2), east and north [m]."""
+    def canvas_px(self, points_m: ArrayLike) -> Array:
+        """Canvas pixels (..., 2) of points (..., 2), east and north [m]."""
         offset = (np.asarray(points_m, dtype=float) - self.centre_m) / self.metres_per_px
         return self.middle + offset * [1.0, -1.0]
 
@@ -77,12 +77,12 @@ def draw_overview(
     if rim:
         window.circle(view.middle, rim / view.metres_per_px, DIM_INK, 2)
     if abs(terrain.search_radius_m - rim) > 0.01 * rim:
-        window.dashes(view.at(_ring((0.0, 0.0), terrain.search_radius_m)), DIM_INK)
+        window.dashes(view.canvas_px(_ring((0.0, 0.0), terrain.search_radius_m)), DIM_INK)
     if truth is not None:
-        window.plus(view.at(truth), 9.0, TRUTH, 2)
+        window.plus(view.canvas_px(truth), 9.0, TRUTH, 2)
     if fix is not None:
         for k, mode in enumerate(fix.modes if ambiguous else fix.modes[:1]):
-            position = view.at((mode.east_m, mode.north_m))
+            position = view.canvas_px((mode.east_m, mode.north_m))
             window.circle(position, 5.0, POSITION, -1)
             window.circle(position, 9.0, POSITION, 2)
             if ambiguous:
@@ -101,21 +101,21 @@ def draw_zoom(canvas: Canvas, box: Box, fix: Fix, truth: ArrayLike | None) -> Ma
     window = canvas.window(box)
     window.rectangle(box, MAP)
     _draw_grid(window, view)
-    ellipse = view.at(_ellipse(position, fix.covariance_m2))
+    ellipse = view.canvas_px(_ellipse(position, fix.covariance_m2))
     window.area(ellipse, mix_colours(MAP, POSITION, 0.35))
     window.line(ellipse, mix_colours(MAP, POSITION, 0.8))
-    window.circle(view.at(position), fix.radius95_m / view.metres_per_px, POSITION, 2)
-    window.plus(view.at(position), 8.0, INK, 2)
+    window.circle(view.canvas_px(position), fix.radius95_m / view.metres_per_px, POSITION, 2)
+    window.plus(view.canvas_px(position), 8.0, INK, 2)
     if truth is not None and bool(np.all(np.abs(np.subtract(truth, position)) < view.half_m)):
-        window.plus(view.at(truth), 9.0, TRUTH, 2)
-        canvas.label(view.at(truth), "truth", CAPTION_SIZE, TRUTH, 14.0, box)
+        window.plus(view.canvas_px(truth), 9.0, TRUTH, 2)
+        canvas.label(view.canvas_px(truth), "truth", CAPTION_SIZE, TRUTH, 14.0, box)
     _draw_frame(canvas, view, f"95 % within {fix.radius95_m:.3g} m")
     return view
 
 
 def draw_leaders(canvas: Canvas, overview: MapView, zoom: MapView) -> None:
     """Faint lines from the position in the overview to the corners of the zoom below it."""
-    position = overview.at(zoom.centre_m)
+    position = overview.canvas_px(zoom.centre_m)
     left, top, right, _ = zoom.box
     for corner in ((left, top), (right, top)):
         toward = np.asarray(corner) - position
@@ -157,7 +157,7 @@ def _draw_grid(window: Canvas, view: MapView) -> None:
         for value in grid_lines_m(view, axis):
             ends = np.array([low, high])
             ends[:, axis] = value
-            window.line(view.at(ends), GRID)
+            window.line(view.canvas_px(ends), GRID)
 
 
 def _draw_frame(canvas: Canvas, view: MapView, caption: str) -> None:

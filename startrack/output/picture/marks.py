@@ -22,7 +22,7 @@ from startrack.output.picture.canvas import (
     mix_colours,
 )
 from startrack.output.star_table import names_of, status_of
-from startrack.output.values import R_body_enu, place_m
+from startrack.output.values import R_body_enu, best_position_m
 from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented
 from startrack.types import Array, Bools, Ints
 
@@ -46,7 +46,7 @@ def draw_detections(canvas: Canvas, view: View, value: Inputs) -> None:
     if isinstance(value, Identified):
         identified[value.identification.detection] = True
     strength = np.clip(np.log(np.maximum(found.snr, 5.0) / 5.0) / np.log(BRIGHT_SNR / 5.0), 0, 1)
-    places = view.at(found.xy_px)
+    places = view.canvas_px(found.xy_px)
     # The bright ones last, on top; the faint ones dim, so that a thousand of them do not drown the stars.
     shown = identified | _is_within_image_circle(value, found.xy_px)
     for k in reversed(range(min(len(found), MAX_CIRCLES))):
@@ -67,7 +67,7 @@ def _is_within_image_circle(value: Inputs, xy_px: Array) -> Bools:
 def draw_hidden(canvas: Canvas, view: View, value: Inputs) -> None:
     """A cross at each of the brighter stars that the terrain hides."""
     _, xy_px = _hidden_stars(value)
-    places = view.at(xy_px[:MAX_CROSSES])
+    places = view.canvas_px(xy_px[:MAX_CROSSES])
     for rank, place in enumerate(places):
         weight = 1.0 - rank / max(len(places), 1)
         colour = mix_colours(HIDDEN, BACKDROP, 0.35 * (1.0 - weight))
@@ -86,7 +86,7 @@ def draw_bodies(canvas: Canvas, view: View, value: Inputs) -> None:
         if below and body.v_mag > DIMMEST_HIDDEN_V_MAG:
             continue
         colour = mix_colours(BODY, BACKDROP, 0.4) if below else BODY
-        at = view.at(xy_px)
+        at = view.canvas_px(xy_px)
         canvas.circle(at, 6.0 if below else 9.0, colour, 2)
         text, size = (f"{body.name} (hidden)", 0.85 * NAME_SIZE) if below else (body.name, NAME_SIZE)
         canvas.label(at, text, size, colour, 13.0, view.box)
@@ -102,9 +102,9 @@ def name_stars(canvas: Canvas, view: View, value: Inputs) -> None:
     seen = _names_at(value, star, xy_px, MAX_NAMES)
     hidden = _names_at(value, *_hidden_stars(value), MAX_HIDDEN_NAMES)
     for place, name in seen:
-        canvas.label(view.at(place), name, NAME_SIZE, INK, 13.0, view.box)
+        canvas.label(view.canvas_px(place), name, NAME_SIZE, INK, 13.0, view.box)
     for place, name in hidden:
-        canvas.label(view.at(place), name, 0.9 * NAME_SIZE, mix_colours(HIDDEN, BACKDROP, 0.15), 11.0, view.box)
+        canvas.label(view.canvas_px(place), name, 0.9 * NAME_SIZE, mix_colours(HIDDEN, BACKDROP, 0.15), 11.0, view.box)
 
 
 def _hidden_stars(value: Inputs) -> tuple[Ints, Array]:
@@ -124,7 +124,7 @@ def _is_below_skyline(value: Inputs, ray_icrs: Array) -> bool:
     if not isinstance(value, Located):
         return False
     azimuth, elevation = azel_from_rays(value.R_enu_icrs @ ray_icrs)
-    horizon = value.terrain.horizon_rad(np.array([place_m(value.fix)]), np.array([azimuth]))
+    horizon = value.terrain.horizon_rad(np.array([best_position_m(value.fix)]), np.array([azimuth]))
     return bool(elevation < horizon[0])
 
 
@@ -157,7 +157,7 @@ def draw_skyline(canvas: Canvas, view: View, value: Inputs) -> None:
     xy_px, imaged = _project(value, AZIMUTHS_RAD, _horizon(value))
     for start, stop in _runs(imaged):
         if stop - start > 1:
-            canvas.curve(view.at(xy_px[start:stop]), SKYLINE, 2.5)
+            canvas.curve(view.canvas_px(xy_px[start:stop]), SKYLINE, 2.5)
 
 
 def draw_compass(canvas: Canvas, view: View, value: Inputs) -> None:
@@ -202,11 +202,11 @@ def _draw_nose(canvas: Canvas, view: View, value: Measured) -> None:
 
 def _canvas_at(view: View, value: Measured, azimuth_rad: float, elevation_deg: float) -> Array:
     """Canvas place (2,) of a direction."""
-    return view.at(_project(value, np.array([azimuth_rad]), np.radians([elevation_deg]))[0][0])
+    return view.canvas_px(_project(value, np.array([azimuth_rad]), np.radians([elevation_deg]))[0][0])
 
 
 def _horizon(value: Located) -> Array:
-    return value.terrain.horizon_rad(np.array([place_m(value.fix)]), AZIMUTHS_RAD)
+    return value.terrain.horizon_rad(np.array([best_position_m(value.fix)]), AZIMUTHS_RAD)
 
 
 def _project(value: Measured, azimuth_rad: Array, elevation_rad: Array) -> tuple[Array, Bools]:

@@ -32,16 +32,16 @@ STEP_DEG = 0.1
 COMPASS = {0: "N", 90: "E", 180: "S", 270: "W"}
 
 
-def relief_picture(terrain: Terrain, place_m: tuple[float, float] | None = None) -> NDArray[np.uint8]:
+def relief_picture(terrain: Terrain, position_m: tuple[float, float] | None = None) -> NDArray[np.uint8]:
     """The relief (H, W, 3), lit from the north-west, with contours, the search area (dashed) and the position."""
     canvas = Canvas(SIZE_PX + round(LEFT_PX), SIZE_PX + round(BELOW_PX))
     box = (LEFT_PX, 8.0, LEFT_PX + SIZE_PX - 9.0, SIZE_PX - 1.0)
     view = draw_overview(canvas, box, terrain, None, False, None)
     canvas.text((box[2] - 13.0, box[1] + 12.0), terrain.name, TEXT_PX, INK, "rt", halo=True)
-    if place_m is not None:
-        canvas.circle(view.at(place_m), 6.0, POSITION, -1)
-        canvas.circle(view.at(place_m), 11.0, POSITION, 2)
-        canvas.reserve(box_around(view.at(place_m), 14.0))
+    if position_m is not None:
+        canvas.circle(view.canvas_px(position_m), 6.0, POSITION, -1)
+        canvas.circle(view.canvas_px(position_m), 11.0, POSITION, 2)
+        canvas.reserve(box_around(view.canvas_px(position_m), 14.0))
     _draw_distances(canvas, view)
     if terrain.rim_radius_m is None:
         window = canvas.window(box)
@@ -57,46 +57,46 @@ def _draw_distances(canvas: Canvas, view: MapView) -> None:
     left, _, right, bottom = view.box
     unit, metres = ("km", 1000.0) if float(view.half_m.min()) >= 2000.0 else ("m", 1.0)
     for east_m in grid_lines_m(view, 0):
-        x = float(view.at((east_m, 0.0))[0])
+        x = float(view.canvas_px((east_m, 0.0))[0])
         canvas.text((x, bottom + 8), f"{east_m / metres:g}", TEXT_PX, DIM_INK, "mt")
     for north_m in grid_lines_m(view, 1):
-        y = float(view.at((0.0, north_m))[1])
+        y = float(view.canvas_px((0.0, north_m))[1])
         canvas.text((left - 8, y), f"{north_m / metres:g}", TEXT_PX, DIM_INK, "rm")
     canvas.text(((left + right) / 2, bottom + 28), f"east and north of the origin [{unit}]", TEXT_PX, DIM_INK, "mt")
 
 
-def panorama_picture(terrain: Terrain, place_m: tuple[float, float]) -> NDArray[np.uint8]:
+def panorama_picture(terrain: Terrain, position_m: tuple[float, float]) -> NDArray[np.uint8]:
     """The horizon (H, W, 3) from north to north, azimuth to the right, seen by a camera at a position."""
     width, height = PANORAMA_PX
     canvas = Canvas(width, height)
     azimuth_deg = np.arange(0.0, 360.0 + STEP_DEG / 2, STEP_DEG)
-    horizon_deg = np.degrees(terrain.horizon_rad(np.array(place_m)[None], np.radians(azimuth_deg)))
+    horizon_deg = np.degrees(terrain.horizon_rad(np.array(position_m)[None], np.radians(azimuth_deg)))
     low, high = min(float(horizon_deg.min()), 0.0), float(horizon_deg.max())
     step = nice_step(max(high - low, 2.0) / 3)
     low, high = np.floor(low / step) * step, np.ceil((high + 0.3 * step) / step) * step
     box = (MARGIN_PX, 34.0, width - 16.0, height - 40.0)
     canvas.rectangle(box, MAP)
 
-    def at(azimuth: Array | float, elevation: Array | float) -> Array:
+    def canvas_px(azimuth: Array | float, elevation: Array | float) -> Array:
         x = box[0] + np.asarray(azimuth) / 360 * (box[2] - box[0])
         y = box[3] - (np.asarray(elevation) - low) / (high - low) * (box[3] - box[1])
         return np.stack(np.broadcast_arrays(x, y), axis=-1)
 
-    ground = np.concatenate([at(azimuth_deg, horizon_deg), at(np.array([360.0, 0.0]), low)])
+    ground = np.concatenate([canvas_px(azimuth_deg, horizon_deg), canvas_px(np.array([360.0, 0.0]), low)])
     canvas.window(box).area(ground, FLOOR)
-    _draw_scales(canvas, box, at, low, high, step)
-    canvas.curve(at(azimuth_deg, horizon_deg), SKYLINE, 2.0)
-    title = f"{terrain.name}: horizon seen from E {place_m[0]:.0f} m, N {place_m[1]:.0f} m"
+    _draw_scales(canvas, box, canvas_px, low, high, step)
+    canvas.curve(canvas_px(azimuth_deg, horizon_deg), SKYLINE, 2.0)
+    title = f"{terrain.name}: horizon seen from E {position_m[0]:.0f} m, N {position_m[1]:.0f} m"
     canvas.text((box[0], 9.0), title, TEXT_PX, INK, "lt")
     return canvas.rendered_pixels()
 
 
-def _draw_scales(canvas: Canvas, box: Box, at, low: float, high: float, step: float) -> None:  # type: ignore[no-untyped-def]
+def _draw_scales(canvas: Canvas, box: Box, canvas_px, low: float, high: float, step: float) -> None:  # type: ignore[no-untyped-def]
     for elevation in np.arange(low, high + step / 2, step):
-        canvas.line(at(np.array([0.0, 360.0]), elevation), GRID if elevation else FAINT_INK)
-        canvas.text((box[0] - 8, float(at(0.0, elevation)[1])), f"{elevation:g}°", TEXT_PX, DIM_INK, "rm")
+        canvas.line(canvas_px(np.array([0.0, 360.0]), elevation), GRID if elevation else FAINT_INK)
+        canvas.text((box[0] - 8, float(canvas_px(0.0, elevation)[1])), f"{elevation:g}°", TEXT_PX, DIM_INK, "rm")
     for azimuth in range(0, 361, 30):
-        canvas.line([at(azimuth, low), at(azimuth, low) + np.array([0.0, 6.0])], DIM_INK)
+        canvas.line([canvas_px(azimuth, low), canvas_px(azimuth, low) + np.array([0.0, 6.0])], DIM_INK)
         name = COMPASS.get(azimuth % 360, f"{azimuth}°")
-        canvas.text((float(at(azimuth, low)[0]), box[3] + 10), name, TEXT_PX, DIM_INK, "mt")
+        canvas.text((float(canvas_px(azimuth, low)[0]), box[3] + 10), name, TEXT_PX, DIM_INK, "mt")
     canvas.rectangle(box, FAINT_INK, 1)

@@ -241,7 +241,7 @@ class Fix(Value):
     """Posterior of the camera's position."""
 
     position_enu_m: Array = array(3)  # posterior mean of the main mode (east, north) and the camera's height there
-    covariance_m2: Array = array(2, 2)  # (east, north)
+    covariance_m2: Array = array(2, 2)  # (east, north); infinite, as the circles, of a method that states none
     radius95_m: float  # circle about the position that holds 95 % of the posterior
     radius999_m: float
     modes: tuple[Mode, ...]  # heaviest first; weights sum to 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ from startrack.localization.branch_and_bound import Search
 from startrack.localization.initial_guess import Guess
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.sector_likelihood import Sectors, contributions, row_range
+from startrack.stages import Settings
 from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain
-from startrack.types import Array, Evidence, NotLocated
+from startrack.types import Array, BadInput, Evidence, NotLocated
 
 TERRAIN = load_terrain("shackleton-thesis")
 assert isinstance(TERRAIN, Cylinder)
@@ -136,6 +138,39 @@ def test_a_descent_that_explains_too_few_stars_is_refused() -> None:
         PseudoGradient(most_steps=1, most_unexplained=0.0)(evidence, TERRAIN)
     loose = PseudoGradient(most_unexplained=0.2)(missed, TERRAIN)
     assert np.linalg.norm(loose.position_enu_m[:2] - [3000.0, 1000.0]) < 2000.0
+
+
+@pytest.mark.parametrize("method", [ExactPosterior(), PseudoGradient(), Hull()])
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [("shackleton-thesis", r"give startrack.load_terrain\('shackleton-thesis'\)"), (None, "NoneType is no terrain")],
+)
+def test_what_is_no_terrain_is_refused_by_every_localizer(method: Localizer, given: Any, message: str) -> None:
+    with pytest.raises(BadInput, match=message) as caught:
+        method(perfect_list(np.random.default_rng(0), np.zeros(2), 100), given)
+    assert caught.value.reason == "bad_terrain"
+
+
+def test_settings_take_a_localizer_or_its_name() -> None:
+    assert Settings(localizer="hull").localizer == Hull()
+    assert Settings().localizer == Settings(localizer="posterior").localizer == ExactPosterior()
+    own = PseudoGradient(gain=0.5)
+    assert Settings(localizer=own).localizer is replace(Settings(), localizer=own).localizer is own
+    assert Settings(localizer=own.__call__).localizer == own.__call__  # any function
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "message"),
+    [
+        ("hul", ValueError, "localizer='hul': known are posterior, pseudo-gradient, hull"),
+        (ExactPosterior, TypeError, r"localizer=ExactPosterior is a class: .* ExactPosterior\(\)"),
+        (None, TypeError, "localizer= is of type NoneType"),
+        (5, TypeError, "localizer= is of type int"),
+    ],
+)
+def test_settings_refuse_what_is_no_localizer(given: Any, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        Settings(localizer=given)
 
 
 SMALL = replace(TERRAIN, diameter_m=400.0, depth_m=60.0, search_radius_m=200.0)

@@ -68,7 +68,7 @@ class Value:
             if "shape" not in f.metadata:
                 continue
             want, given = f.metadata["shape"], getattr(self, f.name)
-            default = f.metadata["default"]
+            default = f.metadata.get("default")
             if default is not None and np.ndim(given) == 0:
                 given = np.full([lengths.get(w, w) for w in want], default if given is None else given)
             a = given if _is_locked(given, f.metadata["dtype"]) else np.array(given, dtype=f.metadata["dtype"])

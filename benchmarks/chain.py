@@ -26,7 +26,10 @@ from startrack.camera import Sensor, load_camera
 from startrack.catalog import load_catalog
 from startrack.exposure import read_exposure
 from startrack.frames import R_from_quat_xyzw
-from startrack.localization import Hull, PseudoGradient
+from startrack.localization import PseudoGradient
+from startrack.localization.convex_hull import hull_position
+from startrack.localization.pseudo_gradient import descend
+from startrack.localization.rim_plane import stars_on_rim_plane
 from startrack.pipeline import locate
 from startrack.rendering import Series, render
 from startrack.stages import Identified, Located, Oriented, Outcome, last_value
@@ -127,13 +130,14 @@ def peers(result: Located, position_m: np.ndarray) -> dict[str, float]:
         llr=np.where(seen[listed], 9.0, -9.0),
         edge_sigma_rad=np.zeros(int(listed.sum())),
     )
-    errors = {}
-    for name, method in (("hull_m", Hull()), ("gradient_m", PseudoGradient())):
-        try:
-            errors[name] = float(np.linalg.norm((method(evidence, result.terrain).position_enu_m - position_m)[:2]))
-        except NoSolution:
-            continue
-    return errors
+    plane, method = stars_on_rim_plane(evidence, result.terrain), PseudoGradient()
+    try:
+        hull = hull_position(plane.points_m[plane.seen], plane.wall_m, plane.radius_m)
+    except NoSolution:
+        return {}
+    # As in the thesis, where the descent ends is its answer, settled or not.
+    refined, _ = descend(plane.points_m, plane.seen, hull, plane.radius_m, method.gain, method.most_steps)
+    return {name: float(np.linalg.norm(p - position_m[:2])) for name, p in (("hull_m", hull), ("gradient_m", refined))}
 
 
 def summary(rows: list[dict[str, Any]]) -> str:

@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from numbers import Real
 from typing import Any
 
 from startrack.errors import BadInput
@@ -59,14 +60,15 @@ class Number(Key):
 
     def check(self, value: Any, name: str) -> float | int:
         kind = "a whole number" if self.integer else "a number"
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        if isinstance(value, bool) or not isinstance(value, Real):  # Real: a number of numpy too
             raise ValueError(f"{name} must be {kind}, not {value_text(value)}")
-        if not self.low <= value <= self.high or (self.above and value == self.low):  # NaN fails the first
+        number: Any = value
+        if not self.low <= number <= self.high or (self.above and number == self.low):  # NaN fails the first
             limits = f"above {self.low:g} and at most" if self.above else f"from {self.low:g} to"
             raise ValueError(f"{name} must be {kind} {limits} {self.high:g}, not {value_text(value)}")
-        if self.integer and value % 1:
+        if self.integer and number % 1:
             raise ValueError(f"{name} must be {kind}, not {value_text(value)}")
-        return int(value) if self.integer else float(value)
+        return int(number) if self.integer else float(number)
 
     def body(self) -> Schema:
         kind = "integer" if self.integer else "number"

@@ -47,7 +47,10 @@ def is_path(reference: FilePath) -> bool:
 
 
 def resolve_named(name_or_path: str | Path, kind: str, reason: str) -> Path:
-    """Path of a user's file or of a shipped one. Raises BadInput `reason` if there is no such file."""
+    """Path of a user's file or of a shipped one. Raises BadInput `reason` if there is none, or if it is no name."""
+    if not isinstance(name_or_path, str | os.PathLike):
+        what = type(name_or_path).__name__
+        raise BadInput(reason, f"{what} is neither a name nor a path: give the name of a shipped file, or a path")
     if is_path(name_or_path):
         path = Path(name_or_path)
         if not os.path.isfile(path):  # False also for names too long for the file system

@@ -23,7 +23,7 @@ from startrack.errors import Reason
 from startrack.evidence import StarEvidence, StarPhotometry
 from startrack.frames import Site
 from startrack.identification import Identifier
-from startrack.localization import ExactPosterior, Localizer
+from startrack.localization import ExactPosterior, Localizer, require_localizer
 from startrack.terrain import Terrain
 from startrack.types import (
     Array,
@@ -47,13 +47,20 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Settings:
-    """The stages and their settings; each can be replaced by another one with the same call."""
+    """The stages and their settings; each can be replaced by another one with the same call.
+
+    `localizer` may be given by its name in `startrack.localization.LOCALIZERS`. Raises TypeError for a class instead of
+    an object, ValueError for another name.
+    """
 
     detector: Detector = field(default_factory=Detector)
     identifier: Identifier = field(default_factory=Identifier)
     evidence: StarEvidence = field(default_factory=StarEvidence)
     localizer: Localizer = field(default_factory=ExactPosterior)
     deep_stars: bool = True  # use Gaia's stars too, where they are installed and the frame is deeper than Hipparcos
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "localizer", require_localizer(self.localizer))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)  # eq: arrays have no single answer to ==

@@ -21,6 +21,8 @@ __all__ = [
     "array",
 ]  # fmt: skip
 
+# Beyond the zenith: the search for an error of the horizon shifts the rows, by three sigma at most.
+MOST_ELEVATION_RAD = np.pi / 2 + 0.6
 MAX_PIXELS = 200_000_000  # contract: a larger image is refused from its header, before anything is decoded
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -31,7 +33,8 @@ T = TypeVar("T")
 def array(*shape: int | str, dtype: Any = np.float64, default: float | None = None) -> Any:
     """A checked array field. Letters in `shape` name lengths that must agree within the value.
 
-    With a default the field may be left out: it is then filled with that number, as long as the fields before it.
+    With a default the field may be left out or be one number: it is then filled with the number, as long as the fields
+    before it.
     """
     metadata = {"shape": shape, "dtype": dtype, "default": default}
     return field(metadata=metadata) if default is None else field(default=None, metadata=metadata)
@@ -65,8 +68,9 @@ class Value:
             if "shape" not in f.metadata:
                 continue
             want, given = f.metadata["shape"], getattr(self, f.name)
-            if given is None:
-                given = np.full([lengths.get(w, w) for w in want], f.metadata["default"])
+            default = f.metadata.get("default")
+            if default is not None and np.ndim(given) == 0:
+                given = np.full([lengths.get(w, w) for w in want], default if given is None else given)
             a = given if _is_locked(given, f.metadata["dtype"]) else np.array(given, dtype=f.metadata["dtype"])
             if a.ndim != len(want):
                 raise ValueError(f"{type(self).__name__}.{f.name}: {a.ndim} dimensions, expected {want}")
@@ -196,6 +200,9 @@ class Evidence(Value):
     Rows may come from stars, from pixels of the diffuse sky, and from several exposures. With V the fraction of the
     ray above the horizon (a step, or Phi((elevation - horizon) / sigma)) a row contributes
     log(V e^l + 1 - V) for a point source, and l V + c V (1 - V) / 2 for extended light, c = `extended_nats`.
+
+    `edge_sigma_rad` and `extended_nats` may each be one number for all rows. Raises ValueError for arrays of different
+    lengths, numbers that are not finite, elevations that are no angles in radians, and negative sigmas or light.
     """
 
     azimuth_rad: Array = array("n")  # in enu
@@ -208,7 +215,16 @@ class Evidence(Value):
         super().__post_init__()
         if not all(np.isfinite(getattr(self, f.name)).all() for f in fields(self)):
             raise ValueError("Evidence holds an infinite number")
-        if len(self) and not 0.0 <= self.azimuth_rad.min() <= self.azimuth_rad.max() < 2 * np.pi:
+        if not len(self):
+            return
+        highest = max(self.elevation_rad.max(), -self.elevation_rad.min())
+        if highest > MOST_ELEVATION_RAD:
+            raise ValueError(f"Evidence.elevation_rad: {highest:g} is beyond pi/2, the zenith: is it in radians?")
+        for name in ("edge_sigma_rad", "extended_nats"):
+            least = getattr(self, name).min()
+            if least < 0:
+                raise ValueError(f"Evidence.{name}: {least:g} is negative")
+        if not 0.0 <= self.azimuth_rad.min() <= self.azimuth_rad.max() < 2 * np.pi:
             wrapped = np.mod(self.azimuth_rad, 2 * np.pi)
             wrapped.flags.writeable = False
             object.__setattr__(self, "azimuth_rad", wrapped)
@@ -241,7 +257,7 @@ class Fix(Value):
     """Posterior of the camera's position."""
 
     position_enu_m: Array = array(3)  # posterior mean of the main mode (east, north) and the camera's height there
-    covariance_m2: Array = array(2, 2)  # (east, north)
+    covariance_m2: Array = array(2, 2)  # (east, north); infinite, as the circles, of a method that states none
     radius95_m: float  # circle about the position that holds 95 % of the posterior
     radius999_m: float
     modes: tuple[Mode, ...]  # heaviest first; weights sum to 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,12 +16,15 @@ import tifffile
 from astropy import units as u
 from astropy.time import Time
 from astropy.utils.masked import Masked
+from jsonschema import Draft202012Validator
 
 import startrack
 from startrack.errors import BadInput
 from startrack.exposure import read_exposure
 from startrack.inputs import exposure_input, time_input
-from startrack.stages import Oriented, Refused, extend, last_value
+from startrack.localization import Hull
+from startrack.output.schema import SCHEMAS
+from startrack.stages import Oriented, Refused, Settings, extend, last_value
 
 IMAGE = "sample_images/near-wall.png"
 LOWELL = "sample_images/lowell-2018-08-06.fits.bz2"
@@ -75,6 +79,22 @@ def test_the_position_has_units_and_an_uncertainty(solution):
     assert along @ solution.covariance_m2 @ along == pytest.approx(p.ellipse.semi_major.value**2)
     assert p.ellipse.semi_minor < p.ellipse.semi_major
     assert "east           -6901." in repr(p) and "± 3." in repr(p) and "long axis at azimuth" in repr(p)
+
+
+def test_a_method_without_a_posterior_states_no_uncertainty(tmp_path):
+    """Near the wall the hull is 4 km off: no number of ours is as large as its errors."""
+    solution = startrack.locate(IMAGE, settings=Settings(localizer=Hull()))
+    assert solution and np.linalg.norm(solution.position_m[:2] - TRUTH_M) > 2000.0
+    p = solution.position
+    uncertainty = [*p.covariance.value.ravel(), *p.sigma.value, p.radius95.value, p.radius999.value]
+    uncertainty += [solution.radius95_m, p.ellipse.semi_major.value, p.ellipse.semi_minor.value]
+    assert np.isinf(uncertainty).all()
+    assert "approximate, no circle" in repr(solution) and "±" not in repr(solution)
+    assert "95 % within  no circle" in repr(p).replace("    ", "  ") and "±" not in repr(p)
+    path = solution.write(tmp_path)  # with the picture
+    written = json.loads(path.read_text())
+    assert written["position"]["radius95_m"] is None
+    Draft202012Validator(SCHEMAS["fix"]).validate(written)
 
 
 def test_the_attitude_is_a_rotation_and_angles(solution):

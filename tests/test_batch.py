@@ -26,7 +26,6 @@ from startrack.cli.main import main
 from startrack.errors import BadInput
 from startrack.exposure import write_exposure, write_sidecar
 from startrack.localization import LOCALIZERS
-from startrack.localization.pseudo_gradient import PUBLISHED_SIGMA_M
 from startrack.localization.rim_plane import point_fix
 from startrack.rendering import Series, render
 from startrack.terrain import load_terrain
@@ -175,7 +174,7 @@ class FixedPosition:
     """A user's own localizer."""
 
     def __call__(self, evidence, terrain):
-        return point_fix(np.array([123.0, 45.0]), 10.0, terrain)
+        return point_fix(np.array([123.0, 45.0]), terrain)
 
 
 def test_a_localizer_is_one_class_and_one_line_in_the_list(night, tmp_path, monkeypatch, capsys):
@@ -198,7 +197,9 @@ def test_batch_takes_a_localizer_by_name(night, tmp_path, capsys):
     command = ["batch", str(night / "images" / "späti"), "-D", str(tmp_path), "-j", "1", "-q", "--no-plots"]
     assert main([*command, "--localizer", "pseudo-gradient"]) == 0
     for record in records_in(tmp_path):
-        assert record["position"]["radius95_m"] == pytest.approx(2.448 * PUBLISHED_SIGMA_M)
+        assert record["position"]["radius95_m"] is record["position"]["covariance_m2"] is None
+    table = QTable.read(tmp_path / "results.ecsv", format="ascii.ecsv")
+    assert all(table[name].mask.all() for name in ("radius95_m", "radius999_m", "cov_east_east_m2"))
     assert json.loads((tmp_path / "manifest.json").read_text())["settings"]["localizer"] == "pseudo-gradient"
     with pytest.raises(SystemExit, match="2"):
         main([*command, "--localizer", "nobody"])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from startrack.catalog import StarCatalog, load_catalog, star_names
+from startrack.errors import BadInput
 from startrack.files import data_dir
 from startrack.frames import angle_between_rad
 
@@ -213,8 +214,10 @@ def test_unsorted_catalogues_are_refused(catalog: StarCatalog) -> None:
 
 
 def test_unknown_catalogue_names_the_known() -> None:
-    with pytest.raises(FileNotFoundError, match="hipparcos"):
-        load_catalog("tycho")
+    for name in ("tycho", None):
+        with pytest.raises(BadInput, match=rf"is called {name!r} .*hipparcos") as caught:
+            load_catalog(name)
+        assert caught.value.reason == "bad_catalog"
 
 
 def test_names(catalog: StarCatalog) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ from startrack.localization.branch_and_bound import Search
 from startrack.localization.initial_guess import Guess
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.sector_likelihood import Sectors, contributions, row_range
-from startrack.terrain import Cylinder, Terrain, load_terrain
-from startrack.types import Array, Evidence, NotLocated
+from startrack.stages import Settings
+from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain
+from startrack.types import Array, BadInput, Evidence, NotLocated
 
 TERRAIN = load_terrain("shackleton-thesis")
 assert isinstance(TERRAIN, Cylinder)
@@ -65,8 +67,11 @@ def test_contract_of_every_localizer(method: Localizer, mean_m: float, most_m: f
         fix = method(perfect_list(rng, at), TERRAIN)
         errors.append(np.linalg.norm(fix.position_enu_m[:2] - at))
         assert fix.position_enu_m[2] == TERRAIN.camera_height_m
-        assert np.linalg.eigvalsh(fix.covariance_m2).min() > 0
-        assert 0 < fix.radius95_m < fix.radius999_m
+        if fix.search == "approximate":  # no posterior: nothing of it is stated
+            assert np.isinf([*fix.covariance_m2.ravel(), fix.radius95_m, fix.radius999_m]).all()
+        else:
+            assert np.linalg.eigvalsh(fix.covariance_m2).min() > 0
+            assert 0 < fix.radius95_m < fix.radius999_m
         assert sum(mode.weight for mode in fix.modes) == pytest.approx(1.0)
         assert not fix.ambiguous
     assert np.mean(errors) < mean_m
@@ -78,6 +83,94 @@ def test_empty_evidence_is_refused_by_every_localizer(method: Localizer) -> None
     none = np.zeros(0)
     with pytest.raises(NotLocated):
         method(Evidence(azimuth_rad=none, elevation_rad=none, llr=none, edge_sigma_rad=none), TERRAIN)
+
+
+def seen_at(azimuth_rad: Array, elevation_rad: Array) -> Evidence:
+    """Stars that are all seen."""
+    return Evidence(azimuth_rad=azimuth_rad, elevation_rad=elevation_rad, llr=np.full(len(azimuth_rad), 9.0))
+
+
+@pytest.mark.parametrize("method", [PseudoGradient(), Hull()])
+def test_the_thesis_methods_refuse_positions_outside_the_search_area(method: Localizer) -> None:
+    east_m, north_m = np.array([14e3, 16e3, 15e3, 15e3]), np.array([0.0, 0.0, 1e3, -1e3])  # a rim of 15 km to the east
+    rays = seen_at(np.arctan2(east_m, north_m), np.arctan(TERRAIN.wall_m / np.hypot(east_m, north_m)))
+    for terrain in (TERRAIN, replace(TERRAIN, search_radius_m=np.inf)):
+        with pytest.raises(NotLocated) as caught:
+            method(rays, terrain)
+        assert caught.value.reason == "outside_search_area"
+    at = np.array([6000.0, -6000.0])
+    narrow = replace(TERRAIN, search_radius_m=5000.0)
+    with pytest.raises(NotLocated, match="outside the search area of 5000 m"):
+        method(perfect_list(np.random.default_rng(2), at), narrow)
+
+
+def test_positions_without_a_posterior_stand_on_the_ground() -> None:
+    class Raised(ForwardingTerrain):
+        def ground_m(self, points_m: Array) -> Array:
+            return np.full(np.shape(points_m)[:-1], 40.0)
+
+    evidence = perfect_list(np.random.default_rng(3), np.array([1000.0, 500.0]))
+    assert Hull()(evidence, Raised(TERRAIN)).position_enu_m[2] == 40.0 + TERRAIN.camera_height_m
+
+
+@pytest.mark.parametrize(
+    ("azimuth_deg", "elevation_deg"),
+    [([90.0, 90.0, 270.0], [40.0, 60.0, 50.0]), ([30.0] * 4, [70.0] * 4)],
+    ids=["one line", "one point"],
+)
+@pytest.mark.parametrize("method", [PseudoGradient(), Hull()])
+def test_seen_stars_on_one_line_make_no_hull(
+    method: Localizer, azimuth_deg: list[float], elevation_deg: list[float]
+) -> None:
+    with pytest.raises(NotLocated, match="make no hull: they stand on one line"):
+        method(seen_at(np.radians(azimuth_deg), np.radians(elevation_deg)), TERRAIN)
+
+
+def test_a_descent_that_explains_too_few_stars_is_refused() -> None:
+    """Of a list with 10 % of its stars missed no position explains the rest."""
+    rng = np.random.default_rng(5)
+    evidence = perfect_list(rng, np.array([3000.0, 1000.0]), 400)
+    missed = replace(evidence, llr=np.where(rng.random(400) < 0.1, -12.0, evidence.llr))
+    assert np.isfinite(PseudoGradient()(evidence, TERRAIN).position_enu_m).all()
+    with pytest.raises(NotLocated, match=r"did not settle: its last position leaves \d+ of \d+ stars unexplained"):
+        PseudoGradient()(missed, TERRAIN)
+    with pytest.raises(NotLocated, match="did not settle"):
+        PseudoGradient(most_steps=1, most_unexplained=0.0)(evidence, TERRAIN)
+    loose = PseudoGradient(most_unexplained=0.2)(missed, TERRAIN)
+    assert np.linalg.norm(loose.position_enu_m[:2] - [3000.0, 1000.0]) < 2000.0
+
+
+@pytest.mark.parametrize("method", [ExactPosterior(), PseudoGradient(), Hull()])
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [("shackleton-thesis", r"give startrack.load_terrain\('shackleton-thesis'\)"), (None, "NoneType is no terrain")],
+)
+def test_what_is_no_terrain_is_refused_by_every_localizer(method: Localizer, given: Any, message: str) -> None:
+    with pytest.raises(BadInput, match=message) as caught:
+        method(perfect_list(np.random.default_rng(0), np.zeros(2), 100), given)
+    assert caught.value.reason == "bad_terrain"
+
+
+def test_settings_take_a_localizer_or_its_name() -> None:
+    assert Settings(localizer="hull").localizer == Hull()
+    assert Settings().localizer == Settings(localizer="posterior").localizer == ExactPosterior()
+    own = PseudoGradient(gain=0.5)
+    assert Settings(localizer=own).localizer is replace(Settings(), localizer=own).localizer is own
+    assert Settings(localizer=own.__call__).localizer == own.__call__  # any function
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "message"),
+    [
+        ("hul", ValueError, "localizer='hul': known are posterior, pseudo-gradient, hull"),
+        (ExactPosterior, TypeError, r"localizer=ExactPosterior is a class: .* ExactPosterior\(\)"),
+        (None, TypeError, "localizer= is of type NoneType"),
+        (5, TypeError, "localizer= is of type int"),
+    ],
+)
+def test_settings_refuse_what_is_no_localizer(given: Any, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        Settings(localizer=given)
 
 
 SMALL = replace(TERRAIN, diameter_m=400.0, depth_m=60.0, search_radius_m=200.0)

@@ -14,6 +14,7 @@ from scipy.special import ndtr
 
 from startrack import pipeline
 from startrack.camera import Camera, Pinhole
+from startrack.localization.rim_plane import point_fix
 from startrack.output import write_annotated
 from startrack.output.picture.annotate import PANEL_WIDTH, annotate
 from startrack.output.picture.backdrop import View, fit_to_canvas, remove_hot_pixels
@@ -153,6 +154,13 @@ def test_every_kind_of_result_can_be_drawn(located):
         drawn = annotate(one)
         assert count_pixels(drawn[badge], STATUS[one.status]) > 500, name
     assert count_pixels(annotate(cases["ambiguous"])[:, -PANEL_WIDTH:], POSITION) > 2 * 60
+
+
+def test_a_position_without_a_circle_is_drawn_without_a_zoom(located, picture):
+    result = located.result
+    point = annotate(replace(result, fix=point_fix(result.fix.position_enu_m[:2], result.terrain)))
+    drawn, circled = (count_pixels(one[:, -PANEL_WIDTH:], POSITION) for one in (point, picture))
+    assert 60 < drawn < 0.5 * circled
 
 
 def test_an_image_of_another_size_than_the_cameras(located):

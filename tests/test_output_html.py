@@ -6,6 +6,7 @@ import base64
 import json
 import re
 import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
@@ -19,11 +20,12 @@ from html_helpers import NASTY, results_in
 from startrack.cli.main import main
 from startrack.cli.report import write_page_of_images
 from startrack.errors import Reason
-from startrack.output import write_json
+from startrack.localization.rim_plane import point_fix
+from startrack.output import result_dict, write_json, write_results
 from startrack.output.html import page_text, result_at, results_under
 from startrack.output.html.details import ground_map
 from startrack.output.html.gather import folder_of
-from startrack.output.html.rows import COLUMNS
+from startrack.output.html.rows import COLUMNS, facts_of
 from startrack.terrain import load_terrain
 
 VOID = {"meta", "link", "input", "br", "img"}
@@ -119,6 +121,21 @@ def test_rows_agree_with_the_results(text, results, located):
     assert head["errors"]["inside95"] == float(row["error_m"] <= row["radius95_m"])
     assert rows["dark"]["east_m"] is None and rows["dark"]["nees"] is None
     assert head["words"]["no_stars"][1] != ""
+
+
+def test_a_position_without_a_circle_has_an_error_only(located, tmp_path):
+    located_at = located.result.fix.position_enu_m[:2]
+    point = replace(located.result, fix=point_fix(located_at, located.result.terrain))
+    write_results(point, tmp_path / "point.fix.json")
+    found, unread = results_under(tmp_path)
+    head = data_of(page_text(found, unread=unread, real={"point": (6010.0, -2507.0)}), "results")
+    row = dict(zip(head["columns"], head["rows"][0], strict=True))
+    assert [row[key] for key in ("radius95_m", "radius999_m", "cov_ee", "nees")] == [None] * 4
+    assert row["error_m"] == pytest.approx(np.linalg.norm(located_at - [6010.0, -2507.0]), abs=0.01)
+    assert head["errors"]["inside95"] is head["errors"]["mean_nees"] is None
+    facts = dict(dict(facts_of(result_dict(point)))["Position"])
+    assert facts["95 % within"] == "no circle" and facts["Search"] == "approximate"
+    assert not {"Sigma", "99.9 % within"} & set(facts)
 
 
 def test_stars_are_those_of_the_star_table(text, results):

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from startrack import pipeline
 from startrack.catalog import load_catalog
+from startrack.localization.rim_plane import point_fix
 from startrack.output import detection_dict, identification_dict, refused_dict, result_dict, write_json
 from startrack.output.text import verbose_text
 from startrack.output.values import boresight_rad
@@ -43,6 +44,11 @@ def make_ambiguous(result):
     modes = (Mode(east_m=6000.0, north_m=-2500.0, weight=0.7), Mode(east_m=-3000.0, north_m=4000.0, weight=0.3))
     fix = replace(result.fix, modes=modes, ambiguous=True)
     return replace(result, fix=fix)
+
+
+def without_circle(result):
+    """The result as of a method without a posterior."""
+    return replace(result, fix=point_fix(result.fix.position_enu_m[:2], result.terrain))
 
 
 def flat_frame(result):
@@ -161,8 +167,14 @@ def test_without_a_terrain_there_are_no_values_in_enu(located):
 
 def test_the_bound_of_the_probability_left_out_is_stated(located, fix):
     assert 0.0 < fix["position"]["dropped_probability"] == located.result.fix.dropped_probability < 0.01
-    point = replace(located.result.fix, search="approximate", dropped_probability=None)
-    assert result_dict(replace(located.result, fix=point))["position"]["dropped_probability"] is None
+
+
+def test_a_method_without_a_posterior_states_no_circle(located):
+    position = result_dict(without_circle(located.result))["position"]
+    stated = ("dropped_probability", "covariance_m2", "radius95_m", "radius999_m")
+    assert [position[key] for key in stated] == [None] * 4
+    assert position["search"] == "approximate"
+    json.dumps(position, allow_nan=False)
 
 
 def test_an_ambiguous_result_has_modes_and_no_position(located):

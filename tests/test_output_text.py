@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from startrack.localization.rim_plane import point_fix
 from startrack.output import refusal_line, summary_line, verbose_text
 from startrack.output.values import chance_text
 from startrack.stages import Detected, Oriented, Refused, extend
@@ -25,6 +26,16 @@ def test_one_line_for_a_fix(located):
     assert north == pytest.approx(located.truth.position_enu_m[1], abs=3 * radius)
     assert heading == pytest.approx(30.0, abs=0.11)
     assert stars == len(located.result.identification)
+
+
+def test_a_position_without_a_circle_is_called_approximate(located):
+    fix = located.result.fix
+    point = replace(located.result, fix=point_fix(fix.position_enu_m[:2], located.result.terrain))
+    line = summary_line(point, seconds=3.14)
+    assert re.fullmatch(r"small  ok  E \S+ m  N \S+ m  approximate, no circle  heading .* stars  3\.1 s", line), line
+    assert "error      search approximate; no circle\n" in verbose_text(point)
+    own = replace(located.result, fix=replace(fix, search="approximate"))  # of a user's own method, with a circle
+    assert re.search(r"±\S+ m \(95 %\)  approximate  heading", summary_line(own))
 
 
 def test_without_a_time_of_its_own_the_stages_are_added_up(located):

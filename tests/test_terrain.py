@@ -235,6 +235,40 @@ BAD = [
 ]  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"diameter_m": -5.0}, "diameter_m must be a number above 0"), ({"diameter_m": np.nan}, "diameter_m must"),
+        ({"depth_m": "a"}, "depth_m must be a number, not 'a'"), ({"depth_m": 0}, "depth_m must"),
+        ({"depth_m": True}, "depth_m must be a number"), ({"diameter_m": None}, "diameter_m must be a number"),
+        ({"camera_height_m": 300.0}, "the camera must be below the rim"), ({"camera_height_m": -1.0}, "height_m must"),
+        ({"depth_sigma_m": -1.0}, "depth_sigma_m must"), ({"depth_sigma_m": 60.0}, "depth_sigma_m must be below 60 m"),
+        ({"diameter_sigma_m": 400.0}, "diameter_sigma_m must be below 400 m"),
+        ({"search_radius_m": 0.0}, "search_radius_m must"), ({"search_radius_m": float("nan")}, "search_radius_m must"),
+        ({"search_radius_m": -np.inf}, "search_radius_m must"),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_an_impossible_cylinder_is_refused(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(BadInput, match=message) as caught:
+        Cylinder(**{"diameter_m": 2000.0, "depth_m": 300.0, **given})
+    assert caught.value.reason == "bad_terrain"
+
+
+def test_a_cylinder_takes_any_real_number_and_an_open_search_area() -> None:
+    crater = Cylinder(diameter_m=np.float32(2000), depth_m=300, camera_height_m=np.int64(2))
+    assert (crater.diameter_m, crater.depth_m, crater.camera_height_m) == (2000.0, 300.0, 2.0)
+    assert isinstance(crater.diameter_m, float) and crater.search_radius_m == np.inf
+
+
+def test_the_search_may_try_craters_beyond_the_limits() -> None:
+    crater = Cylinder(diameter_m=2000.0, depth_m=300.0, camera_height_m=250.0, depth_sigma_m=50.0)
+    flat = crater.reshaped(np.array([-0.3, 0.1]))
+    assert (flat.diameter_m, flat.depth_m) == pytest.approx((2200.0, 231.0))
+    assert (crater.diameter_m, crater.depth_m) == (2000.0, 300.0)
+    assert flat.wall_m < 0 and flat.depth_sigma_m == 50.0
+
+
 @pytest.mark.parametrize(("path", "value", "named"), BAD, ids=lambda v: str(v)[:30])
 def test_a_wrong_key_is_refused_and_named(path: str, value: Any, named: str, tmp_path: Path) -> None:
     file = tmp_path / "bad.toml"

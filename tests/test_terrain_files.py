@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import tomli_w
 
+from startrack.camera import load_camera
 from startrack.cli.main import main
 from startrack.files import data_dir, file_stem
 from startrack.terrain import load_terrain, terrain_from_dict
@@ -495,3 +497,11 @@ def test_pictures_stay_in_their_folder_whatever_the_terrain_is_called(tmp_path, 
         assert Path(file).resolve().parent == out.resolve()
         assert stem is None or Path(file).name == f"{stem}.relief.png"
     assert len(file_stem("\U0001f30b" * 200).encode()) <= 200
+
+
+@pytest.mark.parametrize("given", [5, None, b"shackleton"])
+def test_what_is_neither_a_name_nor_a_path_is_refused(given: Any) -> None:
+    for load, reason in ((load_terrain, "bad_terrain"), (load_camera, "no_calibration")):
+        with pytest.raises(BadInput, match=f"{type(given).__name__} is neither a name nor a path") as caught:
+            load(given)
+        assert caught.value.reason == reason

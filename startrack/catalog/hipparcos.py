@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from startrack.catalog.names import id_texts, star_names
 from startrack.files import data_dir
 from startrack.frames import aberrate, as_utc
-from startrack.types import Array, Ints, Stars, Value, array
+from startrack.types import Array, BadInput, Ints, Stars, Value, array
 
 HIPPARCOS_EPOCH_YR = 1991.25  # J1991.25 (TT), ESA SP-1200 (1997), vol. 1
 ANGLE_UNIT_RAD = 2 * np.pi / 2**32  # of the file's ra and dec columns
@@ -111,13 +111,13 @@ def load_catalog(name: str = "hipparcos") -> StarCatalog:
     """Every star of the shipped catalogue `name`, read once in a process.
 
     Raises:
-        FileNotFoundError: no such catalogue; the message lists the shipped ones.
+        BadInput: bad_catalog, no such catalogue; the message lists the shipped ones.
     """
     folder = data_dir("catalogs")
     path = folder / f"{name}.npy"
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in folder.glob("*.npy"))) or "none"
-        raise FileNotFoundError(f"no star catalogue '{name}' in {folder} (there: {known})")
+        raise BadInput("bad_catalog", f"no star catalogue is called {name!r} in {folder}; there: {known}")
     t = np.load(path, allow_pickle=False)
     ra, dec = t["ra"] * ANGLE_UNIT_RAD, t["dec"] * ANGLE_UNIT_RAD
     sin_ra, cos_ra, sin_dec, cos_dec = np.sin(ra), np.cos(ra), np.sin(dec), np.cos(dec)

@@ -1,6 +1,6 @@
 """Localization: evidence and terrain to a position. Every method is one file and one line in LOCALIZERS."""
 
-from typing import Protocol
+from typing import Any, Protocol
 
 from startrack.localization.consistency import check_consistency
 from startrack.localization.convex_hull import Hull
@@ -33,4 +33,25 @@ def localizer_name(localizer: Localizer) -> str:
     return listed[0] if listed else getattr(localizer, "__name__", type(localizer).__name__)
 
 
-__all__ = ["LOCALIZERS", "ExactPosterior", "Hull", "Localizer", "PseudoGradient", "check_consistency", "localizer_name"]
+def require_localizer(given: Any) -> Localizer:
+    """`given`, if it is a localizer; that of LOCALIZERS, with its usual settings, if it is one of their names.
+
+    Raises TypeError for a class instead of an object and for what cannot be called, ValueError for another name.
+    """
+    if isinstance(given, str):
+        if given not in LOCALIZERS:
+            raise ValueError(f"localizer={given!r}: known are {', '.join(LOCALIZERS)}")
+        return LOCALIZERS[given]()
+    if isinstance(given, type):
+        raise TypeError(f"localizer={given.__name__} is a class: give an object of it, {given.__name__}()")
+    if not callable(given):
+        raise TypeError(
+            f"localizer= is of type {type(given).__name__}: give a function of the evidence and the terrain"
+        )
+    return given  # type: ignore[no-any-return]
+
+
+__all__ = [
+    "LOCALIZERS", "ExactPosterior", "Hull", "Localizer", "PseudoGradient", "check_consistency", "localizer_name",
+    "require_localizer",
+]  # fmt: skip

@@ -10,8 +10,6 @@ from startrack.localization.rim_plane import point_fix, stars_on_rim_plane
 from startrack.terrain import Terrain
 from startrack.types import Array, Evidence, Fix, NotLocated
 
-PUBLISHED_SIGMA_M = float(np.hypot(637.0, 275.0) / np.sqrt(2))  # mean and s.d. of the error, thesis section 3.1.1
-
 
 @dataclass(frozen=True)
 class Hull:
@@ -19,26 +17,35 @@ class Hull:
 
     The hull is that of the picture of the sky; its stars are taken as points (x, y) of the rim, and
     [1, -2x, -2y] (h^2 + k^2, h, k) = r^2 - x^2 - y^2 is solved in the least-squares sense; the position is (-h, -k).
-    Biased: the outermost seen stars stand above the skyline. Source: Kua 2008, eq. 3.1-3.6.
+    Biased: the outermost seen stars stand above the skyline. No covariance and no circle are stated; the thesis's mean
+    error is 637 m. Source: Kua 2008, eq. 3.1-3.6 and section 3.1.1.
     """
 
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
         """The position from the `evidence` in a `terrain` that is a cylinder.
 
-        Raises NotLocated with fewer than 3 seen stars, BadInput bad_terrain on another terrain.
+        Raises NotLocated with fewer than 3 seen stars, with stars on one line, and where the position is outside the
+        search area; BadInput bad_terrain on another terrain.
         """
         plane = stars_on_rim_plane(evidence, terrain)
         position = hull_position(plane.points_m[plane.seen], plane.wall_m, plane.radius_m)
-        return point_fix(position, PUBLISHED_SIGMA_M, terrain)
+        return point_fix(position, terrain)
 
 
 def hull_position(points_m: Array, wall_m: float, radius_m: float) -> Array:
-    """Position (2,) [m] from the seen stars' points (n, 2) on the rim's plane, `wall_m` above the camera."""
-    from scipy.spatial import ConvexHull
+    """Position (2,) [m] from the seen stars' points (n, 2) on the rim's plane, `wall_m` above the camera.
+
+    Raises NotLocated where the stars span no area.
+    """
+    from scipy.spatial import ConvexHull, QhullError
 
     if len(points_m) < 3:
         raise NotLocated(f"{len(points_m)} seen stars make no hull")
-    x, y = points_m[ConvexHull(_project_equidistant(points_m, wall_m)).vertices].T
+    try:
+        hull = ConvexHull(_project_equidistant(points_m, wall_m))
+    except QhullError as cause:
+        raise NotLocated(f"{len(points_m)} seen stars make no hull: they stand on one line") from cause
+    x, y = points_m[hull.vertices].T
     a = np.stack([np.ones_like(x), -2 * x, -2 * y], axis=1)
     q, *_ = np.linalg.lstsq(a, radius_m**2 - x * x - y * y, rcond=None)
     return -q[1:]

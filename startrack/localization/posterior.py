@@ -13,7 +13,7 @@ from startrack.localization.likelihood import SECTOR_EPSILON, SECTOR_RAD, Positi
 from startrack.localization.local_posterior import local_posterior
 from startrack.localization.nuisance import ShapeFit, estimate_horizon_bias, marginalize_horizon_bias, marginalize_shape
 from startrack.localization.summary import summarize
-from startrack.terrain import Terrain
+from startrack.terrain import Terrain, require_terrain
 from startrack.types import Array, Evidence, Fix, NotLocated
 
 MIN_ROWS = 8
@@ -45,6 +45,7 @@ class ExactPosterior:
 
         Raises NotLocated: insufficient_geometry, outside_search_area, inconsistent_evidence.
         """
+        terrain = require_terrain(terrain)
         announce_compilation()
         informative = (np.abs(evidence.llr) > MIN_ROW_NATS) | (evidence.extended_nats > MIN_ROW_NATS)
         informative &= terrain.is_informative(evidence.azimuth_rad, evidence.elevation_rad)

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.terrain import Terrain
-from startrack.types import Array, BadInput, Bools, Evidence, Fix, Mode
+from startrack.localization.summary import camera_at, require_inside
+from startrack.terrain import Terrain, require_terrain
+from startrack.types import Array, BadInput, Bools, Evidence, Fix, Mode, NotLocated
 
 DECISIVE_NATS = 5.0  # wrong for 1 star in 150; on a rendered 4 Mpx frame 3 nats double the pseudo-gradient's error
 
@@ -26,8 +27,9 @@ def stars_on_rim_plane(evidence: Evidence, terrain: Terrain) -> RimPlane:
     """The stars that a detection list would hold or lack: with decisive evidence, and above the lowest skyline.
 
     Faint stars whose light was not measured either way are on no list. A star lower than the rim seen from the opposite
-    wall is hidden from everywhere on the floor. Raises BadInput bad_terrain where the terrain is no cylinder.
+    wall is hidden from everywhere on the floor. Raises BadInput bad_terrain where the terrain is no cylinder, or none.
     """
+    terrain = require_terrain(terrain)
     certainty = np.abs(evidence.llr)
     evidence = evidence.take(certainty >= min(DECISIVE_NATS, 0.5 * float(certainty.max(initial=0.0))))
     disks = terrain.visible_disks(evidence.azimuth_rad, evidence.elevation_rad)
@@ -40,13 +42,23 @@ def stars_on_rim_plane(evidence: Evidence, terrain: Terrain) -> RimPlane:
     return RimPlane(points[above], evidence.llr[above] > 0, radius, wall)
 
 
-def point_fix(position_m: Array, sigma_m: float, terrain: Terrain) -> Fix:
-    """A fix of a method that states no covariance of its own: a round one of the method's published error per axis."""
+def point_fix(position_m: Array, terrain: Terrain) -> Fix:
+    """The fix at a position (2,) [m] of a method without a posterior: covariance and circles are infinite, not stated.
+
+    The method's published error is no substitute: it holds for the publication's skies, not for this evidence. Raises
+    NotLocated outside_search_area where the position is beyond the search radius or no camera can stand there.
+    """
+    require_inside(position_m[None], np.ones(1), terrain)
+    if not terrain.allowed(position_m[None])[0]:
+        raise NotLocated(
+            f"the stars place the camera at E {position_m[0]:.0f} m N {position_m[1]:.0f} m, where none can stand",
+            reason="outside_search_area",
+        )
     return Fix(
-        position_enu_m=np.array([*position_m, terrain.camera_height_m]),
-        covariance_m2=sigma_m**2 * np.eye(2),
-        radius95_m=2.448 * sigma_m,
-        radius999_m=3.717 * sigma_m,
+        position_enu_m=camera_at(position_m, terrain),
+        covariance_m2=np.full((2, 2), np.inf),
+        radius95_m=np.inf,
+        radius999_m=np.inf,
         modes=(Mode(east_m=float(position_m[0]), north_m=float(position_m[1]), weight=1.0),),
         ambiguous=False,
         search="approximate",

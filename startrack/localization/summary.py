@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.terrain import Terrain
-from startrack.types import Array, Fix, Ints, Mode, NotLocated
+from startrack.types import Array, Bools, Fix, Ints, Mode, NotLocated
 
 AMBIGUOUS_MASS = 0.01
 NEGLIGIBLE_MODE = 1e-4
@@ -25,14 +25,7 @@ def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_proba
     if not np.isfinite(log_weight).any():
         raise NotLocated("no position in the search area is possible: widen [search] radius_m in the terrain file?")
     weight = np.exp(log_weight - np.max(log_weight))
-    outside = np.einsum("ni,ni->n", centres_m, centres_m) > terrain.search_radius_m**2
-    if outside.any() and weight[outside].sum() > 0.5 * weight.sum():
-        raise NotLocated(
-            f"the stars place the camera outside the search area of {terrain.search_radius_m:.0f} m: "
-            "widen [search] radius_m in the terrain file if that can be true",
-            reason="outside_search_area",
-        )
-    keep = ~outside & (weight > NEGLIGIBLE_BOX)
+    keep = require_inside(centres_m, weight, terrain) & (weight > NEGLIGIBLE_BOX)
     centres_m, weight = centres_m[keep], weight[keep] / weight[keep].sum()
     mean, covariance = _moments(centres_m, weight, width_m)
     label = _modes(centres_m, weight, width_m, covariance)
@@ -48,9 +41,8 @@ def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_proba
     radius95, radius999 = _radii(centres_m - mean, weight, (0.95, 0.999), width_m)
     if not ambiguous and radius95 > USELESS_FRACTION * terrain.search_radius_m:
         raise NotLocated("the rays leave most of the search area open: is the skyline in the picture?")
-    up = float(terrain.ground_m(mean[None, :])[0]) + terrain.camera_height_m
     return Fix(
-        position_enu_m=np.array([mean[0], mean[1], up]),
+        position_enu_m=camera_at(mean, terrain),
         covariance_m2=covariance,
         radius95_m=radius95,
         radius999_m=radius999,
@@ -58,6 +50,27 @@ def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_proba
         ambiguous=ambiguous,
         dropped_probability=dropped_probability,
     )
+
+
+def require_inside(points_m: Array, weight: Array, terrain: Terrain) -> Bools:
+    """Which of the points (n, 2) [m] of these weights (n,) are within the search radius of the `terrain`.
+
+    Raises NotLocated outside_search_area where most of the weight is beyond it.
+    """
+    outside = np.einsum("ni,ni->n", points_m, points_m) > terrain.search_radius_m**2
+    if outside.any() and weight[outside].sum() > 0.5 * weight.sum():
+        raise NotLocated(
+            f"the stars place the camera outside the search area of {terrain.search_radius_m:.0f} m: "
+            "widen [search] radius_m in the terrain file if that can be true",
+            reason="outside_search_area",
+        )
+    return np.asarray(~outside)
+
+
+def camera_at(point_m: Array, terrain: Terrain) -> Array:
+    """East, north and up (3,) [m] of the camera that stands at a point (2,) [m] of the `terrain`."""
+    up_m = float(terrain.ground_m(point_m[None, :])[0]) + terrain.camera_height_m
+    return np.array([point_m[0], point_m[1], up_m])
 
 
 def smallest_axis(centres_m: Array, width_m: float, log_weight: Array) -> float:

@@ -37,9 +37,12 @@ from startrack.output.values import (
     body_deg,
     body_sigmas_deg,
     boresight_deg,
+    caution_text,
     chance_text,
     ellipse,
     exact_lens_text,
+    finite_or_none,
+    lacking_circle,
     latlon_deg,
     modes_text,
     predicted_visible,
@@ -93,6 +96,7 @@ class Quantity:
     description: str
     schema: Schema = field(default_factory=dict)
     before: Any = ABSENT  # in the record of a value that has not come as far: ABSENT, None, a number, or a function
+    nullable: bool = False  # whether it may be null of a value that has come as far
     optional: bool = False  # whether records of earlier stages or versions lack it although they have its section
     columns: tuple[Column, ...] = ()
     shown: tuple[Show, ...] = ()
@@ -142,8 +146,9 @@ QUANTITIES: tuple[Quantity, ...] = (
              Show("page", "Up", "{:,.2f} m"))),
     Q("position.on", "", Located, lambda at: at("position.terrain"), "the terrain, after the coordinates", derived=True,
       shown=(Show("text", "position", " on {}"), Show("notebook", "on", "{}"))),
-    Q("position.covariance_m2", "m^2", Located, lambda v: v.fix.covariance_m2.tolist(), "2 x 2, (east, north)",
-      {"type": "array", "items": numbers(2), "minItems": 2, "maxItems": 2},
+    Q("position.covariance_m2", "m^2", Located, lambda v: finite_or_none(v.fix.covariance_m2),
+      "2 x 2, (east, north); this and the circles are null of a method that states none",
+      {"type": "array", "items": numbers(2), "minItems": 2, "maxItems": 2}, nullable=True,
       columns=(Column("cov_east_east_m2", "%.6g", (0, 0)), Column("cov_east_north_m2", "%.6g", (0, 1)),
                Column("cov_north_north_m2", "%.6g", (1, 1)))),
     Q("position.sigma_east_m", "m", Located, sigma_m(0), "standard deviation of east", derived=True,
@@ -154,13 +159,14 @@ QUANTITIES: tuple[Quantity, ...] = (
       shown=(Show("text", "error", "sigma {0[0]:.2f} m by {0[1]:.2f} m"),
              Show("notebook", "one sigma", "{0[0]:.2f} m by {0[1]:.2f} m, long axis at azimuth {0[2]:.1f}°"),
              Show("page", "Sigma", "{0[0]:.2f} m by {0[1]:.2f} m"))),
-    Q("position.radius95_m", "m", Located, lambda v: v.fix.radius95_m,
-      "circle about the position that holds 95 % of the posterior", POSITIVE, columns=(Column("radius95_m", "%.4f"),),
+    Q("position.radius95_m", "m", Located, lambda v: finite_or_none(v.fix.radius95_m),
+      "circle about the position that holds 95 % of the posterior", POSITIVE, nullable=True,
+      columns=(Column("radius95_m", "%.4f"),),
       shown=(Show("summary", "radius", "±{:.1f} m (95 %)"), Show("text", "error", "; within {:.1f} m (95 %)"),
              Show("panel", "Position", "   ±{:.1f} m (95 %)"), Show("notebook", "95 % within", "{:.1f} m"),
              Show("page", "95 % within", "{:,.1f} m")), listed=Listed("± 95 %", 1, always=True)),
-    Q("position.radius999_m", "m", Located, lambda v: v.fix.radius999_m,
-      "circle about the position that holds 99.9 %", POSITIVE,
+    Q("position.radius999_m", "m", Located, lambda v: finite_or_none(v.fix.radius999_m),
+      "circle about the position that holds 99.9 %", POSITIVE, nullable=True,
       columns=(Column("radius999_m", "%.4f"),),
       shown=(Show("text", "error", ", {:.1f} m (99.9 %)"), Show("notebook", "99.9 % within", "{:.1f} m"),
              Show("page", "99.9 % within", "{:,.1f} m"))),
@@ -179,7 +185,11 @@ QUANTITIES: tuple[Quantity, ...] = (
       shown=(Show("text", "error", "; search {}"), Show("notebook", "search", "{}"), Show("page", "Search", "{}"))),
     Q("position.dropped_probability", "", Located, lambda v: v.fix.dropped_probability,
       "upper bound of the probability of the positions that the search left out; 1: not bounded; null: a "
-      "method without a posterior", {"anyOf": [CHANCE, {"type": "null"}]}, optional=True),
+      "method without a posterior", CHANCE, nullable=True, optional=True),
+    Q("position.lacking", "", Located, lacking_circle, "the circle that is not stated", derived=True,
+      shown=(Show("text", "error", "; {}"), Show("notebook", "95 % within", "{}"), Show("page", "95 % within", "{}"))),
+    Q("position.caution", "", Located, caution_text, "of a method without a posterior", derived=True,
+      shown=(Show("summary", "caution", "{}"), Show("panel", "Caution", "{}"))),
     Q("modes", "", Located, lambda v: [{"east_m": m.east_m, "north_m": m.north_m, "weight": m.weight}
                                        for m in v.fix.modes],
       "list of `east_m`, `north_m`, `weight`: the positions that fit, heaviest first; weights sum to 1. Ambiguous: "
@@ -281,7 +291,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Q("sky.brightness_mag_arcsec2", "mag/arcsec^2", Located, lambda v: v.sky_brightness_mag_arcsec2,
       "V of the sky beyond that of the ground at the skyline, by the camera's zero point and the exposure's duration; "
       "null where the image shows no step of light there, or one of the two is not known",
-      {"anyOf": [NUMBER, {"type": "null"}]}, columns=(Column("sky_mag_arcsec2", "%.4f"),),
+      NUMBER, nullable=True, columns=(Column("sky_mag_arcsec2", "%.4f"),),
       shown=show_everywhere("Sky", "{:.2f} mag/arcsec2", "evidence")),
     Q("provenance.version", "", Inputs, lambda v: __version__, "of startrack", TEXT),
     Q("provenance.image_sha256", "", Inputs, lambda v: v.exposure.sha256,

@@ -115,6 +115,22 @@ def ellipse(at: At) -> tuple[float, float, float] | None:
     return float(major), float(minor), float(np.degrees(np.arctan2(axes[0, 1], axes[1, 1]) % np.pi))
 
 
+def finite_or_none(value: Any) -> Any:
+    """A number or an array as JSON values, None where it is infinite: not stated."""
+    return np.asarray(value).tolist() if np.isfinite(value).all() else None
+
+
+def lacking_circle(at: At) -> str | None:
+    """A text where a position has no circle."""
+    return "no circle" if at("position.east_m") is not None and at("position.radius95_m") is None else None
+
+
+def caution_text(at: At) -> str | None:
+    """What a reader must know of a position of a method without a posterior; None of other positions."""
+    parts = ("approximate" if at("position.search") == "approximate" else None, at("position.lacking"))
+    return ", ".join(part for part in parts if part) or None
+
+
 def sigma_m(axis: int) -> Callable[[At], float | None]:
     """Standard deviation of east or north (`axis` 0, 1) [m]."""
 

@@ -93,10 +93,11 @@ def section_schema(section: str, description: str = "") -> Schema:
     optional: Schema = {}
     for one in QUANTITIES:
         if one.section == section and not one.derived and one.recorded:
-            nullable = one.before is None or callable(one.before)
-            schema = (
-                or_null(one.schema, one.description) if nullable else {**one.schema, "description": one.description}
-            )
+            schema = {**one.schema, "description": one.description}
+            if one.nullable:  # a list of types, so that a validator names what is wrong with an array
+                schema["type"] = [one.schema["type"], "null"]
+            elif one.before is None or callable(one.before):
+                schema = or_null(one.schema, one.description)
             (optional if one.optional else required)[one.key] = schema
     return record(required, description, optional)
 

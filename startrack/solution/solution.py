@@ -72,13 +72,13 @@ class Solution:
 
     @property
     def covariance_m2(self) -> Array | None:
-        """Covariance of (east, north), (2, 2) [m2]."""
+        """Covariance of (east, north), (2, 2) [m2]; infinite of a method that states none."""
         fix = self._fix
         return None if fix is None else fix.covariance_m2
 
     @property
     def radius95_m(self) -> float | None:
-        """Radius [m] of the circle about the position that holds 95 % of the posterior."""
+        """Radius [m] of the circle that holds 95 % of the posterior; infinite of a method that states none."""
         fix = self._fix
         return None if fix is None else fix.radius95_m
 

@@ -61,7 +61,10 @@ class Ellipse(Shown):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Position(Shown):
-    """Position of the camera: the posterior's mean in the terrain's frame `enu`, with its uncertainty."""
+    """Position of the camera: the posterior's mean in the terrain's frame `enu`, with its uncertainty.
+
+    Covariance and circles of a method that states none are infinite.
+    """
 
     east: Quantity  # [m] from the terrain's origin
     north: Quantity  # [m]
@@ -81,11 +84,14 @@ class Position(Shown):
 
     @property
     def ellipse(self) -> Ellipse:
-        """The covariance as an ellipse of one sigma."""
+        """The covariance as an ellipse of one sigma; of an infinite one both semi-axes are infinite."""
         from astropy import units as u
         from astropy.coordinates import Angle
 
-        squares, axes = np.linalg.eigh(self.covariance.to_value(u.m**2))
+        covariance_m2 = self.covariance.to_value(u.m**2)
+        if not np.isfinite(covariance_m2).all():
+            return Ellipse(np.inf * u.m, np.inf * u.m, Angle(0.0, u.deg))
+        squares, axes = np.linalg.eigh(covariance_m2)
         minor, major = np.sqrt(np.maximum(squares, 0.0)) * u.m
         azimuth_rad = np.arctan2(axes[0, 1], axes[1, 1]) % np.pi
         return Ellipse(major, minor, Angle(np.degrees(azimuth_rad), u.deg))

@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from startrack.declaration import Number
 from startrack.frames import Site
 from startrack.terrain.protocol import Terrain
-from startrack.types import Array, Bools
+from startrack.types import Array, BadInput, Bools
+
+MAX_LENGTH_M = 1e7  # five times the Moon's radius
+MAX_SHAPE_SIGMA = 0.2  # of depth and diameter; the posterior of the shape is expanded about the stated one
+LENGTH = Number(low=0.0, high=MAX_LENGTH_M, above=True)
+CAMERA_HEIGHT = Number(low=0.0, high=MAX_LENGTH_M)
+_SIGMA = Number(low=0.0, high=MAX_LENGTH_M, default=0.0)
+CYLINDER_KEYS = {  # of [cylinder] in a terrain file, and of the class
+    "diameter_m": replace(LENGTH, required=True),
+    "depth_m": replace(LENGTH, required=True),
+    "depth_sigma_m": _SIGMA,
+    "diameter_sigma_m": _SIGMA,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cylinder(Terrain):
     """tan H = (depth - camera height) / d(p, a), d the distance from p along azimuth a to the circle of the rim.
 
-    Source: Kua 2008, section 3.1 (eq. 3.1 seen from the camera's height instead of the floor).
+    Source: Kua 2008, section 3.1 (eq. 3.1 seen from the camera's height instead of the floor). Raises BadInput
+    bad_terrain for lengths that are no numbers, not positive or above 10,000 km, for a camera that is not below the
+    rim, and for a `depth_sigma_m` or `diameter_sigma_m` of a fifth or more. `search_radius_m` may be infinite.
     """
 
     name: str = "cylinder"
@@ -29,6 +45,23 @@ class Cylinder(Terrain):
     diameter_sigma_m: float = 0.0
     axisymmetric = True
     horizon_cost = 0.02
+
+    def __post_init__(self) -> None:
+        declared = {**CYLINDER_KEYS, "camera_height_m": CAMERA_HEIGHT}
+        if self.search_radius_m != np.inf:
+            declared["search_radius_m"] = LENGTH
+        try:
+            for key, kind in declared.items():
+                object.__setattr__(self, key, kind.check(getattr(self, key), key))
+        except ValueError as cause:
+            raise BadInput("bad_terrain", str(cause)) from cause
+        if self.camera_height_m >= self.depth_m:
+            raise BadInput(
+                "bad_terrain", f"camera_height_m is {self.camera_height_m:g}: the camera must be below the rim"
+            )
+        for key, size in (("depth_sigma_m", self.depth_m), ("diameter_sigma_m", self.diameter_m)):
+            if getattr(self, key) >= MAX_SHAPE_SIGMA * size:
+                raise BadInput("bad_terrain", f"{key} must be below {MAX_SHAPE_SIGMA * size:g} m, a fifth of it")
 
     @property
     def radius_m(self) -> float:
@@ -94,11 +127,10 @@ class Cylinder(Terrain):
     def reshaped(self, shape: Array) -> Cylinder:
         """The crater shape[0] steeper and shape[1] larger (relative)."""
         steeper, larger = float(shape[0]), float(shape[1])
-        return replace(
-            self,
-            depth_m=self.depth_m * (1 + steeper) * (1 + larger),
-            diameter_m=self.diameter_m * (1 + larger),
-        )
+        other = copy(self)  # `replace` would check it, and the search tries craters beyond the limits of a stated one
+        object.__setattr__(other, "depth_m", self.depth_m * (1 + steeper) * (1 + larger))
+        object.__setattr__(other, "diameter_m", self.diameter_m * (1 + larger))
+        return other
 
     def facts(self) -> dict[str, Any]:
         """Diameter and depth, as JSON values."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,17 +13,13 @@ import numpy as np
 from startrack.declaration import Choice, Either, List, Number, Table, Text
 from startrack.files import resolve_named
 from startrack.frames import Site
-from startrack.terrain.cylinder import Cylinder
+from startrack.terrain.cylinder import CAMERA_HEIGHT, CYLINDER_KEYS, LENGTH, MAX_LENGTH_M, Cylinder
 from startrack.terrain.protocol import Terrain
 from startrack.types import BadInput
 
 DEFAULT_MAP_RADIUS_M = 10_000.0  # of the search area on height maps
 DEFAULT_CAMERA_HEIGHT_M = 1.5
-MAX_LENGTH_M = 1e7  # five times the Moon's radius
-MAX_SHAPE_SIGMA = 0.2  # of depth and diameter; the posterior of the shape is expanded about the stated one
 
-LENGTH = Number(low=0.0, high=MAX_LENGTH_M, above=True)
-SIGMA = Number(low=0.0, high=MAX_LENGTH_M, default=0.0)
 FILE = Text(max_chars=4000)
 KEYS = Table(
     keys={
@@ -40,12 +37,7 @@ KEYS = Table(
         ),
         "cylinder": Table(
             description="Axis through the origin; floor at z = 0.",
-            keys={
-                "diameter_m": Number(low=0.0, high=MAX_LENGTH_M, above=True, required=True),
-                "depth_m": Number(low=0.0, high=MAX_LENGTH_M, above=True, required=True),
-                "depth_sigma_m": SIGMA,
-                "diameter_sigma_m": SIGMA,
-            },
+            keys=CYLINDER_KEYS,
         ),
         "dem": Table(
             description="Height maps on the Moon's sphere; heights above it, posts at pixel centres, bilinear between.",
@@ -61,7 +53,7 @@ KEYS = Table(
             },
         ),
         "rover": Table(
-            keys={"camera_height_m": Number(low=0.0, high=MAX_LENGTH_M, default=DEFAULT_CAMERA_HEIGHT_M)}
+            keys={"camera_height_m": replace(CAMERA_HEIGHT, default=DEFAULT_CAMERA_HEIGHT_M)}
         ),
         "search": Table(
             keys={
@@ -148,22 +140,12 @@ def terrain_from_dict(values: dict[str, Any], default_name: str = "terrain", fol
 
 def _make_cylinder(keys: dict[str, Any], name: str, site: Site) -> Cylinder:
     cylinder, search = keys["cylinder"], keys.get("search", {})
-    diameter, depth = cylinder["diameter_m"], cylinder["depth_m"]
-    camera_height = keys.get("rover", {}).get("camera_height_m", DEFAULT_CAMERA_HEIGHT_M)
-    if camera_height >= depth:
-        raise BadInput("bad_terrain", f"rover.camera_height_m is {camera_height:g}: the camera must be below the rim")
-    for key, size in (("depth_sigma_m", depth), ("diameter_sigma_m", diameter)):
-        if cylinder[key] >= MAX_SHAPE_SIGMA * size:
-            raise BadInput("bad_terrain", f"cylinder.{key} must be below {MAX_SHAPE_SIGMA * size:g} m, a fifth of it")
     return Cylinder(
         name=name,
         site=site,
-        diameter_m=diameter,
-        depth_m=depth,
-        camera_height_m=camera_height,
-        search_radius_m=search.get("radius_m", diameter / 2),
-        depth_sigma_m=cylinder["depth_sigma_m"],
-        diameter_sigma_m=cylinder["diameter_sigma_m"],
+        camera_height_m=keys.get("rover", {}).get("camera_height_m", DEFAULT_CAMERA_HEIGHT_M),
+        search_radius_m=search.get("radius_m", cylinder["diameter_m"] / 2),
+        **cylinder,
     )
 
 

@@ -167,6 +167,8 @@ def require_terrain(given: Any) -> Terrain:
     members = [name for name in dir(Terrain) if not name.startswith("_")]
     if isinstance(given, Terrain) or all(hasattr(given, name) for name in members):
         return given  # type: ignore[no-any-return]
+    if isinstance(given, str):
+        raise BadInput("bad_terrain", f"{given!r} is a text, no terrain: give startrack.load_terrain({given!r})")
     missing = [name for name in sorted(Terrain.__abstractmethods__) if not hasattr(given, name)]
     lacks = f" (it has no {', '.join(missing)})" if missing else ""
     raise BadInput(

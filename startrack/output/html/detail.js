@@ -28,7 +28,8 @@ function showDetail(host, k) {
 function leadOf(value) {
   if (known(value("east_m"))) {
     const error = known(value("error_m")) ? ` The true position is ${say(value("error_m"), 1, "m")} away.` : "";
-    return `East ${say(value("east_m"), 1, "m")}, north ${say(value("north_m"), 1, "m")}, within ${say(value("radius95_m"), 1, "m")} (95 %).${error}`;
+    const within = known(value("radius95_m")) ? `within ${say(value("radius95_m"), 1, "m")} (95 %)` : "approximate, no circle";
+    return `East ${say(value("east_m"), 1, "m")}, north ${say(value("north_m"), 1, "m")}, ${within}.${error}`;
   }
   return value("status") === "ok" ? `${say(value("identified"), 0)} stars named.` : "";
 }
@@ -69,7 +70,7 @@ function panoramaCard(detail, stars, name) {
 
 function mapsCard(record, real, name) {
   if (!record.position && !record.modes?.length) return null;
-  const close = record.position ? panel("The position and how sure it is", placeView(record, real, name)) : null;
+  const close = known(record.position?.radius95_m) ? panel("The position and how sure it is", placeView(record, real, name)) : null;
   const area = panel(`The search area${record.provenance?.terrain ? ` on ${fileName(record.provenance.terrain)}` : ""}; north is up`, areaView(record, real, name));
   return section("Map", make("div", { class: close ? "pair" : "single" }, area, close), mapLegend(record, real));
 }

@@ -101,12 +101,14 @@ function sideText(v, g, text, [x, y], gap) {
 }
 
 function placesOf(record, real) {
-  const places = (record.modes || []).map((mode, k) => ({
+  const p = record.position;
+  const stated = p && known(p.radius95_m);
+  const places = (p && !stated ? [] : record.modes || []).map((mode, k) => ({
     x: mode.east_m, y: mode.north_m, title: record.modes.length > 1 ? `Position ${k + 1}` : "Posterior's peak",
     rows: [["probability", `${say(100 * mode.weight, mode.weight > 0.9995 ? 0 : 1)} %`]], weight: mode.weight,
   }));
-  const p = record.position;
-  if (p) places.unshift({ x: p.east_m, y: p.north_m, title: "Position", rows: [["95 % within", say(p.radius95_m, 1, "m")], ["99.9 % within", say(p.radius999_m, 1, "m")]] });
+  const circles = stated ? [["95 % within", say(p.radius95_m, 1, "m")], ["99.9 % within", say(p.radius999_m, 1, "m")]] : [["approximate", "no circle"]];
+  if (p) places.unshift({ x: p.east_m, y: p.north_m, title: "Position", rows: circles });
   if (real) places.push({ x: real[0], y: real[1], title: "True position", rows: [["", "not known to the method"]], real: true });
   return places;
 }
@@ -155,8 +157,8 @@ function placeView(record, real, name) {
 
 function mapLegend(record, real) {
   const item = (kind, text) => make("li", {}, make("span", { class: `key ${kind}`, "aria-hidden": "true" }), text);
-  const posterior = record.position ? [item("solid", "95 % of the posterior"), item("dashed", "99.9 %"), item("filled", "covariance, one sigma")] : [];
-  const others = record.status === "ok" ? [] : [item("dot", "position that fits, with its probability")];
+  const posterior = known(record.position?.radius95_m) ? [item("solid", "95 % of the posterior"), item("dashed", "99.9 %"), item("filled", "covariance, one sigma")] : [];
+  const others = record.status !== "ok" ? [item("dot", "position that fits, with its probability")] : posterior.length ? [] : [item("dot", "position, approximate")];
   return make("ul", { class: "legend" }, ...posterior, ...others, real ? item("plus", "true position") : null);
 }
 

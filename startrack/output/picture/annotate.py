@@ -107,7 +107,7 @@ def _inputs_text(value: Inputs) -> str:
 def _draw_figures(canvas: Canvas, room: Box, value: Inputs, truth: tuple[float, float] | None) -> float:
     """Maps where there is a terrain, else residuals; returns where the next thing may stand."""
     left, top, right, bottom = room
-    zoomed = isinstance(value, Located) and not value.fix.ambiguous
+    zoomed = _has_circle(value)
     tallest = right - left if not zoomed else np.inf
     bottom = min(bottom, top + tallest)
     if bottom - top < LOWEST_FIGURE_PX:
@@ -121,10 +121,15 @@ def _draw_figures(canvas: Canvas, room: Box, value: Inputs, truth: tuple[float, 
     fix = value.fix if isinstance(value, Located) else None
     ambiguous = fix is not None and fix.ambiguous
     overview = draw_overview(canvas, (left, top, right, split), value.terrain, fix, ambiguous, truth)
-    if fix is not None and not ambiguous:
+    if fix is not None and zoomed:
         zoom = draw_zoom(canvas, (left, split + 16, right, bottom), fix, truth)
         draw_leaders(canvas, overview, zoom)
     return bottom + 12
+
+
+def _has_circle(value: Inputs) -> bool:
+    """Whether the `value` has a position with a circle that can be drawn."""
+    return isinstance(value, Located) and not value.fix.ambiguous and bool(np.isfinite(value.fix.radius95_m))
 
 
 def _facts(value: Inputs) -> Rows:
@@ -151,7 +156,8 @@ def _legend(value: Inputs, truth: bool) -> list[tuple[str, Colour, str]]:
         found += [("ring", BODY, "planet, Sun, Earth or Moon, where it must be")]
     if isinstance(value, Located) and not value.fix.ambiguous:
         found += [("line", SKYLINE, "skyline of the terrain seen from the position found")]
-        found += [("disc", POSITION, "position; circle 95 %, ellipse one sigma")]
+        around = "; circle 95 %, ellipse one sigma" if _has_circle(value) else ""
+        found += [("disc", POSITION, f"position{around}")]
     if isinstance(value, Located) and value.fix.ambiguous:
         found += [("line", SKYLINE, "skyline of the terrain seen from position 1")]
         found += [("disc", POSITION, "position that fits the stars, with its probability")]

@@ -53,10 +53,6 @@ class Reason(StrEnum):
         "bad_terrain", EXIT_BAD_INPUT, "No terrain file is known, or it cannot be used",
         "Give a terrain file with -t or in NAME.json, and correct what the message names.",
     )  # fmt: skip
-    BAD_CATALOG = (
-        "bad_catalog", EXIT_BAD_INPUT, "No shipped star catalogue has this name",
-        "Give a name that the message lists; startrack doctor shows whether the data files are complete.",
-    )  # fmt: skip
     NO_CLUSTER = (
         "no_cluster", EXIT_BAD_INPUT, "The cluster of --cluster cannot be reached",
         "Start a Dask scheduler and give its address, such as tcp://host:8786.",

@@ -217,7 +217,7 @@ def test_unknown_catalogue_names_the_known() -> None:
     for name in ("tycho", None):
         with pytest.raises(BadInput, match=rf"is called {name!r} .*hipparcos") as caught:
             load_catalog(name)
-        assert caught.value.reason == "bad_catalog"
+        assert caught.value.reason == "bad_calibration"
 
 
 def test_names(catalog: StarCatalog) -> None:

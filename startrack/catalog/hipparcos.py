@@ -111,13 +111,13 @@ def load_catalog(name: str = "hipparcos") -> StarCatalog:
     """Every star of the shipped catalogue `name`, read once in a process.
 
     Raises:
-        BadInput: bad_catalog, no such catalogue; the message lists the shipped ones.
+        BadInput: bad_calibration, no such catalogue; the message lists the shipped ones.
     """
     folder = data_dir("catalogs")
     path = folder / f"{name}.npy"
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in folder.glob("*.npy"))) or "none"
-        raise BadInput("bad_catalog", f"no star catalogue is called {name!r} in {folder}; there: {known}")
+        raise BadInput("bad_calibration", f"no star catalogue is called {name!r} in {folder}; there: {known}")
     t = np.load(path, allow_pickle=False)
     ra, dec = t["ra"] * ANGLE_UNIT_RAD, t["dec"] * ANGLE_UNIT_RAD
     sin_ra, cos_ra, sin_dec, cos_dec = np.sin(ra), np.cos(ra), np.sin(dec), np.cos(dec)

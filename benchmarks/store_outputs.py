@@ -1,8 +1,8 @@
 """Store the outputs of the commands of one version, for benchmarks/compare_outputs.py.
 
-    OLD/python benchmarks/store_outputs.py /tmp/old --frames SCENES
-    NEW/python benchmarks/store_outputs.py /tmp/new --frames SCENES --batch /tmp/old/frames
-    NEW/python benchmarks/compare_outputs.py /tmp/old /tmp/new
+    OLD/python benchmarks/store_outputs.py outputs-old --frames SCENES
+    NEW/python benchmarks/store_outputs.py outputs-new --frames SCENES --batch outputs-old/frames
+    NEW/python benchmarks/compare_outputs.py outputs-old outputs-new
 
 Runs the command `startrack` that lies beside the interpreter, one process at a time, and imports nothing of the
 package, so that it works with every version. OUT must be new or empty. It gets

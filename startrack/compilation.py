@@ -74,7 +74,8 @@ def discard_stale_kernels() -> None:
     nor the types of its arguments. Called before numba loads.
     """
     key = hashlib.sha256(__version__.encode())
-    for source in sorted(PACKAGE.rglob("*.py")):
+    sources = sorted(PACKAGE.rglob("*.py"))
+    for source in sources:
         status = source.stat()
         key.update(f"{source.name} {status.st_size} {status.st_mtime_ns}".encode())
     folder = os.environ.get(VARIABLE)
@@ -83,7 +84,7 @@ def discard_stale_kernels() -> None:
     with suppress(OSError):  # another process may be doing the same
         if file.is_file() and file.read_text() == key.hexdigest():
             return
-        for source in PACKAGE.rglob("*.py"):
+        for source in sources:
             for index in _indices_of(source):
                 index.unlink(missing_ok=True)
         file.parent.mkdir(parents=True, exist_ok=True)

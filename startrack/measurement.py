@@ -14,8 +14,8 @@ from startrack.evidence import (
     StarEvidence,
     StarPhotometry,
     flux_scale,
+    height_above_px,
     measure_sky_step,
-    near_skyline,
     reliable_azimuths,
     subtract_sky_step,
 )  # fmt: skip
@@ -96,12 +96,12 @@ def remeasure_near_skyline(measured: Measured, fix: Fix, step: SkyStep, photomet
     reliable = reliable_azimuths(horizon, [Skyline.trace(position_m + axis, terrain) for axis in axes], camera, R)
     light = measured.light
     azimuth, elevation = light.azimuth_rad, light.elevation_rad
-    wanted = near_skyline(azimuth, elevation, camera, R, horizon, REMEASURED_PX) & reliable(azimuth)
-    around = near_skyline(azimuth, elevation, camera, R, horizon, REMEASURED_PX + NEIGHBOURS_PX)
+    above_px, is_reliable = height_above_px(azimuth, elevation, camera, R, horizon), reliable(azimuth)
+    wanted = (np.abs(above_px) < REMEASURED_PX) & is_reliable
+    around = np.abs(above_px) < REMEASURED_PX + NEIGHBOURS_PX
     # The fix determines the visibility of neighbours better than their faint flux does, except next to the skyline.
-    above = elevation - horizon(azimuth)
-    undecided = near_skyline(azimuth, elevation, camera, R, horizon, UNDECIDED_PX) | ~reliable(azimuth)
-    by_fix = np.where(above > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)
+    undecided = (np.abs(above_px) < UNDECIDED_PX) | ~is_reliable
+    by_fix = np.where(above_px > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)
     visible = np.where(undecided, 1.0 / (1.0 + np.exp(-light.llr)), by_fix)
     newer = _photometry(
         measured, terrain, measured.R_enu_icrs, photometry, detections, light.star[around], visible[around]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from startrack.camera import Camera, Pinhole, load_camera
-from startrack.evidence import measure_sky_step, near_skyline, reliable_azimuths, subtract_sky_step
+from startrack.evidence import height_above_px, measure_sky_step, reliable_azimuths, subtract_sky_step
 from startrack.evidence.sky_step import _azimuth_and_height
 from startrack.terrain import load_terrain
 from startrack.types import Detections
@@ -82,7 +82,7 @@ def test_distances_from_the_skyline_are_pixels_in_every_lens():
         horizon = partial(np.full_like, fill_value=skyline_rad)
         px_rad = np.sin(skyline_rad) ** 2 / 1000.0
         elevation = skyline_rad + np.array([11.0, 13.0]) * px_rad
-        assert near_skyline(np.zeros(2), elevation, pinhole, R_CAM_ENU, horizon, 12.0).tolist() == [True, False]
+        assert (height_above_px(np.zeros(2), elevation, pinhole, R_CAM_ENU, horizon) < 12.0).tolist() == [True, False]
 
 
 def test_right_below_a_wall_the_skyline_is_not_known():
@@ -99,4 +99,5 @@ def test_right_below_a_wall_the_skyline_is_not_known():
 def test_near_means_pixels():
     azimuth = np.zeros(3)
     height = CRATER.horizon_rad(PLACE[None], np.zeros(1))[0] + np.array([-20, 0, 20]) / 652.0
-    assert near_skyline(azimuth, height, CAMERA, R_CAM_ENU, horizon_at(PLACE), 12.0).tolist() == [False, True, False]
+    above_px = height_above_px(azimuth, height, CAMERA, R_CAM_ENU, horizon_at(PLACE))
+    assert (np.abs(above_px) < 12.0).tolist() == [False, True, False]

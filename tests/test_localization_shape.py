@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from startrack.localization import ExactPosterior, check_consistency
-from startrack.localization.branch_and_bound import Explored
-from startrack.localization.consistency import MIN_EXPLAINED_NATS, explained_by_sector
+from startrack.localization.consistency import MIN_EXPLAINED_NATS, SureRows
+from startrack.localization.explored import Explored
 from startrack.localization.nuisance import marginalize_shape
 from startrack.terrain import Cylinder, Terrain, load_terrain
 from startrack.types import Evidence, NotLocated
@@ -80,9 +80,9 @@ def test_a_position_that_explains_the_stars_badly_is_refused() -> None:
     """The evidence of one position, and a fix elsewhere that no single star contradicts clearly."""
     evidence = evidence_at(PLACES[0], seed=3)
     fix = ExactPosterior()(evidence, TRUE)
-    assert explained_by_sector(evidence, fix, TRUE).mean() > -1.0
+    assert SureRows.at_fix(evidence, fix, TRUE).explained_by_sector.mean() > -1.0
     aside = replace(fix, position_enu_m=fix.position_enu_m + np.array([1500.0, 0.0, 0.0]))
-    assert explained_by_sector(evidence, aside, TRUE).mean() < MIN_EXPLAINED_NATS
+    assert SureRows.at_fix(evidence, aside, TRUE).explained_by_sector.mean() < MIN_EXPLAINED_NATS
     with pytest.raises(NotLocated, match=r"explains the strongest rows badly.*most at azimuths"):
         check_consistency(evidence, aside, TRUE)
 

@@ -4,8 +4,8 @@ from startrack.evidence.flux_scale import FluxScale, flux_scale
 from startrack.evidence.sky_step import (
     Skyline,
     SkyStep,
+    height_above_px,
     measure_sky_step,
-    near_skyline,
     reliable_azimuths,
     subtract_sky_step,
 )  # fmt: skip
@@ -18,8 +18,8 @@ __all__ = [
     "StarEvidence",
     "StarPhotometry",
     "flux_scale",
+    "height_above_px",
     "measure_sky_step",
-    "near_skyline",
     "reliable_azimuths",
     "subtract_sky_step",
 ]

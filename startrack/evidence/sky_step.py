@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
-from startrack.frames import azel_from_rays, rays_from_azel
+from startrack.frames import azel_from_rays, off_axis_rad, rays_from_azel
 from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Detections, Ints
 
@@ -93,8 +93,7 @@ def measure_sky_step(detections: Detections, camera: Camera, R_cam_enu: Array, h
     """
     azimuth = np.linspace(0.0, 2 * np.pi, STEP_SAMPLES, endpoint=False)
     elevation = horizon(azimuth)
-    skyline_cam = rays_from_azel(azimuth, elevation) @ R_cam_enu.T
-    angle = np.arctan2(np.hypot(skyline_cam[:, 0], skyline_cam[:, 1]), skyline_cam[:, 2])
+    angle = off_axis_rad(rays_from_azel(azimuth, elevation) @ R_cam_enu.T)
     shift_rad = np.multiply.outer(STEP_OFFSETS_PX, 1.0 / _px_per_rad(camera, angle))
     rays_enu = rays_from_azel(azimuth, elevation + shift_rad)
     xy_px, inside = camera.project(rays_enu @ R_cam_enu.T)
@@ -159,15 +158,15 @@ def reliable_azimuths(
     return is_reliable
 
 
-def near_skyline(
-    azimuth_rad: Array, elevation_rad: Array, camera: Camera, R_cam_enu: Array, horizon: Horizon, within_px: float
-) -> Bools:
-    """Which directions (n,), `azimuth_rad` and `elevation_rad`, lie within `within_px` pixels of a `horizon`.
+def height_above_px(
+    azimuth_rad: Array, elevation_rad: Array, camera: Camera, R_cam_enu: Array, horizon: Horizon
+) -> Array:
+    """Height above a `horizon` [px] of directions (n,), `azimuth_rad` and `elevation_rad`.
 
     `camera` and `R_cam_enu` give the scale of a pixel in each direction.
     """
     px_per_rad = _px_per_rad_at(azimuth_rad, elevation_rad, camera, R_cam_enu)
-    return np.asarray(np.abs(elevation_rad - horizon(azimuth_rad)) * px_per_rad < within_px)
+    return np.asarray((elevation_rad - horizon(azimuth_rad)) * px_per_rad)
 
 
 def _band(shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Bools:
@@ -189,8 +188,7 @@ def _azimuth_and_height(xy_px: Array, camera: Camera, R_cam_enu: Array, horizon:
 
 def _px_per_rad_at(azimuth_rad: Array, elevation_rad: Array, camera: Camera, R_cam_enu: Array) -> Array:
     """Scale of the image (n,) in directions of enu; beyond the lens's view that of its edge."""
-    rays_cam = rays_from_azel(azimuth_rad, elevation_rad) @ R_cam_enu.T
-    angle = np.arctan2(np.hypot(rays_cam[:, 0], rays_cam[:, 1]), rays_cam[:, 2])
+    angle = off_axis_rad(rays_from_azel(azimuth_rad, elevation_rad) @ R_cam_enu.T)
     return _px_per_rad(camera, np.minimum(angle, camera.max_angle_rad))
 
 

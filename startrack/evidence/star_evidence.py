@@ -11,7 +11,7 @@ from startrack.camera import Camera
 from startrack.evidence.flux_scale import FluxScale
 from startrack.evidence.likelihood_ratio import gaussian_llr, visibility_llr
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure
-from startrack.frames import angle_between_rad, azel_from_rays
+from startrack.frames import angle_between_rad, azel_from_rays, off_axis_rad
 from startrack.psf import noise_area_px
 from startrack.types import Array, Body, Bools, Detections, Evidence, Ints, Stars
 
@@ -125,7 +125,7 @@ class StarEvidence:
         xy, inside = camera.project(rays_cam)
         brightest = np.flatnonzero(inside)[: _max_stars(camera, self.crowded * noise_area_px(sigma_px))]
         star, xy, rays_cam, rays_icrs = star[brightest], xy[brightest], rays_cam[brightest], rays_icrs[brightest]
-        angle = np.arctan2(np.hypot(rays_cam[:, 0], rays_cam[:, 1]), rays_cam[:, 2])
+        angle = off_axis_rad(rays_cam)
         expected = scale.flux_e(stars.v_mag[star], angle, camera)
         # A misplaced profile loses light. The rays do not depend on the lens: they are the catalogue's.
         misplaced2 = position_sigma_px**2 + (

@@ -19,10 +19,19 @@ from startrack.localization.boxes import Boxes, split_boxes
 from startrack.localization.score_kernel import smaller_sigma
 from startrack.localization.sector_likelihood import log_mixture, row_range
 
-LOG_POINT_M2 = log(100.0)  # boxes of larger area hold more probability: they are dropped at that lower likelihoods
+LOG_POINT_M2 = log(100.0)  # area of a box from which it counts as large
 SETTLED_NATS = 1e-9  # a row whose contribution varies by less over a box is settled there
 DIGITS_NATS = 37.0  # what is smaller than this beside 1 has no digit in a float64
 DOOM_EVERY = 32  # rows between two tests whether a box can still matter
+
+
+@njit(cache=True, nogil=True)
+def prune_nats_of_box(prune_nats, half):
+    """By how much less likely than the best position a box of that half side [m] is dropped: more for a large box.
+
+    A large box holds more probability at the same likelihood.
+    """
+    return prune_nats + max(0.0, log(4.0 * half * half) - LOG_POINT_M2)
 
 
 @njit(cache=True, nogil=True)
@@ -52,7 +61,7 @@ def bound_boxes(rows, boxes, centres, half, parent, allowed, strength, weakest, 
     kept_row = np.empty(space, dtype=boxes.row.dtype)
     kept_least, kept_most = np.empty(0 if disks else space), np.empty(0 if disks else space)
     cell = log(4.0 * half * half)
-    prune_nats += max(0.0, cell - LOG_POINT_M2)
+    prune_nats = prune_nats_of_box(prune_nats, half)
     dropped, enough = -inf, certain - negligible_nats - cell
     certain = -inf
     n, used, pair = 0, 0, 0

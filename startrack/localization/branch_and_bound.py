@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, Protocol, cast
 
 import numpy as np
 
-from startrack.localization.box_kernel import LOG_POINT_M2, bound_boxes, refine_disks
+from startrack.localization.box_kernel import bound_boxes, prune_nats_of_box, refine_disks
 from startrack.localization.boxes import NO_NUMBERS, Boxes, open_pairs, split_boxes
+from startrack.localization.explored import BudgetSpent, Explored, log_sum
 from startrack.localization.initial_guess import Guess, beam_search, holds_allowed_ground
 from startrack.localization.likelihood import PARTS, PositionLikelihood
 from startrack.localization.summary import smallest_axis
@@ -47,27 +48,6 @@ class SearchSettings(Protocol):
     def most_boxes(self) -> int: ...
     @property
     def budget_horizons(self) -> float: ...
-
-
-class Explored(NamedTuple):
-    """The posterior on equal boxes."""
-
-    centres_m: Array  # (n, 2)
-    half_m: float
-    log_likelihood: Array  # (n,) at the centres
-    log_dropped: float  # logarithm of a bound of the mass [m2] that was dropped
-    search: str  # "proven" or "beam"
-    horizon_bias_rad: float = 0.0  # how much higher than the terrain's the horizon was taken
-
-
-class BudgetSpent(Exception):
-    """The search has traced as many horizons as it may, and boxes of `open_m2` may still matter."""
-
-    def __init__(self, centres_m: Array, upper: Array, half_m: float) -> None:
-        super().__init__(len(upper), half_m)
-        self.centres_m = centres_m[np.argsort(-upper, kind="stable")]  # (n, 2) of the boxes, the best bounded first
-        self.open_m2 = len(upper) * 4 * half_m**2
-        self.log_open = log_sum(upper) + float(np.log(4 * half_m**2))  # bound of their mass [m2]
 
 
 @dataclass
@@ -203,7 +183,7 @@ class Search:
         sure = lower[np.asarray(self.terrain.allowed(centres))]
         self.best = max(self.best, float(sure.max(initial=-np.inf)))
         negligible = log_sum(sure) - settings.negligible_nats
-        keep = upper > max(self.best - settings.prune_nats - max(0.0, cell - LOG_POINT_M2), negligible)
+        keep = upper > max(self.best - prune_nats_of_box(settings.prune_nats, half), negligible)
         self.log_dropped = float(np.logaddexp(self.log_dropped, log_sum(upper[~keep]) + cell))
         return keep, upper[keep]
 
@@ -336,9 +316,3 @@ class Search:
 def explains_all_sectors(log_likelihood: float, likelihood: PositionLikelihood) -> bool:
     """Whether a position explains the evidence as well as a true one: positions hundreds of metres away do not."""
     return log_likelihood > ACCEPTED_NATS * likelihood.sectors.occupied
-
-
-def log_sum(values: Array) -> float:
-    """Logarithm of the sum of exponentials; -inf of none."""
-    top = float(np.max(values, initial=-np.inf))
-    return top + float(np.log(np.sum(np.exp(values - top)))) if np.isfinite(top) else -np.inf

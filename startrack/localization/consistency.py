@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -40,15 +41,82 @@ REFITS = ((40.0, 16.0, 5), (12.0, 4.0, 3))  # neighbourhood [m], first step [m],
 REFIT_LLR, REFIT_ROWS, LAST_REFIT_M = 1.0, 2000, 1.0  # of many rows only the strong ones decide where to climb
 
 
+@dataclass(frozen=True, eq=False)
+class SureRows:
+    """The rows of great |llr|, and the horizon at a fix, traced once.
+
+    Of weaker rows some level skyline always fits the noise better than the true one.
+    """
+
+    evidence: Evidence
+    fix: Fix
+    terrain: Terrain
+    horizon_rad: Array  # (n,) at the rows' azimuths
+
+    @classmethod
+    def at_fix(cls, evidence: Evidence, fix: Fix, terrain: Terrain) -> SureRows:
+        """Those of the evidence, at the position of a fix on a terrain."""
+        rows = evidence.take(np.abs(evidence.llr) > SURE_LLR)
+        horizon = terrain.horizon_rad(fix.position_enu_m[None, :2], rows.azimuth_rad)
+        return cls(rows, fix, terrain, np.asarray(horizon))
+
+    @cached_property
+    def sectors(self) -> Sectors:
+        """The rows in sectors of azimuth."""
+        return Sectors.from_evidence(self.evidence, SECTOR_RAD, SECTOR_EPSILON)
+
+    @cached_property
+    def above_rad(self) -> Array:
+        """(n,) how far the rows stand above the horizon."""
+        return self.evidence.elevation_rad - self.horizon_rad
+
+    @cached_property
+    def explained_by_sector(self) -> Array:
+        """Log-likelihood (sectors,) of the horizon, beside the best level skyline in each sector; 0 is perfect.
+
+        All zero for a terrain of uncertain shape: the fix was made with another shape than the file's.
+        """
+        rows, sectors = self.evidence, self.sectors
+        if any(self.terrain.shape_sigma):
+            return np.zeros(sectors.count)
+        map_sigma = self.terrain.horizon_sigma_rad(self.fix.position_enu_m[None, :2], rows.azimuth_rad)
+        sigma = np.hypot(rows.edge_sigma_rad, map_sigma)
+        value = contributions(rows.llr, rows.extended_nats, rows.elevation_rad, self.horizon_rad, sigma)
+        sums = np.bincount(sectors.sector, weights=value, minlength=sectors.count).astype(np.float64)
+        return sectors.by_sector(sums)
+
+    def explained_nats(self) -> float:
+        """Mean of `explained_by_sector` over the sectors with rows near the skyline of the fix.
+
+        The others, such as those outside the picture, can contradict no position.
+        """
+        sector = self.sectors.sector[np.abs(self.above_rad) < NEAR_SKYLINE_RAD]
+        return float(self.explained_by_sector[np.unique(sector)].mean()) if len(sector) else 0.0
+
+    def contradicted_part(self) -> float:
+        """Part of the horizon's sectors that contradict the fix.
+
+        Only rows near its skyline and yet well clear of it count: a few contradicted sectors are an obstacle or a
+        defect, many are a wrong map, time or identification.
+        """
+        rows, above = self.evidence, self.above_rad
+        counted = (np.abs(above) > CLEAR_OF_SKYLINE_RAD) & (np.abs(above) < NEAR_SKYLINE_RAD)
+        sector = (rows.azimuth_rad / WIDE_SECTOR_RAD).astype(int)
+        count = np.bincount(sector, weights=counted)
+        wrong = np.bincount(sector, weights=counted & ((rows.llr > 0) != (above > 0)))
+        known = count >= MIN_IN_SECTOR
+        return float(np.mean(wrong[known] > SECTOR_CONTRADICTED * count[known])) if known.any() else 0.0
+
+
 def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain) -> None:
     """Raise NotLocated (inconsistent_evidence) where the `evidence` contradicts the `fix`, or the `terrain` does."""
     evidence = lower_evidence(evidence, fix.horizon_error_rad)
-    by_sector = explained_by_sector(evidence, fix, terrain)
-    stretches = contradicted_stretches(by_sector)
-    contradicted = contradicted_part(evidence, fix, terrain)
+    sure = SureRows.at_fix(evidence, fix, terrain)
+    stretches = contradicted_stretches(sure.explained_by_sector)
+    contradicted = sure.contradicted_part()
     if contradicted > MAX_CONTRADICTED_PART:
         raise _inconsistency(f"{100 * contradicted:.0f} % of the horizon contradicts the best position", stretches)
-    explained = explained_nats(evidence, fix, terrain)
+    explained = sure.explained_nats()
     if explained < MIN_EXPLAINED_NATS:
         raise _inconsistency(
             f"the best position explains the strongest rows badly ({explained:.1f} nats a sector; usual: 0 to -0.3)",
@@ -93,40 +161,6 @@ def _check_turn(likelihood: PositionLikelihood, position_m: Array) -> None:
         )
 
 
-def _sure_rows(evidence: Evidence, fix: Fix, terrain: Terrain) -> tuple[Evidence, Array]:
-    """The rows of great |llr|, and the horizon (n,) [rad] at their azimuths."""
-    rows = evidence.take(np.abs(evidence.llr) > SURE_LLR)
-    return rows, np.asarray(terrain.horizon_rad(fix.position_enu_m[None, :2], rows.azimuth_rad))
-
-
-def explained_by_sector(evidence: Evidence, fix: Fix, terrain: Terrain) -> Array:
-    """Log-likelihood (sectors,) of the horizon at the fix, beside the best level skyline in each sector; 0 is perfect.
-
-    Only rows of great |llr| count: of the others, some level skyline always fits the noise better. All zero for a
-    terrain of uncertain shape: the fix was made with another shape than the file's.
-    """
-    rows, horizon = _sure_rows(evidence, fix, terrain)
-    sectors = Sectors.from_evidence(rows, SECTOR_RAD, SECTOR_EPSILON)
-    if any(terrain.shape_sigma):
-        return np.zeros(sectors.count)
-    sigma = np.hypot(rows.edge_sigma_rad, terrain.horizon_sigma_rad(fix.position_enu_m[None, :2], rows.azimuth_rad))
-    value = contributions(rows.llr, rows.extended_nats, rows.elevation_rad, horizon, sigma)
-    sums = np.bincount(sectors.sector, weights=value, minlength=sectors.count).astype(np.float64)
-    return sectors.by_sector(sums)
-
-
-def explained_nats(evidence: Evidence, fix: Fix, terrain: Terrain) -> float:
-    """Mean of `explained_by_sector` over the sectors with rows of great |llr| near the skyline of the fix.
-
-    The others, such as those outside the picture, can contradict no position.
-    """
-    rows, horizon = _sure_rows(evidence, fix, terrain)
-    near = np.abs(rows.elevation_rad - horizon) < NEAR_SKYLINE_RAD
-    sector = Sectors.from_evidence(rows, SECTOR_RAD, SECTOR_EPSILON).sector[near]
-    by_sector = explained_by_sector(evidence, fix, terrain)
-    return float(by_sector[np.unique(sector)].mean()) if len(sector) else 0.0
-
-
 def contradicted_stretches(by_sector: Array) -> list[tuple[int, int]]:
     """First sector and number of each run that contradicts the fix; a single good one between them is no gap.
 
@@ -139,22 +173,6 @@ def contradicted_stretches(by_sector: Array) -> list[tuple[int, int]]:
     good = int(np.argmin(wrong))  # begun there, no run is cut in two
     changes = np.flatnonzero(np.diff(np.roll(wrong, -good), append=False)) + 1
     return [(int(start + good) % len(wrong), int(end - start)) for start, end in changes.reshape(-1, 2)]
-
-
-def contradicted_part(evidence: Evidence, fix: Fix, terrain: Terrain) -> float:
-    """Part of the horizon's sectors that contradict the fix.
-
-    Only rows of great |llr| count, near the fix's skyline and yet well clear of it: a few contradicted sectors are an
-    obstacle or a defect, many are a wrong map, time or identification.
-    """
-    rows, horizon = _sure_rows(evidence, fix, terrain)
-    above = rows.elevation_rad - horizon
-    counted = (np.abs(above) > CLEAR_OF_SKYLINE_RAD) & (np.abs(above) < NEAR_SKYLINE_RAD)
-    sector = (rows.azimuth_rad / WIDE_SECTOR_RAD).astype(int)
-    count = np.bincount(sector, weights=counted)
-    wrong = np.bincount(sector, weights=counted & ((rows.llr > 0) != (above > 0)))
-    known = count >= MIN_IN_SECTOR
-    return float(np.mean(wrong[known] > SECTOR_CONTRADICTED * count[known])) if known.any() else 0.0
 
 
 def admitted_stretch(terrain: Terrain) -> float:

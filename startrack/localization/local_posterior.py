@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.localization.branch_and_bound import Explored
+from startrack.localization.explored import Explored
 from startrack.localization.initial_guess import Guess
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.types import Array

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.localization.branch_and_bound import Explored, log_sum
+from startrack.localization.explored import Explored, log_sum
 from startrack.localization.initial_guess import beam_search
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.terrain import Terrain

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.compilation import announce_compilation
-from startrack.localization.branch_and_bound import BudgetSpent, Explored, Search, explains_all_sectors, log_sum
+from startrack.localization.branch_and_bound import Search, explains_all_sectors
+from startrack.localization.explored import BudgetSpent, Explored, log_sum
 from startrack.localization.initial_guess import beam_search, climb_to_best
 from startrack.localization.likelihood import SECTOR_EPSILON, SECTOR_RAD, PositionLikelihood
 from startrack.localization.local_posterior import local_posterior

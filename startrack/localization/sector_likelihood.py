@@ -55,13 +55,12 @@ class Sectors:
     @cached_property
     def ceiling(self) -> Array:
         """(sectors,) M: largest sum of contributions above one elevation; at least 0 (nothing visible)."""
+        ends = np.searchsorted(self.sector[self.order], np.arange(self.count + 1))
         if self.evidence.extended_nats.any():
-            rows = self.evidence.take(self.order)
-            found, ends = np.zeros(self.count), np.searchsorted(self.sector[self.order], np.arange(self.count + 1))
+            rows, found = self.evidence.take(self.order), np.zeros(self.count)
             soft_ceilings(rows.elevation_rad, rows.llr, rows.extended_nats, rows.edge_sigma_rad, ends, found)
             return found
         below = np.concatenate([[0.0], np.cumsum(self.evidence.llr[self.order])])
-        ends = np.searchsorted(self.sector[self.order], np.arange(self.count + 1))
         # Above the lowest ray, above the next, ..., above none: all these sums end at the sector's last ray.
         least = np.minimum.reduceat(below, ends[:-1])
         return np.asarray(below[ends[1:]] - np.minimum(least, below[ends[1:]]))

@@ -98,13 +98,13 @@ def test_a_signal_while_processes_start_neither_hangs_nor_kills_them():
                 threading.Timer(delay_s, lambda: os.killpg(0, signal.SIGINT)).start()
             with Runner(abs, jobs=2) as runner:
                 done = sorted(outcome for _, outcome in runner.results(range(8)))
-            print(done, len(seen))
+            print(done, 1 <= len(seen) <= 3)  # signals that come while they are blocked arrive as one
     """
     process = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, start_new_session=True,
         timeout=120,
     )  # fmt: skip
-    assert process.stdout == f"{list(range(8))} 3\n", process.stderr
+    assert process.stdout == f"{list(range(8))} True\n", process.stderr
 
 
 def test_an_image_that_kills_dask_workers_is_given_up_and_the_others_are_done(tmp_path):

@@ -9,8 +9,11 @@ import importlib.util
 import io
 import logging
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from startrack import __version__
@@ -37,7 +40,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
     try:
         _write_any_text()
-        parser = _parser()
+        with _ended_by_interrupt():
+            parser = _parser()
         _offer_completion(parser)
         words = _joined_action(sys.argv[1:] if argv is None else argv)
         if words and not words[0].startswith("-") and words[0].split()[0] not in COMMANDS:
@@ -85,6 +89,23 @@ class _Parser(argparse.ArgumentParser):
         if unknown:
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return found, unknown
+
+
+@contextmanager
+def _ended_by_interrupt() -> Iterator[None]:
+    """In the block Ctrl-C ends the process: while modules are loaded, Python can lose a KeyboardInterrupt."""
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler or not _in_main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _in_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()
 
 
 def _parser() -> argparse.ArgumentParser:

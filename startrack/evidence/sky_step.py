@@ -94,7 +94,7 @@ def measure_sky_step(detections: Detections, camera: Camera, R_cam_enu: Array, h
     azimuth = np.linspace(0.0, 2 * np.pi, STEP_SAMPLES, endpoint=False)
     elevation = horizon(azimuth)
     angle = off_axis_rad(rays_from_azel(azimuth, elevation) @ R_cam_enu.T)
-    shift_rad = np.multiply.outer(STEP_OFFSETS_PX, 1.0 / _px_per_rad(camera, angle))
+    shift_rad = np.multiply.outer(STEP_OFFSETS_PX, 1.0 / px_per_rad(camera, angle))
     rays_enu = rays_from_azel(azimuth, elevation + shift_rad)
     xy_px, inside = camera.project(rays_enu @ R_cam_enu.T)
     columns, rows = np.rint(xy_px[inside]).astype(np.int64).T
@@ -114,8 +114,10 @@ def subtract_sky_step(detections: Detections, camera: Camera, R_cam_enu: Array, 
     from the skyline, sector by sector.
     """
     image_e, dead = detections.image_e, detections.dead
-    rows, columns = np.divmod(np.flatnonzero(_band(image_e.shape, camera, R_cam_enu, horizon)), image_e.shape[1])
-    azimuth, above = _azimuth_and_height(np.stack([columns, rows], axis=1).astype(float), camera, R_cam_enu, horizon)
+    rows, columns = np.divmod(np.flatnonzero(skyline_band(image_e.shape, camera, R_cam_enu, horizon)), image_e.shape[1])
+    xy_px = np.stack([columns, rows], axis=1).astype(float)
+    azimuth, elevation, angle = azimuth_and_elevation(xy_px, camera, R_cam_enu)
+    above = (elevation - horizon(azimuth)) * px_per_rad(camera, angle)
     near = (np.abs(above) < BAND_PX) & ~dead[rows, columns]
     rows, columns, azimuth, above = rows[near], columns[near], azimuth[near], above[near]
     if not len(rows):
@@ -169,8 +171,11 @@ def height_above_px(
     return np.asarray((elevation_rad - horizon(azimuth_rad)) * px_per_rad)
 
 
-def _band(shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Bools:
-    """Pixels (H, W) around the skyline, with some to spare."""
+def skyline_band(shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Bools:
+    """Pixels (H, W) of an image of that `shape` within BAND_PX of a `horizon`, with some to spare.
+
+    `camera` and `R_cam_enu` place the skyline in the image.
+    """
     azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS, endpoint=False)
     xy, inside = camera.project(rays_from_azel(azimuth, horizon(azimuth)) @ R_cam_enu.T)
     picture = np.zeros(shape, dtype=np.uint8)
@@ -180,20 +185,24 @@ def _band(shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horizon: Hor
     return picture.view(np.bool_)
 
 
-def _azimuth_and_height(xy_px: Array, camera: Camera, R_cam_enu: Array, horizon: Horizon) -> tuple[Array, Array]:
-    """Azimuth [rad] and height above the skyline [px] of pixels (n, 2)."""
-    azimuth, elevation = azel_from_rays(camera.unproject(xy_px) @ R_cam_enu)
-    return azimuth, (elevation - horizon(azimuth)) * _px_per_rad(camera, camera.angle_rad(xy_px))
+def azimuth_and_elevation(xy_px: Array, camera: Camera, R_cam_enu: Array) -> tuple[Array, Array, Array]:
+    """Azimuth and elevation in enu of pixels `xy_px` (n, 2), and angle off the `camera`'s axis (n,), ... [rad].
+
+    `R_cam_enu` (3, 3) is the rotation from enu to the camera.
+    """
+    rays_cam = camera.unproject(xy_px)
+    azimuth, elevation = azel_from_rays(rays_cam @ R_cam_enu)
+    return azimuth, elevation, off_axis_rad(rays_cam)
 
 
 def _px_per_rad_at(azimuth_rad: Array, elevation_rad: Array, camera: Camera, R_cam_enu: Array) -> Array:
     """Scale of the image (n,) in directions of enu; beyond the lens's view that of its edge."""
     angle = off_axis_rad(rays_from_azel(azimuth_rad, elevation_rad) @ R_cam_enu.T)
-    return _px_per_rad(camera, np.minimum(angle, camera.max_angle_rad))
+    return px_per_rad(camera, np.minimum(angle, camera.max_angle_rad))
 
 
-def _px_per_rad(camera: Camera, angle_rad: Array) -> Array:
-    """Scale of the image away from its centre at angles off the axis (n,) [rad]."""
+def px_per_rad(camera: Camera, angle_rad: Array) -> Array:
+    """Scale (n,) of the `camera`'s image away from its centre at the angles `angle_rad` (n,) off the axis."""
     return np.asarray(np.sqrt(camera.focal_px[0] * camera.focal_px[1]) * camera.lens.slope(angle_rad))
 
 

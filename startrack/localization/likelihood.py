@@ -100,7 +100,7 @@ class PositionLikelihood:
         if self.in_closed_form:
             r, found = self.rows, np.empty(len(points_m))
             points = np.ascontiguousarray(points_m, dtype=np.float64)
-            score_disks(r.disks_m, r.radius_m, r.llr, r.sector, -r.ceiling, r.log_floor, points, found)
+            score_disks(r.disks_m, r.radius_m, r.llr, r.sector, -r.ceiling[None], r.log_floor, points, found)
             return found
         first, last = self.part_sums.split(self.sums, *self.sums.open_rays(self.terrain, points_m, POINT_M))
         return self.centre_scores(self.boxes_by_rows(points_m, POINT_M, first, last))

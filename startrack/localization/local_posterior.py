@@ -20,13 +20,16 @@ MAX_ROUNDS = 10
 NODE_STEP_M, MIN_NODES, MAX_NODES = 12.0, 5, 13  # distance of traced horizons; points along a side
 
 
-def local_posterior(likelihood: PositionLikelihood, guess: Guess, log_open: float) -> Explored:
+def local_posterior(
+    likelihood: PositionLikelihood, guess: Guess, log_open: float, first_half_m: float = FIRST_HALF_M
+) -> Explored:
     """The posterior on squares about the guess's positions, as large as their modes need.
 
-    `log_open` is the logarithm of a bound of the mass [m2] that the search left open elsewhere.
+    `log_open` is the logarithm of a bound of the mass [m2] that the search left open elsewhere; `first_half_m` half the
+    side of the first squares.
     """
     modes = guess.points_m[guess.log_likelihood > guess.best - MODE_NATS]
-    squares = [_square(likelihood, position) for position in modes]
+    squares = [_square(likelihood, position, min(first_half_m, FIRST_HALF_M)) for position in modes]
     half = max(min(square[2] for square in squares), max(square[1] for square in squares) / (4 * MAX_CELLS))
     parts = [_score(likelihood, middle, size, half, NODE_STEP_M) for middle, size, _ in squares]
     centres = np.concatenate([part[0] for part in parts])
@@ -36,9 +39,9 @@ def local_posterior(likelihood: PositionLikelihood, guess: Guess, log_open: floa
     return Explored(centres[first], half, score[first], log_open, "beam")
 
 
-def _square(likelihood: PositionLikelihood, position_m: Array) -> tuple[Array, float, float]:
+def _square(likelihood: PositionLikelihood, position_m: Array, first_half_m: float) -> tuple[Array, float, float]:
     """Middle (2,) and half side of a square that holds the mode, and half side of boxes that resolve it [m]."""
-    middle, size, grown, finest = position_m, FIRST_HALF_M, False, likelihood.terrain.finest_m
+    middle, size, grown, finest = position_m, first_half_m, False, likelihood.terrain.finest_m
     for _ in range(MAX_ROUNDS):
         half = size / (2 * FIRST_CELLS)
         centres, score = _score(likelihood, middle, size, half, size)

@@ -14,6 +14,7 @@ from startrack.kernels import njit
 from startrack.localization.prefix_sums import PrefixSums
 from startrack.localization.score_kernel import log_mixtures, score_disks
 from startrack.localization.sector_likelihood import Sectors, contributions, row_contribution
+from startrack.localization.sky_profiles import SkyProfiles
 from startrack.terrain import Terrain
 from startrack.terrain.horizon_kernel import surfaces
 from startrack.types import Array, Evidence, Ints
@@ -38,6 +39,8 @@ class LocalLikelihood:
     sector: Ints
     settled: Array  # (sectors,) sums of the visible settled rows, less the ceilings
     log_floor: float
+    stars: Ints | slice  # which of the open rows are points of light
+    profiles: SkyProfiles | None  # of the rows of extended light
 
     @classmethod
     def near(
@@ -48,16 +51,20 @@ class LocalLikelihood:
         first, last = sums.open_rays(terrain, centre_m[None], half_m, leeway_rad)
         rows = sums.pairs(first, last)[1]
         e = sums.evidence.take(rows)
+        map_sigma = terrain.horizon_sigma_rad(centre_m[None], e.azimuth_rad)
+        extended = np.flatnonzero(e.extended_nats * e.edge_sigma_rad)
         return cls(
             terrain=terrain,
             ground=terrain.near(centre_m, half_m, e.azimuth_rad, across),
             centre_m=centre_m,
             half_m=half_m,
             evidence=e,
-            sigma_rad=np.hypot(e.edge_sigma_rad, terrain.horizon_sigma_rad(centre_m[None], e.azimuth_rad)),
+            sigma_rad=np.hypot(e.edge_sigma_rad, map_sigma),
             sector=sums.sector[rows],
             settled=sums.sums(first, last)[0][0] - sectors.ceiling,
             log_floor=sectors.log_floor,
+            stars=np.setdiff1d(np.arange(len(e)), extended) if len(extended) else slice(None),
+            profiles=SkyProfiles.from_rows(e, extended, map_sigma) if len(extended) else None,
         )
 
     def scores(self, points_m: Array, elevation_rad: Array | None = None) -> Array:
@@ -96,27 +103,41 @@ class LocalLikelihood:
 
     def _scorer(self, elevation_rad: Array | None) -> Callable[[Array], Array]:
         """Positions (n, 2) to log-likelihoods (n,), by interpolated horizons, by disks, or by the terrain itself."""
+        which = self.stars
         e = self.evidence if elevation_rad is None else replace(self.evidence, elevation_rad=elevation_rad)
+        e, sigma, sector = (e if isinstance(which, slice) else e.take(which)), self.sigma_rad[which], self.sector[which]
         nodes = self.ground.interpolation(e.azimuth_rad)
-        disks = None if nodes is not None or self.sigma_rad.any() else self.terrain.visible_disks(*rays_of(e))
+        disks = None if nodes is not None or sigma.any() else self.terrain.visible_disks(*rays_of(e))
 
         def score(points_m: Array) -> Array:
             points, found = np.ascontiguousarray(points_m, dtype=np.float64), np.empty(len(points_m))
+            rest = sector, self._settled_at(points, elevation_rad), self.log_floor
             if nodes is not None:
                 rise, fill = np.tan(e.elevation_rad), cast(Any, _score_nodes)
-                fill(nodes, rise, e.llr, e.extended_nats, self.sigma_rad, *fixed, points, found)
+                fill(nodes, rise, e.llr, e.extended_nats, sigma, *rest, points, found)
             elif disks is not None:
-                score_disks(*disks, e.llr, *fixed, points, found)
+                score_disks(*disks, e.llr, *rest, points, found)
             else:
-                horizon = self.ground.horizon_rad(points[:, None], e.azimuth_rad)
+                horizon, settled = self.ground.horizon_rad(points[:, None], e.azimuth_rad), rest[1]
                 for k in range(len(points)):
-                    value = contributions(e.llr, e.extended_nats, e.elevation_rad, horizon[k], self.sigma_rad)
-                    sums = np.bincount(self.sector, weights=value, minlength=len(self.settled))
-                    found[k] = log_mixtures(self.settled + sums, self.log_floor)
+                    value = contributions(e.llr, e.extended_nats, e.elevation_rad, horizon[k], sigma)
+                    sums = np.bincount(sector, weights=value, minlength=settled.shape[1])
+                    found[k] = log_mixtures(settled[k % len(settled)] + sums, self.log_floor)
             return found
 
-        fixed = self.sector, self.settled, self.log_floor
         return score
+
+    def _settled_at(self, points_m: Array, elevation_rad: Array | None) -> Array:
+        """Sums (n or 1, sectors) of the settled rows and of the extended light, less the ceilings, at points (n, 2)."""
+        if self.profiles is None:
+            return self.settled[None]
+        row = self.profiles.row
+        horizon = self.ground.horizon_rad(points_m[:, None], self.evidence.azimuth_rad[row])
+        if elevation_rad is not None:
+            horizon = horizon + (self.evidence.elevation_rad - elevation_rad)[row]
+        sums = np.repeat(self.settled[None], len(points_m), axis=0)
+        self.profiles.add_sums(horizon, self.sector[row], sums)
+        return sums
 
 
 def rays_of(evidence: Evidence) -> tuple[Array, Array]:
@@ -126,13 +147,16 @@ def rays_of(evidence: Evidence) -> tuple[Array, Array]:
 
 @njit(cache=True, nogil=True)
 def _score_nodes(nodes, rise, llr, extended, sigma, sector, settled, log_floor, points, found):
-    """Fill found (n,) with the log-likelihoods of points (n, 2); rise (rows,): tan of the rows' elevations."""
+    """Fill found (n,) with the log-likelihoods of points (n, 2); rise (rows,): tan of the rows' elevations.
+
+    settled (n or 1, sectors): sums of the other rows, at each point or everywhere.
+    """
     across = nodes.nodes.shape[1]
     scale = (across - 1) / (2 * nodes.half_m)
-    sums, up = np.empty(len(settled)), np.empty(1)
+    sums, up = np.empty(settled.shape[1]), np.empty(1)
     for p in range(len(found)):
         for s in range(len(sums)):
-            sums[s] = settled[s]
+            sums[s] = settled[p % len(settled), s]
         x, y = (
             (points[p, 0] - nodes.east_m + nodes.half_m) * scale,
             (points[p, 1] - nodes.north_m + nodes.half_m) * scale,

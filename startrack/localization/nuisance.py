@@ -20,7 +20,7 @@ PRIOR_SIGMAS = 3.0  # half width of the first grid
 BIAS_NEARBY_M = 80.0  # horizons are prepared that far about a position; a position farther off is prepared anew
 BIAS_STEPS_M = (16.0, 4.0, 0.5)  # first and later first steps of a climb, and the last
 BIAS_GRID = (7, 5.0, 0.75, 6)  # nodes; nats kept; shrinking that is enough; rounds
-MIXED_SIGMAS = np.linspace(-2.5, 2.5, 11)
+MIXED_SIGMAS, MIXED_NATS = np.linspace(-2.5, 2.5, 11), 20.0  # boxes that are less likely by more are left out
 SHAPE_NEARBY_M, SHAPE_STEPS_M = 600.0, (64.0, 2.0)
 SHAPE_LLR = 0.3  # |llr| of rows that decide on shapes
 SHAPE_GRID = (5, 8.0, 0.8, 8)
@@ -91,8 +91,13 @@ def marginalize_horizon_bias(
     """
     found = explore(lower_evidence(evidence, bias.bias_rad), terrain, np.vstack([bias.position_m, others_m]))
     found = found._replace(horizon_bias_rad=bias.bias_rad)
-    keep = found.log_likelihood > np.max(found.log_likelihood, initial=-np.inf) - 20.0
-    steps = MIXED_SIGMAS[:, None, None] * bias.sigma_rad * bias.drift_m_per_rad
+    return mix_shifted(found, bias.sigma_rad * bias.drift_m_per_rad, terrain)
+
+
+def mix_shifted(found: Explored, sigma_m: Array, terrain: Terrain) -> Explored:
+    """The posterior smeared by a normal shift of one standard deviation `sigma_m` (2,) along its direction."""
+    keep = found.log_likelihood > np.max(found.log_likelihood, initial=-np.inf) - MIXED_NATS
+    steps = MIXED_SIGMAS[:, None, None] * sigma_m
     if not keep.any() or np.abs(steps).max() < 0.5 * found.half_m:
         return found
     share = np.exp(-0.5 * MIXED_SIGMAS**2)

@@ -35,12 +35,15 @@ def score_boxes(rows, boxes, horizon, sigma, score):
 
 @njit(cache=True, nogil=True)
 def score_disks(disks, radius, llr, sector, settled, log_floor, points, found):
-    """Fill found (n,) with the log-likelihoods of points (n, 2) inside or outside the disks (rows, 2) of the rows."""
+    """Fill found (n,) with the log-likelihoods of points (n, 2) inside or outside the disks (rows, 2) of the rows.
+
+    settled (n or 1, sectors): sums of the other rows, at each point or everywhere.
+    """
     r2, log_keep = radius * radius, log1p(-exp(log_floor))
-    sums = np.empty(len(settled))
+    sums = np.empty(settled.shape[1])
     for p in range(len(found)):
         for s in range(len(sums)):
-            sums[s] = settled[s]
+            sums[s] = settled[p % len(settled), s]
         for k in range(len(llr)):
             u, v = points[p, 0] - disks[k, 0], points[p, 1] - disks[k, 1]
             sums[sector[k]] += llr[k] * (u * u + v * v < r2)

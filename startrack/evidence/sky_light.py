@@ -1,0 +1,147 @@
+"""Evidence of the diffuse light of the sky: pixels near a predicted skyline, summed in cells, as rows of extended light.
+
+The sky shines faintly and the ground hardly does. A pixel q above the level of the ground, where the whole sky would be
+t above it, contributes l V + c V (1 - V) / 2 with l = (q t - t^2 / 2) / s^2 and c = t^2 / s^2, s^2 its variance and V
+the fraction of the sky that it shows. The pixels of a narrow sector at equal heights above the predicted skyline show
+the same V, wherever the true skyline is nearby: their sums are one row.
+"""
+
+from __future__ import annotations
+
+# mypy: disable-error-code="no-untyped-def"
+from dataclasses import dataclass
+from math import erfc, sqrt
+
+import numpy as np
+
+from startrack.evidence.sky_levels import CLIP_SIGMAS, GROUND, SECTORS, SKY, SkyLevels, measure_levels, sector_of
+from startrack.evidence.sky_pixels import SkyPixels
+from startrack.evidence.sky_step import Horizon
+from startrack.kernels import njit
+from startrack.types import Array, Bools, Evidence
+
+HEIGHT_PX = 0.75  # of a cell
+LEVELS = 13  # cells of a sector: up to 4.9 px above and below the predicted skyline
+SHIFTS_PX = np.linspace(-4.0, 4.0, 161)  # of the skyline in one sector, above the predicted one
+MIDDLES_RAD = (2 * np.arange(SECTORS) + 1) * np.pi / SECTORS
+
+
+@dataclass(frozen=True, eq=False)
+class SkyLight:
+    """The light of the sky near a predicted skyline: sums in cells of every sector of azimuth, lowest cells first."""
+
+    pixels: SkyPixels
+    levels: SkyLevels
+    elevation_rad: Array  # (SECTORS,) of the predicted skyline at MIDDLES_RAD
+    px_per_rad: Array  # (SECTORS,)
+    height_px: Array  # (SECTORS, LEVELS) of the cells above the predicted skyline, means by information
+    llr: Array  # (SECTORS, LEVELS)
+    extended_nats: Array  # (SECTORS, LEVELS)
+    edge_px: float
+    shift_px: Array  # (SECTORS,) how much higher than predicted the skyline stands
+    shift_sigma_px: Array  # (SECTORS,) infinite where the sector is not covered
+    misfit_nats: Array  # (SECTORS,) by which the best cells exceed the best skyline
+
+    def above(self, horizon: Horizon) -> SkyLight:
+        """The same pixels above another predicted skyline, at most a few pixels away."""
+        return sum_cells(self.pixels.above(horizon), self.levels, horizon)
+
+    def evidence(self, sectors: Bools, raised_px: Array, variance_factor: float = 1.0) -> Evidence:
+        """Rows of the chosen `sectors` (SECTORS,), for the localizer.
+
+        They are put lower by `raised_px` (SECTORS,), by which the image shows them too high; the variances of the
+        pixels are taken `variance_factor` times as large.
+        """
+        s, h = np.nonzero((self.extended_nats > 0.0) & sectors[:, None])
+        return Evidence(
+            azimuth_rad=MIDDLES_RAD[s],
+            elevation_rad=self.elevation_rad[s] + (self.height_px[s, h] - raised_px[s]) / self.px_per_rad[s],
+            llr=self.llr[s, h] / variance_factor,
+            extended_nats=self.extended_nats[s, h] / variance_factor,
+            edge_sigma_rad=self.edge_px / self.px_per_rad[s],
+        )
+
+
+def measure_sky_light(pixels: SkyPixels, horizon: Horizon) -> SkyLight:
+    """The light of the sky by `pixels` near a predicted `horizon`."""
+    return sum_cells(pixels, measure_levels(pixels, sector_of(pixels.azimuth_rad)), horizon)
+
+
+def sum_cells(pixels: SkyPixels, levels: SkyLevels, horizon: Horizon) -> SkyLight:
+    """Sums of `pixels` in cells about a predicted `horizon`, above which their heights are, with known `levels`."""
+    sector = sector_of(pixels.azimuth_rad)
+    sums = np.zeros((SECTORS, LEVELS, 3))
+    scale = np.zeros((SECTORS, 2))
+    _sum_cells(
+        sector, pixels.height_px, pixels.light_e, pixels.px_per_rad, levels.covered, levels.level_e, levels.slope_e,
+        np.square(levels.noise_e) * levels.correlation, levels.correlation, pixels.edge_px, CLIP_SIGMAS, sums, scale,
+    )  # fmt: skip
+    # The pixels of a cell spread over its height.
+    edge_px = sqrt(pixels.edge_px**2 + HEIGHT_PX**2 / 12)
+    llr, extended = sums[..., 0], sums[..., 1]
+    height_px = sums[..., 2] / np.where(extended > 0, extended, 1.0)
+    shift, sigma, misfit = _shifts(height_px, llr, extended, edge_px)
+    seen = scale[:, 0] > 0
+    return SkyLight(
+        pixels=pixels,
+        levels=levels,
+        elevation_rad=horizon(MIDDLES_RAD),
+        px_per_rad=np.where(seen, scale[:, 1] / np.maximum(scale[:, 0], 1.0), 1.0),
+        height_px=height_px,
+        llr=llr,
+        extended_nats=extended,
+        edge_px=edge_px,
+        shift_px=np.where(seen, shift, 0.0),
+        shift_sigma_px=np.where(seen, sigma, np.inf),
+        misfit_nats=misfit,
+    )
+
+
+def _shifts(height_px: Array, llr: Array, extended: Array, edge_px: float) -> tuple[Array, Array, Array]:
+    """Mean and standard deviation (SECTORS,) of the skyline's height above the predicted one, and the misfit."""
+    log = np.empty((SECTORS, len(SHIFTS_PX)))
+    _score_shifts(height_px, llr, extended, edge_px, log)
+    best = log.max(axis=1)
+    weight = np.exp(log - best[:, None])
+    weight /= weight.sum(axis=1, keepdims=True)
+    mean = weight @ SHIFTS_PX
+    variance = weight @ np.square(SHIFTS_PX) - np.square(mean)
+    step = SHIFTS_PX[1] - SHIFTS_PX[0]
+    # Each cell's own best fraction of sky, free of any skyline.
+    free = np.clip(llr / np.where(extended > 0, extended, 1.0) + 0.5, 0.0, 1.0)
+    misfit = (llr * free + 0.5 * extended * free * (1.0 - free)).sum(axis=1) - best
+    return mean, np.sqrt(np.maximum(variance, step**2 / 12)), misfit
+
+
+@njit(cache=True, nogil=True)
+def _score_shifts(height, llr, extended, edge, log):
+    """Fill log (SECTORS, shifts) with the log-likelihoods of a skyline shifted by SHIFTS_PX."""
+    for i in range(log.shape[0]):
+        for m in range(log.shape[1]):
+            total = 0.0
+            for j in range(llr.shape[1]):
+                visible = 0.5 * erfc((SHIFTS_PX[m] - height[i, j]) / (sqrt(2.0) * edge))
+                total += visible * (llr[i, j] + 0.5 * extended[i, j] * (1.0 - visible))
+            log[i, m] = total
+
+
+@njit(cache=True, nogil=True)
+def _sum_cells(sector, height, light, scale, covered, level, slope, variance, correlation, edge, clip, sums, scales):
+    """Add up sums (SECTORS, LEVELS, 3) of l, c and c times the height, and scales (SECTORS, 2): pixels and their scale."""
+    half = 0.5 * sums.shape[1] * HEIGHT_PX
+    for k in range(len(sector)):
+        i, h = sector[k], height[k]
+        if covered[i] and abs(h) < half:
+            ground = level[GROUND, i] + slope[GROUND, i] * h
+            step = level[SKY, i] + slope[SKY, i] * h - ground
+            visible = 0.5 * erfc(-h / (sqrt(2.0) * edge))
+            s2 = variance[GROUND] + max(variance[SKY] - variance[GROUND], 0.0) * visible
+            q = light[k] - ground
+            rest = q - step * visible
+            if step > 0.0 and rest * rest * correlation <= clip * clip * s2:
+                j = min(int((h + half) / HEIGHT_PX), sums.shape[1] - 1)
+                sums[i, j, 0] += (q * step - 0.5 * step * step) / s2
+                sums[i, j, 1] += step * step / s2
+                sums[i, j, 2] += step * step / s2 * h
+                scales[i, 0] += 1.0
+                scales[i, 1] += scale[k]

@@ -1,0 +1,104 @@
+"""Pixels of the diffuse sky and the ground near a predicted skyline, without those that show stars or defects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import ceil, sqrt
+
+import cv2
+import numpy as np
+
+from startrack.camera import Camera
+from startrack.evidence.sky_step import Horizon, Skyline, azimuth_and_elevation, skyline_band
+from startrack.evidence.star_evidence import StarPhotometry, filtered_noise_e
+from startrack.frames import rays_from_azel
+from startrack.psf import noise_area_px
+from startrack.types import Array, Bools, Detections
+
+BAND_PX = 12.0  # from the skyline to the last pixels that are used
+MASKED_SIGMA = 0.25  # light of a known star, in a pixel's noise, from which the pixel is left out
+EDGE_PX = 3.0  # beside the end of the image circle
+SCALE_SAMPLES, SCALE_STEP_RAD = 1440, 1e-3  # around the horizon, and in elevation
+UNRESOLVED_PX2 = 1.0 / 12.0  # variance of the position in a pixel
+
+
+@dataclass(frozen=True, eq=False)
+class SkyPixels:
+    """Pixels (n,) near a predicted skyline, each with its direction and its light."""
+
+    azimuth_rad: Array  # in enu
+    elevation_rad: Array
+    px_per_rad: Array  # of elevation, across the skyline
+    height_px: Array  # above the skyline, across it
+    light_e: Array
+    edge_px: float  # width of a sharp edge in the image: the PSF and the pixel
+
+    def above(self, horizon: Horizon) -> SkyPixels:
+        """The same pixels above another skyline, a few pixels away."""
+        height = (self.elevation_rad - horizon(self.azimuth_rad)) * self.px_per_rad
+        return replace(self, height_px=height)
+
+
+def pixels_near_skyline(
+    detections: Detections, camera: Camera, R_cam_enu: Array, horizon: Horizon, stars: StarPhotometry
+) -> SkyPixels:
+    """Pixels of the `detections`' image near a `horizon` that show no known star and no source.
+
+    `camera` and `R_cam_enu` place the skyline in the image; `stars` are those whose light is left out, visible or not.
+    """
+    band = skyline_band(detections.image_e.shape, camera, R_cam_enu, horizon)
+    band[_star_mask(detections, stars, band)] = False
+    pixel = np.flatnonzero(band)
+    pixel = pixel[~detections.dead.ravel()[pixel]]
+    rows, columns = np.divmod(pixel, band.shape[1])
+    xy_px = np.stack([columns, rows], axis=1).astype(np.float64)
+    azimuth, elevation, angle = azimuth_and_elevation(xy_px, camera, R_cam_enu)
+    scale = scale_across(camera, R_cam_enu, horizon)(azimuth)
+    height = (elevation - horizon(azimuth)) * scale
+    lit = angle < min(camera.calibrated_angle_rad, camera.max_angle_rad) - EDGE_PX / camera.focal_px[0]
+    usable = np.flatnonzero(lit & (np.abs(height) < BAND_PX))
+    return SkyPixels(
+        azimuth_rad=azimuth[usable],
+        elevation_rad=elevation[usable],
+        px_per_rad=scale[usable],
+        height_px=height[usable],
+        light_e=detections.image_e.ravel()[pixel[usable]].astype(np.float64),
+        edge_px=sqrt(detections.psf_sigma_px**2 + UNRESOLVED_PX2),
+    )
+
+
+def scale_across(camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Skyline:
+    """Pixels per radian of elevation across the image of a `horizon`, as a function of azimuths [rad].
+
+    Across, not upwards: a steep skyline is closer than it is high. `camera` and `R_cam_enu` place it in the image.
+    """
+    azimuth = np.linspace(0.0, 2 * np.pi, SCALE_SAMPLES, endpoint=False)
+    elevation = horizon(azimuth)
+
+    def pixels(raised_rad: float) -> Array:
+        return camera.project_unlimited(rays_from_azel(azimuth, elevation + raised_rad) @ R_cam_enu.T)
+
+    up = (pixels(SCALE_STEP_RAD) - pixels(-SCALE_STEP_RAD)) / (2 * SCALE_STEP_RAD)
+    here = pixels(0.0)
+    along = np.roll(here, -1, axis=0) - np.roll(here, 1, axis=0)
+    across = np.abs(up[:, 0] * along[:, 1] - up[:, 1] * along[:, 0])
+    return Skyline(across / np.maximum(np.hypot(*along.T), 1e-9))
+
+
+def _star_mask(detections: Detections, stars: StarPhotometry, band: Bools) -> Bools:
+    """Pixels (H, W) with light of known stars, visible or hidden, and of detections, near those of the band."""
+    sigma2 = detections.psf_sigma_px**2 + UNRESOLVED_PX2
+    noise_e = filtered_noise_e(detections) / sqrt(noise_area_px(detections.psf_sigma_px))
+    xy_px = np.concatenate([stars.xy_px, detections.xy_px])
+    peak = np.concatenate([stars.expected_e, detections.flux_e]) / (2 * np.pi * sigma2 * max(noise_e, 1e-9))
+    radius = np.sqrt(2 * sigma2 * np.log(np.maximum(peak / MASKED_SIGMA, 1.0))) + 0.5
+    x, y = np.rint(np.clip(xy_px, -1e6, 1e6)).astype(np.int64).T
+    on_frame = (x >= 0) & (y >= 0) & (x < band.shape[1]) & (y < band.shape[0])
+    shining = peak > MASKED_SIGMA
+    near = np.zeros(len(x), dtype=bool)
+    near[on_frame] = band[y[on_frame], x[on_frame]]
+    wide = radius > BAND_PX / 2  # the disk may reach into the band from outside
+    mask = np.zeros(band.shape, dtype=np.uint8)
+    for k in np.flatnonzero(shining & (near | wide)).tolist():
+        cv2.circle(mask, (int(x[k]), int(y[k])), ceil(radius[k]), 1, -1)
+    return mask.view(np.bool_)

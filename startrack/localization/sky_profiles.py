@@ -1,0 +1,96 @@
+"""Rows of extended light at one azimuth as one function of the horizon's elevation there: a spline for each azimuth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import erfc, sqrt
+
+# mypy: disable-error-code="no-untyped-def"
+import numpy as np
+
+from startrack.kernels import njit
+from startrack.types import Array, Evidence, Ints
+
+REACH_SIGMAS = 8.0  # of the edge: from the outer rows to the ends of the splines, beyond which they are constant
+KNOT_SIGMAS = 0.2  # of the edge: distance of the knots; a cubic errs by 1e-4 nats at 1e3 nats per squared sigma
+MAP_SIGMAS = 4.0  # of the map's error: from the middle of the normal distribution to its ends
+LEAST_PART = 1e-30  # of the best elevation's likelihood: the floor of a sector is far above it
+
+
+@dataclass(frozen=True, eq=False)
+class SkyProfiles:
+    """Log-likelihoods of the horizon's elevation at each of m azimuths, from rows of extended light.
+
+    Rows of one azimuth stand or fall with the same horizon. An error of the map moves it below all of them together;
+    its normal distribution is averaged over.
+    """
+
+    row: Ints  # (m,) one row of each azimuth
+    low_rad: Array  # (m,) elevation of the first knot
+    step_rad: Array  # (m,) between knots
+    values: Array  # (m, knots)
+
+    @classmethod
+    def from_rows(cls, evidence: Evidence, rows: Ints, map_sigma_rad: Array) -> SkyProfiles:
+        """From those `rows` (k,) of the evidence that hold extended light; `map_sigma_rad` (n,) is that of each row."""
+        rows = rows[np.lexsort((evidence.elevation_rad[rows], evidence.azimuth_rad[rows]))]
+        azimuth, elevation = evidence.azimuth_rad[rows], evidence.elevation_rad[rows]
+        first = np.flatnonzero(np.diff(azimuth, prepend=-1.0) > 0)
+        last = np.append(first[1:], len(rows)) - 1
+        edge, map_sigma = evidence.edge_sigma_rad[rows[first]], map_sigma_rad[rows[first]]
+        around = REACH_SIGMAS * edge + MAP_SIGMAS * map_sigma
+        low = elevation[first] - around
+        span = elevation[last] - elevation[first] + 2 * around
+        knots = max(int(np.ceil(np.max(span / (KNOT_SIGMAS * edge)))) + 1, 4)
+        step = span / (knots - 1)
+        values = np.empty((len(first), knots))
+        _fill_profiles(
+            elevation, evidence.llr[rows], evidence.extended_nats[rows], evidence.edge_sigma_rad[rows], first, last,
+            low, step, values,
+        )  # fmt: skip
+        for k in np.flatnonzero(map_sigma > 0.0):
+            values[k] = _average_over_map(values[k], map_sigma[k] / step[k])
+        return cls(rows[first], low, step, values)
+
+    def add_sums(self, horizon_rad: Array, sector: Ints, sums: Array) -> None:
+        """Add to the sums (n, sectors) the profiles, in the sectors (m,), at horizons (n, m) [rad]."""
+        _add_sums(self.low_rad, self.step_rad, self.values, horizon_rad, sector, sums)
+
+
+def _average_over_map(values: Array, sigma_knots: float) -> Array:
+    """The logarithm of the mean of exp(values) over a normal shift of the horizon by `sigma_knots`."""
+    reach = max(int(np.ceil(MAP_SIGMAS * sigma_knots)), 1)
+    weight = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) / sigma_knots))
+    padded = np.pad(np.exp(values - values.max()), reach, mode="edge")
+    mean = np.convolve(padded, weight / weight.sum(), mode="valid")
+    return np.asarray(values.max() + np.log(np.maximum(mean, LEAST_PART)))
+
+
+@njit(cache=True, nogil=True)
+def _fill_profiles(elevation, llr, extended, sigma, first, last, low, step, values):
+    """Fill values (m, knots) with sums of l V + c V (1 - V) / 2 over the rows from first to last (m,)."""
+    for m in range(len(first)):
+        for j in range(values.shape[1]):
+            horizon, total = low[m] + j * step[m], 0.0
+            for k in range(first[m], last[m] + 1):
+                visible = 0.5 * erfc((horizon - elevation[k]) / (sqrt(2.0) * sigma[k]))
+                total += visible * (llr[k] + 0.5 * extended[k] * (1.0 - visible))
+            values[m, j] = total
+
+
+@njit(cache=True, nogil=True)
+def _add_sums(low, step, values, horizon, sector, sums):
+    """Add to sums (n, sectors) the cubics through four knots about each horizon (n, m); constant beyond the ends."""
+    knots = values.shape[1]
+    for p in range(len(sums)):
+        for m in range(len(low)):
+            at = min(max((horizon[p, m] - low[m]) / step[m], 0.0), knots - 1.0)
+            j = min(max(int(at), 1), knots - 3)
+            u = at - j
+            a, b, c, d = values[m, j - 1], values[m, j], values[m, j + 1], values[m, j + 2]
+            # Lagrange's form; u is in -1..2 at the ends.
+            value = (
+                -a * u * (u - 1) * (u - 2) / 6 + b * (u + 1) * (u - 1) * (u - 2) / 2
+                - c * (u + 1) * u * (u - 2) / 2 + d * (u + 1) * u * (u - 1) / 6
+            )  # fmt: skip
+            sums[p, sector[m]] += value

@@ -1,0 +1,97 @@
+"""The shifts of a measured skyline against the predicted one, explained by a small step of the position: least squares.
+
+It decides which directions show the predicted skyline and which show something else, and it gives the step, the effect
+of errors that all directions share (attitude, lens), and how the position depends on these.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.types import Array, Bools, Ints
+
+WINDOWS = (1, 2, 4, 8, 16, 32, 60)  # sectors that are tested together
+OUTLIER_SIGMAS = 4.0  # of the mean residual of a window
+MARGIN = 1  # sectors left out on either side of a window that contradicts the others
+MAX_DROPPED = 0.4  # of the information
+MIN_SECTORS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class SharedErrors:
+    """Errors that shift the skyline in all directions together, normal and centred at zero."""
+
+    raised_px: Array  # (sectors, k) by one unit of each
+    covariance: Array  # (k, k)
+
+
+@dataclass(frozen=True, eq=False)
+class SkylineFit:
+    """How a measured skyline (sectors) fits after a small step of the position."""
+
+    used: Bools  # (sectors,)
+    step_m: Array  # (2,)
+    shared: Array  # (k,) the shared errors
+    covariance: Array  # (2 + k, 2 + k) of both
+    residual_px: Array  # (sectors,)
+    chi2: float  # of a used sector, mean
+
+    @property
+    def shared_covariance(self) -> Array:
+        """(k, k)."""
+        return self.covariance[2:, 2:]
+
+    @property
+    def step_by_shared(self) -> Array:
+        """(2, k): how the position moves with each of the shared errors."""
+        return np.asarray(self.covariance[:2, 2:] @ np.linalg.pinv(self.shared_covariance, hermitian=True))
+
+
+def fit_skyline(
+    shift_px: Array, variance_px2: Array, px_per_m: Array, shared: SharedErrors, prior_m: Array, prior_m2: Array
+) -> SkylineFit | None:
+    """The step of the position and the shared errors that explain shifts of the skyline; None where none does.
+
+    Args:
+        shift_px: (n,) measured height above the predicted skyline, by sectors around the whole circle.
+        variance_px2: (n,) infinite where the sector shows nothing.
+        px_per_m: (n, 2) how the skyline rises with the position.
+        shared: errors common to the sectors.
+        prior_m: (2,) expected step.
+        prior_m2: (2, 2) its covariance.
+    """
+    used = np.isfinite(variance_px2)
+    weight = np.where(used, 1.0 / np.where(used, variance_px2, 1.0), 0.0)
+    whole = weight.sum()
+    design = np.concatenate([px_per_m, shared.raised_px], axis=1)
+    prior = np.zeros((design.shape[1],) * 2)
+    prior[:2, :2] = np.linalg.inv(prior_m2)
+    prior[2:, 2:] = np.linalg.inv(shared.covariance)
+    while True:
+        w = np.where(used, weight, 0.0)
+        if np.count_nonzero(used) < MIN_SECTORS or w.sum() < (1.0 - MAX_DROPPED) * whole:
+            return None
+        covariance = np.linalg.inv(prior + (design * w[:, None]).T @ design)
+        solution = covariance @ (design.T @ (w * shift_px) + prior[:, :2] @ prior_m)
+        residual = shift_px - design @ solution
+        window = _worst_window(residual, w)
+        if window is None:
+            chi2 = float(np.sum(w * np.square(residual)) / np.count_nonzero(used))
+            return SkylineFit(used, solution[:2], solution[2:], covariance, residual, chi2)
+        used = used.copy()
+        used[window] = False
+
+
+def _worst_window(residual_px: Array, weight: Array) -> Ints | None:
+    """The sectors of the window whose mean residual is farthest from zero, if that is too far."""
+    n, worst, found = len(weight), OUTLIER_SIGMAS, None
+    sums = [np.concatenate([[0.0], np.cumsum(np.tile(a, 2))]) for a in (weight * residual_px, weight)]
+    for width in WINDOWS:
+        part, information = (a[width : width + n] - a[:n] for a in sums)
+        score = np.abs(part) / np.sqrt(np.where(information > 0, information, np.inf))
+        top = int(np.argmax(score))
+        if score[top] > worst:
+            worst, found = float(score[top]), np.arange(top - MARGIN, top + width + MARGIN) % n
+    return found

@@ -18,7 +18,7 @@ from startrack.types import Array, Evidence, Fix
 ROUNDS = 3  # of predicted skylines; the step of the last is far below a pixel
 SETTLED_SIGMAS = 0.5  # of the position: a smaller step needs no further round
 NEAR_PX = 20.0  # stars farther from the skyline do not depend on the position here
-EDGE_SIGMA_PX = 0.03  # of the whole skyline, from the models of the PSF and of both levels; see benchmarks
+EDGE_SIGMA_PX = 0.02  # of the whole skyline, from the models of the PSF and of both levels; see benchmarks
 MOST_CHI2 = 3.0  # of a sector: the skyline is another
 MOST_STARS_CHI2 = 22.0  # of the step against the fix by the stars: one in 60,000
 
@@ -74,7 +74,7 @@ def _fit_step(measured: Measured, sky: SkyLight, position_m: Array, fix: Fix) ->
     if not used.any():
         return None
     map_sigma_px = terrain.horizon_sigma_rad(position_m[None], MIDDLES_RAD) * sky.px_per_rad
-    variance = np.where(used, np.square(sky.shift_sigma_px) + np.square(map_sigma_px), np.inf)
+    variance = np.where(used, sky.variance_px2 + np.square(map_sigma_px), np.inf)
     slopes = horizon_slopes(terrain, position_m, MIDDLES_RAD) * sky.px_per_rad[:, None]
     shift = sky.shift_px - fix.horizon_error_rad * sky.px_per_rad
     return fit_skyline(

@@ -16,8 +16,9 @@ SECTORS = 240  # of 1.5 degrees, as the localizer's
 LEVEL_SIGMAS = 4.0  # of the edge: from here on a pixel shows the sky or the ground alone
 MIN_SIDE_PIXELS = 30  # of a sector on either side of the skyline
 LEVEL_SECTORS = 5.0  # standard deviation of the smoothing along the skyline: 7.5 degrees
-SLOPE_SECTORS = 20.0  # of the slopes away from the skyline
+SLOPE_SECTORS = (20.0, 7.0)  # of the slopes away from the skyline, and of what these leave
 FIRST_CLIP_SIGMAS, CLIP_SIGMAS = 6.0, 3.5  # of the pixels: faint stars and defects
+NOISE_SECTORS = 5.0  # of the smoothing of the pixels' noise
 ROUNDS = 3
 SLOPE_EXCESS = 2.0  # mean square of slopes that the noise explains, in units of their variance
 MEDIAN_ABS_NORMAL = 0.6745
@@ -33,7 +34,8 @@ class SkyLevels:
     slope_e: Array  # per pixel of height
     own_e: Array  # level of each sector by itself, less `level_e`
     own_sigma_e: Array
-    noise_e: Array  # (2,) standard deviation of a pixel on either side
+    variance_e2: Array  # of `level_e` for each sector by itself, before it is smoothed
+    noise_e: Array  # standard deviation of a pixel on either side
     correlation: float  # variance of a sector's level beside that of independent pixels; at least 1
 
     @property
@@ -58,46 +60,69 @@ def measure_levels(pixels: SkyPixels, sector: Ints) -> SkyLevels:
     side = np.where(height > nearest, SKY, np.where(height < -nearest, GROUND, -1))
     counts = np.array([np.bincount(sector[side == s], minlength=SECTORS) for s in (GROUND, SKY)])
     covered = np.asarray((counts >= MIN_SIDE_PIXELS).all(axis=0))
-    level, slope, noise = np.zeros((2, SECTORS)), np.zeros((2, SECTORS)), np.ones(2)
-    for s in (GROUND, SKY):
-        values = light[side == s]
-        middle = float(np.median(values)) if len(values) else 0.0
-        level[s], noise[s] = middle, np.median(np.abs(values - middle)) / MEDIAN_ABS_NORMAL if len(values) else 1.0
-    clip = FIRST_CLIP_SIGMAS
+    level, noise = _first_levels(side, light)
+    slope, clip = np.zeros((2, SECTORS)), FIRST_CLIP_SIGMAS
     for _ in range(ROUNDS):
         sums = np.zeros((2, 6, SECTORS))
         _sum_sides(side, sector, height, light, level, slope, clip * noise, sums)
-        count = sums[:, 0]
-        noise = np.sqrt(np.maximum(sums[:, 5].sum(axis=1) / np.maximum(count.sum(axis=1), 1.0), 1e-12))
         sums *= covered
-        more_slope = _significant_slope(sums, slope, noise)
-        more_level = _smooth_level(sums, more_slope)
-        level, slope, clip = level + more_level, slope + more_slope, CLIP_SIGMAS
-    own = (sums[:, 3] - more_slope * sums[:, 1]) / np.maximum(count, 1.0) - more_level
-    own_sigma = noise[:, None] / np.sqrt(np.maximum(count, 1.0))
-    z2 = np.square(own / own_sigma)[:, covered]
-    correlation = float(np.median(z2)) / MEDIAN_ABS_NORMAL**2 if z2.size else 1.0
-    return SkyLevels(covered, level, slope, own, own_sigma, noise, max(correlation, 1.0))
+        count, squares = _smooth(sums[:, [0, 5]], NOISE_SECTORS).swapaxes(0, 1)
+        noise = np.sqrt(np.maximum(squares / np.maximum(count, 1e-9), 1e-12))
+        more, kept = _significant_slopes(sums, slope, noise)
+        own = sums[:, 3] - more * sums[:, 1]
+        smoothed = _smooth(np.stack([sums[:, 0], own]), LEVEL_SECTORS)
+        change = smoothed[1] / np.maximum(smoothed[0], 1e-9)
+        level, slope, clip = level + change, slope + more, CLIP_SIGMAS
+    count = np.maximum(sums[:, 0], 1.0)
+    own_e, variance = own / count - change, np.square(noise) / count
+    z2 = np.square(own_e) / variance
+    correlation = max(float(np.median(z2[:, covered])) / MEDIAN_ABS_NORMAL**2, 1.0) if covered.any() else 1.0
+    own_variance = correlation * variance
+    rough = np.maximum(_smooth(z2 * covered, NOISE_SECTORS) / np.maximum(_smooth(1.0 * covered, NOISE_SECTORS), 1e-9), 1.0)
+    extrapolated = np.square(sums[:, 1] / count) * count / np.maximum(_spread(sums), 1e-9)
+    return SkyLevels(
+        covered=covered, level_e=level, slope_e=slope, own_e=own_e, own_sigma_e=np.sqrt(own_variance),
+        variance_e2=variance * np.maximum(rough, correlation) * (1.0 + kept * extrapolated), noise_e=noise, correlation=correlation,
+    )  # fmt: skip
 
 
-def _significant_slope(sums: Array, slope_e: Array, noise_e: Array) -> Array:
-    """What is to be added to slopes (2, SECTORS) by sums (2, 6, SECTORS) of residuals, shrunk towards no slope at all.
+def _first_levels(side: Ints, light_e: Array) -> tuple[Array, Array]:
+    """Level and noise (2, SECTORS), (2, SECTORS) from the medians of all pixels of either side."""
+    middle, noise = np.zeros(2), np.ones(2)
+    for s in (GROUND, SKY):
+        values = light_e[side == s]
+        if len(values):
+            middle[s] = np.median(values)
+            noise[s] = np.median(np.abs(values - middle[s])) / MEDIAN_ABS_NORMAL
+    return np.repeat(middle[:, None], SECTORS, axis=1), np.repeat(noise[:, None], SECTORS, axis=1)
 
-    A slope that the noise alone explains would only make the levels at the skyline uncertain: 0.5 e of 7 e.
+
+def _significant_slopes(sums: Array, slope_e: Array, noise_e: Array) -> tuple[Array, Array]:
+    """What is to be added to slopes (2, SECTORS) by sums (2, 6, SECTORS) of residuals; the parts that are kept (2, 1).
+
+    Slopes are shrunk towards no slope at all: one that the noise alone explains would only make the levels at the
+    skyline uncertain, by 0.5 e of 7 e. What wide slopes leave is treated in the same way.
     """
-    n, h, hh, q, qh = np.moveaxis(gaussian_filter1d(sums[:, :5], SLOPE_SECTORS, axis=-1, mode="wrap"), 1, 0)
-    spread = np.maximum(hh - h * h / np.maximum(n, 1e-9), 1e-9)
-    slope = slope_e + (qh - h * q / np.maximum(n, 1e-9)) / spread
-    variance = np.square(noise_e)[:, None] / (spread * 2 * np.sqrt(np.pi) * SLOPE_SECTORS)
-    noisy = SLOPE_EXCESS * variance.mean(axis=1) / np.maximum(np.square(slope).mean(axis=1), 1e-12)
-    return np.asarray(slope * np.maximum(1.0 - noisy, 0.0)[:, None] - slope_e)
+    target, kept = np.zeros_like(slope_e), np.zeros((2, 1))
+    for width in SLOPE_SECTORS:
+        wide = _smooth(sums[:, :5], width)
+        n, h, _, q, qh = np.moveaxis(wide, 1, 0)
+        spread = np.maximum(_spread(wide), 1e-9)
+        slope = slope_e + (qh - h * q / np.maximum(n, 1e-9)) / spread - target
+        variance = np.square(noise_e) / (spread * 2 * np.sqrt(np.pi) * width)
+        noisy = SLOPE_EXCESS * variance.mean(axis=1) / np.maximum(np.square(slope).mean(axis=1), 1e-12)
+        part = np.maximum(1.0 - noisy, 0.0)[:, None]
+        target, kept = target + part * slope, np.maximum(kept, part)
+    return target - slope_e, kept
 
 
-def _smooth_level(sums: Array, slope_e: Array) -> Array:
-    """Level (2, SECTORS) at the skyline of residuals with these sums (2, 6, SECTORS) and slopes (2, SECTORS)."""
-    count, values = sums[:, 0], sums[:, 3] - slope_e * sums[:, 1]
-    smoothed = gaussian_filter1d(np.stack([count, values]), LEVEL_SECTORS, axis=-1, mode="wrap")
-    return np.asarray(smoothed[1] / np.maximum(smoothed[0], 1e-9))
+def _spread(sums: Array) -> Array:
+    """Sum (2, SECTORS) of the squared distances of heights from their mean, from sums (2, 5 or more, SECTORS)."""
+    return np.asarray(sums[:, 2] - np.square(sums[:, 1]) / np.maximum(sums[:, 0], 1e-9))
+
+
+def _smooth(values: Array, sectors: float) -> Array:
+    return np.asarray(gaussian_filter1d(values, sectors, axis=-1, mode="wrap"))
 
 
 @njit(cache=True, nogil=True)
@@ -108,7 +133,7 @@ def _sum_sides(side, sector, height, light, level, slope, limit, sums):
         if s >= 0:
             i, h = sector[k], height[k]
             q = light[k] - level[s, i] - slope[s, i] * h
-            if abs(q) <= limit[s]:
+            if abs(q) <= limit[s, i]:
                 sums[s, 0, i] += 1.0
                 sums[s, 1, i] += h
                 sums[s, 2, i] += h * h

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 # mypy: disable-error-code="no-untyped-def"
 from dataclasses import dataclass
+from functools import cached_property
 from math import erfc, sqrt
 
 import numpy as np
+from scipy.special import ndtr
 
 from startrack.evidence.sky_levels import CLIP_SIGMAS, GROUND, SECTORS, SKY, SkyLevels, measure_levels, sector_of
 from startrack.evidence.sky_pixels import SkyPixels
@@ -46,18 +48,40 @@ class SkyLight:
         """The same pixels above another predicted skyline, at most a few pixels away."""
         return sum_cells(self.pixels.above(horizon), self.levels, horizon)
 
+    @cached_property
+    def variance_px2(self) -> Array:
+        """(SECTORS,) of the skyline's height with the errors of both levels; infinite where it is not covered."""
+        return np.asarray(np.square(self.shift_sigma_px) + self._variance_by_levels_px2)
+
+    @cached_property
+    def _variance_by_levels_px2(self) -> Array:
+        """(SECTORS,). A level that is too high by d moves the edge of a step t by about 2 d / t pixels.
+
+        Levels are smoothed over sectors, whose errors then agree; over wider ranges that is as if each sector had the
+        whole error of its own level.
+        """
+        at = (self.height_px - self.shift_px[:, None]) / self.edge_px
+        visible, slope = ndtr(at), np.exp(-0.5 * np.square(at)) / (np.sqrt(2 * np.pi) * self.edge_px)
+        weight = self.extended_nats * slope
+        per_sky = (weight * visible).sum(axis=1) / np.maximum((weight * slope).sum(axis=1), 1e-12)
+        per_ground = (weight * (1.0 - visible)).sum(axis=1) / np.maximum((weight * slope).sum(axis=1), 1e-12)
+        variance = self.levels.variance_e2
+        step = np.where(self.levels.step_e > 0, self.levels.step_e, np.inf)
+        return np.asarray((np.square(per_ground) * variance[GROUND] + np.square(per_sky) * variance[SKY]) / step**2)
+
     def evidence(self, sectors: Bools, raised_px: Array, variance_factor: float = 1.0) -> Evidence:
         """Rows of the chosen `sectors` (SECTORS,), for the localizer.
 
-        They are put lower by `raised_px` (SECTORS,), by which the image shows them too high; the variances of the
-        pixels are taken `variance_factor` times as large.
+        They are put lower by `raised_px` (SECTORS,), by which the image shows them too high; the variances are taken
+        `variance_factor` times as large.
         """
+        factor = variance_factor * (1.0 + self._variance_by_levels_px2 / np.square(self.shift_sigma_px))
         s, h = np.nonzero((self.extended_nats > 0.0) & sectors[:, None])
         return Evidence(
             azimuth_rad=MIDDLES_RAD[s],
             elevation_rad=self.elevation_rad[s] + (self.height_px[s, h] - raised_px[s]) / self.px_per_rad[s],
-            llr=self.llr[s, h] / variance_factor,
-            extended_nats=self.extended_nats[s, h] / variance_factor,
+            llr=self.llr[s, h] / factor[s],
+            extended_nats=self.extended_nats[s, h] / factor[s],
             edge_sigma_rad=self.edge_px / self.px_per_rad[s],
         )
 
@@ -135,7 +159,7 @@ def _sum_cells(sector, height, light, scale, covered, level, slope, variance, co
             ground = level[GROUND, i] + slope[GROUND, i] * h
             step = level[SKY, i] + slope[SKY, i] * h - ground
             visible = 0.5 * erfc(-h / (sqrt(2.0) * edge))
-            s2 = variance[GROUND] + max(variance[SKY] - variance[GROUND], 0.0) * visible
+            s2 = variance[GROUND, i] + max(variance[SKY, i] - variance[GROUND, i], 0.0) * visible
             q = light[k] - ground
             rest = q - step * visible
             if step > 0.0 and rest * rest * correlation <= clip * clip * s2:

@@ -16,7 +16,7 @@ from startrack.stages import Measured
 from startrack.types import Array, Evidence, Fix
 
 ROUNDS = 3  # of predicted skylines; the step of the last is far below a pixel
-SETTLED_SIGMAS = 0.5  # of the position: a smaller step needs no further round
+SETTLED_PX = 0.3  # a skyline that moves by less need not be predicted anew
 NEAR_PX = 20.0  # stars farther from the skyline do not depend on the position here
 EDGE_SIGMA_PX = 0.02  # of the whole skyline, from the models of the PSF and of both levels; see benchmarks
 MOST_CHI2 = 3.0  # of a sector: the skyline is another
@@ -49,21 +49,20 @@ def refine_by_sky_light(measured: Measured, fix: Fix, stars: bool = True) -> Sky
         if fit is None or not np.asarray(terrain.allowed(position + fit.step_m)):
             return None
         position = position + fit.step_m
+        if np.abs(fit.px_per_m @ fit.step_m).max() < SETTLED_PX:
+            break
         horizon = Skyline.trace(position, terrain)
         sky = sky.above(horizon)
-        if fit.step_m @ np.linalg.solve(fit.covariance[:2, :2], fit.step_m) < SETTLED_SIGMAS**2:
-            break
-    fit = _fit_step(measured, sky, position, fix)
     moved = position - fix.position_enu_m[:2]
-    if fit is None or fit.chi2 > MOST_CHI2 or moved @ np.linalg.solve(prior_m2, moved) > MOST_STARS_CHI2:
+    if fit.chi2 > MOST_CHI2 or moved @ np.linalg.solve(prior_m2, moved) > MOST_STARS_CHI2:
         return None
     raised = _shared_errors(measured, sky).raised_px @ fit.shared
     rows = sky.evidence(fit.used, raised, max(fit.chi2, 1.0))
     if stars:
         rows = Evidence.concatenate(_stars_near(measured, horizon, float(np.median(pixels.px_per_rad))), rows)
     by_shared = fit.step_by_shared
-    sigma_m = float(np.sqrt(np.linalg.eigvalsh(fit.covariance[:2, :2])[1]))
-    refined = refine_fix(rows, fix, terrain, position, sigma_m, by_shared @ fit.shared_covariance @ by_shared.T)
+    smear = by_shared @ fit.shared_covariance @ by_shared.T
+    refined = refine_fix(rows, fix, terrain, position, fit.covariance[:2, :2], smear)
     return SkyRefinement(refined, sky, fit)
 
 

@@ -20,6 +20,7 @@ SLOPE_SECTORS = (20.0, 7.0)  # of the slopes away from the skyline, and of what 
 FIRST_CLIP_SIGMAS, CLIP_SIGMAS = 6.0, 3.5  # of the pixels: faint stars and defects
 NOISE_SECTORS = 5.0  # of the smoothing of the pixels' noise
 ROUNDS = 3
+MEDIAN_STEP = 8  # of the pixels from which the first levels are taken
 SLOPE_EXCESS = 2.0  # mean square of slopes that the noise explains, in units of their variance
 MEDIAN_ABS_NORMAL = 0.6745
 GROUND, SKY = range(2)
@@ -90,7 +91,7 @@ def _first_levels(side: Ints, light_e: Array) -> tuple[Array, Array]:
     """Level and noise (2, SECTORS), (2, SECTORS) from the medians of all pixels of either side."""
     middle, noise = np.zeros(2), np.ones(2)
     for s in (GROUND, SKY):
-        values = light_e[side == s]
+        values = light_e[side == s][::MEDIAN_STEP]
         if len(values):
             middle[s] = np.median(values)
             noise[s] = np.median(np.abs(values - middle[s])) / MEDIAN_ABS_NORMAL

@@ -11,7 +11,7 @@ from __future__ import annotations
 # mypy: disable-error-code="no-untyped-def"
 from dataclasses import dataclass
 from functools import cached_property
-from math import erfc, sqrt
+from math import sqrt
 
 import numpy as np
 from scipy.special import ndtr
@@ -20,6 +20,7 @@ from startrack.evidence.sky_levels import CLIP_SIGMAS, GROUND, SECTORS, SKY, Sky
 from startrack.evidence.sky_pixels import SkyPixels
 from startrack.evidence.sky_step import Horizon
 from startrack.kernels import njit
+from startrack.normal_cdf import normal_cdf
 from startrack.types import Array, Bools, Evidence
 
 HEIGHT_PX = 0.75  # of a cell
@@ -144,7 +145,7 @@ def _score_shifts(height, llr, extended, edge, log):
         for m in range(log.shape[1]):
             total = 0.0
             for j in range(llr.shape[1]):
-                visible = 0.5 * erfc((SHIFTS_PX[m] - height[i, j]) / (sqrt(2.0) * edge))
+                visible = normal_cdf((height[i, j] - SHIFTS_PX[m]) / edge)
                 total += visible * (llr[i, j] + 0.5 * extended[i, j] * (1.0 - visible))
             log[i, m] = total
 
@@ -158,7 +159,7 @@ def _sum_cells(sector, height, light, scale, covered, level, slope, variance, co
         if covered[i] and abs(h) < half:
             ground = level[GROUND, i] + slope[GROUND, i] * h
             step = level[SKY, i] + slope[SKY, i] * h - ground
-            visible = 0.5 * erfc(-h / (sqrt(2.0) * edge))
+            visible = normal_cdf(h / edge)
             s2 = variance[GROUND, i] + max(variance[SKY, i] - variance[GROUND, i], 0.0) * visible
             q = light[k] - ground
             rest = q - step * visible

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.evidence.sky_step import Horizon, Skyline, azimuth_and_elevation, skyline_band
+from startrack.evidence.sky_step import Horizon, Skyline, skyline_band
 from startrack.evidence.star_evidence import StarPhotometry, filtered_noise_e
-from startrack.frames import rays_from_azel
+from startrack.frames import azel_from_rays, rays_from_azel
 from startrack.psf import noise_area_px
 from startrack.types import Array, Bools, Detections
 
@@ -47,16 +47,16 @@ def pixels_near_skyline(
     `camera` and `R_cam_enu` place the skyline in the image; `stars` are those whose light is left out, visible or not.
     """
     band = skyline_band(detections.image_e.shape, camera, R_cam_enu, horizon)
-    band[_star_mask(detections, stars, band)] = False
+    _leave_out_stars(band, detections, stars)
     pixel = np.flatnonzero(band)
     pixel = pixel[~detections.dead.ravel()[pixel]]
     rows, columns = np.divmod(pixel, band.shape[1])
-    xy_px = np.stack([columns, rows], axis=1).astype(np.float64)
-    azimuth, elevation, angle = azimuth_and_elevation(xy_px, camera, R_cam_enu)
+    rays_cam = camera.unproject(np.stack([columns, rows], axis=1).astype(np.float64))
+    azimuth, elevation = azel_from_rays(rays_cam @ R_cam_enu)
     scale = scale_across(camera, R_cam_enu, horizon)(azimuth)
     height = (elevation - horizon(azimuth)) * scale
-    lit = angle < min(camera.calibrated_angle_rad, camera.max_angle_rad) - EDGE_PX / camera.focal_px[0]
-    usable = np.flatnonzero(lit & (np.abs(height) < BAND_PX))
+    limit_rad = min(camera.calibrated_angle_rad, camera.max_angle_rad) - EDGE_PX / camera.focal_px[0]
+    usable = np.flatnonzero((rays_cam[:, 2] > np.cos(limit_rad)) & (np.abs(height) < BAND_PX))
     return SkyPixels(
         azimuth_rad=azimuth[usable],
         elevation_rad=elevation[usable],
@@ -85,20 +85,18 @@ def scale_across(camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Skyline:
     return Skyline(across / np.maximum(np.hypot(*along.T), 1e-9))
 
 
-def _star_mask(detections: Detections, stars: StarPhotometry, band: Bools) -> Bools:
-    """Pixels (H, W) with light of known stars, visible or hidden, and of detections, near those of the band."""
+def _leave_out_stars(band: Bools, detections: Detections, stars: StarPhotometry) -> None:
+    """Clear the pixels of the band (H, W) that hold light of known stars, visible or hidden, or of detections."""
     sigma2 = detections.psf_sigma_px**2 + UNRESOLVED_PX2
     noise_e = filtered_noise_e(detections) / sqrt(noise_area_px(detections.psf_sigma_px))
     xy_px = np.concatenate([stars.xy_px, detections.xy_px])
     peak = np.concatenate([stars.expected_e, detections.flux_e]) / (2 * np.pi * sigma2 * max(noise_e, 1e-9))
-    radius = np.sqrt(2 * sigma2 * np.log(np.maximum(peak / MASKED_SIGMA, 1.0))) + 0.5
+    bright = np.flatnonzero(peak > MASKED_SIGMA)
+    xy_px, radius = xy_px[bright], np.sqrt(2 * sigma2 * np.log(peak[bright] / MASKED_SIGMA)) + 0.5
     x, y = np.rint(np.clip(xy_px, -1e6, 1e6)).astype(np.int64).T
     on_frame = (x >= 0) & (y >= 0) & (x < band.shape[1]) & (y < band.shape[0])
-    shining = peak > MASKED_SIGMA
-    near = np.zeros(len(x), dtype=bool)
-    near[on_frame] = band[y[on_frame], x[on_frame]]
-    wide = radius > BAND_PX / 2  # the disk may reach into the band from outside
-    mask = np.zeros(band.shape, dtype=np.uint8)
-    for k in np.flatnonzero(shining & (near | wide)).tolist():
-        cv2.circle(mask, (int(x[k]), int(y[k])), ceil(radius[k]), 1, -1)
-    return mask.view(np.bool_)
+    touching = radius > BAND_PX / 2  # the disk may reach into the band from outside
+    touching[on_frame] |= band[y[on_frame], x[on_frame]]
+    picture = band.view(np.uint8)
+    for k in np.flatnonzero(touching).tolist():
+        cv2.circle(picture, (int(x[k]), int(y[k])), ceil(radius[k]), 0, -1)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from startrack.camera import Camera
 from startrack.frames import azel_from_rays, off_axis_rad, rays_from_azel
+from startrack.kernels import njit
 from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Detections, Ints
 
@@ -51,10 +52,9 @@ class Skyline:
         return cls(terrain.horizon_rad(np.asarray(position_m)[None, :], azimuth))
 
     def __call__(self, azimuth_rad: Array) -> Array:
-        at = np.mod(azimuth_rad, 2 * np.pi) * (len(self.elevation_rad) / (2 * np.pi))
-        low = at.astype(np.int64) % len(self.elevation_rad)
-        part = at - np.floor(at)
-        return (1 - part) * self.elevation_rad[low] + part * self.elevation_rad[(low + 1) % len(self.elevation_rad)]
+        found = np.empty(np.shape(azimuth_rad))
+        _interpolate_circle(np.ascontiguousarray(self.elevation_rad), np.ravel(azimuth_rad), found.reshape(-1))
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ def measure_sky_step(detections: Detections, camera: Camera, R_cam_enu: Array, h
     azimuth = np.linspace(0.0, 2 * np.pi, STEP_SAMPLES, endpoint=False)
     elevation = horizon(azimuth)
     angle = off_axis_rad(rays_from_azel(azimuth, elevation) @ R_cam_enu.T)
-    shift_rad = np.multiply.outer(STEP_OFFSETS_PX, 1.0 / px_per_rad(camera, angle))
+    shift_rad = np.multiply.outer(STEP_OFFSETS_PX, 1.0 / _px_per_rad(camera, angle))
     rays_enu = rays_from_azel(azimuth, elevation + shift_rad)
     xy_px, inside = camera.project(rays_enu @ R_cam_enu.T)
     columns, rows = np.rint(xy_px[inside]).astype(np.int64).T
@@ -115,9 +115,9 @@ def subtract_sky_step(detections: Detections, camera: Camera, R_cam_enu: Array, 
     """
     image_e, dead = detections.image_e, detections.dead
     rows, columns = np.divmod(np.flatnonzero(skyline_band(image_e.shape, camera, R_cam_enu, horizon)), image_e.shape[1])
-    xy_px = np.stack([columns, rows], axis=1).astype(float)
-    azimuth, elevation, angle = azimuth_and_elevation(xy_px, camera, R_cam_enu)
-    above = (elevation - horizon(azimuth)) * px_per_rad(camera, angle)
+    rays_cam = camera.unproject(np.stack([columns, rows], axis=1).astype(float))
+    azimuth, elevation = azel_from_rays(rays_cam @ R_cam_enu)
+    above = (elevation - horizon(azimuth)) * _px_per_rad(camera, off_axis_rad(rays_cam))
     near = (np.abs(above) < BAND_PX) & ~dead[rows, columns]
     rows, columns, azimuth, above = rows[near], columns[near], azimuth[near], above[near]
     if not len(rows):
@@ -185,25 +185,27 @@ def skyline_band(shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horiz
     return picture.view(np.bool_)
 
 
-def azimuth_and_elevation(xy_px: Array, camera: Camera, R_cam_enu: Array) -> tuple[Array, Array, Array]:
-    """Azimuth and elevation in enu of pixels `xy_px` (n, 2), and angle off the `camera`'s axis (n,), ... [rad].
-
-    `R_cam_enu` (3, 3) is the rotation from enu to the camera.
-    """
-    rays_cam = camera.unproject(xy_px)
-    azimuth, elevation = azel_from_rays(rays_cam @ R_cam_enu)
-    return azimuth, elevation, off_axis_rad(rays_cam)
-
-
 def _px_per_rad_at(azimuth_rad: Array, elevation_rad: Array, camera: Camera, R_cam_enu: Array) -> Array:
     """Scale of the image (n,) in directions of enu; beyond the lens's view that of its edge."""
     angle = off_axis_rad(rays_from_azel(azimuth_rad, elevation_rad) @ R_cam_enu.T)
-    return px_per_rad(camera, np.minimum(angle, camera.max_angle_rad))
+    return _px_per_rad(camera, np.minimum(angle, camera.max_angle_rad))
 
 
-def px_per_rad(camera: Camera, angle_rad: Array) -> Array:
-    """Scale (n,) of the `camera`'s image away from its centre at the angles `angle_rad` (n,) off the axis."""
+def _px_per_rad(camera: Camera, angle_rad: Array) -> Array:
+    """Scale of the image away from its centre at angles off the axis (n,) [rad]."""
     return np.asarray(np.sqrt(camera.focal_px[0] * camera.focal_px[1]) * camera.lens.slope(angle_rad))
+
+
+@njit(cache=True, nogil=True)
+def _interpolate_circle(values, azimuth, found):  # type: ignore[no-untyped-def]
+    """Fill found (n,) with values (m,), given at even steps from azimuth 0 on, at the azimuths (n,) [rad]."""
+    m = len(values)
+    for k in range(len(found)):
+        at = azimuth[k] * (m / (2 * np.pi)) % m
+        low = int(at)
+        part = at - low
+        low = low % m
+        found[k] = (1.0 - part) * values[low] + part * values[(low + 1) % m]
 
 
 def _step_e(light_e: NDArray[np.float32], above: Bools) -> tuple[float, float]:

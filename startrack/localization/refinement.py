@@ -15,12 +15,16 @@ from startrack.localization.summary import summarize
 from startrack.terrain import Terrain
 from startrack.types import Array, Evidence, Fix
 
+NODES = 5  # traced horizons along each side of the ellipse's square
 STEP_M = 1.0  # at which the horizon's change with the position is taken
-FIRST_SIGMAS = 6.0  # half side of the first square, of the expected posterior
+REACH_SIGMAS = 6.0  # of the expected posterior, to the ends of the ellipse that is scored
+BOX_SIGMAS = 0.8  # side of the boxes, of the shorter axis
+MOST_BOXES = 20_000  # of an ellipse; a longer one is scored by the general method
+RIM_SIGMAS, RIM_MASS = 5.0, 1e-4  # more of the probability out there: the expected posterior is too small
 
 
 def refine_fix(
-    evidence: Evidence, fix: Fix, terrain: Terrain, position_m: Array, sigma_m: float, smear_m2: Array
+    evidence: Evidence, fix: Fix, terrain: Terrain, position_m: Array, covariance_m2: Array, smear_m2: Array
 ) -> Fix:
     """The `fix` replaced by the posterior from `evidence` near a good position on a `terrain`.
 
@@ -29,16 +33,15 @@ def refine_fix(
         fix: by the stars alone, whose search it keeps.
         terrain: with the evidence's enu.
         position_m: (2,) close to the best one.
-        sigma_m: about that of the posterior, along its longer axis.
+        covariance_m2: (2, 2) about that of the posterior.
         smear_m2: (2, 2) covariance of the position from errors that the rows share.
 
     Raises NotLocated as `summarize` does.
     """
 
     def explore(rows: Evidence, ground: Terrain, starts_m: Array | None) -> Explored:
-        likelihood = PositionLikelihood.from_evidence(rows, ground)
-        start = (position_m[None] if starts_m is None else starts_m)[:1]
-        return local_posterior(likelihood, Guess(start, np.zeros(1)), -np.inf, FIRST_SIGMAS * sigma_m)
+        start = position_m if starts_m is None else starts_m[0]
+        return _explore_near(PositionLikelihood.from_evidence(rows, ground), start, covariance_m2)
 
     if terrain.common_sigma_rad > 0.0:
         bias = estimate_horizon_bias(PositionLikelihood.from_evidence(evidence, terrain), position_m)
@@ -52,6 +55,26 @@ def refine_fix(
         explored.centres_m, 2 * explored.half_m, explored.log_likelihood, fix.dropped_probability or 0.0, terrain
     )
     return replace(refined, search=fix.search, horizon_error_rad=explored.horizon_bias_rad)
+
+
+def _explore_near(likelihood: PositionLikelihood, position_m: Array, covariance_m2: Array) -> Explored:
+    """The posterior in the ellipse where it is expected; where it does not fit in there, on squares of its own size."""
+    half = max(0.5 * BOX_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(covariance_m2)[0])), likelihood.terrain.finest_m)
+    reach = REACH_SIGMAS * np.sqrt(np.diag(covariance_m2))
+    counts = np.ceil(reach / (2 * half)).astype(int)
+    if np.prod(2.0 * counts + 1) <= MOST_BOXES:
+        lines = [2 * half * np.arange(-count, count + 1) for count in counts]
+        offsets = np.stack(np.meshgrid(*lines), axis=-1).reshape(-1, 2)
+        sigmas = np.sqrt(np.einsum("ni,ij,nj->n", offsets, np.linalg.inv(covariance_m2), offsets))
+        centres = position_m + offsets[sigmas < REACH_SIGMAS]
+        allowed = np.asarray(likelihood.terrain.allowed(centres))
+        score = likelihood.near(position_m, float(reach.max()) + 2 * half, across=NODES).scores(centres[allowed])
+        weight = np.exp(score - score.max(initial=-np.inf))
+        rim = sigmas[sigmas < REACH_SIGMAS][allowed] > RIM_SIGMAS
+        resolved = weight.sum() > 1.0 / BOX_SIGMAS**2
+        if resolved and weight[rim].sum() < RIM_MASS * weight.sum():
+            return Explored(centres[allowed], half, score, -np.inf, "beam")
+    return local_posterior(likelihood, Guess(position_m[None], np.zeros(1)), -np.inf, float(reach.max()))
 
 
 def horizon_slopes(terrain: Terrain, position_m: Array, azimuth_rad: Array) -> Array:

@@ -9,6 +9,7 @@ from math import erfc, exp, expm1, inf, log, log1p, sqrt
 import numpy as np
 
 from startrack.kernels import njit
+from startrack.normal_cdf import normal_cdf
 from startrack.types import Array, Evidence, Ints
 
 SECTOR_STEP = 10.0  # between the keys of neighbouring sectors: more than any two elevations differ [rad]
@@ -111,7 +112,7 @@ def row_contribution(llr, extended, sigmas_above, hard_above):  # type: ignore[n
         value = llr
     elif hard_above == 0 and sigmas_above > -EDGE_SIGMAS:
         if extended > 0.0:
-            visible = 0.5 * erfc(-sigmas_above / sqrt(2.0))
+            visible = normal_cdf(sigmas_above)
             value = llr * visible + 0.5 * extended * visible * (1.0 - visible)
         else:
             fraction = 0.5 * erfc((-sigmas_above if llr > 0.0 else sigmas_above) / sqrt(2.0))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import erfc, sqrt
 
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
 
 from startrack.kernels import njit
+from startrack.normal_cdf import normal_cdf
 from startrack.types import Array, Evidence, Ints
 
 REACH_SIGMAS = 8.0  # of the edge: from the outer rows to the ends of the splines, beyond which they are constant
@@ -73,7 +73,7 @@ def _fill_profiles(elevation, llr, extended, sigma, first, last, low, step, valu
         for j in range(values.shape[1]):
             horizon, total = low[m] + j * step[m], 0.0
             for k in range(first[m], last[m] + 1):
-                visible = 0.5 * erfc((horizon - elevation[k]) / (sqrt(2.0) * sigma[k]))
+                visible = normal_cdf((elevation[k] - horizon) / sigma[k])
                 total += visible * (llr[k] + 0.5 * extended[k] * (1.0 - visible))
             values[m, j] = total
 

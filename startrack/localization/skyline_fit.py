@@ -32,6 +32,7 @@ class SkylineFit:
     """How a measured skyline (sectors) fits after a small step of the position."""
 
     used: Bools  # (sectors,)
+    px_per_m: Array  # (sectors, 2) how the skyline rises with the position
     step_m: Array  # (2,)
     shared: Array  # (k,) the shared errors
     covariance: Array  # (2 + k, 2 + k) of both
@@ -79,7 +80,7 @@ def fit_skyline(
         window = _worst_window(residual, w)
         if window is None:
             chi2 = float(np.sum(w * np.square(residual)) / np.count_nonzero(used))
-            return SkylineFit(used, solution[:2], solution[2:], covariance, residual, chi2)
+            return SkylineFit(used, px_per_m, solution[:2], solution[2:], covariance, residual, chi2)
         used = used.copy()
         used[window] = False
 

@@ -21,6 +21,7 @@ class AttitudeFit:
     """Result of `solve_attitude`."""
 
     attitude: Attitude
+    centroid_covariance_rad2: Array  # (3, 3) part of the attitude's covariance that is not the lens's
     residual_px: Array  # (n, 2) measured minus predicted
     used: Bools  # (n,) not rejected as outliers
     rms_px: float  # of the used stars, per axis
@@ -49,6 +50,7 @@ def solve_attitude(
     by_lens = _attitude_covariance_by_lens(camera, rays_cam, jacobian, weight)
     return AttitudeFit(
         attitude=Attitude(R_cam_icrs=found.state.R_cam_icrs[0], covariance_rad2=by_stars + by_lens),
+        centroid_covariance_rad2=by_stars,
         residual_px=found.residual_px,
         used=used,
         rms_px=float(np.sqrt(np.mean(residual**2))),

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from startrack.evidence import Skyline
 from startrack.evidence.sky_checks import sectors_with_step
 from startrack.evidence.sky_light import MIDDLES_RAD, SkyLight, measure_sky_light
+from startrack.evidence.sky_levels import sector_of
 from startrack.evidence.sky_pixels import pixels_near_skyline
+from startrack.evidence.sky_step import Horizon
+from startrack.evidence.star_offsets import StarOffsets, measure_star_offsets, offset_terms
 from startrack.localization.refinement import horizon_slopes, refine_fix
 from startrack.localization.skyline_fit import SharedErrors, SkylineFit, fit_skyline
 from startrack.stages import Measured
@@ -19,6 +22,7 @@ ROUNDS = 3  # of predicted skylines; the step of the last is far below a pixel
 SETTLED_PX = 0.3  # a skyline that moves by less need not be predicted anew
 NEAR_PX = 20.0  # stars farther from the skyline do not depend on the position here
 EDGE_SIGMA_PX = 0.02  # of the whole skyline, from the models of the PSF and of both levels; see benchmarks
+SHAPE_STEP = 1e-4  # relative, at which the horizon's change with the terrain's shape is taken
 MOST_CHI2 = 3.0  # of a sector: the skyline is another
 MOST_STARS_CHI2 = 22.0  # of the step against the fix by the stars: one in 60,000
 
@@ -56,13 +60,15 @@ def refine_by_sky_light(measured: Measured, fix: Fix, stars: bool = True) -> Sky
     moved = position - fix.position_enu_m[:2]
     if fit.chi2 > MOST_CHI2 or moved @ np.linalg.solve(prior_m2, moved) > MOST_STARS_CHI2:
         return None
-    raised = _shared_errors(measured, sky).raised_px @ fit.shared
-    rows = sky.evidence(fit.used, raised, max(fit.chi2, 1.0))
+    by_terrain = fit.raised_px(of_terrain=True)
+    rows = sky.evidence(fit.used, by_terrain + fit.raised_px(of_terrain=False), max(fit.chi2, 1.0))
     if stars:
-        rows = Evidence.concatenate(_stars_near(measured, horizon, float(np.median(pixels.px_per_rad))), rows)
+        scale = float(np.median(pixels.px_per_rad))
+        rows = Evidence.concatenate(_stars_near(measured, horizon, scale, by_terrain / sky.px_per_rad), rows)
     by_shared = fit.step_by_shared
     smear = by_shared @ fit.shared_covariance @ by_shared.T
-    refined = refine_fix(rows, fix, terrain, position, fit.covariance[:2, :2], smear)
+    error_rad = float(fit.shared[5]) if terrain.common_sigma_rad > 0.0 else 0.0
+    refined = refine_fix(rows, fix, terrain, position, fit.covariance[:2, :2], smear, error_rad)
     return SkyRefinement(refined, sky, fit)
 
 
@@ -75,31 +81,51 @@ def _fit_step(measured: Measured, sky: SkyLight, position_m: Array, fix: Fix) ->
     map_sigma_px = terrain.horizon_sigma_rad(position_m[None], MIDDLES_RAD) * sky.px_per_rad
     variance = np.where(used, sky.variance_px2 + np.square(map_sigma_px), np.inf)
     slopes = horizon_slopes(terrain, position_m, MIDDLES_RAD) * sky.px_per_rad[:, None]
-    shift = sky.shift_px - fix.horizon_error_rad * sky.px_per_rad
-    return fit_skyline(
-        shift, variance, slopes, _shared_errors(measured, sky), fix.position_enu_m[:2] - position_m, fix.covariance_m2
+    shared = _shared_errors(measured, sky, position_m, fix)
+    return fit_skyline(sky.shift_px, variance, slopes, shared, fix.position_enu_m[:2] - position_m, fix.covariance_m2)
+
+
+def _shared_errors(measured: Measured, sky: SkyLight, position_m: Array, fix: Fix) -> SharedErrors:
+    """Errors of the image (attitude, lens, edge model) and of the terrain (its common error and its shape)."""
+    terrain, horizon = measured.terrain, sky.horizon
+    offsets = _star_offsets(measured, horizon)
+    columns, means, variances = [offset_terms(MIDDLES_RAD)], list(offsets.mean_px), []
+    if terrain.common_sigma_rad > 0.0:
+        columns.append(sky.px_per_rad[:, None])
+        means.append(fix.horizon_error_rad)
+        variances.append(terrain.common_sigma_rad**2)
+    here = terrain.horizon_rad(position_m[None], MIDDLES_RAD)
+    for k, sigma in enumerate(terrain.shape_sigma):
+        if sigma > 0.0:
+            changed = terrain.reshaped(SHAPE_STEP * np.eye(2)[k])
+            change = (changed.horizon_rad(position_m[None], MIDDLES_RAD) - here) / SHAPE_STEP
+            columns.append((change * sky.px_per_rad)[:, None])
+            means.append(0.0)
+            variances.append(sigma**2)
+    covariance = np.zeros((len(means),) * 2)
+    covariance[:5, :5] = offsets.covariance_px2
+    covariance[0, 0] += EDGE_SIGMA_PX**2
+    covariance[5:, 5:] = np.diag(variances)
+    return SharedErrors(np.concatenate(columns, axis=1), np.array(means), covariance, np.arange(len(means)) >= 5)
+
+
+def _star_offsets(measured: Measured, horizon: Horizon) -> StarOffsets:
+    """Offset of the image at the skyline, by attitude, lens and the identified stars near it."""
+    found, fit, camera = measured.identification, measured.attitude_fit, measured.camera
+    rays_cam = measured.stars.rays_icrs[found.star[fit.used]] @ fit.attitude.R_cam_icrs.T
+    centroids = measured.detections.covariance_px2[found.detection[fit.used]]
+    variance = 0.5 * np.trace(centroids, axis1=1, axis2=2) + fit.extra_sigma_px**2
+    return measure_star_offsets(
+        camera, measured.R_cam_enu, fit.centroid_covariance_rad2, horizon, rays_cam, fit.residual_px[fit.used], variance
     )
 
 
-def _shared_errors(measured: Measured, sky: SkyLight) -> SharedErrors:
-    """Errors of the attitude about east and north, and of the level of the whole skyline.
+def _stars_near(measured: Measured, horizon: Skyline, px_per_rad: float, raised_rad: Array) -> Evidence:
+    """The rows of the stars that a small step of the position may hide or show, above the map's horizon.
 
-    A rotation w of the camera raises what it shows at azimuth a by w_east cos a - w_north sin a, at any elevation.
+    `raised_rad` (SECTORS,): how much higher the true horizon stands than the map's.
     """
-    R = measured.R_cam_enu
-    turned = (R.T @ measured.attitude_fit.attitude.covariance_rad2 @ R)[:2, :2]
-    columns = np.stack([np.cos(MIDDLES_RAD), -np.sin(MIDDLES_RAD), np.ones_like(MIDDLES_RAD)], axis=1)
-    scale = sky.px_per_rad
-    level = (EDGE_SIGMA_PX / float(np.median(scale))) ** 2 + measured.terrain.common_sigma_rad**2
-    covariance = np.zeros((3, 3))
-    covariance[:2, :2], covariance[2, 2] = turned, level
-    return SharedErrors(columns * scale[:, None], covariance)
-
-
-def _stars_near(measured: Measured, horizon: Skyline, px_per_rad: float) -> Evidence:
-    """The rows of the stars that a small step of the position may hide or show."""
     rows = measured.evidence()
-    near = np.abs(rows.elevation_rad - horizon(rows.azimuth_rad)) < NEAR_PX / px_per_rad
-    return rows.take(near)
-
-
+    above = rows.elevation_rad - horizon(rows.azimuth_rad)
+    near = rows.take(np.abs(above) < NEAR_PX / px_per_rad)
+    return replace(near, elevation_rad=near.elevation_rad - raised_rad[sector_of(near.azimuth_rad)])

@@ -58,5 +58,3 @@ def _is_sharp(sky: SkyLight, sectors: Bools) -> bool:
         return float(np.sum(fraction * (llr + 0.5 * extended * (1.0 - fraction))))
 
     return nats(sky.edge_px) > nats(RAMP_PX) + SHARP_NATS
-
-

@@ -35,6 +35,7 @@ class SkyLight:
 
     pixels: SkyPixels
     levels: SkyLevels
+    horizon: Horizon  # the predicted one
     elevation_rad: Array  # (SECTORS,) of the predicted skyline at MIDDLES_RAD
     px_per_rad: Array  # (SECTORS,)
     height_px: Array  # (SECTORS, LEVELS) of the cells above the predicted skyline, means by information
@@ -110,6 +111,7 @@ def sum_cells(pixels: SkyPixels, levels: SkyLevels, horizon: Horizon) -> SkyLigh
     return SkyLight(
         pixels=pixels,
         levels=levels,
+        horizon=horizon,
         elevation_rad=horizon(MIDDLES_RAD),
         px_per_rad=np.where(seen, scale[:, 1] / np.maximum(scale[:, 0], 1.0), 1.0),
         height_px=height_px,

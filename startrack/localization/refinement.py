@@ -10,7 +10,7 @@ from startrack.localization.explored import Explored
 from startrack.localization.initial_guess import Guess
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.local_posterior import local_posterior
-from startrack.localization.nuisance import estimate_horizon_bias, marginalize_horizon_bias, mix_shifted
+from startrack.localization.nuisance import mix_shifted
 from startrack.localization.summary import summarize
 from startrack.terrain import Terrain
 from startrack.types import Array, Evidence, Fix
@@ -24,7 +24,13 @@ RIM_SIGMAS, RIM_MASS = 5.0, 1e-4  # more of the probability out there: the expec
 
 
 def refine_fix(
-    evidence: Evidence, fix: Fix, terrain: Terrain, position_m: Array, covariance_m2: Array, smear_m2: Array
+    evidence: Evidence,
+    fix: Fix,
+    terrain: Terrain,
+    position_m: Array,
+    covariance_m2: Array,
+    smear_m2: Array,
+    horizon_error_rad: float,
 ) -> Fix:
     """The `fix` replaced by the posterior from `evidence` near a good position on a `terrain`.
 
@@ -35,26 +41,19 @@ def refine_fix(
         position_m: (2,) close to the best one.
         covariance_m2: (2, 2) about that of the posterior.
         smear_m2: (2, 2) covariance of the position from errors that the rows share.
+        horizon_error_rad: by which the rows were put lower, for the common error of the map.
 
     Raises NotLocated as `summarize` does.
     """
 
-    def explore(rows: Evidence, ground: Terrain, starts_m: Array | None) -> Explored:
-        start = position_m if starts_m is None else starts_m[0]
-        return _explore_near(PositionLikelihood.from_evidence(rows, ground), start, covariance_m2)
-
-    if terrain.common_sigma_rad > 0.0:
-        bias = estimate_horizon_bias(PositionLikelihood.from_evidence(evidence, terrain), position_m)
-        explored = marginalize_horizon_bias(explore, evidence, terrain, bias, position_m[None])
-    else:
-        explored = explore(evidence, terrain, position_m[None])
+    explored = _explore_near(PositionLikelihood.from_evidence(evidence, terrain), position_m, covariance_m2)
     sizes, axes = np.linalg.eigh(smear_m2)
     for size, axis in zip(sizes, axes.T, strict=True):
         explored = mix_shifted(explored, np.sqrt(max(size, 0.0)) * axis, terrain)
     refined = summarize(
         explored.centres_m, 2 * explored.half_m, explored.log_likelihood, fix.dropped_probability or 0.0, terrain
     )
-    return replace(refined, search=fix.search, horizon_error_rad=explored.horizon_bias_rad)
+    return replace(refined, search=fix.search, horizon_error_rad=horizon_error_rad)
 
 
 def _explore_near(likelihood: PositionLikelihood, position_m: Array, covariance_m2: Array) -> Explored:

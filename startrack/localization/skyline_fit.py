@@ -21,10 +21,12 @@ MIN_SECTORS = 60
 
 @dataclass(frozen=True, eq=False)
 class SharedErrors:
-    """Errors that shift the skyline in all directions together, normal and centred at zero."""
+    """Errors that shift the skyline in all directions together: of the image, and of the terrain."""
 
     raised_px: Array  # (sectors, k) by one unit of each
+    mean: Array  # (k,)
     covariance: Array  # (k, k)
+    of_terrain: Bools  # (k,) whether the stars see the skyline shifted too
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +36,16 @@ class SkylineFit:
     used: Bools  # (sectors,)
     px_per_m: Array  # (sectors, 2) how the skyline rises with the position
     step_m: Array  # (2,)
-    shared: Array  # (k,) the shared errors
+    errors: SharedErrors
+    shared: Array  # (k,) their values
     covariance: Array  # (2 + k, 2 + k) of both
     residual_px: Array  # (sectors,)
     chi2: float  # of a used sector, mean
+
+    def raised_px(self, of_terrain: bool) -> Array:
+        """(sectors,) how much the shared errors of the terrain, or else those of the image, raise the skyline."""
+        which = self.errors.of_terrain == of_terrain
+        return np.asarray(self.errors.raised_px[:, which] @ self.shared[which])
 
     @property
     def shared_covariance(self) -> Array:
@@ -70,17 +78,18 @@ def fit_skyline(
     prior = np.zeros((design.shape[1],) * 2)
     prior[:2, :2] = np.linalg.inv(prior_m2)
     prior[2:, 2:] = np.linalg.inv(shared.covariance)
+    expected = np.concatenate([prior_m, shared.mean])
     while True:
         w = np.where(used, weight, 0.0)
         if np.count_nonzero(used) < MIN_SECTORS or w.sum() < (1.0 - MAX_DROPPED) * whole:
             return None
         covariance = np.linalg.inv(prior + (design * w[:, None]).T @ design)
-        solution = covariance @ (design.T @ (w * shift_px) + prior[:, :2] @ prior_m)
+        solution = covariance @ (design.T @ (w * shift_px) + prior @ expected)
         residual = shift_px - design @ solution
         window = _worst_window(residual, w)
         if window is None:
             chi2 = float(np.sum(w * np.square(residual)) / np.count_nonzero(used))
-            return SkylineFit(used, px_per_m, solution[:2], solution[2:], covariance, residual, chi2)
+            return SkylineFit(used, px_per_m, solution[:2], shared, solution[2:], covariance, residual, chi2)
         used = used.copy()
         used[window] = False
 

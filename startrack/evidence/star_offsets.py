@@ -1,0 +1,105 @@
+"""How much higher the image shows the sky near the skyline than camera and attitude state, by the stars near it.
+
+Pixels of the sky get their direction from the camera and the attitude, stars theirs from the catalogue. What the stars
+near the skyline show of the difference is taken out of the pixels' heights; its uncertainty stays with the position.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.camera import Camera
+from startrack.camera.uncertainty import compensating_rotation, lens_jacobian
+from startrack.evidence.sky_step import Horizon
+from startrack.frames import azel_from_rays, rays_from_azel
+from startrack.types import Array, Bools
+
+NEAR_PX = 60.0  # from the skyline to the stars that are used: five degrees of a 180-degree fisheye
+SAMPLES, STEP_RAD = 360, 1e-3  # around the skyline, and in elevation
+CLIPPED_SIGMAS = 4.0  # of a star's residual: blends
+SIGNIFICANT_CHI2 = 20.5  # of five terms: one in a thousand; below, the lens is as its file says
+LEAST_SIGMA_PX = 1e-3  # of a term
+MIN_STARS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class StarOffsets:
+    """Terms of the offset (see `offset_terms`) with their covariance."""
+
+    mean_px: Array  # (5,)
+    covariance_px2: Array  # (5, 5)
+
+
+def offset_terms(azimuth_rad: Array) -> Array:
+    """Terms (n, 5) of an offset as a function of azimuths (n,) [rad]: its mean, and waves once and twice around."""
+    a = azimuth_rad
+    return np.stack([np.ones_like(a), np.cos(a), np.sin(a), np.cos(2 * a), np.sin(2 * a)], axis=1)
+
+
+def measure_star_offsets(
+    camera: Camera,
+    R_cam_enu: Array,
+    attitude_covariance_rad2: Array,
+    horizon: Horizon,
+    rays_cam: Array,
+    residual_px: Array,
+    variance_px2: Array,
+) -> StarOffsets:
+    """Offset of the image at a skyline from the covariances of attitude and lens and the residuals of matched stars.
+
+    Args:
+        camera: its covariance is the prior of the lens.
+        R_cam_enu: (3, 3) rotation from enu to the camera.
+        attitude_covariance_rad2: (3, 3) by the centroids, about the camera's axes.
+        horizon: elevations of the skyline.
+        rays_cam: (n, 3) directions of matched stars.
+        residual_px: (n, 2) measured less predicted.
+        variance_px2: (n,) of a residual, per axis.
+    """
+    prior = _prior_px2(camera, R_cam_enu, attitude_covariance_rad2, horizon)
+    azimuth, elevation = azel_from_rays(rays_cam @ R_cam_enu)
+    up, scale = _up_in_image(camera, R_cam_enu, azimuth, elevation)
+    above_px = (elevation - horizon(azimuth)) * scale
+    offset = np.einsum("ni,ni->n", residual_px, up)
+    used: Bools = (np.abs(above_px) < NEAR_PX) & (np.abs(offset) < CLIPPED_SIGMAS * np.sqrt(variance_px2))
+    if np.count_nonzero(used) < MIN_STARS:
+        return StarOffsets(np.zeros(5), prior)
+    terms = offset_terms(azimuth[used])
+    normal = (terms / variance_px2[used, None]).T @ terms
+    right = (terms / variance_px2[used, None]).T @ offset[used]
+    alone = np.linalg.pinv(normal, hermitian=True)
+    excess = right @ alone
+    if excess @ np.linalg.pinv(alone + prior, hermitian=True) @ excess > SIGNIFICANT_CHI2:
+        prior = prior + max(float(np.mean(np.square(excess) - np.diag(alone))), 0.0) * np.eye(5)
+    covariance = np.linalg.inv(np.linalg.inv(prior) + normal)
+    return StarOffsets(covariance @ right, covariance)
+
+
+def _prior_px2(camera: Camera, R_cam_enu: Array, attitude_covariance_rad2: Array, horizon: Horizon) -> Array:
+    """Covariance (5, 5) of the terms by attitude and lens together."""
+    azimuth = np.linspace(0.0, 2 * np.pi, SAMPLES, endpoint=False)
+    elevation = horizon(azimuth)
+    rays_cam = rays_from_azel(azimuth, elevation) @ R_cam_enu.T
+    up, _ = _up_in_image(camera, R_cam_enu, azimuth, elevation)
+    to_terms = np.linalg.pinv(offset_terms(azimuth))
+    rotation = camera.jacobian_px_per_rad(rays_cam)
+    by_rotation = to_terms @ np.einsum("ni,nij->nj", up, rotation)
+    prior = by_rotation @ attitude_covariance_rad2 @ by_rotation.T + LEAST_SIGMA_PX**2 * np.eye(5)
+    if camera.covariance is not None:
+        order = camera.covariance_order
+        lens = lens_jacobian(camera, rays_cam, order) + rotation @ compensating_rotation(camera, order)
+        by_lens = to_terms @ np.einsum("ni,nij->nj", up, lens)
+        prior = prior + by_lens @ camera.covariance @ by_lens.T
+    return np.asarray(prior)
+
+
+def _up_in_image(camera: Camera, R_cam_enu: Array, azimuth: Array, elevation: Array) -> tuple[Array, Array]:
+    """Unit vectors (n, 2) of growing elevation in the image, and pixels per radian (n,)."""
+    low, high = (
+        camera.project_unlimited(rays_from_azel(azimuth, elevation + step) @ R_cam_enu.T)
+        for step in (-STEP_RAD, STEP_RAD)
+    )
+    length = np.maximum(np.hypot(*(high - low).T), 1e-9)
+    return (high - low) / length[:, None], length / (2 * STEP_RAD)

@@ -33,7 +33,7 @@ from startrack.localization.rim_plane import stars_on_rim_plane
 from startrack.pipeline import locate
 from startrack.rendering import Series, render
 from startrack.stages import Identified, Located, Oriented, Outcome, last_value
-from startrack.terrain import load_terrain
+from startrack.terrain import Cylinder, load_terrain
 from startrack.types import Evidence, NoSolution
 
 # 10 s reach V 6.0 at 5 sigma in 100 e of background, of which 7 e are sky.
@@ -119,7 +119,12 @@ def wrong_identities(result: Identified, R_cam_icrs: np.ndarray) -> tuple[int, i
 
 
 def peers(result: Located, position_m: np.ndarray) -> dict[str, float]:
-    """The thesis's methods on this frame's own list: catalogue stars to the detection limit, seen when identified."""
+    """The thesis's methods on this frame's own list: catalogue stars to the detection limit, seen when identified.
+
+    They need a cylinder; nothing on other terrain.
+    """
+    if not isinstance(result.terrain, Cylinder):
+        return {}
     photometry = result.light
     seen = np.isin(photometry.star, result.identification.star)
     listed = seen | (photometry.expected_e > 5.0 * np.maximum(photometry.sigma_e, 1e-9))

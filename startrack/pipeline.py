@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time as clock
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from startrack.camera import Camera
@@ -17,6 +18,7 @@ from startrack.orientation import (
     identify_unknown_lens,
     solve_orientation,
 )  # fmt: skip
+from startrack.sky_refinement import refine_by_sky_light
 from startrack.stages import (
     Detected,
     Inputs,
@@ -67,8 +69,11 @@ def locate(
             fix = run.time_stage("locate", settings.localizer, measured.evidence(), terrain)
         if fix.search != "approximate":
             run.time_stage("locate", check_consistency, measured.evidence(), fix, terrain)
-        sky_mag = step and step.brightness_mag_arcsec2(camera, exposure.exposure_s)
-        return run.finish(extend(measured, Located, fix=fix, sky_brightness_mag_arcsec2=sky_mag))
+        located = extend(measured, Located, fix=fix)
+        if step is not None and settings.evidence_sources != "stars":
+            located = run.time_stage("locate", refine_by_sky_light, located, settings.evidence_sources == "both")
+        sky_mag = None if step is None else step.brightness_mag_arcsec2(camera, exposure.exposure_s)
+        return run.finish(replace(located, sky_brightness_mag_arcsec2=sky_mag))
     except (BadInput, NoSolution) as refusal:
         return run.refuse(refusal)
 

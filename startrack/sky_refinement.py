@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from startrack.evidence import Skyline
 from startrack.evidence.sky_checks import sectors_with_step
-from startrack.evidence.sky_light import MIDDLES_RAD, SkyLight, measure_sky_light
 from startrack.evidence.sky_levels import sector_of
+from startrack.evidence.sky_light import MIDDLES_RAD, SkyLight, measure_sky_light
 from startrack.evidence.sky_pixels import pixels_near_skyline
 from startrack.evidence.sky_step import Horizon
 from startrack.evidence.star_offsets import StarOffsets, measure_star_offsets, offset_terms
 from startrack.localization.refinement import horizon_slopes, refine_fix
 from startrack.localization.skyline_fit import SharedErrors, SkylineFit, fit_skyline
-from startrack.stages import Measured
-from startrack.types import Array, Evidence, Fix
+from startrack.stages import Located, Measured
+from startrack.types import Array, Evidence, Fix, NotLocated
 
-ROUNDS = 3  # of predicted skylines; the step of the last is far below a pixel
+ROUNDS = 5  # of predicted skylines; the step of the last is far below a pixel
 SETTLED_PX = 0.3  # a skyline that moves by less need not be predicted anew
 NEAR_PX = 20.0  # stars farther from the skyline do not depend on the position here
 EDGE_SIGMA_PX = 0.02  # of the whole skyline, from the models of the PSF and of both levels; see benchmarks
@@ -27,20 +27,20 @@ MOST_CHI2 = 3.0  # of a sector: the skyline is another
 MOST_STARS_CHI2 = 22.0  # of the step against the fix by the stars: one in 60,000
 
 
-@dataclass(frozen=True, eq=False)
-class SkyRefinement:
-    """A fix by stars and sky, and the skyline that the sky shows."""
+def refine_by_sky_light(located: Located, stars: bool = True) -> Located:
+    """`located` with its fix by the stars refined; as it was where the image shows no light that stops at the skyline.
 
-    fix: Fix
-    sky: SkyLight
-    fit: SkylineFit
-
-
-def refine_by_sky_light(measured: Measured, fix: Fix, stars: bool = True) -> SkyRefinement | None:
-    """The `fix` found with `measured`, refined; None where the image shows no light that stops at the skyline.
-
-    With `stars` the rows of the stars stay in the posterior, otherwise the sky's light alone determines it.
+    With `stars` their rows stay in the posterior, otherwise the sky's light alone determines it: then raises NotLocated
+    (insufficient_geometry) where there is none.
     """
+    refined = None if located.fix.ambiguous else _refined(located, stars)
+    if refined is None and not stars:
+        raise NotLocated("the image shows no light of the sky that stops at the skyline: expose longer?")
+    return refined or located
+
+
+def _refined(measured: Located, stars: bool) -> Located | None:
+    fix = measured.fix
     terrain, camera = measured.terrain, measured.camera
     position, prior_m2 = fix.position_enu_m[:2], fix.covariance_m2
     horizon = Skyline.trace(position, terrain)
@@ -57,6 +57,8 @@ def refine_by_sky_light(measured: Measured, fix: Fix, stars: bool = True) -> Sky
             break
         horizon = Skyline.trace(position, terrain)
         sky = sky.above(horizon)
+    else:
+        return None
     moved = position - fix.position_enu_m[:2]
     if fit.chi2 > MOST_CHI2 or moved @ np.linalg.solve(prior_m2, moved) > MOST_STARS_CHI2:
         return None
@@ -69,7 +71,7 @@ def refine_by_sky_light(measured: Measured, fix: Fix, stars: bool = True) -> Sky
     smear = by_shared @ fit.shared_covariance @ by_shared.T
     error_rad = float(fit.shared[5]) if terrain.common_sigma_rad > 0.0 else 0.0
     refined = refine_fix(rows, fix, terrain, position, fit.covariance[:2, :2], smear, error_rad)
-    return SkyRefinement(refined, sky, fit)
+    return replace(measured, fix=refined, sky_light=sky, skyline_fit=fit, by_stars=stars)
 
 
 def _fit_step(measured: Measured, sky: SkyLight, position_m: Array, fix: Fix) -> SkylineFit | None:

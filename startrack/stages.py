@@ -20,10 +20,10 @@ from startrack.attitude import AttitudeFit
 from startrack.camera import Camera
 from startrack.detection import Detector
 from startrack.errors import Reason
-from startrack.evidence import StarEvidence, StarPhotometry
+from startrack.evidence import SkyLight, StarEvidence, StarPhotometry
 from startrack.frames import Site
 from startrack.identification import Identifier
-from startrack.localization import ExactPosterior, Localizer, require_localizer
+from startrack.localization import ExactPosterior, Localizer, SkylineFit, require_localizer
 from startrack.terrain import Terrain
 from startrack.types import (
     Array,
@@ -39,6 +39,7 @@ from startrack.types import (
     Stars,
 )  # fmt: skip
 
+EVIDENCE_SOURCES = ("both", "stars", "sky")  # of a position; "sky" begins with a fix by the stars
 UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out
 STAGES = ("read", "detect", "identify", "attitude", "evidence", "locate")  # keys of `timing_ms`
 T = TypeVar("T", bound="Inputs")
@@ -50,17 +51,20 @@ class Settings:
     """The stages and their settings; each can be replaced by another one with the same call.
 
     `localizer` may be given by its name in `startrack.localization.LOCALIZERS`. Raises TypeError for a class instead of
-    an object, ValueError for another name.
+    an object, ValueError for another name, also of `evidence_sources`.
     """
 
     detector: Detector = field(default_factory=Detector)
     identifier: Identifier = field(default_factory=Identifier)
     evidence: StarEvidence = field(default_factory=StarEvidence)
     localizer: Localizer = field(default_factory=ExactPosterior)
+    evidence_sources: str = "both"  # "stars", "sky" (the light of the sky at the skyline) or "both"
     deep_stars: bool = True  # use Gaia's stars too, where they are installed and the frame is deeper than Hipparcos
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "localizer", require_localizer(self.localizer))
+        if self.evidence_sources not in EVIDENCE_SOURCES:
+            raise ValueError(f"evidence_sources {self.evidence_sources!r}: known are {', '.join(EVIDENCE_SOURCES)}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)  # eq: arrays have no single answer to ==
@@ -157,9 +161,19 @@ class Located(Measured):
     """The whole solution: evidence and the position that explains it."""
 
     fix: Fix
-    sky_brightness_mag_arcsec2: (
-        float | None
-    )  # of the sky beyond the ground at the skyline; None: no step, no zero point
+    sky_light: SkyLight | None = None  # of the image at the skyline; None: not used for the fix
+    skyline_fit: SkylineFit | None = None  # of the skyline that the sky's light shows, to that of the fix
+    by_stars: bool = True  # whether the stars' rows are in the posterior too
+    sky_brightness_mag_arcsec2: float | None = (
+        None  # of the sky beyond the ground at the skyline; None: no step, no zero point
+    )
+
+    @property
+    def evidence_source(self) -> str:
+        """What the position is from: stars, sky (the light of the sky), or both."""
+        if self.sky_light is None:
+            return "stars"
+        return "both" if self.by_stars else "sky"
 
     @property
     def status(self) -> str:

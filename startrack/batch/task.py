@@ -34,6 +34,7 @@ class Task:
     plots: bool = True
     overwrite: bool = False  # locate it again even if a valid result is there
     localizer: str = "posterior"  # of startrack.localization.LOCALIZERS
+    evidence: str = "both"  # of startrack.stages.EVIDENCE_SOURCES
 
 
 def locate_images(runner: Runner[Task, ImageDone], tasks: Sequence[Task]) -> Generator[ImageDone, None, None]:
@@ -94,7 +95,7 @@ def _valid_record(task: Task, key: str) -> dict[str, Any] | None:
 
 
 def _key(task: Task, sha256: str) -> str:
-    return job_sha256(task.path, sha256, task.facts, task.plots, task.localizer)
+    return job_sha256(task.path, sha256, task.facts, task.plots, task.localizer, task.evidence)
 
 
 def _locate_and_write(task: Task, sha256: str, key: str) -> dict[str, Any]:
@@ -137,7 +138,7 @@ def _remove_former(result: Path) -> None:
 def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str, str]]:
     """A value with companions, or the record of a refusal without; and the hashes of camera and terrain files."""
     from startrack.exposure import read_exposure
-    from startrack.localization import LOCALIZERS
+    from startrack.localization import require_localizer
     from startrack.output import refused_dict, result_dict
     from startrack.pipeline import Settings, locate_exposure
     from startrack.stages import Inputs, Refused
@@ -149,7 +150,8 @@ def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str
     # Before the files are read, so that a change in between is noticed.
     inputs = input_hashes(task.path, [exposure.camera, exposure.terrain])
     try:
-        return locate_exposure(exposure, Settings(localizer=LOCALIZERS[task.localizer]())), inputs
+        settings = Settings(localizer=require_localizer(task.localizer), evidence_sources=task.evidence)
+        return locate_exposure(exposure, settings), inputs
     except BadInput as cause:
         return result_dict(Refused(reason=cause.reason, message=str(cause), reached=Inputs(exposure=exposure))), inputs
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.batch_show import Counts, Halt, halt_on_signals, omission_lines, show_outcomes, summary
-from startrack.cli.common import DEFAULT_OUT, add_fact_flags, add_localizer_flag, cores, flag_facts, localizer_of
+from startrack.cli.common import DEFAULT_OUT, add_fact_flags, add_localizer_flags, check_localizer, cores, flag_facts
 from startrack.cli.flag_types import positive_count
 from startrack.cli.preparation import compile_kernels, prepare_reference
 from startrack.compilation import is_compiled
@@ -41,7 +41,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("folder", metavar="FOLDER", help="folder of the images, with all below it")
     add_fact_flags(parser)
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file, or the name of a shipped one")
-    add_localizer_flag(parser)
+    add_localizer_flags(parser)
     workers = parser.add_mutually_exclusive_group()
     workers.add_argument(
         "-j", "--jobs", type=positive_count, default=None, metavar="N", help="processes (default: all cores)"
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     from startrack.batch import images_under, listed_images, lock_results
 
     facts = _facts(args)
-    localizer_of(args)
+    check_localizer(args)
     _check_files_of_flags(facts)
     whole = images_under(args.folder, args.dir)
     found = listed_images(args.folder, _paths_in(sys.stdin.buffer.read()), args.dir) if args.files_on_stdin else whole
@@ -110,7 +110,12 @@ def _run(
                 out,
                 _tasks(sorted({*whole, *found}), out, facts, args),
                 records,
-                {**_remove_paths(facts), "localizer": args.localizer, "plots": not args.no_plots},
+                {
+                    **_remove_paths(facts),
+                    "localizer": args.localizer,
+                    "evidence": args.evidence,
+                    "plots": not args.no_plots,
+                },
             )
             tables = f"tables in {out}" + (
                 "" if has_parquet() else " (no results.parquet: the extra parquet is missing)"
@@ -196,6 +201,7 @@ def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argpa
         Task(
             name=image.name, path=os.path.abspath(image.path), result=str(record_path(here, image)), facts=facts,
             plots=not args.no_plots, overwrite=args.overwrite, localizer=args.localizer,
+            evidence=args.evidence,
         )
         for image in found
     ]  # fmt: skip

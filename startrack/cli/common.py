@@ -16,11 +16,11 @@ from startrack.errors import INTERNAL_ERROR, BadInput, exit_code_of
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
-    from startrack.localization import Localizer
     from startrack.types import Exposure
 
 DEFAULT_OUT = "startrack-out"
 DEFAULT_LOCALIZER = "posterior"
+EVIDENCE_SOURCES = ("both", "stars", "sky")  # as startrack.stages has them; written here so that help is quick
 
 
 def add_image_flags(parser: argparse.ArgumentParser) -> None:
@@ -37,21 +37,25 @@ def add_fact_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--exposure", type=positive_number, metavar="S", help="exposure time in seconds")
 
 
-def add_localizer_flag(parser: argparse.ArgumentParser) -> None:
-    """The flag that chooses the method of localization."""
+def add_localizer_flags(parser: argparse.ArgumentParser) -> None:
+    """The flags that choose the method of localization and its evidence."""
     parser.add_argument(
         "--localizer", default=DEFAULT_LOCALIZER, metavar="NAME",
         help="posterior (default), pseudo-gradient, hull, or another of startrack.localization.LOCALIZERS",
     )  # fmt: skip
 
+    parser.add_argument(
+        "--evidence", default=EVIDENCE_SOURCES[0], choices=EVIDENCE_SOURCES,
+        help="of the position: stars, the light of the sky that stops at the skyline, or both (default)",
+    )  # fmt: skip
 
-def localizer_of(args: argparse.Namespace) -> type[Localizer]:
-    """The class that --localizer names; a usage error for an unknown name."""
+
+def check_localizer(args: argparse.Namespace) -> None:
+    """A usage error for an unknown name after --localizer."""
     from startrack.localization import LOCALIZERS
 
     if args.localizer not in LOCALIZERS:
         args.usage_error(f"--localizer {args.localizer}: known are {', '.join(LOCALIZERS)}")
-    return LOCALIZERS[args.localizer]
 
 
 def cores() -> int:

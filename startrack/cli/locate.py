@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli.common import (
     Outcome,
     add_image_flags,
-    add_localizer_flag,
-    localizer_of,
+    add_localizer_flags,
+    check_localizer,
     read,
     result_path,
     run_images,
@@ -31,11 +31,11 @@ def add_parser(subparsers: Any) -> None:
         help="image to position and attitude",
         description="Locate the camera in each image: detect, identify, attitude, evidence, position. Camera, terrain "
         "and time come from flags, else from NAME.json beside the image, else from its header. Writes NAME.fix.json, "
-        "NAME.stars.ecsv, NAME.wcs, NAME.corr and NAME.annotated.png.",
+        "NAME.stars.ecsv, NAME.skyline.ecsv, NAME.wcs, NAME.corr and NAME.annotated.png.",
     )
     add_image_flags(parser)
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file, or the name of a shipped one")
-    add_localizer_flag(parser)
+    add_localizer_flags(parser)
     parser.add_argument("--fov", metavar="DEG", help=argparse.SUPPRESS)  # a flag of identify and calibrate
     parser.set_defaults(run=run, usage_error=parser.error)
     parser.add_argument("--report", action="store_true", help="add a page for a browser, as startrack report makes it")
@@ -50,7 +50,8 @@ def run(args: argparse.Namespace) -> int:
         )
     from startrack.pipeline import Settings
 
-    settings = Settings(localizer=localizer_of(args)())
+    check_localizer(args)
+    settings = Settings(localizer=args.localizer, evidence_sources=args.evidence)
     code = run_images(args, FORMAT, lambda path, stem: _locate_image(path, stem, args, settings))
     if args.report:
         from startrack.cli.report import write_page_of_images

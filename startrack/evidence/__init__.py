@@ -1,6 +1,7 @@
 """Evidence: exposure, attitude and catalogue to rays, each with the log-likelihood ratio of sky against ground."""
 
 from startrack.evidence.flux_scale import FluxScale, flux_scale
+from startrack.evidence.sky_light import SkyLight
 from startrack.evidence.sky_step import (
     Skyline,
     SkyStep,
@@ -13,6 +14,7 @@ from startrack.evidence.star_evidence import StarEvidence, StarPhotometry
 
 __all__ = [
     "FluxScale",
+    "SkyLight",
     "SkyStep",
     "Skyline",
     "StarEvidence",

@@ -36,7 +36,7 @@ def sectors_with_step(sky: SkyLight) -> Bools:
         spread = np.median(np.abs(sky.misfit_nats[good] - middle)) / MEDIAN_ABS_NORMAL
         good &= sky.misfit_nats < middle + MISFIT_SIGMAS * max(float(spread), 1.0)
     mean_step = levels.step_e[good].mean() if good.any() else 0.0
-    mean_sigma = sqrt(np.sum(np.square(sigma[good])) * LEVEL_SECTORS) / max(np.count_nonzero(good), 1)
+    mean_sigma = sqrt(float(np.sum(np.square(sigma[good]))) * LEVEL_SECTORS) / max(int(np.count_nonzero(good)), 1)
     enough = np.count_nonzero(good) >= MIN_SECTORS and mean_step > MIN_STEP_SIGMAS * mean_sigma
     return good if enough and _is_sharp(sky, good) else np.zeros(SECTORS, dtype=bool)
 

@@ -80,12 +80,15 @@ def measure_levels(pixels: SkyPixels, sector: Ints) -> SkyLevels:
     correlation = max(float(np.median(z2[:, covered])) / MEDIAN_ABS_NORMAL**2, 1.0) if covered.any() else 1.0
     own_variance = correlation * variance
     rough = np.maximum(
-        _smooth(z2 * covered, NOISE_SECTORS) / np.maximum(_smooth(1.0 * covered, NOISE_SECTORS), 1e-9), 1.0
+        _smooth(np.asarray(z2 * covered), NOISE_SECTORS)
+        / np.maximum(_smooth(covered.astype(np.float64), NOISE_SECTORS), 1e-9),
+        1.0,
     )
     extrapolated = np.square(sums[:, 1] / count) * count / np.maximum(_spread(sums), 1e-9)
     return SkyLevels(
         covered=covered, level_e=level, slope_e=slope, own_e=own_e, own_sigma_e=np.sqrt(own_variance),
-        variance_e2=variance * np.maximum(rough, correlation) * (1.0 + kept * extrapolated), noise_e=noise, correlation=correlation,
+        variance_e2=variance * np.maximum(rough, correlation) * (1.0 + kept * extrapolated), noise_e=noise,
+        correlation=correlation,
     )  # fmt: skip
 
 

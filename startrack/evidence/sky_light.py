@@ -1,4 +1,4 @@
-"""Evidence of the diffuse light of the sky: pixels near a predicted skyline, summed in cells, as rows of extended light.
+"""Evidence of the diffuse light of the sky: pixels near a predicted skyline, summed in cells, as rows of `Evidence`.
 
 The sky shines faintly and the ground hardly does. A pixel q above the level of the ground, where the whole sky would be
 t above it, contributes l V + c V (1 - V) / 2 with l = (q t - t^2 / 2) / s^2 and c = t^2 / s^2, s^2 its variance and V
@@ -154,7 +154,7 @@ def _score_shifts(height, llr, extended, edge, log):
 
 @njit(cache=True, nogil=True)
 def _sum_cells(sector, height, light, scale, covered, level, slope, variance, correlation, edge, clip, sums, scales):
-    """Add up sums (SECTORS, LEVELS, 3) of l, c and c times the height, and scales (SECTORS, 2): pixels and their scale."""
+    """Add up sums (SECTORS, LEVELS, 3) of l, c and c times the height; scales (SECTORS, 2): pixels, their scale."""
     half = 0.5 * sums.shape[1] * HEIGHT_PX
     for k in range(len(sector)):
         i, h = sector[k], height[k]

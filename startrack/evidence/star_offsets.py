@@ -74,7 +74,7 @@ def measure_star_offsets(
     if excess @ np.linalg.pinv(alone + prior, hermitian=True) @ excess > SIGNIFICANT_CHI2:
         prior = prior + max(float(np.mean(np.square(excess) - np.diag(alone))), 0.0) * np.eye(5)
     covariance = np.linalg.inv(np.linalg.inv(prior) + normal)
-    return StarOffsets(covariance @ right, covariance)
+    return StarOffsets(np.asarray(covariance @ right), np.asarray(covariance))
 
 
 def _prior_px2(camera: Camera, R_cam_enu: Array, attitude_covariance_rad2: Array, horizon: Horizon) -> Array:

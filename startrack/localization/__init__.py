@@ -6,6 +6,7 @@ from startrack.localization.consistency import check_consistency
 from startrack.localization.convex_hull import Hull
 from startrack.localization.posterior import ExactPosterior
 from startrack.localization.pseudo_gradient import PseudoGradient
+from startrack.localization.skyline_fit import SkylineFit
 from startrack.terrain import Terrain
 from startrack.types import Evidence, Fix
 
@@ -52,6 +53,6 @@ def require_localizer(given: Any) -> Localizer:
 
 
 __all__ = [
-    "LOCALIZERS", "ExactPosterior", "Hull", "Localizer", "PseudoGradient", "check_consistency", "localizer_name",
-    "require_localizer",
+    "LOCALIZERS", "ExactPosterior", "Hull", "Localizer", "PseudoGradient", "SkylineFit", "check_consistency",
+    "localizer_name", "require_localizer",
 ]  # fmt: skip

@@ -178,6 +178,12 @@ QUANTITIES: tuple[Quantity, ...] = (
       columns=(Column("longitude_deg", "%.8f"),),
       shown=(Show("text", "position", ", longitude {:.6f}°"), Show("panel", "Lat, lon", "   {:.5f}°"),
              Show("notebook", "longitude", "{:.6f}°"), Show("page", "Longitude", "{:.6f}°"))),
+    Q("position.evidence", "", Located, lambda v: v.evidence_source,
+      "what the position is from: `stars`; `both`, the stars and the light of the sky that stops at the skyline; "
+      "`sky`, that light alone", {"enum": ["stars", "both", "sky"]}, optional=True,
+      columns=(Column("evidence", "%s"),),
+      shown=(Show("text", "error", "; evidence {}"), Show("notebook", "evidence", "{}"),
+             Show("page", "Evidence", "{}"))),
     Q("position.search", "", Located, lambda v: v.fix.search, "`proven`: the search has excluded every other position; "
       "`beam`: its budget ended before that, and the posterior near the best positions is stated; "
       "`approximate`: a method without a posterior",

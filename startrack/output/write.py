@@ -11,10 +11,11 @@ from startrack.errors import BadInput
 from startrack.files import make_folder, write_atomically
 
 if TYPE_CHECKING:
-    from startrack.stages import Oriented, Outcome
+    from startrack.stages import Located, Oriented, Outcome
 
-COMPANIONS = (".stars.ecsv", ".annotated.png", ".wcs", ".corr")  # beside NAME.fix.json and the other records
-KINDS = {"fix": COMPANIONS, "identification": COMPANIONS, "detections": (".annotated.png",)}  # most complete first
+STAR_FILES = (".stars.ecsv", ".annotated.png", ".wcs", ".corr")  # beside NAME.identification.json
+COMPANIONS = (*STAR_FILES, ".skyline.ecsv")  # beside NAME.fix.json
+KINDS = {"fix": COMPANIONS, "identification": STAR_FILES, "detections": (".annotated.png",)}  # most complete first
 FilePath = str | os.PathLike[str]
 
 
@@ -72,12 +73,14 @@ def write_results(outcome: Outcome, path: Path, *, plots: bool = True, write_rec
     be written.
     """
     from startrack.output.record import record_of
-    from startrack.stages import Measured, Oriented, last_value
+    from startrack.stages import Located, Measured, Oriented, last_value
 
     record, value = record_of(outcome, _stem_and_kind(path)[1]), last_value(outcome)
     if isinstance(value, Measured) or (isinstance(value, Oriented) and value.terrain is None):
         write_star_table(companion(path, ".stars.ecsv"), value)
         write_wcs(companion(path, ".wcs"), companion(path, ".corr"), value)
+    if isinstance(value, Located):
+        write_skyline(companion(path, ".skyline.ecsv"), value)
     if plots:
         write_annotated(companion(path, ".annotated.png"), outcome)
     if write_record:
@@ -104,6 +107,14 @@ def write_star_table(path: FilePath, value: Oriented) -> None:
     from startrack.output.star_table import star_table_text
 
     write_atomically(path, star_table_text(value).encode("utf-8"), overwrite=True)
+
+
+def write_skyline(path: FilePath, value: Located) -> None:
+    """Write the measured skyline of a located `value` to `path`. Raises BadInput where it cannot be written."""
+    from startrack.output.skyline_table import skyline_table_text
+    from startrack.skyline import measured_skyline
+
+    write_atomically(path, skyline_table_text(measured_skyline(value)).encode("utf-8"), overwrite=True)
 
 
 def write_wcs(path: FilePath, corr_path: FilePath, value: Oriented) -> None:

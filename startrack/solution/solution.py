@@ -130,6 +130,18 @@ class Solution:
 
         return QTable.read(star_table_text(value), format="ascii.ecsv")
 
+    @cached_property
+    def skyline(self) -> QTable | None:
+        """The skyline that the image shows: azimuth, elevation, sigma [deg] and source; None unless located."""
+        if self._fix is None or not isinstance(self.result, Located):
+            return None
+        from astropy.table import QTable
+
+        from startrack.output.skyline_table import skyline_table_text
+        from startrack.skyline import measured_skyline
+
+        return QTable.read(skyline_table_text(measured_skyline(self.result)), format="ascii.ecsv")
+
     @property
     def warnings(self) -> list[str]:
         """Facts in the image's file that were not used, and azimuths that the terrain does not cover."""

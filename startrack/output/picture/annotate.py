@@ -14,6 +14,7 @@ from startrack.output.picture.canvas import (
     HIDDEN,
     IDENTIFIED,
     INK,
+    MEASURED,
     PANEL,
     POSITION,
     SKYLINE,
@@ -31,6 +32,7 @@ from startrack.output.picture.marks import (
     draw_compass,
     draw_detections,
     draw_hidden,
+    draw_measured_skyline,
     draw_skyline,
     name_stars,
     wall_mask,
@@ -156,6 +158,8 @@ def _legend(value: Inputs, truth: bool) -> list[tuple[str, Colour, str]]:
         found += [("ring", BODY, "planet, Sun, Earth or Moon, where it must be")]
     if isinstance(value, Located) and not value.fix.ambiguous:
         found += [("line", SKYLINE, "skyline of the terrain seen from the position found")]
+        if value.sky_light is not None:
+            found += [("disc", MEASURED, "skyline where the light of the sky stops")]
         around = "; circle 95 %, ellipse one sigma" if _has_circle(value) else ""
         found += [("disc", POSITION, f"position{around}")]
     if isinstance(value, Located) and value.fix.ambiguous:
@@ -202,6 +206,7 @@ def annotate(outcome: Outcome, truth_enu_m: tuple[float, float] | None = None) -
     draw_detections(canvas, view, value)
     draw_hidden(canvas, view, value)
     draw_skyline(canvas, view, value)
+    draw_measured_skyline(canvas, view, value)
     draw_compass(canvas, view, value)
     draw_bodies(canvas, view, value)
     name_stars(canvas, view, value)

@@ -32,6 +32,7 @@ POSITION = VERMILLION
 TRUTH = REDDISH_PURPLE
 
 INK: Colour = (236, 240, 245)
+MEASURED = INK  # small dots on the line of the skyline
 DIM_INK: Colour = (151, 163, 180)
 FAINT_INK: Colour = (74, 86, 104)
 GRID: Colour = (44, 53, 68)

@@ -16,6 +16,7 @@ from startrack.output.picture.canvas import (
     HIDDEN,
     IDENTIFIED,
     INK,
+    MEASURED,
     SKYLINE,
     Canvas,
     box_around,
@@ -23,6 +24,7 @@ from startrack.output.picture.canvas import (
 )
 from startrack.output.star_table import names_of, status_of
 from startrack.output.values import R_body_enu, best_position_m
+from startrack.skyline import measured_skyline
 from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented
 from startrack.types import Array, Bools, Ints
 
@@ -158,6 +160,17 @@ def draw_skyline(canvas: Canvas, view: View, value: Inputs) -> None:
     for start, stop in _runs(imaged):
         if stop - start > 1:
             canvas.curve(view.canvas_px(xy_px[start:stop]), SKYLINE, 2.5)
+
+
+def draw_measured_skyline(canvas: Canvas, view: View, value: Inputs) -> None:
+    """Dots where the light of the sky, and the stars with it, show the skyline."""
+    if not isinstance(value, Located) or value.sky_light is None:
+        return
+    skyline = measured_skyline(value)
+    by_sky = skyline.known & (skyline.source != "stars")
+    xy_px, imaged = _project(value, skyline.azimuth_rad[by_sky], skyline.elevation_rad[by_sky])
+    for place in view.canvas_px(xy_px[imaged]):
+        canvas.circle(tuple(place), 2.0, MEASURED, -1)
 
 
 def draw_compass(canvas: Canvas, view: View, value: Inputs) -> None:

@@ -1,0 +1,66 @@
+"""The skyline that one located image shows, by azimuth: from stars seen and missing, and from the light of the sky."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from startrack.evidence import Skyline
+from startrack.evidence.sky_levels import SECTORS, sector_of
+from startrack.evidence.sky_light import MIDDLES_RAD, SkyLight
+from startrack.localization import SkylineFit
+from startrack.stages import Located
+from startrack.types import Array, Evidence, MeasuredSkyline
+
+REACH_RAD, STEP_RAD = np.radians(3.0), np.radians(0.01)  # of the skyline about the terrain's, which gives its shape
+SHIFTS_RAD = np.arange(-REACH_RAD, REACH_RAD + STEP_RAD, STEP_RAD)
+MOST_SIGMA_RAD = np.radians(1.0)  # a skyline that is known no better counts as unknown
+SIMILAR = 3.0  # sigma by the stars, in that by the sky's light, up to which both count as sources
+
+
+def measured_skyline(located: Located) -> MeasuredSkyline:
+    """The skyline of a `located` image at the middles of 240 sectors of azimuth, without the terrain's heights.
+
+    The terrain serves for the shape of the skyline within each sector only: the elevation is that of the image.
+    """
+    horizon = Skyline.trace(located.fix.position_enu_m[:2], located.terrain)
+    elevation, sigma = _by_stars(located.evidence(), horizon)
+    source = np.where(sigma < MOST_SIGMA_RAD, "stars", "").astype("<U9")
+    if located.sky_light is not None and located.skyline_fit is not None:
+        used = located.skyline_fit.used
+        by_sky, sky_sigma = _by_sky_light(located.sky_light, located.skyline_fit)
+        both = used & (sigma < SIMILAR * sky_sigma)
+        share = np.where(both, sky_sigma**2 / (sky_sigma**2 + sigma**2), 0.0)
+        joined = by_sky + share * (elevation - by_sky)
+        elevation = np.where(used, joined, elevation)
+        sigma = np.where(used, sky_sigma * np.sqrt(1.0 - share), sigma)
+        source = np.where(both, "both", np.where(used, "sky light", source))
+    known = source != ""
+    return MeasuredSkyline(
+        azimuth_rad=MIDDLES_RAD,
+        elevation_rad=np.where(known, elevation, np.nan),
+        sigma_rad=np.where(known, sigma, np.inf),
+        source=source,
+    )
+
+
+def _by_stars(rows: Evidence, horizon: Skyline) -> tuple[Array, Array]:
+    """Elevation and sigma (SECTORS,) of the skyline by stars seen and missing, every shift equally likely before."""
+    above = rows.elevation_rad - horizon(rows.azimuth_rad)
+    column = np.searchsorted(SHIFTS_RAD, above)  # the star is visible at the shifts below its height
+    sums = np.zeros((SECTORS, len(SHIFTS_RAD) + 1))
+    np.add.at(sums, (sector_of(rows.azimuth_rad), column), rows.llr)
+    log = sums.sum(axis=1, keepdims=True) - np.cumsum(sums, axis=1)[:, :-1]
+    weight = np.exp(log - log.max(axis=1, keepdims=True))
+    weight /= weight.sum(axis=1, keepdims=True)
+    mean = weight @ SHIFTS_RAD
+    variance = weight @ np.square(SHIFTS_RAD) - np.square(mean)
+    return horizon(MIDDLES_RAD) + mean, np.sqrt(np.maximum(variance, STEP_RAD**2 / 12))
+
+
+def _by_sky_light(sky: SkyLight, fit: SkylineFit) -> tuple[Array, Array]:
+    """Elevation and sigma (SECTORS,) of the skyline by the sky's light, offsets of the image taken out."""
+    image = ~fit.errors.of_terrain
+    terms = fit.errors.raised_px[:, image]
+    shared = np.einsum("ni,ij,nj->n", terms, fit.shared_covariance[np.ix_(image, image)], terms)
+    height = sky.shift_px - fit.raised_px(of_terrain=False)
+    return sky.elevation_rad + height / sky.px_per_rad, np.sqrt(sky.variance_px2 + shared) / sky.px_per_rad

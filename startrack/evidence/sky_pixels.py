@@ -16,7 +16,7 @@ from startrack.psf import noise_area_px
 from startrack.types import Array, Bools, Detections
 
 BAND_PX = 12.0  # from the skyline to the last pixels that are used
-MASKED_SIGMA = 0.25  # light of a known star, in a pixel's noise, from which the pixel is left out
+MASKED_SIGMA = 0.4  # light of a known star, in a pixel's noise, from which the pixel is left out
 EDGE_PX = 3.0  # beside the end of the image circle
 SCALE_SAMPLES, SCALE_STEP_RAD = 1440, 1e-3  # around the horizon, and in elevation
 UNRESOLVED_PX2 = 1.0 / 12.0  # variance of the position in a pixel
@@ -46,7 +46,7 @@ def pixels_near_skyline(
 
     `camera` and `R_cam_enu` place the skyline in the image; `stars` are those whose light is left out, visible or not.
     """
-    band = skyline_band(detections.image_e.shape, camera, R_cam_enu, horizon)
+    band = skyline_band(detections.image_e.shape, camera, R_cam_enu, horizon, BAND_PX)
     _leave_out_stars(band, detections, stars)
     pixel = np.flatnonzero(band)
     pixel = pixel[~detections.dead.ravel()[pixel]]

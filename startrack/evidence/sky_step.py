@@ -23,7 +23,7 @@ from startrack.types import Array, Bools, Detections, Ints
 
 BAND_PX = 12.0  # both ways; the background model has no sharper edge
 STEP_PX = 0.5
-STEP_SAMPLES = 3600  # azimuths at which the step is measured
+STEP_SAMPLES = 1800  # azimuths at which the step is measured
 STEP_OFFSETS_PX = np.array([-11.0, -9.5, -8.0, -6.5, 6.5, 8.0, 9.5, 11.0])  # heights above the skyline
 SECTORS = 36
 SKYLINE_POINTS = 1440
@@ -171,8 +171,10 @@ def height_above_px(
     return np.asarray((elevation_rad - horizon(azimuth_rad)) * px_per_rad)
 
 
-def skyline_band(shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Bools:
-    """Pixels (H, W) of an image of that `shape` within BAND_PX of a `horizon`, with some to spare.
+def skyline_band(
+    shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horizon: Horizon, half_px: float = BAND_PX
+) -> Bools:
+    """Pixels (H, W) of an image of that `shape` within `half_px` of a `horizon`, with some to spare.
 
     `camera` and `R_cam_enu` place the skyline in the image.
     """
@@ -181,7 +183,7 @@ def skyline_band(shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horiz
     picture = np.zeros(shape, dtype=np.uint8)
     points = np.rint(xy).astype(np.int32)
     both = np.flatnonzero(inside & np.roll(inside, 1))
-    cv2.polylines(picture, list(np.stack([points[both - 1], points[both]], axis=1)), False, 1, int(2 * BAND_PX) + 5)
+    cv2.polylines(picture, list(np.stack([points[both - 1], points[both]], axis=1)), False, 1, int(2 * half_px) + 3)
     return picture.view(np.bool_)
 
 
@@ -201,11 +203,12 @@ def _interpolate_circle(values, azimuth, found):  # type: ignore[no-untyped-def]
     """Fill found (n,) with values (m,), given at even steps from azimuth 0 on, at the azimuths (n,) [rad]."""
     m = len(values)
     for k in range(len(found)):
-        at = azimuth[k] * (m / (2 * np.pi)) % m
-        low = int(at)
+        at = azimuth[k] * (m / (2 * np.pi))
+        if at < 0.0 or at >= m:
+            at %= m
+        low = min(int(at), m - 1)
         part = at - low
-        low = low % m
-        found[k] = (1.0 - part) * values[low] + part * values[(low + 1) % m]
+        found[k] = (1.0 - part) * values[low] + part * values[low + 1 if low + 1 < m else 0]
 
 
 def _step_e(light_e: NDArray[np.float32], above: Bools) -> tuple[float, float]:

@@ -17,10 +17,10 @@ from startrack.types import Array, Evidence, Fix
 
 NODES = 5  # traced horizons along each side of the ellipse's square
 STEP_M = 1.0  # at which the horizon's change with the position is taken
-REACH_SIGMAS = 6.0  # of the expected posterior, to the ends of the ellipse that is scored
-BOX_SIGMAS = 0.8  # side of the boxes, of the shorter axis
+REACH_SIGMAS = 5.5  # of the expected posterior, to the ends of the ellipse that is scored
+BOX_SIGMAS = 1.0  # side of the boxes, of the shorter axis
 MOST_BOXES = 20_000  # of an ellipse; a longer one is scored by the general method
-RIM_SIGMAS, RIM_MASS = 5.0, 1e-4  # more of the probability out there: the expected posterior is too small
+RIM_SIGMAS, RIM_MASS = 4.5, 1e-4  # more of the probability out there: the expected posterior is too small
 
 
 def refine_fix(

@@ -17,7 +17,7 @@ from startrack.errors import BadInput, NoSolution, NotIdentified, NotLocated, To
 
 __all__ = [
     "Array", "Attitude", "BadInput", "Body", "Bools", "Centroids", "Detections", "Evidence", "Exposure", "Fix",
-    "Identification", "Ints", "Mode", "NoSolution", "NotIdentified", "NotLocated", "Stars", "TooFewStars", "Value",
+    "Identification", "Ints", "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated", "Stars", "TooFewStars", "Value",
     "array",
 ]  # fmt: skip
 

@@ -1,7 +1,7 @@
 """The values that cross module borders (and, from errors.py, the exceptions).
 
 Every value is frozen, keyword-only and shape-checked; its arrays are read-only. A stage returns a complete value
-or raises `NoSolution`; there is no NaN, sentinel or half-filled result. Conventions: CONVENTIONS.md.
+or raises `NoSolution`; there is no sentinel or half-filled result, and NaN only where a field says so. Conventions: CONVENTIONS.md.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from startrack.errors import BadInput, NoSolution, NotIdentified, NotLocated, To
 
 __all__ = [
     "Array", "Attitude", "BadInput", "Body", "Bools", "Centroids", "Detections", "Evidence", "Exposure", "Fix",
-    "Identification", "Ints", "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated", "Stars", "TooFewStars", "Value",
-    "array",
+    "Identification", "Ints", "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated", "Stars",
+    "TooFewStars", "Value", "array",
 ]  # fmt: skip
 
 # Beyond the zenith: the search for an error of the horizon shifts the rows, by three sigma at most.
@@ -30,13 +30,15 @@ Ints = NDArray[np.int64]
 T = TypeVar("T")
 
 
-def array(*shape: int | str, dtype: Any = np.float64, default: float | None = None) -> Any:
+def array(
+    *shape: int | str, dtype: Any = np.float64, default: float | None = None, may_be_nan: bool = False
+) -> Any:  # fmt: skip
     """A checked array field. Letters in `shape` name lengths that must agree within the value.
 
     With a default the field may be left out or be one number: it is then filled with the number, as long as the fields
     before it.
     """
-    metadata = {"shape": shape, "dtype": dtype, "default": default}
+    metadata = {"shape": shape, "dtype": dtype, "default": default, "may_be_nan": may_be_nan}
     return field(metadata=metadata) if default is None else field(default=None, metadata=metadata)
 
 
@@ -77,7 +79,7 @@ class Value:
             for n, w in zip(a.shape, want, strict=True):
                 if n != (lengths.setdefault(w, n) if isinstance(w, str) else w):
                     raise ValueError(f"{type(self).__name__}.{f.name}: shape {a.shape}, expected {want} {lengths}")
-            if a.dtype.kind == "f" and np.isnan(a).any():
+            if a.dtype.kind == "f" and not f.metadata["may_be_nan"] and np.isnan(a).any():
                 raise ValueError(f"{type(self).__name__}.{f.name} holds NaN")
             a.flags.writeable = False
             object.__setattr__(self, f.name, a)
@@ -241,6 +243,24 @@ class Evidence(Value):
 
     def __len__(self) -> int:
         return len(self.llr)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredSkyline(Value):
+    """A skyline measured in photographs: apparent elevations, refraction included, at azimuths in enu."""
+
+    azimuth_rad: Array = array("n")
+    elevation_rad: Array = array("n", may_be_nan=True)  # nan where unknown
+    sigma_rad: Array = array("n")  # infinite where unknown
+    source: NDArray[np.str_] = array("n", dtype=np.str_)  # "stars", "sky light", "both"; "" where unknown
+
+    def __len__(self) -> int:
+        return len(self.azimuth_rad)
+
+    @property
+    def known(self) -> Bools:
+        """Whether the elevation is known at each azimuth (n,)."""
+        return np.isfinite(self.elevation_rad)
 
 
 @dataclass(frozen=True, kw_only=True)

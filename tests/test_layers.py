@@ -29,7 +29,7 @@ LAYERS = (  # lowest first; a package imports from lower layers only
     {"measurement", "orientation"},
     {"pipeline", "calibration", "inputs"},
     {"output"},
-    {"solution"},
+    {"solution", "horizon"},
     {"reproduction", "batch", "api"},
     {"cli"},
 )

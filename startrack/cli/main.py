@@ -20,7 +20,7 @@ from startrack import __version__
 from startrack.errors import BadInput, NoSolution
 
 COMMANDS = (
-    "locate", "batch", "identify", "detect", "render", "calibrate", "report", "reproduce", "terrain", "doctor",
+    "locate", "batch", "identify", "detect", "render", "calibrate", "horizon", "report", "reproduce", "terrain", "doctor",
     "schema",
 )  # fmt: skip
 ACTIONS = {"calibrate": ("verify", "show", "convert", "board")}  # with a parser each, beside the command's own

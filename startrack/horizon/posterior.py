@@ -26,6 +26,7 @@ SKY_PER_RAD, SKY_CONTRAST = np.degrees(0.08), 0.12  # density of steps in the sk
 RARE_PER_RAD = np.degrees(3e-4)  # of sharp ones in the sky: wires, halos of bright stars
 GROUND_PER_RAD, GROUND_CONTRAST = np.degrees(0.3), 0.15  # density of steps below the skyline, and their scale
 LOW_MISSING, LOW_SCALE_RAD = 0.4, np.radians(3.0)  # near the horizon: haze dims stars more than the fit
+HIGH_1_PER_RAD = 1.0  # per column; neighbours add up
 LEAST_LLR = 0.25  # rows below it are left out
 EDGE_SIGMAS = 5.0
 OUTLIER_PROBABILITY = 1e-4  # of a column whose evidence means nothing
@@ -37,7 +38,11 @@ class Marginals:
 
     mean_rad: Array
     sigma_rad: Array
-    median_rad: Array
+
+
+def column_log_prior() -> Array:
+    """Logarithm (COLUMNS, n) of the prior of the skyline: high ones are rare."""
+    return np.tile(-HIGH_1_PER_RAD * np.maximum(elevations_rad(), 0.0), (COLUMNS, 1))
 
 
 def star_log_likelihood(rays: Evidence, missing: float, spurious: float) -> Array:
@@ -115,13 +120,11 @@ def combine_columns(log_likelihood: Array) -> Marginals:
     def run(order: Sequence[int]) -> Array:
         found = np.empty((columns, n))
         message = np.full(n, 1.0 / n)
-        for turn in range(2):  # the second turn starts where the first ended: the compass is a circle
+        for _ in range(2):  # the second round starts where the first one ended: the compass is a circle
             for c in order:
                 found[c] = message
                 after = message * likelihood[c]
                 message = predict(after / after.sum())
-                if turn == 0 and c < columns // 2 and order[0] != 0:
-                    continue
         return found
 
     ahead, behind = run(range(columns)), run(range(columns - 1, -1, -1))
@@ -130,9 +133,7 @@ def combine_columns(log_likelihood: Array) -> Marginals:
     elevation = elevations_rad()
     mean = posterior @ elevation
     variance = np.maximum(posterior @ np.square(elevation) - np.square(mean), 0.0)
-    cumulative = np.cumsum(posterior, axis=1)
-    median = elevation[np.argmax(cumulative >= 0.5, axis=1)]
-    return Marginals(mean, np.sqrt(variance), median), posterior
+    return Marginals(mean, np.sqrt(variance))
 
 
 def _kernel(n: int, size: int) -> Array:

@@ -29,8 +29,10 @@ EDGE_SIGMAS_PX = (0.8,1.5,2.5,3.5)  # widths tried: the PSF, fuzzy trees, haze
 MAX_SIGMA_PX = 1.2  # the places tried are spread by 1.4
 SHAPE_ERROR = 0.3  # of the difference between the fitted edge and the half level
 SMOOTH_SAMPLES = 4
+HIGHEST_STEP_RAD = np.radians(60.0)  # above, columns are narrower than pixels and see the same features
 SKY_LEVEL_PX = 3.0  # above the edge: where the sky's level is taken; below, haze darkens it
 FILL_COLUMNS = 21  # around a star
+LARGE_AREA_PX, GLARE_PX = 500, 40  # of the Moon and what surrounds it
 SATURATED_PX = 5  # around saturated pixels nothing is measured
 STAR_PX = 3.0  # radius of the disks around bright stars
 LEVEL_RAD, ABOVE_RAD = np.radians(2.0), np.radians(20.0)  # for the brightness of the sky above a step
@@ -63,7 +65,7 @@ class _Columns:
 
 def find_steps(
     image_e: NDArray[np.float32], noise_e: NDArray[np.float32], dead: NDArray[np.bool_], camera: Camera,
-    R_cam_enu: Array, widths: tuple[int, ...], stars_px: Array,
+    R_cam_enu: Array, *, widths: tuple[int, ...], stars_px: Array,
 ) -> list[Steps]:  # fmt: skip
     """All significant steps of an image (H, W) [e] with the noise of its pixels; saturated ones, `dead`, are left out."""
     columns = _sample(_without_points(image_e, noise_e), noise_e, dead, stars_px, camera, R_cam_enu)
@@ -102,6 +104,7 @@ def _steps_of(columns: _Columns, width: int) -> Steps:
     )
     significance = np.abs(difference) / sigma
     peak = _is_peak(significance, round(2 * SAMPLES_PER_PX)) & (significance > MIN_SIGNIFICANCE)
+    peak &= columns.elevation_rad[:, None] < HIGHEST_STEP_RAD
     row, column = np.nonzero(peak)
     elevation, sigma_px, good = _positions(columns, row, column, noise)
     contrast = difference[row, column] / np.maximum(_sky_level(columns)[row, column] - dark, 1e-9)
@@ -163,7 +166,7 @@ def _half_level(light: Array, half: int, places_px: Array, best: Ints) -> Array:
         distance = np.where(crossing, np.abs(x[:-1] - place), np.inf)
         at = np.argmin(distance, axis=1)
         low, high = above[np.arange(len(rows)), at], above[np.arange(len(rows)), at + 1]
-        found[rows] = np.where(np.isfinite(distance.min(axis=1)), x[at] - low / (high - low) / SAMPLES_PER_PX, np.nan)
+        found[rows] = np.where(np.isfinite(distance.min(axis=1)), x[at] - low / np.where(high > low, high - low, 1.0) / SAMPLES_PER_PX, np.nan)
     return found
 
 
@@ -191,7 +194,7 @@ def _sample(
 
     px_rad = _px_rad(camera, R_cam_enu)
     elevation = np.arange(LOWEST_RAD, HIGHEST_RAD, px_rad / SAMPLES_PER_PX)
-    lost = cv2.dilate(dead.astype(np.uint8), np.ones((2 * SATURATED_PX + 1,) * 2, np.uint8))
+    lost = _around_saturated(dead)
     stars = np.zeros(dead.shape, np.uint8)
     for x, y in np.rint(stars_px).astype(int):
         cv2.circle(stars, (int(x), int(y)), round(STAR_PX), 1, -1)
@@ -206,6 +209,17 @@ def _sample(
         points = points | (cv2.remap(stars, x, y, cv2.INTER_NEAREST) > 0)
     columns = _Columns(elevation, total / SIDE_SAMPLES, spread / SIDE_SAMPLES, px_rad / SAMPLES_PER_PX, px_rad)
     return _fill_points(columns, points)
+
+
+def _around_saturated(dead: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Pixels (H, W) near saturated ones; nearer ones of a lamp or a star than of the Moon."""
+    import cv2
+
+    count, label, facts, _ = cv2.connectedComponentsWithStats(dead.astype(np.uint8))
+    large = np.isin(label, 1 + np.flatnonzero(facts[1:count, cv2.CC_STAT_AREA] > LARGE_AREA_PX))
+    around = [cv2.dilate(part.astype(np.uint8), np.ones((2 * px + 1,) * 2, np.uint8))
+              for part, px in ((dead, SATURATED_PX), (large, GLARE_PX))]  # fmt: skip
+    return np.asarray(np.maximum(*around), dtype=np.uint8)
 
 
 def _px_rad(camera: Camera, R_cam_enu: Array) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 
 from startrack.calibration.throughput import airmass
 from startrack.evidence import FluxScale, StarEvidence
+from startrack.evidence.star_evidence import SEEN_LLR
 from startrack.frames import azel_from_rays, off_axis_rad
 from startrack.horizon.frames import SkyFrame
 from startrack.types import Array, Evidence, Stars
@@ -20,6 +21,8 @@ TYPICAL_SCATTER_MAG = 0.3
 MIN_SCATTER_MAG = 0.1
 TESTED_QUANTILE = 0.95
 ROUNDS = 12
+HIGH_RAD = np.radians(45.0)
+SPURIOUS_PROBABILITY = 0.01
 BRIGHT_SIGMAS = 12.0  # stars beside which the sky's light is not measured
 EDGE_PX = 1.0  # width of the skyline as a star of the usual PSF shows it
 NORMAL_BY_MAD = 1.4826
@@ -69,6 +72,8 @@ class StarLight:
 
     rays: Evidence
     bright_px: Array  # (m, 2)
+    missing: float  # share of the stars high in the sky that are not seen: clouds
+    spurious: float = SPURIOUS_PROBABILITY  # probability of light at a hidden star: leaves with gaps, hot pixels
 
 
 def measure_stars(frame: SkyFrame) -> StarLight:
@@ -86,7 +91,14 @@ def measure_stars(frame: SkyFrame) -> StarLight:
     bright = light.expected_e > BRIGHT_SIGMAS * np.maximum(light.sigma_e, 1e-9)
     inside = np.isfinite(light.xy_px).all(axis=1) & bright
     rays = replace(rows, edge_sigma_rad=np.full(len(rows), EDGE_PX * float(scale_rad)))
-    return StarLight(rays, light.xy_px[inside])
+    return StarLight(rays, light.xy_px[inside], _missing_share(rays))
+
+
+def _missing_share(rays: Evidence) -> float:
+    """Share of decided stars that are not seen where no ground is expected."""
+    highest = rays.elevation_rad > min(HIGH_RAD, float(np.quantile(rays.elevation_rad, 0.5, method="lower")))
+    decided = rays.llr[highest & (np.abs(rays.llr) > SEEN_LLR)]
+    return float((np.count_nonzero(decided < 0) + 1) / (len(decided) + 2))
 
 
 def _dimmed(frame: SkyFrame, dimming: Dimming) -> Stars:

@@ -26,9 +26,11 @@ from startrack.types import Array, Bools, Exposure, MeasuredSkyline
 
 BEYOND_CIRCLE_RAD = np.radians(4.5)  # the edge of the image circle is stated to some degrees; light is followed so far
 WIDTHS = ((1, 0.6), (7, 0.2), (21, 0.1))  # columns averaged, and weight: they share their pixels with their neighbours
-UNKNOWN_SIGMA_RAD = np.radians(1.5)  # a wider posterior is no measurement
+UNKNOWN_SIGMA_RAD = np.radians(2.0)  # a wider posterior is no measurement
 WEATHER_1 = 0.1  # of the refraction: what the weather changes
 NEAR_LIGHT_RAD = np.radians(0.3)  # a step this near to the skyline is evidence for it
+GAP_CONTRAST, GAP_SIGNIFICANCE = 0.25, 5.0  # of brighter light below the skyline
+DEEPEST_GAP_RAD = np.radians(15.0)
 NEAR_STAR_RAD = np.radians(2.0)
 DECISIVE_LLR = 2.0
 
@@ -88,7 +90,8 @@ def _steps_of(frame: SkyFrame, light: StarLight) -> list[Steps]:
     camera = replace(frame.camera, max_angle_rad=edge)
     widths = tuple(width for width, _ in WIDTHS)
     return find_steps(
-        found.image_e, found.noise_e, found.dead, camera, frame.R_cam_enu, widths=widths, stars_px=light.bright_px
+        found.image_e, found.noise_e, found.dead, camera, frame.R_cam_enu, widths=widths, stars_px=light.bright_px,
+        glare_px=light.glare_px,
     )
 
 
@@ -103,6 +106,7 @@ def _skyline(
     variance = np.mean(np.square(marginals.sigma_rad.reshape(BINS, COLUMNS_PER_BIN)), axis=1)
     variance += _neighbourhood_variance(marginals.mean_rad)
     variance += np.square(_common_sigma_rad(frames, azimuth, elevation, site))
+    variance += np.square(_gap_depth(steps, marginals.mean_rad))
     by_stars, by_light = _has_star(stars, azimuth, elevation), _has_step(steps, marginals.mean_rad)
     known = (variance < UNKNOWN_SIGMA_RAD**2) & (by_stars | by_light)
     source = np.select([by_stars & by_light, by_light, by_stars], ["both", "sky light", "stars"], "")
@@ -120,6 +124,18 @@ def _neighbourhood_variance(elevation_rad: Array) -> Array:
     around = np.arange(-half, COLUMNS_PER_BIN + half)
     columns = np.arange(BINS)[:, None] * COLUMNS_PER_BIN + around
     return np.asarray(elevation_rad[columns % COLUMNS].var(axis=1))
+
+
+def _gap_depth(steps: Sequence[list[Steps]], elevation_rad: Array) -> Array:
+    """How far (BINS,) below the skyline light is seen again: one elevation does not describe a tree with gaps."""
+    depth = np.zeros(COLUMNS)
+    for one in (one for by_width in steps for one in by_width[:2]):
+        below = elevation_rad[one.column] - one.elevation_rad
+        light = (one.contrast > GAP_CONTRAST) & (one.significance > GAP_SIGNIFICANCE)
+        light &= (below > NEAR_LIGHT_RAD) & (below < DEEPEST_GAP_RAD)
+        np.maximum.at(depth, one.column[light], below[light])
+    columns = np.arange(BINS)[:, None] * COLUMNS_PER_BIN + np.arange(-2 * COLUMNS_PER_BIN, 3 * COLUMNS_PER_BIN)
+    return np.asarray(depth[columns % COLUMNS].mean(axis=1))
 
 
 def _common_sigma_rad(frames: Sequence[SkyFrame], azimuth: Array, elevation: Array, site: Site) -> Array:

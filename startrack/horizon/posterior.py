@@ -19,14 +19,15 @@ CHANGES_RAD = np.radians(np.array([0.02, 0.12, 0.8]))  # Laplace scales of the c
 CHANGE_WEIGHTS = (0.55, 0.25, 0.18)
 JUMP_WEIGHT = 0.02  # a dome, a mast: any elevation
 SHOWN_PROBABILITY = 0.75  # that the skyline itself is among a column's steps
-BRIGHTER_PROBABILITY = 0.08  # that the ground at the skyline is brighter than the sky
+BRIGHTER_PROBABILITY = 0.25  # that the ground at the skyline is brighter than the sky, in moonlight or lamplight
+SURE_SIGNIFICANCE, RARELY_BRIGHTER_PROBABILITY = 8.0, 0.05  # weak bright steps are more often stars
 WEAKEST_CONTRAST = 0.12  # usual skylines have more
 NOISE_PER_RAD = np.degrees(0.5)  # density of steps of 3 sigma that are noise
 SKY_PER_RAD, SKY_CONTRAST = np.degrees(0.08), 0.12  # density of steps in the sky (clouds, reflections), and their scale
 RARE_PER_RAD = np.degrees(3e-4)  # of sharp ones in the sky: wires, halos of bright stars
 GROUND_PER_RAD, GROUND_CONTRAST = np.degrees(0.3), 0.15  # density of steps below the skyline, and their scale
 LOW_MISSING, LOW_SCALE_RAD = 0.4, np.radians(3.0)  # near the horizon: haze dims stars more than the fit
-HIGH_1_PER_RAD = 1.0  # per column; neighbours add up
+HIGH_1_PER_RAD = 4.0  # per column; neighbours add up
 LEAST_LLR = 0.25  # rows below it are left out
 EDGE_SIGMAS = 5.0
 OUTLIER_PROBABILITY = 1e-4  # of a column whose evidence means nothing
@@ -90,7 +91,8 @@ def step_log_likelihood(steps: Steps, temper: float) -> Array:
     contrast = np.abs(steps.contrast)
     in_sky = noise + SKY_PER_RAD * np.exp(-contrast / SKY_CONTRAST) + RARE_PER_RAD
     in_ground = noise + GROUND_PER_RAD * np.exp(-contrast / GROUND_CONTRAST) + 15 * RARE_PER_RAD
-    weight = np.where(steps.contrast > 0, BRIGHTER_PROBABILITY, 1 - BRIGHTER_PROBABILITY)
+    brighter = np.where(steps.significance > SURE_SIGNIFICANCE, BRIGHTER_PROBABILITY, RARELY_BRIGHTER_PROBABILITY)
+    weight = np.where(steps.contrast > 0, brighter, 1 - brighter)
     weight = SHOWN_PROBABILITY * weight * np.minimum(contrast / WEAKEST_CONTRAST, 1.0) ** 2 / in_ground
     passed = 0.5 * np.log(in_sky / in_ground)
     for c in np.unique(steps.column):

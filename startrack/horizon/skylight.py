@@ -21,20 +21,21 @@ SAMPLES_PER_PX = 3
 SIDE_SAMPLES = 3  # across a column
 GAP_PX = 1.0  # on either side of the step: the blurred edge
 SKY_PX, GROUND_PX = 4.0, 3.0  # lengths of the averages above and below
+MAX_SLOPE_1 = 0.08  # change of the sky's brightness over SKY_PX, relative to it
 MIN_SIGNIFICANCE = 3.0
 RELATIVE_ERROR = 0.02  # of the extrapolated sky, of its brightness above the darkest pixels
 WINDOW_PX = 10.0  # half width of the window in which a step's place is measured
 REACH_PX, PLACE_STEP_PX = 2.5, 0.125  # places tried about the most significant sample
 EDGE_SIGMAS_PX = (0.8,1.5,2.5,3.5)  # widths tried: the PSF, fuzzy trees, haze
-MAX_SIGMA_PX = 1.2  # the places tried are spread by 1.4
+MAX_SIGMA_PX = 2.0
 SHAPE_ERROR = 0.3  # of the difference between the fitted edge and the half level
+BLURRED_PX = 1.5  # error of the place of an edge of the largest width: where ground begins in haze
 SMOOTH_SAMPLES = 4
-HIGHEST_STEP_RAD = np.radians(60.0)  # above, columns are narrower than pixels and see the same features
+HIGHEST_STEP_RAD = np.radians(45.0)  # above, columns are narrower than pixels and see the same features
 SKY_LEVEL_PX = 3.0  # above the edge: where the sky's level is taken; below, haze darkens it
 FILL_COLUMNS = 21  # around a star
 LARGE_AREA_PX, GLARE_PX = 500, 40  # of the Moon and what surrounds it
 SATURATED_PX = 5  # around saturated pixels nothing is measured
-STAR_PX = 3.0  # radius of the disks around bright stars
 LEVEL_RAD, ABOVE_RAD = np.radians(2.0), np.radians(20.0)  # for the brightness of the sky above a step
 HOT_SIGMAS = 6.0  # above the median of the neighbours: stars and hot pixels
 MIN_SIGMA_PX = 0.1  # of a step's position
@@ -65,10 +66,10 @@ class _Columns:
 
 def find_steps(
     image_e: NDArray[np.float32], noise_e: NDArray[np.float32], dead: NDArray[np.bool_], camera: Camera,
-    R_cam_enu: Array, *, widths: tuple[int, ...], stars_px: Array,
+    R_cam_enu: Array, *, widths: tuple[int, ...], stars_px: Array, glare_px: Array,
 ) -> list[Steps]:  # fmt: skip
     """All significant steps of an image (H, W) [e] with the noise of its pixels; saturated ones, `dead`, are left out."""
-    columns = _sample(_without_points(image_e, noise_e), noise_e, dead, stars_px, camera, R_cam_enu)
+    columns = _sample(_without_points(image_e, noise_e), noise_e, dead, (stars_px, glare_px), camera, R_cam_enu)
     return [_steps_of(_average_columns(columns, width), width) for width in widths]
 
 
@@ -93,10 +94,10 @@ def _fill_points(columns: _Columns, points: NDArray[np.bool_]) -> _Columns:
 def _steps_of(columns: _Columns, width: int) -> Steps:
     """The steps of columns that are means over `width`."""
     width_px = width * 2 * np.pi / COLUMNS / columns.px_rad
-    at_ground = _level_above(columns, GAP_PX, 2 * GAP_PX + GROUND_PX / 2)
+    dark = float(np.nanpercentile(columns.light_e, 0.5))
+    at_ground = _level_above(columns, GAP_PX, 2 * GAP_PX + GROUND_PX / 2, dark)
     below = _mean(columns, -GAP_PX - GROUND_PX, -GAP_PX)
     difference = below - at_ground
-    dark = float(np.nanpercentile(columns.light_e, 0.5))
     pixels = max(width_px, 1.0)
     noise = columns.noise_e / np.sqrt(pixels)
     sigma = np.sqrt(
@@ -135,12 +136,14 @@ def _positions(columns: _Columns, row: Ints, column: Ints, noise: Array) -> tupl
     freedom = (2 * WINDOW_PX + 1) - 5.0
     variance = np.maximum(np.square(noise[row, column]), best / SAMPLES_PER_PX / freedom)
     weight = np.exp(-0.5 * np.maximum(rest - best, 0.0) / SAMPLES_PER_PX / np.where(variance > 0, variance, 1.0))
-    weight = weight.sum(axis=0) / weight.sum(axis=(0, 1))
-    mean_px = places_px @ weight
-    sigma_px = np.sqrt(np.maximum(np.square(places_px) @ weight - np.square(mean_px), 0.0))
+    weight /= weight.sum(axis=(0, 1))
+    by_place = weight.sum(axis=0)
+    mean_px = places_px @ by_place
+    sigma_px = np.sqrt(np.maximum(np.square(places_px) @ by_place - np.square(mean_px), 0.0))
     half_px = _half_level(light, half, places_px, rest.reshape(-1, len(row)).argmin(axis=0))
     half_px = np.where(np.abs(half_px - mean_px) < REACH_PX, half_px, mean_px)
-    shape_px = SHAPE_ERROR * np.abs(half_px - mean_px)
+    width_px = np.einsum("w,wpn->n", np.array(EDGE_SIGMAS_PX), weight)
+    shape_px = np.hypot(SHAPE_ERROR * np.abs(half_px - mean_px), BLURRED_PX * (width_px / EDGE_SIGMAS_PX[-1]) ** 3)
     elevation = columns.elevation_rad[middle] + half_px * columns.px_rad
     sigma_px = np.sqrt(np.square(sigma_px) + np.square(shape_px) + MIN_SIGMA_PX**2)
     return elevation, sigma_px, good & (sigma_px < MAX_SIGMA_PX)
@@ -186,18 +189,18 @@ def _edge_profile(half: int, place_px: float, sigma_px: float) -> Array:
 
 
 def _sample(
-    image_e: NDArray[np.float32], noise_e: NDArray[np.float32], dead: NDArray[np.bool_], stars_px: Array,
-    camera: Camera, R_cam_enu: Array,
+    image_e: NDArray[np.float32], noise_e: NDArray[np.float32], dead: NDArray[np.bool_],
+    stars: tuple[Array, Array], camera: Camera, R_cam_enu: Array,
 ) -> _Columns:  # fmt: skip
-    """The image along columns of azimuth, bright stars at `stars_px` (m, 2) replaced by their surroundings."""
+    """The image along columns of azimuth, `stars` (pixels (m, 2), radii (m,)) replaced by their surroundings."""
     import cv2
 
     px_rad = _px_rad(camera, R_cam_enu)
     elevation = np.arange(LOWEST_RAD, HIGHEST_RAD, px_rad / SAMPLES_PER_PX)
     lost = _around_saturated(dead)
-    stars = np.zeros(dead.shape, np.uint8)
-    for x, y in np.rint(stars_px).astype(int):
-        cv2.circle(stars, (int(x), int(y)), round(STAR_PX), 1, -1)
+    disks = np.zeros(dead.shape, np.uint8)
+    for (x, y), radius in zip(np.rint(stars[0]).astype(int).tolist(), stars[1], strict=True):
+        cv2.circle(disks, (x, y), round(radius), 1, -1)
     total, spread, points = 0.0, 0.0, False
     for k in range(SIDE_SAMPLES):
         azimuth = column_azimuths_rad() + ((k + 0.5) / SIDE_SAMPLES - 0.5) * 2 * np.pi / COLUMNS
@@ -206,7 +209,7 @@ def _sample(
         hidden = ~inside | (cv2.remap(lost, x, y, cv2.INTER_NEAREST) > 0)
         total = total + np.where(hidden, np.nan, cv2.remap(image_e, x, y, cv2.INTER_LINEAR).astype(np.float64))
         spread = spread + cv2.remap(noise_e, x, y, cv2.INTER_NEAREST).astype(np.float64)
-        points = points | (cv2.remap(stars, x, y, cv2.INTER_NEAREST) > 0)
+        points = points | (cv2.remap(disks, x, y, cv2.INTER_NEAREST) > 0)
     columns = _Columns(elevation, total / SIDE_SAMPLES, spread / SIDE_SAMPLES, px_rad / SAMPLES_PER_PX, px_rad)
     return _fill_points(columns, points)
 
@@ -255,11 +258,15 @@ def _spread(columns: _Columns, low_px: float, high_px: float, mean: Array) -> Ar
     return np.sqrt(np.maximum(square - np.square(mean), 0.0))
 
 
-def _level_above(columns: _Columns, gap_px: float, distance_px: float) -> Array:
-    """The sky's brightness (k, columns) extrapolated downwards by `distance_px` from `gap_px` above each elevation."""
+def _level_above(columns: _Columns, gap_px: float, distance_px: float, dark_e: float) -> Array:
+    """The sky's brightness (k, columns) extrapolated downwards by `distance_px` from `gap_px` above each elevation.
+
+    The slope is limited: where the samples above are ground themselves, they are no measure of the sky's slope.
+    """
     near = _mean(columns, gap_px, gap_px + SKY_PX)
     far = _mean(columns, gap_px + SKY_PX, gap_px + 2 * SKY_PX)
-    return near + (near - far) * (distance_px + SKY_PX / 2) / SKY_PX
+    limit = MAX_SLOPE_1 * np.maximum(near - dark_e, 0.0)
+    return near + np.clip(near - far, -limit, limit) * (distance_px + SKY_PX / 2) / SKY_PX
 
 
 def _sky_level(columns: _Columns) -> Array:

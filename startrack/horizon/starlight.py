@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.calibration.throughput import airmass
-from startrack.evidence import FluxScale, StarEvidence
+from startrack.evidence import FluxScale, StarEvidence, StarPhotometry
 from startrack.evidence.star_evidence import SEEN_LLR
 from startrack.frames import azel_from_rays, off_axis_rad
 from startrack.horizon.frames import SkyFrame
@@ -23,6 +23,7 @@ TESTED_QUANTILE = 0.95
 ROUNDS = 12
 HIGH_RAD = np.radians(45.0)
 SPURIOUS_PROBABILITY = 0.01
+GLARE_PX, GLARE_PER_DECADE_PX = 3.0, 2.5  # of the faintest of them, and more for each factor of ten
 BRIGHT_SIGMAS = 12.0  # stars beside which the sky's light is not measured
 EDGE_PX = 1.0  # width of the skyline as a star of the usual PSF shows it
 NORMAL_BY_MAD = 1.4826
@@ -71,7 +72,8 @@ class StarLight:
     """The stars of one image: rows of evidence in apparent directions of enu, and the pixels of bright stars."""
 
     rays: Evidence
-    bright_px: Array  # (m, 2)
+    bright_px: Array  # (m, 2) of stars and planets
+    glare_px: Array  # (m,) radius of their light
     missing: float  # share of the stars high in the sky that are not seen: clouds
     spurious: float = SPURIOUS_PROBABILITY  # probability of light at a hidden star: leaves with gaps, hot pixels
 
@@ -88,10 +90,24 @@ def measure_stars(frame: SkyFrame) -> StarLight:
     )  # fmt: skip
     rows = light.evidence()
     scale_rad = camera.mean_scale_rad_per_px(np.array(min(camera.max_angle_rad, np.pi / 2)))
-    bright = light.expected_e > BRIGHT_SIGMAS * np.maximum(light.sigma_e, 1e-9)
-    inside = np.isfinite(light.xy_px).all(axis=1) & bright
     rays = replace(rows, edge_sigma_rad=np.full(len(rows), EDGE_PX * float(scale_rad)))
-    return StarLight(rays, light.xy_px[inside], _missing_share(rays))
+    bright_px, glare_px = _glare(frame, dimming, light)
+    return StarLight(rays, bright_px, glare_px, _missing_share(rays))
+
+
+def _glare(frame: SkyFrame, dimming: Dimming, light: StarPhotometry) -> tuple[Array, Array]:
+    """Pixels (m, 2) of bright stars and planets, and the radii (m,) of their light [px]."""
+    noise_e = max(float(np.median(light.sigma_e[light.usable])) if light.usable.any() else 0.0, 1e-9)
+    planets = [body for body in frame.bodies if body.name not in ("Sun", "Moon")]
+    rays = np.array([body.ray_icrs for body in planets]).reshape(-1, 3)
+    px, seen = frame.camera.project(rays @ frame.R_cam_icrs.T)
+    angle = np.minimum(off_axis_rad(rays @ frame.R_cam_icrs.T), frame.camera.max_angle_rad)
+    zero_mag = dimming.zero_mag(angle, _airmass(rays @ frame.R_enu_icrs.T))
+    flux_e = 10 ** (-0.4 * (np.array([body.v_mag for body in planets]) - zero_mag))
+    snr = np.concatenate([light.expected_e, flux_e[seen]]) / noise_e
+    bright = snr > BRIGHT_SIGMAS
+    radius_px = GLARE_PX + GLARE_PER_DECADE_PX * np.log10(snr[bright] / BRIGHT_SIGMAS)
+    return np.concatenate([light.xy_px, px[seen]])[bright], radius_px
 
 
 def _missing_share(rays: Evidence) -> float:

@@ -4,8 +4,9 @@
     print(startrack.locate("image.png"))
 
 `locate` takes a path or an array and returns a `Solution`; `identify` and `detect` stop earlier, `calibrate` makes a
-camera, `render` an image, `measure_horizon` the skyline of a fixed camera. The packages (`startrack.detection`, `startrack.identification`, `startrack.localization`,
-...) have the stages one by one. Every name is loaded at its first use: importing startrack costs nothing.
+camera, `render` an image, `measure_horizon` the skyline of a fixed camera. The packages (`startrack.detection`,
+`startrack.identification`, `startrack.localization`, ...) have the stages one by one. Every name is loaded at its first
+use: importing startrack costs nothing.
 """
 
 import importlib

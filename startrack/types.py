@@ -1,7 +1,8 @@
 """The values that cross module borders (and, from errors.py, the exceptions).
 
 Every value is frozen, keyword-only and shape-checked; its arrays are read-only. A stage returns a complete value
-or raises `NoSolution`; there is no sentinel or half-filled result, and NaN only where a field says so. Conventions: CONVENTIONS.md.
+or raises `NoSolution`; there is no sentinel or half-filled result, and NaN only where a field says so. Conventions:
+CONVENTIONS.md.
 """
 
 from __future__ import annotations

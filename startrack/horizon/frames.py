@@ -4,24 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 
 import numpy as np
 
-from startrack.calibration.frame import Sky, frame_of, require_time, sky_at
-from startrack.calibration.region_growing import JointFit, fit_frames, grow_from_matches
+from startrack.calibration.frame import Sky, frame_of, pressure_hpa, require_time, sky_at
+from startrack.calibration.region_growing import JointFit, fit_frames
 from startrack.camera import Camera
 from startrack.catalog import StarCatalog
 from startrack.catalog.bodies import bodies
-from startrack.errors import BadInput, NoSolution, NotIdentified, Reason
+from startrack.errors import BadInput, Reason
 from startrack.frames import R_enu_icrs, Site, azel_from_rays, rays_from_azel, refract_rad
-from startrack.calibration.frame import pressure_hpa
 from startrack.pipeline import identify, identify_blind
 from startrack.stages import Oriented, Refused
 from startrack.types import Array, Body, Detections, Exposure, Ints
 
 LOWEST_STAR_RAD = np.radians(-3.0)  # true elevation; refraction lifts a star at -0.5 degrees to the horizon
 CIRCLE_FROM_RAD = np.radians(100.0)  # from here up a field of view is that of the image circle
-MIN_LENS_STARS = 40  # fewer matched stars leave the lens as it is
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -135,7 +134,7 @@ def _sky_frame(k: int, one: Oriented, joint: JointFit, camera: Camera, catalog: 
     )
 
 
-def _lifted_bodies(site: Site, time_utc, R: Array) -> tuple[Body, ...]:
+def _lifted_bodies(site: Site, time_utc: datetime, R: Array) -> tuple[Body, ...]:
     """Planets, Sun and Moon in apparent directions."""
     found = []
     for body in bodies(site, time_utc):

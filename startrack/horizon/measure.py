@@ -12,7 +12,7 @@ from startrack.catalog import StarCatalog
 from startrack.errors import NoSolution
 from startrack.frames import Site, off_axis_rad, rays_from_azel, refract_rad
 from startrack.horizon.frames import LeftOut, SkyFrame, orient_frames, pressure_hpa
-from startrack.horizon.grid import BINS, COLUMNS, COLUMNS_PER_BIN, column_of, elevations_rad
+from startrack.horizon.grid import BINS, COLUMNS, COLUMNS_PER_BIN
 from startrack.horizon.posterior import (
     Marginals,
     column_log_prior,
@@ -90,7 +90,13 @@ def _steps_of(frame: SkyFrame, light: StarLight) -> list[Steps]:
     camera = replace(frame.camera, max_angle_rad=edge)
     widths = tuple(width for width, _ in WIDTHS)
     return find_steps(
-        found.image_e, found.noise_e, found.dead, camera, frame.R_cam_enu, widths=widths, stars_px=light.bright_px,
+        found.image_e,
+        found.noise_e,
+        found.dead,
+        camera,
+        frame.R_cam_enu,
+        widths=widths,
+        stars_px=light.bright_px,
         glare_px=light.glare_px,
     )
 
@@ -101,7 +107,7 @@ def _skyline(
 ) -> MeasuredSkyline:  # fmt: skip
     """The columns' posterior as bins of one degree; the errors that the frames share are added once."""
     columns = marginals.mean_rad.reshape(BINS, COLUMNS_PER_BIN)
-    azimuth = np.arange(BINS) * (2 * np.pi / BINS)
+    azimuth = np.radians(np.arange(BINS, dtype=np.float64) * (360.0 / BINS))
     elevation = columns.mean(axis=1)
     variance = np.mean(np.square(marginals.sigma_rad.reshape(BINS, COLUMNS_PER_BIN)), axis=1)
     variance += _neighbourhood_variance(marginals.mean_rad)
@@ -171,8 +177,11 @@ def _has_step(steps: Sequence[list[Steps]], elevation_rad: Array) -> Bools:
     return np.asarray(found.reshape(BINS, COLUMNS_PER_BIN).mean(axis=1) >= 0.5)
 
 
-def predicted_visible(skyline: MeasuredSkyline, azimuth_rad: Array, elevation_rad: Array) -> tuple[Array, Bools]:
-    """Whether directions (n,) are above a skyline, and whether they are more than two sigma from it (and it is known)."""
+def predicted_visible(skyline: MeasuredSkyline, azimuth_rad: Array, elevation_rad: Array) -> tuple[Bools, Bools]:
+    """Whether directions (n,) are above a `skyline`, and which are more than two sigma from it where it is known.
+
+    `azimuth_rad` and `elevation_rad` (n,) are apparent directions.
+    """
     nearest = np.rint(np.asarray(azimuth_rad) * (len(skyline) / (2 * np.pi))).astype(np.int64) % len(skyline)
     height = elevation_rad - skyline.elevation_rad[nearest]
     return height > 0, np.abs(height) > 2 * skyline.sigma_rad[nearest]

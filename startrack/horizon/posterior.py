@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.horizon.grid import COLUMNS, column_of, LOWEST_RAD, STEP_RAD, elevations_rad
+from startrack.horizon.grid import COLUMNS, LOWEST_RAD, STEP_RAD, column_of, elevations_rad
 from startrack.horizon.skylight import MIN_SIGNIFICANCE, Steps
 from startrack.types import Array, Evidence
 
@@ -66,7 +66,7 @@ def star_log_likelihood(rays: Evidence, missing: float, spurious: float) -> Arra
     first = np.rint((rays.elevation_rad - LOWEST_RAD) / STEP_RAD).astype(int) - half
     # Below its window a star is visible, above it hidden: a step; within it the profile of the edge.
     steps = np.zeros((COLUMNS, n + 1))
-    np.add.at(steps, (column, 0), limited)
+    np.add.at(steps, (column, np.zeros_like(column)), limited)
     np.add.at(steps, (column, np.clip(first, 0, n)), -limited)
     total = np.cumsum(steps, axis=1)[:, :n]
     at = first[:, None] + np.arange(2 * half + 1)
@@ -140,5 +140,8 @@ def combine_columns(log_likelihood: Array) -> Marginals:
 
 def _kernel(n: int, size: int) -> Array:
     distance = STEP_RAD * np.minimum(np.arange(size), size - np.arange(size))
-    parts = [w * np.exp(-distance / s) / np.sum(np.exp(-distance / s)) for w, s in zip(CHANGE_WEIGHTS, CHANGES_RAD)]
-    return np.sum(parts, axis=0)
+    parts = [
+        w * np.exp(-distance / s) / np.sum(np.exp(-distance / s))
+        for w, s in zip(CHANGE_WEIGHTS, CHANGES_RAD, strict=True)
+    ]
+    return np.asarray(np.sum(parts, axis=0))

@@ -103,8 +103,9 @@ def skyline_picture(
     _draw_scales(canvas, box, canvas_px, low, high, step)
     for run in runs:
         at, top = azimuth_deg[run], horizon_deg[run]
-        for sign in (-1.0, 1.0) if sigma_rad is not None else ():
-            canvas.window(box).line(canvas_px(at, top + sign * np.degrees(sigma_rad[run])), FAINT_INK)
+        if sigma_rad is not None:
+            for shift in (-np.degrees(sigma_rad[run]), np.degrees(sigma_rad[run])):
+                canvas.window(box).line(canvas_px(at, top + shift), FAINT_INK)
         canvas.window(box).curve(canvas_px(at, top), SKYLINE, 2.0)
     canvas.text((box[0], 9.0), title, TEXT_PX, INK, "lt")
     return canvas.rendered_pixels()

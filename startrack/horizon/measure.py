@@ -114,7 +114,7 @@ def _skyline(
     variance += np.square(_common_sigma_rad(frames, azimuth, elevation, site))
     variance += np.square(_gap_depth(steps, marginals.mean_rad))
     by_stars, by_light = _has_star(stars, azimuth, elevation), _has_step(steps, marginals.mean_rad)
-    known = (variance < UNKNOWN_SIGMA_RAD**2) & (by_stars | by_light)
+    known = _without_lone_bins((variance < UNKNOWN_SIGMA_RAD**2) & (by_stars | by_light))
     source = np.select([by_stars & by_light, by_light, by_stars], ["both", "sky light", "stars"], "")
     return MeasuredSkyline(
         azimuth_rad=azimuth,
@@ -122,6 +122,12 @@ def _skyline(
         sigma_rad=np.where(known, np.sqrt(variance), np.inf),
         source=np.where(known, source, ""),
     )
+
+
+def _without_lone_bins(known: Bools) -> Bools:
+    """Only runs of three bins (n,) and more: a shorter one is a halo or a reflection more often than ground."""
+    middle = known & np.roll(known, 1) & np.roll(known, -1)
+    return np.asarray(middle | np.roll(middle, 1) | np.roll(middle, -1))
 
 
 def _neighbourhood_variance(elevation_rad: Array) -> Array:

@@ -145,8 +145,8 @@ def locate_with(source: str, exposure: Exposure, camera: Camera, terrain: Terrai
 
 
 def uses_sky(result: Located) -> bool:
-    """Whether extended light is among the evidence."""
-    return bool(np.any(result.evidence().extended_nats > 0))
+    """Whether the light of the sky is among the evidence."""
+    return result.evidence_source != "stars"
 
 
 def cases_table(rows: list[tuple[Case, dict[str, dict[str, Any]]]]) -> str:

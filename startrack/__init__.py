@@ -4,8 +4,9 @@
     print(startrack.locate("image.png"))
 
 `locate` takes a path or an array and returns a `Solution`; `identify` and `detect` stop earlier, `calibrate` makes a
-camera, `render` an image. The packages (`startrack.detection`, `startrack.identification`, `startrack.localization`,
-...) have the stages one by one. Every name is loaded at its first use: importing startrack costs nothing.
+camera, `render` an image, `measure_horizon` the skyline of a fixed camera. The packages (`startrack.detection`,
+`startrack.identification`, `startrack.localization`, ...) have the stages one by one. Every name is loaded at its first
+use: importing startrack costs nothing.
 """
 
 import importlib
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 _MODULES = {  # public name to the module that has it
     "calibrate": "api", "detect": "api", "identify": "api", "locate": "api", "render": "api",
+    "measure_horizon": "api",
     "Solution": "solution",
     "Camera": "camera", "load_camera": "camera",
     "Cylinder": "terrain", "HeightMap": "terrain.height_map", "Terrain": "terrain", "load_terrain": "terrain",
@@ -42,11 +44,12 @@ __all__ = [
     "load_catalog",
     "load_terrain",
     "locate",
+    "measure_horizon",
     "render",
 ]
 
 if TYPE_CHECKING:
-    from startrack.api import calibrate, detect, identify, locate, render
+    from startrack.api import calibrate, detect, identify, locate, measure_horizon, render
     from startrack.camera import Camera, load_camera
     from startrack.catalog import load_catalog
     from startrack.errors import BadInput, NoSolution

@@ -16,6 +16,7 @@ from startrack.catalog import load_catalog
 from startrack.errors import BAD_INPUT_REASONS, BadInput
 from startrack.files import file_stem
 from startrack.frames import Site
+from startrack.horizon import measure_skyline
 from startrack.inputs import (
     Image,
     Time,
@@ -34,7 +35,7 @@ from startrack.rendering import render as render_scene
 from startrack.solution import Solution
 from startrack.stages import Outcome, Refused, Settings
 from startrack.terrain import Terrain
-from startrack.types import Exposure
+from startrack.types import Exposure, MeasuredSkyline
 
 if TYPE_CHECKING:
     from astropy.units import Quantity
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
 
     from startrack.identification import IdentifiedCentroids
 
-__all__ = ["calibrate", "detect", "identify", "locate", "render"]
+__all__ = ["calibrate", "detect", "identify", "locate", "measure_horizon", "render"]
 
 ARGUMENT_OF_FLAG = {"--time UTC": "time="}  # messages of the stages name the flags of the commands
 MAX_LIST_COLUMNS = 4  # x, y, flux and error: an array (n, 4) is no image
@@ -173,6 +174,41 @@ def calibrate(
     exposures = [exposure_input(image, None) for image in images]
     fov_rad = None if fov is None else field_of_view_rad(fov)
     return calibrate_exposures(exposures, load_catalog(), camera=start, fov_rad=fov_rad, site=site, name=name)
+
+
+def measure_horizon(
+    images: Sequence[Image],
+    *,
+    site: Site,
+    camera: str | Camera | None = None,
+    fov: float | Quantity | None = None,
+) -> MeasuredSkyline:
+    """The horizon (obstruction profile) of a fixed camera on the Earth, from photographs of the night sky.
+
+    Args:
+        images: as for `locate`, each with its time; those whose stars cannot be identified are left out.
+        site: on the Earth, where the camera stands.
+        camera: as for `locate`; None: `fov`, or the camera that the first image names.
+        fov: field of view, as for `identify`.
+
+    Returns:
+        Elevation with its sigma at every degree of azimuth; nan where the horizon is unknown.
+
+    Raises:
+        ValueError: both `camera` and `fov` are given, no image, or a site that is not on the Earth.
+        BadInput: as `locate`.
+        NoSolution: the stars of no image are identified.
+    """
+    if fov is not None and camera is not None:
+        raise ValueError("camera= and fov= exclude each other: with fov= the lens is found, with camera= it is known")
+    if site.body != "earth":
+        raise ValueError(f"site= is on the {site.body}: the horizon is measured on the Earth")
+    exposures = [exposure_input(image, None) for image in images]
+    if not exposures:
+        raise ValueError("no image is given")
+    lens = camera_input(camera, exposures[0]) if fov is None else None
+    fov_rad = None if fov is None else field_of_view_rad(fov)
+    return measure_skyline(exposures, load_catalog(), site, camera=lens, fov_rad=fov_rad).skyline
 
 
 def render(

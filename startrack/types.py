@@ -80,7 +80,7 @@ class Value:
             for n, w in zip(a.shape, want, strict=True):
                 if n != (lengths.setdefault(w, n) if isinstance(w, str) else w):
                     raise ValueError(f"{type(self).__name__}.{f.name}: shape {a.shape}, expected {want} {lengths}")
-            if a.dtype.kind == "f" and not f.metadata["may_be_nan"] and np.isnan(a).any():
+            if a.dtype.kind == "f" and not f.metadata.get("may_be_nan") and np.isnan(a).any():
                 raise ValueError(f"{type(self).__name__}.{f.name} holds NaN")
             a.flags.writeable = False
             object.__setattr__(self, f.name, a)

@@ -30,7 +30,7 @@ LAYERS = (  # lowest first; a package imports from lower layers only
     {"measurement", "orientation", "sky_refinement", "skyline"},
     {"pipeline", "calibration", "inputs"},
     {"output"},
-    {"solution"},
+    {"solution", "horizon"},
     {"reproduction", "batch", "api"},
     {"cli"},
 )
@@ -38,7 +38,7 @@ ALLOWED: set[tuple[str, str]] = set()  # exceptions: (package, package of the sa
 HEAVY = (
     "astropy", "cv2", "lunarsky", "matplotlib", "PIL", "rich", "scipy", "skimage", "skyfield", "spiceypy", "tifffile",
 )  # fmt: skip
-CV2_ROOMS = {"detection", "evidence", "exposure", "output"}  # image processing: cv2 may be imported at the top
+CV2_ROOMS = {"detection", "evidence", "exposure", "horizon", "output"}  # image processing at the top
 
 
 def room_of(path: Path) -> str:

@@ -59,21 +59,32 @@ class Frame:
 
 def load_frame(exposure: Exposure, catalog: StarCatalog, site: Site | None, detector: Detector | None = None) -> Frame:
     """Detect the sources and compute the sky at the exposure's time. Raises BadInput no_time, TooFewStars."""
+    require_time(exposure)
+    return frame_of(exposure, (detector or Detector())(exposure, None), catalog, site)
+
+
+def require_time(exposure: Exposure) -> datetime:
+    """The middle of the exposure. Raises BadInput no_time if it is not known."""
     if exposure.time_utc is None:
         raise BadInput("no_time", f"{exposure.name}: {NO_TIME}")
-    found = (detector or Detector())(exposure, None)
+    return exposure.time_utc
+
+
+def frame_of(exposure: Exposure, found: Centroids, catalog: StarCatalog, site: Site | None) -> Frame:
+    """The frame of an exposure whose point sources are `found`. Raises BadInput no_time."""
+    time_utc = require_time(exposure)
     return Frame(
         name=exposure.name,
         exposure=exposure,
-        time_utc=exposure.time_utc,
+        time_utc=time_utc,
         size_px=exposure.size_px,
         sources=Centroids(**{f.name: getattr(found, f.name) for f in fields(Centroids)}),
-        sky=sky_at(catalog, exposure.time_utc, site),
+        sky=sky_at(catalog, time_utc, site),
     )
 
 
-def sky_at(catalog: StarCatalog, time_utc: datetime, site: Site | None) -> Sky:
-    """The catalogue at a time and site: with aberration; on the Earth with refraction, above 3 degrees of elevation.
+def sky_at(catalog: StarCatalog, time_utc: datetime, site: Site | None, lowest_rad: float = LOWEST_RAD) -> Sky:
+    """The catalogue at a time and site: with aberration; on the Earth with refraction, above `lowest_rad` of elevation.
 
     Without a site there is no refraction: on the Earth the fitted lens then contains it.
     """
@@ -84,7 +95,7 @@ def sky_at(catalog: StarCatalog, time_utc: datetime, site: Site | None) -> Sky:
     if site.body != "earth":
         return Sky(stars=stars, b_v=catalog.b_v, elevation_rad=None, R_enu_icrs=R)
     azimuth, elevation = azel_from_rays(stars.rays_icrs @ R.T)
-    up = elevation > LOWEST_RAD
+    up = elevation > lowest_rad
     shown = rays_from_azel(azimuth[up], refract_rad(elevation[up], pressure_hpa(site.height_m))) @ R
     return Sky(
         stars=replace(stars.take(up), rays_icrs=shown), b_v=catalog.b_v[up], elevation_rad=elevation[up], R_enu_icrs=R

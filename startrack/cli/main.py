@@ -20,8 +20,8 @@ from startrack import __version__
 from startrack.errors import BadInput, NoSolution
 
 COMMANDS = (
-    "locate", "batch", "identify", "detect", "render", "calibrate", "report", "reproduce", "terrain", "doctor",
-    "schema",
+    "locate", "batch", "identify", "detect", "render", "calibrate", "horizon", "report", "reproduce", "terrain",
+    "doctor", "schema",
 )  # fmt: skip
 ACTIONS = {"calibrate": ("verify", "show", "convert", "board")}  # with a parser each, beside the command's own
 OK, INTERNAL_ERROR, USAGE, REFUSED, BAD_INPUT, STOPPED = range(6)

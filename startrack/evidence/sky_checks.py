@@ -6,7 +6,6 @@ from math import sqrt
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtr
 
 from startrack.evidence.sky_levels import LEVEL_SECTORS, MEDIAN_ABS_NORMAL, SECTORS
 from startrack.evidence.sky_light import SkyLight
@@ -50,6 +49,8 @@ def _level_sigmas(sky: SkyLight) -> Array:
 
 def _is_sharp(sky: SkyLight, sectors: Bools) -> bool:
     """Whether a step as sharp as a star explains the cells of the sectors better than a wide ramp, by far."""
+    from scipy.special import ndtr
+
     heights = sky.height_px[sectors] - sky.shift_px[sectors, None]
     llr, extended = sky.llr[sectors], sky.extended_nats[sectors]
 

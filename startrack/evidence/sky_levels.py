@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
 from startrack.evidence.sky_pixels import SkyPixels
 from startrack.kernels import njit
@@ -128,6 +127,8 @@ def _spread(sums: Array) -> Array:
 
 
 def _smooth(values: Array, sectors: float) -> Array:
+    from scipy.ndimage import gaussian_filter1d
+
     return np.asarray(gaussian_filter1d(values, sectors, axis=-1, mode="wrap"))
 
 

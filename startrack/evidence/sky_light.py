@@ -14,7 +14,6 @@ from functools import cached_property
 from math import sqrt
 
 import numpy as np
-from scipy.special import ndtr
 
 from startrack.evidence.sky_levels import CLIP_SIGMAS, GROUND, SECTORS, SKY, SkyLevels, measure_levels, sector_of
 from startrack.evidence.sky_pixels import SkyPixels
@@ -62,6 +61,8 @@ class SkyLight:
         Levels are smoothed over sectors, whose errors then agree; over wider ranges that is as if each sector had the
         whole error of its own level.
         """
+        from scipy.special import ndtr
+
         at = (self.height_px - self.shift_px[:, None]) / self.edge_px
         visible, slope = ndtr(at), np.exp(-0.5 * np.square(at)) / (np.sqrt(2 * np.pi) * self.edge_px)
         weight = self.extended_nats * slope

@@ -3,6 +3,7 @@
 from startrack.output.record import detection_dict, identification_dict, record_of, refused_dict, result_dict
 from startrack.output.text import lens_text, refusal_line, summary_line, verbose_text
 from startrack.output.write import (
+    png_bytes,
     prepare_folder,
     remove_companions,
     write_annotated,
@@ -16,6 +17,7 @@ __all__ = [
     "detection_dict",
     "identification_dict",
     "lens_text",
+    "png_bytes",
     "prepare_folder",
     "record_of",
     "refusal_line",

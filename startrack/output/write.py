@@ -11,6 +11,9 @@ from startrack.errors import BadInput
 from startrack.files import make_folder, write_atomically
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from startrack.stages import Located, Oriented, Outcome
 
 STAR_FILES = (".stars.ecsv", ".annotated.png", ".wcs", ".corr")  # beside NAME.identification.json
@@ -137,16 +140,20 @@ def write_annotated(path: FilePath, outcome: Outcome, truth_enu_m: tuple[float, 
 
     `truth_enu_m` (east, north) [m] is drawn if it is given; no stage of the pipeline has it.
     """
-    import cv2
-
     from startrack.output.picture.annotate import annotate
 
-    picture = annotate(outcome, truth_enu_m)
+    write_atomically(path, png_bytes(annotate(outcome, truth_enu_m)), overwrite=True)
+
+
+def png_bytes(picture: NDArray[np.uint8]) -> bytes:
+    """A `picture` (H, W, 3), red, green, blue, as the content of a PNG file."""
+    import cv2
+
     run_lengths = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]  # smaller and quicker for flat colours
     ok, data = cv2.imencode(".png", picture[:, :, ::-1], run_lengths)
     if not ok:
         raise RuntimeError("OpenCV could not encode the picture as PNG")
-    write_atomically(path, data.tobytes(), overwrite=True)
+    return data.tobytes()
 
 
 def _json(value: Any) -> str:

@@ -67,11 +67,24 @@ def _draw_distances(canvas: Canvas, view: MapView) -> None:
 
 def panorama_picture(terrain: Terrain, position_m: tuple[float, float]) -> NDArray[np.uint8]:
     """The horizon (H, W, 3) from north to north, azimuth to the right, seen by a camera at a position."""
+    azimuth_rad = np.radians(np.arange(0.0, 360.0 + STEP_DEG / 2, STEP_DEG))
+    horizon_rad = terrain.horizon_rad(np.array(position_m)[None], azimuth_rad)
+    title = f"{terrain.name}: horizon seen from E {position_m[0]:.0f} m, N {position_m[1]:.0f} m"
+    return skyline_picture(azimuth_rad, horizon_rad, title)
+
+
+def skyline_picture(
+    azimuth_rad: Array, elevation_rad: Array, title: str, sigma_rad: Array | None = None
+) -> NDArray[np.uint8]:
+    """A skyline (H, W, 3) from north to north: elevations (n,) at ascending azimuths (n,), nan where unknown.
+
+    `sigma_rad` (n,): errors, drawn as two thin lines.
+    """
     width, height = PANORAMA_PX
     canvas = Canvas(width, height)
-    azimuth_deg = np.arange(0.0, 360.0 + STEP_DEG / 2, STEP_DEG)
-    horizon_deg = np.degrees(terrain.horizon_rad(np.array(position_m)[None], np.radians(azimuth_deg)))
-    low, high = min(float(horizon_deg.min()), 0.0), float(horizon_deg.max())
+    azimuth_deg, horizon_deg = np.degrees(azimuth_rad), np.degrees(elevation_rad)
+    shown = horizon_deg[np.isfinite(horizon_deg)]
+    low, high = min(float(shown.min(initial=0.0)), 0.0), float(shown.max(initial=0.0))
     step = nice_step(max(high - low, 2.0) / 3)
     low, high = np.floor(low / step) * step, np.ceil((high + 0.3 * step) / step) * step
     box = (MARGIN_PX, 34.0, width - 16.0, height - 40.0)
@@ -82,13 +95,26 @@ def panorama_picture(terrain: Terrain, position_m: tuple[float, float]) -> NDArr
         y = box[3] - (np.asarray(elevation) - low) / (high - low) * (box[3] - box[1])
         return np.stack(np.broadcast_arrays(x, y), axis=-1)
 
-    ground = np.concatenate([canvas_px(azimuth_deg, horizon_deg), canvas_px(np.array([360.0, 0.0]), low)])
-    canvas.window(box).area(ground, FLOOR)
+    runs = _runs(np.isfinite(horizon_deg))
+    for run in runs:
+        at, top = azimuth_deg[run], horizon_deg[run]
+        ground = np.concatenate([canvas_px(at, top), canvas_px(np.array([at[-1], at[0]]), low)])
+        canvas.window(box).area(ground, FLOOR)
     _draw_scales(canvas, box, canvas_px, low, high, step)
-    canvas.curve(canvas_px(azimuth_deg, horizon_deg), SKYLINE, 2.0)
-    title = f"{terrain.name}: horizon seen from E {position_m[0]:.0f} m, N {position_m[1]:.0f} m"
+    for run in runs:
+        at, top = azimuth_deg[run], horizon_deg[run]
+        if sigma_rad is not None:
+            for shift in (-np.degrees(sigma_rad[run]), np.degrees(sigma_rad[run])):
+                canvas.window(box).line(canvas_px(at, top + shift), FAINT_INK)
+        canvas.window(box).curve(canvas_px(at, top), SKYLINE, 2.0)
     canvas.text((box[0], 9.0), title, TEXT_PX, INK, "lt")
     return canvas.rendered_pixels()
+
+
+def _runs(known: NDArray[np.bool_]) -> list[slice]:
+    """Stretches of at least two known points."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
+    return [slice(first, last) for first, last in edges.reshape(-1, 2) if last - first > 1]
 
 
 def _draw_scales(canvas: Canvas, box: Box, canvas_px, low: float, high: float, step: float) -> None:  # type: ignore[no-untyped-def]

@@ -1,0 +1,69 @@
+"""Frames of a fixed camera below a known jagged skyline, painted without the package's renderer."""
+
+from __future__ import annotations
+
+from datetime import datetime
+
+import numpy as np
+from star_painter import paint
+
+from startrack.camera import Camera
+from startrack.catalog import load_catalog
+from startrack.frames import (
+    R_enu_icrs,
+    Site,
+    azel_from_rays,
+    observer_velocity_m_s,
+    parse_utc,
+    rays_from_azel,
+    refract_rad,
+)
+from startrack.types import Exposure
+
+SITE = Site("earth", np.radians(46.0), np.radians(7.0), 1000.0)
+TIME = parse_utc("2024-10-05T21:00:00Z")
+CAMERA = Camera(
+    name="all-sky", size_px=(900, 900), focal_px=(270.0, 270.0), centre_px=(452.0, 447.0),
+    max_angle_rad=np.radians(94.0), calibrated_angle_rad=np.radians(90.0),
+)  # fmt: skip
+R_CAM_ENU = np.array([[-1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0]])  # looks at the zenith, image top to the north
+PRESSURE_HPA = 1010.0 * np.exp(-1000.0 / 8430.0)
+PSF_PX, PEDESTAL, SKY, GROUND, READ_NOISE = 0.9, 300.0, 400.0, 60.0, 8.0
+ZERO_MAG, EXTINCTION_MAG = 14.5, 0.2
+
+
+def skyline_deg(azimuth_deg: np.ndarray) -> np.ndarray:
+    """Hills, a tree line of teeth, and a dome with vertical walls."""
+    hills = 6.0 + 2.0 * np.sin(np.radians(3 * azimuth_deg))
+    teeth = np.where((azimuth_deg > 200) & (azimuth_deg < 260), 3.0 * np.abs((azimuth_deg / 5) % 2 - 1), 0.0)
+    return np.where((azimuth_deg > 100) & (azimuth_deg < 125), 20.0, hills + teeth)
+
+
+def painted_frame(seed: int = 1, time_utc: datetime = TIME, with_stars: bool = True) -> Exposure:
+    """An exposure: the sky with its stars, refracted and dimmed, above the skyline; without stars it is overcast."""
+    rng = np.random.default_rng(seed)
+    width, height = CAMERA.size_px
+    light = np.full((height, width), PEDESTAL)
+    for dx in (-0.25, 0.25):
+        for dy in (-0.25, 0.25):
+            x, y = np.meshgrid(np.arange(width) + dx, np.arange(height) + dy)
+            px = np.stack([x, y], axis=-1)
+            azimuth, elevation = azel_from_rays(CAMERA.unproject(px) @ R_CAM_ENU)
+            is_sky = np.degrees(elevation) > skyline_deg(np.degrees(azimuth))
+            lit = CAMERA.angle_rad(px) < CAMERA.max_angle_rad
+            light += np.where(lit, np.where(is_sky, SKY, GROUND), 0.0) / 4
+    if with_stars:
+        _paint_stars(light, time_utc)
+    light += rng.normal(size=light.shape) * np.sqrt(light + READ_NOISE**2)
+    return Exposure(pixels_adu=light.astype(np.float32), name=f"frame-{seed}", time_utc=time_utc, exposure_s=30.0)
+
+
+def _paint_stars(light: np.ndarray, time_utc: datetime) -> None:
+    stars = load_catalog().at(time_utc, observer_velocity_m_s(SITE, time_utc))
+    azimuth, elevation = azel_from_rays(stars.rays_icrs @ R_enu_icrs(SITE, time_utc).T)
+    elevation = refract_rad(elevation, PRESSURE_HPA)
+    up = (np.degrees(elevation) > skyline_deg(np.degrees(azimuth))) & (stars.v_mag < 7.5)
+    xy, inside = CAMERA.project(rays_from_azel(azimuth[up], elevation[up]) @ R_CAM_ENU.T)
+    air = 1.0 / (np.sin(elevation[up]) + 0.025 * np.exp(-11 * np.sin(elevation[up])))
+    flux = 10 ** (-0.4 * (stars.v_mag[up] + EXTINCTION_MAG * air - ZERO_MAG))
+    paint(light, xy[inside], flux[inside], PSF_PX)

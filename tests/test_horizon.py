@@ -1,0 +1,258 @@
+"""The skyline of a fixed camera: painted frames with a known skyline, a real photograph, the files, refusals."""
+
+from __future__ import annotations
+
+import configparser
+import csv
+import json
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.table import Table
+from horizon_helpers import CAMERA, SITE, TIME, painted_frame, skyline_deg
+
+import startrack
+from startrack.camera import load_camera
+from startrack.catalog import load_catalog
+from startrack.cli.main import main
+from startrack.errors import BadInput, NoSolution
+from startrack.exposure import read_exposure
+from startrack.frames import Site
+from startrack.horizon import measure_skyline, predicted_visible
+from startrack.horizon.frames import orient_frames
+from startrack.horizon.measure import measure_frames
+from startrack.horizon.posterior import limit_llr
+from startrack.horizon.write import (
+    check_output,
+    csv_text,
+    interpolate_unknown,
+    nina_text,
+    write_skyline,
+)
+from startrack.output.skyline_table import skyline_table_text
+from startrack.types import MeasuredSkyline
+
+ROOT = Path(__file__).parent.parent
+PHOTO = ROOT / "sample_images/lowell-2018-08-06.fits.bz2"
+LOWELL = Site("earth", np.radians(34.7443), np.radians(-111.4223), 2361.0)
+LOWELL_FLAG = "--site=34.7443,-111.4223,2361"
+
+
+@pytest.fixture(scope="module")
+def catalog():
+    return load_catalog()
+
+
+@pytest.fixture(scope="module")
+def two_frames():
+    return [painted_frame(1), painted_frame(2, TIME + timedelta(hours=3))]
+
+
+@pytest.fixture(scope="module")
+def overcast():
+    return painted_frame(3, with_stars=False)
+
+
+@pytest.fixture(scope="module")
+def painted(two_frames, catalog):
+    return measure_skyline(two_frames[:1], catalog, SITE, camera=CAMERA).skyline
+
+
+@pytest.fixture(scope="module")
+def photographed(catalog):
+    return measure_skyline([read_exposure(PHOTO)], catalog, LOWELL, camera=load_camera("lowell-ldt")).skyline
+
+
+def small_skyline() -> MeasuredSkyline:
+    elevation = np.radians(np.linspace(1.0, 10.0, 360))
+    elevation[[0, 5, 6]] = np.nan
+    return MeasuredSkyline(
+        azimuth_rad=np.radians(np.arange(360.0)),
+        elevation_rad=elevation,
+        sigma_rad=np.where(np.isnan(elevation), np.inf, np.radians(0.1)),
+        source=np.where(np.isnan(elevation), "", "both"),
+    )
+
+
+def error_deg(skyline):
+    """Errors (n,) of the known azimuths, and their indices; the truth is the mean over each bin."""
+    within = np.arange(-0.5, 0.5, 0.02) + 0.01
+    true = skyline_deg((np.arange(360.0)[:, None] + within) % 360).mean(axis=1)
+    known = np.flatnonzero(skyline.known)
+    return np.degrees(skyline.elevation_rad[known]) - true[known], known
+
+
+def test_a_painted_skyline_is_found(painted):
+    error, known = error_deg(painted)
+    assert len(known) > 300
+    assert np.median(np.abs(error)) < 0.05
+    smooth = painted.sigma_rad[known] <= np.radians(0.1)
+    assert smooth.sum() > 120
+    assert np.sqrt(np.mean(np.square(error[smooth]))) < 0.1
+
+
+def test_its_sigmas_are_honest(painted):
+    error, known = error_deg(painted)
+    ratio = np.abs(error) / np.degrees(painted.sigma_rad[known])
+    assert np.mean(ratio < 2) > 0.9
+    assert np.mean(ratio < 4) > 0.98
+
+
+def test_nights_are_combined(two_frames, catalog, painted):
+    found = measure_skyline(two_frames, catalog, SITE, camera=CAMERA)
+    assert [frame.name for frame in found.frames] == ["frame-1", "frame-2"]
+    error, _ = error_deg(found.skyline)
+    assert np.median(np.abs(error)) < 0.05
+    assert found.skyline.known.sum() >= painted.known.sum() - 10
+
+
+def test_an_overcast_night_is_left_out_and_alone_refused(overcast, two_frames, catalog):
+    frames, left_out = orient_frames([overcast, two_frames[0]], catalog, SITE, camera=CAMERA, fov_rad=None)
+    assert [frame.name for frame in frames] == ["frame-1"]
+    assert [one.name for one in left_out] == ["frame-3"]
+    with pytest.raises(NoSolution, match="frame-3"):
+        measure_frames((), left_out, SITE)
+
+
+def test_without_a_camera_file_the_lens_is_found(two_frames, catalog, painted):
+    found = measure_skyline(two_frames[:1], catalog, SITE, fov_rad=np.radians(180)).skyline
+    both = found.known & painted.known
+    difference = np.degrees(found.elevation_rad - painted.elevation_rad)[both]
+    assert both.sum() > 280
+    assert np.median(np.abs(difference)) < 0.05
+
+
+def test_the_real_skyline_follows_hills_and_trees(photographed):
+    elevation, sigma = np.degrees(photographed.elevation_rad), np.degrees(photographed.sigma_rad)
+    assert photographed.known.sum() > 200
+    assert (sigma < 0.15).sum() > 60
+    hills = np.interp([30, 40, 50, 60], np.arange(360), np.nan_to_num(elevation))
+    np.testing.assert_allclose(hills, [1.4, 0.97, 0.2, -0.43], atol=0.3)  # read off the picture
+    tree = elevation[100:107]
+    np.testing.assert_allclose(tree[np.isfinite(tree)], 15.6, atol=0.6)
+    assert set(photographed.source) <= {"", "stars", "sky light", "both"}
+
+
+def test_stars_are_predicted_by_two_sigma(photographed):
+    visible, sure = predicted_visible(photographed, np.radians([50.0, 50.0, 50.0]), np.radians([10.0, 0.2, -4.0]))
+    assert visible[[0, 2]].tolist() == [True, False]
+    assert sure.tolist() == [True, False, True]
+
+
+def test_one_night_agrees_with_the_published_stars(photographed):
+    """All stars that were matched without startrack are above the skyline."""
+    lines = (ROOT / "tests/data/lowell-2018-08-06-stars.csv").read_text(encoding="utf-8").splitlines()
+    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
+    azimuth = np.radians([float(row["az_deg"]) for row in rows])
+    elevation = np.radians([float(row["alt_deg_refracted"]) for row in rows])
+    visible, sure = predicted_visible(photographed, azimuth, elevation)
+    assert sure.sum() > 200
+    assert visible[sure].mean() > 0.97
+
+
+def test_missing_stars_are_weaker_evidence_under_clouds():
+    llr = np.array([-9.0, 9.0])
+    clear, cloudy = limit_llr(llr, np.array(0.01), 0.01), limit_llr(llr, np.array(0.5), 0.01)
+    assert clear[0] == pytest.approx(np.log(0.01), abs=0.05)
+    assert cloudy[0] == pytest.approx(np.log(0.5), abs=0.05)
+    assert clear[1] == pytest.approx(-np.log(0.01), abs=0.1)
+
+
+def test_the_csv_has_a_row_a_degree(tmp_path):
+    write_skyline(str(tmp_path / "a.csv"), small_skyline(), LOWELL, overwrite=False)
+    lines = (tmp_path / "a.csv").read_text().splitlines()
+    assert lines[0] == "azimuth_deg,elevation_deg,sigma_deg"
+    assert len(lines) == 361
+    assert lines[1] == "0,,"
+    assert lines[3].split(",")[0] == "2"
+    assert float(lines[3].split(",")[1]) == pytest.approx(1.0 + 2 * 9 / 359, abs=1e-4)
+    assert csv_text(small_skyline()).endswith("359,10.0000,0.1000\n")
+
+
+def test_the_ecsv_is_read_by_astropy():
+    table = Table.read(skyline_table_text(small_skyline()).splitlines(), format="ascii.ecsv")
+    assert len(table) == 360
+    assert table["elevation_deg"].unit == "deg"
+    assert table["elevation_deg"].mask[[0, 5, 6]].all()
+    assert table["source"][10] == "both"
+
+
+def test_the_nina_file_is_complete():
+    rows = [line for line in nina_text(small_skyline()).splitlines() if not line.startswith("#")]
+    azimuth, altitude = np.array([row.split(" ") for row in rows], dtype=float).T
+    assert azimuth.tolist() == list(range(361))
+    assert np.isfinite(altitude).all()
+    assert altitude[0] == altitude[360]
+    assert altitude[5] == pytest.approx(1.0 + 5 * 9 / 359, abs=1e-3)
+
+
+def test_the_stellarium_landscape_is_polygonal(tmp_path):
+    write_skyline(f"{tmp_path}/garden/", small_skyline(), LOWELL, overwrite=False)
+    settings = configparser.ConfigParser()
+    settings.read(tmp_path / "garden/landscape.ini")
+    assert settings["landscape"]["type"] == "polygonal"
+    assert settings["landscape"]["name"] == "garden"
+    assert float(settings["location"]["latitude"]) == pytest.approx(34.7443)
+    points = np.loadtxt(tmp_path / "garden" / settings["landscape"]["polygonal_horizon_list"])
+    assert points.shape == (360, 2)
+
+
+def test_the_panorama_is_a_picture(tmp_path):
+    import cv2
+
+    write_skyline(str(tmp_path / "a.png"), small_skyline(), LOWELL, overwrite=False)
+    picture = cv2.imread(str(tmp_path / "a.png"))
+    assert picture.shape[1] > 1000
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
+
+
+def test_unknown_suffixes_and_existing_files_are_refused(tmp_path):
+    with pytest.raises(BadInput, match="suffix"):
+        check_output(str(tmp_path / "a.txt"), overwrite=False)
+    (tmp_path / "a.csv").write_text("mine")
+    with pytest.raises(BadInput, match="exists"):
+        check_output(str(tmp_path / "a.csv"), overwrite=False)
+    check_output(str(tmp_path / "a.csv"), overwrite=True)
+
+
+def test_a_skyline_without_any_azimuth_cannot_be_interpolated():
+    nothing = replace(small_skyline(), elevation_rad=np.full(360, np.nan))
+    with pytest.raises(BadInput):
+        interpolate_unknown(nothing)
+
+
+def test_the_command_writes_the_file_and_the_record(tmp_path, capsys):
+    out = tmp_path / "a.hrz"
+    assert main(["horizon", str(PHOTO), "-o", str(out), LOWELL_FLAG, "-c", "lowell-ldt", "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["format"] == "startrack.horizon/1"
+    assert record["status"] == "ok"
+    assert record["azimuths"]["known"] > 200
+    assert "interpolated" in record["message"]
+    assert out.exists()
+    assert main(["horizon", str(PHOTO), "-o", str(out), LOWELL_FLAG, "-c", "lowell-ldt"]) == 4
+
+
+def test_without_site_or_time_it_is_bad_input(tmp_path, capsys):
+    assert main(["horizon", str(PHOTO), "-o", str(tmp_path / "a.csv")]) == 4
+    assert "--site" in capsys.readouterr().out
+    import cv2
+
+    cv2.imwrite(str(tmp_path / "flat.png"), np.zeros((60, 80), np.uint8))
+    assert (
+        main(["horizon", str(tmp_path / "flat.png"), "-o", str(tmp_path / "a.csv"), "--fov", "180", LOWELL_FLAG]) == 4
+    )
+    assert "no_time" in capsys.readouterr().out
+    assert not (tmp_path / "a.csv").exists()
+
+
+def test_the_library_has_it_and_checks_its_arguments():
+    with pytest.raises(ValueError, match="exclude"):
+        startrack.measure_horizon([PHOTO], site=LOWELL, camera="lowell-ldt", fov=180)
+    with pytest.raises(ValueError, match="moon"):
+        startrack.measure_horizon([PHOTO], site=Site("moon", 0.0, 0.0), fov=180)
+    with pytest.raises(ValueError, match="no image"):
+        startrack.measure_horizon([], site=LOWELL, fov=180)

@@ -77,7 +77,7 @@ def _refined(measured: Located, stars: bool) -> Located | None:
 def _fit_step(measured: Measured, sky: SkyLight, position_m: Array, fix: Fix) -> SkylineFit | None:
     """The step from a position (2,) that explains the skyline which the sky shows there."""
     terrain = measured.terrain
-    used = sectors_with_step(sky)
+    used = sectors_with_step(sky) & terrain.is_informative(MIDDLES_RAD, sky.elevation_rad)
     if not used.any():
         return None
     map_sigma_px = terrain.horizon_sigma_rad(position_m[None], MIDDLES_RAD) * sky.px_per_rad

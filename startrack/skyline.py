@@ -29,10 +29,9 @@ def measured_skyline(located: Located) -> MeasuredSkyline:
         used = located.skyline_fit.used
         by_sky, sky_sigma = _by_sky_light(located.sky_light, located.skyline_fit)
         both = used & (sigma < SIMILAR * sky_sigma)
-        share = np.where(both, sky_sigma**2 / (sky_sigma**2 + sigma**2), 0.0)
-        joined = by_sky + share * (elevation - by_sky)
-        elevation = np.where(used, joined, elevation)
-        sigma = np.where(used, sky_sigma * np.sqrt(1.0 - share), sigma)
+        share = np.where(both, 1.0 / (1.0 + np.square(sigma / sky_sigma)), 0.0)
+        elevation = np.where(used, by_sky + share * (elevation - by_sky), elevation)
+        sigma[used] = (sky_sigma * np.sqrt(1.0 - share))[used]
         source = np.where(both, "both", np.where(used, "sky light", source))
     known = source != ""
     return MeasuredSkyline(

@@ -73,22 +73,30 @@ def measure_levels(pixels: SkyPixels, sector: Ints) -> SkyLevels:
         smoothed = _smooth(np.stack([sums[:, 0], own]), LEVEL_SECTORS)
         change = smoothed[1] / np.maximum(smoothed[0], 1e-9)
         level, slope, clip = level + change, slope + more, CLIP_SIGMAS
-    count = np.maximum(sums[:, 0], 1.0)
-    own_e, variance = own / count - change, np.square(noise) / count
-    z2 = np.square(own_e) / variance
-    correlation = max(float(np.median(z2[:, covered])) / MEDIAN_ABS_NORMAL**2, 1.0) if covered.any() else 1.0
-    own_variance = correlation * variance
-    rough = np.maximum(
-        _smooth(np.asarray(z2 * covered), NOISE_SECTORS)
-        / np.maximum(_smooth(covered.astype(np.float64), NOISE_SECTORS), 1e-9),
-        1.0,
-    )
-    extrapolated = np.square(sums[:, 1] / count) * count / np.maximum(_spread(sums), 1e-9)
+    own_e = own / np.maximum(sums[:, 0], 1.0) - change
+    own_sigma, variance, correlation = _level_errors(sums, own_e, noise, kept, covered)
     return SkyLevels(
-        covered=covered, level_e=level, slope_e=slope, own_e=own_e, own_sigma_e=np.sqrt(own_variance),
-        variance_e2=variance * np.maximum(rough, correlation) * (1.0 + kept * extrapolated), noise_e=noise,
-        correlation=correlation,
+        covered=covered, level_e=level, slope_e=slope, own_e=own_e, own_sigma_e=own_sigma, variance_e2=variance,
+        noise_e=noise, correlation=correlation,
     )  # fmt: skip
+
+
+def _level_errors(
+    sums: Array, own_e: Array, noise_e: Array, kept_slope: Array, covered: Bools
+) -> tuple[Array, Array, float]:
+    """Sigma of the sectors' own levels, variance of the levels at the skyline (2, SECTORS), correlation of the noise.
+
+    Where own levels (2, SECTORS) differ from the smooth ones by more than the noise explains, these are rough: an
+    excess everywhere is taken as correlated noise, one nearby as a level that varies faster than it is smoothed.
+    """
+    count = np.maximum(sums[:, 0], 1.0)
+    independent = np.square(noise_e) / count
+    z2 = np.square(own_e) / independent
+    correlation = max(float(np.median(z2[:, covered])) / MEDIAN_ABS_NORMAL**2, 1.0) if covered.any() else 1.0
+    nearby, seen = (_smooth(np.asarray(a, dtype=np.float64), NOISE_SECTORS) for a in (z2 * covered, covered))
+    rough = np.maximum(nearby / np.maximum(seen, 1e-9), correlation)
+    extrapolated = np.square(sums[:, 1]) / count / np.maximum(_spread(sums), 1e-9)
+    return np.sqrt(correlation * independent), independent * rough * (1.0 + kept_slope * extrapolated), correlation
 
 
 def _first_levels(side: Ints, light_e: Array) -> tuple[Array, Array]:

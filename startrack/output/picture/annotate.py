@@ -159,7 +159,7 @@ def _legend(value: Inputs, truth: bool) -> list[tuple[str, Colour, str]]:
     if isinstance(value, Located) and not value.fix.ambiguous:
         found += [("line", SKYLINE, "skyline of the terrain seen from the position found")]
         if value.sky_light is not None:
-            found += [("disc", MEASURED, "skyline where the light of the sky stops")]
+            found += [("dot", MEASURED, "skyline where the light of the sky stops")]
         around = "; circle 95 %, ellipse one sigma" if _has_circle(value) else ""
         found += [("disc", POSITION, f"position{around}")]
     if isinstance(value, Located) and value.fix.ambiguous:
@@ -177,6 +177,8 @@ def _draw_legend_sample(canvas: Canvas, x: float, y: float, kind: str, colour: C
         canvas.cross((x, y), 5.5, colour, 2)
     elif kind == "line":
         canvas.line([(x - 11, y), (x + 11, y)], colour, 3)
+    elif kind == "dot":
+        canvas.circle((x, y), 2.0, colour, -1)
     elif kind == "plus":
         canvas.plus((x, y), 8.0, colour, 2)
     else:

@@ -70,7 +70,7 @@ def _refined(measured: Located, stars: bool) -> Located | None:
     by_shared = fit.step_by_shared
     smear = by_shared @ fit.shared_covariance @ by_shared.T
     error_rad = float(fit.shared[5]) if terrain.common_sigma_rad > 0.0 else 0.0
-    refined = refine_fix(rows, fix, terrain, position, fit.covariance[:2, :2], smear, error_rad)
+    refined = refine_fix(rows, fix, terrain, position, fit.step_covariance, smear, error_rad)
     return replace(measured, fix=refined, sky_light=sky, skyline_fit=fit, by_stars=stars)
 
 

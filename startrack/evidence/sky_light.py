@@ -46,7 +46,7 @@ class SkyLight:
     misfit_nats: Array  # (SECTORS,) by which the best cells exceed the best skyline
 
     def above(self, horizon: Horizon) -> SkyLight:
-        """The same pixels above another predicted skyline, at most a few pixels away."""
+        """The same pixels above another predicted `horizon`, at most a few pixels away."""
         return sum_cells(self.pixels.above(horizon), self.levels, horizon)
 
     @cached_property

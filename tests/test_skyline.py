@@ -1,0 +1,187 @@
+"""The light of the sky in the whole chain: the refined fix, its sources, and the skyline that the image shows."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from startrack import pipeline
+from startrack.camera import load_camera
+from startrack.catalog import StarCatalog, load_catalog
+from startrack.errors import Reason
+from startrack.evidence.sky_light import MIDDLES_RAD
+from startrack.localization import PseudoGradient
+from startrack.output import write_results
+from startrack.output.write import prepare_folder
+from startrack.pipeline import Settings
+from startrack.rendering import Series, Truth, render
+from startrack.skyline import measured_skyline
+from startrack.solution import Solution
+from startrack.stages import Inputs, Located, Refused
+from startrack.terrain import load_terrain
+from startrack.types import Exposure
+
+CRATER = load_terrain("shackleton-thesis")
+CAMERA = replace(
+    load_camera("fisheye-2048"), name="fisheye-1024", size_px=(1024, 1024), focal_px=(326.0, 326.0),
+    centre_px=(511.5, 511.5),
+)  # fmt: skip
+EXPOSURE_S = 3.0
+PLACES_M = {"near the middle": (1200.0, 800.0), "halfway": (-4500.0, 3000.0)}
+
+
+@pytest.fixture(scope="module")
+def catalog() -> StarCatalog:
+    return load_catalog().brighter_than(7.0)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A rendered exposure and its truth."""
+
+    exposure: Exposure
+    truth: Truth
+
+    def error_m(self, located: Located) -> float:
+        return float(np.linalg.norm((located.fix.position_enu_m - self.truth.position_enu_m)[:2]))
+
+
+def expose(catalog: StarCatalog, place_m: tuple[float, float], sky_v_mag_arcsec2: float | None) -> Frame:
+    """A frame of the crater; None is a black sky."""
+    series = Series(
+        camera=CAMERA, terrain=CRATER, catalog=catalog, seed=3, time_utc=datetime(2031, 2, 3, tzinfo=UTC),
+        east_m=place_m[0], north_m=place_m[1], exposure_s=EXPOSURE_S, faint_v_mag=None, hot_pixels=20,
+        sky_v_mag_arcsec2=sky_v_mag_arcsec2,
+    )  # fmt: skip
+    scene, rng = series.scene(0, "frame")
+    exposure, truth = render(scene, rng=rng)
+    return Frame(exposure, truth)
+
+
+def locate(frame: Frame, catalog: StarCatalog, camera: Any = CAMERA, **settings: Any) -> Any:
+    return pipeline.locate(frame.exposure, camera, CRATER, catalog, Settings(**settings))
+
+
+@pytest.fixture(scope="module", params=list(PLACES_M))
+def bright(request: Any, catalog: StarCatalog) -> Frame:
+    return expose(catalog, PLACES_M[request.param], 21.0)
+
+
+@pytest.fixture(scope="module")
+def by_source(bright: Frame, catalog: StarCatalog) -> dict[str, Located]:
+    return {source: locate(bright, catalog, evidence_sources=source) for source in ("both", "stars", "sky")}
+
+
+def test_the_light_of_the_sky_makes_the_fix_better(bright: Frame, by_source: dict[str, Located]) -> None:
+    assert {source: found.status for source, found in by_source.items()} == dict.fromkeys(by_source, "ok")
+    both, stars, sky = (by_source[source] for source in ("both", "stars", "sky"))
+    assert (both.evidence_source, stars.evidence_source, sky.evidence_source) == ("both", "stars", "sky")
+    assert both.fix.radius95_m < 0.5 * stars.fix.radius95_m
+    assert bright.error_m(both) < bright.error_m(stars)
+    for found in (both, sky):
+        assert bright.error_m(found) < found.fix.radius999_m
+        off = (found.fix.position_enu_m - bright.truth.position_enu_m)[:2]
+        assert off @ np.linalg.solve(found.fix.covariance_m2, off) < 18.4  # 99.99 %
+        assert np.linalg.norm(found.fix.position_enu_m - both.fix.position_enu_m) < stars.fix.radius95_m
+        assert found.fix.search == stars.fix.search
+        assert found.skyline_fit is not None and 0.2 < found.skyline_fit.chi2 < 1.3
+        assert np.count_nonzero(found.skyline_fit.used) > 200
+    assert stars.sky_light is None and stars.skyline_fit is None
+
+
+def test_a_lens_that_is_not_quite_its_file_keeps_the_truth_in_the_circle(bright: Frame, catalog: StarCatalog) -> None:
+    """The principal point is wrong by a third of a pixel: stars near the skyline show it."""
+    found = locate(bright, catalog, replace(CAMERA, centre_px=(511.8, 511.35)))
+    assert found.status == "ok" and found.evidence_source == "both"
+    assert bright.error_m(found) < found.fix.radius999_m
+
+
+def test_the_measured_skyline_is_the_true_one(bright: Frame, by_source: dict[str, Located]) -> None:
+    for source, least in (("both", 200), ("sky", 200), ("stars", 40)):
+        found = measured_skyline(by_source[source])
+        assert len(found) == 240 and np.count_nonzero(found.known) > least
+        true = CRATER.horizon_rad(bright.truth.position_enu_m[None, :2], found.azimuth_rad)
+        z = ((found.elevation_rad - true) / found.sigma_rad)[found.known]
+        # Of a bright sky the sigma holds errors of the levels that neighbouring sectors share.
+        assert 0.2 < np.mean(np.square(z)) < 1.5
+        assert abs(np.mean(z)) < 0.6  # the sectors share errors of the attitude
+        assert np.array_equal(found.known, found.source != "")
+        assert np.array_equal(found.known, np.isfinite(found.sigma_rad))
+        names = set(np.unique(found.source)) - {""}
+        assert names == {"stars"} if source == "stars" else "sky light" in names | {"sky light"} - {"stars"}
+        if source != "stars":
+            used = by_source[source].skyline_fit.used
+            assert np.isin(found.source[used], ("sky light", "both")).all()
+            assert (found.source[~used] != "sky light").all()
+    sigma = [np.median(measured_skyline(by_source[source]).sigma_rad) for source in ("both", "stars")]
+    assert sigma[0] < 0.2 * sigma[1]
+
+
+def test_the_sky_stops_where_the_skyline_is(bright: Frame, by_source: dict[str, Located]) -> None:
+    """The heights of the sectors scatter as their pixels' noise lets them, and are right on average."""
+    sky, fit = by_source["sky"].sky_light, by_source["sky"].skyline_fit
+    assert sky is not None and fit is not None
+    true = CRATER.horizon_rad(bright.truth.position_enu_m[None, :2], MIDDLES_RAD)
+    off = sky.shift_px - fit.raised_px(of_terrain=False) - (true - sky.elevation_rad) * sky.px_per_rad
+    assert 0.7 < np.mean(np.square(off / sky.shift_sigma_px)[fit.used]) < 1.8
+    assert abs(np.mean(off[fit.used])) < 0.03
+
+
+def test_a_black_sky_leaves_the_stars(catalog: StarCatalog) -> None:
+    frame = expose(catalog, PLACES_M["near the middle"], None)
+    found = locate(frame, catalog)
+    assert found.status == "ok" and found.evidence_source == "stars"
+    stars = locate(frame, catalog, evidence_sources="stars")
+    assert np.array_equal(found.fix.position_enu_m, stars.fix.position_enu_m)
+    assert np.array_equal(found.fix.covariance_m2, stars.fix.covariance_m2)
+    alone = locate(frame, catalog, evidence_sources="sky")
+    assert isinstance(alone, Refused)
+    assert alone.reason == "insufficient_geometry" and "light of the sky" in alone.message
+
+
+def test_a_method_without_a_posterior_does_not_use_the_sky(bright: Frame, catalog: StarCatalog) -> None:
+    found = locate(bright, catalog, localizer=PseudoGradient())
+    assert found.status == "ok" and found.evidence_source == "stars"
+    assert found.fix.search == "approximate"
+
+
+def test_unknown_sources_are_refused() -> None:
+    with pytest.raises(ValueError, match="evidence_sources 'moon': known are both, stars, sky"):
+        Settings(evidence_sources="moon")
+
+
+def test_the_table_of_the_skyline(by_source: dict[str, Located], tmp_path: Path) -> None:
+    found = by_source["both"]
+    path = tmp_path / "frame.fix.json"
+    write_results(found, path, plots=False)
+    assert json.loads(path.read_text(encoding="utf-8"))["position"]["evidence"] == "both"
+    table = QTable.read(tmp_path / "frame.skyline.ecsv", format="ascii.ecsv")
+    skyline = measured_skyline(found)
+    assert table["azimuth_deg"].value == pytest.approx(np.degrees(skyline.azimuth_rad), abs=1e-6)
+    known = skyline.known
+    assert table["elevation_deg"].value[known] == pytest.approx(np.degrees(skyline.elevation_rad)[known], abs=1e-4)
+    assert table["sigma_deg"].value[known] == pytest.approx(np.degrees(skyline.sigma_rad)[known], abs=1e-4)
+    assert np.array_equal(table["source"].filled(""), skyline.source)
+    assert np.array_equal(np.ma.getmaskarray(table["elevation_deg"]), ~known)
+    assert [table[name].unit for name in ("azimuth_deg", "elevation_deg", "sigma_deg")] == ["deg"] * 3
+    shown = Solution(found).skyline
+    assert shown is not None and shown.colnames == table.colnames
+    assert np.array_equal(shown["source"].filled(""), skyline.source)
+
+
+def test_a_refusal_removes_the_table(by_source: dict[str, Located], tmp_path: Path) -> None:
+    path = tmp_path / "frame.fix.json"
+    write_results(by_source["both"], path, plots=False)
+    assert (tmp_path / "frame.skyline.ecsv").exists()
+    prepare_folder(path, by_source["both"].exposure.sha256, overwrite=True, remedy="")
+    refused = Refused(reason=Reason.NO_TIME, message="no time", reached=Inputs(exposure=by_source["both"].exposure))
+    write_results(refused, path, plots=False)
+    assert not (tmp_path / "frame.skyline.ecsv").exists()
+    assert Solution(refused).skyline is None

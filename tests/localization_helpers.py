@@ -15,7 +15,7 @@ def slow_contributions(evidence: Evidence, margin_rad: Array, sigma_rad: Array) 
     soft = sigma_rad > 0
     visible = np.where(soft, ndtr(margin_rad / np.where(soft, sigma_rad, 1.0)), margin_rad > 0)
     llr, extended = evidence.llr, evidence.extended_nats
-    point = np.log(visible * np.exp(llr) + 1.0 - visible)
+    point = np.log(visible * np.exp(np.where(extended > 0, 0.0, llr)) + 1.0 - visible)
     return np.where(extended > 0, llr * visible + extended * visible * (1.0 - visible) / 2, point)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from startrack.camera import Camera, Pinhole, load_camera
 from startrack.evidence import height_above_px, measure_sky_step, reliable_azimuths, subtract_sky_step
-from startrack.evidence.sky_step import _azimuth_and_height
+from startrack.frames import azel_from_rays
 from startrack.terrain import load_terrain
 from startrack.types import Detections
 
@@ -38,7 +38,8 @@ def frame():
     """A sky of 90 electrons above the wall, blurred by the PSF, as a flat background model sees it."""
     rows, columns = np.mgrid[0:2048, 0:2048]
     xy = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float)
-    _, above = _azimuth_and_height(xy, CAMERA, R_CAM_ENU, horizon_at(PLACE))
+    azimuth, elevation = azel_from_rays(CAMERA.unproject(xy) @ R_CAM_ENU)
+    above = height_above_px(azimuth, elevation, CAMERA, R_CAM_ENU, horizon_at(PLACE))
     above = above.reshape(2048, 2048)
     rng = np.random.default_rng(5)
     light = STEP_E / (1 + np.exp(np.clip(-above / 0.6, -50, 50)))

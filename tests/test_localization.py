@@ -313,7 +313,10 @@ def test_contributions_are_those_written_out() -> None:
     rng = np.random.default_rng(6)
     e, horizon, sigma = rows(rng, 60), rng.random(60), 0.3 * rng.random(60)
     found = contributions(e.llr, e.extended_nats, e.elevation_rad, horizon, sigma)
-    np.testing.assert_allclose(found, slow_contributions(e, e.elevation_rad - horizon, sigma), atol=1e-11)
+    expected = slow_contributions(e, e.elevation_rad - horizon, sigma)
+    point = e.extended_nats == 0
+    np.testing.assert_allclose(found[point], expected[point], atol=1e-11)
+    np.testing.assert_allclose(found, expected, atol=1e-5)  # V of extended light is from a table, to 5e-7
 
 
 def test_ranges_of_contributions_hold_every_value_between() -> None:
@@ -324,8 +327,8 @@ def test_ranges_of_contributions_hold_every_value_between() -> None:
     value = slow_contributions(e, between, np.ones(200))
     for k in range(200):
         least, most = row_range(e.llr[k], e.extended_nats[k], low[k], high[k])
-        assert least - 1e-6 <= value[:, k].min()
-        assert value[:, k].max() <= most + 1e-6
+        assert least - 1e-6 * (1.0 + e.extended_nats[k]) <= value[:, k].min()
+        assert value[:, k].max() <= most + 1e-6 * (1.0 + e.extended_nats[k])
         assert most - least <= np.ptp(value[:, k]) + 0.05 + 0.02 * e.extended_nats[k]
 
 

@@ -14,6 +14,7 @@ from startrack.types import Array, Bools, Ints
 SECTORS = 240  # of 1.5 degrees, as the localizer's
 LEVEL_SIGMAS = 4.0  # of the edge: from here on a pixel shows the sky or the ground alone
 MIN_SIDE_PIXELS = 30  # of a sector on either side of the skyline
+MIN_KEPT = 0.5  # of them, by the last clipping: else the sector shows something else than those beside it
 LEVEL_SECTORS = 5.0  # standard deviation of the smoothing along the skyline: 7.5 degrees
 SLOPE_SECTORS = (20.0, 7.0)  # of the slopes away from the skyline, and of what these leave
 FIRST_CLIP_SIGMAS, CLIP_SIGMAS = 6.0, 3.5  # of the pixels: faint stars and defects
@@ -29,7 +30,7 @@ GROUND, SKY = range(2)
 class SkyLevels:
     """Light of the ground and the sky beside the skyline, by sector of azimuth; arrays (2, SECTORS) hold both."""
 
-    covered: Bools  # (SECTORS,) with pixels enough on both sides
+    covered: Bools  # (SECTORS,) with pixels enough on both sides that are no outliers
     level_e: Array  # at the skyline itself
     slope_e: Array  # per pixel of height
     own_e: Array  # level of each sector by itself, less `level_e`
@@ -73,6 +74,7 @@ def measure_levels(pixels: SkyPixels, sector: Ints) -> SkyLevels:
         smoothed = _smooth(np.stack([sums[:, 0], own]), LEVEL_SECTORS)
         change = smoothed[1] / np.maximum(smoothed[0], 1e-9)
         level, slope, clip = level + change, slope + more, CLIP_SIGMAS
+    covered &= np.asarray((sums[:, 0] > MIN_KEPT * counts).all(axis=0))
     own_e = own / np.maximum(sums[:, 0], 1.0) - change
     own_sigma, variance, correlation = _level_errors(sums, own_e, noise, kept, covered)
     return SkyLevels(

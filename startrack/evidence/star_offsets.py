@@ -18,7 +18,7 @@ from startrack.types import Array, Bools
 
 NEAR_PX = 60.0  # from the skyline to the stars that are used: five degrees of a 180-degree fisheye
 SAMPLES, STEP_RAD = 360, 1e-3  # around the skyline, and in elevation
-CLIPPED_SIGMAS = 4.0  # of a star's residual: blends
+FIRST_CLIPPED_PX, CLIPPED_SIGMAS, ROUNDS = 1.0, 4.0, 3  # of a star's offset from the terms fitted so far: blends
 SIGNIFICANT_CHI2 = 20.5  # of five terms: one in a thousand; below, the lens is as its file says
 LEAST_SIGMA_PX = 1e-3  # of a term
 MIN_STARS = 10
@@ -64,16 +64,18 @@ def measure_star_offsets(
     up, scale = _up_in_image(camera, R_cam_enu, azimuth, elevation)
     above_px = (elevation - horizon(azimuth)) * scale
     offset = np.einsum("ni,ni->n", residual_px, up)
-    used: Bools = (np.abs(above_px) < NEAR_PX) & (np.abs(offset) < CLIPPED_SIGMAS * np.sqrt(variance_px2))
-    if np.count_nonzero(used) < MIN_STARS:
-        return StarOffsets(np.zeros(5), prior)
-    terms = offset_terms(azimuth[used])
-    normal = (terms / variance_px2[used, None]).T @ terms
-    right = (terms / variance_px2[used, None]).T @ offset[used]
-    alone = np.linalg.pinv(normal, hermitian=True)
-    excess = right @ alone
-    if excess @ np.linalg.pinv(alone + prior, hermitian=True) @ excess > SIGNIFICANT_CHI2:
-        prior = prior + max(float(np.mean(np.square(excess) - np.diag(alone))), 0.0) * np.eye(5)
+    near, terms, sigma = np.abs(above_px) < NEAR_PX, offset_terms(azimuth), np.sqrt(variance_px2)
+    limit, mean = np.maximum(CLIPPED_SIGMAS * sigma, FIRST_CLIPPED_PX), np.zeros(5)
+    for _ in range(ROUNDS):
+        used: Bools = near & (np.abs(offset - terms @ mean) < limit)
+        if np.count_nonzero(used) < MIN_STARS:
+            return StarOffsets(np.zeros(5), prior)
+        weighted = terms[used] / variance_px2[used, None]
+        normal, right = weighted.T @ terms[used], weighted.T @ offset[used]
+        alone = np.linalg.pinv(normal, hermitian=True)
+        limit, mean = CLIPPED_SIGMAS * sigma, alone @ right
+    if mean @ np.linalg.pinv(alone + prior, hermitian=True) @ mean > SIGNIFICANT_CHI2:
+        prior = prior + max(float(np.mean(np.square(mean) - np.diag(alone))), 0.0) * np.eye(5)
     covariance = np.linalg.inv(np.linalg.inv(prior) + normal)
     return StarOffsets(np.asarray(covariance @ right), np.asarray(covariance))
 

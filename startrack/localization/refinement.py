@@ -19,6 +19,7 @@ NODES = 5  # traced horizons along each side of the ellipse's square
 STEP_M = 1.0  # at which the horizon's change with the position is taken
 REACH_SIGMAS = 5.5  # of the expected posterior, to the ends of the ellipse that is scored
 BOX_SIGMAS = 1.0  # side of the boxes, of the shorter axis
+MIN_BOX_SIGMAS = 0.5  # of the posterior, in a box's side: smaller boxes are needed for a narrower one
 MOST_BOXES = 20_000  # of an ellipse; a longer one is scored by the general method
 RIM_SIGMAS, RIM_MASS = 4.5, 1e-4  # more of the probability out there: the expected posterior is too small
 
@@ -39,7 +40,7 @@ def refine_fix(
         fix: by the stars alone, whose search it keeps.
         terrain: with the evidence's enu.
         position_m: (2,) close to the best one.
-        covariance_m2: (2, 2) about that of the posterior.
+        covariance_m2: (2, 2) about that of the posterior by the rows.
         smear_m2: (2, 2) covariance of the position from errors that the rows share.
         horizon_error_rad: by which the rows were put lower, for the common error of the map.
 
@@ -70,10 +71,18 @@ def _explore_near(likelihood: PositionLikelihood, position_m: Array, covariance_
         score = likelihood.near(position_m, float(reach.max()) + 2 * half, across=NODES).scores(centres[allowed])
         weight = np.exp(score - score.max(initial=-np.inf))
         rim = sigmas[sigmas < REACH_SIGMAS][allowed] > RIM_SIGMAS
-        resolved = weight.sum() > 1.0 / BOX_SIGMAS**2
-        if resolved and weight[rim].sum() < RIM_MASS * weight.sum():
+        if _is_resolved(centres[allowed], weight, half) and weight[rim].sum() < RIM_MASS * weight.sum():
             return Explored(centres[allowed], half, score, -np.inf, "beam")
     return local_posterior(likelihood, Guess(position_m[None], np.zeros(1)), -np.inf, float(reach.max()))
+
+
+def _is_resolved(centres_m: Array, weight: Array, half_m: float) -> bool:
+    """Whether the probability spreads over boxes in every direction, by half their side at least."""
+    if not weight.sum() > 0.0:
+        return False
+    off = centres_m - np.average(centres_m, axis=0, weights=weight)
+    spread = (off * weight[:, None]).T @ off / weight.sum()
+    return bool(np.linalg.eigvalsh(spread)[0] > np.square(MIN_BOX_SIGMAS * 2 * half_m))
 
 
 def horizon_slopes(terrain: Terrain, position_m: Array, azimuth_rad: Array) -> Array:

@@ -12,8 +12,9 @@ from startrack.normal_cdf import normal_cdf
 from startrack.types import Array, Evidence, Ints
 
 REACH_SIGMAS = 8.0  # of the edge: from the outer rows to the ends of the splines, beyond which they are constant
-KNOT_SIGMAS = 0.2  # of the edge: distance of the knots; a cubic errs by 1e-4 nats at 1e3 nats per squared sigma
-MAP_SIGMAS = 4.0  # of the map's error: from the middle of the normal distribution to its ends
+KNOT_SIGMAS = 0.2  # of the edge: distance of the knots; a cubic errs by 0.03 nats in a sector of 2e4 nats
+MAP_SIGMAS = 6.0  # of the map's error: from the middle of the normal distribution to its ends
+MAP_STEPS = 3.0  # points of the average in a standard deviation, of the map's error or of the sector's likelihood
 LEAST_PART = 1e-30  # of the best elevation's likelihood: the floor of a sector is far above it
 
 
@@ -58,12 +59,22 @@ class SkyProfiles:
 
 
 def _average_over_map(values: Array, sigma_knots: float) -> Array:
-    """The logarithm of the mean of exp(values) over a normal shift of the horizon by `sigma_knots`."""
-    reach = max(int(np.ceil(MAP_SIGMAS * sigma_knots)), 1)
-    weight = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) / sigma_knots))
-    padded = np.pad(np.exp(values - values.max()), reach, mode="edge")
-    mean = np.convolve(padded, weight / weight.sum(), mode="valid")
-    return np.asarray(values.max() + np.log(np.maximum(mean, LEAST_PART)))
+    """The logarithm of the mean of exp(values) over a normal shift of the horizon by `sigma_knots`.
+
+    A bright sky determines the horizon to a part of a knot: the mean is taken over points between the knots.
+    """
+    from scipy.interpolate import CubicSpline
+
+    sharpest = 1.0 / np.sqrt(max(-float(np.diff(values, 2).min()), 1e-12))
+    fine = max(int(np.ceil(MAP_STEPS / min(sharpest, sigma_knots))), 1)
+    last = len(values) - 1
+    between = CubicSpline(np.arange(len(values)), values)(np.linspace(0, last, last * fine + 1))
+    reach = max(int(np.ceil(MAP_SIGMAS * sigma_knots * fine)), 1)
+    weight = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) / (sigma_knots * fine)))
+    top = between.max()
+    padded = np.pad(np.exp(between - top), reach, mode="edge")
+    mean = np.convolve(padded, weight / weight.sum(), mode="valid")[::fine]
+    return np.asarray(top + np.log(np.maximum(mean, LEAST_PART)))
 
 
 @njit(cache=True, nogil=True)

@@ -43,7 +43,7 @@ class SkylineFit:
     chi2: float  # of a used sector, mean
 
     def raised_px(self, of_terrain: bool) -> Array:
-        """(sectors,) how much the shared errors of the terrain, or else those of the image, raise the skyline."""
+        """(sectors,) how much the shared errors raise the skyline: those `of_terrain`, or else those of the image."""
         which = self.errors.of_terrain == of_terrain
         return np.asarray(self.errors.raised_px[:, which] @ self.shared[which])
 
@@ -51,6 +51,11 @@ class SkylineFit:
     def shared_covariance(self) -> Array:
         """(k, k)."""
         return self.covariance[2:, 2:]
+
+    @property
+    def step_covariance(self) -> Array:
+        """(2, 2) of the step where the shared errors are known."""
+        return np.asarray(np.linalg.inv(np.linalg.inv(self.covariance)[:2, :2]))
 
     @property
     def step_by_shared(self) -> Array:

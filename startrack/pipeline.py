@@ -70,7 +70,7 @@ def locate(
         if fix.search != "approximate":
             run.time_stage("locate", check_consistency, measured.evidence(), fix, terrain)
         located = extend(measured, Located, fix=fix)
-        if step is not None and settings.evidence_sources != "stars":
+        if settings.evidence_sources != "stars":
             located = run.time_stage("locate", refine_by_sky_light, located, settings.evidence_sources == "both")
         sky_mag = None if step is None else step.brightness_mag_arcsec2(camera, exposure.exposure_s)
         return run.finish(replace(located, sky_brightness_mag_arcsec2=sky_mag))

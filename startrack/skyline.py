@@ -14,6 +14,8 @@ from startrack.types import Array, Evidence, MeasuredSkyline
 REACH_RAD, STEP_RAD = np.radians(3.0), np.radians(0.01)  # of the skyline about the terrain's, which gives its shape
 SHIFTS_RAD = np.arange(-REACH_RAD, REACH_RAD + STEP_RAD, STEP_RAD)
 MOST_SIGMA_RAD = np.radians(1.0)  # a skyline that is known no better counts as unknown
+MOST_NATS = 3.0  # of one star: a wrong one must not place the skyline alone
+END_DENSITY = 0.05  # at either end of the window, beside the mean density
 SIMILAR = 3.0  # sigma by the stars, in that by the sky's light, up to which both count as sources
 
 
@@ -47,13 +49,15 @@ def _by_stars(rows: Evidence, horizon: Skyline) -> tuple[Array, Array]:
     above = rows.elevation_rad - horizon(rows.azimuth_rad)
     column = np.searchsorted(SHIFTS_RAD, above)  # the star is visible at the shifts below its height
     sums = np.zeros((SECTORS, len(SHIFTS_RAD) + 1))
-    np.add.at(sums, (sector_of(rows.azimuth_rad), column), rows.llr)
+    np.add.at(sums, (sector_of(rows.azimuth_rad), column), np.clip(rows.llr, -MOST_NATS, MOST_NATS))
     log = sums.sum(axis=1, keepdims=True) - np.cumsum(sums, axis=1)[:, :-1]
     weight = np.exp(log - log.max(axis=1, keepdims=True))
     weight /= weight.sum(axis=1, keepdims=True)
     mean = weight @ SHIFTS_RAD
     variance = weight @ np.square(SHIFTS_RAD) - np.square(mean)
-    return horizon(MIDDLES_RAD) + mean, np.sqrt(np.maximum(variance, STEP_RAD**2 / 12))
+    sigma = np.sqrt(np.maximum(variance, STEP_RAD**2 / 12))
+    bounded = weight[:, [0, -1]].max(axis=1) * len(SHIFTS_RAD) < END_DENSITY  # stars on both sides of the skyline
+    return horizon(MIDDLES_RAD) + mean, np.where(bounded, sigma, np.inf)
 
 
 def _by_sky_light(sky: SkyLight, fit: SkylineFit) -> tuple[Array, Array]:

@@ -21,6 +21,7 @@ MANIFEST = "manifest.json"
 LOCK = ".startrack-batch.lock"
 RESULT = "result"  # in the manifest: path of NAME.fix.json within the folder; null where that is an earlier solution
 SOLVED = ("ok", "ambiguous")
+SKYLINE = ".skyline.ecsv"
 PICTURE = ".annotated.png"
 NEEDED = {  # by the tables, of a record that is ok
     "position": ("east_m", "north_m", "up_m", "covariance_m2"),
@@ -60,9 +61,13 @@ def is_solved(record: dict[str, Any] | None) -> bool:
 
 
 def has_companions(record: dict[str, Any], result: Path, *, plots: bool) -> bool:
-    """Whether star table, WCS and picture are beside a solved record; other records need none."""
+    """Whether star table, skyline, WCS and picture are beside a solved record; other records need none."""
     stem = result.name.removesuffix(".fix.json")
-    needed = [suffix for suffix in COMPANIONS if plots or suffix != PICTURE] if is_solved(record) else []
+    needed = {*COMPANIONS} if is_solved(record) else set()
+    if not plots:
+        needed -= {PICTURE}
+    if record["status"] != "ok" or record["position"].get("search") == "approximate":
+        needed -= {SKYLINE}
     return all(result.with_name(f"{stem}{suffix}").is_file() for suffix in needed)
 
 

@@ -24,6 +24,8 @@ from startrack.types import Array, Bools, Evidence
 
 HEIGHT_PX = 0.75  # of a cell
 LEVELS = 13  # cells of a sector: up to 4.9 px above and below the predicted skyline
+CLIP_SHIFT_PX = 1.0  # a pixel is an outlier only if no skyline within this distance explains it
+INFORMED_NATS = 3.0  # by which the best shift must exceed the outermost ones
 SHIFTS_PX = np.linspace(-4.0, 4.0, 161)  # of the skyline in one sector, above the predicted one
 MIDDLES_RAD = (2 * np.arange(SECTORS) + 1) * np.pi / SECTORS
 
@@ -32,7 +34,6 @@ MIDDLES_RAD = (2 * np.arange(SECTORS) + 1) * np.pi / SECTORS
 class SkyLight:
     """The light of the sky near a predicted skyline: sums in cells of every sector of azimuth, lowest cells first."""
 
-    pixels: SkyPixels
     levels: SkyLevels
     horizon: Horizon  # the predicted one
     elevation_rad: Array  # (SECTORS,) of the predicted skyline at MIDDLES_RAD
@@ -44,10 +45,6 @@ class SkyLight:
     shift_px: Array  # (SECTORS,) how much higher than predicted the skyline stands
     shift_sigma_px: Array  # (SECTORS,) infinite where the sector is not covered
     misfit_nats: Array  # (SECTORS,) by which the best cells exceed the best skyline
-
-    def above(self, horizon: Horizon) -> SkyLight:
-        """The same pixels above another predicted `horizon`, at most a few pixels away."""
-        return sum_cells(self.pixels.above(horizon), self.levels, horizon)
 
     @cached_property
     def variance_px2(self) -> Array:
@@ -110,7 +107,6 @@ def sum_cells(pixels: SkyPixels, levels: SkyLevels, horizon: Horizon) -> SkyLigh
     shift, sigma, misfit = _shifts(height_px, llr, extended, edge_px)
     seen = scale[:, 0] > 0
     return SkyLight(
-        pixels=pixels,
         levels=levels,
         horizon=horizon,
         elevation_rad=horizon(MIDDLES_RAD),
@@ -130,6 +126,7 @@ def _shifts(height_px: Array, llr: Array, extended: Array, edge_px: float) -> tu
     log = np.empty((SECTORS, len(SHIFTS_PX)))
     _score_shifts(height_px, llr, extended, edge_px, log)
     best = log.max(axis=1)
+    informed = best - np.maximum(log[:, 0], log[:, -1]) > INFORMED_NATS
     weight = np.exp(log - best[:, None])
     weight /= weight.sum(axis=1, keepdims=True)
     mean = weight @ SHIFTS_PX
@@ -138,7 +135,8 @@ def _shifts(height_px: Array, llr: Array, extended: Array, edge_px: float) -> tu
     # Each cell's own best fraction of sky, free of any skyline.
     free = np.clip(llr / np.where(extended > 0, extended, 1.0) + 0.5, 0.0, 1.0)
     misfit = (llr * free + 0.5 * extended * free * (1.0 - free)).sum(axis=1) - best
-    return mean, np.sqrt(np.maximum(variance, step**2 / 12)), misfit
+    sigma = np.sqrt(np.maximum(variance, step**2 / 12))
+    return np.where(informed, mean, 0.0), np.where(informed, sigma, np.inf), misfit
 
 
 @njit(cache=True, nogil=True)
@@ -163,10 +161,11 @@ def _sum_cells(sector, height, light, scale, covered, level, slope, variance, co
             ground = level[GROUND, i] + slope[GROUND, i] * h
             step = level[SKY, i] + slope[SKY, i] * h - ground
             visible = normal_cdf(h / edge)
+            least, most = normal_cdf((h - CLIP_SHIFT_PX) / edge), normal_cdf((h + CLIP_SHIFT_PX) / edge)
             s2 = variance[GROUND, i] + max(variance[SKY, i] - variance[GROUND, i], 0.0) * visible
             q = light[k] - ground
-            rest = q - step * visible
-            if step > 0.0 and rest * rest * correlation <= clip * clip * s2:
+            beyond = max(step * least - q, q - step * most, 0.0)
+            if step > 0.0 and beyond * beyond * correlation <= clip * clip * s2:
                 j = min(int((h + half) / HEIGHT_PX), sums.shape[1] - 1)
                 sums[i, j, 0] += (q * step - 0.5 * step * step) / s2
                 sums[i, j, 1] += step * step / s2

@@ -11,7 +11,7 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.evidence.sky_step import Horizon, Skyline, skyline_band
 from startrack.evidence.star_evidence import StarPhotometry, filtered_noise_e
-from startrack.frames import azel_from_rays, rays_from_azel
+from startrack.frames import azel_from_rays, off_axis_rad, rays_from_azel
 from startrack.psf import noise_area_px
 from startrack.types import Array, Bools, Detections
 
@@ -75,14 +75,19 @@ def scale_across(camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Skyline:
     azimuth = np.linspace(0.0, 2 * np.pi, SCALE_SAMPLES, endpoint=False)
     elevation = horizon(azimuth)
 
-    def pixels(raised_rad: float) -> Array:
-        return camera.project_unlimited(rays_from_azel(azimuth, elevation + raised_rad) @ R_cam_enu.T)
+    rays_cam = rays_from_azel(azimuth, elevation) @ R_cam_enu.T
+    seen = off_axis_rad(rays_cam) < min(camera.max_angle_rad, camera.lens.max_invertible_rad)
 
-    up = (pixels(SCALE_STEP_RAD) - pixels(-SCALE_STEP_RAD)) / (2 * SCALE_STEP_RAD)
-    here = pixels(0.0)
-    along = np.roll(here, -1, axis=0) - np.roll(here, 1, axis=0)
+    def pixels(turned: int, raised_rad: float) -> Array:
+        rays_enu = rays_from_azel(np.roll(azimuth, turned), np.roll(elevation, turned) + raised_rad)
+        return camera.project_unlimited((rays_enu @ R_cam_enu.T)[seen])
+
+    up = (pixels(0, SCALE_STEP_RAD) - pixels(0, -SCALE_STEP_RAD)) / (2 * SCALE_STEP_RAD)
+    along = pixels(-1, 0.0) - pixels(1, 0.0)
     across = np.abs(up[:, 0] * along[:, 1] - up[:, 1] * along[:, 0])
-    return Skyline(across / np.maximum(np.hypot(*along.T), 1e-9))
+    scale = np.ones(SCALE_SAMPLES)
+    scale[seen] = across / np.maximum(np.hypot(*along.T), 1e-9)
+    return Skyline(scale)
 
 
 def _leave_out_stars(band: Bools, detections: Detections, stars: StarPhotometry) -> None:

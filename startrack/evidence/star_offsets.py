@@ -13,7 +13,7 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.camera.uncertainty import compensating_rotation, lens_jacobian
 from startrack.evidence.sky_step import Horizon
-from startrack.frames import azel_from_rays, rays_from_azel
+from startrack.frames import azel_from_rays, off_axis_rad, rays_from_azel
 from startrack.types import Array, Bools
 
 NEAR_PX = 60.0  # from the skyline to the stars that are used: five degrees of a 180-degree fisheye
@@ -22,6 +22,7 @@ FIRST_CLIPPED_PX, CLIPPED_SIGMAS, ROUNDS = 1.0, 4.0, 3  # of a star's offset fro
 SIGNIFICANT_CHI2 = 20.5  # of five terms: one in a thousand; below, the lens is as its file says
 LEAST_SIGMA_PX = 1e-3  # of a term
 MIN_STARS = 10
+OFFSET_TERMS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +83,9 @@ def measure_star_offsets(
 def _prior_px2(camera: Camera, R_cam_enu: Array, attitude_covariance_rad2: Array, horizon: Horizon) -> Array:
     """Covariance (5, 5) of the terms by attitude and lens together."""
     azimuth = np.linspace(0.0, 2 * np.pi, SAMPLES, endpoint=False)
-    elevation = horizon(azimuth)
-    rays_cam = rays_from_azel(azimuth, elevation) @ R_cam_enu.T
+    rays_cam = rays_from_azel(azimuth, horizon(azimuth)) @ R_cam_enu.T
+    seen = off_axis_rad(rays_cam) < min(camera.calibrated_angle_rad, camera.lens.max_invertible_rad)
+    azimuth, elevation, rays_cam = azimuth[seen], horizon(azimuth[seen]), rays_cam[seen]
     up, _ = _up_in_image(camera, R_cam_enu, azimuth, elevation)
     to_terms = np.linalg.pinv(offset_terms(azimuth))
     rotation = camera.jacobian_px_per_rad(rays_cam)

@@ -82,7 +82,7 @@ def write_results(outcome: Outcome, path: Path, *, plots: bool = True, write_rec
     if isinstance(value, Measured) or (isinstance(value, Oriented) and value.terrain is None):
         write_star_table(companion(path, ".stars.ecsv"), value)
         write_wcs(companion(path, ".wcs"), companion(path, ".corr"), value)
-    if isinstance(value, Located):
+    if isinstance(value, Located) and value.has_skyline:
         write_skyline(companion(path, ".skyline.ecsv"), value)
     if plots:
         write_annotated(companion(path, ".annotated.png"), outcome)

@@ -133,7 +133,7 @@ class Solution:
     @cached_property
     def skyline(self) -> QTable | None:
         """The skyline that the image shows: azimuth, elevation, sigma [deg] and source; None unless located."""
-        if self._fix is None or not isinstance(self.result, Located):
+        if not isinstance(self.result, Located) or not self.result.has_skyline:
             return None
         from astropy.table import QTable
 

@@ -14,7 +14,7 @@ from sky_helpers import EDGE_PX, ELEVATION_RAD, GROUND_E, NOISE_E, PX_PER_RAD, l
 from startrack.evidence import Skyline
 from startrack.evidence.sky_checks import sectors_with_step
 from startrack.evidence.sky_levels import GROUND, LEVEL_SECTORS, SECTORS, SKY, SkyLevels, measure_levels, sector_of
-from startrack.evidence.sky_light import HEIGHT_PX, LEVELS, MIDDLES_RAD, SkyLight, measure_sky_light
+from startrack.evidence.sky_light import HEIGHT_PX, LEVELS, MIDDLES_RAD, SkyLight, measure_sky_light, sum_cells
 from startrack.evidence.sky_pixels import BAND_PX, SkyPixels, pixels_near_skyline, scale_across
 from startrack.frames import rays_from_azel
 from startrack.normal_cdf import normal_cdf
@@ -106,8 +106,11 @@ def test_correlated_noise_widens_the_sigmas() -> None:
     assert np.median(grouped.shift_sigma_px / plain.shift_sigma_px) == pytest.approx(2.0, rel=0.15)
 
 
-@pytest.mark.parametrize("group", [1, 4], ids=["independent noise", "correlated noise"])
-@pytest.mark.parametrize("step_e", STEPS_E)
+@pytest.mark.parametrize(
+    ("step_e", "group"),
+    [(7.0, 1), (90.0, 1), (14.0, 4), (90.0, 4)],
+    ids=["faint", "bright", "faint, correlated noise", "bright, correlated noise"],
+)
 def test_shifts_of_the_skyline_are_found_within_their_sigmas(step_e: float, group: int) -> None:
     rng, off, sigma, sigma_with_levels = np.random.default_rng([7, group]), [], [], []
     for _ in range(4):
@@ -115,11 +118,13 @@ def test_shifts_of_the_skyline_are_found_within_their_sigmas(step_e: float, grou
         off.append(sky.shift_px - wave_px(MIDDLES_RAD))
         sigma.append(sky.shift_sigma_px)
         sigma_with_levels.append(np.sqrt(sky.variance_px2))
-    z = np.array(off) / sigma
+    known = np.isfinite(sigma)
+    assert known.mean() > 0.95  # where the noise excludes hardly any height, none is stated
+    z = (np.array(off) / sigma)[known]
     assert np.mean(np.square(z)) == pytest.approx(1.0, abs=0.25)
     assert abs(z.mean()) < 0.2
     # The variance counts the levels' errors as those of each sector by itself, though these are smoothed.
-    assert 0.3 < np.mean(np.square(np.array(off) / sigma_with_levels)) < 1.1
+    assert 0.3 < np.mean(np.square(np.array(off) / sigma_with_levels)[known]) < 1.1
 
 
 def test_a_skyline_far_from_the_predicted_one_is_found_roughly() -> None:
@@ -141,9 +146,9 @@ def test_the_variance_contains_the_errors_of_the_levels(step_e: float, slope: fl
     for k in range(draws):
         sky = sky_of(paint_pixels(rng, step_e, slopes_e=(0.0, slope * step_e)))
         for j, parts in enumerate((1, 4, 8)):
-            mean = sky.shift_px.reshape(parts, -1).mean(axis=1)
-            variance = sky.variance_px2.reshape(parts, -1).sum(axis=1) / (SECTORS // parts) ** 2
-            chi2[k, j] = np.mean(np.square(mean) / variance)
+            weight = 1.0 / sky.variance_px2.reshape(parts, -1)
+            mean = (weight * sky.shift_px.reshape(parts, -1)).sum(axis=1) / weight.sum(axis=1)
+            chi2[k, j] = np.mean(np.square(mean) * weight.sum(axis=1))
     assert chi2[:, 0].mean() == pytest.approx(1.0, abs=0.6)  # 40 draws: 2.7 standard deviations
     assert 0.55 < chi2[:, 1:].mean() < 1.35
 
@@ -187,12 +192,13 @@ def test_rows_of_evidence() -> None:
 
 
 def test_another_predicted_skyline_moves_the_shifts() -> None:
-    sky = sky_of(paint_pixels(np.random.default_rng(11), 90.0, shift_px=wave_px))
+    pixels = paint_pixels(np.random.default_rng(11), 90.0, shift_px=wave_px)
+    sky = sky_of(pixels)
 
     def raised(azimuth_rad: Array) -> Array:
         return level_horizon(azimuth_rad) + wave_px(azimuth_rad) / PX_PER_RAD
 
-    above = sky.above(raised)
+    above = sum_cells(pixels.above(raised), sky.levels, raised)
     sigma = np.sqrt(np.median(sky.variance_px2))
     assert np.abs(above.shift_px - (sky.shift_px - wave_px(MIDDLES_RAD))).max() < 1.5 * sigma
     assert np.abs(above.shift_px).mean() < sigma < 0.4 * np.abs(sky.shift_px).mean()

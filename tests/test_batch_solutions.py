@@ -104,7 +104,7 @@ def test_a_refusal_for_lack_of_stars_replaces_a_solution(folder):
     assert [name for name in files(folder) if name.endswith(("ecsv", "wcs", "corr"))] == []
 
 
-@pytest.mark.parametrize("companion", ["00.stars.ecsv", "00.annotated.png", "00.wcs", "00.corr"])
+@pytest.mark.parametrize("companion", ["00.stars.ecsv", "00.skyline.ecsv", "00.annotated.png", "00.wcs", "00.corr"])
 def test_a_solution_without_one_of_its_files_is_incomplete(folder, companion):
     from startrack.batch.store import has_companions
 

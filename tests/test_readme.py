@@ -64,7 +64,9 @@ def test_the_locate_command_prints_what_the_page_shows(clone, capsys):
     printed = capsys.readouterr().out.strip()
     shown = blocks(README, "text")[0].strip()
     same_result(printed, shown)
-    files = [f"near-wall{end}" for end in (".annotated.png", ".corr", ".fix.json", ".stars.ecsv", ".wcs")]
+    files = [
+        f"near-wall{end}" for end in (".annotated.png", ".corr", ".fix.json", ".skyline.ecsv", ".stars.ecsv", ".wcs")
+    ]
     assert sorted(path.name for path in (clone / "startrack-out").iterdir()) == files
 
 
@@ -177,11 +179,11 @@ def test_every_key_that_is_written_is_explained(clone, capsys, command):
     record = json.loads(capsys.readouterr().out)
     assert [key for key in leaf_keys(record) if f"`{key}`" not in FORMATS] == []
     assert f"`{record['format']}`" in FORMATS
-    tables = list((clone / "startrack-out").glob("*.stars.ecsv"))
+    tables = list((clone / "startrack-out").glob("*.ecsv"))
+    assert len(tables) == {"locate": 2, "identify": 1, "detect": 0}[name]
     for table in tables:
         columns = Table.read(table, format="ascii.ecsv").colnames
         assert [column for column in columns if f"`{column}`" not in FORMATS] == []
-    assert bool(tables) == (name != "detect")
 
 
 def test_reasons_and_their_exit_codes_are_those_of_the_code():

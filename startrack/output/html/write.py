@@ -32,7 +32,7 @@ SCRIPTS = ("basics.js", "view.js", "input.js", "sky.js", "map.js", "errors.js", 
 DEFAULT_IMAGES = 30
 FEW = 4  # images whose details may be large
 LARGE, SMALL = (1400, 4000, 1441), (1000, 1500, 721)  # px of the picture, stars, azimuths of the horizon
-FILES = (".annotated.png", ".stars.ecsv", ".wcs", ".corr")
+FILES = (".annotated.png", ".stars.ecsv", ".skyline.ecsv", ".wcs", ".corr")
 
 
 def write_page(

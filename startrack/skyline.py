@@ -31,8 +31,9 @@ def measured_skyline(located: Located) -> MeasuredSkyline:
         used = located.skyline_fit.used
         by_sky, sky_sigma = _by_sky_light(located.sky_light, located.skyline_fit)
         both = used & (sigma < SIMILAR * sky_sigma)
-        share = np.where(both, 1.0 / (1.0 + np.square(sigma / sky_sigma)), 0.0)
-        elevation = np.where(used, by_sky + share * (elevation - by_sky), elevation)
+        share = np.zeros(SECTORS)
+        share[both] = 1.0 / (1.0 + np.square(sigma[both] / sky_sigma[both]))
+        elevation[used] = (by_sky + share * (elevation - by_sky))[used]
         sigma[used] = (sky_sigma * np.sqrt(1.0 - share))[used]
         source = np.where(both, "both", np.where(used, "sky light", source))
     known = source != ""

@@ -28,7 +28,7 @@ BEYOND_CIRCLE_RAD = np.radians(4.5)  # the edge of the image circle is stated to
 WIDTHS = ((1, 0.6), (7, 0.3), (21, 0.2))  # columns averaged, and weight: they share their pixels with their neighbours
 UNKNOWN_SIGMA_RAD = np.radians(2.0)  # a wider posterior is no measurement
 PLACE_SIGMA_RAD = np.radians(0.04)  # a quarter of a usual pixel: the edge's place depends on how the ground is lit
-VARIATION_ERROR = 0.3  # of the mean, per variation: a wall in the bin whose azimuth is known to 0.15 degrees
+WALL_RAD = np.radians(1.0)  # variation from which one elevation does not describe a bin
 WEATHER_1 = 0.1  # of the refraction: what the weather changes
 NEAR_LIGHT_RAD = np.radians(0.3)  # a step this near to the skyline is evidence for it
 GAP_CONTRAST, GAP_SIGNIFICANCE = 0.25, 5.0  # of brighter light below the skyline
@@ -118,7 +118,7 @@ def _skyline(
     by_stars, by_light = _has_star(stars, azimuth, elevation), _has_step(steps, marginals.mean_rad)
     known = (scatter + variation + shared < UNKNOWN_SIGMA_RAD**2) & (by_stars | by_light)
     known = _beside_known_bins(known)
-    variance = scatter / COLUMNS_PER_BIN + VARIATION_ERROR**2 * variation + shared
+    variance = scatter / COLUMNS_PER_BIN + np.square(variation) / (variation + WALL_RAD**2) + shared
     source = np.select([by_stars & by_light, by_light, by_stars], ["both", "sky light", "stars"], "")
     return MeasuredSkyline(
         azimuth_rad=azimuth,

@@ -57,10 +57,13 @@ def _refine(located: Located, stars: bool) -> Located:
     if not np.isfinite(fix.covariance_m2).all() or np.linalg.eigvalsh(fix.covariance_m2)[0] <= 0.0:
         raise NoSkyLight("the fix by the stars states no error")
     position, sky, fit = _settle(located, fix)
+    excess = fit.excess
     if not stars:  # the errors that all rows share, without the stars' position
-        fit = _fit_step(located, sky, position, replace(fix, covariance_m2=WIDE**2 * fix.covariance_m2))
+        fix = replace(fix, covariance_m2=WIDE**2 * fix.covariance_m2)
+    if excess > 1.0 or not stars:
+        fit = _fit_step(located, sky, position, fix, excess)
     by_terrain = fit.raised_px(of_terrain=True)
-    rows = sky.evidence(fit.used, by_terrain + fit.raised_px(of_terrain=False), max(fit.chi2, 1.0))
+    rows = sky.evidence(fit.used, by_terrain + fit.raised_px(of_terrain=False), excess)
     if stars:
         near = _stars_near(located, Skyline.trace(position, terrain), sky, by_terrain / sky.px_per_rad)
         rows = Evidence.concatenate(near, rows)
@@ -68,8 +71,8 @@ def _refine(located: Located, stars: bool) -> Located:
     smear = by_shared @ fit.shared_covariance @ by_shared.T
     error_rad = float(fit.shared[OFFSET_TERMS]) if terrain.common_sigma_rad > 0.0 else 0.0
     refined = refine_fix(rows, fix, terrain, position, fit.step_covariance, smear, error_rad)
-    moved = refined.position_enu_m[:2] - fix.position_enu_m[:2]
-    if moved @ np.linalg.solve(fix.covariance_m2 + refined.covariance_m2, moved) > MOST_STARS_CHI2:
+    moved = refined.position_enu_m[:2] - located.fix.position_enu_m[:2]
+    if moved @ np.linalg.solve(located.fix.covariance_m2 + refined.covariance_m2, moved) > MOST_STARS_CHI2:
         raise NoSkyLight("the stars contradict it")
     if not stars:
         refined = replace(refined, search="beam", dropped_probability=1.0)
@@ -104,14 +107,16 @@ def _settle(located: Located, fix: Fix) -> tuple[Array, SkyLight, SkylineFit]:
     return position, sky, fit
 
 
-def _fit_step(located: Located, sky: SkyLight, position_m: Array, fix: Fix) -> SkylineFit:
+def _fit_step(
+    located: Located, sky: SkyLight, position_m: Array, fix: Fix, variance_factor: float = 1.0
+) -> SkylineFit:  # fmt: skip
     """The step from a position (2,) that explains the skyline which the sky shows there. Raises NoSkyLight."""
     terrain = located.terrain
     used = sectors_with_step(sky) & terrain.is_informative(MIDDLES_RAD, sky.elevation_rad)
     if not used.any():
         raise NoSkyLight("no step of light is in enough directions at the skyline")
     map_sigma_px = terrain.horizon_sigma_rad(position_m[None], MIDDLES_RAD) * sky.px_per_rad
-    variance = np.where(used, sky.variance_px2 + np.square(map_sigma_px), np.inf)
+    variance = np.where(used, variance_factor * sky.variance_px2 + np.square(map_sigma_px), np.inf)
     slopes = horizon_slopes(terrain, position_m, MIDDLES_RAD) * sky.px_per_rad[:, None]
     shared = _shared_errors(located, sky, position_m, fix)
     expected_m = fix.position_enu_m[:2] - position_m

@@ -33,7 +33,7 @@ def measured_skyline(located: Located) -> MeasuredSkyline:
         both = used & (sigma < SIMILAR * sky_sigma)
         share = np.zeros(SECTORS)
         share[both] = 1.0 / (1.0 + np.square(sigma[both] / sky_sigma[both]))
-        elevation = np.where(used, by_sky + share * (elevation - by_sky), elevation)
+        elevation[used] = (by_sky + share * (elevation - by_sky))[used]
         sigma[used] = (sky_sigma * np.sqrt(1.0 - share))[used]
         source = np.where(both, "both", np.where(used, "sky light", source))
     known = source != ""

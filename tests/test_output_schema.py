@@ -11,6 +11,7 @@ import pytest
 from jsonschema import Draft202012Validator, ValidationError
 
 from startrack.camera.io import camera_to_dict
+from startrack.cli.main import main
 from startrack.exposure import write_sidecar
 from startrack.files import data_dir
 from startrack.output import detection_dict, identification_dict, refused_dict, result_dict
@@ -113,6 +114,11 @@ def test_written_cameras_sidecars_and_truths_fit(located, tmp_path):
     fits_schema("sidecar", json.loads(sidecar.read_text(encoding="utf-8")))
     pose, _ = write_truth(tmp_path / "a.png", located.truth, {"seed": 7}, to_v_mag=5.0)
     fits_schema("truth", json.loads(pose.read_text(encoding="utf-8")))
+
+
+def test_the_record_of_a_refused_horizon_fits(tmp_path, capsys):
+    assert main(["horizon", str(tmp_path / "none.png"), "-o", str(tmp_path / "a.csv"), "--json"]) == 4
+    fits_schema("horizon", json.loads(capsys.readouterr().out))
 
 
 @pytest.mark.parametrize(

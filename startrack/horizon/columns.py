@@ -18,7 +18,7 @@ TOP_RAD = np.radians(67.0)  # of the columns
 SAMPLES_PER_PX = 3
 FINEST_PX_RAD = np.radians(0.06)  # pixels of narrow fields are taken as larger ones
 SIDE_SAMPLES = 3  # across a column
-FILL_COLUMNS = 21  # around a star
+FILL_COLUMNS, FILL_SHARE = 21, 0.1  # around a star, and how many of them without a star are enough
 LARGE_AREA_PX, GLARE_PX = 500, 40  # of the Moon and what surrounds it
 SATURATED_PX = 5  # around saturated pixels nothing is measured
 HOT_SIGMAS = 6.0  # above the median of the neighbours: stars and hot pixels
@@ -92,21 +92,21 @@ def remove_points(image_e: NDArray[np.float32], noise_e: NDArray[np.float32]) ->
     return np.where(np.abs(image_e - smooth) > HOT_SIGMAS * noise_e, smooth, image_e).astype(np.float32)
 
 
-def average_columns(columns: Columns, width: int) -> Columns:
-    """Running means over an odd number of columns, at least half of which must be in view."""
+def average_columns(columns: Columns, width: int, least: float = 0.49) -> Columns:
+    """Running means over an odd number of columns, of which at least the share `least` must be in view."""
     from scipy.ndimage import uniform_filter1d
 
     known = np.isfinite(columns.light_e)
     total = uniform_filter1d(np.where(known, columns.light_e, 0.0), width, axis=1, mode="wrap")
     share = uniform_filter1d(known.astype(float), width, axis=1, mode="wrap")
-    light = np.where(share > 0.49, total / np.maximum(share, 1e-9), np.nan)
+    light = np.where(share > least, total / np.maximum(share, 1e-9), np.nan)
     return replace(columns, light_e=light)
 
 
 def _fill_points(columns: Columns, points: Bools) -> Columns:
     """The columns with stars, the samples `points` (k, columns), replaced by the mean of their neighbours."""
     without = replace(columns, light_e=np.where(points, np.nan, columns.light_e))
-    around = average_columns(without, FILL_COLUMNS).light_e
+    around = average_columns(without, FILL_COLUMNS, FILL_SHARE).light_e
     return replace(columns, light_e=np.where(points, around, columns.light_e))
 
 

@@ -17,7 +17,9 @@ EDGE_PARAMETERS = 5  # place, width, two levels, slope
 SHAPE_ERROR = 0.3  # of the difference between the fitted edge and the half level
 BLURRED_PX = 1.5  # error of the place of an edge of the largest width: where ground begins in haze
 MIN_SIGMA_PX, MAX_SIGMA_PX = 0.1, 2.0  # of a place; beyond, it is not measured
-SMOOTH_SAMPLES = 4
+SMOOTH_SAMPLES = 5  # odd: the mean is at its middle
+LEVEL_PX = 2  # of ground that must be in view below an edge,
+EDGE_SIGMAS = 2.0  # which ends so many of its widths below its place
 SKY_LEVEL_PX = 3.0  # above the edge: where the sky's level is taken; below, haze darkens it
 
 
@@ -30,7 +32,7 @@ def measure_edges(columns: Columns, row: Ints, column: Ints, noise: Array) -> tu
     half = round(WINDOW_PX * SAMPLES_PER_PX)
     good = (row >= half) & (row < len(columns.elevation_rad) - half)
     middle = np.where(good, row, half)
-    light = columns.light_e[middle[:, None] + np.arange(-half, half + 1), column[:, None]]
+    light, depth_px = _fill_below(columns.light_e[middle[:, None] + np.arange(-half, half + 1), column[:, None]], half)
     good &= np.isfinite(light).all(axis=1)
     light = np.where(good[:, None], light, 0.0)
     light = light - light.mean(axis=1, keepdims=True)
@@ -44,7 +46,21 @@ def measure_edges(columns: Columns, row: Ints, column: Ints, noise: Array) -> tu
     shape_px = np.hypot(SHAPE_ERROR * np.abs(half_px - mean_px), BLURRED_PX * (width_px / EDGE_SIGMAS_PX[-1]) ** 3)
     sigma_px = np.sqrt(variance_px2 + np.square(shape_px) + MIN_SIGMA_PX**2)
     elevation = columns.elevation_rad[middle] + half_px * columns.px_rad
+    # An edge ends in the ground's level. A ramp that ends at the edge of the view may be the sky's.
+    good &= (depth_px >= WINDOW_PX) | (mean_px - EDGE_SIGMAS * width_px > LEVEL_PX - depth_px)
     return elevation, sigma_px, good & (sigma_px < MAX_SIGMA_PX)
+
+
+def _fill_below(light: Array, half: int) -> tuple[Array, Array]:
+    """Samples (n, 2 half + 1) with their part below the view at the level of the lowest ground in view.
+
+    Also the depth (n,) of the view below the middle [px].
+    """
+    first = np.minimum(np.argmax(np.isfinite(light), axis=1), half)
+    lowest = first[:, None] + np.arange(LEVEL_PX * SAMPLES_PER_PX)
+    level = np.take_along_axis(light, lowest, axis=1).mean(axis=1, keepdims=True)
+    filled = np.where(np.arange(light.shape[1]) < first[:, None], level, light)
+    return filled, (half - first) / SAMPLES_PER_PX
 
 
 def _weigh_edges(light: Array, half: int, noise_e: Array) -> tuple[Array, Ints]:

@@ -27,6 +27,8 @@ from startrack.types import Array, Bools, Exposure, MeasuredSkyline
 BEYOND_CIRCLE_RAD = np.radians(4.5)  # the edge of the image circle is stated to some degrees; light is followed so far
 WIDTHS = ((1, 0.6), (7, 0.3), (21, 0.2))  # columns averaged, and weight: they share their pixels with their neighbours
 UNKNOWN_SIGMA_RAD = np.radians(2.0)  # a wider posterior is no measurement
+PLACE_SIGMA_RAD = np.radians(0.04)  # a quarter of a usual pixel: the edge's place depends on how the ground is lit
+WALL_RAD = np.radians(1.0)  # variation from which one elevation does not describe a bin
 WEATHER_1 = 0.1  # of the refraction: what the weather changes
 NEAR_LIGHT_RAD = np.radians(0.3)  # a step this near to the skyline is evidence for it
 GAP_CONTRAST, GAP_SIGNIFICANCE = 0.25, 5.0  # of brighter light below the skyline
@@ -109,12 +111,14 @@ def _skyline(
     columns = marginals.mean_rad.reshape(BINS, COLUMNS_PER_BIN)
     azimuth = np.radians(np.arange(BINS, dtype=np.float64) * (360.0 / BINS))
     elevation = columns.mean(axis=1)
-    variance = np.mean(np.square(marginals.sigma_rad.reshape(BINS, COLUMNS_PER_BIN)), axis=1)
-    variance += _neighbourhood_variance(marginals.mean_rad)
-    variance += np.square(_common_sigma_rad(frames, azimuth, elevation, site))
-    variance += np.square(_gap_depth(steps, marginals.mean_rad))
+    scatter = np.mean(np.square(marginals.sigma_rad.reshape(BINS, COLUMNS_PER_BIN)), axis=1)
+    variation = _neighbourhood_variance(marginals.mean_rad)
+    shared = np.square(_common_sigma_rad(frames, azimuth, elevation, site)) + PLACE_SIGMA_RAD**2
+    shared += np.square(_gap_depth(steps, marginals.mean_rad))
     by_stars, by_light = _has_star(stars, azimuth, elevation), _has_step(steps, marginals.mean_rad)
-    known = _without_lone_bins((variance < UNKNOWN_SIGMA_RAD**2) & (by_stars | by_light))
+    known = (scatter + variation + shared < UNKNOWN_SIGMA_RAD**2) & (by_stars | by_light)
+    known = _beside_known_bins(known)
+    variance = scatter / COLUMNS_PER_BIN + np.square(variation) / (variation + WALL_RAD**2) + shared
     source = np.select([by_stars & by_light, by_light, by_stars], ["both", "sky light", "stars"], "")
     return MeasuredSkyline(
         azimuth_rad=azimuth,
@@ -124,14 +128,16 @@ def _skyline(
     )
 
 
-def _without_lone_bins(known: Bools) -> Bools:
-    """Only runs of three bins (n,) and more: a shorter one is a halo or a reflection more often than ground."""
-    middle = known & np.roll(known, 1) & np.roll(known, -1)
-    return np.asarray(middle | np.roll(middle, 1) | np.roll(middle, -1))
+def _beside_known_bins(known: Bools) -> Bools:
+    """The known bins (n,) with known neighbours.
+
+    A shorter run is a halo or a reflection more often than ground, and beside an unknown bin the ground often rises.
+    """
+    return np.asarray(known & np.roll(known, 1) & np.roll(known, -1))
 
 
 def _neighbourhood_variance(elevation_rad: Array) -> Array:
-    """Variance (BINS,) of the skyline within one degree to either side: what a direction in the bin may meet."""
+    """Variance (BINS,) of the skyline within one degree to either side."""
     half = COLUMNS_PER_BIN // 2
     around = np.arange(-half, COLUMNS_PER_BIN + half)
     columns = np.arange(BINS)[:, None] * COLUMNS_PER_BIN + around
@@ -188,6 +194,11 @@ def predicted_visible(skyline: MeasuredSkyline, azimuth_rad: Array, elevation_ra
 
     `azimuth_rad` and `elevation_rad` (n,) are apparent directions.
     """
-    nearest = np.rint(np.asarray(azimuth_rad) * (len(skyline) / (2 * np.pi))).astype(np.int64) % len(skyline)
-    height = elevation_rad - skyline.elevation_rad[nearest]
+    n = len(skyline)
+    place = np.asarray(azimuth_rad) * (n / (2 * np.pi))
+    nearest = np.rint(place).astype(np.int64) % n
+    low = np.floor(place).astype(np.int64)
+    share = place - low
+    between = (1 - share) * skyline.elevation_rad[low % n] + share * skyline.elevation_rad[(low + 1) % n]
+    height = elevation_rad - np.where(np.isfinite(between), between, skyline.elevation_rad[nearest])
     return height > 0, np.abs(height) > 2 * skyline.sigma_rad[nearest]

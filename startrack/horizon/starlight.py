@@ -105,7 +105,8 @@ def _glare(frame: SkyFrame, dimming: Dimming, light: StarPhotometry) -> tuple[Ar
     zero_mag = dimming.zero_mag(angle, _airmass(rays @ frame.R_enu_icrs.T))
     flux_e = 10 ** (-0.4 * (np.array([body.v_mag for body in planets]) - zero_mag))
     snr = np.concatenate([light.expected_e, flux_e[seen]]) / noise_e
-    bright = snr > BRIGHT_SIGMAS
+    missing = np.concatenate([light.llr < -SEEN_LLR, np.zeros(int(seen.sum()), dtype=bool)])  # behind the ground
+    bright = (snr > BRIGHT_SIGMAS) & ~missing
     radius_px = GLARE_PX + GLARE_PER_DECADE_PX * np.log10(snr[bright] / BRIGHT_SIGMAS)
     return np.concatenate([light.xy_px, px[seen]])[bright], radius_px
 

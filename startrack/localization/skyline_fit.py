@@ -14,6 +14,7 @@ from startrack.types import Array, Bools, Ints
 
 WINDOWS = (1, 2, 4, 8, 16, 32, 60)  # sectors that are tested together
 OUTLIER_SIGMAS = 4.0  # of the mean residual of a window
+CHANCE_SIGMAS = 4.0  # of the mean square of windows, up to which it is chance
 MARGIN = 1  # sectors left out on either side of a window that contradicts the others
 MAX_DROPPED = 0.4  # of the information
 MIN_SECTORS = 60
@@ -41,6 +42,7 @@ class SkylineFit:
     covariance: Array  # (2 + k, 2 + k) of both
     residual_px: Array  # (sectors,)
     chi2: float  # of a used sector, mean
+    excess: float  # variance of the residuals beside the stated one; 1 unless it is larger beyond chance
 
     def raised_px(self, of_terrain: bool) -> Array:
         """(sectors,) how much the shared errors raise the skyline: those `of_terrain`, or else those of the image."""
@@ -94,17 +96,38 @@ def fit_skyline(
         window = _worst_window(residual, w)
         if window is None:
             chi2 = float(np.sum(w * np.square(residual)) / np.count_nonzero(used))
-            return SkylineFit(used, px_per_m, solution[:2], shared, solution[2:], covariance, residual, chi2)
+            excess = _excess(residual, w)
+            return SkylineFit(used, px_per_m, solution[:2], shared, solution[2:], covariance, residual, chi2, excess)
         used = used.copy()
         used[window] = False
+
+
+def _excess(residual_px: Array, weight: Array) -> float:
+    """Mean squared residual of sectors, and of the means of windows, in units of their variance; at least 1.
+
+    Errors that neighbouring sectors share (a rim that is not level, a wavy lens) hardly show in single sectors, but
+    in windows. What the position absorbs of them is as large as what remains.
+    """
+    n, found = len(weight), 1.0
+    for width in WINDOWS[:-1]:
+        part, information = (_window_sums(a, width) for a in (weight * residual_px, weight))
+        z2 = np.square(part)[information > 0] / information[information > 0]
+        if z2.mean() > 1.0 + CHANCE_SIGMAS * np.sqrt(2.0 * width / n):
+            found = max(found, float(z2.mean()))
+    return found
+
+
+def _window_sums(values: Array, width: int) -> Array:
+    """Sums (n,) of `width` values from each on, around the circle."""
+    sums = np.concatenate([[0.0], np.cumsum(np.concatenate([values, values[:width]]))])
+    return np.asarray(sums[width : width + len(values)] - sums[: len(values)])
 
 
 def _worst_window(residual_px: Array, weight: Array) -> Ints | None:
     """The sectors of the window whose mean residual is farthest from zero, if that is too far."""
     n, worst, found = len(weight), OUTLIER_SIGMAS, None
-    sums = [np.concatenate([[0.0], np.cumsum(np.tile(a, 2))]) for a in (weight * residual_px, weight)]
     for width in WINDOWS:
-        part, information = (a[width : width + n] - a[:n] for a in sums)
+        part, information = (_window_sums(a, width) for a in (weight * residual_px, weight))
         score = np.abs(part) / np.sqrt(np.where(information > 0, information, np.inf))
         top = int(np.argmax(score))
         if score[top] > worst:

@@ -8,6 +8,7 @@ from startrack.exposure.metadata import SIDECAR as SIDECAR_KEYS
 from startrack.output.quantities import BY_PATH
 from startrack.output.record import FORMATS
 from startrack.output.schema_parts import (
+    COUNT,
     NUMBER,
     POSITIVE,
     QUATERNION,
@@ -84,6 +85,27 @@ MATCH = record({
     "y_px": NUMBER,
 })  # fmt: skip
 DETECTION = record({"x_px": NUMBER, "y_px": NUMBER, "flux_e": NUMBER, "snr": NUMBER})
+HORIZON = record(
+    {
+        "format": {"const": "startrack.horizon/1"},
+        "status": {"enum": ["ok", "refused"]},
+        "reason": COMMON["reason"],
+        "message": TEXT,
+    },
+    optional={
+        "output": TEXT,
+        "images": {"type": "array", "items": TEXT},
+        "left_out": {"type": "array", "items": record({"image": TEXT, "reason": {"enum": REFUSALS}, "message": TEXT})},
+        "azimuths": record(dict.fromkeys(("known", "stars", "sky_light", "both"), COUNT)),
+        "median_sigma_deg": or_null(POSITIVE, "of the known azimuths"),
+        "lowest_deg": or_null(NUMBER, "apparent elevation"),
+        "highest_deg": or_null(NUMBER, "apparent elevation"),
+    },
+)
+_HORIZON_RULES = [
+    _if_status("ok", {"properties": {"reason": {"const": None}}, "required": ["output", "images", "azimuths"]}),
+    _if_status("refused", {"properties": {"reason": {"enum": REFUSALS}}}),
+]
 
 SCHEMAS: dict[str, Schema] = {
     "fix": _result(
@@ -104,6 +126,7 @@ SCHEMAS: dict[str, Schema] = {
         {"detections": {"type": "array", "items": DETECTION}},
         [_if_status("ok", {"required": ["detections"]})],
     ),
+    "horizon": schema("Summary of a measured skyline", HORIZON | {"allOf": _HORIZON_RULES}),
     "truth": schema(
         "What is true of a rendered image, for tests and scorers",
         record({"position_enu_m": numbers(3), "quat_xyzw_cam_icrs": QUATERNION}) | {"additionalProperties": True},

@@ -126,6 +126,17 @@ def test_a_skyline_that_fits_is_used_whole() -> None:
     assert np.mean(used) > 0.995
 
 
+def test_errors_that_neighbouring_sectors_share_are_an_excess() -> None:
+    """Ten waves around the circle, as large as the noise of one sector."""
+    rng, errors, variance = np.random.default_rng(15), shared_errors(), np.full(SECTORS, SIGMA_PX**2)
+    excess = [fit(shifts(rng, errors)[0], variance, errors).excess for _ in range(60)]
+    assert np.count_nonzero(np.array(excess) > 1.0) <= 3
+    assert max(excess) < 2.0
+    rough = fit(shifts(rng, errors)[0] + SIGMA_PX * np.cos(10 * MIDDLES_RAD), variance, errors)
+    assert rough.used.all() and rough.chi2 < 1.8
+    assert 2.0 < rough.excess < 8.0  # at most 1 + 8 / 2 in eight sectors, less what varies within them
+
+
 def test_no_fit_where_too_much_contradicts_or_too_little_is_seen() -> None:
     rng, errors = np.random.default_rng(7), shared_errors()
     shift, variance = shifts(rng, errors)[0], np.full(SECTORS, SIGMA_PX**2)

@@ -78,7 +78,9 @@ def test_a_signal_ends_the_batch_after_the_frames_in_progress_and_writes_the_tab
         process.send_signal(wish)
         if to_the_group:
             os.killpg(process.pid, wish)
-    rest, err = process.communicate()
+    with process:
+        assert process.stderr is not None
+        rest, err = process.stdout.read(), process.stderr.read()  # communicate() forgets the lines read ahead
     done = len(rest.splitlines()) + 5
     assert process.returncode == 5
     assert err.count("finishing the images in progress") == 1

@@ -96,7 +96,7 @@ def fit_skyline(
         window = _worst_window(residual, w)
         if window is None:
             chi2 = float(np.sum(w * np.square(residual)) / np.count_nonzero(used))
-            excess = _excess(residual, w)
+            excess = _excess(residual, weight)  # of all: many that contradict make the others doubtful
             return SkylineFit(used, px_per_m, solution[:2], shared, solution[2:], covariance, residual, chi2, excess)
         used = used.copy()
         used[window] = False
@@ -112,6 +112,7 @@ def _excess(residual_px: Array, weight: Array) -> float:
     for width in WINDOWS[:-1]:
         part, information = (_window_sums(a, width) for a in (weight * residual_px, weight))
         z2 = np.square(part)[information > 0] / information[information > 0]
+        z2 = np.minimum(z2, OUTLIER_SIGMAS**2)
         if z2.mean() > 1.0 + CHANCE_SIGMAS * np.sqrt(2.0 * width / n):
             found = max(found, float(z2.mean()))
     return found

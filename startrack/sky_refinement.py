@@ -19,7 +19,7 @@ from startrack.stages import Located, Measured
 from startrack.types import Array, Evidence, Fix, NotLocated
 
 ROUNDS = 8  # of predicted skylines
-SETTLED_PX = 0.1  # a skyline that moves by less need not be predicted anew
+SETTLED_PX = 0.3  # a skyline that moves by less need not be predicted anew
 SAME_PIXELS_PX = 1.5  # after larger steps the pixels are chosen anew: the levels begin 4 px from the skyline
 WIDE = 100.0  # times the stars' error: the sky's light alone
 NEAR_PX = 20.0  # stars farther from the skyline do not depend on the position here

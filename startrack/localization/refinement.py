@@ -21,7 +21,7 @@ REACH_SIGMAS = 5.5  # of the expected posterior, to the ends of the ellipse that
 BOX_SIGMAS = 1.0  # side of the boxes, of the shorter axis
 MIN_BOX_SIGMAS = 0.5  # of the posterior, in a box's side: smaller boxes are needed for a narrower one
 MOST_BOXES = 20_000  # of an ellipse; a longer one is scored by the general method
-RIM_SIGMAS, RIM_MASS = 4.5, 1e-4  # more of the probability out there: the expected posterior is too small
+RIM_SIGMAS, RIM_MASS = 4.5, 1e-3  # more of the probability out there: the expected posterior is too small
 
 
 def refine_fix(

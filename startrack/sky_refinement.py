@@ -135,11 +135,13 @@ def _shared_errors(measured: Measured, sky: SkyLight, position_m: Array, fix: Fi
         columns.append(sky.px_per_rad[:, None])
         means.append(fix.horizon_error_rad)
         variances.append(terrain.common_sigma_rad**2)
-    here = terrain.horizon_rad(position_m[None], MIDDLES_RAD)
     for k, sigma in enumerate(terrain.shape_sigma):
         if sigma > 0.0:
-            changed = terrain.reshaped(SHAPE_STEP * np.eye(2)[k])
-            change = (changed.horizon_rad(position_m[None], MIDDLES_RAD) - here) / SHAPE_STEP
+            here, changed = (
+                ground.horizon_rad(position_m[None], MIDDLES_RAD)
+                for ground in (terrain, terrain.reshaped(SHAPE_STEP * np.eye(2)[k]))
+            )
+            change = (changed - here) / SHAPE_STEP
             columns.append((change * sky.px_per_rad)[:, None])
             means.append(0.0)
             variances.append(sigma**2)

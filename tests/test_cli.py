@@ -491,3 +491,10 @@ def test_a_wrong_time_rotates_the_position_about_the_axis_of_a_round_crater(fold
     assert attitude["heading_deg"] - truth["heading_deg"] == pytest.approx(rotation_deg, abs=0.2)
     true_m, found_m = (np.hypot(place["east_m"], place["north_m"]) for place in (truth, found))
     assert found_m == pytest.approx(true_m, abs=20)
+
+
+def test_the_flag_of_the_evidence_has_the_sources_of_the_settings():
+    from startrack.cli.common import EVIDENCE_SOURCES
+    from startrack.stages import EVIDENCE_SOURCES as SOURCES_OF_SETTINGS
+
+    assert EVIDENCE_SOURCES == SOURCES_OF_SETTINGS

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from startrack.evidence.sky_levels import LEVEL_SECTORS, MEDIAN_ABS_NORMAL, SECTORS
+from startrack.evidence.sky_levels import LEVEL_SECTORS, SECTORS
 from startrack.evidence.sky_light import SkyLight
+from startrack.evidence.sky_step import MEDIAN_ABS_NORMAL
 from startrack.types import Array, Bools
 
 MIN_SECTORS = 60  # with a step

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.evidence.sky_pixels import SkyPixels
+from startrack.evidence.sky_step import MEDIAN_ABS_NORMAL
 from startrack.kernels import njit
 from startrack.types import Array, Bools, Ints
 
@@ -22,7 +23,6 @@ NOISE_SECTORS = 5.0  # of the smoothing of the pixels' noise
 ROUNDS = 3
 MEDIAN_STEP = 8  # of the pixels from which the first levels are taken
 SLOPE_EXCESS = 2.0  # mean square of slopes that the noise explains, in units of their variance
-MEDIAN_ABS_NORMAL = 0.6745
 GROUND, SKY = range(2)
 
 

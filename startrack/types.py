@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from startrack.errors import BadInput, NoSolution, NotIdentified, NotLocated, TooFewStars
 
 __all__ = [
-    "Array", "Attitude", "BadInput", "Body", "Bools", "Centroids", "Detections", "Evidence", "Exposure", "Fix",
+    "Array", "Attitude", "BadInput", "Body", "Bools", "Centroids", "ClockError", "Detections", "Evidence", "Exposure", "Fix",
     "Identification", "Ints", "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated", "Stars",
     "TooFewStars", "Value", "array",
 ]  # fmt: skip
 
 # Beyond the zenith: the search for an error of the horizon shifts the rows, by three sigma at most.
 MOST_ELEVATION_RAD = np.pi / 2 + 0.6
+TIME_SIGMA_S = 1.0  # of the clock, where nothing is stated
 MAX_PIXELS = 200_000_000  # contract: a larger image is refused from its header, before anything is decoded
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -94,6 +95,7 @@ class Exposure(Value):
     name: str = ""  # stem of the file's name
     path: str = ""  # as given by the user
     time_utc: datetime | None = None  # mid-exposure, timezone-aware UTC; None when unknown
+    time_sigma_s: float = TIME_SIGMA_S  # standard deviation of the clock's error
     exposure_s: float | None = None
     camera: str | None = None  # resolved path or shipped name of the camera file
     terrain: str | None = None  # resolved path or shipped name of the terrain file
@@ -273,6 +275,14 @@ class Mode(Value):
     weight: float  # posterior probability
 
 
+@dataclass(frozen=True)
+class ClockError:
+    """How much later the true time is than the stated one."""
+
+    offset_s: float
+    sigma_s: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class Fix(Value):
     """Posterior of the camera's position."""
@@ -286,3 +296,4 @@ class Fix(Value):
     dropped_probability: float | None = None  # bound on the posterior's part that the search left out; None: no search
     search: str = "proven"  # no other position fits; "beam": not proven to the end; "approximate": no posterior
     horizon_error_rad: float = 0.0  # common to all azimuths: how much higher the true horizon is than the map's
+    clock: ClockError | None = None  # as the evidence shows it; None: not estimated

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from startrack.camera import Camera
 from startrack.frames import Site
-from startrack.localization import check_consistency, localizer_name
-from startrack.measurement import measure_evidence, remeasure_near_skyline, sky_step_at
+from startrack.localization import check_consistency, clock_matters, localizer_name
+from startrack.measurement import at_time_of_fix, measure_evidence, remeasure_near_skyline, sky_step_at
 from startrack.orientation import (
     NO_TIME,
     check_inputs,
@@ -23,6 +23,7 @@ from startrack.stages import (
     Detected,
     Inputs,
     Located,
+    Measured,
     Oriented,
     Refused,
     Run,
@@ -35,6 +36,7 @@ from startrack.types import BadInput, Exposure, NoSolution
 
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog
+    from startrack.evidence import SkyStep
 
 __all__ = ["NO_TIME", "Settings", "detect", "identify", "identify_blind", "locate", "locate_exposure"]
 
@@ -61,21 +63,39 @@ def locate(
         )
         oriented = run.run_stage("attitude", solve_orientation, identified)
         measured = run.run_stage("evidence", measure_evidence, oriented, terrain, settings)
-        fix = run.time_stage("locate", settings.localizer, measured.evidence(), terrain)
-        rough = fix.ambiguous or fix.search == "approximate"  # its skyline is not that of the image
-        step = None if rough else run.time_stage("evidence", sky_step_at, measured, fix)
+        located = _locate_by_stars(run, measured, settings)
+        step = _sky_step(run, located)
         if step is not None and step.exceeds_noise:
-            measured = run.run_stage("evidence", remeasure_near_skyline, measured, fix, step, settings.evidence)
-            fix = run.time_stage("locate", settings.localizer, measured.evidence(), terrain)
-        if fix.search != "approximate":
-            run.time_stage("locate", check_consistency, measured.evidence(), fix, terrain)
-        located = extend(measured, Located, fix=fix)
+            measured = run.run_stage(
+                "evidence", remeasure_near_skyline, located, located.fix_at_time, step, settings.evidence
+            )
+            located = _locate_by_stars(run, measured, settings)
+        if located.fix.search != "approximate":
+            run.time_stage("locate", check_consistency, located.evidence(), located.fix_at_time, terrain)
         if settings.evidence_sources != "stars":
             located = run.time_stage("locate", refine_by_sky_light, located, settings.evidence_sources == "both")
         sky_mag = None if step is None else step.brightness_mag_arcsec2(camera, exposure.exposure_s)
         return run.finish(replace(located, sky_brightness_mag_arcsec2=sky_mag))
     except (BadInput, NoSolution) as refusal:
         return run.refuse(refusal)
+
+
+def _locate_by_stars(run: Run, measured: Measured, settings: Settings) -> Located:
+    """The position by the stars, and what was `measured` under the sky of the time that they show."""
+    terrain = measured.terrain
+    fix = run.time_stage("locate", settings.localizer, measured.evidence(), terrain)
+    measured, fix_at_time = at_time_of_fix(measured, fix), fix
+    if fix.clock is not None and clock_matters(measured.clock, terrain):
+        exact = replace(measured.evidence(), clock=None)
+        fix_at_time = run.time_stage("locate", settings.localizer, exact, terrain)
+    return extend(measured, Located, fix=fix, fix_at_time=fix_at_time)
+
+
+def _sky_step(run: Run, located: Located) -> SkyStep | None:
+    """The step of the sky's light at the skyline; None without one, and where the position is not that of the image."""
+    if located.fix_at_time.ambiguous or located.fix.search == "approximate":
+        return None
+    return run.time_stage("evidence", sky_step_at, located, located.fix_at_time)
 
 
 def locate_exposure(exposure: Exposure, settings: Settings | None = None) -> Located | Refused:

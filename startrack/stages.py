@@ -12,7 +12,7 @@ import time as clock
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, Self, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from startrack.camera import Camera
 from startrack.detection import Detector
 from startrack.errors import Reason
 from startrack.evidence import SkyLight, StarEvidence, StarPhotometry
-from startrack.frames import Site
+from startrack.frames import R_from_rotvec, Site
 from startrack.identification import Identifier
 from startrack.localization import ExactPosterior, Localizer, SkylineFit, require_localizer
 from startrack.terrain import Terrain
@@ -30,6 +30,7 @@ from startrack.types import (
     Attitude,
     BadInput,
     Body,
+    Clock,
     Detections,
     Evidence,
     Exposure,
@@ -138,7 +139,8 @@ class Measured(Oriented):
 
     terrain: Terrain
     site: Site  # of the terrain
-    R_enu_icrs: Array  # (3, 3)
+    R_enu_icrs: Array  # (3, 3) at the likeliest time
+    clock: Clock
     light: StarPhotometry
 
     @property
@@ -148,7 +150,13 @@ class Measured(Oriented):
 
     def evidence(self) -> Evidence:
         """The rays for the localizer."""
-        return self.light.evidence()
+        return replace(self.light.evidence(), clock=self.clock)
+
+    def later(self, seconds: float, reach_s: float) -> Self:
+        """The same under the sky of a time later by `seconds`, which is right to `reach_s`."""
+        R = R_from_rotvec(seconds * self.clock.turn_rad_s)
+        clock = replace(self.clock, offset_s=self.clock.offset_s + seconds, reach_s=reach_s)
+        return replace(self, R_enu_icrs=R @ self.R_enu_icrs, light=self.light.turned(R), clock=clock)
 
     @property
     def warnings(self) -> list[str]:
@@ -161,6 +169,7 @@ class Located(Measured):
     """The whole solution: evidence and the position that explains it."""
 
     fix: Fix
+    fix_at_time: Fix  # by the stars, the time of `R_enu_icrs` taken as exact; `fix` where the clock does not matter
     sky_light: SkyLight | None = None  # of the image at the skyline; None: not used for the fix
     skyline_fit: SkylineFit | None = None  # of the skyline that the sky's light shows, to that of the fix
     by_stars: bool = True  # whether the stars' rows are in the posterior too

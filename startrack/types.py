@@ -7,7 +7,7 @@ CONVENTIONS.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields
 from datetime import datetime
 from typing import Any, TypeVar
 
@@ -15,76 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.errors import BadInput, NoSolution, NotIdentified, NotLocated, TooFewStars
+from startrack.values import Array, Bools, Ints, Value, array, take_rows
 
 __all__ = [
-    "Array", "Attitude", "BadInput", "Body", "Bools", "Centroids", "ClockError", "Detections", "Evidence", "Exposure", "Fix",
-    "Identification", "Ints", "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated", "Stars",
-    "TooFewStars", "Value", "array",
+    "Array", "Attitude", "BadInput", "Body", "Bools", "Centroids", "Clock", "ClockError", "Detections", "Evidence",
+    "Exposure", "Fix", "Identification", "Ints", "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated",
+    "Stars", "TooFewStars", "Value", "array",
 ]  # fmt: skip
 
 # Beyond the zenith: the search for an error of the horizon shifts the rows, by three sigma at most.
 MOST_ELEVATION_RAD = np.pi / 2 + 0.6
 TIME_SIGMA_S = 1.0  # of the clock, where nothing is stated
 MAX_PIXELS = 200_000_000  # contract: a larger image is refused from its header, before anything is decoded
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 T = TypeVar("T")
-
-
-def array(
-    *shape: int | str, dtype: Any = np.float64, default: float | None = None, may_be_nan: bool = False
-) -> Any:  # fmt: skip
-    """A checked array field. Letters in `shape` name lengths that must agree within the value.
-
-    With a default the field may be left out or be one number: it is then filled with the number, as long as the fields
-    before it.
-    """
-    metadata = {"shape": shape, "dtype": dtype, "default": default, "may_be_nan": may_be_nan}
-    return field(metadata=metadata) if default is None else field(default=None, metadata=metadata)
-
-
-def take_rows(value: T, which: Any) -> T:
-    """The value with all its array fields of common length n cut to a mask, slice or index array."""
-    names = [f.name for f in fields(value) if f.metadata.get("shape", ())[:1] == ("n",)]  # type: ignore[arg-type]
-    rows = {name: getattr(value, name)[which] for name in names}
-    for taken in rows.values():
-        taken.flags.writeable = False  # new, and locked: the value need not copy it
-    return replace(value, **rows)  # type: ignore[type-var]
-
-
-def _is_locked(given: Any, dtype: Any) -> bool:
-    """Whether an array is immutable and of this type of numbers: it then needs no copy."""
-    if type(given) is not np.ndarray or given.flags.writeable or not given.flags.c_contiguous:
-        return False
-    base = given.base
-    return np.issubdtype(given.dtype, dtype) and (
-        base is None or (type(base) is np.ndarray and not base.flags.writeable)
-    )
-
-
-class Value:
-    """Base of the frozen values: converts, checks and locks the fields declared with `array`."""
-
-    def __post_init__(self) -> None:
-        lengths: dict[str, int] = {}
-        for f in fields(self):  # type: ignore[arg-type]
-            if "shape" not in f.metadata:
-                continue
-            want, given = f.metadata["shape"], getattr(self, f.name)
-            default = f.metadata.get("default")
-            if default is not None and np.ndim(given) == 0:
-                given = np.full([lengths.get(w, w) for w in want], default if given is None else given)
-            a = given if _is_locked(given, f.metadata["dtype"]) else np.array(given, dtype=f.metadata["dtype"])
-            if a.ndim != len(want):
-                raise ValueError(f"{type(self).__name__}.{f.name}: {a.ndim} dimensions, expected {want}")
-            for n, w in zip(a.shape, want, strict=True):
-                if n != (lengths.setdefault(w, n) if isinstance(w, str) else w):
-                    raise ValueError(f"{type(self).__name__}.{f.name}: shape {a.shape}, expected {want} {lengths}")
-            if a.dtype.kind == "f" and not f.metadata.get("may_be_nan") and np.isnan(a).any():
-                raise ValueError(f"{type(self).__name__}.{f.name} holds NaN")
-            a.flags.writeable = False
-            object.__setattr__(self, f.name, a)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,6 +142,20 @@ class Identification(Value):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Clock(Value):
+    """How directions in enu depend on an error of the clock."""
+
+    turn_rad_s: Array = array(3)  # rotation vector in enu: by one second that the true time is later
+    sigma_s: float  # of the stated time
+    offset_s: float = 0.0  # by which the directions' time is later than the stated one
+    reach_s: float = np.inf  # the true time is no farther from the directions' time
+
+    def log_prior(self, later_s: Any) -> Any:
+        """Logarithm of the prior density, less its maximum, of times later than the directions' time."""
+        return -0.5 * np.square((self.offset_s + later_s) / self.sigma_s)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Evidence(Value):
     """Rays, each with a log-likelihood ratio l: visible sky against hidden by the terrain.
 
@@ -215,10 +172,11 @@ class Evidence(Value):
     llr: Array = array("n")  # natural logarithm; 0 carries no information
     edge_sigma_rad: Array = array("n", default=0.0)  # width of the edge: uncertainty of the elevation, or the PSF
     extended_nats: Array = array("n", default=0.0)  # (light / noise)^2 of extended light; 0: a point source
+    clock: Clock | None = None  # one for all rows; None: the time is exact
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not all(np.isfinite(getattr(self, f.name)).all() for f in fields(self)):
+        if not all(np.isfinite(getattr(self, name)).all() for name in self._columns()):
             raise ValueError("Evidence holds an infinite number")
         if not len(self):
             return
@@ -240,9 +198,13 @@ class Evidence(Value):
 
     @classmethod
     def concatenate(cls, *parts: Evidence) -> Evidence:
-        """The rows of all `parts`, of several sources or exposures, in one value."""
-        names = [f.name for f in fields(cls)]
-        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+        """The rows of all `parts`, of several sources or exposures, in one value, with the first part's clock."""
+        clock = next((part.clock for part in parts if part.clock is not None), None)
+        return cls(clock=clock, **{n: np.concatenate([getattr(part, n) for part in parts]) for n in cls._columns()})
+
+    @classmethod
+    def _columns(cls) -> list[str]:
+        return [f.name for f in fields(cls) if "shape" in f.metadata]
 
     def __len__(self) -> int:
         return len(self.llr)

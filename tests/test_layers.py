@@ -16,7 +16,7 @@ import startrack
 ROOT = Path(startrack.__file__).parent
 
 LAYERS = (  # lowest first; a package imports from lower layers only
-    {"errors"},
+    {"errors", "values"},
     {"types", "files", "declaration"},
     {"frames", "runner", "compilation"},
     {"kernels"},
@@ -27,6 +27,7 @@ LAYERS = (  # lowest first; a package imports from lower layers only
     {"attitude"},
     {"rendering", "detection", "identification", "evidence", "localization"},
     {"stages"},
+    {"sky_errors"},
     {"measurement", "orientation", "sky_refinement", "skyline"},
     {"pipeline", "calibration", "inputs"},
     {"output"},

@@ -10,13 +10,14 @@ from localization_helpers import WRAPPERS, slow_scores
 
 from startrack.localization import ExactPosterior, check_consistency
 from startrack.localization.box_average import BoxAverage
-from startrack.localization.consistency import best_turn, contradicted_stretches
+from startrack.localization.consistency import contradicted_stretches
 from startrack.localization.initial_guess import beam_search
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.nuisance import lower_evidence
+from startrack.localization.time_check import best_time
 from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
-from startrack.types import Array, Evidence, NotLocated
+from startrack.types import Array, Clock, Evidence, NotLocated
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -188,12 +189,13 @@ def test_a_sky_rotated_by_a_wrong_clock_is_noticed(shackleton):
     rng = np.random.default_rng(5)
     place = np.array([50.0, -90.0])
     evidence = simulate_rays(shackleton, place, rng, 12_000, 0.0)
+    clock = Clock(turn_rad_s=np.array([0.0, 0.0, -np.radians(0.55) / 3600]), sigma_s=1.0)
     for turn, refused in ((0.0, False), (np.radians(1.1), True)):
         turned = replace(evidence, azimuth_rad=np.mod(evidence.azimuth_rad + turn, 2 * np.pi))
-        found, gain = best_turn(PositionLikelihood.from_evidence(turned, shackleton), place)
+        found_s, gain = best_time(PositionLikelihood.from_evidence(turned, shackleton), place, clock)
         if refused:
             assert gain > 5
-            assert found == pytest.approx(-turn, abs=np.radians(0.6))
+            assert found_s == pytest.approx(-7200, abs=3700)
         else:
             assert gain < 2
 

@@ -11,7 +11,7 @@ from startrack.camera import Camera
 from startrack.evidence.flux_scale import FluxScale
 from startrack.evidence.likelihood_ratio import gaussian_llr, visibility_llr
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure
-from startrack.frames import angle_between_rad, azel_from_rays, off_axis_rad
+from startrack.frames import angle_between_rad, azel_from_rays, off_axis_rad, rays_from_azel
 from startrack.psf import noise_area_px
 from startrack.types import Array, Body, Bools, Detections, Evidence, Ints, Stars
 
@@ -59,6 +59,11 @@ class StarPhotometry:
         for number, text in enumerate(texts, start=len(self.causes)):
             code[self.usable & (reason == text)] = number
         return replace(self, cause_code=code, causes=self.causes + texts, llr=np.where(code == USABLE, self.llr, 0.0))
+
+    def turned(self, R: Array) -> StarPhotometry:
+        """The same under a sky turned by a rotation (3, 3) in enu."""
+        azimuth, elevation = azel_from_rays(rays_from_azel(self.azimuth_rad, self.elevation_rad) @ R.T)
+        return replace(self, azimuth_rad=azimuth, elevation_rad=elevation)
 
     def replace_stars(self, newer: StarPhotometry, which: Ints) -> StarPhotometry:
         """Replace the rows of the stars `which` by the newer measurement, where both contain the star."""

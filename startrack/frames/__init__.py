@@ -31,6 +31,7 @@ from startrack.frames.site import (
     observer_state,
     observer_velocity_m_s,
     position_fixed_m,
+    sky_rotvec_rad,
 )
 from startrack.frames.spice import R_mcmf_icrs, barycentric_state, et_s
 from startrack.frames.time import as_utc, format_utc, parse_utc
@@ -64,5 +65,6 @@ __all__ = [
     "quat_xyzw_from_R",
     "rays_from_azel",
     "refract_rad",
+    "sky_rotvec_rad",
     "wahba",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from math import isfinite, pi
 
 import numpy as np
@@ -87,6 +87,20 @@ def R_enu_icrs(site: Site, time: datetime) -> Array:
     """
     R_fixed_icrs = R_mcmf_icrs(time) if site.body == "moon" else R_itrs_icrs(time)
     return R_enu_fixed(site) @ R_fixed_icrs
+
+
+def sky_rotvec_rad(site: Site, time: datetime, seconds: float) -> Array:
+    """Rotation vector (3,) in enu of the stars at a `site` over an interval of `seconds` about `time`.
+
+    R_enu_icrs(end) = exp([rotvec]x) R_enu_icrs(start); for intervals under half a rotation of the sky.
+
+    Raises: as R_enu_icrs.
+    """
+    half = timedelta(seconds=seconds / 2)
+    R = R_enu_icrs(site, time + half) @ R_enu_icrs(site, time - half).T
+    axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine, cosine = float(np.linalg.norm(axis)), 0.5 * (np.trace(R) - 1)
+    return axis * (np.arctan2(sine, cosine) / sine) if sine > 0 else axis
 
 
 def observer_velocity_m_s(site: Site, time: datetime) -> Array:

@@ -2,6 +2,7 @@
 
 from typing import Any, Protocol
 
+from startrack.localization.clock import clock_matters
 from startrack.localization.consistency import check_consistency
 from startrack.localization.convex_hull import Hull
 from startrack.localization.posterior import ExactPosterior
@@ -54,5 +55,5 @@ def require_localizer(given: Any) -> Localizer:
 
 __all__ = [
     "LOCALIZERS", "ExactPosterior", "Hull", "Localizer", "PseudoGradient", "SkylineFit", "check_consistency",
-    "localizer_name", "require_localizer",
+    "clock_matters", "localizer_name", "require_localizer",
 ]  # fmt: skip

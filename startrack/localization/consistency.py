@@ -9,7 +9,9 @@ import numpy as np
 
 from startrack.localization.likelihood import SECTOR_EPSILON, SECTOR_RAD, PositionLikelihood
 from startrack.localization.nuisance import STEEPNESS_LEEWAY, lower_evidence
+from startrack.localization.refit import STEPS_M, refitted_gain
 from startrack.localization.sector_likelihood import Sectors, contributions
+from startrack.localization.time_check import check_time
 from startrack.terrain import Terrain
 from startrack.types import Array, Evidence, Fix, NotLocated
 
@@ -32,13 +34,6 @@ SMALL_STRETCHES = 4  # of these: the others are tried only where these gain
 STRETCH_NEARBY_M = 80.0
 STRETCH_GAIN_NATS = 4.5  # a true map gains more in 1 of 370; of 240 images with maps 1 % off the least gain was 7.6
 STRETCH_SIGMAS = 3.0  # of what the terrain file itself admits
-TURNS_RAD = np.radians([0.55, 1.1, -0.55, -1.1])  # an hour turns the Moon's sky by 0.55 degrees
-TURN_NEARBY_M, TURN_LEEWAY_RAD = 40.0, np.radians(0.2)
-TURN_GAIN_NATS = 5.0  # of 80 true frames the largest gain was 4.1; of 30 with a clock an hour off half gain more than 5
-TURN_SIGMA_RAD = np.radians(0.02)  # errors of a map go together from azimuth to azimuth, and fit chance turns as well
-STEPS_M = (16.0, 2.0)  # first and last step of a climb
-REFITS = ((40.0, 16.0, 5), (12.0, 4.0, 3))  # neighbourhood [m], first step [m], points across where horizons are traced
-REFIT_LLR, REFIT_ROWS, LAST_REFIT_M = 1.0, 2000, 1.0  # of many rows only the strong ones decide where to climb
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +104,7 @@ class SureRows:
 
 
 def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain) -> None:
-    """Raise NotLocated (inconsistent_evidence) where the `evidence` contradicts the `fix`, or the `terrain` does."""
+    """Raise NotLocated (inconsistent_evidence) where the `evidence` contradicts the `fix`, the `terrain` or the time."""
     evidence = lower_evidence(evidence, fix.horizon_error_rad)
     sure = SureRows.at_fix(evidence, fix, terrain)
     stretches = contradicted_stretches(sure.explained_by_sector)
@@ -130,8 +125,8 @@ def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain) -> None:
         )
     likelihood = PositionLikelihood.from_evidence(evidence, terrain)
     _check_stretch(likelihood, fix.position_enu_m[:2])
-    if not terrain.axisymmetric:  # else a turned sky only turns the position
-        _check_turn(likelihood, fix.position_enu_m[:2])
+    if evidence.clock is not None and not terrain.axisymmetric:  # else a turned sky only turns the position
+        check_time(likelihood, fix.position_enu_m[:2], evidence.clock)
 
 
 def _check_stretch(likelihood: PositionLikelihood, position_m: Array) -> None:
@@ -143,20 +138,6 @@ def _check_stretch(likelihood: PositionLikelihood, position_m: Array) -> None:
             f"the stars see a horizon about {_percent(stretch)} {'higher' if stretch > 1 else 'lower'} than the "
             f"terrain {terrain.name} gives: are the image's time, the terrain's depth and width, its camera height and "
             "the camera file right? (a cylinder can take depth_sigma_m and diameter_sigma_m)",
-            reason="inconsistent_evidence",
-        )
-
-
-def _check_turn(likelihood: PositionLikelihood, position_m: Array) -> None:
-    """Raise NotLocated where a turned sky explains the stars much better: the clock is off."""
-    turn, gain = best_turn(likelihood, position_m)
-    strong = np.abs(likelihood.evidence.llr) >= min(SURE_LLR, float(likelihood.strength.max()))
-    azimuths = likelihood.evidence.azimuth_rad[strong]
-    sigma = float(np.median(likelihood.terrain.horizon_sigma_rad(position_m[None], azimuths)))
-    if gain > TURN_GAIN_NATS * (1 + sigma / TURN_SIGMA_RAD):
-        raise NotLocated(
-            f"a sky turned by {np.degrees(turn):+.1f} degrees about the vertical would fit the terrain better: "
-            "is the time right? (an hour on the Moon is 0.55 degrees)",
             reason="inconsistent_evidence",
         )
 
@@ -204,46 +185,13 @@ def best_stretch(likelihood: PositionLikelihood, position_m: Array) -> tuple[flo
         sizes = STRETCHES
     if gain > STRETCH_GAIN_NATS and not likelihood.in_closed_form:
         e = likelihood.evidence
-        gain = min(gain, _refitted_gain(likelihood, position_m, replace(e, elevation_rad=_lowered_rad(e, best)), at))
-    return best, gain
-
-
-def best_turn(likelihood: PositionLikelihood, position_m: Array) -> tuple[float, float]:
-    """The turn [rad] of the sky about the vertical that fits best, and how much better [nats] than none.
-
-    The position is free near the one given (2,). Near a pole a wrong time looks like that.
-    """
-    local = likelihood.near(position_m, TURN_NEARBY_M, TURN_LEEWAY_RAD)
-    if not len(local.evidence):
-        return 0.0, 0.0
-    best, gain, at = 0.0, 0.0, position_m
-    plain = local.with_turned_sky(0.0).climb(position_m, *STEPS_M)[1]
-    for turn in TURNS_RAD:
-        position, fit = local.with_turned_sky(turn).climb(position_m, *STEPS_M)
-        if fit - plain > gain:
-            best, gain, at = float(turn), fit - plain, position
-    if gain > TURN_GAIN_NATS:
-        e = likelihood.evidence
-        gain = min(gain, _refitted_gain(likelihood, position_m, replace(e, azimuth_rad=e.azimuth_rad + best), at))
+        gain = min(gain, refitted_gain(likelihood, position_m, replace(e, elevation_rad=_lowered_rad(e, best)), at))
     return best, gain
 
 
 def _lowered_rad(evidence: Evidence, stretch: float) -> Array:
     """Elevations (n,) [rad] at which the rows stand above the horizon as they do above one stretched by a factor."""
     return np.asarray(np.arctan(np.tan(evidence.elevation_rad) / stretch))
-
-
-def _refitted_gain(likelihood: PositionLikelihood, position_m: Array, changed: Evidence, at_m: Array) -> float:
-    """How much better [nats] the changed rows fit near a position (2,) than the rows themselves near theirs (2,).
-
-    Beside crests the horizon is not linear over the neighbourhoods searched before: it is traced closer here.
-    """
-    scores = []
-    for evidence, start_m in ((changed, at_m), (likelihood.evidence, position_m)):
-        one = PositionLikelihood.from_evidence(evidence, likelihood.terrain)
-        way, _ = one.strong(REFIT_LLR, REFIT_ROWS).climb(start_m, REFITS, LAST_REFIT_M)
-        scores.append(one.exact_scores(way).max())
-    return float(scores[0] - scores[1])
 
 
 def _inconsistency(cause: str, stretches: list[tuple[int, int]]) -> NotLocated:

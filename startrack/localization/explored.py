@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from startrack.types import Array
+from startrack.types import Array, ClockError
 
 
 class Explored(NamedTuple):
@@ -18,6 +18,7 @@ class Explored(NamedTuple):
     log_dropped: float  # logarithm of a bound of the mass [m2] that was dropped
     search: str  # "proven" or "beam"
     horizon_bias_rad: float = 0.0  # how much higher than the terrain's the horizon was taken
+    clock: ClockError | None = None
 
 
 class BudgetSpent(Exception):

@@ -50,14 +50,14 @@ class Guess:
         return float(self.log_likelihood.max(initial=-np.inf))
 
 
-def beam_search(likelihood: PositionLikelihood) -> Guess:
+def beam_search(likelihood: PositionLikelihood, beams: tuple[Beam, ...] = BEAMS) -> Guess:
     """A few good positions: of ever smaller boxes those with the best average likelihood are quartered.
 
-    The guess decides nothing: without a good one the proof takes longer. Wider beams follow where a narrow one finds no
-    position that explains all sectors.
+    The guess decides nothing: without a good one the proof takes longer. Of the `beams` the wider ones follow where a
+    narrow one finds no position that explains all sectors.
     """
     found = Guess(np.zeros((0, 2)), np.zeros(0))
-    for beam in BEAMS:
+    for beam in beams:
         found = climb_to_best(likelihood, _last_boxes(likelihood, beam), found)
         if found.best > EXPLAINED_NATS * likelihood.sectors.occupied:
             break

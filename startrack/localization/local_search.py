@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from startrack.frames import R_from_rotvec, azel_from_rays, rays_from_azel
 from startrack.kernels import njit
 from startrack.localization.prefix_sums import PrefixSums
 from startrack.localization.score_kernel import log_mixtures, score_disks
@@ -95,11 +96,10 @@ class LocalLikelihood:
         ground = terrain.near(self.centre_m, self.half_m, self.evidence.azimuth_rad)
         return replace(self, terrain=terrain, ground=ground)
 
-    def with_turned_sky(self, turn_rad: float) -> LocalLikelihood:
-        """The same rows at azimuths so much larger; horizons are prepared at four corners only."""
-        azimuth = np.mod(self.evidence.azimuth_rad + turn_rad, 2 * np.pi)
-        ground = self.terrain.near(self.centre_m, self.half_m, azimuth, 2)
-        return replace(self, evidence=replace(self.evidence, azimuth_rad=azimuth), ground=ground)
+    def with_turned_sky(self, rotvec_rad: Array) -> LocalLikelihood:
+        """The same rows under a sky turned by a rotation vector (3,); horizons are prepared at four corners only."""
+        e = turn_rays(self.evidence, rotvec_rad)
+        return replace(self, evidence=e, ground=self.terrain.near(self.centre_m, self.half_m, e.azimuth_rad, 2))
 
     def _scorer(self, elevation_rad: Array | None) -> Callable[[Array], Array]:
         """Positions (n, 2) to log-likelihoods (n,), by interpolated horizons, by disks, or by the terrain itself."""
@@ -138,6 +138,12 @@ class LocalLikelihood:
         sums = np.repeat(self.settled[None], len(points_m), axis=0)
         self.profiles.add_sums(horizon, self.sector[row], sums)
         return sums
+
+
+def turn_rays(evidence: Evidence, rotvec_rad: Array) -> Evidence:
+    """The rows with their directions turned by a rotation vector (3,) in enu."""
+    azimuth, elevation = azel_from_rays(rays_from_azel(*rays_of(evidence)) @ R_from_rotvec(rotvec_rad).T)
+    return replace(evidence, azimuth_rad=azimuth, elevation_rad=elevation)
 
 
 def rays_of(evidence: Evidence) -> tuple[Array, Array]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from startrack.compilation import announce_compilation
 from startrack.localization.branch_and_bound import Search, explains_all_sectors
+from startrack.localization.clock_posterior import marginalize_clock
 from startrack.localization.explored import BudgetSpent, Explored, log_sum
 from startrack.localization.initial_guess import beam_search, climb_to_best
 from startrack.localization.likelihood import SECTOR_EPSILON, SECTOR_RAD, PositionLikelihood
@@ -54,18 +55,26 @@ class ExactPosterior:
         if count < MIN_ROWS:
             raise NotLocated(f"only {count} rays carry information about the skyline: expose longer")
         evidence = evidence if count == len(evidence) else evidence.take(informative)
-        if any(terrain.shape_sigma):
-            explored, _ = marginalize_shape(self.explore_biased, evidence, terrain)
-        else:
-            explored = self.explore_biased(evidence, terrain)
+        explored = marginalize_clock(self.explore_shaped, self.explore, evidence, terrain)
         log_mass = log_sum(explored.log_likelihood) + float(np.log(4 * explored.half_m**2))
         dropped = float(np.exp(min(explored.log_dropped - log_mass, 0.0)))
         fix = summarize(explored.centres_m, 2 * explored.half_m, explored.log_likelihood, dropped, terrain)
-        return replace(fix, horizon_error_rad=explored.horizon_bias_rad, search=explored.search)
+        return replace(
+            fix, horizon_error_rad=explored.horizon_bias_rad, search=explored.search, clock=explored.clock
+        )  # fmt: skip
 
     def fit_shape(self, evidence: Evidence, terrain: Terrain) -> ShapeFit:
         """Shape of a `terrain` with an uncertain one, from the `evidence`, estimated together with the position."""
         return marginalize_shape(self.explore_biased, evidence, terrain)[1]
+
+    def explore_shaped(self, evidence: Evidence, terrain: Terrain) -> Explored:
+        """The posterior on equal boxes, over all shapes and horizon biases that the `terrain` allows beside `evidence`.
+
+        Raises NotLocated as `explore_biased` does.
+        """
+        if any(terrain.shape_sigma):
+            return marginalize_shape(self.explore_biased, evidence, terrain)[0]
+        return self.explore_biased(evidence, terrain)
 
     def explore_biased(self, evidence: Evidence, terrain: Terrain) -> Explored:
         """The posterior on equal boxes, over all horizon biases that the `terrain` allows beside the `evidence`.

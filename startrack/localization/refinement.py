@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -32,6 +33,7 @@ def refine_fix(
     covariance_m2: Array,
     smear_m2: Array,
     horizon_error_rad: float,
+    spread: Callable[[Explored], Explored] = lambda found: found,
 ) -> Fix:
     """The `fix` replaced by the posterior from `evidence` near a good position on a `terrain`.
 
@@ -43,6 +45,7 @@ def refine_fix(
         covariance_m2: (2, 2) about that of the posterior by the rows.
         smear_m2: (2, 2) covariance of the position from errors that the rows share.
         horizon_error_rad: by which the rows were put lower, for the common error of the map.
+        spread: a posterior to the one over a further error that the rows share.
 
     Raises NotLocated as `summarize` does.
     """
@@ -51,10 +54,13 @@ def refine_fix(
     sizes, axes = np.linalg.eigh(smear_m2)
     for size, axis in zip(sizes, axes.T, strict=True):
         explored = mix_shifted(explored, np.sqrt(max(size, 0.0)) * axis, terrain)
+    explored = spread(explored)
     refined = summarize(
         explored.centres_m, 2 * explored.half_m, explored.log_likelihood, fix.dropped_probability or 0.0, terrain
     )
-    return replace(refined, search=fix.search, horizon_error_rad=horizon_error_rad)
+    return replace(
+        refined, search=fix.search, horizon_error_rad=horizon_error_rad, clock=explored.clock
+    )  # fmt: skip
 
 
 def _explore_near(likelihood: PositionLikelihood, position_m: Array, covariance_m2: Array) -> Explored:

@@ -28,6 +28,7 @@ class SharedErrors:
     mean: Array  # (k,)
     covariance: Array  # (k, k)
     of_terrain: Bools  # (k,) whether the stars see the skyline shifted too
+    clock: int | None = None  # which of them is the error of the clock [s]
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from startrack.rendering.compose import light_e, render, truth_of
 from startrack.rendering.defects import draw_hot_pixels
 from startrack.rendering.field_stars import concatenate_stars, draw_field_stars, draw_v_errors
 from startrack.rendering.scene import HotPixels, Scene, Truth
-from startrack.rendering.series import Series, load_sky_catalog, sky_rotvec_rad
+from startrack.rendering.series import Series, load_sky_catalog
 from startrack.rendering.sources import exposure_for_snr
 from startrack.rendering.write import truth_paths, write_truth
 
@@ -21,7 +21,6 @@ __all__ = [
     "light_e",
     "load_sky_catalog",
     "render",
-    "sky_rotvec_rad",
     "truth_of",
     "truth_paths",
     "write_truth",

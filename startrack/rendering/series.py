@@ -11,7 +11,13 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.catalog.bodies import bodies
-from startrack.frames import R_body_enu_from_heading_pitch_roll, R_enu_icrs, Site, observer_velocity_m_s
+from startrack.frames import (
+    R_body_enu_from_heading_pitch_roll,
+    R_enu_icrs,
+    Site,
+    observer_velocity_m_s,
+    sky_rotvec_rad,
+)
 from startrack.rendering.defects import draw_hot_pixels
 from startrack.rendering.field_stars import concatenate_stars, draw_field_stars, draw_v_errors
 from startrack.rendering.scene import Scene
@@ -148,18 +154,6 @@ def load_sky_catalog(stars: str) -> StarCatalog:
     from startrack.catalog.gaia import has_deep_catalog, load_deep_catalog
 
     return load_deep_catalog() if stars == "gaia" or (stars == "auto" and has_deep_catalog()) else load_catalog()
-
-
-def sky_rotvec_rad(site: Site, time: datetime, exposure_s: float) -> Array:
-    """Rotation vector (3,) in enu of the stars at a `site` over an exposure of `exposure_s` about `time`.
-
-    R_enu_icrs(end) = exp([rotvec]x) R_enu_icrs(start); for exposures under half a rotation of the sky.
-    """
-    half = timedelta(seconds=exposure_s / 2)
-    R = R_enu_icrs(site, time + half) @ R_enu_icrs(site, time - half).T
-    axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    sine, cosine = float(np.linalg.norm(axis)), 0.5 * (np.trace(R) - 1)
-    return axis * (np.arctan2(sine, cosine) / sine) if sine > 0 else axis
 
 
 def _random_position(terrain: Terrain, rng: np.random.Generator) -> Array:

@@ -1,0 +1,48 @@
+"""An error of the clock turns the sky about the axis of the body."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from startrack.localization.local_search import turn_rays
+from startrack.terrain import Terrain
+from startrack.types import Clock, Evidence, NotLocated
+
+REACH_SIGMAS = 4.0  # of the stated error, to the last time that is tried
+NEGLIGIBLE_M = 0.05  # by which a row may move over the search area, within one sigma, without an effect on the fix
+
+
+class WrongTime(NotLocated):
+    """The evidence shows a time that the stated one, with its error, excludes."""
+
+    def __init__(self, offset_s: float, sigma_s: float, shown_by: str) -> None:
+        super().__init__(
+            f"{shown_by} shows a time about {_duration(offset_s)} {'later' if offset_s > 0 else 'earlier'} than the "
+            f"image's, which is stated to {_duration(sigma_s)}: is it right? (--time-sigma SECONDS states its error)",
+            reason="inconsistent_evidence",
+        )
+
+
+def _duration(seconds: float) -> str:
+    """In words, to two digits."""
+    size = abs(seconds)
+    unit, factor = ("s", 1.0) if size < 90 else ("minutes", 60.0) if size < 5400 else ("hours", 3600.0)
+    return f"{size / factor:.2g} {unit}"
+
+
+def turn_evidence(evidence: Evidence, later_s: float) -> Evidence:
+    """The rows as they stand if the true time is later by that much."""
+    clock = evidence.clock
+    if clock is None or later_s == 0.0:
+        return evidence
+    moved = replace(clock, offset_s=clock.offset_s + later_s)
+    return replace(turn_rays(evidence, later_s * clock.turn_rad_s), clock=moved)
+
+
+def clock_matters(clock: Clock | None, terrain: Terrain) -> bool:
+    """Whether the error of the clock moves a position on a terrain noticeably."""
+    if clock is None:
+        return False
+    return clock.sigma_s * float(np.linalg.norm(clock.turn_rad_s)) * terrain.reach_m > NEGLIGIBLE_M

@@ -1,0 +1,69 @@
+"""The base of the values that cross module borders: frozen, shape-checked, with read-only arrays."""
+
+from __future__ import annotations
+
+from dataclasses import field, fields, replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+T = TypeVar("T")
+
+
+def array(
+    *shape: int | str, dtype: Any = np.float64, default: float | None = None, may_be_nan: bool = False
+) -> Any:  # fmt: skip
+    """A checked array field. Letters in `shape` name lengths that must agree within the value.
+
+    With a default the field may be left out or be one number: it is then filled with the number, as long as the fields
+    before it.
+    """
+    metadata = {"shape": shape, "dtype": dtype, "default": default, "may_be_nan": may_be_nan}
+    return field(metadata=metadata) if default is None else field(default=None, metadata=metadata)
+
+
+def take_rows(value: T, which: Any) -> T:
+    """The value with all its array fields of common length n cut to a mask, slice or index array."""
+    names = [f.name for f in fields(value) if f.metadata.get("shape", ())[:1] == ("n",)]  # type: ignore[arg-type]
+    rows = {name: getattr(value, name)[which] for name in names}
+    for taken in rows.values():
+        taken.flags.writeable = False  # new, and locked: the value need not copy it
+    return replace(value, **rows)  # type: ignore[type-var]
+
+
+def _is_locked(given: Any, dtype: Any) -> bool:
+    """Whether an array is immutable and of this type of numbers: it then needs no copy."""
+    if type(given) is not np.ndarray or given.flags.writeable or not given.flags.c_contiguous:
+        return False
+    base = given.base
+    return np.issubdtype(given.dtype, dtype) and (
+        base is None or (type(base) is np.ndarray and not base.flags.writeable)
+    )
+
+
+class Value:
+    """Base of the frozen values: converts, checks and locks the fields declared with `array`."""
+
+    def __post_init__(self) -> None:
+        lengths: dict[str, int] = {}
+        for f in fields(self):  # type: ignore[arg-type]
+            if "shape" not in f.metadata:
+                continue
+            want, given = f.metadata["shape"], getattr(self, f.name)
+            default = f.metadata.get("default")
+            if default is not None and np.ndim(given) == 0:
+                given = np.full([lengths.get(w, w) for w in want], default if given is None else given)
+            a = given if _is_locked(given, f.metadata["dtype"]) else np.array(given, dtype=f.metadata["dtype"])
+            if a.ndim != len(want):
+                raise ValueError(f"{type(self).__name__}.{f.name}: {a.ndim} dimensions, expected {want}")
+            for n, w in zip(a.shape, want, strict=True):
+                if n != (lengths.setdefault(w, n) if isinstance(w, str) else w):
+                    raise ValueError(f"{type(self).__name__}.{f.name}: shape {a.shape}, expected {want} {lengths}")
+            if a.dtype.kind == "f" and not f.metadata.get("may_be_nan") and np.isnan(a).any():
+                raise ValueError(f"{type(self).__name__}.{f.name} holds NaN")
+            a.flags.writeable = False
+            object.__setattr__(self, f.name, a)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.output.ecsv import Column, ecsv_text, format_values
-from startrack.types import MeasuredSkyline
+from startrack.types import Array, MeasuredSkyline
+
+LEAST_HALF_DEG, MOST_HALF_DEG = 0.02, 5.0
 
 
 def skyline_table_text(skyline: MeasuredSkyline) -> str:
@@ -17,6 +19,18 @@ def skyline_table_text(skyline: MeasuredSkyline) -> str:
         Column("sigma_deg", sigma, unit="deg", description="standard deviation of the elevation"),
         Column("source", skyline.source, "string", description="stars, sky light, both"),
     ])  # fmt: skip
+
+
+def half_range_deg(raised_deg: Array, sigma_deg: Array) -> float:
+    """Half the range [deg] that shows heights (n,) of a skyline above a predicted one, two sigma (n,) included.
+
+    One height in twenty may lie beyond it; nan where a height is not known.
+    """
+    known = np.isfinite(raised_deg)
+    if not known.any():
+        return 1.0
+    reach = np.quantile(np.abs(raised_deg[known]) + 2.0 * sigma_deg[known], 0.95)
+    return float(np.clip(reach, LEAST_HALF_DEG, MOST_HALF_DEG))
 
 
 def skyline_texts_deg(skyline: MeasuredSkyline) -> tuple[list[str], list[str], list[str]]:

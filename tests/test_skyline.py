@@ -31,7 +31,7 @@ from startrack.output.picture.panorama import (
     WIDTH_PX,
     located_picture,
 )
-from startrack.output.skyline_table import half_range_deg
+from startrack.output.skyline_table import half_range_rad
 from startrack.output.write import prepare_folder
 from startrack.pipeline import Settings
 from startrack.rendering import Series, Truth, render
@@ -249,12 +249,10 @@ def test_the_picture_shows_the_skyline_above_the_horizon(by_source: dict[str, Lo
 
 
 def test_the_enlarged_range_holds_the_skyline_and_not_its_outliers() -> None:
-    raised = np.concatenate([np.full(99, 0.1), [3.0], [np.nan]])
-    sigma = np.concatenate([np.full(100, 0.05), [np.inf]])
-    assert half_range_deg(raised, sigma) == pytest.approx(0.2)
-    assert half_range_deg(raised * 1e-3, sigma * 1e-3) == 0.02
-    assert half_range_deg(raised * 1e3, sigma) == 5.0
-    assert half_range_deg(np.array([np.nan]), np.array([np.inf])) == 1.0
+    raised, sigma = np.append(np.full(99, 2e-3), [0.05, np.nan]), np.append(np.full(100, 1e-3), np.inf)
+    assert half_range_rad(raised, sigma) == pytest.approx(4e-3)
+    assert half_range_rad(raised * 1e-3, sigma * 1e-3) == pytest.approx(np.radians(0.02))
+    assert half_range_rad(raised * 1e3, sigma) == half_range_rad(np.array([np.nan]), sigma[-1:]) == np.radians(5.0)
 
 
 def test_a_refusal_removes_the_table(by_source: dict[str, Located], tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from startrack.output.ecsv import Column, ecsv_text, format_values
 from startrack.types import Array, MeasuredSkyline
 
-LEAST_HALF_DEG, MOST_HALF_DEG = 0.02, 5.0
+LEAST_HALF_RAD, MOST_HALF_RAD = np.radians(0.02), np.radians(5.0)
 
 
 def skyline_table_text(skyline: MeasuredSkyline) -> str:
@@ -21,16 +21,16 @@ def skyline_table_text(skyline: MeasuredSkyline) -> str:
     ])  # fmt: skip
 
 
-def half_range_deg(raised_deg: Array, sigma_deg: Array) -> float:
-    """Half the range [deg] that shows heights (n,) of a skyline above a predicted one, two sigma (n,) included.
+def half_range_rad(raised_rad: Array, sigma_rad: Array) -> float:
+    """Half the range [rad] that shows heights (n,) of a skyline above a predicted one, two sigma (n,) included.
 
     One height in twenty may lie beyond it; nan where a height is not known.
     """
-    known = np.isfinite(raised_deg)
+    known = np.isfinite(raised_rad)
     if not known.any():
-        return 1.0
-    reach = np.quantile(np.abs(raised_deg[known]) + 2.0 * sigma_deg[known], 0.95)
-    return float(np.clip(reach, LEAST_HALF_DEG, MOST_HALF_DEG))
+        return float(MOST_HALF_RAD)
+    reach = np.quantile(np.abs(raised_rad[known]) + 2.0 * sigma_rad[known], 0.95)
+    return float(np.clip(reach, LEAST_HALF_RAD, MOST_HALF_RAD))
 
 
 def skyline_texts_deg(skyline: MeasuredSkyline) -> tuple[list[str], list[str], list[str]]:

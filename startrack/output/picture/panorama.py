@@ -27,7 +27,7 @@ from startrack.output.picture.canvas import (
 )
 from startrack.output.picture.maps import nice_step
 from startrack.output.record import image_name
-from startrack.output.skyline_table import half_range_deg
+from startrack.output.skyline_table import half_range_rad
 from startrack.output.star_table import status_of
 from startrack.stages import Located
 from startrack.terrain import Terrain
@@ -36,7 +36,7 @@ from startrack.types import Array, MeasuredSkyline
 WIDTH_PX, HEIGHT_PX, ENLARGED_PX = 1440, 420, 300
 MARGIN_PX, ABOVE_PX, BELOW_PX, RIGHT_PX = 56.0, 34.0, 40.0, 16.0  # about a plot
 TEXT_PX, LEGEND_PX = 17.0, 15.0
-STEP_DEG = 0.1
+AZIMUTHS_RAD = np.radians(np.linspace(0.0, 360.0, 3601))
 COMPASS = {0: "N", 90: "E", 180: "S", 270: "W"}
 MAX_STARS = 1500  # the brightest
 BANDS = {source: mix_colours(colour, MAP, 0.7) for source, colour in
@@ -55,11 +55,11 @@ class Plot:
     high: float
     step: float
 
-    def canvas_px(self, azimuth_deg: Array | float, elevation_deg: Array | float) -> Array:
+    def canvas_px(self, azimuth_rad: Array | float, elevation_rad: Array | float) -> Array:
         """Places (..., 2) on the canvas."""
         left, top, right, bottom = self.box
-        x = left + np.asarray(azimuth_deg) / 360 * (right - left)
-        y = bottom - (np.asarray(elevation_deg) - self.low) / (self.high - self.low) * (bottom - top)
+        x = left + np.asarray(azimuth_rad) / (2 * np.pi) * (right - left)
+        y = bottom - (np.degrees(elevation_rad) - self.low) / (self.high - self.low) * (bottom - top)
         return np.stack(np.broadcast_arrays(x, y), axis=-1)
 
     @property
@@ -69,73 +69,67 @@ class Plot:
 
     def draw_scales(self) -> None:
         """Lines at even elevations, ticks and names of azimuths, the frame."""
-        left, _, _, bottom = self.box
+        left, _, right, bottom = self.box
         decimals = max(0, -int(np.floor(np.log10(self.step) + 1e-9)))
         for count in range(round(self.low / self.step), round(self.high / self.step) + 1):
-            at = self.canvas_px(np.array([0.0, 360.0]), count * self.step)
-            self.canvas.line(at, GRID if count else FAINT_INK)
-            text = f"{count * self.step:.{decimals}f}°"
-            self.canvas.text((left - 8, float(at[0, 1])), text, TEXT_PX, DIM_INK, "rm")
+            _, y = self.canvas_px(0.0, np.radians(count * self.step)).tolist()
+            self.canvas.line([(left, y), (right, y)], GRID if count else FAINT_INK)
+            self.canvas.text((left - 8, y), f"{count * self.step:.{decimals}f}°", TEXT_PX, DIM_INK, "rm")
         for azimuth in range(0, 361, 30):
-            at = self.canvas_px(azimuth, self.low)
-            self.canvas.line([at, at + np.array([0.0, 6.0])], DIM_INK)
-            name = COMPASS.get(azimuth % 360, f"{azimuth}°")
-            self.canvas.text((float(at[0]), bottom + 10), name, TEXT_PX, DIM_INK, "mt")
+            x, _ = self.canvas_px(np.radians(azimuth), 0.0).tolist()
+            self.canvas.line([(x, bottom), (x, bottom + 6.0)], DIM_INK)
+            self.canvas.text((x, bottom + 10), COMPASS.get(azimuth % 360, f"{azimuth}°"), TEXT_PX, DIM_INK, "mt")
         self.canvas.rectangle(self.box, FAINT_INK, 1)
 
-    def draw_ground(self, azimuth_deg: Array, elevation_deg: Array) -> None:
+    def draw_ground(self, azimuth_rad: Array, elevation_rad: Array) -> None:
         """The ground below elevations (n,) at ascending azimuths (n,), where they are known."""
-        for run in _runs(np.isfinite(elevation_deg)):
-            at = azimuth_deg[run]
-            low = self.canvas_px(np.array([at[-1], at[0]]), self.low)
-            self.window.area(np.concatenate([self.canvas_px(at, elevation_deg[run]), low]), FLOOR)
+        for run in _runs(np.isfinite(elevation_rad)):
+            at = azimuth_rad[run]
+            low = self.canvas_px(np.array([at[-1], at[0]]), np.radians(self.low))
+            self.window.area(np.concatenate([self.canvas_px(at, elevation_rad[run]), low]), FLOOR)
 
-    def draw_line(self, azimuth_deg: Array, elevation_deg: Array, sigma_deg: Array | None = None) -> None:
-        """A skyline (n,) at ascending azimuths (n,), where it is known; `sigma_deg` (n,) as two thin lines."""
-        for run in _runs(np.isfinite(elevation_deg)):
-            at, top = azimuth_deg[run], elevation_deg[run]
-            if sigma_deg is not None:
-                for shift in (-sigma_deg[run], sigma_deg[run]):
+    def draw_line(self, azimuth_rad: Array, elevation_rad: Array, sigma_rad: Array | None = None) -> None:
+        """A skyline (n,) at ascending azimuths (n,), where it is known; `sigma_rad` (n,) as two thin lines."""
+        for run in _runs(np.isfinite(elevation_rad)):
+            at, top = azimuth_rad[run], elevation_rad[run]
+            if sigma_rad is not None:
+                for shift in (-sigma_rad[run], sigma_rad[run]):
                     self.window.line(self.canvas_px(at, top + shift), FAINT_INK)
             self.window.curve(self.canvas_px(at, top), SKYLINE, 2.0)
 
-    def draw_bands(self, elevation_deg: Array, skyline: MeasuredSkyline) -> None:
-        """One sigma of a `skyline` to either side of `elevation_deg` (n,), coloured by its source."""
-        azimuth_deg, sigma_deg = np.degrees(skyline.azimuth_rad), np.degrees(skyline.sigma_rad)
-        half_deg, window = 180.0 / max(len(skyline), 1), self.window
+    def draw_bands(self, elevation_rad: Array, skyline: MeasuredSkyline) -> None:
+        """One sigma of a `skyline` to either side of `elevation_rad` (n,), coloured by its source."""
+        half_rad, window = np.pi / max(len(skyline), 1), self.window
         for k in np.flatnonzero(skyline.known):
-            ends = elevation_deg[k] + np.array([sigma_deg[k], -sigma_deg[k]])
-            corners = self.canvas_px(azimuth_deg[k] + np.array([-half_deg, half_deg]), ends)
+            ends = elevation_rad[k] + np.array([1.0, -1.0]) * skyline.sigma_rad[k]
+            corners = self.canvas_px(skyline.azimuth_rad[k] + np.array([-half_rad, half_rad]), ends)
             (left, top), (right, bottom) = corners.tolist()
             window.rectangle((left, top, right, bottom), BANDS[str(skyline.source[k])])
 
-    def draw_marks(self, azimuth_deg: Array, elevation_deg: Array, kinds: NDArray[np.str_]) -> None:
+    def draw_marks(self, azimuth_rad: Array, elevation_rad: Array, kinds: NDArray[np.str_]) -> None:
         """Marks of LEGEND's `kinds` (n,) in directions (n,), without those that are not known or have another kind."""
         window = self.window
-        for place, kind in zip(self.canvas_px(azimuth_deg, elevation_deg), kinds.tolist(), strict=True):
+        for place, kind in zip(self.canvas_px(azimuth_rad, elevation_rad), kinds.tolist(), strict=True):
             if kind in LEGEND and np.isfinite(place).all():
                 _draw_mark(window, place, kind)
 
 
 def horizon_picture(terrain: Terrain, position_m: tuple[float, float]) -> NDArray[np.uint8]:
     """The horizon (H, W, 3) of a terrain from north to north, azimuth to the right, seen from a position."""
-    azimuth_deg = np.arange(0.0, 360.0 + STEP_DEG / 2, STEP_DEG)
-    horizon_deg = np.degrees(terrain.horizon_rad(np.array(position_m)[None], np.radians(azimuth_deg)))
+    horizon_rad = terrain.horizon_rad(np.array(position_m)[None], AZIMUTHS_RAD)
     title = f"{terrain.name}: horizon seen from E {position_m[0]:.0f} m, N {position_m[1]:.0f} m"
     canvas = Canvas(WIDTH_PX, HEIGHT_PX)
-    _draw_horizon(canvas, title, azimuth_deg, horizon_deg).draw_line(azimuth_deg, horizon_deg)
+    _draw_horizon(canvas, title, AZIMUTHS_RAD, horizon_rad).draw_line(AZIMUTHS_RAD, horizon_rad)
     return canvas.rendered_pixels()
 
 
 def skyline_picture(skyline: MeasuredSkyline) -> NDArray[np.uint8]:
     """A measured `skyline` (H, W, 3) from north to north, with one sigma to either side."""
-    azimuth_deg = np.append(np.degrees(skyline.azimuth_rad), 360.0)
-    elevation_deg, sigma_deg = (
-        np.degrees(np.append(values, values[0])) for values in (skyline.elevation_rad, skyline.sigma_rad)
-    )
+    azimuth_rad = np.append(skyline.azimuth_rad, 2 * np.pi)
+    elevation_rad, sigma_rad = (np.append(a, a[0]) for a in (skyline.elevation_rad, skyline.sigma_rad))
     canvas = Canvas(WIDTH_PX, HEIGHT_PX)
-    plot = _draw_horizon(canvas, "measured skyline", azimuth_deg, elevation_deg)
-    plot.draw_line(azimuth_deg, elevation_deg, sigma_deg)
+    plot = _draw_horizon(canvas, "measured skyline", azimuth_rad, elevation_rad)
+    plot.draw_line(azimuth_rad, elevation_rad, sigma_rad)
     return canvas.rendered_pixels()
 
 
@@ -143,45 +137,48 @@ def located_picture(value: Located, skyline: MeasuredSkyline) -> NDArray[np.uint
     """The `skyline` (H, W, 3) of a located image on the horizon of its terrain, and its height above that, enlarged."""
     canvas = Canvas(WIDTH_PX, HEIGHT_PX + ENLARGED_PX)
     horizon = Skyline.trace(value.fix.position_enu_m[:2], value.terrain)
-    azimuth_deg = np.arange(0.0, 360.0 + STEP_DEG / 2, STEP_DEG)
-    horizon_deg = np.degrees(horizon(np.radians(azimuth_deg)))
+    light, status = value.light, status_of(value.light)
+    decided = np.isin(status, ("seen", "hidden"))  # brightest first
+    azimuth_rad, elevation_rad, status = light.azimuth_rad[decided], light.elevation_rad[decided], status[decided]
     title = f"{image_name(value.exposure)}: horizon of {value.terrain.name} at the position found, skyline of the image"
-    plot = _draw_horizon(canvas, title, azimuth_deg, horizon_deg)
-    status, light = status_of(value.light), value.light
-    decided = np.isin(status, ("seen", "hidden"))
-    star_az, star_el, status = light.azimuth_rad[decided], light.elevation_rad[decided], status[decided]
-    above_deg = np.degrees(star_el - horizon(star_az))
-    star_az, star_el = np.degrees(star_az), np.degrees(star_el)
-    near = np.flatnonzero(star_el < plot.high)[:MAX_STARS]
-    plot.draw_marks(star_az[near], star_el[near], status[near])
-    plot.draw_line(azimuth_deg, horizon_deg)
-    at_deg, elevation_deg = np.degrees(skyline.azimuth_rad), np.degrees(skyline.elevation_rad)
-    plot.draw_marks(at_deg, elevation_deg, skyline.source)
-    raised_deg, sigma_deg = elevation_deg - np.degrees(horizon(skyline.azimuth_rad)), np.degrees(skyline.sigma_rad)
-    half = half_range_deg(raised_deg, sigma_deg)
-    step = nice_step(half / 2)
-    half = np.ceil(half / step - 1e-9) * step
-    enlarged = _draw_plot(canvas, HEIGHT_PX, "enlarged: height above that horizon", -half, half, step)
-    enlarged.draw_ground(np.array([0.0, 360.0]), np.zeros(2))
-    enlarged.draw_bands(raised_deg, skyline)
-    enlarged.draw_scales()
-    enlarged.draw_line(np.array([0.0, 360.0]), np.zeros(2))
-    near = np.flatnonzero(np.abs(above_deg) < half)[:MAX_STARS]
-    enlarged.draw_marks(star_az[near], above_deg[near], status[near])
-    enlarged.draw_marks(at_deg, raised_deg, skyline.source)
+    plot = _draw_horizon(canvas, title, AZIMUTHS_RAD, horizon(AZIMUTHS_RAD))
+    near = np.flatnonzero(elevation_rad < np.radians(plot.high))[:MAX_STARS]
+    plot.draw_marks(azimuth_rad[near], elevation_rad[near], status[near])
+    plot.draw_line(AZIMUTHS_RAD, horizon(AZIMUTHS_RAD))
+    plot.draw_marks(skyline.azimuth_rad, skyline.elevation_rad, skyline.source)
+
+    raised_rad = skyline.elevation_rad - horizon(skyline.azimuth_rad)
+    plot = _draw_enlarged(canvas, raised_rad, skyline)
+    above_rad = elevation_rad - horizon(azimuth_rad)
+    near = np.flatnonzero(np.abs(above_rad) < np.radians(plot.high))[:MAX_STARS]
+    plot.draw_marks(azimuth_rad[near], above_rad[near], status[near])
+    plot.draw_marks(skyline.azimuth_rad, raised_rad, skyline.source)
     _draw_legend(canvas, HEIGHT_PX + ABOVE_PX / 2, [kind for kind in LEGEND if kind in {*status, *skyline.source}])
     return canvas.rendered_pixels()
 
 
-def _draw_horizon(canvas: Canvas, title: str, azimuth_deg: Array, elevation_deg: Array) -> Plot:
+def _draw_horizon(canvas: Canvas, title: str, azimuth_rad: Array, elevation_rad: Array) -> Plot:
     """A plot at the canvas's top with the ground below elevations (n,) at ascending azimuths (n,)."""
-    known = elevation_deg[np.isfinite(elevation_deg)]
+    known = np.degrees(elevation_rad[np.isfinite(elevation_rad)])
     low, high = min(float(known.min(initial=0.0)), 0.0), float(known.max(initial=0.0))
     step = nice_step(max(high - low, 2.0) / 3)
     low, high = np.floor(low / step) * step, np.ceil((high + 0.3 * step) / step) * step
     plot = _draw_plot(canvas, 0, title, low, high, step)
-    plot.draw_ground(azimuth_deg, elevation_deg)
+    plot.draw_ground(azimuth_rad, elevation_rad)
     plot.draw_scales()
+    return plot
+
+
+def _draw_enlarged(canvas: Canvas, raised_rad: Array, skyline: MeasuredSkyline) -> Plot:
+    """A plot below that of the horizon: the heights (n,) of the `skyline` above it, with their sigma."""
+    half = np.degrees(half_range_rad(raised_rad, skyline.sigma_rad))
+    step = nice_step(half / 2)
+    half = np.ceil(half / step - 1e-9) * step
+    plot = _draw_plot(canvas, HEIGHT_PX, "enlarged: height above that horizon", -half, half, step)
+    plot.draw_ground(np.array([0.0, 2 * np.pi]), np.zeros(2))
+    plot.draw_bands(raised_rad, skyline)
+    plot.draw_scales()
+    plot.draw_line(np.array([0.0, 2 * np.pi]), np.zeros(2))
     return plot
 
 

@@ -103,7 +103,7 @@ class Camera:
         return self.lens.angle_rad(np.hypot(*self.radial(px)))
 
     def radial(self, px: Array) -> tuple[Array, Array]:
-        """u, v = rho (cos b, sin b) of the pixels (..., 2), decentring removed."""
+        """u, v = rho (cos b, sin b) of the pixels `px` (..., 2), decentring removed."""
         px = np.asarray(px, dtype=np.float64)
         fx, fy = self.handed_focal_px
         u, v = (px[..., 0] - self.centre_px[0]) / fx, (px[..., 1] - self.centre_px[1]) / fy

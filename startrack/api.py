@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from startrack.inputs import (
     camera_input,
     exposure_input,
     field_of_view_rad,
+    is_list_of_centroids,
     load_camera_input,
     settings_input,
     terrain_input,
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
 __all__ = ["calibrate", "detect", "identify", "locate", "measure_horizon", "render"]
 
 ARGUMENT_OF_FLAG = {"--time UTC": "time="}  # messages of the stages name the flags of the commands
-MAX_LIST_COLUMNS = 4  # x, y, flux and error: an array (n, 4) is no image
 
 
 def locate(
@@ -121,7 +121,7 @@ def identify(
     given = [f"{name}=" for name, value in of_list.items() if value is not None]
     if given and isinstance(image, str | os.PathLike | Exposure):
         raise ValueError(f"{' and '.join(given)}: for lists of centroids only, and this is an image")
-    if given or _are_centroids(image):
+    if given or is_list_of_centroids(image):
         return _identify_list(image, camera, time, fov, size_px, flux, sigma_px)
     exposure = exposure_input(image, time)
     if fov is not None:
@@ -254,17 +254,6 @@ def render(
     )
     scene, rng = series.scene(number, f"{file_stem(ground.name)}-{seed}-{number:03d}")
     return render_scene(scene, rng=rng)
-
-
-def _are_centroids(image: Any) -> bool:
-    """Whether it is meant as a list of centroids, which need not be a valid one.
-
-    That is any list or iterator of pairs, and an array that is empty, or narrower than any image.
-    """
-    if isinstance(image, list | tuple | zip | map | Generator):
-        return True
-    shape = image.shape if isinstance(image, np.ndarray) else None
-    return shape is not None and (shape == (0,) or (len(shape) == 2 and 2 <= shape[1] <= MAX_LIST_COLUMNS))
 
 
 def _identify_list(

@@ -150,7 +150,8 @@ def write_atomically(path: FilePath, data: bytes, *, overwrite: bool, reason: st
 def check_free(path: FilePath, *, overwrite: bool, reason: str = "bad_image") -> None:
     """Raise BadInput `reason` if the file exists and may not be replaced."""
     if not overwrite and os.path.lexists(path):
-        raise BadInput(reason, f"{printable(path)}: exists already; overwriting is not enabled")
+        remedy = "replace it with -O (overwrite=True in the library), or write elsewhere"
+        raise BadInput(reason, f"{printable(path)}: exists already: {remedy}")
 
 
 @contextmanager

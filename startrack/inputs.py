@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Generator
 from datetime import UTC, datetime
 from typing import Any, TypeAlias
 
@@ -19,6 +20,7 @@ from startrack.types import BadInput, Exposure
 
 Image: TypeAlias = str | os.PathLike[str] | ArrayLike | Exposure
 Time: TypeAlias = Any  # text, datetime, datetime64, astropy Time (not imported for a type alone), or None
+MAX_LIST_COLUMNS = 4  # x, y, flux and error: an array (n, 4) is no image
 
 
 def exposure_input(image: Image, time: Time) -> Exposure:
@@ -45,6 +47,17 @@ def exposure_input(image: Image, time: Time) -> Exposure:
             "neighbours' median, say) and give the plain array",
         )
     return exposure_of(np.asarray(pixels), time_utc=time_utc)
+
+
+def is_list_of_centroids(image: Any) -> bool:
+    """Whether an argument `image` is meant as a list of centroids, which need not be a valid one.
+
+    That is any list or iterator of pairs, and an array that is empty, or narrower than any image.
+    """
+    if isinstance(image, list | tuple | zip | map | Generator):
+        return True
+    shape = image.shape if isinstance(image, np.ndarray) else None
+    return shape is not None and (shape == (0,) or (len(shape) == 2 and 2 <= shape[1] <= MAX_LIST_COLUMNS))
 
 
 def time_input(time: Time) -> datetime | None:

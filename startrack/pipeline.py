@@ -19,6 +19,7 @@ from startrack.orientation import (
     solve_orientation,
 )  # fmt: skip
 from startrack.sky_refinement import refine_by_sky_light
+from startrack.skyline import measured_skyline
 from startrack.stages import (
     Detected,
     Inputs,
@@ -75,7 +76,8 @@ def locate(
         if settings.evidence_sources != "stars":
             located = run.time_stage("locate", refine_by_sky_light, located, settings.evidence_sources == "both")
         sky_mag = None if step is None else step.brightness_mag_arcsec2(camera, exposure.exposure_s)
-        return run.finish(replace(located, sky_brightness_mag_arcsec2=sky_mag))
+        skyline = run.time_stage("locate", measured_skyline, located)
+        return run.finish(replace(located, sky_brightness_mag_arcsec2=sky_mag, skyline=skyline))
     except (BadInput, NoSolution) as refusal:
         return run.refuse(refusal)
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from startrack.evidence import Skyline
-from startrack.evidence.sky_checks import sectors_with_step
-from startrack.evidence.sky_levels import sector_of
+from startrack.evidence.sky_checks import MIN_SECTORS, sectors_with_step
+from startrack.evidence.sky_levels import SECTORS, sector_of
 from startrack.evidence.sky_light import MIDDLES_RAD, SkyLight, measure_sky_light, sum_cells
 from startrack.evidence.sky_pixels import pixels_near_skyline
 from startrack.evidence.star_offsets import OFFSET_TERMS
@@ -21,7 +21,7 @@ from startrack.localization.refinement import horizon_slopes, refine_fix
 from startrack.localization.skyline_fit import SkylineFit, fit_skyline
 from startrack.sky_errors import shared_errors
 from startrack.stages import Located, Measured
-from startrack.types import Array, Clock, ClockError, Evidence, Fix, NotLocated
+from startrack.types import Array, Bools, Clock, ClockError, Evidence, Fix, NotLocated
 
 ROUNDS = 8  # of predicted skylines
 SETTLED_PX = 0.3  # a skyline that moves by less need not be predicted anew
@@ -176,8 +176,8 @@ def _fit_step(
     """The step from a position (2,) that explains the skyline which the sky shows there. Raises NoSkyLight."""
     terrain = located.terrain
     used = sectors_with_step(sky) & terrain.is_informative(MIDDLES_RAD, sky.elevation_rad)
-    if not used.any():
-        raise NoSkyLight("no step of light is in enough directions at the skyline")
+    if np.count_nonzero(used) < MIN_SECTORS:
+        raise NoSkyLight(_too_few(sky, used))
     map_sigma_px = terrain.horizon_sigma_rad(position_m[None], MIDDLES_RAD) * sky.px_per_rad
     variance = np.where(used, variance_factor * sky.variance_px2 + np.square(map_sigma_px), np.inf)
     slopes = horizon_slopes(terrain, position_m, MIDDLES_RAD) * sky.px_per_rad[:, None]
@@ -188,6 +188,16 @@ def _fit_step(
     if fit is None:
         raise NoSkyLight("too much of it contradicts the predicted skyline")
     return fit
+
+
+def _too_few(sky: SkyLight, used: Bools) -> str:
+    """Why too few sectors (SECTORS,) are `used`: the skyline is not in view, has no step, or is not in the map."""
+    in_view, on_map, needed = (n * 360.0 / SECTORS for n in (sky.levels.covered.sum(), used.sum(), MIN_SECTORS))
+    if in_view < needed:
+        return f"the image shows sky and ground beside {in_view:.0f}° of the skyline, and {needed:.0f}° are needed"
+    if not on_map:
+        return f"no step of light is clear over {needed:.0f}° of the skyline"
+    return f"the terrain gives {on_map:.0f}° of the skyline that has a step of light, and {needed:.0f}° are needed"
 
 
 def _stars_near(measured: Measured, sky: SkyLight, raised_rad: Array) -> Evidence:

@@ -19,11 +19,14 @@ END_DENSITY = 0.05  # at either end of the window, beside the mean density
 SIMILAR = 3.0  # sigma by the stars, in that by the sky's light, up to which both count as sources
 
 
-def measured_skyline(located: Located) -> MeasuredSkyline:
+def measured_skyline(located: Located) -> MeasuredSkyline | None:
     """The skyline of a `located` image at the middles of 240 sectors of azimuth, without the terrain's heights.
 
-    The terrain serves for the shape of the skyline within each sector only: the elevation is that of the image.
+    The terrain serves for the shape of the skyline within each sector only: the elevation is that of the image. None
+    where several positions fit, and of a method of localization that is not right to the error of the image.
     """
+    if located.fix.ambiguous or located.fix.search == "approximate":
+        return None
     horizon = Skyline.trace(located.fix.position_enu_m[:2], located.terrain)
     elevation, sigma = _by_stars(located.evidence(), horizon)
     source = np.where(sigma < MOST_SIGMA_RAD, "stars", "").astype("<U9")

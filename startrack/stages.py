@@ -36,6 +36,7 @@ from startrack.types import (
     Exposure,
     Fix,
     Identification,
+    MeasuredSkyline,
     NoSolution,
     Stars,
 )  # fmt: skip
@@ -174,14 +175,10 @@ class Located(Measured):
     skyline_fit: SkylineFit | None = None  # of the skyline that the sky's light shows, to that of the fix
     by_stars: bool = True  # whether the stars' rows are in the posterior too
     sky_unused: str = ""  # why the sky's light is not used
+    skyline: MeasuredSkyline | None = None  # that the image shows; None: not one position, or not right to its error
     sky_brightness_mag_arcsec2: float | None = (
         None  # of the sky beyond the ground at the skyline; None: no step, no zero point
     )
-
-    @property
-    def has_skyline(self) -> bool:
-        """Whether the image's skyline can be stated: at one position, by a method that is right to its error."""
-        return not self.fix.ambiguous and self.fix.search != "approximate"
 
     @property
     def evidence_source(self) -> str:

@@ -121,14 +121,15 @@ def test_stars_alone_give_no_heading():
 
 def test_writing_replaces_what_an_earlier_result_left(solution, tmp_path):
     stale = [
-        tmp_path / f"near-wall{end}" for end in (".annotated.png", ".wcs", ".corr", ".stars.ecsv", ".skyline.ecsv")
+        tmp_path / f"near-wall.{end}"
+        for end in ("annotated.png", "skyline.png", "wcs", "corr", "stars.ecsv", "skyline.ecsv")
     ]
     for path in stale:
         path.write_text("of an earlier run")
     (tmp_path / "near-wall-2.wcs").write_text("of another image")
     solution.write(tmp_path, plots=False)
-    assert not stale[0].exists()
-    assert all(path.read_bytes() != b"of an earlier run" for path in stale[1:])
+    assert not stale[0].exists() and not stale[1].exists()
+    assert all(path.read_bytes() != b"of an earlier run" for path in stale[2:])
     assert (tmp_path / "near-wall-2.wcs").read_text() == "of another image"
     solution.write(tmp_path, plots=False)  # of the same image: replaced
     refused = startrack.locate(read_exposure(IMAGE), time="2030-01-01T00:00:00Z")

@@ -93,7 +93,7 @@ def test_images_are_found_in_the_order_of_their_names(night):
 
 
 def test_equal_stems_keep_their_suffix(tmp_path):
-    for name in ("a.png", "a.tif", "b.fits.bz2", "b.jpg", "c.annotated.png"):
+    for name in ("a.png", "a.tif", "b.fits.bz2", "b.jpg", "c.annotated.png", "c.skyline.png"):
         (tmp_path / name).touch()
     assert [image.stem for image in images_under(tmp_path)] == ["a.png", "a.tif", "b.fits.bz2", "b.jpg"]
 

@@ -176,6 +176,11 @@ def test_missing_stars_are_weaker_evidence_under_clouds():
     assert clear[1] == pytest.approx(-np.log(0.01), abs=0.1)
 
 
+def test_the_brightest_star_counts_as_much_as_a_bright_one():
+    bright, brightest = limit_llr(np.array([100.0, 1e5]), np.array(0.01), 0.01)
+    assert brightest == bright == pytest.approx(np.log(0.99 / 0.01))
+
+
 def test_the_csv_has_a_row_a_degree(tmp_path):
     write_skyline(str(tmp_path / "a.csv"), small_skyline(), LOWELL, overwrite=False)
     lines = (tmp_path / "a.csv").read_text().splitlines()
@@ -228,7 +233,7 @@ def test_unknown_suffixes_and_existing_files_are_refused(tmp_path):
     with pytest.raises(BadInput, match="suffix"):
         check_output(str(tmp_path / "a.txt"), overwrite=False)
     (tmp_path / "a.csv").write_text("mine")
-    with pytest.raises(BadInput, match="exists"):
+    with pytest.raises(BadInput, match="replace it with -O"):
         check_output(str(tmp_path / "a.csv"), overwrite=False)
     check_output(str(tmp_path / "a.csv"), overwrite=True)
 

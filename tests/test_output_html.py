@@ -23,7 +23,7 @@ from startrack.errors import Reason
 from startrack.localization.rim_plane import point_fix
 from startrack.output import result_dict, write_json, write_results
 from startrack.output.html import page_text, result_at, results_under
-from startrack.output.html.details import ground_map
+from startrack.output.html.details import SOURCES, ground_map, skyline_of
 from startrack.output.html.gather import folder_of
 from startrack.output.html.rows import COLUMNS, facts_of
 from startrack.terrain import load_terrain
@@ -180,6 +180,38 @@ def test_the_horizon_is_that_of_the_crater(text, located):
     rim_m = -along + np.sqrt(along**2 + 10_000.0**2 - east**2 - north**2)
     np.testing.assert_allclose(horizon, np.degrees(np.arctan2(2000.0 - 1.5, rim_m)), atol=0.002)
     assert data_of(text, "results")["terrains"]["shackleton-thesis"]["rim_m"] == 10_000.0
+
+
+def test_the_skyline_is_that_of_its_table(text, results, located):
+    skyline, stars = data_of(text, "detail-3")["skyline"], data_of(text, "detail-3")["stars"]["columns"]
+    table = Table.read(results / "small.skyline.ecsv", format="ascii.ecsv")
+    known = table[~np.ma.getmaskarray(table["elevation_deg"])]
+    assert len(skyline["az"]) == len(known) > 100
+    for name, column in (("az", "azimuth_deg"), ("el", "elevation_deg"), ("sigma", "sigma_deg")):
+        np.testing.assert_allclose(skyline[name], known[column], atol=0.0006)
+    assert [SOURCES[k] for k in skyline["source"]] == known["source"].tolist()
+    result = located.result
+
+    def horizon_deg(azimuth_deg):
+        return np.degrees(result.terrain.horizon_rad(result.fix.position_enu_m[None, :2], np.radians(azimuth_deg)))
+
+    raised = np.array(known["elevation_deg"]) - horizon_deg(np.array(known["azimuth_deg"]))
+    np.testing.assert_allclose(skyline["above"], raised, atol=0.001)
+    assert np.mean(np.abs(raised) + 2 * np.array(known["sigma_deg"]) <= skyline["half"] + 0.001) == pytest.approx(
+        0.95, abs=0.02
+    )
+    heights = np.array(stars["el"]) - horizon_deg(np.array(stars["az"]))
+    near = [k for k, _ in skyline["near"]]
+    assert near == np.flatnonzero(np.abs(heights) < skyline["half"]).tolist() and near
+    np.testing.assert_allclose([height for _, height in skyline["near"]], heights[near], atol=0.001)
+    assert len(json.dumps(skyline, separators=(",", ":"))) < 10_000  # bytes, of each image
+
+
+def test_results_without_a_skyline_or_a_terrain_show_what_there_is(text, results):
+    assert [data_of(text, f"detail-{k}")["skyline"] for k in range(3)] == [None] * 3
+    shown = skyline_of(results / "small.skyline.ecsv", None, None)
+    assert shown is not None and "above" not in shown and len(shown["el"]) > 100
+    assert skyline_of(results / "dark.skyline.ecsv", None, None) is None
 
 
 def test_only_some_images_have_details_and_all_have_a_row(results, tmp_path):

@@ -212,8 +212,37 @@ def test_words_beside_the_axes_keep_apart(window, size):
         "const at = xs.map(x => v.screen(x, 0)[0]); return at.slice(1).map((x, k) => x - at[k]"
         "- (widthOf(v, xs[k], step) + widthOf(v, xs[k + 1], step)) / 2) })"
     )
-    assert len(rooms) == 3
+    assert len(rooms) == 4
     assert min(room for one in rooms for room in one) > 4
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_the_skyline_of_the_image_is_shown_twice(window, size):
+    """On the panorama and enlarged: each point has its elevation with sigma, source and height above the map's."""
+    w = window(size)
+    w.open("small.png")
+    views = "[...View.all].filter(v => v.axes && find('detail').contains(v.node) && /horizon/.test(v.label))"
+    panorama, enlarged = w.page.evaluate(
+        f"{views}.map(v => v.points.filter(p => p.kind in SKYLINES).map(p => [p.x, p.y, p.el, p.sigma, p.above]))"
+    )
+    assert len(panorama) == len(enlarged) > 100
+    assert all(y == el for _, y, el, _, _ in panorama) and all(y == above for _, y, _, _, above in enlarged)
+    card = w.page.locator("section", has=w.page.get_by_role("heading", name="Panorama"))
+    assert "The skyline of the image, enlarged" in card.inner_text()
+    figure = card.locator("figure").nth(1)
+    canvas = figure.locator("canvas").first
+    canvas.scroll_into_view_if_needed()
+    x, y = canvas.evaluate("c => c.view.screen(...['x', 'y'].map(k => c.view.points.find(p => p.kind in SKYLINES)[k]))")
+    canvas.click(position={"x": x, "y": y})
+    tip = figure.locator(".tip").inner_text()
+    for words in ("Skyline of the image at azimuth", "elevation", "±", "above the map's", "from"):
+        assert words in tip
+    boxes = figure.get_by_role("group", name="Skyline of the image").get_by_role("checkbox")
+    shown = "c => c.view.points.filter(p => p.kind in SKYLINES && c.view.shown(p)).length"
+    assert canvas.evaluate(shown) == len(enlarged)
+    for k in range(boxes.count()):
+        boxes.nth(k).uncheck()
+    assert canvas.evaluate(shown) == 0
 
 
 def test_a_file_is_shown_by_its_name_and_found_by_its_path(window):

@@ -13,7 +13,7 @@ from jsonschema import Draft202012Validator
 from startrack.errors import Reason
 from startrack.frames import R_from_rotvec, heading_pitch_roll_from_R_body_enu
 from startrack.output import quantities, result_dict, views
-from startrack.output.quantities import Column, Listed, Quantity, show_everywhere
+from startrack.output.quantity import Column, Listed, Quantity, show_everywhere
 from startrack.output.schema import SCHEMAS
 from startrack.output.schema_parts import POSITIVE
 from startrack.output.values import body_sigmas_deg

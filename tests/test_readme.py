@@ -65,7 +65,8 @@ def test_the_locate_command_prints_what_the_page_shows(clone, capsys):
     shown = blocks(README, "text")[0].strip()
     same_result(printed, shown)
     files = [
-        f"near-wall{end}" for end in (".annotated.png", ".corr", ".fix.json", ".skyline.ecsv", ".stars.ecsv", ".wcs")
+        f"near-wall.{end}"
+        for end in ("annotated.png", "corr", "fix.json", "skyline.ecsv", "skyline.png", "stars.ecsv", "wcs")
     ]
     assert sorted(path.name for path in (clone / "startrack-out").iterdir()) == files
 

@@ -7,6 +7,7 @@ import pytest
 from render_helpers import CRATER, FISHEYE, SENSOR, SITE, make_scene
 
 from startrack.camera import KannalaBrandt
+from startrack.camera.decentring import Decentring
 from startrack.frames import azel_from_rays
 from startrack.rendering import light_e
 from startrack.rendering.sky import coverage, sky_e_per_s
@@ -46,13 +47,22 @@ def test_vignetting_and_gradient():
 
 
 @pytest.mark.parametrize("tilt", [(0.0, 0.0, 0.0), (25.0, 5.0, -4.0)])
-@pytest.mark.parametrize("k", [(), (-0.03, 0.004, -0.001)])
-def test_the_step_stands_at_the_skyline(tilt, k):
-    camera = replace(FISHEYE, lens=KannalaBrandt(k))
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"lens": KannalaBrandt((-0.03, 0.004, -0.001))},
+        {"decentring": Decentring(0.02, -0.01)},  # up to 20 px, far more than the PSF
+        {"lens": KannalaBrandt((-0.03,)), "decentring": Decentring(-0.02, 0.005), "mirrored": True},
+    ],
+)
+def test_the_step_stands_at_the_skyline(tilt, changes):
+    camera = replace(FISHEYE, **changes)
     settings = {"camera": camera, "heading_pitch_roll_deg": tilt, "sky_v_mag_arcsec2": 20.0}
     open_sky = light_e(make_scene(**settings))
     scene = make_scene(**settings, terrain=CRATER, position_enu_m=PLACE)
     walled = light_e(scene)
+    measured = 0
     for azimuth in np.radians(np.arange(0, 360, 30.0)):
         horizon = CRATER.horizon_rad(PLACE[:2], azimuth)
         elevations = horizon + np.radians(np.linspace(-3, 3, 1201))
@@ -67,6 +77,25 @@ def test_the_step_stands_at_the_skyline(tilt, k):
         assert np.linalg.norm(middle - px[600]) < 0.05, np.degrees(azimuth)
         assert level[0] == pytest.approx(0.0, abs=1e-3)
         assert level[-1] == pytest.approx(1.0, abs=1e-3)
+        measured += 1
+    assert measured >= 4
+
+
+def test_the_image_circle_of_a_decentred_lens_ends_where_its_last_rays_fall():
+    camera = replace(FISHEYE, decentring=Decentring(0.02, -0.01))
+    sky = light_e(make_scene(camera=camera, sky_v_mag_arcsec2=20.0))
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+
+    def pixels_at(angle_rad):
+        rays = [np.sin(angle_rad) * np.cos(turn), np.sin(angle_rad) * np.sin(turn), np.full(24, np.cos(angle_rad))]
+        return camera.project_unlimited(np.stack(rays, axis=-1))
+
+    edge, within = pixels_at(np.radians(85.0)), pixels_at(np.radians(82.0))
+    inside = np.all((edge > 2) & (edge < 509), axis=-1)
+    assert inside.sum() >= 12
+    dimmer = np.sinc(85 / 180) / np.sinc(82 / 180)  # a pixel farther out sees less sky
+    ratio = bilinear(sky, edge[inside]) / bilinear(sky, within[inside])
+    assert ratio == pytest.approx(0.5 * dimmer, abs=0.03)  # a pixel of displacement makes 0.3
 
 
 def bilinear(image, px):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,16 +14,27 @@ import pytest
 from astropy.table import QTable
 
 from startrack import pipeline
-from startrack.camera import load_camera
+from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, load_catalog
 from startrack.errors import Reason
 from startrack.evidence.sky_light import MIDDLES_RAD
 from startrack.localization import PseudoGradient
 from startrack.output import write_results
+from startrack.output.picture.canvas import MEASURED
+from startrack.output.picture.panorama import (
+    ABOVE_PX,
+    BELOW_PX,
+    ENLARGED_PX,
+    HEIGHT_PX,
+    MARGIN_PX,
+    RIGHT_PX,
+    WIDTH_PX,
+    located_picture,
+)
+from startrack.output.skyline_table import half_range_rad
 from startrack.output.write import prepare_folder
 from startrack.pipeline import Settings
 from startrack.rendering import Series, Truth, render
-from startrack.skyline import measured_skyline
 from startrack.solution import Solution
 from startrack.stages import Inputs, Located, Refused
 from startrack.terrain import load_terrain
@@ -53,12 +65,15 @@ class Frame:
         return float(np.linalg.norm((located.fix.position_enu_m - self.truth.position_enu_m)[:2]))
 
 
-def expose(catalog: StarCatalog, place_m: tuple[float, float], sky_v_mag_arcsec2: float | None) -> Frame:
+def expose(
+    catalog: StarCatalog, place_m: tuple[float, float], sky_v_mag_arcsec2: float | None, camera: Camera = CAMERA,
+    heading_rad: float | None = None,
+) -> Frame:  # fmt: skip
     """A frame of the crater; None is a black sky."""
     series = Series(
-        camera=CAMERA, terrain=CRATER, catalog=catalog, seed=3, time_utc=datetime(2031, 2, 3, tzinfo=UTC),
+        camera=camera, terrain=CRATER, catalog=catalog, seed=3, time_utc=datetime(2031, 2, 3, tzinfo=UTC),
         east_m=place_m[0], north_m=place_m[1], exposure_s=EXPOSURE_S, faint_v_mag=None, hot_pixels=20,
-        sky_v_mag_arcsec2=sky_v_mag_arcsec2,
+        sky_v_mag_arcsec2=sky_v_mag_arcsec2, heading_rad=heading_rad,
     )  # fmt: skip
     scene, rng = series.scene(0, "frame")
     exposure, truth = render(scene, rng=rng)
@@ -107,7 +122,8 @@ def test_a_lens_that_is_not_quite_its_file_keeps_the_truth_in_the_circle(bright:
 
 def test_the_measured_skyline_is_the_true_one(bright: Frame, by_source: dict[str, Located]) -> None:
     for source, least in (("both", 200), ("sky", 200), ("stars", 10)):
-        found = measured_skyline(by_source[source])
+        found = by_source[source].skyline
+        assert found is not None
         assert len(found) == 240 and np.count_nonzero(found.known) > least
         true = CRATER.horizon_rad(bright.truth.position_enu_m[None, :2], found.azimuth_rad)
         z = ((found.elevation_rad - true) / found.sigma_rad)[found.known]
@@ -122,7 +138,7 @@ def test_the_measured_skyline_is_the_true_one(bright: Frame, by_source: dict[str
             used = by_source[source].skyline_fit.used
             assert np.isin(found.source[used], ("sky light", "both")).all()
             assert (found.source[~used] != "sky light").all()
-    sigma = [np.median(measured_skyline(by_source[source]).sigma_rad) for source in ("both", "stars")]
+    sigma = [np.median(by_source[source].skyline.sigma_rad) for source in ("both", "stars")]
     assert sigma[0] < 0.2 * sigma[1]
 
 
@@ -149,12 +165,26 @@ def test_a_black_sky_leaves_the_stars(catalog: StarCatalog) -> None:
     assert alone.reason == "insufficient_geometry" and "light of the sky" in alone.message
 
 
+def test_a_camera_that_shows_little_of_the_skyline_leaves_the_stars(catalog: StarCatalog) -> None:
+    """The frame is a part of the camera's on one side: a quarter of the skyline must be in it."""
+    for width, source in ((324, "both"), (184, "stars")):
+        camera = replace(CAMERA, size_px=(width, 1024), centre_px=(511.5 - 1024 + width, 511.5))
+        found = locate(expose(catalog, PLACES_M["halfway"], 21.0, camera, heading_rad=0.3), catalog, camera)
+        assert found.status == "ok" and found.evidence_source == source
+        degrees = re.fullmatch(
+            "the image shows sky and ground beside (.*)° of the skyline, and 90° are needed", found.sky_unused
+        )
+        assert (degrees is None) == (source == "both")
+        if degrees is not None:
+            assert 30 < float(degrees[1]) < 80
+
+
 def test_a_method_without_a_posterior_does_not_use_the_sky(bright: Frame, catalog: StarCatalog) -> None:
     found = locate(bright, catalog, localizer=PseudoGradient())
     assert found.status == "ok" and found.evidence_source == "stars"
     assert found.fix.search == "approximate"
     assert found.sky_unused == "the method of localization has no posterior"
-    assert not found.has_skyline and Solution(found).skyline is None
+    assert found.skyline is None and Solution(found).skyline is None
 
 
 def test_unknown_sources_are_refused() -> None:
@@ -168,7 +198,8 @@ def test_the_table_of_the_skyline(by_source: dict[str, Located], tmp_path: Path)
     write_results(found, path, plots=False)
     assert json.loads(path.read_text(encoding="utf-8"))["position"]["evidence"] == "both"
     table = QTable.read(tmp_path / "frame.skyline.ecsv", format="ascii.ecsv")
-    skyline = measured_skyline(found)
+    skyline = found.skyline
+    assert skyline is not None
     assert table["azimuth_deg"].value == pytest.approx(np.degrees(skyline.azimuth_rad), abs=1e-6)
     known = skyline.known
     assert table["elevation_deg"].value[known] == pytest.approx(np.degrees(skyline.elevation_rad)[known], abs=1e-4)
@@ -179,6 +210,49 @@ def test_the_table_of_the_skyline(by_source: dict[str, Located], tmp_path: Path)
     shown = Solution(found).skyline
     assert shown is not None and shown.colnames == table.colnames
     assert np.array_equal(shown["source"].filled(""), skyline.source)
+
+
+def test_the_skyline_is_measured_once(
+    by_source: dict[str, Located], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(located: Located) -> None:
+        raise AssertionError("the skyline is measured again")
+
+    monkeypatch.setattr("startrack.skyline.measured_skyline", fail)
+    monkeypatch.setattr("startrack.pipeline.measured_skyline", fail)
+    write_results(by_source["both"], tmp_path / "frame.fix.json")
+    assert Solution(by_source["both"]).skyline is not None
+    assert {path.name for path in tmp_path.glob("frame.skyline.*")} == {"frame.skyline.ecsv", "frame.skyline.png"}
+
+
+def test_the_picture_shows_the_skyline_above_the_horizon(by_source: dict[str, Located]) -> None:
+    """Raised by some hundredths of a degree, its marks stand higher by their share of the enlarged plot's height."""
+    found, skyline = by_source["both"], by_source["both"].skyline
+    assert skyline is not None
+    by_sky = skyline.source == "sky light"
+    horizon_rad = CRATER.horizon_rad(found.fix.position_enu_m[None, :2], skyline.azimuth_rad)
+    heights_px = []
+    for raised_deg in (-0.02, 0.02):
+        at = replace(
+            skyline, elevation_rad=np.where(by_sky, horizon_rad + np.radians(raised_deg), np.nan),
+            sigma_rad=np.where(by_sky, np.radians(0.02), np.inf), source=np.where(by_sky, skyline.source, ""),
+        )  # fmt: skip
+        picture = located_picture(found, at)
+        assert picture.shape == (HEIGHT_PX + ENLARGED_PX, WIDTH_PX, 3)
+        plot = picture[HEIGHT_PX + int(ABOVE_PX) + 2 : -int(BELOW_PX) - 2, int(MARGIN_PX) + 2 : -int(RIGHT_PX) - 2]
+        rows = np.flatnonzero((plot == MEASURED).all(axis=-1).sum(axis=1) > 50)
+        assert len(rows) > 0
+        heights_px.append(plot.shape[0] / 2 - rows.mean())
+    half_deg = 0.06  # 0.02 and two sigma
+    px_per_deg = (ENLARGED_PX - ABOVE_PX - BELOW_PX) / (2 * half_deg)
+    assert heights_px == pytest.approx([-0.02 * px_per_deg, 0.02 * px_per_deg], abs=1.5)
+
+
+def test_the_enlarged_range_holds_the_skyline_and_not_its_outliers() -> None:
+    raised, sigma = np.append(np.full(99, 2e-3), [0.05, np.nan]), np.append(np.full(100, 1e-3), np.inf)
+    assert half_range_rad(raised, sigma) == pytest.approx(4e-3)
+    assert half_range_rad(raised * 1e-3, sigma * 1e-3) == pytest.approx(np.radians(0.02))
+    assert half_range_rad(raised * 1e3, sigma) == half_range_rad(np.array([np.nan]), sigma[-1:]) == np.radians(5.0)
 
 
 def test_a_refusal_removes_the_table(by_source: dict[str, Located], tmp_path: Path) -> None:

@@ -12,9 +12,8 @@ from pathlib import Path, PurePosixPath
 
 from startrack.exposure.metadata import PACKING_SUFFIXES, PICTURE_SUFFIXES
 from startrack.files import existing_folder
+from startrack.output.write import PICTURES
 from startrack.types import BadInput
-
-OWN_PICTURES = (".annotated.png",)
 
 
 @dataclass(frozen=True, order=True)
@@ -138,7 +137,7 @@ def _is_file(folder: Path, name: str) -> bool:
 
 def _is_image(name: str) -> bool:
     lower = name.lower()
-    if lower.startswith(".") or lower.endswith(OWN_PICTURES):
+    if lower.startswith(".") or lower.endswith(PICTURES):
         return False
     return any(Path(one).suffix in PICTURE_SUFFIXES for one in _names_without_compression(lower))
 

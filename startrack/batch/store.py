@@ -13,7 +13,7 @@ from startrack.batch.find import Image
 from startrack.batch.fingerprint import sha256_of
 from startrack.errors import BadInput
 from startrack.files import Locked, hold_lock
-from startrack.output.write import COMPANIONS
+from startrack.output.write import COMPANIONS, PICTURES, SKYLINE_FILES
 
 JOB = "job_sha256"  # hash of a result's inputs (content of its files, flags, version); null: the next run repeats it
 INPUTS = "inputs"  # camera and terrain files that the result was made with: path from the image to SHA-256
@@ -21,8 +21,6 @@ MANIFEST = "manifest.json"
 LOCK = ".startrack-batch.lock"
 RESULT = "result"  # in the manifest: path of NAME.fix.json within the folder; null where that is an earlier solution
 SOLVED = ("ok", "ambiguous")
-SKYLINE = ".skyline.ecsv"
-PICTURE = ".annotated.png"
 NEEDED = {  # by the tables, of a record that is ok
     "position": ("east_m", "north_m", "up_m", "covariance_m2"),
     "attitude": ("quat_xyzw_body_enu", "quat_xyzw_cam_icrs", "sigma_arcsec"),
@@ -61,13 +59,13 @@ def is_solved(record: dict[str, Any] | None) -> bool:
 
 
 def has_companions(record: dict[str, Any], result: Path, *, plots: bool) -> bool:
-    """Whether star table, skyline, WCS and picture are beside a solved record; other records need none."""
+    """Whether tables, WCS and pictures are beside a solved record; other records need none."""
     stem = result.name.removesuffix(".fix.json")
     needed = {*COMPANIONS} if is_solved(record) else set()
     if not plots:
-        needed -= {PICTURE}
+        needed -= {*PICTURES}
     if record["status"] != "ok" or record["position"].get("search") == "approximate":
-        needed -= {SKYLINE}
+        needed -= {*SKYLINE_FILES}
     return all(result.with_name(f"{stem}{suffix}").is_file() for suffix in needed)
 
 

@@ -92,7 +92,7 @@ class Camera:
 
     def unproject(self, px: Array) -> Array:
         """Unit rays_cam (..., 3) of the pixels `px` (..., 2): the exact inverse of `project`."""
-        u, v = self._radial(px)
+        u, v = self.radial(px)
         rho = np.hypot(u, v)
         angle = self.lens.angle_rad(rho)
         scale = np.sin(angle) / np.where(rho > 0, rho, 1.0)
@@ -100,10 +100,10 @@ class Camera:
 
     def angle_rad(self, px: Array) -> Array:
         """Angle (...) off the axis [rad] of the pixels `px` (..., 2)."""
-        return self.lens.angle_rad(np.hypot(*self._radial(px)))
+        return self.lens.angle_rad(np.hypot(*self.radial(px)))
 
-    def _radial(self, px: Array) -> tuple[Array, Array]:
-        """u, v = rho (cos b, sin b) of the pixels (..., 2), decentring removed."""
+    def radial(self, px: Array) -> tuple[Array, Array]:
+        """u, v = rho (cos b, sin b) of the pixels `px` (..., 2), decentring removed."""
         px = np.asarray(px, dtype=np.float64)
         fx, fy = self.handed_focal_px
         u, v = (px[..., 0] - self.centre_px[0]) / fx, (px[..., 1] - self.centre_px[1]) / fy

@@ -31,7 +31,7 @@ def add_parser(subparsers: Any) -> None:
         help="image to position and attitude",
         description="Locate the camera in each image: detect, identify, attitude, evidence, position. Camera, terrain "
         "and time come from flags, else from NAME.json beside the image, else from its header. Writes NAME.fix.json, "
-        "NAME.stars.ecsv, NAME.skyline.ecsv, NAME.wcs, NAME.corr and NAME.annotated.png.",
+        "NAME.stars.ecsv, NAME.skyline.ecsv, NAME.wcs, NAME.corr, NAME.annotated.png and NAME.skyline.png.",
     )
     add_image_flags(parser)
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file, or the name of a shipped one")

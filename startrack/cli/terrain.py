@@ -91,12 +91,13 @@ def _show_terrain(args: argparse.Namespace) -> int:
 
 
 def _pictures(args: argparse.Namespace, terrain: Terrain, position: tuple[float, float] | None) -> list[Path]:
-    from startrack.output.picture.terrain_picture import panorama_picture, relief_picture
+    from startrack.output.picture.panorama import horizon_picture
+    from startrack.output.picture.terrain_picture import relief_picture
 
     out, stem = make_folder(args.dir, "bad_terrain"), file_stem(terrain.name)
     pictures = {out / f"{stem}.relief.png": relief_picture(terrain, position)}
     if position is not None:
-        pictures[out / f"{stem}.horizon.png"] = panorama_picture(terrain, position)
+        pictures[out / f"{stem}.horizon.png"] = horizon_picture(terrain, position)
     from PIL import Image
 
     for path, picture in pictures.items():

@@ -29,6 +29,7 @@ GROUND_PER_RAD, GROUND_CONTRAST = np.degrees(0.3), 0.15  # density of steps belo
 LOW_MISSING, LOW_SCALE_RAD = 0.4, np.radians(3.0)  # near the horizon: haze dims stars more than the fit
 HIGH_1_PER_RAD = 4.0  # per column; neighbours add up
 LEAST_LLR = 0.25  # rows below it are left out
+LARGEST_LLR = 500.0  # of a star, before the limits: its exponential would overflow at 710
 EDGE_SIGMAS = 5.0
 OUTLIER_PROBABILITY = 1e-4  # of a column whose evidence means nothing
 
@@ -79,7 +80,7 @@ def star_log_likelihood(rays: Evidence, missing: float, spurious: float) -> Arra
 
 def limit_llr(llr: Array, missing: Array, spurious: float) -> Array:
     """Log-likelihood ratios (n,) with the probabilities of a visible star not seen, and of a hidden one seen."""
-    ratio = np.exp(llr)
+    ratio = np.exp(np.minimum(llr, LARGEST_LLR))
     return np.asarray(np.log(((1 - missing) * ratio + missing) / (spurious * ratio + 1 - spurious)))
 
 

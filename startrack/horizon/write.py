@@ -121,8 +121,6 @@ def _closed_deg(skyline: MeasuredSkyline) -> tuple[Array, Array]:
 
 def _picture(skyline: MeasuredSkyline) -> bytes:
     """The panorama as PNG."""
-    from startrack.output.picture.terrain_picture import skyline_picture
+    from startrack.output.picture.panorama import skyline_picture
 
-    closed = [np.append(values, values[0]) for values in (skyline.elevation_rad, skyline.sigma_rad)]
-    azimuth = np.append(skyline.azimuth_rad, 2 * np.pi)
-    return png_bytes(skyline_picture(azimuth, closed[0], "measured skyline", closed[1]))
+    return png_bytes(skyline_picture(skyline))

@@ -71,10 +71,10 @@ def _copy_along(found: Explored, steps_m: Array, share: Array, terrain: Terrain)
     narrow = smallest_axis(centres, 2 * found.half_m, log)
     apart = max(STEP_SIGMAS * narrow, found.half_m, way[-1] * len(log) / MOST_BOXES)
     group = np.floor(way / apart).astype(np.int64)  # steps that lie closer together make one copy
-    mass: Array = np.bincount(group, weights=share).astype(np.float64)
-    middle = np.stack([np.bincount(group, weights=share * along) for along in steps_m.T], axis=1)
-    middle, mass = middle[mass > 0.0] / mass[mass > 0.0, None], mass[mass > 0.0]
+    mass = np.bincount(group, weights=share)
+    used = mass > 0.0
+    middle = np.stack([np.bincount(group, weights=share * along)[used] / mass[used] for along in steps_m.T], axis=1)
     points = (centres + middle[:, None]).reshape(-1, 2)
     inside = np.asarray(terrain.allowed(points))
-    weights = (log + np.log(mass)[:, None]).ravel()
+    weights = (log + np.log(mass[used])[:, None]).ravel()
     return found._replace(centres_m=points[inside], log_likelihood=weights[inside])

@@ -104,7 +104,7 @@ class SureRows:
 
 
 def check_consistency(evidence: Evidence, fix: Fix, terrain: Terrain) -> None:
-    """Raise NotLocated (inconsistent_evidence) where the `evidence` contradicts the `fix`, the `terrain` or the time."""
+    """Raise NotLocated (inconsistent_evidence) where the `evidence` contradicts the `fix`, `terrain` or time."""
     evidence = lower_evidence(evidence, fix.horizon_error_rad)
     sure = SureRows.at_fix(evidence, fix, terrain)
     stretches = contradicted_stretches(sure.explained_by_sector)

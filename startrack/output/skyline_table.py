@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.output.ecsv import Column, ecsv_text, format_values
-from startrack.types import MeasuredSkyline
+from startrack.types import Array, MeasuredSkyline
+
+LEAST_HALF_RAD, MOST_HALF_RAD = np.radians(0.02), np.radians(5.0)
 
 
 def skyline_table_text(skyline: MeasuredSkyline) -> str:
@@ -17,6 +19,18 @@ def skyline_table_text(skyline: MeasuredSkyline) -> str:
         Column("sigma_deg", sigma, unit="deg", description="standard deviation of the elevation"),
         Column("source", skyline.source, "string", description="stars, sky light, both"),
     ])  # fmt: skip
+
+
+def half_range_rad(raised_rad: Array, sigma_rad: Array) -> float:
+    """Half the range [rad] that shows heights (n,) of a skyline above a predicted one, two sigma (n,) included.
+
+    One height in twenty may lie beyond it; nan where a height is not known.
+    """
+    known = np.isfinite(raised_rad)
+    if not known.any():
+        return float(MOST_HALF_RAD)
+    reach = np.quantile(np.abs(raised_rad[known]) + 2.0 * sigma_rad[known], 0.95)
+    return float(np.clip(reach, LEAST_HALF_RAD, MOST_HALF_RAD))
 
 
 def skyline_texts_deg(skyline: MeasuredSkyline) -> tuple[list[str], list[str], list[str]]:

@@ -15,10 +15,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from startrack.stages import Located, Oriented, Outcome
+    from startrack.types import MeasuredSkyline
 
-STAR_FILES = (".stars.ecsv", ".annotated.png", ".wcs", ".corr")  # beside NAME.identification.json
-COMPANIONS = (*STAR_FILES, ".skyline.ecsv")  # beside NAME.fix.json
-KINDS = {"fix": COMPANIONS, "identification": STAR_FILES, "detections": (".annotated.png",)}  # most complete first
+ANNOTATED = ".annotated.png"
+SKYLINE_TABLE, SKYLINE_PICTURE = SKYLINE_FILES = (".skyline.ecsv", ".skyline.png")  # where the image shows a skyline
+PICTURES = (ANNOTATED, SKYLINE_PICTURE)
+STAR_FILES = (".stars.ecsv", ANNOTATED, ".wcs", ".corr")  # beside NAME.identification.json
+COMPANIONS = (*STAR_FILES, *SKYLINE_FILES)  # beside NAME.fix.json
+KINDS = {"fix": COMPANIONS, "identification": STAR_FILES, "detections": (ANNOTATED,)}  # most complete first
 FilePath = str | os.PathLike[str]
 
 
@@ -70,9 +74,9 @@ def _stem_and_kind(record: Path) -> tuple[str, str]:
 
 
 def write_results(outcome: Outcome, path: Path, *, plots: bool = True, write_record: bool = True) -> dict[str, Any]:
-    """The record of an `outcome`, written to `path` (such as NAME.fix.json) after star table, WCS and picture.
+    """The record of an `outcome`, written to `path` (such as NAME.fix.json) after tables, WCS and pictures.
 
-    `plots` and `write_record`: whether the picture and the record are written. Raises BadInput where a file cannot
+    `plots` and `write_record`: whether the pictures and the record are written. Raises BadInput where a file cannot
     be written.
     """
     from startrack.output.record import record_of
@@ -82,10 +86,12 @@ def write_results(outcome: Outcome, path: Path, *, plots: bool = True, write_rec
     if isinstance(value, Measured) or (isinstance(value, Oriented) and value.terrain is None):
         write_star_table(companion(path, ".stars.ecsv"), value)
         write_wcs(companion(path, ".wcs"), companion(path, ".corr"), value)
-    if isinstance(value, Located) and value.has_skyline:
-        write_skyline(companion(path, ".skyline.ecsv"), value)
+    if isinstance(value, Located) and value.skyline is not None:
+        write_skyline(companion(path, SKYLINE_TABLE), value.skyline)
+        if plots:
+            write_panorama(companion(path, SKYLINE_PICTURE), value, value.skyline)
     if plots:
-        write_annotated(companion(path, ".annotated.png"), outcome)
+        write_annotated(companion(path, ANNOTATED), outcome)
     if write_record:
         write_json(path, record)
     return record
@@ -112,12 +118,18 @@ def write_star_table(path: FilePath, value: Oriented) -> None:
     write_atomically(path, star_table_text(value).encode("utf-8"), overwrite=True)
 
 
-def write_skyline(path: FilePath, value: Located) -> None:
-    """Write the measured skyline of a located `value` to `path`. Raises BadInput where it cannot be written."""
+def write_skyline(path: FilePath, skyline: MeasuredSkyline) -> None:
+    """Write the table of a `skyline` to `path`. Raises BadInput where it cannot be written."""
     from startrack.output.skyline_table import skyline_table_text
-    from startrack.skyline import measured_skyline
 
-    write_atomically(path, skyline_table_text(measured_skyline(value)).encode("utf-8"), overwrite=True)
+    write_atomically(path, skyline_table_text(skyline).encode("utf-8"), overwrite=True)
+
+
+def write_panorama(path: FilePath, value: Located, skyline: MeasuredSkyline) -> None:
+    """Write the panorama of a located `value` with its `skyline` to `path` (PNG). Raises BadInput as the others do."""
+    from startrack.output.picture.panorama import located_picture
+
+    write_atomically(path, png_bytes(located_picture(value, skyline)), overwrite=True)
 
 
 def write_wcs(path: FilePath, corr_path: FilePath, value: Oriented) -> None:

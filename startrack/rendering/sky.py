@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from startrack.camera import Camera
@@ -17,6 +19,7 @@ TANGENT_NODES_SIGMAS = np.linspace(-3.5, 3.5, 11)  # trapezoid over a Gaussian: 
 LENS_SAMPLES = 4096
 ROWS_PER_BLOCK = 64
 GRADIENT_STEP_PX = 0.01
+DECENTRING_STEP_PX = 16  # linear interpolation of a decentring p at the focal length f is then right to 200 p / f px
 
 
 def sky_e_per_s(camera: Camera, sky_v_mag_arcsec2: float | None, angle_rad: Array) -> Array:
@@ -118,24 +121,48 @@ def _sky_and_mask(scene: Scene) -> tuple[Array, Bools]:
     """Sky light (H, W) [e] with no terrain before it, and whether the pixel's centre is above the skyline (H, W)."""
     camera, (width, height) = scene.camera, scene.camera.size_px
     rho, sky_e, side, axial = _lens_table(scene)
-    u = (np.arange(width) - camera.centre_px[0]) / camera.focal_px[0]
+    fx, fy = camera.handed_focal_px
+    u = (np.arange(width) - camera.centre_px[0]) / fx
+    v = (np.arange(height)[:, None] - camera.centre_px[1]) / fy
+    shift_of = _decentring_of_rows(camera)
     sky, above = np.empty((height, width)), np.ones((height, width), dtype=bool)
     tan_horizon = None if scene.terrain is None else _tan_table(scene.terrain, scene.position_enu_m)
-    hand = -1.0 if camera.mirrored else 1.0
-    east, north, up = scene.R_cam_enu.T * [hand, 1.0, 1.0]
+    east, north, up = scene.R_cam_enu.T
     to_east, to_north, _ = scene.sky_gradient * rays_from_azel(scene.sky_gradient_azimuth_rad, 0.0)
     for top in range(0, height, ROWS_PER_BLOCK):
         rows = slice(top, min(top + ROWS_PER_BLOCK, height))
-        v = ((np.arange(rows.start, rows.stop) - camera.centre_px[1]) / camera.focal_px[1])[:, None]
-        r = np.sqrt(u * u + v * v)
+        du, dv = shift_of(rows)
+        x, y = u - du, v[rows] - dv
+        r = np.sqrt(x * x + y * y)
         sky[rows] = np.interp(r, rho, sky_e, right=0.0)
         s, c = np.interp(r, rho, side), np.interp(r, rho, axial)
-        e, n, h = ((axis[0] * u + axis[1] * v) * s + axis[2] * c for axis in (east, north, up))
+        e, n, h = ((axis[0] * x + axis[1] * y) * s + axis[2] * c for axis in (east, north, up))
         if scene.sky_gradient:
             sky[rows] *= np.maximum(1 + to_east * e + to_north * n, 0.0)
         if tan_horizon is not None:
             above[rows] = _is_above_horizon(e, n, h, *tan_horizon)
     return sky, above
+
+
+def _decentring_of_rows(camera: Camera) -> Callable[[slice], Array]:
+    """A function from rows to the shift (2, rows, W) that decentring adds there [focal lengths]; 0 of a centred lens.
+
+    It is smooth, and its inverse is slow: it is interpolated between the points of a coarse grid.
+    """
+    width, height = camera.size_px
+    if not camera.decentring:
+        return lambda rows: np.zeros((2, 1, 1))
+    knots_x, knots_y = (np.arange(0, size + DECENTRING_STEP_PX, DECENTRING_STEP_PX) for size in (width, height))
+    xy_px = np.stack(np.meshgrid(knots_x, knots_y), axis=-1).astype(np.float64)
+    shifted = (xy_px - camera.centre_px) / camera.handed_focal_px
+    grid = np.moveaxis(shifted, -1, 0) - np.stack(camera.radial(xy_px))
+    by_x = _linear_weights(np.arange(width), knots_x)
+    return lambda rows: _linear_weights(np.arange(rows.start, rows.stop), knots_y) @ grid @ by_x.T
+
+
+def _linear_weights(at_px: Ints, knots_px: Ints) -> Array:
+    """Weights (n, k) of the values at evenly spaced knots (k,) in the linear interpolation at points (n,)."""
+    return np.maximum(1.0 - np.abs(at_px[:, None] - knots_px) / DECENTRING_STEP_PX, 0.0)
 
 
 def _is_above_horizon(east: Array, north: Array, up: Array, azimuths: Array, tan_horizon: Array) -> Bools:

@@ -133,14 +133,13 @@ class Solution:
     @cached_property
     def skyline(self) -> QTable | None:
         """The skyline that the image shows: azimuth, elevation, sigma [deg] and source; None unless located."""
-        if not isinstance(self.result, Located) or not self.result.has_skyline:
+        if not isinstance(self.result, Located) or self.result.skyline is None:
             return None
         from astropy.table import QTable
 
         from startrack.output.skyline_table import skyline_table_text
-        from startrack.skyline import measured_skyline
 
-        return QTable.read(skyline_table_text(measured_skyline(self.result)), format="ascii.ecsv")
+        return QTable.read(skyline_table_text(self.result.skyline), format="ascii.ecsv")
 
     @property
     def warnings(self) -> list[str]:

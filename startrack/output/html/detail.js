@@ -65,7 +65,11 @@ function panoramaCard(detail, stars, name) {
   const { total } = detail.stars;
   const cut = total > stars.length ? ` The ${say(stars.length, 0)} brightest of ${say(total, 0)} stars; fainter ones appear as you zoom in.` : " Fainter stars appear as you zoom in.";
   const line = detail.horizon ? "The blue line is the horizon that the map gives at the estimated position: seen stars belong above it, hidden ones below." : "The terrain's file is not available, so its horizon is omitted.";
-  return section("Panorama", make("p", { class: "dim" }, line + cut), panoramaView(detail, stars, name).node);
+  const dots = detail.skyline ? " The dots on it are the skyline that the image shows." : "";
+  return section("Panorama", make("p", { class: "dim" }, line + dots + cut), panoramaView(detail, stars, name).node,
+    ...(detail.skyline?.above ? [make("h3", { class: "next" }, "The skyline of the image, enlarged"),
+      make("p", { class: "dim" }, "Its height above the horizon that the map gives at the estimated position. Bands are one sigma. Stars above the skyline should be seen, stars below it hidden."),
+      enlargedView(detail, stars, name).node] : []));
 }
 
 function mapsCard(record, real, name) {

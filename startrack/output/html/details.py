@@ -1,10 +1,11 @@
-"""Details of one image on a page: its brightest stars, the ground with its horizon, and the annotated picture."""
+"""Details of one image on a page: its brightest stars, ground, horizon and skyline, and the annotated picture."""
 
 from __future__ import annotations
 
 import base64
 import csv
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,12 @@ from startrack.camera import load_camera
 from startrack.output.picture.annotate import PANEL_WIDTH
 from startrack.output.picture.backdrop import fit_to_canvas
 from startrack.output.picture.relief import edge_cover, ground_cells, hill_shading
+from startrack.output.skyline_table import half_range_rad
 from startrack.terrain import Terrain, load_terrain
-from startrack.types import BadInput
+from startrack.types import Array, BadInput
 
 Columns = dict[str, list[Any]]
+Horizon = Callable[[Array], Array]  # azimuths (n,) to elevations (n,) [rad]
 # name on the page, column of NAME.stars.ecsv, decimals (None: a text)
 STAR_COLUMNS: tuple[tuple[str, str, int | None], ...] = (
     ("id", "catalog_id", None), ("name", "name", None), ("mag", "v_mag", 2), ("az", "azimuth_deg", 3),
@@ -96,16 +99,73 @@ class TerrainsByName:
         return self._known[name]
 
 
-def horizon_deg(terrain: Terrain, east_m: float, north_m: float, count: int) -> list[float] | None:
-    """Elevation of the horizon [deg] at `count` azimuths, evenly from 0 to 360 degrees, both ends included.
+def horizon_from(terrain: Terrain, east_m: float, north_m: float) -> Horizon:
+    """The horizon seen from a position."""
+
+    def horizon_rad(azimuth_rad: Array) -> Array:
+        place = np.broadcast_to([east_m, north_m], (len(azimuth_rad), 2))
+        return np.asarray(terrain.horizon_rad(place, azimuth_rad))
+
+    return horizon_rad
+
+
+def horizon_line(horizon: Horizon, count: int) -> list[float] | None:
+    """Elevation of the `horizon` [deg] at `count` azimuths, evenly from 0 to 360 degrees, both ends included.
 
     None from where it is not known: a position off the map.
     """
-    azimuths_rad = np.linspace(0.0, 2 * np.pi, count)
-    horizon_rad = terrain.horizon_rad(np.broadcast_to([east_m, north_m], (count, 2)), azimuths_rad)
-    if not np.isfinite(horizon_rad).all():
+    elevation = horizon(np.linspace(0.0, 2 * np.pi, count))
+    return _round_values(np.degrees(elevation), 3) if np.isfinite(elevation).all() else None
+
+
+SOURCES = ("", "stars", "sky light", "both")  # of a skyline; the page has their places in this list
+
+
+def skyline_of(path: Path, horizon: Horizon | None, stars: dict[str, Any] | None) -> dict[str, Any] | None:
+    """The skyline of a table NAME.skyline.ecsv as columns of its known directions [deg]; None where there is none.
+
+    Of a known `horizon` also `above`, the heights above it, `half`, the range of them to
+    be shown, and `near`: the indices of the `stars` within that range, and their heights above the horizon.
+    """
+    if not path.is_file():
         return None
-    return [round(value, 3) for value in np.degrees(horizon_rad).tolist()]
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = [row for row in _read_ecsv(file)[1] if row.get("source") in SOURCES[1:]]
+    if not rows:
+        return None
+    azimuth, elevation, sigma = (
+        np.radians([float(row[f"{name}_deg"]) for row in rows]) for name in ("azimuth", "elevation", "sigma")
+    )
+    found: dict[str, Any] = {
+        "az": _round_values(np.degrees(azimuth), 2),
+        "el": _round_values(np.degrees(elevation), 3),
+        "sigma": _round_values(np.degrees(sigma), 4),
+        "source": [SOURCES.index(row["source"]) for row in rows],
+    }
+    if horizon is None:
+        return found
+    above = elevation - horizon(azimuth)
+    half = half_range_rad(above, sigma)
+    return {
+        **found,
+        "above": _round_values(np.degrees(above), 4),
+        "half": round(math.degrees(half), 3),
+        "near": _stars_near(stars, horizon, half),
+    }
+
+
+def _stars_near(stars: dict[str, Any] | None, horizon: Horizon, half_rad: float) -> list[list[float]]:
+    """Index and height above the `horizon` [deg] of each star within `half_rad` of it."""
+    columns = stars["columns"] if stars is not None else {}
+    if "az" not in columns or "el" not in columns:
+        return []
+    above = np.radians(columns["el"]) - horizon(np.radians(columns["az"]))
+    near = np.flatnonzero(np.abs(above) < half_rad)
+    return [list(pair) for pair in zip(near.tolist(), _round_values(np.degrees(above[near]), 3), strict=True)]
+
+
+def _round_values(values: Array, decimals: int) -> list[float]:
+    return [round(value, decimals) for value in values.tolist()]
 
 
 def ground_map(terrain: Terrain) -> dict[str, Any]:

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from startrack.output.html.gather import Found
-from startrack.output.quantities import QUANTITIES, Quantity
+from startrack.output.quantities import QUANTITIES
+from startrack.output.quantity import Quantity
 from startrack.output.views import at_record, rows
 
 Position = tuple[float, float]  # east, north [m]

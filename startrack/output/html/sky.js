@@ -1,4 +1,4 @@
-// The picture and the panorama: the same stars, in pixels and in azimuth and elevation.
+// The stars of an image, their marks, and the picture.
 const KINDS = {
   seen: ["seen", "its light is there"],
   hidden: ["hidden", "its light is missing: the ground hides it"],
@@ -39,7 +39,15 @@ function mark(g, [x, y], kind, r) {
   g.strokeStyle = g.fillStyle = colour(kind === "identified" ? "seen" : kind === "unmatched" ? "uncertain" : kind);
   g.lineWidth = 1.6;
   g.beginPath();
-  if (kind === "hidden") {
+  if (kind === "bystars" || kind === "byboth") {
+    g.moveTo(x, y - r);
+    g.lineTo(x + r, y);
+    g.lineTo(x, y + r);
+    g.lineTo(x - r, y);
+    g.closePath();
+    if (kind === "byboth") g.fill();
+    else g.stroke();
+  } else if (kind === "hidden") {
     g.moveTo(x - r, y - r);
     g.lineTo(x + r, y + r);
     g.moveTo(x - r, y + r);
@@ -72,16 +80,16 @@ function markSample(kind) {
   return canvas;
 }
 
-// Boxes to choose which kinds of stars are marked; calls `change` with the set of them.
-function kindBoxes(stars, chosen, change) {
-  const kinds = Object.keys(KINDS).filter((kind) => stars.some((star) => star.kind === kind));
-  return make("fieldset", { class: "kinds" }, make("legend", {}, "Mark stars"), ...kinds.map((kind) => {
+// Boxes to choose which of the kinds of marks in `words` are drawn; calls `change` after each choice.
+function kindBoxes(title, words, marks, chosen, change) {
+  const kinds = Object.keys(words).filter((kind) => marks.some((one) => one.kind === kind));
+  return make("fieldset", { class: "kinds" }, make("legend", {}, title), ...kinds.map((kind) => {
     const box = make("input", { type: "checkbox", checked: chosen.has(kind), onchange: () => {
       if (box.checked) chosen.add(kind);
       else chosen.delete(kind);
       change();
     } });
-    return make("label", {}, box, markSample(kind), KINDS[kind][0]);
+    return make("label", {}, box, markSample(kind), words[kind][0]);
   }));
 }
 
@@ -105,60 +113,6 @@ function skyView(detail, stars, name) {
   });
   image.onload = () => view.redraw();
   image.src = picture.src;
-  if (placed.length) view.node.append(kindBoxes(placed, chosen, () => view.redraw()));
+  if (placed.length) view.node.append(kindBoxes("Mark stars", KINDS, placed, chosen, () => view.redraw()));
   return view;
-}
-
-function panoramaView(detail, stars, name) {
-  const { horizon } = detail;
-  const chosen = new Set(["seen", "hidden"]);
-  const placed = stars.filter((star) => known(star.az)).map((star) => ({ ...star, x: star.az, y: star.el }));
-  const lowest = Math.min(0, ...(horizon || []), ...placed.map((star) => star.y)) - 1;
-  const deepest = () => (view.width < 600 ? 4.7 : 6) + 1.5 * Math.log2(view.zoom); // fainter stars come with the zoom
-  const view = new View({
-    shown: (star) => chosen.has(star.kind) && star.mag <= deepest(),
-    label: `Panorama of ${name}: horizon of the estimated position, and stars by azimuth and elevation`,
-    world: [0, lowest, 360, 90], square: false, ratio: window.innerWidth < 600 ? 0.8 : 0.42, points: placed, describe: starText, most: 60,
-    axes: {
-      x: "azimuth, north through east", y: "elevation", steps: [[0.1, 0.5, 1, 2, 5, 10, 15, 30, 45, 90], [0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30]],
-      gap: 46, names: { 0: "N", 90: "E", 180: "S", 270: "W", 360: "N" }, text: (value, step) => `${say(value, step < 1 ? 1 : 0)}°`,
-    },
-    draw(v, g) {
-      if (horizon) drawGround(v, g, horizon, lowest);
-      for (const star of placed) {
-        if (!v.shown(star)) continue;
-        const size = Math.max(0.9, 3.8 - 0.5 * star.mag) * Math.min(1 + 0.25 * Math.log2(v.zoom), 2.2);
-        mark(g, v.screen(star.x, star.y), star.kind, star.kind === "seen" ? size : Math.max(size, 1.6));
-      }
-      if (horizon) drawSkyline(v, g, horizon);
-    },
-  });
-  view.node.append(kindBoxes(placed, chosen, () => view.redraw()));
-  return view;
-}
-
-function skylinePath(v, g, horizon) {
-  horizon.forEach((elevation, k) => {
-    const [x, y] = v.screen((360 * k) / (horizon.length - 1), elevation);
-    if (k) g.lineTo(x, y);
-    else g.moveTo(x, y);
-  });
-}
-
-function drawGround(v, g, horizon, lowest) {
-  g.beginPath();
-  skylinePath(v, g, horizon);
-  g.lineTo(...v.screen(360, lowest));
-  g.lineTo(...v.screen(0, lowest));
-  g.closePath();
-  g.fillStyle = colour("ground");
-  g.fill();
-}
-
-function drawSkyline(v, g, horizon) {
-  g.beginPath();
-  skylinePath(v, g, horizon);
-  g.strokeStyle = colour("skyline");
-  g.lineWidth = 2;
-  g.stroke();
 }

@@ -12,7 +12,16 @@ from urllib.parse import quote
 
 from startrack.errors import Reason
 from startrack.files import write_atomically
-from startrack.output.html.details import TerrainsByName, ground_map, horizon_deg, picture_of, stars_of
+from startrack.output.html.details import (
+    Horizon,
+    TerrainsByName,
+    ground_map,
+    horizon_from,
+    horizon_line,
+    picture_of,
+    skyline_of,
+    stars_of,
+)
 from startrack.output.html.gather import Found, folder_of
 from startrack.output.html.rows import (
     COLUMNS,
@@ -28,11 +37,14 @@ from startrack.output.html.rows import (
 
 HERE = Path(__file__).parent
 STYLES = ("page.css",)
-SCRIPTS = ("basics.js", "view.js", "input.js", "sky.js", "map.js", "errors.js", "detail.js", "table.js", "page.js")
+SCRIPTS = (
+    "basics.js", "view.js", "input.js", "sky.js", "panorama.js", "map.js", "errors.js", "detail.js", "table.js",
+    "page.js",
+)  # fmt: skip
 DEFAULT_IMAGES = 30
 FEW = 4  # images whose details may be large
 LARGE, SMALL = (1400, 4000, 1441), (1000, 1500, 721)  # px of the picture, stars, azimuths of the horizon
-FILES = (".annotated.png", ".stars.ecsv", ".skyline.ecsv", ".wcs", ".corr")
+FILES = (".annotated.png", ".stars.ecsv", ".skyline.ecsv", ".skyline.png", ".wcs", ".corr")
 
 
 def write_page(
@@ -114,13 +126,18 @@ def _relative_url(folder: Path, seen_from: Path) -> str:
 
 def _detail(found: Found, terrains: TerrainsByName, size: tuple[int, int, int]) -> dict[str, Any]:
     record = found.record
-    longest_px, stars, azimuths = size
+    longest_px, most_stars, azimuths = size
+    stars = stars_of(found.companion(".stars.ecsv"), most_stars)
+    horizon = _horizon(record, terrains)
+    line = None if horizon is None else horizon_line(horizon, azimuths)
+    skyline = skyline_of(found.companion(".skyline.ecsv"), None if line is None else horizon, stars)
     return {
         "record": {key: value for key, value in record.items() if key not in ("matches", "detections", "camera")},
         "facts": facts_of(record),
         "picture": picture_of(found.companion(".annotated.png"), found.companion(".wcs"), record, longest_px),
-        "stars": stars_of(found.companion(".stars.ecsv"), stars),
-        "horizon": _horizon(record, terrains, azimuths),
+        "stars": stars,
+        "horizon": line,
+        "skyline": skyline,
         "files": [
             found.path.name,
             *(found.companion(end).name for end in FILES if found.companion(end).is_file()),
@@ -128,7 +145,7 @@ def _detail(found: Found, terrains: TerrainsByName, size: tuple[int, int, int]) 
     }
 
 
-def _horizon(record: dict[str, Any], terrains: TerrainsByName, azimuths: int) -> list[float] | None:
+def _horizon(record: dict[str, Any], terrains: TerrainsByName) -> Horizon | None:
     """Horizon at the position, or at the likeliest one; None without a position or without the terrain's file."""
     modes = record.get("modes")
     position = section_of(record, "position") or (modes[0] if isinstance(modes, list) and modes else {})
@@ -137,7 +154,7 @@ def _horizon(record: dict[str, Any], terrains: TerrainsByName, azimuths: int) ->
     terrain = terrains.terrain(name) if name and east is not None and record["status"] != "refused" else None
     if terrain is None or east is None or north is None:
         return None
-    return horizon_deg(terrain, east, north, azimuths)
+    return horizon_from(terrain, east, north)
 
 
 def _terrains(found: Sequence[Found], terrains: TerrainsByName) -> dict[str, Any]:

@@ -24,7 +24,6 @@ from startrack.output.picture.canvas import (
 )
 from startrack.output.star_table import names_of, status_of
 from startrack.output.values import R_body_enu, best_position_m
-from startrack.skyline import measured_skyline
 from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented
 from startrack.types import Array, Bools, Ints
 
@@ -164,9 +163,9 @@ def draw_skyline(canvas: Canvas, view: View, value: Inputs) -> None:
 
 def draw_measured_skyline(canvas: Canvas, view: View, value: Inputs) -> None:
     """Dots where the light of the sky, and the stars with it, show the skyline."""
-    if not isinstance(value, Located) or value.sky_light is None:
+    if not isinstance(value, Located) or value.sky_light is None or value.skyline is None:
         return
-    skyline = measured_skyline(value)
+    skyline = value.skyline
     by_sky = skyline.known & (skyline.source != "stars")
     xy_px, imaged = _project(value, skyline.azimuth_rad[by_sky], skyline.elevation_rad[by_sky])
     for place in view.canvas_px(xy_px[imaged]):

@@ -1,0 +1,231 @@
+"""Pictures of a skyline by azimuth: of a terrain, measured in photographs, and both with the stars near them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.evidence import Skyline
+from startrack.output.picture.canvas import (
+    DIM_INK,
+    FAINT_INK,
+    FLOOR,
+    GRID,
+    HIDDEN,
+    IDENTIFIED,
+    INK,
+    MAP,
+    MEASURED,
+    SKYLINE,
+    Box,
+    Canvas,
+    Colour,
+    mix_colours,
+    text_width,
+)
+from startrack.output.picture.maps import nice_step
+from startrack.output.record import image_name
+from startrack.output.skyline_table import half_range_rad
+from startrack.output.star_table import status_of
+from startrack.stages import Located
+from startrack.terrain import Terrain
+from startrack.types import Array, MeasuredSkyline
+
+WIDTH_PX, HEIGHT_PX, ENLARGED_PX = 1440, 420, 300
+MARGIN_PX, ABOVE_PX, BELOW_PX, RIGHT_PX = 56.0, 34.0, 40.0, 16.0  # about a plot
+TEXT_PX, LEGEND_PX = 17.0, 15.0
+AZIMUTHS_RAD = np.radians(np.linspace(0.0, 360.0, 3601))
+COMPASS = {0: "N", 90: "E", 180: "S", 270: "W"}
+MAX_STARS = 1500  # the brightest
+BANDS = {source: mix_colours(colour, MAP, 0.7) for source, colour in
+         (("sky light", MEASURED), ("stars", IDENTIFIED), ("both", SKYLINE))}  # fmt: skip
+LEGEND = {"seen": "seen star", "hidden": "hidden star", "sky light": "skyline by the light of the sky",
+          "stars": "by stars seen and missing", "both": "by both"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Axes on a canvas: azimuth from north to north to the right, elevations from `low` to `high` [deg] upwards."""
+
+    canvas: Canvas
+    box: Box
+    low: float
+    high: float
+    step: float
+
+    def canvas_px(self, azimuth_rad: Array | float, elevation_rad: Array | float) -> Array:
+        """Places (..., 2) on the canvas."""
+        left, top, right, bottom = self.box
+        x = left + np.asarray(azimuth_rad) / (2 * np.pi) * (right - left)
+        y = bottom - (np.degrees(elevation_rad) - self.low) / (self.high - self.low) * (bottom - top)
+        return np.stack(np.broadcast_arrays(x, y), axis=-1)
+
+    @property
+    def window(self) -> Canvas:
+        """The canvas, with shapes clipped to the box."""
+        return self.canvas.window(self.box)
+
+    def draw_scales(self) -> None:
+        """Lines at even elevations, ticks and names of azimuths, the frame."""
+        left, _, right, bottom = self.box
+        decimals = max(0, -int(np.floor(np.log10(self.step) + 1e-9)))
+        for count in range(round(self.low / self.step), round(self.high / self.step) + 1):
+            _, y = self.canvas_px(0.0, np.radians(count * self.step)).tolist()
+            self.canvas.line([(left, y), (right, y)], GRID if count else FAINT_INK)
+            self.canvas.text((left - 8, y), f"{count * self.step:.{decimals}f}°", TEXT_PX, DIM_INK, "rm")
+        for azimuth in range(0, 361, 30):
+            x, _ = self.canvas_px(np.radians(azimuth), 0.0).tolist()
+            self.canvas.line([(x, bottom), (x, bottom + 6.0)], DIM_INK)
+            self.canvas.text((x, bottom + 10), COMPASS.get(azimuth % 360, f"{azimuth}°"), TEXT_PX, DIM_INK, "mt")
+        self.canvas.rectangle(self.box, FAINT_INK, 1)
+
+    def draw_ground(self, azimuth_rad: Array, elevation_rad: Array) -> None:
+        """The ground below elevations (n,) at ascending azimuths (n,), where they are known."""
+        for run in _runs(np.isfinite(elevation_rad)):
+            at = azimuth_rad[run]
+            low = self.canvas_px(np.array([at[-1], at[0]]), np.radians(self.low))
+            self.window.area(np.concatenate([self.canvas_px(at, elevation_rad[run]), low]), FLOOR)
+
+    def draw_line(self, azimuth_rad: Array, elevation_rad: Array, sigma_rad: Array | None = None) -> None:
+        """A skyline (n,) at ascending azimuths (n,), where it is known; `sigma_rad` (n,) as two thin lines."""
+        for run in _runs(np.isfinite(elevation_rad)):
+            at, top = azimuth_rad[run], elevation_rad[run]
+            if sigma_rad is not None:
+                for shift in (-sigma_rad[run], sigma_rad[run]):
+                    self.window.line(self.canvas_px(at, top + shift), FAINT_INK)
+            self.window.curve(self.canvas_px(at, top), SKYLINE, 2.0)
+
+    def draw_bands(self, elevation_rad: Array, skyline: MeasuredSkyline) -> None:
+        """One sigma of a `skyline` to either side of `elevation_rad` (n,), coloured by its source."""
+        half_rad, window = np.pi / max(len(skyline), 1), self.window
+        for k in np.flatnonzero(skyline.known):
+            ends = elevation_rad[k] + np.array([1.0, -1.0]) * skyline.sigma_rad[k]
+            corners = self.canvas_px(skyline.azimuth_rad[k] + np.array([-half_rad, half_rad]), ends)
+            (left, top), (right, bottom) = corners.tolist()
+            window.rectangle((left, top, right, bottom), BANDS[str(skyline.source[k])])
+
+    def draw_marks(self, azimuth_rad: Array, elevation_rad: Array, kinds: NDArray[np.str_]) -> None:
+        """Marks of LEGEND's `kinds` (n,) in directions (n,), without those that are not known or have another kind."""
+        window = self.window
+        for place, kind in zip(self.canvas_px(azimuth_rad, elevation_rad), kinds.tolist(), strict=True):
+            if kind in LEGEND and np.isfinite(place).all():
+                _draw_mark(window, place, kind)
+
+
+def horizon_picture(terrain: Terrain, position_m: tuple[float, float]) -> NDArray[np.uint8]:
+    """The horizon (H, W, 3) of a terrain from north to north, azimuth to the right, seen from a position."""
+    horizon_rad = terrain.horizon_rad(np.array(position_m)[None], AZIMUTHS_RAD)
+    title = f"{terrain.name}: horizon seen from E {position_m[0]:.0f} m, N {position_m[1]:.0f} m"
+    canvas = Canvas(WIDTH_PX, HEIGHT_PX)
+    _draw_horizon(canvas, title, AZIMUTHS_RAD, horizon_rad).draw_line(AZIMUTHS_RAD, horizon_rad)
+    return canvas.rendered_pixels()
+
+
+def skyline_picture(skyline: MeasuredSkyline) -> NDArray[np.uint8]:
+    """A measured `skyline` (H, W, 3) from north to north, with one sigma to either side."""
+    azimuth_rad = np.append(skyline.azimuth_rad, 2 * np.pi)
+    elevation_rad, sigma_rad = (np.append(a, a[0]) for a in (skyline.elevation_rad, skyline.sigma_rad))
+    canvas = Canvas(WIDTH_PX, HEIGHT_PX)
+    plot = _draw_horizon(canvas, "measured skyline", azimuth_rad, elevation_rad)
+    plot.draw_line(azimuth_rad, elevation_rad, sigma_rad)
+    return canvas.rendered_pixels()
+
+
+def located_picture(value: Located, skyline: MeasuredSkyline) -> NDArray[np.uint8]:
+    """The `skyline` (H, W, 3) of a located image on the horizon of its terrain, and its height above that, enlarged."""
+    canvas = Canvas(WIDTH_PX, HEIGHT_PX + ENLARGED_PX)
+    horizon = Skyline.trace(value.fix.position_enu_m[:2], value.terrain)
+    light, status = value.light, status_of(value.light)
+    decided = np.isin(status, ("seen", "hidden"))  # brightest first
+    azimuth_rad, elevation_rad, status = light.azimuth_rad[decided], light.elevation_rad[decided], status[decided]
+    title = f"{image_name(value.exposure)}: horizon of {value.terrain.name} at the position found, skyline of the image"
+    plot = _draw_horizon(canvas, title, AZIMUTHS_RAD, horizon(AZIMUTHS_RAD))
+    near = np.flatnonzero(elevation_rad < np.radians(plot.high))[:MAX_STARS]
+    plot.draw_marks(azimuth_rad[near], elevation_rad[near], status[near])
+    plot.draw_line(AZIMUTHS_RAD, horizon(AZIMUTHS_RAD))
+    plot.draw_marks(skyline.azimuth_rad, skyline.elevation_rad, skyline.source)
+
+    raised_rad = skyline.elevation_rad - horizon(skyline.azimuth_rad)
+    plot = _draw_enlarged(canvas, raised_rad, skyline)
+    above_rad = elevation_rad - horizon(azimuth_rad)
+    near = np.flatnonzero(np.abs(above_rad) < np.radians(plot.high))[:MAX_STARS]
+    plot.draw_marks(azimuth_rad[near], above_rad[near], status[near])
+    plot.draw_marks(skyline.azimuth_rad, raised_rad, skyline.source)
+    _draw_legend(canvas, HEIGHT_PX + ABOVE_PX / 2, [kind for kind in LEGEND if kind in {*status, *skyline.source}])
+    return canvas.rendered_pixels()
+
+
+def _draw_horizon(canvas: Canvas, title: str, azimuth_rad: Array, elevation_rad: Array) -> Plot:
+    """A plot at the canvas's top with the ground below elevations (n,) at ascending azimuths (n,)."""
+    known = np.degrees(elevation_rad[np.isfinite(elevation_rad)])
+    low, high = min(float(known.min(initial=0.0)), 0.0), float(known.max(initial=0.0))
+    step = nice_step(max(high - low, 2.0) / 3)
+    low, high = np.floor(low / step) * step, np.ceil((high + 0.3 * step) / step) * step
+    plot = _draw_plot(canvas, 0, title, low, high, step)
+    plot.draw_ground(azimuth_rad, elevation_rad)
+    plot.draw_scales()
+    return plot
+
+
+def _draw_enlarged(canvas: Canvas, raised_rad: Array, skyline: MeasuredSkyline) -> Plot:
+    """A plot below that of the horizon: the heights (n,) of the `skyline` above it, with their sigma."""
+    half = np.degrees(half_range_rad(raised_rad, skyline.sigma_rad))
+    step = nice_step(half / 2)
+    half = np.ceil(half / step - 1e-9) * step
+    plot = _draw_plot(canvas, HEIGHT_PX, "enlarged: height above that horizon", -half, half, step)
+    plot.draw_ground(np.array([0.0, 2 * np.pi]), np.zeros(2))
+    plot.draw_bands(raised_rad, skyline)
+    plot.draw_scales()
+    plot.draw_line(np.array([0.0, 2 * np.pi]), np.zeros(2))
+    return plot
+
+
+def _draw_plot(canvas: Canvas, top: float, title: str, low: float, high: float, step: float) -> Plot:
+    """An empty plot from `top` on, with its title."""
+    height = HEIGHT_PX if top == 0 else ENLARGED_PX
+    box = (MARGIN_PX, top + ABOVE_PX, WIDTH_PX - RIGHT_PX, top + height - BELOW_PX)
+    canvas.rectangle(box, MAP)
+    canvas.text((box[0], top + 9.0), title, TEXT_PX, INK, "lt")
+    return Plot(canvas, box, low, high, step)
+
+
+def _draw_mark(canvas: Canvas, place: Array, kind: str) -> None:
+    """The mark of one of LEGEND's kinds: each has its own shape."""
+    if kind == "hidden":
+        canvas.cross(place, 2.5, HIDDEN)
+    elif kind == "seen":
+        _draw_polygon(canvas, place, 2.3, 12, IDENTIFIED)
+    elif kind == "sky light":
+        canvas.circle(place, 1.5, MEASURED, -1)
+    else:
+        _draw_polygon(canvas, place, 4.0, 4, MEASURED, filled=kind == "both")
+
+
+def _draw_polygon(
+    canvas: Canvas, place: Array, radius: float, count: int, colour: Colour, *, filled: bool = True
+) -> None:
+    """A regular polygon of `count` corners, one of them on top."""
+    turn = np.arange(count) * 2 * np.pi / count
+    corners = place + radius * np.stack([np.sin(turn), -np.cos(turn)], axis=-1)
+    if filled:
+        canvas.area(corners, colour)
+    else:
+        canvas.line(corners, colour, closed=True)
+
+
+def _draw_legend(canvas: Canvas, y: float, kinds: list[str]) -> None:
+    """Marks and words in one line that ends at the plot's right edge."""
+    x = WIDTH_PX - RIGHT_PX
+    for kind in reversed(kinds):
+        x -= text_width(LEGEND[kind], LEGEND_PX)
+        canvas.text((x, y), LEGEND[kind], LEGEND_PX, DIM_INK, "lm")
+        _draw_mark(canvas, np.array([x - 11.0, y]), kind)
+        x -= 36.0
+
+
+def _runs(known: NDArray[np.bool_]) -> list[slice]:
+    """Stretches of at least two known points."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
+    return [slice(first, last) for first, last in edges.reshape(-1, 2) if last - first > 1]

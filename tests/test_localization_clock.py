@@ -1,0 +1,144 @@
+"""An error of the clock: estimated with the position, marginalised over, and refused where it is not admitted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pytest
+from test_localization_ground import shackleton, simulate_rays  # noqa: F401
+from test_localization_shape import evidence_at
+
+from startrack.frames import R_enu_icrs, Site, azel_from_rays, sky_rotvec_rad
+from startrack.localization import ExactPosterior, check_consistency
+from startrack.localization.clock import clock_matters, turn_evidence
+from startrack.terrain import Terrain, load_terrain
+from startrack.terrain.height_map import HeightMap
+from startrack.types import Array, Clock, Evidence, Fix, NotLocated
+
+TIME = datetime(2030, 6, 3, 4, 5, 6, tzinfo=UTC)
+HOUR_S = 3600.0
+SITES = {
+    "shackleton": Site("moon", np.radians(-89.66), np.radians(129.78)),
+    "kepler": Site("moon", np.radians(8.12), np.radians(-38.0)),
+    "earth": Site("earth", np.radians(35.0), np.radians(-111.6)),
+}
+
+
+def clock_at(site: Site, sigma_s: float) -> Clock:
+    return Clock(turn_rad_s=sky_rotvec_rad(site, TIME, 600.0) / 600.0, sigma_s=sigma_s)
+
+
+def stated_early(evidence: Evidence, site: Site, offset_s: float, sigma_s: float) -> Evidence:
+    """The rows as a clock shows them that is late: the true time is later by the offset."""
+    clock = clock_at(site, sigma_s)
+    return replace(turn_evidence(replace(evidence, clock=clock), -offset_s), clock=clock)
+
+
+@pytest.fixture(scope="module")
+def ground(shackleton: HeightMap) -> HeightMap:
+    return replace(shackleton, height_sigma_m=1.0)
+
+
+@pytest.mark.parametrize("name", SITES)
+def test_a_later_time_turns_the_rows_as_the_ephemeris_does(name: str) -> None:
+    site, rng = SITES[name], np.random.default_rng(1)
+    rays_icrs = rng.normal(size=(50, 3))
+    rays_icrs /= np.linalg.norm(rays_icrs, axis=1, keepdims=True)
+    for later_s in (-6 * HOUR_S, 20.0, 6 * HOUR_S):
+        now, later = (
+            azel_from_rays(rays_icrs @ R_enu_icrs(site, TIME + timedelta(seconds=s)).T) for s in (0.0, later_s)
+        )
+        rows = Evidence(azimuth_rad=now[0], elevation_rad=now[1], llr=np.ones(50), clock=clock_at(site, 1.0))
+        turned = turn_evidence(rows, later_s)
+        off = np.mod(turned.azimuth_rad - later[0] + np.pi, 2 * np.pi) - np.pi
+        assert np.abs(off * np.cos(later[1])).max() < 2e-5  # the Moon's axis and rate vary over half a day
+        assert np.abs(turned.elevation_rad - later[1]).max() < 2e-5
+        assert turned.clock is not None
+        assert turned.clock.offset_s == later_s
+
+
+def test_the_usual_clock_changes_nothing() -> None:
+    terrain, site = load_terrain("shackleton-thesis"), SITES["shackleton"]
+    rows = evidence_at((3000.0, -2000.0), 5)
+    exact = ExactPosterior()(rows, terrain)
+    usual = ExactPosterior()(replace(rows, clock=clock_at(site, 1.0)), terrain)
+    np.testing.assert_array_equal(usual.position_enu_m, exact.position_enu_m)
+    np.testing.assert_array_equal(usual.covariance_m2, exact.covariance_m2)
+    assert exact.clock is None
+    assert usual.clock is not None
+    assert (usual.clock.offset_s, usual.clock.sigma_s) == (0.0, 1.0)
+    assert not clock_matters(clock_at(site, 1.0), terrain)
+    assert clock_matters(clock_at(SITES["earth"], 1.0), terrain)
+
+
+@pytest.mark.parametrize("sigma_s", [600.0, 6 * HOUR_S])
+def test_in_a_round_crater_the_position_lies_on_an_arc(sigma_s: float) -> None:
+    """Against a slow mixture: the posterior at each of many times, weighted by the prior."""
+    terrain, site = load_terrain("shackleton-thesis"), SITES["shackleton"]
+    rows = evidence_at((-6500.0, 1000.0), 6)
+    clock = clock_at(site, sigma_s)
+    fix = ExactPosterior()(replace(rows, clock=clock), terrain)
+    offsets = np.linspace(-3.5, 3.5, 57)
+    weight = np.exp(-0.5 * offsets**2)
+    weight /= weight.sum()
+    fixes = [
+        ExactPosterior()(replace(turn_evidence(replace(rows, clock=clock), x * sigma_s), clock=None), terrain)
+        for x in offsets
+    ]
+    means = np.array([one.position_enu_m[:2] for one in fixes])
+    mean = weight @ means
+    spread = np.einsum("n,ni,nj->ij", weight, means - mean, means - mean)
+    spread = spread + np.einsum("n,nij->ij", weight, [one.covariance_m2 for one in fixes])
+    size = np.sqrt(np.trace(spread))
+    assert np.linalg.norm(fix.position_enu_m[:2] - mean) < 0.1 * size
+    assert fix.covariance_m2 == pytest.approx(spread, abs=0.08 * size**2)
+    assert fix.radius999_m > 2.7 * size
+    assert fix.clock is not None
+    assert fix.clock.sigma_s == pytest.approx(sigma_s, rel=0.02)
+
+
+@pytest.mark.parametrize("offset_s", [-HOUR_S, 4 * HOUR_S])
+def test_on_real_ground_the_time_is_found_with_the_position(ground: HeightMap, offset_s: float) -> None:
+    place = np.array([50.0, -90.0])
+    rows = simulate_rays(ground, place, np.random.default_rng(7), 5000, 0.0)
+    fix = ExactPosterior()(stated_early(rows, SITES["shackleton"], offset_s, abs(offset_s)), ground)
+    assert is_inside(fix, place)
+    assert fix.clock is not None
+    assert abs(fix.clock.offset_s - offset_s) < 4 * fix.clock.sigma_s < 2 * HOUR_S
+
+
+def test_stated_times_and_errors_are_true_of_many_positions(ground: HeightMap) -> None:
+    """Offsets drawn from the stated error: normalised squared errors of position and time near 2 and 1."""
+    rng, site = np.random.default_rng(8), SITES["shackleton"]
+    squares, times = [], []
+    for _ in range(8):
+        place, offset_s = rng.uniform(-150, 150, 2), 1200.0 * rng.normal()
+        rows = simulate_rays(ground, place, rng, 4000, 0.0)
+        fix = ExactPosterior()(stated_early(rows, site, offset_s, 1200.0), ground)
+        off = fix.position_enu_m[:2] - place
+        assert fix.clock is not None
+        squares.append(off @ np.linalg.solve(fix.covariance_m2, off))
+        times.append(((fix.clock.offset_s - offset_s) / fix.clock.sigma_s) ** 2)
+    assert 0.7 < np.mean(squares) < 4.2  # of 16 degrees of freedom
+    assert 0.1 < np.mean(times) < 2.7  # of 8
+
+
+@pytest.mark.parametrize("hours", [0.0, 2.0])
+def test_a_time_beyond_its_stated_error_is_refused(ground: HeightMap, hours: float) -> None:
+    rows = simulate_rays(ground, np.array([50.0, -90.0]), np.random.default_rng(9), 12_000, 0.0)
+    rows = stated_early(rows, SITES["shackleton"], hours * HOUR_S, 1.0)
+    exact: Terrain = replace(ground, height_sigma_m=0.0)
+    fix = ExactPosterior()(rows, exact)
+    if not hours:
+        check_consistency(rows, fix, exact)
+        return
+    with pytest.raises(NotLocated, match="time") as refusal:
+        check_consistency(rows, fix, exact)
+    assert refusal.value.reason == "inconsistent_evidence"
+
+
+def is_inside(fix: Fix, place_m: Array) -> bool:
+    """Whether a place (2,) is within the circle of 99.9 % of a single position."""
+    return not fix.ambiguous and float(np.linalg.norm(fix.position_enu_m[:2] - place_m)) < fix.radius999_m

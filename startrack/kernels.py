@@ -9,4 +9,6 @@ discard_stale_kernels()
 
 from numba import njit  # noqa: E402 - numba reads where its cache lies when it loads
 
-__all__ = ["njit"]
+REORDERED_SUMS = {"reassoc", "contract", "nsz"}  # as `fastmath`: lets the compiler sum several pixels at a time
+
+__all__ = ["REORDERED_SUMS", "njit"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import field, fields, replace
+from dataclasses import field, fields
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,12 +27,21 @@ def array(
 
 
 def take_rows(value: T, which: Any) -> T:
-    """The value with all its array fields of common length n cut to a mask, slice or index array."""
-    names = [f.name for f in fields(value) if f.metadata.get("shape", ())[:1] == ("n",)]  # type: ignore[arg-type]
-    rows = {name: getattr(value, name)[which] for name in names}
-    for taken in rows.values():
-        taken.flags.writeable = False  # new, and locked: the value need not copy it
-    return replace(value, **rows)  # type: ignore[type-var]
+    """The value with all its array fields of common length n cut to a mask, slice or index array.
+
+    Parts of checked rows need no check.
+    """
+    taken = object.__new__(type(value))
+    for f in fields(value):  # type: ignore[arg-type]
+        part = whole = getattr(value, f.name)
+        if f.metadata.get("shape", ())[:1] == ("n",):
+            part = whole[which]
+            if part.ndim != whole.ndim:
+                raise ValueError(f"{which!r} selects no rows: give a mask, a slice or an index array")
+            part = np.ascontiguousarray(part)
+            part.flags.writeable = False
+        object.__setattr__(taken, f.name, part)
+    return taken
 
 
 def _is_locked(given: Any, dtype: Any) -> bool:

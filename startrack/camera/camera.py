@@ -9,7 +9,7 @@ import numpy as np
 from startrack.camera.decentring import Decentring
 from startrack.camera.kannala_brandt import KannalaBrandt
 from startrack.camera.lens import Lens
-from startrack.frames import off_axis_rad
+from startrack.frames import length_xy, off_axis_rad
 from startrack.types import Array, Bools
 
 # Body x (forward) = image top = -cam y, body y (left) = +cam x, body z (up) = +cam z: it looks at the zenith.
@@ -70,7 +70,8 @@ class Camera:
         angle = off_axis_rad(rays_cam)
         imaged = angle <= min(self.max_angle_rad, self.lens.max_invertible_rad)
         px = self._pixels(rays_cam, angle, self.lens.rho(np.where(imaged, angle, 0.0)))
-        within = np.all((px >= -0.5) & (px <= np.array(self.size_px) - 0.5), axis=-1)
+        x, y = px[..., 0], px[..., 1]
+        within = (x >= -0.5) & (y >= -0.5) & (x <= self.size_px[0] - 0.5) & (y <= self.size_px[1] - 0.5)
         return px, imaged & within
 
     def project_unlimited(self, rays_cam: Array) -> Array:
@@ -80,7 +81,7 @@ class Camera:
         return self._pixels(rays_cam, angle, self.lens.rho(angle))
 
     def _pixels(self, rays_cam: Array, angle_rad: Array, rho: Array) -> Array:
-        off_axis = np.hypot(rays_cam[..., 0], rays_cam[..., 1])
+        off_axis = length_xy(rays_cam[..., 0], rays_cam[..., 1])
         per_off_axis = 1.0 / np.where(off_axis > 0, off_axis, 1.0)
         scale = rho * per_off_axis
         u, v = scale * rays_cam[..., 0], scale * rays_cam[..., 1]
@@ -93,14 +94,14 @@ class Camera:
     def unproject(self, px: Array) -> Array:
         """Unit rays_cam (..., 3) of the pixels `px` (..., 2): the exact inverse of `project`."""
         u, v = self.radial(px)
-        rho = np.hypot(u, v)
+        rho = length_xy(u, v)
         angle = self.lens.angle_rad(rho)
         scale = np.sin(angle) / np.where(rho > 0, rho, 1.0)
         return np.stack([u * scale, v * scale, np.cos(angle)], axis=-1)
 
     def angle_rad(self, px: Array) -> Array:
         """Angle (...) off the axis [rad] of the pixels `px` (..., 2)."""
-        return self.lens.angle_rad(np.hypot(*self.radial(px)))
+        return self.lens.angle_rad(length_xy(*self.radial(px)))
 
     def radial(self, px: Array) -> tuple[Array, Array]:
         """u, v = rho (cos b, sin b) of the pixels `px` (..., 2), decentring removed."""
@@ -120,7 +121,7 @@ class Camera:
         """
         rays_cam = np.asarray(rays_cam, dtype=np.float64)
         x, y, z = rays_cam[..., 0], rays_cam[..., 1], rays_cam[..., 2]
-        s = np.hypot(x, y)
+        s = length_xy(x, y)
         angle = np.arctan2(s, z)
         off_axis = s > 1e-12
         divisor = np.where(off_axis, s, 1.0)

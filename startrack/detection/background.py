@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.kernels import REORDERED_SUMS, njit
+
 BAND_PIXELS = 2**18
 BLOCK_PX = 16  # side of the blocks for a PSF up to 1.5 WIDEST_PX
 WIDEST_PX = 1.4
@@ -57,18 +59,35 @@ def local_level(standardised: Image, width_px: int) -> Image:
     Boxes are made of whole squares of COARSE_PX, which costs a third of the time and no more than their coarseness.
     """
     height, width = standardised.shape
-    # To zero, not to the nearest value: stars are all on one side.
-    _, clipped = cv2.threshold(standardised, CLIPPED_SIGMA, 0.0, cv2.THRESH_TOZERO_INV)
-    cv2.threshold(clipped, -CLIPPED_SIGMA, 0.0, cv2.THRESH_TOZERO, dst=clipped)
-    small = -(-width // COARSE_PX), -(-height // COARSE_PX)
-    below, right = -height % COARSE_PX, -width % COARSE_PX
-    if below or right:
-        clipped = np.asarray(cv2.copyMakeBorder(clipped, 0, below, 0, right, cv2.BORDER_REFLECT_101))
-    coarse = cv2.resize(clipped, small, interpolation=cv2.INTER_AREA)
+    coarse = np.empty((-(-height // COARSE_PX), -(-width // COARSE_PX)), dtype=np.float32)
+    _clipped_means(standardised, coarse)
     side = coarse_width(width_px)
     smooth = cv2.boxFilter(coarse, -1, (side, side), borderType=cv2.BORDER_REFLECT)
-    full: Any = cv2.resize(smooth, (small[0] * COARSE_PX, small[1] * COARSE_PX), interpolation=cv2.INTER_LINEAR)
-    return full[:height, :width]
+    return _enlarge(smooth, COARSE_PX, standardised.shape)
+
+
+@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
+def _clipped_means(values, means):  # type: ignore[no-untyped-def]
+    """Fill means (h, w) with those of squares of COARSE_PX of the values (H, W), at the borders of what there is.
+
+    Values beyond CLIPPED_SIGMA count as zero, not as the nearest value: stars are all on one side.
+    """
+    height, width = values.shape
+    zero, limit = np.float32(0.0), np.float32(CLIPPED_SIGMA)
+    column = np.empty(width, np.float32)
+    for i in range(means.shape[0]):
+        top, bottom = i * COARSE_PX, min((i + 1) * COARSE_PX, height)
+        column[:] = zero
+        for y in range(top, bottom):
+            for x in range(width):
+                value = values[y, x]
+                column[x] += value if abs(value) <= limit else zero
+        for j in range(means.shape[1]):
+            first, last = j * COARSE_PX, min((j + 1) * COARSE_PX, width)
+            total = zero
+            for x in range(first, last):
+                total += column[x]
+            means[i, j] = total / np.float32((bottom - top) * (last - first))
 
 
 def coarse_width(width_px: int) -> int:
@@ -115,11 +134,22 @@ def _blocks(image: Image, side: int, quantum: float) -> Image:
     below, right = -height % side, -width % side
     if below or right:
         image = np.asarray(cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_REFLECT_101), dtype=np.float32)
-    rows, columns = image.shape[0] // side, image.shape[1] // side
-    parts = BLOCK_PX // 2
-    cut = image.reshape(rows, parts, side // parts, columns, parts, side // parts)[:, :, :2, :, :, :2]
-    part_steps = (np.float32(quantum) * _dither_steps(BLOCK_PX**2)).reshape(parts, 2, parts, 2)
-    return np.add(cut.transpose(0, 3, 1, 2, 4, 5), part_steps, order="C").reshape(rows * columns, BLOCK_PX**2)
+    part_steps = (np.float32(quantum) * _dither_steps(BLOCK_PX**2)).reshape(BLOCK_PX, BLOCK_PX)
+    blocks = np.empty((image.shape[0] // side, image.shape[1] // side, BLOCK_PX, BLOCK_PX), dtype=np.float32)
+    _fill_blocks(np.ascontiguousarray(image), side, part_steps, blocks)
+    return blocks.reshape(-1, BLOCK_PX**2)
+
+
+@njit(cache=True, nogil=True)
+def _fill_blocks(image, side, part_steps, blocks):  # type: ignore[no-untyped-def]
+    """Fill blocks (rows, columns, BLOCK_PX, BLOCK_PX) with squares of two by two of the image, and the part-steps."""
+    apart = 2 * side // BLOCK_PX  # the squares
+    for i in range(blocks.shape[0]):
+        for j in range(blocks.shape[1]):
+            for r in range(BLOCK_PX):
+                row, left = i * side + r // 2 * apart + r % 2, j * side
+                for c in range(BLOCK_PX):
+                    blocks[i, j, r, c] = image[row, left + c // 2 * apart + c % 2] + part_steps[r, c]
 
 
 def _clipped_spread(ordered: Image, quantum: np.float32) -> tuple[Image]:

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from startrack.kernels import njit
+from startrack.kernels import REORDERED_SUMS, njit
 from startrack.psf import ERF_COEFFICIENTS, ERF_T
 
 MAX_STEP_PX = 0.5
@@ -17,7 +17,7 @@ SQRT_2PI = math.sqrt(2.0 * math.pi)
 T, A1, A2, A3, A4, A5 = float(ERF_T), *(float(a) for a in ERF_COEFFICIENTS)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
 def fit_stamps(
     data, variance, usable, start_px, sigma_px, per_unit, model_error, rounds, surround, xy_px, values, covariance
 ) -> None:
@@ -64,7 +64,8 @@ def fit_stamps(
                 level = (a * right[3] - b * right[2]) / determinant
                 continue
             _factorise(normal)
-            for k in range(size + 1):  # the columns of the inverse, then the step
+            # The columns of the inverse, once the fit has converged, and the step.
+            for k in range(0 if step == rounds else size, size + 1):
                 for m in range(size):
                     delta[m] = right[m] if k == size else (1.0 if m == k else 0.0)
                 _solve(normal, delta)

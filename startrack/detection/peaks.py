@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from startrack.detection.background import COARSE_PX, coarse_width, local_level
 from startrack.detection.frame import Frame, Image, radius_for
+from startrack.kernels import njit
 from startrack.psf import filter_kernel
 from startrack.types import Array, Bools, Ints
 
@@ -20,7 +21,6 @@ MAX_BLOBS = 1000  # saturated; the largest
 MAX_DEAD_GROUPED_PX = 20_000  # pixels up to which they are grouped without looking at the whole mask
 OWN_RESIDUE_SIGMAS = 1.5
 ONE_PIXEL_FRACTION = 0.15  # of a peak's light beside it; a star of 0.45 px has 0.18
-NEIGHBOURS = [(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)]
 
 
 @dataclass(frozen=True)
@@ -109,16 +109,24 @@ def _strip_peaks(
     own = filtered[rows.start - first : rows.stop - first]
     row, column = np.divmod(np.flatnonzero(own > np.float32(lowest)), own.shape[1])
     row += rows.start
-    inside = _are_usable(frame, row, column, len(kernel) // 2 + 1)
-    row, column = row[inside] - first, column[inside]
-    height = filtered[row, column]
-    highest = np.ones(len(row), dtype=bool)
-    for down, right in NEIGHBOURS:
-        highest &= height >= filtered[row + down, column + right]
-    row, column = row[highest], column[highest]
+    good = _are_usable(frame, row, column, len(kernel) // 2 + 1)
+    row -= first
+    _require_highest(filtered, row, column, good)
+    row, column = row[good], column[good]
     offset = _parabola(filtered, row, column)
     pixels = np.stack([column, row + first], axis=1).astype(np.int64)
-    return pixels, height[highest], offset, level[row, column].astype(np.float64)
+    return pixels, filtered[row, column].astype(np.float64), offset, level[row, column].astype(np.float64)
+
+
+@njit(cache=True, nogil=True)
+def _require_highest(image, row, column, good):  # type: ignore[no-untyped-def]
+    """Clear those of good (n,) whose pixel any of its eight neighbours exceeds."""
+    for k in range(len(good)):
+        if good[k]:
+            y, x = row[k], column[k]
+            for i in range(y - 1, y + 2):
+                for j in range(x - 1, x + 2):
+                    good[k] = good[k] and image[y, x] >= image[i, j]
 
 
 def _are_off_known(known: Array, start: Array, sigma: float) -> Bools:

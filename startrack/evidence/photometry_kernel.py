@@ -1,7 +1,8 @@
 """The compiled loops of the forced photometry: one pass over the stars, each with the neighbours within reach.
 
 Helpers take whole arrays and have one exit: views and early exits cost reference counts, more than the arithmetic.
-Unsigned indices spare the test for negative ones, so that the compiler treats several pixels at a time.
+Unsigned indices spare the test for negative ones, so that the compiler treats several pixels at a time. Pixels are in
+single precision: twice as many at a time, and rounding is 1e-5 of the noise.
 """
 
 from __future__ import annotations
@@ -9,12 +10,12 @@ from __future__ import annotations
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
 
-from startrack.kernels import njit
+from startrack.kernels import REORDERED_SUMS, njit
 
-OUTLIER_SIGMA = 5.0
-MODEL_ERROR = 0.05  # of a star's light, pixel by pixel: the real PSF is not quite the Gaussian
+ZERO, ONE, LEAST = np.float32(0.0), np.float32(1.0), np.float32(1e-30)  # literals would be of double precision
+OUTLIER_VARIANCES = np.float32(5.0**2)
+MODEL_VARIANCE = np.float32(0.05**2)  # of a star's squared light, pixel by pixel: the real PSF is no Gaussian
 MAX_MASKED_PX = 6  # a stamp with more deviant pixels is not a star on a smooth background
-REORDERED_SUMS = {"reassoc", "contract", "nsz"}  # lets the compiler sum several pixels at a time
 
 
 @njit(cache=True, nogil=True, fastmath=REORDERED_SUMS)
@@ -33,18 +34,18 @@ def measure_sources(
     side = 2 * radius + 1
     across, down, centre = _profiles(xy_px, profiles)
     size = side * side
-    profile, light, data = np.empty(size), np.empty(size), np.empty(size)
-    variance, weight = np.empty(size), np.empty(size)
+    profile, light, data = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
+    variance, weight = np.empty(size, np.float32), np.empty(size, np.float32)
     near = np.empty(n, np.int64)
     for i in range(n):
         count = _find_neighbours(near, i, xy_px, visible, first, columns, side_px, reach_px)
         left, top = centre[i, 0] - radius, centre[i, 1] - radius
         for p in range(size):
-            light[p] = 0.0
+            light[p] = ZERO
         for m in range(count):
             j = near[m]
             x, y = k + left - centre[j, 0], k + top - centre[j, 1]
-            _add_light(light, side, flux_e[j] * visible[j], across, down, j, x, y)
+            _add_light(light, side, np.float32(flux_e[j] * visible[j]), across, down, j, x, y)
         _load_stamp(
             image,
             background,
@@ -134,7 +135,7 @@ def _load_stamp(
             profile[p] = height * across[source, c0 + c]
             data[p] = image[y, x] - background[y, x] - light[p]
             variance[p] = noise[y, x] * noise[y, x]
-            weight[p] = 0.0 if dead[y, x] else 1.0 / variance[p]
+            weight[p] = ZERO if dead[y, x] else ONE / variance[p]
 
 
 @njit(inline="always")
@@ -150,14 +151,14 @@ def _add_light(light, side, flux, across, down, j, x, y) -> None:
 
 
 @njit(inline="always")
-def _leak(weight, side, across, down, j, x, y) -> float:
+def _leak(weight, side, across, down, j, x, y):
     """Part of the light of neighbour j that the weights of the stamp take for the star's."""
     wide = across.shape[1]
     neighbour, width, dx, dy = np.uint64(j), np.uint64(side), np.uint64(x), np.uint64(y)
     c0, c1 = np.uint64(max(0, -x)), np.uint64(min(side, wide - x))
-    total = 0.0
+    total = ZERO
     for r in range(np.uint64(max(0, -y)), np.uint64(min(side, wide - y))):
-        inner = 0.0
+        inner = ZERO
         for c in range(c0, c1):
             inner += weight[r * width + c] * across[neighbour, c + dx]
         total += inner * down[neighbour, r + dy]
@@ -169,9 +170,9 @@ def _fit_masking(profile, light, data, variance, weight):
     """Flux, the profile's weighted mean, its strength about that, and how many deviant pixels got the weight 0."""
     size = len(profile)
     masked = 0
-    flux, middle, strength = 0.0, 0.0, 0.0
+    flux, middle, strength = ZERO, ZERO, ZERO
     while True:
-        w, wp, wd, wpp, wpd = 0.0, 0.0, 0.0, 0.0, 0.0
+        w, wp, wd, wpp, wpd = ZERO, ZERO, ZERO, ZERO, ZERO
         for p in range(size):
             v, q = weight[p], profile[p]
             w += v
@@ -179,45 +180,45 @@ def _fit_masking(profile, light, data, variance, weight):
             wd += v * data[p]
             wpp += v * q * q
             wpd += v * q * data[p]
-        middle = wp / max(w, 1e-30)
+        middle = wp / max(w, LEAST)
         strength = wpp - middle * wp
-        flux = (wpd - middle * wd) / strength if strength > 0.0 else 0.0
-        level = (wd - flux * wp) / max(w, 1e-30)
-        shine = max(flux, 0.0)
+        flux = (wpd - middle * wd) / strength if strength > ZERO else ZERO
+        level = (wd - flux * wp) / max(w, LEAST)
+        shine = max(flux, ZERO)
         deviant = 0
         for p in range(size):
             stars = shine * profile[p] + light[p]
             rest = data[p] - flux * profile[p] - level
-            allowed = variance[p] + stars + (MODEL_ERROR * stars) ** 2
-            deviant += 1 if weight[p] * rest * rest > weight[p] * allowed * OUTLIER_SIGMA**2 else 0
+            allowed = variance[p] + stars + MODEL_VARIANCE * stars * stars
+            deviant += 1 if weight[p] * rest * rest > weight[p] * allowed * OUTLIER_VARIANCES else 0
         if deviant == 0 or masked > MAX_MASKED_PX:
             break
         # The worst pixel first: a bright one shifts the fit so far that normal pixels beside it look deviant too.
-        worst, worst_excess = 0, 0.0
+        worst, worst_excess = 0, ZERO
         for p in range(size):
             stars = shine * profile[p] + light[p]
             rest = data[p] - flux * profile[p] - level
-            excess = rest * rest / (variance[p] + stars + (MODEL_ERROR * stars) ** 2)
-            if weight[p] > 0.0 and excess > worst_excess:
+            excess = rest * rest / (variance[p] + stars + MODEL_VARIANCE * stars * stars)
+            if weight[p] > ZERO and excess > worst_excess:
                 worst, worst_excess = p, excess
-        weight[worst] = 0.0
+        weight[worst] = ZERO
         masked += 1
     return flux, middle, strength, masked
 
 
 @njit(inline="always")
-def _visible_fraction(profile, weight) -> float:
+def _visible_fraction(profile, weight):
     """Part of the star's light in pixels that have a weight."""
-    total = 0.0
+    total = ZERO
     for p in range(len(profile)):
-        total += profile[p] if weight[p] > 0.0 else 0.0
+        total += profile[p] if weight[p] > ZERO else ZERO
     return total
 
 
 @njit(inline="always")
 def _variances(profile, light, variance, weight, middle, strength):
     """Variance of the flux without and per electron of its own light; the weights become those of flux = sum w data."""
-    total, own = 0.0, 0.0
+    total, own = ZERO, ZERO
     for p in range(len(profile)):
         weight[p] = weight[p] * (profile[p] - middle) / strength
         squared = weight[p] * weight[p]

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
+# mypy: disable-error-code="no-untyped-def"
 from dataclasses import dataclass, replace
-from math import ceil, sqrt
+from math import sqrt
 
-import cv2
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.evidence.sky_step import Horizon, Skyline, skyline_band
+from startrack.evidence.sky_step import BAND_PX, SKYLINE_POINTS, Horizon, Skyline, skyline_band
 from startrack.evidence.star_evidence import StarPhotometry, filtered_noise_e
 from startrack.frames import azel_from_rays, off_axis_rad, rays_from_azel
+from startrack.kernels import njit
 from startrack.psf import noise_area_px
 from startrack.types import Array, Bools, Detections
 
-BAND_PX = 12.0  # from the skyline to the last pixels that are used
 MASKED_SIGMA = 0.4  # light of a known star, in a pixel's noise, from which the pixel is left out
 EDGE_PX = 3.0  # beside the end of the image circle
-SCALE_SAMPLES, SCALE_STEP_RAD = 1440, 1e-3  # around the horizon, and in elevation
+SCALE_STEP_RAD = 1e-3  # in elevation
 UNRESOLVED_PX2 = 1.0 / 12.0  # variance of the position in a pixel
 
 
@@ -46,7 +46,7 @@ def pixels_near_skyline(
 
     `camera` and `R_cam_enu` place the skyline in the image; `stars` are those whose light is left out, visible or not.
     """
-    band = skyline_band(detections.image_e.shape, camera, R_cam_enu, horizon, BAND_PX)
+    band = skyline_band(detections.image_e.shape, camera, R_cam_enu, horizon)
     _leave_out_stars(band, detections, stars)
     pixel = np.flatnonzero(band)
     pixel = pixel[~detections.dead.ravel()[pixel]]
@@ -72,7 +72,7 @@ def scale_across(camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Skyline:
 
     Across, not upwards: a steep skyline is closer than it is high. `camera` and `R_cam_enu` place it in the image.
     """
-    azimuth = np.linspace(0.0, 2 * np.pi, SCALE_SAMPLES, endpoint=False)
+    azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS, endpoint=False)
     elevation = horizon(azimuth)
 
     rays_cam = rays_from_azel(azimuth, elevation) @ R_cam_enu.T
@@ -85,7 +85,7 @@ def scale_across(camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Skyline:
     up = (pixels(0, SCALE_STEP_RAD) - pixels(0, -SCALE_STEP_RAD)) / (2 * SCALE_STEP_RAD)
     along = pixels(-1, 0.0) - pixels(1, 0.0)
     across = np.abs(up[:, 0] * along[:, 1] - up[:, 1] * along[:, 0])
-    scale = np.ones(SCALE_SAMPLES)
+    scale = np.ones(SKYLINE_POINTS)
     scale[seen] = across / np.maximum(np.hypot(*along.T), 1e-9)
     return Skyline(scale)
 
@@ -97,11 +97,24 @@ def _leave_out_stars(band: Bools, detections: Detections, stars: StarPhotometry)
     xy_px = np.concatenate([stars.xy_px, detections.xy_px])
     peak = np.concatenate([stars.expected_e, detections.flux_e]) / (2 * np.pi * sigma2 * max(noise_e, 1e-9))
     bright = np.flatnonzero(peak > MASKED_SIGMA)
-    xy_px, radius = xy_px[bright], np.sqrt(2 * sigma2 * np.log(peak[bright] / MASKED_SIGMA)) + 0.5
-    x, y = np.rint(np.clip(xy_px, -1e6, 1e6)).astype(np.int64).T
-    on_frame = (x >= 0) & (y >= 0) & (x < band.shape[1]) & (y < band.shape[0])
-    touching = radius > BAND_PX / 2  # the disk may reach into the band from outside
-    touching[on_frame] |= band[y[on_frame], x[on_frame]]
-    picture = band.view(np.uint8)
-    for k in np.flatnonzero(touching).tolist():
-        cv2.circle(picture, (int(x[k]), int(y[k])), ceil(radius[k]), 0, -1)
+    radius = np.ceil(np.sqrt(2 * sigma2 * np.log(peak[bright] / MASKED_SIGMA)) + 0.5)
+    _clear_disks(band, np.rint(np.clip(xy_px[bright], -1e6, 1e6)).astype(np.int64), radius.astype(np.int64))
+
+
+@njit(cache=True, nogil=True)
+def _clear_disks(mask, xy_px, radius_px):
+    """Clear the pixels of a mask (H, W) within `radius_px` (n,) of the pixels (n, 2).
+
+    A small disk whose middle the mask lacks hardly reaches into the band: it is left out.
+    """
+    height, width = mask.shape
+    touching = radius_px > BAND_PX / 2
+    for k in range(len(xy_px)):
+        x, y = xy_px[k, 0], xy_px[k, 1]
+        touching[k] |= 0 <= x < width and 0 <= y < height and mask[y, x]
+    for k in np.flatnonzero(touching):
+        x, y, r = xy_px[k, 0], xy_px[k, 1], radius_px[k]
+        for row in range(max(y - r, 0), min(y + r + 1, height)):
+            for column in range(max(x - r, 0), min(x + r + 1, width)):
+                if (column - x) ** 2 + (row - y) ** 2 <= r * r:
+                    mask[row, column] = False

@@ -21,11 +21,11 @@ from startrack.kernels import njit
 from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Detections, Ints
 
-BAND_PX = 12.0  # both ways; the background model has no sharper edge
+BAND_PX = 12.0  # from the skyline to the last pixels that are used; the background model has no sharper edge
 STEP_PX = 0.5
 STEP_SAMPLES = 1800  # azimuths at which the step is measured
 STEP_OFFSETS_PX = np.array([-11.0, -9.5, -8.0, -6.5, 6.5, 8.0, 9.5, 11.0])  # heights above the skyline
-SECTORS = 36
+STEP_SECTORS = 36
 SKYLINE_POINTS = 1440
 SKYLINE_SAMPLES = 7200  # one in 3 arcmin: half a pixel of a 180-degree fisheye
 MEDIAN_ABS_NORMAL = 0.6745  # median of the absolute value of a standard normal variable
@@ -125,8 +125,8 @@ def subtract_sky_step(detections: Detections, camera: Camera, R_cam_enu: Array, 
     rest = (image_e[rows, columns] - detections.background_e[rows, columns]).astype(np.float64)
     spread = detections.noise_e[rows, columns].astype(np.float64)
     steps = int(2 * BAND_PX / STEP_PX)
-    cell = (azimuth / (2 * np.pi) * SECTORS).astype(np.int64) % SECTORS * steps + _step_of(above, steps)
-    middle = _medians(rest, cell, SECTORS * steps).reshape(SECTORS, steps)
+    cell = (azimuth / (2 * np.pi) * STEP_SECTORS).astype(np.int64) % STEP_SECTORS * steps + _step_of(above, steps)
+    middle = _medians(rest, cell, STEP_SECTORS * steps).reshape(STEP_SECTORS, steps)
     background, noise = detections.background_e.copy(), detections.noise_e.copy()
     profile = _interpolate_table(middle, azimuth, above)
     background[rows, columns] += profile.astype(np.float32)
@@ -171,19 +171,17 @@ def height_above_px(
     return np.asarray((elevation_rad - horizon(azimuth_rad)) * px_per_rad)
 
 
-def skyline_band(
-    shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horizon: Horizon, half_px: float = BAND_PX
-) -> Bools:
-    """Pixels (H, W) of an image of that `shape` within `half_px` of a `horizon`, with some to spare.
+def skyline_band(shape: tuple[int, ...], camera: Camera, R_cam_enu: Array, horizon: Horizon) -> Bools:
+    """Pixels (H, W) of an image of that `shape` within BAND_PX of a `horizon`, with some to spare.
 
     `camera` and `R_cam_enu` place the skyline in the image.
     """
     azimuth = np.linspace(0.0, 2 * np.pi, SKYLINE_POINTS, endpoint=False)
     xy, inside = camera.project(rays_from_azel(azimuth, horizon(azimuth)) @ R_cam_enu.T)
-    picture = np.zeros(shape, dtype=np.uint8)
+    picture = np.full(shape, 0, dtype=np.uint8)  # np.zeros would take small memory pages
     points = np.rint(xy).astype(np.int32)
     both = np.flatnonzero(inside & np.roll(inside, 1))
-    cv2.polylines(picture, list(np.stack([points[both - 1], points[both]], axis=1)), False, 1, int(2 * half_px) + 3)
+    cv2.polylines(picture, list(np.stack([points[both - 1], points[both]], axis=1)), False, 1, int(2 * BAND_PX) + 3)
     return picture.view(np.bool_)
 
 

@@ -2,6 +2,9 @@
 
 Pixels of the sky get their direction from the camera and the attitude, stars theirs from the catalogue. What the stars
 near the skyline show of the difference is taken out of the pixels' heights; its uncertainty stays with the position.
+
+The stars near the skyline, a tenth of those identified, are also in the fit whose covariance is the attitude's prior.
+A prior without their part moves 13 positions by 0.0004 to 0.08 sigma and widens these sigmas by 1.6 % at most.
 """
 
 from __future__ import annotations

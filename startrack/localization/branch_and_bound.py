@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from startrack.localization.boxes import NO_NUMBERS, Boxes, open_pairs, split_bo
 from startrack.localization.explored import BudgetSpent, Explored, log_sum
 from startrack.localization.initial_guess import Guess, beam_search, holds_allowed_ground
 from startrack.localization.likelihood import PARTS, PositionLikelihood
+from startrack.localization.search_settings import SearchSettings
 from startrack.localization.summary import smallest_axis
 from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Ints, NotLocated
@@ -24,30 +25,12 @@ LOOKED_UP_RAD = np.radians(0.26)  # height maps look up what is as wide as that,
 LLR_TIERS = ((4.0, np.inf), (2.0, 4.0), (1.0, 2.0), (0.0, 1.0))  # |llr| of rows that are bounded in turns
 MAX_SCORED_PAIRS = 200_000  # open (box, row) pairs above which horizons at the boxes' centres cost more than they gain
 SOFT_BOXES = 0.3  # of the boxes per sigma suffice where edges are soft: sums of Gaussians converge, and leave no cells
-ACCEPTED_NATS = -1.0  # mean over the sectors with rows, of a position answered without a proof: see EXPLAINED_NATS
 UNLIKELY_NATS = 16.0  # boxes that are less likely than the best by more are no part of the posterior
 START_LLR, START_ROWS, START_HALF_M = 4.0, 1000, 3.0  # |llr| and least number of strong rows; their smallest boxes
 NODE_STEP_M, FIRST_NODES_M = 10.0, 12.0  # least distance of traced points; half side of the first boxes worth it
 WORTH_NODES = 12.0  # horizons traced per open pair, which the levels to come would cost anyhow
 PAIRS_NEAR_NODES = 0.97  # of the pairs lie within the points; the others are traced
 LOOK_UP_COST, INTERPOLATION_COST, BOX_COST = 0.08, 0.03, 2.0  # a look-up, an interpolation, a traced box; in horizons
-
-
-class SearchSettings(Protocol):
-    """What the search reads of `ExactPosterior`."""
-
-    @property
-    def prune_nats(self) -> float: ...
-    @property
-    def negligible_nats(self) -> float: ...
-    @property
-    def finest_m(self) -> float: ...
-    @property
-    def boxes_per_sigma(self) -> float: ...
-    @property
-    def most_boxes(self) -> int: ...
-    @property
-    def budget_horizons(self) -> float: ...
 
 
 @dataclass
@@ -311,8 +294,3 @@ class Search:
         self.work += horizons * self.terrain.horizon_cost
         if self.work > self.settings.budget_horizons:
             raise BudgetSpent(boxes.centres_m, boxes.upper, boxes.half_m)
-
-
-def explains_all_sectors(log_likelihood: float, likelihood: PositionLikelihood) -> bool:
-    """Whether a position explains the evidence as well as a true one: positions hundreds of metres away do not."""
-    return log_likelihood > ACCEPTED_NATS * likelihood.sectors.occupied

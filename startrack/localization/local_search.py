@@ -53,7 +53,8 @@ class LocalLikelihood:
         rows = sums.pairs(first, last)[1]
         e = sums.evidence.take(rows)
         map_sigma = terrain.horizon_sigma_rad(centre_m[None], e.azimuth_rad)
-        extended = np.flatnonzero(e.extended_nats * e.edge_sigma_rad)
+        is_extended = e.extended_nats * e.edge_sigma_rad > 0.0
+        extended = np.flatnonzero(is_extended)
         return cls(
             terrain=terrain,
             ground=terrain.near(centre_m, half_m, e.azimuth_rad, across),
@@ -64,7 +65,7 @@ class LocalLikelihood:
             sector=sums.sector[rows],
             settled=sums.sums(first, last)[0][0] - sectors.ceiling,
             log_floor=sectors.log_floor,
-            stars=np.setdiff1d(np.arange(len(e)), extended) if len(extended) else slice(None),
+            stars=np.flatnonzero(~is_extended) if len(extended) else slice(None),
             profiles=SkyProfiles.from_rows(e, extended, map_sigma) if len(extended) else None,
         )
 
@@ -104,23 +105,24 @@ class LocalLikelihood:
     def _scorer(self, elevation_rad: Array | None) -> Callable[[Array], Array]:
         """Positions (n, 2) to log-likelihoods (n,), by interpolated horizons, by disks, or by the terrain itself."""
         which = self.stars
-        e = self.evidence if elevation_rad is None else replace(self.evidence, elevation_rad=elevation_rad)
-        e, sigma, sector = (e if isinstance(which, slice) else e.take(which)), self.sigma_rad[which], self.sector[which]
+        e = self.evidence if isinstance(which, slice) else self.evidence.take(which)
+        elevation = e.elevation_rad if elevation_rad is None else elevation_rad[which]
+        sigma, sector = self.sigma_rad[which], self.sector[which]
         nodes = self.ground.interpolation(e.azimuth_rad)
-        disks = None if nodes is not None or sigma.any() else self.terrain.visible_disks(*rays_of(e))
+        disks = None if nodes is not None or sigma.any() else self.terrain.visible_disks(e.azimuth_rad, elevation)
 
         def score(points_m: Array) -> Array:
             points, found = np.ascontiguousarray(points_m, dtype=np.float64), np.empty(len(points_m))
             rest = sector, self._settled_at(points, elevation_rad), self.log_floor
             if nodes is not None:
-                rise, fill = np.tan(e.elevation_rad), cast(Any, _score_nodes)
+                rise, fill = np.tan(elevation), cast(Any, _score_nodes)
                 fill(nodes, rise, e.llr, e.extended_nats, sigma, *rest, points, found)
             elif disks is not None:
                 score_disks(*disks, e.llr, *rest, points, found)
             else:
                 horizon, settled = self.ground.horizon_rad(points[:, None], e.azimuth_rad), rest[1]
                 for k in range(len(points)):
-                    value = contributions(e.llr, e.extended_nats, e.elevation_rad, horizon[k], sigma)
+                    value = contributions(e.llr, e.extended_nats, elevation, horizon[k], sigma)
                     sums = np.bincount(sector, weights=value, minlength=settled.shape[1])
                     found[k] = log_mixtures(settled[k % len(settled)] + sums, self.log_floor)
             return found

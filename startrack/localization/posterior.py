@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.compilation import announce_compilation
-from startrack.localization.branch_and_bound import Search, explains_all_sectors
+from startrack.localization.branch_and_bound import Search
 from startrack.localization.clock_posterior import marginalize_clock
 from startrack.localization.explored import BudgetSpent, Explored, log_sum
-from startrack.localization.initial_guess import beam_search, climb_to_best
+from startrack.localization.initial_guess import beam_search, climb_to_best, explains_all_sectors
 from startrack.localization.likelihood import SECTOR_EPSILON, SECTOR_RAD, PositionLikelihood
 from startrack.localization.local_posterior import local_posterior
 from startrack.localization.nuisance import ShapeFit, estimate_horizon_bias, marginalize_horizon_bias, marginalize_shape

@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.kernels import njit
-from startrack.terrain.bounds_kernel import bounds, box_height_bounds
+from startrack.terrain.bounds_kernel import bounds
+from startrack.terrain.box_height_kernel import box_height_bounds
 from startrack.terrain.horizon_kernel import FAR_M, horizon, surfaces
 from startrack.terrain.horizon_table import ANGLE_STEP_RAD, BINS, DISTANCE_STEP_M, FARTHEST, NOT_KNOWN_M, RISE_STEP
 

@@ -26,6 +26,7 @@ HURST = 0.8
 LARGEST_ROUGHNESS_M = 2000.0  # wavelength; larger waves have no more power
 SLOPE_RAD = np.radians(5.0)
 SEARCH_RADIUS_M = 3500.0
+HEIGHT_SIGMA_M = 0.48  # rendered from the map itself; what its roughness shows between posts
 SEED = 30
 
 
@@ -36,7 +37,8 @@ def rough_terrain(folder: Path) -> Path:
         return terrain
     folder.mkdir(parents=True, exist_ok=True)
     write_map(source, rough_crater())
-    words = ["--latitude", str(LATITUDE_DEG), "--longitude", str(LONGITUDE_DEG), "--radius", str(SEARCH_RADIUS_M)]
+    words = ["--latitude", str(LATITUDE_DEG), "--longitude", str(LONGITUDE_DEG), "--radius", str(SEARCH_RADIUS_M),
+             "--sigma", str(HEIGHT_SIGMA_M)]  # fmt: skip
     if startrack(["terrain", "import", str(source), "-o", str(terrain), *words, "-q"]) != 0:
         raise SystemExit("the rough map could not be imported")
     return terrain

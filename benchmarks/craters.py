@@ -51,7 +51,9 @@ def main() -> None:
     lines: list[list[str]] = []
     for name in args.terrain:
         rough = name == "rough"
-        terrain = load_terrain(rough_terrain(Path(tempfile.gettempdir()) / "startrack-rough-map") if rough else name)
+        terrain = load_terrain(
+            rough_terrain(Path(tempfile.gettempdir()) / "startrack-rough-map") if rough else f"{name}-rendered"
+        )
         assert isinstance(terrain, HeightMap)
         terrain.prepare()
         rng = np.random.default_rng(args.seed)

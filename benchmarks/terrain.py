@@ -44,8 +44,9 @@ def main() -> None:
     parser.add_argument("--no-degraded", action="store_true")
     parser.add_argument("--keep", type=Path, help="folder where the frames' evidence is kept, and taken from if there")
     args = parser.parse_args()
-    true = replace_settings(load_terrain(args.terrain), search_radius_m=args.radius, most_slope_rad=SLOPE_RAD)
-    maps = {"the map as it is": (replace_sigma(true, 0.0, 0.0), 0.0), "the shipped file's errors": (true, 0.0)}
+    rendered = load_terrain(f"{args.terrain}-rendered")
+    true = replace_settings(rendered, search_radius_m=args.radius, most_slope_rad=SLOPE_RAD)
+    maps = {"the map as it is": (replace_sigma(true, 0.0, 0.0), 0.0), "the errors of its -rendered file": (true, 0.0)}
     if not args.no_degraded:
         maps["degraded, and known to be"] = (degrade_map(true, args.seed), BIAS_RAD)
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in maps}

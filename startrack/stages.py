@@ -161,8 +161,8 @@ class Measured(Oriented):
 
     @property
     def warnings(self) -> list[str]:
-        """Facts in the image's file that were not used, and azimuths that the terrain does not cover."""
-        return [*self.exposure.warnings, *self.terrain.masked_sectors()]
+        """Facts in the image's file that were not used; what the terrain does not cover, and errors it leaves out."""
+        return [*self.exposure.warnings, *self.terrain.masked_sectors(), *self.terrain.error_warnings()]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,7 +1,7 @@
 """Make the shipped height maps from the published ones: python terrain/build_maps.py FOLDER [--check]
 
 FOLDER holds the original files (names, sources and sums: README.md here). Nothing is resampled: posts keep their
-places and, but for the far maps' rounding, their values.
+places and, but for rounding (far maps, site01), their values.
 """
 
 from __future__ import annotations
@@ -25,9 +25,12 @@ SUMS = {
     "ldem75s_far_1787m_rg16.png": "15225105c62d1f4feeb45bdf4bcdadcdb0e9801b021707f0f6116b50423d0ed8",
     "kepler_lola_48m.tif": "3cf9d369650bfd1d353272c1f7a4b7f1f2fad788b266084d840aee3ef383b2b2",
     "LDEM_4.IMG": "972d66d7f330abca62abc21aae270661516c00dd1a881ec102b94df9563656b5",
+    "site01_connecting_ridge_10m_rg16.png": "e366140ae324cc2122f69f5c591e568c36713d583bc2cf3c744c9ebd8becda12",
 }
 KEPLER = np.radians(8.12), np.radians(-38.01)
 FAR_KEPLER_M = 300_000.0
+SITE01_CENTRE_M = (-11_000.0, -12_000.0)  # x, y
+SITE01_MIDDLE = slice(350, 1250)  # 9 km: enough to measure the errors of the 240 m map
 MIDDLE = slice(288, 1248)  # 230 km about the pole: every crater of the TOML files here, and 25 km around the last
 
 
@@ -53,23 +56,31 @@ def make(folder: Path, out: Path) -> list[str]:
     """Write all maps into a folder; their names."""
     polar(folder / "ldem75s_cap_240m_rg16.png", out / "ldem75s-240m.tif", 240.0, -5499.0, 7025.0, MIDDLE)
     polar(folder / "ldem75s_far_1787m_rg16.png", out / "ldem75s-1787m.tif", 1786.875, -6829.5, 7025.0)
+    polar(folder / "site01_connecting_ridge_10m_rg16.png", out / "site01-10m.tif", 10.0, -523.2, 1959.5, SITE01_MIDDLE,
+          centre_m=SITE01_CENTRE_M, step_m=0.25)  # fmt: skip
     write_map(out / "kepler-48m.tif", read_map(folder / "kepler_lola_48m.tif", scale=0.5), step_m=0.5, offset_m=-4000.0)
     write_map(out / "kepler-far.tif", global_map(folder / "LDEM_4.IMG").crop_around(*KEPLER, FAR_KEPLER_M), step_m=0.5,
               offset_m=-10000.0)  # fmt: skip
-    return ["ldem75s-240m.tif", "ldem75s-1787m.tif", "kepler-48m.tif", "kepler-far.tif"]
+    return ["ldem75s-240m.tif", "ldem75s-1787m.tif", "site01-10m.tif", "kepler-48m.tif", "kepler-far.tif"]
 
 
-def polar(source: Path, to: Path, post_m: float, low_m: float, high_m: float, cut: slice = slice(None)) -> None:
-    """A south polar map of a picture whose red and green are the two bytes of the height."""
+def polar(
+    source: Path, to: Path, post_m: float, low_m: float, high_m: float, cut: slice = slice(None), *,
+    centre_m: tuple[float, float] = (0.0, 0.0), step_m: float | None = None,
+) -> None:  # fmt: skip
+    """A south polar map of a picture whose red and green are the two bytes of the height.
+
+    centre_m: x, y of the picture's centre. step_m: to which heights are rounded; None keeps those of the picture.
+    """
     picture = cv2.imread(str(source), cv2.IMREAD_UNCHANGED)
     steps = picture[:, :, 2].astype(np.int64) * 256 + picture[:, :, 1]
-    step_m = (high_m - low_m) / 65_535
+    own_step_m = (high_m - low_m) / 65_535
     corner = (steps.shape[0] - 1) / 2 * post_m
     heights = Raster(
-        heights_m=(low_m + steps * step_m).astype(np.float32), projection=polar_stereographic(), x0_m=-corner,
-        y0_m=corner, dx_m=post_m, dy_m=-post_m,
+        heights_m=(low_m + steps * own_step_m).astype(np.float32), projection=polar_stereographic(),
+        x0_m=centre_m[0] - corner, y0_m=centre_m[1] + corner, dx_m=post_m, dy_m=-post_m,
     )  # fmt: skip
-    write_map(to, heights.crop(cut, cut), step_m=step_m, offset_m=low_m)
+    write_map(to, heights.crop(cut, cut), step_m=step_m or own_step_m, offset_m=low_m)
 
 
 def global_map(source: Path) -> Raster:

@@ -25,7 +25,7 @@ def _own_cache(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("where", PLACES)
 def test_a_position_in_a_shipped_crater_is_found(where):
-    terrain = load_terrain(where.split()[0])
+    terrain = load_terrain(f"{where.split()[0]}-rendered")
     latitude, longitude = latlon_from_enu(terrain.site, *PLACES[where], 0.0)
     terrain = replace(terrain, site=Site("moon", float(latitude), float(longitude)), search_radius_m=250.0)
     rays = 1200 if where.startswith("kepler") else 3000  # wide craters with low rims give less information

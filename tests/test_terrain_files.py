@@ -26,6 +26,7 @@ from startrack.terrain.raster import (
     projection_of,
 )
 from startrack.terrain.raster_io import read_map
+from startrack.terrain.stated_errors import MEASURED_PER_ESTIMATE
 from startrack.types import BadInput
 
 ROOT = Path(__file__).parent.parent
@@ -86,6 +87,37 @@ def test_every_key_reaches_the_terrain(tmp_path):
     slopes = terrain.slope_rad(np.array([[0.0, 0.0], [0.0, 690.0]]))
     assert slopes[0] < 0.01
     assert terrain.allowed(np.array([[0.0, 0.0], [2000.0, 0.0]])).tolist() == [True, False]
+
+
+def test_errors_that_a_file_leaves_out_are_zero_and_a_warning(tmp_path):
+    cylinder = {key: HILL[key] for key in ("format", "body", "origin")} | {"name": "pit"}
+    sizes = {"diameter_m": 9000.0, "depth_m": 1600.0}
+    pit = terrain_from_dict(cylinder | {"cylinder": sizes})
+    assert pit.shape_sigma == (0.0, 0.0)
+    (line,) = pit.error_warnings()
+    assert "pit: its file states no depth_sigma_m and diameter_sigma_m: taken as 0" in line
+    (line,) = terrain_from_dict(cylinder | {"cylinder": sizes | {"depth_sigma_m": 3.2}}).error_warnings()
+    assert "no diameter_sigma_m" in line
+    stated = terrain_from_dict(cylinder | {"cylinder": sizes | {"depth_sigma_m": 0.0, "diameter_sigma_m": 0.0}})
+    assert stated.error_warnings() == load_terrain("shackleton-thesis").error_warnings() == []
+
+    hill = load_terrain(terrain_file(tmp_path))
+    assert hill.error_warnings() == []
+    (tmp_path / "hill.toml").write_text(tomli_w.dumps({**HILL, "dem": {"file": "hill.tif"}}))
+    assert ["no height_sigma_m" in line for line in load_terrain(tmp_path / "hill.toml").error_warnings()] == [True]
+
+
+def test_a_result_warns_of_errors_that_the_terrain_file_leaves_out(tmp_path, capsys):
+    path = tmp_path / "pit.toml"
+    text = (data_dir("terrain") / "shackleton-thesis.toml").read_text()
+    path.write_text("\n".join(line for line in text.splitlines() if "_sigma_m" not in line))
+    sample = str(ROOT / "sample_images/near-centre.png")
+    for terrain, count in ((str(path), 1), ("shackleton-thesis", 0)):
+        assert main(["locate", sample, "-t", terrain, "--json", "--no-plots", "-D", str(tmp_path / "out"), "-O"]) == 0
+        heard = capsys.readouterr()
+        warnings = json.loads(heard.out)["warnings"]
+        assert sum("depth_sigma_m and diameter_sigma_m" in line for line in warnings) == count
+        assert ("depth_sigma_m" in heard.err) == bool(count)
 
 
 REFUSED = [
@@ -324,7 +356,7 @@ def test_the_error_of_posts_is_estimated_from_the_map(tmp_path, capsys):
         half_way = every // 2
         middle = 0.5 * (posts[:, 1:] + posts[:, :-1])
         true = float(np.sqrt(np.mean((ground[::every, half_way::every][:, : n - 1] - middle) ** 2)))
-        taken[every] = facts["height_sigma_m"] / true
+        taken[every] = facts["height_sigma_m"] / MEASURED_PER_ESTIMATE / true
     assert all(0.66 < ratio < 1.5 for ratio in taken.values()), taken
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli.common import DEFAULT_OUT
 from startrack.cli.preparation import prepare
 from startrack.cli.terrain_facts import facts_of, lines_of, view_facts
+from startrack.compilation import announce_compilation
 from startrack.files import file_stem, make_folder
 
 if TYPE_CHECKING:
@@ -55,8 +56,12 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "--offset", nargs="+", type=float, metavar="M", help="height of value 0 of each map, if the files lack it"
     )
     imported.add_argument(
-        "--sigma", type=float, metavar="M", help="error of single posts (default: estimated from the map's roughness)"
+        "--sigma", type=float, metavar="M", help="error of single posts (default: measured or estimated)"
     )
+    imported.add_argument(
+        "--compare", nargs="+", default=(), metavar="MAP",
+        help="finer maps of a part of the ground, to measure the errors (the shipped maps are tried anyway)",
+    )  # fmt: skip
     imported.add_argument(
         "--camera-height", type=float, default=1.5, metavar="M", help="above the ground (%(default)g)"
     )
@@ -127,14 +132,16 @@ def _import_map(args: argparse.Namespace) -> int:
     from startrack.terrain import load_terrain
     from startrack.terrain.import_map import import_maps
 
+    announce_compilation()
     half = list(args.half or [])
     half += [30_000.0 if not half and k == 0 else 300_000.0 for k in range(len(half), len(args.maps))]
     imported = import_maps(
         args.maps, args.output, latitude_rad=radians(args.latitude), longitude_rad=radians(args.longitude), half_m=half,
         radius_m=args.radius, scale=args.scale or (), offset_m=args.offset or (), height_sigma_m=args.sigma,
-        camera_height_m=args.camera_height, overwrite=args.overwrite,
+        compare=args.compare, camera_height_m=args.camera_height, overwrite=args.overwrite,
     )  # fmt: skip
-    facts = facts_of(load_terrain(imported.path)) | {"sigma_from": "map" if args.sigma is None else "flag"}
+    facts = facts_of(load_terrain(imported.path))
+    facts |= {"sigma_from": imported.errors.origin, "sigma_comment": imported.errors.comment}
     _print_facts(args, facts | {"files": [str(imported.path)], "warnings": imported.warnings})
     return 0
 

@@ -97,7 +97,8 @@ def lines_of(facts: dict[str, Any]) -> Iterator[str]:
 def _errors_text(facts: dict[str, Any]) -> str:
     shared = facts["horizon_sigma_deg"]
     all_around = "three times what these make of it" if shared is None else f"{shared:g} degrees"
-    source = {"map": " (from the map's roughness)"}.get(facts.get("sigma_from", ""), "")
+    sources = {"map": " (from the map's roughness)", "comparison": " (compared with a finer map)"}
+    source = sources.get(facts.get("sigma_from", ""), "")
     return f"of single posts {facts['height_sigma_m']:g} m{source}; shared by the whole horizon {all_around}"
 
 

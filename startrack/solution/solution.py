@@ -143,7 +143,7 @@ class Solution:
 
     @property
     def warnings(self) -> list[str]:
-        """Facts in the image's file that were not used, and azimuths that the terrain does not cover."""
+        """Facts in the image's file that were not used, and what the terrain does not cover or its file leaves out."""
         return self.result.warnings
 
     def to_dict(self) -> dict[str, Any]:

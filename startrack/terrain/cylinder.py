@@ -17,7 +17,7 @@ MAX_LENGTH_M = 1e7  # five times the Moon's radius
 MAX_SHAPE_SIGMA = 0.2  # of depth and diameter; the posterior of the shape is expanded about the stated one
 LENGTH = Number(low=0.0, high=MAX_LENGTH_M, above=True)
 CAMERA_HEIGHT = Number(low=0.0, high=MAX_LENGTH_M)
-_SIGMA = Number(low=0.0, high=MAX_LENGTH_M, default=0.0)
+_SIGMA = Number(low=0.0, high=MAX_LENGTH_M, description="if absent 0, with a warning")
 CYLINDER_KEYS = {  # of [cylinder] in a terrain file, and of the class
     "diameter_m": replace(LENGTH, required=True),
     "depth_m": replace(LENGTH, required=True),
@@ -43,6 +43,7 @@ class Cylinder(Terrain):
     search_radius_m: float = np.inf
     depth_sigma_m: float = 0.0  # standard deviations; with either, the shape is estimated with the position
     diameter_sigma_m: float = 0.0
+    unstated_errors: tuple[str, ...] = ()
     axisymmetric = True
     horizon_cost = 0.02
 

@@ -51,6 +51,7 @@ class HeightMap(Terrain):
     horizon_sigma_common_rad: float | None = None  # of an error that all azimuths share; None: see common_sigma_rad
     most_slope_rad: float = np.pi / 2  # a rover does not stand on steeper ground
     glare_rad: Sectors = ()  # lit by the Sun: no evidence there
+    unstated_errors: tuple[str, ...] = ()
     finest_m = FINEST_BOX_M
 
     def __post_init__(self) -> None:

@@ -5,15 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from startrack.terrain.geotiff import write_map
+from startrack.terrain.map_comparison import crest_angle_rad_per_m
 from startrack.terrain.map_error import carried_spacing, error_between_posts_m
 from startrack.terrain.raster import Raster
 from startrack.terrain.raster_io import read_map
+from startrack.terrain.stated_errors import StatedErrors, measure_errors
 from startrack.types import BadInput
+
+if TYPE_CHECKING:
+    from startrack.terrain.height_map import HeightMap
 
 RIM_RADII = 1.5  # of the search area: most of the rim is nearer
 MAX_POST_RADII = 0.2  # of the search area: with posts further apart its shape is not resolved
@@ -21,23 +26,26 @@ MAX_POST_RADII = 0.2  # of the search area: with posts further apart its shape i
 
 @dataclass(frozen=True, kw_only=True)
 class ImportedTerrain:
-    """The terrain file that was written, and warnings about its maps."""
+    """The terrain file that was written, the errors that it states, and warnings about its maps."""
 
     path: Path
+    errors: StatedErrors
     warnings: list[str]
 
 
 def import_maps(
     maps: Sequence[str | Path], output: str | Path, *, latitude_rad: float, longitude_rad: float,
     half_m: Sequence[float], radius_m: float, scale: Sequence[float] = (), offset_m: Sequence[float] = (),
-    height_sigma_m: float | None = None, camera_height_m: float = 1.5, overwrite: bool = False,
+    height_sigma_m: float | None = None, compare: Sequence[str | Path] = (), camera_height_m: float = 1.5,
+    overwrite: bool = False,
 ) -> ImportedTerrain:  # fmt: skip
     """Write the terrain file `output` and, beside it, a crop of each map: NAME-1.tif, the finest, and so on.
 
     latitude_rad, longitude_rad: the origin. half_m: half the side of each crop about it [m]. radius_m: of the search
     area. scale, offset_m: of each map, the finest first, where the files do not state them. height_sigma_m: error
-    of single posts [m]; None estimates it from the roughness of the map that makes the horizon. camera_height_m: above
-    the ground [m]. overwrite: replace existing files.
+    of single posts [m]; None measures it where a finer map covers a part of the map that makes the horizon: one of the
+    `maps`, of the files `compare`, or a shipped one; else it is estimated from the map's roughness. camera_height_m:
+    above the ground [m]. overwrite: replace existing files.
 
     Raises BadInput bad_terrain; nothing is then written.
     """
@@ -60,19 +68,27 @@ def import_maps(
             raise BadInput("bad_terrain", f"{source}: it does not reach {latitude_deg:g}, {longitude_deg:g}")
         crops.append(replace(crop, source=Path(source).name))
     rim = _rim_map(crops, radius_m)
-    sigma_m = float(f"{error_between_posts_m(rim):.2g}") if height_sigma_m is None else float(height_sigma_m)
+    if height_sigma_m is None:
+        errors = measure_errors(rim, [*crops, *map(read_map, compare)])
+    else:
+        errors = StatedErrors(height_sigma_m=float(height_sigma_m), origin="flag", comment="height_sigma_m: as given")
     values = {
         "format": 1, "name": output.stem, "body": "moon",
         "origin": {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg},
-        "dem": {"file": [path.name for path in files], "height_sigma_m": sigma_m},
+        "dem": {"file": [path.name for path in files], "height_sigma_m": errors.height_sigma_m},
         "rover": {"camera_height_m": float(camera_height_m)}, "search": {"radius_m": float(radius_m)},
     }  # fmt: skip
-    _write_terrain(output, values, dict(zip(files, crops, strict=True)))
-    return ImportedTerrain(path=output, warnings=spacing_warnings(crops, radius_m) + smoothness_warnings(rim, sigma_m))
+    _write_terrain(output, values, errors, dict(zip(files, crops, strict=True)))
+    warnings = [*errors.warnings, *spacing_warnings(crops, radius_m)]
+    warnings += smoothness_warnings(rim, errors.height_sigma_m)
+    return ImportedTerrain(path=output, errors=errors, warnings=warnings)
 
 
-def _write_terrain(output: Path, values: dict[str, Any], crops: dict[Path, Raster]) -> None:
-    """Write the maps, check them as a terrain, and write its file. After an exception no file is left."""
+def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, crops: dict[Path, Raster]) -> None:
+    """Write the maps, check them as a terrain, and write its file. After an exception no file is left.
+
+    The horizon's sigma, where it was measured, follows from the distance of the crests on the terrain.
+    """
     import tomli_w
 
     from startrack.terrain.io import terrain_from_dict
@@ -83,8 +99,11 @@ def _write_terrain(output: Path, values: dict[str, Any], crops: dict[Path, Raste
         for path, crop in crops.items():
             written.append(path)
             write_map(path, crop)
-        terrain_from_dict(values, folder=output.parent)
-        output.write_text(tomli_w.dumps(values), encoding="utf-8")
+        terrain = terrain_from_dict(values, folder=output.parent)
+        if errors.common_crest_sigma_m is not None:
+            angle_rad = errors.common_crest_sigma_m * crest_angle_rad_per_m(cast("HeightMap", terrain))
+            values["dem"]["horizon_sigma_deg"] = float(f"{np.degrees(angle_rad):.2g}")
+        output.write_text(errors.comment_lines() + tomli_w.dumps(values), encoding="utf-8")
     except BaseException:
         for path in written:
             path.unlink(missing_ok=True)

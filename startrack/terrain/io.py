@@ -44,8 +44,9 @@ KEYS = Table(
             keys={
                 "file": Either(kinds=(FILE, List(each=FILE, least=1, most=100)), required=True,
                                description="finest first"),
-                "height_sigma_m": Number(low=0.0, high=MAX_LENGTH_M, default=0.0,
-                                         description="of single posts, independent of each other"),
+                "height_sigma_m": Number(low=0.0, high=MAX_LENGTH_M,
+                                         description="of single posts, independent of each other; if absent 0, with "
+                                         "a warning"),
                 "horizon_sigma_deg": Number(low=0.0, high=9.99, description="of an error that all azimuths share"),
                 "scale": Number(low=-1e6, high=1e6, description="metres per unit, where the files do not state it"),
                 "offset_m": Number(low=-MAX_LENGTH_M, high=MAX_LENGTH_M,
@@ -140,11 +141,13 @@ def terrain_from_dict(values: dict[str, Any], default_name: str = "terrain", fol
 
 def _make_cylinder(keys: dict[str, Any], name: str, site: Site) -> Cylinder:
     cylinder, search = keys["cylinder"], keys.get("search", {})
+    missing = tuple(key for key in ("depth_sigma_m", "diameter_sigma_m") if key not in cylinder)
     return Cylinder(
         name=name,
         site=site,
         camera_height_m=keys.get("rover", {}).get("camera_height_m", DEFAULT_CAMERA_HEIGHT_M),
         search_radius_m=search.get("radius_m", cylinder["diameter_m"] / 2),
+        unstated_errors=missing,
         **cylinder,
     )
 
@@ -165,7 +168,8 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
         maps=tuple(read_map(file, near=near, **scaling) for file in _map_files(keys, folder)),
         camera_height_m=keys.get("rover", {}).get("camera_height_m", DEFAULT_CAMERA_HEIGHT_M),
         search_radius_m=search.get("radius_m", DEFAULT_MAP_RADIUS_M),
-        height_sigma_m=dem["height_sigma_m"],
+        height_sigma_m=dem.get("height_sigma_m", 0.0),
+        unstated_errors=() if "height_sigma_m" in dem else ("height_sigma_m",),
         horizon_sigma_common_rad=None if common_deg is None else float(np.radians(common_deg)),
         most_slope_rad=float(np.radians(search.get("max_slope_deg", 90.0))),
         glare_rad=tuple((float(np.radians(a)), float(np.radians(b))) for a, b in search.get("glare_deg", ())),

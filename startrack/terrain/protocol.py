@@ -58,6 +58,7 @@ class Terrain(ABC):
     shape_sigma: tuple[float, float] = (0.0, 0.0)  # relative, of steepness and of size: see `reshaped`
     rim_radius_m: float | None = None  # of a circular rim about the origin, drawn on maps instead of the relief
     table_path: Path | None = None  # file of the table that `prepare` computes; None where it computes none
+    unstated_errors: tuple[str, ...] = ()  # keys of errors that the terrain file leaves out: they count as zero
 
     @property
     def reach_m(self) -> float:
@@ -111,6 +112,17 @@ class Terrain(ABC):
     def masked_sectors(self) -> list[str]:
         """One line of text per range of azimuths that is not informative."""
         return []
+
+    def error_warnings(self) -> list[str]:
+        """One line of text if the terrain file leaves out errors: the ground then counts as exact."""
+        missing = [key for key in self.unstated_errors if not getattr(self, key)]
+        if not missing:
+            return []
+        keys = " and ".join(missing)
+        return [
+            f"terrain {self.name}: its file states no {keys}: taken as 0; circles are too small unless the ground is "
+            "exactly so; state the errors (0 for a model from which pictures are rendered)"
+        ]
 
     def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = 3) -> Terrain:
         """The same ground, prepared for positions within `half_m` of a centre (2,), at the azimuths (n,).
@@ -237,7 +249,8 @@ class ForwardingTerrain(Terrain):
     max_horizon_sigma_rad = _forward("max_horizon_sigma_rad")
     ground_m, allowed, near = _forward("ground_m"), _forward("allowed"), _forward("near")
     is_informative, mask_reason = _forward("is_informative"), _forward("mask_reason")
-    masked_sectors = _forward("masked_sectors")
+    masked_sectors, error_warnings = _forward("masked_sectors"), _forward("error_warnings")
+    unstated_errors = _forward("unstated_errors")
     reshaped, log_prior = _forward("reshaped"), _forward("log_prior")
     visible_disks, interpolation = _forward("visible_disks"), _forward("interpolation")
     interpolated_part, horizon_spread_rad = _forward("interpolated_part"), _forward("horizon_spread_rad")

@@ -38,10 +38,10 @@ def add_fact_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--exposure", type=positive_number, metavar="S", help="exposure time in seconds")
 
 
-def add_time_sigma_flag(parser: Any, default_s: float | None = None) -> None:
+def add_time_sigma_flag(parser: Any) -> None:
     """The flag for the sigma of the clock, in a parser or a group of its flags."""
     parser.add_argument(
-        "--time-sigma", type=time_sigma_s, default=default_s, metavar="SECONDS",
+        "--time-sigma", type=time_sigma_s, metavar="SECONDS",
         help="standard deviation of the clock's error (1)",
     )  # fmt: skip
 

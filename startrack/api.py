@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 __all__ = ["calibrate", "detect", "identify", "locate", "measure_horizon", "render"]
 
-ARGUMENT_OF_FLAG = {"--time UTC": "time="}  # messages of the stages name the flags of the commands
+TIME_FLAG, TIME_ARGUMENT = "--time UTC", "time="  # messages of the stages name the flags of the commands
 
 
 def locate(
@@ -55,6 +55,7 @@ def locate(
     camera: str | Camera | None = None,
     terrain: str | Terrain | None = None,
     time: Time = None,
+    time_sigma: float | Quantity | None = None,
     settings: Settings | None = None,
 ) -> Solution:
     """Position and attitude from one image of the stars.
@@ -66,6 +67,7 @@ def locate(
         camera: a camera file, the name of a shipped one, or the object.
         terrain: a terrain file, the name of a shipped one, or the object.
         time: middle of the exposure: text, aware datetime, numpy datetime64 (UTC) or astropy Time (any scale).
+        time_sigma: standard deviation of the clock's error: an astropy duration, or seconds.
         settings: stages to use instead of the usual ones.
 
     Returns:
@@ -77,7 +79,7 @@ def locate(
         TypeError: `settings` of another type.
     """
     settings = settings_input(settings)
-    exposure = exposure_input(image, time)
+    exposure = exposure_input(image, time, time_sigma)
     known = camera_input(camera, exposure), terrain_input(terrain, exposure)
     return _solution(pipeline.locate(exposure, *known, load_catalog(), settings), "fix")
 
@@ -283,8 +285,5 @@ def _identify_list(
 def _solution(outcome: Outcome, kind: str) -> Solution:
     """Raises BadInput where the input was at fault, whichever stage found that."""
     if isinstance(outcome, Refused) and outcome.reason in BAD_INPUT_REASONS:
-        message = outcome.message
-        for flag, argument in ARGUMENT_OF_FLAG.items():
-            message = message.replace(flag, argument)
-        raise BadInput(outcome.reason, message)
+        raise BadInput(outcome.reason, outcome.message.replace(TIME_FLAG, TIME_ARGUMENT))
     return Solution(outcome, kind)

@@ -58,14 +58,18 @@ class Number(Key):
     above: bool = False
     integer: bool = False
 
+    @property
+    def limits(self) -> str:
+        """The limits in words."""
+        return f"{f'above {self.low:g} and at most' if self.above else f'from {self.low:g} to'} {self.high:g}"
+
     def check(self, value: Any, name: str) -> float | int:
         kind = "a whole number" if self.integer else "a number"
         if isinstance(value, bool) or not isinstance(value, Real):  # Real: a number of numpy too
             raise ValueError(f"{name} must be {kind}, not {value_text(value)}")
         number: Any = value
         if not self.low <= number <= self.high or (self.above and number == self.low):  # NaN fails the first
-            limits = f"above {self.low:g} and at most" if self.above else f"from {self.low:g} to"
-            raise ValueError(f"{name} must be {kind} {limits} {self.high:g}, not {value_text(value)}")
+            raise ValueError(f"{name} must be {kind} {self.limits}, not {value_text(value)}")
         if self.integer and number % 1:
             raise ValueError(f"{name} must be {kind}, not {value_text(value)}")
         return int(number) if self.integer else float(number)

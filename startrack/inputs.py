@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from startrack.camera import Camera, load_camera
 from startrack.exposure import exposure_of, read_exposure, with_facts
+from startrack.exposure.metadata import check_time_sigma_s
 from startrack.frames import parse_utc
 from startrack.stages import Settings
 from startrack.terrain import Terrain, load_terrain, require_terrain
@@ -23,16 +24,17 @@ Time: TypeAlias = Any  # text, datetime, datetime64, astropy Time (not imported 
 MAX_LIST_COLUMNS = 4  # x, y, flux and error: an array (n, 4) is no image
 
 
-def exposure_input(image: Image, time: Time) -> Exposure:
-    """The exposure of an `image`: a file, an array (H, W) or (H, W, 3), or the exposure itself; at `time` if given.
+def exposure_input(image: Image, time: Time, time_sigma: Any = None) -> Exposure:
+    """The exposure of an `image`: a file, an array (H, W) or (H, W, 3), or the exposure itself.
 
-    Raises BadInput (bad_image, no_time). An array whose mask hides pixels is refused: no stage can leave pixels out.
+    `time` and `time_sigma` (see `time_sigma_input`) replace its own where they are given. Raises BadInput (bad_image,
+    no_time). An array whose mask hides pixels is refused: no stage can leave pixels out.
     """
-    time_utc = time_input(time)
+    given: dict[str, Any] = {"time_utc": time_input(time), "time_sigma_s": time_sigma_input(time_sigma)}
     if isinstance(image, Exposure):
-        return with_facts(image, time_utc=time_utc)
+        return with_facts(image, **given)
     if isinstance(image, str | os.PathLike):
-        return read_exposure(image, time_utc=time_utc)
+        return read_exposure(image, **given)
     try:
         pixels = np.asanyarray(image)  # a plain array would have lost its mask
     except (TypeError, ValueError) as cause:
@@ -46,7 +48,7 @@ def exposure_input(image: Image, time: Time) -> Exposure:
             f"{masked} of {pixels.size} pixels are masked, and startrack cannot leave pixels out: fill them (by their "
             "neighbours' median, say) and give the plain array",
         )
-    return exposure_of(np.asarray(pixels), time_utc=time_utc)
+    return with_facts(exposure_of(np.asarray(pixels)), **given)
 
 
 def is_list_of_centroids(image: Any) -> bool:
@@ -79,6 +81,20 @@ def time_input(time: Time) -> datetime | None:
     if not isinstance(moment, str):
         raise BadInput("no_time", f"{time!r} is no time: give text, a datetime, a datetime64 or one astropy Time")
     return parse_utc(moment)
+
+
+def time_sigma_input(time_sigma: Any) -> float | None:
+    """Standard deviation of the clock's error [s]: an astropy duration, or seconds; None stays None.
+
+    Raises BadInput (no_time) for anything else, and for a number that is negative or larger than ten days.
+    """
+    if time_sigma is None:
+        return None
+    try:
+        seconds = time_sigma.to_value("s") if hasattr(time_sigma, "to_value") else time_sigma
+        return check_time_sigma_s(seconds, "time_sigma=")
+    except (TypeError, ValueError) as cause:
+        raise BadInput("no_time", f"{cause}: give seconds or an astropy duration") from cause
 
 
 def _iso_text(time: Any) -> Any:

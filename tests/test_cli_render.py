@@ -114,6 +114,22 @@ def test_the_files_agree_with_each_other_and_with_the_sky(folder):
     assert np.median(snr[bright & table["hidden"]]) < 3
 
 
+def test_a_wrong_clock_changes_the_stated_time_alone(folder):
+    pose = ["--time", "2026-03-01T12:00:00", "--east", "1000", "--north", "-2000", "--heading", "30"]
+    render(*pose, "-o", "right.png")
+    render(*pose, "--clock-offset", "-90.5", "--time-sigma", "60", "-o", "wrong.png")
+    right, wrong = read_exposure("right.png"), read_exposure("wrong.png")
+    assert (wrong.time_utc - right.time_utc).total_seconds() == 90.5
+    assert (right.time_sigma_s, wrong.time_sigma_s) == (1.0, 60.0)
+    np.testing.assert_array_equal(wrong.pixels_adu, right.pixels_adu)
+    (folder / "wrong.json").unlink()
+    assert read_exposure("wrong.png").time_utc == wrong.time_utc  # from the header
+    truths = [json.loads((folder / f"{name}.truth.json").read_text()) for name in ("right", "wrong")]
+    assert [truth["clock_offset_s"] for truth in truths] == [0.0, -90.5]
+    assert parse_utc(truths[1]["time_utc"]) == parse_utc(truths[0]["time_utc"]) == right.time_utc
+    assert truths[1]["quat_xyzw_cam_icrs"] == truths[0]["quat_xyzw_cam_icrs"]
+
+
 def test_every_format_holds_the_same_pixels(folder):
     frames = []
     for suffix in ("png", "tif", "fits"):
@@ -183,7 +199,16 @@ def test_bad_input_is_refused_by_its_reason(folder, flags, reason):
 
 
 @pytest.mark.parametrize(
-    "flags", [["-o", "x.png", "-n", "2"], ["-o", "x.jpg"], ["--exposure", "0"], ["--east", "nan"], ["--seed", "-1"]]
+    "flags",
+    [
+        ["-o", "x.png", "-n", "2"],
+        ["-o", "x.jpg"],
+        ["--exposure", "0"],
+        ["--east", "nan"],
+        ["--seed", "-1"],
+        ["--clock-offset", "1e6"],
+        ["--time-sigma", "-1"],
+    ],
 )
 def test_wrong_usage_exits_with_2(folder, flags):
     with pytest.raises(SystemExit) as leaving:

@@ -18,7 +18,7 @@ from startrack.types import BadInput, Exposure
 
 FRAME = np.random.default_rng(8).integers(0, 65536, (33, 44)).astype(np.uint16)
 MID = datetime(2031, 3, 26, 20, 58, 11, 966208, tzinfo=UTC)
-FACTS = ("time_utc", "exposure_s", "saturation_adu")
+FACTS = ("time_utc", "time_sigma_s", "exposure_s", "saturation_adu")
 SUFFIXES = [".png", ".tif", ".tiff", ".fits", ".fit", ".fits.gz", ".fits.bz2", ".PNG"]
 
 
@@ -29,7 +29,9 @@ def exposure_of(pixels, saturation=65535.0, **facts):
 @pytest.fixture
 def exposure(tmp_path):
     camera = tmp_path / "calib" / "camera.toml"
-    return exposure_of(FRAME, time_utc=MID, exposure_s=9.999999, camera=str(camera), terrain="shackleton")
+    return exposure_of(
+        FRAME, time_utc=MID, time_sigma_s=0.25, exposure_s=9.999999, camera=str(camera), terrain="shackleton"
+    )
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -74,6 +76,7 @@ def test_others_read_our_png(tmp_path, exposure):
         "TIMESYS": "UTC",
         "DATE-OBS": "2031-03-26T20:58:06.966208",
         "DATE-AVG": "2031-03-26T20:58:11.966208",
+        "STTSIG": "0.25",
         "EXPTIME": "9.999999",
         "STCAMERA": "calib/camera.toml",
         "STTERRAI": "shackleton",
@@ -88,6 +91,7 @@ def test_others_read_our_fits(tmp_path, exposure):
         header = units[0].header
     assert header["DATE-OBS"] == "2031-03-26T20:58:06.966208"
     assert header["DATE-AVG"] == "2031-03-26T20:58:11.966208"
+    assert (header["STTSIG"], header.comments["STTSIG"]) == (0.25, "[s] standard deviation of the clock's error")
     assert (header["EXPTIME"], header["TIMESYS"], header["STCAMERA"]) == (9.999999, "UTC", "calib/camera.toml")
 
 
@@ -106,7 +110,8 @@ def test_equal_input_gives_equal_bytes(tmp_path, exposure, suffix, monkeypatch):
 
 def test_unknown_facts_are_left_out(tmp_path):
     path = write_exposure(tmp_path / "frame.png", exposure_of(FRAME, time_utc=MID))
-    assert Image.open(path).text == {"TIMESYS": "UTC", "DATE-AVG": "2031-03-26T20:58:11.966208"}
+    assert Image.open(path).text == {"TIMESYS": "UTC", "DATE-AVG": "2031-03-26T20:58:11.966208", "STTSIG": "1.0"}
+    assert Image.open(write_exposure(tmp_path / "timeless.png", exposure_of(FRAME))).text == {}
     assert write_sidecar(path, Facts()).read_text() == "{}\n"
 
 
@@ -134,12 +139,13 @@ def test_sidecar(tmp_path, exposure):
     assert path == tmp_path / "frames" / "a.json"
     assert json.loads(path.read_text()) == {
         "time_utc": "2031-03-26T20:58:11.966208Z",
+        "time_sigma_s": 0.25,
         "exposure_s": 9.999999,
         "camera": "../calib/camera.toml",
         "terrain": "shackleton",
     }
     back = read_exposure(tmp_path / "frames" / "a.png")
-    assert (back.time_utc, back.exposure_s) == (MID, 9.999999)
+    assert (back.time_utc, back.time_sigma_s, back.exposure_s) == (MID, 0.25, 9.999999)
     assert os.path.realpath(back.camera) == os.path.realpath(exposure.camera)
 
 

@@ -26,8 +26,9 @@ KEYS = {
     "heading_deg pitch_deg roll_body_deg sigma_heading_deg sigma_pitch_deg sigma_roll_body_deg",
     "stars": "detected identified unexplained predicted_visible rms_px false_alarm_probability",
     "sky": "brightness_mag_arcsec2 unused",
+    "clock": "offset_s sigma_s",
     "timing_ms": "read detect identify attitude evidence locate",
-    "provenance": "version image_sha256 camera terrain catalog localizer time_utc exposure_s",
+    "provenance": "version image_sha256 camera terrain catalog localizer time_utc time_sigma_s exposure_s",
 }
 
 

@@ -30,7 +30,7 @@ class Task:
     name: str  # of the image, relative to the batch's folder
     path: str
     result: str  # path of NAME.fix.json
-    facts: dict[str, Any] = field(default_factory=dict)  # from flags: time_utc, exposure_s, camera, terrain
+    facts: dict[str, Any] = field(default_factory=dict)  # from flags, by the parameters of `read_exposure`
     plots: bool = True
     overwrite: bool = False  # locate it again even if a valid result is there
     localizer: str = "posterior"  # of startrack.localization.LOCALIZERS

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.flag_types import positive_number
+from startrack.cli.flag_types import positive_number, time_sigma_s
 from startrack.errors import INTERNAL_ERROR, BadInput, exit_code_of
 
 if TYPE_CHECKING:
@@ -34,7 +34,16 @@ def add_fact_flags(parser: argparse.ArgumentParser) -> None:
     """Flags for facts that images may lack."""
     parser.add_argument("-c", "--camera", metavar="FILE", help="camera file, or the name of a shipped one")
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601")
+    add_time_sigma_flag(parser)
     parser.add_argument("--exposure", type=positive_number, metavar="S", help="exposure time in seconds")
+
+
+def add_time_sigma_flag(parser: Any) -> None:
+    """The flag for the sigma of the clock, in a parser or a group of its flags."""
+    parser.add_argument(
+        "--time-sigma", type=time_sigma_s, metavar="SECONDS",
+        help="standard deviation of the clock's error (1)",
+    )  # fmt: skip
 
 
 def add_localizer_flags(parser: argparse.ArgumentParser) -> None:
@@ -87,6 +96,7 @@ def flag_facts(args: argparse.Namespace) -> dict[str, Any]:
 
     flags: dict[str, Any] = {
         "time_utc": parse_utc(args.time) if args.time is not None else None,
+        "time_sigma_s": getattr(args, "time_sigma", None),
         "exposure_s": args.exposure,
         "camera": args.camera,
         "terrain": getattr(args, "terrain", None),

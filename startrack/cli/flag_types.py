@@ -31,6 +31,21 @@ def positive_number(text: str) -> float:
     return number(text)
 
 
+def time_sigma_s(text: str) -> float:
+    """A standard deviation of a clock's error [s]."""
+    from startrack.exposure.metadata import check_time_sigma_s
+
+    try:
+        return check_time_sigma_s(number(text), "SECONDS")
+    except ValueError as cause:
+        raise argparse.ArgumentTypeError(str(cause)) from cause
+
+
+def clock_offset_s(text: str) -> float:
+    """An error of a clock [s], no larger than the largest sigma."""
+    return math.copysign(time_sigma_s(str(abs(number(text)))), number(text))
+
+
 def count(text: str) -> int:
     """A whole number from 0 up."""
     try:

@@ -6,10 +6,12 @@ import argparse
 import json
 import math
 import os
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.flag_types import amount, count, number, positive_count, positive_number
+from startrack.cli.common import add_time_sigma_flag
+from startrack.cli.flag_types import amount, clock_offset_s, count, number, positive_count, positive_number
 from startrack.cli.progress import progress
 from startrack.errors import BadInput
 
@@ -58,6 +60,9 @@ def run(args: argparse.Namespace) -> int:
 
 def _add_pose(group: Any) -> None:
     group.add_argument("--time", metavar="UTC", help="middle of the exposure; else between 2024 and 2034")
+    add_time_sigma_flag(group)
+    help_offset = "true minus stated time, for image and sidecar with the time of a wrong clock (0)"
+    group.add_argument("--clock-offset", type=clock_offset_s, default=0.0, metavar="SECONDS", help=help_offset)
     group.add_argument("--east", type=number, metavar="M", help="from the terrain's origin")
     group.add_argument("--north", type=number, metavar="M", help="from the terrain's origin")
     group.add_argument("--heading", type=number, metavar="DEG", help="azimuth of the rover's nose")
@@ -153,12 +158,14 @@ def _series(args: argparse.Namespace) -> Series:
 
 def _render_one(args: argparse.Namespace, series: Series, number: int, image: Path) -> dict[str, Any]:
     """Render, write image, sidecar and truth, and return the text about it."""
-    from startrack.exposure import write_exposure, write_sidecar
+    from startrack.exposure import with_facts, write_exposure, write_sidecar
     from startrack.rendering import render, write_truth
 
     scene, rng = series.scene(number, image.stem)
     exposure, truth = render(scene, rng=rng)
-    pose = _pose(scene, truth)
+    stated = None if scene.time_utc is None else scene.time_utc - timedelta(seconds=args.clock_offset)
+    exposure = with_facts(exposure, time_utc=stated, time_sigma_s=args.time_sigma)
+    pose = {**_pose(scene, truth), "clock_offset_s": args.clock_offset}
     write_exposure(image, exposure, overwrite=args.overwrite)
     write_sidecar(image, exposure, overwrite=args.overwrite)
     facts = {**pose, "seed": args.seed, "number": number, "catalog": series.catalog.name, "settings": _settings(args)}

@@ -1,4 +1,4 @@
-"""Time, exposure seconds, camera and terrain of an image: from a flag, else its sidecar, else its header."""
+"""Time and its sigma, exposure seconds, camera, terrain of an image: from a flag, else its sidecar, else its header."""
 
 from __future__ import annotations
 
@@ -18,11 +18,17 @@ from startrack.types import BadInput, Exposure
 
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 MAX_EXPOSURE_S = 1e6
+# Ten days rotate the Moon's sky by a third of a turn: such a clock states no time. A larger number has another unit.
+MAX_TIME_SIGMA_S = 864_000.0
+NUMBERS = {
+    "time_sigma_s": Number(low=0, high=MAX_TIME_SIGMA_S, description="standard deviation of the clock's error"),
+    "exposure_s": Number(low=0, high=MAX_EXPOSURE_S, above=True),
+}
 SIDECAR = Table(
     description="NAME.json beside NAME.png. Paths are relative to the sidecar.",
     keys={
         "time_utc": Text(max_chars=100, description="middle of the exposure, ISO 8601, UTC"),
-        "exposure_s": Number(low=0, high=MAX_EXPOSURE_S, above=True),
+        **NUMBERS,
         "camera": Text(description="a camera file, or the name of a shipped one"),
         "terrain": Text(description="a terrain file, or the name of a shipped one"),
         "bayer_pattern": Choice(values=BAYER_PATTERNS, description="colours of the first 2 x 2 pixels of a mosaic"),
@@ -30,8 +36,9 @@ SIDECAR = Table(
 )
 # Names in a header (FITS keywords, PNG text chunks, TIFF description) and the fact that each one gives. The names of
 # the sidecar's keys are valid there too, except in FITS, where a card called CAMERA is common and names the hardware.
-HEADER_KEYS = {k: k for k in ("DATE-AVG", "DATE-OBS", "TIMESYS", "EXPTIME", "STCAMERA", "STTERRAI", "BAYERPAT")}
-HEADER_KEYS |= dict(zip(SIDECAR.keys, ("DATE-AVG", "EXPTIME", "STCAMERA", "STTERRAI", "BAYERPAT"), strict=True))
+_HEADER_KEYS = ("DATE-AVG", "STTSIG", "EXPTIME", "STCAMERA", "STTERRAI", "BAYERPAT")
+HEADER_KEYS = {key: key for key in ("DATE-OBS", "TIMESYS", *_HEADER_KEYS)}
+HEADER_KEYS |= dict(zip(SIDECAR.keys, _HEADER_KEYS, strict=True))
 RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".crw", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"}
 PICTURE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".fits", ".fit", ".fts"} | RAW_SUFFIXES
 PACKING_SUFFIXES = {".gz", ".bz2", ".fz"}
@@ -41,33 +48,48 @@ MAX_UNKNOWN_KEY_WARNINGS = 5
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """Metadata of an exposure besides its pixels; None if not known."""
+    """Metadata of an exposure besides its pixels; None if not known.
+
+    Raises ValueError for an unusable `time_sigma_s`.
+    """
 
     time_utc: datetime | None = None  # mid-exposure, timezone-aware
+    time_sigma_s: float | None = None  # standard deviation of the clock's error
     exposure_s: float | None = None
     camera: str | None = None  # path, or name of a shipped file
     terrain: str | None = None  # path, or name of a shipped file
     bayer_pattern: str | None = None  # RGGB and the like: the pixels are a mosaic of colours
     warnings: tuple[str, ...] = ()  # values that were ignored, and why
 
+    def __post_init__(self) -> None:
+        if self.time_sigma_s is not None:
+            object.__setattr__(self, "time_sigma_s", check_time_sigma_s(self.time_sigma_s, "time_sigma_s"))
+
+
+def check_time_sigma_s(value: Any, name: str) -> float:
+    """The standard deviation `value` [s] of a clock's error. Raises ValueError with a line that names it `name`."""
+    return float(NUMBERS["time_sigma_s"].check(value, name))
+
 
 def with_facts(
     exposure: Exposure,
     *,
     time_utc: datetime | None = None,
+    time_sigma_s: float | None = None,
     exposure_s: float | None = None,
     camera: str | None = None,
     terrain: str | None = None,
 ) -> Exposure:
     """The exposure with the values given here in place of its own; `time_utc` is mid-exposure.
 
-    `camera` and `terrain` are names or paths of files.
+    `time_sigma_s` is the standard deviation of the clock's error. `camera` and `terrain` are names or paths of files.
 
     A mid-exposure time computed from DATE-OBS and a header's EXPTIME does not change with a new `exposure_s`; give it
-    to `read_exposure` for that. Raises ValueError for a time without zone.
+    to `read_exposure` for that. Raises ValueError for a time without zone and an unusable `time_sigma_s`.
     """
     given: dict[str, Any] = {"exposure_s": exposure_s, "camera": camera, "terrain": terrain}
     given["time_utc"] = None if time_utc is None else as_utc(time_utc)
+    given["time_sigma_s"] = None if time_sigma_s is None else check_time_sigma_s(time_sigma_s, "time_sigma_s")
     return replace(exposure, **{key: value for key, value in given.items() if value is not None})
 
 
@@ -79,11 +101,12 @@ def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts
     """
     sidecar, values = _read_sidecar(image)
     notes: list[str] = [*given.warnings, *_unknown_keys(sidecar, values)]
-    exposure_s = given.exposure_s
-    if exposure_s is None:
-        exposure_s = _sidecar_value(sidecar, values, "exposure_s")
-    if exposure_s is None:
-        exposure_s = _header_exposure_s(header.get("EXPTIME"), notes)
+
+    def first_number(key: str, flag: float | None) -> float | None:
+        stated = _sidecar_value(sidecar, values, key) if flag is None else flag
+        return _header_number(header, key, notes) if stated is None else stated
+
+    exposure_s = first_number("exposure_s", given.exposure_s)
     time_utc = given.time_utc
     if time_utc is None:
         time_utc = _sidecar_time(sidecar, values.get("time_utc"))
@@ -91,6 +114,7 @@ def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts
         time_utc = _header_time(header, exposure_s, notes)
     return Facts(
         time_utc=None if time_utc is None else as_utc(time_utc),
+        time_sigma_s=first_number("time_sigma_s", given.time_sigma_s),
         exposure_s=exposure_s,
         camera=given.camera
         or _sidecar_reference(sidecar, values, "camera")
@@ -224,17 +248,17 @@ def _resolve_path(file: Path, reference: str) -> str:
     return os.path.join(file.parent, reference) if is_path(reference) else reference
 
 
-def _header_exposure_s(value: object, notes: list[str]) -> float | None:
+def _header_number(header: Mapping[str, Any], key: str, notes: list[str]) -> float | None:
+    """The header's number of seconds for a key of the sidecar, within the limits of that key."""
+    declared, name = NUMBERS[key], HEADER_KEYS[key]
+    value = header.get(name)
     if value is None or value == "":
         return None
     try:
-        seconds = math.nan if isinstance(value, bool) else float(value)  # type: ignore[arg-type]
+        return float(declared.check(math.nan if isinstance(value, bool) else float(value), name))
     except (TypeError, ValueError, OverflowError):
-        seconds = math.nan
-    if 0 < seconds <= MAX_EXPOSURE_S:
-        return seconds
-    notes.append(f"EXPTIME {value_text(value)} is not a number of seconds above 0; not used")
-    return None
+        notes.append(f"{name} {value_text(value)} is not a number of seconds {declared.limits}; not used")
+        return None
 
 
 def _header_time(header: Mapping[str, Any], exposure_s: float | None, notes: list[str]) -> datetime | None:

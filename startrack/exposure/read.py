@@ -24,7 +24,7 @@ from startrack.exposure.decoded import (
 )
 from startrack.exposure.metadata import RAW_SUFFIXES, Facts, resolve_facts, stem
 from startrack.files import printable
-from startrack.types import BadInput, Exposure
+from startrack.types import TIME_SIGMA_S, BadInput, Exposure
 
 PNG = (b"\x89PNG\r\n\x1a\n",)
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -36,6 +36,7 @@ def read_exposure(
     path: str | os.PathLike[str],
     *,
     time_utc: datetime | None = None,
+    time_sigma_s: float | None = None,
     exposure_s: float | None = None,
     camera: str | None = None,
     terrain: str | None = None,
@@ -43,18 +44,20 @@ def read_exposure(
     """The image at `path` (PNG, TIFF, JPEG or FITS by its content, or camera raw by its suffix) with its metadata.
 
     Pixels (H, W) are the counts in the file [ADU], 16 bits kept; pixel (0, 0) is the first of the first row stored,
-    in FITS too; orientation tags are ignored. `time_utc` (mid-exposure), `exposure_s`, `camera` and `terrain` replace
-    the values of sidecar and header, which are then not read. `warnings` lists ignored facts and causes.
+    in FITS too; orientation tags are ignored. `time_utc` (mid-exposure), `time_sigma_s` (of the clock), `exposure_s`,
+    `camera` and `terrain` replace the values of sidecar and header, which are then not read. `warnings` lists ignored
+    facts and causes.
 
     Raises:
         BadInput: bad_image with file and cause in one line; no_time if a sidecar's time is not UTC.
+        ValueError: `time_sigma_s` is no usable number of seconds.
     """
+    given = Facts(time_utc=time_utc, time_sigma_s=time_sigma_s, exposure_s=exposure_s, camera=camera, terrain=terrain)
     try:
         raw = _read_bytes(path)
         decoded = _decode(raw, Path(path).suffix.lower() in RAW_SUFFIXES)
     except BadInput as error:
         raise BadInput(error.reason, " ".join(f"{printable(path)}: {error}".split())) from error
-    given = Facts(time_utc=time_utc, exposure_s=exposure_s, camera=camera, terrain=terrain)
     facts = resolve_facts(Path(path), decoded.header, given)
     pixels, notes = _level_mosaic(decoded, facts)
     return Exposure(
@@ -62,6 +65,7 @@ def read_exposure(
         name=stem(Path(path)),
         path=os.fspath(path),
         time_utc=facts.time_utc,
+        time_sigma_s=TIME_SIGMA_S if facts.time_sigma_s is None else facts.time_sigma_s,
         exposure_s=facts.exposure_s,
         camera=facts.camera,
         terrain=facts.terrain,

@@ -57,6 +57,7 @@ def write_sidecar(image: str | os.PathLike[str], facts: Facts | Exposure, *, ove
     target = sidecars(Path(image))[-1]
     values = {
         "time_utc": None if facts.time_utc is None else format_utc(facts.time_utc),
+        "time_sigma_s": None if facts.time_utc is None else facts.time_sigma_s,
         "exposure_s": facts.exposure_s,
         "camera": _relative_path(facts.camera, target.parent),
         "terrain": _relative_path(facts.terrain, target.parent),
@@ -76,6 +77,7 @@ def header_entries(exposure: Exposure, folder: Path) -> dict[str, str | float]:
             start = exposure.time_utc - timedelta(seconds=exposure.exposure_s / 2)
             entries["DATE-OBS"] = format_utc(start).removesuffix("Z")  # FITS has no zone letter
         entries["DATE-AVG"] = format_utc(exposure.time_utc).removesuffix("Z")
+        entries["STTSIG"] = float(exposure.time_sigma_s)
     if exposure.exposure_s is not None:
         entries["EXPTIME"] = float(exposure.exposure_s)
     for key, reference in (("STCAMERA", exposure.camera), ("STTERRAI", exposure.terrain)):
@@ -152,6 +154,7 @@ _COMMENTS = {  # none beside a path, which may need the whole card
     "TIMESYS": "time scale of the dates",
     "DATE-OBS": "start of exposure",
     "DATE-AVG": "middle of exposure",
+    "STTSIG": "[s] standard deviation of the clock's error",
     "EXPTIME": "[s] exposure",
 }
 FITS_SUFFIXES = {".fits", ".fit", ".fts"}

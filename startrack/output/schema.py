@@ -41,6 +41,7 @@ POSITION = section_schema("position", "The camera's centre. covariance_m2 is of 
 MODES: Schema = {**BY_PATH["modes"].schema, "description": BY_PATH["modes"].description}
 ATTITUDE = section_schema("attitude", "Of the camera among the stars and, with terrain and time, of the rover's body.")
 SKY = section_schema("sky", "Diffuse light of the sky.")
+CLOCK = section_schema("clock", "Error of the stated time.")
 PROVENANCE = section_schema("provenance")
 COMMON: Schema = {
     "image": TEXT,
@@ -111,7 +112,7 @@ SCHEMAS: dict[str, Schema] = {
     "fix": _result(
         "fix",
         "Position and attitude of one image",
-        {"position": POSITION, "modes": MODES, "attitude": ATTITUDE, "sky": SKY},
+        {"position": POSITION, "modes": MODES, "attitude": ATTITUDE, "sky": SKY, "clock": CLOCK},
         _FIX_RULES,
     ),
     "identification": _result(

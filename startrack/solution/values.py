@@ -1,4 +1,4 @@
-"""Position and attitude as values with units, that print themselves in a terminal and in a notebook."""
+"""Position, attitude and clock as values with units, that print themselves in a terminal and in a notebook."""
 
 from __future__ import annotations
 
@@ -114,6 +114,25 @@ class Orientation(Shown):
     roll_body: Angle | None = None  # right side down positive
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class Clock(Shown):
+    """Error of the stated time, as the image shows it."""
+
+    offset: Quantity  # [s] true minus stated time
+    sigma: Quantity  # [s] standard deviation of the offset
+    shown: Rows  # name and text of each quantity of the table
+
+
+def clock_of(result: Inputs) -> Clock | None:
+    """Error of the clock of a result with a fix; None where it is not estimated."""
+    if not isinstance(result, Located) or result.fix.clock is None:
+        return None
+    from astropy import units as u
+
+    clock = result.fix.clock
+    return Clock(clock.offset_s * u.s, clock.sigma_s * u.s, rows("notebook", at_stage(result), ("clock",)))
+
+
 def position_of(result: Inputs) -> Position | None:
     """Position of a result whose status is ok."""
     if not isinstance(result, Located) or result.fix.ambiguous:
@@ -126,7 +145,7 @@ def position_of(result: Inputs) -> Position | None:
     latitude, longitude = (Angle(np.degrees(a), u.deg) for a in latlon_from_enu(result.site, *fix.position_enu_m))
     return Position(
         east, north, up, fix.covariance_m2 * u.m**2, fix.radius95_m * u.m, fix.radius999_m * u.m, latitude, longitude,
-        terrain.name, rows("notebook", at_stage(result), ("position", "sky")),
+        terrain.name, rows("notebook", at_stage(result), ("position", "sky", "clock")),
     )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
-from test_localization_ground import shackleton, simulate_rays  # noqa: F401
+from test_localization_ground import simulate_rays
 from test_localization_shape import evidence_at
 
 from startrack.frames import R_enu_icrs, Site, azel_from_rays, sky_rotvec_rad
@@ -37,8 +37,12 @@ def stated_early(evidence: Evidence, site: Site, offset_s: float, sigma_s: float
 
 
 @pytest.fixture(scope="module")
-def ground(shackleton: HeightMap) -> HeightMap:
-    return replace(shackleton, height_sigma_m=1.0)
+def ground() -> HeightMap:
+    terrain = load_terrain("shackleton")
+    assert isinstance(terrain, HeightMap)
+    terrain = replace(terrain, search_radius_m=300.0, height_sigma_m=0.0, horizon_sigma_common_rad=0.0)
+    terrain.prepare()
+    return replace(terrain, height_sigma_m=1.0)
 
 
 @pytest.mark.parametrize("name", SITES)

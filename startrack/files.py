@@ -46,6 +46,18 @@ def is_path(reference: FilePath) -> bool:
     return text.endswith(".toml") or "/" in text or "\\" in text
 
 
+def relative_path(file: FilePath, folder: FilePath) -> str:
+    """The path of a `file` as seen from `folder`, with forward slashes.
+
+    Real paths: `..` of a linked folder is not the folder above the link.
+    """
+    real = os.path.realpath(file)
+    try:
+        return Path(os.path.relpath(real, os.path.realpath(folder))).as_posix()
+    except ValueError:  # another drive of Windows
+        return Path(real).as_posix()
+
+
 def resolve_named(name_or_path: str | Path, kind: str, reason: str) -> Path:
     """Path of a user's file or of a shipped one. Raises BadInput `reason` if there is none, or if it is no name."""
     if not isinstance(name_or_path, str | os.PathLike):

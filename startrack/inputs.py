@@ -27,8 +27,8 @@ MAX_LIST_COLUMNS = 4  # x, y, flux and error: an array (n, 4) is no image
 def exposure_input(image: Image, time: Time, time_sigma: Any = None) -> Exposure:
     """The exposure of an `image`: a file, an array (H, W) or (H, W, 3), or the exposure itself.
 
-    `time` and `time_sigma` (see `time_sigma_input`) replace its own where they are given. Raises BadInput (bad_image,
-    no_time). An array whose mask hides pixels is refused: no stage can leave pixels out.
+    `time` and `time_sigma` (see `time_sigma_input`) replace its own where they are given. Pixels that a masked array
+    hides do not count. Raises BadInput (bad_image, no_time).
     """
     given: dict[str, Any] = {"time_utc": time_input(time), "time_sigma_s": time_sigma_input(time_sigma)}
     if isinstance(image, Exposure):
@@ -41,14 +41,11 @@ def exposure_input(image: Image, time: Time, time_sigma: Any = None) -> Exposure
         raise BadInput("bad_image", f"{type(image).__name__} is neither a file nor an array of pixels") from cause
     if pixels.dtype == object and pixels.ndim == 0:  # one object that is no sequence
         raise BadInput("bad_image", f"{type(image).__name__} is neither a file nor an array of pixels")
-    masked = np.count_nonzero(getattr(pixels, "mask", False))
-    if masked:
-        raise BadInput(
-            "bad_image",
-            f"{masked} of {pixels.size} pixels are masked, and startrack cannot leave pixels out: fill them (by their "
-            "neighbours' median, say) and give the plain array",
-        )
-    return with_facts(exposure_of(np.asarray(pixels)), **given)
+    masked = getattr(pixels, "mask", None)  # of numpy's masked arrays and astropy's
+    if masked is not None:
+        masked = np.broadcast_to(masked, pixels.shape)
+        pixels = getattr(pixels, "unmasked", np.ma.getdata(pixels))
+    return with_facts(exposure_of(np.asarray(pixels), masked=masked), **given)
 
 
 def is_list_of_centroids(image: Any) -> bool:

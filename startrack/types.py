@@ -1,8 +1,7 @@
 """The values that cross module borders (and, from errors.py, the exceptions).
 
 Every value is frozen, keyword-only and shape-checked; its arrays are read-only. A stage returns a complete value
-or raises `NoSolution`; there is no sentinel or half-filled result, and NaN only where a field says so. Conventions:
-CONVENTIONS.md.
+or raises `NoSolution`; there is no sentinel or half-filled result, NaN only where a field allows it (CONVENTIONS.md).
 """
 
 from __future__ import annotations
@@ -15,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.errors import BadInput, NoSolution, NotIdentified, NotLocated, TooFewStars
+from startrack.mask import Mask
 from startrack.values import Array, Bools, Ints, Value, array, take_rows
 
 __all__ = [
     "Array", "Attitude", "BadInput", "Body", "Bools", "Centroids", "Clock", "ClockError", "Detections", "Evidence",
-    "Exposure", "Fix", "Identification", "Ints", "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated",
-    "Stars", "TooFewStars", "Value", "array",
+    "Exposure", "Fix", "Identification", "Ints", "Mask", "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified",
+    "NotLocated", "Stars", "TooFewStars", "Value", "array",
 ]  # fmt: skip
 
 # Beyond the zenith: the search for an error of the horizon shifts the rows, by three sigma at most.
@@ -42,6 +42,7 @@ class Exposure(Value):
     exposure_s: float | None = None
     camera: str | None = None  # resolved path or shipped name of the camera file
     terrain: str | None = None  # resolved path or shipped name of the terrain file
+    mask: str | Mask | None = None  # resolved path of the mask's file, or the mask; None: every pixel counts
     saturation_adu: float | None = None  # largest value the file's type can hold, None for float images
     sha256: str = ""
     warnings: tuple[str, ...] = ()
@@ -87,9 +88,10 @@ class Detections(Centroids):
 
     flux_sigma_e: Array = array("n")
     image_e: NDArray[np.float32]  # (H, W) the exposure [e], pedestal included
-    dead: NDArray[np.bool_]  # (H, W) saturated pixels
+    dead: NDArray[np.bool_]  # (H, W) saturated and masked pixels
     background_e: NDArray[np.float32]  # (H, W) smooth background [e], pedestal included
     noise_e: NDArray[np.float32]  # (H, W) noise of one pixel [e]
+    mask: Mask | None = None  # of camera and image together; masked pixels of `image_e` hold their surroundings
 
 
 @dataclass(frozen=True, kw_only=True)

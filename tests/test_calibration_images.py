@@ -18,13 +18,14 @@ from startrack.calibration.verify import verify, verify_dict
 from startrack.camera import load_camera, save_camera
 from startrack.catalog import load_catalog
 from startrack.cli.main import main
-from startrack.exposure import read_exposure
+from startrack.exposure import read_exposure, read_mask, write_exposure
 from startrack.frames import Site
 from startrack.types import BadInput, NotIdentified
 
 ROOT = Path(__file__).parent.parent
 PHOTO = ROOT / "sample_images/lowell-2018-08-06.fits.bz2"
 SITE = Site("earth", np.radians(34.7443), np.radians(-111.4223), 2361.0)
+SITE_FLAG = ("-c", "lowell-ldt", "--site=34.7443,-111.4223,2361")
 REFERENCE = Path(__file__).parent / "data/lowell-2018-08-06-stars.csv"
 
 
@@ -72,6 +73,22 @@ def test_the_mirror_image_is_solved_and_reported_as_mirrored(exposure):
     assert found.camera.mirrored
     opposite = next(gate.value for gate in found.checks if gate.name.startswith("opposite"))
     assert opposite > 50
+
+
+def test_a_mast_in_the_photograph_is_proposed_for_the_mask(exposure, tmp_path, capsys):
+    pixels = np.array(exposure.pixels_adu)
+    across = np.abs(np.arange(1392) - 760) < 70
+    pixels[560:, across] = np.rint(np.random.default_rng(1).normal(2300.0, 15.0, (480, across.sum())))
+    write_exposure(tmp_path / "frame.fits", replace(exposure, pixels_adu=pixels))
+    camera = tmp_path / "camera.toml"
+    assert main(["calibrate", str(tmp_path / "frame.fits"), "-o", str(camera), "--no-plots", *SITE_FLAG]) == 0
+    assert 'mask = "camera.mask.png"' in capsys.readouterr().out
+    assert load_camera(camera).mask is None  # it is proposed, not applied
+    masked = read_mask(tmp_path / "camera.mask.png").masked
+    assert np.mean(masked[560:750, across]) > 0.5  # one photograph has few stars for each cell
+    clear = np.ones(1392, dtype=bool)
+    clear[760 - 70 - 64 : 760 + 70 + 64] = False
+    assert not masked[:700, clear].any()  # trees stand lower in the image
 
 
 def test_a_picture_of_another_size_is_a_size_mismatch(exposure):

@@ -16,7 +16,7 @@ import startrack
 ROOT = Path(startrack.__file__).parent
 
 LAYERS = (  # lowest first; a package imports from lower layers only
-    {"errors", "values"},
+    {"errors", "mask", "values"},
     {"types", "files", "declaration"},
     {"frames", "runner", "compilation"},
     {"kernels"},

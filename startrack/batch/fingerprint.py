@@ -16,10 +16,10 @@ from typing import Any
 from startrack import __version__
 from startrack.catalog.gaia import has_deep_catalog
 from startrack.exposure.metadata import RAW_SUFFIXES, sidecar_of
-from startrack.files import is_path
+from startrack.files import is_path, relative_path
 
 MISSING = "?"  # in place of the hash of a file that cannot be read; once it can, the hash differs
-FILES = ("camera", "terrain")  # facts that may be paths
+FILES = ("camera", "terrain", "mask")  # facts that may be paths
 
 
 def sha256_of(path: str | os.PathLike[str]) -> str:
@@ -34,10 +34,10 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
 
 
 def job_sha256(image: str, image_sha256: str, facts: dict[str, Any], *others: object) -> str:
-    """SHA-256 of image, sidecar, flags, version and extras; `input_hashes` covers camera and terrain files."""
+    """SHA-256 of image, sidecar, flags, version and extras; `input_hashes` covers the files they name."""
     path = Path(image)
     sidecar = sidecar_of(path)
-    files = {key: _relative_path(path, facts[key]) for key in FILES if is_path(facts.get(key, ""))}
+    files = {key: relative_path(facts[key], path.parent) for key in FILES if is_path(facts.get(key, ""))}
     flags = {**facts, **files}
     extras = [has_deep_catalog(), path.suffix.lower() in RAW_SUFFIXES and find_spec("rawpy") is not None]
     whole = [__version__, flags, *others, extras, image_sha256, sidecar and sha256_of(sidecar)]
@@ -45,13 +45,13 @@ def job_sha256(image: str, image_sha256: str, facts: dict[str, Any], *others: ob
 
 
 def input_hashes(image: str, references: Iterable[str | None]) -> dict[str, str]:
-    """Path to SHA-256 of the camera file, the terrain file and its height maps; shipped files belong to the version.
+    """Path to SHA-256 of the `references`, of a camera's mask and a terrain's height maps; not of shipped files.
 
     Paths are relative to the image's folder, so that a tree may move.
     """
     files = [Path(reference) for reference in references if reference and is_path(reference)]
-    files += [named for file in tuple(files) for named in _height_maps(file)]
-    return {_relative_path(Path(image), file): _cached_sha256(file) for file in files}
+    files += [named for file in tuple(files) if file.suffix == ".toml" for named in _named_files(file)]
+    return {relative_path(file, Path(image).parent): _cached_sha256(file) for file in files}
 
 
 def are_unchanged(image: str, hashes: dict[str, str]) -> bool:
@@ -69,23 +69,15 @@ def is_older_than(image: str | os.PathLike[str], result: str | os.PathLike[str])
     return max(of_image.st_mtime_ns, of_image.st_ctime_ns) < of_result.st_mtime_ns
 
 
-def _height_maps(terrain: Path) -> list[Path]:
-    """The height maps that a terrain file names."""
+def _named_files(file: Path) -> list[Path]:
+    """The height maps that a terrain file names, or the mask that a camera file names."""
     try:
-        dem = tomllib.loads(terrain.read_text(encoding="utf-8")).get("dem")
+        values = tomllib.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):  # missing or unreadable: refused when it is loaded
         return []
-    names = dem.get("file") if isinstance(dem, dict) else None
-    return [terrain.parent / str(name) for name in (names if isinstance(names, list) else [names]) if name]
-
-
-def _relative_path(image: Path, file: str | Path) -> str:
-    """A path relative to the image's folder. Real paths: `..` of a linked folder is not the folder above the link."""
-    real = os.path.realpath(file)
-    try:
-        return Path(os.path.relpath(real, os.path.realpath(image.parent))).as_posix()
-    except ValueError:  # another drive of Windows
-        return real
+    dem = values.get("dem")
+    names = dem.get("file") if isinstance(dem, dict) else values.get("mask")
+    return [file.parent / str(name) for name in (names if isinstance(names, list) else [names]) if name]
 
 
 def _cached_sha256(path: Path) -> str:

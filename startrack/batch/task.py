@@ -148,7 +148,8 @@ def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str
     except BadInput as cause:
         return {**refused_dict(task.name, cause.reason, str(cause)), **_unread_provenance(sha256)}, {}
     # Before the files are read, so that a change in between is noticed.
-    inputs = input_hashes(task.path, [exposure.camera, exposure.terrain])
+    mask = exposure.mask if isinstance(exposure.mask, str) else None
+    inputs = input_hashes(task.path, [exposure.camera, exposure.terrain, mask])
     try:
         settings = Settings(localizer=require_localizer(task.localizer), evidence_sources=task.evidence)
         return locate_exposure(exposure, settings), inputs

@@ -7,8 +7,10 @@ from datetime import datetime
 
 import numpy as np
 
+from startrack.camera import Camera
 from startrack.catalog import StarCatalog
 from startrack.detection import Detector
+from startrack.exposure import combine_masks, with_facts
 from startrack.frames import (
     R_enu_icrs,
     Site,
@@ -57,9 +59,20 @@ class Frame:
     sky: Sky
 
 
-def load_frame(exposure: Exposure, catalog: StarCatalog, site: Site | None, detector: Detector | None = None) -> Frame:
-    """Detect the sources and compute the sky at the exposure's time. Raises BadInput no_time, TooFewStars."""
+def load_frame(
+    exposure: Exposure,
+    catalog: StarCatalog,
+    site: Site | None,
+    detector: Detector | None = None,
+    camera: Camera | None = None,
+) -> Frame:
+    """Detect the sources outside the masks of exposure and `camera`, and compute the sky at the exposure's time.
+
+    Raises BadInput (no_time, or a mask that cannot be used), TooFewStars.
+    """
     require_time(exposure)
+    if camera is not None:
+        exposure = with_facts(exposure, mask=combine_masks(exposure.mask, camera.mask, exposure.size_px))
     return frame_of(exposure, (detector or Detector())(exposure, None), catalog, site)
 
 

@@ -27,6 +27,18 @@ CELLS_ACROSS = 12  # of the frame's longer side; a cell without matches is not o
 
 
 @dataclass(frozen=True)
+class BrightStars:
+    """Stars (n,) bright enough to be detected where the sky is open, wherever they are predicted."""
+
+    star: Ints  # indices into the frame's sky
+    xy_px: Array  # (n, 2)
+    found: Bools  # whether there is a source of equal brightness
+
+
+NO_BRIGHT_STARS = BrightStars(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.bool_))
+
+
+@dataclass(frozen=True)
 class FrameMatches:
     """Matches of one frame, and how many there should be."""
 
@@ -36,6 +48,7 @@ class FrameMatches:
     expected_found: int  # those with a source of equal brightness
     significant: int  # bright sources within the angle searched
     significant_matched: int
+    bright: BrightStars
 
     def __len__(self) -> int:
         return len(self.star)
@@ -59,11 +72,11 @@ def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: flo
     found, stars = frame.sources, frame.sky.stars
     source_mag = instrumental_mag(found.flux_e)
     tree = cKDTree(found.xy_px)
-    zero_mag = _zero_point(frame, camera, R_cam_icrs, within_rad, gate_px, tree)
+    zero_mag = zero_point(frame, camera, R_cam_icrs, within_rad, gate_px, tree)
     limit = float(source_mag.max()) + DEPTH_MAG
     faintest_v = limit + BLEND_MAG + float(np.max(zero_mag(np.linspace(0.0, within_rad, 50))))
     count = int(np.searchsorted(stars.v_mag, faintest_v))
-    px, angle, seen = _predict(frame, camera, R_cam_icrs, within_rad, count)
+    px, angle, seen = predict_pixels(frame, camera, R_cam_icrs, within_rad, count)
     star_mag = stars.v_mag[:count] - zero_mag(angle)  # instrumental
     seen = seen[star_mag[seen] < limit + BLEND_MAG]
     detection, star, _ = match_by_brightness(
@@ -82,15 +95,16 @@ def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: flo
         expected_found=int(np.isin(expected, star).sum()),
         significant=int(significant.sum()),
         significant_matched=int(np.count_nonzero(significant[detection])),
+        bright=BrightStars(bright, px[bright], np.isin(bright, star)),
     )
 
 
-def _predict(
+def predict_pixels(
     frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: float, count: int
 ) -> tuple[Array, Array, Ints]:
-    """Pixels (n, 2) and off-axis angles (n,) of the `count` brightest stars, and the indices of those in the frame.
+    """Pixels (n, 2) and off-axis angles (n,) of the `count` brightest stars, and the indices of those in the `frame`.
 
-    Pixels and angles of the others are not computed.
+    `camera` and `R_cam_icrs` place them; those within `within_rad` of the axis are computed.
     """
     rays_icrs = frame.sky.stars.rays_icrs[:count]
     widest = min(within_rad, camera.lens.max_invertible_rad)
@@ -104,12 +118,16 @@ def _predict(
     return px, angle, near[inside]
 
 
-def _zero_point(
+def zero_point(
     frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: float, gate_px: float, tree: Any
 ) -> Callable[[Array], Array]:
-    """Zero point [mag] as a function of the angle off the axis; it includes vignetting and, roughly, extinction."""
+    """Zero point [mag] of a `frame` as a function of the angle off the axis; with vignetting and, roughly, extinction.
+
+    `camera` and `R_cam_icrs` predict the stars up to `within_rad` off the axis, `tree` holds the sources, which are
+    taken within `gate_px`.
+    """
     found, v_mag = frame.sources, frame.sky.stars.v_mag
-    px, angle, seen = _predict(frame, camera, R_cam_icrs, within_rad, SCALE_STARS)
+    px, angle, seen = predict_pixels(frame, camera, R_cam_icrs, within_rad, SCALE_STARS)
     distance, nearest = tree.query(px[seen], distance_upper_bound=gate_px)
     hit = np.isfinite(distance)
     hit[hit] &= ~found.saturated[nearest[hit]]

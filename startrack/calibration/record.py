@@ -50,6 +50,7 @@ def calibration_dict(calibration: Calibration) -> dict[str, Any]:
         },
         "photometry": photometry_dict(calibration.photometry),
         "images": _images(calibration),
+        "obstructed_fraction": 0.0 if calibration.obstructed is None else float(calibration.obstructed.mean()),
         "refused": [vars(refused) for refused in calibration.refused],
         "provenance": {"version": __version__, "false_alarm_probability": calibration.false_alarm_probability},
     }

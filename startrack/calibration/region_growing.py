@@ -8,7 +8,7 @@ import numpy as np
 
 from startrack.calibration.frame import Frame
 from startrack.calibration.lens_fit import MIN_STARS, LensFit, fit_lens
-from startrack.calibration.matching import FrameMatches, match_frame
+from startrack.calibration.matching import NO_BRIGHT_STARS, FrameMatches, match_frame
 from startrack.camera import Camera
 from startrack.normal_equations import Observations
 from startrack.types import Array, Ints, NotIdentified
@@ -121,7 +121,7 @@ def _points(frames: tuple[Frame, ...], matches: tuple[FrameMatches, ...]) -> Obs
 
 def _pairs(detection: Ints, star: Ints) -> FrameMatches:
     order = np.argsort(detection)
-    return FrameMatches(detection[order], star[order], 0, 0, 0, 0)
+    return FrameMatches(detection[order], star[order], 0, 0, 0, 0, NO_BRIGHT_STARS)
 
 
 def _outer_angle(angle_rad: Array) -> float:

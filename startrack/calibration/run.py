@@ -10,13 +10,14 @@ import numpy as np
 from startrack.calibration.acceptance import Check, Checked, check_acceptance
 from startrack.calibration.frame import Frame, load_frame, remove_static_sources
 from startrack.calibration.initial_camera import mirror_camera
+from startrack.calibration.obstruction import find_obstructions
 from startrack.calibration.photometry import KnownSensor, Photometry, measure_photometry
 from startrack.calibration.region_growing import JointFit, fit_frames, grow_from_matches
 from startrack.camera import Camera
 from startrack.catalog import StarCatalog
 from startrack.frames import Site
 from startrack.identification import Identifier, identify_unknown_lens
-from startrack.types import Array, BadInput, Exposure, Identification, NoSolution, NotIdentified
+from startrack.types import Array, BadInput, Bools, Exposure, Identification, NoSolution, NotIdentified
 
 WIDE_FIELD_RAD = np.radians(100.0)  # from here up a field of view is that of the image circle
 BRIGHTEST_IDENTIFIED = 100  # the region growing starts from the inner half of these stars
@@ -43,6 +44,7 @@ class Calibration(Checked):
     site: Site | None
     false_alarm_probability: float  # the largest of the images' identifications
     photometry: Photometry
+    obstructed: Bools | None  # (H, W) pixels proposed for the mask: no star is ever seen there; None: no such pixels
 
 
 @dataclass
@@ -98,20 +100,22 @@ def calibrate(
     run = _Run(catalog, camera, _field_rad(camera, fov_rad), site, progress)
     frames = _frames(run, exposures)
     _identify_all(run, frames)
-    joint = _fit_jointly(run)
+    joint, same = _fit_jointly(run)
     fitted = replace(joint.fit.camera, name=name)
     fitted = replace(fitted, max_angle_rad=_max_angle_rad(fitted, camera, fov_rad))
     joint = replace(joint, fit=replace(joint.fit, camera=fitted))
     progress("measuring throughput and sensor")
     photometry = measure_photometry(joint, known_sensor or KnownSensor())
+    mask = None if camera is None else camera.mask
     return Calibration(
-        camera=replace(fitted, sensor=photometry.sensor),
+        camera=replace(fitted, sensor=photometry.sensor, mask=mask),
         joint=joint,
         checks=check_acceptance(joint),
         refused=tuple(run.refused),
         site=site,
         false_alarm_probability=run.largest_false_alarm,
         photometry=photometry,
+        obstructed=find_obstructions(joint, same) if mask is None else None,
     )
 
 
@@ -127,7 +131,7 @@ def _frames(run: _Run, exposures: Sequence[Exposure]) -> list[Frame]:
             )
         run.progress(f"detecting stars in {exposure.name}")
         try:
-            frames.append(load_frame(exposure, run.catalog, run.site))
+            frames.append(load_frame(exposure, run.catalog, run.site, camera=run.start))
         except NoSolution as cause:
             run.refused.append(RefusedImage(name=exposure.name, reason=cause.reason, message=str(cause)))
     if not frames:
@@ -219,8 +223,8 @@ def identify_with(camera: Camera, frame: Frame) -> tuple[Camera, Identification]
     return camera, replace(found, detection=found.detection[sure], star=found.star[sure])
 
 
-def _fit_jointly(run: _Run) -> JointFit:
-    """The joint fit without static sources, and without images of the other handedness."""
+def _fit_jointly(run: _Run) -> tuple[JointFit, tuple[Frame, ...]]:
+    """The joint fit without static sources, and its frames with them; images of the other handedness are left out."""
     lead = max(run.identified, key=lambda n: n.stars)
     same = [n for n in run.identified if n.camera.mirrored == lead.camera.mirrored]
     for other in run.identified:
@@ -229,7 +233,8 @@ def _fit_jointly(run: _Run) -> JointFit:
             run.refused.append(RefusedImage(name=other.frame.name, reason="mirrored", message=text))
     R = np.stack([n.R_cam_icrs for n in same])
     run.progress("fitting the lens to all images")
-    return fit_frames(remove_static_sources(tuple(n.frame for n in same), R), lead.camera, R)
+    frames = tuple(n.frame for n in same)
+    return fit_frames(remove_static_sources(frames, R), lead.camera, R), frames
 
 
 def _max_angle_rad(fitted: Camera, start: Camera | None, fov_rad: float | None) -> float:

@@ -44,7 +44,7 @@ def verify(exposure: Exposure, camera: Camera, catalog: StarCatalog, site: Site 
 
     Raises BadInput no_time, NotIdentified (also reason mirrored) where the stars cannot be identified with the file.
     """
-    frame = load_frame(exposure, catalog, site)
+    frame = load_frame(exposure, catalog, site, camera=camera)
     found_camera, found = identify_with(camera, frame)
     if found_camera.mirrored != camera.mirrored:
         raise NotIdentified("the picture is a mirror image, compared with the camera file", reason="mirrored")

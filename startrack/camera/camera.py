@@ -10,7 +10,7 @@ from startrack.camera.decentring import Decentring
 from startrack.camera.kannala_brandt import KannalaBrandt
 from startrack.camera.lens import Lens
 from startrack.frames import length_xy, off_axis_rad
-from startrack.types import Array, Bools
+from startrack.types import Array, Bools, Mask
 
 # Body x (forward) = image top = -cam y, body y (left) = +cam x, body z (up) = +cam z: it looks at the zenith.
 ZENITH_MOUNT_R_BODY_CAM = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -58,6 +58,7 @@ class Camera:
     sensor: Sensor | None = None
     covariance_order: tuple[str, ...] = ()
     covariance: Array | None = None
+    mask: str | Mask | None = None  # path of the file, or the mask, of pixels that never show the sky
 
     @property
     def handed_focal_px(self) -> tuple[float, float]:

@@ -13,9 +13,9 @@ from startrack.camera.decentring import Decentring
 from startrack.camera.lens import Lens
 from startrack.camera.lenses import default_lens, lens_kinds
 from startrack.declaration import Choice, Flag, List, Number, Table, Text
-from startrack.files import read_toml, resolve_named, write_atomically
+from startrack.files import read_toml, relative_path, resolve_named, write_atomically
 from startrack.frames import R_from_quat_xyzw, quat_xyzw_from_R
-from startrack.types import MAX_PIXELS, Array, BadInput
+from startrack.types import MAX_PIXELS, Array, BadInput, Mask
 
 UNIT_QUATERNION_1 = 1e-3  # largest error of the length
 MIN_SIGMA = 1e-15  # of a parameter, px or 1; smaller ones count as zero
@@ -100,6 +100,7 @@ def camera_keys(lens: type[Lens] | None = None) -> Table:
                 low=0, high=360, above=True, description="beyond this the lens is not known; default: max_angle_deg"
             ),
             "mirrored": Flag(default=False),
+            "mask": Text(description="8-bit image of this size, relative to this file: pixels below 128 do not count"),
             "decentring": List(each=Number(low=-1, high=1), count=2, description="p1, p2 of a decentred lens"),
             "mount": MOUNT,
             "sensor": SENSOR,
@@ -116,32 +117,41 @@ def load_camera(name_or_path: str | Path) -> Camera:
     path = resolve_named(name_or_path, "calib", "no_calibration")
     values = read_toml(path, "bad_calibration")
     try:
-        return camera_from_dict(values, default_name=path.stem)
+        return camera_from_dict(values, default_name=path.stem, folder=path.parent)
     except BadInput as cause:
         raise BadInput(cause.reason, f"{path}: {cause}") from cause
 
 
 def save_camera(camera: Camera, path: str | Path) -> None:
-    """Write the camera to the file `path`; `load_camera` gives it back. Raises BadInput if it cannot be written."""
-    write_atomically(path, camera_text(camera).encode("utf-8"), overwrite=True)
+    """Write the camera to the file `path`; `load_camera` gives it back.
+
+    Raises BadInput if it cannot be written, ValueError for a mask that is no file.
+    """
+    if isinstance(camera.mask, Mask):
+        raise ValueError("the camera's mask is an array: write it as an image, and give its path")
+    write_atomically(path, camera_text(camera, Path(path).parent).encode("utf-8"), overwrite=True)
 
 
-def camera_text(camera: Camera) -> str:
-    """The camera file as text."""
+def camera_text(camera: Camera, folder: Path | None = None) -> str:
+    """The camera file as text; its mask as seen from the `folder` of the file (None: the current one)."""
     import tomli_w
 
-    return tomli_w.dumps(camera_to_dict(camera))
+    values = camera_to_dict(camera)
+    if "mask" in values and folder is not None:
+        values["mask"] = relative_path(values["mask"], folder)
+    return tomli_w.dumps(values)
 
 
-def camera_from_dict(d: dict[str, Any], default_name: str = "camera") -> Camera:
+def camera_from_dict(d: dict[str, Any], default_name: str = "camera", folder: Path | None = None) -> Camera:
     """The camera of the keys `d` of a camera file, called `default_name` if they have no name.
 
-    Raises BadInput bad_calibration with a line that names the wrong key.
+    The path of a mask is relative to `folder` (None: the current one). Raises BadInput bad_calibration with a line that
+    names the wrong key.
     """
     try:
         model = d.get("model", default_lens().model)
         lens = lens_kinds().get(model) if isinstance(model, str) else None
-        return _camera(camera_keys(lens).check(d, ""), default_name)
+        return _camera(camera_keys(lens).check(d, ""), default_name, folder or Path())
     except ValueError as cause:
         raise BadInput("bad_calibration", str(cause)) from cause
 
@@ -160,6 +170,8 @@ def camera_to_dict(camera: Camera) -> dict[str, Any]:
         "calibrated_angle_deg": float(np.degrees(camera.calibrated_angle_rad)),
         "mirrored": camera.mirrored,
     }
+    if isinstance(camera.mask, str):
+        d["mask"] = camera.mask
     if camera.decentring:
         d["decentring"] = [float(camera.decentring.p1), float(camera.decentring.p2)]
     if not np.array_equal(camera.R_body_cam, ZENITH_MOUNT_R_BODY_CAM):
@@ -171,7 +183,7 @@ def camera_to_dict(camera: Camera) -> dict[str, Any]:
     return d
 
 
-def _camera(values: dict[str, Any], default_name: str) -> Camera:
+def _camera(values: dict[str, Any], default_name: str, folder: Path) -> Camera:
     """The camera of checked values. Raises ValueError for values that contradict each other."""
     width, height = values["size_px"]
     if width * height > MAX_PIXELS:
@@ -194,6 +206,7 @@ def _camera(values: dict[str, Any], default_name: str) -> Camera:
         sensor=None if sensor is None else Sensor(**sensor),
         covariance_order=order,
         covariance=covariance,
+        mask=str(folder / values["mask"]) if "mask" in values else None,
     )
 
 

@@ -175,6 +175,8 @@ def _facts(args: argparse.Namespace) -> dict[str, Any]:
     """The facts given by flags, with absolute paths, since workers run in other folders."""
     facts = flag_facts(args)
     named = {key: os.path.abspath(facts[key]) for key in ("camera", "terrain") if is_path(facts.get(key, ""))}
+    if "mask" in facts:
+        named["mask"] = os.path.abspath(facts["mask"])
     return facts | named
 
 
@@ -184,11 +186,12 @@ def _paths_in(listed: bytes) -> list[str]:
 
 
 def _check_files_of_flags(facts: dict[str, Any]) -> None:
-    """Raise BadInput for a camera or terrain file of a flag before anything is changed."""
+    """Raise BadInput for a camera, terrain or mask file of a flag before anything is changed."""
     from startrack.camera import load_camera
+    from startrack.exposure import read_mask
     from startrack.terrain import load_terrain
 
-    for key, load in (("camera", load_camera), ("terrain", load_terrain)):
+    for key, load in (("camera", load_camera), ("terrain", load_terrain), ("mask", read_mask)):
         if key in facts:
             load(facts[key])
 
@@ -242,7 +245,9 @@ def _write_tables(
 
 def _remove_paths(facts: dict[str, Any]) -> dict[str, str]:
     """The facts of flags for the manifest, without paths of this machine."""
-    return {key: Path(value).name if key in ("camera", "terrain") else str(value) for key, value in facts.items()}
+    return {
+        key: Path(value).name if key in ("camera", "terrain", "mask") else str(value) for key, value in facts.items()
+    }
 
 
 def _address(text: str) -> str:

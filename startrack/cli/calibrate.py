@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.common import DEFAULT_OUT, read
+from startrack.cli.common import DEFAULT_OUT, add_mask_flag, read
 from startrack.cli.flag_types import amount, field_of_view_rad, number, positive_number
 from startrack.cli.progress import progress
 from startrack.compilation import announce_compilation
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from startrack.calibration import Calibration
     from startrack.camera import Camera
     from startrack.frames import Site
-    from startrack.types import Exposure
+    from startrack.types import Bools, Exposure
 
 
 def add_parser(subparsers: Any) -> None:
@@ -64,6 +64,7 @@ def add_site_flags(parser: argparse.ArgumentParser) -> None:
     """Flags for the time, the duration and the site of exposures of the sky."""
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601 (one image only)")
     parser.add_argument("--exposure", type=positive_number, metavar="S", help="exposure time in seconds")
+    add_mask_flag(parser)
     parser.add_argument("--site", metavar="LAT,LON[,M]", help="site on the Earth, in degrees and metres, to correct "
                         "for refraction (--site=-30.2,...)")  # fmt: skip
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file whose origin is the site")
@@ -121,14 +122,16 @@ def _write_calibration(args: argparse.Namespace, out: Path, found: Calibration) 
     """Write and print a calibration; the exit code."""
     from startrack.calibration.record import calibration_dict, summary
     from startrack.calibration.report import write_report
-    from startrack.camera.io import camera_text
+    from startrack.camera import save_camera
     from startrack.files import write_atomically
     from startrack.output import write_json
 
     record, line = calibration_dict(found), summary(found, out.name)
     line += f"\n  {record['message']}" if record["message"] else ""
     if found.accepted:
-        write_atomically(out, camera_text(found.camera).encode("utf-8"), overwrite=True)
+        save_camera(found.camera, out)
+        if found.obstructed is not None:
+            line += f"\n  {_write_proposed_mask(out, found.obstructed)}"
     write_json(out.with_suffix(".calibration.json"), record)
     hot = found.photometry.properties.hot_px
     if hot is not None:
@@ -139,6 +142,22 @@ def _write_calibration(args: argparse.Namespace, out: Path, found: Calibration) 
     if args.verbose:
         line += "".join(f"\n  {note}" for note in found.photometry.notes)
     return print_outcome(args, record, line)
+
+
+def _write_proposed_mask(camera_file: Path, obstructed: Bools) -> str:
+    """Write CAMERA.mask.png beside the camera file; the line that explains its use."""
+    import numpy as np
+
+    from startrack.exposure import write_exposure
+    from startrack.types import Exposure
+
+    path = camera_file.with_suffix(".mask.png")
+    pixels = np.where(obstructed, 0.0, 255.0).astype(np.float32)
+    write_exposure(path, Exposure(pixels_adu=pixels, saturation_adu=255.0), overwrite=True)
+    return (
+        f"{path.name}: {100 * obstructed.mean():.1f} % of the pixels are in places that never show a star; it is not "
+        f'used unless {camera_file.name} has the line mask = "{path.name}" above its first [table]'
+    )
 
 
 def print_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) -> int:

@@ -36,6 +36,14 @@ def add_fact_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601")
     add_time_sigma_flag(parser)
     parser.add_argument("--exposure", type=positive_number, metavar="S", help="exposure time in seconds")
+    add_mask_flag(parser)
+
+
+def add_mask_flag(parser: argparse.ArgumentParser) -> None:
+    """The flag for the pixels that do not count."""
+    parser.add_argument(
+        "--mask", metavar="FILE", help="8-bit image of the frame's size: pixels below 128 do not count (a mast, a lamp)"
+    )
 
 
 def add_time_sigma_flag(parser: Any) -> None:
@@ -100,6 +108,7 @@ def flag_facts(args: argparse.Namespace) -> dict[str, Any]:
         "exposure_s": args.exposure,
         "camera": args.camera,
         "terrain": getattr(args, "terrain", None),
+        "mask": getattr(args, "mask", None),
     }
     return {key: value for key, value in flags.items() if value is not None}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 
@@ -28,11 +29,13 @@ from startrack.detection.frame import (
     mask_or_none,
     radius_for,
 )  # fmt: skip
+from startrack.detection.masked import fill_masked
 from startrack.detection.peaks import Peaks, find_peaks, unbin_peaks
 from startrack.detection.psf_width import WIDTH_TOLERANCE, guess_psf_width, measure_psf_width
 from startrack.detection.saturated import refit_saturated
 from startrack.detection.streaks import Streaks, are_elongated, find_streaks
-from startrack.types import Array, Bools, Detections, Exposure, Ints, TooFewStars
+from startrack.exposure import combine_masks, touch_masked
+from startrack.types import Array, Bools, Detections, Exposure, Ints, Mask, TooFewStars
 
 UNKNOWN_WIDTH_PX = 1.2  # first guess where the camera file does not state the width
 FIRST_PASS_LOWER = 1.1  # sigma of the filtered noise: threshold of the stars minus that of the candidates
@@ -70,17 +73,21 @@ class Detector:
     def __call__(self, exposure: Exposure, camera: Camera | None = None) -> Detections:
         """Point sources of an `exposure`, brightest first; fluxes in electrons with the camera's gain, else in ADU.
 
-        Raises TooFewStars (reason no_stars) if the frame has no point source.
+        Raises TooFewStars (reason no_stars) if the frame has no point source, BadInput for a mask that cannot be used.
         """
         image, dead = electrons(exposure, camera)
+        mask = combine_masks(exposure.mask, None if camera is None else camera.mask, exposure.size_px)
+        if mask is not None:
+            image, dead = fill_masked(image, mask.masked), dead & ~mask.masked
         if _is_flat(image):
             raise TooFewStars("the frame is flat: every pixel has the same value (lens cap, or a saturated day sky?)")
         known = camera.sensor.psf_sigma_px if camera is not None and camera.sensor is not None else None
         source_noise = SourceNoise(per_unit=0.0 if known is None else 1.0)
-        candidates = self._candidates(_FrameSource(image, mask_or_none(dead), source_noise), self.psf_sigma_px or known)
+        source = _FrameSource(image, mask_or_none(dead), source_noise, None if mask is None else mask.masked)
+        candidates = self._candidates(source, self.psf_sigma_px or known)
         frame, sigma = candidates.frame, candidates.sigma
         if are_elongated(frame, candidates.centres) and (streaks := find_streaks(frame)) is not None:
-            return _detections_of_streaks(frame, dead, streaks)
+            return _detections_of_streaks(frame, dead, streaks, mask)
         stars = self._select_stars(frame, candidates.fitted, candidates.side, sigma)
         if candidates.side > 1 or _covered_fraction(stars, sigma, frame.shape) > CROWDED_FRACTION:
             frame, stars = self._detect_again(candidates, unbin_fits(stars, candidates.side))
@@ -95,9 +102,10 @@ class Detector:
             saturated=_saturated_mask(frame, stars),
             psf_sigma_px=sigma,
             image_e=image,
-            dead=dead,
+            dead=_unusable(dead, mask),
             background_e=frame.background,
             noise_e=frame.noise,
+            mask=mask,
         )
 
     def _candidates(self, source: _FrameSource, expected: float | None) -> _Candidates:
@@ -130,9 +138,8 @@ class Detector:
     def _detect_again(self, candidates: _Candidates, stars: PointFits) -> tuple[Frame, PointFits]:
         """The frame and its stars; known stars are subtracted before the background and faint stars are measured."""
         side, sigma, frame = candidates.side, candidates.sigma, candidates.frame
-        frame = _FrameSource(frame.image, frame.dead, candidates.fitted.source_noise).frame(
-            sigma, paint_sources(stars, sigma, frame.shape)
-        )
+        source = _FrameSource(frame.image, frame.dead, candidates.fitted.source_noise, frame.masked)
+        frame = source.frame(sigma, paint_sources(stars, sigma, frame.shape))
         positions = (stars.xy_px - 0.5 * (side - 1)) / side
         peaks = self._find_peaks(frame, bin_frame(frame, side), side, sigma, known=positions)
         peaks = unbin_peaks(peaks, side, frame.shape, radius_for(sigma))
@@ -151,14 +158,24 @@ class Detector:
         fits = fitted.fits
         threshold = detection_threshold(self.threshold_snr, sigma / side, noise_skewness(frame) / side)
         good = select_stars(fitted, width_px, threshold)
+        if frame.masked is not None:
+            xy_px = side * fits.xy_px[good] + 0.5 * (side - 1)
+            good = good[~touch_masked(frame.masked, xy_px, radius_for(sigma))]
         good = good[select_brightest_per_position(fits.xy_px[good], fits.flux[good], 1.2 * sigma / side)]
         stars = fits.take(good[np.argsort(-fits.flux[good], kind="stable")])
         clear = reject_wing_misfits(stars.xy_px, stars.flux, peak_heights(stars), sigma / side, threshold)
         return stars.take(np.flatnonzero(clear))
 
 
-def _detections_of_streaks(frame: Frame, dead: Bools, streaks: Streaks) -> Detections:
+def _unusable(saturated: Bools, mask: Mask | None) -> Bools:
+    return saturated if mask is None else saturated | mask.masked
+
+
+def _detections_of_streaks(frame: Frame, dead: Bools, streaks: Streaks, mask: Mask | None) -> Detections:
     """The stars of a frame taken by a rotating camera; the PSF width is that of the whole streak."""
+    if mask is not None:
+        half_px = ceil(0.5 * streaks.length_px + WINGS_SIGMAS * streaks.width_px)
+        streaks = streaks.take(~touch_masked(mask.masked, streaks.xy_px, half_px))
     return Detections(
         xy_px=streaks.xy_px,
         covariance_px2=streaks.covariance_px2,
@@ -168,9 +185,10 @@ def _detections_of_streaks(frame: Frame, dead: Bools, streaks: Streaks) -> Detec
         saturated=np.zeros(len(streaks.flux), dtype=bool),
         psf_sigma_px=float(np.hypot(streaks.width_px, streaks.length_px / np.sqrt(12.0))),
         image_e=frame.image,
-        dead=dead,
+        dead=_unusable(dead, mask),
         background_e=frame.background,
         noise_e=frame.noise,
+        mask=mask,
     )
 
 
@@ -181,8 +199,10 @@ def _is_flat(image: Image) -> bool:
 class _FrameSource:
     """An image with its unusable pixels; backgrounds are computed once for each block size."""
 
-    def __init__(self, image: Image, dead: Bools | None, source_noise: SourceNoise) -> None:
-        self.image, self.dead, self.source_noise = image, dead, source_noise
+    def __init__(
+        self, image: Image, dead: Bools | None, source_noise: SourceNoise, masked: Bools | None
+    ) -> None:  # fmt: skip
+        self.image, self.dead, self.source_noise, self.masked = image, dead, source_noise, masked
         self.quantum = smallest_step(image)
         self._kept: dict[int, tuple[Image, Image]] = {}
 
@@ -190,11 +210,11 @@ class _FrameSource:
         """The prepared frame; stars in `found` are excluded from background and noise."""
         if found is not None:
             maps = background_and_noise(self.image - found, self.quantum, sigma)
-            return Frame(self.image, *maps, self.dead, self.source_noise, found)
+            return Frame(self.image, *maps, self.dead, self.source_noise, self.masked, found)
         side = block_side(sigma)
         if side not in self._kept:
             self._kept[side] = background_and_noise(self.image, self.quantum, sigma)
-        return Frame(self.image, *self._kept[side], self.dead, self.source_noise)
+        return Frame(self.image, *self._kept[side], self.dead, self.source_noise, self.masked)
 
 
 def _covered_fraction(stars: PointFits, sigma: float, shape: tuple[int, int]) -> float:

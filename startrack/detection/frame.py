@@ -38,6 +38,7 @@ class Frame:
     noise: Image  # standard deviation of one pixel
     dead: NDArray[np.bool_] | None  # saturated: no weight in fits; None where no pixel is
     source_noise: SourceNoise
+    masked: Bools | None = None  # filled with its surroundings; a star that touches it is left out
     found: Image | None = None  # signal of the known stars, where their wings cover much of the frame
 
     @property
@@ -124,7 +125,7 @@ def bin_frame(frame: Frame, side: int) -> Frame:
     middle = slice(side // 2, height, side), slice(side // 2, width, side)
     background = frame.background[middle] * np.float32(side**2)
     noise = frame.noise[middle] * np.float32(side)
-    return Frame(_sums(frame.image[whole], side), background, noise, dead, frame.source_noise, found)
+    return Frame(_sums(frame.image[whole], side), background, noise, dead, frame.source_noise, found=found)
 
 
 def _sums(image: Image, side: int) -> Image:

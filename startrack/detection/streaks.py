@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -32,6 +32,11 @@ class Streaks:
     flux_sigma: Array
     length_px: float  # typical
     width_px: float  # typical standard deviation across
+
+    def take(self, which: Bools) -> Streaks:
+        """The streaks that a mask (n,) selects."""
+        rows = {name: getattr(self, name)[which] for name in ("xy_px", "covariance_px2", "flux", "flux_sigma")}
+        return replace(self, **rows)
 
 
 def are_elongated(frame: Frame, centres: Ints) -> bool:

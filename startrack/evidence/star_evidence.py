@@ -11,6 +11,7 @@ from startrack.camera import Camera
 from startrack.evidence.flux_scale import FluxScale
 from startrack.evidence.likelihood_ratio import gaussian_llr, visibility_llr
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure
+from startrack.exposure import touch_masked
 from startrack.frames import angle_between_rad, azel_from_rays, off_axis_rad, rays_from_azel
 from startrack.psf import noise_area_px
 from startrack.types import Array, Body, Bools, Detections, Evidence, Ints, Stars
@@ -22,8 +23,8 @@ DISKS_RAD = {"Sun": 0.0047, "Moon": 0.0049, "Earth": 0.0180}  # largest radii, t
 DECIDABLE_SNR = 2.0  # of stars whose own flux shows whether they are visible
 NOISE_STEP_PX = 16  # both ways: the noise is interpolated between blocks of 16 px
 VIEW_MARGIN_RAD = 1e-6  # for rounding
-CAUSES = ("", "edge of the image circle", "beyond the calibrated angle", "off the frame", "bad pixels")
-USABLE, EDGE_OF_CIRCLE, NOT_CALIBRATED, OFF_FRAME, BAD_PIXELS = range(len(CAUSES))
+CAUSES = ("", "edge of the image circle", "beyond the calibrated angle", "off the frame", "bad pixels", "masked")
+USABLE, EDGE_OF_CIRCLE, NOT_CALIBRATED, OFF_FRAME, BAD_PIXELS, MASKED = range(len(CAUSES))
 SEEN_LLR = 3.0  # from here on a star counts as seen, from minus this as hidden
 
 
@@ -139,6 +140,9 @@ class StarEvidence:
         blur = misplaced2 / (2 * sigma_px) ** 2
         fraction = np.sqrt(scale.scatter**2 + np.square(0.4 * np.log(10) * stars.v_sigma_mag[star]) + blur**2)
         cause = _causes(xy, angle, camera, bodies, R_cam_icrs, half_width(sigma_px))
+        if detections.mask is not None:
+            touching = touch_masked(detections.mask.masked, xy, half_width(sigma_px))
+            cause[touching & (cause == USABLE)] = MASKED
         measurable = np.flatnonzero(cause != OFF_FRAME)
         if visible is None:
             at = xy[measurable], expected[measurable], fraction[measurable]

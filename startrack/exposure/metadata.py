@@ -14,7 +14,7 @@ from typing import Any
 from startrack.declaration import SHOWN_CHARS, Choice, Number, Table, Text, value_text
 from startrack.files import is_path, printable
 from startrack.frames.time import as_utc, parse_utc
-from startrack.types import BadInput, Exposure
+from startrack.types import BadInput, Exposure, Mask
 
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 MAX_EXPOSURE_S = 1e6
@@ -31,6 +31,7 @@ SIDECAR = Table(
         **NUMBERS,
         "camera": Text(description="a camera file, or the name of a shipped one"),
         "terrain": Text(description="a terrain file, or the name of a shipped one"),
+        "mask": Text(description="8-bit image of the frame's size: pixels below 128 do not count"),
         "bayer_pattern": Choice(values=BAYER_PATTERNS, description="colours of the first 2 x 2 pixels of a mosaic"),
     },
 )
@@ -38,7 +39,7 @@ SIDECAR = Table(
 # the sidecar's keys are valid there too, except in FITS, where a card called CAMERA is common and names the hardware.
 _HEADER_KEYS = ("DATE-AVG", "STTSIG", "EXPTIME", "STCAMERA", "STTERRAI", "BAYERPAT")
 HEADER_KEYS = {key: key for key in ("DATE-OBS", "TIMESYS", *_HEADER_KEYS)}
-HEADER_KEYS |= dict(zip(SIDECAR.keys, _HEADER_KEYS, strict=True))
+HEADER_KEYS |= dict(zip((key for key in SIDECAR.keys if key != "mask"), _HEADER_KEYS, strict=True))
 RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".crw", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"}
 PICTURE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".fits", ".fit", ".fts"} | RAW_SUFFIXES
 PACKING_SUFFIXES = {".gz", ".bz2", ".fz"}
@@ -58,6 +59,7 @@ class Facts:
     exposure_s: float | None = None
     camera: str | None = None  # path, or name of a shipped file
     terrain: str | None = None  # path, or name of a shipped file
+    mask: str | None = None  # path
     bayer_pattern: str | None = None  # RGGB and the like: the pixels are a mosaic of colours
     warnings: tuple[str, ...] = ()  # values that were ignored, and why
 
@@ -79,15 +81,17 @@ def with_facts(
     exposure_s: float | None = None,
     camera: str | None = None,
     terrain: str | None = None,
+    mask: str | Mask | None = None,
 ) -> Exposure:
     """The exposure with the values given here in place of its own; `time_utc` is mid-exposure.
 
-    `time_sigma_s` is the standard deviation of the clock's error. `camera` and `terrain` are names or paths of files.
+    `time_sigma_s` is the standard deviation of the clock's error. `camera` and `terrain` are names or paths of files,
+    `mask` is a path or the mask itself.
 
     A mid-exposure time computed from DATE-OBS and a header's EXPTIME does not change with a new `exposure_s`; give it
     to `read_exposure` for that. Raises ValueError for a time without zone and an unusable `time_sigma_s`.
     """
-    given: dict[str, Any] = {"exposure_s": exposure_s, "camera": camera, "terrain": terrain}
+    given: dict[str, Any] = {"exposure_s": exposure_s, "camera": camera, "terrain": terrain, "mask": mask}
     given["time_utc"] = None if time_utc is None else as_utc(time_utc)
     given["time_sigma_s"] = None if time_sigma_s is None else check_time_sigma_s(time_sigma_s, "time_sigma_s")
     return replace(exposure, **{key: value for key, value in given.items() if value is not None})
@@ -122,6 +126,7 @@ def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts
         terrain=given.terrain
         or _sidecar_reference(sidecar, values, "terrain")
         or _header_reference(image, header, "STTERRAI", notes),
+        mask=given.mask or _sidecar_reference(sidecar, values, "mask"),
         bayer_pattern=_sidecar_value(sidecar, values, "bayer_pattern") or _header_pattern(header, notes),
         warnings=tuple(notes),
     )
@@ -220,6 +225,8 @@ def _sidecar_time(sidecar: Path, value: object) -> datetime | None:
 
 def _sidecar_reference(sidecar: Path, values: Mapping[str, Any], key: str) -> str | None:
     value = _sidecar_value(sidecar, values, key)
+    if key == "mask" and value is not None:  # always a path: no mask is shipped
+        return os.path.join(sidecar.parent, value)
     return None if value is None else _resolve_path(sidecar, value)
 
 

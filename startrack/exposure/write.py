@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.exposure.metadata import Facts, sidecars
-from startrack.files import check_free, is_path, printable, write_atomically
+from startrack.files import check_free, is_path, printable, relative_path, write_atomically
 from startrack.frames.time import format_utc
 from startrack.types import BadInput, Exposure
 
@@ -61,6 +61,7 @@ def write_sidecar(image: str | os.PathLike[str], facts: Facts | Exposure, *, ove
         "exposure_s": facts.exposure_s,
         "camera": _relative_path(facts.camera, target.parent),
         "terrain": _relative_path(facts.terrain, target.parent),
+        "mask": relative_path(facts.mask, target.parent) if isinstance(facts.mask, str) else None,
         "bayer_pattern": facts.bayer_pattern if isinstance(facts, Facts) else None,
     }
     text = json.dumps({k: v for k, v in values.items() if v is not None}, ensure_ascii=False, allow_nan=False)
@@ -91,10 +92,7 @@ def _relative_path(reference: str | None, folder: Path) -> str | None:
     """A path as seen from `folder`, with forward slashes; a shipped name as it is."""
     if reference is None or not is_path(reference):
         return reference
-    try:  # real paths, or ".." would lead astray where the folder is a symbolic link
-        relative = Path(os.path.relpath(os.path.realpath(reference), os.path.realpath(folder))).as_posix()
-    except ValueError:  # another drive of Windows
-        return Path(reference).absolute().as_posix()
+    relative = relative_path(reference, folder)
     return relative if is_path(relative) else f"./{relative}"
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from startrack.camera import Camera
 from startrack.frames import off_axis_rad, rays_from_azel
 from startrack.horizon.grid import COLUMNS, LOWEST_RAD, column_azimuths_rad
-from startrack.types import Array, Bools
+from startrack.types import Array, Bools, Detections
 
 TOP_RAD = np.radians(67.0)  # of the columns
 SAMPLES_PER_PX = 3
@@ -44,14 +44,16 @@ class Columns:
 
 
 def sample_columns(
-    image_e: NDArray[np.float32], noise_e: NDArray[np.float32], dead: Bools,
+    image_e: NDArray[np.float32], noise_e: NDArray[np.float32], lost: NDArray[np.uint8],
     stars: tuple[Array, Array], camera: Camera, R_cam_enu: Array,
 ) -> Columns:  # fmt: skip
-    """An image (H, W) along columns of azimuth, `stars` (pixels (m, 2), radii (m,)) replaced by their surroundings."""
+    """An image (H, W) along columns of azimuth, `stars` (pixels (m, 2), radii (m,)) replaced by their surroundings.
+
+    Nothing is measured at the pixels `lost` (H, W), as `lost_pixels` gives them.
+    """
     px_rad = _px_rad(camera, R_cam_enu)
     elevation = np.arange(LOWEST_RAD, TOP_RAD, px_rad / SAMPLES_PER_PX)
-    lost = _around_saturated(dead)
-    disks = np.zeros(dead.shape, np.uint8)
+    disks = np.zeros(image_e.shape, np.uint8)
     for (i, j), radius in zip(np.rint(stars[0]).astype(int).tolist(), stars[1], strict=True):
         cv2.circle(disks, (i, j), round(radius), 1, -1)
     shape = len(elevation), COLUMNS
@@ -68,8 +70,15 @@ def sample_columns(
     return _fill_points(columns, points)
 
 
+def lost_pixels(detections: Detections) -> NDArray[np.uint8]:
+    """Pixels (H, W) that are masked, or near saturated ones; nearer ones of a lamp or a star than of the Moon."""
+    if detections.mask is None:
+        return _around_saturated(detections.dead)
+    masked = detections.mask.masked
+    return _around_saturated(detections.dead & ~masked) | masked.view(np.uint8)
+
+
 def _around_saturated(dead: Bools) -> NDArray[np.uint8]:
-    """Pixels (H, W) near saturated ones; nearer ones of a lamp or a star than of the Moon."""
     count, label, facts, _ = cv2.connectedComponentsWithStats(dead.astype(np.uint8))
     large = np.isin(label, 1 + np.flatnonzero(facts[1:count, cv2.CC_STAT_AREA] > LARGE_AREA_PX))
     around = [cv2.dilate(part.astype(np.uint8), np.ones((2 * px + 1,) * 2, np.uint8))

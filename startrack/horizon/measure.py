@@ -11,6 +11,7 @@ from startrack.camera import Camera
 from startrack.catalog import StarCatalog
 from startrack.errors import NoSolution
 from startrack.frames import Site, off_axis_rad, rays_from_azel, refract_rad
+from startrack.horizon.columns import lost_pixels
 from startrack.horizon.frames import LeftOut, SkyFrame, orient_frames, pressure_hpa
 from startrack.horizon.grid import BINS, COLUMNS, COLUMNS_PER_BIN
 from startrack.horizon.posterior import (
@@ -94,7 +95,7 @@ def _steps_of(frame: SkyFrame, light: StarLight) -> list[Steps]:
     return find_steps(
         found.image_e,
         found.noise_e,
-        found.dead,
+        lost_pixels(found),
         camera,
         frame.R_cam_enu,
         widths=widths,

@@ -47,15 +47,15 @@ class Steps:
 
 
 def find_steps(
-    image_e: NDArray[np.float32], noise_e: NDArray[np.float32], dead: Bools, camera: Camera,
+    image_e: NDArray[np.float32], noise_e: NDArray[np.float32], lost: NDArray[np.uint8], camera: Camera,
     R_cam_enu: Array, *, widths: tuple[int, ...], stars_px: Array, glare_px: Array,
 ) -> list[Steps]:  # fmt: skip
     """All significant steps of an image (H, W) [e], for each width of columns averaged.
 
-    `noise_e`: of its pixels; `dead`: the saturated ones, which are left out like the light of stars, of radii
+    `noise_e`: of its pixels; `lost`: those that are left out (`lost_pixels`), like the light of stars, of radii
     `glare_px` (m,) around `stars_px` (m, 2).
     """
-    columns = sample_columns(remove_points(image_e, noise_e), noise_e, dead, (stars_px, glare_px), camera, R_cam_enu)
+    columns = sample_columns(remove_points(image_e, noise_e), noise_e, lost, (stars_px, glare_px), camera, R_cam_enu)
     return [_steps_of(average_columns(columns, width), width) for width in widths]
 
 

@@ -260,6 +260,9 @@ QUANTITIES: tuple[Quantity, ...] = (
       optional=True, columns=(Column("time_sigma_s", "%.9g"),)),
     Q("provenance.exposure_s", "s", Inputs, lambda v: v.exposure.exposure_s, "null: not known", NUMBER, before=None,
       columns=(Column("exposure_s", "%.9g"),)),
+    Q("provenance.mask_sha256", "", Detected, lambda v: None if v.detections.mask is None else v.detections.mask.sha256,
+      "of the file of the mask, or of the array that is masked; with the camera's and the image's mask both, joined by "
+      "`+`; null: every pixel counts", TEXT, before=None, nullable=True, optional=True),
 )  # fmt: skip
 BY_PATH = {one.path: one for one in QUANTITIES}
 # The batch's columns came in this order before the table did; a column that is not named here is appended.

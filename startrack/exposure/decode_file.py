@@ -1,0 +1,85 @@
+"""From a file to its pixels and header: open, find the type from its first bytes, decode strictly."""
+
+from __future__ import annotations
+
+import os
+import stat
+import warnings
+from pathlib import Path
+
+from startrack.exposure.decoded import MAX_FILE_BYTES, Decoded, bad_image
+from startrack.exposure.metadata import RAW_SUFFIXES
+from startrack.files import printable
+from startrack.types import BadInput
+
+PNG = (b"\x89PNG\r\n\x1a\n",)
+TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+JPEG = (b"\xff\xd8\xff",)
+FITS = (b"SIMPLE  =", b"\x1f\x8b", b"BZh")
+
+
+def decode_file(path: str | os.PathLike[str]) -> tuple[bytes, Decoded]:
+    """The bytes of the image at `path`, and their content. Raises BadInput bad_image with file and cause."""
+    try:
+        raw = _read_bytes(path)
+        return raw, _decode(raw, Path(path).suffix.lower() in RAW_SUFFIXES)
+    except BadInput as error:
+        raise BadInput(error.reason, " ".join(f"{printable(path)}: {error}".split())) from error
+
+
+def _read_bytes(path: str | os.PathLike[str]) -> bytes:
+    try:
+        status = os.stat(path)
+        if stat.S_ISDIR(status.st_mode):
+            raise bad_image("is a folder, not an image")
+        if not stat.S_ISREG(status.st_mode):  # a pipe would block, a device never end
+            raise bad_image("is not a regular file")
+        if status.st_size == 0:
+            raise bad_image("is empty")
+        if status.st_size > MAX_FILE_BYTES:
+            raise bad_image(f"is {status.st_size / 1e9:.1f} GB, more than any image startrack reads")
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise bad_image(f"cannot be opened ({error.strerror or error})") from error
+    except ValueError as error:  # a NUL in the name
+        raise bad_image(f"cannot be opened ({error})") from error
+
+
+def _decode(raw: bytes, camera_raw: bool) -> Decoded:
+    """The decoded file. Camera raw files are known by their suffix: they are TIFFs with a thumbnail as their picture.
+
+    Raises BadInput bad_image; whatever else a decoder raises for damaged bytes is turned into it.
+    """
+    kind, decode = "image", _refuse_unknown
+    try:
+        if camera_raw:
+            from startrack.exposure.mosaic import decode_camera_raw
+
+            kind, decode = "camera raw file", decode_camera_raw
+        elif raw.startswith(PNG):
+            from startrack.exposure.png import decode_png
+
+            kind, decode = "PNG", decode_png
+        elif raw.startswith(TIFF):
+            from startrack.exposure.tiff import decode_tiff
+
+            kind, decode = "TIFF", decode_tiff
+        elif raw.startswith(JPEG):
+            from startrack.exposure.jpeg import decode_jpeg
+
+            kind, decode = "JPEG", decode_jpeg
+        elif raw.startswith(FITS):
+            from startrack.exposure.fits import decode_fits
+
+            kind, decode = "FITS", decode_fits
+        with warnings.catch_warnings():  # the decoders' checks refuse the file or fill `Exposure.warnings`
+            warnings.simplefilter("ignore")
+            return decode(raw)
+    except BadInput:
+        raise
+    except Exception as error:
+        raise bad_image(f"truncated or damaged {kind} ({type(error).__name__}: {str(error)[:200]})") from error
+
+
+def _refuse_unknown(raw: bytes) -> Decoded:
+    raise bad_image("is not a PNG, TIFF, JPEG or FITS file, nor named as a camera raw file")

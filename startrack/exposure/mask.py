@@ -1,0 +1,86 @@
+"""Masks: which pixels of an image do not count, by the camera's mask and the image's own."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from startrack.exposure.decode_file import decode_file
+from startrack.files import printable
+from startrack.types import Array, BadInput, Bools, Mask
+
+SKY_FROM = 128  # of 255: darker pixels of a mask's file do not count
+LARGEST_VALUE = 255.0  # of an 8-bit file
+KEPT_MASKS = 2  # the camera's and the image's
+
+
+def mask_of(masked: ArrayLike) -> Mask | None:
+    """The mask of the pixels (H, W) that are `masked`; None where no pixel is."""
+    whole = np.asarray(masked, dtype=np.bool_)
+    if not whole.any():
+        return None
+    return Mask(
+        masked=whole, sha256=hashlib.sha256(f"{whole.shape}".encode() + np.packbits(whole).tobytes()).hexdigest()
+    )
+
+
+def read_mask(path: str | os.PathLike[str], reason: str = "bad_image") -> Mask:
+    """The mask in the 8-bit image at `path`. Raises BadInput `reason` if it is none, or if no pixel of it counts."""
+    try:
+        found = os.stat(path)
+        return _read_mask(os.fspath(path), reason, (found.st_ino, found.st_size, found.st_mtime_ns))
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        cause = getattr(error, "strerror", None) or error
+        raise BadInput(reason, f"mask {printable(path)}: cannot be opened ({cause})") from error
+
+
+def combine_masks(
+    of_image: str | Mask | None, of_camera: str | Mask | None, size_px: tuple[int, int]
+) -> Mask | None:  # fmt: skip
+    """The pixels that the mask `of_image` or the mask `of_camera` hides, in an image of `size_px` (W, H); None: none.
+
+    A mask is its file's path, or the mask itself. Raises BadInput: bad_image and bad_calibration where a file is no
+    mask, size_mismatch where it has another size than the image.
+    """
+    given = ((of_camera, "bad_calibration"), (of_image, "bad_image"))
+    masks = [one if isinstance(one, Mask) else read_mask(one, reason) for one, reason in given if one is not None]
+    for mask in masks:
+        height, width = mask.masked.shape
+        if (width, height) != size_px:
+            raise BadInput("size_mismatch", f"the mask is {width} x {height} px, the image {size_px[0]} x {size_px[1]}")
+    if len(masks) < 2:
+        return masks[0] if masks else None
+    return Mask(masked=masks[0].masked | masks[1].masked, sha256="+".join(mask.sha256 for mask in masks))
+
+
+def touch_masked(masked: Bools, xy_px: Array, radius_px: int) -> Bools:
+    """Whether a square of half width `radius_px` about each position `xy_px` (n, 2) holds a `masked` pixel (H, W)."""
+    import cv2
+
+    side = 2 * radius_px + 1
+    around = cv2.dilate(masked.view(np.uint8), np.ones((side, side), np.uint8))
+    height, width = masked.shape
+    column, row = np.rint(np.clip(xy_px, 0, [width - 1, height - 1])).astype(np.int64).T
+    return np.asarray(around[row, column] > 0)
+
+
+@lru_cache(maxsize=KEPT_MASKS)
+def _read_mask(path: str, reason: str, stamp: tuple[int, ...]) -> Mask:
+    """The mask at `path`, read once as long as the file keeps its `stamp`."""
+    try:
+        raw, decoded = decode_file(path)
+        if decoded.saturation_adu != LARGEST_VALUE:
+            raise BadInput(reason, f"{printable(path)}: is not an 8-bit image")
+    except BadInput as error:
+        raise BadInput(reason, f"mask {error}") from error
+    masked = decoded.pixels_adu < SKY_FROM
+    if masked.all():
+        raise BadInput(
+            reason,
+            f"mask {printable(path)}: all pixels are below {SKY_FROM}, so none would count: 255 is sky, 0 masked",
+        )
+    return Mask(masked=masked, sha256=hashlib.sha256(raw).hexdigest())

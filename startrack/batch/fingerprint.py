@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import stat
-import tomllib
 from collections.abc import Iterable
 from functools import lru_cache
 from importlib.util import find_spec
@@ -16,7 +15,8 @@ from typing import Any
 from startrack import __version__
 from startrack.catalog.gaia import has_deep_catalog
 from startrack.exposure.metadata import RAW_SUFFIXES, sidecar_of
-from startrack.files import is_path
+from startrack.errors import BadInput
+from startrack.files import is_path, parse_toml, read_text
 
 MISSING = "?"  # in place of the hash of a file that cannot be read; once it can, the hash differs
 FILES = ("camera", "terrain")  # facts that may be paths
@@ -72,8 +72,8 @@ def is_older_than(image: str | os.PathLike[str], result: str | os.PathLike[str])
 def _height_maps(terrain: Path) -> list[Path]:
     """The height maps that a terrain file names."""
     try:
-        dem = tomllib.loads(terrain.read_text(encoding="utf-8")).get("dem")
-    except (OSError, ValueError):  # missing or unreadable: refused when it is loaded
+        dem = parse_toml(read_text(terrain, "bad_terrain"), "bad_terrain").get("dem")
+    except BadInput:  # refused when it is loaded
         return []
     names = dem.get("file") if isinstance(dem, dict) else None
     return [terrain.parent / str(name) for name in (names if isinstance(names, list) else [names]) if name]

@@ -69,3 +69,10 @@ def field_of_view_rad(text: str, narrowest_deg: float = 0.5, widest_deg: float =
     if not narrowest_deg <= number(text) <= widest_deg:
         raise argparse.ArgumentTypeError(f"{text} is not between {narrowest_deg:g} and {widest_deg:g} degrees")
     return math.radians(number(text))
+
+
+def calibrated_angle_rad(text: str) -> float:
+    """An angle off the axis, above 0 and up to 180, given in degrees [rad]."""
+    if not 0 < number(text) <= 180:
+        raise argparse.ArgumentTypeError(f"{text} is not above 0 and up to 180 degrees")
+    return math.radians(number(text))

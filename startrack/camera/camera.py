@@ -15,7 +15,7 @@ from startrack.types import Array, Bools
 # Body x (forward) = image top = -cam y, body y (left) = +cam x, body z (up) = +cam z: it looks at the zenith.
 ZENITH_MOUNT_R_BODY_CAM = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
-MIN_THROUGHPUT_1 = 0.05  # relative to the axis, up to the calibrated angle; fisheyes have 0.3 to 1 at their edge
+MIN_THROUGHPUT_1 = 0.05  # relative to the axis, up to the calibrated angle: no light for evidence below it (3.3 mag)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from startrack.cli.calibrate import add_print_flags, add_site_flags, output_path, print_outcome, show_steps, site_of
+from startrack.cli.calibrate import (
+    add_print_flags,
+    add_site_flags,
+    check_name,
+    output_path,
+    print_outcome,
+    show_steps,
+    site_of,
+)
 from startrack.cli.common import DEFAULT_OUT, read
 from startrack.cli.flag_types import calibrated_angle_rad
 from startrack.errors import BadInput, NoSolution
@@ -72,6 +80,7 @@ def run_convert(args: argparse.Namespace) -> int:
     from startrack.camera.io import camera_text
     from startrack.files import file_stem, read_text, write_atomically
 
+    check_name(args)
     if args.to is not None:
         camera = load_camera(args.file)
         text = to_text(camera, args.to)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import add_time_sigma_flag
-from startrack.cli.flag_types import amount, clock_offset_s, count, number, positive_count, positive_number
+from startrack.cli.flag_types import amount, clock_offset_s, count, limited_count, number, positive_count, seconds
 from startrack.cli.progress import progress
 from startrack.errors import BadInput
 
@@ -76,7 +76,7 @@ def _add_light(group: Any) -> None:
     help_faint = "no stars fainter than this; down to it, stars that Hipparcos lacks are drawn at random (FIELD n) (10)"
     help_stars = "whose stars the sky has (auto: Gaia's where the extra `deep` is installed)"
     help_scatter = "of each star's flux, beyond the catalogue's own errors (0.03); 0 turns both off"
-    group.add_argument("--exposure", type=positive_number, metavar="S", help=help_exposure)
+    group.add_argument("--exposure", type=seconds, metavar="S", help=help_exposure)
     group.add_argument("--sky-mag", type=number, default=22.0, metavar="V", help="diffuse sky per arcsec^2 (22.0)")
     group.add_argument("--sky-gradient", type=number, default=0.0, metavar="F", help="its slope to the horizon (0)")
     group.add_argument("--sky-gradient-azimuth", type=number, default=0.0, metavar="DEG", help="where it rises to (0)")
@@ -85,8 +85,8 @@ def _add_light(group: Any) -> None:
     group.add_argument("--faint-stars", type=number, default=10.0, metavar="V", help=help_faint)
     group.add_argument("--no-faint-stars", action="store_true", help="the catalogue's stars alone")
     group.add_argument("--flux-scatter", type=amount, default=0.03, metavar="MAG", help=help_scatter)
-    group.add_argument("--hot-pixels", type=count, default=200, metavar="N", help="of the sensor (200)")
-    group.add_argument("--cosmic-rays", type=count, default=5, metavar="N", help="tracks per exposure (5)")
+    group.add_argument("--hot-pixels", type=limited_count, default=200, metavar="N", help="of the sensor (200)")
+    group.add_argument("--cosmic-rays", type=limited_count, default=5, metavar="N", help="tracks per exposure (5)")
 
 
 def _add_output(group: Any) -> None:

@@ -10,6 +10,7 @@ from startrack.declaration import LARGEST, SHOWN_CHARS
 
 MAX_EXPOSURE_S = 1e6  # as startrack.exposure.metadata has it; written here so that help is quick
 MAX_COUNT = 1_000_000
+MAX_MAGNITUDE = 100.0
 
 
 def number(text: str) -> float:
@@ -50,6 +51,13 @@ def time_sigma_s(text: str) -> float:
 def clock_offset_s(text: str) -> float:
     """An error of a clock [s], no larger than the largest sigma."""
     return math.copysign(time_sigma_s(str(abs(number(text)))), number(text))
+
+
+def magnitude(text: str) -> float:
+    """A magnitude, from -100 to 100."""
+    if not abs(number(text)) <= MAX_MAGNITUDE:
+        raise argparse.ArgumentTypeError(f"{text!r} is no magnitude from -{MAX_MAGNITUDE:g} to {MAX_MAGNITUDE:g}")
+    return number(text)
 
 
 def seconds(text: str) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -18,7 +17,9 @@ import pytest
 from batch_helpers import frames
 
 from startrack.cli.main import main
+from startrack.errors import BadInput
 from startrack.exposure import read_exposure
+from startrack.output.write import remove_companions, write_results
 
 ROOT = Path(__file__).parent.parent
 BAD_INPUT, NOT_ALL = 4, 5
@@ -104,27 +105,23 @@ def test_a_folder_in_place_of_a_table_is_named(tmp_path, capsys):
     assert "full" not in err and "space" not in err
 
 
-def test_a_full_disk_leaves_no_part_of_a_fix(tmp_path):
-    """A limit on file sizes, just below that of the largest file, stands for the full disk."""
-    for suffix in (".png", ".json"):
-        shutil.copy(ROOT / "sample_images" / f"near-centre{suffix}", tmp_path)
-    command = [sys.executable, "-m", "startrack", "locate", "near-centre.png", "--no-plots"]
-
-    def locate(out: str, largest_bytes: int) -> tuple[int, str, list[str]]:
-        done = subprocess.run(
-            [*command, "-D", out], cwd=tmp_path, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)},
-            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (largest_bytes, largest_bytes)),
-        )  # fmt: skip
-        return done.returncode, done.stdout + done.stderr, sorted(p.name for p in (tmp_path / out).iterdir())
-
-    code, text, files = locate("sound", resource.RLIM_INFINITY)
-    assert (code, "near-centre.fix.json" in files) == (0, True)
-    sizes = {path.name: path.stat().st_size for path in (tmp_path / "sound").iterdir()}
-    limit = max(sizes.values()) - 1  # the largest file does not fit, the others do
-    code, text, files = locate("full", limit)
-    assert (code, files) == (BAD_INPUT, [])
-    assert "cannot be written (File too large)" in text
-    assert len(text.splitlines()) == 1
+@pytest.mark.parametrize("largest_kb", [1, 100, 400])
+def test_a_full_disk_leaves_no_part_of_a_fix(located, tmp_path, largest_kb):
+    """A limit on file sizes stands for the full disk: of the record, of the star table, or of the picture alone."""
+    path = tmp_path / "small.fix.json"
+    write_results(located.result, path)
+    sizes = {one.name: one.stat().st_size for one in tmp_path.iterdir()}
+    assert min(sizes.values()) < 1024 * largest_kb < max(sizes.values())
+    remove_companions(path)
+    path.unlink()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1024 * largest_kb, limits[1]))
+    try:
+        with pytest.raises(BadInput, match=r"cannot be written \(File too large\)"):
+            write_results(located.result, path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_colour_jpeg_takes_a_bounded_memory(tmp_path):
@@ -147,7 +144,5 @@ def test_a_colour_jpeg_takes_a_bounded_memory(tmp_path):
 
 
 def test_devices_are_no_images(tmp_path):
-    from startrack.errors import BadInput
-
     with time_limit(20), pytest.raises(BadInput, match="bad_image|/dev/zero"):
         read_exposure("/dev/zero")

@@ -219,7 +219,8 @@ def test_files_that_opencv_writes_are_read(form, tmp_path):
 
 
 HUGE = [("opencv", "rows: 3", "rows: 200000000"), ("opencv", "rows: 3", 'rows: ["a", 1]'), ("ros", "480.1", "1e308"),
-        ("kalibr", "480.1", "9" * 400), ("colmap", "480.1", "x" * 5000), ("kalibr", "T_cam_imu:\n  - [", "T_cam_imu:\n  - [.nan, "),
+        ("kalibr", "480.1", "9" * 400), ("colmap", "480.1", "x" * 5000),
+        ("kalibr", "T_cam_imu:\n  - [", "T_cam_imu:\n  - [.nan, "),
         ("colmap", "1600", "-1"), ("kalibr", "cam0:", "cam0: " + "[" * 2000)]  # fmt: skip
 
 

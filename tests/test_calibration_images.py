@@ -208,8 +208,9 @@ def test_wrong_usage_is_refused(words, code, tmp_path, capsys):
 @pytest.mark.parametrize(
     "words",
     [
-        "--gain 1e308", "--gain 1e-300", "--gain nan", "--gain 0", "--read-noise 1e308", "--read-noise -1", "--bias 1e308",
-        "--bias inf", "--exposure 1e308", "--exposure 0", "--fov 1e308", "--fov nan", "--site 1e308,0", "--site nan,nan",
+        "--gain 1e308", "--gain 1e-300", "--gain nan", "--gain 0", "--read-noise 1e308", "--read-noise -1",
+        "--bias 1e308", "--bias inf", "--exposure 1e308", "--exposure 0", "--fov 1e308", "--fov nan", "--site 1e308,0",
+        "--site nan,nan",
         "--site 91,0", "--site 34", "--site 1,2,3,4", "--site 34,-111,1e308", "--site 34,x", "--name two\nlines",
         f"--name {'x' * 250}", f"-o {'x' * 250}.toml",
     ],
@@ -228,8 +229,8 @@ def test_values_of_flags_beyond_all_limits_are_wrong_usage(words, tmp_path, caps
 
 
 @pytest.mark.parametrize(
-    "words", ["--pattern 0x0", "--pattern -3x5", "--pattern 100000x100000", "--pattern 9", "--pattern 9x6 --marker 1e308",
-              "--pattern 9x6 --marker nan"],
+    "words", ["--pattern 0x0", "--pattern -3x5", "--pattern 100000x100000", "--pattern 9",
+              "--pattern 9x6 --marker 1e308", "--pattern 9x6 --marker nan"],
 )  # fmt: skip
 def test_impossible_boards_are_wrong_usage(words, tmp_path, capsys):
     flags = [f"{flag}={value}" for flag, value in zip(*[iter(words.split())] * 2, strict=True)]

@@ -142,7 +142,9 @@ def fit_throughput(stars: StarFluxes, edge_rad: float, flux_ratio: float = 1.0) 
 def _failures(stars: StarFluxes, terms: list[str], fit: _Fit) -> list[str]:
     """Reasons not to trust the fit: a bound, held-out stars, or images with different zero points."""
     failures = []
-    sensor = Sensor(zero_point_e_per_s=1.0, vignetting=_vignetting(fit.values["middle"], fit.values["edge"], fit.edge_rad))
+    sensor = Sensor(
+        zero_point_e_per_s=1.0, vignetting=_vignetting(fit.values["middle"], fit.values["edge"], fit.edge_rad)
+    )
     if {"middle", "edge"} & set(fit.at_bound) or sensor.lowest_throughput(fit.edge_rad) < MIN_THROUGHPUT_1:
         failures.append("the fitted vignetting is not physical")
     held_out = _held_out_mag(stars, terms, fit.edge_rad)

@@ -36,7 +36,6 @@ class Sensor:
         a2 = np.square(angle_rad)
         return np.maximum(1.0 + a2 * (self.vignetting[0] + a2 * self.vignetting[1]), 0.0)
 
-
     def lowest_throughput(self, angle_rad: float) -> float:
         """Smallest value of 1 + v1 a^2 + v2 a^4 from the axis to `angle_rad`; negative where the polynomial is."""
         v1, v2 = self.vignetting

@@ -213,8 +213,8 @@ def _sensor(values: dict[str, Any], calibrated_rad: float) -> Sensor:
     lowest = sensor.lowest_throughput(calibrated_rad)
     if lowest < MIN_THROUGHPUT_1:
         raise ValueError(
-            f"sensor.vignetting: within the calibrated angle of {np.degrees(calibrated_rad):.1f} degrees the throughput "
-            f"falls to {lowest:.2g} of that on the axis, below {MIN_THROUGHPUT_1:g}: no lens is that dark"
+            f"sensor.vignetting: within the calibrated angle of {np.degrees(calibrated_rad):.1f} degrees the "
+            f"throughput falls to {lowest:.2g} of that on the axis, below {MIN_THROUGHPUT_1:g}: no lens is that dark"
         )
     return sensor
 

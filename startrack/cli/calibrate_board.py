@@ -23,7 +23,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("images", nargs="+", metavar="IMAGE", help="pictures of the board")
     parser.add_argument("--pattern", metavar="CxR", help="inner corners of a chessboard; squares of a ChArUco board")
     parser.add_argument("--charuco", metavar="DICT", help="ChArUco with this dictionary, such as DICT_5X5_100")
-    parser.add_argument("--marker", type=marker_fraction, default=0.75, metavar="PART", help="marker's side over square's (0.75)")
+    parser.add_argument(
+        "--marker", type=marker_fraction, default=0.75, metavar="PART", help="marker's side over square's (0.75)"
+    )
     add_camera_output_flags(parser)
     parser.set_defaults(run=run, usage_error=parser.error, camera=None, time=None, exposure=None)
 

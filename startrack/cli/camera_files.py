@@ -88,12 +88,16 @@ def run_convert(args: argparse.Namespace) -> int:
         lost = decentring_rms_px(camera) if camera.decentring and args.to != "colmap" else 0.0
         note = f"; {args.to} has no decentring: {lost:.2f} px RMS are lost" if lost else ""
     else:
-        camera = from_text(read_text(args.file, "no_calibration"), args.source, Path(args.file).stem, args.calibrated_angle_rad)
+        camera = from_text(
+            read_text(args.file, "no_calibration"), args.source, Path(args.file).stem, args.calibrated_angle_rad
+        )
         text = camera_text(replace(camera, name=args.name or camera.name))
         default, note = f"{Path(args.file).stem}.toml", ""
         if args.calibrated_angle_rad is None:
             angle_deg = math.degrees(camera.calibrated_angle_rad)
-            warning = f"calibrated_angle_deg is set to {angle_deg:.1f}, the nearest edge of the frame: the file states none"
+            warning = (
+                f"calibrated_angle_deg is set to {angle_deg:.1f}, the nearest edge of the frame: the file states none"
+            )
             print(f"{args.file}: {warning}; give --calibrated-angle", file=sys.stderr)
     out = output_path(args, default)
     write_atomically(out, text.encode("utf-8"), overwrite=True)

@@ -94,7 +94,9 @@ def _run_process(kind: str, first: int, runs: int, seed: int, folder: Path, hang
     if hung:
         outcome.hangs.append(number)
     elif process.returncode:
-        outcome.crashes.append({"index": number, "cause": f"the process ended with {process.returncode}: {error}"[-800:]})
+        outcome.crashes.append(
+            {"index": number, "cause": f"the process ended with {process.returncode}: {error}"[-800:]}
+        )
     return number + 1 if hung or process.returncode else runs
 
 

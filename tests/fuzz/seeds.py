@@ -67,8 +67,7 @@ def seeds() -> dict[str, tuple[bytes, ...]]:
     cameras = _cameras()
     return {
         "png": tuple(_pngs()),
-        "jpeg": tuple(_pillow(FRAME // 8, "JPEG", **how) for how in ({}, {"progressive": True}))
-        + (_pillow(np.dstack(3 * [FRAME // 8]), "JPEG", comment=json.dumps(HEADER).encode()),),
+        "jpeg": tuple(_jpegs()),
         "tiff": tuple(_tiffs()),
         "fits": tuple(_fits()),
         "raw": (_dng(),),
@@ -87,6 +86,14 @@ def _pillow(pixels: Any, form: str, **options: Any) -> bytes:
     eight = form == "JPEG" or pixels.ndim == 3
     Image.fromarray(pixels.astype(np.uint8) if eight else pixels).save(file, form, **options)
     return file.getvalue()
+
+
+def _jpegs() -> list[bytes]:
+    grey, colour = FRAME // 8, np.dstack(3 * [FRAME // 8])
+    comment = json.dumps(HEADER).encode()
+    return [
+        _pillow(grey, "JPEG"), _pillow(grey, "JPEG", progressive=True), _pillow(colour, "JPEG", comment=comment),
+    ]  # fmt: skip
 
 
 def _pngs() -> list[bytes]:

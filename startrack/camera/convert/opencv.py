@@ -1,7 +1,8 @@
 """OpenCV FileStorage (YAML, or XML when reading), with the keys of OpenCV's own calibration program.
 
 Pixel (0, 0) is the centre of the first pixel, as here. fisheye_model = 1: cv2.fisheye's four coefficients, which are
-k1 to k4. OpenCV's own parser is not used: it crashes on damaged files. cv2.fisheye itself mirrors rays past 90 degrees: the numbers are right, that program's geometry there is not.
+k1 to k4. cv2.fisheye itself mirrors rays past 90 degrees: the numbers are right, that program's geometry there is not.
+OpenCV's own parser is not used: damaged files end its process.
 """
 
 from __future__ import annotations

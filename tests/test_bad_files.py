@@ -105,7 +105,7 @@ def test_a_folder_in_place_of_a_table_is_named(tmp_path, capsys):
     assert "full" not in err and "space" not in err
 
 
-@pytest.mark.parametrize("largest_kb", [1, 100, 400])
+@pytest.mark.parametrize("largest_kb", [4, 100, 900])
 def test_a_full_disk_leaves_no_part_of_a_fix(located, tmp_path, largest_kb):
     """A limit on file sizes stands for the full disk: of the record, of the star table, or of the picture alone."""
     path = tmp_path / "small.fix.json"
@@ -144,5 +144,5 @@ def test_a_colour_jpeg_takes_a_bounded_memory(tmp_path):
 
 
 def test_devices_are_no_images(tmp_path):
-    with time_limit(20), pytest.raises(BadInput, match="bad_image|/dev/zero"):
+    with time_limit(20), pytest.raises(BadInput, match="/dev/zero"):
         read_exposure("/dev/zero")

@@ -191,7 +191,8 @@ class Table(Key):
             meant = get_close_matches(unknown.lower(), self.keys, n=1, cutoff=SIMILAR)
             if meant or self.closed:
                 hint = f": is {meant[0]} meant?" if meant else f"; known: {', '.join(self.keys)}"
-                raise ValueError(f"{prefix}{unknown[:SHOWN_CHARS]} is an unknown key{hint}")
+                shown = unknown[:SHOWN_CHARS] if unknown.isprintable() else value_text(unknown)
+                raise ValueError(f"{prefix}{shown} is an unknown key{hint}")
         checked = {}
         for key, declared in self.keys.items():
             if key in value:

@@ -15,7 +15,8 @@ from uuid import uuid4
 from startrack.errors import BadInput
 
 PACKAGE = Path(__file__).resolve().parent
-MAX_TOML_BYTES = 2**20  # camera and terrain files have a few kilobytes
+MAX_TEXT_BYTES = 2**20  # camera and terrain files have a few kilobytes
+MAX_CAUSE_CHARS = 200  # of a library's message
 MAX_STEM_BYTES = 200  # file systems take names of 255, and a suffix follows
 FilePath = str | os.PathLike[str]
 
@@ -75,18 +76,27 @@ def resolve_named(name_or_path: str | Path, kind: str, reason: str) -> Path:
     return path
 
 
-def read_toml(path: Path, reason: str) -> dict[str, Any]:
-    """The keys of a TOML file. Raises BadInput `reason` with one line that names the file and the cause."""
+def read_text(path: FilePath, reason: str) -> str:
+    """The text of a user's file of at most 1 MiB, UTF-8. Raises BadInput `reason` with one line of cause."""
     try:
-        with path.open("rb") as file:
-            raw = file.read(MAX_TOML_BYTES + 1)
-        if len(raw) > MAX_TOML_BYTES:
+        if not os.path.isfile(path):  # a folder; a device or a pipe, which might never end
+            raise ValueError("no such file")
+        with open(path, "rb") as file:
+            raw = file.read(MAX_TEXT_BYTES + 1)
+        if len(raw) > MAX_TEXT_BYTES:
             raise ValueError("it has more than 1 MiB")
-        return tomllib.loads(raw.decode("utf-8"))
-    except OSError as cause:
-        raise BadInput(reason, f"{path}: cannot be read ({cause.strerror or cause})") from cause
-    except (ValueError, RecursionError) as cause:  # not UTF-8, not TOML, huge integers, deeply nested lists
-        raise BadInput(reason, " ".join(f"{path}: not a TOML file: {str(cause)[:200]}".split())) from cause
+        return raw.decode("utf-8")
+    except (OSError, ValueError) as cause:  # ValueError: not UTF-8 too
+        text = (cause.strerror if isinstance(cause, OSError) else None) or str(cause)
+        raise BadInput(reason, f"{printable(path)}: cannot be read ({text[:MAX_CAUSE_CHARS]})") from cause
+
+
+def parse_toml(text: str, reason: str) -> dict[str, Any]:
+    """The keys of a TOML text. Raises BadInput `reason` with one line of cause."""
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as cause:  # TOMLDecodeError, huge integers, deeply nested lists
+        raise BadInput(reason, " ".join(f"not a TOML file: {str(cause)[:MAX_CAUSE_CHARS]}".split())) from cause
 
 
 def existing_folder(folder: FilePath, content: str = "") -> Path:

@@ -188,3 +188,68 @@ def test_the_flag_names_the_camera_and_its_file_stays_in_the_folder(tmp_path, ca
         assert load_camera(str(tmp_path / "out.toml")).name == name
         assert main(["calibrate", "convert", str(tmp_path / "out.toml"), "--to", "ros", "-D", str(tmp_path / "d")]) == 0
         assert Path(capsys.readouterr().out.strip()).parent == tmp_path / "d"
+
+
+XML = """<?xml version="1.0"?><opencv_storage><image_width>1600</image_width><image_height>1200</image_height>
+<fisheye_model>1</fisheye_model><camera_matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>
+<data>480. 0. 801.25 0. 481. 597.75 0. 0. 1.</data></camera_matrix>
+<distortion_coefficients type_id="opencv-matrix"><rows>4</rows><cols>1</cols><dt>d</dt>
+<data>-0.01 2.5e-03 0. 0.</data></distortion_coefficients></opencv_storage>"""
+
+
+def test_an_opencv_file_in_xml_is_read():
+    camera = from_text(XML, "opencv", "x")
+    assert (camera.size_px, camera.focal_px, camera.centre_px) == ((1600, 1200), (480.0, 481.0), (801.25, 597.75))
+    assert camera.lens == KannalaBrandt((-0.01, 0.0025, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("form", ["YAML", "XML"])
+def test_files_that_opencv_writes_are_read(form, tmp_path):
+    path = str(tmp_path / f"camera.{form.lower()}")
+    store = cv2.FileStorage(path, cv2.FILE_STORAGE_WRITE)
+    store.write("image_width", 1600)
+    store.write("image_height", 1200)
+    store.write("fisheye_model", 1)
+    store.write("camera_matrix", np.array([[480.123456789, 0, 801.25], [0, 479.5, 597.75], [0, 0, 1]]))
+    store.write("distortion_coefficients", np.array([[-0.0141, 1e-5, 0.0, -4.1316e-4]]))
+    store.release()
+    camera = from_text(Path(path).read_text(), "opencv", "x")
+    assert camera.focal_px == (480.123456789, 479.5)
+    assert camera.lens == KannalaBrandt((-0.0141, 1e-5, 0.0, -4.1316e-4))
+
+
+HUGE = [("opencv", "rows: 3", "rows: 200000000"), ("opencv", "rows: 3", 'rows: ["a", 1]'), ("ros", "480.1", "1e308"),
+        ("kalibr", "480.1", "9" * 400), ("colmap", "480.1", "x" * 5000),
+        ("kalibr", "T_cam_imu:\n  - [", "T_cam_imu:\n  - [.nan, "),
+        ("colmap", "1600", "-1"), ("kalibr", "cam0:", "cam0: " + "[" * 2000)]  # fmt: skip
+
+
+@pytest.mark.parametrize(("program", "old", "new"), HUGE, ids=range(len(HUGE)))
+def test_impossible_numbers_are_refused_in_one_line(program, old, new):
+    text = to_text(FISHEYE, program)
+    assert old in text
+    with pytest.raises(BadInput, match="that can be used") as caught:
+        from_text(text.replace(old, new), program, "x")
+    assert caught.value.reason == "bad_calibration"
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_the_calibrated_angle_is_given_or_that_of_the_nearest_edge(program, tmp_path, capsys):
+    """No other format states it: it must not become that of the image circle, where no star was measured."""
+    source, made = tmp_path / "theirs.txt", tmp_path / "ours.toml"
+    source.write_text(to_text(FISHEYE, program))
+    words = ["calibrate", "convert", str(source), "--from", program, "-o", str(made)]
+    assert main(words) == 0
+    camera = load_camera(made)
+    edge = np.array([801.25, -0.5])  # the frame is 1600 x 1200 and its centre at 801, 598
+    assert camera.calibrated_angle_rad == pytest.approx(float(camera.angle_rad(edge)))
+    assert camera.calibrated_angle_rad < 0.7 * camera.max_angle_rad
+    assert "the file states none; give --calibrated-angle" in capsys.readouterr().err
+    assert main([*words, "--calibrated-angle", "50"]) == 0
+    assert load_camera(made).calibrated_angle_rad == pytest.approx(np.radians(50))
+    assert capsys.readouterr().err == ""
+    off_centre = replace(FISHEYE, centre_px=(-100.0, 600.0))
+    with pytest.raises(BadInput, match="--calibrated-angle"):
+        from_text(to_text(off_centre, program), program, "off")
+    assert from_text(to_text(off_centre, program), program, "off", 0.5).calibrated_angle_rad == 0.5

@@ -220,3 +220,38 @@ def test_wrong_usage_is_refused(words, code, tmp_path, capsys):
     else:
         assert main(["calibrate", str(image), *words, "-D", str(tmp_path)]) == code
         assert "--fov" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--gain 1e308", "--gain 1e-300", "--gain nan", "--gain 0", "--read-noise 1e308", "--read-noise -1",
+        "--bias 1e308", "--bias inf", "--exposure 1e308", "--exposure 0", "--fov 1e308", "--fov nan", "--site 1e308,0",
+        "--site nan,nan",
+        "--site 91,0", "--site 34", "--site 1,2,3,4", "--site 34,-111,1e308", "--site 34,x", "--name two\nlines",
+        f"--name {'x' * 250}", f"-o {'x' * 250}.toml",
+    ],
+    ids=lambda words: words[:24],
+)  # fmt: skip
+def test_values_of_flags_beyond_all_limits_are_wrong_usage(words, tmp_path, capsys):
+    """In one line that names the flag, before any image is read."""
+    flag, value = words.split(" ", 1)
+    with pytest.raises(SystemExit) as stopped:
+        main(["calibrate", str(tmp_path / "none.png"), f"{flag}={value}" if flag[1] == "-" else flag + value])
+    cause = capsys.readouterr().err.splitlines()[-1]
+    assert stopped.value.code == 2
+    assert cause.startswith("startrack calibrate: error: ")
+    assert flag.strip("-") in cause or "--output" in cause
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "words", ["--pattern 0x0", "--pattern -3x5", "--pattern 100000x100000", "--pattern 9",
+              "--pattern 9x6 --marker 1e308", "--pattern 9x6 --marker nan"],
+)  # fmt: skip
+def test_impossible_boards_are_wrong_usage(words, tmp_path, capsys):
+    flags = [f"{flag}={value}" for flag, value in zip(*[iter(words.split())] * 2, strict=True)]
+    with pytest.raises(SystemExit) as stopped:
+        main(["calibrate", "board", str(tmp_path / "none.png"), *flags])
+    assert stopped.value.code == 2
+    assert "--pattern" in capsys.readouterr().err

@@ -187,3 +187,16 @@ def test_vignetting_is_the_stated_polynomial_and_never_negative() -> None:
     sensor = Sensor(zero_point_e_per_s=1.0, vignetting=(-0.3, 0.02))
     assert sensor.throughput(np.array([0.0, 1.0])) == pytest.approx([1.0, 0.72])
     assert Sensor(zero_point_e_per_s=1.0, vignetting=(-1.0, 0.0)).throughput(np.array([1.5])) == [0.0]
+
+
+def test_a_lens_darker_than_any_is_refused() -> None:
+    """Vignetting that a calibration with airmass in it once gave: 0.014 at 80 degrees, negative from 82.6."""
+    dark = change_key("sensor.vignetting", [-0.70, 0.10])
+    for calibrated_deg in (80.0, 91.0):
+        with pytest.raises(BadInput, match=rf"sensor.vignetting.*{calibrated_deg:.1f} degrees") as caught:
+            camera_from_dict(dark | {"calibrated_angle_deg": calibrated_deg})
+        assert caught.value.reason == "bad_calibration"
+    assert camera_from_dict(dark | {"calibrated_angle_deg": 60.0}).sensor is not None
+    dip = Sensor(zero_point_e_per_s=1.0, vignetting=(-2.0, 1.0))  # 1 - 2 a^2 + a^4 is 0 at a = 1 and 1 at a = sqrt 2
+    assert dip.lowest_throughput(1.4) == pytest.approx(0.0, abs=1e-12)
+    assert dip.lowest_throughput(0.5) == pytest.approx(dip.throughput(np.array(0.5)))

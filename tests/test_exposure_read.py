@@ -129,6 +129,17 @@ def test_colour_becomes_the_plain_mean_in_full_depth(read, planes):
     assert exposure.warnings == ("colour image: the plain mean of its three channels is used",)
 
 
+@pytest.mark.parametrize("kind", ["PNG", "JPEG"])
+def test_a_pixel_with_a_clipped_channel_is_saturated(read, kind):
+    """A bright red star: its red channel ends at 255, the mean of its channels at 215."""
+    rgb = np.full((64, 64, 3), 40, np.uint8)
+    rgb[16:40, 16:40] = 255, 220, 170
+    exposure = read(encode_image(rgb, kind, **({"quality": 95, "subsampling": 0} if kind == "JPEG" else {})))
+    assert exposure.saturation_adu == 255
+    assert (exposure.pixels_adu[20:36, 20:36] == 255).mean() > (0.99 if kind == "PNG" else 0.5)
+    assert abs(float(np.median(exposure.pixels_adu[48:, 48:])) - 40) <= 1
+
+
 def test_equal_channels_give_the_channel_exactly(read):
     exposure = read(cv2.imencode(".png", np.stack([FRAME16] * 3, axis=-1))[1].tobytes())
     np.testing.assert_array_equal(exposure.pixels_adu, FRAME16)

@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import stat
-import tomllib
 from collections.abc import Iterable
 from functools import lru_cache
 from importlib.util import find_spec
@@ -15,8 +14,9 @@ from typing import Any
 
 from startrack import __version__
 from startrack.catalog.gaia import has_deep_catalog
+from startrack.errors import BadInput
 from startrack.exposure.metadata import RAW_SUFFIXES, sidecar_of
-from startrack.files import is_path, relative_path
+from startrack.files import is_path, parse_toml, read_text, relative_path
 
 MISSING = "?"  # in place of the hash of a file that cannot be read; once it can, the hash differs
 FILES = ("camera", "terrain", "mask")  # facts that may be paths
@@ -72,8 +72,8 @@ def is_older_than(image: str | os.PathLike[str], result: str | os.PathLike[str])
 def _named_files(file: Path) -> list[Path]:
     """The height maps that a terrain file names, or the mask that a camera file names."""
     try:
-        values = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):  # missing or unreadable: refused when it is loaded
+        values = parse_toml(read_text(file, "bad_terrain"), "bad_terrain")
+    except BadInput:  # refused when it is loaded
         return []
     dem = values.get("dem")
     names = dem.get("file") if isinstance(dem, dict) else values.get("mask")

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.calibration.region_growing import JointFit
+from startrack.camera import Sensor
+from startrack.camera.camera import MIN_THROUGHPUT_1
 from startrack.types import Array, Ints
 
 MIN_STARS = 30
@@ -21,7 +23,7 @@ PHOTOMETRY_MAG = 0.05  # error of a star's magnitude beyond catalogue and noise
 LARGEST_TERM_SIGMA_MAG = 0.03  # per airmass, or per B-V: a term with a larger sigma is left out
 TYPICAL_B_V = 0.6
 LOWEST_ELEVATION_RAD = np.radians(8.0)
-THROUGHPUT_1 = (0.05, 1.1)  # relative to the axis, up to the calibrated angle: a lens is darker at its edge
+THROUGHPUT_1 = (MIN_THROUGHPUT_1, 1.1)  # relative to the axis, up to the calibrated angle: a lens is darker at its edge
 EXTINCTION_MAG = (0.0, 1.5)  # per airmass; 0.1 to 0.5 in clear air
 COLOUR_MAG = (-1.0, 1.0)  # per B-V
 AT_BOUND_1 = 1e-3  # of the range of a term
@@ -140,7 +142,10 @@ def fit_throughput(stars: StarFluxes, edge_rad: float, flux_ratio: float = 1.0) 
 def _failures(stars: StarFluxes, terms: list[str], fit: _Fit) -> list[str]:
     """Reasons not to trust the fit: a bound, held-out stars, or images with different zero points."""
     failures = []
-    if {"middle", "edge"} & set(fit.at_bound):
+    sensor = Sensor(
+        zero_point_e_per_s=1.0, vignetting=_vignetting(fit.values["middle"], fit.values["edge"], fit.edge_rad)
+    )
+    if {"middle", "edge"} & set(fit.at_bound) or sensor.lowest_throughput(fit.edge_rad) < MIN_THROUGHPUT_1:
         failures.append("the fitted vignetting is not physical")
     held_out = _held_out_mag(stars, terms, fit.edge_rad)
     scatter = NORMAL_BY_MAD * float(np.median(np.abs(held_out)))

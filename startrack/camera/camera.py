@@ -15,6 +15,8 @@ from startrack.types import Array, Bools, Mask
 # Body x (forward) = image top = -cam y, body y (left) = +cam x, body z (up) = +cam z: it looks at the zenith.
 ZENITH_MOUNT_R_BODY_CAM = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
+MIN_THROUGHPUT_1 = 0.05  # relative to the axis, up to the calibrated angle: no light for evidence below it (3.3 mag)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
@@ -33,6 +35,14 @@ class Sensor:
         """Relative throughput max(1 + v1 a^2 + v2 a^4, 0) at the angles a = `angle_rad` off the axis, any shape."""
         a2 = np.square(angle_rad)
         return np.maximum(1.0 + a2 * (self.vignetting[0] + a2 * self.vignetting[1]), 0.0)
+
+    def lowest_throughput(self, angle_rad: float) -> float:
+        """Smallest value of 1 + v1 a^2 + v2 a^4 from the axis to `angle_rad`; negative where the polynomial is."""
+        v1, v2 = self.vignetting
+        ends = [0.0, angle_rad**2]
+        if v2 and 0 < -v1 / (2 * v2) < ends[1]:  # a^2 at the polynomial's extremum
+            ends.append(-v1 / (2 * v2))
+        return min(1.0 + a2 * (v1 + a2 * v2) for a2 in ends)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from startrack.camera.camera import ZENITH_MOUNT_R_BODY_CAM, Camera, Sensor
+from startrack.camera.camera import MIN_THROUGHPUT_1, ZENITH_MOUNT_R_BODY_CAM, Camera, Sensor
 from startrack.camera.decentring import Decentring
 from startrack.camera.lens import Lens
 from startrack.camera.lenses import default_lens, lens_kinds
 from startrack.declaration import Choice, Flag, List, Number, Table, Text
-from startrack.files import read_toml, relative_path, resolve_named, write_atomically
+from startrack.files import parse_toml, printable, read_text, relative_path, resolve_named, write_atomically
 from startrack.frames import R_from_quat_xyzw, quat_xyzw_from_R
 from startrack.types import MAX_PIXELS, Array, BadInput, Mask
 
@@ -115,11 +115,11 @@ def load_camera(name_or_path: str | Path) -> Camera:
     Raises BadInput: no_calibration if there is no such file, bad_calibration if it cannot be used.
     """
     path = resolve_named(name_or_path, "calib", "no_calibration")
-    values = read_toml(path, "bad_calibration")
+    text = read_text(path, "bad_calibration")
     try:
-        return camera_from_dict(values, default_name=path.stem, folder=path.parent)
+        return camera_from_dict(parse_toml(text, "bad_calibration"), default_name=path.stem, folder=path.parent)
     except BadInput as cause:
-        raise BadInput(cause.reason, f"{path}: {cause}") from cause
+        raise BadInput(cause.reason, f"{printable(path)}: {cause}") from cause
 
 
 def save_camera(camera: Camera, path: str | Path) -> None:
@@ -191,7 +191,7 @@ def _camera(values: dict[str, Any], default_name: str, folder: Path) -> Camera:
     lens = lens_kinds()[values["model"]].from_file(values)
     max_angle, calibrated = _angles_rad(values, lens)
     order, covariance = _covariance(values.get("covariance"), lens)
-    sensor = values.get("sensor")
+    sensor = None if "sensor" not in values else _sensor(values["sensor"], calibrated)
     return Camera(
         name=values.get("name", default_name),
         size_px=values["size_px"],
@@ -203,7 +203,7 @@ def _camera(values: dict[str, Any], default_name: str, folder: Path) -> Camera:
         mirrored=values["mirrored"],
         decentring=Decentring(*values.get("decentring", ())),
         R_body_cam=_mount(values.get("mount", {})),
-        sensor=None if sensor is None else Sensor(**sensor),
+        sensor=sensor,
         covariance_order=order,
         covariance=covariance,
         mask=str(folder / values["mask"]) if "mask" in values else None,
@@ -218,6 +218,18 @@ def _angles_rad(values: dict[str, Any], lens: Lens) -> tuple[float, float]:
         raise ValueError(f"max_angle_deg: the radius of this lens only rises to {limit:.2f} degrees")
     calibrated = np.radians(values.get("calibrated_angle_deg", values["max_angle_deg"]))
     return float(max_angle), float(min(calibrated, max_angle))
+
+
+def _sensor(values: dict[str, Any], calibrated_rad: float) -> Sensor:
+    """The sensor. Raises ValueError for a lens that lets hardly any light through within the calibrated angle."""
+    sensor = Sensor(**values)
+    lowest = sensor.lowest_throughput(calibrated_rad)
+    if lowest < MIN_THROUGHPUT_1:
+        raise ValueError(
+            f"sensor.vignetting: within the calibrated angle of {np.degrees(calibrated_rad):.1f} degrees the "
+            f"throughput falls to {lowest:.2g} of that on the axis, below {MIN_THROUGHPUT_1:g}: no lens is that dark"
+        )
+    return sensor
 
 
 def _mount(values: dict[str, Any]) -> Array:

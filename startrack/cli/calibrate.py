@@ -12,15 +12,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import DEFAULT_OUT, add_mask_flag, read
-from startrack.cli.flag_types import amount, field_of_view_rad, number, positive_number
+from startrack.cli.flag_types import amount, field_of_view_rad, number, positive_number, seconds
 from startrack.cli.progress import progress
 from startrack.compilation import announce_compilation
 from startrack.errors import NoSolution, exit_code_of
 from startrack.files import make_folder
 
 if TYPE_CHECKING:
-    from startrack.calibration import Calibration
+    from startrack.calibration import Calibration, KnownSensor
     from startrack.camera import Camera
+    from startrack.declaration import Key
     from startrack.frames import Site
     from startrack.types import Bools, Exposure
 
@@ -63,7 +64,7 @@ def add_parser(subparsers: Any) -> None:
 def add_site_flags(parser: argparse.ArgumentParser) -> None:
     """Flags for the time, the duration and the site of exposures of the sky."""
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601 (one image only)")
-    parser.add_argument("--exposure", type=positive_number, metavar="S", help="exposure time in seconds")
+    parser.add_argument("--exposure", type=seconds, metavar="S", help="exposure time in seconds")
     add_mask_flag(parser)
     parser.add_argument("--site", metavar="LAT,LON[,M]", help="site on the Earth, in degrees and metres, to correct "
                         "for refraction (--site=-30.2,...)")  # fmt: skip
@@ -88,13 +89,16 @@ def add_print_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate; the exit code."""
-    from startrack.calibration import KnownSensor, calibrate
+    from startrack.calibration import calibrate
     from startrack.calibration.record import refusal_dict
     from startrack.catalog import load_catalog
     from startrack.output import write_json
 
     if args.time is not None and len(args.images) > 1:
         args.usage_error("--time is the time of one image; give each of several its own in a sidecar NAME.json")
+    check_name(args)
+    known_sensor = _known_sensor(args)
+    flag_site(args)  # wrong usage is reported before the images are read
     out = output_path(args, "camera.toml")
     exposures = [read(path, args) for path in args.images]
     announce_compilation()
@@ -107,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
                 camera=start,
                 fov_rad=args.fov,
                 site=site_of(args, exposures),
-                known_sensor=KnownSensor(gain_e_per_adu=args.gain, read_noise_e=args.read_noise, bias_adu=args.bias),
+                known_sensor=known_sensor,
                 name=args.name or out.stem,
                 progress=show_step,
             )
@@ -116,6 +120,38 @@ def run(args: argparse.Namespace) -> int:
             write_json(out.with_suffix(".calibration.json"), record)
             return print_outcome(args, record, f"{out.name}  refused {cause.reason}: {cause}")
     return _write_calibration(args, out, found)
+
+
+def check_name(args: argparse.Namespace) -> None:
+    """A usage error for a name, of --name or of the file, that a camera file cannot hold."""
+    from startrack.camera.io import camera_keys
+
+    for flag, name in (("--name", args.name), ("the stem of --output", args.output and Path(args.output).stem)):
+        if name is not None:
+            checked_flag(args, camera_keys().keys["name"], name, flag)
+
+
+def _known_sensor(args: argparse.Namespace) -> KnownSensor:
+    """The sensor's properties given by flags, within the limits of camera files; else a usage error."""
+    from startrack.calibration import KnownSensor
+    from startrack.camera.io import SENSOR
+
+    flags = {"gain_e_per_adu": "--gain", "read_noise_e": "--read-noise", "bias_adu": "--bias"}
+    given = (args.gain, args.read_noise, args.bias)
+    known = {
+        key: checked_flag(args, SENSOR.keys[key], value, flag)
+        for (key, flag), value in zip(flags.items(), given, strict=True)
+        if value is not None
+    }
+    return KnownSensor(**known)
+
+
+def checked_flag(args: argparse.Namespace, key: Key, value: Any, flag: str) -> Any:
+    """The value of a `flag` as the `key` of a file would have it; else a usage error."""
+    try:
+        return key.check(value, flag)
+    except ValueError as cause:
+        args.usage_error(str(cause))
 
 
 def _write_calibration(args: argparse.Namespace, out: Path, found: Calibration) -> int:
@@ -184,19 +220,30 @@ def approximate_camera(args: argparse.Namespace, exposures: list[Exposure]) -> C
     return load_camera(named) if named else None
 
 
+def flag_site(args: argparse.Namespace) -> Site | None:
+    """The site of --site; None without it. A usage error for a place that is not on the Earth."""
+    from startrack.frames import Site
+    from startrack.terrain.io import KEYS
+
+    if not args.site:
+        return None
+    try:
+        words = [float(word) for word in args.site.split(",")]
+        names = ("latitude_deg", "longitude_deg", "height_m")[: max(len(words), 2)]
+        keys = dict(zip(names, words, strict=True))
+    except ValueError:
+        args.usage_error(f"--site {args.site}: latitude, longitude and, if known, height: 34.74,-111.42,2361")
+    site = checked_flag(args, KEYS.keys["origin"], keys, "--site")
+    return Site("earth", math.radians(site["latitude_deg"]), math.radians(site["longitude_deg"]), site["height_m"])
+
+
 def site_of(args: argparse.Namespace, exposures: list[Exposure]) -> Site | None:
     """The site of --site, else of the terrain that a flag or the images name; None if there is none."""
-    from startrack.frames import Site
     from startrack.terrain import load_terrain
 
-    if args.site:
-        try:
-            latitude, longitude, *height = (float(word) for word in args.site.split(","))
-        except ValueError:
-            args.usage_error(f"--site {args.site}: latitude, longitude and, if known, height: 34.74,-111.42,2361")
-        return Site("earth", math.radians(latitude), math.radians(longitude), height[0] if height else 0.0)
+    given = flag_site(args)
     named = next((e.terrain for e in exposures if e.terrain), None)
-    return load_terrain(named).site if named else None
+    return given if given is not None or named is None else load_terrain(named).site
 
 
 @contextmanager

@@ -5,9 +5,12 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from startrack.cli.calibrate import add_camera_output_flags, output_path, print_outcome, show_steps
+from startrack.cli.calibrate import add_camera_output_flags, check_name, output_path, print_outcome, show_steps
 from startrack.cli.common import read
+from startrack.cli.flag_types import number
 from startrack.errors import NoSolution
+
+MIN_SIDE, MAX_SIDE = 3, 100
 
 
 def add_parser(subparsers: Any) -> None:
@@ -20,7 +23,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("images", nargs="+", metavar="IMAGE", help="pictures of the board")
     parser.add_argument("--pattern", metavar="CxR", help="inner corners of a chessboard; squares of a ChArUco board")
     parser.add_argument("--charuco", metavar="DICT", help="ChArUco with this dictionary, such as DICT_5X5_100")
-    parser.add_argument("--marker", type=float, default=0.75, metavar="PART", help="marker's side over square's (0.75)")
+    parser.add_argument(
+        "--marker", type=marker_fraction, default=0.75, metavar="PART", help="marker's side over square's (0.75)"
+    )
     add_camera_output_flags(parser)
     parser.set_defaults(run=run, usage_error=parser.error, camera=None, time=None, exposure=None)
 
@@ -37,6 +42,9 @@ def run(args: argparse.Namespace) -> int:
         columns, rows = (int(n) for n in (args.pattern or "").lower().split("x"))
     except ValueError:
         args.usage_error("--pattern CxR is needed: inner corners of a chessboard, squares of a ChArUco board")
+    if min(columns, rows) < MIN_SIDE or max(columns, rows) > MAX_SIDE:
+        args.usage_error(f"--pattern {args.pattern}: a board has {MIN_SIDE} to {MAX_SIDE} corners or squares a side")
+    check_name(args)
     out = output_path(args, "camera.toml")
     exposures = [read(path, args) for path in args.images]
     with show_steps(args, len(exposures) + 1) as show_step:
@@ -52,3 +60,10 @@ def run(args: argparse.Namespace) -> int:
     write_json(out.with_suffix(".calibration.json"), record)
     line = board_line(found, out.name) + (f"\n  {record['message']}" if record["message"] else "")
     return print_outcome(args, record, line)
+
+
+def marker_fraction(text: str) -> float:
+    """A part of the square's side, above 0 and below 1."""
+    if not 0 < number(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1")
+    return number(text)

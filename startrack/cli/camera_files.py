@@ -4,12 +4,23 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from startrack.cli.calibrate import add_print_flags, add_site_flags, output_path, print_outcome, show_steps, site_of
+from startrack.cli.calibrate import (
+    add_print_flags,
+    add_site_flags,
+    check_name,
+    output_path,
+    print_outcome,
+    show_steps,
+    site_of,
+)
 from startrack.cli.common import DEFAULT_OUT, read
+from startrack.cli.flag_types import calibrated_angle_rad
 from startrack.errors import BadInput, NoSolution
 
 FORMATS = ("ros", "kalibr", "colmap", "opencv")
@@ -31,6 +42,11 @@ def add_parsers(subparsers: Any) -> None:
     direction = convert.add_mutually_exclusive_group(required=True)
     direction.add_argument("--to", choices=FORMATS, help="write this format")
     direction.add_argument("--from", dest="source", choices=FORMATS, help="read this format")
+    convert.add_argument(
+        "--calibrated-angle", dest="calibrated_angle_rad", type=calibrated_angle_rad, metavar="DEG",
+        help="with --from: angle off the axis up to which the lens was calibrated, which no such file states "
+        "(default: that of the frame's nearest edge)",
+    )  # fmt: skip
     convert.add_argument("-o", "--output", metavar="FILE", help="what to write (default: a file in OUT)")
     convert.add_argument("--name", help="name of the camera (default: the one in the file, else its stem)")
     convert.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the results (%(default)s)")
@@ -62,8 +78,9 @@ def run_convert(args: argparse.Namespace) -> int:
     from startrack.camera.convert import from_text, to_text
     from startrack.camera.convert.intrinsics import decentring_rms_px
     from startrack.camera.io import camera_text
-    from startrack.files import file_stem, write_atomically
+    from startrack.files import file_stem, read_text, write_atomically
 
+    check_name(args)
     if args.to is not None:
         camera = load_camera(args.file)
         text = to_text(camera, args.to)
@@ -71,9 +88,17 @@ def run_convert(args: argparse.Namespace) -> int:
         lost = decentring_rms_px(camera) if camera.decentring and args.to != "colmap" else 0.0
         note = f"; {args.to} has no decentring: {lost:.2f} px RMS are lost" if lost else ""
     else:
-        camera = from_text(_text(args.file), args.source, Path(args.file).stem)
+        camera = from_text(
+            read_text(args.file, "no_calibration"), args.source, Path(args.file).stem, args.calibrated_angle_rad
+        )
         text = camera_text(replace(camera, name=args.name or camera.name))
         default, note = f"{Path(args.file).stem}.toml", ""
+        if args.calibrated_angle_rad is None:
+            angle_deg = math.degrees(camera.calibrated_angle_rad)
+            warning = (
+                f"calibrated_angle_deg is set to {angle_deg:.1f}, the nearest edge of the frame: the file states none"
+            )
+            print(f"{args.file}: {warning}; give --calibrated-angle", file=sys.stderr)
     out = output_path(args, default)
     write_atomically(out, text.encode("utf-8"), overwrite=True)
     if not args.quiet:
@@ -103,10 +128,3 @@ def run_verify(args: argparse.Namespace) -> int:
                 continue
         worst = max(worst, print_outcome(args, verify_dict(found), verify_line(found)))
     return worst
-
-
-def _text(path: str) -> str:
-    try:
-        return Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as cause:
-        raise BadInput("no_calibration", f"{path}: {cause}") from cause

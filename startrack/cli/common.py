@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.flag_types import positive_number, time_sigma_s
+from startrack.cli.flag_types import seconds, time_sigma_s
 from startrack.errors import INTERNAL_ERROR, BadInput, exit_code_of
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def add_fact_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-c", "--camera", metavar="FILE", help="camera file, or the name of a shipped one")
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601")
     add_time_sigma_flag(parser)
-    parser.add_argument("--exposure", type=positive_number, metavar="S", help="exposure time in seconds")
+    parser.add_argument("--exposure", type=seconds, metavar="S", help="exposure time in seconds")
     add_mask_flag(parser)
 
 

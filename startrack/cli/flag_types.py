@@ -5,15 +5,21 @@ from __future__ import annotations
 import argparse
 import math
 
+from startrack.declaration import LARGEST, SHOWN_CHARS
+
+MAX_EXPOSURE_S = 1e6  # as startrack.exposure.metadata has it; written here so that help is quick
+MAX_COUNT = 1_000_000
+MAX_MAGNITUDE = 100.0
+
 
 def number(text: str) -> float:
-    """Any finite number."""
+    """A number whose size is at most that in our files."""
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number")
+    if not abs(value) <= LARGEST:  # NaN fails too
+        raise argparse.ArgumentTypeError(f"{text[:SHOWN_CHARS]!r} is not a number from -{LARGEST:g} to {LARGEST:g}")
     return value
 
 
@@ -46,6 +52,20 @@ def clock_offset_s(text: str) -> float:
     return math.copysign(time_sigma_s(str(abs(number(text)))), number(text))
 
 
+def magnitude(text: str) -> float:
+    """A magnitude, from -100 to 100."""
+    if not abs(number(text)) <= MAX_MAGNITUDE:
+        raise argparse.ArgumentTypeError(f"{text!r} is no magnitude from -{MAX_MAGNITUDE:g} to {MAX_MAGNITUDE:g}")
+    return number(text)
+
+
+def seconds(text: str) -> float:
+    """An exposure time [s]."""
+    if not 0 < number(text) <= MAX_EXPOSURE_S:
+        raise argparse.ArgumentTypeError(f"{text!r} is not above 0 and up to {MAX_EXPOSURE_S:g} seconds")
+    return number(text)
+
+
 def count(text: str) -> int:
     """A whole number from 0 up."""
     try:
@@ -55,6 +75,13 @@ def count(text: str) -> int:
     if value < 0:
         raise argparse.ArgumentTypeError(f"{text!r} is negative")
     return value
+
+
+def limited_count(text: str) -> int:
+    """A whole number from 0 to a million."""
+    if count(text) > MAX_COUNT:
+        raise argparse.ArgumentTypeError(f"{text[:SHOWN_CHARS]} is more than {MAX_COUNT}")
+    return count(text)
 
 
 def positive_count(text: str) -> int:
@@ -68,4 +95,11 @@ def field_of_view_rad(text: str, narrowest_deg: float = 0.5, widest_deg: float =
     """An angle given in degrees [rad]."""
     if not narrowest_deg <= number(text) <= widest_deg:
         raise argparse.ArgumentTypeError(f"{text} is not between {narrowest_deg:g} and {widest_deg:g} degrees")
+    return math.radians(number(text))
+
+
+def calibrated_angle_rad(text: str) -> float:
+    """An angle off the axis, above 0 and up to 180, given in degrees [rad]."""
+    if not 0 < number(text) <= 180:
+        raise argparse.ArgumentTypeError(f"{text} is not above 0 and up to 180 degrees")
     return math.radians(number(text))

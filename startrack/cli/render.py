@@ -11,7 +11,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import add_time_sigma_flag
-from startrack.cli.flag_types import amount, clock_offset_s, count, number, positive_count, positive_number
+from startrack.cli.flag_types import (
+    amount,
+    clock_offset_s,
+    count,
+    limited_count,
+    magnitude,
+    number,
+    positive_count,
+    seconds,
+)
 from startrack.cli.progress import progress
 from startrack.errors import BadInput
 
@@ -76,17 +85,17 @@ def _add_light(group: Any) -> None:
     help_faint = "no stars fainter than this; down to it, stars that Hipparcos lacks are drawn at random (FIELD n) (10)"
     help_stars = "whose stars the sky has (auto: Gaia's where the extra `deep` is installed)"
     help_scatter = "of each star's flux, beyond the catalogue's own errors (0.03); 0 turns both off"
-    group.add_argument("--exposure", type=positive_number, metavar="S", help=help_exposure)
-    group.add_argument("--sky-mag", type=number, default=22.0, metavar="V", help="diffuse sky per arcsec^2 (22.0)")
+    group.add_argument("--exposure", type=seconds, metavar="S", help=help_exposure)
+    group.add_argument("--sky-mag", type=magnitude, default=22.0, metavar="V", help="diffuse sky per arcsec^2 (22.0)")
     group.add_argument("--sky-gradient", type=number, default=0.0, metavar="F", help="its slope to the horizon (0)")
     group.add_argument("--sky-gradient-azimuth", type=number, default=0.0, metavar="DEG", help="where it rises to (0)")
     group.add_argument("--wall-reflectance", type=amount, default=0.04, metavar="F", help="of the sky's light (0.04)")
     group.add_argument("--stars", choices=STAR_LISTS, default="auto", help=help_stars)
-    group.add_argument("--faint-stars", type=number, default=10.0, metavar="V", help=help_faint)
+    group.add_argument("--faint-stars", type=magnitude, default=10.0, metavar="V", help=help_faint)
     group.add_argument("--no-faint-stars", action="store_true", help="the catalogue's stars alone")
     group.add_argument("--flux-scatter", type=amount, default=0.03, metavar="MAG", help=help_scatter)
-    group.add_argument("--hot-pixels", type=count, default=200, metavar="N", help="of the sensor (200)")
-    group.add_argument("--cosmic-rays", type=count, default=5, metavar="N", help="tracks per exposure (5)")
+    group.add_argument("--hot-pixels", type=limited_count, default=200, metavar="N", help="of the sensor (200)")
+    group.add_argument("--cosmic-rays", type=limited_count, default=5, metavar="N", help="tracks per exposure (5)")
 
 
 def _add_output(group: Any) -> None:
@@ -94,7 +103,7 @@ def _add_output(group: Any) -> None:
     where.add_argument("-o", "--output", metavar="FILE", help="one image: .png, .tif or .fits")
     where.add_argument("-D", "--dir", default="startrack-out", metavar="OUT", help="folder (default %(default)s)")
     group.add_argument("--format", choices=SUFFIXES, default="png", help="of images in the folder (png)")
-    group.add_argument("--truth-mag", type=number, default=8.5, metavar="V", help="faintest star in the table (8.5)")
+    group.add_argument("--truth-mag", type=magnitude, default=8.5, metavar="V", help="faintest star in the table (8.5)")
     group.add_argument("-O", "--overwrite", action="store_true", help="replace existing files")
     group.add_argument("--json", action="store_true", help="one JSON object per image on stdout")
     group.add_argument("--no-plots", action="store_true", help="accepted everywhere; render draws no plots")

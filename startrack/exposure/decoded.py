@@ -50,7 +50,8 @@ def check_size(width_px: int, height_px: int) -> None:
 def grey_float32(stored: NDArray[Any]) -> tuple[NDArray[np.float32], tuple[str, ...]]:
     """Pixels (H, W) as float32 [ADU], and warnings, from (H, W) or (H, W, 3) of any integer or real type.
 
-    8 and 16 bits stay exact. Colour becomes the mean of its channels, not rounded. Fractions from 0 to 1 are kept, with
+    8 and 16 bits stay exact. Colour becomes the mean of its channels, not rounded, and the largest value of the type
+    where one of them is clipped there: such a pixel is saturated. Fractions from 0 to 1 are kept, with
     a warning, because their scale is not known. Raises BadInput bad_image for a pixel that is not finite.
     """
     warnings: list[str] = []
@@ -61,6 +62,9 @@ def grey_float32(stored: NDArray[Any]) -> tuple[NDArray[np.float32], tuple[str, 
             for channel in (1, 2):  # sums of 16-bit values are exact in float32
                 pixels += stored[..., channel]
             pixels /= np.float32(3)
+            top = largest_value(stored.dtype)
+            for channel in () if top is None else range(3):
+                pixels[stored[..., channel] == top] = top
         else:
             pixels = np.ascontiguousarray(stored, dtype=np.float32)
     if stored.dtype.kind == "f":

@@ -7,6 +7,10 @@ colours of the pixels need not be known, only that the pattern repeats every 2 p
 
 from __future__ import annotations
 
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from io import BytesIO
 
@@ -16,6 +20,7 @@ from numpy.typing import NDArray
 from startrack.exposure.decoded import Decoded, bad_image, check_size
 from startrack.types import Array
 
+STDERR = 2  # its file descriptor
 Picture = NDArray[np.float32]
 
 MOSAIC_WARNING = "colour mosaic: its four kinds of pixels are brought to one level and one gain"
@@ -38,7 +43,7 @@ def decode_camera_raw(raw: bytes) -> Decoded:
         raise bad_image("is a camera raw file, which needs rawpy: pip install '.[raw]' in a clone of startrack")
     import rawpy
 
-    with rawpy.imread(BytesIO(raw)) as file:
+    with _without_stderr(), rawpy.imread(BytesIO(raw)) as file:
         check_size(file.sizes.width, file.sizes.height)
         if file.raw_type is not rawpy.RawType.Flat:
             raise bad_image("holds colours in layers; startrack reads mosaics")
@@ -48,6 +53,20 @@ def decode_camera_raw(raw: bytes) -> Decoded:
         pixels = file.raw_image_visible.astype(np.float32)
         white = float(file.white_level)
     return Decoded(pixels_adu=pixels, saturation_adu=white, mosaic=pattern is not None)
+
+
+@contextmanager
+def _without_stderr() -> Iterator[None]:
+    """Discard what LibRaw, which has no switch for it, prints about a damaged file: the exception has the cause."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(STDERR), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, STDERR)
+        yield
+    finally:
+        os.dup2(kept, STDERR)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def equalize_mosaic(pixels_adu: Picture, saturation_adu: float | None) -> Picture:

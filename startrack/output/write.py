@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,14 +53,19 @@ def prepare_folder(path: Path, sha256: str, *, overwrite: bool, remedy: str) -> 
     """
     make_folder(path.parent)
     try:
+        if path.exists() and not path.is_file():  # a folder; a pipe, which would block
+            raise BadInput("bad_image", f"{path}: cannot be replaced: it is no file; {remedy}")
         before = json.loads(path.read_text(encoding="utf-8")) if path.exists() and not overwrite else None
     except OSError as cause:
         raise BadInput("bad_image", f"{path}: cannot be read, nor replaced: {cause.strerror}") from cause
-    except ValueError:  # no JSON: not ours
+    except (ValueError, RecursionError):  # no JSON: not ours
         before = {}
     if before is not None and not _is_of(before, sha256):
         raise BadInput("bad_image", f"{path} is not a result of this image: {remedy}")
-    remove_companions(path)
+    try:
+        remove_companions(path)
+    except OSError as cause:
+        raise BadInput("bad_image", f"{cause.filename}: cannot be replaced: {cause.strerror}; {remedy}") from cause
 
 
 def _is_of(record: Any, sha256: str) -> bool:
@@ -77,12 +83,26 @@ def write_results(outcome: Outcome, path: Path, *, plots: bool = True, write_rec
     """The record of an `outcome`, written to `path` (such as NAME.fix.json) after tables, WCS and pictures.
 
     `plots` and `write_record`: whether the pictures and the record are written. Raises BadInput where a file cannot
-    be written.
+    be written; none of them is then left.
     """
     from startrack.output.record import record_of
+
+    record = record_of(outcome, _stem_and_kind(path)[1])
+    try:
+        _write_companions(outcome, path, plots=plots)
+        if write_record:
+            write_json(path, record)
+    except BaseException:
+        with suppress(OSError):  # must not hide the cause
+            remove_companions(path)
+        raise
+    return record
+
+
+def _write_companions(outcome: Outcome, path: Path, *, plots: bool) -> None:
     from startrack.stages import Located, Measured, Oriented, last_value
 
-    record, value = record_of(outcome, _stem_and_kind(path)[1]), last_value(outcome)
+    value = last_value(outcome)
     if isinstance(value, Measured) or (isinstance(value, Oriented) and value.terrain is None):
         write_star_table(companion(path, ".stars.ecsv"), value)
         write_wcs(companion(path, ".wcs"), companion(path, ".corr"), value)
@@ -92,9 +112,6 @@ def write_results(outcome: Outcome, path: Path, *, plots: bool = True, write_rec
             write_panorama(companion(path, SKYLINE_PICTURE), value, value.skyline)
     if plots:
         write_annotated(companion(path, ANNOTATED), outcome)
-    if write_record:
-        write_json(path, record)
-    return record
 
 
 def write_json(path: FilePath, record: dict[str, Any]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from startrack.declaration import Choice, Either, List, Number, Table, Text
-from startrack.files import resolve_named
+from startrack.files import parse_toml, printable, read_text, resolve_named
 from startrack.frames import Site
 from startrack.terrain.cylinder import CAMERA_HEIGHT, CYLINDER_KEYS, LENGTH, MAX_LENGTH_M, Cylinder
 from startrack.terrain.protocol import Terrain
@@ -73,30 +72,23 @@ def load_terrain(name_or_path: str | Path) -> Terrain:
 
     Raises BadInput bad_terrain with the file and the cause.
     """
-    try:
-        path = resolve_named(name_or_path, "terrain", "bad_terrain")
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as cause:
-        raise BadInput("bad_terrain", f"{name_or_path}: not a TOML file that can be read: {cause}") from cause
+    path = resolve_named(name_or_path, "terrain", "bad_terrain")
+    text = read_text(path, "bad_terrain")
     try:
         return _load_cached(path.absolute(), text, _map_stamps(path.parent, read_keys(text)))
     except BadInput as cause:
-        raise BadInput("bad_terrain", f"{path}: {cause}") from cause
+        raise BadInput("bad_terrain", f"{printable(path)}: {cause}") from cause
 
 
 def read_keys(text: str) -> dict[str, Any]:
     """The checked keys of a terrain file's text. Raises BadInput bad_terrain."""
-    try:
-        values = tomllib.loads(text)
-    except (ValueError, RecursionError) as cause:  # TOMLDecodeError, huge integers, deep nesting
-        raise BadInput("bad_terrain", f"not a TOML file: {cause}") from cause
-    return KEYS.read(values, "bad_terrain")
+    return KEYS.read(parse_toml(text, "bad_terrain"), "bad_terrain")
 
 
 @lru_cache(maxsize=2)
 def _load_cached(path: Path, text: str, stamps: tuple[Any, ...]) -> Terrain:
     """Read once for many images: maps, packed ground and tables take some 0.3 GB and half a second."""
-    return terrain_from_dict(tomllib.loads(text), default_name=path.stem, folder=path.parent)
+    return terrain_from_dict(parse_toml(text, "bad_terrain"), default_name=path.stem, folder=path.parent)
 
 
 def _map_files(keys: dict[str, Any], folder: Path) -> list[Path]:

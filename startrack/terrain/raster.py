@@ -55,7 +55,7 @@ class Projection:
         return R_enu_fixed(Site("moon", self.latitude_rad, self.longitude_rad))
 
     def xy_from_latlon(self, latitude_rad: ArrayLike, longitude_rad: ArrayLike) -> tuple[Array, Array]:
-        """Map coordinates x, y (...) [m] of places."""
+        """Map coordinates x, y (...) [m] of places; not finite where the projection does not reach."""
         lat, lon = np.asarray(latitude_rad, dtype=float), np.asarray(longitude_rad, dtype=float)
         fixed = np.stack(np.broadcast_arrays(np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)), -1)
         v = fixed @ self.R_projection_fixed.T
@@ -64,8 +64,9 @@ class Projection:
             x = size * np.arctan2(v[..., 1], v[..., 0])
             y = self.radius_m * self.scale_y * np.arctan2(v[..., 2], np.hypot(v[..., 0], v[..., 1]))
         else:
-            k = 2 * size / (1 + v[..., 2]) if self.kind == STEREOGRAPHIC else size
-            x, y = k * v[..., 0], k * v[..., 1]
+            with np.errstate(divide="ignore", invalid="ignore"):  # not finite at the antipode
+                k = 2 * size / (1 + v[..., 2]) if self.kind == STEREOGRAPHIC else size
+                x, y = k * v[..., 0], k * v[..., 1]
         return x + self.false_x_m, y + self.false_y_m
 
     def latlon_from_xy(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[Array, Array]:

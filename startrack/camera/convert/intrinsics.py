@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from startrack.camera import Camera, Decentring, KannalaBrandt, Lens, Pinhole
+from startrack.camera import Camera, Decentring
+from startrack.camera.io import camera_from_dict
 from startrack.camera.uncertainty import cap_grid
 from startrack.types import BadInput
 
 FISHEYE_COEFFICIENTS = 4
+SMALL_ANGLE_DEG = 1e-3  # of an image circle within any lens
 
 
 @dataclass(frozen=True)
@@ -75,20 +78,15 @@ def decentring_rms_px(camera: Camera) -> float:
 def camera_from_intrinsics(numbers: Intrinsics, name: str, decentring: Decentring | None = None) -> Camera:
     """A camera whose image circle ends at the frame's farthest corner, or where the radius stops rising.
 
-    Raises BadInput bad_calibration for numbers that are not finite and positive.
+    Raises BadInput bad_calibration for numbers beyond the limits of our own camera files.
     """
-    if min(*numbers.focal_px, *numbers.size_px) <= 0 or not np.isfinite([*numbers.matrix, *(numbers.k or ())]).all():
-        raise BadInput("bad_calibration", "image size and focal lengths must be positive, and all numbers finite")
-    lens: Lens = Pinhole() if numbers.k is None else KannalaBrandt(numbers.k if any(numbers.k) else ())
-    camera = Camera(
-        name=name,
-        size_px=numbers.size_px,
-        focal_px=numbers.focal_px,
-        centre_px=numbers.centre_px,
-        max_angle_rad=lens.max_invertible_rad,
-        calibrated_angle_rad=lens.max_invertible_rad,
-        lens=lens,
-        decentring=decentring or Decentring(),
+    keys: dict[str, Any] = {"name": name, "model": "pinhole" if numbers.k is None else "kannala_brandt"}
+    keys |= {"size_px": numbers.size_px, "focal_px": numbers.focal_px, "centre_px": numbers.centre_px}
+    keys |= {"k": numbers.k} if numbers.k and any(numbers.k) else {}
+    keys |= {"decentring": (decentring.p1, decentring.p2)} if decentring else {}
+    camera = camera_from_dict({**keys, "max_angle_deg": SMALL_ANGLE_DEG})  # the limits are checked here
+    camera = replace(
+        camera, max_angle_rad=camera.lens.max_invertible_rad, calibrated_angle_rad=camera.lens.max_invertible_rad
     )
     width, height = numbers.size_px
     corners = np.array([[-0.5, -0.5], [width - 0.5, -0.5], [-0.5, height - 0.5], [width - 0.5, height - 0.5]])
@@ -96,11 +94,29 @@ def camera_from_intrinsics(numbers: Intrinsics, name: str, decentring: Decentrin
     return replace(camera, max_angle_rad=edge, calibrated_angle_rad=edge)
 
 
+def nearest_edge_rad(camera: Camera) -> float:
+    """The angle off the axis [rad] of the point of the frame's edge that is nearest to the centre.
+
+    Raises BadInput bad_calibration if the centre is outside the frame.
+    """
+    (cx, cy), (width, height) = camera.centre_px, camera.size_px
+    if not (-0.5 < cx < width - 0.5 and -0.5 < cy < height - 0.5):
+        raise BadInput(
+            "bad_calibration",
+            "the centre is outside the frame: give the angle up to which the lens is calibrated, --calibrated-angle",
+        )
+    edges = np.array([[-0.5, cy], [width - 0.5, cy], [cx, -0.5], [cx, height - 0.5]])
+    return float(np.min(camera.angle_rad(edges)))
+
+
 def read_numbers(values: Any, count: int, key: str) -> list[float]:
-    """`count` numbers. Raises ValueError naming the key."""
+    """`count` finite numbers. Raises ValueError naming the key."""
     if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
         raise ValueError(f"{key} must be {count} numbers")
-    return [float(v) for v in values]
+    numbers = [float(v) for v in values]
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{key} must be {count} finite numbers")
+    return numbers
 
 
 def read_distortion(

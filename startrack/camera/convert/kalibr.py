@@ -20,6 +20,8 @@ from startrack.camera.convert.intrinsics import (
     read_yaml,
     yaml_list,
 )
+from startrack.frames import quat_xyzw_from_R
+from startrack.frames.rotations import ORTHONORMAL_1
 
 
 def to_text(camera: Camera) -> str:
@@ -51,6 +53,7 @@ def from_text(text: str, name: str) -> Camera:
     if "T_cam_imu" not in d:
         return camera
     R_cam_body = np.array([read_numbers(row, 4, "T_cam_imu")[:3] for row in d["T_cam_imu"][:3]])
-    if R_cam_body.shape != (3, 3) or np.abs(R_cam_body @ R_cam_body.T - np.eye(3)).max() > 1e-6:
+    if R_cam_body.shape != (3, 3) or np.abs(R_cam_body).max() > 1 + ORTHONORMAL_1:
         raise ValueError("T_cam_imu holds no rotation")
+    quat_xyzw_from_R(R_cam_body)  # ValueError for what is no proper rotation
     return replace(camera, R_body_cam=R_cam_body.T)

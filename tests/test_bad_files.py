@@ -1,0 +1,148 @@
+"""Files in unusual places: pipes, folders and deep nesting where results are expected, and full disks."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from batch_helpers import frames
+
+from startrack.cli.main import main
+from startrack.errors import BadInput
+from startrack.exposure import read_exposure
+from startrack.output.write import remove_companions, write_results
+
+ROOT = Path(__file__).parent.parent
+BAD_INPUT, NOT_ALL = 4, 5
+DEEP = "[" * 100_000
+
+
+@contextmanager
+def time_limit(seconds: int) -> Iterator[None]:
+    """An exception where the block hangs."""
+
+    def end(*_: object) -> None:
+        raise TimeoutError
+
+    before = signal.signal(signal.SIGALRM, end)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def put(path: Path, kind: str) -> None:
+    """Something that is no result at the path of one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "full folder":
+        path.mkdir()
+        (path / "file").write_text("")
+    else:
+        path.write_text(DEEP)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "deep JSON"])
+@pytest.mark.parametrize("overwrite", [[], ["-O"]])
+def test_what_is_no_result_is_not_replaced_and_does_not_hang(tmp_path, capsys, kind, overwrite):
+    (image,) = frames(tmp_path, 1)
+    record = tmp_path / "out" / "00.detections.json"
+    put(record, kind)
+    with time_limit(60):
+        code = main(["detect", str(image), "-D", str(tmp_path / "out"), "--no-plots", *overwrite])
+    out = capsys.readouterr().out
+    if overwrite and kind == "deep JSON":
+        assert (code, json.loads(record.read_text())["reason"]) == (3, "no_stars")
+    else:
+        assert (code, len(out.splitlines())) == (BAD_INPUT, 1)
+        assert "00.detections.json" in out
+
+
+def test_a_folder_in_place_of_a_companion_is_named(tmp_path, capsys):
+    (image,) = frames(tmp_path, 1)
+    put(tmp_path / "out" / "00.annotated.png", "folder")
+    assert main(["detect", str(image), "-D", str(tmp_path / "out")]) == BAD_INPUT
+    (line,) = capsys.readouterr().out.splitlines()
+    assert "bad_image" in line and "00.annotated.png: cannot be replaced" in line
+
+
+@pytest.mark.parametrize("name", ["00.fix.json", "manifest.json"])
+@pytest.mark.parametrize("kind", ["pipe", "full folder", "deep JSON"])
+def test_a_batch_does_not_hang_or_fail_on_what_is_no_result(tmp_path, capsys, kind, name):
+    frames(tmp_path / "images", 2)
+    out = tmp_path / "out"
+    put(out / name, kind)
+    with time_limit(120):
+        code = main(["batch", str(tmp_path / "images"), "-D", str(out), "-j", "1", "-v"])
+    err = "".join(capsys.readouterr())
+    assert code in (BAD_INPUT, NOT_ALL)
+    assert "internal error" not in err and "Traceback" not in err
+    if kind == "full folder":
+        assert name in err and "No space left" not in err
+    assert json.loads((out / "01.fix.json").read_text())["reason"] == "no_stars"
+
+
+def test_a_folder_in_place_of_a_table_is_named(tmp_path, capsys):
+    frames(tmp_path / "images", 1)
+    put(tmp_path / "out" / "results.ecsv", "full folder")
+    assert main(["batch", str(tmp_path / "images"), "-D", str(tmp_path / "out"), "-j", "1"]) in (BAD_INPUT, NOT_ALL)
+    err = capsys.readouterr().err
+    assert "results.ecsv" in err
+    assert "full" not in err and "space" not in err
+
+
+@pytest.mark.parametrize("largest_kb", [4, 100, 900])
+def test_a_full_disk_leaves_no_part_of_a_fix(located, tmp_path, largest_kb):
+    """A limit on file sizes stands for the full disk: of the record, of the star table, or of the picture alone."""
+    path = tmp_path / "small.fix.json"
+    write_results(located.result, path)
+    sizes = {one.name: one.stat().st_size for one in tmp_path.iterdir()}
+    assert min(sizes.values()) < 1024 * largest_kb < max(sizes.values())
+    remove_companions(path)
+    path.unlink()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1024 * largest_kb, limits[1]))
+    try:
+        with pytest.raises(BadInput, match=r"cannot be written \(File too large\)"):
+            write_results(located.result, path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_colour_jpeg_takes_a_bounded_memory(tmp_path):
+    """At the peak 3 bytes a pixel as stored, 4 decoded by Pillow, 4 as floating point: 2.2 GB for 200 Mpx."""
+    import cv2
+
+    side = 6000
+    path = tmp_path / "large.jpg"
+    path.write_bytes(cv2.imencode(".jpg", np.full((side, side, 3), 40, np.uint8))[1].tobytes())
+    code = (
+        "import resource, sys; import numpy, PIL.JpegImagePlugin; from startrack.exposure import read_exposure; "
+        "used = lambda: 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; before = used(); "
+        "read_exposure(sys.argv[1]); print(used() - before)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert float(done.stdout) / side**2 < 11.0
+
+
+def test_devices_are_no_images(tmp_path):
+    with time_limit(20), pytest.raises(BadInput, match="/dev/zero"):
+        read_exposure("/dev/zero")

@@ -95,7 +95,7 @@ def test_a_solution_has_the_clock_with_units(located):
     solution = Solution(with_clock(located, CLOCK))
     clock = solution.clock
     assert (clock.offset.to_value(u.ms), clock.sigma.to_value(u.s)) == (pytest.approx(-12345.6), 0.25)
-    assert repr(clock) == "Clock\n  clock  -12.346 s ± 0.250 s"
+    assert repr(clock) == "ClockOffset\n  clock  -12.346 s ± 0.250 s"
     assert "-12.346 s ± 0.250 s" in clock._repr_html_() and "-12.346 s" in solution._repr_html_()
     assert "\n  clock          -12.346 s ± 0.250 s" in repr(solution.position)
     without = Solution(with_clock(located, None))

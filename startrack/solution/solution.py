@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 from startrack.output import prepare_folder, record_of, summary_line, write_results
 from startrack.output.values import boresight_rad
-from startrack.solution.values import Clock, Orientation, Position, clock_of, html_table, orientation_of, position_of
+from startrack.solution.values import (
+    ClockOffset,
+    Orientation,
+    Position,
+    clock_of,
+    html_table,
+    orientation_of,
+    position_of,
+)
 from startrack.stages import Located, Oriented, Outcome, last_value
 
 if TYPE_CHECKING:
@@ -59,7 +67,7 @@ class Solution:
         return orientation_of(last_value(self.result))
 
     @cached_property
-    def clock(self) -> Clock | None:
+    def clock(self) -> ClockOffset | None:
         """Offset (true minus stated time) and its sigma, with units; None where it is not estimated."""
         return clock_of(last_value(self.result))
 

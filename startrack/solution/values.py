@@ -115,7 +115,7 @@ class Orientation(Shown):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Clock(Shown):
+class ClockOffset(Shown):
     """Error of the stated time, as the image shows it."""
 
     offset: Quantity  # [s] true minus stated time
@@ -123,14 +123,14 @@ class Clock(Shown):
     shown: Rows  # name and text of each quantity of the table
 
 
-def clock_of(result: Inputs) -> Clock | None:
+def clock_of(result: Inputs) -> ClockOffset | None:
     """Error of the clock of a result with a fix; None where it is not estimated."""
     if not isinstance(result, Located) or result.fix.clock is None:
         return None
     from astropy import units as u
 
     clock = result.fix.clock
-    return Clock(clock.offset_s * u.s, clock.sigma_s * u.s, rows("notebook", at_stage(result), ("clock",)))
+    return ClockOffset(clock.offset_s * u.s, clock.sigma_s * u.s, rows("notebook", at_stage(result), ("clock",)))
 
 
 def position_of(result: Inputs) -> Position | None:

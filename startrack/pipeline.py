@@ -6,9 +6,13 @@ import time as clock
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from startrack.camera import Camera
 from startrack.frames import Site
-from startrack.localization import check_consistency, clock_matters, localizer_name
+from startrack.localization import Integrity, check_consistency, clock_matters, localizer_name
+from startrack.localization.integrity import assess_integrity
+from startrack.localization.nuisance import lower_evidence
 from startrack.measurement import at_time_of_fix, measure_evidence, remeasure_near_skyline, sky_step_at
 from startrack.orientation import (
     NO_TIME,
@@ -75,6 +79,8 @@ def locate(
             run.time_stage("locate", check_consistency, located.evidence(), located.fix_at_time, terrain)
         if settings.evidence_sources != "stars":
             located = run.time_stage("locate", refine_by_sky_light, located, settings.evidence_sources == "both")
+        if located.integrity is None and located.fix.search != "approximate" and not located.fix.ambiguous:
+            located = replace(located, integrity=run.time_stage("locate", _integrity_by_stars, located))
         sky_mag = None if step is None else step.brightness_mag_arcsec2(camera, exposure.exposure_s)
         skyline = run.time_stage("locate", measured_skyline, located)
         return run.finish(replace(located, sky_brightness_mag_arcsec2=sky_mag, skyline=skyline))
@@ -91,6 +97,14 @@ def _locate_by_stars(run: Run, measured: Measured, settings: Settings) -> Locate
         exact = replace(measured.evidence(), clock=None)
         fix_at_time = run.time_stage("locate", settings.localizer, exact, terrain)
     return extend(measured, Located, fix=fix, fix_at_time=fix_at_time)
+
+
+def _integrity_by_stars(located: Located) -> Integrity:
+    """The integrity of a fix by the stars alone. Raises NotLocated where their directions contradict each other."""
+    fix = located.fix_at_time
+    ground = located.terrain.reshaped(np.array(fix.shape)) if any(fix.shape) else located.terrain
+    rows = lower_evidence(located.evidence(), fix.horizon_error_rad)
+    return assess_integrity(rows, fix.position_enu_m[:2], fix.covariance_m2, located.fix, ground)
 
 
 def _sky_step(run: Run, located: Located) -> SkyStep | None:

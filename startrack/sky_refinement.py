@@ -17,6 +17,7 @@ from startrack.localization import ExactPosterior
 from startrack.localization.clock import WrongTime, clock_matters
 from startrack.localization.clock_posterior import spread_on_arc
 from startrack.localization.explored import Explored
+from startrack.localization.integrity import assess_integrity
 from startrack.localization.refinement import horizon_slopes, refine_fix
 from startrack.localization.skyline_fit import SkylineFit, fit_skyline
 from startrack.sky_errors import shared_errors
@@ -107,10 +108,11 @@ def _refine(located: Located, stars: bool) -> Located:
     moved = refined.position_enu_m[:2] - located.fix.position_enu_m[:2]
     if moved @ np.linalg.solve(located.fix.covariance_m2 + refined.covariance_m2, moved) > MOST_STARS_CHI2:
         raise NoSkyLight("the stars contradict it")
+    integrity = assess_integrity(rows, position, fit.step_covariance, refined, terrain)
     refined = replace(refined, clock=refined.clock or _clock_error(there.clock, fit))
     if not stars:
         refined = replace(refined, search="beam", dropped_probability=1.0)
-    return replace(there, fix=refined, sky_light=sky, skyline_fit=fit, by_stars=stars)
+    return replace(there, fix=refined, sky_light=sky, skyline_fit=fit, integrity=integrity, by_stars=stars)
 
 
 def _over_arc(located: Located) -> Callable[[Explored], Explored]:

@@ -23,7 +23,7 @@ from startrack.errors import Reason
 from startrack.evidence import SkyLight, StarEvidence, StarPhotometry
 from startrack.frames import R_from_rotvec, Site
 from startrack.identification import Identifier
-from startrack.localization import ExactPosterior, Localizer, SkylineFit, require_localizer
+from startrack.localization import ExactPosterior, Integrity, Localizer, SkylineFit, require_localizer
 from startrack.terrain import Terrain
 from startrack.types import (
     Array,
@@ -173,6 +173,7 @@ class Located(Measured):
     fix_at_time: Fix  # by the stars, the time of `R_enu_icrs` taken as exact; `fix` where the clock does not matter
     sky_light: SkyLight | None = None  # of the image at the skyline; None: not used for the fix
     skyline_fit: SkylineFit | None = None  # of the skyline that the sky's light shows, to that of the fix
+    integrity: Integrity | None = None  # None: not assessed, of a fix without a single posterior
     by_stars: bool = True  # whether the stars' rows are in the posterior too
     sky_unused: str = ""  # why the sky's light is not used
     skyline: MeasuredSkyline | None = None  # that the image shows; None: not one position, or not right to its error

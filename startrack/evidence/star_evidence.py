@@ -62,7 +62,7 @@ class StarPhotometry:
         return replace(self, cause_code=code, causes=self.causes + texts, llr=np.where(code == USABLE, self.llr, 0.0))
 
     def turned(self, R: Array) -> StarPhotometry:
-        """The same under a sky turned by a rotation (3, 3) in enu."""
+        """The same under a sky turned by a rotation `R` (3, 3) in enu."""
         azimuth, elevation = azel_from_rays(rays_from_azel(self.azimuth_rad, self.elevation_rad) @ R.T)
         return replace(self, azimuth_rad=azimuth, elevation_rad=elevation)
 

@@ -5,6 +5,7 @@ from typing import Any, Protocol
 from startrack.localization.clock import clock_matters
 from startrack.localization.consistency import check_consistency
 from startrack.localization.convex_hull import Hull
+from startrack.localization.integrity import Integrity
 from startrack.localization.posterior import ExactPosterior
 from startrack.localization.pseudo_gradient import PseudoGradient
 from startrack.localization.skyline_fit import SkylineFit
@@ -54,6 +55,6 @@ def require_localizer(given: Any) -> Localizer:
 
 
 __all__ = [
-    "LOCALIZERS", "ExactPosterior", "Hull", "Localizer", "PseudoGradient", "SkylineFit", "check_consistency",
+    "LOCALIZERS", "ExactPosterior", "Hull", "Integrity", "Localizer", "PseudoGradient", "SkylineFit", "check_consistency",
     "clock_matters", "localizer_name", "require_localizer",
 ]  # fmt: skip

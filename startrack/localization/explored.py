@@ -18,6 +18,7 @@ class Explored(NamedTuple):
     log_dropped: float  # logarithm of a bound of the mass [m2] that was dropped
     search: str  # "proven" or "beam"
     horizon_bias_rad: float = 0.0  # how much higher than the terrain's the horizon was taken
+    shape: tuple[float, float] = (0.0, 0.0)  # of the terrain, mean
     clock: ClockError | None = None
 
 

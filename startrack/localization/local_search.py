@@ -39,6 +39,7 @@ class LocalLikelihood:
     sigma_rad: Array  # (n,) of the edge, with the terrain's
     sector: Ints
     settled: Array  # (sectors,) sums of the visible settled rows, less the ceilings
+    ceiling: Array  # (sectors,)
     log_floor: float
     stars: Ints | slice  # which of the open rows are points of light
     profiles: SkyProfiles | None  # of the rows of extended light
@@ -64,6 +65,7 @@ class LocalLikelihood:
             sigma_rad=np.hypot(e.edge_sigma_rad, map_sigma),
             sector=sums.sector[rows],
             settled=sums.sums(first, last)[0][0] - sectors.ceiling,
+            ceiling=sectors.ceiling,
             log_floor=sectors.log_floor,
             stars=np.flatnonzero(~is_extended) if len(extended) else slice(None),
             profiles=SkyProfiles.from_rows(e, extended, map_sigma) if len(extended) else None,
@@ -91,6 +93,19 @@ class LocalLikelihood:
             else:
                 step /= 2
         return position, best
+
+    def sums_by_sector(self, points_m: Array) -> Array:
+        """Sums of the rows' contributions (n, sectors), without ceilings, at positions (n, 2)."""
+        which = self.stars
+        e = self.evidence if isinstance(which, slice) else self.evidence.take(which)
+        sigma, sector = self.sigma_rad[which], self.sector[which]
+        settled = self._settled_at(np.ascontiguousarray(points_m), None) + self.ceiling
+        horizon = self.ground.horizon_rad(points_m[:, None], e.azimuth_rad)
+        found = np.empty((len(points_m), settled.shape[1]))
+        for k in range(len(points_m)):
+            value = contributions(e.llr, e.extended_nats, e.elevation_rad, horizon[k], sigma)
+            found[k] = settled[k % len(settled)] + np.bincount(sector, weights=value, minlength=settled.shape[1])
+        return found
 
     def with_terrain(self, terrain: Terrain) -> LocalLikelihood:
         """The same rows on another terrain, whose horizon differs by no more than the leeway."""

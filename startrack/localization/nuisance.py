@@ -126,7 +126,8 @@ def marginalize_shape(explore: Explore, evidence: Evidence, terrain: Terrain) ->
     search = "beam" if any(p.search == "beam" for p in parts) else "proven"
     density = np.concatenate(logs) - np.log(4 * half**2)
     bias = float(share @ [p.horizon_bias_rad for p in parts])
-    mixed = Explored(np.concatenate([p.centres_m for p in parts]), half, density, dropped, search, bias)
+    centres, shape = np.concatenate([p.centres_m for p in parts]), (float(mean[0]), float(mean[1]))
+    mixed = Explored(centres, half, density, dropped, search, bias, shape)
     return mixed, ShapeFit(mean, np.einsum("n,ni,nj->ij", share, nodes - mean, nodes - mean))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from startrack import __version__
 from startrack.frames import format_utc, quat_xyzw_from_R
+from startrack.localization.integrity import RISK
 from startrack.output.quantity import Column, Listed, Quantity, Show, show_everywhere
 from startrack.output.schema_parts import (
     CHANCE,
@@ -30,9 +31,11 @@ from startrack.output.values import (
     R_body_enu,
     ambiguous_modes,
     arcsec_text,
+    azimuths_text,
     body_deg,
     body_sigmas_deg,
     boresight_deg,
+    carrying_azimuths,
     caution_text,
     chance_text,
     ellipse,
@@ -42,6 +45,7 @@ from startrack.output.values import (
     latlon_deg,
     modes_text,
     predicted_visible,
+    protection_level_m,
     sigma_m,
 )  # fmt: skip
 from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented
@@ -95,6 +99,20 @@ QUANTITIES: tuple[Quantity, ...] = (
       columns=(Column("radius999_m", "%.4f"),),
       shown=(Show("text", "error", ", {:.1f} m (99.9 %)"), Show("notebook", "99.9 % within", "{:.1f} m"),
              Show("page", "99.9 % within", "{:,.1f} m"))),
+    Q("position.protection_level_m", "m", Located, protection_level_m,
+      "circle about the position beyond which it is with `protection_risk` at most, also where one of eight groups of "
+      "directions shows something that is on no map; null: one group alone holds the position in some direction, or a "
+      "method without a posterior", POSITIVE, nullable=True, columns=(Column("protection_level_m", "%.4f"),),
+      shown=(Show("text", "protection", "{:.1f} m"), Show("notebook", "protection level", "{:.1f} m"),
+             Show("page", "Protection level", "{:,.1f} m"))),
+    Q("position.protection_risk", "", Located, lambda v: None if v.integrity is None else RISK,
+      "probability of an error beyond `protection_level_m`", CHANCE, nullable=True, optional=True,
+      shown=(Show("text", "protection", " (risk {:g})"),)),
+    Q("position.carried_by", "deg", Located, carrying_azimuths,
+      "list of [first, last] azimuths: the fewest of eight groups of directions that hold half of the information",
+      {"type": "array", "items": numbers(2)}, nullable=True, optional=True,
+      shown=(Show("text", "protection", lambda a: "; carried by azimuths " + azimuths_text(a)),
+             Show("page", "Carried by azimuths", azimuths_text))),
     Q("position.latitude_deg", "deg", Located, latlon_deg(0), "of the same point", LATITUDE,
       columns=(Column("latitude_deg", "%.8f"),),
       shown=(Show("text", "position", "; latitude {:.6f}°"), Show("panel", "Lat, lon", "{:.5f}°"),

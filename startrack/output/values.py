@@ -49,6 +49,24 @@ def boresight_rad(R_cam_icrs: Array) -> tuple[float, float, float]:
     return positive_turn(float(ra)), float(dec), positive_turn(float(roll))
 
 
+def protection_level_m(value: Located) -> float | None:
+    """The protection level of a `value`; None where it is not bounded or not assessed."""
+    return None if value.integrity is None else finite_or_none(value.integrity.protection_level_m)
+
+
+def carrying_azimuths(value: Located) -> list[list[float]] | None:
+    """First and last azimuth [deg] of the groups of directions that carry the fix of a `value`, the strongest first."""
+    if value.integrity is None:
+        return None
+    first, width = np.degrees(value.integrity.first_azimuth_rad), 360.0 / len(value.integrity.part)
+    return [[float(first[g]), float(first[g] + width)] for g in value.integrity.carriers()]
+
+
+def azimuths_text(ranges: list[list[float]]) -> str:
+    """Ranges of azimuths [deg] in words."""
+    return ", ".join(f"{first:.0f}-{last:.0f}°" for first, last in ranges)
+
+
 def R_body_enu(value: Measured) -> Array:
     """Rotation (3, 3) from enu to the rover's body, of a measured `value`."""
     return np.asarray(value.camera.R_body_cam @ value.R_cam_enu)

@@ -55,6 +55,6 @@ def require_localizer(given: Any) -> Localizer:
 
 
 __all__ = [
-    "LOCALIZERS", "ExactPosterior", "Hull", "Integrity", "Localizer", "PseudoGradient", "SkylineFit", "check_consistency",
-    "clock_matters", "localizer_name", "require_localizer",
+    "LOCALIZERS", "ExactPosterior", "Hull", "Integrity", "Localizer", "PseudoGradient", "SkylineFit",
+    "check_consistency", "clock_matters", "localizer_name", "require_localizer",
 ]  # fmt: skip

@@ -30,6 +30,8 @@ from startrack.output.values import (
     R_body_enu,
     ambiguous_modes,
     arcsec_text,
+    blocked_deg,
+    blocked_text,
     body_deg,
     body_sigmas_deg,
     boresight_deg,
@@ -42,6 +44,7 @@ from startrack.output.values import (
     latlon_deg,
     modes_text,
     predicted_visible,
+    ranges_text,
     sigma_m,
 )  # fmt: skip
 from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented
@@ -219,6 +222,13 @@ QUANTITIES: tuple[Quantity, ...] = (
       shown=(Show("text", "stars", lambda p: f"; false alarm {chance_text(p)}"),
              Show("panel", "Residual", lambda p: f"   false alarm {chance_text(p)}"),
              Show("page", "Chance match", chance_text))),
+    Q("evidence.blocked", "deg", Measured, blocked_deg,
+      "list of [from, to]: azimuths in which something on no map hides stars above the skyline, and where no evidence "
+      "is taken; across north `to` is the smaller", {"type": "array", "items": numbers(2)}, optional=True,
+      shown=(Show("text", "evidence", blocked_text), Show("page", "Blocked azimuths", ranges_text))),
+    Q("evidence.damage", "", Inputs, lambda v: None if v.damage is None else v.damage.cause,
+      "what processing did to the pixels, where the evidence is measured on the frame itself; null: nothing shows",
+      TEXT, nullable=True, optional=True),
     Q("sky.brightness_mag_arcsec2", "mag/arcsec^2", Located, lambda v: v.sky_brightness_mag_arcsec2,
       "V of the sky beyond that of the ground at the skyline, by the camera's zero point and the exposure's duration; "
       "null where the image shows no step of light there, or one of the two is not known",

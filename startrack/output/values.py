@@ -159,3 +159,18 @@ def arcsec_text(sigma: list[float]) -> str:
 def exact_lens_text(included: bool) -> str:
     """Text for a sigma of the attitude that lacks the lens, because the camera has no covariance."""
     return "" if included else ", the lens taken as exact"
+
+
+def blocked_deg(measured: Measured) -> list[list[float]]:
+    """Ranges [from, to] of azimuth [deg] that are left out because something on no map blocks them."""
+    return [] if measured.blocked is None else np.degrees(measured.blocked.ranges_rad).tolist()
+
+
+def ranges_text(ranges: list[list[float]]) -> str:
+    """Ranges of azimuth [deg] in words; empty where there are none."""
+    return ", ".join(f"{start:.0f}° to {end:.0f}°" for start, end in ranges)
+
+
+def blocked_text(ranges: list[list[float]]) -> str:
+    """The part of a line about blocked azimuths [deg]; empty where there are none."""
+    return f"; blocked {ranges_text(ranges)}" if ranges else ""

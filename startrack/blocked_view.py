@@ -28,7 +28,7 @@ def leave_out_blocked(measured: Measured, fix: Fix, localizer: Localizer) -> Mea
     rows, blocked = replace(measured.evidence(), clock=None), None
     for _ in range(ROUNDS):
         newer = find_blocked(rows, fix, measured.terrain)
-        if newer is None and blocked is None or newer is not None and newer.same_as(blocked):
+        if (newer is None and blocked is None) or (newer is not None and newer.same_as(blocked)):
             break
         blocked = newer
         if blocked is not None and blocked.width_rad > MOST_BLOCKED_RAD:

@@ -120,7 +120,7 @@ SCHEMAS: dict[str, Schema] = {
             "evidence": EVIDENCE,
             "sky": SKY,
             "clock": CLOCK,
-        },  # fmt: skip
+        },
         _FIX_RULES,
     ),
     "identification": _result(

@@ -163,7 +163,7 @@ def exact_lens_text(included: bool) -> str:
 
 def blocked_deg(measured: Measured) -> list[list[float]]:
     """Ranges [from, to] of azimuth [deg] that are left out because something on no map blocks them."""
-    return [] if measured.blocked is None else np.degrees(measured.blocked.ranges_rad).tolist()
+    return [] if measured.blocked is None else np.round(np.degrees(measured.blocked.ranges_rad), 6).tolist()
 
 
 def ranges_text(ranges: list[list[float]]) -> str:

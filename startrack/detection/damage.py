@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,7 +110,7 @@ def _neighbour_correlation(tiles: NDArray[np.float32], middle: Array, sigma: Arr
     return float(np.percentile(found, FEW_STARS_PERCENTILE))
 
 
-def _mean_products(z: NDArray[np.float32], shift: int) -> Array:
+def _mean_products(z: NDArray[Any], shift: int) -> Array:
     """Mean products (n,) of pixels of tiles with those `shift` pixels on, in rows and columns."""
     across, down = z[:, :, shift:] * z[:, :, :-shift], z[:, shift:] * z[:, :-shift]
     return np.asarray(0.5 * (across.mean(axis=(1, 2)) + down.mean(axis=(1, 2))))

@@ -71,7 +71,7 @@ def find_blocked(evidence: Evidence, fix: Fix, terrain: Terrain) -> Blocked | No
 
     `fix` is a position on the `terrain` found with them. None where nothing is blocked.
     """
-    position, azimuths = fix.position_enu_m[None, :2], np.arange(SAMPLES) * (2 * np.pi / SAMPLES)
+    position, azimuths = fix.position_enu_m[None, :2], np.linspace(0.0, 2 * np.pi, SAMPLES, endpoint=False)
     traced = np.asarray(terrain.horizon_rad(position, azimuths)).ravel() + fix.horizon_error_rad
     highest = np.maximum(np.maximum(np.roll(traced, 1), np.roll(traced, -1)), traced)
     sigma = np.asarray(terrain.horizon_sigma_rad(position, azimuths)).ravel()
@@ -81,8 +81,8 @@ def find_blocked(evidence: Evidence, fix: Fix, terrain: Terrain) -> Blocked | No
     above = evidence.elevation_rad[which] - highest[sample]
     counted = above > LEVELS_RAD[0] + MAP_SIGMAS * sigma[sample]
     above, sector, hidden = above[counted], _sector_of(azimuth[counted]), -evidence.llr[which[counted]]
-    parts = [_find_patches(_sum_cells(levels, sector, above, hidden)) for levels in (LEVELS_RAD, HIGH_RAD)]
-    found = Blocked(*parts, highest.reshape(COUNT, -1).max(axis=1) + HIGH_RAD[0])
+    whole, high = (_find_patches(_sum_cells(levels, sector, above, hidden)) for levels in (LEVELS_RAD, HIGH_RAD))
+    found = Blocked(whole, high, highest.reshape(COUNT, -1).max(axis=1) + HIGH_RAD[0])
     return found if found else None
 
 

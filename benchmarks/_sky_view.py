@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from datetime import timedelta
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from startrack.rendering.defects import add_cosmic_rays, add_hot_pixels
 from startrack.rendering.sensor import ADC_MAX_ADU, read_out
 from startrack.rendering.sky import diffuse_e
 from startrack.rendering.sources import add_sources
+from startrack.terrain import Terrain
 from startrack.types import Array, Exposure
 
 HORIZON_SAMPLES = 1 << 14
@@ -82,21 +84,28 @@ class Hazard:
     light: Callable[[View, Rng], Array] = lambda view, rng: view.light_e
     scene: Callable[[Scene, Rng], Scene] = lambda scene, rng: scene
     noise_e: Callable[[tuple[int, ...], Rng], Array | float] = lambda shape, rng: 0.0
+    pixels: Callable[[Array, View, Rng], Array] = lambda frame, view, rng: frame  # [ADU], of the frame as recorded
     stated: Callable[[Camera, Scene, Rng], Camera] = lambda camera, scene, rng: camera  # the camera file
+    terrain: Callable[[Terrain, Rng], Terrain] = lambda terrain, rng: terrain  # the terrain file
+    clock_s: Callable[[Rng], float] = lambda rng: 0.0  # stated time minus the true one
 
 
 def expose(scene: Scene, hazard: Hazard, rng: Rng) -> tuple[Exposure, Truth, Camera]:
     """The exposure of a scene with a hazard, as `startrack.rendering.render` makes it; the truth; the camera file."""
     given, scene = scene.camera, hazard.scene(scene, rng)
-    electrons = hazard.light(View.of(scene), rng)
+    view = View.of(scene)
+    electrons = hazard.light(view, rng)
     electrons += scene.sensor.dark_e_per_s * scene.exposure_s
     add_hot_pixels(electrons, scene.hot_pixels, scene.exposure_s)
     add_cosmic_rays(electrons, scene.cosmic_rays, rng=rng)
     sensor = scene.sensor
     pixels = read_out(electrons, sensor, rng=rng) + hazard.noise_e(electrons.shape, rng) / sensor.gain_e_per_adu
+    recorded = np.rint(np.clip(pixels, 0, sensor.saturation_adu))
+    changed = np.clip(np.rint(hazard.pixels(recorded, view, rng)), 0, ADC_MAX_ADU)
     exposure = Exposure(
-        pixels_adu=np.rint(np.clip(pixels, 0, sensor.saturation_adu)).astype(np.float32), name=scene.name,
-        time_utc=scene.time_utc, exposure_s=scene.exposure_s, saturation_adu=min(sensor.saturation_adu, ADC_MAX_ADU),
+        pixels_adu=np.ascontiguousarray(changed, dtype=np.float32), name=scene.name,
+        time_utc=scene.time_utc + timedelta(seconds=hazard.clock_s(rng)), exposure_s=scene.exposure_s,
+        saturation_adu=min(sensor.saturation_adu, ADC_MAX_ADU),
     )  # fmt: skip
     return exposure, truth_of(scene), hazard.stated(given, scene, rng)
 

@@ -84,6 +84,10 @@ class Reason(StrEnum):
         "Check terrain, time and camera height; something that is not on the map (a boulder, the lander) may stand in "
         "view.",
     )  # fmt: skip
+    DAMAGED_IMAGE = (
+        "damaged_image", EXIT_REFUSED, "Processing took the noise or the faint stars from the image",
+        "Give the frame as the sensor recorded it: before dark subtraction, filters, thresholds and lossy compression.",
+    )  # fmt: skip
     AMBIGUOUS = (
         "ambiguous", EXIT_REFUSED, "More than one position fits",
         "Take another picture some way off, expose longer, or narrow [search] in the terrain file to where the rover "

@@ -15,6 +15,8 @@ from startrack.evidence import (
     StarPhotometry,
     flux_scale,
     height_above_px,
+    measure_noise,
+    measure_response,
     measure_sky_step,
     reliable_azimuths,
     subtract_sky_step,
@@ -49,12 +51,20 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
         raise BadInput("no_time", "the mid-exposure time is not known")
     if settings.deep_stars:
         oriented = add_gaia_stars(oriented, terrain.site)
-    R = R_enu_icrs(terrain.site, when)
+    R, response = R_enu_icrs(terrain.site, when), None
+    if oriented.damage is not None:
+        oriented = replace(oriented, detections=measure_noise(oriented.detections))
     light = _photometry(oriented, terrain, R, settings.evidence, oriented.detections)
+    if oriented.damage is not None:
+        response = measure_response(light)
+        light = response.correct(light)
     clock = Clock(
         turn_rad_s=sky_rotvec_rad(terrain.site, when, TURN_S) / TURN_S, sigma_s=oriented.exposure.time_sigma_s
     )  # fmt: skip
-    return extend(oriented, Measured, terrain=terrain, site=terrain.site, R_enu_icrs=R, clock=clock, light=light)
+    return extend(
+        oriented, Measured, terrain=terrain, site=terrain.site, R_enu_icrs=R, clock=clock, light=light,
+        response=response,
+    )  # fmt: skip
 
 
 def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
@@ -90,8 +100,10 @@ def at_time_of_fix(measured: Measured, fix: Fix) -> Measured:
 def sky_step_at(measured: Measured, fix: Fix) -> SkyStep | None:
     """The step of the sky brightness at the terrain's skyline seen from a `fix` found with `measured`.
 
-    None if the image does not contain that skyline.
+    None if the image does not contain that skyline, or is damaged so that levels of light cannot be compared.
     """
+    if measured.damage is not None and not measured.damage.has_levels:
+        return None
     horizon = Skyline.trace(fix.position_enu_m[:2], measured.terrain)
     return measure_sky_step(measured.detections, measured.camera, measured.R_cam_enu, horizon)
 
@@ -111,6 +123,8 @@ def remeasure_near_skyline(measured: Measured, fix: Fix, step: SkyStep, photomet
     azimuth, elevation = light.azimuth_rad, light.elevation_rad
     above_px, is_reliable = height_above_px(azimuth, elevation, camera, R, horizon), reliable(azimuth)
     wanted = (np.abs(above_px) < REMEASURED_PX) & is_reliable
+    if measured.blocked is not None:
+        wanted &= ~measured.blocked.hides(azimuth, elevation)
     around = np.abs(above_px) < REMEASURED_PX + NEIGHBOURS_PX
     # The fix determines the visibility of neighbours better than their faint flux does, except next to the skyline.
     undecided = (np.abs(above_px) < UNDECIDED_PX) | ~is_reliable
@@ -119,6 +133,7 @@ def remeasure_near_skyline(measured: Measured, fix: Fix, step: SkyStep, photomet
     newer = _photometry(
         measured, terrain, measured.R_enu_icrs, photometry, detections, light.star[around], visible[around]
     )
+    newer = newer if measured.response is None else measured.response.correct(newer)
     return replace(measured, light=light.replace_stars(newer, light.star[wanted]))
 
 

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from startrack.blocked_view import leave_out_blocked
 from startrack.camera import Camera
+from startrack.detection import find_damage
 from startrack.frames import Site
 from startrack.localization import Integrity, check_consistency, clock_matters, localizer_name
 from startrack.localization.integrity import assess_integrity
@@ -57,7 +59,7 @@ def locate(
     settings = settings or Settings()
     inputs = Inputs(
         exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name,
-        localizer_name=localizer_name(settings.localizer),
+        localizer_name=localizer_name(settings.localizer), damage=find_damage(exposure, camera),
     )  # fmt: skip
     run = Run(inputs)
     try:
@@ -69,6 +71,9 @@ def locate(
         oriented = run.run_stage("attitude", solve_orientation, identified)
         measured = run.run_stage("evidence", measure_evidence, oriented, terrain, settings)
         located = _locate_by_stars(run, measured, settings)
+        measured = run.time_stage("locate", leave_out_blocked, located, located.fix_at_time, settings.localizer)
+        if measured is not located:
+            located = _locate_by_stars(run, measured, settings)
         step = _sky_step(run, located)
         if step is not None and step.exceeds_noise:
             measured = run.run_stage(

@@ -49,6 +49,8 @@ def refine_by_sky_light(located: Located, stars: bool = True) -> Located:
     another time than the one stated.
     """
     try:
+        if located.damage is not None and not located.damage.has_levels:
+            raise NoSkyLight("the image is damaged")
         _require_refinable(located.fix)
         if not located.terrain.axisymmetric:
             _check_clock(located)
@@ -178,6 +180,8 @@ def _fit_step(
     """The step from a position (2,) that explains the skyline which the sky shows there. Raises NoSkyLight."""
     terrain = located.terrain
     used = sectors_with_step(sky) & terrain.is_informative(MIDDLES_RAD, sky.elevation_rad)
+    if located.blocked is not None:
+        used &= ~located.blocked.beside(MIDDLES_RAD)
     if np.count_nonzero(used) < MIN_SECTORS:
         raise NoSkyLight(_too_few(sky, used))
     map_sigma_px = terrain.horizon_sigma_rad(position_m[None], MIDDLES_RAD) * sky.px_per_rad

@@ -18,12 +18,12 @@ import numpy as np
 
 from startrack.attitude import AttitudeFit
 from startrack.camera import Camera
-from startrack.detection import Detector
+from startrack.detection import Damage, Detector
 from startrack.errors import Reason
-from startrack.evidence import SkyLight, StarEvidence, StarPhotometry
+from startrack.evidence import DamagedResponse, SkyLight, StarEvidence, StarPhotometry
 from startrack.frames import R_from_rotvec, Site
 from startrack.identification import Identifier
-from startrack.localization import ExactPosterior, Integrity, Localizer, SkylineFit, require_localizer
+from startrack.localization import Blocked, ExactPosterior, Integrity, Localizer, SkylineFit, require_localizer
 from startrack.terrain import Terrain
 from startrack.types import (
     Array,
@@ -43,6 +43,9 @@ from startrack.types import (
 
 EVIDENCE_SOURCES = ("both", "stars", "sky")  # of a position; "sky" begins with a fix by the stars
 UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out
+HIDDEN_BY_DAMAGE = {  # reasons that damage of the image causes too
+    Reason.NOT_IDENTIFIED, Reason.INCONSISTENT_EVIDENCE, Reason.INSUFFICIENT_GEOMETRY, Reason.DAMAGED_IMAGE,
+}  # fmt: skip
 STAGES = ("read", "detect", "identify", "attitude", "evidence", "locate")  # keys of `timing_ms`
 T = TypeVar("T", bound="Inputs")
 R = TypeVar("R")
@@ -77,6 +80,7 @@ class Inputs:
     camera: Camera | None = None  # None: not known; `detect` works without, `identify_blind` finds it
     terrain: Terrain | None = None  # None: identification or detection only
     catalog_name: str = ""
+    damage: Damage | None = None  # what processing did to the pixels; None: nothing shows
     localizer_name: str = ""  # in LOCALIZERS, or of its class or function; empty: identification or detection only
     timing_ms: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))  # stage to wall time [ms]
 
@@ -98,7 +102,8 @@ class Inputs:
     @property
     def warnings(self) -> list[str]:
         """Facts in the image's file that were not used."""
-        return list(self.exposure.warnings)
+        damage = [] if self.damage is None else [self.damage.message]
+        return [*self.exposure.warnings, *damage]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -143,6 +148,8 @@ class Measured(Oriented):
     R_enu_icrs: Array  # (3, 3) at the likeliest time
     clock: Clock
     light: StarPhotometry
+    response: DamagedResponse | None = None  # of a damaged image to stars
+    blocked: Blocked | None = None  # parts of the view that are left out; None: nothing is blocked
 
     @property
     def R_cam_enu(self) -> Array:
@@ -162,7 +169,10 @@ class Measured(Oriented):
     @property
     def warnings(self) -> list[str]:
         """Facts in the image's file that were not used; what the terrain does not cover, and errors it leaves out."""
-        return [*self.exposure.warnings, *self.terrain.masked_sectors(), *self.terrain.error_warnings()]
+        blocked = [] if self.blocked is None else [f"blocked and left out: {self.blocked.text}"]
+        return [
+            *super().warnings, *self.terrain.masked_sectors(), *self.terrain.error_warnings(), *blocked,
+        ]  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -277,10 +287,12 @@ class Run:
         return replace(value, timing_ms=MappingProxyType(self._timing_ms))
 
     def refuse(self, cause: BadInput | NoSolution) -> Refused:
-        """The refusal for a `cause`, with the last complete value."""
+        """The refusal for a `cause`, with the last complete value; of a damaged image its damage may be the reason."""
+        damage = self.reached.damage
+        damaged = damage is not None and cause.reason in HIDDEN_BY_DAMAGE
         return Refused(
-            reason=cause.reason,
-            message=str(cause),
+            reason=Reason.DAMAGED_IMAGE if damaged else cause.reason,
+            message=str(cause) if damage is None or not damaged else f"{damage.message} ({cause})",
             reached=self.reached,
             timing_ms=MappingProxyType(self._timing_ms),
         )

@@ -28,7 +28,7 @@ LAYERS = (  # lowest first; a package imports from lower layers only
     {"rendering", "detection", "identification", "evidence", "localization"},
     {"stages"},
     {"sky_errors"},
-    {"measurement", "orientation", "sky_refinement", "skyline"},
+    {"measurement", "orientation", "sky_refinement", "blocked_view", "skyline"},
     {"pipeline", "calibration", "inputs"},
     {"output"},
     {"solution", "horizon"},

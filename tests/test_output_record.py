@@ -25,6 +25,7 @@ KEYS = {
     "attitude": "quat_xyzw_cam_icrs ra_deg dec_deg roll_deg sigma_arcsec lens_error_included quat_xyzw_body_enu "
     "heading_deg pitch_deg roll_body_deg sigma_heading_deg sigma_pitch_deg sigma_roll_body_deg",
     "stars": "detected identified unexplained predicted_visible rms_px false_alarm_probability",
+    "evidence": "blocked damage",
     "sky": "brightness_mag_arcsec2 unused",
     "clock": "offset_s sigma_s",
     "timing_ms": "read detect identify attitude evidence locate",

@@ -1,5 +1,6 @@
 """Evidence: exposure, attitude and catalogue to rays, each with the log-likelihood ratio of sky against ground."""
 
+from startrack.evidence.damaged_response import DamagedResponse, measure_noise, measure_response
 from startrack.evidence.flux_scale import FluxScale, flux_scale
 from startrack.evidence.sky_light import SkyLight
 from startrack.evidence.sky_step import (
@@ -13,6 +14,7 @@ from startrack.evidence.sky_step import (
 from startrack.evidence.star_evidence import StarEvidence, StarPhotometry
 
 __all__ = [
+    "DamagedResponse",
     "FluxScale",
     "SkyLight",
     "SkyStep",
@@ -21,6 +23,8 @@ __all__ = [
     "StarPhotometry",
     "flux_scale",
     "height_above_px",
+    "measure_noise",
+    "measure_response",
     "measure_sky_step",
     "reliable_azimuths",
     "subtract_sky_step",

@@ -2,6 +2,7 @@
 
 from typing import Any, Protocol
 
+from startrack.localization.blocked import Blocked, find_blocked
 from startrack.localization.clock import clock_matters
 from startrack.localization.consistency import check_consistency
 from startrack.localization.convex_hull import Hull
@@ -55,6 +56,6 @@ def require_localizer(given: Any) -> Localizer:
 
 
 __all__ = [
-    "LOCALIZERS", "ExactPosterior", "Hull", "Integrity", "Localizer", "PseudoGradient", "SkylineFit",
-    "check_consistency", "clock_matters", "localizer_name", "require_localizer",
+    "LOCALIZERS", "Blocked", "ExactPosterior", "Hull", "Integrity", "Localizer", "PseudoGradient", "SkylineFit",
+    "check_consistency", "clock_matters", "find_blocked", "localizer_name", "require_localizer",
 ]  # fmt: skip

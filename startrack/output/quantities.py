@@ -31,7 +31,8 @@ from startrack.output.values import (
     R_body_enu,
     ambiguous_modes,
     arcsec_text,
-    azimuths_text,
+    blocked_deg,
+    blocked_text,
     body_deg,
     body_sigmas_deg,
     boresight_deg,
@@ -46,6 +47,7 @@ from startrack.output.values import (
     modes_text,
     predicted_visible,
     protection_level_m,
+    ranges_text,
     sigma_m,
 )  # fmt: skip
 from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented
@@ -111,8 +113,8 @@ QUANTITIES: tuple[Quantity, ...] = (
     Q("position.carried_by", "deg", Located, carrying_azimuths,
       "list of [first, last] azimuths: the fewest of eight groups of directions that hold half of the information",
       {"type": "array", "items": numbers(2)}, nullable=True, optional=True,
-      shown=(Show("text", "protection", lambda a: "; carried by azimuths " + azimuths_text(a)),
-             Show("page", "Carried by azimuths", azimuths_text))),
+      shown=(Show("text", "protection", lambda a: f"; carried by azimuths {ranges_text(a)}"),
+             Show("page", "Carried by azimuths", ranges_text))),
     Q("position.latitude_deg", "deg", Located, latlon_deg(0), "of the same point", LATITUDE,
       columns=(Column("latitude_deg", "%.8f"),),
       shown=(Show("text", "position", "; latitude {:.6f}°"), Show("panel", "Lat, lon", "{:.5f}°"),
@@ -237,6 +239,13 @@ QUANTITIES: tuple[Quantity, ...] = (
       shown=(Show("text", "stars", lambda p: f"; false alarm {chance_text(p)}"),
              Show("panel", "Residual", lambda p: f"   false alarm {chance_text(p)}"),
              Show("page", "Chance match", chance_text))),
+    Q("evidence.blocked", "deg", Measured, blocked_deg,
+      "list of [from, to]: azimuths in which something on no map hides stars above the skyline, and where no evidence "
+      "is taken; across north `to` is the smaller", {"type": "array", "items": numbers(2)}, optional=True,
+      shown=(Show("text", "evidence", blocked_text), Show("page", "Blocked azimuths", ranges_text))),
+    Q("evidence.damage", "", Inputs, lambda v: None if v.damage is None else v.damage.cause,
+      "what processing did to the pixels, where the evidence is measured on the frame itself; null: nothing shows",
+      TEXT, nullable=True, optional=True),
     Q("sky.brightness_mag_arcsec2", "mag/arcsec^2", Located, lambda v: v.sky_brightness_mag_arcsec2,
       "V of the sky beyond that of the ground at the skyline, by the camera's zero point and the exposure's duration; "
       "null where the image shows no step of light there, or one of the two is not known",

@@ -37,7 +37,7 @@ def identification_dict(result: Outcome) -> dict[str, Any]:
         xy_px = value.detections.xy_px[value.identification.detection].tolist()
         hips = value.stars.hip[value.identification.star].tolist()
         own["matches"] = [{"hip": hip or None, "x_px": x, "y_px": y} for hip, (x, y) in zip(hips, xy_px, strict=True)]
-    return _record("identification", result, own, without=("position", "modes", "sky", "clock"))
+    return _record("identification", result, own, without=("position", "modes", "evidence", "sky", "clock"))
 
 
 def detection_dict(result: Outcome) -> dict[str, Any]:
@@ -47,7 +47,8 @@ def detection_dict(result: Outcome) -> dict[str, Any]:
         found = value.detections
         columns = zip(found.xy_px.tolist(), found.flux_e.tolist(), found.snr.tolist(), strict=True)
         rows = [{"x_px": x, "y_px": y, "flux_e": flux, "snr": snr} for (x, y), flux, snr in columns]
-    return _record("detection", result, {"detections": rows}, without=("position", "modes", "sky", "clock", "attitude"))
+    without = ("position", "modes", "evidence", "sky", "clock", "attitude")
+    return _record("detection", result, {"detections": rows}, without=without)
 
 
 def record_of(result: Outcome, kind: str) -> dict[str, Any]:

@@ -40,6 +40,7 @@ def _part_of(whole: Schema) -> Schema:
 POSITION = section_schema("position", "The camera's centre. covariance_m2 is of (east, north).")
 MODES: Schema = {**BY_PATH["modes"].schema, "description": BY_PATH["modes"].description}
 ATTITUDE = section_schema("attitude", "Of the camera among the stars and, with terrain and time, of the rover's body.")
+EVIDENCE = section_schema("evidence", "What is left out of the evidence, and why.")
 SKY = section_schema("sky", "Diffuse light of the sky.")
 CLOCK = section_schema("clock", "Error of the stated time.")
 PROVENANCE = section_schema("provenance")
@@ -112,7 +113,14 @@ SCHEMAS: dict[str, Schema] = {
     "fix": _result(
         "fix",
         "Position and attitude of one image",
-        {"position": POSITION, "modes": MODES, "attitude": ATTITUDE, "sky": SKY, "clock": CLOCK},
+        {
+            "position": POSITION,
+            "modes": MODES,
+            "attitude": ATTITUDE,
+            "evidence": EVIDENCE,
+            "sky": SKY,
+            "clock": CLOCK,
+        },
         _FIX_RULES,
     ),
     "identification": _result(

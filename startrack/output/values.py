@@ -62,11 +62,6 @@ def carrying_azimuths(value: Located) -> list[list[float]] | None:
     return [[float(first[g]), float(first[g] + width)] for g in value.integrity.carriers()]
 
 
-def azimuths_text(ranges: list[list[float]]) -> str:
-    """Ranges of azimuths [deg] in words."""
-    return ", ".join(f"{first:.0f}-{last:.0f}°" for first, last in ranges)
-
-
 def R_body_enu(value: Measured) -> Array:
     """Rotation (3, 3) from enu to the rover's body, of a measured `value`."""
     return np.asarray(value.camera.R_body_cam @ value.R_cam_enu)
@@ -177,3 +172,18 @@ def arcsec_text(sigma: list[float]) -> str:
 def exact_lens_text(included: bool) -> str:
     """Text for a sigma of the attitude that lacks the lens, because the camera has no covariance."""
     return "" if included else ", the lens taken as exact"
+
+
+def blocked_deg(measured: Measured) -> list[list[float]]:
+    """Ranges [from, to] of azimuth [deg] that are left out because something on no map blocks them."""
+    return [] if measured.blocked is None else np.round(np.degrees(measured.blocked.ranges_rad), 6).tolist()
+
+
+def ranges_text(ranges: list[list[float]]) -> str:
+    """Ranges of azimuth [deg] in words; empty where there are none."""
+    return ", ".join(f"{start:.0f}° to {end:.0f}°" for start, end in ranges)
+
+
+def blocked_text(ranges: list[list[float]]) -> str:
+    """The part of a line about blocked azimuths [deg]; empty where there are none."""
+    return f"; blocked {ranges_text(ranges)}" if ranges else ""

@@ -26,6 +26,8 @@ class AttitudeFit:
     used: Bools  # (n,) not rejected as outliers
     rms_px: float  # of the used stars, per axis
     extra_sigma_px: float  # error per axis beyond the stated centroid errors (lens, blends, catalogue)
+    centre_shift_px: Array  # (2,) by which the image stands off the camera's centre, by the used stars
+    centre_chi2: float  # of that shift, two degrees of freedom
 
 
 def solve_attitude(
@@ -48,6 +50,7 @@ def solve_attitude(
     by_stars = _attitude_covariance(jacobian, found.inverse[used], weight, residual)
     rays_cam = found.state.rays_cam(points)[used]
     by_lens = _attitude_covariance_by_lens(camera, rays_cam, jacobian, weight)
+    centre_shift, centre_chi2 = _centre_shift(camera, rays_cam, jacobian, weight, residual)
     return AttitudeFit(
         attitude=Attitude(R_cam_icrs=found.state.R_cam_icrs[0], covariance_rad2=by_stars + by_lens),
         centroid_covariance_rad2=by_stars,
@@ -55,6 +58,8 @@ def solve_attitude(
         used=used,
         rms_px=float(np.sqrt(np.mean(residual**2))),
         extra_sigma_px=float(np.sqrt(found.extra_px2)),
+        centre_shift_px=centre_shift,
+        centre_chi2=centre_chi2,
     )
 
 
@@ -72,6 +77,19 @@ def _attitude_covariance(jacobian: Array, inverse: Array, weight: Array, residua
     scores = np.einsum("nia,nij,nj->na", jacobian, weight, residual_px, optimize=True)
     by_scatter = bread @ (scores.T @ scores) @ bread * (n / (n - 3))
     return np.asarray(stated * max(1.0, float(np.trace(by_scatter) / np.trace(stated))))
+
+
+def _centre_shift(
+    camera: Camera, rays_cam: Array, jacobian: Array, weight: Array, residual_px: Array
+) -> tuple[Array, float]:
+    """Shift (2,) of the image's centre that the residuals ask for beside a rotation, and its chi2; 0 of few stars."""
+    if len(residual_px) < MIN_FOR_SCATTER:
+        return np.zeros(2), 0.0
+    design = np.concatenate([jacobian, lens_jacobian(camera, rays_cam, ("cx", "cy"))], axis=2)
+    weighted = np.einsum("nia,nij->naj", design, weight)
+    covariance = np.linalg.inv(np.einsum("naj,njb->ab", weighted, design))
+    shift = (covariance @ np.einsum("naj,nj->a", weighted, residual_px))[3:]
+    return shift, float(shift @ np.linalg.solve(covariance[3:, 3:], shift))
 
 
 def _attitude_covariance_by_lens(camera: Camera, rays_cam: Array, jacobian: Array, weight: Array) -> Array:

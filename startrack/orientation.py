@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import datetime
 from typing import TYPE_CHECKING
 
-from startrack.attitude import solve_attitude
+import numpy as np
+
+from startrack.attitude import AttitudeFit, solve_attitude
 from startrack.camera import Camera
 from startrack.catalog.bodies import bodies
 from startrack.compilation import announce_compilation
@@ -29,6 +32,9 @@ NO_TIME = (
     "the mid-exposure time is not known: give --time UTC, a sidecar NAME.json with time_utc, or a header with it; "
     "nothing is guessed"
 )
+LEAST_SHIFT_PX, MOST_SHIFT_PX = 0.1, 8.0  # of the image's centre; a larger one is another camera
+SHIFT_CHI2 = 30.0  # of a shift in two coordinates: one in three million by chance
+SHIFT_ROUNDS = 3  # stars that the shift made outliers come back
 NO_SITE = "terrain {} has no site: an image can be located only on ground whose position on a body is known"
 ANYWHERE = Site("moon", 0.0, 0.0)  # used for an unknown site: 0.7 arcsec of aberration at most
 
@@ -99,16 +105,32 @@ def identify_unknown_lens(detected: Detected, fov_rad: float, catalog: StarCatal
 
 
 def solve_orientation(identified: Identified) -> Oriented:
-    """The attitude that fits the `identified` stars. Raises NotIdentified."""
+    """The attitude that fits the `identified` stars. Raises NotIdentified.
+
+    Where the stars show that the image stands off the centre that the camera file states, as of a loose sensor, the
+    value's camera has the centre by the stars.
+    """
+    camera, fit = identified.camera, _fit_attitude(identified, identified.camera)
+    offset_px = fit.centre_shift_px
+    if LEAST_SHIFT_PX < np.linalg.norm(offset_px) < MOST_SHIFT_PX and fit.centre_chi2 > SHIFT_CHI2:
+        for _ in range(SHIFT_ROUNDS):
+            x, y = np.array(identified.camera.centre_px) + offset_px
+            camera = replace(identified.camera, centre_px=(float(x), float(y)))
+            fit = _fit_attitude(identified, camera)
+            offset_px = offset_px + fit.centre_shift_px
+    moved_px = float(np.linalg.norm(np.subtract(camera.centre_px, identified.camera.centre_px)))
+    return extend(identified, Oriented, camera=camera, attitude_fit=fit, centre_shift_px=moved_px)
+
+
+def _fit_attitude(identified: Identified, camera: Camera) -> AttitudeFit:
     found, detections = identified.identification, identified.detections
-    fit = solve_attitude(
-        identified.camera,
+    return solve_attitude(
+        camera,
         detections.xy_px[found.detection],
         detections.covariance_px2[found.detection],
         identified.stars.rays_icrs[found.star],
         found.R_cam_icrs,
     )
-    return extend(identified, Oriented, attitude_fit=fit)
 
 
 def stars_at(catalog: StarCatalog, when: datetime | None, site: Site | None) -> Stars:

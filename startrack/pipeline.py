@@ -24,6 +24,7 @@ from startrack.orientation import (
     identify_unknown_lens,
     solve_orientation,
 )  # fmt: skip
+from startrack.run import Run, with_timing
 from startrack.sky_refinement import refine_by_sky_light
 from startrack.skyline import measured_skyline
 from startrack.stages import (
@@ -33,10 +34,8 @@ from startrack.stages import (
     Measured,
     Oriented,
     Refused,
-    Run,
     Settings,
     extend,
-    with_timing,
 )  # fmt: skip
 from startrack.terrain import Terrain
 from startrack.types import BadInput, Exposure, NoSolution

@@ -8,8 +8,7 @@ returns states which stages have run; no field is filled in later.
 
 from __future__ import annotations
 
-import time as clock
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any, Self, TypeAlias, TypeVar
@@ -28,7 +27,6 @@ from startrack.terrain import Terrain
 from startrack.types import (
     Array,
     Attitude,
-    BadInput,
     Body,
     Clock,
     Detections,
@@ -37,15 +35,11 @@ from startrack.types import (
     Fix,
     Identification,
     MeasuredSkyline,
-    NoSolution,
     Stars,
 )  # fmt: skip
 
 EVIDENCE_SOURCES = ("both", "stars", "sky")  # of a position; "sky" begins with a fix by the stars
 UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out
-HIDDEN_BY_DAMAGE = {  # reasons that damage of the image causes too
-    Reason.NOT_IDENTIFIED, Reason.INCONSISTENT_EVIDENCE, Reason.INSUFFICIENT_GEOMETRY, Reason.DAMAGED_IMAGE,
-}  # fmt: skip
 STAGES = ("read", "detect", "identify", "attitude", "evidence", "locate")  # keys of `timing_ms`
 T = TypeVar("T", bound="Inputs")
 R = TypeVar("R")
@@ -128,6 +122,15 @@ class Oriented(Identified):
     """Identified stars with the attitude of the camera among the stars."""
 
     attitude_fit: AttitudeFit
+    centre_shift_px: float = 0.0  # by which `camera` has its centre off that of the camera file, as the stars show it
+
+    @property
+    def warnings(self) -> list[str]:
+        """Those of `Inputs`, and the shift of the image."""
+        shift = (
+            f"the image stands {self.centre_shift_px:.2f} px off the centre in the camera file: corrected by the stars"
+        )
+        return [*super().warnings, *([shift] if self.centre_shift_px else [])]
 
     @property
     def attitude(self) -> Attitude:
@@ -251,48 +254,3 @@ def extend(value: Inputs, to: type[T], **more: Any) -> T:
     """The fields of a value and the results of one more stage as the next value of the chain."""
     known = {f.name: getattr(value, f.name) for f in fields(to) if hasattr(value, f.name)}
     return to(**known | more)
-
-
-def with_timing(outcome: Any, **more_ms: float) -> Any:
-    """The same outcome with wall times [ms] added to its stages' times."""
-    times = dict(outcome.timing_ms)
-    for stage, ms in more_ms.items():
-        times[stage] = times.get(stage, 0.0) + ms
-    return replace(outcome, timing_ms=MappingProxyType(times))
-
-
-class Run:
-    """One exposure on its way through the stages: the last complete value, and the wall time of each stage."""
-
-    def __init__(self, inputs: Inputs) -> None:
-        self.reached = inputs
-        self._timing_ms: dict[str, float] = {}
-
-    def time_stage(self, stage: str, function: Callable[..., R], *args: Any) -> R:
-        """The result of `function(*args)`, its time added to that of the `stage`."""
-        start = clock.perf_counter()
-        try:
-            return function(*args)
-        finally:
-            self._timing_ms[stage] = self._timing_ms.get(stage, 0.0) + 1e3 * (clock.perf_counter() - start)
-
-    def run_stage(self, stage: str, function: Callable[..., T], *args: Any) -> T:
-        """The same as `time_stage`, for a function that returns the next complete value."""
-        value = self.time_stage(stage, function, *args)
-        self.reached = value
-        return value
-
-    def finish(self, value: T) -> T:
-        """The `value` with the times of the stages."""
-        return replace(value, timing_ms=MappingProxyType(self._timing_ms))
-
-    def refuse(self, cause: BadInput | NoSolution) -> Refused:
-        """The refusal for a `cause`, with the last complete value; of a damaged image its damage may be the reason."""
-        damage = self.reached.damage
-        damaged = damage is not None and cause.reason in HIDDEN_BY_DAMAGE
-        return Refused(
-            reason=Reason.DAMAGED_IMAGE if damaged else cause.reason,
-            message=str(cause) if damage is None or not damaged else f"{damage.message} ({cause})",
-            reached=self.reached,
-            timing_ms=MappingProxyType(self._timing_ms),
-        )

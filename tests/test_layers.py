@@ -27,7 +27,7 @@ LAYERS = (  # lowest first; a package imports from lower layers only
     {"attitude"},
     {"rendering", "detection", "identification", "evidence", "localization"},
     {"stages"},
-    {"sky_errors"},
+    {"sky_errors", "run"},
     {"measurement", "orientation", "sky_refinement", "blocked_view", "skyline"},
     {"pipeline", "calibration", "inputs"},
     {"output"},

@@ -53,7 +53,8 @@ def _identify_image(path: str, stem: str, args: argparse.Namespace) -> Outcome:
         write_results,
     )
     from startrack.pipeline import identify, identify_blind
-    from startrack.stages import Oriented, Refused, with_timing
+    from startrack.run import with_timing
+    from startrack.stages import Oriented, Refused
 
     start = time.perf_counter()
     exposure = read(path, args)

@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
 def _locate_image(path: str, stem: str, args: argparse.Namespace, settings: Settings) -> Outcome:
     from startrack.output import summary_line, verbose_text, write_results
     from startrack.pipeline import locate_exposure
-    from startrack.stages import with_timing
+    from startrack.run import with_timing
 
     start = time.perf_counter()
     exposure = read(path, args)

@@ -80,7 +80,8 @@ def test_the_position_has_units_and_an_uncertainty(solution):
     assert along @ solution.covariance_m2 @ along == pytest.approx(p.ellipse.semi_major.value**2)
     assert p.ellipse.semi_minor < p.ellipse.semi_major
     assert re.search(r"^  east +-(6899|6900)\.\d\d m ± [01]\.\d\d m$", repr(p), flags=re.MULTILINE)
-    assert "long axis at azimuth" in repr(p) and "evidence       both" in repr(p)
+    assert "long axis at azimuth" in repr(p)
+    assert re.search(r"^  evidence +both$", repr(p), flags=re.MULTILINE)
 
 
 def test_a_method_without_a_posterior_states_no_uncertainty(tmp_path):

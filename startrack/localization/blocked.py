@@ -15,7 +15,7 @@ HIGH_RAD = np.radians([15.0, 25.0, 35.0, 45.0, 55.0, 90.0])  # the position does
 MAP_SIGMAS = 3.0  # of the map's horizon, below which stars are not counted
 SECTOR_COST_NATS = 0.3  # by which each sector of a patch must gain, in the mean
 MIN_GAIN_NATS = 24.0  # of a patch; a million patches are tried, and true rows of any reach 24 in one of 10^10
-MIN_LLR = 1.0  # of a row: weaker ones, most of all, add little
+MIN_LLR, MOST_NATS = 3.0, 8.0  # of a row: faint stars together err beside a bright one; one star is no patch
 TAKEN_NATS = 1e6  # in place of the gains of sectors found already
 MARGIN, FLANK_PART = 1, 0.15  # sectors left out on either side, and part of the patch: a ridge's flanks are too low
 SKY_MARGIN = 6  # sectors beside a patch whose light of the sky is not used: it shows flanks that stars do not
@@ -32,12 +32,12 @@ class Blocked:
     high_from_rad: Array  # elevation where that begins
 
     def hides(self, azimuth_rad: Array, elevation_rad: Array) -> Bools:
-        """Whether directions (n,) are in the blocked parts."""
+        """Whether directions (n,), `azimuth_rad` and `elevation_rad`, are in the blocked parts."""
         sector = _sector_of(azimuth_rad)
         return np.asarray(self.whole[sector] | (self.high[sector] & (elevation_rad > self.high_from_rad[sector])))
 
     def beside(self, azimuth_rad: Array) -> Bools:
-        """Whether the skyline at azimuths (n,) is in a patch or close to one."""
+        """Whether the skyline at azimuths `azimuth_rad` (n,) is in a patch or close to one."""
         near = self.whole
         for side in (-1, 1):
             for step in range(1, SKY_MARGIN + 1):
@@ -48,7 +48,7 @@ class Blocked:
         return bool(self.whole.any() or self.high.any())
 
     def same_as(self, other: Blocked | None) -> bool:
-        """Whether both are the same sectors."""
+        """Whether the sectors are those of `other`."""
         return other is not None and bool((self.whole == other.whole).all() and (self.high == other.high).all())
 
     @property
@@ -89,7 +89,7 @@ def find_blocked(evidence: Evidence, fix: Fix, terrain: Terrain) -> Blocked | No
     sample = np.rint(azimuth * (SAMPLES / (2 * np.pi))).astype(np.int64) % SAMPLES
     above = evidence.elevation_rad[which] - highest[sample]
     counted = above > LEVELS_RAD[0] + MAP_SIGMAS * sigma[sample]
-    above, sector, hidden = above[counted], _sector_of(azimuth[counted]), -evidence.llr[which[counted]]
+    above, sector, hidden = above[counted], _sector_of(azimuth[counted]), np.minimum(-evidence.llr[which[counted]], MOST_NATS)
     whole, high = (_find_patches(_sum_cells(levels, sector, above, hidden)) for levels in (LEVELS_RAD, HIGH_RAD))
     found = Blocked(whole, high, highest.reshape(COUNT, -1).max(axis=1) + HIGH_RAD[0])
     return found if found else None

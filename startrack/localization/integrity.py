@@ -21,6 +21,7 @@ WRONG_GROUP = 0.05  # probability that one of the groups shows something that is
 RINGS, POINTS_ON_RING = 5, 16  # points about the fix to which the quadratics are fitted
 REACHES_SIGMAS = (2.5, 7.5)  # of the outer ring; the wider one where a group alone holds the fix in one direction
 MOST_CHI2 = 25.0  # of a separation of two coordinates; see docs/trust.md
+UNIMPORTANT_SIGMAS = 0.5  # of the fix: a separation of that size is no contradiction, whatever its own error
 MARGIN_M = 2.0  # of the neighbourhood beyond the points
 CARRIED_PART = 0.5  # of the information, by the groups that are named
 
@@ -117,8 +118,8 @@ def _separate(slopes: Array, information: Array, fix: Fix) -> Integrity:
             continue
         without = np.linalg.inv(rest)
         separation[g] = without @ (slopes.sum(axis=0) - slopes[g]) - best
-        extra = without - covariance
-        chi2[g] = separation[g] @ np.linalg.solve(extra + 1e-12 * np.eye(2), separation[g])
+        extra = without - covariance + UNIMPORTANT_SIGMAS**2 * covariance
+        chi2[g] = separation[g] @ np.linalg.solve(extra, separation[g])
         largest = float(np.linalg.eigvalsh(without + shared)[1])
         spread = np.sqrt(-2.0 * np.log(RISK / WRONG_GROUP) * largest)
         level = max(level, float(np.linalg.norm(separation[g])) + float(spread))

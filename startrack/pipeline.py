@@ -106,7 +106,7 @@ def _locate_by_stars(run: Run, measured: Measured, settings: Settings) -> Locate
 def _integrity_by_stars(located: Located) -> Integrity:
     """The integrity of a fix by the stars alone. Raises NotLocated where their directions contradict each other."""
     fix = located.fix_at_time
-    ground = located.terrain.reshaped(np.array(fix.shape)) if any(fix.shape) else located.terrain
+    ground = located.terrain.reshaped(np.array(fix.shape_1)) if any(fix.shape_1) else located.terrain
     rows = lower_evidence(located.evidence(), fix.horizon_error_rad)
     return assess_integrity(rows, fix.position_enu_m[:2], fix.covariance_m2, located.fix, ground)
 

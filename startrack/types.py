@@ -260,5 +260,5 @@ class Fix(Value):
     dropped_probability: float | None = None  # bound on the posterior's part that the search left out; None: no search
     search: str = "proven"  # no other position fits; "beam": not proven to the end; "approximate": no posterior
     horizon_error_rad: float = 0.0  # common to all azimuths: how much higher the true horizon is than the map's
-    shape: tuple[float, float] = (0.0, 0.0)  # of the terrain, as in `Terrain.reshaped`, by the evidence
+    shape_1: tuple[float, float] = (0.0, 0.0)  # of the terrain, as in `Terrain.reshaped`, by the evidence
     clock: ClockError | None = None  # as the evidence shows it; None: not estimated

@@ -219,7 +219,7 @@ def test_randomness_is_explicit() -> None:
     assert not wrong
 
 
-UNITS = re.compile(r"_(m|s|rad|px|adu|e|mag|m2|px2|rad2|m_s|e_per_s|e_per_adu|e_per_px)$")
+UNITS = re.compile(r"_(1|m|s|rad|px|adu|e|mag|m2|px2|rad2|m_s|e_per_s|e_per_adu|e_per_px)$")
 # Pure numbers, and names with a frame instead of a unit.
 UNITLESS = re.compile(r"^(R_\w+_\w+|rays?_(icrs|enu|cam|body)|\w*(snr|llr|nats|weight|probability|mass))$")
 

@@ -89,7 +89,11 @@ def find_blocked(evidence: Evidence, fix: Fix, terrain: Terrain) -> Blocked | No
     sample = np.rint(azimuth * (SAMPLES / (2 * np.pi))).astype(np.int64) % SAMPLES
     above = evidence.elevation_rad[which] - highest[sample]
     counted = above > LEVELS_RAD[0] + MAP_SIGMAS * sigma[sample]
-    above, sector, hidden = above[counted], _sector_of(azimuth[counted]), np.minimum(-evidence.llr[which[counted]], MOST_NATS)
+    above, sector, hidden = (
+        above[counted],
+        _sector_of(azimuth[counted]),
+        np.minimum(-evidence.llr[which[counted]], MOST_NATS),
+    )
     whole, high = (_find_patches(_sum_cells(levels, sector, above, hidden)) for levels in (LEVELS_RAD, HIGH_RAD))
     found = Blocked(whole, high, highest.reshape(COUNT, -1).max(axis=1) + HIGH_RAD[0])
     return found if found else None

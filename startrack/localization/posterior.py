@@ -60,7 +60,7 @@ class ExactPosterior:
         dropped = float(np.exp(min(explored.log_dropped - log_mass, 0.0)))
         fix = summarize(explored.centres_m, 2 * explored.half_m, explored.log_likelihood, dropped, terrain)
         return replace(
-            fix, horizon_error_rad=explored.horizon_bias_rad, search=explored.search, shape=explored.shape,
+            fix, horizon_error_rad=explored.horizon_bias_rad, search=explored.search, shape_1=explored.shape,
             clock=explored.clock,
         )  # fmt: skip
 

@@ -105,7 +105,7 @@ QUANTITIES: tuple[Quantity, ...] = (
       "circle about the position beyond which it is with `protection_risk` at most, also where one of eight groups of "
       "directions shows something that is on no map; null: one group alone holds the position in some direction, or a "
       "method without a posterior", POSITIVE, nullable=True, columns=(Column("protection_level_m", "%.4f"),),
-      shown=(Show("text", "protection", "{:.1f} m"), Show("notebook", "protection level", "{:.1f} m"),
+      shown=(Show("text", "protection", "{:.1f} m"), Show("notebook", "protected", "{:.1f} m"),
              Show("page", "Protection level", "{:,.1f} m"))),
     Q("position.protection_risk", "", Located, lambda v: None if v.integrity is None else RISK,
       "probability of an error beyond `protection_level_m`", CHANCE, nullable=True, optional=True,

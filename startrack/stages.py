@@ -127,9 +127,7 @@ class Oriented(Identified):
     @property
     def warnings(self) -> list[str]:
         """Those of `Inputs`, and the shift of the image."""
-        shift = (
-            f"the image stands {self.centre_shift_px:.2f} px off the centre in the camera file: corrected by the stars"
-        )
+        shift = f"the image stands {self.centre_shift_px:.2f} px off the camera file's centre: corrected by the stars"
         return [*super().warnings, *([shift] if self.centre_shift_px else [])]
 
     @property

@@ -174,3 +174,15 @@ def test_detect_needs_no_camera(located: Any) -> None:
     assert result.status == "ok"
     assert len(result.detections) == pytest.approx(len(located.result.detections), rel=0.1)
     assert result.detections.psf_sigma_px == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("shift_px", [(0.0, 0.0), (0.9, -0.6), (-2.5, 1.5)])
+def test_a_sensor_that_has_moved_is_noticed_and_does_not_move_the_fix(located, catalog, shift_px):
+    known = located.result
+    stated = replace(known.camera, centre_px=tuple(np.add(known.camera.centre_px, shift_px).tolist()))
+    result = pipeline.locate(known.exposure, stated, known.terrain, catalog)
+    assert result.status == "ok"
+    off = result.fix.position_enu_m[:2] - located.truth.position_enu_m[:2]
+    assert np.hypot(*off) < result.fix.radius999_m
+    assert result.centre_shift_px == pytest.approx(np.hypot(*shift_px), abs=0.1)
+    assert any("off the camera file's centre" in text for text in result.warnings) == any(shift_px)

@@ -19,17 +19,19 @@ class WrongTime(NotLocated):
 
     def __init__(self, offset_s: float, sigma_s: float, shown_by: str) -> None:
         super().__init__(
-            f"{shown_by} shows a time about {_duration(offset_s)} {'later' if offset_s > 0 else 'earlier'} than the "
-            f"image's, which is stated to {_duration(sigma_s)}: is it right? (--time-sigma SECONDS states its error)",
+            f"{shown_by} shows a time about {duration(offset_s)} {'later' if offset_s > 0 else 'earlier'} than the "
+            f"image's, which is stated to {duration(sigma_s)}: is it right? (--time-sigma SECONDS states its error)",
             reason="inconsistent_evidence",
         )
 
 
-def _duration(seconds: float) -> str:
-    """In words, to two digits."""
+def duration(seconds: float) -> str:
+    """`seconds` in words, to two digits."""
     size = abs(seconds)
-    unit, factor = ("s", 1.0) if size < 90 else ("minutes", 60.0) if size < 5400 else ("hours", 3600.0)
-    return f"{size / factor:.2g} {unit}"
+    units = (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0), ("s", 1.0))
+    unit, factor = next(((unit, factor) for unit, factor in units if size >= 1.5 * factor), units[-1])
+    value = size / factor
+    return f"{value:.0f} {unit}" if value >= 9.5 else f"{value:.2g} {unit}"
 
 
 def turn_evidence(evidence: Evidence, later_s: float) -> Evidence:

@@ -8,6 +8,7 @@ import numpy as np
 
 from startrack.compilation import announce_compilation
 from startrack.localization.branch_and_bound import Search
+from startrack.localization.clock import clock_matters, duration
 from startrack.localization.clock_posterior import marginalize_clock
 from startrack.localization.explored import BudgetSpent, Explored, log_sum
 from startrack.localization.initial_guess import beam_search, climb_to_best, explains_all_sectors
@@ -58,7 +59,19 @@ class ExactPosterior:
         explored = marginalize_clock(self.explore_shaped, self.explore, evidence, terrain)
         log_mass = log_sum(explored.log_likelihood) + float(np.log(4 * explored.half_m**2))
         dropped = float(np.exp(min(explored.log_dropped - log_mass, 0.0)))
-        fix = summarize(explored.centres_m, 2 * explored.half_m, explored.log_likelihood, dropped, terrain)
+        try:
+            fix = summarize(explored.centres_m, 2 * explored.half_m, explored.log_likelihood, dropped, terrain)
+        except NotLocated as cause:
+            if (
+                evidence.clock is None
+                or cause.reason != "insufficient_geometry"
+                or not clock_matters(evidence.clock, terrain)
+            ):
+                raise
+            raise NotLocated(
+                f"a clock that is right to {duration(evidence.clock.sigma_s)} leaves most of the search area open: "
+                "find the time more exactly (--time-sigma states its error)"
+            ) from cause
         return replace(
             fix, horizon_error_rad=explored.horizon_bias_rad, search=explored.search, shape_1=explored.shape,
             clock=explored.clock,

@@ -70,8 +70,8 @@ def R_body_enu(value: Measured) -> Array:
 def body_sigmas_deg(value: Measured) -> Array:
     """Standard deviations (3,) of heading, pitch and roll [deg] of a measured `value`.
 
-    From the attitude's covariance C of rotations about the camera's axes, J C J^T with the numerical derivative J of
-    the three angles. Not meaningful where the nose points to the zenith: heading and roll are then one angle.
+    From the covariance C of rotations about the camera's axes, J C J^T with the numerical derivative J of the three
+    angles. C is the attitude's among the stars, and the turn of the stars by the error of the clock. Not meaningful where the nose points to the zenith: heading and roll are then one angle.
     """
     angles = [
         np.array(heading_pitch_roll_from_R_body_enu(value.camera.R_body_cam @ R_from_rotvec(step) @ value.R_cam_enu))
@@ -80,7 +80,10 @@ def body_sigmas_deg(value: Measured) -> Array:
     ]
     change = (np.stack(angles[::2]) - np.stack(angles[1::2]) + np.pi) % (2 * np.pi) - np.pi
     jacobian = change.T / (2 * ROTATION_STEP_RAD)
-    return np.degrees(np.sqrt(np.diag(jacobian @ value.attitude.covariance_rad2 @ jacobian.T)))
+    clock = value.fix.clock if isinstance(value, Located) else None
+    by_clock = value.R_cam_enu @ value.clock.turn_rad_s * (value.clock.sigma_s if clock is None else clock.sigma_s)
+    covariance = value.attitude.covariance_rad2 + np.outer(by_clock, by_clock)
+    return np.degrees(np.sqrt(np.diag(jacobian @ covariance @ jacobian.T)))
 
 
 def predicted_visible(value: Located) -> int:

@@ -1,0 +1,91 @@
+"""Pictures with nothing wrong: how many are answered, and which reasons refuse the others.
+
+    python benchmarks/answered.py [--frames 40] [--only shackleton]
+
+Rendered frames of every shipped terrain: places over the whole ground where a camera can stand, exposures that reach
+V 5 to 8, tilts up to 20 degrees, a sky of 18 to 24 mag/arcsec2. Half of the frames of the thesis's crater are within
+200 m of the wall, and no nearer than 20 m.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any
+
+import numpy as np
+from _results import table, write_section
+
+from startrack.camera import Camera, load_camera
+from startrack.catalog import load_catalog
+from startrack.files import data_dir
+from startrack.pipeline import locate
+from startrack.rendering import Series, render
+from startrack.rendering.sources import exposure_for_snr
+from startrack.stages import Located
+from startrack.terrain import Cylinder, load_terrain
+
+SEED, NEAR_WALL_M, WALL_MARGIN_M = 2026, 200.0, 20.0
+TERRAINS = sorted(p.stem for p in data_dir("terrain").glob("*.toml") if "rendered" in p.stem or "thesis" in p.stem)
+
+
+def main() -> None:
+    """Render and locate the frames, print the table; write the section if all terrains were run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, default=40, help="of each terrain")
+    parser.add_argument("--only", nargs="*", default=[], help="terrains whose names hold one of these words")
+    parser.add_argument("-j", "--jobs", type=int, default=2)
+    args = parser.parse_args()
+    names = [name for name in TERRAINS if not args.only or any(word in name for word in args.only)]
+    jobs = [(name, number) for name in names for number in range(args.frames)]
+    with ProcessPoolExecutor(args.jobs) as pool:
+        rows = list(pool.map(measure_frame, jobs, chunksize=4))
+    lines = [summary(name, [row for job, row in zip(jobs, rows, strict=True) if job[0] == name]) for name in names]
+    body = table(["terrain", "frames", "answered", "refused", "mean error, m", "beyond the 99.9 % circle"], lines)
+    print(body)
+    if not args.only:
+        write_section("Answered", f"python benchmarks/answered.py --frames {args.frames}", ("numpy", "scipy"), body)
+
+
+def measure_frame(job: tuple[str, int]) -> dict[str, Any]:
+    """One frame of one terrain."""
+    name, number = job
+    rng = np.random.default_rng([SEED, number, TERRAINS.index(name)])
+    camera, terrain, catalog = load_camera("fisheye-2048"), load_terrain(name), load_catalog()
+    east_m, north_m = (None, None)
+    if isinstance(terrain, Cylinder) and number % 2:
+        azimuth = rng.uniform(0, 2 * np.pi)
+        radius = terrain.diameter_m / 2 - rng.uniform(WALL_MARGIN_M, NEAR_WALL_M)
+        east_m, north_m = float(radius * np.sin(azimuth)), float(radius * np.cos(azimuth))
+    sky = float(rng.uniform(18.0, 24.0))
+    series = Series(
+        camera=camera, terrain=terrain, catalog=catalog, seed=SEED, east_m=east_m, north_m=north_m,
+        exposure_s=exposure_that_reaches(camera, sky, float(rng.uniform(5.0, 8.0))), sky_v_mag_arcsec2=sky,
+        max_tilt_rad=float(np.radians(20.0)),
+    )  # fmt: skip
+    scene, noise = series.scene(number)
+    exposure, truth = render(scene, rng=noise)
+    result = locate(exposure, camera, terrain, catalog)
+    if not isinstance(result, Located) or result.status != "ok":
+        return {"reason": str(result.reason), "message": result.message}
+    error = float(np.linalg.norm(result.fix.position_enu_m[:2] - truth.position_enu_m[:2]))
+    return {"reason": None, "error_m": error, "beyond": error > result.fix.radius999_m}
+
+
+def exposure_that_reaches(camera: Camera, sky_mag: float, v_mag: float) -> float:
+    """Seconds in which a star of that magnitude reaches 5 sigma."""
+    return exposure_for_snr(camera, sky_mag, v_mag=v_mag, snr=5.0)
+
+
+def summary(name: str, rows: list[dict[str, Any]]) -> list[str]:
+    """The table's line of a terrain."""
+    ok = [row for row in rows if row["reason"] is None]
+    reasons = Counter(row["reason"] for row in rows if row["reason"] is not None)
+    why = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()) or "0"
+    mean = f"{np.mean([row['error_m'] for row in ok]):.2f}" if ok else "-"
+    return [name, str(len(rows)), str(len(ok)), why, mean, str(sum(row["beyond"] for row in ok))]
+
+
+if __name__ == "__main__":
+    main()

@@ -71,7 +71,8 @@ def body_sigmas_deg(value: Measured) -> Array:
     """Standard deviations (3,) of heading, pitch and roll [deg] of a measured `value`.
 
     From the covariance C of rotations about the camera's axes, J C J^T with the numerical derivative J of the three
-    angles. C is the attitude's among the stars, and the turn of the stars by the error of the clock. Not meaningful where the nose points to the zenith: heading and roll are then one angle.
+    angles. C is the attitude's among the stars, and the turn of the stars by the error of the clock. Not meaningful
+    where the nose points to the zenith: heading and roll are then one angle.
     """
     angles = [
         np.array(heading_pitch_roll_from_R_body_enu(value.camera.R_body_cam @ R_from_rotvec(step) @ value.R_cam_enu))

@@ -102,9 +102,10 @@ QUANTITIES: tuple[Quantity, ...] = (
       shown=(Show("text", "error", ", {:.1f} m (99.9 %)"), Show("notebook", "99.9 % within", "{:.1f} m"),
              Show("page", "99.9 % within", "{:,.1f} m"))),
     Q("position.protection_level_m", "m", Located, protection_level_m,
-      "circle about the position beyond which it is with `protection_risk` at most, also where one of eight groups of "
-      "directions shows something that is on no map; null: one group alone holds the position in some direction, or a "
-      "method without a posterior", POSITIVE, nullable=True, columns=(Column("protection_level_m", "%.4f"),),
+      "radius about the position beyond which the true one lies with probability `protection_risk` at most, also where "
+      "the directions within 45 degrees of azimuth show something on no map; null: such a group alone holds the "
+      "position in some direction, or a method without a posterior",
+      POSITIVE, nullable=True, columns=(Column("protection_level_m", "%.4f"),),
       shown=(Show("text", "protection", "{:.1f} m"), Show("notebook", "protected", "{:.1f} m"),
              Show("page", "Protection level", "{:,.1f} m"))),
     Q("position.protection_risk", "", Located, lambda v: None if v.integrity is None else RISK,

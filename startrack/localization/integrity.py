@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -18,9 +19,17 @@ from startrack.types import Array, Evidence, Fix, NotLocated
 
 GROUPS = 8  # of azimuth, 45 degrees wide
 DIVISIONS = 3  # into such groups, each turned by 15 degrees: an obstacle of up to 30 degrees is wholly in one group
-RISK = 2e-3  # of an error beyond the protection level: half without an obstacle (the 99.9 % circle), half with one
+RISK = 1e-3  # of an error beyond the protection level: half without an obstacle, half with one
 WRONG_GROUP = 0.05  # probability that one of the groups shows something that is on no map
-GRIDS = ((6.0, 21), (15.0, 21), (40.0, 41))  # reach in sigmas, points across; a wider one where a posterior leaves one
+WIDER_CIRCLE = 1.05  # radius that holds all but half of RISK, in that of the 99.9 % circle; of a normal distribution
+Grid = tuple[float, int]
+COARSE: Grid = (6.0, 13)  # reach in sigmas, and points across, of a grid
+FINE: tuple[Grid, ...] = ((6.0, 21), (15.0, 21), (40.0, 41))  # where the coarse one does not do; wide posteriors last
+    (6.0, 21),
+    (15.0, 21),
+    (40.0, 41),
+)  # where the coarse one does not do; a wider one where a posterior leaves one
+SUSPICIOUS_CHI2 = 9.0  # on the coarse grid, from which on the fine ones decide
 # At 2 sigma from point to point sums over a normal distribution are right to 1 %, at 0.6 sigma to 1e-10.
 NODES = 5  # traced horizons along each side of the grid
 MATCHED = (0.8, 1.25)  # variances of the posterior, in those that the grid is made for
@@ -67,7 +76,10 @@ def assess_integrity(
     likelihood = PositionLikelihood.from_evidence(evidence, terrain)
     groups = _divide(likelihood.sectors.count)
     centre_m, covariance_m2 = _match_grid(likelihood, position_m, covariance_m2)
-    found = _assess(lambda offsets_m: _scores(likelihood, centre_m, offsets_m), covariance_m2, groups, fix)
+    scores = partial(_scores, likelihood, centre_m)
+    found = _assess(scores, covariance_m2, groups, fix, (COARSE,))
+    if not np.isfinite(found.protection_level_m) or found.chi2.max() > SUSPICIOUS_CHI2:
+        found = _assess(scores, covariance_m2, groups, fix)
     _require_agreement(found)
     return found
 
@@ -95,7 +107,7 @@ def _divide(sectors: int) -> Array:
 def _match_grid(likelihood: PositionLikelihood, position_m: Array, covariance_m2: Array) -> tuple[Array, Array]:
     """Mean (2,) and covariance (2, 2) of the posterior by all rows, from guesses of both."""
     for _ in range(MATCH_ROUNDS):
-        offsets_m, _ = _grid(covariance_m2, *GRIDS[0])
+        offsets_m, _ = _grid(covariance_m2, *COARSE)
         log = _scores(likelihood, position_m, offsets_m).sum(axis=1)
         (mean,), (spread,) = _moments(offsets_m, log[:, None])
         unit = np.linalg.inv(np.linalg.cholesky(covariance_m2))
@@ -138,13 +150,15 @@ def _masses(log: Array) -> Array:
     return np.asarray(mass / mass.sum(axis=0))
 
 
-def _assess(scores: Callable[[Array], Array], covariance_m2: Array, groups: Array, fix: Fix) -> Integrity:
+def _assess(
+    scores: Callable[[Array], Array], covariance_m2: Array, groups: Array, fix: Fix, grids: tuple[Grid, ...] = FINE
+) -> Integrity:
     """Integrity from the contributions of the sectors at offsets, `scores`: (n, 2) to (n, sectors).
 
-    `covariance_m2` is about that of the posterior by all sectors, `groups` (m, sectors) says which are in each group.
+    `covariance_m2` is about that of the posterior by all sectors, `groups` (m, sectors) has 1 for those of a group.
     """
     mean, without = np.full((len(groups), 2), np.nan), np.full((len(groups), 2, 2), np.inf)
-    for number, (reach_sigmas, across) in enumerate(GRIDS):
+    for number, (reach_sigmas, across) in enumerate(grids):
         offsets_m, is_rim = _grid(covariance_m2, reach_sigmas, across)
         by_sector = scores(offsets_m)
         whole = by_sector.sum(axis=1)[:, None]
@@ -173,7 +187,7 @@ def _conclude(best: Array, covariance: Array, mean: Array, without: Array, fix: 
     first = np.arange(GROUPS) / GROUPS + np.arange(DIVISIONS)[:, None] / (DIVISIONS * GROUPS)
     return Integrity(
         2 * np.pi * first.ravel(), separation, chi2, part / max(part.sum(), np.finfo(float).tiny),
-        max(float(level.max()), fix.radius999_m),
+        max(float(level.max()), WIDER_CIRCLE * fix.radius999_m),
     )  # fmt: skip
 
 

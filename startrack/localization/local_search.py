@@ -101,10 +101,8 @@ class LocalLikelihood:
         sigma, sector = self.sigma_rad[which], self.sector[which]
         settled = self._settled_at(np.ascontiguousarray(points_m), None) + self.ceiling
         horizon = self.ground.horizon_rad(points_m[:, None], e.azimuth_rad)
-        found = np.empty((len(points_m), settled.shape[1]))
-        for k in range(len(points_m)):
-            value = contributions(e.llr, e.extended_nats, e.elevation_rad, horizon[k], sigma)
-            found[k] = settled[k % len(settled)] + np.bincount(sector, weights=value, minlength=settled.shape[1])
+        found = np.array(np.broadcast_to(settled, (len(points_m), settled.shape[1])))
+        _add_rows(e.elevation_rad, e.llr, e.extended_nats, sigma, sector, horizon, found)
         return found
 
     def with_terrain(self, terrain: Terrain) -> LocalLikelihood:
@@ -166,6 +164,18 @@ def turn_rays(evidence: Evidence, rotvec_rad: Array) -> Evidence:
 def rays_of(evidence: Evidence) -> tuple[Array, Array]:
     """Azimuths and elevations (n,), (n,) [rad]."""
     return evidence.azimuth_rad, evidence.elevation_rad
+
+
+@njit(cache=True, nogil=True)
+def _add_rows(elevation, llr, extended, sigma, sector, horizon, found):
+    """Add to found (n, sectors) the rows' contributions where their horizons (n, rows) stand."""
+    for p in range(len(found)):
+        for k in range(len(llr)):
+            margin = elevation[k] - horizon[p, k]
+            if sigma[k] > 0.0:
+                found[p, sector[k]] += row_contribution(llr[k], extended[k], margin / sigma[k], 0)
+            elif margin > 0.0:
+                found[p, sector[k]] += llr[k]
 
 
 @njit(cache=True, nogil=True)

@@ -24,11 +24,8 @@ WRONG_GROUP = 0.05  # probability that one of the groups shows something that is
 WIDER_CIRCLE = 1.05  # radius that holds all but half of RISK, in that of the 99.9 % circle; of a normal distribution
 Grid = tuple[float, int]
 COARSE: Grid = (6.0, 13)  # reach in sigmas, and points across, of a grid
-FINE: tuple[Grid, ...] = ((6.0, 21), (15.0, 21), (40.0, 41))  # where the coarse one does not do; wide posteriors last
-    (6.0, 21),
-    (15.0, 21),
-    (40.0, 41),
-)  # where the coarse one does not do; a wider one where a posterior leaves one
+# Where the coarse grid does not do: closer points, and wider grids for wide posteriors.
+FINE: tuple[Grid, ...] = ((6.0, 21), (15.0, 21), (40.0, 41))
 SUSPICIOUS_CHI2 = 9.0  # on the coarse grid, from which on the fine ones decide
 # At 2 sigma from point to point sums over a normal distribution are right to 1 %, at 0.6 sigma to 1e-10.
 NODES = 5  # traced horizons along each side of the grid

@@ -35,6 +35,7 @@ RIM_PART, RIM_MASS = 0.9, 1e-3  # of the grid's reach; a posterior with more mas
 CHUNK = 100  # points at which all rows are summed at once
 MOST_CHI2 = 30.0  # of a separation (two coordinates); of 540 true positions of simulated stars the largest was 27
 NEGLIGIBLE_SIGMAS = 0.7  # of the fix, added to the error of a separation: smaller ones are in its circle anyway
+LEAST_PART = 1e-9  # of the covariance, added so that one on a single point of a grid can be inverted
 MARGIN_M = 2.0  # of the neighbourhood beyond the grid
 CARRIED_PART = 0.5  # of the information, by the groups that are named
 
@@ -179,7 +180,7 @@ def _conclude(best: Array, covariance: Array, mean: Array, without: Array, fix: 
     spread = np.sqrt(-2.0 * np.log(0.5 * RISK / WRONG_GROUP) * np.linalg.eigvalsh(without[held] + shared)[:, 1])
     level[held] = np.linalg.norm(separation[held], axis=1) + spread
     known = np.zeros_like(without)
-    known[held] = np.linalg.inv(without[held])
+    known[held] = np.linalg.inv(without[held] + LEAST_PART * covariance)
     part = np.maximum(2.0 - np.einsum("gij,ij->g", known[:GROUPS], covariance), 0.0)
     first = np.arange(GROUPS) / GROUPS + np.arange(DIVISIONS)[:, None] / (DIVISIONS * GROUPS)
     return Integrity(

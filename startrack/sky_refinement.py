@@ -20,6 +20,7 @@ from startrack.localization.explored import Explored
 from startrack.localization.integrity import assess_integrity
 from startrack.localization.refinement import horizon_slopes, refine_fix
 from startrack.localization.skyline_fit import SkylineFit, fit_skyline
+from startrack.localization.summary import camera_at
 from startrack.sky_errors import shared_errors
 from startrack.stages import Located, Measured
 from startrack.types import Array, Bools, Clock, ClockError, Evidence, Fix, NotLocated
@@ -85,7 +86,7 @@ def _check_clock(located: Located) -> None:
     shown = _clock_error(there.clock, fit)
     variance = clock.sigma_s**2 + fit.excess * shown.sigma_s**2 + (CLOCK_FLOOR_RAD / turn) ** 2
     if shown.offset_s**2 > 2 * CLOCK_GAIN_NATS * variance:
-        raise WrongTime(shown.offset_s, clock.sigma_s, "the light of the sky")
+        raise WrongTime(replace(shown, sigma_s=shown.sigma_s * fit.excess**0.5), clock.sigma_s, "the light of the sky")
 
 
 def _refine(located: Located, stars: bool) -> Located:
@@ -114,7 +115,10 @@ def _refine(located: Located, stars: bool) -> Located:
     refined = replace(refined, clock=refined.clock or _clock_error(there.clock, fit))
     if not stars:
         refined = replace(refined, search="beam", dropped_probability=1.0)
-    return replace(there, fix=refined, sky_light=sky, skyline_fit=fit, integrity=integrity, by_stars=stars)
+    at_time = replace(there.fix_at_time, position_enu_m=camera_at(position, terrain)) if by_arc else there.fix_at_time
+    return replace(
+        there, fix=refined, fix_at_time=at_time, sky_light=sky, skyline_fit=fit, integrity=integrity, by_stars=stars
+    )
 
 
 def _over_arc(located: Located) -> Callable[[Explored], Explored]:

@@ -27,7 +27,7 @@ def measured_skyline(located: Located) -> MeasuredSkyline | None:
     """
     if located.fix.ambiguous or located.fix.search == "approximate":
         return None
-    horizon = Skyline.trace(located.fix.position_enu_m[:2], located.terrain)
+    horizon = Skyline.trace(located.position_at_time_m, located.terrain)
     elevation, sigma = _by_stars(located.evidence(), horizon)
     source = np.where(sigma < MOST_SIGMA_RAD, "stars", "").astype("<U9")
     if located.sky_light is not None and located.skyline_fit is not None:

@@ -22,7 +22,15 @@ from startrack.errors import Reason
 from startrack.evidence import DamagedResponse, SkyLight, StarEvidence, StarPhotometry
 from startrack.frames import R_from_rotvec, Site
 from startrack.identification import Identifier
-from startrack.localization import Blocked, ExactPosterior, Integrity, Localizer, SkylineFit, require_localizer
+from startrack.localization import (
+    Blocked,
+    ExactPosterior,
+    Integrity,
+    Localizer,
+    SkylineFit,
+    clock_matters,
+    require_localizer,
+)
 from startrack.terrain import Terrain
 from startrack.types import (
     Array,
@@ -191,6 +199,15 @@ class Located(Measured):
     sky_brightness_mag_arcsec2: float | None = (
         None  # of the sky beyond the ground at the skyline; None: no step, no zero point
     )
+
+    @property
+    def position_at_time_m(self) -> Array:
+        """East and north (2,) at the time of `R_enu_icrs`: where the skyline and the stars are compared.
+
+        In a round crater the error of the clock spreads the position over an arc, whose mean lies beside it.
+        """
+        on_arc = self.terrain.axisymmetric and clock_matters(self.clock, self.terrain)
+        return np.asarray((self.fix_at_time if on_arc else self.fix).position_enu_m[:2])
 
     @property
     def evidence_source(self) -> str:

@@ -26,6 +26,7 @@ NOISE_PER_RAD = np.degrees(0.5)  # density of steps of 3 sigma that are noise
 SKY_PER_RAD, SKY_CONTRAST = np.degrees(0.08), 0.12  # density of steps in the sky (clouds, reflections), and their scale
 RARE_PER_RAD = np.degrees(3e-4)  # of sharp ones in the sky: wires, halos of bright stars
 GROUND_PER_RAD, GROUND_CONTRAST = np.degrees(0.3), 0.15  # density of steps below the skyline, and their scale
+MOST_MISSING = 0.999  # probability that a visible star is not seen
 LOW_MISSING, LOW_SCALE_RAD = 0.4, np.radians(3.0)  # near the horizon: haze dims stars more than the fit
 HIGH_1_PER_RAD = 4.0  # per column; neighbours add up
 LEAST_LLR = 0.25  # rows below it are left out
@@ -58,6 +59,7 @@ def star_log_likelihood(rays: Evidence, missing: float, spurious: float) -> Arra
     elevation = elevations_rad()
     n = len(elevation)
     low = missing + LOW_MISSING * np.exp(-np.maximum(rays.elevation_rad, 0.0) / LOW_SCALE_RAD)
+    low = np.minimum(low, MOST_MISSING)
     limited = limit_llr(rays.llr, low, spurious)
     use = (np.abs(limited) > LEAST_LLR) & (rays.elevation_rad > LOWEST_RAD) & (rays.elevation_rad < elevation[-1])
     rays, limited = rays.take(use), limited[use]

@@ -8,19 +8,25 @@ import numpy as np
 
 from startrack.localization.local_search import turn_rays
 from startrack.terrain import Terrain
-from startrack.types import Clock, Evidence, NotLocated
+from startrack.types import Clock, ClockError, Evidence, NotLocated
 
 REACH_SIGMAS = 4.0  # of the stated error, to the last time that is tried
 NEGLIGIBLE_M = 0.05  # by which a row may move over the search area, within one sigma, without an effect on the fix
 
 
 class WrongTime(NotLocated):
-    """The evidence shows a time that the stated one, with its error, excludes."""
+    """The evidence shows a time that the stated one, with its error, excludes.
 
-    def __init__(self, offset_s: float, sigma_s: float, shown_by: str) -> None:
+    `shown` is the time's offset from the stated one, with an infinite sigma where it is rough; `sigma_s` is stated.
+    """
+
+    def __init__(self, shown: ClockError, sigma_s: float, shown_by: str) -> None:
+        size = f"about {duration(shown.offset_s)}"
+        if np.isfinite(shown.sigma_s):
+            size = f"{duration(shown.offset_s)} (sigma {duration(shown.sigma_s)})"
         super().__init__(
-            f"{shown_by} shows a time about {duration(offset_s)} {'later' if offset_s > 0 else 'earlier'} than the "
-            f"image's, which is stated to {duration(sigma_s)}: is it right? (--time-sigma SECONDS states its error)",
+            f"{shown_by} shows a time {size} {'later' if shown.offset_s > 0 else 'earlier'} than the image's, which is "
+            f"stated to {duration(sigma_s)}: is it right? (--time-sigma SECONDS states its error)",
             reason="inconsistent_evidence",
         )
 

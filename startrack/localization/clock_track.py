@@ -7,22 +7,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.localization.clock import REACH_SIGMAS, turn_evidence
+from startrack.localization.clock import REACH_SIGMAS, duration, turn_evidence
 from startrack.localization.explored import Explored
 from startrack.localization.initial_guess import BEAMS, CLIMBS, LAST_STEP_M, beam_search
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.nuisance import estimate_horizon_bias, lower_evidence
 from startrack.terrain import Terrain
-from startrack.types import Array, Clock, Evidence, NotLocated
+from startrack.types import Array, Clock, Evidence, Ints, NotLocated
 
 Explore = Callable[[Evidence, Terrain], Explored]
 Node = tuple[float, Array]  # log-likelihood with the prior [nats], and position (2,)
 
 STEP_RAD = np.radians(0.13)  # of the turn between two times; a position is followed over it
 STEP_ON_ARC_RAD = np.radians(1.0)
+MOST_SCANNED = 250  # of these times: 65 degrees of turn, five days on the Moon
 SCAN_STEPS = 2  # between the times at which a position is searched for from nothing
 LIKELY_NATS = 10.0  # less than the best: a time still matters
 TRACKED_NATS = 30.0  # less than the best: a position is not followed further
+JUMP = 4.0  # times the usual way between two times, from which on the positions are two
 FINE_TIMES = 1500  # to which the shares and positions are interpolated
 
 
@@ -38,12 +40,34 @@ class Track:
     def likely_way(self) -> tuple[Array, Array, Array]:
         """Times (n,) that matter [s later], the logarithm of their share (n,), and the best positions (n, 2)."""
         nodes = self._nodes()
-        times = np.array(sorted(nodes))
-        log_share = np.array([nodes[k][0] for k in times])
-        way_m = np.array([nodes[k][1] for k in times])
-        if len(times) == 1:
-            return times * self.step_s, log_share, way_m
-        return _interpolate_way(times * self.step_s, log_share, way_m)
+        numbers = np.array(sorted(nodes))
+        log_share = np.array([nodes[k][0] for k in numbers])
+        way_m = np.array([nodes[k][1] for k in numbers])
+        apart = np.linalg.norm(np.diff(way_m, axis=0), axis=1) > JUMP * self.step_s * self._speed_m_s
+        runs = np.split(np.arange(len(numbers)), np.flatnonzero((np.diff(numbers) > 1) | apart) + 1)
+        parts = [self._fine_run(numbers[run], log_share[run], way_m[run], len(numbers)) for run in runs]
+        later_s, log_share, way_m = (np.concatenate([part[i] for part in parts]) for i in range(3))
+        keep = log_share > log_share.max() - LIKELY_NATS
+        return later_s[keep], log_share[keep], way_m[keep]
+
+    @property
+    def _speed_m_s(self) -> float:
+        """By which a turn of the sky about a middle as far as the search area moves a position."""
+        return float(np.linalg.norm(self.clock.turn_rad_s)) * self.terrain.reach_m
+
+    def _fine_run(self, numbers: Ints, log_share: Array, way_m: Array, of: int) -> tuple[Array, Array, Array]:
+        """Finer times, their shares and positions, between neighbouring nodes whose positions hang together."""
+        from scipy.interpolate import PchipInterpolator
+
+        each = max(FINE_TIMES // of, 1)
+        fine = (np.arange(len(numbers) * each) + 0.5) / each - 0.5  # each node stands for as much time
+        fine = np.clip(fine, 0.0, len(numbers) - 1.0)
+        later_s = (numbers[0] + fine) * self.step_s
+        if len(numbers) == 1:
+            return later_s, np.repeat(log_share, each), np.repeat(way_m, each, axis=0)
+        at = np.arange(len(numbers))
+        share = self.clock.log_prior(later_s) if self.terrain.axisymmetric else PchipInterpolator(at, log_share)(fine)
+        return later_s, np.asarray(share), np.asarray(PchipInterpolator(at, way_m)(fine))
 
     @property
     def limits_s(self) -> tuple[float, float]:
@@ -89,6 +113,11 @@ class Track:
         if self.terrain.axisymmetric:
             return [(middle, np.zeros(2))]
         wanted = range(low, high + 1, SCAN_STEPS) if high - low > 2 * SCAN_STEPS else [middle]
+        if len(wanted) > MOST_SCANNED:
+            raise NotLocated(
+                f"a clock that is right to {duration(self.clock.sigma_s)} leaves too many times to search on this "
+                "terrain: find the time more exactly (--time-sigma states its error)"
+            )
         found = []
         for k in wanted:
             likelihood = self._likelihood(k)
@@ -129,13 +158,3 @@ class Track:
 
     def _likelihood(self, number: int) -> PositionLikelihood:
         return PositionLikelihood.from_evidence(turn_evidence(self.evidence, number * self.step_s), self.terrain)
-
-
-def _interpolate_way(times_s: Array, log_share: Array, way_m: Array) -> tuple[Array, Array, Array]:
-    """Times, shares and positions at finer steps; times that do not matter are left out."""
-    from scipy.interpolate import PchipInterpolator
-
-    fine = np.linspace(times_s[0], times_s[-1], FINE_TIMES)
-    log_fine = PchipInterpolator(times_s, log_share)(fine)
-    keep = log_fine > log_fine.max() - LIKELY_NATS
-    return fine[keep], log_fine[keep], PchipInterpolator(times_s, way_m)(fine[keep])

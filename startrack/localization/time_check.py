@@ -8,7 +8,7 @@ from startrack.localization.clock import REACH_SIGMAS, WrongTime
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.local_search import turn_rays
 from startrack.localization.refit import STEPS_M, refitted_gain
-from startrack.types import Array, Clock
+from startrack.types import Array, Clock, ClockError
 
 TURNS_RAD = np.radians([0.55, 1.1, -0.55, -1.1])  # an hour turns the Moon's sky by 0.55 degrees
 NEARBY_M, LEEWAY_RAD = 40.0, np.radians(0.2)
@@ -27,7 +27,7 @@ def check_time(likelihood: PositionLikelihood, position_m: Array, clock: Clock) 
     azimuths = likelihood.evidence.azimuth_rad[strong]
     sigma = float(np.median(likelihood.terrain.horizon_sigma_rad(position_m[None], azimuths)))
     if gain > GAIN_NATS * (1 + sigma / MAP_SIGMA_RAD):
-        raise WrongTime(clock.offset_s + later_s, clock.sigma_s, "the skyline among the stars")
+        raise WrongTime(ClockError(clock.offset_s + later_s, np.inf), clock.sigma_s, "the skyline among the stars")
 
 
 def best_time(likelihood: PositionLikelihood, position_m: Array, clock: Clock) -> tuple[float, float]:

@@ -27,6 +27,14 @@ class Angle(float):
         return format(0.0, spec) if text == format(360.0, spec) else text
 
 
+def skyline_position_m(value: Located) -> tuple[float, float]:
+    """East and north [m] of the position whose skyline a located `value` is compared with."""
+    if value.fix.ambiguous:
+        return best_position_m(value.fix)
+    east_m, north_m = value.position_at_time_m
+    return float(east_m), float(north_m)
+
+
 def best_position_m(fix: Fix) -> tuple[float, float]:
     """East and north [m] of the position of a `fix`, or of its heaviest mode where several positions fit."""
     if fix.ambiguous:
@@ -91,7 +99,7 @@ def predicted_visible(value: Located) -> int:
     """Number of stars of a located `value` that were measured and are above the skyline of the fix."""
     if value not in _predicted_visible:  # horizons of a height map take time, and several outputs need this number
         light = value.light
-        horizon = value.terrain.horizon_rad(np.array([best_position_m(value.fix)]), light.azimuth_rad)
+        horizon = value.terrain.horizon_rad(np.array([skyline_position_m(value)]), light.azimuth_rad)
         _predicted_visible[value] = int((light.usable & (light.elevation_rad > horizon)).sum())
     return _predicted_visible[value]
 

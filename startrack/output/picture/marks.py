@@ -23,7 +23,7 @@ from startrack.output.picture.canvas import (
     mix_colours,
 )
 from startrack.output.star_table import names_of, status_of
-from startrack.output.values import R_body_enu, best_position_m
+from startrack.output.values import R_body_enu, skyline_position_m
 from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented
 from startrack.types import Array, Bools, Ints
 
@@ -125,7 +125,7 @@ def _is_below_skyline(value: Inputs, ray_icrs: Array) -> bool:
     if not isinstance(value, Located):
         return False
     azimuth, elevation = azel_from_rays(value.R_enu_icrs @ ray_icrs)
-    horizon = value.terrain.horizon_rad(np.array([best_position_m(value.fix)]), np.array([azimuth]))
+    horizon = value.terrain.horizon_rad(np.array([skyline_position_m(value)]), np.array([azimuth]))
     return bool(elevation < horizon[0])
 
 
@@ -218,7 +218,7 @@ def _canvas_at(view: View, value: Measured, azimuth_rad: float, elevation_deg: f
 
 
 def _horizon(value: Located) -> Array:
-    return value.terrain.horizon_rad(np.array([best_position_m(value.fix)]), AZIMUTHS_RAD)
+    return value.terrain.horizon_rad(np.array([skyline_position_m(value)]), AZIMUTHS_RAD)
 
 
 def _project(value: Measured, azimuth_rad: Array, elevation_rad: Array) -> tuple[Array, Bools]:

@@ -136,7 +136,7 @@ def skyline_picture(skyline: MeasuredSkyline) -> NDArray[np.uint8]:
 def located_picture(value: Located, skyline: MeasuredSkyline) -> NDArray[np.uint8]:
     """The `skyline` (H, W, 3) of a located image on the horizon of its terrain, and its height above that, enlarged."""
     canvas = Canvas(WIDTH_PX, HEIGHT_PX + ENLARGED_PX)
-    horizon = Skyline.trace(value.fix.position_enu_m[:2], value.terrain)
+    horizon = Skyline.trace(value.position_at_time_m, value.terrain)
     light, status = value.light, status_of(value.light)
     decided = np.isin(status, ("seen", "hidden"))  # brightest first
     azimuth_rad, elevation_rad, status = light.azimuth_rad[decided], light.elevation_rad[decided], status[decided]

@@ -111,7 +111,10 @@ def _refine(located: Located, stars: bool) -> Located:
     moved = refined.position_enu_m[:2] - located.fix.position_enu_m[:2]
     if moved @ np.linalg.solve(located.fix.covariance_m2 + refined.covariance_m2, moved) > MOST_STARS_CHI2:
         raise NoSkyLight("the stars contradict it")
-    integrity = assess_integrity(rows, position, fit.step_covariance, refined, terrain)
+    middle, by_rows = refined.position_enu_m[:2], refined.covariance_m2 - smear
+    if refined.clock is not None or np.linalg.eigvalsh(by_rows)[0] <= 0.0:  # spread over an arc, or all smear
+        middle, by_rows = position, fit.step_covariance
+    integrity = assess_integrity(rows, middle, by_rows, refined, terrain)
     refined = replace(refined, clock=refined.clock or _clock_error(there.clock, fit))
     if not stars:
         refined = replace(refined, search="beam", dropped_probability=1.0)

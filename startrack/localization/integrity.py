@@ -30,6 +30,7 @@ SUSPICIOUS_CHI2 = 9.0  # on the coarse grid, from which on the fine ones decide
 # At 2 sigma from point to point sums over a normal distribution are right to 1 %, at 0.6 sigma to 1e-10.
 NODES = 5  # traced horizons along each side of the grid
 MATCHED = (0.8, 1.25)  # variances of the posterior, in those that the grid is made for
+CENTRED = 0.5  # sigmas, from the middle of the grid to that of the posterior
 MATCH_ROUNDS, WIDER_PART = 8, 0.02  # a grid too coarse or too small is replaced; part of its variance that stays
 RIM_PART, RIM_MASS = 0.9, 1e-3  # of the grid's reach; a posterior with more mass beyond is not on the grid
 CHUNK = 100  # points at which all rows are summed at once
@@ -73,9 +74,9 @@ def assess_integrity(
     """
     likelihood = PositionLikelihood.from_evidence(evidence, terrain)
     groups = _divide(likelihood.sectors.count)
-    centre_m, covariance_m2 = _match_grid(likelihood, position_m, covariance_m2)
+    centre_m, covariance_m2, by_sector = _match_grid(likelihood, position_m, covariance_m2)
     scores = partial(_scores, likelihood, centre_m)
-    found = _assess(scores, covariance_m2, groups, fix, (COARSE,))
+    found = _assess(lambda _: by_sector, covariance_m2, groups, fix, (COARSE,))
     if not np.isfinite(found.protection_level_m) or found.chi2.max() > SUSPICIOUS_CHI2:
         found = _assess(scores, covariance_m2, groups, fix)
     _require_agreement(found)
@@ -102,18 +103,19 @@ def _divide(sectors: int) -> Array:
     return np.asarray(group[:, None] == np.arange(GROUPS)[:, None], dtype=np.float64).reshape(-1, sectors)
 
 
-def _match_grid(likelihood: PositionLikelihood, position_m: Array, covariance_m2: Array) -> tuple[Array, Array]:
-    """Mean (2,) and covariance (2, 2) of the posterior by all rows, from guesses of both."""
-    for _ in range(MATCH_ROUNDS):
+def _match_grid(likelihood: PositionLikelihood, position_m: Array, covariance_m2: Array) -> tuple[Array, Array, Array]:
+    """Position (2,) and covariance (2, 2) whose coarse grid fits the posterior by all rows, and the scores there."""
+    for number in range(MATCH_ROUNDS):
         offsets_m, _ = _grid(covariance_m2, *COARSE)
-        log = _scores(likelihood, position_m, offsets_m).sum(axis=1)
-        (mean,), (spread,) = _moments(offsets_m, log[:, None])
+        by_sector = _scores(likelihood, position_m, offsets_m)
+        (mean,), (spread,) = _moments(offsets_m, by_sector.sum(axis=1)[:, None])
         unit = np.linalg.inv(np.linalg.cholesky(covariance_m2))
         variances = np.linalg.eigvalsh(unit @ spread @ unit.T)
-        position_m, covariance_m2 = position_m + mean, spread + WIDER_PART * covariance_m2
-        if MATCHED[0] < variances[0] and variances[1] < MATCHED[1]:
+        off = float(np.linalg.norm(unit @ mean))
+        if number == MATCH_ROUNDS - 1 or (MATCHED[0] < variances[0] and variances[1] < MATCHED[1] and off < CENTRED):
             break
-    return position_m, covariance_m2
+        position_m, covariance_m2 = position_m + mean, spread + WIDER_PART * covariance_m2
+    return position_m, covariance_m2, by_sector
 
 
 def _grid(covariance_m2: Array, reach_sigmas: float, across: int) -> tuple[Array, Array]:

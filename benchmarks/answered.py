@@ -9,13 +9,11 @@ V 5 to 8, tilts up to 20 degrees, a sky of 21 to 24 mag/arcsec2. Half of the fra
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import numpy as np
-from _results import table, write_section
+from _classes import run_classes
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
@@ -33,20 +31,8 @@ TERRAINS = sorted(p.stem for p in data_dir("terrain").glob("*.toml") if "rendere
 
 def main() -> None:
     """Render and locate the frames, print the table; write the section if all terrains were run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, default=40, help="of each terrain")
-    parser.add_argument("--only", nargs="*", default=[], help="terrains whose names hold one of these words")
-    parser.add_argument("-j", "--jobs", type=int, default=2)
-    args = parser.parse_args()
-    names = [name for name in TERRAINS if not args.only or any(word in name for word in args.only)]
-    jobs = [(name, number) for name in names for number in range(args.frames)]
-    with ProcessPoolExecutor(args.jobs) as pool:
-        rows = list(pool.map(measure_frame, jobs, chunksize=4))
-    lines = [summary(name, [row for job, row in zip(jobs, rows, strict=True) if job[0] == name]) for name in names]
-    body = table(["terrain", "frames", "answered", "refused", "mean error, m", "beyond the 99.9 % circle"], lines)
-    print(body)
-    if not args.only:
-        write_section("Answered", f"python benchmarks/answered.py --frames {args.frames}", ("numpy", "scipy"), body)
+    head = ["terrain", "frames", "answered", "refused", "mean error, m", "beyond the 99.9 % circle"]
+    run_classes(__file__, __doc__, "Answered", TERRAINS, 40, head, measure_frame, summary)
 
 
 def measure_frame(job: tuple[str, int]) -> dict[str, Any]:

@@ -8,14 +8,12 @@ Rendered frames of the thesis's crater (5 sigma at V 6, sky 7 % of the backgroun
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import numpy as np
+from _classes import run_classes
 from _file_hazards import CAMERA_HAZARDS, CLOCK_HAZARDS, TERRAIN_HAZARDS
-from _results import table, write_section
 from _sky_scenes import EXPOSURE_S, camera_for_share
 from _sky_view import expose
 from _view_hazards import VIEW_HAZARDS
@@ -32,20 +30,8 @@ SEED, SHARE = 1907, 0.07
 
 def main() -> None:
     """Run the classes, print the table; write the section if all were run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, default=24, help="of each class")
-    parser.add_argument("--only", nargs="*", default=[], help="classes whose names hold one of these words")
-    parser.add_argument("-j", "--jobs", type=int, default=2)
-    args = parser.parse_args()
-    names = [name for name in HAZARDS if not args.only or any(word in name for word in args.only)]
-    jobs = [(name, number) for name in names for number in range(args.frames)]
-    with ProcessPoolExecutor(args.jobs) as pool:
-        rows = list(pool.map(measure_frame, jobs, chunksize=2))
-    lines = [summary(name, [r for (n, _), r in zip(jobs, rows, strict=True) if n == name]) for name in names]
-    body = table(["class", "frames", "answered rightly", "refused", "beyond the 99.9 % circle"], lines)
-    print(body)
-    if not args.only:
-        write_section("Hazards", f"python benchmarks/hazards.py --frames {args.frames}", ("numpy", "scipy"), body)
+    head = ["class", "frames", "answered rightly", "refused", "beyond the 99.9 % circle"]
+    run_classes(__file__, __doc__, "Hazards", list(HAZARDS), 24, head, measure_frame, summary)
 
 
 def measure_frame(job: tuple[str, int]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import numpy as np
 from startrack.evidence.sky_light import MIDDLES_RAD, SkyLight
 from startrack.evidence.sky_step import Horizon
 from startrack.evidence.star_offsets import OFFSET_TERMS, StarOffsets, measure_star_offsets, offset_terms
-from startrack.frames import R_from_rotvec, azel_from_rays, rays_from_azel
+from startrack.frames import R_from_rotvec, turn_azel
 from startrack.localization.skyline_fit import SharedErrors
 from startrack.stages import Measured
 from startrack.terrain import Terrain
@@ -56,8 +56,8 @@ def _raised_by_clock(horizon: Horizon, clock: Clock) -> Array:
     step_s = TURN_STEP_RAD / float(np.linalg.norm(clock.turn_rad_s))
     raised = []
     for later_s in (-step_s, step_s):
-        rays = rays_from_azel(MIDDLES_RAD, horizon(MIDDLES_RAD)) @ R_from_rotvec(later_s * clock.turn_rad_s).T
-        azimuth, elevation = azel_from_rays(rays)
+        R = R_from_rotvec(later_s * clock.turn_rad_s)
+        azimuth, elevation = turn_azel(MIDDLES_RAD, horizon(MIDDLES_RAD), R)
         raised.append(horizon(azimuth) - elevation)
     return np.asarray(raised[1] - raised[0]) / (2 * step_s)
 

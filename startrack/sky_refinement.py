@@ -56,9 +56,9 @@ def refine_by_sky_light(located: Located, stars: bool = True) -> Located:
         if not located.terrain.axisymmetric:
             _check_clock(located)
         return _refine(located, stars)
+    except WrongTime:
+        raise
     except (NoSkyLight, NotLocated) as cause:
-        if isinstance(cause, WrongTime):
-            raise
         if not stars:
             raise NotLocated(f"the light of the sky gives no position: {cause}") from cause
         return replace(located, sky_unused=str(cause))

@@ -12,7 +12,7 @@ from startrack.evidence.flux_scale import FluxScale
 from startrack.evidence.likelihood_ratio import gaussian_llr, visibility_llr
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure
 from startrack.exposure import touch_masked
-from startrack.frames import angle_between_rad, azel_from_rays, off_axis_rad, rays_from_azel
+from startrack.frames import angle_between_rad, azel_from_rays, off_axis_rad, turn_azel
 from startrack.psf import noise_area_px
 from startrack.types import Array, Body, Bools, Detections, Evidence, Ints, Stars
 
@@ -63,7 +63,7 @@ class StarPhotometry:
 
     def turned(self, R: Array) -> StarPhotometry:
         """The same under a sky turned by a rotation `R` (3, 3) in enu."""
-        azimuth, elevation = azel_from_rays(rays_from_azel(self.azimuth_rad, self.elevation_rad) @ R.T)
+        azimuth, elevation = turn_azel(self.azimuth_rad, self.elevation_rad, R)
         return replace(self, azimuth_rad=azimuth, elevation_rad=elevation)
 
     def replace_stars(self, newer: StarPhotometry, which: Ints) -> StarPhotometry:

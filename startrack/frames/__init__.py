@@ -12,6 +12,7 @@ from startrack.frames.rays import (
     off_axis_rad,
     rays_from_azel,
     refract_rad,
+    turn_azel,
 )
 from startrack.frames.rotations import (
     R_body_enu_from_heading_pitch_roll,
@@ -68,5 +69,6 @@ __all__ = [
     "rays_from_azel",
     "refract_rad",
     "sky_rotvec_rad",
+    "turn_azel",
     "wahba",
 ]

@@ -67,6 +67,11 @@ def aberrate(rays_icrs: ArrayLike, velocity_m_s: ArrayLike) -> Array:
     return np.stack([x / length, y / length, z / length], axis=-1)
 
 
+def turn_azel(azimuth_rad: Array, elevation_rad: Array, R: Array) -> tuple[Array, Array]:
+    """Azimuth and elevation (n,), (n,) of the directions `azimuth_rad`, `elevation_rad` (n,) turned by `R` (3, 3)."""
+    return azel_from_rays(rays_from_azel(azimuth_rad, elevation_rad) @ R.T)
+
+
 def refract_rad(elevation_rad: ArrayLike, pressure_hpa: float = 1010.0, temperature_c: float = 10.0) -> Array:
     """Apparent elevation (...) in the Earth's air of a source at true elevation `elevation_rad` [rad].
 

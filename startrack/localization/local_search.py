@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from startrack.frames import R_from_rotvec, azel_from_rays, rays_from_azel
+from startrack.frames import R_from_rotvec, turn_azel
 from startrack.kernels import njit
 from startrack.localization.prefix_sums import PrefixSums
 from startrack.localization.score_kernel import log_mixtures, score_disks
@@ -157,7 +157,7 @@ class LocalLikelihood:
 
 def turn_rays(evidence: Evidence, rotvec_rad: Array) -> Evidence:
     """The rows with their directions turned by a rotation vector (3,) in enu."""
-    azimuth, elevation = azel_from_rays(rays_from_azel(*rays_of(evidence)) @ R_from_rotvec(rotvec_rad).T)
+    azimuth, elevation = turn_azel(*rays_of(evidence), R_from_rotvec(rotvec_rad))
     return replace(evidence, azimuth_rad=azimuth, elevation_rad=elevation)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import timedelta
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from startrack import pipeline
 from startrack.catalog import StarCatalog, load_catalog
-from startrack.frames import azel_from_rays
+from startrack.frames import R_enu_icrs, azel_from_rays
 from startrack.stages import Located, Outcome
 from startrack.types import Exposure
 
@@ -186,3 +187,24 @@ def test_a_sensor_that_has_moved_is_noticed_and_does_not_move_the_fix(located, c
     assert np.hypot(*off) < result.fix.radius999_m
     assert result.centre_shift_px == pytest.approx(np.hypot(*shift_px), abs=0.1)
     assert any("off the camera file's centre" in text for text in result.warnings) == any(shift_px)
+
+
+def test_a_value_at_a_later_time_has_the_sky_of_that_time(located):
+    known, seconds = located.result, 3600.0
+    later = known.later(seconds, 60.0)
+    R = R_enu_icrs(known.site, known.exposure.time_utc + timedelta(seconds=seconds))
+    np.testing.assert_allclose(later.R_enu_icrs, R, atol=1e-6)
+    azimuth, elevation = azel_from_rays(known.stars.rays_icrs[known.light.star] @ R.T)
+    np.testing.assert_allclose(later.light.elevation_rad, elevation, atol=1e-6)
+    np.testing.assert_allclose(np.cos(later.light.azimuth_rad - azimuth), 1.0, atol=1e-9)
+    assert (later.clock.offset_s, later.clock.reach_s) == (seconds, 60.0)
+
+
+def test_a_clock_of_ten_minutes_widens_the_circle_along_the_wall(located, catalog):
+    known = located.result
+    exposure = replace(known.exposure, time_sigma_s=600.0)
+    result = pipeline.locate(exposure, known.camera, known.terrain, catalog)
+    off = result.fix.position_enu_m[:2] - located.truth.position_enu_m[:2]
+    assert np.hypot(*off) < result.fix.radius95_m
+    assert result.fix.radius95_m > 3 * known.fix.radius95_m
+    assert result.fix.clock.sigma_s == pytest.approx(600.0, rel=0.02)

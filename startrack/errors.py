@@ -53,6 +53,10 @@ class Reason(StrEnum):
         "bad_terrain", EXIT_BAD_INPUT, "No terrain file is known, or it cannot be used",
         "Give a terrain file with -t or in NAME.json, and correct what the message names.",
     )  # fmt: skip
+    BAD_ODOMETRY = (
+        "bad_odometry", EXIT_BAD_INPUT, "The odometry, or the path of a drive, cannot be used",
+        "Correct what the message names; docs/track.md describes the files of odometry and the path of a drive.",
+    )  # fmt: skip
     NO_CLUSTER = (
         "no_cluster", EXIT_BAD_INPUT, "The cluster of --cluster cannot be reached",
         "Start a Dask scheduler and give its address, such as tcp://host:8786.",

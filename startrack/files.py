@@ -76,15 +76,15 @@ def resolve_named(name_or_path: str | Path, kind: str, reason: str) -> Path:
     return path
 
 
-def read_text(path: FilePath, reason: str) -> str:
-    """The text of a user's file of at most 1 MiB, UTF-8. Raises BadInput `reason` with one line of cause."""
+def read_text(path: FilePath, reason: str, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
+    """The text of a user's file of at most `max_bytes`, UTF-8. Raises BadInput `reason` with one line of cause."""
     try:
         if not os.path.isfile(path):  # a folder; a device or a pipe, which might never end
             raise ValueError("no such file")
         with open(path, "rb") as file:
-            raw = file.read(MAX_TEXT_BYTES + 1)
-        if len(raw) > MAX_TEXT_BYTES:
-            raise ValueError("it has more than 1 MiB")
+            raw = file.read(max_bytes + 1)
+        if len(raw) > max_bytes:
+            raise ValueError(f"it has more than {max_bytes // 2**20} MiB")
         return raw.decode("utf-8")
     except (OSError, ValueError) as cause:  # ValueError: not UTF-8 too
         text = (cause.strerror if isinstance(cause, OSError) else None) or str(cause)

@@ -32,12 +32,13 @@ LAYERS = (  # lowest first; a package imports from lower layers only
     {"pipeline", "calibration", "inputs"},
     {"output"},
     {"solution", "horizon"},
-    {"reproduction", "batch", "api"},
+    {"reproduction", "batch", "tracking", "api"},
     {"cli"},
 )
 ALLOWED: set[tuple[str, str]] = set()  # exceptions: (package, package of the same or a higher layer)
 HEAVY = (
-    "astropy", "cv2", "lunarsky", "matplotlib", "PIL", "rich", "scipy", "skimage", "skyfield", "spiceypy", "tifffile",
+    "astropy", "cv2", "lunarsky", "matplotlib", "PIL", "rich", "rosbags", "scipy", "skimage", "skyfield", "spiceypy",
+    "tifffile",
 )  # fmt: skip
 CV2_ROOMS = {"detection", "evidence", "exposure", "horizon", "output"}  # image processing at the top
 

@@ -23,7 +23,7 @@ from startrack.batch.find import unique_names
 from startrack.batch.store import INPUTS, JOB, MANIFEST, RESULT, is_solved, stored_record, text_of_name
 from startrack.batch.task import Record, Task, valid_stored_record
 from startrack.files import write_atomically
-from startrack.frames import R_from_quat_xyzw, quat_xyzw_from_R
+from startrack.frames import R_from_quat_xyzw, tum_line
 from startrack.output.ecsv import Column, ecsv_text, format_values
 from startrack.output.views import columns
 from startrack.stages import STAGES
@@ -181,9 +181,8 @@ def _pose(record: Record) -> str:
     """A line of TUM's format: seconds of UTC, position, and the rotation from the rover's body to enu."""
     position, attitude = record["position"], record["attitude"]
     seconds = datetime.fromisoformat(record["provenance"]["time_utc"]).timestamp()
-    quat = quat_xyzw_from_R(R_from_quat_xyzw(np.array(attitude["quat_xyzw_body_enu"])).T)
-    numbers = [position["east_m"], position["north_m"], position["up_m"], *quat.tolist()]
-    return f"{seconds:017.6f} " + " ".join(f"{number:.9f}" for number in numbers) + "\n"
+    position_m = np.array([position["east_m"], position["north_m"], position["up_m"]])
+    return tum_line(seconds, position_m, R_from_quat_xyzw(attitude["quat_xyzw_body_enu"]).T)
 
 
 def _timings(records: Sequence[Record]) -> bytes:

@@ -22,6 +22,7 @@ OPTIONAL = {  # extra: its packages and what they are for
     "plots": (("matplotlib",), "figures of calibrate and reproduce"),
     "raw": (("rawpy",), "camera raw files"),
     "cluster": (("distributed",), "batches on Dask"),
+    "ros": (("rosbags",), "ROS bags"),
     "parquet": (("pyarrow",), "results.parquet"),
     "completion": (("argcomplete",), "completion in the shell"),
 }

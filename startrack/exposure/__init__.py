@@ -6,13 +6,14 @@ raw files); `mask.py` reads which pixels count; `metadata.py` finds time, exposu
 exception.
 """
 
+from startrack.exposure.decode_file import decode_bytes
 from startrack.exposure.decoded import are_fractions
 from startrack.exposure.mask import combine_masks, mask_of, read_mask, touch_masked
 from startrack.exposure.metadata import Facts, with_facts
-from startrack.exposure.read import exposure_of, read_exposure
+from startrack.exposure.read import exposure_of, exposure_of_decoded, read_exposure
 from startrack.exposure.write import write_exposure, write_sidecar
 
 __all__ = [
-    "Facts", "are_fractions", "combine_masks", "exposure_of", "mask_of", "read_exposure", "read_mask",
-    "touch_masked", "with_facts", "write_exposure", "write_sidecar",
+    "Facts", "are_fractions", "combine_masks", "decode_bytes", "exposure_of", "exposure_of_decoded", "mask_of",
+    "read_exposure", "read_mask", "touch_masked", "with_facts", "write_exposure", "write_sidecar",
 ]  # fmt: skip

@@ -22,7 +22,7 @@ def decode_file(path: str | os.PathLike[str]) -> tuple[bytes, Decoded]:
     """The bytes of the image at `path`, and their content. Raises BadInput bad_image with file and cause."""
     try:
         raw = _read_bytes(path)
-        return raw, _decode(raw, Path(path).suffix.lower() in RAW_SUFFIXES)
+        return raw, decode_bytes(raw, camera_raw=Path(path).suffix.lower() in RAW_SUFFIXES)
     except BadInput as error:
         raise BadInput(error.reason, " ".join(f"{printable(path)}: {error}".split())) from error
 
@@ -45,8 +45,8 @@ def _read_bytes(path: str | os.PathLike[str]) -> bytes:
         raise bad_image(f"cannot be opened ({error})") from error
 
 
-def _decode(raw: bytes, camera_raw: bool) -> Decoded:
-    """The decoded file. Camera raw files are known by their suffix: they are TIFFs with a thumbnail as their picture.
+def decode_bytes(raw: bytes, *, camera_raw: bool = False) -> Decoded:
+    """The decoded content of a file. Camera raw files are known by their suffix: they are TIFFs with a thumbnail.
 
     Raises BadInput bad_image; whatever else a decoder raises for damaged bytes is turned into it.
     """

@@ -45,11 +45,16 @@ def read_exposure(
         time_utc=time_utc, time_sigma_s=time_sigma_s, exposure_s=exposure_s, camera=camera, terrain=terrain, mask=mask
     )
     facts = resolve_facts(Path(path), decoded.header, given)
+    return exposure_of_decoded(decoded, facts, raw=raw, name=stem(Path(path)), path=os.fspath(path))
+
+
+def exposure_of_decoded(decoded: Decoded, facts: Facts, *, raw: bytes, name: str, path: str) -> Exposure:
+    """The exposure of pixels `decoded` from the bytes `raw`, with its `facts`; a mosaic's pixels are equalized."""
     pixels, notes = _level_mosaic(decoded, facts)
     return Exposure(
         pixels_adu=pixels,
-        name=stem(Path(path)),
-        path=os.fspath(path),
+        name=name,
+        path=path,
         time_utc=facts.time_utc,
         time_sigma_s=TIME_SIGMA_S if facts.time_sigma_s is None else facts.time_sigma_s,
         exposure_s=facts.exposure_s,

@@ -37,6 +37,7 @@ from startrack.frames.site import (
 )
 from startrack.frames.spice import R_mcmf_icrs, barycentric_state, et_s
 from startrack.frames.time import as_utc, format_utc, parse_utc
+from startrack.frames.tum import tum_line
 
 __all__ = [
     "MOON_RADIUS_M",
@@ -69,6 +70,7 @@ __all__ = [
     "rays_from_azel",
     "refract_rad",
     "sky_rotvec_rad",
+    "tum_line",
     "turn_azel",
     "wahba",
 ]

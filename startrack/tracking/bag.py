@@ -1,0 +1,98 @@
+"""Messages of ROS 1 and ROS 2 bags, read with the package rosbags (extra `ros`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from startrack.errors import BadInput
+from startrack.files import MAX_CAUSE_CHARS, FilePath, printable
+
+BAG_SUFFIXES = (".bag", ".db3", ".mcap")
+ODOMETRY_TYPES = ("nav_msgs/msg/Odometry",)
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+
+
+class Message(NamedTuple):
+    """One message of a topic."""
+
+    topic: str
+    kind: str  # such as "nav_msgs/msg/Odometry"
+    stamp_ns: int  # of its header: nanoseconds since 1970, UTC
+    content: Any  # fields as in the message's definition
+    raw: bytes  # as stored
+
+    @property
+    def stamp_s(self) -> float:
+        """The header's time [Unix s]."""
+        return self.stamp_ns / 1e9
+
+
+def is_bag(path: FilePath) -> bool:
+    """Whether a path is read as a ROS bag: a file .bag, .db3 or .mcap, or a folder."""
+    return Path(path).suffix.lower() in BAG_SUFFIXES or Path(path).is_dir()
+
+
+def read_messages(
+    path: FilePath, kinds: tuple[str, ...], topic: str | None, *, reason: str, flag: str
+) -> Iterator[Message]:
+    """The messages of one `topic` of the types `kinds`, one by one, in the bag's order.
+
+    None takes the only topic of these types. `flag` is named in the advice where there are several.
+
+    Raises:
+        BadInput: `reason` with the file and the cause: no such file or topic, several topics, a damaged bag, a header
+            without time, or rosbags is not installed.
+    """
+    if find_spec("rosbags") is None:
+        raise BadInput(
+            reason, f"{printable(path)}: ROS bags need rosbags: pip install '.[ros]' in a clone of startrack"
+        )
+    try:
+        yield from _messages(Path(path), kinds, topic, flag)
+    except _Fault as fault:
+        raise BadInput(reason, f"{printable(path)}: {fault}") from fault
+    except OSError as error:
+        raise BadInput(reason, f"{printable(path)}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:  # rosbags raises many types for a damaged file
+        cause = " ".join(f"{type(error).__name__}: {error}".split())[:MAX_CAUSE_CHARS]
+        raise BadInput(reason, f"{printable(path)}: damaged or unknown ROS bag ({cause})") from error
+
+
+class _Fault(Exception):
+    """Why the content of a bag cannot be used."""
+
+
+def _messages(path: Path, kinds: tuple[str, ...], topic: str | None, flag: str) -> Iterator[Message]:
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    if path.is_dir() and not (path / "metadata.yaml").is_file():
+        raise _Fault("is a folder without metadata.yaml, not a ROS 2 bag")
+    # Files of older ROS 2 releases lack the definitions; those of the messages read here have never changed.
+    with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
+        used = _choose_topic([(one.topic, one.msgtype) for one in reader.connections], kinds, topic, flag)
+        connections = [one for one in reader.connections if one.topic == used and one.msgtype in kinds]
+        for connection, _, raw in reader.messages(connections=connections):
+            content: Any = reader.deserialize(raw, connection.msgtype)
+            stamp = content.header.stamp
+            stamp_ns = int(stamp.sec) * 10**9 + int(stamp.nanosec)
+            if stamp_ns <= 0:
+                raise _Fault(f"topic {used}: a message's header has no time")
+            yield Message(used, connection.msgtype, stamp_ns, content, bytes(raw))
+
+
+def _choose_topic(topics: list[tuple[str, str]], kinds: tuple[str, ...], topic: str | None, flag: str) -> str:
+    """The topic to read, from the pairs of name and type in the bag."""
+    found = sorted({name for name, kind in topics if kind in kinds})
+    wanted = " or ".join(kind.replace("/msg/", "/") for kind in kinds)
+    listed = ", ".join(found) if found else "none"
+    if topic is not None and topic not in found:
+        raise _Fault(f"has no topic {topic} of type {wanted}; topics of that type: {listed}")
+    if topic is None and not found:
+        raise _Fault(f"has no topic of type {wanted}")
+    if topic is None and len(found) > 1:
+        raise _Fault(f"has several topics of type {wanted}: choose one with {flag}: {listed}")
+    return found[0] if topic is None else topic

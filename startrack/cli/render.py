@@ -11,6 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import add_time_sigma_flag
+from startrack.cli.drive import (
+    add_drive_flags,
+    count_images,
+    read_drive_flags,
+    trajectory_paths,
+    write_trajectories,
+)
 from startrack.cli.flag_types import (
     amount,
     clock_offset_s,
@@ -25,7 +32,7 @@ from startrack.cli.progress import progress
 from startrack.errors import BadInput
 
 if TYPE_CHECKING:
-    from startrack.rendering import Scene, Series, Truth
+    from startrack.rendering import Drive, Scene, Series, Truth
 
 SUFFIXES = {"png": ".png", "tiff": ".tif", "fits": ".fits"}
 KNOWN_SUFFIXES = {".png", ".tif", ".tiff", ".fits", ".fit", ".fts"}
@@ -40,14 +47,17 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "render",
         help="make synthetic exposures and files with their truth",
         description="Render the image of a camera on the crater's floor. Position, heading, tilt and time are drawn "
-        "from the seed unless they are given. Beside NAME.png: NAME.json (time, exposure, camera, terrain), "
+        "from the seed unless they are given. With --every the exposures are at equal steps of time, at rest or, with "
+        "--path, on a drive with odometry. Beside NAME.png: NAME.json (time, exposure, camera, terrain), "
         "NAME.truth.json (pose, settings) and NAME.truth.ecsv (stars).",
     )
     parser.add_argument("-c", "--camera", default="fisheye-2048", metavar="FILE", help="default %(default)s")
     parser.add_argument("-t", "--terrain", default="shackleton-thesis", metavar="FILE", help="default %(default)s")
     parser.add_argument("--seed", type=count, default=0, metavar="N", help="same seed, same bytes (default 0)")
-    parser.add_argument("-n", "--count", type=positive_count, default=1, metavar="N", help="images (default 1)")
+    help_count = "images (default 1; of a drive all along its path)"
+    parser.add_argument("-n", "--count", type=positive_count, metavar="N", help=help_count)
     _add_pose(parser.add_argument_group("pose and time (what is not given is drawn from the seed)"))
+    add_drive_flags(parser.add_argument_group("series at rest (--every alone) or along a path"))
     _add_light(parser.add_argument_group("light and defects"))
     _add_output(parser.add_argument_group("output"))
     parser.set_defaults(run=run, usage_error=parser.error)
@@ -56,14 +66,18 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> int:
     """Render and write the images; 0. Raises BadInput for files and values that cannot be used."""
-    images = _targets(args)
-    series = _series(args)
+    drive = read_drive_flags(args)
+    images = _targets(args, count_images(args, drive))
+    series = _series(args, drive)
+    poses = [series.pose(number) for number in range(len(images))] if args.every is not None else []
     with progress("render", len(images), shown=len(images) >= PROGRESS_FROM) as bar:
         for number, image in enumerate(images):
             summary = _render_one(args, series, number, image)
             if args.json or not args.quiet:
                 print(json.dumps(summary) if args.json else _line(summary))
             bar.advance()
+    if poses:
+        write_trajectories(args, series, poses)
     return 0
 
 
@@ -111,27 +125,28 @@ def _add_output(group: Any) -> None:
     group.add_argument("-q", "--quiet", action="store_true", help="print errors only")
 
 
-def _targets(args: argparse.Namespace) -> list[Path]:
+def _targets(args: argparse.Namespace, count: int) -> list[Path]:
     """The images to write; every file is checked first, so that nothing is written half-way to a refusal."""
     from startrack.rendering import truth_paths
 
-    if args.output is not None and args.count != 1:
-        args.usage_error(f"--output names one image, but --count is {args.count}: give --dir")
+    if args.output is not None and count != 1:
+        args.usage_error(f"--output names one image, but --count is {count}: give --dir")
     if args.output is not None:
         images = [Path(args.output)]
         if images[0].suffix.lower() not in KNOWN_SUFFIXES:
             args.usage_error(f"--output {args.output}: the suffix must be .png, .tif or .fits")
     else:
         stem = f"{Path(args.terrain).name.removesuffix('.toml')}-{args.seed}"
-        digits = max(3, len(str(args.count - 1)))
-        images = [Path(args.dir) / f"{stem}-{k:0{digits}d}{SUFFIXES[args.format]}" for k in range(args.count)]
-    for path in (p for image in images for p in (image, image.with_suffix(".json"), *truth_paths(image))):
+        digits = max(3, len(str(count - 1)))
+        images = [Path(args.dir) / f"{stem}-{k:0{digits}d}{SUFFIXES[args.format]}" for k in range(count)]
+    ours = (p for image in images for p in (image, image.with_suffix(".json"), *truth_paths(image)))
+    for path in (*ours, *trajectory_paths(args)):
         if not args.overwrite and os.path.lexists(path):
             raise BadInput("bad_image", f"{path}: exists already; -O/--overwrite replaces it")
     return images
 
 
-def _series(args: argparse.Namespace) -> Series:
+def _series(args: argparse.Namespace, drive: Drive | None) -> Series:
     from startrack.camera import load_camera
     from startrack.frames import parse_utc
     from startrack.rendering import Series, load_sky_catalog
@@ -160,6 +175,8 @@ def _series(args: argparse.Namespace) -> Series:
         flux_scatter_mag=args.flux_scatter,
         hot_pixels=args.hot_pixels,
         cosmic_rays=args.cosmic_rays,
+        every_s=args.every,
+        drive=drive,
         camera_ref=args.camera,
         terrain_ref=args.terrain,
     )

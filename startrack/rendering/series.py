@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
@@ -19,11 +20,12 @@ from startrack.frames import (
     sky_rotvec_rad,
 )
 from startrack.rendering.defects import draw_hot_pixels
+from startrack.rendering.drive import Drive, draw_odometry
 from startrack.rendering.field_stars import concatenate_stars, draw_field_stars, draw_v_errors
 from startrack.rendering.scene import Scene
 from startrack.rendering.sources import exposure_for_snr
 from startrack.terrain import Terrain
-from startrack.types import Array, BadInput, Stars
+from startrack.types import Array, BadInput, Stars, Value, array
 
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog
@@ -34,12 +36,25 @@ EXPOSURE_V_MAG, EXPOSURE_SNR = 6.0, 5.0  # magnitude and SNR on the axis that de
 RANDOM_TIMES = datetime(2024, 1, 1, tzinfo=UTC), datetime(2034, 1, 1, tzinfo=UTC)
 MAX_POSITION_TRIES = 1000
 # Streams of the seed. Sky and sensor are the same in every exposure of a series: errors that exposures share.
-_SKY, _SENSOR, _EXPOSURE = 0, 1, 2
+_SKY, _SENSOR, _EXPOSURE, _ODOMETRY = 0, 1, 2, 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pose(Value):
+    """Where the rover is in an exposure."""
+
+    time_utc: datetime  # mid-exposure
+    position_enu_m: Array = array(3)  # the camera's centre, which is the body's origin
+    R_body_enu: Array = array(3, 3)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Series:
-    """Settings of a series of exposures; fields that are None are drawn from the seed for each exposure."""
+    """Settings of a series of exposures; fields that are None are drawn from the seed for each exposure.
+
+    With `every_s` the exposures are at equal steps of time: at rest, with the pose of the first one, or on a `drive`.
+    Raises BadInput (bad_odometry) for a drive that leaves the terrain's search area.
+    """
 
     camera: Camera
     terrain: Terrain
@@ -61,8 +76,18 @@ class Series:
     flux_scatter_mag: float = 0.03  # beyond the catalogue's own errors; 0: neither
     hot_pixels: int = 200
     cosmic_rays: int = 5
+    every_s: float | None = None  # between exposures; the rover is then at rest, or on its drive. None: times are drawn
+    drive: Drive | None = None  # with `every_s`; it gives positions and headings
     camera_ref: str | None = None
     terrain_ref: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.drive is not None and self.every_s is None:
+            raise ValueError("Series.drive needs every_s")
+        if self.every_s is not None and not self.every_s > 0:
+            raise ValueError(f"Series.every_s must be positive, not {self.every_s!r}")
+        if self.drive is not None:
+            _require_in_search_area(self.drive, self.terrain)
 
     @cached_property
     def exposure_used_s(self) -> float:
@@ -79,18 +104,11 @@ class Series:
         Raises:
             BadInput: bad_terrain when no position can be found, no_time outside the ephemeris.
         """
-        rng = np.random.default_rng([self.seed, _EXPOSURE, number])
-        time, position_m, heading, pitch, roll = self._pose(rng)
-        if not bool(self.terrain.allowed(position_m[None])[0]):
-            raise BadInput(
-                "bad_terrain",
-                f"{self.terrain.name}: no camera can stand at {position_m[0]:.0f} m east, {position_m[1]:.0f} north",
-            )
-        site, exposure_s = self.terrain.site, self.exposure_used_s
+        pose, rng = self._pose_and_rng(number)
+        time, site, exposure_s = pose.time_utc, self.terrain.site, self.exposure_used_s
         if site is None:
             raise BadInput("bad_terrain", f"terrain {self.terrain.name} has no site: its sky is not known")
         stars, v_error_mag = self._sky(site, time)
-        height_m = float(self.terrain.ground_m(position_m[None])[0]) + self.terrain.camera_height_m
         sensor_rng = np.random.default_rng([self.seed, _SENSOR])
         scene = Scene(
             camera=self.camera,
@@ -98,8 +116,8 @@ class Series:
             stars=stars,
             v_error_mag=v_error_mag,
             bodies=tuple(bodies(site, time)),
-            position_enu_m=np.append(position_m, height_m),
-            R_cam_enu=self.camera.R_body_cam.T @ R_body_enu_from_heading_pitch_roll(heading, pitch, roll),
+            position_enu_m=pose.position_enu_m,
+            R_cam_enu=self.camera.R_body_cam.T @ pose.R_body_enu,
             R_enu_icrs=R_enu_icrs(site, time),
             sky_rotvec_rad=sky_rotvec_rad(site, time, exposure_s),
             exposure_s=exposure_s,
@@ -116,7 +134,47 @@ class Series:
         )
         return scene, rng
 
-    def _pose(self, rng: np.random.Generator) -> tuple[datetime, Array, float, float, float]:
+    def pose(self, number: int) -> Pose:
+        """Time and pose of exposure `number`.
+
+        Raises:
+            BadInput: bad_terrain where no camera can stand, no_time beyond the calendar.
+        """
+        return self._pose_and_rng(number)[0]
+
+    def odometry(self, poses: Sequence[Pose], *, sigma_1: float, floor_m: float) -> tuple[Array, Array]:
+        """Odometry of the first exposures of the series, whose true poses are `poses`; see `draw_odometry`."""
+        position_enu_m = np.array([pose.position_enu_m for pose in poses])
+        R_body_enu = np.array([pose.R_body_enu for pose in poses])
+        rng = np.random.default_rng([self.seed, _ODOMETRY])
+        return draw_odometry(position_enu_m, R_body_enu, sigma_1=sigma_1, floor_m=floor_m, rng=rng)
+
+    def _pose_and_rng(self, number: int) -> tuple[Pose, np.random.Generator]:
+        """The pose of exposure `number`, and the generator in the state after the pose was drawn."""
+        rng = np.random.default_rng([self.seed, _EXPOSURE, number])
+        time, position_m, heading, pitch, roll = self._draw_pose(rng)
+        if self.every_s is not None:
+            first = self._draw_pose(np.random.default_rng([self.seed, _EXPOSURE, 0]))
+            time = _time_after(first[0], number * self.every_s)
+            if self.drive is None:  # at rest
+                _, position_m, heading, pitch, roll = first
+            else:
+                position_m = self.drive.position_m(number * self.every_s)
+                heading = self.drive.heading_rad(number * self.every_s)
+        if not bool(self.terrain.allowed(position_m[None])[0]):
+            raise BadInput(
+                "bad_terrain",
+                f"{self.terrain.name}: no camera can stand at {position_m[0]:.0f} m east, {position_m[1]:.0f} north",
+            )
+        height_m = float(self.terrain.ground_m(position_m[None])[0]) + self.terrain.camera_height_m
+        pose = Pose(
+            time_utc=time,
+            position_enu_m=np.append(position_m, height_m),
+            R_body_enu=R_body_enu_from_heading_pitch_roll(heading, pitch, roll),
+        )
+        return pose, rng
+
+    def _draw_pose(self, rng: np.random.Generator) -> tuple[datetime, Array, float, float, float]:
         """Time, position (2,) [m], heading, pitch and roll [rad]. All are drawn: a given one does not change others."""
         first, last = RANDOM_TIMES
         time = first + timedelta(microseconds=int(rng.integers((last - first) // timedelta(microseconds=1))))
@@ -156,6 +214,19 @@ def load_sky_catalog(stars: str) -> StarCatalog:
     return load_deep_catalog() if stars == "gaia" or (stars == "auto" and has_deep_catalog()) else load_catalog()
 
 
+def _require_in_search_area(drive: Drive, terrain: Terrain) -> None:
+    """Raises BadInput (bad_odometry) unless all waypoints, and so the lines between them, are in the search area."""
+    away_m = np.linalg.norm(drive.waypoints_m, axis=1)
+    outside = np.flatnonzero(away_m > terrain.search_radius_m)
+    if len(outside):
+        east_m, north_m = drive.waypoints_m[outside[0]]
+        raise BadInput(
+            "bad_odometry",
+            f"{len(outside)} of {len(away_m)} waypoints are outside the search area of {terrain.name}, "
+            f"{terrain.search_radius_m:g} m about its origin; the first is {east_m:g} m east, {north_m:g} m north",
+        )
+
+
 def _random_position(terrain: Terrain, rng: np.random.Generator) -> Array:
     """A position (2,) [m], uniform over the part of the search area where the camera can stand."""
     for _ in range(MAX_POSITION_TRIES):
@@ -164,6 +235,13 @@ def _random_position(terrain: Terrain, rng: np.random.Generator) -> Array:
         if bool(terrain.allowed(position[None])[0]):
             return position
     raise BadInput("bad_terrain", f"{terrain.name}: nowhere in its search area can the camera stand")
+
+
+def _time_after(start: datetime, seconds: float) -> datetime:
+    try:
+        return start + timedelta(seconds=seconds)
+    except OverflowError as cause:
+        raise BadInput("no_time", f"{seconds:g} s after {start} is beyond the calendar") from cause
 
 
 def _value_or_draw(value: T | None, drawn: T) -> T:

@@ -13,7 +13,7 @@ from startrack.types import Array, BadInput, Value, array
 
 PATH_COLUMNS = ("east_m", "north_m")
 MAX_FRAMES = 1_000_000  # of a drive: more is a wrong unit
-ROUNDING_1 = 1e-9  # of a number of steps: a path of whole steps has a frame at its end
+ROUNDING_1 = 1e-9  # relative, of a number of steps: a path of whole steps has a frame at its end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ class Drive(Value):
         Raises BadInput (bad_odometry) for fewer than two or more than a million.
         """
         duration_s = float(self.distance_m[-1]) / self.speed_m_s
-        steps = int(min(duration_s / every_s + ROUNDING_1, 1e15))
+        steps = int(min(duration_s / every_s * (1 + ROUNDING_1), 1e15))
         if not 1 <= steps < MAX_FRAMES:
             raise BadInput(
                 "bad_odometry",

@@ -53,12 +53,17 @@ def read_messages(
     try:
         yield from _messages(Path(path), kinds, topic, flag)
     except _Fault as fault:
-        raise BadInput(reason, f"{printable(path)}: {fault}") from fault
+        raise BadInput(reason, f"{printable(path)}: {_escape(str(fault))}") from fault
     except OSError as error:
         raise BadInput(reason, f"{printable(path)}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # rosbags raises many types for a damaged file
-        cause = " ".join(f"{type(error).__name__}: {error}".split())[:MAX_CAUSE_CHARS]
+        cause = _escape(f"{type(error).__name__}: {error}")[:MAX_CAUSE_CHARS]
         raise BadInput(reason, f"{printable(path)}: damaged or unknown ROS bag ({cause})") from error
+
+
+def _escape(text: str) -> str:
+    """The text in one line, control characters escaped: a damaged bag may have any in a name."""
+    return "".join(one if one.isprintable() else repr(one)[1:-1] for one in " ".join(text.split()))
 
 
 class _Fault(Exception):

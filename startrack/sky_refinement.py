@@ -197,7 +197,7 @@ def _fit_step(
     clock = None if clock_sigma_s is None else replace(located.clock, sigma_s=clock_sigma_s)
     shared = shared_errors(located, sky, position_m, fix, clock)
     expected_m = fix.position_enu_m[:2] - position_m
-    fit = fit_skyline(sky.shift_px, variance, slopes, shared, expected_m, fix.covariance_m2)
+    fit = fit_skyline(sky.shift_px, variance, slopes, shared, expected_m, fix.covariance_m2, min_sectors=MIN_SECTORS)
     if fit is None:
         raise NoSkyLight("too much of it contradicts the predicted skyline")
     return fit

@@ -19,12 +19,7 @@ from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
 from startrack.types import Array, Clock, Evidence, NotLocated
 
-
-@pytest.fixture(scope="module", autouse=True)
-def _own_cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        yield
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ from render_helpers import CRATER
 from scipy.special import ndtr
 from sky_helpers import EDGE_PX, PX_PER_RAD
 
+from startrack.evidence.sky_checks import MIN_SECTORS
 from startrack.evidence.sky_levels import SECTORS
 from startrack.evidence.sky_light import HEIGHT_PX, LEVELS, MIDDLES_RAD
 from startrack.evidence.star_offsets import offset_terms
@@ -40,13 +41,13 @@ def shared_errors() -> SharedErrors:
 
 def shifts(rng: np.random.Generator, errors: SharedErrors, sigma_px: Array | float = SIGMA_PX) -> tuple[Array, Array]:
     """Shifts (SECTORS,) of a skyline by a step of the position and shared errors from their priors, and the step."""
-    step = rng.multivariate_normal(PRIOR_M, PRIOR_M2)
+    step = rng.multivariate_normal(PRIOR_M, PRIOR_M2, min_sectors=MIN_SECTORS)
     values = rng.multivariate_normal(errors.mean, errors.covariance)
     return SLOPES @ step + errors.raised_px @ values + sigma_px * rng.normal(size=SECTORS), step
 
 
 def fit(shift_px: Array, variance_px2: Array, errors: SharedErrors) -> SkylineFit:
-    found = fit_skyline(shift_px, variance_px2, SLOPES, errors, PRIOR_M, PRIOR_M2)
+    found = fit_skyline(shift_px, variance_px2, SLOPES, errors, PRIOR_M, PRIOR_M2, min_sectors=MIN_SECTORS)
     assert found is not None
     return found
 
@@ -141,12 +142,12 @@ def test_no_fit_where_too_much_contradicts_or_too_little_is_seen() -> None:
     rng, errors = np.random.default_rng(7), shared_errors()
     shift, variance = shifts(rng, errors)[0], np.full(SECTORS, SIGMA_PX**2)
     few = np.where(np.arange(SECTORS) < 59, variance, np.inf)
-    assert fit_skyline(shift, few, SLOPES, errors, PRIOR_M, PRIOR_M2) is None
+    assert fit_skyline(shift, few, SLOPES, errors, PRIOR_M, PRIOR_M2, min_sectors=MIN_SECTORS) is None
     another = shift + rng.uniform(-3, 3, SECTORS)
-    assert fit_skyline(another, variance, SLOPES, errors, PRIOR_M, PRIOR_M2) is None
+    assert fit_skyline(another, variance, SLOPES, errors, PRIOR_M, PRIOR_M2, min_sectors=MIN_SECTORS) is None
     half = shift.copy()
     half[: int((MAX_DROPPED + 0.08) * SECTORS)] += rng.uniform(1, 3, int((MAX_DROPPED + 0.08) * SECTORS))
-    assert fit_skyline(half, variance, SLOPES, errors, PRIOR_M, PRIOR_M2) is None
+    assert fit_skyline(half, variance, SLOPES, errors, PRIOR_M, PRIOR_M2, min_sectors=MIN_SECTORS) is None
 
 
 def sky_rows(

@@ -12,15 +12,11 @@ from startrack.localization import ExactPosterior, check_consistency
 from startrack.terrain import load_terrain
 from startrack.types import Evidence
 
+pytestmark = pytest.mark.usefixtures("own_cache")
 PLACES = {  # east and north [m]: centres of the search areas
     "haworth floor": (-2515.0, 5192.0), "de-gerlache floor": (-434.0, -6059.0), "faustini floor": (1000.0, -2000.0),
     "kepler floor": (-521.0, -7271.0), "kepler wall": (9647.0, -1547.0),
 }  # fmt: skip
-
-
-@pytest.fixture(autouse=True)
-def _own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
 @pytest.mark.parametrize("where", PLACES)

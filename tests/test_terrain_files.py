@@ -30,11 +30,7 @@ from startrack.terrain.stated_errors import MEASURED_PER_ESTIMATE
 from startrack.types import BadInput
 
 ROOT = Path(__file__).parent.parent
-
-
-@pytest.fixture(autouse=True)
-def _own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 def hill(posts: int = 61, post_m: float = 100.0, projection: Projection | None = None) -> Raster:
@@ -395,6 +391,7 @@ def test_a_folder_that_takes_no_pictures_is_named_before_any_work(tmp_path, caps
 
 
 def test_a_build_prints_one_line_and_an_interrupted_one_is_discarded(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # of this test alone: it lists the folder
     path = terrain_file(tmp_path)
     terrain = load_terrain(path)
     assert isinstance(terrain, HeightMap)

@@ -16,7 +16,7 @@ from startrack.frames import Site, enu_from_latlon, latlon_from_enu
 from startrack.localization import ExactPosterior
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.nuisance import estimate_horizon_bias, lower_evidence
-from startrack.terrain import load_terrain
+from startrack.terrain import load_terrain, table_building
 from startrack.terrain import table_cache as cache
 from startrack.terrain.height_map import HeightMap
 from startrack.terrain.pyramid import ground_up_m
@@ -31,13 +31,7 @@ from startrack.terrain.raster import (
 from startrack.types import Evidence
 
 DATA = Path(__file__).parent / "data"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _own_cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        yield
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 @pytest.fixture(scope="module")
@@ -150,14 +144,14 @@ def test_the_table_is_kept_and_found_again_by_content(shackleton):
 
 def test_of_two_that_need_a_table_one_makes_it(shackleton, monkeypatch):
     """Each thread represents a process: locks belong to open files, not to processes."""
-    made, build = [], HeightMap._build_table
+    made, build = [], table_building._build
 
     def slow(terrain, progress):
         made.append(threading.get_ident())
         time.sleep(0.3)
         return build(terrain, progress)
 
-    monkeypatch.setattr(HeightMap, "_build_table", slow)
+    monkeypatch.setattr(table_building, "_build", slow)
     terrains = [replace(shackleton, camera_height_m=1.75, search_radius_m=150.0) for _ in range(3)]
     path = cache.path_of(cache.key_of(terrains[0]))
     path.parent.mkdir(parents=True, exist_ok=True)

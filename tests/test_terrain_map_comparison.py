@@ -23,14 +23,8 @@ from startrack.terrain.raster_io import read_map
 from startrack.types import Array, Evidence
 
 DATA = Path(__file__).parent / "data"
+pytestmark = pytest.mark.usefixtures("own_cache")
 POLAR, MAPS = ("shackleton", "haworth", "faustini", "de-gerlache"), ("shackleton", "haworth", "kepler")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _own_cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        yield
 
 
 @pytest.fixture(scope="module")

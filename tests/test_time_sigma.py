@@ -20,7 +20,7 @@ from startrack.cli.common import add_fact_flags, flag_facts
 from startrack.cli.main import main
 from startrack.errors import BadInput
 from startrack.exposure import Facts, read_exposure, with_facts
-from startrack.exposure.metadata import MAX_TIME_SIGMA_S
+from startrack.exposure.sidecar import MAX_TIME_SIGMA_S
 from startrack.inputs import exposure_input, time_sigma_input
 from startrack.types import TIME_SIGMA_S, Exposure
 

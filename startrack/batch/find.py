@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path, PurePosixPath
 
-from startrack.exposure.metadata import PACKING_SUFFIXES, PICTURE_SUFFIXES
+from startrack.exposure.sidecar import PACKING_SUFFIXES, PICTURE_SUFFIXES
 from startrack.files import existing_folder
 from startrack.output.write import PICTURES
 from startrack.types import BadInput

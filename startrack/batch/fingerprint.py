@@ -15,7 +15,7 @@ from typing import Any
 from startrack import __version__
 from startrack.catalog.gaia import has_deep_catalog
 from startrack.errors import BadInput
-from startrack.exposure.metadata import RAW_SUFFIXES, sidecar_of
+from startrack.exposure.sidecar import RAW_SUFFIXES, sidecar_of
 from startrack.files import is_path, parse_toml, read_text, relative_path
 
 MISSING = "?"  # in place of the hash of a file that cannot be read; once it can, the hash differs

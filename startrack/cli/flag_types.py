@@ -7,7 +7,7 @@ import math
 
 from startrack.declaration import LARGEST, SHOWN_CHARS
 
-MAX_EXPOSURE_S = 1e6  # as startrack.exposure.metadata has it; written here so that help is quick
+MAX_EXPOSURE_S = 1e6  # as startrack.exposure.sidecar has it; written here so that help is quick
 MAX_COUNT = 1_000_000
 MAX_MAGNITUDE = 100.0
 

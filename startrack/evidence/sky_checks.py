@@ -12,7 +12,7 @@ from startrack.evidence.sky_light import SkyLight
 from startrack.evidence.sky_step import MEDIAN_ABS_NORMAL
 from startrack.types import Array, Bools
 
-MIN_SECTORS = 60  # with a step
+MIN_SECTORS = 60  # with a step; fewer determine no shift of the skyline
 MIN_STEP_SIGMAS = 8.0  # of the mean step
 SECTOR_STEP_SIGMAS = 3.0  # of the step of one sector
 OWN_LEVEL_SIGMAS = 5.0  # of a sector's own level against its neighbours'

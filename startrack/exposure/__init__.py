@@ -1,9 +1,9 @@
 """One image with the facts that travel with it: read, validate, write.
 
 `decode_file.py` opens a file and picks its decoder (`png.py`, `tiff.py`, `jpeg.py`, `fits.py`, `mosaic.py` for camera
-raw files); `mask.py` reads which pixels count; `metadata.py` finds time, exposure seconds, camera, terrain and mask;
-`write.py` writes images and sidecars. A file that cannot be used raises `startrack.types.BadInput` and no other
-exception.
+raw files); `mask.py` reads which pixels count; `metadata.py` finds time, exposure seconds, camera, terrain and mask:
+in flags, the sidecar (`sidecar.py`) and the header (`header.py`); `write.py` writes images and sidecars. A file that
+cannot be used raises `startrack.types.BadInput` and no other exception.
 """
 
 from startrack.exposure.decode_file import decode_bytes

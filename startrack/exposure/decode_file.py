@@ -8,7 +8,7 @@ import warnings
 from pathlib import Path
 
 from startrack.exposure.decoded import MAX_FILE_BYTES, Decoded, bad_image
-from startrack.exposure.metadata import RAW_SUFFIXES
+from startrack.exposure.sidecar import RAW_SUFFIXES
 from startrack.files import printable
 from startrack.types import BadInput
 

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from startrack.exposure.decode_file import decode_file
 from startrack.exposure.decoded import COLOUR_WARNING, Decoded, bad_image, check_size, grey_float32, largest_value
 from startrack.exposure.mask import mask_of
-from startrack.exposure.metadata import Facts, resolve_facts, stem
+from startrack.exposure.metadata import Facts, resolve_facts
+from startrack.exposure.sidecar import stem
 from startrack.types import TIME_SIGMA_S, Bools, Exposure
 
 

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.exposure.metadata import Facts, sidecars
+from startrack.exposure.metadata import Facts
+from startrack.exposure.sidecar import sidecars
 from startrack.files import check_free, is_path, printable, relative_path, write_atomically
 from startrack.frames.time import format_utc
 from startrack.types import BadInput, Exposure

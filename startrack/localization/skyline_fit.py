@@ -17,7 +17,6 @@ OUTLIER_SIGMAS = 4.0  # of the mean residual of a window
 CHANCE_SIGMAS = 4.0  # of the mean square of windows, up to which it is chance
 MARGIN = 1  # sectors left out on either side of a window that contradicts the others
 MAX_DROPPED = 0.4  # of the information
-MIN_SECTORS = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +66,14 @@ class SkylineFit:
 
 
 def fit_skyline(
-    shift_px: Array, variance_px2: Array, px_per_m: Array, shared: SharedErrors, prior_m: Array, prior_m2: Array
+    shift_px: Array,
+    variance_px2: Array,
+    px_per_m: Array,
+    shared: SharedErrors,
+    prior_m: Array,
+    prior_m2: Array,
+    *,
+    min_sectors: int,
 ) -> SkylineFit | None:
     """The step of the position and the shared errors that explain shifts of the skyline; None where none does.
 
@@ -78,6 +84,7 @@ def fit_skyline(
         shared: errors common to the sectors.
         prior_m: (2,) expected step.
         prior_m2: (2, 2) its covariance.
+        min_sectors: fewer explain nothing.
     """
     used = np.isfinite(variance_px2)
     weight = np.where(used, 1.0 / np.where(used, variance_px2, 1.0), 0.0)
@@ -89,7 +96,7 @@ def fit_skyline(
     expected = np.concatenate([prior_m, shared.mean])
     while True:
         w = np.where(used, weight, 0.0)
-        if np.count_nonzero(used) < MIN_SECTORS or w.sum() < (1.0 - MAX_DROPPED) * whole:
+        if np.count_nonzero(used) < min_sectors or w.sum() < (1.0 - MAX_DROPPED) * whole:
             return None
         covariance = np.linalg.inv(prior + (design * w[:, None]).T @ design)
         solution = covariance @ (design.T @ (w * shift_px) + prior @ expected)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from startrack.camera.io import camera_keys
 from startrack.errors import Reason
-from startrack.exposure.metadata import SIDECAR as SIDECAR_KEYS
+from startrack.exposure.sidecar import SIDECAR as SIDECAR_KEYS
 from startrack.output.quantities import BY_PATH
 from startrack.output.record import FORMATS
 from startrack.output.schema_parts import (

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import time as clock
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,21 +15,20 @@ from startrack.terrain import table_cache as cache
 from startrack.terrain import tracing
 from startrack.terrain.horizon_interpolator import NODES_ACROSS, HorizonInterpolator
 from startrack.terrain.horizon_sigma import HorizonSigma
-from startrack.terrain.horizon_table import BINS, HorizonTable, Square, build_table
+from startrack.terrain.horizon_table import BINS, HorizonTable, Square
 from startrack.terrain.masks import GLARE, OFF_MAP, Sectors, describe_masks, in_sectors
 from startrack.terrain.protocol import Progress, Terrain
 from startrack.terrain.pyramid import Ground, ground_up_m, pack_maps
 from startrack.terrain.raster import Raster
-from startrack.types import Array, BadInput, Bools, Ints
+from startrack.terrain.table_building import load_or_build_table
+from startrack.types import Array, BadInput, Bools
 
-LOG = logging.getLogger(__name__)
 FINEST_BOX_M = 0.45  # half side of the smallest boxes of positions: no height map is more accurate
 CELL_M = 200.0  # cells of the table are no wider
 MAX_CELLS_ACROSS = 128
 COMMON_PER_POST = 3.0
 MARGIN = 1.15  # of the search radius: so far is searched, to notice that the camera left the area
 SLOPE_STEP_M = 5.0
-UNKNOWN_FROM = 12  # points across the square at which the ends of the maps are looked up
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -130,28 +127,12 @@ class HeightMap(Terrain):
         If several processes need the same table, one computes it and the others wait.
         """
         if "table" not in self.__dict__:
-            self.__dict__["table"] = self._load_or_build_table(progress)
+            self.__dict__["table"] = load_or_build_table(self, self._key, progress)
 
     @cached_property
     def table(self) -> HorizonTable:
         """The table of horizons; see `prepare`."""
-        return self._load_or_build_table(None)
-
-    def _load_or_build_table(self, progress: Progress | None) -> HorizonTable:
-        table = cache.load_table(self._key, self.square)
-        if table is None:
-            with cache.single_builder(self._key, self.name):
-                table = cache.load_table(self._key, self.square) or self._build_and_keep_table(progress)
-        return table
-
-    def _build_and_keep_table(self, progress: Progress | None) -> HorizonTable:
-        LOG.info("horizons of %s: computed now, once; this takes a minute or two", self.name)
-        start = clock.perf_counter()
-        table = self._build_table(progress)
-        path = cache.keep_table(self._key, table)
-        where = f"kept in {path}" if path else f"not kept: {cache.cache_dir()} cannot be written"
-        LOG.debug("horizons of %s: done in %.0f s, %s", self.name, clock.perf_counter() - start, where)
-        return table
+        return load_or_build_table(self, self._key)
 
     def discard_table(self) -> None:
         """Remove the table of horizons from memory and disk."""
@@ -167,29 +148,7 @@ class HeightMap(Terrain):
         self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
     ) -> tuple[Array, Array]:
         """Bounds of the horizon over boxes [rad]: from the table, and for single rays and small boxes by tracing."""
-        centres_m = np.asarray(centres_m, dtype=np.float64)
-        shape = np.broadcast_shapes(
-            centres_m.shape[:-1], np.shape(half_m), np.shape(azimuths_rad), np.shape(azimuth_half_rad)
-        )
-        centres = _flatten(centres_m, (*shape, 2)).reshape(-1, 2)
-        half, azimuths, turn = (_flatten(a, shape).ravel() for a in (half_m, azimuths_rad, azimuth_half_rad))
-        table = self.table
-        low, high = np.empty(len(half)), np.empty(len(half))
-        traced = (turn < 0.25 * 2 * np.pi / BINS) & (half < table.square.half_m)
-        if traced.all():
-            tracing.trace_box_bounds(self, table, centres, half, azimuths, turn, low, high)
-        elif not traced.any() and np.all(half == half[0]):
-            tracing.look_up_sector_bounds(self, table, centres, half, azimuths, turn, low, high)
-        else:
-            for kind in np.unique(half[~traced]):
-                which = ~traced & (half == kind)
-                low[which], high[which] = self._bounds_of_some(
-                    tracing.look_up_sector_bounds, centres, half, azimuths, turn, which
-                )
-            low[traced], high[traced] = self._bounds_of_some(
-                tracing.trace_box_bounds, centres, half, azimuths, turn, traced
-            )
-        return low.reshape(shape), high.reshape(shape)
+        return tracing.bound_horizons(self, self.table, centres_m, half_m, azimuths_rad, azimuth_half_rad)
 
     def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """From the height of the single post that makes the horizon: sigma cos^2 H / its distance."""
@@ -280,53 +239,14 @@ class HeightMap(Terrain):
         """tan, distance, and distance of the maps' end, of each point and azimuth."""
         points_m = np.asarray(points_m, dtype=np.float64)
         shape = np.broadcast_shapes(points_m.shape[:-1], np.shape(azimuths_rad))
-        points = _flatten(points_m, (*shape, 2)).reshape(-1, 2)
+        points = tracing.flatten(points_m, (*shape, 2)).reshape(-1, 2)
         found = tracing.trace_horizons(
-            self, cache.TABLES_IN_MEMORY.get(self._key), points, _flatten(azimuths_rad, shape).ravel()
+            self, cache.TABLES_IN_MEMORY.get(self._key), points, tracing.flatten(azimuths_rad, shape).ravel()
         )
         return tuple(a.reshape(shape) for a in found)  # type: ignore[return-value]
-
-    def _bounds_of_some(
-        self, bounds: Any, centres: Array, half: Array, azimuths: Array, turn: Array, which: Bools
-    ) -> Any:
-        low, high = np.empty(int(which.sum())), np.empty(int(which.sum()))
-        if len(low):
-            parts = (np.ascontiguousarray(a[which]) for a in (centres, half, azimuths, turn))
-            bounds(self, self.table, *parts, low, high)
-        return low, high
-
-    def _build_table(self, progress: Progress | None) -> HorizonTable:
-        square = self.square
-        centres = square.centres_m
-        wanted = np.hypot(*centres.T) < self.reach_m + 1.42 * square.half_m  # all that contain a position within reach
-        middles = (np.arange(BINS) + 0.5) * 2 * np.pi / BINS
-
-        def fill(cells: Ints) -> Array:
-            return tracing.trace_cells(self, centres[cells], square.half_m, middles, np.pi / BINS)
-
-        return build_table(square, wanted, fill, self._unknown_rad(), progress)
-
-    def _unknown_rad(self) -> Array:
-        """(BINS,) elevation below which ground beyond the maps might be seen from somewhere in the search area."""
-        line = np.linspace(-1, 1, UNKNOWN_FROM) * self.search_radius_m
-        places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-        places = places[np.hypot(*places.T) <= self.search_radius_m]
-        azimuths = np.repeat((np.arange(BINS)[:, None] + [0.02, 0.5, 0.98]).ravel(), len(places)) * 2 * np.pi / BINS
-        where = np.tile(places, (3 * BINS, 1))
-        tan, _, edge = self.horizons(where, azimuths)
-        up = self.ground_m(places) + self.camera_height_m
-        away = where + edge[:, None] * np.stack([np.sin(azimuths), np.cos(azimuths)], axis=-1)
-        drop = np.sum(np.minimum(np.abs(away), 1e7) ** 2, axis=-1) / (2 * self.ground.radius_m)
-        possible = (self.ground.highest_m - drop - np.tile(up, 3 * BINS)) / edge
-        unknown = np.where((edge < 1e9) & (possible > tan), np.arctan(possible), -np.pi / 2)
-        return np.asarray(unknown.reshape(BINS, -1).max(axis=1))
 
     def _covers(self, half_m: float) -> bool:
         """Whether the maps know all ground in the square about the origin."""
         line = np.linspace(-half_m, half_m, 65)
         points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
         return not np.isnan(ground_up_m(self.site, list(self.maps), points)).any()
-
-
-def _flatten(a: Any, shape: tuple[int, ...]) -> Array:
-    return np.ascontiguousarray(np.broadcast_to(np.asarray(a, dtype=np.float64), shape))

@@ -92,6 +92,46 @@ def interpolate_bounds(near: HorizonInterpolator, centres: Array, half: float, c
     return low, high
 
 
+def bound_horizons(
+    terrain: HeightMap,
+    table: HorizonTable,
+    centres_m: Array,
+    half_m: Array,
+    azimuths_rad: Array,
+    azimuth_half_rad: Array | float,
+) -> tuple[Array, Array]:
+    """Bounds of the horizon over boxes [rad]: traced for single rays and small boxes, else from the table.
+
+    Arguments and results broadcast, as in `Terrain.horizon_bounds_rad`.
+    """
+    centres_m = np.asarray(centres_m, dtype=np.float64)
+    shape = np.broadcast_shapes(
+        centres_m.shape[:-1], np.shape(half_m), np.shape(azimuths_rad), np.shape(azimuth_half_rad)
+    )
+    centres = flatten(centres_m, (*shape, 2)).reshape(-1, 2)
+    half, azimuths, turn = (flatten(a, shape).ravel() for a in (half_m, azimuths_rad, azimuth_half_rad))
+    low, high = np.empty(len(half)), np.empty(len(half))
+    traced = (turn < 0.25 * 2 * np.pi / BINS) & (half < table.square.half_m)
+    if traced.all():
+        trace_box_bounds(terrain, table, centres, half, azimuths, turn, low, high)
+    elif not traced.any() and np.all(half == half[0]):
+        look_up_sector_bounds(terrain, table, centres, half, azimuths, turn, low, high)
+    else:
+        parts = [(look_up_sector_bounds, ~traced & (half == kind)) for kind in np.unique(half[~traced])]
+        for bounds, which in [*parts, (trace_box_bounds, traced)]:
+            if which.any():
+                some = [np.ascontiguousarray(a[which]) for a in (centres, half, azimuths, turn)]
+                results = np.empty((2, len(some[0])))
+                bounds(terrain, table, *some, *results)
+                low[which], high[which] = results
+    return low.reshape(shape), high.reshape(shape)
+
+
+def flatten(a: Any, shape: tuple[int, ...]) -> Array:
+    """The values of `a`, broadcast to the shape, in one contiguous array."""
+    return np.ascontiguousarray(np.broadcast_to(np.asarray(a, dtype=np.float64), shape))
+
+
 def level_for(table: HorizonTable, half: float) -> int:
     """Level of the pyramid whose blocks are as wide as the box at least, or the last."""
     level = 0

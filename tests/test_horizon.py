@@ -271,6 +271,21 @@ def test_without_site_or_time_it_is_bad_input(tmp_path, capsys):
     assert not (tmp_path / "a.csv").exists()
 
 
+def test_a_picture_of_another_body_is_refused(two_frames, catalog, tmp_path, capsys):
+    """The terrain that an image names identifies the body."""
+    lunar = replace(two_frames[0], terrain="shackleton-thesis")
+    with pytest.raises(
+        BadInput, match="shackleton-thesis, which is on the Moon, but the site is on the Earth"
+    ) as cause:
+        measure_skyline([lunar], catalog, SITE, camera=CAMERA)
+    assert cause.value.reason == "bad_terrain"
+    words = [str(ROOT / "sample_images/near-centre.png"), LOWELL_FLAG]
+    for command in (["horizon", "-o", str(tmp_path / "a.csv")], ["calibrate", "-o", str(tmp_path / "a.toml")]):
+        assert main([*command, *words]) == 4
+        assert "on the Moon" in "".join(capsys.readouterr())
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_library_has_it_and_checks_its_arguments():
     with pytest.raises(ValueError, match="exclude"):
         startrack.measure_horizon([PHOTO], site=LOWELL, camera="lowell-ldt", fov=180)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from datetime import datetime
+from pathlib import Path
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from startrack.frames import (
     rays_from_azel,
     refract_rad,
 )
+from startrack.terrain.io import body_of_terrain
 from startrack.types import Array, BadInput, Bools, Centroids, Exposure, Stars, take_rows
 
 LOWEST_RAD = np.radians(3.0)  # on the Earth; below it refraction is not predictable
@@ -68,9 +70,10 @@ def load_frame(
 ) -> Frame:
     """Detect the sources outside the masks of exposure and `camera`, and compute the sky at the exposure's time.
 
-    Raises BadInput (no_time, or a mask that cannot be used), TooFewStars.
+    Raises BadInput (no_time, bad_terrain of another body, or a mask that cannot be used), TooFewStars.
     """
     require_time(exposure)
+    require_body(exposure, site)
     if camera is not None:
         exposure = with_facts(exposure, mask=combine_masks(exposure.mask, camera.mask, exposure.size_px))
     return frame_of(exposure, (detector or Detector())(exposure, None), catalog, site)
@@ -81,6 +84,19 @@ def require_time(exposure: Exposure) -> datetime:
     if exposure.time_utc is None:
         raise BadInput("no_time", f"{exposure.name}: {NO_TIME}")
     return exposure.time_utc
+
+
+def require_body(exposure: Exposure, site: Site | None) -> None:
+    """Raise BadInput bad_terrain where the exposure names a terrain on another body than the site."""
+    if site is None or exposure.terrain is None:
+        return
+    body = body_of_terrain(exposure.terrain)
+    if body != site.body:
+        raise BadInput(
+            "bad_terrain",
+            f"{exposure.name} names the terrain {Path(exposure.terrain).name}, which is on the {body.title()}, but the "
+            f"site is on the {site.body.title()}: correct the site, or the terrain in the image's sidecar or header",
+        )
 
 
 def frame_of(exposure: Exposure, found: Centroids, catalog: StarCatalog, site: Site | None) -> Frame:

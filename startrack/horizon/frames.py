@@ -8,7 +8,7 @@ from datetime import datetime
 
 import numpy as np
 
-from startrack.calibration.frame import Sky, frame_of, pressure_hpa, require_time, sky_at
+from startrack.calibration.frame import Sky, frame_of, pressure_hpa, require_body, require_time, sky_at
 from startrack.calibration.region_growing import JointFit, fit_frames
 from startrack.camera import Camera
 from startrack.catalog import StarCatalog
@@ -60,7 +60,7 @@ def orient_frames(
     """The frames with identified stars, and those without.
 
     The lens is that of `camera`, or found from `fov_rad`, and then fitted to the stars of all frames in their apparent
-    directions. Raises BadInput (no_time, no_calibration, size_mismatch).
+    directions. Raises BadInput (no_time, no_calibration, size_mismatch, bad_terrain of another body).
     """
     if camera is None and fov_rad is None:
         raise BadInput("no_calibration", "no camera is known: give a camera file (-c) or the field of view (--fov)")
@@ -68,6 +68,7 @@ def orient_frames(
     left_out: list[LeftOut] = []
     for exposure in exposures:
         require_time(exposure)
+        require_body(exposure, site)
         outcome = _identify(exposure, catalog, site, identified[0].camera if identified else camera, fov_rad)
         if isinstance(outcome, Refused):
             left_out.append(LeftOut(name=exposure.name, reason=outcome.reason, message=outcome.message))

@@ -80,6 +80,12 @@ def load_terrain(name_or_path: str | Path) -> Terrain:
         raise BadInput("bad_terrain", f"{printable(path)}: {cause}") from cause
 
 
+def body_of_terrain(name_or_path: str | Path) -> str:
+    """The body of a terrain file, as `load_terrain` finds it, without reading its maps. Raises BadInput bad_terrain."""
+    path = resolve_named(name_or_path, "terrain", "bad_terrain")
+    return str(read_keys(read_text(path, "bad_terrain"))["body"])
+
+
 def read_keys(text: str) -> dict[str, Any]:
     """The checked keys of a terrain file's text. Raises BadInput bad_terrain."""
     return KEYS.read(parse_toml(text, "bad_terrain"), "bad_terrain")

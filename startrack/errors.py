@@ -126,6 +126,10 @@ class BadInput(Exception):
         self.reason = reason_of(reason)
 
 
+class BadOutput(BadInput):
+    """A path at which results cannot be written; of a flag it is wrong usage (exit code 2)."""
+
+
 class NoSolution(Exception):
     """A stage found no reliable answer (exit code 3). The message contains advice."""
 

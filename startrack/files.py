@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import tempfile
@@ -12,12 +13,13 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from startrack.errors import BadInput
+from startrack.errors import BadInput, BadOutput
 
 PACKAGE = Path(__file__).resolve().parent
 MAX_TEXT_BYTES = 2**20  # camera and terrain files have a few kilobytes
 MAX_CAUSE_CHARS = 200  # of a library's message
 MAX_STEM_BYTES = 200  # file systems take names of 255, and a suffix follows
+FULL_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}  # errors of writing that are not the path's
 FilePath = str | os.PathLike[str]
 
 
@@ -112,17 +114,38 @@ def existing_folder(folder: FilePath, content: str = "") -> Path:
 def make_folder(folder: FilePath, reason: str = "bad_image") -> Path:
     """Make a folder for results and check that files can be written there, before anything is computed.
 
-    Raises BadInput `reason` if they cannot.
+    Raises BadOutput `reason` if they cannot; BadInput if the disk is full.
     """
     path = Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
             pass
-    except OSError as cause:
-        raise BadInput(
-            reason, f"{path}: results cannot be written to this folder ({cause.strerror}): choose another"
+    except (OSError, ValueError) as cause:  # ValueError: a name with a null character
+        text = getattr(cause, "strerror", None) or cause
+        raise _write_error(cause)(
+            reason, f"{printable(path)}: results cannot be written to this folder ({text}): choose another"
         ) from cause
+    return path
+
+
+def check_output(file: FilePath, *, overwrite: bool, reason: str = "bad_image") -> Path:
+    """Path of an output file, before anything is computed; its folder is made.
+
+    Raises BadOutput `reason` if the file exists and not `overwrite`, or is a folder, or if its folder takes no files.
+    """
+    path = Path(file)
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):  # `make_folder` reports what is no folder
+        pass
+    except (OSError, ValueError) as cause:  # a name too long, or with a null character
+        text = getattr(cause, "strerror", None) or cause
+        raise BadOutput(reason, f"{printable(path)}: cannot be written ({text})") from cause
+    if os.path.lexists(path) and not os.path.isfile(path):  # a folder; a pipe or a device, which must not be replaced
+        raise BadOutput(reason, f"{printable(path)}: is no file, so that it cannot be replaced: choose another")
+    check_free(path, overwrite=overwrite, reason=reason)
+    make_folder(path.parent, reason)
     return path
 
 
@@ -158,7 +181,8 @@ def atomic_file(path: FilePath) -> Iterator[Path]:
 def write_atomically(path: FilePath, data: bytes, *, overwrite: bool, reason: str = "bad_image") -> None:
     """Write a file that appears under its name only when it is complete; missing folders are made.
 
-    Raises BadInput `reason` if the file exists and not `overwrite`, or if it cannot be written.
+    Raises BadOutput `reason` if the file exists and not `overwrite`, or if the path takes no file; BadInput if the
+    disk is full.
     """
     check_free(path, overwrite=overwrite, reason=reason)
     try:
@@ -166,14 +190,19 @@ def write_atomically(path: FilePath, data: bytes, *, overwrite: bool, reason: st
             file.write(data)
     except (OSError, ValueError) as error:
         cause = getattr(error, "strerror", None) or error
-        raise BadInput(reason, f"{printable(path)}: cannot be written ({cause})") from error
+        raise _write_error(error)(reason, f"{printable(path)}: cannot be written ({cause})") from error
+
+
+def _write_error(cause: Exception) -> type[BadInput]:
+    """BadInput of a full disk, else BadOutput: the path is at fault."""
+    return BadInput if isinstance(cause, OSError) and cause.errno in FULL_DISK else BadOutput
 
 
 def check_free(path: FilePath, *, overwrite: bool, reason: str = "bad_image") -> None:
-    """Raise BadInput `reason` if the file exists and may not be replaced."""
+    """Raise BadOutput `reason` if the file exists and may not be replaced."""
     if not overwrite and os.path.lexists(path):
         remedy = "replace it with -O (overwrite=True in the library), or write elsewhere"
-        raise BadInput(reason, f"{printable(path)}: exists already: {remedy}")
+        raise BadOutput(reason, f"{printable(path)}: exists already: {remedy}")
 
 
 @contextmanager

@@ -96,6 +96,41 @@ def test_a_batch_does_not_hang_or_fail_on_what_is_no_result(tmp_path, capsys, ki
     assert json.loads((out / "01.fix.json").read_text())["reason"] == "no_stars"
 
 
+@pytest.mark.parametrize("fault", ["/proc/a", "folder", "file/below", "long", "unknown suffix", "existing"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        "horizon {image} --fov 180 --site=34,-111 -o", "calibrate {image} --fov 180 -o",
+        "calibrate board {image} --pattern 9x6 -o", "calibrate convert fisheye-2048 --to ros -o",
+        "render -t shackleton-thesis -o", "report {folder} -o",
+        "terrain import {image} --latitude -89 --longitude 0 -o",
+    ],
+    ids=lambda words: words.split(" {")[0].split(" -")[0],
+)  # fmt: skip
+def test_an_output_path_at_fault_is_wrong_usage(tmp_path, capsys, words, fault):
+    """In one line with the cause, exit code 2, and nothing is written."""
+    suffix = {"horizon": ".csv", "render": ".png", "report": ".html"}.get(words.split()[0], ".toml")
+    (image,) = frames(tmp_path / "images", 1)
+    (tmp_path / f"folder{suffix}").mkdir()
+    (tmp_path / "file").write_text("")
+    (tmp_path / f"existing{suffix}").write_text("before")
+    name = {"long": "x" * 300 + suffix, "unknown suffix": "a.xyz"}.get(fault, fault + suffix)
+    replacing = words.split()[0] in ("calibrate", "report")  # these replace their file, and take any suffix
+    if replacing and fault in ("existing", "unknown suffix"):
+        pytest.skip("no fault of this command")
+    before = sorted(tmp_path.rglob("*"))
+    command = words.format(image=image, folder=tmp_path / "images").split()
+    try:
+        code = main([*command, str(tmp_path / name)])
+    except SystemExit as end:
+        code = end.code
+    out, err = capsys.readouterr()
+    assert (code, out) == (2, "")
+    assert "error: " in err.splitlines()[-1] and "Traceback" not in err
+    assert sorted(tmp_path.rglob("*")) == before
+    assert (tmp_path / f"existing{suffix}").read_text() == "before"
+
+
 def test_a_folder_in_place_of_a_table_is_named(tmp_path, capsys):
     frames(tmp_path / "images", 1)
     put(tmp_path / "out" / "results.ecsv", "full folder")

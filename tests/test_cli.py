@@ -325,11 +325,12 @@ def test_a_field_of_view_where_it_does_not_help_is_wrong_usage(folder, capsys, w
 @pytest.mark.parametrize("command", ["locate", "identify", "detect"])
 def test_a_folder_that_takes_no_results_is_named_before_any_work(folder, capsys, command):
     stars()
-    code, lines, _ = run(capsys, command, "stars.png", "-D", "/proc", "--json")
-    record = json.loads(lines[0])
-    assert (code, record["reason"]) == (BAD_INPUT, "bad_image")
-    assert record["message"].startswith("/proc: results cannot be written to this folder")
-    assert "timing_ms" not in record
+    with pytest.raises(SystemExit) as end:
+        main([command, "stars.png", "-D", "/proc", "--json"])
+    assert end.value.code == USAGE
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "/proc: results cannot be written to this folder" in err.splitlines()[-1]
 
 
 def test_no_refusal_shows_a_traceback(folder):

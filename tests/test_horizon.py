@@ -255,7 +255,7 @@ def test_the_command_writes_the_file_and_the_record(tmp_path, capsys):
     Draft202012Validator(SCHEMAS["horizon"]).validate(record)
     assert set(record) <= set(SCHEMAS["horizon"]["properties"])
     assert out.exists()
-    assert main(["horizon", str(PHOTO), "-o", str(out), LOWELL_FLAG, "-c", "lowell-ldt"]) == 4
+    assert main(["horizon", str(PHOTO), "-o", str(out), LOWELL_FLAG, "-c", "lowell-ldt"]) == 2
 
 
 def test_without_site_or_time_it_is_bad_input(tmp_path, capsys):

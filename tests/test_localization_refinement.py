@@ -41,7 +41,7 @@ def shared_errors() -> SharedErrors:
 
 def shifts(rng: np.random.Generator, errors: SharedErrors, sigma_px: Array | float = SIGMA_PX) -> tuple[Array, Array]:
     """Shifts (SECTORS,) of a skyline by a step of the position and shared errors from their priors, and the step."""
-    step = rng.multivariate_normal(PRIOR_M, PRIOR_M2, min_sectors=MIN_SECTORS)
+    step = rng.multivariate_normal(PRIOR_M, PRIOR_M2)
     values = rng.multivariate_normal(errors.mean, errors.covariance)
     return SLOPES @ step + errors.raised_px @ values + sigma_px * rng.normal(size=SECTORS), step
 

@@ -16,7 +16,7 @@ from startrack.cli.flag_types import amount, field_of_view_rad, number, positive
 from startrack.cli.progress import progress
 from startrack.compilation import announce_compilation
 from startrack.errors import NoSolution, exit_code_of
-from startrack.files import make_folder
+from startrack.files import check_output
 
 if TYPE_CHECKING:
     from startrack.calibration import Calibration, KnownSensor
@@ -206,10 +206,8 @@ def print_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) -
 
 
 def output_path(args: argparse.Namespace, default: str) -> Path:
-    """Path of the result; its folder is made. Raises BadInput if that is impossible."""
-    path = Path(args.output) if args.output else Path(args.dir) / default
-    make_folder(path.parent)
-    return path
+    """Path of the result; its folder is made. Raises BadOutput if that is impossible."""
+    return check_output(args.output or Path(args.dir) / default, overwrite=True)
 
 
 def approximate_camera(args: argparse.Namespace, exposures: list[Exposure]) -> Camera | None:

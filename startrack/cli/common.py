@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.flag_types import seconds, time_sigma_s
-from startrack.errors import INTERNAL_ERROR, BadInput, exit_code_of
+from startrack.errors import INTERNAL_ERROR, BadInput, BadOutput, exit_code_of
+from startrack.files import make_folder
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
@@ -196,10 +197,15 @@ def _refused_outcome(path: str, cause: BadInput, format_name: str) -> Outcome:
 def result_path(args: argparse.Namespace, stem: str, suffix: str, exposure: Exposure) -> Path:
     """Path of a result; its folder is made. A result of the same image is replaced, that of another only with -O.
 
-    Raises BadInput (bad_image, for lack of a better code) before anything is computed.
+    Raises BadInput (bad_image, for lack of a better code) before anything is computed. A folder that takes no results
+    is a usage error.
     """
     from startrack.output import prepare_folder
 
     path = Path(args.dir) / f"{stem}{suffix}"
+    try:
+        make_folder(path.parent)
+    except BadOutput as cause:
+        args.usage_error(str(cause))
     prepare_folder(path, exposure.sha256, overwrite=args.overwrite, remedy="choose another -D, or replace it with -O")
     return path

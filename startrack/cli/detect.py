@@ -20,7 +20,7 @@ def add_parser(subparsers: Any) -> None:
         "ADU and the PSF is measured from the image. Writes NAME.detections.json and NAME.annotated.png.",
     )
     add_image_flags(parser)
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, usage_error=parser.error)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -12,7 +12,7 @@ from startrack.cli.calibrate import approximate_camera, print_outcome, site_of
 from startrack.cli.common import add_fact_flags, add_output_flags, read
 from startrack.cli.flag_types import field_of_view_rad
 from startrack.cli.progress import progress
-from startrack.errors import BadInput, NoSolution
+from startrack.errors import BadInput, BadOutput, NoSolution
 
 if TYPE_CHECKING:
     from startrack.frames import Site
@@ -52,6 +52,8 @@ def run(args: argparse.Namespace) -> int:
         args.usage_error("--time is the time of one image; give each of several its own in a sidecar NAME.json")
     try:
         return print_outcome(args, *_measure(args))
+    except BadOutput:
+        raise
     except (BadInput, NoSolution) as cause:
         record = {"format": FORMAT, "status": "refused", "reason": cause.reason, "message": str(cause)}
         return print_outcome(args, record, f"{Path(args.output).name}  refused {cause.reason}: {cause}")

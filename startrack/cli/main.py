@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import errno
 import importlib
 import importlib.util
 import io
@@ -17,7 +16,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from startrack import __version__
-from startrack.errors import BadInput, NoSolution
+from startrack.errors import BadInput, BadOutput, NoSolution
+from startrack.files import FULL_DISK
 
 COMMANDS = (
     "locate", "batch", "identify", "detect", "render", "calibrate", "horizon", "report", "reproduce", "terrain",
@@ -26,7 +26,6 @@ COMMANDS = (
 ACTIONS = {"calibrate": ("verify", "show", "convert", "board")}  # with a parser each, beside the command's own
 OK, INTERNAL_ERROR, USAGE, REFUSED, BAD_INPUT, STOPPED = range(6)
 INTERRUPTED = 130
-FULL_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}  # errors of writing to stdout
 EPILOG = """exit codes: 0 every image solved; 1 internal error; 2 usage; 3 an image ambiguous or refused; 4 bad input;
 5 batch: some image not solved; 5 also if the reader of the output has gone before the end (a closed pipe)
 
@@ -62,6 +61,9 @@ def _run(args: argparse.Namespace) -> int:
         code = int(args.run(args))
         sys.stdout.flush()  # here, where a closed pipe is distinguished from an error
         return code
+    except BadOutput as cause:
+        print(f"startrack {args.command}: error: {cause}", file=sys.stderr)
+        return USAGE
     except BadInput as cause:
         return _report_failure(f"{cause.reason}: {cause}", BAD_INPUT)
     except NoSolution as cause:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +28,7 @@ from startrack.cli.flag_types import (
     seconds,
 )
 from startrack.cli.progress import progress
-from startrack.errors import BadInput
+from startrack.files import check_output
 
 if TYPE_CHECKING:
     from startrack.rendering import Drive, Scene, Series, Truth
@@ -65,10 +64,11 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Render and write the images; 0. Raises BadInput for files and values that cannot be used."""
+    """Render and write the images; 0. Raises BadInput for files and values that cannot be used, BadOutput for paths."""
     drive = read_drive_flags(args)
     images = _targets(args, count_images(args, drive))
     series = _series(args, drive)
+    _check_targets(images, args)
     poses = [series.pose(number) for number in range(len(images))] if args.every is not None else []
     with progress("render", len(images), shown=len(images) >= PROGRESS_FROM) as bar:
         for number, image in enumerate(images):
@@ -126,9 +126,7 @@ def _add_output(group: Any) -> None:
 
 
 def _targets(args: argparse.Namespace, count: int) -> list[Path]:
-    """The images to write; every file is checked first, so that nothing is written half-way to a refusal."""
-    from startrack.rendering import truth_paths
-
+    """The images to write."""
     if args.output is not None and count != 1:
         args.usage_error(f"--output names one image, but --count is {count}: give --dir")
     if args.output is not None:
@@ -139,11 +137,16 @@ def _targets(args: argparse.Namespace, count: int) -> list[Path]:
         stem = f"{Path(args.terrain).name.removesuffix('.toml')}-{args.seed}"
         digits = max(3, len(str(count - 1)))
         images = [Path(args.dir) / f"{stem}-{k:0{digits}d}{SUFFIXES[args.format]}" for k in range(count)]
+    return images
+
+
+def _check_targets(images: list[Path], args: argparse.Namespace) -> None:
+    """Check every file first, so that nothing is written half-way to an error. Raises BadOutput."""
+    from startrack.rendering import truth_paths
+
     ours = (p for image in images for p in (image, image.with_suffix(".json"), *truth_paths(image)))
     for path in (*ours, *trajectory_paths(args)):
-        if not args.overwrite and os.path.lexists(path):
-            raise BadInput("bad_image", f"{path}: exists already; -O/--overwrite replaces it")
-    return images
+        check_output(path, overwrite=args.overwrite)
 
 
 def _series(args: argparse.Namespace, drive: Drive | None) -> Series:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from startrack.cli.flag_types import count
 from startrack.errors import BadInput
-from startrack.files import existing_folder
+from startrack.files import check_output, existing_folder
 
 if TYPE_CHECKING:
     from startrack.output.html import Found
@@ -56,9 +56,11 @@ def run(args: argparse.Namespace) -> int:
 def write_page_of(
     out: str, *, truth: str | None = None, images: int = DEFAULT_IMAGES, output: str | None = None
 ) -> Path:
-    """Write the page of a folder of results or of one NAME.fix.json; its path. Raises BadInput."""
+    """Write the page of a folder of results or of one NAME.fix.json; its path. Raises BadInput, BadOutput."""
     from startrack.output.html import result_at, results_under, write_page
 
+    if output is not None:
+        check_output(output, overwrite=True)
     if Path(out).is_file():
         one = result_at(out)
         path = Path(output) if output else one.companion(OF_ONE)

@@ -14,7 +14,7 @@ from startrack.cli.common import DEFAULT_OUT
 from startrack.cli.preparation import prepare
 from startrack.cli.terrain_facts import facts_of, lines_of, view_facts
 from startrack.compilation import announce_compilation
-from startrack.files import file_stem, make_folder
+from startrack.files import check_output, file_stem, make_folder
 
 if TYPE_CHECKING:
     from startrack.terrain import Terrain
@@ -106,6 +106,7 @@ def _pictures(args: argparse.Namespace, terrain: Terrain, position: tuple[float,
     from PIL import Image
 
     for path, picture in pictures.items():
+        check_output(path, overwrite=True, reason="bad_terrain")
         Image.fromarray(picture).save(path)
     return list(pictures)
 

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from startrack.files import check_free, write_atomically
+from startrack.errors import BadOutput
+from startrack.files import check_output as check_file
+from startrack.files import write_atomically
 from startrack.frames import Site
 from startrack.output import png_bytes
 from startrack.output.skyline_table import skyline_table_text, skyline_texts_deg
@@ -18,11 +20,11 @@ TINY_DEG = 1e-5  # Stellarium draws a polygon with a corner at exactly 0 or 180 
 
 
 def kind_of(output: str) -> str:
-    """The suffix of an output path, "" for a folder. Raises BadInput (bad_image, for lack of a better code)."""
+    """The suffix of an output path, "" for a folder. Raises BadOutput (bad_image, for lack of a better code)."""
     suffix = "" if output.endswith(("/", "\\")) else Path(output).suffix.lower()
     if suffix not in (*SUFFIXES, ""):
         known = ", ".join(SUFFIXES)
-        raise BadInput("bad_image", f"{output}: the suffix is none of {known}; a name without one is a folder")
+        raise BadOutput("bad_image", f"{output}: the suffix is none of {known}; a name without one is a folder")
     return suffix
 
 
@@ -33,9 +35,9 @@ def output_files(output: str) -> tuple[Path, ...]:
 
 
 def check_output(output: str, *, overwrite: bool) -> None:
-    """Raise BadInput if the output has an unknown suffix, or exists and may not be replaced."""
+    """Raise BadOutput if the output has an unknown suffix, exists and may not be replaced, or takes no files."""
     for path in output_files(output):
-        check_free(path, overwrite=overwrite)
+        check_file(path, overwrite=overwrite)
 
 
 def needs_all_azimuths(output: str) -> bool:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from startrack.errors import BadOutput
+from startrack.files import check_output
 from startrack.terrain.geotiff import write_map
 from startrack.terrain.map_comparison import crest_angle_rad_per_m
 from startrack.terrain.map_error import carried_spacing, error_between_posts_m
@@ -47,19 +49,18 @@ def import_maps(
     `maps`, of the files `compare`, or a shipped one; else it is estimated from the map's roughness. camera_height_m:
     above the ground [m]. overwrite: replace existing files.
 
-    Raises BadInput bad_terrain; nothing is then written.
+    Raises BadInput bad_terrain, BadOutput of `output`; nothing is then written.
     """
     output = Path(output)
     if output.suffix != ".toml":
-        raise BadInput("bad_terrain", f"{output}: a terrain file's name ends in .toml")
+        raise BadOutput("bad_terrain", f"{output}: a terrain file's name ends in .toml")
     origin = latitude_rad, longitude_rad
     latitude_deg, longitude_deg = (round(float(np.degrees(angle)), 9) for angle in origin)
     if not abs(latitude_deg) <= 90:
         raise BadInput("bad_terrain", f"latitude {latitude_deg:g} is not within -90..90")
     files = [output.with_name(f"{output.stem}-{k + 1}.tif") for k in range(len(maps))]
-    existing = [path for path in (output, *files) if path.exists()]
-    if existing and not overwrite:
-        raise BadInput("bad_terrain", f"{existing[0]} exists: choose another name, or replace it with -O")
+    for path in (output, *files):
+        check_output(path, overwrite=overwrite, reason="bad_terrain")
     crops = []
     for k, (source, half) in enumerate(zip(maps, half_m, strict=True)):
         own = {"scale": scale[k] if k < len(scale) else None, "offset_m": offset_m[k] if k < len(offset_m) else None}

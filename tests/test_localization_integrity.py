@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -14,6 +14,7 @@ from test_localization_shape import TRUE, evidence_at
 from startrack.evidence.sky_light import MIDDLES_RAD
 from startrack.localization import ExactPosterior, Integrity
 from startrack.localization.integrity import (
+    COARSE,
     DIVISIONS,
     GROUPS,
     NEGLIGIBLE_SIGMAS,
@@ -21,12 +22,17 @@ from startrack.localization.integrity import (
     WRONG_GROUP,
     _assess,
     _divide,
+    _grid,
+    _match_grid,
+    _moments,
     assess_integrity,
 )
+from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.refinement import refine_fix
 from startrack.output import result_dict, verbose_text
 from startrack.output.schema import SCHEMAS
-from startrack.types import Array, Evidence, Fix, NotLocated
+from startrack.terrain import Cylinder
+from startrack.types import Array, Bools, Evidence, Fix, NotLocated
 
 SECTORS = 240
 WIDTH_RAD = 2 * np.pi / GROUPS
@@ -103,6 +109,41 @@ def test_true_positions_are_within_the_level_and_not_refused() -> None:
         ratios.append(found.protection_level_m / fix.radius999_m)
     assert np.median(ratios) < 3.0
     assert np.mean(np.isfinite(ratios)) > 0.85
+
+
+class _WestOnly(Cylinder):
+    """The thesis's crater, east of a line too steep for a rover."""
+
+    def allowed(self, points_m: Array) -> Bools:
+        return super().allowed(points_m) & (np.asarray(points_m)[..., 0] <= EASTERN_LIMIT_M)
+
+
+EASTERN_LIMIT_M = 3000.0
+
+
+def test_positions_that_are_not_allowed_do_not_count() -> None:
+    """Half of a normal posterior is beyond the limit: the mean of the other half is at sqrt(2 / pi) sigma."""
+    covariance, fine = np.array([[9.0, 2.0], [2.0, 4.0]]), (6.0, 41)
+    offsets_m, is_rim = _grid(covariance, *fine, lambda at: at[:, 0] <= 0.0)
+    log = -0.5 * np.einsum("ni,ij,nj->n", offsets_m, np.linalg.inv(covariance), offsets_m)
+    (mean,), (spread,) = _moments(offsets_m, log[:, None])
+    assert mean[0] == pytest.approx(-3.0 * np.sqrt(2 / np.pi), abs=0.5)
+    assert spread[0, 0] < 0.5 * covariance[0, 0]
+    assert len(offsets_m) == len(is_rim) < len(_grid(covariance, *fine, lambda at: at[:, 0] < np.inf)[0])
+
+
+def test_a_position_beside_ground_that_is_not_allowed() -> None:
+    west = _WestOnly(**{field.name: getattr(TRUE, field.name) for field in fields(TRUE) if field.init})
+    rows = evidence_at((EASTERN_LIMIT_M - 1.0, -2000.0), 1)
+    fix = ExactPosterior()(rows, TRUE)
+    east_m = {}
+    for terrain in (west, TRUE):
+        likelihood = PositionLikelihood.from_evidence(rows, terrain)
+        centre_m, covariance_m2, by_sector = _match_grid(likelihood, fix.position_enu_m[:2], fix.covariance_m2)
+        offsets_m, _ = _grid(covariance_m2, *COARSE, lambda at, c=centre_m, t=terrain: t.allowed(c + at))
+        assert len(offsets_m) == len(by_sector)
+        east_m[type(terrain)] = centre_m[0] + _moments(offsets_m, by_sector.sum(axis=1)[:, None])[0][0][0]
+    assert east_m[_WestOnly] < min(east_m[Cylinder], EASTERN_LIMIT_M)
 
 
 def test_errors_with_an_obstacle_are_refused_or_within_the_level() -> None:

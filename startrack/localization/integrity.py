@@ -1,8 +1,8 @@
 """Integrity of a fix: what it would be without each group of directions, and how far off it can be if one is wrong.
 
-The posterior without a group is that of the other rows, computed on a grid about the fix. It need not be normal: the
-edge of a single bright star is a step. Source: solution separation, as in Blanch et al. 2015, IEEE Trans. AES 51(1),
-713.
+The posterior without a group is that of the other rows, computed on a grid about the fix where the terrain allows a
+camera. It need not be normal: the edge of a single bright star is a step. Source: solution separation, as in Blanch et
+al. 2015, IEEE Trans. AES 51(1), 713.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.terrain import Terrain
-from startrack.types import Array, Evidence, Fix, NotLocated
+from startrack.types import Array, Bools, Evidence, Fix, NotLocated
 
 GROUPS = 8  # of azimuth, 45 degrees wide
 DIVISIONS = 3  # into such groups, each turned by 15 degrees: an obstacle of up to 30 degrees is wholly in one group
@@ -23,6 +23,7 @@ RISK = 1e-3  # of an error beyond the protection level: half without an obstacle
 WRONG_GROUP = 0.05  # probability that one of the groups shows something that is on no map
 WIDER_CIRCLE = 1.05  # radius that holds all but half of RISK, in that of the 99.9 % circle; of a normal distribution
 Grid = tuple[float, int]
+Allowed = Callable[[Array], Bools]  # of offsets (n, 2) [m]: where a camera can stand
 COARSE: Grid = (6.0, 13)  # reach in sigmas, and points across, of a grid
 # Where the coarse grid does not do: closer points, and wider grids for wide posteriors.
 FINE: tuple[Grid, ...] = ((6.0, 21), (15.0, 21), (40.0, 41))
@@ -75,10 +76,10 @@ def assess_integrity(
     likelihood = PositionLikelihood.from_evidence(evidence, terrain)
     groups = _divide(likelihood.sectors.count)
     centre_m, covariance_m2, by_sector = _match_grid(likelihood, position_m, covariance_m2)
-    scores = partial(_scores, likelihood, centre_m)
-    found = _assess(lambda _: by_sector, covariance_m2, groups, fix, (COARSE,))
+    scores, allowed = partial(_scores, likelihood, centre_m), _allowed_about(terrain, centre_m)
+    found = _assess(lambda _: by_sector, covariance_m2, groups, fix, (COARSE,), allowed)
     if not np.isfinite(found.protection_level_m) or found.chi2.max() > SUSPICIOUS_CHI2:
-        found = _assess(scores, covariance_m2, groups, fix)
+        found = _assess(scores, covariance_m2, groups, fix, allowed=allowed)
     _require_agreement(found)
     return found
 
@@ -106,7 +107,7 @@ def _divide(sectors: int) -> Array:
 def _match_grid(likelihood: PositionLikelihood, position_m: Array, covariance_m2: Array) -> tuple[Array, Array, Array]:
     """Position (2,) and covariance (2, 2) whose coarse grid fits the posterior by all rows, and the scores there."""
     for number in range(MATCH_ROUNDS):
-        offsets_m, _ = _grid(covariance_m2, *COARSE)
+        offsets_m, _ = _grid(covariance_m2, *COARSE, _allowed_about(likelihood.terrain, position_m))
         by_sector = _scores(likelihood, position_m, offsets_m)
         (mean,), (spread,) = _moments(offsets_m, by_sector.sum(axis=1)[:, None])
         unit = np.linalg.inv(np.linalg.cholesky(covariance_m2))
@@ -118,14 +119,23 @@ def _match_grid(likelihood: PositionLikelihood, position_m: Array, covariance_m2
     return position_m, covariance_m2, by_sector
 
 
-def _grid(covariance_m2: Array, reach_sigmas: float, across: int) -> tuple[Array, Array]:
-    """Offsets (n, 2) [m] in an ellipse, and which of them are at its rim (n,)."""
+def _allowed_about(terrain: Terrain, centre_m: Array) -> Allowed:
+    return lambda offsets_m: terrain.allowed(centre_m + offsets_m)
+
+
+def _anywhere(offsets_m: Array) -> Bools:
+    return np.ones(len(offsets_m), dtype=bool)
+
+
+def _grid(covariance_m2: Array, reach_sigmas: float, across: int, allowed: Allowed) -> tuple[Array, Bools]:
+    """Offsets (n, 2) [m] in an ellipse that are allowed, or all if none is; which of them are at its rim (n,)."""
     line = reach_sigmas * np.linspace(-1.0, 1.0, across)
     points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     radius = np.linalg.norm(points, axis=1)
     inside = radius <= reach_sigmas * (1 + 1e-9)
-    offsets_m = points[inside] @ np.linalg.cholesky(covariance_m2).T
-    return offsets_m, radius[inside] > RIM_PART * reach_sigmas
+    offsets_m, is_rim = points[inside] @ np.linalg.cholesky(covariance_m2).T, radius[inside] > RIM_PART * reach_sigmas
+    kept = allowed(offsets_m)
+    return (offsets_m[kept], is_rim[kept]) if kept.any() else (offsets_m, is_rim)
 
 
 def _scores(likelihood: PositionLikelihood, centre_m: Array, offsets_m: Array) -> Array:
@@ -151,15 +161,21 @@ def _masses(log: Array) -> Array:
 
 
 def _assess(
-    scores: Callable[[Array], Array], covariance_m2: Array, groups: Array, fix: Fix, grids: tuple[Grid, ...] = FINE
+    scores: Callable[[Array], Array],
+    covariance_m2: Array,
+    groups: Array,
+    fix: Fix,
+    grids: tuple[Grid, ...] = FINE,
+    allowed: Allowed = _anywhere,
 ) -> Integrity:
     """Integrity from the contributions of the sectors at offsets, `scores`: (n, 2) to (n, sectors).
 
     `covariance_m2` is about that of the posterior by all sectors, `groups` (m, sectors) has 1 for those of a group.
+    Only `allowed` offsets count.
     """
     mean, without = np.full((len(groups), 2), np.nan), np.full((len(groups), 2, 2), np.inf)
     for number, (reach_sigmas, across) in enumerate(grids):
-        offsets_m, is_rim = _grid(covariance_m2, reach_sigmas, across)
+        offsets_m, is_rim = _grid(covariance_m2, reach_sigmas, across, allowed)
         by_sector = scores(offsets_m)
         whole = by_sector.sum(axis=1)[:, None]
         if number == 0:

@@ -36,6 +36,7 @@ def calibration_dict(calibration: Calibration) -> dict[str, Any]:
             "held_out_rms_arcmin": fit.held_out_rms_px * arcmin_per_px(calibration.camera),
             "extra_sigma_px": fit.extra_sigma_px,
             "chi2_per_dof": fit.chi2_per_dof,
+            "birge_ratio": calibration.joint.birge_ratio,
             "map_sigma_px": next(check.value for check in calibration.checks if check.name.startswith("map sigma")),
             "refraction": "taken out" if refracted else "not taken out: no site on the Earth was given",
             "models": [vars(candidate) for candidate in fit.candidates],

@@ -38,6 +38,7 @@ class JointFit:
     points: Observations
     fit: LensFit
     gate_px: float
+    birge_ratio: float = 1.0  # by which the errors of regions exceed those of their stars; in the lens's covariance
 
 
 def grow_from_matches(

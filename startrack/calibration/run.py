@@ -13,6 +13,7 @@ from startrack.calibration.initial_camera import mirror_camera
 from startrack.calibration.obstruction import find_obstructions
 from startrack.calibration.photometry import KnownSensor, Photometry, measure_photometry
 from startrack.calibration.region_growing import JointFit, fit_frames, grow_from_matches
+from startrack.calibration.shared_errors import widen_covariance
 from startrack.camera import Camera
 from startrack.catalog import StarCatalog
 from startrack.frames import Site
@@ -101,6 +102,7 @@ def calibrate(
     frames = _frames(run, exposures)
     _identify_all(run, frames)
     joint, same = _fit_jointly(run)
+    joint = widen_covariance(joint)
     fitted = replace(joint.fit.camera, name=name)
     fitted = replace(fitted, max_angle_rad=_max_angle_rad(fitted, camera, fov_rad))
     joint = replace(joint, fit=replace(joint.fit, camera=fitted))

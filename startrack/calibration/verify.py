@@ -10,6 +10,7 @@ import numpy as np
 from startrack.calibration.frame import load_frame
 from startrack.calibration.region_growing import fit_frames, grow_from_matches
 from startrack.calibration.run import identify_with
+from startrack.calibration.shared_errors import widen_covariance
 from startrack.camera import Camera
 from startrack.camera.uncertainty import cap_grid, projection_covariance_px2
 from startrack.catalog import StarCatalog
@@ -30,7 +31,7 @@ class Verification:
     stars: int
     rms_px: float  # of the fresh fit
     change_px: float  # RMS change of the map, the best rotation removed
-    change_sigma_px: float  # expected from noise alone
+    change_sigma_px: float  # expected from the covariances of both
     largest_px: float
 
     @property
@@ -49,7 +50,7 @@ def verify(exposure: Exposure, camera: Camera, catalog: StarCatalog, site: Site 
     if found_camera.mirrored != camera.mirrored:
         raise NotIdentified("the picture is a mirror image, compared with the camera file", reason="mirrored")
     start, R = grow_from_matches(frame, found_camera, found.R_cam_icrs, found.star, found.detection)
-    fit = fit_frames((frame,), start, R[None]).fit
+    fit = widen_covariance(fit_frames((frame,), start, R[None])).fit
     grid = cap_grid(min(camera.calibrated_angle_rad, fit.camera.calibrated_angle_rad))
     change = difference_px(camera, fit.camera, grid)
     variance = projection_covariance_px2(fit.camera, grid) + projection_covariance_px2(camera, grid)

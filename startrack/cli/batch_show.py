@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.progress import progress
-from startrack.errors import INTERNAL_ERROR
+from startrack.errors import EXIT_BAD_INPUT, INTERNAL_ERROR, exit_code_of
 
 if TYPE_CHECKING:
     from startrack.batch import Rows
@@ -79,6 +79,8 @@ def show_outcomes(total: int, args: argparse.Namespace, halt: Halt) -> Iterator[
                 print(json.dumps(record), flush=True)
             elif args.verbose:
                 print(f"{record['image']}: {record['status']} {record['message']}".rstrip(), flush=True)
+            elif record["reason"] and exit_code_of(record["reason"]) == EXIT_BAD_INPUT and not args.quiet:
+                print(f"{record['image']}: {record['reason']}: {record['message']}", file=sys.stderr, flush=True)
         except BrokenPipeError:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             halt("the output is no longer read")

@@ -18,12 +18,14 @@ from startrack.stages import Detected, Inputs, Located
 Q = Quantity
 RUN: tuple[Quantity, ...] = (
     Q("clock.offset_s", "s", Located, lambda v: None if v.fix.clock is None else v.fix.clock.offset_s,
-      "true minus stated time, as the image shows it; null: not estimated", NUMBER, nullable=True,
+      "true minus stated time: mean of the posterior; 0 in a round crater, where the image does not show it; null: a "
+      "method without a posterior", NUMBER, nullable=True,
       columns=(Column("clock_offset_s", "%.6g"),),
       shown=(Show("text", "clock", "offset {:+.3f} s"), Show("notebook", "clock", "{:+.3f} s"),
              Show("page", "Clock", "{:+.3f} s"))),
     Q("clock.sigma_s", "s", Located, lambda v: None if v.fix.clock is None else v.fix.clock.sigma_s,
-      "standard deviation of the offset; null: not estimated", POSITIVE, nullable=True,
+      "standard deviation of the offset; as stated (`provenance.time_sigma_s`) where the image does not show it; null: "
+      "as above", POSITIVE, nullable=True,
       columns=(Column("clock_sigma_s", "%.6g"),),
       shown=(Show("text", "clock", "; sigma {:.3f} s"), Show("notebook", "clock", " ± {:.3f} s"),
              Show("page", "Clock", " ± {:.3f} s"))),

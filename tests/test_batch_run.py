@@ -165,3 +165,10 @@ def test_a_read_only_folder_is_reported_at_once(tmp_path, capsys):
     frames(tmp_path / "images", 1)
     assert main(["batch", str(tmp_path / "images"), "-D", "/proc"]) == 2
     assert "/proc: results cannot be written" in capsys.readouterr().err
+
+
+def test_bad_input_is_named_with_its_cause_without_any_flag(tmp_path, capsys):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "broken.png").write_bytes(b"no picture")
+    assert main(["batch", str(tmp_path / "images"), "-D", str(tmp_path / "out"), "-j", "1"]) == 5
+    assert "broken.png: bad_image: " in capsys.readouterr().err

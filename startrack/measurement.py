@@ -25,7 +25,7 @@ from startrack.evidence.star_evidence import filtered_noise_e
 from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s, sky_rotvec_rad
 from startrack.stages import Measured, Oriented, Settings, extend
 from startrack.terrain import Terrain
-from startrack.types import Array, BadInput, Clock, Detections, Fix, Ints
+from startrack.types import Array, BadInput, Clock, Detections, Fix, Ints, Stars
 
 REMEASURED_PX = 12.0  # stars this near the skyline are measured again
 NEIGHBOURS_PX = 10.0  # and with them the stars up to this distance from them, whose PSFs overlap theirs
@@ -33,6 +33,10 @@ UNDECIDED_PX = 2.0  # farther from the skyline than this, the fix decides which 
 CERTAIN_PROBABILITY = 0.99  # of being visible, or hidden, for the stars that the fix decides
 CLOCK_SIGMAS = 5.0  # of a fix, within which the true time is searched once the fix is known
 TURN_S = 600.0  # over which the sky's turn is taken
+HIGH_RAD = np.radians(45.0)  # no skyline is as high, except beside a wall
+LEAST_PART = 0.5  # of the light of the stars that only the deep catalogue has
+SURE_SIGMAS = 5.0
+NO_DEEP_STARS = "the image does not show the faint stars of {}: only Hipparcos is used"
 COMPLETE_V_MAG = 6.5  # frames with 5 sigma at this magnitude show many stars that Hipparcos lacks
 
 
@@ -49,12 +53,18 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
         )
     if when is None:
         raise BadInput("no_time", "the mid-exposure time is not known")
+    shown = oriented
     if settings.deep_stars:
         oriented = add_gaia_stars(oriented, terrain.site)
     R, response = R_enu_icrs(terrain.site, when), None
     if oriented.damage is not None:
         oriented = replace(oriented, detections=measure_noise(oriented.detections))
     light = _photometry(oriented, terrain, R, settings.evidence, oriented.detections)
+    if oriented.catalog_name != shown.catalog_name and not _shows_deep_stars(light, oriented.stars):
+        warnings = (*shown.exposure.warnings, NO_DEEP_STARS.format(oriented.catalog_name))
+        exposure = replace(shown.exposure, warnings=warnings)
+        oriented = replace(shown, exposure=exposure, detections=oriented.detections)
+        light = _photometry(oriented, terrain, R, settings.evidence, oriented.detections)
     if oriented.damage is not None:
         response = measure_response(light)
         light = response.correct(light)
@@ -87,6 +97,20 @@ def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
         stars=deep.at(when, observer_velocity_m_s(site, when)),
         identification=replace(found, star=hipparcos_rows_in_deep()[found.star]),
     )
+
+
+def _shows_deep_stars(light: StarPhotometry, stars: Stars) -> bool:
+    """Whether the image shows the stars that Hipparcos lacks, by their light together high above any skyline.
+
+    Synthetic images of Hipparcos alone do not: every one of these stars would then be evidence of a wall.
+    """
+    high = light.usable & (stars.hip[light.star] == 0) & (light.elevation_rad > HIGH_RAD)
+    if not high.any():
+        return True
+    expected, weight = light.expected_e[high], 1.0 / np.square(light.sigma_e[high])
+    information = float(weight @ np.square(expected))
+    part = float((weight * expected) @ light.flux_e[high]) / information
+    return part + SURE_SIGMAS / np.sqrt(information) > LEAST_PART
 
 
 def at_time_of_fix(measured: Measured, fix: Fix) -> Measured:

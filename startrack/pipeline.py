@@ -20,12 +20,12 @@ from startrack.orientation import (
     solve_orientation,
 )  # fmt: skip
 from startrack.run import Run, with_timing
-from startrack.sky_refinement import refine_by_sky_light
+from startrack.sky_refinement import OtherDepth, check_depth, refine_by_sky_light
 from startrack.skyline import measured_skyline
 from startrack.stages import Detected, Inputs, Located, Oriented, Refused, Settings
 from startrack.star_fix import check_fix, fix_by_stars, fix_unblocked, with_integrity
 from startrack.terrain import Terrain
-from startrack.types import BadInput, Exposure, NoSolution
+from startrack.types import BadInput, Exposure, NoSolution, NotLocated
 
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog
@@ -63,9 +63,7 @@ def locate(
                 "evidence", remeasure_near_skyline, located, located.fix_at_time, step, settings.evidence
             )
             located = run.time_stage("locate", fix_by_stars, measured, Located, settings.localizer)
-        run.time_stage("locate", check_fix, located)
-        if settings.evidence_sources != "stars":
-            located = run.time_stage("locate", refine_by_sky_light, located, settings.evidence_sources == "both")
+        located = run.time_stage("locate", _check_and_refine, located, settings)
         if located.integrity is None:
             located = run.time_stage("locate", with_integrity, located)
         sky_mag = None if step is None else step.brightness_mag_arcsec2(camera, exposure.exposure_s)
@@ -73,6 +71,28 @@ def locate(
         return run.finish(replace(located, sky_brightness_mag_arcsec2=sky_mag, skyline=skyline))
     except (BadInput, NoSolution) as refusal:
         return run.refuse(refusal)
+
+
+def _check_and_refine(located: Located, settings: Settings) -> Located:
+    """The fix, checked, and refined by the light of the sky; in a crater of another depth where that shows one."""
+    try:
+        return _refine_checked(located, settings)
+    except OtherDepth as shown:
+        located = replace(located, terrain=shown.terrain, steeper=shown.steeper)
+        return _refine_checked(fix_by_stars(located, Located, settings.localizer), settings)
+
+
+def _refine_checked(located: Located, settings: Settings) -> Located:
+    """Raises NotLocated where the rays contradict the fix, and OtherDepth."""
+    if settings.evidence_sources == "stars":
+        check_fix(located)
+        return located
+    try:
+        check_fix(located)
+    except NotLocated:
+        check_depth(located)
+        raise
+    return refine_by_sky_light(located, settings.evidence_sources == "both")
 
 
 def _sky_step(run: Run, located: Located) -> SkyStep | None:

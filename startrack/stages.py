@@ -156,6 +156,7 @@ class StarRays:
     clock: Clock
     light: StarPhotometry
     blocked: Blocked | None = None  # parts of the view that are left out; None: nothing is blocked
+    steeper: float = 0.0  # relative, by which the sky's light shows a crater deeper than its file states
 
     def evidence(self) -> Evidence:
         """The rays for the localizer."""
@@ -198,8 +199,10 @@ class Measured(StarRays, Oriented):
     def warnings(self) -> list[str]:
         """Facts in the image's file that were not used; what the terrain does not cover, and errors it leaves out."""
         blocked = [] if self.blocked is None else [f"blocked and left out: {self.blocked.text}"]
+        depth = f"the light of the sky shows a depth {self.steeper:+.2%} off that of the terrain file: it is estimated"
+        steeper = [depth] if self.steeper else []
         return [
-            *super().warnings, *self.terrain.masked_sectors(), *self.terrain.error_warnings(), *blocked,
+            *super().warnings, *self.terrain.masked_sectors(), *self.terrain.error_warnings(), *blocked, *steeper,
         ]  # fmt: skip
 
 

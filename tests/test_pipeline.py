@@ -101,6 +101,16 @@ def test_the_wrong_crater_is_refused(located: Any, catalog: StarCatalog, terrain
     assert (result.status, result.reason) == ("refused", "inconsistent_evidence")
 
 
+@pytest.mark.parametrize("error", [-0.003, 0.0, 0.003])
+def test_a_wrong_depth_shows_in_the_light_of_the_sky(located: Any, catalog: StarCatalog, error: float) -> None:
+    depth_m = located.result.terrain.depth_m
+    found = locate_again(located, catalog, depth_m=depth_m * (1 + error), depth_sigma_m=0.0)
+    assert isinstance(found, Located), found.message
+    assert covers_truth(found, located)
+    assert found.steeper == (pytest.approx(-error, abs=0.0015) if error else 0.0)
+    assert any("depth" in warning for warning in found.warnings) == bool(error)
+
+
 def test_a_position_beyond_the_search_area_is_refused(located: Any, catalog: StarCatalog) -> None:
     result = locate_again(located, catalog, search_radius_m=4000.0)  # the camera is 6.5 km from the middle
     assert (result.status, result.reason) == ("refused", "outside_search_area")

@@ -46,7 +46,9 @@ def _read_bytes(path: str | os.PathLike[str]) -> bytes:
 
 
 def decode_bytes(raw: bytes, *, camera_raw: bool = False) -> Decoded:
-    """The decoded content of a file. Camera raw files are known by their suffix: they are TIFFs with a thumbnail.
+    """The decoded content of a file, of a camera's raw file where `camera_raw` is set.
+
+    Camera raw files are known by their suffix: they are TIFFs with a thumbnail.
 
     Raises BadInput bad_image; whatever else a decoder raises for damaged bytes is turned into it.
     """

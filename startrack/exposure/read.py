@@ -50,7 +50,10 @@ def read_exposure(
 
 
 def exposure_of_decoded(decoded: Decoded, facts: Facts, *, raw: bytes, name: str, path: str) -> Exposure:
-    """The exposure of pixels `decoded` from the bytes `raw`, with its `facts`; a mosaic's pixels are equalized."""
+    """The exposure of pixels `decoded` from the bytes `raw`, with its `facts`, `name` (stem) and `path`.
+
+    The pixels of a mosaic are equalized.
+    """
     pixels, notes = _level_mosaic(decoded, facts)
     return Exposure(
         pixels_adu=pixels,

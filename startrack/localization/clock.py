@@ -35,7 +35,7 @@ class WrongTime(NotLocated):
 
 
 def clock_at(site: Site, time_utc: datetime, sigma_s: float) -> Clock:
-    """The clock of directions at the stated time of an exposure, which is right to `sigma_s`."""
+    """The clock of directions at a `site` at the stated `time_utc` of an exposure, which is right to `sigma_s`."""
     return Clock(turn_rad_s=sky_rotvec_rad(site, time_utc, TURN_S) / TURN_S, sigma_s=sigma_s)
 
 

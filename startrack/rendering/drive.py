@@ -73,7 +73,9 @@ class Drive(Value):
 
 
 def read_drive(path: FilePath, speed_m_s: float) -> Drive:
-    """The drive along the waypoints of a CSV file with a header line and the columns east_m and north_m.
+    """The drive at `speed_m_s` along the waypoints in a CSV file with a header line and columns east_m and north_m.
+
+    `path` is the file's.
 
     Raises BadInput (bad_odometry) with the file and the cause.
     """
@@ -102,7 +104,9 @@ def _waypoint(number: int, row: list[str], columns: list[int]) -> list[float]:
 def draw_odometry(
     position_enu_m: Array, R_body_enu: Array, *, sigma_1: float, floor_m: float, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Odometry of the true poses (n, 3), (n, 3, 3): positions (n, 3) [m] and rotations R_odom_body (n, 3, 3).
+    """Odometry of true poses: positions (n, 3) [m] and rotations R_odom_body (n, 3, 3).
+
+    The poses are `position_enu_m` (n, 3) and `R_body_enu` (n, 3, 3); `rng` draws the errors.
 
     The frame `odom` begins at the first pose; it is level, and its heading is drawn. The error of each increment is
     independent and normal on each horizontal axis, with the variance (sigma_1 length)^2 + floor_m^2; the errors of

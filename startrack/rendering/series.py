@@ -143,7 +143,10 @@ class Series:
         return self._pose_and_rng(number)[0]
 
     def odometry(self, poses: Sequence[Pose], *, sigma_1: float, floor_m: float) -> tuple[Array, Array]:
-        """Odometry of the first exposures of the series, whose true poses are `poses`; see `draw_odometry`."""
+        """Odometry of the first exposures of the series, whose true poses are `poses`.
+
+        `sigma_1` and `floor_m` are its errors; see `draw_odometry`.
+        """
         position_enu_m = np.array([pose.position_enu_m for pose in poses])
         R_body_enu = np.array([pose.R_body_enu for pose in poses])
         rng = np.random.default_rng([self.seed, _ODOMETRY])

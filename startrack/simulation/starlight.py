@@ -25,7 +25,7 @@ class Starlight:
     def measure(
         self, sources: Sources, pixel_variance_e2: Array, saturation_e: float, *, rng: np.random.Generator
     ) -> Photometry:
-        """A draw of what `startrack.evidence.photometry.measure` finds at the sources (n).
+        """A draw, by `rng`, of what `startrack.evidence.photometry.measure` finds at the sources (n).
 
         The background is known, and the noise of a pixel without stars is the same over the stamp of a star,
         `pixel_variance_e2` (n,). The weights are those of linear least squares for flux and local level; the light of

@@ -37,7 +37,8 @@ def read_bag_exposures(
 
     sensor_msgs/Image in mono8, mono16 or a Bayer encoding, and sensor_msgs/CompressedImage of PNG or JPEG. The time
     of a message's header is taken as the middle of the exposure. The exposures are named BAG-0000, BAG-0001, ...
-    The other arguments are facts that a bag does not have, as in `read_exposure`.
+    `path` is a file or the folder of a ROS 2 bag. A bag does not have `exposure_s`, `time_sigma_s`, `camera`, `terrain`
+    and `mask`: they are as in `read_exposure`.
 
     Raises:
         BadInput: bad_image with the file and the cause, in one line.

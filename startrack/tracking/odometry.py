@@ -46,7 +46,7 @@ class Odometry(Value):
         return len(self.time_s)
 
     def increments_body_m(self, time_s: Array) -> Array:
-        """Increments (m - 1, 3) [m] between the times (m,) [Unix s], each in the body frame of its first time.
+        """Increments (m - 1, 3) [m] between the times `time_s` (m,) [Unix s], each in the body frame of its first time.
 
         Between two poses the position is interpolated linearly, the attitude along the great arc (slerp).
 
@@ -79,7 +79,7 @@ class Odometry(Value):
 
 
 def read_odometry(path: FilePath, topic: str | None = None) -> Odometry:
-    """The odometry in a file: TUM text, or a ROS bag (.bag, .db3, .mcap, a folder with metadata.yaml).
+    """The odometry in the file `path`: TUM text, or a ROS bag (.bag, .db3, .mcap, a folder with metadata.yaml).
 
     TUM text has one pose a line, `time tx ty tz qx qy qz qw`, with the time in Unix seconds (UTC) and comments after
     `#`. Of a bag, the nav_msgs/Odometry messages of a `topic` are read (None: its only topic of that type), with the

@@ -137,7 +137,7 @@ class StarEvidence:
         return self.crowded * noise_area_px(psf_sigma_px)
 
     def judge(self, found: ExpectedStars, light: Photometry) -> StarPhotometry:
-        """The stars that are expected (`found`) with the `light` at the measurable ones, and its log-likelihood ratios."""
+        """The stars expected (`found`) with the `light` at the measurable ones, and its log-likelihood ratios."""
         which, cause = found.measurable, found.cause_code.copy()
         llr, sigma = _ratios(light, found.flux_e[which], found.fraction_sigma[which], self.capped)
         cause[which[~light.usable & (cause[which] == USABLE)]] = BAD_PIXELS

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
 from startrack.localization import Localizer
 from startrack.localization.blocked import find_blocked
-from startrack.stages import Measured
+from startrack.stages import StarRays
 from startrack.types import Fix, NotLocated
 
 ROUNDS = 4  # of finding and leaving out; two are usual
 MOST_BLOCKED_RAD = np.radians(150.0)  # of the skyline: the rest must show by itself that map, time and camera are right
 BLOCKED = "blocked"  # the cause in the star table
+S = TypeVar("S", bound=StarRays)
 
 
-def leave_out_blocked(measured: Measured, fix: Fix, localizer: Localizer) -> Measured:
+def leave_out_blocked(measured: S, fix: Fix, localizer: Localizer) -> S:
     """`measured` without the blocked parts of the view; `measured` itself where nothing is blocked.
 
     Only stars that are missing above the map's skyline are left out, with everything at their azimuths. `fix` is the

@@ -22,17 +22,16 @@ from startrack.evidence import (
     subtract_sky_step,
 )  # fmt: skip
 from startrack.evidence.star_evidence import filtered_noise_e
-from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s, sky_rotvec_rad
+from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
+from startrack.localization import clock_at
 from startrack.stages import Measured, Oriented, Settings, extend
 from startrack.terrain import Terrain
-from startrack.types import Array, BadInput, Clock, Detections, Fix, Ints, Stars
+from startrack.types import Array, BadInput, Detections, Fix, Ints, Stars
 
 REMEASURED_PX = 12.0  # stars this near the skyline are measured again
 NEIGHBOURS_PX = 10.0  # and with them the stars up to this distance from them, whose PSFs overlap theirs
 UNDECIDED_PX = 2.0  # farther from the skyline than this, the fix decides which stars are visible
 CERTAIN_PROBABILITY = 0.99  # of being visible, or hidden, for the stars that the fix decides
-CLOCK_SIGMAS = 5.0  # of a fix, within which the true time is searched once the fix is known
-TURN_S = 600.0  # over which the sky's turn is taken
 HIGH_RAD = np.radians(45.0)  # no skyline is as high, except beside a wall
 LEAST_PART = 0.5  # of the light of the stars that only the deep catalogue has
 SURE_SIGMAS = 5.0
@@ -68,9 +67,7 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
     if oriented.damage is not None:
         response = measure_response(light)
         light = response.correct(light)
-    clock = Clock(
-        turn_rad_s=sky_rotvec_rad(terrain.site, when, TURN_S) / TURN_S, sigma_s=oriented.exposure.time_sigma_s
-    )  # fmt: skip
+    clock = clock_at(terrain.site, when, oriented.exposure.time_sigma_s)
     return extend(
         oriented, Measured, terrain=terrain, site=terrain.site, R_enu_icrs=R, clock=clock, light=light,
         response=response,
@@ -111,14 +108,6 @@ def _shows_deep_stars(light: StarPhotometry, stars: Stars) -> bool:
     information = float(weight @ np.square(expected))
     part = float((weight * expected) @ light.flux_e[high]) / information
     return part + SURE_SIGMAS / np.sqrt(information) > LEAST_PART
-
-
-def at_time_of_fix(measured: Measured, fix: Fix) -> Measured:
-    """`measured` under the sky of the time that the evidence of a `fix` shows."""
-    if fix.clock is None:
-        return measured
-    later_s = fix.clock.offset_s - measured.clock.offset_s
-    return measured.later(later_s, CLOCK_SIGMAS * fix.clock.sigma_s) if later_s else measured
 
 
 def sky_step_at(measured: Measured, fix: Fix) -> SkyStep | None:

@@ -6,16 +6,11 @@ import time as clock
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from startrack.blocked_view import leave_out_blocked
 from startrack.camera import Camera
 from startrack.detection import find_damage
 from startrack.frames import Site
-from startrack.localization import Integrity, check_consistency, clock_matters, localizer_name
-from startrack.localization.integrity import assess_integrity
-from startrack.localization.nuisance import lower_evidence
-from startrack.measurement import at_time_of_fix, measure_evidence, remeasure_near_skyline, sky_step_at
+from startrack.localization import localizer_name
+from startrack.measurement import measure_evidence, remeasure_near_skyline, sky_step_at
 from startrack.orientation import (
     NO_TIME,
     check_inputs,
@@ -27,16 +22,8 @@ from startrack.orientation import (
 from startrack.run import Run, with_timing
 from startrack.sky_refinement import refine_by_sky_light
 from startrack.skyline import measured_skyline
-from startrack.stages import (
-    Detected,
-    Inputs,
-    Located,
-    Measured,
-    Oriented,
-    Refused,
-    Settings,
-    extend,
-)  # fmt: skip
+from startrack.stages import Detected, Inputs, Located, Oriented, Refused, Settings
+from startrack.star_fix import check_fix, fix_by_stars, fix_unblocked, with_integrity
 from startrack.terrain import Terrain
 from startrack.types import BadInput, Exposure, NoSolution
 
@@ -69,46 +56,23 @@ def locate(
         )
         oriented = run.run_stage("attitude", solve_orientation, identified)
         measured = run.run_stage("evidence", measure_evidence, oriented, terrain, settings)
-        located = _locate_by_stars(run, measured, settings)
-        measured = run.time_stage("locate", leave_out_blocked, located, located.fix_at_time, settings.localizer)
-        if measured is not located:
-            located = _locate_by_stars(run, measured, settings)
+        located = run.time_stage("locate", fix_unblocked, measured, Located, settings.localizer)
         step = _sky_step(run, located)
         if step is not None and step.exceeds_noise:
             measured = run.run_stage(
                 "evidence", remeasure_near_skyline, located, located.fix_at_time, step, settings.evidence
             )
-            located = _locate_by_stars(run, measured, settings)
-        if located.fix.search != "approximate":
-            run.time_stage("locate", check_consistency, located.evidence(), located.fix_at_time, terrain)
+            located = run.time_stage("locate", fix_by_stars, measured, Located, settings.localizer)
+        run.time_stage("locate", check_fix, located)
         if settings.evidence_sources != "stars":
             located = run.time_stage("locate", refine_by_sky_light, located, settings.evidence_sources == "both")
-        if located.integrity is None and located.fix.search != "approximate" and not located.fix.ambiguous:
-            located = replace(located, integrity=run.time_stage("locate", _integrity_by_stars, located))
+        if located.integrity is None:
+            located = run.time_stage("locate", with_integrity, located)
         sky_mag = None if step is None else step.brightness_mag_arcsec2(camera, exposure.exposure_s)
         skyline = run.time_stage("locate", measured_skyline, located)
         return run.finish(replace(located, sky_brightness_mag_arcsec2=sky_mag, skyline=skyline))
     except (BadInput, NoSolution) as refusal:
         return run.refuse(refusal)
-
-
-def _locate_by_stars(run: Run, measured: Measured, settings: Settings) -> Located:
-    """The position by the stars, and what was `measured` under the sky of the time that they show."""
-    terrain = measured.terrain
-    fix = run.time_stage("locate", settings.localizer, measured.evidence(), terrain)
-    measured, fix_at_time = at_time_of_fix(measured, fix), fix
-    if fix.clock is not None and clock_matters(measured.clock, terrain):
-        exact = replace(measured.evidence(), clock=None)
-        fix_at_time = run.time_stage("locate", settings.localizer, exact, terrain)
-    return extend(measured, Located, fix=fix, fix_at_time=fix_at_time)
-
-
-def _integrity_by_stars(located: Located) -> Integrity:
-    """The integrity of a fix by the stars alone. Raises NotLocated where their directions contradict each other."""
-    fix = located.fix_at_time
-    ground = located.terrain.reshaped(np.array(fix.shape_1)) if any(fix.shape_1) else located.terrain
-    rows = lower_evidence(located.evidence(), fix.horizon_error_rad)
-    return assess_integrity(rows, fix.position_enu_m[:2], fix.covariance_m2, located.fix, ground)
 
 
 def _sky_step(run: Run, located: Located) -> SkyStep | None:

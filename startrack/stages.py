@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
-from typing import Any, Self, TypeAlias, TypeVar
+from typing import Any, Self, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -49,8 +49,7 @@ from startrack.types import (
 EVIDENCE_SOURCES = ("both", "stars", "sky")  # of a position; "sky" begins with a fix by the stars
 UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out
 STAGES = ("read", "detect", "identify", "attitude", "evidence", "locate")  # keys of `timing_ms`
-T = TypeVar("T", bound="Inputs")
-R = TypeVar("R")
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -149,21 +148,14 @@ class Oriented(Identified):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Measured(Oriented):
-    """An attitude above a terrain, with photometry at every catalogue star in view."""
+class StarRays:
+    """Photometry of the catalogue's stars above a terrain: all that a position by the stars needs."""
 
     terrain: Terrain
-    site: Site  # of the terrain
     R_enu_icrs: Array  # (3, 3) at the likeliest time
     clock: Clock
     light: StarPhotometry
-    response: DamagedResponse | None = None  # of a damaged image to stars
     blocked: Blocked | None = None  # parts of the view that are left out; None: nothing is blocked
-
-    @property
-    def R_cam_enu(self) -> Array:
-        """Rotation (3, 3) from enu to the camera."""
-        return np.asarray(self.attitude_fit.attitude.R_cam_icrs @ self.R_enu_icrs.T)
 
     def evidence(self) -> Evidence:
         """The rays for the localizer."""
@@ -175,6 +167,33 @@ class Measured(Oriented):
         clock = replace(self.clock, offset_s=self.clock.offset_s + seconds, reach_s=reach_s)
         return replace(self, R_enu_icrs=R @ self.R_enu_icrs, light=self.light.turned(R), clock=clock)
 
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StarFix(StarRays):
+    """The position that explains the stars, and its integrity."""
+
+    fix: Fix
+    fix_at_time: Fix  # by the stars, the time of `R_enu_icrs` taken as exact; `fix` where the clock does not matter
+    integrity: Integrity | None = None  # None: not assessed, of a fix without a single posterior
+
+    @property
+    def status(self) -> str:
+        """ok, or ambiguous where several positions fit."""
+        return "ambiguous" if self.fix.ambiguous else "ok"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measured(StarRays, Oriented):
+    """An attitude above a terrain, with photometry at every catalogue star in view."""
+
+    site: Site  # of the terrain
+    response: DamagedResponse | None = None  # of a damaged image to stars
+
+    @property
+    def R_cam_enu(self) -> Array:
+        """Rotation (3, 3) from enu to the camera."""
+        return np.asarray(self.attitude_fit.attitude.R_cam_icrs @ self.R_enu_icrs.T)
+
     @property
     def warnings(self) -> list[str]:
         """Facts in the image's file that were not used; what the terrain does not cover, and errors it leaves out."""
@@ -185,14 +204,11 @@ class Measured(Oriented):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Located(Measured):
+class Located(StarFix, Measured):
     """The whole solution: evidence and the position that explains it."""
 
-    fix: Fix
-    fix_at_time: Fix  # by the stars, the time of `R_enu_icrs` taken as exact; `fix` where the clock does not matter
     sky_light: SkyLight | None = None  # of the image at the skyline; None: not used for the fix
     skyline_fit: SkylineFit | None = None  # of the skyline that the sky's light shows, to that of the fix
-    integrity: Integrity | None = None  # None: not assessed, of a fix without a single posterior
     by_stars: bool = True  # whether the stars' rows are in the posterior too
     sky_unused: str = ""  # why the sky's light is not used
     skyline: MeasuredSkyline | None = None  # that the image shows; None: not one position, or not right to its error
@@ -215,11 +231,6 @@ class Located(Measured):
         if self.sky_light is None:
             return "stars"
         return "both" if self.by_stars else "sky"
-
-    @property
-    def status(self) -> str:
-        """ok, or ambiguous where several positions fit."""
-        return "ambiguous" if self.fix.ambiguous else "ok"
 
     @property
     def reason(self) -> Reason | None:
@@ -265,7 +276,7 @@ def last_value(outcome: Outcome) -> Inputs:
     return outcome.reached if isinstance(outcome, Refused) else outcome
 
 
-def extend(value: Inputs, to: type[T], **more: Any) -> T:
+def extend(value: Any, to: type[T], **more: Any) -> T:
     """The fields of a value and the results of one more stage as the next value of the chain."""
-    known = {f.name: getattr(value, f.name) for f in fields(to) if hasattr(value, f.name)}
+    known = {f.name: getattr(value, f.name) for f in fields(cast(Any, to)) if hasattr(value, f.name)}
     return to(**known | more)

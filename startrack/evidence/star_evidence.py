@@ -8,23 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
+from startrack.evidence.expected_stars import BAD_PIXELS, USABLE, ExpectedStars, expect_stars
 from startrack.evidence.flux_scale import FluxScale
 from startrack.evidence.likelihood_ratio import gaussian_llr, visibility_llr
-from startrack.evidence.photometry import Photometry, Sources, half_width, measure
-from startrack.exposure import touch_masked
-from startrack.frames import angle_between_rad, azel_from_rays, off_axis_rad, turn_azel
+from startrack.evidence.photometry import Photometry, Sources, measure
+from startrack.frames import turn_azel
 from startrack.psf import noise_area_px
 from startrack.types import Array, Body, Bools, Detections, Evidence, Ints, Stars
 
 MIN_SNR = 0.6  # a sixth of the time less than with 0.5; mean errors grow by 2 % (60 frames, with the sky's light)
 MIN_PSF_AREAS_PER_STAR = 2.0  # with more stars in the pixels the same light would be counted twice
-BODY_GLARE_PX = 8.0
-DISKS_RAD = {"Sun": 0.0047, "Moon": 0.0049, "Earth": 0.0180}  # largest radii, the Earth's seen from the Moon
 DECIDABLE_SNR = 2.0  # of stars whose own flux shows whether they are visible
 NOISE_STEP_PX = 16  # both ways: the noise is interpolated between blocks of 16 px
-VIEW_MARGIN_RAD = 1e-6  # for rounding
-CAUSES = ("", "edge of the image circle", "beyond the calibrated angle", "off the frame", "bad pixels", "masked")
-USABLE, EDGE_OF_CIRCLE, NOT_CALIBRATED, OFF_FRAME, BAD_PIXELS, MASKED = range(len(CAUSES))
 SEEN_LLR = 3.0  # from here on a star counts as seen, from minus this as hidden
 
 
@@ -124,49 +119,40 @@ class StarEvidence:
                 the star's light in its neighbours' measurements only.
         """
         sigma_px = detections.psf_sigma_px
-        faintest = scale.zero_mag - 2.5 * np.log10(self.faintest_snr * max(filtered_noise_e(detections), 1e-9))
-        star = stars_in_view(camera, stars, R_cam_icrs, faintest)
-        rays_icrs = stars.rays_icrs[star]
-        rays_cam = rays_icrs @ R_cam_icrs.T
-        xy, inside = camera.project(rays_cam)
-        brightest = np.flatnonzero(inside)[: _max_stars(camera, self.crowded * noise_area_px(sigma_px))]
-        star, xy, rays_cam, rays_icrs = star[brightest], xy[brightest], rays_cam[brightest], rays_icrs[brightest]
-        angle = off_axis_rad(rays_cam)
-        expected = scale.flux_e(stars.v_mag[star], angle, camera)
-        # A misplaced profile loses light. The rays do not depend on the lens: they are the catalogue's.
-        misplaced2 = position_sigma_px**2 + (
-            np.square(camera.projection_sigma_px(rays_cam)) if camera.covariance_order else 0.0
-        )
-        blur = misplaced2 / (2 * sigma_px) ** 2
-        fraction = np.sqrt(scale.scatter**2 + np.square(0.4 * np.log(10) * stars.v_sigma_mag[star]) + blur**2)
-        cause = _causes(xy, angle, camera, bodies, R_cam_icrs, half_width(sigma_px))
-        if detections.mask is not None:
-            touching = touch_masked(detections.mask.masked, xy, half_width(sigma_px))
-            cause[touching & (cause == USABLE)] = MASKED
-        measurable = np.flatnonzero(cause != OFF_FRAME)
-        if visible is None:
-            at = xy[measurable], expected[measurable], fraction[measurable]
-            shining = _guess_visibility(detections, *at)
-        else:
-            shining = visible[star[measurable]]
-        sources = Sources(
-            xy_px=xy[measurable], flux_e=expected[measurable], fraction_sigma=fraction[measurable], visible=shining
-        )
-        light = measure(detections, sources)
-        llr, sigma = _ratios(light, expected[measurable], fraction[measurable], self.capped)
-        azimuth, elevation = azel_from_rays(rays_icrs @ R_enu_icrs.T)
-        cause[measurable[~light.usable & (cause[measurable] == USABLE)]] = BAD_PIXELS
+        found = expect_stars(
+            camera, stars, bodies, R_cam_icrs, R_enu_icrs, scale, psf_sigma_px=sigma_px,
+            least_e=self.least_e(filtered_noise_e(detections)), area_px=self.area_px(sigma_px),
+            position_sigma_px=position_sigma_px, mask=detections.mask,
+        )  # fmt: skip
+        sources = found.sources(0.5)
+        shining = _guess_visibility(detections, sources) if visible is None else visible[found.star[found.measurable]]
+        return self.judge(found, measure(detections, replace(sources, visible=shining)))
+
+    def least_e(self, noise_e: float) -> float:
+        """Expected flux [e] below which stars are left out, with noise of `noise_e` through the matched filter."""
+        return self.faintest_snr * max(noise_e, 1e-9)
+
+    def area_px(self, psf_sigma_px: float) -> float:
+        """Area of the image [px^2] that each star needs, for a PSF of `psf_sigma_px`."""
+        return self.crowded * noise_area_px(psf_sigma_px)
+
+    def judge(self, found: ExpectedStars, light: Photometry) -> StarPhotometry:
+        """The expected stars with the `light` measured at the measurable ones, and its log-likelihood ratios."""
+        which, cause = found.measurable, found.cause_code.copy()
+        llr, sigma = _ratios(light, found.flux_e[which], found.fraction_sigma[which], self.capped)
+        cause[which[~light.usable & (cause[which] == USABLE)]] = BAD_PIXELS
+        n = len(found.star)
         return StarPhotometry(
-            star=star,
-            xy_px=xy,
-            azimuth_rad=azimuth,
-            elevation_rad=elevation,
-            expected_e=expected,
-            flux_e=_scatter_rows(light.flux_e, measurable, len(star)),
-            sigma_e=_scatter_rows(sigma, measurable, len(star)),
-            llr=np.where(cause == USABLE, _scatter_rows(llr, measurable, len(star)), 0.0),
+            star=found.star,
+            xy_px=found.xy_px,
+            azimuth_rad=found.azimuth_rad,
+            elevation_rad=found.elevation_rad,
+            expected_e=found.flux_e,
+            flux_e=_scatter_rows(light.flux_e, which, n),
+            sigma_e=_scatter_rows(sigma, which, n),
+            llr=np.where(cause == USABLE, _scatter_rows(llr, which, n), 0.0),
             cause_code=cause,
-            causes=(*CAUSES, *(f"beside {body.name}" for body in bodies)),
+            causes=found.causes,
         )
 
 
@@ -176,35 +162,21 @@ def filtered_noise_e(detections: Detections) -> float:
     return pixel_e * float(np.sqrt(noise_area_px(detections.psf_sigma_px)))
 
 
-def stars_in_view(camera: Camera, stars: Stars, R_cam_icrs: Array, faintest_mag: float) -> Ints:
-    """Indices (k,), ascending, of the stars brighter than a magnitude that may fall into the image circle."""
-    near_axis = stars.rays_icrs @ R_cam_icrs[2] > np.cos(min(camera.max_angle_rad + VIEW_MARGIN_RAD, np.pi))
-    return np.flatnonzero(near_axis & (stars.v_mag < faintest_mag))
-
-
-def _max_stars(camera: Camera, area_px: float) -> int:
-    """Number of stars that fit on the frame, each on its own area [px^2]. Stars are sorted, the brightest first."""
-    rho = float(camera.lens.rho(np.array(camera.max_angle_rad)))
-    circle = np.pi * camera.focal_px[0] * camera.focal_px[1] * rho**2
-    width, height = camera.size_px
-    return max(int(min(circle, width * height) / area_px), 1)
-
-
-def _guess_visibility(detections: Detections, xy_px: Array, expected_e: Array, fraction: Array) -> Array:
+def _guess_visibility(detections: Detections, sources: Sources) -> Array:
     """Probability (n,) that each star is visible, before a position is known: by their own flux for the brighter ones.
 
     It weights their light in their neighbours' measurements; one half for the faint ones.
     """
-    shining = np.full(len(xy_px), 0.5)
-    noise_e = detections.noise_e[tuple(np.rint(xy_px).astype(int).T[::-1])]
-    bright = np.flatnonzero(expected_e > DECIDABLE_SNR * noise_e * np.sqrt(noise_area_px(detections.psf_sigma_px)))
+    shining = np.full(len(sources.flux_e), 0.5)
+    noise_e = detections.noise_e[tuple(np.rint(sources.xy_px).astype(int).T[::-1])]
+    area_px = noise_area_px(detections.psf_sigma_px)
+    bright = np.flatnonzero(sources.flux_e > DECIDABLE_SNR * noise_e * np.sqrt(area_px))
     if len(bright):
-        alone = np.zeros(len(bright))
-        sources = Sources(
-            xy_px=xy_px[bright], flux_e=expected_e[bright], fraction_sigma=fraction[bright], visible=alone
+        expected, fraction = sources.flux_e[bright], sources.fraction_sigma[bright]
+        alone = Sources(
+            xy_px=sources.xy_px[bright], flux_e=expected, fraction_sigma=fraction, visible=np.zeros(len(bright))
         )
-        light = measure(detections, sources)
-        llr, _ = _ratios(light, expected_e[bright], fraction[bright])
+        llr, _ = _ratios(measure(detections, alone), expected, fraction)
         shining[bright] = 1.0 / (1.0 + np.exp(-llr))
     return shining
 
@@ -216,29 +188,6 @@ def _ratios(light: Photometry, expected_e: Array, fraction: Array, capped: bool 
     sigma = np.sqrt(hidden)
     ratio = visibility_llr if capped else gaussian_llr
     return ratio(light.flux_e, expected_e, sigma, np.sqrt(shining)), sigma
-
-
-def _causes(
-    xy_px: Array, angle_rad: Array, camera: Camera, bodies: list[Body], R_cam_icrs: Array, margin: int
-) -> NDArray[np.int8]:
-    """Why stars (n) cannot be used: indices into CAUSES, followed by the bodies; USABLE where they can."""
-    cause = np.full(len(xy_px), USABLE, dtype=np.int8)
-    x, y = np.ascontiguousarray(xy_px.T)
-    for number, body in enumerate(bodies):
-        at, seen = camera.project(body.ray_icrs @ R_cam_icrs.T)
-        if seen:
-            off_axis = angle_between_rad(body.ray_icrs @ R_cam_icrs.T, np.array([0.0, 0.0, 1.0]))
-            disk_px = DISKS_RAD.get(body.name, 0.0) / camera.mean_scale_rad_per_px(off_axis)
-            near = np.flatnonzero(np.abs(x - at[0]) < BODY_GLARE_PX + disk_px)
-            dx, dy = x[near] - at[0], y[near] - at[1]
-            cause[near[dx * dx + dy * dy < np.square(BODY_GLARE_PX + disk_px)]] = len(CAUSES) + number
-    # The stamp must lie within the lit circle: beyond its edge the background is another.
-    edge = camera.max_angle_rad - (margin + 1) * camera.mean_scale_rad_per_px(np.array(camera.max_angle_rad))
-    cause[angle_rad > edge] = EDGE_OF_CIRCLE
-    cause[angle_rad > camera.calibrated_angle_rad] = NOT_CALIBRATED
-    width, height = camera.size_px
-    cause[(x < margin) | (y < margin) | (x > width - 1 - margin) | (y > height - 1 - margin)] = OFF_FRAME
-    return cause
 
 
 def _scatter_rows(values: Array, index: Ints, n: int) -> Array:

@@ -3,7 +3,7 @@
 from typing import Any, Protocol
 
 from startrack.localization.blocked import Blocked, find_blocked
-from startrack.localization.clock import clock_matters
+from startrack.localization.clock import clock_at, clock_matters
 from startrack.localization.consistency import check_consistency
 from startrack.localization.convex_hull import Hull
 from startrack.localization.integrity import Integrity
@@ -57,5 +57,5 @@ def require_localizer(given: Any) -> Localizer:
 
 __all__ = [
     "LOCALIZERS", "Blocked", "ExactPosterior", "Hull", "Integrity", "Localizer", "PseudoGradient", "SkylineFit",
-    "check_consistency", "clock_matters", "find_blocked", "localizer_name", "require_localizer",
+    "check_consistency", "clock_at", "clock_matters", "find_blocked", "localizer_name", "require_localizer",
 ]  # fmt: skip

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import datetime
 
 import numpy as np
 
+from startrack.frames import Site, sky_rotvec_rad
 from startrack.localization.local_search import turn_rays
 from startrack.terrain import Terrain
 from startrack.types import Clock, ClockError, Evidence, NotLocated
 
 REACH_SIGMAS = 4.0  # of the stated error, to the last time that is tried
+TURN_S = 600.0  # over which the sky's turn is taken
 NEGLIGIBLE_M = 0.05  # by which a row may move over the search area, within one sigma, without an effect on the fix
 
 
@@ -29,6 +32,11 @@ class WrongTime(NotLocated):
             f"stated to {duration(sigma_s)}: is it right? (--time-sigma SECONDS states its error)",
             reason="inconsistent_evidence",
         )
+
+
+def clock_at(site: Site, time_utc: datetime, sigma_s: float) -> Clock:
+    """The clock of directions at the stated time of an exposure, which is right to `sigma_s`."""
+    return Clock(turn_rad_s=sky_rotvec_rad(site, time_utc, TURN_S) / TURN_S, sigma_s=sigma_s)
 
 
 def duration(seconds: float) -> str:

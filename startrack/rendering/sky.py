@@ -34,6 +34,12 @@ def sky_e_per_s(camera: Camera, sky_v_mag_arcsec2: float | None, angle_rad: Arra
     return sensor.zero_point_e_per_s * 10 ** (-0.4 * sky_v_mag_arcsec2) * arcsec2 * sensor.throughput(angle_rad)
 
 
+def sky_gradient(scene: Scene, east: Array, north: Array) -> Array:
+    """The sky's light in directions of these components in enu, relative to its mean: 1 without a gradient."""
+    to_east, to_north, _ = scene.sky_gradient * rays_from_azel(scene.sky_gradient_azimuth_rad, 0.0)
+    return np.maximum(1 + to_east * east + to_north * north, 0.0)
+
+
 def diffuse_e(scene: Scene) -> Array:
     """Electrons (H, W) float64 of diffuse light: sky above the skyline, wall below it, zero off the image circle.
 
@@ -128,7 +134,6 @@ def _sky_and_mask(scene: Scene) -> tuple[Array, Bools]:
     sky, above = np.empty((height, width)), np.ones((height, width), dtype=bool)
     tan_horizon = None if scene.terrain is None else _tan_table(scene.terrain, scene.position_enu_m)
     east, north, up = scene.R_cam_enu.T
-    to_east, to_north, _ = scene.sky_gradient * rays_from_azel(scene.sky_gradient_azimuth_rad, 0.0)
     for top in range(0, height, ROWS_PER_BLOCK):
         rows = slice(top, min(top + ROWS_PER_BLOCK, height))
         du, dv = shift_of(rows)
@@ -138,7 +143,7 @@ def _sky_and_mask(scene: Scene) -> tuple[Array, Bools]:
         s, c = np.interp(r, rho, side), np.interp(r, rho, axial)
         e, n, h = ((axis[0] * x + axis[1] * y) * s + axis[2] * c for axis in (east, north, up))
         if scene.sky_gradient:
-            sky[rows] *= np.maximum(1 + to_east * e + to_north * n, 0.0)
+            sky[rows] *= sky_gradient(scene, e, n)
         if tan_horizon is not None:
             above[rows] = _is_above_horizon(e, n, h, *tan_horizon)
     return sky, above

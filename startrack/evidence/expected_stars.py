@@ -1,0 +1,144 @@
+"""The catalogue's stars in view: predicted pixels, expected light, and why some of them cannot be measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.camera import Camera
+from startrack.evidence.flux_scale import FluxScale
+from startrack.evidence.photometry import Sources, half_width
+from startrack.exposure import touch_masked
+from startrack.frames import angle_between_rad, azel_from_rays, off_axis_rad
+from startrack.types import Array, Body, Ints, Mask, Stars
+
+BODY_GLARE_PX = 8.0
+DISKS_RAD = {"Sun": 0.0047, "Moon": 0.0049, "Earth": 0.0180}  # largest radii, the Earth's seen from the Moon
+VIEW_MARGIN_RAD = 1e-6  # for rounding
+CAUSES = ("", "edge of the image circle", "beyond the calibrated angle", "off the frame", "bad pixels", "masked")
+USABLE, EDGE_OF_CIRCLE, NOT_CALIBRATED, OFF_FRAME, BAD_PIXELS, MASKED = range(len(CAUSES))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExpectedStars:
+    """The catalogue's stars in view (n) and their expected light, before anything is measured."""
+
+    star: Ints  # index into Stars
+    xy_px: Array  # (n, 2) predicted
+    azimuth_rad: Array
+    elevation_rad: Array
+    flux_e: Array  # whole PSF
+    fraction_sigma: Array  # relative uncertainty of the flux
+    cause_code: NDArray[np.int8]  # index into `causes`; 0 where usable
+    causes: tuple[str, ...]
+
+    @property
+    def measurable(self) -> Ints:
+        """Indices of the stars whose stamps lie on the frame."""
+        return np.flatnonzero(self.cause_code != OFF_FRAME)
+
+    def sources(self, visible: Array | float) -> Sources:
+        """The measurable stars for the photometry; `visible`: the probability that each is, for its neighbours."""
+        which = self.measurable
+        return Sources(
+            xy_px=self.xy_px[which], flux_e=self.flux_e[which], fraction_sigma=self.fraction_sigma[which],
+            visible=np.broadcast_to(np.asarray(visible, dtype=np.float64), (len(which),)),
+        )  # fmt: skip
+
+
+def expect_stars(
+    camera: Camera,
+    stars: Stars,
+    bodies: list[Body],
+    R_cam_icrs: Array,
+    R_enu_icrs: Array,
+    scale: FluxScale,
+    *,
+    psf_sigma_px: float,
+    least_e: float,
+    area_px: float,
+    position_sigma_px: float = 0.0,
+    mask: Mask | None = None,
+) -> ExpectedStars:
+    """The stars in view of a camera and their expected light.
+
+    Args:
+        camera: projects the stars.
+        stars: of the catalogue, brightest first.
+        bodies: whose glare spoils the stars beside them.
+        R_cam_icrs: (3, 3).
+        R_enu_icrs: (3, 3).
+        scale: of the fluxes.
+        psf_sigma_px: of the image.
+        least_e: expected flux on the axis [e] below which stars are left out.
+        area_px: of the image [px^2] that each star needs; where they are too many, the faintest are left out.
+        position_sigma_px: error of the predicted pixels per axis.
+        mask: pixels that do not count.
+    """
+    faintest = scale.zero_mag - 2.5 * np.log10(least_e)
+    star = stars_in_view(camera, stars, R_cam_icrs, faintest)
+    rays_icrs = stars.rays_icrs[star]
+    rays_cam = rays_icrs @ R_cam_icrs.T
+    xy, inside = camera.project(rays_cam)
+    brightest = np.flatnonzero(inside)[: _max_stars(camera, area_px)]
+    star, xy, rays_cam, rays_icrs = star[brightest], xy[brightest], rays_cam[brightest], rays_icrs[brightest]
+    angle = off_axis_rad(rays_cam)
+    # A misplaced profile loses light. The rays do not depend on the lens: they are the catalogue's.
+    misplaced2 = position_sigma_px**2 + (
+        np.square(camera.projection_sigma_px(rays_cam)) if camera.covariance_order else 0.0
+    )
+    blur = misplaced2 / (2 * psf_sigma_px) ** 2
+    margin = half_width(psf_sigma_px)
+    cause = _causes(xy, angle, camera, bodies, R_cam_icrs, margin)
+    if mask is not None:
+        cause[touch_masked(mask.masked, xy, margin) & (cause == USABLE)] = MASKED
+    azimuth, elevation = azel_from_rays(rays_icrs @ R_enu_icrs.T)
+    return ExpectedStars(
+        star=star,
+        xy_px=xy,
+        azimuth_rad=azimuth,
+        elevation_rad=elevation,
+        flux_e=scale.flux_e(stars.v_mag[star], angle, camera),
+        fraction_sigma=np.sqrt(scale.scatter**2 + np.square(0.4 * np.log(10) * stars.v_sigma_mag[star]) + blur**2),
+        cause_code=cause,
+        causes=(*CAUSES, *(f"beside {body.name}" for body in bodies)),
+    )
+
+
+def stars_in_view(camera: Camera, stars: Stars, R_cam_icrs: Array, faintest_mag: float) -> Ints:
+    """Indices (k,), ascending, of the stars brighter than a magnitude that may fall into the image circle."""
+    near_axis = stars.rays_icrs @ R_cam_icrs[2] > np.cos(min(camera.max_angle_rad + VIEW_MARGIN_RAD, np.pi))
+    return np.flatnonzero(near_axis & (stars.v_mag < faintest_mag))
+
+
+def _max_stars(camera: Camera, area_px: float) -> int:
+    """Number of stars that fit on the frame, each on its own area [px^2]. Stars are sorted, the brightest first."""
+    rho = float(camera.lens.rho(np.array(camera.max_angle_rad)))
+    circle = np.pi * camera.focal_px[0] * camera.focal_px[1] * rho**2
+    width, height = camera.size_px
+    return max(int(min(circle, width * height) / area_px), 1)
+
+
+def _causes(
+    xy_px: Array, angle_rad: Array, camera: Camera, bodies: list[Body], R_cam_icrs: Array, margin: int
+) -> NDArray[np.int8]:
+    """Why stars (n) cannot be used: indices into CAUSES, followed by the bodies; USABLE where they can."""
+    cause = np.full(len(xy_px), USABLE, dtype=np.int8)
+    x, y = np.ascontiguousarray(xy_px.T)
+    for number, body in enumerate(bodies):
+        at, seen = camera.project(body.ray_icrs @ R_cam_icrs.T)
+        if seen:
+            off_axis = angle_between_rad(body.ray_icrs @ R_cam_icrs.T, np.array([0.0, 0.0, 1.0]))
+            disk_px = DISKS_RAD.get(body.name, 0.0) / camera.mean_scale_rad_per_px(off_axis)
+            near = np.flatnonzero(np.abs(x - at[0]) < BODY_GLARE_PX + disk_px)
+            dx, dy = x[near] - at[0], y[near] - at[1]
+            cause[near[dx * dx + dy * dy < np.square(BODY_GLARE_PX + disk_px)]] = len(CAUSES) + number
+    # The stamp must lie within the lit circle: beyond its edge the background is another.
+    edge = camera.max_angle_rad - (margin + 1) * camera.mean_scale_rad_per_px(np.array(camera.max_angle_rad))
+    cause[angle_rad > edge] = EDGE_OF_CIRCLE
+    cause[angle_rad > camera.calibrated_angle_rad] = NOT_CALIBRATED
+    width, height = camera.size_px
+    cause[(x < margin) | (y < margin) | (x > width - 1 - margin) | (y > height - 1 - margin)] = OFF_FRAME
+    return cause

@@ -1,0 +1,6 @@
+"""Simulation of evidence: what the pipeline measures of a scene, drawn without pixels."""
+
+from startrack.simulation.star_rays import simulate_rays
+from startrack.simulation.starlight import Starlight
+
+__all__ = ["Starlight", "simulate_rays"]

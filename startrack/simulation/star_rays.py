@@ -1,0 +1,164 @@
+"""The stars' rays of a scene, as the pipeline would measure them in its image.
+
+What is left out: errors of the attitude and of the lens (a hundredth of a pixel), hot pixels and cosmic rays (the
+photometry masks them), light of the bodies beyond their glare, trails, and errors of the background near the skyline.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+
+import numpy as np
+
+from startrack.catalog import StarCatalog
+from startrack.evidence import FluxScale, Skyline, StarEvidence
+from startrack.evidence.expected_stars import ExpectedStars, expect_stars
+from startrack.evidence.flux_scale import BRIGHT_SNR, MIN_SCATTER, MIN_STARS
+from startrack.exposure import combine_masks
+from startrack.frames import R_enu_icrs, azel_from_rays, observer_velocity_m_s, off_axis_rad
+from startrack.localization import clock_at
+from startrack.psf import noise_area_px
+from startrack.rendering import Scene
+from startrack.rendering.sky import sky_e_per_s, sky_gradient
+from startrack.rendering.sources import flux_e
+from startrack.simulation.starlight import Starlight
+from startrack.stages import StarRays
+from startrack.terrain import Terrain
+from startrack.types import TIME_SIGMA_S, Array, BadInput, Bools, Ints
+
+EXACT_RAD = np.radians(2.0)  # from the skyline; farther, its elevations at one azimuth in 3 arcmin decide
+UNDECIDED_RAD = np.radians(0.2)  # from the skyline: here the visibility of a neighbour is not known
+CERTAIN_PROBABILITY = 0.99  # of the neighbours elsewhere, as where the pipeline measures a second time
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """A scene's stars in view (m), which of them shine, and the skyline."""
+
+    star: Ints  # (m,) index into the scene's stars
+    angle_rad: Array  # off the axis
+    visible: Bools
+    skyline: Skyline
+
+
+def simulate_rays(
+    scene: Scene,
+    catalog: StarCatalog,
+    terrain: Terrain | None = None,
+    *,
+    time_utc: datetime | None = None,
+    time_sigma_s: float = TIME_SIGMA_S,
+    photometry: StarEvidence | None = None,
+    rng: np.random.Generator,
+) -> StarRays:
+    """The photometry of the catalogue's stars in the image of a `scene`, drawn without its pixels.
+
+    The scene holds the truth. What the files of the image state is given beside it:
+
+    Args:
+        scene: with a terrain and a time; its camera has a sensor.
+        catalog: whose stars are measured.
+        terrain: the map (None: the scene's terrain, which is the ground).
+        time_utc: the stated time (None: the true one).
+        time_sigma_s: its stated error.
+        photometry: settings of the evidence.
+        rng: of the noise.
+
+    Raises BadInput: bad_terrain and no_time where scene or map lack what relates the stars to the ground.
+    """
+    ground, photometry = scene.terrain, photometry or StarEvidence()
+    if ground is None:
+        raise BadInput("bad_terrain", "the scene has no terrain: nothing hides the stars")
+    terrain = terrain or ground
+    if terrain.site is None:
+        raise BadInput("bad_terrain", f"terrain {terrain.name} has no site: its sky is not known")
+    if scene.time_utc is None:
+        raise BadInput("no_time", "the time of the scene is not known")
+    camera, when = scene.camera, time_utc or scene.time_utc
+    sensor, site = scene.sensor, terrain.site
+    frame = _visible_stars(scene, ground)
+    typical_e = _typical_noise_e(scene)
+    scale = _expected_scale(scene, frame, typical_e)
+    stars, R_enu = catalog.at(when, observer_velocity_m_s(site, when)), R_enu_icrs(site, when)
+    found = expect_stars(
+        camera, stars, list(scene.bodies), scene.R_cam_icrs, R_enu, scale, psf_sigma_px=sensor.psf_sigma_px,
+        least_e=photometry.least_e(typical_e), area_px=photometry.area_px(sensor.psf_sigma_px),
+        mask=combine_masks(None, camera.mask, camera.size_px),
+    )  # fmt: skip
+    true = _true_rays(found, stars.rays_icrs, scene)
+    above = _height_above(true, frame.skyline)
+    sure = np.where(above > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)
+    visible = np.where(np.abs(above) < UNDECIDED_RAD, 0.5, sure)[found.measurable]
+    variance = _pixel_variance_e2(scene, true, above > 0)[found.measurable]
+    light = _shining(scene, frame).measure(
+        found.sources(visible), variance, sensor.gain_e_per_adu * (sensor.saturation_adu - sensor.bias_adu), rng=rng
+    )
+    measured = photometry.judge(found, light)
+    rays = measured.azimuth_rad, measured.elevation_rad
+    if not terrain.is_informative(*rays).all():
+        measured = measured.masked(terrain.mask_reason(*rays))
+    return StarRays(terrain=terrain, R_enu_icrs=R_enu, clock=clock_at(site, when, time_sigma_s), light=measured)
+
+
+def _visible_stars(scene: Scene, ground: Terrain) -> _Frame:
+    """The scene's stars in the image circle, and which of them the terrain leaves visible at mid-exposure."""
+    angle = off_axis_rad(scene.stars.rays_icrs @ scene.R_cam_icrs.T)
+    star = np.flatnonzero(angle <= scene.camera.max_angle_rad)
+    rays_enu = scene.stars.rays_icrs[star] @ scene.R_enu_icrs.T
+    position_m = scene.position_enu_m[:2]
+    skyline = Skyline.trace(position_m, ground)
+    above = _height_above(rays_enu, skyline)
+    near = np.flatnonzero(np.abs(above) < EXACT_RAD)
+    azimuth, elevation = azel_from_rays(rays_enu[near])
+    above[near] = elevation - np.asarray(ground.horizon_rad(position_m[None], azimuth)).ravel()
+    return _Frame(star, angle[star], above > 0, skyline)
+
+
+def _expected_scale(scene: Scene, frame: _Frame, noise_e: float) -> FluxScale:
+    """The scale of fluxes that the bright visible stars of the scene show, with `noise_e` of a star's flux."""
+    zero_mag = 2.5 * np.log10(scene.sensor.zero_point_e_per_s * scene.exposure_s)
+    star = frame.star[frame.visible]
+    bright = star[scene.stars.v_mag[star] < zero_mag - 2.5 * np.log10(BRIGHT_SNR * noise_e)]
+    if len(bright) < MIN_STARS:
+        return FluxScale(float(zero_mag), 0.0, MIN_SCATTER, len(bright))
+    error = scene.v_error_mag[bright]
+    middle = float(np.median(error))
+    scatter = 0.4 * np.log(10) * 1.4826 * float(np.median(np.abs(error - middle)))
+    return FluxScale(float(zero_mag) - middle, 0.0, max(scatter, MIN_SCATTER), len(bright))
+
+
+def _shining(scene: Scene, frame: _Frame) -> Starlight:
+    star = frame.star[frame.visible]
+    xy_px, _ = scene.camera.project(scene.stars.rays_icrs[star] @ scene.R_cam_icrs.T)
+    v_mag = scene.stars.v_mag[star] + scene.v_error_mag[star]
+    light_e = flux_e(scene.sensor, v_mag, frame.angle_rad[frame.visible], scene.exposure_s)
+    return Starlight(xy_px, light_e, scene.sensor.psf_sigma_px)
+
+
+def _true_rays(found: ExpectedStars, rays_icrs: Array, scene: Scene) -> Array:
+    """Directions (n, 3) of the expected stars in enu at the true time."""
+    return np.asarray(rays_icrs[found.star] @ scene.R_enu_icrs.T)
+
+
+def _height_above(rays_enu: Array, skyline: Skyline) -> Array:
+    azimuth, elevation = azel_from_rays(rays_enu)
+    return np.asarray(elevation - skyline(azimuth))
+
+
+def _typical_noise_e(scene: Scene) -> float:
+    """Noise of a star's flux halfway between the axis and the edge of the view."""
+    half = 0.5 * scene.camera.max_angle_rad
+    ray = np.array([[np.sin(half), 0.0, np.cos(half)]]) @ scene.R_cam_enu
+    variance = float(_pixel_variance_e2(scene, ray, np.ones(1, dtype=np.bool_))[0])
+    return float(np.sqrt(variance * noise_area_px(scene.sensor.psf_sigma_px)))
+
+
+def _pixel_variance_e2(scene: Scene, rays_enu: Array, above: Bools) -> Array:
+    """Variance (n,) [e^2] of a pixel without stars in directions (n, 3), above the skyline or not."""
+    sensor = scene.sensor
+    angle = off_axis_rad(rays_enu @ scene.R_cam_enu.T)
+    sky = sky_e_per_s(scene.camera, scene.sky_v_mag_arcsec2, angle)
+    sky = sky * sky_gradient(scene, rays_enu[:, 0], rays_enu[:, 1]) * np.where(above, 1.0, scene.wall_reflectance)
+    rounding = sensor.gain_e_per_adu**2 / 12
+    return np.asarray((sky + sensor.dark_e_per_s) * scene.exposure_s + sensor.read_noise_e**2 + rounding)

@@ -1,0 +1,73 @@
+"""The position by the stars alone, with its checks: the same for measured stars and for simulated ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from startrack.blocked_view import leave_out_blocked
+from startrack.localization import ExactPosterior, Localizer, check_consistency, clock_matters
+from startrack.localization.integrity import assess_integrity
+from startrack.localization.nuisance import lower_evidence
+from startrack.stages import StarFix, StarRays, extend
+from startrack.types import Fix
+
+CLOCK_SIGMAS = 5.0  # of a fix, within which the true time is searched once the fix is known
+F = TypeVar("F", bound=StarFix)
+S = TypeVar("S", bound=StarRays)
+
+
+def locate_rays(rays: StarRays, localizer: Localizer | None = None) -> StarFix:
+    """The position that explains photometry of stars, and its integrity; `localizer` None: the posterior.
+
+    Raises NotLocated (or another NoSolution of the `localizer`) where the pipeline refuses an image with these `rays`.
+    """
+    fixed = fix_unblocked(rays, StarFix, localizer or ExactPosterior())
+    check_fix(fixed)
+    return with_integrity(fixed)
+
+
+def fix_unblocked(rays: StarRays, to: type[F], localizer: Localizer) -> F:
+    """As `fix_by_stars`, without the parts of the view that something on no map blocks."""
+    fixed = fix_by_stars(rays, to, localizer)
+    unblocked = leave_out_blocked(fixed, fixed.fix_at_time, localizer)
+    return fixed if unblocked is fixed else fix_by_stars(unblocked, to, localizer)
+
+
+def fix_by_stars(rays: StarRays, to: type[F], localizer: Localizer) -> F:
+    """`rays` under the sky of the time that they show, with the position, as a value of the class `to`."""
+    fix = localizer(rays.evidence(), rays.terrain)
+    rays, fix_at_time = _at_time_of_fix(rays, fix), fix
+    if fix.clock is not None and clock_matters(rays.clock, rays.terrain):
+        fix_at_time = localizer(replace(rays.evidence(), clock=None), rays.terrain)
+    return extend(rays, to, fix=fix, fix_at_time=fix_at_time)
+
+
+def check_fix(fixed: StarFix) -> None:
+    """Raises NotLocated (inconsistent_evidence) where the rays contradict the fix, the terrain or the time."""
+    if fixed.fix.search != "approximate":
+        check_consistency(fixed.evidence(), fixed.fix_at_time, fixed.terrain)
+
+
+def with_integrity(fixed: F) -> F:
+    """`fixed` with its integrity, if it is one position with a posterior.
+
+    Raises NotLocated (inconsistent_evidence) where its directions contradict each other.
+    """
+    fix, terrain = fixed.fix_at_time, fixed.terrain
+    if fixed.fix.search == "approximate" or fixed.fix.ambiguous:
+        return fixed
+    ground = terrain.reshaped(np.array(fix.shape_1)) if any(fix.shape_1) else terrain
+    rows = lower_evidence(fixed.evidence(), fix.horizon_error_rad)
+    found = assess_integrity(rows, fix.position_enu_m[:2], fix.covariance_m2, fixed.fix, ground)
+    return replace(fixed, integrity=found)
+
+
+def _at_time_of_fix(rays: S, fix: Fix) -> S:
+    """`rays` under the sky of the time that the evidence of a `fix` shows."""
+    if fix.clock is None:
+        return rays
+    later_s = fix.clock.offset_s - rays.clock.offset_s
+    return rays.later(later_s, CLOCK_SIGMAS * fix.clock.sigma_s) if later_s else rays

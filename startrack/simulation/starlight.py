@@ -10,7 +10,8 @@ from startrack.evidence.photometry import Photometry, Sources, half_width
 from startrack.psf import pixel_profile, pixel_profile_single
 from startrack.types import Array, Ints
 
-NEIGHBOUR_SIGMAS = 3.0  # of the PSF beyond a star's stamp, to the last star whose light reaches it
+NEIGHBOUR_SIGMAS = 3.0  # of the PSF beyond half a stamp, to the last star whose light is subtracted, as in `measure`
+CORNER = float(np.sqrt(2.0))  # half diagonal of a stamp in its half widths: light reaches its corners, too
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class Starlight:
         subtracted, subtracted_shot, unsure = np.zeros((3, len(sources.flux_e)))
         reach_px = radius + NEIGHBOUR_SIGMAS * sigma
         _, own_shot = stamps.part_of(np.arange(len(stamps.pixel)), sources.xy_px)
-        star, other = _pairs(sources.xy_px, self.xy_px, reach_px)
+        star, other = _pairs(sources.xy_px, self.xy_px, CORNER * radius + NEIGHBOUR_SIGMAS * sigma)
         part, noise = stamps.part_of(star, self.xy_px[other])
         np.add.at(mean, star, part * self.flux_e[other])
         np.add.at(shot, star, noise * self.flux_e[other])

@@ -25,7 +25,7 @@ def run_classes(
 ) -> None:  # fmt: skip
     """Measure `frames` of each class and print the table; write the section if all classes were run.
 
-    Of a class only the frames whose numbers divide by `every(name)` are measured. `flag` is the option for the number
+    Of a class only one frame in `every(name)` is measured. `flag` is the option for the number
     of frames, `total` a text about the rows of all classes.
     """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -35,7 +35,7 @@ def run_classes(
     parser.add_argument("-j", "--jobs", type=int, default=2)
     args = parser.parse_args()
     wanted = [name for name in names if not args.only or any(word in name for word in args.only)]
-    jobs = [(name, k) for k in range(args.frames) for name in wanted if k % every(name) == 0]
+    jobs = [(name, k) for k in range(args.frames) for name in wanted if k % every(name) == every(name) - 1]
     rows: dict[str, list[Row]] = {name: [] for name in wanted}
     end = time.monotonic() + 60 * args.minutes
     with ProcessPoolExecutor(args.jobs) as pool:

@@ -32,10 +32,11 @@ SHAPE_SIGMA = 0.002  # of the cylinder whose file states errors
 TOO_FAINT_MAG = 20.0
 HOUR_S = 3600.0
 SLOWEST = 150  # rounds between two frames of the classes that take minutes
-WITHIN, BEYOND, BLOCKED, CLOCK = "within", "beyond", "blocked", "clock"
+WITHIN, BEYOND, BLOCKED, CLOCK, UNSEEN = "within", "beyond", "blocked", "clock", "unseen"
 KINDS = {
     WITHIN: "errors within what the files state", BEYOND: "errors beyond what the files state",
     BLOCKED: "part of the view blocked", CLOCK: "clock off by an hour, stated to a second",
+    UNSEEN: "the size of a crater beyond what its file states, which no picture shows",
 }  # fmt: skip
 HEAD = [
     "errors", "class", "frames", "answered rightly", "refused", "median error, m", "beyond the 99.9 % circle",
@@ -60,7 +61,7 @@ class Risen(ForwardingTerrain):
 class Class:
     """One class of frames: what their files state, and how the truth differs from it."""
 
-    kind: str  # within the stated errors, beyond them, parts of the view blocked, or a clock with the default error
+    kind: str  # within the stated errors, beyond them, parts of the view blocked, a clock with the default error, or unseen
     stated: Callable[[], Terrain]
     ground: Callable[[Terrain, Rng], Terrain] = lambda stated, rng: stated
     scene: Callable[[Scene, Rng], Scene] = lambda scene, rng: scene
@@ -89,6 +90,17 @@ def other_shape(depth: tuple[float, float], diameter: tuple[float, float]) -> Ca
         assert isinstance(stated, Cylinder)
         parts = [1.0 + rng.uniform(*size) * rng.choice([-1.0, 1.0]) for size in (depth, diameter)]
         return replace(stated, depth_m=stated.depth_m * parts[0], diameter_m=stated.diameter_m * parts[1])
+
+    return ground
+
+
+def other_size(low: float, high: float) -> Callable[[Terrain, Rng], Terrain]:
+    """A crater larger or smaller by a part between two, in the same proportions."""
+
+    def ground(stated: Terrain, rng: Rng) -> Terrain:
+        assert isinstance(stated, Cylinder)
+        factor = 1.0 + rng.uniform(low, high) * rng.choice([-1.0, 1.0])
+        return replace(stated, depth_m=stated.depth_m * factor, diameter_m=stated.diameter_m * factor)
 
     return ground
 
@@ -343,9 +355,11 @@ CLASSES = {
     "low wide ridge, 70 to 150 by 1 to 3 degrees": Class(BEYOND, THESIS, ridge((70, 150), (1, 3))),
     "small ridge, Shackleton": Class(BEYOND, RENDERED, ridge((10, 60), (0.2, 1)), every=24),
     "depth 0.1 to 0.5 % wrong, stated exact": Class(BEYOND, THESIS, other_shape((0.001, 0.005), (0.0, 0.0))),
-    "depth and diameter 1 to 5 % wrong, stated exact": Class(BEYOND, THESIS, other_shape((0.01, 0.05), (0.01, 0.05))),
-    "depth and diameter 0.6 to 2 % wrong, stated 0.2 %": Class(
-        BEYOND, stated_shape, other_shape((0.006, 0.02), (0.006, 0.02)), every=2
+    "depth 1 to 5 % wrong, stated exact": Class(BEYOND, THESIS, other_shape((0.01, 0.05), (0.0, 0.0))),
+    "diameter 1 to 5 % wrong, stated exact": Class(BEYOND, THESIS, other_shape((0.0, 0.0), (0.01, 0.05))),
+    "depth 1 to 2 % wrong, stated 0.2 %": Class(BEYOND, stated_shape, other_shape((0.01, 0.02), (0.0, 0.0)), every=2),
+    "crater 0.6 to 2 % larger or smaller in the same proportions, stated 0.2 %": Class(
+        UNSEEN, stated_shape, other_size(0.006, 0.02), every=2
     ),
     "Shackleton, posts wrong by 5 m, stated 1 m": Class(BEYOND, RENDERED, posts_wrong_by(5.0), every=24),
     "mast of 2 to 12 degrees": Class(BLOCKED, THESIS, scene=hidden_where(mast)),

@@ -61,7 +61,7 @@ class Risen(ForwardingTerrain):
 class Class:
     """One class of frames: what their files state, and how the truth differs from it."""
 
-    kind: str  # within the stated errors, beyond them, parts of the view blocked, a clock with the default error, or unseen
+    kind: str  # of KINDS
     stated: Callable[[], Terrain]
     ground: Callable[[Terrain, Rng], Terrain] = lambda stated, rng: stated
     scene: Callable[[Scene, Rng], Scene] = lambda scene, rng: scene

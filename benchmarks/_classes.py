@@ -45,7 +45,9 @@ def run_classes(
             chunk = jobs[start : start + CHUNK]
             for job, row in zip(chunk, pool.map(measure_frame, chunk, chunksize=2), strict=True):
                 rows[job[0]].append(row)
-    body = table(head, [summary(name, rows[name]) for name in wanted]) + total(rows)
+    body = table(head, [summary(name, rows[name]) for name in wanted if rows[name]]) + total(rows)
     print(body)
     if not args.only:
-        write_section(section, f"python benchmarks/{Path(file).name} {flag} {args.frames}", ("numpy", "scipy"), body)
+        within = f" --minutes {args.minutes:g}" if np.isfinite(args.minutes) else ""
+        command = f"python benchmarks/{Path(file).name} {flag} {args.frames}{within}"
+        write_section(section, command, ("numpy", "scipy"), body)

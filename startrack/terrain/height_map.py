@@ -14,6 +14,7 @@ from startrack.frames import Site
 from startrack.terrain import table_cache as cache
 from startrack.terrain import tracing
 from startrack.terrain.horizon_interpolator import NODES_ACROSS, HorizonInterpolator
+from startrack.terrain.horizon_posts import HorizonPosts, cell_posts
 from startrack.terrain.horizon_sigma import HorizonSigma
 from startrack.terrain.horizon_table import BINS, HorizonTable, Square
 from startrack.terrain.masks import GLARE, OFF_MAP, Sectors, describe_masks, in_sectors
@@ -234,6 +235,22 @@ class HeightMap(Terrain):
         return HorizonInterpolator(
             self, np.asarray(centre_m, dtype=np.float64), half_m, np.unique(azimuths_rad), across
         )
+
+    def horizon_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
+        """The posts about the crests; see `Terrain`."""
+        tan, distance, _ = self.horizons(point_m, azimuths_rad)
+        away = distance[:, None] * np.stack([np.sin(azimuths_rad), np.cos(azimuths_rad)], axis=1)
+        up = float(self.ground_m(point_m)) + self.camera_height_m + tan * distance
+        post, weight = cell_posts(self.site, self.maps, np.column_stack([point_m + away, up]))
+        return HorizonPosts(post, weight / ((1.0 + tan * tan) * distance)[:, None])
+
+    def ground_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
+        """The posts about the camera; see `Terrain`."""
+        tan, distance, _ = self.horizons(point_m, azimuths_rad)
+        post, weight = cell_posts(self.site, self.maps, np.append(point_m, self.ground_m(point_m))[None])
+        return HorizonPosts(
+            np.repeat(post, len(tan), axis=0), -weight / ((1.0 + tan * tan) * distance)[:, None]
+        )  # fmt: skip
 
     def horizons(self, points_m: Array, azimuths_rad: Array) -> tuple[Array, Array, Array]:
         """tan, distance, and distance of the maps' end, of each point and azimuth."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.frames import Site
+from startrack.terrain.horizon_posts import HorizonPosts
 from startrack.types import Array, BadInput, Bools
 
 Progress = Callable[[int, int], None]  # parts done, of how many
@@ -49,6 +50,7 @@ class Terrain(ABC):
     name: str = "terrain"
     site: Site | None = None  # where enu stands; needed to locate images, not to localize rays
     camera_height_m: float = 0.0  # of the camera above the ground
+    height_sigma_m: float = 0.0  # standard deviation of the height of a post, independent of the others
     search_radius_m: float = 10_000.0  # the camera is within this horizontal distance of the origin
     common_sigma_rad: float = 0.0  # standard deviation of an error of the horizon that all azimuths and positions share
     hard_edges: bool = True  # whether the horizon is exact: `horizon_sigma_rad` is zero everywhere
@@ -123,6 +125,14 @@ class Terrain(ABC):
             f"terrain {self.name}: its file states no {keys}: taken as 0; circles are too small unless the ground is "
             "exactly so; state the errors (0 for a model from which pictures are rendered)"
         ]
+
+    def horizon_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
+        """The posts of the map that make the horizon seen from a point (2,), at the azimuths (n,)."""
+        return HorizonPosts.create_empty(len(azimuths_rad))
+
+    def ground_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
+        """As `horizon_posts`, of the ground that the camera stands on: the horizon sinks as it rises."""
+        return HorizonPosts.create_empty(len(azimuths_rad))
 
     def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = 3) -> Terrain:
         """The same ground, prepared for positions within `half_m` of a centre (2,), at the azimuths (n,).
@@ -248,6 +258,9 @@ class ForwardingTerrain(Terrain):
     horizon_sigma_rad = _forward("horizon_sigma_rad")
     max_horizon_sigma_rad = _forward("max_horizon_sigma_rad")
     ground_m, allowed, near = _forward("ground_m"), _forward("allowed"), _forward("near")
+    height_sigma_m, horizon_posts, ground_posts = (
+        _forward("height_sigma_m"), _forward("horizon_posts"), _forward("ground_posts")
+    )  # fmt: skip
     is_informative, mask_reason = _forward("is_informative"), _forward("mask_reason")
     masked_sectors, error_warnings = _forward("masked_sectors"), _forward("error_warnings")
     unstated_errors = _forward("unstated_errors")

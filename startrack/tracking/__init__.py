@@ -1,6 +1,12 @@
-"""Many exposures: odometry, and images and odometry from ROS bags."""
+"""Many exposures: tracks of a camera at rest or on a drive; odometry, and images and odometry from ROS bags."""
 
 from startrack.tracking.bag_images import read_bag_exposures
+from startrack.tracking.observe import ObservedFrame, observe_frame
 from startrack.tracking.odometry import Odometry, read_odometry
+from startrack.tracking.shared import SharedErrors
+from startrack.tracking.track import CrestHeights, Track, TrackFrame, Trajectory, estimate_track
 
-__all__ = ["Odometry", "read_bag_exposures", "read_odometry"]
+__all__ = [
+    "CrestHeights", "ObservedFrame", "Odometry", "SharedErrors", "Track", "TrackFrame", "Trajectory", "estimate_track",
+    "observe_frame", "read_bag_exposures", "read_odometry",
+]  # fmt: skip

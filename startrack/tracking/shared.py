@@ -1,0 +1,55 @@
+"""The errors that all frames of a track share: of the horizon, of the clock, of a crater's shape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from startrack.localization import clock_matters
+from startrack.terrain import Terrain
+from startrack.types import Array, Clock, Evidence
+
+BIAS, CLOCK, SHAPES = "horizon_bias_rad", "clock_s", ("steepness_1", "size_1")
+
+
+@dataclass(frozen=True, eq=False)
+class SharedErrors:
+    """Names and standard deviations (k,) of the shared errors, in the units that their names end with."""
+
+    names: tuple[str, ...]
+    sigma: Array  # (k,)
+    turn_rad_s: Array  # (3,) of the sky, in enu
+
+    @classmethod
+    def of(cls, terrain: Terrain, clock: Clock | None) -> Self:
+        """Those of a terrain, and of a clock that matters on it."""
+        stated = {BIAS: terrain.common_sigma_rad, **dict(zip(SHAPES, terrain.shape_sigma, strict=True))}
+        turn = np.zeros(3)
+        if clock is not None and clock_matters(clock, terrain):
+            stated[CLOCK], turn = clock.sigma_s, clock.turn_rad_s
+        known = {name: sigma for name, sigma in stated.items() if sigma > 0.0}
+        return cls(tuple(known), np.array(list(known.values())), turn)
+
+    def shape_axis(self, name: str) -> int:
+        """Which of the two numbers of `Terrain.reshaped` an error is."""
+        return SHAPES.index(name)
+
+    def taken(self, evidence: Evidence) -> Array:
+        """(k,) what the directions of the evidence already include, in standard deviations."""
+        clock = evidence.clock
+        offset_s = 0.0 if clock is None else clock.offset_s
+        return np.array([offset_s if name == CLOCK else 0.0 for name in self.names]) / self.sigma
+
+    def reach_rad(self, evidence: Evidence) -> float:
+        """About the change of elevations above the horizon with one standard deviation of all errors."""
+        reach = 0.0
+        for name, sigma in zip(self.names, self.sigma, strict=True):
+            if name == BIAS:
+                reach += sigma
+            elif name == CLOCK:
+                reach += sigma * float(np.hypot(*self.turn_rad_s[:2]))
+            else:
+                reach += 0.35 * sigma  # d tan H / tan H = dH / (sin H cos H), at rims up to 20 degrees
+        return reach

@@ -212,6 +212,7 @@ class Located(StarFix, Measured):
 
     sky_light: SkyLight | None = None  # of the image at the skyline; None: not used for the fix
     skyline_fit: SkylineFit | None = None  # of the skyline that the sky's light shows, to that of the fix
+    sky_variance_factor: float = 1.0  # of the sky's light, by which its stated variance is too small
     by_stars: bool = True  # whether the stars' rows are in the posterior too
     sky_unused: str = ""  # why the sky's light is not used
     skyline: MeasuredSkyline | None = None  # that the image shows; None: not one position, or not right to its error

@@ -14,7 +14,7 @@ from startrack.frames import Site
 from startrack.terrain import table_cache as cache
 from startrack.terrain import tracing
 from startrack.terrain.horizon_interpolator import NODES_ACROSS, HorizonInterpolator
-from startrack.terrain.horizon_posts import HorizonPosts, cell_posts
+from startrack.terrain.horizon_posts import HorizonPosts, cell_posts, post_positions
 from startrack.terrain.horizon_sigma import HorizonSigma
 from startrack.terrain.horizon_table import BINS, HorizonTable, Square
 from startrack.terrain.masks import GLARE, OFF_MAP, Sectors, describe_masks, in_sectors
@@ -251,6 +251,10 @@ class HeightMap(Terrain):
         return HorizonPosts(
             np.repeat(post, len(tan), axis=0), -weight / ((1.0 + tan * tan) * distance)[:, None]
         )  # fmt: skip
+
+    def post_positions_m(self, posts: Ints) -> Array:
+        """See `Terrain`."""
+        return post_positions(self.site, self.maps, posts)
 
     def horizons(self, points_m: Array, azimuths_rad: Array) -> tuple[Array, Array, Array]:
         """tan, distance, and distance of the maps' end, of each point and azimuth."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.frames import Site, latlon_from_enu
+from startrack.frames import Site, enu_from_latlon, latlon_from_enu
 from startrack.terrain.raster import Raster
 from startrack.types import Array, Ints
 
@@ -46,3 +46,17 @@ def cell_posts(site: Site, maps: tuple[Raster, ...], points_enu_m: Array) -> tup
         weight[new] = np.prod(1.0 - np.abs(at[new, None] - corner), axis=-1)
         first += raster.heights_m.size
     return post, weight
+
+
+def post_positions(site: Site, maps: tuple[Raster, ...], posts: Ints) -> Array:
+    """East, north and up (n, 3) in enu of posts (n,), by the map."""
+    found, first = np.zeros((len(posts), 3)), 0
+    for raster in maps:
+        columns, last = raster.heights_m.shape[1], first + raster.heights_m.size
+        here = (posts >= first) & (posts < last)
+        row_column = np.stack(np.divmod(posts[here] - first, columns), axis=-1)
+        latitude, longitude = raster.projection.latlon_from_xy(*raster.xy(row_column))
+        height = raster.heights_m.ravel()[posts[here] - first]
+        found[here] = enu_from_latlon(site, latitude, longitude, height)
+        first = last
+    return found

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from startrack.frames import Site
 from startrack.terrain.horizon_posts import HorizonPosts
-from startrack.types import Array, BadInput, Bools
+from startrack.types import Array, BadInput, Bools, Ints
 
 Progress = Callable[[int, int], None]  # parts done, of how many
 
@@ -133,6 +133,10 @@ class Terrain(ABC):
     def ground_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
         """As `horizon_posts`, of the ground that the camera stands on: the horizon sinks as it rises."""
         return HorizonPosts.create_empty(len(azimuths_rad))
+
+    def post_positions_m(self, posts: Ints) -> Array:
+        """East, north and up (n, 3) in enu of the posts with these numbers (n,)."""
+        return np.zeros((len(posts), 3))
 
     def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = 3) -> Terrain:
         """The same ground, prepared for positions within `half_m` of a centre (2,), at the azimuths (n,).
@@ -258,9 +262,8 @@ class ForwardingTerrain(Terrain):
     horizon_sigma_rad = _forward("horizon_sigma_rad")
     max_horizon_sigma_rad = _forward("max_horizon_sigma_rad")
     ground_m, allowed, near = _forward("ground_m"), _forward("allowed"), _forward("near")
-    height_sigma_m, horizon_posts, ground_posts = (
-        _forward("height_sigma_m"), _forward("horizon_posts"), _forward("ground_posts")
-    )  # fmt: skip
+    height_sigma_m, post_positions_m = _forward("height_sigma_m"), _forward("post_positions_m")
+    horizon_posts, ground_posts = _forward("horizon_posts"), _forward("ground_posts")
     is_informative, mask_reason = _forward("is_informative"), _forward("mask_reason")
     masked_sectors, error_warnings = _forward("masked_sectors"), _forward("error_warnings")
     unstated_errors = _forward("unstated_errors")

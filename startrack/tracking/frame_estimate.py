@@ -7,7 +7,8 @@ the parameters with the slopes of the log-likelihood: the derivative of a poster
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,6 +26,14 @@ OUTSIDE = -1e6  # logarithm of a density that is zero
 MIN_NOISE_SHARE = 0.3  # of the evidence's covariance: the least noise that a frame has of its own
 NEGLIGIBLE_POST = 1e-4  # part of the variance of a position, by all posts that are left out together
 ROUNDING = 1e-9  # of the covariance, added to the noise so that it can be inverted
+
+
+@dataclass(frozen=True, eq=False)
+class ImageErrors:
+    """Errors of attitude and lens: they raise the skyline of the sky's light, not that of the stars."""
+
+    pattern: Callable[[Array], Array]  # azimuths (n,) to rises (n, j) [rad] by one unit of each
+    covariance: Array  # (j, j)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +61,7 @@ def estimate_frame(
     position_m: Array,
     covariance_m2: Array,
     shared_mean: Array | None = None,
-    smear: tuple[Array, Array] | None = None,
+    image_errors: ImageErrors | None = None,
 ) -> FrameEstimate:
     """The observation by rows of `evidence` above the map's horizon.
 
@@ -63,8 +72,7 @@ def estimate_frame(
         position_m: (2,) near the posterior's mode that is meant.
         covariance_m2: (2, 2) about that of the mode.
         shared_mean: (k,) first guess of the shared errors, in standard deviations; None: zero.
-        smear: pattern (azimuths to rises (n, j) [rad]) sampled at the items, and covariance (j, j), of errors of the
-            image that raise the skyline of the sky's light; None: none.
+        image_errors: of the rows of the sky's light; None: none.
     """
     k = len(shared.names)
     mean = np.concatenate([position_m, np.zeros(k) if shared_mean is None else shared_mean])
@@ -82,7 +90,7 @@ def estimate_frame(
         mean, covariance = samples.mean, samples.covariance
         if inside:
             break
-    return _observation(likelihood, samples)
+    return _observation(likelihood, samples, image_errors)
 
 
 def _log_posterior(likelihood: SkylineLikelihood, half_m: float):  # type: ignore[no-untyped-def]
@@ -100,7 +108,9 @@ def _log_posterior(likelihood: SkylineLikelihood, half_m: float):  # type: ignor
     return log_density
 
 
-def _observation(likelihood: SkylineLikelihood, samples: Samples) -> FrameEstimate:
+def _observation(
+    likelihood: SkylineLikelihood, samples: Samples, image_errors: ImageErrors | None
+) -> FrameEstimate:
     used = samples.weight > 0.0
     samples = Samples(samples.points[used], samples.weight[used])
     mean, covariance = samples.mean, samples.covariance
@@ -109,6 +119,9 @@ def _observation(likelihood: SkylineLikelihood, samples: Samples) -> FrameEstima
     by_evidence = covariance - covariance @ prior @ covariance  # of the mean at given true parameters
     counted = (by_horizon * np.square(likelihood.map_sigma_rad)) @ by_horizon.T
     noise = clipped_noise(by_evidence - counted, by_evidence) + ROUNDING * covariance
+    if image_errors is not None:
+        by_image = by_horizon @ (image_errors.pattern(likelihood.azimuth_rad) * likelihood.is_sky[:, None])
+        noise += by_image @ image_errors.covariance @ by_image.T
     post, by_post = _posts(likelihood, by_horizon, covariance)
     shared_by_posts = likelihood.local.terrain.height_sigma_m**2 * by_post @ by_post.T
     return FrameEstimate(
@@ -147,8 +160,3 @@ def _sum_by_post(parts: list[HorizonPosts], by_horizon: Array) -> tuple[Ints, Ar
     known = post != NO_POST
     numbers, of = np.unique(post[known], return_inverse=True)
     return numbers, np.stack([np.bincount(of, weights=row[known], minlength=len(numbers)) for row in response])
-
-
-def with_noise(estimate: FrameEstimate, added: Array) -> FrameEstimate:
-    """The observation with a further covariance (2 + k, 2 + k) of its own noise."""
-    return replace(estimate, noise=estimate.noise + added, covariance=estimate.covariance + added)

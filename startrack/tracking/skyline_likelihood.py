@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
 
@@ -14,7 +14,7 @@ from startrack.localization.local_search import LocalLikelihood
 from startrack.localization.sector_likelihood import contributions
 from startrack.terrain import Terrain
 from startrack.tracking.shared import BIAS, CLOCK, SharedErrors
-from startrack.types import Array, Evidence, Ints
+from startrack.types import Array, Bools, Evidence, Ints
 
 NODES = 5  # traced horizons along each side of the neighbourhood
 STEP_SIGMAS = 0.5  # of the horizon's spread, to each side: where the change with the horizon is taken
@@ -49,6 +49,11 @@ class SkylineLikelihood:
         """(m,) row of each item in the evidence of `local`."""
         stars = np.arange(len(self.local.evidence))[self.local.stars]
         return stars if self.local.profiles is None else np.concatenate([stars, self.local.profiles.row])
+
+    @property
+    def is_sky(self) -> Bools:
+        """(m,) whether an item is the sky's light at an azimuth."""
+        return np.arange(len(self.rows)) >= len(np.arange(len(self.local.evidence))[self.local.stars])
 
     @property
     def azimuth_rad(self) -> Array:
@@ -156,8 +161,3 @@ def _raised_by_clock(
         azimuth, elevation = turn_azel(azimuth_rad, elevation_rad, R_from_rotvec(later_s * turn_rad_s))
         raised.append(terrain.horizon_rad(position_m[None], azimuth) - elevation)
     return np.asarray(raised[1] - raised[0]) / (2 * step_s)
-
-
-def without_clock(evidence: Evidence) -> Evidence:
-    """The rows at the time that they are turned to."""
-    return evidence if evidence.clock is None else replace(evidence, clock=None)

@@ -174,11 +174,10 @@ def _predicted_steps(position_m: Array, blocks: Array, steps: Steps, weight: Arr
     here = np.arange(len(weight))
     covariance = blocks[here, :, here] + blocks[here + 1, :, here + 1] - blocks[here, :, here + 1]
     covariance -= blocks[here + 1, :, here]
-    move = np.diff(position_m, axis=0)
-    information = np.linalg.inv(covariance)
-    without = np.linalg.inv(information - 0.999999 * weight[:, None, None] * np.eye(2))
-    target = np.einsum("nij,nj->ni", information, move) - weight[:, None] * steps.move_m
-    return steps.move_m - np.einsum("nij,nj->ni", without, target), without
+    residual = steps.move_m - np.diff(position_m, axis=0)
+    # Just less than the whole weight: a move that nothing else predicts stays invertible.
+    without = np.linalg.inv(np.linalg.inv(covariance) - (1.0 - 1e-9) * weight[:, None, None] * np.eye(2))
+    return residual + np.einsum("n,nij,nj->ni", weight, without, residual), without
 
 
 def _predicted_frames(observations: Observations, best: Array, covariance: Array) -> tuple[Array, Array]:

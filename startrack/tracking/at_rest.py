@@ -1,0 +1,77 @@
+"""A camera at rest: the evidence of all its exposures in one posterior, which needs no linearization."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.terrain import Terrain
+from startrack.tracking.contradictions import RobustTrack, smooth_robustly
+from startrack.tracking.frame_estimate import FrameEstimate, estimate_frame
+from startrack.tracking.observe import ObservedFrame
+from startrack.tracking.shared import SharedErrors
+from startrack.tracking.smoother import UNKNOWN_M, Observations, Smoothed, Steps, smooth
+from startrack.types import Array, Evidence, Ints
+
+STILL_M = 1e-3  # of a camera at rest from exposure to exposure, in the comparison of single fixes
+
+
+@dataclass(frozen=True, eq=False)
+class AtRest:
+    """Position after each exposure, and by all."""
+
+    position_m: Array  # (n, 2)
+    covariance_m2: Array  # (n, 2, 2)
+    smoothed: Smoothed  # of one position, by all exposures
+    mode: Ints  # (n,) which mode of each exposure agrees with the others; -1: none
+
+
+def positions_at_rest(frames: Sequence[ObservedFrame], terrain: Terrain, shared: SharedErrors) -> AtRest:
+    """The position by the evidence of the first exposures, for each number of them.
+
+    Single fixes that contradict the others are left out. Errors that exposures share (bias, clock, shape, heights of
+    posts) are carried once. Raises ValueError where no exposure has a position.
+    """
+    n = len(frames)
+    robust = agreeing_fixes([frame.modes for frame in frames], terrain.height_sigma_m)
+    position, covariance = np.zeros((n, 2)), np.repeat([UNKNOWN_M**2 * np.eye(2)], n, axis=0)
+    found = None
+    rows: list[Evidence] = []
+    for k, frame in enumerate(frames):
+        if robust.mode[k] >= 0 and frame.evidence is not None:
+            rows.append(frame.evidence)
+            found = _pooled(rows, frame.modes[robust.mode[k]], found, terrain, shared)
+        if found is not None:
+            position[k], covariance[k] = found.position_m[0], found.covariance_m2[0]
+    assert found is not None  # an exposure agrees with itself
+    return AtRest(position, covariance, found, robust.mode)
+
+
+def agreeing_fixes(modes: Sequence[Sequence[FrameEstimate]], height_sigma_m: float) -> RobustTrack:
+    """The single fixes as a track that does not move: which of them agree."""
+    still = Steps(np.zeros((len(modes) - 1, 2)), np.full(len(modes) - 1, STILL_M))
+    return smooth_robustly(modes, still, height_sigma_m)
+
+
+def _pooled(
+    rows: list[Evidence], newest: FrameEstimate, before: Smoothed | None, terrain: Terrain, shared: SharedErrors
+) -> Smoothed:
+    """The position by all rows together; the search begins at the position before, combined with the newest fix."""
+    if len(rows) == 1 or before is None:
+        estimate = newest
+    else:
+        k = len(shared.names)
+        mean, covariance = _combine(newest, before)
+        pooled = Evidence.concatenate(*rows)
+        estimate = estimate_frame(pooled, terrain, shared, mean[:2], covariance[:2, :2], mean[2:] if k else None)
+    return smooth(Observations.of([estimate], terrain.height_sigma_m), Steps.unknown(1))
+
+
+def _combine(newest: FrameEstimate, before: Smoothed) -> tuple[Array, Array]:
+    """A first guess: weighted mean of two positions; shared errors as before."""
+    known = [np.linalg.inv(c) for c in (newest.covariance[:2, :2], before.covariance_m2[0])]
+    covariance = np.linalg.inv(known[0] + known[1])
+    position = covariance @ (known[0] @ newest.mean[:2] + known[1] @ before.position_m[0])
+    return np.concatenate([position, before.shared]), covariance

@@ -1,0 +1,127 @@
+"""Moves and frames that the rest of a track contradicts: wheel slip, wrong fixes, and the modes of ambiguous frames.
+
+Every move and every frame is compared with its prediction by all the others. Its probability under its stated error is
+weighed against that of a gross error. The worst one of a neighbourhood is left out first; then all are compared anew,
+also those left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from startrack.tracking.frame_estimate import FrameEstimate
+from startrack.tracking.smoother import Observations, Smoothed, Steps, smooth
+from startrack.types import Array, Bools, Ints
+
+SLIP_PROBABILITY, SLIP_SIGMA_M = 0.05, 20.0  # of a move by wheel slip, and its size on each axis
+WRONG_PROBABILITY, WRONG_SIGMA_M = 1e-3, 200.0  # of a frame, and the error of its position on each axis
+NEIGHBOURS = 2  # frames and moves to each side that one gross error makes doubtful
+MAX_ROUNDS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class RobustTrack:
+    """The estimate without the moves and frames that contradict the others."""
+
+    smoothed: Smoothed
+    mode: Ints  # (n,) which mode of each frame is used; -1: none
+    slipped: Bools  # (n - 1,)
+
+
+def smooth_robustly(modes: Sequence[Sequence[FrameEstimate]], steps: Steps, height_sigma_m: float) -> RobustTrack:
+    """The estimate from frames with one mode each, several (ambiguous) or none (refused), and the moves between them.
+
+    Ambiguous frames are left out at first. Raises ValueError where no frame has a single mode.
+    """
+    mode = np.array([0 if len(of) == 1 else -1 for of in modes])
+    slipped = np.zeros(len(modes) - 1, dtype=bool)
+    tried, observations = set(), _chosen(modes, mode, height_sigma_m)
+    for _ in range(MAX_ROUNDS):
+        found = smooth(observations, _without(steps, slipped))
+        state = (tuple(mode), tuple(slipped))
+        if state in tried:
+            break
+        tried.add(state)
+        doubt_steps = step_doubt(found, steps)
+        new_mode, doubt_frames = _frame_doubt(found, observations, modes, mode)
+        # Moves stand between frames: one line of doubts, frame, move, frame, ...
+        doubt = np.full(2 * len(modes) - 1, -np.inf)
+        doubt[::2], doubt[1::2] = doubt_frames, doubt_steps
+        out = np.zeros(len(doubt), dtype=bool)
+        out[::2], out[1::2] = mode < 0, slipped
+        worst = _worst_nearby(np.where(out, -np.inf, doubt))
+        now_out = (out & (doubt > 0.0)) | worst
+        slipped = now_out[1::2] & np.isfinite(steps.sigma_m)
+        changed = np.where(now_out[::2], -1, np.where(mode < 0, new_mode, mode))
+        if not (changed == mode).all():
+            mode = changed
+            observations = _chosen(modes, mode, height_sigma_m)
+    return RobustTrack(found, mode, slipped)
+
+
+def step_doubt(found: Smoothed, steps: Steps) -> Array:
+    """(n - 1,) logarithm of the odds that each move slipped; -inf where it is not known."""
+    known = np.isfinite(steps.sigma_m)
+    variance = np.where(known, np.square(np.where(known, steps.sigma_m, 1.0)), 1.0)[:, None, None] * np.eye(2)
+    return np.where(
+        known,
+        gross_log_odds(found.step_residual_m, found.step_variance_m2 + variance, SLIP_PROBABILITY, SLIP_SIGMA_M),
+        -np.inf,
+    )
+
+
+def gross_log_odds(residual: Array, covariance: Array, probability: float, sigma_m: float) -> Array:
+    """(n,) logarithm of the odds that residuals (n, 2) have a gross error, beside their covariances (n, 2, 2)."""
+    wide = covariance + sigma_m**2 * np.eye(2)
+    odds = np.log(probability) - np.log1p(-probability)
+    return np.asarray(odds + log_normal(residual, wide) - log_normal(residual, covariance))
+
+
+def log_normal(residual: Array, covariance: Array) -> Array:
+    """Logarithm of normal densities at residuals (..., 2) with covariances (..., 2, 2), less a constant."""
+    chi2 = np.einsum("...i,...ij,...j->...", residual, np.linalg.inv(covariance), residual)
+    return np.asarray(-0.5 * chi2 - 0.5 * np.linalg.slogdet(covariance)[1])
+
+
+def _frame_doubt(
+    found: Smoothed, observations: Observations, modes: Sequence[Sequence[FrameEstimate]], mode: Ints
+) -> tuple[Ints, Array]:
+    """The best mode (n,) of each frame, and the logarithm of the odds (n,) that the frame is wrong in it."""
+    best, doubt = mode.copy(), np.full(len(mode), -np.inf)
+    used = np.array(observations.frames)
+    doubt[used] = gross_log_odds(
+        found.frame_residual[:, :2], found.frame_covariance[:, :2, :2], WRONG_PROBABILITY, WRONG_SIGMA_M
+    )
+    for k in np.flatnonzero(mode < 0):
+        odds = [mode_log_odds(e, found.position_m[k], found.covariance_m2[k]) for e in modes[k]]
+        if odds:
+            best[k], doubt[k] = int(np.argmin(odds)), min(odds)
+    return best, doubt
+
+
+def mode_log_odds(estimate: FrameEstimate, position_m: Array, covariance_m2: Array) -> float:
+    """Logarithm of the odds that a mode is wrong, beside a position (2,) predicted without it."""
+    away = estimate.mean[:2] - position_m
+    odds = gross_log_odds(away, covariance_m2 + estimate.covariance[:2, :2], WRONG_PROBABILITY, WRONG_SIGMA_M)
+    return float(odds) - float(np.log(estimate.weight))
+
+
+def _worst_nearby(doubt: Array) -> Bools:
+    """Those above even odds that no neighbour exceeds."""
+    padded = np.pad(doubt, 2 * NEIGHBOURS, constant_values=-np.inf)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 4 * NEIGHBOURS + 1)
+    return np.asarray((doubt > 0.0) & (doubt >= windows.max(axis=1)))
+
+
+def _without(steps: Steps, slipped: Bools) -> Steps:
+    return replace(steps, sigma_m=np.where(slipped, np.hypot(steps.sigma_m, SLIP_SIGMA_M), steps.sigma_m))
+
+
+def _chosen(modes: Sequence[Sequence[FrameEstimate]], mode: Ints, height_sigma_m: float) -> Observations:
+    chosen = [of[k] if k >= 0 else None for of, k in zip(modes, mode, strict=True)]
+    if all(one is None for one in chosen):
+        raise ValueError("no frame has a single position")
+    return Observations.of(chosen, height_sigma_m)

@@ -1,0 +1,100 @@
+"""From the result of one image to what a track needs of it: a few numbers, without the image."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import datetime
+
+import numpy as np
+
+from startrack.evidence.star_offsets import OFFSET_TERMS
+from startrack.stages import Located, Measured, Outcome, Refused, last_value
+from startrack.terrain import Terrain
+from startrack.tracking.frame_estimate import FrameEstimate, ImageErrors, estimate_frame
+from startrack.tracking.shared import BIAS, SharedErrors
+from startrack.types import Array, Bools, Evidence
+
+NEAR_RAD = np.radians(1.5)  # rows within this of the skyline are kept for other exposures of the same position
+MODE_SIGMA_M = 10.0  # of a mode of an ambiguous fix, of the first Gaussian
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedFrame:
+    """One image of a track."""
+
+    name: str
+    time_utc: datetime
+    R_body_enu: Array | None  # (3, 3) from enu; None: no attitude
+    modes: tuple[FrameEstimate, ...]  # of the position; empty: refused
+    evidence: Evidence | None  # rows near the skyline, above the map's horizon; None: refused
+    reason: str = ""  # of a refusal
+    message: str = ""
+
+
+def observe_frame(outcome: Outcome, shared: SharedErrors | None = None) -> ObservedFrame:
+    """What the `outcome` of one image says of its position and of the errors `shared` (None: those of its terrain).
+
+    Raises ValueError for an image without a time, and for a fix that states no error (another localizer).
+    """
+    value, when = last_value(outcome), outcome.exposure.time_utc
+    if when is None:
+        raise ValueError(f"{outcome.exposure.name}: an image of a track needs its time")
+    R = None
+    if isinstance(value, Measured):
+        R = value.camera.R_body_cam @ value.R_cam_enu
+    if isinstance(outcome, Refused) or not isinstance(value, Located):
+        reason = str(outcome.reason) if isinstance(outcome, Refused) else ""
+        message = outcome.message if isinstance(outcome, Refused) else ""
+        return ObservedFrame(outcome.exposure.name, when, R, (), None, reason, message)
+    if value.fix.search == "approximate":
+        raise ValueError(f"{outcome.exposure.name}: a track needs the localizer posterior")
+    shared = shared or SharedErrors.of(value.terrain, value.clock)
+    rows, errors = located_evidence(value)
+    estimates = tuple(_mode_estimates(value, rows, shared, errors))
+    return ObservedFrame(outcome.exposure.name, when, R, estimates, rows_near(rows, value.terrain, estimates))
+
+
+def located_evidence(located: Located) -> tuple[Evidence, ImageErrors | None]:
+    """Rows of the stars and of the sky's light above the map's horizon, and the errors of the image in the latter."""
+    stars, sky, fit = located.evidence(), located.sky_light, located.skyline_fit
+    if sky is None or fit is None:
+        return stars, None
+    image = ~fit.errors.of_terrain
+    raised_px = fit.errors.raised_px[:, image] @ fit.errors.mean[image]
+    light = sky.evidence(fit.used, raised_px, located.sky_variance_factor)
+    columns = fit.errors.raised_px[:, image] / sky.px_per_rad[:, None]
+
+    def pattern(azimuth_rad: Array) -> Array:
+        sector = (azimuth_rad / (2 * np.pi) * len(columns)).astype(np.int64) % len(columns)
+        return np.asarray(columns[sector])
+
+    errors = ImageErrors(pattern, fit.errors.covariance[:OFFSET_TERMS, :OFFSET_TERMS])
+    if not located.by_stars:
+        return replace(light, clock=stars.clock), errors
+    return Evidence.concatenate(stars, light), errors
+
+
+def _mode_estimates(
+    located: Located, rows: Evidence, shared: SharedErrors, errors: ImageErrors | None
+) -> Iterator[FrameEstimate]:
+    fix, terrain = located.fix, located.terrain
+    first = np.array([fix.horizon_error_rad / sigma if name == BIAS else 0.0 for name, sigma in
+                      zip(shared.names, shared.sigma, strict=True)])  # fmt: skip
+    if not fix.ambiguous:
+        yield estimate_frame(rows, terrain, shared, fix.position_enu_m[:2], fix.covariance_m2, first, errors)
+        return
+    for mode in fix.modes:
+        at, spread = np.array([mode.east_m, mode.north_m]), MODE_SIGMA_M**2 * np.eye(2)
+        yield replace(estimate_frame(rows, terrain, shared, at, spread, first, errors), weight=mode.weight)
+
+
+def rows_near(rows: Evidence, terrain: Terrain, estimates: tuple[FrameEstimate, ...]) -> Evidence:
+    """The rows near the skyline seen from one of the modes."""
+    return rows.take(np.any([_is_near(rows, terrain, e.mean[:2]) for e in estimates], axis=0))
+
+
+def _is_near(rows: Evidence, terrain: Terrain, position_m: Array) -> Bools:
+    azimuth = np.linspace(0.0, 2 * np.pi, 721)
+    horizon = np.interp(rows.azimuth_rad, azimuth, terrain.horizon_rad(position_m[None], azimuth))
+    return np.asarray(np.abs(rows.elevation_rad - horizon) < NEAR_RAD)

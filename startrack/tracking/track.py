@@ -1,0 +1,205 @@
+"""Frames of one camera to a track: filtered and smoothed positions with their covariances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any, Protocol
+
+import numpy as np
+
+from startrack.frames import quat_xyzw_from_R
+from startrack.localization.summary import camera_at
+from startrack.terrain import Terrain
+from startrack.tracking.at_rest import positions_at_rest
+from startrack.tracking.contradictions import RobustTrack, smooth_robustly
+from startrack.tracking.observe import ObservedFrame
+from startrack.tracking.online import OnlineTrack
+from startrack.tracking.shared import BIAS, CLOCK, SharedErrors
+from startrack.tracking.smoother import UNKNOWN_M, Smoothed, Steps
+from startrack.types import Array, BadInput, Bools, ClockError, Ints
+
+ODOMETRY_SIGMA, ODOMETRY_FLOOR_M = 0.02, 0.05  # of a move, relative to its length, and beside that
+UNKNOWN_SIGMA_M = 1e-3 * UNKNOWN_M  # a position with a larger error is not known
+
+
+class Odometry(Protocol):
+    """Poses of the body by a sensor of its own."""
+
+    def increments_body_m(self, time_s: Array) -> Array:
+        """Moves (n - 1, 3) between times (n,) [Unix s], each in the body's axes at its first time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Positions of the camera; nan and infinite where nothing is known."""
+
+    position_enu_m: Array  # (n, 3)
+    covariance_m2: Array  # (n, 2, 2) of east and north
+
+
+@dataclass(frozen=True, eq=False)
+class TrackFrame:
+    """One image of the track."""
+
+    name: str
+    time_utc: datetime
+    status: str  # "used"; "left_out": contradicts the track, or ambiguous to the end; "refused"
+    reason: str  # code; empty where used
+    message: str
+    quat_xyzw_body_enu: Array | None  # (4,) None: no attitude
+
+
+@dataclass(frozen=True, eq=False)
+class CrestHeights:
+    """Errors of the map's posts that make the skylines of the track, by all frames together."""
+
+    post: Ints  # (c,) number in the terrain
+    position_enu_m: Array  # (c, 3) by the map
+    error_m: Array  # (c,) true minus map
+    sigma_m: Array  # (c,) the map's own is the prior
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A track with what its frames share."""
+
+    frames: tuple[TrackFrame, ...]
+    filtered: Trajectory  # known at the time of each frame
+    smoothed: Trajectory  # known at the end
+    bias_rad: float  # by which the true horizon is higher than the map's, all around
+    bias_sigma_rad: float
+    clock: ClockError | None
+    crests: CrestHeights | None  # None: a terrain without posts, or without errors of their heights
+    slipped: Bools  # (n - 1,) odometry steps judged wheel slip
+    at_rest: bool
+    terrain: Terrain
+
+
+def estimate_track(
+    frames: Sequence[ObservedFrame],
+    terrain: Terrain,
+    shared: SharedErrors,
+    *,
+    odometry: Odometry | None = None,
+    odometry_sigma: float = ODOMETRY_SIGMA,
+    odometry_floor_m: float = ODOMETRY_FLOOR_M,
+    at_rest: bool = False,
+) -> Track:
+    """The track of frames in the order of time.
+
+    Args:
+        frames: what `observe_frame` gave of each image, with the same `shared`.
+        terrain: on which all were located.
+        shared: the errors that the frames share.
+        odometry: moves between the frames; None: not known.
+        odometry_sigma: standard deviation of a move on each horizontal axis, relative to its length.
+        odometry_floor_m: the same, beside that.
+        at_rest: the camera did not move: all exposures have one position.
+
+    Raises BadInput (no_time) for frames that are not in the order of time, (insufficient_geometry is a refusal of single
+    frames) and ValueError where no frame has a position.
+    """
+    times = [frame.time_utc for frame in frames]
+    if any(a > b for a, b in zip(times, times[1:], strict=False)):
+        raise BadInput("no_time", "the frames are not in the order of their times")
+    if at_rest:
+        rest = positions_at_rest(frames, terrain, shared)
+        robust = RobustTrack(rest.smoothed, rest.mode, np.zeros(max(len(frames) - 1, 0), dtype=bool))
+        n = len(frames)
+        smoothed = np.repeat(rest.smoothed.position_m, n, 0), np.repeat(rest.smoothed.covariance_m2, n, 0)
+        filtered = rest.position_m, rest.covariance_m2
+    else:
+        steps = odometry_steps(frames, odometry, odometry_sigma, odometry_floor_m)
+        modes = [frame.modes for frame in frames]
+        robust = smooth_robustly(modes, steps, terrain.height_sigma_m)
+        smoothed = robust.smoothed.position_m, robust.smoothed.covariance_m2
+        filtered = filter_positions(modes, steps, len(shared.names), terrain.height_sigma_m)
+    return Track(
+        tuple(_track_frame(frame, mode) for frame, mode in zip(frames, robust.mode, strict=True)),
+        _trajectory(*filtered, terrain), _trajectory(*smoothed, terrain), *_bias(robust.smoothed, shared),
+        _clock(robust.smoothed, shared), _crests(robust.smoothed, terrain), robust.slipped, at_rest, terrain,
+    )  # fmt: skip
+
+
+def filter_positions(
+    modes: Sequence[Sequence[Any]], steps: Steps, shared_count: int, height_sigma_m: float
+) -> tuple[Array, Array]:
+    """Positions (n, 2) and covariances (n, 2, 2), each by the frames up to its own."""
+    track, position, covariance = OnlineTrack(shared_count, height_sigma_m), [], []
+    for k, of in enumerate(modes):
+        move, sigma = (np.zeros(2), 0.0) if k == 0 else (steps.move_m[k - 1], float(steps.sigma_m[k - 1]))
+        track.add(of, move, sigma)
+        position.append(track.position_m)
+        covariance.append(track.covariance_m2)
+    return np.array(position), np.array(covariance)
+
+
+def odometry_steps(
+    frames: Sequence[ObservedFrame], odometry: Odometry | None, sigma_1: float, floor_m: float
+) -> Steps:
+    """Moves between frames in enu, turned by the attitude that the stars show.
+
+    Frames without an attitude of their own take the last one before them, and the odometry's turns since. Moves before
+    the first attitude are not known.
+    """
+    steps = Steps.unknown(len(frames))
+    if odometry is None:
+        return steps
+    time_s = np.array([frame.time_utc.astimezone(UTC).timestamp() for frame in frames])
+    move, sigma, anchor = steps.move_m.copy(), steps.sigma_m.copy(), -1
+    for k in range(len(frames) - 1):
+        anchor = k if frames[k].R_body_enu is not None else anchor
+        if anchor < 0:
+            continue
+        R = frames[anchor].R_body_enu
+        at = np.unique([anchor, k, k + 1])
+        # From the anchor to either frame, in the axes of the anchor's body.
+        ends = [odometry.increments_body_m(time_s[[anchor, end]])[0] for end in at[1:]]
+        move_body = ends[-1] - (ends[-2] if len(ends) > 1 else 0.0)
+        move[k] = (R.T @ move_body)[:2]
+        sigma[k] = np.hypot(sigma_1 * np.linalg.norm(move_body), floor_m)
+    return Steps(move, sigma)
+
+
+def _track_frame(frame: ObservedFrame, mode: int) -> TrackFrame:
+    status, reason, message = "used", "", ""
+    if not frame.modes:
+        status, reason, message = "refused", frame.reason, frame.message
+    elif mode < 0 and len(frame.modes) > 1:
+        status, reason, message = "left_out", "ambiguous", f"none of {len(frame.modes)} positions agrees with the track"
+    elif mode < 0:
+        status, reason, message = "left_out", "inconsistent_evidence", "its position contradicts the other frames"
+    quat = None if frame.R_body_enu is None else quat_xyzw_from_R(frame.R_body_enu)
+    return TrackFrame(frame.name, frame.time_utc, status, reason, message, quat)
+
+
+def _trajectory(position_m: Array, covariance_m2: Array, terrain: Terrain) -> Trajectory:
+    known = np.sqrt(np.trace(covariance_m2, axis1=1, axis2=2)) < UNKNOWN_SIGMA_M
+    position = np.full((len(position_m), 3), np.nan)
+    for k in np.flatnonzero(known):
+        position[k] = camera_at(position_m[k], terrain)
+    return Trajectory(position, np.where(known[:, None, None], covariance_m2, np.inf))
+
+
+def _bias(found: Smoothed, shared: SharedErrors) -> tuple[float, float]:
+    if BIAS not in shared.names:
+        return 0.0, 0.0
+    at = shared.names.index(BIAS)
+    sigma = float(shared.sigma[at])
+    return sigma * float(found.shared[at]), sigma * float(np.sqrt(found.shared_covariance[at, at]))
+
+
+def _clock(found: Smoothed, shared: SharedErrors) -> ClockError | None:
+    if CLOCK not in shared.names:
+        return None
+    at = shared.names.index(CLOCK)
+    sigma = float(shared.sigma[at])
+    return ClockError(sigma * float(found.shared[at]), sigma * float(np.sqrt(found.shared_covariance[at, at])))
+
+
+def _crests(found: Smoothed, terrain: Terrain) -> CrestHeights | None:
+    if not len(found.post):
+        return None
+    return CrestHeights(found.post, terrain.post_positions_m(found.post), found.post_error_m, found.post_sigma_m)

@@ -1,0 +1,186 @@
+"""The linear estimator of a track: against least squares with every unknown written out, and against the truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tracking_helpers import HEIGHT_SIGMA_M, STEP_SIGMA_M, Drive, mean_nees, shifted, simulate_drive, with_slips
+
+from startrack.tracking.contradictions import smooth_robustly
+from startrack.tracking.filter import TrackFilter
+from startrack.tracking.online import OnlineTrack
+from startrack.tracking.smoother import Observations, Steps, smooth
+from startrack.tracking.track import filter_positions
+
+
+def least_squares(drive: Drive, frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions, shared errors and heights as unknowns of one linear problem, and their covariance."""
+    k, posts = len(drive.shared), len(drive.height_error_m)
+    size = 2 * frames + k + posts
+    rows, values = [], []
+
+    def add(design: np.ndarray, value: np.ndarray, covariance: np.ndarray) -> None:
+        unit = np.linalg.inv(np.linalg.cholesky(covariance))
+        rows.append(unit @ design)
+        values.append(unit @ value)
+
+    for i, e in enumerate(drive.estimates[:frames]):
+        design = np.zeros((2 + k, size))
+        design[:, 2 * i : 2 * i + 2] = e.response[:, :2]
+        design[:, 2 * frames : 2 * frames + k] = e.response[:, 2:]
+        design[:, 2 * frames + k + e.post] = e.by_post
+        add(design, e.mean, e.noise)
+    for i in range(frames - 1):
+        design = np.zeros((2, size))
+        design[:, 2 * i : 2 * i + 2], design[:, 2 * i + 2 : 2 * i + 4] = -np.eye(2), np.eye(2)
+        add(design, drive.steps.move_m[i], STEP_SIGMA_M**2 * np.eye(2))
+    priors = np.concatenate([np.ones(k), np.full(posts, HEIGHT_SIGMA_M)])
+    add(np.eye(size)[2 * frames :], np.zeros(k + posts), np.diag(priors**2))
+    A, b = np.vstack(rows), np.concatenate(values)
+    solution = np.linalg.lstsq(A, b, rcond=None)[0]
+    return solution, np.linalg.inv(A.T @ A)
+
+
+@pytest.mark.parametrize("shared_count", [0, 1, 2])
+def test_the_smoother_is_least_squares_with_all_unknowns(shared_count):
+    drive = simulate_drive(np.random.default_rng(1), 7, shared_count)
+    found = smooth(Observations.of(drive.estimates, HEIGHT_SIGMA_M), drive.steps)
+    solution, covariance = least_squares(drive, 7)
+    posts = 14 + shared_count + found.post
+    np.testing.assert_allclose(found.position_m.ravel(), solution[:14], atol=1e-6)
+    np.testing.assert_allclose(found.shared, solution[14 : 14 + shared_count], atol=1e-7)
+    np.testing.assert_allclose(found.post_error_m, solution[posts], atol=1e-6)
+    np.testing.assert_allclose(found.post_sigma_m, np.sqrt(np.diag(covariance)[posts]), atol=1e-6)
+    for i in range(7):
+        part = slice(2 * i, 2 * i + 2)
+        np.testing.assert_allclose(found.covariance_m2[i], covariance[part, part], atol=1e-6)
+
+
+def test_the_filter_is_the_smoother_of_the_frames_so_far():
+    drive = simulate_drive(np.random.default_rng(2), 9)
+    state = TrackFilter(1, HEIGHT_SIGMA_M)
+    for k, estimate in enumerate(drive.estimates):
+        if k:
+            state.predict(drive.steps.move_m[k - 1], STEP_SIGMA_M)
+        state.update(estimate)
+        steps = Steps(drive.steps.move_m[:k], drive.steps.sigma_m[:k])
+        batch = smooth(Observations.of(drive.estimates[: k + 1], HEIGHT_SIGMA_M), steps)
+        np.testing.assert_allclose(state.position_m, batch.position_m[-1], atol=1e-4)
+        np.testing.assert_allclose(state.covariance_m2, batch.covariance_m2[-1], atol=1e-4)
+
+
+def test_predictions_by_the_others_are_those_without_the_frame_or_the_move():
+    drive = simulate_drive(np.random.default_rng(3), 6)
+    whole = smooth(Observations.of(drive.estimates, HEIGHT_SIGMA_M), drive.steps)
+    without = smooth(
+        Observations.of([None if k == 2 else e for k, e in enumerate(drive.estimates)], HEIGHT_SIGMA_M), drive.steps
+    )
+    unknown = np.where(np.arange(5) == 3, np.inf, drive.steps.sigma_m)
+    loose = smooth(Observations.of(drive.estimates, HEIGHT_SIGMA_M), replace(drive.steps, sigma_m=unknown))
+    move = drive.steps.move_m[3] - (loose.position_m[4] - loose.position_m[3])
+    np.testing.assert_allclose(whole.step_residual_m[3], move, atol=1e-3)
+    state_less = drive.estimates[2].response @ np.concatenate([without.position_m[2], without.shared])
+    known = np.isin(without.post, drive.estimates[2].post)
+    heights = dict(zip(without.post[known], without.post_error_m[known], strict=True))
+    by_posts = drive.estimates[2].by_post @ [heights.get(post, 0.0) for post in drive.estimates[2].post]
+    np.testing.assert_allclose(whole.frame_residual[2], drive.estimates[2].mean - state_less - by_posts, atol=1e-5)
+
+
+def test_positions_have_their_stated_errors_and_the_plain_sum_has_not():
+    errors, covariances, plain_errors, plain_covariances = [], [], [], []
+    for seed in range(60):
+        drive = simulate_drive(np.random.default_rng([4, seed]), 12)
+        found = smooth(Observations.of(drive.estimates, HEIGHT_SIGMA_M), drive.steps)
+        alone = [replace(e, noise=e.covariance, post=e.post[:0], by_post=e.by_post[:, :0]) for e in drive.estimates]
+        plain = smooth(Observations.of(alone, HEIGHT_SIGMA_M), drive.steps)
+        errors.append(found.position_m - drive.position_m)
+        covariances.append(found.covariance_m2)
+        plain_errors.append(plain.position_m - drive.position_m)
+        plain_covariances.append(plain.covariance_m2)
+    assert 1.6 < mean_nees(np.concatenate(errors), np.concatenate(covariances)) < 2.4
+    assert mean_nees(np.concatenate(plain_errors), np.concatenate(plain_covariances)) > 2.6
+    assert np.square(errors).mean() < np.square(plain_errors).mean()
+
+
+def test_slipped_moves_are_found_and_cost_nothing():
+    found, lost, right = 0, [], []
+    for seed in range(10):
+        drive = simulate_drive(np.random.default_rng([5, seed]), 30)
+        rng = np.random.default_rng([6, seed])
+        which = np.sort(rng.choice(29, 3, replace=False))
+        modes = [(e,) for e in drive.estimates]
+        slipped = smooth_robustly(modes, with_slips(drive.steps, which, 20.0), HEIGHT_SIGMA_M)
+        clean = smooth_robustly(modes, drive.steps, HEIGHT_SIGMA_M)
+        found += int(slipped.slipped[which].sum())
+        assert slipped.slipped.sum() <= 4
+        assert not clean.slipped.any()
+        lost.append(np.linalg.norm(slipped.smoothed.position_m - drive.position_m, axis=1).mean())
+        right.append(np.linalg.norm(clean.smoothed.position_m - drive.position_m, axis=1).mean())
+    assert found >= 29
+    assert np.mean(lost) < 1.15 * np.mean(right)
+
+
+def test_a_frame_that_contradicts_is_left_out_by_both_estimates():
+    drive = simulate_drive(np.random.default_rng(7), 20)
+    estimates = list(drive.estimates)
+    estimates[8] = shifted(estimates[8], np.array([120.0, -90.0]))
+    modes = [(e,) for e in estimates]
+    found = smooth_robustly(modes, drive.steps, HEIGHT_SIGMA_M)
+    assert found.mode.tolist() == [0] * 8 + [-1] + [0] * 11
+    assert not found.slipped.any()
+    online, _ = filter_positions(modes, drive.steps, 1, HEIGHT_SIGMA_M)
+    assert np.linalg.norm(online - drive.position_m, axis=1).max() < 15.0
+
+
+def test_a_wrong_first_frame_does_not_hold_the_filter():
+    drive = simulate_drive(np.random.default_rng(8), 12)
+    modes = [(e,) for e in drive.estimates]
+    modes[0] = (shifted(drive.estimates[0], np.array([300.0, 400.0])),)
+    online, _ = filter_positions(modes, drive.steps, 1, HEIGHT_SIGMA_M)
+    assert np.linalg.norm(online[4:] - drive.position_m[4:], axis=1).max() < 15.0
+    assert smooth_robustly(modes, drive.steps, HEIGHT_SIGMA_M).mode[0] == -1
+
+
+def test_three_refused_frames_are_bridged_with_growing_errors():
+    drive = simulate_drive(np.random.default_rng(9), 12)
+    modes = [() if k in (5, 6, 7) else (e,) for k, e in enumerate(drive.estimates)]
+    found = smooth_robustly(modes, drive.steps, HEIGHT_SIGMA_M)
+    assert found.mode.tolist() == [-1 if k in (5, 6, 7) else 0 for k in range(12)]
+    online = OnlineTrack(1, HEIGHT_SIGMA_M)
+    traces = []
+    for k, of in enumerate(modes):
+        online.add(of, drive.steps.move_m[k - 1] if k else np.zeros(2), STEP_SIGMA_M if k else 0.0)
+        traces.append(np.trace(online.covariance_m2))
+    assert traces[4] < traces[5] < traces[6] < traces[7] > traces[8]
+    smoothed = np.trace(found.smoothed.covariance_m2, axis1=1, axis2=2)
+    assert smoothed[6] > max(smoothed[4], smoothed[8])
+    error = found.smoothed.position_m - drive.position_m
+    assert 0.2 < mean_nees(error, found.smoothed.covariance_m2) < 6.0
+
+
+def test_the_sequence_chooses_the_mode_of_an_ambiguous_frame():
+    drive = simulate_drive(np.random.default_rng(10), 10)
+    modes = [(e,) for e in drive.estimates]
+    wrong, right = shifted(drive.estimates[4], np.array([200.0, 0.0])), drive.estimates[4]
+    modes[4] = (replace(wrong, weight=0.7), replace(right, weight=0.3))
+    modes[6] = (replace(shifted(wrong, np.array([0.0, 500.0])), weight=0.6), replace(wrong, weight=0.4))  # neither
+    found = smooth_robustly(modes, drive.steps, HEIGHT_SIGMA_M)
+    assert found.mode[4] == 1
+    assert found.mode[6] == -1
+
+
+def test_without_odometry_only_the_shared_errors_connect_the_frames():
+    drive = simulate_drive(np.random.default_rng(11), 8)
+    alone = smooth(Observations.of([drive.estimates[3]], HEIGHT_SIGMA_M), Steps.unknown(1))
+    modes = [(e,) for e in drive.estimates]
+    found = smooth_robustly(modes, Steps.unknown(8), HEIGHT_SIGMA_M)
+    assert found.mode.tolist() == [0] * 8
+    assert not found.slipped.any()
+    assert np.trace(found.smoothed.covariance_m2[3]) < np.trace(alone.covariance_m2[0])
+    assert found.smoothed.shared_covariance[0, 0] < alone.shared_covariance[0, 0]
+    assert np.linalg.norm(found.smoothed.position_m - drive.position_m, axis=1).max() < 25.0
+
+
+def test_a_track_needs_one_frame_with_a_position():
+    with pytest.raises(ValueError, match="no frame has a single position"):
+        smooth_robustly([(), ()], Steps.unknown(2), HEIGHT_SIGMA_M)

@@ -38,12 +38,12 @@ def simulate_drive(rng: np.random.Generator, frames: int, shared_count: int = 1)
     position = np.cumsum(rng.normal(size=(frames, 2)) + [STEP_M, 0.0], axis=0)
     shared = rng.normal(size=shared_count)
     heights = HEIGHT_SIGMA_M * rng.normal(size=frames * POSTS_IN_PLAY)
-    estimates = []
+    estimates, response_to_post = [], rng.normal(0.12, 0.06, (2, len(heights)))
     for k in range(frames):
         post = np.arange(POSTS_IN_PLAY) + k * (POSTS_IN_PLAY - POSTS_KEPT)
-        by_post = np.vstack([rng.normal(0.0, 0.3, (2, len(post))), rng.normal(0.0, 0.01, (shared_count, len(post)))])
+        by_post = np.vstack([response_to_post[:, post], rng.normal(0.0, 0.01, (shared_count, len(post)))])
         covariance = np.diag([4.0] * p)
-        covariance[:2, :2] = random_covariance(rng, 2, 4.0)
+        covariance[:2, :2] = random_covariance(rng, 2, 2.5)
         covariance[2:] *= 0.01
         covariance[2:, 2:] = random_covariance(rng, shared_count, 0.2) if shared_count else covariance[2:, 2:]
         covariance = 0.5 * (covariance + covariance.T)

@@ -62,16 +62,15 @@ def _pooled(
     if len(rows) == 1 or before is None:
         estimate = newest
     else:
-        k = len(shared.names)
-        mean, covariance = _combine(newest, before)
-        pooled = Evidence.concatenate(*rows)
-        estimate = estimate_frame(pooled, terrain, shared, mean[:2], covariance[:2, :2], mean[2:] if k else None)
+        estimate = estimate_frame(Evidence.concatenate(*rows), terrain, shared, *_combine(newest, before))
     return smooth(Observations.of([estimate], terrain.height_sigma_m), Steps.unknown(1))
 
 
 def _combine(newest: FrameEstimate, before: Smoothed) -> tuple[Array, Array]:
     """A first guess: weighted mean of two positions; shared errors as before."""
     known = [np.linalg.inv(c) for c in (newest.covariance[:2, :2], before.covariance_m2[0])]
-    covariance = np.linalg.inv(known[0] + known[1])
-    position = covariance @ (known[0] @ newest.mean[:2] + known[1] @ before.position_m[0])
+    covariance = np.zeros_like(newest.covariance)
+    covariance[:2, :2] = np.linalg.inv(known[0] + known[1])
+    covariance[2:, 2:] = before.shared_covariance
+    position = covariance[:2, :2] @ (known[0] @ newest.mean[:2] + known[1] @ before.position_m[0])
     return np.concatenate([position, before.shared]), covariance

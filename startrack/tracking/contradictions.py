@@ -19,6 +19,7 @@ from startrack.types import Array, Bools, Ints
 SLIP_PROBABILITY, SLIP_SIGMA_M = 0.05, 20.0  # of a move by wheel slip, and its size on each axis
 WRONG_PROBABILITY, WRONG_SIGMA_M = 1e-3, 200.0  # of a frame, and the error of its position on each axis
 NEIGHBOURS = 2  # frames and moves to each side that one gross error makes doubtful
+SHIFTS = 4  # moves to each side, to which a slip may belong instead
 MAX_ROUNDS = 30
 
 
@@ -47,6 +48,7 @@ def smooth_robustly(modes: Sequence[Sequence[FrameEstimate]], steps: Steps, heig
         tried.add(state)
         doubt_steps = step_doubt(found, steps)
         new_mode, doubt_frames = _frame_doubt(found, observations, modes, mode)
+        doubt_frames[~_has_known_move(steps)] = -np.inf  # nothing predicts the frame
         # Moves stand between frames: one line of doubts, frame, move, frame, ...
         doubt = np.full(2 * len(modes) - 1, -np.inf)
         doubt[::2], doubt[1::2] = doubt_frames, doubt_steps
@@ -54,7 +56,7 @@ def smooth_robustly(modes: Sequence[Sequence[FrameEstimate]], steps: Steps, heig
         out[::2], out[1::2] = mode < 0, slipped
         worst = _worst_nearby(np.where(out, -np.inf, doubt))
         now_out = (out & (doubt > 0.0)) | worst
-        slipped = now_out[1::2] & np.isfinite(steps.sigma_m)
+        slipped = _improve_slips(found, steps, slipped) if not worst.any() else now_out[1::2]
         changed = np.where(now_out[::2], -1, np.where(mode < 0, new_mode, mode))
         if not (changed == mode).all():
             mode = changed
@@ -73,6 +75,48 @@ def step_doubt(found: Smoothed, steps: Steps) -> Array:
     )
 
 
+def _improve_slips(found: Smoothed, steps: Steps, slipped: Bools) -> Bools:
+    """The moves that slipped, each shifted to a neighbour or cancelled with one where that explains the track better.
+
+    One gross error makes several moves doubtful, and the first one chosen hides the right one.
+    """
+    improved = slipped.copy()
+    for k in np.flatnonzero(slipped):
+        near = _near(k, steps)
+        near = near[(improved == slipped)[near]] if improved[k] else near[:0]
+        gains = [_gain(found, steps, slipped, int(k), int(other)) for other in near]
+        if gains and max(gains) > 0.0:
+            other = near[int(np.argmax(gains))]
+            improved[k], improved[other] = False, not slipped[other]
+    return improved
+
+
+def _near(k: int, steps: Steps) -> Ints:
+    """Known moves to each side of a move."""
+    near = np.arange(max(k - SHIFTS, 0), min(k + SHIFTS + 1, len(steps.sigma_m)))
+    return near[(near != k) & np.isfinite(steps.sigma_m[near])]
+
+
+def _gain(found: Smoothed, steps: Steps, slipped: Bools, here: int, there: int) -> float:
+    """Logarithm of the odds that the move `here`, which counts as slipped, did not: `there` slipped, or neither."""
+    pair, n = np.array([here, there]), len(found.position_m)
+    difference = np.zeros((4, n, 2))
+    for row, (step, axis) in enumerate((step, axis) for step in pair for axis in range(2)):
+        difference[row, step, axis], difference[row, step + 1, axis] = -1.0, 1.0
+    touched = np.unique([pair, pair + 1])
+    part = difference[:, touched].reshape(4, -1)
+    joint = found.joint_m2[touched][:, :, touched].reshape(2 * len(touched), -1)
+    now = np.square(np.repeat(_without(steps, slipped).sigma_m[pair], 2))
+    residual = (steps.move_m - np.diff(found.position_m, axis=0))[pair].ravel()
+    without = np.linalg.inv(np.linalg.inv(part @ joint @ part.T) - (1.0 - 1e-9) * np.diag(1.0 / now))
+    residual = residual + without @ (residual / now)
+    changed = slipped.copy()
+    changed[pair] = [False, not slipped[there]]
+    then = np.square(np.repeat(_without(steps, changed).sigma_m[pair], 2))
+    prior = 2.0 * float(np.log(1.0 / SLIP_PROBABILITY - 1.0)) if slipped[there] else 0.0
+    return prior + float(log_normal(residual, without + np.diag(then)) - log_normal(residual, without + np.diag(now)))
+
+
 def gross_log_odds(residual: Array, covariance: Array, probability: float, sigma_m: float) -> Array:
     """(n,) logarithm of the odds that residuals (n, 2) have a gross error, beside their covariances (n, 2, 2)."""
     wide = covariance + sigma_m**2 * np.eye(2)
@@ -84,6 +128,12 @@ def log_normal(residual: Array, covariance: Array) -> Array:
     """Logarithm of normal densities at residuals (..., 2) with covariances (..., 2, 2), less a constant."""
     chi2 = np.einsum("...i,...ij,...j->...", residual, np.linalg.inv(covariance), residual)
     return np.asarray(-0.5 * chi2 - 0.5 * np.linalg.slogdet(covariance)[1])
+
+
+def _has_known_move(steps: Steps) -> Bools:
+    """Whether a move to or from each frame (n,) is known."""
+    known = np.isfinite(steps.sigma_m)
+    return np.append(known, False) | np.insert(known, 0, False)
 
 
 def _frame_doubt(

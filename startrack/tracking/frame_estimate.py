@@ -15,7 +15,7 @@ import numpy as np
 from startrack.terrain import Terrain
 from startrack.terrain.horizon_posts import NO_POST, HorizonPosts
 from startrack.tracking.importance_sampling import Samples, sample_posterior
-from startrack.tracking.shared import SharedErrors
+from startrack.tracking.shared import BIAS, SharedErrors
 from startrack.tracking.skyline_likelihood import SkylineLikelihood
 from startrack.types import Array, Evidence, Ints
 
@@ -58,9 +58,8 @@ def estimate_frame(
     evidence: Evidence,
     terrain: Terrain,
     shared: SharedErrors,
-    position_m: Array,
-    covariance_m2: Array,
-    shared_mean: Array | None = None,
+    first_mean: Array,
+    first_covariance: Array,
     image_errors: ImageErrors | None = None,
 ) -> FrameEstimate:
     """The observation by rows of `evidence` above the map's horizon.
@@ -69,15 +68,11 @@ def estimate_frame(
         evidence: rows of one exposure, or of several of a camera at rest.
         terrain: with the evidence's enu.
         shared: errors that frames share.
-        position_m: (2,) near the posterior's mode that is meant.
-        covariance_m2: (2, 2) about that of the mode.
-        shared_mean: (k,) first guess of the shared errors, in standard deviations; None: zero.
+        first_mean: (2 + k,) parameters near the posterior's mode that is meant, see `first_guess`.
+        first_covariance: (2 + k, 2 + k) about that of the mode.
         image_errors: of the rows of the sky's light; None: none.
     """
-    k = len(shared.names)
-    mean = np.concatenate([position_m, np.zeros(k) if shared_mean is None else shared_mean])
-    covariance = np.diag(np.full(2 + k, FIRST_SHARED_SIGMA**2))
-    covariance[:2, :2] = covariance_m2
+    mean, covariance = first_mean, first_covariance
     for _ in range(MAX_NEIGHBOURHOODS):
         half = REACH_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1])) + MARGIN_M
         sigmas = float(np.abs(mean[2:]).max(initial=0.0)) + REACH_SIGMAS * float(
@@ -93,7 +88,20 @@ def estimate_frame(
     return _observation(likelihood, samples, image_errors)
 
 
-def _log_posterior(likelihood: SkylineLikelihood, half_m: float):  # type: ignore[no-untyped-def]
+def first_guess(
+    shared: SharedErrors, position_m: Array, covariance_m2: Array, horizon_error_rad: float = 0.0
+) -> tuple[Array, Array]:
+    """Mean (2 + k,) and covariance (2 + k, 2 + k) of the first Gaussian, from a fix by one image."""
+    k = len(shared.names)
+    mean, covariance = np.zeros(2 + k), np.diag(np.full(2 + k, FIRST_SHARED_SIGMA**2))
+    mean[:2], covariance[:2, :2] = position_m, covariance_m2
+    if BIAS in shared.names:
+        at = shared.names.index(BIAS)
+        mean[2 + at] = horizon_error_rad / shared.sigma[at]
+    return mean, covariance
+
+
+def _log_posterior(likelihood: SkylineLikelihood, half_m: float) -> Callable[[Array], Array]:
     terrain, centre = likelihood.local.terrain, likelihood.centre_m
 
     def log_density(points: Array) -> Array:

@@ -11,8 +11,8 @@ import numpy as np
 from startrack.evidence.star_offsets import OFFSET_TERMS
 from startrack.stages import Located, Measured, Outcome, Refused, last_value
 from startrack.terrain import Terrain
-from startrack.tracking.frame_estimate import FrameEstimate, ImageErrors, estimate_frame
-from startrack.tracking.shared import BIAS, SharedErrors
+from startrack.tracking.frame_estimate import FrameEstimate, ImageErrors, estimate_frame, first_guess
+from startrack.tracking.shared import SharedErrors
 from startrack.types import Array, Bools, Evidence
 
 NEAR_RAD = np.radians(1.5)  # rows within this of the skyline are kept for other exposures of the same position
@@ -79,14 +79,14 @@ def _mode_estimates(
     located: Located, rows: Evidence, shared: SharedErrors, errors: ImageErrors | None
 ) -> Iterator[FrameEstimate]:
     fix, terrain = located.fix, located.terrain
-    first = np.array([fix.horizon_error_rad / sigma if name == BIAS else 0.0 for name, sigma in
-                      zip(shared.names, shared.sigma, strict=True)])  # fmt: skip
     if not fix.ambiguous:
-        yield estimate_frame(rows, terrain, shared, fix.position_enu_m[:2], fix.covariance_m2, first, errors)
+        first = first_guess(shared, fix.position_enu_m[:2], fix.covariance_m2, fix.horizon_error_rad)
+        yield estimate_frame(rows, terrain, shared, *first, errors)
         return
     for mode in fix.modes:
         at, spread = np.array([mode.east_m, mode.north_m]), MODE_SIGMA_M**2 * np.eye(2)
-        yield replace(estimate_frame(rows, terrain, shared, at, spread, first, errors), weight=mode.weight)
+        first = first_guess(shared, at, spread, fix.horizon_error_rad)
+        yield replace(estimate_frame(rows, terrain, shared, *first, errors), weight=mode.weight)
 
 
 def rows_near(rows: Evidence, terrain: Terrain, estimates: tuple[FrameEstimate, ...]) -> Evidence:

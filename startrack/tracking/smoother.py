@@ -43,6 +43,7 @@ class Smoothed:
     covariance_m2: Array  # (n, 2, 2)
     shared: Array  # (k,) in standard deviations of their priors
     shared_covariance: Array  # (k, k)
+    joint_m2: Array  # (n, 2, n, 2) covariance of all positions
     step_residual_m: Array  # (n - 1, 2) of each move, where the other data predict it
     step_variance_m2: Array  # (n - 1, 2, 2) of that prediction
     frame_residual: Array  # (frames, 2 + k) of the observations used, where the others predict them
@@ -153,8 +154,8 @@ def smooth(observations: Observations, steps: Steps) -> Smoothed:
     pulls, spread = _predicted_frames(observations, best, covariance)
     error, sigma = _posts(observations, best, covariance)
     return Smoothed(
-        best[: 2 * n].reshape(n, 2), blocks[frame, :, frame], best[2 * n :], covariance[2 * n :, 2 * n :], residual,
-        variance, pulls, spread, observations.posts, error, sigma,
+        best[: 2 * n].reshape(n, 2), blocks[frame, :, frame], best[2 * n :], covariance[2 * n :, 2 * n :], blocks,
+        residual, variance, pulls, spread, observations.posts, error, sigma,
     )  # fmt: skip
 
 

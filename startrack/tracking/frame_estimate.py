@@ -154,7 +154,8 @@ def _posts(likelihood: SkylineLikelihood, by_horizon: Array, covariance: Array) 
         return np.zeros(0, dtype=np.int64), np.zeros((len(by_horizon), 0))
     azimuth = likelihood.azimuth_rad
     parts = [terrain.horizon_posts(likelihood.centre_m, azimuth), terrain.ground_posts(likelihood.centre_m, azimuth)]
-    post, by_post = _sum_by_post(parts, by_horizon)
+    # Ground higher than the map acts on the evidence as a map lower than the ground.
+    post, by_post = _sum_by_post(parts, -by_horizon)
     scale = terrain.height_sigma_m / np.sqrt(np.diag(covariance))
     effect = np.square(by_post * scale[:, None]).max(axis=0, initial=0.0)
     order = np.argsort(effect)

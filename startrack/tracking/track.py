@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from startrack.terrain import Terrain
 from startrack.tracking.at_rest import positions_at_rest
 from startrack.tracking.contradictions import RobustTrack, smooth_robustly
 from startrack.tracking.observe import ObservedFrame
+from startrack.tracking.odometry import Odometry
 from startrack.tracking.online import OnlineTrack
 from startrack.tracking.shared import BIAS, CLOCK, SharedErrors
 from startrack.tracking.smoother import UNKNOWN_M, Smoothed, Steps
@@ -22,13 +23,6 @@ from startrack.types import Array, BadInput, Bools, ClockError, Ints
 
 ODOMETRY_SIGMA, ODOMETRY_FLOOR_M = 0.02, 0.05  # of a move, relative to its length, and beside that
 UNKNOWN_SIGMA_M = 1e-3 * UNKNOWN_M  # a position with a larger error is not known
-
-
-class Odometry(Protocol):
-    """Poses of the body by a sensor of its own."""
-
-    def increments_body_m(self, time_s: Array) -> Array:
-        """Moves (n - 1, 3) between times (n,) [Unix s], each in the body's axes at its first time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +92,8 @@ def estimate_track(
         odometry_floor_m: the same, beside that.
         at_rest: the camera did not move: all exposures have one position.
 
-    Raises BadInput (no_time) for frames that are not in the order of time, (insufficient_geometry is a refusal of single
-    frames) and ValueError where no frame has a position.
+    Raises BadInput: no_time for frames that are not in the order of time, bad_odometry for odometry that does not cover
+    them; ValueError where no frame has a single position.
     """
     times = [frame.time_utc for frame in frames]
     if any(a > b for a, b in zip(times, times[1:], strict=False)):

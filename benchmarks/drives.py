@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -134,7 +134,8 @@ def course_of(case: Case, rng: np.random.Generator, pixels: bool) -> Course:
     if case.degraded:
         ground, stated, raised = draw_ground(shipped, POST_SIGMA_M, rng), shipped, RAISED_SIGMA_RAD * rng.normal()
     if pixels and raised:
-        ground, raised = RaisedMap(**{f: getattr(ground, f) for f in ground.__dataclass_fields__}, raised_rad=raised), 0.0
+        facts = {f.name: getattr(ground, f.name) for f in fields(ground)}
+        ground, raised = RaisedMap(**facts, raised_rad=raised), 0.0
     stated.prepare()
     return draw_course(
         ground, stated, float(raised), frames=case.frames, spacing_m=case.spacing_m, every_s=case.every_s,

@@ -104,7 +104,9 @@ def test_the_response_to_the_bias_is_that_to_raised_rows(ground):
     here = estimate(evidence, ground)
     raised = replace(evidence, elevation_rad=evidence.elevation_rad + 0.2 * ground.common_sigma_rad)
     there = estimate(raised, ground)
-    np.testing.assert_allclose(there.mean - here.mean, 0.2 * here.response[:, 2], atol=0.1 * np.sqrt(here.covariance[0, 0]))
+    np.testing.assert_allclose(
+        there.mean - here.mean, 0.2 * here.response[:, 2], atol=0.1 * np.sqrt(here.covariance[0, 0])
+    )
     assert here.response[2, 2] > 0.9
     np.testing.assert_allclose(here.response[:, :2], np.eye(3)[:, :2], atol=1e-9)
 

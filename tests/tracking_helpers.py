@@ -35,7 +35,7 @@ def random_covariance(rng: np.random.Generator, size: int, scale: float) -> Arra
 def simulate_drive(rng: np.random.Generator, frames: int, shared_count: int = 1) -> Drive:
     """A drive whose neighbouring frames depend on the same posts; its numbers are as on a 240 m map of 5 m errors."""
     p = 2 + shared_count
-    position = np.cumsum(rng.normal(size=(frames, 2)) + [STEP_M, 0.0], axis=0)
+    position = np.cumsum(rng.normal(size=(frames, 2)) + np.array([STEP_M, 0.0]), axis=0)
     shared = rng.normal(size=shared_count)
     heights = HEIGHT_SIGMA_M * rng.normal(size=frames * POSTS_IN_PLAY)
     estimates, response_to_post = [], rng.normal(0.12, 0.06, (2, len(heights)))

@@ -81,10 +81,10 @@ def _improve_slips(found: Smoothed, steps: Steps, slipped: Bools) -> Bools:
     One gross error makes several moves doubtful, and the first one chosen hides the right one.
     """
     improved = slipped.copy()
-    for k in np.flatnonzero(slipped):
+    for k in np.flatnonzero(slipped).tolist():
         near = _near(k, steps)
         near = near[(improved == slipped)[near]] if improved[k] else near[:0]
-        gains = [_gain(found, steps, slipped, int(k), int(other)) for other in near]
+        gains = [_gain(found, steps, slipped, k, other) for other in near.tolist()]
         if gains and max(gains) > 0.0:
             other = near[int(np.argmax(gains))]
             improved[k], improved[other] = False, not slipped[other]
@@ -107,9 +107,9 @@ def _gain(found: Smoothed, steps: Steps, slipped: Bools, here: int, there: int) 
     part = difference[:, touched].reshape(4, -1)
     joint = found.joint_m2[touched][:, :, touched].reshape(2 * len(touched), -1)
     now = np.square(np.repeat(_without(steps, slipped).sigma_m[pair], 2))
-    residual = (steps.move_m - np.diff(found.position_m, axis=0))[pair].ravel()
-    without = np.linalg.inv(np.linalg.inv(part @ joint @ part.T) - (1.0 - 1e-9) * np.diag(1.0 / now))
-    residual = residual + without @ (residual / now)
+    residual: Array = (steps.move_m - np.diff(found.position_m, axis=0))[pair].ravel()
+    without = np.asarray(np.linalg.inv(np.linalg.inv(part @ joint @ part.T) - (1.0 - 1e-9) * np.diag(1.0 / now)))
+    residual = np.asarray(residual + without @ (residual / now))
     changed = slipped.copy()
     changed[pair] = [False, not slipped[there]]
     then = np.square(np.repeat(_without(steps, changed).sigma_m[pair], 2))
@@ -145,7 +145,7 @@ def _frame_doubt(
     doubt[used] = gross_log_odds(
         found.frame_residual[:, :2], found.frame_covariance[:, :2, :2], WRONG_PROBABILITY, WRONG_SIGMA_M
     )
-    for k in np.flatnonzero(mode < 0):
+    for k in np.flatnonzero(mode < 0).tolist():
         odds = [mode_log_odds(e, found.position_m[k], found.covariance_m2[k]) for e in modes[k]]
         if odds:
             best[k], doubt[k] = int(np.argmin(odds)), min(odds)

@@ -116,9 +116,7 @@ def _log_posterior(likelihood: SkylineLikelihood, half_m: float) -> Callable[[Ar
     return log_density
 
 
-def _observation(
-    likelihood: SkylineLikelihood, samples: Samples, image_errors: ImageErrors | None
-) -> FrameEstimate:
+def _observation(likelihood: SkylineLikelihood, samples: Samples, image_errors: ImageErrors | None) -> FrameEstimate:
     used = samples.weight > 0.0
     samples = Samples(samples.points[used], samples.weight[used])
     mean, covariance = samples.mean, samples.covariance
@@ -165,7 +163,9 @@ def _posts(likelihood: SkylineLikelihood, by_horizon: Array, covariance: Array) 
 
 def _sum_by_post(parts: list[HorizonPosts], by_horizon: Array) -> tuple[Ints, Array]:
     post = np.concatenate([part.post.ravel() for part in parts])
-    response = np.concatenate([(by_horizon[:, :, None] * part.rad_per_m).reshape(len(by_horizon), -1) for part in parts], 1)
+    response = np.concatenate(
+        [(by_horizon[:, :, None] * part.rad_per_m).reshape(len(by_horizon), -1) for part in parts], 1
+    )
     known = post != NO_POST
     numbers, of = np.unique(post[known], return_inverse=True)
     return numbers, np.stack([np.bincount(of, weights=row[known], minlength=len(numbers)) for row in response])

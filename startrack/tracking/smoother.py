@@ -86,7 +86,8 @@ class Observations:
         p, n = self.size, self.count
         matrix = np.concatenate([e.response for e in self.estimates])
         frame = np.repeat(self.frames, p)[:, None]
-        column = np.concatenate([2 * frame, 2 * frame + 1, np.broadcast_to(2 * n + np.arange(p - 2), (len(frame), p - 2))], 1)
+        shared = np.broadcast_to(2 * n + np.arange(p - 2), (len(frame), p - 2))
+        column = np.concatenate([2 * frame, 2 * frame + 1, shared], axis=1)
         row = np.broadcast_to(np.arange(len(frame))[:, None], column.shape)
         return csr_array((matrix.ravel(), (row.ravel(), column.ravel())), shape=(len(frame), 2 * n + p - 2))
 
@@ -178,7 +179,7 @@ def _predicted_steps(position_m: Array, blocks: Array, steps: Steps, weight: Arr
     residual = steps.move_m - np.diff(position_m, axis=0)
     # Just less than the whole weight: a move that nothing else predicts stays invertible.
     without = np.linalg.inv(np.linalg.inv(covariance) - (1.0 - 1e-9) * weight[:, None, None] * np.eye(2))
-    return residual + np.einsum("n,nij,nj->ni", weight, without, residual), without
+    return np.asarray(residual + np.einsum("n,nij,nj->ni", weight, without, residual)), np.asarray(without)
 
 
 def _predicted_frames(observations: Observations, best: Array, covariance: Array) -> tuple[Array, Array]:

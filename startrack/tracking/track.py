@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -96,7 +97,7 @@ def estimate_track(
     them; ValueError where no frame has a single position.
     """
     times = [frame.time_utc for frame in frames]
-    if any(a > b for a, b in zip(times, times[1:], strict=False)):
+    if any(a > b for a, b in pairwise(times)):
         raise BadInput("no_time", "the frames are not in the order of their times")
     if at_rest:
         rest = positions_at_rest(frames, terrain, shared)
@@ -130,9 +131,7 @@ def filter_positions(
     return np.array(position), np.array(covariance)
 
 
-def odometry_steps(
-    frames: Sequence[ObservedFrame], odometry: Odometry | None, sigma_1: float, floor_m: float
-) -> Steps:
+def odometry_steps(frames: Sequence[ObservedFrame], odometry: Odometry | None, sigma_1: float, floor_m: float) -> Steps:
     """Moves between frames in enu, turned by the attitude that the stars show.
 
     Frames without an attitude of their own take the last one before them, and the odometry's turns since. Moves before
@@ -142,12 +141,12 @@ def odometry_steps(
     if odometry is None:
         return steps
     time_s = np.array([frame.time_utc.astimezone(UTC).timestamp() for frame in frames])
-    move, sigma, anchor = steps.move_m.copy(), steps.sigma_m.copy(), -1
+    move, sigma, anchor, R = steps.move_m.copy(), steps.sigma_m.copy(), -1, None
     for k in range(len(frames) - 1):
-        anchor = k if frames[k].R_body_enu is not None else anchor
-        if anchor < 0:
+        if frames[k].R_body_enu is not None:
+            anchor, R = k, frames[k].R_body_enu
+        if R is None:
             continue
-        R = frames[anchor].R_body_enu
         at = np.unique([anchor, k, k + 1])
         # From the anchor to either frame, in the axes of the anchor's body.
         ends = [odometry.increments_body_m(time_s[[anchor, end]])[0] for end in at[1:]]

@@ -9,7 +9,7 @@ import numpy as np
 
 from startrack.terrain import Terrain
 from startrack.tracking.contradictions import RobustTrack, smooth_robustly
-from startrack.tracking.frame_estimate import FrameEstimate, estimate_frame
+from startrack.tracking.frame_estimate import FrameEstimate, ImageErrors, estimate_frame
 from startrack.tracking.observe import ObservedFrame
 from startrack.tracking.shared import SharedErrors
 from startrack.tracking.smoother import UNKNOWN_M, Observations, Smoothed, Steps, smooth
@@ -35,18 +35,17 @@ def positions_at_rest(frames: Sequence[ObservedFrame], terrain: Terrain, shared:
     posts) are carried once. Raises ValueError where no exposure has a position.
     """
     n = len(frames)
-    robust = agreeing_fixes([frame.modes for frame in frames], terrain.height_sigma_m)
+    mode = agreeing_fixes([frame.modes for frame in frames], terrain.height_sigma_m).mode
     position, covariance = np.zeros((n, 2)), np.repeat([UNKNOWN_M**2 * np.eye(2)], n, axis=0)
-    found = None
-    rows: list[Evidence] = []
-    for k, frame in enumerate(frames):
-        if robust.mode[k] >= 0 and frame.evidence is not None:
-            rows.append(frame.evidence)
-            found = _pooled(rows, frame.modes[robust.mode[k]], found, terrain, shared)
-        if found is not None:
-            position[k], covariance[k] = found.position_m[0], found.covariance_m2[0]
-    assert found is not None  # an exposure agrees with itself
-    return AtRest(position, covariance, found, robust.mode)
+    first, *later = np.flatnonzero(mode >= 0).tolist()
+    found = _alone(frames[first].modes[mode[first]], terrain)
+    position[first:], covariance[first:] = found.position_m[0], found.covariance_m2[0]
+    used = [frames[first]]
+    for k in later:
+        used.append(frames[k])
+        found = _alone(_pooled(used, *_combine(frames[k].modes[mode[k]], found), terrain, shared), terrain)
+        position[k:], covariance[k:] = found.position_m[0], found.covariance_m2[0]
+    return AtRest(position, covariance, found, mode)
 
 
 def agreeing_fixes(modes: Sequence[Sequence[FrameEstimate]], height_sigma_m: float) -> RobustTrack:
@@ -55,15 +54,25 @@ def agreeing_fixes(modes: Sequence[Sequence[FrameEstimate]], height_sigma_m: flo
     return smooth_robustly(modes, still, height_sigma_m)
 
 
-def _pooled(
-    rows: list[Evidence], newest: FrameEstimate, before: Smoothed | None, terrain: Terrain, shared: SharedErrors
-) -> Smoothed:
-    """The position by all rows together; the search begins at the position before, combined with the newest fix."""
-    if len(rows) == 1 or before is None:
-        estimate = newest
-    else:
-        estimate = estimate_frame(Evidence.concatenate(*rows), terrain, shared, *_combine(newest, before))
+def _alone(estimate: FrameEstimate, terrain: Terrain) -> Smoothed:
     return smooth(Observations.of([estimate], terrain.height_sigma_m), Steps.unknown(1))
+
+
+def _pooled(
+    frames: list[ObservedFrame], first_mean: Array, first_covariance: Array, terrain: Terrain, shared: SharedErrors
+) -> FrameEstimate:
+    """The observation by the rows of all exposures together."""
+    rows = Evidence.concatenate(*(frame.evidence for frame in frames if frame.evidence is not None))
+    errors = mean_image_errors([frame.image_errors for frame in frames if frame.image_errors is not None])
+    return estimate_frame(rows, terrain, shared, first_mean, first_covariance, errors)
+
+
+def mean_image_errors(errors: Sequence[ImageErrors]) -> ImageErrors | None:
+    """Errors of the mean of several exposures, each with its own: None where none has any."""
+    if not errors:
+        return None
+    covariance = np.sum([one.covariance for one in errors], axis=0) / len(errors) ** 2
+    return ImageErrors(errors[0].pattern, covariance)
 
 
 def _combine(newest: FrameEstimate, before: Smoothed) -> tuple[Array, Array]:

@@ -28,6 +28,7 @@ class ObservedFrame:
     R_body_enu: Array | None  # (3, 3) from enu; None: no attitude
     modes: tuple[FrameEstimate, ...]  # of the position; empty: refused
     evidence: Evidence | None  # rows near the skyline, above the map's horizon; None: refused
+    image_errors: ImageErrors | None = None  # of the rows of the sky's light
     reason: str = ""  # of a refusal
     message: str = ""
 
@@ -46,13 +47,14 @@ def observe_frame(outcome: Outcome, shared: SharedErrors | None = None) -> Obser
     if isinstance(outcome, Refused) or not isinstance(value, Located):
         reason = str(outcome.reason) if isinstance(outcome, Refused) else ""
         message = outcome.message if isinstance(outcome, Refused) else ""
-        return ObservedFrame(outcome.exposure.name, when, R, (), None, reason, message)
+        return ObservedFrame(outcome.exposure.name, when, R, (), None, None, reason, message)
     if value.fix.search == "approximate":
         raise ValueError(f"{outcome.exposure.name}: a track needs the localizer posterior")
     shared = shared or SharedErrors.of(value.terrain, value.clock)
     rows, errors = located_evidence(value)
     estimates = tuple(_mode_estimates(value, rows, shared, errors))
-    return ObservedFrame(outcome.exposure.name, when, R, estimates, rows_near(rows, value.terrain, estimates))
+    near = rows_near(rows, value.terrain, estimates)
+    return ObservedFrame(outcome.exposure.name, when, R, estimates, near, errors)
 
 
 def located_evidence(located: Located) -> tuple[Evidence, ImageErrors | None]:

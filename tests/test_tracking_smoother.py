@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from tracking_helpers import HEIGHT_SIGMA_M, STEP_SIGMA_M, Drive, mean_nees, shifted, simulate_drive, with_slips
 
+from startrack.tracking import filter as tracking_filter
 from startrack.tracking.contradictions import smooth_robustly
 from startrack.tracking.filter import TrackFilter
 from startrack.tracking.online import OnlineTrack
@@ -67,6 +68,22 @@ def test_the_filter_is_the_smoother_of_the_frames_so_far():
         batch = smooth(Observations.of(drive.estimates[: k + 1], HEIGHT_SIGMA_M), steps)
         np.testing.assert_allclose(state.position_m, batch.position_m[-1], atol=1e-4)
         np.testing.assert_allclose(state.covariance_m2, batch.covariance_m2[-1], atol=1e-4)
+
+
+def test_the_filter_forgets_posts_without_a_jump(monkeypatch):
+    drive = simulate_drive(np.random.default_rng(12), 30)
+    modes = [(e,) for e in drive.estimates]
+    whole, covariance = filter_positions(modes, drive.steps, 1, HEIGHT_SIGMA_M)
+    monkeypatch.setattr(tracking_filter, "MOST_POSTS", 24)
+    monkeypatch.setattr(tracking_filter, "KEPT_POSTS", 12)  # a frame depends on 8, of which the next has 6
+    state = TrackFilter(1, HEIGHT_SIGMA_M)
+    for k, estimate in enumerate(drive.estimates):
+        if k:
+            state.predict(drive.steps.move_m[k - 1], STEP_SIGMA_M)
+        state.update(estimate)
+        assert len(state.mean) <= 3 + 24
+        np.testing.assert_allclose(state.position_m, whole[k], atol=1e-4)
+        np.testing.assert_allclose(state.covariance_m2, covariance[k], atol=1e-4)
 
 
 def test_predictions_by_the_others_are_those_without_the_frame_or_the_move():

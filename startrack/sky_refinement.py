@@ -161,7 +161,13 @@ def _refine(located: Located, stars: bool) -> Located:
         refined = replace(refined, search="beam", dropped_probability=1.0)
     at_time = replace(there.fix_at_time, position_enu_m=camera_at(position, terrain)) if by_arc else there.fix_at_time
     return replace(
-        there, fix=refined, fix_at_time=at_time, sky_light=sky, skyline_fit=fit, integrity=integrity, by_stars=stars,
+        there,
+        fix=refined,
+        fix_at_time=at_time,
+        sky_light=sky,
+        skyline_fit=fit,
+        integrity=integrity,
+        by_stars=stars,
         sky_variance_factor=excess,
     )
 

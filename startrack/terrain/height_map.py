@@ -22,7 +22,7 @@ from startrack.terrain.protocol import Progress, Terrain
 from startrack.terrain.pyramid import Ground, ground_up_m, pack_maps
 from startrack.terrain.raster import Raster
 from startrack.terrain.table_building import load_or_build_table
-from startrack.types import Array, BadInput, Bools
+from startrack.types import Array, BadInput, Bools, Ints
 
 FINEST_BOX_M = 0.45  # half side of the smallest boxes of positions: no height map is more accurate
 CELL_M = 200.0  # cells of the table are no wider

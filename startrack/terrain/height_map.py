@@ -237,7 +237,7 @@ class HeightMap(Terrain):
         )
 
     def horizon_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
-        """The posts about the crests; see `Terrain`."""
+        """The posts about the crests seen from `point_m`; see `Terrain`."""
         tan, distance, _ = self.horizons(point_m, azimuths_rad)
         away = distance[:, None] * np.stack([np.sin(azimuths_rad), np.cos(azimuths_rad)], axis=1)
         up = float(self.ground_m(point_m)) + self.camera_height_m + tan * distance
@@ -245,7 +245,7 @@ class HeightMap(Terrain):
         return HorizonPosts(post, weight / ((1.0 + tan * tan) * distance)[:, None])
 
     def ground_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
-        """The posts about the camera; see `Terrain`."""
+        """The posts about a camera at `point_m`; see `Terrain`."""
         tan, distance, _ = self.horizons(point_m, azimuths_rad)
         post, weight = cell_posts(self.site, self.maps, np.append(point_m, self.ground_m(point_m))[None])
         return HorizonPosts(

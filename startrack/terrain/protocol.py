@@ -127,11 +127,11 @@ class Terrain(ABC):
         ]
 
     def horizon_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
-        """The posts of the map that make the horizon seen from a point (2,), at the azimuths (n,)."""
+        """The posts of the map that make the horizon seen from `point_m` (2,), at the azimuths (n,)."""
         return HorizonPosts.create_empty(len(azimuths_rad))
 
     def ground_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
-        """As `horizon_posts`, of the ground that the camera stands on: the horizon sinks as it rises."""
+        """As `horizon_posts`, of the ground below a camera at `point_m`: the horizon sinks as it rises."""
         return HorizonPosts.create_empty(len(azimuths_rad))
 
     def post_positions_m(self, posts: Ints) -> Array:

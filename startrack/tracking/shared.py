@@ -33,7 +33,7 @@ class SharedErrors:
         return cls(tuple(known), np.array(list(known.values())), turn)
 
     def shape_axis(self, name: str) -> int:
-        """Which of the two numbers of `Terrain.reshaped` an error is."""
+        """Which of the two numbers of `Terrain.reshaped` the error `name` is."""
         return SHAPES.index(name)
 
     def taken(self, evidence: Evidence) -> Array:
@@ -43,7 +43,7 @@ class SharedErrors:
         return np.array([offset_s if name == CLOCK else 0.0 for name in self.names]) / self.sigma
 
     def reach_rad(self, evidence: Evidence) -> float:
-        """About the change of elevations above the horizon with one standard deviation of all errors."""
+        """About the change of elevations above the horizon, in `evidence`, with one standard deviation of all errors."""
         reach = 0.0
         for name, sigma in zip(self.names, self.sigma, strict=True):
             if name == BIAS:

@@ -43,7 +43,7 @@ class SharedErrors:
         return np.array([offset_s if name == CLOCK else 0.0 for name in self.names]) / self.sigma
 
     def reach_rad(self, evidence: Evidence) -> float:
-        """About the change of elevations above the horizon, in `evidence`, with one standard deviation of all errors."""
+        """About the change of the heights in `evidence` above the horizon with one standard deviation of all errors."""
         reach = 0.0
         for name, sigma in zip(self.names, self.sigma, strict=True):
             if name == BIAS:

@@ -33,7 +33,9 @@ LAYERS = (  # lowest first; a package imports from lower layers only
     {"pipeline", "calibration", "inputs", "simulation"},
     {"output"},
     {"solution", "horizon"},
-    {"reproduction", "batch", "tracking", "api"},
+    {"reproduction", "batch"},
+    {"tracking"},
+    {"api"},
     {"cli"},
 )
 ALLOWED: set[tuple[str, str]] = set()  # exceptions: (package, package of the same or a higher layer)

@@ -72,7 +72,7 @@ def mean_image_errors(errors: Sequence[ImageErrors]) -> ImageErrors | None:
     if not errors:
         return None
     covariance = np.sum([one.covariance for one in errors], axis=0) / len(errors) ** 2
-    return ImageErrors(errors[0].pattern, covariance)
+    return ImageErrors(errors[0].raised_rad, covariance)
 
 
 def _combine(newest: FrameEstimate, before: Smoothed) -> tuple[Array, Array]:

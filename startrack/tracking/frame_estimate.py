@@ -32,8 +32,13 @@ ROUNDING = 1e-9  # of the covariance, added to the noise so that it can be inver
 class ImageErrors:
     """Errors of attitude and lens: they raise the skyline of the sky's light, not that of the stars."""
 
-    pattern: Callable[[Array], Array]  # azimuths (n,) to rises (n, j) [rad] by one unit of each
+    raised_rad: Array  # (sectors, j) of equal width from north on, by one unit of each
     covariance: Array  # (j, j)
+
+    def at(self, azimuth_rad: Array) -> Array:
+        """Rises (n, j) [rad] at azimuths (n,), by one unit of each."""
+        sector = (azimuth_rad / (2 * np.pi) * len(self.raised_rad)).astype(np.int64) % len(self.raised_rad)
+        return np.asarray(self.raised_rad[sector])
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +131,7 @@ def _observation(likelihood: SkylineLikelihood, samples: Samples, image_errors: 
     counted = (by_horizon * np.square(likelihood.map_sigma_rad)) @ by_horizon.T
     noise = clipped_noise(by_evidence - counted, by_evidence) + ROUNDING * covariance
     if image_errors is not None:
-        by_image = by_horizon @ (image_errors.pattern(likelihood.azimuth_rad) * likelihood.is_sky[:, None])
+        by_image = by_horizon @ (image_errors.at(likelihood.azimuth_rad) * likelihood.is_sky[:, None])
         noise += by_image @ image_errors.covariance @ by_image.T
     post, by_post = _posts(likelihood, by_horizon, covariance)
     shared_by_posts = likelihood.local.terrain.height_sigma_m**2 * by_post @ by_post.T

@@ -65,13 +65,8 @@ def located_evidence(located: Located) -> tuple[Evidence, ImageErrors | None]:
     image = ~fit.errors.of_terrain
     raised_px = fit.errors.raised_px[:, image] @ fit.errors.mean[image]
     light = sky.evidence(fit.used, raised_px, located.sky_variance_factor)
-    columns = fit.errors.raised_px[:, image] / sky.px_per_rad[:, None]
-
-    def pattern(azimuth_rad: Array) -> Array:
-        sector = (azimuth_rad / (2 * np.pi) * len(columns)).astype(np.int64) % len(columns)
-        return np.asarray(columns[sector])
-
-    errors = ImageErrors(pattern, fit.errors.covariance[:OFFSET_TERMS, :OFFSET_TERMS])
+    raised_rad = fit.errors.raised_px[:, image] / sky.px_per_rad[:, None]
+    errors = ImageErrors(raised_rad, fit.errors.covariance[:OFFSET_TERMS, :OFFSET_TERMS])
     if not located.by_stars:
         return replace(light, clock=stars.clock), errors
     return Evidence.concatenate(stars, light), errors

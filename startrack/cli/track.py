@@ -1,0 +1,269 @@
+"""`startrack track`: the images of a drive, or of a rover at rest, to a trajectory."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from startrack.cli.common import EVIDENCE_SOURCES, add_fact_flags, add_output_flags, flag_facts
+from startrack.cli.flag_types import amount, seconds
+from startrack.cli.preparation import prepare_reference
+from startrack.cli.progress import progress
+from startrack.errors import BadInput, exit_code_of
+
+if TYPE_CHECKING:
+    from startrack.tracking import ObservedFrame, Odometry, Track
+    from startrack.tracking.session import TrackSession
+    from startrack.types import Exposure
+
+Source = tuple[str, "Callable[[], ObservedFrame]"]  # of one image: its name, and what adds it to the track
+STORE = ".frames"  # in OUT
+REWRITE_FACTOR = 5.0  # of the time that the files of a growing track took: so long they are not written again
+BAGS = (".bag", ".db3", ".mcap")
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add `track` to the commands of the `startrack` parser."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "track",
+        help="images of a drive or of a rover at rest to a trajectory",
+        description="Locate the images of one camera and estimate its trajectory from all of them, with the errors "
+        "that they share. Writes track.tum (by all images), track.filtered.tum (by the images up to each), track.ecsv, "
+        "track.geojson, track.json, track.crests.ecsv, track.png and track.html.",
+    )
+    parser.add_argument("frames", nargs="+", metavar="FRAMES", help="images, one folder, or one ROS bag")
+    add_fact_flags(parser)
+    parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file, or the name of a shipped one")
+    parser.add_argument("--evidence", default=EVIDENCE_SOURCES[0], choices=EVIDENCE_SOURCES, help="as of locate")
+    _add_motion(parser.add_argument_group("motion between the images (without: each is alone but for shared errors)"))
+    _add_live(parser.add_argument_group("live"))
+    add_output_flags(parser)
+    parser.set_defaults(run=run, usage_error=parser.error)
+
+
+def _add_motion(group: Any) -> None:
+    group.add_argument("--odometry", metavar="FILE", help="TUM text, or a ROS bag")
+    group.add_argument("--odometry-topic", metavar="TOPIC", help="of a bag with several")
+    group.add_argument("--odometry-sigma", type=amount, default=0.02, metavar="F", help="of a move, relative (0.02)")
+    group.add_argument("--odometry-floor", type=amount, default=0.05, metavar="M", help="of a move, beside that (0.05)")
+    group.add_argument("--at-rest", action="store_true", help="the camera did not move")
+    group.add_argument("--image-topic", metavar="TOPIC", help="of a bag with several")
+
+
+def _add_live(group: Any) -> None:
+    group.add_argument("--follow", action="store_true", help="take images as they are written into the folder FRAMES")
+    group.add_argument("--until-idle", type=seconds, metavar="S", help="end after S seconds without an image")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Estimate and write the track; the exit code of its worst image."""
+    _check_flags(args)
+    from startrack.pipeline import Settings
+    from startrack.tracking.frame_store import FrameStore
+    from startrack.tracking.session import TrackSession
+
+    _check_folder(args)
+    session = TrackSession(
+        store=FrameStore(Path(args.dir) / STORE), settings=Settings(evidence_sources=args.evidence),
+        facts=flag_facts(args),
+    )  # fmt: skip
+    run_of = _Run(args, session)
+    if args.follow:
+        run_of.follow()
+    else:
+        run_of.take_all()
+    return next((code for code in (1, 4, 3) if code in run_of.codes), 0)
+
+
+def _check_flags(args: argparse.Namespace) -> None:
+    if args.odometry is not None and args.at_rest:
+        args.usage_error("--odometry is for a rover that moves, --at-rest for one that does not: give one of them")
+    if args.time is not None:
+        args.usage_error("--time is that of one image: the images of a track have their times in sidecars or headers")
+    if args.follow and (len(args.frames) != 1 or not Path(args.frames[0]).is_dir()):
+        args.usage_error("--follow takes one folder")
+    if args.until_idle is not None and not args.follow:
+        args.usage_error("--until-idle is for --follow")
+
+
+def _check_folder(args: argparse.Namespace) -> None:
+    """Make the folder of the results. Raises BadOutput where it holds the track of other images, and not -O."""
+    from startrack.errors import BadOutput
+    from startrack.files import make_folder
+
+    out = Path(args.dir)
+    make_folder(out)
+    if not args.overwrite and (out / "track.json").exists() and not (out / STORE).is_dir():
+        raise BadOutput(
+            "bad_image", f"{out} holds a track that this command did not write: choose another -D, or give -O"
+        )
+
+
+class _Run:
+    """One run of the command: what it prints and writes."""
+
+    def __init__(self, args: argparse.Namespace, session: TrackSession) -> None:
+        self.args, self.session = args, session
+        self.codes: set[int] = {0}
+        self._next_write = 0.0
+
+    def take_all(self) -> None:
+        """Locate all images, then estimate and write the track."""
+        paths = self._paths()
+        with progress("track", len(paths or ()), shown=paths is not None and not self.args.quiet) as bar:
+            for name, add in self._exposures_of_bag() if paths is None else self._images(paths):
+                try:
+                    self._note(add())
+                except BadInput as cause:
+                    self._refuse(name, cause)
+                bar.advance()
+        track = self._estimate()
+        self._write(track)
+        self._print_frames(track)
+        self._print_summary(track)
+
+    def follow(self) -> None:
+        """Take images as they come; Ctrl-C and SIGTERM end it."""
+        import signal
+
+        from startrack.tracking.follow import follow_images
+
+        former = signal.signal(signal.SIGTERM, signal.default_int_handler)
+        try:
+            with suppress(KeyboardInterrupt):
+                for _ in follow_images(
+                    self.args.frames[0], self.args.dir, lambda image: self._note(self._add(image.path)),
+                    lambda image, cause: self._refuse(image.name, cause), until_idle_s=self.args.until_idle,
+                ):  # fmt: skip
+                    self._update()
+        finally:
+            signal.signal(signal.SIGTERM, former)
+        track = self._estimate(growing=True)
+        self._write(track)
+        self._print_summary(track)
+
+    def _update(self) -> None:
+        """The growing track after new images: one line, and the files unless they were just written."""
+        from startrack.tracking.quantities import frame_records
+
+        try:
+            track = self._estimate(growing=True)
+        except BadInput as cause:  # no position yet, or no odometry for the first images
+            print(f"waiting: {cause}", file=sys.stderr, flush=True)
+            return
+        record = frame_records(track)[-1]
+        if self.args.json:
+            print(json.dumps(record), flush=True)
+        elif not self.args.quiet:
+            print(_line(record, "filtered_"), flush=True)
+        if time.monotonic() >= self._next_write:
+            start = time.monotonic()
+            self._write(track, pictures=False)
+            self._next_write = time.monotonic() + REWRITE_FACTOR * (time.monotonic() - start)
+
+    def _paths(self) -> list[str] | None:
+        """The image files; None for a bag."""
+        from startrack.batch.find import images_under
+
+        first = Path(self.args.frames[0])
+        if len(self.args.frames) == 1 and (first.suffix.lower() in BAGS or (first / "metadata.yaml").is_file()):
+            return None
+        paths = [one.path for one in images_under(first, self.args.dir)] if first.is_dir() else self.args.frames
+        if not paths:
+            raise BadInput("bad_image", f"{first}: no images in this folder")
+        return list(paths)
+
+    def _images(self, paths: list[str]) -> Iterator[Source]:
+        yield from ((Path(path).name, partial(self._add, path)) for path in paths)
+
+    def _exposures_of_bag(self) -> Iterator[Source]:
+        from startrack.tracking import read_bag_exposures
+
+        for exposure in read_bag_exposures(self.args.frames[0], self.args.image_topic, **self.session.facts):
+            yield exposure.name, partial(self._add_exposure, exposure)
+
+    def _add(self, path: str) -> ObservedFrame:
+        from startrack.exposure import read_exposure
+
+        return self._add_exposure(read_exposure(path, **self.session.facts), path)
+
+    def _add_exposure(self, exposure: Exposure, path: str | None = None) -> ObservedFrame:
+        if self.session.terrain is None:
+            prepare_reference(exposure.terrain, self.args)
+        return self.session.add_exposure(exposure, path)
+
+    def _note(self, frame: ObservedFrame) -> None:
+        if not frame.modes:
+            self.codes.add(3)
+
+    def _refuse(self, name: str, cause: BadInput) -> None:
+        self.codes.add(exit_code_of(cause.reason))
+        print(f"{name}  refused  {cause.reason}: {cause}", file=sys.stderr, flush=True)
+
+    def _estimate(self, growing: bool = False) -> Track:
+        args = self.args
+        return self.session.estimate(
+            self._odometry(), odometry_sigma=args.odometry_sigma, odometry_floor_m=args.odometry_floor,
+            at_rest=args.at_rest, covered_only=growing,
+        )  # fmt: skip
+
+    def _odometry(self) -> Odometry | None:
+        from startrack.tracking import read_odometry
+
+        if self.args.odometry is None:
+            return None
+        return read_odometry(self.args.odometry, self.args.odometry_topic)
+
+    def _write(self, track: Track, pictures: bool = True) -> None:
+        from startrack.tracking.write import write_track
+
+        args, odometry = self.args, None
+        if args.odometry is not None:
+            odometry = {"file": Path(args.odometry).name, "sigma": args.odometry_sigma, "floor_m": args.odometry_floor}
+        made = self._pictures(track) if pictures and not args.no_plots else {}
+        write_track(track, Path(args.dir), odometry=odometry, pictures=made)
+
+    def _pictures(self, track: Track) -> dict[str, bytes]:
+        return {}
+
+    def _print_frames(self, track: Track) -> None:
+        from startrack.tracking.quantities import frame_records
+
+        for record in frame_records(track):
+            if record["status"] != "used":
+                self.codes.add(3)
+            if self.args.json:
+                print(json.dumps(record))
+            elif not self.args.quiet:
+                print(_line(record, ""))
+
+    def _print_summary(self, track: Track) -> None:
+        from startrack.tracking.write import track_record
+
+        if self.args.quiet or self.args.json:
+            return
+        counts = track_record(track)["counts"]
+        print(
+            f"{counts['frames']} frames: {counts['used']} used, {counts['left_out']} left out, {counts['refused']} "
+            f"refused; {counts['slips']} slips of the odometry; files in {self.args.dir}/track.*"
+        )
+
+
+def _line(record: dict[str, Any], prefix: str) -> str:
+    """One line about a frame."""
+    radius = record[f"{prefix}radius95_m"]
+    if record[f"{prefix}east_m"] is None or radius is None:
+        place = "no position"
+    else:
+        place = f"E {record[f'{prefix}east_m']:.1f} m  N {record[f'{prefix}north_m']:.1f} m  ±{radius:.1f} m (95 %)"
+    status = record["status"].replace("_", " ")
+    why = f"  {record['reason']}: {record['message']}" if record["reason"] else ""
+    slip = "  after a slip" if record["slipped"] else ""
+    return f"{record['image']}  {status}  {place}{slip}{why}"

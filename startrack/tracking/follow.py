@@ -1,0 +1,58 @@
+"""Images as they are written into a folder: each once, when its file is complete."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from startrack.batch.find import Image, images_under
+from startrack.errors import BadInput
+
+POLL_S = 0.1
+STILL_S = 0.2  # since the last change of a file, after which it is complete
+PATIENCE_S = 5.0  # for a file that cannot be read, or whose sidecar is missing
+
+
+def follow_images(
+    folder: str | os.PathLike[str],
+    excluded: str | os.PathLike[str],
+    take: Callable[[Image], None],
+    refuse: Callable[[Image, BadInput], None],
+    *,
+    until_idle_s: float | None,
+) -> Iterator[None]:
+    """Give each image of a `folder` to `take`, and yield after those that came together.
+
+    Ends when no image came for `until_idle_s` (None: never). An image that `take` refuses with BadInput is tried again
+    for some seconds, since its sidecar may be missing; then `refuse` gets it. The folder `excluded` is left out.
+    """
+    done: set[str] = set()
+    first_try: dict[str, float] = {}
+    idle_since = time.monotonic()
+    while until_idle_s is None or time.monotonic() - idle_since < until_idle_s:
+        taken = 0
+        for image in images_under(folder, excluded):
+            if image.path in done or not _is_still(image.path):
+                continue
+            idle_since = time.monotonic()
+            try:
+                take(image)
+            except BadInput as cause:
+                if time.monotonic() - first_try.setdefault(image.path, time.monotonic()) < PATIENCE_S:
+                    continue
+                refuse(image, cause)
+            done.add(image.path)
+            taken += 1
+            idle_since = time.monotonic()
+        if taken:
+            yield
+        time.sleep(POLL_S)
+
+
+def _is_still(path: str) -> bool:
+    try:
+        return time.time() - Path(path).stat().st_mtime > STILL_S
+    except OSError:  # removed since it was listed
+        return False

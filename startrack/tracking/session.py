@@ -1,0 +1,119 @@
+"""The images of one track: each is located once, reduced to what the track needs of it, and kept in a folder."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import UTC
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from startrack.batch.fingerprint import input_hashes, job_sha256
+from startrack.errors import BadInput
+from startrack.localization import clock_at
+from startrack.pipeline import NO_TIME, locate_exposure
+from startrack.stages import Settings
+from startrack.tracking.frame_store import FrameStore
+from startrack.tracking.observe import ObservedFrame, observe_frame
+from startrack.tracking.odometry import SPAN_TOLERANCE_S, Odometry
+from startrack.tracking.shared import SharedErrors
+from startrack.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA, Track, estimate_track
+
+if TYPE_CHECKING:
+    from startrack.terrain import Terrain
+    from startrack.types import Exposure
+
+
+@dataclass
+class TrackSession:
+    """A track that grows image by image. The terrain is that of its first image, and all images must have it."""
+
+    store: FrameStore | None = None  # None: frames are kept in memory alone
+    settings: Settings = field(default_factory=Settings)
+    facts: dict[str, Any] = field(default_factory=dict)  # from flags, by the parameters of `read_exposure`
+    frames: list[ObservedFrame] = field(default_factory=list)  # in the order of time
+    terrain: Terrain | None = None
+    shared: SharedErrors | None = None
+    _reference: str | None = None  # of the terrain
+
+    def add(self, path: str | Path) -> ObservedFrame:
+        """The frame of the image file at `path`, located unless the store has it.
+
+        Raises BadInput where the image, its time, camera or terrain cannot be used, or the terrain is another one.
+        """
+        from startrack.exposure import read_exposure
+
+        return self.add_exposure(read_exposure(path, **self.facts), str(path))
+
+    def add_exposure(self, exposure: Exposure, path: str | None = None) -> ObservedFrame:
+        """The frame of an `exposure`; `path` (None: not from a file) is that of its file. Raises as `add`."""
+        if exposure.time_utc is None:
+            raise BadInput("no_time", "; ".join([NO_TIME, *exposure.warnings]))
+        shared = self._shared_errors(exposure)
+        key = None if self.store is None else self._key(exposure, path, shared)
+        frame = None if self.store is None or key is None else self.store.read(key)
+        if frame is None:
+            frame = observe_frame(locate_exposure(exposure, self.settings), shared)
+            if self.store is not None and key is not None:
+                self.store.write(key, frame)
+        self.frames.append(frame)
+        self.frames.sort(key=lambda one: (one.time_utc, one.name))
+        return frame
+
+    def estimate(
+        self,
+        odometry: Odometry | None = None,
+        *,
+        odometry_sigma: float = ODOMETRY_SIGMA,
+        odometry_floor_m: float = ODOMETRY_FLOOR_M,
+        at_rest: bool = False,
+        covered_only: bool = False,
+    ) -> Track:
+        """The track of the frames so far; arguments as in `estimate_track`.
+
+        With `covered_only`, frames after the last pose of the odometry wait for it. Raises BadInput where there is no
+        frame, or none has a position, and as `estimate_track`.
+        """
+        frames: Sequence[ObservedFrame] = self.frames
+        if covered_only and odometry is not None:
+            last_s = float(odometry.time_s[-1]) + SPAN_TOLERANCE_S
+            frames = [one for one in frames if one.time_utc.astimezone(UTC).timestamp() <= last_s]
+        if self.terrain is None or self.shared is None or not frames:
+            raise BadInput("bad_image", "no image of the track could be read")
+        return estimate_track(
+            frames, self.terrain, self.shared, odometry=odometry, odometry_sigma=odometry_sigma,
+            odometry_floor_m=odometry_floor_m, at_rest=at_rest,
+        )  # fmt: skip
+
+    def _shared_errors(self, exposure: Exposure) -> SharedErrors:
+        """The errors that all frames share, from the first of them."""
+        from startrack.terrain import load_terrain
+
+        if exposure.terrain is None:
+            raise BadInput("bad_terrain", "no terrain file is known: give -t FILE or a sidecar with terrain")
+        if self.terrain is None or self.shared is None:
+            terrain = load_terrain(exposure.terrain)
+            if terrain.site is None:
+                raise BadInput("bad_terrain", f"terrain {terrain.name} has no site")
+            clock = clock_at(terrain.site, exposure.time_utc, exposure.time_sigma_s)  # type: ignore[arg-type]
+            self.terrain, self.shared = terrain, SharedErrors.of(terrain, clock)
+            self._reference = exposure.terrain
+        if exposure.terrain != self._reference:
+            raise BadInput(
+                "bad_terrain",
+                f"{exposure.name} is on the terrain {exposure.terrain}, the track on {self._reference}",
+            )
+        return self.shared
+
+    def _key(self, exposure: Exposure, path: str | None, shared: SharedErrors) -> str | None:
+        """Hash of all that decides a frame; None for an image that is not from a file."""
+        if path is None:
+            return None
+        mask = exposure.mask if isinstance(exposure.mask, str) else None
+        files = input_hashes(path, [exposure.camera, exposure.terrain, mask])
+        errors = [shared.names, shared.sigma.tolist(), shared.turn_rad_s.tolist()]
+        job = job_sha256(
+            path, exposure.sha256, self.facts, self.settings.evidence_sources, sorted(files.items()), errors
+        )
+        return hashlib.sha256(f"{exposure.name} {job}".encode()).hexdigest()[:32]

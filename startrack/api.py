@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,6 +36,8 @@ from startrack.rendering import render as render_scene
 from startrack.solution import Solution
 from startrack.stages import Outcome, Refused, Settings
 from startrack.terrain import Terrain
+from startrack.tracking import Odometry, SharedErrors, Track, estimate_track, observe_frame, read_odometry
+from startrack.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.types import Exposure, MeasuredSkyline
 
 if TYPE_CHECKING:
@@ -44,7 +46,7 @@ if TYPE_CHECKING:
 
     from startrack.identification import IdentifiedCentroids
 
-__all__ = ["calibrate", "detect", "identify", "locate", "measure_horizon", "render"]
+__all__ = ["calibrate", "detect", "identify", "locate", "measure_horizon", "render", "track"]
 
 TIME_FLAG, TIME_ARGUMENT = "--time UTC", "time="  # messages of the stages name the flags of the commands
 
@@ -82,6 +84,52 @@ def locate(
     exposure = exposure_input(image, time, time_sigma)
     known = camera_input(camera, exposure), terrain_input(terrain, exposure)
     return _solution(pipeline.locate(exposure, *known, load_catalog(), settings), "fix")
+
+
+def track(
+    images: Iterable[Image],
+    *,
+    camera: str | Camera | None = None,
+    terrain: str | Terrain | None = None,
+    odometry: str | Odometry | None = None,
+    odometry_sigma: float = ODOMETRY_SIGMA,
+    odometry_floor_m: float = ODOMETRY_FLOOR_M,
+    at_rest: bool = False,
+    settings: Settings | None = None,
+) -> Track:
+    """The trajectory of a camera from many images, with the errors that they share.
+
+    Args:
+        images: as for `locate`, in any order; they are read one by one.
+        camera: as for `locate`.
+        terrain: as for `locate`; one for all images.
+        odometry: a file (TUM text or a ROS bag), or the object. None: the moves between the images are not known.
+        odometry_sigma: standard deviation of a move on each horizontal axis, relative to its length.
+        odometry_floor_m: the same, beside that.
+        at_rest: the camera did not move.
+        settings: stages to use instead of the usual ones.
+
+    Returns:
+        The track: `frames`, and the trajectories `smoothed` (by all images) and `filtered` (by those up to each).
+
+    Raises:
+        BadInput: as `locate`; bad_odometry; bad_image without images.
+        ValueError: no image has a single position.
+    """
+    settings, frames, shared, ground = settings_input(settings), [], None, None
+    for image in images:
+        exposure = exposure_input(image, None)
+        known_camera, ground = camera_input(camera, exposure), ground or terrain_input(terrain, exposure)
+        shared = shared or SharedErrors.of_exposure(ground, exposure)
+        frames.append(observe_frame(pipeline.locate(exposure, known_camera, ground, load_catalog(), settings), shared))
+    if shared is None or ground is None:
+        raise BadInput("bad_image", "there are no images")
+    frames.sort(key=lambda frame: frame.time_utc)
+    moves = odometry if odometry is None or isinstance(odometry, Odometry) else read_odometry(odometry)
+    return estimate_track(
+        frames, ground, shared, odometry=moves, odometry_sigma=odometry_sigma, odometry_floor_m=odometry_floor_m,
+        at_rest=at_rest,
+    )  # fmt: skip
 
 
 def identify(

@@ -21,11 +21,13 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print a schema; 0, or a usage error for an unknown kind."""
     from startrack.output.schema import SCHEMAS
+    from startrack.tracking.schema import TRACK
 
+    schemas = {**SCHEMAS, "track": TRACK}
     if args.name is None:
-        print("\n".join(SCHEMAS))
-    elif args.name in SCHEMAS:
-        print(json.dumps(SCHEMAS[args.name], indent=2))
+        print("\n".join(schemas))
+    elif args.name in schemas:
+        print(json.dumps(schemas[args.name], indent=2))
     else:
-        args.usage_error(f"no schema is called {args.name!r}; there are: {', '.join(SCHEMAS)}")
+        args.usage_error(f"no schema is called {args.name!r}; there are: {', '.join(schemas)}")
     return 0

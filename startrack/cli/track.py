@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 Source = tuple[str, "Callable[[], ObservedFrame]"]  # of one image: its name, and what adds it to the track
 STORE = ".frames"  # in OUT
-REWRITE_FACTOR = 5.0  # of the time that the files of a growing track took: so long they are not written again
+QUICK_S = 0.2  # files that take longer are written when no image waits
 BAGS = (".bag", ".db3", ".mcap")
 
 
@@ -112,7 +112,7 @@ class _Run:
     def __init__(self, args: argparse.Namespace, session: TrackSession) -> None:
         self.args, self.session = args, session
         self.codes: set[int] = {0}
-        self._next_write = 0.0
+        self._is_old, self._write_s = False, 0.0  # the files; what writing them took
 
     def take_all(self) -> None:
         """Locate all images, then estimate and write the track."""
@@ -138,35 +138,44 @@ class _Run:
         former = signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             with suppress(KeyboardInterrupt):
-                for _ in follow_images(
+                for image in follow_images(
                     self.args.frames[0], self.args.dir, lambda image: self._note(self._add(image.path)),
                     lambda image, cause: self._refuse(image.name, cause), until_idle_s=self.args.until_idle,
                 ):  # fmt: skip
-                    self._update()
+                    self._update(image is not None)
         finally:
             signal.signal(signal.SIGTERM, former)
         track = self._estimate(growing=True)
         self._write(track)
         self._print_summary(track)
 
-    def _update(self) -> None:
-        """The growing track after new images: one line, and the files unless they were just written."""
+    def _update(self, has_come: bool) -> None:
+        """A line about the image that has come; the files, unless that would make the next image wait."""
+        try:
+            if has_come:
+                self._print_newest()
+                self._is_old = True
+            if self._is_old and (not has_come or self._write_s < QUICK_S):
+                start = time.monotonic()
+                self._write(self._estimate(growing=True), pictures=False)
+                self._write_s, self._is_old = time.monotonic() - start, False
+        except BadInput as cause:  # no position yet, or no odometry for the first images
+            if has_come:
+                print(f"waiting: {cause}", file=sys.stderr, flush=True)
+            self._is_old = False
+
+    def _print_newest(self) -> None:
         from startrack.tracking.quantities import frame_records
 
-        try:
-            track = self._estimate(growing=True)
-        except BadInput as cause:  # no position yet, or no odometry for the first images
-            print(f"waiting: {cause}", file=sys.stderr, flush=True)
-            return
-        record = frame_records(track)[-1]
+        found = self.session.newest(
+            self._odometry(), odometry_sigma=self.args.odometry_sigma, odometry_floor_m=self.args.odometry_floor,
+            at_rest=self.args.at_rest,
+        )  # fmt: skip
+        record = frame_records(found)[-1]
         if self.args.json:
             print(json.dumps(record), flush=True)
         elif not self.args.quiet:
             print(_line(record, "filtered_"), flush=True)
-        if time.monotonic() >= self._next_write:
-            start = time.monotonic()
-            self._write(track, pictures=False)
-            self._next_write = time.monotonic() + REWRITE_FACTOR * (time.monotonic() - start)
 
     def _paths(self) -> list[str] | None:
         """The image files; None for a bag."""

@@ -72,7 +72,9 @@ def mean_image_errors(errors: Sequence[ImageErrors]) -> ImageErrors | None:
     if not errors:
         return None
     covariance = np.sum([one.covariance for one in errors], axis=0) / len(errors) ** 2
-    return ImageErrors(errors[0].raised_rad, covariance)
+    raised = np.stack([one.raised_rad for one in errors])
+    many = np.maximum(raised.any(axis=2).sum(axis=0), 1)
+    return ImageErrors(raised.sum(axis=0) / many[:, None], covariance)
 
 
 def _combine(newest: FrameEstimate, before: Smoothed) -> tuple[Array, Array]:

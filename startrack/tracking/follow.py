@@ -22,8 +22,8 @@ def follow_images(
     refuse: Callable[[Image, BadInput], None],
     *,
     until_idle_s: float | None,
-) -> Iterator[None]:
-    """Give each image of a `folder` to `take`, and yield after those that came together.
+) -> Iterator[Image | None]:
+    """Give each image of a `folder` to `take`, and yield it after that; None where no image waits.
 
     Ends when no image came for `until_idle_s` (None: never). An image that `take` refuses with BadInput is tried again
     for some seconds, since its sidecar may be missing; then `refuse` gets it. The folder `excluded` is left out.
@@ -32,7 +32,7 @@ def follow_images(
     first_try: dict[str, float] = {}
     idle_since = time.monotonic()
     while until_idle_s is None or time.monotonic() - idle_since < until_idle_s:
-        taken = 0
+        waiting = False
         for image in images_under(folder, excluded):
             if image.path in done or not _is_still(image.path):
                 continue
@@ -43,12 +43,15 @@ def follow_images(
                 if time.monotonic() - first_try.setdefault(image.path, time.monotonic()) < PATIENCE_S:
                     continue
                 refuse(image, cause)
+                done.add(image.path)
+                continue
             done.add(image.path)
-            taken += 1
+            waiting = True
+            yield image
             idle_since = time.monotonic()
-        if taken:
-            yield
-        time.sleep(POLL_S)
+        if not waiting:
+            yield None
+            time.sleep(POLL_S)
 
 
 def _is_still(path: str) -> bool:

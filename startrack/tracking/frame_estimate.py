@@ -32,7 +32,7 @@ ROUNDING = 1e-9  # of the covariance, added to the noise so that it can be inver
 class ImageErrors:
     """Errors of attitude and lens: they raise the skyline of the sky's light, not that of the stars."""
 
-    raised_rad: Array  # (sectors, j) of equal width from north on, by one unit of each
+    raised_rad: Array  # (sectors, j) of equal width from north on, by one unit of each; 0 where no light is used
     covariance: Array  # (j, j)
 
     def at(self, azimuth_rad: Array) -> Array:

@@ -65,7 +65,7 @@ def located_evidence(located: Located) -> tuple[Evidence, ImageErrors | None]:
     image = ~fit.errors.of_terrain
     raised_px = fit.errors.raised_px[:, image] @ fit.errors.mean[image]
     light = sky.evidence(fit.used, raised_px, located.sky_variance_factor)
-    raised_rad = fit.errors.raised_px[:, image] / sky.px_per_rad[:, None]
+    raised_rad = np.where(fit.used[:, None], fit.errors.raised_px[:, image] / sky.px_per_rad[:, None], 0.0)
     errors = ImageErrors(raised_rad, fit.errors.covariance[:OFFSET_TERMS, :OFFSET_TERMS])
     if not located.by_stars:
         return replace(light, clock=stars.clock), errors

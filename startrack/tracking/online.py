@@ -46,6 +46,11 @@ class OnlineTrack:
         """(2, 2) of the last frame."""
         return self._filter.covariance_m2
 
+    @property
+    def mode(self) -> int:
+        """Which mode of the last frame is used; -1: none."""
+        return self._mode[-1]
+
     def add(self, modes: Modes, move_m: Array, sigma_m: float) -> None:
         """One more frame, with one mode, several (ambiguous) or none (refused), after a move (2,) in enu.
 

@@ -9,16 +9,25 @@ from datetime import UTC
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from startrack.batch.fingerprint import input_hashes, job_sha256
 from startrack.errors import BadInput
-from startrack.localization import clock_at
 from startrack.pipeline import NO_TIME, locate_exposure
 from startrack.stages import Settings
 from startrack.tracking.frame_store import FrameStore
 from startrack.tracking.observe import ObservedFrame, observe_frame
 from startrack.tracking.odometry import SPAN_TOLERANCE_S, Odometry
+from startrack.tracking.online import RECENT_FRAMES, OnlineTrack
 from startrack.tracking.shared import SharedErrors
-from startrack.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA, Track, estimate_track
+from startrack.tracking.track import (
+    ODOMETRY_FLOOR_M,
+    ODOMETRY_SIGMA,
+    Track,
+    estimate_track,
+    odometry_steps,
+    track_of_newest,
+)
 
 if TYPE_CHECKING:
     from startrack.terrain import Terrain
@@ -36,6 +45,8 @@ class TrackSession:
     terrain: Terrain | None = None
     shared: SharedErrors | None = None
     _reference: str | None = None  # of the terrain
+    _filtered: list[ObservedFrame] = field(default_factory=list)  # that the filter has
+    _online: OnlineTrack | None = None
 
     def add(self, path: str | Path) -> ObservedFrame:
         """The frame of the image file at `path`, located unless the store has it.
@@ -86,6 +97,27 @@ class TrackSession:
             odometry_floor_m=odometry_floor_m, at_rest=at_rest,
         )  # fmt: skip
 
+    def newest(
+        self, odometry: Odometry | None, *, odometry_sigma: float, odometry_floor_m: float, at_rest: bool
+    ) -> Track:
+        """A track that ends with the last frame in the order of time, filtered by all frames so far.
+
+        Unless `at_rest` it has this frame alone. Arguments and exceptions as of `estimate`. Frames that came late are
+        filtered anew.
+        """
+        if at_rest or self.terrain is None or self.shared is None:
+            return self.estimate(at_rest=at_rest)
+        if self._filtered != self.frames[: len(self._filtered)]:
+            self._filtered, self._online = [], None
+        self._online = self._online or OnlineTrack(len(self.shared.names), self.terrain.height_sigma_m)
+        for k in range(len(self._filtered), len(self.frames)):
+            recent = self.frames[max(k - RECENT_FRAMES, 0) : k + 1]
+            steps = odometry_steps(recent, odometry, odometry_sigma, odometry_floor_m)
+            move, sigma = (steps.move_m[-1], float(steps.sigma_m[-1])) if k else (np.zeros(2), 0.0)
+            self._online.add(self.frames[k].modes, move, sigma)
+            self._filtered.append(self.frames[k])
+        return track_of_newest(self.frames[-1], self._online, self.terrain)
+
     def _shared_errors(self, exposure: Exposure) -> SharedErrors:
         """The errors that all frames share, from the first of them."""
         from startrack.terrain import load_terrain
@@ -94,10 +126,8 @@ class TrackSession:
             raise BadInput("bad_terrain", "no terrain file is known: give -t FILE or a sidecar with terrain")
         if self.terrain is None or self.shared is None:
             terrain = load_terrain(exposure.terrain)
-            if terrain.site is None:
-                raise BadInput("bad_terrain", f"terrain {terrain.name} has no site")
-            clock = clock_at(terrain.site, exposure.time_utc, exposure.time_sigma_s)  # type: ignore[arg-type]
-            self.terrain, self.shared = terrain, SharedErrors.of(terrain, clock)
+            self.shared = SharedErrors.of_exposure(terrain, exposure)
+            self.terrain = terrain
             self._reference = exposure.terrain
         if exposure.terrain != self._reference:
             raise BadInput(

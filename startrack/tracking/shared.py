@@ -7,9 +7,10 @@ from typing import Self
 
 import numpy as np
 
-from startrack.localization import clock_matters
+from startrack.localization import clock_at, clock_matters
+from startrack.pipeline import NO_TIME
 from startrack.terrain import Terrain
-from startrack.types import Array, Clock, Evidence
+from startrack.types import Array, BadInput, Clock, Evidence, Exposure
 
 BIAS, CLOCK, SHAPES = "horizon_bias_rad", "clock_s", ("steepness_1", "size_1")
 
@@ -31,6 +32,18 @@ class SharedErrors:
             stated[CLOCK], turn = clock.sigma_s, clock.turn_rad_s
         known = {name: sigma for name, sigma in stated.items() if sigma > 0.0}
         return cls(tuple(known), np.array(list(known.values())), turn)
+
+    @classmethod
+    def of_exposure(cls, terrain: Terrain, exposure: Exposure) -> Self:
+        """Those of a `terrain`, and of the clock of an `exposure`.
+
+        Raises BadInput (no_time, bad_terrain) where the exposure has no time, or the terrain no site.
+        """
+        if exposure.time_utc is None:
+            raise BadInput("no_time", "; ".join([NO_TIME, *exposure.warnings]))
+        if terrain.site is None:
+            raise BadInput("bad_terrain", f"terrain {terrain.name} has no site")
+        return cls.of(terrain, clock_at(terrain.site, exposure.time_utc, exposure.time_sigma_s))
 
     def shape_axis(self, name: str) -> int:
         """Which of the two numbers of `Terrain.reshaped` the error `name` is."""

@@ -118,6 +118,13 @@ def estimate_track(
     )  # fmt: skip
 
 
+def track_of_newest(frame: ObservedFrame, online: OnlineTrack, terrain: Terrain) -> Track:
+    """The last `frame` that `online` has, as a track of its own: by all frames up to it."""
+    found = _trajectory(online.position_m[None], online.covariance_m2[None], terrain)
+    none = np.zeros(0, dtype=bool)
+    return Track((_track_frame(frame, online.mode),), found, found, 0.0, 0.0, None, None, none, False, terrain)
+
+
 def filter_positions(
     modes: Sequence[Sequence[Any]], steps: Steps, shared_count: int, height_sigma_m: float
 ) -> tuple[Array, Array]:

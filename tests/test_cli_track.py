@@ -1,0 +1,222 @@
+"""`startrack track`: a drive of small rendered images, at once, live and killed, at rest; files, schema, refusals."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.table import Table
+from jsonschema import Draft202012Validator
+
+import startrack
+from startrack.camera import load_camera, save_camera
+from startrack.cli.main import main
+from startrack.frames import R_from_quat_xyzw
+from startrack.tracking import read_odometry
+from startrack.tracking.circles import radius_holding
+from startrack.tracking.frame_store import decode_frame, encode_frame
+from startrack.tracking.schema import TRACK
+
+FRAMES = 5
+FILES = ("track.tum", "track.filtered.tum", "track.ecsv", "track.geojson", "track.json", "track.crests.ecsv")
+
+
+def run(*arguments):
+    """Exit code of the command."""
+    return main(["track", *map(str, arguments)])
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """A folder with images 25 m apart, their odometry, and the truth."""
+    folder = tmp_path_factory.mktemp("drive")
+    camera = load_camera("fisheye-2048")
+    from dataclasses import replace
+
+    small = replace(camera, name="small", size_px=(1024, 1024), focal_px=(326.0, 326.0), centre_px=(511.5, 511.5))
+    save_camera(small, folder / "small.toml")
+    (folder / "path.csv").write_text("east_m,north_m\n-6900,4700\n-6850,4700\n-6850,4750\n")
+    code = main([
+        "render", "--path", str(folder / "path.csv"), "--speed", "0.05", "--every", "500", "--seed", "3", "-q",
+        "-c", str(folder / "small.toml"), "-D", str(folder / "frames"),
+    ])  # fmt: skip
+    assert code == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def tracked(drive):
+    """The folder of the drive's track."""
+    assert run(drive / "frames", "--odometry", drive / "frames" / "odometry.tum", "-D", drive / "out", "-q") == 0
+    return drive / "out"
+
+
+def truth_m(drive):
+    return read_odometry(drive / "frames" / "truth.tum").position_m
+
+
+def test_the_track_holds_the_truth_and_is_better_than_single_images(drive, tracked):
+    record = json.loads((tracked / "track.json").read_text())
+    Draft202012Validator(TRACK).validate(record)
+    assert record["counts"] == {"frames": FRAMES, "used": FRAMES, "left_out": 0, "refused": 0, "slips": 0}
+    for prefix in ("", "filtered_"):
+        found = np.array([[one[f"{prefix}east_m"], one[f"{prefix}north_m"]] for one in record["frames"]])
+        error = found - truth_m(drive)[:, :2]
+        covariance = [
+            [[one[f"{prefix}covariance_{text}_m2"] for text in row] for row in (("ee", "en"), ("en", "nn"))]
+            for one in record["frames"]
+        ]
+        nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error)
+        assert nees.max() < 16.0
+    radius = np.array([[one["radius95_m"], one["filtered_radius95_m"]] for one in record["frames"]])
+    assert (radius[:-1, 0] < radius[:-1, 1]).all()  # later images help
+    assert radius[-1, 0] == pytest.approx(radius[-1, 1], rel=0.02)
+    assert radius[-1, 1] < 0.8 * radius[0, 1]
+
+
+def test_tum_text_is_that_of_the_poses(drive, tracked):
+    true = read_odometry(drive / "frames" / "truth.tum")
+    for name in ("track.tum", "track.filtered.tum"):
+        found = read_odometry(tracked / name)
+        np.testing.assert_allclose(found.time_s, true.time_s, atol=1e-6)
+        assert np.abs(found.position_m - true.position_m).max() < 10.0
+        for a, b in zip(found.quat_xyzw, true.quat_xyzw, strict=True):
+            assert np.abs(R_from_quat_xyzw(a) - R_from_quat_xyzw(b)).max() < 1e-3
+
+
+def test_tables_are_read_by_astropy_and_the_map_has_every_frame(tracked):
+    record = json.loads((tracked / "track.json").read_text())
+    table = Table.read(tracked / "track.ecsv")
+    assert table["east_m"].unit == "m"
+    np.testing.assert_allclose(table["east_m"], [one["east_m"] for one in record["frames"]], atol=1e-4)
+    assert len(Table.read(tracked / "track.crests.ecsv")) == 0  # a cylinder has no posts
+    features = json.loads((tracked / "track.geojson").read_text())["features"]
+    assert [one["geometry"]["type"] for one in features] == ["LineString", *["Point"] * FRAMES]
+    assert features[0]["geometry"]["coordinates"][0] == features[1]["geometry"]["coordinates"]
+
+
+def test_images_followed_and_killed_give_the_same_files(drive, tracked, tmp_path):
+    live, out = drive / "live", tmp_path / "out"  # beside the camera file that the images name
+    live.mkdir()
+    command = [
+        sys.executable, "-m", "startrack", "track", "--follow", str(live), "-D", str(out), "--until-idle", "3",
+        "--odometry", str(drive / "frames" / "odometry.tum"), "--no-plots",
+    ]  # fmt: skip
+    images = sorted((drive / "frames").glob("*.png"))
+    first = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    for image in images[:2]:
+        shutil.copy(image.with_suffix(".json"), live)
+        shutil.copy(image, live)
+    for _ in range(600):
+        if len(list((out / ".frames").glob("*.npz"))) == 2:
+            break
+        time.sleep(0.1)
+    os.kill(first.pid, signal.SIGKILL)
+    first.wait()
+    for image in images[2:]:
+        shutil.copy(image.with_suffix(".json"), live)
+        shutil.copy(image, live)
+    second = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert sum("used" in line for line in second.stdout.splitlines()[:-1]) == FRAMES
+    for name in FILES:
+        assert (out / name).read_bytes() == (tracked / name).read_bytes(), name
+
+
+def test_at_rest_the_images_share_one_position(drive, tmp_path):
+    code = main([
+        "render", "--every", "40000", "-n", "3", "--seed", "5", "-q", "-c", str(drive / "small.toml"), "-D",
+        str(tmp_path / "rest"),
+    ])  # fmt: skip
+    assert code == 0
+    assert run(tmp_path / "rest", "--at-rest", "-D", tmp_path / "out", "-q") == 0
+    frames = json.loads((tmp_path / "out" / "track.json").read_text())["frames"]
+    assert len({(one["east_m"], one["north_m"]) for one in frames}) == 1
+    true = read_odometry(tmp_path / "rest" / "truth.tum").position_m[0]
+    assert np.hypot(frames[0]["east_m"] - true[0], frames[0]["north_m"] - true[1]) < 2 * frames[0]["radius95_m"]
+    assert frames[-1]["filtered_radius95_m"] < frames[0]["filtered_radius95_m"]
+
+
+def test_refused_images_are_bridged_by_the_odometry(drive, tmp_path):
+    from startrack.exposure import read_exposure
+
+    frames = tmp_path / "frames"
+    shutil.copytree(drive / "frames", frames)
+    shutil.copy(drive / "small.toml", tmp_path)
+    dark = sorted(frames.glob("*.png"))[2]
+    import cv2
+
+    cv2.imwrite(str(dark), np.full(read_exposure(dark).pixels_adu.shape, 100, np.uint16))
+    assert run(frames, "--odometry", frames / "odometry.tum", "-D", tmp_path / "out", "-q") == 3
+    record = json.loads((tmp_path / "out" / "track.json").read_text())
+    assert [one["status"] for one in record["frames"]] == ["used", "used", "refused", "used", "used"]
+    bridged = record["frames"][2]
+    assert bridged["reason"] == "no_stars"
+    miss = np.hypot(bridged["east_m"] - truth_m(drive)[2, 0], bridged["north_m"] - truth_m(drive)[2, 1])
+    assert miss < 2 * bridged["radius95_m"]
+    assert bridged["filtered_radius95_m"] > record["frames"][1]["filtered_radius95_m"]
+
+
+def test_the_library_gives_the_track_of_the_command(drive, tracked):
+    images = sorted((drive / "frames").glob("*.png"))
+    track = startrack.track(images, odometry=str(drive / "frames" / "odometry.tum"))
+    record = json.loads((tracked / "track.json").read_text())
+    expected = [[one["east_m"], one["north_m"], one["up_m"]] for one in record["frames"]]
+    np.testing.assert_array_equal(track.smoothed.position_enu_m, expected)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["--at-rest", "--odometry", "x.tum"], 2, "give one of them"),
+        (["--time", "2030-01-01T00:00:00"], 2, "have their times in sidecars"),
+        (["--odometry", "none.tum"], 4, "none.tum"),
+        (["-t", "shackleton-none"], 4, "bad_terrain"),
+        (["--until-idle", "3"], 2, "is for --follow"),
+    ],
+)
+def test_wrong_use_is_refused_in_a_line(drive, tmp_path, capsys, arguments, code, message):
+    try:
+        found = run(drive / "frames", "-D", tmp_path / "out", *arguments)
+    except SystemExit as cause:
+        found = cause.code
+    text = capsys.readouterr().err
+    assert found == code, text
+    assert message in text
+    assert "Traceback" not in text
+
+
+def test_a_folder_without_images_is_refused(tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    assert run(tmp_path / "empty", "-D", tmp_path / "out") == 4
+    assert "no images in this folder" in capsys.readouterr().err
+
+
+def test_a_stored_frame_is_the_frame(drive, tracked):
+    for file in (tracked / ".frames").glob("*.npz"):
+        frame = decode_frame(file.read_bytes())
+        again = decode_frame(encode_frame(frame))
+        assert (frame.name, frame.time_utc) == (again.name, again.time_utc)
+        np.testing.assert_array_equal(frame.modes[0].mean, again.modes[0].mean)
+        np.testing.assert_array_equal(frame.evidence.llr, again.evidence.llr)
+        assert frame.time_utc.tzinfo is not None and frame.time_utc > datetime(2020, 1, 1, tzinfo=UTC)
+    with pytest.raises((ValueError, KeyError)):
+        decode_frame(Path(__file__).read_bytes())
+
+
+def test_a_circle_holds_its_part_of_a_gaussian():
+    rng = np.random.default_rng(4)
+    covariance = np.array([np.eye(2), [[9.0, 2.0], [2.0, 1.0]], [[1e4, 0.0], [0.0, 1e-4]]])
+    radius = radius_holding(covariance, 0.95)
+    assert radius[0] == pytest.approx(np.sqrt(-2 * np.log(0.05)))
+    for one, r in zip(covariance, radius, strict=True):
+        draws = rng.multivariate_normal(np.zeros(2), one, 200_000)
+        assert np.mean(np.hypot(*draws.T) < r) == pytest.approx(0.95, abs=0.002)
+    assert radius[2] == pytest.approx(100 * 1.95996, rel=1e-3)
+    assert radius_holding(np.full((1, 2, 2), np.inf), 0.95)[0] == np.inf

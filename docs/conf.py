@@ -1,0 +1,80 @@
+"""Settings of the documentation site.
+
+    sphinx-build -W --keep-going docs build/site
+
+The pages are also read on their own, outside the site. `link_to_pages` turns their links to files of the repository
+into links to the pages that include these files.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from typing import Any
+
+from sphinx.application import Sphinx
+
+import startrack
+
+project = "startrack"
+author = "The startrack developers"
+copyright = "The startrack developers. Licence: MIT"
+release = version = startrack.__version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+exclude_patterns = ["images/*"]
+myst_enable_extensions = ["colon_fence", "dollarmath", "attrs_inline"]
+myst_heading_anchors = 3
+suppress_warnings = ["myst.header"]  # included parts of README.md begin below the heading of their page
+
+autodoc_default_options = {"members": True, "undoc-members": True, "exclude-members": "from_dict"}
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+napoleon_numpy_docstring = False
+default_role = "py:obj"  # `name` in a docstring is code, and a link where the name has a page
+
+html_theme = "furo"
+html_title = "startrack"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_show_sphinx = False
+html_copy_source = False
+
+PAGES_OF_FILES = {  # file of the repository to the page that includes it
+    "CONVENTIONS.md": "conventions.md",
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "README.md": "index.md",
+    "benchmarks/RESULTS.md": "results.md",
+    "startrack/terrain/protocol.py": "api/terrain.md",
+}
+
+
+def link_to_pages(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Replace links to files outside docs/ by links to their pages."""
+    up = "../" * docname.count("/")
+    for file, page in PAGES_OF_FILES.items():
+        source[0] = source[0].replace(f"]({up}../{file}", f"]({up}{page}")
+
+
+def describe_field(app: Sphinx, what: str, name: str, one: Any, options: Any, lines: list[str]) -> None:
+    """Document a field of a dataclass by the comment at the end of its line; bars in a docstring are no references."""
+    lines[:] = [line.replace("|", r"\|") for line in lines]
+    if what != "attribute" or any(lines):
+        return
+    path, _, field = name.rpartition(".")
+    module, _, owner = path.rpartition(".")
+    home = getattr(__import__(module, fromlist=[owner]), owner, None)
+    for base in inspect.getmro(home) if inspect.isclass(home) else ():
+        if field in vars(base).get("__annotations__", {}):
+            found = re.search(rf"^    {field}: [^#\n]*  # (.+)$", inspect.getsource(base), re.MULTILINE)
+            lines[:] = [found[1].replace("|", r"\|")] if found else []
+            return
+
+
+def setup(app: Sphinx) -> None:
+    """Connect the handlers."""
+    app.connect("source-read", link_to_pages)
+    app.connect("autodoc-process-docstring", describe_field)

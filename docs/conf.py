@@ -2,14 +2,15 @@
 
     sphinx-build -W --keep-going docs build/site
 
-The pages are also read on their own, outside the site. `link_to_pages` turns their links to files of the repository
-into links to the pages that include these files.
+The pages are also read on their own, outside the site. Their links to files of the repository become links to the
+pages that include these files (`link_to_pages`, `link_in_included`).
 """
 
 from __future__ import annotations
 
 import inspect
 import re
+from pathlib import Path
 from typing import Any
 
 from sphinx.application import Sphinx
@@ -46,6 +47,7 @@ PAGES_OF_FILES = {  # file of the repository to the page that includes it
     "CONVENTIONS.md": "conventions.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
     "README.md": "index.md",
     "benchmarks/RESULTS.md": "results.md",
     "startrack/terrain/protocol.py": "api/terrain.md",
@@ -53,10 +55,17 @@ PAGES_OF_FILES = {  # file of the repository to the page that includes it
 
 
 def link_to_pages(app: Sphinx, docname: str, source: list[str]) -> None:
-    """Replace links to files outside docs/ by links to their pages."""
+    """Replace a page's links to files outside docs/ by links to their pages."""
     up = "../" * docname.count("/")
     for file, page in PAGES_OF_FILES.items():
         source[0] = source[0].replace(f"]({up}../{file}", f"]({up}{page}")
+
+
+def link_in_included(app: Sphinx, path: Path, docname: str, source: list[str]) -> None:
+    """The same in a file of the repository's root that a page of docs/ includes."""
+    source[0] = source[0].replace("](docs/", "](")
+    for file, page in PAGES_OF_FILES.items():
+        source[0] = source[0].replace(f"]({file}", f"]({page}")
 
 
 def describe_field(app: Sphinx, what: str, name: str, one: Any, options: Any, lines: list[str]) -> None:
@@ -77,4 +86,5 @@ def describe_field(app: Sphinx, what: str, name: str, one: Any, options: Any, li
 def setup(app: Sphinx) -> None:
     """Connect the handlers."""
     app.connect("source-read", link_to_pages)
+    app.connect("include-read", link_in_included)
     app.connect("autodoc-process-docstring", describe_field)

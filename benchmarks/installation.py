@@ -5,7 +5,8 @@
 A Python is any of 3.11 and later on the PATH or among pyenv's versions. Each gets the wheel with its required packages
 in an environment of its own, and then the smoke test: `startrack doctor`, a picture located from another folder, and
 the type marker. The first also installs from the source distribution. `--lock` writes the versions that the first one
-installed, for `pip install -r`. The sizes are those of the files that pip installed.
+installed, for `pip install -r`. The sizes are those of all files in site-packages that the
+installation made.
 """
 
 from __future__ import annotations
@@ -93,17 +94,12 @@ def check(python: Path, archive: Path, folder: Path) -> list[str]:
 
 
 def site_sizes(python: Path) -> dict[str, int]:
-    """Bytes on the disk of each folder and file in the environment's site-packages, without compiled copies."""
+    """Bytes on the disk of each folder and file in the environment's site-packages."""
     site = Path(output(str(python), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))").strip())
     return {
-        one.name: sum(f.stat().st_size for f in ([one] if one.is_file() else one.rglob("*")) if is_shipped(f))
+        one.name: sum(f.stat().st_size for f in ([one] if one.is_file() else one.rglob("*")) if f.is_file())
         for one in site.iterdir()
     }
-
-
-def is_shipped(path: Path) -> bool:
-    """A file that a package brought, not one that Python or numba made."""
-    return path.is_file() and path.suffix not in (".pyc", ".nbi", ".nbc")
 
 
 def locked(folder: Path, python: str) -> str:

@@ -8,12 +8,12 @@ pages that include these files (`link_to_pages`, `link_in_included`).
 
 from __future__ import annotations
 
-import inspect
 import re
 from pathlib import Path
 from typing import Any
 
 from sphinx.application import Sphinx
+from sphinx.pycode import ModuleAnalyzer
 
 import startrack
 
@@ -26,7 +26,10 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphin
 exclude_patterns = ["images/*"]
 myst_enable_extensions = ["colon_fence", "dollarmath", "attrs_inline"]
 myst_heading_anchors = 3
-suppress_warnings = ["myst.header"]  # included parts of README.md begin below the heading of their page
+suppress_warnings = [
+    "myst.header",  # included parts of README.md begin below the heading of their page
+    "ref.python",  # a type whose short name several packages have is linked to the first
+]
 
 autodoc_default_options = {"members": True, "undoc-members": True, "exclude-members": "from_dict"}
 autodoc_typehints = "description"
@@ -34,7 +37,7 @@ autodoc_typehints_description_target = "documented"
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 napoleon_numpy_docstring = False
-default_role = "py:obj"  # `name` in a docstring is code, and a link where the name has a page
+default_role = "code"  # `name` in a docstring
 
 html_theme = "furo"
 html_title = "startrack"
@@ -68,23 +71,28 @@ def link_in_included(app: Sphinx, path: Path, docname: str, source: list[str]) -
         source[0] = source[0].replace(f"]({file}", f"]({page}")
 
 
-def describe_field(app: Sphinx, what: str, name: str, one: Any, options: Any, lines: list[str]) -> None:
-    """Document a field of a dataclass by the comment at the end of its line; bars in a docstring are no references."""
+def protect_docstring(app: Sphinx, what: str, name: str, one: Any, options: Any, lines: list[str]) -> None:
+    """Keep bars from being references, and the words before a colon from being the type of an attribute."""
     lines[:] = [line.replace("|", r"\|") for line in lines]
-    if what != "attribute" or any(lines):
-        return
-    path, _, field = name.rpartition(".")
-    module, _, owner = path.rpartition(".")
-    home = getattr(__import__(module, fromlist=[owner]), owner, None)
-    for base in inspect.getmro(home) if inspect.isclass(home) else ():
-        if field in vars(base).get("__annotations__", {}):
-            found = re.search(rf"^    {field}: [^#\n]*  # (.+)$", inspect.getsource(base), re.MULTILINE)
-            lines[:] = [found[1].replace("|", r"\|")] if found else []
-            return
+    if what in ("attribute", "property") and any(lines):
+        lines.insert(0, "")
+
+
+def source_with_field_comments(module: str) -> tuple[str | None, str | None]:
+    """File and source of a module for autodoc, where the comment after a field of a dataclass documents the field."""
+    path, source = module_source(module)
+    if source is None and path is not None:
+        source = Path(path).read_text(encoding="utf-8")
+    return path, None if source is None else FIELD.sub(r"\1  #: ", source)
+
+
+FIELD = re.compile(r"^(    \w+: [^#\n]*\S)  # (?!fmt|type)", re.MULTILINE)
+module_source = ModuleAnalyzer.get_module_source
+ModuleAnalyzer.get_module_source = staticmethod(source_with_field_comments)  # type: ignore[method-assign]
 
 
 def setup(app: Sphinx) -> None:
     """Connect the handlers."""
     app.connect("source-read", link_to_pages)
     app.connect("include-read", link_in_included)
-    app.connect("autodoc-process-docstring", describe_field)
+    app.connect("autodoc-process-docstring", protect_docstring, priority=400)  # before Napoleon

@@ -20,7 +20,8 @@ from startrack.cli.main import main
 
 ROOT = Path(__file__).parent.parent
 SNIPPET = re.compile(
-    r"(?:^<!-- (?P<mark>[^\n]*) -->\n)?^```(?P<language>sh|python)\n(?P<code>.*?)^```\n(?:\n^```text\n(?P<shown>.*?)^```)?",
+    r"(?:^<!-- (?P<mark>[^\n]*) -->\n)?^```(?P<language>sh|python)\n(?P<code>.*?)^```\n"
+    r"(?:\n^```text\n(?P<shown>.*?)^```)?",
     flags=re.MULTILINE | re.DOTALL,
 )
 EXIT_CODE = re.compile(r"#.*\bexit code (\d)")
@@ -136,11 +137,12 @@ def same_output(printed: str, shown: str) -> None:
 
     A line `...` of the page stands for lines left out.
     """
-    compare = lines_of(printed), lines_of(shown)
-    for part in split_at_dots(compare[1]):
-        start = next((k for k, line in enumerate(compare[0]) if replace_figures(line) == replace_figures(part[0])), None)
-        assert start is not None, f"the page shows {part[0]!r}; printed:\n{printed}"
-        for now, then in zip(compare[0][start : start + len(part)], part, strict=True):
+    lines = lines_of(printed)
+    shapes = [replace_figures(line) for line in lines]
+    for part in split_at_dots(lines_of(shown)):
+        assert replace_figures(part[0]) in shapes, f"the page shows {part[0]!r}; printed:\n{printed}"
+        start = shapes.index(replace_figures(part[0]))
+        for now, then in zip(lines[start : start + len(part)], part, strict=True):
             assert replace_figures(now) == replace_figures(then)
             for one, other in zip(numbers(now), numbers(then), strict=True):
                 decimals = len(other.partition(".")[2])

@@ -88,7 +88,7 @@ def make_posterior(solution: Any, folder: Path) -> None:
             log_p[inside] = log_posterior(used, terrain, points[inside])
             log_p -= np.nanmax(log_p)
             shown = log_p if scale < 1 else np.exp(log_p)
-            extent = np.array([centre_m[0], centre_m[0], centre_m[1], centre_m[1]]) + half_m * np.array([-1, 1, -1, 1])
+            extent = np.repeat(centre_m, 2) + half_m * np.array([-1, 1, -1, 1])
             lowest = np.nanquantile(shown, 0.02)
             drawn = axes.imshow(
                 shown.reshape(141, 141), origin="lower", extent=extent * scale, cmap="inferno", vmin=lowest,

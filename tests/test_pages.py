@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import bz2
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from page_helpers import ROOT, run_page, same_output, snippets
+
+from startrack.cli.main import main
+from startrack.exposure import read_exposure, write_exposure
 
 PAGES = [*sorted(ROOT.glob("docs/*.md")), *sorted(ROOT.glob("docs/tutorials/*.md"))]
 
@@ -32,6 +37,25 @@ def folder_of_images(folder: Path) -> None:
         shutil.copy(ROOT / f"sample_images/near-wall{end}", folder / "FOLDER")
 
 
+def nights(folder: Path) -> None:
+    """Photographs of the sky, pictures of a chessboard, and a calibration of another program."""
+    from test_calibration_board import POSES, chessboard, draw_picture
+
+    pixels = read_exposure(ROOT / "sample_images/lowell-2018-08-06.fits.bz2")
+    for k, name in enumerate(["night1.png", "night2.png", "tonight.png"]):
+        write_exposure(folder / name, replace(pixels, pixels_adu=np.minimum(pixels.pixels_adu + k, 65535)))
+    for k, pose in enumerate(POSES):
+        write_exposure(folder / f"board{k}.png", draw_picture(pose, chessboard))
+    convert = ["calibrate", "convert", "lowell-ldt", "--to", "kalibr", "-o", str(folder / "camchain.yaml")]
+    assert main(convert) == 0
+
+
+def fits_nights(folder: Path) -> None:
+    content = bz2.decompress((ROOT / "sample_images/lowell-2018-08-06.fits.bz2").read_bytes())
+    for name in ("night1.fits", "night2.fits"):
+        (folder / name).write_bytes(content)
+
+
 def own_maps(folder: Path) -> None:
     shutil.copy(ROOT / "terrain/site01-10m.tif", folder / "fine.tif")
     shutil.copy(ROOT / "terrain/ldem75s-240m.tif", folder / "coarse.tif")
@@ -45,6 +69,8 @@ def small_camera(folder: Path) -> None:
 
 ASSUMED = {
     "batch": Assumed(folder_of_images),
+    "calibration": Assumed(nights),
+    "horizon": Assumed(fits_nights),
     "terrain": Assumed(own_maps),
     "track": Assumed(small_camera, {"render": ["-c", "small.toml", "-q"]}),
 }
@@ -58,7 +84,9 @@ def test_snippets_of_the_page_run(page, clone, capsys):
     assumed = ASSUMED.get(page.stem, Assumed())
     assumed.files(clone)
     with capsys.disabled():
-        run_page(page, assumed.flags)
+        ran = run_page(page, assumed.flags)
+    for code, printed in ran.printed.items():
+        assert printed or "print(" not in code
 
 
 def test_output_is_compared_line_by_line():

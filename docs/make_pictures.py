@@ -93,11 +93,11 @@ def make_posterior(solution: Any, folder: Path) -> None:
             drawn = axes.imshow(
                 shown.reshape(141, 141), origin="lower", extent=extent * scale, cmap="inferno", vmin=lowest,
             )  # fmt: skip
-            units = "km" if scale < 1 else "m"
+            units, density = ("km", "log posterior") if scale < 1 else ("m", "posterior, relative")
             axes.set(title=title, xlabel=f"east, {units}", ylabel=f"north, {units}")
             axes.ticklabel_format(useOffset=False)
             axes.locator_params(nbins=4)
-            figure.colorbar(drawn, ax=axes, fraction=0.046, label="log posterior" if scale < 1 else "posterior, relative")
+            figure.colorbar(drawn, ax=axes, fraction=0.046, label=density)
             axes.plot(TRUE_M[0] * scale, TRUE_M[1] * scale, "+", color="#4fd1c5", ms=14, mew=2, label="true position")
         circle = Circle(tuple(middle_m), radius_m, fill=False, color="#63b3ed", lw=1.8, label="95 % circle of the fix")
         all_axes[1].add_patch(circle)

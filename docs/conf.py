@@ -37,6 +37,7 @@ autodoc_typehints_description_target = "documented"
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 napoleon_numpy_docstring = False
+smartquotes = False
 default_role = "code"  # `name` in a docstring
 
 html_theme = "furo"
@@ -71,11 +72,16 @@ def link_in_included(app: Sphinx, path: Path, docname: str, source: list[str]) -
         source[0] = source[0].replace(f"]({file}", f"]({page}")
 
 
-def protect_docstring(app: Sphinx, what: str, name: str, one: Any, options: Any, lines: list[str]) -> None:
-    """Keep bars from being references, and the words before a colon from being the type of an attribute."""
+def keep_attribute(app: Sphinx, what: str, name: str, one: Any, options: Any, lines: list[str]) -> None:
+    """Before Napoleon: it takes the words before a colon for the type of an attribute. Bars are no references."""
     lines[:] = [line.replace("|", r"\|") for line in lines]
-    if what in ("attribute", "property") and any(lines):
-        lines.insert(0, "")
+    if what in ("attribute", "property"):
+        kept[name] = list(lines)
+
+
+def restore_attribute(app: Sphinx, what: str, name: str, one: Any, options: Any, lines: list[str]) -> None:
+    """After Napoleon."""
+    lines[:] = kept.pop(name, lines)
 
 
 def source_with_field_comments(module: str) -> tuple[str | None, str | None]:
@@ -86,7 +92,8 @@ def source_with_field_comments(module: str) -> tuple[str | None, str | None]:
     return path, None if source is None else FIELD.sub(r"\1  #: ", source)
 
 
-FIELD = re.compile(r"^(    \w+: [^#\n]*\S)  # (?!fmt|type)", re.MULTILINE)
+FIELD = re.compile(r"^(    \w+: [^#\n]*\S)  # (?!fmt|type|noqa)", re.MULTILINE)
+kept: dict[str, list[str]] = {}
 module_source = ModuleAnalyzer.get_module_source
 ModuleAnalyzer.get_module_source = staticmethod(source_with_field_comments)  # type: ignore[method-assign]
 
@@ -95,4 +102,5 @@ def setup(app: Sphinx) -> None:
     """Connect the handlers."""
     app.connect("source-read", link_to_pages)
     app.connect("include-read", link_in_included)
-    app.connect("autodoc-process-docstring", protect_docstring, priority=400)  # before Napoleon
+    app.connect("autodoc-process-docstring", keep_attribute, priority=400)  # Napoleon has 500
+    app.connect("autodoc-process-docstring", restore_attribute, priority=600)

@@ -29,6 +29,7 @@ EXIT_CODE = re.compile(r"#.*\bexit code (\d)")
 TIME_TAKEN = re.compile(r"  \d+\.\d s$|computed in \d+\.\d s")
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 LEAST_TOLERANCE = 0.011
+COUNT_TOLERANCE = 0.002
 
 
 @dataclass(frozen=True)
@@ -158,5 +159,6 @@ def same_line(now: str, then: str) -> bool:
 
 
 def last_digit(number: str) -> float:
-    """The tolerance of a number as a page shows it."""
-    return max(1.1 * 10.0 ** -len(number.partition(".")[2]), LEAST_TOLERANCE)
+    """The tolerance of a number as a page shows it; of counts a part, because of objects at the edge of a threshold."""
+    decimals = number.partition(".")[2]
+    return max(1.1 * 10.0 ** -len(decimals), LEAST_TOLERANCE, 0.0 if decimals else COUNT_TOLERANCE * abs(float(number)))

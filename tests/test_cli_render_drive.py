@@ -1,10 +1,6 @@
 """`startrack render --every`: series at rest and drives, their files, and refusals. A small camera keeps it quick."""
 
 import json
-import re
-import shlex
-import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -143,17 +139,3 @@ def test_flags_that_do_not_go_together_exit_with_2(folder, flags):
         render(*flags)
     assert leaving.value.code == 2
     assert sorted(path.name for path in folder.iterdir()) == ["path.csv", "small.toml"]
-
-
-def test_commands_and_code_of_the_page_run(folder):
-    page = (Path(__file__).parent.parent / "docs/track.md").read_text(encoding="utf-8")
-    waypoints, *commands = re.findall(r"^```sh\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)[0].splitlines()
-    subprocess.run(["bash", "-c", waypoints], check=True)
-    for command in commands:
-        words = shlex.split(command, comments=True)
-        assert words[:2] == ["startrack", "render"]
-        render(*words[2:])
-    assert len(list((folder / "drive").glob("*.png"))) == 4
-    assert len(list((folder / "rest").glob("*.png"))) == 12
-    code = next(code for code in re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL))
-    exec(compile(code, "docs/track.md", "exec"), {})

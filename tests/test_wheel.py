@@ -55,6 +55,7 @@ def test_catalogue_cameras_and_terrains_are_inside(wheel):
         assert {f"startrack/data/{kind}/{name}" for name in wanted} <= inside
     sources = {str(path.relative_to(ROOT)) for path in (ROOT / "startrack").rglob("*.py")}
     assert sources <= inside
+    assert "startrack/py.typed" in inside
 
 
 def test_nothing_else_is_inside(wheel):

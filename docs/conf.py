@@ -1,0 +1,106 @@
+"""Settings of the documentation site.
+
+    sphinx-build -W --keep-going docs build/site
+
+The pages are also read on their own, outside the site. Their links to files of the repository become links to the
+pages that include these files (`link_to_pages`, `link_in_included`).
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from sphinx.application import Sphinx
+from sphinx.pycode import ModuleAnalyzer
+
+import startrack
+
+project = "startrack"
+author = "The startrack developers"
+copyright = "The startrack developers. Licence: MIT"
+release = version = startrack.__version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+exclude_patterns = ["images/*"]
+myst_enable_extensions = ["colon_fence", "dollarmath", "attrs_inline"]
+myst_heading_anchors = 3
+suppress_warnings = [
+    "myst.header",  # included parts of README.md begin below the heading of their page
+    "ref.python",  # a type whose short name several packages have is linked to the first
+]
+
+autodoc_default_options = {"members": True, "undoc-members": True, "exclude-members": "from_dict"}
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+napoleon_numpy_docstring = False
+smartquotes = False
+default_role = "code"  # `name` in a docstring
+
+html_theme = "furo"
+html_title = "startrack"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_show_sphinx = False
+html_copy_source = False
+
+PAGES_OF_FILES = {  # file of the repository to the page that includes it
+    "CONVENTIONS.md": "conventions.md",
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
+    "README.md": "index.md",
+    "benchmarks/RESULTS.md": "results.md",
+    "startrack/terrain/protocol.py": "api/terrain.md",
+}
+
+
+def link_to_pages(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Replace a page's links to files outside docs/ by links to their pages."""
+    up = "../" * docname.count("/")
+    for file, page in PAGES_OF_FILES.items():
+        source[0] = source[0].replace(f"]({up}../{file}", f"]({up}{page}")
+
+
+def link_in_included(app: Sphinx, path: Path, docname: str, source: list[str]) -> None:
+    """The same in a file of the repository's root that a page of docs/ includes."""
+    source[0] = source[0].replace("](docs/", "](")
+    for file, page in PAGES_OF_FILES.items():
+        source[0] = source[0].replace(f"]({file}", f"]({page}")
+
+
+def keep_attribute(app: Sphinx, what: str, name: str, one: Any, options: Any, lines: list[str]) -> None:
+    """Before Napoleon: it takes the words before a colon for the type of an attribute. Bars are no references."""
+    lines[:] = [line.replace("|", r"\|") for line in lines]
+    if what in ("attribute", "property"):
+        kept[name] = list(lines)
+
+
+def restore_attribute(app: Sphinx, what: str, name: str, one: Any, options: Any, lines: list[str]) -> None:
+    """After Napoleon."""
+    lines[:] = kept.pop(name, lines)
+
+
+def source_with_field_comments(module: str) -> tuple[str | None, str | None]:
+    """File and source of a module for autodoc, where the comment after a field of a dataclass documents the field."""
+    path, source = module_source(module)
+    if source is None and path is not None:
+        source = Path(path).read_text(encoding="utf-8")
+    return path, None if source is None else FIELD.sub(r"\1  #: ", source)
+
+
+FIELD = re.compile(r"^(    \w+: [^#\n]*\S)  # (?!fmt|type|noqa)", re.MULTILINE)
+kept: dict[str, list[str]] = {}
+module_source = ModuleAnalyzer.get_module_source
+ModuleAnalyzer.get_module_source = staticmethod(source_with_field_comments)  # type: ignore[method-assign]
+
+
+def setup(app: Sphinx) -> None:
+    """Connect the handlers."""
+    app.connect("source-read", link_to_pages)
+    app.connect("include-read", link_in_included)
+    app.connect("autodoc-process-docstring", keep_attribute, priority=400)  # Napoleon has 500
+    app.connect("autodoc-process-docstring", restore_attribute, priority=600)

@@ -1,0 +1,172 @@
+"""Makes the pictures of README.md and docs/ from a sample and from benchmarks/RESULTS.md.
+
+    python docs/make_pictures.py [NAME ...]
+
+Needs the extras `plots` and, for `report`, `browser` with Chromium. The figures of the thesis are made by
+`startrack reproduce` instead.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from PIL import Image
+
+import startrack
+from startrack.types import Array, Evidence
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+from matplotlib.patches import Circle
+
+ROOT = Path(__file__).parent.parent
+IMAGES = ROOT / "docs/images"
+SAMPLE = ROOT / "sample_images/near-wall.png"
+TRUE_M = (-6900.0, 4700.0)  # near-wall.truth.json
+MAX_BYTES = 300_000
+WIDE_LLR = 4.0  # rows of the panel of the whole floor: they decide the sum at distances of hundreds of metres
+NEAR_RAD = np.radians(3.0)  # other rows are the same at every position of the enlarged panel
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+DARK = {"figure.facecolor": "#0c0f16", "axes.facecolor": "#0c0f16", "savefig.facecolor": "#0c0f16",
+        "text.color": "#e8eaf0", "axes.labelcolor": "#c8ccd8", "xtick.color": "#a0a6b4", "ytick.color": "#a0a6b4",
+        "axes.edgecolor": "#58606e", "font.size": 11}  # fmt: skip
+
+
+def make_annotated(solution: Any, folder: Path) -> None:
+    """The annotated picture of the sample."""
+    save_webp(Image.open(folder / "near-wall.annotated.png"), "annotated", width_px=1600)
+
+
+def make_skyline(solution: Any, folder: Path) -> None:
+    """The panorama of the sample."""
+    save_webp(Image.open(folder / "near-wall.skyline.png"), "skyline", width_px=1440)
+
+
+def make_report(solution: Any, folder: Path) -> None:
+    """The HTML page of the sample, as a browser shows it."""
+    from playwright.sync_api import sync_playwright
+
+    from startrack.cli.main import main as command
+
+    if command(["report", str(folder / "near-wall.fix.json")]) != 0:
+        raise SystemExit("the page could not be made")
+    with sync_playwright() as driver:
+        path = next(filter(None, map(shutil.which, BROWSERS)), None)
+        browser = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1200, "height": 900})
+        page.goto((folder / "near-wall.report.html").as_uri())
+        page.wait_for_timeout(1500)
+        page.screenshot(path=folder / "report.png", full_page=True)
+        browser.close()
+    save_webp(Image.open(folder / "report.png"), "report", width_px=1000)
+
+
+def make_posterior(solution: Any, folder: Path) -> None:
+    """Posterior by the stars on the whole floor and enlarged, with the final 95 % circle and the truth."""
+    located, terrain = solution.result, solution.result.terrain
+    rows, middle_m = located.evidence(), np.asarray(located.fix.position_enu_m[:2])
+    radius_m = located.fix.radius95_m
+    horizon = terrain.horizon_rad(middle_m[None], rows.azimuth_rad)
+    near = np.abs(rows.elevation_rad - horizon.ravel()) < NEAR_RAD
+    panels = [
+        ("Whole crater floor", np.zeros(2), 10_000.0, 1e-3, rows.take(np.abs(rows.llr) > WIDE_LLR)),
+        ("Enlarged", middle_m, 4 * radius_m, 1.0, rows.take(near)),
+    ]
+    with plt.rc_context(DARK):
+        figure, all_axes = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained")
+        for axes, (title, centre_m, half_m, scale, used) in zip(all_axes, panels, strict=True):
+            line = np.linspace(-half_m, half_m, 141)
+            points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2) + centre_m
+            inside = np.hypot(*points.T) < 9_990.0
+            log_p = np.full(len(points), np.nan)
+            log_p[inside] = log_posterior(used, terrain, points[inside])
+            log_p -= np.nanmax(log_p)
+            shown = log_p if scale < 1 else np.exp(log_p)
+            extent = np.repeat(centre_m, 2) + half_m * np.array([-1, 1, -1, 1])
+            lowest = np.nanquantile(shown, 0.02)
+            drawn = axes.imshow(
+                shown.reshape(141, 141), origin="lower", extent=extent * scale, cmap="inferno", vmin=lowest,
+            )  # fmt: skip
+            units, density = ("km", "log posterior") if scale < 1 else ("m", "posterior, relative")
+            axes.set(title=title, xlabel=f"east, {units}", ylabel=f"north, {units}")
+            axes.ticklabel_format(useOffset=False)
+            axes.locator_params(nbins=4)
+            figure.colorbar(drawn, ax=axes, fraction=0.046, label=density)
+            axes.plot(TRUE_M[0] * scale, TRUE_M[1] * scale, "+", color="#4fd1c5", ms=14, mew=2, label="true position")
+        circle = Circle(tuple(middle_m), radius_m, fill=False, color="#63b3ed", lw=1.8, label="95 % circle of the fix")
+        all_axes[1].add_patch(circle)
+        all_axes[1].legend(loc="upper right", fontsize=9)
+        save_figure(figure, "posterior")
+
+
+def log_posterior(rows: Evidence, terrain: startrack.Terrain, points_m: Array) -> Array:
+    """Sum of the rows' contributions at the points (n, 2) for a hard skyline; the prior is uniform."""
+    total = np.zeros(len(points_m))
+    for part in np.array_split(np.arange(len(points_m)), max(1, len(points_m) // 500)):
+        horizon = terrain.horizon_rad(points_m[part][:, None], rows.azimuth_rad)
+        total[part] = (rows.elevation_rad > horizon) @ rows.llr
+    return total
+
+
+def make_accuracy(solution: Any, folder: Path) -> None:
+    """Position errors of the methods on the same rendered frames: section Chain of RESULTS.md."""
+    text = (ROOT / "benchmarks/RESULTS.md").read_text(encoding="utf-8")
+    section = text.split("\n## Chain\n")[1].split("\n## ")[0]
+    cells = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")]
+    head = next(k for k, row in enumerate(cells) if row[0] == "position error, m")
+    rows = cells[head + 2 : head + 5]
+    names = [row[0] for row in rows][::-1]
+    mean, median, _, largest = np.array([[float(cell) for cell in row[1:]] for row in rows])[::-1].T
+    figure, axes = plt.subplots(figsize=(8, 2.6), layout="constrained")
+    axes.barh(names, mean, color="#3182ce", height=0.5, label="mean")
+    axes.plot(median, names, "o", color="#ffffff", mec="#1a365d", label="median")
+    axes.plot(largest, names, "|", color="#c05621", ms=18, mew=2.5, label="largest")
+    for name, value in zip(names, largest, strict=True):
+        axes.annotate(f"{value:.0f} m", (value, name), xytext=(8, 0), textcoords="offset points", va="center")
+    axes.set(xscale="log", xlim=(1, 6000), xlabel="position error, m (logarithmic)")
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False)
+    axes.spines[["top", "right"]].set_visible(False)
+    save_figure(figure, "accuracy")
+
+
+def save_webp(image: Image.Image, name: str, width_px: int) -> None:
+    """The image in docs/images/, at the best quality below MAX_BYTES."""
+    image = image.convert("RGB")
+    if image.width > width_px:
+        image = image.resize((width_px, round(image.height * width_px / image.width)), Image.Resampling.LANCZOS)
+    path = IMAGES / f"{name}.webp"
+    for quality in range(90, 20, -5):
+        image.save(path, quality=quality, method=6)
+        if path.stat().st_size < MAX_BYTES:
+            return
+    raise SystemExit(f"{path} is larger than {MAX_BYTES} bytes")
+
+
+def save_figure(figure: Any, name: str) -> None:
+    figure.savefig(IMAGES / f"{name}.png", dpi=110, metadata={"Software": None})
+    plt.close(figure)
+
+
+PICTURES = {
+    "annotated": make_annotated, "skyline": make_skyline, "posterior": make_posterior, "report": make_report,
+    "accuracy": make_accuracy,
+}  # fmt: skip
+
+
+def main() -> None:
+    """Make all pictures, or those named."""
+    solution = startrack.locate(SAMPLE)
+    with tempfile.TemporaryDirectory() as folder:
+        solution.write(folder)
+        for name in sys.argv[1:] or PICTURES:
+            PICTURES[name](solution, Path(folder))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""Writes the tables of docs/formats.md that are made from the code: quantities of the result record, and reasons.
+"""Writes the tables of docs/formats.md and docs/track.md that are made from the code: quantities of the result record, and reasons.
 
     python docs/make_tables.py
 
@@ -12,8 +12,9 @@ from pathlib import Path
 
 from startrack.errors import Reason
 from startrack.output.quantities import QUANTITIES
+from startrack.tracking.quantities import FRAME_QUANTITIES
 
-PAGE = Path(__file__).parent / "formats.md"
+PAGES = [Path(__file__).parent / name for name in ("formats.md", "track.md")]
 
 
 def quantity_table() -> str:
@@ -24,6 +25,12 @@ def quantity_table() -> str:
     return "\n".join(["| key | unit | meaning |", "| --- | --- | --- |", *rows])
 
 
+def track_table() -> str:
+    """Columns of track.ecsv with unit and meaning."""
+    rows = [f"| `{one.key}` | {one.unit} | {one.description} |" for one in FRAME_QUANTITIES]
+    return "\n".join(["| column | unit | meaning |", "| --- | --- | --- |", *rows])
+
+
 def reason_table() -> str:
     """Reasons with their exit codes and meanings."""
     rows = [f"| `{one.value}` | {one.exit_code} | {one.meaning} |" for one in Reason]
@@ -32,9 +39,9 @@ def reason_table() -> str:
 
 def page_with_tables(text: str) -> str:
     """The page `text` with its tables as the code has them."""
-    tables = {"quantities": quantity_table(), "reasons": reason_table()}
+    tables = {"quantities": quantity_table(), "reasons": reason_table(), "track": track_table()}
     return re.sub(
-        r"(<!-- table (\w+) -->\n).*?(\n<!-- end -->)",
+        r"(<!-- table (\w+) -->\n).*?(\n?<!-- end -->)",
         lambda found: found[1] + tables[found[2]] + found[3],
         text,
         flags=re.DOTALL,
@@ -42,4 +49,5 @@ def page_with_tables(text: str) -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page_with_tables(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    for page in PAGES:
+        page.write_text(page_with_tables(page.read_text(encoding="utf-8")), encoding="utf-8")

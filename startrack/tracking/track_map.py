@@ -14,6 +14,7 @@ from startrack.output.picture.canvas import (
     Box,
     Canvas,
     Colour,
+    box_around,
     mix_colours,
 )
 from startrack.output.picture.maps import CAPTION_SIZE, MapView, draw_frame, draw_ground, ellipse_m, map_view, nice_step
@@ -27,6 +28,7 @@ ODOMETRY, REFUSED, LEFT_OUT, SLIP = YELLOW, REDDISH_PURPLE, REDDISH_PURPLE, YELL
 SIGMAS_95 = float(np.sqrt(-2.0 * np.log(0.05)))  # half axes of the ellipse that holds 95 % of a Gaussian
 SEEN_PX = 14.0  # half of the longer axis that the median ellipse has at least
 SMALLEST_HALF_M = 0.05
+TRACK_PX = 12.0  # half of the room that the track takes
 REST_WIDEST = 25.0  # the map of a camera at rest, in half axes of the last ellipse
 
 
@@ -35,6 +37,10 @@ def draw_track_map(canvas: Canvas, box: Box, track: Track, odometry_m: Array | N
     view = map_view(box, *track_extent(track, odometry_m))
     window = canvas.window(box)
     draw_ground(window, view, track.terrain)
+    north = box[2] - 30.0, box[1] + 26.0
+    canvas.reserve(box_around(north, 40.0))
+    for place in () if track.at_rest else view.canvas_px(known_points(track.smoothed.position_enu_m[:, :2])):
+        canvas.reserve(box_around(place, TRACK_PX))  # heights of contours keep clear of it
     step_m = None
     if track.terrain.rim_radius_m is None:
         size = window.size[1], window.size[0]
@@ -44,7 +50,7 @@ def draw_track_map(canvas: Canvas, box: Box, track: Track, odometry_m: Array | N
     else:
         legend = _draw_drive(canvas, window, view, track, odometry_m)
     draw_frame(canvas, view, "" if step_m is None else f"contours each {step_m:g} m, heights above the origin")
-    _draw_north(canvas, box)
+    _draw_north(canvas, *north)
     return view, legend
 
 
@@ -89,22 +95,23 @@ def _draw_drive(canvas: Canvas, window: Canvas, view: MapView, track: Track, odo
     enlarged = f", enlarged {times:g} times" if times > 1 else ""
     legend += [("ring", POSITION, f"95 % ellipse of it{enlarged}")]
     if odometry_m is not None:
-        window.line(view.canvas_px(_known(odometry_m)), ODOMETRY, 2)
+        window.line(view.canvas_px(known_points(odometry_m)), ODOMETRY, 2)
         legend += [("line", ODOMETRY, "odometry alone")]
-    smoothed = _known(track.smoothed.position_enu_m[:, :2])
+    smoothed = known_points(track.smoothed.position_enu_m[:, :2])
     if len(smoothed) > 1:
         window.curve(view.canvas_px(smoothed), POSITION, 3.0)
-    for place in view.canvas_px(_known(track.filtered.position_enu_m[:, :2])):
+    for place in view.canvas_px(known_points(track.filtered.position_enu_m[:, :2])):
         window.circle(place, 3.2 if len(smoothed) < 200 else 2.0, SKY_BLUE, -1)
     legend += [("dot", SKY_BLUE, "filtered: by the frames up to each")]
     legend += _draw_not_used(window, view, track)
     for word, place in zip(("start", "end"), view.canvas_px(smoothed[[0, -1]]) if len(smoothed) > 1 else (), strict=False):
         window.circle(place, 7.0, INK, 2)
-        canvas.label(place, word, CAPTION_SIZE, INK, 14.0, view.box)
+        canvas.text(place + [14.0, 0.0], word, CAPTION_SIZE, INK, "lm", halo=True)
     return legend
 
 
-def _known(points_m: Array) -> Array:
+def known_points(points_m: Array) -> Array:
+    """The points (n, 2) that are known."""
     return points_m[np.isfinite(points_m).all(axis=1)]
 
 
@@ -171,8 +178,7 @@ def _draw_rest(canvas: Canvas, window: Canvas, view: MapView, track: Track) -> L
     ]
 
 
-def _draw_north(canvas: Canvas, box: Box) -> None:
-    """An arrow to the north, in the upper right corner of the map."""
-    x, y = box[2] - 30.0, box[1] + 26.0
+def _draw_north(canvas: Canvas, x: float, y: float) -> None:
+    """An arrow to the north about (x, y)."""
     canvas.area([(x, y - 12), (x + 8, y + 16), (x, y + 9), (x - 8, y + 16)], INK)
     canvas.text((x, y + 36), "N", CAPTION_SIZE, INK, "ms", halo=True)

@@ -168,22 +168,27 @@ def _round_values(values: Array, decimals: int) -> list[float]:
     return [round(value, decimals) for value in values.tolist()]
 
 
-def ground_map(terrain: Terrain) -> dict[str, Any]:
-    """`search_m`, the radius of the search area; of a cylinder `rim_m`, else `relief` with its `half_m`."""
+def ground_map(
+    terrain: Terrain, centre_m: tuple[float, float] = (0.0, 0.0), half_m: float | None = None
+) -> dict[str, Any]:
+    """`search_m`, the radius of the search area; of a cylinder `rim_m`, else `relief` with its `half_m` and centre.
+
+    The relief shows `half_m` east and north of `centre_m`; None: all of the search area.
+    """
     shape: dict[str, Any] = {
         "search_m": terrain.search_radius_m,
         "site": terrain.site.body if terrain.site is not None else None,
     }
     if terrain.rim_radius_m is not None:
         return {**shape, "rim_m": terrain.rim_radius_m}
-    half_m = MARGIN * terrain.reach_m
-    return {**shape, "half_m": half_m, "relief": _relief(terrain, half_m)}
+    half_m = MARGIN * terrain.reach_m if half_m is None else half_m
+    return {**shape, "half_m": half_m, "centre_m": list(centre_m), "relief": _relief(terrain, centre_m, half_m)}
 
 
-def _relief(terrain: Terrain, half_m: float) -> str:
+def _relief(terrain: Terrain, centre_m: tuple[float, float], half_m: float) -> str:
     """The ground's shape, lit from the north-west as maps are; see-through where a camera cannot stand."""
     halves_m, shape = (half_m, half_m), (RELIEF_CELLS, RELIEF_CELLS)
-    ground_m, known = ground_cells(terrain, halves_m, shape)
+    ground_m, known = ground_cells(terrain, halves_m, shape, centre_m)
     grey = np.rint(BRIGHTEST * hill_shading(ground_m, known, halves_m)).astype(np.uint8)
     cover = np.rint(255 * edge_cover(known, shape)).astype(np.uint8)
     return data_uri(np.stack([grey, grey, grey, cover], axis=-1))

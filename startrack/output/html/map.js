@@ -22,7 +22,8 @@ function drawGroundMap(v, g, name) {
     g.arc(x, y, radius * v.perX * v.zoom, 0, 2 * Math.PI);
   };
   if (relief?.complete) {
-    const [left, top] = v.screen(-terrain.half_m, terrain.half_m);
+    const [east, north] = terrain.centre_m;
+    const [left, top] = v.screen(east - terrain.half_m, north + terrain.half_m);
     const side = 2 * terrain.half_m * v.perX * v.zoom;
     g.globalAlpha = 0.75;
     g.drawImage(relief, left, top, side, side);

@@ -199,7 +199,8 @@ function ring(g, [x, y], radius, stroke, width) {
 function ticks(view, axis) {
   const [a, b] = [view.pointAt(view.box[0], view.box[3])[axis], view.pointAt(view.box[2], view.box[1])[axis]];
   const pixels = axis ? view.box[3] - view.box[1] : view.box[2] - view.box[0];
-  if (view.axes.fixed) return [view.axes.fixed.filter((value) => value >= Math.min(a, b) && value <= Math.max(a, b)), 1];
+  const fixed = axis ? view.axes.fixedY || view.axes.fixed : view.axes.fixed;
+  if (fixed) return [fixed.filter((value) => value >= Math.min(a, b) && value <= Math.max(a, b)), view.axes.fixed ? 1 : null];
   const given = axis ? view.axes.steps?.[1] : view.axes.steps?.[0];
   const stepOf = (gap) => {
     const least = (Math.abs(b - a) / pixels) * gap;

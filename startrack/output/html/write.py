@@ -101,18 +101,25 @@ def page_text(
         "terrains": _terrains(found, terrains),
     }
     title = f"{found[0].record['image']} · startrack" if head["single"] else f"{len(found):,} images · startrack"
-    frame = (HERE / "page.html").read_text(encoding="utf-8")
-    data = [
-        _script_of_data("results", head),
-        *(_script_of_data(f"detail-{k}", detail) for k, detail in details.items()),
-    ]
+    data = {"results": head, **{f"detail-{k}": detail for k, detail in details.items()}}
+    return filled_frame(title, data, SCRIPTS)
+
+
+def filled_frame(
+    title: str, data: Mapping[str, Any], scripts: Sequence[str], *, style: str = "", script: str = ""
+) -> str:
+    """A page with a `title`, the `data` by their names, the style, and those of this room's `scripts` that it needs.
+
+    `style` and `script` are texts that follow those of this room.
+    """
     parts = {
         "TITLE": html.escape(title),
-        "STYLE": "".join((HERE / name).read_text(encoding="utf-8") for name in STYLES),
-        "DATA": "\n".join(data),
-        "SCRIPT": "".join((HERE / name).read_text(encoding="utf-8") for name in SCRIPTS),
+        "STYLE": "".join((HERE / name).read_text(encoding="utf-8") for name in STYLES) + style,
+        "DATA": "\n".join(_script_of_data(name, value) for name, value in data.items()),
+        "SCRIPT": "".join((HERE / name).read_text(encoding="utf-8") for name in scripts) + script,
     }
-    pieces = frame.split("@@")  # never replaced twice: a result may hold any text
+    # Never replaced twice: a result may hold any text.
+    pieces = (HERE / "page.html").read_text(encoding="utf-8").split("@@")
     return "".join(parts.get(piece, piece) for piece in pieces)
 
 

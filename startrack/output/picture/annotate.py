@@ -70,7 +70,7 @@ def draw_panel(canvas: Canvas, left: int, outcome: Outcome, truth_enu_m: tuple[f
         canvas.line([(left, legend_top), (right, legend_top)], FAINT_INK)
     for row, (kind, colour, text) in enumerate(legend):
         y = legend_top + 14 + LEGEND_STEP * (row + 1)
-        _draw_legend_sample(canvas, left + 12, y - 6, kind, colour)
+        draw_legend_sample(canvas, left + 12, y - 6, kind, colour)
         canvas.text((left + 36, y), text, 17.0, DIM_INK)
 
 
@@ -170,7 +170,8 @@ def _legend(value: Inputs, truth: bool) -> list[tuple[str, Colour, str]]:
     return found
 
 
-def _draw_legend_sample(canvas: Canvas, x: float, y: float, kind: str, colour: Colour) -> None:
+def draw_legend_sample(canvas: Canvas, x: float, y: float, kind: str, colour: Colour) -> None:
+    """A mark of a legend about (x, y): a ring, cross, line, dot, plus or disc."""
     if kind == "ring":
         canvas.circle((x, y), 7.0, colour, 2)
     elif kind == "cross":

@@ -68,16 +68,7 @@ def draw_overview(
     rim = terrain.rim_radius_m or 0.0
     view = map_view(box, (0.0, 0.0), 1.07 * max(min(terrain.search_radius_m, terrain.reach_m), rim))
     window = canvas.window(box)
-    window.rectangle(box, MAP)
-    if rim:
-        window.circle(view.middle, rim / view.metres_per_px, FLOOR, -1)
-    else:
-        draw_relief(window, view, *ground_of_view(view, terrain, (window.size[1], window.size[0])))
-    _draw_grid(window, view)
-    if rim:
-        window.circle(view.middle, rim / view.metres_per_px, DIM_INK, 2)
-    if abs(terrain.search_radius_m - rim) > 0.01 * rim:
-        window.dashes(view.canvas_px(_ring((0.0, 0.0), terrain.search_radius_m)), DIM_INK)
+    draw_ground(window, view, terrain)
     if truth is not None:
         window.plus(view.canvas_px(truth), 9.0, TRUTH, 2)
     if fix is not None:
@@ -87,8 +78,31 @@ def draw_overview(
             window.circle(position, 9.0, POSITION, 2)
             if ambiguous:
                 canvas.label(position, f"{k + 1}: {100 * mode.weight:.0f} %", CAPTION_SIZE, INK, 14.0, box)
-    _draw_frame(canvas, view, "search area, north up")
+    draw_frame(canvas, view, "search area, north up")
     return view
+
+
+def draw_ground(window: Canvas, view: MapView, terrain: Terrain) -> None:
+    """The shape of the ground, or the rim of a cylinder; the search area (dashed) and a grid."""
+    rim = terrain.rim_radius_m or 0.0
+    window.rectangle(view.box, MAP)
+    if rim:
+        _draw_floor(window, view, rim)
+    else:
+        draw_relief(window, view, *ground_of_view(view, terrain, (window.size[1], window.size[0])))
+    _draw_grid(window, view)
+    if rim:
+        window.circle(view.canvas_px((0.0, 0.0)), rim / view.metres_per_px, DIM_INK, 2)
+    if abs(terrain.search_radius_m - rim) > 0.01 * rim:
+        window.dashes(view.canvas_px(_ring((0.0, 0.0), terrain.search_radius_m)), DIM_INK)
+
+
+def _draw_floor(window: Canvas, view: MapView, radius_m: float) -> None:
+    """The floor within a rim of `radius_m` about the origin; all of a map that ends within it."""
+    if float(np.linalg.norm(np.abs(view.centre_m) + view.half_m)) < radius_m:
+        window.rectangle(view.box, FLOOR)
+    else:
+        window.circle(view.canvas_px((0.0, 0.0)), radius_m / view.metres_per_px, FLOOR, -1)
 
 
 def draw_zoom(canvas: Canvas, box: Box, fix: Fix, truth: ArrayLike | None) -> MapView:
@@ -101,7 +115,7 @@ def draw_zoom(canvas: Canvas, box: Box, fix: Fix, truth: ArrayLike | None) -> Ma
     window = canvas.window(box)
     window.rectangle(box, MAP)
     _draw_grid(window, view)
-    ellipse = view.canvas_px(_ellipse(position, fix.covariance_m2))
+    ellipse = view.canvas_px(ellipse_m(position, fix.covariance_m2))
     window.area(ellipse, mix_colours(MAP, POSITION, 0.35))
     window.line(ellipse, mix_colours(MAP, POSITION, 0.8))
     window.circle(view.canvas_px(position), fix.radius95_m / view.metres_per_px, POSITION, 2)
@@ -109,7 +123,7 @@ def draw_zoom(canvas: Canvas, box: Box, fix: Fix, truth: ArrayLike | None) -> Ma
     if truth is not None and bool(np.all(np.abs(np.subtract(truth, position)) < view.half_m)):
         window.plus(view.canvas_px(truth), 9.0, TRUTH, 2)
         canvas.label(view.canvas_px(truth), "truth", CAPTION_SIZE, TRUTH, 14.0, box)
-    _draw_frame(canvas, view, f"95 % within {fix.radius95_m:.3g} m")
+    draw_frame(canvas, view, f"95 % within {fix.radius95_m:.3g} m")
     return view
 
 
@@ -138,7 +152,8 @@ def _ring(centre_m: tuple[float, float], radius_m: float) -> Array:
     return np.asarray(centre_m) + radius_m * np.stack([np.sin(CIRCLE_RAD), np.cos(CIRCLE_RAD)], axis=-1)
 
 
-def _ellipse(centre_m: tuple[float, float], covariance_m2: Array) -> Array:
+def ellipse_m(centre_m: tuple[float, float], covariance_m2: Array) -> Array:
+    """Points (n, 2) of the ellipse of one sigma."""
     lengths, axes = np.linalg.eigh(covariance_m2)
     half_m = np.sqrt(np.maximum(lengths, 0.0))
     return np.asarray(centre_m) + (_ring((0.0, 0.0), 1.0) * half_m) @ axes.T
@@ -160,7 +175,7 @@ def _draw_grid(window: Canvas, view: MapView) -> None:
             window.line(view.canvas_px(ends), GRID)
 
 
-def _draw_frame(canvas: Canvas, view: MapView, caption: str) -> None:
+def draw_frame(canvas: Canvas, view: MapView, caption: str) -> None:
     """Frame, caption and scale bar."""
     left, top, right, bottom = view.box
     canvas.rectangle(view.box, FAINT_INK, 1)

@@ -28,13 +28,16 @@ TRIED = 60  # places along a contour
 
 def ground_of_view(view: MapView, terrain: Terrain, shape: tuple[int, int]) -> tuple[Image, Bools]:
     """Heights [m] of the cells of a map that is `shape` (H, W) pixels large, and where there is ground."""
-    return ground_cells(terrain, view.half_m, tuple(max(2, n // CELL_PX) for n in shape))  # type: ignore[arg-type]
+    cells = max(2, shape[0] // CELL_PX), max(2, shape[1] // CELL_PX)
+    return ground_cells(terrain, view.half_m, cells, view.centre_m)
 
 
-def ground_cells(terrain: Terrain, half_m: ArrayLike, shape: tuple[int, int]) -> tuple[Image, Bools]:
-    """Heights [m] (H, W) within `half_m` east and north of the origin, north up, and where there is ground."""
+def ground_cells(
+    terrain: Terrain, half_m: ArrayLike, shape: tuple[int, int], centre_m: tuple[float, float] = (0.0, 0.0)
+) -> tuple[Image, Bools]:
+    """Heights [m] (H, W) within `half_m` east and north of the centre, north up, and where there is ground."""
     x, y = (np.linspace(-half, half, n) for half, n in zip(np.asarray(half_m), shape[::-1], strict=True))
-    points_m = np.stack(np.meshgrid(x, y[::-1]), axis=-1).reshape(-1, 2)
+    points_m = np.stack(np.meshgrid(x, y[::-1]), axis=-1).reshape(-1, 2) + np.asarray(centre_m)
     known = np.asarray(terrain.allowed(points_m), dtype=bool)
     ground_m = np.zeros(len(known), dtype=np.float32)
     ground_m[known] = terrain.ground_m(points_m[known])

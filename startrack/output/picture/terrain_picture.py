@@ -25,7 +25,7 @@ def relief_picture(terrain: Terrain, position_m: tuple[float, float] | None = No
         canvas.circle(view.canvas_px(position_m), 6.0, POSITION, -1)
         canvas.circle(view.canvas_px(position_m), 11.0, POSITION, 2)
         canvas.reserve(box_around(view.canvas_px(position_m), 14.0))
-    _draw_distances(canvas, view)
+    draw_distances(canvas, view)
     if terrain.rim_radius_m is None:
         window = canvas.window(box)
         step_m = draw_contours(canvas, window, view, *ground_of_view(view, terrain, (window.size[1], window.size[0])))
@@ -35,7 +35,7 @@ def relief_picture(terrain: Terrain, position_m: tuple[float, float] | None = No
     return canvas.rendered_pixels()
 
 
-def _draw_distances(canvas: Canvas, view: MapView) -> None:
+def draw_distances(canvas: Canvas, view: MapView) -> None:
     """East and north of the grid's lines, outside of the map."""
     left, _, right, bottom = view.box
     unit, metres = ("km", 1000.0) if float(view.half_m.min()) >= 2000.0 else ("m", 1.0)

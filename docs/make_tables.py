@@ -1,4 +1,4 @@
-"""Writes the tables of docs/formats.md and docs/track.md that are made from the code: quantities of the result record, and reasons.
+"""Writes the tables of docs/formats.md and docs/track.md that are made from the code: quantities and reasons.
 
     python docs/make_tables.py
 

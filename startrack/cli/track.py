@@ -240,7 +240,19 @@ class _Run:
         write_track(track, Path(args.dir), odometry=odometry, pictures=made)
 
     def _pictures(self, track: Track) -> dict[str, bytes]:
-        return {}
+        from startrack.output.write import png_bytes
+        from startrack.tracking.page import track_page
+        from startrack.tracking.picture import draw_track
+
+        args, moves_m = self.args, None
+        if args.odometry is not None and not args.at_rest:
+            moves_m = self.session.odometry_positions_m(
+                track, self._odometry(), odometry_sigma=args.odometry_sigma, odometry_floor_m=args.odometry_floor
+            )
+        picture = png_bytes(draw_track(track, moves_m))
+        title = f"Track of {Path(args.frames[0]).resolve().name}"
+        page = track_page(track, picture, title=title, odometry_m=moves_m)
+        return {"track.png": picture, "track.html": page.encode()}
 
     def _print_frames(self, track: Track) -> None:
         from startrack.tracking.quantities import frame_records

@@ -66,12 +66,17 @@ def _facts(track: Track) -> list[str]:
     )
     lines = [f"{len(statuses)} frames: {counts}"]
     if statuses:
-        lines.append(f"{track.frames[0].time_utc:%Y-%m-%d %H:%M:%S} to {track.frames[-1].time_utc:%Y-%m-%d %H:%M:%S} UTC")
+        lines.append(
+            f"{track.frames[0].time_utc:%Y-%m-%d %H:%M:%S} to {track.frames[-1].time_utc:%Y-%m-%d %H:%M:%S} UTC"
+        )
     radius_m = radius_holding(track.smoothed.covariance_m2, 0.95)
     known = np.flatnonzero(np.isfinite(radius_m))
     if len(known):
         east_m, north_m, _ = track.smoothed.position_enu_m[known[-1]]
-        lines += [f"last position: E {east_m:.1f} m  N {north_m:.1f} m", f"95 % within {radius_m[known[-1]]:.2g} m of it"]
+        lines += [
+            f"last position: E {east_m:.1f} m  N {north_m:.1f} m",
+            f"95 % within {radius_m[known[-1]]:.2g} m of it",
+        ]
     if len(known) > 1 and not track.at_rest:
         lines.append(f"95 % radius of all, smoothed: median {np.median(radius_m[known]):.2g} m")
     if track.slipped.any():

@@ -31,7 +31,7 @@ from startrack.tracking.track import (
 
 if TYPE_CHECKING:
     from startrack.terrain import Terrain
-    from startrack.types import Exposure
+    from startrack.types import Array, Exposure
 
 
 @dataclass
@@ -96,6 +96,18 @@ class TrackSession:
             frames, self.terrain, self.shared, odometry=odometry, odometry_sigma=odometry_sigma,
             odometry_floor_m=odometry_floor_m, at_rest=at_rest,
         )  # fmt: skip
+
+    def odometry_positions_m(
+        self, track: Track, odometry: Odometry | None, *, odometry_sigma: float, odometry_floor_m: float
+    ) -> Array:
+        """Positions (n, 2) [m] of the frames of a `track` by odometry alone, from the first smoothed position.
+
+        Arguments as of `estimate`. Not a number where no move is known.
+        """
+        steps = odometry_steps(self.frames[: len(track.frames)], odometry, odometry_sigma, odometry_floor_m)
+        move_m = np.where(np.isfinite(steps.sigma_m)[:, None], steps.move_m, np.nan)
+        first_m = track.smoothed.position_enu_m[:1, :2]
+        return np.concatenate([first_m, first_m + np.cumsum(move_m, axis=0)])
 
     def newest(
         self, odometry: Odometry | None, *, odometry_sigma: float, odometry_floor_m: float, at_rest: bool

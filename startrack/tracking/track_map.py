@@ -67,7 +67,9 @@ def track_extent(track: Track, odometry_m: Array | None = None) -> tuple[tuple[f
     axis = half_axes_95_m(track.smoothed.covariance_m2)
     widest = float(axis[np.isfinite(axis)].max(initial=SMALLEST_HALF_M))
     east, north = 0.5 * (low + high)
-    return (float(east), float(north)), max(0.57 * float((high - low).max()), 0.5 * float((high - low).max()) + 1.3 * widest)
+    return (float(east), float(north)), max(
+        0.57 * float((high - low).max()), 0.5 * float((high - low).max()) + 1.3 * widest
+    )
 
 
 def _rest_extent(track: Track) -> tuple[tuple[float, float], float]:
@@ -104,7 +106,9 @@ def _draw_drive(canvas: Canvas, window: Canvas, view: MapView, track: Track, odo
         window.circle(place, 3.2 if len(smoothed) < 200 else 2.0, SKY_BLUE, -1)
     legend += [("dot", SKY_BLUE, "filtered: by the frames up to each")]
     legend += _draw_not_used(window, view, track)
-    for word, place in zip(("start", "end"), view.canvas_px(smoothed[[0, -1]]) if len(smoothed) > 1 else (), strict=False):
+    for word, place in zip(
+        ("start", "end"), view.canvas_px(smoothed[[0, -1]]) if len(smoothed) > 1 else (), strict=False
+    ):
         window.circle(place, 7.0, INK, 2)
         canvas.text(place + [14.0, 0.0], word, CAPTION_SIZE, INK, "lm", halo=True)
     return legend

@@ -6,6 +6,8 @@ import time as clock
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from startrack.camera import Camera
 from startrack.detection import find_damage
 from startrack.frames import Site
@@ -74,25 +76,38 @@ def locate(
 
 
 def _check_and_refine(located: Located, settings: Settings) -> Located:
-    """The fix, checked, and refined by the light of the sky; in a crater of another depth where that shows one."""
+    """The fix, checked, and refined by the light of the sky; with another depth where that and the stars agree on it."""
     try:
         return _refine_checked(located, settings)
     except OtherDepth as shown:
+        if not _stars_allow_depth(located, shown.steeper, settings):
+            return _refine_checked(located, settings, depth_is_right=True)
         located = replace(located, terrain=shown.terrain, steeper=shown.steeper)
-        return _refine_checked(fix_by_stars(located, Located, settings.localizer), settings)
+        located = fix_by_stars(located, Located, settings.localizer)
+        return _refine_checked(located, settings, depth_is_right=True)
 
 
-def _refine_checked(located: Located, settings: Settings) -> Located:
-    """Raises NotLocated where the rays contradict the fix, and OtherDepth."""
-    if settings.evidence_sources == "stars":
-        check_fix(located)
-        return located
+def _refine_checked(located: Located, settings: Settings, depth_is_right: bool = False) -> Located:
+    """Raises NotLocated where the rays contradict the fix, and, unless `depth_is_right`, OtherDepth."""
     try:
         check_fix(located)
     except NotLocated:
-        check_depth(located)
+        if settings.evidence_sources != "stars" and not depth_is_right:
+            check_depth(located)
         raise
-    return refine_by_sky_light(located, settings.evidence_sources == "both")
+    if settings.evidence_sources == "stars":
+        return located
+    return refine_by_sky_light(located, settings.evidence_sources == "both", depth_is_right)
+
+
+def _stars_allow_depth(located: Located, steeper: float, settings: Settings) -> bool:
+    """Whether the stars do not contradict a crater that is deeper by a part; a second skyline shows one to the light."""
+    deeper = replace(located, terrain=located.terrain.reshaped(np.array([steeper, 0.0])))
+    try:
+        check_fix(fix_by_stars(deeper, Located, settings.localizer))
+    except NotLocated:
+        return False
+    return True
 
 
 def _sky_step(run: Run, located: Located) -> SkyStep | None:

@@ -56,12 +56,12 @@ class NoSkyLight(Exception):
     """The light of the sky cannot refine the fix; the message has the reason."""
 
 
-def refine_by_sky_light(located: Located, stars: bool = True) -> Located:
+def refine_by_sky_light(located: Located, stars: bool = True, depth_is_right: bool = False) -> Located:
     """`located` with its fix by the stars refined; as it was, with the reason, where the sky's light cannot refine it.
 
     With `stars` their rows stay in the posterior, otherwise the sky's light alone determines it: then raises NotLocated
     (insufficient_geometry) where it cannot. Raises NotLocated (inconsistent_evidence) where the light of the sky shows
-    another time than the one stated, and OtherDepth where it shows a crater deeper or less deep than stated.
+    another time than the one stated, and, unless `depth_is_right`, OtherDepth where it shows a crater deeper or less deep than stated.
     """
     try:
         if located.damage is not None and not located.damage.has_levels:
@@ -69,7 +69,7 @@ def refine_by_sky_light(located: Located, stars: bool = True) -> Located:
         _require_refinable(located.fix)
         if not located.terrain.axisymmetric:
             _check_clock(located)
-        return _refine(located, stars)
+        return _refine(located, stars, depth_is_right)
     except WrongTime:
         raise
     except (NoSkyLight, NotLocated) as cause:
@@ -109,7 +109,7 @@ def check_depth(located: Located, there: tuple[Array, SkyLight] | None = None) -
     `there`: position (2,) and light of the skyline by the stated depth; None where that fails, or is not known.
     """
     terrain, fix = located.terrain, located.fix_at_time
-    if not isinstance(terrain, Cylinder) or located.steeper:
+    if not isinstance(terrain, Cylinder):
         return
     free = replace(located, terrain=replace(terrain, depth_sigma_m=FREE_STEEPNESS * terrain.depth_m))
     try:
@@ -125,7 +125,7 @@ def check_depth(located: Located, there: tuple[Array, SkyLight] | None = None) -
         raise OtherDepth(replace(terrain, depth_sigma_m=abs(steeper) * terrain.depth_m), steeper)
 
 
-def _refine(located: Located, stars: bool) -> Located:
+def _refine(located: Located, stars: bool, depth_is_right: bool) -> Located:
     """`located` refined. Raises NoSkyLight, and NotLocated as `refine_fix` does."""
     terrain, by_arc = located.terrain, located.terrain.axisymmetric
     fix = located.fix_at_time if by_arc else located.fix
@@ -133,9 +133,11 @@ def _refine(located: Located, stars: bool) -> Located:
     try:
         position, sky, fit, there = _settle(located, fix, clock_sigma_s)
     except NoSkyLight:
-        check_depth(located)
+        if not depth_is_right:
+            check_depth(located)
         raise
-    check_depth(there, (position, sky))
+    if not depth_is_right:
+        check_depth(there, (position, sky))
     excess = fit.excess
     if not stars:  # the errors that all rows share, without the stars' position
         fix = _widened(fix)

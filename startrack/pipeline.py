@@ -76,7 +76,7 @@ def locate(
 
 
 def _check_and_refine(located: Located, settings: Settings) -> Located:
-    """The fix, checked, and refined by the light of the sky; with another depth where that and the stars agree on it."""
+    """The fix, checked, and refined by the light of the sky; of another depth where that and the stars agree."""
     try:
         return _refine_checked(located, settings)
     except OtherDepth as shown:
@@ -101,7 +101,7 @@ def _refine_checked(located: Located, settings: Settings, depth_is_right: bool =
 
 
 def _stars_allow_depth(located: Located, steeper: float, settings: Settings) -> bool:
-    """Whether the stars do not contradict a crater that is deeper by a part; a second skyline shows one to the light."""
+    """Whether the stars do not contradict a crater deeper by a part: a second skyline shows one to the light alone."""
     deeper = replace(located, terrain=located.terrain.reshaped(np.array([steeper, 0.0])))
     try:
         check_fix(fix_by_stars(deeper, Located, settings.localizer))

@@ -220,3 +220,72 @@ def test_a_circle_holds_its_part_of_a_gaussian():
         assert np.mean(np.hypot(*draws.T) < r) == pytest.approx(0.95, abs=0.002)
     assert radius[2] == pytest.approx(100 * 1.95996, rel=1e-3)
     assert radius_holding(np.full((1, 2, 2), np.inf), 0.95)[0] == np.inf
+
+
+def dark(image, out):
+    """Write a dark frame of the size of an `image` to `out`, with its sidecar."""
+    import cv2
+
+    cv2.imwrite(str(out), np.full(cv2.imread(str(image), -1).shape[:2], 100, np.uint16))
+    shutil.copy(image.with_suffix(".json"), out.with_suffix(".json"))
+
+
+def test_a_track_without_a_position_names_why(drive, tmp_path, capsys):
+    (tmp_path / "frames").mkdir()
+    shutil.copy(drive / "small.toml", tmp_path)
+    image = min((drive / "frames").glob("*.png"))
+    dark(image, tmp_path / "frames" / image.name)
+    assert run(tmp_path / "frames", "-D", tmp_path / "out") == 3
+    assert "no_stars" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "track.json").exists()
+    assert run("--follow", tmp_path / "frames", "-D", tmp_path / "live", "--until-idle", "1") == 3
+    assert "refused  no position  no_stars" in capsys.readouterr().out
+
+
+def test_an_image_counts_once(drive, tmp_path, capsys):
+    image = min((drive / "frames").glob("*.png"))
+    assert run(image, image, "-D", tmp_path / "out") == 4
+    assert "a track takes an image once" in capsys.readouterr().err
+    assert json.loads((tmp_path / "out" / "track.json").read_text())["counts"]["frames"] == 1
+
+
+def test_images_of_another_camera_are_refused(drive, tmp_path, capsys):
+    frames = tmp_path / "frames"
+    shutil.copytree(drive / "frames", frames)
+    shutil.copy(drive / "small.toml", tmp_path / "small.toml")
+    shutil.copy(drive / "small.toml", tmp_path / "other.toml")
+    sidecar = max(path for path in frames.glob("*.json") if ".truth" not in path.name)
+    sidecar.write_text(json.dumps({**json.loads(sidecar.read_text()), "camera": "../other.toml"}))
+    assert run(frames, "-D", tmp_path / "out", "-q") == 4
+    assert "bad_calibration" in capsys.readouterr().err
+    assert json.loads((tmp_path / "out" / "track.json").read_text())["counts"]["frames"] == FRAMES - 1
+
+
+def test_followed_images_wait_for_their_odometry(drive, tmp_path):
+    live, growing = tmp_path / "live", tmp_path / "odometry.tum"
+    live.mkdir()
+    shutil.copy(drive / "small.toml", tmp_path)
+    images = sorted((drive / "frames").glob("*.png"))[:3]
+    lines = (drive / "frames" / "odometry.tum").read_text().splitlines(keepends=True)
+    poses = [line for line in lines if not line.startswith("#")]
+    growing.write_text("".join(poses[:2]))
+    for image in images:
+        shutil.copy(image.with_suffix(".json"), live)
+        shutil.copy(image, live)
+    command = [
+        sys.executable, "-m", "startrack", "track", "--follow", str(live), "-D", str(tmp_path / "out"), "--until-idle",
+        "60", "--odometry", str(growing), "--no-plots",
+    ]  # fmt: skip
+    running = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert [running.stdout.readline().split("  ")[1] for _ in range(2)] == ["used", "used"]
+        growing.write_text("".join(poses[:3])[:-30])  # a line that is being written
+        time.sleep(0.3)
+        growing.write_text("".join(poses[:3]))
+        assert running.stdout.readline().startswith(images[2].stem)
+        running.terminate()
+        rest, _ = running.communicate(timeout=60)
+    finally:
+        running.kill()
+    assert running.returncode == 0
+    assert "3 used" in rest

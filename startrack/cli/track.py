@@ -16,7 +16,7 @@ from startrack.cli.common import EVIDENCE_SOURCES, add_fact_flags, add_output_fl
 from startrack.cli.flag_types import amount, seconds
 from startrack.cli.preparation import prepare_reference
 from startrack.cli.progress import progress
-from startrack.errors import BadInput, exit_code_of
+from startrack.errors import EXIT_BAD_INPUT, BadInput, exit_code_of
 
 if TYPE_CHECKING:
     from startrack.tracking import ObservedFrame, Odometry, Track
@@ -113,6 +113,8 @@ class _Run:
         self.args, self.session = args, session
         self.codes: set[int] = {0}
         self._is_old, self._write_s = False, 0.0  # the files; what writing them took
+        self._printed = 0  # lines at rest
+        self._read: tuple[object, Odometry] | None = None  # the odometry, with the stamp of its file
 
     def take_all(self) -> None:
         """Locate all images, then estimate and write the track."""
@@ -124,10 +126,11 @@ class _Run:
                 except BadInput as cause:
                     self._refuse(name, cause)
                 bar.advance()
-        track = self._estimate()
-        self._write(track)
-        self._print_frames(track)
-        self._print_summary(track)
+        track = self._whole_track()
+        if track is not None:
+            self._write(track)
+            self._print_frames(track)
+            self._print_summary(track)
 
     def follow(self) -> None:
         """Take images as they come; Ctrl-C and SIGTERM end it."""
@@ -145,16 +148,17 @@ class _Run:
                     self._update(image is not None)
         finally:
             signal.signal(signal.SIGTERM, former)
-        track = self._estimate(growing=True)
-        self._write(track)
-        self._print_summary(track)
+        track = self._whole_track(growing=True)
+        if track is not None:
+            self._write(track)
+            self._print_summary(track)
 
     def _update(self, has_come: bool) -> None:
-        """A line about the image that has come; the files, unless that would make the next image wait."""
+        """A line about each image that the odometry reaches; the files, unless the next image would wait for them."""
+        if not (has_come or self._is_old or self._waits()):
+            return
         try:
-            if has_come:
-                self._print_newest()
-                self._is_old = True
+            self._is_old |= self._print_newest()
             if self._is_old and (not has_come or self._write_s < QUICK_S):
                 start = time.monotonic()
                 self._write(self._estimate(growing=True), pictures=False)
@@ -164,18 +168,33 @@ class _Run:
                 print(f"waiting: {cause}", file=sys.stderr, flush=True)
             self._is_old = False
 
-    def _print_newest(self) -> None:
+    def _waits(self) -> bool:
+        """Whether images wait for the odometry, whose file has changed."""
+        if self.args.odometry is None or not self.session.waits:
+            return False
+        return self._read is None or self._read[0] != _stamp(self.args.odometry)
+
+    def _print_newest(self) -> bool:
+        """Print a line about each image that has none yet; whether there was one."""
         from startrack.tracking.quantities import frame_records
 
-        found = self.session.newest(
-            self._odometry(), odometry_sigma=self.args.odometry_sigma, odometry_floor_m=self.args.odometry_floor,
-            at_rest=self.args.at_rest,
-        )  # fmt: skip
-        record = frame_records(found)[-1]
-        if self.args.json:
-            print(json.dumps(record), flush=True)
-        elif not self.args.quiet:
-            print(_line(record, "filtered_"), flush=True)
+        args, session = self.args, self.session
+        before = self._printed
+        if args.at_rest:
+            self._printed = len(session.frames)
+            records = frame_records(self._estimate())[before:]
+        else:
+            records = []
+            for track in session.newest(
+                self._odometry(), odometry_sigma=args.odometry_sigma, odometry_floor_m=args.odometry_floor
+            ):
+                records += frame_records(track)
+        for record in records:
+            if args.json:
+                print(json.dumps(record), flush=True)
+            elif not args.quiet:
+                print(_line(record, "filtered_"), flush=True)
+        return bool(records)
 
     def _paths(self) -> list[str] | None:
         """The image files; None for a bag."""
@@ -216,6 +235,19 @@ class _Run:
         self.codes.add(exit_code_of(cause.reason))
         print(f"{name}  refused  {cause.reason}: {cause}", file=sys.stderr, flush=True)
 
+    def _whole_track(self, growing: bool = False) -> Track | None:
+        """The track of all images; None, with the reasons on stderr, where none has a position."""
+        try:
+            return self._estimate(growing)
+        except BadInput as cause:
+            if exit_code_of(cause.reason) == EXIT_BAD_INPUT:
+                raise
+            for frame in self.session.frames:
+                print(f"{frame.name}  refused  {frame.reason}: {frame.message}", file=sys.stderr, flush=True)
+            print(f"startrack: {cause.reason}: {cause}", file=sys.stderr, flush=True)
+            self.codes.add(exit_code_of(cause.reason))
+            return None
+
     def _estimate(self, growing: bool = False) -> Track:
         args = self.args
         return self.session.estimate(
@@ -228,7 +260,10 @@ class _Run:
 
         if self.args.odometry is None:
             return None
-        return read_odometry(self.args.odometry, self.args.odometry_topic)
+        stamp = _stamp(self.args.odometry)
+        if self._read is None or self._read[0] != stamp:
+            self._read = stamp, read_odometry(self.args.odometry, self.args.odometry_topic)
+        return self._read[1]
 
     def _write(self, track: Track, pictures: bool = True) -> None:
         from startrack.tracking.write import write_track
@@ -275,6 +310,14 @@ class _Run:
             f"{counts['frames']} frames: {counts['used']} used, {counts['left_out']} left out, {counts['refused']} "
             f"refused; {counts['slips']} slips of the odometry; files in {self.args.dir}/track.*"
         )
+
+
+def _stamp(path: str) -> object:
+    """Of a file that may grow: another one after each change."""
+    with suppress(OSError):
+        found = Path(path).stat()
+        return found.st_size, found.st_mtime_ns
+    return None
 
 
 def _line(record: dict[str, Any], prefix: str) -> str:

@@ -28,13 +28,15 @@ def follow_images(
     Ends when no image came for `until_idle_s` (None: never). An image that `take` refuses with BadInput is tried again
     for some seconds, since its sidecar may be missing; then `refuse` gets it. The folder `excluded` is left out.
     """
-    done: set[str] = set()
+    taken: set[str] = set()
+    refused: set[tuple[str, int]] = set()  # with the time of its last change: a file that grows on is tried anew
     first_try: dict[str, float] = {}
     idle_since = time.monotonic()
     while until_idle_s is None or time.monotonic() - idle_since < until_idle_s:
         waiting = False
         for image in images_under(folder, excluded):
-            if image.path in done or not _is_still(image.path):
+            changed_ns = _changed_ns(image.path)
+            if image.path in taken or (image.path, changed_ns) in refused or not _is_still(changed_ns):
                 continue
             idle_since = time.monotonic()
             try:
@@ -43,9 +45,9 @@ def follow_images(
                 if time.monotonic() - first_try.setdefault(image.path, time.monotonic()) < PATIENCE_S:
                     continue
                 refuse(image, cause)
-                done.add(image.path)
+                refused.add((image.path, changed_ns))
                 continue
-            done.add(image.path)
+            taken.add(image.path)
             waiting = True
             yield image
             idle_since = time.monotonic()
@@ -54,8 +56,12 @@ def follow_images(
             time.sleep(POLL_S)
 
 
-def _is_still(path: str) -> bool:
+def _changed_ns(path: str) -> int:
     try:
-        return time.time() - Path(path).stat().st_mtime > STILL_S
+        return Path(path).stat().st_mtime_ns
     except OSError:  # removed since it was listed
-        return False
+        return time.time_ns()
+
+
+def _is_still(changed_ns: int) -> bool:
+    return time.time_ns() - changed_ns > STILL_S * 1e9

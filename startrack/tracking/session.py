@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC
 from pathlib import Path
@@ -44,7 +44,7 @@ class TrackSession:
     frames: list[ObservedFrame] = field(default_factory=list)  # in the order of time
     terrain: Terrain | None = None
     shared: SharedErrors | None = None
-    _reference: str | None = None  # of the terrain
+    _references: tuple[Any, Any] | None = None  # camera and terrain
     _filtered: list[ObservedFrame] = field(default_factory=list)  # that the filter has
     _online: OnlineTrack | None = None
 
@@ -62,6 +62,7 @@ class TrackSession:
         if exposure.time_utc is None:
             raise BadInput("no_time", "; ".join([NO_TIME, *exposure.warnings]))
         shared = self._shared_errors(exposure)
+        self._check_time(exposure)
         key = None if self.store is None else self._key(exposure, path, shared)
         frame = None if self.store is None or key is None else self.store.read(key)
         if frame is None:
@@ -87,11 +88,14 @@ class TrackSession:
         frame, or none has a position, and as `estimate_track`.
         """
         frames: Sequence[ObservedFrame] = self.frames
-        if covered_only and odometry is not None:
-            last_s = float(odometry.time_s[-1]) + SPAN_TOLERANCE_S
-            frames = [one for one in frames if one.time_utc.astimezone(UTC).timestamp() <= last_s]
+        if covered_only:
+            frames = [one for one in frames if _is_reached(one, odometry)]
         if self.terrain is None or self.shared is None or not frames:
             raise BadInput("bad_image", "no image of the track could be read")
+        if all(len(frame.modes) != 1 for frame in frames):
+            refused = next((frame for frame in frames if not frame.modes), None)
+            reason = "insufficient_geometry" if refused is None else refused.reason
+            raise BadInput(reason, f"none of {len(frames)} images has a single position")
         return estimate_track(
             frames, self.terrain, self.shared, odometry=odometry, odometry_sigma=odometry_sigma,
             odometry_floor_m=odometry_floor_m, at_rest=at_rest,
@@ -109,26 +113,36 @@ class TrackSession:
         first_m = track.smoothed.position_enu_m[:1, :2]
         return np.concatenate([first_m, first_m + np.cumsum(move_m, axis=0)])
 
-    def newest(
-        self, odometry: Odometry | None, *, odometry_sigma: float, odometry_floor_m: float, at_rest: bool
-    ) -> Track:
-        """A track that ends with the last frame in the order of time, filtered by all frames so far.
+    @property
+    def waits(self) -> bool:
+        """Whether frames were not filtered yet."""
+        return self._filtered != self.frames
 
-        Unless `at_rest` it has this frame alone. Arguments and exceptions as of `estimate`. Frames that came late are
-        filtered anew.
+    def newest(self, odometry: Odometry | None, *, odometry_sigma: float, odometry_floor_m: float) -> Iterator[Track]:
+        """Each frame that was not filtered yet and that the odometry reaches, by the frames before it: one track each.
+
+        Arguments and exceptions as of `estimate`. If a frame comes late, all frames after it are filtered anew.
         """
-        if at_rest or self.terrain is None or self.shared is None:
-            return self.estimate(at_rest=at_rest)
+        if self.terrain is None or self.shared is None:
+            return
         if self._filtered != self.frames[: len(self._filtered)]:
             self._filtered, self._online = [], None
         self._online = self._online or OnlineTrack(len(self.shared.names), self.terrain.height_sigma_m)
         for k in range(len(self._filtered), len(self.frames)):
+            if not _is_reached(self.frames[k], odometry):
+                return
             recent = self.frames[max(k - RECENT_FRAMES, 0) : k + 1]
             steps = odometry_steps(recent, odometry, odometry_sigma, odometry_floor_m)
             move, sigma = (steps.move_m[-1], float(steps.sigma_m[-1])) if k else (np.zeros(2), 0.0)
             self._online.add(self.frames[k].modes, move, sigma)
             self._filtered.append(self.frames[k])
-        return track_of_newest(self.frames[-1], self._online, self.terrain)
+            yield track_of_newest(self.frames[k], self._online, self.terrain)
+
+    def _check_time(self, exposure: Exposure) -> None:
+        """Raise BadInput for a second image of one time: its evidence would count twice."""
+        same = next((frame for frame in self.frames if frame.time_utc == exposure.time_utc), None)
+        if same is not None:
+            raise BadInput("bad_image", f"{exposure.name} has the time of {same.name}: a track takes an image once")
 
     def _shared_errors(self, exposure: Exposure) -> SharedErrors:
         """The errors that all frames share, from the first of them."""
@@ -140,11 +154,15 @@ class TrackSession:
             terrain = load_terrain(exposure.terrain)
             self.shared = SharedErrors.of_exposure(terrain, exposure)
             self.terrain = terrain
-            self._reference = exposure.terrain
-        if exposure.terrain != self._reference:
+            self._references = exposure.camera, exposure.terrain
+        camera, ground = self._references or (None, None)
+        if exposure.terrain != ground:
             raise BadInput(
-                "bad_terrain",
-                f"{exposure.name} is on the terrain {exposure.terrain}, the track on {self._reference}",
+                "bad_terrain", f"{exposure.name} is on the terrain {exposure.terrain}, the track on {ground}"
+            )
+        if exposure.camera != camera:
+            raise BadInput(
+                "bad_calibration", f"{exposure.name} is of the camera {exposure.camera}, the track of {camera}"
             )
         return self.shared
 
@@ -159,3 +177,9 @@ class TrackSession:
             path, exposure.sha256, self.facts, self.settings.evidence_sources, sorted(files.items()), errors
         )
         return hashlib.sha256(f"{exposure.name} {job}".encode()).hexdigest()[:32]
+
+
+def _is_reached(frame: ObservedFrame, odometry: Odometry | None) -> bool:
+    """Whether the odometry has come as far as the frame."""
+    last_s = np.inf if odometry is None else float(odometry.time_s[-1])
+    return frame.time_utc.astimezone(UTC).timestamp() <= last_s + SPAN_TOLERANCE_S

@@ -31,9 +31,9 @@ def synthetic_track(
     shape = np.array([[1.0, 0.4], [0.4, 0.5]])
     count = np.arange(1, frames + 1)
     filtered_m2 = (9.0 / count)[:, None, None] * shape
-    smoothed_m2 = (
-        np.broadcast_to(1.3 * filtered_m2[-1], filtered_m2.shape) if at_rest else 0.3 * filtered_m2 + 0.4 * shape
-    )
+    smoothed_m2 = 0.3 * filtered_m2 + 0.4 * shape
+    if at_rest:
+        smoothed_m2 = np.broadcast_to(1.3 * filtered_m2[-1], filtered_m2.shape)
     filtered = smoothed + np.einsum("nij,nj->ni", np.linalg.cholesky(filtered_m2), rng.normal(size=(frames, 2)))
     status = ["used"] * frames
     if not at_rest:

@@ -29,7 +29,8 @@ def draw_graph(
     count = len(series[0][1])
     known = np.concatenate([values[np.isfinite(values) & (values >= 0)] for _, values, _ in series])
     canvas.rectangle(box, MAP)
-    _draw_names(canvas, box, caption, series)
+    names = [(name, of) for name, _, of in series] + [("x: frame not used", colour)] * (len(crossed) > 0)
+    _draw_names(canvas, box, caption, names)
     if len(known) and known.max() > 0:
         left, top, right, bottom = box
         logarithmic = logarithmic and known.min() > 0 and known.max() > LOGARITHMIC * known.min()
@@ -51,11 +52,11 @@ def draw_graph(
     canvas.rectangle(box, FAINT_INK, 1)
 
 
-def _draw_names(canvas: Canvas, box: Box, caption: str, series: Sequence[Series]) -> None:
-    """The caption, and the names of the series in their colours."""
+def _draw_names(canvas: Canvas, box: Box, caption: str, names: Sequence[tuple[str, Colour]]) -> None:
+    """The caption, and names in their colours."""
     left, top, right, bottom = box
     x = canvas.text((left, top - 9), caption, TEXT_PX, DIM_INK)[2]
-    for name, _, colour in series:
+    for name, colour in names:
         if name:
             x = canvas.text((x + 18, top - 9), name, TEXT_PX, colour)[2]
     canvas.text(((left + right) / 2, bottom + 27), "frame", TEXT_PX, DIM_INK, "mt")

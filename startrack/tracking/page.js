@@ -129,7 +129,7 @@ function radiiView() {
   const inRange = LENGTHS.filter((value) => value >= low && value <= high);
   const lengths = inRange.length > 6 ? LENGTHS.filter(Number.isInteger) : LENGTHS;
   const view = new View({
-    label: "Stated 95 percent radius by frame", world: [0.5, low, count + 0.5, high], square: false, ratio: 0.5, most: Math.max(1, count / 8), points: series[1][0],
+    label: "Stated 95 percent radius by frame", world: [0.5, low, count + 0.5, high], square: false, ratio: 0.4, most: Math.max(1, count / 8), points: series[1][0],
     axes: { x: "frame", y: "95 % radius", left: 60, fixedY: lengths, text: (value, step) => (step === null ? sayLength(Number((10 ** value).toPrecision(3))) : say(value, 0)) },
     describe: ({ k }) => [frames.image[k], [["filtered", radiusText(k, "filtered_")], ["smoothed", radiusText(k, "")]]], open: ({ k }) => choose(k),
     draw(v, g) {

@@ -66,9 +66,8 @@ def _facts(track: Track) -> list[str]:
     )
     lines = [f"{len(statuses)} frames: {counts}"]
     if statuses:
-        lines.append(
-            f"{track.frames[0].time_utc:%Y-%m-%d %H:%M:%S} to {track.frames[-1].time_utc:%Y-%m-%d %H:%M:%S} UTC"
-        )
+        start, end = (f"{track.frames[k].time_utc:%Y-%m-%d %H:%M:%S}" for k in (0, -1))
+        lines.append(f"{start} to {end} UTC")
     radius_m = radius_holding(track.smoothed.covariance_m2, 0.95)
     known = np.flatnonzero(np.isfinite(radius_m))
     if len(known):

@@ -19,7 +19,7 @@ from startrack.output.picture.canvas import (
 )
 from startrack.output.picture.maps import CAPTION_SIZE, MapView, draw_frame, draw_ground, ellipse_m, map_view, nice_step
 from startrack.output.picture.relief import draw_contours, ground_of_view
-from startrack.tracking.track import Track
+from startrack.tracking.track import Track, Trajectory
 from startrack.types import Array
 
 Legend = list[tuple[str, Colour, str]]  # kind of the mark, its colour, words
@@ -66,10 +66,9 @@ def track_extent(track: Track, odometry_m: Array | None = None) -> tuple[tuple[f
     low, high = around.min(axis=0), around.max(axis=0)
     axis = half_axes_95_m(track.smoothed.covariance_m2)
     widest = float(axis[np.isfinite(axis)].max(initial=SMALLEST_HALF_M))
-    east, north = 0.5 * (low + high)
-    return (float(east), float(north)), max(
-        0.57 * float((high - low).max()), 0.5 * float((high - low).max()) + 1.3 * widest
-    )
+    east, north = (float(x) for x in 0.5 * (low + high))
+    span = float((high - low).max())
+    return (east, north), max(0.57 * span, 0.5 * span + 1.3 * widest)
 
 
 def _rest_extent(track: Track) -> tuple[tuple[float, float], float]:
@@ -106,11 +105,10 @@ def _draw_drive(canvas: Canvas, window: Canvas, view: MapView, track: Track, odo
         window.circle(place, 3.2 if len(smoothed) < 200 else 2.0, SKY_BLUE, -1)
     legend += [("dot", SKY_BLUE, "filtered: by the frames up to each")]
     legend += _draw_not_used(window, view, track)
-    for word, place in zip(
-        ("start", "end"), view.canvas_px(smoothed[[0, -1]]) if len(smoothed) > 1 else (), strict=False
-    ):
-        window.circle(place, 7.0, INK, 2)
-        canvas.text(place + [14.0, 0.0], word, CAPTION_SIZE, INK, "lm", halo=True)
+    if len(smoothed) > 1:
+        for word, place in zip(("start", "end"), view.canvas_px(smoothed[[0, -1]]), strict=True):
+            window.circle(place, 7.0, INK, 2)
+            canvas.text((place[0] + 14.0, place[1]), word, CAPTION_SIZE, INK, "lm", halo=True)
     return legend
 
 
@@ -126,30 +124,37 @@ def _draw_ellipses(window: Canvas, view: MapView, track: Track) -> float:
     if not len(known):
         return 1.0
     median_px = max(float(np.median(axis_m[known])) / view.metres_per_px, 1e-6)
-    times = 1.0 if median_px >= SEEN_PX else nice_step(2.0 * SEEN_PX / median_px)
+    times = 1.0 if median_px >= SEEN_PX else nice_step(2.5 * SEEN_PX / median_px)
     last = None
     for k in known:
         centre_m = track.smoothed.position_enu_m[k, :2]
         if last is None or k == known[-1] or np.linalg.norm(centre_m - last) > 0.8 * times * axis_m[k]:
             last = centre_m
-            outline = ellipse_m(centre_m, (times * SIGMAS_95) ** 2 * track.smoothed.covariance_m2[k])
-            window.curve(view.canvas_px(outline[:-1]), mix_colours(POSITION, INK, 0.25), 1.6, closed=True)
+            outline = _outline(view, track.smoothed, int(k), times)
+            window.curve(outline, mix_colours(POSITION, INK, 0.25), 1.6, closed=True)
     return times
+
+
+def _outline(view: MapView, trajectory: Trajectory, k: int, times: float = 1.0) -> Array:
+    """Canvas places (n, 2) of the 95 % ellipse of frame k, enlarged so many times."""
+    east, north, _ = trajectory.position_enu_m[k]
+    return view.canvas_px(ellipse_m((east, north), (times * SIGMAS_95) ** 2 * trajectory.covariance_m2[k])[:-1])
 
 
 def _draw_not_used(window: Canvas, view: MapView, track: Track) -> Legend:
     """Marks at the smoothed positions of frames that were refused or left out, and after slips of the odometry."""
     legend: Legend = []
     places = view.canvas_px(track.smoothed.position_enu_m[:, :2])
-    seen = np.isfinite(places).all(axis=1)
-    status = np.array([frame.status for frame in track.frames])
-    for place in places[seen & (status == "refused")]:
-        window.cross(place, 6.5, REFUSED, 3)
-    for place in places[seen & (status == "left_out")]:
-        window.plus(place, 8.0, LEFT_OUT, 3)
-    if (status == "refused").any():
+    seen = np.asarray(np.isfinite(places).all(axis=1))
+    statuses = [frame.status for frame in track.frames]
+    for place, known, status in zip(places, seen, statuses, strict=True):
+        if known and status == "refused":
+            window.cross(place, 6.5, REFUSED, 3)
+        elif known and status == "left_out":
+            window.plus(place, 8.0, LEFT_OUT, 3)
+    if "refused" in statuses:
         legend += [("cross", REFUSED, "refused frame")]
-    if (status == "left_out").any():
+    if "left_out" in statuses:
         legend += [("plus", LEFT_OUT, "frame left out")]
     if track.slipped.any():
         for k in np.flatnonzero(track.slipped):
@@ -164,18 +169,16 @@ def _draw_rest(canvas: Canvas, window: Canvas, view: MapView, track: Track) -> L
     known = np.flatnonzero(np.isfinite(track.filtered.position_enu_m).all(axis=1))
     for rank, k in enumerate(known):
         colour = mix_colours(FAINT_INK, SKY_BLUE, (rank + 1) / len(known))
-        centre_m = track.filtered.position_enu_m[k, :2]
-        outline = view.canvas_px(ellipse_m(centre_m, SIGMAS_95**2 * track.filtered.covariance_m2[k])[:-1])
+        outline = _outline(view, track.filtered, int(k))
         window.curve(outline, colour, 2.0, closed=True)
         canvas.label(outline[int(np.argmin(outline[:, 1]))], str(k + 1), CAPTION_SIZE, colour, 9.0, view.box)
     window.line(view.canvas_px(track.filtered.position_enu_m[known, :2]), SKY_BLUE)
     for place in view.canvas_px(track.filtered.position_enu_m[known, :2]):
         window.circle(place, 3.5, SKY_BLUE, -1)
     if len(known):
-        last = known[-1]
-        centre_m, covariance_m2 = track.smoothed.position_enu_m[last, :2], track.smoothed.covariance_m2[last]
-        window.curve(view.canvas_px(ellipse_m(centre_m, SIGMAS_95**2 * covariance_m2)[:-1]), POSITION, 3.0, closed=True)
-        window.plus(view.canvas_px(centre_m), 7.0, POSITION, 2)
+        last = int(known[-1])
+        window.curve(_outline(view, track.smoothed, last), POSITION, 3.0, closed=True)
+        window.plus(view.canvas_px(track.smoothed.position_enu_m[last, :2]), 7.0, POSITION, 2)
     return [
         ("ring", SKY_BLUE, "position after each exposure, and its 95 % ellipse"),
         ("ring", POSITION, "by all exposures"),

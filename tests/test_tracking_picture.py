@@ -1,0 +1,115 @@
+"""The picture of a track: what it draws, where, and of what it makes a legend."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic_track import odometry_alone, synthetic_track
+
+from startrack.output.picture.canvas import POSITION, SKY_BLUE, Canvas
+from startrack.terrain import load_terrain
+from startrack.tracking.frame_graph import draw_graph
+from startrack.tracking.picture import HEIGHT_PX, WIDTH_PX, draw_track
+from startrack.tracking.track_map import ODOMETRY, REFUSED, draw_track_map, half_axes_95_m, track_extent
+
+BOX = (0.0, 0.0, 600.0, 600.0)
+
+
+def pixels_like(pixels, colour) -> int:
+    return int(np.count_nonzero(np.abs(pixels.astype(int) - colour).sum(axis=-1) < 12))
+
+
+def drawn(track, odometry_m=None):
+    """The map's pixels, its view and its legend."""
+    canvas = Canvas(601, 601)
+    view, legend = draw_track_map(canvas, BOX, track, odometry_m)
+    return canvas.pixels, view, legend
+
+
+def test_the_map_shows_every_part_of_a_track_and_its_legend_names_them():
+    track = synthetic_track()
+    odometry_m = odometry_alone(track)
+    pixels, view, legend = drawn(track, odometry_m)
+    for colour in (POSITION, SKY_BLUE, ODOMETRY, REFUSED):
+        assert pixels_like(pixels, colour) > 20
+    words = " | ".join(text for _, _, text in legend)
+    for word in ("smoothed", "filtered", "odometry alone", "refused frame", "frame left out", "slip", "enlarged"):
+        assert word in words
+    everything = np.concatenate([track.smoothed.position_enu_m[:, :2], odometry_m])
+    places = view.canvas_px(everything)
+    assert (places > 10).all() and (places < 590).all()
+    plain, _, legend = drawn(replace(track, slipped=np.zeros(7, dtype=bool)))
+    assert pixels_like(plain, ODOMETRY) == 0
+    assert not any(word in text for _, _, text in legend for word in ("slip", "odometry"))
+
+
+def test_small_ellipses_are_enlarged_and_large_ones_are_not():
+    small, large = synthetic_track(step_m=500.0), synthetic_track(step_m=2.0)
+    words = [next(text for _, _, text in drawn(track)[2] if "ellipse" in text) for track in (small, large)]
+    assert "enlarged" in words[0] and "enlarged" not in words[1]
+    times = float(words[0].split("enlarged ")[1].split()[0])
+    _, view, _ = drawn(small)
+    median_px = times * np.median(half_axes_95_m(small.smoothed.covariance_m2)) / view.metres_per_px
+    assert 13.0 <= median_px <= 30.0
+
+
+def test_half_axes_hold_95_percent():
+    np.testing.assert_allclose(half_axes_95_m(np.diag([4.0, 1.0])[None]), 2.0 * np.sqrt(5.991464547), rtol=1e-6)
+    assert np.isinf(half_axes_95_m(np.full((1, 2, 2), np.inf)))[0]
+
+
+def test_a_map_at_rest_holds_all_ellipses():
+    track = synthetic_track(at_rest=True)
+    pixels, view, legend = drawn(track)
+    assert [text for _, _, text in legend][-1] == "by all exposures"
+    assert pixels_like(pixels, POSITION) > 100
+    reach_m = half_axes_95_m(track.filtered.covariance_m2) + np.linalg.norm(
+        track.filtered.position_enu_m[:, :2] - view.centre_m, axis=1
+    )
+    assert reach_m.max() < view.half_m.min()
+
+
+@pytest.mark.parametrize("at_rest", [False, True])
+def test_frames_without_a_position_are_not_drawn(at_rest):
+    part, none = (synthetic_track(at_rest=at_rest, unknown=count) for count in (3, 8))
+    assert draw_track(part).shape == draw_track(none).shape == (HEIGHT_PX, WIDTH_PX, 3)
+    assert track_extent(none) == ((0.0, 0.0), none.terrain.search_radius_m)
+    assert pixels_like(drawn(part)[0], SKY_BLUE) > pixels_like(drawn(none)[0], SKY_BLUE) == 0
+
+
+def test_one_frame_is_a_track():
+    assert draw_track(synthetic_track(frames=1, at_rest=True)).any()
+
+
+def test_the_relief_of_the_map_is_that_of_its_own_place():
+    ground = load_terrain("shackleton")
+    west, east = (synthetic_track(ground, start_m=(x, 0.0), step_m=200.0) for x in (-6000.0, 6000.0))
+    assert any("contours" in text.text for text in _texts_of(east))
+    free = np.s_[500:590, 20:200]  # no track there
+    assert np.abs(drawn(west)[0][free].astype(int) - drawn(east)[0][free]).mean() > 10
+
+
+def _texts_of(track):
+    canvas = Canvas(601, 601)
+    draw_track_map(canvas, BOX, track, None)
+    return canvas._texts
+
+
+@pytest.mark.parametrize(
+    ("lengths_m", "ticks"), [((1.0, 4.0), {"0", "1 m", "2 m"}), ((0.1, 40.0), {"0.1 m", "1 m", "10 m"})]
+)
+def test_a_graph_of_wide_range_is_logarithmic(lengths_m, ticks):
+    canvas = Canvas(400, 200)
+    values = np.array([lengths_m[0], np.inf, *lengths_m])
+    draw_graph(
+        canvas, (60.0, 20.0, 380.0, 160.0), "radius", [("all", values, SKY_BLUE)], np.array([1]), REFUSED,
+        logarithmic=True,
+    )  # fmt: skip
+    texts = {text.text for text in canvas._texts}
+    assert texts >= ticks | {"radius", "all", "frame", "1", "4"}
+    assert pixels_like(canvas.pixels, REFUSED) > 5
+    window = canvas.pixels[21:160, 61:380]
+    rows = np.flatnonzero((np.abs(window.astype(int) - SKY_BLUE).sum(axis=-1) < 12).any(axis=1))
+    assert rows.min() < 40 < 80 < rows.max()  # the largest is near the top, the smallest lower

@@ -61,7 +61,7 @@ def refine_by_sky_light(located: Located, stars: bool = True, depth_is_right: bo
 
     With `stars` their rows stay in the posterior, otherwise the sky's light alone determines it: then raises NotLocated
     (insufficient_geometry) where it cannot. Raises NotLocated (inconsistent_evidence) where the light of the sky shows
-    another time than the one stated, and, unless `depth_is_right`, OtherDepth where it shows a crater deeper or less deep than stated.
+    another time than the one stated, and, unless `depth_is_right`, OtherDepth where it shows a crater of another depth.
     """
     try:
         if located.damage is not None and not located.damage.has_levels:

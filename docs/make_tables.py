@@ -12,6 +12,7 @@ from pathlib import Path
 
 from startrack.errors import Reason
 from startrack.output.quantities import QUANTITIES
+from startrack.output.quantities_prediction import CELL_QUANTITIES
 from startrack.tracking.quantities import FRAME_QUANTITIES
 
 PAGES = [Path(__file__).parent / name for name in ("formats.md", "track.md")]
@@ -37,9 +38,20 @@ def reason_table() -> str:
     return "\n".join(["| reason | exit code | meaning |", "| --- | --- | --- |", *rows])
 
 
+def prediction_table() -> str:
+    """Bands of predict.tif and columns of predict.ecsv."""
+    rows = [f"| `{one.name}` | {one.unit} | {one.description} |" for one in CELL_QUANTITIES]
+    return "\n".join(["| band, column | unit | meaning |", "| --- | --- | --- |", *rows])
+
+
 def page_with_tables(text: str) -> str:
     """The page `text` with its tables as the code has them."""
-    tables = {"quantities": quantity_table(), "reasons": reason_table(), "track": track_table()}
+    tables = {
+        "quantities": quantity_table(),
+        "reasons": reason_table(),
+        "track": track_table(),
+        "prediction": prediction_table(),
+    }
     return re.sub(
         r"(<!-- table (\w+) -->\n).*?(\n?<!-- end -->)",
         lambda found: found[1] + tables[found[2]] + found[3],

@@ -4,9 +4,10 @@
     print(startrack.locate("image.png"))
 
 `locate` takes a path or an array and returns a `Solution`; `identify` and `detect` stop earlier. `track` makes a
-trajectory of many images, `calibrate` a camera, `render` an image, `measure_horizon` the skyline of a fixed camera. The
-packages (`startrack.detection`, `startrack.identification`, `startrack.localization`, ...) have the stages one by one.
-Every name is loaded at its first use: importing startrack costs nothing.
+trajectory of many images, `calibrate` a camera, `render` an image, `predict` the expected accuracy, `measure_horizon`
+the skyline of a fixed camera. The packages (`startrack.detection`, `startrack.identification`,
+`startrack.localization`, ...) have the stages one by one. Every name is loaded at its first use: importing startrack
+costs nothing.
 """
 
 import importlib
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 _MODULES = {  # public name to the module that has it
     "calibrate": "api", "detect": "api", "identify": "api", "locate": "api", "render": "api",
-    "measure_horizon": "api", "track": "api",
+    "measure_horizon": "api", "predict": "api", "track": "api",
     "Solution": "solution",
     "Camera": "camera", "load_camera": "camera",
     "Cylinder": "terrain", "HeightMap": "terrain.height_map", "Terrain": "terrain", "load_terrain": "terrain",
@@ -45,12 +46,13 @@ __all__ = [
     "load_terrain",
     "locate",
     "measure_horizon",
+    "predict",
     "render",
     "track",
 ]
 
 if TYPE_CHECKING:
-    from startrack.api import calibrate, detect, identify, locate, measure_horizon, render, track
+    from startrack.api import calibrate, detect, identify, locate, measure_horizon, predict, render, track
     from startrack.camera import Camera, load_camera
     from startrack.catalog import load_catalog
     from startrack.errors import BadInput, NoSolution

@@ -22,6 +22,7 @@ from startrack.inputs import (
     Time,
     angle_rad,
     camera_input,
+    duration_s,
     exposure_input,
     field_of_view_rad,
     is_list_of_centroids,
@@ -45,8 +46,9 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from startrack.identification import IdentifiedCentroids
+    from startrack.prediction import Prediction
 
-__all__ = ["calibrate", "detect", "identify", "locate", "measure_horizon", "render", "track"]
+__all__ = ["calibrate", "detect", "identify", "locate", "measure_horizon", "predict", "render", "track"]
 
 TIME_FLAG, TIME_ARGUMENT = "--time UTC", "time="  # messages of the stages name the flags of the commands
 
@@ -304,6 +306,55 @@ def render(
     )
     scene, rng = series.scene(number, f"{file_stem(ground.name)}-{seed}-{number:03d}")
     return render_scene(scene, rng=rng)
+
+
+def predict(
+    camera: str | Camera,
+    terrain: str | Terrain,
+    *,
+    time: Time | tuple[Time, Time],
+    positions_m: ArrayLike | None = None,
+    spacing_m: float | None = None,
+    exposure: float | Quantity | None = None,
+    sky_v_mag_arcsec2: float = 22.0,
+    draws: int = 10,
+    seed: int = 0,
+    localizer: str = "posterior",
+) -> Prediction:
+    """Expected accuracy of positions over the search area of a terrain, or at given positions.
+
+    Evidence of the stars is drawn at every place and located as `locate` does with the stars alone.
+
+    Args:
+        camera: as for `locate`; it needs a `[sensor]`.
+        terrain: as for `locate`.
+        time: middle of the exposures, as for `locate`; of a pair the draws are evenly spaced between both.
+        positions_m: (k, 2) east and north from the terrain's origin [m]. None: cells of the search area.
+        spacing_m: of the cells [m]. None: a tenth of the search area, or a little less.
+        exposure: an astropy duration, or seconds. None: a V 6 star on the axis reaches 5 sigma.
+        sky_v_mag_arcsec2: diffuse light of the sky.
+        draws: at each place.
+        seed: of the draws.
+        localizer: as `--localizer`.
+
+    Returns:
+        The prediction: `positions_m` (k, 2), `cells` (arrays (k,) by name, as the columns of predict.ecsv), `summary`.
+
+    Raises:
+        BadInput: as `locate`; bad_calibration without a sensor.
+        ValueError: positions of another shape, or where no camera can stand.
+    """
+    from startrack.prediction import predict_positions
+
+    first, last = time if isinstance(time, tuple) else (time, time)
+    start, end = time_input(first), time_input(last)
+    if start is None or end is None:
+        raise BadInput("no_time", "give time=: the sky depends on it")
+    return predict_positions(
+        load_camera_input(camera), terrain_input(terrain, None), (start, end), positions_m=positions_m,
+        spacing_m=spacing_m, exposure_s=duration_s(exposure), sky_v_mag_arcsec2=sky_v_mag_arcsec2, draws=draws,
+        seed=seed, localizer=localizer,
+    )  # fmt: skip
 
 
 def _identify_list(

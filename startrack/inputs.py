@@ -94,6 +94,16 @@ def time_sigma_input(time_sigma: Any) -> float | None:
         raise BadInput("no_time", f"{cause}: give seconds or an astropy duration") from cause
 
 
+def duration_s(duration: Any) -> float | None:
+    """A `duration` [s]: an astropy duration, or seconds; None stays None. Raises ValueError unless it is above 0."""
+    if duration is None:
+        return None
+    seconds = float(duration.to_value("s") if hasattr(duration, "to_value") else duration)
+    if not (math.isfinite(seconds) and seconds > 0):
+        raise ValueError(f"exposure={duration!r} is not above 0 s")
+    return seconds
+
+
 def _iso_text(time: Any) -> Any:
     """An astropy Time in UTC, to the microsecond: its own text ends at the millisecond. None for anything else."""
     try:

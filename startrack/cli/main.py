@@ -20,8 +20,8 @@ from startrack.errors import BadInput, BadOutput, NoSolution
 from startrack.files import FULL_DISK
 
 COMMANDS = (
-    "locate", "batch", "track", "identify", "detect", "render", "calibrate", "horizon", "report", "reproduce",
-    "terrain", "doctor", "schema",
+    "locate", "batch", "track", "identify", "detect", "render", "calibrate", "horizon", "predict", "report",
+    "reproduce", "terrain", "doctor", "schema",
 )  # fmt: skip
 ACTIONS = {"calibrate": ("verify", "show", "convert", "board")}  # with a parser each, beside the command's own
 OK, INTERNAL_ERROR, USAGE, REFUSED, BAD_INPUT, STOPPED = range(6)

@@ -6,6 +6,7 @@ from startrack.camera.io import camera_keys
 from startrack.errors import Reason
 from startrack.exposure.sidecar import SIDECAR as SIDECAR_KEYS
 from startrack.output.quantities import BY_PATH
+from startrack.output.quantities_prediction import PREDICTION
 from startrack.output.record import FORMATS
 from startrack.output.schema_parts import (
     COUNT,
@@ -136,6 +137,7 @@ SCHEMAS: dict[str, Schema] = {
         [_if_status("ok", {"required": ["detections"]})],
     ),
     "horizon": schema("Summary of a measured skyline", HORIZON | {"allOf": _HORIZON_RULES}),
+    "predict": PREDICTION,
     "truth": schema(
         "What is true of a rendered image, for tests and scorers",
         record({"position_enu_m": numbers(3), "quat_xyzw_cam_icrs": QUATERNION}) | {"additionalProperties": True},

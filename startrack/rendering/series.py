@@ -98,17 +98,19 @@ class Series:
             raise BadInput("bad_calibration", f"camera {self.camera.name} has no [sensor]: nothing to render with")
         return exposure_for_snr(self.camera, self.sky_v_mag_arcsec2, v_mag=EXPOSURE_V_MAG, snr=EXPOSURE_SNR)
 
-    def scene(self, number: int, name: str = "") -> tuple[Scene, np.random.Generator]:
+    def scene(
+        self, number: int, name: str = "", sky: tuple[Stars, Array] | None = None
+    ) -> tuple[Scene, np.random.Generator]:
         """The scene of exposure `number`, called `name`, and the generator to render it with.
+
+        `sky` is what `draw_sky` gives for the time of the exposure, if it has been drawn before.
 
         Raises:
             BadInput: bad_terrain when no position can be found, no_time outside the ephemeris.
         """
         pose, rng = self._pose_and_rng(number)
-        time, site, exposure_s = pose.time_utc, self.terrain.site, self.exposure_used_s
-        if site is None:
-            raise BadInput("bad_terrain", f"terrain {self.terrain.name} has no site: its sky is not known")
-        stars, v_error_mag = self._sky(site, time)
+        time, site, exposure_s = pose.time_utc, self._site(), self.exposure_used_s
+        stars, v_error_mag = sky or self.draw_sky(time)
         sensor_rng = np.random.default_rng([self.seed, _SENSOR])
         scene = Scene(
             camera=self.camera,
@@ -133,6 +135,11 @@ class Series:
             terrain_ref=self.terrain_ref,
         )
         return scene, rng
+
+    def _site(self) -> Site:
+        if self.terrain.site is None:
+            raise BadInput("bad_terrain", f"terrain {self.terrain.name} has no site: its sky is not known")
+        return self.terrain.site
 
     def pose(self, number: int) -> Pose:
         """Time and pose of exposure `number`.
@@ -192,8 +199,12 @@ class Series:
             _value_or_draw(self.roll_rad, tilt * np.sin(direction)),
         )
 
-    def _sky(self, site: Site, time: datetime) -> tuple[Stars, Array]:
-        """Apparent stars, first those of the catalogue, then the random ones, and their magnitude errors (n,)."""
+    def draw_sky(self, time: datetime) -> tuple[Stars, Array]:
+        """Apparent stars, first those of the catalogue, then the random ones, and their magnitude errors (n,).
+
+        Raises BadInput (bad_terrain) where the terrain has no site.
+        """
+        site = self._site()
         rng = np.random.default_rng([self.seed, _SKY])
         stars = self.catalog.at(time, observer_velocity_m_s(site, time))
         errors = np.zeros(len(stars))

@@ -69,6 +69,20 @@ def exposure_for_snr(camera: Camera, sky_v_mag_arcsec2: float | None, *, v_mag: 
     return float((linear + np.sqrt(linear**2 + 4 * star**2 * constant)) / (2 * star**2))
 
 
+def limiting_v_mag(camera: Camera, sky_v_mag_arcsec2: float | None, *, exposure_s: float, snr: float) -> float:
+    """Magnitude of the star on the axis that reaches `snr` in `exposure_s`: the inverse of `exposure_for_snr`."""
+    from startrack.rendering.sky import sky_e_per_s
+
+    sensor = camera.sensor
+    if sensor is None:
+        raise ValueError(f"camera {camera.name} has no sensor")
+    area_px = 4 * np.pi * (sensor.psf_sigma_px**2 + 1 / 12)
+    background = sensor.dark_e_per_s + float(sky_e_per_s(camera, sky_v_mag_arcsec2, np.zeros(1))[0])
+    noise_e2 = area_px * (sensor.read_noise_e**2 + background * exposure_s)
+    star_e = 0.5 * (snr**2 + np.sqrt(snr**4 + 4 * snr**2 * noise_e2))
+    return float(-2.5 * np.log10(star_e / (sensor.zero_point_e_per_s * exposure_s)))
+
+
 def _points(scene: Scene) -> tuple[Array, Array]:
     """Directions (n, 3) and true magnitudes (n,) of all points of light; a disk of a body is many points."""
     parts = [(scene.stars.rays_icrs, scene.stars.v_mag + scene.v_error_mag)]

@@ -10,6 +10,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+from numpy.typing import NDArray
 
 from startrack.files import atomic_file
 from startrack.terrain.raster import (
@@ -158,6 +159,26 @@ def write_map(path: str | Path, raster: Raster, *, step_m: float | None = None, 
         tifffile.imwrite(
             temporary, values, compression="deflate", compressionargs={"level": 9}, predictor=True, extratags=tags,
             metadata=None, rowsperstrip=256, software="startrack",
+        )  # fmt: skip
+
+
+def write_bands(path: str | Path, frame: Raster, bands: Mapping[str, NDArray[np.float32]]) -> None:
+    """Write named bands (rows, columns) at the place of a `frame`'s posts, NaN where there is no value. Raises OSError.
+
+    The file appears when complete.
+    """
+    import tifffile
+
+    names = "".join(
+        f'<Item name="DESCRIPTION" sample="{k}" role="description">{name}</Item>' for k, name in enumerate(bands)
+    )
+    metadata = f"<GDALMetadata>{names}</GDALMetadata>"
+    tags = [(METADATA_TAG, "s", 0, metadata, True), *_place_tags(frame), (NO_DATA_TAG, "s", 0, "nan", True)]
+    values = np.stack([np.asarray(band, dtype=np.float32) for band in bands.values()])
+    with atomic_file(path) as temporary:
+        tifffile.imwrite(
+            temporary, values, photometric="minisblack", planarconfig="separate", compression="deflate",
+            compressionargs={"level": 9}, extratags=tags, metadata=None, software="startrack",
         )  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from startrack.terrain.horizon_table import BINS, HorizonTable, Square
 from startrack.terrain.masks import GLARE, OFF_MAP, Sectors, describe_masks, in_sectors
 from startrack.terrain.protocol import Progress, Terrain
 from startrack.terrain.pyramid import Ground, ground_up_m, pack_maps
-from startrack.terrain.raster import Raster
+from startrack.terrain.raster import Projection, Raster
 from startrack.terrain.table_building import load_or_build_table
 from startrack.types import Array, BadInput, Bools, Ints
 
@@ -66,6 +66,11 @@ class HeightMap(Terrain):
     def hard_edges(self) -> bool:  # type: ignore[override]
         """Whether single posts have no error: the horizon of a point is then exact, but for a common error."""
         return self.height_sigma_m == 0
+
+    @property
+    def projection(self) -> Projection:  # type: ignore[override]
+        """That of the finest map."""
+        return self.maps[0].projection
 
     @cached_property
     def ground(self) -> Ground:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from startrack.frames import Site
 from startrack.terrain.horizon_posts import HorizonPosts
+from startrack.terrain.raster import STEREOGRAPHIC, Projection
 from startrack.types import Array, BadInput, Bools, Ints
 
 Progress = Callable[[int, int], None]  # parts done, of how many
@@ -66,6 +67,15 @@ class Terrain(ABC):
     def reach_m(self) -> float:
         """Half side of the square that is searched: the search area and a margin to notice leaving it [m]."""
         return 1.25 * self.search_radius_m
+
+    @property
+    def projection(self) -> Projection | None:
+        """That of maps of this ground: stereographic about the origin. None where that is not on the Moon."""
+        if self.site is None or self.site.body != "moon":
+            return None
+        return Projection(
+            kind=STEREOGRAPHIC, latitude_rad=self.site.latitude_rad, longitude_rad=self.site.longitude_rad
+        )
 
     @abstractmethod
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
@@ -256,7 +266,7 @@ class ForwardingTerrain(Terrain):
     search_radius_m, reach_m, finest_m = _forward("search_radius_m"), _forward("reach_m"), _forward("finest_m")
     common_sigma_rad, hard_edges = _forward("common_sigma_rad"), _forward("hard_edges")
     axisymmetric, shape_sigma = _forward("axisymmetric"), _forward("shape_sigma")
-    horizon_cost = _forward("horizon_cost")
+    horizon_cost, projection = _forward("horizon_cost"), _forward("projection")
     rim_radius_m, table_path, facts = _forward("rim_radius_m"), _forward("table_path"), _forward("facts")
     horizon_rad, horizon_bounds_rad = _forward("horizon_rad"), _forward("horizon_bounds_rad")
     horizon_sigma_rad = _forward("horizon_sigma_rad")

@@ -94,7 +94,7 @@ def draw_ground(window: Canvas, view: MapView, terrain: Terrain) -> None:
     if rim:
         window.circle(view.canvas_px((0.0, 0.0)), rim / view.metres_per_px, DIM_INK, 2)
     if abs(terrain.search_radius_m - rim) > 0.01 * rim:
-        window.dashes(view.canvas_px(_ring((0.0, 0.0), terrain.search_radius_m)), DIM_INK)
+        window.dashes(view.canvas_px(ring((0.0, 0.0), terrain.search_radius_m)), DIM_INK)
 
 
 def _draw_floor(window: Canvas, view: MapView, radius_m: float) -> None:
@@ -148,7 +148,8 @@ def distance_text(metres: float) -> str:
     return f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m" if metres >= 0.1 else f"{100 * metres:g} cm"
 
 
-def _ring(centre_m: tuple[float, float], radius_m: float) -> Array:
+def ring(centre_m: tuple[float, float], radius_m: float) -> Array:
+    """Points (n, 2) of a circle."""
     return np.asarray(centre_m) + radius_m * np.stack([np.sin(CIRCLE_RAD), np.cos(CIRCLE_RAD)], axis=-1)
 
 
@@ -156,7 +157,7 @@ def ellipse_m(centre_m: tuple[float, float], covariance_m2: Array) -> Array:
     """Points (n, 2) of the ellipse of one sigma."""
     lengths, axes = np.linalg.eigh(covariance_m2)
     half_m = np.sqrt(np.maximum(lengths, 0.0))
-    return np.asarray(centre_m) + (_ring((0.0, 0.0), 1.0) * half_m) @ axes.T
+    return np.asarray(centre_m) + (ring((0.0, 0.0), 1.0) * half_m) @ axes.T
 
 
 def grid_lines_m(view: MapView, axis: int) -> Array:

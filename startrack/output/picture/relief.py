@@ -51,7 +51,7 @@ def hill_shading(ground_m: Image, known: Bools, half_m: ArrayLike) -> Image:
     facing, inner = east / east_m + down / north_m, _erode(known)
     steep = max(float(np.percentile(np.abs(facing[inner]), 95)) if inner.any() else 0.0, GENTLE_SLOPE)
     light = np.maximum(0.5 + 0.5 * np.tanh(1.2 * facing / steep), 0.05)
-    return _extrapolate(light.astype(np.float32), inner)
+    return extrapolate(light.astype(np.float32), inner)
 
 
 def edge_cover(known: Bools, size: tuple[int, int]) -> Array:
@@ -78,7 +78,7 @@ def draw_contours(canvas: Canvas, window: Canvas, view: MapView, ground_m: Image
     from skimage.measure import find_contours
 
     step_m = _contour_step_m(high - low)
-    fine = _resize(_extrapolate(ground_m, known), window.size)
+    fine = _resize(extrapolate(ground_m, known), window.size)
     inside = edge_cover(inner, window.size) > 0.5
     cover, left_top = np.zeros(fine.shape, dtype=np.uint8), np.array(view.box[:2])
     for number in np.arange(np.floor(low / step_m) + 1, np.ceil(high / step_m)):
@@ -120,7 +120,7 @@ def _erode(known: Bools) -> Bools:
     return cv2.erode(known.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE) > 0
 
 
-def _extrapolate(values: Image, known: Bools) -> Image:
+def extrapolate(values: Image, known: Bools) -> Image:
     """Known values, carried a few cells beyond their edge."""
     filled, weight = np.where(known, values, 0).astype(np.float32), known.astype(np.float32)
     for reach in (3, 7, 15):

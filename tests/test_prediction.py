@@ -1,0 +1,350 @@
+"""Predicted accuracy: the same search as for images, files that other programs read, the same for any workers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pytest
+from astropy.table import Table
+from jsonschema import Draft202012Validator
+
+import startrack
+from startrack.camera import load_camera
+from startrack.cli.main import main
+from startrack.frames import Site, latlon_from_enu
+from startrack.output.picture.prediction_map import class_bounds_m, prediction_picture
+from startrack.output.picture.prediction_plot import comparison_picture, path_picture
+from startrack.output.quantities_prediction import CELL_QUANTITIES
+from startrack.output.schema import SCHEMAS
+from startrack.prediction import (
+    AMBIGUOUS,
+    OK,
+    REFUSED,
+    Conditions,
+    Place,
+    Predictions,
+    Predictor,
+    area_cells,
+    evenly_spaced,
+    path_points,
+    predicted,
+    share_within,
+    summarized,
+)
+from startrack.rendering import Drive, exposure_for_snr, limiting_v_mag
+from startrack.terrain import Cylinder, load_terrain
+from startrack.terrain.geotiff import write_bands
+from startrack.types import BadInput
+
+WHEN = datetime(2030, 6, 1, tzinfo=UTC)
+NAMES = [one.name for one in CELL_QUANTITIES]
+FLAGS = ["predict", "-t", "shackleton-thesis", "-c", "fisheye-2048", "--time", "2030-06-01T00:00:00"]
+
+
+def run(out, *flags):
+    return main([*FLAGS, "--exposure", "0.2", "-j", "1", "-D", str(out), *map(str, flags)])
+
+
+@pytest.fixture(scope="module")
+def area(tmp_path_factory):
+    out = tmp_path_factory.mktemp("area")
+    assert run(out, "--spacing", 9000, "--draws", 1) == 0
+    return out
+
+
+def test_the_map_is_a_geotiff_in_the_projection_of_the_terrain(area):
+    rasterio = pytest.importorskip("rasterio")
+    from rasterio.warp import transform
+
+    table = Table.read(area / "predict.ecsv")
+    with rasterio.open(area / "predict.tif") as file:
+        assert list(file.descriptions) == NAMES
+        assert np.isnan(file.nodata)
+        assert set(file.dtypes) == {"float32"}
+        sphere = rasterio.crs.CRS.from_string("+proj=longlat +R=1737400 +no_defs")
+        xs, ys = transform(sphere, file.crs, table["longitude_deg"], table["latitude_deg"])
+        values = np.array(list(file.sample(zip(xs, ys, strict=True))))
+        assert np.isfinite(file.read(2)).sum() == len(table) == 5
+        for name, band in zip(NAMES, values.T, strict=True):
+            assert band == pytest.approx(np.ma.filled(np.ma.asarray(table[name]), np.nan), rel=1e-5, nan_ok=True)
+
+
+def test_the_summary_fits_its_schema_and_the_table(area):
+    record = json.loads((area / "predict.json").read_text())
+    Draft202012Validator(SCHEMAS["predict"], format_checker=Draft202012Validator.FORMAT_CHECKER).validate(record)
+    radius = np.asarray(Table.read(area / "predict.ecsv")["radius95_m"])
+    assert record["summary"]["share_below_20_m"] == pytest.approx(np.mean(radius < 20))
+    assert record["summary"]["median_radius95_m"] == pytest.approx(np.median(radius), rel=1e-5)
+    assert record["exposure_s"] == 0.2
+    assert record["places"] == 5
+    assert (area / "predict.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_two_workers_write_the_same_bytes(area, tmp_path):
+    assert run(tmp_path, "--spacing", 9000, "--draws", 1, "-j", 2) == 0
+    for name in ("predict.tif", "predict.ecsv", "predict.json", "predict.png"):
+        assert (tmp_path / name).read_bytes() == (area / name).read_bytes(), name
+
+
+def test_a_stopped_run_is_resumed(area, capsys, monkeypatch):
+    """Two chunks of five are lost, as if the run had been killed: only these are drawn again."""
+    from startrack.prediction import draws
+
+    before = (area / "predict.ecsv").read_bytes()
+    for chunk in sorted((area / ".predict").glob("*.npz"))[:2]:
+        chunk.unlink()
+    drawn = []
+    real = draws.Predictor.draw
+    monkeypatch.setattr(draws.Predictor, "draw", lambda self, place: drawn.append(place) or real(self, place))
+    assert run(area, "--spacing", 9000, "--draws", 1, "--json") == 0
+    assert len(drawn) == 2
+    assert (area / "predict.ecsv").read_bytes() == before
+    assert json.loads(capsys.readouterr().out) == json.loads((area / "predict.json").read_text())
+
+
+def test_a_folder_with_another_prediction_is_kept(area, capsys):
+    before = (area / "predict.json").read_bytes()
+    assert run(area, "--spacing", 8000, "--draws", 1) == 2
+    assert "holds another prediction (spacing_m" in capsys.readouterr().err
+    assert (area / "predict.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("flags", "code", "text"),
+    [
+        (["--time", "2030-06-01"], 4, "no_time"),
+        (["--time", "2030-06-02T00:00:00/2030-06-01T00:00:00"], 4, "before the start"),
+        (["-c", "nothing"], 4, "no_calibration"),
+        (["-t", "nothing"], 4, "bad_terrain"),
+        (["--spacing", "0"], 2, "not above 0"),
+        (["--spacing", "1"], 4, "more than 1000000"),
+        (["--draws", "100000"], 2, "at most 1000"),
+        (["--exposures", "1,1"], 2, "twice"),
+        (["--exposures", "1,x"], 2, "is not a number"),
+        (["--depth"], 2, "go together"),
+        (["--target-radius95", "5"], 2, "go together"),
+        (["--localizer", "guess"], 2, "known are"),
+        (["--path", "no-such-file.csv"], 4, "bad_odometry"),
+        (["--depth", "--exposure", "1"], 2, "not allowed"),
+    ],
+)
+def test_bad_flags_have_one_line_and_leave_no_file(flags, code, text, tmp_path, capsys):
+    out = tmp_path / "out"
+    try:
+        found = main([*FLAGS, "-D", str(out), *flags])
+    except SystemExit as ended:
+        found = ended.code
+    assert found == code
+    assert text in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_camera_without_a_sensor_is_refused():
+    bare = replace(load_camera("fisheye-2048"), sensor=None)
+    with pytest.raises(BadInput) as caught:
+        startrack.predict(bare, "shackleton-thesis", time=WHEN, positions_m=[[0.0, 0.0]], draws=1)
+    assert caught.value.reason == "bad_calibration"
+
+
+def test_a_draw_depends_on_seed_and_place_only():
+    """Neither other places nor their order change it; another seed and another number do."""
+    terrain, camera = load_terrain("shackleton-thesis"), load_camera("fisheye-2048")
+
+    def draw(number, seed=0, first=()):
+        conditions = Conditions("c", "t", (WHEN,), exposure_s=0.2, seed=seed)
+        predictor = Predictor(camera, terrain, conditions)
+        for other in first:
+            predictor.draw(Place(other, -3000.0, 0.0))
+        return predictor.draw(Place(number, 2000.0, 1000.0))["offset_m"]
+
+    here = draw(7)
+    assert np.array_equal(draw(7, first=[3]), here)
+    assert not np.array_equal(draw(8), here)
+    assert not np.array_equal(draw(7, seed=1), here)
+
+
+def test_the_library_gives_the_radius_of_the_search():
+    found = startrack.predict(
+        "fisheye-2048", "shackleton-thesis", time=("2030-06-01T00:00:00", "2030-06-15T00:00:00"), draws=2,
+        positions_m=[[4000.0, 2000.0]], exposure=0.4,
+    )  # fmt: skip
+    assert found.cells["p_ok"] == pytest.approx(1.0)
+    assert 1.0 < found.cells["radius95_m"][0] < 40.0
+    # Of a normal error the 95 % radius is between 1.96 (a line) and 2.45 (a circle) long standard deviations.
+    assert 1.6 < found.cells["radius95_m"][0] / found.cells["sigma_major_m"][0] < 3.0
+    assert found.summary["p_ok"] == 1.0
+
+
+def draws_of(status, radius, covariance):
+    covariances = np.where(np.array(status)[:, :, None, None] == OK, np.array(covariance), np.nan)
+    return {
+        "status": np.array(status), "radius95_m": np.array(radius, dtype=float), "covariance_m2": covariances,
+    }  # fmt: skip
+
+
+def test_refused_draws_count_and_a_place_without_positions_has_no_radius():
+    nan = np.nan
+    status = [[OK, OK, REFUSED], [REFUSED, AMBIGUOUS, REFUSED], [OK, AMBIGUOUS, REFUSED]]
+    cells = predicted(draws_of(status, [[3.0, 9.0, nan], [nan] * 3, [4.0, nan, nan]], [[9.0, 0.0], [0.0, 4.0]]))
+    assert cells["radius95_m"] == pytest.approx([9.0, nan, nan], nan_ok=True)
+    assert cells["p_ok"] == pytest.approx([2 / 3, 0, 1 / 3])
+    assert cells["p_ambiguous"] == pytest.approx([0, 1 / 3, 1 / 3])
+    assert cells["p_refused"] == pytest.approx([1 / 3, 2 / 3, 1 / 3])
+    assert cells["sigma_major_m"] == pytest.approx([3.0, nan, 3.0], nan_ok=True)
+    assert cells["sigma_minor_m"] == pytest.approx([2.0, nan, 2.0], nan_ok=True)
+    assert cells["azimuth_deg"][[0, 2]] == pytest.approx(90.0)
+    assert summarized(cells)["share_below_10_m"] == pytest.approx(1 / 3)
+    assert summarized(cells)["median_radius95_m"] is None
+    assert share_within(cells, 9.0) == pytest.approx(1 / 3)
+
+
+def test_the_azimuth_is_that_of_the_long_axis():
+    """Long towards the north-east by 30 degrees from north."""
+    along = np.array([np.sin(np.radians(30)), np.cos(np.radians(30))])
+    covariance = 25.0 * np.outer(along, along) + np.eye(2)
+    cells = predicted(draws_of([[OK]], [[5.0]], covariance))
+    assert cells["azimuth_deg"] == pytest.approx([30.0])
+    assert cells["sigma_major_m"] == pytest.approx([np.sqrt(26.0)])
+
+
+@pytest.mark.parametrize("name", ["shackleton-thesis", "shackleton", "kepler"])
+def test_cells_stand_where_the_map_has_them(name):
+    """The middle of each cell, as projected, is the place whose position was drawn."""
+    terrain = load_terrain(name)
+    area = area_cells(terrain, 3000.0)
+    assert (np.hypot(*area.position_m.T) <= terrain.search_radius_m).all()
+    up_m = terrain.ground_m(area.position_m)
+    lat, lon = latlon_from_enu(terrain.site, area.position_m[:, 0], area.position_m[:, 1], up_m)
+    rows_columns = area.frame.row_column(lat, lon)
+    assert rows_columns == pytest.approx(np.round(rows_columns), abs=1e-4)  # of a cell: 0.3 m
+    columns = area.frame.heights_m.shape[1]
+    assert np.array_equal(np.round(rows_columns) @ [columns, 1], area.cell)
+    spacing = np.linalg.norm(area.position_m[:, None] - area.position_m[None], axis=-1)
+    assert spacing[spacing > 0].min() == pytest.approx(3000.0, rel=0.01)
+    assert np.abs(area.position_m).min(axis=0) == pytest.approx([0, 0], abs=20.0)  # one at the origin
+
+
+def test_a_terrain_on_the_earth_has_no_map_projection():
+    site = Site("earth", 0.5, 0.1)
+    with pytest.raises(BadInput, match="no map projection"):
+        area_cells(Cylinder(site=site, diameter_m=1000.0, depth_m=100.0), 100.0)
+
+
+def test_times_are_the_middles_of_equal_parts():
+    times = evenly_spaced(WHEN, WHEN + timedelta(hours=4), 4)
+    assert [time - WHEN for time in times] == [timedelta(minutes=60 * k + 30) for k in range(4)]
+    assert evenly_spaced(WHEN, WHEN, 3) == (WHEN,) * 3
+
+
+def test_limiting_magnitude_is_the_inverse_of_the_exposure():
+    camera = load_camera("fisheye-2048")
+    for v_mag in (4.0, 6.0, 8.5):
+        exposure_s = exposure_for_snr(camera, 21.5, v_mag=v_mag, snr=5.0)
+        assert limiting_v_mag(camera, 21.5, exposure_s=exposure_s, snr=5.0) == pytest.approx(v_mag, abs=1e-9)
+
+
+class KnownStore:
+    """A store whose radius at every place is 12 m over the square root of the exposure."""
+
+    def discard(self, tasks):
+        raise AssertionError("nothing is overwritten")
+
+    def chunks(self, what, tasks):
+        for task in tasks:
+            radius = np.array([12.0 / np.sqrt(task.conditions.exposure_s)])
+            yield draws_of([[OK]], [radius], np.eye(2)) | {"offset_m": np.zeros((1, 1, 2))}
+
+
+def test_depth_finds_the_exposure_of_a_known_radius():
+    class Store(KnownStore):
+        def chunks(self, what, tasks):
+            return ({key: values[0] for key, values in chunk.items()} for chunk in super().chunks(what, tasks))
+
+    predictions = Predictions([Place(0, 0.0, 0.0)], Store())
+    conditions = Conditions("fisheye-2048", "shackleton-thesis", (WHEN,))
+    best, record = predictions.depth(conditions, 6.0)  # reached in 4 s
+    assert 4.0 <= best.exposure_s <= 4.0 * 1.25
+    assert record["exposure_s"] == best.exposure_s
+    assert record["limiting_v_mag"] == pytest.approx(
+        limiting_v_mag(load_camera("fisheye-2048"), 22.0, exposure_s=best.exposure_s, snr=5.0)
+    )
+    unreached, record = predictions.depth(conditions, 1e-3)
+    assert record["exposure_s"] is record["limiting_v_mag"] is None
+    assert unreached.exposure_s == record["tried"][-1]["exposure_s"]
+    assert share_within({"radius95_m": np.array([6.0])}, 6.0) == 1.0
+
+
+def test_bands_are_written_with_their_names(tmp_path):
+    rasterio = pytest.importorskip("rasterio")
+    area = area_cells(load_terrain("shackleton"), 5000.0)
+    values = np.arange(len(area.cell), dtype=float)
+    write_bands(tmp_path / "a.tif", area.frame, {"one": area.band(values), "two": area.band(-values)})
+    with rasterio.open(tmp_path / "a.tif") as file:
+        assert file.descriptions == ("one", "two")
+        assert file.read(1) == pytest.approx(area.band(values), nan_ok=True)
+        assert file.read(2) == pytest.approx(-area.band(values), nan_ok=True)
+        assert file.crs.to_dict()["proj"] == "stere"
+
+
+def test_points_of_a_path_include_both_ends():
+    terrain = load_terrain("shackleton-thesis")
+    drive = Drive(waypoints_m=np.array([[0.0, 0.0], [0.0, 300.0], [400.0, 300.0]]), speed_m_s=1.0)
+    points = path_points(drive, terrain, 150.0)
+    assert points.distance_m == pytest.approx(np.linspace(0, 700, 6))
+    assert points.position_m[0] == pytest.approx([0, 0])
+    assert points.position_m[-1] == pytest.approx([400, 300])
+    with pytest.raises(BadInput, match="leaves the search area"):
+        path_points(Drive(waypoints_m=np.array([[0.0, 0.0], [0.0, 11000.0]]), speed_m_s=1.0), terrain, 1000.0)
+
+
+def test_the_picture_shows_the_classes_and_the_places_without_a_position():
+    terrain = load_terrain("shackleton-thesis")
+    area = area_cells(terrain, 1000.0)
+    radius = np.where(area.position_m[:, 0] < -5000.0, np.inf, np.where(area.position_m[:, 1] > 0, 3.0, 30.0))
+    pixels = prediction_picture(terrain, area.site, area.raster(radius), "title", ["line"])
+    west, north, south = pixels[500, 140], pixels[300, 500], pixels[700, 500]
+    assert west[0] > 1.4 * max(west[1:])  # vermillion
+    assert north[0] > 150
+    assert north[1] > 150  # light
+    assert south.max() < 110  # dark
+    assert class_bounds_m(radius) == [5.0, 10.0, 20.0]
+    assert class_bounds_m(np.linspace(13.0, 22.0, 50)) == [14.0, 16.0, 18.0, 20.0]
+    assert class_bounds_m(np.array([np.nan, np.inf])) == []
+    assert class_bounds_m(np.full(3, 7.0)) == [10.0]
+
+
+def test_pictures_of_curves_are_drawn_also_without_any_position():
+    distance = np.linspace(0, 100, 5)
+    for radius in (np.full(5, np.inf), np.array([3.0, 4.0, np.inf, 5.0, 3.0])):
+        pixels = path_picture(distance, radius, np.isfinite(radius).astype(float), "title", ["line"])
+        assert len(np.unique(pixels)) > 10
+    for median in (None, 3.0):
+        variants = [{"camera": "a", "exposure_s": 1.0, "summary": {"median_radius95_m": median}}]
+        assert len(np.unique(comparison_picture(variants, "title"))) > 10
+
+
+@pytest.fixture
+def waypoints(tmp_path):
+    path = tmp_path / "waypoints.csv"
+    path.write_text("east_m,north_m\n0,0\n3000,3000\n")
+    return path
+
+
+def test_along_a_path_there_is_a_table_with_distances_and_no_map(waypoints, tmp_path):
+    out = tmp_path / "out"
+    flags = ["--exposures", "0.2,0.4", "-j", "1", "-D", str(out), "-q"]
+    assert main([*FLAGS, *flags, "--path", str(waypoints), "--spacing", "4300", "--draws", "1"]) == 0
+    table = Table.read(out / "predict.ecsv")
+    assert list(table["distance_m"]) == pytest.approx([0, 3000 * 2**0.5], abs=1e-3)
+    assert not (out / "predict.tif").exists()
+    rows = Table.read(out / "predict-compare.ecsv")
+    assert list(rows["exposure_s"]) == [0.2, 0.4]
+    record = json.loads((out / "predict.json").read_text())
+    assert record["kind"] == "path"
+    assert record["variants"][0]["summary"] == record["summary"]
+    assert record["variants"][0]["limiting_v_mag"] < record["variants"][1]["limiting_v_mag"]
+    Draft202012Validator(SCHEMAS["predict"]).validate(record)
+    assert (out / "predict-compare.png").exists()

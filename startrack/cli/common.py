@@ -33,7 +33,9 @@ def add_image_flags(parser: argparse.ArgumentParser) -> None:
 
 def add_fact_flags(parser: argparse.ArgumentParser) -> None:
     """Flags for facts that images may lack."""
-    parser.add_argument("-c", "--camera", metavar="FILE", help="camera file, or the name of a shipped one")
+    parser.add_argument("-c", "--camera", metavar="FILE",
+        help="camera file of startrack, ROS, Kalibr, COLMAP or OpenCV, or the name of a shipped one",
+    )
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601")
     add_time_sigma_flag(parser)
     parser.add_argument("--exposure", type=seconds, metavar="S", help="exposure time in seconds")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.flag_types import seconds, time_sigma_s
+from startrack.cli.flag_types import position_prior, seconds, time_sigma_s
 from startrack.errors import INTERNAL_ERROR, BadInput, BadOutput, exit_code_of
 from startrack.files import make_folder
 
@@ -70,9 +70,19 @@ def add_localizer_flags(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+    parser.add_argument(
+        "--near", type=position_prior, metavar="EAST,NORTH,SIGMA",
+        help="prior of the position, a normal distribution [m]: the posterior contains it, and an image that "
+        "contradicts it is refused",
+    )  # fmt: skip
+
+
 def check_localizer(args: argparse.Namespace) -> None:
-    """A usage error for an unknown name after --localizer."""
+    """A usage error for an unknown name after --localizer, and for one that takes no --near."""
     from startrack.localization import LOCALIZERS
+
+    if args.near is not None and args.localizer != DEFAULT_LOCALIZER:
+        args.usage_error(f"--near: only --localizer {DEFAULT_LOCALIZER} takes a prior of the position")
 
     if args.localizer not in LOCALIZERS:
         args.usage_error(f"--localizer {args.localizer}: known are {', '.join(LOCALIZERS)}")

@@ -49,9 +49,11 @@ def run(args: argparse.Namespace) -> int:
             f"--fov {args.fov} IMAGE... -o CAMERA.toml, then startrack locate -c CAMERA.toml"
         )
     from startrack.pipeline import Settings
+    from startrack.prior import PositionPrior
 
     check_localizer(args)
-    settings = Settings(localizer=args.localizer, evidence_sources=args.evidence)
+    near = None if args.near is None else PositionPrior(*args.near)
+    settings = Settings(localizer=args.localizer, evidence_sources=args.evidence, near=near)
     code = run_images(args, FORMAT, lambda path, stem: _locate_image(path, stem, args, settings))
     if args.report:
         from startrack.cli.report import write_page_of_images

@@ -8,6 +8,7 @@ import importlib.util
 import io
 import logging
 import os
+import re
 import signal
 import sys
 import threading
@@ -83,7 +84,14 @@ def _run(args: argparse.Namespace) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser, also of each command, that reports unknown arguments with its own usage."""
+    """A parser, also of each command, that reports unknown arguments with its own usage.
+
+    A list of numbers that begins with a minus sign is a value, not a flag: --near -3000,1500,200.
+    """
+
+    def __init__(self, *given: Any, **more: Any) -> None:
+        super().__init__(*given, **more)
+        self._negative_number_matcher = re.compile(r"-\.?\d[\d.,e+-]*$")
 
     def parse_known_args(self, *given: Any, **more: Any) -> Any:
         """As `argparse`, but an argument that is not known is an error: the parser of all commands does not get it."""

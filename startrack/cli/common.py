@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.flag_types import position_prior, seconds, time_sigma_s
-from startrack.errors import INTERNAL_ERROR, BadInput, BadOutput, exit_code_of
+from startrack.errors import INTERNAL_ERROR, BadInput, BadOutput, exit_code_of, next_step
 from startrack.files import make_folder
 
 if TYPE_CHECKING:
@@ -170,8 +170,19 @@ def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, s
             print(outcome.line, file=sys.stdout if not args.quiet else sys.stderr, flush=True)
         elif not args.quiet:
             print(outcome.line, flush=True)
+        if not args.json:
+            print_advice(outcome.reason, outcome.record.get("message", ""), args)
         codes.append(exit_code(outcome))
     return next((code for code in (1, 4, 3) if code in codes), 0)
+
+
+def print_advice(reason: str | None, message: str, args: argparse.Namespace) -> None:
+    """What to do after a refusal, on stderr, where its `message` does not contain it; once for each reason."""
+    advice = "" if reason is None or getattr(args, "quiet", False) else next_step(reason, message)
+    printed: set[str] = vars(args).setdefault("printed_advice", set())
+    if advice and advice not in printed:
+        printed.add(advice)
+        print(f"  next: {advice}", file=sys.stderr, flush=True)
 
 
 def exit_code(outcome: Outcome) -> int:
@@ -188,6 +199,7 @@ def _internal_error(path: str, cause: Exception, format_name: str) -> Outcome:
         "status": "refused",
         "reason": INTERNAL_ERROR,
         "message": message,
+        "advice": INTERNAL_ERROR.advice,
     }
     return Outcome("refused", INTERNAL_ERROR, f"{Path(path).name}  {message}", record)
 
@@ -202,6 +214,7 @@ def _refused_outcome(path: str, cause: BadInput, format_name: str) -> Outcome:
         "status": "refused",
         "reason": cause.reason,
         "message": str(cause),
+        "advice": cause.reason.advice,
     }
     return Outcome("refused", cause.reason, refusal_line(path, cause.reason, str(cause)), record)
 

@@ -6,6 +6,7 @@ table in docs/formats.md are made from `Reason`; a new reason is one entry here.
 
 from __future__ import annotations
 
+import re
 from enum import StrEnum
 from typing import Any
 
@@ -104,6 +105,9 @@ class Reason(StrEnum):
 
 
 INTERNAL_ERROR = Reason.INTERNAL_ERROR
+ADVICE_IN_MESSAGE = re.compile(  # the imperatives of our messages, a flag, or a question
+    r"\?|(^|\s)--[a-z]|\b(give|choose|correct|enlarge|expose|find|flip|install|make|replace|run|set|state|try|use|widen) "
+)
 _OF_CODE = {one.value: one for one in Reason}
 BAD_INPUT_REASONS = frozenset(one for one in Reason if one.exit_code == EXIT_BAD_INPUT)  # BadInput in the library
 
@@ -111,6 +115,11 @@ BAD_INPUT_REASONS = frozenset(one for one in Reason if one.exit_code == EXIT_BAD
 def reason_of(code: str) -> Reason:
     """The reason with a `code` of the result format. Raises KeyError for any other text."""
     return _OF_CODE[code]
+
+
+def next_step(reason: str, message: str) -> str:
+    """The advice of a `reason` for a terminal; empty where the `message` itself contains what to do, or a question."""
+    return "" if ADVICE_IN_MESSAGE.search(message) else reason_of(reason).advice
 
 
 def exit_code_of(reason: str | None) -> int:

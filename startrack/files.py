@@ -20,6 +20,7 @@ MAX_TEXT_BYTES = 2**20  # camera and terrain files have a few kilobytes
 MAX_CAUSE_CHARS = 200  # of a library's message
 MAX_STEM_BYTES = 200  # file systems take names of 255, and a suffix follows
 FULL_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}  # errors of writing that are not the path's
+FOREIGN_CAMERA_SUFFIXES = ".yaml", ".yml", ".xml", ".txt"  # of other programs' camera files
 FilePath = str | os.PathLike[str]
 
 
@@ -43,10 +44,10 @@ def data_dir(kind: str) -> Path:
 def is_path(reference: FilePath) -> bool:
     """Whether a camera's or terrain's `reference` is a path; otherwise it is the name of a shipped file.
 
-    A path ends in .toml or contains a separator: "/", or "\\" as written on Windows.
+    A path ends in .toml, or as other programs' camera files do, or contains a separator: "/", or "\\" as on Windows.
     """
     text = os.fspath(reference)
-    return text.endswith(".toml") or "/" in text or "\\" in text
+    return text.endswith((".toml", *FOREIGN_CAMERA_SUFFIXES)) or "/" in text or "\\" in text
 
 
 def relative_path(file: FilePath, folder: FilePath) -> str:
@@ -74,7 +75,10 @@ def resolve_named(name_or_path: str | Path, kind: str, reason: str) -> Path:
     path = data_dir(kind) / f"{name_or_path}.toml"
     if not os.path.isfile(path):
         shipped = ", ".join(sorted(p.stem for p in data_dir(kind).glob("*.toml")))
-        raise BadInput(reason, f"no shipped file is called {name_or_path!r}; shipped: {shipped}; a path ends in .toml")
+        raise BadInput(
+            reason,
+            f"no shipped file is called {name_or_path!r}; shipped: {shipped}; a path ends in .toml or contains a separator",
+        )
     return path
 
 

@@ -70,7 +70,7 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
     clock = clock_at(terrain.site, when, oriented.exposure.time_sigma_s)
     return extend(
         oriented, Measured, terrain=terrain, site=terrain.site, R_enu_icrs=R, clock=clock, light=light,
-        response=response,
+        response=response, near=settings.near,
     )  # fmt: skip
 
 

@@ -147,6 +147,7 @@ def _refine(located: Located, stars: bool, depth_is_right: bool) -> Located:
     rows = sky.evidence(fit.used, by_terrain + fit.raised_px(of_terrain=False), excess)
     if stars:
         rows = Evidence.concatenate(_stars_near(there, sky, by_terrain / sky.px_per_rad), rows)
+    rows = replace(rows, near=located.near)
     by_shared = fit.step_by_shared
     smear = by_shared @ fit.shared_covariance @ by_shared.T
     error_rad = float(fit.shared[OFFSET_TERMS]) if terrain.common_sigma_rad > 0.0 else 0.0

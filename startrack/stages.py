@@ -31,6 +31,7 @@ from startrack.localization import (
     clock_matters,
     require_localizer,
 )
+from startrack.prior import PositionPrior
 from startrack.terrain import Terrain
 from startrack.types import (
     Array,
@@ -65,12 +66,15 @@ class Settings:
     evidence: StarEvidence = field(default_factory=StarEvidence)
     localizer: Localizer = field(default_factory=ExactPosterior)
     evidence_sources: str = "both"  # "stars", "sky" (the light of the sky at the skyline) or "both"
+    near: PositionPrior | None = None  # of the position; None: anywhere in the search area of the terrain
     deep_stars: bool = True  # use Gaia's stars too, where they are installed and the frame is deeper than Hipparcos
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "localizer", require_localizer(self.localizer))
         if self.evidence_sources not in EVIDENCE_SOURCES:
             raise ValueError(f"evidence_sources {self.evidence_sources!r}: known are {', '.join(EVIDENCE_SOURCES)}")
+        if self.near is not None and not isinstance(self.localizer, ExactPosterior):
+            raise ValueError(f"near={self.near}: only the localizer posterior takes a prior of the position")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)  # eq: arrays have no single answer to ==
@@ -155,12 +159,13 @@ class StarRays:
     R_enu_icrs: Array  # (3, 3) at the likeliest time
     clock: Clock
     light: StarPhotometry
+    near: PositionPrior | None = None  # of the position
     blocked: Blocked | None = None  # parts of the view that are left out; None: nothing is blocked
     steeper: float = 0.0  # relative, by which the sky's light shows a crater deeper than its file states
 
     def evidence(self) -> Evidence:
         """The rays for the localizer."""
-        return replace(self.light.evidence(), clock=self.clock)
+        return replace(self.light.evidence(), clock=self.clock, near=self.near)
 
     def later(self, seconds: float, reach_s: float) -> Self:
         """The same under the sky of a time later by `seconds`, which is right to `reach_s`."""

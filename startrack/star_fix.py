@@ -11,8 +11,9 @@ from startrack.blocked_view import leave_out_blocked
 from startrack.localization import ExactPosterior, Localizer, check_consistency, clock_matters
 from startrack.localization.integrity import assess_integrity
 from startrack.localization.nuisance import lower_evidence
+from startrack.localization.position_prior import name_prior
 from startrack.stages import StarFix, StarRays, extend
-from startrack.types import Fix
+from startrack.types import Fix, NotLocated
 
 CLOCK_SIGMAS = 5.0  # of a fix, within which the true time is searched once the fix is known
 F = TypeVar("F", bound=StarFix)
@@ -47,8 +48,12 @@ def fix_by_stars(rays: StarRays, to: type[F], localizer: Localizer) -> F:
 
 def check_fix(fixed: StarFix) -> None:
     """Raises NotLocated (inconsistent_evidence) where the rays contradict the fix, the terrain or the time."""
-    if fixed.fix.search != "approximate":
+    if fixed.fix.search == "approximate":
+        return
+    try:
         check_consistency(fixed.evidence(), fixed.fix_at_time, fixed.terrain)
+    except NotLocated as refusal:
+        raise name_prior(refusal, fixed.near) from refusal
 
 
 def with_integrity(fixed: F) -> F:

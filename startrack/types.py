@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from startrack.errors import BadInput, NoSolution, NotIdentified, NotLocated, TooFewStars
 from startrack.mask import Mask
+from startrack.prior import PositionPrior
 from startrack.values import Array, Bools, Ints, Value, array, take_rows
 
 __all__ = [
@@ -175,6 +176,7 @@ class Evidence(Value):
     edge_sigma_rad: Array = array("n", default=0.0)  # width of the edge: uncertainty of the elevation, or the PSF
     extended_nats: Array = array("n", default=0.0)  # (light / noise)^2 of extended light; 0: a point source
     clock: Clock | None = None  # one for all rows; None: the time is exact
+    near: PositionPrior | None = None  # of the camera's position; None: anywhere in the search area
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -200,9 +202,12 @@ class Evidence(Value):
 
     @classmethod
     def concatenate(cls, *parts: Evidence) -> Evidence:
-        """The rows of all `parts`, of several sources or exposures, in one value, with the first part's clock."""
+        """The rows of all `parts`, of several sources or exposures, in one value, with the first clock and prior."""
         clock = next((part.clock for part in parts if part.clock is not None), None)
-        return cls(clock=clock, **{n: np.concatenate([getattr(part, n) for part in parts]) for n in cls._columns()})
+        near = next((part.near for part in parts if part.near is not None), None)
+        return cls(
+            clock=clock, near=near, **{n: np.concatenate([getattr(part, n) for part in parts]) for n in cls._columns()}
+        )
 
     @classmethod
     def _columns(cls) -> list[str]:

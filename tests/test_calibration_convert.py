@@ -253,3 +253,42 @@ def test_the_calibrated_angle_is_given_or_that_of_the_nearest_edge(program, tmp_
     with pytest.raises(BadInput, match="--calibrated-angle"):
         from_text(to_text(off_centre, program), program, "off")
     assert from_text(to_text(off_centre, program), program, "off", 0.5).calibrated_angle_rad == 0.5
+
+
+@pytest.mark.parametrize("camera", [FISHEYE, PINHOLE], ids=lambda c: c.name)
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_every_program_is_recognized_by_content(program, camera, tmp_path, monkeypatch, caplog):
+    monkeypatch.chdir(tmp_path)
+    name = f"{program}-{camera.name}.txt"
+    Path(name).write_text(to_text(camera, program))
+    direct = load_camera(name)
+    assert f"{name}: the lens is taken as calibrated to" in caplog.text
+    converted = from_text(to_text(camera, program), program, Path(name).stem)
+    seen = rays(converted.calibrated_angle_rad)
+    np.testing.assert_array_equal(direct.project(seen)[0], converted.project(seen)[0])
+    assert direct.calibrated_angle_rad == converted.calibrated_angle_rad < camera.max_angle_rad
+    assert direct.name == converted.name
+
+
+def test_an_opencv_file_in_xml_is_recognized(tmp_path):
+    (tmp_path / "camera.xml").write_text(XML)
+    assert load_camera(tmp_path / "camera.xml").lens == KannalaBrandt((-0.01, 0.0025, 0.0, 0.0))
+
+
+OTHER_FILES = [
+    ("ros", "equidistant", "plumb_bob", "distortion plumb_bob with coefficients other than 0 has no counterpart"),
+    ("kalibr", "camera_model: pinhole", "camera_model: omni", "camera_model 'omni' has no counterpart"),
+    ("colmap", "OPENCV_FISHEYE", "OPENCV", "camera model OPENCV with 8 parameters has no counterpart"),
+    ("opencv", "fisheye_model: 1", "fisheye_model: 0", "distortion pinhole with coefficients other than 0"),
+    ("ros", "camera_matrix", "matrix", "not a camera file of startrack (.toml), ROS, Kalibr, COLMAP or OpenCV"),
+]
+
+
+@pytest.mark.parametrize(("program", "old", "new", "cause"), OTHER_FILES, ids=lambda v: str(v)[:20])
+def test_a_lens_that_cannot_be_converted_exactly_is_refused(program, old, new, cause, tmp_path):
+    file = tmp_path / "theirs.yaml"
+    file.write_text(to_text(FISHEYE, program).replace(old, new))
+    with pytest.raises(BadInput, match=re.escape(cause)) as refusal:
+        load_camera(file)
+    assert refusal.value.reason == "bad_calibration"
+    assert str(file) in str(refusal.value)

@@ -35,6 +35,7 @@ class Task:
     overwrite: bool = False  # locate it again even if a valid result is there
     localizer: str = "posterior"  # of startrack.localization.LOCALIZERS
     evidence: str = "both"  # of startrack.stages.EVIDENCE_SOURCES
+    near: tuple[float, float, float] | None = None  # east, north, sigma [m] of a prior of the position
 
 
 def locate_images(runner: Runner[Task, ImageDone], tasks: Sequence[Task]) -> Generator[ImageDone, None, None]:
@@ -95,7 +96,7 @@ def _valid_record(task: Task, key: str) -> dict[str, Any] | None:
 
 
 def _key(task: Task, sha256: str) -> str:
-    return job_sha256(task.path, sha256, task.facts, task.plots, task.localizer, task.evidence)
+    return job_sha256(task.path, sha256, task.facts, task.plots, task.localizer, task.evidence, *(task.near or ()))
 
 
 def _locate_and_write(task: Task, sha256: str, key: str) -> dict[str, Any]:
@@ -141,6 +142,7 @@ def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str
     from startrack.localization import require_localizer
     from startrack.output import refused_dict, result_dict
     from startrack.pipeline import Settings, locate_exposure
+    from startrack.prior import PositionPrior
     from startrack.stages import Inputs, Refused
 
     try:
@@ -151,7 +153,10 @@ def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str
     mask = exposure.mask if isinstance(exposure.mask, str) else None
     inputs = input_hashes(task.path, [exposure.camera, exposure.terrain, mask])
     try:
-        settings = Settings(localizer=require_localizer(task.localizer), evidence_sources=task.evidence)
+        near = None if task.near is None else PositionPrior(*task.near)
+        settings = Settings(
+            localizer=require_localizer(task.localizer), evidence_sources=task.evidence, near=near
+        )  # fmt: skip
         return locate_exposure(exposure, settings), inputs
     except BadInput as cause:
         return result_dict(Refused(reason=cause.reason, message=str(cause), reached=Inputs(exposure=exposure))), inputs

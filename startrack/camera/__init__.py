@@ -2,9 +2,10 @@
 
 from startrack.camera.camera import Camera, Sensor
 from startrack.camera.decentring import Decentring
-from startrack.camera.io import camera_from_dict, camera_to_dict, load_camera, save_camera
+from startrack.camera.io import camera_from_dict, camera_to_dict, save_camera
 from startrack.camera.kannala_brandt import KannalaBrandt
 from startrack.camera.lens import Lens
+from startrack.camera.load import load_camera
 from startrack.camera.pinhole import Pinhole
 
 __all__ = [

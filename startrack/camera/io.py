@@ -13,7 +13,7 @@ from startrack.camera.decentring import Decentring
 from startrack.camera.lens import Lens
 from startrack.camera.lenses import default_lens, lens_kinds
 from startrack.declaration import Choice, Flag, List, Number, Table, Text
-from startrack.files import parse_toml, printable, read_text, relative_path, resolve_named, write_atomically
+from startrack.files import relative_path, write_atomically
 from startrack.frames import R_from_quat_xyzw, quat_xyzw_from_R
 from startrack.types import MAX_PIXELS, Array, BadInput, Mask
 
@@ -107,19 +107,6 @@ def camera_keys(lens: type[Lens] | None = None) -> Table:
             "covariance": COVARIANCE,
         },
     )
-
-
-def load_camera(name_or_path: str | Path) -> Camera:
-    """The camera of a file; `name_or_path` is a path if it ends in .toml or contains a separator, else a shipped name.
-
-    Raises BadInput: no_calibration if there is no such file, bad_calibration if it cannot be used.
-    """
-    path = resolve_named(name_or_path, "calib", "no_calibration")
-    text = read_text(path, "bad_calibration")
-    try:
-        return camera_from_dict(parse_toml(text, "bad_calibration"), default_name=path.stem, folder=path.parent)
-    except BadInput as cause:
-        raise BadInput(cause.reason, f"{printable(path)}: {cause}") from cause
 
 
 def save_camera(camera: Camera, path: str | Path) -> None:

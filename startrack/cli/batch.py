@@ -114,6 +114,7 @@ def _run(
                     **_remove_paths(facts),
                     "localizer": args.localizer,
                     "evidence": args.evidence,
+                    **({} if args.near is None else {"near": list(args.near)}),
                     "plots": not args.no_plots,
                 },
             )
@@ -204,7 +205,7 @@ def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argpa
         Task(
             name=image.name, path=os.path.abspath(image.path), result=str(record_path(here, image)), facts=facts,
             plots=not args.no_plots, overwrite=args.overwrite, localizer=args.localizer,
-            evidence=args.evidence,
+            evidence=args.evidence, near=args.near,
         )
         for image in found
     ]  # fmt: skip

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.flag_types import seconds, time_sigma_s
-from startrack.errors import INTERNAL_ERROR, BadInput, BadOutput, exit_code_of
+from startrack.cli.flag_types import position_prior, seconds, time_sigma_s
+from startrack.errors import INTERNAL_ERROR, BadInput, BadOutput, exit_code_of, next_step
 from startrack.files import make_folder
 
 if TYPE_CHECKING:
@@ -33,7 +33,12 @@ def add_image_flags(parser: argparse.ArgumentParser) -> None:
 
 def add_fact_flags(parser: argparse.ArgumentParser) -> None:
     """Flags for facts that images may lack."""
-    parser.add_argument("-c", "--camera", metavar="FILE", help="camera file, or the name of a shipped one")
+    parser.add_argument(
+        "-c",
+        "--camera",
+        metavar="FILE",
+        help="camera file of startrack, ROS, Kalibr, COLMAP or OpenCV, or the name of a shipped one",
+    )
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601")
     add_time_sigma_flag(parser)
     parser.add_argument("--exposure", type=seconds, metavar="S", help="exposure time in seconds")
@@ -67,10 +72,19 @@ def add_localizer_flags(parser: argparse.ArgumentParser) -> None:
         help="of the position: stars, the light of the sky that stops at the skyline, or both (default)",
     )  # fmt: skip
 
+    parser.add_argument(
+        "--near", type=position_prior, metavar="EAST,NORTH,SIGMA",
+        help="prior of the position, a normal distribution [m]: the posterior contains it, and an image that "
+        "contradicts it is refused",
+    )  # fmt: skip
+
 
 def check_localizer(args: argparse.Namespace) -> None:
-    """A usage error for an unknown name after --localizer."""
+    """A usage error for an unknown name after --localizer, and for one that takes no --near."""
     from startrack.localization import LOCALIZERS
+
+    if args.near is not None and args.localizer != DEFAULT_LOCALIZER:
+        args.usage_error(f"--near: only --localizer {DEFAULT_LOCALIZER} takes a prior of the position")
 
     if args.localizer not in LOCALIZERS:
         args.usage_error(f"--localizer {args.localizer}: known are {', '.join(LOCALIZERS)}")
@@ -158,8 +172,19 @@ def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, s
             print(outcome.line, file=sys.stdout if not args.quiet else sys.stderr, flush=True)
         elif not args.quiet:
             print(outcome.line, flush=True)
+        if not args.json:
+            print_advice(outcome.reason, outcome.record.get("message", ""), args)
         codes.append(exit_code(outcome))
     return next((code for code in (1, 4, 3) if code in codes), 0)
+
+
+def print_advice(reason: str | None, message: str, args: argparse.Namespace) -> None:
+    """What to do after a refusal, on stderr, where its `message` does not contain it; once for each reason."""
+    advice = "" if reason is None or getattr(args, "quiet", False) else next_step(reason, message)
+    printed: set[str] = vars(args).setdefault("printed_advice", set())
+    if advice and advice not in printed:
+        printed.add(advice)
+        print(f"  next: {advice}", file=sys.stderr, flush=True)
 
 
 def exit_code(outcome: Outcome) -> int:
@@ -176,6 +201,7 @@ def _internal_error(path: str, cause: Exception, format_name: str) -> Outcome:
         "status": "refused",
         "reason": INTERNAL_ERROR,
         "message": message,
+        "advice": INTERNAL_ERROR.advice,
     }
     return Outcome("refused", INTERNAL_ERROR, f"{Path(path).name}  {message}", record)
 
@@ -190,6 +216,7 @@ def _refused_outcome(path: str, cause: BadInput, format_name: str) -> Outcome:
         "status": "refused",
         "reason": cause.reason,
         "message": str(cause),
+        "advice": cause.reason.advice,
     }
     return Outcome("refused", cause.reason, refusal_line(path, cause.reason, str(cause)), record)
 

@@ -98,6 +98,14 @@ def field_of_view_rad(text: str, narrowest_deg: float = 0.5, widest_deg: float =
     return math.radians(number(text))
 
 
+def position_prior(text: str) -> tuple[float, float, float]:
+    """East, north and standard deviation [m] of a position."""
+    words = text.split(",")
+    if len(words) != 3:
+        raise argparse.ArgumentTypeError(f"{text[:SHOWN_CHARS]!r} is not EAST,NORTH,SIGMA in metres, as -3000,1500,200")
+    return number(words[0]), number(words[1]), positive_number(words[2])
+
+
 def calibrated_angle_rad(text: str) -> float:
     """An angle off the axis, above 0 and up to 180, given in degrees [rad]."""
     if not 0 < number(text) <= 180:

@@ -36,6 +36,10 @@ def add_parser(subparsers: Any) -> None:
     add_image_flags(parser)
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file, or the name of a shipped one")
     add_localizer_flags(parser)
+    parser.add_argument(
+        "--format", action="append", choices=("geojson", "kml"), default=[],
+        help="write NAME.geojson or NAME.kml too: position, 95 %% circle, attitude; may be given twice",
+    )  # fmt: skip
     parser.add_argument("--fov", metavar="DEG", help=argparse.SUPPRESS)  # a flag of identify and calibrate
     parser.set_defaults(run=run, usage_error=parser.error)
     parser.add_argument("--report", action="store_true", help="add a page for a browser, as startrack report makes it")
@@ -49,9 +53,11 @@ def run(args: argparse.Namespace) -> int:
             f"--fov {args.fov} IMAGE... -o CAMERA.toml, then startrack locate -c CAMERA.toml"
         )
     from startrack.pipeline import Settings
+    from startrack.prior import PositionPrior
 
     check_localizer(args)
-    settings = Settings(localizer=args.localizer, evidence_sources=args.evidence)
+    near = None if args.near is None else PositionPrior(*args.near)
+    settings = Settings(localizer=args.localizer, evidence_sources=args.evidence, near=near)
     code = run_images(args, FORMAT, lambda path, stem: _locate_image(path, stem, args, settings))
     if args.report:
         from startrack.cli.report import write_page_of_images
@@ -61,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _locate_image(path: str, stem: str, args: argparse.Namespace, settings: Settings) -> Outcome:
-    from startrack.output import summary_line, verbose_text, write_results
+    from startrack.output import summary_line, verbose_text, write_geo, write_results
     from startrack.pipeline import locate_exposure
     from startrack.run import with_timing
 
@@ -74,6 +80,7 @@ def _locate_image(path: str, stem: str, args: argparse.Namespace, settings: Sett
     start = time.perf_counter()
     result = with_timing(locate_exposure(exposure, settings), read=read_ms)
     record = write_results(result, out, plots=not args.no_plots)
+    write_geo(out, result, args.format)
     line = summary_line(result, seconds=read_ms / 1e3 + time.perf_counter() - start)
     if args.verbose:
         line += "\n" + verbose_text(result) + f"\n  written to {Path(args.dir)}/{stem}.*"

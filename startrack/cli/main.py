@@ -8,6 +8,7 @@ import importlib.util
 import io
 import logging
 import os
+import re
 import signal
 import sys
 import threading
@@ -16,12 +17,13 @@ from contextlib import contextmanager
 from typing import Any
 
 from startrack import __version__
+from startrack.cli.common import print_advice
 from startrack.errors import BadInput, BadOutput, NoSolution
 from startrack.files import FULL_DISK
 
 COMMANDS = (
     "locate", "batch", "track", "identify", "detect", "render", "calibrate", "horizon", "predict", "report",
-    "reproduce", "terrain", "doctor", "schema",
+    "reproduce", "terrain", "doctor", "schema", "demo",
 )  # fmt: skip
 ACTIONS = {"calibrate": ("verify", "show", "convert", "board")}  # with a parser each, beside the command's own
 OK, INTERNAL_ERROR, USAGE, REFUSED, BAD_INPUT, STOPPED = range(6)
@@ -33,6 +35,11 @@ startrack locate sample_images/near-centre.png     where is the rover?
 startrack identify sky.png -c camera.toml          which stars are these?
 startrack render --seed 1                          a synthetic exposure to try it on
 """
+START = """usage: startrack COMMAND ... (startrack --help lists the commands; startrack demo shows what they do)
+
+rover navigation       startrack locate sample_images/near-wall.png       where is the camera, on a map of the ground?
+all-sky cameras        startrack calibrate NIGHT.jpg... --fov 180         the lens from your own pictures, then startrack horizon
+star identification    startrack identify SKY.png --fov 60                which stars are these? no camera file is needed"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -47,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             parser.error(f"no command is called {words[0]!r}; there are: {', '.join(COMMANDS)}")
         args = parser.parse_args(words)
         if not args.command:
-            parser.print_help()
+            print(START)
             return USAGE
         return _run(args)
     except KeyboardInterrupt:
@@ -65,9 +72,9 @@ def _run(args: argparse.Namespace) -> int:
         print(f"startrack {args.command}: error: {cause}", file=sys.stderr)
         return USAGE
     except BadInput as cause:
-        return _report_failure(f"{cause.reason}: {cause}", BAD_INPUT)
+        return _report_refusal(cause, BAD_INPUT, args)
     except NoSolution as cause:
-        return _report_failure(f"{cause.reason}: {cause}", REFUSED)
+        return _report_refusal(cause, REFUSED, args)
     except BrokenPipeError:
         _discard_stdout()
         return STOPPED
@@ -83,7 +90,14 @@ def _run(args: argparse.Namespace) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser, also of each command, that reports unknown arguments with its own usage."""
+    """A parser, also of each command, that reports unknown arguments with its own usage.
+
+    A list of numbers that begins with a minus sign is a value, not a flag: --near -3000,1500,200.
+    """
+
+    def __init__(self, *given: Any, **more: Any) -> None:
+        super().__init__(*given, **more)
+        self._negative_number_matcher = re.compile(r"-\.?\d[\d.,e+-]*$")
 
     def parse_known_args(self, *given: Any, **more: Any) -> Any:
         """As `argparse`, but an argument that is not known is an error: the parser of all commands does not get it."""
@@ -151,6 +165,13 @@ def _discard_stdout() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (OSError, ValueError):  # not a file, as under a test
         return
+
+
+def _report_refusal(cause: BadInput | NoSolution, code: int, args: argparse.Namespace) -> int:
+    """The refusal of a whole command, and what to do."""
+    _report_failure(f"{cause.reason}: {cause}", code)
+    print_advice(cause.reason, str(cause), args)
+    return code
 
 
 def _report_failure(message: str, code: int) -> int:

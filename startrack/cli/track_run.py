@@ -49,6 +49,7 @@ class TrackRun:
         track = self._whole_track()
         if track is not None:
             self._write(track)
+            self._note_unused(track)
             self._print_frames(track)
             self._print_summary(track)
 

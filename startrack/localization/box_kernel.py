@@ -193,7 +193,9 @@ def bound_boxes(rows, boxes, centres, half, parent, allowed, strength, weakest, 
 
 
 @njit(cache=True, nogil=True)
-def refine_disks(rows, boxes, reach, best, certain, prune_nats, negligible_nats, boxes_per_sigma, finest, most_boxes):
+def refine_disks(
+    rows, boxes, searched, best, certain, prune_nats, negligible_nats, boxes_per_sigma, finest, most_boxes
+):
     """Quarter the boxes by the disks of the rows, at least once, until `boxes_per_sigma` fit into their spread.
 
     They are also small enough at the half side `finest` [m], or where four times as many exceed `most_boxes`, or where
@@ -201,9 +203,9 @@ def refine_disks(rows, boxes, reach, best, certain, prune_nats, negligible_nats,
     """
     nothing, dropped = np.zeros(0), -inf
     while True:
-        centres, parent = split_boxes(boxes.centres_m, boxes.half_m, reach)
-        away2 = centres[:, 0] ** 2 + centres[:, 1] ** 2
-        allowed = (away2 < rows.radius_m**2) & (away2 <= reach * reach)
+        centres, parent = split_boxes(boxes.centres_m, boxes.half_m, searched)
+        inside = (centres[:, 0] - searched[0]) ** 2 + (centres[:, 1] - searched[1]) ** 2 <= searched[2] ** 2
+        allowed = inside & (centres[:, 0] ** 2 + centres[:, 1] ** 2 < rows.radius_m**2)
         boxes, best, certain, lost = bound_boxes(
             rows, boxes, centres, 0.5 * boxes.half_m, parent, allowed, nothing, 0.0, inf, nothing, nothing,
             nothing, best, certain, prune_nats, negligible_nats,

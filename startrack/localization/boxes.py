@@ -49,21 +49,21 @@ class Boxes(NamedTuple):
     score: Array  # (n,) log-likelihood at the centre; -inf where no camera can be; valid only with disks
 
 
-def root_box(rows: Rows, half_m: float) -> Boxes:
-    """One box about the origin with all rows open."""
+def root_box(rows: Rows, searched: Array) -> Boxes:
+    """The box about the disk that is `searched` (3,), with all rows open."""
     sums = -rows.ceiling[None]
     settled = log_mixtures(sums[0], rows.log_floor)
     n, open_pairs_too = len(rows.llr), not len(rows.disks_m)
     return Boxes(
-        np.zeros((1, 2)), half_m, np.array([0, n]), np.arange(n), rows.least if open_pairs_too else NO_NUMBERS,
+        searched[None, :2].copy(), float(searched[2]), np.array([0, n]), np.arange(n), rows.least if open_pairs_too else NO_NUMBERS,
         rows.most if open_pairs_too else NO_NUMBERS, sums, np.array([settled]), np.array([-inf]),
         np.array([settled + rows.most.sum()]), np.array([-inf]),
     )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
-def split_boxes(centres, half, reach):
-    """Centres (m, 2) of the quarters that come within reach of the origin, and the box (m,) of each."""
+def split_boxes(centres, half, searched):
+    """Centres (m, 2) of the quarters that touch the disk that is searched, and the box (m,) of each."""
     quarter = 0.5 * half
     found = np.empty((4 * len(centres), 2))
     parent = np.empty(4 * len(centres), dtype=np.int64)
@@ -72,9 +72,10 @@ def split_boxes(centres, half, reach):
         for k in range(4):
             x = centres[b, 0] + (quarter if k % 2 else -quarter)
             y = centres[b, 1] + (quarter if k // 2 else -quarter)
-            beyond_x, beyond_y = max(abs(x) - quarter, 0.0), max(abs(y) - quarter, 0.0)
+            beyond_x = max(abs(x - searched[0]) - quarter, 0.0)
+            beyond_y = max(abs(y - searched[1]) - quarter, 0.0)
             found[n, 0], found[n, 1], parent[n] = x, y, b
-            n += beyond_x * beyond_x + beyond_y * beyond_y <= reach * reach
+            n += beyond_x * beyond_x + beyond_y * beyond_y <= searched[2] * searched[2]
     return found[:n], parent[:n]
 
 

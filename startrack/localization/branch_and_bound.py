@@ -96,7 +96,7 @@ class Search:
     def _exclude_by_sectors(self) -> Boxes:
         """From the whole square to boxes of `ROW_BY_ROW_M`, with look-ups of whole sectors or of their parts."""
         lk, terrain = self.likelihood, self.terrain
-        centres, half, parent = np.zeros((1, 2)), float(terrain.reach_m), np.zeros(1, dtype=np.int64)
+        centres, half, parent = terrain.searched[None, :2], float(terrain.searched[2]), np.zeros(1, dtype=np.int64)
         known: tuple[Ints, Ints] | None = None  # open rows of the parts, once these are bounded
         while True:
             if known is None:
@@ -109,7 +109,7 @@ class Search:
                 boxes = lk.boxes_by_rows(centres, half, first, last)
                 self._spend(LOOK_UP_COST * len(boxes.row), boxes)
                 return self._bound_by_llr_tier(boxes)
-            quarters, parent = split_boxes(centres, half, terrain.reach_m)
+            quarters, parent = split_boxes(centres, half, terrain.searched)
             half /= 2
             holds = holds_allowed_ground(terrain, quarters, half)
             centres, parent = quarters[holds], parent[holds]
@@ -175,7 +175,7 @@ class Search:
         s, terrain = self.settings, self.terrain
         while True:
             boxes, self.best, self.certain, dropped = refine_disks(
-                self.likelihood.rows, boxes, terrain.reach_m, self.best, self.certain, s.prune_nats, s.negligible_nats,
+                self.likelihood.rows, boxes, terrain.searched, self.best, self.certain, s.prune_nats, s.negligible_nats,
                 s.boxes_per_sigma, max(finest_m, terrain.finest_m), s.most_boxes,
             )  # fmt: skip
             self.log_dropped = float(np.logaddexp(self.log_dropped, dropped))
@@ -199,7 +199,7 @@ class Search:
 
     def _split(self, boxes: Boxes) -> Boxes:
         """The quarters that hold ground, with the bounds and open rows of the boxes that they are quarters of."""
-        centres, parent = split_boxes(boxes.centres_m, boxes.half_m, self.terrain.reach_m)
+        centres, parent = split_boxes(boxes.centres_m, boxes.half_m, self.terrain.searched)
         holds = holds_allowed_ground(self.terrain, centres, boxes.half_m / 2)
         boxes = self._bound(boxes, centres[holds], boxes.half_m / 2, parent[holds], np.inf, np.inf, (NO_NUMBERS,) * 3)
         self._spend(0.0, boxes)

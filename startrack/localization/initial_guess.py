@@ -87,18 +87,19 @@ def holds_allowed_ground(terrain: Terrain, centres_m: Array, half_m: float) -> B
 def _last_boxes(likelihood: PositionLikelihood, beam: Beam) -> Array:
     """Centres (n, 2) of the last boxes, the best average first."""
     terrain, average = likelihood.terrain, likelihood.average
-    half = terrain.reach_m / FIRST_ACROSS
-    line = half * (2 * np.arange(FIRST_ACROSS) + 1) - terrain.reach_m
-    centres = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    beyond = np.maximum(np.abs(centres) - half, 0.0)
-    centres = centres[np.hypot(beyond[:, 0], beyond[:, 1]) <= terrain.reach_m]
+    reach = float(terrain.searched[2])
+    half = reach / FIRST_ACROSS
+    line = half * (2 * np.arange(FIRST_ACROSS) + 1) - reach
+    offsets = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    beyond = np.maximum(np.abs(offsets) - half, 0.0)
+    centres = terrain.searched[:2] + offsets[np.hypot(beyond[:, 0], beyond[:, 1]) <= reach]
     while True:
         centres = centres[holds_allowed_ground(terrain, centres, half)]
         score = average.score(terrain, centres, half, traced=beam.traced and half < TRACED_BELOW_M)
         centres = centres[np.argsort(-score, kind="stable")[: beam.width]]
         if half <= LAST_HALF_M[beam.traced] or not len(centres):
             return centres
-        centres, half = split_boxes(centres, half, terrain.reach_m)[0], half / 2
+        centres, half = split_boxes(centres, half, terrain.searched)[0], half / 2
 
 
 def _climb(likelihood: PositionLikelihood, centres_m: Array) -> Guess:

@@ -91,7 +91,7 @@ class PositionLikelihood:
     @cached_property
     def root(self) -> Boxes:
         """The searched square as one box, all rows open."""
-        return root_box(self.rows, self.terrain.reach_m)
+        return root_box(self.rows, self.terrain.searched)
 
     def exact_scores(self, points_m: Array) -> Array:
         """Log-likelihoods (n,) of positions (n, 2), horizons from the terrain itself."""

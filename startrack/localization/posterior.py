@@ -15,10 +15,20 @@ from startrack.localization.initial_guess import beam_search, climb_to_best, exp
 from startrack.localization.likelihood import SECTOR_EPSILON, SECTOR_RAD, PositionLikelihood
 from startrack.localization.local_posterior import local_posterior
 from startrack.localization.nuisance import ShapeFit, estimate_horizon_bias, marginalize_horizon_bias, marginalize_shape
-from startrack.localization.summary import summarize
+from startrack.localization.position_prior import (
+    PRIOR_NATS,
+    REACH_SIGMAS,
+    SearchedNear,
+    contradiction,
+    name_prior,
+    weigh_by_prior,
+)
+from startrack.localization.summary import smallest_axis, summarize
+from startrack.prior import PositionPrior
 from startrack.terrain import Terrain, require_terrain
 from startrack.types import Array, Evidence, Fix, NotLocated
 
+FINER, MOST_FINER = 1.5, 30.0  # times the boxes per sigma, from which on a prior makes the search begin again; at most
 MIN_ROWS = 8
 MIN_ROW_NATS = 1e-3  # |llr| below which a row is left out
 CONTRADICTED_NATS = -1.7  # mean over the sectors at the best position; -0.5 is usual, and -9.2 the least possible
@@ -56,7 +66,7 @@ class ExactPosterior:
         if count < MIN_ROWS:
             raise NotLocated(f"only {count} rays carry information about the skyline: expose longer")
         evidence = evidence if count == len(evidence) else evidence.take(informative)
-        explored = marginalize_clock(self.explore_shaped, self.explore, evidence, terrain)
+        explored = self._explore_clocked(evidence, terrain)
         log_mass = log_sum(explored.log_likelihood) + float(np.log(4 * explored.half_m**2))
         dropped = float(np.exp(min(explored.log_dropped - log_mass, 0.0)))
         try:
@@ -76,6 +86,51 @@ class ExactPosterior:
             fix, horizon_error_rad=explored.horizon_bias_rad, search=explored.search, shape_1=explored.shape,
             clock=explored.clock,
         )  # fmt: skip
+
+    def _explore_clocked(self, evidence: Evidence, terrain: Terrain) -> Explored:
+        """The posterior on equal boxes, over all times, shapes and biases, and with the prior of the position.
+
+        Raises NotLocated as `explore_shaped` does, and inconsistent_evidence where the evidence contradicts the prior.
+        """
+        if evidence.near is None:
+            return marginalize_clock(self.explore_shaped, self.explore, evidence, terrain)
+        try:
+            return self._explore_near(evidence, terrain, evidence.near)
+        except NotLocated as refusal:
+            raise name_prior(refusal, evidence.near) from refusal
+
+    def _explore_near(self, evidence: Evidence, terrain: Terrain, near: PositionPrior) -> Explored:
+        """As `_explore_clocked`, in the neighbourhood of the prior."""
+        prune, negligible = self.prune_nats + PRIOR_NATS, self.negligible_nats + PRIOR_NATS
+        search = replace(self, prune_nats=prune, negligible_nats=negligible)
+        found = search.explore_about(evidence, SearchedNear(terrain, near))
+        lowest = CONTRADICTED_NATS * self._likelihood(evidence, terrain).sectors.occupied
+        if np.max(found.log_likelihood, initial=-np.inf) < lowest:
+            raise contradiction(near, f"are more than {REACH_SIGMAS:.0f} sigma from it")
+        weighed = weigh_by_prior(found, near)
+        narrow = smallest_axis(weighed.centres_m, 2 * found.half_m, weighed.log_likelihood)
+        finer = 2 * found.half_m * self.boxes_per_sigma / max(narrow, self.finest_m)
+        if finer < FINER or found.search == "beam":
+            return weighed
+        # Boxes that suit the evidence alone are too large beside a narrow prior.
+        search = replace(search, boxes_per_sigma=min(finer, MOST_FINER) * self.boxes_per_sigma)
+        terrain = SearchedNear(terrain, near, REACH_SIGMAS * near.sigma_m)
+        return weigh_by_prior(marginalize_clock(search.explore_shaped, search.explore, evidence, terrain), near)
+
+    def explore_about(self, evidence: Evidence, terrain: SearchedNear) -> Explored:
+        """The posterior by `evidence` alone near a prior.
+
+        The searched disk is enlarged until the likeliest position is not at its edge: else nothing would show how far
+        off the prior the evidence is. Raises NotLocated as `explore_shaped` does.
+        """
+        found = marginalize_clock(self.explore_shaped, self.explore, evidence, terrain)
+        while terrain.is_at_edge(found):
+            wider = terrain.enlarged()
+            try:
+                found, terrain = marginalize_clock(self.explore_shaped, self.explore, evidence, wider), wider
+            except NotLocated:  # the smaller disk has an answer
+                break
+        return found
 
     def fit_shape(self, evidence: Evidence, terrain: Terrain) -> ShapeFit:
         """Shape of a `terrain` with an uncertain one, from the `evidence`, estimated together with the position."""

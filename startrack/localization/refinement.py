@@ -12,6 +12,7 @@ from startrack.localization.initial_guess import Guess
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.local_posterior import local_posterior
 from startrack.localization.nuisance import mix_shifted
+from startrack.localization.position_prior import weigh_by_prior
 from startrack.localization.summary import summarize
 from startrack.terrain import Terrain
 from startrack.types import Array, Evidence, Fix
@@ -51,6 +52,8 @@ def refine_fix(
     """
 
     explored = _explore_near(PositionLikelihood.from_evidence(evidence, terrain), position_m, covariance_m2)
+    if evidence.near is not None:
+        explored = weigh_by_prior(explored, evidence.near)
     sizes, axes = np.linalg.eigh(smear_m2)
     for size, axis in zip(sizes, axes.T, strict=True):
         explored = mix_shifted(explored, np.sqrt(max(size, 0.0)) * axis, terrain)

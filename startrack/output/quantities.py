@@ -13,7 +13,7 @@ from startrack.output.quantities_light import LIGHT
 from startrack.output.quantities_position import POSITION
 from startrack.output.quantity import Column, Quantity, Show
 from startrack.output.schema_parts import NUMBER, POSITIVE, TEXT
-from startrack.stages import Detected, Inputs, Located
+from startrack.stages import Detected, Inputs, Located, Measured
 
 Q = Quantity
 RUN: tuple[Quantity, ...] = (
@@ -41,6 +41,9 @@ RUN: tuple[Quantity, ...] = (
     Q("provenance.localizer", "", Inputs, lambda v: v.localizer_name or None,
       "method of localization, by its name for `--localizer`; of one of your own the name of its class or function; "
       "null: of `identify` and `detect`", TEXT, before=None, optional=True),
+    Q("provenance.near", "m", Measured, lambda v: None if v.near is None else str(v.near),
+      "`EAST,NORTH,SIGMA` of the prior of the position that the posterior contains; null: none was given", TEXT,
+      nullable=True, optional=True),
     Q("provenance.time_utc", "", Inputs,
       lambda v: None if v.exposure.time_utc is None else format_utc(v.exposure.time_utc),
       "middle of the exposure; null: not known", {"type": "string", "format": "date-time"}, before=None,

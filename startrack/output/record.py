@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from startrack.errors import reason_of
 from startrack.output.views import record_sections
 from startrack.stages import STAGES, Detected, Identified, Outcome, last_value
 from startrack.types import Exposure
@@ -67,6 +68,7 @@ def refused_dict(image: str, reason: str, message: str, kind: str = "fix") -> di
         "status": "refused",
         "reason": str(reason),
         "message": message,
+        "advice": reason_of(reason).advice,
     }
 
 
@@ -88,6 +90,7 @@ def _record(
         "status": result.status,
         "reason": None if result.reason is None else str(result.reason),
         "message": result.message,
+        **({} if result.reason is None else {"advice": reason_of(result.reason).advice}),
         **first,
         **(own or {}),
         **sections,

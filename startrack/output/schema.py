@@ -60,11 +60,15 @@ MEASURED: Schema = {
 
 WARNINGS: Schema = {"type": "array", "items": TEXT, "description": "what was found in the image's file and not used"}
 
+ADVICE: Schema = {"type": "string", "description": "what to do next, by the reason; absent where the status is ok"}
+
 
 def _result(kind: str, title: str, own: Schema, rules: list[Schema]) -> Schema:
     keys = {"format": {"const": FORMATS[kind]}, **COMMON}
     return schema(
-        title, record(keys, optional={**own, **MEASURED, "warnings": WARNINGS}) | {"allOf": [*_STATUS_RULES, *rules]}
+        title,
+        record(keys, optional={"advice": ADVICE, **own, **MEASURED, "warnings": WARNINGS})
+        | {"allOf": [*_STATUS_RULES, *rules]},
     )
 
 

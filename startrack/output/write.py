@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -112,6 +113,22 @@ def _write_companions(outcome: Outcome, path: Path, *, plots: bool) -> None:
             write_panorama(companion(path, SKYLINE_PICTURE), value, value.skyline)
     if plots:
         write_annotated(companion(path, ANNOTATED), outcome)
+
+
+def write_geo(record: Path, outcome: Outcome, kinds: Sequence[str]) -> None:
+    """Write an `outcome` with a position or modes beside its `record` NAME.fix.json, as NAME.geojson and NAME.kml.
+
+    `kinds`: which of the two. A former file of another outcome is removed. Raises BadInput where one cannot be written.
+    """
+    from startrack.output.geo import GEO_FORMATS, geo_text
+    from startrack.stages import Located
+
+    for kind in GEO_FORMATS:
+        path = record.with_name(f"{_stem_and_kind(record)[0]}.{kind}")
+        if kind in kinds and isinstance(outcome, Located):
+            write_atomically(path, geo_text(outcome, kind).encode("utf-8"), overwrite=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def write_json(path: FilePath, record: dict[str, Any]) -> None:

@@ -77,6 +77,11 @@ class Terrain(ABC):
             kind=STEREOGRAPHIC, latitude_rad=self.site.latitude_rad, longitude_rad=self.site.longitude_rad
         )
 
+    @property
+    def searched(self) -> Array:
+        """The disk in which positions are searched: east and north of its middle, and its radius (3,) [m]."""
+        return np.array([0.0, 0.0, self.reach_m])
+
     @abstractmethod
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation (...) [rad] seen from the points (..., 2) [m] at the azimuths (...) [rad]."""
@@ -266,7 +271,7 @@ class ForwardingTerrain(Terrain):
     search_radius_m, reach_m, finest_m = _forward("search_radius_m"), _forward("reach_m"), _forward("finest_m")
     common_sigma_rad, hard_edges = _forward("common_sigma_rad"), _forward("hard_edges")
     axisymmetric, shape_sigma = _forward("axisymmetric"), _forward("shape_sigma")
-    horizon_cost, projection = _forward("horizon_cost"), _forward("projection")
+    horizon_cost, projection, searched = _forward("horizon_cost"), _forward("projection"), _forward("searched")
     rim_radius_m, table_path, facts = _forward("rim_radius_m"), _forward("table_path"), _forward("facts")
     horizon_rad, horizon_bounds_rad = _forward("horizon_rad"), _forward("horizon_bounds_rad")
     horizon_sigma_rad = _forward("horizon_sigma_rad")

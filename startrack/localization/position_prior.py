@@ -1,0 +1,80 @@
+"""A prior of the position: where it restricts the search, what it adds to the posterior, and when it is contradicted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from startrack.localization.explored import Explored
+from startrack.prior import PositionPrior
+from startrack.terrain import ForwardingTerrain, Terrain
+from startrack.types import Array, Bools, NotLocated
+
+REACH_SIGMAS = 6.0  # of the prior, to the edge of the area that is searched
+LEAST_REACH_M = 300.0  # of the first disk: in a smaller one few edges of evidence show which way is likelier
+EDGE_PART, ENLARGED = 0.7, 3.0  # of the disk's radius, where its edge begins; factor of the next radius
+PRIOR_NATS = 0.5 * REACH_SIGMAS**2  # by which the prior may favour a position that the evidence alone makes unlikely
+CONTRADICTED_SIGMAS = 4.5  # of evidence and prior together: a true prior is farther off once in 25,000 images
+
+
+class SearchedNear(ForwardingTerrain):
+    """A terrain of which the neighbourhood of a prior's mean is searched."""
+
+    def __init__(self, whole: Terrain, near: PositionPrior, radius_m: float | None = None) -> None:
+        super().__init__(whole)
+        self.near_prior, self.radius_m = near, radius_m or max(REACH_SIGMAS * near.sigma_m, LEAST_REACH_M)
+
+    @property
+    def searched(self) -> Array:
+        """The disk of the prior: east, north and radius (3,) [m]."""
+        return np.array([self.near_prior.east_m, self.near_prior.north_m, self.radius_m])
+
+    def allowed(self, points_m: Array) -> Bools:
+        """As of the whole terrain, within the disk."""
+        east, north, reach = self.searched
+        inside = np.hypot(points_m[..., 0] - east, points_m[..., 1] - north) <= reach
+        return np.asarray(inside & self.whole.allowed(points_m))
+
+    def reshaped(self, shape: Array) -> Terrain:
+        """As of the whole terrain, searched in the same disk."""
+        return SearchedNear(self.whole.reshaped(shape), self.near_prior, self.radius_m)
+
+    def is_at_edge(self, found: Explored) -> bool:
+        """Whether the likeliest position of a posterior is at the edge of the disk, within the search area."""
+        if self.radius_m > 2 * self.reach_m or not len(found.log_likelihood):
+            return False
+        best_m = found.centres_m[np.argmax(found.log_likelihood)]
+        return bool(np.linalg.norm(best_m - self.near_prior.mean_m) > EDGE_PART * self.radius_m)
+
+    def enlarged(self) -> SearchedNear:
+        """The same with a larger disk."""
+        return SearchedNear(self.whole, self.near_prior, ENLARGED * self.radius_m)
+
+
+def weigh_by_prior(found: Explored, near: PositionPrior) -> Explored:
+    """The posterior with the prior. Raises NotLocated (inconsistent_evidence) where the two contradict each other.
+
+    Of two normal distributions the maximum of the product lies chi^2 / 2 below the product of the maxima.
+    """
+    weighed = found.log_likelihood + near.log_density(found.centres_m)
+    lost = np.max(found.log_likelihood, initial=-np.inf) - np.max(weighed, initial=-np.inf)
+    if lost > 0.5 * CONTRADICTED_SIGMAS**2:
+        raise contradiction(near, f"lie {np.sqrt(2 * lost):.1f} sigma from it")
+    return found._replace(log_likelihood=weighed)
+
+
+def contradiction(near: PositionPrior, how: str) -> NotLocated:
+    """The refusal of evidence that contradicts the prior."""
+    return NotLocated(
+        f"the positions that the image allows {how}, the prior --near {near}: is it right, and its sigma large enough?",
+        reason="inconsistent_evidence",
+    )
+
+
+def name_prior(refusal: NotLocated, near: PositionPrior | None) -> NotLocated:
+    """The `refusal`, with the prior in its message where there is one: a wrong prior causes it too."""
+    if near is None or "--near" in str(refusal):
+        return refusal
+    evidence: dict[str, Any] = refusal.evidence
+    return NotLocated(f"{refusal} (searched within 6 sigma of --near {near})", reason=refusal.reason, **evidence)

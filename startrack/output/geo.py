@@ -1,0 +1,119 @@
+"""A fix as GeoJSON and as KML: the position or the modes as points, the 95 % circle as a polygon.
+
+Coordinates are longitude and latitude in degrees: WGS 84 on the Earth, planetocentric on the sphere of 1737.4 km
+(IAU_2015:30100) on the Moon.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+from startrack.frames import Site, latlon_from_enu
+from startrack.output.record import result_dict
+
+if TYPE_CHECKING:
+    from startrack.stages import Located
+    from startrack.types import Array
+
+GEO_FORMATS = ("geojson", "kml")
+CIRCLE_POINTS = 72
+MOON_CRS = {"type": "name", "properties": {"name": "urn:ogc:def:crs:IAU_2015::30100"}}  # RFC 7946 has WGS 84 alone
+ATTITUDE_KEYS = ("ra_deg", "dec_deg", "roll_deg", "heading_deg", "pitch_deg", "roll_body_deg", "sigma_arcsec")
+POSITION_KEYS = ("east_m", "north_m", "up_m", "radius95_m", "radius999_m", "protection_level_m", "covariance_m2")
+KML_HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"{hint}>\n<Document>\n'
+
+
+def geo_text(value: Located, kind: str) -> str:
+    """The text of a file of the `kind` geojson or kml with the fix of a located `value`."""
+    found = features(value)
+    return _kml(value, found) if kind == "kml" else _geojson(value, found)
+
+
+def features(value: Located) -> list[dict[str, Any]]:
+    """GeoJSON features: one point for the position and one polygon for its circle, or one point for each mode.
+
+    The circle is left out where it holds a pole, where longitudes make no polygon, and where none is stated.
+    """
+    record, site = result_dict(value), value.site
+    common = {key: record[key] for key in ("image", "status")} | {"time_utc": record["provenance"]["time_utc"]}
+    common |= {key: record["attitude"].get(key) for key in ATTITUDE_KEYS}
+    if "position" not in record:
+        up_m = float(value.fix.position_enu_m[2])
+        return [
+            _feature("Point", _lonlat(site, np.array([[mode["east_m"], mode["north_m"], up_m]]))[0], common | mode)
+            for mode in record["modes"]
+        ]
+    position = record["position"]
+    middle_m = np.array([position["east_m"], position["north_m"], position["up_m"]])
+    point = _feature(
+        "Point", _lonlat(site, middle_m[None])[0], common | {key: position.get(key) for key in POSITION_KEYS}
+    )
+    ring = None if position["radius95_m"] is None else _circle(site, middle_m, position["radius95_m"])
+    circle = {"image": record["image"], "circle": "95 %", "radius_m": position["radius95_m"]}
+    return [point, *([] if ring is None else [_feature("Polygon", [ring], circle)])]
+
+
+def _circle(site: Site, middle_m: Array, radius_m: float) -> list[list[float]] | None:
+    """Longitude and latitude of a closed ring, anticlockwise; None where it goes round a pole."""
+    angle = np.linspace(0.0, 2 * np.pi, CIRCLE_POINTS + 1)
+    ring_m = middle_m + radius_m * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
+    ring = np.array(_lonlat(site, ring_m))
+    ring[:, 0] = np.degrees(np.unwrap(np.radians(ring[:, 0])))  # across 180 degrees it goes on to 181
+    if abs(ring[-1, 0] - ring[0, 0]) > 1.0:
+        return None
+    ring[-1] = ring[0]
+    return [[float(lon), float(lat)] for lon, lat in ring]
+
+
+def _lonlat(site: Site, points_m: Array) -> list[list[float]]:
+    latitude, longitude = latlon_from_enu(site, *points_m.T)
+    return [[float(lon), float(lat)] for lon, lat in np.degrees(np.stack([longitude, latitude], axis=1))]
+
+
+def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}
+
+
+def _geojson(value: Located, found: list[dict[str, Any]]) -> str:
+    whole: dict[str, Any] = {"type": "FeatureCollection"}
+    if value.site.body == "moon":
+        whole |= {"crs": MOON_CRS, "body": "moon"}
+    return json.dumps({**whole, "features": found}, ensure_ascii=False, allow_nan=False, indent=1) + "\n"
+
+
+def _kml(value: Located, found: list[dict[str, Any]]) -> str:
+    """KML has no frame for other bodies: Google Earth reads the hint, other programs draw the Moon's fix on the Earth."""
+    on_moon = value.site.body == "moon"
+    note = "On the Moon: planetocentric, sphere of 1737.4 km, east positive. " if on_moon else ""
+    hint = ' hint="target=moon"' if on_moon else ""
+    marks = "".join(_placemark(one) for one in found)
+    description = f"<description>{note}startrack {escape(value.exposure.name)}</description>\n"
+    return f"{KML_HEAD.format(hint=hint)}{description}{marks}</Document>\n</kml>\n"
+
+
+def _placemark(feature: dict[str, Any]) -> str:
+    geometry, properties = feature["geometry"], feature["properties"]
+    data = "".join(
+        f'<Data name="{key}"><value>{escape(text if isinstance(text, str) else json.dumps(text))}</value></Data>'
+        for key, text in properties.items()
+        if text is not None
+    )
+    name = f"{properties['image']} {properties.get('circle', '')}".strip()
+    if geometry["type"] == "Point":
+        shape = f"<Point><coordinates>{_kml_points([geometry['coordinates']])}</coordinates></Point>"
+    else:
+        ring = _kml_points(geometry["coordinates"][0])
+        shape = (
+            f"<Polygon><outerBoundaryIs><LinearRing><coordinates>{ring}</coordinates></LinearRing></outerBoundaryIs>"
+            "</Polygon>"
+        )
+    extended = f"<ExtendedData>{data}</ExtendedData>"
+    return f"<Placemark><name>{escape(name)}</name>{extended}{shape}</Placemark>\n"
+
+
+def _kml_points(points: list[list[float]]) -> str:
+    return " ".join(f"{lon!r},{lat!r}" for lon, lat in points)

@@ -1,0 +1,100 @@
+"""A prior of the position: the posterior is the product, the search stays near it, a wrong one is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from localization_helpers import ThreeMethods
+
+from startrack.localization import ExactPosterior
+from startrack.prior import PositionPrior
+from startrack.stages import Settings
+from startrack.terrain import Cylinder, Terrain, load_terrain
+from startrack.types import Array, Evidence, Fix, NotLocated
+
+CRATER = load_terrain("shackleton-thesis")
+assert isinstance(CRATER, Cylinder)
+AT_M = np.array([-3000.0, 2000.0])
+
+
+def evidence(near: PositionPrior | None = None, *, soft: bool = False, count: int = 700, seed: int = 1) -> Evidence:
+    """Stars near the skyline of AT_M, seen or hidden; soft edges make the posterior nearly normal."""
+    rng = np.random.default_rng(seed)
+    azimuth, edge = 2 * np.pi * rng.random(count), np.radians(0.2) if soft else 0.0
+    above = np.radians(6.0) * rng.uniform(-1, 1, count)
+    elevation = CRATER.horizon_rad(AT_M[None], azimuth) + above
+    llr = np.where(above + edge * rng.standard_normal(count) > 0, 5.0, -5.0)
+    return Evidence(azimuth_rad=azimuth, elevation_rad=elevation, llr=llr, edge_sigma_rad=edge, near=near)
+
+
+def product(fix: Fix, near: PositionPrior) -> tuple[Array, Array]:
+    """Mean and covariance of the product of two normal distributions."""
+    weight, by_prior = np.linalg.inv(fix.covariance_m2), np.eye(2) / near.sigma_m**2
+    covariance = np.linalg.inv(weight + by_prior)
+    return covariance @ (weight @ fix.position_enu_m[:2] + by_prior @ near.mean_m), covariance
+
+
+@pytest.mark.parametrize("sigmas", [20.0, 1.0, 0.1])
+def test_the_posterior_is_the_product_with_the_prior(sigmas: float) -> None:
+    alone = ExactPosterior()(evidence(soft=True), CRATER)
+    sigma_m = sigmas * float(np.sqrt(np.linalg.eigvalsh(alone.covariance_m2)[0]))
+    near = PositionPrior(*(alone.position_enu_m[:2] + [1.1 * sigma_m, -0.7 * sigma_m]), sigma_m)
+    fix = ExactPosterior()(evidence(near, soft=True), CRATER)
+    mean, covariance = product(alone, near)
+    scale = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(fix.position_enu_m[:2] / scale, mean / scale, atol=0.15)
+    np.testing.assert_allclose(fix.covariance_m2 / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=0.12)
+    assert not fix.ambiguous
+
+
+@pytest.mark.parametrize("terrain", [CRATER, ThreeMethods(CRATER)], ids=["disks", "bounds"])
+def test_the_prior_weighs_hard_edges_too(terrain: Terrain) -> None:
+    """Against the boxes of the search without the prior, weighed by hand."""
+    boxes = ExactPosterior(boxes_per_sigma=8.0).explore(evidence(), CRATER)
+    near = PositionPrior(*(AT_M + [5.0, -3.0]), 8.0)
+    off = boxes.centres_m - near.mean_m
+    weight = np.exp(boxes.log_likelihood - boxes.log_likelihood.max() - np.sum(off**2, axis=1) / (2 * 8.0**2))
+    mean = np.average(boxes.centres_m, axis=0, weights=weight)
+    spread = np.cov(boxes.centres_m.T, aweights=weight, ddof=0)
+    fix = ExactPosterior()(evidence(near), terrain)
+    sigma = np.sqrt(np.diag(spread))
+    np.testing.assert_allclose(fix.position_enu_m[:2] / sigma, mean / sigma, atol=0.1)
+    np.testing.assert_allclose(fix.covariance_m2 / np.outer(sigma, sigma), spread / np.outer(sigma, sigma), atol=0.1)
+
+
+def test_an_ambiguous_position_becomes_single() -> None:
+    """Stars due east and due west only: a position and its mirror image to the south have the same horizon there."""
+    rng = np.random.default_rng(3)
+    n, at = 1500, np.array([2000.0, 6000.0])
+    azimuth = np.where(rng.random(n) < 0.5, np.pi / 2, 3 * np.pi / 2)
+    elevation, snr = np.radians(60) * rng.random(n), 1 + 3 * rng.random(n)
+    flux = snr * (elevation > CRATER.horizon_rad(at[None], azimuth)) + rng.standard_normal(n)
+    llr = np.clip(snr * flux - snr**2 / 2, -9, 9)
+    rows = Evidence(azimuth_rad=azimuth, elevation_rad=elevation, llr=llr)
+    method = ExactPosterior(sector_epsilon=0.0)
+    assert method(rows, CRATER).ambiguous
+    one = method(replace(rows, near=PositionPrior(1900.0, 6300.0, 400.0)), CRATER)
+    assert not one.ambiguous
+    assert len(one.modes) == 1
+    assert np.linalg.norm(one.position_enu_m[:2] - at) < one.radius999_m
+
+
+@pytest.mark.parametrize("off_m", [[150.0, 0.0], [0.0, -300.0], [4000.0, -3000.0]], ids=str)
+@pytest.mark.parametrize("sigma_m", [4.0, 10.0])
+def test_a_wrong_prior_is_refused(off_m: list[float], sigma_m: float) -> None:
+    near = PositionPrior(*(AT_M + off_m), sigma_m)
+    with pytest.raises(NotLocated, match=f"--near {near}") as refusal:
+        ExactPosterior()(evidence(near), CRATER)
+    assert refusal.value.reason == "inconsistent_evidence"
+
+
+def test_only_the_posterior_takes_a_prior() -> None:
+    near = PositionPrior(0.0, 0.0, 10.0)
+    assert Settings(near=near).near == near
+    with pytest.raises(ValueError, match="only the localizer posterior"):
+        Settings(localizer="hull", near=near)
+    for numbers in ((0.0, 0.0, 0.0), (np.nan, 0.0, 1.0), (0.0, 0.0, -1.0)):
+        with pytest.raises(ValueError, match="above 0"):
+            PositionPrior(*numbers)

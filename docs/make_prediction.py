@@ -10,6 +10,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from PIL import Image
+
 from startrack.cli.main import main
 from startrack.files import data_dir
 
@@ -39,7 +41,7 @@ if __name__ == "__main__":
     FLOOR.write_text(text.replace('"ldem', f'"{shipped.as_posix()}/ldem'))
     waypoints.write_text(WAYPOINTS)
     area = run("area", str(FLOOR), "--spacing", "1000", "--draws", "2")
-    shutil.copy(area / "predict.png", IMAGES / "predict.png")
+    Image.open(area / "predict.png").save(IMAGES / "predict.webp", quality=90)
     drive = run("drive", "shackleton-thesis", "--path", str(waypoints), *DRIVE)
     shutil.copy(drive / "predict.png", IMAGES / "predict-drive.png")
     shutil.copy(drive / "predict-compare.png", IMAGES / "predict-exposures.png")

@@ -165,6 +165,6 @@ def evenly_spaced(first: datetime, last: datetime, count: int) -> tuple[datetime
 
 
 def joined(chunks: Iterable[Chunk]) -> Chunk:
-    """Chunks of places as arrays over places (k, n, ...)."""
+    """The `chunks` of places as arrays over places (k, n, ...)."""
     rows = list(chunks)
     return {key: np.stack([row[key] for row in rows]) for key in rows[0]}

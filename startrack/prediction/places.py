@@ -59,13 +59,13 @@ class AreaCells:
         return [Place(int(number), float(east), float(north)) for number, (east, north) in numbered]
 
     def band(self, values: Array) -> NDArray[np.float32]:
-        """Values (k,) of the cells on the whole grid (rows, columns), NaN elsewhere."""
+        """The `values` (k,) of the cells on the whole grid (rows, columns), NaN elsewhere."""
         whole = np.full(self.frame.heights_m.size, np.nan, dtype=np.float32)
         whole[self.cell] = values
         return whole.reshape(self.frame.heights_m.shape)
 
     def raster(self, values: Array) -> Raster:
-        """Values (k,) of the cells as a map."""
+        """The `values` (k,) of the cells as a map."""
         return replace(self.frame, heights_m=self.band(values))
 
 
@@ -101,12 +101,12 @@ def area_cells(terrain: Terrain, spacing_m: float) -> AreaCells:
 
 
 def default_spacing_m(terrain: Terrain) -> float:
-    """At most a tenth of the search area's width [m], a nice number."""
+    """At most a tenth of the width [m] of a `terrain`'s search area, a nice number."""
     return nice_step(2 * terrain.search_radius_m / CELLS_ACROSS)
 
 
 def path_points(drive: Drive, terrain: Terrain, spacing_m: float) -> PathPoints:
-    """Points along a path, `spacing_m` apart or a little less, with both ends.
+    """Points along the path of a `drive` on a `terrain`, `spacing_m` apart or a little less, with both ends.
 
     Raises BadInput (bad_odometry) where a point is outside of the search area, or no camera can stand there.
     """

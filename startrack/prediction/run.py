@@ -35,7 +35,10 @@ class Predictions:
     _new: set[Conditions] = field(default_factory=set)
 
     def cells(self, conditions: Conditions, what: str) -> Cells:
-        """The predicted quantities of the places. Raises RunStopped."""
+        """The predicted quantities of the places under `conditions`; `what` names them in the progress bar.
+
+        Raises RunStopped.
+        """
         tasks = [Task(conditions, place, self.inputs) for place in self.places]
         if self.overwrite and conditions not in self._new:
             self.store.discard(tasks)
@@ -111,7 +114,10 @@ def predict_positions(
     camera: Camera, terrain: Terrain, times_utc: tuple[datetime, datetime], *, draws: int,
     positions_m: ArrayLike | None = None, spacing_m: float | None = None, **conditions: Any,
 ) -> Prediction:  # fmt: skip
-    """The prediction of a camera and a terrain in memory, in this process; see `startrack.predict`."""
+    """The prediction of a camera and a terrain in memory, in this process.
+
+    `times_utc`, `draws`, `positions_m`, `spacing_m` and the `conditions` are those of `startrack.predict`.
+    """
     if positions_m is None:
         cells = area_cells(terrain, spacing_m or default_spacing_m(terrain))
         points, places = cells.position_m, cells.places

@@ -39,7 +39,7 @@ def _ellipses(draws: Chunk) -> tuple[Array, Array, Array]:
 
 
 def summarized(cells: Cells) -> dict[str, Any]:
-    """The summary of places, by the keys of the schema."""
+    """The summary of the places in `cells`, by the keys of the schema."""
     radius = np.where(np.isnan(cells["radius95_m"]), np.inf, cells["radius95_m"])
     median = float(np.median(radius))
     return {
@@ -50,5 +50,5 @@ def summarized(cells: Cells) -> dict[str, Any]:
 
 
 def share_within(cells: Cells, radius95_m: float) -> float:
-    """Share of the places whose 95 % radius is at most `radius95_m`."""
+    """Share of the places in `cells` whose 95 % radius is at most `radius95_m`."""
     return float(np.mean(np.nan_to_num(cells["radius95_m"], nan=np.inf) <= radius95_m))

@@ -20,7 +20,10 @@ SOURCES = (  # their content is part of a chunk's key
 
 
 def draw_store(out: Path, *, draws: int, jobs: int, progress: Progress, cluster: str | None = None) -> ChunkStore[Task]:
-    """The store of draws under the folder `out`, of which each place has `draws`."""
+    """The store of draws under the folder `out`, of which each place has `draws`.
+
+    They are made in `jobs` processes or on a `cluster`, and reported to `progress`.
+    """
     limit_s = draws * TASK_LIMIT_S  # a draw takes as long as an image
     return ChunkStore(out / FOLDER, draw_task, _key, jobs=jobs, progress=progress, cluster=cluster, limit_s=limit_s)
 

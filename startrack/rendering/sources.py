@@ -70,7 +70,10 @@ def exposure_for_snr(camera: Camera, sky_v_mag_arcsec2: float | None, *, v_mag: 
 
 
 def limiting_v_mag(camera: Camera, sky_v_mag_arcsec2: float | None, *, exposure_s: float, snr: float) -> float:
-    """Magnitude of the star on the axis that reaches `snr` in `exposure_s`: the inverse of `exposure_for_snr`."""
+    """Magnitude of the star on the axis of a `camera` that reaches `snr` in `exposure_s`.
+
+    The sky has the brightness `sky_v_mag_arcsec2`. The inverse of `exposure_for_snr`.
+    """
     from startrack.rendering.sky import sky_e_per_s
 
     sensor = camera.sensor

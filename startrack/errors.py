@@ -106,7 +106,8 @@ class Reason(StrEnum):
 
 INTERNAL_ERROR = Reason.INTERNAL_ERROR
 ADVICE_IN_MESSAGE = re.compile(  # the imperatives of our messages, a flag, or a question
-    r"\?|(^|\s)--[a-z]|\b(give|choose|correct|enlarge|expose|find|flip|install|make|replace|run|set|state|try|use|widen) "
+    r"\?|(^|\s)--[a-z]"
+    r"|\b(give|choose|correct|enlarge|expose|find|flip|install|make|replace|run|set|state|try|use|widen) "
 )
 _OF_CODE = {one.value: one for one in Reason}
 BAD_INPUT_REASONS = frozenset(one for one in Reason if one.exit_code == EXIT_BAD_INPUT)  # BadInput in the library

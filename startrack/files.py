@@ -77,7 +77,8 @@ def resolve_named(name_or_path: str | Path, kind: str, reason: str) -> Path:
         shipped = ", ".join(sorted(p.stem for p in data_dir(kind).glob("*.toml")))
         raise BadInput(
             reason,
-            f"no shipped file is called {name_or_path!r}; shipped: {shipped}; a path ends in .toml or contains a separator",
+            f"no shipped file is called {name_or_path!r}; shipped: {shipped}; a path ends in .toml or contains a "
+            "separator",
         )
     return path
 

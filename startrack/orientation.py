@@ -23,7 +23,7 @@ from startrack.stages import (
     Oriented,
     extend,
 )  # fmt: skip
-from startrack.types import BadInput, Stars
+from startrack.types import Array, BadInput, NotIdentified, Stars, TooFewStars
 
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog
@@ -89,18 +89,31 @@ def identify_stars(
     )
 
 
-def identify_unknown_lens(detected: Detected, fov_rad: float, catalog: StarCatalog) -> Identified:
-    """The same as `identify_stars`, with the camera found from the approximate field of view `fov_rad` [rad].
+def identify_unknown_lens(detected: Detected, fovs_rad: Array, catalog: StarCatalog) -> Identified:
+    """The same as `identify_stars`, with the camera found from an approximate field of view.
 
-    `detected` has the point sources, `catalog` the stars. Raises NotIdentified, TooFewStars.
+    `detected` has the point sources, `catalog` the stars. The first of `fovs_rad` (n,) that identifies the image is
+    taken: an identification is accepted at any of them only where chance would not give it. Raises NotIdentified,
+    TooFewStars.
     """
     from startrack.identification import identify_unknown_lens as solve
 
     stars = stars_at(catalog, detected.exposure.time_utc, None)
     sources, size_px = detected.detections, detected.exposure.size_px
-    found = solve(sources, size_px, fov_rad, stars, background=sources.background_e)
-    return extend(
-        detected, Identified, camera=found.camera, stars=stars, bodies=(), identification=found.identification
+    for fov_rad in fovs_rad:
+        try:
+            found = solve(sources, size_px, float(fov_rad), stars, background=sources.background_e)
+        except (NotIdentified, TooFewStars):
+            if len(fovs_rad) == 1:
+                raise
+            continue
+        return extend(
+            detected, Identified, camera=found.camera, stars=stars, bodies=(), identification=found.identification
+        )
+    low, high = np.degrees([fovs_rad[0], fovs_rad[-1]])
+    raise NotIdentified(
+        f"no lens of {low:.3g} to {high:.3g} degrees explains the point sources ({len(fovs_rad)} tried): "
+        "is this the night sky, and in focus?"
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -156,17 +157,18 @@ def identify(
 
 
 def identify_blind(
-    exposure: Exposure, fov_rad: float, catalog: StarCatalog, settings: Settings | None = None
+    exposure: Exposure, fov_rad: float | Sequence[float], catalog: StarCatalog, settings: Settings | None = None
 ) -> Oriented | Refused:
     """Stars, attitude and lens of an `exposure` without a camera file, from an approximate field of view alone.
 
-    `fov_rad` [rad] is the angle across the image's width below 100 degrees, from there up that of the whole image
+    `fov_rad` [rad], one or several that are tried in their order, is the angle across the image's width
+    below 100 degrees, from there up that of the whole image
     circle. `catalog` is the list of stars; `settings` has the detector. The lens found is the value's `camera`.
     """
     run = Run(Inputs(exposure=exposure, catalog_name=catalog.name))
     try:
         detected = run.run_stage("detect", detect_sources, run.reached, None, (settings or Settings()).detector)
-        identified = run.run_stage("identify", identify_unknown_lens, detected, fov_rad, catalog)
+        identified = run.run_stage("identify", identify_unknown_lens, detected, np.atleast_1d(fov_rad), catalog)
         return run.finish(run.run_stage("attitude", solve_orientation, identified))
     except (BadInput, NoSolution) as refusal:
         return run.refuse(refusal)

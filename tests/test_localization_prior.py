@@ -40,12 +40,14 @@ def product(fix: Fix, near: PositionPrior) -> tuple[Array, Array]:
 def test_the_posterior_is_the_product_with_the_prior(sigmas: float) -> None:
     alone = ExactPosterior()(evidence(soft=True), CRATER)
     sigma_m = sigmas * float(np.sqrt(np.linalg.eigvalsh(alone.covariance_m2)[0]))
-    near = PositionPrior(*(alone.position_enu_m[:2] + [1.1 * sigma_m, -0.7 * sigma_m]), sigma_m)
+    near = PositionPrior(alone.position_enu_m[0] + 1.1 * sigma_m, alone.position_enu_m[1] - 0.7 * sigma_m, sigma_m)
     fix = ExactPosterior()(evidence(near, soft=True), CRATER)
     mean, covariance = product(alone, near)
     scale = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(fix.position_enu_m[:2] / scale, mean / scale, atol=0.15)
-    np.testing.assert_allclose(fix.covariance_m2 / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=0.12)
+    np.testing.assert_allclose(
+        fix.covariance_m2 / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=0.12
+    )
     assert not fix.ambiguous
 
 
@@ -53,7 +55,7 @@ def test_the_posterior_is_the_product_with_the_prior(sigmas: float) -> None:
 def test_the_prior_weighs_hard_edges_too(terrain: Terrain) -> None:
     """Against the boxes of the search without the prior, weighed by hand."""
     boxes = ExactPosterior(boxes_per_sigma=8.0).explore(evidence(), CRATER)
-    near = PositionPrior(*(AT_M + [5.0, -3.0]), 8.0)
+    near = PositionPrior(AT_M[0] + 5.0, AT_M[1] - 3.0, 8.0)
     off = boxes.centres_m - near.mean_m
     weight = np.exp(boxes.log_likelihood - boxes.log_likelihood.max() - np.sum(off**2, axis=1) / (2 * 8.0**2))
     mean = np.average(boxes.centres_m, axis=0, weights=weight)

@@ -30,7 +30,8 @@ KEYS = {
     "sky": "brightness_mag_arcsec2 unused",
     "clock": "offset_s sigma_s",
     "timing_ms": "read detect identify attitude evidence locate",
-    "provenance": "version image_sha256 camera terrain catalog localizer near time_utc time_sigma_s exposure_s mask_sha256",
+    "provenance": "version image_sha256 camera terrain catalog localizer near time_utc time_sigma_s exposure_s "
+    "mask_sha256",
 }
 
 

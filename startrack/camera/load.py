@@ -57,6 +57,7 @@ def _converted(path: Path, text: str, program: str) -> Camera:
 @lru_cache  # once for a file, however many images name it
 def _log_angle(path: str, program: str, angle_deg: float) -> None:
     LOG.warning(
-        "%s: the lens is taken as calibrated to %.1f degrees off the axis, the frame's nearest edge: the file states no "
-        "angle (startrack calibrate convert --from %s --calibrated-angle DEG sets one)", path, angle_deg, program,
+        "%s: the lens is taken as calibrated to %.1f degrees off the axis, the frame's nearest edge: the file states "
+        "no angle (startrack calibrate convert --from %s --calibrated-angle DEG sets one)",
+        path, angle_deg, program,
     )  # fmt: skip

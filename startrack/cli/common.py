@@ -83,7 +83,7 @@ def check_localizer(args: argparse.Namespace) -> None:
     """A usage error for an unknown name after --localizer, and for one that takes no --near."""
     from startrack.localization import LOCALIZERS
 
-    if args.near is not None and args.localizer != DEFAULT_LOCALIZER:
+    if getattr(args, "near", None) is not None and args.localizer != DEFAULT_LOCALIZER:
         args.usage_error(f"--near: only --localizer {DEFAULT_LOCALIZER} takes a prior of the position")
 
     if args.localizer not in LOCALIZERS:

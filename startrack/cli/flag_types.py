@@ -10,6 +10,7 @@ from startrack.declaration import LARGEST, SHOWN_CHARS
 MAX_EXPOSURE_S = 1e6  # as startrack.exposure.sidecar has it; written here so that help is quick
 MAX_COUNT = 1_000_000
 MAX_MAGNITUDE = 100.0
+FIELD_TOLERANCE_1 = 0.1  # as startrack.identification.unknown_lens has it; written here so that help is quick
 
 
 def number(text: str) -> float:
@@ -96,6 +97,24 @@ def field_of_view_rad(text: str, narrowest_deg: float = 0.5, widest_deg: float =
     if not narrowest_deg <= number(text) <= widest_deg:
         raise argparse.ArgumentTypeError(f"{text} is not between {narrowest_deg:g} and {widest_deg:g} degrees")
     return math.radians(number(text))
+
+
+def fields_of_view_rad(text: str, narrowest_deg: float, widest_deg: float) -> tuple[float, ...]:
+    """An angle, or every angle to try between two, MIN..MAX, given in degrees [rad].
+
+    The identifier allows for FIELD_TOLERANCE_1 to both sides of an angle: geometric steps as wide leave no gap.
+    """
+    first, between, last = text.partition("..")
+    low = field_of_view_rad(first, narrowest_deg, widest_deg)
+    if not between:
+        return (low,)
+    high = field_of_view_rad(last, narrowest_deg, widest_deg)
+    if high < low:
+        raise argparse.ArgumentTypeError(f"{text}: the first field of view is wider than the last")
+    step = (1 + FIELD_TOLERANCE_1) / (1 - FIELD_TOLERANCE_1)
+    count = max(math.ceil(math.log(high / low) / math.log(step)), 1)
+    ends = [low * (high / low) ** (k / count) for k in range(count + 1)]
+    return tuple(0.5 * (ends[k] + ends[k + 1]) for k in range(count))  # the middle is as far from both ends
 
 
 def position_prior(text: str) -> tuple[float, float, float]:

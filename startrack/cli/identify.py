@@ -5,13 +5,17 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import Outcome, add_image_flags, camera_of, read, result_path, run_images
-from startrack.cli.flag_types import field_of_view_rad
+from startrack.cli.flag_types import fields_of_view_rad
+
+if TYPE_CHECKING:
+    from startrack.camera import Camera
 
 FORMAT = "startrack.identification/1"
 NARROWEST_DEG, WIDEST_DEG = 3.0, 280.0
+WIDE_RAD = math.radians(100.0)  # from here up the field of view is that of the image circle
 
 
 def add_parser(subparsers: Any) -> None:
@@ -26,15 +30,26 @@ def add_parser(subparsers: Any) -> None:
     )
     add_image_flags(parser)
     parser.add_argument(
-        "--fov", type=_field_of_view_rad, metavar="DEG",
-        help="no camera file: field of view in degrees, good to 10 %%; below 100 across the image's width, from there "
+        "--fov", type=_fields_of_view_rad, metavar="DEG|MIN..MAX",
+        help="no camera file: field of view in degrees, good to 10 %%, or a range that is tried in steps; "
+        "below 100 across the image's width, from there "
         "up of the whole image circle, even where the frame clips it. Takes 12 stars, 7 below 100 degrees",
     )  # fmt: skip
     parser.set_defaults(run=run, usage_error=parser.error)
 
 
-def _field_of_view_rad(text: str) -> float:
-    return field_of_view_rad(text, NARROWEST_DEG, WIDEST_DEG)
+def _fields_of_view_rad(text: str) -> tuple[float, ...]:
+    return fields_of_view_rad(text, NARROWEST_DEG, WIDEST_DEG)
+
+
+def _found_fov_text(camera: Camera, fovs_rad: tuple[float, ...]) -> str:
+    """The field of view in degrees, of those tried [rad], that is closest to that of the `camera` found."""
+    middle, right = camera.centre_px[1], camera.size_px[0] - 0.5
+    width_rad = float(camera.angle_rad([[-0.5, middle], [right, middle]]).sum())
+    closest = min(
+        fovs_rad, key=lambda fov: abs(math.log(fov / (width_rad if fov < WIDE_RAD else 2 * camera.max_angle_rad)))
+    )
+    return f"{math.degrees(closest):.4g}"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -69,7 +84,6 @@ def _identify_image(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     record = write_results(result, out, plots=not args.no_plots)
     line = summary_line(result, seconds=time.perf_counter() - start)
     if camera is None and isinstance(result, Oriented):
-        line += (
-            f"\n  {lens_text(result.camera)}; a camera file: startrack calibrate --fov {math.degrees(args.fov):g} IMAGE"
-        )
+        fov = _found_fov_text(result.camera, args.fov)
+        line += f"\n  {lens_text(result.camera)}; a camera file: startrack calibrate --fov {fov} IMAGE"
     return Outcome(result.status, result.reason, line + ("\n" + verbose_text(result) if args.verbose else ""), record)

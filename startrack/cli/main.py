@@ -37,9 +37,9 @@ startrack render --seed 1                          a synthetic exposure to try i
 """
 START = """usage: startrack COMMAND ... (startrack --help lists the commands; startrack demo shows what they do)
 
-rover navigation       startrack locate sample_images/near-wall.png       where is the camera, on a map of the ground?
-all-sky cameras        startrack calibrate NIGHT.jpg... --fov 180         the lens from your own pictures, then startrack horizon
-star identification    startrack identify SKY.png --fov 60                which stars are these? no camera file is needed"""
+rover navigation     startrack locate sample_images/near-wall.png    where is the camera, on a map of the ground?
+all-sky cameras      startrack calibrate NIGHT.jpg... --fov 180      the lens; then startrack horizon: the skyline
+star identification  startrack identify SKY.png --fov 60             which stars are these? no camera file is needed"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -55,7 +55,8 @@ def root_box(rows: Rows, searched: Array) -> Boxes:
     settled = log_mixtures(sums[0], rows.log_floor)
     n, open_pairs_too = len(rows.llr), not len(rows.disks_m)
     return Boxes(
-        searched[None, :2].copy(), float(searched[2]), np.array([0, n]), np.arange(n), rows.least if open_pairs_too else NO_NUMBERS,
+        searched[None, :2].copy(), float(searched[2]), np.array([0, n]), np.arange(n),
+        rows.least if open_pairs_too else NO_NUMBERS,
         rows.most if open_pairs_too else NO_NUMBERS, sums, np.array([settled]), np.array([-inf]),
         np.array([settled + rows.most.sum()]), np.array([-inf]),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""A prior of the position: where it restricts the search, what it adds to the posterior, and when it is contradicted."""
+"""A prior of the position: the search near it, the posterior with it, and its contradiction by the evidence."""
 
 from __future__ import annotations
 

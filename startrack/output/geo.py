@@ -86,7 +86,7 @@ def _geojson(value: Located, found: list[dict[str, Any]]) -> str:
 
 
 def _kml(value: Located, found: list[dict[str, Any]]) -> str:
-    """KML has no frame for other bodies: Google Earth reads the hint, other programs draw the Moon's fix on the Earth."""
+    """KML has no frame for other bodies: Google Earth reads the hint, other programs draw the fix on the Earth."""
     on_moon = value.site.body == "moon"
     note = "On the Moon: planetocentric, sphere of 1737.4 km, east positive. " if on_moon else ""
     hint = ' hint="target=moon"' if on_moon else ""

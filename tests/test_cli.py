@@ -304,7 +304,7 @@ def test_an_unknown_command_shows_the_names_of_the_commands(capsys, word):
         main([word, "x.png"])
     said = capsys.readouterr().err
     assert end.value.code == USAGE
-    assert f"no command is called '{word}'; there are: locate, batch, identify," in said
+    assert f"no command is called '{word}'; there are: locate, batch, track, identify," in said
     assert "calibrate verify" not in said
 
 

@@ -44,8 +44,10 @@ def _fields_of_view_rad(text: str) -> tuple[float, ...]:
 
 def _found_fov_text(camera: Camera, fovs_rad: tuple[float, ...]) -> str:
     """The field of view in degrees, of those tried [rad], that is closest to that of the `camera` found."""
+    import numpy as np
+
     middle, right = camera.centre_px[1], camera.size_px[0] - 0.5
-    width_rad = float(camera.angle_rad([[-0.5, middle], [right, middle]]).sum())
+    width_rad = float(camera.angle_rad(np.array([[-0.5, middle], [right, middle]])).sum())
     closest = min(
         fovs_rad, key=lambda fov: abs(math.log(fov / (width_rad if fov < WIDE_RAD else 2 * camera.max_angle_rad)))
     )

@@ -118,7 +118,7 @@ class ExactPosterior:
         return weigh_by_prior(marginalize_clock(search.explore_shaped, search.explore, evidence, terrain), near)
 
     def explore_about(self, evidence: Evidence, terrain: SearchedNear) -> Explored:
-        """The posterior by `evidence` alone near a prior.
+        """The posterior by `evidence` alone near the prior of a `terrain`.
 
         The searched disk is enlarged until the likeliest position is not at its edge: else nothing would show how far
         off the prior the evidence is. Raises NotLocated as `explore_shaped` does.

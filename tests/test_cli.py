@@ -430,7 +430,7 @@ def test_doctor_knows_the_packages_and_extras_of_the_project():
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert {*REQUIRED} == {re.split("[><=]", one)[0] for one in project["dependencies"]}
-    extras = {*project["optional-dependencies"]} - {"test", "dev", "docs", "bench", "browser"}
+    extras = {*project["optional-dependencies"]} - {"test", "dev", "bench", "browser"}
     assert {*OPTIONAL} == extras
     assert re.findall(r"^\| `(\w+)` \|", (ROOT / "README.md").read_text(), flags=re.MULTILINE) == [*OPTIONAL]
 

@@ -25,6 +25,7 @@ OPTIONAL = {  # extra: its packages and what they are for
     "ros": (("rosbags",), "ROS bags"),
     "parquet": (("pyarrow",), "results.parquet"),
     "completion": (("argcomplete",), "completion in the shell"),
+    "docs": (("sphinx",), "the documentation as a site"),
 }
 SELF_TEST_SEED = 20080501
 SELF_TEST_LIMIT_M = 40.0

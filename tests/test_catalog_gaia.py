@@ -49,6 +49,7 @@ def test_magnitudes_of_added_stars_state_their_missing_colour() -> None:
     assert np.all(np.diff(deep.v_mag) >= 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sky", "used"), [("gaia", "hipparcos+gaia"), ("hipparcos", "hipparcos")])
 def test_deep_stars_are_used_only_where_the_image_shows_them(sky: str, used: str) -> None:
     camera, terrain = load_camera("fisheye-2048"), load_terrain("shackleton-thesis")

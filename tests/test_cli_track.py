@@ -102,6 +102,7 @@ def test_tables_are_read_by_astropy_and_the_map_has_every_frame(tracked):
     assert features[0]["geometry"]["coordinates"][0] == features[1]["geometry"]["coordinates"]
 
 
+@pytest.mark.slow
 def test_images_followed_and_killed_give_the_same_files(drive, tracked, tmp_path):
     live, out = drive / "live", tmp_path / "out"  # beside the camera file that the images name
     live.mkdir()
@@ -129,6 +130,7 @@ def test_images_followed_and_killed_give_the_same_files(drive, tracked, tmp_path
         assert (out / name).read_bytes() == (tracked / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_at_rest_the_images_share_one_position(drive, tmp_path):
     code = main([
         "render", "--every", "40000", "-n", "3", "--seed", "5", "-q", "-c", str(drive / "small.toml"), "-D",
@@ -143,6 +145,7 @@ def test_at_rest_the_images_share_one_position(drive, tmp_path):
     assert frames[-1]["filtered_radius95_m"] < frames[0]["filtered_radius95_m"]
 
 
+@pytest.mark.slow
 def test_refused_images_are_bridged_by_the_odometry(drive, tmp_path):
     from startrack.exposure import read_exposure
 

@@ -66,6 +66,7 @@ def test_the_prior_weighs_hard_edges_too(terrain: Terrain) -> None:
     np.testing.assert_allclose(fix.covariance_m2 / np.outer(sigma, sigma), spread / np.outer(sigma, sigma), atol=0.1)
 
 
+@pytest.mark.slow
 def test_an_ambiguous_position_becomes_single() -> None:
     """Stars due east and due west only: a position and its mirror image to the south have the same horizon there."""
     rng = np.random.default_rng(3)
@@ -83,6 +84,7 @@ def test_an_ambiguous_position_becomes_single() -> None:
     assert np.linalg.norm(one.position_enu_m[:2] - at) < one.radius999_m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("off_m", [[150.0, 0.0], [0.0, -300.0], [4000.0, -3000.0]], ids=str)
 @pytest.mark.parametrize("sigma_m", [4.0, 10.0])
 def test_a_wrong_prior_is_refused(off_m: list[float], sigma_m: float) -> None:

@@ -87,6 +87,7 @@ def test_a_saturated_star_spoils_its_stamp():
     assert found.usable.tolist() == [False, False, True]
 
 
+@pytest.mark.slow
 def test_positions_of_simulated_stars_err_as_they_state(series: Series):
     nees, inside = [], 0
     for number in range(30):

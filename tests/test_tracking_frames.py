@@ -59,6 +59,7 @@ def raise_post(terrain: HeightMap, post: int, by_m: float) -> HeightMap:
     return replace(terrain, maps=(replace(terrain.maps[0], heights_m=heights), *terrain.maps[1:]))
 
 
+@pytest.mark.slow
 def test_the_horizon_rises_with_the_posts_that_make_it(ground):
     azimuth = np.radians([17.0, 140.0, 255.0])
     found = ground.horizon_posts(PLACE_M, azimuth)
@@ -88,6 +89,7 @@ def test_posts_stand_where_the_map_has_them(ground):
     assert (np.abs(points[:, :2] - PLACE_M).max(axis=1) < 350).all()
 
 
+@pytest.mark.slow
 def test_the_observation_is_the_exact_posterior(ground):
     evidence = rays_at(ground, PLACE_M, np.random.default_rng(1), raised_rad=HORIZON_ERROR_RAD)
     fix = ExactPosterior()(evidence, ground)
@@ -111,6 +113,7 @@ def test_the_response_to_the_bias_is_that_to_raised_rows(ground):
     np.testing.assert_allclose(here.response[:, :2], np.eye(3)[:, :2], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_response_to_a_post_is_that_to_a_lower_map(ground):
     evidence = rays_at(ground, PLACE_M, np.random.default_rng(3))
     here = estimate(evidence, ground)

@@ -15,20 +15,7 @@ from html_helpers import DESKTOP, NASTY, PHONE, SMALL, Window, results_in
 from startrack.output.html import page_text, results_under, write_page
 from startrack.output.html.gather import Found
 
-playwright = pytest.importorskip("playwright.sync_api", reason="the extra `browser` is not installed")
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 REAL = {"small": (6010.0, -2507.0)}
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    path = next(filter(None, map(shutil.which, BROWSERS)), None)
-    with playwright.sync_playwright() as driver:
-        if path is None and not Path(driver.chromium.executable_path).exists():
-            pytest.skip("no Chromium is installed")
-        browser = driver.chromium.launch(executable_path=path, args=["--no-sandbox", "--disable-gpu"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +16,6 @@ from startrack.output.write import png_bytes
 from startrack.tracking.circles import radius_holding
 from startrack.tracking.page import track_page
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 PICTURE = png_bytes(np.full((40, 60, 3), 90, dtype=np.uint8))
 TITLE = 'A drive & </script><i>"more"</i>'
 
@@ -50,18 +47,6 @@ def test_a_page_without_a_position_can_be_made():
     data = data_of(track_page(synthetic_track(unknown=8), PICTURE, title="nothing"))
     assert set(data["frames"]["radius95_m"]) == {None}
     assert data["odometry"] is None
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api", reason="the extra `browser` is not installed")
-    path = next(filter(None, map(shutil.which, BROWSERS)), None)
-    with playwright.sync_playwright() as driver:
-        if path is None and not Path(driver.chromium.executable_path).exists():
-            pytest.skip("no Chromium is installed")
-        browser = driver.chromium.launch(executable_path=path, args=["--no-sandbox", "--disable-gpu"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from startrack.cli.common import EVIDENCE_SOURCES, add_fact_flags, add_output_flags, flag_facts
+from startrack.cli.drive import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA_1
 from startrack.cli.flag_types import amount, seconds
 from startrack.cli.track_run import TrackRun
 
@@ -35,8 +36,12 @@ def add_parser(subparsers: Any) -> None:
 def _add_motion(group: Any) -> None:
     group.add_argument("--odometry", metavar="FILE", help="TUM text, or a ROS bag")
     group.add_argument("--odometry-topic", metavar="TOPIC", help="of a bag with several")
-    group.add_argument("--odometry-sigma", type=amount, default=0.02, metavar="F", help="of a move, relative (0.02)")
-    group.add_argument("--odometry-floor", type=amount, default=0.05, metavar="M", help="of a move, beside that (0.05)")
+    group.add_argument(
+        "--odometry-sigma", type=amount, default=ODOMETRY_SIGMA_1, metavar="F", help="of a move, relative (%(default)s)"
+    )
+    group.add_argument(
+        "--odometry-floor", type=amount, default=ODOMETRY_FLOOR_M, metavar="M", help="beside that (%(default)s)"
+    )
     group.add_argument("--at-rest", action="store_true", help="the camera did not move")
     group.add_argument("--image-topic", metavar="TOPIC", help="of a bag with several")
 

@@ -30,7 +30,7 @@ KML_HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.openg
 def geo_text(value: Located, kind: str) -> str:
     """The text of a file of the `kind` geojson or kml with the fix of a located `value`."""
     found = features(value)
-    return _kml(value, found) if kind == "kml" else _geojson(value, found)
+    return _kml(value, found) if kind == "kml" else geojson_text(found, value.site.body)
 
 
 def features(value: Located) -> list[dict[str, Any]]:
@@ -44,17 +44,17 @@ def features(value: Located) -> list[dict[str, Any]]:
     if "position" not in record:
         up_m = float(value.fix.position_enu_m[2])
         return [
-            _feature("Point", _lonlat(site, np.array([[mode["east_m"], mode["north_m"], up_m]]))[0], common | mode)
+            feature("Point", _lonlat(site, np.array([[mode["east_m"], mode["north_m"], up_m]]))[0], common | mode)
             for mode in record["modes"]
         ]
     position = record["position"]
     middle_m = np.array([position["east_m"], position["north_m"], position["up_m"]])
-    point = _feature(
+    point = feature(
         "Point", _lonlat(site, middle_m[None])[0], common | {key: position.get(key) for key in POSITION_KEYS}
     )
     ring = None if position["radius95_m"] is None else _circle(site, middle_m, position["radius95_m"])
     circle = {"image": record["image"], "circle": "95 %", "radius_m": position["radius95_m"]}
-    return [point, *([] if ring is None else [_feature("Polygon", [ring], circle)])]
+    return [point, *([] if ring is None else [feature("Polygon", [ring], circle)])]
 
 
 def _circle(site: Site, middle_m: Array, radius_m: float) -> list[list[float]] | None:
@@ -74,15 +74,20 @@ def _lonlat(site: Site, points_m: Array) -> list[list[float]]:
     return [[float(lon), float(lat)] for lon, lat in np.degrees(np.stack([longitude, latitude], axis=1))]
 
 
-def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
+def feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
+    """A feature of GeoJSON with a geometry of this `kind`, its `coordinates` in degrees, and its `properties`."""
     return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}
 
 
-def _geojson(value: Located, found: list[dict[str, Any]]) -> str:
+def geojson_text(features: list[dict[str, Any]], body: str) -> str:
+    """The `features` as GeoJSON; on the Moon with its frame, since GeoJSON alone is on the Earth. `body` is a site's.
+
+    Raises ValueError for NaN or an infinity, which JSON has not.
+    """
     whole: dict[str, Any] = {"type": "FeatureCollection"}
-    if value.site.body == "moon":
+    if body == "moon":
         whole |= {"crs": MOON_CRS, "body": "moon"}
-    return json.dumps({**whole, "features": found}, ensure_ascii=False, allow_nan=False, indent=1) + "\n"
+    return json.dumps({**whole, "features": features}, ensure_ascii=False, allow_nan=False, indent=1) + "\n"
 
 
 def _kml(value: Located, found: list[dict[str, Any]]) -> str:

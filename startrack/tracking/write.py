@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from datetime import UTC
 from pathlib import Path
@@ -14,6 +13,8 @@ from startrack import __version__
 from startrack.files import write_atomically
 from startrack.frames import R_from_quat_xyzw, tum_line
 from startrack.output.ecsv import Column, ecsv_text, format_values
+from startrack.output.geo import feature, geojson_text
+from startrack.output.write import json_text
 from startrack.tracking.quantities import FRAME_QUANTITIES, frame_records
 from startrack.tracking.track import Track, Trajectory
 
@@ -56,10 +57,10 @@ def write_track(
         "track.tum": tum_text(track, track.smoothed).encode(),
         "track.filtered.tum": tum_text(track, track.filtered).encode(),
         "track.ecsv": frames_table(record["frames"]).encode(),
-        "track.geojson": json_bytes(geojson(record)),
+        "track.geojson": track_geojson(track, record["frames"]).encode(),
         "track.crests.ecsv": crests_table(track).encode(),
         **(pictures or {}),
-        "track.json": json_bytes(record),  # last: it exists where all others do
+        "track.json": json_text(record).encode(),  # last: it exists where all others do
     }
     for name, data in made.items():
         write_atomically(out / name, data, overwrite=True)
@@ -101,22 +102,11 @@ def crests_table(track: Track) -> str:
     return ecsv_text(columns)
 
 
-def geojson(record: dict[str, Any]) -> dict[str, Any]:
-    """The track as GeoJSON: a line through the smoothed positions, and a point for each frame."""
-    known = [one for one in record["frames"] if one["latitude_deg"] is not None]
+def track_geojson(track: Track, records: Sequence[dict[str, Any]]) -> str:
+    """track.geojson: a line through the smoothed positions of a `track`, and a point for each of its `records`."""
+    known = [one for one in records if one["latitude_deg"] is not None]
     places = [[one["longitude_deg"], one["latitude_deg"]] for one in known]
-    points = [
-        {"type": "Feature", "geometry": {"type": "Point", "coordinates": place}, "properties": one}
-        for place, one in zip(places, known, strict=True)
-    ]
-    line = {
-        "type": "Feature",
-        "geometry": {"type": "LineString", "coordinates": places},
-        "properties": {"name": "smoothed track", "terrain": record["terrain"]},
-    }
-    return {"type": "FeatureCollection", "features": [*([line] if len(places) > 1 else []), *points]}
-
-
-def json_bytes(value: dict[str, Any]) -> bytes:
-    """JSON with one space of indentation."""
-    return (json.dumps(value, indent=1, ensure_ascii=False) + "\n").encode()
+    line = feature("LineString", places, {"name": "smoothed track", "terrain": track.terrain.name})
+    points = [feature("Point", place, one) for place, one in zip(places, known, strict=True)]
+    site = track.terrain.site
+    return geojson_text([*([line] if len(places) > 1 else []), *points], "" if site is None else site.body)

@@ -67,10 +67,18 @@ def small_camera(folder: Path) -> None:
     (folder / "small.toml").write_text(CAMERA)
 
 
+def path_and_cameras(folder: Path) -> None:
+    (folder / "waypoints.csv").write_text("east_m,north_m\n-3000,0\n0,1000\n")
+    for name in ("mine.toml", "other.toml"):
+        shutil.copy(ROOT / "calib/fisheye-2048.toml", folder / name)
+
+
+QUICK_PREDICTION = ["-t", "shackleton-thesis", "--spacing", "9000", "--draws", "1", "--no-plots"]
 ASSUMED = {
     "batch": Assumed(folder_of_images),
     "calibration": Assumed(nights),
     "horizon": Assumed(fits_nights),
+    "predict": Assumed(path_and_cameras, {"predict": QUICK_PREDICTION}),
     "terrain": Assumed(own_maps),
     "track": Assumed(small_camera, {"render": ["-c", "small.toml", "-q"]}),
 }

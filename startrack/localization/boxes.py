@@ -49,13 +49,13 @@ class Boxes(NamedTuple):
     score: Array  # (n,) log-likelihood at the centre; -inf where no camera can be; valid only with disks
 
 
-def root_box(rows: Rows, searched: Array) -> Boxes:
-    """The box about the disk that is `searched` (3,), with all rows open."""
+def root_box(rows: Rows, searched: tuple[float, float, float]) -> Boxes:
+    """The box about the disk that is `searched` (east, north, radius [m]), with all rows open."""
     sums = -rows.ceiling[None]
     settled = log_mixtures(sums[0], rows.log_floor)
     n, open_pairs_too = len(rows.llr), not len(rows.disks_m)
     return Boxes(
-        searched[None, :2].copy(), float(searched[2]), np.array([0, n]), np.arange(n),
+        np.array([searched[:2]]), searched[2], np.array([0, n]), np.arange(n),
         rows.least if open_pairs_too else NO_NUMBERS,
         rows.most if open_pairs_too else NO_NUMBERS, sums, np.array([settled]), np.array([-inf]),
         np.array([settled + rows.most.sum()]), np.array([-inf]),

@@ -96,7 +96,7 @@ class Search:
     def _exclude_by_sectors(self) -> Boxes:
         """From the whole square to boxes of `ROW_BY_ROW_M`, with look-ups of whole sectors or of their parts."""
         lk, terrain = self.likelihood, self.terrain
-        centres, half, parent = terrain.searched[None, :2], float(terrain.searched[2]), np.zeros(1, dtype=np.int64)
+        centres, half, parent = np.array([terrain.searched[:2]]), terrain.searched[2], np.zeros(1, dtype=np.int64)
         known: tuple[Ints, Ints] | None = None  # open rows of the parts, once these are bounded
         while True:
             if known is None:

@@ -87,12 +87,12 @@ def holds_allowed_ground(terrain: Terrain, centres_m: Array, half_m: float) -> B
 def _last_boxes(likelihood: PositionLikelihood, beam: Beam) -> Array:
     """Centres (n, 2) of the last boxes, the best average first."""
     terrain, average = likelihood.terrain, likelihood.average
-    reach = float(terrain.searched[2])
+    east_m, north_m, reach = terrain.searched
     half = reach / FIRST_ACROSS
     line = half * (2 * np.arange(FIRST_ACROSS) + 1) - reach
     offsets = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     beyond = np.maximum(np.abs(offsets) - half, 0.0)
-    centres = terrain.searched[:2] + offsets[np.hypot(beyond[:, 0], beyond[:, 1]) <= reach]
+    centres = np.array([east_m, north_m]) + offsets[np.hypot(beyond[:, 0], beyond[:, 1]) <= reach]
     while True:
         centres = centres[holds_allowed_ground(terrain, centres, half)]
         score = average.score(terrain, centres, half, traced=beam.traced and half < TRACED_BELOW_M)

@@ -26,9 +26,9 @@ class SearchedNear(ForwardingTerrain):
         self.near_prior, self.radius_m = near, radius_m or max(REACH_SIGMAS * near.sigma_m, LEAST_REACH_M)
 
     @property
-    def searched(self) -> Array:
-        """The disk of the prior: east, north and radius (3,) [m]."""
-        return np.array([self.near_prior.east_m, self.near_prior.north_m, self.radius_m])
+    def searched(self) -> tuple[float, float, float]:  # type: ignore[override]
+        """The disk of the prior: east, north and radius [m]."""
+        return float(self.near_prior.east_m), float(self.near_prior.north_m), float(self.radius_m)
 
     def allowed(self, points_m: Array) -> Bools:
         """As of the whole terrain, within the disk."""

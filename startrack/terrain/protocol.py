@@ -78,9 +78,9 @@ class Terrain(ABC):
         )
 
     @property
-    def searched(self) -> Array:
-        """The disk in which positions are searched: east and north of its middle, and its radius (3,) [m]."""
-        return np.array([0.0, 0.0, self.reach_m])
+    def searched(self) -> tuple[float, float, float]:
+        """The disk in which positions are searched: east and north of its middle, and its radius [m]."""
+        return 0.0, 0.0, float(self.reach_m)
 
     @abstractmethod
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:

@@ -63,6 +63,7 @@ def changes_in_sigmas(flex_px: float, *, widened: bool) -> Array:
     return np.array(ratios)
 
 
+@pytest.mark.slow
 def test_with_a_flex_from_night_to_night_the_sigma_of_a_change_is_sound() -> None:
     """The field bends by 0.06 px, as between the nights of the sample photographs."""
     before, after = (changes_in_sigmas(0.06, widened=widened) for widened in (False, True))

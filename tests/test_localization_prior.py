@@ -36,6 +36,7 @@ def product(fix: Fix, near: PositionPrior) -> tuple[Array, Array]:
     return covariance @ (weight @ fix.position_enu_m[:2] + by_prior @ near.mean_m), covariance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigmas", [20.0, 1.0, 0.1])
 def test_the_posterior_is_the_product_with_the_prior(sigmas: float) -> None:
     alone = ExactPosterior()(evidence(soft=True), CRATER)

@@ -21,19 +21,28 @@ S = TypeVar("S", bound=StarRays)
 def leave_out_blocked(measured: S, fix: Fix, localizer: Localizer) -> S:
     """`measured` without the blocked parts of the view; `measured` itself where nothing is blocked.
 
-    Only stars that are missing above the map's skyline are left out, with everything at their azimuths. `fix` is the
-    position at the time of `measured`; the `localizer` finds it anew. Where too much of the skyline would be left out,
-    or what is left gives no position, nothing is: the fix must then explain all of the evidence.
+    Patches of missing stars above the map's skyline are left out, and ranges where the skyline rises above the map's,
+    with everything at their azimuths. `fix` is the position at the time of `measured`; the `localizer` finds it anew.
+    Where too much of the skyline would be left out, or what is left gives no position, nothing is: the fix must then
+    explain all of the evidence. Raises NotLocated (inconsistent_evidence) where the skyline rises in too much of it.
     """
     if fix.search == "approximate":  # its skyline is not that of the image
         return measured
     rows, blocked = replace(measured.evidence(), clock=None), None
     for _ in range(ROUNDS):
         newer = find_blocked(rows, fix, measured.terrain)
-        if (newer is None and blocked is None) or (newer is not None and newer.same_as(blocked)):
+        if newer is None and (blocked is None or blocked.risen):  # the better position meets a low ridge's flanks
+            break
+        if newer is not None and newer.same_as(blocked):
             break
         blocked = newer
         if blocked is not None and blocked.width_rad > MOST_BLOCKED_RAD:
+            if blocked.risen:
+                raise NotLocated(
+                    f"the skyline is higher than the map's at azimuths {blocked.text}, too much to leave out: "
+                    "wrong terrain, time or camera file, or a ridge on no map?",
+                    reason="inconsistent_evidence",
+                )
             return measured
         kept = rows if blocked is None else rows.take(~blocked.hides(rows.azimuth_rad, rows.elevation_rad))
         try:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.localization.likelihood import SECTOR_RAD
+from startrack.localization.ridge import find_ridge
 from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Evidence, Fix, Ints
 
@@ -30,6 +31,7 @@ class Blocked:
     whole: Bools  # all of the sector
     high: Bools  # what stands high above the skyline
     high_from_rad: Array  # elevation where that begins
+    risen: bool  # whether part of it shows the skyline higher than the map, rather than stars missing above it
 
     def hides(self, azimuth_rad: Array, elevation_rad: Array) -> Bools:
         """Whether directions (n,), `azimuth_rad` and `elevation_rad`, are in the blocked parts."""
@@ -76,27 +78,35 @@ class Blocked:
 
 
 def find_blocked(evidence: Evidence, fix: Fix, terrain: Terrain) -> Blocked | None:
-    """The parts of the view in which rows of the `evidence` above the map's skyline are hidden together.
+    """The parts of the view that something on no map blocks.
 
-    `fix` is a position on the `terrain` found with them. None where nothing is blocked.
+    There rows of the `evidence` above the map's skyline are hidden together, or the skyline rises over a range of
+    azimuths. `fix` is a position on the `terrain` found with them. None where nothing is blocked.
     """
     position, azimuths = fix.position_enu_m[None, :2], np.linspace(0.0, 2 * np.pi, SAMPLES, endpoint=False)
     traced = np.asarray(terrain.horizon_rad(position, azimuths)).ravel() + fix.horizon_error_rad
     highest = np.maximum(np.maximum(np.roll(traced, 1), np.roll(traced, -1)), traced)
-    sigma = np.asarray(terrain.horizon_sigma_rad(position, azimuths)).ravel()
+    sigma = np.broadcast_to(np.asarray(terrain.horizon_sigma_rad(position, azimuths)).ravel(), SAMPLES)
+    whole, high = _find_missing(evidence, highest, sigma)
+    rows = evidence.take(~whole[_sector_of(evidence.azimuth_rad)])
+    skyline, error = (np.interp(rows.azimuth_rad, azimuths, one, period=2 * np.pi) for one in (traced, sigma))
+    ridge = find_ridge(rows, rows.elevation_rad - skyline, error, COUNT)
+    high_from = highest.reshape(COUNT, -1).max(axis=1) + HIGH_RAD[0]
+    found = Blocked(whole | ridge, high, high_from, risen=bool(ridge.any()))
+    return found if found else None
+
+
+def _find_missing(evidence: Evidence, skyline_rad: Array, sigma_rad: Array) -> tuple[Bools, Bools]:
+    """Sectors (COUNT,) with patches of missing stars, low and high above the skyline (SAMPLES,) of that sigma."""
     which = np.flatnonzero(np.abs(evidence.llr) > MIN_LLR)
     azimuth = evidence.azimuth_rad[which]
     sample = np.rint(azimuth * (SAMPLES / (2 * np.pi))).astype(np.int64) % SAMPLES
-    above = evidence.elevation_rad[which] - highest[sample]
-    counted = above > LEVELS_RAD[0] + MAP_SIGMAS * sigma[sample]
-    above, sector, hidden = (
-        above[counted],
-        _sector_of(azimuth[counted]),
-        np.minimum(-evidence.llr[which[counted]], MOST_NATS),
-    )
-    whole, high = (_find_patches(_sum_cells(levels, sector, above, hidden)) for levels in (LEVELS_RAD, HIGH_RAD))
-    found = Blocked(whole, high, highest.reshape(COUNT, -1).max(axis=1) + HIGH_RAD[0])
-    return found if found else None
+    above = evidence.elevation_rad[which] - skyline_rad[sample]
+    counted = above > LEVELS_RAD[0] + MAP_SIGMAS * sigma_rad[sample]
+    above, sector = above[counted], _sector_of(azimuth[counted])
+    hidden = np.minimum(-evidence.llr[which[counted]], MOST_NATS)
+    low, high = (_find_patches(_sum_cells(levels, sector, above, hidden)) for levels in (LEVELS_RAD, HIGH_RAD))
+    return low, high
 
 
 def _sum_cells(levels: Array, sector: Ints, above: Array, hidden: Array) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.localization.likelihood import SECTOR_RAD
-from startrack.localization.ridge import find_ridge
+from startrack.localization.ridge import MOST_RISE_RAD, find_ridge
 from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Evidence, Fix, Ints
 
@@ -88,7 +88,8 @@ def find_blocked(evidence: Evidence, fix: Fix, terrain: Terrain) -> Blocked | No
     highest = np.maximum(np.maximum(np.roll(traced, 1), np.roll(traced, -1)), traced)
     sigma = np.broadcast_to(np.asarray(terrain.horizon_sigma_rad(position, azimuths)).ravel(), SAMPLES)
     whole, high = _find_missing(evidence, highest, sigma)
-    rows = evidence.take(~whole[_sector_of(evidence.azimuth_rad)])
+    about = np.abs(evidence.elevation_rad - traced[_sample_of(evidence.azimuth_rad)]) < MOST_RISE_RAD
+    rows = evidence.take(about & ~whole[_sector_of(evidence.azimuth_rad)])
     skyline, error = (np.interp(rows.azimuth_rad, azimuths, one, period=2 * np.pi) for one in (traced, sigma))
     ridge = find_ridge(rows, rows.elevation_rad - skyline, error, COUNT)
     high_from = highest.reshape(COUNT, -1).max(axis=1) + HIGH_RAD[0]
@@ -100,7 +101,7 @@ def _find_missing(evidence: Evidence, skyline_rad: Array, sigma_rad: Array) -> t
     """Sectors (COUNT,) with patches of missing stars, low and high above the skyline (SAMPLES,) of that sigma."""
     which = np.flatnonzero(np.abs(evidence.llr) > MIN_LLR)
     azimuth = evidence.azimuth_rad[which]
-    sample = np.rint(azimuth * (SAMPLES / (2 * np.pi))).astype(np.int64) % SAMPLES
+    sample = _sample_of(azimuth)
     above = evidence.elevation_rad[which] - skyline_rad[sample]
     counted = above > LEVELS_RAD[0] + MAP_SIGMAS * sigma_rad[sample]
     above, sector = above[counted], _sector_of(azimuth[counted])
@@ -116,6 +117,10 @@ def _sum_cells(levels: Array, sector: Ints, above: Array, hidden: Array) -> Arra
     inside = (level >= 0) & (level < cells)
     cell = sector[inside] * cells + level[inside]
     return np.asarray(np.bincount(cell, weights=hidden[inside], minlength=COUNT * cells).reshape(COUNT, cells))
+
+
+def _sample_of(azimuth_rad: Array) -> Ints:
+    return np.asarray(np.rint(azimuth_rad * (SAMPLES / (2 * np.pi))).astype(np.int64) % SAMPLES)
 
 
 def _sector_of(azimuth_rad: Array) -> Ints:

@@ -15,6 +15,7 @@ from startrack.localization.sector_likelihood import Sectors, row_contribution
 from startrack.types import Array, Bools, Evidence
 
 LEVELS_RAD = np.radians(np.arange(-1.0, 4.0, 0.05))  # above the map's skyline
+MOST_RISE_RAD = np.radians(5.0)  # rows farther from a coarse skyline are not needed
 HALF_WIDTHS = np.array([5, 10, 17, 28, 47])  # sectors, of a triangular rise: 15 to 141 degrees wide
 HEIGHTS_RAD = np.radians([0.1, 0.2, 0.35, 0.6, 1.0, 1.6])
 CENTRE_STEP = 4  # sectors, between the rises that are tried

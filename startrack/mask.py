@@ -13,7 +13,8 @@ class Mask:
     """Pixels of an image that do not count; True means masked, as in numpy's masked arrays."""
 
     masked: NDArray[np.bool_]  # (H, W)
-    sha256: str  # of its file, or of its values; of a union the hashes of its parts, joined by "+"
+    sha256: str  # of its file, or of its values; of a union the hashes of its parts, joined by "+"; "": none is given
+    dead_part: float = 0.0  # of the image, that shows no light: found in the image, not given
 
     def __post_init__(self) -> None:
         locked = np.array(self.masked, dtype=np.bool_)

@@ -117,6 +117,14 @@ class Detected(Inputs):
 
     detections: Detections
 
+    @property
+    def warnings(self) -> list[str]:
+        """As before, with the parts of the sensor that show no light."""
+        mask = self.detections.mask
+        if mask is None or not mask.dead_part:
+            return super().warnings
+        return [*super().warnings, f"{100 * mask.dead_part:.0f} % of the image holds one value: left out as if masked"]
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Identified(Detected):

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
+from startrack.detection.dead_parts import find_dead_parts
 from startrack.types import Array, Exposure
 
 TILE_PX, TILES = 16, 16  # side of a sampled tile, and tiles across the image: 65,536 pixels, 2 ms
@@ -78,7 +79,7 @@ def find_damage(exposure: Exposure, camera: Camera | None = None) -> Damage | No
 
 
 def _sample_tiles(pixels_adu: NDArray[np.float32], camera: Camera | None) -> NDArray[np.float32]:
-    """Tiles (n, side, side) on a regular grid."""
+    """Tiles (n, side, side) on a regular grid, without those that touch a dead part."""
     height, width = pixels_adu.shape
     if min(height, width) < 2 * TILE_PX:
         return np.empty((0, TILE_PX, TILE_PX), dtype=np.float32)
@@ -89,7 +90,14 @@ def _sample_tiles(pixels_adu: NDArray[np.float32], camera: Camera | None) -> NDA
             camera.angle_rad(corners + np.array(at) * (TILE_PX - 1.0)) for at in ((0, 0), (0, 1), (1, 0), (1, 1))
         ]
         corners = corners[np.max(off_axis, axis=0) < camera.max_angle_rad]
-    windows = np.lib.stride_tricks.sliding_window_view(pixels_adu, (TILE_PX, TILE_PX))
+    tiles = _tiles_at(pixels_adu, corners)
+    dead = find_dead_parts(pixels_adu)
+    return tiles if dead is None else tiles[~_tiles_at(dead, corners).any(axis=(1, 2))]
+
+
+def _tiles_at(pixels: NDArray[Any], corners: Array) -> NDArray[Any]:
+    """Tiles (n, side, side) whose first pixels are `corners` (n, 2), x and y."""
+    windows = np.lib.stride_tricks.sliding_window_view(pixels, (TILE_PX, TILE_PX))
     return np.asarray(windows[corners[:, 1], corners[:, 0]])
 
 

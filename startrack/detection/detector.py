@@ -17,6 +17,7 @@ from startrack.detection.classify import (
     select_brightest_per_position,
     select_stars,
 )
+from startrack.detection.dead_parts import find_dead_parts, with_dead_parts
 from startrack.detection.deblend import Fitted, fit_all, paint_sources
 from startrack.detection.fit import PointFits, unbin_fits
 from startrack.detection.frame import (
@@ -76,7 +77,8 @@ class Detector:
         Raises TooFewStars (reason no_stars) if the frame has no point source, BadInput for a mask that cannot be used.
         """
         image, dead = electrons(exposure, camera)
-        mask = combine_masks(exposure.mask, None if camera is None else camera.mask, exposure.size_px)
+        given = combine_masks(exposure.mask, None if camera is None else camera.mask, exposure.size_px)
+        mask = with_dead_parts(given, find_dead_parts(exposure.pixels_adu))
         if mask is not None:
             image, dead = fill_masked(image, mask.masked), dead & ~mask.masked
         if _is_flat(image):

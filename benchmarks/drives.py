@@ -36,6 +36,7 @@ RADIUS_M, SLOPE_RAD = 4000.0, np.radians(20.0)
 SLIP_PART, SLIP_M = 0.1, 20.0
 SETTLED_FRAMES = 10  # after which the filter is scored
 SEED = 41
+CRATER = "shackleton-thesis"
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ class Case:
     degraded: bool = False
     share: float = 0.0  # of the sky's light in the background
     slips: bool = False
+    terrain: str = "shackleton-rendered"
 
 
 CASES = {
@@ -58,7 +60,10 @@ CASES = {
     "57 m, degraded": Case(14, 57.0, 900.0, degraded=True),
     "rest": Case(12, 0.0, 12 * 3600.0),
     "rest, sky 7 %": Case(12, 0.0, 12 * 3600.0, share=0.07),
+    "rest, sky 30 %": Case(12, 0.0, 12 * 3600.0, share=0.3),
     "rest, degraded": Case(12, 0.0, 12 * 3600.0, degraded=True),
+    "rest, thesis crater": Case(12, 0.0, 12 * 3600.0, terrain=CRATER),
+    "rest, thesis crater, sky 30 %": Case(12, 0.0, 12 * 3600.0, share=0.3, terrain=CRATER),
 }
 
 
@@ -129,13 +134,13 @@ def score_track(case: Case, rng: np.random.Generator, pixels: bool, number: int)
 
 def course_of(case: Case, rng: np.random.Generator, pixels: bool) -> Course:
     """The track's true positions, its ground and the stated map."""
-    shipped, exact = load_terrain("shackleton"), load_terrain("shackleton-rendered")
-    assert isinstance(shipped, HeightMap)
-    assert isinstance(exact, HeightMap)
-    ground, stated, raised = exact, exact, 0.0
+    ground = stated = load_terrain(case.terrain)
+    raised = 0.0
     if case.degraded:
+        shipped = load_terrain("shackleton")
+        assert isinstance(shipped, HeightMap)
         ground, stated, raised = draw_ground(shipped, POST_SIGMA_M, rng), shipped, RAISED_SIGMA_RAD * rng.normal()
-    if pixels and raised:
+    if pixels and raised and isinstance(ground, HeightMap):
         facts = {f.name: getattr(ground, f.name) for f in fields(ground)}
         ground, raised = RaisedMap(**facts, raised_rad=raised), 0.0
     stated.prepare()

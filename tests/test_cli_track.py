@@ -292,3 +292,32 @@ def test_followed_images_wait_for_their_odometry(drive, tmp_path):
         running.kill()
     assert running.returncode == 0
     assert "3 used" in rest
+
+
+def test_followed_odometry_that_ends_within_a_line_waits(drive, tracked, tmp_path):
+    lines = (drive / "frames" / "odometry.tum").read_text().splitlines(keepends=True)
+    for torn in (lines[-1][:-1], lines[-1][:-3], "1900000000 1.0 2.0", "1900000000 1.0 2.0\n", "190"):
+        odometry = tmp_path / "odometry.tum"
+        odometry.write_text("".join(lines[:-1]) + torn)
+        shutil.copytree(tracked, tmp_path / "out")
+        arguments = ("--odometry", odometry, "--no-plots", "--until-idle", "0.5", "-q")
+        assert run("--follow", drive / "frames", "-D", tmp_path / "out", *arguments) == 0
+        counts = json.loads((tmp_path / "out" / "track.json").read_text())["counts"]
+        whole = torn.startswith(lines[-1][:-3])  # a last digit that is missing does not show
+        assert counts["used"] == (FRAMES if whole else FRAMES - 1), torn
+        shutil.rmtree(tmp_path / "out")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_following_that_is_stopped_before_any_image_has_the_code_of_a_stop(tmp_path, capsys, monkeypatch, number):
+    from startrack.tracking import follow
+
+    def stopped(*arguments, **more):
+        os.kill(os.getpid(), number)
+        yield None
+
+    monkeypatch.setattr(follow, "follow_images", stopped)
+    (tmp_path / "live").mkdir()
+    assert run("--follow", tmp_path / "live", "-D", tmp_path / "out") == 5
+    assert "before the first image" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "track.json").exists()

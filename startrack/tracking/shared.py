@@ -12,7 +12,8 @@ from startrack.pipeline import NO_TIME
 from startrack.terrain import Terrain
 from startrack.types import Array, BadInput, Clock, Evidence, Exposure
 
-BIAS, CLOCK, SHAPES = "horizon_bias_rad", "clock_s", ("steepness_1", "size_1")
+BIAS, CLOCK, STEEPNESS = "horizon_bias_rad", "clock_s", "steepness_1"
+SHAPES = STEEPNESS, "size_1"
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +45,14 @@ class SharedErrors:
         if terrain.site is None:
             raise BadInput("bad_terrain", f"terrain {terrain.name} has no site")
         return cls.of(terrain, clock_at(terrain.site, exposure.time_utc, exposure.time_sigma_s))
+
+    def of_terrain(self, terrain: Terrain) -> Self:
+        """The same clock above another `terrain`."""
+        own = type(self).of(terrain, None)
+        if CLOCK not in self.names:
+            return own
+        at = self.names.index(CLOCK)
+        return type(self)((*own.names, CLOCK), np.append(own.sigma, self.sigma[at]), self.turn_rad_s)
 
     def shape_axis(self, name: str) -> int:
         """Which of the two numbers of `Terrain.reshaped` the error `name` is."""

@@ -177,9 +177,15 @@ def _scored(estimates: list[Any], position_m: Array) -> dict[str, float]:
 
 
 def _score(found_m: Array, covariance_m2: Array, position_m: Array) -> dict[str, float]:
+    error_m, nees = mean_error_and_nees(found_m, covariance_m2, position_m)
+    return {"m": error_m, "NEES": nees}
+
+
+def mean_error_and_nees(found_m: Array, covariance_m2: Array, position_m: Array) -> list[float]:
+    """Mean error [m] and NEES of positions (n, 2) with covariances (n, 2, 2)."""
     off = found_m - position_m
     nees = np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance_m2), off)
-    return {"m": float(np.linalg.norm(off, axis=1).mean()), "NEES": float(nees.mean())}
+    return [float(np.linalg.norm(off, axis=1).mean()), float(nees.mean())]
 
 
 def summary(rows: list[dict[str, float]]) -> list[str]:

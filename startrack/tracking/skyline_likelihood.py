@@ -16,7 +16,8 @@ from startrack.terrain import Terrain
 from startrack.tracking.shared import BIAS, CLOCK, SharedErrors
 from startrack.types import Array, Bools, Evidence, Ints
 
-NODES = 5  # traced horizons along each side of the neighbourhood
+NODES, NARROW_NODES = 5, 3  # traced horizons along each side of the neighbourhood
+NARROW_M = 20.0  # half of the side of a neighbourhood in which three do: 1e-6 rad on Shackleton's floor
 STEP_SIGMAS = 0.5  # of the horizon's spread, to each side: where the change with the horizon is taken
 SHAPE_STEP = 1e-4  # relative
 TURN_STEP_RAD = 2e-3  # of the sky, at which the horizon's change with the time is taken: crests are no narrower
@@ -42,7 +43,8 @@ class SkylineLikelihood:
         """For positions within `half_m` of a centre (2,), and shared errors of so many standard deviations."""
         whole = PositionLikelihood.from_evidence(evidence, terrain)
         leeway = raised_sigmas * shared.reach_rad(evidence)
-        return cls(whole, whole.near(centre_m, half_m, leeway, NODES), shared, centre_m)
+        across = NARROW_NODES if half_m < NARROW_M else NODES
+        return cls(whole, whole.near(centre_m, half_m, leeway, across), shared, centre_m)
 
     @cached_property
     def rows(self) -> Ints:

@@ -39,11 +39,12 @@ class Course:
     raised_rad: float  # of the true horizon above that of the ground
     position_m: Array  # (n, 2)
     time_utc: tuple[datetime, ...]
+    uses_sky: bool = False
 
     @cached_property
     def shared(self) -> SharedErrors:
         """The clock is exact."""
-        return SharedErrors.of(self.stated, None)
+        return SharedErrors.of(self.stated, None, self.uses_sky)
 
 
 def frames_by_evidence(course: Course, rng: np.random.Generator) -> Iterator[ObservedFrame]:

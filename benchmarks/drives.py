@@ -144,10 +144,11 @@ def course_of(case: Case, rng: np.random.Generator, pixels: bool) -> Course:
         facts = {f.name: getattr(ground, f.name) for f in fields(ground)}
         ground, raised = RaisedMap(**facts, raised_rad=raised), 0.0
     stated.prepare()
-    return draw_course(
+    course = draw_course(
         ground, stated, float(raised), frames=case.frames, spacing_m=case.spacing_m, every_s=case.every_s,
         radius_m=RADIUS_M, slope_rad=SLOPE_RAD, rng=rng,
     )  # fmt: skip
+    return replace(course, uses_sky=case.share > 0.0)
 
 
 def odometry(case: Case, position_m: Array, rng: np.random.Generator) -> Steps:

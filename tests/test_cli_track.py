@@ -25,6 +25,7 @@ from startrack.tracking.frame_store import decode_frame, encode_frame
 from startrack.tracking.schema import TRACK
 
 FRAMES = 5
+KILLS, KILL_AFTER_S, KILL_SEED = 3, (1.5, 6.0), 8
 FILES = ("track.tum", "track.filtered.tum", "track.ecsv", "track.geojson", "track.json", "track.crests.ecsv")
 
 
@@ -110,20 +111,15 @@ def test_images_followed_and_killed_give_the_same_files(drive, tracked, tmp_path
         sys.executable, "-m", "startrack", "track", "--follow", str(live), "-D", str(out), "--until-idle", "3",
         "--odometry", str(drive / "frames" / "odometry.tum"), "--no-plots",
     ]  # fmt: skip
-    images = sorted((drive / "frames").glob("*.png"))
-    first = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    for image in images[:2]:
-        shutil.copy(image.with_suffix(".json"), live)
-        shutil.copy(image, live)
-    for _ in range(600):
-        if len(list((out / ".frames").glob("*.npz"))) == 2:
-            break
-        time.sleep(0.1)
-    os.kill(first.pid, signal.SIGKILL)
-    first.wait()
-    for image in images[2:]:
-        shutil.copy(image.with_suffix(".json"), live)
-        shutil.copy(image, live)
+    images, rng = sorted((drive / "frames").glob("*.png")), np.random.default_rng(KILL_SEED)
+    for part in np.array_split(np.arange(FRAMES), KILLS):
+        killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        for k in part:
+            shutil.copy(images[k].with_suffix(".json"), live)
+            shutil.copy(images[k], live)
+        time.sleep(rng.uniform(*KILL_AFTER_S))
+        os.kill(killed.pid, signal.SIGKILL)
+        killed.wait()
     second = subprocess.run(command, capture_output=True, text=True, check=True)
     assert sum("used" in line for line in second.stdout.splitlines()[:-1]) == FRAMES
     for name in FILES:

@@ -13,8 +13,9 @@ from zipfile import BadZipFile
 import numpy as np
 
 from startrack.files import write_atomically
-from startrack.tracking.frame_estimate import FrameEstimate, ImageErrors
+from startrack.tracking.frame_estimate import FrameEstimate
 from startrack.tracking.observe import ObservedFrame
+from startrack.tracking.shared import ImageErrors
 from startrack.types import Array, Clock, Evidence
 
 FORMAT = "startrack.observed-frame/2"

@@ -11,8 +11,8 @@ import numpy as np
 from startrack.evidence.star_offsets import OFFSET_TERMS
 from startrack.stages import Located, Measured, Outcome, Refused, last_value
 from startrack.terrain import Terrain
-from startrack.tracking.frame_estimate import FrameEstimate, ImageErrors, estimate_frame, first_guess
-from startrack.tracking.shared import SharedErrors
+from startrack.tracking.frame_estimate import FrameEstimate, estimate_frame, first_guess
+from startrack.tracking.shared import ImageErrors, SharedErrors
 from startrack.types import Array, Bools, Evidence
 
 NEAR_RAD = np.radians(1.5)  # rows within this of the skyline are kept for other exposures of the same position
@@ -58,6 +58,7 @@ def observe_frame(
     terrain = terrain or value.terrain
     shared = shared or SharedErrors.of(terrain, value.clock)
     rows, errors = located_evidence(value)
+    errors = errors and errors.without_edge(shared)
     estimates = tuple(_mode_estimates(value, rows, terrain, shared, errors))
     near = rows_near(rows, terrain, estimates)
     return ObservedFrame(outcome.exposure.name, when, R, estimates, near, errors, steeper=value.steeper)

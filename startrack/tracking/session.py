@@ -179,7 +179,8 @@ class TrackSession:
             raise BadInput("bad_terrain", "no terrain is known: give -t FILE (terrain=) or a sidecar with terrain")
         if self.camera is None or self.terrain is None or self.shared is None:
             lens, ground = load_camera_input(camera), terrain_input(terrain, None)
-            self.shared = SharedErrors.of_exposure(ground, exposure)
+            uses_sky = self.settings.evidence_sources != "stars"
+            self.shared = SharedErrors.of_exposure(ground, exposure, uses_sky)
             self.camera, self.terrain, self._references = lens, ground, (camera, terrain)
         first_camera, first_terrain = self._references or (None, None)
         if terrain is not first_terrain and terrain != first_terrain:

@@ -13,7 +13,7 @@ from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.local_search import LocalLikelihood
 from startrack.localization.sector_likelihood import contributions
 from startrack.terrain import Terrain
-from startrack.tracking.shared import BIAS, CLOCK, SharedErrors
+from startrack.tracking.shared import BIAS, CLOCK, EDGE, ImageErrors, SharedErrors
 from startrack.types import Array, Bools, Evidence, Ints
 
 NODES, NARROW_NODES = 5, 3  # traced horizons along each side of the neighbourhood
@@ -33,18 +33,19 @@ class SkylineLikelihood:
     whole: PositionLikelihood
     local: LocalLikelihood
     shared: SharedErrors
+    image_errors: ImageErrors | None  # of the rows of the sky's light; None: there are none
     centre_m: Array  # (2,)
 
     @classmethod
     def near(
-        cls, evidence: Evidence, terrain: Terrain, shared: SharedErrors, centre_m: Array, half_m: float,
-        raised_sigmas: float,
+        cls, evidence: Evidence, terrain: Terrain, shared: SharedErrors, image_errors: ImageErrors | None,
+        centre_m: Array, half_m: float, raised_sigmas: float,
     ) -> Self:  # fmt: skip
         """For positions within `half_m` of a centre (2,), and shared errors of so many standard deviations."""
         whole = PositionLikelihood.from_evidence(evidence, terrain)
         leeway = raised_sigmas * shared.reach_rad(evidence)
         across = NARROW_NODES if half_m < NARROW_M else NODES
-        return cls(whole, whole.near(centre_m, half_m, leeway, across), shared, centre_m)
+        return cls(whole, whole.near(centre_m, half_m, leeway, across), shared, image_errors, centre_m)
 
     @cached_property
     def rows(self) -> Ints:
@@ -78,6 +79,8 @@ class SkylineLikelihood:
                 rise = np.ones(len(azimuth))
             elif name == CLOCK:
                 rise = _raised_by_clock(terrain, self.centre_m, azimuth, elevation, self.shared.turn_rad_s)
+            elif name == EDGE:
+                rise = self.is_sky * (0.0 if self.image_errors is None else self.image_errors.at(azimuth)[:, 0])
             else:
                 rise = _raised_by_shape(terrain, self.centre_m, azimuth, self.shared.shape_axis(name))
             columns.append(sigma * rise)

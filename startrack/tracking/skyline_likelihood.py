@@ -80,11 +80,18 @@ class SkylineLikelihood:
             elif name == CLOCK:
                 rise = _raised_by_clock(terrain, self.centre_m, azimuth, elevation, self.shared.turn_rad_s)
             elif name == EDGE:
-                rise = self.is_sky * (0.0 if self.image_errors is None else self.image_errors.at(azimuth)[:, 0])
+                rise = self._raised_by_edge
             else:
                 rise = _raised_by_shape(terrain, self.centre_m, azimuth, self.shared.shape_axis(name))
             columns.append(sigma * rise)
         return np.stack(columns, axis=1) if columns else np.zeros((len(azimuth), 0))
+
+    @property
+    def _raised_by_edge(self) -> Array:
+        """(m,) by one px of the whole skyline in the sky's light."""
+        if self.image_errors is None:
+            return np.zeros(len(self.rows))
+        return np.asarray(self.image_errors.at(self.azimuth_rad)[:, 0] * self.is_sky)
 
     def horizons(self, parameters: Array) -> Array:
         """(n, m) horizon [rad] beside each item."""

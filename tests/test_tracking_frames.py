@@ -199,6 +199,12 @@ def test_a_located_image_becomes_an_observation(located):
     assert heading == pytest.approx(located.heading_pitch_roll_deg[0], abs=0.05)
 
 
+def test_a_fix_of_another_depth_needs_an_error_of_the_depth(located):
+    deeper = replace(located.result, steeper=0.005)
+    with pytest.raises(ValueError, match="wrong depth"):
+        observe_frame(deeper, SharedErrors.of(deeper.terrain, None))
+
+
 def test_exposures_at_rest_are_one_posterior():
     terrain, shared, nees, errors = crater(), SharedErrors.of(crater(), None), [], []
     for seed in range(6):

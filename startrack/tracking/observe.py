@@ -12,7 +12,7 @@ from startrack.evidence.star_offsets import OFFSET_TERMS
 from startrack.stages import Located, Measured, Outcome, Refused, last_value
 from startrack.terrain import Terrain
 from startrack.tracking.frame_estimate import FrameEstimate, estimate_frame, first_guess
-from startrack.tracking.shared import ImageErrors, SharedErrors
+from startrack.tracking.shared import STEEPNESS, ImageErrors, SharedErrors
 from startrack.types import Array, Bools, Evidence
 
 NEAR_RAD = np.radians(1.5)  # rows within this of the skyline are kept for other exposures of the same position
@@ -41,7 +41,8 @@ def observe_frame(
     """The `outcome` of one image as an observation of its position and of the errors `shared`.
 
     `shared` and `terrain` are those of the track; None: those of the image. Raises ValueError for an image without a
-    time, and for a fix that states no error (another localizer).
+    time, for a fix that states no error (another localizer), and for one of another depth than the file's where
+    `shared` has no error of the depth (see `TrackSession`).
     """
     value, when = last_value(outcome), outcome.exposure.time_utc
     if when is None:
@@ -57,6 +58,8 @@ def observe_frame(
         raise ValueError(f"{outcome.exposure.name}: a track needs the localizer posterior")
     terrain = terrain or value.terrain
     shared = shared or SharedErrors.of(terrain, value.clock)
+    if value.steeper and STEEPNESS not in shared.names:
+        raise ValueError(f"{outcome.exposure.name}: it shows a wrong depth of the crater, which must be shared")
     rows, errors = located_evidence(value)
     errors = errors and errors.without_edge(shared)
     estimates = tuple(_mode_estimates(value, rows, terrain, shared, errors))

@@ -39,11 +39,12 @@ class Course:
     raised_rad: float  # of the true horizon above that of the ground
     position_m: Array  # (n, 2)
     time_utc: tuple[datetime, ...]
+    uses_sky: bool = False
 
     @cached_property
     def shared(self) -> SharedErrors:
         """The clock is exact."""
-        return SharedErrors.of(self.stated, None)
+        return SharedErrors.of(self.stated, None, self.uses_sky)
 
 
 def frames_by_evidence(course: Course, rng: np.random.Generator) -> Iterator[ObservedFrame]:
@@ -100,7 +101,7 @@ def frames_by_pixels(course: Course, share: float, seed: int) -> Iterator[Observ
 
 
 def draw_course(
-    ground: HeightMap, stated: HeightMap, raised_rad: float, *, frames: int, spacing_m: float, every_s: float,
+    ground: Terrain, stated: Terrain, raised_rad: float, *, frames: int, spacing_m: float, every_s: float,
     radius_m: float, slope_rad: float, rng: np.random.Generator,
 ) -> Course:  # fmt: skip
     """A straight drive (or a rest, `spacing_m` 0) within a radius, on ground no steeper than a slope."""
@@ -108,7 +109,8 @@ def draw_course(
         heading = rng.uniform(0.0, 2 * np.pi)
         along = spacing_m * np.arange(frames)[:, None] * [np.sin(heading), np.cos(heading)]
         position = rng.uniform(-radius_m, radius_m, 2) + along
-        if np.hypot(*position.T).max() < radius_m and stated.slope_rad(position).max() < slope_rad:
+        steepest = stated.slope_rad(position).max() if isinstance(stated, HeightMap) else 0.0
+        if np.hypot(*position.T).max() < radius_m and steepest < slope_rad:
             break
     start = FIRST_DAY + timedelta(days=float(rng.uniform(0.0, DAYS)))
     times = tuple(start + timedelta(seconds=every_s * k) for k in range(frames))

@@ -36,6 +36,7 @@ RADIUS_M, SLOPE_RAD = 4000.0, np.radians(20.0)
 SLIP_PART, SLIP_M = 0.1, 20.0
 SETTLED_FRAMES = 10  # after which the filter is scored
 SEED = 41
+CRATER = "shackleton-thesis"
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ class Case:
     degraded: bool = False
     share: float = 0.0  # of the sky's light in the background
     slips: bool = False
+    terrain: str = "shackleton-rendered"
 
 
 CASES = {
@@ -58,7 +60,10 @@ CASES = {
     "57 m, degraded": Case(14, 57.0, 900.0, degraded=True),
     "rest": Case(12, 0.0, 12 * 3600.0),
     "rest, sky 7 %": Case(12, 0.0, 12 * 3600.0, share=0.07),
+    "rest, sky 30 %": Case(12, 0.0, 12 * 3600.0, share=0.3),
     "rest, degraded": Case(12, 0.0, 12 * 3600.0, degraded=True),
+    "rest, thesis crater": Case(12, 0.0, 12 * 3600.0, terrain=CRATER),
+    "rest, thesis crater, sky 30 %": Case(12, 0.0, 12 * 3600.0, share=0.3, terrain=CRATER),
 }
 
 
@@ -129,20 +134,21 @@ def score_track(case: Case, rng: np.random.Generator, pixels: bool, number: int)
 
 def course_of(case: Case, rng: np.random.Generator, pixels: bool) -> Course:
     """The track's true positions, its ground and the stated map."""
-    shipped, exact = load_terrain("shackleton"), load_terrain("shackleton-rendered")
-    assert isinstance(shipped, HeightMap)
-    assert isinstance(exact, HeightMap)
-    ground, stated, raised = exact, exact, 0.0
+    ground = stated = load_terrain(case.terrain)
+    raised = 0.0
     if case.degraded:
+        shipped = load_terrain("shackleton")
+        assert isinstance(shipped, HeightMap)
         ground, stated, raised = draw_ground(shipped, POST_SIGMA_M, rng), shipped, RAISED_SIGMA_RAD * rng.normal()
-    if pixels and raised:
+    if pixels and raised and isinstance(ground, HeightMap):
         facts = {f.name: getattr(ground, f.name) for f in fields(ground)}
         ground, raised = RaisedMap(**facts, raised_rad=raised), 0.0
     stated.prepare()
-    return draw_course(
+    course = draw_course(
         ground, stated, float(raised), frames=case.frames, spacing_m=case.spacing_m, every_s=case.every_s,
         radius_m=RADIUS_M, slope_rad=SLOPE_RAD, rng=rng,
     )  # fmt: skip
+    return replace(course, uses_sky=case.share > 0.0)
 
 
 def odometry(case: Case, position_m: Array, rng: np.random.Generator) -> Steps:
@@ -172,9 +178,15 @@ def _scored(estimates: list[Any], position_m: Array) -> dict[str, float]:
 
 
 def _score(found_m: Array, covariance_m2: Array, position_m: Array) -> dict[str, float]:
+    error_m, nees = mean_error_and_nees(found_m, covariance_m2, position_m)
+    return {"m": error_m, "NEES": nees}
+
+
+def mean_error_and_nees(found_m: Array, covariance_m2: Array, position_m: Array) -> list[float]:
+    """Mean error [m] and NEES of positions (n, 2) with covariances (n, 2, 2)."""
     off = found_m - position_m
     nees = np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance_m2), off)
-    return {"m": float(np.linalg.norm(off, axis=1).mean()), "NEES": float(nees.mean())}
+    return [float(np.linalg.norm(off, axis=1).mean()), float(nees.mean())]
 
 
 def summary(rows: list[dict[str, float]]) -> list[str]:

@@ -37,7 +37,7 @@ from startrack.rendering import render as render_scene
 from startrack.solution import Solution
 from startrack.stages import Outcome, Refused, Settings
 from startrack.terrain import Terrain
-from startrack.tracking import Odometry, SharedErrors, Track, estimate_track, observe_frame, read_odometry
+from startrack.tracking import Odometry, Track, TrackSession, read_odometry
 from startrack.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.types import Exposure, MeasuredSkyline
 
@@ -115,22 +115,18 @@ def track(
         The track: `frames`, and the trajectories `smoothed` (by all images) and `filtered` (by those up to each).
 
     Raises:
-        BadInput: as `locate`; bad_odometry; bad_image without images.
-        ValueError: no image has a single position.
+        BadInput: as `locate`; bad_odometry; bad_image without images and for one that is given twice; bad_calibration
+            for another camera and bad_terrain for another terrain than those of the first image; the reason of the
+            first refused image where none has a single position.
     """
-    settings, frames, shared, ground = settings_input(settings), [], None, None
+    session = TrackSession(
+        settings=settings_input(settings) or Settings(), stated_camera=camera, stated_terrain=terrain
+    )  # fmt: skip
     for image in images:
-        exposure = exposure_input(image, None)
-        known_camera, ground = camera_input(camera, exposure), ground or terrain_input(terrain, exposure)
-        shared = shared or SharedErrors.of_exposure(ground, exposure)
-        frames.append(observe_frame(pipeline.locate(exposure, known_camera, ground, load_catalog(), settings), shared))
-    if shared is None or ground is None:
-        raise BadInput("bad_image", "there are no images")
-    frames.sort(key=lambda frame: frame.time_utc)
+        session.add_exposure(exposure_input(image, None))
     moves = odometry if odometry is None or isinstance(odometry, Odometry) else read_odometry(odometry)
-    return estimate_track(
-        frames, ground, shared, odometry=moves, odometry_sigma=odometry_sigma, odometry_floor_m=odometry_floor_m,
-        at_rest=at_rest,
+    return session.estimate(
+        moves, odometry_sigma=odometry_sigma, odometry_floor_m=odometry_floor_m, at_rest=at_rest
     )  # fmt: skip
 
 

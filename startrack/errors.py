@@ -10,7 +10,7 @@ import re
 from enum import StrEnum
 from typing import Any
 
-EXIT_OK, EXIT_INTERNAL_ERROR, EXIT_REFUSED, EXIT_BAD_INPUT = 0, 1, 3, 4
+EXIT_OK, EXIT_INTERNAL_ERROR, EXIT_REFUSED, EXIT_BAD_INPUT, EXIT_STOPPED = 0, 1, 3, 4, 5
 
 
 class Reason(StrEnum):

@@ -25,6 +25,7 @@ from startrack.tracking.frame_store import decode_frame, encode_frame
 from startrack.tracking.schema import TRACK
 
 FRAMES = 5
+KILLS, KILL_AFTER_S, KILL_SEED = 3, (1.5, 6.0), 8
 FILES = ("track.tum", "track.filtered.tum", "track.ecsv", "track.geojson", "track.json", "track.crests.ecsv")
 
 
@@ -110,20 +111,15 @@ def test_images_followed_and_killed_give_the_same_files(drive, tracked, tmp_path
         sys.executable, "-m", "startrack", "track", "--follow", str(live), "-D", str(out), "--until-idle", "3",
         "--odometry", str(drive / "frames" / "odometry.tum"), "--no-plots",
     ]  # fmt: skip
-    images = sorted((drive / "frames").glob("*.png"))
-    first = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    for image in images[:2]:
-        shutil.copy(image.with_suffix(".json"), live)
-        shutil.copy(image, live)
-    for _ in range(600):
-        if len(list((out / ".frames").glob("*.npz"))) == 2:
-            break
-        time.sleep(0.1)
-    os.kill(first.pid, signal.SIGKILL)
-    first.wait()
-    for image in images[2:]:
-        shutil.copy(image.with_suffix(".json"), live)
-        shutil.copy(image, live)
+    images, rng = sorted((drive / "frames").glob("*.png")), np.random.default_rng(KILL_SEED)
+    for part in np.array_split(np.arange(FRAMES), KILLS):
+        killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        for k in part:
+            shutil.copy(images[k].with_suffix(".json"), live)
+            shutil.copy(images[k], live)
+        time.sleep(rng.uniform(*KILL_AFTER_S))
+        os.kill(killed.pid, signal.SIGKILL)
+        killed.wait()
     second = subprocess.run(command, capture_output=True, text=True, check=True)
     assert sum("used" in line for line in second.stdout.splitlines()[:-1]) == FRAMES
     for name in FILES:
@@ -292,3 +288,32 @@ def test_followed_images_wait_for_their_odometry(drive, tmp_path):
         running.kill()
     assert running.returncode == 0
     assert "3 used" in rest
+
+
+def test_followed_odometry_that_ends_within_a_line_waits(drive, tracked, tmp_path):
+    lines = (drive / "frames" / "odometry.tum").read_text().splitlines(keepends=True)
+    for torn in (lines[-1][:-1], lines[-1][:-3], "1900000000 1.0 2.0", "1900000000 1.0 2.0\n", "190"):
+        odometry = tmp_path / "odometry.tum"
+        odometry.write_text("".join(lines[:-1]) + torn)
+        shutil.copytree(tracked, tmp_path / "out")
+        arguments = ("--odometry", odometry, "--no-plots", "--until-idle", "0.5", "-q")
+        assert run("--follow", drive / "frames", "-D", tmp_path / "out", *arguments) == 0
+        counts = json.loads((tmp_path / "out" / "track.json").read_text())["counts"]
+        whole = torn.startswith(lines[-1][:-3])  # a last digit that is missing does not show
+        assert counts["used"] == (FRAMES if whole else FRAMES - 1), torn
+        shutil.rmtree(tmp_path / "out")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_following_that_is_stopped_before_any_image_has_the_code_of_a_stop(tmp_path, capsys, monkeypatch, number):
+    from startrack.tracking import follow
+
+    def stopped(*arguments, **more):
+        os.kill(os.getpid(), number)
+        yield None
+
+    monkeypatch.setattr(follow, "follow_images", stopped)
+    (tmp_path / "live").mkdir()
+    assert run("--follow", tmp_path / "live", "-D", tmp_path / "out") == 5
+    assert "before the first image" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "track.json").exists()

@@ -15,7 +15,7 @@ from startrack.tracking.at_rest import positions_at_rest
 from startrack.tracking.frame_estimate import MIN_NOISE_SHARE, clipped_noise, estimate_frame, first_guess
 from startrack.tracking.importance_sampling import sample_posterior
 from startrack.tracking.observe import ObservedFrame, observe_frame
-from startrack.tracking.shared import BIAS, CLOCK, SHAPES, SharedErrors
+from startrack.tracking.shared import BIAS, CLOCK, EDGE, SHAPES, ImageErrors, SharedErrors
 from startrack.tracking.smoother import Observations, Steps, smooth
 from startrack.types import Clock, Evidence
 
@@ -162,6 +162,29 @@ def test_shared_errors_are_those_that_the_terrain_and_the_clock_state(ground):
     assert SharedErrors.of(ground, Clock(turn_rad_s=turn, sigma_s=1.0)).names == (BIAS,)
 
 
+def test_the_edge_of_the_skyline_is_shared_and_no_longer_each_images_own(ground):
+    found = SharedErrors.of(ground, None, uses_sky=True)
+    assert found.names == (BIAS, EDGE)
+    assert found.of_terrain(crater(depth_sigma_m=5.0)).names == (*SHAPES[:1], EDGE)
+    own = ImageErrors(np.ones((4, 2)), np.diag([0.01, 0.02]))
+    np.testing.assert_allclose(own.without_edge(found).covariance, np.diag([0.01 - found.sigma[1] ** 2, 0.02]))
+    assert own.without_edge(SharedErrors.of(ground, None)) is own
+
+
+def test_an_error_that_the_evidence_does_not_depend_on_stays_unknown():
+    evidence, known = rays_at(crater(), PLACE_M, np.random.default_rng(7)), SharedErrors.of(crater(), None)
+    shared = SharedErrors.of(crater(), None, uses_sky=True)
+    with_edge, without = (
+        estimate_frame(evidence, crater(), one, *first_guess(one, PLACE_M, 25.0 * np.eye(2))) for one in (shared, known)
+    )
+    assert with_edge.mean[2] == 0.0 and not with_edge.response[2].any()  # of stars alone
+    away = with_edge.mean[:2] - without.mean[:2]
+    assert away @ np.linalg.solve(without.covariance, away) < 0.05
+    found = smooth(Observations.of([with_edge, with_edge], 0.0), Steps(np.zeros((1, 2)), np.ones(1)))
+    assert found.shared[0] == pytest.approx(0.0, abs=1e-9)
+    assert found.shared_covariance[0, 0] == pytest.approx(1.0)
+
+
 def test_a_located_image_becomes_an_observation(located):
     found = observe_frame(located.result)
     fix = located.result.fix
@@ -174,6 +197,12 @@ def test_a_located_image_becomes_an_observation(located):
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     heading = np.degrees(np.arctan2(*R[0, :2]))  # of the body's x axis
     assert heading == pytest.approx(located.heading_pitch_roll_deg[0], abs=0.05)
+
+
+def test_a_fix_of_another_depth_needs_an_error_of_the_depth(located):
+    deeper = replace(located.result, steeper=0.005)
+    with pytest.raises(ValueError, match="wrong depth"):
+        observe_frame(deeper, SharedErrors.of(deeper.terrain, None))
 
 
 def test_exposures_at_rest_are_one_posterior():

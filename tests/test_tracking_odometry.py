@@ -172,3 +172,17 @@ def test_a_value_that_is_no_odometry_raises(changes, cause):
     good = {"time_s": [0.0, 1.0], "position_m": [[0, 0, 0], [1, 0, 0]], "quat_xyzw": [[0, 0, 0, 1]] * 2}
     with pytest.raises(ValueError, match=cause):
         Odometry(**{**good, **changes})
+
+
+@pytest.mark.parametrize("end", ["", "5", "5 1 2 3", "5 1 2 3\n", "5 1 2 3 0 0 0 1", "# note", "5 1 2 # 3\n"])
+def test_text_that_grows_is_read_to_its_last_complete_line(tmp_path, end):
+    path = tmp_path / "odometry.tum"
+    path.write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n" + end)
+    assert read_odometry(path, growing=True).time_s.tolist() == [1.0, 2.0]
+
+
+def test_text_that_grows_is_still_refused_for_a_wrong_line_within(tmp_path):
+    path = tmp_path / "odometry.tum"
+    path.write_text("1 0 0 0 0 0 0 1\n2 1 0 0\n3 1 0 0 0 0 0 1\n")
+    with pytest.raises(BadInput, match="line 2: 4 columns"):
+        read_odometry(path, growing=True)

@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
         run_of.follow()
     else:
         run_of.take_all()
-    return next((code for code in (1, 4, 3) if code in run_of.codes), 0)
+    return next((code for code in (1, 4, 5, 3) if code in run_of.codes), 0)
 
 
 def _check_flags(args: argparse.Namespace) -> None:

@@ -7,14 +7,14 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from startrack.cli.odometry_file import OdometryFile
 from startrack.cli.preparation import prepare_reference
 from startrack.cli.progress import progress
-from startrack.errors import EXIT_BAD_INPUT, BadInput, exit_code_of
+from startrack.errors import EXIT_BAD_INPUT, EXIT_STOPPED, BadInput, exit_code_of
 
 if TYPE_CHECKING:
     from startrack.tracking import ObservedFrame, Odometry, Track
@@ -34,7 +34,10 @@ class TrackRun:
         self.codes: set[int] = {0}
         self._is_old, self._write_s = False, 0.0  # the files; what writing them took
         self._printed = 0  # lines at rest
-        self._read: tuple[object, Odometry] | None = None  # the odometry, with the stamp of its file
+        self._shows_depth = False  # whether an image showed that the depth of the file is wrong
+        self._moves = (
+            None if args.odometry is None else OdometryFile(args.odometry, args.odometry_topic, bool(args.follow))
+        )  # fmt: skip
 
     def take_all(self) -> None:
         """Locate all images, then estimate and write the track."""
@@ -54,21 +57,27 @@ class TrackRun:
             self._print_summary(track)
 
     def follow(self) -> None:
-        """Take images as they come; Ctrl-C and SIGTERM end it."""
+        """Take images as they come; Ctrl-C and SIGTERM end it, before the first image with the code of a stop."""
         import signal
 
         from startrack.tracking.follow import follow_images
 
         former = signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
-            with suppress(KeyboardInterrupt):
-                for image in follow_images(
-                    self.args.frames[0], self.args.dir, lambda image: self._note(self._add(image.path)),
-                    lambda image, cause: self._refuse(image.name, cause), until_idle_s=self.args.until_idle,
-                ):  # fmt: skip
-                    self._update(image is not None)
+            for image in follow_images(
+                self.args.frames[0], self.args.dir, lambda image: self._note(self._add(image.path)),
+                lambda image, cause: self._refuse(image.name, cause), until_idle_s=self.args.until_idle,
+            ):  # fmt: skip
+                self._update(image is not None)
+        except KeyboardInterrupt:
+            if not self.session.frames:
+                print("startrack: interrupted before the first image", file=sys.stderr, flush=True)
+                self.codes.add(EXIT_STOPPED)
+                return
         finally:
             signal.signal(signal.SIGTERM, former)
+        if self._moves is not None:
+            self._moves.end()
         track = self._whole_track(growing=True)
         if track is not None:
             self._write(track)
@@ -96,9 +105,7 @@ class TrackRun:
 
     def _waits(self) -> bool:
         """Whether images wait for the odometry, whose file has changed."""
-        if self.args.odometry is None or not self.session.waits:
-            return False
-        return self._read is None or self._read[0] != _stamp(self.args.odometry)
+        return self._moves is not None and self.session.waits and self._moves.has_changed
 
     def _print_newest(self) -> bool:
         """Print a line about each image that has none yet; whether there was one."""
@@ -154,6 +161,12 @@ class TrackRun:
         return self.session.add_exposure(exposure, path)
 
     def _note(self, frame: ObservedFrame) -> None:
+        if frame.steeper and not self._shows_depth:
+            self._shows_depth = True
+            print(
+                f"{frame.name}  the light of the sky shows a depth {frame.steeper:+.2%} off that of the terrain file: "
+                "the track estimates it", file=sys.stderr, flush=True,
+            )  # fmt: skip
         if not frame.modes:
             self.codes.add(3)
 
@@ -182,14 +195,7 @@ class TrackRun:
         )  # fmt: skip
 
     def _odometry(self) -> Odometry | None:
-        from startrack.tracking import read_odometry
-
-        if self.args.odometry is None:
-            return None
-        stamp = _stamp(self.args.odometry)
-        if self._read is None or self._read[0] != stamp:
-            self._read = stamp, read_odometry(self.args.odometry, self.args.odometry_topic)
-        return self._read[1]
+        return None if self._moves is None else self._moves.read()
 
     def _write(self, track: Track, pictures: bool = True) -> None:
         from startrack.tracking.write import write_track
@@ -234,14 +240,6 @@ class TrackRun:
             f"{counts['frames']} frames: {counts['used']} used, {counts['left_out']} left out, {counts['refused']} "
             f"refused; {counts['slips']} slips of the odometry; files in {self.args.dir}/track.*"
         )
-
-
-def _stamp(path: str) -> object:
-    """Of a file that may grow: another one after each change."""
-    with suppress(OSError):
-        found = Path(path).stat()
-        return found.st_size, found.st_mtime_ns
-    return None
 
 
 def _line(record: dict[str, Any], prefix: str) -> str:

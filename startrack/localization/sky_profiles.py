@@ -49,8 +49,9 @@ class SkyProfiles:
             elevation, evidence.llr[rows], evidence.extended_nats[rows], evidence.edge_sigma_rad[rows], first, last,
             low, step, values,
         )  # fmt: skip
-        for k in np.flatnonzero(map_sigma > 0.0):
-            values[k] = _average_over_map(values[k], map_sigma[k] / step[k])
+        moved = np.flatnonzero(map_sigma > 0.0)
+        if len(moved):
+            values[moved] = _average_over_map(values[moved], map_sigma[moved] / step[moved])
         return cls(rows[first], low, step, values)
 
     def add_sums(self, horizon_rad: Array, sector: Ints, sums: Array) -> None:
@@ -58,23 +59,44 @@ class SkyProfiles:
         _add_sums(self.low_rad, self.step_rad, self.values, horizon_rad, sector, sums)
 
 
-def _average_over_map(values: Array, sigma_knots: float) -> Array:
-    """The logarithm of the mean of exp(values) over a normal shift of the horizon by `sigma_knots`.
+def _average_over_map(values: Array, sigma_knots: Array) -> Array:
+    """Logarithms (m, knots) of the means of exp(values) over normal shifts of the horizon by `sigma_knots` (m,).
 
     A bright sky determines the horizon to a part of a knot: the mean is taken over points between the knots.
     """
     from scipy.interpolate import CubicSpline
 
-    sharpest = 1.0 / np.sqrt(max(-float(np.diff(values, 2).min()), 1e-12))
-    fine = max(int(np.ceil(MAP_STEPS / min(sharpest, sigma_knots))), 1)
-    last = len(values) - 1
-    between = CubicSpline(np.arange(len(values)), values)(np.linspace(0, last, last * fine + 1))
-    reach = max(int(np.ceil(MAP_SIGMAS * sigma_knots * fine)), 1)
-    weight = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) / (sigma_knots * fine)))
-    top = between.max()
-    padded = np.pad(np.exp(between - top), reach, mode="edge")
-    mean = np.convolve(padded, weight / weight.sum(), mode="valid")[::fine]
-    return np.asarray(top + np.log(np.maximum(mean, LEAST_PART)))
+    sharpest = 1.0 / np.sqrt(np.maximum(-np.diff(values, 2, axis=1).min(axis=1), 1e-12))
+    fine = np.maximum(np.ceil(MAP_STEPS / np.minimum(sharpest, sigma_knots)), 1.0).astype(np.int64)
+    cubics = CubicSpline(np.arange(values.shape[1]), values, axis=1).c
+    averaged = np.empty_like(values)
+    _fill_averages(values, np.ascontiguousarray(np.moveaxis(cubics, -1, 0)), fine, sigma_knots, averaged)
+    return averaged
+
+
+@njit(cache=True, nogil=True)
+def _fill_averages(values, cubics, fine, sigma_knots, averaged):
+    """Fill averaged (m, knots) from cubics (m, 4, knots - 1) taken at `fine` (m,) points between two knots."""
+    knots = values.shape[1]
+    for m in range(len(values)):
+        last = (knots - 1) * fine[m]
+        between = np.empty(last + 1)
+        for j in range(knots - 1):
+            a, b, c, d = cubics[m, 0, j], cubics[m, 1, j], cubics[m, 2, j], cubics[m, 3, j]
+            for i in range(fine[m]):
+                u = i / fine[m]
+                between[j * fine[m] + i] = ((a * u + b) * u + c) * u + d
+        between[last] = values[m, knots - 1]
+        top = between.max()
+        likelihood = np.exp(between - top)
+        reach = max(int(np.ceil(MAP_SIGMAS * sigma_knots[m] * fine[m])), 1)
+        weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (sigma_knots[m] * fine[m])) ** 2)
+        weight /= weight.sum()
+        for j in range(knots):
+            mean = 0.0
+            for i in range(-reach, reach + 1):
+                mean += weight[i + reach] * likelihood[min(max(j * fine[m] + i, 0), last)]
+            averaged[m, j] = top + np.log(max(mean, LEAST_PART))
 
 
 @njit(cache=True, nogil=True)

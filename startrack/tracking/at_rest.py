@@ -9,9 +9,9 @@ import numpy as np
 
 from startrack.terrain import Terrain
 from startrack.tracking.contradictions import RobustTrack, smooth_robustly
-from startrack.tracking.frame_estimate import FrameEstimate, ImageErrors, estimate_frame
+from startrack.tracking.frame_estimate import FrameEstimate, estimate_frame
 from startrack.tracking.observe import ObservedFrame
-from startrack.tracking.shared import SharedErrors
+from startrack.tracking.shared import ImageErrors, SharedErrors
 from startrack.tracking.smoother import UNKNOWN_M, Observations, Smoothed, Steps, smooth
 from startrack.types import Array, Evidence, Ints
 

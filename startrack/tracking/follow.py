@@ -10,8 +10,8 @@ from pathlib import Path
 from startrack.batch.find import Image, images_under
 from startrack.errors import BadInput
 
-POLL_S = 0.1
-STILL_S = 0.2  # since the last change of a file, after which it is complete
+POLL_S = 0.05
+STILL_S = 0.1  # since the last change of a file, after which it is complete
 PATIENCE_S = 5.0  # for a file that cannot be read, or whose sidecar is missing
 
 

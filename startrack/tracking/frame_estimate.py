@@ -8,14 +8,15 @@ the parameters with the slopes of the log-likelihood: the derivative of a poster
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from startrack.terrain import Terrain
 from startrack.terrain.horizon_posts import NO_POST, HorizonPosts
 from startrack.tracking.importance_sampling import Samples, sample_posterior
-from startrack.tracking.shared import BIAS, SharedErrors
+from startrack.tracking.shared import BIAS, ImageErrors, SharedErrors
 from startrack.tracking.skyline_likelihood import SkylineLikelihood
 from startrack.types import Array, Evidence, Ints
 
@@ -26,19 +27,6 @@ OUTSIDE = -1e6  # logarithm of a density that is zero
 MIN_NOISE_SHARE = 0.3  # of the evidence's covariance: the least noise that a frame has of its own
 NEGLIGIBLE_POST = 1e-4  # part of the variance of a position, by all posts that are left out together
 ROUNDING = 1e-9  # of the covariance, added to the noise so that it can be inverted
-
-
-@dataclass(frozen=True, eq=False)
-class ImageErrors:
-    """Errors of attitude and lens: they raise the skyline of the sky's light, not that of the stars."""
-
-    raised_rad: Array  # (sectors, j) of equal width from north on, by one unit of each; 0 where no light is used
-    covariance: Array  # (j, j)
-
-    def at(self, azimuth_rad: Array) -> Array:
-        """Rises (n, j) [rad] at azimuths (n,), by one unit of each."""
-        sector = (azimuth_rad / (2 * np.pi) * len(self.raised_rad)).astype(np.int64) % len(self.raised_rad)
-        return np.asarray(self.raised_rad[sector])
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +71,8 @@ def estimate_frame(
         sigmas = float(np.abs(mean[2:]).max(initial=0.0)) + REACH_SIGMAS * float(
             np.sqrt(np.diag(covariance)[2:].max(initial=0.0))
         )
-        likelihood = SkylineLikelihood.near(evidence, terrain, shared, mean[:2], half, min(sigmas, REACH_SIGMAS))
+        near = partial(SkylineLikelihood.near, evidence, terrain, shared, image_errors)
+        likelihood = near(mean[:2], half, min(sigmas, REACH_SIGMAS))
         samples = sample_posterior(_log_posterior(likelihood, half), mean, covariance)
         moved = float(np.abs(samples.mean[:2] - mean[:2]).max())
         inside = moved + 3.0 * np.sqrt(np.linalg.eigvalsh(samples.covariance[:2, :2])[1]) < half
@@ -135,9 +124,22 @@ def _observation(likelihood: SkylineLikelihood, samples: Samples, image_errors: 
         noise += by_image @ image_errors.covariance @ by_image.T
     post, by_post = _posts(likelihood, by_horizon, covariance)
     shared_by_posts = likelihood.local.terrain.height_sigma_m**2 * by_post @ by_post.T
-    return FrameEstimate(
+    found = FrameEstimate(
         mean, covariance - by_evidence + noise + shared_by_posts, np.eye(len(mean)) - covariance @ prior, noise, post,
         by_post,
+    )  # fmt: skip
+    return _without(found, 2 + np.flatnonzero(~likelihood.rise_rad.any(axis=0)))
+
+
+def _without(estimate: FrameEstimate, unseen: Ints) -> FrameEstimate:
+    """The estimate without sampling noise in the parameters (u,) that the evidence does not depend on."""
+    if not len(unseen):
+        return estimate
+    seen = ~np.isin(np.arange(estimate.parameters), unseen)
+    both, own = np.outer(seen, seen), np.diag(np.where(seen, 0.0, 1.0))
+    return replace(
+        estimate, mean=estimate.mean * seen, covariance=estimate.covariance * both + own,
+        response=estimate.response * both, noise=estimate.noise * both + own, by_post=estimate.by_post * seen[:, None],
     )  # fmt: skip
 
 

@@ -13,11 +13,12 @@ from zipfile import BadZipFile
 import numpy as np
 
 from startrack.files import write_atomically
-from startrack.tracking.frame_estimate import FrameEstimate, ImageErrors
+from startrack.tracking.frame_estimate import FrameEstimate
 from startrack.tracking.observe import ObservedFrame
+from startrack.tracking.shared import ImageErrors
 from startrack.types import Array, Clock, Evidence
 
-FORMAT = "startrack.observed-frame/1"
+FORMAT = "startrack.observed-frame/2"
 ROWS = ("azimuth_rad", "elevation_rad", "llr", "edge_sigma_rad", "extended_nats")
 
 
@@ -58,7 +59,7 @@ def encode_frame(frame: ObservedFrame) -> bytes:
         arrays |= {f"errors.{f.name}": getattr(frame.image_errors, f.name) for f in fields(ImageErrors)}
     head = {
         "format": FORMAT, "name": frame.name, "time_utc": frame.time_utc.isoformat(), "modes": len(frame.modes),
-        "reason": frame.reason, "message": frame.message,
+        "reason": frame.reason, "message": frame.message, "steeper": frame.steeper,
     }  # fmt: skip
     file = io.BytesIO()
     np.savez(file, head=np.array(json.dumps(head)), **arrays)  # type: ignore[arg-type]
@@ -78,7 +79,7 @@ def decode_frame(data: bytes) -> ObservedFrame:
     return ObservedFrame(
         head["name"], datetime.fromisoformat(head["time_utc"]), arrays.get("R_body_enu"),
         tuple(_mode(arrays, number) for number in range(head["modes"])), _evidence(arrays), errors, head["reason"],
-        head["message"],
+        head["message"], head["steeper"],
     )  # fmt: skip
 
 

@@ -11,12 +11,13 @@ import numpy as np
 from startrack.evidence.star_offsets import OFFSET_TERMS
 from startrack.stages import Located, Measured, Outcome, Refused, last_value
 from startrack.terrain import Terrain
-from startrack.tracking.frame_estimate import FrameEstimate, ImageErrors, estimate_frame, first_guess
-from startrack.tracking.shared import SharedErrors
+from startrack.tracking.frame_estimate import FrameEstimate, estimate_frame, first_guess
+from startrack.tracking.shared import STEEPNESS, ImageErrors, SharedErrors
 from startrack.types import Array, Bools, Evidence
 
 NEAR_RAD = np.radians(1.5)  # rows within this of the skyline are kept for other exposures of the same position
 MODE_SIGMA_M = 10.0  # of a mode of an ambiguous fix, of the first Gaussian
+WIDER = 3.0  # standard deviations of a position by another shape of the terrain, of the first Gaussian
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,12 +32,17 @@ class ObservedFrame:
     image_errors: ImageErrors | None = None  # of the rows of the sky's light
     reason: str = ""  # of a refusal
     message: str = ""
+    steeper: float = 0.0  # relative, by which the sky's light shows a crater deeper than its file states
 
 
-def observe_frame(outcome: Outcome, shared: SharedErrors | None = None) -> ObservedFrame:
-    """What the `outcome` of one image says of its position and of the errors `shared` (None: those of its terrain).
+def observe_frame(
+    outcome: Outcome, shared: SharedErrors | None = None, terrain: Terrain | None = None
+) -> ObservedFrame:
+    """The `outcome` of one image as an observation of its position and of the errors `shared`.
 
-    Raises ValueError for an image without a time, and for a fix that states no error (another localizer).
+    `shared` and `terrain` are those of the track; None: those of the image. Raises ValueError for an image without a
+    time, for a fix that states no error (another localizer), and for one of another depth than the file's where
+    `shared` has no error of the depth (see `TrackSession`).
     """
     value, when = last_value(outcome), outcome.exposure.time_utc
     if when is None:
@@ -50,11 +56,28 @@ def observe_frame(outcome: Outcome, shared: SharedErrors | None = None) -> Obser
         return ObservedFrame(outcome.exposure.name, when, R, (), None, None, reason, message)
     if value.fix.search == "approximate":
         raise ValueError(f"{outcome.exposure.name}: a track needs the localizer posterior")
-    shared = shared or SharedErrors.of(value.terrain, value.clock)
+    terrain = terrain or value.terrain
+    shared = shared or SharedErrors.of(terrain, value.clock)
+    if value.steeper and STEEPNESS not in shared.names:
+        raise ValueError(f"{outcome.exposure.name}: it shows a wrong depth of the crater, which must be shared")
     rows, errors = located_evidence(value)
-    estimates = tuple(_mode_estimates(value, rows, shared, errors))
-    near = rows_near(rows, value.terrain, estimates)
-    return ObservedFrame(outcome.exposure.name, when, R, estimates, near, errors)
+    errors = errors and errors.without_edge(shared)
+    estimates = tuple(_mode_estimates(value, rows, terrain, shared, errors))
+    near = rows_near(rows, terrain, estimates)
+    return ObservedFrame(outcome.exposure.name, when, R, estimates, near, errors, steeper=value.steeper)
+
+
+def observe_again(frame: ObservedFrame, shared: SharedErrors, terrain: Terrain) -> ObservedFrame:
+    """The `frame` by its evidence, with other shared errors and another error of the terrain's shape."""
+    if frame.evidence is None:
+        return frame
+    modes = []
+    for mode in frame.modes:
+        spread = WIDER**2 * mode.covariance[:2, :2] + MODE_SIGMA_M**2 * np.eye(2)
+        first = first_guess(shared, mode.mean[:2], spread)
+        one = estimate_frame(frame.evidence, terrain, shared, *first, frame.image_errors)
+        modes.append(replace(one, weight=mode.weight))
+    return replace(frame, modes=tuple(modes))
 
 
 def located_evidence(located: Located) -> tuple[Evidence, ImageErrors | None]:
@@ -73,9 +96,9 @@ def located_evidence(located: Located) -> tuple[Evidence, ImageErrors | None]:
 
 
 def _mode_estimates(
-    located: Located, rows: Evidence, shared: SharedErrors, errors: ImageErrors | None
+    located: Located, rows: Evidence, terrain: Terrain, shared: SharedErrors, errors: ImageErrors | None
 ) -> Iterator[FrameEstimate]:
-    fix, terrain = located.fix, located.terrain
+    fix = located.fix
     if not fix.ambiguous:
         first = first_guess(shared, fix.position_enu_m[:2], fix.covariance_m2, fix.horizon_error_rad)
         yield estimate_frame(rows, terrain, shared, *first, errors)

@@ -78,12 +78,13 @@ class Odometry(Value):
         return np.clip(time_s, first, last)
 
 
-def read_odometry(path: FilePath, topic: str | None = None) -> Odometry:
+def read_odometry(path: FilePath, topic: str | None = None, *, growing: bool = False) -> Odometry:
     """The odometry in the file `path`: TUM text, or a ROS bag (.bag, .db3, .mcap, a folder with metadata.yaml).
 
     TUM text has one pose a line, `time tx ty tz qx qy qz qw`, with the time in Unix seconds (UTC) and comments after
     `#`. Of a bag, the nav_msgs/Odometry messages of a `topic` are read (None: its only topic of that type), with the
-    times of their headers.
+    times of their headers. `growing`: text that is being written; its last line is left out unless it is complete,
+    with eight numbers and the end of the line.
 
     Raises:
         BadInput: bad_odometry with the file and the cause, in one line.
@@ -92,13 +93,14 @@ def read_odometry(path: FilePath, topic: str | None = None) -> Odometry:
         return _odometry_of_bag(path, topic)
     if topic is not None:
         _refuse(f"{printable(path)}: is read as text and has no topic {topic}; bags end in {', '.join(BAG_SUFFIXES)}")
-    return _odometry_of_text(path)
+    return _odometry_of_text(path, growing)
 
 
-def _odometry_of_text(path: FilePath) -> Odometry:
+def _odometry_of_text(path: FilePath, growing: bool) -> Odometry:
     rows: list[list[float]] = []
     numbers: list[int] = []
-    for number, line in enumerate(read_text(path, "bad_odometry", max_bytes=MAX_ODOMETRY_BYTES).splitlines(), start=1):
+    text = read_text(path, "bad_odometry", max_bytes=MAX_ODOMETRY_BYTES)
+    for number, line in enumerate((_complete_lines(text) if growing else text).splitlines(), start=1):
         words = line.partition("#")[0].split()
         if not words:
             continue
@@ -107,10 +109,18 @@ def _odometry_of_text(path: FilePath) -> Odometry:
         try:
             rows.append([float(word) for word in words])
         except ValueError as cause:
-            text = str(cause)[:MAX_CAUSE_CHARS]
-            raise BadInput("bad_odometry", f"{printable(path)}: line {number}: {text}") from cause
+            why = str(cause)[:MAX_CAUSE_CHARS]
+            raise BadInput("bad_odometry", f"{printable(path)}: line {number}: {why}") from cause
         numbers.append(number)
     return _odometry_of_rows(path, rows, lambda row: f"line {numbers[row]}")
+
+
+def _complete_lines(text: str) -> str:
+    """The text without a last line that is being written: it has no end, or too few numbers."""
+    whole = text[: text.rfind("\n") + 1]
+    last = whole.rstrip("\n").rfind("\n") + 1
+    words = whole[last:].partition("#")[0].split()
+    return whole if not words or len(words) >= len(TUM_COLUMNS.split()) else whole[:last]
 
 
 def _odometry_of_bag(path: FilePath, topic: str | None) -> Odometry:

@@ -32,6 +32,10 @@ TRACK = schema(
         "counts": record(dict.fromkeys(("frames", *STATUSES, "slips"), COUNT)),
         "horizon": record({"error_deg": NUMBER, "sigma_deg": POSITIVE}, "true horizon less the map's"),
         "clock": or_null(record({"offset_s": NUMBER, "sigma_s": POSITIVE}), "true time less the stated one"),
+        "depth": or_null(
+            record({"error_percent": NUMBER, "sigma_percent": POSITIVE}),
+            "true depth of a crater less that of its file; null where that is taken as exact",
+        ),
         "frames": {"type": "array", "items": FRAME},
         "provenance": record({"version": TEXT}),
     }),

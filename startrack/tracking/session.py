@@ -12,11 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from startrack.batch.fingerprint import input_hashes, job_sha256
+from startrack.catalog import load_catalog
 from startrack.errors import BadInput
-from startrack.pipeline import NO_TIME, locate_exposure
-from startrack.stages import Settings
+from startrack.inputs import load_camera_input, terrain_input
+from startrack.pipeline import NO_TIME, locate
+from startrack.stages import Located, Settings
+from startrack.tracking.depth import drop_other_depths, free_depth
 from startrack.tracking.frame_store import FrameStore
-from startrack.tracking.observe import ObservedFrame, observe_frame
+from startrack.tracking.observe import ObservedFrame, observe_again, observe_frame
 from startrack.tracking.odometry import SPAN_TOLERANCE_S, Odometry
 from startrack.tracking.online import RECENT_FRAMES, OnlineTrack
 from startrack.tracking.shared import SharedErrors
@@ -30,21 +33,29 @@ from startrack.tracking.track import (
 )
 
 if TYPE_CHECKING:
+    from startrack.camera import Camera
     from startrack.terrain import Terrain
     from startrack.types import Array, Exposure
 
 
 @dataclass
 class TrackSession:
-    """A track that grows image by image. The terrain is that of its first image, and all images must have it."""
+    """A track that grows image by image. Camera and terrain are those of its first image; all must have them.
+
+    Where the sky's light in an image shows a crater's depth that its file excludes, the depth is one of the errors that
+    the images share from then on; the images before it are observed anew from their evidence.
+    """
 
     store: FrameStore | None = None  # None: frames are kept in memory alone
     settings: Settings = field(default_factory=Settings)
     facts: dict[str, Any] = field(default_factory=dict)  # from flags, by the parameters of `read_exposure`
+    stated_camera: str | Camera | None = None  # of all images; None: that which each names
+    stated_terrain: str | Terrain | None = None  # the same
     frames: list[ObservedFrame] = field(default_factory=list)  # in the order of time
     terrain: Terrain | None = None
+    camera: Camera | None = None
     shared: SharedErrors | None = None
-    _references: tuple[Any, Any] | None = None  # camera and terrain
+    _references: tuple[Any, Any] | None = None  # camera and terrain as the first image has them
     _filtered: list[ObservedFrame] = field(default_factory=list)  # that the filter has
     _online: OnlineTrack | None = None
 
@@ -61,17 +72,30 @@ class TrackSession:
         """The frame of an `exposure`; `path` (None: not from a file) is that of its file. Raises as `add`."""
         if exposure.time_utc is None:
             raise BadInput("no_time", "; ".join([NO_TIME, *exposure.warnings]))
-        shared = self._shared_errors(exposure)
+        camera, terrain, shared = self._load_references(exposure)
         self._check_time(exposure)
         key = None if self.store is None else self._key(exposure, path, shared)
         frame = None if self.store is None or key is None else self.store.read(key)
         if frame is None:
-            frame = observe_frame(locate_exposure(exposure, self.settings), shared)
+            outcome = locate(exposure, camera, terrain, load_catalog(), self.settings)
+            if isinstance(outcome, Located) and outcome.steeper:
+                terrain, shared = self._free_depth(terrain, shared)
+            frame = observe_frame(outcome, shared, terrain)
             if self.store is not None and key is not None:
                 self.store.write(key, frame)
+        elif frame.steeper:
+            self._free_depth(terrain, shared)
         self.frames.append(frame)
         self.frames.sort(key=lambda one: (one.time_utc, one.name))
         return frame
+
+    def _free_depth(self, terrain: Terrain, shared: SharedErrors) -> tuple[Terrain, SharedErrors]:
+        """The `terrain` with a depth that the images estimate, and the `shared` errors with that of the depth."""
+        terrain = free_depth(terrain)
+        shared = shared.of_terrain(terrain)
+        self.frames = [observe_again(frame, shared, terrain) for frame in self.frames]
+        self.terrain, self.shared = terrain, shared
+        return terrain, shared
 
     def estimate(
         self,
@@ -131,12 +155,13 @@ class TrackSession:
         for k in range(len(self._filtered), len(self.frames)):
             if not _is_reached(self.frames[k], odometry):
                 return
+            frame = drop_other_depths(self.frames[: k + 1], self.shared)[k]
             recent = self.frames[max(k - RECENT_FRAMES, 0) : k + 1]
             steps = odometry_steps(recent, odometry, odometry_sigma, odometry_floor_m)
             move, sigma = (steps.move_m[-1], float(steps.sigma_m[-1])) if k else (np.zeros(2), 0.0)
-            self._online.add(self.frames[k].modes, move, sigma)
+            self._online.add(frame.modes, move, sigma)
             self._filtered.append(self.frames[k])
-            yield track_of_newest(self.frames[k], self._online, self.terrain)
+            yield track_of_newest(frame, self._online, self.terrain)
 
     def _check_time(self, exposure: Exposure) -> None:
         """Raise BadInput for a second image of one time: its evidence would count twice."""
@@ -144,27 +169,25 @@ class TrackSession:
         if same is not None:
             raise BadInput("bad_image", f"{exposure.name} has the time of {same.name}: a track takes an image once")
 
-    def _shared_errors(self, exposure: Exposure) -> SharedErrors:
-        """The errors that all frames share, from the first of them."""
-        from startrack.terrain import load_terrain
-
-        if exposure.terrain is None:
-            raise BadInput("bad_terrain", "no terrain file is known: give -t FILE or a sidecar with terrain")
-        if self.terrain is None or self.shared is None:
-            terrain = load_terrain(exposure.terrain)
-            self.shared = SharedErrors.of_exposure(terrain, exposure)
-            self.terrain = terrain
-            self._references = exposure.camera, exposure.terrain
-        camera, ground = self._references or (None, None)
-        if exposure.terrain != ground:
-            raise BadInput(
-                "bad_terrain", f"{exposure.name} is on the terrain {exposure.terrain}, the track on {ground}"
-            )
-        if exposure.camera != camera:
-            raise BadInput(
-                "bad_calibration", f"{exposure.name} is of the camera {exposure.camera}, the track of {camera}"
-            )
-        return self.shared
+    def _load_references(self, exposure: Exposure) -> tuple[Camera, Terrain, SharedErrors]:
+        """Camera, terrain and shared errors of the track: those of its first image. Raises BadInput for another's."""
+        camera = exposure.camera if self.stated_camera is None else self.stated_camera
+        terrain = exposure.terrain if self.stated_terrain is None else self.stated_terrain
+        if camera is None:
+            raise BadInput("no_calibration", "no camera is known: give -c FILE (camera=) or a sidecar with camera")
+        if terrain is None:
+            raise BadInput("bad_terrain", "no terrain is known: give -t FILE (terrain=) or a sidecar with terrain")
+        if self.camera is None or self.terrain is None or self.shared is None:
+            lens, ground = load_camera_input(camera), terrain_input(terrain, None)
+            uses_sky = self.settings.evidence_sources != "stars"
+            self.shared = SharedErrors.of_exposure(ground, exposure, uses_sky)
+            self.camera, self.terrain, self._references = lens, ground, (camera, terrain)
+        first_camera, first_terrain = self._references or (None, None)
+        if terrain is not first_terrain and terrain != first_terrain:
+            raise BadInput("bad_terrain", f"{exposure.name} is on the terrain {terrain}, the track on {first_terrain}")
+        if camera is not first_camera and camera != first_camera:
+            raise BadInput("bad_calibration", f"{exposure.name} is of the camera {camera}, the track of {first_camera}")
+        return self.camera, self.terrain, self.shared
 
     def _key(self, exposure: Exposure, path: str | None, shared: SharedErrors) -> str | None:
         """Hash of all that decides a frame; None for an image that is not from a file."""

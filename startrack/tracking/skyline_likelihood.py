@@ -13,10 +13,11 @@ from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.local_search import LocalLikelihood
 from startrack.localization.sector_likelihood import contributions
 from startrack.terrain import Terrain
-from startrack.tracking.shared import BIAS, CLOCK, SharedErrors
+from startrack.tracking.shared import BIAS, CLOCK, EDGE, ImageErrors, SharedErrors
 from startrack.types import Array, Bools, Evidence, Ints
 
-NODES = 5  # traced horizons along each side of the neighbourhood
+NODES, NARROW_NODES = 5, 3  # traced horizons along each side of the neighbourhood
+NARROW_M = 20.0  # half of the side of a neighbourhood in which three do: 1e-6 rad on Shackleton's floor
 STEP_SIGMAS = 0.5  # of the horizon's spread, to each side: where the change with the horizon is taken
 SHAPE_STEP = 1e-4  # relative
 TURN_STEP_RAD = 2e-3  # of the sky, at which the horizon's change with the time is taken: crests are no narrower
@@ -32,17 +33,19 @@ class SkylineLikelihood:
     whole: PositionLikelihood
     local: LocalLikelihood
     shared: SharedErrors
+    image_errors: ImageErrors | None  # of the rows of the sky's light; None: there are none
     centre_m: Array  # (2,)
 
     @classmethod
     def near(
-        cls, evidence: Evidence, terrain: Terrain, shared: SharedErrors, centre_m: Array, half_m: float,
-        raised_sigmas: float,
+        cls, evidence: Evidence, terrain: Terrain, shared: SharedErrors, image_errors: ImageErrors | None,
+        centre_m: Array, half_m: float, raised_sigmas: float,
     ) -> Self:  # fmt: skip
         """For positions within `half_m` of a centre (2,), and shared errors of so many standard deviations."""
         whole = PositionLikelihood.from_evidence(evidence, terrain)
         leeway = raised_sigmas * shared.reach_rad(evidence)
-        return cls(whole, whole.near(centre_m, half_m, leeway, NODES), shared, centre_m)
+        across = NARROW_NODES if half_m < NARROW_M else NODES
+        return cls(whole, whole.near(centre_m, half_m, leeway, across), shared, image_errors, centre_m)
 
     @cached_property
     def rows(self) -> Ints:
@@ -76,10 +79,19 @@ class SkylineLikelihood:
                 rise = np.ones(len(azimuth))
             elif name == CLOCK:
                 rise = _raised_by_clock(terrain, self.centre_m, azimuth, elevation, self.shared.turn_rad_s)
+            elif name == EDGE:
+                rise = self._raised_by_edge
             else:
                 rise = _raised_by_shape(terrain, self.centre_m, azimuth, self.shared.shape_axis(name))
             columns.append(sigma * rise)
         return np.stack(columns, axis=1) if columns else np.zeros((len(azimuth), 0))
+
+    @property
+    def _raised_by_edge(self) -> Array:
+        """(m,) by one px of the whole skyline in the sky's light."""
+        if self.image_errors is None:
+            return np.zeros(len(self.rows))
+        return np.asarray(self.image_errors.at(self.azimuth_rad)[:, 0] * self.is_sky)
 
     def horizons(self, parameters: Array) -> Array:
         """(n, m) horizon [rad] beside each item."""

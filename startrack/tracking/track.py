@@ -15,10 +15,11 @@ from startrack.localization.summary import camera_at
 from startrack.terrain import Terrain
 from startrack.tracking.at_rest import positions_at_rest
 from startrack.tracking.contradictions import RobustTrack, smooth_robustly
+from startrack.tracking.depth import drop_other_depths
 from startrack.tracking.observe import ObservedFrame
 from startrack.tracking.odometry import Odometry
 from startrack.tracking.online import OnlineTrack
-from startrack.tracking.shared import BIAS, CLOCK, SharedErrors
+from startrack.tracking.shared import BIAS, CLOCK, SHAPES, SharedErrors
 from startrack.tracking.smoother import UNKNOWN_M, Smoothed, Steps
 from startrack.types import Array, BadInput, Bools, ClockError, Ints
 
@@ -57,6 +58,14 @@ class CrestHeights:
 
 
 @dataclass(frozen=True, eq=False)
+class DepthError:
+    """By which a crater is deeper than its file states, relative."""
+
+    error_1: float
+    sigma_1: float
+
+
+@dataclass(frozen=True, eq=False)
 class Track:
     """A track with what its frames share."""
 
@@ -66,6 +75,7 @@ class Track:
     bias_rad: float  # by which the true horizon is higher than the map's, all around
     bias_sigma_rad: float
     clock: ClockError | None
+    depth: DepthError | None  # None: the file's depth is taken as exact
     crests: CrestHeights | None  # None: a terrain without posts, or without errors of their heights
     slipped: Bools  # (n - 1,) odometry steps judged wheel slip
     at_rest: bool
@@ -99,6 +109,7 @@ def estimate_track(
     times = [frame.time_utc for frame in frames]
     if any(a > b for a, b in pairwise(times)):
         raise BadInput("no_time", "the frames are not in the order of their times")
+    frames = drop_other_depths(frames, shared)
     if at_rest:
         rest = positions_at_rest(frames, terrain, shared)
         robust = RobustTrack(rest.smoothed, rest.mode, np.zeros(max(len(frames) - 1, 0), dtype=bool))
@@ -114,7 +125,8 @@ def estimate_track(
     return Track(
         tuple(_track_frame(frame, mode) for frame, mode in zip(frames, robust.mode, strict=True)),
         _trajectory(*filtered, terrain), _trajectory(*smoothed, terrain), *_bias(robust.smoothed, shared),
-        _clock(robust.smoothed, shared), _crests(robust.smoothed, terrain), robust.slipped, at_rest, terrain,
+        _clock(robust.smoothed, shared), _depth(robust.smoothed, shared), _crests(robust.smoothed, terrain),
+        robust.slipped, at_rest, terrain,
     )  # fmt: skip
 
 
@@ -122,7 +134,7 @@ def track_of_newest(frame: ObservedFrame, online: OnlineTrack, terrain: Terrain)
     """The last `frame` that `online` has, as a track of its own: by all frames up to it."""
     found = _trajectory(online.position_m[None], online.covariance_m2[None], terrain)
     none = np.zeros(0, dtype=bool)
-    return Track((_track_frame(frame, online.mode),), found, found, 0.0, 0.0, None, None, none, False, terrain)
+    return Track((_track_frame(frame, online.mode),), found, found, 0.0, 0.0, None, None, None, none, False, terrain)
 
 
 def filter_positions(
@@ -184,19 +196,25 @@ def _trajectory(position_m: Array, covariance_m2: Array, terrain: Terrain) -> Tr
 
 
 def _bias(found: Smoothed, shared: SharedErrors) -> tuple[float, float]:
-    if BIAS not in shared.names:
-        return 0.0, 0.0
-    at = shared.names.index(BIAS)
-    sigma = float(shared.sigma[at])
-    return sigma * float(found.shared[at]), sigma * float(np.sqrt(found.shared_covariance[at, at]))
+    return _estimate(found, shared, BIAS) or (0.0, 0.0)
 
 
 def _clock(found: Smoothed, shared: SharedErrors) -> ClockError | None:
-    if CLOCK not in shared.names:
+    clock = _estimate(found, shared, CLOCK)
+    return None if clock is None else ClockError(*clock)
+
+
+def _depth(found: Smoothed, shared: SharedErrors) -> DepthError | None:
+    depth = _estimate(found, shared, *SHAPES)  # a larger crater of one steepness is deeper
+    return None if depth is None else DepthError(*depth)
+
+
+def _estimate(found: Smoothed, shared: SharedErrors, *names: str) -> tuple[float, float] | None:
+    """Sum of the shared errors of these names and its standard deviation; None where none of them is shared."""
+    weight = np.where(np.isin(shared.names, names), shared.sigma, 0.0)
+    if not weight.any():
         return None
-    at = shared.names.index(CLOCK)
-    sigma = float(shared.sigma[at])
-    return ClockError(sigma * float(found.shared[at]), sigma * float(np.sqrt(found.shared_covariance[at, at])))
+    return float(weight @ found.shared), float(np.sqrt(weight @ found.shared_covariance @ weight))
 
 
 def _crests(found: Smoothed, terrain: Terrain) -> CrestHeights | None:

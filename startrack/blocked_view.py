@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from startrack.localization import Localizer
+from startrack.localization import ExactPosterior, Localizer
 from startrack.localization.blocked import find_blocked
 from startrack.stages import StarRays
 from startrack.types import Fix, NotLocated
@@ -24,7 +24,8 @@ def leave_out_blocked(measured: S, fix: Fix, localizer: Localizer) -> S:
     Patches of missing stars above the map's skyline are left out, and ranges where the skyline rises above the map's,
     with everything at their azimuths. `fix` is the position at the time of `measured`; the `localizer` finds it anew.
     Where too much of the skyline would be left out, or what is left gives no position, nothing is: the fix must then
-    explain all of the evidence. Raises NotLocated (inconsistent_evidence) where the skyline rises in too much of it.
+    explain all of the evidence. With the posterior, raises NotLocated (inconsistent_evidence) where the skyline rises
+    in too much of it.
     """
     if fix.search == "approximate":  # its skyline is not that of the image
         return measured
@@ -37,7 +38,7 @@ def leave_out_blocked(measured: S, fix: Fix, localizer: Localizer) -> S:
             break
         blocked = newer
         if blocked is not None and blocked.width_rad > MOST_BLOCKED_RAD:
-            if blocked.risen:
+            if blocked.risen and isinstance(localizer, ExactPosterior):  # others need not find the best of all rows
                 raise NotLocated(
                     f"the skyline is higher than the map's at azimuths {blocked.text}, too much to leave out: "
                     "wrong terrain, time or camera file, or a ridge on no map?",

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 _MODULES = {  # public name to the module that has it
-    "calibrate": "api", "detect": "api", "identify": "api", "locate": "api", "render": "api",
-    "measure_horizon": "api", "predict": "api", "track": "api",
+    "detect": "api.solve", "identify": "api.solve", "locate": "api.solve", "track": "api.solve",
+    "calibrate": "api.photographs", "measure_horizon": "api.photographs",
+    "predict": "api.synthetic", "render": "api.synthetic",
     "Solution": "solution",
     "Camera": "camera", "load_camera": "camera",
     "Cylinder": "terrain", "HeightMap": "terrain.height_map", "Terrain": "terrain", "load_terrain": "terrain",
@@ -52,7 +53,9 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from startrack.api import calibrate, detect, identify, locate, measure_horizon, predict, render, track
+    from startrack.api.photographs import calibrate, measure_horizon
+    from startrack.api.solve import detect, identify, locate, track
+    from startrack.api.synthetic import predict, render
     from startrack.camera import Camera, load_camera
     from startrack.catalog import load_catalog
     from startrack.errors import BadInput, NoSolution

@@ -1,28 +1,19 @@
-"""The functions of the library: images to solutions or to a camera, a pose to an image; with astropy's types."""
+"""Images to solutions, and many images to a track."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from startrack import pipeline
-from startrack.calibration import Calibration
-from startrack.calibration import calibrate as calibrate_exposures
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
 from startrack.errors import BAD_INPUT_REASONS, BadInput
-from startrack.files import file_stem
-from startrack.frames import Site
-from startrack.horizon import measure_skyline
 from startrack.inputs import (
     Image,
     Time,
-    angle_rad,
     camera_input,
-    duration_s,
     exposure_input,
     field_of_view_rad,
     is_list_of_centroids,
@@ -32,23 +23,18 @@ from startrack.inputs import (
     time_input,
 )  # fmt: skip
 from startrack.orientation import stars_at
-from startrack.rendering import Series, Truth, load_sky_catalog
-from startrack.rendering import render as render_scene
 from startrack.solution import Solution
 from startrack.stages import Outcome, Refused, Settings
 from startrack.terrain import Terrain
 from startrack.tracking import Odometry, Track, TrackSession, read_odometry
 from startrack.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
-from startrack.types import Exposure, MeasuredSkyline
+from startrack.types import Exposure
 
 if TYPE_CHECKING:
     from astropy.units import Quantity
     from numpy.typing import ArrayLike
 
     from startrack.identification import IdentifiedCentroids
-    from startrack.prediction import Prediction
-
-__all__ = ["calibrate", "detect", "identify", "locate", "measure_horizon", "predict", "render", "track"]
 
 TIME_FLAG, TIME_ARGUMENT = "--time UTC", "time="  # messages of the stages name the flags of the commands
 
@@ -190,167 +176,6 @@ def detect(image: Image, *, camera: str | Camera | None = None) -> Solution:
     exposure = exposure_input(image, None)
     is_known = camera is not None or exposure.camera is not None
     return _solution(pipeline.detect(exposure, camera_input(camera, exposure) if is_known else None), "detections")
-
-
-def calibrate(
-    images: Sequence[Image],
-    *,
-    camera: str | Camera | None = None,
-    fov: float | Quantity | None = None,
-    site: Site | None = None,
-    name: str = "camera",
-) -> Calibration:
-    """A camera from images of the open sky.
-
-    Args:
-        images: as for `locate`, each with its time.
-        camera: an approximate camera; or give `fov`.
-        fov: field of view, as for `identify`.
-        site: on the Earth, where the camera stood: refraction is then taken out of the lens.
-        name: of the camera.
-
-    Returns:
-        The calibration. Use its `camera` only where `accepted` is true; `checks` lists the conditions.
-
-    Raises:
-        BadInput: as `locate`.
-        NotIdentified: no image's stars could be identified.
-    """
-    if camera is None and fov is None:
-        raise BadInput("no_calibration", "give fov=, or an approximate camera=")
-    start = None if camera is None else load_camera_input(camera)
-    exposures = [exposure_input(image, None) for image in images]
-    fov_rad = None if fov is None else field_of_view_rad(fov)
-    return calibrate_exposures(exposures, load_catalog(), camera=start, fov_rad=fov_rad, site=site, name=name)
-
-
-def measure_horizon(
-    images: Sequence[Image],
-    *,
-    site: Site,
-    camera: str | Camera | None = None,
-    fov: float | Quantity | None = None,
-) -> MeasuredSkyline:
-    """The horizon (obstruction profile) of a fixed camera on the Earth, from photographs of the night sky.
-
-    Args:
-        images: as for `locate`, each with its time; those whose stars cannot be identified are left out.
-        site: on the Earth, where the camera stands.
-        camera: as for `locate`; None: `fov`, or the camera that the first image names.
-        fov: field of view, as for `identify`.
-
-    Returns:
-        Elevation with its sigma at every degree of azimuth; nan where the horizon is unknown.
-
-    Raises:
-        ValueError: both `camera` and `fov` are given, no image, or a site that is not on the Earth.
-        BadInput: as `locate`.
-        NoSolution: the stars of no image are identified.
-    """
-    if fov is not None and camera is not None:
-        raise ValueError("camera= and fov= exclude each other: with fov= the lens is found, with camera= it is known")
-    if site.body != "earth":
-        raise ValueError(f"site= is on the {site.body}: the horizon is measured on the Earth")
-    exposures = [exposure_input(image, None) for image in images]
-    if not exposures:
-        raise ValueError("no image is given")
-    lens = camera_input(camera, exposures[0]) if fov is None else None
-    fov_rad = None if fov is None else field_of_view_rad(fov)
-    return measure_skyline(exposures, load_catalog(), site, camera=lens, fov_rad=fov_rad).skyline
-
-
-def render(
-    camera: str | Camera = "fisheye-2048",
-    terrain: str | Terrain = "shackleton-thesis",
-    *,
-    time: Time = None,
-    position_m: tuple[float, float] | None = None,
-    heading: float | Quantity | None = None,
-    seed: int = 0,
-    number: int = 0,
-    **settings: Any,
-) -> tuple[Exposure, Truth]:
-    """A synthetic exposure, and the truth about it. The same arguments give the same pixels.
-
-    Args:
-        camera: as for `locate`; it needs a `[sensor]`.
-        terrain: as for `locate`.
-        time: middle of the exposure, as for `locate`. None: drawn from the seed, like all that is not given.
-        position_m: (east, north) from the terrain's origin [m].
-        heading: azimuth of the rover's nose: an angle, or degrees.
-        seed: of sky, sensor and noise.
-        number: of the exposure within the series of this seed.
-        settings: further fields of `startrack.rendering.Series`, such as `exposure_s` or `sky_v_mag_arcsec2`.
-
-    Raises:
-        BadInput: bad_calibration without a sensor, bad_terrain where no camera can stand there.
-        ValueError: `heading` is no angle.
-    """
-    lens = load_camera_input(camera)
-    ground = terrain_input(terrain, None)
-    catalog = load_sky_catalog("auto").brighter_than(settings.get("faint_v_mag", Series.faint_v_mag) or np.inf)
-    east_m, north_m = position_m if position_m is not None else (None, None)
-    series = Series(
-        camera=lens,
-        terrain=ground,
-        seed=seed,
-        time_utc=time_input(time),
-        east_m=east_m,
-        north_m=north_m,
-        heading_rad=None if heading is None else angle_rad(heading, "heading") % (2 * np.pi),
-        **{"catalog": catalog, **settings},
-    )
-    scene, rng = series.scene(number, f"{file_stem(ground.name)}-{seed}-{number:03d}")
-    return render_scene(scene, rng=rng)
-
-
-def predict(
-    camera: str | Camera,
-    terrain: str | Terrain,
-    *,
-    time: Time | tuple[Time, Time],
-    positions_m: ArrayLike | None = None,
-    spacing_m: float | None = None,
-    exposure: float | Quantity | None = None,
-    sky_v_mag_arcsec2: float = 22.0,
-    draws: int = 10,
-    seed: int = 0,
-    localizer: str = "posterior",
-) -> Prediction:
-    """Expected accuracy of positions over the search area of a terrain, or at given positions.
-
-    Evidence of the stars is drawn at every place and located as `locate` does with the stars alone.
-
-    Args:
-        camera: as for `locate`; it needs a `[sensor]`.
-        terrain: as for `locate`.
-        time: middle of the exposures, as for `locate`; of a pair the draws are evenly spaced between both.
-        positions_m: (k, 2) east and north from the terrain's origin [m]. None: cells of the search area.
-        spacing_m: of the cells [m]. None: a tenth of the search area, or a little less.
-        exposure: an astropy duration, or seconds. None: a V 6 star on the axis reaches 5 sigma.
-        sky_v_mag_arcsec2: diffuse light of the sky.
-        draws: at each place.
-        seed: of the draws.
-        localizer: as `--localizer`.
-
-    Returns:
-        The prediction: `positions_m` (k, 2), `cells` (arrays (k,) by name, as the columns of predict.ecsv), `summary`.
-
-    Raises:
-        BadInput: as `locate`; bad_calibration without a sensor.
-        ValueError: positions of another shape, or where no camera can stand.
-    """
-    from startrack.prediction import predict_positions
-
-    first, last = time if isinstance(time, tuple) else (time, time)
-    start, end = time_input(first), time_input(last)
-    if start is None or end is None:
-        raise BadInput("no_time", "give time=: the sky depends on it")
-    return predict_positions(
-        load_camera_input(camera), terrain_input(terrain, None), (start, end), positions_m=positions_m,
-        spacing_m=spacing_m, exposure_s=duration_s(exposure), sky_v_mag_arcsec2=sky_v_mag_arcsec2, draws=draws,
-        seed=seed, localizer=localizer,
-    )  # fmt: skip
 
 
 def _identify_list(

@@ -38,9 +38,7 @@ def find_ridge(rows: Evidence, above_rad: Array, sigma_rad: Array, count: int) -
 
 
 def rise_gains(table: Array) -> Array:
-    """By how much [nats] each rise (centres, widths, heights) fits better than none, from log-likelihoods (sectors,
-    levels).
-    """
+    """Gains [nats] (centres, widths, heights) of rises over none; `table` (sectors, levels): log-likelihoods."""
     centres = np.arange(0, len(table), CENTRE_STEP)
     gains = np.empty((len(centres), len(HALF_WIDTHS), len(HEIGHTS_RAD)))
     _fill_gains(table, LEVELS_RAD[0], LEVELS_RAD[1] - LEVELS_RAD[0], centres, HALF_WIDTHS, HEIGHTS_RAD, gains)

@@ -54,7 +54,8 @@ RUN: tuple[Quantity, ...] = (
       optional=True, columns=(Column("time_sigma_s", "%.9g"),)),
     Q("provenance.exposure_s", "s", Inputs, lambda v: v.exposure.exposure_s, "null: not known", NUMBER, before=None,
       columns=(Column("exposure_s", "%.9g"),)),
-    Q("provenance.mask_sha256", "", Detected, lambda v: getattr(v.detections.mask, "sha256", None) or None,
+    Q("provenance.mask_sha256", "", Detected,
+      lambda v: None if v.detections.mask is None else v.detections.mask.sha256 or None,
       "of the file of the mask, or of the array that is masked; with the camera's and the image's mask both, joined by "
       "`+`; null: every pixel counts", TEXT, before=None, nullable=True, optional=True),
 )  # fmt: skip

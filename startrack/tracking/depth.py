@@ -40,11 +40,12 @@ def drop_other_depths(frames: Sequence[ObservedFrame], shared: SharedErrors) -> 
     at = shared.names.index(STEEPNESS)
     depths = {k: one for k, frame in enumerate(frames) if (one := _depth(frame.modes, at)) is not None}
     other: dict[int, Measured] = {}
-    while away := {k: _sigmas_off(k, depths) for k in depths}:
-        worst = max(away, key=lambda k: (round(away[k], 6), k))
-        if away[worst] < MOST_SIGMAS:
+    while len(depths) > 1:
+        away = _sigmas_off(list(depths.values()))
+        number, worst = max(zip(depths, away, strict=True), key=lambda one: (round(one[1], 6), one[0]))
+        if worst < MOST_SIGMAS:
             break
-        other[worst] = depths.pop(worst)
+        other[number] = depths.pop(number)
     return [_refuse(frame, other[k], depths, shared) if k in other else frame for k, frame in enumerate(frames)]
 
 
@@ -72,10 +73,10 @@ def _mean(depths: Sequence[Measured]) -> Measured:
     return float(np.average(value, weights=1.0 / variance)), float(1.0 / np.sum(1.0 / variance))
 
 
-def _sigmas_off(k: int, depths: dict[int, Measured]) -> float:
-    """Difference of frame k from the mean of the other frames, in standard deviations; 0 where there is no other."""
-    others = [depth for number, depth in depths.items() if number != k]
-    if not others:
-        return 0.0
-    (value, variance), (mean, of_mean) = depths[k], _mean(others)
-    return abs(value - mean) / float(np.sqrt(variance + of_mean))
+def _sigmas_off(depths: Sequence[Measured]) -> list[float]:
+    """Difference of each of two or more depths from the mean of the others, in standard deviations."""
+    value, variance = np.array(depths).T
+    weight = 1.0 / variance
+    rest = weight.sum() - weight
+    mean = ((weight @ value) - weight * value) / rest
+    return list(np.abs(value - mean) / np.sqrt(variance + 1.0 / rest))

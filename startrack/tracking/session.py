@@ -106,12 +106,11 @@ class TrackSession:
         at_rest: bool = False,
         covered_only: bool = False,
     ) -> Track:
-        """The track of the frames so far; arguments as in `estimate_track`.
+        """The track of the frames so far.
 
-        With `covered_only`, frames after the last pose of the odometry wait for it. Raises BadInput where there is no
-        frame, or none has a position, and as `estimate_track`.
-
-        Arguments `odometry_sigma`, `odometry_floor_m` [m] and `at_rest` as in `estimate_track`.
+        `odometry`, `odometry_sigma`, `odometry_floor_m` [m] and `at_rest` are those of `estimate_track`. With
+        `covered_only`, frames after the last pose of the odometry wait for it. Raises BadInput where there is no frame,
+        or none has a position, and as `estimate_track`.
         """
         frames: Sequence[ObservedFrame] = self.frames
         if covered_only:
@@ -132,9 +131,8 @@ class TrackSession:
     ) -> Array:
         """Positions (n, 2) [m] of the frames of a `track` by odometry alone, from the first smoothed position.
 
-        Arguments as of `estimate`. Not a number where no move is known.
-
-        Arguments `odometry_sigma` and `odometry_floor_m` [m] as in `estimate_track`.
+        `odometry`, `odometry_sigma` and `odometry_floor_m` [m] are those of `estimate`. Not a number where no move is
+        known.
         """
         steps = odometry_steps(self.frames[: len(track.frames)], odometry, odometry_sigma, odometry_floor_m)
         move_m = np.where(np.isfinite(steps.sigma_m)[:, None], steps.move_m, np.nan)
@@ -149,9 +147,8 @@ class TrackSession:
     def newest(self, odometry: Odometry | None, *, odometry_sigma: float, odometry_floor_m: float) -> Iterator[Track]:
         """Each frame that was not filtered yet and that the odometry reaches, by the frames before it: one track each.
 
-        Arguments and exceptions as of `estimate`. If a frame comes late, all frames after it are filtered anew.
-
-        Arguments `odometry_sigma` and `odometry_floor_m` [m] as in `estimate_track`.
+        `odometry`, `odometry_sigma`, `odometry_floor_m` [m] and the exceptions are those of `estimate`. If a frame
+        comes late, all frames after it are filtered anew.
         """
         if self.terrain is None or self.shared is None:
             return

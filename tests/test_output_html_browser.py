@@ -78,10 +78,10 @@ def test_keys_zoom_move_and_step_through_the_stars(window):
     w.page.keyboard.press("ArrowRight")
     assert w.page.evaluate(centre) > before
     w.page.keyboard.press("n")
-    first = w.page.locator("#detail [role=status]").first.text_content()
+    first = w.page.locator("#detail figure [role=status]").first.text_content()
     w.page.keyboard.press("n")
     assert "magnitude" in first
-    assert w.page.locator("#detail [role=status]").first.text_content() not in ("", first)
+    assert w.page.locator("#detail figure [role=status]").first.text_content() not in ("", first)
     w.page.keyboard.press("0")
     assert w.zoom == 1
 
@@ -96,7 +96,7 @@ def test_fingers_tap_and_pinch(window):
     box, stage = (w.page.locator(f"#detail {which}").first.bounding_box() for which in (".tip", ".stage"))
     assert box["x"] >= 0 and box["x"] + box["width"] <= PHONE[0]
     assert box["y"] >= stage["y"] + stage["height"]  # the picture and the star stay in sight
-    assert box["y"] + box["height"] <= PHONE[1]
+    assert box["y"] + box["height"] <= PHONE[1] + 1  # the page scrolls by whole pixels
     x, y = w.star_position("Canopus")
     session = w.context.new_cdp_session(w.page)
     for apart, kind in ((20, "touchStart"), (30, "touchMove"), (60, "touchMove"), (60, "touchEnd")):
@@ -174,6 +174,8 @@ def test_a_magnified_pixel_of_the_picture_looks_like_one(window):
         "([x, y]) => { const c = document.querySelector('#detail .stage canvas'), f = c.getBoundingClientRect();"
         "c.view.zoomBy(20, x - f.left, y - f.top) }", [x, y],
     )  # fmt: skip
+    for box in w.page.locator("#detail figure").first.get_by_role("checkbox").all():
+        box.uncheck()
     w.wait_for("document.querySelector('#detail .stage').dataset.zoom > 19")
     w.wait_for("!document.querySelector('#detail .stage canvas').view.waiting")
     steps, pixel_px = w.page.evaluate(
@@ -199,7 +201,7 @@ def test_words_beside_the_axes_keep_apart(window, size):
         "const at = xs.map(x => v.screen(x, 0)[0]); return at.slice(1).map((x, k) => x - at[k]"
         "- (widthOf(v, xs[k], step) + widthOf(v, xs[k + 1], step)) / 2) })"
     )
-    assert len(rooms) == 4
+    assert len(rooms) == 6
     assert min(room for one in rooms for room in one) > 4
 
 

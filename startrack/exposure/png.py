@@ -46,7 +46,7 @@ def decode_png(raw: bytes) -> Decoded:
     width = height = depth = channels = 0
     interlaced = False
     picture: list[memoryview] = []
-    for kind, body in _chunks(raw):
+    for kind, body in chunks(raw):
         if kind == b"IHDR":
             width, height, depth, channels, interlaced = _check_ihdr(body)
         elif kind == b"IDAT":
@@ -78,7 +78,7 @@ def add_text(png: bytes, texts: Mapping[str, str]) -> bytes:
     return png[:IHDR_END] + b"".join(_text_chunk(k, v) for k, v in texts.items()) + png[IHDR_END:]
 
 
-def _chunks(raw: bytes) -> Iterator[tuple[bytes, memoryview]]:
+def chunks(raw: bytes) -> Iterator[tuple[bytes, memoryview]]:
     """(kind, body) of each chunk up to IEND, lengths and checksums verified."""
     view = memoryview(raw)
     at = len(SIGNATURE)

@@ -184,11 +184,18 @@ def write_wcs(path: FilePath, corr_path: FilePath, value: Oriented) -> None:
 def write_annotated(path: FilePath, outcome: Outcome, truth_enu_m: tuple[float, float] | None = None) -> None:
     """Write the annotated picture of an `outcome` to `path` (PNG). Raises BadInput where it cannot be written.
 
-    `truth_enu_m` (east, north) [m] is drawn if it is given; no stage of the pipeline has it.
+    `truth_enu_m` (east, north) [m] is drawn if it is given; no stage of the pipeline has it. The file also holds the
+    picture without marks and the marks as coordinates, for the HTML page (`picture/layers.py`).
     """
-    from startrack.output.picture.annotate import annotate
+    from startrack.output.picture.annotate import annotate, bare_picture
+    from startrack.output.picture.layers import Layers, add_layers
+    from startrack.output.picture.overlay import overlay_of
+    from startrack.stages import last_value
 
-    write_atomically(path, png_bytes(annotate(outcome, truth_enu_m)), overwrite=True)
+    value = last_value(outcome)
+    bare = bare_picture(value)
+    png = png_bytes(annotate(outcome, truth_enu_m, bare))
+    write_atomically(path, add_layers(png, Layers(bare, overlay_of(value))), overwrite=True)
 
 
 def png_bytes(picture: NDArray[np.uint8]) -> bytes:

@@ -13,13 +13,15 @@ function showDetail(host, k) {
   const stars = detail ? starsOf(detail) : [];
   const name = value("image");
   const groups = detail ? factGroups(detail, value) : [];
+  const views = []; // with stars to be found
   host.replaceChildren(...[
     make("div", { class: "title" }, make("h1", { tabindex: "-1" }, name), badge(record.status)),
     make("p", { class: "lead" }, leadOf(value)),
     refusalCard(record), warningsCard(record), detail ? null : leftOut(),
-    detail?.picture ? pictureCard(detail, stars, name, groups.splice(0, 3)) : null,
+    detail?.picture ? pictureCard(detail, stars, name, groups.splice(0, 3), views) : null,
     mapsCard(record, real, name),
-    detail && stars.some((star) => known(star.az)) ? panoramaCard(detail, stars, name) : null,
+    detail && stars.some((star) => known(star.az)) ? panoramaCard(detail, stars, name, views) : null,
+    detail ? evidenceCard(detail, name) : null,
     groups.length ? make("div", { class: "cards" }, ...groups.map(([title, body]) => section(title, ...[body].flat()))) : null,
     stars.length ? starsCard(detail, stars) : null, filesCard(detail, value("stem"), value("kind")),
   ].filter(Boolean));
@@ -53,23 +55,29 @@ function leftOut() {
   return make("p", { class: "card note" }, "This page holds the pictures and stars of some images only; startrack report OUT --images N holds more, and so does startrack report NAME.fix.json for this one.");
 }
 
-function pictureCard(detail, stars, name, groups) {
+function pictureCard(detail, stars, name, groups, views) {
   const view = skyView(detail, stars, name);
-  const hint = detail.picture.scale && stars.length ? "Point at a star, or tap it. " : "";
+  const found = Boolean(detail.picture.scale && stars.length);
+  if (found) views.push(view);
+  const hint = found ? "Point at a star, or tap it. Fainter stars appear as you zoom in. " : "";
   const ground = detail.record.modes?.length ? "; orange crosses are stars that should be here and are hidden, the blue line is the skyline at the estimated position." : ".";
-  return section("Picture", make("p", { class: "dim" }, `${hint}Green rings are stars with a name, grey rings other point sources${ground}`),
+  return section("Picture", make("p", { class: "dim" }, `${hint}Green rings are identified stars, grey rings other point sources${ground}`),
+    found ? searchForm(stars, detail, views) : null,
     make("div", { class: "beside" }, view.node, make("div", {}, ...groups.map(([title, body]) => make("div", {}, make("h3", {}, title), body)))));
 }
 
-function panoramaCard(detail, stars, name) {
+function panoramaCard(detail, stars, name, views) {
   const { total } = detail.stars;
   const cut = total > stars.length ? ` The ${say(stars.length, 0)} brightest of ${say(total, 0)} stars; fainter ones appear as you zoom in.` : " Fainter stars appear as you zoom in.";
   const line = detail.horizon ? "The blue line is the horizon that the map gives at the estimated position: seen stars belong above it, hidden ones below." : "The terrain's file is not available, so its horizon is omitted.";
   const dots = detail.skyline ? " The dots on it are the skyline that the image shows." : "";
-  return section("Panorama", make("p", { class: "dim" }, line + dots + cut), panoramaView(detail, stars, name).node,
-    ...(detail.skyline?.above ? [make("h3", { class: "next" }, "The skyline of the image, enlarged"),
+  const panorama = panoramaView(detail, stars, name);
+  const enlarged = detail.skyline?.above ? enlargedView(detail, stars, name) : null;
+  views.push(panorama, ...(enlarged ? [enlarged] : []));
+  return section("Panorama", make("p", { class: "dim" }, line + dots + cut), panorama.node,
+    ...(enlarged ? [make("h3", { class: "next" }, "The skyline of the image, enlarged"),
       make("p", { class: "dim" }, "Its height above the horizon that the map gives at the estimated position. Bands are one sigma. Stars above the skyline should be seen, stars below it hidden."),
-      enlargedView(detail, stars, name).node] : []));
+      enlarged.node] : []));
 }
 
 function mapsCard(record, real, name) {

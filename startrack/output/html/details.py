@@ -1,11 +1,10 @@
-"""Details of one image on a page: its brightest stars, ground, horizon and skyline, and the annotated picture."""
+"""Details of one image on a page: ground, horizon and skyline, and the picture with the marks to be drawn on it."""
 
 from __future__ import annotations
 
 import base64
-import csv
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,70 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import load_camera
+from startrack.output.html.stars import read_ecsv
 from startrack.output.picture.annotate import PANEL_WIDTH
 from startrack.output.picture.backdrop import fit_to_canvas
+from startrack.output.picture.layers import layers_of
 from startrack.output.picture.relief import edge_cover, ground_cells, hill_shading
 from startrack.output.skyline_table import half_range_rad
 from startrack.terrain import Terrain, load_terrain
 from startrack.types import Array, BadInput
 
-Columns = dict[str, list[Any]]
 Horizon = Callable[[Array], Array]  # azimuths (n,) to elevations (n,) [rad]
-# name on the page, column of NAME.stars.ecsv, decimals (None: a text)
-STAR_COLUMNS: tuple[tuple[str, str, int | None], ...] = (
-    ("id", "catalog_id", None), ("name", "name", None), ("mag", "v_mag", 2), ("az", "azimuth_deg", 3),
-    ("el", "elevation_deg", 3), ("x", "x_px", 2), ("y", "y_px", 2), ("mx", "x_measured_px", 2),
-    ("my", "y_measured_px", 2), ("exp", "expected_e", 0), ("flux", "flux_e", 0), ("sigma", "sigma_e", 0),
-    ("ev", "evidence", 2), ("status", "status", None), ("cause", "cause", None),
-)  # fmt: skip
-
-
-def stars_of(path: Path, most: int) -> dict[str, Any] | None:
-    """The `most` brightest stars as columns, with how many the table has of each status; None where there is none."""
-    if not path.is_file():
-        return None
-    kept: Columns = {name: [] for name, _, _ in STAR_COLUMNS}
-    counts: dict[str, int] = {}
-    total, unit = 0, "e"
-    with path.open(encoding="utf-8", newline="") as file:
-        head, rows = _read_ecsv(file)
-        if any("'expected_e'" in line and "unit: adu" in line for line in head):
-            unit = "ADU"
-        for row in rows:
-            total += 1
-            status = row.get("status", "")
-            counts[status] = counts.get(status, 0) + 1
-            if total <= most:
-                for name, column, decimals in STAR_COLUMNS:
-                    kept[name].append(_text_or_number(row.get(column) or "", decimals))
-    return {"total": total, "counts": counts, "unit": unit, "columns": _drop_empty_columns(kept)}
-
-
-def _read_ecsv(file: Any) -> tuple[list[str], Iterator[dict[str, str]]]:
-    """ECSV's comment lines, and its rows."""
-    head: list[str] = []
-    for line in file:
-        if not line.startswith("#"):
-            names = next(csv.reader([line]))
-            return head, (dict(zip(names, row, strict=False)) for row in csv.reader(file))
-        head.append(line)
-    return head, iter(())
-
-
-def _text_or_number(text: str, decimals: int | None) -> Any:
-    if decimals is None:
-        return text
-    try:
-        number = round(float(text), decimals)
-    except ValueError:  # an empty field: nothing was measured
-        return None
-    return int(number) if decimals == 0 or number == int(number) else number
-
-
-def _drop_empty_columns(columns: Columns) -> Columns:
-    """The columns without the empty ones."""
-    return {name: values for name, values in columns.items() if any(value not in (None, "") for value in values)}
-
 
 RELIEF_CELLS = 420
 MARGIN = 1.03  # beyond the map, for its edge
@@ -130,7 +75,7 @@ def skyline_of(path: Path, horizon: Horizon | None, stars: dict[str, Any] | None
     if not path.is_file():
         return None
     with path.open(encoding="utf-8", newline="") as file:
-        rows = [row for row in _read_ecsv(file)[1] if row.get("source") in SOURCES[1:]]
+        rows = [row for row in read_ecsv(file)[1] if row.get("source") in SOURCES[1:]]
     if not rows:
         return None
     azimuth, elevation, sigma = (
@@ -198,23 +143,40 @@ QUALITY = 82
 def picture_of(picture: Path, wcs: Path, record: dict[str, Any], longest_px: int) -> dict[str, Any] | None:
     """`src` (a data URI), `width`, `height` [px of the picture], and, where the image's size is known, `scale`.
 
-    The image's pixel (x, y) lies at scale (x + 1/2), scale (y + 1/2) from the picture's top-left corner. None without a
-    picture.
+    The image's pixel (x, y) lies at scale (x + 1/2), scale (y + 1/2) from the picture's top-left corner. `marks`: those
+    of `overlay_of`, to be drawn on the picture; absent where its file has no layers and shows its marks itself. None
+    without a picture.
     """
-    import cv2
-
-    data = np.frombuffer(picture.read_bytes(), dtype=np.uint8) if picture.is_file() else np.empty(0, np.uint8)
-    whole = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    data = picture.read_bytes() if picture.is_file() else b""
+    layers = layers_of(data)
+    if layers is not None:
+        shown = _shown(layers.bare[:, :, ::-1], longest_px)
+        return {**shown, "scale": round(shown["width"] / layers.overlay["size"][0], 6), "marks": layers.overlay}
+    whole = _decoded(data)
     if whole is None or whole.shape[1] <= PANEL_WIDTH:
         return None
     size_px = image_size(wcs, record)
-    sky, known = _sky_part(np.asarray(whole, dtype=np.uint8), size_px)
+    sky, known = _sky_part(whole, size_px)
+    shown = _shown(sky, longest_px)
+    return {**shown, "scale": round(shown["width"] / size_px[0], 6)} if known and size_px is not None else shown
+
+
+def _decoded(data: bytes) -> NDArray[np.uint8] | None:
+    import cv2
+
+    whole = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    return None if whole is None else np.asarray(whole, dtype=np.uint8)
+
+
+def _shown(sky: NDArray[np.uint8], longest_px: int) -> dict[str, Any]:
+    """The picture (H, W, 3), blue first, for the page."""
+    import cv2
+
     shrink = min(1.0, longest_px / max(sky.shape[:2]))
     if shrink < 1:
         size = tuple(max(1, round(n * shrink)) for n in sky.shape[1::-1])
         sky = np.asarray(cv2.resize(sky, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    shown = {"src": data_uri(sky), "width": sky.shape[1], "height": sky.shape[0]}
-    return {**shown, "scale": round(sky.shape[1] / size_px[0], 6)} if known and size_px is not None else shown
+    return {"src": data_uri(sky), "width": sky.shape[1], "height": sky.shape[0]}
 
 
 def image_size(wcs: Path, record: dict[str, Any]) -> tuple[int, int] | None:

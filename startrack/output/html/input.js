@@ -27,7 +27,7 @@ View.prototype.listen = function listen() {
   });
   canvas.addEventListener("pointercancel", (event) => this.fingers.delete(event.pointerId));
   canvas.addEventListener("pointerleave", (event) => {
-    if (event.pointerType === "mouse" && !this.fingers.size) this.select(null);
+    if (event.pointerType === "mouse" && !this.fingers.size && !this.tapped) this.select(null); // a tap scrolls the page
   });
   canvas.addEventListener("dblclick", (event) => {
     event.preventDefault();

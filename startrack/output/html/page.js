@@ -81,8 +81,4 @@ function route() {
 
 if (!page.single) buildOverview();
 window.addEventListener("hashchange", route);
-window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
-  themeColours = {};
-  for (const view of View.all) view.redraw();
-});
 route();

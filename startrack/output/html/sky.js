@@ -1,4 +1,4 @@
-// The stars of an image, their marks, and the picture.
+// The stars of an image and their marks.
 const KINDS = {
   seen: ["seen", "its light is there"],
   hidden: ["hidden", "its light is missing: the ground hides it"],
@@ -7,6 +7,8 @@ const KINDS = {
   identified: ["identified", "a point source has its name"],
   unmatched: ["not matched", "no point source was found there"],
 };
+
+const shownKind = (kind) => ({ identified: "seen", unmatched: "uncertain" }[kind] || kind);
 
 function starsOf(detail) {
   if (!detail.stars) return [];
@@ -35,8 +37,8 @@ function starText(star) {
 }
 
 // One shape for each kind, so that colour is never needed to distinguish them.
-function mark(g, [x, y], kind, r) {
-  g.strokeStyle = g.fillStyle = colour(kind === "identified" ? "seen" : kind === "unmatched" ? "uncertain" : kind);
+function mark(g, [x, y], kind, r, stroke) {
+  g.strokeStyle = g.fillStyle = stroke || colour(shownKind(kind));
   g.lineWidth = 1.6;
   g.beginPath();
   if (kind === "bystars" || kind === "byboth") {
@@ -67,13 +69,14 @@ function mark(g, [x, y], kind, r) {
   }
 }
 
-function markSample(kind) {
+// A small drawing of a mark for a legend; `draw(g, at, kind, r)` draws it.
+function markSample(kind, draw) {
   const canvas = make("canvas", { width: 36, height: 36, class: "sample", "aria-hidden": "true" });
   const paint = () => {
     const g = canvas.getContext("2d");
     g.setTransform(2, 0, 0, 2, 0, 0);
     g.clearRect(0, 0, 18, 18);
-    mark(g, [9, 9], kind, 4.5);
+    draw(g, [9, 9], kind, 4.5);
   };
   View.all.add({ node: canvas, redraw: paint });
   paint();
@@ -81,7 +84,7 @@ function markSample(kind) {
 }
 
 // Boxes to choose which of the kinds of marks in `words` are drawn; calls `change` after each choice.
-function kindBoxes(title, words, marks, chosen, change) {
+function kindBoxes(title, words, marks, chosen, change, draw = mark) {
   const kinds = Object.keys(words).filter((kind) => marks.some((one) => one.kind === kind));
   return make("fieldset", { class: "kinds" }, make("legend", {}, title), ...kinds.map((kind) => {
     const box = make("input", { type: "checkbox", checked: chosen.has(kind), onchange: () => {
@@ -89,30 +92,6 @@ function kindBoxes(title, words, marks, chosen, change) {
       else chosen.delete(kind);
       change();
     } });
-    return make("label", {}, box, markSample(kind), words[kind][0]);
+    return make("label", {}, box, markSample(kind, draw), words[kind][0]);
   }));
-}
-
-function skyView(detail, stars, name) {
-  const { picture } = detail;
-  const image = new Image();
-  const chosen = new Set();
-  const placed = picture.scale ? stars.filter((star) => known(star.px)).map((star) => (
-    { ...star, x: picture.scale * (star.px + 0.5), y: picture.scale * (star.py + 0.5) })) : [];
-  const view = new View({
-    label: `Annotated picture ${name}`, world: [0, 0, picture.width, picture.height], up: false,
-    ratio: picture.height / picture.width, points: placed, describe: starText, most: 24,
-    draw(v, g) {
-      const [x, y] = v.screen(0, 0);
-      const [right, bottom] = v.screen(picture.width, picture.height);
-      g.imageSmoothingEnabled = v.magnified < 2; // magnified, a pixel shall look like one
-      g.imageSmoothingQuality = "high";
-      if (image.complete) g.drawImage(image, x, y, right - x, bottom - y);
-      for (const star of placed) if (chosen.has(star.kind)) mark(g, v.screen(star.x, star.y), star.kind, 3.5 + 0.6 * Math.min(v.zoom, 6));
-    },
-  });
-  image.onload = () => view.redraw();
-  image.src = picture.src;
-  if (placed.length) view.node.append(kindBoxes("Mark stars", KINDS, placed, chosen, () => view.redraw()));
-  return view;
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -20,7 +20,6 @@ from startrack.output.html.details import (
     horizon_line,
     picture_of,
     skyline_of,
-    stars_of,
 )
 from startrack.output.html.gather import Found, folder_of
 from startrack.output.html.rows import (
@@ -34,11 +33,14 @@ from startrack.output.html.rows import (
     row_of,
     section_of,
 )
+from startrack.output.html.sectors import sectors_of
+from startrack.output.html.stars import star_table_of
 
 HERE = Path(__file__).parent
 STYLES = ("page.css",)
+DRAWING = ("basics.js", "view.js", "axes.js", "input.js", "theme.js")  # in every page
 SCRIPTS = (
-    "basics.js", "view.js", "input.js", "sky.js", "panorama.js", "map.js", "errors.js", "detail.js", "table.js",
+    "sky.js", "panorama.js", "picture.js", "evidence.js", "search.js", "map.js", "errors.js", "detail.js", "table.js",
     "page.js",
 )  # fmt: skip
 DEFAULT_IMAGES = 30
@@ -108,19 +110,23 @@ def page_text(
 def filled_frame(
     title: str, data: Mapping[str, Any], scripts: Sequence[str], *, style: str = "", script: str = ""
 ) -> str:
-    """A page with a `title`, the `data` by their names, the style, and those of this room's `scripts` that it needs.
+    """A page with a `title`, the `data` by their names, the style, and this room's DRAWING and further `scripts`.
 
     `style` and `script` are texts that follow those of this room.
     """
     parts = {
         "TITLE": html.escape(title),
-        "STYLE": "".join((HERE / name).read_text(encoding="utf-8") for name in STYLES) + style,
+        "STYLE": _joined(STYLES) + style,
         "DATA": "\n".join(_script_of_data(name, value) for name, value in data.items()),
-        "SCRIPT": "".join((HERE / name).read_text(encoding="utf-8") for name in scripts) + script,
+        "SCRIPT": _joined(dict.fromkeys((*DRAWING, *scripts))) + script,
     }
     # Never replaced twice: a result may hold any text.
     pieces = (HERE / "page.html").read_text(encoding="utf-8").split("@@")
     return "".join(parts.get(piece, piece) for piece in pieces)
+
+
+def _joined(names: Iterable[str]) -> str:
+    return "".join((HERE / name).read_text(encoding="utf-8") for name in names)
 
 
 def _relative_url(folder: Path, seen_from: Path) -> str:
@@ -134,10 +140,12 @@ def _relative_url(folder: Path, seen_from: Path) -> str:
 def _detail(found: Found, terrains: TerrainsByName, size: tuple[int, int, int]) -> dict[str, Any]:
     record = found.record
     longest_px, most_stars, azimuths = size
-    stars = stars_of(found.companion(".stars.ecsv"), most_stars)
+    table = star_table_of(found.companion(".stars.ecsv"), most_stars)
+    stars = None if table is None else table.shown
     horizon = _horizon(record, terrains)
     line = None if horizon is None else horizon_line(horizon, azimuths)
-    skyline = skyline_of(found.companion(".skyline.ecsv"), None if line is None else horizon, stars)
+    horizon = None if line is None else horizon
+    skyline = skyline_of(found.companion(".skyline.ecsv"), horizon, stars)
     return {
         "record": {key: value for key, value in record.items() if key not in ("matches", "detections", "camera")},
         "facts": facts_of(record),
@@ -145,6 +153,7 @@ def _detail(found: Found, terrains: TerrainsByName, size: tuple[int, int, int]) 
         "stars": stars,
         "horizon": line,
         "skyline": skyline,
+        "sectors": None if table is None or horizon is None else sectors_of(table.measured, horizon),
         "files": [
             found.path.name,
             *(found.companion(end).name for end in FILES if found.companion(end).is_file()),

@@ -197,15 +197,26 @@ def _shorten_text(text: str, size: float, width: float) -> str:
     return f"{text[: kept // 2]}…{text[-(kept // 2) :]}"
 
 
-def annotate(outcome: Outcome, truth_enu_m: tuple[float, float] | None = None) -> NDArray[np.uint8]:
-    """The picture (H, W, 3), red, green, blue. Parts that were not reached are left out; `truth_enu_m` is optional."""
+def bare_picture(value: Inputs) -> NDArray[np.uint8]:
+    """The exposure (H, W, 3) as the picture of a stage's `value` shows it, red, green, blue, without any mark."""
+    _, size = fit_to_canvas(value.exposure.size_px)
+    return backdrop(value, size, wall_mask(value, size))
+
+
+def annotate(
+    outcome: Outcome, truth_enu_m: tuple[float, float] | None = None, bare: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
+    """The picture (H, W, 3), red, green, blue. Parts that were not reached are left out.
+
+    `truth_enu_m` (east, north) [m] is drawn if it is given. `bare`: the `bare_picture`, where a caller has it.
+    """
     value = last_value(outcome)
     scale, size = fit_to_canvas(value.exposure.size_px)
     height = max(size[1], PANEL_HEIGHT)
     canvas = Canvas(size[0] + PANEL_WIDTH, height)
     view = View(scale, (0.0, float((height - size[1]) // 2)), size)
     top = (height - size[1]) // 2
-    canvas.pixels[top : top + size[1], : size[0]] = backdrop(value, size, wall_mask(value, size))
+    canvas.pixels[top : top + size[1], : size[0]] = bare_picture(value) if bare is None else bare
     draw_detections(canvas, view, value)
     draw_hidden(canvas, view, value)
     draw_skyline(canvas, view, value)

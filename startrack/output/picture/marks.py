@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.frames import azel_from_rays, heading_pitch_roll_from_R_body_enu, rays_from_azel
+from startrack.frames import azel_from_rays
 from startrack.output.picture.backdrop import View
 from startrack.output.picture.canvas import (
     BODY,
@@ -22,10 +22,23 @@ from startrack.output.picture.canvas import (
     box_around,
     mix_colours,
 )
+from startrack.output.picture.overlay import (
+    AZIMUTHS_RAD,
+    LETTER_DEG,
+    TICK_DEG,
+    bodies_in_frame,
+    compass_feet,
+    heading_rad,
+    horizon_at_fix,
+    lowest_deg,
+    measured_skyline_px,
+    other_sources,
+    project_azel,
+    skyline_stretches_px,
+)
 from startrack.output.star_table import names_of, status_of
-from startrack.output.values import R_body_enu, skyline_position_m
-from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented
-from startrack.types import Array, Bools, Ints
+from startrack.stages import Detected, Identified, Inputs, Located, Measured
+from startrack.types import Array, Ints
 
 MAX_CIRCLES = 4000
 MAX_CROSSES = 150  # of hidden stars, the brightest: more would hide the picture
@@ -33,7 +46,6 @@ MAX_NAMES = 20
 MAX_HIDDEN_NAMES = 8
 NAME_SIZE = 19.0
 FAINT_RING = 0.6  # how far the ring of the faintest detection fades into the sky
-DIMMEST_HIDDEN_V_MAG = 3.0  # a fainter planet behind the wall is not missed
 BACKDROP = (12, 17, 28)
 BRIGHT_SNR = 300.0
 
@@ -49,20 +61,13 @@ def draw_detections(canvas: Canvas, view: View, value: Inputs) -> None:
     strength = np.clip(np.log(np.maximum(found.snr, 5.0) / 5.0) / np.log(BRIGHT_SNR / 5.0), 0, 1)
     places = view.canvas_px(found.xy_px)
     # The bright ones last, on top; the faint ones dim, so that a thousand of them do not drown the stars.
-    shown = identified | _is_within_image_circle(value, found.xy_px)
+    shown = identified | other_sources(value)
     for k in reversed(range(min(len(found), MAX_CIRCLES))):
         if not shown[k]:
             continue
         colour = IDENTIFIED if identified[k] else DETECTION
         faint = FAINT_RING * (1.0 - float(strength[k]))
         canvas.circle(places[k], 4.5 + 5.5 * float(strength[k]), mix_colours(colour, BACKDROP, faint))
-
-
-def _is_within_image_circle(value: Inputs, xy_px: Array) -> Bools:
-    """Whether light of the lens can reach the pixels (n, 2); all, where the camera is not known."""
-    if value.camera is None or value.camera.size_px != value.exposure.size_px:
-        return np.ones(len(xy_px), dtype=bool)
-    return value.camera.angle_rad(xy_px) <= value.camera.max_angle_rad
 
 
 def draw_hidden(canvas: Canvas, view: View, value: Inputs) -> None:
@@ -77,19 +82,11 @@ def draw_hidden(canvas: Canvas, view: View, value: Inputs) -> None:
 
 def draw_bodies(canvas: Canvas, view: View, value: Inputs) -> None:
     """A ring and the name at each planet, moon or sun in the frame; stars beside it are not evidence."""
-    if not isinstance(value, Oriented):
-        return
-    for body in value.bodies:
-        xy_px, inside = value.camera.project(body.ray_icrs @ value.attitude.R_cam_icrs.T)
-        if not inside:
-            continue
-        below = _is_below_skyline(value, body.ray_icrs)
-        if below and body.v_mag > DIMMEST_HIDDEN_V_MAG:
-            continue
-        colour = mix_colours(BODY, BACKDROP, 0.4) if below else BODY
-        at = view.canvas_px(xy_px)
-        canvas.circle(at, 6.0 if below else 9.0, colour, 2)
-        text, size = (f"{body.name} (hidden)", 0.85 * NAME_SIZE) if below else (body.name, NAME_SIZE)
+    for body in bodies_in_frame(value):
+        colour = mix_colours(BODY, BACKDROP, 0.4) if body.hidden else BODY
+        at = view.canvas_px(body.xy_px)
+        canvas.circle(at, 6.0 if body.hidden else 9.0, colour, 2)
+        text, size = (f"{body.name} (hidden)", 0.85 * NAME_SIZE) if body.hidden else (body.name, NAME_SIZE)
         canvas.label(at, text, size, colour, 13.0, view.box)
 
 
@@ -121,20 +118,11 @@ def _names_at(value: Identified, star: Ints, xy_px: Array, most: int) -> list[tu
     return [(place, name) for place, name in zip(xy_px, first, strict=False) if name][:most]
 
 
-def _is_below_skyline(value: Inputs, ray_icrs: Array) -> bool:
-    if not isinstance(value, Located):
-        return False
-    azimuth, elevation = azel_from_rays(value.R_enu_icrs @ ray_icrs)
-    horizon = value.terrain.horizon_rad(np.array([skyline_position_m(value)]), np.array([azimuth]))
-    return bool(elevation < horizon[0])
-
-
-AZIMUTHS_RAD = np.linspace(0.0, 2 * np.pi, 1441)
 WALL_STEP = 4  # the wall's mask is reckoned at every fourth pixel and interpolated
 EDGE_RAD = 0.003  # width of its edge
 COMPASS = {0: "N", 90: "E", 180: "S", 270: "W"}
-HIGHEST_COMPASS_DEG = 60.0
 LETTER_SIZE = 30.0
+SHORT_TICK_DEG = 1.2
 
 
 def wall_mask(value: Inputs, size: tuple[int, int]) -> NDArray[np.float32] | None:
@@ -145,7 +133,7 @@ def wall_mask(value: Inputs, size: tuple[int, int]) -> NDArray[np.float32] | Non
     scale = np.array(value.camera.size_px) / size
     xy_px = np.stack(np.meshgrid(*cells), axis=-1) * scale - 0.5
     azimuth, elevation = azel_from_rays(value.camera.unproject(xy_px) @ value.R_cam_enu)
-    below = np.interp(azimuth, AZIMUTHS_RAD, _horizon(value)) - elevation
+    below = np.interp(azimuth, AZIMUTHS_RAD, horizon_at_fix(value)) - elevation
     # The signed distance is what may be interpolated; cut off afterwards, it gives a sharp and smooth edge.
     below_rad = np.asarray(cv2.resize(below.astype(np.float32), size, interpolation=cv2.INTER_LINEAR))
     return np.clip(below_rad * np.float32(1 / EDGE_RAD) + np.float32(0.5), 0, 1)
@@ -153,22 +141,13 @@ def wall_mask(value: Inputs, size: tuple[int, int]) -> NDArray[np.float32] | Non
 
 def draw_skyline(canvas: Canvas, view: View, value: Inputs) -> None:
     """The skyline that the terrain shows from the fix."""
-    if not isinstance(value, Located):
-        return
-    xy_px, imaged = _project(value, AZIMUTHS_RAD, _horizon(value))
-    for start, stop in _runs(imaged):
-        if stop - start > 1:
-            canvas.curve(view.canvas_px(xy_px[start:stop]), SKYLINE, 2.5)
+    for stretch in skyline_stretches_px(value):
+        canvas.curve(view.canvas_px(stretch), SKYLINE, 2.5)
 
 
 def draw_measured_skyline(canvas: Canvas, view: View, value: Inputs) -> None:
     """Dots where the light of the sky, and the stars with it, show the skyline."""
-    if not isinstance(value, Located) or value.sky_light is None or value.skyline is None:
-        return
-    skyline = value.skyline
-    by_sky = skyline.known & (skyline.source != "stars")
-    xy_px, imaged = _project(value, skyline.azimuth_rad[by_sky], skyline.elevation_rad[by_sky])
-    for place in view.canvas_px(xy_px[imaged]):
+    for place in view.canvas_px(measured_skyline_px(value)):
         canvas.circle(tuple(place), 2.0, MEASURED, -1)
 
 
@@ -177,26 +156,26 @@ def draw_compass(canvas: Canvas, view: View, value: Inputs) -> None:
     frame shows."""
     if not isinstance(value, Measured):
         return
-    lowest_deg = {azimuth_deg: _lowest_deg(value, np.radians(azimuth_deg)) for azimuth_deg in range(0, 360, 10)}
-    feet = {azimuth_deg: lowest for azimuth_deg, lowest in lowest_deg.items() if lowest is not None}
+    feet = compass_feet(value)
     for azimuth_deg in sorted(COMPASS.keys() & feet.keys()):
-        at = _canvas_at(view, value, np.radians(azimuth_deg), feet[azimuth_deg] + 5.0)
+        at = _canvas_at(view, value, np.radians(azimuth_deg), feet[azimuth_deg] + LETTER_DEG)
         canvas.text(at, COMPASS[azimuth_deg], LETTER_SIZE, INK, "mm", halo=True)
     _draw_nose(canvas, view, value)
     for azimuth_deg, lowest in feet.items():
         main, letter = azimuth_deg % 30 == 0, azimuth_deg in COMPASS
         azimuth_rad = np.radians(azimuth_deg)
-        ends = [_canvas_at(view, value, azimuth_rad, lowest + reach) for reach in (0.0, 2.2 if main else 1.2)]
+        reach_deg = TICK_DEG if main else SHORT_TICK_DEG
+        ends = [_canvas_at(view, value, azimuth_rad, lowest + above) for above in (0.0, reach_deg)]
         canvas.line(np.array(ends), INK if letter else DIM_INK if main else FAINT_INK, 2 if main else 1)
-        at = _canvas_at(view, value, azimuth_rad, lowest + 5.0)
+        at = _canvas_at(view, value, azimuth_rad, lowest + LETTER_DEG)
         if main and not letter and canvas.is_free(box_around(at, 24.0)):
             canvas.text(at, str(azimuth_deg), 15.0, DIM_INK, "mm", halo=True)
 
 
 def _draw_nose(canvas: Canvas, view: View, value: Measured) -> None:
     """An arrow head where the rover's nose points: at the edge of the picture, or further in where a letter stands."""
-    heading, _, _ = heading_pitch_roll_from_R_body_enu(R_body_enu(value))
-    lowest = _lowest_deg(value, heading)
+    heading = heading_rad(value)
+    lowest = lowest_deg(value, heading)
     if lowest is None:
         return
     for further_in_deg in (0.5, 8.5, 16.5):
@@ -214,30 +193,4 @@ def _draw_nose(canvas: Canvas, view: View, value: Measured) -> None:
 
 def _canvas_at(view: View, value: Measured, azimuth_rad: float, elevation_deg: float) -> Array:
     """Canvas place (2,) of a direction."""
-    return view.canvas_px(_project(value, np.array([azimuth_rad]), np.radians([elevation_deg]))[0][0])
-
-
-def _horizon(value: Located) -> Array:
-    return value.terrain.horizon_rad(np.array([skyline_position_m(value)]), AZIMUTHS_RAD)
-
-
-def _project(value: Measured, azimuth_rad: Array, elevation_rad: Array) -> tuple[Array, Bools]:
-    """Pixels (n, 2), and which directions (n,) the lens images, within the frame or not."""
-    rays_cam = rays_from_azel(azimuth_rad, elevation_rad) @ value.R_cam_enu.T
-    xy_px, _ = value.camera.project(rays_cam)
-    angle = np.arctan2(np.hypot(rays_cam[:, 0], rays_cam[:, 1]), rays_cam[:, 2])
-    return xy_px, angle <= min(value.camera.max_angle_rad, value.camera.lens.max_invertible_rad)
-
-
-def _lowest_deg(value: Measured, azimuth_rad: float) -> float | None:
-    """Lowest elevation, from the horizontal up, that the frame shows at the azimuth; None where there is none."""
-    elevation_deg = np.arange(0.0, HIGHEST_COMPASS_DEG, 0.5)
-    rays_cam = rays_from_azel(azimuth_rad, np.radians(elevation_deg)) @ value.R_cam_enu.T
-    _, inside = value.camera.project(rays_cam)
-    return float(elevation_deg[np.argmax(inside)]) if inside.any() else None
-
-
-def _runs(mask: Bools) -> list[tuple[int, int]]:
-    """Start and end of each stretch of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+    return view.canvas_px(project_azel(value, np.array([azimuth_rad]), np.radians([elevation_deg]))[0][0])

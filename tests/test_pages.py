@@ -77,6 +77,7 @@ QUICK_PREDICTION = ["-t", "shackleton-thesis", "--spacing", "9000", "--draws", "
 ASSUMED = {
     "batch": Assumed(folder_of_images),
     "calibration": Assumed(nights),
+    "expected-accuracy": Assumed(flags={"predict": ["-j", "1"]}),  # to start processes takes longer than the draws
     "horizon": Assumed(fits_nights),
     "predict": Assumed(path_and_cameras, {"predict": QUICK_PREDICTION}),
     "terrain": Assumed(own_maps),

@@ -36,7 +36,8 @@ class Reason(StrEnum):
     )  # fmt: skip
     SIZE_MISMATCH = (
         "size_mismatch", EXIT_BAD_INPUT, "The image's size is not the camera's",
-        "Give the right camera file with -c, and the picture as it left the camera, neither cropped nor scaled.",
+        "Give the right camera file with -c, and the picture as it left the camera, neither cropped nor scaled; mask, "
+        "dark frame and flat field have its size.",
     )  # fmt: skip
     NO_TIME = (
         "no_time", EXIT_BAD_INPUT, "The time is not known, or is not UTC",

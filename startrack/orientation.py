@@ -61,7 +61,7 @@ def detect_sources(inputs: Inputs, camera: Camera | None, detector: Detector) ->
     """
     announce_compilation()
     stated = camera is not None and camera.sensor is not None
-    if stated and inputs.exposure.saturation_adu is None and are_fractions(inputs.exposure.pixels_adu):
+    if stated and inputs.exposure.saturation_adu is None and are_fractions(inputs.exposure.recorded_adu):
         raise BadInput(
             "bad_image",
             "the pixels are fractions from 0 to 1, and the camera file's gain and levels are for the sensor's counts: "

@@ -13,15 +13,16 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.correction import Correction
 from startrack.errors import BadInput, NoSolution, NotIdentified, NotLocated, TooFewStars
 from startrack.mask import Mask
 from startrack.prior import PositionPrior
 from startrack.values import Array, Bools, Ints, Value, array, take_rows
 
 __all__ = [
-    "Array", "Attitude", "BadInput", "Body", "Bools", "Centroids", "Clock", "ClockError", "Detections", "Evidence",
-    "Exposure", "Fix", "Identification", "Ints", "Mask", "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified",
-    "NotLocated", "Stars", "TooFewStars", "Value", "array",
+    "Array", "Attitude", "BadInput", "Body", "Bools", "Centroids", "Clock", "ClockError", "Correction", "Detections",
+    "Evidence", "Exposure", "Fix", "Identification", "Ints", "Mask", "MeasuredSkyline", "Mode", "NoSolution",
+    "NotIdentified", "NotLocated", "Stars", "TooFewStars", "Value", "array",
 ]  # fmt: skip
 
 # Beyond the zenith: the search for an error of the horizon shifts the rows, by three sigma at most.
@@ -47,6 +48,7 @@ class Exposure(Value):
     saturation_adu: float | None = None  # largest value the file's type can hold, None for float images
     sha256: str = ""
     warnings: tuple[str, ...] = ()
+    correction: Correction | None = None  # by dark frame and flat field; None: `pixels_adu` are the recorded counts
 
     def __post_init__(self) -> None:
         p = np.asarray(self.pixels_adu, dtype=np.float32)
@@ -61,6 +63,11 @@ class Exposure(Value):
     def size_px(self) -> tuple[int, int]:
         """(W, H)."""
         return self.pixels_adu.shape[1], self.pixels_adu.shape[0]
+
+    @property
+    def recorded_adu(self) -> NDArray[np.float32]:
+        """Counts (H, W) [ADU] before dark frame and flat field."""
+        return self.pixels_adu if self.correction is None else self.correction.recorded_adu
 
 
 @dataclass(frozen=True, kw_only=True)

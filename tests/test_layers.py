@@ -17,7 +17,7 @@ ROOT = Path(startrack.__file__).parent
 
 LAYERS = (  # lowest first; a package imports from lower layers only
     {"errors", "mask", "values"},
-    {"prior"},
+    {"prior", "correction"},
     {"types", "files", "declaration"},
     {"frames", "runner", "compilation"},
     {"kernels", "chunk_store"},

@@ -31,7 +31,7 @@ KEYS = {
     "clock": "offset_s sigma_s",
     "timing_ms": "read detect identify attitude evidence locate",
     "provenance": "version image_sha256 camera terrain catalog localizer near time_utc time_sigma_s exposure_s "
-    "mask_sha256",
+    "mask_sha256 dark_sha256 flat_sha256",
 }
 
 

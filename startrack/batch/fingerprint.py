@@ -15,11 +15,11 @@ from typing import Any
 from startrack import __version__
 from startrack.catalog.gaia import has_deep_catalog
 from startrack.errors import BadInput
-from startrack.exposure.sidecar import RAW_SUFFIXES, sidecar_of
+from startrack.exposure.sidecar import IMAGE_KEYS, RAW_SUFFIXES, read_sidecar, sidecar_of, sidecar_reference
 from startrack.files import is_path, parse_toml, read_text, relative_path
 
 MISSING = "?"  # in place of the hash of a file that cannot be read; once it can, the hash differs
-FILES = ("camera", "terrain", "mask")  # facts that may be paths
+FILES = ("camera", "terrain", *IMAGE_KEYS)  # facts that may be paths
 
 
 def sha256_of(path: str | os.PathLike[str]) -> str:
@@ -34,14 +34,28 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
 
 
 def job_sha256(image: str, image_sha256: str, facts: dict[str, Any], *others: object) -> str:
-    """SHA-256 of image, sidecar, flags, version and extras; `input_hashes` covers the files they name."""
+    """SHA-256 of image, sidecar, flags, version and extras, and of dark frame and flat field.
+
+    `input_hashes` covers the other files that these name.
+    """
     path = Path(image)
     sidecar = sidecar_of(path)
     files = {key: relative_path(facts[key], path.parent) for key in FILES if is_path(facts.get(key, ""))}
     flags = {**facts, **files}
     extras = [has_deep_catalog(), path.suffix.lower() in RAW_SUFFIXES and find_spec("rawpy") is not None]
     whole = [__version__, flags, *others, extras, image_sha256, sidecar and sha256_of(sidecar)]
+    whole += _correction_sha256(path, facts)
     return hashlib.sha256(json.dumps(whole, default=str).encode()).hexdigest()
+
+
+def _correction_sha256(image: Path, facts: dict[str, Any]) -> list[str]:
+    """Key and SHA-256 of the dark frame and the flat field of an `image`, by flags, else by its sidecar."""
+    try:
+        sidecar, values = read_sidecar(image)
+        files = {key: facts.get(key) or sidecar_reference(sidecar, values, key) for key in ("dark", "flat")}
+    except BadInput:  # refused when the image is read
+        return []
+    return [f"{key} {_cached_sha256(Path(file))}" for key, file in files.items() if file]
 
 
 def input_hashes(image: str, references: Iterable[str | None]) -> dict[str, str]:

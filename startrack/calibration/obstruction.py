@@ -66,7 +66,7 @@ def _predict_all(joint: JointFit, frames: Sequence[Frame]) -> PredictedStars:
         rate = matched.expected_found / max(matched.expected, 1)
         if rate < MIN_RATE_1:
             continue
-        mask = combine_masks(frame.exposure.mask, None, frame.size_px)
+        mask = combine_masks(frame.exposure.mask, None, frame.size_px, frame.exposure.correction)
         bright = matched.bright
         column, row = np.rint(bright.xy_px).astype(np.int64).T
         counts = np.ones(len(row), dtype=bool) if mask is None else ~mask.masked[row, column]

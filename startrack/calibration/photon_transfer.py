@@ -37,12 +37,14 @@ class PhotonTransfer:
 def fit_photon_transfer(pairs: list[tuple[Exposure, Exposure]]) -> PhotonTransfer | None:
     """Photon transfer of pairs of frames; None without a pair, or with too small a range of levels.
 
+    From the counts as recorded: after a flat field, variance and level would differ by its sensitivity.
+
     Where the sky has moved between the two frames, stars below the detection limit add to the variance, by some per
     cent in deep wide-field frames; the gain is then as much too low.
     """
     levels, variances = [], []
     for a, b in pairs:
-        level, variance = _block_statistics(a.pixels_adu.astype(np.float64), b.pixels_adu.astype(np.float64))
+        level, variance = _block_statistics(a.recorded_adu.astype(np.float64), b.recorded_adu.astype(np.float64))
         levels.append(level)
         variances.append(variance)
     if not levels:

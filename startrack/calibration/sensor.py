@@ -106,8 +106,8 @@ def _quarters(x: Ints, y: Ints, camera: Camera) -> list[Bools]:
 
 def _saturation_level(frames: tuple[Frame, ...]) -> float | None:
     """The largest value [ADU], where several pixels share it; None where nothing is saturated."""
-    top = max(float(frame.exposure.pixels_adu.max()) for frame in frames)
-    count = sum(int(np.count_nonzero(frame.exposure.pixels_adu >= top)) for frame in frames)
+    top = max(float(frame.exposure.recorded_adu.max()) for frame in frames)
+    count = sum(int(np.count_nonzero(frame.exposure.recorded_adu >= top)) for frame in frames)
     return top if count >= MIN_SATURATED_PIXELS else None
 
 

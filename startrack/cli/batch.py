@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from startrack.runner import Runner
 
 OK, FAULT, STOPPED = 0, 1, 5
+IMAGE_FLAGS = ("mask", "dark", "flat")
 SCHEMES = ("", "tcp", "tls", "ucx", "ws", "wss")  # of Dask's addresses
 
 
@@ -176,9 +177,7 @@ def _facts(args: argparse.Namespace) -> dict[str, Any]:
     """The facts given by flags, with absolute paths, since workers run in other folders."""
     facts = flag_facts(args)
     named = {key: os.path.abspath(facts[key]) for key in ("camera", "terrain") if is_path(facts.get(key, ""))}
-    if "mask" in facts:
-        named["mask"] = os.path.abspath(facts["mask"])
-    return facts | named
+    return facts | named | {key: os.path.abspath(facts[key]) for key in IMAGE_FLAGS if key in facts}
 
 
 def _paths_in(listed: bytes) -> list[str]:
@@ -187,14 +186,16 @@ def _paths_in(listed: bytes) -> list[str]:
 
 
 def _check_files_of_flags(facts: dict[str, Any]) -> None:
-    """Raise BadInput for a camera, terrain or mask file of a flag before anything is changed."""
+    """Raise BadInput for a camera, terrain or other file of a flag before anything is changed."""
     from startrack.camera import load_camera
-    from startrack.exposure import read_mask
+    from startrack.exposure import read_dark, read_flat, read_mask
     from startrack.terrain import load_terrain
 
-    for key, load in (("camera", load_camera), ("terrain", load_terrain), ("mask", read_mask)):
-        if key in facts:
-            load(facts[key])
+    load: dict[str, Callable[[str], object]] = {
+        "camera": load_camera, "terrain": load_terrain, "mask": read_mask, "dark": read_dark, "flat": read_flat,
+    }  # fmt: skip
+    for key in (key for key in load if key in facts):
+        load[key](facts[key])
 
 
 def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace) -> list[Task]:
@@ -247,7 +248,8 @@ def _write_tables(
 def _remove_paths(facts: dict[str, Any]) -> dict[str, str]:
     """The facts of flags for the manifest, without paths of this machine."""
     return {
-        key: Path(value).name if key in ("camera", "terrain", "mask") else str(value) for key, value in facts.items()
+        key: Path(value).name if key in ("camera", "terrain", *IMAGE_FLAGS) else str(value)
+        for key, value in facts.items()
     }
 
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.common import DEFAULT_OUT, add_mask_flag, read
+from startrack.cli.common import DEFAULT_OUT, add_pixel_flags, read
 from startrack.cli.flag_types import amount, field_of_view_rad, number, positive_number, seconds
 from startrack.cli.progress import progress
 from startrack.compilation import announce_compilation
@@ -65,7 +65,7 @@ def add_site_flags(parser: argparse.ArgumentParser) -> None:
     """Flags for the time, the duration and the site of exposures of the sky."""
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601 (one image only)")
     parser.add_argument("--exposure", type=seconds, metavar="S", help="exposure time in seconds")
-    add_mask_flag(parser)
+    add_pixel_flags(parser)
     parser.add_argument("--site", metavar="LAT,LON[,M]", help="site on the Earth, in degrees and metres, to correct "
                         "for refraction (--site=-30.2,...)")  # fmt: skip
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file whose origin is the site")

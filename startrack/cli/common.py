@@ -42,14 +42,16 @@ def add_fact_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--time", metavar="UTC", help="middle of the exposure, ISO 8601")
     add_time_sigma_flag(parser)
     parser.add_argument("--exposure", type=seconds, metavar="S", help="exposure time in seconds")
-    add_mask_flag(parser)
+    add_pixel_flags(parser)
 
 
-def add_mask_flag(parser: argparse.ArgumentParser) -> None:
-    """The flag for the pixels that do not count."""
+def add_pixel_flags(parser: argparse.ArgumentParser) -> None:
+    """The flags for the pixels that do not count, and for the correction of the others."""
     parser.add_argument(
         "--mask", metavar="FILE", help="8-bit image of the frame's size: pixels below 128 do not count (a mast, a lamp)"
     )
+    parser.add_argument("--dark", metavar="FILE", help="dark frame of the frame's size: subtracted, its median kept")
+    parser.add_argument("--flat", metavar="FILE", help="flat field of the frame's size, its own dark subtracted")
 
 
 def add_time_sigma_flag(parser: Any) -> None:
@@ -123,7 +125,7 @@ def flag_facts(args: argparse.Namespace) -> dict[str, Any]:
         "exposure_s": args.exposure,
         "camera": args.camera,
         "terrain": getattr(args, "terrain", None),
-        "mask": getattr(args, "mask", None),
+        **{key: getattr(args, key, None) for key in ("mask", "dark", "flat")},
     }
     return {key: value for key, value in flags.items() if value is not None}
 

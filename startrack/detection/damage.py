@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from startrack.camera import Camera
 from startrack.detection.dead_parts import find_dead_parts
-from startrack.types import Array, Exposure
+from startrack.types import Array, Exposure, Ints
 
 TILE_PX, TILES = 16, 16  # side of a sampled tile, and tiles across the image: 65,536 pixels, 2 ms
 MIN_TILES = 16
@@ -42,9 +42,11 @@ class Damage:
 def find_damage(exposure: Exposure, camera: Camera | None = None) -> Damage | None:
     """The damage that shows in tiles of an `exposure` within the image circle of a `camera`; None: none shows.
 
-    Tiles of one value (a masked border, a dead part) are left out, unless nearly all are.
+    Tiles of one value (a masked border, a dead part) are left out, unless nearly all are. Clipping shows in the counts
+    as recorded, filtering in the counts corrected by dark frame and flat field, whose patterns are no noise.
     """
-    tiles = _sample_tiles(exposure.pixels_adu, camera)
+    corners = _tile_corners(exposure.recorded_adu, camera)
+    tiles = _tiles_at(exposure.recorded_adu, corners)
     if len(tiles) < MIN_TILES:
         return None
     equal = np.ptp(tiles, axis=(1, 2)) == 0
@@ -56,9 +58,7 @@ def find_damage(exposure: Exposure, camera: Camera | None = None) -> Damage | No
     ordered = np.sort(tiles.reshape(len(tiles), -1), axis=1)
     lowest = ordered[:, 0].min()
     clipped = float(np.mean(ordered == lowest))
-    count = ordered.shape[1]
-    middle = ordered[:, count // 2]
-    sigma = (ordered[:, 3 * count // 4] - ordered[:, count // 4]) / (2 * QUARTILE_SIGMAS)
+    middle, sigma = _middle_and_sigma(ordered)
     step = _smallest_step(ordered)
     if clipped > CLIPPED_PART and np.median(sigma) > COARSE_STEPS * step:
         return Damage(
@@ -69,6 +69,10 @@ def find_damage(exposure: Exposure, camera: Camera | None = None) -> Damage | No
         return Damage(
             f"the noise is removed: most pixels of {100 * np.mean(~noisy):.0f} % of the image are equal", False
         )
+    if exposure.correction is not None:
+        tiles = _tiles_at(exposure.pixels_adu, corners[~equal])
+        middle, sigma = _middle_and_sigma(np.sort(tiles.reshape(len(tiles), -1), axis=1))
+        noisy &= sigma > 0
     correlation = _neighbour_correlation(tiles[noisy], middle[noisy], sigma[noisy])
     if correlation > CORRELATION:
         return Damage(
@@ -78,11 +82,11 @@ def find_damage(exposure: Exposure, camera: Camera | None = None) -> Damage | No
     return None
 
 
-def _sample_tiles(pixels_adu: NDArray[np.float32], camera: Camera | None) -> NDArray[np.float32]:
-    """Tiles (n, side, side) on a regular grid, without those that touch a dead part."""
+def _tile_corners(pixels_adu: NDArray[np.float32], camera: Camera | None) -> Ints:
+    """First pixels (n, 2), x and y, of tiles on a regular grid, without those that touch a dead part."""
     height, width = pixels_adu.shape
     if min(height, width) < 2 * TILE_PX:
-        return np.empty((0, TILE_PX, TILE_PX), dtype=np.float32)
+        return np.empty((0, 2), dtype=np.int64)
     top, left = (np.linspace(0, n - TILE_PX, min(TILES, n // TILE_PX)).astype(int) for n in (height, width))
     corners = np.stack(np.meshgrid(left, top), axis=-1).reshape(-1, 2)
     if camera is not None:
@@ -90,15 +94,21 @@ def _sample_tiles(pixels_adu: NDArray[np.float32], camera: Camera | None) -> NDA
             camera.angle_rad(corners + np.array(at) * (TILE_PX - 1.0)) for at in ((0, 0), (0, 1), (1, 0), (1, 1))
         ]
         corners = corners[np.max(off_axis, axis=0) < camera.max_angle_rad]
-    tiles = _tiles_at(pixels_adu, corners)
     dead = find_dead_parts(pixels_adu)
-    return tiles if dead is None else tiles[~_tiles_at(dead, corners).any(axis=(1, 2))]
+    return np.asarray(corners if dead is None else corners[~_tiles_at(dead, corners).any(axis=(1, 2))])
 
 
-def _tiles_at(pixels: NDArray[Any], corners: Array) -> NDArray[Any]:
+def _tiles_at(pixels: NDArray[Any], corners: Ints) -> NDArray[Any]:
     """Tiles (n, side, side) whose first pixels are `corners` (n, 2), x and y."""
     windows = np.lib.stride_tricks.sliding_window_view(pixels, (TILE_PX, TILE_PX))
     return np.asarray(windows[corners[:, 1], corners[:, 0]])
+
+
+def _middle_and_sigma(ordered: NDArray[np.float32]) -> tuple[Array, Array]:
+    """Middle and standard deviation of the noise (n,), (n,) by quartiles of ordered values (n, m)."""
+    count = ordered.shape[1]
+    sigma = (ordered[:, 3 * count // 4] - ordered[:, count // 4]) / (2 * QUARTILE_SIGMAS)
+    return np.asarray(ordered[:, count // 2]), np.asarray(sigma)
 
 
 def _smallest_step(ordered: NDArray[np.float32]) -> float:

@@ -29,6 +29,7 @@ from startrack.detection.frame import (
     electrons,
     mask_or_none,
     radius_for,
+    recorded_step,
 )  # fmt: skip
 from startrack.detection.masked import fill_masked
 from startrack.detection.peaks import Peaks, find_peaks, unbin_peaks
@@ -55,6 +56,7 @@ class _Candidates:
     small: Frame
     side: int
     sigma: float  # of the PSF in the frame [px]
+    quantum: float  # smallest step between the values that the sensor recorded
     fitted: Fitted
 
     @property
@@ -77,15 +79,18 @@ class Detector:
         Raises TooFewStars (reason no_stars) if the frame has no point source, BadInput for a mask that cannot be used.
         """
         image, dead = electrons(exposure, camera)
-        given = combine_masks(exposure.mask, None if camera is None else camera.mask, exposure.size_px)
-        mask = with_dead_parts(given, find_dead_parts(exposure.pixels_adu))
+        given = combine_masks(
+            exposure.mask, None if camera is None else camera.mask, exposure.size_px, exposure.correction
+        )
+        mask = with_dead_parts(given, find_dead_parts(exposure.recorded_adu))
         if mask is not None:
             image, dead = fill_masked(image, mask.masked), dead & ~mask.masked
         if _is_flat(image):
             raise TooFewStars("the frame is flat: every pixel has the same value (lens cap, or a saturated day sky?)")
         known = camera.sensor.psf_sigma_px if camera is not None and camera.sensor is not None else None
         source_noise = SourceNoise(per_unit=0.0 if known is None else 1.0)
-        source = _FrameSource(image, mask_or_none(dead), source_noise, None if mask is None else mask.masked)
+        quantum = smallest_step(image) if exposure.correction is None else recorded_step(exposure, camera)
+        source = _FrameSource(image, quantum, mask_or_none(dead), source_noise, None if mask is None else mask.masked)
         candidates = self._candidates(source, self.psf_sigma_px or known)
         frame, sigma = candidates.frame, candidates.sigma
         if are_elongated(frame, candidates.centres) and (streaks := find_streaks(frame)) is not None:
@@ -135,12 +140,13 @@ class Detector:
         peaks = self._find_peaks(frame, small, side, sigma)
         if not len(peaks.centres):
             raise TooFewStars(NOTHING_SEEN)
-        return _Candidates(frame, small, side, sigma, fit_all(small, peaks, sigma / side))
+        return _Candidates(frame, small, side, sigma, source.quantum, fit_all(small, peaks, sigma / side))
 
     def _detect_again(self, candidates: _Candidates, stars: PointFits) -> tuple[Frame, PointFits]:
         """The frame and its stars; known stars are subtracted before the background and faint stars are measured."""
         side, sigma, frame = candidates.side, candidates.sigma, candidates.frame
-        source = _FrameSource(frame.image, frame.dead, candidates.fitted.source_noise, frame.masked)
+        noise = candidates.fitted.source_noise
+        source = _FrameSource(frame.image, candidates.quantum, frame.dead, noise, frame.masked)
         frame = source.frame(sigma, paint_sources(stars, sigma, frame.shape))
         positions = (stars.xy_px - 0.5 * (side - 1)) / side
         peaks = self._find_peaks(frame, bin_frame(frame, side), side, sigma, known=positions)
@@ -202,10 +208,9 @@ class _FrameSource:
     """An image with its unusable pixels; backgrounds are computed once for each block size."""
 
     def __init__(
-        self, image: Image, dead: Bools | None, source_noise: SourceNoise, masked: Bools | None
+        self, image: Image, quantum: float, dead: Bools | None, source_noise: SourceNoise, masked: Bools | None
     ) -> None:  # fmt: skip
-        self.image, self.dead, self.source_noise, self.masked = image, dead, source_noise, masked
-        self.quantum = smallest_step(image)
+        self.image, self.quantum, self.dead, self.source_noise, self.masked = image, quantum, dead, source_noise, masked
         self._kept: dict[int, tuple[Image, Image]] = {}
 
     def frame(self, sigma: float, found: Image | None = None) -> Frame:

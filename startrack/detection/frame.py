@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
+from startrack.detection.background import smallest_step
 from startrack.psf import stamp_radius
 from startrack.types import Bools, Exposure, Ints
 
@@ -75,17 +76,31 @@ class Frame:
 
 
 def electrons(exposure: Exposure, camera: Camera | None) -> tuple[Image, NDArray[np.bool_]]:
-    """The exposure in electrons above bias (ADU without the gain of a `camera`), and the mask of saturated pixels."""
+    """The exposure in electrons above bias (ADU without the gain of a `camera`), and the mask of saturated pixels.
+
+    Saturation shows in the counts as recorded, before dark frame and flat field.
+    """
     pixels_adu, ceiling = exposure.pixels_adu, exposure.saturation_adu or np.inf
+    recorded_adu, correction = exposure.recorded_adu, exposure.correction
     if camera is None or camera.sensor is None:
-        return pixels_adu, pixels_adu >= SATURATED_FRACTION * ceiling
+        return pixels_adu, recorded_adu >= SATURATED_FRACTION * ceiling
     sensor = camera.sensor
-    saturated = pixels_adu >= SATURATED_FRACTION * min(ceiling, sensor.saturation_adu)
+    saturated = recorded_adu >= SATURATED_FRACTION * min(ceiling, sensor.saturation_adu)
     if sensor.gain_e_per_adu == 1.0 and sensor.bias_adu == 0.0:
         return pixels_adu, saturated
     image = pixels_adu * np.float32(sensor.gain_e_per_adu)
-    image -= np.float32(sensor.bias_adu * sensor.gain_e_per_adu)
+    bias_e = np.float32(sensor.bias_adu * sensor.gain_e_per_adu)
+    if correction is not None and correction.scales_black and correction.sensitivity_1 is not None:
+        image -= bias_e / correction.sensitivity_1
+    else:
+        image -= bias_e
     return image, saturated
+
+
+def recorded_step(exposure: Exposure, camera: Camera | None) -> float:
+    """Smallest step between the counts as recorded, in the unit of `electrons`: dark and flat do not undo rounding."""
+    gain = 1.0 if camera is None or camera.sensor is None else camera.sensor.gain_e_per_adu
+    return gain * smallest_step(exposure.recorded_adu)
 
 
 def stamps(image: NDArray[Any], centres: Ints, radius: int) -> NDArray[Any]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from startrack.declaration import SHOWN_CHARS, value_text
-from startrack.exposure.sidecar import BAYER_PATTERNS, NUMBERS, SIDECAR, is_pattern, resolve_path
+from startrack.exposure.sidecar import BAYER_PATTERNS, IMAGE_KEYS, NUMBERS, SIDECAR, is_pattern, resolve_path
 from startrack.frames.time import parse_utc
 from startrack.types import BadInput
 
@@ -18,7 +18,7 @@ from startrack.types import BadInput
 # the sidecar's keys are valid there too, except in FITS, where a card called CAMERA is common and names the hardware.
 _HEADER_KEYS = ("DATE-AVG", "STTSIG", "EXPTIME", "STCAMERA", "STTERRAI", "BAYERPAT")
 HEADER_KEYS = {key: key for key in ("DATE-OBS", "TIMESYS", *_HEADER_KEYS)}
-HEADER_KEYS |= dict(zip((key for key in SIDECAR.keys if key != "mask"), _HEADER_KEYS, strict=True))
+HEADER_KEYS |= dict(zip((key for key in SIDECAR.keys if key not in IMAGE_KEYS), _HEADER_KEYS, strict=True))
 
 
 def facts_in_text(text: str) -> dict[str, Any]:

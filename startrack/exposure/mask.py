@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from startrack.exposure.decode_file import decode_file
 from startrack.files import printable
-from startrack.types import Array, BadInput, Bools, Mask
+from startrack.types import Array, BadInput, Bools, Correction, Mask
 
 SKY_FROM = 128  # of 255: darker pixels of a mask's file do not count
 LARGEST_VALUE = 255.0  # of an 8-bit file
@@ -39,14 +39,17 @@ def read_mask(path: str | os.PathLike[str], reason: str = "bad_image") -> Mask:
 
 
 def combine_masks(
-    of_image: str | Mask | None, of_camera: str | Mask | None, size_px: tuple[int, int]
+    of_image: str | Mask | None, of_camera: str | Mask | None, size_px: tuple[int, int],
+    of_correction: Correction | None = None,
 ) -> Mask | None:  # fmt: skip
     """The pixels that the mask `of_image` or the mask `of_camera` hides, in an image of `size_px` (W, H); None: none.
 
+    Pixels that a dark frame or flat field cannot correct do not count either, and are in no hash.
     A mask is its file's path, or the mask itself. Raises BadInput: bad_image and bad_calibration where a file is no
     mask, size_mismatch where it has another size than the image.
     """
-    given = ((of_camera, "bad_calibration"), (of_image, "bad_image"))
+    not_corrected = None if of_correction is None else of_correction.mask
+    given = ((of_camera, "bad_calibration"), (of_image, "bad_image"), (not_corrected, "bad_image"))
     masks = [one if isinstance(one, Mask) else read_mask(one, reason) for one, reason in given if one is not None]
     for mask in masks:
         height, width = mask.masked.shape
@@ -54,7 +57,8 @@ def combine_masks(
             raise BadInput("size_mismatch", f"the mask is {width} x {height} px, the image {size_px[0]} x {size_px[1]}")
     if len(masks) < 2:
         return masks[0] if masks else None
-    return Mask(masked=masks[0].masked | masks[1].masked, sha256="+".join(mask.sha256 for mask in masks))
+    masked = np.logical_or.reduce([mask.masked for mask in masks])
+    return Mask(masked=masked, sha256="+".join(mask.sha256 for mask in masks if mask.sha256))
 
 
 def touch_masked(masked: Bools, xy_px: Array, radius_px: int) -> Bools:

@@ -34,6 +34,8 @@ class Facts:
     camera: str | None = None  # path, or name of a shipped file
     terrain: str | None = None  # path, or name of a shipped file
     mask: str | None = None  # path
+    dark: str | None = None  # path of the dark frame
+    flat: str | None = None  # path of the flat field
     bayer_pattern: str | None = None  # RGGB and the like: the pixels are a mosaic of colours
     warnings: tuple[str, ...] = ()  # values that were ignored, and why
 
@@ -101,6 +103,8 @@ def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts
         or sidecar_reference(sidecar, values, "terrain")
         or header_reference(image, header, "STTERRAI", notes),
         mask=given.mask or sidecar_reference(sidecar, values, "mask"),
+        dark=given.dark or sidecar_reference(sidecar, values, "dark"),
+        flat=given.flat or sidecar_reference(sidecar, values, "flat"),
         bayer_pattern=sidecar_value(sidecar, values, "bayer_pattern") or header_pattern(header, notes),
         warnings=tuple(notes),
     )

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.exposure.correct import correct_counts
 from startrack.exposure.decode_file import decode_file
 from startrack.exposure.decoded import COLOUR_WARNING, Decoded, bad_image, check_size, grey_float32, largest_value
 from startrack.exposure.mask import mask_of
 from startrack.exposure.metadata import Facts, resolve_facts
+from startrack.exposure.mosaic import MOSAIC_WARNING, equalize_mosaic
 from startrack.exposure.sidecar import stem
 from startrack.types import TIME_SIGMA_S, Bools, Exposure
 
@@ -28,23 +30,27 @@ def read_exposure(
     camera: str | None = None,
     terrain: str | None = None,
     mask: str | None = None,
+    dark: str | None = None,
+    flat: str | None = None,
 ) -> Exposure:
     """The image at `path` (PNG, TIFF, JPEG or FITS by its content, or camera raw by its suffix) with its metadata.
 
     Pixels (H, W) are the counts in the file [ADU], 16 bits kept; pixel (0, 0) is the first of the first row stored,
     in FITS too; orientation tags are ignored. `time_utc` (mid-exposure), `time_sigma_s` (of the clock), `exposure_s`,
-    `camera`, `terrain` and `mask` (path of an 8-bit image) replace the values of sidecar and header, which are then not
-    read. `warnings` lists ignored
-    facts and causes.
+    `camera`, `terrain`, `mask` (path of an 8-bit image), `dark` and `flat` (paths of a dark frame and a flat field)
+    replace the values of sidecar and header, which are then not read. The counts are corrected by dark frame and flat
+    field, as in `correct_counts`. `warnings` lists ignored facts and causes.
 
     Raises:
-        BadInput: bad_image with file and cause in one line; no_time if a sidecar's time is not UTC.
+        BadInput: bad_image with file and cause in one line; no_time if a sidecar's time is not UTC; size_mismatch for
+            a dark frame or flat field of another size.
         ValueError: `time_sigma_s` is no usable number of seconds.
     """
     raw, decoded = decode_file(path)
     given = Facts(
-        time_utc=time_utc, time_sigma_s=time_sigma_s, exposure_s=exposure_s, camera=camera, terrain=terrain, mask=mask
-    )
+        time_utc=time_utc, time_sigma_s=time_sigma_s, exposure_s=exposure_s, camera=camera, terrain=terrain, mask=mask,
+        dark=dark, flat=flat,
+    )  # fmt: skip
     facts = resolve_facts(Path(path), decoded.header, given)
     return exposure_of_decoded(decoded, facts, raw=raw, name=stem(Path(path)), path=os.fspath(path))
 
@@ -52,9 +58,14 @@ def read_exposure(
 def exposure_of_decoded(decoded: Decoded, facts: Facts, *, raw: bytes, name: str, path: str) -> Exposure:
     """The exposure of pixels `decoded` from the bytes `raw`, with its `facts`, `name` (stem) and `path`.
 
-    The pixels of a mosaic are equalized.
+    They are corrected by the dark frame and the flat field of the facts; then the pixels of a mosaic are equalized.
+    Raises BadInput (bad_image, size_mismatch) for a dark frame or flat field that cannot be used.
     """
-    pixels, notes = _level_mosaic(decoded, facts)
+    pixels, correction, mosaic = decoded.pixels_adu, None, _is_mosaic(decoded, facts)
+    if facts.dark is not None or facts.flat is not None:
+        pixels, correction = correct_counts(pixels, decoded.saturation_adu, facts.dark, facts.flat, mosaic=mosaic)
+    if mosaic:
+        pixels = equalize_mosaic(pixels, decoded.saturation_adu)
     return Exposure(
         pixels_adu=pixels,
         name=name,
@@ -67,7 +78,8 @@ def exposure_of_decoded(decoded: Decoded, facts: Facts, *, raw: bytes, name: str
         mask=facts.mask,
         saturation_adu=decoded.saturation_adu,
         sha256=hashlib.sha256(raw).hexdigest(),
-        warnings=decoded.warnings + notes + facts.warnings,
+        warnings=decoded.warnings + ((MOSAIC_WARNING,) if mosaic else ()) + facts.warnings,
+        correction=correction,
     )
 
 
@@ -97,11 +109,7 @@ def exposure_of(
     )
 
 
-def _level_mosaic(decoded: Decoded, facts: Facts) -> tuple[NDArray[np.float32], tuple[str, ...]]:
-    """The pixels (a mosaic's at one level and gain), and a warning if they were changed."""
+def _is_mosaic(decoded: Decoded, facts: Facts) -> bool:
+    """Whether the pixels are a mosaic of colours, by the kind of file or by the facts."""
     colour_already = decoded.mosaic is None and COLOUR_WARNING in decoded.warnings
-    if colour_already or not (decoded.mosaic or facts.bayer_pattern):
-        return decoded.pixels_adu, ()
-    from startrack.exposure.mosaic import MOSAIC_WARNING, equalize_mosaic
-
-    return equalize_mosaic(decoded.pixels_adu, decoded.saturation_adu), (MOSAIC_WARNING,)
+    return not colour_already and bool(decoded.mosaic or facts.bayer_pattern)

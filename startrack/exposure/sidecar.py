@@ -30,9 +30,12 @@ SIDECAR = Table(
         "camera": Text(description="a camera file, or the name of a shipped one"),
         "terrain": Text(description="a terrain file, or the name of a shipped one"),
         "mask": Text(description="8-bit image of the frame's size: pixels below 128 do not count"),
+        "dark": Text(description="dark frame of the frame's size, subtracted"),
+        "flat": Text(description="flat field of the frame's size, divided by"),
         "bayer_pattern": Choice(values=BAYER_PATTERNS, description="colours of the first 2 x 2 pixels of a mosaic"),
     },
 )
+IMAGE_KEYS = ("mask", "dark", "flat")  # always paths: no such image is shipped, and no header names one
 RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".crw", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"}
 PICTURE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".fits", ".fit", ".fts"} | RAW_SUFFIXES
 PACKING_SUFFIXES = {".gz", ".bz2", ".fz"}
@@ -124,7 +127,7 @@ def sidecar_time(sidecar: Path, value: object) -> datetime | None:
 def sidecar_reference(sidecar: Path, values: Mapping[str, Any], key: str) -> str | None:
     """The path or name of a file under a key of the sidecar."""
     value = sidecar_value(sidecar, values, key)
-    if key == "mask" and value is not None:  # always a path: no mask is shipped
+    if key in IMAGE_KEYS and value is not None:
         return os.path.join(sidecar.parent, value)
     return None if value is None else resolve_path(sidecar, value)
 

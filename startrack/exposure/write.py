@@ -63,6 +63,7 @@ def write_sidecar(image: str | os.PathLike[str], facts: Facts | Exposure, *, ove
         "camera": _relative_path(facts.camera, target.parent),
         "terrain": _relative_path(facts.terrain, target.parent),
         "mask": relative_path(facts.mask, target.parent) if isinstance(facts.mask, str) else None,
+        **{key: relative_path(path, target.parent) for key in ("dark", "flat") if (path := getattr(facts, key, None))},
         "bayer_pattern": facts.bayer_pattern if isinstance(facts, Facts) else None,
     }
     text = json.dumps({k: v for k, v in values.items() if v is not None}, ensure_ascii=False, allow_nan=False)

@@ -58,6 +58,12 @@ RUN: tuple[Quantity, ...] = (
       lambda v: None if v.detections.mask is None else v.detections.mask.sha256 or None,
       "of the file of the mask, or of the array that is masked; with the camera's and the image's mask both, joined by "
       "`+`; null: every pixel counts", TEXT, before=None, nullable=True, optional=True),
+    Q("provenance.dark_sha256", "", Inputs,
+      lambda v: None if v.exposure.correction is None else v.exposure.correction.dark_sha256,
+      "of the file of the dark frame; null: none was subtracted", TEXT, before=None, nullable=True, optional=True),
+    Q("provenance.flat_sha256", "", Inputs,
+      lambda v: None if v.exposure.correction is None else v.exposure.correction.flat_sha256,
+      "of the file of the flat field; null: none was used", TEXT, before=None, nullable=True, optional=True),
 )  # fmt: skip
 QUANTITIES: tuple[Quantity, ...] = POSITION + ATTITUDE + LIGHT + RUN
 BY_PATH = {one.path: one for one in QUANTITIES}

@@ -1,0 +1,177 @@
+"""Dark frame and flat field: counts without the sensor's own charge, at one sensitivity.
+
+    corrected = (recorded - dark) / flat + black        black: median of the dark; flat: 1 at its median
+
+The black level stays, so that bias and noise of the camera file hold. Source: Howell 2006, Handbook of CCD Astronomy,
+section 4.5.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.correction import Correction
+from startrack.exposure.decode_file import decode_file
+from startrack.exposure.mosaic import PHASES
+from startrack.files import printable
+from startrack.types import BadInput, Bools, Exposure, Mask
+
+MIN_SENSITIVITY_1 = 0.05  # of the median: darker pixels of a flat field do not count
+LIT_PERCENTILE = 99.0  # of a flat field: pixels above MIN_SENSITIVITY_1 of this are in the image circle
+SATURATED_1 = 0.98  # of the largest value: a dark frame is saturated there
+KEPT_FRAMES = 2  # of each kind: a night has one, seldom two
+Picture = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationFrame:
+    """A dark frame, as its excess over its median, or a flat field, as sensitivity."""
+
+    values: Picture  # (H, W) [ADU], or 1 at the median
+    unusable: Bools | None  # (H, W): values are 0, or 1 of a flat; None where every pixel is usable
+    median_adu: float
+    sha256: str
+
+
+def correct_exposure(
+    exposure: Exposure, *, dark: str | os.PathLike[str] | None = None, flat: str | os.PathLike[str] | None = None
+) -> Exposure:
+    """The exposure corrected by the images `dark` and `flat`. Not for mosaics, which `read_exposure` corrects.
+
+    Raises BadInput as `correct_counts`, ValueError where the exposure is corrected already.
+    """
+    if exposure.correction is not None:
+        raise ValueError(f"{exposure.name}: is corrected already")
+    if dark is None and flat is None:
+        return exposure
+    pixels, correction = correct_counts(exposure.pixels_adu, exposure.saturation_adu, dark, flat)
+    return replace(exposure, pixels_adu=pixels, correction=correction)
+
+
+def correct_counts(
+    recorded_adu: Picture, saturation_adu: float | None, dark: str | os.PathLike[str] | None,
+    flat: str | os.PathLike[str] | None, *, mosaic: bool = False,
+) -> tuple[Picture, Correction]:  # fmt: skip
+    """The corrected counts (H, W) [ADU], not clipped, and the correction; of `dark` and `flat` one may be None.
+
+    Each colour of a `mosaic` has its own median of the flat. Pixels at `saturation_adu` stay at least there.
+    Raises BadInput: bad_image where a file is no dark frame or flat field, size_mismatch where it has another size.
+    """
+    pixels, masked = np.array(recorded_adu), np.zeros(recorded_adu.shape, dtype=np.bool_)
+    dark_frame = None if dark is None else read_dark(dark)
+    flat_frame = None if flat is None else read_flat(flat, mosaic=mosaic)
+    if dark_frame is not None:
+        _check_shape("dark frame", dark_frame, pixels)
+        pixels -= dark_frame.values
+        if dark_frame.unusable is not None:
+            masked |= dark_frame.unusable
+    if flat_frame is not None:
+        _check_shape("flat field", flat_frame, pixels)
+        black = np.float32(0.0 if dark_frame is None else dark_frame.median_adu)
+        pixels -= black
+        pixels /= flat_frame.values
+        pixels += black
+        if flat_frame.unusable is not None:
+            masked |= flat_frame.unusable
+    if saturation_adu is not None:
+        np.maximum(pixels, np.float32(saturation_adu), out=pixels, where=recorded_adu >= saturation_adu)
+    return pixels, Correction(
+        recorded_adu=recorded_adu,
+        mask=Mask(masked=masked, sha256="") if masked.any() else None,
+        sensitivity_1=None if flat_frame is None else flat_frame.values,
+        scales_black=dark_frame is None,
+        dark_sha256=None if dark_frame is None else dark_frame.sha256,
+        flat_sha256=None if flat_frame is None else flat_frame.sha256,
+    )
+
+
+def read_dark(path: str | os.PathLike[str]) -> CalibrationFrame:
+    """The dark frame in the image at `path`. Raises BadInput bad_image if it cannot be read, or is saturated."""
+    return _read(path, "dark frame", _read_dark)
+
+
+def read_flat(path: str | os.PathLike[str], *, mosaic: bool = False) -> CalibrationFrame:
+    """The flat field in the image at `path`. Raises BadInput bad_image if it cannot be read, or is dark."""
+    return _read(path, "flat field", _read_mosaic_flat if mosaic else _read_flat)
+
+
+def _read(
+    path: str | os.PathLike[str], kind: str, read: Callable[[str, tuple[int, ...]], CalibrationFrame]
+) -> CalibrationFrame:
+    try:
+        found = os.stat(path)
+        return read(os.fspath(path), (found.st_ino, found.st_size, found.st_mtime_ns))
+    except BadInput as error:
+        raise BadInput(error.reason, f"{kind} {error}") from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        cause = getattr(error, "strerror", None) or error
+        raise BadInput("bad_image", f"{kind} {printable(path)}: cannot be opened ({cause})") from error
+
+
+@lru_cache(maxsize=KEPT_FRAMES)
+def _read_dark(path: str, stamp: tuple[int, ...]) -> CalibrationFrame:
+    """The dark frame at `path`, read once as long as the file keeps its `stamp`."""
+    raw, decoded = decode_file(path)
+    median = float(np.median(decoded.pixels_adu))
+    excess = decoded.pixels_adu - np.float32(median)
+    top = np.inf if decoded.saturation_adu is None else SATURATED_1 * decoded.saturation_adu
+    return _frame(path, raw, excess, decoded.pixels_adu >= top, median, fill=0.0, cause="is saturated")
+
+
+@lru_cache(maxsize=KEPT_FRAMES)
+def _read_flat(path: str, stamp: tuple[int, ...]) -> CalibrationFrame:
+    """The flat field of a grey or colour image at `path`, read once as long as the file keeps its `stamp`."""
+    raw, decoded = decode_file(path)
+    level = _lit_level(decoded.pixels_adu, path)
+    return _flat_frame(path, raw, decoded.pixels_adu / np.float32(level), level)
+
+
+@lru_cache(maxsize=KEPT_FRAMES)
+def _read_mosaic_flat(path: str, stamp: tuple[int, ...]) -> CalibrationFrame:
+    """The flat field of a mosaic at `path`, each of its colours 1 at its own median."""
+    raw, decoded = decode_file(path)
+    sensitivity = np.array(decoded.pixels_adu)
+    levels = [_lit_level(decoded.pixels_adu[i::2, j::2], path) for i, j in PHASES]
+    for (i, j), level in zip(PHASES, levels, strict=True):
+        sensitivity[i::2, j::2] /= np.float32(level)
+    return _flat_frame(path, raw, sensitivity, float(np.mean(levels)))
+
+
+def _lit_level(pixels_adu: Picture, path: str) -> float:
+    """Median of the pixels within the image circle. Raises BadInput bad_image where no pixel is lit."""
+    limit = MIN_SENSITIVITY_1 * float(np.percentile(pixels_adu, LIT_PERCENTILE))
+    if limit <= 0:
+        raise BadInput("bad_image", f"{printable(path)}: is dark, so it shows no sensitivities")
+    return float(np.median(pixels_adu[pixels_adu > limit]))
+
+
+def _flat_frame(path: str, raw: bytes, sensitivity: Picture, level: float) -> CalibrationFrame:
+    dark = sensitivity < MIN_SENSITIVITY_1
+    return _frame(path, raw, sensitivity, dark, level, fill=1.0, cause="is dark")
+
+
+def _frame(
+    path: str, raw: bytes, values: Picture, unusable: Bools, median: float, *, fill: float, cause: str
+) -> CalibrationFrame:
+    """The frame whose unusable pixels hold `fill`. Raises BadInput bad_image with `cause` where all are unusable."""
+    if unusable.all():
+        raise BadInput("bad_image", f"{printable(path)}: every pixel {cause}")
+    values[unusable] = fill
+    values.flags.writeable = False
+    return CalibrationFrame(
+        values, unusable if unusable.any() else None, median, hashlib.sha256(raw).hexdigest()
+    )  # fmt: skip
+
+
+def _check_shape(kind: str, frame: CalibrationFrame, pixels: Picture) -> None:
+    """Raise BadInput size_mismatch unless the frame has the size of the image."""
+    if frame.values.shape != pixels.shape:
+        (own_h, own_w), (height, width) = frame.values.shape, pixels.shape
+        raise BadInput("size_mismatch", f"the {kind} is {own_w} x {own_h} px, the image {width} x {height}")

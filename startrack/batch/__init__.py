@@ -1,6 +1,6 @@
 """Batches: find the images of a folder, locate them in parallel, resume a stopped run, write tables."""
 
-from startrack.batch.find import Image, images_under, listed_images
+from startrack.batch.find import Image, images_of_bag, images_under, listed_images
 from startrack.batch.store import (
     JOB,
     LOCK,
@@ -12,7 +12,7 @@ from startrack.batch.store import (
     text_of_name,
 )
 from startrack.batch.tables import Rows, has_parquet, table_rows, table_values, write_tables
-from startrack.batch.task import ImageDone, Task, locate_image, locate_images
+from startrack.batch.task import ImageDone, Task, locate_image, locate_images, read_task
 
 __all__ = [
     "JOB",
@@ -23,11 +23,13 @@ __all__ = [
     "Task",
     "belongs_to_other_images",
     "has_parquet",
+    "images_of_bag",
     "images_under",
     "listed_images",
     "locate_image",
     "locate_images",
     "lock_results",
+    "read_task",
     "record_path",
     "stored_record",
     "table_rows",

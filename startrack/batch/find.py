@@ -6,10 +6,11 @@ import os
 import stat
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path, PurePosixPath
 
+from startrack.exposure import BagImage, list_bag_images
 from startrack.exposure.sidecar import PACKING_SUFFIXES, PICTURE_SUFFIXES
 from startrack.files import existing_folder
 from startrack.output.write import PICTURES
@@ -18,11 +19,21 @@ from startrack.types import BadInput
 
 @dataclass(frozen=True, order=True)
 class Image:
-    """One image of a batch."""
+    """One image of a batch: a file, or a message of a bag."""
 
     name: str  # path relative to the folder, with / on every system
     stem: str  # of its results, relative to the folder of the results
     path: str
+    bag_image: BagImage | None = field(default=None, compare=False)  # where `path` is BAG#NUMBER
+
+
+def images_of_bag(bag: str | os.PathLike[str], topic: str | None = None) -> list[Image]:
+    """Every image of a ROS bag's image `topic` (None: its only one). Raises BadInput (bad_image)."""
+    stem = Path(bag).stem
+    return [
+        Image(Path(one.path).name, f"{stem}-{one.number:06d}", one.path, one)
+        for one in list_bag_images(os.path.abspath(bag), topic)
+    ]
 
 
 def images_under(folder: str | os.PathLike[str], excluded: str | os.PathLike[str] | None = None) -> list[Image]:

@@ -15,6 +15,7 @@ from typing import Any
 from startrack import __version__
 from startrack.catalog.gaia import has_deep_catalog
 from startrack.errors import BadInput
+from startrack.exposure import BagImage
 from startrack.exposure.sidecar import IMAGE_KEYS, RAW_SUFFIXES, read_sidecar, sidecar_of, sidecar_reference
 from startrack.files import is_path, parse_toml, read_text, relative_path
 
@@ -31,6 +32,11 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except (OSError, ValueError):  # a NUL in the name
         return MISSING
+
+
+def content_sha256(image: str, bag_image: BagImage | None) -> str:
+    """SHA-256 of an image's file, or of its message in a bag; `MISSING` if the file cannot be read."""
+    return sha256_of(image) if bag_image is None else bag_image.message.sha256
 
 
 def job_sha256(image: str, image_sha256: str, facts: dict[str, Any], *others: object) -> str:

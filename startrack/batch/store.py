@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from startrack.batch.find import Image
-from startrack.batch.fingerprint import sha256_of
+from startrack.batch.fingerprint import content_sha256
 from startrack.errors import BadInput
 from startrack.files import Locked, hold_lock
 from startrack.output.write import COMPANIONS, PICTURES, SKYLINE_FILES
@@ -95,7 +95,7 @@ def belongs_to_other_images(out: Path, images: Iterable[Image]) -> bool:
     for image in images:
         record = stored_record(record_path(out, image))
         known = listed.get(text_of_name(image.name)) or (record and image_sha256(record))
-        if known is not None and known == sha256_of(image.path):
+        if known is not None and known == content_sha256(image.path, image.bag_image):
             return False
         some = some or known is not None
     return some

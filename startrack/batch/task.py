@@ -10,13 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack import __version__
-from startrack.batch.fingerprint import MISSING, are_unchanged, input_hashes, is_older_than, job_sha256, sha256_of
+from startrack.batch.fingerprint import MISSING, are_unchanged, content_sha256, input_hashes, is_older_than, job_sha256
 from startrack.batch.store import INPUTS, JOB, has_companions, image_sha256, is_solved, stored_record, text_of_name
 from startrack.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
 from startrack.runner import Died, Runner, RunStopped
 
 if TYPE_CHECKING:
+    from startrack.exposure import BagImage
     from startrack.stages import Outcome
+    from startrack.types import Exposure
 
 Record = dict[str, Any]
 ImageDone = tuple[Record, bool]  # the record, and whether it was there already
@@ -35,6 +37,7 @@ class Task:
     overwrite: bool = False  # locate it again even if a valid result is there
     localizer: str = "posterior"  # of startrack.localization.LOCALIZERS
     evidence: str = "both"  # of startrack.stages.EVIDENCE_SOURCES
+    bag_image: BagImage | None = None  # where `path` is BAG#NUMBER
     near: tuple[float, float, float] | None = None  # east, north, sigma [m] of a prior of the position
 
 
@@ -54,7 +57,7 @@ def locate_image(task: Task) -> ImageDone:
     NAME.fix.json is written last, so that a record that exists is complete. Raises RunStopped if the disk is full.
     """
     try:
-        sha256 = sha256_of(task.path)
+        sha256 = content_sha256(task.path, task.bag_image)
         key = _key(task, sha256)
         before = None if task.overwrite else _valid_record(task, key)
         return (before, True) if before is not None else (_locate_and_write(task, sha256, key), False)
@@ -71,14 +74,17 @@ def valid_stored_record(task: Task) -> dict[str, Any] | None:
     if record is None:
         return None
     known = image_sha256(record) if is_older_than(task.path, task.result) else None
-    return _valid_record(task, _key(task, known or sha256_of(task.path)))
+    return _valid_record(task, _key(task, known or content_sha256(task.path, task.bag_image)))
 
 
 def write_failure(task: Task, message: str, reason: str = INTERNAL_ERROR) -> dict[str, Any]:
     """Write and return the record of an image that failed: without a job hash, so that the next run repeats it."""
     from startrack.output import refused_dict, write_json
 
-    record = {**refused_dict(task.name, reason, message), **_unread_provenance(sha256_of(task.path))}
+    record = {
+        **refused_dict(task.name, reason, message),
+        **_unread_provenance(content_sha256(task.path, task.bag_image)),
+    }
     record |= {"image": text_of_name(task.name), JOB: None}
     with suppress(BadInput):  # the record is returned all the same
         if not is_solved(stored_record(task.result)):
@@ -136,9 +142,17 @@ def _remove_former(result: Path) -> None:
         raise BadInput("bad_image", f"{result}: cannot be written ({cause.strerror})") from cause
 
 
+def read_task(task: Task) -> Exposure:
+    """The exposure of a task's image. Raises BadInput."""
+    from startrack.exposure import read_bag_image, read_exposure
+
+    if task.bag_image is not None:
+        return read_bag_image(task.bag_image, **task.facts)
+    return read_exposure(task.path, **task.facts)
+
+
 def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str, str]]:
     """A value with companions, or the record of a refusal without; and the hashes of camera and terrain files."""
-    from startrack.exposure import read_exposure
     from startrack.localization import require_localizer
     from startrack.output import refused_dict, result_dict
     from startrack.pipeline import Settings, locate_exposure
@@ -146,7 +160,7 @@ def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str
     from startrack.stages import Inputs, Refused
 
     try:
-        exposure = read_exposure(task.path, **task.facts)
+        exposure = read_task(task)
     except BadInput as cause:
         return {**refused_dict(task.name, cause.reason, str(cause)), **_unread_provenance(sha256)}, {}
     # Before the files are read, so that a change in between is noticed.

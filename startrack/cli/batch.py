@@ -5,26 +5,33 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from startrack.cli.batch_inputs import absolute_facts, check_files_of_flags, find_images, remove_paths
 from startrack.cli.batch_show import Counts, Halt, halt_on_signals, omission_lines, show_outcomes, summary
-from startrack.cli.common import DEFAULT_OUT, add_fact_flags, add_localizer_flags, check_localizer, cores, flag_facts
+from startrack.cli.common import (
+    DEFAULT_OUT,
+    add_fact_flags,
+    add_localizer_flags,
+    add_topic_flag,
+    check_localizer,
+    cores,
+)
 from startrack.cli.flag_types import positive_count
 from startrack.cli.preparation import compile_kernels, prepare_reference
 from startrack.compilation import is_compiled
 from startrack.errors import INTERNAL_ERROR, BadInput
-from startrack.files import is_path, make_folder
+from startrack.files import make_folder
 
 if TYPE_CHECKING:
     from startrack.batch import Image, ImageDone, Task
     from startrack.runner import Runner
 
 OK, FAULT, STOPPED = 0, 1, 5
-IMAGE_FLAGS = ("mask", "dark", "flat")
 SCHEMES = ("", "tcp", "tls", "ucx", "ws", "wss")  # of Dask's addresses
 
 
@@ -39,7 +46,8 @@ def add_parser(subparsers: Any) -> None:
         epilog="exit codes: 0 every image solved; 5 some not solved, or stopped early (Ctrl-C, SIGTERM, a full disk, a "
         "closed pipe); 1 an internal error; 2 usage; 4 bad input",
     )
-    parser.add_argument("folder", metavar="FOLDER", help="folder of the images, with all below it")
+    parser.add_argument("folder", metavar="FOLDER", help="folder of the images, with all below it; or a ROS bag")
+    add_topic_flag(parser)
     add_fact_flags(parser)
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file, or the name of a shipped one")
     add_localizer_flags(parser)
@@ -70,20 +78,12 @@ def run(args: argparse.Namespace) -> int:
     """0 if every image is solved, 5 if some are not or the run was stopped, 1 after an internal error."""
     if args.cluster is not None and find_spec("distributed") is None:
         args.usage_error("--cluster needs distributed: pip install '.[cluster]' in a clone of startrack")
-    from startrack.batch import images_under, listed_images, lock_results
+    from startrack.batch import lock_results
 
-    facts = _facts(args)
+    facts = absolute_facts(args)
     check_localizer(args)
-    _check_files_of_flags(facts)
-    whole = images_under(args.folder, args.dir)
-    found = listed_images(args.folder, _paths_in(sys.stdin.buffer.read()), args.dir) if args.files_on_stdin else whole
-    if not found:
-        raise BadInput("bad_image", f"{args.folder}: no PNG, TIFF, FITS, JPEG or camera raw images there")
-    if args.time is not None and len(found) > 1:
-        args.usage_error(
-            f"--time is of one image, and {args.folder} has {len(found)}: give each its time in a sidecar NAME.json "
-            "with time_utc"
-        )
+    check_files_of_flags(facts)
+    found, whole = find_images(args)
     out = make_folder(args.dir)
     with lock_results(out):
         return _run(found, whole, out, facts, args)
@@ -112,7 +112,7 @@ def _run(
                 _tasks(sorted({*whole, *found}), out, facts, args),
                 records,
                 {
-                    **_remove_paths(facts),
+                    **remove_paths(facts),
                     "localizer": args.localizer,
                     "evidence": args.evidence,
                     **({} if args.near is None else {"near": list(args.near)}),
@@ -173,31 +173,6 @@ def _check_ownership(out: Path, images: Sequence[Image], args: argparse.Namespac
         )
 
 
-def _facts(args: argparse.Namespace) -> dict[str, Any]:
-    """The facts given by flags, with absolute paths, since workers run in other folders."""
-    facts = flag_facts(args)
-    named = {key: os.path.abspath(facts[key]) for key in ("camera", "terrain") if is_path(facts.get(key, ""))}
-    return facts | named | {key: os.path.abspath(facts[key]) for key in IMAGE_FLAGS if key in facts}
-
-
-def _paths_in(listed: bytes) -> list[str]:
-    """Paths ended by NUL, as from `find -print0`, or else one a line."""
-    return os.fsdecode(listed).split("\0" if b"\0" in listed else "\n")
-
-
-def _check_files_of_flags(facts: dict[str, Any]) -> None:
-    """Raise BadInput for a camera, terrain or other file of a flag before anything is changed."""
-    from startrack.camera import load_camera
-    from startrack.exposure import read_dark, read_flat, read_mask
-    from startrack.terrain import load_terrain
-
-    load: dict[str, Callable[[str], object]] = {
-        "camera": load_camera, "terrain": load_terrain, "mask": read_mask, "dark": read_dark, "flat": read_flat,
-    }  # fmt: skip
-    for key in (key for key in load if key in facts):
-        load[key](facts[key])
-
-
 def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace) -> list[Task]:
     from startrack.batch import Task, record_path
 
@@ -206,7 +181,7 @@ def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argpa
         Task(
             name=image.name, path=os.path.abspath(image.path), result=str(record_path(here, image)), facts=facts,
             plots=not args.no_plots, overwrite=args.overwrite, localizer=args.localizer,
-            evidence=args.evidence, near=args.near,
+            evidence=args.evidence, near=args.near, bag_image=image.bag_image,
         )
         for image in found
     ]  # fmt: skip
@@ -221,12 +196,12 @@ def _prepare(task: Task, args: argparse.Namespace) -> None:
 
 def _terrain_of(task: Task) -> str | None:
     """Reference of the terrain of an image."""
-    from startrack.exposure import read_exposure
+    from startrack.batch import read_task
 
     if task.facts.get("terrain"):
         return str(task.facts["terrain"])
     with suppress(BadInput):  # reported when the image is located
-        return read_exposure(task.path, **task.facts).terrain
+        return read_task(task).terrain
     return None
 
 
@@ -243,14 +218,6 @@ def _write_tables(
     write_tables(out, found.rows, settings)
     for line in omission_lines(found):
         print(f"startrack: {line}", file=sys.stderr)
-
-
-def _remove_paths(facts: dict[str, Any]) -> dict[str, str]:
-    """The facts of flags for the manifest, without paths of this machine."""
-    return {
-        key: Path(value).name if key in ("camera", "terrain", *IMAGE_FLAGS) else str(value)
-        for key, value in facts.items()
-    }
 
 
 def _address(text: str) -> str:

@@ -26,9 +26,17 @@ EVIDENCE_SOURCES = ("both", "stars", "sky")  # as startrack.stages has them; wri
 
 def add_image_flags(parser: argparse.ArgumentParser) -> None:
     """Flags of every command that reads images."""
-    parser.add_argument("images", nargs="+", metavar="IMAGE", help="PNG, TIFF, FITS, JPEG or camera raw")
+    parser.add_argument(
+        "images", nargs="+", metavar="IMAGE", help="PNG, TIFF, FITS, JPEG, camera raw, ROS bag, or BAG#NUMBER"
+    )
+    add_topic_flag(parser)
     add_fact_flags(parser)
     add_output_flags(parser)
+
+
+def add_topic_flag(parser: argparse.ArgumentParser) -> None:
+    """The flag for the images of a bag."""
+    parser.add_argument("--image-topic", metavar="TOPIC", help="of a ROS bag with several")
 
 
 def add_fact_flags(parser: argparse.ArgumentParser) -> None:
@@ -109,10 +117,13 @@ def add_output_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def read(path: str, args: argparse.Namespace) -> Exposure:
-    """The image with its facts; flags take precedence over sidecar and header."""
-    from startrack.exposure import read_exposure
+    """The image with its facts; flags take precedence over sidecar and header. With --image-topic also of a bag."""
+    from startrack.exposure import choose_bag_image, read_bag_image, read_exposure, split_bag_path
 
-    return read_exposure(path, **flag_facts(args))
+    bag = split_bag_path(path) if hasattr(args, "image_topic") else None
+    if bag is None:
+        return read_exposure(path, **flag_facts(args))
+    return read_bag_image(choose_bag_image(*bag, args.image_topic), **flag_facts(args))
 
 
 def flag_facts(args: argparse.Namespace) -> dict[str, Any]:
@@ -156,7 +167,10 @@ def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, s
     """
     codes = [0]
     from startrack.batch.find import result_stems
+    from startrack.exposure import split_bag_path
 
+    if args.image_topic is not None and not any(split_bag_path(path) for path in args.images):
+        args.usage_error("--image-topic is for ROS bags, and none is given")
     for path, stem in zip(args.images, result_stems(args.images), strict=True):
         try:
             outcome = one(path, stem)

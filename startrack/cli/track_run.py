@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 Source = tuple[str, "Callable[[], ObservedFrame]"]  # of one image: its name, and what adds it to the track
 QUICK_S = 0.2  # files that take longer are written when no image waits
-BAGS = (".bag", ".db3", ".mcap")
 
 
 class TrackRun:
@@ -132,9 +131,10 @@ class TrackRun:
     def _paths(self) -> list[str] | None:
         """The image files; None for a bag."""
         from startrack.batch.find import images_under
+        from startrack.exposure import is_bag
 
         first = Path(self.args.frames[0])
-        if len(self.args.frames) == 1 and (first.suffix.lower() in BAGS or (first / "metadata.yaml").is_file()):
+        if len(self.args.frames) == 1 and is_bag(first):
             return None
         paths = [one.path for one in images_under(first, self.args.dir)] if first.is_dir() else self.args.frames
         if not paths:

@@ -1,12 +1,21 @@
 """One image with the facts that travel with it: read, validate, write.
 
 `decode_file.py` opens a file and picks its decoder (`png.py`, `tiff.py`, `jpeg.py`, `fits.py`, `mosaic.py` for camera
-raw files); `mask.py` reads which pixels count; `correct.py` applies dark frame and
-flat field; `metadata.py` finds time, exposure seconds, camera, terrain, mask, dark frame and flat field: in flags, the
-sidecar (`sidecar.py`) and the header (`header.py`); `write.py` writes images and sidecars. A file that cannot be used
-raises `startrack.types.BadInput` and no other exception.
+raw files); `bag.py` and `bag_images.py` read images from ROS bags; `mask.py` reads which pixels count; `correct.py`
+applies dark frame and flat field; `metadata.py` finds time, exposure seconds, camera, terrain, mask, dark frame and
+flat field: in flags, the sidecar (`sidecar.py`) and the header (`header.py`); `write.py` writes images and sidecars.
+A file that cannot be used raises `startrack.types.BadInput` and no other exception.
 """
 
+from startrack.exposure.bag import is_bag
+from startrack.exposure.bag_images import (
+    BagImage,
+    choose_bag_image,
+    list_bag_images,
+    read_bag_exposures,
+    read_bag_image,
+    split_bag_path,
+)
 from startrack.exposure.correct import correct_exposure, read_dark, read_flat
 from startrack.exposure.decode_file import decode_bytes
 from startrack.exposure.decoded import are_fractions
@@ -16,7 +25,8 @@ from startrack.exposure.read import exposure_of, exposure_of_decoded, read_expos
 from startrack.exposure.write import write_exposure, write_sidecar
 
 __all__ = [
-    "Facts", "are_fractions", "combine_masks", "correct_exposure", "decode_bytes", "exposure_of", "exposure_of_decoded",
-    "mask_of", "read_dark", "read_exposure", "read_flat", "read_mask", "touch_masked", "with_facts", "write_exposure",
-    "write_sidecar",
+    "BagImage", "Facts", "are_fractions", "choose_bag_image", "combine_masks", "correct_exposure", "decode_bytes",
+    "exposure_of", "exposure_of_decoded", "is_bag", "list_bag_images", "mask_of", "read_bag_exposures",
+    "read_bag_image", "read_dark", "read_exposure", "read_flat", "read_mask", "split_bag_path", "touch_masked",
+    "with_facts", "write_exposure", "write_sidecar",
 ]  # fmt: skip

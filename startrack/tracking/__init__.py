@@ -1,6 +1,6 @@
-"""Many exposures: tracks of a camera at rest or on a drive; odometry, and images and odometry from ROS bags."""
+"""Many exposures: tracks of a camera at rest or on a drive; odometry from text and ROS bags."""
 
-from startrack.tracking.bag_images import read_bag_exposures
+from startrack.exposure import read_bag_exposures
 from startrack.tracking.observe import ObservedFrame, observe_frame
 from startrack.tracking.odometry import Odometry, read_odometry
 from startrack.tracking.session import TrackSession

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
 
 from startrack.errors import BadInput
+from startrack.exposure.bag import BAG_SUFFIXES, ODOMETRY_TYPES, is_bag, read_messages
 from startrack.files import MAX_CAUSE_CHARS, FilePath, printable, read_text
 from startrack.frames import format_utc
-from startrack.tracking.bag import BAG_SUFFIXES, ODOMETRY_TYPES, is_bag, read_messages
 from startrack.types import Array, Value, array
 
 TUM_COLUMNS = "time tx ty tz qx qy qz qw"
@@ -89,7 +90,7 @@ def read_odometry(path: FilePath, topic: str | None = None, *, growing: bool = F
     Raises:
         BadInput: bad_odometry with the file and the cause, in one line.
     """
-    if is_bag(path):
+    if is_bag(path) or Path(path).is_dir():
         return _odometry_of_bag(path, topic)
     if topic is not None:
         _refuse(f"{printable(path)}: is read as text and has no topic {topic}; bags end in {', '.join(BAG_SUFFIXES)}")

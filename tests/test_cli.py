@@ -413,16 +413,31 @@ def test_a_full_disk_behind_stdout_is_named(folder):
     )
 
 
-def test_shell_completion_knows_the_commands(folder, tmp_path):
-    """As bash calls argcomplete: the completions are written to descriptor 8."""
+@pytest.mark.parametrize(
+    ("shell", "answers"),
+    [
+        ({}, {"loc": "locate", "locate --ima": "--image-topic"}),  # bash and zsh
+        (
+            {"_ARGCOMPLETE_SHELL": "fish", "_ARGCOMPLETE_DFS": "\t", "_ARGCOMPLETE_SUPPRESS_SPACE": "1"},
+            {
+                "loc": "locate\timage to position and attitude",
+                "locate --ima": "--image-topic\tof a ROS bag with several",
+            },
+        ),
+    ],
+    ids=["bash", "fish"],
+)
+def test_shell_completion_knows_the_commands(folder, tmp_path, shell, answers):
+    """As the functions of register-python-argcomplete call it: the completions are written to descriptor 8."""
     pytest.importorskip("argcomplete", reason="the extra `completion` is not installed")
     answer = tmp_path / "answer"
-    words = {"COMP_LINE": "startrack loc", "COMP_POINT": "13", "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n"}
     command = f"exec 8>{answer} 9>/dev/null; exec {sys.executable} -m startrack"
-    subprocess.run(
-        ["bash", "-c", command], cwd=folder, check=False, env={**os.environ, **words, "PYTHONPATH": str(ROOT)}
-    )
-    assert answer.read_text().strip() == "locate"
+    for words, expected in answers.items():
+        line = f"startrack {words}"
+        asked = {"COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n"}
+        env = {**os.environ, **asked, **shell, "PYTHONPATH": str(ROOT)}
+        subprocess.run(["bash", "-c", command], cwd=folder, check=False, env=env)
+        assert answer.read_text().strip() == expected
 
 
 def test_doctor_knows_the_packages_and_extras_of_the_project():

@@ -218,6 +218,19 @@ def test_the_black_level_is_not_divided(tmp_path):
         assert image[radius > 262.0].mean() == pytest.approx(0.0, abs=0.2)
 
 
+def test_a_dark_frame_of_another_exposure_time_and_a_flat_field_alone_give_a_warning(tmp_path):
+    flat = Exposure(pixels_adu=np.full((8, 8), 1000.0))
+    files = {"flat": write_exposure(tmp_path / "flat.fits", flat)}
+    for name, seconds in (("dark", 30.0), ("short", 10.0)):
+        write_exposure(tmp_path / f"{name}.fits", replace(flat, exposure_s=seconds))
+    image = replace(flat, exposure_s=31.0)
+    assert correct_exposure(image, dark=tmp_path / "dark.fits", **files).warnings == ()
+    (note,) = correct_exposure(image, dark=tmp_path / "short.fits", **files).warnings
+    assert note == "the dark frame was exposed for 10 s, the image for 31 s"
+    (note,) = correct_exposure(image, **files).warnings
+    assert note.startswith("flat field without a dark frame: the black level is divided too")
+
+
 def test_the_noise_of_coarse_counts_is_right_after_correction(tmp_path):
     """Rounding to whole counts is part of the noise, though the corrected counts are not whole."""
     rng, shape = np.random.default_rng(6), (512, 512)

@@ -10,15 +10,17 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from startrack.correction import Correction
 from startrack.exposure.decode_file import decode_file
+from startrack.exposure.header import header_number
 from startrack.exposure.mosaic import PHASES
 from startrack.files import printable
 from startrack.types import BadInput, Bools, Exposure, Mask
@@ -26,7 +28,9 @@ from startrack.types import BadInput, Bools, Exposure, Mask
 MIN_SENSITIVITY_1 = 0.05  # of the median: darker pixels of a flat field do not count
 LIT_PERCENTILE = 99.0  # of a flat field: pixels above MIN_SENSITIVITY_1 of this are in the image circle
 SATURATED_1 = 0.98  # of the largest value: a dark frame is saturated there
+LONGEST_OTHER_1 = 1.1  # ratio of the exposure times of dark frame and image above which a warning is given
 KEPT_FRAMES = 2  # of each kind: a night has one, seldom two
+FLAT_ALONE = "flat field without a dark frame: the black level is divided too, unless the camera file has its bias_adu"
 Picture = NDArray[np.float32]
 
 
@@ -38,6 +42,7 @@ class CalibrationFrame:
     unusable: Bools | None  # (H, W): values are 0, or 1 of a flat; None where every pixel is usable
     median_adu: float
     sha256: str
+    exposure_s: float | None  # by its header
 
 
 def correct_exposure(
@@ -52,7 +57,8 @@ def correct_exposure(
     if dark is None and flat is None:
         return exposure
     pixels, correction = correct_counts(exposure.pixels_adu, exposure.saturation_adu, dark, flat)
-    return replace(exposure, pixels_adu=pixels, correction=correction)
+    notes = exposure.warnings + correction_warnings(dark, flat, exposure.exposure_s)
+    return replace(exposure, pixels_adu=pixels, correction=correction, warnings=notes)
 
 
 def correct_counts(
@@ -92,6 +98,18 @@ def correct_counts(
     )
 
 
+def correction_warnings(
+    dark: str | os.PathLike[str] | None, flat: str | os.PathLike[str] | None, exposure_s: float | None
+) -> tuple[str, ...]:
+    """Warnings about a flat field alone, and a dark frame of another exposure time than `exposure_s` of the image."""
+    if dark is None:
+        return () if flat is None else (FLAT_ALONE,)
+    stated = read_dark(dark).exposure_s
+    if stated is None or exposure_s is None or max(stated, exposure_s) < LONGEST_OTHER_1 * min(stated, exposure_s):
+        return ()
+    return (f"the dark frame was exposed for {stated:g} s, the image for {exposure_s:g} s",)
+
+
 def read_dark(path: str | os.PathLike[str]) -> CalibrationFrame:
     """The dark frame in the image at `path`. Raises BadInput bad_image if it cannot be read, or is saturated."""
     return _read(path, "dark frame", _read_dark)
@@ -122,7 +140,7 @@ def _read_dark(path: str, stamp: tuple[int, ...]) -> CalibrationFrame:
     median = float(np.median(decoded.pixels_adu))
     excess = decoded.pixels_adu - np.float32(median)
     top = np.inf if decoded.saturation_adu is None else SATURATED_1 * decoded.saturation_adu
-    return _frame(path, raw, excess, decoded.pixels_adu >= top, median, fill=0.0, cause="is saturated")
+    return _frame(path, raw, excess, decoded.pixels_adu >= top, median, decoded.header, fill=0.0, cause="is saturated")
 
 
 @lru_cache(maxsize=KEPT_FRAMES)
@@ -130,7 +148,7 @@ def _read_flat(path: str, stamp: tuple[int, ...]) -> CalibrationFrame:
     """The flat field of a grey or colour image at `path`, read once as long as the file keeps its `stamp`."""
     raw, decoded = decode_file(path)
     level = _lit_level(decoded.pixels_adu, path)
-    return _flat_frame(path, raw, decoded.pixels_adu / np.float32(level), level)
+    return _flat_frame(path, raw, decoded.pixels_adu / np.float32(level), level, decoded.header)
 
 
 @lru_cache(maxsize=KEPT_FRAMES)
@@ -141,7 +159,7 @@ def _read_mosaic_flat(path: str, stamp: tuple[int, ...]) -> CalibrationFrame:
     levels = [_lit_level(decoded.pixels_adu[i::2, j::2], path) for i, j in PHASES]
     for (i, j), level in zip(PHASES, levels, strict=True):
         sensitivity[i::2, j::2] /= np.float32(level)
-    return _flat_frame(path, raw, sensitivity, float(np.mean(levels)))
+    return _flat_frame(path, raw, sensitivity, float(np.mean(levels)), decoded.header)
 
 
 def _lit_level(pixels_adu: Picture, path: str) -> float:
@@ -152,22 +170,24 @@ def _lit_level(pixels_adu: Picture, path: str) -> float:
     return float(np.median(pixels_adu[pixels_adu > limit]))
 
 
-def _flat_frame(path: str, raw: bytes, sensitivity: Picture, level: float) -> CalibrationFrame:
+def _flat_frame(
+    path: str, raw: bytes, sensitivity: Picture, level: float, header: Mapping[str, Any]
+) -> CalibrationFrame:  # fmt: skip
     dark = sensitivity < MIN_SENSITIVITY_1
-    return _frame(path, raw, sensitivity, dark, level, fill=1.0, cause="is dark")
+    return _frame(path, raw, sensitivity, dark, level, header, fill=1.0, cause="is dark")
 
 
 def _frame(
-    path: str, raw: bytes, values: Picture, unusable: Bools, median: float, *, fill: float, cause: str
-) -> CalibrationFrame:
+    path: str, raw: bytes, values: Picture, unusable: Bools, median: float, header: Mapping[str, Any], *,
+    fill: float, cause: str,
+) -> CalibrationFrame:  # fmt: skip
     """The frame whose unusable pixels hold `fill`. Raises BadInput bad_image with `cause` where all are unusable."""
     if unusable.all():
         raise BadInput("bad_image", f"{printable(path)}: every pixel {cause}")
     values[unusable] = fill
     values.flags.writeable = False
-    return CalibrationFrame(
-        values, unusable if unusable.any() else None, median, hashlib.sha256(raw).hexdigest()
-    )  # fmt: skip
+    sha256, exposure_s = hashlib.sha256(raw).hexdigest(), header_number(header, "exposure_s", [])
+    return CalibrationFrame(values, unusable if unusable.any() else None, median, sha256, exposure_s)
 
 
 def _check_shape(kind: str, frame: CalibrationFrame, pixels: Picture) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.exposure.correct import correct_counts
+from startrack.exposure.correct import correct_counts, correction_warnings
 from startrack.exposure.decode_file import decode_file
 from startrack.exposure.decoded import COLOUR_WARNING, Decoded, bad_image, check_size, grey_float32, largest_value
 from startrack.exposure.mask import mask_of
@@ -61,11 +61,14 @@ def exposure_of_decoded(decoded: Decoded, facts: Facts, *, raw: bytes, name: str
     They are corrected by the dark frame and the flat field of the facts; then the pixels of a mosaic are equalized.
     Raises BadInput (bad_image, size_mismatch) for a dark frame or flat field that cannot be used.
     """
-    pixels, correction, mosaic = decoded.pixels_adu, None, _is_mosaic(decoded, facts)
+    pixels, correction, notes = decoded.pixels_adu, None, decoded.warnings
+    mosaic = _is_mosaic(decoded, facts)
     if facts.dark is not None or facts.flat is not None:
         pixels, correction = correct_counts(pixels, decoded.saturation_adu, facts.dark, facts.flat, mosaic=mosaic)
+        notes += correction_warnings(facts.dark, facts.flat, facts.exposure_s)
     if mosaic:
         pixels = equalize_mosaic(pixels, decoded.saturation_adu)
+        notes += (MOSAIC_WARNING,)
     return Exposure(
         pixels_adu=pixels,
         name=name,
@@ -78,7 +81,7 @@ def exposure_of_decoded(decoded: Decoded, facts: Facts, *, raw: bytes, name: str
         mask=facts.mask,
         saturation_adu=decoded.saturation_adu,
         sha256=hashlib.sha256(raw).hexdigest(),
-        warnings=decoded.warnings + ((MOSAIC_WARNING,) if mosaic else ()) + facts.warnings,
+        warnings=notes + facts.warnings,
         correction=correction,
     )
 

@@ -52,20 +52,26 @@ class BagImage:
 
 
 def split_bag_path(path: str) -> tuple[str, int | None] | None:
-    """The bag and the number of an image, of a text BAG or BAG#NUMBER; None where the text names no bag."""
+    """The bag and the number of an image, of a `path` BAG or BAG#NUMBER; None where the path is of no bag."""
     found = None if os.path.exists(path) else NUMBERED.fullmatch(path)
     bag, number = (found["bag"], int(found["number"])) if found else (path, None)
     return (bag, number) if is_bag(bag) else None
 
 
 def list_bag_images(path: FilePath, topic: str | None = None) -> list[BagImage]:
-    """The images of a bag's image `topic` (None: its only one), without their pixels. Raises BadInput bad_image."""
+    """The images of a `topic` of the bag at `path`, without their pixels. None: its only topic of images.
+
+    Raises BadInput bad_image.
+    """
     messages = list_messages(path, IMAGE_TYPES, topic, **READING)
     return [BagImage(os.fspath(path), number, message) for number, message in enumerate(messages)]
 
 
 def choose_bag_image(path: FilePath, number: int | None, topic: str | None = None) -> BagImage:
-    """The image of that number, or the only one. Raises BadInput bad_image where there is no such, or several."""
+    """The image `number` (None: the only one) of a `topic` of the bag at `path`.
+
+    Raises BadInput bad_image where there is no such image, or several.
+    """
     images, name = list_bag_images(path, topic), printable(path)
     if number is None and len(images) != 1:
         raise BadInput(
@@ -79,7 +85,7 @@ def choose_bag_image(path: FilePath, number: int | None, topic: str | None = Non
 
 
 def read_bag_image(image: BagImage, **given: Any) -> Exposure:
-    """The exposure of one `image`. Arguments, time and exceptions: `read_bag_exposures`."""
+    """The exposure of one `image` with the facts `given`. Time and exceptions are as of `read_bag_exposures`."""
     message = read_message(image.bag, IMAGE_TYPES, image.message, reason=READING["reason"])
     where = f"{printable(image.bag)}: image {image.number} of {message.topic}"
     return _exposure_of(message, where, Path(image.path).name, image.path, given)

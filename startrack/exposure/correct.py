@@ -116,7 +116,10 @@ def read_dark(path: str | os.PathLike[str]) -> CalibrationFrame:
 
 
 def read_flat(path: str | os.PathLike[str], *, mosaic: bool = False) -> CalibrationFrame:
-    """The flat field in the image at `path`. Raises BadInput bad_image if it cannot be read, or is dark."""
+    """The flat field in the image at `path`, of a `mosaic` with a median for each colour.
+
+    Raises BadInput bad_image if it cannot be read, or is dark.
+    """
     return _read(path, "flat field", _read_mosaic_flat if mosaic else _read_flat)
 
 

@@ -44,7 +44,7 @@ def combine_masks(
 ) -> Mask | None:  # fmt: skip
     """The pixels that the mask `of_image` or the mask `of_camera` hides, in an image of `size_px` (W, H); None: none.
 
-    Pixels that a dark frame or flat field cannot correct do not count either, and are in no hash.
+    Pixels that a dark frame or flat field cannot correct (`of_correction`) do not count either, and are in no hash.
     A mask is its file's path, or the mask itself. Raises BadInput: bad_image and bad_calibration where a file is no
     mask, size_mismatch where it has another size than the image.
     """

@@ -9,6 +9,7 @@ import numpy as np
 
 from startrack.localization import ExactPosterior, Localizer
 from startrack.localization.blocked import find_blocked
+from startrack.localization.summary import ground_of_fix
 from startrack.stages import StarRays
 from startrack.types import Fix, NotLocated
 
@@ -31,7 +32,7 @@ def leave_out_blocked(measured: S, fix: Fix, localizer: Localizer) -> S:
         return measured
     rows, blocked = replace(measured.evidence(), clock=None), None
     for _ in range(ROUNDS):
-        newer = find_blocked(rows, fix, measured.terrain)
+        newer = find_blocked(rows, fix, ground_of_fix(fix, measured.terrain))
         if newer is None and (blocked is None or blocked.risen):  # the better position meets a low ridge's flanks
             break
         if newer is not None and newer.same_as(blocked):

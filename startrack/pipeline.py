@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.crater_depth import check_depth_by_stars
 from startrack.detection import find_damage
 from startrack.frames import Site
 from startrack.localization import localizer_name
@@ -23,10 +24,10 @@ from startrack.orientation import (
     solve_orientation,
 )  # fmt: skip
 from startrack.run import Run, with_timing
-from startrack.sky_refinement import OtherDepth, check_depth, refine_by_sky_light
+from startrack.sky_refinement import check_depth, refine_by_sky_light
 from startrack.skyline import measured_skyline
 from startrack.stages import Detected, Inputs, Located, Oriented, Refused, Settings
-from startrack.star_fix import check_fix, fix_by_stars, fix_unblocked, with_integrity
+from startrack.star_fix import check_by_stars, check_fix, fix_by_stars, fix_unblocked, with_integrity, with_shown_depth
 from startrack.terrain import Terrain
 from startrack.types import BadInput, Exposure, NoSolution, NotLocated
 
@@ -78,37 +79,28 @@ def locate(
 
 def _check_and_refine(located: Located, settings: Settings) -> Located:
     """The fix, checked, and refined by the light of the sky; of another depth where that and the stars agree."""
-    try:
-        return _refine_checked(located, settings)
-    except OtherDepth as shown:
-        if not _stars_allow_depth(located, shown.steeper, settings):
-            return _refine_checked(located, settings, depth_is_right=True)
-        located = replace(located, terrain=shown.terrain, steeper=shown.steeper)
-        located = fix_by_stars(located, Located, settings.localizer)
-        return _refine_checked(located, settings, depth_is_right=True)
+
+    def check(fixed: Located, depth_is_right: bool) -> Located:
+        return _refine_checked(fixed, settings, depth_is_right)
+
+    return with_shown_depth(located, check, Located, settings.localizer)
 
 
-def _refine_checked(located: Located, settings: Settings, depth_is_right: bool = False) -> Located:
+def _refine_checked(located: Located, settings: Settings, depth_is_right: bool) -> Located:
     """Raises NotLocated where the rays contradict the fix, and, unless `depth_is_right`, OtherDepth."""
+    if settings.evidence_sources == "stars":
+        return check_by_stars(located, depth_is_right)
     try:
         check_fix(located)
     except NotLocated:
-        if settings.evidence_sources != "stars" and not depth_is_right:
+        if not depth_is_right:
             check_depth(located)
+            check_depth_by_stars(located)
         raise
-    if settings.evidence_sources == "stars":
-        return located
-    return refine_by_sky_light(located, settings.evidence_sources == "both", depth_is_right)
-
-
-def _stars_allow_depth(located: Located, steeper: float, settings: Settings) -> bool:
-    """Whether the stars do not contradict a crater deeper by a part: a second skyline shows one to the light alone."""
-    deeper = replace(located, terrain=located.terrain.reshaped(np.array([steeper, 0.0])))
-    try:
-        check_fix(fix_by_stars(deeper, Located, settings.localizer))
-    except NotLocated:
-        return False
-    return True
+    refined = refine_by_sky_light(located, settings.evidence_sources == "both", depth_is_right)
+    if refined.sky_light is None and not depth_is_right:
+        check_depth_by_stars(located)
+    return refined
 
 
 def _sky_step(run: Run, located: Located) -> SkyStep | None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from startrack.crater_depth import OtherDepth
 from startrack.evidence import Skyline
 from startrack.evidence.sky_checks import MIN_SECTORS, sectors_with_step
 from startrack.evidence.sky_levels import SECTORS, sector_of
@@ -42,14 +43,6 @@ MOST_STARS_CHI2 = 22.0  # of the step against the fix by the stars: one in 60,00
 FREE_STEEPNESS = 0.02  # relative standard deviation of a crater's depth where it is fitted freely
 MOST_STEEPER = 0.01  # beyond this the crater is another one
 SHAPE_SIGMAS = 3.0  # of a free depth over the stated one; of 0.3 % wrong depths in the thesis's crater 7 of 9 show more
-
-
-class OtherDepth(Exception):
-    """The light of the sky shows a crater of another depth than the stated one."""
-
-    def __init__(self, terrain: Cylinder, steeper: float) -> None:
-        super().__init__(f"{steeper:+.2%}")
-        self.terrain, self.steeper = terrain, steeper  # with this error (relative) as that of its depth
 
 
 class NoSkyLight(Exception):
@@ -122,7 +115,7 @@ def check_depth(located: Located, there: tuple[Array, SkyLight] | None = None) -
     steeper, variance = float(fit.shared[OFFSET_TERMS]), fit.shared_covariance[OFFSET_TERMS, OFFSET_TERMS]
     least = SHAPE_SIGMAS * np.hypot(np.sqrt(fit.excess * variance), terrain.shape_sigma[0])
     if least < abs(steeper) < MOST_STEEPER:
-        raise OtherDepth(replace(terrain, depth_sigma_m=abs(steeper) * terrain.depth_m), steeper)
+        raise OtherDepth(terrain, steeper)
 
 
 def _refine(located: Located, stars: bool, depth_is_right: bool) -> Located:

@@ -169,7 +169,7 @@ class StarRays:
     light: StarPhotometry
     near: PositionPrior | None = None  # of the position
     blocked: Blocked | None = None  # parts of the view that are left out; None: nothing is blocked
-    steeper: float = 0.0  # relative, by which the sky's light shows a crater deeper than its file states
+    steeper: float = 0.0  # relative, by which the image shows a crater deeper than its file states
 
     def evidence(self) -> Evidence:
         """The rays for the localizer."""
@@ -212,7 +212,7 @@ class Measured(StarRays, Oriented):
     def warnings(self) -> list[str]:
         """Facts in the image's file that were not used; what the terrain does not cover, and errors it leaves out."""
         blocked = [] if self.blocked is None else [f"blocked and left out: {self.blocked.text}"]
-        depth = f"the light of the sky shows a depth {self.steeper:+.2%} off that of the terrain file: it is estimated"
+        depth = f"the image shows a depth {self.steeper:+.2%} off that of the terrain file: it is estimated"
         steeper = [depth] if self.steeper else []
         return [
             *super().warnings, *self.terrain.masked_sectors(), *self.terrain.error_warnings(), *blocked, *steeper,

@@ -28,7 +28,7 @@ LAYERS = (  # lowest first; a package imports from lower layers only
     {"attitude"},
     {"rendering", "detection", "identification", "evidence", "localization"},
     {"stages"},
-    {"sky_errors", "run"},
+    {"sky_errors", "run", "crater_depth"},
     {"measurement", "orientation", "sky_refinement", "blocked_view", "skyline"},
     {"star_fix"},
     {"pipeline", "calibration", "inputs", "simulation"},

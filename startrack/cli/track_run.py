@@ -164,7 +164,7 @@ class TrackRun:
         if frame.steeper and not self._shows_depth:
             self._shows_depth = True
             print(
-                f"{frame.name}  the light of the sky shows a depth {frame.steeper:+.2%} off that of the terrain file: "
+                f"{frame.name}  the image shows a depth {frame.steeper:+.2%} off that of the terrain file: "
                 "the track estimates it", file=sys.stderr, flush=True,
             )  # fmt: skip
         if not frame.modes:

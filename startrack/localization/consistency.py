@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from startrack.localization.likelihood import SECTOR_EPSILON, SECTOR_RAD, PositionLikelihood
-from startrack.localization.nuisance import STEEPNESS_LEEWAY, lower_evidence
-from startrack.localization.refit import STEPS_M, refitted_gain
+from startrack.localization.nuisance import lower_evidence
 from startrack.localization.sector_likelihood import Sectors, contributions
+from startrack.localization.stretch import STRETCH_GAIN_NATS, STRETCHES, best_stretch
 from startrack.localization.time_check import check_time
 from startrack.terrain import Terrain
 from startrack.types import Array, Evidence, Fix, NotLocated
@@ -29,10 +29,6 @@ CONTRADICTED_NATS = -3.0  # of one sector
 NAMED_STRETCHES = 3
 MAX_SEPARATE = 7  # at right positions 0 to 3 were seen, and 9 or more where the sky was turned by 6 degrees and more
 
-STRETCHES = (0.005, 0.01, 0.015, 0.025, 0.05, 0.1)  # relative, both ways
-SMALL_STRETCHES = 4  # of these: the others are tried only where these gain
-STRETCH_NEARBY_M = 80.0
-STRETCH_GAIN_NATS = 4.5  # a true map gains more in 1 of 370; of 240 images with maps 1 % off the least gain was 7.6
 STRETCH_SIGMAS = 3.0  # of what the terrain file itself admits
 
 
@@ -159,39 +155,6 @@ def contradicted_stretches(by_sector: Array) -> list[tuple[int, int]]:
 def admitted_stretch(terrain: Terrain) -> float:
     """Relative error (one sigma) of the horizon that the terrain file admits: the fix has it in its covariance."""
     return float(np.hypot(terrain.shape_sigma[0], terrain.common_sigma_rad / USUAL_HORIZON_RAD))
-
-
-def best_stretch(likelihood: PositionLikelihood, position_m: Array) -> tuple[float, float]:
-    """The stretch of the horizon that fits best near a position (2,), and how much better [nats] than none.
-
-    tan H -> s tan H for all azimuths, the position free: a wrong depth, width or camera height shows as s != 1, while a
-    wrong position cannot. Large stretches are tried only where small ones gain, and more of them than less.
-    """
-    best, gain, at, sizes = 1.0, 0.0, position_m, STRETCHES[:SMALL_STRETCHES]
-    for leeway in (sizes[-1] * STEEPNESS_LEEWAY, STRETCHES[-1] * STEEPNESS_LEEWAY):
-        local = likelihood.near(position_m, STRETCH_NEARBY_M, leeway)
-        if not len(local.evidence):
-            break
-        middle, plain = local.climb(position_m, *STEPS_M)
-        for sign in (1, -1):
-            position = middle
-            for stretch in (1 + sign * size for size in sizes):
-                lowered = _lowered_rad(local.evidence, stretch)
-                position, fit = local.climb(position, *STEPS_M, lowered)
-                if fit - plain > gain:
-                    best, gain, at = stretch, fit - plain, position
-        if abs(best - 1) < sizes[-1] * (1 - 1e-9):
-            break
-        sizes = STRETCHES
-    if gain > STRETCH_GAIN_NATS and not likelihood.in_closed_form:
-        e = likelihood.evidence
-        gain = min(gain, refitted_gain(likelihood, position_m, replace(e, elevation_rad=_lowered_rad(e, best)), at))
-    return best, gain
-
-
-def _lowered_rad(evidence: Evidence, stretch: float) -> Array:
-    """Elevations (n,) [rad] at which the rows stand above the horizon as they do above one stretched by a factor."""
-    return np.asarray(np.arctan(np.tan(evidence.elevation_rad) / stretch))
 
 
 def _inconsistency(cause: str, stretches: list[tuple[int, int]]) -> NotLocated:

@@ -67,6 +67,11 @@ def require_inside(points_m: Array, weight: Array, terrain: Terrain) -> Bools:
     return np.asarray(~outside)
 
 
+def ground_of_fix(fix: Fix, terrain: Terrain) -> Terrain:
+    """The `terrain` with the shape that the evidence of a `fix` on it shows."""
+    return terrain.reshaped(np.array(fix.shape_1)) if any(fix.shape_1) else terrain
+
+
 def camera_at(point_m: Array, terrain: Terrain) -> Array:
     """East, north and up (3,) [m] of the camera that stands at a point (2,) [m] of the `terrain`."""
     up_m = float(terrain.ground_m(point_m[None, :])[0]) + terrain.camera_height_m

@@ -32,7 +32,7 @@ class ObservedFrame:
     image_errors: ImageErrors | None = None  # of the rows of the sky's light
     reason: str = ""  # of a refusal
     message: str = ""
-    steeper: float = 0.0  # relative, by which the sky's light shows a crater deeper than its file states
+    steeper: float = 0.0  # relative, by which the image shows a crater deeper than its file states
 
 
 def observe_frame(

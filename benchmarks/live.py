@@ -125,7 +125,7 @@ def kill_at_random(root: Path, kills: int) -> Path:
         running.communicate()
         stored = len(list((out / ".frames").glob("*.npz"))) if (out / ".frames").is_dir() else 0
         print(f"killed with {stored} of {part[-1] + 1} images located", flush=True)
-    follow(root, out, 3.0).communicate()
+    follow(root, out, 30.0).communicate()  # longer than an image takes beside other processes
     return out
 
 

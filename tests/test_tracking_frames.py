@@ -17,7 +17,7 @@ from startrack.tracking.importance_sampling import sample_posterior
 from startrack.tracking.observe import ObservedFrame, observe_frame
 from startrack.tracking.shared import BIAS, CLOCK, EDGE, SHAPES, ImageErrors, SharedErrors
 from startrack.tracking.smoother import Observations, Steps, smooth
-from startrack.types import Clock, Evidence
+from startrack.types import BadInput, Clock, Evidence
 
 TIME = datetime(2030, 6, 1, tzinfo=UTC)
 HORIZON_ERROR_RAD = np.radians(0.05)
@@ -205,17 +205,19 @@ def test_a_fix_of_another_depth_needs_an_error_of_the_depth(located):
         observe_frame(deeper, SharedErrors.of(deeper.terrain, None))
 
 
+def frame_at(terrain, shared, place, rng, number):
+    rows = rays_at(terrain, place, rng, rays=600)
+    guess = first_guess(shared, place + rng.normal(size=2), 25.0 * np.eye(2))
+    one = estimate_frame(rows, terrain, shared, *guess)
+    return ObservedFrame(f"{number}", TIME + timedelta(hours=number), None, (one,), rows)
+
+
 def test_exposures_at_rest_are_one_posterior():
     terrain, shared, nees, errors = crater(), SharedErrors.of(crater(), None), [], []
     for seed in range(6):
         rng = np.random.default_rng([6, seed])
         place = rng.uniform(-3000, 3000, 2)
-        frames = []
-        for k in range(4):
-            rows = rays_at(terrain, place, rng, rays=600)
-            guess = first_guess(shared, place + rng.normal(size=2), 25.0 * np.eye(2))
-            one = estimate_frame(rows, terrain, shared, *guess)
-            frames.append(ObservedFrame(f"{k}", TIME + timedelta(hours=k), None, (one,), rows))
+        frames = [frame_at(terrain, shared, place, rng, k) for k in range(4)]
         found = positions_at_rest(frames, terrain, shared)
         assert found.mode.tolist() == [0, 0, 0, 0]
         pooled = ExactPosterior()(Evidence.concatenate(*(frame.evidence for frame in frames)), terrain)
@@ -227,3 +229,17 @@ def test_exposures_at_rest_are_one_posterior():
         errors.append(np.linalg.norm(off, axis=1))
     assert np.mean(errors, axis=0)[-1] < 0.6 * np.mean(errors, axis=0)[0]
     assert 0.7 < np.mean(nees) < 4.5
+
+
+@pytest.mark.parametrize("apart_m", [200.0, 1000.0])
+def test_a_camera_that_moved_is_not_at_rest(apart_m):
+    """Nothing slips at rest: of many images that which moved is left out, and of two or four there is no majority."""
+    terrain, shared, rng = crater(), SharedErrors.of(crater(), None), np.random.default_rng(12)
+    here, there = np.array([1000.0, -500.0]), np.array([1000.0, -500.0 + apart_m])
+    frames = [frame_at(terrain, shared, there if k == 2 else here, rng, k) for k in range(5)]
+    assert positions_at_rest(frames, terrain, shared).mode.tolist() == [0, 0, -1, 0, 0]
+    for count in (2, 4):
+        moved = [frame_at(terrain, shared, here + k * (there - here), rng, k) for k in range(count)]
+        with pytest.raises(BadInput, match="agree on one position") as refusal:
+            positions_at_rest(moved, terrain, shared)
+        assert refusal.value.reason == "inconsistent_evidence"

@@ -182,6 +182,8 @@ class TrackRun:
             if exit_code_of(cause.reason) == EXIT_BAD_INPUT:
                 raise
             for frame in self.session.frames:
+                if not frame.reason:
+                    continue
                 print(f"{frame.name}  refused  {frame.reason}: {frame.message}", file=sys.stderr, flush=True)
             print(f"startrack: {cause.reason}: {cause}", file=sys.stderr, flush=True)
             self.codes.add(exit_code_of(cause.reason))

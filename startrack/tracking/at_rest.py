@@ -13,7 +13,7 @@ from startrack.tracking.frame_estimate import FrameEstimate, estimate_frame
 from startrack.tracking.observe import ObservedFrame
 from startrack.tracking.shared import ImageErrors, SharedErrors
 from startrack.tracking.smoother import UNKNOWN_M, Observations, Smoothed, Steps, smooth
-from startrack.types import Array, Evidence, Ints
+from startrack.types import Array, BadInput, Evidence, Ints
 
 STILL_M = 1e-3  # of a camera at rest from exposure to exposure, in the comparison of single fixes
 
@@ -32,10 +32,12 @@ def positions_at_rest(frames: Sequence[ObservedFrame], terrain: Terrain, shared:
     """The position by the evidence of the first exposures, for each number of them.
 
     Single fixes that contradict the others are left out. Errors that exposures share (bias, clock, shape, heights of
-    posts) are carried once. Raises ValueError where no exposure has a position.
+    posts) are carried once. Raises ValueError where no exposure has a position, and BadInput (inconsistent_evidence)
+    where half of those with a single position or more are elsewhere.
     """
     n = len(frames)
     mode = agreeing_fixes([frame.modes for frame in frames], terrain.height_sigma_m).mode
+    _require_rest(frames, mode)
     position, covariance = np.zeros((n, 2)), np.repeat([UNKNOWN_M**2 * np.eye(2)], n, axis=0)
     first, *later = np.flatnonzero(mode >= 0).tolist()
     found = _alone(frames[first].modes[mode[first]], terrain)
@@ -48,10 +50,20 @@ def positions_at_rest(frames: Sequence[ObservedFrame], terrain: Terrain, shared:
     return AtRest(position, covariance, found, mode)
 
 
+def _require_rest(frames: Sequence[ObservedFrame], mode: Ints) -> None:
+    single = np.array([len(frame.modes) == 1 for frame in frames])
+    agree, count = int(np.sum(single & (mode >= 0))), int(np.sum(single))
+    if count > 1 and 2 * agree <= count:
+        raise BadInput(
+            "inconsistent_evidence",
+            f"only {agree} of {count} images agree on one position: has the camera moved? Then leave --at-rest out",
+        )
+
+
 def agreeing_fixes(modes: Sequence[Sequence[FrameEstimate]], height_sigma_m: float) -> RobustTrack:
     """The single fixes as a track that does not move: which of them agree."""
     still = Steps(np.zeros((len(modes) - 1, 2)), np.full(len(modes) - 1, STILL_M))
-    return smooth_robustly(modes, still, height_sigma_m)
+    return smooth_robustly(modes, still, height_sigma_m, may_slip=False)
 
 
 def _alone(estimate: FrameEstimate, terrain: Terrain) -> Smoothed:

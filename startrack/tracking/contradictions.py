@@ -32,10 +32,13 @@ class RobustTrack:
     slipped: Bools  # (n - 1,)
 
 
-def smooth_robustly(modes: Sequence[Sequence[FrameEstimate]], steps: Steps, height_sigma_m: float) -> RobustTrack:
+def smooth_robustly(
+    modes: Sequence[Sequence[FrameEstimate]], steps: Steps, height_sigma_m: float, *, may_slip: bool = True
+) -> RobustTrack:
     """The estimate from frames with one mode each, several (ambiguous) or none (refused), and the moves between them.
 
-    Ambiguous frames are left out at first. Raises ValueError where no frame has a single mode.
+    Moves are right unless they `may_slip`. Ambiguous frames are left out at first. Raises ValueError where no frame has
+    a single mode.
     """
     mode = np.array([0 if len(of) == 1 else -1 for of in modes])
     slipped = np.zeros(len(modes) - 1, dtype=bool)
@@ -46,7 +49,7 @@ def smooth_robustly(modes: Sequence[Sequence[FrameEstimate]], steps: Steps, heig
         if state in tried:
             break
         tried.add(state)
-        doubt_steps = step_doubt(found, steps)
+        doubt_steps = step_doubt(found, steps) if may_slip else np.full(len(slipped), -np.inf)
         new_mode, doubt_frames = _frame_doubt(found, observations, modes, mode)
         doubt_frames[~_has_known_move(steps)] = -np.inf  # nothing predicts the frame
         # Moves stand between frames: one line of doubts, frame, move, frame, ...

@@ -59,7 +59,9 @@ def announce_compilation() -> None:
         def on_start(self, event: Any) -> None:
             if not self.made and event.data["dispatcher"].py_func.__module__.startswith("startrack."):
                 self.made = True
-                LOG.warning("compiling for this machine, once: about 20 s, for height maps a minute")
+                LOG.warning(
+                    "compiling what this command uses first: about 20 s, for height maps a minute; kept on disk"
+                )
 
         def on_end(self, event: Any) -> None:
             """Nothing to do."""

@@ -293,3 +293,11 @@ def test_the_library_has_it_and_checks_its_arguments():
         startrack.measure_horizon([PHOTO], site=Site("moon", 0.0, 0.0), fov=180)
     with pytest.raises(ValueError, match="no image"):
         startrack.measure_horizon([], site=LOWELL, fov=180)
+
+
+@pytest.mark.parametrize("site", [(-34.7443, -111.4223), (34.7443, 111.4223)])
+def test_stars_below_the_horizon_show_a_wrong_site(site):
+    wrong = Site("earth", *np.radians(site), 2361.0)
+    with pytest.raises(BadInput, match="identified stars are below the horizon") as refusal:
+        orient_frames([read_exposure(PHOTO)], load_catalog(), wrong, camera=load_camera("lowell-ldt"), fov_rad=None)
+    assert refusal.value.reason == "inconsistent_evidence"

@@ -11,6 +11,7 @@ from startrack.calibration.acceptance import star_coverage
 from startrack.calibration.photometry import photometry_dict
 from startrack.calibration.run import Calibration, RefusedImage
 from startrack.camera import Camera, camera_to_dict
+from startrack.errors import reason_of
 from startrack.frames import format_utc, quat_xyzw_from_R
 from startrack.types import Array
 
@@ -64,6 +65,7 @@ def refusal_dict(reason: str, text: str, refused: tuple[RefusedImage, ...] = ())
         "status": "refused",
         "reason": reason,
         "message": text,
+        "advice": reason_of(reason).advice,
         "camera": None,
         "refused": [vars(one) for one in refused],
     }

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.common import DEFAULT_OUT, add_pixel_flags, read
+from startrack.cli.common import DEFAULT_OUT, add_pixel_flags, print_advice, read
 from startrack.cli.flag_types import amount, field_of_view_rad, number, positive_number, seconds
 from startrack.cli.progress import progress
 from startrack.compilation import announce_compilation
@@ -175,6 +175,9 @@ def _write_calibration(args: argparse.Namespace, out: Path, found: Calibration) 
         write_atomically(out.with_suffix(".hot-pixels.csv"), ("\n".join(lines) + "\n").encode(), overwrite=True)
     if not args.no_plots:
         write_report(out, found)
+    if not args.quiet:
+        for one in found.refused:
+            print(f"{one.name}: left out, {one.reason}: {one.message}", file=sys.stderr, flush=True)
     if args.verbose:
         line += "".join(f"\n  {note}" for note in found.photometry.notes)
     return print_outcome(args, record, line)
@@ -202,6 +205,8 @@ def print_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) -
         print(json.dumps(record), flush=True)
     elif not args.quiet or record["status"] != "ok":
         print(line, file=sys.stderr if args.quiet else sys.stdout, flush=True)
+    if not args.json:
+        print_advice(record["reason"], record["message"], args)
     return exit_code_of(record["reason"])
 
 

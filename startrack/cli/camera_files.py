@@ -123,7 +123,8 @@ def run_verify(args: argparse.Namespace) -> int:
                 show_step(f"verifying with {exposure.name}")
                 found = verify(exposure, load_camera(named), load_catalog(), site_of(args, [exposure]))
             except NoSolution as cause:
-                record = {"image": exposure.name, "status": "refused", "reason": cause.reason, "message": str(cause)}
+                record = {"image": exposure.name, "status": "refused", "reason": cause.reason, "message": str(cause),
+                          "advice": cause.reason.advice}  # fmt: skip
                 worst = max(worst, print_outcome(args, record, f"{exposure.name}  refused {cause.reason}: {cause}"))
                 continue
         worst = max(worst, print_outcome(args, verify_dict(found), verify_line(found)))

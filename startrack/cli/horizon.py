@@ -55,7 +55,8 @@ def run(args: argparse.Namespace) -> int:
     except BadOutput:
         raise
     except (BadInput, NoSolution) as cause:
-        record = {"format": FORMAT, "status": "refused", "reason": cause.reason, "message": str(cause)}
+        record = {"format": FORMAT, "status": "refused", "reason": cause.reason, "message": str(cause),
+                  "advice": cause.reason.advice}  # fmt: skip
         return print_outcome(args, record, f"{Path(args.output).name}  refused {cause.reason}: {cause}")
 
 
@@ -73,7 +74,8 @@ def _measure(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     with progress("horizon", 2, shown=not (args.quiet or args.json)) as bar:
         bar.advance(0, text="identifying the stars")
         frames, left_out = orient_frames(exposures, load_catalog(), site, camera=camera, fov_rad=args.fov)
-        _name_left_out(left_out)
+        if frames:  # else the refusal names them
+            _name_left_out(left_out)
         bar.advance(text="measuring the skyline")
         found = measure_frames(frames, left_out, site)
     write_skyline(args.output, found.skyline, site, overwrite=args.overwrite)

@@ -20,6 +20,7 @@ from startrack.stages import Oriented, Refused
 from startrack.types import Array, Body, Detections, Exposure, Ints
 
 LOWEST_STAR_RAD = np.radians(-3.0)  # true elevation; refraction lifts a star at -0.5 degrees to the horizon
+MOST_BELOW_PART = 0.01  # of the identified stars; right sites: 0; a wrong sign of latitude or longitude: 0.4 and 0.5
 CIRCLE_FROM_RAD = np.radians(100.0)  # from here up a field of view is that of the image circle
 
 
@@ -60,7 +61,8 @@ def orient_frames(
     """The frames with identified stars, and those without.
 
     The lens is that of `camera`, or found from `fov_rad`, and then fitted to the stars of all frames in their apparent
-    directions. Raises BadInput (no_time, no_calibration, size_mismatch, bad_terrain of another body).
+    directions. Raises BadInput (no_time, no_calibration, size_mismatch, bad_terrain of another body,
+    inconsistent_evidence where stars below the horizon are seen).
     """
     if camera is None and fov_rad is None:
         raise BadInput("no_calibration", "no camera is known: give a camera file (-c) or the field of view (--fov)")
@@ -73,6 +75,7 @@ def orient_frames(
         if isinstance(outcome, Refused):
             left_out.append(LeftOut(name=exposure.name, reason=outcome.reason, message=outcome.message))
         else:
+            _require_above_horizon(outcome, site)
             identified.append(outcome)
     if not identified:
         return (), tuple(left_out)
@@ -94,6 +97,18 @@ def _identify(
     if isinstance(outcome, Refused) and outcome.reason.exit_code == Reason.BAD_IMAGE.exit_code:
         raise BadInput(outcome.reason, f"{exposure.name}: {outcome.message}")
     return outcome
+
+
+def _require_above_horizon(one: Oriented, site: Site) -> None:
+    """Raises BadInput (inconsistent_evidence) where identified stars are below the horizon of the `site`."""
+    rays = one.stars.rays_icrs[one.identification.star] @ R_enu_icrs(site, require_time(one.exposure)).T
+    below = int(np.sum(azel_from_rays(rays)[1] < LOWEST_STAR_RAD))
+    if below > MOST_BELOW_PART * len(rays):
+        raise BadInput(
+            "inconsistent_evidence",
+            f"{one.exposure.name}: {below} of {len(rays)} identified stars are below the horizon of this site at this "
+            "time: check --site (signs) and --time",
+        )
 
 
 def _fit_lens(identified: list[Oriented], catalog: StarCatalog, site: Site) -> JointFit:

@@ -100,6 +100,7 @@ HORIZON = record(
         "message": TEXT,
     },
     optional={
+        "advice": ADVICE,
         "output": TEXT,
         "images": {"type": "array", "items": TEXT},
         "left_out": {"type": "array", "items": record({"image": TEXT, "reason": {"enum": REFUSALS}, "message": TEXT})},

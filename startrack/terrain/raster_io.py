@@ -37,7 +37,9 @@ def read_map(
     raster = _raster_of(grid, path, scale, offset_m)
     cut = raster if near is None else raster.crop_around(*near, WINDOW_HALF_M)
     if min(cut.heights_m.shape) < 2:
-        raise BadInput("bad_terrain", f"{path}: it is not near the origin")
+        raise BadInput(
+            "bad_terrain", f"{path}: it is not near the origin: give the latitude and longitude of a place on this map"
+        )
     return cut
 
 
@@ -52,7 +54,10 @@ def _raster_of(grid: Grid, path: Path, scale: float | None, offset_m: float | No
     """The heights [m above the sphere], NaN where the file has none. Raises BadInput bad_terrain."""
     values = grid.values
     if values.ndim != 2 or min(values.shape) < 2:
-        raise BadInput("bad_terrain", f"{path}: too small for a height map, or not near the origin")
+        raise BadInput(
+            "bad_terrain",
+            f"{path}: too small for a height map, or not near the origin: give the place on it",
+        )
     if values.dtype.kind not in "iuf":
         raise BadInput("bad_terrain", f"{path}: values of type {values.dtype} are no heights")
     scale = grid.scale if scale is None else scale

@@ -48,8 +48,8 @@ function searchForm(stars, detail, views) {
 
 function missing(words, stars, detail) {
   const { total } = detail.stars;
-  return total > stars.length ? `“${words}” is not among the ${say(stars.length, 0)} brightest of the ${say(total, 0)} stars in the frame; NAME.stars.ecsv has all.`
-    : `“${words}” is not among the ${say(total, 0)} stars in the frame.`;
+  return total > stars.length ? `“${words}” is outside of the picture, or not among the ${say(stars.length, 0)} brightest of its ${say(total, 0)} stars; NAME.stars.ecsv has all.`
+    : `“${words}” is not among the ${say(total, 0)} stars in the picture.`;
 }
 
 document.addEventListener("keydown", (event) => {

@@ -54,11 +54,23 @@ def trace_cells(terrain: HeightMap, centres: Array, half: float, azimuths: Array
     return found
 
 
-def trace_box_bounds(terrain: HeightMap, table: HorizonTable, *arrays: Array) -> None:
-    """Bounds traced over small boxes: centres (n, 2), half sides, azimuths and their half widths; results low, high."""
+def trace_box_bounds(
+    terrain: HeightMap, table: HorizonTable, centres: Array, half: Array, azimuths: Array, turn: Array, low: Array,
+    high: Array,
+) -> None:  # fmt: skip
+    """Fill low and high (n,) with bounds traced over small boxes: centres (n, 2), half sides, azimuths, half widths."""
     from startrack.terrain.table_kernel import box_bounds
 
-    _run_in_threads(box_bounds, (terrain.ground, *_table_arrays(table), terrain.camera_height_m), arrays)
+    fixed = terrain.ground, *_table_arrays(table), terrain.camera_height_m
+
+    def trace(centres: Array, half: Array, azimuths: Array, low: Array, high: Array) -> None:
+        arrays = centres, half, azimuths, np.zeros(len(low)), low, high
+        _run_in_threads(box_bounds, fixed, arrays)
+
+    if turn.any():
+        _run_in_threads(box_bounds, fixed, (centres, half, azimuths, turn, low, high))
+    else:
+        table.box_memory.fill(trace, centres, half, azimuths, low, high)
 
 
 def look_up_sector_bounds(terrain: HeightMap, table: HorizonTable, *arrays: Array) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,16 +52,19 @@ class Guess:
         return float(self.log_likelihood.max(initial=-np.inf))
 
 
-def beam_search(likelihood: PositionLikelihood, beams: tuple[Beam, ...] = BEAMS) -> Guess:
+def beam_search(
+    likelihood: PositionLikelihood, beams: tuple[Beam, ...] = BEAMS, best_of: Callable[[Guess], float] | None = None
+) -> Guess:
     """A few good positions: of ever smaller boxes those with the best average likelihood are quartered.
 
     The guess decides nothing: without a good one the proof takes longer. Of the `beams` the wider ones follow where a
-    narrow one finds no position that explains all sectors.
+    narrow one finds no position that explains all sectors; `best_of` is the log-likelihood of a guess (None: its own).
     """
     found = Guess(np.zeros((0, 2)), np.zeros(0))
     for beam in beams:
         found = climb_to_best(likelihood, _last_boxes(likelihood, beam), found)
-        if found.best > EXPLAINED_NATS * likelihood.sectors.occupied:
+        best = best_of(found) if best_of is not None and len(found.points_m) else found.best
+        if best > EXPLAINED_NATS * likelihood.sectors.occupied:
             break
     return found
 

@@ -35,6 +35,7 @@ class HorizonBias:
     sigma_rad: float
     position_m: Array  # (2,) of the camera at that bias
     drift_m_per_rad: Array  # (2,) how the position moves with the bias
+    log_likelihood: float  # of the best bias and position, without the prior of the bias
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,9 @@ def estimate_horizon_bias(likelihood: PositionLikelihood, position_m: Array) -> 
     off = biases - bias
     variance = float(weight @ off**2) + (biases[1] - biases[0]) ** 2 / 12
     mean_m = weight @ positions_m
-    return HorizonBias(bias, float(np.sqrt(variance)), mean_m, (weight * off) @ (positions_m - mean_m) / variance)
+    drift = (weight * off) @ (positions_m - mean_m) / variance
+    best = float(np.max(scores + 0.5 * (biases / prior) ** 2))
+    return HorizonBias(bias, float(np.sqrt(variance)), mean_m, drift, best)
 
 
 def marginalize_horizon_bias(

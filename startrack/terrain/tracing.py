@@ -38,11 +38,14 @@ def trace_horizons(
     """
     from startrack.terrain.table_kernel import horizons
 
-    tan, at, edge = (np.empty(len(azimuths)) for _ in range(3))
-    values, across, reach = _table_arrays(table)
-    fixed = terrain.ground, values, across, reach, terrain.camera_height_m
-    _run_in_threads(horizons, fixed, (points, azimuths, tan, at, edge))
-    return tan, at, edge
+    fixed = terrain.ground, *_table_arrays(table), terrain.camera_height_m
+
+    def trace(points: Array, azimuths: Array) -> tuple[Array, Array, Array]:
+        tan, at, edge = (np.empty(len(azimuths)) for _ in range(3))
+        _run_in_threads(horizons, fixed, (points, azimuths, tan, at, edge))
+        return tan, at, edge
+
+    return trace(points, azimuths) if table is None else table.skyline_memory.horizons(trace, points, azimuths)
 
 
 def trace_cells(terrain: HeightMap, centres: Array, half: float, azimuths: Array, turn: float) -> Array:

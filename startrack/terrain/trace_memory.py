@@ -1,4 +1,4 @@
-"""Bounds of the horizon over small boxes that were traced before: images and draws of one place ask for them again.
+"""Horizons and their bounds that were traced before: images and draws of one place ask for them again.
 
 The search cuts its square at the same lines for every image. Under the sky of one time the same stars meet the same
 boxes, and a bound that is kept costs a hundredth of one that is traced. What is kept is what was traced, bit for bit.
@@ -18,11 +18,39 @@ from startrack.types import Array
 SLOTS = 2**17  # boxes and azimuths that are kept: 6 MB; a draw on Shackleton's floor traces 10,000 to 40,000
 NEW = np.uint64(0xFFFF_FFFF_FFFF_FFFF)  # a NaN, which no box has
 MIX_1, MIX_2, SHIFT = np.uint64(0x9E37_79B9_7F4A_7C15), np.uint64(0xBF58_476D_1CE4_E5B9), np.uint64(29)
+MIN_AZIMUTHS, MAX_SKYLINES = 100, 16  # of skylines that are kept: 0.3 MB each
+Horizons = tuple[Array, Array, Array]  # see `trace_horizons`
 Trace = Callable[[Array, Array, Array, Array, Array], None]  # centres, half sides, azimuths; fills low and high
 
 
+class SkylineMemory:
+    """Horizons of single points at many azimuths, the last few."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[bytes, bytes], Horizons] = {}
+        self._lock = Lock()
+
+    def __reduce__(self) -> tuple[type[SkylineMemory], tuple[()]]:
+        return SkylineMemory, ()
+
+    def horizons(self, trace: Callable[[Array, Array], Horizons], points: Array, azimuths: Array) -> Horizons:
+        """What `trace` finds at points (n, 2) and azimuths (n,); kept if all points are one."""
+        if len(points) < MIN_AZIMUTHS or (points != points[0]).any():
+            return trace(points, azimuths)
+        key = points[0].tobytes(), azimuths.tobytes()
+        found = self._kept.get(key)
+        if found is None:
+            found = trace(points, azimuths)
+            with self._lock:
+                while len(self._kept) >= MAX_SKYLINES:
+                    self._kept.pop(next(iter(self._kept)))
+                self._kept[key] = found
+        tan, distance, edge = found
+        return tan.copy(), distance.copy(), edge.copy()
+
+
 class BoxMemory:
-    """Bounds by box and azimuth in a table of fixed size, in which later ones replace earlier ones."""
+    """Two numbers by box and azimuth in a table of fixed size, in which later ones replace earlier ones."""
 
     def __init__(self) -> None:
         self._keys, self._bounds = np.full((SLOTS, 4), NEW), np.empty((SLOTS, 2))
@@ -32,7 +60,7 @@ class BoxMemory:
         return BoxMemory, ()  # another process traces for itself
 
     def fill(self, trace: Trace, centres: Array, half: Array, azimuths: Array, low: Array, high: Array) -> None:
-        """Fill low and high (n,) for boxes at centres (n, 2), and trace those that are not kept."""
+        """Fill low and high (n,) for boxes at centres (n, 2); `trace` fills those that are not kept."""
         keys = np.column_stack([centres, half, azimuths]).view(np.uint64)
         missing = np.empty(len(low), dtype=np.bool_)
         with self._lock:

@@ -9,26 +9,46 @@ import numpy as np
 from startrack.chunk_store import Chunk
 from startrack.output.quantities_prediction import CELL_QUANTITIES, SHARE_KEYS
 from startrack.prediction.draws import AMBIGUOUS, OK, REFUSED
-from startrack.types import Array
+from startrack.types import Array, Bools
 
 Cells = dict[str, Array]  # the quantities of places (k,), by the names of CELL_QUANTITIES
+
+
+STATED_DRAWS = 10  # the stated covariance counts as so many draws, so that few real ones do not decide on the scale
 
 
 def predicted(draws: Chunk) -> Cells:
     """The quantities of places (k,) from their draws (k, n, ...)."""
     status = draws["status"]
+    located = (status == OK) & np.isfinite(draws["covariance_m2"]).all(axis=(2, 3))
     shares = [np.mean(status == code, axis=1) for code in (OK, AMBIGUOUS, REFUSED)]
     radius = np.median(np.where(status == OK, draws["radius95_m"], np.inf), axis=1)
     radius[~np.isfinite(radius)] = np.nan
-    found = (radius, *shares, *_ellipses(draws))
+    scale = error_scale(draws, located)
+    major, minor, azimuth = _ellipses(draws["covariance_m2"], located)
+    found = (scale * radius, *shares, scale * major, scale * minor, azimuth)
     return {one.name: values for one, values in zip(CELL_QUANTITIES, found, strict=True)}
 
 
-def _ellipses(draws: Chunk) -> tuple[Array, Array, Array]:
-    """Standard deviations (k,) [m] on both axes of the mean covariance, and the azimuth (k,) of the long one [deg]."""
-    located = (draws["status"] == OK) & np.isfinite(draws["covariance_m2"]).all(axis=(2, 3))
+def error_scale(draws: Chunk, located: Bools) -> float:
+    """Errors of the draws (k, n, ...) that are `located` (k, n), in their stated standard deviations: one number.
+
+    A stated covariance holds more than the errors that occur, such as those of a search on a grid. The draws know their
+    errors. Those of one place are few, so the squares of all places count, each over the mean covariance of its place.
+    """
+    error_m2 = np.where(located, np.square(draws["offset_m"]).sum(axis=-1), 0.0).sum(axis=1)
+    stated_m2 = np.where(located, np.trace(draws["covariance_m2"], axis1=2, axis2=3), 0.0).sum(axis=1)
+    known, count = stated_m2 > 0.0, located.sum(axis=1)
+    squares = float(np.sum(count[known] * error_m2[known] / stated_m2[known]))
+    return float(np.sqrt((STATED_DRAWS + squares) / (STATED_DRAWS + np.sum(count[known]))))
+
+
+def _ellipses(covariance_m2: Array, located: Bools) -> tuple[Array, Array, Array]:
+    """Standard deviations (k,) [m] on both axes of the mean of the covariances (k, n, 2, 2) of the draws that are
+    `located` (k, n), and the azimuth (k,) of the long one [deg].
+    """
     count = located.sum(axis=1)
-    total = np.where(located[:, :, None, None], draws["covariance_m2"], 0.0).sum(axis=1)
+    total = np.where(located[:, :, None, None], covariance_m2, 0.0).sum(axis=1)
     major, minor, azimuth = np.full((3, len(count)), np.nan)
     known = count > 0
     squares, axes = np.linalg.eigh(total[known] / count[known, None, None])

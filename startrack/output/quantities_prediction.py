@@ -21,15 +21,22 @@ class CellQuantity:
 
 
 CELL_QUANTITIES = (
-    CellQuantity("radius95_m", "m", "%.6g", "median over the draws of the 95 % radius; a draw without a position "
+    CellQuantity("radius95_m", "m", "%.6g", "median over the draws of the 95 % radius, in the scale of their errors; a draw without a position "
                  "counts as infinite; empty: half of the draws or more have no position"),
     CellQuantity("p_ok", "", "%.6g", "share of the draws that have one position"),
     CellQuantity("p_ambiguous", "", "%.6g", "share of the draws that several positions fit"),
     CellQuantity("p_refused", "", "%.6g", "share of the draws that are refused"),
     CellQuantity("sigma_major_m", "m", "%.6g", "standard deviation along the long axis of the error ellipse: "
-                 "of the mean covariance of the draws that have one position"),
+                 "of the errors of the draws that have one position"),
     CellQuantity("sigma_minor_m", "m", "%.6g", "standard deviation across it"),
     CellQuantity("azimuth_deg", "deg", "%.6g", "azimuth of the long axis, from 0 to 180"),
+)  # fmt: skip
+
+FILTERED, SMOOTHED = "radius95_filtered_m", "radius95_smoothed_m"
+PATH_QUANTITIES = (  # beside the others, along a path with odometry
+    CellQuantity(FILTERED, "m", "%.6g", "95 % radius of the position by the images so far and the odometry between "
+                 "them; empty before the first image with a position"),
+    CellQuantity(SMOOTHED, "m", "%.6g", "the same by all images of the path"),
 )  # fmt: skip
 
 SHARE_KEYS = {f"share_below_{bound}_m": bound for bound in SHARES_M}
@@ -60,6 +67,14 @@ DEPTH: Schema = record(
         "tried": {"type": "array", "items": record({"exposure_s": POSITIVE, "share": CHANCE})},
     }
 )
+ALONG_PATH: Schema = record(
+    {
+        "sigma": {**NUMBER, "description": "error of a move on each axis, as a part of its length"},
+        "floor_m": {**NUMBER, "description": "beside that, in quadrature"},
+        f"median_{FILTERED}": or_null(POSITIVE, "over the places; null: half of the places or more have no radius"),
+        f"median_{SMOOTHED}": or_null(POSITIVE, "the same, by all images"),
+    }
+)
 INPUTS: Schema = {
     "type": "object",
     "additionalProperties": TEXT,
@@ -86,6 +101,6 @@ PREDICTION = schema(
             "summary": SUMMARY,
             "provenance": record({"version": TEXT, "inputs": INPUTS}),
         },
-        optional={"variants": {"type": "array", "items": VARIANT}, "depth": DEPTH},
+        optional={"variants": {"type": "array", "items": VARIANT}, "depth": DEPTH, "odometry": ALONG_PATH},
     ),
 )  # fmt: skip

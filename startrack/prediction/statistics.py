@@ -61,12 +61,17 @@ def _ellipses(covariance_m2: Array, located: Bools) -> tuple[Array, Array, Array
 def summarized(cells: Cells) -> dict[str, Any]:
     """The summary of the places in `cells`, by the keys of the schema."""
     radius = np.where(np.isnan(cells["radius95_m"]), np.inf, cells["radius95_m"])
-    median = float(np.median(radius))
     return {
-        "median_radius95_m": median if np.isfinite(median) else None,
+        "median_radius95_m": median_or_none(radius),
         **{key: float(np.mean(radius < bound)) for key, bound in SHARE_KEYS.items()},
         **{name: float(np.mean(cells[name])) for name in ("p_ok", "p_ambiguous", "p_refused")},
     }
+
+
+def median_or_none(radius_m: Array) -> float | None:
+    """Median of radii (k,), NaN and infinity where there is no position; None if half of them or more are such."""
+    median = float(np.median(np.nan_to_num(radius_m, nan=np.inf)))
+    return median if np.isfinite(median) else None
 
 
 def share_within(cells: Cells, radius95_m: float) -> float:

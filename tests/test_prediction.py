@@ -180,8 +180,11 @@ def test_the_library_gives_the_radius_of_the_search():
 
 def draws_of(status, radius, covariance):
     covariances = np.where(np.array(status)[:, :, None, None] == OK, np.array(covariance), np.nan)
+    errors = np.zeros((*np.shape(status), 2))
+    errors[..., 0] = np.sqrt(np.trace(covariances, axis1=2, axis2=3))  # as large as stated
     return {
         "status": np.array(status), "radius95_m": np.array(radius, dtype=float), "covariance_m2": covariances,
+        "offset_m": errors,
     }  # fmt: skip
 
 
@@ -199,6 +202,27 @@ def test_refused_draws_count_and_a_place_without_positions_has_no_radius():
     assert summarized(cells)["share_below_10_m"] == pytest.approx(1 / 3)
     assert summarized(cells)["median_radius95_m"] is None
     assert share_within(cells, 9.0) == pytest.approx(1 / 3)
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
+def test_radii_and_ellipses_are_those_of_the_errors_of_all_draws(factor):
+    """Places whose stated errors differ by a factor of 10; of every draw the errors are `factor` times the stated."""
+    rng = np.random.default_rng(1)
+    sigma_m = np.geomspace(1.0, 10.0, 400)
+    covariance = np.square(sigma_m)[:, None, None, None] * np.diag([4.0, 1.0])
+    draws = draws_of(np.full((400, 10), OK), np.ones((400, 10)), np.broadcast_to(covariance, (400, 10, 2, 2)))
+    draws["offset_m"] = factor * sigma_m[:, None, None] * rng.normal(size=(400, 10, 2)) * [2.0, 1.0]
+    cells = predicted(draws)
+    assert cells["sigma_major_m"] == pytest.approx(2.0 * factor * sigma_m, rel=0.05)
+    assert cells["sigma_minor_m"] == pytest.approx(factor * sigma_m, rel=0.05)
+    assert cells["radius95_m"] == pytest.approx(factor, rel=0.05)
+    assert summarized(cells)["error_scale"] == pytest.approx(factor, rel=0.05)
+
+
+def test_one_draw_does_not_decide_on_the_scale():
+    draws = draws_of([[OK]], [[5.0]], np.eye(2))
+    draws["offset_m"][:] = 0.0
+    assert 0.9 < predicted(draws)["error_scale"][0] < 1.0
 
 
 def test_the_azimuth_is_that_of_the_long_axis():
@@ -255,7 +279,7 @@ class KnownStore:
     def chunks(self, what, tasks):
         for task in tasks:
             radius = np.array([12.0 / np.sqrt(task.conditions.exposure_s)])
-            yield draws_of([[OK]], [radius], np.eye(2)) | {"offset_m": np.zeros((1, 1, 2))}
+            yield draws_of([[OK]], [radius], np.eye(2))
 
 
 def test_depth_finds_the_exposure_of_a_known_radius():

@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 
 from startrack.chunk_store import Chunk
-from startrack.output.quantities_prediction import CELL_QUANTITIES, SHARE_KEYS
+from startrack.output.quantities_prediction import CELL_QUANTITIES, ERROR_SCALE, SHARE_KEYS
 from startrack.prediction.draws import AMBIGUOUS, OK, REFUSED
 from startrack.types import Array, Bools
 
-Cells = dict[str, Array]  # the quantities of places (k,), by the names of CELL_QUANTITIES
-
+Cells = dict[str, Array]  # the quantities of places (k,), by the names of CELL_QUANTITIES; and ERROR_SCALE
 
 STATED_DRAWS = 10  # the stated covariance counts as so many draws, so that few real ones do not decide on the scale
 
@@ -27,14 +26,16 @@ def predicted(draws: Chunk) -> Cells:
     scale = error_scale(draws, located)
     major, minor, azimuth = _ellipses(draws["covariance_m2"], located)
     found = (scale * radius, *shares, scale * major, scale * minor, azimuth)
-    return {one.name: values for one, values in zip(CELL_QUANTITIES, found, strict=True)}
+    cells = {one.name: values for one, values in zip(CELL_QUANTITIES, found, strict=True)}
+    return cells | {ERROR_SCALE: np.full(len(radius), scale)}
 
 
 def error_scale(draws: Chunk, located: Bools) -> float:
-    """Errors of the draws (k, n, ...) that are `located` (k, n), in their stated standard deviations: one number.
+    """Root mean square of the errors of the draws (k, n, ...) that are `located` (k, n), over the stated ones.
 
-    A stated covariance holds more than the errors that occur, such as those of a search on a grid. The draws know their
-    errors. Those of one place are few, so the squares of all places count, each over the mean covariance of its place.
+    Stated covariances are not exact: the search bounds some errors from above, and some lines of sight have edges that
+    a normal distribution does not describe. The draws of one place are too few for a number of its own. So the squares
+    of all places count together, those of each place over its mean stated covariance.
     """
     error_m2 = np.where(located, np.square(draws["offset_m"]).sum(axis=-1), 0.0).sum(axis=1)
     stated_m2 = np.where(located, np.trace(draws["covariance_m2"], axis1=2, axis2=3), 0.0).sum(axis=1)
@@ -64,7 +65,7 @@ def summarized(cells: Cells) -> dict[str, Any]:
     return {
         "median_radius95_m": median_or_none(radius),
         **{key: float(np.mean(radius < bound)) for key, bound in SHARE_KEYS.items()},
-        **{name: float(np.mean(cells[name])) for name in ("p_ok", "p_ambiguous", "p_refused")},
+        **{name: float(np.mean(cells[name])) for name in ("p_ok", "p_ambiguous", "p_refused", ERROR_SCALE)},
     }
 
 

@@ -13,7 +13,7 @@ from startrack.kernels import njit
 def collect_light(
     xy_px, others_px, number, weight, square_weight, first, columns, side_px, reach_px, radius, table, found
 ) -> None:  # fmt: skip
-    """Fill found (n, 5) for stars at `xy_px` (n, 2) with sums over other stars (m) within `reach_px`, at most `side_px`.
+    """Fill found (n, 5) for stars at `xy_px` (n, 2) with sums over others (m) within `reach_px`, at most `side_px`.
 
     The others are ordered by cells of `side_px`, `first` is each cell's first; `number` (m,) is the index of another
     among the stars, or -1. The weights of a stamp are those of linear least squares for flux and level,

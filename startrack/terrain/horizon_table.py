@@ -19,7 +19,7 @@ from startrack.terrain.protocol import Progress
 from startrack.types import Array, Bools, Ints
 
 if TYPE_CHECKING:
-    from startrack.terrain.trace_memory import BoxMemory
+    from startrack.terrain.trace_memory import BoxMemory, SkylineMemory
 
 BINS = 360  # azimuths; the localizer's sectors are 1.5 degrees wide
 DISTANCE_STEP_M = 4.0

@@ -18,7 +18,7 @@ from startrack.types import Array
 SLOTS = 2**17  # boxes and azimuths that are kept: 6 MB; a draw on Shackleton's floor traces 10,000 to 40,000
 NEW = np.uint64(0xFFFF_FFFF_FFFF_FFFF)  # a NaN, which no box has
 MIX_1, MIX_2, SHIFT = np.uint64(0x9E37_79B9_7F4A_7C15), np.uint64(0xBF58_476D_1CE4_E5B9), np.uint64(29)
-MIN_AZIMUTHS, MAX_SKYLINES = 100, 16  # of skylines that are kept: 0.3 MB each
+MIN_AZIMUTHS, MAX_AZIMUTHS, MAX_SKYLINES = 100, 20_000, 16  # of skylines that are kept: at most 0.7 MB each
 Horizons = tuple[Array, Array, Array]  # see `trace_horizons`
 Trace = Callable[[Array, Array, Array, Array, Array], None]  # centres, half sides, azimuths; fills low and high
 
@@ -34,8 +34,8 @@ class SkylineMemory:
         return SkylineMemory, ()
 
     def horizons(self, trace: Callable[[Array, Array], Horizons], points: Array, azimuths: Array) -> Horizons:
-        """What `trace` finds at points (n, 2) and azimuths (n,); kept if all points are one."""
-        if len(points) < MIN_AZIMUTHS or (points != points[0]).any():
+        """What `trace` finds at points (n, 2) and azimuths (n,); kept if all points are the same."""
+        if not MIN_AZIMUTHS <= len(points) <= MAX_AZIMUTHS or (points != points[0]).any():
             return trace(points, azimuths)
         key = points[0].tobytes(), azimuths.tobytes()
         found = self._kept.get(key)

@@ -67,11 +67,12 @@ def path_picture(
 
 def _draw_curves(canvas: Canvas, scale: _Linear, distance_m: Array, curves: Mapping[str, Array]) -> None:
     """Further curves, with the names of all."""
-    for k, (name, radius_m) in enumerate(curves.items(), start=1):
+    for colour, radius_m in zip(CURVES[1:], curves.values(), strict=False):
         for run in _runs(np.isfinite(radius_m)):
-            canvas.line(scale(distance_m[run], radius_m[run]), CURVES[k], 3)
-    for k, name in enumerate([EACH_IMAGE, *curves] if curves else []):
-        canvas.text((BOX[2] - 12.0, BOX[1] + 12.0 + 24.0 * k), name, TEXT_PX, CURVES[k], "rt", halo=True)
+            canvas.line(scale(distance_m[run], radius_m[run]), colour, 3)
+    names = [EACH_IMAGE, *curves] if curves else []
+    for k, (name, colour) in enumerate(zip(names, CURVES, strict=False)):
+        canvas.text((BOX[2] - 12.0, BOX[1] + 12.0 + 24.0 * k), name, TEXT_PX, colour, "rt", halo=True)
 
 
 def comparison_picture(variants: Sequence[dict[str, Any]], title: str) -> NDArray[np.uint8]:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import pickle
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 import numpy as np
 
-from startrack.terrain import load_terrain
 from startrack.terrain.trace_memory import MAX_AZIMUTHS, MAX_SKYLINES, SLOTS, BoxMemory, SkylineMemory
 
 
@@ -112,18 +110,3 @@ def test_another_process_begins_with_an_empty_memory():
     assert len(packed) < 1000
     fill(pickle.loads(packed), tracer, inputs)
     assert tracer.traced == 200
-
-
-def test_bounds_and_horizons_of_a_map_do_not_depend_on_what_was_traced_before():
-    terrain = replace(load_terrain("shackleton"), search_radius_m=150.0)
-    rng = np.random.default_rng(6)
-    centres, azimuths = rng.uniform(-100, 100, (2000, 2)), rng.uniform(0, 2 * np.pi, 2000)
-    here, around = np.zeros((1, 2)), np.linspace(0, 2 * np.pi, 300)
-    fresh = terrain.horizon_bounds_rad(centres, np.array(2.0), azimuths, 0.0), terrain.horizon_rad(here, around)
-    some = rng.permutation(2000)
-    again = terrain.horizon_bounds_rad(centres[some], np.array(2.0), azimuths[some], 0.0)
-    np.testing.assert_array_equal(again, np.array(fresh[0])[:, some])
-    np.testing.assert_array_equal(terrain.horizon_rad(here, around), fresh[1])
-    higher = replace(terrain, camera_height_m=5.0)  # another table, with its own memory
-    assert np.mean(higher.horizon_rad(here, around) < fresh[1]) > 0.9
-    assert np.mean(higher.horizon_bounds_rad(centres, np.array(2.0), azimuths, 0.0)[0] < fresh[0][0]) > 0.9

@@ -61,7 +61,7 @@ def _ellipses(covariance_m2: Array, located: Bools) -> tuple[Array, Array, Array
 
 def summarized(cells: Cells) -> dict[str, Any]:
     """The summary of the places in `cells`, by the keys of the schema."""
-    radius = np.where(np.isnan(cells["radius95_m"]), np.inf, cells["radius95_m"])
+    radius = cells["radius95_m"]
     return {
         "median_radius95_m": median_or_none(radius),
         **{key: float(np.mean(radius < bound)) for key, bound in SHARE_KEYS.items()},
@@ -70,11 +70,11 @@ def summarized(cells: Cells) -> dict[str, Any]:
 
 
 def median_or_none(radius_m: Array) -> float | None:
-    """Median of radii (k,), NaN and infinity where there is no position; None if half of them or more are such."""
-    median = float(np.median(np.nan_to_num(radius_m, nan=np.inf)))
+    """Median of radii (k,), NaN where there is no position; None if half of them or more are such."""
+    median = float(np.median(np.where(np.isnan(radius_m), np.inf, radius_m)))
     return median if np.isfinite(median) else None
 
 
 def share_within(cells: Cells, radius95_m: float) -> float:
     """Share of the places in `cells` whose 95 % radius is at most `radius95_m`."""
-    return float(np.mean(np.nan_to_num(cells["radius95_m"], nan=np.inf) <= radius95_m))
+    return float(np.mean(cells["radius95_m"] <= radius95_m))

@@ -19,7 +19,7 @@ from startrack.terrain.protocol import Progress
 from startrack.types import Array, Bools, Ints
 
 if TYPE_CHECKING:
-    from startrack.terrain.trace_memory import BoxMemory, SkylineMemory
+    from startrack.terrain.trace_memory import BoxMemory
 
 BINS = 360  # azimuths; the localizer's sectors are 1.5 degrees wide
 DISTANCE_STEP_M = 4.0
@@ -70,13 +70,6 @@ class HorizonTable:
         from startrack.terrain.trace_memory import BoxMemory
 
         return BoxMemory()
-
-    @cached_property
-    def skyline_memory(self) -> SkylineMemory:
-        """Horizons of single points that were traced with this table before."""
-        from startrack.terrain.trace_memory import SkylineMemory
-
-        return SkylineMemory()
 
     @cached_property
     def pyramid(self) -> list[tuple[NDArray[np.uint16], NDArray[np.uint16]]]:

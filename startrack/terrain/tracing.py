@@ -38,14 +38,10 @@ def trace_horizons(
     """
     from startrack.terrain.table_kernel import horizons
 
+    tan, at, edge = (np.empty(len(azimuths)) for _ in range(3))
     fixed = terrain.ground, *_table_arrays(table), terrain.camera_height_m
-
-    def trace(points: Array, azimuths: Array) -> tuple[Array, Array, Array]:
-        tan, at, edge = (np.empty(len(azimuths)) for _ in range(3))
-        _run_in_threads(horizons, fixed, (points, azimuths, tan, at, edge))
-        return tan, at, edge
-
-    return trace(points, azimuths) if table is None else table.skyline_memory.horizons(trace, points, azimuths)
+    _run_in_threads(horizons, fixed, (points, azimuths, tan, at, edge))
+    return tan, at, edge
 
 
 def trace_cells(terrain: HeightMap, centres: Array, half: float, azimuths: Array, turn: float) -> Array:
@@ -57,23 +53,12 @@ def trace_cells(terrain: HeightMap, centres: Array, half: float, azimuths: Array
     return found
 
 
-def trace_box_bounds(
-    terrain: HeightMap, table: HorizonTable, centres: Array, half: Array, azimuths: Array, turn: Array, low: Array,
-    high: Array,
-) -> None:  # fmt: skip
-    """Fill low and high (n,) with bounds traced over small boxes: centres (n, 2), half sides, azimuths, half widths."""
+def trace_box_bounds(terrain: HeightMap, table: HorizonTable, *arrays: Array) -> None:
+    """Bounds traced over small boxes: centres (n, 2), half sides, azimuths and their half widths; results low, high."""
     from startrack.terrain.table_kernel import box_bounds
 
     fixed = terrain.ground, *_table_arrays(table), terrain.camera_height_m
-
-    def trace(centres: Array, half: Array, azimuths: Array, low: Array, high: Array) -> None:
-        arrays = centres, half, azimuths, np.zeros(len(low)), low, high
-        _run_in_threads(box_bounds, fixed, arrays)
-
-    if turn.any():
-        _run_in_threads(box_bounds, fixed, (centres, half, azimuths, turn, low, high))
-    else:
-        table.box_memory.fill(trace, centres, half, azimuths, low, high)
+    table.box_memory.fill(lambda *some: _run_in_threads(box_bounds, fixed, some), *arrays)
 
 
 def look_up_sector_bounds(terrain: HeightMap, table: HorizonTable, *arrays: Array) -> None:

@@ -205,24 +205,22 @@ def test_refused_draws_count_and_a_place_without_positions_has_no_radius():
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
-def test_radii_and_ellipses_are_those_of_the_errors_of_all_draws(factor):
-    """Places whose stated errors differ by a factor of 10; of every draw the errors are `factor` times the stated."""
+def test_the_ratio_is_that_of_the_errors_of_the_draws_to_the_stated(factor):
+    """Places whose stated errors differ by a factor of 10; at one no draw has a position."""
     rng = np.random.default_rng(1)
     sigma_m = np.geomspace(1.0, 10.0, 400)
     covariance = np.square(sigma_m)[:, None, None, None] * np.diag([4.0, 1.0])
     draws = draws_of(np.full((400, 10), OK), np.ones((400, 10)), np.broadcast_to(covariance, (400, 10, 2, 2)))
     draws["offset_m"] = factor * sigma_m[:, None, None] * rng.normal(size=(400, 10, 2)) * [2.0, 1.0]
+    draws["status"][7], draws["offset_m"][7], draws["covariance_m2"][7] = REFUSED, np.nan, np.nan
     cells = predicted(draws)
-    assert cells["sigma_major_m"] == pytest.approx(2.0 * factor * sigma_m, rel=0.05)
-    assert cells["sigma_minor_m"] == pytest.approx(factor * sigma_m, rel=0.05)
-    assert cells["radius95_m"] == pytest.approx(factor, rel=0.05)
-    assert summarized(cells)["error_scale"] == pytest.approx(factor, rel=0.05)
+    assert summarized(cells)["error_ratio"] == pytest.approx(factor, rel=0.05)
+    assert np.delete(cells["sigma_major_m"], 7) == pytest.approx(2.0 * np.delete(sigma_m, 7))
 
 
-def test_one_draw_does_not_decide_on_the_scale():
-    draws = draws_of([[OK]], [[5.0]], np.eye(2))
-    draws["offset_m"][:] = 0.0
-    assert 0.9 < predicted(draws)["error_scale"][0] < 1.0
+def test_without_a_position_there_is_no_ratio():
+    cells = predicted(draws_of([[REFUSED, AMBIGUOUS]], [[np.nan, np.nan]], np.eye(2)))
+    assert summarized(cells)["error_ratio"] is None
 
 
 def test_the_azimuth_is_that_of_the_long_axis():

@@ -21,13 +21,13 @@ class CellQuantity:
 
 
 CELL_QUANTITIES = (
-    CellQuantity("radius95_m", "m", "%.6g", "median over the draws of the stated 95 % radius, times error_scale; a "
-                 "draw without a position counts as infinite; empty: half of the draws or more have no position"),
+    CellQuantity("radius95_m", "m", "%.6g", "median over the draws of the 95 % radius; a draw without a position "
+                 "counts as infinite; empty: half of the draws or more have no position"),
     CellQuantity("p_ok", "", "%.6g", "share of the draws that have one position"),
     CellQuantity("p_ambiguous", "", "%.6g", "share of the draws that several positions fit"),
     CellQuantity("p_refused", "", "%.6g", "share of the draws that are refused"),
-    CellQuantity("sigma_major_m", "m", "%.6g", "standard deviation along the long axis of the error ellipse: of the "
-                 "mean covariance of the draws that have one position, times error_scale"),
+    CellQuantity("sigma_major_m", "m", "%.6g", "standard deviation along the long axis of the error ellipse: "
+                 "of the mean covariance of the draws that have one position"),
     CellQuantity("sigma_minor_m", "m", "%.6g", "standard deviation across it"),
     CellQuantity("azimuth_deg", "deg", "%.6g", "azimuth of the long axis, from 0 to 180"),
 )  # fmt: skip
@@ -39,7 +39,7 @@ PATH_QUANTITIES = (  # beside the others, along a path with odometry
     CellQuantity(SMOOTHED, "m", "%.6g", "the same by all images of the path"),
 )  # fmt: skip
 
-ERROR_SCALE = "error_scale"
+ERROR_RATIO = "error_ratio"
 SHARE_KEYS = {f"share_below_{bound}_m": bound for bound in SHARES_M}
 SUMMARY: Schema = record(
     {
@@ -49,11 +49,11 @@ SUMMARY: Schema = record(
             for key, bound in SHARE_KEYS.items()
         },
         **{name: {**CHANCE, "description": "mean over the places"} for name in ("p_ok", "p_ambiguous", "p_refused")},
-        ERROR_SCALE: {
-            **POSITIVE,
-            "description": "errors of all draws over the stated ones, root mean square: radii and ellipses of the "
-            "places are the stated ones times this",
-        },
+        ERROR_RATIO: or_null(
+            POSITIVE,
+            "errors of the draws over the stated ones, root mean square over the places: near 1 where the stated ones "
+            "are right; null: no draw has a position",
+        ),
     }
 )
 VARIANT: Schema = record(

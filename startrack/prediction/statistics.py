@@ -7,13 +7,11 @@ from typing import Any
 import numpy as np
 
 from startrack.chunk_store import Chunk
-from startrack.output.quantities_prediction import CELL_QUANTITIES, ERROR_SCALE, SHARE_KEYS
+from startrack.output.quantities_prediction import CELL_QUANTITIES, ERROR_RATIO, SHARE_KEYS
 from startrack.prediction.draws import AMBIGUOUS, OK, REFUSED
 from startrack.types import Array, Bools
 
-Cells = dict[str, Array]  # the quantities of places (k,), by the names of CELL_QUANTITIES; and ERROR_SCALE
-
-STATED_DRAWS = 10  # the stated covariance counts as so many draws, so that few real ones do not decide on the scale
+Cells = dict[str, Array]  # the quantities of places (k,), by the names of CELL_QUANTITIES; and ERROR_RATIO
 
 
 def predicted(draws: Chunk) -> Cells:
@@ -23,25 +21,16 @@ def predicted(draws: Chunk) -> Cells:
     shares = [np.mean(status == code, axis=1) for code in (OK, AMBIGUOUS, REFUSED)]
     radius = np.median(np.where(status == OK, draws["radius95_m"], np.inf), axis=1)
     radius[~np.isfinite(radius)] = np.nan
-    scale = error_scale(draws, located)
-    major, minor, azimuth = _ellipses(draws["covariance_m2"], located)
-    found = (scale * radius, *shares, scale * major, scale * minor, azimuth)
+    found = (radius, *shares, *_ellipses(draws["covariance_m2"], located))
     cells = {one.name: values for one, values in zip(CELL_QUANTITIES, found, strict=True)}
-    return cells | {ERROR_SCALE: np.full(len(radius), scale)}
+    return cells | {ERROR_RATIO: _error_ratio(draws, located)}
 
 
-def error_scale(draws: Chunk, located: Bools) -> float:
-    """Root mean square of the errors of the draws (k, n, ...) that are `located` (k, n), over the stated ones.
-
-    Stated covariances are not exact: the search bounds some errors from above, and some lines of sight have edges that
-    a normal distribution does not describe. The draws of one place are too few for a number of its own. So the squares
-    of all places count together, those of each place over its mean stated covariance.
-    """
+def _error_ratio(draws: Chunk, located: Bools) -> Array:
+    """Root mean square (k,) of the errors of the draws (k, n, ...) that are `located` (k, n), over the stated one."""
     error_m2 = np.where(located, np.square(draws["offset_m"]).sum(axis=-1), 0.0).sum(axis=1)
     stated_m2 = np.where(located, np.trace(draws["covariance_m2"], axis1=2, axis2=3), 0.0).sum(axis=1)
-    known, count = stated_m2 > 0.0, located.sum(axis=1)
-    squares = float(np.sum(count[known] * error_m2[known] / stated_m2[known]))
-    return float(np.sqrt((STATED_DRAWS + squares) / (STATED_DRAWS + np.sum(count[known]))))
+    return np.sqrt(error_m2 / np.where(stated_m2 > 0.0, stated_m2, np.nan))
 
 
 def _ellipses(covariance_m2: Array, located: Bools) -> tuple[Array, Array, Array]:
@@ -61,11 +50,12 @@ def _ellipses(covariance_m2: Array, located: Bools) -> tuple[Array, Array, Array
 
 def summarized(cells: Cells) -> dict[str, Any]:
     """The summary of the places in `cells`, by the keys of the schema."""
-    radius = cells["radius95_m"]
+    radius, ratio = cells["radius95_m"], cells[ERROR_RATIO]
     return {
         "median_radius95_m": median_or_none(radius),
         **{key: float(np.mean(radius < bound)) for key, bound in SHARE_KEYS.items()},
-        **{name: float(np.mean(cells[name])) for name in ("p_ok", "p_ambiguous", "p_refused", ERROR_SCALE)},
+        **{name: float(np.mean(cells[name])) for name in ("p_ok", "p_ambiguous", "p_refused")},
+        ERROR_RATIO: float(np.sqrt(np.nanmean(np.square(ratio)))) if np.isfinite(ratio).any() else None,
     }
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from startrack.errors import Reason
 from startrack.output.quantities import QUANTITIES
-from startrack.output.quantities_prediction import CELL_QUANTITIES
+from startrack.output.quantities_prediction import CELL_QUANTITIES, PATH_QUANTITIES
 from startrack.tracking.quantities import FRAME_QUANTITIES
 
 PAGES = [Path(__file__).parent / name for name in ("formats.md", "track.md")]
@@ -40,7 +40,7 @@ def reason_table() -> str:
 
 def prediction_table() -> str:
     """Bands of predict.tif and columns of predict.ecsv."""
-    rows = [f"| `{one.name}` | {one.unit} | {one.description} |" for one in CELL_QUANTITIES]
+    rows = [f"| `{one.name}` | {one.unit} | {one.description} |" for one in (*CELL_QUANTITIES, *PATH_QUANTITIES)]
     return "\n".join(["| band, column | unit | meaning |", "| --- | --- | --- |", *rows])
 
 

@@ -33,9 +33,10 @@ LAYERS = (  # lowest first; a package imports from lower layers only
     {"star_fix"},
     {"pipeline", "calibration", "inputs", "simulation"},
     {"output"},
-    {"solution", "horizon", "prediction"},
+    {"solution", "horizon"},
     {"reproduction", "batch"},
     {"tracking"},
+    {"prediction"},
     {"api"},
     {"cli"},
 )

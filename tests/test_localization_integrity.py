@@ -23,6 +23,7 @@ from startrack.localization.integrity import (
     _assess,
     _divide,
     _grid,
+    _GridScores,
     _match_grid,
     _moments,
     assess_integrity,
@@ -138,8 +139,8 @@ def test_a_position_beside_ground_that_is_not_allowed() -> None:
     fix = ExactPosterior()(rows, TRUE)
     east_m = {}
     for terrain in (west, TRUE):
-        likelihood = PositionLikelihood.from_evidence(rows, terrain)
-        centre_m, covariance_m2, by_sector = _match_grid(likelihood, fix.position_enu_m[:2], fix.covariance_m2)
+        scores = _GridScores(PositionLikelihood.from_evidence(rows, terrain))
+        centre_m, covariance_m2, by_sector = _match_grid(scores, fix.position_enu_m[:2], fix.covariance_m2)
         offsets_m, _ = _grid(covariance_m2, *COARSE, lambda at, c=centre_m, t=terrain: t.allowed(c + at))
         assert len(offsets_m) == len(by_sector)
         east_m[type(terrain)] = centre_m[0] + _moments(offsets_m, by_sector.sum(axis=1)[:, None])[0][0][0]

@@ -73,7 +73,7 @@ def path_and_cameras(folder: Path) -> None:
         shutil.copy(ROOT / "calib/fisheye-2048.toml", folder / name)
 
 
-QUICK_PREDICTION = ["-t", "shackleton-thesis", "--spacing", "9000", "--draws", "1", "--no-plots"]
+QUICK_PREDICTION = ["-t", "shackleton-thesis", "--spacing", "9000", "--draws", "1", "--no-plots", "-j", "1"]
 ASSUMED = {
     "batch": Assumed(folder_of_images),
     "calibration": Assumed(nights),

@@ -180,8 +180,11 @@ def test_the_library_gives_the_radius_of_the_search():
 
 def draws_of(status, radius, covariance):
     covariances = np.where(np.array(status)[:, :, None, None] == OK, np.array(covariance), np.nan)
+    errors = np.zeros((*np.shape(status), 2))
+    errors[..., 0] = np.sqrt(np.trace(covariances, axis1=2, axis2=3))  # as large as stated
     return {
         "status": np.array(status), "radius95_m": np.array(radius, dtype=float), "covariance_m2": covariances,
+        "offset_m": errors,
     }  # fmt: skip
 
 
@@ -199,6 +202,25 @@ def test_refused_draws_count_and_a_place_without_positions_has_no_radius():
     assert summarized(cells)["share_below_10_m"] == pytest.approx(1 / 3)
     assert summarized(cells)["median_radius95_m"] is None
     assert share_within(cells, 9.0) == pytest.approx(1 / 3)
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
+def test_the_ratio_is_that_of_the_errors_of_the_draws_to_the_stated(factor):
+    """Places whose stated errors differ by a factor of 10; at one no draw has a position."""
+    rng = np.random.default_rng(1)
+    sigma_m = np.geomspace(1.0, 10.0, 400)
+    covariance = np.square(sigma_m)[:, None, None, None] * np.diag([4.0, 1.0])
+    draws = draws_of(np.full((400, 10), OK), np.ones((400, 10)), np.broadcast_to(covariance, (400, 10, 2, 2)))
+    draws["offset_m"] = factor * sigma_m[:, None, None] * rng.normal(size=(400, 10, 2)) * [2.0, 1.0]
+    draws["status"][7], draws["offset_m"][7], draws["covariance_m2"][7] = REFUSED, np.nan, np.nan
+    cells = predicted(draws)
+    assert summarized(cells)["error_ratio"] == pytest.approx(factor, rel=0.05)
+    assert np.delete(cells["sigma_major_m"], 7) == pytest.approx(2.0 * np.delete(sigma_m, 7))
+
+
+def test_without_a_position_there_is_no_ratio():
+    cells = predicted(draws_of([[REFUSED, AMBIGUOUS]], [[np.nan, np.nan]], np.eye(2)))
+    assert summarized(cells)["error_ratio"] is None
 
 
 def test_the_azimuth_is_that_of_the_long_axis():
@@ -255,7 +277,7 @@ class KnownStore:
     def chunks(self, what, tasks):
         for task in tasks:
             radius = np.array([12.0 / np.sqrt(task.conditions.exposure_s)])
-            yield draws_of([[OK]], [radius], np.eye(2)) | {"offset_m": np.zeros((1, 1, 2))}
+            yield draws_of([[OK]], [radius], np.eye(2))
 
 
 def test_depth_finds_the_exposure_of_a_known_radius():

@@ -118,6 +118,18 @@ def test_bounds_hold_the_horizons_of_small_steps(shackleton, half, turn):
     assert np.median(high - low) < np.radians(0.02 * half + 0.3 * (turn > 0))
 
 
+def test_bounds_do_not_depend_on_what_was_traced_before(shackleton):
+    terrain, rng = replace(shackleton, search_radius_m=150.0), np.random.default_rng(6)
+    centres, azimuths = rng.uniform(-100, 100, (2000, 2)), rng.uniform(0, 2 * np.pi, 2000)
+    half, some = np.array(2.0), rng.permutation(2000)
+    for turn in (0.0, np.radians(0.2)):
+        fresh = np.array(terrain.horizon_bounds_rad(centres, half, azimuths, turn))
+        again = terrain.horizon_bounds_rad(centres[some], half, azimuths[some], turn)
+        assert np.array_equal(again, fresh[:, some])
+        del terrain.table.__dict__["box_memory"]
+        assert np.array_equal(terrain.horizon_bounds_rad(centres, half, azimuths, turn), fresh)
+
+
 def test_the_table_is_kept_and_found_again_by_content(shackleton):
     terrain = replace(shackleton, camera_height_m=1.7, search_radius_m=150.0)
     table = terrain.table

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import DEFAULT_LOCALIZER, DEFAULT_OUT, check_localizer, cores
-from startrack.cli.flag_types import count, magnitude, positive_count, positive_number, seconds
+from startrack.cli.drive import ODOMETRY_FLOOR_M
+from startrack.cli.flag_types import amount, count, magnitude, positive_count, positive_number, seconds
 from startrack.cli.preparation import compile_kernels, prepare
 from startrack.cli.progress import Progress, progress
 from startrack.compilation import is_compiled
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from startrack.prediction import Conditions
-    from startrack.prediction.report import Report
+    from startrack.prediction.report import OdometryErrors, Report
     from startrack.prediction.run import Predictions
 
 STOPPED = 5
@@ -63,6 +64,12 @@ def _add_questions(group: Any) -> None:
     group.add_argument("--target-radius95", type=positive_number, metavar="M", help="wanted at nine of ten places")
     group.add_argument("--compare", metavar="CAMERA2", help="a second camera at the same places")
     group.add_argument("--path", metavar="WAYPOINTS", help="CSV with east_m,north_m: the places are on this path")
+    group.add_argument(
+        "--odometry-sigma", type=amount, metavar="F", help="with --path: odometry between the places, error of a move"
+    )
+    group.add_argument(
+        "--odometry-floor", type=amount, metavar="M", help=f"beside that, in quadrature ({ODOMETRY_FLOOR_M})"
+    )
 
 
 def _add_run(group: Any) -> None:
@@ -104,6 +111,8 @@ def run(args: argparse.Namespace) -> int:
     except RunStopped as cause:
         print(f"startrack predict: {cause}; the same command goes on", file=sys.stderr)
         return STOPPED
+    if args.odometry_sigma is not None:
+        report = report.between(_odometry(args))
     files = write_report(report, out, plots=not args.no_plots)
     _print(args, report, files, time.perf_counter() - start)
     return 0
@@ -137,10 +146,23 @@ def _check_flags(args: argparse.Namespace) -> None:
     check_localizer(args)
     if args.depth != (args.target_radius95 is not None):
         args.usage_error("--depth and --target-radius95 go together")
+    if args.odometry_sigma is not None and args.path is None:
+        args.usage_error("--odometry-sigma needs --path")
+    if args.odometry_floor is not None and args.odometry_sigma is None:
+        args.usage_error("--odometry-floor needs --odometry-sigma")
+    if args.odometry_sigma == 0 and args.odometry_floor == 0:
+        args.usage_error("--odometry-sigma 0 --odometry-floor 0: odometry without errors is not known")
     if args.draws > MAX_DRAWS:
         args.usage_error(f"--draws {args.draws}: at most {MAX_DRAWS}")
     if args.cluster is not None and find_spec("distributed") is None:
         args.usage_error("--cluster needs distributed: pip install '.[cluster]' in a clone of startrack")
+
+
+def _odometry(args: argparse.Namespace) -> OdometryErrors:
+    from startrack.prediction.report import OdometryErrors
+
+    floor_m = ODOMETRY_FLOOR_M if args.odometry_floor is None else args.odometry_floor
+    return OdometryErrors(args.odometry_sigma, floor_m)
 
 
 def _conditions(args: argparse.Namespace) -> Conditions:

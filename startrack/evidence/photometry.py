@@ -51,8 +51,8 @@ def measure(detections: Detections, sources: Sources) -> Photometry:
     sigma_px, d = detections.psf_sigma_px, detections
     radius = half_width(sigma_px)
     reach_px = radius + 3.0 * sigma_px
-    order, first, columns = _order_by_cell(sources.xy_px, d.image_e.shape, reach_px)
-    table = pixel_profile_table(sigma_px, max(radius, int(np.ceil(PROFILE_SIGMAS * sigma_px)) + 1))
+    order, first, columns = order_by_cell(sources.xy_px, d.image_e.shape, reach_px)
+    table = neighbour_profiles(sigma_px)
     measured, usable = np.empty((len(order), 4)), np.empty(len(order), dtype=np.bool_)
     measure_sources(
         _read_only(d.image_e), _read_only(d.background_e), _read_only(d.noise_e), _read_only(d.dead),
@@ -71,7 +71,12 @@ def measure(detections: Detections, sources: Sources) -> Photometry:
     )
 
 
-def _order_by_cell(xy_px: Array, shape: tuple[int, ...], side_px: float) -> tuple[Ints, Ints, int]:
+def neighbour_profiles(sigma_px: float) -> Array:
+    """The table of pixel profiles of a PSF, wide enough for the light of a star in the stamps of its neighbours."""
+    return pixel_profile_table(sigma_px, max(half_width(sigma_px), int(np.ceil(PROFILE_SIGMAS * sigma_px)) + 1))
+
+
+def order_by_cell(xy_px: Array, shape: tuple[int, ...], side_px: float) -> tuple[Ints, Ints, int]:
     """Order of the sources (n, 2) by square cells of a grid over an image (H, W); each cell's first; the columns."""
     columns, rows = int(shape[1] / side_px) + 1, int(shape[0] / side_px) + 1
     position = (xy_px / side_px).astype(np.int64)

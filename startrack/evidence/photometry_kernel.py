@@ -32,7 +32,7 @@ def measure_sources(
     n = len(xy_px)
     k = profiles.shape[1] // 2
     side = 2 * radius + 1
-    across, down, centre = _profiles(xy_px, profiles)
+    across, down, centre = profiles_of(xy_px, profiles)
     size = side * side
     profile, light, data = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
     variance, weight = np.empty(size, np.float32), np.empty(size, np.float32)
@@ -96,7 +96,7 @@ def _find_neighbours(near, i, xy_px, visible, first, columns, side_px, reach_px)
 
 
 @njit(inline="always")
-def _profiles(xy_px, profiles):
+def profiles_of(xy_px, profiles):
     """Profiles (n, 2 k + 1) of the sources in x and in y about their middle pixels, and these pixels (n, 2)."""
     n, wide = len(xy_px), profiles.shape[1]
     steps = profiles.shape[0] - 1

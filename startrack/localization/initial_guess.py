@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,18 +52,29 @@ class Guess:
         return float(self.log_likelihood.max(initial=-np.inf))
 
 
-def beam_search(likelihood: PositionLikelihood, beams: tuple[Beam, ...] = BEAMS) -> Guess:
-    """A few good positions: of ever smaller boxes those with the best average likelihood are quartered.
+NO_GUESS = Guess(np.zeros((0, 2)), np.zeros(0))
 
-    The guess decides nothing: without a good one the proof takes longer. Of the `beams` the wider ones follow where a
-    narrow one finds no position that explains all sectors.
+
+def beam_search(likelihood: PositionLikelihood, beams: tuple[Beam, ...] = BEAMS) -> Guess:
+    """A few good positions; of the `beams` the wider ones follow where narrow ones find none that explains all sectors.
+
+    The guess decides nothing: without a good one the proof takes longer.
     """
-    found = Guess(np.zeros((0, 2)), np.zeros(0))
-    for beam in beams:
-        found = climb_to_best(likelihood, _last_boxes(likelihood, beam), found)
-        if found.best > EXPLAINED_NATS * likelihood.sectors.occupied:
+    found = NO_GUESS
+    for found in widening_guesses(likelihood, beams):
+        if is_likely_true(found.best, likelihood):
             break
     return found
+
+
+def widening_guesses(likelihood: PositionLikelihood, beams: tuple[Beam, ...] = BEAMS) -> Iterator[Guess]:
+    """The best guess so far after each of the `beams`: of ever smaller boxes those with the best average likelihood
+    are quartered.
+    """
+    found = NO_GUESS
+    for beam in beams:
+        found = climb_to_best(likelihood, _last_boxes(likelihood, beam), found)
+        yield found
 
 
 def climb_to_best(likelihood: PositionLikelihood, centres_m: Array, known: Guess) -> Guess:
@@ -132,6 +144,11 @@ def _distinct(points_m: Array, order: Ints) -> list[int]:
         if len(chosen) < CANDIDATES and all(np.abs(points_m[i] - points_m[k]).max() > APART_M for k in chosen):
             chosen.append(int(i))
     return chosen
+
+
+def is_likely_true(log_likelihood: float, likelihood: PositionLikelihood) -> bool:
+    """Whether a position explains the evidence so well that no better one is looked for before the proof."""
+    return log_likelihood > EXPLAINED_NATS * likelihood.sectors.occupied
 
 
 def explains_all_sectors(log_likelihood: float, likelihood: PositionLikelihood) -> bool:

@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from startrack.localization.likelihood import PositionLikelihood
+from startrack.localization.local_search import LocalLikelihood
 from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Evidence, Fix, NotLocated
 
@@ -73,10 +74,10 @@ def assess_integrity(
 
     Raises NotLocated (inconsistent_evidence) where one group of directions contradicts the others.
     """
-    likelihood = PositionLikelihood.from_evidence(evidence, terrain)
-    groups = _divide(likelihood.sectors.count)
-    centre_m, covariance_m2, by_sector = _match_grid(likelihood, position_m, covariance_m2)
-    scores, allowed = partial(_scores, likelihood, centre_m), _allowed_about(terrain, centre_m)
+    grid = _GridScores(PositionLikelihood.from_evidence(evidence, terrain))
+    groups = _divide(grid.likelihood.sectors.count)
+    centre_m, covariance_m2, by_sector = _match_grid(grid, position_m, covariance_m2)
+    scores, allowed = partial(grid, centre_m), _allowed_about(terrain, centre_m)
     found = _assess(lambda _: by_sector, covariance_m2, groups, fix, (COARSE,), allowed)
     if not np.isfinite(found.protection_level_m) or found.chi2.max() > SUSPICIOUS_CHI2:
         found = _assess(scores, covariance_m2, groups, fix, allowed=allowed)
@@ -104,11 +105,11 @@ def _divide(sectors: int) -> Array:
     return np.asarray(group[:, None] == np.arange(GROUPS)[:, None], dtype=np.float64).reshape(-1, sectors)
 
 
-def _match_grid(likelihood: PositionLikelihood, position_m: Array, covariance_m2: Array) -> tuple[Array, Array, Array]:
+def _match_grid(scores: _GridScores, position_m: Array, covariance_m2: Array) -> tuple[Array, Array, Array]:
     """Position (2,) and covariance (2, 2) whose coarse grid fits the posterior by all rows, and the scores there."""
     for number in range(MATCH_ROUNDS):
-        offsets_m, _ = _grid(covariance_m2, *COARSE, _allowed_about(likelihood.terrain, position_m))
-        by_sector = _scores(likelihood, position_m, offsets_m)
+        offsets_m, _ = _grid(covariance_m2, *COARSE, _allowed_about(scores.likelihood.terrain, position_m))
+        by_sector = scores(position_m, offsets_m)
         (mean,), (spread,) = _moments(offsets_m, by_sector.sum(axis=1)[:, None])
         unit = np.linalg.inv(np.linalg.cholesky(covariance_m2))
         variances = np.linalg.eigvalsh(unit @ spread @ unit.T)
@@ -138,12 +139,22 @@ def _grid(covariance_m2: Array, reach_sigmas: float, across: int, allowed: Allow
     return (offsets_m[kept], is_rim[kept]) if kept.any() else (offsets_m, is_rim)
 
 
-def _scores(likelihood: PositionLikelihood, centre_m: Array, offsets_m: Array) -> Array:
-    """Contributions (n, sectors) to the log-likelihood at offsets (n, 2) from a position (2,)."""
-    local = likelihood.near(centre_m, float(np.abs(offsets_m).max()) + MARGIN_M, across=NODES)
-    points = centre_m + offsets_m
-    parts = [local.sums_by_sector(points[k : k + CHUNK]) for k in range(0, len(points), CHUNK)]
-    return likelihood.sectors.by_sector(np.concatenate(parts))
+@dataclass(eq=False)
+class _GridScores:
+    """Contributions of the sectors to the log-likelihood on grids, with the last neighbourhood that was prepared."""
+
+    likelihood: PositionLikelihood
+    _local: LocalLikelihood | None = None
+
+    def __call__(self, centre_m: Array, offsets_m: Array) -> Array:
+        """Contributions (n, sectors) at offsets (n, 2) from a position (2,)."""
+        half_m = float(np.abs(offsets_m).max()) + MARGIN_M
+        local = self._local
+        if local is None or local.half_m != half_m or (local.centre_m != centre_m).any():
+            local = self._local = self.likelihood.near(centre_m, half_m, across=NODES)
+        points = centre_m + offsets_m
+        parts = [local.sums_by_sector(points[k : k + CHUNK]) for k in range(0, len(points), CHUNK)]
+        return self.likelihood.sectors.by_sector(np.concatenate(parts))
 
 
 def _moments(offsets_m: Array, log: Array) -> tuple[Array, Array]:

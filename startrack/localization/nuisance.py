@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.localization.explored import Explored, log_sum
-from startrack.localization.initial_guess import beam_search
+from startrack.localization.initial_guess import beam_search, is_likely_true, widening_guesses
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.terrain import Terrain
 from startrack.types import Array, Evidence, NotLocated
@@ -35,6 +35,7 @@ class HorizonBias:
     sigma_rad: float
     position_m: Array  # (2,) of the camera at that bias
     drift_m_per_rad: Array  # (2,) how the position moves with the bias
+    log_likelihood: float  # of the best bias and position, without the prior of the bias
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,23 @@ class ShapeFit:
 def lower_evidence(evidence: Evidence, bias_rad: float) -> Evidence:
     """The rows as they stand above the map's horizon where the true one is `bias_rad` higher."""
     return replace(evidence, elevation_rad=evidence.elevation_rad - bias_rad) if bias_rad else evidence
+
+
+def find_horizon_bias(likelihood: PositionLikelihood) -> tuple[HorizonBias, Array]:
+    """The likeliest bias at the best position of a guess, and the other positions (n, 2) of the guess.
+
+    A guess is judged with the bias that suits it: without the bias the true position explains the stars badly, and
+    wider beams would follow that find nothing better. Raises NotLocated (outside_search_area).
+    """
+    bias, others_m = None, np.zeros((0, 2))
+    for guess in widening_guesses(likelihood):
+        if len(guess.points_m):
+            bias, others_m = estimate_horizon_bias(likelihood, guess.points_m[0]), guess.points_m[1:]
+            if is_likely_true(max(bias.log_likelihood, guess.best), likelihood):
+                break
+    if bias is None:
+        raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
+    return bias, others_m
 
 
 def estimate_horizon_bias(likelihood: PositionLikelihood, position_m: Array) -> HorizonBias:
@@ -78,7 +96,9 @@ def estimate_horizon_bias(likelihood: PositionLikelihood, position_m: Array) -> 
     off = biases - bias
     variance = float(weight @ off**2) + (biases[1] - biases[0]) ** 2 / 12
     mean_m = weight @ positions_m
-    return HorizonBias(bias, float(np.sqrt(variance)), mean_m, (weight * off) @ (positions_m - mean_m) / variance)
+    drift = (weight * off) @ (positions_m - mean_m) / variance
+    best = float(np.max(scores + 0.5 * (biases / prior) ** 2))
+    return HorizonBias(bias, float(np.sqrt(variance)), mean_m, drift, best)
 
 
 def marginalize_horizon_bias(

@@ -11,10 +11,10 @@ from startrack.localization.branch_and_bound import Search
 from startrack.localization.clock import clock_matters, duration
 from startrack.localization.clock_posterior import marginalize_clock
 from startrack.localization.explored import BudgetSpent, Explored, log_sum
-from startrack.localization.initial_guess import beam_search, climb_to_best, explains_all_sectors
+from startrack.localization.initial_guess import climb_to_best, explains_all_sectors
 from startrack.localization.likelihood import SECTOR_EPSILON, SECTOR_RAD, PositionLikelihood
 from startrack.localization.local_posterior import local_posterior
-from startrack.localization.nuisance import ShapeFit, estimate_horizon_bias, marginalize_horizon_bias, marginalize_shape
+from startrack.localization.nuisance import ShapeFit, find_horizon_bias, marginalize_horizon_bias, marginalize_shape
 from startrack.localization.position_prior import (
     PRIOR_NATS,
     REACH_SIGMAS,
@@ -153,11 +153,8 @@ class ExactPosterior:
         if terrain.common_sigma_rad == 0:
             return self.explore(evidence, terrain)
         likelihood = self._likelihood(evidence, terrain)
-        guess = beam_search(likelihood)
-        if not len(guess.points_m):
-            raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
-        bias = estimate_horizon_bias(likelihood, guess.points_m[0])
-        return marginalize_horizon_bias(self.explore, evidence, terrain, bias, guess.points_m[1:])
+        bias, others_m = find_horizon_bias(likelihood)
+        return marginalize_horizon_bias(self.explore, evidence, terrain, bias, others_m)
 
     def explore(self, evidence: Evidence, terrain: Terrain, starts_m: Array | None = None) -> Explored:
         """The posterior on equal boxes from `evidence` on a `terrain`; `starts_m` (n, 2): good positions, if known.

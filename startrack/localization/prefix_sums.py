@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.kernels import njit
 from startrack.localization.sector_likelihood import (
     CERTAIN_SIGMAS,
     SECTOR_STEP,
@@ -72,10 +73,9 @@ class PrefixSums:
         require_bounds(terrain, low, high)
         map_sigma = terrain.max_horizon_sigma_rad(boxes, half_m, middle, np.pi / count)
         margin = leeway_rad + CERTAIN_SIGMAS * np.hypot(self.sigma_rad, map_sigma)
-        step = SECTOR_STEP * np.arange(count)
-        first = np.searchsorted(self.key, (low - margin + step).ravel(), side="left")
-        last = np.searchsorted(self.key, (high + margin + step).ravel(), side="right")
-        return first.reshape(low.shape), last.reshape(low.shape)
+        first, last = np.empty((2, *low.shape), dtype=np.int64)
+        _find_open(self.key, self.ends, low - margin, high + margin, first, last)
+        return first, last
 
     def split(self, whole: PrefixSums, first: Ints, last: Ints) -> tuple[Ints, Ints]:
         """Open rays (n, sectors x parts) of these parts, from those of `whole`: the same rays, one part a sector."""
@@ -126,6 +126,29 @@ class PrefixSums:
         box = np.repeat(np.arange(first.shape[0]), (last - first).sum(axis=1))
         step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         return box, np.repeat(first.ravel(), count) + step
+
+
+@njit(cache=True, nogil=True)
+def _find_open(key, ends, low, high, first, last) -> None:  # type: ignore[no-untyped-def]
+    """Fill first and last (n, parts) with the rays of each part from `low` to `high` (n, parts) [rad]."""
+    for n in range(len(low)):
+        begin = 0
+        for part in range(len(ends)):
+            end = ends[part]
+            for side in range(2):
+                wanted = (high[n, part] if side else low[n, part]) + SECTOR_STEP * part
+                a, b = begin, end
+                while a < b:
+                    middle = (a + b) >> 1
+                    if key[middle] < wanted or (side and key[middle] == wanted):
+                        a = middle + 1
+                    else:
+                        b = middle
+                if side:
+                    last[n, part] = a
+                else:
+                    first[n, part] = a
+            begin = end
 
 
 def _running_sum(values: Array) -> Array:

@@ -32,6 +32,14 @@ CELL_QUANTITIES = (
     CellQuantity("azimuth_deg", "deg", "%.6g", "azimuth of the long axis, from 0 to 180"),
 )  # fmt: skip
 
+FILTERED, SMOOTHED = "radius95_filtered_m", "radius95_smoothed_m"
+PATH_QUANTITIES = (  # beside the others, along a path with odometry
+    CellQuantity(FILTERED, "m", "%.6g", "95 % radius of the position by the images so far and the odometry between "
+                 "them; empty before the first image with a position"),
+    CellQuantity(SMOOTHED, "m", "%.6g", "the same by all images of the path"),
+)  # fmt: skip
+
+ERROR_RATIO = "error_ratio"
 SHARE_KEYS = {f"share_below_{bound}_m": bound for bound in SHARES_M}
 SUMMARY: Schema = record(
     {
@@ -41,6 +49,11 @@ SUMMARY: Schema = record(
             for key, bound in SHARE_KEYS.items()
         },
         **{name: {**CHANCE, "description": "mean over the places"} for name in ("p_ok", "p_ambiguous", "p_refused")},
+        ERROR_RATIO: or_null(
+            POSITIVE,
+            "errors of the draws over the stated ones, root mean square over the places: near 1 where the stated ones "
+            "are right; null: no draw has a position",
+        ),
     }
 )
 VARIANT: Schema = record(
@@ -58,6 +71,14 @@ DEPTH: Schema = record(
         "exposure_s": or_null(POSITIVE, "shortest that reaches the target; null: none within the limits"),
         "limiting_v_mag": or_null(NUMBER, "of this exposure: a star on the axis at 5 sigma"),
         "tried": {"type": "array", "items": record({"exposure_s": POSITIVE, "share": CHANCE})},
+    }
+)
+ALONG_PATH: Schema = record(
+    {
+        "sigma": {**NUMBER, "description": "error of a move on each axis, as a part of its length"},
+        "floor_m": {**NUMBER, "description": "beside that, in quadrature"},
+        f"median_{FILTERED}": or_null(POSITIVE, "over the places; null: half of the places or more have no radius"),
+        f"median_{SMOOTHED}": or_null(POSITIVE, "the same, by all images"),
     }
 )
 INPUTS: Schema = {
@@ -86,6 +107,6 @@ PREDICTION = schema(
             "summary": SUMMARY,
             "provenance": record({"version": TEXT, "inputs": INPUTS}),
         },
-        optional={"variants": {"type": "array", "items": VARIANT}, "depth": DEPTH},
+        optional={"variants": {"type": "array", "items": VARIANT}, "depth": DEPTH, "odometry": ALONG_PATH},
     ),
 )  # fmt: skip

@@ -16,7 +16,7 @@ from startrack.chunk_store import Chunk
 from startrack.localization import require_localizer
 from startrack.measurement import COMPLETE_V_MAG
 from startrack.rendering import Series, limiting_v_mag, load_sky_catalog
-from startrack.simulation import simulate_rays
+from startrack.simulation import draw_ground, simulate_rays
 from startrack.star_fix import locate_rays
 from startrack.terrain import Terrain, load_terrain
 from startrack.types import Array, BadInput, NoSolution, Stars
@@ -122,7 +122,8 @@ class Predictor:
         if draw not in self._skies:
             self._skies[draw] = series.draw_sky(self.conditions.times_utc[draw])
         scene, rng = series.scene(place.number, sky=self._skies[draw])
-        rays = simulate_rays(scene, self.catalog, rng=rng)
+        scene = replace(scene, terrain=draw_ground(self.terrain, rng=rng.spawn(1)[0]))
+        rays = simulate_rays(scene, self.catalog, self.terrain, rng=rng)
         try:
             located = locate_rays(rays, self.localizer)
         except BadInput:

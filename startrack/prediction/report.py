@@ -13,11 +13,12 @@ import numpy as np
 from startrack import __version__
 from startrack.errors import BadOutput
 from startrack.frames import format_utc
-from startrack.output.quantities_prediction import FORMAT, SHARES_M
+from startrack.output.quantities_prediction import FILTERED, FORMAT, SHARES_M, SMOOTHED
+from startrack.prediction.along_path import with_odometry
 from startrack.prediction.draws import Conditions
 from startrack.prediction.places import AreaCells, PathPoints
 from startrack.prediction.run import predictor_of, variant_record
-from startrack.prediction.statistics import Cells, summarized
+from startrack.prediction.statistics import Cells, median_or_none, summarized
 from startrack.prediction.write import (
     COMPARISON_PICTURE,
     FILES,
@@ -31,7 +32,16 @@ from startrack.prediction.write import (
 )
 from startrack.terrain import Terrain, load_terrain
 
+PATH_CURVES = {FILTERED: "images so far, and odometry", SMOOTHED: "all images, and odometry"}
 SETTINGS = ("kind", "terrain", "camera", "first_time_utc", "last_time_utc", "spacing_m", "places")  # of one prediction
+
+
+@dataclass(frozen=True)
+class OdometryErrors:
+    """Errors of moves on each horizontal axis."""
+
+    sigma_1: float  # relative to the length of a move
+    floor_m: float  # beside that, in quadrature
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +55,7 @@ class Report:
     cells: Cells = field(default_factory=dict)
     variants: list[dict[str, Any]] = field(default_factory=list)
     depth: dict[str, Any] | None = None
+    odometry: OdometryErrors | None = None
 
     @classmethod
     def begin(
@@ -60,6 +71,12 @@ class Report:
         """The report with the predictions: of the `conditions`, of `others` to compare with, and of a search."""
         variants = [variant_record(other, found) for other, found in others.items()]
         return replace(self, conditions=conditions, cells=cells, variants=variants, depth=depth)
+
+    def between(self, odometry: OdometryErrors) -> Report:
+        """The report of a path with odometry between its images."""
+        points_m = self.points.position_m
+        cells = with_odometry(points_m, self.cells, sigma_1=odometry.sigma_1, floor_m=odometry.floor_m)
+        return replace(self, cells=cells, odometry=odometry)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -88,6 +105,9 @@ class Report:
         more: dict[str, Any] = {"variants": self.variants} if self.variants else {}
         if self.depth is not None:
             more["depth"] = self.depth
+        if self.odometry is not None:
+            medians = {f"median_{name}": median_or_none(self.cells[name]) for name in (FILTERED, SMOOTHED)}
+            more["odometry"] = {"sigma": self.odometry.sigma_1, "floor_m": self.odometry.floor_m, **medians}
         provenance = {"version": __version__, "inputs": dict(self.inputs)}
         return {**self.settings, "summary": summarized(self.cells), **more, "provenance": provenance}
 
@@ -114,6 +134,8 @@ class Report:
             f"draws: {100 * found['p_ok']:.1f} % located, {100 * found['p_ambiguous']:.1f} % ambiguous, "
             f"{100 * found['p_refused']:.1f} % refused",
         ]
+        if self.odometry is not None:
+            lines.append(_odometry_line(self.record["odometry"]))
         if self.depth is not None:
             lines.append(_depth_line(self.depth))
         return lines + [_variant_line(one) for one in self.variants]
@@ -147,7 +169,8 @@ def _picture(report: Report) -> Any:
     if isinstance(points, AreaCells):
         raster = points.raster(radius)
         return prediction_picture(report.terrain, points.site, raster, title, _caption(report))
-    return path_picture(points.distance_m, radius, cells["p_ok"], title, _caption(report))
+    curves = {words: cells[name] for name, words in PATH_CURVES.items() if name in cells}
+    return path_picture(points.distance_m, radius, cells["p_ok"], title, _caption(report), curves)
 
 
 def _comparison_picture(report: Report) -> Any:
@@ -170,6 +193,13 @@ def _depth_line(depth: dict[str, Any]) -> str:
     if depth["exposure_s"] is None:
         return f"{wanted}: not reached by any exposure to {depth['tried'][-1]['exposure_s']:.3g} s"
     return f"{wanted}: {depth['exposure_s']:.3g} s, limiting magnitude V {depth['limiting_v_mag']:.1f}"
+
+
+def _odometry_line(found: dict[str, Any]) -> str:
+    radii = [found[f"median_{name}"] for name in (FILTERED, SMOOTHED)]
+    if None in radii:
+        return "with odometry: no position at half of the places"
+    return f"with odometry: median 95 % radius {radii[0]:.3g} m at each place, {radii[1]:.3g} m by all images"
 
 
 def _variant_line(one: dict[str, Any]) -> str:

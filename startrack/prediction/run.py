@@ -48,9 +48,11 @@ class Predictions:
     def depth(self, conditions: Conditions, target_m: float) -> tuple[Conditions, dict[str, Any]]:
         """The shortest exposure whose radius is at most `target_m` at nine of ten places; and the record of the search.
 
-        By bisection over the limiting magnitude. The conditions returned have that exposure, or the longest tried.
+        By magnitudes one by one, as deep images cost most, then by bisection of the last one. The conditions returned
+        have that exposure, or the longest tried.
         """
-        low, high = DEPTH_V_MAG
+        low, deepest = DEPTH_V_MAG
+        high = low
         tried: list[dict[str, float]] = []
 
         def reaches(v_mag: float) -> bool:
@@ -58,7 +60,8 @@ class Predictions:
             tried.append({"exposure_s": float(at_depth(conditions, v_mag).exposure_s or 0.0), "share": share})
             return share >= DEPTH_SHARE
 
-        found = reaches(high)
+        while not (found := reaches(high)) and high < deepest:
+            low, high = high, min(high + 1.0, deepest)
         while found and high - low > DEPTH_STEP_MAG:
             middle = 0.5 * (low + high)
             low, high = (low, middle) if reaches(middle) else (middle, high)

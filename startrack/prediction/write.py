@@ -12,7 +12,7 @@ import numpy as np
 from startrack.files import write_atomically
 from startrack.frames import latlon_from_enu
 from startrack.output.ecsv import Column, ecsv_text, format_values
-from startrack.output.quantities_prediction import CELL_QUANTITIES
+from startrack.output.quantities_prediction import CELL_QUANTITIES, PATH_QUANTITIES
 from startrack.prediction.places import AreaCells
 from startrack.prediction.statistics import Cells
 from startrack.terrain import Terrain
@@ -27,7 +27,7 @@ FILES = (MAP, TABLE, SUMMARY, PICTURE, COMPARISON_TABLE, COMPARISON_PICTURE)
 def write_map(out: Path, area: AreaCells, cells: Cells) -> Path:
     """The quantities as bands of a GeoTIFF in the projection of the terrain's map."""
     path = out / MAP
-    write_bands(path, area.frame, {name: area.band(values) for name, values in cells.items()})
+    write_bands(path, area.frame, {one.name: area.band(cells[one.name]) for one in CELL_QUANTITIES})
     return path
 
 
@@ -45,7 +45,11 @@ def write_table(out: Path, terrain: Terrain, position_m: Array, cells: Cells, di
             names, latlon_from_enu(terrain.site, position_m[:, 0], position_m[:, 1], up_m), strict=True
         ):
             columns.append(_column(name, np.degrees(angle), "deg", "%.9f", "of the camera"))
-    columns += [_column(one.name, cells[one.name], one.unit, one.form, one.description) for one in CELL_QUANTITIES]
+    columns += [
+        _column(one.name, cells[one.name], one.unit, one.form, one.description)
+        for one in (*CELL_QUANTITIES, *PATH_QUANTITIES)
+        if one.name in cells
+    ]
     return _write_text(out / TABLE, ecsv_text(columns))
 
 

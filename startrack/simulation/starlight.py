@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.evidence.photometry import Photometry, Sources, half_width
-from startrack.psf import pixel_profile, pixel_profile_single
+from startrack.evidence.photometry import Photometry, Sources, half_width, neighbour_profiles, order_by_cell
+from startrack.psf import pixel_profile
 from startrack.types import Array, Ints
 
 NEIGHBOUR_SIGMAS = 3.0  # of the PSF beyond half a stamp, to the last star whose light is subtracted, as in `measure`
@@ -33,24 +33,17 @@ class Starlight:
         of overlapping stamps are drawn independently. A star with a pixel above `saturation_e` is not usable.
         """
         sigma, radius = self.psf_sigma_px, half_width(self.psf_sigma_px)
-        stamps = _Stamps.about(sources.xy_px, sigma, radius)
-        mean, shot = np.zeros((2, len(sources.flux_e)))
-        subtracted, subtracted_shot, unsure = np.zeros((3, len(sources.flux_e)))
-        reach_px = radius + NEIGHBOUR_SIGMAS * sigma
-        _, own_shot = stamps.part_of(np.arange(len(stamps.pixel)), sources.xy_px)
-        star, other = _pairs(sources.xy_px, self.xy_px, CORNER * radius + NEIGHBOUR_SIGMAS * sigma)
-        part, noise = stamps.part_of(star, self.xy_px[other])
-        np.add.at(mean, star, part * self.flux_e[other])
-        np.add.at(shot, star, noise * self.flux_e[other])
-        star, other = _pairs(sources.xy_px, sources.xy_px, reach_px)
-        star, other = star[star != other], other[star != other]
-        part, noise = stamps.part_of(star, sources.xy_px[other])
-        light, visible = sources.flux_e[other], sources.visible[other]
-        spread = visible * (1.0 - visible) + visible * np.square(sources.fraction_sigma[other])
-        np.add.at(subtracted, star, part * light * visible)
-        np.add.at(subtracted_shot, star, noise * light * visible)
-        np.add.at(unsure, star, np.square(part * light) * spread)
-        without_stars = pixel_variance_e2 / stamps.strength
+        reach_px = CORNER * radius + NEIGHBOUR_SIGMAS * sigma
+        lowest_px = np.floor(sources.xy_px.min(axis=0, initial=0.0) - reach_px)
+        near = (self.xy_px > lowest_px).all(axis=1)
+        collect = _Collector(sources.xy_px - lowest_px, sigma)
+        mean, shot, *_ = collect(self.xy_px[near] - lowest_px, self.flux_e[near], reach_px)
+        light, visible = sources.flux_e, sources.visible
+        spread = visible * (1.0 - visible) + visible * np.square(sources.fraction_sigma)
+        subtracted, subtracted_shot, unsure, own_shot, strength = collect(
+            collect.xy_px, light * visible, radius + NEIGHBOUR_SIGMAS * sigma, np.square(light) * spread
+        )
+        without_stars = pixel_variance_e2 / strength
         noise_e = np.sqrt(np.maximum(without_stars + shot, 0.0))
         flux = mean - subtracted + noise_e * rng.standard_normal(len(mean))
         peak = self.flux_e * np.square(pixel_profile(np.zeros(1), sigma, 0)[0][0, 0])
@@ -64,46 +57,26 @@ class Starlight:
 
 
 @dataclass(frozen=True, eq=False)
-class _Stamps:
-    """The pixels about stars (n) and the weights of their profiles, P - mean(P) over `strength`."""
+class _Collector:
+    """The stamps about stars (n), and the light that their weights collect; see `collect_light`."""
 
-    pixel: Ints  # (n, 2) in the middle
-    across: Array  # (n, side) profile in x
-    down: Array  # (n, side) profile in y
-    middle: Array  # (n,) mean of the profile
-    strength: Array  # (n,) sum of P (P - mean)
+    xy_px: Array  # (n, 2), none negative
     sigma_px: float
-    radius: int
 
-    @classmethod
-    def about(cls, xy_px: Array, sigma_px: float, radius: int) -> _Stamps:
-        """Those about positions (n, 2)."""
-        pixel = np.rint(xy_px)
-        offset = xy_px - pixel
-        across, down = (pixel_profile(offset[:, axis], sigma_px, radius)[0] for axis in (0, 1))
-        total = across.sum(axis=1) * down.sum(axis=1)
-        middle = total / across.shape[1] ** 2
-        strength = np.square(across).sum(axis=1) * np.square(down).sum(axis=1) - middle * total
-        return cls(pixel.astype(np.int64), across, down, middle, strength, sigma_px, radius)
+    def __call__(self, others_px: Array, weight: Array, reach_px: float, square_weight: Array | None = None) -> Array:
+        """The sums (5, n) over others (m) within reach; those with a `square_weight` are the stars (n) themselves."""
+        from startrack.simulation.starlight_kernel import collect_light
 
-    def part_of(self, star: Ints, xy_px: Array) -> tuple[Array, Array]:
-        """Of the light at `xy_px` (k, 2): the part (k,) that stamp `star` (k,) takes for its star's, and the variance
-        that each of its electrons adds.
-        """
-        offset = xy_px - self.pixel[star]
-        sums = [self._sums(profile[star], offset[:, axis]) for axis, profile in enumerate((self.across, self.down))]
-        light, with_profile, with_square = (x * y for x, y in zip(*sums, strict=True))
-        middle, strength = self.middle[star], self.strength[star]
-        part = (with_profile - middle * light) / strength
-        variance = (with_square - 2.0 * middle * with_profile + np.square(middle) * light) / np.square(strength)
-        return part, variance
-
-    def _sums(self, own: Array, offset_px: Array) -> tuple[Array, Array, Array]:
-        """Along one axis, sums (k,) of a neighbour's profile alone, times the star's `own` (k, side), and times its
-        square.
-        """
-        other = pixel_profile_single(offset_px, self.sigma_px, self.radius)[0].astype(np.float64)
-        return other.sum(axis=1), np.einsum("kp,kp->k", other, own), np.einsum("kp,kp,kp->k", other, own, own)
+        size_px = np.maximum(self.xy_px.max(axis=0, initial=0.0), others_px.max(axis=0, initial=0.0)) + 1.0
+        order, first, columns = order_by_cell(others_px, (int(size_px[1]), int(size_px[0])), reach_px)
+        number = np.full(len(order), -1) if square_weight is None else order
+        squares = np.zeros(len(order)) if square_weight is None else square_weight[order]
+        found = np.empty((len(self.xy_px), 5))
+        collect_light(
+            self.xy_px, others_px[order], number, weight[order], squares, first, columns, reach_px, reach_px,
+            half_width(self.sigma_px), neighbour_profiles(self.sigma_px), found,
+        )  # fmt: skip
+        return np.ascontiguousarray(found.T)
 
 
 def _pairs(xy_px: Array, others_px: Array, reach_px: float) -> tuple[Ints, Ints]:

@@ -40,11 +40,14 @@ class HorizonSigma:
         reach_m = self.table.square.reach_m
         n, side = len(most), 2 * reach_m / len(most)
         steps = 2 + int(2 * azimuth_half_rad * BINS / (2 * np.pi)) if azimuth_half_rad > 0 else 1
+        corners = np.array([centres_m + corner for corner in half_m * (1 - 1e-9) * CORNERS])
+        cells = np.clip((corners + reach_m) / side, 0, n - 1).astype(np.int64)
+        if (cells == cells[0]).all():  # boxes of the search lie within blocks
+            cells = cells[:1]
         found = np.zeros(np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad)))
         for turn in np.linspace(-azimuth_half_rad, azimuth_half_rad, steps) * (1 - 1e-9):
             b = np.floor((np.asarray(azimuths_rad) + turn) / (2 * np.pi) * BINS).astype(np.int64) % BINS
-            for corner in half_m * (1 - 1e-9) * CORNERS:
-                cell = np.clip((np.asarray(centres_m) + corner + reach_m) / side, 0, n - 1).astype(np.int64)
+            for cell in cells:
                 found = np.maximum(found, most[cell[..., 0], cell[..., 1], b])
         return found
 

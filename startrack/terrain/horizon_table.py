@@ -10,12 +10,16 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from startrack.terrain.protocol import Progress
 from startrack.types import Array, Bools, Ints
+
+if TYPE_CHECKING:
+    from startrack.terrain.trace_memory import BoxMemory
 
 BINS = 360  # azimuths; the localizer's sectors are 1.5 degrees wide
 DISTANCE_STEP_M = 4.0
@@ -59,6 +63,13 @@ class HorizonTable:
     square: Square
     values: NDArray[np.uint16]  # (cells, BINS, 11)
     unknown_rad: Array  # (BINS,) elevation below which ground off the maps might stand, seen from anywhere; or -pi/2
+
+    @cached_property
+    def box_memory(self) -> BoxMemory:
+        """Bounds over small boxes that were traced with this table before."""
+        from startrack.terrain.trace_memory import BoxMemory
+
+        return BoxMemory()
 
     @cached_property
     def pyramid(self) -> list[tuple[NDArray[np.uint16], NDArray[np.uint16]]]:

@@ -16,8 +16,8 @@ EDGE = 1e-9  # of a cell or a bin: what only touches it does not count
 
 
 @njit(cache=True, nogil=True)
-def sector_bounds(values, lows, highs, across, reach, centre, half, low_up, high_up, azimuth, turn, out):
-    """Bounds (2,) of the elevation over a box and the azimuths within `turn`; lows, highs: of the level that fits.
+def sector_bounds(values, lows, highs, across, reach, east, north, half, low_up, high_up, azimuth, turn):
+    """Bounds of the elevation over a box and the azimuths within `turn`; lows, highs: of the level that fits.
 
     Boxes smaller than a cell take the lines and points of the cells they touch, larger ones the bounds of the level's
     blocks.
@@ -25,10 +25,10 @@ def sector_bounds(values, lows, highs, across, reach, centre, half, low_up, high
     n = lows.shape[0]
     side = 2 * reach / n
     fine = n == across and half < 0.5 * side
-    i0 = min(max(int(np.floor((centre[0] - half + reach) / side + EDGE)), 0), n - 1)
-    i1 = min(max(int(np.ceil((centre[0] + half + reach) / side - EDGE)) - 1, i0), n - 1)
-    j0 = min(max(int(np.floor((centre[1] - half + reach) / side + EDGE)), 0), n - 1)
-    j1 = min(max(int(np.ceil((centre[1] + half + reach) / side - EDGE)) - 1, j0), n - 1)
+    i0 = min(max(int(np.floor((east - half + reach) / side + EDGE)), 0), n - 1)
+    i1 = min(max(int(np.ceil((east + half + reach) / side - EDGE)) - 1, i0), n - 1)
+    j0 = min(max(int(np.floor((north - half + reach) / side + EDGE)), 0), n - 1)
+    j1 = min(max(int(np.ceil((north + half + reach) / side - EDGE)) - 1, j0), n - 1)
     first = int(np.floor((azimuth - turn) / BIN_RAD + EDGE))
     last = max(int(np.ceil((azimuth + turn) / BIN_RAD - EDGE)) - 1, first)
     last = min(last, first + BINS - 1)
@@ -44,14 +44,14 @@ def sector_bounds(values, lows, highs, across, reach, centre, half, low_up, high
                     middle = (b + 0.5) * BIN_RAD
                     sin_a, cos_a = np.sin(middle), np.cos(middle)
                     v = values[i * across + j, b]
-                    along = (centre[0] - (2 * i + 1) * side / 2 + reach) * sin_a
-                    along += (centre[1] - (2 * j + 1) * side / 2 + reach) * cos_a
+                    along = (east - (2 * i + 1) * side / 2 + reach) * sin_a
+                    along += (north - (2 * j + 1) * side / 2 + reach) * cos_a
                     wide = half * (abs(sin_a) + abs(cos_a))
-                    aside = (centre[0] - (2 * i + 1) * side / 2 + reach) * cos_a
-                    aside -= (centre[1] - (2 * j + 1) * side / 2 + reach) * sin_a
+                    aside = (east - (2 * i + 1) * side / 2 + reach) * cos_a
+                    aside -= (north - (2 * j + 1) * side / 2 + reach) * sin_a
                     below, above = _of_line(v, along, abs(aside), wide, low_up, high_up, 0.5 * side)
                 low, high = min(low, below), max(high, above)
-    out[0], out[1] = low, high
+    return low, high
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -87,18 +87,18 @@ def _of_line(v, along, aside, wide, low_up, high_up, cell_half):
 
 
 @njit(cache=True, nogil=True)
-def look_up(values, across, reach, point, azimuth, out):
+def look_up(values, across, reach, east, north, azimuth, out):
     """Between which distances the horizon stands from a point, and about where [m]; (0, 1e9, 0) off the table."""
     side = 2 * reach / across
-    i, j = int(np.floor((point[0] + reach) / side)), int(np.floor((point[1] + reach) / side))
+    i, j = int(np.floor((east + reach) / side)), int(np.floor((north + reach) / side))
     out[0], out[1], out[2] = 0.0, 1e9, 0.0
     if 0 <= i < across and 0 <= j < across:
         b = int(np.floor(azimuth / BIN_RAD)) % BINS
         v = values[i * across + j, b]
         if v[2] <= v[3]:
             middle = (b + 0.5) * BIN_RAD
-            along = (point[0] - (i + 0.5) * side + reach) * np.sin(middle)
-            along += (point[1] - (j + 0.5) * side + reach) * np.cos(middle)
+            along = (east - (i + 0.5) * side + reach) * np.sin(middle)
+            along += (north - (j + 0.5) * side + reach) * np.cos(middle)
             margin = 0.01 * side + DISTANCE_STEP_M
             out[0] = max(v[2] * DISTANCE_STEP_M - along - margin, 0.0) if v[2] > 0 else 0.0
             if v[3] < FARTHEST:
@@ -118,7 +118,7 @@ def horizons(ground, values, across, reach, camera_height, points, azimuths, tan
             surfaces(ground, points[k : k + 1], one)
             up = one[0] + camera_height
         if across > 0:
-            look_up(values, across, reach, points[k], azimuths[k], near)
+            look_up(values, across, reach, points[k, 0], points[k, 1], azimuths[k], near)
         tan[k], at[k], edge[k] = horizon(
             ground, points[k, 0], points[k, 1], up, np.sin(azimuths[k]), np.cos(azimuths[k]), near[0], near[1], near[2]
         )
@@ -129,7 +129,6 @@ def box_bounds(ground, values, across, reach, camera_height, centres, half, azim
     """Fill low and high (n,) [rad] with bounds over small boxes and narrow azimuths, traced anew."""
     near, around, found = np.empty(3), np.empty(3), np.empty(11)
     middle, lowest, highest, slope_e, slope_n = 0.0, 0.0, 0.0, 0.0, 0.0
-    corner = np.empty(2)
     for k in range(len(low)):
         if k == 0 or centres[k, 0] != centres[k - 1, 0] or centres[k, 1] != centres[k - 1, 1] or half[k] != half[k - 1]:
             middle, lowest, highest, slope_e, slope_n = box_height_bounds(
@@ -139,10 +138,10 @@ def box_bounds(ground, values, across, reach, camera_height, centres, half, azim
         if across > 0:
             near[0], near[1] = FAR_M, 0.0
             for c in range(4):
-                corner[0] = centres[k, 0] + half[k] * (2 * (c & 1) - 1)
-                corner[1] = centres[k, 1] + half[k] * (c - (c & 1) - 1)
+                east = centres[k, 0] + half[k] * (2 * (c & 1) - 1)
+                north = centres[k, 1] + half[k] * (c - (c & 1) - 1)
                 for side in range(1 if turn[k] == 0.0 else 2):
-                    look_up(values, across, reach, corner, azimuths[k] + turn[k] * (2 * side - 1), around)
+                    look_up(values, across, reach, east, north, azimuths[k] + turn[k] * (2 * side - 1), around)
                     near[0], near[1] = min(near[0], around[0]), max(near[1], around[1])
             wide = 2.0 * half[k]
             near[0] = max(near[0] - wide, 0.0)
@@ -161,17 +160,16 @@ def many_sector_bounds(
     ground, values, lows, highs, across, reach, camera_height, centres, half, azimuths, turn, low, high
 ):
     """Fill low and high (n,) [rad] with `sector_bounds`."""
-    out = np.empty(2)
     lowest, highest = 0.0, 0.0
     for k in range(len(low)):
         new = k == 0 or centres[k, 0] != centres[k - 1, 0] or centres[k, 1] != centres[k - 1, 1]
         if half[k] < reach / across and (new or half[k] != half[k - 1]):
             _, lowest, highest, _, _ = box_height_bounds(ground, centres[k, 0], centres[k, 1], half[k], False)
             lowest, highest = lowest + camera_height, highest + camera_height
-        sector_bounds(
-            values, lows, highs, across, reach, centres[k], half[k], lowest, highest, azimuths[k], turn[k], out
-        )
-        low[k], high[k] = out[0], out[1]
+        low[k], high[k] = sector_bounds(
+            values, lows, highs, across, reach, centres[k, 0], centres[k, 1], half[k], lowest, highest, azimuths[k],
+            turn[k],
+        )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)

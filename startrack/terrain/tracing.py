@@ -39,8 +39,7 @@ def trace_horizons(
     from startrack.terrain.table_kernel import horizons
 
     tan, at, edge = (np.empty(len(azimuths)) for _ in range(3))
-    values, across, reach = _table_arrays(table)
-    fixed = terrain.ground, values, across, reach, terrain.camera_height_m
+    fixed = terrain.ground, *_table_arrays(table), terrain.camera_height_m
     _run_in_threads(horizons, fixed, (points, azimuths, tan, at, edge))
     return tan, at, edge
 
@@ -58,7 +57,8 @@ def trace_box_bounds(terrain: HeightMap, table: HorizonTable, *arrays: Array) ->
     """Bounds traced over small boxes: centres (n, 2), half sides, azimuths and their half widths; results low, high."""
     from startrack.terrain.table_kernel import box_bounds
 
-    _run_in_threads(box_bounds, (terrain.ground, *_table_arrays(table), terrain.camera_height_m), arrays)
+    fixed = terrain.ground, *_table_arrays(table), terrain.camera_height_m
+    table.box_memory.fill(lambda *some: _run_in_threads(box_bounds, fixed, some), *arrays)
 
 
 def look_up_sector_bounds(terrain: HeightMap, table: HorizonTable, *arrays: Array) -> None:

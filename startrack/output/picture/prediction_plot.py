@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,16 +29,19 @@ WIDTH_PX, HEIGHT_PX = 1100, 620
 BOX: Box = (90.0, 84.0, 1070.0, 540.0)
 TITLE_PX, TEXT_PX, CAPTION_PX = 22.0, 17.0, 16.0
 CURVES = (SKY_BLUE, ORANGE, BLUISH_GREEN, REDDISH_PURPLE)
+EACH_IMAGE = "each image alone"
 LOCATED = 0.9  # share of the draws below which a point is marked
 NICE = tuple(step * 10.0**power for power in range(-3, 6) for step in (1.0, 2.0, 5.0))
 
 
 def path_picture(
-    distance_m: Array, radius_m: Array, p_ok: Array, title: str, lines: Sequence[str]
-) -> NDArray[np.uint8]:
+    distance_m: Array, radius_m: Array, p_ok: Array, title: str, lines: Sequence[str],
+    more: Mapping[str, Array] | None = None,
+) -> NDArray[np.uint8]:  # fmt: skip
     """The 95 % radius (k,) against the distance (k,) along a path; points with fewer positions are marked.
 
-    A radius is infinite where half of the draws or more have no position.
+    A radius is infinite where half of the draws or more have no position. `more` has radii (k,) with odometry, by the
+    names of their curves.
     """
     canvas = Canvas(WIDTH_PX, HEIGHT_PX)
     known = np.isfinite(radius_m)
@@ -48,6 +51,7 @@ def path_picture(
     _draw_linear_grid(canvas, scale)
     for run in _runs(known):
         canvas.line(scale(distance_m[run], radius_m[run]), SKY_BLUE, 3)
+    _draw_curves(canvas, scale, distance_m, more or {})
     for distance, radius, share in zip(distance_m, radius_m, p_ok, strict=True):
         if not np.isfinite(radius):
             canvas.cross(scale(distance, 0.97 * top_m), 6.0, VERMILLION, 2)
@@ -59,6 +63,16 @@ def path_picture(
         words = "red circle: fewer than 9 of 10 images give a position; red cross: half of them or fewer"
         canvas.text((BOX[2], BOX[3] + 62.0), words, CAPTION_PX, DIM_INK, "rm")
     return canvas.rendered_pixels()
+
+
+def _draw_curves(canvas: Canvas, scale: _Linear, distance_m: Array, curves: Mapping[str, Array]) -> None:
+    """Further curves, with the names of all."""
+    for colour, radius_m in zip(CURVES[1:], curves.values(), strict=False):
+        for run in _runs(np.isfinite(radius_m)):
+            canvas.line(scale(distance_m[run], radius_m[run]), colour, 3)
+    names = [EACH_IMAGE, *curves] if curves else []
+    for k, (name, colour) in enumerate(zip(names, CURVES, strict=False)):
+        canvas.text((BOX[2] - 12.0, BOX[1] + 12.0 + 24.0 * k), name, TEXT_PX, colour, "rt", halo=True)
 
 
 def comparison_picture(variants: Sequence[dict[str, Any]], title: str) -> NDArray[np.uint8]:

@@ -105,6 +105,10 @@ class LocalLikelihood:
         _add_rows(e.elevation_rad, e.llr, e.extended_nats, sigma, sector, horizon, found)
         return found
 
+    def interpolated(self) -> LocalLikelihood:
+        """The same with horizons interpolated at all azimuths, also between two crests."""
+        return replace(self, ground=self.ground.interpolated())
+
     def with_terrain(self, terrain: Terrain) -> LocalLikelihood:
         """The same rows on another terrain, whose horizon differs by no more than the leeway."""
         ground = terrain.near(self.centre_m, self.half_m, self.evidence.azimuth_rad)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -34,6 +35,7 @@ class HorizonInterpolator(ForwardingTerrain):
     half_m: float
     azimuths_rad: Array  # (n,) ascending
     across: int = NODES_ACROSS
+    exact: bool = True  # azimuths with a large interpolation error are traced
 
     @cached_property
     def step_m(self) -> float:
@@ -87,6 +89,12 @@ class HorizonInterpolator(ForwardingTerrain):
             float(self.centre_m[0]), float(self.centre_m[1]), float(self.half_m),
         )  # fmt: skip
 
+    def interpolated(self) -> HorizonInterpolator:
+        """The same nodes, between which all azimuths are interpolated; see `Terrain`."""
+        nodes, other = self._traced_nodes, copy(self)
+        other.__dict__.update(_traced_nodes=nodes, exact=False)
+        return other
+
     def column(self, azimuths_rad: Array) -> tuple[Ints, Bools]:
         """Index of each azimuth (...) in `azimuths_rad`, and whether it is there."""
         at = np.minimum(np.searchsorted(self.azimuths_rad, azimuths_rad), len(self.azimuths_rad) - 1)
@@ -121,7 +129,7 @@ class HorizonInterpolator(ForwardingTerrain):
         column, known = self.column(azimuths)
         found = tracing.interpolate(self, points, column)
         inside = np.abs(points - self.centre_m).max(axis=-1) <= self.half_m * (1 + 1e-9)
-        other = ~(inside & known & self._smooth[column])
+        other = ~(inside & known & (self._smooth[column] if self.exact else True))
         if other.any():
             found[other] = self.whole.horizon_rad(points[other], azimuths[other])
         return found.reshape(shape)

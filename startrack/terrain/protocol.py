@@ -175,6 +175,10 @@ class Terrain(ABC):
         """
         return None
 
+    def interpolated(self) -> Terrain:
+        """As this one, with horizons interpolated where `near` prepared them and tracing would take long."""
+        return self
+
     def interpolation(self, azimuths_rad: Array) -> Interpolation | None:
         """Horizons prepared by `near` as the compiled kernels read them, for the azimuths (n,); None: not prepared."""
         return None

@@ -18,6 +18,8 @@ ExploreFrom = Callable[[Evidence, Terrain, Array | None], Explored]
 
 PRIOR_SIGMAS = 3.0  # half width of the first grid
 BIAS_NEARBY_M = 80.0  # horizons are prepared that far about a position; a position farther off is prepared anew
+BIAS_CLOSE_M = 15.0  # where the bias found makes the fit worse than none by more than the next number
+BIAS_LOSS_NATS = 1.0
 BIAS_STEPS_M = (16.0, 4.0, 0.5)  # first and later first steps of a climb, and the last
 BIAS_GRID = (7, 5.0, 0.75, 6)  # nodes; nats kept; shrinking that is enough; rounds
 MIXED_SIGMAS, MIXED_NATS = np.linspace(-2.5, 2.5, 11), 10.0  # boxes less likely by more hold 5e-5 of the mass
@@ -69,18 +71,37 @@ def find_horizon_bias(likelihood: PositionLikelihood) -> tuple[HorizonBias, Arra
 
 
 def estimate_horizon_bias(likelihood: PositionLikelihood, position_m: Array) -> HorizonBias:
-    """The bias that fits best with its prior `Terrain.common_sigma_rad`, the position free near the one given (2,)."""
+    """The bias that fits best with its prior `Terrain.common_sigma_rad`, the position free near the one given (2,).
+
+    Horizons are interpolated between traced ones. Beside near crests that can show a wrong bias: where the position
+    given fits better without it, horizons are traced closer to that.
+    """
+    found = _bias_nearby(likelihood, position_m, BIAS_NEARBY_M, PRIOR_SIGMAS * likelihood.terrain.common_sigma_rad)
+    if float(likelihood.exact_scores(position_m[None])[0]) > _exact_fit(likelihood, found) + BIAS_LOSS_NATS:
+        return _bias_nearby(likelihood, position_m, BIAS_CLOSE_M, abs(found.bias_rad) + PRIOR_SIGMAS * found.sigma_rad)
+    return found
+
+
+def _exact_fit(likelihood: PositionLikelihood, found: HorizonBias) -> float:
+    """Log-likelihood of a bias and its position with traced horizons, and with the prior of the bias [nats]."""
+    lowered = lower_evidence(likelihood.evidence, found.bias_rad)
+    fit = PositionLikelihood.from_evidence(lowered, likelihood.terrain).exact_scores(found.position_m[None])
+    return float(fit[0]) - 0.5 * (found.bias_rad / likelihood.terrain.common_sigma_rad) ** 2
+
+
+def _bias_nearby(likelihood: PositionLikelihood, position_m: Array, nearby_m: float, most_rad: float) -> HorizonBias:
+    """The best bias of at most `most_rad`; horizons are prepared within `nearby_m` of a position."""
     prior = likelihood.terrain.common_sigma_rad
     first_step, next_step, last_step = BIAS_STEPS_M
-    centre, step = position_m, first_step
-    local = likelihood.near(centre, BIAS_NEARBY_M, PRIOR_SIGMAS * prior)
+    centre, step = position_m, min(first_step, 0.5 * nearby_m)
+    local = likelihood.near(centre, nearby_m, most_rad)
     positions_m = np.zeros((0, 2))
 
     def fits(nodes: Array) -> Array:
         nonlocal centre, step, local, position_m, positions_m
-        if np.abs(position_m - centre).max() > BIAS_NEARBY_M:
+        if np.abs(position_m - centre).max() > nearby_m:
             centre = position_m
-            local = likelihood.near(centre, BIAS_NEARBY_M, PRIOR_SIGMAS * prior)
+            local = likelihood.near(centre, nearby_m, most_rad)
         e = local.evidence.elevation_rad
         found = [local.climb(position_m, step, last_step, e - bias) for bias in nodes[:, 0]]
         positions_m = np.array([point for point, _ in found])
@@ -88,7 +109,7 @@ def estimate_horizon_bias(likelihood: PositionLikelihood, position_m: Array) -> 
         position_m, step = positions_m[int(np.argmax(scores))], next_step
         return scores
 
-    nodes, scores = zoom_grid(fits, np.array([PRIOR_SIGMAS * prior]), *BIAS_GRID)
+    nodes, scores = zoom_grid(fits, np.array([most_rad]), *BIAS_GRID)
     biases = nodes[:, 0]
     weight = np.exp(scores - scores.max())
     weight /= weight.sum()

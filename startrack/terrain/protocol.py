@@ -289,4 +289,5 @@ class ForwardingTerrain(Terrain):
     reshaped, log_prior = _forward("reshaped"), _forward("log_prior")
     visible_disks, interpolation = _forward("visible_disks"), _forward("interpolation")
     interpolated_part, horizon_spread_rad = _forward("interpolated_part"), _forward("horizon_spread_rad")
+    interpolated = _forward("interpolated")
     is_prepared, prepare, discard_table = _forward("is_prepared"), _forward("prepare"), _forward("discard_table")

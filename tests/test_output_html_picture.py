@@ -98,7 +98,7 @@ def test_a_star_is_found_by_name_and_by_number(window):
         assert w.page.evaluate(f"{VIEW}.pinned.name") == "Canopus"
     w.page.get_by_label("Find a star").fill("Nowhere")
     w.page.keyboard.press("Enter")
-    assert "“Nowhere” is not among" in answer.inner_text()
+    assert "“Nowhere” is outside of the picture" in answer.inner_text()
 
 
 def test_a_star_behind_the_wall_is_found_as_hidden(window):

@@ -13,7 +13,7 @@ SHAPE_SIGMAS = 4.0  # of a terrain's shape, beyond which none is drawn
 
 
 def draw_ground(terrain: Terrain, *, rng: np.random.Generator) -> Terrain:
-    """The ground below a camera, drawn by `rng` where the file of the `terrain` states errors; else the terrain itself."""
+    """The ground below a camera, drawn by `rng` where the file of the `terrain` states errors; else the terrain."""
     if any(terrain.shape_sigma):
         terrain = terrain.reshaped(_draw_shape(terrain, rng))
     if terrain.common_sigma_rad > 0.0 or terrain.height_sigma_m > 0.0:

@@ -53,6 +53,12 @@ class Window:
         self.page.goto(path.as_uri())
         self.said.remove(path.as_uri())
 
+    def close(self, ignored: str | None = None) -> None:
+        """Close the page: no error, no warning, and no request but for itself; messages with `ignored` do not count."""
+        said = [text for text in self.said if ignored is None or ignored not in text]
+        self.context.close()
+        assert said == []
+
     def wait_for(self, condition: str) -> None:
         """Wait for a condition in JavaScript. (Playwright's own way polls by eval, which the page's rules forbid.)"""
         for _ in range(600):

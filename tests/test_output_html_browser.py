@@ -41,9 +41,7 @@ def window(chromium, folder) -> Iterator[Any]:
 
     yield make
     for one in opened:
-        said = one.said
-        one.context.close()
-        assert said == []  # no error, no warning, and no request but for the page itself
+        one.close()
 
 
 def test_hover_shows_a_star_and_the_wheel_zooms_at_the_pointer(window):

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from startrack.correction import Correction
 from startrack.exposure.decode_file import decode_file
 from startrack.exposure.header import header_number
+from startrack.exposure.mask import require_size
 from startrack.exposure.mosaic import PHASES
 from startrack.files import printable
 from startrack.types import BadInput, Bools, Exposure, Mask
@@ -71,15 +72,16 @@ def correct_counts(
     Raises BadInput: bad_image where a file is no dark frame or flat field, size_mismatch where it has another size.
     """
     pixels, masked = np.array(recorded_adu), np.zeros(recorded_adu.shape, dtype=np.bool_)
+    size_px = (pixels.shape[1], pixels.shape[0])
     dark_frame = None if dark is None else read_dark(dark)
     flat_frame = None if flat is None else read_flat(flat, mosaic=mosaic)
     if dark_frame is not None:
-        _check_shape("dark frame", dark_frame, pixels)
+        require_size("dark frame", dark_frame.values.shape, size_px)
         pixels -= dark_frame.values
         if dark_frame.unusable is not None:
             masked |= dark_frame.unusable
     if flat_frame is not None:
-        _check_shape("flat field", flat_frame, pixels)
+        require_size("flat field", flat_frame.values.shape, size_px)
         black = np.float32(0.0 if dark_frame is None else dark_frame.median_adu)
         pixels -= black
         pixels /= flat_frame.values
@@ -191,10 +193,3 @@ def _frame(
     values.flags.writeable = False
     sha256, exposure_s = hashlib.sha256(raw).hexdigest(), header_number(header, "exposure_s", [])
     return CalibrationFrame(values, unusable if unusable.any() else None, median, sha256, exposure_s)
-
-
-def _check_shape(kind: str, frame: CalibrationFrame, pixels: Picture) -> None:
-    """Raise BadInput size_mismatch unless the frame has the size of the image."""
-    if frame.values.shape != pixels.shape:
-        (own_h, own_w), (height, width) = frame.values.shape, pixels.shape
-        raise BadInput("size_mismatch", f"the {kind} is {own_w} x {own_h} px, the image {width} x {height}")

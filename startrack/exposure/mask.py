@@ -52,13 +52,18 @@ def combine_masks(
     given = ((of_camera, "bad_calibration"), (of_image, "bad_image"), (not_corrected, "bad_image"))
     masks = [one if isinstance(one, Mask) else read_mask(one, reason) for one, reason in given if one is not None]
     for mask in masks:
-        height, width = mask.masked.shape
-        if (width, height) != size_px:
-            raise BadInput("size_mismatch", f"the mask is {width} x {height} px, the image {size_px[0]} x {size_px[1]}")
+        require_size("mask", mask.masked.shape, size_px)
     if len(masks) < 2:
         return masks[0] if masks else None
     masked = np.logical_or.reduce([mask.masked for mask in masks])
     return Mask(masked=masked, sha256="+".join(mask.sha256 for mask in masks if mask.sha256))
+
+
+def require_size(kind: str, shape: tuple[int, ...], size_px: tuple[int, int]) -> None:
+    """Raise BadInput size_mismatch unless an array of a `shape` (H, W) has the size (W, H) of the image."""
+    height, width = shape
+    if (width, height) != size_px:
+        raise BadInput("size_mismatch", f"the {kind} is {width} x {height} px, the image {size_px[0]} x {size_px[1]}")
 
 
 def touch_masked(masked: Bools, xy_px: Array, radius_px: int) -> Bools:

@@ -49,7 +49,9 @@ def draw_track_map(canvas: Canvas, box: Box, track: Track, odometry_m: Array | N
         legend = _draw_rest(canvas, window, view, track)
     else:
         legend = _draw_drive(canvas, window, view, track, odometry_m)
-    draw_frame(canvas, view, "" if step_m is None else f"contours each {step_m:g} m, heights above the sphere")
+    draw_frame(
+        canvas, view, "" if step_m is None else f"contours each {step_m:g} m, heights above the sphere at the origin"
+    )
     _draw_north(canvas, *north)
     return view, legend
 

@@ -54,10 +54,10 @@ function colour(name) {
 }
 
 // Text on a drawing, with a rim of the ground's colour that keeps it apart from whatever lies below.
-function writeOn(g, text, x, y, fill) {
+function writeOn(g, text, x, y, fill, rim = colour("plot"), width = 4) {
   g.lineJoin = "round";
-  g.lineWidth = 4;
-  g.strokeStyle = colour("plot");
+  g.lineWidth = width;
+  g.strokeStyle = rim;
   g.strokeText(text, x, y);
   g.fillStyle = fill;
   g.fillText(text, x, y);

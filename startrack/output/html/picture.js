@@ -27,12 +27,7 @@ function skyLine(g, points, stroke, width) {
 
 // Text on the sky: its rim is dark in either theme.
 function skyText(g, text, x, y, fill) {
-  g.lineJoin = "round";
-  g.lineWidth = 3.5;
-  g.strokeStyle = onSky("ground");
-  g.strokeText(text, x, y);
-  g.fillStyle = fill;
-  g.fillText(text, x, y);
+  writeOn(g, text, x, y, fill, onSky("ground"), 3.5);
 }
 
 // A ring about a star that has a detection, a dot where only its light was measured; other kinds have their shapes.

@@ -30,7 +30,7 @@ def relief_picture(terrain: Terrain, position_m: tuple[float, float] | None = No
         window = canvas.window(box)
         step_m = draw_contours(canvas, window, view, *ground_of_view(view, terrain, (window.size[1], window.size[0])))
         if step_m is not None:
-            words = f"contours each {step_m:g} m, heights above the sphere"
+            words = f"contours each {step_m:g} m, heights above the sphere at the origin"
             canvas.text((box[0] + 12.0, box[3] - 14.0), words, CAPTION_SIZE, DIM_INK, "ls", halo=True)
     return canvas.rendered_pixels()
 

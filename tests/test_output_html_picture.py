@@ -158,9 +158,23 @@ def test_the_button_changes_the_theme_of_page_and_drawings(window):
     w.page.get_by_role("button", name="Dark theme").click()
     dark = w.page.evaluate(f"[{paper}, {ground}]")
     assert light[0] > 700 and dark[0] < 100 and light[1] != dark[1]
+    w.page.reload()  # the choice is kept
+    assert w.page.evaluate(f"[{paper}, {ground}]") == dark
     w.page.emulate_media(color_scheme="dark")
     w.page.get_by_role("button", name="Light theme").click()
     assert w.page.evaluate(f"[{paper}, {ground}]") == light
+    w.said.remove(w.page.url.partition("#")[0])  # of the reload
+
+
+def test_the_theme_changes_where_the_browser_refuses_storage(window):
+    w = window()
+    w.page.add_init_script(
+        "Object.defineProperty(window, 'localStorage', { get() { throw new DOMException('refused', 'SecurityError') } })"
+    )
+    w.page.reload()
+    w.page.get_by_role("button", name="Dark theme").click()
+    assert w.page.get_by_role("button", name="Light theme").is_visible()
+    w.said.remove(w.page.url)  # of the reload
 
 
 def test_a_sector_of_the_evidence_is_described(window):

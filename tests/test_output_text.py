@@ -17,7 +17,7 @@ from startrack.types import Mode
 def test_one_line_for_a_fix(located):
     line = summary_line(located.result, seconds=3.14)
     found = re.fullmatch(
-        r"small  ok  E (-?\d+\.\d) m  N (-?\d+\.\d) m  ±(\d+\.\d) m \(95 %\)  heading (\d+\.\d)°  (\d+) stars  3\.1 s",
+        r"small  ok  E (-?\d+\.\d) m  N (-?\d+\.\d) m  ±(\d+\.\d) m \(95 %\)  heading (\d+\.\d)°  (\d+) stars  3\.1 s with files",
         line,
     )
     assert found is not None, line
@@ -34,7 +34,7 @@ def test_a_position_without_a_circle_is_called_approximate(located):
         located.result, fix=point_fix(fix.position_enu_m[:2], located.result.terrain), sky_light=None, skyline_fit=None
     )
     line = summary_line(point, seconds=3.14)
-    assert re.fullmatch(r"small  ok  E \S+ m  N \S+ m  approximate, no circle  heading .* stars  3\.1 s", line), line
+    assert re.fullmatch(r"small  ok  E \S+ m  N \S+ m  approximate, no circle  heading .* stars  3\.1 s with files", line), line
     assert "error      evidence stars; search approximate; no circle\n" in verbose_text(point)
     own = replace(located.result, fix=replace(fix, search="approximate"))  # of a user's own method, with a circle
     assert re.search(r"±\S+ m \(95 %\)  approximate  heading", summary_line(own))
@@ -56,7 +56,7 @@ def test_other_results(located):
         r"small  ok  RA \d+\.\d{3}°  Dec [+-]\d+\.\d{3}°  roll \d+\.\d{3}°  \d+ stars", summary_line(identified)
     )
     detected = extend(result, Detected)
-    assert summary_line(detected, seconds=0.2) == f"small  ok  {len(result.detections)} point sources  0.2 s"
+    assert summary_line(detected, seconds=0.2) == f"small  ok  {len(result.detections)} point sources  0.2 s with files"
 
 
 def test_refusals_are_one_line_with_reason_and_message(located):
@@ -83,7 +83,8 @@ def test_verbose_gives_more_lines(located):
     assert angles is not None
     assert [float(angle) for angle in angles.groups()] == pytest.approx(located.heading_pitch_roll_deg, abs=0.01)
     assert "2030-06-01T00:00:00" in text
-    assert "locate" in text.splitlines()[-1]
+    total = sum(located.result.timing_ms.values())
+    assert re.search(rf"locate \d+; stages together {total:.0f}$", text.splitlines()[-1])
     warned = replace(
         located.result, exposure=replace(located.result.exposure, warnings=("EXIF turned",), time_utc=None)
     )

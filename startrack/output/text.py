@@ -19,12 +19,15 @@ NAME_LETTERS = 11  # width of the names in the detailed text
 
 
 def summary_line(result: Outcome, seconds: float | None = None) -> str:
-    """One line about a `result`. `seconds` is the time that it took; without it the times of the stages are added."""
+    """One line about a `result`. It ends with the sum of the times of the stages.
+
+    `seconds`: the time that the result and the writing of its files took, which is then stated instead.
+    """
     if isinstance(result, Refused):
         return refusal_line(image_name(result.exposure), result.reason, result.message)
-    took_s = seconds if seconds is not None else sum(result.timing_ms.values()) / 1e3
+    took = f"{sum(result.timing_ms.values()) / 1e3:.1f} s" if seconds is None else f"{seconds:.1f} s with files"
     parts = [text for _, text in rows("summary", at_stage(result))]
-    return "  ".join([image_name(result.exposure), result.status, *parts, f"{took_s:.1f} s"])
+    return "  ".join([image_name(result.exposure), result.status, *parts, took])
 
 
 def refusal_line(image: str, reason: str, message: str) -> str:
@@ -50,6 +53,6 @@ def verbose_text(result: Outcome) -> str:
     when = at("provenance.time_utc")
     lines += [("time", f"{when if when is not None else 'not known'} (middle of the exposure)")]
     spent = [f"{stage} {result.timing_ms[stage]:.0f}" for stage in STAGES if stage in result.timing_ms]
-    lines += [("ms", ", ".join(spent))] if spent else []
+    lines += [("ms", f"{', '.join(spent)}; stages together {sum(result.timing_ms.values()):.0f}")] if spent else []
     lines += [("warning", warning) for warning in result.warnings]
     return "\n".join(f"  {name:<{NAME_LETTERS}}{text}" for name, text in lines)

@@ -107,8 +107,8 @@ function timings(spent) {
   const time = (ms) => (ms >= 1000 ? say(ms / 1000, 2, "s") : say(ms, ms < 10 ? 1 : 0, "ms"));
   const rows = Object.entries(spent).filter(([, ms]) => ms > 0).map(([stage, ms]) => make("tr", {}, make("th", { scope: "row" }, stage),
     make("td", { class: "bar" }, make("span", { style: `width:${(100 * ms) / longest}%` })), make("td", {}, time(ms))));
-  return [make("table", { class: "times" }, make("tbody", {}, ...rows), make("tfoot", {}, make("tr", {}, make("th", { scope: "row" }, "in all"), make("td"), make("td", {}, time(all))))),
-    make("p", { class: "dim" }, "The first image of a run also pays for loading programs, catalogue and maps; later ones take less.")];
+  return [make("table", { class: "times" }, make("tbody", {}, ...rows), make("tfoot", {}, make("tr", {}, make("th", { scope: "row" }, "stages together"), make("td"), make("td", {}, time(all))))),
+    make("p", { class: "dim" }, "The first image of a run also pays for loading programs, catalogue and maps; later ones take less. The time that the command line states “with files” includes the writing of tables and pictures, too.")];
 }
 
 function starsCard(detail, stars) {

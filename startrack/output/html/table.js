@@ -13,7 +13,7 @@ const HEADS = [
   ...page.headings.filter(inMetres).map(quantityHead),
   ["error_m", "Error", "num extra", (row) => say(row.error_m, 1, "m")], ["nees", "NEES", "num extra", (row) => say(row.nees, 2)],
   ...page.headings.filter((head) => !inMetres(head)).map(quantityHead),
-  ["seconds", "Took", "num extra", (row) => say(row.seconds, 1, "s")],
+  ["seconds", "Stages", "num extra", (row) => say(row.seconds, 1, "s")],
 ];
 
 class Table {

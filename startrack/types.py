@@ -249,6 +249,8 @@ class Mode(Value):
     east_m: float
     north_m: float
     weight: float  # posterior probability
+    radius95_m: float = np.inf  # circle about it that holds 95 % of the mode's own probability; infinite: not stated
+    radius999_m: float = np.inf
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ def results_in(out: Path, located: Any) -> Path:
     write_json(out / "small.fix.json", record)
     (out / "night 1").mkdir()
     modes = [
-        {"east_m": 6000.0, "north_m": -2500.0, "weight": 0.75},
+        {"east_m": 6000.0, "north_m": -2500.0, "weight": 0.75, "radius95_m": 300.0, "radius999_m": 500.0},
         {"east_m": -3000.0, "north_m": 10.0, "weight": 0.25},
     ]
     ambiguous = {key: value for key, value in record.items() if key != "position"} | {

@@ -58,6 +58,9 @@ def test_astropy_types_at_the_edge(solution):
     assert solution.stars["x_px"].unit == u.pix
     assert len(solution.stars) > 5000
     assert solution.modes["east"].unit == u.m
+    assert solution.modes["radius95"].to_value(u.m) == pytest.approx(
+        [mode.radius95_m for mode in solution.result.fix.modes]
+    )
 
 
 def test_it_prints_itself(solution, tmp_path):

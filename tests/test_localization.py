@@ -278,6 +278,8 @@ def test_two_positions_that_fit_are_both_modes(terrain: Terrain) -> None:
     assert first.north_m == pytest.approx(-second.north_m, abs=100.0)
     assert abs(first.north_m) == pytest.approx(6000.0, abs=300.0)
     assert first.east_m == pytest.approx(2000.0, abs=300.0)
+    true = first if first.north_m > 0 else second
+    assert np.hypot(true.east_m - at[0], true.north_m - at[1]) < true.radius999_m < 500.0
 
 
 def test_a_camera_outside_the_search_area_is_refused() -> None:

@@ -63,6 +63,11 @@ def test_a_second_mode_of_a_few_per_cent_is_ambiguous() -> None:
     assert fix.ambiguous
     assert [(round(m.east_m), round(m.north_m)) for m in fix.modes] == [(3000, 2000), (3000, -2000), (-100, 0)]
     assert [m.weight for m in fix.modes] == pytest.approx([0.6, 0.37, 0.03], abs=1e-3)
+    rng = np.random.default_rng(2)
+    for mode, sigma_m in zip(fix.modes, ([6.0, 6.0], [8.0, 4.0], [5.0, 5.0]), strict=True):
+        drawn = np.hypot(*(rng.normal(size=(200_000, 2)) * sigma_m).T)  # the circles of a mode hold its own part
+        assert mode.radius95_m == pytest.approx(np.percentile(drawn, 95), abs=WIDTH_M)
+        assert mode.radius999_m == pytest.approx(np.percentile(drawn, 99.9), abs=WIDTH_M)
 
 
 def test_a_long_thin_posterior_is_one_mode() -> None:

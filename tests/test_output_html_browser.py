@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -157,10 +158,20 @@ def test_an_ambiguous_image_shows_every_mode_and_its_warnings(window):
     w.open("night 1/two.png")
     places = w.page.locator(".why li").all_inner_texts()
     assert [text.replace("\u00a0", " ") for text in places] == [
-        "East 6,000 m, north −2,500 m: 75.0 %",
-        "East −3,000 m, north 10 m: 25.0 %",
+        "East 6,000.0 m, north −2,500.0 m, within 300.0 m (95 %): probability 75.0 %",
+        "East −3,000.0 m, north 10.0 m: probability 25.0 %",  # of an older version, without a circle
     ]
-    assert "EXIF orientation" in w.page.locator("#detail").inner_text()
+    assert w.page.locator("#detail figcaption", has_text="Position 1, probability 75.0").count() == 1  # its map
+    area, close = w.page.evaluate(
+        "[...View.all].filter(v => v.axes === METRES && v.node.closest('#detail')).map(v => [v.world[2] - v.world[0],"
+        "v.points.map(p => v.describe(p)[1].map(row => row.join(' ')).join('; ').replaceAll('\u00a0', ' '))])"
+    )
+    assert area[0] > 20_000 and close[0] == 2 * 1.25 * 500
+    position = "east 6,000.0 m; north −2,500.0 m; probability 75.0 %"
+    assert close[1][0] == f"{position}; 95 % within 300.0 m; 99.9 % within 500.0 m"
+    text = w.page.locator("#detail").inner_text()
+    assert re.search(r"Search\s+(proven|beam)", text)
+    assert "EXIF orientation" in text
     assert w.page.locator("a", has_text="two.fix.json").get_attribute("href") == "./night%201/two.fix.json"
 
 

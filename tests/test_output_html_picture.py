@@ -169,7 +169,8 @@ def test_the_button_changes_the_theme_of_page_and_drawings(window):
 def test_the_theme_changes_where_the_browser_refuses_storage(window):
     w = window()
     w.page.add_init_script(
-        "Object.defineProperty(window, 'localStorage', { get() { throw new DOMException('refused', 'SecurityError') } })"
+        "const get = () => { throw new DOMException('refused', 'SecurityError') };"
+        "Object.defineProperty(window, 'localStorage', { get });"
     )
     w.page.reload()
     w.page.get_by_role("button", name="Dark theme").click()

@@ -23,6 +23,7 @@ KEYS = {
     "position": "frame terrain east_m north_m up_m covariance_m2 radius95_m radius999_m "
     "protection_level_m protection_risk carried_by latitude_deg longitude_deg "
     "evidence search dropped_probability",
+    "search": "outcome dropped_probability",
     "attitude": "quat_xyzw_cam_icrs ra_deg dec_deg roll_deg sigma_arcsec lens_error_included quat_xyzw_body_enu "
     "heading_deg pitch_deg roll_body_deg sigma_heading_deg sigma_pitch_deg sigma_roll_body_deg",
     "stars": "detected identified unexplained predicted_visible rms_px false_alarm_probability",

@@ -17,7 +17,8 @@ from startrack.types import Mode
 def test_one_line_for_a_fix(located):
     line = summary_line(located.result, seconds=3.14)
     found = re.fullmatch(
-        r"small  ok  E (-?\d+\.\d) m  N (-?\d+\.\d) m  ±(\d+\.\d) m \(95 %\)  heading (\d+\.\d)°  (\d+) stars  3\.1 s with files",
+        r"small  ok  E (-?\d+\.\d) m  N (-?\d+\.\d) m  ±(\d+\.\d) m \(95 %\)  heading (\d+\.\d)°  (\d+) stars  "
+        r"3\.1 s with files",
         line,
     )
     assert found is not None, line
@@ -34,7 +35,9 @@ def test_a_position_without_a_circle_is_called_approximate(located):
         located.result, fix=point_fix(fix.position_enu_m[:2], located.result.terrain), sky_light=None, skyline_fit=None
     )
     line = summary_line(point, seconds=3.14)
-    assert re.fullmatch(r"small  ok  E \S+ m  N \S+ m  approximate, no circle  heading .* stars  3\.1 s with files", line), line
+    assert re.fullmatch(
+        r"small  ok  E \S+ m  N \S+ m  approximate, no circle  heading .* stars  3\.1 s with files", line
+    ), line
     assert "error      evidence stars; search approximate; no circle\n" in verbose_text(point)
     own = replace(located.result, fix=replace(fix, search="approximate"))  # of a user's own method, with a circle
     assert re.search(r"±\S+ m \(95 %\)  approximate  heading", summary_line(own))
@@ -47,10 +50,14 @@ def test_without_a_time_of_its_own_the_stages_are_added_up(located):
 
 def test_other_results(located):
     result = located.result
-    two = (Mode(east_m=6000.0, north_m=-2500.0, weight=0.7), Mode(east_m=-3000.4, north_m=4000.0, weight=0.3))
+    two = (
+        Mode(east_m=6000.0, north_m=-2500.0, weight=0.7, radius95_m=3.46),
+        Mode(east_m=-3000.4, north_m=4000.0, weight=0.3),
+    )
     ambiguous = replace(result, fix=replace(result.fix, modes=two, ambiguous=True))
-    assert "ambiguous  2 positions fit: E 6000 m N -2500 m (70 %); E -3000 m N 4000 m (30 %)" in summary_line(ambiguous)
-    assert "±" not in summary_line(ambiguous)
+    places = "E 6000.0 m N -2500.0 m ±3.5 m (95 %), probability 70 %; E -3000.4 m N 4000.0 m, probability 30 %"
+    assert f"ambiguous  2 positions fit: {places}" in summary_line(ambiguous)
+    assert f"  places     {places}; search {result.fix.search}\n" in verbose_text(ambiguous)
     identified = extend(result, Oriented, terrain=None)
     assert re.search(
         r"small  ok  RA \d+\.\d{3}°  Dec [+-]\d+\.\d{3}°  roll \d+\.\d{3}°  \d+ stars", summary_line(identified)

@@ -29,7 +29,7 @@ def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_proba
     centres_m, weight = centres_m[keep], weight[keep] / weight[keep].sum()
     mean, covariance = _moments(centres_m, weight, width_m)
     label = _modes(centres_m, weight, width_m, covariance)
-    modes = _list_modes(centres_m, weight, label)
+    modes = _list_modes(centres_m, weight, width_m, label)
     if label.any():
         main = label == np.argmax(np.bincount(label, weights=weight))
         mean, covariance = _moments(centres_m[main], weight[main], width_m)
@@ -156,10 +156,16 @@ def _link_boxes(points_m: Array, gap_m: float) -> Ints:
     return np.asarray(connected_components(graph, directed=False)[1])[of].astype(np.int64)
 
 
-def _list_modes(centres_m: Array, weight: Array, label: Ints) -> tuple[Mode, ...]:
+def _list_modes(centres_m: Array, weight: Array, width_m: float, label: Ints) -> tuple[Mode, ...]:
     mass = np.bincount(label, weights=weight)
-    east = np.bincount(label, weights=weight * centres_m[:, 0]) / np.maximum(mass, 1e-300)
-    north = np.bincount(label, weights=weight * centres_m[:, 1]) / np.maximum(mass, 1e-300)
     order = [int(i) for i in np.argsort(-mass, kind="stable") if mass[i] > NEGLIGIBLE_MODE]
     total = float(mass[order].sum())
-    return tuple(Mode(east_m=float(east[i]), north_m=float(north[i]), weight=float(mass[i]) / total) for i in order)
+    return tuple(_mode(centres_m[label == i], weight[label == i], width_m, total) for i in order)
+
+
+def _mode(centres_m: Array, weight: Array, width_m: float, total: float) -> Mode:
+    """The mode of these boxes, of which all modes together weigh `total`."""
+    mean, _ = _mean_and_spread(centres_m, weight)
+    radius95, radius999 = _radii(centres_m - mean, weight, (0.95, 0.999), width_m)
+    part = float(weight.sum()) / total
+    return Mode(east_m=float(mean[0]), north_m=float(mean[1]), weight=part, radius95_m=radius95, radius999_m=radius999)

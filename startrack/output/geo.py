@@ -34,9 +34,9 @@ def geo_text(value: Located, kind: str) -> str:
 
 
 def features(value: Located) -> list[dict[str, Any]]:
-    """GeoJSON features: one point for the position and one polygon for its circle, or one point for each mode.
+    """GeoJSON features: one point for the position and one polygon for its circle, or these of each mode.
 
-    The circle is left out where it holds a pole, where longitudes make no polygon, and where none is stated.
+    A circle is left out where it holds a pole, where longitudes make no polygon, and where none is stated.
     """
     record, site = result_dict(value), value.site
     common = {key: record[key] for key in ("image", "status")} | {"time_utc": record["provenance"]["time_utc"]}
@@ -44,16 +44,18 @@ def features(value: Located) -> list[dict[str, Any]]:
     if "position" not in record:
         up_m = float(value.fix.position_enu_m[2])
         return [
-            feature("Point", _lonlat(site, np.array([[mode["east_m"], mode["north_m"], up_m]]))[0], common | mode)
-            for mode in record["modes"]
+            one for mode in record["modes"] for one in _point_and_circle(site, mode | {"up_m": up_m}, common | mode)
         ]
     position = record["position"]
-    middle_m = np.array([position["east_m"], position["north_m"], position["up_m"]])
-    point = feature(
-        "Point", _lonlat(site, middle_m[None])[0], common | {key: position.get(key) for key in POSITION_KEYS}
-    )
-    ring = None if position["radius95_m"] is None else _circle(site, middle_m, position["radius95_m"])
-    circle = {"image": record["image"], "circle": "95 %", "radius_m": position["radius95_m"]}
+    return _point_and_circle(site, position, common | {key: position.get(key) for key in POSITION_KEYS})
+
+
+def _point_and_circle(site: Site, at: dict[str, Any], properties: dict[str, Any]) -> list[dict[str, Any]]:
+    """A point with `properties` at a position or mode, and the polygon of its 95 % circle."""
+    middle_m, radius_m = np.array([at["east_m"], at["north_m"], at["up_m"]]), at["radius95_m"]
+    point = feature("Point", _lonlat(site, middle_m[None])[0], properties)
+    ring = None if radius_m is None else _circle(site, middle_m, radius_m)
+    circle = {"image": properties["image"], "circle": "95 %", "radius_m": radius_m}
     return [point, *([] if ring is None else [feature("Polygon", [ring], circle)])]
 
 

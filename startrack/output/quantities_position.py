@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from startrack.localization.integrity import RISK
 from startrack.output.quantity import Column, Listed, Quantity, Show
-from startrack.output.schema_parts import CHANCE, LATITUDE, LONGITUDE, NUMBER, POSITIVE, TEXT, numbers, record
+from startrack.output.schema_parts import (
+    CHANCE,
+    LATITUDE,
+    LONGITUDE,
+    NUMBER,
+    POSITIVE,
+    TEXT,
+    Schema,
+    numbers,
+    or_null,
+    record,
+)  # fmt: skip
 from startrack.output.values import (
     ambiguous_modes,
     carrying_azimuths,
@@ -13,6 +24,7 @@ from startrack.output.values import (
     finite_or_none,
     lacking_circle,
     latlon_deg,
+    modes_record,
     modes_text,
     protection_level_m,
     ranges_text,
@@ -21,6 +33,14 @@ from startrack.output.values import (
 from startrack.stages import Located
 
 Q = Quantity
+SEARCHES: Schema = {"enum": ["proven", "beam", "approximate"]}
+MODE = record(
+    {"east_m": NUMBER, "north_m": NUMBER, "weight": CHANCE},
+    optional={
+        "radius95_m": or_null(POSITIVE, "circle about it that holds 95 % of this mode; null: not stated"),
+        "radius999_m": or_null(POSITIVE, "circle about it that holds 99.9 % of this mode"),
+    },
+)
 POSITION: tuple[Quantity, ...] = (
     Q("position.frame", "", Located, lambda v: "enu", "`enu`: axes east, north, up at the terrain's origin",
       {"const": "enu"}),
@@ -100,7 +120,7 @@ POSITION: tuple[Quantity, ...] = (
     Q("position.search", "", Located, lambda v: v.fix.search, "`proven`: the search has excluded every other position; "
       "`beam`: its budget ended before that, and the posterior near the best positions is stated; "
       "`approximate`: a method without a posterior",
-      {"enum": ["proven", "beam", "approximate"]}, optional=True, columns=(Column("search", "%s"),),
+      SEARCHES, optional=True, columns=(Column("search", "%s"),),
       shown=(Show("text", "error", "; search {}"), Show("notebook", "search", "{}"), Show("page", "Search", "{}"))),
     Q("position.dropped_probability", "", Located, lambda v: v.fix.dropped_probability,
       "upper bound of the probability of the positions that the search left out; 1: not bounded; null: a "
@@ -109,12 +129,18 @@ POSITION: tuple[Quantity, ...] = (
       shown=(Show("text", "error", "; {}"), Show("notebook", "95 % within", "{}"), Show("page", "95 % within", "{}"))),
     Q("position.caution", "", Located, caution_text, "of a method without a posterior", derived=True,
       shown=(Show("summary", "caution", "{}"), Show("panel", "Caution", "{}"))),
-    Q("modes", "", Located, lambda v: [{"east_m": m.east_m, "north_m": m.north_m, "weight": m.weight}
-                                       for m in v.fix.modes],
-      "list of `east_m`, `north_m`, `weight`: the positions that fit, heaviest first; weights sum to 1. Ambiguous: "
-      "modes outside the main mode's 99.9 % circle hold more than 1 %",
-      {"type": "array", "items": record({"east_m": NUMBER, "north_m": NUMBER, "weight": CHANCE}), "minItems": 1}),
+    Q("modes", "", Located, lambda v: modes_record(v.fix),
+      "list of `east_m`, `north_m`, `weight`, `radius95_m`, `radius999_m`: the positions that fit, heaviest first; "
+      "weights sum to 1. The circles about each hold 95 and 99.9 % of that mode: the true position is in them if it is "
+      "in this mode; null: not stated. Ambiguous: modes outside the main mode's 99.9 % circle hold more than 1 %",
+      {"type": "array", "items": MODE, "minItems": 1}),
     Q("modes.text", "", Located, ambiguous_modes, "the positions that fit", derived=True,
       shown=(Show("summary", "modes", lambda m: f"{len(m)} positions fit: {modes_text(m)}"),
              Show("text", "places", modes_text))),
+    Q("search.outcome", "", Located, lambda v: v.fix.search, "as `position.search`; also where several positions fit: "
+      "`proven` is then the proof that no further position fits", SEARCHES,
+      shown=(Show("text", "places", "; search {}", unless="position.search"),
+             Show("page", "Search", "{}", unless="position.search"))),
+    Q("search.dropped_probability", "", Located, lambda v: v.fix.dropped_probability,
+      "as `position.dropped_probability`", CHANCE, nullable=True),
 )  # fmt: skip

@@ -15,6 +15,7 @@ FORMATS = {
     "identification": "startrack.identification/1",
     "detection": "startrack.detection/1",
 }
+OF_A_POSITION = ("position", "modes", "search", "evidence", "sky", "clock")  # sections of a fix alone
 
 
 def result_dict(result: Outcome) -> dict[str, Any]:
@@ -38,7 +39,7 @@ def identification_dict(result: Outcome) -> dict[str, Any]:
         xy_px = value.detections.xy_px[value.identification.detection].tolist()
         hips = value.stars.hip[value.identification.star].tolist()
         own["matches"] = [{"hip": hip or None, "x_px": x, "y_px": y} for hip, (x, y) in zip(hips, xy_px, strict=True)]
-    return _record("identification", result, own, without=("position", "modes", "evidence", "sky", "clock"))
+    return _record("identification", result, own, without=OF_A_POSITION)
 
 
 def detection_dict(result: Outcome) -> dict[str, Any]:
@@ -48,8 +49,7 @@ def detection_dict(result: Outcome) -> dict[str, Any]:
         found = value.detections
         columns = zip(found.xy_px.tolist(), found.flux_e.tolist(), found.snr.tolist(), strict=True)
         rows = [{"x_px": x, "y_px": y, "flux_e": flux, "snr": snr} for (x, y), flux, snr in columns]
-    without = ("position", "modes", "evidence", "sky", "clock", "attitude")
-    return _record("detection", result, {"detections": rows}, without=without)
+    return _record("detection", result, {"detections": rows}, without=(*OF_A_POSITION, "attitude"))
 
 
 def record_of(result: Outcome, kind: str) -> dict[str, Any]:
@@ -82,7 +82,9 @@ def _record(
 ) -> dict[str, Any]:
     """The record with its `own` keys after the attitude, and without some sections."""
     sections = {key: part for key, part in record_sections(last_value(result)).items() if key not in without}
-    first: dict[str, Any] = {key: sections.pop(key) for key in ("position", "modes", "attitude") if key in sections}
+    first: dict[str, Any] = {
+        key: sections.pop(key) for key in ("position", "modes", "search", "attitude") if key in sections
+    }
     provenance = sections.pop("provenance")
     return {
         "format": FORMATS[kind],

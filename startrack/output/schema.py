@@ -43,6 +43,7 @@ MODES: Schema = {**BY_PATH["modes"].schema, "description": BY_PATH["modes"].desc
 ATTITUDE = section_schema("attitude", "Of the camera among the stars and, with terrain and time, of the rover's body.")
 EVIDENCE = section_schema("evidence", "What is left out of the evidence, and why.")
 SKY = section_schema("sky", "Diffuse light of the sky.")
+SEARCH = section_schema("search", "How far other positions are excluded.")
 CLOCK = section_schema("clock", "Error of the stated time.")
 PROVENANCE = section_schema("provenance")
 COMMON: Schema = {
@@ -122,6 +123,7 @@ SCHEMAS: dict[str, Schema] = {
         {
             "position": POSITION,
             "modes": MODES,
+            "search": SEARCH,
             "attitude": ATTITUDE,
             "evidence": EVIDENCE,
             "sky": SKY,

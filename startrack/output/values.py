@@ -171,9 +171,26 @@ def ambiguous_modes(at: At) -> Any:
     return at("modes") if at("position.east_m") is None else None
 
 
-def modes_text(modes: list[dict[str, float]]) -> str:
-    """Every mode with its weight."""
-    return "; ".join(f"E {m['east_m']:.0f} m N {m['north_m']:.0f} m ({100 * m['weight']:.0f} %)" for m in modes)
+def modes_record(fix: Fix) -> list[dict[str, Any]]:
+    """The modes of a `fix` as JSON values; a circle is null where none is stated."""
+    circles = ("radius95_m", "radius999_m")
+    return [
+        {"east_m": mode.east_m, "north_m": mode.north_m, "weight": mode.weight}
+        | {key: finite_or_none(getattr(mode, key)) for key in circles}
+        for mode in fix.modes
+    ]
+
+
+def mode_text(mode: dict[str, Any]) -> str:
+    """A `mode` of a record with its circle and its probability."""
+    radius_m = mode.get("radius95_m")
+    circle = "" if radius_m is None else f" ±{radius_m:.1f} m (95 %)"
+    return f"E {mode['east_m']:.1f} m N {mode['north_m']:.1f} m{circle}, probability {100 * mode['weight']:.0f} %"
+
+
+def modes_text(modes: list[dict[str, Any]]) -> str:
+    """Every mode of a record."""
+    return "; ".join(map(mode_text, modes))
 
 
 def arcsec_text(sigma: list[float]) -> str:

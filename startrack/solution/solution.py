@@ -101,7 +101,10 @@ class Solution:
 
     @cached_property
     def modes(self) -> QTable | None:
-        """Every position that fits: east, north, weight; heaviest first."""
+        """Every position that fits: east, north, weight, radius95 and radius999; heaviest first.
+
+        The circles hold their part of that mode alone; they are infinite where none is stated.
+        """
         if not isinstance(self.result, Located):
             return None
         from astropy import units as u
@@ -109,7 +112,8 @@ class Solution:
 
         modes = self.result.fix.modes
         east, north = [m.east_m for m in modes] * u.m, [m.north_m for m in modes] * u.m
-        return QTable({"east": east, "north": north, "weight": [m.weight for m in modes]})
+        circles = {"radius95": [m.radius95_m for m in modes] * u.m, "radius999": [m.radius999_m for m in modes] * u.m}
+        return QTable({"east": east, "north": north, "weight": [m.weight for m in modes], **circles})
 
     @cached_property
     def time(self) -> Time | None:

@@ -40,7 +40,7 @@ function refusalCard(record) {
   if (record.status === "ok") return null;
   const [words, advice] = page.words[record.reason] || [record.reason ? record.reason.replaceAll("_", " ") : statusWord(record.status), ""];
   const modes = record.status === "ambiguous" && record.modes ? make("ol", {}, ...record.modes.map((mode) => make("li", {},
-    `East ${say(mode.east_m, 0, "m")}, north ${say(mode.north_m, 0, "m")}: ${say(100 * mode.weight, 1)} %`))) : null;
+    `East ${say(mode.east_m, 1, "m")}, north ${say(mode.north_m, 1, "m")}${known(mode.radius95_m) ? `, within ${say(mode.radius95_m, 1, "m")} (95 %)` : ""}: probability ${say(100 * mode.weight, 1)} %`))) : null;
   return make("section", { class: `card why ${record.status}`, "aria-label": "Why there is no single position" },
     make("h2", {}, words), known(record.message) ? make("p", { class: "message" }, record.message) : null, modes,
     advice ? make("p", {}, make("strong", {}, "What to try: "), advice) : null);
@@ -82,9 +82,10 @@ function panoramaCard(detail, stars, name, views) {
 
 function mapsCard(record, real, name) {
   if (!record.position && !record.modes?.length) return null;
-  const close = known(record.position?.radius95_m) ? panel("The position and how sure it is", placeView(record, real, name)) : null;
   const area = panel(`The search area${record.provenance?.terrain ? ` on ${fileName(record.provenance.terrain)}` : ""}; north is up`, areaView(record, real, name));
-  return section("Map", make("div", { class: close ? "pair" : "single" }, area, close), mapLegend(record, real));
+  const close = statedPositions(record).slice(0, MOST_CLOSE_MAPS).map((position) => panel(position.number
+    ? `Position ${position.number}, probability ${say(100 * position.weight, 1)} %` : "The position and how sure it is", placeView(record, position, real, name)));
+  return section("Map", make("div", { class: close.length ? "pair" : "single" }, area, ...close), mapLegend(record, real));
 }
 
 // The quantities of the record come with their texts; the page adds what it knows of the truth, times and origin.

@@ -1,4 +1,5 @@
 // Maps: the search area with what fits, the position with its posterior, and the positions of a batch.
+const MOST_CLOSE_MAPS = 4; // of positions that fit
 const METRES = { x: "east", y: "north", left: 72, gap: 60, text: (value, step) => (step >= 1000 ? `${say(value / 1000, 0)} km` : say(value, step < 1 ? 1 : 0, "m")) };
 const reliefs = {};
 
@@ -101,15 +102,22 @@ function sideText(v, g, text, [x, y], gap) {
   writeOn(g, text, right ? x + gap : x - gap, y, colour("ink"));
 }
 
+// The position with its circles, or every mode that has some where several positions fit, with its number.
+function statedPositions(record) {
+  const positions = record.position ? [record.position] : (record.modes || []).map((mode, k) => ({ ...mode, number: k + 1 }));
+  return positions.filter((position) => known(position.radius95_m));
+}
+
+const circleRows = (position) => (known(position.radius95_m) ? [["95 % within", say(position.radius95_m, 1, "m")], ["99.9 % within", say(position.radius999_m, 1, "m")]] : []);
+
 function placesOf(record, real) {
   const p = record.position;
   const stated = p && known(p.radius95_m);
   const places = (p && !stated ? [] : record.modes || []).map((mode, k) => ({
     x: mode.east_m, y: mode.north_m, title: record.modes.length > 1 ? `Position ${k + 1}` : "Posterior's peak",
-    rows: [["probability", `${say(100 * mode.weight, mode.weight > 0.9995 ? 0 : 1)} %`]], weight: mode.weight,
+    rows: [["probability", `${say(100 * mode.weight, mode.weight > 0.9995 ? 0 : 1)} %`], ...(p ? [] : circleRows(mode))], weight: mode.weight,
   }));
-  const circles = stated ? [["95 % within", say(p.radius95_m, 1, "m")], ["99.9 % within", say(p.radius999_m, 1, "m")]] : [["approximate", "no circle"]];
-  if (p) places.unshift({ x: p.east_m, y: p.north_m, title: "Position", rows: circles });
+  if (p) places.unshift({ x: p.east_m, y: p.north_m, title: "Position", rows: stated ? circleRows(p) : [["approximate", "no circle"]] });
   if (real) places.push({ x: real[0], y: real[1], title: "True position", rows: [["", "not known to the method"]], real: true });
   return places;
 }
@@ -117,7 +125,7 @@ function placesOf(record, real) {
 const positionText = (place) => [place.title, [["east", say(place.x, 1, "m")], ["north", say(place.y, 1, "m")], ...place.rows]];
 
 function drawPositions(v, g, record, places) {
-  if (record.position) drawPosterior(v, g, record.position);
+  for (const position of record.position ? [record.position] : statedPositions(record)) drawPosterior(v, g, position);
   for (const place of places) {
     const at = v.screen(place.x, place.y);
     if (place.real) drawPlus(g, at, 8, colour("real"));
@@ -145,20 +153,20 @@ function areaView(record, real, name) {
   });
 }
 
-function placeView(record, real, name) {
-  const p = record.position;
+function placeView(record, p, real, name) {
   const places = placesOf(record, real);
   let half = 1.25 * Math.max(p.radius999_m || 0, p.radius95_m || 0, 0.5);
   if (real) half = Math.min(Math.max(half, 1.2 * Math.hypot(real[0] - p.east_m, real[1] - p.north_m)), 6 * half);
   return new View({
-    label: `Posterior of the position of ${name}`, world: [p.east_m - half, p.north_m - half, p.east_m + half, p.north_m + half],
+    label: `Posterior of ${p.number ? `position ${p.number}` : "the position"} of ${name}`, world: [p.east_m - half, p.north_m - half, p.east_m + half, p.north_m + half],
     points: places, describe: positionText, most: 40, axes: METRES, draw: (v, g) => drawPositions(v, g, record, places),
   });
 }
 
 function mapLegend(record, real) {
   const item = (kind, text) => make("li", {}, make("span", { class: `key ${kind}`, "aria-hidden": "true" }), text);
-  const posterior = known(record.position?.radius95_m) ? [item("solid", "95 % of the posterior"), item("dashed", "99.9 %"), item("filled", "covariance, one sigma")] : [];
+  const whole = record.position ? "the posterior" : "this position’s part";
+  const posterior = statedPositions(record).length ? [item("solid", `95 % of ${whole}`), item("dashed", "99.9 %"), record.position ? item("filled", "covariance, one sigma") : null] : [];
   const others = record.status !== "ok" ? [item("dot", "position that fits, with its probability")] : posterior.length ? [] : [item("dot", "position, approximate")];
   return make("ul", { class: "legend" }, ...posterior, ...others, real ? item("plus", "true position") : null);
 }

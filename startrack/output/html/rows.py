@@ -50,10 +50,14 @@ def headings() -> list[list[Any]]:
 
 def facts_of(record: Mapping[str, Any]) -> list[list[Any]]:
     """The quantities of a record for people: title of each group, and its rows of a name and a text."""
-    groups = (("Position", ("position", "clock")), ("Attitude", ("attitude",)), ("Stars", ("stars", "evidence", "sky")))
+    groups = (
+        ("Position", ("position", "search", "clock")),
+        ("Attitude", ("attitude",)),
+        ("Stars", ("stars", "evidence", "sky")),
+    )
     at = at_record(record)
-    found = [(title, rows("page", at, sections)) for title, sections in groups if section_of(record, sections[0])]
-    return [[title, [[name, text.replace("-", "−")] for name, text in facts]] for title, facts in found]
+    found = [(title, rows("page", at, sections)) for title, sections in groups]
+    return [[title, [[name, text.replace("-", "−")] for name, text in facts]] for title, facts in found if facts]
 
 
 def errors_of(table: Sequence[Sequence[Any]]) -> dict[str, Any] | None:

@@ -38,6 +38,7 @@ from startrack.output.picture.marks import (
     wall_mask,
 )
 from startrack.output.record import image_name
+from startrack.output.values import mode_text, modes_record
 from startrack.output.views import Rows, at_stage, rows
 from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented, Outcome, last_value
 
@@ -139,9 +140,8 @@ def _facts(value: Inputs) -> Rows:
     when = value.exposure.time_utc
     found = [("Time", f"{when:%Y-%m-%d  %H:%M:%S} UTC" if when is not None else "not known")]
     if isinstance(value, Located) and value.fix.ambiguous:
-        for k, mode in enumerate(value.fix.modes[:MAX_MODES]):
-            position = f"E {mode.east_m:.0f} m   N {mode.north_m:.0f} m   ({100 * mode.weight:.0f} %)"
-            found += [(f"Position {k + 1}", position)]
+        modes = modes_record(value.fix)[:MAX_MODES]
+        found += [(f"Position {k + 1}", mode_text(mode)) for k, mode in enumerate(modes)]
     return found + rows("panel", at_stage(value))
 
 

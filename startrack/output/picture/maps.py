@@ -76,6 +76,9 @@ def draw_overview(
             position = view.canvas_px((mode.east_m, mode.north_m))
             window.circle(position, 5.0, POSITION, -1)
             window.circle(position, 9.0, POSITION, 2)
+            radius_px = mode.radius95_m / view.metres_per_px
+            if ambiguous and 9.0 < radius_px < np.inf:
+                window.circle(position, radius_px, POSITION, 2)
             if ambiguous:
                 canvas.label(position, f"{k + 1}: {100 * mode.weight:.0f} %", CAPTION_SIZE, INK, 14.0, box)
     draw_frame(canvas, view, "search area, north up")

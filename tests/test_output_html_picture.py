@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from html_helpers import DESKTOP, NASTY, SMALL, Window, results_in
 
+from startrack.catalog import proper_name_designations, star_names
 from startrack.output.html import page_text, result_at, results_under
 
 READ_TWICE = "willReadFrequently"  # a hint of Chromium where a test reads a canvas more than once
@@ -88,7 +89,7 @@ def test_a_star_is_found_by_name_and_by_number(window):
     assert centre == pytest.approx(w.page.evaluate(f"[{VIEW}.pinned.x, {VIEW}.pinned.y]"), abs=1)
     marked = w.page.evaluate("[...View.all].filter(v => v.pinned && v.node.isConnected).map(v => v.pinned.id)")
     assert marked[:2] == ["HIP 30438"] * 2  # the picture and the panorama
-    for words in ("HIP 30438", "30438"):
+    for words in ("HIP 30438", "30438", "alpha Car", "alf Car", "α Car", "αCar", "ALPHA CARINAE"):
         w.page.evaluate(f"{VIEW}.reset()")
         assert w.page.evaluate(f"{VIEW}.pinned") is None
         w.page.get_by_label("Find a star").fill(words)
@@ -97,6 +98,58 @@ def test_a_star_is_found_by_name_and_by_number(window):
     w.page.get_by_label("Find a star").fill("Nowhere")
     w.page.keyboard.press("Enter")
     assert "“Nowhere” is outside of the picture" in answer.inner_text()
+
+
+def test_components_of_a_designation_are_found(window):
+    """Without an index the brightest one; and every designation of the catalogue is read as one."""
+    w = window()
+    shown = {
+        "alpha Cen": "Rigil Kentaurus",
+        "α¹ Cen": "Rigil Kentaurus",
+        "alf02 Cen": "Toliman",
+        "rigil": "Rigil Kentaurus",
+    }
+    shown |= {"gam2 Vel": "gamma2 Vel", "γ Velorum": "gamma2 Vel", "bet Canis Majoris": "Mirzam", "Nowhere Cen": None}
+    stars = [
+        {"id": f"HIP {k}", "name": name}
+        for k, name in enumerate(("Rigil Kentaurus", "Toliman", "gamma2 Vel", "Mirzam"))
+    ]
+    proper = proper_name_designations()
+    found = w.page.evaluate(
+        "([stars, designations, words]) => {"
+        "const columns = { id: stars.map(s => s.id), name: stars.map(s => s.name) };"
+        "const read = starsOf({ stars: { columns, designations } });"
+        "return words.map(one => starOf(read, one)?.name ?? null) }",
+        [stars, dict(proper), list(shown)],
+    )
+    assert dict(zip(shown, found, strict=True)) == shown
+    known = [*proper.values(), *(set(star_names().values()) - set(proper))]
+    assert w.page.evaluate("known => known.filter(one => !designationOf(one))", known) == []
+    assert len(known) > 3500
+
+
+def test_a_planet_is_found_and_described(window):
+    w = window()
+    bodies = w.page.evaluate("detailOf(0).picture.marks.bodies")
+    name, x, y, _ = bodies[0]
+    w.page.get_by_label("Find a star").fill(name.lower())
+    pinned = w.page.evaluate(f"[{VIEW}.pinned.name, {VIEW}.pinned.px, {VIEW}.pinned.py]")
+    assert pinned == [name, x, y]
+    assert w.page.locator(".answer").inner_text().startswith(f"{name}: predicted")
+    marked = w.page.evaluate(f"{VIEW}.shown({VIEW}.pinned)")
+    w.page.get_by_label("planets").first.uncheck()
+    assert [marked, w.page.evaluate(f"{VIEW}.shown({VIEW}.pinned)")] == [True, False]
+
+
+def test_the_hint_in_the_search_is_whole_on_a_small_screen(window):
+    w = window(SMALL)
+    room, width = w.page.evaluate(
+        "(() => { const input = find('star-search'), style = getComputedStyle(input);"
+        "const g = make('canvas').getContext('2d'); g.font = style.font;"
+        "return [input.clientWidth - parseFloat(style.paddingLeft) - parseFloat(style.paddingRight),"
+        "g.measureText(input.placeholder).width] })()"
+    )
+    assert 0 < width < room - 24  # beside the browser's own button
 
 
 def test_a_star_behind_the_wall_is_found_as_hidden(window):

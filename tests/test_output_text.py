@@ -91,7 +91,7 @@ def test_verbose_gives_more_lines(located):
     assert [float(angle) for angle in angles.groups()] == pytest.approx(located.heading_pitch_roll_deg, abs=0.01)
     assert "2030-06-01T00:00:00" in text
     total = sum(located.result.timing_ms.values())
-    assert re.search(rf"locate \d+; stages together {total:.0f}$", text.splitlines()[-1])
+    assert re.search(rf"locate \d+; all stages {total:.0f}$", text.splitlines()[-1])
     warned = replace(
         located.result, exposure=replace(located.result.exposure, warnings=("EXIF turned",), time_utc=None)
     )

@@ -49,7 +49,7 @@ def run_elsewhere(unpacked, folder, *words):
 
 def test_catalogue_cameras_and_terrains_are_inside(wheel):
     inside = names(wheel)
-    for kind, ends in {"catalogs": ("*.npy", "star_names.csv"), "calib": ("*.toml",), "terrain": ("*.toml",)}.items():
+    for kind, ends in {"catalogs": ("*.npy", "*_names.csv"), "calib": ("*.toml",), "terrain": ("*.toml",)}.items():
         wanted = {path.name for end in ends for path in (ROOT / kind).glob(end)}
         assert wanted
         assert {f"startrack/data/{kind}/{name}" for name in wanted} <= inside

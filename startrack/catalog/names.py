@@ -24,6 +24,14 @@ def star_names() -> Mapping[int, str]:
     return MappingProxyType({int(hip): name for hip, name in pairs})
 
 
+@lru_cache(maxsize=1)
+def proper_name_designations() -> Mapping[str, str]:
+    """Proper name ("Rigil Kentaurus") -> Bayer, Flamsteed or variable-star designation ("alpha1 Cen"); read-only."""
+    lines = (data_dir("catalogs") / "proper_names.csv").read_text(encoding="utf-8").splitlines()[1:]
+    pairs = (line.split(",", 1) for line in lines)
+    return MappingProxyType({name: designation for designation, name in pairs})
+
+
 def id_texts(sources: tuple[str, ...], source: Ints, number: Ints) -> NDArray[np.str_]:
     """Ids f"{sources[s]} {n}" (n,) of stars with source index s and number n, by array operations.
 

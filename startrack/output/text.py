@@ -53,6 +53,6 @@ def verbose_text(result: Outcome) -> str:
     when = at("provenance.time_utc")
     lines += [("time", f"{when if when is not None else 'not known'} (middle of the exposure)")]
     spent = [f"{stage} {result.timing_ms[stage]:.0f}" for stage in STAGES if stage in result.timing_ms]
-    lines += [("ms", f"{', '.join(spent)}; stages together {sum(result.timing_ms.values()):.0f}")] if spent else []
+    lines += [("ms", f"{', '.join(spent)}; all stages {sum(result.timing_ms.values()):.0f}")] if spent else []
     lines += [("warning", warning) for warning in result.warnings]
     return "\n".join(f"  {name:<{NAME_LETTERS}}{text}" for name, text in lines)

@@ -182,15 +182,15 @@ def modes_record(fix: Fix) -> list[dict[str, Any]]:
 
 
 def mode_text(mode: dict[str, Any]) -> str:
-    """A `mode` of a record with its circle and its probability."""
+    """Position of a `mode` of a record, with its circle."""
     radius_m = mode.get("radius95_m")
     circle = "" if radius_m is None else f" ±{radius_m:.1f} m (95 %)"
-    return f"E {mode['east_m']:.1f} m N {mode['north_m']:.1f} m{circle}, probability {100 * mode['weight']:.0f} %"
+    return f"E {mode['east_m']:.1f} m N {mode['north_m']:.1f} m{circle}"
 
 
 def modes_text(modes: list[dict[str, Any]]) -> str:
-    """Every mode of a record."""
-    return "; ".join(map(mode_text, modes))
+    """Every mode of a record with its probability."""
+    return "; ".join(f"{mode_text(mode)}, probability {100 * mode['weight']:.0f} %" for mode in modes)
 
 
 def arcsec_text(sigma: list[float]) -> str:

@@ -62,7 +62,7 @@ function pictureCard(detail, stars, name, groups, views) {
   const hint = found ? "Point at a star, or tap it. Fainter stars appear as you zoom in. " : "";
   const ground = detail.record.modes?.length ? "; orange crosses are stars that should be here and are hidden, the blue line is the skyline at the estimated position." : ".";
   return section("Picture", make("p", { class: "dim" }, `${hint}Green rings are identified stars, grey rings other point sources${ground}`),
-    found ? searchForm(stars, detail, views) : null,
+    found ? searchForm([...stars, ...bodiesOf(detail)], detail, views) : null,
     make("div", { class: "beside" }, view.node, make("div", {}, ...groups.map(([title, body]) => make("div", {}, make("h3", {}, title), body)))));
 }
 
@@ -108,7 +108,7 @@ function timings(spent) {
   const time = (ms) => (ms >= 1000 ? say(ms / 1000, 2, "s") : say(ms, ms < 10 ? 1 : 0, "ms"));
   const rows = Object.entries(spent).filter(([, ms]) => ms > 0).map(([stage, ms]) => make("tr", {}, make("th", { scope: "row" }, stage),
     make("td", { class: "bar" }, make("span", { style: `width:${(100 * ms) / longest}%` })), make("td", {}, time(ms))));
-  return [make("table", { class: "times" }, make("tbody", {}, ...rows), make("tfoot", {}, make("tr", {}, make("th", { scope: "row" }, "stages together"), make("td"), make("td", {}, time(all))))),
+  return [make("table", { class: "times" }, make("tbody", {}, ...rows), make("tfoot", {}, make("tr", {}, make("th", { scope: "row" }, "all stages"), make("td"), make("td", {}, time(all))))),
     make("p", { class: "dim" }, "The first image of a run also pays for loading programs, catalogue and maps; later ones take less. The time that the command line states “with files” includes the writing of tables and pictures, too.")];
 }
 

@@ -156,7 +156,8 @@ function areaView(record, real, name) {
 function placeView(record, p, real, name) {
   const places = placesOf(record, real);
   let half = 1.25 * Math.max(p.radius999_m || 0, p.radius95_m || 0, 0.5);
-  if (real) half = Math.min(Math.max(half, 1.2 * Math.hypot(real[0] - p.east_m, real[1] - p.north_m)), 6 * half);
+  const truth = real ? 1.2 * Math.hypot(real[0] - p.east_m, real[1] - p.north_m) : 0;
+  if (truth < 6 * half) half = Math.max(half, truth); // farther off, the map would show no circle
   return new View({
     label: `Posterior of ${p.number ? `position ${p.number}` : "the position"} of ${name}`, world: [p.east_m - half, p.north_m - half, p.east_m + half, p.north_m + half],
     points: places, describe: positionText, most: 40, axes: METRES, draw: (v, g) => drawPositions(v, g, record, places),

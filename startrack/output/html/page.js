@@ -31,10 +31,11 @@ function placesFacts(rows) {
   const of = (name) => rows.map((row) => row[column[name]]).filter(known).sort((a, b) => a - b);
   const span = (values) => (values.length ? say(values.at(-1) - values[0], 0, "m") : null);
   const radii = of("radius95_m");
+  const median = (radii[Math.floor((radii.length - 1) / 2)] + radii[Math.floor(radii.length / 2)]) / 2;
   const times = rows.map((row) => row[column.time_utc]).filter(known).sort();
   return facts([["Positions", say(rows.length, 0)], ["From", times.length ? sayTime(times[0]) : null], ["To", times.length ? sayTime(times.at(-1)) : null],
     ["East to west", span(of("east_m"))], ["North to south", span(of("north_m"))],
-    ["95 % within", radii.length ? `${say(radii[Math.floor(radii.length / 2)], 1, "m")} median, ${say(radii.at(-1), 1, "m")} largest` : null]]);
+    ["95 % within", radii.length ? `${say(median, 1, "m")} median, ${say(radii.at(-1), 1, "m")} largest` : null]]);
 }
 
 function trajectoryCard(open) {

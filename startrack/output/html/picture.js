@@ -109,11 +109,15 @@ function skyView(detail, stars, name) {
     const [x, y] = onPicture(known(star.mx) ? star.mx : star.px, known(star.mx) ? star.my : star.py);
     return { ...star, x, y };
   }) : [];
+  const bodyPoints = bodiesOf(detail).map((body) => {
+    const [x, y] = onPicture(body.px, body.py);
+    return { ...body, x, y };
+  });
   const deepest = () => (view.width < 600 ? 3.2 : 4.8) + 1.7 * Math.log2(view.zoom); // fainter stars come with the zoom
-  const isShown = (star) => !marks || (chosen.has(star.kind) && star.mag <= deepest() - (star.kind === "hidden" ? 1 : 0));
+  const isShown = (star) => !marks || (isBody(star) ? chosen.has("bodies") : chosen.has(star.kind) && star.mag <= deepest() - (star.kind === "hidden" ? 1 : 0));
   const view = new View({
     label: `Picture ${name} with its stars`, world: [0, 0, picture.width, picture.height], up: false,
-    ratio: picture.height / picture.width, points: placed, shown: isShown, describe: starText, most: 24,
+    ratio: picture.height / picture.width, points: [...placed, ...bodyPoints], shown: isShown, describe: starText, most: 24,
     draw(v, g) {
       const [x, y] = v.screen(0, 0);
       const [right, bottom] = v.screen(picture.width, picture.height);

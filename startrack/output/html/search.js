@@ -1,16 +1,18 @@
-// The search for a star by name or number: it is put in the middle of the picture and marked in every drawing.
+// The search for a star or planet by name, designation or number: it is put in the middle of the picture and marked in
+// every drawing.
 const FOUND_ZOOM = 6;
 const ANSWERED = ["catalogue", "magnitude", "direction"];
 
-const plain = (text) => text.toLowerCase().replace(/\s+/g, " ").trim();
-
-// The star that is meant: its name, its number in a catalogue, or the brightest whose name begins with, or holds, the words.
+// The star that is meant: its name, its number in a catalogue, its designation (the brightest component where the words
+// have no index), or the brightest whose name begins with, or holds, the words.
 function starOf(stars, words) {
   const text = plain(words);
   if (!text) return null;
   const numbers = [text, `hip ${text}`];
   const names = (test) => stars.find((star) => star.name && test(plain(star.name)));
+  const meant = designationOf(words);
   return names((name) => name === text) || stars.find((star) => numbers.includes(plain(star.id)))
+    || stars.find((star) => isDesignation(star.designated, meant))
     || (/^\d+$/.test(text) ? null : names((name) => name.startsWith(text)) || names((name) => name.includes(text))) || null;
 }
 
@@ -25,7 +27,7 @@ function goTo(star, views) {
 function searchForm(stars, detail, views) {
   const list = make("datalist", { id: "star-names" }, ...stars.filter((star) => star.name).map((star) => make("option", { value: star.name }, star.id)));
   const answer = make("p", { class: "dim answer", role: "status" });
-  const input = make("input", { type: "search", id: "star-search", list: "star-names", autocomplete: "off", placeholder: "Vega, HIP 91262", "aria-keyshortcuts": "/" });
+  const input = make("input", { type: "search", id: "star-search", list: "star-names", autocomplete: "off", placeholder: "Vega, α Cen", "aria-keyshortcuts": "/" });
   const show = (star) => {
     goTo(star, views);
     const [title, rows] = starText(star);
@@ -39,7 +41,8 @@ function searchForm(stars, detail, views) {
     else answer.textContent = input.value.trim() ? missing(input.value.trim(), stars, detail) : "";
   };
   input.addEventListener("input", () => {
-    const star = stars.find((one) => one.name && plain(one.name) === plain(input.value));
+    const meant = designationOf(input.value);
+    const star = stars.find((one) => one.name && plain(one.name) === plain(input.value)) || stars.find((one) => isDesignation(one.designated, meant));
     if (star) show(star); // also where a name is picked from the list
   });
   return make("form", { role: "search", class: "search", onsubmit: find }, make("label", { for: "star-search" }, "Find a star"), input, list,

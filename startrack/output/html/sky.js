@@ -6,6 +6,8 @@ const KINDS = {
   unusable: ["unusable", "not measured"],
   identified: ["identified", "a point source has its name"],
   unmatched: ["not matched", "no point source was found there"],
+  body: ["predicted", "Sun, Moon, Earth or planet, where it must be"],
+  hiddenbody: ["predicted, hidden", "Sun, Moon, Earth or planet behind the ground, where it must be"],
 };
 
 const shownKind = (kind) => ({ identified: "seen", unmatched: "uncertain" }[kind] || kind);
@@ -17,14 +19,25 @@ function starsOf(detail) {
   return columns.id.map((id, k) => ({
     id, unit: detail.stars.unit, ...Object.fromEntries(Object.keys(columns).map((name) => [name, columns[name][k]])),
     kind: value("status", k) || (known(value("mx", k)) ? "identified" : "unmatched"), px: value("x", k), py: value("y", k),
-  }));
+  })).map((star) => {
+    const designation = detail.stars.designations?.[star.name];
+    return { ...star, designation, designated: star.name ? designationOf(designation || star.name) : null };
+  });
 }
+
+// Sun, Moon, Earth and planets in the picture.
+function bodiesOf(detail) {
+  return (detail.picture?.marks?.bodies || []).map(([name, px, py, hidden]) => ({ id: name, name, kind: hidden ? "hiddenbody" : "body", px, py }));
+}
+
+const isBody = (star) => star.kind === "body" || star.kind === "hiddenbody";
 
 function starText(star) {
   const [word, meaning] = KINDS[star.kind] || [star.kind, ""];
   const light = known(star.flux) ? `${say(star.flux)} ± ${say(star.sigma)} ${star.unit}` : null;
   return [star.name || star.id, [
-    ["catalogue", star.name ? star.id : null],
+    ["catalogue", star.name && !isBody(star) ? star.id : null],
+    ["designation", star.designation],
     ["magnitude", known(star.mag) ? `V ${say(star.mag, 2)}` : null],
     [word, star.cause || meaning],
     ["light", light],

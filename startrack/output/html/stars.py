@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.catalog import proper_name_designations
 from startrack.types import Array
 
 Columns = dict[str, list[Any]]
@@ -38,7 +39,7 @@ class MeasuredStars:
 class StarTable:
     """What a page needs of a star table."""
 
-    shown: dict[str, Any]  # the brightest stars as columns, and how many the table has of each status
+    shown: dict[str, Any]  # the brightest stars as columns, designations of named ones, how many have each status
     measured: MeasuredStars
 
 
@@ -64,7 +65,9 @@ def star_table_of(path: Path, most: int) -> StarTable | None:
             if total <= most:
                 for name, column, decimals in STAR_COLUMNS:
                     kept[name].append(_text_or_number(row.get(column) or "", decimals))
-    shown = {"total": total, "counts": counts, "unit": unit, "columns": _drop_empty_columns(kept)}
+    designations = {name: known for name in kept["name"] if (known := proper_name_designations().get(name))}
+    columns = _drop_empty_columns(kept)
+    shown = {"total": total, "counts": counts, "unit": unit, "columns": columns, "designations": designations}
     return StarTable(shown, _measured_stars(measured))
 
 

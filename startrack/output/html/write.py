@@ -40,8 +40,8 @@ HERE = Path(__file__).parent
 STYLES = ("page.css",)
 DRAWING = ("basics.js", "view.js", "axes.js", "input.js", "theme.js")  # in every page
 SCRIPTS = (
-    "sky.js", "panorama.js", "picture.js", "evidence.js", "search.js", "map.js", "errors.js", "detail.js", "table.js",
-    "page.js",
+    "sky.js", "panorama.js", "picture.js", "evidence.js", "designations.js", "search.js", "map.js", "errors.js",
+    "detail.js", "table.js", "page.js",
 )  # fmt: skip
 DEFAULT_IMAGES = 30
 FEW = 4  # images whose details may be large

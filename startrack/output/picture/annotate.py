@@ -164,7 +164,7 @@ def _legend(value: Inputs, truth: bool) -> list[tuple[str, Colour, str]]:
         found += [("disc", POSITION, f"position{around}")]
     if isinstance(value, Located) and value.fix.ambiguous:
         found += [("line", SKYLINE, "skyline of the terrain seen from position 1")]
-        found += [("disc", POSITION, "position that fits the stars, with its probability")]
+        found += [("disc", POSITION, "position that fits the stars, its probability, circle 95 %")]
     if truth and value.terrain is not None:
         found += [("plus", TRUTH, "true position (not known to the method)")]
     return found

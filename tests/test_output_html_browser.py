@@ -108,6 +108,11 @@ def test_fingers_tap_and_pinch(window):
 def test_nothing_stands_out_sideways(window, size, scheme):
     w = window(size, scheme=scheme)
     assert w.has_no_overflow()
+    beyond = w.page.evaluate(  # px, from the right edge of each badge of an outcome to that of its cell
+        "[...document.querySelectorAll('td.mid .badge')].map(badge => badge.closest('td').getBoundingClientRect().right"
+        " - badge.getBoundingClientRect().right)"
+    )
+    assert len(beyond) == 4 and min(beyond) >= 0
     for index in range(4):
         w.page.evaluate("k => { location.hash = `#i${k}` }", index)
         w.wait_for(f"document.getElementById('detail').dataset.index === '{index}'")

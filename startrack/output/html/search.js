@@ -51,7 +51,8 @@ function searchForm(stars, detail, views) {
 
 function missing(words, stars, detail) {
   const { total } = detail.stars;
-  return total > stars.length ? `“${words}” is outside of the picture, or not among the ${say(stars.length, 0)} brightest of its ${say(total, 0)} stars; NAME.stars.ecsv has all.`
+  const count = stars.filter((star) => !isBody(star)).length;
+  return total > count ? `“${words}” is outside of the picture, or not among the ${say(count, 0)} brightest of its ${say(total, 0)} stars; NAME.stars.ecsv has all.`
     : `“${words}” is not among the ${say(total, 0)} stars in the picture.`;
 }
 

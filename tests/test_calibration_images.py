@@ -6,6 +6,7 @@ import csv
 import json
 import re
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +18,11 @@ from startrack.calibration.acceptance import joint_log_p_value
 from startrack.calibration.verify import verify, verify_dict
 from startrack.camera import load_camera, save_camera
 from startrack.catalog import load_catalog
+from startrack.cli.calibration_files import write_camera
 from startrack.cli.main import main
 from startrack.exposure import read_exposure, read_mask, write_exposure
 from startrack.frames import Site
-from startrack.types import BadInput, NotIdentified
+from startrack.types import BadInput, Exposure, NotIdentified
 
 ROOT = Path(__file__).parent.parent
 PHOTO = ROOT / "sample_images/lowell-2018-08-06.fits.bz2"
@@ -110,6 +112,45 @@ def test_noise_is_refused_with_advice(exposure):
     with pytest.raises(NotIdentified, match="point source") as refusal:
         calibrate([noise], load_catalog(), camera=replace(load_camera("lowell-ldt"), size_px=(400, 300)))
     assert refusal.value.reason == "no_stars"
+
+
+@pytest.mark.parametrize("command", ["calibrate", "calibrate board --pattern 9x6"])
+@pytest.mark.parametrize("suffix", [".toml", ".calibration.json", ".report.html", ".report.png", ".mask.png",
+                                    ".hot-pixels.csv"])  # fmt: skip
+def test_an_existing_file_is_refused_before_the_images_are_read(command, suffix, tmp_path, capsys):
+    former = (tmp_path / "mine.toml").with_suffix(suffix)
+    former.write_text("before")
+    words = [*command.split(), str(tmp_path / "none.png"), "-o", str(tmp_path / "mine.toml")]
+    assert main(words) == 2
+    message = capsys.readouterr().err
+    assert f"{former}: exists already: replace it with -O, or write elsewhere" in message
+    assert "overwrite=True" not in message
+    assert main([*words, "-O"]) == 4  # the image is read
+    assert "none.png" in capsys.readouterr().err
+    assert former.read_text() == "before"
+
+
+def test_the_record_of_a_refused_calibration_is_replaced(tmp_path):
+    """A picture without stars has left a record; the next attempt under the same name needs no flag."""
+    picture = Exposure(pixels_adu=np.full((60, 80), 100.0, np.float32), time_utc=datetime(2026, 1, 1, tzinfo=UTC))
+    write_exposure(tmp_path / "flat.png", picture)
+    for _ in range(2):
+        assert main(["calibrate", str(tmp_path / "flat.png"), "--fov", "180", "-o", str(tmp_path / "a.toml")]) == 3
+        assert json.loads((tmp_path / "a.calibration.json").read_text())["status"] == "refused"
+
+
+def test_mask_and_hot_pixels_of_the_former_calibration_are_removed(cold_calibration, tmp_path):
+    """Except a mask that the new calibration used."""
+    found = replace(cold_calibration, obstructed=None)
+    mask, hot = tmp_path / "new.mask.png", tmp_path / "new.hot-pixels.csv"
+    for used_masks, is_kept in (([str(mask)], True), ([None], False)):
+        mask.write_text("former")
+        hot.write_text("former")
+        assert write_camera(tmp_path / "new.toml", found, used_masks) == ""
+        assert (mask.exists(), hot.exists()) == (is_kept, False)
+    found = replace(cold_calibration, obstructed=np.eye(1040, 1392, dtype=bool))
+    assert 'mask = "new.mask.png"' in write_camera(tmp_path / "new.toml", found, [])
+    assert read_mask(mask).masked.sum() == 1040
 
 
 @pytest.fixture(scope="module")

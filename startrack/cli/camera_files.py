@@ -11,14 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from startrack.cli.calibrate import (
+    add_overwrite_flag,
     add_print_flags,
     add_site_flags,
     check_name,
-    output_path,
     print_outcome,
     show_steps,
     site_of,
 )
+from startrack.cli.calibration_files import output_path
 from startrack.cli.common import DEFAULT_OUT, read
 from startrack.cli.flag_types import calibrated_angle_rad
 from startrack.errors import BadInput, NoSolution
@@ -50,6 +51,7 @@ def add_parsers(subparsers: Any) -> None:
     convert.add_argument("-o", "--output", metavar="FILE", help="what to write (default: a file in OUT)")
     convert.add_argument("--name", help="name of the camera (default: the one in the file, else its stem)")
     convert.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the results (%(default)s)")
+    add_overwrite_flag(convert)
     convert.set_defaults(run=run_convert)
 
 
@@ -100,7 +102,7 @@ def run_convert(args: argparse.Namespace) -> int:
             )
             print(f"{args.file}: {warning}; give --calibrated-angle", file=sys.stderr)
     out = output_path(args, default)
-    write_atomically(out, text.encode("utf-8"), overwrite=True)
+    write_atomically(out, text.encode("utf-8"), overwrite=args.overwrite)
     if not args.quiet:
         print(f"{out}{note}")
     return 0

@@ -69,7 +69,7 @@ def _run(args: argparse.Namespace) -> int:
         sys.stdout.flush()  # here, where a closed pipe is distinguished from an error
         return code
     except BadOutput as cause:
-        print(f"startrack {args.command}: error: {cause}", file=sys.stderr)
+        print(f"startrack {args.command}: error: {cause.command_message}", file=sys.stderr)
         return USAGE
     except BadInput as cause:
         return _report_refusal(cause, BAD_INPUT, args)

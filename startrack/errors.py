@@ -96,7 +96,8 @@ class Reason(StrEnum):
     )  # fmt: skip
     AMBIGUOUS = (
         "ambiguous", EXIT_REFUSED, "More than one position fits",
-        "Take another picture some way off, expose longer, or narrow [search] in the terrain file to where the rover "
+        "To choose between the positions, give locate or batch a rough one: --near EAST,NORTH,SIGMA in metres. Or "
+        "take another picture some way off, expose longer, or narrow [search] in the terrain file to where the rover "
         "can be.",
     )  # fmt: skip
     INTERNAL_ERROR = (

@@ -16,7 +16,7 @@ import startrack
 ROOT = Path(startrack.__file__).parent
 
 LAYERS = (  # lowest first; a package imports from lower layers only
-    {"errors", "mask", "values"},
+    {"errors", "lengths", "mask", "values"},
     {"prior", "correction"},
     {"types", "files", "declaration"},
     {"frames", "runner", "compilation"},

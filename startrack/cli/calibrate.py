@@ -170,9 +170,10 @@ def _write_calibration(args: argparse.Namespace, out: Path, found: Calibration, 
         about_mask = write_camera(out, found, [found.camera.mask, *masks])
         line += f"\n  {about_mask}" if about_mask else ""
     write_record(out, record)
-    if not args.no_plots:
-        write_report(out, found)
+    about_picture = "" if args.no_plots else write_report(out, found)
     if not args.quiet:
+        if about_picture:
+            print(about_picture, file=sys.stderr, flush=True)
         for one in found.refused:
             print(f"{one.name}: left out, {one.reason}: {one.message}", file=sys.stderr, flush=True)
     if args.verbose:

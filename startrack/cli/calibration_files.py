@@ -47,6 +47,17 @@ def _is_refusal(record: Path) -> bool:
         return False
 
 
+def has_site(camera_file: Path) -> bool | None:
+    """Whether the record beside a camera file states a site on the Earth; None where no record states that."""
+    from startrack.calibration.record import REFRACTION_REMOVED
+
+    try:
+        lens = json.loads(camera_file.with_suffix(RECORD).read_text(encoding="utf-8"))["lens"]
+        return bool(lens["refraction"] == REFRACTION_REMOVED)
+    except (OSError, ValueError, RecursionError, KeyError, TypeError):  # none; of a refusal; not ours
+        return None
+
+
 def write_record(camera_file: Path, record: dict[str, Any]) -> None:
     """Write CAMERA.calibration.json in the place of a former one, whose report is removed."""
     from startrack.output import write_json

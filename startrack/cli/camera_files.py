@@ -19,7 +19,7 @@ from startrack.cli.calibrate import (
     show_steps,
     site_of,
 )
-from startrack.cli.calibration_files import output_path
+from startrack.cli.calibration_files import has_site, output_path
 from startrack.cli.common import DEFAULT_OUT, read
 from startrack.cli.flag_types import calibrated_angle_rad
 from startrack.errors import BadInput, NoSolution
@@ -30,7 +30,10 @@ DEFAULT_NAMES = {"colmap": "cameras.txt", "kalibr": "camchain.yaml"}  # of the o
 
 def add_parsers(subparsers: Any) -> None:
     """Add the actions to the commands of the `startrack` parser."""
-    verify = _add_action(subparsers, "verify", "Check whether a camera file still fits exposures of the stars.")
+    verify = _add_action(
+        subparsers, "verify", "Check whether a camera file still fits exposures of the stars. If the file was "
+        "calibrated with --site, verify needs --site too.",
+    )  # fmt: skip
     verify.add_argument("images", nargs="+", metavar="IMAGE", help="PNG, TIFF, FITS, JPEG or camera raw")
     verify.add_argument("-c", "--camera", metavar="FILE", help="camera file (default: the one that the image names)")
     add_site_flags(verify)
@@ -113,6 +116,7 @@ def run_verify(args: argparse.Namespace) -> int:
     from startrack.calibration.verify import verify, verify_dict, verify_line
     from startrack.camera import load_camera
     from startrack.catalog import load_catalog
+    from startrack.files import resolve_named
 
     worst = 0
     for path in args.images:
@@ -123,7 +127,9 @@ def run_verify(args: argparse.Namespace) -> int:
         with show_steps(args, 1) as show_step:
             try:
                 show_step(f"verifying with {exposure.name}")
-                found = verify(exposure, load_camera(named), load_catalog(), site_of(args, [exposure]))
+                camera, site = load_camera(named), site_of(args, [exposure])
+                known = has_site(resolve_named(named, "calib", "no_calibration"))
+                found = verify(exposure, camera, load_catalog(), site, file_has_site=known)
             except NoSolution as cause:
                 record = {"image": exposure.name, "status": "refused", "reason": cause.reason, "message": str(cause),
                           "advice": cause.reason.advice}  # fmt: skip

@@ -17,10 +17,14 @@ from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from startrack import __version__
 from startrack.files import PACKAGE
+
+if TYPE_CHECKING:
+    from multiprocessing.context import BaseContext
+    from multiprocessing.synchronize import Semaphore
 
 LOG = logging.getLogger(__name__)
 VARIABLE = "NUMBA_CACHE_DIR"
@@ -45,6 +49,36 @@ def choose_cache_folder() -> None:
     os.environ[VARIABLE] = str(folder)
 
 
+class _Turn:
+    """Whether this process may still announce; the first of the processes that share a semaphore does."""
+
+    def __init__(self) -> None:
+        self.is_taken = False
+        self.shared: Semaphore | None = None
+
+    def take(self) -> bool:
+        if self.is_taken:
+            return False
+        self.is_taken = True
+        return self.shared is None or bool(self.shared.acquire(block=False))
+
+
+_TURN = _Turn()
+
+
+def turn_for_pool(context: BaseContext) -> Semaphore:
+    """A semaphore for `share_turn` in the processes that a multiprocessing `context` starts.
+
+    None of them announces where this process has done so.
+    """
+    return context.Semaphore(int(not _TURN.is_taken))
+
+
+def share_turn(semaphore: Semaphore) -> None:
+    """From now on, announce in this process only if no other process that shares the `semaphore` has done so."""
+    _TURN.shared = semaphore
+
+
 @cache
 def announce_compilation() -> None:
     """From now on, log one line when numba compiles the first kernel of startrack in this process.
@@ -54,11 +88,8 @@ def announce_compilation() -> None:
     from numba.core import event
 
     class Announcement(event.Listener):  # type: ignore[misc]
-        made = False
-
         def on_start(self, event: Any) -> None:
-            if not self.made and event.data["dispatcher"].py_func.__module__.startswith("startrack."):
-                self.made = True
+            if event.data["dispatcher"].py_func.__module__.startswith("startrack.") and _TURN.take():
                 LOG.warning(
                     "compiling what this command uses first: about 20 s, for height maps a minute; kept on disk"
                 )

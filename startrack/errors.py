@@ -96,7 +96,8 @@ class Reason(StrEnum):
     )  # fmt: skip
     AMBIGUOUS = (
         "ambiguous", EXIT_REFUSED, "More than one position fits",
-        "Take another picture some way off, expose longer, or narrow [search] in the terrain file to where the rover "
+        "To choose between the positions, give locate or batch a rough one: --near EAST,NORTH,SIGMA in metres. Or "
+        "take another picture some way off, expose longer, or narrow [search] in the terrain file to where the rover "
         "can be.",
     )  # fmt: skip
     INTERNAL_ERROR = (
@@ -139,6 +140,24 @@ class BadInput(Exception):
 
 class BadOutput(BadInput):
     """A path at which results cannot be written; of a flag it is wrong usage (exit code 2)."""
+
+    @property
+    def command_message(self) -> str:
+        """The cause with flags of the command instead of arguments of the library."""
+        return str(self)
+
+
+class OutputExists(BadOutput):
+    """A file (`name`) that exists and may not be replaced."""
+
+    def __init__(self, reason: str, name: str) -> None:
+        super().__init__(reason, f"{name}: exists already: replace it with overwrite=True, or write elsewhere")
+        self.name = name
+
+    @property
+    def command_message(self) -> str:
+        """The cause with the flag of the command."""
+        return f"{self.name}: exists already: replace it with -O, or write elsewhere"
 
 
 class NoSolution(Exception):

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from startrack.errors import BadInput, BadOutput
+from startrack.errors import BadInput, BadOutput, OutputExists
 
 PACKAGE = Path(__file__).resolve().parent
 MAX_TEXT_BYTES = 2**20  # camera and terrain files have a few kilobytes
@@ -204,10 +204,9 @@ def _write_error(cause: Exception) -> type[BadInput]:
 
 
 def check_free(path: FilePath, *, overwrite: bool, reason: str = "bad_image") -> None:
-    """Raise BadOutput `reason` if the file exists and may not be replaced."""
+    """Raise OutputExists `reason` if the file exists and may not be replaced."""
     if not overwrite and os.path.lexists(path):
-        remedy = "replace it with -O (overwrite=True in the library), or write elsewhere"
-        raise BadOutput(reason, f"{printable(path)}: exists already: {remedy}")
+        raise OutputExists(reason, printable(path))
 
 
 @contextmanager

@@ -18,9 +18,12 @@ from multiprocessing.connection import wait as wait_for_sentinels
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from startrack.compilation import share_turn, turn_for_pool
 from startrack.errors import BadInput
 
 if TYPE_CHECKING:
+    from multiprocessing.synchronize import Semaphore
+
     from distributed import Client
 
 CONNECT_S = 10.0
@@ -192,7 +195,9 @@ class _Pool:
             os.environ["PYTHONWARNINGS"] = f"{rules},{NO_TRACKER_WARNINGS}".strip(",")
         self._others = set(active_children())
         # New processes: a fork would copy the thread of the progress bar.
-        self._executor = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_begin_process)
+        context = get_context("spawn")
+        given = (turn_for_pool(context), logging.getLogger("startrack").level)
+        self._executor = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_process, initargs=given)
 
     def submit(self, work: Callable[[Task], Result], task: Task) -> Future[Result]:
         """The future result; in a broken pool a future with BrokenProcessPool."""
@@ -230,8 +235,10 @@ def _blocked_signals() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _begin_process() -> None:
-    """The first call in a new process."""
+def _begin_process(turn: Semaphore, log_level: int) -> None:
+    """The first call in a new process: one of the pool announces compilation, and logs are as quiet as the parent's."""
+    share_turn(turn)
+    logging.getLogger("startrack").setLevel(log_level)
     for number in SIGNALS:  # sent to the whole process group: the tasks in progress are finished
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()

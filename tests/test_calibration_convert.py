@@ -184,9 +184,10 @@ def test_the_flag_names_the_camera_and_its_file_stays_in_the_folder(tmp_path, ca
     (tmp_path / "info.yaml").write_text(to_text(PINHOLE, "ros"))
     command = ["calibrate", "convert", str(tmp_path / "info.yaml"), "--from", "ros", "-q", "-o"]
     for words, name in ((["--name", "../mine"], "../mine"), ([], "pinhole")):
-        assert main([*command, str(tmp_path / "out.toml"), *words]) == 0
+        assert main([*command, str(tmp_path / "out.toml"), "-O", *words]) == 0
         assert load_camera(str(tmp_path / "out.toml")).name == name
-        assert main(["calibrate", "convert", str(tmp_path / "out.toml"), "--to", "ros", "-D", str(tmp_path / "d")]) == 0
+        to_ros = ["calibrate", "convert", str(tmp_path / "out.toml"), "--to", "ros", "-O"]
+        assert main([*to_ros, "-D", str(tmp_path / "d")]) == 0
         assert Path(capsys.readouterr().out.strip()).parent == tmp_path / "d"
 
 
@@ -246,7 +247,7 @@ def test_the_calibrated_angle_is_given_or_that_of_the_nearest_edge(program, tmp_
     assert camera.calibrated_angle_rad == pytest.approx(float(camera.angle_rad(edge)))
     assert camera.calibrated_angle_rad < 0.7 * camera.max_angle_rad
     assert "the file states none; give --calibrated-angle" in capsys.readouterr().err
-    assert main([*words, "--calibrated-angle", "50"]) == 0
+    assert main([*words, "--calibrated-angle", "50", "-O"]) == 0
     assert load_camera(made).calibrated_angle_rad == pytest.approx(np.radians(50))
     assert capsys.readouterr().err == ""
     off_centre = replace(FISHEYE, centre_px=(-100.0, 600.0))

@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import json
 import re
+import sys
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +16,15 @@ from scipy.spatial import cKDTree
 
 from startrack.calibration import calibrate
 from startrack.calibration.acceptance import joint_log_p_value
-from startrack.calibration.verify import verify, verify_dict
+from startrack.calibration.report import write_report
+from startrack.calibration.verify import Verification, verify, verify_dict, verify_line
 from startrack.camera import load_camera, save_camera
 from startrack.catalog import load_catalog
+from startrack.cli.calibration_files import write_camera
 from startrack.cli.main import main
 from startrack.exposure import read_exposure, read_mask, write_exposure
 from startrack.frames import Site
-from startrack.types import BadInput, NotIdentified
+from startrack.types import BadInput, Exposure, NotIdentified
 
 ROOT = Path(__file__).parent.parent
 PHOTO = ROOT / "sample_images/lowell-2018-08-06.fits.bz2"
@@ -60,6 +64,27 @@ def test_its_stars_are_those_that_were_named_without_startrack(cold_calibration)
     assert both.sum() >= 380
     names = np.array([int(row["hip"]) for row in rows])
     assert np.mean(frame.sky.stars.hip[matched.star][both] == names[nearest[both]]) >= 0.995
+
+
+@pytest.mark.parametrize(
+    ("signs", "hours"), [((1, 1), 0), ((1, -1), 0), ((-1, 1), 0), ((1, 1), 3)], ids=["right", "lon", "lat", "time"]
+)
+def test_a_wrong_site_or_time_shows_stars_below_the_horizon(exposure, signs, hours):
+    site = Site("earth", signs[0] * SITE.latitude_rad, signs[1] * SITE.longitude_rad, SITE.height_m)
+    picture = replace(exposure, time_utc=exposure.time_utc + timedelta(hours=hours))
+    found = calibrate([picture], load_catalog().brighter_than(8.0), camera=load_camera("lowell-ldt"), site=site)
+    (check,) = (one for one in found.checks if "below the horizon" in one.name)
+    assert check.passed == found.accepted == (signs == (1, 1) and hours == 0)
+    assert check.reason == "inconsistent_evidence" and "--site (signs) and the time" in check.advice
+    if check.passed:
+        assert check.value == 0
+    else:
+        assert check.value > 0.02 and found.failed_checks[0] is check
+
+
+def test_without_a_site_there_is_no_horizon(exposure):
+    found = calibrate([exposure], load_catalog().brighter_than(7.0), camera=load_camera("lowell-ldt"))
+    assert not any("below the horizon" in check.name for check in found.checks)
 
 
 def test_chance_gives_no_such_number_of_matches(cold_calibration):
@@ -112,6 +137,45 @@ def test_noise_is_refused_with_advice(exposure):
     assert refusal.value.reason == "no_stars"
 
 
+@pytest.mark.parametrize("command", ["calibrate", "calibrate board --pattern 9x6"])
+@pytest.mark.parametrize("suffix", [".toml", ".calibration.json", ".report.html", ".report.png", ".mask.png",
+                                    ".hot-pixels.csv"])  # fmt: skip
+def test_an_existing_file_is_refused_before_the_images_are_read(command, suffix, tmp_path, capsys):
+    former = (tmp_path / "mine.toml").with_suffix(suffix)
+    former.write_text("before")
+    words = [*command.split(), str(tmp_path / "none.png"), "-o", str(tmp_path / "mine.toml")]
+    assert main(words) == 2
+    message = capsys.readouterr().err
+    assert f"{former}: exists already: replace it with -O, or write elsewhere" in message
+    assert "overwrite=True" not in message
+    assert main([*words, "-O"]) == 4  # the image is read
+    assert "none.png" in capsys.readouterr().err
+    assert former.read_text() == "before"
+
+
+def test_the_record_of_a_refused_calibration_is_replaced(tmp_path):
+    """A picture without stars has left a record; the next attempt under the same name needs no flag."""
+    picture = Exposure(pixels_adu=np.full((60, 80), 100.0, np.float32), time_utc=datetime(2026, 1, 1, tzinfo=UTC))
+    write_exposure(tmp_path / "flat.png", picture)
+    for _ in range(2):
+        assert main(["calibrate", str(tmp_path / "flat.png"), "--fov", "180", "-o", str(tmp_path / "a.toml")]) == 3
+        assert json.loads((tmp_path / "a.calibration.json").read_text())["status"] == "refused"
+
+
+def test_mask_and_hot_pixels_of_the_former_calibration_are_removed(cold_calibration, tmp_path):
+    """Except a mask that the new calibration used."""
+    found = replace(cold_calibration, obstructed=None)
+    mask, hot = tmp_path / "new.mask.png", tmp_path / "new.hot-pixels.csv"
+    for used_masks, is_kept in (([str(mask)], True), ([None], False)):
+        mask.write_text("former")
+        hot.write_text("former")
+        assert write_camera(tmp_path / "new.toml", found, used_masks) == ""
+        assert (mask.exists(), hot.exists()) == (is_kept, False)
+    found = replace(cold_calibration, obstructed=np.eye(1040, 1392, dtype=bool))
+    assert 'mask = "new.mask.png"' in write_camera(tmp_path / "new.toml", found, [])
+    assert read_mask(mask).masked.sum() == 1040
+
+
 @pytest.fixture(scope="module")
 def written_files(tmp_path_factory):
     """Output of the command for the photograph, from a camera file that is 2 % and 6 px off."""
@@ -144,6 +208,15 @@ def test_the_command_writes_camera_record_and_report(written_files):
     assert "accepted" in page
     assert not re.search(r'(src|href)="(?!data:)', page)  # nothing is fetched
     assert (written_files / "new.report.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_report_without_matplotlib_names_the_extra(cold_calibration, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)  # importing it fails, and it is not found
+    note = write_report(tmp_path / "a.toml", cold_calibration)
+    assert note.startswith("a.report.html: no picture: ") and "pip install '.[plots]'" in note
+    assert [path.name for path in tmp_path.iterdir()] == ["a.report.html"]
+    page = (tmp_path / "a.report.html").read_text()
+    assert "accepted" in page and "the extra plots" in page and "<img" not in page
 
 
 def test_the_sensor_is_measured_where_the_picture_allows(written_files):
@@ -189,6 +262,40 @@ def test_a_lens_that_has_changed_does_not_verify(written_files, exposure):
     assert record["reason"] == "inconsistent_evidence"
     assert record["focal_change"] == pytest.approx(-0.004, abs=0.0015)
     assert record["map_change_px"] > 0.4
+
+
+@pytest.mark.parametrize(
+    ("site", "file_has_site", "advice"),
+    [(None, True, "give --site LAT,LON[,M] here"), (None, None, "give --site here too"),
+     (SITE, False, "verify it without --site"), (SITE, True, "the lens has changed: calibrate again"),
+     (SITE, None, "the lens has changed: calibrate again"), (None, False, "the lens has changed: calibrate again")],
+)  # fmt: skip
+def test_a_refused_file_is_asked_for_the_site_that_it_was_made_with(cold_calibration, site, file_has_site, advice):
+    camera = cold_calibration.camera
+    found = Verification(
+        image="a", camera=camera, fresh=camera, stars=100, rms_px=0.2, change_px=1.0, change_sigma_px=0.05,
+        largest_px=2.0, has_site=site is not None, file_has_site=file_has_site,
+    )  # fmt: skip
+    assert verify_dict(found)["message"].endswith(advice) and advice in verify_line(found)
+    assert replace(found, change_px=0.1).message == ""
+
+
+def test_verify_finds_what_the_record_states(written_files, exposure, tmp_path, capsys):
+    """The lens of the photograph is scaled so that it must be refused; the site in the record decides on the advice."""
+    camera = load_camera(written_files / "new.toml")
+    save_camera(replace(camera, focal_px=(camera.focal_px[0] * 1.004, camera.focal_px[1] * 1.004)), tmp_path / "a.toml")
+    words = ["calibrate", "verify", str(PHOTO), "-c", str(tmp_path / "a.toml")]
+    assert main(words) == 3
+    assert "if the file was made with --site" in capsys.readouterr().out
+    record = (written_files / "new.calibration.json").read_text()
+    (tmp_path / "a.calibration.json").write_text(record)
+    assert main(words) == 3
+    assert "was made with a site" in capsys.readouterr().out
+    assert main([*words, "--site=34.7443,111.4223,2361"]) == 3
+    assert "stars are below the horizon of this site" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["calibrate", "verify", "--help"])
+    assert "verify needs --site too" in " ".join(capsys.readouterr().out.split())
 
 
 def test_convert_by_command(written_files, capsys):

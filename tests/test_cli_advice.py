@@ -10,6 +10,7 @@ import pytest
 from startrack.cli.main import main
 from startrack.errors import Reason, next_step
 
+ACTIONS = {"calibrate": ("board", "verify", "show", "convert"), "terrain": ("show", "import", "build")}
 SAMPLE = str(Path(__file__).parents[1] / "sample_images/near-wall.png")
 
 
@@ -19,6 +20,31 @@ def test_startrack_alone_shows_where_to_start(capsys: pytest.CaptureFixture[str]
     assert len(shown) == 5
     for word in ("locate", "calibrate", "identify", "demo", "--help"):  # three tasks, and where to see more
         assert any(f"startrack {word}" in line for line in shown)
+
+
+@pytest.mark.parametrize("command", ACTIONS)
+def test_a_command_with_actions_alone_shows_them(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command]) == 2
+    shown = capsys.readouterr()
+    assert shown.err == "" and shown.out.startswith(f"usage: startrack {command} ")
+    for action in ACTIONS[command]:
+        assert f"startrack {command} {action} " in shown.out
+
+
+def test_a_track_of_what_does_not_exist_names_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "nofolder"
+    assert main(["track", str(path), "-D", str(tmp_path / "out")]) == 4
+    (line, *_) = capsys.readouterr().err.splitlines()
+    assert f"{path}: no such file or folder: give images, one folder of images, or one ROS bag" in line
+    with pytest.raises(SystemExit) as end:
+        main(["track", str(path), "--follow"])
+    assert end.value.code == 2
+    assert f"{path} is no folder" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_advice_on_several_positions_names_the_flag_that_chooses() -> None:
+    assert "--near EAST,NORTH,SIGMA" in Reason.AMBIGUOUS.advice
 
 
 def test_a_refusal_ends_with_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from startrack import compilation
 from startrack.localization import posterior
+from startrack.runner import Runner
 from startrack.terrain import load_terrain
 from startrack.types import Evidence, NotLocated
 
@@ -50,6 +54,30 @@ def test_compiling_is_announced_once_and_loading_is_not(tmp_path):
         "compiling what this command uses first: about 20 s, for height maps a minute; kept on disk"
     ]
     assert run_script(script, tmp_path / "cache") == ""
+
+
+def compile_beside_another(folder: str) -> int:
+    """Signal the compilation of a kernel, as numba does, once two processes have begun."""
+    from numba.core import event
+
+    compilation.announce_compilation()
+    (Path(folder) / str(os.getpid())).touch()
+    while len(list(Path(folder).iterdir())) < 2:
+        time.sleep(0.01)
+    dispatcher = SimpleNamespace(py_func=SimpleNamespace(__module__="startrack.probe"))
+    event.start_event("numba:compile", data={"dispatcher": dispatcher})
+    return os.getpid()
+
+
+@pytest.mark.parametrize(("announced", "level", "lines"), [(False, 0, 1), (True, 0, 0), (False, logging.ERROR, 0)])
+def test_two_processes_announce_once(tmp_path, capfd, monkeypatch, announced, level, lines):
+    """And not at all where their parent has, or where it is quiet."""
+    monkeypatch.setattr(compilation._TURN, "is_taken", announced)
+    monkeypatch.setattr(logging.getLogger("startrack"), "level", level)
+    with Runner(compile_beside_another, jobs=2) as runner:
+        processes = {process for _, process in runner.results([str(tmp_path)] * 4)}
+    assert len(processes) == 2
+    assert capfd.readouterr().err.count("compiling what this command uses first") == lines
 
 
 def test_a_localizer_called_without_the_pipeline_announces_too(monkeypatch):

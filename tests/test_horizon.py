@@ -233,7 +233,7 @@ def test_unknown_suffixes_and_existing_files_are_refused(tmp_path):
     with pytest.raises(BadInput, match="suffix"):
         check_output(str(tmp_path / "a.txt"), overwrite=False)
     (tmp_path / "a.csv").write_text("mine")
-    with pytest.raises(BadInput, match="replace it with -O"):
+    with pytest.raises(BadInput, match="replace it with overwrite=True, or"):
         check_output(str(tmp_path / "a.csv"), overwrite=False)
     check_output(str(tmp_path / "a.csv"), overwrite=True)
 

@@ -16,10 +16,11 @@ import startrack
 ROOT = Path(startrack.__file__).parent
 
 LAYERS = (  # lowest first; a package imports from lower layers only
-    {"errors", "mask", "values"},
+    {"errors", "lengths", "mask", "values"},
     {"prior", "correction"},
     {"types", "files", "declaration"},
-    {"frames", "runner", "compilation"},
+    {"compilation"},
+    {"frames", "runner"},
     {"kernels", "chunk_store"},
     {"normal_cdf"},
     {"psf", "catalog", "camera", "terrain", "exposure"},

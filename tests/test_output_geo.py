@@ -20,7 +20,7 @@ KML = "{http://www.opengis.net/kml/2.2}"
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("geo")
-    words = ["locate", str(SAMPLE), "-D", str(folder), "--no-plots", "-q", "--format", "geojson", "--format", "kml"]
+    words = ["locate", str(SAMPLE), "-D", str(folder), "--no-plots", "-q", "--format", "geojson,kml"]
     assert main(words) == 0
     return folder
 
@@ -65,6 +65,13 @@ def test_no_former_file_stands_beside_another_result(out: Path, tmp_path: Path) 
     assert (tmp_path / "near-wall.geojson").exists() and not (tmp_path / "near-wall.kml").exists()
     assert main([*words, "--near", "-6000,4700,10"]) == 3
     assert not (tmp_path / "near-wall.geojson").exists()
+
+
+def test_another_format_is_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["locate", str(SAMPLE), "--format", "geojson,shp"])
+    assert end.value.code == 2
+    assert "'geojson,shp' is not geojson, kml or geojson,kml" in capsys.readouterr().err
 
 
 def test_a_circle_across_180_degrees_is_whole_and_one_about_the_pole_is_left_out() -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.calibration.frame import Frame
 from startrack.calibration.initial_camera import fit_attitudes, mirror_camera
-from startrack.calibration.matching import match_frame
+from startrack.calibration.matching import FrameMatches, match_frame
 from startrack.calibration.region_growing import JointFit
 from startrack.camera import Camera
 from startrack.camera.uncertainty import cap_grid
@@ -91,20 +93,18 @@ def joint_log_p_value(joint: JointFit) -> float:
 
     The number expected by chance is measured by the same matching at certainly wrong attitudes.
     """
-    camera, within = joint.fit.camera, joint.fit.camera.calibrated_angle_rad
     found = sum(map(len, joint.matches))
-    wrong = [
-        sum(
-            len(
-                match_frame(
-                    frame, camera, R_from_rotvec(np.array([0.0, 0.3 * angle, angle])) @ R, within, joint.gate_px
-                )
-            )
-            for frame, R in zip(joint.frames, joint.fit.R_cam_icrs, strict=True)
-        )
-        for angle in WRONG_ROTATIONS_RAD
-    ]
+    wrong = [sum(map(len, rotated_matches(joint, joint.frames, angle))) for angle in WRONG_ROTATIONS_RAD]
     return log_p_value_poisson(found, max(float(np.mean(wrong)), MIN_CHANCE_MATCHES))
+
+
+def rotated_matches(joint: JointFit, frames: Sequence[Frame], rotation_rad: float) -> list[FrameMatches]:
+    """The matches of `frames` with the lens and the attitudes of a `joint` fit, these rotated by an angle."""
+    camera, rotation = joint.fit.camera, R_from_rotvec(np.array([0.0, 0.3 * rotation_rad, rotation_rad]))
+    return [
+        match_frame(frame, camera, rotation @ R, camera.calibrated_angle_rad, joint.gate_px)
+        for frame, R in zip(frames, joint.fit.R_cam_icrs, strict=True)
+    ]
 
 
 def mirrored_residual_px(joint: JointFit) -> float:

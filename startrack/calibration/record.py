@@ -16,6 +16,7 @@ from startrack.frames import format_utc, quat_xyzw_from_R
 from startrack.types import Array
 
 FORMAT = "startrack.calibration/1"
+REFRACTION_REMOVED = "taken out"
 MAP_ANGLES = 10
 
 
@@ -39,7 +40,7 @@ def calibration_dict(calibration: Calibration) -> dict[str, Any]:
             "chi2_per_dof": fit.chi2_per_dof,
             "birge_ratio": calibration.joint.birge_ratio,
             "map_sigma_px": next(check.value for check in calibration.checks if check.name.startswith("map sigma")),
-            "refraction": "taken out" if refracted else "not taken out: no site on the Earth was given",
+            "refraction": REFRACTION_REMOVED if refracted else "not taken out: no site on the Earth was given",
             "models": [vars(candidate) for candidate in fit.candidates],
         },
         "gates": [

@@ -16,6 +16,7 @@ from startrack.files import write_atomically
 from startrack.frames import format_utc
 from startrack.types import Array
 
+NO_PICTURE = "no picture: it needs matplotlib, the extra plots (pip install '.[plots]' in a clone of startrack)"
 STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#1b2430;background:#fff}
 h1{font-size:1.6rem;margin-bottom:.2rem} h2{font-size:1.15rem;margin-top:2rem}
@@ -27,8 +28,11 @@ pre{background:#f3f5f8;padding:.8rem;overflow-x:auto} p.lead{font-size:1.05rem}
 """
 
 
-def write_report(camera_path: Path, calibration: Calibration) -> None:
-    """Write NAME.report.html and, where matplotlib is installed, NAME.report.png beside the camera file."""
+def write_report(camera_path: Path, calibration: Calibration) -> str:
+    """Write NAME.report.html and, where matplotlib is installed, NAME.report.png beside the camera file.
+
+    The line that explains how to get the picture; empty where it is written.
+    """
     picture: bytes | None = None
     if find_spec("matplotlib") is not None:
         from startrack.calibration.plots import report_png
@@ -37,6 +41,7 @@ def write_report(camera_path: Path, calibration: Calibration) -> None:
         write_atomically(camera_path.with_suffix(".report.png"), picture, overwrite=True)
     page = report_html(calibration, picture)
     write_atomically(camera_path.with_suffix(".report.html"), page.encode("utf-8"), overwrite=True)
+    return "" if picture else f"{camera_path.with_suffix('.report.html').name}: {NO_PICTURE}"
 
 
 def report_html(calibration: Calibration, picture: bytes | None) -> str:
@@ -47,7 +52,7 @@ def report_html(calibration: Calibration, picture: bytes | None) -> str:
     image = (
         f'<img alt="residuals and map sigma" src="data:image/png;base64,{base64.b64encode(picture).decode()}">'
         if picture
-        else "<p>No picture: matplotlib is not installed (extra <code>plots</code>).</p>"
+        else f"<p>{NO_PICTURE}.</p>"
     )
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8">'

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from startrack.calibration.acceptance import Check, Checked, check_acceptance
+from startrack.calibration.below_horizon import horizon_checks
 from startrack.calibration.frame import Frame, load_frame, remove_static_sources
 from startrack.calibration.initial_camera import mirror_camera
 from startrack.calibration.obstruction import find_obstructions
@@ -112,7 +113,7 @@ def calibrate(
     return Calibration(
         camera=replace(fitted, sensor=photometry.sensor, mask=mask),
         joint=joint,
-        checks=check_acceptance(joint),
+        checks=(*horizon_checks(joint, catalog, site), *check_acceptance(joint)),
         refused=tuple(run.refused),
         site=site,
         false_alarm_probability=run.largest_false_alarm,
@@ -159,7 +160,8 @@ def _identify_all(run: _Run, frames: list[Frame]) -> None:
     if not run.identified:
         raise NotIdentified(
             f"the stars of no image could be identified ({run.refused[0].message}). Take pictures of the clear, dark "
-            "night sky, in focus, with the camera still and at least a hundred stars in view",
+            "night sky, in focus, with the camera still and at least a hundred stars in view"
+            + ("" if run.site is None else "; check the site (signs) and the time"),
             reason=run.refused[0].reason,
         )
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from startrack.calibration.below_horizon import horizon_checks
 from startrack.calibration.frame import load_frame
 from startrack.calibration.region_growing import fit_frames, grow_from_matches
 from startrack.calibration.run import identify_with
@@ -33,24 +34,48 @@ class Verification:
     change_px: float  # RMS change of the map, the best rotation removed
     change_sigma_px: float  # expected from the covariances of both
     largest_px: float
+    has_site: bool  # on the Earth: refraction was removed from the picture's stars
+    file_has_site: bool | None = None  # the same of the file's calibration; None: not known
 
     @property
     def is_valid(self) -> bool:
         """Whether the file can still be used."""
         return self.change_px <= max(ALLOWED_PX, SIGNIFICANT_SIGMAS * self.change_sigma_px)
 
+    @property
+    def message(self) -> str:
+        """Why the file cannot be used, and what to do; empty where it can."""
+        if self.is_valid:
+            return ""
+        if self.has_site and self.file_has_site is False:
+            return "the camera file was made without a site and contains the refraction: verify it without --site"
+        if not self.has_site and self.file_has_site:
+            return "the camera file was made with a site and is free of refraction: give --site LAT,LON[,M] here"
+        if not self.has_site and self.file_has_site is None:
+            return "the lens has changed: calibrate again; or, if the file was made with --site, give --site here too"
+        return "the lens has changed: calibrate again"
 
-def verify(exposure: Exposure, camera: Camera, catalog: StarCatalog, site: Site | None = None) -> Verification:
+
+def verify(
+    exposure: Exposure, camera: Camera, catalog: StarCatalog, site: Site | None = None,
+    *, file_has_site: bool | None = None,
+) -> Verification:  # fmt: skip
     """Fit the lens to the picture and compare the projections where both are calibrated.
 
-    Raises BadInput no_time, NotIdentified (also reason mirrored) where the stars cannot be identified with the file.
+    The picture needs a `site` if the camera file was calibrated with one (`file_has_site`, if known): both lenses must
+    be without refraction, or both with it. Raises BadInput no_time, NotIdentified where the stars cannot be identified
+    with the file, also with the reasons mirrored and, for a wrong site or time, inconsistent_evidence.
     """
     frame = load_frame(exposure, catalog, site, camera=camera)
     found_camera, found = identify_with(camera, frame)
     if found_camera.mirrored != camera.mirrored:
         raise NotIdentified("the picture is a mirror image, compared with the camera file", reason="mirrored")
     start, R = grow_from_matches(frame, found_camera, found.R_cam_icrs, found.star, found.detection)
-    fit = widen_covariance(fit_frames((frame,), start, R[None])).fit
+    joint = widen_covariance(fit_frames((frame,), start, R[None]))
+    for check in horizon_checks(joint, catalog, site):
+        if not check.passed:
+            raise NotIdentified(check.advice, reason=check.reason)
+    fit = joint.fit
     grid = cap_grid(min(camera.calibrated_angle_rad, fit.camera.calibrated_angle_rad))
     change = difference_px(camera, fit.camera, grid)
     variance = projection_covariance_px2(fit.camera, grid) + projection_covariance_px2(camera, grid)
@@ -63,6 +88,8 @@ def verify(exposure: Exposure, camera: Camera, catalog: StarCatalog, site: Site 
         change_px=float(np.sqrt(np.mean(np.sum(change**2, axis=1)))),
         change_sigma_px=float(np.sqrt(np.mean(np.trace(variance, axis1=1, axis2=2)))),
         largest_px=float(np.max(np.linalg.norm(change, axis=1))),
+        has_site=frame.sky.includes_refraction,
+        file_has_site=file_has_site,
     )
 
 
@@ -82,7 +109,7 @@ def verify_dict(found: Verification) -> dict[str, Any]:
         "image": found.image,
         "status": "ok" if found.is_valid else "refused",
         "reason": None if found.is_valid else "inconsistent_evidence",
-        "message": "" if found.is_valid else "the lens has changed: calibrate again",
+        "message": found.message,
         "camera": old.name,
         "stars": found.stars,
         "rms_px": found.rms_px,
@@ -96,7 +123,7 @@ def verify_dict(found: Verification) -> dict[str, Any]:
 
 def verify_line(found: Verification) -> str:
     """Summary in one line."""
-    verdict = "ok" if found.is_valid else "refused inconsistent_evidence: the lens has changed, calibrate again:"
+    verdict = "ok" if found.is_valid else f"refused inconsistent_evidence: {found.message}:"
     return (
         f"{found.image}  {verdict}  {found.stars} stars  map changed by {found.change_px:.2f} px RMS "
         f"(± {found.change_sigma_px:.2f}), {found.largest_px:.2f} px at most"

@@ -11,19 +11,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from startrack.cli.calibration_files import check_camera_output, write_camera, write_record
 from startrack.cli.common import DEFAULT_OUT, add_pixel_flags, print_advice, read
 from startrack.cli.flag_types import amount, field_of_view_rad, number, positive_number, seconds
 from startrack.cli.progress import progress
 from startrack.compilation import announce_compilation
 from startrack.errors import NoSolution, exit_code_of
-from startrack.files import check_output
 
 if TYPE_CHECKING:
     from startrack.calibration import Calibration, KnownSensor
     from startrack.camera import Camera
     from startrack.declaration import Key
     from startrack.frames import Site
-    from startrack.types import Bools, Exposure
+    from startrack.types import Exposure, Mask
 
 
 def add_parser(subparsers: Any) -> None:
@@ -76,8 +76,14 @@ def add_camera_output_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", metavar="FILE", help="the camera file (default: camera.toml in OUT)")
     parser.add_argument("--name", help="name of the camera (default: the file's stem)")
     parser.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the results (%(default)s)")
+    add_overwrite_flag(parser)
     parser.add_argument("--no-plots", action="store_true", help="no report")
     add_print_flags(parser)
+
+
+def add_overwrite_flag(parser: argparse.ArgumentParser) -> None:
+    """The flag for replacing files."""
+    parser.add_argument("-O", "--overwrite", action="store_true", help="replace files")
 
 
 def add_print_flags(parser: argparse.ArgumentParser) -> None:
@@ -92,14 +98,13 @@ def run(args: argparse.Namespace) -> int:
     from startrack.calibration import calibrate
     from startrack.calibration.record import refusal_dict
     from startrack.catalog import load_catalog
-    from startrack.output import write_json
 
     if args.time is not None and len(args.images) > 1:
         args.usage_error("--time is the time of one image; give each of several its own in a sidecar NAME.json")
     check_name(args)
     known_sensor = _known_sensor(args)
     flag_site(args)  # wrong usage is reported before the images are read
-    out = output_path(args, "camera.toml")
+    out = check_camera_output(args)
     exposures = [read(path, args) for path in args.images]
     announce_compilation()
     start = approximate_camera(args, exposures)
@@ -117,9 +122,9 @@ def run(args: argparse.Namespace) -> int:
             )
         except NoSolution as cause:
             record = refusal_dict(cause.reason, str(cause))
-            write_json(out.with_suffix(".calibration.json"), record)
+            write_record(out, record)
             return print_outcome(args, record, f"{out.name}  refused {cause.reason}: {cause}")
-    return _write_calibration(args, out, found)
+    return _write_calibration(args, out, found, [one.mask for one in exposures])
 
 
 def check_name(args: argparse.Namespace) -> None:
@@ -154,49 +159,26 @@ def checked_flag(args: argparse.Namespace, key: Key, value: Any, flag: str) -> A
         args.usage_error(str(cause))
 
 
-def _write_calibration(args: argparse.Namespace, out: Path, found: Calibration) -> int:
-    """Write and print a calibration; the exit code."""
+def _write_calibration(args: argparse.Namespace, out: Path, found: Calibration, masks: list[str | Mask | None]) -> int:
+    """Write and print a calibration of images with `masks`; the exit code."""
     from startrack.calibration.record import calibration_dict, summary
     from startrack.calibration.report import write_report
-    from startrack.camera import save_camera
-    from startrack.files import write_atomically
-    from startrack.output import write_json
 
     record, line = calibration_dict(found), summary(found, out.name)
     line += f"\n  {record['message']}" if record["message"] else ""
     if found.accepted:
-        save_camera(found.camera, out)
-        if found.obstructed is not None:
-            line += f"\n  {_write_proposed_mask(out, found.obstructed)}"
-    write_json(out.with_suffix(".calibration.json"), record)
-    hot = found.photometry.properties.hot_px
-    if hot is not None:
-        lines = ["x_px,y_px", *(f"{x:.0f},{y:.0f}" for x, y in hot)]
-        write_atomically(out.with_suffix(".hot-pixels.csv"), ("\n".join(lines) + "\n").encode(), overwrite=True)
-    if not args.no_plots:
-        write_report(out, found)
+        about_mask = write_camera(out, found, [found.camera.mask, *masks])
+        line += f"\n  {about_mask}" if about_mask else ""
+    write_record(out, record)
+    about_picture = "" if args.no_plots else write_report(out, found)
     if not args.quiet:
+        if about_picture:
+            print(about_picture, file=sys.stderr, flush=True)
         for one in found.refused:
             print(f"{one.name}: left out, {one.reason}: {one.message}", file=sys.stderr, flush=True)
     if args.verbose:
         line += "".join(f"\n  {note}" for note in found.photometry.notes)
     return print_outcome(args, record, line)
-
-
-def _write_proposed_mask(camera_file: Path, obstructed: Bools) -> str:
-    """Write CAMERA.mask.png beside the camera file; the line that explains its use."""
-    import numpy as np
-
-    from startrack.exposure import write_exposure
-    from startrack.types import Exposure
-
-    path = camera_file.with_suffix(".mask.png")
-    pixels = np.where(obstructed, 0.0, 255.0).astype(np.float32)
-    write_exposure(path, Exposure(pixels_adu=pixels, saturation_adu=255.0), overwrite=True)
-    return (
-        f"{path.name}: {100 * obstructed.mean():.1f} % of the pixels are in places that never show a star; it is not "
-        f'used unless {camera_file.name} has the line mask = "{path.name}" above its first [table]'
-    )
 
 
 def print_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) -> int:
@@ -208,11 +190,6 @@ def print_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) -
     if not args.json:
         print_advice(record["reason"], record["message"], args)
     return exit_code_of(record["reason"])
-
-
-def output_path(args: argparse.Namespace, default: str) -> Path:
-    """Path of the result; its folder is made. Raises BadOutput if that is impossible."""
-    return check_output(args.output or Path(args.dir) / default, overwrite=True)
 
 
 def approximate_camera(args: argparse.Namespace, exposures: list[Exposure]) -> Camera | None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from startrack.cli.calibrate import add_camera_output_flags, check_name, output_path, print_outcome, show_steps
+from startrack.cli.calibrate import add_camera_output_flags, check_name, print_outcome, show_steps
+from startrack.cli.calibration_files import check_camera_output, remove_former, write_record
 from startrack.cli.common import read
 from startrack.cli.flag_types import number
 from startrack.errors import NoSolution
@@ -34,9 +35,7 @@ def run(args: argparse.Namespace) -> int:
     """Calibrate with the board; the exit code."""
     from startrack.calibration.board import board_dict, board_line, calibrate_board
     from startrack.calibration.board_pose import Board
-    from startrack.camera.io import camera_text
-    from startrack.files import write_atomically
-    from startrack.output import write_json
+    from startrack.camera import save_camera
 
     try:
         columns, rows = (int(n) for n in (args.pattern or "").lower().split("x"))
@@ -45,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     if min(columns, rows) < MIN_SIDE or max(columns, rows) > MAX_SIDE:
         args.usage_error(f"--pattern {args.pattern}: a board has {MIN_SIDE} to {MAX_SIDE} corners or squares a side")
     check_name(args)
-    out = output_path(args, "camera.toml")
+    out = check_camera_output(args)
     exposures = [read(path, args) for path in args.images]
     with show_steps(args, len(exposures) + 1) as show_step:
         try:
@@ -56,8 +55,9 @@ def run(args: argparse.Namespace) -> int:
             return print_outcome(args, record, f"{out.name}  refused {cause.reason}: {cause}")
     record = board_dict(found)
     if found.accepted:
-        write_atomically(out, camera_text(found.camera).encode("utf-8"), overwrite=True)
-    write_json(out.with_suffix(".calibration.json"), record)
+        save_camera(found.camera, out)
+        remove_former(out, [one.mask for one in exposures])
+    write_record(out, record)
     line = board_line(found, out.name) + (f"\n  {record['message']}" if record["message"] else "")
     return print_outcome(args, record, line)
 

@@ -11,14 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from startrack.cli.calibrate import (
+    add_overwrite_flag,
     add_print_flags,
     add_site_flags,
     check_name,
-    output_path,
     print_outcome,
     show_steps,
     site_of,
 )
+from startrack.cli.calibration_files import has_site, output_path
 from startrack.cli.common import DEFAULT_OUT, read
 from startrack.cli.flag_types import calibrated_angle_rad
 from startrack.errors import BadInput, NoSolution
@@ -29,7 +30,10 @@ DEFAULT_NAMES = {"colmap": "cameras.txt", "kalibr": "camchain.yaml"}  # of the o
 
 def add_parsers(subparsers: Any) -> None:
     """Add the actions to the commands of the `startrack` parser."""
-    verify = _add_action(subparsers, "verify", "Check whether a camera file still fits exposures of the stars.")
+    verify = _add_action(
+        subparsers, "verify", "Check whether a camera file still fits exposures of the stars. If the file was "
+        "calibrated with --site, verify needs --site too.",
+    )  # fmt: skip
     verify.add_argument("images", nargs="+", metavar="IMAGE", help="PNG, TIFF, FITS, JPEG or camera raw")
     verify.add_argument("-c", "--camera", metavar="FILE", help="camera file (default: the one that the image names)")
     add_site_flags(verify)
@@ -50,6 +54,7 @@ def add_parsers(subparsers: Any) -> None:
     convert.add_argument("-o", "--output", metavar="FILE", help="what to write (default: a file in OUT)")
     convert.add_argument("--name", help="name of the camera (default: the one in the file, else its stem)")
     convert.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the results (%(default)s)")
+    add_overwrite_flag(convert)
     convert.set_defaults(run=run_convert)
 
 
@@ -100,7 +105,7 @@ def run_convert(args: argparse.Namespace) -> int:
             )
             print(f"{args.file}: {warning}; give --calibrated-angle", file=sys.stderr)
     out = output_path(args, default)
-    write_atomically(out, text.encode("utf-8"), overwrite=True)
+    write_atomically(out, text.encode("utf-8"), overwrite=args.overwrite)
     if not args.quiet:
         print(f"{out}{note}")
     return 0
@@ -111,6 +116,7 @@ def run_verify(args: argparse.Namespace) -> int:
     from startrack.calibration.verify import verify, verify_dict, verify_line
     from startrack.camera import load_camera
     from startrack.catalog import load_catalog
+    from startrack.files import resolve_named
 
     worst = 0
     for path in args.images:
@@ -121,7 +127,9 @@ def run_verify(args: argparse.Namespace) -> int:
         with show_steps(args, 1) as show_step:
             try:
                 show_step(f"verifying with {exposure.name}")
-                found = verify(exposure, load_camera(named), load_catalog(), site_of(args, [exposure]))
+                camera, site = load_camera(named), site_of(args, [exposure])
+                known = has_site(resolve_named(named, "calib", "no_calibration"))
+                found = verify(exposure, camera, load_catalog(), site, file_has_site=known)
             except NoSolution as cause:
                 record = {"image": exposure.name, "status": "refused", "reason": cause.reason, "message": str(cause),
                           "advice": cause.reason.advice}  # fmt: skip

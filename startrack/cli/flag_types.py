@@ -10,6 +10,7 @@ from startrack.declaration import LARGEST, SHOWN_CHARS
 MAX_EXPOSURE_S = 1e6  # as startrack.exposure.sidecar has it; written here so that help is quick
 MAX_COUNT = 1_000_000
 MAX_MAGNITUDE = 100.0
+GEO_FORMATS = ("geojson", "kml")
 FIELD_TOLERANCE_1 = 0.1  # as startrack.identification.unknown_lens has it; written here so that help is quick
 
 
@@ -115,6 +116,14 @@ def fields_of_view_rad(text: str, narrowest_deg: float, widest_deg: float) -> tu
     count = max(math.ceil(math.log(high / low) / math.log(step)), 1)
     ends = [low * (high / low) ** (k / count) for k in range(count + 1)]
     return tuple(0.5 * (ends[k] + ends[k + 1]) for k in range(count))  # the middle is as far from both ends
+
+
+def geo_formats(text: str) -> list[str]:
+    """Names of GEO_FORMATS with commas between them."""
+    found = text.split(",")
+    if any(one not in GEO_FORMATS for one in found):
+        raise argparse.ArgumentTypeError(f"{text[:SHOWN_CHARS]!r} is not geojson, kml or geojson,kml")
+    return found
 
 
 def position_prior(text: str) -> tuple[float, float, float]:

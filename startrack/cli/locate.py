@@ -16,6 +16,7 @@ from startrack.cli.common import (
     result_path,
     run_images,
 )
+from startrack.cli.flag_types import geo_formats
 from startrack.cli.preparation import prepare_reference
 
 if TYPE_CHECKING:
@@ -37,8 +38,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file, or the name of a shipped one")
     add_localizer_flags(parser)
     parser.add_argument(
-        "--format", action="append", choices=("geojson", "kml"), default=[],
-        help="write NAME.geojson or NAME.kml too: position, 95 %% circle, attitude; may be given twice",
+        "--format", type=geo_formats, action="extend", metavar="geojson[,kml]", default=[],
+        help="write NAME.geojson, NAME.kml or both too: position, 95 %% circle, attitude",
     )  # fmt: skip
     parser.add_argument("--fov", metavar="DEG", help=argparse.SUPPRESS)  # a flag of identify and calibrate
     parser.set_defaults(run=run, usage_error=parser.error)

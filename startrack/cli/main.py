@@ -41,6 +41,21 @@ rover navigation     startrack locate sample_images/near-wall.png    where is th
 all-sky cameras      startrack calibrate NIGHT.jpg... --fov 180      the lens; then startrack horizon: the skyline
 star identification  startrack identify SKY.png --fov 60             which stars are these? no camera file is needed"""
 
+START_OF = {  # of the commands with actions
+    "calibrate": """usage: startrack calibrate [ACTION] ... (startrack calibrate --help lists the flags of each action)
+
+from stars       startrack calibrate NIGHT.jpg... --fov 180 -o CAMERA.toml   the lens, from pictures of the night sky
+from a board     startrack calibrate board BOARD.png... --pattern 9x6        the lens, from pictures of a chessboard
+check            startrack calibrate verify LATER.jpg -c CAMERA.toml         does the camera file still fit?
+look             startrack calibrate show CAMERA.toml                        the content of a camera file
+other programs   startrack calibrate convert CAMERA.toml --to ros            ros, kalibr, colmap, opencv; --from too""",
+    "terrain": """usage: startrack terrain ACTION ... (startrack terrain ACTION --help)
+
+look             startrack terrain show shackleton --at 0 0                  properties, relief, a horizon
+your own map     startrack terrain import MAP.tif -o NAME.toml --latitude DEG --longitude DEG
+prepare          startrack terrain build NAME.toml                           its horizons, before the first fix""",
+}
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
@@ -52,6 +67,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         words = _joined_action(sys.argv[1:] if argv is None else argv)
         if words and not words[0].startswith("-") and words[0].split()[0] not in COMMANDS:
             parser.error(f"no command is called {words[0]!r}; there are: {', '.join(COMMANDS)}")
+        if len(words) == 1 and words[0] in START_OF:
+            print(START_OF[words[0]])
+            return USAGE
         args = parser.parse_args(words)
         if not args.command:
             print(START)
@@ -69,7 +87,7 @@ def _run(args: argparse.Namespace) -> int:
         sys.stdout.flush()  # here, where a closed pipe is distinguished from an error
         return code
     except BadOutput as cause:
-        print(f"startrack {args.command}: error: {cause}", file=sys.stderr)
+        print(f"startrack {args.command}: error: {cause.command_message}", file=sys.stderr)
         return USAGE
     except BadInput as cause:
         return _report_refusal(cause, BAD_INPUT, args)

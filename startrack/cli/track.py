@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,7 @@ def _add_live(group: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Estimate and write the track; the exit code of its worst image."""
     _check_flags(args)
+    _check_frames(args)
     from startrack.pipeline import Settings
     from startrack.tracking.frame_store import FrameStore
     from startrack.tracking.session import TrackSession
@@ -77,9 +79,21 @@ def _check_flags(args: argparse.Namespace) -> None:
     if args.time is not None:
         args.usage_error("--time is that of one image: the images of a track have their times in sidecars or headers")
     if args.follow and (len(args.frames) != 1 or not Path(args.frames[0]).is_dir()):
-        args.usage_error("--follow takes one folder")
+        args.usage_error(f"--follow takes one folder, into which images are written: {args.frames[0]} is no folder")
     if args.until_idle is not None and not args.follow:
         args.usage_error("--until-idle is for --follow")
+
+
+def _check_frames(args: argparse.Namespace) -> None:
+    """Raises BadInput (bad_image) where no path of FRAMES exists; one missing image of several is refused later."""
+    from startrack.errors import BadInput
+    from startrack.files import printable
+
+    if not any(os.path.exists(path) for path in args.frames):
+        raise BadInput(
+            "bad_image", f"{printable(args.frames[0])}: no such file or folder: give images, one folder of images, or "
+            "one ROS bag",
+        )  # fmt: skip
 
 
 def _check_folder(args: argparse.Namespace) -> None:

@@ -8,6 +8,7 @@ from datetime import datetime
 
 import numpy as np
 
+from startrack.calibration.below_horizon import LOWEST_STAR_RAD, MOST_BELOW_PART, is_below_horizon
 from startrack.calibration.frame import Sky, frame_of, pressure_hpa, require_body, require_time, sky_at
 from startrack.calibration.region_growing import JointFit, fit_frames
 from startrack.camera import Camera
@@ -19,8 +20,6 @@ from startrack.pipeline import identify, identify_blind
 from startrack.stages import Oriented, Refused
 from startrack.types import Array, Body, Detections, Exposure, Ints
 
-LOWEST_STAR_RAD = np.radians(-3.0)  # true elevation; refraction lifts a star at -0.5 degrees to the horizon
-MOST_BELOW_PART = 0.01  # of the identified stars; right sites: 0; a wrong sign of latitude or longitude: 0.4 and 0.5
 CIRCLE_FROM_RAD = np.radians(100.0)  # from here up a field of view is that of the image circle
 
 
@@ -101,8 +100,8 @@ def _identify(
 
 def _require_above_horizon(one: Oriented, site: Site) -> None:
     """Raises BadInput (inconsistent_evidence) where identified stars are below the horizon of the `site`."""
-    rays = one.stars.rays_icrs[one.identification.star] @ R_enu_icrs(site, require_time(one.exposure)).T
-    below = int(np.sum(azel_from_rays(rays)[1] < LOWEST_STAR_RAD))
+    rays = one.stars.rays_icrs[one.identification.star]
+    below = int(np.count_nonzero(is_below_horizon(rays, site, require_time(one.exposure))))
     if below > MOST_BELOW_PART * len(rays):
         raise BadInput(
             "inconsistent_evidence",

@@ -13,6 +13,7 @@ import numpy as np
 from startrack import __version__
 from startrack.errors import BadOutput
 from startrack.frames import format_utc
+from startrack.lengths import length_text
 from startrack.output.quantities_prediction import FILTERED, FORMAT, SHARES_M, SMOOTHED
 from startrack.prediction.along_path import with_odometry
 from startrack.prediction.draws import Conditions
@@ -126,8 +127,7 @@ class Report:
     def lines(self) -> list[str]:
         """The summary in words."""
         found, what = summarized(self.cells), "area" if self.points.kind == "area" else "path"
-        median = found["median_radius95_m"]
-        radius = "no position at half of the places" if median is None else f"median 95 % radius {median:.3g} m"
+        radius = _median_text(found["median_radius95_m"])
         shares = ", ".join(f"{100 * found[f'share_below_{bound}_m']:.0f} % below {bound} m" for bound in SHARES_M)
         lines = [
             f"{self.terrain.name}: {len(self.points.position_m)} places, {radius}; of the {what} {shares}",
@@ -195,14 +195,20 @@ def _depth_line(depth: dict[str, Any]) -> str:
     return f"{wanted}: {depth['exposure_s']:.3g} s, limiting magnitude V {depth['limiting_v_mag']:.1f}"
 
 
+def _median_text(radius95_m: float | None) -> str:
+    if radius95_m is None:
+        return "no position at half of the places"
+    return f"median 95 % radius {length_text(radius95_m, 3)}"
+
+
 def _odometry_line(found: dict[str, Any]) -> str:
     radii = [found[f"median_{name}"] for name in (FILTERED, SMOOTHED)]
     if None in radii:
         return "with odometry: no position at half of the places"
-    return f"with odometry: median 95 % radius {radii[0]:.3g} m at each place, {radii[1]:.3g} m by all images"
+    filtered, smoothed = (length_text(one, 3) for one in radii)
+    return f"with odometry: median 95 % radius {filtered} at each place, {smoothed} by all images"
 
 
 def _variant_line(one: dict[str, Any]) -> str:
-    median = one["summary"]["median_radius95_m"]
-    radius = "no position at half of the places" if median is None else f"median 95 % radius {median:.3g} m"
+    radius = _median_text(one["summary"]["median_radius95_m"])
     return f"{one['camera']}, {one['exposure_s']:.3g} s (V {one['limiting_v_mag']:.1f}): {radius}"

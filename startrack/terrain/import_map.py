@@ -11,6 +11,7 @@ import numpy as np
 
 from startrack.errors import BadOutput
 from startrack.files import check_output
+from startrack.lengths import length_text
 from startrack.terrain.geotiff import write_map
 from startrack.terrain.map_comparison import crest_angle_rad_per_m
 from startrack.terrain.map_error import carried_spacing, error_between_posts_m
@@ -124,9 +125,10 @@ def smoothness_warnings(rim: Raster, height_sigma_m: float) -> list[str]:
         return []
     error_m = error_between_posts_m(rim, spacing)
     return [
-        f"{rim.source or 'the map'} looks interpolated or smoothed: posts are {rim.post_m:.3g} m apart, but its ground "
-        f"is that of posts {spacing * rim.post_m:.2g} m apart, with errors of about {error_m:.2g} m (height_sigma_m is "
-        f"{height_sigma_m:.2g} m); give the map it was made from, or a known error"
+        f"{rim.source or 'the map'} looks interpolated or smoothed: posts are {length_text(rim.post_m, 3)} apart, but "
+        f"its ground is that of posts {length_text(spacing * rim.post_m)} apart, with errors of about "
+        f"{length_text(error_m)} (height_sigma_m is {length_text(height_sigma_m)}); give the map it was made "
+        "from, or a known error"
     ]
 
 

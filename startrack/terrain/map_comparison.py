@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from startrack.frames import Site
+from startrack.lengths import length_text
 from startrack.terrain.height_map import COMMON_PER_POST, HeightMap
 from startrack.terrain.raster import Raster
 from startrack.types import Array, BadInput
@@ -63,8 +64,9 @@ class MapComparison:
             f"{self.crest_sigma_m:.1f} m between the crests of one)"
         )
         return (
-            f"compared with {self.finer} (posts {self.finer_post_m:.3g} m apart) over {self.across_m / 1000:.1f} km: "
-            f"heights {self.height_bias_m:+.1f} m, s.d. {self.height_sigma_m:.1f} m; {crests}"
+            f"compared with {self.finer} (posts {length_text(self.finer_post_m, 3)} apart) over "
+            f"{self.across_m / 1000:.1f} km: heights {self.height_bias_m:+.1f} m, "
+            f"s.d. {self.height_sigma_m:.1f} m; {crests}"
         )
 
 

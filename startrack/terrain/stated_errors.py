@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from startrack.files import data_dir
+from startrack.lengths import length_text
 from startrack.terrain.map_comparison import MapComparison, compare_with_finest
 from startrack.terrain.map_error import error_between_posts_m
 from startrack.terrain.raster import Raster
@@ -31,8 +32,8 @@ class StatedErrors:
         text = f"{self.comment}."
         if self.common_crest_sigma_m is not None:
             text += (
-                f" horizon_sigma_deg: crests wrong by {self.common_crest_sigma_m:.2g} m all around, at their median "
-                "distance; at least three times the error of heights, as at the sharp rim of Shackleton."
+                f" horizon_sigma_deg: crests wrong by {length_text(self.common_crest_sigma_m)} all around, at their "
+                "median distance; at least three times the error of heights, as at the sharp rim of Shackleton."
             )
         return textwrap.fill(text, COMMENT_CHARS, initial_indent="# ", subsequent_indent="# ") + "\n"
 
@@ -71,6 +72,7 @@ def _other_ground_warnings(rim: Raster, comparison: MapComparison | None) -> tup
     if comparison is None:
         return ()
     return (
-        f"{rim.source} differs from {comparison.finer} by {comparison.height_sigma_m:.3g} m (s.d.) where both are, "
-        f"and heights vary there by {comparison.heights_sigma_m:.3g} m: is its projection or its scale wrong?",
+        f"{rim.source} differs from {comparison.finer} by {length_text(comparison.height_sigma_m, 3)} (s.d.) "
+        f"where both are, and heights vary there by {length_text(comparison.heights_sigma_m, 3)}: is its projection or "
+        "its scale wrong?",
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.lengths import length_text
 from startrack.output.picture.annotate import draw_legend_sample
 from startrack.output.picture.canvas import DIM_INK, INK, POSITION, SKY_BLUE, Box, Canvas, Colour, wrap_text
 from startrack.output.picture.maps import MapView, draw_overview
@@ -74,10 +75,10 @@ def _facts(track: Track) -> list[str]:
         east_m, north_m, _ = track.smoothed.position_enu_m[known[-1]]
         lines += [
             f"last position: E {east_m:.1f} m  N {north_m:.1f} m",
-            f"95 % within {radius_m[known[-1]]:.2g} m of it",
+            f"95 % within {length_text(radius_m[known[-1]])} of it",
         ]
     if len(known) > 1 and not track.at_rest:
-        lines.append(f"95 % radius of all, smoothed: median {np.median(radius_m[known]):.2g} m")
+        lines.append(f"95 % radius of all, smoothed: median {length_text(float(np.median(radius_m[known])))}")
     if track.slipped.any():
         lines.append(f"slips of the odometry: {np.count_nonzero(track.slipped)}")
     return lines

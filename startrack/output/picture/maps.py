@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from startrack.attitude import AttitudeFit
+from startrack.lengths import length_text
 from startrack.output.picture.canvas import (
     DIM_INK,
     FAINT_INK,
@@ -126,7 +127,7 @@ def draw_zoom(canvas: Canvas, box: Box, fix: Fix, truth: ArrayLike | None) -> Ma
     if truth is not None and bool(np.all(np.abs(np.subtract(truth, position)) < view.half_m)):
         window.plus(view.canvas_px(truth), 9.0, TRUTH, 2)
         canvas.label(view.canvas_px(truth), "truth", CAPTION_SIZE, TRUTH, 14.0, box)
-    draw_frame(canvas, view, f"95 % within {fix.radius95_m:.3g} m")
+    draw_frame(canvas, view, f"95 % within {length_text(fix.radius95_m, 3)}")
     return view
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.lengths import length_text
 from startrack.output.picture.canvas import (
     BLUISH_GREEN,
     DIM_INK,
@@ -96,7 +97,7 @@ def comparison_picture(variants: Sequence[dict[str, Any]], title: str) -> NDArra
             canvas.line(points, colour, 3)
         for point, (exposure, radius) in zip(points, own, strict=True):
             canvas.circle(point, 6.0, colour, -1)
-            canvas.label(point, f"{exposure:.3g} s: {radius:.3g} m", CAPTION_PX, INK, 14.0, BOX)
+            canvas.label(point, f"{exposure:.3g} s: {length_text(radius, 3)}", CAPTION_PX, INK, 14.0, BOX)
         canvas.text((BOX[2] - 12.0, BOX[1] + 12.0 + 24.0 * k), camera, TEXT_PX, colour, "rt", halo=True)
     return canvas.rendered_pixels()
 

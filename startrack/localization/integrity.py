@@ -39,7 +39,8 @@ CHUNK = 100  # points at which all rows are summed at once
 MOST_CHI2 = 30.0  # of a separation (two coordinates); of 540 true positions of simulated stars the largest was 27
 NEGLIGIBLE_SIGMAS = 0.7  # of the fix, added to the error of a separation: smaller ones are in its circle anyway
 LEAST_PART = 1e-9  # of the covariance, added so that one on a single point of a grid can be inverted
-MARGIN_M = 2.0  # of the neighbourhood beyond the grid
+MARGIN_1, MARGIN_M = 1.02, 2.0  # of the neighbourhood beyond the grid; a grid with closer points has a wider rim
+WIDER = 1.5  # in these, up to which a neighbourhood made for a larger grid serves
 CARRIED_PART = 0.5  # of the information, by the groups that are named
 
 
@@ -150,14 +151,21 @@ class _GridScores:
 
     def __call__(self, centre_m: Array, offsets_m: Array, exact: bool = False) -> Array:
         """Contributions (n, sectors) at offsets (n, 2) from a position (2,); horizons are interpolated or `exact`."""
-        half_m = float(np.abs(offsets_m).max()) + MARGIN_M
+        reach_m = float(np.abs(offsets_m).max())
         local = self._local
-        if local is None or local.half_m != half_m or (local.centre_m != centre_m).any():
+        if local is None or not self._serves(local, centre_m, reach_m):
+            half_m = MARGIN_1 * reach_m + MARGIN_M
             local = self._local = self.likelihood.near(centre_m, half_m, across=NODES)
         local = local if exact else local.interpolated()
         points = centre_m + offsets_m
         parts = [local.sums_by_sector(points[k : k + CHUNK]) for k in range(0, len(points), CHUNK)]
         return self.likelihood.sectors.by_sector(np.concatenate(parts))
+
+    @staticmethod
+    def _serves(local: LocalLikelihood, centre_m: Array, reach_m: float) -> bool:
+        """Whether a neighbourhood holds a grid, and has nodes about as close as its own would have."""
+        needed_m = float(np.abs(centre_m - local.centre_m).max()) + reach_m
+        return needed_m <= local.half_m <= WIDER * (reach_m + MARGIN_M)
 
 
 def _moments(offsets_m: Array, log: Array) -> tuple[Array, Array]:

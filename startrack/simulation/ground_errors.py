@@ -36,11 +36,11 @@ class ErringGround(ForwardingTerrain):
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:  # type: ignore[override]
         """Horizon elevation (..., n) [rad] seen from one point (1, 2) at azimuths (n,)."""
-        horizon = np.asarray(self.whole.horizon_rad(points_m, azimuths_rad)) + self._shared_rad
         if self.whole.height_sigma_m == 0.0:
-            return horizon
+            return np.asarray(self.whole.horizon_rad(points_m, azimuths_rad)) + self._shared_rad
         posts = self.whole.horizon_posts(np.reshape(points_m, 2), azimuths_rad)
-        return np.asarray(horizon + np.sum(posts.rad_per_m * self._errors_m(posts.post), axis=1))
+        by_post = np.sum(posts.rad_per_m * self._errors_m(posts.post), axis=1)
+        return np.asarray(posts.horizon_rad + self._shared_rad + by_post)
 
     def _errors_m(self, posts: Ints) -> Array:
         """Errors of the heights of posts (n, 4) [m]: each is drawn when its post is first seen."""

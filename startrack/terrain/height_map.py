@@ -247,14 +247,14 @@ class HeightMap(Terrain):
         away = distance[:, None] * np.stack([np.sin(azimuths_rad), np.cos(azimuths_rad)], axis=1)
         up = float(self.ground_m(point_m)) + self.camera_height_m + tan * distance
         post, weight = cell_posts(self.site, self.maps, np.column_stack([point_m + away, up]))
-        return HorizonPosts(post, weight / ((1.0 + tan * tan) * distance)[:, None])
+        return HorizonPosts(post, weight / ((1.0 + tan * tan) * distance)[:, None], np.arctan(tan))
 
     def ground_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
         """The posts about a camera at `point_m`; see `Terrain`."""
         tan, distance, _ = self.horizons(point_m, azimuths_rad)
         post, weight = cell_posts(self.site, self.maps, np.append(point_m, self.ground_m(point_m))[None])
         return HorizonPosts(
-            np.repeat(post, len(tan), axis=0), -weight / ((1.0 + tan * tan) * distance)[:, None]
+            np.repeat(post, len(tan), axis=0), -weight / ((1.0 + tan * tan) * distance)[:, None], np.arctan(tan)
         )  # fmt: skip
 
     def post_positions_m(self, posts: Ints) -> Array:

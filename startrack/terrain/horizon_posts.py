@@ -20,11 +20,12 @@ class HorizonPosts:
 
     post: Ints  # (n, 4); NO_POST where no map reaches
     rad_per_m: Array  # (n, 4) rise of the horizon with the height of each
+    horizon_rad: Array  # (n,) of the map; NaN of ground without posts
 
     @classmethod
     def create_empty(cls, rays: int) -> HorizonPosts:
         """Of ground without posts."""
-        return cls(np.full((rays, 4), NO_POST), np.zeros((rays, 4)))
+        return cls(np.full((rays, 4), NO_POST), np.zeros((rays, 4)), np.full(rays, np.nan))
 
 
 def cell_posts(site: Site, maps: tuple[Raster, ...], points_enu_m: Array) -> tuple[Ints, Array]:

@@ -13,7 +13,7 @@ FIX = {
     "reason": None,
     "position": {"east_m": 424.1605, "north_m": -320.7067, "up_m": 1.5},
     "timing_ms": {"detect": 698.2},
-    "provenance": {"version": "0.1.0", "camera": "/tmp/old/frames/camera.toml"},
+    "provenance": {"version": "0.1.0", "camera": "/old/frames/camera.toml"},
     "matches": [{"hip": 1, "x_px": 10.25}, {"hip": 2, "x_px": 20.5}],
 }
 STARS = """# %ECSV 1.0

@@ -31,7 +31,7 @@ def check_camera_output(args: argparse.Namespace) -> Path:
     Without -O nothing is replaced but the record and the report of a calibration that was refused.
     """
     out = output_path(args, "camera.toml")
-    replaceable = args.overwrite or _is_refusal(out.with_suffix(RECORD))
+    replaceable = args.overwrite or _recorded(out, "status") == "refused"
     for suffix in (RECORD, *REPORTS):
         check_output(out.with_suffix(suffix), overwrite=replaceable)
     for suffix in (MASK, HOT_PIXELS):
@@ -39,23 +39,23 @@ def check_camera_output(args: argparse.Namespace) -> Path:
     return out
 
 
-def _is_refusal(record: Path) -> bool:
-    """Whether the `record` is of a calibration that was refused."""
-    try:
-        return bool(json.loads(record.read_text(encoding="utf-8"))["status"] == "refused")
-    except (OSError, ValueError, RecursionError, KeyError, TypeError):  # none; not ours
-        return False
-
-
 def has_site(camera_file: Path) -> bool | None:
     """Whether the record beside a camera file states a site on the Earth; None where no record states that."""
     from startrack.calibration.record import REFRACTION_REMOVED
 
+    refraction = _recorded(camera_file, "lens", "refraction")
+    return None if refraction is None else bool(refraction == REFRACTION_REMOVED)
+
+
+def _recorded(camera_file: Path, *keys: str) -> Any:
+    """The value in the record beside a camera file; None without a record, or in one of another kind."""
     try:
-        lens = json.loads(camera_file.with_suffix(RECORD).read_text(encoding="utf-8"))["lens"]
-        return bool(lens["refraction"] == REFRACTION_REMOVED)
-    except (OSError, ValueError, RecursionError, KeyError, TypeError):  # none; of a refusal; not ours
+        found = json.loads(camera_file.with_suffix(RECORD).read_text(encoding="utf-8"))
+        for key in keys:
+            found = found[key]
+    except (OSError, ValueError, RecursionError, KeyError, TypeError):
         return None
+    return found
 
 
 def write_record(camera_file: Path, record: dict[str, Any]) -> None:

@@ -40,7 +40,7 @@ MOST_CHI2 = 30.0  # of a separation (two coordinates); of 540 true positions of 
 NEGLIGIBLE_SIGMAS = 0.7  # of the fix, added to the error of a separation: smaller ones are in its circle anyway
 LEAST_PART = 1e-9  # of the covariance, added so that one on a single point of a grid can be inverted
 MARGIN_1, MARGIN_M = 1.02, 2.0  # of the neighbourhood beyond the grid; a grid with closer points has a wider rim
-WIDER = 1.5  # in these, up to which a neighbourhood made for a larger grid serves
+WIDER = 1.5  # factor by which a neighbourhood that serves may exceed a grid with its margin
 CARRIED_PART = 0.5  # of the information, by the groups that are named
 
 

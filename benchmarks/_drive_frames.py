@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 from functools import cached_property
 
 import numpy as np
-from _sky_scenes import EXPOSURE_S, camera_for_share
+from _cameras import EXPOSURE_S, camera_for_share
 
 from startrack.catalog import load_catalog
 from startrack.evidence.likelihood_ratio import visibility_llr
@@ -18,8 +18,8 @@ from startrack.rendering import Series, render
 from startrack.stages import Located
 from startrack.terrain import Terrain
 from startrack.terrain.height_map import HeightMap
-from startrack.tracking import ObservedFrame, SharedErrors, observe_frame
-from startrack.tracking.frame_estimate import estimate_frame, first_guess
+from startrack.tracking import ObservedFrame, TrackErrors, observe_frame
+from startrack.tracking.frame_estimate import estimate_frame
 from startrack.types import Array, Evidence
 
 SNR_5_MAG, FAINTEST_MAG = 6.0, 8.6  # of a star with 5 sigma, and of the faintest star used
@@ -42,9 +42,9 @@ class Course:
     uses_sky: bool = False
 
     @cached_property
-    def shared(self) -> SharedErrors:
+    def shared(self) -> TrackErrors:
         """The clock is exact."""
-        return SharedErrors.of(self.stated, None, self.uses_sky)
+        return TrackErrors.of(self.stated, None, self.uses_sky)
 
 
 def frames_by_evidence(course: Course, rng: np.random.Generator) -> Iterator[ObservedFrame]:
@@ -54,8 +54,7 @@ def frames_by_evidence(course: Course, rng: np.random.Generator) -> Iterator[Obs
     for number, (position, when) in enumerate(zip(course.position_m, course.time_utc, strict=True)):
         evidence = simulate_evidence(course, position, when, error_mag, rng)
         at = position + FIRST_ERROR_M * rng.normal(size=2)
-        first = first_guess(course.shared, at, FIRST_SIGMA_M**2 * np.eye(2), course.raised_rad)
-        estimate = estimate_frame(evidence, course.stated, course.shared, *first)
+        estimate = estimate_frame(evidence, course.stated, course.shared, at, FIRST_SIGMA_M**2 * np.eye(2))
         yield ObservedFrame(f"frame-{number:03d}", when, None, (estimate,), evidence)
 
 

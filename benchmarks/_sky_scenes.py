@@ -7,17 +7,13 @@ from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
-from chain import SENSOR
 
-from startrack.camera import Camera, load_camera
-from startrack.rendering.sky import ARCSEC2_PER_SR
+from startrack.camera import Camera
 from startrack.terrain import Cylinder, load_terrain
 from startrack.terrain.height_map import HeightMap
 from startrack.types import Array, Bools
 from terrain import BIAS_RAD, SLOPE_ERROR_RAD, SLOPE_RAD, replace_settings
 
-EXPOSURE_S, BACKGROUND_E = 10.0, 100.0
-SKYLINE_ANGLE_RAD = np.radians(75.0)  # off the axis; here the background is BACKGROUND_E and the share is exact
 RIM_ANGLE_RAD = np.radians(80.0)  # off the axis; here the lens has the stated error
 RIM_WAVES = np.arange(1, 9)  # around the crater
 LENS_WAVES = np.array([2, 3, 4])  # around the image; one wave is a shift of the centre, which the attitude absorbs
@@ -64,16 +60,6 @@ class BentCamera(Camera):
 
     def unproject(self, px: Array) -> Array:
         return super().unproject(px - self.bend(px))
-
-
-def camera_for_share(share: float) -> tuple[Camera, float | None]:
-    """A camera with BACKGROUND_E near the skyline, and the sky [V mag/arcsec2] that is the `share` of it."""
-    camera = load_camera("fisheye-2048")
-    camera = replace(camera, sensor=replace(SENSOR, dark_e_per_s=(1.0 - share) * BACKGROUND_E / EXPOSURE_S))
-    if share == 0:
-        return camera, None
-    arcsec2 = float(camera.pixel_solid_angle_sr(np.array(SKYLINE_ANGLE_RAD))) * ARCSEC2_PER_SR
-    return camera, float(-2.5 * np.log10(share * BACKGROUND_E / EXPOSURE_S / (SENSOR.zero_point_e_per_s * arcsec2)))
 
 
 def random_wave(waves: Array, rng: np.random.Generator) -> Wave:

@@ -15,6 +15,7 @@ from _sky_hazards import dust, mast, second_skyline, vignetting
 from _sky_view import Hazard, Rng, View, draw
 
 from startrack.camera import Camera
+from startrack.frames import R_from_rotvec
 from startrack.rendering import Scene
 from startrack.terrain import Cylinder
 from startrack.types import Array
@@ -109,6 +110,25 @@ def ghost(frame: Array, view: View, rng: Rng) -> Array:
     level, _ = dark_level(frame, view)
     way = rng.uniform(1.5, 25) * np.exp(1j * rng.uniform(0, 2 * np.pi))
     return frame + rng.uniform(0.05, 0.3) * (shift(frame, way.real, way.imag) - level)
+
+
+def mirrored_ghost(view: View, rng: Rng) -> Array:
+    """The image mirrored through the frame's centre, of 1 to 5 % of its light."""
+    return view.light_e + draw(0.01, 0.05, rng) * view.light_e[::-1, ::-1]
+
+
+def moved_between(view: View, rng: Rng) -> Array:
+    """Half of the exposure each at two places 100 to 900 m apart."""
+    turn, far_m = rng.uniform(0, 2 * np.pi), draw(100, 900, rng)
+    place_m = view.scene.position_enu_m + far_m * np.array([np.sin(turn), np.cos(turn), 0.0])
+    return 0.5 * (view.light_e + View.of(replace(view.scene, position_enu_m=place_m)).light_e)
+
+
+def turned_between(view: View, rng: Rng) -> Array:
+    """Half of the exposure each with two attitudes, turned by 1 to 90 degrees against each other."""
+    axis = rng.standard_normal(3)
+    turn = R_from_rotvec(np.radians(draw(1, 90, rng)) * axis / np.linalg.norm(axis))
+    return 0.5 * (view.light_e + View.of(replace(view.scene, R_cam_enu=view.scene.R_cam_enu @ turn)).light_e)
 
 
 def shifted_sensor(frame: Array, view: View, rng: Rng) -> Array:
@@ -221,6 +241,9 @@ VIEW_HAZARDS = {
     "rotated by 90 degrees": H(pixels=lambda frame, view, rng: np.rot90(frame, int(rng.integers(1, 4)))),
     "haze": H(pixels=haze),
     "ghost image": H(pixels=ghost),
+    "mirrored ghost": H(light=mirrored_ghost),
+    "moved by 100 to 900 m between two halves": H(light=moved_between),
+    "turned by 1 to 90 degrees between two halves": H(light=turned_between),
     "shifted by 1 to 2 px": H(pixels=shifted_sensor),
     "rows lost in readout": H(pixels=lost_rows),
     "10,000 to 50,000 hot pixels": H(pixels=hot_pixels),

@@ -20,9 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from _cameras import SENSOR
 from _results import table, write_section
 
-from startrack.camera import Sensor, load_camera
+from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.exposure import read_exposure
 from startrack.frames import R_from_quat_xyzw
@@ -37,9 +38,6 @@ from startrack.terrain import Cylinder, load_terrain
 from startrack.types import Evidence, NoSolution
 
 # 10 s reach V 6.0 at 5 sigma in 100 e of background, of which 7 e are sky.
-SENSOR = Sensor(
-    zero_point_e_per_s=4973.0, gain_e_per_adu=0.5, bias_adu=200.0, read_noise_e=3.0, dark_e_per_s=9.3, psf_sigma_px=1.0
-)
 ARCSEC = np.degrees(1.0) * 3600
 
 

@@ -18,9 +18,9 @@ from datetime import timedelta
 
 import numpy as np
 from _drive_frames import Course, draw_course, frames_by_evidence
+from _map_draws import draw_ground
 from _results import table, write_section
 from drives import POST_SIGMA_M, RADIUS_M, RAISED_SIGMA_RAD, SLOPE_RAD, mean_error_and_nees
-from map_errors import draw_ground
 
 from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 from _drive_frames import Course, draw_course, frames_by_evidence, frames_by_pixels
+from _map_draws import draw_ground
 from _results import table, write_section
-from map_errors import draw_ground
 
 from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
@@ -125,7 +125,7 @@ def score_track(case: Case, rng: np.random.Generator, pixels: bool, number: int)
         found["smoothed"] = _score(rest.position_m[-1:], rest.covariance_m2[-1:], course.position_m[:1])
     else:
         late = slice(SETTLED_FRAMES, None)
-        position, covariance = filter_positions(modes, steps, len(course.shared.names), sigma_m)
+        position, covariance = filter_positions(modes, steps, len(course.shared), sigma_m)
         found["filtered"] = _score(position[late], covariance[late], course.position_m[late])
         robust = smooth_robustly(modes, steps, sigma_m).smoothed
         found["smoothed"] = _score(robust.position_m, robust.covariance_m2, course.position_m)

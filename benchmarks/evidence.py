@@ -142,7 +142,7 @@ def _ablations(result: Measured) -> Iterator[tuple[str, Evidence, ExactPosterior
     yield "without crowding", lonely.evidence(), full
     yield "without flux uncertainty", _photometry(result, certain=True).evidence(), full
     plain = _photometry(result, settings=StarEvidence(capped=False))
-    yield "without caps", plain.evidence(), replace(full, sector_epsilon=0.0)
+    yield "without caps", plain.evidence(), full
 
 
 def _list_evidence(photometry: StarPhotometry, threshold: float) -> Evidence:

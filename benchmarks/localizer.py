@@ -40,8 +40,7 @@ def main() -> None:
     cylinder, truth, lists = crater(ASPECT_RATIO), draw_positions(SEED, 0, 0, args.places), thesis_lists(args.places)
     methods: dict[str, tuple[Callable[..., Fix], int]] = {  # and the number of lists
         "pseudo-gradient (Kua 2008)": (PseudoGradient(), args.places),
-        "exact posterior": (ExactPosterior(sector_epsilon=0.0), args.places),
-        "the same, with floors for unmapped obstacles": (ExactPosterior(), args.places),
+        "posterior": (ExactPosterior(), args.places),
     }
     times: dict[str, list[float]] = {name: [] for name in methods}
     errors = {

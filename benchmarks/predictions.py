@@ -15,9 +15,9 @@ import argparse
 from datetime import UTC, datetime
 
 import numpy as np
-from _evidence_hazards import stated_errors
+from _hazard_class import errors_as_stated
+from _map_draws import draw_position
 from _results import table, write_section
-from map_errors import draw_position
 
 import startrack
 from startrack.camera import load_camera
@@ -88,7 +88,7 @@ def error_m(name: str, position_m: Array, seed: int) -> float | None:
     """Horizontal error of the position from one rendered image; None where it is refused or ambiguous."""
     camera, terrain = load_camera(CAMERA), load_terrain(name)
     is_map = isinstance(terrain, HeightMap)
-    ground = stated_errors(terrain, np.random.default_rng([SEED, seed])) if is_map else terrain
+    ground = errors_as_stated(terrain, np.random.default_rng([SEED, seed])) if is_map else terrain
     series = Series(
         camera=camera, terrain=ground, catalog=load_sky_catalog("auto").brighter_than(FAINTEST_V_MAG), seed=seed,
         time_utc=WHEN, east_m=float(position_m[0]), north_m=float(position_m[1]),

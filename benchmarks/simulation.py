@@ -11,9 +11,9 @@ import argparse
 from typing import Any
 
 import numpy as np
+from _cameras import EXPOSURE_S, camera_for_share
+from _map_draws import draw_position
 from _results import table, write_section
-from _sky_scenes import EXPOSURE_S, camera_for_share
-from map_errors import draw_position
 
 from startrack.catalog import load_catalog
 from startrack.localization.integrity import Integrity

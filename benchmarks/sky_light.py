@@ -16,13 +16,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from _cameras import EXPOSURE_S, camera_for_share
 from _results import table, write_section
 from _sky_hazards import HAZARDS
 from _sky_scenes import (
-    EXPOSURE_S,
     SEED,
     bend_camera,
-    camera_for_share,
     degraded_map,
     map_of_floor,
     raised_map,

@@ -24,9 +24,9 @@ from startrack.evidence import (
 from startrack.evidence.star_evidence import filtered_noise_e
 from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
 from startrack.localization import clock_at
-from startrack.stages import Measured, Oriented, Settings, extend
+from startrack.stages import Located, Measured, Oriented, Settings, extend
 from startrack.terrain import Terrain
-from startrack.types import Array, BadInput, Detections, Fix, Ints, Stars
+from startrack.types import Array, BadInput, Detections, Ints, Stars
 
 REMEASURED_PX = 12.0  # stars this near the skyline are measured again
 NEIGHBOURS_PX = 10.0  # and with them the stars up to this distance from them, whose PSFs overlap theirs
@@ -67,7 +67,8 @@ def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -
     if oriented.damage is not None:
         response = measure_response(light)
         light = response.correct(light)
-    clock = clock_at(terrain.site, when, oriented.exposure.time_sigma_s)
+    stated = oriented.exposure.time_sigma_s, oriented.exposure.time_sigma_is_stated
+    clock = clock_at(terrain.site, when, *stated)
     return extend(
         oriented, Measured, terrain=terrain, site=terrain.site, R_enu_icrs=R, clock=clock, light=light,
         response=response, near=settings.near,
@@ -110,34 +111,34 @@ def _shows_deep_stars(light: StarPhotometry, stars: Stars) -> bool:
     return part + SURE_SIGMAS / np.sqrt(information) > LEAST_PART
 
 
-def sky_step_at(measured: Measured, fix: Fix) -> SkyStep | None:
-    """The step of the sky brightness at the terrain's skyline seen from a `fix` found with `measured`.
+def sky_step_at(located: Located) -> SkyStep | None:
+    """The step of the sky brightness at the terrain's skyline seen from the fix of a `located` image.
 
     None if the image does not contain that skyline, or is damaged so that levels of light cannot be compared.
     """
-    if measured.damage is not None and not measured.damage.has_levels:
+    if located.damage is not None and not located.damage.has_levels:
         return None
-    horizon = Skyline.trace(fix.position_enu_m[:2], measured.terrain)
-    return measure_sky_step(measured.detections, measured.camera, measured.R_cam_enu, horizon)
+    horizon = Skyline.trace(located.position_at_time_m, located.terrain)
+    return measure_sky_step(located.detections, located.camera, located.R_cam_enu, horizon)
 
 
-def remeasure_near_skyline(measured: Measured, fix: Fix, step: SkyStep, photometry: StarEvidence) -> Measured:
-    """The stars near the skyline of a `fix` measured again, with the `step` of the sky brightness subtracted.
+def remeasure_near_skyline(measured: Located, step: SkyStep, photometry: StarEvidence) -> Located:
+    """The stars near the skyline of a fix measured again, with the `step` of the sky brightness subtracted.
 
-    `fix` is a position found with `measured`, `photometry` the settings of the measurement.
+    `photometry` has the settings of the measurement.
     """
-    camera, terrain, position_m = measured.camera, measured.terrain, fix.position_enu_m[:2]
+    camera, terrain, position_m = measured.camera, measured.terrain, measured.position_at_time_m
     R = measured.R_cam_enu
     horizon = step.horizon
     detections = subtract_sky_step(measured.detections, camera, R, horizon)
-    axes = np.linalg.cholesky(fix.covariance_m2).T
+    axes = np.linalg.cholesky(measured.fix.covariance_m2).T
     reliable = reliable_azimuths(horizon, [Skyline.trace(position_m + axis, terrain) for axis in axes], camera, R)
     light = measured.light
     azimuth, elevation = light.azimuth_rad, light.elevation_rad
     above_px, is_reliable = height_above_px(azimuth, elevation, camera, R, horizon), reliable(azimuth)
     wanted = (np.abs(above_px) < REMEASURED_PX) & is_reliable
     if measured.blocked is not None:
-        wanted &= ~measured.blocked.hides(azimuth, elevation)
+        wanted &= ~measured.blocked.hides(azimuth)
     around = np.abs(above_px) < REMEASURED_PX + NEIGHBOURS_PX
     # The fix determines the visibility of neighbours better than their faint flux does, except next to the skyline.
     undecided = (np.abs(above_px) < UNDECIDED_PX) | ~is_reliable

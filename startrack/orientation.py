@@ -16,6 +16,7 @@ from startrack.detection import Detector
 from startrack.exposure import are_fractions
 from startrack.frames import Site, observer_velocity_m_s
 from startrack.identification import Identifier
+from startrack.identification.second_field import check_single_field
 from startrack.stages import (
     Detected,
     Identified,
@@ -133,6 +134,12 @@ def solve_orientation(identified: Identified) -> Oriented:
             offset_px = offset_px + fit.centre_shift_px
     moved_px = float(np.linalg.norm(np.subtract(camera.centre_px, identified.camera.centre_px)))
     return extend(identified, Oriented, camera=camera, attitude_fit=fit, centre_shift_px=moved_px)
+
+
+def check_one_attitude(oriented: Oriented) -> None:
+    """Raises NotLocated (inconsistent_evidence) where the sources of `oriented` show a second attitude, too."""
+    known = replace(oriented.identification, R_cam_icrs=oriented.attitude_fit.attitude.R_cam_icrs)
+    check_single_field(oriented.detections, oriented.camera, oriented.stars, known)
 
 
 def _fit_attitude(identified: Identified, camera: Camera) -> AttitudeFit:

@@ -10,26 +10,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.crater_depth import check_depth_by_stars
 from startrack.detection import find_damage
+from startrack.evidence.double_exposure import check_single_skyline
 from startrack.frames import Site
 from startrack.localization import localizer_name
 from startrack.measurement import measure_evidence, remeasure_near_skyline, sky_step_at
 from startrack.orientation import (
     NO_TIME,
     check_inputs,
+    check_one_attitude,
     detect_sources,
     identify_stars,
     identify_unknown_lens,
     solve_orientation,
 )  # fmt: skip
 from startrack.run import Run, with_timing
-from startrack.sky_refinement import check_depth, refine_by_sky_light
+from startrack.sky_refinement import refine_by_sky_light
 from startrack.skyline import measured_skyline
 from startrack.stages import Detected, Inputs, Located, Oriented, Refused, Settings
-from startrack.star_fix import check_by_stars, check_fix, fix_by_stars, fix_unblocked, with_integrity, with_shown_depth
+from startrack.star_fix import fix_position
 from startrack.terrain import Terrain
-from startrack.types import BadInput, Exposure, NoSolution, NotLocated
+from startrack.types import BadInput, Exposure, NoSolution
 
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog
@@ -59,17 +60,15 @@ def locate(
             "identify", identify_stars, detected, camera, catalog, settings.identifier, terrain.site
         )
         oriented = run.run_stage("attitude", solve_orientation, identified)
+        run.time_stage("attitude", check_one_attitude, oriented)
         measured = run.run_stage("evidence", measure_evidence, oriented, terrain, settings)
-        located = run.time_stage("locate", fix_unblocked, measured, Located, settings.localizer)
+        interim = replace(measured.evidence(), is_interim=True)
+        located = run.time_stage("locate", fix_position, measured, Located, settings.localizer, interim)
         step = _sky_step(run, located)
         if step is not None and step.exceeds_noise:
-            measured = run.run_stage(
-                "evidence", remeasure_near_skyline, located, located.fix_at_time, step, settings.evidence
-            )
-            located = run.time_stage("locate", fix_by_stars, measured, Located, settings.localizer)
-        located = run.time_stage("locate", _check_and_refine, located, settings)
-        if located.integrity is None:
-            located = run.time_stage("locate", with_integrity, located)
+            located = run.time_stage("evidence", remeasure_near_skyline, located, step, settings.evidence)
+        run.time_stage("locate", check_single_skyline, located.light, located.terrain, located.position_at_time_m)
+        located = run.time_stage("locate", _with_sky_light, located, settings)
         sky_mag = None if step is None else step.brightness_mag_arcsec2(camera, exposure.exposure_s)
         skyline = run.time_stage("locate", measured_skyline, located)
         return run.finish(replace(located, sky_brightness_mag_arcsec2=sky_mag, skyline=skyline))
@@ -77,37 +76,21 @@ def locate(
         return run.refuse(refusal)
 
 
-def _check_and_refine(located: Located, settings: Settings) -> Located:
-    """The fix, checked, and refined by the light of the sky; of another depth where that and the stars agree."""
-
-    def check(fixed: Located, depth_is_right: bool) -> Located:
-        return _refine_checked(fixed, settings, depth_is_right)
-
-    return with_shown_depth(located, check, Located, settings.localizer)
-
-
-def _refine_checked(located: Located, settings: Settings, depth_is_right: bool) -> Located:
-    """Raises NotLocated where the rays contradict the fix, and, unless `depth_is_right`, OtherDepth."""
-    if settings.evidence_sources == "stars":
-        return check_by_stars(located, depth_is_right)
-    try:
-        check_fix(located)
-    except NotLocated:
-        if not depth_is_right:
-            check_depth(located)
-            check_depth_by_stars(located)
-        raise
-    refined = refine_by_sky_light(located, settings.evidence_sources == "both", depth_is_right)
-    if refined.sky_light is None and not depth_is_right:
-        check_depth_by_stars(located)
-    return refined
+def _with_sky_light(located: Located, settings: Settings) -> Located:
+    """The position by all of the evidence that is asked for."""
+    if settings.evidence_sources != "stars":
+        located = refine_by_sky_light(located, settings.localizer, settings.evidence_sources == "both")
+    if located.sky_light is not None:
+        return located
+    evidence = replace(located.evidence(), support=located.fix.samples)
+    return fix_position(located, Located, settings.localizer, evidence)
 
 
 def _sky_step(run: Run, located: Located) -> SkyStep | None:
     """The step of the sky's light at the skyline; None without one, and where the position is not that of the image."""
-    if located.fix_at_time.ambiguous or located.fix.search == "approximate":
+    if located.fix.ambiguous or located.fix.search == "approximate":
         return None
-    return run.time_stage("evidence", sky_step_at, located, located.fix_at_time)
+    return run.time_stage("evidence", sky_step_at, located)
 
 
 def locate_exposure(exposure: Exposure, settings: Settings | None = None) -> Located | Refused:

@@ -7,7 +7,7 @@ import numpy as np
 from startrack.evidence import Skyline
 from startrack.evidence.sky_levels import SECTORS, sector_of
 from startrack.evidence.sky_light import MIDDLES_RAD, SkyLight
-from startrack.localization import SkylineFit
+from startrack.sky_refinement import raised_by_image
 from startrack.stages import Located
 from startrack.types import Array, Evidence, MeasuredSkyline
 
@@ -30,9 +30,9 @@ def measured_skyline(located: Located) -> MeasuredSkyline | None:
     horizon = Skyline.trace(located.position_at_time_m, located.terrain)
     elevation, sigma = _by_stars(located.evidence(), horizon)
     source = np.where(sigma < MOST_SIGMA_RAD, "stars", "").astype("<U9")
-    if located.sky_light is not None and located.skyline_fit is not None:
-        used = located.skyline_fit.used
-        by_sky, sky_sigma = _by_sky_light(located.sky_light, located.skyline_fit)
+    if located.sky_light is not None and located.sky_used is not None:
+        used = located.sky_used if located.blocked is None else located.sky_used & ~located.blocked.whole
+        by_sky, sky_sigma = _by_sky_light(located, located.sky_light)
         both = used & (sigma < SIMILAR * sky_sigma)
         share = np.zeros(SECTORS)
         share[both] = 1.0 / (1.0 + np.square(sigma[both] / sky_sigma[both]))
@@ -64,10 +64,9 @@ def _by_stars(rows: Evidence, horizon: Skyline) -> tuple[Array, Array]:
     return horizon(MIDDLES_RAD) + mean, np.where(bounded, sigma, np.inf)
 
 
-def _by_sky_light(sky: SkyLight, fit: SkylineFit) -> tuple[Array, Array]:
+def _by_sky_light(located: Located, sky: SkyLight) -> tuple[Array, Array]:
     """Elevation and sigma (SECTORS,) of the skyline by the sky's light, offsets of the image taken out."""
-    image = ~fit.errors.of_terrain
-    terms = fit.errors.raised_px[:, image]
-    shared = np.einsum("ni,ij,nj->n", terms, fit.shared_covariance[np.ix_(image, image)], terms)
-    height = sky.shift_px - fit.raised_px(of_terrain=False)
-    return sky.elevation_rad + height / sky.px_per_rad, np.sqrt(sky.variance_px2 + shared) / sky.px_per_rad
+    errors, variance = located.image_errors, sky.variance_px2 / np.square(sky.px_per_rad)
+    if errors is not None:
+        variance = variance + np.einsum("ni,ij,nj->n", errors.raised_rad, errors.covariance, errors.raised_rad)
+    return sky.elevation_rad + sky.shift_px / sky.px_per_rad - raised_by_image(located), np.sqrt(variance)

@@ -22,27 +22,23 @@ from startrack.errors import Reason
 from startrack.evidence import DamagedResponse, SkyLight, StarEvidence, StarPhotometry
 from startrack.frames import R_from_rotvec, Site
 from startrack.identification import Identifier
-from startrack.localization import (
-    Blocked,
-    ExactPosterior,
-    Integrity,
-    Localizer,
-    SkylineFit,
-    clock_matters,
-    require_localizer,
-)
+from startrack.localization import DEFAULT_LOCALIZER, Localizer, has_posterior, require_localizer
 from startrack.prior import PositionPrior
 from startrack.terrain import Terrain
 from startrack.types import (
     Array,
     Attitude,
+    Blocked,
     Body,
+    Bools,
     Clock,
     Detections,
     Evidence,
     Exposure,
     Fix,
     Identification,
+    ImageErrors,
+    Integrity,
     MeasuredSkyline,
     Stars,
 )  # fmt: skip
@@ -64,7 +60,7 @@ class Settings:
     detector: Detector = field(default_factory=Detector)
     identifier: Identifier = field(default_factory=Identifier)
     evidence: StarEvidence = field(default_factory=StarEvidence)
-    localizer: Localizer = field(default_factory=ExactPosterior)
+    localizer: Localizer = field(default_factory=lambda: require_localizer(DEFAULT_LOCALIZER))
     evidence_sources: str = "both"  # "stars", "sky" (the light of the sky at the skyline) or "both"
     near: PositionPrior | None = None  # of the position; None: anywhere in the search area of the terrain
     deep_stars: bool = True  # use Gaia's stars too, where they are installed and the frame is deeper than Hipparcos
@@ -73,7 +69,7 @@ class Settings:
         object.__setattr__(self, "localizer", require_localizer(self.localizer))
         if self.evidence_sources not in EVIDENCE_SOURCES:
             raise ValueError(f"evidence_sources {self.evidence_sources!r}: known are {', '.join(EVIDENCE_SOURCES)}")
-        if self.near is not None and not isinstance(self.localizer, ExactPosterior):
+        if self.near is not None and not has_posterior(self.localizer):
             raise ValueError(f"near={self.near}: only the localizer posterior takes a prior of the position")
 
 
@@ -168,8 +164,6 @@ class StarRays:
     clock: Clock
     light: StarPhotometry
     near: PositionPrior | None = None  # of the position
-    blocked: Blocked | None = None  # parts of the view that are left out; None: nothing is blocked
-    steeper: float = 0.0  # relative, by which the image shows a crater deeper than its file states
 
     def evidence(self) -> Evidence:
         """The rays for the localizer."""
@@ -187,8 +181,16 @@ class StarFix(StarRays):
     """The position that explains the stars, and its integrity."""
 
     fix: Fix
-    fix_at_time: Fix  # by the stars, the time of `R_enu_icrs` taken as exact; `fix` where the clock does not matter
-    integrity: Integrity | None = None  # None: not assessed, of a fix without a single posterior
+
+    @property
+    def integrity(self) -> Integrity | None:
+        """Of the fix; None: not assessed, of several positions or without a posterior."""
+        return self.fix.integrity
+
+    @property
+    def blocked(self) -> Blocked | None:
+        """Parts of the view that something on no map blocks; None: nothing is blocked."""
+        return self.fix.blocked
 
     @property
     def status(self) -> str:
@@ -211,12 +213,7 @@ class Measured(StarRays, Oriented):
     @property
     def warnings(self) -> list[str]:
         """Facts in the image's file that were not used; what the terrain does not cover, and errors it leaves out."""
-        blocked = [] if self.blocked is None else [f"blocked and left out: {self.blocked.text}"]
-        depth = f"the image shows a depth {self.steeper:+.2%} off that of the terrain file: it is estimated"
-        steeper = [depth] if self.steeper else []
-        return [
-            *super().warnings, *self.terrain.masked_sectors(), *self.terrain.error_warnings(), *blocked, *steeper,
-        ]  # fmt: skip
+        return [*super().warnings, *self.terrain.masked_sectors(), *self.terrain.error_warnings()]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -224,8 +221,8 @@ class Located(StarFix, Measured):
     """The whole solution: evidence and the position that explains it."""
 
     sky_light: SkyLight | None = None  # of the image at the skyline; None: not used for the fix
-    skyline_fit: SkylineFit | None = None  # of the skyline that the sky's light shows, to that of the fix
-    sky_variance_factor: float = 1.0  # of the sky's light, by which its stated variance is too small
+    sky_used: Bools | None = None  # (SECTORS,) where it is used
+    image_errors: ImageErrors | None = None  # of it
     by_stars: bool = True  # whether the stars' rows are in the posterior too
     sky_unused: str = ""  # why the sky's light is not used
     skyline: MeasuredSkyline | None = None  # that the image shows; None: not one position, or not right to its error
@@ -239,8 +236,14 @@ class Located(StarFix, Measured):
 
         In a round crater the error of the clock spreads the position over an arc, whose mean lies beside it.
         """
-        on_arc = self.terrain.axisymmetric and clock_matters(self.clock, self.terrain)
-        return np.asarray((self.fix_at_time if on_arc else self.fix).position_enu_m[:2])
+        return np.asarray(self.fix.at_time_m)
+
+    @property
+    def warnings(self) -> list[str]:
+        """Those of `Measured`, what blocks the view, and errors beyond the defaults of facts that no file states."""
+        blocked = [] if self.blocked is None else [f"blocked and left out: {self.blocked.text}"]
+        shown = [f"the image shows {one.text}, which no file states: it is estimated" for one in self.fix.shown]
+        return [*super().warnings, *blocked, *shown]
 
     @property
     def evidence_source(self) -> str:

@@ -15,14 +15,16 @@ from numpy.typing import NDArray
 
 from startrack.correction import Correction
 from startrack.errors import BadInput, NoSolution, NotIdentified, NotLocated, TooFewStars
+from startrack.fix import Blocked, ClockError, Fix, Integrity, Mode, UnstatedFact
 from startrack.mask import Mask
 from startrack.prior import PositionPrior
 from startrack.values import Array, Bools, Ints, Value, array, take_rows
 
 __all__ = [
-    "Array", "Attitude", "BadInput", "Body", "Bools", "Centroids", "Clock", "ClockError", "Correction", "Detections",
-    "Evidence", "Exposure", "Fix", "Identification", "Ints", "Mask", "MeasuredSkyline", "Mode", "NoSolution",
-    "NotIdentified", "NotLocated", "Stars", "TooFewStars", "Value", "array",
+    "Array", "Attitude", "BadInput", "Blocked", "Body", "Bools", "Centroids", "Clock", "ClockError", "Correction",
+    "Detections", "Evidence", "Exposure", "Fix", "Identification", "ImageErrors", "Integrity", "Ints", "Mask",
+    "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated", "Stars", "TooFewStars", "UnstatedFact",
+    "Value", "array",
 ]  # fmt: skip
 
 # Beyond the zenith: the search for an error of the horizon shifts the rows, by three sigma at most.
@@ -41,6 +43,7 @@ class Exposure(Value):
     path: str = ""  # as given by the user
     time_utc: datetime | None = None  # mid-exposure, timezone-aware UTC; None when unknown
     time_sigma_s: float = TIME_SIGMA_S  # standard deviation of the clock's error
+    time_sigma_is_stated: bool = False  # by the user or a file; made true where it is not the default
     exposure_s: float | None = None
     camera: str | None = None  # resolved path or shipped name of the camera file
     terrain: str | None = None  # resolved path or shipped name of the terrain file
@@ -58,6 +61,8 @@ class Exposure(Value):
             p = p.view()
             p.flags.writeable = False
         object.__setattr__(self, "pixels_adu", p)
+        if self.time_sigma_s != TIME_SIGMA_S:
+            object.__setattr__(self, "time_sigma_is_stated", True)
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -153,16 +158,34 @@ class Identification(Value):
 
 @dataclass(frozen=True, kw_only=True)
 class Clock(Value):
-    """How directions in enu depend on an error of the clock."""
+    """How directions in enu depend on an error of the clock.
+
+    The prior of its error is a mixture: `sigma_s`, or with `gross_probability` the wider `gross_sigma_s`.
+    """
 
     turn_rad_s: Array = array(3)  # rotation vector in enu: by one second that the true time is later
     sigma_s: float  # of the stated time
     offset_s: float = 0.0  # by which the directions' time is later than the stated one
     reach_s: float = np.inf  # the true time is no farther from the directions' time
+    gross_probability: float = 0.0  # above 0 where `sigma_s` is not stated
+    gross_sigma_s: float = 0.0
 
     def log_prior(self, later_s: Any) -> Any:
-        """Logarithm of the prior density, less its maximum, of times later than the directions' time."""
+        """Logarithm of the prior density, less its maximum and its gross part, `later_s` than the directions' time."""
         return -0.5 * np.square((self.offset_s + later_s) / self.sigma_s)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageErrors:
+    """Errors of attitude and lens: they raise the skyline that the sky's light shows, not that of the stars.
+
+    Arrays over sectors of azimuth begin at north and go eastward.
+    """
+
+    raised_rad: Array  # (sectors, j) by one unit of each
+    mean: Array  # (j,)
+    covariance: Array  # (j, j)
+    variance_rad2: Array  # (sectors,) of the skyline by the light of the sky alone; infinite where it shows none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,6 +207,9 @@ class Evidence(Value):
     extended_nats: Array = array("n", default=0.0)  # (light / noise)^2 of extended light; 0: a point source
     clock: Clock | None = None  # one for all rows; None: the time is exact
     near: PositionPrior | None = None  # of the camera's position; None: anywhere in the search area
+    image_errors: ImageErrors | None = None  # of the rows of extended light; None: these are exact
+    is_interim: bool = False  # more rows of the same image follow: the fix needs no integrity
+    support: Any = None  # samples of an earlier fix from much the same rows; None: the whole area is searched
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -209,12 +235,12 @@ class Evidence(Value):
 
     @classmethod
     def concatenate(cls, *parts: Evidence) -> Evidence:
-        """The rows of all `parts`, of several sources or exposures, in one value, with the first clock and prior."""
-        clock = next((part.clock for part in parts if part.clock is not None), None)
-        near = next((part.near for part in parts if part.near is not None), None)
-        return cls(
-            clock=clock, near=near, **{n: np.concatenate([getattr(part, n) for part in parts]) for n in cls._columns()}
-        )
+        """The rows of all `parts`, of several sources or exposures, in one value, with the first clock and so on."""
+        shared: dict[str, Any] = {
+            name: next((getattr(part, name) for part in parts if getattr(part, name) is not None), None)
+            for name in ("clock", "near", "image_errors", "support")
+        }
+        return cls(**shared | {n: np.concatenate([getattr(part, n) for part in parts]) for n in cls._columns()})
 
     @classmethod
     def _columns(cls) -> list[str]:
@@ -240,39 +266,3 @@ class MeasuredSkyline(Value):
     def known(self) -> Bools:
         """Whether the elevation is known at each azimuth (n,)."""
         return np.isfinite(self.elevation_rad)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Mode(Value):
-    """One connected region of the posterior."""
-
-    east_m: float
-    north_m: float
-    weight: float  # posterior probability
-    radius95_m: float = np.inf  # circle about it that holds 95 % of the mode's own probability; infinite: not stated
-    radius999_m: float = np.inf
-
-
-@dataclass(frozen=True)
-class ClockError:
-    """How much later the true time is than the stated one."""
-
-    offset_s: float
-    sigma_s: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Fix(Value):
-    """Posterior of the camera's position."""
-
-    position_enu_m: Array = array(3)  # posterior mean of the main mode (east, north) and the camera's height there
-    covariance_m2: Array = array(2, 2)  # (east, north); infinite, as the circles, of a method that states none
-    radius95_m: float  # circle about the position that holds 95 % of the posterior
-    radius999_m: float
-    modes: tuple[Mode, ...]  # heaviest first; weights sum to 1
-    ambiguous: bool  # modes outside the main mode's 99.9 % circle hold more than 1 %
-    dropped_probability: float | None = None  # bound on the posterior's part that the search left out; None: no search
-    search: str = "proven"  # no other position fits; "beam": not proven to the end; "approximate": no posterior
-    horizon_error_rad: float = 0.0  # common to all azimuths: how much higher the true horizon is than the map's
-    shape_1: tuple[float, float] = (0.0, 0.0)  # of the terrain, as in `Terrain.reshaped`, by the evidence
-    clock: ClockError | None = None  # as the evidence shows it; None: not estimated

@@ -1,13 +1,19 @@
-"""The log-likelihood of positions written out in numpy, row by row: the reference of the kernels."""
+"""Log-likelihoods of positions written out in numpy: of the search row by row, and of the chain of obstacles."""
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import ndtr
 
+from startrack.errors import Reason
+from startrack.localization import ExactPosterior
+from startrack.localization.obstacle_chain import LEVELS_RAD, STATES, WRONG_SECTOR, transitions
 from startrack.localization.sector_likelihood import Sectors
+from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS, SECTORS, sector_of
 from startrack.terrain import ForwardingTerrain, Terrain
-from startrack.types import Array, Evidence
+from startrack.types import Array, Evidence, Fix, NotLocated
 
 
 def slow_contributions(evidence: Evidence, margin_rad: Array, sigma_rad: Array) -> Array:
@@ -29,6 +35,56 @@ def slow_scores(points_m: Array, evidence: Evidence, terrain: Terrain, sectors: 
     sums = np.bincount(key.ravel(), weights=value.ravel(), minlength=len(points_m) * sectors.count)
     sums = sums.reshape(len(points_m), sectors.count)
     return sectors.score(sums)
+
+
+def locate_or_refuse(evidence: Evidence, terrain: Terrain) -> tuple[Fix | None, Reason | None]:
+    """The fix of the posterior, or the reason of its refusal."""
+    try:
+        return ExactPosterior()(evidence, terrain), None
+    except NotLocated as refusal:
+        return None, refusal.reason
+
+
+def _mean_likelihood(margin_rad: Array, llr: Array, low_rad: Array | float, high_rad: float) -> Array:
+    """Means (p,) over heights of the skyline from low (p,) to high of exp F, F the sum of llr (n,) of rows above it."""
+    order = np.argsort(margin_rad, axis=1)
+    at = np.take_along_axis(margin_rad, order, axis=1)
+    above = np.cumsum(llr[order][:, ::-1], axis=1)[:, ::-1]
+    zero, far = np.zeros((len(at), 1)), np.full((len(at), 1), np.inf)
+    log, edge = np.hstack([above, zero]), np.hstack([-far, at, far])
+    low = np.reshape(np.broadcast_to(low_rad, len(at)), (-1, 1))
+    overlap = np.minimum(edge[:, 1:], high_rad) - np.maximum(edge[:, :-1], low)
+    return np.asarray((np.exp(log) * np.maximum(overlap, 0.0)).sum(axis=1) / (high_rad - low[:, 0]))
+
+
+def slow_chain(emissions: Array) -> Array:
+    """Logarithms (p,) of the traces of the products of transitions and emissions (p, SECTORS, STATES)."""
+    product, log = np.broadcast_to(np.eye(STATES), (len(emissions), STATES, STATES)), np.zeros(len(emissions))
+    for e in np.moveaxis(emissions, 1, 0):
+        product = product @ transitions() * e[:, None]
+        scale = product.max(axis=(1, 2))
+        product, log = product / scale[:, None, None], log + np.log(scale)
+    return np.asarray(log + np.log(np.trace(product, axis1=1, axis2=2)))
+
+
+def slow_chain_scores(points_m: Array, evidence: Evidence, terrain: Terrain, reference_m: Array) -> Array:
+    """Log-likelihoods (p,) of positions (p, 2) with obstacles: each star with its own horizon, hard edges.
+
+    Heights of the skyline are in a window about that of the reference (2,).
+    """
+    azimuth = evidence.azimuth_rad
+    about = evidence.elevation_rad - terrain.horizon_rad(reference_m[None], azimuth)
+    e = np.ones((len(points_m), SECTORS, STATES))
+    for s in range(SECTORS):
+        own = np.flatnonzero((sector_of(azimuth) == s) & (about > LOW_RAD) & (about < HIGH_RAD))
+        llr = np.clip(evidence.llr[own], -ROW_NATS, ROW_NATS)
+        margin = evidence.elevation_rad[own] - terrain.horizon_rad(points_m[:, None], azimuth[own])
+        anywhere = _mean_likelihood(about[own][None], llr, LOW_RAD, HIGH_RAD)
+        e[:, s, 0] = np.exp((llr * (margin > 0)).sum(axis=1))
+        for j, (low, high) in enumerate(pairwise(LEVELS_RAD)):
+            e[:, s, j + 1] = _mean_likelihood(margin, llr, low, high)
+        e[:, s] = (1 - WRONG_SECTOR) * e[:, s] + WRONG_SECTOR * anywhere
+    return slow_chain(e)
 
 
 class Delegating:

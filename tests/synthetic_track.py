@@ -64,4 +64,4 @@ def _frame(k: int, status: str) -> TrackFrame:
 
 def _trajectory(position_m: Array, covariance_m2: Array, known: Array) -> Trajectory:
     position = np.where(known[:, None], np.column_stack([position_m, np.zeros(len(position_m))]), np.nan)
-    return Trajectory(position, np.where(known[:, None, None], covariance_m2, np.inf))
+    return Trajectory.of_normal(position, np.where(known[:, None, None], covariance_m2, np.inf))

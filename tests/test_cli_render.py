@@ -120,7 +120,10 @@ def test_a_wrong_clock_changes_the_stated_time_alone(folder):
     render(*pose, "--clock-offset", "-90.5", "--time-sigma", "60", "-o", "wrong.png")
     right, wrong = read_exposure("right.png"), read_exposure("wrong.png")
     assert (wrong.time_utc - right.time_utc).total_seconds() == 90.5
-    assert (right.time_sigma_s, wrong.time_sigma_s) == (1.0, 60.0)
+    assert (right.time_sigma_s, wrong.time_sigma_s) == (0.0, 60.0)
+    assert right.time_sigma_is_stated and wrong.time_sigma_is_stated
+    render(*pose, "--clock-offset", "-90.5", "-o", "silent.png")
+    assert (read_exposure("silent.png").time_sigma_s, read_exposure("silent.png").time_sigma_is_stated) == (1.0, False)
     np.testing.assert_array_equal(wrong.pixels_adu, right.pixels_adu)
     (folder / "wrong.json").unlink()
     assert read_exposure("wrong.png").time_utc == wrong.time_utc  # from the header

@@ -82,6 +82,24 @@ def test_the_track_holds_the_truth_and_is_better_than_single_images(drive, track
     assert radius[-1, 1] < 0.8 * radius[0, 1]
 
 
+def test_a_track_of_one_image_states_what_locate_states(drive, tmp_path):
+    image = min((drive / "frames").glob("*.png"))
+    alone = startrack.locate(image).result
+    for flags in ([], ["--at-rest"]):
+        assert run(image, "-D", tmp_path / "out", "-q", *flags) == 0
+        found = json.loads((tmp_path / "out" / "track.json").read_text())["frames"][0]
+        for prefix in ("", "filtered_"):
+            position = [found[f"{prefix}{axis}_m"] for axis in ("east", "north", "up")]
+            np.testing.assert_allclose(position, alone.fix.position_enu_m, rtol=0, atol=1e-9)
+            covariance = [found[f"{prefix}covariance_{text}_m2"] for text in ("ee", "en", "en", "nn")]
+            np.testing.assert_allclose(covariance, alone.fix.covariance_m2.ravel(), rtol=0, atol=1e-9)
+            circles = [found[f"{prefix}radius95_m"], found[f"{prefix}radius999_m"]]
+            np.testing.assert_allclose(circles, [alone.fix.radius95_m, alone.fix.radius999_m], rtol=0, atol=1e-9)
+        R_body_enu = alone.camera.R_body_cam @ alone.R_cam_enu
+        quat = [found[f"q{axis}_body_enu"] for axis in "xyzw"]
+        np.testing.assert_allclose(R_from_quat_xyzw(quat), R_body_enu, rtol=0, atol=1e-9)
+
+
 def test_tum_text_is_that_of_the_poses(drive, tracked):
     true = read_odometry(drive / "frames" / "truth.tum")
     for name in ("track.tum", "track.filtered.tum"):

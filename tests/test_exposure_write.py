@@ -110,7 +110,7 @@ def test_equal_input_gives_equal_bytes(tmp_path, exposure, suffix, monkeypatch):
 
 def test_unknown_facts_are_left_out(tmp_path):
     path = write_exposure(tmp_path / "frame.png", exposure_of(FRAME, time_utc=MID))
-    assert Image.open(path).text == {"TIMESYS": "UTC", "DATE-AVG": "2031-03-26T20:58:11.966208", "STTSIG": "1.0"}
+    assert Image.open(path).text == {"TIMESYS": "UTC", "DATE-AVG": "2031-03-26T20:58:11.966208"}
     assert Image.open(write_exposure(tmp_path / "timeless.png", exposure_of(FRAME))).text == {}
     assert write_sidecar(path, Facts()).read_text() == "{}\n"
 

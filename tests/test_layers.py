@@ -17,7 +17,7 @@ ROOT = Path(startrack.__file__).parent
 
 LAYERS = (  # lowest first; a package imports from lower layers only
     {"errors", "lengths", "mask", "values"},
-    {"prior", "correction"},
+    {"fix", "prior", "correction"},
     {"types", "files", "declaration"},
     {"compilation"},
     {"frames", "runner"},
@@ -29,9 +29,9 @@ LAYERS = (  # lowest first; a package imports from lower layers only
     {"attitude"},
     {"rendering", "detection", "identification", "evidence", "localization"},
     {"stages"},
-    {"sky_errors", "run", "crater_depth"},
-    {"measurement", "orientation", "sky_refinement", "blocked_view", "skyline"},
-    {"star_fix"},
+    {"run", "star_fix"},
+    {"measurement", "orientation", "sky_refinement"},
+    {"skyline"},
     {"pipeline", "calibration", "inputs", "simulation"},
     {"output"},
     {"solution", "horizon"},

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from localization_helpers import WRAPPERS, ThreeMethods, slow_contributions, slow_scores
+from localization_helpers import WRAPPERS, ThreeMethods, slow_chain_scores, slow_contributions, slow_scores
 
 from startrack.localization import ExactPosterior, Hull, Localizer, PseudoGradient
 from startrack.localization.branch_and_bound import Search
 from startrack.localization.initial_guess import Guess
 from startrack.localization.likelihood import PositionLikelihood
-from startrack.localization.sector_likelihood import Sectors, contributions, row_range
+from startrack.localization.sector_likelihood import contributions, row_range
 from startrack.stages import Settings
 from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain
 from startrack.types import Array, BadInput, Evidence, NotLocated
@@ -176,30 +176,27 @@ def test_settings_refuse_what_is_no_localizer(given: Any, error: type[Exception]
 SMALL = replace(TERRAIN, diameter_m=400.0, depth_m=60.0, search_radius_m=200.0)
 
 
-@pytest.mark.parametrize("sigma_rad", [0.0, 0.01])
-@pytest.mark.parametrize("epsilon", [0.0, 1e-3])
-@pytest.mark.parametrize("seed", range(2))
-def test_exact_posterior_equals_brute_force(seed: int, epsilon: float, sigma_rad: float) -> None:
-    """Mean, covariance and the 95 % circle of a grid of 1 m over the whole floor of a small crater."""
+@pytest.mark.parametrize("terrain", [SMALL, TERRAIN], ids=["small", "thesis"])
+@pytest.mark.parametrize("seed", range(3))
+def test_exact_posterior_equals_brute_force(seed: int, terrain: Cylinder) -> None:
+    """Mean, covariance and circles of a grid with the chain of obstacles written out."""
     rng = np.random.default_rng(seed)
-    evidence = measure_stars(rng, random_position(rng, SMALL), SMALL, 250, sigma_rad)
-    method = ExactPosterior(sector_epsilon=epsilon)
-    fix = method(evidence, SMALL)
-    line = np.arange(-200.0, 200.0, 1.0) + 0.5
-    x, y = np.meshgrid(line, line)
-    grid = np.stack([x.ravel(), y.ravel()], axis=1)
-    grid = grid[np.hypot(grid[:, 0], grid[:, 1]) < 200.0]
-    sectors = Sectors.from_evidence(evidence, method.sector_width_rad, epsilon)
-    log = np.concatenate([slow_scores(some, evidence, SMALL, sectors) for some in np.array_split(grid, 60)])
+    evidence = measure_stars(rng, random_position(rng, terrain), terrain, 600 if terrain is SMALL else 3000)
+    fix = ExactPosterior()(evidence, terrain)
+    middle, line = fix.position_enu_m[:2], np.linspace(-6, 6, 49)
+    grid = middle + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2) @ np.linalg.cholesky(fix.covariance_m2).T
+    grid = grid[np.asarray(terrain.allowed(grid))]
+    log = slow_chain_scores(grid, evidence, terrain, middle)
     weight = np.exp(log - log.max())
     weight /= weight.sum()
     mean = weight @ grid
     spread = np.einsum("n,ni,nj->ij", weight, grid - mean, grid - mean)
     sigma = np.sqrt(np.trace(spread))
-    assert np.linalg.norm(fix.position_enu_m[:2] - mean) < 0.05 * sigma + 0.1
-    np.testing.assert_allclose(fix.covariance_m2, spread, atol=0.1 * sigma**2 + 0.2)
-    distance = np.linalg.norm(grid - fix.position_enu_m[:2], axis=1)
+    assert np.linalg.norm(middle - mean) < 0.1 * sigma
+    np.testing.assert_allclose(fix.covariance_m2, spread, atol=0.12 * sigma**2)
+    distance = np.linalg.norm(grid - middle, axis=1)
     assert weight[distance < fix.radius95_m].sum() == pytest.approx(0.95, abs=0.03)
+    assert weight[distance > 1.1 * fix.radius999_m].sum() < 2e-3
     assert fix.dropped_probability < 1e-3
 
 
@@ -231,9 +228,11 @@ def test_a_wrapped_terrain_gives_the_terrains_own_fix(wrapper: type, sigma_rad: 
     at = random_position(rng)
     evidence = measure_stars(rng, at, TERRAIN, 3000, sigma_rad)
     own, wrapped = ExactPosterior()(evidence, TERRAIN), ExactPosterior()(evidence, wrapper(TERRAIN))
-    np.testing.assert_allclose(wrapped.position_enu_m, own.position_enu_m, atol=1e-6)
-    np.testing.assert_allclose(wrapped.covariance_m2, own.covariance_m2, rtol=1e-6)
-    assert wrapped.radius95_m == pytest.approx(own.radius95_m, rel=1e-6)
+    size = np.sqrt(np.trace(own.covariance_m2))
+    part = 0.1 if wrapper is ThreeMethods else 1e-6  # which is searched by other boxes: sampled by other points
+    np.testing.assert_allclose(wrapped.position_enu_m, own.position_enu_m, atol=part * size)
+    np.testing.assert_allclose(wrapped.covariance_m2, own.covariance_m2, atol=1.5 * part * size**2)
+    assert wrapped.radius95_m == pytest.approx(own.radius95_m, rel=part)
 
 
 def test_positions_beside_the_wall_and_deep_evidence_are_located() -> None:
@@ -271,7 +270,7 @@ def test_two_positions_that_fit_are_both_modes(terrain: Terrain) -> None:
     flux = snr * (elevation > TERRAIN.horizon_rad(at[None], azimuth)) + rng.standard_normal(n)
     llr = np.clip(snr * flux - snr**2 / 2, -9, 9)
     evidence = Evidence(azimuth_rad=azimuth, elevation_rad=elevation, llr=llr, edge_sigma_rad=np.zeros(n))
-    fix = ExactPosterior(sector_epsilon=0.0)(evidence, terrain)
+    fix = ExactPosterior()(evidence, terrain)
     assert fix.ambiguous
     first, second = fix.modes[:2]
     assert first.weight == pytest.approx(0.5, abs=0.1)
@@ -370,11 +369,6 @@ def test_a_boulder_costs_no_more_than_its_sectors() -> None:
     hidden = replace(evidence, llr=llr)
     fix = ExactPosterior()(hidden, TERRAIN)
     assert np.linalg.norm(fix.position_enu_m[:2] - at) < fix.radius999_m
-    # The evidence of the dark sectors is bounded: 14 sectors of 1.5 degrees at ln(1e-4) each.
-    sectors = Sectors.from_evidence(hidden, float(np.radians(1.5)), 1e-4)
-    clear = Sectors.from_evidence(evidence, float(np.radians(1.5)), 1e-4)
-    loss = slow_scores(at[None], evidence, TERRAIN, clear)[0] - slow_scores(at[None], hidden, TERRAIN, sectors)[0]
-    assert 0 < loss < 14 * -np.log(1e-4)
 
 
 def whole_sky(seed: int, n: int = 1500) -> Evidence:

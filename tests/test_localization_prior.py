@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from localization_helpers import ThreeMethods
+from localization_helpers import ThreeMethods, slow_chain_scores
 
 from startrack.localization import ExactPosterior
 from startrack.prior import PositionPrior
@@ -54,13 +54,15 @@ def test_the_posterior_is_the_product_with_the_prior(sigmas: float) -> None:
 
 @pytest.mark.parametrize("terrain", [CRATER, ThreeMethods(CRATER)], ids=["disks", "bounds"])
 def test_the_prior_weighs_hard_edges_too(terrain: Terrain) -> None:
-    """Against the boxes of the search without the prior, weighed by hand."""
-    boxes = ExactPosterior(boxes_per_sigma=8.0).explore(evidence(), CRATER)
+    """Against a grid weighed by hand."""
     near = PositionPrior(AT_M[0] + 5.0, AT_M[1] - 3.0, 8.0)
-    off = boxes.centres_m - near.mean_m
-    weight = np.exp(boxes.log_likelihood - boxes.log_likelihood.max() - np.sum(off**2, axis=1) / (2 * 8.0**2))
-    mean = np.average(boxes.centres_m, axis=0, weights=weight)
-    spread = np.cov(boxes.centres_m.T, aweights=weight, ddof=0)
+    line = np.linspace(-30.0, 30.0, 61)
+    grid = AT_M + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    off = grid - near.mean_m
+    log = slow_chain_scores(grid, evidence(), CRATER, AT_M) - np.sum(off**2, axis=1) / (2 * 8.0**2)
+    weight = np.exp(log - log.max())
+    mean = np.average(grid, axis=0, weights=weight)
+    spread = np.cov(grid.T, aweights=weight, ddof=0)
     fix = ExactPosterior()(evidence(near), terrain)
     sigma = np.sqrt(np.diag(spread))
     np.testing.assert_allclose(fix.position_enu_m[:2] / sigma, mean / sigma, atol=0.1)
@@ -77,7 +79,7 @@ def test_an_ambiguous_position_becomes_single() -> None:
     flux = snr * (elevation > CRATER.horizon_rad(at[None], azimuth)) + rng.standard_normal(n)
     llr = np.clip(snr * flux - snr**2 / 2, -9, 9)
     rows = Evidence(azimuth_rad=azimuth, elevation_rad=elevation, llr=llr)
-    method = ExactPosterior(sector_epsilon=0.0)
+    method = ExactPosterior()
     assert method(rows, CRATER).ambiguous
     one = method(replace(rows, near=PositionPrior(1900.0, 6300.0, 400.0)), CRATER)
     assert not one.ambiguous

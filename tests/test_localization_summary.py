@@ -1,17 +1,19 @@
-"""From weighted boxes to a fix: probabilities of the circles, and modes."""
+"""From weighted points to a position: probabilities of the circles, and modes."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from startrack.localization.summary import smallest_axis, summarize
+from startrack.localization.conclusion import Posterior, label_modes
+from startrack.localization.summary import require_inside, smallest_axis
 from startrack.terrain import Cylinder, load_terrain
-from startrack.types import Fix, NotLocated
+from startrack.types import NotLocated
 
 TERRAIN = load_terrain("shackleton-thesis")
 assert isinstance(TERRAIN, Cylinder)
@@ -27,95 +29,87 @@ def blob(middle: tuple[float, float], sigma_m: tuple[float, float], part: float)
     return offset + np.array(middle), log - np.log(np.exp(log).sum()) + np.log(part)
 
 
-def fix_of(*blobs: tuple[np.ndarray, np.ndarray]) -> Fix:
-    centres, log = (np.concatenate(part) for part in zip(*blobs, strict=True))
-    return summarize(centres, WIDTH_M, log, 1e-7, TERRAIN)
+def summary_of(*blobs: tuple[np.ndarray, np.ndarray]) -> tuple[Posterior, np.ndarray, tuple[float, float]]:
+    """All points of a posterior, its main position (2,) and the radii of its circles."""
+    points, log = (np.concatenate(part) for part in zip(*blobs, strict=True))
+    whole = posterior_of(points, log)
+    middle = np.average(points[whole.main], axis=0, weights=whole.share[whole.main])
+    return whole, middle, whole.radii(points, whole.share, middle)
+
+
+def posterior_of(points: np.ndarray, log: np.ndarray) -> Posterior:
+    one = SimpleNamespace(positions_m=points, log_weight=log, gross="")
+    return Posterior([one], TERRAIN)  # type: ignore[list-item]
 
 
 def test_one_gaussian() -> None:
-    fix = fix_of(blob((3000.0, -1000.0), (20.0, 6.0), 1.0))
-    assert fix.position_enu_m == pytest.approx([3000.0, -1000.0, TERRAIN.camera_height_m], abs=1.0)
-    assert fix.covariance_m2 == pytest.approx(np.diag([400.0, 36.0]), rel=0.02, abs=0.5)
-    rng = np.random.default_rng(1)
-    drawn = np.hypot(*(rng.normal(size=(200_000, 2)) * [20.0, 6.0]).T)
-    assert fix.radius95_m == pytest.approx(np.percentile(drawn, 95), abs=2 * WIDTH_M)
-    assert fix.radius999_m == pytest.approx(np.percentile(drawn, 99.9), abs=2 * WIDTH_M)
-    assert [mode.weight for mode in fix.modes] == pytest.approx([1.0])
-    assert not fix.ambiguous
-    assert fix.dropped_probability == 1e-7
+    whole, middle, radii = summary_of(blob((3000.0, -1000.0), (20.0, 6.0), 1.0))
+    assert middle == pytest.approx([3000.0, -1000.0], abs=0.5)
+    drawn = np.hypot(*(np.random.default_rng(1).normal(size=(200_000, 2)) * [20.0, 6.0]).T)
+    assert radii == pytest.approx(np.percentile(drawn, [95, 99.9]), abs=2 * WIDTH_M)
+    assert whole.main.all()
 
 
 def test_a_weak_second_mode_does_not_shift_the_position() -> None:
-    fix = fix_of(blob((3000.0, 2000.0), (6.0, 6.0), 0.995), blob((-5000.0, -3000.0), (6.0, 6.0), 0.005))
-    assert not fix.ambiguous  # less than 1 %
-    assert fix.position_enu_m[:2] == pytest.approx([3000.0, 2000.0], abs=1.0)  # the mean of both is 47 m away
-    assert np.sqrt(np.diag(fix.covariance_m2)) == pytest.approx([6.0, 6.0], rel=0.05)
-    assert fix.radius95_m < 20.0
-    assert fix.radius999_m > 9000.0  # but it is there
-    assert [round(mode.weight, 4) for mode in fix.modes] == [0.995, 0.005]
+    whole, middle, (radius95, radius999) = summary_of(
+        blob((3000.0, 2000.0), (6.0, 6.0), 0.995), blob((-5000.0, -3000.0), (6.0, 6.0), 0.005)
+    )
+    assert middle == pytest.approx([3000.0, 2000.0], abs=0.5)  # the mean of both is 47 m away
+    assert radius95 < 20.0
+    assert radius999 > 9000.0  # but it is there
+    assert whole.share[whole.label == 1].sum() == pytest.approx(0.005, rel=0.01)
 
 
-def test_a_second_mode_of_a_few_per_cent_is_ambiguous() -> None:
-    fix = fix_of(
+def test_modes_are_labelled_by_their_weight() -> None:
+    sigmas = ([6.0, 6.0], [8.0, 4.0], [5.0, 5.0])
+    whole, _, _ = summary_of(
         blob((3000.0, 2000.0), (6.0, 6.0), 0.6), blob((3000.0, -2000.0), (8.0, 4.0), 0.37),
         blob((-100.0, 0.0), (5.0, 5.0), 0.03),
     )  # fmt: skip
-    assert fix.ambiguous
-    assert [(round(m.east_m), round(m.north_m)) for m in fix.modes] == [(3000, 2000), (3000, -2000), (-100, 0)]
-    assert [m.weight for m in fix.modes] == pytest.approx([0.6, 0.37, 0.03], abs=1e-3)
     rng = np.random.default_rng(2)
-    for mode, sigma_m in zip(fix.modes, ([6.0, 6.0], [8.0, 4.0], [5.0, 5.0]), strict=True):
+    for number, (weight, sigma_m) in enumerate(zip((0.6, 0.37, 0.03), sigmas, strict=True)):
+        own = whole.label == number
+        assert whole.share[own].sum() == pytest.approx(weight, abs=1e-3)
+        points, share = whole.positions_m[own], whole.share[own]
         drawn = np.hypot(*(rng.normal(size=(200_000, 2)) * sigma_m).T)  # the circles of a mode hold its own part
-        assert mode.radius95_m == pytest.approx(np.percentile(drawn, 95), abs=WIDTH_M)
-        assert mode.radius999_m == pytest.approx(np.percentile(drawn, 99.9), abs=WIDTH_M)
+        found = whole.radii(points, share, np.average(points, axis=0, weights=share))
+        assert found == pytest.approx(np.percentile(drawn, [95, 99.9]), abs=WIDTH_M)
 
 
-def test_a_long_thin_posterior_is_one_mode() -> None:
-    fix = fix_of(blob((0.0, 1000.0), (300.0, 3.0), 1.0))
-    assert len(fix.modes) == 1
-    assert not fix.ambiguous
+@pytest.mark.parametrize("sigma_m", [(300.0, 3.0), (20.0, 20.0), (5.0, 90.0)])
+def test_scattered_points_of_one_distribution_are_one_mode(sigma_m: tuple[float, float]) -> None:
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        points = rng.normal(size=(1200, 2)) * 1.3 * np.array(sigma_m)
+        log = -0.5 * np.square(points / sigma_m).sum(axis=1) * (1 - 1 / 1.69)
+        weight = np.exp(log)
+        label = label_modes(points, weight / weight.sum())
+        assert weight[label == 0].sum() / weight.sum() > 0.99
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(1, 400), st.floats(0.1, 6.0))
+@given(st.integers(0, 2**32 - 1), st.integers(30, 400), st.floats(0.1, 2.0))
 def test_circles_contain_their_probability(seed: int, n: int, spread: float) -> None:
-    """Any weights on any boxes: the circles hold 95 and 99.9 %, and no much smaller ones would."""
+    """Any weights on any points: the circles hold 95 and 99.9 %, to the weight of a point, and no smaller ones do."""
     rng = np.random.default_rng(seed)
-    cells = np.unique(rng.integers(-15, 16, (n, 2)), axis=0)
-    centres, log = WIDTH_M * cells + [500.0, 0.0], spread * rng.normal(size=len(cells))
-    fix = summarize(centres, WIDTH_M, log, 0.0, TERRAIN)
-    weight = np.exp(log - log.max())
-    weight /= weight.sum()
-    distance = np.linalg.norm(centres - fix.position_enu_m[:2], axis=1)
-    for radius, mass in ((fix.radius95_m, 0.95), (fix.radius999_m, 0.999)):
-        assert weight[distance <= radius].sum() >= mass - 1e-9
-        assert weight[distance < radius - 1.5 * WIDTH_M].sum() < mass + 1e-9
-    assert fix.radius95_m <= fix.radius999_m
-    assert sum(mode.weight for mode in fix.modes) == pytest.approx(1.0)
-    assert np.all(np.diff([mode.weight for mode in fix.modes]) <= 1e-12)
-    assert np.linalg.eigvalsh(fix.covariance_m2)[0] >= WIDTH_M**2 / 12 - 1e-9
+    points, log = 20.0 * rng.normal(size=(n, 2)), spread * rng.normal(size=n)
+    whole = posterior_of(points, log)
+    middle = whole.share @ points
+    away, most = np.linalg.norm(points - middle, axis=1), whole.share.max()
+    for radius, mass in zip(whole.radii(points, whole.share, middle), (0.95, 0.999), strict=True):
+        assert whole.share[away <= radius].sum() >= mass - most - 1e-9
+        assert whole.share[away < radius - 1e-9].sum() < mass + 1e-9
 
 
 def test_most_of_the_posterior_outside_the_search_area_is_refused() -> None:
-    centres, log = blob((3200.0, 0.0), (20.0, 20.0), 1.0)
+    points, log = blob((3200.0, 0.0), (20.0, 20.0), 1.0)
+    small = replace(TERRAIN, search_radius_m=3000.0)
     with pytest.raises(NotLocated, match="3000 m") as caught:
-        summarize(centres, WIDTH_M, log, 0.0, replace(TERRAIN, search_radius_m=3000.0))
+        require_inside(points, np.exp(log), small)
     assert caught.value.reason == "outside_search_area"
-    # Near the border only the probability inside the search area counts.
-    centres, log = blob((2990.0, 0.0), (20.0, 20.0), 1.0)
-    fix = summarize(centres, WIDTH_M, log, 0.0, replace(TERRAIN, search_radius_m=3000.0))
-    assert fix.position_enu_m[0] < 2985.0
-    assert max(mode.east_m for mode in fix.modes) < 3000.0
-
-
-def test_a_posterior_as_wide_as_the_area_is_refused() -> None:
-    line = np.arange(-9000.0, 9001.0, 300.0)
-    x, y = np.meshgrid(line, line)
-    centres = np.stack([x.ravel(), y.ravel()], axis=1)
-    centres = centres[np.hypot(*centres.T) < 9900]
-    with pytest.raises(NotLocated, match="open") as caught:
-        summarize(centres, 300.0, np.zeros(len(centres)), 0.0, TERRAIN)
-    assert caught.value.reason == "insufficient_geometry"
+    points, log = blob((2990.0, 0.0), (20.0, 20.0), 1.0)
+    inside = require_inside(points, np.exp(log), small)
+    assert np.exp(log)[inside].sum() == pytest.approx(0.69, abs=0.05)
 
 
 def test_the_smallest_axis_is_a_mode_s_own():

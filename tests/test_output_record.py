@@ -21,7 +21,7 @@ from startrack.types import BadInput, Mode
 ARCSEC = np.pi / 648_000
 KEYS = {
     "position": "frame terrain east_m north_m up_m covariance_m2 radius95_m radius999_m "
-    "protection_level_m protection_risk carried_by latitude_deg longitude_deg "
+    "protection_level_m protection_risk carried_by unstated latitude_deg longitude_deg "
     "evidence search dropped_probability",
     "search": "outcome dropped_probability",
     "attitude": "quat_xyzw_cam_icrs ra_deg dec_deg roll_deg sigma_arcsec lens_error_included quat_xyzw_body_enu "

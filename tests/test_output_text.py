@@ -32,7 +32,7 @@ def test_one_line_for_a_fix(located):
 def test_a_position_without_a_circle_is_called_approximate(located):
     fix = located.result.fix
     point = replace(
-        located.result, fix=point_fix(fix.position_enu_m[:2], located.result.terrain), sky_light=None, skyline_fit=None
+        located.result, fix=point_fix(fix.position_enu_m[:2], located.result.terrain), sky_light=None, sky_used=None
     )
     line = summary_line(point, seconds=3.14)
     assert re.fullmatch(

@@ -102,13 +102,22 @@ def test_the_wrong_crater_is_refused(located: Any, catalog: StarCatalog, terrain
 
 
 @pytest.mark.parametrize("error", [-0.003, 0.0, 0.003])
-def test_a_wrong_depth_shows_in_the_light_of_the_sky(located: Any, catalog: StarCatalog, error: float) -> None:
+def test_a_depth_that_is_not_stated_is_estimated(located: Any, catalog: StarCatalog, error: float) -> None:
     depth_m = located.result.terrain.depth_m
-    found = locate_again(located, catalog, depth_m=depth_m * (1 + error), depth_sigma_m=0.0)
+    found = locate_again(located, catalog, depth_m=depth_m * (1 + error), depth_sigma_m=None)
     assert isinstance(found, Located), found.message
     assert covers_truth(found, located)
-    assert found.steeper == (pytest.approx(-error, abs=0.0015) if error else 0.0)
+    assert [one.value for one in found.fix.shown] == ([pytest.approx(-error, abs=0.0015)] if error else [])
     assert any("depth" in warning for warning in found.warnings) == bool(error)
+
+
+@pytest.mark.parametrize("error", [-0.003, 0.003])
+def test_a_stated_depth_that_the_light_of_the_sky_contradicts_is_refused(
+    located: Any, catalog: StarCatalog, error: float
+) -> None:
+    depth_m = located.result.terrain.depth_m
+    result = locate_again(located, catalog, depth_m=depth_m * (1 + error), depth_sigma_m=0.0)
+    assert (result.status, result.reason) == ("refused", "inconsistent_evidence")
 
 
 def test_a_position_beyond_the_search_area_is_refused(located: Any, catalog: StarCatalog) -> None:

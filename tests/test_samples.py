@@ -55,6 +55,7 @@ def test_the_image_carries_its_facts_inside_too(name):
     beside = json.loads((SAMPLES / f"{name}.json").read_text())
     assert parse_utc(inside["DATE-AVG"]) == parse_utc(beside["time_utc"])
     assert float(inside["EXPTIME"]) == pytest.approx(beside["exposure_s"])
+    assert float(inside["STTSIG"]) == beside["time_sigma_s"] == 0.0
     assert (inside["STCAMERA"], inside["STTERRAI"]) == (beside["camera"], beside["terrain"])
 
 

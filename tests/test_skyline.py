@@ -35,6 +35,7 @@ from startrack.output.skyline_table import half_range_rad
 from startrack.output.write import prepare_folder
 from startrack.pipeline import Settings
 from startrack.rendering import Series, Truth, render
+from startrack.sky_refinement import raised_by_image
 from startrack.solution import Solution
 from startrack.stages import Inputs, Located, Refused
 from startrack.terrain import load_terrain
@@ -105,11 +106,10 @@ def test_the_light_of_the_sky_makes_the_fix_better(bright: Frame, by_source: dic
         off = (found.fix.position_enu_m - bright.truth.position_enu_m)[:2]
         assert off @ np.linalg.solve(found.fix.covariance_m2, off) < 18.4  # 99.99 %
         assert np.linalg.norm(found.fix.position_enu_m - both.fix.position_enu_m) < stars.fix.radius95_m
-        assert found.skyline_fit is not None and 0.2 < found.skyline_fit.chi2 < 1.3
-        assert np.count_nonzero(found.skyline_fit.used) > 180  # two missing stars cost 16 degrees in one of the frames
-    assert stars.sky_light is None and stars.skyline_fit is None
-    assert (both.fix.search, both.fix.dropped_probability) == (stars.fix.search, stars.fix.dropped_probability)
-    assert (sky.fix.search, sky.fix.dropped_probability) == ("beam", 1.0)
+        assert np.count_nonzero(found.sky_used) > 180
+        assert found.blocked is None
+    assert stars.sky_light is None and stars.sky_used is None
+    assert both.fix.search == stars.fix.search == "proven"
     assert [found.sky_unused for found in by_source.values()] == ["", "", ""]
 
 
@@ -135,7 +135,7 @@ def test_the_measured_skyline_is_the_true_one(bright: Frame, by_source: dict[str
         names = set(np.unique(found.source)) - {""}
         assert names == {"stars"} if source == "stars" else "sky light" in names | {"sky light"} - {"stars"}
         if source != "stars":
-            used = by_source[source].skyline_fit.used
+            used = by_source[source].sky_used
             assert np.isin(found.source[used], ("sky light", "both")).all()
             assert (found.source[~used] != "sky light").all()
     sigma = [np.median(by_source[source].skyline.sigma_rad) for source in ("both", "stars")]
@@ -144,12 +144,12 @@ def test_the_measured_skyline_is_the_true_one(bright: Frame, by_source: dict[str
 
 def test_the_sky_stops_where_the_skyline_is(bright: Frame, by_source: dict[str, Located]) -> None:
     """The heights of the sectors scatter as their pixels' noise lets them, and are right on average."""
-    sky, fit = by_source["sky"].sky_light, by_source["sky"].skyline_fit
-    assert sky is not None and fit is not None
+    sky, used = by_source["sky"].sky_light, by_source["sky"].sky_used
+    assert sky is not None and used is not None
     true = CRATER.horizon_rad(bright.truth.position_enu_m[None, :2], MIDDLES_RAD)
-    off = sky.shift_px - fit.raised_px(of_terrain=False) - (true - sky.elevation_rad) * sky.px_per_rad
-    assert 0.7 < np.mean(np.square(off / sky.shift_sigma_px)[fit.used]) < 1.8
-    assert abs(np.mean(off[fit.used])) < 0.03
+    off = sky.shift_px - (true + raised_by_image(by_source["sky"]) - sky.elevation_rad) * sky.px_per_rad
+    assert 0.7 < np.mean(np.square(off / sky.shift_sigma_px)[used]) < 1.8
+    assert abs(np.mean(off[used])) < 0.03
 
 
 def test_a_black_sky_leaves_the_stars(catalog: StarCatalog) -> None:

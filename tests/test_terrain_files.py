@@ -85,35 +85,15 @@ def test_every_key_reaches_the_terrain(tmp_path):
     assert terrain.allowed(np.array([[0.0, 0.0], [2000.0, 0.0]])).tolist() == [True, False]
 
 
-def test_errors_that_a_file_leaves_out_are_zero_and_a_warning(tmp_path):
+def test_heights_whose_error_a_file_leaves_out_are_exact_with_a_warning(tmp_path):
     cylinder = {key: HILL[key] for key in ("format", "body", "origin")} | {"name": "pit"}
-    sizes = {"diameter_m": 9000.0, "depth_m": 1600.0}
-    pit = terrain_from_dict(cylinder | {"cylinder": sizes})
-    assert pit.shape_sigma == (0.0, 0.0)
-    (line,) = pit.error_warnings()
-    assert "pit: its file states no depth_sigma_m and diameter_sigma_m: taken as 0" in line
-    (line,) = terrain_from_dict(cylinder | {"cylinder": sizes | {"depth_sigma_m": 3.2}}).error_warnings()
-    assert "no diameter_sigma_m" in line
-    stated = terrain_from_dict(cylinder | {"cylinder": sizes | {"depth_sigma_m": 0.0, "diameter_sigma_m": 0.0}})
-    assert stated.error_warnings() == load_terrain("shackleton-thesis").error_warnings() == []
-
+    pit = terrain_from_dict(cylinder | {"cylinder": {"diameter_m": 9000.0, "depth_m": 1600.0}})
+    assert pit.shape_errors == ()
+    assert pit.error_warnings() == load_terrain("shackleton-thesis").error_warnings() == []
     hill = load_terrain(terrain_file(tmp_path))
     assert hill.error_warnings() == []
     (tmp_path / "hill.toml").write_text(tomli_w.dumps({**HILL, "dem": {"file": "hill.tif"}}))
     assert ["no height_sigma_m" in line for line in load_terrain(tmp_path / "hill.toml").error_warnings()] == [True]
-
-
-def test_a_result_warns_of_errors_that_the_terrain_file_leaves_out(tmp_path, capsys):
-    path = tmp_path / "pit.toml"
-    text = (data_dir("terrain") / "shackleton-thesis.toml").read_text()
-    path.write_text("\n".join(line for line in text.splitlines() if "_sigma_m" not in line))
-    sample = str(ROOT / "sample_images/near-centre.png")
-    for terrain, count in ((str(path), 1), ("shackleton-thesis", 0)):
-        assert main(["locate", sample, "-t", terrain, "--json", "--no-plots", "-D", str(tmp_path / "out"), "-O"]) == 0
-        heard = capsys.readouterr()
-        warnings = json.loads(heard.out)["warnings"]
-        assert sum("depth_sigma_m and diameter_sigma_m" in line for line in warnings) == count
-        assert ("depth_sigma_m" in heard.err) == bool(count)
 
 
 REFUSED = [

@@ -14,8 +14,8 @@ import pytest
 from startrack.errors import NotLocated
 from startrack.frames import Site, enu_from_latlon, latlon_from_enu
 from startrack.localization import ExactPosterior
+from startrack.localization.horizon_bias import estimate_horizon_bias, lower_evidence
 from startrack.localization.likelihood import PositionLikelihood
-from startrack.localization.nuisance import estimate_horizon_bias, lower_evidence
 from startrack.terrain import load_terrain, table_building
 from startrack.terrain import table_cache as cache
 from startrack.terrain.height_map import HeightMap

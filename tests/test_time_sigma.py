@@ -19,9 +19,11 @@ from startrack.batch.task import valid_stored_record
 from startrack.cli.common import add_fact_flags, flag_facts
 from startrack.cli.main import main
 from startrack.errors import BadInput
-from startrack.exposure import Facts, read_exposure, with_facts
+from startrack.exposure import Facts, read_exposure, with_facts, write_exposure, write_sidecar
 from startrack.exposure.sidecar import MAX_TIME_SIGMA_S
 from startrack.inputs import exposure_input, time_sigma_input
+from startrack.localization import clock_at
+from startrack.terrain import load_terrain
 from startrack.types import TIME_SIGMA_S, Exposure
 
 FRAME = np.arange(12, dtype=np.uint16).reshape(3, 4)
@@ -50,9 +52,10 @@ WRITERS = {"a.png": write_png, "a.fits": write_fits, "a.tif": write_tiff}
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_flag_then_sidecar_then_header_then_default(tmp_path, name):
-    assert read_exposure(WRITERS[name](tmp_path / f"bare {name}")).time_sigma_s == TIME_SIGMA_S == 1.0
+    bare = read_exposure(WRITERS[name](tmp_path / f"bare {name}"))
+    assert bare.time_sigma_s == TIME_SIGMA_S == 1.0 and not bare.time_sigma_is_stated
     image = WRITERS[name](tmp_path / name, STTSIG=2.5)
-    assert read_exposure(image).time_sigma_s == 2.5
+    assert read_exposure(image).time_sigma_s == 2.5 and read_exposure(image).time_sigma_is_stated
     image.with_suffix(".json").write_text('{"time_sigma_s": null}')
     assert read_exposure(image).time_sigma_s == 2.5
     image.with_suffix(".json").write_text('{"time_sigma_s": 30}')
@@ -108,6 +111,33 @@ def test_the_library_takes_seconds_and_astropy_durations(tmp_path):
         assert exposure_input(given, None, 3 * u.ms).time_sigma_s == pytest.approx(0.003)
     assert exposure_input(image, None).time_sigma_s == 2.5
     assert exposure_input(FRAME, datetime(2030, 1, 1, tzinfo=UTC)).time_sigma_s == 1.0
+
+
+def test_the_default_number_may_be_stated(tmp_path):
+    image = write_png(tmp_path / "a.png")
+    assert not read_exposure(image).time_sigma_is_stated
+    assert read_exposure(image, time_sigma_s=1.0).time_sigma_is_stated
+    assert exposure_input(image, None, 1.0).time_sigma_is_stated
+    assert with_facts(Exposure(pixels_adu=FRAME), time_sigma_s=1.0).time_sigma_is_stated
+    assert Exposure(pixels_adu=FRAME, time_sigma_s=2.0).time_sigma_is_stated
+    assert not exposure_input(FRAME, None).time_sigma_is_stated
+    (tmp_path / "a.json").write_text('{"time_sigma_s": 1}')
+    assert read_exposure(image).time_sigma_is_stated
+
+
+def test_a_default_is_not_written_as_stated(tmp_path):
+    silent = Exposure(pixels_adu=FRAME, time_utc=datetime(2030, 1, 1, tzinfo=UTC), saturation_adu=65535.0)
+    for name, exposure in (("silent.png", silent), ("stated.png", with_facts(silent, time_sigma_s=1.0))):
+        image = write_exposure(tmp_path / name, exposure)
+        assert read_exposure(image).time_sigma_is_stated == exposure.time_sigma_is_stated
+        assert ("time_sigma_s" in json.loads(write_sidecar(image, exposure).read_text())) == (name == "stated.png")
+
+
+def test_a_clock_that_nobody_states_may_be_grossly_wrong():
+    site, when = load_terrain("shackleton-thesis").site, datetime(2030, 1, 1, tzinfo=UTC)
+    stated, silent = clock_at(site, when, 1.0), clock_at(site, when, 1.0, is_stated=False)
+    assert (stated.gross_probability, stated.gross_sigma_s) == (0.0, 0.0)
+    assert (silent.sigma_s, silent.gross_probability, silent.gross_sigma_s) == (1.0, 0.01, 3600.0)
 
 
 def test_with_facts_leaves_the_rest_alone():

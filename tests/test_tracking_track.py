@@ -11,9 +11,11 @@ from tracking_helpers import HEIGHT_SIGMA_M, shifted, simulate_drive
 
 from startrack.errors import BadInput
 from startrack.frames import R_body_enu_from_heading_pitch_roll, quat_xyzw_from_R
+from startrack.localization.shared_errors import SharedErrors
 from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
-from startrack.tracking import ObservedFrame, Odometry, SharedErrors, Track, estimate_track
+from startrack.terrain.shape import ShapeError
+from startrack.tracking import ObservedFrame, Odometry, Track, TrackErrors, estimate_track
 from startrack.tracking.track import odometry_steps
 
 START, EVERY_S = datetime(2030, 6, 1, tzinfo=UTC), 900.0
@@ -27,7 +29,7 @@ def ground() -> HeightMap:
     return replace(terrain, search_radius_m=3000.0, height_sigma_m=HEIGHT_SIGMA_M)
 
 
-SHARED = SharedErrors(("horizon_bias_rad",), np.array([1e-3]), np.zeros(3))
+SHARED = TrackErrors(SharedErrors((ShapeError(name="bias_rad", fact="horizon_sigma_deg", sigma=1e-3),)))
 
 
 def attitudes(rng) -> list[np.ndarray]:

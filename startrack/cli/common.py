@@ -62,11 +62,11 @@ def add_pixel_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--flat", metavar="FILE", help="flat field of the frame's size, its own dark subtracted")
 
 
-def add_time_sigma_flag(parser: Any) -> None:
-    """The flag for the sigma of the clock, in a parser or a group of its flags."""
+def add_time_sigma_flag(parser: Any, default: str = "1, and more where it is not stated") -> None:
+    """The flag for the sigma of the clock, in a parser or a group of its flags; its help names the `default`."""
     parser.add_argument(
         "--time-sigma", type=time_sigma_s, metavar="SECONDS",
-        help="standard deviation of the clock's error (1)",
+        help=f"standard deviation of the clock's error ({default})",
     )  # fmt: skip
 
 
@@ -188,6 +188,8 @@ def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, s
             print(outcome.line, file=sys.stdout if not args.quiet else sys.stderr, flush=True)
         elif not args.quiet:
             print(outcome.line, flush=True)
+        for need in () if args.json or args.quiet else outcome.record.get("explain", ()):
+            print(f"  needs {need}", file=sys.stderr, flush=True)
         if not args.json:
             print_advice(outcome.reason, outcome.record.get("message", ""), args)
         codes.append(exit_code(outcome))

@@ -41,6 +41,11 @@ def add_parser(subparsers: Any) -> None:
         "--format", type=geo_formats, action="extend", metavar="geojson[,kml]", default=[],
         help="write NAME.geojson, NAME.kml or both too: position, 95 %% circle, attitude",
     )  # fmt: skip
+    parser.add_argument(
+        "--explain", action="store_true",
+        help="of a refused or wide answer: what the image would need (exposure, facts, skyline in view, time, camera "
+        "file, terrain), on stderr or in JSON as explain",
+    )  # fmt: skip
     parser.add_argument("--fov", metavar="DEG", help=argparse.SUPPRESS)  # a flag of identify and calibrate
     parser.set_defaults(run=run, usage_error=parser.error)
     parser.add_argument("--report", action="store_true", help="add a page for a browser, as startrack report makes it")
@@ -69,6 +74,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _locate_image(path: str, stem: str, args: argparse.Namespace, settings: Settings) -> Outcome:
     from startrack.output import summary_line, verbose_text, write_geo, write_results
+    from startrack.output.explain import explain
     from startrack.pipeline import locate_exposure
     from startrack.run import with_timing
 
@@ -80,7 +86,8 @@ def _locate_image(path: str, stem: str, args: argparse.Namespace, settings: Sett
         prepare_reference(exposure.terrain, args)
     start = time.perf_counter()
     result = with_timing(locate_exposure(exposure, settings), read=read_ms)
-    record = write_results(result, out, plots=not args.no_plots)
+    more = {"explain": explain(result)} if args.explain else {}
+    record = write_results(result, out, plots=not args.no_plots, more=more)
     write_geo(out, result, args.format)
     line = summary_line(result, seconds=read_ms / 1e3 + time.perf_counter() - start)
     if args.verbose:

@@ -53,6 +53,7 @@ other programs   startrack calibrate convert CAMERA.toml --to ros            ros
 
 look             startrack terrain show shackleton --at 0 0                  properties, relief, a horizon
 your own map     startrack terrain import MAP.tif -o NAME.toml --latitude DEG --longitude DEG
+state errors     startrack terrain state NAME.toml                           what its file leaves out widens circles
 prepare          startrack terrain build NAME.toml                           its horizons, before the first fix""",
 }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,6 +33,7 @@ from startrack.files import check_output
 
 if TYPE_CHECKING:
     from startrack.rendering import Drive, Scene, Series, Truth
+    from startrack.types import Exposure
 
 SUFFIXES = {"png": ".png", "tiff": ".tif", "fits": ".fits"}
 KNOWN_SUFFIXES = {".png", ".tif", ".tiff", ".fits", ".fit", ".fts"}
@@ -83,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _add_pose(group: Any) -> None:
     group.add_argument("--time", metavar="UTC", help="middle of the exposure; else between 2024 and 2034")
-    add_time_sigma_flag(group)
+    add_time_sigma_flag(group, default="0; with --clock-offset not stated")
     help_offset = "true minus stated time, for image and sidecar with the time of a wrong clock (0)"
     group.add_argument("--clock-offset", type=clock_offset_s, default=0.0, metavar="SECONDS", help=help_offset)
     group.add_argument("--east", type=number, metavar="M", help="from the terrain's origin")
@@ -193,13 +195,24 @@ def _render_one(args: argparse.Namespace, series: Series, number: int, image: Pa
     scene, rng = series.scene(number, image.stem)
     exposure, truth = render(scene, rng=rng)
     stated = None if scene.time_utc is None else scene.time_utc - timedelta(seconds=args.clock_offset)
-    exposure = with_facts(exposure, time_utc=stated, time_sigma_s=args.time_sigma)
+    exposure = _with_stated_clock(with_facts(exposure, time_utc=stated), args)
     pose = {**_pose(scene, truth), "clock_offset_s": args.clock_offset}
     write_exposure(image, exposure, overwrite=args.overwrite)
     write_sidecar(image, exposure, overwrite=args.overwrite)
     facts = {**pose, "seed": args.seed, "number": number, "catalog": series.catalog.name, "settings": _settings(args)}
     pose_path, table_path = write_truth(image, truth, facts, to_v_mag=args.truth_mag, overwrite=args.overwrite)
     return {"image": str(image), "truth": str(pose_path), "table": str(table_path), **facts}
+
+
+def _with_stated_clock(exposure: Exposure, args: argparse.Namespace) -> Exposure:
+    """The exposure with `--time-sigma`; without it a right clock is exact, and nothing is stated of a wrong one."""
+    from startrack.types import TIME_SIGMA_S
+
+    if args.time_sigma is None and args.clock_offset == 0.0:
+        return exposure
+
+    sigma_s = TIME_SIGMA_S if args.time_sigma is None else args.time_sigma
+    return replace(exposure, time_sigma_s=sigma_s, time_sigma_is_stated=args.time_sigma is not None)
 
 
 def _pose(scene: Scene, truth: Truth) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""`startrack terrain`: show a terrain, compute its horizons ahead of time, make one from elevation data."""
+"""`startrack terrain`: show a terrain, compute its horizons, make one from elevation data, state its errors."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli.common import DEFAULT_OUT
 from startrack.cli.preparation import prepare
 from startrack.cli.terrain_facts import facts_of, lines_of, view_facts
+from startrack.cli.terrain_state import add_state_parser, state_terrain
 from startrack.compilation import announce_compilation
 from startrack.files import check_output, file_stem, make_folder
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add `terrain` to the commands of the `startrack` parser."""
     parser: argparse.ArgumentParser = subparsers.add_parser(
-        "terrain", help="show a terrain, compute its horizons, make one from elevation data",
+        "terrain", help="show a terrain, compute its horizons, make one from elevation data, state its errors",
         description="TERRAIN is a terrain file (a path if it ends in .toml or contains a separator) or a shipped name.",
     )  # fmt: skip
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
@@ -65,7 +66,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     imported.add_argument(
         "--camera-height", type=float, default=1.5, metavar="M", help="above the ground (%(default)g)"
     )
-    for action in (show, build, imported):
+    state = add_state_parser(actions)
+    for action in (show, build, imported, state):
         action.add_argument("--json", action="store_true", help="print one JSON object per terrain")
         action.add_argument(
             "-v", "--verbose", action="count", default=0, help="more output; tracebacks of internal errors"
@@ -79,8 +81,10 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the action; 0."""
-    return {"show": _show_terrain, "build": _build_tables, "import": _import_map}[args.action](args)
+    """Run the action; its exit code."""
+    return {"show": _show_terrain, "build": _build_tables, "import": _import_map, "state": state_terrain}[args.action](
+        args
+    )
 
 
 def _show_terrain(args: argparse.Namespace) -> int:

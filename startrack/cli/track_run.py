@@ -33,7 +33,7 @@ class TrackRun:
         self.codes: set[int] = {0}
         self._is_old, self._write_s = False, 0.0  # the files; what writing them took
         self._printed = 0  # lines at rest
-        self._shows_depth = False  # whether an image showed that the depth of the file is wrong
+        self._shown: set[str] = set()  # facts whose gross error an image showed
         self._moves = (
             None if args.odometry is None else OdometryFile(args.odometry, args.odometry_topic, bool(args.follow))
         )  # fmt: skip
@@ -161,12 +161,13 @@ class TrackRun:
         return self.session.add_exposure(exposure, path)
 
     def _note(self, frame: ObservedFrame) -> None:
-        if frame.steeper and not self._shows_depth:
-            self._shows_depth = True
-            print(
-                f"{frame.name}  the image shows a depth {frame.steeper:+.2%} off that of the terrain file: "
-                "the track estimates it", file=sys.stderr, flush=True,
-            )  # fmt: skip
+        for one in frame.shown:
+            if one.fact not in self._shown:
+                self._shown.add(one.fact)
+                print(
+                    f"{frame.name}  the image shows {one.text}, which no file states: the track estimates it",
+                    file=sys.stderr, flush=True,
+                )  # fmt: skip
         if not frame.modes:
             self.codes.add(3)
 

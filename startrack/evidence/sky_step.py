@@ -56,6 +56,12 @@ class Skyline:
         _interpolate_circle(np.ascontiguousarray(self.elevation_rad), np.ravel(azimuth_rad), found.reshape(-1))
         return found
 
+    def raised(self, by_rad: Array) -> Skyline:
+        """The skyline higher by `by_rad` (n,) [rad], at the middles of n equal sectors from north eastward."""
+        azimuth = np.linspace(0.0, 2 * np.pi, len(self.elevation_rad), endpoint=False)
+        middle = (np.arange(len(by_rad)) + 0.5) * 2 * np.pi / len(by_rad)
+        return Skyline(self.elevation_rad + np.interp(azimuth, middle, by_rad, period=2 * np.pi))
+
 
 @dataclass(frozen=True, eq=False)
 class SkyStep:

@@ -69,7 +69,8 @@ def with_facts(
     """
     given: dict[str, Any] = {"exposure_s": exposure_s, "camera": camera, "terrain": terrain, "mask": mask}
     given["time_utc"] = None if time_utc is None else as_utc(time_utc)
-    given["time_sigma_s"] = None if time_sigma_s is None else check_time_sigma_s(time_sigma_s, "time_sigma_s")
+    if time_sigma_s is not None:
+        given |= {"time_sigma_s": check_time_sigma_s(time_sigma_s, "time_sigma_s"), "time_sigma_is_stated": True}
     return replace(exposure, **{key: value for key, value in given.items() if value is not None})
 
 

@@ -75,6 +75,7 @@ def exposure_of_decoded(decoded: Decoded, facts: Facts, *, raw: bytes, name: str
         path=path,
         time_utc=facts.time_utc,
         time_sigma_s=TIME_SIGMA_S if facts.time_sigma_s is None else facts.time_sigma_s,
+        time_sigma_is_stated=facts.time_sigma_s is not None,
         exposure_s=facts.exposure_s,
         camera=facts.camera,
         terrain=facts.terrain,

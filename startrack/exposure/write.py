@@ -58,7 +58,7 @@ def write_sidecar(image: str | os.PathLike[str], facts: Facts | Exposure, *, ove
     target = sidecars(Path(image))[-1]
     values = {
         "time_utc": None if facts.time_utc is None else format_utc(facts.time_utc),
-        "time_sigma_s": None if facts.time_utc is None else facts.time_sigma_s,
+        "time_sigma_s": None if facts.time_utc is None else _stated_time_sigma_s(facts),
         "exposure_s": facts.exposure_s,
         "camera": _relative_path(facts.camera, target.parent),
         "terrain": _relative_path(facts.terrain, target.parent),
@@ -80,7 +80,8 @@ def header_entries(exposure: Exposure, folder: Path) -> dict[str, str | float]:
             start = exposure.time_utc - timedelta(seconds=exposure.exposure_s / 2)
             entries["DATE-OBS"] = format_utc(start).removesuffix("Z")  # FITS has no zone letter
         entries["DATE-AVG"] = format_utc(exposure.time_utc).removesuffix("Z")
-        entries["STTSIG"] = float(exposure.time_sigma_s)
+        if exposure.time_sigma_is_stated:
+            entries["STTSIG"] = float(exposure.time_sigma_s)
     if exposure.exposure_s is not None:
         entries["EXPTIME"] = float(exposure.exposure_s)
     for key, reference in (("STCAMERA", exposure.camera), ("STTERRAI", exposure.terrain)):
@@ -88,6 +89,11 @@ def header_entries(exposure: Exposure, folder: Path) -> dict[str, str | float]:
         if relative is not None:
             entries[key] = relative
     return entries
+
+
+def _stated_time_sigma_s(facts: Facts | Exposure) -> float | None:
+    """The sigma of the clock that somebody states; None of an exposure with the default."""
+    return facts.time_sigma_s if isinstance(facts, Facts) or facts.time_sigma_is_stated else None
 
 
 def _relative_path(reference: str | None, folder: Path) -> str | None:

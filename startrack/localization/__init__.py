@@ -2,14 +2,10 @@
 
 from typing import Any, Protocol
 
-from startrack.localization.blocked import Blocked, find_blocked
 from startrack.localization.clock import clock_at, clock_matters
-from startrack.localization.consistency import check_consistency
 from startrack.localization.convex_hull import Hull
-from startrack.localization.integrity import Integrity
 from startrack.localization.posterior import ExactPosterior
 from startrack.localization.pseudo_gradient import PseudoGradient
-from startrack.localization.skyline_fit import SkylineFit
 from startrack.terrain import Terrain
 from startrack.types import Evidence, Fix
 
@@ -24,17 +20,24 @@ class Localizer(Protocol):
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix: ...
 
 
+DEFAULT_LOCALIZER = "posterior"
 LOCALIZERS: dict[str, type[Localizer]] = {
-    "posterior": ExactPosterior,
+    DEFAULT_LOCALIZER: ExactPosterior,
     "pseudo-gradient": PseudoGradient,
     "hull": Hull,
 }
+WITHOUT_POSTERIOR = ("pseudo-gradient", "hull")
 
 
 def localizer_name(localizer: Localizer) -> str:
     """The name of a `localizer` in LOCALIZERS; of one that is not listed, that of its class or function."""
     listed = [name for name, kind in LOCALIZERS.items() if kind is type(localizer)]
     return listed[0] if listed else getattr(localizer, "__name__", type(localizer).__name__)
+
+
+def has_posterior(localizer: Localizer) -> bool:
+    """Whether a `localizer` weighs a prior of the position: all do but those of the thesis."""
+    return localizer_name(localizer) not in WITHOUT_POSTERIOR
 
 
 def require_localizer(given: Any) -> Localizer:
@@ -56,6 +59,6 @@ def require_localizer(given: Any) -> Localizer:
 
 
 __all__ = [
-    "LOCALIZERS", "Blocked", "ExactPosterior", "Hull", "Integrity", "Localizer", "PseudoGradient", "SkylineFit",
-    "check_consistency", "clock_at", "clock_matters", "find_blocked", "localizer_name", "require_localizer",
+    "DEFAULT_LOCALIZER", "LOCALIZERS", "ExactPosterior", "Hull", "Localizer", "PseudoGradient", "clock_at",
+    "clock_matters", "has_posterior", "localizer_name", "require_localizer",
 ]  # fmt: skip

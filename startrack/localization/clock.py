@@ -10,33 +10,24 @@ import numpy as np
 from startrack.frames import Site, sky_rotvec_rad
 from startrack.localization.local_search import turn_rays
 from startrack.terrain import Terrain
-from startrack.types import Clock, ClockError, Evidence, NotLocated
+from startrack.types import Clock, Evidence
 
 REACH_SIGMAS = 4.0  # of the stated error, to the last time that is tried
 TURN_S = 600.0  # over which the sky's turn is taken
+GROSS_PROBABILITY, GROSS_SIGMA_S = 0.01, 3600.0  # of a clock whose error nobody states
 NEGLIGIBLE_M = 0.05  # by which a row may move over the search area, within one sigma, without an effect on the fix
 
 
-class WrongTime(NotLocated):
-    """The evidence shows a time that the stated one, with its error, excludes.
+def clock_at(site: Site, time_utc: datetime, sigma_s: float, is_stated: bool = True) -> Clock:
+    """The clock of directions at a `site` at the stated `time_utc` of an exposure, which is right to `sigma_s`.
 
-    `shown` is the time's offset from the stated one, with an infinite sigma where it is rough; `sigma_s` is stated.
+    is_stated: whether somebody states `sigma_s`; where it is a default, the clock may be grossly wrong.
     """
-
-    def __init__(self, shown: ClockError, sigma_s: float, shown_by: str) -> None:
-        size = f"about {duration(shown.offset_s)}"
-        if np.isfinite(shown.sigma_s):
-            size = f"{duration(shown.offset_s)} (sigma {duration(shown.sigma_s)})"
-        super().__init__(
-            f"{shown_by} shows a time {size} {'later' if shown.offset_s > 0 else 'earlier'} than the image's, which is "
-            f"stated to {duration(sigma_s)}: is it right? (--time-sigma SECONDS states its error)",
-            reason="inconsistent_evidence",
-        )
-
-
-def clock_at(site: Site, time_utc: datetime, sigma_s: float) -> Clock:
-    """The clock of directions at a `site` at the stated `time_utc` of an exposure, which is right to `sigma_s`."""
-    return Clock(turn_rad_s=sky_rotvec_rad(site, time_utc, TURN_S) / TURN_S, sigma_s=sigma_s)
+    gross = (0.0, 0.0) if is_stated else (GROSS_PROBABILITY, GROSS_SIGMA_S)
+    return Clock(
+        turn_rad_s=sky_rotvec_rad(site, time_utc, TURN_S) / TURN_S, sigma_s=sigma_s, gross_probability=gross[0],
+        gross_sigma_s=gross[1],
+    )  # fmt: skip
 
 
 def duration(seconds: float) -> str:

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from startrack.localization.clock import REACH_SIGMAS, duration, turn_evidence
-from startrack.localization.explored import Explored
+from startrack.localization.horizon_bias import estimate_horizon_bias, lower_evidence
 from startrack.localization.initial_guess import BEAMS, CLIMBS, LAST_STEP_M, beam_search
 from startrack.localization.likelihood import PositionLikelihood
-from startrack.localization.nuisance import estimate_horizon_bias, lower_evidence
 from startrack.terrain import Terrain
 from startrack.types import Array, Clock, Evidence, Ints, NotLocated
 
-Explore = Callable[[Evidence, Terrain], Explored]
 Node = tuple[float, Array]  # log-likelihood with the prior [nats], and position (2,)
 
 STEP_RAD = np.radians(0.13)  # of the turn between two times; a position is followed over it
-STEP_ON_ARC_RAD = np.radians(1.0)
 MOST_SCANNED = 250  # of these times: 65 degrees of turn, five days on the Moon
 SCAN_STEPS = 2  # between the times at which a position is searched for from nothing
 LIKELY_NATS = 10.0  # less than the best: a time still matters
@@ -35,7 +31,6 @@ class Track:
     evidence: Evidence
     terrain: Terrain
     clock: Clock
-    explore: Explore
 
     def likely_way(self) -> tuple[Array, Array, Array]:
         """Times (n,) that matter [s later], the logarithm of their share (n,), and the best positions (n, 2)."""
@@ -66,7 +61,7 @@ class Track:
         if len(numbers) == 1:
             return later_s, np.repeat(log_share, each), np.repeat(way_m, each, axis=0)
         at = np.arange(len(numbers))
-        share = self.clock.log_prior(later_s) if self.terrain.axisymmetric else PchipInterpolator(at, log_share)(fine)
+        share = PchipInterpolator(at, log_share)(fine)
         return later_s, np.asarray(share), np.asarray(PchipInterpolator(at, way_m)(fine))
 
     @property
@@ -79,9 +74,8 @@ class Track:
     @property
     def step_s(self) -> float:
         """Between two times."""
-        step = STEP_ON_ARC_RAD if self.terrain.axisymmetric else STEP_RAD
         low, high = self.limits_s
-        return float(min(step / np.linalg.norm(self.clock.turn_rad_s), (high - low) / 4))
+        return float(min(STEP_RAD / np.linalg.norm(self.clock.turn_rad_s), (high - low) / 4))
 
     def _nodes(self) -> dict[int, Node]:
         """Fit and position by the number of the step."""
@@ -110,8 +104,6 @@ class Track:
     def _seeds(self, low: int, high: int) -> list[tuple[int, Array]]:
         """Numbers of steps to follow positions from, the best first, with positions (2,)."""
         middle = min(max(0, low), high)
-        if self.terrain.axisymmetric:
-            return [(middle, np.zeros(2))]
         wanted = range(low, high + 1, SCAN_STEPS) if high - low > 2 * SCAN_STEPS else [middle]
         if len(wanted) > MOST_SCANNED:
             raise NotLocated(
@@ -131,8 +123,6 @@ class Track:
         return [(k, position) for _, k, position in likely]
 
     def _node(self, number: int, start_m: Array) -> Node:
-        if self.terrain.axisymmetric:
-            return self._node_on_arc(number)
         likelihood, bias_nats = self._likelihood(number), 0.0
         offset = self._log_offset(number, likelihood)
         if self.terrain.common_sigma_rad > 0.0:
@@ -144,13 +134,6 @@ class Track:
         scores = likelihood.exact_scores(way)
         top = int(np.argmax(scores))
         return offset + float(scores[top]) - bias_nats, way[top]
-
-    def _node_on_arc(self, number: int) -> Node:
-        """The prior alone: the skyline is the same after a turn about the vertical, and nearly so about other axes."""
-        found = self.explore(turn_evidence(self.evidence, number * self.step_s), self.terrain)
-        weight = np.exp(found.log_likelihood - found.log_likelihood.max())
-        prior = float(self.clock.log_prior(number * self.step_s))
-        return prior, np.asarray(np.average(found.centres_m, axis=0, weights=weight))
 
     def _log_offset(self, number: int, likelihood: PositionLikelihood) -> float:
         """The prior, and what makes likelihoods at different times comparable: their sectors hold different rows."""

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from startrack.types import Array, ClockError
+from startrack.types import Array
 
 
 class Explored(NamedTuple):
@@ -17,18 +17,17 @@ class Explored(NamedTuple):
     log_likelihood: Array  # (n,) at the centres
     log_dropped: float  # logarithm of a bound of the mass [m2] that was dropped
     search: str  # "proven" or "beam"
+    dropped_probability: float | None = None  # of an earlier fix with these points; None: by `log_dropped`
     horizon_bias_rad: float = 0.0  # how much higher than the terrain's the horizon was taken
-    shape: tuple[float, float] = (0.0, 0.0)  # of the terrain, mean
-    clock: ClockError | None = None
 
 
 class BudgetSpent(Exception):
-    """The search has traced as many horizons as it may, and boxes of `open_m2` may still matter."""
+    """The search has traced as many horizons as it may, and boxes may still matter."""
 
     def __init__(self, centres_m: Array, upper: Array, half_m: float) -> None:
         super().__init__(len(upper), half_m)
         self.centres_m = centres_m[np.argsort(-upper, kind="stable")]  # (n, 2) of the boxes, the best bounded first
-        self.open_m2 = len(upper) * 4 * half_m**2
+        self.half_m = half_m
         self.log_open = log_sum(upper) + float(np.log(4 * half_m**2))  # bound of their mass [m2]
 
 

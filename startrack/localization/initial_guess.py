@@ -18,7 +18,6 @@ SMALL_BOX_M = 20.0  # half side up to which boxes are tested for allowed ground 
 TRACED_BELOW_M = 400.0  # half side; the horizons of smaller boxes may be traced instead of looked up
 LAST_HALF_M = {False: 20.0, True: 12.0}  # half side of the last boxes, looked up or traced; smaller ones rank no better
 EXPLAINED_NATS = -0.8  # mean over the sectors with rows; true positions: -0.2 to -0.65, the best false one seen: -1.2
-ACCEPTED_NATS = -1.0  # mean over the sectors with rows, of a position answered without a proof: less strict
 SCORED = 16  # of the last boxes, row by row
 CANDIDATES, APART_M = 3, 60.0  # positions that are climbed from, and how far they are apart
 LAST_STEP_M = 0.5
@@ -149,8 +148,3 @@ def _distinct(points_m: Array, order: Ints) -> list[int]:
 def is_likely_true(log_likelihood: float, likelihood: PositionLikelihood) -> bool:
     """Whether a position explains the evidence so well that no better one is looked for before the proof."""
     return log_likelihood > EXPLAINED_NATS * likelihood.sectors.occupied
-
-
-def explains_all_sectors(log_likelihood: float, likelihood: PositionLikelihood) -> bool:
-    """Whether a position explains the evidence as well as a true one: positions hundreds of metres away do not."""
-    return log_likelihood > ACCEPTED_NATS * likelihood.sectors.occupied

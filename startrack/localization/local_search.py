@@ -28,7 +28,7 @@ class LocalLikelihood:
     """Log-likelihood of positions within `half_m` of one, all rows counted.
 
     Rows too far from the skyline to change there are summed beforehand. Elevations may be replaced within the leeway
-    of `near`, which serves horizon bias and stretch; azimuths may be turned.
+    of `near`, which serves the horizon's bias.
     """
 
     terrain: Terrain
@@ -94,31 +94,6 @@ class LocalLikelihood:
                 step /= 2
         return position, best
 
-    def sums_by_sector(self, points_m: Array) -> Array:
-        """Sums of the rows' contributions (n, sectors), without ceilings, at positions (n, 2)."""
-        which = self.stars
-        e = self.evidence if isinstance(which, slice) else self.evidence.take(which)
-        sigma, sector = self.sigma_rad[which], self.sector[which]
-        settled = self._settled_at(np.ascontiguousarray(points_m), None) + self.ceiling
-        horizon = self.ground.horizon_rad(points_m[:, None], e.azimuth_rad)
-        found = np.array(np.broadcast_to(settled, (len(points_m), settled.shape[1])))
-        _add_rows(e.elevation_rad, e.llr, e.extended_nats, sigma, sector, horizon, found)
-        return found
-
-    def interpolated(self) -> LocalLikelihood:
-        """The same with horizons interpolated at all azimuths, also between two crests."""
-        return replace(self, ground=self.ground.interpolated())
-
-    def with_terrain(self, terrain: Terrain) -> LocalLikelihood:
-        """The same rows on another terrain, whose horizon differs by no more than the leeway."""
-        ground = terrain.near(self.centre_m, self.half_m, self.evidence.azimuth_rad)
-        return replace(self, terrain=terrain, ground=ground)
-
-    def with_turned_sky(self, rotvec_rad: Array) -> LocalLikelihood:
-        """The same rows under a sky turned by a rotation vector (3,); horizons are prepared at four corners only."""
-        e = turn_rays(self.evidence, rotvec_rad)
-        return replace(self, evidence=e, ground=self.terrain.near(self.centre_m, self.half_m, e.azimuth_rad, 2))
-
     def _scorer(self, elevation_rad: Array | None) -> Callable[[Array], Array]:
         """Positions (n, 2) to log-likelihoods (n,), by interpolated horizons, by disks, or by the terrain itself."""
         which = self.stars
@@ -168,18 +143,6 @@ def turn_rays(evidence: Evidence, rotvec_rad: Array) -> Evidence:
 def rays_of(evidence: Evidence) -> tuple[Array, Array]:
     """Azimuths and elevations (n,), (n,) [rad]."""
     return evidence.azimuth_rad, evidence.elevation_rad
-
-
-@njit(cache=True, nogil=True)
-def _add_rows(elevation, llr, extended, sigma, sector, horizon, found):
-    """Add to found (n, sectors) the rows' contributions where their horizons (n, rows) stand."""
-    for p in range(len(found)):
-        for k in range(len(llr)):
-            margin = elevation[k] - horizon[p, k]
-            if sigma[k] > 0.0:
-                found[p, sector[k]] += row_contribution(llr[k], extended[k], margin / sigma[k], 0)
-            elif margin > 0.0:
-                found[p, sector[k]] += llr[k]
 
 
 @njit(cache=True, nogil=True)

@@ -14,7 +14,6 @@ from startrack.types import Array, Bools, NotLocated
 REACH_SIGMAS = 6.0  # of the prior, to the edge of the area that is searched
 LEAST_REACH_M = 300.0  # of the first disk: in a smaller one few edges of evidence show which way is likelier
 EDGE_PART, ENLARGED = 0.7, 3.0  # of the disk's radius, where its edge begins; factor of the next radius
-PRIOR_NATS = 0.5 * REACH_SIGMAS**2  # by which the prior may favour a position that the evidence alone makes unlikely
 CONTRADICTED_SIGMAS = 4.5  # of evidence and prior together: a true prior is farther off once in 25,000 images
 
 
@@ -35,10 +34,6 @@ class SearchedNear(ForwardingTerrain):
         east, north, reach = self.searched
         inside = np.hypot(points_m[..., 0] - east, points_m[..., 1] - north) <= reach
         return np.asarray(inside & self.whole.allowed(points_m))
-
-    def reshaped(self, shape: Array) -> Terrain:
-        """As of the whole terrain, searched in the same disk."""
-        return SearchedNear(self.whole.reshaped(shape), self.near_prior, self.radius_m)
 
     def is_at_edge(self, found: Explored) -> bool:
         """Whether the likeliest position of a posterior is at the edge of the disk, within the search area."""

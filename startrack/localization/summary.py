@@ -1,55 +1,14 @@
-"""From a posterior on boxes to a fix: mean, covariance, circles and modes."""
+"""Sums over a posterior on boxes: moments and connected modes; and where its points may be."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from startrack.terrain import Terrain
-from startrack.types import Array, Bools, Fix, Ints, Mode, NotLocated
+from startrack.types import Array, Bools, Ints, NotLocated
 
 AMBIGUOUS_MASS = 0.01
-NEGLIGIBLE_MODE = 1e-4
 NEGLIGIBLE_BOX = 1e-12
-USELESS_FRACTION = 0.5  # a 95 % circle wider than this part of the search radius says nothing worth having
-
-
-def summarize(centres_m: Array, width_m: float, log_weight: Array, dropped_probability: float, terrain: Terrain) -> Fix:
-    """Fix from equal boxes (n, 2) of the given width with log-likelihoods (n,).
-
-    Position and covariance are those of the heaviest mode: one of half a per cent far away would drag the mean to where
-    nobody can be. The circles about the position hold their part of the whole posterior.
-
-    Raises NotLocated: outside_search_area where most of the posterior lies beyond the search radius, and
-    insufficient_geometry where the posterior is as wide as the area itself.
-    """
-    if not np.isfinite(log_weight).any():
-        raise NotLocated("no position in the search area is possible: widen [search] radius_m in the terrain file?")
-    weight = np.exp(log_weight - np.max(log_weight))
-    keep = require_inside(centres_m, weight, terrain) & (weight > NEGLIGIBLE_BOX)
-    centres_m, weight = centres_m[keep], weight[keep] / weight[keep].sum()
-    mean, covariance = _moments(centres_m, weight, width_m)
-    label = _modes(centres_m, weight, width_m, covariance)
-    modes = _list_modes(centres_m, weight, width_m, label)
-    if label.any():
-        main = label == np.argmax(np.bincount(label, weights=weight))
-        mean, covariance = _moments(centres_m[main], weight[main], width_m)
-        (main_999,) = _radii(centres_m[main] - mean, weight[main], (0.999,), width_m)
-        beyond = weight[np.linalg.norm(centres_m - mean, axis=1) > main_999 + width_m].sum()
-        ambiguous = bool(beyond > AMBIGUOUS_MASS and len(modes) > 1)
-    else:
-        ambiguous = False
-    radius95, radius999 = _radii(centres_m - mean, weight, (0.95, 0.999), width_m)
-    if not ambiguous and radius95 > USELESS_FRACTION * terrain.search_radius_m:
-        raise NotLocated("the rays leave most of the search area open: is the skyline in the picture?")
-    return Fix(
-        position_enu_m=camera_at(mean, terrain),
-        covariance_m2=covariance,
-        radius95_m=radius95,
-        radius999_m=radius999,
-        modes=modes,
-        ambiguous=ambiguous,
-        dropped_probability=dropped_probability,
-    )
 
 
 def require_inside(points_m: Array, weight: Array, terrain: Terrain) -> Bools:
@@ -65,11 +24,6 @@ def require_inside(points_m: Array, weight: Array, terrain: Terrain) -> Bools:
             reason="outside_search_area",
         )
     return np.asarray(~outside)
-
-
-def ground_of_fix(fix: Fix, terrain: Terrain) -> Terrain:
-    """The `terrain` with the shape that the evidence of a `fix` on it shows."""
-    return terrain.reshaped(np.array(fix.shape_1)) if any(fix.shape_1) else terrain
 
 
 def camera_at(point_m: Array, terrain: Terrain) -> Array:
@@ -106,16 +60,6 @@ def _mean_and_spread(centres_m: Array, weight: Array) -> tuple[Array, Array]:
     return mean, (centred * weight[:, None]).T @ centred
 
 
-def _radii(offsets_m: Array, weight: Array, masses: tuple[float, ...], width_m: float) -> tuple[float, ...]:
-    """Radii of the circles that hold these parts of the mass; of a single box it is the half diagonal."""
-    distance = np.sqrt(np.einsum("ni,ni->n", offsets_m, offsets_m))
-    order = np.argsort(distance)
-    running = np.cumsum(weight[order])
-    at = np.searchsorted(running, np.array(masses) * running[-1] * (1 - 1e-12))
-    # As much of the boxes across the circle lies within as beyond it: their size adds in squares, not in full.
-    return tuple(float(np.hypot(r, width_m * np.sqrt(0.5))) for r in distance[order[np.minimum(at, len(order) - 1)]])
-
-
 def _modes(centres_m: Array, weight: Array, width_m: float, covariance: Array) -> Ints:
     """Mode number (n,) of each box: boxes linked by gaps no wider than the posterior's local spread."""
     label = np.zeros(len(weight), dtype=np.int64)
@@ -125,7 +69,7 @@ def _modes(centres_m: Array, weight: Array, width_m: float, covariance: Array) -
         heaviest = label == np.argmax(np.bincount(label, weights=weight))
         _, covariance = _moments(centres_m[heaviest], weight[heaviest], width_m)
         gap = max(1.5 * width_m, sigmas * float(np.sqrt(np.linalg.eigvalsh(covariance)[1])))
-        label = _link_boxes(centres_m, gap)
+        label = link_points(centres_m, gap)
     return label
 
 
@@ -135,7 +79,7 @@ def _in_one_piece(centres_m: Array, covariance: Array, width_m: float) -> bool:
     return bool(np.diff(along).max(initial=0.0) < 1.5 * width_m)
 
 
-def _link_boxes(points_m: Array, gap_m: float) -> Ints:
+def link_points(points_m: Array, gap_m: float) -> Ints:
     """Labels (n,) of the connected groups of points closer than the gap.
 
     Points are first put into cells of the gap's size, so the cost does not grow with the number of pairs.
@@ -154,18 +98,3 @@ def _link_boxes(points_m: Array, gap_m: float) -> Ints:
     pairs = cKDTree(cells).query_pairs(2.9, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
     return np.asarray(connected_components(graph, directed=False)[1])[of].astype(np.int64)
-
-
-def _list_modes(centres_m: Array, weight: Array, width_m: float, label: Ints) -> tuple[Mode, ...]:
-    mass = np.bincount(label, weights=weight)
-    order = [int(i) for i in np.argsort(-mass, kind="stable") if mass[i] > NEGLIGIBLE_MODE]
-    total = float(mass[order].sum())
-    return tuple(_mode(centres_m[label == i], weight[label == i], width_m, total) for i in order)
-
-
-def _mode(centres_m: Array, weight: Array, width_m: float, total: float) -> Mode:
-    """The mode of these boxes, of which all modes together weigh `total`."""
-    mean, _ = _mean_and_spread(centres_m, weight)
-    radius95, radius999 = _radii(centres_m - mean, weight, (0.95, 0.999), width_m)
-    part = float(weight.sum()) / total
-    return Mode(east_m=float(mean[0]), north_m=float(mean[1]), weight=part, radius95_m=radius95, radius999_m=radius999)

@@ -41,9 +41,9 @@ LIGHT: tuple[Quantity, ...] = (
       shown=(Show("text", "stars", lambda p: f"; false alarm {chance_text(p)}"),
              Show("panel", "Residual", lambda p: f"   false alarm {chance_text(p)}"),
              Show("page", "Chance match", chance_text))),
-    Q("evidence.blocked", "deg", Measured, blocked_deg,
-      "list of [from, to]: azimuths in which something on no map hides stars above the skyline, and where no evidence "
-      "is taken; across north `to` is the smaller", {"type": "array", "items": numbers(2)}, optional=True,
+    Q("evidence.blocked", "deg", Located, blocked_deg,
+      "list of [from, to]: azimuths in which something on no map more likely hides the map's skyline than not; across "
+      "north `to` is the smaller", {"type": "array", "items": numbers(2)}, optional=True,
       shown=(Show("text", "evidence", blocked_text), Show("page", "Blocked azimuths", ranges_text))),
     Q("evidence.damage", "", Inputs, lambda v: None if v.damage is None else v.damage.cause,
       "what processing did to the pixels, where the evidence is measured on the frame itself; null: nothing shows",

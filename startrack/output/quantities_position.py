@@ -20,6 +20,7 @@ from startrack.output.values import (
     ambiguous_modes,
     carrying_azimuths,
     caution_text,
+    dominant_fact,
     ellipse,
     finite_or_none,
     lacking_circle,
@@ -29,11 +30,13 @@ from startrack.output.values import (
     protection_level_m,
     ranges_text,
     sigma_m,
+    unstated_record,
 )  # fmt: skip
 from startrack.stages import Located
 
 Q = Quantity
 SEARCHES: Schema = {"enum": ["proven", "beam", "approximate"]}
+UNSTATED = record({"fact": TEXT, "radius999_m_if_exact": POSITIVE})
 MODE = record(
     {"east_m": NUMBER, "north_m": NUMBER, "weight": CHANCE},
     optional={
@@ -103,6 +106,11 @@ POSITION: tuple[Quantity, ...] = (
       {"type": "array", "items": numbers(2)}, nullable=True, optional=True,
       shown=(Show("text", "protection", lambda a: f"; carried by azimuths {ranges_text(a)}"),
              Show("page", "Carried by azimuths", ranges_text))),
+    Q("position.unstated", "", Located, lambda v: unstated_record(v.fix),
+      "list of `fact`, `radius999_m_if_exact`: facts that nobody states, each with the 99.9 % circle if it were stated "
+      "and exact, the largest effect first", {"type": "array", "items": UNSTATED}, optional=True),
+    Q("position.unstated_text", "", Located, dominant_fact, "the fact whose statement gains most", derived=True,
+      shown=(Show("text", "error", " ({})"), Show("page", "99.9 % within, if stated", "{}"))),
     Q("position.latitude_deg", "deg", Located, latlon_deg(0), "of the same point", LATITUDE,
       columns=(Column("latitude_deg", "%.8f"),),
       shown=(Show("text", "position", "; latitude {:.6f}°"), Show("panel", "Lat, lon", "{:.5f}°"),

@@ -61,6 +61,9 @@ MEASURED: Schema = {
 
 WARNINGS: Schema = {"type": "array", "items": TEXT, "description": "what was found in the image's file and not used"}
 
+EXPLAIN: Schema = {
+    "type": "array", "items": TEXT, "description": "with --explain: what a refused or wide answer would need"
+}  # fmt: skip
 ADVICE: Schema = {"type": "string", "description": "what to do next, by the reason; absent where the status is ok"}
 
 
@@ -128,6 +131,7 @@ SCHEMAS: dict[str, Schema] = {
             "evidence": EVIDENCE,
             "sky": SKY,
             "clock": CLOCK,
+            "explain": EXPLAIN,
         },
         _FIX_RULES,
     ),

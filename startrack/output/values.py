@@ -14,6 +14,7 @@ from startrack.types import Array, Fix
 
 ARCSEC_PER_RAD = 648_000 / np.pi
 SMALLEST_CHANCE = 1e-100  # smaller probabilities are beyond the models that they come from
+DOMINANT = 3.0  # times the circle that a stated fact gives: the line of the terminal names it
 ROTATION_STEP_RAD = 1e-5  # of the numerical derivative of heading, pitch and roll
 _predicted_visible: WeakKeyDictionary[Located, int] = WeakKeyDictionary()
 At = Callable[[str], Any]  # from the path of a quantity to its value, None where it is not known
@@ -203,9 +204,23 @@ def exact_lens_text(included: bool) -> str:
     return "" if included else ", the lens taken as exact"
 
 
-def blocked_deg(measured: Measured) -> list[list[float]]:
-    """Ranges [from, to] of azimuth [deg] that are left out because something on no map blocks them."""
-    return [] if measured.blocked is None else np.round(np.degrees(measured.blocked.ranges_rad), 6).tolist()
+def blocked_deg(value: Located) -> list[list[float]]:
+    """Ranges [from, to] of azimuth [deg] in which something on no map more likely blocks the view than not."""
+    ranges = [] if value.blocked is None else value.blocked.ranges_rad
+    return [[round(float(edge), 6) for edge in np.degrees(one)] for one in ranges]
+
+
+def unstated_record(fix: Fix) -> list[dict[str, Any]]:
+    """The facts that no file states, with the 99.9 % circle [m] if each were exact."""
+    return [{"fact": one.fact, "radius999_m_if_exact": round(one.radius999_m_if_exact, 6)} for one in fix.unstated]
+
+
+def dominant_fact(at: At) -> str | None:
+    """The fact that widens the 99.9 % circle by more than three times, and the circle without it."""
+    unstated, radius_m = at("position.unstated"), at("position.radius999_m")
+    if not unstated or radius_m is None or not radius_m > DOMINANT * unstated[0]["radius999_m_if_exact"]:
+        return None
+    return f"{unstated[0]['radius999_m_if_exact']:.1f} m if {unstated[0]['fact']} were stated and exact"
 
 
 def ranges_text(ranges: list[list[float]]) -> str:

@@ -80,15 +80,17 @@ def _stem_and_kind(record: Path) -> tuple[str, str]:
     return stem, kind
 
 
-def write_results(outcome: Outcome, path: Path, *, plots: bool = True, write_record: bool = True) -> dict[str, Any]:
+def write_results(
+    outcome: Outcome, path: Path, *, plots: bool = True, write_record: bool = True, more: dict[str, Any] | None = None
+) -> dict[str, Any]:
     """The record of an `outcome`, written to `path` (such as NAME.fix.json) after tables, WCS and pictures.
 
-    `plots` and `write_record`: whether the pictures and the record are written. Raises BadInput where a file cannot
-    be written; none of them is then left.
+    `plots` and `write_record`: whether the pictures and the record are written; `more`: keys that are added to the
+    record. Raises BadInput where a file cannot be written; none of them is then left.
     """
     from startrack.output.record import record_of
 
-    record = record_of(outcome, _stem_and_kind(path)[1])
+    record = record_of(outcome, _stem_and_kind(path)[1]) | (more or {})
     try:
         _write_companions(outcome, path, plots=plots)
         if write_record:

@@ -28,6 +28,7 @@ def render(scene: Scene, *, rng: np.random.Generator) -> tuple[Exposure, Truth]:
         pixels_adu=read_out(electrons, scene.sensor, rng=rng),
         name=scene.name,
         time_utc=scene.time_utc,
+        time_sigma_s=0.0,
         exposure_s=scene.exposure_s,
         camera=scene.camera_ref or scene.camera.name,
         terrain=scene.terrain_ref or (scene.terrain.name if scene.terrain else None),

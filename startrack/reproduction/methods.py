@@ -96,8 +96,7 @@ def _solve_kua(points: Array, seen: list[Bools], wall_m: float, radius_m: float)
 
 
 def _solve_ours(task: Task, sky: Sky, seen: list[Bools], truth: Array) -> Chunk:
-    # The simulator has no boulders that the map lacks, so the evidence of a sector needs no cap.
-    localizer = ExactPosterior(sector_epsilon=0.0)
+    localizer = ExactPosterior()
     cylinder = crater(task.aspect_ratio)
     evidence = [
         task.mistakes.evidence(sky, task.mistakes.draw_list(one, task.seed, task.sky, task.start + k))

@@ -9,28 +9,33 @@ from startrack.terrain.horizon_posts import NO_POST
 from startrack.terrain.protocol import ForwardingTerrain
 from startrack.types import Array, Ints
 
-SHAPE_SIGMAS = 4.0  # of a terrain's shape, beyond which none is drawn
+MOST_SIGMAS = 4.0  # of an error of the shape, beyond which none is drawn
 
 
 def draw_ground(terrain: Terrain, *, rng: np.random.Generator) -> Terrain:
-    """The ground below a camera, drawn by `rng` where the file of the `terrain` states errors; else the terrain."""
-    if any(terrain.shape_sigma):
-        terrain = terrain.reshaped(_draw_shape(terrain, rng))
-    if terrain.common_sigma_rad > 0.0 or terrain.height_sigma_m > 0.0:
-        return ErringGround(terrain, rng)
-    return terrain
+    """The ground below a camera, drawn by `rng` where the `terrain` has errors; else the terrain.
+
+    Errors of the shape are drawn from their stated or default sigmas, without the gross parts.
+    """
+    errors, shared_sigma_rad = terrain.shape_errors, terrain.common_sigma_rad
+    if any(error.name == "bias_rad" for error in errors):
+        shared_sigma_rad = 0.0  # it is drawn with the shape
+    ground = terrain.with_shape(_draw_shape(terrain, rng)) if errors else terrain
+    if shared_sigma_rad > 0.0 or terrain.height_sigma_m > 0.0:
+        return ErringGround(ground, rng, shared_sigma_rad)
+    return ground
 
 
 class ErringGround(ForwardingTerrain):
     """The terrain `whole` with the horizon of one camera wrong by drawn errors.
 
     Each post about a crest errs by itself and lifts the horizon to first order (the choice of the crest is that of the
-    map); the error that all azimuths share is drawn too, with that of the camera's own ground.
+    map); an error that all azimuths share, of `shared_sigma_rad`, is drawn too.
     """
 
-    def __init__(self, whole: Terrain, rng: np.random.Generator) -> None:
+    def __init__(self, whole: Terrain, rng: np.random.Generator, shared_sigma_rad: float) -> None:
         super().__init__(whole)
-        self._shared_rad = float(rng.normal(0.0, whole.common_sigma_rad))
+        self._shared_rad = float(rng.normal(0.0, shared_sigma_rad)) if shared_sigma_rad > 0.0 else 0.0
         self._rng = rng
         self._post, self._error_m = np.zeros(0, dtype=np.int64), np.zeros(0)  # drawn so far; posts ascending
 
@@ -54,8 +59,8 @@ class ErringGround(ForwardingTerrain):
 
 
 def _draw_shape(terrain: Terrain, rng: np.random.Generator) -> Array:
-    """A shape (2,) for `reshaped`, from the terrain's prior: drawn in a box, and kept as often as it is likely."""
-    while True:
-        shape = SHAPE_SIGMAS * np.array(terrain.shape_sigma) * rng.uniform(-1.0, 1.0, 2)
-        if rng.random() < np.exp(terrain.log_prior(shape)):
-            return np.asarray(shape)
+    """Values (k,) for `with_shape`, normal within some sigmas: beyond them a crater may have no depth."""
+    drawn = rng.standard_normal(len(terrain.shape_errors))
+    while (far := np.abs(drawn) > MOST_SIGMAS).any():
+        drawn[far] = rng.standard_normal(np.count_nonzero(far))
+    return np.array([error.sigma for error in terrain.shape_errors]) * drawn

@@ -48,7 +48,7 @@ def simulate_rays(
     terrain: Terrain | None = None,
     *,
     time_utc: datetime | None = None,
-    time_sigma_s: float = TIME_SIGMA_S,
+    time_sigma_s: float | None = TIME_SIGMA_S,
     photometry: StarEvidence | None = None,
     rng: np.random.Generator,
 ) -> StarRays:
@@ -61,7 +61,7 @@ def simulate_rays(
         catalog: whose stars are measured.
         terrain: the map (None: the scene's terrain, which is the ground).
         time_utc: the stated time (None: the true one).
-        time_sigma_s: its stated error.
+        time_sigma_s: its stated error (None: nobody states it).
         photometry: settings of the evidence.
         rng: of the noise.
 
@@ -98,7 +98,9 @@ def simulate_rays(
     rays = measured.azimuth_rad, measured.elevation_rad
     if not terrain.is_informative(*rays).all():
         measured = measured.masked(terrain.mask_reason(*rays))
-    return StarRays(terrain=terrain, R_enu_icrs=R_enu, clock=clock_at(site, when, time_sigma_s), light=measured)
+    sigma_s = TIME_SIGMA_S if time_sigma_s is None else time_sigma_s
+    clock = clock_at(site, when, sigma_s, is_stated=time_sigma_s is not None)
+    return StarRays(terrain=terrain, R_enu_icrs=R_enu, clock=clock, light=measured)
 
 
 def _visible_stars(scene: Scene, ground: Terrain) -> _Frame:

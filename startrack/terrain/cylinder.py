@@ -2,27 +2,44 @@
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from startrack.declaration import Number
+from startrack.declaration import Flag, Number
 from startrack.frames import Site
+from startrack.terrain.circle import distance_bounds, distance_to_circle, horizons_of_circle
+from startrack.terrain.deformed_crater import DeformedCrater, slopes_of_round_crater
 from startrack.terrain.protocol import Terrain
+from startrack.terrain.shape import CAMERA_ERROR, DEPTH, DIAMETER, ELLIPSE, RIM_TILT, ShapeError, by_name, select_slopes
 from startrack.types import Array, BadInput, Bools
 
 MAX_LENGTH_M = 1e7  # five times the Moon's radius
 MAX_SHAPE_SIGMA = 0.2  # of depth and diameter; the posterior of the shape is expanded about the stated one
+MAX_TILT_DEG = 5.0
 LENGTH = Number(low=0.0, high=MAX_LENGTH_M, above=True)
 CAMERA_HEIGHT = Number(low=0.0, high=MAX_LENGTH_M)
-_SIGMA = Number(low=0.0, high=MAX_LENGTH_M, description="if absent 0, with a warning")
-CYLINDER_KEYS = {  # of [cylinder] in a terrain file, and of the class
-    "diameter_m": replace(LENGTH, required=True),
-    "depth_m": replace(LENGTH, required=True),
-    "depth_sigma_m": _SIGMA,
-    "diameter_sigma_m": _SIGMA,
+_SIGMA = Number(low=0.0, high=MAX_LENGTH_M)
+CAMERA_SIGMA = replace(_SIGMA, description="if absent 0.02 above a height map, and 0 in a cylinder")
+_SIZES = {"diameter_m": replace(LENGTH, required=True), "depth_m": replace(LENGTH, required=True)}
+_SIGMAS = {
+    "depth_sigma_m": replace(_SIGMA, description="if absent 0.1 % of it, and with probability 1 % 1 %"),
+    "diameter_sigma_m": replace(_SIGMA, description="if absent 0.1 % of it, and with probability 1 % 1 %"),
+    "ellipse_sigma_1": Number(low=0.0, high=0.1, description="relative, of each of the rim's two terms; if absent "
+                              "0.0005, and with probability 1 % 0.005"),
+}  # fmt: skip
+CYLINDER_KEYS = {  # of [cylinder] in a terrain file
+    **_SIZES,
+    "exact": Flag(description="true: a model, without errors of its shape"),
+    **_SIGMAS,
+    "rim_tilt_sigma_deg": Number(low=0.0, high=MAX_TILT_DEG, description="of each of two axes; if absent 0.002, and "
+                                 "with probability 0.5 % 0.1"),
+}  # fmt: skip
+_CLASS_SIGMAS = {
+    **_SIGMAS,
+    "rim_tilt_sigma_rad": Number(low=0.0, high=float(np.radians(MAX_TILT_DEG))),
+    "camera_height_sigma_m": CAMERA_SIGMA,
 }
 
 
@@ -41,14 +58,17 @@ class Cylinder(Terrain):
     depth_m: float
     camera_height_m: float = 0.0
     search_radius_m: float = np.inf
-    depth_sigma_m: float = 0.0  # standard deviations; with either, the shape is estimated with the position
-    diameter_sigma_m: float = 0.0
-    unstated_errors: tuple[str, ...] = ()
+    depth_sigma_m: float | None = 0.0  # standard deviations; None: not stated, see `terrain.shape`
+    diameter_sigma_m: float | None = 0.0
+    ellipse_sigma_1: float | None = 0.0  # relative to the radius, of each of two terms
+    rim_tilt_sigma_rad: float | None = 0.0  # of each of two axes
+    camera_height_sigma_m: float = 0.0
     axisymmetric = True
     horizon_cost = 0.02
 
     def __post_init__(self) -> None:
-        declared = {**CYLINDER_KEYS, "camera_height_m": CAMERA_HEIGHT}
+        stated = {key: kind for key, kind in _CLASS_SIGMAS.items() if getattr(self, key) is not None}
+        declared = {**_SIZES, "camera_height_m": CAMERA_HEIGHT, **stated}
         if self.search_radius_m != np.inf:
             declared["search_radius_m"] = LENGTH
         try:
@@ -61,7 +81,7 @@ class Cylinder(Terrain):
                 "bad_terrain", f"camera_height_m is {self.camera_height_m:g}: the camera must be below the rim"
             )
         for key, size in (("depth_sigma_m", self.depth_m), ("diameter_sigma_m", self.diameter_m)):
-            if getattr(self, key) >= MAX_SHAPE_SIGMA * size:
+            if (getattr(self, key) or 0.0) >= MAX_SHAPE_SIGMA * size:
                 raise BadInput("bad_terrain", f"{key} must be below {MAX_SHAPE_SIGMA * size:g} m, a fifth of it")
 
     @property
@@ -85,29 +105,18 @@ class Cylinder(Terrain):
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad]; pi/2 from inside the wall. See `Terrain`."""
-        return np.arctan2(self.wall_m, _distance_to_circle(points_m, azimuths_rad, self.radius_m))
+        points, azimuths = np.asarray(points_m, dtype=np.float64), np.asarray(azimuths_rad, dtype=np.float64)
+        if points.ndim == 3 and points.shape[1] == 1 and azimuths.ndim == 1:  # each point with each azimuth
+            return np.asarray(horizons_of_circle(points[:, 0], azimuths, self.radius_m, self.wall_m))
+        return np.arctan2(self.wall_m, distance_to_circle(points, azimuths, self.radius_m))
 
     def horizon_bounds_rad(
         self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
     ) -> tuple[Array, Array]:
-        """Bounds of the horizon over boxes [rad], from circles grown and shrunk by the half diagonal.
-
-        A point within r of the centre c sees the circle of radius R no nearer than c sees the one of radius R - r, and
-        no farther than c sees the one of radius R + r. Over azimuths the distance grows steadily from the side that the
-        point is on to the opposite one.
-        """
-        reach = np.sqrt(2.0) * np.asarray(half_m)
-        if not np.any(azimuth_half_rad):
-            nearest = _distance_to_circle(centres_m, azimuths_rad, self.radius_m - reach)
-            farthest = _distance_to_circle(centres_m, azimuths_rad, self.radius_m + reach)
-            return np.arctan2(self.wall_m, farthest), np.arctan2(self.wall_m, nearest)
-        x, y = centres_m[..., 0], centres_m[..., 1]
-        turn = np.abs((azimuths_rad - np.arctan2(x, y) + np.pi) % (2 * np.pi) - np.pi)
-        off_centre = np.hypot(x, y)
-        near_side = np.cos(np.maximum(turn - azimuth_half_rad, 0.0))
-        far_side = np.cos(np.minimum(turn + azimuth_half_rad, np.pi))
-        nearest = _chord(off_centre * near_side, off_centre, self.radius_m - reach)
-        farthest = _chord(off_centre * far_side, off_centre, self.radius_m + reach)
+        """Bounds of the horizon over boxes [rad], from circles grown and shrunk by the half diagonal."""
+        nearest, farthest = distance_bounds(
+            centres_m, half_m, azimuths_rad, azimuth_half_rad, self.radius_m, self.radius_m
+        )
         return np.arctan2(self.wall_m, farthest), np.arctan2(self.wall_m, nearest)
 
     def ground_m(self, points_m: Array) -> Array:
@@ -120,31 +129,39 @@ class Cylinder(Terrain):
         return np.asarray((away < self.radius_m) & (away <= self.reach_m))
 
     @property
-    def shape_sigma(self) -> tuple[float, float]:  # type: ignore[override]
-        """Relative sigma of the steepness depth / diameter, and of the diameter."""
-        larger = self.diameter_sigma_m / self.diameter_m
-        return float(np.hypot(self.depth_sigma_m / self.depth_m, larger)), larger
+    def shape_errors(self) -> tuple[ShapeError, ...]:  # type: ignore[override]
+        """Errors of depth and width (relative), ellipse, tilt of the rim, and height of the camera."""
+        depth = None if self.depth_sigma_m is None else self.depth_sigma_m / self.depth_m
+        diameter = None if self.diameter_sigma_m is None else self.diameter_sigma_m / self.diameter_m
+        return (
+            *DEPTH.shape_errors(depth), *DIAMETER.shape_errors(diameter), *ELLIPSE.shape_errors(self.ellipse_sigma_1),
+            *RIM_TILT.shape_errors(self.rim_tilt_sigma_rad), *CAMERA_ERROR.shape_errors(self.camera_height_sigma_m),
+        )  # fmt: skip
 
-    def reshaped(self, shape: Array) -> Cylinder:
-        """The crater shape[0] steeper and shape[1] larger (relative)."""
-        steeper, larger = float(shape[0]), float(shape[1])
-        other = copy(self)  # `replace` would check it, and the search tries craters beyond the limits of a stated one
-        object.__setattr__(other, "depth_m", self.depth_m * (1 + steeper) * (1 + larger))
-        object.__setattr__(other, "diameter_m", self.diameter_m * (1 + larger))
-        return other
+    def shape_slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """In closed form; see `Terrain`. Zero from inside the wall."""
+        shape = np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
+        errors = self.shape_errors
+        if not errors:
+            return np.zeros((0, *shape))
+        slopes = slopes_of_round_crater(
+            points_m, azimuths_rad, radius_m=self.radius_m, depth_m=self.depth_m, camera_height_m=self.camera_height_m
+        )
+        return select_slopes(errors, slopes, shape)
+
+    def with_shape(self, values: Array) -> DeformedCrater:
+        """The crater with these errors; see `Terrain`."""
+        errors = by_name(self.shape_errors, values)
+        return DeformedCrater(
+            name=self.name, site=self.site, search_radius_m=self.search_radius_m,
+            diameter_m=self.diameter_m * (1.0 + errors.pop("diameter_1", 0.0)),
+            depth_m=self.depth_m * (1.0 + errors.pop("depth_1", 0.0)),
+            camera_height_m=self.camera_height_m + errors.pop("camera_height_m", 0.0), **errors,
+        )  # fmt: skip
 
     def facts(self) -> dict[str, Any]:
         """Diameter and depth, as JSON values."""
         return {"kind": "cylinder", "diameter_m": self.diameter_m, "depth_m": self.depth_m}
-
-    def log_prior(self, shape: Array) -> float:
-        """Normal priors of depth and diameter, independent of each other."""
-        crater, z2 = self.reshaped(shape), 0.0
-        if self.depth_sigma_m > 0:
-            z2 += ((crater.depth_m - self.depth_m) / self.depth_sigma_m) ** 2
-        if self.diameter_sigma_m > 0:
-            z2 += ((crater.diameter_m - self.diameter_m) / self.diameter_sigma_m) ** 2
-        return -0.5 * z2
 
     def visible_disks(self, azimuths_rad: Array, elevations_rad: Array) -> tuple[Array, float]:
         """A ray is visible from p exactly where |p + rho u| < R, rho = wall / tan e, u its horizontal direction.
@@ -155,18 +172,3 @@ class Cylinder(Terrain):
         rho = np.divide(self.wall_m, tan, out=np.full_like(tan, 1e12), where=tan > 0)
         u = np.stack([np.sin(azimuths_rad), np.cos(azimuths_rad)], axis=-1)
         return -np.minimum(rho, 1e12)[:, None] * u, self.radius_m
-
-
-def _distance_to_circle(points_m: Array, azimuths_rad: Array, radius_m: Array | float) -> Array:
-    """Distance from p along the azimuth to the far side of the origin's circle; 0 where there is none ahead."""
-    points_m = np.asarray(points_m, dtype=np.float64)
-    x, y = points_m[..., 0], points_m[..., 1]
-    return _chord(x * np.sin(azimuths_rad) + y * np.cos(azimuths_rad), np.hypot(x, y), radius_m)
-
-
-def _chord(along_m: Array, off_centre_m: Array, radius_m: Array | float) -> Array:
-    """Distance to the circle ahead of a point `off_centre_m` from its middle, `along_m` of that in the direction."""
-    inner = np.square(np.maximum(radius_m, 0.0)) - np.square(off_centre_m)
-    root = np.sqrt(np.maximum(np.square(along_m) + inner, 0.0))
-    # Outside the circle (inner < 0) the rim no longer surrounds the point: the wall is overhead, at distance 0.
-    return np.where(inner > 0, np.maximum(root - along_m, 0.0), 0.0)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from startrack.frames import Site
 from startrack.terrain import table_cache as cache
 from startrack.terrain import tracing
+from startrack.terrain.deformed_map import DeformedMap, slopes_of_map
 from startrack.terrain.horizon_interpolator import NODES_ACROSS, HorizonInterpolator
 from startrack.terrain.horizon_posts import HorizonPosts, cell_posts, post_positions
 from startrack.terrain.horizon_sigma import HorizonSigma
@@ -21,6 +22,7 @@ from startrack.terrain.masks import GLARE, OFF_MAP, Sectors, describe_masks, in_
 from startrack.terrain.protocol import Progress, Terrain
 from startrack.terrain.pyramid import Ground, ground_up_m, pack_maps
 from startrack.terrain.raster import Projection, Raster
+from startrack.terrain.shape import BIAS, CAMERA_ERROR, STRETCH, VERTICAL, ShapeError, by_name
 from startrack.terrain.table_building import load_or_build_table
 from startrack.types import Array, BadInput, Bools, Ints
 
@@ -47,6 +49,9 @@ class HeightMap(Terrain):
     search_radius_m: float = 10_000.0
     height_sigma_m: float = 0.0  # of single posts, independent of each other
     horizon_sigma_common_rad: float | None = None  # of an error that all azimuths share; None: see common_sigma_rad
+    stretch_sigma_1: float | None = 0.0  # of the factor of tan H, less 1; None: not stated, see `terrain.shape`
+    vertical_sigma_rad: float | None = 0.0  # of a tilt of the whole map, of each of two axes
+    camera_height_sigma_m: float | None = 0.0
     most_slope_rad: float = np.pi / 2  # a rover does not stand on steeper ground
     glare_rad: Sectors = ()  # lit by the Sun: no evidence there
     unstated_errors: tuple[str, ...] = ()
@@ -94,6 +99,23 @@ class HeightMap(Terrain):
         own = float(np.median(self._sigma.cells_rad[self._search_area_cells])) if self.height_sigma_m else 0.0
         known = self.horizon_sigma_common_rad
         return float(np.hypot(own, COMMON_PER_POST * own if known is None else known))
+
+    @cached_property
+    def shape_errors(self) -> tuple[ShapeError, ...]:  # type: ignore[override]
+        """Bias, stretch, tilt of the vertical, and height of the camera. The bias needs the table of horizons."""
+        return (
+            *BIAS.shape_errors(self.common_sigma_rad), *STRETCH.shape_errors(self.stretch_sigma_1),
+            *VERTICAL.shape_errors(self.vertical_sigma_rad), *CAMERA_ERROR.shape_errors(self.camera_height_sigma_m),
+        )  # fmt: skip
+
+    def shape_slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """From the traced horizon and the distance of its crest; see `Terrain`."""
+        tan, distance, _ = self.horizons(points_m, azimuths_rad)
+        return slopes_of_map(self.shape_errors, tan, 1.0 / distance, azimuths_rad)
+
+    def with_shape(self, values: Array) -> DeformedMap:
+        """The ground with these errors; see `Terrain`."""
+        return DeformedMap(self, **by_name(self.shape_errors, values))
 
     @cached_property
     def _search_area_cells(self) -> Bools:

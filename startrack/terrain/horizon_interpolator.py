@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from startrack.terrain import tracing
+from startrack.terrain.deformed_map import slopes_of_map
 from startrack.terrain.protocol import ForwardingTerrain, Interpolation
 from startrack.types import Array, Bools, Ints
 
@@ -113,6 +114,14 @@ class HorizonInterpolator(ForwardingTerrain):
         return np.broadcast_to(
             self._sigma_rad[column], np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
         )
+
+    def shape_slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """With the interpolated horizon, and the crests' distance in the middle; see `Terrain`."""
+        column, known = self.column(azimuths_rad)
+        if not np.all(known):
+            return self.whole.shape_slopes_rad(points_m, azimuths_rad)
+        tan = np.tan(self.horizon_rad(points_m, azimuths_rad))
+        return slopes_of_map(self.whole.shape_errors, tan, self.per_height[column], azimuths_rad)
 
     def interpolated_part(self, points_m: Array, azimuths_rad: Array) -> float:
         """See `Terrain`."""

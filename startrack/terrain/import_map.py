@@ -17,12 +17,14 @@ from startrack.terrain.map_comparison import crest_angle_rad_per_m
 from startrack.terrain.map_error import carried_spacing, error_between_posts_m
 from startrack.terrain.raster import Raster
 from startrack.terrain.raster_io import read_map
+from startrack.terrain.shape import CAMERA_ERROR, STRETCH, VERTICAL
 from startrack.terrain.stated_errors import StatedErrors, measure_errors
 from startrack.types import BadInput
 
 if TYPE_CHECKING:
     from startrack.terrain.height_map import HeightMap
 
+MAP_SIGMAS = {"stretch_sigma_1": STRETCH.sigma, "vertical_sigma_deg": round(float(np.degrees(VERTICAL.sigma)), 9)}
 RIM_RADII = 1.5  # of the search area: most of the rim is nearer
 MAX_POST_RADII = 0.2  # of the search area: with posts further apart its shape is not resolved
 
@@ -77,8 +79,9 @@ def import_maps(
     values = {
         "format": 1, "name": output.stem, "body": "moon",
         "origin": {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg},
-        "dem": {"file": [path.name for path in files], "height_sigma_m": errors.height_sigma_m},
-        "rover": {"camera_height_m": float(camera_height_m)}, "search": {"radius_m": float(radius_m)},
+        "dem": {"file": [path.name for path in files], "height_sigma_m": errors.height_sigma_m, **MAP_SIGMAS},
+        "rover": {"camera_height_m": float(camera_height_m), "camera_height_sigma_m": CAMERA_ERROR.sigma},
+        "search": {"radius_m": float(radius_m)},
     }  # fmt: skip
     _write_terrain(output, values, errors, dict(zip(files, crops, strict=True)))
     warnings = [*errors.warnings, *spacing_warnings(crops, radius_m)]

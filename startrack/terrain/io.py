@@ -12,8 +12,9 @@ import numpy as np
 from startrack.declaration import Choice, Either, List, Number, Table, Text
 from startrack.files import parse_toml, printable, read_text, resolve_named
 from startrack.frames import Site
-from startrack.terrain.cylinder import CAMERA_HEIGHT, CYLINDER_KEYS, LENGTH, MAX_LENGTH_M, Cylinder
+from startrack.terrain.cylinder import CAMERA_HEIGHT, CAMERA_SIGMA, CYLINDER_KEYS, LENGTH, MAX_LENGTH_M, Cylinder
 from startrack.terrain.protocol import Terrain
+from startrack.terrain.shape import CYLINDER_FACTS
 from startrack.types import BadInput
 
 DEFAULT_MAP_RADIUS_M = 10_000.0  # of the search area on height maps
@@ -47,13 +48,21 @@ KEYS = Table(
                                          description="of single posts, independent of each other; if absent 0, with "
                                          "a warning"),
                 "horizon_sigma_deg": Number(low=0.0, high=9.99, description="of an error that all azimuths share"),
+                "stretch_sigma_1": Number(low=0.0, high=0.2, description="of the factor of tan of the horizon, less 1; "
+                                          "if absent 0, and with probability 0.5 % 0.005"),
+                "vertical_sigma_deg": Number(low=0.0, high=5.0,
+                                             description="of a tilt of the whole map, of each of two axes; if absent "
+                                             "0.0005, and with probability 0.5 % 0.02"),
                 "scale": Number(low=-1e6, high=1e6, description="metres per unit, where the files do not state it"),
                 "offset_m": Number(low=-MAX_LENGTH_M, high=MAX_LENGTH_M,
                                    description="height of value 0, where the files do not state it"),
             },
         ),
         "rover": Table(
-            keys={"camera_height_m": replace(CAMERA_HEIGHT, default=DEFAULT_CAMERA_HEIGHT_M)}
+            keys={
+                "camera_height_m": replace(CAMERA_HEIGHT, default=DEFAULT_CAMERA_HEIGHT_M),
+                "camera_height_sigma_m": CAMERA_SIGMA,
+            }
         ),
         "search": Table(
             keys={
@@ -138,16 +147,27 @@ def terrain_from_dict(values: dict[str, Any], default_name: str = "terrain", fol
 
 
 def _make_cylinder(keys: dict[str, Any], name: str, site: Site) -> Cylinder:
-    cylinder, search = keys["cylinder"], keys.get("search", {})
-    missing = tuple(key for key in ("depth_sigma_m", "diameter_sigma_m") if key not in cylinder)
+    cylinder, search, rover = dict(keys["cylinder"]), keys.get("search", {}), keys.get("rover", {})
+    sigmas = {key: cylinder.pop(key, None) for key in [fact.key for fact in CYLINDER_FACTS]}
+    if cylinder.pop("exact", False):
+        wrong = [key for key, sigma in sigmas.items() if sigma]
+        if wrong:
+            raise BadInput("bad_terrain", f"cylinder.exact is true, but {wrong[0]} is not 0: leave one of them out")
+        sigmas = dict.fromkeys(sigmas, 0.0)
     return Cylinder(
         name=name,
         site=site,
-        camera_height_m=keys.get("rover", {}).get("camera_height_m", DEFAULT_CAMERA_HEIGHT_M),
+        camera_height_m=rover.get("camera_height_m", DEFAULT_CAMERA_HEIGHT_M),
         search_radius_m=search.get("radius_m", cylinder["diameter_m"] / 2),
-        unstated_errors=missing,
+        camera_height_sigma_m=rover.get("camera_height_sigma_m", 0.0),
+        rim_tilt_sigma_rad=_radians(sigmas.pop("rim_tilt_sigma_deg")),
         **cylinder,
+        **sigmas,
     )
+
+
+def _radians(degrees: float | None) -> float | None:
+    return None if degrees is None else float(np.radians(degrees))
 
 
 def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) -> Terrain:
@@ -156,19 +176,21 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
 
     if site.body != "moon":
         raise BadInput("bad_terrain", "[dem] maps are heights above the Moon's sphere: body must be moon")
-    dem, search = keys["dem"], keys.get("search", {})
+    dem, search, rover = keys["dem"], keys.get("search", {}), keys.get("rover", {})
     scaling = {key: dem[key] for key in ("scale", "offset_m") if key in dem}
     near = site.latitude_rad, site.longitude_rad
-    common_deg = dem.get("horizon_sigma_deg")
     return HeightMap(
         name=name,
         site=site,
         maps=tuple(read_map(file, near=near, **scaling) for file in _map_files(keys, folder)),
-        camera_height_m=keys.get("rover", {}).get("camera_height_m", DEFAULT_CAMERA_HEIGHT_M),
+        camera_height_m=rover.get("camera_height_m", DEFAULT_CAMERA_HEIGHT_M),
         search_radius_m=search.get("radius_m", DEFAULT_MAP_RADIUS_M),
         height_sigma_m=dem.get("height_sigma_m", 0.0),
         unstated_errors=() if "height_sigma_m" in dem else ("height_sigma_m",),
-        horizon_sigma_common_rad=None if common_deg is None else float(np.radians(common_deg)),
+        horizon_sigma_common_rad=_radians(dem.get("horizon_sigma_deg")),
+        stretch_sigma_1=dem.get("stretch_sigma_1"),
+        vertical_sigma_rad=_radians(dem.get("vertical_sigma_deg")),
+        camera_height_sigma_m=rover.get("camera_height_sigma_m"),
         most_slope_rad=float(np.radians(search.get("max_slope_deg", 90.0))),
         glare_rad=tuple((float(np.radians(a)), float(np.radians(b))) for a, b in search.get("glare_deg", ())),
     )

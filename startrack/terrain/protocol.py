@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from startrack.frames import Site
 from startrack.terrain.horizon_posts import HorizonPosts
 from startrack.terrain.raster import STEREOGRAPHIC, Projection
-from startrack.types import Array, BadInput, Bools, Ints
+from startrack.terrain.shape import ShapeError
+from startrack.types import Array, Bools, Ints
 
 Progress = Callable[[int, int], None]  # parts done, of how many
-
-BOUNDS_ROUNDING_RAD = 1e-9  # by which a least horizon may exceed the greatest
 
 
 class Interpolation(NamedTuple):
@@ -58,7 +57,7 @@ class Terrain(ABC):
     finest_m: float = 0.05  # half side of the smallest box of positions that the ground distinguishes
     axisymmetric: bool = False  # whether a turn of the sky about the vertical only turns the position
     horizon_cost: float = 1.0  # of one horizon, beside one traced on a height map: the search has a budget of these
-    shape_sigma: tuple[float, float] = (0.0, 0.0)  # relative, of steepness and of size: see `reshaped`
+    shape_errors: tuple[ShapeError, ...] = ()  # errors that all azimuths share: those that may differ from zero
     rim_radius_m: float | None = None  # of a circular rim about the origin, drawn on maps instead of the relief
     table_path: Path | None = None  # file of the table that `prepare` computes; None where it computes none
     unstated_errors: tuple[str, ...] = ()  # keys of errors that the terrain file leaves out: they count as zero
@@ -160,13 +159,22 @@ class Terrain(ABC):
         """
         return self
 
-    def reshaped(self, shape: Array) -> Terrain:
-        """The terrain shape[0] steeper and shape[1] larger (relative); only where `shape_sigma` is not zero."""
-        return self
+    def shape_slopes_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """Change (k, ...) [rad] of the horizon by one unit of each of the k `shape_errors`, to first order.
 
-    def log_prior(self, shape: Array) -> float:
-        """Logarithm of the prior density of `reshaped(shape)`, beside that of the terrain as it is."""
-        return 0.0
+        Seen from the points (..., 2) [m] at the azimuths (...) [rad].
+        """
+        return np.zeros((0, *np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))))
+
+    def with_shape(self, values: Array) -> Terrain:
+        """The ground that has the errors `values` (k,), in the units of the k `shape_errors`, exactly.
+
+        For simulation: its horizon may cost much, and its bounds may be wide. Raises ValueError for another number of
+        values.
+        """
+        if np.size(values):
+            raise ValueError(f"with_shape: {np.size(values)} values for a terrain without errors of its shape")
+        return self
 
     def visible_disks(self, azimuths_rad: Array, elevations_rad: Array) -> tuple[Array, float] | None:
         """Centres (n, 2) and radius [m] of the disks of ground from which the rays (n,) are visible.
@@ -203,91 +211,31 @@ class Terrain(ABC):
         return {"kind": "other"}
 
 
-def require_terrain(given: Any) -> Terrain:
-    """`given`, if it is a terrain: of a class derived from Terrain, or with every member of one.
-
-    The one check of the members of a user's object; `require_bounds` and `require_horizons` check the values. All other
-    code relies on the protocol. Raises BadInput (bad_terrain) that names the required methods which are missing.
-    """
-    members = [name for name in dir(Terrain) if not name.startswith("_")]
-    if isinstance(given, Terrain) or all(hasattr(given, name) for name in members):
-        return given  # type: ignore[no-any-return]
-    if isinstance(given, str):
-        raise BadInput("bad_terrain", f"{given!r} is a text, no terrain: give startrack.load_terrain({given!r})")
-    missing = [name for name in sorted(Terrain.__abstractmethods__) if not hasattr(given, name)]
-    lacks = f" (it has no {', '.join(missing)})" if missing else ""
-    raise BadInput(
-        "bad_terrain",
-        f"{type(given).__name__} is no terrain{lacks}: give a file, a name, or an object of a class derived from "
-        "startrack.Terrain",
-    )
-
-
-def require_bounds(terrain: Terrain, low_rad: Array, high_rad: Array) -> None:
-    """Raise BadInput (bad_terrain) unless what `horizon_bounds_rad` of a `terrain` gave are bounds.
-
-    `low_rad` and `high_rad` (...): the least and greatest horizons. The search asks for those of the whole search area
-    first, so that an error in a user's terrain is named before it misleads the search.
-    """
-    wrong = ~(low_rad <= high_rad + BOUNDS_ROUNDING_RAD)
-    if not wrong.any():
-        return
-    nan = np.isnan(low_rad) | np.isnan(high_rad)
-    fault = "NaN" if nan.any() else "least horizons above the greatest"
-    count = np.count_nonzero(nan if nan.any() else wrong)
-    raise BadInput(
-        "bad_terrain",
-        f"{_described(terrain)}: horizon_bounds_rad gives {fault} for {count} of {wrong.size} sectors of boxes",
-    )
-
-
-def require_horizons(terrain: Terrain, points_m: Array, horizon_rad: Array) -> None:
-    """Raise BadInput (bad_terrain) unless a `terrain` gave finite horizons wherever a camera can stand.
-
-    `points_m` (..., 2) are the positions, `horizon_rad` (...) what `horizon_rad` gave there.
-    """
-    if np.isfinite(horizon_rad).all():
-        return
-    wrong = ~np.isfinite(horizon_rad) & np.asarray(terrain.allowed(points_m))
-    if wrong.any():
-        raise BadInput(
-            "bad_terrain",
-            f"{_described(terrain)}: horizon_rad gives NaN or infinity for {np.count_nonzero(wrong)} of {wrong.size} "
-            "rays from ground on which a camera can stand",
-        )
-
-
-def _described(terrain: Terrain) -> str:
-    return f"terrain {terrain.name!r} ({type(terrain).__name__})"
-
-
-def _forward(name: str) -> Any:
-    return property(lambda self: getattr(self.whole, name))
-
-
 class ForwardingTerrain(Terrain):
     """A terrain with every attribute and method of another one, `whole`; subclasses replace some of them."""
 
     def __init__(self, whole: Terrain) -> None:
         self.whole = whole
 
-    name, site, camera_height_m = _forward("name"), _forward("site"), _forward("camera_height_m")
-    search_radius_m, reach_m, finest_m = _forward("search_radius_m"), _forward("reach_m"), _forward("finest_m")
-    common_sigma_rad, hard_edges = _forward("common_sigma_rad"), _forward("hard_edges")
-    axisymmetric, shape_sigma = _forward("axisymmetric"), _forward("shape_sigma")
-    horizon_cost, projection, searched = _forward("horizon_cost"), _forward("projection"), _forward("searched")
-    rim_radius_m, table_path, facts = _forward("rim_radius_m"), _forward("table_path"), _forward("facts")
-    horizon_rad, horizon_bounds_rad = _forward("horizon_rad"), _forward("horizon_bounds_rad")
-    horizon_sigma_rad = _forward("horizon_sigma_rad")
-    max_horizon_sigma_rad = _forward("max_horizon_sigma_rad")
-    ground_m, allowed, near = _forward("ground_m"), _forward("allowed"), _forward("near")
-    height_sigma_m, post_positions_m = _forward("height_sigma_m"), _forward("post_positions_m")
-    horizon_posts, ground_posts = _forward("horizon_posts"), _forward("ground_posts")
-    is_informative, mask_reason = _forward("is_informative"), _forward("mask_reason")
-    masked_sectors, error_warnings = _forward("masked_sectors"), _forward("error_warnings")
-    unstated_errors = _forward("unstated_errors")
-    reshaped, log_prior = _forward("reshaped"), _forward("log_prior")
-    visible_disks, interpolation = _forward("visible_disks"), _forward("interpolation")
-    interpolated_part, horizon_spread_rad = _forward("interpolated_part"), _forward("horizon_spread_rad")
-    interpolated = _forward("interpolated")
-    is_prepared, prepare, discard_table = _forward("is_prepared"), _forward("prepare"), _forward("discard_table")
+    def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """As of `whole`."""
+        return self.whole.horizon_rad(points_m, azimuths_rad)
+
+    def horizon_bounds_rad(
+        self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
+    ) -> tuple[Array, Array]:
+        """As of `whole`."""
+        return self.whole.horizon_bounds_rad(centres_m, half_m, azimuths_rad, azimuth_half_rad)
+
+    def ground_m(self, points_m: Array) -> Array:
+        """As of `whole`."""
+        return self.whole.ground_m(points_m)
+
+
+def _forward(name: str) -> Any:
+    return property(lambda self: getattr(self.whole, name))
+
+
+for _name in set(vars(Terrain)) - set(vars(ForwardingTerrain)):
+    if not _name.startswith("_"):
+        setattr(ForwardingTerrain, _name, _forward(_name))

@@ -15,6 +15,10 @@ from startrack.terrain.raster_io import read_map
 
 MEASURED_PER_ESTIMATE = 1.6  # of the 240 m map on the ground of site01-10m.tif: 5.4 m measured, 3.3 m by its roughness
 COMMENT_CHARS = 118
+OTHER_FACTS = (
+    "The map is taken to be to scale (stretch_sigma_1) and in its place to 15 m (vertical_sigma_deg), the camera at "
+    "its height to 2 cm (camera_height_sigma_m): change what you know better."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +39,7 @@ class StatedErrors:
                 f" horizon_sigma_deg: crests wrong by {length_text(self.common_crest_sigma_m)} all around, at their "
                 "median distance; at least three times the error of heights, as at the sharp rim of Shackleton."
             )
+        text += f" {OTHER_FACTS}"
         return textwrap.fill(text, COMMENT_CHARS, initial_indent="# ", subsequent_indent="# ") + "\n"
 
 

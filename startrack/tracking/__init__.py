@@ -4,10 +4,10 @@ from startrack.exposure import read_bag_exposures
 from startrack.tracking.observe import ObservedFrame, observe_frame
 from startrack.tracking.odometry import Odometry, read_odometry
 from startrack.tracking.session import TrackSession
-from startrack.tracking.shared import SharedErrors
+from startrack.tracking.shared import TrackErrors
 from startrack.tracking.track import CrestHeights, Track, TrackFrame, Trajectory, estimate_track
 
 __all__ = [
-    "CrestHeights", "ObservedFrame", "Odometry", "SharedErrors", "Track", "TrackFrame", "TrackSession", "Trajectory",
+    "CrestHeights", "ObservedFrame", "Odometry", "Track", "TrackErrors", "TrackFrame", "TrackSession", "Trajectory",
     "estimate_track", "observe_frame", "read_bag_exposures", "read_odometry",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""A camera at rest: the evidence of all its exposures in one posterior, which needs no linearization."""
+"""A camera at rest: the joint posterior of one position by all its exposures, with the shared errors carried once."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import numpy as np
 
 from startrack.terrain import Terrain
 from startrack.tracking.contradictions import RobustTrack, smooth_robustly
-from startrack.tracking.frame_estimate import FrameEstimate, estimate_frame
+from startrack.tracking.frame_estimate import LEAST_HALF_M, REACH_SIGMAS, FrameEstimate, observe_together
+from startrack.tracking.frame_model import UNKNOWN_M, FrameModel
+from startrack.tracking.frame_sampling import sample_together
 from startrack.tracking.observe import ObservedFrame
-from startrack.tracking.shared import ImageErrors, SharedErrors
-from startrack.tracking.smoother import UNKNOWN_M, Observations, Smoothed, Steps, smooth
-from startrack.types import Array, BadInput, Evidence, Ints
+from startrack.tracking.shared import TrackErrors
+from startrack.tracking.smoother import Observations, Smoothed, Steps, smooth
+from startrack.types import Array, BadInput, Ints
 
 STILL_M = 1e-3  # of a camera at rest from exposure to exposure, in the comparison of single fixes
 
@@ -28,24 +30,28 @@ class AtRest:
     mode: Ints  # (n,) which mode of each exposure agrees with the others; -1: none
 
 
-def positions_at_rest(frames: Sequence[ObservedFrame], terrain: Terrain, shared: SharedErrors) -> AtRest:
-    """The position by the evidence of the first exposures, for each number of them.
+def positions_at_rest(frames: Sequence[ObservedFrame], terrain: Terrain, errors: TrackErrors) -> AtRest:
+    """The position by the first exposures together, for each number of them.
 
-    Single fixes that contradict the others are left out. Errors that exposures share (bias, clock, shape, heights of
-    posts) are carried once. Raises ValueError where no exposure has a position, and BadInput (inconsistent_evidence)
-    where half of those with a single position or more are elsewhere.
+    Single fixes that contradict the others are left out. Errors that exposures share are carried once, those of each
+    image apart. Raises ValueError where no exposure has a position, and BadInput (inconsistent_evidence) where half of
+    those with a single position or more are elsewhere.
     """
     n = len(frames)
-    mode = agreeing_fixes([frame.modes for frame in frames], terrain.height_sigma_m).mode
+    agreeing = agreeing_fixes([frame.modes for frame in frames], terrain.height_sigma_m)
+    mode, by_fixes = agreeing.mode, agreeing.smoothed
     _require_rest(frames, mode)
     position, covariance = np.zeros((n, 2)), np.repeat([UNKNOWN_M**2 * np.eye(2)], n, axis=0)
     first, *later = np.flatnonzero(mode >= 0).tolist()
     found = _alone(frames[first].modes[mode[first]], terrain)
     position[first:], covariance[first:] = found.position_m[0], found.covariance_m2[0]
-    used = [frames[first]]
+    reference = by_fixes.position_m[0]
+    half = max(REACH_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(found.covariance_m2[0])[1])), LEAST_HALF_M)
+    models = _models(frames[first], terrain, errors, reference, half)
     for k in later:
-        used.append(frames[k])
-        found = _alone(_pooled(used, *_combine(frames[k].modes[mode[k]], found), terrain, shared), terrain)
+        models += _models(frames[k], terrain, errors, reference, half)
+        points = sample_together(models, reference, by_fixes.covariance_m2[0])
+        found = _alone(observe_together(models, points), terrain)
         position[k:], covariance[k:] = found.position_m[0], found.covariance_m2[0]
     return AtRest(position, covariance, found, mode)
 
@@ -70,30 +76,9 @@ def _alone(estimate: FrameEstimate, terrain: Terrain) -> Smoothed:
     return smooth(Observations.of([estimate], terrain.height_sigma_m), Steps.unknown(1))
 
 
-def _pooled(
-    frames: list[ObservedFrame], first_mean: Array, first_covariance: Array, terrain: Terrain, shared: SharedErrors
-) -> FrameEstimate:
-    """The observation by the rows of all exposures together."""
-    rows = Evidence.concatenate(*(frame.evidence for frame in frames if frame.evidence is not None))
-    errors = mean_image_errors([frame.image_errors for frame in frames if frame.image_errors is not None])
-    return estimate_frame(rows, terrain, shared, first_mean, first_covariance, errors)
-
-
-def mean_image_errors(errors: Sequence[ImageErrors]) -> ImageErrors | None:
-    """Errors of the mean of several exposures, each with its own: None where none has any."""
-    if not errors:
-        return None
-    covariance = np.sum([one.covariance for one in errors], axis=0) / len(errors) ** 2
-    raised = np.stack([one.raised_rad for one in errors])
-    many = np.maximum(raised.any(axis=2).sum(axis=0), 1)
-    return ImageErrors(raised.sum(axis=0) / many[:, None], covariance)
-
-
-def _combine(newest: FrameEstimate, before: Smoothed) -> tuple[Array, Array]:
-    """A first guess: weighted mean of two positions; shared errors as before."""
-    known = [np.linalg.inv(c) for c in (newest.covariance[:2, :2], before.covariance_m2[0])]
-    covariance = np.zeros_like(newest.covariance)
-    covariance[:2, :2] = np.linalg.inv(known[0] + known[1])
-    covariance[2:, 2:] = before.shared_covariance
-    position = covariance[:2, :2] @ (known[0] @ newest.mean[:2] + known[1] @ before.position_m[0])
-    return np.concatenate([position, before.shared]), covariance
+def _models(
+    frame: ObservedFrame, terrain: Terrain, errors: TrackErrors, reference_m: Array, half_m: float
+) -> list[FrameModel]:
+    if frame.evidence is None:
+        return []
+    return [FrameModel.near(frame.evidence, terrain, errors, reference_m, half_m)]

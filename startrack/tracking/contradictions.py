@@ -18,6 +18,8 @@ from startrack.types import Array, Bools, Ints
 
 SLIP_PROBABILITY, SLIP_SIGMA_M = 0.05, 20.0  # of a move by wheel slip, and its size on each axis
 WRONG_PROBABILITY, WRONG_SIGMA_M = 1e-3, 200.0  # of a frame, and the error of its position on each axis
+WRONG_SIGMA = 1.0  # of each shared error by a wrong frame, in standard deviations of its prior
+EARLIER_NATS = 1e-6  # of two frames that contradict each other equally the later one is left out
 NEIGHBOURS = 2  # frames and moves to each side that one gross error makes doubtful
 SHIFTS = 4  # moves to each side, to which a slip may belong instead
 MAX_ROUNDS = 30
@@ -50,8 +52,7 @@ def smooth_robustly(
             break
         tried.add(state)
         doubt_steps = step_doubt(found, steps) if may_slip else np.full(len(slipped), -np.inf)
-        new_mode, doubt_frames = _frame_doubt(found, observations, modes, mode)
-        doubt_frames[~_has_known_move(steps)] = -np.inf  # nothing predicts the frame
+        new_mode, doubt_frames = _frame_doubt(found, observations, modes, mode, _has_known_move(steps))
         # Moves stand between frames: one line of doubts, frame, move, frame, ...
         doubt = np.full(2 * len(modes) - 1, -np.inf)
         doubt[::2], doubt[1::2] = doubt_frames, doubt_steps
@@ -140,26 +141,53 @@ def _has_known_move(steps: Steps) -> Bools:
 
 
 def _frame_doubt(
-    found: Smoothed, observations: Observations, modes: Sequence[Sequence[FrameEstimate]], mode: Ints
+    found: Smoothed, observations: Observations, modes: Sequence[Sequence[FrameEstimate]], mode: Ints, placed: Bools
 ) -> tuple[Ints, Array]:
-    """The best mode (n,) of each frame, and the logarithm of the odds (n,) that the frame is wrong in it."""
+    """The best mode (n,) of each frame, and the logarithm of the odds (n,) that the frame is wrong in it.
+
+    Frames that are not `placed` (n,) have no prediction of their position, only of the shared errors.
+    """
     best, doubt = mode.copy(), np.full(len(mode), -np.inf)
-    used = np.array(observations.frames)
-    doubt[used] = gross_log_odds(
-        found.frame_residual[:, :2], found.frame_covariance[:, :2, :2], WRONG_PROBABILITY, WRONG_SIGMA_M
-    )
+    for number, (k, estimate) in enumerate(zip(observations.frames, observations.estimates, strict=True)):
+        residual, covariance = found.frame_residual[number], found.frame_covariance[number]
+        doubt[k] = wrong_log_odds(residual, covariance, estimate, placed=bool(placed[k])) + EARLIER_NATS * k
     for k in np.flatnonzero(mode < 0).tolist():
-        odds = [mode_log_odds(e, found.position_m[k], found.covariance_m2[k]) for e in modes[k]]
+        odds = [mode_log_odds(e, found, k, observations.height_sigma_m, placed=bool(placed[k])) for e in modes[k]]
         if odds:
-            best[k], doubt[k] = int(np.argmin(odds)), min(odds)
+            best[k], doubt[k] = int(np.argmin(odds)), min(odds) + EARLIER_NATS * k
     return best, doubt
 
 
-def mode_log_odds(estimate: FrameEstimate, position_m: Array, covariance_m2: Array) -> float:
-    """Logarithm of the odds that a mode is wrong, beside a position (2,) predicted without it."""
-    away = estimate.mean[:2] - position_m
-    odds = gross_log_odds(away, covariance_m2 + estimate.covariance[:2, :2], WRONG_PROBABILITY, WRONG_SIGMA_M)
-    return float(odds) - float(np.log(estimate.weight))
+def mode_log_odds(
+    estimate: FrameEstimate, found: Smoothed, k: int, height_sigma_m: float, *, placed: bool = True
+) -> float:
+    """Logarithm of the odds that a mode of frame k is wrong, beside a track `found` without it."""
+    known = np.zeros((estimate.parameters, estimate.parameters))
+    known[:2, :2], known[2:, 2:] = found.covariance_m2[k], found.shared_covariance
+    response, posts = estimate.response, height_sigma_m * estimate.by_post
+    covariance = response @ known @ response.T + estimate.noise + posts @ posts.T
+    residual = estimate.mean - response @ np.concatenate([found.position_m[k], found.shared])
+    return wrong_log_odds(residual, covariance, estimate, placed=placed)
+
+
+def wrong_log_odds(residual: Array, covariance: Array, estimate: FrameEstimate, *, placed: bool = True) -> float:
+    """Logarithm of the odds that a frame is wrong, by the residual (p,) of its `estimate` with a covariance (p, p).
+
+    Where the frame is not `placed`, its position is not predicted and says nothing.
+    """
+    wrong, part = wrong_covariance(estimate), slice(0 if placed else 2, None)
+    if not placed and estimate.parameters == 2:
+        return -np.inf
+    right = covariance[part, part]
+    odds = np.log(WRONG_PROBABILITY) - np.log1p(-WRONG_PROBABILITY)
+    wide = log_normal(residual[part], right + wrong[part, part])
+    return float(odds + wide - log_normal(residual[part], right))
+
+
+def wrong_covariance(estimate: FrameEstimate) -> Array:
+    """(p, p) by which the residual of a wrong frame varies beside that of a right one."""
+    sigma = np.r_[WRONG_SIGMA_M, WRONG_SIGMA_M, np.full(estimate.parameters - 2, WRONG_SIGMA)]
+    return np.asarray((estimate.response * np.square(sigma)) @ estimate.response.T)
 
 
 def _worst_nearby(doubt: Array) -> Bools:

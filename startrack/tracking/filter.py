@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from startrack.tracking.frame_estimate import FrameEstimate
-from startrack.tracking.smoother import UNKNOWN_M
+from startrack.tracking.frame_model import UNKNOWN_M
 from startrack.types import Array, Ints
 
 MOST_POSTS, KEPT_POSTS = 2000, 1500  # in the state; 40 frames 50 m apart depend on 500

@@ -7,23 +7,23 @@ the parameters with the slopes of the log-likelihood: the derivative of a poster
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
+from startrack.localization.importance_sampling import WeightedPoints, moments
+from startrack.localization.skyline_model import MIDDLES_RAD
 from startrack.terrain import Terrain
 from startrack.terrain.horizon_posts import NO_POST, HorizonPosts
-from startrack.tracking.importance_sampling import Samples, sample_posterior
-from startrack.tracking.shared import BIAS, ImageErrors, SharedErrors
-from startrack.tracking.skyline_likelihood import SkylineLikelihood
+from startrack.tracking.frame_model import FrameModel
+from startrack.tracking.frame_sampling import balanced_moments, sample_together
+from startrack.tracking.shared import TrackErrors
 from startrack.types import Array, Evidence, Ints
 
 REACH_SIGMAS, MARGIN_M = 6.0, 5.0  # of a Gaussian, to the side of the neighbourhood
-MAX_NEIGHBOURHOODS = 4  # after so many the posterior is taken as it is
-FIRST_SHARED_SIGMA = 0.3  # of the prior, of the first Gaussian
-OUTSIDE = -1e6  # logarithm of a density that is zero
+LEAST_HALF_M = 40.0  # of the neighbourhood
+MAX_NEIGHBOURHOODS = 3  # after so many the posterior is taken as it is
 MIN_NOISE_SHARE = 0.3  # of the evidence's covariance: the least noise that a frame has of its own
 NEGLIGIBLE_POST = 1e-4  # part of the variance of a position, by all posts that are left out together
 ROUNDING = 1e-9  # of the covariance, added to the noise so that it can be inverted
@@ -48,87 +48,71 @@ class FrameEstimate:
 
 
 def estimate_frame(
-    evidence: Evidence,
-    terrain: Terrain,
-    shared: SharedErrors,
-    first_mean: Array,
-    first_covariance: Array,
-    image_errors: ImageErrors | None = None,
+    evidence: Evidence, terrain: Terrain, errors: TrackErrors, position_m: Array, covariance_m2: Array
 ) -> FrameEstimate:
-    """The observation by rows of `evidence` above the map's horizon.
+    """The observation by rows of `evidence` and their errors of the image.
 
     Args:
-        evidence: rows of one exposure, or of several of a camera at rest.
+        evidence: rows of one exposure.
         terrain: with the evidence's enu.
-        shared: errors that frames share.
-        first_mean: (2 + k,) parameters near the posterior's mode that is meant, see `first_guess`.
-        first_covariance: (2 + k, 2 + k) about that of the mode.
-        image_errors: of the rows of the sky's light; None: none.
+        errors: those that frames share.
+        position_m: (2,) near the posterior's mode that is meant.
+        covariance_m2: (2, 2) about that of the mode.
     """
-    mean, covariance = first_mean, first_covariance
+    reference, spread = position_m, covariance_m2
     for _ in range(MAX_NEIGHBOURHOODS):
-        half = REACH_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1])) + MARGIN_M
-        sigmas = float(np.abs(mean[2:]).max(initial=0.0)) + REACH_SIGMAS * float(
-            np.sqrt(np.diag(covariance)[2:].max(initial=0.0))
-        )
-        near = partial(SkylineLikelihood.near, evidence, terrain, shared, image_errors)
-        likelihood = near(mean[:2], half, min(sigmas, REACH_SIGMAS))
-        samples = sample_posterior(_log_posterior(likelihood, half), mean, covariance)
-        moved = float(np.abs(samples.mean[:2] - mean[:2]).max())
-        inside = moved + 3.0 * np.sqrt(np.linalg.eigvalsh(samples.covariance[:2, :2])[1]) < half
-        mean, covariance = samples.mean, samples.covariance
-        if inside:
+        half = max(REACH_SIGMAS * _widest(spread) + MARGIN_M, LEAST_HALF_M)
+        models = [FrameModel.near(evidence, terrain, errors, reference, half)]
+        found = sample_together(models, reference, spread)
+        mean, covariance = moments(found.points, found.share)
+        if np.abs(mean[:2] - reference).max() + 3.0 * _widest(covariance[:2, :2]) < half:
             break
-    return _observation(likelihood, samples, image_errors)
+        reference, spread = mean[:2], covariance[:2, :2]
+    return observe_together(models, found)
 
 
-def first_guess(
-    shared: SharedErrors, position_m: Array, covariance_m2: Array, horizon_error_rad: float = 0.0
-) -> tuple[Array, Array]:
-    """Mean (2 + k,) and covariance (2 + k, 2 + k) of the first Gaussian, from a fix by one image."""
-    k = len(shared.names)
-    mean, covariance = np.zeros(2 + k), np.diag(np.full(2 + k, FIRST_SHARED_SIGMA**2))
-    mean[:2], covariance[:2, :2] = position_m, covariance_m2
-    if BIAS in shared.names:
-        at = shared.names.index(BIAS)
-        mean[2 + at] = horizon_error_rad / shared.sigma[at]
-    return mean, covariance
+def _widest(covariance: Array) -> float:
+    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 
-def _log_posterior(likelihood: SkylineLikelihood, half_m: float) -> Callable[[Array], Array]:
-    terrain, centre = likelihood.local.terrain, likelihood.centre_m
-
-    def log_density(points: Array) -> Array:
-        inside = np.abs(points[:, :2] - centre).max(axis=1) < half_m
-        inside &= np.asarray(terrain.allowed(points[:, :2]))
-        found = np.full(len(points), OUTSIDE)
-        if inside.any():
-            found[inside] = likelihood.log_likelihood(points[inside])
-            found[inside] -= 0.5 * np.square(points[inside, 2:]).sum(axis=1)
-        return found
-
-    return log_density
-
-
-def _observation(likelihood: SkylineLikelihood, samples: Samples, image_errors: ImageErrors | None) -> FrameEstimate:
-    used = samples.weight > 0.0
-    samples = Samples(samples.points[used], samples.weight[used])
-    mean, covariance = samples.mean, samples.covariance
+def observe_together(models: Sequence[FrameModel], found: WeightedPoints) -> FrameEstimate:
+    """The observation by sampled points of exposures of one position."""
+    used = np.isfinite(found.log_weight)
+    mean, covariance = balanced_moments(found)
+    points, share = found.points[used], found.share[used]
     prior = np.diag(np.concatenate([np.zeros(2), np.ones(len(mean) - 2)]))
-    by_horizon = samples.covariance_with(likelihood.slopes(samples.points))
     by_evidence = covariance - covariance @ prior @ covariance  # of the mean at given true parameters
-    counted = (by_horizon * np.square(likelihood.map_sigma_rad)) @ by_horizon.T
+    plain, spread = moments(points, share)
+    by_horizon, counted = np.zeros((len(mean), len(MIDDLES_RAD))), np.zeros_like(covariance)
+    for model in models:
+        model.settle(mean)
+        slopes = model.slopes(points, share)
+        common = ((points - plain) * share[:, None]).T @ (slopes - share @ slopes)
+        own = covariance @ np.linalg.solve(spread, common)
+        counted += (own * np.square(model.map_sigma_rad)) @ own.T
+        by_horizon += own
     noise = clipped_noise(by_evidence - counted, by_evidence) + ROUNDING * covariance
-    if image_errors is not None:
-        by_image = by_horizon @ (image_errors.at(likelihood.azimuth_rad) * likelihood.is_sky[:, None])
-        noise += by_image @ image_errors.covariance @ by_image.T
-    post, by_post = _posts(likelihood, by_horizon, covariance)
-    shared_by_posts = likelihood.local.terrain.height_sigma_m**2 * by_post @ by_post.T
-    found = FrameEstimate(
+    post, by_post = _posts(models[0], by_horizon, covariance)
+    shared_by_posts = models[0].model.terrain.height_sigma_m ** 2 * by_post @ by_post.T
+    estimate = FrameEstimate(
         mean, covariance - by_evidence + noise + shared_by_posts, np.eye(len(mean)) - covariance @ prior, noise, post,
         by_post,
     )  # fmt: skip
-    return _without(found, 2 + np.flatnonzero(~likelihood.rise_rad.any(axis=0)))
+    seen = np.any([model.rise_rad.any(axis=0) for model in models], axis=0)
+    return _turned(_without(estimate, 2 + np.flatnonzero(~seen)), models[0].errors)
+
+
+def _turned(estimate: FrameEstimate, errors: TrackErrors) -> FrameEstimate:
+    """The estimate with the position after the turn of the clock's error, see `TrackErrors.turn_m`."""
+    to = np.eye(estimate.parameters)
+    to[:2, 2:] = errors.turn_m(estimate.mean[:2])
+    if not to[:2, 2:].any():
+        return estimate
+    return replace(
+        estimate, mean=to @ estimate.mean, covariance=to @ estimate.covariance @ to.T,
+        response=to @ estimate.response @ np.linalg.inv(to), noise=to @ estimate.noise @ to.T,
+        by_post=to @ estimate.by_post,
+    )  # fmt: skip
 
 
 def _without(estimate: FrameEstimate, unseen: Ints) -> FrameEstimate:
@@ -152,13 +136,12 @@ def clipped_noise(noise: Array, whole: Array) -> Array:
     return np.asarray(root @ (turned * np.clip(share, MIN_NOISE_SHARE, 1.0)) @ turned.T @ root.T)
 
 
-def _posts(likelihood: SkylineLikelihood, by_horizon: Array, covariance: Array) -> tuple[Ints, Array]:
+def _posts(model: FrameModel, by_horizon: Array, covariance: Array) -> tuple[Ints, Array]:
     """Posts (c,) of the crests and of the camera's ground, and the response (d, c) of the mean to their heights."""
-    terrain = likelihood.local.terrain
+    terrain, at = model.model.terrain, model.model.reference_m
     if not terrain.height_sigma_m:
         return np.zeros(0, dtype=np.int64), np.zeros((len(by_horizon), 0))
-    azimuth = likelihood.azimuth_rad
-    parts = [terrain.horizon_posts(likelihood.centre_m, azimuth), terrain.ground_posts(likelihood.centre_m, azimuth)]
+    parts = [terrain.horizon_posts(at, MIDDLES_RAD), terrain.ground_posts(at, MIDDLES_RAD)]
     # Ground higher than the map acts on the evidence as a map lower than the ground.
     post, by_post = _sum_by_post(parts, -by_horizon)
     scale = terrain.height_sigma_m / np.sqrt(np.diag(covariance))

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import fields
+from dataclasses import asdict, fields
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
 
 from startrack.files import write_atomically
+from startrack.fix import ShownError
 from startrack.tracking.frame_estimate import FrameEstimate
-from startrack.tracking.observe import ObservedFrame
-from startrack.tracking.shared import ImageErrors
-from startrack.types import Array, Clock, Evidence
+from startrack.tracking.observe import ImageFix, ObservedFrame
+from startrack.types import Array, Clock, Evidence, ImageErrors
 
-FORMAT = "startrack.observed-frame/2"
+FORMAT = "startrack.observed-frame/3"
+T = TypeVar("T")
 ROWS = ("azimuth_rad", "elevation_rad", "llr", "edge_sigma_rad", "extended_nats")
 
 
@@ -50,16 +51,19 @@ def encode_frame(frame: ObservedFrame) -> bytes:
     if frame.R_body_enu is not None:
         arrays["R_body_enu"] = frame.R_body_enu
     for number, mode in enumerate(frame.modes):
-        arrays |= {f"mode{number}.{f.name}": np.asarray(getattr(mode, f.name)) for f in fields(mode)}
+        arrays |= _arrays(f"mode{number}", mode)
+    for number, fix in enumerate(frame.fixes):
+        arrays |= _arrays(f"fix{number}", fix)
     if frame.evidence is not None:
         arrays |= {f"evidence.{name}": np.asarray(getattr(frame.evidence, name)) for name in ROWS}
         if frame.evidence.clock is not None:
-            arrays |= {f"clock.{f.name}": np.asarray(getattr(frame.evidence.clock, f.name)) for f in fields(Clock)}
-    if frame.image_errors is not None:
-        arrays |= {f"errors.{f.name}": getattr(frame.image_errors, f.name) for f in fields(ImageErrors)}
+            arrays |= _arrays("clock", frame.evidence.clock)
+        if frame.evidence.image_errors is not None:
+            arrays |= _arrays("errors", frame.evidence.image_errors)
     head = {
         "format": FORMAT, "name": frame.name, "time_utc": frame.time_utc.isoformat(), "modes": len(frame.modes),
-        "reason": frame.reason, "message": frame.message, "steeper": frame.steeper,
+        "fixes": len(frame.fixes), "shown": [asdict(one) for one in frame.shown], "reason": frame.reason,
+        "message": frame.message,
     }  # fmt: skip
     file = io.BytesIO()
     np.savez(file, head=np.array(json.dumps(head)), **arrays)  # type: ignore[arg-type]
@@ -73,27 +77,28 @@ def decode_frame(data: bytes) -> ObservedFrame:
     head = json.loads(str(arrays["head"]))
     if head["format"] != FORMAT:
         raise ValueError(f"format {head['format']}, expected {FORMAT}")
-    errors = None
-    if "errors.covariance" in arrays:
-        errors = ImageErrors(**{f.name: arrays[f"errors.{f.name}"] for f in fields(ImageErrors)})
     return ObservedFrame(
         head["name"], datetime.fromisoformat(head["time_utc"]), arrays.get("R_body_enu"),
-        tuple(_mode(arrays, number) for number in range(head["modes"])), _evidence(arrays), errors, head["reason"],
-        head["message"], head["steeper"],
+        tuple(_value(FrameEstimate, f"mode{number}", arrays) for number in range(head["modes"])), _evidence(arrays),
+        tuple(_value(ImageFix, f"fix{number}", arrays) for number in range(head["fixes"])),
+        tuple(ShownError(**one) for one in head["shown"]), head["reason"], head["message"],
     )  # fmt: skip
 
 
-def _mode(arrays: dict[str, Any], number: int) -> FrameEstimate:
-    values = {f.name: arrays[f"mode{number}.{f.name}"] for f in fields(FrameEstimate)}
-    return FrameEstimate(**{**values, "weight": float(values["weight"])})
+def _arrays(prefix: str, value: Any) -> dict[str, Array]:
+    """The fields of a dataclass of numbers and arrays."""
+    return {f"{prefix}.{f.name}": np.asarray(getattr(value, f.name)) for f in fields(value)}
+
+
+def _value(kind: type[T], prefix: str, arrays: dict[str, Any]) -> T:
+    """The dataclass that `_arrays` took apart."""
+    values = {f.name: arrays[f"{prefix}.{f.name}"] for f in fields(kind)}  # type: ignore[arg-type]
+    return kind(**{name: one if one.ndim else float(one) for name, one in values.items()})
 
 
 def _evidence(arrays: dict[str, Any]) -> Evidence | None:
     if "evidence.llr" not in arrays:
         return None
-    clock = None
-    if "clock.turn_rad_s" in arrays:
-        of_clock: dict[str, Any] = {f.name: arrays[f"clock.{f.name}"] for f in fields(Clock)}
-        numbers = {name: float(one) for name, one in of_clock.items() if not one.ndim}
-        clock = Clock(turn_rad_s=of_clock["turn_rad_s"], **numbers)
-    return Evidence(clock=clock, **{name: arrays[f"evidence.{name}"] for name in ROWS})
+    clock = _value(Clock, "clock", arrays) if "clock.turn_rad_s" in arrays else None
+    errors = _value(ImageErrors, "errors", arrays) if "errors.covariance" in arrays else None
+    return Evidence(clock=clock, image_errors=errors, **{name: arrays[f"evidence.{name}"] for name in ROWS})

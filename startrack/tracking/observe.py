@@ -1,23 +1,37 @@
-"""From the result of one image to what a track needs of it: a few numbers, without the image."""
+"""From the result of one image to what a track needs of it: a few numbers and rows, without the image."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
 
 import numpy as np
 
-from startrack.evidence.star_offsets import OFFSET_TERMS
+from startrack.evidence.sky_levels import SECTORS
+from startrack.fix import ShownError
+from startrack.localization.posterior import MIN_ROW_NATS
+from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD
+from startrack.localization.summary import camera_at
 from startrack.stages import Located, Measured, Outcome, Refused, last_value
 from startrack.terrain import Terrain
-from startrack.tracking.frame_estimate import FrameEstimate, estimate_frame, first_guess
-from startrack.tracking.shared import STEEPNESS, ImageErrors, SharedErrors
-from startrack.types import Array, Bools, Evidence
+from startrack.tracking.frame_estimate import FrameEstimate, estimate_frame
+from startrack.tracking.shared import TrackErrors
+from startrack.types import Array, Evidence, Fix
 
-NEAR_RAD = np.radians(1.5)  # rows within this of the skyline are kept for other exposures of the same position
-MODE_SIGMA_M = 10.0  # of a mode of an ambiguous fix, of the first Gaussian
-WIDER = 3.0  # standard deviations of a position by another shape of the terrain, of the first Gaussian
+CIRCLE_SIGMAS = float(np.sqrt(-2.0 * np.log(0.05)))  # of a round Gaussian, in the radius that holds 95 % of it
+MODE_SIGMA_M = 10.0  # of a mode whose circle is not known
+
+
+@dataclass(frozen=True, eq=False)
+class ImageFix:
+    """One position by an image alone, as `locate` states it."""
+
+    position_enu_m: Array  # (3,)
+    covariance_m2: Array  # (2, 2)
+    radius95_m: float
+    radius999_m: float
+    at_time_m: Array  # (2,) if the stated time is right
+    weight: float = 1.0  # probability of the position
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,21 +42,24 @@ class ObservedFrame:
     time_utc: datetime
     R_body_enu: Array | None  # (3, 3) from enu; None: no attitude
     modes: tuple[FrameEstimate, ...]  # of the position; empty: refused
-    evidence: Evidence | None  # rows near the skyline, above the map's horizon; None: refused
-    image_errors: ImageErrors | None = None  # of the rows of the sky's light
+    evidence: Evidence | None  # rows about the skyline; None: refused
+    fixes: tuple[ImageFix, ...] = ()  # by the image alone, of each mode
+    shown: tuple[ShownError, ...] = ()  # errors beyond the defaults of facts that no file states
     reason: str = ""  # of a refusal
     message: str = ""
-    steeper: float = 0.0  # relative, by which the image shows a crater deeper than its file states
+
+    @property
+    def facts(self) -> frozenset[str]:
+        """Facts whose gross error the image shows."""
+        return frozenset(one.fact for one in self.shown)
 
 
-def observe_frame(
-    outcome: Outcome, shared: SharedErrors | None = None, terrain: Terrain | None = None
-) -> ObservedFrame:
-    """The `outcome` of one image as an observation of its position and of the errors `shared`.
+def observe_frame(outcome: Outcome, errors: TrackErrors | None = None, terrain: Terrain | None = None) -> ObservedFrame:
+    """The `outcome` of one image as an observation of its position and of the shared `errors`.
 
-    `shared` and `terrain` are those of the track; None: those of the image. Raises ValueError for an image without a
-    time, for a fix that states no error (another localizer), and for one of another depth than the file's where
-    `shared` has no error of the depth (see `TrackSession`).
+    `errors` and `terrain` are those of the track; None: those of the image. Raises ValueError for an image without a
+    time, for a fix that states no error (another localizer), and for one that shows a gross error of a fact that is not
+    among those of `errors` (see `TrackErrors.with_gross`).
     """
     value, when = last_value(outcome), outcome.exposure.time_utc
     if when is None:
@@ -53,68 +70,67 @@ def observe_frame(
     if isinstance(outcome, Refused) or not isinstance(value, Located):
         reason = str(outcome.reason) if isinstance(outcome, Refused) else ""
         message = outcome.message if isinstance(outcome, Refused) else ""
-        return ObservedFrame(outcome.exposure.name, when, R, (), None, None, reason, message)
+        return ObservedFrame(outcome.exposure.name, when, R, (), None, reason=reason, message=message)
     if value.fix.search == "approximate":
         raise ValueError(f"{outcome.exposure.name}: a track needs the localizer posterior")
     terrain = terrain or value.terrain
-    shared = shared or SharedErrors.of(terrain, value.clock)
-    if value.steeper and STEEPNESS not in shared.names:
-        raise ValueError(f"{outcome.exposure.name}: it shows a wrong depth of the crater, which must be shared")
-    rows, errors = located_evidence(value)
-    errors = errors and errors.without_edge(shared)
-    estimates = tuple(_mode_estimates(value, rows, terrain, shared, errors))
-    near = rows_near(rows, terrain, estimates)
-    return ObservedFrame(outcome.exposure.name, when, R, estimates, near, errors, steeper=value.steeper)
+    if errors is None:
+        errors = TrackErrors.of(terrain, value.clock, value.sky_light is not None)
+        errors = errors.with_gross(facts_of(value, errors))
+    missing = facts_of(value, errors) - errors.gross
+    if missing:
+        raise ValueError(f"{outcome.exposure.name}: it shows a gross error of {', '.join(missing)}: it must be shared")
+    fixes = image_fixes(value.fix, terrain)
+    rows = informative_rows(located_evidence(value), terrain, fixes[0].at_time_m)
+    frame = ObservedFrame(outcome.exposure.name, when, R, (), rows, fixes, value.fix.shown)
+    return observe_again(frame, errors, terrain)
 
 
-def observe_again(frame: ObservedFrame, shared: SharedErrors, terrain: Terrain) -> ObservedFrame:
-    """The `frame` by its evidence, with other shared errors and another error of the terrain's shape."""
+def facts_of(outcome: Outcome, errors: TrackErrors) -> frozenset[str]:
+    """Facts among those of `errors` whose gross error an `outcome` shows."""
+    shown = outcome.fix.shown if isinstance(outcome, Located) else ()
+    return frozenset(one.fact for one in shown) & frozenset(errors.listed.facts)
+
+
+def observe_again(frame: ObservedFrame, errors: TrackErrors, terrain: Terrain) -> ObservedFrame:
+    """The `frame` by its evidence, with these shared `errors`."""
     if frame.evidence is None:
         return frame
-    modes = []
-    for mode in frame.modes:
-        spread = WIDER**2 * mode.covariance[:2, :2] + MODE_SIGMA_M**2 * np.eye(2)
-        first = first_guess(shared, mode.mean[:2], spread)
-        one = estimate_frame(frame.evidence, terrain, shared, *first, frame.image_errors)
-        modes.append(replace(one, weight=mode.weight))
+    modes = [
+        replace(estimate_frame(frame.evidence, terrain, errors, fix.at_time_m, fix.covariance_m2), weight=fix.weight)
+        for fix in frame.fixes
+    ]
     return replace(frame, modes=tuple(modes))
 
 
-def located_evidence(located: Located) -> tuple[Evidence, ImageErrors | None]:
-    """Rows of the stars and of the sky's light above the map's horizon, and the errors of the image in the latter."""
-    stars, sky, fit = located.evidence(), located.sky_light, located.skyline_fit
-    if sky is None or fit is None:
-        return stars, None
-    image = ~fit.errors.of_terrain
-    raised_px = fit.errors.raised_px[:, image] @ fit.errors.mean[image]
-    light = sky.evidence(fit.used, raised_px, located.sky_variance_factor)
-    raised_rad = np.where(fit.used[:, None], fit.errors.raised_px[:, image] / sky.px_per_rad[:, None], 0.0)
-    errors = ImageErrors(raised_rad, fit.errors.covariance[:OFFSET_TERMS, :OFFSET_TERMS])
-    if not located.by_stars:
-        return replace(light, clock=stars.clock), errors
-    return Evidence.concatenate(stars, light), errors
-
-
-def _mode_estimates(
-    located: Located, rows: Evidence, terrain: Terrain, shared: SharedErrors, errors: ImageErrors | None
-) -> Iterator[FrameEstimate]:
-    fix = located.fix
+def image_fixes(fix: Fix, terrain: Terrain) -> tuple[ImageFix, ...]:
+    """The position of a `fix` by one image, or each of several."""
     if not fix.ambiguous:
-        first = first_guess(shared, fix.position_enu_m[:2], fix.covariance_m2, fix.horizon_error_rad)
-        yield estimate_frame(rows, terrain, shared, *first, errors)
-        return
+        position, at = np.asarray(fix.position_enu_m), np.asarray(fix.at_time_m)
+        return (ImageFix(position, np.asarray(fix.covariance_m2), fix.radius95_m, fix.radius999_m, at),)
+    found = []
     for mode in fix.modes:
-        at, spread = np.array([mode.east_m, mode.north_m]), MODE_SIGMA_M**2 * np.eye(2)
-        first = first_guess(shared, at, spread, fix.horizon_error_rad)
-        yield replace(estimate_frame(rows, terrain, shared, *first, errors), weight=mode.weight)
+        at = np.array([mode.east_m, mode.north_m])
+        sigma = mode.radius95_m / CIRCLE_SIGMAS if np.isfinite(mode.radius95_m) else MODE_SIGMA_M
+        position = np.asarray(camera_at(at, terrain))
+        found.append(ImageFix(position, sigma**2 * np.eye(2), mode.radius95_m, mode.radius999_m, at, mode.weight))
+    return tuple(found)
 
 
-def rows_near(rows: Evidence, terrain: Terrain, estimates: tuple[FrameEstimate, ...]) -> Evidence:
-    """The rows near the skyline seen from one of the modes."""
-    return rows.take(np.any([_is_near(rows, terrain, e.mean[:2]) for e in estimates], axis=0))
+def located_evidence(located: Located) -> Evidence:
+    """Rows of the stars and of the sky's light that a position is from, with the errors of the image."""
+    stars = replace(located.evidence(), near=None)
+    if located.sky_light is None or located.sky_used is None:
+        return stars
+    light = located.sky_light.evidence(located.sky_used, np.zeros(SECTORS))
+    rows = Evidence.concatenate(stars, light) if located.by_stars else light
+    return replace(rows, clock=stars.clock, image_errors=located.image_errors)
 
 
-def _is_near(rows: Evidence, terrain: Terrain, position_m: Array) -> Bools:
+def informative_rows(rows: Evidence, terrain: Terrain, position_m: Array) -> Evidence:
+    """The rows about the skyline seen from a position (2,) that say something about it."""
     azimuth = np.linspace(0.0, 2 * np.pi, 721)
-    horizon = np.interp(rows.azimuth_rad, azimuth, terrain.horizon_rad(position_m[None], azimuth))
-    return np.asarray(np.abs(rows.elevation_rad - horizon) < NEAR_RAD)
+    above = rows.elevation_rad - np.interp(rows.azimuth_rad, azimuth, terrain.horizon_rad(position_m[None], azimuth))
+    kept = (np.abs(rows.llr) > MIN_ROW_NATS) | (rows.extended_nats > MIN_ROW_NATS)
+    kept &= np.asarray(terrain.is_informative(rows.azimuth_rad, rows.elevation_rad))
+    return rows.take(kept & (above > LOW_RAD) & (above < HIGH_RAD))

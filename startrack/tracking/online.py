@@ -13,6 +13,8 @@ from startrack.tracking.contradictions import (
     WRONG_SIGMA_M,
     log_normal,
     smooth_robustly,
+    wrong_covariance,
+    wrong_log_odds,
 )
 from startrack.tracking.filter import TrackFilter
 from startrack.tracking.frame_estimate import FrameEstimate
@@ -51,6 +53,11 @@ class OnlineTrack:
         """Which mode of the last frame is used; -1: none."""
         return self._mode[-1]
 
+    @property
+    def is_first(self) -> bool:
+        """Whether the last frame is used, and the only one so far."""
+        return self.mode >= 0 and sum(mode >= 0 for mode in self._mode) == 1
+
     def add(self, modes: Modes, move_m: Array, sigma_m: float) -> None:
         """One more frame, with one mode, several (ambiguous) or none (refused), after a move (2,) in enu.
 
@@ -71,17 +78,18 @@ class OnlineTrack:
             return -1, False
         self._filter.predict(move_m, 0.0)
         wide = self._filter.covariance_m2[0, 0] > 1e3 * WRONG_SIGMA_M**2 or not np.isfinite(sigma_m)
-        if wide:  # nothing is predicted
+        if wide:  # no position is predicted
+            doubts = [wrong_log_odds(*self._filter.innovation(mode), mode, placed=False) for mode in modes]
             self._filter.predict(-move_m, 0.0)
-            return (0 if len(modes) == 1 else -1), False
+            return (0 if len(modes) == 1 and doubts[0] < 0.0 else -1), False
         found = []
         for number, mode in enumerate(modes):
             residual, covariance = self._filter.innovation(mode)
-            residual, covariance = residual[:2], covariance[:2, :2] + sigma_m**2 * np.eye(2)
+            covariance[[0, 1], [0, 1]] += sigma_m**2
             share = np.log(mode.weight)
             right = np.log(1.0 - SLIP_PROBABILITY - WRONG_PROBABILITY) + log_normal(residual, covariance)
-            slip = np.log(SLIP_PROBABILITY) + log_normal(residual, covariance + SLIP_SIGMA_M**2 * np.eye(2))
-            wrong = np.log(WRONG_PROBABILITY) + log_normal(residual, covariance + WRONG_SIGMA_M**2 * np.eye(2))
+            slip = np.log(SLIP_PROBABILITY) + log_normal(residual, _wider(covariance, SLIP_SIGMA_M))
+            wrong = np.log(WRONG_PROBABILITY) + log_normal(residual, covariance + wrong_covariance(mode))
             found += [(share + right, number, False), (share + slip, number, True), (share + wrong, -1, False)]
         self._filter.predict(-move_m, 0.0)
         best = max(found)
@@ -110,3 +118,10 @@ class OnlineTrack:
         self._filter = TrackFilter(*self._start)
         for (modes, move_m, sigma_m), mode, slipped in zip(self._added, self._mode, self._slipped, strict=True):
             self._take(modes, move_m, sigma_m, mode, slipped)
+
+
+def _wider(covariance: Array, sigma_m: float) -> Array:
+    """The covariance (p, p) with another error of the position on each axis."""
+    found = covariance.copy()
+    found[[0, 1], [0, 1]] += sigma_m**2
+    return found

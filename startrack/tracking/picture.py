@@ -10,7 +10,6 @@ from startrack.output.picture.annotate import draw_legend_sample
 from startrack.output.picture.canvas import DIM_INK, INK, POSITION, SKY_BLUE, Box, Canvas, Colour, wrap_text
 from startrack.output.picture.maps import MapView, draw_overview
 from startrack.output.picture.terrain_picture import draw_distances
-from startrack.tracking.circles import radius_holding
 from startrack.tracking.frame_graph import Series, draw_graph
 from startrack.tracking.track import Track
 from startrack.tracking.track_map import ODOMETRY, REFUSED, draw_track_map
@@ -69,7 +68,7 @@ def _facts(track: Track) -> list[str]:
     if statuses:
         start, end = (f"{track.frames[k].time_utc:%Y-%m-%d %H:%M:%S}" for k in (0, -1))
         lines.append(f"{start} to {end} UTC")
-    radius_m = radius_holding(track.smoothed.covariance_m2, 0.95)
+    radius_m = track.smoothed.radius95_m
     known = np.flatnonzero(np.isfinite(radius_m))
     if len(known):
         east_m, north_m, _ = track.smoothed.position_enu_m[known[-1]]
@@ -107,8 +106,8 @@ def _draw_legend(canvas: Canvas, y: float, legend: list[tuple[str, Colour, str]]
 def _draw_graphs(canvas: Canvas, track: Track, odometry_m: Array | None) -> None:
     """Stated 95 % radii by frame; beside it, how far odometry alone departs from the smoothed track."""
     radii: list[Series] = [
-        ("filtered", radius_holding(track.filtered.covariance_m2, 0.95), SKY_BLUE),
-        ("smoothed", radius_holding(track.smoothed.covariance_m2, 0.95), POSITION),
+        ("filtered", track.filtered.radius95_m, SKY_BLUE),
+        ("smoothed", track.smoothed.radius95_m, POSITION),
     ]
     crossed = np.array([k for k, frame in enumerate(track.frames) if frame.status != "used"], dtype=np.int64)
     left, right = MAP_BOX[0], PANEL[2]

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from startrack.frames import format_utc, latlon_from_enu
-from startrack.tracking.circles import radius_holding
-from startrack.tracking.track import Track, Trajectory
+from startrack.tracking.track import Track
 from startrack.types import Array
 
 STATUSES = ("used", "left_out", "refused")
@@ -25,21 +24,12 @@ class TrackValues:
         self.track = track
 
     @cached_property
-    def radius95_m(self) -> dict[str, Array]:
-        """(n,) of the filtered and the smoothed positions."""
-        return {name: radius_holding(one.covariance_m2, 0.95) for name, one in self._trajectories.items()}
-
-    @cached_property
     def latlon_deg(self) -> Array:
         """(n, 2) of the smoothed positions."""
         site = self.track.terrain.site
         if site is None:
             return np.full((len(self.track.frames), 2), np.nan)
         return np.degrees(np.stack(latlon_from_enu(site, *self.track.smoothed.position_enu_m.T), axis=-1))
-
-    @property
-    def _trajectories(self) -> dict[str, Trajectory]:
-        return {"filtered": self.track.filtered, "smoothed": self.track.smoothed}
 
 
 @dataclass(frozen=True)
@@ -70,6 +60,10 @@ def _covariance(name: str, row: int, column: int) -> Callable[[TrackValues, int]
     return lambda values, k: _number(getattr(values.track, name).covariance_m2[k, row, column])
 
 
+def _radius(name: str, key: str) -> Callable[[TrackValues, int], Any]:
+    return lambda values, k: _number(getattr(getattr(values.track, name), key)[k])
+
+
 def _quaternion(axis: int) -> Callable[[TrackValues, int], Any]:
     def value(values: TrackValues, k: int) -> float | None:
         found = values.track.frames[k].quat_xyzw_body_enu
@@ -89,11 +83,11 @@ def _trajectory(name: str, prefix: str, when: str) -> list[FrameQuantity]:
         )
         for text, at in (("ee", (0, 0)), ("en", (0, 1)), ("nn", (1, 1)))
     ]
-    radius = FrameQuantity(
-        f"{prefix}radius95_m", "m", "%.4f", "circle about it that holds 95 %",
-        lambda values, k: _number(values.radius95_m[name][k]),
-    )  # fmt: skip
-    return [*position, *covariance, radius]
+    radii = [
+        FrameQuantity(f"{prefix}{key}", "m", "%.4f", f"circle about it that holds {part} %", _radius(name, key))
+        for key, part in (("radius95_m", "95"), ("radius999_m", "99.9"))
+    ]
+    return [*position, *covariance, *radii]
 
 
 FRAME_QUANTITIES = (

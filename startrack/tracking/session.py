@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,13 +16,12 @@ from startrack.catalog import load_catalog
 from startrack.errors import BadInput
 from startrack.inputs import load_camera_input, terrain_input
 from startrack.pipeline import NO_TIME, locate
-from startrack.stages import Located, Settings
-from startrack.tracking.depth import drop_other_depths, free_depth
+from startrack.stages import Settings
 from startrack.tracking.frame_store import FrameStore
-from startrack.tracking.observe import ObservedFrame, observe_again, observe_frame
+from startrack.tracking.observe import ObservedFrame, facts_of, observe_again, observe_frame
 from startrack.tracking.odometry import SPAN_TOLERANCE_S, Odometry
 from startrack.tracking.online import RECENT_FRAMES, OnlineTrack
-from startrack.tracking.shared import SharedErrors
+from startrack.tracking.shared import TrackErrors
 from startrack.tracking.track import (
     ODOMETRY_FLOOR_M,
     ODOMETRY_SIGMA,
@@ -42,8 +41,8 @@ if TYPE_CHECKING:
 class TrackSession:
     """A track that grows image by image. Camera and terrain are those of its first image; all must have them.
 
-    Where the sky's light in an image shows a crater's depth that its file excludes, the depth is one of the errors that
-    the images share from then on; the images before it are observed anew from their evidence.
+    Where an image shows a gross error of a fact that no file states, that error is one of those that the images share;
+    the others are observed anew from their evidence.
     """
 
     store: FrameStore | None = None  # None: frames are kept in memory alone
@@ -54,7 +53,7 @@ class TrackSession:
     frames: list[ObservedFrame] = field(default_factory=list)  # in the order of time
     terrain: Terrain | None = None
     camera: Camera | None = None
-    shared: SharedErrors | None = None
+    shared: TrackErrors | None = None
     _references: tuple[Any, Any] | None = None  # camera and terrain as the first image has them
     _filtered: list[ObservedFrame] = field(default_factory=list)  # that the filter has
     _online: OnlineTrack | None = None
@@ -78,24 +77,21 @@ class TrackSession:
         frame = None if self.store is None or key is None else self.store.read(key)
         if frame is None:
             outcome = locate(exposure, camera, terrain, load_catalog(), self.settings)
-            if isinstance(outcome, Located) and outcome.steeper:
-                terrain, shared = self._free_depth(terrain, shared)
-            frame = observe_frame(outcome, shared, terrain)
+            frame = observe_frame(outcome, replace(shared, gross=facts_of(outcome, shared)), terrain)
             if self.store is not None and key is not None:
                 self.store.write(key, frame)
-        elif frame.steeper:
-            self._free_depth(terrain, shared)
+        frame = self._share_facts(frame, terrain, shared)
         self.frames.append(frame)
         self.frames.sort(key=lambda one: (one.time_utc, one.name))
         return frame
 
-    def _free_depth(self, terrain: Terrain, shared: SharedErrors) -> tuple[Terrain, SharedErrors]:
-        """The `terrain` with a depth that the images estimate, and the `shared` errors with that of the depth."""
-        terrain = free_depth(terrain)
-        shared = shared.of_terrain(terrain)
-        self.frames = [observe_again(frame, shared, terrain) for frame in self.frames]
-        self.terrain, self.shared = terrain, shared
-        return terrain, shared
+    def _share_facts(self, frame: ObservedFrame, terrain: Terrain, shared: TrackErrors) -> ObservedFrame:
+        """The new `frame` with the gross errors that all images show; the others anew where it shows another one."""
+        together = shared.with_gross(frame.facts)
+        if together.gross != shared.gross:
+            self.frames = [observe_again(one, together, terrain) for one in self.frames]
+            self.shared = together
+        return frame if frame.facts == together.gross else observe_again(frame, together, terrain)
 
     def estimate(
         self,
@@ -154,17 +150,16 @@ class TrackSession:
             return
         if self._filtered != self.frames[: len(self._filtered)]:
             self._filtered, self._online = [], None
-        self._online = self._online or OnlineTrack(len(self.shared.names), self.terrain.height_sigma_m)
+        self._online = self._online or OnlineTrack(len(self.shared), self.terrain.height_sigma_m)
         for k in range(len(self._filtered), len(self.frames)):
             if not _is_reached(self.frames[k], odometry):
                 return
-            frame = drop_other_depths(self.frames[: k + 1], self.shared)[k]
             recent = self.frames[max(k - RECENT_FRAMES, 0) : k + 1]
             steps = odometry_steps(recent, odometry, odometry_sigma, odometry_floor_m)
             move, sigma = (steps.move_m[-1], float(steps.sigma_m[-1])) if k else (np.zeros(2), 0.0)
-            self._online.add(frame.modes, move, sigma)
+            self._online.add(self.frames[k].modes, move, sigma)
             self._filtered.append(self.frames[k])
-            yield track_of_newest(frame, self._online, self.terrain)
+            yield track_of_newest(self.frames[k], self._online, self.terrain)
 
     def _check_time(self, exposure: Exposure) -> None:
         """Raise BadInput for a second image of one time: its evidence would count twice."""
@@ -172,7 +167,7 @@ class TrackSession:
         if same is not None:
             raise BadInput("bad_image", f"{exposure.name} has the time of {same.name}: a track takes an image once")
 
-    def _load_references(self, exposure: Exposure) -> tuple[Camera, Terrain, SharedErrors]:
+    def _load_references(self, exposure: Exposure) -> tuple[Camera, Terrain, TrackErrors]:
         """Camera, terrain and shared errors of the track: those of its first image. Raises BadInput for another's."""
         camera = exposure.camera if self.stated_camera is None else self.stated_camera
         terrain = exposure.terrain if self.stated_terrain is None else self.stated_terrain
@@ -183,7 +178,7 @@ class TrackSession:
         if self.camera is None or self.terrain is None or self.shared is None:
             lens, ground = load_camera_input(camera), terrain_input(terrain, None)
             uses_sky = self.settings.evidence_sources != "stars"
-            self.shared = SharedErrors.of_exposure(ground, exposure, uses_sky)
+            self.shared = TrackErrors.of_exposure(ground, exposure, uses_sky)
             self.camera, self.terrain, self._references = lens, ground, (camera, terrain)
         first_camera, first_terrain = self._references or (None, None)
         if terrain is not first_terrain and terrain != first_terrain:
@@ -192,13 +187,15 @@ class TrackSession:
             raise BadInput("bad_calibration", f"{exposure.name} is of the camera {camera}, the track of {first_camera}")
         return self.camera, self.terrain, self.shared
 
-    def _key(self, exposure: Exposure, path: str | None, shared: SharedErrors) -> str | None:
+    def _key(self, exposure: Exposure, path: str | None, shared: TrackErrors) -> str | None:
         """Hash of all that decides a frame; None for an image that is not from a file."""
         if path is None:
             return None
         mask = exposure.mask if isinstance(exposure.mask, str) else None
         files = input_hashes(path, [exposure.camera, exposure.terrain, mask])
-        errors = [shared.names, shared.sigma.tolist(), shared.turn_rad_s.tolist()]
+        alone = replace(shared, gross=frozenset())  # with the facts that the image itself shows
+        clock = None if shared.listed.clock is None else shared.listed.clock.turn_rad_s.tolist()
+        errors = [repr(shared.listed.listed), alone.names, alone.sigma.tolist(), clock]
         job = job_sha256(
             path, exposure.sha256, self.facts, self.settings.evidence_sources, sorted(files.items()), errors
         )

@@ -1,66 +1,40 @@
-"""The errors that frames of a track share (horizon, clock, a crater's shape, skyline), and those of each image."""
+"""The errors that frames of a track share: of the terrain, of the clock, and of the skyline in the sky's light."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
 
-from startrack.localization import clock_at, clock_matters
+from startrack.localization import clock_at
+from startrack.localization.shared_errors import SharedErrors
 from startrack.pipeline import NO_TIME
-from startrack.sky_errors import EDGE_SIGMA_PX
+from startrack.sky_refinement import EDGE_SIGMA_PX
 from startrack.terrain import Terrain
-from startrack.types import Array, BadInput, Clock, Evidence, Exposure
+from startrack.types import Array, BadInput, Clock, Evidence, Exposure, ImageErrors
 
-BIAS, CLOCK, STEEPNESS, EDGE = "horizon_bias_rad", "clock_s", "steepness_1", "edge_px"
-SHAPES = STEEPNESS, "size_1"
-COARSEST_PX_PER_RAD = 100.0  # of a lens: for a bound
+BIAS, CLOCK, DEPTH, EDGE = "bias_rad", "clock_s", "depth_1", "edge_px"
 
 
 @dataclass(frozen=True, eq=False)
-class ImageErrors:
-    """Errors of attitude and lens [px]: they raise the skyline of the sky's light, not that of the stars."""
+class TrackErrors:
+    """The errors (k,) that all frames of a track have in common, with their standard deviations.
 
-    raised_rad: Array  # (sectors, j) of equal width from north on, by one px of each, the first all around; 0: unused
-    covariance: Array  # (j, j)
+    Those of the terrain and the clock come first, as `SharedErrors` lists them. Parameters of a track are a position
+    (2,) [m] and the errors in units of their standard deviations.
+    """
 
-    def without_edge(self, shared: SharedErrors) -> ImageErrors:
-        """These without the error of the whole skyline, where it is among the errors `shared` by all images."""
-        if EDGE not in shared.names:
-            return self
-        own = self.covariance.copy()
-        own[0, 0] -= EDGE_SIGMA_PX**2
-        return replace(self, covariance=own)
-
-    def at(self, azimuth_rad: Array) -> Array:
-        """Rises (n, j) [rad] at azimuths (n,), by one unit of each."""
-        sector = (azimuth_rad / (2 * np.pi) * len(self.raised_rad)).astype(np.int64) % len(self.raised_rad)
-        return np.asarray(self.raised_rad[sector])
-
-
-@dataclass(frozen=True, eq=False)
-class SharedErrors:
-    """Names and standard deviations (k,) of the shared errors, in the units that their names end with."""
-
-    names: tuple[str, ...]
-    sigma: Array  # (k,)
-    turn_rad_s: Array  # (3,) of the sky, in enu
+    listed: SharedErrors  # of the terrain and the clock
+    uses_sky: bool = False  # whether the light of the sky is part of the evidence
+    gross: frozenset[str] = frozenset()  # facts that no file states, whose gross error an image shows
 
     @classmethod
     def of(cls, terrain: Terrain, clock: Clock | None, uses_sky: bool = False) -> Self:
-        """Those of a terrain, of a clock that matters on it, and of the skyline that the sky's light shows.
-
-        `uses_sky`: whether the light of the sky is part of the evidence.
-        """
-        stated = {BIAS: terrain.common_sigma_rad, **dict(zip(SHAPES, terrain.shape_sigma, strict=True))}
-        turn = np.zeros(3)
-        if clock is not None and clock_matters(clock, terrain):
-            stated[CLOCK], turn = clock.sigma_s, clock.turn_rad_s
-        if uses_sky:
-            stated[EDGE] = EDGE_SIGMA_PX
-        known = {name: sigma for name, sigma in stated.items() if sigma > 0.0}
-        return cls(tuple(known), np.array(list(known.values())), turn)
+        """Those of a `terrain`, of a `clock`, and with `uses_sky` of the skyline that the sky's light shows."""
+        return cls(SharedErrors.of(terrain, clock), uses_sky)
 
     @classmethod
     def of_exposure(cls, terrain: Terrain, exposure: Exposure, uses_sky: bool = False) -> Self:
@@ -72,34 +46,62 @@ class SharedErrors:
             raise BadInput("no_time", "; ".join([NO_TIME, *exposure.warnings]))
         if terrain.site is None:
             raise BadInput("bad_terrain", f"terrain {terrain.name} has no site")
-        return cls.of(terrain, clock_at(terrain.site, exposure.time_utc, exposure.time_sigma_s), uses_sky)
+        stated = exposure.time_sigma_s, exposure.time_sigma_is_stated
+        return cls.of(terrain, clock_at(terrain.site, exposure.time_utc, *stated), uses_sky)
 
-    def of_terrain(self, terrain: Terrain) -> Self:
-        """The same clock and skyline above another `terrain`."""
-        own, kept = type(self).of(terrain, None), [name for name in self.names if name in (CLOCK, EDGE)]
-        sigma = [self.sigma[self.names.index(name)] for name in kept]
-        return type(self)((*own.names, *kept), np.append(own.sigma, sigma), self.turn_rad_s)
+    def with_gross(self, facts: Iterable[str]) -> Self:
+        """The same with gross errors of more `facts`; those that the terrain states are left out."""
+        return replace(self, gross=self.gross | (frozenset(facts) & frozenset(self.listed.facts)))
 
-    def shape_axis(self, name: str) -> int:
-        """Which of the two numbers of `Terrain.reshaped` the error `name` is."""
-        return SHAPES.index(name)
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """(k,); each ends with its unit."""
+        return (*(one.name for one in self.listed.listed), *([EDGE] if self.uses_sky else []))
 
-    def taken(self, evidence: Evidence) -> Array:
-        """(k,) what the directions of the evidence already include, in standard deviations."""
-        clock = evidence.clock
-        offset_s = 0.0 if clock is None else clock.offset_s
-        return np.array([offset_s if name == CLOCK else 0.0 for name in self.names]) / self.sigma
+    @cached_property
+    def sigma(self) -> Array:
+        """(k,) in the units of the names."""
+        found = self.listed.sigma()
+        for fact in self.gross:
+            found = np.where([one.fact == fact for one in self.listed.listed], self.listed.sigma(fact), found)
+        return np.append(found, [EDGE_SIGMA_PX] if self.uses_sky else [])
 
-    def reach_rad(self, evidence: Evidence) -> float:
-        """About the change of the heights in `evidence` above the horizon with one standard deviation of all errors."""
-        reach = 0.0
-        for name, sigma in zip(self.names, self.sigma, strict=True):
-            if name == BIAS:
-                reach += sigma
-            elif name == CLOCK:
-                reach += sigma * float(np.hypot(*self.turn_rad_s[:2]))
-            elif name == EDGE:
-                reach += sigma / COARSEST_PX_PER_RAD
-            else:
-                reach += 0.35 * sigma  # d tan H / tan H = dH / (sin H cos H), at rims up to 20 degrees
-        return reach
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def to_model(self, parameters: Array, evidence: Evidence) -> Array:
+        """Parameters (n, 2 + m) of a `SkylineModel` of `evidence`, from those of the track (n, 2 + k)."""
+        m = len(self.listed)
+        found = parameters[:, : 2 + m] * np.r_[1.0, 1.0, self.sigma[:m]]
+        if self.listed.clock is not None and evidence.clock is not None:
+            found[:, -1] -= evidence.clock.offset_s  # the directions include it
+        return found
+
+    def rise_rad(self, slopes_rad: Array, edge_rad: Array) -> Array:
+        """(n, k) rise of the skyline by one standard deviation of each error.
+
+        `slopes_rad` (m, n) are those of the listed errors by their units, `edge_rad` (n,) by one px of the edge.
+        """
+        units = np.vstack([slopes_rad, edge_rad]) if self.uses_sky else slopes_rad
+        return np.asarray((units * self.sigma[:, None]).T)
+
+    def of_image(self, errors: ImageErrors | None) -> ImageErrors | None:
+        """Errors of one image without that of the edge, where all images share it."""
+        if errors is None or not self.uses_sky:
+            return errors
+        own = errors.covariance.copy()
+        own[0, 0] -= EDGE_SIGMA_PX**2
+        return replace(errors, covariance=own)
+
+    def turn_m(self, position_m: Array) -> Array:
+        """(2, k) by which the positions of parameters are turned with the clock, at `position_m` (2,).
+
+        See `SharedErrors`: in ground that is the same after a turn the parameters hold the position before it.
+        """
+        found = np.zeros((2, len(self)))
+        clock = self.listed.clock
+        if self.listed.axisymmetric and clock is not None:
+            at = self.names.index(CLOCK)
+            angle = clock.turn_rad_s[2] * self.sigma[at]
+            found[:, at] = angle * np.array([-position_m[1], position_m[0]])
+        return found

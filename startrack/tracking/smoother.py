@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from startrack.tracking.frame_estimate import FrameEstimate
+from startrack.tracking.frame_model import UNKNOWN_M
 from startrack.types import Array, Ints
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
-
-UNKNOWN_M = 1e6  # standard deviation of a position about which nothing is known
 
 
 @dataclass(frozen=True, eq=False)

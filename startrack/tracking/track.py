@@ -14,13 +14,14 @@ from startrack.frames import quat_xyzw_from_R
 from startrack.localization.summary import camera_at
 from startrack.terrain import Terrain
 from startrack.tracking.at_rest import positions_at_rest
+from startrack.tracking.circles import radius_holding
 from startrack.tracking.contradictions import RobustTrack, smooth_robustly
-from startrack.tracking.depth import drop_other_depths
-from startrack.tracking.observe import ObservedFrame
+from startrack.tracking.frame_model import UNKNOWN_M
+from startrack.tracking.observe import ImageFix, ObservedFrame
 from startrack.tracking.odometry import Odometry
 from startrack.tracking.online import OnlineTrack
-from startrack.tracking.shared import BIAS, CLOCK, SHAPES, SharedErrors
-from startrack.tracking.smoother import UNKNOWN_M, Smoothed, Steps
+from startrack.tracking.shared import BIAS, CLOCK, DEPTH, TrackErrors
+from startrack.tracking.smoother import Smoothed, Steps
 from startrack.types import Array, BadInput, Bools, ClockError, Ints
 
 ODOMETRY_SIGMA, ODOMETRY_FLOOR_M = 0.02, 0.05  # of a move, relative to its length, and beside that
@@ -33,6 +34,14 @@ class Trajectory:
 
     position_enu_m: Array  # (n, 3)
     covariance_m2: Array  # (n, 2, 2) of east and north
+    radius95_m: Array  # (n,) circle about the position that holds 95 %
+    radius999_m: Array  # (n,) 99.9 %
+
+    @classmethod
+    def of_normal(cls, position_enu_m: Array, covariance_m2: Array) -> Trajectory:
+        """With the circles of normal errors."""
+        radius95, radius999 = (radius_holding(covariance_m2, part) for part in (0.95, 0.999))
+        return cls(position_enu_m, covariance_m2, radius95, radius999)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +94,7 @@ class Track:
 def estimate_track(
     frames: Sequence[ObservedFrame],
     terrain: Terrain,
-    shared: SharedErrors,
+    shared: TrackErrors,
     *,
     odometry: Odometry | None = None,
     odometry_sigma: float = ODOMETRY_SIGMA,
@@ -109,22 +118,28 @@ def estimate_track(
     times = [frame.time_utc for frame in frames]
     if any(a > b for a, b in pairwise(times)):
         raise BadInput("no_time", "the frames are not in the order of their times")
-    frames = drop_other_depths(frames, shared)
+    n = len(frames)
     if at_rest:
         rest = positions_at_rest(frames, terrain, shared)
-        robust = RobustTrack(rest.smoothed, rest.mode, np.zeros(max(len(frames) - 1, 0), dtype=bool))
-        n = len(frames)
+        robust = RobustTrack(rest.smoothed, rest.mode, np.zeros(max(n - 1, 0), dtype=bool))
         smoothed = np.repeat(rest.smoothed.position_m, n, 0), np.repeat(rest.smoothed.covariance_m2, n, 0)
         filtered = rest.position_m, rest.covariance_m2
+        first, second = [*np.flatnonzero(rest.mode >= 0).tolist(), n][:2]
+        known_by_first = range(first, second)
     else:
         steps = odometry_steps(frames, odometry, odometry_sigma, odometry_floor_m)
         modes = [frame.modes for frame in frames]
         robust = smooth_robustly(modes, steps, terrain.height_sigma_m)
         smoothed = robust.smoothed.position_m, robust.smoothed.covariance_m2
-        filtered = filter_positions(modes, steps, len(shared.names), terrain.height_sigma_m)
+        filtered = filter_positions(modes, steps, len(shared), terrain.height_sigma_m)
+        first = next(k for k, of in enumerate(modes) if len(of) == 1)
+        known_by_first = range(first, first + 1)
+    used = np.flatnonzero(robust.mode >= 0).tolist()
+    by_one = [] if len(used) > 1 else range(n) if at_rest else used
     return Track(
         tuple(_track_frame(frame, mode) for frame, mode in zip(frames, robust.mode, strict=True)),
-        _trajectory(*filtered, terrain), _trajectory(*smoothed, terrain), *_bias(robust.smoothed, shared),
+        _trajectory(*filtered, terrain, frames[first].fixes, known_by_first),
+        _trajectory(*smoothed, terrain, frames[used[0]].fixes, by_one), *_bias(robust.smoothed, shared),
         _clock(robust.smoothed, shared), _depth(robust.smoothed, shared), _crests(robust.smoothed, terrain),
         robust.slipped, at_rest, terrain,
     )  # fmt: skip
@@ -132,7 +147,8 @@ def estimate_track(
 
 def track_of_newest(frame: ObservedFrame, online: OnlineTrack, terrain: Terrain) -> Track:
     """The last `frame` that `online` has, as a track of its own: by all frames up to it."""
-    found = _trajectory(online.position_m[None], online.covariance_m2[None], terrain)
+    known_by_one = [0] if online.is_first else []
+    found = _trajectory(online.position_m[None], online.covariance_m2[None], terrain, frame.fixes, known_by_one)
     none = np.zeros(0, dtype=bool)
     return Track((_track_frame(frame, online.mode),), found, found, 0.0, 0.0, None, None, None, none, False, terrain)
 
@@ -187,34 +203,45 @@ def _track_frame(frame: ObservedFrame, mode: int) -> TrackFrame:
     return TrackFrame(frame.name, frame.time_utc, status, reason, message, quat)
 
 
-def _trajectory(position_m: Array, covariance_m2: Array, terrain: Terrain) -> Trajectory:
+def _trajectory(
+    position_m: Array, covariance_m2: Array, terrain: Terrain, fixes: Sequence[ImageFix], by_fix: Sequence[int]
+) -> Trajectory:
+    """Positions (n, 2) and covariances (n, 2, 2) as a trajectory.
+
+    Those of the frames `by_fix` are by one image alone: the only one of its `fixes` is what is known of them.
+    """
     known = np.sqrt(np.trace(covariance_m2, axis1=1, axis2=2)) < UNKNOWN_SIGMA_M
     position = np.full((len(position_m), 3), np.nan)
     for k in np.flatnonzero(known):
         position[k] = camera_at(position_m[k], terrain)
-    return Trajectory(position, np.where(known[:, None, None], covariance_m2, np.inf))
+    found = Trajectory.of_normal(position, np.where(known[:, None, None], covariance_m2, np.inf))
+    for at in by_fix if len(fixes) == 1 else ():
+        found.position_enu_m[at], found.covariance_m2[at] = fixes[0].position_enu_m, fixes[0].covariance_m2
+        found.radius95_m[at], found.radius999_m[at] = fixes[0].radius95_m, fixes[0].radius999_m
+    return found
 
 
-def _bias(found: Smoothed, shared: SharedErrors) -> tuple[float, float]:
+def _bias(found: Smoothed, shared: TrackErrors) -> tuple[float, float]:
     return _estimate(found, shared, BIAS) or (0.0, 0.0)
 
 
-def _clock(found: Smoothed, shared: SharedErrors) -> ClockError | None:
+def _clock(found: Smoothed, shared: TrackErrors) -> ClockError | None:
     clock = _estimate(found, shared, CLOCK)
     return None if clock is None else ClockError(*clock)
 
 
-def _depth(found: Smoothed, shared: SharedErrors) -> DepthError | None:
-    depth = _estimate(found, shared, *SHAPES)  # a larger crater of one steepness is deeper
+def _depth(found: Smoothed, shared: TrackErrors) -> DepthError | None:
+    depth = _estimate(found, shared, DEPTH)
     return None if depth is None else DepthError(*depth)
 
 
-def _estimate(found: Smoothed, shared: SharedErrors, *names: str) -> tuple[float, float] | None:
-    """Sum of the shared errors of these names and its standard deviation; None where none of them is shared."""
-    weight = np.where(np.isin(shared.names, names), shared.sigma, 0.0)
-    if not weight.any():
+def _estimate(found: Smoothed, shared: TrackErrors, name: str) -> tuple[float, float] | None:
+    """The shared error of this name and its standard deviation; None where it is not shared."""
+    if name not in shared.names:
         return None
-    return float(weight @ found.shared), float(np.sqrt(weight @ found.shared_covariance @ weight))
+    at = shared.names.index(name)
+    sigma = float(shared.sigma[at])
+    return sigma * float(found.shared[at]), sigma * float(np.sqrt(found.shared_covariance[at, at]))
 
 
 def _crests(found: Smoothed, terrain: Terrain) -> CrestHeights | None:

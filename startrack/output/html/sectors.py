@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from startrack.localization.consistency import CONTRADICTED_NATS, SURE_LLR
 from startrack.localization.sector_likelihood import Sectors
 from startrack.output.html.details import Horizon
 from startrack.output.html.stars import MeasuredStars
@@ -17,6 +16,8 @@ NEAR_RAD = np.radians(3.0)  # to either side of the skyline
 COARSE_AZIMUTHS = 721
 COARSE_ERROR_RAD = np.radians(1.0)  # a ridge between two coarse azimuths: nearer stars get their own horizon
 NATS_DECIMALS = 2
+SURE_LLR = 4.0  # of stars that decide; of weaker ones some level skyline always fits the noise better
+CONTRADICTED_NATS = -3.0  # of one sector
 
 
 def sectors_of(stars: MeasuredStars, horizon: Horizon) -> dict[str, Any] | None:

@@ -1,4 +1,4 @@
-"""Errors that all rows share, estimated with the position and marginalised: the horizon's bias, the terrain's shape."""
+"""The error of the horizon that all azimuths share, at which the area is searched."""
 
 from __future__ import annotations
 
@@ -7,14 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.localization.explored import Explored, log_sum
-from startrack.localization.initial_guess import beam_search, is_likely_true, widening_guesses
+from startrack.localization.explored import Explored
+from startrack.localization.initial_guess import is_likely_true, widening_guesses
 from startrack.localization.likelihood import PositionLikelihood
-from startrack.terrain import Terrain
 from startrack.types import Array, Evidence, NotLocated
 
-Explore = Callable[[Evidence, Terrain], Explored]
-ExploreFrom = Callable[[Evidence, Terrain, Array | None], Explored]
+ExploreFrom = Callable[[PositionLikelihood, Array | None], Explored]
 
 PRIOR_SIGMAS = 3.0  # half width of the first grid
 BIAS_NEARBY_M = 80.0  # horizons are prepared that far about a position; a position farther off is prepared anew
@@ -22,11 +20,6 @@ BIAS_CLOSE_M = 15.0  # where the bias found makes the fit worse than none by mor
 BIAS_LOSS_NATS = 1.0
 BIAS_STEPS_M = (16.0, 4.0, 0.5)  # first and later first steps of a climb, and the last
 BIAS_GRID = (7, 5.0, 0.75, 6)  # nodes; nats kept; shrinking that is enough; rounds
-MIXED_SIGMAS, MIXED_NATS = np.linspace(-2.5, 2.5, 11), 10.0  # boxes less likely by more hold 5e-5 of the mass
-SHAPE_NEARBY_M, SHAPE_STEPS_M = 600.0, (64.0, 2.0)
-SHAPE_LLR = 0.3  # |llr| of rows that decide on shapes
-SHAPE_GRID = (5, 8.0, 0.8, 8)
-STEEPNESS_LEEWAY = 0.35  # d tan H / tan H = dH / (sin H cos H), at rims up to 20 degrees
 
 
 @dataclass(frozen=True)
@@ -38,14 +31,6 @@ class HorizonBias:
     position_m: Array  # (2,) of the camera at that bias
     drift_m_per_rad: Array  # (2,) how the position moves with the bias
     log_likelihood: float  # of the best bias and position, without the prior of the bias
-
-
-@dataclass(frozen=True)
-class ShapeFit:
-    """Shape of the terrain as the stars see it: how much steeper and how much larger it is, relative."""
-
-    shape: Array  # (2,) for `Terrain.reshaped`
-    covariance: Array  # (2, 2)
 
 
 def lower_evidence(evidence: Evidence, bias_rad: float) -> Evidence:
@@ -84,8 +69,14 @@ def estimate_horizon_bias(likelihood: PositionLikelihood, position_m: Array) -> 
 
 def _exact_fit(likelihood: PositionLikelihood, found: HorizonBias) -> float:
     """Log-likelihood of a bias and its position with traced horizons, and with the prior of the bias [nats]."""
-    lowered = lower_evidence(likelihood.evidence, found.bias_rad)
-    fit = PositionLikelihood.from_evidence(lowered, likelihood.terrain).exact_scores(found.position_m[None])
+    sectors = likelihood.sectors
+    lowered = PositionLikelihood.from_evidence(
+        lower_evidence(likelihood.evidence, found.bias_rad),
+        likelihood.terrain,
+        2 * np.pi / sectors.count,
+        sectors.epsilon,
+    )
+    fit = lowered.exact_scores(found.position_m[None])
     return float(fit[0]) - 0.5 * (found.bias_rad / likelihood.terrain.common_sigma_rad) ** 2
 
 
@@ -122,91 +113,21 @@ def _bias_nearby(likelihood: PositionLikelihood, position_m: Array, nearby_m: fl
     return HorizonBias(bias, float(np.sqrt(variance)), mean_m, drift, best)
 
 
-def marginalize_horizon_bias(
-    explore: ExploreFrom, evidence: Evidence, terrain: Terrain, bias: HorizonBias, others_m: Array
-) -> Explored:
-    """The position's posterior over all biases: explored at the likeliest one, and smeared along the drift.
+def explore_biased(explore: ExploreFrom, likelihood: PositionLikelihood) -> Explored:
+    """The boxes that may matter where the terrain's horizon may err at all azimuths together.
 
-    Exact where position and bias depend on each other linearly over the bias's own small uncertainty. `others_m` (n, 2)
-    are further positions that the search begins with.
+    They are searched at the likeliest error. `explore` searches by a likelihood, from good positions (n, 2). Raises
+    NotLocated (outside_search_area).
     """
-    found = explore(lower_evidence(evidence, bias.bias_rad), terrain, np.vstack([bias.position_m, others_m]))
-    found = found._replace(horizon_bias_rad=bias.bias_rad)
-    return mix_shifted(found, bias.sigma_rad * bias.drift_m_per_rad, terrain)
-
-
-def mix_shifted(found: Explored, sigma_m: Array, terrain: Terrain) -> Explored:
-    """The posterior smeared by a normal shift of one standard deviation `sigma_m` (2,) along its direction."""
-    keep = found.log_likelihood > np.max(found.log_likelihood, initial=-np.inf) - MIXED_NATS
-    steps = MIXED_SIGMAS[:, None, None] * sigma_m
-    if not keep.any() or np.abs(steps).max() < 0.5 * found.half_m:
-        return found
-    share = np.exp(-0.5 * MIXED_SIGMAS**2)
-    share /= share.sum()
-    smeared = (found.centres_m[keep] + steps).reshape(-1, 2)
-    weights = (found.log_likelihood[keep] + np.log(share)[:, None]).ravel()
-    inside = np.asarray(terrain.allowed(smeared))
-    return found._replace(centres_m=smeared[inside], log_likelihood=weights[inside])
-
-
-def marginalize_shape(explore: Explore, evidence: Evidence, terrain: Terrain) -> tuple[Explored, ShapeFit]:
-    """The position's posterior over the shapes of a terrain, each with its share of the probability.
-
-    Grids of shapes, each with its best position, zoom in on those that matter; over the last grid the exact posteriors
-    are mixed. A shape with which no position explains the evidence has no share. Raises NotLocated where all are such.
-    """
-    nodes, parts = _explore_shapes(explore, evidence, terrain, _shapes_that_matter(evidence, terrain))
-    log_prior = np.array([terrain.log_prior(node) for node in nodes])
-    logs = [p.log_likelihood + prior + np.log(4 * p.half_m**2) for p, prior in zip(parts, log_prior, strict=True)]
-    log_mass = np.array([log_sum(log) for log in logs])
-    share = np.exp(log_mass - log_mass.max())
-    share /= share.sum()
-    mean = share @ nodes
-    half = max(p.half_m for p in parts)
-    dropped = log_sum(np.array([p.log_dropped + prior for p, prior in zip(parts, log_prior, strict=True)]))
-    search = "beam" if any(p.search == "beam" for p in parts) else "proven"
-    density = np.concatenate(logs) - np.log(4 * half**2)
-    bias = float(share @ [p.horizon_bias_rad for p in parts])
-    centres, shape = np.concatenate([p.centres_m for p in parts]), (float(mean[0]), float(mean[1]))
-    mixed = Explored(centres, half, density, dropped, search, bias, shape)
-    return mixed, ShapeFit(mean, np.einsum("n,ni,nj->ij", share, nodes - mean, nodes - mean))
-
-
-def _explore_shapes(
-    explore: Explore, evidence: Evidence, terrain: Terrain, nodes: Array
-) -> tuple[Array, list[Explored]]:
-    """The shapes (n, 2) that explain the evidence somewhere, and their posteriors."""
-    kept, parts, refused = [], [], None
-    for node in nodes:
-        try:
-            parts.append(explore(evidence, terrain.reshaped(node)))
-            kept.append(node)
-        except NotLocated as refusal:
-            if refusal.reason == "insufficient_geometry":  # its share is not known
-                raise
-            refused = refusal
-    if refused is not None and not parts:
-        raise refused
-    return np.array(kept), parts
-
-
-def _shapes_that_matter(evidence: Evidence, terrain: Terrain) -> Array:
-    """Nodes (n, 2) of an even grid that covers the joint posterior of shape and position."""
-    half = PRIOR_SIGMAS * np.array(terrain.shape_sigma)
-    guess = beam_search(PositionLikelihood.from_evidence(evidence, terrain))
-    position = guess.points_m[0] if len(guess.points_m) else np.zeros(2)
-    # Without floors the likelihood falls all the way to its top, so that a climb is not caught on the way.
-    plain = PositionLikelihood.from_evidence(evidence.take(np.abs(evidence.llr) > SHAPE_LLR), terrain, epsilon=0.0)
-    local = plain.near(position, SHAPE_NEARBY_M, STEEPNESS_LEEWAY * float(half.sum()))
-
-    def fits(nodes: Array) -> Array:
-        nonlocal position
-        found = [local.with_terrain(terrain.reshaped(node)).climb(position, *SHAPE_STEPS_M) for node in nodes]
-        scores = np.array([fit + terrain.log_prior(node) for (_, fit), node in zip(found, nodes, strict=True)])
-        position = found[int(np.argmax(scores))][0]
-        return scores
-
-    return zoom_grid(fits, half, *SHAPE_GRID)[0]
+    terrain = likelihood.terrain
+    if terrain.common_sigma_rad == 0.0:
+        return explore(likelihood, None)
+    bias, others_m = find_horizon_bias(likelihood)
+    sectors = likelihood.sectors
+    lowered = PositionLikelihood.from_evidence(
+        lower_evidence(likelihood.evidence, bias.bias_rad), terrain, 2 * np.pi / sectors.count, sectors.epsilon
+    )
+    return explore(lowered, np.vstack([bias.position_m, others_m]))._replace(horizon_bias_rad=bias.bias_rad)
 
 
 def zoom_grid(

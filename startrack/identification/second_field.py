@@ -1,0 +1,126 @@
+"""A second star field in the frame, at another attitude: the camera turned between two parts of the exposure.
+
+The significant point sources that the first attitude does not explain are identified by themselves, with the same odds
+against chance. What is found is a second exposure, unless it is a ghost (a reflection in the lens), or a part of the
+image that came from another one.
+
+A ghost is faint. Bare silicon reflects 35 % of the light and a cover glass without coatings 8 % back onto it: 3 %. A
+part p of the exposure shows its stars with p / (1 - p) of the light of the others. Rendered ghosts of 10 and
+30 % were measured with 10 and 28 %, second parts of 30 % with 41 %, of 50 % with 80 to 97 %.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.camera import Camera
+from startrack.identification.lost_in_space import Identifier
+from startrack.match import SIGNIFICANT_SNR
+from startrack.types import Array, Centroids, Identification, Ints, NotIdentified, NotLocated, Stars
+
+LEAST_UNEXPLAINED = 12  # significant sources; untouched frames have 0 to 4
+LEAST_PART = 0.03  # of them, to the identified stars: second exposures of 30 to 50 % had 0.11 to 0.39, ghosts to 0.015
+LEAST_STARS = 8  # of a second field
+EXPLAINED_PX = 1.5  # from a predicted star; nearer sources belong to the first attitude
+FAINTER_MAG = 1.0  # predicted stars fainter than the faintest identified one explain sources, too
+MOST_SOURCES = 150  # brightest ones that are identified
+LEAST_TURN_PX = 3.0  # of the stars: below it both images of a star are one source
+LEAST_RATIO = 0.35  # of the light of the fainter field to that of the other one
+LEAST_INTERLEAVED = 0.25  # of the second field beside stars of the first: second exposures 0.39 to 1, strips to 0.15
+
+
+@dataclass(frozen=True)
+class SecondField:
+    """A second field of stars."""
+
+    stars: int  # identified
+    turn_rad: float  # between both attitudes
+    shift_px: float  # by which its stars are displaced, the median
+    ratio: float  # of light at equal magnitude, that of the fainter field to that of the other
+    interleaved: float  # part of its stars beside which a star of the first field is seen
+    false_alarm_probability: float
+
+    @property
+    def is_exposure(self) -> bool:
+        """Whether it is a part of the exposure, rather than a ghost or a part of the image from another one."""
+        return self.ratio > LEAST_RATIO and self.shift_px > LEAST_TURN_PX and self.interleaved > LEAST_INTERLEAVED
+
+
+def check_single_field(centroids: Centroids, camera: Camera, stars: Stars, first: Identification) -> None:
+    """Raise NotLocated (inconsistent_evidence) where the frame has a second star field as bright as the first.
+
+    `first` has the matches of the `centroids` with the `stars`, and the attitude of the `camera`, right to a pixel.
+    """
+    found = find_second_field(centroids, camera, stars, first)
+    if found is not None and found.is_exposure:
+        raise NotLocated(
+            f"two star fields in one frame, turned by {np.degrees(found.turn_rad):.1f} degrees against each other: "
+            f"{len(first)} stars show one attitude and {found.stars} others, {100 * found.ratio:.0f} % as bright for "
+            "their magnitudes, another: did the camera turn during the exposure, or are these two pictures in one?",
+            reason="inconsistent_evidence",
+        )
+
+
+def find_second_field(centroids: Centroids, camera: Camera, stars: Stars, first: Identification) -> SecondField | None:
+    """The star field among the sources that an attitude leaves unexplained; None where there is none.
+
+    The arguments are those of `check_single_field`.
+    """
+    if first.unexplained < max(LEAST_UNEXPLAINED, LEAST_PART * len(first)):
+        return None
+    left = _unexplained(centroids, camera, stars, first)[:MOST_SOURCES]
+    if len(left) < LEAST_UNEXPLAINED:
+        return None
+    sources = centroids.take(left)
+    try:
+        second = Identifier(whole_field=False)(sources, camera, stars)
+    except NotIdentified:
+        return None
+    if len(second) < LEAST_STARS:
+        return None
+    turn = second.R_cam_icrs @ first.R_cam_icrs.T
+    expected_px, _ = camera.project(stars.rays_icrs[second.star] @ first.R_cam_icrs.T)
+    shift_px = np.linalg.norm(sources.xy_px[second.detection] - expected_px, axis=1)
+    light = _light(sources, camera, stars, second) / _light(centroids, camera, stars, first)
+    return SecondField(
+        stars=len(second),
+        turn_rad=float(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0))),
+        shift_px=float(np.median(shift_px)),
+        ratio=min(light, 1.0 / light),
+        interleaved=_interleaved(sources.xy_px[second.detection], camera, stars, first),
+        false_alarm_probability=second.false_alarm_probability,
+    )
+
+
+def _unexplained(centroids: Centroids, camera: Camera, stars: Stars, first: Identification) -> Ints:
+    """Indices, brightest first, of the significant sources without a predicted star nearby."""
+    from scipy.spatial import cKDTree
+
+    faintest = float(stars.v_mag[first.star].max()) + FAINTER_MAG
+    predicted_px, inside = camera.project(stars.rays_icrs[stars.v_mag < faintest] @ first.R_cam_icrs.T)
+    distance, _ = cKDTree(predicted_px[inside]).query(centroids.xy_px, distance_upper_bound=EXPLAINED_PX)
+    far = np.isinf(distance) & (centroids.snr > SIGNIFICANT_SNR)
+    far[first.detection] = False
+    return np.flatnonzero(far)
+
+
+def _light(sources: Centroids, camera: Camera, stars: Stars, found: Identification) -> float:
+    """Median light [e] of the stars found, for a star of magnitude 0 on the axis."""
+    clear = ~sources.saturated[found.detection]
+    clear = clear if clear.any() else np.ones(len(clear), dtype=bool)
+    detection, star = found.detection[clear], found.star[clear]
+    throughput = 1.0 if camera.sensor is None else camera.sensor.throughput(camera.angle_rad(sources.xy_px[detection]))
+    light = sources.flux_e[detection] / np.maximum(throughput, 1e-3)
+    return float(np.median(light * 10 ** (0.4 * stars.v_mag[star])))
+
+
+def _interleaved(xy_px: Array, camera: Camera, stars: Stars, first: Identification) -> float:
+    """Part of the pixels (n, 2) next to which the nearest bright star of the first field is one that is identified."""
+    from scipy.spatial import cKDTree
+
+    bright = np.flatnonzero(stars.v_mag < np.median(stars.v_mag[first.star]))
+    predicted_px, inside = camera.project(stars.rays_icrs[bright] @ first.R_cam_icrs.T)
+    _, nearest = cKDTree(predicted_px[inside]).query(xy_px)
+    return float(np.mean(np.isin(bright[inside][nearest], first.star)))

@@ -1,0 +1,274 @@
+"""From the sampled posterior to a fix or a refusal: everything is read off the same weighted points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from startrack.fix import Blocked, ClockError, Fix, Mode, ShownError, UnstatedFact
+from startrack.localization.explored import Explored
+from startrack.localization.free_skyline import free_log_likelihood
+from startrack.localization.importance_sampling import moments
+from startrack.localization.integrity import assess_integrity
+from startrack.localization.joint_posterior import Hypothesis
+from startrack.localization.summary import camera_at, link_points, require_inside
+from startrack.terrain import Terrain
+from startrack.types import Array, Ints, NotLocated
+
+AMBIGUOUS_MASS = 0.01
+NEGLIGIBLE_MODE = 2e-3  # of the probability: points apart that hold less belong to the nearest mode
+USELESS_FRACTION = 0.5  # a 95 % circle wider than this part of the search radius says nothing worth having
+WRONG_MAP, RISK = 0.01, 1e-2  # prior probability of a free skyline, and its weight from which on a fix is refused
+MOST_BLOCKED = 0.5  # of the compass: where more is on no map, another place may explain the rows as well
+WIDE_SHAPE = 0.4  # relative range of a wrong map's steepness: a free skyline is compared with a map of any of them
+SUPPORT = 200  # points of a fix with which a later search of the same image begins
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """All hypotheses together, the heaviest first."""
+
+    hypotheses: Sequence[Hypothesis]
+    terrain: Terrain
+
+    @cached_property
+    def positions_m(self) -> Array:
+        """(n, 2)."""
+        return np.concatenate([one.positions_m for one in self.hypotheses])
+
+    @cached_property
+    def share(self) -> Array:
+        """(n,) of the probability."""
+        logs = np.concatenate([one.log_weight for one in self.hypotheses])
+        return np.asarray(np.exp(logs - np.logaddexp.reduce(logs)))
+
+    @property
+    def best(self) -> Hypothesis:
+        """The heaviest hypothesis."""
+        return self.hypotheses[0]
+
+    @cached_property
+    def is_core(self) -> Array:
+        """(n,) points of hypotheses with the gross error of the best one, if it has any."""
+        return np.concatenate([np.full(len(one.log_weight), one.gross == self.best.gross) for one in self.hypotheses])
+
+    @cached_property
+    def label(self) -> Ints:
+        """(n,) mode of each point; the heaviest is 0."""
+        points, share = self.positions_m[self.is_core], self.share[self.is_core]
+        found = np.zeros(len(self.share), dtype=np.int64)
+        found[self.is_core] = label_modes(points, share / share.sum())
+        return found
+
+    @cached_property
+    def main(self) -> Array:
+        """(n,) points of the main mode."""
+        return self.is_core & (self.label == 0)
+
+    def radii(self, positions_m: Array, share: Array, middle_m: Array) -> tuple[float, float]:
+        """Radii [m] of the circles about a position (2,) that hold 95 and 99.9 % of weighted points (n, 2)."""
+        away = np.linalg.norm(positions_m - middle_m, axis=1)
+        order = np.argsort(away)
+        running = np.cumsum(share[order]) / share.sum()
+        low, high = np.interp([0.95, 0.999], running, away[order])
+        return float(low), float(high)
+
+
+def label_modes(points_m: Array, share: Array) -> Ints:
+    """Mode (n,) of weighted points (n, 2): points linked by gaps no wider than the heaviest mode; 0 is the heaviest."""
+    order = np.argsort(-share)
+    kept = order[: int(np.searchsorted(np.cumsum(share[order]), 1.0 - NEGLIGIBLE_MODE)) + 1]
+    points, weight = points_m[kept], share[kept]
+    label = np.zeros(len(kept), dtype=np.int64)
+    for sigmas in (1.0, 1.5, 2.5):  # far modes widen the first spread; the heaviest one's own decides in the end
+        heaviest = label == np.argmax(np.bincount(label, weights=weight))
+        gap = sigmas * float(np.sqrt(np.linalg.eigvalsh(moments(points[heaviest], weight[heaviest])[1])[1]))
+        label = link_points(points, max(gap, 1e-3))
+    mass = np.bincount(label, weights=weight)
+    heavy = [int(i) for i in np.argsort(-mass, kind="stable") if mass[i] > NEGLIGIBLE_MODE] or [int(np.argmax(mass))]
+    from scipy.spatial import cKDTree
+
+    trees = [cKDTree(points[label == i]).query(points_m)[0] for i in heavy]
+    return np.asarray(np.argmin(trees, axis=0))
+
+
+def conclude(
+    found: Sequence[Hypothesis],
+    terrain: Terrain,
+    explored: Explored,
+    dropped_probability: float,
+    with_integrity: bool = True,
+) -> Fix:
+    """The fix by sampled hypotheses, the heaviest first, in a terrain, after a search.
+
+    Raises NotLocated: outside_search_area, insufficient_geometry, inconsistent_evidence.
+    """
+    whole = Posterior(found, terrain)
+    require_inside(whole.positions_m, whole.share, terrain)
+    middle, covariance = moments(whole.positions_m[whole.main], whole.share[whole.main])
+    radius95, radius999 = whole.radii(whole.positions_m, whole.share, middle)
+    modes = _list_modes(whole)
+    ambiguous = len(modes) > 1 and _beyond(whole, middle) > AMBIGUOUS_MASS
+    best, own = whole.best, _own_main(whole)
+    parameters, near = moments(best.found.points[own], best.found.share[own])
+    clear = best.model.states(parameters)[:, 0]
+    if not ambiguous and radius95 > USELESS_FRACTION * terrain.search_radius_m:
+        raise NotLocated(_useless(whole))
+    _require_map(whole, parameters, clear)
+    integrity = None
+    if with_integrity and not ambiguous:
+        integrity = assess_integrity(best.model, parameters, near[:2, :2], clear, covariance, radius999)
+    blocked = Blocked(1.0 - clear)
+    return Fix(
+        position_enu_m=camera_at(middle, terrain), covariance_m2=covariance, radius95_m=radius95, radius999_m=radius999,
+        modes=modes, ambiguous=ambiguous, dropped_probability=dropped_probability, search=explored.search,
+        horizon_error_rad=_mean_error(best, "bias_rad"), clock=_clock(whole), blocked=blocked if blocked else None,
+        integrity=integrity, unstated=_unstated(whole), raised_rad=best.model.raised_rad(parameters),
+        at_time_m=parameters[:2], shown=_shown(best), samples=_support(whole, explored, dropped_probability),
+    )  # fmt: skip
+
+
+def _own_main(whole: Posterior) -> Array:
+    """Which points of the best hypothesis (n,) are in the main mode, with most of their copies; all where none is."""
+    best = whole.best
+    copies = whole.main[: len(best.log_weight)].reshape(-1, best.copies)
+    own = copies.mean(axis=1) > 0.5
+    return np.asarray(own if own.any() else np.ones(len(own), dtype=bool))
+
+
+def _useless(whole: Posterior) -> str:
+    clock = whole.best.model.errors.clock
+    if clock is not None and clock.sigma_s > 60.0:
+        from startrack.localization.clock import duration
+
+        return (
+            f"a clock that is right to {duration(clock.sigma_s)} leaves most of the search area open: "
+            "find the time more exactly (--time-sigma states its error)"
+        )
+    return "the rays leave most of the search area open: is the skyline in the picture?"
+
+
+def _beyond(whole: Posterior, middle: Array) -> float:
+    """Part of the core's probability beyond the main mode's own 99.9 % circle."""
+    core = whole.share[whole.is_core].sum()
+    _, radius = whole.radii(whole.positions_m[whole.main], whole.share[whole.main], middle)
+    away = np.linalg.norm(whole.positions_m - middle, axis=1) > radius
+    return float(whole.share[whole.is_core & away & (whole.label > 0)].sum() / core)
+
+
+def _list_modes(whole: Posterior) -> tuple[Mode, ...]:
+    core = whole.share[whole.is_core].sum()
+    modes = []
+    for i in range(int(whole.label.max()) + 1):
+        own = whole.is_core & (whole.label == i)
+        mean, _ = moments(whole.positions_m[own], whole.share[own])
+        radius95, radius999 = whole.radii(whole.positions_m[own], whole.share[own], mean)
+        modes.append(
+            Mode(
+                east_m=float(mean[0]), north_m=float(mean[1]), weight=min(float(whole.share[own].sum() / core), 1.0),
+                radius95_m=radius95, radius999_m=radius999,
+            )
+        )  # fmt: skip
+    return tuple(sorted(modes, key=lambda mode: -mode.weight))
+
+
+def _require_map(whole: Posterior, parameters: Array, clear: Array) -> None:
+    """Raises NotLocated (inconsistent_evidence) where the map's skyline shows too little of itself, or another fits."""
+    wrong = Blocked(1.0 - clear)
+    if wrong.whole.mean() > MOST_BLOCKED:
+        raise NotLocated(
+            f"something on no map hides {360.0 * wrong.whole.mean():.0f} degrees of the skyline, or terrain, time or "
+            "camera file are wrong",
+            reason="inconsistent_evidence",
+        )
+    best, at = whole.best, parameters[None]
+    model = best.model
+    shift, _ = model.with_image_errors(model.shifts(at))
+    by_map = float(model.log_likelihood_of(shift)[0])
+    if best.gross:  # a wrong map may have any shape: the small prior of a gross error is no argument against it
+        own = np.array([one.fact == best.gross for one in model.errors.listed])
+        sigma, z = model.errors.sigma(best.gross)[own], parameters[2:] @ model.basis.shown[own].T
+        by_map -= float(np.sum(0.5 * np.square(z / sigma) + np.log(sigma * np.sqrt(2 * np.pi) / WIDE_SHAPE)))
+    free = free_log_likelihood(model.profiles, shift[0])
+    if free + np.log(WRONG_MAP) > by_map + np.log(RISK):
+        where = f", most at azimuths {wrong.text}" if wrong else ""
+        better = f"better, by {free - by_map:.0f} nats" if free > by_map + 0.5 else "as well"
+        raise NotLocated(
+            f"a skyline unlike the map's explains the image {better}{where}: wrong terrain, time or camera file, or "
+            "something on no map?",
+            reason="inconsistent_evidence",
+        )
+
+
+def _mean_error(best: Hypothesis, name: str) -> float:
+    for number, one in enumerate(best.model.errors.listed):
+        if one.name == name:
+            return float(_share(best) @ best.values[:, number])
+    return 0.0
+
+
+def _share(one: Hypothesis) -> Array:
+    """(n,) of a hypothesis's points in its own probability."""
+    return np.asarray(np.exp(one.log_weight - np.logaddexp.reduce(one.log_weight)))
+
+
+def _clock(whole: Posterior) -> ClockError | None:
+    """The error of the clock by the points of the best hypothesis."""
+    best = whole.best
+    stated, errors = best.model.rows.clock, best.model.errors
+    if stated is None:
+        return None
+    if errors.clock is None:
+        return ClockError(stated.offset_s, stated.sigma_s)
+    later, share = best.values[:, -1], _share(best)
+    mean = float(share @ later)
+    return ClockError(stated.offset_s + mean, float(np.sqrt(share @ np.square(later - mean))))
+
+
+def _unstated(whole: Posterior) -> tuple[UnstatedFact, ...]:
+    """The facts that no file states, the one that widens the 99.9 % circle most first."""
+    found = []
+    for fact in whole.best.model.errors.facts:
+        parts = [(_without(one, fact), one.log_weight) for one in whole.hypotheses if one.gross != fact]
+        if not parts:
+            continue
+        positions, logs = (np.concatenate(part) for part in zip(*parts, strict=True))
+        share = np.exp(logs - np.logaddexp.reduce(logs))
+        found.append(UnstatedFact(fact, whole.radii(positions, share, share @ positions)[1]))
+    return tuple(sorted(found, key=lambda one: one.radius999_m_if_exact))
+
+
+def _without(one: Hypothesis, fact: str) -> Array:
+    """Positions (n, 2) of a hypothesis's points with the errors of a fact taken out, by linear regression."""
+    own = np.flatnonzero([error.fact == fact for error in one.model.errors.listed])
+    _, covariance = moments(np.hstack([one.unturned_m, one.values[:, own]]), _share(one))
+    drift = np.linalg.pinv(covariance[2:, 2:], hermitian=True) @ covariance[2:, :2]
+    values = one.values.copy()
+    values[:, own] = 0.0
+    return one.model.errors.turned(one.unturned_m - one.values[:, own] @ drift, values)
+
+
+def _shown(best: Hypothesis) -> tuple[ShownError, ...]:
+    """The gross errors that the image shows."""
+    if not best.gross:
+        return ()
+    mean, covariance = moments(best.values, _share(best))
+    return tuple(
+        ShownError(one.name, one.fact, float(mean[k]), float(np.sqrt(covariance[k, k])))
+        for k, one in enumerate(best.model.errors.listed)
+        if one.fact == best.gross
+    )
+
+
+def _support(whole: Posterior, explored: Explored, dropped_probability: float) -> Explored:
+    """Where a later search of the same image begins: points of the posterior without errors of the clock."""
+    one = whole.best
+    order = np.argsort(-one.found.log_weight)[:SUPPORT]
+    points, log = one.found.points[order, :2], one.found.log_weight[order]
+    spread = np.sqrt(max(float(np.linalg.eigvalsh(moments(points, np.exp(log - log.max()))[1])[0]), 1e-6))
+    return explored._replace(
+        centres_m=points, half_m=0.5 * spread, log_likelihood=log, dropped_probability=dropped_probability
+    )

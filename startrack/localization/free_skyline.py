@@ -1,0 +1,77 @@
+"""The evidence of any smooth skyline near the map's: what a wrong map, time or camera file shows."""
+
+from __future__ import annotations
+
+# mypy: disable-error-code="no-untyped-def"
+from math import exp, log
+
+import numpy as np
+
+from startrack.kernels import njit
+from startrack.localization.obstacle_chain import clear_emission
+from startrack.localization.skyline_profiles import Profiles
+from startrack.types import Array
+
+REACH_RAD, NODES, SPREAD = np.radians(12.0), 121, 6.5  # of heights about the map's skyline, closer about it
+ROUGH_RAD = np.radians([0.003, 0.01, 0.03, 0.1])  # mean steps from sector to sector, equally likely
+JUMP = 1e-4  # probability of a step to anywhere
+HEIGHTS_RAD = REACH_RAD * np.sinh(SPREAD * np.linspace(-1, 1, NODES)) / np.sinh(SPREAD)
+CELLS_RAD = np.gradient(HEIGHTS_RAD)
+
+
+def free_log_likelihood(profiles: Profiles, shift: Array) -> float:
+    """Log-likelihood of the rows if the skyline is the map's, higher by `shift` (SECTORS,), and any smooth curve."""
+    likelihood = _emissions(profiles, shift, HEIGHTS_RAD)
+    logs = [_pass(likelihood, HEIGHTS_RAD, CELLS_RAD, rough) for rough in ROUGH_RAD]
+    return float(np.logaddexp.reduce(logs)) - log(len(logs))
+
+
+@njit(cache=True, nogil=True)
+def _emissions(profiles, shift, heights):
+    """Likelihoods (SECTORS, heights) of skylines at heights above the map's."""
+    found = np.empty((len(shift), len(heights)))
+    for s in range(len(shift)):
+        for i in range(len(heights)):
+            found[s, i] = clear_emission(profiles, s, shift[s] + heights[i])
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _pass(likelihood, heights, cells, rough):
+    """Log-likelihood of one pass around the circle, with steps of a mean size `rough` to either side.
+
+    The sums over exp(-|x - x'| / rough) are two recursions, up and down.
+    """
+    n, whole = len(heights), cells.sum()
+    fall, norm, found = np.empty(n), _spread(cells, heights, rough), 0.0
+    a = cells / whole
+    for s in range(len(likelihood)):
+        if s > 0:
+            for i in range(n):
+                fall[i] = a[i] / norm[i]
+            moved = _spread(fall, heights, rough)
+            for i in range(n):
+                a[i] = cells[i] * ((1.0 - JUMP) * moved[i] + JUMP / whole)
+        total = 0.0
+        for i in range(n):
+            a[i] *= likelihood[s, i]
+            total += a[i]
+        for i in range(n):
+            a[i] /= total
+        found += log(total)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _spread(values, heights, rough):
+    """Sums (n,) over j of values[j] exp(-|heights[i] - heights[j]| / rough)."""
+    n = len(values)
+    found = values.copy()
+    up, down = values[0], 0.0
+    for i in range(1, n):
+        up = up * exp((heights[i - 1] - heights[i]) / rough) + values[i]
+        found[i] = up
+    for i in range(n - 2, -1, -1):
+        down = (down + values[i + 1]) * exp((heights[i] - heights[i + 1]) / rough)
+        found[i] += down
+    return found

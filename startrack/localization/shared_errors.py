@@ -1,0 +1,123 @@
+"""Errors that raise the skyline at all azimuths together: of the terrain's shape, and of the clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from startrack.frames import R_from_rotvec, turn_azel
+from startrack.terrain import Terrain
+from startrack.terrain.shape import ShapeError
+from startrack.types import Array, Clock
+
+TURN_STEP_RAD = 2e-3  # of the sky, at which the skyline's change with the time is taken: its crests are no narrower
+ROUGH_RAD = np.radians(0.002)  # of ground that nobody states as exact: 0.35 m of a rim 10 km away
+LEAST_PART = 1e-3  # of a gross error: the sigma of an error that is zero unless it is gross
+NEGLIGIBLE_M = 0.05  # by which an error of the clock moves a row over the search area, without an effect on the fix
+
+
+@dataclass(frozen=True, eq=False)
+class SharedErrors:
+    """The errors (k,) of a terrain and of a clock, in the units that their names end with.
+
+    In ground that is the same after a turn about the vertical, the vertical part of the clock's turn only turns the
+    position: there the parameters hold the position before that turn.
+    """
+
+    listed: tuple[ShapeError, ...]
+    clock: Clock | None = None  # the last of the errors, where it is not None
+    axisymmetric: bool = False
+
+    @classmethod
+    def of(cls, terrain: Terrain, clock: Clock | None) -> SharedErrors:
+        """Those of a `terrain`, and of a `clock` where its error matters there."""
+        listed = tuple(terrain.shape_errors)
+        if clock is None or not is_noticed(clock, terrain):
+            return cls(listed, None, terrain.axisymmetric)
+        error = ShapeError(
+            name="clock_s", fact="time_sigma_s", sigma=clock.sigma_s, gross_probability=clock.gross_probability,
+            gross_sigma=clock.gross_sigma_s,
+        )  # fmt: skip
+        return cls((*listed, error), clock, terrain.axisymmetric)
+
+    def __len__(self) -> int:
+        return len(self.listed)
+
+    @cached_property
+    def facts(self) -> tuple[str, ...]:
+        """Facts with a gross part, which no file states."""
+        return tuple(dict.fromkeys(error.fact for error in self.listed if error.gross_probability > 0.0))
+
+    def sigma(self, gross: str = "") -> Array:
+        """Standard deviations (k,); those of the fact `gross` as of a gross error."""
+        least = [max(one.sigma, LEAST_PART * one.gross_sigma) for one in self.listed]
+        return np.array(
+            [one.gross_sigma if one.fact == gross else low for one, low in zip(self.listed, least, strict=True)]
+        )
+
+    @cached_property
+    def mean(self) -> Array:
+        """(k,) expected values: zero, but for rows that are turned to another time than the stated one."""
+        found = np.zeros(len(self.listed))
+        if self.clock is not None:
+            found[-1] = -self.clock.offset_s
+        return found
+
+    def log_probability(self, gross: str = "") -> float:
+        """Logarithm of the prior probability that the fact `gross` alone has a gross error; "": that none has."""
+        each = {one.fact: one.gross_probability for one in self.listed}
+        return float(sum(np.log(p if fact == gross else 1.0 - p) for fact, p in each.items()))
+
+    def slopes_rad(self, terrain: Terrain, position_m: Array, azimuth_rad: Array, horizon_rad: Array) -> Array:
+        """Rise (k, n) of the skyline `horizon_rad` (n,) at azimuths (n,) by one unit of each error."""
+        shape = np.reshape(terrain.shape_slopes_rad(position_m, azimuth_rad), (-1, len(azimuth_rad)))
+        if self.clock is None:
+            return shape
+        turn = self.clock.turn_rad_s.copy()
+        if self.axisymmetric:
+            turn[2] = 0.0
+        size = float(np.linalg.norm(self.clock.turn_rad_s))
+        if not np.linalg.norm(turn) > 0.0:
+            return np.vstack([shape, np.zeros(len(azimuth_rad))])
+        step_s, raised = TURN_STEP_RAD / size, []
+        for later_s in (-step_s, step_s):
+            azimuth, elevation = turn_azel(azimuth_rad, horizon_rad, R_from_rotvec(later_s * turn))
+            raised.append(np.asarray(terrain.horizon_rad(position_m[None], azimuth)).ravel() - elevation)
+        return np.vstack([shape, (raised[1] - raised[0]) / (2 * step_s)])
+
+    def turned(self, points: Array, values: Array) -> Array:
+        """Positions (n, 2) turned by the clock's error among the values (n, k) of the errors, in a round crater."""
+        if self.clock is None or not self.axisymmetric:
+            return points
+        angle = self.clock.turn_rad_s[2] * values[:, -1]
+        c, s = np.cos(angle), np.sin(angle)
+        return np.stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]], axis=1)
+
+    @staticmethod
+    def map_sigma_rad(terrain: Terrain, position_m: Array, azimuth_rad: Array) -> Array:
+        """Error (n,) of the map's skyline at azimuths (n,), as if independent of the others.
+
+        Ground of which facts are not stated is rough by ROUGH_RAD besides.
+
+        Posts that make the skyline at several azimuths err there together: each azimuth is given the variance that
+        the sum over its neighbours has, which is right for errors that go far around the compass, as of a position.
+        """
+        rough = 0.0 if all(one.is_stated for one in terrain.shape_errors) else ROUGH_RAD
+        posts = terrain.horizon_posts(position_m, azimuth_rad)
+        if not terrain.height_sigma_m or not np.isfinite(posts.horizon_rad).any():
+            return np.hypot(np.asarray(terrain.horizon_sigma_rad(position_m[None], azimuth_rad)).ravel(), rough)
+        used = posts.post >= 0
+        numbers, of = np.unique(posts.post[used], return_inverse=True)
+        azimuth = np.broadcast_to(np.arange(len(azimuth_rad))[:, None], posts.post.shape)[used]
+        by_post = posts.rad_per_m[used]
+        total = np.bincount(of, weights=by_post, minlength=len(numbers))
+        variance = np.bincount(azimuth, weights=by_post * total[of], minlength=len(azimuth_rad))
+        return np.hypot(terrain.height_sigma_m * np.sqrt(variance), rough)
+
+
+def is_noticed(clock: Clock, terrain: Terrain) -> bool:
+    """Whether the error of a `clock` moves a position on a `terrain` noticeably."""
+    most_s = max(clock.sigma_s, clock.gross_sigma_s if clock.gross_probability > 0.0 else 0.0)
+    return most_s * float(np.linalg.norm(clock.turn_rad_s)) * terrain.reach_m > NEGLIGIBLE_M

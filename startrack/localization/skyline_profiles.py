@@ -1,0 +1,262 @@
+"""How well each height of the skyline explains the rows of each sector of azimuth: stars and the sky's light alike.
+
+A height x is measured from the skyline that the map gives at a reference position, which the skyline follows within a
+sector. A star above the skyline contributes its llr, one below it nothing; light of the sky contributes as in
+`Evidence`. The sum over the rows of a sector is F(x); what counts is F less the logarithm R of the mean of exp F over
+all heights of the window: the evidence for x against a skyline that is anywhere.
+"""
+
+from __future__ import annotations
+
+# mypy: disable-error-code="no-untyped-def"
+from math import erf, exp, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from startrack.kernels import njit
+from startrack.localization.sky_profiles import SkyProfiles
+from startrack.types import Array, Evidence, Ints
+
+SECTORS = 240  # of 1.5 degrees: an obstacle on no map hides stars together, faint and bright ones
+LOW_RAD, HIGH_RAD = np.radians(-12.0), np.radians(20.0)  # window of heights: beyond it a skyline is no skyline
+ROW_NATS = 6.0  # most that one star counts: one in 400 is variable, misnamed or not in the catalogue
+SKY_STEP_PX = 0.1  # of the edge's width: cells of the sky's light, quadratic in each, right to 0.02 nats
+SOFT_BINS = np.linspace(-3.5, 3.5, 15)  # of a normal error of the map, whose mean is taken bin by bin
+SOFT_REACH_RAD, SOFT_SIGMAS = np.radians(0.3), 8.0  # about the map's skyline, where its error is averaged over
+SOFT_STEP, MOST_SOFT_CELLS = 0.5, 120.0  # of the error: cells of the average; at most, to each side
+
+
+class Profiles(NamedTuple):
+    """F of each sector in cells of heights, quadratic in each, as the kernels read it.
+
+    Cell k reaches from x[k] to x[k + 1]; the last one of a sector is a sentinel.
+    """
+
+    first: Ints  # (SECTORS + 1,) cell where each sector begins
+    x: Array  # (m,) [rad]
+    left: Array  # (m,) F at the begin of a cell
+    right: Array  # (m,) and at its end
+    bend: Array  # (m,) 4 (F in the middle - mean of both)
+    integral: Array  # (m,) of exp(F - free) from the lowest height to x
+    free: Array  # (SECTORS,) R
+
+
+def sector_of(azimuth_rad: Array) -> Ints:
+    """Sector (n,) of each azimuth."""
+    return np.asarray((azimuth_rad * (SECTORS / (2 * np.pi))).astype(np.int64) % SECTORS)
+
+
+def profiles_of(rows: Evidence, above_rad: Array, map_sigma_rad: Array) -> Profiles:
+    """Profiles of rows (n,) that stand `above_rad` (n,) the skyline; map errors (SECTORS,) are averaged over."""
+    extended = rows.extended_nats * rows.edge_sigma_rad > 0.0
+    star = np.flatnonzero(~extended & (above_rad > LOW_RAD) & (above_rad < HIGH_RAD))
+    order = star[np.argsort(sector_of(rows.azimuth_rad[star]) * 100.0 + above_rad[star])]
+    sector = sector_of(rows.azimuth_rad[order])
+    llr = np.clip(rows.llr[order], -ROW_NATS, ROW_NATS)
+    starts = np.searchsorted(sector, np.arange(SECTORS + 1))
+    knots = _sky_knots(rows, above_rad, np.flatnonzero(extended))
+    hard = _fill_cells(above_rad[order], llr, starts, *knots)
+    sigma = map_sigma_rad
+    if len(star) and rows.edge_sigma_rad[star].any():
+        count = np.maximum(np.bincount(sector, minlength=SECTORS), 1)
+        own = np.bincount(sector, weights=np.square(rows.edge_sigma_rad[order]), minlength=SECTORS) / count
+        sigma = np.sqrt(np.square(sigma) + own)
+    found = Profiles(*hard)
+    return Profiles(*_average_over_map(found, sigma, SOFT_BINS)) if sigma.any() else found
+
+
+def _sky_knots(rows: Evidence, above_rad: Array, which: Ints) -> tuple[Array, Array, Array, Array]:
+    """First knot, step, cells' step (SECTORS,) and values (SECTORS, knots) of the sky's light; step 0: none."""
+    low, step, cell = np.zeros((3, SECTORS))
+    if not len(which):
+        return low, step, cell, np.zeros((SECTORS, 4))
+    level = Evidence(
+        azimuth_rad=rows.azimuth_rad[which], elevation_rad=above_rad[which], llr=rows.llr[which],
+        edge_sigma_rad=rows.edge_sigma_rad[which], extended_nats=rows.extended_nats[which],
+    )  # fmt: skip
+    sky = SkyProfiles.from_rows(level, np.arange(len(which)), np.zeros(len(which)))
+    at = sector_of(level.azimuth_rad[sky.row])
+    values = np.zeros((SECTORS, sky.values.shape[1]))
+    low[at], step[at], values[at] = sky.low_rad, sky.step_rad, sky.values
+    cell[at] = SKY_STEP_PX * level.edge_sigma_rad[sky.row]
+    return low, step, cell, values
+
+
+@njit(cache=True, nogil=True)
+def _cubic(values, at):
+    """Value between the knots of a uniform grid; constant beyond its ends."""
+    knots = len(values)
+    at = min(max(at, 0.0), knots - 1.0)
+    j = min(max(int(at), 1), knots - 3)
+    u = at - j
+    return (
+        -values[j - 1] * u * (u - 1) * (u - 2) / 6 + values[j] * (u + 1) * (u - 1) * (u - 2) / 2
+        - values[j + 1] * (u + 1) * u * (u - 2) / 2 + values[j + 2] * (u + 1) * u * (u - 1) / 6
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _fill_cells(above, llr, starts, sky_low, sky_step, cell, sky_values):
+    """Cells between the stars of a sector, and of equal width where the sky's light shows the skyline."""
+    sectors, knots = len(starts) - 1, sky_values.shape[1]
+    room = len(above) + 3 * sectors
+    for s in range(sectors):
+        if sky_step[s] > 0.0:
+            room += int((knots - 1) * sky_step[s] / cell[s]) + 3
+    first = np.zeros(sectors + 1, dtype=np.int64)
+    x, left, right, bend = np.zeros(room), np.zeros(room), np.zeros(room), np.zeros(room)
+    n = 0
+    for s in range(sectors):
+        total = 0.0
+        for k in range(starts[s], starts[s + 1]):
+            total += llr[k]
+        k, end = starts[s], starts[s + 1]
+        sky_at, sky_end = HIGH_RAD, LOW_RAD
+        if sky_step[s] > 0.0:
+            sky_at = max(sky_low[s], LOW_RAD + cell[s])
+            sky_end = min(sky_low[s] + (knots - 1) * sky_step[s], HIGH_RAD - cell[s])
+        at = LOW_RAD
+        while at < HIGH_RAD:
+            x[n], left[n] = at, total
+            following = HIGH_RAD
+            if k < end:
+                following = min(following, above[k])
+            if sky_at <= sky_end:
+                following = min(following, sky_at)
+            right[n] = total
+            if sky_step[s] > 0.0:
+                a, b = (at - sky_low[s]) / sky_step[s], (following - sky_low[s]) / sky_step[s]
+                left[n] += _cubic(sky_values[s], a)
+                right[n] += _cubic(sky_values[s], b)
+                middle = total + _cubic(sky_values[s], 0.5 * (a + b))
+                bend[n] = 4.0 * (middle - 0.5 * (left[n] + right[n]))
+            while k < end and above[k] <= following:
+                total -= llr[k]
+                k += 1
+            if sky_at <= following:
+                sky_at += cell[s]
+            at = following
+            n += 1
+        x[n], left[n], right[n] = HIGH_RAD, 0.0, 0.0
+        n += 1
+        first[s + 1] = n
+    return _integrate(first, x[:n].copy(), left[:n].copy(), right[:n].copy(), bend[:n].copy())
+
+
+@njit(cache=True, nogil=True)
+def _integrate(first, x, left, right, bend):
+    """The cells with `free` and the integral; each cell by Simpson's rule."""
+    sectors = len(first) - 1
+    integral, free = np.zeros(len(x)), np.zeros(sectors)
+    for s in range(sectors):
+        top = -np.inf
+        for k in range(first[s], first[s + 1] - 1):
+            top = max(top, left[k], right[k], 0.5 * (left[k] + right[k]) + 0.25 * bend[k])
+        total = 0.0
+        for k in range(first[s], first[s + 1] - 1):
+            integral[k] = total
+            middle = exp(0.5 * (left[k] + right[k]) + 0.25 * bend[k] - top)
+            total += (x[k + 1] - x[k]) / 6.0 * (exp(left[k] - top) + 4.0 * middle + exp(right[k] - top))
+        last = first[s + 1] - 1
+        integral[last] = total
+        free[s] = top + np.log(total / (HIGH_RAD - LOW_RAD))
+        for k in range(first[s], last + 1):
+            integral[k] *= (HIGH_RAD - LOW_RAD) / total
+    return first, x, left, right, bend, integral, free
+
+
+@njit(cache=True, nogil=True)
+def cell_at(first, x, s, height, begin):
+    """The cell of a sector that holds a height, at or after the cell `begin`."""
+    low, high = max(first[s], begin), first[s + 1] - 1
+    while high - low > 1:
+        middle = (low + high) >> 1
+        if x[middle] <= height:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@njit(cache=True, nogil=True)
+def log_at(profiles, s, height):
+    """F - R of a sector at a height."""
+    if height >= HIGH_RAD:
+        return -profiles.free[s]
+    k = cell_at(profiles.first, profiles.x, s, height, 0)
+    u = min(max((height - profiles.x[k]) / (profiles.x[k + 1] - profiles.x[k]), 0.0), 1.0)
+    value = profiles.left[k] + u * (profiles.right[k] - profiles.left[k]) + u * (1.0 - u) * profiles.bend[k]
+    return value - profiles.free[s]
+
+
+@njit(cache=True, nogil=True)
+def integral_to(profiles, s, height):
+    """Integral of exp(F - R) of a sector up to a height; constant beyond the window's ends, where none is."""
+    if height >= HIGH_RAD:
+        last = profiles.first[s + 1] - 1
+        return profiles.integral[last] + (height - HIGH_RAD) * exp(-profiles.free[s])
+    k = cell_at(profiles.first, profiles.x, s, height, 0)
+    u = (height - profiles.x[k]) / (profiles.x[k + 1] - profiles.x[k])
+    return profiles.integral[k] + u * (profiles.integral[k + 1] - profiles.integral[k])
+
+
+@njit(cache=True, nogil=True)
+def _average_over_map(profiles, sigma, bins):
+    """The cells with exp F averaged over a normal error of the map's skyline (SECTORS,); far off it stays as it is."""
+    weights = np.empty(len(bins) - 1)
+    for q in range(len(weights)):
+        weights[q] = 0.5 * (erf(bins[q + 1] / sqrt(2.0)) - erf(bins[q] / sqrt(2.0)))
+    weights /= weights.sum()
+    sectors, room = len(sigma), len(profiles.x)
+    reach, step = np.zeros(sectors), np.zeros(sectors)
+    for s in range(sectors):
+        reach[s] = SOFT_REACH_RAD + SOFT_SIGMAS * sigma[s]
+        step[s] = max(SOFT_STEP * sigma[s], reach[s] / MOST_SOFT_CELLS)
+        room += int(2.0 * reach[s] / step[s]) + 4
+    first = np.zeros(sectors + 1, dtype=np.int64)
+    x, left, right, bend = np.zeros(room), np.zeros(room), np.zeros(room), np.zeros(room)
+    n = 0
+    for s in range(sectors):
+        if sigma[s] <= 0.0:
+            for k in range(profiles.first[s], profiles.first[s + 1]):
+                x[n], left[n], right[n], bend[n] = profiles.x[k], profiles.left[k], profiles.right[k], profiles.bend[k]
+                n += 1
+            first[s + 1] = n
+            continue
+        k, last = profiles.first[s], profiles.first[s + 1] - 1
+        while k < last and profiles.x[k] < -reach[s]:
+            x[n], left[n], right[n], bend[n] = profiles.x[k], profiles.left[k], profiles.right[k], profiles.bend[k]
+            n += 1
+            k += 1
+        count = int(2.0 * reach[s] / step[s])
+        before = _mean_over(profiles, s, -reach[s], sigma[s], bins, weights)
+        for i in range(count):
+            at = -reach[s] + i * step[s]
+            after = _mean_over(profiles, s, at + step[s], sigma[s], bins, weights)
+            middle = _mean_over(profiles, s, at + 0.5 * step[s], sigma[s], bins, weights)
+            x[n], left[n], right[n], bend[n] = at, before, after, 4.0 * (middle - 0.5 * (before + after))
+            before = after
+            n += 1
+        end = -reach[s] + count * step[s]
+        k = cell_at(profiles.first, profiles.x, s, end, 0)
+        x[n] = end
+        left[n] = log_at(profiles, s, end) + profiles.free[s]
+        right[n] = profiles.right[k]
+        n += 1
+        for j in range(k + 1, last + 1):
+            x[n], left[n], right[n], bend[n] = profiles.x[j], profiles.left[j], profiles.right[j], profiles.bend[j]
+            n += 1
+        first[s + 1] = n
+    return _integrate(first, x[:n].copy(), left[:n].copy(), right[:n].copy(), bend[:n].copy())
+
+
+@njit(cache=True, nogil=True)
+def _mean_over(profiles, s, height, sigma, bins, weights):
+    """Logarithm of the mean of exp F over a normal error about a height."""
+    total, before = 0.0, integral_to(profiles, s, height + bins[0] * sigma)
+    for q in range(len(weights)):
+        after = integral_to(profiles, s, height + bins[q + 1] * sigma)
+        total += weights[q] * (after - before) / ((bins[q + 1] - bins[q]) * sigma)
+        before = after
+    return np.log(max(total, 1e-300)) + profiles.free[s]

@@ -1,0 +1,124 @@
+"""Height maps with errors that all azimuths share: the ground exactly, and what each error changes to first order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from startrack.frames.rotations import R_from_rotvec
+from startrack.terrain.horizon_posts import HorizonPosts
+from startrack.terrain.protocol import ForwardingTerrain, Terrain
+from startrack.terrain.shape import ShapeError, select_slopes
+from startrack.types import Array
+
+if TYPE_CHECKING:
+    from startrack.terrain.height_map import HeightMap
+
+TURNS = 2  # of the azimuth towards that of the turned skyline: each leaves a thousandth of the difference
+WIDER_RAD = 0.1  # by which azimuths are widened to find the highest skyline that a tilt may turn into a direction
+
+
+class DeformedMap(ForwardingTerrain):
+    """The ground of a height map with errors of its shape, given by the names of `shape_errors`.
+
+    In this order: the camera stands higher, tan of the horizon is stretched, the horizon rises by the bias, and the
+    skyline is turned about a horizontal axis. It has no further errors of its shape. Its bounds need the table of a
+    map with the camera at the changed height; the horizon does without.
+    """
+
+    shape_errors, common_sigma_rad = (), 0.0
+    near, interpolated, interpolation = Terrain.near, Terrain.interpolated, Terrain.interpolation
+    interpolated_part = Terrain.interpolated_part
+    shape_slopes_rad, with_shape = Terrain.shape_slopes_rad, Terrain.with_shape
+
+    def __init__(
+        self, whole: HeightMap, *, bias_rad: float = 0.0, stretch_1: float = 0.0, vertical_east_rad: float = 0.0,
+        vertical_north_rad: float = 0.0, camera_height_m: float = 0.0,
+    ) -> None:  # fmt: skip
+        super().__init__(whole)
+        self._map, self._raised_m = whole, camera_height_m
+        self._bias_rad, self._stretch_1 = bias_rad, stretch_1
+        self._tilt_rad = float(np.hypot(vertical_east_rad, vertical_north_rad))
+        self._R_turned_map = R_from_rotvec([vertical_north_rad, -vertical_east_rad, 0.0])
+
+    @property
+    def camera_height_m(self) -> float:  # type: ignore[override]
+        """Of the camera above the ground, with its error."""
+        return max(self._map.camera_height_m + self._raised_m, 0.0)
+
+    @cached_property
+    def _raised(self) -> HeightMap:
+        return replace(self._map, camera_height_m=self.camera_height_m) if self._raised_m else self._map
+
+    def _level_rad(self, horizon_rad: Array) -> Array:
+        """A horizon [rad] of the raised camera, stretched and with the bias."""
+        return np.asarray(np.arctan((1.0 + self._stretch_1) * np.tan(horizon_rad)) + self._bias_rad)
+
+    def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """Horizon elevation [rad], traced; see `Terrain`."""
+        found = self._level_rad(self._raised.horizon_rad(points_m, azimuths_rad))
+        if not self._tilt_rad:
+            return found
+        azimuths = np.broadcast_to(azimuths_rad, found.shape)
+        own = np.array(azimuths)
+        for _ in range(TURNS):
+            own += (azimuths - self._turned(own, found)[0] + np.pi) % (2 * np.pi) - np.pi
+            found = self._level_rad(self._raised.horizon_rad(points_m, own))
+        return self._turned(own, found)[1]
+
+    def _turned(self, azimuths_rad: Array, elevations_rad: Array) -> tuple[Array, Array]:
+        """Azimuths and elevations (...), (...) [rad] of directions of the map after the turn."""
+        level = np.cos(elevations_rad)
+        rays = np.stack([level * np.sin(azimuths_rad), level * np.cos(azimuths_rad), np.sin(elevations_rad)], axis=-1)
+        east, north, up = np.moveaxis(rays @ self._R_turned_map.T, -1, 0)
+        return np.arctan2(east, north), np.arctan2(up, np.hypot(east, north))
+
+    def horizon_bounds_rad(
+        self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
+    ) -> tuple[Array, Array]:
+        """Bounds [rad] from those of the raised camera's map, over azimuths that hold what the turn brings in."""
+        turn = np.asarray(azimuth_half_rad)
+        if self._tilt_rad:
+            high = self._level_rad(
+                self._raised.horizon_bounds_rad(centres_m, half_m, azimuths_rad, turn + WIDER_RAD)[1]
+            )
+            turn = turn + 1.01 * self._tilt_rad / np.cos(np.minimum(high + self._tilt_rad, np.pi / 2 - 1e-3))
+        low, high = self._raised.horizon_bounds_rad(centres_m, half_m, azimuths_rad, turn)
+        return self._level_rad(low) - self._tilt_rad, self._level_rad(high) + self._tilt_rad
+
+    def horizon_spread_rad(self, points_m: Array, half_m: float, azimuths_rad: Array) -> tuple[Array, Array]:
+        """As of the map, about the horizon of this ground; see `Terrain`."""
+        return self.horizon_rad(points_m, azimuths_rad), self._map.horizon_spread_rad(points_m, half_m, azimuths_rad)[1]
+
+    def horizon_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
+        """Those of the map, with the horizon of this ground; see `Terrain`."""
+        return replace(
+            self._map.horizon_posts(point_m, azimuths_rad), horizon_rad=self.horizon_rad(point_m, azimuths_rad)
+        )
+
+    def ground_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
+        """Those of the map, with the horizon of this ground; see `Terrain`."""
+        return replace(
+            self._map.ground_posts(point_m, azimuths_rad), horizon_rad=self.horizon_rad(point_m, azimuths_rad)
+        )
+
+
+def slopes_of_map(errors: Sequence[ShapeError], tan: Array, per_m: Array, azimuths_rad: Array) -> Array:
+    """Change (k, ...) of the horizon [rad] by one unit of each error, where its tangent is `tan` (...).
+
+    `per_m` (...) is one over the distance of the crest [1/m]. Of a tilt the change of elevation alone: that of azimuth
+    moves the skyline by its slope times tan H times the tilt, which is left out.
+    """
+    flat = 1.0 / (1.0 + np.square(tan))  # cos^2 H
+    slopes = {
+        "bias_rad": np.ones(1),
+        "stretch_1": tan * flat,
+        "vertical_east_rad": np.sin(azimuths_rad),
+        "vertical_north_rad": np.cos(azimuths_rad),
+        "camera_height_m": -per_m * flat,
+    }
+    return select_slopes(errors, slopes, np.shape(tan))

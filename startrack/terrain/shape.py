@@ -1,0 +1,86 @@
+"""Errors of a terrain's shape: what a file states about them, and what counts where it is silent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.types import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapeError:
+    """One error that all azimuths share, normal about 0, in the unit that its name ends with.
+
+    Its prior is a mixture: `sigma`, or with `gross_probability` the wider `gross_sigma`. Errors of a pair (the terms of
+    an ellipse, the axes of a tilt) have the same `fact`, and one gross part: both are gross, or neither.
+    """
+
+    name: str  # such as "depth_1" (relative), "bias_rad", "camera_height_m"
+    fact: str  # the key of the terrain file that states it, such as "depth_sigma_m"
+    sigma: float
+    gross_probability: float = 0.0
+    gross_sigma: float = 0.0
+
+    @property
+    def is_stated(self) -> bool:
+        """Whether `sigma` is the whole prior."""
+        return self.gross_probability == 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fact:
+    """A key of the terrain file that states the sigma of some errors, and what counts for them where it is absent."""
+
+    key: str
+    errors: tuple[str, ...]  # names of the errors
+    sigma: float  # of each, in the unit of the errors
+    gross_probability: float = 0.0
+    gross_sigma: float = 0.0
+
+    def shape_errors(self, stated: float | None) -> list[ShapeError]:
+        """Those of the errors that count; `stated` is the sigma in the unit of the errors, None where it is not."""
+        if stated is None:
+            gross = {"gross_probability": self.gross_probability, "gross_sigma": self.gross_sigma}
+            found = [ShapeError(name=name, fact=self.key, sigma=self.sigma, **gross) for name in self.errors]
+        else:
+            found = [ShapeError(name=name, fact=self.key, sigma=float(stated)) for name in self.errors]
+        return [error for error in found if error.sigma > 0.0 or error.gross_probability > 0.0]
+
+
+DEPTH = Fact(key="depth_sigma_m", errors=("depth_1",), sigma=1e-3, gross_probability=0.01, gross_sigma=0.01)
+DIAMETER = Fact(key="diameter_sigma_m", errors=("diameter_1",), sigma=1e-3, gross_probability=0.01, gross_sigma=0.01)
+ELLIPSE = Fact(
+    key="ellipse_sigma_1", errors=("ellipse_cos_1", "ellipse_sin_1"), sigma=5e-4, gross_probability=0.01,
+    gross_sigma=5e-3,
+)  # fmt: skip
+RIM_TILT = Fact(
+    key="rim_tilt_sigma_deg", errors=("rim_tilt_east_rad", "rim_tilt_north_rad"), sigma=float(np.radians(0.002)),
+    gross_probability=0.005, gross_sigma=float(np.radians(0.1)),
+)  # fmt: skip
+BIAS = Fact(key="horizon_sigma_deg", errors=("bias_rad",), sigma=0.0)
+STRETCH = Fact(
+    key="stretch_sigma_1", errors=("stretch_1",), sigma=0.0, gross_probability=0.005, gross_sigma=5e-3
+)  # fmt: skip
+VERTICAL = Fact(
+    key="vertical_sigma_deg", errors=("vertical_east_rad", "vertical_north_rad"), sigma=float(np.radians(0.0005)),
+    gross_probability=0.005, gross_sigma=float(np.radians(0.02)),
+)  # fmt: skip
+CAMERA_ERROR = Fact(key="camera_height_sigma_m", errors=("camera_height_m",), sigma=0.02)
+CYLINDER_FACTS = (DEPTH, DIAMETER, ELLIPSE, RIM_TILT)
+MAP_FACTS = (BIAS, STRETCH, VERTICAL, CAMERA_ERROR)
+
+
+def select_slopes(errors: Sequence[ShapeError], slopes_rad: dict[str, Array], shape: Iterable[int]) -> Array:
+    """Slopes (k, ...) of the errors in their order, each broadcast to `shape`, from a dictionary by name."""
+    shape = tuple(shape)
+    if not errors:
+        return np.zeros((0, *shape))
+    return np.stack([np.broadcast_to(slopes_rad[error.name], shape) for error in errors])
+
+
+def by_name(errors: Sequence[ShapeError], values: Array) -> dict[str, float]:
+    """The `values` (k,) of the errors by name. Raises ValueError where there are not as many."""
+    return {error.name: float(value) for error, value in zip(errors, values, strict=True)}

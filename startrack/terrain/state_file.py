@@ -1,0 +1,118 @@
+"""Terrain files that leave errors out: which ones, what counts for them, and the file with them written in."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from startrack.files import parse_toml
+from startrack.terrain.io import read_keys
+from startrack.terrain.shape import BIAS, CAMERA_ERROR, CYLINDER_FACTS, DEPTH, DIAMETER, STRETCH, VERTICAL, Fact
+from startrack.types import BadInput
+
+HEIGHTS = "height_sigma_m"
+MEANINGS = {
+    DEPTH.key: "error of the depth [m]",
+    DIAMETER.key: "error of the width [m]",
+    "ellipse_sigma_1": "each of the two terms of an elliptic rim, relative to its radius",
+    "rim_tilt_sigma_deg": "tilt of the rim about each of two axes [deg]",
+    HEIGHTS: "error of single heights of the map [m]",
+    BIAS.key: "error of the horizon that all azimuths share [deg]",
+    STRETCH.key: "error of the scale of heights, relative",
+    VERTICAL.key: "tilt of the whole map about each of two axes [deg]",
+    CAMERA_ERROR.key: "error of the camera's height [m]",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class StateableError:
+    """A key of a terrain file that states an error."""
+
+    table: str  # of the file
+    key: str
+    meaning: str
+    default: str  # what counts where the key is absent
+    is_missing: bool  # and matters
+
+
+def stateable_errors(text: str) -> list[StateableError]:
+    """The errors that a terrain file with this `text` states or could state. Raises BadInput bad_terrain."""
+    keys = read_keys(text)
+    return list(_cylinder_errors(keys) if "cylinder" in keys else _map_errors(keys))
+
+
+def _cylinder_errors(keys: Mapping[str, Any]) -> Iterator[StateableError]:
+    cylinder = keys["cylinder"]
+    for fact in CYLINDER_FACTS:
+        unit = {DEPTH.key: cylinder["depth_m"], DIAMETER.key: cylinder["diameter_m"]}.get(fact.key)
+        missing = fact.key not in cylinder and not cylinder.get("exact", False)
+        yield _stateable("cylinder", fact.key, _default_text(fact, unit), missing)
+    yield _stateable("rover", CAMERA_ERROR.key, "0", False)
+
+
+def _map_errors(keys: Mapping[str, Any]) -> Iterator[StateableError]:
+    dem, rover = keys.get("dem", {}), keys.get("rover", {})
+    yield _stateable("dem", HEIGHTS, "0, with a warning", HEIGHTS not in dem)
+    yield _stateable("dem", BIAS.key, f"three times what {HEIGHTS} makes of the horizon", BIAS.key not in dem)
+    for fact in (STRETCH, VERTICAL):
+        yield _stateable("dem", fact.key, _default_text(fact), fact.key not in dem)
+    yield _stateable("rover", CAMERA_ERROR.key, _default_text(CAMERA_ERROR), CAMERA_ERROR.key not in rover)
+
+
+def _stateable(table: str, key: str, default: str, missing: bool) -> StateableError:
+    return StateableError(table=table, key=key, meaning=MEANINGS[key], default=default, is_missing=missing)
+
+
+def _default_text(fact: Fact, size_m: float | None = None) -> str:
+    """The prior of a fact that a file leaves out, in the unit of its key; `size_m` is what a relative error is of."""
+    unit = 180.0 / np.pi if fact.key.endswith("_deg") else size_m or 1.0
+    text = f"{fact.sigma * unit:.4g}"
+    if fact.gross_probability:
+        text += f", and with probability {100 * fact.gross_probability:g} % {fact.gross_sigma * unit:.4g}"
+    return text
+
+
+def state_errors(text: str, values: Mapping[tuple[str, str], float | bool]) -> str:
+    """The `text` of a terrain file with `values` by table and key written in; all else is as before.
+
+    Raises BadInput bad_terrain where a key is there already, or the file's notation leaves no place for it.
+    """
+    for (table, key), value in values.items():
+        text = _with_key(text, table, key, value)
+    return text
+
+
+def _with_key(text: str, table: str, key: str, value: float | bool) -> str:
+    before = parse_toml(text, "bad_terrain")
+    if key in before.get(table, {}):
+        raise BadInput("bad_terrain", f"it states {table}.{key} already")
+    wanted = {**before, table: {**before.get(table, {}), key: value}}
+    line = f"{key} = {str(value).lower() if isinstance(value, bool) else repr(float(value))}"
+    for changed in _places(text, table, line):
+        try:
+            if parse_toml(changed, "bad_terrain") == wanted:
+                return changed
+        except BadInput:
+            continue
+    raise BadInput("bad_terrain", f"startrack finds no place for it: write `{line}` into [{table}] by hand")
+
+
+def _places(text: str, table: str, line: str) -> Iterator[str]:
+    """Texts with the line after the last key of the table, after its header, or in a table of its own at the end."""
+    end = "\r\n" if "\r\n" in text else "\n"
+    lines = text.splitlines(keepends=True)
+    for at, one in enumerate(lines):
+        if re.match(rf"\s*\[\s*{table}\s*\]", one):
+            rest = at + 1
+            while rest < len(lines) and not re.match(r"\s*\[", lines[rest]):
+                rest += 1
+            while rest > at + 1 and re.match(r"\s*(#|$)", lines[rest - 1]):
+                rest -= 1
+            for place in (rest, at + 1):
+                head = "".join(lines[:place])
+                yield head + ("" if head.endswith("\n") else end) + line + end + "".join(lines[place:])
+    yield text + ("" if text.endswith("\n") else end) + f"{end}[{table}]{end}{line}{end}"

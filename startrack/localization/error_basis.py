@@ -31,13 +31,22 @@ class ErrorBasis:
 
     @classmethod
     def of(
-        cls, errors: SharedErrors, gross: str, slopes_rad: Array, position_slopes: Array, moments: SectorMoments
+        cls,
+        errors: SharedErrors,
+        gross: str,
+        slopes_rad: Array,
+        position_slopes: Array,
+        moments: SectorMoments,
+        reach_m: float,
     ) -> ErrorBasis:
-        """Of errors that raise the skyline by `slopes_rad` (k, n), a position that does by `position_slopes` (2, n)."""
+        """Of errors that raise the skyline by `slopes_rad` (k, n), a position that does by `position_slopes` (2, n).
+
+        The position is known to `reach_m` before.
+        """
         sigma = errors.sigma(gross)
         weight = 1.0 / moments.variance_rad2
         rise, moved = sigma[:, None] * slopes_rad, position_slopes
-        normal = (moved * weight) @ moved.T
+        normal = (moved * weight) @ moved.T + reach_m**-2.0 * np.eye(2)
         to_move = np.linalg.solve(normal, (moved * weight) @ rise.T)  # (2, k) of the position, by each error
         left = rise - to_move.T @ moved
         information, axes = np.linalg.eigh((left * weight) @ left.T)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import log, pi
+from typing import Protocol
 
 import numpy as np
 
@@ -67,15 +68,23 @@ def moments(points: Array, weight: Array) -> Gaussian:
     return mean, (off * weight[:, None]).T @ off / weight.sum()
 
 
-def sample(log_density: LogDensity, modes: Sequence[Gaussian], rounds: Sequence[int] = ROUNDS) -> WeightedPoints:
-    """Weighted points of exp(log_density), which takes points (n, d), from about its `modes`."""
+def sample(
+    log_density: LogDensity,
+    modes: Sequence[Gaussian],
+    rounds: Sequence[int] = ROUNDS,
+    first: Sequence[Distribution] = (),
+) -> WeightedPoints:
+    """Weighted points of exp(log_density), which takes points (n, d), from about its `modes`.
+
+    The first round draws from the distributions `first` besides.
+    """
     points: list[Array] = []
     density: list[Array] = []
-    parts: list[_Part] = []
+    parts: list[Distribution] = []
     modes = list(modes)
     more = 1.0 + MORE_POINTS * (len(modes[0][0]) - 2)
     for number, count in enumerate(rounds):
-        new = _parts(modes, round(more * count))
+        new = [*_parts(modes, round(more * count)), *(first if number == 0 else ())]
         drawn = _draw(new, sum(len(one) for one in points))
         parts.extend(new)
         points.append(drawn)
@@ -89,29 +98,88 @@ def sample(log_density: LogDensity, modes: Sequence[Gaussian], rounds: Sequence[
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """A t distribution of which `count` points are drawn."""
+class Distribution(Protocol):
+    """A distribution of which `count` points are drawn."""
 
-    mean: Array
-    root: Array  # (d, d) of its covariance
-    degrees: float
-    count: int
+    @property
+    def count(self) -> int: ...
+
+    def draw(self, first: int) -> Array:
+        """Points (count, d), from the sequence's number `first` on."""
 
     def log_density(self, points: Array) -> Array:
         """(n,) at points (n, d)."""
-        from scipy.special import gammaln
-
-        d = len(self.mean)
-        q = np.square(np.linalg.solve(self.root, (points - self.mean).T)).sum(axis=0)
-        norm = gammaln(0.5 * (self.degrees + d)) - gammaln(0.5 * self.degrees) - 0.5 * d * log(self.degrees * pi)
-        volume = float(np.log(np.abs(np.diag(self.root))).sum())
-        return np.asarray(norm - volume - 0.5 * (self.degrees + d) * np.log1p(q / self.degrees))
 
 
-def _parts(modes: Sequence[Gaussian], count: int) -> list[_Part]:
+@dataclass(frozen=True, eq=False)
+class TDistribution:
+    """A t distribution of `degrees` of freedom."""
+
+    mean: Array
+    root: Array  # (d, d) of its covariance, lower triangular
+    degrees: float
+    count: int
+
+    def draw(self, first: int) -> Array:
+        """Points (count, d), from the sequence's number `first` on."""
+        from scipy.special import gammaincinv
+
+        unit, uniform = normal_sequence(len(self.mean), first, self.count)
+        size = np.sqrt(self.degrees / (2.0 * gammaincinv(0.5 * self.degrees, uniform)))
+        return np.asarray(self.mean + (unit * size[:, None]) @ self.root.T)
+
+    def log_density(self, points: Array) -> Array:
+        """(n,) at points (n, d)."""
+        return log_t_density(np.linalg.solve(self.root, (points - self.mean).T), self.degrees) - float(
+            np.log(np.diag(self.root)).sum()
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class BoxDistribution:
+    """Equal square boxes of positions, uniform in each, with a t distribution of the other parameters about its own."""
+
+    centres: Array  # (m, d)
+    half_m: float
+    share: Array  # (m,) of the probability
+    root: Array  # (d - 2, d - 2) of the other parameters' covariance, lower triangular
+    count: int
+
+    def draw(self, first: int) -> Array:
+        """Points (count, d), from the sequence's number `first` on."""
+        from scipy.special import ndtr
+
+        d = self.centres.shape[1]
+        unit, uniform = normal_sequence(d, first, self.count)
+        box = np.minimum(np.searchsorted(np.cumsum(self.share), uniform), len(self.share) - 1)
+        found = self.centres[box]
+        found[:, :2] += self.half_m * (2.0 * ndtr(unit[:, :2]) - 1.0)
+        found[:, 2:] += unit[:, 2:] @ self.root.T
+        return found
+
+    def log_density(self, points: Array) -> Array:
+        """(n,) at points (n, d)."""
+        inside = np.abs(points[:, None, 0] - self.centres[:, 0]) <= self.half_m
+        inside &= np.abs(points[:, None, 1] - self.centres[:, 1]) <= self.half_m
+        point, box = np.nonzero(inside)
+        off = np.linalg.solve(self.root, (points[point, 2:] - self.centres[box, 2:]).T)
+        log = -0.5 * np.square(off).sum(axis=0) - 0.5 * len(off) * np.log(2 * pi) - np.log(np.diag(self.root)).sum()
+        each = self.share[box] / (4 * self.half_m**2) * np.exp(log)
+        return np.log(np.bincount(point, weights=each, minlength=len(points)) + np.finfo(float).tiny)
+
+
+def log_t_density(off: Array, degrees: float) -> Array:
+    """(n,) of a t distribution of unit size at offsets (d, n)."""
+    from scipy.special import gammaln
+
+    d = len(off)
+    norm = gammaln(0.5 * (degrees + d)) - gammaln(0.5 * degrees) - 0.5 * d * log(degrees * pi)
+    return np.asarray(norm - 0.5 * (degrees + d) * np.log1p(np.square(off).sum(axis=0) / degrees))
+
+
+def _parts(modes: Sequence[Gaussian], count: int) -> list[Distribution]:
     """The distributions of one round."""
-    each, parts = max(count // len(modes), 40), []
+    each, parts = max(count // len(modes), 40), list[Distribution]()
     for mean, covariance in modes:
         order = np.r_[2 : len(mean), 0, 1]  # position last: it is drawn beside the other parameters
         root = np.empty_like(covariance)
@@ -119,8 +187,8 @@ def _parts(modes: Sequence[Gaussian], count: int) -> list[_Part]:
         far = root * np.r_[np.full(len(mean) - 2, FAR_OTHERS), FAR, FAR]
         wide = round(FAR_PART * each)
         parts += [
-            _Part(mean, _triangular(root), DEGREES, each - wide),
-            _Part(mean, _triangular(far), FAR_DEGREES, wide),
+            TDistribution(mean, _triangular(root), DEGREES, each - wide),
+            TDistribution(mean, _triangular(far), FAR_DEGREES, wide),
         ]
     return parts
 
@@ -130,16 +198,12 @@ def _triangular(root: Array) -> Array:
     return np.asarray(np.linalg.cholesky(root @ root.T))
 
 
-def _draw(parts: Sequence[_Part], first: int) -> Array:
+def _draw(parts: Sequence[Distribution], first: int) -> Array:
     """Points (n, d) of the distributions, from the sequence's number `first` on."""
-    from scipy.special import gammaincinv
-
-    drawn, at = [], first
+    drawn = []
     for part in parts:
-        unit, uniform = normal_sequence(len(part.mean), at, part.count)
-        size = np.sqrt(part.degrees / (2.0 * gammaincinv(0.5 * part.degrees, uniform)))
-        drawn.append(part.mean + (unit * size[:, None]) @ part.root.T)
-        at += part.count
+        drawn.append(part.draw(first))
+        first += part.count
     return np.concatenate(drawn)
 
 
@@ -159,7 +223,7 @@ def normal_sequence(dimensions: int, first: int, count: int) -> tuple[Array, Arr
     return ndtri(uniform[:, :-1]), np.clip(uniform[:, -1], 1e-6, 1.0)
 
 
-def _weigh(points: Array, density: Array, parts: Sequence[_Part]) -> WeightedPoints:
+def _weigh(points: Array, density: Array, parts: Sequence[Distribution]) -> WeightedPoints:
     """Weights of points by the mixture of all distributions that any of them was drawn from."""
     mixture = np.asarray(np.logaddexp.reduce([log(part.count) + part.log_density(points) for part in parts], axis=0))
     return WeightedPoints(points, density - mixture, mixture)

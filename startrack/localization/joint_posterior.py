@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from startrack.localization.explored import Explored
 from startrack.localization.importance_sampling import (
+    BoxDistribution,
     Gaussian,
     WeightedPoints,
     effective_points,
@@ -29,10 +31,10 @@ SMALLER = 0.3  # variance of a gross error that is none, beside that by the line
 HIDDEN_COPIES = 6  # of each point, with values of the errors that the rows do not show
 MOST_GROUPS, MOST_BOXES = 6, 160  # groups of boxes; boxes of a group that the chain is computed at
 MOST_MODES, MODE_NATS = 4, 14.0  # of a group; less likely ones than the best by more are none
+BOX_POINTS = 160  # drawn from the boxes
 APART_BOXES = 3.0  # between two modes that sampling begins with
 GROSS_ROUNDS = (120, 160, 200)
 FEW, MORE_ROUNDS = 60.0, (300, 500, 900)  # effective points of the best hypothesis, below which it is sampled anew
-PRIOR_WIDTH = 1e6  # m: no prior of the position
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +96,10 @@ def sample_posterior(explored: Explored, rows: Evidence, terrain: Terrain) -> li
     found: list[Hypothesis] = []
     for number, (centres_m, reach_m) in enumerate(groups):
         model = SkylineModel(terrain, rows, centres_m[0], max(reach_m, 40.0), errors, image_errors=rows.image_errors)
-        modes = _first_modes(model, centres_m, explored.half_m)
-        if not modes:
+        start = _start(model, centres_m, explored.half_m)
+        if start is None:
             continue
-        plain = _sample(model, references_m, modes)
+        plain = _sample(model, references_m, start.modes, first=[start.boxes])
         found.append(plain)
         best = max(one.found.log_evidence for one in found)
         if number == 0 or plain.found.log_evidence > best - MODE_NATS:
@@ -127,7 +129,7 @@ def _group_boxes(explored: Explored, reach_m: float) -> list[tuple[Array, float]
 def _linear(model: SkylineModel) -> tuple[Array, Array, Array]:
     """Parameters (2 + a,) by the linear model of the sectors, their covariance, and weights (SECTORS,)."""
     k = 2 + len(model.basis)
-    mean, prior = np.zeros(k), np.diag(np.r_[np.full(2, PRIOR_WIDTH**-2.0), np.ones(k - 2)])
+    mean, prior = np.zeros(k), np.diag(np.r_[np.full(2, model.terrain.reach_m**-2.0), np.ones(k - 2)])
     design = np.vstack([model.position_slopes, model.slopes_rad]).T
     if model.image_errors is not None:
         j = len(model.image_errors.mean)
@@ -140,20 +142,27 @@ def _linear(model: SkylineModel) -> tuple[Array, Array, Array]:
     return parameters[:k], covariance[:k, :k], weight
 
 
-def _first_modes(model: SkylineModel, centres_m: Array, half_m: float) -> list[Gaussian]:
-    """Modes with which sampling begins: the best boxes by the chain, each with the errors that suit it."""
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where the sampling of a group begins: likely modes, and its boxes."""
+
+    modes: list[Gaussian]
+    boxes: BoxDistribution
+
+
+def _start(model: SkylineModel, centres_m: Array, half_m: float) -> Start | None:
+    """The best boxes by the chain, each with the errors that suit it; None where none is allowed."""
     if len(centres_m) > MOST_BOXES:
         step = len(centres_m) / MOST_BOXES
-        centres_m = centres_m[np.unique((np.arange(MOST_BOXES) ** 1.0 * step).astype(int))]
+        centres_m, half_m = centres_m[(np.arange(MOST_BOXES) * step).astype(int)], half_m * np.sqrt(step)
     _, covariance, weight = _linear(model)
     model.__dict__["clear"] = weight
     boxes = model.with_likely_errors(centres_m, weight)
     value = model.log_likelihood(boxes) + model.basis.log_prior(boxes[:, 2:])
     value = np.where(np.asarray(model.terrain.allowed(boxes[:, :2])), value, -np.inf)
     if not np.isfinite(value).any():
-        return []
-    best = boxes[int(np.argmax(value))]
-    model.states(best)
+        return None
+    model.states(boxes[int(np.argmax(value))])
     chosen: list[Array] = []
     for i in np.argsort(-value):
         if value[i] < value.max() - MODE_NATS or len(chosen) == MOST_MODES:
@@ -163,16 +172,19 @@ def _first_modes(model: SkylineModel, centres_m: Array, half_m: float) -> list[G
     flat = value - value.max()
     while effective_points(flat) < min(6.0, 0.5 * np.isfinite(flat).sum()):
         flat = 0.6 * flat
-    spread = moments(boxes[:, :2], np.exp(flat))[1] + half_m**2 / 3 * np.eye(2)
+    share = np.exp(flat) / np.exp(flat).sum()
+    spread = moments(boxes[:, :2], share)[1] + half_m**2 / 3 * np.eye(2)
     if len(chosen) > 1:
         spread = np.minimum(np.trace(spread) / 2, (APART_BOXES * half_m) ** 2) * np.eye(2)
     whole = covariance.copy()
     whole[:2, :2] += spread
-    return [(one, whole) for one in chosen]
+    left = covariance[2:, 2:] - covariance[2:, :2] @ np.linalg.solve(covariance[:2, :2], covariance[:2, 2:])
+    drawn = BoxDistribution(boxes, half_m, share, np.linalg.cholesky(left), BOX_POINTS)
+    return Start([(one, whole) for one in chosen], drawn)
 
 
-def _sample(model: SkylineModel, references_m: Array, modes: Sequence[Gaussian], **rounds: Sequence[int]) -> Hypothesis:
-    """A hypothesis sampled where its reference is the nearest of all `references_m` (g, 2)."""
+def _sample(model: SkylineModel, references_m: Array, modes: Sequence[Gaussian], **how: Any) -> Hypothesis:
+    """A hypothesis sampled, as `sample` is told `how`, where its reference is the nearest of all (g, 2)."""
     near, basis = model.rows.near, model.basis
     area = float(np.log(np.pi * model.terrain.reach_m**2))
 
@@ -189,7 +201,7 @@ def _sample(model: SkylineModel, references_m: Array, modes: Sequence[Gaussian],
                 value[inside] += near.log_density(position[inside])
         return value
 
-    return Hypothesis(model, sample(log_density, modes, **rounds))
+    return Hypothesis(model, sample(log_density, modes, **how))
 
 
 def _moments_of(one: Hypothesis) -> Gaussian:

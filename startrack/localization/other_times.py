@@ -64,7 +64,7 @@ def _fit(model: SkylineModel) -> float:
     """Log-likelihood of the rows where position and shared errors suit them, by the linear model of the sectors."""
     k = 2 + len(model.basis)
     design = np.vstack([model.position_slopes, model.slopes_rad]).T
-    prior = np.diag(np.r_[np.zeros(2), np.ones(k - 2)])
+    prior = np.diag(np.r_[np.full(2, model.terrain.reach_m**-2.0), np.ones(k - 2)])
     parameters, _, _ = solve_linear(model.moments, design, np.zeros(k), prior)
     parameters[:2] += model.reference_m
     return float(model.log_likelihood(parameters[None])[0]) + model.log_offset

@@ -73,7 +73,8 @@ class SkylineModel:
     @cached_property
     def basis(self) -> ErrorBasis:
         """Directions of the shared errors."""
-        return ErrorBasis.of(self.errors, self.gross, self.error_slopes_rad, self.position_slopes, self.moments)
+        slopes, moved, reach_m = self.error_slopes_rad, self.position_slopes, self.terrain.reach_m
+        return ErrorBasis.of(self.errors, self.gross, slopes, moved, self.moments, reach_m)
 
     @cached_property
     def slopes_rad(self) -> Array:

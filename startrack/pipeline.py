@@ -62,13 +62,13 @@ def locate(
         oriented = run.run_stage("attitude", solve_orientation, identified)
         run.time_stage("attitude", check_one_attitude, oriented)
         measured = run.run_stage("evidence", measure_evidence, oriented, terrain, settings)
-        interim = replace(measured.evidence(), is_interim=True)
-        located = run.time_stage("locate", fix_position, measured, Located, settings.localizer, interim)
+        located = run.time_stage("locate", fix_position, measured, Located, settings.localizer)
         step = _sky_step(run, located)
-        if step is not None and step.exceeds_noise:
+        is_bright = step is not None and step.exceeds_noise
+        if is_bright:
             located = run.time_stage("evidence", remeasure_near_skyline, located, step, settings.evidence)
         run.time_stage("locate", check_single_skyline, located.light, located.terrain, located.position_at_time_m)
-        located = run.time_stage("locate", _with_sky_light, located, settings)
+        located = run.time_stage("locate", _refine, located, is_bright, settings)
         sky_mag = None if step is None else step.brightness_mag_arcsec2(camera, exposure.exposure_s)
         skyline = run.time_stage("locate", measured_skyline, located)
         return run.finish(replace(located, sky_brightness_mag_arcsec2=sky_mag, skyline=skyline))
@@ -76,14 +76,13 @@ def locate(
         return run.refuse(refusal)
 
 
-def _with_sky_light(located: Located, settings: Settings) -> Located:
-    """The position by all of the evidence that is asked for."""
+def _refine(located: Located, is_newer: bool, settings: Settings) -> Located:
+    """The position by all of the evidence that is asked for; `is_newer`: its stars were measured after the fix."""
     if settings.evidence_sources != "stars":
         located = refine_by_sky_light(located, settings.localizer, settings.evidence_sources == "both")
-    if located.sky_light is not None:
-        return located
-    evidence = replace(located.evidence(), support=located.fix.samples)
-    return fix_position(located, Located, settings.localizer, evidence)
+    if located.sky_light is None and is_newer:
+        return fix_position(located, Located, settings.localizer)
+    return located
 
 
 def _sky_step(run: Run, located: Located) -> SkyStep | None:

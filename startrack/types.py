@@ -208,7 +208,6 @@ class Evidence(Value):
     clock: Clock | None = None  # one for all rows; None: the time is exact
     near: PositionPrior | None = None  # of the camera's position; None: anywhere in the search area
     image_errors: ImageErrors | None = None  # of the rows of extended light; None: these are exact
-    is_interim: bool = False  # more rows of the same image follow: the fix needs no integrity
     support: Any = None  # samples of an earlier fix from much the same rows; None: the whole area is searched
 
     def __post_init__(self) -> None:

@@ -102,8 +102,8 @@ def test_locate_gives_the_fix_of_the_same_image_in_a_file(drive, located, tmp_pa
     records = []
     time = located.result.exposure.time_utc.isoformat()
     for command in (
-        ["locate", f"{drive}#0", "--image-topic", "/cam", *common, "--json"],
-        ["locate", str(drive.parent.parent / "same.png"), *common, "--json", "--time", time],
+        ["locate", f"{drive}#0", "--image-topic", "/cam", *common, "--json", "--time-sigma", "1"],
+        ["locate", str(drive.parent.parent / "same.png"), *common, "--json", "--time", time, "--time-sigma", "1"],
     ):
         assert main(command) == 0
         records.append(json.loads(capsys.readouterr().out))

@@ -42,7 +42,7 @@ def night(tmp_path_factory) -> Path:
     )
     save_camera(camera, root / "small.toml")
     series = Series(
-        camera=camera, terrain=load_terrain("shackleton-thesis"), catalog=load_catalog().brighter_than(7.0), seed=3,
+        camera=camera, terrain=load_terrain("shackleton-thesis"), catalog=load_catalog(), seed=3,
         faint_v_mag=None, hot_pixels=20, terrain_ref="shackleton-thesis",
     )  # fmt: skip
     for number, name in enumerate(("a 1.png", "späti/a 1.png", "späti/b.png")):

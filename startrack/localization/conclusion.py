@@ -95,13 +95,7 @@ def label_modes(points_m: Array, share: Array) -> Ints:
     return np.asarray(np.argmin(trees, axis=0))
 
 
-def conclude(
-    found: Sequence[Hypothesis],
-    terrain: Terrain,
-    explored: Explored,
-    dropped_probability: float,
-    with_integrity: bool = True,
-) -> Fix:
+def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, dropped_probability: float) -> Fix:
     """The fix by sampled hypotheses, the heaviest first, in a terrain, after a search.
 
     Raises NotLocated: outside_search_area, insufficient_geometry, inconsistent_evidence.
@@ -119,7 +113,7 @@ def conclude(
         raise NotLocated(_useless(whole))
     _require_map(whole, parameters, clear)
     integrity = None
-    if with_integrity and not ambiguous:
+    if not ambiguous:
         integrity = assess_integrity(best.model, parameters, near[:2, :2], clear, covariance, radius999)
     blocked = Blocked(1.0 - clear)
     return Fix(

@@ -18,10 +18,10 @@ import numpy as np
 from startrack.types import Array
 
 DEGREES, FAR_DEGREES = 5.0, 3.0  # of freedom of the t distributions
-FAR_PART, FAR, FAR_OTHERS = 0.25, 4.0, 1.4  # of the points; how much farther out, in position and in the others
-ROUNDS = (120, 200, 360, 500, 600)  # points
-MORE_POINTS = 0.5  # part by which each further dimension has more
-LEAST_ROUNDS, ENOUGH = 3, 200.0  # after so many rounds so many effective points end them
+FAR_PART, FAR, FAR_OTHERS = 0.4, 4.0, 1.4  # of the points; how much farther out, in position and in the others
+ROUNDS = (200, 400, 600, 800, 1000)  # points
+MORE_POINTS = 0.3  # part by which each further dimension has more
+LEAST_ROUNDS, ENOUGH = 3, 400.0  # after so many rounds so many effective points end them
 TEMPERED = 7.0  # effective points a dimension to which weights are tempered before the distributions move
 KEPT_PART = 0.03  # of the former covariance
 LEAST_WEIGHT = 1e-5  # of a mode; a lighter one is dropped
@@ -130,7 +130,7 @@ class TDistribution:
 
     def log_density(self, points: Array) -> Array:
         """(n,) at points (n, d)."""
-        return log_t_density(np.linalg.solve(self.root, (points - self.mean).T), self.degrees) - float(
+        return log_t_density(np.asarray(np.linalg.solve(self.root, (points - self.mean).T)), self.degrees) - float(
             np.log(np.diag(self.root)).sum()
         )
 

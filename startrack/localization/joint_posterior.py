@@ -179,7 +179,7 @@ def _start(model: SkylineModel, centres_m: Array, half_m: float) -> Start | None
     whole = covariance.copy()
     whole[:2, :2] += spread
     left = covariance[2:, 2:] - covariance[2:, :2] @ np.linalg.solve(covariance[:2, :2], covariance[:2, 2:])
-    drawn = BoxDistribution(boxes, half_m, share, np.linalg.cholesky(left), BOX_POINTS)
+    drawn = BoxDistribution(boxes, half_m, share, np.asarray(np.linalg.cholesky(left)), BOX_POINTS)
     return Start([(one, whole) for one in chosen], drawn)
 
 

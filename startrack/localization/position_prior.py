@@ -50,9 +50,12 @@ class SearchedNear(ForwardingTerrain):
 def weigh_by_prior(found: Explored, near: PositionPrior) -> Explored:
     """The posterior with the prior. Raises NotLocated (inconsistent_evidence) where the two contradict each other.
 
-    Of two normal distributions the maximum of the product lies chi^2 / 2 below the product of the maxima.
+    Of two normal distributions the maximum of the product lies chi^2 / 2 below the product of the maxima. The prior's
+    maximum in a box is at its point nearest to the mean.
     """
-    weighed = found.log_likelihood + near.log_density(found.centres_m)
+    off = found.centres_m - near.mean_m
+    nearest_m = near.mean_m + np.sign(off) * np.maximum(np.abs(off) - found.half_m, 0.0)
+    weighed = found.log_likelihood + near.log_density(nearest_m)
     lost = np.max(found.log_likelihood, initial=-np.inf) - np.max(weighed, initial=-np.inf)
     if lost > 0.5 * CONTRADICTED_SIGMAS**2:
         raise contradiction(near, f"lie {np.sqrt(2 * lost):.1f} sigma from it")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -65,7 +65,7 @@ class ExactPosterior:
             parts = self._explore_times(rows, terrain)
             found = [one for turned, explored in parts for one in sample_posterior(explored, turned, terrain)]
             found.sort(key=lambda one: -one.found.log_evidence)
-            return conclude(found, terrain, parts[0][1], _dropped_probability(parts[0][1]), not rows.is_interim)
+            return conclude(found, terrain, parts[0][1], _dropped_probability(parts[0][1]))
         except NotLocated as refusal:
             raise name_prior(refusal, near) from refusal
 
@@ -89,16 +89,15 @@ class ExactPosterior:
         The searched disk is enlarged until the likeliest position is not at its edge: else nothing would show how far
         off the prior the evidence is. Raises NotLocated (inconsistent_evidence) where the two contradict each other.
         """
-        nearby = SearchedNear(terrain, near)
-        found = self.explore(evidence, nearby)
+        nearby, method = SearchedNear(terrain, near), replace(self, finest_m=min(self.finest_m, near.sigma_m))
+        found = method.explore(evidence, nearby)
         while nearby.is_at_edge(found):
             wider = nearby.enlarged()
             try:
-                found, nearby = self.explore(evidence, wider), wider
+                found, nearby = method.explore(evidence, wider), wider
             except NotLocated:  # the smaller disk has an answer
                 break
-        weighed = weigh_by_prior(found, near)
-        return weighed
+        return weigh_by_prior(found, near)
 
     def explore_plain(self, likelihood: PositionLikelihood, starts_m: Array | None = None) -> Explored:
         """The boxes that may matter by a likelihood; `starts_m` (n, 2): good positions, if known."""

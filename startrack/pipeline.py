@@ -67,7 +67,8 @@ def locate(
         is_bright = step is not None and step.exceeds_noise
         if is_bright:
             located = run.time_stage("evidence", remeasure_near_skyline, located, step, settings.evidence)
-        run.time_stage("locate", check_single_skyline, located.light, located.terrain, located.position_at_time_m)
+        if located.damage is None:  # which changes the light of stars in part
+            run.time_stage("locate", check_single_skyline, located.light, located.terrain, located.position_at_time_m)
         located = run.time_stage("locate", _refine, located, is_bright, settings)
         sky_mag = None if step is None else step.brightness_mag_arcsec2(camera, exposure.exposure_s)
         skyline = run.time_stage("locate", measured_skyline, located)

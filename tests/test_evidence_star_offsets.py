@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from startrack.camera import Camera, load_camera
-from startrack.evidence.star_offsets import LEAST_SIGMA_PX, StarOffsets, measure_star_offsets, offset_terms
+from startrack.evidence.star_offsets import (
+    LEAST_SIGMA_PX,
+    NIGHT_SIGMA_PX,
+    StarOffsets,
+    measure_star_offsets,
+    offset_terms,
+)
 from startrack.frames import R_from_rotvec, azel_from_rays, rays_from_azel
 from startrack.types import Array
 
@@ -109,11 +115,12 @@ def test_the_errors_of_attitude_and_lens_are_the_prior() -> None:
     """A tilt shows as one wave around the skyline, a wrong scale as a level."""
     none = np.empty((0, 3)), np.empty((0, 2))
     exact = offsets(*none).covariance_px2
-    scaled = offsets(*none, camera=with_lens_error(0.2, "f")).covariance_px2 - exact
+    calibrated = exact + NIGHT_SIGMA_PX**2 * np.eye(5)
+    scaled = offsets(*none, camera=with_lens_error(0.2, "f")).covariance_px2 - calibrated
     angle = np.pi / 2 - 0.18
     # The attitude's refit cannot compensate a wrong scale.
     assert np.sqrt(scaled[0, 0]) == pytest.approx(0.2 * angle, rel=0.05)
-    shifted = offsets(*none, camera=with_lens_error(0.3, "cx", "cy")).covariance_px2 - exact
+    shifted = offsets(*none, camera=with_lens_error(0.3, "cx", "cy")).covariance_px2 - calibrated
     once = np.sqrt(shifted[1, 1] + shifted[2, 2])
     assert 0.02 < once < 0.3  # the refit compensates the most of it
     assert shifted[0, 0] < 0.1 * once**2

@@ -70,7 +70,7 @@ class TrackErrors:
         return len(self.names)
 
     def to_model(self, parameters: Array, evidence: Evidence) -> Array:
-        """Parameters (n, 2 + m) of a `SkylineModel` of `evidence`, from those of the track (n, 2 + k)."""
+        """Parameters (n, 2 + m) of a `SkylineModel` of `evidence`, from `parameters` (n, 2 + k) of the track."""
         m = len(self.listed)
         found = parameters[:, : 2 + m] * np.r_[1.0, 1.0, self.sigma[:m]]
         if self.listed.clock is not None and evidence.clock is not None:

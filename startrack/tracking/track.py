@@ -39,7 +39,7 @@ class Trajectory:
 
     @classmethod
     def of_normal(cls, position_enu_m: Array, covariance_m2: Array) -> Trajectory:
-        """With the circles of normal errors."""
+        """At `position_enu_m` (3,), with the circles of normal errors of `covariance_m2` (2, 2)."""
         radius95, radius999 = (radius_holding(covariance_m2, part) for part in (0.95, 0.999))
         return cls(position_enu_m, covariance_m2, radius95, radius999)
 

@@ -100,7 +100,7 @@ def test_in_a_round_crater_the_position_lies_on_an_arc(sigma_s: float) -> None:
     assert fix.covariance_m2 == pytest.approx(spread, abs=0.08 * size**2)
     assert fix.radius999_m > 2.7 * size
     assert fix.clock is not None
-    assert fix.clock.sigma_s == pytest.approx(sigma_s, rel=0.02)
+    assert fix.clock.sigma_s == pytest.approx(sigma_s, rel=0.05)
 
 
 @pytest.mark.parametrize("offset_s", [-HOUR_S, 4 * HOUR_S])

@@ -101,7 +101,6 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     Raises NotLocated: outside_search_area, insufficient_geometry, inconsistent_evidence.
     """
     whole = Posterior(found, terrain)
-    require_inside(whole.positions_m, whole.share, terrain)
     middle, covariance = moments(whole.positions_m[whole.main], whole.share[whole.main])
     radius95, radius999 = whole.radii(whole.positions_m, whole.share, middle)
     modes = _list_modes(whole)
@@ -112,6 +111,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     if not ambiguous and radius95 > USELESS_FRACTION * terrain.search_radius_m:
         raise NotLocated(_useless(whole))
     _require_map(whole, parameters, clear)
+    require_inside(whole.positions_m, whole.share, terrain)
     integrity = None
     if not ambiguous:
         integrity = assess_integrity(best.model, parameters, near[:2, :2], clear, covariance, radius999)

@@ -19,12 +19,12 @@ from startrack.localization.importance_sampling import (
     normal_sequence,
     sample,
 )
-from startrack.localization.other_times import turned_models
+from startrack.localization.other_times import is_linear, turned_model, turned_models
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
-from startrack.types import Array, Evidence, NotLocated
+from startrack.types import Array, Clock, Evidence, NotLocated
 
 REACH_M = 300.0  # of a group of boxes about its best one, with one neighbourhood
 SMALLER = 0.3  # variance of a gross error that is none, beside that by the linear model
@@ -34,6 +34,7 @@ MOST_MODES, MODE_NATS = 4, 14.0  # of a group; less likely ones than the best by
 BOX_POINTS = 160  # drawn from the boxes
 APART_BOXES = 3.0  # between two modes that sampling begins with
 GROSS_ROUNDS = (120, 160, 200)
+TIME_ROUNDS = 6  # in which the rows are turned to the time that a gross error of the clock shows
 FEW, MORE_ROUNDS = 60.0, (300, 500, 900)  # effective points of the best hypothesis, below which it is sampled anew
 
 
@@ -221,9 +222,30 @@ def _gross_hypotheses(plain: Hypothesis, references_m: Array) -> list[Hypothesis
             less = other.basis.log_probability - model.basis.log_probability
             found.append(Hypothesis(other, replace(plain.found, log_weight=plain.found.log_weight + less)))
             continue
-        for other in _models_of(model.with_gross(gross)):
-            modes = _gross_modes(plain, other)
-            found.append(_sample(other, references_m, modes, rounds=GROSS_ROUNDS))
+        other = model.with_gross(gross)
+        clock = _gross_clock(other)
+        if clock is not None:
+            turned = turned_models(other, clock)
+            found.extend(_at_settled_time(plain, one, clock, references_m) for one in turned)
+        else:
+            found.append(_sample(other, references_m, _gross_modes(plain, other), rounds=GROSS_ROUNDS))
+    return found
+
+
+def _gross_clock(model: SkylineModel) -> Clock | None:
+    """The clock where the gross error is its, on real ground: there the skyline is not linear in it."""
+    clock, listed = model.errors.clock, model.errors.listed
+    return clock if listed[-1].fact == model.gross and not model.terrain.axisymmetric else None
+
+
+def _at_settled_time(plain: Hypothesis, model: SkylineModel, clock: Clock, references_m: Array) -> Hypothesis:
+    """The hypothesis of a gross error of the clock, with the rows turned to the time that it shows."""
+    for _ in range(TIME_ROUNDS):
+        found = _sample(model, references_m, _gross_modes(plain, model))
+        later_s = float(found.found.share @ found.values[:: found.copies, -1])
+        if is_linear(clock, later_s):
+            break
+        model = turned_model(model, later_s)
     return found
 
 
@@ -233,11 +255,3 @@ def _gross_modes(plain: Hypothesis, other: SkylineModel) -> list[Gaussian]:
     mean = plain.found.share @ plain.found.points
     same = np.linalg.pinv(other.basis.shown) @ (plain.model.basis.shown @ mean[2:])
     return [(start, 2.0 * covariance), (np.append(mean[:2], same), SMALLER * covariance)]
-
-
-def _models_of(model: SkylineModel) -> list[SkylineModel]:
-    """The model of a gross error; of one of the clock on real ground, those of the times that suit the rows."""
-    clock = model.errors.clock
-    if clock is None or model.gross != model.errors.listed[-1].fact or model.terrain.axisymmetric:
-        return [model]
-    return turned_models(model, clock)

@@ -26,7 +26,12 @@ def is_wide(clock: Clock, terrain: Terrain) -> bool:
     """Whether the stated error of a clock turns the sky over more than a skyline's shape is linear in."""
     if terrain.axisymmetric:
         return False
-    return clock.sigma_s * float(np.linalg.norm(clock.turn_rad_s)) > LINEAR_TURN_RAD
+    return not is_linear(clock, clock.sigma_s)
+
+
+def is_linear(clock: Clock, error_s: float) -> bool:
+    """Whether the skyline of real ground is linear in an error of the clock of this size."""
+    return abs(error_s) * float(np.linalg.norm(clock.turn_rad_s)) <= LINEAR_TURN_RAD
 
 
 def explore_times(plain: PositionLikelihood, evidence: Evidence, clock: Clock) -> list[tuple[Evidence, Explored]]:
@@ -49,15 +54,20 @@ def replace_rows(likelihood: PositionLikelihood, rows: Evidence) -> PositionLike
     return PositionLikelihood.from_evidence(rows, likelihood.terrain, 2 * np.pi / sectors.count, sectors.epsilon)
 
 
+def turned_model(model: SkylineModel, later_s: float, is_rough: bool = False) -> SkylineModel:
+    """The model with its rows turned to a later time; see `SkylineModel.is_rough`."""
+    return model.with_rows(turn_evidence(model.rows, later_s), is_rough)
+
+
 def turned_models(model: SkylineModel, clock: Clock) -> list[SkylineModel]:
-    """The model at the likeliest times of a gross error of the clock, far enough from the stated one."""
+    """The model at the likeliest times of a gross error of its `clock`, far enough from the stated one."""
     turn = float(np.linalg.norm(clock.turn_rad_s))
     count = int(np.ceil(REACH_SIGMAS * clock.gross_sigma_s * turn / STEP_RAD))
     later_s = np.arange(-count, count + 1) * STEP_RAD / turn
-    fits = np.array([_fit(model.with_rows(turn_evidence(model.rows, later), is_rough=True)) for later in later_s])
+    fits = np.array([_fit(turned_model(model, later, is_rough=True)) for later in later_s])
     fits -= 0.5 * np.square(later_s / clock.gross_sigma_s)
     likely = [float(later_s[at]) for at in _peaks(later_s, fits, clock)]
-    return [model.with_rows(turn_evidence(model.rows, later), is_rough=False) for later in likely if later != 0.0]
+    return [turned_model(model, later) for later in likely if later != 0.0]
 
 
 def _fit(model: SkylineModel) -> float:

@@ -32,6 +32,7 @@ HIDDEN_COPIES = 6  # of each point, with values of the errors that the rows do n
 MOST_GROUPS, MOST_BOXES = 6, 160  # groups of boxes; boxes of a group that the chain is computed at
 MOST_MODES, MODE_NATS = 4, 14.0  # of a group; less likely ones than the best by more are none
 BOX_POINTS = 160  # drawn from the boxes
+LINEAR_WIDER = 2.0  # variance about the solution of the linear model with which sampling begins
 APART_BOXES = 3.0  # between two modes that sampling begins with
 GROSS_ROUNDS = (120, 160, 200)
 TIME_ROUNDS = 6  # in which the rows are turned to the time that a gross error of the clock shows
@@ -156,14 +157,16 @@ def _start(model: SkylineModel, centres_m: Array, half_m: float) -> Start | None
     if len(centres_m) > MOST_BOXES:
         step = len(centres_m) / MOST_BOXES
         centres_m, half_m = centres_m[(np.arange(MOST_BOXES) * step).astype(int)], half_m * np.sqrt(step)
-    _, covariance, weight = _linear(model)
+    linear, covariance, weight = _linear(model)
     model.__dict__["clear"] = weight
     boxes = model.with_likely_errors(centres_m, weight)
-    value = model.log_likelihood(boxes) + model.basis.log_prior(boxes[:, 2:])
-    value = np.where(np.asarray(model.terrain.allowed(boxes[:, :2])), value, -np.inf)
+    tried = np.vstack([boxes, linear])
+    value = model.log_likelihood(tried) + model.basis.log_prior(tried[:, 2:])
+    value = np.where(np.asarray(model.terrain.allowed(tried[:, :2])), value, -np.inf)
     if not np.isfinite(value).any():
         return None
-    model.states(boxes[int(np.argmax(value))])
+    model.states(tried[int(np.argmax(value))])
+    value, by_linear = value[:-1], value[-1]
     chosen: list[Array] = []
     for i in np.argsort(-value):
         if value[i] < value.max() - MODE_NATS or len(chosen) == MOST_MODES:
@@ -181,7 +184,10 @@ def _start(model: SkylineModel, centres_m: Array, half_m: float) -> Start | None
     whole[:2, :2] += spread
     left = covariance[2:, 2:] - covariance[2:, :2] @ np.linalg.solve(covariance[:2, :2], covariance[:2, 2:])
     drawn = BoxDistribution(boxes, half_m, share, np.asarray(np.linalg.cholesky(left)), BOX_POINTS)
-    return Start([(one, whole) for one in chosen], drawn)
+    modes = [(one, whole) for one in chosen]
+    if by_linear > value.max():
+        modes = [(linear, LINEAR_WIDER * covariance), *modes[: MOST_MODES - 1]]
+    return Start(modes, drawn)
 
 
 def _sample(model: SkylineModel, references_m: Array, modes: Sequence[Gaussian], **how: Any) -> Hypothesis:

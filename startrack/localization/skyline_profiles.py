@@ -24,6 +24,7 @@ ROW_NATS = 6.0  # most that one star counts: one in 400 is variable, misnamed or
 SKY_STEP_PX = 0.1  # of the edge's width: cells of the sky's light, quadratic in each, right to 0.02 nats
 SOFT_BINS = np.linspace(-3.5, 3.5, 15)  # of a normal error of the map, whose mean is taken bin by bin
 SOFT_REACH_RAD, SOFT_SIGMAS = np.radians(0.3), 8.0  # about the map's skyline, where its error is averaged over
+LEAST_MEAN = 1e-8  # of exp (F - R) over such an error: differences of the integral have no more digits
 SOFT_STEP, MOST_SOFT_CELLS = 0.5, 120.0  # of the error: cells of the average; at most, to each side
 
 
@@ -235,7 +236,10 @@ def _average_over_map(profiles, sigma, bins):
             at = -reach[s] + i * step[s]
             after = _mean_over(profiles, s, at + step[s], sigma[s], bins, weights)
             middle = _mean_over(profiles, s, at + 0.5 * step[s], sigma[s], bins, weights)
+            rise = abs(after - before)
             x[n], left[n], right[n], bend[n] = at, before, after, 4.0 * (middle - 0.5 * (before + after))
+            if min(before, after) <= middle <= max(before, after):  # the parabola has no peak either
+                bend[n] = min(max(bend[n], -rise), rise)
             before = after
             n += 1
         end = -reach[s] + count * step[s]
@@ -259,4 +263,4 @@ def _mean_over(profiles, s, height, sigma, bins, weights):
         after = integral_to(profiles, s, height + bins[q + 1] * sigma)
         total += weights[q] * (after - before) / ((bins[q + 1] - bins[q]) * sigma)
         before = after
-    return np.log(max(total, 1e-300)) + profiles.free[s]
+    return np.log(max(total, LEAST_MEAN)) + profiles.free[s]

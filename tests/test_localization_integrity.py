@@ -14,6 +14,7 @@ from test_localization_shape import TRUE, evidence_at
 
 from startrack.evidence.sky_light import MIDDLES_RAD
 from startrack.localization import ExactPosterior
+from startrack.localization.explored import Explored
 from startrack.localization.integrity import DIVISIONS, GROUPS, RISK, WRONG_GROUP, _divide
 from startrack.localization.skyline_profiles import SECTORS
 from startrack.output import result_dict, verbose_text
@@ -129,7 +130,11 @@ def test_a_skyline_raised_over_forty_degrees_is_within_the_level_or_refused(rais
 @pytest.mark.parametrize(("groups", "is_bounded"), [([2, 4], True), ([6], False)])
 def test_the_groups_named_are_those_that_hold_the_rows(groups: list[int], is_bounded: bool) -> None:
     place = np.array([3000.0, -2000.0])
-    rows = sky_rows(place, np.random.default_rng(5), 60.0)
+    line = np.linspace(-120.0, 120.0, 25)
+    about = Explored(
+        place + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2), 5.0, np.zeros(625), -100.0, "proven"
+    )
+    rows = replace(sky_rows(place, np.random.default_rng(5), 60.0), support=about)
     part = rows.take(np.isin((rows.azimuth_rad / WIDTH_RAD).astype(int), groups))
     assert len(np.unique(part.azimuth_rad)) == len(groups) * len(MIDDLES_RAD) // GROUPS
     fix = ExactPosterior()(part, CRATER)

@@ -102,6 +102,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     Raises NotLocated: outside_search_area, insufficient_geometry, inconsistent_evidence.
     """
     whole = Posterior(found, terrain)
+    require_inside(whole.positions_m, whole.share, terrain)
     middle, covariance = moments(whole.positions_m[whole.main], whole.share[whole.main])
     radius95, radius999 = whole.radii(whole.positions_m, whole.share, middle)
     modes = _list_modes(whole)
@@ -112,7 +113,6 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     if not ambiguous and radius95 > USELESS_FRACTION * terrain.search_radius_m:
         raise NotLocated(_useless(whole))
     _require_map(whole, parameters, clear)
-    require_inside(whole.positions_m, whole.share, terrain)
     integrity = None
     if not ambiguous:
         integrity = assess_integrity(best.model, parameters, near[:2, :2], clear, covariance, radius999)
@@ -248,7 +248,7 @@ def _without(one: Hypothesis, fact: str) -> Array:
 
 def _shown(best: Hypothesis) -> tuple[ShownError, ...]:
     """The errors that nobody states and that the image shows to be larger than their default."""
-    mean, covariance = moments(best.values, _share(best))
+    mean, covariance = moments(best.values - best.model.errors.mean, _share(best))
     sigma = np.sqrt(np.diag(covariance))
     return tuple(
         ShownError(one.name, one.fact, float(mean[k]), float(sigma[k]))

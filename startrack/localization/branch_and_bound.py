@@ -287,8 +287,10 @@ class Search:
     def _spend_on_boxes(self, horizons: float, kept: list[tuple[Array, Array, Ints, Ints]], half: float) -> None:
         self.work += horizons * self.terrain.horizon_cost
         if self.work > self.settings.budget_horizons:
-            centres = np.concatenate([part[0] for part in kept] or [np.zeros((1, 2))])
-            raise BudgetSpent(centres, np.concatenate([part[1] for part in kept] or [np.zeros(1)]), half)
+            if not kept:  # nothing is known of the whole area
+                raise BudgetSpent(np.array([self.terrain.searched[:2]]), np.zeros(1), self.terrain.searched[2])
+            centres, upper = (np.concatenate([part[k] for part in kept]) for k in (0, 1))
+            raise BudgetSpent(centres, upper, half)
 
     def _spend(self, horizons: float, boxes: Boxes) -> None:
         self.work += horizons * self.terrain.horizon_cost

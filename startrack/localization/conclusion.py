@@ -22,7 +22,9 @@ AMBIGUOUS_MASS = 0.01
 NEGLIGIBLE_MODE = 2e-3  # of the probability: points apart that hold less belong to the nearest mode
 USELESS_FRACTION = 0.5  # a 95 % circle wider than this part of the search radius says nothing worth having
 WRONG_MAP, RISK = 0.01, 1e-2  # prior probability of a free skyline, and its weight from which on a fix is refused
-MOST_BLOCKED = 0.5  # of the skyline that the rows show: where more is on no map, another place may explain the rows as well
+MOST_BLOCKED = (
+    0.5  # of the skyline that the rows show: where more is on no map, another place may explain the rows as well
+)
 SHOWN_SIGMAS = 2.0  # by which an error that nobody states is beyond its default
 WIDE_SHAPE = 0.4  # relative range of a wrong map's steepness: a free skyline is compared with a map of any of them
 SUPPORT = 200  # points of a fix with which a later search of the same image begins

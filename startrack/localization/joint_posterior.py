@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from startrack.localization.explored import Explored
+from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.importance_sampling import (
     BoxDistribution,
     Gaussian,
@@ -35,6 +36,7 @@ BOX_POINTS = 160  # drawn from the boxes
 LINEAR_WIDER = 2.0  # variance about the solution of the linear model with which sampling begins
 APART_BOXES = 3.0  # between two modes that sampling begins with
 GROSS_ROUNDS = (120, 160, 200)
+DOUBTFUL_NATS = 5.0  # by which a map beats a free skyline, below which other times are tried too
 TIME_ROUNDS = 6  # in which the rows are turned to the time that a gross error of the clock shows
 FEW, MORE_ROUNDS = 60.0, (300, 500, 900)  # effective points of the best hypothesis, below which it is sampled anew
 
@@ -83,6 +85,18 @@ class Hypothesis:
     def positions_m(self) -> Array:
         """(n, 2)."""
         return self.model.errors.turned(self.unturned_m, self.values)
+
+    @property
+    def later_s(self) -> float:
+        """How much later the true time is than the stated one, in the mean."""
+        return float(self.found.share @ self.values[:: self.copies, -1]) + self.model.later_s
+
+    @property
+    def suits_map(self) -> bool:
+        """Whether the map's skyline explains the rows far better than any other one does, so that no time does."""
+        shift, _ = self.model.with_image_errors(self.model.shifts((self.found.share @ self.found.points)[None]))
+        free = free_log_likelihood(self.model.profiles, shift[0])
+        return free < float(self.model.log_likelihood_of(shift)[0]) - DOUBTFUL_NATS
 
 
 def sample_posterior(explored: Explored, rows: Evidence, terrain: Terrain) -> list[Hypothesis]:
@@ -230,11 +244,21 @@ def _gross_hypotheses(plain: Hypothesis, references_m: Array) -> list[Hypothesis
             continue
         other = model.with_gross(gross)
         clock = _gross_clock(other)
-        if clock is not None:
-            turned = turned_models(other, clock)
-            found.extend(_at_settled_time(plain, one, clock, references_m) for one in turned)
+        if clock is not None and not plain.suits_map:
+            found.extend(_at_other_times(plain, other, clock, references_m))
         else:
             found.append(_sample(other, references_m, _gross_modes(plain, other), rounds=GROSS_ROUNDS))
+    return found
+
+
+def _at_other_times(plain: Hypothesis, model: SkylineModel, clock: Clock, references_m: Array) -> list[Hypothesis]:
+    """The hypotheses of a gross error of the clock at times that are apart from each other."""
+    found: list[Hypothesis] = []
+    for turned in turned_models(model, clock):
+        one = _at_settled_time(plain, turned, clock, references_m)
+        at_s, others_s = one.later_s, [other.later_s for other in found]
+        if not any(is_linear(clock, at_s - other_s) for other_s in others_s):
+            found.append(one)
     return found
 
 
@@ -248,10 +272,10 @@ def _at_settled_time(plain: Hypothesis, model: SkylineModel, clock: Clock, refer
     """The hypothesis of a gross error of the clock, with the rows turned to the time that it shows."""
     for _ in range(TIME_ROUNDS):
         found = _sample(model, references_m, _gross_modes(plain, model))
-        later_s = float(found.found.share @ found.values[:: found.copies, -1])
-        if is_linear(clock, later_s):
+        off_s = found.later_s - model.later_s
+        if is_linear(clock, off_s):
             break
-        model = turned_model(model, later_s)
+        model = turned_model(model, off_s)
     return found
 
 

@@ -25,7 +25,7 @@ MIN_ROWS = 8
 MIN_ROW_NATS = 1e-3  # |llr| below which a row is left out
 SEARCH_EPSILON = 0.1  # of a sector in the search: an obstacle costs the true position 2.3 nats a sector, not 9
 SLACK_NATS = 44.0  # by which the published model may favour a position over the search: 29 degrees of obstacles
-OPEN_BOXES = 200  # handed on where the budget of the search is spent
+OPEN_BOXES, MOST_OPEN_M = 200, 20.0  # handed on where the budget of the search is spent; the largest half side
 NATS = 16.0  # positions that are e^-16 as likely as the best are dropped
 
 
@@ -111,8 +111,9 @@ class ExactPosterior:
     def _explore_open(likelihood: PositionLikelihood, search: Search, spent: BudgetSpent) -> Explored:
         """The best boxes known where the budget is spent, and those still open that may matter most."""
         guess = climb_to_best(likelihood, spent.centres_m, search.guess)
-        open_m = spent.centres_m[:OPEN_BOXES]
-        handed = Explored(open_m, spent.half_m, likelihood.exact_scores(open_m), spent.log_open, "beam")
+        open_m = spent.centres_m[: OPEN_BOXES if spent.half_m <= MOST_OPEN_M else 0]
+        scores = likelihood.exact_scores(open_m) if len(open_m) else np.zeros(0)
+        handed = Explored(open_m, spent.half_m, scores, spent.log_open, "beam")
         if not len(guess.points_m):
             return handed
         near = local_posterior(likelihood, guess, spent.log_open)

@@ -140,6 +140,11 @@ class SkylineModel:
         high = (self.above_rad >= HIGH_RAD) & (rows.extended_nats == 0.0)
         return float(self.profiles.free.sum() + np.clip(rows.llr[high], -ROW_NATS, ROW_NATS).sum())
 
+    @property
+    def later_s(self) -> float:
+        """How much later than stated the time is that the rows are turned to."""
+        return 0.0 if self.errors.clock is None else self.errors.clock.offset_s
+
     @cached_property
     def moments(self) -> SectorMoments:
         """Heights of the skyline that the rows show, sector by sector."""

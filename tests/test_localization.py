@@ -15,7 +15,7 @@ from startrack.localization.initial_guess import Guess
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.sector_likelihood import contributions, row_range
 from startrack.stages import Settings
-from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain
+from startrack.terrain import Cylinder, ForwardingTerrain, load_terrain
 from startrack.types import Array, BadInput, Evidence, NotLocated
 
 TERRAIN = load_terrain("shackleton-thesis")

@@ -11,9 +11,9 @@ import numpy as np
 from startrack.fix import Blocked, ClockError, Fix, Mode, ShownError, UnstatedFact
 from startrack.localization.explored import Explored
 from startrack.localization.free_skyline import free_log_likelihood
+from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.importance_sampling import moments
 from startrack.localization.integrity import assess_integrity
-from startrack.localization.joint_posterior import Hypothesis
 from startrack.localization.summary import camera_at, link_points, require_inside
 from startrack.terrain import Terrain
 from startrack.types import Array, Ints, NotLocated

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from localization_helpers import ThreeMethods, slow_chain_scores
+from test_localization import SMALL, TwoCraters, measure_stars
 
 from startrack.localization import ExactPosterior
 from startrack.prior import PositionPrior
@@ -71,20 +72,14 @@ def test_the_prior_weighs_hard_edges_too(terrain: Terrain) -> None:
 
 @pytest.mark.slow
 def test_an_ambiguous_position_becomes_single() -> None:
-    """Stars due east and due west only: a position and its mirror image to the south have the same horizon there."""
-    rng = np.random.default_rng(3)
-    n, at = 1500, np.array([2000.0, 6000.0])
-    azimuth = np.where(rng.random(n) < 0.5, np.pi / 2, 3 * np.pi / 2)
-    elevation, snr = np.radians(60) * rng.random(n), 1 + 3 * rng.random(n)
-    flux = snr * (elevation > CRATER.horizon_rad(at[None], azimuth)) + rng.standard_normal(n)
-    llr = np.clip(snr * flux - snr**2 / 2, -9, 9)
-    rows = Evidence(azimuth_rad=azimuth, elevation_rad=elevation, llr=llr)
-    method = ExactPosterior()
-    assert method(rows, CRATER).ambiguous
-    one = method(replace(rows, near=PositionPrior(1900.0, 6300.0, 400.0)), CRATER)
+    """Of two equal craters the prior chooses one."""
+    at, terrain = np.array([40.0, -90.0]), TwoCraters()
+    rows = measure_stars(np.random.default_rng(3), at, SMALL, 1500)
+    assert ExactPosterior()(rows, terrain).ambiguous
+    one = ExactPosterior()(replace(rows, near=PositionPrior(500.0, -20.0, 80.0)), terrain)
     assert not one.ambiguous
     assert len(one.modes) == 1
-    assert np.linalg.norm(one.position_enu_m[:2] - at) < one.radius999_m
+    assert np.linalg.norm(one.position_enu_m[:2] - at - [600.0, 0.0]) < one.radius999_m
 
 
 @pytest.mark.slow

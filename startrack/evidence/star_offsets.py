@@ -28,7 +28,6 @@ LEAST_SIGMA_PX = 1e-3  # of a term
 # nights outside the calibration of an all-sky camera erred by 0.8 m an axis where 0.1 px is 0.8 m.
 NIGHT_SIGMA_PX = 0.1
 MIN_STARS = 10
-OFFSET_TERMS = 5
 
 
 @dataclass(frozen=True, eq=False)

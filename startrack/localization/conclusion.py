@@ -10,7 +10,6 @@ import numpy as np
 
 from startrack.fix import Blocked, ClockError, Fix, Mode, ShownError, UnstatedFact
 from startrack.localization.explored import Explored
-from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.importance_sampling import moments
 from startrack.localization.integrity import assess_integrity
@@ -181,15 +180,12 @@ def _require_map(whole: Posterior, parameters: Array, clear: Array) -> None:
             "camera file are wrong",
             reason="inconsistent_evidence",
         )
-    best, at = whole.best, parameters[None]
-    model = best.model
-    shift, _ = model.with_image_errors(model.shifts(at))
-    by_map = float(model.log_likelihood_of(shift)[0])
+    best, model = whole.best, whole.best.model
+    by_map, free = model.compare_skylines(parameters)
     if best.gross:  # a wrong map may have any shape: the small prior of a gross error is no argument against it
         own = np.array([one.fact == best.gross for one in model.errors.listed])
         sigma, z = model.errors.sigma(best.gross)[own], parameters[2:] @ model.basis.shown[own].T
         by_map -= float(np.sum(0.5 * np.square(z / sigma) + np.log(sigma * np.sqrt(2 * np.pi) / WIDE_SHAPE)))
-    free = free_log_likelihood(model.profiles, shift[0])
     if free + np.log(WRONG_MAP) > by_map + np.log(RISK):
         where = f", most at azimuths {wrong.text}" if wrong else ""
         better = f"better, by {free - by_map:.0f} nats" if free > by_map + 0.5 else "as well"

@@ -51,7 +51,7 @@ class TDistribution:
 
 @dataclass(frozen=True, eq=False)
 class BoxDistribution:
-    """Equal square boxes of positions, uniform in each, with a t distribution of the other parameters about its own."""
+    """Equal square boxes of positions, uniform in each, with normal other parameters about its own."""
 
     centres: Array  # (m, d)
     half_m: float

@@ -22,12 +22,11 @@ def sample_gross_errors(plain: Hypothesis, references_m: Array) -> list[Hypothes
     model, found = plain.model, []
     for gross in model.errors.facts:
         own = np.array([one.fact == gross for one in model.errors.listed])
+        other = model.with_gross(gross)
         if not model.error_slopes_rad[own].any():  # nothing shows it: the points are the same
-            other = model.with_gross(gross)
             less = other.basis.log_probability - model.basis.log_probability
             found.append(Hypothesis(other, replace(plain.found, log_weight=plain.found.log_weight + less)))
             continue
-        other = model.with_gross(gross)
         clock = _gross_clock(other)
         if clock is not None and not plain.suits_map:
             found.extend(_at_other_times(plain, other, clock, references_m))

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from startrack.localization.distributions import normal_sequence
-from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.importance_sampling import Gaussian, WeightedPoints, sample
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.skyline_model import SkylineModel
@@ -73,9 +72,8 @@ class Hypothesis:
     @property
     def suits_map(self) -> bool:
         """Whether the map's skyline explains the rows far better than any other one does, so that no time does."""
-        shift, _ = self.model.with_image_errors(self.model.shifts((self.found.share @ self.found.points)[None]))
-        free = free_log_likelihood(self.model.profiles, shift[0])
-        return free < float(self.model.log_likelihood_of(shift)[0]) - DOUBTFUL_NATS
+        by_map, free = self.model.compare_skylines(self.found.share @ self.found.points)
+        return free < by_map - DOUBTFUL_NATS
 
 
 def solve_model(model: SkylineModel) -> tuple[Array, Array, Array]:

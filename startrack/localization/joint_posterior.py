@@ -10,11 +10,7 @@ from startrack.localization.distributions import BoxDistribution
 from startrack.localization.explored import Explored
 from startrack.localization.gross_errors import sample_gross_errors
 from startrack.localization.hypothesis import Hypothesis, sample_hypothesis, solve_model
-from startrack.localization.importance_sampling import (
-    Gaussian,
-    effective_points,
-    moments,
-)
+from startrack.localization.importance_sampling import Gaussian, effective_points, moments
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
@@ -91,7 +87,7 @@ def _start(model: SkylineModel, centres_m: Array, half_m: float) -> Start | None
     tried = np.vstack([boxes, linear])
     value = model.log_likelihood(tried) + model.basis.log_prior(tried[:, 2:])
     value = np.where(np.asarray(model.terrain.allowed(tried[:, :2])), value, -np.inf)
-    if not np.isfinite(value).any():
+    if not np.isfinite(value[:-1]).any():
         return None
     model.states(tried[int(np.argmax(value))])
     value, by_linear = value[:-1], value[-1]

@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from startrack.localization.error_basis import ErrorBasis
+from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.obstacle_chain import (
     MOVES,
     Levels,
@@ -83,7 +84,7 @@ class SkylineModel:
 
     def with_gross(self, gross: str) -> SkylineModel:
         """The same neighbourhood where a fact has a gross error."""
-        return self._sharing(replace(self, gross=gross), (*OF_GROUND, "above_rad", "profiles", "moments"))
+        return self._sharing(replace(self, gross=gross), (*OF_GROUND, "above_rad", "profiles", "moments", "image_rise"))
 
     def with_rows(self, rows: Evidence, is_rough: bool) -> SkylineModel:
         """The same neighbourhood with other rows and their clock."""
@@ -177,6 +178,11 @@ class SkylineModel:
         chain_log_likelihoods(self.profiles, self._levels(shifts), MOVES, shifts, cut, closing, found)
         return found
 
+    def compare_skylines(self, parameters: Array) -> tuple[float, float]:
+        """Log-likelihoods at parameters (2 + a,): by the map with obstacles, and by any smooth skyline near it."""
+        shift, _ = self.with_image_errors(self.shifts(parameters[None]))
+        return float(self.log_likelihood_of(shift)[0]), free_log_likelihood(self.profiles, shift[0])
+
     def states(self, parameters: Array) -> Array:
         """Probabilities (SECTORS, STATES) of the chain's states at parameters (2 + a,); the circle is cut by them."""
         shifts, _ = self.with_image_errors(self.shifts(parameters[None]))
@@ -211,11 +217,12 @@ class SkylineModel:
 
         The share of the sky's light must not vary with its noise: errors that look like a displacement would not.
         """
-        image = self.image_errors or NO_IMAGE_ERRORS
+        if self.image_errors is None:
+            return NO_IMAGE_ERRORS.raised_rad
         stars = np.flatnonzero(self.rows.extended_nats == 0.0)
         by_stars = measure_moments(profiles_of(self.rows.take(stars), self.above_rad[stars], np.zeros(SECTORS)))
-        share = by_stars.variance_rad2 / (by_stars.variance_rad2 + image.variance_rad2)
-        return np.asarray(share[:, None] * image.raised_rad)
+        share = by_stars.variance_rad2 / (by_stars.variance_rad2 + self.image_errors.variance_rad2)
+        return np.asarray(share[:, None] * self.image_errors.raised_rad)
 
     @property
     def _image_mean(self) -> Array:

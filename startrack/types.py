@@ -160,7 +160,8 @@ class Identification(Value):
 class Clock(Value):
     """How directions in enu depend on an error of the clock.
 
-    The prior of its error is a mixture: `sigma_s`, or with `gross_probability` the wider `gross_sigma_s`.
+    The prior of its error is a mixture: `sigma_s`, or with `gross_probability` the wider `gross_sigma_s`, which is
+    also what the error would be if a stated `sigma_s` were wrong.
     """
 
     turn_rad_s: Array = array(3)  # rotation vector in enu: by one second that the true time is later

@@ -15,6 +15,7 @@ from startrack.types import Clock, Evidence
 REACH_SIGMAS = 4.0  # of the stated error, to the last time that is tried
 TURN_S = 600.0  # over which the sky's turn is taken
 GROSS_PROBABILITY, GROSS_SIGMA_S = 0.01, 3600.0  # of a clock whose error nobody states
+WRONG_SIGMA_S = 21_600.0  # of one whose stated error is wrong: a local time, a half of the day
 NEGLIGIBLE_M = 0.05  # by which a row may move over the search area, within one sigma, without an effect on the fix
 
 
@@ -23,10 +24,9 @@ def clock_at(site: Site, time_utc: datetime, sigma_s: float, is_stated: bool = T
 
     is_stated: whether somebody states `sigma_s`; where it is a default, the clock may be grossly wrong.
     """
-    gross = (0.0, 0.0) if is_stated else (GROSS_PROBABILITY, GROSS_SIGMA_S)
     return Clock(
-        turn_rad_s=sky_rotvec_rad(site, time_utc, TURN_S) / TURN_S, sigma_s=sigma_s, gross_probability=gross[0],
-        gross_sigma_s=gross[1],
+        turn_rad_s=sky_rotvec_rad(site, time_utc, TURN_S) / TURN_S, sigma_s=sigma_s,
+        gross_probability=0.0 if is_stated else GROSS_PROBABILITY, gross_sigma_s=WRONG_SIGMA_S if is_stated else GROSS_SIGMA_S,
     )  # fmt: skip
 
 

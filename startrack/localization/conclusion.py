@@ -14,18 +14,14 @@ from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.importance_sampling import moments
 from startrack.localization.integrity import assess_integrity
 from startrack.localization.summary import camera_at, link_points, require_inside
+from startrack.localization.wrong_files import require_files
 from startrack.terrain import Terrain
 from startrack.types import Array, Ints, NotLocated
 
 AMBIGUOUS_MASS = 0.01
 NEGLIGIBLE_MODE = 2e-3  # of the probability: points apart that hold less belong to the nearest mode
 USELESS_FRACTION = 0.5  # a 95 % circle wider than this part of the search radius says nothing worth having
-WRONG_MAP, RISK = 0.01, 1e-2  # prior probability of a free skyline, and its weight from which on a fix is refused
-MOST_BLOCKED = (
-    0.5  # of the skyline that the rows show: where more is on no map, another place may explain the rows as well
-)
 SHOWN_SIGMAS = 2.0  # by which an error that nobody states is beyond its default
-WIDE_SHAPE = 0.4  # relative range of a wrong map's steepness: a free skyline is compared with a map of any of them
 SUPPORT = 200  # points of a fix with which a later search of the same image begins
 
 
@@ -113,7 +109,7 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     clear = best.model.states(parameters)[:, 0]
     if not ambiguous and radius95 > USELESS_FRACTION * terrain.search_radius_m:
         raise NotLocated(_useless(whole))
-    _require_map(whole, parameters, clear)
+    require_files(found, parameters, clear)
     integrity = None
     if not ambiguous:
         integrity = assess_integrity(best.model, parameters, near[:2, :2], clear, covariance, radius999)
@@ -169,31 +165,6 @@ def _list_modes(whole: Posterior) -> tuple[Mode, ...]:
             )
         )  # fmt: skip
     return tuple(sorted(modes, key=lambda mode: -mode.weight))
-
-
-def _require_map(whole: Posterior, parameters: Array, clear: Array) -> None:
-    """Raises NotLocated (inconsistent_evidence) where the map's skyline shows too little of itself, or another fits."""
-    wrong = Blocked(1.0 - clear)
-    if np.average(wrong.whole, weights=whole.best.model.moments.information) > MOST_BLOCKED:
-        raise NotLocated(
-            f"something on no map hides {360.0 * wrong.whole.mean():.0f} degrees of the skyline, or terrain, time or "
-            "camera file are wrong",
-            reason="inconsistent_evidence",
-        )
-    best, model = whole.best, whole.best.model
-    by_map, free = model.compare_skylines(parameters)
-    if best.gross:  # a wrong map may have any shape: the small prior of a gross error is no argument against it
-        own = np.array([one.fact == best.gross for one in model.errors.listed])
-        sigma, z = model.errors.sigma(best.gross)[own], parameters[2:] @ model.basis.shown[own].T
-        by_map -= float(np.sum(0.5 * np.square(z / sigma) + np.log(sigma * np.sqrt(2 * np.pi) / WIDE_SHAPE)))
-    if free + np.log(WRONG_MAP) > by_map + np.log(RISK):
-        where = f", most at azimuths {wrong.text}" if wrong else ""
-        better = f"better, by {free - by_map:.0f} nats" if free > by_map + 0.5 else "as well"
-        raise NotLocated(
-            f"a skyline unlike the map's explains the image {better}{where}: wrong terrain, time or camera file, or "
-            "something on no map?",
-            reason="inconsistent_evidence",
-        )
 
 
 def _mean_error(best: Hypothesis, name: str) -> float:

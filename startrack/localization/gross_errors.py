@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from startrack.localization.hypothesis import Hypothesis, sample_hypothesis, solve_model
-from startrack.localization.importance_sampling import Gaussian
+from startrack.localization.importance_sampling import Gaussian, moments
 from startrack.localization.other_times import is_linear, turned_model, turned_models
 from startrack.localization.skyline_model import SkylineModel
 from startrack.types import Array, Clock
 
-SMALLER = 0.3  # variance of a gross error that is none, beside that by the linear model
+WIDER, LINEAR_PART = 2.0, 0.01  # variance of the first points, in that of the plain ones and in that of the linear model
 GROSS_ROUNDS = (120, 160, 200)
 TIME_ROUNDS = 6  # in which the rows are turned to the time that a gross error of the clock shows
 
@@ -26,13 +27,19 @@ def sample_gross_errors(plain: Hypothesis, references_m: Array) -> list[Hypothes
         if not model.error_slopes_rad[own].any():  # nothing shows it: the points are the same
             less = other.basis.log_probability - model.basis.log_probability
             found.append(Hypothesis(other, replace(plain.found, log_weight=plain.found.log_weight + less)))
-            continue
-        clock = _gross_clock(other)
-        if clock is not None and not plain.suits_map:
-            found.extend(_at_other_times(plain, other, clock, references_m))
         else:
-            found.append(sample_hypothesis(other, references_m, _gross_modes(plain, other), rounds=GROSS_ROUNDS))
+            found.extend(sample_gross_error(plain, other, references_m))
     return found
+
+
+def sample_gross_error(
+    plain: Hypothesis, other: SkylineModel, references_m: Array, rounds: Sequence[int] = GROSS_ROUNDS
+) -> list[Hypothesis]:
+    """The hypothesis `other` of one gross error; of the clock on real ground there may be several times."""
+    clock = _gross_clock(other)
+    if clock is not None and not plain.suits_map:
+        return _at_other_times(plain, other, clock, references_m)
+    return [sample_hypothesis(other, references_m, _gross_modes(plain, other), rounds=rounds)]
 
 
 def _at_other_times(plain: Hypothesis, model: SkylineModel, clock: Clock, references_m: Array) -> list[Hypothesis]:
@@ -64,8 +71,18 @@ def _at_settled_time(plain: Hypothesis, model: SkylineModel, clock: Clock, refer
 
 
 def _gross_modes(plain: Hypothesis, other: SkylineModel) -> list[Gaussian]:
-    """Modes with which the sampling of a gross error begins: by the linear model, and where it is none."""
-    start, covariance, _ = solve_model(other)
-    mean = plain.found.share @ plain.found.points
-    same = np.linalg.pinv(other.basis.shown) @ (plain.model.basis.shown @ mean[2:])
-    return [(start, 2.0 * covariance), (np.append(mean[:2], same), SMALLER * covariance)]
+    """The mode with which the sampling of a gross error begins: the plain points, drawn out along what it does.
+
+    The linear model tells how position and other errors follow a gross one, though its own solution may be far off.
+    """
+    _, linear, _ = solve_model(other)
+    known = {one.name: number for number, one in enumerate(plain.model.errors.listed)}
+    place = [known.get(one.name, -1) for one in other.errors.listed]
+    errors = np.pad(plain.found.points[:, 2:] @ plain.model.basis.shown.T, ((0, 0), (0, 1)))[:, place]
+    points = np.hstack([plain.found.points[:, :2], errors @ np.linalg.pinv(other.basis.shown).T])
+    mean, same = moments(points, plain.found.share)
+    gross = [one.fact == other.gross for one in other.errors.listed]
+    picked = np.pad(other.basis.shown[gross], ((0, 0), (2, 0)))
+    follow = linear @ picked.T
+    drawn_out = follow @ np.linalg.pinv(picked @ follow) @ follow.T
+    return [(mean, WIDER * same + drawn_out + LINEAR_PART * linear)]

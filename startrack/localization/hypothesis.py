@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from startrack.localization.distributions import normal_sequence
+from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.importance_sampling import Gaussian, WeightedPoints, sample
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.skyline_model import SkylineModel
@@ -72,8 +73,9 @@ class Hypothesis:
     @property
     def suits_map(self) -> bool:
         """Whether the map's skyline explains the rows far better than any other one does, so that no time does."""
-        by_map, free = self.model.compare_skylines(self.found.share @ self.found.points)
-        return free < by_map - DOUBTFUL_NATS
+        shift = self.model.shift_of(self.found.share @ self.found.points)
+        by_map = float(self.model.log_likelihood_of(shift[None])[0])
+        return free_log_likelihood(self.model.profiles, shift) < by_map - DOUBTFUL_NATS
 
 
 def solve_model(model: SkylineModel) -> tuple[Array, Array, Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +14,7 @@ from startrack.types import Array, Clock
 
 TURN_STEP_RAD = 2e-3  # of the sky, at which the skyline's change with the time is taken: its crests are no narrower
 ROUGH_RAD = np.radians(0.002)  # of ground that nobody states as exact: 0.35 m of a rim 10 km away
+CLOCK_FACT = "time_sigma_s"
 LEAST_PART = 1e-3  # of a gross error: the sigma of an error that is zero unless it is gross
 NEGLIGIBLE_M = 0.05  # by which an error of the clock moves a row over the search area, without an effect on the fix
 
@@ -31,16 +32,22 @@ class SharedErrors:
     axisymmetric: bool = False
 
     @classmethod
-    def of(cls, terrain: Terrain, clock: Clock | None) -> SharedErrors:
-        """Those of a `terrain`, and of a `clock` where its error matters there."""
-        listed = tuple(terrain.shape_errors)
-        if clock is None or not is_noticed(clock, terrain):
-            return cls(listed, None, terrain.axisymmetric)
-        error = ShapeError(
-            name="clock_s", fact="time_sigma_s", sigma=clock.sigma_s, gross_probability=clock.gross_probability,
-            gross_sigma=clock.gross_sigma_s,
-        )  # fmt: skip
-        return cls((*listed, error), clock, terrain.axisymmetric)
+    def of(cls, terrain: Terrain, clock: Clock | None, doubted: str = "") -> SharedErrors:
+        """Those of a `terrain` and a `clock` that may be other than zero.
+
+        What is stated of the fact `doubted` does not count: its errors are gross.
+        """
+        known = [*terrain.shape_errors, *([] if clock is None else [_clock_error(clock, terrain)])]
+        known = [replace(one, gross_probability=1.0) if one.fact == doubted else one for one in known]
+        listed = tuple(one for one in known if one.sigma > 0.0 or one.gross_probability > 0.0)
+        has_clock = any(one.fact == CLOCK_FACT for one in listed)
+        return cls(listed, clock if has_clock else None, terrain.axisymmetric)
+
+    @staticmethod
+    def doubtable(terrain: Terrain, clock: Clock | None) -> tuple[str, ...]:
+        """Stated facts of a `terrain` and a `clock` whose errors would be larger if the statement were wrong."""
+        known = [*terrain.shape_errors, *([] if clock is None else [_clock_error(clock, terrain)])]
+        return tuple(dict.fromkeys(one.fact for one in known if one.is_stated and one.gross_sigma > one.sigma))
 
     def __len__(self) -> int:
         return len(self.listed)
@@ -72,7 +79,9 @@ class SharedErrors:
 
     def slopes_rad(self, terrain: Terrain, position_m: Array, azimuth_rad: Array, horizon_rad: Array) -> Array:
         """Rise (k, n) of the skyline `horizon_rad` (n,) at azimuths (n,) by one unit of each error."""
+        known = {one.name: number for number, one in enumerate(terrain.shape_errors)}
         shape = np.reshape(terrain.shape_slopes_rad(position_m, azimuth_rad), (-1, len(azimuth_rad)))
+        shape = shape[[known[one.name] for one in self.listed if one.fact != CLOCK_FACT]]
         if self.clock is None:
             return shape
         turn = self.clock.turn_rad_s.copy()
@@ -117,7 +126,12 @@ class SharedErrors:
         return np.hypot(terrain.height_sigma_m * np.sqrt(variance), rough)
 
 
-def is_noticed(clock: Clock, terrain: Terrain) -> bool:
-    """Whether the error of a `clock` moves a position on a `terrain` noticeably."""
+def _clock_error(clock: Clock, terrain: Terrain) -> ShapeError:
+    """The error of a `clock`; zero where it moves no position on a `terrain` noticeably."""
+    m_per_s = float(np.linalg.norm(clock.turn_rad_s)) * terrain.reach_m
     most_s = max(clock.sigma_s, clock.gross_sigma_s if clock.gross_probability > 0.0 else 0.0)
-    return most_s * float(np.linalg.norm(clock.turn_rad_s)) * terrain.reach_m > NEGLIGIBLE_M
+    noticed = most_s * m_per_s > NEGLIGIBLE_M
+    return ShapeError(
+        name="clock_s", fact=CLOCK_FACT, sigma=clock.sigma_s if noticed else 0.0,
+        gross_probability=clock.gross_probability if noticed else 0.0, gross_sigma=clock.gross_sigma_s,
+    )  # fmt: skip

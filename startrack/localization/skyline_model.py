@@ -8,13 +8,13 @@ of a linear model of the sectors, and the likelihood is taken at those values.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from startrack.localization.error_basis import ErrorBasis
-from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.obstacle_chain import (
     MOVES,
     Levels,
@@ -83,15 +83,18 @@ class SkylineModel:
         return np.asarray(self.basis.shown.T @ self.error_slopes_rad)
 
     def with_gross(self, gross: str) -> SkylineModel:
-        """The same neighbourhood where a fact has a gross error."""
-        return self._sharing(replace(self, gross=gross), (*OF_GROUND, "above_rad", "profiles", "moments", "image_rise"))
+        """The same neighbourhood where a fact has a gross error, whatever is stated of it."""
+        errors = self.errors if gross in self.errors.facts else SharedErrors.of(self.terrain, self.rows.clock, gross)
+        shared = ("above_rad", "profiles", "moments", "image_rise", "clear", "_closing", *OF_GROUND)
+        same = shared if errors is self.errors else [name for name in shared if name != "error_slopes_rad"]
+        return self._sharing(replace(self, gross=gross, errors=errors), same)
 
     def with_rows(self, rows: Evidence, is_rough: bool) -> SkylineModel:
         """The same neighbourhood with other rows and their clock."""
         errors = replace(self.errors, clock=rows.clock)
         return self._sharing(replace(self, rows=rows, errors=errors, is_rough=is_rough), OF_GROUND)
 
-    def _sharing(self, other: SkylineModel, names: tuple[str, ...]) -> SkylineModel:
+    def _sharing(self, other: SkylineModel, names: Iterable[str]) -> SkylineModel:
         """The `other` model with what this one has computed."""
         for name in names:
             other.__dict__[name] = getattr(self, name)
@@ -178,15 +181,13 @@ class SkylineModel:
         chain_log_likelihoods(self.profiles, self._levels(shifts), MOVES, shifts, cut, closing, found)
         return found
 
-    def compare_skylines(self, parameters: Array) -> tuple[float, float]:
-        """Log-likelihoods at parameters (2 + a,): by the map with obstacles, and by any smooth skyline near it."""
-        shift, _ = self.with_image_errors(self.shifts(parameters[None]))
-        return float(self.log_likelihood_of(shift)[0]), free_log_likelihood(self.profiles, shift[0])
+    def shift_of(self, parameters: Array) -> Array:
+        """(SECTORS,) by how much the skyline of the map at parameters (2 + a,) stands higher than at the reference."""
+        return np.asarray(self.with_image_errors(self.shifts(parameters[None]))[0][0])
 
     def states(self, parameters: Array) -> Array:
         """Probabilities (SECTORS, STATES) of the chain's states at parameters (2 + a,); the circle is cut by them."""
-        shifts, _ = self.with_image_errors(self.shifts(parameters[None]))
-        found = state_probabilities(self.profiles, shifts[0])
+        found = state_probabilities(self.profiles, self.shift_of(parameters))
         self._closing = closing_of(found)
         return found
 

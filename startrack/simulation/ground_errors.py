@@ -18,9 +18,9 @@ def draw_ground(terrain: Terrain, *, rng: np.random.Generator) -> Terrain:
     Errors of the shape are drawn from their stated or default sigmas, without the gross parts.
     """
     errors, shared_sigma_rad = terrain.shape_errors, terrain.common_sigma_rad
-    if any(error.name == "bias_rad" for error in errors):
+    if any(error.name == "bias_rad" and error.sigma > 0.0 for error in errors):
         shared_sigma_rad = 0.0  # it is drawn with the shape
-    ground = terrain.with_shape(_draw_shape(terrain, rng)) if errors else terrain
+    ground = terrain.with_shape(_draw_shape(terrain, rng)) if any(error.sigma > 0.0 for error in errors) else terrain
     if shared_sigma_rad > 0.0 or terrain.height_sigma_m > 0.0:
         return ErringGround(ground, rng, shared_sigma_rad)
     return ground
@@ -60,7 +60,10 @@ class ErringGround(ForwardingTerrain):
 
 def _draw_shape(terrain: Terrain, rng: np.random.Generator) -> Array:
     """Values (k,) for `with_shape`, normal within some sigmas: beyond them a crater may have no depth."""
-    drawn = rng.standard_normal(len(terrain.shape_errors))
+    sigma = np.array([error.sigma for error in terrain.shape_errors])
+    errs = np.flatnonzero(sigma)
+    drawn = rng.standard_normal(len(errs))
     while (far := np.abs(drawn) > MOST_SIGMAS).any():
         drawn[far] = rng.standard_normal(np.count_nonzero(far))
-    return np.array([error.sigma for error in terrain.shape_errors]) * drawn
+    sigma[errs] *= drawn
+    return sigma

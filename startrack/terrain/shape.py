@@ -15,7 +15,8 @@ class ShapeError:
     """One error that all azimuths share, normal about 0, in the unit that its name ends with.
 
     Its prior is a mixture: `sigma`, or with `gross_probability` the wider `gross_sigma`. Errors of a pair (the terms of
-    an ellipse, the axes of a tilt) have the same `fact`, and one gross part: both are gross, or neither.
+    an ellipse, the axes of a tilt) have the same `fact`, and one gross part: both are gross, or neither. Of a stated
+    error `gross_sigma` is what it would be if the statement were wrong.
     """
 
     name: str  # such as "depth_1" (relative), "bias_rad", "camera_height_m"
@@ -42,12 +43,14 @@ class Fact:
 
     def shape_errors(self, stated: float | None) -> list[ShapeError]:
         """Those of the errors that count; `stated` is the sigma in the unit of the errors, None where it is not."""
-        if stated is None:
-            gross = {"gross_probability": self.gross_probability, "gross_sigma": self.gross_sigma}
-            found = [ShapeError(name=name, fact=self.key, sigma=self.sigma, **gross) for name in self.errors]
-        else:
-            found = [ShapeError(name=name, fact=self.key, sigma=float(stated)) for name in self.errors]
-        return [error for error in found if error.sigma > 0.0 or error.gross_probability > 0.0]
+        sigma, probability = (self.sigma, self.gross_probability) if stated is None else (float(stated), 0.0)
+        return [
+            ShapeError(
+                name=name, fact=self.key, sigma=sigma, gross_probability=probability, gross_sigma=self.gross_sigma
+            )
+            for name in self.errors
+            if sigma > 0.0 or self.gross_sigma > 0.0
+        ]  # fmt: skip
 
 
 DEPTH = Fact(key="depth_sigma_m", errors=("depth_1",), sigma=1e-3, gross_probability=0.01, gross_sigma=0.01)
@@ -60,7 +63,7 @@ RIM_TILT = Fact(
     key="rim_tilt_sigma_deg", errors=("rim_tilt_east_rad", "rim_tilt_north_rad"), sigma=float(np.radians(0.002)),
     gross_probability=0.005, gross_sigma=float(np.radians(0.1)),
 )  # fmt: skip
-BIAS = Fact(key="horizon_sigma_deg", errors=("bias_rad",), sigma=0.0)
+BIAS = Fact(key="horizon_sigma_deg", errors=("bias_rad",), sigma=0.0, gross_sigma=float(np.radians(1.0)))
 STRETCH = Fact(
     key="stretch_sigma_1", errors=("stretch_1",), sigma=0.0, gross_probability=0.005, gross_sigma=5e-3
 )  # fmt: skip

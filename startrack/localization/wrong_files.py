@@ -1,0 +1,82 @@
+"""What contradicts an image's files: a stated fact that is grossly wrong, or any other smooth skyline, fits better."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from startrack.fix import Blocked
+from startrack.localization.free_skyline import free_log_likelihood
+from startrack.localization.gross_errors import GROSS_ROUNDS, sample_gross_error
+from startrack.localization.hypothesis import Hypothesis
+from startrack.localization.shared_errors import SharedErrors
+from startrack.types import Array, NotLocated
+
+WRONG_FACT_NATS = 3.0  # by which a gross error of a stated fact must explain the rows better: 1 of 100 clean skies
+MOST_BLOCKED = 0.5  # of the skyline that the rows show: where more is on no map, another place may explain them as well
+WIDE_SHAPE = 0.4  # relative range of a wrong map's steepness: a free skyline is compared with a map of any of them
+FEW_ROUNDS, SCREENED_NATS = (120,), 1.0  # points by which facts are screened; what they may err by
+
+
+def require_files(found: Sequence[Hypothesis], parameters: Array, clear: Array) -> None:
+    """Raises NotLocated (inconsistent_evidence) where something else explains the rows better than the files.
+
+    Args:
+        found: the hypotheses, the heaviest first.
+        parameters: (2 + a,) of the best position and errors.
+        clear: (SECTORS,) probability that the map's skyline shows.
+    """
+    wrong, model = Blocked(1.0 - clear), found[0].model
+    if np.average(wrong.whole, weights=model.moments.information) > MOST_BLOCKED:
+        raise NotLocated(
+            f"something on no map hides {360.0 * wrong.whole.mean():.0f} degrees of the skyline, or terrain, time or "
+            "camera file are wrong",
+            reason="inconsistent_evidence",
+        )
+    better = free_log_likelihood(model.profiles, model.shift_of(parameters)) - _log_map(found[0], parameters)
+    if better > 0.0:
+        where = f", most at azimuths {wrong.text}" if wrong else ""
+        raise NotLocated(
+            f"a skyline unlike the map's explains the image better, by {better:.0f} nats{where}: wrong terrain, time "
+            "or camera file, or something on no map?",
+            reason="inconsistent_evidence",
+        )
+    for fact, better in weigh_wrong_facts(found):
+        if better > WRONG_FACT_NATS:
+            raise NotLocated(
+                f"an error beyond the stated {fact} explains the image better, by {better:.0f} nats: is it right?",
+                reason="inconsistent_evidence",
+            )
+
+
+def _log_map(best: Hypothesis, parameters: Array) -> float:
+    """Log-likelihood of the best point; with a gross error, as of a wrong map that may have any shape in a range."""
+    model = best.model
+    value = float(model.log_likelihood_of(model.shift_of(parameters)[None])[0])
+    if not best.gross:
+        return value
+    own = np.array([one.fact == best.gross for one in model.errors.listed])
+    sigma, z = model.errors.sigma(best.gross)[own], parameters[2:] @ model.basis.shown[own].T
+    return value - float(np.sum(0.5 * np.square(z / sigma) + np.log(sigma * np.sqrt(2 * np.pi) / WIDE_SHAPE)))
+
+
+def weigh_wrong_facts(found: Sequence[Hypothesis]) -> Iterator[tuple[str, float]]:
+    """Stated facts, and by how many nats a gross error of each explains the rows better than the files.
+
+    Both are integrals over position and errors. Facts that are certainly right are left out.
+    """
+    best = found[0].model
+    near = [one for one in found if one.model.ground is best.ground]
+    plain = min(near, key=lambda one: one.gross != "")
+    by_files = float(np.logaddexp.reduce([one.found.log_evidence for one in near]))
+    for fact in SharedErrors.doubtable(best.terrain, best.rows.clock):
+        other = plain.model.with_gross(fact)
+        better = -np.inf
+        for rounds in FEW_ROUNDS, GROSS_ROUNDS:
+            if len(other.basis):
+                doubted = sample_gross_error(plain, other, best.reference_m[None], rounds)
+                better = float(np.logaddexp.reduce([one.found.log_evidence for one in doubted])) - by_files
+            if better < -SCREENED_NATS:
+                break
+        yield fact, better

@@ -176,7 +176,7 @@ def test_every_member_exists_and_describes_the_ground(name):
     assert 0 < terrain.finest_m < 1
     assert terrain.common_sigma_rad == 0
     assert isinstance(terrain.axisymmetric, bool)
-    assert all(error.sigma > 0.0 and error.is_stated for error in terrain.shape_errors)
+    assert all(error.sigma >= 0.0 and error.is_stated for error in terrain.shape_errors)
     assert terrain.shape_slopes_rad(np.zeros((4, 1, 2)), AZIMUTHS).shape == (len(terrain.shape_errors), 4, 12)
     assert isinstance(terrain.with_shape(np.zeros(len(terrain.shape_errors))), Terrain)
     assert terrain.masked_sectors() == []

@@ -12,6 +12,7 @@ import pytest
 from test_terrain_files import HILL, hill, terrain_file
 
 from startrack.files import data_dir
+from startrack.localization.shared_errors import SharedErrors
 from startrack.simulation import draw_ground
 from startrack.simulation.ground_errors import ErringGround
 from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain, terrain_from_dict
@@ -61,19 +62,21 @@ def test_a_silent_crater_has_defaults_and_gross_parts():
 def test_stated_errors_of_a_crater_are_trusted():
     stated = crater_file(depth_sigma_m=3.2, diameter_sigma_m=0, ellipse_sigma_1=0.001, rim_tilt_sigma_deg=0.01)
     errors = {error.name: error for error in stated.shape_errors}
-    assert tuple(errors) == ("depth_1", *NAMES[2:6])
-    assert all(error.is_stated and error.gross_sigma == 0.0 for error in errors.values())
-    assert errors["depth_1"].sigma == pytest.approx(0.002)
+    assert tuple(errors) == NAMES[:6]
+    assert all(error.is_stated for error in errors.values())
+    assert (errors["depth_1"].sigma, errors["diameter_1"].sigma) == (pytest.approx(0.002), 0.0)
     assert errors["rim_tilt_north_rad"].sigma == pytest.approx(np.radians(0.01))
     partly = crater_file(depth_sigma_m=0.0, rover={"camera_height_sigma_m": 0.1}).shape_errors
-    assert [error.name for error in partly] == list(NAMES[1:])
-    assert [error.is_stated for error in partly] == 5 * [False] + [True]
+    assert [error.name for error in partly] == list(NAMES)
+    assert [error.is_stated for error in partly] == [True] + 5 * [False] + [True]
 
 
 def test_exact_craters_have_no_errors():
-    assert crater_file(exact=True).shape_errors == crater_file(exact=True, depth_sigma_m=0).shape_errors == ()
-    assert len(crater_file(exact=False).shape_errors) == 6
-    assert Cylinder(diameter_m=9000.0, depth_m=1600.0).shape_errors == ()
+    exact = (crater_file(exact=True), crater_file(exact=True, depth_sigma_m=0), Cylinder(diameter_m=9e3, depth_m=1.6e3))
+    for one in exact:
+        assert all(error.sigma == 0.0 and error.is_stated for error in one.shape_errors)
+        assert len(SharedErrors.of(one, None)) == 0
+    assert len(SharedErrors.of(crater_file(exact=False), None)) == 6
     for key in ("depth_sigma_m", "diameter_sigma_m", "ellipse_sigma_1", "rim_tilt_sigma_deg"):
         with pytest.raises(BadInput, match=rf"exact is true, but {key} is not 0") as caught:
             crater_file(exact=True, **{key: 0.01})
@@ -94,7 +97,7 @@ def test_shipped_terrains_state_everything(path):
     terrain = load_terrain(path)
     assert terrain.unstated_errors == ()
     if terrain.facts()["kind"] == "cylinder":
-        assert terrain.shape_errors == ()
+        assert all(error.is_stated and error.sigma == 0.0 for error in terrain.shape_errors)
     else:
         sigmas = terrain.stretch_sigma_1, terrain.vertical_sigma_rad, terrain.camera_height_sigma_m
         assert None not in (*sigmas, terrain.horizon_sigma_common_rad)
@@ -195,9 +198,8 @@ def test_errors_of_a_map_by_file(tmp_path: Path):
     stated = {"height_sigma_m": 0.0, "horizon_sigma_deg": 0.0, "stretch_sigma_1": 0.0, "vertical_sigma_deg": 0.01}
     path = terrain_file(tmp_path, dem=stated, rover={"camera_height_sigma_m": 0.0})
     errors = load_terrain(path).shape_errors
-    assert [error.name for error in errors] == ["vertical_east_rad", "vertical_north_rad"]
-    assert all(error.is_stated and error.sigma == pytest.approx(np.radians(0.01)) for error in errors)
-    assert hill_terrain().shape_errors == ()
+    assert [error.sigma for error in errors] == pytest.approx([0.0, 0.0, *np.radians([0.01, 0.01])])
+    assert all(error.is_stated for error in errors)
 
 
 def test_slopes_of_a_map_are_the_differences_of_its_horizon():
@@ -229,7 +231,8 @@ def test_a_tilt_turns_the_skyline_exactly():
     slow = np.interp(
         AZIMUTHS, np.arctan2(turned[:, 0], turned[:, 1]) % (2 * np.pi), np.arcsin(turned[:, 2]), period=2 * np.pi
     )
-    assert terrain.with_shape(np.array([east, north])).horizon_rad(point, AZIMUTHS) == pytest.approx(slow, abs=2e-6)
+    ground = terrain.with_shape(np.array([0.0, 0.0, east, north]))
+    assert ground.horizon_rad(point, AZIMUTHS) == pytest.approx(slow, abs=2e-6)
 
 
 def test_bounds_of_a_deformed_map_hold():

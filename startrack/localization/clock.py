@@ -26,7 +26,8 @@ def clock_at(site: Site, time_utc: datetime, sigma_s: float, is_stated: bool = T
     """
     return Clock(
         turn_rad_s=sky_rotvec_rad(site, time_utc, TURN_S) / TURN_S, sigma_s=sigma_s,
-        gross_probability=0.0 if is_stated else GROSS_PROBABILITY, gross_sigma_s=WRONG_SIGMA_S if is_stated else GROSS_SIGMA_S,
+        gross_probability=0.0 if is_stated else GROSS_PROBABILITY,
+        gross_sigma_s=WRONG_SIGMA_S if is_stated else GROSS_SIGMA_S,
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from startrack.localization.other_times import is_linear, turned_model, turned_m
 from startrack.localization.skyline_model import SkylineModel
 from startrack.types import Array, Clock
 
-WIDER, LINEAR_PART = 2.0, 0.01  # variance of the first points, in that of the plain ones and in that of the linear model
+WIDER, LINEAR_PART = 2.0, 0.01  # variance of the first points, in that of the plain and of the linear solution
 GROSS_ROUNDS = (120, 160, 200)
 TIME_ROUNDS = 6  # in which the rows are turned to the time that a gross error of the clock shows
 

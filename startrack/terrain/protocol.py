@@ -57,7 +57,7 @@ class Terrain(ABC):
     finest_m: float = 0.05  # half side of the smallest box of positions that the ground distinguishes
     axisymmetric: bool = False  # whether a turn of the sky about the vertical only turns the position
     horizon_cost: float = 1.0  # of one horizon, beside one traced on a height map: the search has a budget of these
-    shape_errors: tuple[ShapeError, ...] = ()  # errors that all azimuths share: those that may differ from zero
+    shape_errors: tuple[ShapeError, ...] = ()  # errors that all azimuths share, those that are stated as zero too
     rim_radius_m: float | None = None  # of a circular rim about the origin, drawn on maps instead of the relief
     table_path: Path | None = None  # file of the table that `prepare` computes; None where it computes none
     unstated_errors: tuple[str, ...] = ()  # keys of errors that the terrain file leaves out: they count as zero

@@ -97,7 +97,7 @@ def test_the_search_leaves_the_boxes_that_matter(seed: int) -> None:
     weight = np.exp(log - log.max())
     weight /= weight.sum()
     for nats in (1.0, 3.0, 6.0):
-        method = ExactPosterior(prune_nats=nats, boxes_per_sigma=2.5)
+        method = ExactPosterior(prune_nats=nats)
         centres, half, log_weight, log_dropped, *_ = method.explore(evidence, PIT)
         kept = cKDTree(centres).query(places, p=np.inf)[0] <= half
         total = np.log(np.sum(np.exp(log_weight - log_weight.max())) * 4 * half**2) + log_weight.max()

@@ -13,14 +13,14 @@ from startrack.types import Array, NotLocated
 
 BOXES_AT_ONCE = 2000  # so that memory stays flat
 LOOK_UP_COST = 0.08  # of a bound, in horizons traced
-FINEST_M = 10.0  # half side of the smallest boxes: sampling finds what they hold
-MOST_BOXES = 1000  # that are left: sampling begins at no more
-LIKELY_NATS = 16.0  # boxes are not dropped by their average likelihood, which is no bound, within so much of the best
+FINEST_M = 12.0  # half side of boxes that may be the last ones: sampling finds what they hold
+MOST_BOXES = 4000  # of the last level
+RESOLVED_NATS = 16.0  # less than at a position within may the average be over larger boxes that are the last ones
 
 
 @dataclass
 class Search:
-    """One run: the best log-likelihood known, the work done, and how much probability was dropped."""
+    """One run: the work done, how much probability was dropped, and the best log-likelihood known."""
 
     likelihood: PositionLikelihood
     guess: Guess
@@ -28,18 +28,24 @@ class Search:
     budget_horizons: float
     log_dropped: float = -np.inf  # logarithm of a bound of the mass [m2]
     work: float = 0.0  # in horizons traced
+    best: float = -np.inf  # log-likelihood known
 
     def run(self) -> Explored:
         """The boxes that may matter ("proven"); where the budget ends first, those about the best positions ("beam").
 
         Raises NotLocated (outside_search_area).
         """
-        terrain, self.best = self.likelihood.terrain, self.guess.best
+        self.best, terrain = self.guess.best, self.likelihood.terrain
         centres, half = np.array([terrain.searched[:2]]), terrain.searched[2]
         while True:
             centres, upper = self._bound(centres, half)
-            if half <= FINEST_M:
-                return self._ranked(centres, upper, half)
+            is_last = 4 * len(centres) > MOST_BOXES
+            if half <= FINEST_M or is_last:
+                average = self.likelihood.average.score(terrain, centres, half)
+                if average.max() > self.guess.best - (self.prune_nats if half <= FINEST_M else RESOLVED_NATS):
+                    return self._ranked(centres, average, half)
+                if is_last:
+                    return self._about_best(centres, upper, half)
             quarters = split_boxes(centres, half, terrain)
             if not len(quarters):
                 raise NotLocated(
@@ -74,12 +80,9 @@ class Search:
         lost = log_sum(log_likelihood) + 2.0 * float(np.log(2 * half))
         self.log_dropped = float(np.logaddexp(self.log_dropped, lost))
 
-    def _ranked(self, centres: Array, upper: Array, half: float) -> Explored:
-        """The boxes with their average likelihood, and the guess with its own; unlikely boxes are dropped."""
-        average = self.likelihood.average.score(self.likelihood.terrain, centres, half)
-        keep = average > average.max() - max(self.prune_nats, LIKELY_NATS)
-        if np.count_nonzero(keep) > MOST_BOXES:
-            return self._about_best(centres, upper, half)
+    def _ranked(self, centres: Array, average: Array, half: float) -> Explored:
+        """The boxes with their average log-likelihood (n,), and the guess with its own; unlikely boxes are dropped."""
+        keep = average > average.max() - self.prune_nats
         self._drop(average[~keep], half)
         centres = np.vstack([self.guess.points_m, centres[keep]])
         log_likelihood = np.append(self.guess.log_likelihood, average[keep])

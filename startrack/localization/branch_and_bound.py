@@ -15,7 +15,6 @@ BOXES_AT_ONCE = 2000  # so that memory stays flat
 LOOK_UP_COST = 0.08  # of a bound, in horizons traced
 FINEST_M = 12.0  # half side of boxes that may be the last ones: sampling finds what they hold
 MOST_BOXES = 4000  # of the last level
-RESOLVED_NATS = 16.0  # less than at a position within may the average be over larger boxes that are the last ones
 
 
 @dataclass
@@ -42,7 +41,8 @@ class Search:
             is_last = 4 * len(centres) > MOST_BOXES
             if half <= FINEST_M or is_last:
                 average = self.likelihood.average.score(terrain, centres, half)
-                if average.max() > self.guess.best - (self.prune_nats if half <= FINEST_M else RESOLVED_NATS):
+                likely = np.mean(average > average.max() - self.prune_nats)
+                if average.max() > self.guess.best - self.prune_nats and (half <= FINEST_M or likely > 0.5):
                     return self._ranked(centres, average, half)
                 if is_last:
                     return self._about_best(centres, upper, half)

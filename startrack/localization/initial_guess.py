@@ -16,7 +16,7 @@ LAST_HALF_M = {False: 20.0, True: 12.0}  # half side of the last boxes, looked u
 # most positions right. Beside near crests they are too wide: of 9 positions on Shackleton's floor and walls they miss
 # 2, where traced ones rank the true box among the first 70 at every level.
 BEAMS = ((32, False), (80, True), (200, True))
-SCORED, CLOSER = 16, 2  # of the last boxes, row by row; of these, at each smaller size
+SCORED, CLOSER = 16, 4  # of the last boxes, row by row; of these, at each smaller size
 LAST_STEP_M = 1.0
 APART_M, MODE_NATS = 60.0, 12.0  # between the positions of a guess; less likely ones than the best by more are none
 FIRST_REACH_M, LAST_REACH_M, ACROSS = 16.0, 256.0, 5  # of boxes about a position, and how many along a side

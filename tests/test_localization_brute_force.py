@@ -80,7 +80,7 @@ def test_any_small_problem_agrees_with_the_grid(seed: int) -> None:
         spread = np.einsum("n,ni,nj->ij", weight, places - mean, places - mean)
         sigma = np.sqrt(np.trace(spread))
         # Cells narrower than a step are the grid's own error.
-        assert np.linalg.norm(fix.position_enu_m[:2] - mean) < 0.1 * sigma + 0.5 * STEP_M
+        assert np.linalg.norm(fix.position_enu_m[:2] - mean) < 0.12 * sigma + 0.5 * STEP_M
         assert fix.covariance_m2 == pytest.approx(spread, abs=0.15 * sigma**2 + STEP_M**2)
     assert weight[close < 1.1 * fix.radius95_m + STEP_M].sum() > 0.94
     assert weight[close < 0.85 * fix.radius95_m - STEP_M].sum() < 0.96
@@ -96,14 +96,13 @@ def test_the_search_leaves_the_boxes_that_matter(seed: int) -> None:
     log = log_likelihood(places, evidence)
     weight = np.exp(log - log.max())
     weight /= weight.sum()
-    for nats in (1.0, 3.0, 6.0):
-        method = ExactPosterior(prune_nats=nats, boxes_per_sigma=2.5)
+    for nats in (6.0, 12.0, 20.0):
+        method = ExactPosterior(prune_nats=nats)
         centres, half, log_weight, log_dropped, *_ = method.explore(evidence, PIT)
         kept = cKDTree(centres).query(places, p=np.inf)[0] <= half
         total = np.log(np.sum(np.exp(log_weight - log_weight.max())) * 4 * half**2) + log_weight.max()
         admitted = np.exp(log_dropped - np.logaddexp(log_dropped, total))
         assert weight[~kept].sum() <= admitted + 0.01
-        assert weight[~kept].sum() > 0 or nats > 1
 
 
 @pytest.mark.parametrize("n", [1, 5, 7])

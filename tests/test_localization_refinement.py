@@ -19,7 +19,7 @@ from startrack.localization.explored import Explored
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.sector_likelihood import row_contribution
 from startrack.localization.sky_profiles import SkyProfiles
-from startrack.terrain import ForwardingTerrain
+from startrack.localization.skyline_profiles import _cubic
 from startrack.types import Array, Evidence, ImageErrors, NotLocated
 
 PLACE = np.array([3000.0, -2000.0])
@@ -61,16 +61,15 @@ def slow_profile(rows: Evidence, which: Array, horizon_rad: Array) -> Array:
     sigmas = (rows.elevation_rad[which] - horizon_rad[:, None]) / rows.edge_sigma_rad[which]
     visible = ndtr(sigmas)
     value = visible * (rows.llr[which] + 0.5 * rows.extended_nats[which] * (1.0 - visible))
-    kernel = [row_contribution(rows.llr[k], rows.extended_nats[k], sigmas[0, j], 0) for j, k in enumerate(which)]
+    kernel = [row_contribution(rows.llr[k], rows.extended_nats[k], sigmas[0, j], 1.0) for j, k in enumerate(which)]
     assert value[0] == pytest.approx(kernel, abs=2e-6 * rows.extended_nats.max())
     return value.sum(axis=1)
 
 
 def profile_sums(profiles: SkyProfiles, horizon_rad: Array) -> Array:
-    """The profiles (n, m) at horizons (n, m), each in a sector of its own."""
-    sums = np.zeros_like(horizon_rad)
-    profiles.add_sums(horizon_rad, np.arange(horizon_rad.shape[1]), sums)
-    return sums
+    """The profiles (n, m) at horizons (n, m)."""
+    at = (horizon_rad - profiles.low_rad) / profiles.step_rad
+    return np.stack([[_cubic(knots, x) for x in own] for knots, own in zip(profiles.values, at.T, strict=True)], axis=1)
 
 
 @pytest.mark.parametrize("nats", [1.0, 50.0, 1500.0])
@@ -109,51 +108,6 @@ def test_profiles_are_averaged_over_an_error_of_the_map(nats: float, map_px: flo
         likely = expected > expected.max() - 3.0
         assert found[likely, k] == pytest.approx(expected[likely], abs=0.05)
         assert found[:, k] == pytest.approx(expected, abs=0.5)
-
-
-class RoughMap(ForwardingTerrain):
-    """A crater whose horizon has an error in each direction."""
-
-    hard_edges = False
-
-    def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        return np.full(np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad)), 0.4 / PX_PER_RAD)
-
-
-def test_scores_near_a_position_are_those_of_all_rows() -> None:
-    rng = np.random.default_rng(10)
-    rows = Evidence.concatenate(sky_rows(PLACE, rng, 60.0), star_rows(PLACE, rng, 300))
-    rows = rows.take(rng.permutation(len(rows)))
-    whole = PositionLikelihood.from_evidence(rows, CRATER)
-    points = PLACE + rng.uniform(-20, 20, (60, 2))
-    found = whole.near(PLACE, 30.0, across=5).scores(points)
-    expected = slow_scores(points, rows, CRATER, whole.sectors)
-    assert found == pytest.approx(expected, abs=0.2)
-    assert found - found[0] == pytest.approx(expected - expected[0], abs=0.03)
-    assert np.ptp(expected) > 50.0
-    lowered = whole.near(PLACE, 30.0, 0.01)
-    moved = lowered.scores(points, lowered.evidence.elevation_rad - 1.5e-3)
-    lower = replace(rows, elevation_rad=rows.elevation_rad - 1.5e-3)
-    assert moved == pytest.approx(slow_scores(points, lower, CRATER, whole.sectors), abs=0.2)
-
-
-def test_scores_on_a_map_with_errors_average_over_them() -> None:
-    """Sectors with one error each, without floors: the sum over the profiles, each averaged by itself."""
-    rng, terrain = np.random.default_rng(11), RoughMap(CRATER)
-    rows = sky_rows(PLACE, rng, 60.0, map_rad=0.4 / PX_PER_RAD)
-    whole = PositionLikelihood.from_evidence(rows, terrain, epsilon=0.0)
-    points = PLACE + rng.uniform(-25, 25, (5, 2))
-    found = whole.near(PLACE, 30.0).scores(points)
-    errors = np.linspace(-2.4, 2.4, 481)
-    weight = np.exp(-0.5 * np.square(errors / 0.4))
-    expected = np.full(len(points), -whole.sectors.ceiling.sum())
-    for k, azimuth in enumerate(MIDDLES_RAD):
-        horizon = CRATER.horizon_rad(points, azimuth)[:, None] + errors / PX_PER_RAD
-        log = slow_profile(rows, LEVELS * k + np.arange(LEVELS), horizon.ravel()).reshape(len(points), -1)
-        top = log.max(axis=1, keepdims=True)
-        expected += np.log(np.exp(log - top) @ weight / weight.sum()) + top[:, 0]
-    assert found == pytest.approx(expected, abs=0.3)
-    assert np.ptp(expected) > 10.0
 
 
 def posterior_on_a_grid(rows: Evidence, middle_m: Array, reach_m: float) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from startrack.localization.conclusion import Posterior, label_modes
-from startrack.localization.summary import require_inside, smallest_axis
+from startrack.localization.summary import require_inside
 from startrack.terrain import Cylinder, load_terrain
 from startrack.types import NotLocated
 
@@ -110,12 +110,3 @@ def test_most_of_the_posterior_outside_the_search_area_is_refused() -> None:
     points, log = blob((2990.0, 0.0), (20.0, 20.0), 1.0)
     inside = require_inside(points, np.exp(log), small)
     assert np.exp(log)[inside].sum() == pytest.approx(0.69, abs=0.05)
-
-
-def test_the_smallest_axis_is_a_mode_s_own():
-    places, sigmas = ((0.0, 0.0), (3000.0, 0.0), (0.0, 4000.0)), ((40.0, 9.0), (20.0, 12.0), (15.0, 30.0))
-    blobs = [blob(place, sigma, part) for place, sigma, part in zip(places, sigmas, (0.5, 0.3, 0.2), strict=True)]
-    centres, log = (np.concatenate(part) for part in zip(*blobs, strict=True))
-    assert smallest_axis(centres, WIDTH_M, log) == pytest.approx(9.0, rel=0.05)
-    one = slice(0, len(blobs[0][0]))
-    assert smallest_axis(centres[one], WIDTH_M, log[one]) == pytest.approx(9.0, rel=0.05)

@@ -7,8 +7,7 @@ from datetime import datetime
 
 import numpy as np
 
-from startrack.frames import Site, sky_rotvec_rad
-from startrack.localization.local_search import turn_rays
+from startrack.frames import R_from_rotvec, Site, sky_rotvec_rad, turn_azel
 from startrack.terrain import Terrain
 from startrack.types import Clock, Evidence
 
@@ -46,7 +45,9 @@ def turn_evidence(evidence: Evidence, later_s: float) -> Evidence:
     if clock is None or later_s == 0.0:
         return evidence
     moved = replace(clock, offset_s=clock.offset_s + later_s)
-    return replace(turn_rays(evidence, later_s * clock.turn_rad_s), clock=moved)
+    R = R_from_rotvec(later_s * clock.turn_rad_s)
+    azimuth, elevation = turn_azel(evidence.azimuth_rad, evidence.elevation_rad, R)
+    return replace(evidence, azimuth_rad=azimuth, elevation_rad=elevation, clock=moved)
 
 
 def clock_matters(clock: Clock | None, terrain: Terrain) -> bool:

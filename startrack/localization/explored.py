@@ -1,4 +1,4 @@
-"""What the search gives: the posterior on boxes, or the boxes that were left when its budget was spent."""
+"""Boxes of positions: how they are quartered, and what a search leaves of them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from startrack.terrain import Terrain
 from startrack.types import Array
+
+SMALL_BOX_M = 20.0  # half side up to which boxes are tested for allowed ground point by point
+QUARTERS = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])  # of half a side
 
 
 class Explored(NamedTuple):
@@ -18,20 +22,30 @@ class Explored(NamedTuple):
     log_dropped: float  # logarithm of a bound of the mass [m2] that was dropped
     search: str  # "proven" or "beam"
     dropped_probability: float | None = None  # of an earlier fix with these points; None: by `log_dropped`
-    horizon_bias_rad: float = 0.0  # how much higher than the terrain's the horizon was taken
-
-
-class BudgetSpent(Exception):
-    """The search has traced as many horizons as it may, and boxes may still matter."""
-
-    def __init__(self, centres_m: Array, upper: Array, half_m: float) -> None:
-        super().__init__(len(upper), half_m)
-        self.centres_m = centres_m[np.argsort(-upper, kind="stable")]  # (n, 2) of the boxes, the best bounded first
-        self.half_m = half_m
-        self.log_open = log_sum(upper) + float(np.log(4 * half_m**2))  # bound of their mass [m2]
 
 
 def log_sum(values: Array) -> float:
     """Logarithm of the sum of exponentials; -inf of none."""
-    top = float(np.max(values, initial=-np.inf))
-    return top + float(np.log(np.sum(np.exp(values - top)))) if np.isfinite(top) else -np.inf
+    return float(np.logaddexp.reduce(values, initial=-np.inf))
+
+
+def split_boxes(centres_m: Array, half_m: float, terrain: Terrain) -> Array:
+    """Centres (m, 2) of the quarters of boxes that touch the searched disk and may hold ground for a camera.
+
+    Small ones are tested on a grid that is closer than slopes change: at most single metres of a box's ground are
+    missed.
+    """
+    centres = (centres_m[:, None] + half_m * QUARTERS).reshape(-1, 2)
+    east_m, north_m, reach_m = terrain.searched
+    beyond = np.maximum(np.abs(centres - [east_m, north_m]) - 0.5 * half_m, 0.0)
+    centres = centres[np.hypot(beyond[:, 0], beyond[:, 1]) <= reach_m]
+    if half_m > 2 * SMALL_BOX_M:
+        return centres
+    points = centres[:, None] + square_grid(0.5 * half_m, 5)
+    return centres[np.any(terrain.allowed(points), axis=1)]
+
+
+def square_grid(half_m: float, across: int) -> Array:
+    """Points (across^2, 2) of an even grid about the origin, up to `half_m` from it along each axis."""
+    line = np.linspace(-half_m, half_m, across)
+    return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)

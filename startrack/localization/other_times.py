@@ -7,9 +7,8 @@ import numpy as np
 from startrack.localization.clock import turn_evidence
 from startrack.localization.clock_track import Track
 from startrack.localization.explored import Explored
-from startrack.localization.initial_guess import Guess
+from startrack.localization.initial_guess import Guess, local_posterior
 from startrack.localization.likelihood import PositionLikelihood
-from startrack.localization.local_posterior import local_posterior
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain

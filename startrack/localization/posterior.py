@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from startrack.compilation import announce_compilation
 from startrack.localization.branch_and_bound import Search
 from startrack.localization.conclusion import conclude
-from startrack.localization.explored import BudgetSpent, Explored, log_sum
-from startrack.localization.horizon_bias import explore_biased
-from startrack.localization.initial_guess import climb_to_best
+from startrack.localization.explored import Explored, log_sum
+from startrack.localization.horizon_bias import find_start
 from startrack.localization.joint_posterior import sample_posterior
 from startrack.localization.likelihood import SECTOR_RAD, PositionLikelihood
-from startrack.localization.local_posterior import local_posterior
 from startrack.localization.other_times import explore_times, is_wide
 from startrack.localization.position_prior import SearchedNear, name_prior, weigh_by_prior
 from startrack.prior import PositionPrior
 from startrack.terrain import Terrain, require_terrain
-from startrack.types import Array, Evidence, Fix, NotLocated
+from startrack.types import Evidence, Fix, NotLocated
 
 MIN_ROWS = 8
 MIN_ROW_NATS = 1e-3  # |llr| below which a row is left out
 SEARCH_EPSILON = 0.1  # of a sector in the search: an obstacle costs the true position 2.3 nats a sector, not 9
 SLACK_NATS = 44.0  # by which the published model may favour a position over the search: 29 degrees of obstacles
-OPEN_BOXES, MOST_OPEN_M = 200, 20.0  # handed on where the budget of the search is spent; the largest half side
 NATS = 16.0  # positions that are e^-16 as likely as the best are dropped
 
 
@@ -41,10 +38,6 @@ class ExactPosterior:
     """
 
     prune_nats: float = NATS + SLACK_NATS
-    negligible_nats: float = NATS + SLACK_NATS + 2.0  # boxes that hold at most e^-62 of the probability are dropped
-    finest_m: float = 4.0  # half side of the smallest boxes: sampling finds what they hold
-    boxes_per_sigma: float = 0.5  # of the posterior's smaller axis
-    most_boxes: int = 4_000
     budget_horizons: float = 250_000.0  # traced for the proof: some two seconds
 
     def __call__(self, evidence: Evidence, terrain: Terrain) -> Fix:
@@ -81,7 +74,8 @@ class ExactPosterior:
 
     def explore(self, evidence: Evidence, terrain: Terrain) -> Explored:
         """The boxes of the `terrain` that may matter by `evidence`, with the likeliest common error of the horizon."""
-        return explore_biased(self.explore_plain, self.likelihood(evidence, terrain))
+        likelihood, guess = find_start(self.likelihood(evidence, terrain))
+        return Search(likelihood, guess, self.prune_nats, self.budget_horizons).run()
 
     def _explore_near(self, evidence: Evidence, terrain: Terrain, near: PositionPrior) -> Explored:
         """As `explore`, in the neighbourhood of the prior.
@@ -89,36 +83,15 @@ class ExactPosterior:
         The searched disk is enlarged until the likeliest position is not at its edge: else nothing would show how far
         off the prior the evidence is. Raises NotLocated (inconsistent_evidence) where the two contradict each other.
         """
-        nearby, method = SearchedNear(terrain, near), replace(self, finest_m=min(self.finest_m, near.sigma_m))
-        found = method.explore(evidence, nearby)
+        nearby = SearchedNear(terrain, near)
+        found = self.explore(evidence, nearby)
         while nearby.is_at_edge(found):
             wider = nearby.enlarged()
             try:
-                found, nearby = method.explore(evidence, wider), wider
+                found, nearby = self.explore(evidence, wider), wider
             except NotLocated:  # the smaller disk has an answer
                 break
         return weigh_by_prior(found, near)
-
-    def explore_plain(self, likelihood: PositionLikelihood, starts_m: Array | None = None) -> Explored:
-        """The boxes that may matter by a likelihood; `starts_m` (n, 2): good positions, if known."""
-        search = Search.begin(self, likelihood, starts_m)
-        try:
-            return search.run()
-        except BudgetSpent as spent:
-            return self._explore_open(likelihood, search, spent)
-
-    @staticmethod
-    def _explore_open(likelihood: PositionLikelihood, search: Search, spent: BudgetSpent) -> Explored:
-        """The best boxes known where the budget is spent, and those still open that may matter most."""
-        guess = climb_to_best(likelihood, spent.centres_m, search.guess)
-        open_m = spent.centres_m[: OPEN_BOXES if spent.half_m <= MOST_OPEN_M else 0]
-        scores = likelihood.exact_scores(open_m) if len(open_m) else np.zeros(0)
-        handed = Explored(open_m, spent.half_m, scores, spent.log_open, "beam")
-        if not len(guess.points_m):
-            return handed
-        near = local_posterior(likelihood, guess, spent.log_open)
-        centres, scores = np.vstack([near.centres_m, open_m]), np.append(near.log_likelihood, handed.log_likelihood)
-        return near._replace(centres_m=centres, log_likelihood=scores)
 
     @staticmethod
     def likelihood(evidence: Evidence, terrain: Terrain) -> PositionLikelihood:

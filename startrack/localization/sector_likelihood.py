@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import erfc, exp, expm1, inf, log, log1p, sqrt
+from math import erfc, expm1, log1p, sqrt
 
 import numpy as np
 
@@ -13,10 +13,8 @@ from startrack.normal_cdf import normal_cdf
 from startrack.types import Array, Evidence, Ints
 
 SECTOR_STEP = 10.0  # between the keys of neighbouring sectors: more than any two elevations differ [rad]
-CERTAIN_SIGMAS = 6.0  # a ray farther than this from the horizon is visible or hidden for certain: to 1e-9
 EDGE_SIGMAS = 8.0  # beyond this the edge of a single row is not computed
 CEILING_STEP = 0.01  # of the edge's width: last step to the best level skyline
-NEGLIGIBLE_NATS = 14.0  # e^-14 beside 1 is left out: a millionth
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ class Sectors:
     @cached_property
     def order(self) -> Ints:
         """Order (n,) of the rows by sector, and from low to high within one."""
-        return elevation_order(self.evidence, self.sector)
+        return np.argsort(SECTOR_STEP * self.sector + self.evidence.elevation_rad)
 
     @cached_property
     def ceiling(self) -> Array:
@@ -66,11 +64,6 @@ class Sectors:
         least = np.minimum.reduceat(below, ends[:-1])
         return np.asarray(below[ends[1:]] - np.minimum(least, below[ends[1:]]))
 
-    @cached_property
-    def log_floor(self) -> float:
-        """log eps; -inf: no floor and no ceiling."""
-        return log(self.epsilon) if self.epsilon > 0.0 else -inf
-
     def score(self, sums: Array) -> Array:
         """Log-likelihood (n,) of positions from the sums of contributions (n, sectors)."""
         return np.asarray(np.sum(self.by_sector(sums), axis=-1))
@@ -82,11 +75,6 @@ class Sectors:
             return np.asarray(below)
         # Within a narrow sector a real skyline hardly beats the best level one; bounds must not claim that it does.
         return np.asarray(np.log((1.0 - self.epsilon) * np.exp(np.minimum(below, 0.0)) + self.epsilon))
-
-
-def elevation_order(evidence: Evidence, sector: Ints) -> Ints:
-    """Order (n,) of the rows by sector, and from low to high within one."""
-    return np.argsort(SECTOR_STEP * sector + evidence.elevation_rad)
 
 
 def row_limits(evidence: Evidence) -> tuple[Array, Array]:
@@ -101,51 +89,28 @@ def row_limits(evidence: Evidence) -> tuple[Array, Array]:
 
 
 @njit(cache=True, nogil=True)
-def row_contribution(llr, extended, sigmas_above, hard_above):  # type: ignore[no-untyped-def]
-    """Contribution of a row `sigmas_above` the horizon; with `hard_above` 1 or -1 it is wholly visible or hidden.
+def row_contribution(llr, extended, margin, sigma):  # type: ignore[no-untyped-def]
+    """Contribution of a row `margin` [rad] above the horizon, whose edge has the width sigma [rad]; 0: hard.
 
-    A point source contributes log(V e^l + 1 - V), extended light l V + c V (1 - V) / 2, V = Phi(sigmas_above). The
+    A point source contributes log(V e^l + 1 - V), extended light l V + c V (1 - V) / 2, V = Phi(margin / sigma). The
     mixture is computed from the less likely side, which keeps all digits.
     """
-    value = 0.0
-    if hard_above > 0 or (hard_above == 0 and sigmas_above > EDGE_SIGMAS):
-        value = llr
-    elif hard_above == 0 and sigmas_above > -EDGE_SIGMAS:
+    value = llr if margin > 0.0 else 0.0
+    if abs(margin) <= EDGE_SIGMAS * sigma and sigma > 0.0:
         if extended > 0.0:
-            visible = normal_cdf(sigmas_above)
+            visible = normal_cdf(margin / sigma)
             value = llr * visible + 0.5 * extended * visible * (1.0 - visible)
         else:
-            fraction = 0.5 * erfc((-sigmas_above if llr > 0.0 else sigmas_above) / sqrt(2.0))
+            fraction = 0.5 * erfc((-margin if llr > 0.0 else margin) / (sigma * sqrt(2.0)))
             value = min(llr, 0.0) + log1p(fraction * expm1(abs(llr)))
     return value
 
 
 @njit(cache=True, nogil=True)
-def row_range(llr, extended, low, high):  # type: ignore[no-untyped-def]
-    """Least and greatest contribution where the row stands between `low` and `high` sigmas above the horizon."""
-    a, b = row_contribution(llr, extended, low, 0), row_contribution(llr, extended, high, 0)
-    least, most = min(a, b), max(a, b)
-    if extended > 0.0 and abs(llr) < 0.5 * extended:
-        top = llr / extended + 0.5  # of the parabola in V
-        if 0.5 * erfc(-low / sqrt(2.0)) < top < 0.5 * erfc(-high / sqrt(2.0)):
-            most = (llr + 0.5 * extended) ** 2 / (2.0 * extended)
-    return least, most
-
-
-@njit(cache=True, nogil=True)
-def contributions(llr, extended, elevation, horizon, sigma):  # type: ignore[no-untyped-def]
-    """Contribution (n,) of rows at their elevation above the horizon (n,) [rad], with edges of width sigma (n,) [rad].
-
-    It rises with the margin for l > 0 and falls for l < 0 (point sources), so bounds of the horizon bound it.
-    """
-    value = np.empty(len(llr))
+def add_contributions(point, sector, llr, extended, margin, sigma, sums):  # type: ignore[no-untyped-def]
+    """Add to sums (n, sectors) the contributions of pairs (m,) of a point and a row."""
     for k in range(len(llr)):
-        margin = elevation[k] - horizon[k]
-        if sigma[k] > 0.0:
-            value[k] = row_contribution(llr[k], extended[k], margin / sigma[k], 0)
-        else:
-            value[k] = llr[k] if margin > 0.0 else 0.0
-    return value
+        sums[point[k], sector[k]] += row_contribution(llr[k], extended[k], margin[k], sigma[k])
 
 
 @njit(cache=True, nogil=True)
@@ -182,25 +147,5 @@ def _level_sum(elevation, llr, extended, sigma, first, last, horizon):  # type: 
     """Sum of contributions of the rows from first to last where the skyline is level at that elevation."""
     total = 0.0
     for k in range(first, last):
-        margin = elevation[k] - horizon
-        if sigma[k] > 0.0:
-            total += row_contribution(llr[k], extended[k], margin / sigma[k], 0)
-        elif margin > 0.0:
-            total += llr[k]
+        total += row_contribution(llr[k], extended[k], elevation[k] - horizon, sigma[k])
     return total
-
-
-@njit(cache=True, nogil=True)
-def log_mixture(below, log_keep, log_floor):  # type: ignore[no-untyped-def]
-    """log(exp(min(below, 0) + log_keep) + exp(log_floor)); log_floor = -inf means no floor and no ceiling."""
-    value = below
-    if log_floor > -np.inf:
-        value = min(below, 0.0) + log_keep
-        if value < log_floor - NEGLIGIBLE_NATS:
-            value = log_floor
-        elif value < log_floor + NEGLIGIBLE_NATS:
-            if value > log_floor:
-                value += log1p(exp(log_floor - value))
-            else:
-                value = log_floor + log1p(exp(value - log_floor))
-    return value

@@ -54,10 +54,6 @@ class SkyProfiles:
             values[moved] = _average_over_map(values[moved], map_sigma[moved] / step[moved])
         return cls(rows[first], low, step, values)
 
-    def add_sums(self, horizon_rad: Array, sector: Ints, sums: Array) -> None:
-        """Add to the sums (n, sectors) the profiles, in the sectors (m,), at horizons (n, m) [rad]."""
-        _add_sums(self.low_rad, self.step_rad, self.values, horizon_rad, sector, sums)
-
 
 def _average_over_map(values: Array, sigma_knots: Array) -> Array:
     """Logarithms (m, knots) of the means of exp(values) over normal shifts of the horizon by `sigma_knots` (m,).
@@ -109,21 +105,3 @@ def _fill_profiles(elevation, llr, extended, sigma, first, last, low, step, valu
                 visible = normal_cdf((elevation[k] - horizon) / sigma[k])
                 total += visible * (llr[k] + 0.5 * extended[k] * (1.0 - visible))
             values[m, j] = total
-
-
-@njit(cache=True, nogil=True)
-def _add_sums(low, step, values, horizon, sector, sums):
-    """Add to sums (n, sectors) the cubics through four knots about each horizon (n, m); constant beyond the ends."""
-    knots = values.shape[1]
-    for p in range(len(sums)):
-        for m in range(len(low)):
-            at = min(max((horizon[p, m] - low[m]) / step[m], 0.0), knots - 1.0)
-            j = min(max(int(at), 1), knots - 3)
-            u = at - j
-            a, b, c, d = values[m, j - 1], values[m, j], values[m, j + 1], values[m, j + 2]
-            # Lagrange's form; u is in -1..2 at the ends.
-            value = (
-                -a * u * (u - 1) * (u - 2) / 6 + b * (u + 1) * (u - 1) * (u - 2) / 2
-                - c * (u + 1) * u * (u - 2) / 2 + d * (u + 1) * u * (u - 1) / 6
-            )  # fmt: skip
-            sums[p, sector[m]] += value

@@ -1,4 +1,4 @@
-"""Sums over a posterior on boxes: moments and connected modes; and where its points may be."""
+"""Points of a posterior: where they may be, and how they hang together."""
 
 from __future__ import annotations
 
@@ -6,9 +6,6 @@ import numpy as np
 
 from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Ints, NotLocated
-
-AMBIGUOUS_MASS = 0.01
-NEGLIGIBLE_BOX = 1e-12
 
 
 def require_inside(points_m: Array, weight: Array, terrain: Terrain) -> Bools:
@@ -30,53 +27,6 @@ def camera_at(point_m: Array, terrain: Terrain) -> Array:
     """East, north and up (3,) [m] of the camera that stands at a point (2,) [m] of the `terrain`."""
     up_m = float(terrain.ground_m(point_m[None, :])[0]) + terrain.camera_height_m
     return np.array([point_m[0], point_m[1], up_m])
-
-
-def smallest_axis(centres_m: Array, width_m: float, log_weight: Array) -> float:
-    """Standard deviation [m] of the posterior along its shorter axis; where it has modes, of the narrowest that counts.
-
-    Of all modes together it would be as large as they are far apart.
-    """
-    weight = np.exp(log_weight - np.max(log_weight))
-    weight /= weight.sum()
-    centres_m, weight = centres_m[weight > NEGLIGIBLE_BOX], weight[weight > NEGLIGIBLE_BOX]
-    label = _modes(centres_m, weight, width_m, _moments(centres_m, weight, width_m)[1])
-    counts = np.flatnonzero(np.bincount(label, weights=weight) > AMBIGUOUS_MASS)
-    spreads = [_mean_and_spread(centres_m[label == i], weight[label == i])[1] for i in counts]
-    return float(np.sqrt(max(min(np.linalg.eigvalsh(spread)[0] for spread in spreads), 0.0)))
-
-
-def _moments(centres_m: Array, weight: Array, width_m: float) -> tuple[Array, Array]:
-    """Mean and covariance; a box's own extent (width^2 / 12) is part of the covariance."""
-    mean, spread = _mean_and_spread(centres_m, weight)
-    return mean, spread + width_m**2 / 12 * np.eye(2)
-
-
-def _mean_and_spread(centres_m: Array, weight: Array) -> tuple[Array, Array]:
-    """Mean and covariance of the boxes' centres."""
-    weight = weight / weight.sum()
-    mean = weight @ centres_m
-    centred = centres_m - mean
-    return mean, (centred * weight[:, None]).T @ centred
-
-
-def _modes(centres_m: Array, weight: Array, width_m: float, covariance: Array) -> Ints:
-    """Mode number (n,) of each box: boxes linked by gaps no wider than the posterior's local spread."""
-    label = np.zeros(len(weight), dtype=np.int64)
-    if _in_one_piece(centres_m, covariance, width_m):
-        return label
-    for sigmas in (1.0, 1.0, 3.0):  # far modes widen the first spread; the heaviest one's own decides in the end
-        heaviest = label == np.argmax(np.bincount(label, weights=weight))
-        _, covariance = _moments(centres_m[heaviest], weight[heaviest], width_m)
-        gap = max(1.5 * width_m, sigmas * float(np.sqrt(np.linalg.eigvalsh(covariance)[1])))
-        label = link_points(centres_m, gap)
-    return label
-
-
-def _in_one_piece(centres_m: Array, covariance: Array, width_m: float) -> bool:
-    """Whether the boxes leave no gap along the posterior's longer axis, where two places would lie apart."""
-    along = np.sort(centres_m @ np.linalg.eigh(covariance)[1][:, 1])
-    return bool(np.diff(along).max(initial=0.0) < 1.5 * width_m)
 
 
 def link_points(points_m: Array, gap_m: float) -> Ints:

@@ -39,13 +39,14 @@ def distance_bounds(
     if not np.any(azimuth_half_rad):
         nearest = distance_to_circle(centres_m, azimuths_rad, least_radius_m - reach)
         return nearest, distance_to_circle(centres_m, azimuths_rad, greatest_radius_m + reach)
-    x, y = centres_m[..., 0], centres_m[..., 1]
-    turn = np.abs((azimuths_rad - np.arctan2(x, y) + np.pi) % (2 * np.pi) - np.pi)
-    off_centre = np.hypot(x, y)
-    near_side = np.cos(np.maximum(turn - azimuth_half_rad, 0.0))
-    far_side = np.cos(np.minimum(turn + azimuth_half_rad, np.pi))
-    nearest = chord(off_centre * near_side, off_centre, least_radius_m - reach)
-    return nearest, chord(off_centre * far_side, off_centre, greatest_radius_m + reach)
+    x, y, sine, cosine = centres_m[..., 0], centres_m[..., 1], np.sin(azimuths_rad), np.cos(azimuths_rad)
+    along, across = x * sine + y * cosine, np.abs(x * cosine - y * sine)
+    off_centre, turn, turned = np.hypot(x, y), np.cos(azimuth_half_rad), np.sin(azimuth_half_rad)
+    side = off_centre * turn
+    most_along = np.where(along >= side, off_centre, along * turn + across * turned)
+    least_along = np.where(along <= -side, -off_centre, along * turn - across * turned)
+    nearest = chord(most_along, off_centre, least_radius_m - reach)
+    return nearest, chord(least_along, off_centre, greatest_radius_m + reach)
 
 
 def horizons_of_circle(points_m: Array, azimuths_rad: Array, radius_m: float, wall_m: float) -> Array:

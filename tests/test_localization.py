@@ -238,6 +238,7 @@ def test_positions_beside_the_wall_and_deep_evidence_are_located() -> None:
         at = (TERRAIN.radius_m - 50 * rng.random()) * np.array([np.sin(turn), np.cos(turn)])
         fix = ExactPosterior()(measure_stars(rng, at, TERRAIN, n), TERRAIN)
         assert np.linalg.norm(fix.position_enu_m[:2] - at) < fix.radius999_m
+        assert fix.search == "proven"
 
 
 def test_errors_are_as_large_as_stated() -> None:

@@ -90,5 +90,6 @@ def local_posterior(likelihood: PositionLikelihood, guess: Guess, log_open: floa
         if at_rim < -RIM_NATS or reach_m >= LAST_REACH_M:
             break
         reach_m *= 2
+    centres, score = np.vstack([guess.points_m, centres]), np.append(guess.log_likelihood, score)
     likely = np.isfinite(score)
     return Explored(centres[likely], reach_m / (ACROSS - 1), score[likely], log_open, "beam")

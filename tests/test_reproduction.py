@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import sys
 from contextlib import contextmanager
 from dataclasses import replace
@@ -16,6 +17,7 @@ from startrack import runner
 from startrack.cli import reproduce as cli
 from startrack.cli.main import main
 from startrack.cli.progress import Progress, progress
+from startrack.files import hold_lock
 from startrack.localization import ExactPosterior, Hull, PseudoGradient
 from startrack.reproduction import (
     ARTEFACTS,
@@ -47,8 +49,8 @@ from startrack.reproduction.simulator import (
 )
 
 SMALL = Size(
-    "small", skies=10, per_sky=300, ours_per_sky=10, bound_per_sky=10, deep_per_sky=3, one_sky=500, ours_one_sky=150,
-    sweep_skies=1, sweep_per_sky=4, traverses=10,
+    "small", skies=10, per_sky=300, ours_per_sky=5, bound_per_sky=5, deep_per_sky=2, one_sky=500, ours_one_sky=60,
+    sweep_skies=1, sweep_per_sky=2, traverses=10,
 )  # fmt: skip
 TINY = replace(SMALL, skies=3, per_sky=8, ours_per_sky=4, bound_per_sky=4, deep_per_sky=1, one_sky=8, ours_one_sky=4)
 
@@ -60,9 +62,10 @@ def hide_progress(what, total):
 
 @pytest.fixture(scope="module")
 def small_run(tmp_path_factory):
-    """Every table and figure of a small run, with its files."""
+    """Every table and figure of a small run, with its files. Workers of pytest-xdist share what is computed."""
     out = tmp_path_factory.mktemp("reproduced")
-    with ChunkStore(out, jobs=1, progress=hide_progress) as store:
+    shared = tmp_path_factory.getbasetemp().parent if "PYTEST_XDIST_WORKER" in os.environ else out
+    with hold_lock(shared / "reproduced.lock"), ChunkStore(shared, jobs=1, progress=hide_progress) as store:
         artefacts = {name: make(Context(SMALL, 0, store)) for name, make in ARTEFACTS.items()}
     return {name: (artefact, write_artefact(artefact, out, plots=True)) for name, artefact in artefacts.items()}
 

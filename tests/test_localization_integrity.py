@@ -43,6 +43,7 @@ def random_places(seed: int, count: int) -> list[tuple[float, float]]:
     return [(float(r * np.cos(a)), float(r * np.sin(a))) for r, a in zip(radius, angle, strict=True)]
 
 
+@pytest.mark.slow
 def test_true_positions_are_within_the_level_and_not_refused() -> None:
     ratios = []
     for number, place in enumerate(random_places(1, 40)):

@@ -49,10 +49,10 @@ from startrack.reproduction.simulator import (
 )
 
 SMALL = Size(
-    "small", skies=10, per_sky=300, ours_per_sky=5, bound_per_sky=5, deep_per_sky=2, one_sky=500, ours_one_sky=60,
+    "small", skies=10, per_sky=300, ours_per_sky=5, bound_per_sky=5, deep_per_sky=2, one_sky=500, ours_one_sky=120,
     sweep_skies=1, sweep_per_sky=2, traverses=10,
 )  # fmt: skip
-TINY = replace(SMALL, skies=3, per_sky=8, ours_per_sky=4, bound_per_sky=4, deep_per_sky=1, one_sky=8, ours_one_sky=4)
+TINY = replace(SMALL, skies=3, per_sky=8, ours_per_sky=2, bound_per_sky=2, deep_per_sky=1, one_sky=8, ours_one_sky=4)
 
 
 @contextmanager

@@ -107,7 +107,6 @@ class Predictor:
         `status` (OK, AMBIGUOUS, REFUSED), and of draws with one position `radius95_m`, `covariance_m2` (n, 2, 2) and
         `offset_m` (n, 2), found minus true position; NaN of the others.
         """
-        self.terrain.prepare()  # so that the first draw of a process traces horizons as the later ones do
         n = len(self.conditions.times_utc)
         found = {
             "status": np.full(n, REFUSED, dtype=np.int8), "radius95_m": np.full(n, np.nan),

@@ -130,7 +130,7 @@ def test_stated_times_and_errors_are_true_of_many_positions(ground: HeightMap) -
     assert 0.1 < np.mean(times) < 2.7  # of 8
 
 
-@pytest.mark.parametrize("hours", [0.0, 2.0])
+@pytest.mark.parametrize("hours", [pytest.param(0.0, marks=pytest.mark.slow), 2.0])
 def test_a_time_beyond_its_stated_error_is_refused(ground: HeightMap, hours: float) -> None:
     place = np.array([50.0, -90.0])
     rows = simulate_rays(ground, place, np.random.default_rng(9), 12_000, 0.0)

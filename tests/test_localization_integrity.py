@@ -97,6 +97,7 @@ def test_a_position_beside_ground_that_is_not_allowed() -> None:
     assert error_m(limited, place) <= limited.integrity.protection_level_m
 
 
+@pytest.mark.slow
 def test_errors_with_an_obstacle_are_refused_or_within_the_level() -> None:
     """Rows over 40 degrees, hidden up to 3 degrees above the skyline: most fixes are right, and none is beyond."""
     rng, right = np.random.default_rng(3), 0

@@ -146,6 +146,7 @@ def test_the_localizers_give_what_the_table_is_made_of():
         np.testing.assert_allclose(refined.position_enu_m[:2], chunk["refined_m"][k], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_table_3_1_is_within_the_bars(small_run):
     values = small_run["table3.1"][0].values
     assert 30 <= values["reproduced"]["descent"]["mean_m"] <= 38  # thesis 34.2
@@ -168,6 +169,7 @@ def test_ours_is_near_the_middle_of_the_exact_cell():
     assert np.median(off) < 1.0
 
 
+@pytest.mark.slow
 def test_skyline_is_better_near_the_centre_and_stars_near_the_wall(small_run):
     artefact = small_run["fig3.10"][0]
     columns = {column.name: [float(v) for v in column.values] for column in artefact.columns}
@@ -205,6 +207,7 @@ def test_distances_between_changes_are_the_thesis_s():
 # Files
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", cli.NAMES)
 def test_each_table_and_figure_is_written(small_run, name):
     artefact, files = small_run[name]
@@ -223,6 +226,7 @@ def test_each_table_and_figure_is_written(small_run, name):
         assert "thesis" in text and artefact.values["thesis"]
 
 
+@pytest.mark.slow
 def test_tables_are_read_by_astropy(small_run):
     from astropy import units
     from astropy.table import QTable

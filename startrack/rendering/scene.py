@@ -75,7 +75,10 @@ class Scene(Value):
         return self.R_cam_enu @ self.R_enu_icrs
 
     def horizon_rad(self, azimuths_rad: Array) -> Array:
-        """Horizon elevation (n,) [rad] of the terrain, which there must be: the same bits for every state of caches."""
+        """Horizon elevation (n,) [rad] at `azimuths_rad` (n,): the same bits whether or not a table is prepared.
+
+        Raises ValueError for a scene without terrain.
+        """
         if self.terrain is None:
             raise ValueError("a scene without terrain has no horizon")
         return np.asarray(self.terrain.without_table().horizon_rad(self.position_enu_m[:2], azimuths_rad))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -14,20 +13,6 @@ import numpy as np
 import pytest
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-START_S = time.monotonic()
-SLOW_UNTIL_S = 400.0  # since the start: installation takes a minute, the longest slow test 100 s, together 10 minutes
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Slow tests come last."""
-    items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
-
-
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Slow tests begin while there is time for them; `pytest -m slow` runs all of them."""
-    late = time.monotonic() - START_S > SLOW_UNTIL_S
-    if late and item.get_closest_marker("slow") is not None and "slow" not in item.config.option.markexpr:
-        pytest.skip("a slow test, and no time was left for it on this machine: pytest -n auto -m slow runs it")
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,8 @@ from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD, ROW_NATS,
 from startrack.terrain import ForwardingTerrain, Terrain
 from startrack.types import Array, Evidence, Fix, NotLocated
 
+PART = 300  # positions at a time: their matrices fit the processor's cache
+
 
 def slow_contributions(evidence: Evidence, margin_rad: Array, sigma_rad: Array) -> Array:
     """Contributions (..., n) of rows at these margins above the horizon."""
@@ -45,23 +47,31 @@ def locate_or_refuse(evidence: Evidence, terrain: Terrain) -> tuple[Fix | None, 
         return None, refusal.reason
 
 
-def _mean_likelihood(margin_rad: Array, llr: Array, low_rad: Array | float, high_rad: float) -> Array:
+def _mean_likelihoods(margin_rad: Array, llr: Array, ranges_rad: list[tuple[Array | float, float]]) -> list[Array]:
     """Means (p,) over heights of the skyline from low (p,) to high of exp F, F the sum of llr (n,) of rows above it."""
     order = np.argsort(margin_rad, axis=1)
     at = np.take_along_axis(margin_rad, order, axis=1)
     above = np.cumsum(llr[order][:, ::-1], axis=1)[:, ::-1]
     zero, far = np.zeros((len(at), 1)), np.full((len(at), 1), np.inf)
-    log, edge = np.hstack([above, zero]), np.hstack([-far, at, far])
-    low = np.reshape(np.broadcast_to(low_rad, len(at)), (-1, 1))
-    overlap = np.minimum(edge[:, 1:], high_rad) - np.maximum(edge[:, :-1], low)
-    return np.asarray((np.exp(log) * np.maximum(overlap, 0.0)).sum(axis=1) / (high_rad - low[:, 0]))
+    likelihood, edge, means = np.exp(np.hstack([above, zero])), np.hstack([-far, at, far]), []
+    for low_rad, high_rad in ranges_rad:
+        low = np.reshape(np.broadcast_to(low_rad, len(at)), (-1, 1))
+        overlap = np.minimum(edge[:, 1:], high_rad) - np.maximum(edge[:, :-1], low)
+        means.append((likelihood * np.maximum(overlap, 0.0)).sum(axis=1) / (high_rad - low[:, 0]))
+    return means
 
 
 def slow_chain(emissions: Array) -> Array:
     """Logarithms (p,) of the traces of the products of transitions and emissions (p, SECTORS, STATES)."""
-    product, log = np.broadcast_to(np.eye(STATES), (len(emissions), STATES, STATES)), np.zeros(len(emissions))
+    parts = np.array_split(emissions, max(len(emissions) // PART, 1))
+    return np.concatenate([_chain_of_part(part) for part in parts])
+
+
+def _chain_of_part(emissions: Array) -> Array:
+    product, log, T = np.tile(np.eye(STATES), (len(emissions), 1, 1)), np.zeros(len(emissions)), transitions()
     for e in np.moveaxis(emissions, 1, 0):
-        product = product @ transitions() * e[:, None]
+        # One product of two matrices, instead of one small product a position.
+        product = (product.reshape(-1, STATES) @ T).reshape(product.shape) * e[:, None]
         scale = product.max(axis=(1, 2))
         product, log = product / scale[:, None, None], log + np.log(scale)
     return np.asarray(log + np.log(np.trace(product, axis1=1, axis2=2)))
@@ -79,10 +89,9 @@ def slow_chain_scores(points_m: Array, evidence: Evidence, terrain: Terrain, ref
         own = np.flatnonzero((sector_of(azimuth) == s) & (about > LOW_RAD) & (about < HIGH_RAD))
         llr = np.clip(evidence.llr[own], -ROW_NATS, ROW_NATS)
         margin = evidence.elevation_rad[own] - terrain.horizon_rad(points_m[:, None], azimuth[own])
-        anywhere = _mean_likelihood(about[own][None], llr, LOW_RAD, HIGH_RAD)
+        (anywhere,) = _mean_likelihoods(about[own][None], llr, [(LOW_RAD, HIGH_RAD)])
         e[:, s, 0] = np.exp((llr * (margin > 0)).sum(axis=1))
-        for j, (low, high) in enumerate(pairwise(LEVELS_RAD)):
-            e[:, s, j + 1] = _mean_likelihood(margin, llr, low, high)
+        e[:, s, 1 : len(LEVELS_RAD)] = np.stack(_mean_likelihoods(margin, llr, list(pairwise(LEVELS_RAD))), axis=1)
         e[:, s] = (1 - WRONG_SECTOR) * e[:, s] + WRONG_SECTOR * anywhere
     return slow_chain(e)
 

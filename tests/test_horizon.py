@@ -104,6 +104,7 @@ def test_its_sigmas_are_honest(painted):
     assert np.mean(ratio < 4) > 0.98
 
 
+@pytest.mark.slow
 def test_nights_are_combined(two_frames, catalog, painted):
     found = measure_skyline(two_frames, catalog, SITE, camera=CAMERA)
     assert [frame.name for frame in found.frames] == ["frame-1", "frame-2"]
@@ -120,6 +121,7 @@ def test_an_overcast_night_is_left_out_and_alone_refused(overcast, two_frames, c
         measure_frames((), left_out, SITE)
 
 
+@pytest.mark.slow
 def test_without_a_camera_file_the_lens_is_found(two_frames, catalog, painted):
     found = measure_skyline(two_frames[:1], catalog, SITE, fov_rad=np.radians(180)).skyline
     both = found.known & painted.known

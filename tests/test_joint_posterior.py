@@ -137,7 +137,7 @@ def test_profiles_are_the_sums_of_their_rows(light: str) -> None:
     if light == "stars":
         rows, above = rows.take(np.arange(3000)), above[:3000]
     found = profiles_of(rows, above, np.zeros(SECTORS))
-    for sector in range(0, SECTORS, 24):
+    for sector in range(0, SECTORS, 48):
         at = np.array([log_at(found, sector, height) for height in HEIGHTS_RAD])
         plain = direct_log(rows, above, sector, HEIGHTS_RAD)
         near = plain > plain.max() - 20.0
@@ -215,6 +215,7 @@ def test_evidence_and_moments_are_those_of_a_grid(seed: int) -> None:
     assert covariance == pytest.approx(expected_covariance, abs=0.25 * size**2)
 
 
+@pytest.mark.slow
 def test_circles_vary_little_with_the_points_that_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """The Monte Carlo error of the 99.9 % radius is at most 5 %, in the mean of six skies with ten draws each."""
     sequence, errors = distributions.normal_sequence, []

@@ -241,6 +241,7 @@ def test_positions_beside_the_wall_and_deep_evidence_are_located() -> None:
         assert fix.search == "proven"
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_stated() -> None:
     """150 noisy skies: mean NEES 2, and the 95 % circle holds 95 %. Bounds are 3.5 sigma of the count."""
     nees, within = [], []

@@ -43,6 +43,7 @@ def random_places(seed: int, count: int) -> list[tuple[float, float]]:
     return [(float(r * np.cos(a)), float(r * np.sin(a))) for r, a in zip(radius, angle, strict=True)]
 
 
+@pytest.mark.slow
 def test_true_positions_are_within_the_level_and_not_refused() -> None:
     ratios = []
     for number, place in enumerate(random_places(1, 40)):
@@ -96,6 +97,7 @@ def test_a_position_beside_ground_that_is_not_allowed() -> None:
     assert error_m(limited, place) <= limited.integrity.protection_level_m
 
 
+@pytest.mark.slow
 def test_errors_with_an_obstacle_are_refused_or_within_the_level() -> None:
     """Rows over 40 degrees, hidden up to 3 degrees above the skyline: most fixes are right, and none is beyond."""
     rng, right = np.random.default_rng(3), 0

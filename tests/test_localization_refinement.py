@@ -134,7 +134,7 @@ def expected_covariance(nats: float) -> Array:
     return np.linalg.inv(slopes.T @ slopes * nats * 0.28 / EDGE_PX / HEIGHT_PX)
 
 
-@pytest.mark.parametrize("nats", [60.0, 1500.0])
+@pytest.mark.parametrize("nats", [60.0, pytest.param(1500.0, marks=pytest.mark.slow)])
 def test_the_posterior_by_stars_and_sky_light_is_that_of_a_plain_sum(nats: float) -> None:
     rng = np.random.default_rng([12, int(nats)])
     true = PLACE + np.array([1.0, -2.0])
@@ -175,6 +175,7 @@ def test_errors_of_the_image_widen_the_posterior_as_in_least_squares() -> None:
         assert off @ np.linalg.solve(fix.covariance_m2, off) < 14.0
 
 
+@pytest.mark.slow
 def test_positions_agree_with_their_covariance_under_errors_of_the_image() -> None:
     """Skylines raised by errors drawn from their prior: mean NEES 2 within 3.5 standard deviations."""
     rng, nees = np.random.default_rng(3), []

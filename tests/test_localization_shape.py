@@ -96,11 +96,12 @@ def test_an_uncertain_shape_and_a_horizon_bias_are_estimated_together() -> None:
     assert np.linalg.norm(fix.position_enu_m[:2] - PLACES[0]) < fix.radius999_m < 200
 
 
+@pytest.mark.parametrize("seeds", [range(1), pytest.param(range(1, 6), marks=pytest.mark.slow)], ids=["one", "five"])
 @pytest.mark.parametrize("coverage_deg", [30.0, 60.0])
-def test_errors_of_the_horizon_in_a_part_of_the_view_are_refused(coverage_deg: float) -> None:
+def test_errors_of_the_horizon_in_a_part_of_the_view_are_refused(coverage_deg: float, seeds: range) -> None:
     """Directions without stars do not count as explained."""
     refused = 0
-    for seed in range(6):
+    for seed in seeds:
         rng = np.random.default_rng(seed)
         at = np.array([2500.0, -1800.0])
         azimuth, elevation = rng.uniform(0, np.radians(coverage_deg), 6000), np.arcsin(rng.random(6000))
@@ -114,4 +115,4 @@ def test_errors_of_the_horizon_in_a_part_of_the_view_are_refused(coverage_deg: f
             ExactPosterior()(evidence, TRUE)
         except NotLocated:
             refused += 1
-    assert refused == 6
+    assert refused == len(seeds)

@@ -2,8 +2,10 @@
 
 import importlib.util
 import json
+import os
 import re
 import subprocess
+import sys
 import tomllib
 
 import pytest
@@ -69,6 +71,38 @@ def test_ci_runs_the_command_of_the_page():
     assert found.splitlines() == [line]
     assert line.startswith("python3 -m venv .venv && .venv/bin/pip install")
     assert ".venv/bin/pytest" in line
+
+
+@pytest.mark.parametrize(("quick", "slow"), [(0, 0), (1, 0), (0, 1), (2, 3)], ids=lambda code: f"exit{code}")
+def test_ci_runs_the_slow_tests_after_the_command(tmp_path, quick, slow):
+    """In a clone whose tests are a stub: both runs happen, the second's output is the last, and a failure stays."""
+    stub = f'#!/bin/sh\necho "pytest $*"\ncase "$*" in *slow*) exit {slow};; esac\nexit {quick}\n'
+    for name, text in (
+        (".ci/run", (ROOT / ".ci/run").read_text(encoding="utf-8")),
+        ("README.md", "<!-- test -->\n```sh\npython3 --version && .venv/bin/pytest -n auto\n```\n"),
+        (".venv/bin/pytest", stub),
+        ("bin/chromium", "#!/bin/sh\n"),
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        (tmp_path / name).chmod(0o755)
+    path = f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}"
+    ran = subprocess.run([tmp_path / ".ci/run"], env={**os.environ, "PATH": path}, capture_output=True, text=True)
+    printed = [line for line in ran.stdout.splitlines() if line.startswith("pytest")]
+    assert printed == ["pytest -n auto", "pytest -n auto -m slow"]
+    assert ran.stdout.endswith("pytest -n auto -m slow\n")
+    assert (ran.returncode == 0) == (quick == slow == 0)
+
+
+@pytest.mark.parametrize("mark", [None, "slow"])
+def test_only_the_mark_selects_slow_tests(mark):
+    """Of a file of slow tests, pytest alone collects none, and `-m slow` all of them."""
+    flags = ["-q", "--collect-only", *(["-m", mark] if mark else [])]
+    ran = subprocess.run(
+        [sys.executable, "-m", "pytest", *flags, "tests/test_wheel.py"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert ran.returncode == (0 if mark else 5), ran.stdout + ran.stderr  # 5: pytest collected no test
+    assert ("deselected" in ran.stdout) == (mark is None)
 
 
 def test_commands_of_the_table_are_the_commands():

@@ -4,13 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from render_helpers import CRATER, FISHEYE, SENSOR, SITE, make_scene
+from render_helpers import CRATER, FISHEYE, SENSOR, SITE, make_scene, stars_at_azel
 
 from startrack.camera import KannalaBrandt
 from startrack.camera.decentring import Decentring
 from startrack.frames import azel_from_rays
-from startrack.rendering import light_e
+from startrack.rendering import light_e, render
 from startrack.rendering.sky import coverage, sky_e_per_s
+from startrack.terrain import load_terrain
 
 PLACE = np.array([5000.0, 3000.0, 1.5])
 
@@ -117,6 +118,9 @@ class Ragged:
         a = np.asarray(azimuths_rad)
         return 0.3 + 0.03 * np.sin(7 * a) + 0.06 * np.abs(((a * 60 / np.pi) % 2) - 1)
 
+    def without_table(self):
+        return self
+
 
 def test_a_ragged_skyline_against_brute_force():
     scene = make_scene(terrain=Ragged(), heading_pitch_roll_deg=(10, 6, 3), sky_v_mag_arcsec2=20.0)
@@ -154,3 +158,19 @@ def test_the_wall_reflects_and_the_frame_is_dark_off_the_image_circle():
     assert bilinear(sky, np.array([[255.5 + 160 * np.radians(85), 255.5]]))[0] / sky[255, 255 + 233] == pytest.approx(
         0.5, abs=0.02
     )
+
+
+def test_a_picture_on_a_height_map_does_not_depend_on_its_table(own_cache):
+    """A table of horizons makes other last digits of a traced horizon: the picture must not show them."""
+    terrain = replace(load_terrain("shackleton"), search_radius_m=150.0)
+    elevation_deg = np.degrees(terrain.horizon_rad(np.zeros(2), np.radians(np.arange(360.0))))
+    scene = make_scene(
+        stars_at_azel(np.arange(360.0), elevation_deg, np.full(360, 5.0)), terrain=terrain, sky_v_mag_arcsec2=20.0
+    )
+    pictures = []
+    for _ in range(2):  # before the table, and with it in memory
+        exposure, truth = render(replace(scene), rng=np.random.default_rng(1))
+        pictures.append((exposure.pixels_adu, truth.hidden, light_e(replace(scene))))
+        terrain.prepare()
+    for before, after in zip(*pictures, strict=True):
+        np.testing.assert_array_equal(before, after)

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import sys
 from contextlib import contextmanager
 from dataclasses import replace
@@ -16,6 +17,7 @@ from startrack import runner
 from startrack.cli import reproduce as cli
 from startrack.cli.main import main
 from startrack.cli.progress import Progress, progress
+from startrack.files import hold_lock
 from startrack.localization import ExactPosterior, Hull, PseudoGradient
 from startrack.reproduction import (
     ARTEFACTS,
@@ -47,10 +49,10 @@ from startrack.reproduction.simulator import (
 )
 
 SMALL = Size(
-    "small", skies=10, per_sky=300, ours_per_sky=10, bound_per_sky=10, deep_per_sky=3, one_sky=500, ours_one_sky=150,
-    sweep_skies=1, sweep_per_sky=4, traverses=10,
+    "small", skies=10, per_sky=300, ours_per_sky=5, bound_per_sky=5, deep_per_sky=2, one_sky=500, ours_one_sky=120,
+    sweep_skies=1, sweep_per_sky=2, traverses=10,
 )  # fmt: skip
-TINY = replace(SMALL, skies=3, per_sky=8, ours_per_sky=4, bound_per_sky=4, deep_per_sky=1, one_sky=8, ours_one_sky=4)
+TINY = replace(SMALL, skies=3, per_sky=8, ours_per_sky=2, bound_per_sky=2, deep_per_sky=1, one_sky=8, ours_one_sky=4)
 
 
 @contextmanager
@@ -60,9 +62,10 @@ def hide_progress(what, total):
 
 @pytest.fixture(scope="module")
 def small_run(tmp_path_factory):
-    """Every table and figure of a small run, with its files."""
+    """Every table and figure of a small run, with its files. Workers of pytest-xdist share what is computed."""
     out = tmp_path_factory.mktemp("reproduced")
-    with ChunkStore(out, jobs=1, progress=hide_progress) as store:
+    shared = tmp_path_factory.getbasetemp().parent if "PYTEST_XDIST_WORKER" in os.environ else out
+    with hold_lock(shared / "reproduced.lock"), ChunkStore(shared, jobs=1, progress=hide_progress) as store:
         artefacts = {name: make(Context(SMALL, 0, store)) for name, make in ARTEFACTS.items()}
     return {name: (artefact, write_artefact(artefact, out, plots=True)) for name, artefact in artefacts.items()}
 
@@ -143,6 +146,7 @@ def test_the_localizers_give_what_the_table_is_made_of():
         np.testing.assert_allclose(refined.position_enu_m[:2], chunk["refined_m"][k], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_table_3_1_is_within_the_bars(small_run):
     values = small_run["table3.1"][0].values
     assert 30 <= values["reproduced"]["descent"]["mean_m"] <= 38  # thesis 34.2
@@ -165,6 +169,7 @@ def test_ours_is_near_the_middle_of_the_exact_cell():
     assert np.median(off) < 1.0
 
 
+@pytest.mark.slow
 def test_skyline_is_better_near_the_centre_and_stars_near_the_wall(small_run):
     artefact = small_run["fig3.10"][0]
     columns = {column.name: [float(v) for v in column.values] for column in artefact.columns}
@@ -202,6 +207,7 @@ def test_distances_between_changes_are_the_thesis_s():
 # Files
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", cli.NAMES)
 def test_each_table_and_figure_is_written(small_run, name):
     artefact, files = small_run[name]
@@ -220,6 +226,7 @@ def test_each_table_and_figure_is_written(small_run, name):
         assert "thesis" in text and artefact.values["thesis"]
 
 
+@pytest.mark.slow
 def test_tables_are_read_by_astropy(small_run):
     from astropy import units
     from astropy.table import QTable

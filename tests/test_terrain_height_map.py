@@ -17,7 +17,9 @@ from startrack.localization import ExactPosterior
 from startrack.localization.horizon_bias import LinearSolution, lower_evidence
 from startrack.terrain import load_terrain, table_building
 from startrack.terrain import table_cache as cache
+from startrack.terrain.deformed_map import DeformedMap
 from startrack.terrain.height_map import HeightMap
+from startrack.terrain.protocol import ForwardingTerrain
 from startrack.terrain.pyramid import ground_up_m
 from startrack.terrain.raster import (
     EQUIRECTANGULAR,
@@ -82,6 +84,28 @@ def test_the_table_changes_no_horizon(shackleton):
     assert not fresh.is_prepared
     fresh.prepare()
     assert np.abs(fresh.horizon_rad(places, azimuths) - before).max() < np.radians(0.001)
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        lambda whole: whole,
+        ForwardingTerrain,
+        lambda whole: whole.near(np.zeros(2), 200.0, np.linspace(0.0, 6.0, 300)),
+        lambda whole: DeformedMap(whole, stretch_1=0.01, vertical_east_rad=1e-3),
+        lambda whole: DeformedMap(whole, camera_height_m=0.3),
+    ],
+    ids=["map", "forwarded", "interpolator", "tilted", "raised"],
+)
+def test_without_the_table_horizons_are_the_same_bits_before_and_after_it(shackleton, form):
+    terrain, azimuths = replace(shackleton, camera_height_m=1.8, search_radius_m=150.0), np.linspace(0.0, 6.0, 300)
+    terrain.discard_table()
+    places = np.random.default_rng(2).uniform(-100, 100, (20, 1, 2))
+    before = form(terrain).without_table().horizon_rad(places, azimuths)
+    for one in (terrain, replace(terrain, camera_height_m=1.8 + 0.3)):
+        one.prepare()
+    assert np.array_equal(form(terrain).without_table().horizon_rad(places, azimuths), before)
+    assert form(terrain).horizon_rad(places, azimuths) == pytest.approx(before, abs=1e-4)
 
 
 def test_far_crests_are_found_with_the_table_too():

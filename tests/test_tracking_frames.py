@@ -233,6 +233,7 @@ def frame_at(terrain, shared, place, rng, number):
     return ObservedFrame(f"{number}", TIME + timedelta(hours=number), None, (one,), rows)
 
 
+@pytest.mark.slow
 def test_exposures_at_rest_are_one_posterior():
     terrain, shared, nees, errors = crater(), TrackErrors.of(crater(), None), [], []
     for seed in range(6):

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import cached_property
 
 import numpy as np
 
 from startrack.camera import Camera, Sensor
 from startrack.terrain import Terrain
 from startrack.types import Array, BadInput, Body, Bools, Ints, Stars, Value, array
+
+AZIMUTHS = 1 << 16  # of the skyline: 0.0055 degrees, a sixteenth of a pixel of the widest fisheye
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +73,22 @@ class Scene(Value):
     def R_cam_icrs(self) -> Array:
         """Attitude (3, 3) at mid-exposure."""
         return self.R_cam_enu @ self.R_enu_icrs
+
+    def horizon_rad(self, azimuths_rad: Array) -> Array:
+        """Horizon elevation (n,) [rad] at `azimuths_rad` (n,): the same bits whether or not a table is prepared.
+
+        Raises ValueError for a scene without terrain.
+        """
+        if self.terrain is None:
+            raise ValueError("a scene without terrain has no horizon")
+        return np.asarray(self.terrain.without_table().horizon_rad(self.position_enu_m[:2], azimuths_rad))
+
+    @cached_property
+    def skyline_rad(self) -> tuple[Array, Array]:
+        """Azimuths from 0 to 2 pi, both ends included, and the horizon of the terrain there [rad]."""
+        azimuths = np.linspace(0.0, 2 * np.pi, AZIMUTHS + 1)
+        horizon = self.horizon_rad(azimuths[:-1])
+        return azimuths, np.append(horizon, horizon[0])
 
 
 @dataclass(frozen=True, kw_only=True)

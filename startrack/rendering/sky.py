@@ -9,11 +9,9 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.frames import azel_from_rays, rays_from_azel
 from startrack.rendering.scene import Scene
-from startrack.terrain import Terrain
 from startrack.types import Array, Bools, Ints
 
 ARCSEC2_PER_SR = (180 * 3600 / np.pi) ** 2
-AZIMUTHS = 1 << 16  # of the horizon's table: 0.0055 degrees, a sixteenth of a pixel of the widest fisheye
 EDGE_WIDTH_SIGMAS = 4.0  # distance from the skyline up to which the PSF-smoothed step is computed
 TANGENT_NODES_SIGMAS = np.linspace(-3.5, 3.5, 11)  # trapezoid over a Gaussian: exact to 1e-9 for a smooth skyline
 LENS_SAMPLES = 4096
@@ -72,7 +70,7 @@ def coverage(scene: Scene, xy_px: Ints | Array) -> Array:
     across, slope_rad_per_px = _local_axes(scene, xy_px)
     weights = np.exp(-0.5 * TANGENT_NODES_SIGMAS**2)
     weights /= weights.sum()
-    azimuths, horizon = _horizon_table(scene.terrain, scene.position_enu_m)
+    azimuths, horizon = scene.skyline_rad
     total = np.zeros(len(xy_px))
     for node, weight in zip(TANGENT_NODES_SIGMAS * sigma, weights, strict=True):
         azimuth, elevation = _azel(scene, xy_px + node * across)
@@ -83,13 +81,6 @@ def coverage(scene: Scene, xy_px: Ints | Array) -> Array:
 
 def _sigma_px(scene: Scene) -> float:
     return float(np.sqrt(scene.sensor.psf_sigma_px**2 + 1 / 12))
-
-
-def _horizon_table(terrain: Terrain, position_enu_m: Array) -> tuple[Array, Array]:
-    """Azimuths from 0 to 2 pi, both ends included, and the horizon there [rad] seen from the position (3,)."""
-    azimuths = np.linspace(0.0, 2 * np.pi, AZIMUTHS + 1)
-    horizon = np.asarray(terrain.horizon_rad(position_enu_m[:2], azimuths[:-1]), dtype=np.float64)
-    return azimuths, np.append(horizon, horizon[0])
 
 
 def _azel(scene: Scene, xy_px: Array) -> tuple[Array, Array]:
@@ -132,7 +123,7 @@ def _sky_and_mask(scene: Scene) -> tuple[Array, Bools]:
     v = (np.arange(height)[:, None] - camera.centre_px[1]) / fy
     shift_of = _decentring_of_rows(camera)
     sky, above = np.empty((height, width)), np.ones((height, width), dtype=bool)
-    tan_horizon = None if scene.terrain is None else _tan_table(scene.terrain, scene.position_enu_m)
+    tan_horizon = None if scene.terrain is None else np.tan(np.minimum(scene.skyline_rad[1], 1.5707))
     east, north, up = scene.R_cam_enu.T
     for top in range(0, height, ROWS_PER_BLOCK):
         rows = slice(top, min(top + ROWS_PER_BLOCK, height))
@@ -145,7 +136,7 @@ def _sky_and_mask(scene: Scene) -> tuple[Array, Bools]:
         if scene.sky_gradient:
             sky[rows] *= sky_gradient(scene, e, n)
         if tan_horizon is not None:
-            above[rows] = _is_above_horizon(e, n, h, *tan_horizon)
+            above[rows] = _is_above_horizon(e, n, h, scene.skyline_rad[0], tan_horizon)
     return sky, above
 
 
@@ -178,11 +169,6 @@ def _is_above_horizon(east: Array, north: Array, up: Array, azimuths: Array, tan
     azimuth = np.arctan2(east[unclear], north[unclear]) % (2 * np.pi)
     above[unclear] = up[unclear] > np.interp(azimuth, azimuths, tan_horizon) * level[unclear]
     return above
-
-
-def _tan_table(terrain: Terrain, position_enu_m: Array) -> tuple[Array, Array]:
-    azimuths, horizon = _horizon_table(terrain, position_enu_m)
-    return azimuths, np.tan(np.minimum(horizon, 1.5707))
 
 
 def _lens_table(scene: Scene) -> tuple[Array, Array, Array, Array]:

@@ -27,7 +27,7 @@ def is_above_terrain(scene: Scene, rays_enu: Array) -> Bools:
     if scene.terrain is None:
         return np.ones(len(rays_enu), dtype=bool)
     azimuth, elevation = azel_from_rays(rays_enu)
-    return elevation > scene.terrain.horizon_rad(scene.position_enu_m[:2], azimuth)
+    return elevation > scene.horizon_rad(azimuth)
 
 
 def add_sources(image_e: Array, scene: Scene) -> None:

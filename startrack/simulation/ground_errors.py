@@ -39,6 +39,8 @@ class ErringGround(ForwardingTerrain):
         self._rng = rng
         self._post, self._error_m = np.zeros(0, dtype=np.int64), np.zeros(0)  # drawn so far; posts ascending
 
+    without_table = Terrain.without_table  # itself: a copy would draw other errors
+
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:  # type: ignore[override]
         """Horizon elevation (..., n) [rad] seen from one point (1, 2) at azimuths (n,)."""
         if self.whole.height_sigma_m == 0.0:

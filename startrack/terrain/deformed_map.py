@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -53,6 +54,12 @@ class DeformedMap(ForwardingTerrain):
     @cached_property
     def _raised(self) -> HeightMap:
         return replace(self._map, camera_height_m=self.camera_height_m) if self._raised_m else self._map
+
+    def without_table(self) -> DeformedMap:
+        """The same ground of the raised camera's map without its table; see `Terrain`."""
+        other = copy(self)
+        other.__dict__["_raised"] = self._raised.without_table()
+        return other
 
     def _level_rad(self, horizon_rad: Array) -> Array:
         """A horizon [rad] of the raised camera, stretched and with the bias."""

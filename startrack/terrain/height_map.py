@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -56,16 +57,14 @@ class HeightMap(Terrain):
     glare_rad: Sectors = ()  # lit by the Sun: no evidence there
     unstated_errors: tuple[str, ...] = ()
     finest_m = FINEST_BOX_M
+    _uses_table = True  # traces begin at the horizon's distance of a table in memory
 
     def __post_init__(self) -> None:
         if not self.maps:
             raise BadInput("bad_terrain", "[dem] needs at least one map")
         if not self._covers(self.search_radius_m):
-            raise BadInput(
-                "bad_terrain",
-                f"the maps do not cover the search area of {self.search_radius_m:.0f} m about the origin, "
-                "or have holes in it",
-            )
+            area = f"the search area of {self.search_radius_m:.0f} m about the origin"
+            raise BadInput("bad_terrain", f"the maps do not cover {area}, or have holes in it")
 
     @property
     def hard_edges(self) -> bool:  # type: ignore[override]
@@ -168,6 +167,12 @@ class HeightMap(Terrain):
         self.__dict__.pop("_sigma", None)
         cache.discard_table(self._key)
 
+    def without_table(self) -> HeightMap:
+        """The same map whose traces begin at the camera; see `Terrain`."""
+        other = copy(self)
+        other.__dict__["_uses_table"] = False
+        return other
+
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad], traced. See `Terrain`."""
         return np.arctan(self.horizons(points_m, azimuths_rad)[0])
@@ -221,8 +226,7 @@ class HeightMap(Terrain):
         points = np.asarray(points_m, dtype=np.float64)
         steps = SLOPE_STEP_M * np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])
         z = self.ground_m(points[..., None, :] + steps)
-        rise = np.hypot(z[..., 0] - z[..., 1], z[..., 2] - z[..., 3]) / (2 * SLOPE_STEP_M)
-        return np.asarray(np.arctan(rise))
+        return np.asarray(np.arctan(np.hypot(z[..., 0] - z[..., 1], z[..., 2] - z[..., 3]) / (2 * SLOPE_STEP_M)))
 
     def is_informative(self, azimuths_rad: Array, elevations_rad: Array) -> Bools:
         """Whether the map decides if the rays (...) are visible: outside glare, and above unmapped ground."""
@@ -259,9 +263,8 @@ class HeightMap(Terrain):
 
     def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = NODES_ACROSS) -> Terrain:
         """The ground near a centre (2,), see `HorizonInterpolator`."""
-        return HorizonInterpolator(
-            self, np.asarray(centre_m, dtype=np.float64), half_m, np.unique(azimuths_rad), across
-        )
+        centre = np.asarray(centre_m, dtype=np.float64)
+        return HorizonInterpolator(self, centre, half_m, np.unique(azimuths_rad), across)
 
     def horizon_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
         """The posts about the crests seen from `point_m`; see `Terrain`."""
@@ -275,9 +278,8 @@ class HeightMap(Terrain):
         """The posts about a camera at `point_m`; see `Terrain`."""
         tan, distance, _ = self.horizons(point_m, azimuths_rad)
         post, weight = cell_posts(self.site, self.maps, np.append(point_m, self.ground_m(point_m))[None])
-        return HorizonPosts(
-            np.repeat(post, len(tan), axis=0), -weight / ((1.0 + tan * tan) * distance)[:, None], np.arctan(tan)
-        )  # fmt: skip
+        weights = -weight / ((1.0 + tan * tan) * distance)[:, None]
+        return HorizonPosts(np.repeat(post, len(tan), axis=0), weights, np.arctan(tan))
 
     def post_positions_m(self, posts: Ints) -> Array:
         """See `Terrain`."""
@@ -285,12 +287,10 @@ class HeightMap(Terrain):
 
     def horizons(self, points_m: Array, azimuths_rad: Array) -> tuple[Array, Array, Array]:
         """tan, distance, and distance of the maps' end, of each point and azimuth."""
-        points_m = np.asarray(points_m, dtype=np.float64)
-        shape = np.broadcast_shapes(points_m.shape[:-1], np.shape(azimuths_rad))
+        shape = np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
         points = tracing.flatten(points_m, (*shape, 2)).reshape(-1, 2)
-        found = tracing.trace_horizons(
-            self, cache.TABLES_IN_MEMORY.get(self._key), points, tracing.flatten(azimuths_rad, shape).ravel()
-        )
+        table = cache.TABLES_IN_MEMORY.get(self._key) if self._uses_table else None
+        found = tracing.trace_horizons(self, table, points, tracing.flatten(azimuths_rad, shape).ravel())
         return tuple(a.reshape(shape) for a in found)  # type: ignore[return-value]
 
     def _covers(self, half_m: float) -> bool:

@@ -96,6 +96,10 @@ class HorizonInterpolator(ForwardingTerrain):
         other.__dict__.update(_traced_nodes=nodes, exact=False)
         return other
 
+    def without_table(self) -> HeightMap:
+        """The whole map: nothing is interpolated; see `Terrain`."""
+        return self.whole.without_table()
+
     def column(self, azimuths_rad: Array) -> tuple[Ints, Bools]:
         """Index of each azimuth (...) in `azimuths_rad`, and whether it is there."""
         at = np.minimum(np.searchsorted(self.azimuths_rad, azimuths_rad), len(self.azimuths_rad) - 1)

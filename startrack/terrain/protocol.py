@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from copy import copy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -206,6 +207,13 @@ class Terrain(ABC):
     def discard_table(self) -> None:  # noqa: B027 - the default has nothing to discard
         """Discard the table of `prepare`, in memory and on disk."""
 
+    def without_table(self) -> Terrain:
+        """The same ground with a `horizon_rad` that is the same bits before and after `prepare`, in every process.
+
+        A table tells a trace where to begin: it is quicker, and its last digits are others.
+        """
+        return self
+
     def facts(self) -> dict[str, Any]:
         """Facts about the ground that `startrack terrain show` prints, as JSON values; "kind" is one of them."""
         return {"kind": "other"}
@@ -230,6 +238,12 @@ class ForwardingTerrain(Terrain):
     def ground_m(self, points_m: Array) -> Array:
         """As of `whole`."""
         return self.whole.ground_m(points_m)
+
+    def without_table(self) -> Terrain:
+        """A copy of this one, about `whole` without its table."""
+        other = copy(self)
+        other.__dict__["whole"] = self.whole.without_table()
+        return other
 
 
 def _forward(name: str) -> Any:

@@ -138,7 +138,8 @@ def expected_covariance(nats: float) -> Array:
 def test_the_posterior_by_stars_and_sky_light_is_that_of_a_plain_sum(nats: float) -> None:
     rng = np.random.default_rng([12, int(nats)])
     true = PLACE + np.array([1.0, -2.0])
-    rows = Evidence.concatenate(sky_rows(true, rng, nats), star_rows(true, rng, 100))
+    light, stars = sky_rows(true, rng, nats), star_rows(true, rng, 100)
+    rows = replace(Evidence.concatenate(light, stars), support=ExactPosterior()(stars, CRATER).samples)
     mean, covariance = posterior_on_a_grid(rows, true, 6 * np.sqrt(np.linalg.eigvalsh(expected_covariance(nats))[1]))
     fix = ExactPosterior()(rows, CRATER)
     sigma = np.sqrt(np.trace(covariance))
@@ -177,17 +178,25 @@ def test_errors_of_the_image_widen_the_posterior_as_in_least_squares() -> None:
 
 @pytest.mark.slow
 def test_positions_agree_with_their_covariance_under_errors_of_the_image() -> None:
-    """Skylines raised by errors drawn from their prior: mean NEES 2 within 3.5 standard deviations."""
-    rng, nees = np.random.default_rng(3), []
+    """Skylines raised by errors drawn from their prior: mean NEES 2 within 3.5 standard deviations.
+
+    One image of a hundred seems to show an error of the crater that its file denies, and is refused.
+    """
+    rng, nees, refused = np.random.default_rng(3), [], 0
     errors = image_errors(np.random.default_rng(2), 1.0)
     for _ in range(40):
         rows = sky_rows(PLACE, rng, 60.0)
         raised = errors.raised_rad @ rng.multivariate_normal(errors.mean, errors.covariance)
         shown = replace(rows, elevation_rad=rows.elevation_rad + np.repeat(raised, LEVELS))
-        fix = ExactPosterior()(replace(shown, support=explored_at(), image_errors=errors), CRATER)
+        try:
+            fix = ExactPosterior()(replace(shown, support=explored_at(), image_errors=errors), CRATER)
+        except NotLocated:
+            refused += 1
+            continue
         off = fix.position_enu_m[:2] - PLACE
         nees.append(off @ np.linalg.solve(fix.covariance_m2, off))
     assert 1.1 < np.mean(nees) < 3.1
+    assert refused <= 1
 
 
 def explored_at() -> Explored:

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.localization.explored import Explored, log_sum, split_boxes
-from startrack.localization.initial_guess import Guess, local_posterior, refine_boxes
+from startrack.localization.initial_guess import CLIMB_NATS, Guess, local_posterior, refine_boxes
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.types import Array, NotLocated
 
 BOXES_AT_ONCE = 2000  # so that memory stays flat
 LOOK_UP_COST = 0.08  # of a bound, in horizons traced
 FINEST_M = 12.0  # half side of boxes that may be the last ones: sampling finds what they hold
-MOST_BOXES = 4000  # of the last level
+MANY_BOXES, MOST_BOXES = 4000, 16_000  # of a level: from which on a better position is sought, and of the last one
 
 
 @dataclass
@@ -39,10 +39,13 @@ class Search:
         while True:
             centres, upper = self._bound(centres, half)
             is_last = 4 * len(centres) > MOST_BOXES
+            if 4 * len(centres) > MANY_BOXES and self._climb(centres, half):
+                continue
             if half <= FINEST_M or is_last:
                 average = self.likelihood.average.score(terrain, centres, half)
                 likely = np.mean(average > average.max() - self.prune_nats)
-                if average.max() > self.guess.best - self.prune_nats and (half <= FINEST_M or likely > 0.5):
+                resolved = average.max() > self.guess.best - self.prune_nats and likely > 0.5
+                if half <= FINEST_M or resolved:
                     return self._ranked(centres, average, half)
                 if is_last:
                     return self._about_best(centres, upper, half)
@@ -75,6 +78,15 @@ class Search:
             self._drop(upper[~keep], half)
             kept.append((some[keep], upper[keep]))
         return np.concatenate([part[0] for part in kept]), np.concatenate([part[1] for part in kept])
+
+    def _climb(self, centres: Array, half: float) -> bool:
+        """Whether a better position than the best known is near the boxes (n, 2) with the best average."""
+        average = self.likelihood.average.score(self.likelihood.terrain, centres, half)
+        found = refine_boxes(self.likelihood, centres[np.argsort(-average, kind="stable")], half)
+        is_better = found.best > self.guess.best + CLIMB_NATS
+        if is_better:
+            self.guess, self.best = found, max(self.best, found.best)
+        return is_better
 
     def _drop(self, log_likelihood: Array, half: float) -> None:
         lost = log_sum(log_likelihood) + 2.0 * float(np.log(2 * half))

@@ -17,7 +17,7 @@ LAST_HALF_M = {False: 20.0, True: 12.0}  # half side of the last boxes, looked u
 # 2, where traced ones rank the true box among the first 70 at every level.
 BEAMS = ((32, False), (80, True), (200, True))
 SCORED, CLOSER = 16, 4  # of the last boxes, row by row; of these, at each smaller size
-LAST_STEP_M = 1.0
+LAST_STEP_M, CLIMB_NATS = 0.5, 1.0  # of a climb; what it must gain to go on in steps of the same size
 APART_M, MODE_NATS = 60.0, 12.0  # between the positions of a guess; less likely ones than the best by more are none
 FIRST_REACH_M, LAST_REACH_M, ACROSS = 16.0, 256.0, 5  # of boxes about a position, and how many along a side
 RIM_NATS = 3.0  # less probability than the whole has the rim of these boxes
@@ -56,18 +56,26 @@ def _last_boxes(likelihood: PositionLikelihood, width: int, traced: bool) -> tup
 
 
 def refine_boxes(likelihood: PositionLikelihood, centres_m: Array, half_m: float) -> Guess:
-    """The best positions in the first of boxes with the centres (n, 2): the best centres of ever smaller boxes."""
-    points, scores, centres_m = [np.zeros((0, 2))], [np.zeros(0)], centres_m[:SCORED]
-    while len(centres_m):
-        score = likelihood.exact_scores(centres_m)
-        allowed = np.asarray(likelihood.terrain.allowed(centres_m))
-        points.append(centres_m[allowed])
-        scores.append(score[allowed])
-        if half_m <= LAST_STEP_M:
-            break
-        best = centres_m[np.argsort(-score, kind="stable")[:CLOSER]]
-        centres_m, half_m = split_boxes(best, half_m, likelihood.terrain), half_m / 2
-    found, score = np.concatenate(points), np.concatenate(scores)
+    """The best positions about the first of boxes with the centres (n, 2), the best average first.
+
+    Ever smaller boxes of the best average, and climbs in ever smaller steps: where the rows are strong only an average
+    shows from afar where the top is, and near it only the positions themselves.
+    """
+    terrain, near, half = likelihood.terrain, centres_m[:CLOSER], half_m
+    while half > LAST_STEP_M and len(near):
+        near, half = split_boxes(near, half, terrain), half / 2
+        near = near[np.argsort(-likelihood.average.score(terrain, near, half), kind="stable")[:CLOSER]]
+    found, score = np.zeros((0, 2)), np.zeros(0)
+    new, step_m, gained = np.vstack([centres_m[:SCORED], near]), half_m, np.inf
+    while len(new) and (step_m > LAST_STEP_M or gained > CLIMB_NATS):
+        new = new[np.asarray(terrain.allowed(new))]
+        before = score.max(initial=-np.inf)
+        found, score = np.vstack([found, new]), np.append(score, likelihood.exact_scores(new))
+        gained = score.max(initial=-np.inf) - before
+        if gained <= CLIMB_NATS:
+            step_m /= 2
+        best = found[np.argsort(-score, kind="stable")[:CLOSER]]
+        new = (best[:, None] + square_grid(step_m, 3)).reshape(-1, 2)
     chosen: list[int] = []
     for i in np.argsort(-score, kind="stable"):
         if all(np.abs(found[i] - found[k]).max() > APART_M for k in chosen):

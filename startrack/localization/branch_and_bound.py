@@ -13,7 +13,7 @@ from startrack.types import Array, NotLocated
 
 BOXES_AT_ONCE = 2000  # so that memory stays flat
 LOOK_UP_COST = 0.08  # of a bound, in horizons traced
-FINEST_M = 12.0  # half side of boxes that may be the last ones: sampling finds what they hold
+FINEST_M, FINEST_PART = 12.0, 0.01  # half side of boxes that may be the last ones: at most, and in the half square
 MANY_BOXES, MOST_BOXES = 4000, 16_000  # of a level: from which on a better position is sought, and of the last one
 
 
@@ -36,16 +36,17 @@ class Search:
         """
         self.best, terrain = self.guess.best, self.likelihood.terrain
         centres, half = np.array([terrain.searched[:2]]), terrain.searched[2]
+        finest_m = min(FINEST_M, FINEST_PART * half)
         while True:
             centres, upper = self._bound(centres, half)
             is_last = 4 * len(centres) > MOST_BOXES
             if 4 * len(centres) > MANY_BOXES and self._climb(centres, half):
                 continue
-            if half <= FINEST_M or is_last:
+            if half <= finest_m or is_last:
                 average = self.likelihood.average.score(terrain, centres, half)
                 likely = np.mean(average > average.max() - self.prune_nats)
                 resolved = average.max() > self.guess.best - self.prune_nats and likely > 0.5
-                if half <= FINEST_M or resolved:
+                if half <= finest_m or resolved:
                     return self._ranked(centres, average, half)
                 if is_last:
                     return self._about_best(centres, upper, half)

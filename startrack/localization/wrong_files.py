@@ -42,12 +42,12 @@ def require_files(found: Sequence[Hypothesis], parameters: Array, clear: Array) 
             "or camera file, or something on no map?",
             reason="inconsistent_evidence",
         )
-    for fact, better in weigh_wrong_facts(found):
-        if better > WRONG_FACT_NATS:
-            raise NotLocated(
-                f"an error beyond the stated {fact} explains the image better, by {better:.0f} nats: is it right?",
-                reason="inconsistent_evidence",
-            )
+    better, fact = max(((nats, fact) for fact, nats in weigh_wrong_facts(found)), default=(0.0, ""))
+    if better > WRONG_FACT_NATS:
+        raise NotLocated(
+            f"an error beyond what {fact} states explains the image better, by {better:.0f} nats: is it right?",
+            reason="inconsistent_evidence",
+        )
 
 
 def _log_map(best: Hypothesis, parameters: Array) -> float:

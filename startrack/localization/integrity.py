@@ -14,7 +14,7 @@ import numpy as np
 
 from startrack.fix import Integrity
 from startrack.kernels import njit
-from startrack.localization.obstacle_chain import emission_beside
+from startrack.localization.obstacle_chain import fill_clear_emissions
 from startrack.localization.skyline_model import SkylineModel
 from startrack.localization.skyline_profiles import SECTORS
 from startrack.types import Array, Bools
@@ -89,8 +89,9 @@ def _sector_logs(model: SkylineModel, parameters: Array, offsets: Array, clear: 
 def clear_logs(profiles, shifts, clear):
     found, cell = np.empty(shifts.shape), profiles.first[:-1].copy()
     for i in range(shifts.shape[0]):
+        fill_clear_emissions(profiles, shifts[i], cell, found[i])
         for s in range(shifts.shape[1]):
-            found[i, s] = log(clear[s] * emission_beside(profiles, s, shifts[i, s], cell) + 1.0 - clear[s])
+            found[i, s] = log(clear[s] * found[i, s] + 1.0 - clear[s])
     return found
 
 

@@ -10,7 +10,7 @@ from startrack.localization.distributions import BoxDistribution
 from startrack.localization.explored import Explored
 from startrack.localization.gross_errors import sample_gross_errors
 from startrack.localization.hypothesis import Hypothesis, sample_hypothesis, solve_model
-from startrack.localization.importance_sampling import Gaussian, effective_points, moments
+from startrack.localization.importance_sampling import ROUNDS, Gaussian, effective_points, moments
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
@@ -19,6 +19,7 @@ from startrack.types import Array, Evidence, NotLocated
 REACH_M = 300.0  # of a group of boxes about its best one, with one neighbourhood
 MOST_GROUPS, MOST_BOXES = 6, 160  # groups of boxes; boxes of a group that the chain is computed at
 MOST_MODES, MODE_NATS = 4, 14.0  # of a group; less likely ones than the best by more are none
+FIRST_ROUNDS = ROUNDS[:2]  # of a further group of boxes: it is left at them where it is less likely than MODE_NATS
 BOX_POINTS = 160  # drawn from the boxes
 LINEAR_WIDER = 2.0  # variance about the solution of the linear model with which sampling begins
 APART_BOXES = 3.0  # between two modes that sampling begins with
@@ -41,10 +42,14 @@ def sample_posterior(explored: Explored, rows: Evidence, terrain: Terrain) -> li
         start = _start(model, centres_m, explored.half_m)
         if start is None:
             continue
-        plain = sample_hypothesis(model, references_m, start.modes, first=[start.boxes])
+        best = max((one.found.log_evidence for one in found), default=-np.inf)
+        for rounds in [ROUNDS] if number == 0 else [FIRST_ROUNDS, ROUNDS]:
+            plain = sample_hypothesis(model, references_m, start.modes, first=[start.boxes], rounds=rounds)
+            is_likely = plain.found.log_evidence > best - MODE_NATS
+            if not is_likely:
+                break
         found.append(plain)
-        best = max(one.found.log_evidence for one in found)
-        if number == 0 or plain.found.log_evidence > best - MODE_NATS:
+        if is_likely:
             found.extend(sample_gross_errors(plain, references_m))
     if not found:
         raise NotLocated("no position in the search area is allowed", reason="outside_search_area")

@@ -50,7 +50,7 @@ def test_a_depth_that_no_file_states_is_estimated_by_the_stars(series: Series, s
         assert [one.fact for one in fix.unstated] == ["depth_sigma_m"]
         for error in fix.shown:
             assert (error.name, error.fact) == ("depth_1", "depth_sigma_m")
-            assert abs(error.value - steeper) < 4 * error.sigma < 0.01
+            assert abs(error.value - steeper) < 4.5 * error.sigma < 0.01  # edges of stars: the tails are no normal ones
             shown += 1
     assert abs(steeper) < 0.01 or shown == FRAMES
 

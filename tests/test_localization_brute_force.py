@@ -102,7 +102,7 @@ def test_the_search_leaves_the_boxes_that_matter(seed: int) -> None:
     log = log_likelihood(places, evidence)
     weight = np.exp(log - log.max())
     weight /= weight.sum()
-    for nats in (6.0, 12.0, 20.0):
+    for nats in (12.0, 20.0, 60.0):
         method = ExactPosterior(prune_nats=nats)
         centres, half, log_weight, log_dropped, *_ = method.explore(evidence, PIT)
         kept = cKDTree(centres).query(places, p=np.inf)[0] <= half

@@ -181,7 +181,7 @@ def test_a_sky_turned_by_a_wrong_clock_is_refused_or_its_time_is_found(shackleto
         return
     fix = ExactPosterior()(turned, shackleton)
     assert np.linalg.norm(fix.position_enu_m[:2] - place) < fix.radius999_m
-    assert abs(fix.clock.offset_s + 7200) < 4 * fix.clock.sigma_s < 1200
+    assert abs(fix.clock.offset_s + 7200) < 4 * fix.clock.sigma_s < 1500
     assert [one.name for one in fix.shown] == ["clock_s"]
 
 

@@ -49,7 +49,7 @@ class Search:
                 if half <= finest_m or resolved:
                     return self._ranked(centres, average, half)
                 if is_last:
-                    return self._about_best(centres, upper, half)
+                    return self._about_best(upper, half)
             quarters = split_boxes(centres, half, terrain)
             if not len(quarters):
                 raise NotLocated(
@@ -58,7 +58,8 @@ class Search:
                 )
             self.work += terrain.horizon_cost * LOOK_UP_COST * self.likelihood.sectors.count * len(quarters)
             if self.work > self.budget_horizons:
-                return self._about_best(centres, upper, half)
+                self._climb(centres, half)
+                return self._about_best(upper, half)
             centres, half = quarters, half / 2
 
     def _bound(self, centres: Array, half: float) -> tuple[Array, Array]:
@@ -101,9 +102,7 @@ class Search:
         log_likelihood = np.append(self.guess.log_likelihood, average[keep])
         return Explored(centres, half, log_likelihood, self.log_dropped, "proven")
 
-    def _about_best(self, centres: Array, upper: Array, half: float) -> Explored:
-        """The neighbourhoods of the best positions known, by the guess or in the most promising open boxes."""
-        promising = refine_boxes(self.likelihood, centres[np.argsort(-upper, kind="stable")], half)
+    def _about_best(self, upper: Array, half: float) -> Explored:
+        """The neighbourhoods of the best positions known, where boxes with bounds (n,) are left open."""
         self._drop(upper, half)
-        best = promising if promising.best > self.guess.best else self.guess
-        return local_posterior(self.likelihood, best, self.log_dropped)
+        return local_posterior(self.likelihood, self.guess, self.log_dropped)

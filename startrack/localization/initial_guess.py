@@ -16,8 +16,8 @@ LAST_HALF_M = {False: 20.0, True: 12.0}  # half side of the last boxes, looked u
 # most positions right. Beside near crests they are too wide: of 9 positions on Shackleton's floor and walls they miss
 # 2, where traced ones rank the true box among the first 70 at every level.
 BEAMS = ((32, False), (80, True), (200, True))
-SCORED, CLOSER = 16, 4  # of the last boxes, row by row; of these, at each smaller size
-LAST_STEP_M, CLIMB_NATS = 0.5, 1.0  # of a climb; what it must gain to go on in steps of the same size
+SCORED, CLOSER = 8, 4  # of the last boxes, row by row; of these, at each smaller size
+LAST_STEP_M, CLIMB_NATS = 1.0, 1.0  # of a climb; what it must gain to go on in steps of the same size
 APART_M, MODE_NATS = 60.0, 12.0  # between the positions of a guess; less likely ones than the best by more are none
 FIRST_REACH_M, LAST_REACH_M, ACROSS = 16.0, 256.0, 5  # of boxes about a position, and how many along a side
 RIM_NATS = 3.0  # less probability than the whole has the rim of these boxes
@@ -74,8 +74,10 @@ def refine_boxes(likelihood: PositionLikelihood, centres_m: Array, half_m: float
         gained = score.max(initial=-np.inf) - before
         if gained <= CLIMB_NATS:
             step_m /= 2
-        best = found[np.argsort(-score, kind="stable")[:CLOSER]]
-        new = (best[:, None] + square_grid(step_m, 3)).reshape(-1, 2)
+        if not len(found):
+            break
+        around = found[np.argmax(score)] + square_grid(step_m, 3)
+        new = around[np.abs(around[:, None] - found).max(axis=2).min(axis=1) > 0.1 * LAST_STEP_M]
     chosen: list[int] = []
     for i in np.argsort(-score, kind="stable"):
         if all(np.abs(found[i] - found[k]).max() > APART_M for k in chosen):

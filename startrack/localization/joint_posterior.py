@@ -17,6 +17,7 @@ from startrack.terrain import Terrain
 from startrack.types import Array, Evidence, NotLocated
 
 REACH_M = 300.0  # of a group of boxes about its best one, with one neighbourhood
+LEAST_REACH_M, REACH_SIGMAS = 40.0, 16.0  # of a neighbourhood in which the posterior is sampled
 MOST_GROUPS, MOST_BOXES = 6, 160  # groups of boxes; boxes of a group that the chain is computed at
 MOST_MODES, MODE_NATS = 4, 14.0  # of a group; less likely ones than the best by more are none
 FIRST_ROUNDS = ROUNDS[:2]  # of a further group of boxes: it is left at them where it is less likely than MODE_NATS
@@ -38,19 +39,25 @@ def sample_posterior(explored: Explored, rows: Evidence, terrain: Terrain) -> li
     references_m = np.array([centres_m[0] for centres_m, _ in groups])
     found: list[Hypothesis] = []
     for number, (centres_m, reach_m) in enumerate(groups):
-        model = SkylineModel(terrain, rows, centres_m[0], max(reach_m, 40.0), errors, image_errors=rows.image_errors)
+        half_m = max(reach_m, LEAST_REACH_M)
+        model = SkylineModel(terrain, rows, centres_m[0], half_m, errors, image_errors=rows.image_errors)
         start = _start(model, centres_m, explored.half_m)
         if start is None:
             continue
         best = max((one.found.log_evidence for one in found), default=-np.inf)
-        for rounds in [ROUNDS] if number == 0 else [FIRST_ROUNDS, ROUNDS]:
-            plain = sample_hypothesis(model, references_m, start.modes, first=[start.boxes], rounds=rounds)
-            is_likely = plain.found.log_evidence > best - MODE_NATS
-            if not is_likely:
-                break
-        found.append(plain)
-        if is_likely:
-            found.extend(sample_gross_errors(plain, references_m))
+        plain = sample_hypothesis(model, references_m, start.modes, first=[start.boxes], rounds=FIRST_ROUNDS)
+        if plain.found.log_evidence < best - MODE_NATS:
+            found.append(plain)
+            continue
+        mean, covariance = _moments_of(plain)
+        reach_m = max(REACH_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1])), LEAST_REACH_M)
+        if terrain.axisymmetric or reach_m > 0.5 * model.half_m:
+            plain = sample_hypothesis(model, references_m, start.modes, first=[start.boxes])
+        else:  # horizons are interpolated more closely in a smaller neighbourhood
+            references_m[number] = mean[:2]
+            closer = SkylineModel(terrain, rows, mean[:2], reach_m, errors, image_errors=rows.image_errors)
+            plain = sample_hypothesis(closer, references_m, [_begin_in(closer, mean, covariance)])
+        found.extend([plain, *sample_gross_errors(plain, references_m)])
     if not found:
         raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
     found.sort(key=lambda one: -one.found.log_evidence)
@@ -117,6 +124,16 @@ def _start(model: SkylineModel, centres_m: Array, half_m: float) -> Start | None
     if by_linear > value.max():
         modes = [(linear, LINEAR_WIDER * covariance), *modes[: MOST_MODES - 1]]
     return Start(modes, drawn)
+
+
+def _begin_in(model: SkylineModel, mean: Array, covariance: Array) -> Gaussian:
+    """The position of a mode with the errors that suit it in a `model` whose directions of errors may be others."""
+    _, whole, weight = solve_model(model)
+    model.__dict__["clear"] = weight
+    wider = whole.copy()
+    wider[:2, :2] = covariance[:2, :2]
+    wider[:2, 2:] = wider[2:, :2] = 0.0
+    return model.with_likely_errors(mean[None, :2], weight)[0], wider
 
 
 def _moments_of(one: Hypothesis) -> Gaussian:

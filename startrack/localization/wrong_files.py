@@ -69,14 +69,19 @@ def weigh_wrong_facts(found: Sequence[Hypothesis]) -> Iterator[tuple[str, float]
     best = found[0].model
     near = [one for one in found if one.model.ground is best.ground]
     plain = min(near, key=lambda one: one.gross != "")
-    by_files = float(np.logaddexp.reduce([one.found.log_evidence for one in near]))
+    by_files = _log_evidence(near)
     for fact in SharedErrors.doubtable(best.terrain, best.rows.clock):
         other = plain.model.with_gross(fact)
         better = -np.inf
         for rounds in FEW_ROUNDS, GROSS_ROUNDS:
             if len(other.basis):
                 doubted = sample_gross_error(plain, other, best.reference_m[None], rounds)
-                better = float(np.logaddexp.reduce([one.found.log_evidence for one in doubted])) - by_files
+                better = _log_evidence(doubted) - by_files
             if better < -SCREENED_NATS:
                 break
         yield fact, better
+
+
+def _log_evidence(found: Sequence[Hypothesis]) -> float:
+    """Logarithm of the evidence, whatever the prior probabilities of the gross errors are."""
+    return float(np.logaddexp.reduce([one.found.log_evidence - one.model.basis.log_probability for one in found]))

@@ -41,7 +41,8 @@ def distance_bounds(
         return nearest, distance_to_circle(centres_m, azimuths_rad, greatest_radius_m + reach)
     x, y, sine, cosine = centres_m[..., 0], centres_m[..., 1], np.sin(azimuths_rad), np.cos(azimuths_rad)
     along, across = x * sine + y * cosine, np.abs(x * cosine - y * sine)
-    off_centre, turn, turned = np.hypot(x, y), np.cos(azimuth_half_rad), np.sin(azimuth_half_rad)
+    half = np.minimum(azimuth_half_rad, np.pi)
+    off_centre, turn, turned = np.hypot(x, y), np.cos(half), np.sin(half)
     side = off_centre * turn
     most_along = np.where(along >= side, off_centre, along * turn + across * turned)
     least_along = np.where(along <= -side, -off_centre, along * turn - across * turned)

@@ -18,7 +18,7 @@ from startrack.types import Array
 
 DEGREES, FAR_DEGREES = 5.0, 3.0  # of freedom of the t distributions
 FAR_PART, FAR, FAR_OTHERS = 0.4, 4.0, 1.4  # of the points; how much farther out, in position and in the others
-ROUNDS = (200, 400, 600, 800, 1000)  # points
+ROUNDS = (200, 400, 800, 1000, 1200)  # points
 MORE_POINTS = 0.3  # part by which each further dimension has more
 LEAST_ROUNDS, ENOUGH = 3, 600.0  # after so many rounds so many effective points end them
 TEMPERED = 7.0  # effective points a dimension to which weights are tempered before the distributions move

@@ -20,7 +20,7 @@ REACH_M = 300.0  # of a group of boxes about its best one, with one neighbourhoo
 LEAST_REACH_M, REACH_SIGMAS = 40.0, 16.0  # of a neighbourhood in which the posterior is sampled
 MOST_GROUPS, MOST_BOXES = 6, 160  # groups of boxes; boxes of a group that the chain is computed at
 MOST_MODES, MODE_NATS = 4, 14.0  # of a group; less likely ones than the best by more are none
-FIRST_ROUNDS = ROUNDS[:2]  # of a further group of boxes: it is left at them where it is less likely than MODE_NATS
+FIRST_ROUNDS = ROUNDS[:2]  # that show whether a group of boxes is likely, and how wide the posterior is
 BOX_POINTS = 160  # drawn from the boxes
 LINEAR_WIDER = 2.0  # variance about the solution of the linear model with which sampling begins
 APART_BOXES = 3.0  # between two modes that sampling begins with
@@ -45,25 +45,38 @@ def sample_posterior(explored: Explored, rows: Evidence, terrain: Terrain) -> li
         if start is None:
             continue
         best = max((one.found.log_evidence for one in found), default=-np.inf)
-        plain = sample_hypothesis(model, references_m, start.modes, first=[start.boxes], rounds=FIRST_ROUNDS)
-        if plain.found.log_evidence < best - MODE_NATS:
-            found.append(plain)
-            continue
-        mean, covariance = _moments_of(plain)
-        reach_m = max(REACH_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1])), LEAST_REACH_M)
-        if terrain.axisymmetric or reach_m > 0.5 * model.half_m:
-            plain = sample_hypothesis(model, references_m, start.modes, first=[start.boxes])
-        else:  # horizons are interpolated more closely in a smaller neighbourhood
-            references_m[number] = mean[:2]
-            closer = SkylineModel(terrain, rows, mean[:2], reach_m, errors, image_errors=rows.image_errors)
-            plain = sample_hypothesis(closer, references_m, [_begin_in(closer, mean, covariance)])
-        found.extend([plain, *sample_gross_errors(plain, references_m)])
+        plain = _sample_group(model, start, references_m, number, best)
+        found.append(plain)
+        if plain.found.log_evidence >= best - MODE_NATS:
+            found.extend(sample_gross_errors(plain, references_m))
     if not found:
         raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
     found.sort(key=lambda one: -one.found.log_evidence)
     if found[0].found.effective < FEW:
         found[0] = sample_hypothesis(found[0].model, references_m, [_moments_of(found[0])], rounds=MORE_ROUNDS)
     return found
+
+
+def _sample_group(model: SkylineModel, start: Start, references_m: Array, number: int, best: float) -> Hypothesis:
+    """The plain hypothesis of a group of boxes, with the reference `number` of all (g, 2), which may move.
+
+    A further group is left at its first rounds where it is less likely than the `best` by MODE_NATS. On a height map
+    the last rounds are in a neighbourhood as small as the posterior, because horizons are interpolated in it.
+    """
+    if number == 0 and model.terrain.axisymmetric:
+        return sample_hypothesis(model, references_m, start.modes, first=[start.boxes])
+    plain = sample_hypothesis(model, references_m, start.modes, first=[start.boxes], rounds=FIRST_ROUNDS)
+    if plain.found.log_evidence < best - MODE_NATS:
+        return plain
+    mean, covariance = _moments_of(plain)
+    reach_m = max(REACH_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1])), LEAST_REACH_M)
+    if model.terrain.axisymmetric or reach_m > 0.5 * model.half_m:
+        return sample_hypothesis(model, references_m, start.modes, first=[start.boxes])
+    references_m[number] = mean[:2]
+    closer = SkylineModel(
+        model.terrain, model.rows, mean[:2], reach_m, model.errors, image_errors=model.image_errors
+    )  # fmt: skip
+    return sample_hypothesis(closer, references_m, [_begin_in(closer, mean, covariance)])
 
 
 def _group_boxes(explored: Explored, reach_m: float) -> list[tuple[Array, float]]:

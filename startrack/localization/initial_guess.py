@@ -69,13 +69,13 @@ def refine_boxes(likelihood: PositionLikelihood, centres_m: Array, half_m: float
     new, step_m, gained = np.vstack([centres_m[:SCORED], near]), half_m, np.inf
     while len(new) and (step_m > LAST_STEP_M or gained > CLIMB_NATS):
         new = new[np.asarray(terrain.allowed(new))]
-        before = score.max(initial=-np.inf)
+        before = float(score.max(initial=-np.inf))
         found, score = np.vstack([found, new]), np.append(score, likelihood.exact_scores(new))
-        gained = score.max(initial=-np.inf) - before
-        if gained <= CLIMB_NATS:
-            step_m /= 2
         if not len(found):
             break
+        gained = float(score.max()) - before
+        if gained <= CLIMB_NATS:
+            step_m /= 2
         around = found[np.argmax(score)] + square_grid(step_m, 3)
         new = around[np.abs(around[:, None] - found).max(axis=2).min(axis=1) > 0.1 * LAST_STEP_M]
     chosen: list[int] = []

@@ -23,6 +23,7 @@ MIN_ROWS = 8
 MIN_ROW_NATS = 1e-3  # |llr| below which a row is left out
 SEARCH_EPSILON = 0.1  # of a sector in the search: an obstacle costs the true position 2.3 nats a sector, not 9
 SLACK_NATS = 44.0  # by which the published model may favour a position over the search: 29 degrees of obstacles
+NEAR_BOXES = 60  # likely with a prior, whose middles are compared with the best position
 NATS = 16.0  # positions that are e^-16 as likely as the best are dropped
 
 
@@ -91,7 +92,11 @@ class ExactPosterior:
                 found, nearby = self.explore(evidence, wider), wider
             except NotLocated:  # the smaller disk has an answer
                 break
-        return weigh_by_prior(found, near)
+        likely = np.argsort(-(found.log_likelihood + near.log_density(found.centres_m)), kind="stable")[:NEAR_BOXES]
+        scores = found.log_likelihood.copy()  # averages of boxes lie below that of the positions that count in them
+        exact = self.likelihood(evidence, terrain).exact_scores(found.centres_m[likely])
+        scores[likely] = np.maximum(scores[likely], exact)
+        return weigh_by_prior(found._replace(log_likelihood=scores), near)
 
     @staticmethod
     def likelihood(evidence: Evidence, terrain: Terrain) -> PositionLikelihood:

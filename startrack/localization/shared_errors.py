@@ -37,7 +37,7 @@ class SharedErrors:
 
         What is stated of the fact `doubted` does not count: its errors are gross.
         """
-        known = [*terrain.shape_errors, *([] if clock is None else [_clock_error(clock, terrain)])]
+        known = _known_errors(terrain, clock)
         known = [replace(one, gross_probability=1.0) if one.fact == doubted else one for one in known]
         listed = tuple(one for one in known if one.sigma > 0.0 or one.gross_probability > 0.0)
         has_clock = any(one.fact == CLOCK_FACT for one in listed)
@@ -46,7 +46,7 @@ class SharedErrors:
     @staticmethod
     def doubtable(terrain: Terrain, clock: Clock | None) -> tuple[str, ...]:
         """Stated facts of a `terrain` and a `clock` whose errors would be larger if the statement were wrong."""
-        known = [*terrain.shape_errors, *([] if clock is None else [_clock_error(clock, terrain)])]
+        known = _known_errors(terrain, clock)
         return tuple(dict.fromkeys(one.fact for one in known if one.is_stated and one.gross_sigma > one.sigma))
 
     def __len__(self) -> int:
@@ -124,6 +124,11 @@ class SharedErrors:
         total = np.bincount(of, weights=by_post, minlength=len(numbers))
         variance = np.bincount(azimuth, weights=by_post * total[of], minlength=len(azimuth_rad))
         return np.hypot(terrain.height_sigma_m * np.sqrt(variance), rough)
+
+
+def _known_errors(terrain: Terrain, clock: Clock | None) -> list[ShapeError]:
+    """The errors of a `terrain`, and of a `clock`, those that are stated as zero too."""
+    return [*terrain.shape_errors, *([] if clock is None else [_clock_error(clock, terrain)])]
 
 
 def _clock_error(clock: Clock, terrain: Terrain) -> ShapeError:

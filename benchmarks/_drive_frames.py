@@ -10,17 +10,17 @@ from functools import cached_property
 import numpy as np
 from _cameras import EXPOSURE_S, camera_for_share
 
+from startrack.applications.tracking import ObservedFrame, TrackErrors, observe_frame
+from startrack.applications.tracking.frame_estimate import estimate_frame
 from startrack.catalog import load_catalog
+from startrack.chain.pipeline import Settings, locate
+from startrack.chain.stages import Located
+from startrack.core.types import Array, Evidence
 from startrack.evidence.likelihood_ratio import visibility_llr
 from startrack.frames import R_enu_icrs, azel_from_rays, observer_velocity_m_s
-from startrack.pipeline import Settings, locate
 from startrack.rendering import Series, render
-from startrack.stages import Located
 from startrack.terrain import Terrain
 from startrack.terrain.height_map import HeightMap
-from startrack.tracking import ObservedFrame, TrackErrors, observe_frame
-from startrack.tracking.frame_estimate import estimate_frame
-from startrack.types import Array, Evidence
 
 SNR_5_MAG, FAINTEST_MAG = 6.0, 8.6  # of a star with 5 sigma, and of the faintest star used
 FLUX_SCATTER = 0.03  # beyond the catalogue's own

@@ -16,13 +16,13 @@ from _hazard_classes import CLASSES
 from _map_draws import draw_position
 
 from startrack.catalog import load_catalog
+from startrack.chain.stages import StarFix, StarRays
+from startrack.chain.star_fix import locate_rays
+from startrack.core.types import Array, NoSolution
 from startrack.rendering import Series
 from startrack.simulation import simulate_rays
-from startrack.stages import StarFix, StarRays
-from startrack.star_fix import locate_rays
 from startrack.terrain import Terrain
 from startrack.terrain.height_map import HeightMap
-from startrack.types import Array, NoSolution
 
 SEEDS = {"choose": 515, "judge": 7321}  # numbers may be fitted on the first half, and are judged on the second
 SHARE, FAINTEST_V_MAG = 0.07, 8.6  # stars fainter than this are no evidence in these frames

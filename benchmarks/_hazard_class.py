@@ -12,13 +12,13 @@ import numpy as np
 from _hazard_grounds import NAMES, crater_with, map_with
 from _map_draws import draw_ground
 
+from startrack.chain.stages import StarRays
+from startrack.core.types import Array
 from startrack.frames import R_enu_icrs, Site
 from startrack.rendering import Scene
-from startrack.stages import StarRays
 from startrack.terrain import Cylinder, Terrain, load_terrain
 from startrack.terrain.height_map import HeightMap
 from startrack.terrain.raster import STEREOGRAPHIC, Projection, Raster
-from startrack.types import Array
 
 WITHIN, GROSS, VISIBLE, UNSEEN = "within", "gross", "visible", "unseen"
 KINDS = {

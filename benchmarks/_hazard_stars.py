@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from _hazard_grounds import turn
 
+from startrack.chain.stages import StarRays
+from startrack.core.types import Array
 from startrack.evidence.likelihood_ratio import visibility_llr
 from startrack.frames import azel_from_rays
 from startrack.rendering import Scene
-from startrack.stages import StarRays
-from startrack.types import Array
 
 TOO_FAINT_MAG = 20.0
 Rng = np.random.Generator

@@ -20,8 +20,8 @@ from _star_lists import StarList
 from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera
+from startrack.core.types import NotIdentified, Stars
 from startrack.identification import Identifier
-from startrack.types import NotIdentified, Stars
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from _sky_view import expose
 from _view_hazards import VIEW_HAZARDS
 
 from startrack.catalog import load_catalog
-from startrack.pipeline import Settings, locate
+from startrack.chain.pipeline import Settings, locate
+from startrack.chain.stages import Located
 from startrack.rendering import Series
-from startrack.stages import Located
 from startrack.terrain import load_terrain
 
 HAZARDS = {**VIEW_HAZARDS, **CAMERA_HAZARDS, **TERRAIN_HAZARDS, **CLOCK_HAZARDS}

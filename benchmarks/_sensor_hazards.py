@@ -9,9 +9,9 @@ import numpy as np
 from _sky_view import Rng, View, draw, smooth_noise, turn
 
 from startrack.camera import Camera
+from startrack.core.types import Array
 from startrack.rendering import Scene
 from startrack.terrain import Cylinder
-from startrack.types import Array
 
 EIGHT_BITS = {"gain_e_per_adu": 4.0, "bias_adu": 12.0, "saturation_adu": 255.0}
 

@@ -22,7 +22,7 @@ from _sensor_hazards import (
 )  # fmt: skip
 from _sky_view import Hazard, Rng, View, draw, smooth_noise, turn
 
-from startrack.types import Array
+from startrack.core.types import Array
 
 
 def cloud(view: View, rng: Rng) -> Array:

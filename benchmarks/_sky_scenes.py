@@ -9,9 +9,9 @@ from functools import lru_cache
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.core.types import Array, Bools
 from startrack.terrain import Cylinder, load_terrain
 from startrack.terrain.height_map import HeightMap
-from startrack.types import Array, Bools
 from terrain import BIAS_RAD, SLOPE_ERROR_RAD, SLOPE_RAD, replace_settings
 
 RIM_ANGLE_RAD = np.radians(80.0)  # off the axis; here the lens has the stated error

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.core.types import Array, Exposure
 from startrack.frames import azel_from_rays
 from startrack.rendering import Scene, Truth, truth_of
 from startrack.rendering.defects import add_cosmic_rays, add_hot_pixels
@@ -17,7 +18,6 @@ from startrack.rendering.sensor import ADC_MAX_ADU, read_out
 from startrack.rendering.sky import diffuse_e
 from startrack.rendering.sources import add_sources
 from startrack.terrain import Terrain
-from startrack.types import Array, Exposure
 
 HORIZON_SAMPLES = 1 << 14
 Rng = np.random.Generator

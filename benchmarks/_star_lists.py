@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera
-from startrack.types import Detections, Stars
+from startrack.core.types import Detections, Stars
 
 CLOSE_PX = 3.0
 SCATTER_MAG = 0.1

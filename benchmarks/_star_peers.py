@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from startrack.camera import Camera, Sensor
+from startrack.core.types import Exposure, TooFewStars
 from startrack.detection import Detector
-from startrack.types import Exposure, TooFewStars
 
 Finder = Callable[[np.ndarray, float], np.ndarray]
 NO_STARS = np.zeros((0, 2))

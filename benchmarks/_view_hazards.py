@@ -15,10 +15,10 @@ from _sky_hazards import dust, mast, second_skyline, vignetting
 from _sky_view import Hazard, Rng, View, draw
 
 from startrack.camera import Camera
+from startrack.core.types import Array
 from startrack.frames import R_from_rotvec
 from startrack.rendering import Scene
 from startrack.terrain import Cylinder
-from startrack.types import Array
 
 EIGHT_BITS_E = 4.0  # electrons of one step
 

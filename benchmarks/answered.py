@@ -17,11 +17,11 @@ from _classes import run_classes
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.files import data_dir
-from startrack.pipeline import locate
+from startrack.chain.pipeline import locate
+from startrack.chain.stages import Located
+from startrack.core.files import data_dir
 from startrack.rendering import Series, load_sky_catalog, render
 from startrack.rendering.sources import exposure_for_snr
-from startrack.stages import Located
 from startrack.terrain import Cylinder, load_terrain
 
 SEED, NEAR_WALL_M, WALL_MARGIN_M = 2026, 200.0, 20.0

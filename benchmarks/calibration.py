@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from _results import table, write_section
 
-from startrack.calibration import calibrate, fit_lens, initial_state, observations
+from startrack.applications.calibration import calibrate, fit_lens, initial_state, observations
 from startrack.camera import Camera, KannalaBrandt
 from startrack.camera.uncertainty import cap_grid, compensating_rotation, lens_jacobian
 from startrack.catalog import load_catalog

@@ -25,17 +25,17 @@ from _results import table, write_section
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
+from startrack.chain.pipeline import locate
+from startrack.chain.stages import Identified, Located, Oriented, Outcome, last_value
+from startrack.core.types import Evidence, NoSolution
 from startrack.exposure import read_exposure
 from startrack.frames import R_from_quat_xyzw
 from startrack.localization import PseudoGradient
 from startrack.localization.convex_hull import hull_position
 from startrack.localization.pseudo_gradient import descend
 from startrack.localization.rim_plane import stars_on_rim_plane
-from startrack.pipeline import locate
 from startrack.rendering import Series, render
-from startrack.stages import Identified, Located, Oriented, Outcome, last_value
 from startrack.terrain import Cylinder, load_terrain
-from startrack.types import Evidence, NoSolution
 
 # 10 s reach V 6.0 at 5 sigma in 100 e of background, of which 7 e are sky.
 ARCSEC = np.degrees(1.0) * 3600

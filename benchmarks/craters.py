@@ -27,10 +27,10 @@ from _rough_map import rough_terrain
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.catalog.bodies import bodies
+from startrack.chain.pipeline import locate
+from startrack.chain.stages import Located
 from startrack.frames import R_enu_icrs, Site
-from startrack.pipeline import locate
 from startrack.rendering import Series, render
-from startrack.stages import Located
 from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
 

@@ -22,14 +22,14 @@ from _drive_frames import Course, draw_course, frames_by_evidence, frames_by_pix
 from _map_draws import draw_ground
 from _results import table, write_section
 
+from startrack.applications.tracking.at_rest import positions_at_rest
+from startrack.applications.tracking.contradictions import smooth_robustly
+from startrack.applications.tracking.frame_estimate import FrameEstimate
+from startrack.applications.tracking.smoother import Observations, Steps, smooth
+from startrack.applications.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA, filter_positions
+from startrack.core.types import Array
 from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
-from startrack.tracking.at_rest import positions_at_rest
-from startrack.tracking.contradictions import smooth_robustly
-from startrack.tracking.frame_estimate import FrameEstimate
-from startrack.tracking.smoother import Observations, Steps, smooth
-from startrack.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA, filter_positions
-from startrack.types import Array
 
 POST_SIGMA_M, RAISED_SIGMA_RAD = 5.0, np.radians(0.08)
 RADIUS_M, SLOPE_RAD = 4000.0, np.radians(20.0)

@@ -23,13 +23,13 @@ from chain import SENSOR
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.catalog.gaia import load_deep_catalog
+from startrack.chain.pipeline import Settings, locate
+from startrack.chain.stages import Located, Measured, last_value
+from startrack.core.types import Array, Evidence, Fix, NoSolution
 from startrack.evidence import StarEvidence, StarPhotometry, flux_scale
 from startrack.localization import ExactPosterior
-from startrack.pipeline import Settings, locate
 from startrack.rendering import Series, exposure_for_snr, render
-from startrack.stages import Located, Measured, last_value
 from startrack.terrain import load_terrain
-from startrack.types import Array, Evidence, Fix, NoSolution
 
 CHI2_2 = {"50": 1.3863, "95": 5.9915, "99.9": 13.8155}  # of two degrees of freedom
 LISTS = {"full": "as deep as the frame", "Hipparcos alone": "Hipparcos alone"}

@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 from _results import table, write_section
 
+from startrack.applications.tracking.write import FILES
 from startrack.cli.main import main as run_command
-from startrack.tracking.write import FILES
 
 WARM_UP = 2  # images
 PLACES = {"shackleton-thesis": (-4000.0, 3000.0), "shackleton-rendered": (-1500.0, 1000.0)}  # start, on the floor

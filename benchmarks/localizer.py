@@ -16,8 +16,7 @@ from collections.abc import Callable
 import numpy as np
 from _results import table, write_section
 
-from startrack.localization import ExactPosterior, PseudoGradient
-from startrack.reproduction.simulator import (
+from startrack.applications.reproduction.simulator import (
     ASPECT_RATIO,
     MAGNITUDE,
     PERFECT,
@@ -26,7 +25,8 @@ from startrack.reproduction.simulator import (
     draw_positions,
     visible_stars,
 )
-from startrack.types import Evidence, Fix
+from startrack.core.types import Evidence, Fix
+from startrack.localization import ExactPosterior, PseudoGradient
 
 ROUNDS = 9
 SEED = 11

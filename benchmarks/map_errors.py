@@ -16,10 +16,10 @@ import numpy as np
 from _map_draws import draw_ground, draw_position
 from _results import table, write_section
 
+from startrack.core.types import Array, Evidence, NoSolution
 from startrack.localization import ExactPosterior
 from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
-from startrack.types import Array, Evidence, NoSolution
 
 RAYS, HALF_BAND_RAD, EDGE_RAD = 2000, np.radians(3.5), np.radians(0.01)
 MAX_LLR = 9.0

@@ -22,12 +22,12 @@ from _results import table, write_section
 import startrack
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.pipeline import Settings, locate
+from startrack.chain.pipeline import Settings, locate
+from startrack.chain.stages import Located
+from startrack.core.types import Array
 from startrack.rendering import Series, load_sky_catalog, render
-from startrack.stages import Located
 from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
-from startrack.types import Array
 
 SEED, WHEN = 4211, datetime(2031, 2, 14, tzinfo=UTC)
 CAMERA, TERRAINS = "fisheye-2048", ("shackleton-thesis", "shackleton")

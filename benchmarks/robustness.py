@@ -21,14 +21,14 @@ from chain import SENSOR
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
+from startrack.chain.pipeline import Settings, locate
+from startrack.chain.stages import Located
+from startrack.core.types import Array
 from startrack.evidence import StarEvidence
 from startrack.frames import R_from_rotvec
 from startrack.localization import ExactPosterior
-from startrack.pipeline import Settings, locate
 from startrack.rendering import Series, render
-from startrack.stages import Located
 from startrack.terrain import Cylinder, load_terrain
-from startrack.types import Array
 
 BOULDER_AZIMUTH_RAD = np.radians(75.0)
 

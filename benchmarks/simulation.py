@@ -16,15 +16,15 @@ from _map_draws import draw_position
 from _results import table, write_section
 
 from startrack.catalog import load_catalog
+from startrack.chain.pipeline import Settings, locate
+from startrack.chain.stages import Located, StarFix
+from startrack.chain.star_fix import locate_rays
+from startrack.core.types import NoSolution
 from startrack.localization.integrity import Integrity
-from startrack.pipeline import Settings, locate
 from startrack.rendering import Scene, Series, render
 from startrack.simulation import simulate_rays
-from startrack.stages import Located, StarFix
-from startrack.star_fix import locate_rays
 from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
-from startrack.types import NoSolution
 
 SEED, SHARE = 7, 0.07
 FLOOR_M, FLOOR_SLOPE_RAD = 4000.0, np.radians(15.0)  # positions on height maps

@@ -31,11 +31,11 @@ from _sky_view import expose
 
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
-from startrack.pipeline import Settings, locate
+from startrack.chain.pipeline import Settings, locate
+from startrack.chain.stages import Located
+from startrack.core.types import Array, Exposure
 from startrack.rendering import Series, render
-from startrack.stages import Located
 from startrack.terrain import Cylinder, Terrain, load_terrain
-from startrack.types import Array, Exposure
 
 SOURCES = ("stars", "sky", "both")
 HAZARD_SOURCES = ("stars", "both")

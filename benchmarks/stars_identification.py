@@ -29,7 +29,7 @@ from _star_lists import StarList, Trouble, star_list
 
 from startrack.camera import Camera, Pinhole, load_camera
 from startrack.catalog import load_catalog
-from startrack.types import Stars
+from startrack.core.types import Stars
 
 WRONG_RAD = np.radians(0.2)
 PEERS = ("numpy", "scipy", "ruststartracker", "tetra3rs")

@@ -27,10 +27,10 @@ from _star_frames import BACKGROUND_E, READ_NOISE_E, profiles  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 from startrack.catalog import load_catalog  # noqa: E402
+from startrack.core.types import Exposure, NoSolution, Stars  # noqa: E402
 from startrack.detection import Detector  # noqa: E402
 from startrack.exposure import read_exposure  # noqa: E402
 from startrack.identification.unknown_lens import identify_unknown_lens  # noqa: E402
-from startrack.types import Exposure, NoSolution, Stars  # noqa: E402
 
 FIELDS_DEG = {  # across the width
     "2019-07-29": 11.4, "crappy": 10.2, "orion": 10.2, "pleiades": 10.2, "roof": 10.2, "tree": 10.2, "jan1": 10.9,

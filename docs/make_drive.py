@@ -17,9 +17,9 @@ from astropy.table import Table
 from PIL import Image
 
 import startrack
+from startrack.applications.tracking import read_odometry
 from startrack.cli.main import main
 from startrack.output.picture.annotate import PANEL_WIDTH, annotate
-from startrack.tracking import read_odometry
 
 matplotlib.use("Agg")
 from make_pictures import DARK, IMAGES

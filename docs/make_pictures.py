@@ -19,7 +19,7 @@ import numpy as np
 from PIL import Image
 
 import startrack
-from startrack.types import Array, Evidence
+from startrack.core.types import Array, Evidence
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

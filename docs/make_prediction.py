@@ -13,7 +13,7 @@ from pathlib import Path
 from PIL import Image
 
 from startrack.cli.main import main
-from startrack.files import data_dir
+from startrack.core.files import data_dir
 
 IMAGES = Path(__file__).parent / "images"
 OUT = Path("startrack-predict")

@@ -1,4 +1,4 @@
-"""Writes the tables of docs/formats.md and docs/track.md that are made from the code: quantities and reasons.
+"""Writes what README.md, docs/formats.md and docs/track.md show of the code: packages, quantities and reasons.
 
     python docs/make_tables.py
 
@@ -7,15 +7,19 @@ Each table stands between `<!-- table NAME -->` and `<!-- end -->`; the text aro
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 
-from startrack.errors import Reason
+import startrack
+
+from startrack.applications.tracking.quantities import FRAME_QUANTITIES
+from startrack.core.errors import Reason
 from startrack.output.quantities import QUANTITIES
 from startrack.output.quantities_prediction import CELL_QUANTITIES, PATH_QUANTITIES
-from startrack.tracking.quantities import FRAME_QUANTITIES
 
-PAGES = [Path(__file__).parent / name for name in ("formats.md", "track.md")]
+PAGES = [Path(__file__).parent / name for name in ("../README.md", "formats.md", "track.md")]
+PACKAGE = Path(startrack.__file__).parent
 
 
 def quantity_table() -> str:
@@ -44,9 +48,32 @@ def prediction_table() -> str:
     return "\n".join(["| band, column | unit | meaning |", "| --- | --- | --- |", *rows])
 
 
+def package_list() -> str:
+    """Packages of `startrack/`, each above all that it imports, with the first sentence of its docstring."""
+    trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in PACKAGE.rglob("*.py")}
+    imports: dict[str, set[str]] = {}
+    for path, tree in trees.items():
+        name = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        modules = {node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+        imports.setdefault(name, set()).update(m.split(".")[1] for m in modules if m.startswith("startrack."))
+    names = [name for name in imports if not name.startswith("__")]
+
+    def height(name: str) -> int:
+        return 1 + max((height(other) for other in imports[name] - {name}), default=0)
+
+    def sentence(name: str) -> str:
+        path = PACKAGE / f"{name}.py"
+        text = ast.get_docstring(trees[path if path in trees else PACKAGE / name / "__init__.py"]) or ""
+        return text.partition("\n\n")[0].replace("\n", " ").rstrip(".")
+
+    rows = sorted(names, key=lambda name: (-height(name), name))
+    return "\n".join(["```text", *(f"{name:<16}{sentence(name)}" for name in rows), "```"])
+
+
 def page_with_tables(text: str) -> str:
     """The page `text` with its tables as the code has them."""
     tables = {
+        "packages": package_list(),
         "quantities": quantity_table(),
         "reasons": reason_table(),
         "track": track_table(),

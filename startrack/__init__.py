@@ -18,13 +18,13 @@ _MODULES = {  # public name to the module that has it
     "detect": "api.solve", "identify": "api.solve", "locate": "api.solve", "track": "api.solve",
     "calibrate": "api.photographs", "measure_horizon": "api.photographs",
     "predict": "api.synthetic", "render": "api.synthetic",
-    "Solution": "solution",
+    "Solution": "api.solution",
     "Camera": "camera", "load_camera": "camera",
     "Cylinder": "terrain", "HeightMap": "terrain.height_map", "Terrain": "terrain", "load_terrain": "terrain",
     "load_catalog": "catalog",
-    "Detections": "types", "Evidence": "types", "Fix": "types",
+    "Detections": "core.types", "Evidence": "core.types", "Fix": "core.types",
     "ExactPosterior": "localization",
-    "BadInput": "errors", "NoSolution": "errors",
+    "BadInput": "core.errors", "NoSolution": "core.errors",
 }  # fmt: skip
 __all__ = [
     "BadInput",
@@ -54,16 +54,16 @@ __all__ = [
 
 if TYPE_CHECKING:
     from startrack.api.photographs import calibrate, measure_horizon
+    from startrack.api.solution import Solution
     from startrack.api.solve import detect, identify, locate, track
     from startrack.api.synthetic import predict, render
     from startrack.camera import Camera, load_camera
     from startrack.catalog import load_catalog
-    from startrack.errors import BadInput, NoSolution
+    from startrack.core.errors import BadInput, NoSolution
+    from startrack.core.types import Detections, Evidence, Fix
     from startrack.localization import ExactPosterior
-    from startrack.solution import Solution
     from startrack.terrain import Cylinder, Terrain, load_terrain
     from startrack.terrain.height_map import HeightMap
-    from startrack.types import Detections, Evidence, Fix
 
 
 def __getattr__(name: str) -> Any:

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.types import Array
+from startrack.core.types import Array
 
 SQRT2 = math.sqrt(2.0)
 TABLE_STEPS = 1024  # per pixel

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from startrack.batch import Task
+from startrack.applications.batch import Task
 
 SIZE = 256
 CAMERA = f"""

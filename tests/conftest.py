@@ -61,9 +61,9 @@ def compiled_kernels(located: Located) -> None:
 @pytest.fixture(scope="session")
 def located() -> Located:
     """A rendered and located exposure of a 1024 px fisheye, 6.5 km off the middle of the thesis's crater."""
-    from startrack import pipeline
     from startrack.camera import load_camera
     from startrack.catalog import load_catalog
+    from startrack.chain import pipeline
     from startrack.rendering import Series, render
     from startrack.terrain import load_terrain
 

@@ -15,12 +15,12 @@ import numpy as np
 
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, load_catalog
+from startrack.chain.stages import StarRays
+from startrack.chain.star_fix import locate_rays
+from startrack.core.types import Array, Exposure, NoSolution
 from startrack.rendering import Scene, Series, render
 from startrack.simulation import simulate_rays
-from startrack.stages import StarRays
-from startrack.star_fix import locate_rays
 from startrack.terrain import Terrain, load_terrain
-from startrack.types import Array, Exposure, NoSolution
 
 Ground = Callable[[Terrain], Terrain]
 

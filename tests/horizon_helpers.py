@@ -9,6 +9,7 @@ from star_painter import paint
 
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
+from startrack.core.types import Exposure
 from startrack.frames import (
     R_enu_icrs,
     Site,
@@ -18,7 +19,6 @@ from startrack.frames import (
     rays_from_azel,
     refract_rad,
 )
-from startrack.types import Exposure
 
 SITE = Site("earth", np.radians(46.0), np.radians(7.0), 1000.0)
 TIME = parse_utc("2024-10-05T21:00:00Z")

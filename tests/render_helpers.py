@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from startrack.camera import Camera, Sensor
+from startrack.core.types import Stars
 from startrack.frames import R_body_enu_from_heading_pitch_roll, Site, rays_from_azel
 from startrack.rendering import Scene
 from startrack.terrain import Cylinder
-from startrack.types import Stars
 
 SITE = Site("moon", np.radians(-89.66), np.radians(129.78))
 CRATER = Cylinder(

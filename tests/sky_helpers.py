@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from scipy.special import ndtr
 
+from startrack.core.types import Array
 from startrack.evidence.sky_levels import SECTORS
 from startrack.evidence.sky_pixels import BAND_PX, SkyPixels
-from startrack.types import Array
 
 EDGE_PX = 1.04  # a PSF of 1 px, and the pixel
 PX_PER_RAD = 652.0

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from startrack.camera import Camera, Sensor
-from startrack.types import Exposure
+from startrack.core.types import Exposure
 
 REACH_SIGMAS = 6.0
 

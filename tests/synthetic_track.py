@@ -6,10 +6,10 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
+from startrack.applications.tracking import Track, TrackFrame, Trajectory
+from startrack.core.types import Array
 from startrack.frames import Site
 from startrack.terrain import Cylinder, Terrain
-from startrack.tracking import Track, TrackFrame, Trajectory
-from startrack.types import Array
 
 SITE = Site("moon", np.radians(-89.66), np.radians(129.78))
 CRATER = Cylinder(

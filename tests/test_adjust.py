@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from startrack.attitude import AttitudeFit, solve_attitude
 from startrack.camera import Camera, KannalaBrandt, Pinhole
 from startrack.camera.parameters import with_update
-from startrack.types import NotIdentified
+from startrack.core.types import NotIdentified
+from startrack.estimation.attitude import AttitudeFit, solve_attitude
 
 ARCSEC = np.pi / 648_000
 FISHEYE = Camera(

@@ -20,12 +20,12 @@ from astropy.utils.masked import Masked
 from jsonschema import Draft202012Validator
 
 import startrack
-from startrack.errors import BadInput
+from startrack.chain.inputs import exposure_input, time_input
+from startrack.chain.stages import Oriented, Refused, Settings, extend, last_value
+from startrack.core.errors import BadInput
 from startrack.exposure import read_exposure
-from startrack.inputs import exposure_input, time_input
 from startrack.localization import Hull
 from startrack.output.schema import SCHEMAS
-from startrack.stages import Oriented, Refused, Settings, extend, last_value
 
 IMAGE = "sample_images/near-wall.png"
 LOWELL = "sample_images/lowell-2018-08-06.fits.bz2"

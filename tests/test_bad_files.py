@@ -17,7 +17,7 @@ import pytest
 from batch_helpers import frames
 
 from startrack.cli.main import main
-from startrack.errors import BadInput
+from startrack.core.errors import BadInput
 from startrack.exposure import read_exposure
 from startrack.output.write import remove_companions, write_results
 

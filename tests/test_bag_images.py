@@ -16,6 +16,7 @@ from bag_helpers import FORMATS, STAMP, STAMP_NS, write_bag
 
 from startrack.camera import save_camera
 from startrack.cli.main import main
+from startrack.core.types import BadInput
 from startrack.exposure import (
     choose_bag_image,
     list_bag_images,
@@ -24,7 +25,6 @@ from startrack.exposure import (
     split_bag_path,
     write_exposure,
 )
-from startrack.types import BadInput
 
 PIXELS = [np.random.default_rng(k).normal(100.0, 3.0, (64, 96)).round().astype(np.uint16) for k in range(5)]
 

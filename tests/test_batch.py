@@ -18,12 +18,12 @@ import pyarrow.parquet as pq
 import pytest
 from astropy.table import QTable
 
-from startrack.batch import Task, images_under, listed_images, locate_image, write_tables
+from startrack.applications.batch import Task, images_under, listed_images, locate_image, write_tables
 from startrack.camera import load_camera
 from startrack.camera.io import save_camera
 from startrack.catalog import load_catalog
 from startrack.cli.main import main
-from startrack.errors import BadInput
+from startrack.core.errors import BadInput
 from startrack.exposure import write_exposure, write_sidecar
 from startrack.localization import LOCALIZERS
 from startrack.localization.rim_plane import point_fix
@@ -164,7 +164,7 @@ def test_a_trajectory_holds_poses_above_one_terrain(batch_output, tmp_path):
 def test_parquet_is_written_with_the_extra_only(batch_output, tmp_path, monkeypatch):
     write_tables(tmp_path, records_in(batch_output), {})
     assert (tmp_path / "results.parquet").exists()
-    monkeypatch.setattr("startrack.batch.tables.find_spec", lambda name: None)
+    monkeypatch.setattr("startrack.applications.batch.tables.find_spec", lambda name: None)
     write_tables(tmp_path, records_in(batch_output), {})
     assert not (tmp_path / "results.parquet").exists()  # the one of the earlier run would be out of date
     assert (tmp_path / "results.ecsv").exists()

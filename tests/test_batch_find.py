@@ -9,11 +9,11 @@ import pytest
 from astropy.table import Table
 from batch_helpers import frames, stdin_of, task_of
 
-from startrack.batch import images_under, locate_image
-from startrack.batch.find import result_stems
+from startrack.applications.batch import images_under, locate_image
+from startrack.applications.batch.find import result_stems
 from startrack.cli.main import main
+from startrack.core.types import BadInput
 from startrack.exposure import read_exposure
-from startrack.types import BadInput
 
 
 def names(folder, *apart) -> list[str]:

@@ -10,14 +10,14 @@ import sys
 import pytest
 from batch_helpers import frames
 
-from startrack.batch import LOCK, lock_results
+from startrack.applications.batch import LOCK, lock_results
 from startrack.cli.main import main
-from startrack.errors import BadInput
+from startrack.core.errors import BadInput
 
 HOLD = """
 import sys
 from pathlib import Path
-from startrack.batch import lock_results
+from startrack.applications.batch import lock_results
 with lock_results(Path(sys.argv[1])): print(flush=True); input()
 """
 

@@ -28,7 +28,7 @@ def start_batch(folder: Path, *flags: str, before: str = "") -> subprocess.Popen
 
 def test_a_scheduler_that_does_not_answer_is_bad_input(tmp_path, capsys, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("startrack.runner.CONNECT_S", 0.2)
+    monkeypatch.setattr("startrack.core.runner.CONNECT_S", 0.2)
     frames(tmp_path / "images", 1)
     out, nobody = str(tmp_path / "out"), "tcp://127.0.0.1:1"
     assert main(["batch", str(tmp_path / "images"), "-D", out, "--cluster", nobody]) == 4

@@ -10,7 +10,7 @@ import pytest
 from astropy.table import Table
 from batch_helpers import frames, stdin_of
 
-from startrack.batch import stored_record
+from startrack.applications.batch import stored_record
 from startrack.cli.main import main
 
 ROOT = Path(__file__).parent.parent
@@ -106,7 +106,7 @@ def test_a_refusal_for_lack_of_stars_replaces_a_solution(folder):
 
 @pytest.mark.parametrize("end", ["stars.ecsv", "skyline.ecsv", "skyline.png", "annotated.png", "wcs", "corr"])
 def test_a_solution_without_one_of_its_files_is_incomplete(folder, end):
-    from startrack.batch.store import has_companions
+    from startrack.applications.batch.store import has_companions
 
     record, result = stored_record(folder / "out" / "00.fix.json"), folder / "out" / "00.fix.json"
     assert has_companions(record, result, plots=True)

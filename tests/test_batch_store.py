@@ -12,7 +12,7 @@ import pytest
 from astropy.table import Table
 from batch_helpers import FACTS, frames, task_of
 
-from startrack.batch import locate_image
+from startrack.applications.batch import locate_image
 from startrack.cli.main import main
 from startrack.output.schema import SCHEMAS
 

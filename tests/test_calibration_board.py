@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from startrack.calibration.board import calibrate_board
-from startrack.calibration.board_pose import Board, BoardState, Corners, find_corners, initial_board_state
-from startrack.calibration.lens_fit import fit_state
+from startrack.applications.calibration.board import calibrate_board
+from startrack.applications.calibration.board_pose import Board, BoardState, Corners, find_corners, initial_board_state
+from startrack.applications.calibration.lens_fit import fit_state
 from startrack.camera import Camera, KannalaBrandt, load_camera
 from startrack.cli.main import main
+from startrack.core.types import Exposure, NotIdentified
+from startrack.estimation.normal_equations import observations
 from startrack.exposure import write_exposure
-from startrack.normal_equations import observations
-from startrack.types import Exposure, NotIdentified
 
 SIZE_PX = (640, 480)
 TRUTH = Camera(

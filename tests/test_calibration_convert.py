@@ -16,7 +16,7 @@ from startrack.camera import Camera, Decentring, KannalaBrandt, Pinhole, load_ca
 from startrack.camera.convert import from_text, to_text
 from startrack.camera.convert.intrinsics import decentring_rms_px
 from startrack.cli.main import main
-from startrack.types import BadInput
+from startrack.core.types import BadInput
 
 PROGRAMS = ("ros", "kalibr", "colmap", "opencv")
 BOARD_MOUNT = Rotation.from_quat([0.1, -0.2, 0.3, 0.9]).as_matrix()

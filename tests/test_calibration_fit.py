@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from startrack.calibration import fit_lens, initial_state, observations
+from startrack.applications.calibration import fit_lens, initial_state, observations
 from startrack.camera import Camera, Decentring, KannalaBrandt, camera_from_dict, camera_to_dict
 from startrack.camera.parameters import with_update
 from startrack.camera.uncertainty import lens_jacobian
-from startrack.types import NotIdentified
+from startrack.core.types import NotIdentified
 
 FOCAL_PX, SIZE_PX = 652.0, (2048, 2048)
 CENTRE_PX = np.array([1019.0, 1031.5])

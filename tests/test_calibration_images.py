@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from startrack.calibration import calibrate
-from startrack.calibration.acceptance import joint_log_p_value
-from startrack.calibration.report import write_report
-from startrack.calibration.verify import Verification, verify, verify_dict, verify_line
+from startrack.applications.calibration import calibrate
+from startrack.applications.calibration.acceptance import joint_log_p_value
+from startrack.applications.calibration.report import write_report
+from startrack.applications.calibration.verify import Verification, verify, verify_dict, verify_line
 from startrack.camera import load_camera, save_camera
 from startrack.catalog import load_catalog
 from startrack.cli.calibration_files import write_camera
 from startrack.cli.main import main
+from startrack.core.types import BadInput, Exposure, NotIdentified
 from startrack.exposure import read_exposure, read_mask, write_exposure
 from startrack.frames import Site
-from startrack.types import BadInput, Exposure, NotIdentified
 
 ROOT = Path(__file__).parent.parent
 PHOTO = ROOT / "sample_images/lowell-2018-08-06.fits.bz2"

@@ -9,17 +9,17 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 
-from startrack.calibration import KnownSensor, calibrate
-from startrack.calibration.photometry import measure_photometry
-from startrack.calibration.photon_transfer import fit_photon_transfer
-from startrack.calibration.throughput import StarFluxes, airmass, fit_throughput
-from startrack.calibration.verify import difference_px
+from startrack.applications.calibration import KnownSensor, calibrate
+from startrack.applications.calibration.photometry import measure_photometry
+from startrack.applications.calibration.photon_transfer import fit_photon_transfer
+from startrack.applications.calibration.throughput import StarFluxes, airmass, fit_throughput
+from startrack.applications.calibration.verify import difference_px
 from startrack.camera import Camera, KannalaBrandt, Sensor
 from startrack.camera.uncertainty import cap_grid
 from startrack.catalog import load_catalog
+from startrack.core.types import Exposure
 from startrack.rendering import Series, render
 from startrack.terrain import load_terrain
-from startrack.types import Exposure
 
 SENSOR = Sensor(
     zero_point_e_per_s=9000.0, gain_e_per_adu=0.5, bias_adu=200.0, read_noise_e=6.0, dark_e_per_s=0.1,

@@ -13,8 +13,8 @@ import tomli_w
 from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera, KannalaBrandt, Pinhole, Sensor, camera_from_dict, load_camera, save_camera
-from startrack.files import data_dir
-from startrack.types import BadInput
+from startrack.core.files import data_dir
+from startrack.core.types import BadInput
 
 GOOD: dict[str, Any] = {
     "format": 1,

@@ -14,7 +14,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from scipy.spatial.transform import Rotation
 
-from startrack.calibration import fit_lens, observations
+from startrack.applications.calibration import fit_lens, observations
 from startrack.camera import (
     Camera,
     KannalaBrandt,
@@ -31,8 +31,8 @@ from startrack.camera.io import camera_keys
 from startrack.camera.parameters import with_update
 from startrack.camera.uncertainty import lens_jacobian
 from startrack.cli.main import main
+from startrack.core.types import Array, BadInput
 from startrack.output.wcs import header_block, wcs_cards
-from startrack.types import Array, BadInput
 
 
 @dataclass(frozen=True)

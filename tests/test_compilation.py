@@ -12,17 +12,17 @@ from types import SimpleNamespace
 
 import pytest
 
-from startrack import compilation
+from startrack.core import compilation
+from startrack.core.runner import Runner
+from startrack.core.types import Evidence, NotLocated
 from startrack.localization import posterior
-from startrack.runner import Runner
 from startrack.terrain import load_terrain
-from startrack.types import Evidence, NotLocated
 
 ROOT = Path(__file__).parent.parent
 FIRST_USE = """
 import sys
 
-from startrack.compilation import announce_compilation
+from startrack.core.compilation import announce_compilation
 
 announce_compilation()
 announce_compilation()

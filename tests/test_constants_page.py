@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from startrack.core.types import TIME_SIGMA_S
 from startrack.localization.clock import GROSS_PROBABILITY, GROSS_SIGMA_S
 from startrack.terrain.shape import CYLINDER_FACTS, MAP_FACTS
-from startrack.types import TIME_SIGMA_S
 
 PAGE = (Path(__file__).parents[1] / "docs/method.md").read_text(encoding="utf-8")
 

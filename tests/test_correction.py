@@ -16,19 +16,19 @@ from render_helpers import FISHEYE, SENSOR
 from scipy.spatial import cKDTree
 from scipy.stats import kstest
 
-from startrack import pipeline
-from startrack.batch.fingerprint import job_sha256
-from startrack.calibration.photon_transfer import fit_photon_transfer
+from startrack.applications.batch.fingerprint import job_sha256
+from startrack.applications.calibration.photon_transfer import fit_photon_transfer
 from startrack.camera import save_camera
 from startrack.catalog import load_catalog
+from startrack.chain import pipeline
 from startrack.cli.main import main
+from startrack.core.types import BadInput, Exposure
 from startrack.detection import Detector
 from startrack.detection.damage import find_damage
 from startrack.detection.frame import electrons
 from startrack.exposure import Facts, correct_exposure, read_exposure, write_exposure, write_sidecar
 from startrack.rendering import Series, light_e
 from startrack.rendering.sensor import read_out
-from startrack.types import BadInput, Exposure
 
 TOP_ADU = 65535.0
 EVERY_CHI2_2DOF = 18.4  # 99.99 %

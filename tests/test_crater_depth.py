@@ -10,12 +10,12 @@ from localization_helpers import locate_or_refuse
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
+from startrack.chain.stages import StarRays
+from startrack.chain.star_fix import locate_rays
+from startrack.core.types import Fix, NotLocated
 from startrack.rendering import Scene, Series
 from startrack.simulation import simulate_rays
-from startrack.stages import StarRays
-from startrack.star_fix import locate_rays
 from startrack.terrain import Cylinder, load_terrain
-from startrack.types import Fix, NotLocated
 
 FRAMES = 4
 

@@ -7,8 +7,8 @@ from typing import Any
 import jsonschema
 import pytest
 
-from startrack.declaration import Choice, Either, Flag, Key, List, Number, Table, Text
-from startrack.errors import BadInput
+from startrack.core.declaration import Choice, Either, Flag, Key, List, Number, Table, Text
+from startrack.core.errors import BadInput
 
 DEEP: Any = 0
 for _ in range(5000):

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from star_painter import StarField, cramer_rao, flux_of, isolated_stars, paint, plain_camera, snr_of
 
 from startrack.camera import Camera
+from startrack.core.types import Detections, Exposure, TooFewStars
 from startrack.detection import Detector
-from startrack.types import Detections, Exposure, TooFewStars
 
 SIZE = 1024
 BACKGROUND, READ_NOISE = 94.0, 2.5

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from startrack.core.types import Exposure
 from startrack.detection import find_damage
-from startrack.types import Exposure
 
 NOISE = np.random.default_rng(5).normal(400.0, 20.0, (512, 512))
 

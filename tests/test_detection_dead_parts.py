@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from startrack import pipeline
 from startrack.catalog import load_catalog
+from startrack.chain import pipeline
 from startrack.detection import find_damage
 from startrack.detection.dead_parts import find_dead_parts
 from startrack.output.record import result_dict

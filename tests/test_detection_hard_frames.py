@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial import cKDTree
 from star_painter import cramer_rao, flux_of, isolated_stars, paint, plain_camera
 
+from startrack.core.types import Exposure, TooFewStars
 from startrack.detection import Detector
 from startrack.detection.background import background_and_noise
-from startrack.types import Exposure, TooFewStars
 
 SIZE = 1024
 VARIANCE = 100.0 + 3.0**2

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
+from startrack.core.types import Exposure
 from startrack.detection import Detector
-from startrack.types import Exposure
 
 SIZE = 512
 SIGMA_PX = 0.6

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from startrack import pipeline
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, load_catalog
+from startrack.chain import pipeline
+from startrack.chain.stages import Oriented
+from startrack.core.types import Array, Exposure, NotLocated
 from startrack.evidence import StarPhotometry
 from startrack.evidence.double_exposure import DECISIVE, check_single_skyline, find_double_exposure
 from startrack.frames import R_from_rotvec
@@ -19,9 +21,7 @@ from startrack.rendering import Scene, Series
 from startrack.rendering.compose import light_e
 from startrack.rendering.sensor import ADC_MAX_ADU, read_out
 from startrack.simulation import simulate_rays
-from startrack.stages import Oriented
 from startrack.terrain import load_terrain
-from startrack.types import Array, Exposure, NotLocated
 
 PLACE_M = (3000.0, -2500.0)
 

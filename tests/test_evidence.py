@@ -13,11 +13,11 @@ from scipy.special import expit
 from scipy.stats import norm
 from star_painter import cramer_rao, paint
 
+from startrack.core.types import Body, Detections, Identification, Stars
 from startrack.evidence import FluxScale, StarEvidence, StarPhotometry, flux_scale
 from startrack.evidence.likelihood_ratio import CAP, visibility_llr
 from startrack.evidence.photometry import Photometry, Sources, half_width, measure
 from startrack.frames import azel_from_rays
-from startrack.types import Body, Detections, Identification, Stars
 
 SIZE, VARIANCE, READ_NOISE = 1024, 100.0, 2.5
 SCATTER = 0.05

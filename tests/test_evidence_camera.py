@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from startrack import measurement
 from startrack.catalog import load_catalog
-from startrack.measurement import measure_evidence
-from startrack.stages import Settings
+from startrack.chain import measurement
+from startrack.chain.measurement import measure_evidence
+from startrack.chain.stages import Settings
 
 
 def with_covariance(camera, sigma_px):

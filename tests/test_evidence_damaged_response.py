@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from startrack import pipeline
 from startrack.catalog import load_catalog
+from startrack.chain import pipeline
+from startrack.chain.stages import Outcome
 from startrack.output.record import result_dict
-from startrack.stages import Outcome
 
 EVERY_CHI2_2DOF = 18.4  # 99.99 %
 

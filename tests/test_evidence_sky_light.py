@@ -11,14 +11,14 @@ from scipy.spatial import cKDTree
 from scipy.special import ndtr
 from sky_helpers import EDGE_PX, ELEVATION_RAD, GROUND_E, NOISE_E, PX_PER_RAD, level_horizon, paint_pixels
 
+from startrack.core.types import Array
+from startrack.estimation.normal_cdf import normal_cdf
 from startrack.evidence import Skyline
 from startrack.evidence.sky_checks import sectors_with_step
 from startrack.evidence.sky_levels import GROUND, LEVEL_SECTORS, SECTORS, SKY, SkyLevels, measure_levels, sector_of
 from startrack.evidence.sky_light import HEIGHT_PX, LEVELS, MIDDLES_RAD, SkyLight, measure_sky_light, sum_cells
 from startrack.evidence.sky_pixels import BAND_PX, SkyPixels, pixels_near_skyline, scale_across
 from startrack.frames import rays_from_azel
-from startrack.normal_cdf import normal_cdf
-from startrack.types import Array
 
 STEPS_E = (7.0, 90.0)
 SMOOTHED = 2 * np.sqrt(np.pi) * LEVEL_SECTORS  # sectors in one smoothed level

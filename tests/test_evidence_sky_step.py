@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from startrack.camera import Camera, Pinhole, load_camera
+from startrack.core.types import Detections
 from startrack.evidence import height_above_px, measure_sky_step, reliable_azimuths, subtract_sky_step
 from startrack.frames import azel_from_rays
 from startrack.terrain import load_terrain
-from startrack.types import Detections
 
 CAMERA, CRATER = load_camera("fisheye-2048"), load_terrain("shackleton-thesis")
 PLACE = np.array([3000.0, 2000.0])

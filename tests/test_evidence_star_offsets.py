@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from startrack.camera import Camera, load_camera
+from startrack.core.types import Array
 from startrack.evidence.star_offsets import (
     LEAST_SIGMA_PX,
     NIGHT_SIGMA_PX,
@@ -16,7 +17,6 @@ from startrack.evidence.star_offsets import (
     offset_terms,
 )
 from startrack.frames import R_from_rotvec, azel_from_rays, rays_from_azel
-from startrack.types import Array
 
 CAMERA = load_camera("fisheye-2048")
 R_CAM_ENU = R_from_rotvec(np.radians([3.0, -2.0, 40.0])) @ np.diag([-1.0, -1.0, 1.0])

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from startrack.chain.stages import Detected, Measured, Refused, extend
 from startrack.cli.main import main
-from startrack.errors import Reason
-from startrack.fix import Blocked, UnstatedFact
+from startrack.core.errors import Reason
+from startrack.core.fix import Blocked, UnstatedFact
+from startrack.core.types import Mode
 from startrack.output.explain import explain
 from startrack.output.schema import SCHEMAS
-from startrack.stages import Detected, Measured, Refused, extend
-from startrack.types import Mode
 
 SAMPLE = str(Path(__file__).parents[1] / "sample_images/near-centre.png")
 

@@ -12,9 +12,9 @@ import tifffile
 from astropy.io import fits
 from PIL import Image
 
+from startrack.core.types import BadInput
 from startrack.exposure import read_exposure
 from startrack.exposure.png import SIGNATURE, chunk
-from startrack.types import BadInput
 
 FRAME = np.random.default_rng(3).normal(1000, 50, (40, 60)).astype(np.uint16)
 

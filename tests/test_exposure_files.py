@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from startrack.core.types import BadInput
 from startrack.exposure import read_exposure
-from startrack.types import BadInput
 
 WHOLE = cv2.imencode(".png", np.arange(600, dtype=np.uint16).reshape(20, 30))[1].tobytes()
 

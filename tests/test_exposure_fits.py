@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from startrack.core.types import BadInput
 from startrack.exposure import read_exposure
-from startrack.types import BadInput
 
 FRAME = np.random.default_rng(5).integers(0, 65536, (31, 47)).astype(np.uint16)
 SIGNED = FRAME.view(np.int16)

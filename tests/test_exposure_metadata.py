@@ -10,8 +10,8 @@ import tifffile
 from astropy.io import fits
 from PIL import Image, PngImagePlugin
 
+from startrack.core.types import BadInput
 from startrack.exposure import read_exposure, with_facts
-from startrack.types import BadInput
 
 FRAME = np.arange(12, dtype=np.uint16).reshape(3, 4)
 MID = datetime(2031, 3, 26, 20, 58, 11, 966208, tzinfo=UTC)

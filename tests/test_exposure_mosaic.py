@@ -11,9 +11,9 @@ import pytest
 import tifffile
 
 import startrack
+from startrack.core.types import BadInput, Exposure
 from startrack.exposure import read_exposure, write_exposure
 from startrack.exposure.mosaic import equalize_mosaic
-from startrack.types import BadInput, Exposure
 
 SAMPLE = Path(__file__).parents[1] / "sample_images" / "near-wall"
 PATTERN = (((0, 0), "R"), ((0, 1), "G"), ((1, 0), "G"), ((1, 1), "B"))

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from startrack.errors import BadInput
+from startrack.core.errors import BadInput
 from startrack.exposure.png import SIGNATURE, chunk, decode_png
 from startrack.exposure.png_rows import decode_rows
 

@@ -10,9 +10,9 @@ import pytest
 import tifffile
 from PIL import Image, PngImagePlugin
 
+from startrack.core.types import BadInput
 from startrack.exposure import read_exposure
 from startrack.exposure.png import SIGNATURE, chunk
-from startrack.types import BadInput
 
 RNG = np.random.default_rng(20310326)
 FRAME16 = RNG.integers(0, 65536, (37, 53)).astype(np.uint16)

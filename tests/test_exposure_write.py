@@ -13,8 +13,8 @@ import tifffile
 from astropy.io import fits
 from PIL import Image
 
+from startrack.core.types import BadInput, Exposure
 from startrack.exposure import Facts, read_exposure, write_exposure, write_sidecar
-from startrack.types import BadInput, Exposure
 
 FRAME = np.random.default_rng(8).integers(0, 65536, (33, 44)).astype(np.uint16)
 MID = datetime(2031, 3, 26, 20, 58, 11, 966208, tzinfo=UTC)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from startrack.false_alarm import (
+from startrack.estimation.false_alarm import (
     coincidence_probability,
     density_per_px2,
     density_per_sr,
@@ -15,7 +15,7 @@ from startrack.false_alarm import (
     log_p_value_bound,
     log_p_value_poisson,
 )
-from startrack.match import match_mutual, match_nearest, select_closest
+from startrack.estimation.match import match_mutual, match_nearest, select_closest
 
 
 def test_binomial_and_poisson_tails_are_those_of_scipy() -> None:

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from startrack.core.types import BadInput
 from startrack.frames import (
     SPEED_OF_LIGHT_M_S,
     R_enu_fixed,
@@ -30,7 +31,6 @@ from startrack.frames import (
     rays_from_azel,
     refract_rad,
 )
-from startrack.types import BadInput
 
 ARCSEC_RAD = np.radians(1 / 3600)
 

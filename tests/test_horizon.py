@@ -16,26 +16,26 @@ from horizon_helpers import CAMERA, SITE, TIME, painted_frame, skyline_deg
 from jsonschema import Draft202012Validator
 
 import startrack
-from startrack.camera import load_camera
-from startrack.catalog import load_catalog
-from startrack.cli.main import main
-from startrack.errors import BadInput, NoSolution
-from startrack.exposure import read_exposure
-from startrack.frames import Site
-from startrack.horizon import measure_skyline, predicted_visible
-from startrack.horizon.frames import orient_frames
-from startrack.horizon.measure import measure_frames
-from startrack.horizon.posterior import limit_llr
-from startrack.horizon.write import (
+from startrack.applications.horizon import measure_skyline, predicted_visible
+from startrack.applications.horizon.frames import orient_frames
+from startrack.applications.horizon.measure import measure_frames
+from startrack.applications.horizon.posterior import limit_llr
+from startrack.applications.horizon.write import (
     check_output,
     csv_text,
     interpolate_unknown,
     nina_text,
     write_skyline,
 )
+from startrack.camera import load_camera
+from startrack.catalog import load_catalog
+from startrack.cli.main import main
+from startrack.core.errors import BadInput, NoSolution
+from startrack.core.types import MeasuredSkyline
+from startrack.exposure import read_exposure
+from startrack.frames import Site
 from startrack.output.schema import SCHEMAS
 from startrack.output.skyline_table import skyline_table_text
-from startrack.types import MeasuredSkyline
 
 ROOT = Path(__file__).parent.parent
 PHOTO = ROOT / "sample_images/lowell-2018-08-06.fits.bz2"

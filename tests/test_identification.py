@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera, Pinhole, load_camera
 from startrack.catalog import load_catalog
-from startrack.false_alarm import coincidence_probability, density_per_sr, log_p_value
+from startrack.core.types import Detections, Identification, NotIdentified, Stars
+from startrack.estimation.false_alarm import coincidence_probability, density_per_sr, log_p_value
 from startrack.frames import angle_between_rad
 from startrack.identification import Identifier
 from startrack.identification.triangles import triangles
-from startrack.types import Detections, Identification, NotIdentified, Stars
 
 ARCSEC = np.pi / 648_000
 FISHEYE = load_camera("fisheye-2048")

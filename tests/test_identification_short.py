@@ -22,14 +22,14 @@ from test_identification import (
     sky,
 )
 
+from startrack.core.types import NotIdentified
+from startrack.estimation.match import CandidatePairs, PhotometricScale, is_last_occurrence
 from startrack.frames import R_from_rotvec, wahba
 from startrack.identification import Identifier
 from startrack.identification.attitude_search import AttitudeSearch
 from startrack.identification.index import CatalogPatterns, PerObject
 from startrack.identification.pairs import build_pairs
 from startrack.identification.triangles import sides_of_few, triangles
-from startrack.match import CandidatePairs, PhotometricScale, is_last_occurrence
-from startrack.types import NotIdentified
 
 
 def hundred_stars(seed: int, false: int = 20, true: int = 80, noise_px: float = 0.2) -> Frame:

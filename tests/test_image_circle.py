@@ -11,11 +11,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 from startrack.catalog import load_catalog
+from startrack.chain.pipeline import identify_blind
+from startrack.core.types import Exposure
 from startrack.detection import Detector
 from startrack.exposure import read_exposure
 from startrack.identification.image_circle import image_circle
-from startrack.pipeline import identify_blind
-from startrack.types import Exposure
 
 DATA = Path(__file__).parent / "data"
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from startrack.core.types import Array
 from startrack.localization.importance_sampling import ENOUGH, LEAST_WEIGHT, moments, sample
-from startrack.types import Array
 
 
 def gaussian(dimensions: int, seed: int) -> tuple[Array, Array, Any]:

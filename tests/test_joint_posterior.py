@@ -12,6 +12,7 @@ from localization_helpers import slow_chain, slow_chain_scores
 from scipy.special import ndtr
 from test_localization_shape import evidence_at
 
+from startrack.core.types import Array, Clock, Evidence
 from startrack.frames import Site, sky_rotvec_rad
 from startrack.localization import ExactPosterior, distributions
 from startrack.localization.clock import turn_evidence
@@ -39,7 +40,6 @@ from startrack.localization.skyline_profiles import (
     sector_of,
 )
 from startrack.terrain import Cylinder, Terrain, load_terrain
-from startrack.types import Array, Clock, Evidence
 
 CRATER = load_terrain("shackleton-thesis")
 assert isinstance(CRATER, Cylinder)

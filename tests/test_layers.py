@@ -16,28 +16,14 @@ import startrack
 ROOT = Path(startrack.__file__).parent
 
 LAYERS = (  # lowest first; a package imports from lower layers only
-    {"errors", "lengths", "mask", "values"},
-    {"fix", "prior", "correction"},
-    {"types", "files", "declaration"},
-    {"compilation"},
-    {"frames", "runner"},
-    {"kernels", "chunk_store"},
-    {"normal_cdf"},
+    {"core"},
+    {"frames"},
     {"psf", "catalog", "camera", "terrain", "exposure"},
-    {"match", "normal_equations", "false_alarm"},
-    {"adjust"},
-    {"attitude"},
+    {"estimation"},
     {"rendering", "detection", "identification", "evidence", "localization"},
-    {"stages"},
-    {"run", "star_fix"},
-    {"measurement", "orientation", "sky_refinement"},
-    {"skyline"},
-    {"pipeline", "calibration", "inputs", "simulation"},
-    {"output"},
-    {"solution", "horizon"},
-    {"reproduction", "batch"},
-    {"tracking"},
-    {"prediction"},
+    {"chain"},
+    {"simulation", "output"},
+    {"applications"},
     {"api"},
     {"cli"},
 )
@@ -119,7 +105,7 @@ def test_each_exception_is_still_needed():
     [
         ("from startrack.output import text", "detection", "output"),
         ("import startrack.identification.index", "detection", "identification"),
-        ("def f():\n    from startrack import pipeline", "camera", "pipeline"),
+        ("def f():\n    from startrack import chain", "camera", "chain"),
         ("from ..cli import common", "evidence", "cli"),
     ],
 )
@@ -170,5 +156,5 @@ def test_help_is_printed_without_numpy_or_any_heavy_module():
 
 def test_the_library_is_imported_without_the_slow_ones():
     """The pipeline computes with numpy, scipy and cv2; ephemerides, FITS, plots and progress bars can wait."""
-    loaded = loaded_after("import startrack.pipeline, startrack.output")
+    loaded = loaded_after("import startrack.chain.pipeline, startrack.output")
     assert loaded & (set(HEAVY) - {"cv2", "scipy"}) == set()

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from localization_helpers import WRAPPERS, ThreeMethods, slow_chain_scores, slow_contributions, slow_scores
 
+from startrack.chain.stages import Settings
+from startrack.core.types import Array, BadInput, Evidence, NotLocated
 from startrack.localization import ExactPosterior, Hull, Localizer, PseudoGradient
 from startrack.localization.branch_and_bound import Search
 from startrack.localization.initial_guess import Guess
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.sector_likelihood import add_contributions
-from startrack.stages import Settings
 from startrack.terrain import Cylinder, ForwardingTerrain, load_terrain
-from startrack.types import Array, BadInput, Evidence, NotLocated
 
 TERRAIN = load_terrain("shackleton-thesis")
 assert isinstance(TERRAIN, Cylinder)

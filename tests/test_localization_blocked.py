@@ -10,13 +10,13 @@ import pytest
 from localization_helpers import locate_or_refuse
 from test_localization_shape import evidence_at
 
-from startrack import pipeline
 from startrack.catalog import load_catalog
+from startrack.chain import pipeline
+from startrack.core.types import Array, Evidence, Fix
 from startrack.evidence.likelihood_ratio import visibility_llr
 from startrack.localization import ExactPosterior
 from startrack.output.record import result_dict
 from startrack.terrain import load_terrain
-from startrack.types import Array, Evidence, Fix
 
 CRATER = load_terrain("shackleton-thesis")
 POSITION_M, NEAR_WALL_M = np.array([3000.0, -4500.0]), np.array([-5000.0, -7500.0])

@@ -10,11 +10,11 @@ from localization_helpers import slow_chain_scores
 from scipy.spatial import cKDTree
 from scipy.stats import norm
 
+from startrack.core.types import Evidence, Fix, NotLocated
 from startrack.localization import ExactPosterior, Hull, PseudoGradient
 from startrack.localization.posterior import SEARCH_EPSILON
 from startrack.localization.pseudo_gradient import descend
 from startrack.terrain import Cylinder, load_terrain
-from startrack.types import Evidence, Fix, NotLocated
 
 THESIS = load_terrain("shackleton-thesis")
 assert isinstance(THESIS, Cylinder)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from localization_helpers import WRAPPERS, slow_scores
 
+from startrack.core.types import Array, Clock, Evidence, NotLocated
 from startrack.localization import ExactPosterior
 from startrack.localization.box_average import BoxAverage
 from startrack.localization.branch_and_bound import Search
@@ -16,7 +17,6 @@ from startrack.localization.initial_guess import BEAMS, Guess, beam_search
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.terrain import load_terrain
 from startrack.terrain.height_map import HeightMap
-from startrack.types import Array, Clock, Evidence, NotLocated
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 

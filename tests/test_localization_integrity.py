@@ -12,6 +12,7 @@ from localization_helpers import locate_or_refuse
 from test_localization_refinement import CRATER, PX_PER_RAD, sky_rows
 from test_localization_shape import TRUE, evidence_at
 
+from startrack.core.types import Array, Bools, Fix
 from startrack.evidence.sky_light import MIDDLES_RAD
 from startrack.localization import ExactPosterior
 from startrack.localization.explored import Explored
@@ -20,7 +21,6 @@ from startrack.localization.skyline_profiles import SECTORS
 from startrack.output import result_dict, verbose_text
 from startrack.output.schema import SCHEMAS
 from startrack.terrain import Cylinder
-from startrack.types import Array, Bools, Fix
 
 WIDTH_RAD = 2 * np.pi / GROUPS
 

@@ -7,8 +7,8 @@ import pytest
 from localization_helpers import slow_contributions
 from scipy.special import ndtr
 
+from startrack.core.types import Evidence
 from startrack.localization.sector_likelihood import Sectors
-from startrack.types import Evidence
 
 
 @pytest.mark.parametrize("strength", [0.5, 80.0])

@@ -9,11 +9,11 @@ import pytest
 from localization_helpers import ThreeMethods, slow_chain_scores
 from test_localization import SMALL, TwoCraters, measure_stars
 
+from startrack.chain.stages import Settings
+from startrack.core.prior import PositionPrior
+from startrack.core.types import Array, Evidence, Fix, NotLocated
 from startrack.localization import ExactPosterior
-from startrack.prior import PositionPrior
-from startrack.stages import Settings
 from startrack.terrain import Cylinder, Terrain, load_terrain
-from startrack.types import Array, Evidence, Fix, NotLocated
 
 CRATER = load_terrain("shackleton-thesis")
 assert isinstance(CRATER, Cylinder)

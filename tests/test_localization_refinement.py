@@ -11,6 +11,7 @@ from render_helpers import CRATER
 from scipy.special import ndtr
 from sky_helpers import EDGE_PX, PX_PER_RAD
 
+from startrack.core.types import Array, Evidence, ImageErrors, NotLocated
 from startrack.evidence.sky_levels import SECTORS
 from startrack.evidence.sky_light import HEIGHT_PX, LEVELS, MIDDLES_RAD
 from startrack.evidence.star_offsets import offset_terms
@@ -20,7 +21,6 @@ from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.sector_likelihood import row_contribution
 from startrack.localization.sky_profiles import SkyProfiles
 from startrack.localization.skyline_profiles import _cubic
-from startrack.types import Array, Evidence, ImageErrors, NotLocated
 
 PLACE = np.array([3000.0, -2000.0])
 

@@ -7,11 +7,11 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from startrack.core.types import Array, Evidence, NotLocated
 from startrack.localization import ExactPosterior
 from startrack.localization.importance_sampling import moments
 from startrack.localization.joint_posterior import sample_posterior
 from startrack.terrain import Cylinder, load_terrain
-from startrack.types import Array, Evidence, NotLocated
 
 TRUE = load_terrain("shackleton-thesis")
 PLACES = [(3000.0, -2000.0), (-6500.0, 1000.0), (500.0, 400.0)]

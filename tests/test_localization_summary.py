@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from startrack.core.types import NotLocated
 from startrack.localization.conclusion import Posterior, label_modes
 from startrack.localization.summary import require_inside
 from startrack.terrain import Cylinder, load_terrain
-from startrack.types import NotLocated
 
 TERRAIN = load_terrain("shackleton-thesis")
 assert isinstance(TERRAIN, Cylinder)

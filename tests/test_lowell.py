@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
+from startrack.chain.pipeline import identify
 from startrack.exposure import read_exposure
 from startrack.frames import parse_utc
-from startrack.pipeline import identify
 
 ROOT = Path(__file__).parent.parent
 PHOTO = ROOT / "sample_images/lowell-2018-08-06.fits.bz2"

@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from render_helpers import FISHEYE
 
-from startrack import pipeline
-from startrack.batch.fingerprint import are_unchanged, input_hashes
-from startrack.calibration.obstruction import PredictedStars, obstructed_cells
+from startrack.applications.batch.fingerprint import are_unchanged, input_hashes
+from startrack.applications.calibration.obstruction import PredictedStars, obstructed_cells
 from startrack.camera import load_camera, save_camera
 from startrack.catalog import StarCatalog, load_catalog
+from startrack.chain import pipeline
+from startrack.chain.stages import Located
 from startrack.cli.main import main
+from startrack.core.types import BadInput, Bools, Exposure
 from startrack.detection import Detector
 from startrack.detection.masked import fill_masked
 from startrack.exposure import (
@@ -32,8 +34,6 @@ from startrack.exposure import (
 from startrack.frames import azel_from_rays
 from startrack.output import result_dict
 from startrack.output.star_table import status_of
-from startrack.stages import Located
-from startrack.types import BadInput, Bools, Exposure
 
 LIT_ADU, DARK_ADU = 30_000.0, 100.0
 EVERY_CHI2_2DOF = 18.4  # 99.99 %

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from startrack.core.types import BadInput
 from startrack.frames import (
     R_enu_fixed,
     R_enu_icrs,
@@ -31,7 +32,6 @@ from startrack.frames import (
     spice,
 )
 from startrack.frames.earth import R_itrs_icrs
-from startrack.types import BadInput
 
 ARCSEC_RAD = np.radians(1 / 3600)
 DATA = Path(__file__).parent / "data"

@@ -12,15 +12,15 @@ import pytest
 from PIL import Image
 from scipy.special import ndtr
 
-from startrack import pipeline
 from startrack.camera import Camera, Pinhole
+from startrack.chain import pipeline
+from startrack.chain.stages import Detected, Inputs, Measured, Oriented, Refused, extend
+from startrack.core.types import Mode
 from startrack.localization.rim_plane import point_fix
 from startrack.output import write_annotated
 from startrack.output.picture.annotate import PANEL_WIDTH, annotate
 from startrack.output.picture.backdrop import View, fit_to_canvas, remove_hot_pixels
 from startrack.output.picture.canvas import HIDDEN, IDENTIFIED, POSITION, SKYLINE, STATUS, TRUTH
-from startrack.stages import Detected, Inputs, Measured, Oriented, Refused, extend
-from startrack.types import Mode
 
 
 def has_colour_near(picture, place, colour, reach=2, tolerance=60):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from startrack.core.types import Fix, Mode
 from startrack.frames import Site
 from startrack.output.picture.backdrop import View
 from startrack.output.picture.canvas import (
@@ -25,7 +26,6 @@ from startrack.output.picture.maps import distance_text, draw_overview, draw_zoo
 from startrack.output.picture.relief import draw_contours, draw_relief, ground_of_view
 from startrack.output.picture.terrain_picture import relief_picture
 from startrack.terrain import Terrain
-from startrack.types import Fix, Mode
 
 WHITE = (255, 255, 255)
 SITE = Site("moon", -1.5, 0.0)

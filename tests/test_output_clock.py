@@ -9,13 +9,13 @@ import pytest
 from astropy import units as u
 from jsonschema import Draft202012Validator, ValidationError
 
-from startrack.batch.tables import COLUMNS, table_values
+from startrack.api.solution import Solution
+from startrack.applications.batch.tables import COLUMNS, table_values
+from startrack.chain.stages import Measured, Refused, extend
+from startrack.core.types import ClockError, Mode
 from startrack.output import detection_dict, identification_dict, result_dict, verbose_text
 from startrack.output.html.rows import facts_of
 from startrack.output.schema import SCHEMAS
-from startrack.solution import Solution
-from startrack.stages import Measured, Refused, extend
-from startrack.types import ClockError, Mode
 
 CLOCK = ClockError(offset_s=-12.3456, sigma_s=0.25)
 CHECK = Draft202012Validator(SCHEMAS["fix"])

@@ -19,7 +19,7 @@ from html_helpers import NASTY, results_in
 
 from startrack.cli.main import main
 from startrack.cli.report import write_page_of_images
-from startrack.errors import Reason
+from startrack.core.errors import Reason
 from startrack.localization.rim_plane import point_fix
 from startrack.output import result_dict, write_json, write_results
 from startrack.output.html import page_text, result_at, results_under

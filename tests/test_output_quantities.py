@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 
-from startrack.errors import Reason
+from startrack.chain.stages import Located, Measured
+from startrack.core.errors import Reason
+from startrack.core.types import Attitude
 from startrack.frames import R_from_rotvec, heading_pitch_roll_from_R_body_enu
 from startrack.output import quantities, result_dict, views
 from startrack.output.quantity import Column, Listed, Quantity, show_everywhere
 from startrack.output.schema import SCHEMAS
 from startrack.output.schema_parts import POSITIVE
 from startrack.output.values import body_sigmas_deg
-from startrack.stages import Located, Measured
-from startrack.types import Attitude
 
 ROOT = Path(__file__).parent.parent
 ARCSEC = np.pi / 648_000

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from startrack import pipeline
 from startrack.catalog import load_catalog
+from startrack.chain import pipeline
+from startrack.chain.stages import Oriented, extend
+from startrack.core.types import BadInput, Mode
 from startrack.localization.rim_plane import point_fix
 from startrack.output import detection_dict, identification_dict, refused_dict, result_dict, write_json
 from startrack.output.text import verbose_text
 from startrack.output.values import boresight_rad
-from startrack.stages import Oriented, extend
-from startrack.types import BadInput, Mode
 
 ARCSEC = np.pi / 648_000
 KEYS = {

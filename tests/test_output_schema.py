@@ -11,14 +11,14 @@ import pytest
 from jsonschema import Draft202012Validator, ValidationError
 
 from startrack.camera.io import camera_to_dict
+from startrack.chain.stages import Measured, Oriented, Refused, extend
 from startrack.cli.main import main
+from startrack.core.files import data_dir
+from startrack.core.types import Mode
 from startrack.exposure import write_sidecar
-from startrack.files import data_dir
 from startrack.output import detection_dict, identification_dict, refused_dict, result_dict
 from startrack.output.schema import SCHEMAS
 from startrack.rendering import write_truth
-from startrack.stages import Measured, Oriented, Refused, extend
-from startrack.types import Mode
 
 
 def fits_schema(kind, value):

@@ -9,10 +9,10 @@ import pytest
 from astropy import units
 from astropy.table import Table
 
+from startrack.chain.stages import Identified, Oriented, extend
 from startrack.output import write_star_table
 from startrack.output.ecsv import Column, ecsv_text
 from startrack.output.star_table import star_table_text, status_of
-from startrack.stages import Identified, Oriented, extend
 
 COLUMNS = (
     "catalog_id hip name v_mag azimuth_deg elevation_deg x_px y_px x_measured_px y_measured_px expected_e flux_e "

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import pytest
 
+from startrack.chain.stages import Detected, Oriented, Refused, extend
+from startrack.core.types import Mode
 from startrack.localization.rim_plane import point_fix
 from startrack.output import refusal_line, summary_line, verbose_text
 from startrack.output.values import chance_text
-from startrack.stages import Detected, Oriented, Refused, extend
-from startrack.types import Mode
 
 
 def test_one_line_for_a_fix(located):

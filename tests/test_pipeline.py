@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from startrack import pipeline
 from startrack.catalog import StarCatalog, load_catalog
+from startrack.chain import pipeline
+from startrack.chain.stages import Located, Outcome
+from startrack.core.types import Exposure
 from startrack.frames import R_enu_icrs, azel_from_rays
-from startrack.stages import Located, Outcome
-from startrack.types import Exposure
 
 ARCSEC = np.pi / 648_000
 EVERY_CHI2_2DOF = 18.4  # 99.99 %

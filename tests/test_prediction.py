@@ -12,14 +12,7 @@ from astropy.table import Table
 from jsonschema import Draft202012Validator
 
 import startrack
-from startrack.camera import load_camera
-from startrack.cli.main import main
-from startrack.frames import Site, latlon_from_enu
-from startrack.output.picture.prediction_map import class_bounds_m, prediction_picture
-from startrack.output.picture.prediction_plot import comparison_picture, path_picture
-from startrack.output.quantities_prediction import CELL_QUANTITIES
-from startrack.output.schema import SCHEMAS
-from startrack.prediction import (
+from startrack.applications.prediction import (
     AMBIGUOUS,
     OK,
     REFUSED,
@@ -34,10 +27,17 @@ from startrack.prediction import (
     share_within,
     summarized,
 )
+from startrack.camera import load_camera
+from startrack.cli.main import main
+from startrack.core.types import BadInput
+from startrack.frames import Site, latlon_from_enu
+from startrack.output.picture.prediction_map import class_bounds_m, prediction_picture
+from startrack.output.picture.prediction_plot import comparison_picture, path_picture
+from startrack.output.quantities_prediction import CELL_QUANTITIES
+from startrack.output.schema import SCHEMAS
 from startrack.rendering import Drive, exposure_for_snr, limiting_v_mag
 from startrack.terrain import Cylinder, load_terrain
 from startrack.terrain.geotiff import write_bands
-from startrack.types import BadInput
 
 WHEN = datetime(2030, 6, 1, tzinfo=UTC)
 NAMES = [one.name for one in CELL_QUANTITIES]
@@ -91,7 +91,7 @@ def test_two_workers_write_the_same_bytes(area, tmp_path):
 
 def test_a_stopped_run_is_resumed(area, capsys, monkeypatch):
     """Two chunks of five are lost, as if the run had been killed: only these are drawn again."""
-    from startrack.prediction import draws
+    from startrack.applications.prediction import draws
 
     before = (area / "predict.ecsv").read_bytes()
     for chunk in sorted((area / ".predict").glob("*.npz"))[:2]:

@@ -9,9 +9,9 @@ import pytest
 from astropy.table import Table
 from jsonschema import Draft202012Validator
 
+from startrack.applications.prediction.along_path import ellipse_m2, with_odometry
 from startrack.cli.main import main
 from startrack.output.schema import SCHEMAS
-from startrack.prediction.along_path import ellipse_m2, with_odometry
 
 POSITION_M = np.array([[0.0, 0.0], [300.0, 0.0], [300.0, 400.0], [700.0, 400.0], [700.0, 900.0]])
 SIGMA_1, FLOOR_M = 0.02, 3.0

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from render_helpers import CRATER, FISHEYE
 
-from startrack.errors import BadInput
+from startrack.applications.tracking import Odometry
+from startrack.core.errors import BadInput
 from startrack.frames import R_body_enu_from_heading_pitch_roll, heading_pitch_roll_from_R_body_enu, parse_utc
 from startrack.rendering import Drive, Series, draw_odometry, read_drive
-from startrack.tracking import Odometry
 
 EAST_THEN_NORTH = Drive(waypoints_m=[[0, 0], [100, 0], [100, 50]], speed_m_s=0.5)
 

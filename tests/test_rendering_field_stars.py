@@ -7,9 +7,9 @@ import pytest
 from render_helpers import SITE, stars_at
 
 from startrack.catalog import load_catalog
+from startrack.core.types import Stars
 from startrack.frames import R_enu_icrs, R_from_rotvec, Site, sky_rotvec_rad
 from startrack.rendering import concatenate_stars, draw_field_stars, draw_v_errors
-from startrack.types import Stars
 
 TIME = datetime(2026, 3, 1, 12, tzinfo=UTC)
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from render_helpers import CRATER, FISHEYE, SENSOR, centroid_px, make_scene, stars_at_azel
 
+from startrack.core.types import Body
 from startrack.rendering import exposure_for_snr, light_e, truth_of
-from startrack.types import Body
 
 
 def test_flux_of_a_star_is_zero_point_times_exposure_times_throughput():

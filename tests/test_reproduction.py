@@ -13,13 +13,7 @@ import pytest
 from PIL import Image
 from scipy import stats
 
-from startrack import runner
-from startrack.cli import reproduce as cli
-from startrack.cli.main import main
-from startrack.cli.progress import Progress, progress
-from startrack.files import hold_lock
-from startrack.localization import ExactPosterior, Hull, PseudoGradient
-from startrack.reproduction import (
+from startrack.applications.reproduction import (
     ARTEFACTS,
     FULL,
     QUICK,
@@ -30,9 +24,9 @@ from startrack.reproduction import (
     published,
     write_artefact,
 )
-from startrack.reproduction.bound import cell_centroid
-from startrack.reproduction.methods import KUA, OURS, Task, compute_chunk, tasks_of
-from startrack.reproduction.simulator import (
+from startrack.applications.reproduction.bound import cell_centroid
+from startrack.applications.reproduction.methods import KUA, OURS, Task, compute_chunk, tasks_of
+from startrack.applications.reproduction.simulator import (
     PERFECT,
     Mistakes,
     Sky,
@@ -47,6 +41,12 @@ from startrack.reproduction.simulator import (
     star_count,
     visible_stars,
 )
+from startrack.cli import reproduce as cli
+from startrack.cli.main import main
+from startrack.cli.progress import Progress, progress
+from startrack.core import runner
+from startrack.core.files import hold_lock
+from startrack.localization import ExactPosterior, Hull, PseudoGradient
 
 SMALL = Size(
     "small", skies=10, per_sky=300, ours_per_sky=5, bound_per_sky=5, deep_per_sky=2, one_sky=500, ours_one_sky=120,
@@ -100,7 +100,7 @@ def test_smaller_runs_are_the_beginning_of_larger_ones():
 def test_stars_in_sight_are_those_above_the_horizon_and_inside_the_drawn_edge():
     from matplotlib.path import Path as Polygon
 
-    from startrack.reproduction.drawing import fisheye_points
+    from startrack.applications.reproduction.drawing import fisheye_points
 
     sky, cylinder = Sky.draw(0, 0), crater()
     for position in draw_positions(0, 0, 0, 10):
@@ -255,7 +255,7 @@ def contents(folder):
 
 
 def test_any_number_of_workers_gives_the_same_bytes(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("startrack.reproduction.QUICK", TINY)
+    monkeypatch.setattr("startrack.applications.reproduction.QUICK", TINY)
     for jobs in ("1", "2"):
         assert main(["reproduce", "table3.1", "figB", "-j", jobs, "-D", str(tmp_path / jobs), "-v"]) == 0
     one, two = contents(tmp_path / "1"), contents(tmp_path / "2")
@@ -266,7 +266,7 @@ def test_any_number_of_workers_gives_the_same_bytes(tmp_path, monkeypatch, capsy
 
 def test_a_cluster_gives_the_same_bytes(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
-    monkeypatch.setattr("startrack.reproduction.QUICK", TINY)
+    monkeypatch.setattr("startrack.applications.reproduction.QUICK", TINY)
     with distributed.LocalCluster(1, processes=False, threads_per_worker=1, dashboard_address=None) as cluster:
         address = cluster.scheduler_address
         assert main(["reproduce", "table3.1", "--cluster", address, "-D", str(tmp_path / "c"), "-v"]) == 0
@@ -318,7 +318,7 @@ def test_chunks_of_other_settings_are_not_taken(tmp_path, monkeypatch):
 
 
 def test_json_has_one_object_for_each(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("startrack.reproduction.QUICK", TINY)
+    monkeypatch.setattr("startrack.applications.reproduction.QUICK", TINY)
     argv = ["reproduce", "fig3.8", "fig3.4", "--json", "--no-plots", "-j", "1", "-D", str(tmp_path), "--seed", "5"]
     assert main(argv) == 0
     records = [json.loads(line) for line in capsys.readouterr().out.splitlines()]

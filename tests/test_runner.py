@@ -14,8 +14,8 @@ import time
 import pytest
 from batch_helpers import task_of
 
-from startrack.batch import locate_images
-from startrack.runner import Died, Runner, RunStopped
+from startrack.applications.batch import locate_images
+from startrack.core.runner import Died, Runner, RunStopped
 
 JOBS = 2
 
@@ -58,7 +58,7 @@ def test_few_tasks_are_repeated_after_a_death():
         ends: list[list[str]] = []
 
         def until_failure():
-            from startrack.runner import TASKS_PER_PROCESS, _Pool
+            from startrack.core.runner import TASKS_PER_PROCESS, _Pool
 
             ends.append((yield from runner._run_until_failure(iter(names), _Pool(JOBS), TASKS_PER_PROCESS * JOBS)))
 
@@ -90,7 +90,7 @@ def test_a_signal_while_processes_start_neither_hangs_nor_kills_them():
     """Sent to the process group while its processes start, as a terminal sends Ctrl-C."""
     code = """
         import os, signal, sys, threading
-        from startrack.runner import Runner
+        from startrack.core.runner import Runner
         if __name__ == "__main__":
             seen = []
             signal.signal(signal.SIGINT, lambda *_: seen.append(1))

@@ -13,14 +13,14 @@ from test_evidence import without_sources
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
+from startrack.chain.pipeline import Settings, locate
+from startrack.chain.stages import StarRays, extend
+from startrack.chain.star_fix import locate_rays
+from startrack.core.types import BadInput
 from startrack.evidence.photometry import Sources, half_width, measure
-from startrack.pipeline import Settings, locate
 from startrack.rendering import Series
 from startrack.simulation import Starlight, simulate_rays
-from startrack.stages import StarRays, extend
-from startrack.star_fix import locate_rays
 from startrack.terrain import load_terrain
-from startrack.types import BadInput
 
 SIZE, VARIANCE_E2, SATURATION_E = 256, 100.0, 1e5
 

@@ -13,10 +13,15 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
-from startrack import pipeline
+from startrack.api.solution import Solution
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, load_catalog
-from startrack.errors import Reason
+from startrack.chain import pipeline
+from startrack.chain.pipeline import Settings
+from startrack.chain.sky_refinement import raised_by_image
+from startrack.chain.stages import Inputs, Located, Refused
+from startrack.core.errors import Reason
+from startrack.core.types import Exposure
 from startrack.evidence.sky_light import MIDDLES_RAD
 from startrack.localization import PseudoGradient
 from startrack.output import write_results
@@ -33,13 +38,8 @@ from startrack.output.picture.panorama import (
 )
 from startrack.output.skyline_table import half_range_rad
 from startrack.output.write import prepare_folder
-from startrack.pipeline import Settings
 from startrack.rendering import Series, Truth, render
-from startrack.sky_refinement import raised_by_image
-from startrack.solution import Solution
-from startrack.stages import Inputs, Located, Refused
 from startrack.terrain import load_terrain
-from startrack.types import Exposure
 
 CRATER = load_terrain("shackleton-thesis")
 CAMERA = replace(
@@ -218,8 +218,8 @@ def test_the_skyline_is_measured_once(
     def fail(located: Located) -> None:
         raise AssertionError("the skyline is measured again")
 
-    monkeypatch.setattr("startrack.skyline.measured_skyline", fail)
-    monkeypatch.setattr("startrack.pipeline.measured_skyline", fail)
+    monkeypatch.setattr("startrack.chain.skyline.measured_skyline", fail)
+    monkeypatch.setattr("startrack.chain.pipeline.measured_skyline", fail)
     write_results(by_source["both"], tmp_path / "frame.fix.json")
     assert Solution(by_source["both"]).skyline is not None
     assert {path.name for path in tmp_path.glob("frame.skyline.*")} == {"frame.skyline.ecsv", "frame.skyline.png"}

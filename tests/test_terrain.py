@@ -13,10 +13,10 @@ import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from startrack.files import data_dir
+from startrack.core.files import data_dir
+from startrack.core.types import BadInput
 from startrack.frames import Site
 from startrack.terrain import Cylinder, Terrain, load_terrain, terrain_from_dict
-from startrack.types import BadInput
 
 SITE = Site("moon", np.radians(-89.66), np.radians(129.78))
 

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from startrack.chain.inputs import terrain_input
+from startrack.core.types import Array, BadInput, Evidence
 from startrack.frames import Site
-from startrack.inputs import terrain_input
 from startrack.localization import ExactPosterior
 from startrack.terrain import Cylinder, Terrain, load_terrain
 from startrack.terrain.deformed_crater import DeformedCrater
 from startrack.terrain.protocol import ForwardingTerrain
-from startrack.types import Array, BadInput, Evidence
 
 SITE = Site("moon", np.radians(-89.66), np.radians(129.78))
 AZIMUTHS = np.linspace(0.01, 2 * np.pi, 12, endpoint=False)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from startrack.core.types import Evidence
 from startrack.frames import Site, latlon_from_enu
 from startrack.localization import ExactPosterior
 from startrack.terrain import load_terrain
-from startrack.types import Evidence
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 PLACES = {  # east and north [m]: centres of the search areas

@@ -13,7 +13,8 @@ import tomli_w
 
 from startrack.camera import load_camera
 from startrack.cli.main import main
-from startrack.files import data_dir, file_stem
+from startrack.core.files import data_dir, file_stem
+from startrack.core.types import BadInput
 from startrack.terrain import load_terrain, terrain_from_dict
 from startrack.terrain.geotiff import write_map
 from startrack.terrain.height_map import HeightMap
@@ -27,7 +28,6 @@ from startrack.terrain.raster import (
 )
 from startrack.terrain.raster_io import read_map
 from startrack.terrain.stated_errors import MEASURED_PER_ESTIMATE
-from startrack.types import BadInput
 
 ROOT = Path(__file__).parent.parent
 pytestmark = pytest.mark.usefixtures("own_cache")

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from startrack.errors import NotLocated
+from startrack.core.errors import NotLocated
+from startrack.core.types import Evidence
 from startrack.frames import Site, enu_from_latlon, latlon_from_enu
 from startrack.localization import ExactPosterior
 from startrack.localization.horizon_bias import LinearSolution, lower_evidence
@@ -29,7 +30,6 @@ from startrack.terrain.raster import (
     Raster,
     polar_stereographic,
 )
-from startrack.types import Evidence
 
 DATA = Path(__file__).parent / "data"
 pytestmark = pytest.mark.usefixtures("own_cache")

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from startrack.cli.main import main
-from startrack.files import data_dir
+from startrack.core.files import data_dir
+from startrack.core.types import Array, Evidence
 from startrack.frames import enu_from_latlon
 from startrack.localization import ExactPosterior
 from startrack.terrain import load_terrain
@@ -20,7 +21,6 @@ from startrack.terrain.height_map import HeightMap
 from startrack.terrain.map_comparison import MapComparison, compare_maps
 from startrack.terrain.raster import ORTHOGRAPHIC, STEREOGRAPHIC, Projection, Raster
 from startrack.terrain.raster_io import read_map
-from startrack.types import Array, Evidence
 
 DATA = Path(__file__).parent / "data"
 pytestmark = pytest.mark.usefixtures("own_cache")

@@ -9,11 +9,11 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from startrack.cli.main import main
+from startrack.core.types import Array, BadInput
 from startrack.terrain import load_terrain
 from startrack.terrain.geotiff import write_map
 from startrack.terrain.map_error import carried_spacing, error_between_posts_m
 from startrack.terrain.raster import Raster, polar_stereographic
-from startrack.types import Array, BadInput
 
 
 def grid(heights_m: Array, post_m: float = 100.0) -> Raster:

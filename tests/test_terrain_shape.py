@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from test_terrain_files import HILL, hill, terrain_file
 
-from startrack.files import data_dir
+from startrack.core.files import data_dir
+from startrack.core.types import BadInput
 from startrack.localization.shared_errors import SharedErrors
 from startrack.simulation import draw_ground
 from startrack.simulation.ground_errors import ErringGround
 from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain, terrain_from_dict
 from startrack.terrain.deformed_crater import DeformedCrater
 from startrack.terrain.height_map import HeightMap
-from startrack.types import BadInput
 
 CRATER = {
     "format": 1, "name": "pit", "body": "moon", "origin": {"latitude_deg": -89.0, "longitude_deg": 0.0},

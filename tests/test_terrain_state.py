@@ -12,9 +12,9 @@ import pytest
 from test_terrain_files import terrain_file
 
 from startrack.cli.main import main
+from startrack.core.types import BadInput
 from startrack.terrain import load_terrain
 from startrack.terrain.state_file import state_errors, stateable_errors
-from startrack.types import BadInput
 
 PIT = """# My crater.
 format = 1

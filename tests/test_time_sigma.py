@@ -14,17 +14,17 @@ from astropy.io import fits
 from batch_helpers import frames, task_of
 from PIL import Image, PngImagePlugin
 
-from startrack.batch import locate_image
-from startrack.batch.task import valid_stored_record
+from startrack.applications.batch import locate_image
+from startrack.applications.batch.task import valid_stored_record
+from startrack.chain.inputs import exposure_input, time_sigma_input
 from startrack.cli.common import add_fact_flags, flag_facts
 from startrack.cli.main import main
-from startrack.errors import BadInput
+from startrack.core.errors import BadInput
+from startrack.core.types import TIME_SIGMA_S, Exposure
 from startrack.exposure import Facts, read_exposure, with_facts, write_exposure, write_sidecar
 from startrack.exposure.sidecar import MAX_TIME_SIGMA_S
-from startrack.inputs import exposure_input, time_sigma_input
 from startrack.localization import clock_at
 from startrack.terrain import load_terrain
-from startrack.types import TIME_SIGMA_S, Exposure
 
 FRAME = np.arange(12, dtype=np.uint16).reshape(3, 4)
 

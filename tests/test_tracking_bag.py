@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from startrack.errors import BadInput
+from startrack.applications.tracking import read_bag_exposures, read_odometry
+from startrack.core.errors import BadInput
 from startrack.exposure import read_exposure
-from startrack.tracking import read_bag_exposures, read_odometry
 
 pytest.importorskip("rosbags", reason="the extra `ros` is not installed")
 from bag_helpers import FORMATS, STAMP, STAMP_NS, write_bag

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import startrack
+from startrack.applications.tracking import ObservedFrame, TrackErrors, estimate_track
+from startrack.applications.tracking.frame_estimate import FrameEstimate
+from startrack.applications.tracking.shared import DEPTH
 from startrack.camera import load_camera, save_camera
 from startrack.cli.main import main
 from startrack.terrain import load_terrain
-from startrack.tracking import ObservedFrame, TrackErrors, estimate_track
-from startrack.tracking.frame_estimate import FrameEstimate
-from startrack.tracking.shared import DEPTH
 
 START = datetime(2030, 6, 1, tzinfo=UTC)
 SIGMA_1 = 0.0005  # of the depth by one frame

@@ -8,19 +8,19 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 
-from startrack.fix import ShownError
+from startrack.applications.tracking.at_rest import positions_at_rest
+from startrack.applications.tracking.frame_estimate import MIN_NOISE_SHARE, clipped_noise, estimate_frame
+from startrack.applications.tracking.frame_sampling import balanced_moments
+from startrack.applications.tracking.frame_store import decode_frame, encode_frame
+from startrack.applications.tracking.observe import ObservedFrame, observe_again, observe_frame
+from startrack.applications.tracking.shared import BIAS, CLOCK, DEPTH, EDGE, TrackErrors
+from startrack.applications.tracking.smoother import Observations, Steps, smooth
+from startrack.core.fix import ShownError
+from startrack.core.types import BadInput, Clock, Evidence, ImageErrors
 from startrack.localization import ExactPosterior
 from startrack.localization.importance_sampling import sample
 from startrack.terrain import Cylinder, load_terrain
 from startrack.terrain.height_map import HeightMap
-from startrack.tracking.at_rest import positions_at_rest
-from startrack.tracking.frame_estimate import MIN_NOISE_SHARE, clipped_noise, estimate_frame
-from startrack.tracking.frame_sampling import balanced_moments
-from startrack.tracking.frame_store import decode_frame, encode_frame
-from startrack.tracking.observe import ObservedFrame, observe_again, observe_frame
-from startrack.tracking.shared import BIAS, CLOCK, DEPTH, EDGE, TrackErrors
-from startrack.tracking.smoother import Observations, Steps, smooth
-from startrack.types import BadInput, Clock, Evidence, ImageErrors
 
 TIME = datetime(2030, 6, 1, tzinfo=UTC)
 HORIZON_ERROR_RAD = np.radians(0.05)

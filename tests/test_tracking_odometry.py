@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from startrack.errors import BadInput
+from startrack.applications.tracking import Odometry, read_odometry
+from startrack.core.errors import BadInput
 from startrack.frames import R_from_quat_xyzw, tum_line
-from startrack.tracking import Odometry, read_odometry
 
 START_S = 1_900_000_000.0
 GOOD = ["0 0 0 0 0 0 0 1", "10 1 0 0 0 0 0 1", "20 2 1 0 0 0 0 1"]

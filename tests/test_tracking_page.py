@@ -12,9 +12,9 @@ import pytest
 from html_helpers import DESKTOP, PHONE, Window
 from synthetic_track import NASTY, odometry_alone, synthetic_track
 
+from startrack.applications.tracking.circles import radius_holding
+from startrack.applications.tracking.page import track_page
 from startrack.output.write import png_bytes
-from startrack.tracking.circles import radius_holding
-from startrack.tracking.page import track_page
 
 PICTURE = png_bytes(np.full((40, 60, 3), 90, dtype=np.uint8))
 TITLE = 'A drive & </script><i>"more"</i>'

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from tracking_helpers import HEIGHT_SIGMA_M, STEP_SIGMA_M, Drive, mean_nees, shifted, simulate_drive, with_slips
 
-from startrack.tracking import filter as tracking_filter
-from startrack.tracking.contradictions import smooth_robustly
-from startrack.tracking.filter import TrackFilter
-from startrack.tracking.online import OnlineTrack
-from startrack.tracking.smoother import Observations, Steps, smooth
-from startrack.tracking.track import filter_positions
+from startrack.applications.tracking import filter as tracking_filter
+from startrack.applications.tracking.contradictions import smooth_robustly
+from startrack.applications.tracking.filter import TrackFilter
+from startrack.applications.tracking.online import OnlineTrack
+from startrack.applications.tracking.smoother import Observations, Steps, smooth
+from startrack.applications.tracking.track import filter_positions
 
 
 def least_squares(drive: Drive, frames: int) -> tuple[np.ndarray, np.ndarray]:

@@ -28,15 +28,15 @@ from hazard_helpers import (
 from localization_helpers import Delegating
 
 import startrack
-from startrack import pipeline
+from startrack.api.solution import Solution
+from startrack.applications.tracking.write import track_record
+from startrack.chain import pipeline
+from startrack.chain.stages import Refused, Settings
+from startrack.chain.star_fix import locate_rays
+from startrack.core.types import Array, Evidence, Fix, NoSolution
 from startrack.localization import ExactPosterior
 from startrack.output.record import result_dict
-from startrack.solution import Solution
-from startrack.stages import Refused, Settings
-from startrack.star_fix import locate_rays
 from startrack.terrain import Cylinder, ForwardingTerrain, Terrain
-from startrack.tracking.write import track_record
-from startrack.types import Array, Evidence, Fix, NoSolution
 
 THESIS, RENDERED, SHACKLETON = "shackleton-thesis", "shackleton-rendered", "shackleton"
 PLACES = ((6000.0, -2500.0), (-1500.0, 700.0), (-4000.0, 7200.0))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from startrack.types import Evidence
+from startrack.core.types import Evidence
 
 ROWS = {"azimuth_rad": [0.1, 7.0, -1.0], "elevation_rad": [0.1, np.pi / 2, -0.1], "llr": [2.0, -3.0, 0.0]}
 

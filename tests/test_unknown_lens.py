@@ -13,10 +13,12 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from startrack.attitude import solve_attitude
 from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole
 from startrack.catalog import load_catalog
+from startrack.chain.pipeline import identify_blind as identify_picture
 from startrack.cli.main import main
+from startrack.core.types import Detections, NotIdentified, Stars
+from startrack.estimation.attitude import solve_attitude
 from startrack.exposure import read_exposure
 from startrack.frames import angle_between_rad
 from startrack.identification.proximity_mask import proximity_mask
@@ -28,8 +30,6 @@ from startrack.identification.radial_lens_family import (
     RadialFamily,
 )
 from startrack.identification.unknown_lens import UnknownLensSolution, identify_unknown_lens
-from startrack.pipeline import identify_blind as identify_picture
-from startrack.types import Detections, NotIdentified, Stars
 
 DATA = Path(__file__).parent / "data"
 PHOTO = Path(__file__).parent.parent / "sample_images/lowell-2018-08-06.fits.bz2"

@@ -7,10 +7,10 @@ import pytest
 from test_unknown_lens import SIZE, detections, lens_camera, picture, sky
 
 from startrack.camera import KannalaBrandt, Pinhole
+from startrack.core.types import Detections
 from startrack.identification.narrow_field import NarrowFieldSearch
 from startrack.identification.triangles import shape_index, triangles
 from startrack.identification.unknown_lens import LOG_FALSE_ALARM, identify_unknown_lens
-from startrack.types import Detections
 
 FIELD_SR = 0.05
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.tracking.frame_estimate import FrameEstimate
-from startrack.tracking.smoother import Steps
-from startrack.types import Array, Ints
+from startrack.applications.tracking.frame_estimate import FrameEstimate
+from startrack.applications.tracking.smoother import Steps
+from startrack.core.types import Array, Ints
 
 HEIGHT_SIGMA_M = 5.0
 POSTS_IN_PLAY, POSTS_KEPT = 8, 6  # of a frame, and of the frame before

@@ -1,1 +1,1 @@
-"""The functions of the library: what the commands do, with astropy's types; each loads its own module."""
+"""The library: functions that do what the commands do, with astropy's types; each loads its own module."""

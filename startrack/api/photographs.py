@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from startrack.calibration import Calibration
-from startrack.calibration import calibrate as calibrate_exposures
+from startrack.applications.calibration import Calibration
+from startrack.applications.calibration import calibrate as calibrate_exposures
+from startrack.applications.horizon import measure_skyline
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
-from startrack.errors import BadInput
+from startrack.chain.inputs import Image, camera_input, exposure_input, field_of_view_rad, load_camera_input
+from startrack.core.errors import BadInput
+from startrack.core.types import MeasuredSkyline
 from startrack.frames import Site
-from startrack.horizon import measure_skyline
-from startrack.inputs import Image, camera_input, exposure_input, field_of_view_rad, load_camera_input
-from startrack.types import MeasuredSkyline
 
 if TYPE_CHECKING:
     from astropy.units import Quantity

@@ -6,11 +6,13 @@ import os
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from startrack import pipeline
+from startrack.api.solution import Solution
+from startrack.applications.tracking import Odometry, Track, TrackSession, read_odometry
+from startrack.applications.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
-from startrack.errors import BAD_INPUT_REASONS, BadInput
-from startrack.inputs import (
+from startrack.chain import pipeline
+from startrack.chain.inputs import (
     Image,
     Time,
     camera_input,
@@ -22,13 +24,11 @@ from startrack.inputs import (
     terrain_input,
     time_input,
 )  # fmt: skip
-from startrack.orientation import stars_at
-from startrack.solution import Solution
-from startrack.stages import Outcome, Refused, Settings
+from startrack.chain.orientation import stars_at
+from startrack.chain.stages import Outcome, Refused, Settings
+from startrack.core.errors import BAD_INPUT_REASONS, BadInput
+from startrack.core.types import Exposure
 from startrack.terrain import Terrain
-from startrack.tracking import Odometry, Track, TrackSession, read_odometry
-from startrack.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
-from startrack.types import Exposure
 
 if TYPE_CHECKING:
     from astropy.units import Quantity

@@ -7,19 +7,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.errors import BadInput
-from startrack.files import file_stem
-from startrack.inputs import Time, angle_rad, duration_s, load_camera_input, terrain_input, time_input
+from startrack.chain.inputs import Time, angle_rad, duration_s, load_camera_input, terrain_input, time_input
+from startrack.core.errors import BadInput
+from startrack.core.files import file_stem
+from startrack.core.types import Exposure
 from startrack.rendering import Series, Truth, load_sky_catalog
 from startrack.rendering import render as render_scene
 from startrack.terrain import Terrain
-from startrack.types import Exposure
 
 if TYPE_CHECKING:
     from astropy.units import Quantity
     from numpy.typing import ArrayLike
 
-    from startrack.prediction import Prediction
+    from startrack.applications.prediction import Prediction
 
 
 def render(
@@ -103,7 +103,7 @@ def predict(
         BadInput: as `locate`; bad_calibration without a sensor.
         ValueError: positions of another shape, or where no camera can stand.
     """
-    from startrack.prediction import predict_positions
+    from startrack.applications.prediction import predict_positions
 
     first, last = time if isinstance(time, tuple) else (time, time)
     start, end = time_input(first), time_input(last)

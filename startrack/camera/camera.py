@@ -9,8 +9,8 @@ import numpy as np
 from startrack.camera.decentring import Decentring
 from startrack.camera.kannala_brandt import KannalaBrandt
 from startrack.camera.lens import Lens
+from startrack.core.types import Array, Bools, Mask
 from startrack.frames import length_xy, off_axis_rad
-from startrack.types import Array, Bools, Mask
 
 # Body x (forward) = image top = -cam y, body y (left) = +cam x, body z (up) = +cam z: it looks at the zenith.
 ZENITH_MOUNT_R_BODY_CAM = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

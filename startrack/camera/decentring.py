@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.types import Array
+from startrack.core.types import Array
 
 MAX_INVERSION_STEPS = 30
 INVERSION_TOLERANCE_1 = 1e-14  # in focal lengths

@@ -12,10 +12,10 @@ from startrack.camera.camera import MIN_THROUGHPUT_1, ZENITH_MOUNT_R_BODY_CAM, C
 from startrack.camera.decentring import Decentring
 from startrack.camera.lens import Lens
 from startrack.camera.lenses import default_lens, lens_kinds
-from startrack.declaration import Choice, Flag, List, Number, Table, Text
-from startrack.files import relative_path, write_atomically
+from startrack.core.declaration import Choice, Flag, List, Number, Table, Text
+from startrack.core.files import relative_path, write_atomically
+from startrack.core.types import MAX_PIXELS, Array, BadInput, Mask
 from startrack.frames import R_from_quat_xyzw, quat_xyzw_from_R
-from startrack.types import MAX_PIXELS, Array, BadInput, Mask
 
 UNIT_QUATERNION_1 = 1e-3  # largest error of the length
 MIN_SIGMA = 1e-15  # of a parameter, px or 1; smaller ones count as zero

@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from startrack.camera.lens import Lens, WcsProjection
-from startrack.declaration import Key, List, Number
-from startrack.types import Array
+from startrack.core.declaration import Key, List, Number
+from startrack.core.types import Array
 
 MAX_COEFFICIENTS = 4
 

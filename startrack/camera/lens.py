@@ -14,8 +14,8 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from startrack.declaration import Key, Number
-from startrack.types import Array
+from startrack.core.declaration import Key, Number
+from startrack.core.types import Array
 
 MAX_INVERSION_STEPS = 60  # near the turning point Newton's steps only halve the error
 INVERSION_TOLERANCE_RAD = 1e-15

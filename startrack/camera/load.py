@@ -10,8 +10,8 @@ import numpy as np
 
 from startrack.camera.camera import Camera
 from startrack.camera.io import camera_from_dict
-from startrack.files import FOREIGN_CAMERA_SUFFIXES, parse_toml, printable, read_text, resolve_named
-from startrack.types import BadInput
+from startrack.core.files import FOREIGN_CAMERA_SUFFIXES, parse_toml, printable, read_text, resolve_named
+from startrack.core.types import BadInput
 
 LOG = logging.getLogger(__name__)
 

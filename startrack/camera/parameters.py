@@ -12,7 +12,7 @@ import numpy as np
 
 from startrack.camera.camera import Camera
 from startrack.camera.decentring import Decentring
-from startrack.types import Array
+from startrack.core.types import Array
 
 SQUARE_PIXEL_SIGMA_1 = 1e-7  # relative sigma of fx / fy where they are fitted as one: just enough for an inverse
 

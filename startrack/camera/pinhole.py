@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from startrack.camera.lens import Lens, WcsProjection
-from startrack.types import Array
+from startrack.core.types import Array
 
 MAX_ANGLE_RAD = 1.57  # 89.95 degrees: beyond this the tangent is no radius
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from startrack.camera.decentring import Decentring
-from startrack.types import Array
+from startrack.core.types import Array
 
 if TYPE_CHECKING:
     from startrack.camera.camera import Camera

@@ -12,6 +12,7 @@ from datetime import datetime
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 
+from startrack.core.types import Array, Body
 from startrack.frames import (
     SPEED_OF_LIGHT_M_S,
     Site,
@@ -21,7 +22,6 @@ from startrack.frames import (
     et_s,
     observer_state,
 )
-from startrack.types import Array, Body
 
 ASTRONOMICAL_UNIT_M = 149_597_870_700.0  # IAU 2012, resolution B2
 _NAIF_SUN = 10

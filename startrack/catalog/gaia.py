@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from startrack.catalog.hipparcos import MAS_RAD, StarCatalog, load_catalog
-from startrack.types import Array, BadInput, Bools, Ints
+from startrack.core.types import Array, BadInput, Bools, Ints
 
 GAIA_EPOCH_YR = 2016.0  # Gaia DR3
 SAME_STAR_RAD = np.radians(6.0 / 3600)  # Hipparcos carried to 2016 agrees to 0.1 arcsec; companions of doubles drop too

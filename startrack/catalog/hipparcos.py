@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from startrack.catalog.names import id_texts, star_names
-from startrack.files import data_dir
+from startrack.core.files import data_dir
+from startrack.core.types import Array, BadInput, Ints, Stars, Value, array
 from startrack.frames import aberrate, as_utc
-from startrack.types import Array, BadInput, Ints, Stars, Value, array
 
 HIPPARCOS_EPOCH_YR = 1991.25  # J1991.25 (TT), ESA SP-1200 (1997), vol. 1
 ANGLE_UNIT_RAD = 2 * np.pi / 2**32  # of the file's ra and dec columns

@@ -9,8 +9,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.files import data_dir
-from startrack.types import Ints
+from startrack.core.files import data_dir
+from startrack.core.types import Ints
 
 
 @lru_cache(maxsize=1)

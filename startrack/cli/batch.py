@@ -23,13 +23,13 @@ from startrack.cli.common import (
 )
 from startrack.cli.flag_types import positive_count
 from startrack.cli.preparation import compile_kernels, prepare_reference
-from startrack.compilation import is_compiled
-from startrack.errors import INTERNAL_ERROR, BadInput
-from startrack.files import make_folder
+from startrack.core.compilation import is_compiled
+from startrack.core.errors import INTERNAL_ERROR, BadInput
+from startrack.core.files import make_folder
 
 if TYPE_CHECKING:
-    from startrack.batch import Image, ImageDone, Task
-    from startrack.runner import Runner
+    from startrack.applications.batch import Image, ImageDone, Task
+    from startrack.core.runner import Runner
 
 OK, FAULT, STOPPED = 0, 1, 5
 SCHEMES = ("", "tcp", "tls", "ucx", "ws", "wss")  # of Dask's addresses
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     """0 if every image is solved, 5 if some are not or the run was stopped, 1 after an internal error."""
     if args.cluster is not None and find_spec("distributed") is None:
         args.usage_error("--cluster needs distributed: pip install '.[cluster]' in a clone of startrack")
-    from startrack.batch import lock_results
+    from startrack.applications.batch import lock_results
 
     facts = absolute_facts(args)
     check_localizer(args)
@@ -93,8 +93,8 @@ def _run(
     found: Sequence[Image], whole: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace
 ) -> int:
     """Locate the images `found` and write the tables of the `whole` folder; the exit code."""
-    from startrack.batch import has_parquet, locate_image
-    from startrack.runner import Runner
+    from startrack.applications.batch import has_parquet, locate_image
+    from startrack.core.runner import Runner
 
     _check_ownership(out, whole, args)
     tasks = _tasks(found, out, facts, args)
@@ -144,8 +144,8 @@ def _locate_all(
     runner: Runner[Task, ImageDone], tasks: Sequence[Task], counts: Counts, halt: Halt, args: argparse.Namespace
 ) -> tuple[list[dict[str, Any]], str | None]:
     """Table values of each image that was done, and the cause if not all were."""
-    from startrack.batch import locate_images, table_values
-    from startrack.runner import RunStopped
+    from startrack.applications.batch import locate_images, table_values
+    from startrack.core.runner import RunStopped
 
     records: list[dict[str, Any]] = []
     try:
@@ -164,7 +164,7 @@ def _locate_all(
 
 
 def _check_ownership(out: Path, images: Sequence[Image], args: argparse.Namespace) -> None:
-    from startrack.batch import belongs_to_other_images
+    from startrack.applications.batch import belongs_to_other_images
 
     if not args.overwrite and belongs_to_other_images(out, images):
         args.usage_error(
@@ -174,7 +174,7 @@ def _check_ownership(out: Path, images: Sequence[Image], args: argparse.Namespac
 
 
 def _tasks(found: Sequence[Image], out: Path, facts: dict[str, Any], args: argparse.Namespace) -> list[Task]:
-    from startrack.batch import Task, record_path
+    from startrack.applications.batch import Task, record_path
 
     here = Path(os.path.abspath(out))
     return [
@@ -196,7 +196,7 @@ def _prepare(task: Task, args: argparse.Namespace) -> None:
 
 def _terrain_of(task: Task) -> str | None:
     """Reference of the terrain of an image."""
-    from startrack.batch import read_task
+    from startrack.applications.batch import read_task
 
     if task.facts.get("terrain"):
         return str(task.facts["terrain"])
@@ -212,7 +212,7 @@ def _write_tables(
 
     Raises BadInput if they cannot be written.
     """
-    from startrack.batch import table_rows, write_tables
+    from startrack.applications.batch import table_rows, write_tables
 
     found = table_rows(tasks, {record["image"]: record for record in records}, os.path.abspath(out))
     write_tables(out, found.rows, settings)

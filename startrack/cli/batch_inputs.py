@@ -10,18 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.common import flag_facts
-from startrack.errors import BadInput
-from startrack.files import is_path
+from startrack.core.errors import BadInput
+from startrack.core.files import is_path
 
 if TYPE_CHECKING:
-    from startrack.batch import Image
+    from startrack.applications.batch import Image
 
 IMAGE_FLAGS = ("mask", "dark", "flat")
 
 
 def find_images(args: argparse.Namespace) -> tuple[Sequence[Image], Sequence[Image]]:
     """The images to locate, and all images of the folder or bag. Raises BadInput (bad_image) where there is none."""
-    from startrack.batch import images_of_bag, images_under, listed_images
+    from startrack.applications.batch import images_of_bag, images_under, listed_images
     from startrack.exposure import is_bag
 
     of_bag = is_bag(args.folder)

@@ -15,10 +15,10 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.progress import progress
-from startrack.errors import EXIT_BAD_INPUT, INTERNAL_ERROR, exit_code_of
+from startrack.core.errors import EXIT_BAD_INPUT, INTERNAL_ERROR, exit_code_of
 
 if TYPE_CHECKING:
-    from startrack.batch import Rows
+    from startrack.applications.batch import Rows
 
 SHOWN = ("ok", "ambiguous", "refused", "error")
 FINISHING = b"\nstartrack: finishing the images in progress; a second Ctrl-C drops them\n"

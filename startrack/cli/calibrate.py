@@ -15,15 +15,15 @@ from startrack.cli.calibration_files import check_camera_output, write_camera, w
 from startrack.cli.common import DEFAULT_OUT, add_pixel_flags, print_advice, read
 from startrack.cli.flag_types import amount, field_of_view_rad, number, positive_number, seconds
 from startrack.cli.progress import progress
-from startrack.compilation import announce_compilation
-from startrack.errors import NoSolution, exit_code_of
+from startrack.core.compilation import announce_compilation
+from startrack.core.errors import NoSolution, exit_code_of
 
 if TYPE_CHECKING:
-    from startrack.calibration import Calibration, KnownSensor
+    from startrack.applications.calibration import Calibration, KnownSensor
     from startrack.camera import Camera
-    from startrack.declaration import Key
+    from startrack.core.declaration import Key
+    from startrack.core.types import Exposure, Mask
     from startrack.frames import Site
-    from startrack.types import Exposure, Mask
 
 
 def add_parser(subparsers: Any) -> None:
@@ -95,8 +95,8 @@ def add_print_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate; the exit code."""
-    from startrack.calibration import calibrate
-    from startrack.calibration.record import refusal_dict
+    from startrack.applications.calibration import calibrate
+    from startrack.applications.calibration.record import refusal_dict
     from startrack.catalog import load_catalog
 
     if args.time is not None and len(args.images) > 1:
@@ -138,7 +138,7 @@ def check_name(args: argparse.Namespace) -> None:
 
 def _known_sensor(args: argparse.Namespace) -> KnownSensor:
     """The sensor's properties given by flags, within the limits of camera files; else a usage error."""
-    from startrack.calibration import KnownSensor
+    from startrack.applications.calibration import KnownSensor
     from startrack.camera.io import SENSOR
 
     flags = {"gain_e_per_adu": "--gain", "read_noise_e": "--read-noise", "bias_adu": "--bias"}
@@ -161,8 +161,8 @@ def checked_flag(args: argparse.Namespace, key: Key, value: Any, flag: str) -> A
 
 def _write_calibration(args: argparse.Namespace, out: Path, found: Calibration, masks: list[str | Mask | None]) -> int:
     """Write and print a calibration of images with `masks`; the exit code."""
-    from startrack.calibration.record import calibration_dict, summary
-    from startrack.calibration.report import write_report
+    from startrack.applications.calibration.record import calibration_dict, summary
+    from startrack.applications.calibration.report import write_report
 
     record, line = calibration_dict(found), summary(found, out.name)
     line += f"\n  {record['message']}" if record["message"] else ""

@@ -9,7 +9,7 @@ from startrack.cli.calibrate import add_camera_output_flags, check_name, print_o
 from startrack.cli.calibration_files import check_camera_output, remove_former, write_record
 from startrack.cli.common import read
 from startrack.cli.flag_types import number
-from startrack.errors import NoSolution
+from startrack.core.errors import NoSolution
 
 MIN_SIDE, MAX_SIDE = 3, 100
 
@@ -33,8 +33,8 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate with the board; the exit code."""
-    from startrack.calibration.board import board_dict, board_line, calibrate_board
-    from startrack.calibration.board_pose import Board
+    from startrack.applications.calibration.board import board_dict, board_line, calibrate_board
+    from startrack.applications.calibration.board_pose import Board
     from startrack.camera import save_camera
 
     try:

@@ -9,11 +9,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.files import check_output, write_atomically
+from startrack.core.files import check_output, write_atomically
 
 if TYPE_CHECKING:
-    from startrack.calibration import Calibration
-    from startrack.types import Array, Bools, Mask
+    from startrack.applications.calibration import Calibration
+    from startrack.core.types import Array, Bools, Mask
 
 RECORD = ".calibration.json"
 REPORTS = (".report.html", ".report.png")
@@ -41,7 +41,7 @@ def check_camera_output(args: argparse.Namespace) -> Path:
 
 def has_site(camera_file: Path) -> bool | None:
     """Whether the record beside a camera file states a site on the Earth; None where no record states that."""
-    from startrack.calibration.record import REFRACTION_REMOVED
+    from startrack.applications.calibration.record import REFRACTION_REMOVED
 
     refraction = _recorded(camera_file, "lens", "refraction")
     return None if refraction is None else bool(refraction == REFRACTION_REMOVED)
@@ -99,8 +99,8 @@ def _write_proposed_mask(camera_file: Path, obstructed: Bools) -> str:
     """Write CAMERA.mask.png beside the camera file; the line that explains its use."""
     import numpy as np
 
+    from startrack.core.types import Exposure
     from startrack.exposure import write_exposure
-    from startrack.types import Exposure
 
     path = camera_file.with_suffix(MASK)
     pixels = np.where(obstructed, 0.0, 255.0).astype(np.float32)

@@ -22,7 +22,7 @@ from startrack.cli.calibrate import (
 from startrack.cli.calibration_files import has_site, output_path
 from startrack.cli.common import DEFAULT_OUT, read
 from startrack.cli.flag_types import calibrated_angle_rad
-from startrack.errors import BadInput, NoSolution
+from startrack.core.errors import BadInput, NoSolution
 
 FORMATS = ("ros", "kalibr", "colmap", "opencv")
 DEFAULT_NAMES = {"colmap": "cameras.txt", "kalibr": "camchain.yaml"}  # of the other programs
@@ -68,7 +68,7 @@ def _add_action(subparsers: Any, action: str, description: str) -> argparse.Argu
 
 def run_show(args: argparse.Namespace) -> int:
     """Print the contents of camera files; 0."""
-    from startrack.calibration.record import camera_properties, camera_text
+    from startrack.applications.calibration.record import camera_properties, camera_text
     from startrack.camera import load_camera
 
     for name in args.cameras:
@@ -83,7 +83,7 @@ def run_convert(args: argparse.Namespace) -> int:
     from startrack.camera.convert import from_text, to_text
     from startrack.camera.convert.intrinsics import decentring_rms_px
     from startrack.camera.io import camera_text
-    from startrack.files import file_stem, read_text, write_atomically
+    from startrack.core.files import file_stem, read_text, write_atomically
 
     check_name(args)
     if args.to is not None:
@@ -113,10 +113,10 @@ def run_convert(args: argparse.Namespace) -> int:
 
 def run_verify(args: argparse.Namespace) -> int:
     """Check a camera file against exposures of the stars; the exit code of the worst."""
-    from startrack.calibration.verify import verify, verify_dict, verify_line
+    from startrack.applications.calibration.verify import verify, verify_dict, verify_line
     from startrack.camera import load_camera
     from startrack.catalog import load_catalog
-    from startrack.files import resolve_named
+    from startrack.core.files import resolve_named
 
     worst = 0
     for path in args.images:

@@ -12,16 +12,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.flag_types import position_prior, seconds, time_sigma_s
-from startrack.errors import INTERNAL_ERROR, BadInput, BadOutput, exit_code_of, next_step
-from startrack.files import make_folder
+from startrack.core.errors import INTERNAL_ERROR, BadInput, BadOutput, exit_code_of, next_step
+from startrack.core.files import make_folder
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
-    from startrack.types import Exposure
+    from startrack.core.types import Exposure
 
 DEFAULT_OUT = "startrack-out"
 DEFAULT_LOCALIZER = "posterior"
-EVIDENCE_SOURCES = ("both", "stars", "sky")  # as startrack.stages has them; written here so that help is quick
+EVIDENCE_SOURCES = ("both", "stars", "sky")  # as startrack.chain.stages has them; written here so that help is quick
 
 
 def add_image_flags(parser: argparse.ArgumentParser) -> None:
@@ -166,7 +166,7 @@ def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, s
     A BadInput or an internal error of one image is its outcome and does not stop the others.
     """
     codes = [0]
-    from startrack.batch.find import result_stems
+    from startrack.applications.batch.find import result_stems
     from startrack.exposure import split_bag_path
 
     if args.image_topic is not None and not any(split_bag_path(path) for path in args.images):

@@ -29,9 +29,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _detect_image(path: str, stem: str, args: argparse.Namespace) -> Outcome:
+    from startrack.chain.pipeline import detect
+    from startrack.chain.run import with_timing
     from startrack.output import summary_line, write_results
-    from startrack.pipeline import detect
-    from startrack.run import with_timing
 
     start = time.perf_counter()
     exposure = read(path, args)

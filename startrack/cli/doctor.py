@@ -112,7 +112,7 @@ def _catalogue() -> str:
 
 def _check_shipped_files(kind: str) -> str:
     from startrack.camera import load_camera
-    from startrack.files import data_dir
+    from startrack.core.files import data_dir
     from startrack.terrain import load_terrain
 
     names = sorted(path.stem for path in data_dir(kind).glob("*.toml"))
@@ -150,9 +150,9 @@ def _self_test() -> str:
 
     from startrack.camera import load_camera
     from startrack.catalog import load_catalog
-    from startrack.pipeline import locate
+    from startrack.chain.pipeline import locate
+    from startrack.chain.stages import Refused
     from startrack.rendering import Series, render
-    from startrack.stages import Refused
     from startrack.terrain import load_terrain
 
     terrain, camera, catalog = load_terrain("shackleton-thesis"), load_camera("fisheye-2048"), load_catalog()

@@ -73,7 +73,7 @@ def trajectory_paths(args: argparse.Namespace) -> list[Path]:
 
 def write_trajectories(args: argparse.Namespace, series: Series, poses: Sequence[Pose]) -> None:
     """Write the true `poses` of the series and, of a drive, its odometry, as TUM text with the stated times."""
-    from startrack.files import write_atomically
+    from startrack.core.files import write_atomically
     from startrack.frames import tum_line
 
     def text(position_m: Any, R_frame_body: Any) -> str:

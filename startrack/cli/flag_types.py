@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 
-from startrack.declaration import LARGEST, SHOWN_CHARS
+from startrack.core.declaration import LARGEST, SHOWN_CHARS
 
 MAX_EXPOSURE_S = 1e6  # as startrack.exposure.sidecar has it; written here so that help is quick
 MAX_COUNT = 1_000_000

@@ -12,12 +12,12 @@ from startrack.cli.calibrate import approximate_camera, print_outcome, site_of
 from startrack.cli.common import add_fact_flags, add_output_flags, read
 from startrack.cli.flag_types import field_of_view_rad
 from startrack.cli.progress import progress
-from startrack.errors import BadInput, BadOutput, NoSolution
+from startrack.core.errors import BadInput, BadOutput, NoSolution
 
 if TYPE_CHECKING:
+    from startrack.applications.horizon import LeftOut, SkylineResult
+    from startrack.core.types import Exposure
     from startrack.frames import Site
-    from startrack.horizon import LeftOut, SkylineResult
-    from startrack.types import Exposure
 
 FORMAT = "startrack.horizon/1"
 
@@ -62,10 +62,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _measure(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     """The record and the line of a skyline that was measured and written."""
+    from startrack.applications.horizon.frames import orient_frames
+    from startrack.applications.horizon.measure import measure_frames
+    from startrack.applications.horizon.write import check_output, needs_all_azimuths, write_skyline
     from startrack.catalog import load_catalog
-    from startrack.horizon.frames import orient_frames
-    from startrack.horizon.measure import measure_frames
-    from startrack.horizon.write import check_output, needs_all_azimuths, write_skyline
 
     check_output(args.output, overwrite=args.overwrite)
     exposures = [read(path, args) for path in args.images]

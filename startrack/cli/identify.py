@@ -63,15 +63,15 @@ def run(args: argparse.Namespace) -> int:
 
 def _identify_image(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     from startrack.catalog import load_catalog
+    from startrack.chain.pipeline import identify, identify_blind
+    from startrack.chain.run import with_timing
+    from startrack.chain.stages import Oriented, Refused
     from startrack.output import (
         lens_text,
         summary_line,
         verbose_text,
         write_results,
     )
-    from startrack.pipeline import identify, identify_blind
-    from startrack.run import with_timing
-    from startrack.stages import Oriented, Refused
 
     start = time.perf_counter()
     exposure = read(path, args)

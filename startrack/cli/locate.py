@@ -20,7 +20,7 @@ from startrack.cli.flag_types import geo_formats
 from startrack.cli.preparation import prepare_reference
 
 if TYPE_CHECKING:
-    from startrack.pipeline import Settings
+    from startrack.chain.pipeline import Settings
 
 FORMAT = "startrack.fix/1"
 
@@ -58,8 +58,8 @@ def run(args: argparse.Namespace) -> int:
             "a position needs the lens better than --fov finds it: make a camera file with startrack calibrate "
             f"--fov {args.fov} IMAGE... -o CAMERA.toml, then startrack locate -c CAMERA.toml"
         )
-    from startrack.pipeline import Settings
-    from startrack.prior import PositionPrior
+    from startrack.chain.pipeline import Settings
+    from startrack.core.prior import PositionPrior
 
     check_localizer(args)
     near = None if args.near is None else PositionPrior(*args.near)
@@ -73,10 +73,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _locate_image(path: str, stem: str, args: argparse.Namespace, settings: Settings) -> Outcome:
+    from startrack.chain.pipeline import locate_exposure
+    from startrack.chain.run import with_timing
     from startrack.output import summary_line, verbose_text, write_geo, write_results
     from startrack.output.explain import explain
-    from startrack.pipeline import locate_exposure
-    from startrack.run import with_timing
 
     start = time.perf_counter()
     exposure = read(path, args)

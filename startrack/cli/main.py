@@ -18,8 +18,8 @@ from typing import Any
 
 from startrack import __version__
 from startrack.cli.common import print_advice
-from startrack.errors import BadInput, BadOutput, NoSolution
-from startrack.files import FULL_DISK
+from startrack.core.errors import BadInput, BadOutput, NoSolution
+from startrack.core.files import FULL_DISK
 
 COMMANDS = (
     "locate", "batch", "track", "identify", "detect", "render", "calibrate", "horizon", "predict", "report",

@@ -6,10 +6,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from startrack.errors import BadInput
+from startrack.core.errors import BadInput
 
 if TYPE_CHECKING:
-    from startrack.tracking import Odometry
+    from startrack.applications.tracking import Odometry
 
 
 class OdometryFile:
@@ -38,7 +38,7 @@ class OdometryFile:
         self._has_ended, self._read = True, None
 
     def _parse(self) -> Odometry:
-        from startrack.tracking import read_odometry
+        from startrack.applications.tracking import read_odometry
 
         if self._has_ended:
             with suppress(BadInput):

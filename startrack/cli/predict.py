@@ -15,16 +15,16 @@ from startrack.cli.drive import ODOMETRY_FLOOR_M
 from startrack.cli.flag_types import amount, count, magnitude, positive_count, positive_number, seconds
 from startrack.cli.preparation import compile_kernels, prepare
 from startrack.cli.progress import Progress, progress
-from startrack.compilation import is_compiled
-from startrack.files import is_path, make_folder
+from startrack.core.compilation import is_compiled
+from startrack.core.files import is_path, make_folder
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from contextlib import AbstractContextManager
 
-    from startrack.prediction import Conditions
-    from startrack.prediction.report import OdometryErrors, Report
-    from startrack.prediction.run import Predictions
+    from startrack.applications.prediction import Conditions
+    from startrack.applications.prediction.report import OdometryErrors, Report
+    from startrack.applications.prediction.run import Predictions
 
 STOPPED = 5
 MAX_DRAWS = 1000
@@ -88,10 +88,10 @@ def _add_run(group: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Predict, write the files and print the summary; 0, or 5 if the run was stopped."""
     _check_flags(args)
-    from startrack.prediction.report import Report, write_report
-    from startrack.prediction.run import Predictions
-    from startrack.prediction.store import draw_store
-    from startrack.runner import RunStopped
+    from startrack.applications.prediction.report import Report, write_report
+    from startrack.applications.prediction.run import Predictions
+    from startrack.applications.prediction.store import draw_store
+    from startrack.core.runner import RunStopped
 
     conditions, inputs = _conditions(args), _inputs(args)
     report = Report.begin(conditions, inputs, _places(args, conditions))
@@ -159,7 +159,7 @@ def _check_flags(args: argparse.Namespace) -> None:
 
 
 def _odometry(args: argparse.Namespace) -> OdometryErrors:
-    from startrack.prediction.report import OdometryErrors
+    from startrack.applications.prediction.report import OdometryErrors
 
     floor_m = ODOMETRY_FLOOR_M if args.odometry_floor is None else args.odometry_floor
     return OdometryErrors(args.odometry_sigma, floor_m)
@@ -167,8 +167,8 @@ def _odometry(args: argparse.Namespace) -> OdometryErrors:
 
 def _conditions(args: argparse.Namespace) -> Conditions:
     """Raises BadInput: no_time, no_calibration, bad_calibration, bad_terrain."""
+    from startrack.applications.prediction import Conditions, evenly_spaced
     from startrack.frames import parse_utc
-    from startrack.prediction import Conditions, evenly_spaced
 
     first, slash, last = args.time.partition("/")
     start = parse_utc(first)
@@ -185,7 +185,7 @@ def _conditions(args: argparse.Namespace) -> Conditions:
 
 def _places(args: argparse.Namespace, conditions: Conditions) -> Any:
     """The cells of the area, or the points of the path."""
-    from startrack.prediction import area_cells, default_spacing_m, path_points
+    from startrack.applications.prediction import area_cells, default_spacing_m, path_points
     from startrack.terrain import load_terrain
 
     terrain = load_terrain(conditions.terrain)
@@ -199,7 +199,7 @@ def _places(args: argparse.Namespace, conditions: Conditions) -> Any:
 
 def _inputs(args: argparse.Namespace) -> tuple[tuple[str, str], ...]:
     """Name and SHA-256 of the files that the flags name, and of the maps that these name."""
-    from startrack.batch.fingerprint import input_hashes
+    from startrack.applications.batch.fingerprint import input_hashes
 
     references = [_reference(one) for one in (args.camera, args.terrain, args.compare) if one is not None]
     found = input_hashes(os.path.join(args.dir, "predict.json"), references)

@@ -10,8 +10,8 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from startrack.cli.progress import progress
-from startrack.compilation import announce_compilation
-from startrack.errors import BadInput
+from startrack.core.compilation import announce_compilation
+from startrack.core.errors import BadInput
 
 if TYPE_CHECKING:
     from startrack.terrain import Terrain
@@ -48,8 +48,8 @@ def compile_kernels(terrain: Terrain) -> None:
     """Compile the kernels of a fix on this terrain, by one fix from an ideal skyline seen from the origin."""
     import numpy as np
 
+    from startrack.core.types import Evidence, NotLocated
     from startrack.localization import ExactPosterior
-    from startrack.types import Evidence, NotLocated
 
     announce_compilation()
     azimuth = np.linspace(0.0, 2 * np.pi, RAYS, endpoint=False)

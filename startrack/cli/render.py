@@ -29,11 +29,11 @@ from startrack.cli.flag_types import (
     seconds,
 )
 from startrack.cli.progress import progress
-from startrack.files import check_output
+from startrack.core.files import check_output
 
 if TYPE_CHECKING:
+    from startrack.core.types import Exposure
     from startrack.rendering import Drive, Scene, Series, Truth
-    from startrack.types import Exposure
 
 SUFFIXES = {"png": ".png", "tiff": ".tif", "fits": ".fits"}
 KNOWN_SUFFIXES = {".png", ".tif", ".tiff", ".fits", ".fit", ".fts"}
@@ -206,7 +206,7 @@ def _render_one(args: argparse.Namespace, series: Series, number: int, image: Pa
 
 def _with_stated_clock(exposure: Exposure, args: argparse.Namespace) -> Exposure:
     """The exposure with `--time-sigma`; without it a right clock is exact, and nothing is stated of a wrong one."""
-    from startrack.types import TIME_SIGMA_S
+    from startrack.core.types import TIME_SIGMA_S
 
     if args.time_sigma is None and args.clock_offset == 0.0:
         return exposure

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.flag_types import count
-from startrack.errors import BadInput
-from startrack.files import check_output, existing_folder
+from startrack.core.errors import BadInput
+from startrack.core.files import check_output, existing_folder
 
 if TYPE_CHECKING:
     from startrack.output.html import Found
@@ -77,7 +77,7 @@ def write_page_of(
 
 def _select_tabled(out: str, found: list[Found]) -> list[Found]:
     """The results without results of a batch that its tables lack; a line on stderr names these."""
-    from startrack.batch import JOB, tabled_results
+    from startrack.applications.batch import JOB, tabled_results
 
     known = tabled_results(Path(out))
     if known is None:
@@ -98,7 +98,7 @@ def write_page_of_images(out: str, images: Sequence[str]) -> None:
 
     An image that could not be read has no result to show.
     """
-    from startrack.batch.find import result_stems
+    from startrack.applications.batch.find import result_stems
 
     results = [path for stem in result_stems(images) if (path := Path(out) / f"{stem}.fix.json").is_file()]
     if len(images) == 1 and results:

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli.common import DEFAULT_OUT, cores
 from startrack.cli.flag_types import count, positive_count
 from startrack.cli.progress import progress
-from startrack.compilation import announce_compilation
-from startrack.files import make_folder
+from startrack.core.compilation import announce_compilation
+from startrack.core.files import make_folder
 
 if TYPE_CHECKING:
-    from startrack.reproduction import Artefact
+    from startrack.applications.reproduction import Artefact
 
-# The keys of startrack.reproduction.ARTEFACTS, whose import would load numpy.
+# The keys of startrack.applications.reproduction.ARTEFACTS, whose import would load numpy.
 NAMES = (
     "table3.1", "fig3.3", "fig3.4", "fig3.5", "fig3.6", "fig3.7", "fig3.8", "fig3.9", "fig3.10", "figA.1", "figA.2",
     "figB", "magnitude", "aspect",
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     _require_extra(args, "matplotlib", "plots", "figures need", unless=args.no_plots)
     _require_extra(args, "distributed", "cluster", "--cluster needs", unless=args.cluster is None)
 
-    from startrack.reproduction import ARTEFACTS, FULL, QUICK, ChunkStore, Context, write_artefact
+    from startrack.applications.reproduction import ARTEFACTS, FULL, QUICK, ChunkStore, Context, write_artefact
 
     out, size = make_folder(args.dir), FULL if args.full else QUICK
     announce_compilation()

@@ -20,8 +20,8 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a schema; 0, or a usage error for an unknown kind."""
+    from startrack.applications.tracking.schema import TRACK
     from startrack.output.schema import SCHEMAS
-    from startrack.tracking.schema import TRACK
 
     schemas = {**SCHEMAS, "track": TRACK}
     if args.name is None:

@@ -14,8 +14,8 @@ from startrack.cli.common import DEFAULT_OUT
 from startrack.cli.preparation import prepare
 from startrack.cli.terrain_facts import facts_of, lines_of, view_facts
 from startrack.cli.terrain_state import add_state_parser, state_terrain
-from startrack.compilation import announce_compilation
-from startrack.files import check_output, file_stem, make_folder
+from startrack.core.compilation import announce_compilation
+from startrack.core.files import check_output, file_stem, make_folder
 
 if TYPE_CHECKING:
     from startrack.terrain import Terrain

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from math import degrees
 from typing import TYPE_CHECKING, Any
 
-from startrack.errors import BadInput
+from startrack.core.errors import BadInput
 
 if TYPE_CHECKING:
     from startrack.frames import Site

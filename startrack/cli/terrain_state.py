@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.flag_types import amount
-from startrack.errors import BadInput
-from startrack.files import parse_toml, printable, read_text, resolve_named, write_atomically
+from startrack.core.errors import BadInput
+from startrack.core.files import parse_toml, printable, read_text, resolve_named, write_atomically
 
 if TYPE_CHECKING:
     from startrack.terrain.state_file import StateableError

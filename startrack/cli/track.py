@@ -56,9 +56,9 @@ def run(args: argparse.Namespace) -> int:
     """Estimate and write the track; the exit code of its worst image."""
     _check_flags(args)
     _check_frames(args)
-    from startrack.pipeline import Settings
-    from startrack.tracking.frame_store import FrameStore
-    from startrack.tracking.session import TrackSession
+    from startrack.applications.tracking.frame_store import FrameStore
+    from startrack.applications.tracking.session import TrackSession
+    from startrack.chain.pipeline import Settings
 
     _check_folder(args)
     session = TrackSession(
@@ -86,8 +86,8 @@ def _check_flags(args: argparse.Namespace) -> None:
 
 def _check_frames(args: argparse.Namespace) -> None:
     """Raises BadInput (bad_image) where no path of FRAMES exists; one missing image of several is refused later."""
-    from startrack.errors import BadInput
-    from startrack.files import printable
+    from startrack.core.errors import BadInput
+    from startrack.core.files import printable
 
     if not any(os.path.exists(path) for path in args.frames):
         raise BadInput(
@@ -98,8 +98,8 @@ def _check_frames(args: argparse.Namespace) -> None:
 
 def _check_folder(args: argparse.Namespace) -> None:
     """Make the folder of the results. Raises BadOutput where it holds the track of other images, and not -O."""
-    from startrack.errors import BadOutput
-    from startrack.files import make_folder
+    from startrack.core.errors import BadOutput
+    from startrack.core.files import make_folder
 
     out = Path(args.dir)
     make_folder(out)

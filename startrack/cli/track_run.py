@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli.odometry_file import OdometryFile
 from startrack.cli.preparation import prepare_reference
 from startrack.cli.progress import progress
-from startrack.errors import EXIT_BAD_INPUT, EXIT_STOPPED, BadInput, exit_code_of
+from startrack.core.errors import EXIT_BAD_INPUT, EXIT_STOPPED, BadInput, exit_code_of
 
 if TYPE_CHECKING:
-    from startrack.tracking import ObservedFrame, Odometry, Track
-    from startrack.tracking.session import TrackSession
-    from startrack.types import Exposure
+    from startrack.applications.tracking import ObservedFrame, Odometry, Track
+    from startrack.applications.tracking.session import TrackSession
+    from startrack.core.types import Exposure
 
 Source = tuple[str, "Callable[[], ObservedFrame]"]  # of one image: its name, and what adds it to the track
 QUICK_S = 0.2  # files that take longer are written when no image waits
@@ -59,7 +59,7 @@ class TrackRun:
         """Take images as they come; Ctrl-C and SIGTERM end it, before the first image with the code of a stop."""
         import signal
 
-        from startrack.tracking.follow import follow_images
+        from startrack.applications.tracking.follow import follow_images
 
         former = signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
@@ -108,7 +108,7 @@ class TrackRun:
 
     def _print_newest(self) -> bool:
         """Print a line about each image that has none yet; whether there was one."""
-        from startrack.tracking.quantities import frame_records
+        from startrack.applications.tracking.quantities import frame_records
 
         args, session = self.args, self.session
         before = self._printed
@@ -130,7 +130,7 @@ class TrackRun:
 
     def _paths(self) -> list[str] | None:
         """The image files; None for a bag."""
-        from startrack.batch.find import images_under
+        from startrack.applications.batch.find import images_under
         from startrack.exposure import is_bag
 
         first = Path(self.args.frames[0])
@@ -145,7 +145,7 @@ class TrackRun:
         yield from ((Path(path).name, partial(self._add, path)) for path in paths)
 
     def _exposures_of_bag(self) -> Iterator[Source]:
-        from startrack.tracking import read_bag_exposures
+        from startrack.applications.tracking import read_bag_exposures
 
         for exposure in read_bag_exposures(self.args.frames[0], self.args.image_topic, **self.session.facts):
             yield exposure.name, partial(self._add_exposure, exposure)
@@ -201,7 +201,7 @@ class TrackRun:
         return None if self._moves is None else self._moves.read()
 
     def _write(self, track: Track, pictures: bool = True) -> None:
-        from startrack.tracking.write import write_track
+        from startrack.applications.tracking.write import write_track
 
         args, odometry = self.args, None
         if args.odometry is not None:
@@ -210,9 +210,9 @@ class TrackRun:
         write_track(track, Path(args.dir), odometry=odometry, pictures=made)
 
     def _pictures(self, track: Track) -> dict[str, bytes]:
+        from startrack.applications.tracking.page import track_page
+        from startrack.applications.tracking.picture import draw_track
         from startrack.output.write import png_bytes
-        from startrack.tracking.page import track_page
-        from startrack.tracking.picture import draw_track
 
         args, moves_m = self.args, None
         if args.odometry is not None and not args.at_rest:
@@ -225,7 +225,7 @@ class TrackRun:
         return {"track.png": picture, "track.html": page.encode()}
 
     def _print_frames(self, track: Track) -> None:
-        from startrack.tracking.quantities import frame_records
+        from startrack.applications.tracking.quantities import frame_records
 
         for record in frame_records(track):
             if self.args.json:
@@ -234,7 +234,7 @@ class TrackRun:
                 print(_line(record, ""))
 
     def _print_summary(self, track: Track) -> None:
-        from startrack.tracking.write import track_record
+        from startrack.applications.tracking.write import track_record
 
         if self.args.quiet or self.args.json:
             return

@@ -1,4 +1,4 @@
-"""Detection: exposure to point sources; damage of its noise."""
+"""Exposure to point sources; damage of its noise."""
 
 from startrack.detection.damage import Damage, find_damage
 from startrack.detection.detector import Detector

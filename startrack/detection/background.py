@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.kernels import REORDERED_SUMS, njit
+from startrack.core.kernels import REORDERED_SUMS, njit
 
 BAND_PIXELS = 2**18
 BLOCK_PX = 16  # side of the blocks for a PSF up to 1.5 WIDEST_PX

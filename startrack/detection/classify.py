@@ -7,12 +7,12 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.types import Array, Bools, Ints
 from startrack.detection.deblend import Fitted, own_signal
 from startrack.detection.fit import PointFits, Stamps
 from startrack.detection.frame import Frame, Pixels, SourceNoise
 from startrack.detection.psf_width import BRIGHT_SNR, MIN_BRIGHT_SOURCES
 from startrack.detection.saturated import are_saturated
-from startrack.types import Array, Bools, Ints
 
 WIDTHS_PX = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0)
 HEIGHTS = (5.80, 5.70, 5.54, 5.43, 5.33, 5.18, 5.09)  # measured at USUAL_SKEWNESS: equal rates of false stars

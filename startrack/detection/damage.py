@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
+from startrack.core.types import Array, Exposure, Ints
 from startrack.detection.dead_parts import find_dead_parts
-from startrack.types import Array, Exposure, Ints
 
 TILE_PX, TILES = 16, 16  # side of a sampled tile, and tiles across the image: 65,536 pixels, 2 ms
 MIN_TILES = 16

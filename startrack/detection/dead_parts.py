@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.types import Bools, Mask
 from startrack.detection.background import smallest_step
-from startrack.types import Bools, Mask
 
 TILE_PX, STRIDE_PX = 8, 64  # of the tiles that are looked at first: dead parts of 72 px and more hold one
 MIN_STEPS = 1.0  # standard deviation of the noise, in steps of the values: below it a calm sky has one value too

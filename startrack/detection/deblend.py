@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from startrack.core.types import Array, Ints
 from startrack.detection.fit import ROUNDS, ROUNDS_AGAIN, PointFits, Stamps, concatenate_fits, fit_points
 from startrack.detection.frame import Frame, Pixels, SourceNoise, radius_for
 from startrack.detection.peaks import Peaks
 from startrack.detection.source_noise import measure_source_noise
 from startrack.psf import pixel_profile_single
-from startrack.types import Array, Ints
 
 CROWDED_ROUNDS = 3  # of subtracting neighbours and fitting again
 NEIGHBOUR_SIGMA = 0.1  # of a pixel's noise: a neighbour's signal above this is subtracted

@@ -8,6 +8,7 @@ from math import ceil
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.core.types import Array, Bools, Detections, Exposure, Ints, Mask, TooFewStars
 from startrack.detection.background import background_and_noise, block_side, smallest_step
 from startrack.detection.classify import (
     detection_threshold,
@@ -37,7 +38,6 @@ from startrack.detection.psf_width import WIDTH_TOLERANCE, guess_psf_width, meas
 from startrack.detection.saturated import refit_saturated
 from startrack.detection.streaks import Streaks, are_elongated, find_streaks
 from startrack.exposure import combine_masks, touch_masked
-from startrack.types import Array, Bools, Detections, Exposure, Ints, Mask, TooFewStars
 
 UNKNOWN_WIDTH_PX = 1.2  # first guess where the camera file does not state the width
 FIRST_PASS_LOWER = 1.1  # sigma of the filtered noise: threshold of the stars minus that of the candidates

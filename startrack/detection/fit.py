@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from startrack.core.types import Array, Bools, Ints
 from startrack.detection.frame import Pixels, SourceNoise
-from startrack.types import Array, Bools, Ints
 
 ROUNDS, ROUNDS_AGAIN = 3, 2  # iterations of a first fit, and of a repeated one
 ALL_USABLE = np.zeros((0, 0, 0), dtype=np.bool_)

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from startrack.kernels import REORDERED_SUMS, njit
+from startrack.core.kernels import REORDERED_SUMS, njit
 from startrack.psf import ERF_COEFFICIENTS, ERF_T
 
 MAX_STEP_PX = 0.5

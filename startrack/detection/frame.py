@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
+from startrack.core.types import Bools, Exposure, Ints
 from startrack.detection.background import smallest_step
 from startrack.psf import stamp_radius
-from startrack.types import Bools, Exposure, Ints
 
 Image = NDArray[np.float32]
 Pixels = NDArray[np.floating[Any]]  # stamps, in either precision

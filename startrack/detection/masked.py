@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.kernels import njit
+from startrack.core.types import Bools, TooFewStars
 from startrack.detection.background import BLOCK_PX
-from startrack.kernels import njit
-from startrack.types import Bools, TooFewStars
 
 Image = NDArray[np.float32]
 MIN_GOOD_PX = 64  # of the 256 of a block: a quarter gives its level to an eighth of the noise

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.kernels import njit
+from startrack.core.types import Array, Bools, Ints
 from startrack.detection.background import COARSE_PX, coarse_width, local_level
 from startrack.detection.frame import Frame, Image, radius_for
-from startrack.kernels import njit
 from startrack.psf import filter_kernel
-from startrack.types import Array, Bools, Ints
 
 STRIP_ROWS = 320
 MAX_STAMP_PIXELS = 2_500_000  # of all candidates together: bounds time and memory, for any content of the frame

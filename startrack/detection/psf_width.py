@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from startrack.core.types import Array, Bools, Ints
 from startrack.detection.fit import ROUNDS_AGAIN, PointFits, Stamps, fit_points
 from startrack.detection.frame import Frame, Pixels, radius_for
 from startrack.detection.peaks import bright_pixels, find_peaks
 from startrack.psf import pixel_profile_single
-from startrack.types import Array, Bools, Ints
 
 BRIGHT_SNR = 12.0  # of the sources from which the width is measured
 WIDTH_TOLERANCE = 0.12  # a measured PSF that differs by more than this fraction from the expected one replaces it

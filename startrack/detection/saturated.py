@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from startrack.core.types import Array, Bools
 from startrack.detection.deblend import Fitted
 from startrack.detection.fit import ROUNDS_AGAIN, Stamps, fit_points
-from startrack.types import Array, Bools
 
 WIDTH_FACTORS = (1.15, 1.3, 1.5)  # widths of the wings over the width of the PSF
 POOR_CHI2_PER_DOF = 2.0  # with the PSF's own width; below it no wider one is tried

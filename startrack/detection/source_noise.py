@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from startrack.core.types import Array, Bools, Ints
 from startrack.detection.fit import PointFits, Stamps
 from startrack.detection.frame import MODEL_ERROR, SourceNoise
 from startrack.psf import pixel_profile
-from startrack.types import Array, Bools, Ints
 
 BRIGHT_SNR = 15.0
 MIN_STARS, MAX_STARS = 20, 120

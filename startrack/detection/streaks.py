@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from startrack.core.types import Array, Bools, Ints
 from startrack.detection.frame import Frame
-from startrack.types import Array, Bools, Ints
 
 PIXEL_SIGMAS = 2.5  # of the lightly smoothed image: pixels of a streak
 SMOOTH_PX = 1.0

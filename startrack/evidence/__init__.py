@@ -1,4 +1,4 @@
-"""Evidence: exposure, attitude and catalogue to rays, each with the log-likelihood ratio of sky against ground."""
+"""Exposure, attitude and catalogue to rays, each with the log-likelihood ratio of sky against ground."""
 
 from startrack.evidence.damaged_response import DamagedResponse, measure_noise, measure_response
 from startrack.evidence.flux_scale import FluxScale, flux_scale

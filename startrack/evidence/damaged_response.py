@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.types import Array, Bools, Detections, NoSolution
 from startrack.evidence.likelihood_ratio import visibility_llr
 from startrack.evidence.star_evidence import StarPhotometry
-from startrack.types import Array, Bools, Detections, NoSolution
 
 BLOCK_PX, KEPT_PART = 16, 0.95  # side of the blocks of the noise map; part of their pixels without the brightest
 SMALLEST_NOISE = 0.2  # of the frame's median: of blocks of nearly one value

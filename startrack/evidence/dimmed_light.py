@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.types import Array
+from startrack.core.types import Array
 
 OUTLIERS = 0.02  # least share of stars with any light: variable, blended, beside a defect
 OUTLIER_SIGMAS, SCATTER_ROUNDS = 4.0, 4

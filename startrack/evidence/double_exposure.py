@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.core.types import Array, Bools, NotLocated
 from startrack.evidence.dimmed_light import log_likelihoods, measure_scatter
 from startrack.evidence.star_evidence import StarPhotometry
 from startrack.terrain import Terrain
-from startrack.types import Array, Bools, NotLocated
 
 PRIOR = 1e-3  # that a frame is a double exposure
 DECISIVE = 1e3  # ratio of the weights, with the prior, from which a frame is refused

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
+from startrack.core.types import Array, Body, Ints, Mask, Stars
 from startrack.evidence.flux_scale import FluxScale
 from startrack.evidence.photometry import Sources, half_width
 from startrack.exposure import touch_masked
 from startrack.frames import angle_between_rad, azel_from_rays, off_axis_rad
-from startrack.types import Array, Body, Ints, Mask, Stars
 
 BODY_GLARE_PX = 8.0
 DISKS_RAD = {"Sun": 0.0047, "Moon": 0.0049, "Earth": 0.0180}  # largest radii, the Earth's seen from the Moon

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.types import Array, Detections, Identification, Stars
+from startrack.core.types import Array, Detections, Identification, Stars
 
 BRIGHT_SNR = 15.0
 MIN_STARS = 5

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.types import Array
+from startrack.core.types import Array
 
 MISSING_PROBABILITY = 2e-3  # a visible star is not measured: variable, wrong entry, small obstacle
 ANOMALY_PROBABILITY = 1e-3  # light where the ground is: track, reflection, defect

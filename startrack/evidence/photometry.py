@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.types import Array, Bools, Detections, Ints
 from startrack.psf import pixel_profile_table, stamp_radius
-from startrack.types import Array, Bools, Detections, Ints
 
 PROFILE_SIGMAS = 6.0  # half width of a neighbour's profile: 1e-9 of its light lies beyond
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
 
-from startrack.kernels import REORDERED_SUMS, njit
+from startrack.core.kernels import REORDERED_SUMS, njit
 
 ZERO, ONE, LEAST = np.float32(0.0), np.float32(1.0), np.float32(1e-30)  # literals would be of double precision
 OUTLIER_VARIANCES = np.float32(5.0**2)

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from startrack.core.types import Array, Bools
 from startrack.evidence.sky_levels import LEVEL_SECTORS, SECTORS
 from startrack.evidence.sky_light import SkyLight
 from startrack.evidence.sky_step import MEDIAN_ABS_NORMAL
-from startrack.types import Array, Bools
 
 MIN_SECTORS = 60  # with a step; fewer determine no shift of the skyline
 MIN_STEP_SIGMAS = 8.0  # of the mean step

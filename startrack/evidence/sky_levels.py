@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.core.kernels import njit
+from startrack.core.types import Array, Bools, Ints
 from startrack.evidence.sky_pixels import SkyPixels
 from startrack.evidence.sky_step import MEDIAN_ABS_NORMAL
-from startrack.kernels import njit
-from startrack.types import Array, Bools, Ints
 
 SECTORS = 240  # of 1.5 degrees, as the localizer's
 LEVEL_SIGMAS = 4.0  # of the edge: from here on a pixel shows the sky or the ground alone

@@ -15,12 +15,12 @@ from math import sqrt
 
 import numpy as np
 
+from startrack.core.kernels import njit
+from startrack.core.types import Array, Bools, Evidence
+from startrack.estimation.normal_cdf import normal_cdf
 from startrack.evidence.sky_levels import CLIP_SIGMAS, GROUND, SECTORS, SKY, SkyLevels, measure_levels, sector_of
 from startrack.evidence.sky_pixels import SkyPixels
 from startrack.evidence.sky_step import Horizon
-from startrack.kernels import njit
-from startrack.normal_cdf import normal_cdf
-from startrack.types import Array, Bools, Evidence
 
 HEIGHT_PX = 0.75  # of a cell
 LEVELS = 13  # cells of a sector: up to 4.9 px above and below the predicted skyline

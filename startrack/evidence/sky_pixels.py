@@ -9,12 +9,12 @@ from math import sqrt
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.core.kernels import njit
+from startrack.core.types import Array, Bools, Detections
 from startrack.evidence.sky_step import BAND_PX, SKYLINE_POINTS, Horizon, Skyline, skyline_band
 from startrack.evidence.star_evidence import StarPhotometry, filtered_noise_e
 from startrack.frames import azel_from_rays, off_axis_rad, rays_from_azel
-from startrack.kernels import njit
 from startrack.psf import noise_area_px
-from startrack.types import Array, Bools, Detections
 
 MASKED_SIGMA = 0.4  # light of a known star, in a pixel's noise, from which the pixel is left out
 EDGE_PX = 3.0  # beside the end of the image circle

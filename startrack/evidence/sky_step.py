@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
+from startrack.core.kernels import njit
+from startrack.core.types import Array, Bools, Detections, Ints
 from startrack.frames import azel_from_rays, off_axis_rad, rays_from_azel
-from startrack.kernels import njit
 from startrack.terrain import Terrain
-from startrack.types import Array, Bools, Detections, Ints
 
 BAND_PX = 12.0  # from the skyline to the last pixels that are used; the background model has no sharper edge
 STEP_PX = 0.5

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Camera
+from startrack.core.types import Array, Body, Bools, Detections, Evidence, Ints, Stars
 from startrack.evidence.expected_stars import BAD_PIXELS, USABLE, ExpectedStars, expect_stars
 from startrack.evidence.flux_scale import FluxScale
 from startrack.evidence.likelihood_ratio import gaussian_llr, visibility_llr
 from startrack.evidence.photometry import Photometry, Sources, measure
 from startrack.frames import turn_azel
 from startrack.psf import noise_area_px
-from startrack.types import Array, Body, Bools, Detections, Evidence, Ints, Stars
 
 MIN_SNR = 0.6  # a sixth of the time less than with 0.5; mean errors grow by 2 % (60 frames, with the sky's light)
 MIN_PSF_AREAS_PER_STAR = 2.0  # with more stars in the pixels the same light would be counted twice

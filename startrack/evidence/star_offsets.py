@@ -15,9 +15,9 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.camera.uncertainty import compensating_rotation, lens_jacobian
+from startrack.core.types import Array, Bools
 from startrack.evidence.sky_step import Horizon
 from startrack.frames import azel_from_rays, off_axis_rad, rays_from_azel
-from startrack.types import Array, Bools
 
 NEAR_PX = 60.0  # from the skyline to the stars that are used: five degrees of a 180-degree fisheye
 SAMPLES, STEP_RAD = 360, 1e-3  # around the skyline, and in elevation

@@ -4,7 +4,7 @@
 raw files); `bag.py` and `bag_images.py` read images from ROS bags; `mask.py` reads which pixels count; `correct.py`
 applies dark frame and flat field; `metadata.py` finds time, exposure seconds, camera, terrain, mask, dark frame and
 flat field: in flags, the sidecar (`sidecar.py`) and the header (`header.py`); `write.py` writes images and sidecars.
-A file that cannot be used raises `startrack.types.BadInput` and no other exception.
+A file that cannot be used raises `startrack.core.types.BadInput` and no other exception.
 """
 
 from startrack.exposure.bag import is_bag

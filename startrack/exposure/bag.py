@@ -9,8 +9,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from startrack.errors import BadInput
-from startrack.files import MAX_CAUSE_CHARS, FilePath, printable
+from startrack.core.errors import BadInput
+from startrack.core.files import MAX_CAUSE_CHARS, FilePath, printable
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
 ODOMETRY_TYPES = ("nav_msgs/msg/Odometry",)

@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.errors import BadInput
+from startrack.core.errors import BadInput
+from startrack.core.files import FilePath, printable
+from startrack.core.types import Exposure
 from startrack.exposure.bag import (
     IMAGE_TYPES,
     Message,
@@ -27,8 +29,6 @@ from startrack.exposure.decode_file import decode_bytes
 from startrack.exposure.decoded import Decoded, check_size, grey_float32, largest_value
 from startrack.exposure.metadata import Facts
 from startrack.exposure.read import exposure_of_decoded
-from startrack.files import FilePath, printable
-from startrack.types import Exposure
 
 READING = {"reason": "bad_image", "flag": "--image-topic"}
 NUMBERED = re.compile(r"(?P<bag>.+)#(?P<number>\d{1,9})")

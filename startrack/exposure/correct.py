@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.correction import Correction
+from startrack.core.correction import Correction
+from startrack.core.files import printable
+from startrack.core.types import BadInput, Bools, Exposure, Mask
 from startrack.exposure.decode_file import decode_file
 from startrack.exposure.header import header_number
 from startrack.exposure.mask import require_size
 from startrack.exposure.mosaic import PHASES
-from startrack.files import printable
-from startrack.types import BadInput, Bools, Exposure, Mask
 
 MIN_SENSITIVITY_1 = 0.05  # of the median: darker pixels of a flat field do not count
 LIT_PERCENTILE = 99.0  # of a flat field: pixels above MIN_SENSITIVITY_1 of this are in the image circle

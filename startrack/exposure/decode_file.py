@@ -7,10 +7,10 @@ import stat
 import warnings
 from pathlib import Path
 
+from startrack.core.files import printable
+from startrack.core.types import BadInput
 from startrack.exposure.decoded import MAX_FILE_BYTES, Decoded, bad_image
 from startrack.exposure.sidecar import RAW_SUFFIXES
-from startrack.files import printable
-from startrack.types import BadInput
 
 PNG = (b"\x89PNG\r\n\x1a\n",)
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.types import MAX_PIXELS, BadInput
+from startrack.core.types import MAX_PIXELS, BadInput
 
 MAX_FILE_BYTES = 8 * MAX_PIXELS + 2**24  # the largest image at the widest pixel type, and its headers
 EXACT_IN_FLOAT32 = 2**24

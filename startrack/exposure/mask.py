@@ -9,9 +9,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
+from startrack.core.files import printable
+from startrack.core.types import Array, BadInput, Bools, Correction, Mask
 from startrack.exposure.decode_file import decode_file
-from startrack.files import printable
-from startrack.types import Array, BadInput, Bools, Correction, Mask
 
 SKY_FROM = 128  # of 255: darker pixels of a mask's file do not count
 LARGEST_VALUE = 255.0  # of an 8-bit file

@@ -8,6 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from startrack.core.types import Exposure, Mask
 from startrack.exposure.header import header_number, header_pattern, header_reference, header_time
 from startrack.exposure.sidecar import (
     NUMBERS,
@@ -18,7 +19,6 @@ from startrack.exposure.sidecar import (
     unknown_key_warnings,
 )
 from startrack.frames.time import as_utc
-from startrack.types import Exposure, Mask
 
 
 @dataclass(frozen=True, kw_only=True)

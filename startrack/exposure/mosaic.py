@@ -17,8 +17,8 @@ from io import BytesIO
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.types import Array
 from startrack.exposure.decoded import Decoded, bad_image, check_size
-from startrack.types import Array
 
 STDERR = 2  # its file descriptor
 Picture = NDArray[np.float32]

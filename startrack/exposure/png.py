@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.compilation import announce_compilation
+from startrack.core.compilation import announce_compilation
 from startrack.exposure.decoded import (
     Decoded,
     bad_image,

@@ -7,8 +7,8 @@ import numpy as np
 from isal import isal_zlib
 from numpy.typing import NDArray
 
+from startrack.core.kernels import njit
 from startrack.exposure.decoded import bad_image
-from startrack.kernels import njit
 
 DAMAGED = "damaged PNG: its picture data cannot be decoded"
 

@@ -9,10 +9,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from startrack.declaration import SHOWN_CHARS, Choice, Number, Table, Text, value_text
-from startrack.files import is_path, printable
+from startrack.core.declaration import SHOWN_CHARS, Choice, Number, Table, Text, value_text
+from startrack.core.files import is_path, printable
+from startrack.core.types import BadInput
 from startrack.frames.time import parse_utc
-from startrack.types import BadInput
 
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 MAX_EXPOSURE_S = 1e6

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.files import check_free, is_path, printable, relative_path, write_atomically
+from startrack.core.types import BadInput, Exposure
 from startrack.exposure.metadata import Facts
 from startrack.exposure.sidecar import sidecars
-from startrack.files import check_free, is_path, printable, relative_path, write_atomically
 from startrack.frames.time import format_utc
-from startrack.types import BadInput, Exposure
 
 PACKED = {".gz": lambda data: gzip.compress(data, compresslevel=1, mtime=0), ".bz2": bz2.compress}
 

@@ -7,9 +7,9 @@ from functools import cache
 
 import numpy as np
 
+from startrack.core.types import Array
 from startrack.frames.spice import et_s
 from startrack.frames.time import seconds_since_2000
-from startrack.types import Array
 
 EARTH_SPIN_RAD_S = 7.292115e-5  # nominal mean angular velocity, IERS Conventions (2010), table 1.2
 _J2000_JD = 2_451_545.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from startrack.types import Array
+from startrack.core.types import Array
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0  # exact, SI
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from startrack.types import Array
+from startrack.core.types import Array
 
 GIMBAL_LOCK_SIN = 1e-9  # body x this close to the vertical: heading and roll rotate about the same axis
 ORTHONORMAL_1 = 1e-6  # largest error of R R^T that still counts as a rotation matrix

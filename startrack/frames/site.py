@@ -9,9 +9,9 @@ from math import isfinite, pi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from startrack.core.types import Array, BadInput
 from startrack.frames.earth import EARTH_SPIN_RAD_S, R_itrs_icrs
 from startrack.frames.spice import R_mcmf_icrs, R_mcmf_icrs_rate_1_s, barycentric_state, et_s
-from startrack.types import Array, BadInput
 
 MOON_RADIUS_M = 1_737_400.0  # sphere of the LOLA maps, IAU 2015
 EARTH_RADIUS_M = 6_378_137.0  # equatorial, WGS 84

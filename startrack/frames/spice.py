@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from startrack.core.types import Array, BadInput
 from startrack.frames.time import format_utc, seconds_since_2000
-from startrack.types import Array, BadInput
 
 # Package to install, its module, file inside it. A later kernel overrides an earlier one.
 _KERNELS = (

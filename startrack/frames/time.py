@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from datetime import UTC, datetime, timedelta
 
-from startrack.types import BadInput
+from startrack.core.types import BadInput
 
 # The suffix only: the date and the time of day before it are left to the standard library.
 _PARTS = re.compile(r"(?P<stamp>\d[\d-]*[Tt ]\d[\d:.,]*)\s?(?P<suffix>[Zz]|[+-][\d:]+)?", re.ASCII)

@@ -5,8 +5,8 @@ Source: Sturm et al. 2012, A benchmark for the evaluation of RGB-D SLAM systems,
 
 from __future__ import annotations
 
+from startrack.core.types import Array
 from startrack.frames.rotations import quat_xyzw_from_R
-from startrack.types import Array
 
 
 def tum_line(time_s: float, position_m: Array, R_frame_body: Array) -> str:

@@ -1,4 +1,4 @@
-"""Identification: which detection is which catalogue star, with a camera file or from a field of view alone."""
+"""Which detection is which catalogue star, with a camera file or from a field of view alone."""
 
 from startrack.identification.centroids import IdentifiedCentroids, identify_centroids
 from startrack.identification.lost_in_space import Identifier

@@ -11,11 +11,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from startrack.false_alarm import PATTERN_MATCHES, expected_false_alarms
+from startrack.core.types import Array, Ints
+from startrack.estimation.false_alarm import PATTERN_MATCHES, expected_false_alarms
 from startrack.frames import wahba
 from startrack.identification.index import CatalogPatterns, Neighbours, PatternIndex, PixelScale
 from startrack.identification.triangles import sides_of_few, triangles
-from startrack.types import Array, Ints
 
 PREFIXES = (0, 7, 10, 14, 20, 28)  # number of brightest detections that form triangles, round by round
 WINDOW_RANKS, NEW_RANKS = 24, 12  # ranks of brightness that form triangles beyond these, and how many of them are new

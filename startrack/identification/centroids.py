@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from startrack.attitude import AttitudeFit, solve_attitude
 from startrack.camera import Camera
+from startrack.core.types import Array, Attitude, Centroids, Identification, Ints, NotIdentified, Stars
+from startrack.estimation.attitude import AttitudeFit, solve_attitude
 from startrack.identification.lost_in_space import Identifier
 from startrack.identification.unknown_lens import identify_unknown_lens
-from startrack.types import Array, Attitude, Centroids, Identification, Ints, NotIdentified, Stars
 
 DEFAULT_SIGMA_PX = 0.3  # centroid error per axis where none is given
 DEFAULT_PSF_SIGMA_PX = 1.0

@@ -9,13 +9,13 @@ from functools import cached_property
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.false_alarm import PATTERN_MATCHES, log_p_value
+from startrack.core.types import Array, Bools, Ints, Stars
+from startrack.estimation.false_alarm import PATTERN_MATCHES, log_p_value
 from startrack.identification.index import separate_bright_stars
 from startrack.identification.proximity_mask import ProximityMask, proximity_mask
 from startrack.identification.radial_lens_family import RadialFamily, angle
 from startrack.identification.region_growing import LensHypothesis
 from startrack.identification.triangles import ShapeIndex, Triangles, shape_index, triad_attitude, triangles
-from startrack.types import Array, Bools, Ints, Stars
 
 HEMISPHERE_SR = 2 * np.pi
 STARS_OF_HEMISPHERE = 200  # pattern stars of the whole sky for a lens with half of it in view

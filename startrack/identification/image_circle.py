@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.types import Array
+from startrack.core.types import Array
 
 REDUCED_SIDE_PX = 160  # longer side of the reduced background
 DIRECTIONS = 72

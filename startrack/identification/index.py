@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.core.types import Array, Ints, Stars
 from startrack.identification.triangles import triangles
-from startrack.types import Array, Ints, Stars
 
 if TYPE_CHECKING:
     from startrack.identification.pairs import PairIndex

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.false_alarm import (
+from startrack.core.types import Array, Bools, Centroids, Identification, Ints, NotIdentified, Stars
+from startrack.estimation.false_alarm import (
     CAP_RADIUS_RAD,
     coincidence_probability,
     density_per_sr,
@@ -16,6 +17,7 @@ from startrack.false_alarm import (
     log_trials,
     probability,
 )
+from startrack.estimation.match import DIMMED_MAG, SIGNIFICANT_SNR, brightness_agreement, upper_median
 from startrack.identification.attitude_search import AttitudeHypothesis, AttitudeSearch
 from startrack.identification.index import CatalogPatterns, PixelScale, patterns_of, pixel_scale_of
 from startrack.identification.refine_attitude import (
@@ -27,8 +29,6 @@ from startrack.identification.refine_attitude import (
     AttitudeRefiner,
     neighbour_radius_px,
 )
-from startrack.match import DIMMED_MAG, SIGNIFICANT_SNR, brightness_agreement, upper_median
-from startrack.types import Array, Bools, Centroids, Identification, Ints, NotIdentified, Stars
 
 MIN_MATCHES = 6
 SMALLEST_RADIUS_PX = 0.5

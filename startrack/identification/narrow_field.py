@@ -8,13 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from startrack.false_alarm import (
+from startrack.core.types import Array, Centroids, Ints, Stars
+from startrack.estimation.false_alarm import (
     PATTERN_MATCHES,
     coincidence_probability,
     density_per_px2,
     log_p_value_bound,
     log_trials,
 )
+from startrack.estimation.match import CandidatePairs, PhotometricScale, match_nearest
 from startrack.identification.hypotheses import ShapePatterns, family_rays, narrow_sizes, patterns_for
 from startrack.identification.index import PerObject
 from startrack.identification.pinhole_view import PinholeView
@@ -31,8 +33,6 @@ from startrack.identification.verify_unknown_lens import (
     significance,
     trusted_radius,
 )
-from startrack.match import CandidatePairs, PhotometricScale, match_nearest
-from startrack.types import Array, Centroids, Ints, Stars
 
 STARS_IN_FIELD, SIDE_OF_FIELD = 24, 0.4  # pattern stars; longest side of their triangles over the field's diameter
 ROUNDS = ((0, 10), (0, 16), (8, 22), (0, 22), (20, 34))  # ranks of brightness whose triangles vote together

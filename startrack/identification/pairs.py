@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.core.types import Array, Ints, Stars
 from startrack.identification.index import separate_bright_stars
-from startrack.types import Array, Ints, Stars
 
 PAIRS_WANTED = 180_000
 DEEPEST = 5000

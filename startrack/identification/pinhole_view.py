@@ -1,7 +1,7 @@
 """View of a narrow field: attitude, focal length and one distortion term of a camera whose axis is the frame's centre.
 
-A state for `startrack.adjust` with closed-form derivatives in the tangential plane, an order of magnitude cheaper than
-those of a general lens.
+A state for `startrack.estimation.adjust` with closed-form derivatives in the tangential plane, an order of magnitude
+cheaper than those of a general lens.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.adjust import Scheme, adjust, cauchy_loss
 from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole
+from startrack.core.types import Array, Bools
+from startrack.estimation.adjust import Scheme, adjust, cauchy_loss
+from startrack.estimation.normal_equations import Observations, Terms, observations_of_image
 from startrack.frames import R_from_rotvec
-from startrack.normal_equations import Observations, Terms, observations_of_image
-from startrack.types import Array, Bools
 
 TANGENT = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)  # series of tan a beyond a: to 1e-7 up to 20 degrees
 STEEPEST_RAD = 1.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.types import Array, Bools
+from startrack.core.types import Array, Bools
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from startrack.camera import Lens
-from startrack.types import Array
+from startrack.core.types import Array
 
 ORTHOGRAPHIC, EQUISOLID, EQUIDISTANT, STEREOGRAPHIC, PINHOLE = -1.0, -0.5, 0.0, 0.5, 1.0
 LINEAR_SHAPE = 1e-4  # below this the law is the equidistant one

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.adjust import CHI2_2DOF_MEDIAN, OUTLIER_CHI2, SMALLEST_EXTRA_PX2
 from startrack.camera import Camera
+from startrack.core.types import Array, Bools, Centroids, Ints
+from startrack.estimation.adjust import CHI2_2DOF_MEDIAN, OUTLIER_CHI2, SMALLEST_EXTRA_PX2
+from startrack.estimation.match import CandidatePairs, PhotometricScale, upper_median
 from startrack.frames import wahba
 from startrack.identification.attitude_search import AttitudeHypothesis
 from startrack.identification.index import CatalogPatterns, pixel_scale_of
-from startrack.match import CandidatePairs, PhotometricScale, upper_median
-from startrack.types import Array, Bools, Centroids, Ints
 
 MIN_MATCHES = 6
 FIRST_GATE_PX, GATE_PX = 3.0, 6.0

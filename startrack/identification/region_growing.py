@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.adjust import Prior, Scheme, State, adjust, cauchy_loss
 from startrack.camera import Camera, KannalaBrandt
 from startrack.camera.lenses import lens_kinds
-from startrack.false_alarm import log_p_value_bound
-from startrack.match import match_mutual
-from startrack.normal_equations import observations_of_image
-from startrack.types import Array, Ints
+from startrack.core.types import Array, Ints
+from startrack.estimation.adjust import Prior, Scheme, State, adjust, cauchy_loss
+from startrack.estimation.false_alarm import log_p_value_bound
+from startrack.estimation.match import match_mutual
+from startrack.estimation.normal_equations import observations_of_image
 
 ROUNDS = 2  # of matching and fitting within a stage
 FEWEST = 5

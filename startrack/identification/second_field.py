@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.core.types import Array, Centroids, Identification, Ints, NotIdentified, NotLocated, Stars
+from startrack.estimation.match import SIGNIFICANT_SNR
 from startrack.identification.lost_in_space import Identifier
-from startrack.match import SIGNIFICANT_SNR
-from startrack.types import Array, Centroids, Identification, Ints, NotIdentified, NotLocated, Stars
 
 LEAST_UNEXPLAINED = 12  # significant sources; untouched frames have 0 to 4
 LEAST_PART = 0.03  # of them, to the identified stars: second exposures of 30 to 50 % had 0.11 to 0.39, ghosts to 0.015

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.types import Array, Ints
+from startrack.core.types import Array, Ints
 
 CELL_LENGTH = 16.0  # range of the logarithm of the size within a cell of the key
 SMALLEST_LOG = -12.0

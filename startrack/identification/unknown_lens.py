@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.adjust import HUBER_WITH_CUT, Scheme, State, adjust
 from startrack.camera import Camera
 from startrack.camera.parameters import with_covariance
-from startrack.false_alarm import probability
+from startrack.core.types import Array, Centroids, Identification, Ints, NotIdentified, Stars
+from startrack.estimation.adjust import HUBER_WITH_CUT, Scheme, State, adjust
+from startrack.estimation.false_alarm import probability
+from startrack.estimation.normal_equations import observations_of_image
 from startrack.identification.hypotheses import (
     HypothesisSearch,
     LensGuess,
@@ -28,8 +30,6 @@ from startrack.identification.narrow_field import NarrowFieldSearch
 from startrack.identification.radial_lens_family import PINHOLE, radius
 from startrack.identification.region_growing import WIDE_STAGES, GrownLens, GrowthStage, grow, prior_of
 from startrack.identification.verify_unknown_lens import VerifiedLens, verify
-from startrack.normal_equations import observations_of_image
-from startrack.types import Array, Centroids, Identification, Ints, NotIdentified, Stars
 
 WIDE_FIELD_RAD = np.radians(100.0)  # from here up, `fov_rad` is the angle of the image circle
 NARROW_FIELD_RAD = np.radians(40.0)  # up to here all lenses are nearly pinholes

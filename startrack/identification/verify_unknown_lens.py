@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.false_alarm import coincidence_probability, density_per_sr, log_p_value, log_trials
-from startrack.identification.region_growing import GrownLens, fit_camera, match_in_view, with_file_lens
-from startrack.match import (
+from startrack.core.types import Array, Bools, Centroids, Ints, Stars
+from startrack.estimation.false_alarm import coincidence_probability, density_per_sr, log_p_value, log_trials
+from startrack.estimation.match import (
     BRIGHTER_MAG,
     DEPTH_BELOW_THRESHOLD_MAG,
     MIN_UNSATURATED,
@@ -19,7 +19,7 @@ from startrack.match import (
     is_isolated,
     match_by_brightness,
 )
-from startrack.types import Array, Bools, Centroids, Ints, Stars
+from startrack.identification.region_growing import GrownLens, fit_camera, match_in_view, with_file_lens
 
 FITS = ((4.0, 200), (2.5, 500), (1.8, 3000))  # gate [px] and number of brightest detections
 GATES_PX = (2.0, 1.5)  # of the matches by brightness

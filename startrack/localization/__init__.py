@@ -1,13 +1,13 @@
-"""Localization: evidence and terrain to a position. Every method is one file and one line in LOCALIZERS."""
+"""Evidence and terrain to a position. Every method is one file and one line in LOCALIZERS."""
 
 from typing import Any, Protocol
 
+from startrack.core.types import Evidence, Fix
 from startrack.localization.clock import clock_at, clock_matters
 from startrack.localization.convex_hull import Hull
 from startrack.localization.posterior import ExactPosterior
 from startrack.localization.pseudo_gradient import PseudoGradient
 from startrack.terrain import Terrain
-from startrack.types import Evidence, Fix
 
 
 class Localizer(Protocol):

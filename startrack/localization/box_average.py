@@ -7,11 +7,11 @@ from math import log
 
 import numpy as np
 
-from startrack.kernels import njit
+from startrack.core.kernels import njit
+from startrack.core.types import Array, Evidence, Ints
 from startrack.localization.prefix_sums import PrefixSums
 from startrack.localization.sector_likelihood import SECTOR_STEP, Sectors
 from startrack.terrain import Terrain, require_bounds
-from startrack.types import Array, Evidence, Ints
 
 NARROWEST_RAD = 1e-6
 TRACED_EVERY = 3  # sectors: a traced horizon costs a hundred times a look-up

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.core.types import Array, NotLocated
 from startrack.localization.explored import Explored, log_sum, split_boxes
 from startrack.localization.initial_guess import CLIMB_NATS, Guess, local_posterior, refine_boxes
 from startrack.localization.likelihood import PositionLikelihood
-from startrack.types import Array, NotLocated
 
 BOXES_AT_ONCE = 2000  # so that memory stays flat
 LOOK_UP_COST = 0.08  # of a bound, in horizons traced

@@ -7,9 +7,9 @@ from datetime import datetime
 
 import numpy as np
 
+from startrack.core.types import Clock, Evidence
 from startrack.frames import R_from_rotvec, Site, sky_rotvec_rad, turn_azel
 from startrack.terrain import Terrain
-from startrack.types import Clock, Evidence
 
 REACH_SIGMAS = 4.0  # of the stated error, to the last time that is tried
 TURN_S = 600.0  # over which the sky's turn is taken

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.core.types import Array, Clock, Evidence, NotLocated
 from startrack.localization.clock import REACH_SIGMAS, duration, turn_evidence
 from startrack.localization.horizon_bias import LinearSolution, at_likeliest_bias
 from startrack.localization.initial_guess import BEAMS, Guess, beam_search
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.terrain import Terrain
-from startrack.types import Array, Clock, Evidence, NotLocated
 
 STEP_RAD = np.radians(0.26)  # of the turn between two times at which a position is searched
 MOST_SCANNED = 250  # of these times: 65 degrees of turn, five days on the Moon

@@ -8,7 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from startrack.fix import Blocked, ClockError, Fix, Mode, ShownError, UnstatedFact
+from startrack.core.fix import Blocked, ClockError, Fix, Mode, ShownError, UnstatedFact
+from startrack.core.types import Array, Ints, NotLocated
 from startrack.localization.explored import Explored
 from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.importance_sampling import moments
@@ -16,7 +17,6 @@ from startrack.localization.integrity import assess_integrity
 from startrack.localization.summary import camera_at, link_points, require_inside
 from startrack.localization.wrong_files import require_files
 from startrack.terrain import Terrain
-from startrack.types import Array, Ints, NotLocated
 
 AMBIGUOUS_MASS = 0.01
 NEGLIGIBLE_MODE = 2e-3  # of the probability: points apart that hold less belong to the nearest mode

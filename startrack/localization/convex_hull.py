@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.core.types import Array, Evidence, Fix, NotLocated
 from startrack.localization.rim_plane import point_fix, stars_on_rim_plane
 from startrack.terrain import Terrain
-from startrack.types import Array, Evidence, Fix, NotLocated
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from startrack.types import Array
+from startrack.core.types import Array
 
 
 class Distribution(Protocol):

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.core.types import Array
 from startrack.localization.sector_moments import SectorMoments
 from startrack.localization.shared_errors import SharedErrors
-from startrack.types import Array
 
 LEAST_INFORMATION = 0.03  # beside that of the prior, from which on a direction is sampled: a sigma smaller by 1.5 %
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from startrack.core.types import Array
 from startrack.terrain import Terrain
-from startrack.types import Array
 
 SMALL_BOX_M = 20.0  # half side up to which boxes are tested for allowed ground point by point
 QUARTERS = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])  # of half a side

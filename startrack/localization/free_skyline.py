@@ -7,10 +7,10 @@ from math import exp, log
 
 import numpy as np
 
-from startrack.kernels import njit
+from startrack.core.kernels import njit
+from startrack.core.types import Array
 from startrack.localization.obstacle_chain import clear_emission
 from startrack.localization.skyline_profiles import Profiles
-from startrack.types import Array
 
 REACH_RAD, NODES, SPREAD = np.radians(12.0), 121, 6.5  # of heights about the map's skyline, closer about it
 ROUGH_RAD = np.radians([0.003, 0.01, 0.03, 0.1])  # mean steps from sector to sector, equally likely

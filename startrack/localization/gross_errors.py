@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from startrack.core.types import Array, Clock
 from startrack.localization.hypothesis import Hypothesis, sample_hypothesis, solve_model
 from startrack.localization.importance_sampling import Gaussian, moments
 from startrack.localization.other_times import is_linear, turned_model, turned_models
 from startrack.localization.skyline_model import SkylineModel
-from startrack.types import Array, Clock
 
 WIDER, LINEAR_PART = 2.0, 0.01  # variance of the first points, in that of the plain and of the linear solution
 GROSS_ROUNDS = (120, 160, 200)

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from startrack.core.types import Array, Evidence
 from startrack.localization.initial_guess import BEAMS, Guess, beam_search
 from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
-from startrack.types import Array, Evidence
 
 NEARBY_M = 40.0  # horizons are prepared that far about a position
 EXPLAINED_NATS = -0.8  # mean over the sectors with rows; true positions: -0.2 to -0.65, the best false one seen: -1.2

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from startrack.core.types import Array
 from startrack.localization.distributions import normal_sequence
 from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.importance_sampling import Gaussian, WeightedPoints, sample
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.skyline_model import SkylineModel
-from startrack.types import Array
 
 HIDDEN_COPIES = 6  # of each point, with values of the errors that the rows do not show
 DOUBTFUL_NATS = 5.0  # by which a map beats a free skyline, below which other times are tried too

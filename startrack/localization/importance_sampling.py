@@ -13,8 +13,8 @@ from math import log
 
 import numpy as np
 
+from startrack.core.types import Array
 from startrack.localization.distributions import Distribution, TDistribution
-from startrack.types import Array
 
 DEGREES, FAR_DEGREES = 5.0, 3.0  # of freedom of the t distributions
 FAR_PART, FAR, FAR_OTHERS = 0.4, 4.0, 1.4  # of the points; how much farther out, in position and in the others

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.core.types import Array
 from startrack.localization.explored import Explored, log_sum, split_boxes, square_grid
 from startrack.localization.likelihood import PositionLikelihood
-from startrack.types import Array
 
 TRACED_BELOW_M = 400.0  # half side; the horizons of smaller boxes may be traced instead of looked up
 LAST_HALF_M = {False: 20.0, True: 12.0}  # half side of the last boxes, looked up or traced; smaller ones rank no better

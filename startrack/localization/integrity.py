@@ -12,12 +12,12 @@ from math import log
 
 import numpy as np
 
-from startrack.fix import Integrity
-from startrack.kernels import njit
+from startrack.core.fix import Integrity
+from startrack.core.kernels import njit
+from startrack.core.types import Array, Bools
 from startrack.localization.obstacle_chain import fill_clear_emissions
 from startrack.localization.skyline_model import SkylineModel
 from startrack.localization.skyline_profiles import SECTORS
-from startrack.types import Array, Bools
 
 GROUPS = 8  # of azimuth, 45 degrees wide
 DIVISIONS = 3  # into such groups, each turned by 15 degrees: an obstacle of up to 30 degrees is wholly in one group

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.core.types import Array, Evidence, NotLocated
 from startrack.localization.distributions import BoxDistribution
 from startrack.localization.explored import Explored
 from startrack.localization.gross_errors import sample_gross_errors
@@ -14,7 +15,6 @@ from startrack.localization.importance_sampling import ROUNDS, Gaussian, effecti
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
-from startrack.types import Array, Evidence, NotLocated
 
 REACH_M = 300.0  # of a group of boxes about its best one, with one neighbourhood
 LEAST_REACH_M, REACH_SIGMAS = 40.0, 16.0  # of a neighbourhood in which the posterior is sampled

@@ -7,11 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
+from startrack.core.types import Array, Evidence
 from startrack.localization.box_average import BoxAverage
 from startrack.localization.prefix_sums import PrefixSums
 from startrack.localization.sector_likelihood import Sectors, add_contributions
 from startrack.terrain import Terrain, require_horizons
-from startrack.types import Array, Evidence
 
 SECTOR_RAD, SECTOR_EPSILON = float(np.radians(1.5)), 1e-4  # width of a sector; probability that one is wholly wrong
 POINT_M = 0.5  # half side of a box that stands for a point

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from startrack.core.types import Array, Clock, Evidence
 from startrack.localization.clock import turn_evidence
 from startrack.localization.clock_track import Track
 from startrack.localization.explored import Explored
@@ -12,7 +13,6 @@ from startrack.localization.likelihood import PositionLikelihood
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
-from startrack.types import Array, Clock, Evidence
 
 LINEAR_TURN_RAD = np.radians(0.05)  # of the sky: up to it the skyline of a map changes linearly with the time
 STEP_RAD = np.radians(0.13)  # of the turn between two times that are tried

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from startrack.core.prior import PositionPrior
+from startrack.core.types import Array, Bools, NotLocated
 from startrack.localization.explored import Explored
-from startrack.prior import PositionPrior
 from startrack.terrain import ForwardingTerrain, Terrain
-from startrack.types import Array, Bools, NotLocated
 
 REACH_SIGMAS = 6.0  # of the prior, to the edge of the area that is searched
 LEAST_REACH_M = 300.0  # of the first disk: in a smaller one few edges of evidence show which way is likelier

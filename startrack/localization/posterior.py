@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.compilation import announce_compilation
+from startrack.core.compilation import announce_compilation
+from startrack.core.prior import PositionPrior
+from startrack.core.types import Evidence, Fix, NotLocated
 from startrack.localization.branch_and_bound import Search
 from startrack.localization.conclusion import conclude
 from startrack.localization.explored import Explored, log_sum
@@ -15,9 +17,7 @@ from startrack.localization.joint_posterior import sample_posterior
 from startrack.localization.likelihood import SECTOR_RAD, PositionLikelihood
 from startrack.localization.other_times import explore_times, is_wide
 from startrack.localization.position_prior import SearchedNear, name_prior, weigh_by_prior
-from startrack.prior import PositionPrior
 from startrack.terrain import Terrain, require_terrain
-from startrack.types import Evidence, Fix, NotLocated
 
 MIN_ROWS = 8
 MIN_ROW_NATS = 1e-3  # |llr| below which a row is left out

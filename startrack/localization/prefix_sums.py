@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.kernels import njit
+from startrack.core.kernels import njit
+from startrack.core.types import Array, Evidence, Ints
 from startrack.localization.sector_likelihood import SECTOR_STEP, Sectors, row_limits
 from startrack.terrain import Terrain, require_bounds
-from startrack.types import Array, Evidence, Ints
 
 CERTAIN_SIGMAS = 6.0  # a ray farther than this from the horizon is visible or hidden for certain: to 1e-9
 

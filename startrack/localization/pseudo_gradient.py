@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.core.types import Array, Bools, Evidence, Fix, NotLocated
 from startrack.localization.convex_hull import hull_position
 from startrack.localization.rim_plane import point_fix, stars_on_rim_plane
 from startrack.terrain import Terrain
-from startrack.types import Array, Bools, Evidence, Fix, NotLocated
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.core.types import Array, BadInput, Bools, Evidence, Fix, Mode, NotLocated
 from startrack.localization.summary import camera_at, require_inside
 from startrack.terrain import Terrain, require_terrain
-from startrack.types import Array, BadInput, Bools, Evidence, Fix, Mode, NotLocated
 
 DECISIVE_NATS = 5.0  # wrong for 1 star in 150; on a rendered 4 Mpx frame 3 nats double the pseudo-gradient's error
 

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from startrack.kernels import njit
+from startrack.core.kernels import njit
+from startrack.core.types import Array
 from startrack.localization.skyline_profiles import Profiles, cell_at
-from startrack.types import Array
 
 REACH_RAD = np.radians(1.2)  # of heights about the reference's skyline
 LEAST_SIGMA_RAD, LEAST_INFORMATION = 1e-7, 1e-9

@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
+from startrack.core.types import Array, Evidence, ImageErrors, Ints
 from startrack.localization.error_basis import ErrorBasis
 from startrack.localization.obstacle_chain import (
     MOVES,
@@ -27,7 +28,6 @@ from startrack.localization.sector_moments import SectorMoments, measure_moments
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_profiles import HIGH_RAD, ROW_NATS, SECTORS, Profiles, profiles_of
 from startrack.terrain import Terrain
-from startrack.types import Array, Evidence, ImageErrors, Ints
 
 MIDDLES_RAD = (np.arange(SECTORS) + 0.5) * 2 * np.pi / SECTORS
 SAMPLES = 6 * SECTORS  # of the skyline around the reference, between which rows are compared with it

@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from startrack.kernels import njit
+from startrack.core.kernels import njit
+from startrack.core.types import Array, Evidence, Ints
 from startrack.localization.sky_profiles import SkyProfiles
-from startrack.types import Array, Evidence, Ints
 
 SECTORS = 240  # of 1.5 degrees: an obstacle on no map hides stars together, faint and bright ones
 LOW_RAD, HIGH_RAD = np.radians(-12.0), np.radians(20.0)  # window of heights: beyond it a skyline is no skyline

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from startrack.core.types import Array, Bools, Ints, NotLocated
 from startrack.terrain import Terrain
-from startrack.types import Array, Bools, Ints, NotLocated
 
 
 def require_inside(points_m: Array, weight: Array, terrain: Terrain) -> Bools:

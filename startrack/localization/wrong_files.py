@@ -6,12 +6,12 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from startrack.fix import Blocked
+from startrack.core.fix import Blocked
+from startrack.core.types import Array, NotLocated
 from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.gross_errors import GROSS_ROUNDS, sample_gross_error
 from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.shared_errors import SharedErrors
-from startrack.types import Array, NotLocated
 
 WRONG_FACT_NATS = 3.0  # by which a gross error of a stated fact must explain the rows better: 1 of 100 clean skies
 MOST_BLOCKED = 0.5  # of the skyline that the rows show: where more is on no map, another place may explain them as well

@@ -1,4 +1,4 @@
-"""Output for people and programs: results as JSON, star tables, annotated pictures, one-line summaries."""
+"""Results for people and programs: results as JSON, star tables, annotated pictures, one-line summaries."""
 
 from startrack.output.record import detection_dict, identification_dict, record_of, refused_dict, result_dict
 from startrack.output.text import lens_text, refusal_line, summary_line, verbose_text

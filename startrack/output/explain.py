@@ -6,14 +6,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from startrack.errors import Reason
+from startrack.chain.stages import Detected, Identified, Located, Measured, Outcome, Refused, last_value
+from startrack.core.errors import Reason
+from startrack.core.lengths import length_text
+from startrack.core.types import Array, Blocked
 from startrack.evidence.star_evidence import DECIDABLE_SNR
 from startrack.frames import rays_from_azel
-from startrack.lengths import length_text
 from startrack.localization.clock import duration
 from startrack.output.values import DOMINANT
-from startrack.stages import Detected, Identified, Located, Measured, Outcome, Refused, last_value
-from startrack.types import Array, Blocked
 
 WIDE_PART = 1e-3  # of the search radius: an answer with a smaller 95 % circle needs nothing
 LONGER = 4.0  # times the exposure; stars of half the signal-to-noise ratio are in the star table

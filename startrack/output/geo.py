@@ -16,8 +16,8 @@ from startrack.frames import Site, latlon_from_enu
 from startrack.output.record import result_dict
 
 if TYPE_CHECKING:
-    from startrack.stages import Located
-    from startrack.types import Array
+    from startrack.chain.stages import Located
+    from startrack.core.types import Array
 
 GEO_FORMATS = ("geojson", "kml")
 CIRCLE_POINTS = 72

@@ -7,13 +7,13 @@ and a table of docs/formats.md are made from `QUANTITIES`. A new quantity is one
 from __future__ import annotations
 
 from startrack import __version__
+from startrack.chain.stages import Detected, Inputs, Located, Measured
 from startrack.frames import format_utc
 from startrack.output.quantities_attitude import ATTITUDE
 from startrack.output.quantities_light import LIGHT
 from startrack.output.quantities_position import POSITION
 from startrack.output.quantity import Column, Quantity, Show
 from startrack.output.schema_parts import NUMBER, POSITIVE, TEXT
-from startrack.stages import Detected, Inputs, Located, Measured
 
 Q = Quantity
 RUN: tuple[Quantity, ...] = (

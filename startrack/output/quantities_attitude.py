@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from startrack.chain.stages import Measured, Oriented
 from startrack.frames import quat_xyzw_from_R
 from startrack.output.quantity import Column, Quantity, Show
 from startrack.output.schema_parts import FLAG, LATITUDE, LONGITUDE, POSITIVE, QUATERNION, TURN, numbers
@@ -16,7 +17,6 @@ from startrack.output.values import (
     boresight_deg,
     exact_lens_text,
 )  # fmt: skip
-from startrack.stages import Measured, Oriented
 
 Q = Quantity
 _HEADING = "attitude.heading_deg"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from startrack.chain.stages import Located
 from startrack.localization.integrity import RISK
 from startrack.output.quantity import Column, Listed, Quantity, Show
 from startrack.output.schema_parts import (
@@ -32,7 +33,6 @@ from startrack.output.values import (
     sigma_m,
     unstated_record,
 )  # fmt: skip
-from startrack.stages import Located
 
 Q = Quantity
 SEARCHES: Schema = {"enum": ["proven", "beam", "approximate"]}

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from startrack.chain.stages import Inputs
 from startrack.output.schema_parts import Schema
-from startrack.stages import Inputs
 
 ABSENT: Any = object()  # of a quantity that has no key before its stage
 

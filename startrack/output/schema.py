@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from startrack.camera.io import camera_keys
-from startrack.errors import Reason
+from startrack.chain.stages import STAGES
+from startrack.core.errors import Reason
 from startrack.exposure.sidecar import SIDECAR as SIDECAR_KEYS
 from startrack.output.quantities import BY_PATH
 from startrack.output.quantities_prediction import PREDICTION
@@ -21,7 +22,6 @@ from startrack.output.schema_parts import (
     schema,
 )
 from startrack.output.views import section_schema
-from startrack.stages import STAGES
 from startrack.terrain.io import KEYS as TERRAIN_KEYS
 
 CAMERA = schema("Camera file", camera_keys().schema())

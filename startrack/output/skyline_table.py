@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from startrack.core.types import Array, MeasuredSkyline
 from startrack.output.ecsv import Column, ecsv_text, format_values
-from startrack.types import Array, MeasuredSkyline
 
 LEAST_HALF_RAD, MOST_HALF_RAD = np.radians(0.02), np.radians(5.0)
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.catalog import star_names
+from startrack.chain.stages import Identified, Inputs, Measured, Oriented
+from startrack.core.types import Array, Ints, Stars
 from startrack.evidence.star_evidence import SEEN_LLR
 from startrack.output.ecsv import Column, ecsv_text, format_values
-from startrack.stages import Identified, Inputs, Measured, Oriented
-from startrack.types import Array, Ints, Stars
 
 if TYPE_CHECKING:
     from startrack.evidence import StarPhotometry

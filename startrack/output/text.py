@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from startrack.files import printable
+from startrack.chain.stages import STAGES, Outcome, Refused, last_value
+from startrack.core.files import printable
 from startrack.output.record import image_name
 from startrack.output.views import at_stage, rows
-from startrack.stages import STAGES, Outcome, Refused, last_value
 
 if TYPE_CHECKING:
     from startrack.camera import Camera

@@ -8,9 +8,9 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from startrack.chain.stages import Located, Measured, Oriented
+from startrack.core.types import Array, Fix
 from startrack.frames import R_from_rotvec, heading_pitch_roll_from_R_body_enu, latlon_from_enu
-from startrack.stages import Located, Measured, Oriented
-from startrack.types import Array, Fix
 
 ARCSEC_PER_RAD = 648_000 / np.pi
 SMALLEST_CHANCE = 1e-100  # smaller probabilities are beyond the models that they come from

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from startrack import __version__
 from startrack.camera import Camera, Decentring
+from startrack.chain.stages import Measured, Oriented
+from startrack.core.types import Array
 from startrack.frames import Site, aberrate, format_utc, observer_velocity_m_s, wahba
-from startrack.stages import Measured, Oriented
-from startrack.types import Array
 
 Card = bool | int | float | str
 SIP_ORDER = 4

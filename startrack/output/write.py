@@ -9,15 +9,15 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.errors import BadInput
-from startrack.files import make_folder, write_atomically
+from startrack.core.errors import BadInput
+from startrack.core.files import make_folder, write_atomically
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from startrack.stages import Located, Oriented, Outcome
-    from startrack.types import MeasuredSkyline
+    from startrack.chain.stages import Located, Oriented, Outcome
+    from startrack.core.types import MeasuredSkyline
 
 ANNOTATED = ".annotated.png"
 SKYLINE_TABLE, SKYLINE_PICTURE = SKYLINE_FILES = (".skyline.ecsv", ".skyline.png")  # where the image shows a skyline
@@ -103,7 +103,7 @@ def write_results(
 
 
 def _write_companions(outcome: Outcome, path: Path, *, plots: bool) -> None:
-    from startrack.stages import Located, Measured, Oriented, last_value
+    from startrack.chain.stages import Located, Measured, Oriented, last_value
 
     value = last_value(outcome)
     if isinstance(value, Measured) or (isinstance(value, Oriented) and value.terrain is None):
@@ -122,8 +122,8 @@ def write_geo(record: Path, outcome: Outcome, kinds: Sequence[str]) -> None:
 
     `kinds`: which of the two. A former file of another outcome is removed. Raises BadInput where one cannot be written.
     """
+    from startrack.chain.stages import Located
     from startrack.output.geo import GEO_FORMATS, geo_text
-    from startrack.stages import Located
 
     for kind in GEO_FORMATS:
         path = record.with_name(f"{_stem_and_kind(record)[0]}.{kind}")
@@ -189,10 +189,10 @@ def write_annotated(path: FilePath, outcome: Outcome, truth_enu_m: tuple[float, 
     `truth_enu_m` (east, north) [m] is drawn if it is given; no stage of the pipeline has it. The file also holds the
     picture without marks and the marks as coordinates, for the HTML page (`picture/layers.py`).
     """
+    from startrack.chain.stages import last_value
     from startrack.output.picture.annotate import annotate, bare_picture
     from startrack.output.picture.layers import Layers, add_layers
     from startrack.output.picture.overlay import overlay_of
-    from startrack.stages import last_value
 
     value = last_value(outcome)
     bare = bare_picture(value)

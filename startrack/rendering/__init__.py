@@ -1,4 +1,4 @@
-"""Rendering: an exposure and its truth from catalogue, camera, terrain and a true pose."""
+"""An exposure and its truth from catalogue, camera, terrain and a true pose."""
 
 from startrack.rendering.compose import light_e, render, truth_of
 from startrack.rendering.defects import draw_hot_pixels

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from startrack.core.types import Array, Exposure, Stars
 from startrack.frames import off_axis_rad
 from startrack.rendering.defects import add_cosmic_rays, add_hot_pixels
 from startrack.rendering.field_stars import concatenate_stars
@@ -11,7 +12,6 @@ from startrack.rendering.scene import Scene, Truth
 from startrack.rendering.sensor import ADC_MAX_ADU, read_out
 from startrack.rendering.sky import diffuse_e
 from startrack.rendering.sources import add_sources, flux_e, is_above_terrain
-from startrack.types import Array, Exposure, Stars
 
 
 def render(scene: Scene, *, rng: np.random.Generator) -> tuple[Exposure, Truth]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from startrack.core.types import Array
 from startrack.rendering.psf import splat
 from startrack.rendering.scene import HotPixels
-from startrack.types import Array
 
 HOT_E_PER_S = (50.0, 50_000.0)  # dark current of hot pixels: even in its logarithm, from barely visible to glaring
 TRACK_MEAN_PX = 6.0  # exponential length: most rays pass steeply, a few graze along the chip

@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from startrack.files import FilePath, printable, read_text
-from startrack.types import Array, BadInput, Value, array
+from startrack.core.files import FilePath, printable, read_text
+from startrack.core.types import Array, BadInput, Value, array
 
 PATH_COLUMNS = ("east_m", "north_m")
 MAX_FRAMES = 1_000_000  # of a drive: more is a wrong unit

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.types import Array, Stars
+from startrack.core.types import Array, Stars
 
 # Stars brighter than V over the whole sky: N = N_REF e^(GROWTH (V - V_REF)).
 GROWTH_PER_MAG = 1.08  # slope of star counts at V 6-10: 2.9 per magnitude

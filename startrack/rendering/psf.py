@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from startrack.types import Array
+from startrack.core.types import Array
 
 # A stamp ends where a star leaves less than this in a pixel: far under any sensor's noise, even summed over the rim.
 INVISIBLE_E_PER_PX = 0.02

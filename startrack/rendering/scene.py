@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from startrack.camera import Camera, Sensor
+from startrack.core.types import Array, BadInput, Body, Bools, Ints, Stars, Value, array
 from startrack.terrain import Terrain
-from startrack.types import Array, BadInput, Body, Bools, Ints, Stars, Value, array
 
 AZIMUTHS = 1 << 16  # of the skyline: 0.0055 degrees, a sixteenth of a pixel of the widest fisheye
 

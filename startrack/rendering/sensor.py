@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import Sensor
-from startrack.types import Array
+from startrack.core.types import Array
 
 ADC_MAX_ADU = 65535.0  # 16 bits
 POISSON_UP_TO_E = 64.0  # above it the normal distribution is used (skewness under 1/8), five times as fast

@@ -12,6 +12,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.catalog.bodies import bodies
+from startrack.core.types import Array, BadInput, Stars, Value, array
 from startrack.frames import (
     R_body_enu_from_heading_pitch_roll,
     R_enu_icrs,
@@ -25,7 +26,6 @@ from startrack.rendering.field_stars import concatenate_stars, draw_field_stars,
 from startrack.rendering.scene import Scene
 from startrack.rendering.sources import exposure_for_snr
 from startrack.terrain import Terrain
-from startrack.types import Array, BadInput, Stars, Value, array
 
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from startrack.camera import Camera
+from startrack.core.types import Array, Bools, Ints
 from startrack.frames import azel_from_rays, rays_from_azel
 from startrack.rendering.scene import Scene
-from startrack.types import Array, Bools, Ints
 
 ARCSEC2_PER_SR = (180 * 3600 / np.pi) ** 2
 EDGE_WIDTH_SIGMAS = 4.0  # distance from the skyline up to which the PSF-smoothed step is computed

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.camera import Camera, Sensor
+from startrack.core.types import Array, Body, Bools
 from startrack.frames import R_from_rotvec, azel_from_rays, off_axis_rad
 from startrack.rendering.psf import splat
 from startrack.rendering.scene import Scene
-from startrack.types import Array, Body, Bools
 
 TRAIL_VISIBLE_PX = 0.02  # motion during the exposure below which a star is a point
 TRAIL_STEP_PX = 0.2  # a step s adds s^2/12 to the variance of the trail's profile: 0.003 px^2

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from startrack.files import write_atomically
+from startrack.core.files import write_atomically
 from startrack.frames import quat_xyzw_from_R
 from startrack.rendering.scene import Truth
 

@@ -1,4 +1,4 @@
-"""Simulation of evidence: what the pipeline measures of a scene, drawn without pixels."""
+"""Evidence without pixels: what the pipeline measures of a scene, drawn without pixels."""
 
 from startrack.simulation.ground_errors import draw_ground
 from startrack.simulation.star_rays import simulate_rays

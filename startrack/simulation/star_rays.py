@@ -12,6 +12,8 @@ from datetime import datetime
 import numpy as np
 
 from startrack.catalog import StarCatalog
+from startrack.chain.stages import StarRays
+from startrack.core.types import TIME_SIGMA_S, Array, BadInput, Bools, Ints
 from startrack.evidence import FluxScale, Skyline, StarEvidence
 from startrack.evidence.expected_stars import ExpectedStars, expect_stars
 from startrack.evidence.flux_scale import BRIGHT_SNR, MIN_SCATTER, MIN_STARS
@@ -23,9 +25,7 @@ from startrack.rendering import Scene
 from startrack.rendering.sky import sky_e_per_s, sky_gradient
 from startrack.rendering.sources import flux_e
 from startrack.simulation.starlight import Starlight
-from startrack.stages import StarRays
 from startrack.terrain import Terrain
-from startrack.types import TIME_SIGMA_S, Array, BadInput, Bools, Ints
 
 EXACT_RAD = np.radians(2.0)  # from the skyline; farther, its elevations at one azimuth in 3 arcmin decide
 UNDECIDED_RAD = np.radians(0.2)  # from the skyline: here the visibility of a neighbour is not known

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.core.types import Array, Ints
 from startrack.evidence.photometry import Photometry, Sources, half_width, neighbour_profiles, order_by_cell
 from startrack.psf import pixel_profile
-from startrack.types import Array, Ints
 
 NEIGHBOUR_SIGMAS = 3.0  # of the PSF beyond half a stamp, to the last star whose light is subtracted, as in `measure`
 CORNER = float(np.sqrt(2.0))  # half diagonal of a stamp in its half widths: light reaches its corners, too

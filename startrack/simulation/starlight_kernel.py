@@ -5,8 +5,8 @@ from __future__ import annotations
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
 
+from startrack.core.kernels import njit
 from startrack.evidence.photometry_kernel import profiles_of
-from startrack.kernels import njit
 
 
 @njit(cache=True, nogil=True)

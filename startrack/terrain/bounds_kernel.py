@@ -8,7 +8,7 @@ from __future__ import annotations
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
 
-from startrack.kernels import njit
+from startrack.core.kernels import njit
 from startrack.terrain.horizon_kernel import (
     FAR_M,
     LOWEST_TAN,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # mypy: disable-error-code="no-untyped-def"
-from startrack.kernels import njit
+from startrack.core.kernels import njit
 from startrack.terrain.horizon_kernel import block_at, locate, on_map, surface
 from startrack.terrain.slope_kernel import level_of, steepness
 

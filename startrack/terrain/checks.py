@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from startrack.core.types import Array, BadInput
 from startrack.terrain.protocol import Terrain
-from startrack.types import Array, BadInput
 
 BOUNDS_ROUNDING_RAD = 1e-9  # by which a least horizon may exceed the greatest
 

@@ -6,8 +6,8 @@ from math import atan2, sqrt
 
 import numpy as np
 
-from startrack.kernels import njit
-from startrack.types import Array
+from startrack.core.kernels import njit
+from startrack.core.types import Array
 
 
 def distance_to_circle(points_m: Array, azimuths_rad: Array, radius_m: Array | float) -> Array:

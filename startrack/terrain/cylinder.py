@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from startrack.declaration import Flag, Number
+from startrack.core.declaration import Flag, Number
+from startrack.core.types import Array, BadInput, Bools
 from startrack.frames import Site
 from startrack.terrain.circle import distance_bounds, distance_to_circle, horizons_of_circle
 from startrack.terrain.deformed_crater import DeformedCrater, slopes_of_round_crater
 from startrack.terrain.protocol import Terrain
 from startrack.terrain.shape import CAMERA_ERROR, DEPTH, DIAMETER, ELLIPSE, RIM_TILT, ShapeError, by_name, select_slopes
-from startrack.types import Array, BadInput, Bools
 
 MAX_LENGTH_M = 1e7  # five times the Moon's radius
 MAX_SHAPE_SIGMA = 0.2  # of depth and diameter; the posterior of the shape is expanded about the stated one

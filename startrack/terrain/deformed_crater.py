@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from startrack.core.types import Array, Bools
 from startrack.frames import Site
 from startrack.terrain.circle import distance_bounds, distance_to_circle
 from startrack.terrain.protocol import Terrain
-from startrack.types import Array, Bools
 
 HALVINGS = 60  # of the range of distances: to the last digit of a length
 

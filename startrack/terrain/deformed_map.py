@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from startrack.core.types import Array
 from startrack.frames.rotations import R_from_rotvec
 from startrack.terrain.horizon_posts import HorizonPosts
 from startrack.terrain.protocol import ForwardingTerrain, Terrain
 from startrack.terrain.shape import ShapeError, select_slopes
-from startrack.types import Array
 
 if TYPE_CHECKING:
     from startrack.terrain.height_map import HeightMap

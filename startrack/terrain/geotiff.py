@@ -12,7 +12,8 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.files import atomic_file
+from startrack.core.files import atomic_file
+from startrack.core.types import BadInput
 from startrack.terrain.raster import (
     EQUIRECTANGULAR,
     ORTHOGRAPHIC,
@@ -22,7 +23,6 @@ from startrack.terrain.raster import (
     Raster,
     projection_of,
 )
-from startrack.types import BadInput
 
 MAX_PIXELS = 200_000_000
 MIN_STEP_M = 0.01  # of the heights in files that are written

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.types import Array, BadInput, Bools, Ints
 from startrack.frames import Site
 from startrack.terrain import table_cache as cache
 from startrack.terrain import tracing
@@ -25,7 +26,6 @@ from startrack.terrain.pyramid import Ground, ground_up_m, pack_maps
 from startrack.terrain.raster import Projection, Raster
 from startrack.terrain.shape import BIAS, CAMERA_ERROR, STRETCH, VERTICAL, ShapeError, by_name
 from startrack.terrain.table_building import load_or_build_table
-from startrack.types import Array, BadInput, Bools, Ints
 
 FINEST_BOX_M = 0.45  # half side of the smallest boxes of positions: no height map is more accurate
 CELL_M = 200.0  # cells of the table are no wider

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from startrack.core.types import Array, Bools, Ints
 from startrack.terrain import tracing
 from startrack.terrain.deformed_map import slopes_of_map
 from startrack.terrain.protocol import ForwardingTerrain, Interpolation
-from startrack.types import Array, Bools, Ints
 
 if TYPE_CHECKING:
     from startrack.terrain.height_map import HeightMap

@@ -12,7 +12,7 @@ from __future__ import annotations
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
 
-from startrack.kernels import njit
+from startrack.core.kernels import njit
 
 SPHERE_M = 1_737_400.0
 LOWEST_TAN = -50.0

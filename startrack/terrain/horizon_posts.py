@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from startrack.core.types import Array, Ints
 from startrack.frames import Site, enu_from_latlon, latlon_from_enu
 from startrack.terrain.raster import Raster
-from startrack.types import Array, Ints
 
 CORNERS = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])  # (row, column) of the posts of a cell
 NO_POST = -1

@@ -7,9 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
+from startrack.core.types import Array
 from startrack.terrain.horizon_table import ANGLE_STEP_RAD, BEST, BINS, DISTANCE_STEP_M, HorizonTable
 from startrack.terrain.tracing import level_for
-from startrack.types import Array
 
 NEAREST_M = 50.0  # the table does not distinguish crests closer by
 CORNERS = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])

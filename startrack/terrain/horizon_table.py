@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.types import Array, Bools, Ints
 from startrack.terrain.protocol import Progress
-from startrack.types import Array, Bools, Ints
 
 if TYPE_CHECKING:
     from startrack.terrain.trace_memory import BoxMemory

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from startrack.errors import BadOutput
-from startrack.files import check_output
-from startrack.lengths import length_text
+from startrack.core.errors import BadOutput
+from startrack.core.files import check_output
+from startrack.core.lengths import length_text
+from startrack.core.types import BadInput
 from startrack.terrain.geotiff import write_map
 from startrack.terrain.map_comparison import crest_angle_rad_per_m
 from startrack.terrain.map_error import carried_spacing, error_between_posts_m
@@ -19,7 +20,6 @@ from startrack.terrain.raster import Raster
 from startrack.terrain.raster_io import read_map
 from startrack.terrain.shape import CAMERA_ERROR, STRETCH, VERTICAL
 from startrack.terrain.stated_errors import StatedErrors, measure_errors
-from startrack.types import BadInput
 
 if TYPE_CHECKING:
     from startrack.terrain.height_map import HeightMap

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from startrack.declaration import Choice, Either, List, Number, Table, Text
-from startrack.files import parse_toml, printable, read_text, resolve_named
+from startrack.core.declaration import Choice, Either, List, Number, Table, Text
+from startrack.core.files import parse_toml, printable, read_text, resolve_named
+from startrack.core.types import BadInput
 from startrack.frames import Site
 from startrack.terrain.cylinder import CAMERA_HEIGHT, CAMERA_SIGMA, CYLINDER_KEYS, LENGTH, MAX_LENGTH_M, Cylinder
 from startrack.terrain.protocol import Terrain
 from startrack.terrain.shape import CYLINDER_FACTS
-from startrack.types import BadInput
 
 DEFAULT_MAP_RADIUS_M = 10_000.0  # of the search area on height maps
 DEFAULT_CAMERA_HEIGHT_M = 1.5

@@ -8,11 +8,11 @@ from functools import cached_property
 
 import numpy as np
 
+from startrack.core.lengths import length_text
+from startrack.core.types import Array, BadInput
 from startrack.frames import Site
-from startrack.lengths import length_text
 from startrack.terrain.height_map import COMMON_PER_POST, HeightMap
 from startrack.terrain.raster import Raster
-from startrack.types import Array, BadInput
 
 FINER = 2.0  # a finer map has at least so many posts to one of the map
 MIN_POSTS_ACROSS = 20.0  # of the map, in the overlap

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from startrack.core.types import Array, BadInput
 from startrack.terrain.raster import Raster
-from startrack.types import Array, BadInput
 
 MIN_ERROR_M = 0.1
 MIN_RATIO_ROUGH = 0.5  # natural ground is no smoother: errors fall with the distance of the posts, not with its square

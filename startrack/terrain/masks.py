@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.types import Array, Bools
+from startrack.core.types import Array, Bools
 
 GLARE, OFF_MAP = "glare of a lit rim", "ground off the map"
 Sectors = tuple[tuple[float, float], ...]  # azimuth ranges [rad], each from the first eastward to the second

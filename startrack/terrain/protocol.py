@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.types import Array, Bools, Ints
 from startrack.frames import Site
 from startrack.terrain.horizon_posts import HorizonPosts
 from startrack.terrain.raster import STEREOGRAPHIC, Projection
 from startrack.terrain.shape import ShapeError
-from startrack.types import Array, Bools, Ints
 
 Progress = Callable[[int, int], None]  # parts done, of how many
 

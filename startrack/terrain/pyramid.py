@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.types import Array, Ints
 from startrack.frames import MOON_RADIUS_M, Site, latlon_from_enu
 from startrack.terrain.raster import GRID_NUMBERS, Raster
-from startrack.types import Array, Ints
 
 SLOPE_STEPS = 127  # a slope is kept as a whole number of 1/127 of the map's steepest, rounded away from the middle
 SMALLEST_BLOCKS = 4  # a pyramid ends where a level has no more blocks than this along an axis

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from startrack.core.types import Array, BadInput
 from startrack.frames import MOON_RADIUS_M, R_enu_fixed, Site, latlon_from_enu
-from startrack.types import Array, BadInput
 
 STEREOGRAPHIC, ORTHOGRAPHIC, EQUIRECTANGULAR = 0, 1, 2
 NAMES = ("stereographic", "orthographic", "equirectangular")

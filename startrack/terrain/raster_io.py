@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from startrack.core.types import BadInput
 from startrack.frames import MOON_RADIUS_M
 from startrack.terrain.geotiff import MAX_PIXELS, METRES, read_geotiff
 from startrack.terrain.raster import Grid, Projection, Raster, projection_of
-from startrack.types import BadInput
 
 WINDOW_HALF_M = 300_000.0  # about the origin; farther away even 10 km mountains are below the horizontal
 MIN_RADIUS_M = 1_000_000.0  # larger heights are counted from the Moon's centre

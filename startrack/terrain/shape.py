@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.types import Array
+from startrack.core.types import Array
 
 
 @dataclass(frozen=True, kw_only=True)

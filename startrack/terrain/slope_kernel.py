@@ -5,7 +5,7 @@ from __future__ import annotations
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
 
-from startrack.kernels import njit
+from startrack.core.kernels import njit
 
 SHIFT_HEIGHT_M = 1000.0  # height of a sight line above the ground that its place on the map allows for
 MAX_TOUCHED = 25  # cells of a part

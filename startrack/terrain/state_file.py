@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from startrack.files import parse_toml
+from startrack.core.files import parse_toml
+from startrack.core.types import BadInput
 from startrack.terrain.io import read_keys
 from startrack.terrain.shape import BIAS, CAMERA_ERROR, CYLINDER_FACTS, DEPTH, DIAMETER, STRETCH, VERTICAL, Fact
-from startrack.types import BadInput
 
 HEIGHTS = "height_sigma_m"
 MEANINGS = {

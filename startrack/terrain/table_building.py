@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from startrack.core.types import Array, Ints
 from startrack.terrain import table_cache as cache
 from startrack.terrain import tracing
 from startrack.terrain.horizon_table import BINS, HorizonTable, build_table
 from startrack.terrain.protocol import Progress
-from startrack.types import Array, Ints
 
 if TYPE_CHECKING:
     from startrack.terrain.height_map import HeightMap

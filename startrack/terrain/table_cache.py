@@ -14,7 +14,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from startrack.files import atomic_file, hold_lock
+from startrack.core.files import atomic_file, hold_lock
 from startrack.terrain.horizon_table import BINS, FIELDS, HorizonTable, Square
 
 if TYPE_CHECKING:

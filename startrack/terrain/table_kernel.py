@@ -5,7 +5,7 @@ from __future__ import annotations
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
 
-from startrack.kernels import njit
+from startrack.core.kernels import njit
 from startrack.terrain.bounds_kernel import bounds
 from startrack.terrain.box_height_kernel import box_height_bounds
 from startrack.terrain.horizon_kernel import FAR_M, horizon, surfaces

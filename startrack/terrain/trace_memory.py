@@ -12,8 +12,8 @@ from threading import Lock
 
 import numpy as np
 
-from startrack.kernels import njit
-from startrack.types import Array
+from startrack.core.kernels import njit
+from startrack.core.types import Array
 
 SLOTS = 2**18  # boxes and azimuths that are kept: 15 MB; a draw on Shackleton's floor traces 20,000 to 110,000
 NUMBERS = 5  # of a box and its azimuths

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from startrack.core.types import Array, Ints
 from startrack.terrain.horizon_table import BINS, FIELDS, HorizonTable, cpu_count
-from startrack.types import Array, Ints
 
 if TYPE_CHECKING:
     from startrack.terrain.height_map import HeightMap

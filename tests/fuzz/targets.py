@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from startrack.errors import BAD_INPUT_REASONS, BadInput, exit_code_of
-from startrack.files import data_dir
+from startrack.core.errors import BAD_INPUT_REASONS, BadInput, exit_code_of
+from startrack.core.files import data_dir
 
 from .access import Broken, no_access_beside
 from .mutate import mutate

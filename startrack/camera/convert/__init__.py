@@ -12,7 +12,7 @@ from dataclasses import replace
 from startrack.camera import Camera
 from startrack.camera.convert import colmap, kalibr, opencv, ros
 from startrack.camera.convert.intrinsics import nearest_edge_rad
-from startrack.types import BadInput
+from startrack.core.types import BadInput
 
 TITLES = {"ros": "ROS", "kalibr": "Kalibr", "colmap": "COLMAP", "opencv": "OpenCV"}
 MAX_CAUSE_CHARS = 200  # of a parser's message

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from startrack.camera import Camera, Decentring
 from startrack.camera.convert.intrinsics import Intrinsics, camera_from_intrinsics, intrinsics_of
-from startrack.types import BadInput
+from startrack.core.types import BadInput
 
 CORNER_PX = 0.5
 HEAD = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"

@@ -12,7 +12,7 @@ import numpy as np
 from startrack.camera import Camera, Decentring
 from startrack.camera.io import camera_from_dict
 from startrack.camera.uncertainty import cap_grid
-from startrack.types import BadInput
+from startrack.core.types import BadInput
 
 FISHEYE_COEFFICIENTS = 4
 SMALL_ANGLE_DEG = 1e-3  # of an image circle within any lens

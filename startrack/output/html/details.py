@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.camera import load_camera
+from startrack.core.types import Array, BadInput
 from startrack.output.html.stars import read_ecsv
 from startrack.output.picture.annotate import PANEL_WIDTH
 from startrack.output.picture.backdrop import fit_to_canvas
@@ -19,7 +20,6 @@ from startrack.output.picture.layers import layers_of
 from startrack.output.picture.relief import edge_cover, ground_cells, hill_shading
 from startrack.output.skyline_table import half_range_rad
 from startrack.terrain import Terrain, load_terrain
-from startrack.types import Array, BadInput
 
 Horizon = Callable[[Array], Array]  # azimuths (n,) to elevations (n,) [rad]
 

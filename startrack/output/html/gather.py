@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from startrack.files import existing_folder
-from startrack.types import BadInput
+from startrack.core.files import existing_folder
+from startrack.core.types import BadInput
 
 KINDS = (".fix.json", ".identification.json")  # of one image the first that is there counts
 

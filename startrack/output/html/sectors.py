@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from startrack.core.types import Array, Bools, Evidence
 from startrack.localization.sector_likelihood import Sectors
 from startrack.output.html.details import Horizon
 from startrack.output.html.stars import MeasuredStars
-from startrack.types import Array, Bools, Evidence
 
 SECTORS = 72  # of 5 degrees: wide enough for some stars near the skyline, narrow enough to show a boulder
 NEAR_RAD = np.radians(3.0)  # to either side of the skyline

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.catalog import proper_name_designations
-from startrack.types import Array
+from startrack.core.types import Array
 
 Columns = dict[str, list[Any]]
 # name on the page, column of NAME.stars.ecsv, decimals (None: a text)

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from startrack.errors import Reason
-from startrack.files import write_atomically
+from startrack.core.errors import Reason
+from startrack.core.files import write_atomically
 from startrack.output.html.details import (
     Horizon,
     TerrainsByName,

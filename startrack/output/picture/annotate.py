@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.chain.stages import Detected, Identified, Inputs, Located, Measured, Oriented, Outcome, last_value
 from startrack.output.picture.backdrop import View, backdrop, fit_to_canvas
 from startrack.output.picture.canvas import (
     BODY,
@@ -40,7 +41,6 @@ from startrack.output.picture.marks import (
 from startrack.output.record import image_name
 from startrack.output.values import mode_text, modes_record
 from startrack.output.views import Rows, at_stage, rows
-from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented, Outcome, last_value
 
 PANEL_WIDTH, PANEL_HEIGHT = 620, 1160
 MARGIN = 28

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from startrack.camera import Camera
+from startrack.chain.stages import Detected, Inputs
+from startrack.core.types import Array, Bools
 from startrack.output.picture.canvas import PAPER, SKY_BRIGHT, SKY_DARK, STARLIGHT, WALL
-from startrack.stages import Detected, Inputs
-from startrack.types import Array, Bools
 
 Image = NDArray[np.float32]
 LONGEST_SIDE_PX = 1400

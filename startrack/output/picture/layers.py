@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.errors import BadInput
+from startrack.core.errors import BadInput
 from startrack.exposure.png import IHDR_END, chunk, chunks
 
 PICTURE, OVERLAY = b"stPX", b"stOV"  # a JPEG; compressed JSON

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from startrack.attitude import AttitudeFit
-from startrack.lengths import length_text
+from startrack.core.lengths import length_text
+from startrack.core.types import Array, Fix
+from startrack.estimation.attitude import AttitudeFit
 from startrack.output.picture.canvas import (
     DIM_INK,
     FAINT_INK,
@@ -25,7 +26,6 @@ from startrack.output.picture.canvas import (
 )
 from startrack.output.picture.relief import draw_relief, ground_of_view
 from startrack.terrain import Terrain
-from startrack.types import Array, Fix
 
 CIRCLE_RAD = np.linspace(0.0, 2 * np.pi, 181)
 CAPTION_SIZE = 16.0

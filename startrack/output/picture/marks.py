@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.chain.stages import Detected, Identified, Inputs, Located, Measured
+from startrack.core.types import Array, Ints
 from startrack.frames import azel_from_rays
 from startrack.output.picture.backdrop import View
 from startrack.output.picture.canvas import (
@@ -37,8 +39,6 @@ from startrack.output.picture.overlay import (
     skyline_stretches_px,
 )
 from startrack.output.star_table import names_of, status_of
-from startrack.stages import Detected, Identified, Inputs, Located, Measured
-from startrack.types import Array, Ints
 
 MAX_CIRCLES = 4000
 MAX_CROSSES = 150  # of hidden stars, the brightest: more would hide the picture

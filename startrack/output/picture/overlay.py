@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from startrack.chain.stages import Detected, Identified, Inputs, Located, Measured, Oriented
+from startrack.core.types import Array, Bools
 from startrack.frames import azel_from_rays, heading_pitch_roll_from_R_body_enu, rays_from_azel
 from startrack.output.values import R_body_enu, skyline_position_m
-from startrack.stages import Detected, Identified, Inputs, Located, Measured, Oriented
-from startrack.types import Array, Bools
 
 AZIMUTHS_RAD = np.linspace(0.0, 2 * np.pi, 1441)
 DIMMEST_HIDDEN_V_MAG = 3.0  # a fainter planet behind the wall is not missed

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.chain.stages import Located
+from startrack.core.types import Array, MeasuredSkyline
 from startrack.evidence import Skyline
 from startrack.output.picture.canvas import (
     DIM_INK,
@@ -29,9 +31,7 @@ from startrack.output.picture.maps import nice_step
 from startrack.output.record import image_name
 from startrack.output.skyline_table import half_range_rad
 from startrack.output.star_table import status_of
-from startrack.stages import Located
 from startrack.terrain import Terrain
-from startrack.types import Array, MeasuredSkyline
 
 WIDTH_PX, HEIGHT_PX, ENLARGED_PX = 1440, 420, 300
 MARGIN_PX, ABOVE_PX, BELOW_PX, RIGHT_PX = 56.0, 34.0, 40.0, 16.0  # about a plot

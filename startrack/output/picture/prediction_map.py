@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.types import Array, Bools
 from startrack.frames import Site, latlon_from_enu
 from startrack.output.picture.canvas import DIM_INK, INK, MAP, PAPER, VERMILLION, Canvas, Colour, box_around
 from startrack.output.picture.maps import CAPTION_SIZE, MapView, map_view, ring
 from startrack.output.picture.relief import edge_cover, extrapolate, ground_of_view, hill_shading
 from startrack.output.picture.terrain_picture import draw_distances
-from startrack.types import Array, Bools
 
 if TYPE_CHECKING:
     from startrack.terrain import Terrain

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.lengths import length_text
+from startrack.core.lengths import length_text
+from startrack.core.types import Array
 from startrack.output.picture.canvas import (
     BLUISH_GREEN,
     DIM_INK,
@@ -24,7 +25,6 @@ from startrack.output.picture.canvas import (
     Canvas,
 )
 from startrack.output.picture.maps import nice_step
-from startrack.types import Array
 
 WIDTH_PX, HEIGHT_PX = 1100, 620
 BOX: Box = (90.0, 84.0, 1070.0, 540.0)

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from startrack.core.types import Array, Bools
 from startrack.output.picture.canvas import DIM_INK, FLOOR, INK, MAP, SHIFT_BITS, Canvas, box_around
-from startrack.types import Array, Bools
 
 if TYPE_CHECKING:
     from startrack.output.picture.maps import MapView

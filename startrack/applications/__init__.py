@@ -1,0 +1,1 @@
+"""Uses of the chain: calibration, horizon of a site, tracks, predictions, the thesis's studies, batches of images."""

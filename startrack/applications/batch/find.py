@@ -1,0 +1,165 @@
+"""The images of a folder tree, and the names of their results."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import count
+from pathlib import Path, PurePosixPath
+
+from startrack.core.files import existing_folder
+from startrack.core.types import BadInput
+from startrack.exposure import BagImage, list_bag_images
+from startrack.exposure.sidecar import PACKING_SUFFIXES, PICTURE_SUFFIXES
+from startrack.output.write import PICTURES
+
+
+@dataclass(frozen=True, order=True)
+class Image:
+    """One image of a batch: a file, or a message of a bag."""
+
+    name: str  # path relative to the folder, with / on every system
+    stem: str  # of its results, relative to the folder of the results
+    path: str
+    bag_image: BagImage | None = field(default=None, compare=False)  # where `path` is BAG#NUMBER
+
+
+def images_of_bag(bag: str | os.PathLike[str], topic: str | None = None) -> list[Image]:
+    """Every image of a ROS bag's image `topic` (None: its only one). Raises BadInput (bad_image)."""
+    stem = Path(bag).stem
+    return [
+        Image(Path(one.path).name, f"{stem}-{one.number:06d}", one.path, one)
+        for one in list_bag_images(os.path.abspath(bag), topic)
+    ]
+
+
+def images_under(folder: str | os.PathLike[str], excluded: str | os.PathLike[str] | None = None) -> list[Image]:
+    """Every image of the tree, sorted by name.
+
+    Links to folders outside the tree are followed, each folder once. Hidden files and folders, the folder `excluded`
+    and anything but regular files are left out. Raises BadInput (bad_image) if `folder` is none.
+    """
+    root = existing_folder(folder)
+    return _images(root, _image_names(root, None if excluded is None else os.path.realpath(excluded)))
+
+
+def listed_images(
+    folder: str | os.PathLike[str], paths: Iterable[str], excluded: str | os.PathLike[str] | None = None
+) -> list[Image]:
+    """The images at `paths`: absolute, or relative to the current folder or to `folder`. `excluded` is no image folder.
+
+    An image that does not exist (any more) is included, and refused when it is read. Raises BadInput (bad_image) for a
+    path that is no image under `folder`, and if there is no path at all.
+    """
+    root, known = os.path.abspath(folder), {image.name: image for image in images_under(folder, excluded)}
+    texts = [text for text in (path.strip("\r\n") for path in paths) if text]
+    if not texts:
+        raise BadInput("bad_image", "no file names came on standard input: give one path a line")
+    chosen = set()
+    for text in texts:
+        paths_read = (os.path.abspath(text), os.path.abspath(os.path.join(root, text)))
+        names = [os.path.relpath(path, root).replace(os.sep, "/") for path in paths_read]
+        name = next((name for name in names if name in known), None)
+        if name is None:
+            name = next((name for name in names if _is_missing(root, name)), None)
+            if name is None:
+                raise BadInput("bad_image", f"{text} is not an image under {folder}")
+            known[name] = Image(name, _stem_of_missing(name, known.values()), os.path.join(root, name))
+        chosen.add(known[name])
+    return sorted(chosen)  # with the results' names of a run over the whole folder
+
+
+def result_stems(images: Sequence[str]) -> list[str]:
+    """Unique names of the results: the images' stems, with the suffix where stems are equal."""
+    names = [Path(image).name for image in images]
+    stems = [_stem(name) for name in names]
+    often = Counter(stems)
+    return unique_names([name if often[stem] > 1 else stem for name, stem in zip(names, stems, strict=True)])
+
+
+def unique_names(names: Sequence[str]) -> list[str]:
+    """The names; a repeated one gets the first number that makes it unique."""
+    taken, given = set(names), set[str]()
+    unique = []
+    for name in names:
+        numbered = (f"{name}-{number}" for number in count(2))
+        one = next(one for one in numbered if one not in taken) if name in given else name
+        taken.add(one)
+        given.add(one)
+        unique.append(one)
+    return unique
+
+
+def _images(root: Path, names: Sequence[str]) -> list[Image]:
+    folders: dict[str, list[str]] = {}
+    for name in names:
+        folders.setdefault(str(PurePosixPath(name).parent), []).append(name)
+    found = [
+        Image(name, (PurePosixPath(parent) / stem).as_posix(), str(root / name))
+        for parent, group in folders.items()
+        for name, stem in zip(group, result_stems(group), strict=True)
+    ]
+    return sorted(found)
+
+
+def _is_missing(root: str, name: str) -> bool:
+    """Whether `name` is that of an image within the folder that does not exist."""
+    path = PurePosixPath(name)
+    return path.parts[:1] != ("..",) and _is_image(path.name) and not os.path.lexists(os.path.join(root, name))
+
+
+def _stem_of_missing(name: str, others: Iterable[Image]) -> str:
+    stem = (PurePosixPath(name).parent / _stem(PurePosixPath(name).name)).as_posix()
+    return name if stem in {image.stem for image in others} else stem
+
+
+def _image_names(root: Path, excluded: str | None) -> list[str]:
+    """Paths of the tree's images, relative to it. A folder is entered once, by its own name rather than by a link."""
+    top = os.path.realpath(root)
+    entered, found = {top}, []
+
+    def is_entered(path: Path) -> bool:
+        real = os.path.realpath(path)
+        inside_by_link = path.is_symlink() and Path(real).is_relative_to(top)
+        if path.name.startswith(".") or real == excluded or real in entered or inside_by_link:
+            return False
+        entered.add(real)
+        return True
+
+    for parent, folders, files in os.walk(root, followlinks=True):
+        here = Path(parent)
+        folders[:] = [name for name in sorted(folders) if is_entered(here / name)]
+        found += [
+            (here / name).relative_to(root).as_posix() for name in files if _is_image(name) and _is_file(here, name)
+        ]
+    return sorted(found)
+
+
+def _is_file(folder: Path, name: str) -> bool:
+    """Whether it is no pipe, which would block the reader. A broken link is an image that will be refused."""
+    try:
+        return stat.S_ISREG((folder / name).stat().st_mode)
+    except OSError:
+        return True
+
+
+def _is_image(name: str) -> bool:
+    lower = name.lower()
+    if lower.startswith(".") or lower.endswith(PICTURES):
+        return False
+    return any(Path(one).suffix in PICTURE_SUFFIXES for one in _names_without_compression(lower))
+
+
+def _names_without_compression(name: str) -> Iterator[str]:
+    yield name
+    if Path(name).suffix in PACKING_SUFFIXES:
+        yield Path(name).stem
+
+
+def _stem(name: str) -> str:
+    path = Path(name)
+    packed = path.suffix.lower() in PACKING_SUFFIXES
+    return Path(path.stem).stem if packed and Path(path.stem).suffix else path.stem

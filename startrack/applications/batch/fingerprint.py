@@ -1,0 +1,114 @@
+"""Hashes of all that decides an image's result: the content of its files, the flags, this version."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import stat
+from collections.abc import Iterable
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from startrack import __version__
+from startrack.catalog.gaia import has_deep_catalog
+from startrack.core.errors import BadInput
+from startrack.core.files import is_path, parse_toml, read_text, relative_path
+from startrack.exposure import BagImage
+from startrack.exposure.sidecar import IMAGE_KEYS, RAW_SUFFIXES, read_sidecar, sidecar_of, sidecar_reference
+
+MISSING = "?"  # in place of the hash of a file that cannot be read; once it can, the hash differs
+FILES = ("camera", "terrain", *IMAGE_KEYS)  # facts that may be paths
+
+
+def sha256_of(path: str | os.PathLike[str]) -> str:
+    """SHA-256 of a file's content in hex; `MISSING` if it cannot be read, which the reader of the file reports."""
+    try:
+        if not stat.S_ISREG(os.stat(path).st_mode):  # opening a pipe would block
+            return MISSING
+        with Path(path).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except (OSError, ValueError):  # a NUL in the name
+        return MISSING
+
+
+def content_sha256(image: str, bag_image: BagImage | None) -> str:
+    """SHA-256 of an image's file, or of its message in a bag; `MISSING` if the file cannot be read."""
+    return sha256_of(image) if bag_image is None else bag_image.message.sha256
+
+
+def job_sha256(image: str, image_sha256: str, facts: dict[str, Any], *others: object) -> str:
+    """SHA-256 of image, sidecar, flags, version and extras, and of dark frame and flat field.
+
+    `input_hashes` covers the other files that these name.
+    """
+    path = Path(image)
+    sidecar = sidecar_of(path)
+    files = {key: relative_path(facts[key], path.parent) for key in FILES if is_path(facts.get(key, ""))}
+    flags = {**facts, **files}
+    extras = [has_deep_catalog(), path.suffix.lower() in RAW_SUFFIXES and find_spec("rawpy") is not None]
+    whole = [__version__, flags, *others, extras, image_sha256, sidecar and sha256_of(sidecar)]
+    whole += _correction_sha256(path, facts)
+    return hashlib.sha256(json.dumps(whole, default=str).encode()).hexdigest()
+
+
+def _correction_sha256(image: Path, facts: dict[str, Any]) -> list[str]:
+    """Key and SHA-256 of the dark frame and the flat field of an `image`, by flags, else by its sidecar."""
+    try:
+        sidecar, values = read_sidecar(image)
+        files = {key: facts.get(key) or sidecar_reference(sidecar, values, key) for key in ("dark", "flat")}
+    except BadInput:  # refused when the image is read
+        return []
+    return [f"{key} {_cached_sha256(Path(file))}" for key, file in files.items() if file]
+
+
+def input_hashes(image: str, references: Iterable[str | None]) -> dict[str, str]:
+    """Path to SHA-256 of the `references`, of a camera's mask and a terrain's height maps; not of shipped files.
+
+    Paths are relative to the image's folder, so that a tree may move.
+    """
+    files = [Path(reference) for reference in references if reference and is_path(reference)]
+    files += [named for file in tuple(files) if file.suffix == ".toml" for named in _named_files(file)]
+    return {relative_path(file, Path(image).parent): _cached_sha256(file) for file in files}
+
+
+def are_unchanged(image: str, hashes: dict[str, str]) -> bool:
+    """Whether the files of `input_hashes` have the content they had."""
+    folder = os.path.realpath(Path(image).parent)
+    return all(_cached_sha256(Path(folder, path)) == sha256 for path, sha256 in hashes.items())
+
+
+def is_older_than(image: str | os.PathLike[str], result: str | os.PathLike[str]) -> bool:
+    """Whether the image was neither written nor moved after its result was written; neither file is read."""
+    try:
+        of_image, of_result = os.stat(image), os.stat(result)
+    except (OSError, ValueError):  # a NUL in the name
+        return False
+    return max(of_image.st_mtime_ns, of_image.st_ctime_ns) < of_result.st_mtime_ns
+
+
+def _named_files(file: Path) -> list[Path]:
+    """The height maps that a terrain file names, or the mask that a camera file names."""
+    try:
+        values = parse_toml(read_text(file, "bad_terrain"), "bad_terrain")
+    except BadInput:  # refused when it is loaded
+        return []
+    dem = values.get("dem")
+    names = dem.get("file") if isinstance(dem, dict) else values.get("mask")
+    return [file.parent / str(name) for name in (names if isinstance(names, list) else [names]) if name]
+
+
+def _cached_sha256(path: Path) -> str:
+    """The same as `sha256_of`; a height map is read once, not for every image."""
+    try:
+        found = path.stat()
+    except (OSError, ValueError):
+        return MISSING
+    return _sha256_at_stamp(path, (found.st_ino, found.st_size, found.st_mtime_ns))
+
+
+@lru_cache(maxsize=64)
+def _sha256_at_stamp(path: Path, stamp: tuple[int, ...]) -> str:
+    return sha256_of(path)

@@ -1,0 +1,217 @@
+"""The tables of a batch: results, trajectories, timings and a manifest.
+
+They are made from the images' records, sorted by name, so that they have the same bytes however the work was divided.
+Only `timings.ecsv` differs from run to run.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import datetime
+from importlib.util import find_spec
+from pathlib import Path, PurePath
+from typing import Any
+
+import numpy as np
+
+from startrack import __version__
+from startrack.applications.batch.find import unique_names
+from startrack.applications.batch.store import INPUTS, JOB, MANIFEST, RESULT, is_solved, stored_record, text_of_name
+from startrack.applications.batch.task import Record, Task, valid_stored_record
+from startrack.chain.stages import STAGES
+from startrack.core.files import write_atomically
+from startrack.frames import R_from_quat_xyzw, tum_line
+from startrack.output.ecsv import Column, ecsv_text, format_values
+from startrack.output.views import columns
+
+FORMAT = "startrack.manifest/1"
+TRAJECTORY = "trajectory.tum"
+PARQUET = "results.parquet"
+NOT_IN_TABLES = ("modes", "message", "warnings", "format")
+FILES = ("provenance.camera", "provenance.terrain")  # names or paths of files: the tables hold the stem, no path
+ASTROPY_UNITS = {
+    "m": "m", "m^2": "m2", "deg": "deg", "arcsec": "arcsec", "px": "pix", "s": "s", "mag/arcsec^2": "mag / arcsec2",
+}  # fmt: skip
+DATATYPES = {"d": "int64", "s": "string"}  # by the last letter of the format, else float64
+
+
+@dataclass(frozen=True)
+class TableColumn:
+    """A column of the results table."""
+
+    name: str
+    datatype: str
+    unit: str | None
+    form: str  # printf format
+    path: tuple[Any, ...]  # keys and indices that lead to the value in a record
+
+    def values(self, records: Sequence[Record]) -> list[Any]:
+        """One value a record, None if it has none."""
+        values = [_value_at(record, self.path) for record in records]
+        is_file = ".".join(map(str, self.path)) in FILES
+        return [value if value is None or not is_file else file_stem(value) for value in values]
+
+
+COLUMNS = [
+    *(TableColumn(name, "string", None, "%s", (name,)) for name in ("image", "status", "reason")),
+    *(
+        TableColumn(
+            column.name, DATATYPES.get(column.form[-1], "float64"), ASTROPY_UNITS.get(quantity.unit), column.form,
+            (*quantity.path.split("."), *column.at),
+        )
+        for quantity, column in columns()
+    ),
+]  # fmt: skip
+
+
+@dataclass
+class Rows:
+    """Rows of all images of a folder, and the number of results that have none."""
+
+    rows: list[Record] = field(default_factory=list)
+    omitted: int = 0  # stored results of other settings or contents, or of an attempt that failed
+    superseded: int = 0  # images refused now because of an input, whose earlier solution is kept beside the tables
+
+
+def table_values(record: Record) -> Record:
+    """The part of a record that the tables need: the rest of 100,000 records need not stay in memory."""
+    return {key: value for key, value in record.items() if key not in NOT_IN_TABLES}
+
+
+def table_rows(tasks: Iterable[Task], now: Mapping[str, Record], out: str | os.PathLike[str]) -> Rows:
+    """Rows of the whole folder's `tasks`; `now` has the records of this run by the images' names as text.
+
+    `out` is the folder of the results."""
+    found = Rows()
+    for task in tasks:
+        name = text_of_name(task.name)
+        record = now.get(name) or valid_stored_record(task)
+        if record is None:
+            found.omitted += os.path.exists(task.result)
+            continue
+        superseded = name in now and not is_solved(record) and is_solved(stored_record(task.result))
+        found.superseded += superseded
+        result = text_of_name(Path(os.path.relpath(task.result, out)).as_posix())
+        found.rows.append({**table_values(record), "image": name, RESULT: None if superseded else result})
+    return found
+
+
+def write_tables(out: Path, records: Sequence[Record], settings: dict[str, Any]) -> list[Path]:
+    """Write results.ecsv, results.parquet (with the extra `parquet`), trajectories, timings.ecsv and manifest.json.
+
+    Args:
+        out: folder of the results.
+        records: of the images.
+        settings: of the run, for the manifest.
+
+    Tables of an earlier run that this one does not make are removed. Returns the paths written; raises BadInput if
+    one cannot be.
+    """
+    records = sorted(records, key=lambda record: str(record["image"]))
+    made: dict[str, Callable[[], bytes]] = {"results.ecsv": lambda: _results(records)}
+    if has_parquet():
+        made[PARQUET] = lambda: _parquet(records)
+    for name, lines in _trajectories(records).items():
+        made[name] = "".join(lines).encode
+    made |= {"timings.ecsv": lambda: _timings(records), MANIFEST: lambda: _manifest(records, settings)}
+    for former in (out / PARQUET, out / TRAJECTORY, *out.glob("trajectory-*.tum")):
+        if former.name not in made:
+            with suppress(OSError):
+                former.unlink()
+    for name, make in made.items():
+        write_atomically(out / name, make(), overwrite=True)
+    return [out / name for name in made]
+
+
+def has_parquet() -> bool:
+    """Whether the extra `parquet` is installed."""
+    return find_spec("pyarrow") is not None
+
+
+def file_stem(reference: str) -> str:
+    """Name of a camera or terrain: of a shipped one as it is, of a file its stem."""
+    return PurePath(reference.replace("\\", "/")).name.removesuffix(".toml")
+
+
+def _results(records: Sequence[Record]) -> bytes:
+    table = [Column(one.name, format_values(one.form, one.values(records)), one.datatype, one.unit) for one in COLUMNS]
+    return ecsv_text(table).encode()
+
+
+def _parquet(records: Sequence[Record]) -> bytes:
+    """The results as Parquet, units in the columns' metadata."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    types = {"string": pa.string(), "float64": pa.float64(), "int64": pa.int64()}
+    fields = [
+        pa.field(one.name, types[one.datatype], metadata={"unit": one.unit} if one.unit else None) for one in COLUMNS
+    ]
+    table = pa.table([one.values(records) for one in COLUMNS], schema=pa.schema(fields))
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink)
+    return bytes(sink.getvalue().to_pybytes())
+
+
+def _trajectories(records: Sequence[Record]) -> dict[str, list[str]]:
+    """File name to poses in the order of time: one file a terrain, whose origin the coordinates count from."""
+    poses: dict[tuple[str, ...], list[str]] = {}
+    for record in records:
+        if record["status"] == "ok" and record["provenance"]["time_utc"] is not None:
+            poses.setdefault(_terrain_key(record), []).append(_pose(record))
+    if len(poses) <= 1:
+        return {TRAJECTORY: sorted(next(iter(poses.values()), []))}
+    keys = sorted(poses)
+    names = unique_names([key[0] for key in keys])
+    return {f"trajectory-{name}.tum": sorted(poses[key]) for name, key in zip(names, keys, strict=True)}
+
+
+def _terrain_key(record: Record) -> tuple[str, ...]:
+    """Name of the terrain's file, and the hashes of the files of that name: equal for equal terrains only."""
+    stem = file_stem(str(record["provenance"].get("terrain") or record["position"].get("terrain")))
+    inputs = record.get(INPUTS, {})
+    return stem, *sorted(sha256 for path, sha256 in inputs.items() if PurePath(path).name == f"{stem}.toml")
+
+
+def _pose(record: Record) -> str:
+    """A line of TUM's format: seconds of UTC, position, and the rotation from the rover's body to enu."""
+    position, attitude = record["position"], record["attitude"]
+    seconds = datetime.fromisoformat(record["provenance"]["time_utc"]).timestamp()
+    position_m = np.array([position["east_m"], position["north_m"], position["up_m"]])
+    return tum_line(seconds, position_m, R_from_quat_xyzw(attitude["quat_xyzw_body_enu"]).T)
+
+
+def _timings(records: Sequence[Record]) -> bytes:
+    table = [Column("image", [record["image"] for record in records], "string")]
+    for stage in STAGES:
+        times = [_value_at(record, ("timing_ms", stage)) for record in records]
+        table.append(Column(f"{stage}_ms", format_values("%.3f", times), "float64", "ms"))
+    return ecsv_text(table).encode()
+
+
+def _manifest(records: Sequence[Record], settings: dict[str, Any]) -> bytes:
+    images = [
+        {
+            "image": record["image"],
+            RESULT: record.get(RESULT),
+            "status": record["status"],
+            "image_sha256": record.get("provenance", {}).get("image_sha256"),
+            JOB: record.get(JOB),
+        }
+        for record in records
+    ]
+    whole = {"format": FORMAT, "version": __version__, "settings": settings, "images": images}
+    return (json.dumps(whole, indent=1, ensure_ascii=False) + "\n").encode()
+
+
+def _value_at(record: Any, path: Iterable[Any]) -> Any:
+    """The value in a record that keys and indices lead to; None if the record lacks it."""
+    for key in path:
+        if record is None or (isinstance(key, str) and key not in record):
+            return None
+        record = record[key]
+    return record

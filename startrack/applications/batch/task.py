@@ -1,0 +1,202 @@
+"""One image of a batch: located in any process, unless a valid result is there already."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Generator, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from startrack import __version__
+from startrack.applications.batch.fingerprint import (
+    MISSING,
+    are_unchanged,
+    content_sha256,
+    input_hashes,
+    is_older_than,
+    job_sha256,
+)
+from startrack.applications.batch.store import (
+    INPUTS,
+    JOB,
+    has_companions,
+    image_sha256,
+    is_solved,
+    stored_record,
+    text_of_name,
+)
+from startrack.core.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
+from startrack.core.runner import Died, Runner, RunStopped
+
+if TYPE_CHECKING:
+    from startrack.chain.stages import Outcome
+    from startrack.core.types import Exposure
+    from startrack.exposure import BagImage
+
+Record = dict[str, Any]
+ImageDone = tuple[Record, bool]  # the record, and whether it was there already
+DISK_ERRORS = {errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.EFBIG, errno.EIO}
+
+
+@dataclass(frozen=True)
+class Task:
+    """An image and all settings that decide its result; small, so that it is cheap to send to a worker."""
+
+    name: str  # of the image, relative to the batch's folder
+    path: str
+    result: str  # path of NAME.fix.json
+    facts: dict[str, Any] = field(default_factory=dict)  # from flags, by the parameters of `read_exposure`
+    plots: bool = True
+    overwrite: bool = False  # locate it again even if a valid result is there
+    localizer: str = "posterior"  # of startrack.localization.LOCALIZERS
+    evidence: str = "both"  # of startrack.chain.stages.EVIDENCE_SOURCES
+    bag_image: BagImage | None = None  # where `path` is BAG#NUMBER
+    near: tuple[float, float, float] | None = None  # east, north, sigma [m] of a prior of the position
+
+
+def locate_images(runner: Runner[Task, ImageDone], tasks: Sequence[Task]) -> Generator[ImageDone, None, None]:
+    """The outcomes of `tasks` on a `runner` in the order of completion. Raises BadInput (no_cluster), RunStopped."""
+    with closing(runner.results(tasks)) as results:
+        for task, outcome in results:
+            if isinstance(outcome, Died):
+                yield write_failure(task, f"internal error: {outcome.cause}"), False
+            else:
+                yield outcome
+
+
+def locate_image(task: Task) -> ImageDone:
+    """The record of a `task`'s image, and whether it existed already. Bad images and internal errors have records too.
+
+    NAME.fix.json is written last, so that a record that exists is complete. Raises RunStopped if the disk is full.
+    """
+    try:
+        sha256 = content_sha256(task.path, task.bag_image)
+        key = _key(task, sha256)
+        before = None if task.overwrite else _valid_record(task, key)
+        return (before, True) if before is not None else (_locate_and_write(task, sha256, key), False)
+    except Exception as cause:  # noqa: BLE001 - an internal error of one image is counted and recorded; the others go on
+        if isinstance(cause, BadInput):  # not of the image, which would be a record: the results cannot be written
+            _stop_if_disk_is_full(cause)
+            return write_failure(task, str(cause), cause.reason), False
+        return write_failure(task, f"internal error: {type(cause).__name__}: {cause}"), False
+
+
+def valid_stored_record(task: Task) -> dict[str, Any] | None:
+    """The stored record that the next run would keep, else None. An image older than its record is not read."""
+    record = stored_record(task.result)
+    if record is None:
+        return None
+    known = image_sha256(record) if is_older_than(task.path, task.result) else None
+    return _valid_record(task, _key(task, known or content_sha256(task.path, task.bag_image)))
+
+
+def write_failure(task: Task, message: str, reason: str = INTERNAL_ERROR) -> dict[str, Any]:
+    """Write and return the record of an image that failed: without a job hash, so that the next run repeats it."""
+    from startrack.output import refused_dict, write_json
+
+    record = {
+        **refused_dict(task.name, reason, message),
+        **_unread_provenance(content_sha256(task.path, task.bag_image)),
+    }
+    record |= {"image": text_of_name(task.name), JOB: None}
+    with suppress(BadInput):  # the record is returned all the same
+        if not is_solved(stored_record(task.result)):
+            _remove_former(Path(task.result))
+            write_json(task.result, record)
+    return record
+
+
+def _valid_record(task: Task, key: str) -> dict[str, Any] | None:
+    """The stored record, if it is complete and everything it was made from is unchanged; else None."""
+    record = stored_record(task.result)
+    if record is None or record.get(JOB) != key or not are_unchanged(task.path, record.get(INPUTS, {})):
+        return None
+    return record if has_companions(record, Path(task.result), plots=task.plots) else None
+
+
+def _key(task: Task, sha256: str) -> str:
+    return job_sha256(task.path, sha256, task.facts, task.plots, task.localizer, task.evidence, *(task.near or ()))
+
+
+def _locate_and_write(task: Task, sha256: str, key: str) -> dict[str, Any]:
+    """Locate the image and write its record and companions, unless an input is at fault and a solution exists already.
+
+    Former files are removed before new ones are written, so that no result consists of both.
+    """
+    from startrack.output import result_dict, write_json, write_results
+
+    result = Path(task.result)
+    found, inputs = _locate(task, sha256)
+    reason = found["reason"] if isinstance(found, dict) else found.reason
+    keeps_former = reason in BAD_INPUT_REASONS and is_solved(stored_record(result))
+    if not keeps_former:
+        _remove_former(result)
+    if isinstance(found, dict):
+        record = found
+    elif keeps_former:
+        record = result_dict(found)
+    else:
+        record = write_results(found, result, plots=task.plots, write_record=False)
+    record = {**record, "image": text_of_name(task.name), JOB: key, INPUTS: inputs}
+    if not keeps_former:
+        write_json(result, record)
+    return record
+
+
+def _remove_former(result: Path) -> None:
+    """Make the folder and remove the files of an earlier run. Raises BadInput if that is impossible."""
+    from startrack.output import remove_companions
+
+    try:
+        result.parent.mkdir(parents=True, exist_ok=True)
+        result.unlink(missing_ok=True)
+        remove_companions(result)
+    except OSError as cause:
+        raise BadInput("bad_image", f"{result}: cannot be written ({cause.strerror})") from cause
+
+
+def read_task(task: Task) -> Exposure:
+    """The exposure of a task's image. Raises BadInput."""
+    from startrack.exposure import read_bag_image, read_exposure
+
+    if task.bag_image is not None:
+        return read_bag_image(task.bag_image, **task.facts)
+    return read_exposure(task.path, **task.facts)
+
+
+def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str, str]]:
+    """A value with companions, or the record of a refusal without; and the hashes of camera and terrain files."""
+    from startrack.chain.pipeline import Settings, locate_exposure
+    from startrack.chain.stages import Inputs, Refused
+    from startrack.core.prior import PositionPrior
+    from startrack.localization import require_localizer
+    from startrack.output import refused_dict, result_dict
+
+    try:
+        exposure = read_task(task)
+    except BadInput as cause:
+        return {**refused_dict(task.name, cause.reason, str(cause)), **_unread_provenance(sha256)}, {}
+    # Before the files are read, so that a change in between is noticed.
+    mask = exposure.mask if isinstance(exposure.mask, str) else None
+    inputs = input_hashes(task.path, [exposure.camera, exposure.terrain, mask])
+    try:
+        near = None if task.near is None else PositionPrior(*task.near)
+        settings = Settings(
+            localizer=require_localizer(task.localizer), evidence_sources=task.evidence, near=near
+        )  # fmt: skip
+        return locate_exposure(exposure, settings), inputs
+    except BadInput as cause:
+        return result_dict(Refused(reason=cause.reason, message=str(cause), reached=Inputs(exposure=exposure))), inputs
+
+
+def _unread_provenance(sha256: str) -> dict[str, Any]:
+    """The provenance of an image that could not be decoded, or its sidecar not be read: the file's hash."""
+    unknown = dict.fromkeys(("camera", "terrain", "catalog", "time_utc", "exposure_s"))
+    return {} if sha256 == MISSING else {"provenance": {"version": __version__, "image_sha256": sha256, **unknown}}
+
+
+def _stop_if_disk_is_full(cause: BadInput) -> None:
+    if isinstance(cause.__cause__, OSError) and cause.__cause__.errno in DISK_ERRORS:
+        raise RunStopped(str(cause)) from cause

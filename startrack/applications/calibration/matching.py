@@ -1,0 +1,158 @@
+"""Matches of a frame's sources with predicted stars during a calibration, and how complete they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from startrack.applications.calibration.frame import Frame
+from startrack.camera import Camera
+from startrack.core.types import Array, Bools, Ints
+from startrack.estimation.match import instrumental_mag, is_isolated, match_by_brightness
+
+TOLERANCE_MAG = 0.9
+BLEND_MAG = 2.0  # a neighbour less than this fainter than the star shifts its centroid
+BLEND_SIGMAS = 3.5  # of the PSF
+DEPTH_MAG = 0.5  # stars are predicted to this much below the faintest source
+SCALE_STARS = 4000  # brightest stars used for the zero point
+MIN_STARS_FOR_SHAPE = 30
+NEAR_CURVE_MAG = 1.2  # stars with a zero point this close to the curve are used in its fit
+CURVE_ROUNDS = 4
+SECURE_MAG = 0.7  # a star this much brighter than the frame's limit is detected where the sky is open
+LIMIT_QUANTILE = 0.85
+CELLS_ACROSS = 12  # of the frame's longer side; a cell without matches is not open sky
+
+
+@dataclass(frozen=True)
+class BrightStars:
+    """Stars (n,) bright enough to be detected where the sky is open, wherever they are predicted."""
+
+    star: Ints  # indices into the frame's sky
+    xy_px: Array  # (n, 2)
+    found: Bools  # whether there is a source of equal brightness
+
+
+NO_BRIGHT_STARS = BrightStars(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.bool_))
+
+
+@dataclass(frozen=True)
+class FrameMatches:
+    """Matches of one frame, and how many there should be."""
+
+    detection: Ints  # (n,) indices into the frame's sources
+    star: Ints  # (n,) indices into the frame's sky
+    expected: int  # bright stars predicted where the sky is open
+    expected_found: int  # those with a source of equal brightness
+    significant: int  # bright sources within the angle searched
+    significant_matched: int
+    bright: BrightStars
+
+    def __len__(self) -> int:
+        return len(self.star)
+
+    @property
+    def fraction(self) -> float:
+        """The larger of two fractions: bright stars with a source, and bright sources with a star.
+
+        Clouds and trees reduce the first, hot pixels and lamps the second, a wrong lens both.
+        """
+        return max(
+            self.expected_found / self.expected if self.expected else 0.0,
+            self.significant_matched / self.significant if self.significant else 0.0,
+        )
+
+
+def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: float, gate_px: float) -> FrameMatches:
+    """Unblended nearest pairs of equal brightness within the gate, up to the angle `within_rad` off the axis."""
+    from scipy.spatial import cKDTree
+
+    found, stars = frame.sources, frame.sky.stars
+    source_mag = instrumental_mag(found.flux_e)
+    tree = cKDTree(found.xy_px)
+    zero_mag = zero_point(frame, camera, R_cam_icrs, within_rad, gate_px, tree)
+    limit = float(source_mag.max()) + DEPTH_MAG
+    faintest_v = limit + BLEND_MAG + float(np.max(zero_mag(np.linspace(0.0, within_rad, 50))))
+    count = int(np.searchsorted(stars.v_mag, faintest_v))
+    px, angle, seen = predict_pixels(frame, camera, R_cam_icrs, within_rad, count)
+    star_mag = stars.v_mag[:count] - zero_mag(angle)  # instrumental
+    seen = seen[star_mag[seen] < limit + BLEND_MAG]
+    detection, star, _ = match_by_brightness(
+        tree, px, seen, gate_px, star_mag=star_mag, star_sigma_mag=stars.v_sigma_mag[:count],
+        detection_mag=source_mag, saturated=found.saturated, limit_mag=limit, tolerance_mag=TOLERANCE_MAG,
+    )  # fmt: skip
+    alone = is_isolated(px[star], star, px, seen, stars.v_mag, BLEND_SIGMAS * found.psf_sigma_px, BLEND_MAG)
+    faintest = float(np.quantile(source_mag[detection], LIMIT_QUANTILE)) if len(detection) else -np.inf
+    bright = seen[star_mag[seen] < faintest - SECURE_MAG]
+    expected = bright[_is_open_sky(px[bright], found.xy_px[detection], frame.size_px)]
+    significant = (camera.angle_rad(found.xy_px) < within_rad) & (source_mag < faintest - SECURE_MAG)
+    return FrameMatches(
+        detection=detection[alone],
+        star=star[alone],
+        expected=len(expected),
+        expected_found=int(np.isin(expected, star).sum()),
+        significant=int(significant.sum()),
+        significant_matched=int(np.count_nonzero(significant[detection])),
+        bright=BrightStars(bright, px[bright], np.isin(bright, star)),
+    )
+
+
+def predict_pixels(
+    frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: float, count: int
+) -> tuple[Array, Array, Ints]:
+    """Pixels (n, 2) and off-axis angles (n,) of the `count` brightest stars, and the indices of those in the `frame`.
+
+    `camera` and `R_cam_icrs` place them; those within `within_rad` of the axis are computed.
+    """
+    rays_icrs = frame.sky.stars.rays_icrs[:count]
+    widest = min(within_rad, camera.lens.max_invertible_rad)
+    near = np.flatnonzero(rays_icrs @ R_cam_icrs[2] > np.cos(widest))
+    rays = rays_icrs[near] @ R_cam_icrs.T
+    px, angle = np.zeros((len(rays_icrs), 2)), np.zeros(len(rays_icrs))
+    px[near] = camera.project_unlimited(rays)
+    angle[near] = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    width, height = frame.size_px
+    inside = np.all((px[near] > -0.5) & (px[near] < np.array([width, height]) - 0.5), axis=1)
+    return px, angle, near[inside]
+
+
+def zero_point(
+    frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: float, gate_px: float, tree: Any
+) -> Callable[[Array], Array]:
+    """Zero point [mag] of a `frame` as a function of the angle off the axis; with vignetting and, roughly, extinction.
+
+    `camera` and `R_cam_icrs` predict the stars up to `within_rad` off the axis, `tree` holds the sources, which are
+    taken within `gate_px`.
+    """
+    found, v_mag = frame.sources, frame.sky.stars.v_mag
+    px, angle, seen = predict_pixels(frame, camera, R_cam_icrs, within_rad, SCALE_STARS)
+    distance, nearest = tree.query(px[seen], distance_upper_bound=gate_px)
+    hit = np.isfinite(distance)
+    hit[hit] &= ~found.saturated[nearest[hit]]
+    return _fit_parabola(angle[seen[hit]], v_mag[seen[hit]] - instrumental_mag(found.flux_e[nearest[hit]]))
+
+
+def _fit_parabola(angle_rad: Array, zero_mag: Array) -> Callable[[Array], Array]:
+    """Robust parabola through zero points, constant beyond the angles of the stars."""
+    if not len(zero_mag):
+        return np.poly1d([0.0])
+    fit = np.poly1d([float(np.median(zero_mag))])
+    if len(zero_mag) < MIN_STARS_FOR_SHAPE:
+        return fit
+    for _ in range(CURVE_ROUNDS):
+        close = np.abs(zero_mag - fit(angle_rad)) < NEAR_CURVE_MAG
+        if close.sum() < MIN_STARS_FOR_SHAPE:
+            break
+        fit = np.poly1d(np.polyfit(angle_rad[close], zero_mag[close], 2))
+    low, high = np.min(angle_rad), np.max(angle_rad)
+    return lambda a: fit(np.clip(a, low, high))
+
+
+def _is_open_sky(px: Array, xy_px: Array, size_px: tuple[int, int]) -> Bools:
+    """Whether the pixels (n, 2) lie in a cell of the frame with a match; the others are cloud, tree or wall."""
+    cell = max(size_px) / CELLS_ACROSS
+    columns = int(np.ceil(size_px[0] / cell)) + 2
+    numbers = [np.clip(np.rint(p / cell), 0, None).astype(int) @ np.array([1, columns]) for p in (px, xy_px)]
+    return np.isin(*numbers)

@@ -1,0 +1,124 @@
+"""Picture of a calibration: residual vectors, residuals by angle, projection sigma over the image, sectors."""
+
+from __future__ import annotations
+
+import io
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from startrack.applications.calibration.record import projection_by_angle
+from startrack.applications.calibration.report import ring_rms_px
+from startrack.applications.calibration.run import Calibration
+from startrack.camera import Camera
+from startrack.core.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+INK, GOOD, BAD, LINE = "#1b2430", "#0072b2", "#d55e00", "#009e73"
+ARROW_FRACTION = 0.02  # of the frame's width: length of an arrow of the RMS residual
+MAP_SIDE = 160
+MAX_ARROWS = 1000  # more overlap
+CIRCLE_RAD = np.linspace(0.0, 2 * np.pi, 181)
+
+
+def report_png(calibration: Calibration) -> bytes:
+    """The picture as PNG."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13.0, 11.0), dpi=100, layout="constrained")
+    axes = figure.subplots(2, 2)
+    _draw_vectors(axes[0, 0], calibration)
+    _draw_by_angle(axes[0, 1], calibration)
+    _draw_sigma(axes[1, 0], calibration.camera)
+    _draw_sectors(axes[1, 1], calibration)
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png", metadata={"Software": None})
+    return drawn.getvalue()
+
+
+def _draw_frame(axes: Axes, camera: Camera) -> None:
+    """Axes of the frame, y down, with the image circle and the calibrated radius."""
+    width, height = camera.size_px
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="x px", ylabel="y px")
+    for angle, style, label in (
+        (camera.calibrated_angle_rad, "-", f"calibrated to {np.degrees(camera.calibrated_angle_rad):.1f}°"),
+        (camera.max_angle_rad, ":", f"image circle {np.degrees(camera.max_angle_rad):.1f}°"),
+    ):
+        rays = np.stack(
+            [np.sin(angle) * np.cos(CIRCLE_RAD), np.sin(angle) * np.sin(CIRCLE_RAD), np.full(181, np.cos(angle))],
+            axis=1,
+        )
+        px, _ = camera.project(rays * (1 - 1e-12))
+        axes.plot(px[:, 0], px[:, 1], style, color=LINE, linewidth=1.2, label=label)
+    axes.legend(loc="lower right", fontsize=8, framealpha=0.9)
+
+
+def _draw_vectors(axes: Axes, calibration: Calibration) -> None:
+    fit, camera = calibration.joint.fit, calibration.camera
+    px, residual = calibration.joint.points.xy_px, fit.held_out_px
+    scale = ARROW_FRACTION * camera.size_px[0] / max(fit.held_out_rms_px, 1e-6)
+    used = np.flatnonzero(fit.used)
+    used = used[:: max(len(used) // MAX_ARROWS, 1)]
+    axes.quiver(
+        px[used, 0], px[used, 1], scale * residual[used, 0], scale * residual[used, 1], color=GOOD, angles="xy",
+        scale_units="xy", scale=1, width=0.0016,
+    )  # fmt: skip
+    rejected = ~fit.used
+    axes.plot(px[rejected, 0], px[rejected, 1], "x", color=BAD, markersize=5, label=f"{rejected.sum()} rejected")
+    axes.set_title(f"Held-out residuals, {scale:.0f} times enlarged (RMS {fit.held_out_rms_px:.3f} px)", fontsize=11)
+    _draw_frame(axes, camera)
+
+
+def _draw_by_angle(axes: Axes, calibration: Calibration) -> None:
+    fit, camera, points = calibration.joint.fit, calibration.camera, calibration.joint.points
+    angle = camera.angle_rad(points.xy_px)
+    offset = points.xy_px - np.asarray(camera.centre_px)
+    outwards = offset / np.maximum(np.linalg.norm(offset, axis=1), 1e-9)[:, None]
+    radial = np.sum(fit.held_out_px * outwards, axis=1)
+    across = fit.held_out_px[:, 1] * outwards[:, 0] - fit.held_out_px[:, 0] * outwards[:, 1]
+    used = fit.used
+    axes.plot(np.degrees(angle[used]), radial[used], ".", color=GOOD, markersize=3, label="radial", alpha=0.6)
+    axes.plot(np.degrees(angle[used]), across[used], ".", color=BAD, markersize=3, label="across", alpha=0.6)
+    grid = np.linspace(0.0, camera.calibrated_angle_rad, 60)
+    sigma = projection_by_angle(camera, grid)[2]
+    for sign in (-1, 1):
+        label = "3 map sigma" if sign > 0 else None
+        axes.plot(np.degrees(grid), sign * 3 * sigma, color=INK, linewidth=1.2, label=label)
+    axes.axvline(float(np.degrees(camera.calibrated_angle_rad)), color=LINE, linewidth=1.2)
+    top = 4.0 * max(fit.held_out_rms_px, 1e-3)
+    axes.set(ylim=(-top, top), xlabel="angle off the axis, degrees", ylabel="held-out residual px")
+    axes.set_title("Residuals by angle: a curve shows a wrong lens model", fontsize=11)
+    axes.legend(loc="upper left", fontsize=8, ncols=3)
+
+
+def _draw_sigma(axes: Axes, camera: Camera) -> None:
+    width, height = camera.size_px
+    x, y = np.meshgrid(np.linspace(0, width - 1, MAP_SIDE), np.linspace(0, height - 1, MAP_SIDE * height // width))
+    rays = camera.unproject(np.stack([x, y], axis=-1))
+    inside = camera.angle_rad(np.stack([x, y], axis=-1)) <= camera.calibrated_angle_rad
+    sigma: Array = np.ma.masked_where(~inside, camera.projection_sigma_px(rays))
+    drawn = axes.imshow(sigma, extent=(-0.5, width - 0.5, height - 0.5, -0.5), cmap="viridis", interpolation="bilinear")
+    axes.figure.colorbar(drawn, ax=axes, shrink=0.85, label="px per axis")
+    axes.set_title("Projection sigma inside the calibrated radius, attitude free", fontsize=11)
+    _draw_frame(axes, camera)
+
+
+def _draw_sectors(axes: Axes, calibration: Calibration) -> None:
+    cover, _, by_sector = ring_rms_px(calibration)
+    drawn = axes.imshow(np.ma.masked_invalid(by_sector), cmap="magma", aspect="auto", vmin=0.0)
+    axes.figure.colorbar(drawn, ax=axes, shrink=0.85, label="held-out RMS px")
+    dark = np.nanmax(by_sector) * 0.5 if np.isfinite(by_sector).any() else 0.0
+    for ring, row in enumerate(by_sector):
+        for sector, value in enumerate(row):
+            text = f"{value:.2f}\n{cover.stars[ring, sector]:.0f} stars" if np.isfinite(value) else "no star"
+            colour = "white" if np.isfinite(value) and value < dark else "black"
+            axes.text(sector, ring, text, ha="center", va="center", fontsize=8, color=colour)
+    edges = np.degrees(cover.ring_edges_rad)
+    rings, sectors = by_sector.shape
+    axes.set_xticks(range(sectors), [f"{360 * k // sectors}°" for k in range(sectors)])
+    axes.set_yticks(range(rings), [f"{a:.0f}–{b:.0f}°" for a, b in pairwise(edges)])
+    axes.set(xlabel="sector, from image right, clockwise", ylabel="ring")
+    axes.set_title("Held-out RMS and number of stars by ring and sector", fontsize=11)

@@ -1,0 +1,188 @@
+"""A calibration as the dictionary of its JSON file and as one line; a camera file as text."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from startrack import __version__
+from startrack.applications.calibration.acceptance import star_coverage
+from startrack.applications.calibration.photometry import photometry_dict
+from startrack.applications.calibration.run import Calibration, RefusedImage
+from startrack.camera import Camera, camera_to_dict
+from startrack.core.errors import reason_of
+from startrack.core.types import Array
+from startrack.frames import format_utc, quat_xyzw_from_R
+
+FORMAT = "startrack.calibration/1"
+REFRACTION_REMOVED = "taken out"
+MAP_ANGLES = 10
+
+
+def calibration_dict(calibration: Calibration) -> dict[str, Any]:
+    """The calibration's JSON object, with the camera only if all checks passed."""
+    fit, failed = calibration.joint.fit, calibration.failed_checks
+    cover, refracted = star_coverage(calibration.joint), _is_refracted(calibration)
+    return {
+        "format": FORMAT,
+        "status": "refused" if failed else "ok",
+        "reason": failed[0].reason if failed else None,
+        "message": message(calibration),
+        "camera": None if failed else camera_to_dict(calibration.camera),
+        "lens": {
+            "stars": int(fit.used.sum()),
+            "clipped": int((~fit.used).sum()),
+            "rms_px": fit.rms_px,
+            "held_out_rms_px": fit.held_out_rms_px,
+            "held_out_rms_arcmin": fit.held_out_rms_px * arcmin_per_px(calibration.camera),
+            "extra_sigma_px": fit.extra_sigma_px,
+            "chi2_per_dof": fit.chi2_per_dof,
+            "birge_ratio": calibration.joint.birge_ratio,
+            "map_sigma_px": next(check.value for check in calibration.checks if check.name.startswith("map sigma")),
+            "refraction": REFRACTION_REMOVED if refracted else "not taken out: no site on the Earth was given",
+            "models": [vars(candidate) for candidate in fit.candidates],
+        },
+        "gates": [
+            {"name": check.name, "value": _json_number(check.value), "limit": check.limit, "passed": bool(check.passed)}
+            for check in calibration.checks
+        ],
+        "coverage": {
+            "ring_edges_deg": np.degrees(cover.ring_edges_rad).round(3).tolist(),
+            "stars": cover.stars.astype(int).tolist(),
+        },
+        "photometry": photometry_dict(calibration.photometry),
+        "images": _images(calibration),
+        "obstructed_fraction": 0.0 if calibration.obstructed is None else float(calibration.obstructed.mean()),
+        "refused": [vars(refused) for refused in calibration.refused],
+        "provenance": {"version": __version__, "false_alarm_probability": calibration.false_alarm_probability},
+    }
+
+
+def refusal_dict(reason: str, text: str, refused: tuple[RefusedImage, ...] = ()) -> dict[str, Any]:
+    """The JSON object of a calibration without a lens."""
+    return {
+        "format": FORMAT,
+        "status": "refused",
+        "reason": reason,
+        "message": text,
+        "advice": reason_of(reason).advice,
+        "camera": None,
+        "refused": [vars(one) for one in refused],
+    }
+
+
+def message(calibration: Calibration) -> str:
+    """Failed checks and advice; empty where the calibration is accepted."""
+    return "; ".join(
+        f"{check.name} is {check.value:.3g}, required {check.limit}: {check.advice}"
+        for check in calibration.failed_checks
+    )
+
+
+def summary(calibration: Calibration, name: str) -> str:
+    """Summary in one line."""
+    camera, fit = calibration.camera, calibration.joint.fit
+    images = len(calibration.joint.frames)
+    head = f"{name}  {'ok' if calibration.accepted else 'refused ' + calibration.failed_checks[0].reason}"
+    return (
+        f"{head}  {images} of {images + len(calibration.refused)} images  {int(fit.used.sum())} stars  "
+        f"held-out {fit.held_out_rms_px:.2f} px ({fit.held_out_rms_px * arcmin_per_px(camera):.2f}')  "
+        f"f {camera.focal_px[0]:.2f} px/rad  calibrated to {np.degrees(camera.calibrated_angle_rad):.1f}°"
+        f"{'  mirrored' if camera.mirrored else ''}"
+    )
+
+
+def arcmin_per_px(camera: Camera) -> float:
+    """Angular size [arcmin] of a pixel half way to the calibrated angle."""
+    return float(np.degrees(camera.mean_scale_rad_per_px(np.array(0.5 * camera.calibrated_angle_rad))) * 60.0)
+
+
+def _is_refracted(calibration: Calibration) -> bool:
+    return all(frame.sky.includes_refraction for frame in calibration.joint.frames)
+
+
+def _json_number(value: float) -> float:
+    return float(np.clip(value, -1e6, 1e6))
+
+
+def _images(calibration: Calibration) -> list[dict[str, Any]]:
+    """One row per image."""
+    fit, joint = calibration.joint.fit, calibration.joint
+    rows = []
+    for i, (frame, matched) in enumerate(zip(joint.frames, joint.matches, strict=True)):
+        own = (joint.points.image == i) & fit.used
+        held = fit.held_out_px[own]
+        row: dict[str, Any] = {
+            "image": frame.name,
+            "sha256": frame.exposure.sha256,
+            "time_utc": format_utc(frame.time_utc),
+            "stars": int(own.sum()),
+            "matched_fraction": matched.fraction,
+            "held_out_rms_px": float(np.sqrt(np.mean(np.sum(held**2, axis=1)))) if len(held) else None,
+            "quat_xyzw_cam_icrs": quat_xyzw_from_R(fit.R_cam_icrs[i]).tolist(),
+            "sigma_arcsec": (np.degrees(np.sqrt(np.diag(fit.pose_covariance_rad2[i]))) * 3600.0).tolist(),
+        }
+        if frame.sky.R_enu_icrs is not None:
+            row["quat_xyzw_cam_enu"] = quat_xyzw_from_R(fit.R_cam_icrs[i] @ frame.sky.R_enu_icrs.T).tolist()
+        rows.append(row)
+    return rows
+
+
+def camera_properties(camera: Camera) -> dict[str, Any]:
+    """The camera file's keys, and the projection by angle: radius, scale, and sigma where there is a covariance."""
+    angle = np.linspace(0.0, camera.calibrated_angle_rad, MAP_ANGLES)
+    radius, scale, sigma = projection_by_angle(camera, angle)
+    rows = [
+        {
+            "angle_deg": float(np.degrees(a)),
+            "radius_px": float(r),
+            "arcmin_per_px": float(s),
+            "map_sigma_px": None if camera.covariance is None else float(e),
+        }
+        for a, r, s, e in zip(angle, radius, scale, sigma, strict=True)
+    ]
+    return {"camera": camera_to_dict(camera), "map": rows}
+
+
+def projection_by_angle(camera: Camera, angle_rad: Array) -> tuple[Array, Array, Array]:
+    """Radius [px], scale [arcmin/px] and projection sigma per axis [px], each (n,), at the angles (n,) off the axis.
+
+    Sigma is the RMS over eight directions.
+    """
+    around = np.linspace(0.0, 2 * np.pi, 8, endpoint=False)
+    rays = np.stack(
+        [
+            np.sin(angle_rad)[:, None] * np.cos(around),
+            np.sin(angle_rad)[:, None] * np.sin(around),
+            np.cos(angle_rad)[:, None] * np.ones_like(around),
+        ],
+        axis=-1,
+    )
+    sigma = np.sqrt(np.mean(np.square(camera.projection_sigma_px(rays)), axis=1))
+    radius = np.sqrt(np.prod(camera.focal_px)) * camera.lens.rho(angle_rad)
+    return radius, np.degrees(camera.mean_scale_rad_per_px(np.maximum(angle_rad, 1e-6))) * 60.0, sigma
+
+
+def camera_text(camera: Camera) -> str:
+    """The camera file's content in several lines."""
+    (fx, fy), (cx, cy) = camera.focal_px, camera.centre_px
+    lines = [
+        f"{camera.name}: {camera.lens.model}, {camera.size_px[0]} x {camera.size_px[1]} px"
+        + (", mirrored" if camera.mirrored else ""),
+        f"  focal length {fx:.3f}, {fy:.3f} px/rad; centre {cx:.3f}, {cy:.3f} px"
+        + "".join(f"; {name} {value:.6g}" for name, value in camera.lens.parameters.items())
+        + (f"; decentring {camera.decentring.p1:.3g}, {camera.decentring.p2:.3g}" if camera.decentring else ""),
+        f"  image circle to {np.degrees(camera.max_angle_rad):.2f}°, calibrated to "
+        f"{np.degrees(camera.calibrated_angle_rad):.2f}°; "
+        + ("no covariance" if camera.covariance is None else "with covariance"),
+        "  angle °   radius px   arcmin/px   map sigma px",
+    ]
+    for row in camera_properties(camera)["map"]:
+        sigma = "-" if row["map_sigma_px"] is None else f"{row['map_sigma_px']:.3f}"
+        lines.append(f"  {row['angle_deg']:7.2f} {row['radius_px']:11.2f} {row['arcmin_per_px']:11.3f} {sigma:>14}")
+    if camera.sensor is not None:
+        lines += ["  sensor:", *(f"    {key} = {value}" for key, value in vars(camera.sensor).items())]
+    else:
+        lines.append("  sensor: not known")
+    return "\n".join(lines)

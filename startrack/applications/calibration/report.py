@@ -1,0 +1,204 @@
+"""Report of a calibration: a self-contained HTML page, and its picture as PNG."""
+
+from __future__ import annotations
+
+import base64
+import html
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from startrack.applications.calibration.acceptance import RINGS, SECTORS, Coverage, rings_and_sectors, star_coverage
+from startrack.applications.calibration.record import arcmin_per_px, camera_text, message, summary
+from startrack.applications.calibration.run import Calibration
+from startrack.core.files import write_atomically
+from startrack.core.types import Array
+from startrack.frames import format_utc
+
+NO_PICTURE = "no picture: it needs matplotlib, the extra plots (pip install '.[plots]' in a clone of startrack)"
+STYLE = """
+body{font:16px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#1b2430;background:#fff}
+h1{font-size:1.6rem;margin-bottom:.2rem} h2{font-size:1.15rem;margin-top:2rem}
+table{border-collapse:collapse;margin:.5rem 0;font-variant-numeric:tabular-nums;display:block;overflow-x:auto}
+td,th{padding:.25rem .7rem;border-bottom:1px solid #d8dee6;text-align:right}
+td:first-child,th:first-child{text-align:left}
+.ok{color:#00694d;font-weight:600} .no{color:#b34700;font-weight:600} img{max-width:100%;height:auto}
+pre{background:#f3f5f8;padding:.8rem;overflow-x:auto} p.lead{font-size:1.05rem}
+"""
+
+
+def write_report(camera_path: Path, calibration: Calibration) -> str:
+    """Write NAME.report.html and, where matplotlib is installed, NAME.report.png beside the camera file.
+
+    The line that explains how to get the picture; empty where it is written.
+    """
+    picture: bytes | None = None
+    if find_spec("matplotlib") is not None:
+        from startrack.applications.calibration.plots import report_png
+
+        picture = report_png(calibration)
+        write_atomically(camera_path.with_suffix(".report.png"), picture, overwrite=True)
+    page = report_html(calibration, picture)
+    write_atomically(camera_path.with_suffix(".report.html"), page.encode("utf-8"), overwrite=True)
+    return "" if picture else f"{camera_path.with_suffix('.report.html').name}: {NO_PICTURE}"
+
+
+def report_html(calibration: Calibration, picture: bytes | None) -> str:
+    """The page, without scripts or other files."""
+    camera = calibration.camera
+    verdict = "ok" if calibration.accepted else "no"
+    text = "accepted" if calibration.accepted else f"refused: {html.escape(message(calibration))}"
+    image = (
+        f'<img alt="residuals and map sigma" src="data:image/png;base64,{base64.b64encode(picture).decode()}">'
+        if picture
+        else f"<p>{NO_PICTURE}.</p>"
+    )
+    return (
+        '<!doctype html><html lang="en"><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<title>Calibration of {html.escape(camera.name)}</title><style>{STYLE}</style>"
+        f"<h1>Calibration of {html.escape(camera.name)}</h1>"
+        f'<p class="lead"><span class="{verdict}">{text}</span></p>'
+        f"<p>{html.escape(summary(calibration, camera.name))}</p>"
+        f"<h2>Acceptance checks</h2>{_checks_table(calibration)}"
+        f"<h2>Residuals</h2>{image}{_rings_table(calibration)}"
+        f"<h2>Lens models, tested with held-out stars</h2>{_models_table(calibration)}"
+        f"<h2>Pictures</h2>{_pictures_table(calibration)}"
+        f"<h2>Throughput and sensor</h2>{_photometry_table(calibration)}"
+        f"<h2>The camera</h2><pre>{html.escape(camera_text(camera))}</pre></html>\n"
+    )
+
+
+def ring_rms_px(calibration: Calibration) -> tuple[Coverage, Array, Array]:
+    """Coverage, and held-out RMS distance [px] by ring (rings,) and by ring and sector (rings, sectors); NaN if empty.
+
+    For drawing and tables only.
+    """
+    joint = calibration.joint
+    used = joint.fit.used
+    points, held = joint.points.take(used), joint.fit.held_out_px[used]
+    angle, ring, sector = rings_and_sectors(calibration.camera, points)
+    inside = angle <= calibration.camera.calibrated_angle_rad
+    squared, count = np.zeros((RINGS, SECTORS)), np.zeros((RINGS, SECTORS))
+    np.add.at(squared, (ring[inside], sector[inside]), np.sum(held[inside] ** 2, axis=1))
+    np.add.at(count, (ring[inside], sector[inside]), 1.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        by_ring = np.sqrt(squared.sum(axis=1) / count.sum(axis=1))
+        return star_coverage(joint), by_ring, np.sqrt(squared / count)
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    def line(cells: list[str], tag: str) -> str:
+        return "<tr>" + "".join(f"<{tag}>{cell}</{tag}>" for cell in cells) + "</tr>"
+
+    return "<table>" + line(head, "th") + "".join(line(row, "td") for row in rows) + "</table>"
+
+
+def _checks_table(calibration: Calibration) -> str:
+    return _table(
+        ["condition", "value", "required", "", "advice"],
+        [
+            [html.escape(c.name), f"{c.value:,.0f}" if c.value >= 1000 else f"{c.value:.3g}", html.escape(c.limit),
+             f'<span class="{"ok" if c.passed else "no"}">{"passed" if c.passed else "failed"}</span>',
+             "" if c.passed else html.escape(c.advice)]
+            for c in calibration.checks
+        ],
+    )  # fmt: skip
+
+
+def _rings_table(calibration: Calibration) -> str:
+    cover, by_ring, by_sector = ring_rms_px(calibration)
+    scale = arcmin_per_px(calibration.camera)
+    edges = np.degrees(cover.ring_edges_rad)
+    sectors = [f"{360 * k // SECTORS}°" for k in range(SECTORS)]
+    rows = [
+        [f"{edges[k]:.0f}° to {edges[k + 1]:.0f}°", f"{cover.stars[k].sum():.0f}", _two_decimals(by_ring[k]),
+         _two_decimals(by_ring[k] * scale), *(_two_decimals(value) for value in by_sector[k])]
+        for k in range(RINGS)
+    ]  # fmt: skip
+    fit = calibration.joint.fit
+    note = (
+        f"<p>Held-out RMS distance by ring and by sector (from image right, clockwise). All stars: "
+        f"{fit.held_out_rms_px:.3f} px = {fit.held_out_rms_px * scale:.2f}', chi² per degree of freedom with the "
+        f"stated centroid errors {fit.chi2_per_dof:.2f}; additional error {fit.extra_sigma_px:.3f} px per axis. "
+        f"{int((~fit.used).sum())} of {len(fit.used)} matches were rejected.</p>"
+    )
+    return _table(["ring", "stars", "RMS px", "RMS '", *sectors], rows) + note
+
+
+def _two_decimals(value: float) -> str:
+    return f"{value:.2f}" if np.isfinite(value) else "–"
+
+
+def _models_table(calibration: Calibration) -> str:
+    rows = [
+        [html.escape(c.name), str(c.parameters), f"{c.held_out_chi2:.0f}", f"{c.held_out_rms_px:.3f}"]
+        for c in calibration.joint.fit.candidates
+    ]
+    return _table(["model", "parameters", "held-out chi²", "held-out RMS px"], rows)
+
+
+def _pictures_table(calibration: Calibration) -> str:
+    joint = calibration.joint
+    rows = []
+    for i, (frame, matched) in enumerate(zip(joint.frames, joint.matches, strict=True)):
+        own = (joint.points.image == i) & joint.fit.used
+        rms = np.sqrt(np.mean(np.sum(joint.fit.held_out_px[own] ** 2, axis=1))) if own.any() else np.nan
+        rows.append(
+            [
+                html.escape(frame.name),
+                html.escape(format_utc(frame.time_utc)),
+                str(int(own.sum())),
+                f"{matched.fraction:.2f}",
+                _two_decimals(float(rms)),
+                "used",
+            ]
+        )
+    rows += [
+        [
+            html.escape(r.name),
+            "",
+            "",
+            "",
+            "",
+            f'<span class="no">{html.escape(r.reason)}: {html.escape(r.message)}</span>',
+        ]
+        for r in calibration.refused
+    ]
+    air = all(frame.sky.includes_refraction for frame in joint.frames)
+    note = "Refraction is taken out." if air else (
+        "No site on the Earth was given: of pictures taken through air this lens contains the refraction (up to half a "
+        "degree at the horizon). Give --site."
+    )  # fmt: skip
+    return _table(["picture", "time", "stars", "matched", "RMS px", ""], rows) + f"<p>{note}</p>"
+
+
+def _photometry_table(calibration: Calibration) -> str:
+    found = calibration.photometry
+    rows: list[list[str]] = []
+    if found.throughput is not None:
+        light = found.throughput
+        rows += [
+            ["zero point", f"{light.zero_point_adu_per_s:.0f} ADU/s (± {light.zero_point_sigma_mag:.3f} mag)"],
+            ["vignetting", f"{light.vignetting[0]:.3f}, {light.vignetting[1]:.3f}"],
+            ["colour term", _with_unit(light.colour_mag, "mag per B-V")],
+            ["extinction", _with_unit(light.extinction_mag, "mag per airmass")],
+            ["scatter", f"{light.scatter_mag:.3f} mag, {light.stars} stars"],
+        ]
+    sensor = found.properties
+    gain = sensor.transfer.gain_e_per_adu if sensor.transfer is not None else None
+    rows += [
+        ["gain (photon transfer)", _with_unit(gain, "e/ADU")],
+        ["dark level", _with_unit(sensor.bias_adu, "ADU")],
+        ["saturation", _with_unit(sensor.saturation_adu, "ADU")],
+        ["PSF sigma", _with_unit(sensor.psf_sigma_px, "px")],
+        ["PSF sigma by ring", ", ".join("–" if v is None else f"{v:.2f}" for v in sensor.psf_by_ring_px) + " px"],
+        ["hot pixels", "–" if sensor.hot_px is None else str(len(sensor.hot_px))],
+    ]
+    notes = "".join(f"<li>{html.escape(note)}</li>" for note in found.notes)
+    return _table(["", "measured"], rows) + (f"<ul>{notes}</ul>" if notes else "")
+
+
+def _with_unit(value: float | None, unit: str) -> str:
+    return "not measured" if value is None else f"{value:.4g} {unit}"

@@ -1,0 +1,253 @@
+"""Throughput from the stars' fluxes: zero point, vignetting, colour term and, on the Earth, extinction.
+
+The fit is bounded to physically possible values. In a camera that looks at the zenith airmass is a function of the
+angle off the axis, so that extinction and vignetting can be exchanged for each other; a term that the data do not
+determine, or that ends at a bound, is left out, and so is the whole throughput where it fails a held-out test.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.applications.calibration.region_growing import JointFit
+from startrack.camera import Sensor
+from startrack.camera.camera import MIN_THROUGHPUT_1
+from startrack.core.types import Array, Ints
+
+MIN_STARS = 30
+BRIGHT_SNR = 10.0
+LOSS_MAG = 0.2  # residual beyond which a star's influence is constant
+PHOTOMETRY_MAG = 0.05  # error of a star's magnitude beyond catalogue and noise
+LARGEST_TERM_SIGMA_MAG = 0.03  # per airmass, or per B-V: a term with a larger sigma is left out
+TYPICAL_B_V = 0.6
+LOWEST_ELEVATION_RAD = np.radians(8.0)
+THROUGHPUT_1 = (MIN_THROUGHPUT_1, 1.1)  # relative to the axis, up to the calibrated angle: a lens is darker at its edge
+EXTINCTION_MAG = (0.0, 1.5)  # per airmass; 0.1 to 0.5 in clear air
+COLOUR_MAG = (-1.0, 1.0)  # per B-V
+AT_BOUND_1 = 1e-3  # of the range of a term
+FOLDS = 5
+LARGEST_HELD_OUT_MAG = 0.4  # median scatter of held-out stars
+LARGEST_HELD_OUT_RATIO = 1.5  # of held-out scatter to that of the fit
+LARGEST_IMAGE_OFFSET_MAG = 0.15  # of an image's zero point from the common one: clouds, or twilight
+MIN_STARS_PER_IMAGE = 10
+NORMAL_BY_MAD = 1.4826
+
+
+@dataclass(frozen=True, kw_only=True)
+class Throughput:
+    """Fitted throughput; None for terms that the data do not determine."""
+
+    zero_point_adu_per_s: float  # of a V = 0 star of typical colour on the axis, above the air if extinction is known
+    zero_point_sigma_mag: float
+    vignetting: tuple[float, float]  # relative throughput 1 + v1 a^2 + v2 a^4
+    colour_mag: float | None  # gain per magnitude of B-V redder than 0.6
+    extinction_mag: float | None  # loss per airmass
+    scatter_mag: float
+    stars: int
+
+
+@dataclass(frozen=True)
+class ThroughputFit:
+    """The throughput (None where it is not known), and warnings for the record."""
+
+    throughput: Throughput | None
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class StarFluxes:
+    """Bright matched stars of all frames, each (n,)."""
+
+    gain_mag: Array  # V minus the instrumental magnitude
+    sigma_mag: Array
+    angle_rad: Array
+    b_v: Array
+    airmass: Array | None
+    image: Ints
+
+    def take(self, which: Array) -> StarFluxes:
+        """The stars selected by a mask or index array."""
+        air = None if self.airmass is None else self.airmass[which]
+        return StarFluxes(
+            self.gain_mag[which], self.sigma_mag[which], self.angle_rad[which], self.b_v[which], air, self.image[which]
+        )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Values of the terms, their sigmas, the scatter of the stars, and the terms at a bound."""
+
+    values: dict[str, float]
+    sigma: dict[str, float]
+    scatter_mag: float
+    at_bound: tuple[str, ...]
+    edge_rad: float
+
+
+def airmass(elevation_rad: Array) -> Array:
+    """Airmass along the line of sight, zenith = 1. Source: Rozenberg 1966, Twilight, p. 160."""
+    s = np.sin(elevation_rad)
+    return 1.0 / (s + 0.025 * np.exp(-11.0 * s))
+
+
+def measure_throughput(joint: JointFit, flux_ratio: float = 1.0) -> ThroughputFit:
+    """The throughput from the matched stars of all frames.
+
+    `flux_ratio`: by which the detector's fluxes are multiplied (its PSF is not quite each star's own).
+    """
+    stars = _star_fluxes(joint)
+    if stars is None or len(stars.gain_mag) < MIN_STARS:
+        return ThroughputFit(None, (
+            "zero point: not measured; the images must state their exposure time (EXPTIME, exposure_s), and 30 "
+            "unsaturated stars are needed",
+        ))  # fmt: skip
+    return fit_throughput(stars, joint.fit.camera.calibrated_angle_rad, flux_ratio)
+
+
+def fit_throughput(stars: StarFluxes, edge_rad: float, flux_ratio: float = 1.0) -> ThroughputFit:
+    """The throughput of stars up to the angle `edge_rad` off the axis, tested; None with a warning if it fails."""
+    warnings: list[str] = []
+    terms = ["zero", "middle", "edge", "colour", *(["air"] if stars.airmass is not None else [])]
+    while True:
+        fit = _fit(stars, terms, edge_rad)
+        optional = [t for t in ("air", "colour") if t in terms]
+        poor = [t for t in optional if t in fit.at_bound or fit.sigma[t] > LARGEST_TERM_SIGMA_MAG]
+        if not poor:
+            break
+        if poor[0] == "air" and "air" in fit.at_bound:
+            warnings.append("extinction: left out; the fitted value is not physical: it cannot be separated from "
+                            "vignetting")  # fmt: skip
+        terms.remove(poor[0])
+    failures = _failures(stars, terms, fit)
+    if failures:
+        return ThroughputFit(None, (*warnings, *(f"throughput: left out; {failure}" for failure in failures)))
+    if fit.values.get("air") is None and not warnings:
+        warnings.append("extinction: not distinguished from vignetting; zero point and vignetting contain it")
+    return ThroughputFit(
+        Throughput(
+            zero_point_adu_per_s=float(flux_ratio * 10 ** (0.4 * fit.values["zero"])),
+            zero_point_sigma_mag=fit.sigma["zero"],
+            vignetting=_vignetting(fit.values["middle"], fit.values["edge"], edge_rad),
+            colour_mag=fit.values.get("colour"),
+            extinction_mag=fit.values.get("air"),
+            scatter_mag=fit.scatter_mag,
+            stars=len(stars.gain_mag),
+        ),
+        tuple(warnings),
+    )
+
+
+def _failures(stars: StarFluxes, terms: list[str], fit: _Fit) -> list[str]:
+    """Reasons not to trust the fit: a bound, held-out stars, or images with different zero points."""
+    failures = []
+    sensor = Sensor(
+        zero_point_e_per_s=1.0, vignetting=_vignetting(fit.values["middle"], fit.values["edge"], fit.edge_rad)
+    )
+    if {"middle", "edge"} & set(fit.at_bound) or sensor.lowest_throughput(fit.edge_rad) < MIN_THROUGHPUT_1:
+        failures.append("the fitted vignetting is not physical")
+    held_out = _held_out_mag(stars, terms, fit.edge_rad)
+    scatter = NORMAL_BY_MAD * float(np.median(np.abs(held_out)))
+    if scatter > min(LARGEST_HELD_OUT_MAG, LARGEST_HELD_OUT_RATIO * max(fit.scatter_mag, PHOTOMETRY_MAG)):
+        failures.append(f"held-out stars scatter by {scatter:.2f} mag, the fitted ones by {fit.scatter_mag:.2f}")
+    residual = stars.gain_mag - _model(stars, fit.values, fit.edge_rad)
+    offsets = [
+        float(np.median(residual[stars.image == i]))
+        for i, count in enumerate(np.bincount(stars.image))
+        if count >= MIN_STARS_PER_IMAGE
+    ]
+    if len(offsets) > 1 and (largest := float(np.max(np.abs(offsets)))) > LARGEST_IMAGE_OFFSET_MAG:
+        failures.append(f"the zero points of the images differ by up to {largest:.2f} mag from their mean: clouds?")
+    return failures
+
+
+def _held_out_mag(stars: StarFluxes, terms: list[str], edge_rad: float) -> Array:
+    """Residuals (n,) of fits that do not contain the star: with several images, none of its image's stars."""
+    images = len(np.unique(stars.image))
+    order = np.argsort(stars.angle_rad, kind="stable")
+    fold = np.empty(len(order), dtype=np.int64)
+    fold[order] = np.arange(len(order)) % FOLDS
+    fold = stars.image if images > 1 else fold
+    residual = np.empty(len(fold))
+    for k in np.unique(fold):
+        held = fold == k
+        rest = stars.take(~held)
+        if len(rest.gain_mag) < MIN_STARS:
+            rest = stars
+        residual[held] = (stars.gain_mag - _model(stars, _fit(rest, terms, edge_rad).values, edge_rad))[held]
+    return residual
+
+
+def _star_fluxes(joint: JointFit) -> StarFluxes | None:
+    """The bright, unsaturated matched stars; None where no image has an exposure time."""
+    columns: list[tuple[Array, ...]] = []
+    calibrated = joint.fit.camera.calibrated_angle_rad
+    for i, (frame, matched) in enumerate(zip(joint.frames, joint.matches, strict=True)):
+        exposure_s = frame.exposure.exposure_s
+        if exposure_s is None:
+            continue
+        used = joint.fit.used[joint.points.image == i]
+        d, s = matched.detection[used], matched.star[used]
+        found, sky = frame.sources, frame.sky
+        angle = joint.fit.camera.angle_rad(found.xy_px[d])
+        good = (found.snr[d] > BRIGHT_SNR) & ~found.saturated[d] & (angle < calibrated) & np.isfinite(sky.b_v[s])
+        if sky.elevation_rad is not None:
+            good &= sky.elevation_rad[s] > LOWEST_ELEVATION_RAD
+        d, s, angle = d[good], s[good], angle[good]
+        instrumental = -2.5 * np.log10(found.flux_e[d] / exposure_s)
+        sigma = np.sqrt((1.086 / found.snr[d]) ** 2 + sky.stars.v_sigma_mag[s] ** 2 + PHOTOMETRY_MAG**2)
+        air = airmass(sky.elevation_rad[s]) if sky.elevation_rad is not None else np.full(len(s), np.nan)
+        columns.append((sky.stars.v_mag[s] - instrumental, sigma, angle, sky.b_v[s], air, np.full(len(s), i)))
+    if not columns:
+        return None
+    gain, sigma, angle, b_v, air, image = (np.concatenate(c) for c in zip(*columns, strict=True))
+    return StarFluxes(gain, sigma, angle, b_v, None if np.isnan(air).any() else air, image.astype(np.int64))
+
+
+def _vignetting(middle: float, edge: float, edge_rad: float) -> tuple[float, float]:
+    """v1, v2 of the relative throughput 1 + v1 a^2 + v2 a^4 from its values at a^2 = edge^2 / 2 and edge^2."""
+    u = edge_rad**2
+    return (4.0 * middle - edge - 3.0) / u, (2.0 + 2.0 * edge - 4.0 * middle) / u**2
+
+
+def _model(stars: StarFluxes, values: dict[str, float], edge_rad: float) -> Array:
+    """V minus the instrumental magnitude (n,) by the model."""
+    v1, v2 = _vignetting(values["middle"], values["edge"], edge_rad)
+    a2 = np.square(stars.angle_rad)
+    throughput = np.maximum(1.0 + a2 * (v1 + a2 * v2), THROUGHPUT_1[0] / 2)
+    model = values["zero"] + 2.5 * np.log10(throughput) + values.get("colour", 0.0) * (stars.b_v - TYPICAL_B_V)
+    return np.asarray(model if stars.airmass is None else model - values.get("air", 0.0) * stars.airmass)
+
+
+def _fit(stars: StarFluxes, terms: list[str], edge_rad: float) -> _Fit:
+    """Bounded robust least squares over the terms."""
+    from scipy.optimize import least_squares
+
+    zero = float(np.median(stars.gain_mag))
+    bounds = {"zero": (zero - 10.0, zero + 10.0), "middle": THROUGHPUT_1, "edge": THROUGHPUT_1, "colour": COLOUR_MAG,
+              "air": EXTINCTION_MAG}  # fmt: skip
+    start = {"zero": zero, "middle": 0.95, "edge": 0.9, "colour": 0.0, "air": 0.2}
+    low, high = np.array([bounds[t] for t in terms]).T
+
+    def misfit(p: Array) -> Array:
+        values = dict(zip(terms, p.tolist(), strict=True))
+        return np.asarray((stars.gain_mag - _model(stars, values, edge_rad)) / stars.sigma_mag)
+
+    loss_scale = LOSS_MAG / float(np.median(stars.sigma_mag))
+    fit = least_squares(
+        misfit, [start[t] for t in terms], bounds=(low, high), loss="soft_l1", f_scale=loss_scale, xtol=1e-12,
+        ftol=1e-12, gtol=1e-12,
+    )  # fmt: skip
+    residual = misfit(fit.x)
+    spread = NORMAL_BY_MAD * float(np.median(np.abs(residual)))
+    covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * max(spread, 1.0) ** 2
+    margin = AT_BOUND_1 * (high - low)
+    at_bound = (fit.x < low + margin) | (fit.x > high - margin)
+    return _Fit(
+        values=dict(zip(terms, fit.x.tolist(), strict=True)),
+        sigma=dict(zip(terms, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+        scatter_mag=NORMAL_BY_MAD * float(np.median(np.abs(residual * stars.sigma_mag))),
+        at_bound=tuple(t for t, reached in zip(terms, at_bound, strict=True) if reached),
+        edge_rad=edge_rad,
+    )

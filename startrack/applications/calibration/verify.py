@@ -1,0 +1,130 @@
+"""Verification of a camera file: one new picture of the stars, its own lens compared with the file's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from startrack.applications.calibration.below_horizon import horizon_checks
+from startrack.applications.calibration.frame import load_frame
+from startrack.applications.calibration.region_growing import fit_frames, grow_from_matches
+from startrack.applications.calibration.run import identify_with
+from startrack.applications.calibration.shared_errors import widen_covariance
+from startrack.camera import Camera
+from startrack.camera.uncertainty import cap_grid, projection_covariance_px2
+from startrack.catalog import StarCatalog
+from startrack.core.types import Array, Exposure, NotIdentified
+from startrack.frames import Site
+
+ALLOWED_PX = 0.3  # acceptable RMS change of the projection: a tenth of it propagates to the position
+SIGNIFICANT_SIGMAS = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verification:
+    """The lens of the picture compared with that of the file."""
+
+    image: str
+    camera: Camera
+    fresh: Camera  # fitted to this picture
+    stars: int
+    rms_px: float  # of the fresh fit
+    change_px: float  # RMS change of the map, the best rotation removed
+    change_sigma_px: float  # expected from the covariances of both
+    largest_px: float
+    has_site: bool  # on the Earth: refraction was removed from the picture's stars
+    file_has_site: bool | None = None  # the same of the file's calibration; None: not known
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether the file can still be used."""
+        return self.change_px <= max(ALLOWED_PX, SIGNIFICANT_SIGMAS * self.change_sigma_px)
+
+    @property
+    def message(self) -> str:
+        """Why the file cannot be used, and what to do; empty where it can."""
+        if self.is_valid:
+            return ""
+        if self.has_site and self.file_has_site is False:
+            return "the camera file was made without a site and contains the refraction: verify it without --site"
+        if not self.has_site and self.file_has_site:
+            return "the camera file was made with a site and is free of refraction: give --site LAT,LON[,M] here"
+        if not self.has_site and self.file_has_site is None:
+            return "the lens has changed: calibrate again; or, if the file was made with --site, give --site here too"
+        return "the lens has changed: calibrate again"
+
+
+def verify(
+    exposure: Exposure, camera: Camera, catalog: StarCatalog, site: Site | None = None,
+    *, file_has_site: bool | None = None,
+) -> Verification:  # fmt: skip
+    """Fit the lens to the picture and compare the projections where both are calibrated.
+
+    The picture needs a `site` if the camera file was calibrated with one (`file_has_site`, if known): both lenses must
+    be without refraction, or both with it. Raises BadInput no_time, NotIdentified where the stars cannot be identified
+    with the file, also with the reasons mirrored and, for a wrong site or time, inconsistent_evidence.
+    """
+    frame = load_frame(exposure, catalog, site, camera=camera)
+    found_camera, found = identify_with(camera, frame)
+    if found_camera.mirrored != camera.mirrored:
+        raise NotIdentified("the picture is a mirror image, compared with the camera file", reason="mirrored")
+    start, R = grow_from_matches(frame, found_camera, found.R_cam_icrs, found.star, found.detection)
+    joint = widen_covariance(fit_frames((frame,), start, R[None]))
+    for check in horizon_checks(joint, catalog, site):
+        if not check.passed:
+            raise NotIdentified(check.advice, reason=check.reason)
+    fit = joint.fit
+    grid = cap_grid(min(camera.calibrated_angle_rad, fit.camera.calibrated_angle_rad))
+    change = difference_px(camera, fit.camera, grid)
+    variance = projection_covariance_px2(fit.camera, grid) + projection_covariance_px2(camera, grid)
+    return Verification(
+        image=exposure.name,
+        camera=camera,
+        fresh=fit.camera,
+        stars=int(fit.used.sum()),
+        rms_px=fit.rms_px,
+        change_px=float(np.sqrt(np.mean(np.sum(change**2, axis=1)))),
+        change_sigma_px=float(np.sqrt(np.mean(np.trace(variance, axis1=1, axis2=2)))),
+        largest_px=float(np.max(np.linalg.norm(change, axis=1))),
+        has_site=frame.sky.includes_refraction,
+        file_has_site=file_has_site,
+    )
+
+
+def difference_px(one: Camera, other: Camera, rays_cam: Array) -> Array:
+    """Pixels (n, 2) of `other` minus those of `one` at the rays (n, 3), the best rotation between them removed."""
+    change = (other.project_unlimited(rays_cam) - one.project_unlimited(rays_cam)).reshape(-1)
+    by_rotation = one.jacobian_px_per_rad(rays_cam).reshape(-1, 3)
+    rest = change - by_rotation @ np.linalg.lstsq(by_rotation, change, rcond=None)[0]
+    return np.asarray(rest.reshape(-1, 2), dtype=np.float64)
+
+
+def verify_dict(found: Verification) -> dict[str, Any]:
+    """The verification's JSON object."""
+    old, new = found.camera, found.fresh
+    return {
+        "format": "startrack.verification/1",
+        "image": found.image,
+        "status": "ok" if found.is_valid else "refused",
+        "reason": None if found.is_valid else "inconsistent_evidence",
+        "message": found.message,
+        "camera": old.name,
+        "stars": found.stars,
+        "rms_px": found.rms_px,
+        "map_change_px": found.change_px,
+        "map_change_sigma_px": found.change_sigma_px,
+        "map_change_largest_px": found.largest_px,
+        "focal_change": float(new.focal_px[0] / old.focal_px[0] - 1.0),
+        "centre_change_px": [float(b - a) for a, b in zip(old.centre_px, new.centre_px, strict=True)],
+    }
+
+
+def verify_line(found: Verification) -> str:
+    """Summary in one line."""
+    verdict = "ok" if found.is_valid else f"refused inconsistent_evidence: {found.message}:"
+    return (
+        f"{found.image}  {verdict}  {found.stars} stars  map changed by {found.change_px:.2f} px RMS "
+        f"(± {found.change_sigma_px:.2f}), {found.largest_px:.2f} px at most"
+    )

@@ -1,0 +1,130 @@
+"""The image along columns of constant azimuth: stars and saturated pixels taken out, and means along and across."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.applications.horizon.grid import COLUMNS, LOWEST_RAD, column_azimuths_rad
+from startrack.camera import Camera
+from startrack.core.types import Array, Bools, Detections
+from startrack.frames import off_axis_rad, rays_from_azel
+
+TOP_RAD = np.radians(67.0)  # of the columns
+SAMPLES_PER_PX = 3
+FINEST_PX_RAD = np.radians(0.06)  # pixels of narrow fields are taken as larger ones
+SIDE_SAMPLES = 3  # across a column
+FILL_COLUMNS, FILL_SHARE = 21, 0.1  # around a star, and how many of them without a star are enough
+LARGE_AREA_PX, GLARE_PX = 500, 40  # of the Moon and what surrounds it
+SATURATED_PX = 5  # around saturated pixels nothing is measured
+HOT_SIGMAS = 6.0  # above the median of the neighbours: stars and hot pixels
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Brightness (k, columns) on a grid of elevations, nan out of view."""
+
+    elevation_rad: Array  # (k,) ascending
+    light_e: Array  # (k, columns)
+    noise_e: Array  # (k, columns) of one sample's pixel
+    step_rad: float
+    px_rad: float
+
+    @cached_property
+    def sums(self) -> tuple[Array, Array]:
+        """Sums (k + 1, columns) of the samples below each elevation, and the numbers of known ones."""
+        zero = np.zeros((1, self.light_e.shape[1]))
+        known = np.isfinite(self.light_e)
+        light = np.cumsum(np.where(known, self.light_e, 0.0), axis=0)
+        return np.concatenate([zero, light]), np.concatenate([zero, np.cumsum(known, axis=0)])
+
+
+def sample_columns(
+    image_e: NDArray[np.float32], noise_e: NDArray[np.float32], lost: NDArray[np.uint8],
+    stars: tuple[Array, Array], camera: Camera, R_cam_enu: Array,
+) -> Columns:  # fmt: skip
+    """An image (H, W) along columns of azimuth, `stars` (pixels (m, 2), radii (m,)) replaced by their surroundings.
+
+    Nothing is measured at the pixels `lost` (H, W), as `lost_pixels` gives them.
+    """
+    px_rad = _px_rad(camera, R_cam_enu)
+    elevation = np.arange(LOWEST_RAD, TOP_RAD, px_rad / SAMPLES_PER_PX)
+    disks = np.zeros(image_e.shape, np.uint8)
+    for (i, j), radius in zip(np.rint(stars[0]).astype(int).tolist(), stars[1], strict=True):
+        cv2.circle(disks, (i, j), round(radius), 1, -1)
+    shape = len(elevation), COLUMNS
+    total, spread, points = np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=bool)
+    for k in range(SIDE_SAMPLES):
+        azimuth = column_azimuths_rad() + ((k + 0.5) / SIDE_SAMPLES - 0.5) * 2 * np.pi / COLUMNS
+        xy, inside = camera.project(rays_from_azel(azimuth[None, :], elevation[:, None]) @ R_cam_enu.T)
+        x, y = (np.ascontiguousarray(xy[..., axis], dtype=np.float32) for axis in (0, 1))
+        hidden = ~inside | (cv2.remap(lost, x, y, cv2.INTER_NEAREST) > 0)
+        total += np.where(hidden, np.nan, cv2.remap(image_e, x, y, cv2.INTER_LINEAR))
+        spread += cv2.remap(noise_e, x, y, cv2.INTER_NEAREST)
+        points |= cv2.remap(disks, x, y, cv2.INTER_NEAREST) > 0
+    columns = Columns(elevation, total / SIDE_SAMPLES, spread / SIDE_SAMPLES, px_rad / SAMPLES_PER_PX, px_rad)
+    return _fill_points(columns, points)
+
+
+def lost_pixels(detections: Detections) -> NDArray[np.uint8]:
+    """Pixels (H, W) that are masked, or near saturated ones; nearer ones of a lamp or a star than of the Moon."""
+    if detections.mask is None:
+        return _around_saturated(detections.dead)
+    masked = detections.mask.masked
+    return _around_saturated(detections.dead & ~masked) | masked.view(np.uint8)
+
+
+def _around_saturated(dead: Bools) -> NDArray[np.uint8]:
+    count, label, facts, _ = cv2.connectedComponentsWithStats(dead.astype(np.uint8))
+    large = np.isin(label, 1 + np.flatnonzero(facts[1:count, cv2.CC_STAT_AREA] > LARGE_AREA_PX))
+    around = [cv2.dilate(part.astype(np.uint8), np.ones((2 * px + 1,) * 2, np.uint8))
+              for part, px in ((dead, SATURATED_PX), (large, GLARE_PX))]  # fmt: skip
+    return np.asarray(np.maximum(*around), dtype=np.uint8)
+
+
+def _px_rad(camera: Camera, R_cam_enu: Array) -> float:
+    """Size [rad] of a pixel in elevation at the horizon, or where the view comes nearest to it."""
+    azimuth = np.linspace(0, 2 * np.pi, 36, endpoint=False)
+    angle = off_axis_rad(rays_from_azel(azimuth, 0.0) @ R_cam_enu.T)
+    nearest = np.minimum(np.min(angle), camera.max_angle_rad)
+    px_rad = 1.0 / (np.sqrt(np.prod(camera.focal_px)) * camera.lens.slope(np.array(nearest)))
+    return max(float(px_rad), FINEST_PX_RAD)
+
+
+def remove_points(image_e: NDArray[np.float32], noise_e: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The image (H, W) with stars and hot pixels replaced by the median of their neighbours."""
+    smooth = cv2.medianBlur(image_e, 3)
+    return np.where(np.abs(image_e - smooth) > HOT_SIGMAS * noise_e, smooth, image_e).astype(np.float32)
+
+
+def average_columns(columns: Columns, width: int, least: float = 0.49) -> Columns:
+    """Running means over an odd number of columns, of which at least the share `least` must be in view."""
+    from scipy.ndimage import uniform_filter1d
+
+    known = np.isfinite(columns.light_e)
+    total = uniform_filter1d(np.where(known, columns.light_e, 0.0), width, axis=1, mode="wrap")
+    share = uniform_filter1d(known.astype(float), width, axis=1, mode="wrap")
+    light = np.where(share > least, total / np.maximum(share, 1e-9), np.nan)
+    return replace(columns, light_e=light)
+
+
+def _fill_points(columns: Columns, points: Bools) -> Columns:
+    """The columns with stars, the samples `points` (k, columns), replaced by the mean of their neighbours."""
+    without = replace(columns, light_e=np.where(points, np.nan, columns.light_e))
+    around = average_columns(without, FILL_COLUMNS, FILL_SHARE).light_e
+    return replace(columns, light_e=np.where(points, around, columns.light_e))
+
+
+def mean_above(columns: Columns, low_px: float, high_px: float) -> Array:
+    """Mean (k, columns) of the samples from `low_px` to `high_px` above each elevation; nan where one is missing."""
+    low, high = round(low_px * SAMPLES_PER_PX), round(high_px * SAMPLES_PER_PX)
+    sums, count = columns.sums
+    samples = len(columns.elevation_rad)
+    first = np.clip(np.arange(samples) + low, 0, samples)
+    last = np.clip(np.arange(samples) + high, 0, samples)
+    full = (count[last] - count[first]) == high - low
+    return np.where(full, (sums[last] - sums[first]) / (high - low), np.nan)

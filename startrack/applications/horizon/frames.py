@@ -1,0 +1,159 @@
+"""The frames of a fixed camera: identified stars, one lens for all of them, and an attitude for each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+
+import numpy as np
+
+from startrack.applications.calibration.below_horizon import LOWEST_STAR_RAD, MOST_BELOW_PART, is_below_horizon
+from startrack.applications.calibration.frame import Sky, frame_of, pressure_hpa, require_body, require_time, sky_at
+from startrack.applications.calibration.region_growing import JointFit, fit_frames
+from startrack.camera import Camera
+from startrack.catalog import StarCatalog
+from startrack.catalog.bodies import bodies
+from startrack.chain.pipeline import identify, identify_blind
+from startrack.chain.stages import Oriented, Refused
+from startrack.core.errors import BadInput, Reason
+from startrack.core.types import Array, Body, Detections, Exposure, Ints
+from startrack.frames import R_enu_icrs, Site, azel_from_rays, rays_from_azel, refract_rad
+
+CIRCLE_FROM_RAD = np.radians(100.0)  # from here up a field of view is that of the image circle
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SkyFrame:
+    """One photograph with its attitude above the horizon, and the catalogue in apparent directions."""
+
+    name: str
+    detections: Detections
+    camera: Camera
+    R_cam_icrs: Array  # (3, 3) of apparent directions, refraction included
+    R_enu_icrs: Array  # (3, 3)
+    attitude_sigma_rad: float  # largest of the three axes
+    extra_sigma_px: float  # error of predicted pixels per axis
+    sky: Sky  # from LOWEST_STAR_RAD up
+    bodies: tuple[Body, ...]  # apparent directions, refraction included
+    matched_detection: Ints  # (n,)
+    matched_star: Ints  # (n,) indices into `sky.stars`
+
+    @property
+    def R_cam_enu(self) -> Array:
+        """Rotation (3, 3) from enu to the camera."""
+        return np.asarray(self.R_cam_icrs @ self.R_enu_icrs.T)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeftOut:
+    """A photograph without identified stars, and why."""
+
+    name: str
+    reason: Reason
+    message: str
+
+
+def orient_frames(
+    exposures: Sequence[Exposure], catalog: StarCatalog, site: Site, *, camera: Camera | None, fov_rad: float | None
+) -> tuple[tuple[SkyFrame, ...], tuple[LeftOut, ...]]:
+    """The frames with identified stars, and those without.
+
+    The lens is that of `camera`, or found from `fov_rad`, and then fitted to the stars of all frames in their apparent
+    directions. Raises BadInput (no_time, no_calibration, size_mismatch, bad_terrain of another body,
+    inconsistent_evidence where stars below the horizon are seen).
+    """
+    if camera is None and fov_rad is None:
+        raise BadInput("no_calibration", "no camera is known: give a camera file (-c) or the field of view (--fov)")
+    identified: list[Oriented] = []
+    left_out: list[LeftOut] = []
+    for exposure in exposures:
+        require_time(exposure)
+        require_body(exposure, site)
+        outcome = _identify(exposure, catalog, site, identified[0].camera if identified else camera, fov_rad)
+        if isinstance(outcome, Refused):
+            left_out.append(LeftOut(name=exposure.name, reason=outcome.reason, message=outcome.message))
+        else:
+            _require_above_horizon(outcome, site)
+            identified.append(outcome)
+    if not identified:
+        return (), tuple(left_out)
+    joint = _fit_lens(identified, catalog, site)
+    camera = replace(joint.fit.camera, max_angle_rad=_edge_rad(joint.fit.camera, camera, fov_rad))
+    found = tuple(_sky_frame(k, one, joint, camera, catalog, site) for k, one in enumerate(identified))
+    return found, tuple(left_out)
+
+
+def _identify(
+    exposure: Exposure, catalog: StarCatalog, site: Site, camera: Camera | None, fov_rad: float | None
+) -> Oriented | Refused:
+    """Stars with the camera, if there is one, else without; raises BadInput for an image that cannot be used."""
+    outcome = (
+        identify(exposure, camera, catalog, site=site)
+        if camera is not None
+        else identify_blind(exposure, fov_rad or 0.0, catalog)
+    )
+    if isinstance(outcome, Refused) and outcome.reason.exit_code == Reason.BAD_IMAGE.exit_code:
+        raise BadInput(outcome.reason, f"{exposure.name}: {outcome.message}")
+    return outcome
+
+
+def _require_above_horizon(one: Oriented, site: Site) -> None:
+    """Raises BadInput (inconsistent_evidence) where identified stars are below the horizon of the `site`."""
+    rays = one.stars.rays_icrs[one.identification.star]
+    below = int(np.count_nonzero(is_below_horizon(rays, site, require_time(one.exposure))))
+    if below > MOST_BELOW_PART * len(rays):
+        raise BadInput(
+            "inconsistent_evidence",
+            f"{one.exposure.name}: {below} of {len(rays)} identified stars are below the horizon of this site at this "
+            "time: check --site (signs) and --time",
+        )
+
+
+def _fit_lens(identified: list[Oriented], catalog: StarCatalog, site: Site) -> JointFit:
+    """The lens of all frames and their attitudes, with refraction. Raises NotIdentified where too few stars agree."""
+    frames = tuple(frame_of(one.exposure, one.detections, catalog, site) for one in identified)
+    R = np.stack([one.attitude_fit.attitude.R_cam_icrs for one in identified])
+    lead = max(identified, key=lambda one: len(one.identification))
+    return fit_frames(frames, lead.camera, R)
+
+
+def _edge_rad(fitted: Camera, given: Camera | None, fov_rad: float | None) -> float:
+    """Edge of the image circle: of the camera file, else by the field of view; the lens must be invertible there."""
+    edge = fitted.max_angle_rad
+    if given is not None:
+        edge = given.max_angle_rad
+    elif fov_rad is not None and fov_rad >= CIRCLE_FROM_RAD:
+        edge = 0.5 * fov_rad
+    return float(min(edge, fitted.lens.max_invertible_rad))
+
+
+def _sky_frame(k: int, one: Oriented, joint: JointFit, camera: Camera, catalog: StarCatalog, site: Site) -> SkyFrame:
+    time_utc = require_time(one.exposure)
+    sky = sky_at(catalog, time_utc, site, LOWEST_STAR_RAD)
+    R = R_enu_icrs(site, time_utc)
+    hip_of_match = joint.frames[k].sky.stars.hip[joint.matches[k].star]
+    order = np.argsort(sky.stars.hip)
+    return SkyFrame(
+        name=one.exposure.name,
+        detections=one.detections,
+        camera=camera,
+        R_cam_icrs=joint.fit.R_cam_icrs[k],
+        R_enu_icrs=R,
+        attitude_sigma_rad=float(np.sqrt(np.max(np.diag(joint.fit.pose_covariance_rad2[k])))),
+        extra_sigma_px=joint.fit.extra_sigma_px,
+        sky=sky,
+        bodies=_lifted_bodies(site, time_utc, R),
+        matched_detection=joint.matches[k].detection,
+        matched_star=order[np.searchsorted(sky.stars.hip[order], hip_of_match)],
+    )
+
+
+def _lifted_bodies(site: Site, time_utc: datetime, R: Array) -> tuple[Body, ...]:
+    """Planets, Sun and Moon in apparent directions."""
+    found = []
+    for body in bodies(site, time_utc):
+        azimuth, elevation = azel_from_rays(R @ body.ray_icrs)
+        lifted = rays_from_azel(azimuth, refract_rad(elevation, pressure_hpa(site.height_m)))
+        found.append(replace(body, ray_icrs=lifted @ R))
+    return tuple(found)

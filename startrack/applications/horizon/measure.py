@@ -1,0 +1,205 @@
+"""From photographs of the night sky to the skyline of a fixed camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from startrack.applications.horizon.columns import lost_pixels
+from startrack.applications.horizon.frames import LeftOut, SkyFrame, orient_frames, pressure_hpa
+from startrack.applications.horizon.grid import BINS, COLUMNS, COLUMNS_PER_BIN
+from startrack.applications.horizon.posterior import (
+    Marginals,
+    column_log_prior,
+    combine_columns,
+    star_log_likelihood,
+    step_log_likelihood,
+)
+from startrack.applications.horizon.skylight import Steps, find_steps
+from startrack.applications.horizon.starlight import StarLight, measure_stars
+from startrack.camera import Camera
+from startrack.catalog import StarCatalog
+from startrack.core.errors import NoSolution
+from startrack.core.types import Array, Bools, Exposure, MeasuredSkyline
+from startrack.frames import Site, off_axis_rad, rays_from_azel, refract_rad
+
+BEYOND_CIRCLE_RAD = np.radians(4.5)  # the edge of the image circle is stated to some degrees; light is followed so far
+WIDTHS = ((1, 0.6), (7, 0.3), (21, 0.2))  # columns averaged, and weight: they share their pixels with their neighbours
+UNKNOWN_SIGMA_RAD = np.radians(2.0)  # a wider posterior is no measurement
+PLACE_SIGMA_RAD = np.radians(0.04)  # a quarter of a usual pixel: the edge's place depends on how the ground is lit
+WALL_RAD = np.radians(1.0)  # variation from which one elevation does not describe a bin
+WEATHER_1 = 0.1  # of the refraction: what the weather changes
+NEAR_LIGHT_RAD = np.radians(0.3)  # a step this near to the skyline is evidence for it
+GAP_CONTRAST, GAP_SIGNIFICANCE = 0.25, 5.0  # of brighter light below the skyline
+DEEPEST_GAP_RAD = np.radians(15.0)
+NEAR_STAR_RAD = np.radians(2.0)
+DECISIVE_LLR = 2.0
+
+
+@dataclass(frozen=True)
+class SkylineResult:
+    """The measured skyline, the frames that it comes from, and the photographs left out."""
+
+    skyline: MeasuredSkyline
+    frames: tuple[SkyFrame, ...]
+    left_out: tuple[LeftOut, ...]
+
+
+def measure_skyline(
+    exposures: Sequence[Exposure], catalog: StarCatalog, site: Site, *, camera: Camera | None = None,
+    fov_rad: float | None = None,
+) -> SkylineResult:  # fmt: skip
+    """The skyline of a fixed camera on the Earth from one or several exposures.
+
+    Args:
+        exposures: each with its time.
+        catalog: stars.
+        site: where the camera stands.
+        camera: its lens; None: `fov_rad` is needed.
+        fov_rad: field of view to 10 %, as for `identify_blind`.
+
+    Raises:
+        BadInput: no_time, no_calibration, size_mismatch.
+        NoSolution: the stars of no exposure are identified.
+    """
+    frames, left_out = orient_frames(exposures, catalog, site, camera=camera, fov_rad=fov_rad)
+    return measure_frames(frames, left_out, site)
+
+
+def measure_frames(frames: tuple[SkyFrame, ...], left_out: tuple[LeftOut, ...], site: Site) -> SkylineResult:
+    """The skyline at a `site` from `frames` with their attitudes; `left_out` are the photographs without.
+
+    Raises NoSolution if there is no frame.
+    """
+    if not frames:
+        first = left_out[0]
+        raise NoSolution(f"{first.name}: {first.message}", reason=first.reason)
+    stars = [measure_stars(frame) for frame in frames]
+    steps = [_steps_of(frame, light) for frame, light in zip(frames, stars, strict=True)]
+    total = column_log_prior()
+    for light, by_width in zip(stars, steps, strict=True):
+        total = total + star_log_likelihood(light.rays, light.missing, light.spurious)
+        for found, (_, weight) in zip(by_width, WIDTHS, strict=True):
+            total += step_log_likelihood(found, weight)
+    marginals = combine_columns(total)
+    return SkylineResult(_skyline(marginals, frames, stars, steps, site), frames, left_out)
+
+
+def _steps_of(frame: SkyFrame, light: StarLight) -> list[Steps]:
+    found = frame.detections
+    edge = min(frame.camera.max_angle_rad + BEYOND_CIRCLE_RAD, frame.camera.lens.max_invertible_rad)
+    camera = replace(frame.camera, max_angle_rad=edge)
+    widths = tuple(width for width, _ in WIDTHS)
+    return find_steps(
+        found.image_e,
+        found.noise_e,
+        lost_pixels(found),
+        camera,
+        frame.R_cam_enu,
+        widths=widths,
+        stars_px=light.bright_px,
+        glare_px=light.glare_px,
+    )
+
+
+def _skyline(
+    marginals: Marginals, frames: Sequence[SkyFrame], stars: Sequence[StarLight], steps: Sequence[list[Steps]],
+    site: Site,
+) -> MeasuredSkyline:  # fmt: skip
+    """The columns' posterior as bins of one degree; the errors that the frames share are added once."""
+    columns = marginals.mean_rad.reshape(BINS, COLUMNS_PER_BIN)
+    azimuth = np.radians(np.arange(BINS, dtype=np.float64) * (360.0 / BINS))
+    elevation = columns.mean(axis=1)
+    scatter = np.mean(np.square(marginals.sigma_rad.reshape(BINS, COLUMNS_PER_BIN)), axis=1)
+    variation = _neighbourhood_variance(marginals.mean_rad)
+    shared = np.square(_common_sigma_rad(frames, azimuth, elevation, site)) + PLACE_SIGMA_RAD**2
+    shared += np.square(_gap_depth(steps, marginals.mean_rad))
+    by_stars, by_light = _has_star(stars, azimuth, elevation), _has_step(steps, marginals.mean_rad)
+    known = (scatter + variation + shared < UNKNOWN_SIGMA_RAD**2) & (by_stars | by_light)
+    known = _beside_known_bins(known)
+    variance = scatter / COLUMNS_PER_BIN + np.square(variation) / (variation + WALL_RAD**2) + shared
+    source = np.select([by_stars & by_light, by_light, by_stars], ["both", "sky light", "stars"], "")
+    return MeasuredSkyline(
+        azimuth_rad=azimuth,
+        elevation_rad=np.where(known, elevation, np.nan),
+        sigma_rad=np.where(known, np.sqrt(variance), np.inf),
+        source=np.where(known, source, ""),
+    )
+
+
+def _beside_known_bins(known: Bools) -> Bools:
+    """The known bins (n,) with known neighbours.
+
+    A shorter run is a halo or a reflection more often than ground, and beside an unknown bin the ground often rises.
+    """
+    return np.asarray(known & np.roll(known, 1) & np.roll(known, -1))
+
+
+def _neighbourhood_variance(elevation_rad: Array) -> Array:
+    """Variance (BINS,) of the skyline within one degree to either side."""
+    half = COLUMNS_PER_BIN // 2
+    around = np.arange(-half, COLUMNS_PER_BIN + half)
+    columns = np.arange(BINS)[:, None] * COLUMNS_PER_BIN + around
+    return np.asarray(elevation_rad[columns % COLUMNS].var(axis=1))
+
+
+def _gap_depth(steps: Sequence[list[Steps]], elevation_rad: Array) -> Array:
+    """How far (BINS,) below the skyline light is seen again: one elevation does not describe a tree with gaps."""
+    depth = np.zeros(COLUMNS)
+    for one in (one for by_width in steps for one in by_width[:2]):
+        below = elevation_rad[one.column] - one.elevation_rad
+        light = (one.contrast > GAP_CONTRAST) & (one.significance > GAP_SIGNIFICANCE)
+        light &= (below > NEAR_LIGHT_RAD) & (below < DEEPEST_GAP_RAD)
+        np.maximum.at(depth, one.column[light], below[light])
+    columns = np.arange(BINS)[:, None] * COLUMNS_PER_BIN + np.arange(-2 * COLUMNS_PER_BIN, 3 * COLUMNS_PER_BIN)
+    return np.asarray(depth[columns % COLUMNS].mean(axis=1))
+
+
+def _common_sigma_rad(frames: Sequence[SkyFrame], azimuth: Array, elevation: Array, site: Site) -> Array:
+    """Error (n,) of lens, attitude and refraction: that of the best frame, for frames share the lens."""
+    rays_enu = rays_from_azel(azimuth, elevation)
+    by_frame = []
+    for frame in frames:
+        rays = rays_enu @ frame.R_cam_enu.T
+        angle = np.minimum(off_axis_rad(rays), frame.camera.max_angle_rad)
+        scale = frame.camera.mean_scale_rad_per_px(angle)
+        by_frame.append(np.hypot(frame.camera.projection_sigma_px(rays) * scale, frame.attitude_sigma_rad))
+    lift = refract_rad(elevation, pressure_hpa(site.height_m)) - elevation
+    return np.hypot(np.min(by_frame, axis=0), WEATHER_1 * lift)
+
+
+def _has_star(stars: Sequence[StarLight], azimuth: Array, elevation: Array) -> Bools:
+    """Whether stars near the skyline decide about each bin (n,)."""
+    found = np.zeros(len(azimuth), dtype=bool)
+    for light in stars:
+        rays = light.rays.take(np.abs(light.rays.llr) > DECISIVE_LLR)
+        apart = np.abs((rays.azimuth_rad - azimuth[:, None] + np.pi) % (2 * np.pi) - np.pi)
+        near = apart * np.cos(elevation)[:, None] < NEAR_STAR_RAD
+        found |= (near & (np.abs(rays.elevation_rad - elevation[:, None]) < NEAR_STAR_RAD)).any(axis=1)
+    return found
+
+
+def _has_step(steps: Sequence[list[Steps]], elevation_rad: Array) -> Bools:
+    """Whether steps of light lie at the skyline of most columns of each bin."""
+    found = np.zeros(COLUMNS, dtype=bool)
+    for one in (one for by_width in steps for one in by_width):
+        near = np.abs(one.elevation_rad - elevation_rad[one.column]) < NEAR_LIGHT_RAD
+        found[one.column[near]] = True
+    return np.asarray(found.reshape(BINS, COLUMNS_PER_BIN).mean(axis=1) >= 0.5)
+
+
+def predicted_visible(skyline: MeasuredSkyline, azimuth_rad: Array, elevation_rad: Array) -> tuple[Bools, Bools]:
+    """Whether directions (n,) are above a `skyline`, and which are more than two sigma from it where it is known.
+
+    `azimuth_rad` and `elevation_rad` (n,) are apparent directions.
+    """
+    n = len(skyline)
+    place = np.asarray(azimuth_rad) * (n / (2 * np.pi))
+    nearest = np.rint(place).astype(np.int64) % n
+    low = np.floor(place).astype(np.int64)
+    share = place - low
+    between = (1 - share) * skyline.elevation_rad[low % n] + share * skyline.elevation_rad[(low + 1) % n]
+    height = elevation_rad - np.where(np.isfinite(between), between, skyline.elevation_rad[nearest])
+    return height > 0, np.abs(height) > 2 * skyline.sigma_rad[nearest]

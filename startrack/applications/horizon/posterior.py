@@ -1,0 +1,150 @@
+"""Posterior of the skyline's elevation in every column of azimuth: stars, steps of light, and neighbouring columns.
+
+A hidden Markov chain around the compass. The skyline's elevation changes from column to column by a Laplace
+distribution, sometimes a wide one (a tree), and sometimes it jumps anywhere (a dome).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.applications.horizon.grid import COLUMNS, LOWEST_RAD, STEP_RAD, column_of, elevations_rad
+from startrack.applications.horizon.skylight import MIN_SIGNIFICANCE, Steps
+from startrack.core.types import Array, Evidence
+
+CHANGES_RAD = np.radians(np.array([0.02, 0.12, 0.8]))  # Laplace scales of the change between columns: hill, wood, tree
+CHANGE_WEIGHTS = (0.55, 0.25, 0.18)
+JUMP_WEIGHT = 0.02  # a dome, a mast: any elevation
+SHOWN_PROBABILITY = 0.75  # that the skyline itself is among a column's steps
+BRIGHTER_PROBABILITY = 0.25  # that the ground at the skyline is brighter than the sky, in moonlight or lamplight
+SURE_SIGNIFICANCE, RARELY_BRIGHTER_PROBABILITY = 8.0, 0.05  # weak bright steps are more often stars
+WEAKEST_CONTRAST = 0.25  # usual skylines have more
+NOISE_PER_RAD = np.degrees(0.5)  # density of steps of 3 sigma that are noise
+SKY_PER_RAD, SKY_CONTRAST = np.degrees(0.08), 0.12  # density of steps in the sky (clouds, reflections), and their scale
+RARE_PER_RAD = np.degrees(3e-4)  # of sharp ones in the sky: wires, halos of bright stars
+GROUND_PER_RAD, GROUND_CONTRAST = np.degrees(0.3), 0.15  # density of steps below the skyline, and their scale
+MOST_MISSING = 0.999  # probability that a visible star is not seen
+LOW_MISSING, LOW_SCALE_RAD = 0.4, np.radians(3.0)  # near the horizon: haze dims stars more than the fit
+HIGH_1_PER_RAD = 4.0  # per column; neighbours add up
+LEAST_LLR = 0.25  # rows below it are left out
+LARGEST_LLR = 500.0  # of a star, before the limits: its exponential would overflow at 710
+EDGE_SIGMAS = 5.0
+OUTLIER_PROBABILITY = 1e-4  # of a column whose evidence means nothing
+
+
+@dataclass(frozen=True)
+class Marginals:
+    """Posterior of each column (COLUMNS) on the grid of elevations."""
+
+    mean_rad: Array
+    sigma_rad: Array
+
+
+def column_log_prior() -> Array:
+    """Logarithm (COLUMNS, n) of the prior of the skyline: high ones are rare."""
+    return np.tile(-HIGH_1_PER_RAD * np.maximum(elevations_rad(), 0.0), (COLUMNS, 1))
+
+
+def star_log_likelihood(rays: Evidence, missing: float, spurious: float) -> Array:
+    """Log-likelihood (COLUMNS, n) of the stars' rows at each elevation of the skyline.
+
+    `missing`: probability that a visible star is not seen (cloud), `spurious`: that a hidden one seems seen (a gap in
+    the leaves, a hot pixel).
+    """
+    from scipy.special import log_ndtr
+
+    elevation = elevations_rad()
+    n = len(elevation)
+    low = missing + LOW_MISSING * np.exp(-np.maximum(rays.elevation_rad, 0.0) / LOW_SCALE_RAD)
+    low = np.minimum(low, MOST_MISSING)
+    limited = limit_llr(rays.llr, low, spurious)
+    use = (np.abs(limited) > LEAST_LLR) & (rays.elevation_rad > LOWEST_RAD) & (rays.elevation_rad < elevation[-1])
+    rays, limited = rays.take(use), limited[use]
+    column = column_of(rays.azimuth_rad)
+    edge_rad = float(rays.edge_sigma_rad.max(initial=STEP_RAD))
+    half = int(np.ceil(EDGE_SIGMAS * edge_rad / STEP_RAD))
+    first = np.rint((rays.elevation_rad - LOWEST_RAD) / STEP_RAD).astype(int) - half
+    # Below its window a star is visible, above it hidden: a step; within it the profile of the edge.
+    steps = np.zeros((COLUMNS, n + 1))
+    np.add.at(steps, (column, np.zeros_like(column)), limited)
+    np.add.at(steps, (column, np.clip(first, 0, n)), -limited)
+    total = np.cumsum(steps, axis=1)[:, :n]
+    at = first[:, None] + np.arange(2 * half + 1)
+    z = (rays.elevation_rad[:, None] - (LOWEST_RAD + STEP_RAD * at)) / edge_rad
+    profile = np.logaddexp(log_ndtr(z) + limited[:, None], log_ndtr(-z))
+    inside = (at >= 0) & (at < n)
+    np.add.at(total, (np.broadcast_to(column[:, None], at.shape)[inside], at[inside]), profile[inside])
+    return total
+
+
+def limit_llr(llr: Array, missing: Array, spurious: float) -> Array:
+    """Log-likelihood ratios (n,) with the probabilities of a visible star not seen, and of a hidden one seen."""
+    ratio = np.exp(np.minimum(llr, LARGEST_LLR))
+    return np.asarray(np.log(((1 - missing) * ratio + missing) / (spurious * ratio + 1 - spurious)))
+
+
+def step_log_likelihood(steps: Steps, temper: float) -> Array:
+    """Log-likelihood (COLUMNS, n) of one image's steps of light at each elevation of the skyline, times `temper`."""
+    elevation = elevations_rad()
+    total = np.zeros((COLUMNS, len(elevation)))
+    noise = NOISE_PER_RAD * np.exp(-0.5 * (np.square(steps.significance) - MIN_SIGNIFICANCE**2))
+    contrast = np.abs(steps.contrast)
+    in_sky = noise + SKY_PER_RAD * np.exp(-contrast / SKY_CONTRAST) + RARE_PER_RAD
+    in_ground = noise + GROUND_PER_RAD * np.exp(-contrast / GROUND_CONTRAST) + 15 * RARE_PER_RAD
+    brighter = np.where(steps.significance > SURE_SIGNIFICANCE, BRIGHTER_PROBABILITY, RARELY_BRIGHTER_PROBABILITY)
+    weight = np.where(steps.contrast > 0, brighter, 1 - brighter)
+    weight = SHOWN_PROBABILITY * weight * np.minimum(contrast / WEAKEST_CONTRAST, 1.0) ** 2 / in_ground
+    passed = 0.5 * np.log(in_sky / in_ground)
+    for c in np.unique(steps.column):
+        mixture = np.full(len(elevation), 1 - SHOWN_PROBABILITY)
+        for k in np.flatnonzero(steps.column == c):
+            e, s = steps.elevation_rad[k], steps.sigma_rad[k]
+            mixture += weight[k] * np.exp(-0.5 * np.square((elevation - e) / s)) / (s * np.sqrt(2 * np.pi))
+            total[c] += passed[k] * (elevation < e - 2 * s)
+        total[c] += np.log(mixture)
+    return temper * total
+
+
+def combine_columns(log_likelihood: Array) -> Marginals:
+    """Marginals of the chain with the log-likelihoods (COLUMNS, n)."""
+    from scipy.fft import irfft, next_fast_len, rfft
+
+    columns, n = log_likelihood.shape
+    likelihood = np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
+    likelihood = likelihood / likelihood.mean(axis=1, keepdims=True) + OUTLIER_PROBABILITY
+    size = next_fast_len(2 * n)
+    kernel = rfft(_kernel(n, size))
+
+    def predict(message: Array) -> Array:
+        spread = np.maximum(irfft(rfft(message, size) * kernel, size)[:n], 0.0)
+        return (1 - JUMP_WEIGHT) * spread / spread.sum() + JUMP_WEIGHT / n
+
+    def run(order: Sequence[int]) -> Array:
+        found = np.empty((columns, n))
+        message = np.full(n, 1.0 / n)
+        for _ in range(2):  # the second round starts where the first one ended: the compass is a circle
+            for c in order:
+                found[c] = message
+                after = message * likelihood[c]
+                message = predict(after / after.sum())
+        return found
+
+    ahead, behind = run(range(columns)), run(range(columns - 1, -1, -1))
+    posterior = ahead * behind * likelihood
+    posterior /= posterior.sum(axis=1, keepdims=True)
+    elevation = elevations_rad()
+    mean = posterior @ elevation
+    variance = np.maximum(posterior @ np.square(elevation) - np.square(mean), 0.0)
+    return Marginals(mean, np.sqrt(variance))
+
+
+def _kernel(n: int, size: int) -> Array:
+    distance = STEP_RAD * np.minimum(np.arange(size), size - np.arange(size))
+    parts = [
+        w * np.exp(-distance / s) / np.sum(np.exp(-distance / s))
+        for w, s in zip(CHANGE_WEIGHTS, CHANGES_RAD, strict=True)
+    ]
+    return np.asarray(np.sum(parts, axis=0))

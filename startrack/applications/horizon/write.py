@@ -1,0 +1,128 @@
+"""A measured skyline in the formats of other programs: CSV, ECSV, N.I.N.A., Stellarium, a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from startrack.core.errors import BadOutput
+from startrack.core.files import check_output as check_file
+from startrack.core.files import write_atomically
+from startrack.core.types import Array, BadInput, MeasuredSkyline
+from startrack.frames import Site
+from startrack.output import png_bytes
+from startrack.output.skyline_table import skyline_table_text, skyline_texts_deg
+
+SUFFIXES = (".csv", ".ecsv", ".hrz", ".png")  # and none: the folder of a Stellarium landscape
+LANDSCAPE, HORIZON_LIST = "landscape.ini", "horizon.txt"
+TINY_DEG = 1e-5  # Stellarium draws a polygon with a corner at exactly 0 or 180 degrees badly
+
+
+def kind_of(output: str) -> str:
+    """The suffix of an output path, "" for a folder. Raises BadOutput (bad_image, for lack of a better code)."""
+    suffix = "" if output.endswith(("/", "\\")) else Path(output).suffix.lower()
+    if suffix not in (*SUFFIXES, ""):
+        known = ", ".join(SUFFIXES)
+        raise BadOutput("bad_image", f"{output}: the suffix is none of {known}; a name without one is a folder")
+    return suffix
+
+
+def output_files(output: str) -> tuple[Path, ...]:
+    """The files that `write_skyline` writes for an output path."""
+    path = Path(output)
+    return (path,) if kind_of(output) else (path / LANDSCAPE, path / HORIZON_LIST)
+
+
+def check_output(output: str, *, overwrite: bool) -> None:
+    """Raise BadOutput if the output has an unknown suffix, exists and may not be replaced, or takes no files."""
+    for path in output_files(output):
+        check_file(path, overwrite=overwrite)
+
+
+def needs_all_azimuths(output: str) -> bool:
+    """Whether the format cannot leave azimuths empty."""
+    return kind_of(output) in (".hrz", "")
+
+
+def write_skyline(output: str, skyline: MeasuredSkyline, site: Site, *, overwrite: bool) -> tuple[Path, ...]:
+    """Write a skyline in the format of the suffix of `output`; the files. Raises BadInput if that is impossible."""
+    files = output_files(output)
+    texts = {
+        ".csv": lambda: (csv_text(skyline),),
+        ".ecsv": lambda: (skyline_table_text(skyline),),
+        ".hrz": lambda: (nina_text(skyline),),
+        "": lambda: (landscape_text(Path(output).name, site), horizon_list_text(skyline)),
+    }
+    kind = kind_of(output)
+    data = (_picture(skyline),) if kind == ".png" else tuple(text.encode("utf-8") for text in texts[kind]())
+    for path, content in zip(files, data, strict=True):
+        write_atomically(path, content, overwrite=overwrite)
+    return files
+
+
+def csv_text(skyline: MeasuredSkyline) -> str:
+    """One row a degree; elevation and sigma are empty where the skyline is unknown."""
+    rows = ["azimuth_deg,elevation_deg,sigma_deg"]
+    rows += map(",".join, zip(*skyline_texts_deg(skyline), strict=True))
+    return "\n".join(rows) + "\n"
+
+
+def nina_text(skyline: MeasuredSkyline) -> str:
+    """Lines "azimuth altitude" in degrees from 0 to 360, as N.I.N.A. reads them (# begins a comment)."""
+    azimuth, elevation = _closed_deg(skyline)
+    rows = [f"{a:g} {e:.3f}" for a, e in zip(azimuth, elevation, strict=True)]
+    return "# azimuth altitude\n" + "\n".join(rows) + "\n"
+
+
+def horizon_list_text(skyline: MeasuredSkyline) -> str:
+    """The list of azimuth and altitude of a polygonal landscape."""
+    azimuth, elevation = _closed_deg(skyline)
+    rows = [f"{a:.1f} {e:.3f}" for a, e in zip(azimuth[:-1], elevation[:-1], strict=True)]
+    return "# azimuth altitude\n" + "\n".join(rows) + "\n"
+
+
+def landscape_text(name: str, site: Site) -> str:
+    """The landscape.ini of a polygonal landscape, as the Stellarium User Guide describes it."""
+    return (
+        "[landscape]\n"
+        f"name = {name}\n"
+        "author = startrack\n"
+        "description = Skyline measured in photographs of the night sky\n"
+        "type = polygonal\n"
+        f"polygonal_horizon_list = {HORIZON_LIST}\n"
+        "polygonal_horizon_list_mode = azDeg_altDeg\n"
+        f"polygonal_angle_rotatez = {TINY_DEG:.5f}\n"
+        "ground_color = 0.15,0.2,0.15\n"
+        "horizon_line_color = 0.4,0.6,0.8\n"
+        "\n"
+        "[location]\n"
+        "planet = Earth\n"
+        f"latitude = {np.degrees(site.latitude_rad):.6f}\n"
+        f"longitude = {np.degrees(site.longitude_rad):.6f}\n"
+        f"altitude = {site.height_m:.0f}\n"
+    )
+
+
+def interpolate_unknown(skyline: MeasuredSkyline) -> Array:
+    """Elevations (n,) with the unknown ones interpolated between their neighbours around the compass.
+
+    Raises BadInput (bad_image, for lack of a better code) if none is known.
+    """
+    known = skyline.known
+    if not known.any():
+        raise BadInput("bad_image", "the skyline is unknown at all azimuths")
+    at, elevation = skyline.azimuth_rad[known], skyline.elevation_rad[known]
+    return np.asarray(np.interp(skyline.azimuth_rad, at, elevation, period=2 * np.pi))
+
+
+def _closed_deg(skyline: MeasuredSkyline) -> tuple[Array, Array]:
+    elevation = np.degrees(interpolate_unknown(skyline))
+    return np.append(np.degrees(skyline.azimuth_rad), 360.0), np.append(elevation, elevation[0])
+
+
+def _picture(skyline: MeasuredSkyline) -> bytes:
+    """The panorama as PNG."""
+    from startrack.output.picture.panorama import skyline_picture
+
+    return png_bytes(skyline_picture(skyline))

@@ -1,0 +1,171 @@
+"""Draws of evidence at one place, located as images are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from datetime import datetime
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from startrack.camera import Camera, load_camera
+from startrack.catalog import StarCatalog, load_catalog
+from startrack.catalog.gaia import has_deep_catalog, load_deep_catalog
+from startrack.chain.measurement import COMPLETE_V_MAG
+from startrack.chain.star_fix import locate_rays
+from startrack.core.chunk_store import Chunk
+from startrack.core.types import Array, BadInput, NoSolution, Stars
+from startrack.localization import require_localizer
+from startrack.rendering import Series, limiting_v_mag, load_sky_catalog
+from startrack.simulation import draw_ground, simulate_rays
+from startrack.terrain import Terrain, load_terrain
+
+OK, AMBIGUOUS, REFUSED = range(3)  # status of a draw
+FAINTEST_V_MAG = 10.0  # of the stars in the sky, as `render` has it; and
+BELOW_LIMIT_MAG = 3.0  # below the limit at 5 sigma: fainter stars add 2 % to the variance of a star's flux
+MAX_DRAWS = 1_000_000
+LIMIT_SNR = 5.0
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What is predicted: small, so that it is cheap to send to a worker."""
+
+    camera: str  # file, or the name of a shipped one
+    terrain: str
+    times_utc: tuple[datetime, ...]  # mid-exposure, one a draw
+    exposure_s: float | None = None  # None: a V 6 star on the axis reaches 5 sigma
+    sky_v_mag_arcsec2: float = 22.0
+    seed: int = 0
+    localizer: str = "posterior"
+
+
+@dataclass(frozen=True)
+class Place:
+    """A position of the camera, and its number in the streams of random numbers."""
+
+    number: int
+    east_m: float
+    north_m: float
+
+
+@dataclass(frozen=True)
+class Task:
+    """The draws at one place; `inputs` are hashes of the files of the conditions, part of the key of its chunk."""
+
+    conditions: Conditions
+    place: Place
+    inputs: tuple[tuple[str, str], ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.conditions.times_utc)
+
+
+class Predictor:
+    """Draws of evidence for one camera above one terrain under one set of conditions.
+
+    Raises BadInput: bad_calibration for a camera without a sensor, bad_terrain for a terrain without a site.
+    """
+
+    def __init__(self, camera: Camera, terrain: Terrain, conditions: Conditions) -> None:
+        self.camera, self.terrain, self.conditions = camera, terrain, conditions
+        self.localizer = require_localizer(conditions.localizer)
+        self._skies: dict[int, tuple[Stars, Array]] = {}
+
+    @cached_property
+    def exposure_s(self) -> float:
+        """The exposure, given or default [s]."""
+        return self._series_of(0, load_catalog(), None).exposure_used_s
+
+    @cached_property
+    def limiting_v_mag(self) -> float:
+        """Magnitude of a star on the axis at 5 sigma."""
+        sky = self.conditions.sky_v_mag_arcsec2
+        return limiting_v_mag(self.camera, sky, exposure_s=self.exposure_s, snr=LIMIT_SNR)
+
+    @cached_property
+    def catalog(self) -> StarCatalog:
+        """The stars that the pipeline measures in an image of this depth."""
+        is_deep = has_deep_catalog() and self.limiting_v_mag >= COMPLETE_V_MAG
+        return load_deep_catalog() if is_deep else load_catalog()
+
+    @cached_property
+    def faintest_v_mag(self) -> float:
+        """Of the stars in the sky."""
+        return min(FAINTEST_V_MAG, self.limiting_v_mag + BELOW_LIMIT_MAG)
+
+    @cached_property
+    def _series(self) -> list[Series]:
+        """The exposures of each draw at all places: the sky's errors differ from draw to draw."""
+        sky = load_sky_catalog("auto").brighter_than(self.faintest_v_mag)
+        return [self._series_of(draw, sky, self.faintest_v_mag) for draw in range(len(self.conditions.times_utc))]
+
+    def draw(self, place: Place) -> Chunk:
+        """Arrays over the draws (n,) at a place, which depend on the seed, the place and the conditions only.
+
+        `status` (OK, AMBIGUOUS, REFUSED), and of draws with one position `radius95_m`, `covariance_m2` (n, 2, 2) and
+        `offset_m` (n, 2), found minus true position; NaN of the others.
+        """
+        n = len(self.conditions.times_utc)
+        found = {
+            "status": np.full(n, REFUSED, dtype=np.int8), "radius95_m": np.full(n, np.nan),
+            "covariance_m2": np.full((n, 2, 2), np.nan), "offset_m": np.full((n, 2), np.nan),
+        }  # fmt: skip
+        for draw in range(n):
+            self._draw_one(place, draw, found)
+        return found
+
+    def _draw_one(self, place: Place, draw: int, found: Chunk) -> None:
+        """Fill in row `draw`."""
+        series = replace(self._series[draw], east_m=place.east_m, north_m=place.north_m)
+        if draw not in self._skies:
+            self._skies[draw] = series.draw_sky(self.conditions.times_utc[draw])
+        scene, rng = series.scene(place.number, sky=self._skies[draw])
+        scene = replace(scene, terrain=draw_ground(self.terrain, rng=rng.spawn(1)[0]))
+        rays = simulate_rays(scene, self.catalog, self.terrain, rng=rng)
+        try:
+            located = locate_rays(rays, self.localizer)
+        except BadInput:
+            raise
+        except NoSolution:
+            return
+        if located.fix.ambiguous:
+            found["status"][draw] = AMBIGUOUS
+            return
+        found["status"][draw] = OK
+        found["radius95_m"][draw] = located.fix.radius95_m
+        found["covariance_m2"][draw] = located.fix.covariance_m2
+        found["offset_m"][draw] = (located.fix.position_enu_m - scene.position_enu_m)[:2]
+
+    def _series_of(self, draw: int, catalog: StarCatalog, faint_v_mag: float | None) -> Series:
+        conditions = self.conditions
+        return Series(
+            camera=self.camera, terrain=self.terrain, catalog=catalog, seed=MAX_DRAWS * conditions.seed + draw,
+            time_utc=conditions.times_utc[draw], exposure_s=conditions.exposure_s,
+            sky_v_mag_arcsec2=conditions.sky_v_mag_arcsec2, faint_v_mag=faint_v_mag, hot_pixels=0, cosmic_rays=0,
+        )  # fmt: skip
+
+
+def draw_task(task: Task) -> Chunk:
+    """The draws of a task, in any process."""
+    return _predictor(task.conditions).draw(task.place)
+
+
+@lru_cache(maxsize=2)
+def _predictor(conditions: Conditions) -> Predictor:
+    return Predictor(load_camera(conditions.camera), load_terrain(conditions.terrain), conditions)
+
+
+def evenly_spaced(first: datetime, last: datetime, count: int) -> tuple[datetime, ...]:
+    """The middles of `count` equal parts of a time. Raises BadInput (no_time) if `last` is before `first`."""
+    if last < first:
+        raise BadInput("no_time", f"the end {last.isoformat()} is before the start {first.isoformat()}")
+    step = (last - first) / count
+    return tuple(first + (k + 0.5) * step for k in range(count))
+
+
+def joined(chunks: Iterable[Chunk]) -> Chunk:
+    """The `chunks` of places as arrays over places (k, n, ...)."""
+    rows = list(chunks)
+    return {key: np.stack([row[key] for row in rows]) for key in rows[0]}

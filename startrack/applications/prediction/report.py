@@ -1,0 +1,214 @@
+"""What a prediction found, as a record, as lines of text, and as files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from startrack import __version__
+from startrack.applications.prediction.along_path import with_odometry
+from startrack.applications.prediction.draws import Conditions
+from startrack.applications.prediction.places import AreaCells, PathPoints
+from startrack.applications.prediction.run import predictor_of, variant_record
+from startrack.applications.prediction.statistics import Cells, median_or_none, summarized
+from startrack.applications.prediction.write import (
+    COMPARISON_PICTURE,
+    FILES,
+    PICTURE,
+    SUMMARY,
+    write_comparison_table,
+    write_map,
+    write_picture,
+    write_summary,
+    write_table,
+)
+from startrack.core.errors import BadOutput
+from startrack.core.lengths import length_text
+from startrack.frames import format_utc
+from startrack.output.quantities_prediction import FILTERED, FORMAT, SHARES_M, SMOOTHED
+from startrack.terrain import Terrain, load_terrain
+
+PATH_CURVES = {FILTERED: "images so far, and odometry", SMOOTHED: "all images, and odometry"}
+SETTINGS = ("kind", "terrain", "camera", "first_time_utc", "last_time_utc", "spacing_m", "places")  # of one prediction
+
+
+@dataclass(frozen=True)
+class OdometryErrors:
+    """Errors of moves on each horizontal axis."""
+
+    sigma_1: float  # relative to the length of a move
+    floor_m: float  # beside that, in quadrature
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """A prediction at the points, with its record."""
+
+    conditions: Conditions
+    terrain: Terrain
+    points: AreaCells | PathPoints
+    inputs: tuple[tuple[str, str], ...]
+    cells: Cells = field(default_factory=dict)
+    variants: list[dict[str, Any]] = field(default_factory=list)
+    depth: dict[str, Any] | None = None
+    odometry: OdometryErrors | None = None
+
+    @classmethod
+    def begin(
+        cls, conditions: Conditions, inputs: tuple[tuple[str, str], ...], points: AreaCells | PathPoints
+    ) -> Report:
+        """The report before the draws. Raises BadInput for files that cannot be used."""
+        predictor_of(conditions).exposure_s  # noqa: B018 - a camera without a sensor is refused before anything is drawn
+        return cls(conditions, load_terrain(conditions.terrain), points, inputs)
+
+    def finish(
+        self, conditions: Conditions, cells: Cells, others: Mapping[Conditions, Cells], depth: dict[str, Any] | None
+    ) -> Report:
+        """The report with the predictions: of the `conditions`, of `others` to compare with, and of a search."""
+        variants = [variant_record(other, found) for other, found in others.items()]
+        return replace(self, conditions=conditions, cells=cells, variants=variants, depth=depth)
+
+    def between(self, odometry: OdometryErrors) -> Report:
+        """The report of a path with odometry between its images."""
+        points_m = self.points.position_m
+        cells = with_odometry(points_m, self.cells, sigma_1=odometry.sigma_1, floor_m=odometry.floor_m)
+        return replace(self, cells=cells, odometry=odometry)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What was predicted, without results."""
+        predictor, times = predictor_of(self.conditions), self.conditions.times_utc
+        return {
+            "format": FORMAT,
+            "kind": self.points.kind,
+            "terrain": self.terrain.name,
+            "camera": predictor.camera.name,
+            "first_time_utc": format_utc(times[0]),
+            "last_time_utc": format_utc(times[-1]),
+            "exposure_s": predictor.exposure_s,
+            "limiting_v_mag": predictor.limiting_v_mag,
+            "sky_mag_arcsec2": self.conditions.sky_v_mag_arcsec2,
+            "spacing_m": self.points.spacing_m,
+            "places": len(self.points.position_m),
+            "draws": len(times),
+            "seed": self.conditions.seed,
+            "localizer": self.conditions.localizer,
+        }
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The content of predict.json."""
+        more: dict[str, Any] = {"variants": self.variants} if self.variants else {}
+        if self.depth is not None:
+            more["depth"] = self.depth
+        if self.odometry is not None:
+            medians = {f"median_{name}": median_or_none(self.cells[name]) for name in (FILTERED, SMOOTHED)}
+            more["odometry"] = {"sigma": self.odometry.sigma_1, "floor_m": self.odometry.floor_m, **medians}
+        provenance = {"version": __version__, "inputs": dict(self.inputs)}
+        return {**self.settings, "summary": summarized(self.cells), **more, "provenance": provenance}
+
+    def check_folder(self, out: Path, *, overwrite: bool) -> None:
+        """Raise BadOutput if `out` holds a prediction of other places, cameras or times and not `overwrite`."""
+        try:
+            before = json.loads((out / SUMMARY).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return
+        now = self.settings
+        differs = [key for key in SETTINGS if not isinstance(before, dict) or before.get(key) != now[key]]
+        if differs and not overwrite:
+            what = f"{out} holds another prediction ({', '.join(differs)} differ)"
+            raise BadOutput("bad_image", f"{what}: choose another -D, or replace it with -O")
+
+    def lines(self) -> list[str]:
+        """The summary in words."""
+        found, what = summarized(self.cells), "area" if self.points.kind == "area" else "path"
+        radius = _median_text(found["median_radius95_m"])
+        shares = ", ".join(f"{100 * found[f'share_below_{bound}_m']:.0f} % below {bound} m" for bound in SHARES_M)
+        lines = [
+            f"{self.terrain.name}: {len(self.points.position_m)} places, {radius}; of the {what} {shares}",
+            f"draws: {100 * found['p_ok']:.1f} % located, {100 * found['p_ambiguous']:.1f} % ambiguous, "
+            f"{100 * found['p_refused']:.1f} % refused",
+        ]
+        if self.odometry is not None:
+            lines.append(_odometry_line(self.record["odometry"]))
+        if self.depth is not None:
+            lines.append(_depth_line(self.depth))
+        return lines + [_variant_line(one) for one in self.variants]
+
+
+def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
+    """Write the files; those of an earlier prediction that this one does not make are removed."""
+    points = report.points
+    files = [write_map(out, points, report.cells)] if isinstance(points, AreaCells) else []
+    distance_m = points.distance_m if isinstance(points, PathPoints) else None
+    files.append(write_table(out, report.terrain, points.position_m, report.cells, distance_m))
+    if plots:
+        files.append(write_picture(out / PICTURE, _picture(report)))
+    if report.variants:
+        files.append(write_comparison_table(out, report.variants))
+        if plots:
+            files.append(write_picture(out / COMPARISON_PICTURE, _comparison_picture(report)))
+    files.append(write_summary(out, report.record))
+    for name in set(FILES) - {path.name for path in files}:
+        (out / name).unlink(missing_ok=True)
+    return files
+
+
+def _picture(report: Report) -> Any:
+    from startrack.output.picture.prediction_map import prediction_picture
+    from startrack.output.picture.prediction_plot import path_picture
+
+    points, cells = report.points, report.cells
+    radius = np.where(np.isnan(cells["radius95_m"]), np.inf, cells["radius95_m"])
+    title = f"How well one image of the stars gives the position: {report.terrain.name}"
+    if isinstance(points, AreaCells):
+        raster = points.raster(radius)
+        return prediction_picture(report.terrain, points.site, raster, title, _caption(report))
+    curves = {words: cells[name] for name, words in PATH_CURVES.items() if name in cells}
+    return path_picture(points.distance_m, radius, cells["p_ok"], title, _caption(report), curves)
+
+
+def _comparison_picture(report: Report) -> Any:
+    from startrack.output.picture.prediction_plot import comparison_picture
+
+    return comparison_picture(report.variants, f"Cameras and exposures at the same places: {report.terrain.name}")
+
+
+def _caption(report: Report) -> list[str]:
+    s = report.settings
+    times = s["first_time_utc"][:16].replace("T", " ")
+    if s["last_time_utc"] != s["first_time_utc"]:
+        times += f" to {s['last_time_utc'][:16].replace('T', ' ')}"
+    draws = f"{s['draws']} draws every {s['spacing_m']:.4g} m"
+    return [f"camera {s['camera']}, {s['exposure_s']:.3g} s, {times} UTC, {draws}"]
+
+
+def _depth_line(depth: dict[str, Any]) -> str:
+    wanted = f"{depth['target_radius95_m']:g} m at {100 * depth['share']:.0f} % of the places"
+    if depth["exposure_s"] is None:
+        return f"{wanted}: not reached by any exposure to {depth['tried'][-1]['exposure_s']:.3g} s"
+    return f"{wanted}: {depth['exposure_s']:.3g} s, limiting magnitude V {depth['limiting_v_mag']:.1f}"
+
+
+def _median_text(radius95_m: float | None) -> str:
+    if radius95_m is None:
+        return "no position at half of the places"
+    return f"median 95 % radius {length_text(radius95_m, 3)}"
+
+
+def _odometry_line(found: dict[str, Any]) -> str:
+    radii = [found[f"median_{name}"] for name in (FILTERED, SMOOTHED)]
+    if None in radii:
+        return "with odometry: no position at half of the places"
+    filtered, smoothed = (length_text(one, 3) for one in radii)
+    return f"with odometry: median 95 % radius {filtered} at each place, {smoothed} by all images"
+
+
+def _variant_line(one: dict[str, Any]) -> str:
+    radius = _median_text(one["summary"]["median_radius95_m"])
+    return f"{one['camera']}, {one['exposure_s']:.3g} s (V {one['limiting_v_mag']:.1f}): {radius}"

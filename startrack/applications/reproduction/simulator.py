@@ -1,0 +1,157 @@
+"""The thesis's crater environment simulator: random starfields, a cylinder, the list of stars visible at a position.
+
+Source: Kua 2008, sections 3.2.1 and 3.2.2. No pixels: stars are identified and detected without error, except for
+`Mistakes`. All random draws depend on (seed, sky, number of the position) only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.core.types import Array, Bools, Evidence
+from startrack.frames import Site
+from startrack.terrain import Cylinder
+
+DIAMETER_M, DEPTH_M = 20_000.0, 2_000.0  # Shackleton as the thesis has it (section 3.3)
+MAGNITUDE = 6.0
+ASPECT_RATIO = DIAMETER_M / DEPTH_M
+STARS, POSITIONS, MISTAKES = 1, 2, 3  # streams of random numbers
+EDGE_POINTS = 360  # of the drawn crater edge (section 3.2.1)
+STEP_M = 5.0  # of the traverse through the middle of the crater (section 3.2.2)
+SHACKLETON = Site(body="moon", latitude_rad=float(np.radians(-89.66)), longitude_rad=float(np.radians(129.78)))
+
+
+def star_count(magnitude: float) -> int:
+    """Number of stars down to a magnitude on half the sky: 6.57 e^(1.08 M) (1 - cos(A / 2)) / 2 with A = 180 degrees.
+
+    Rounded: 2142 at magnitude 6. Source: Liebe 2002, as Kua 2008, eq. 3.8.
+    """
+    return round(float(6.57 * np.exp(1.08 * magnitude) * 0.5))
+
+
+def crater(aspect_ratio: float = ASPECT_RATIO) -> Cylinder:
+    """A crater as wide as Shackleton, of any aspect ratio (diameter to depth); the camera is on the floor."""
+    return Cylinder(
+        name=f"kua-2008-{aspect_ratio:g}",
+        site=SHACKLETON,
+        diameter_m=DIAMETER_M,
+        depth_m=DIAMETER_M / aspect_ratio,
+        search_radius_m=DIAMETER_M / 2,
+    )
+
+
+@dataclass(frozen=True)
+class Sky:
+    """A random starfield: azimuths and elevations (n,) [rad] in enu. A deeper one begins with the same stars."""
+
+    azimuth_rad: Array
+    elevation_rad: Array
+
+    @classmethod
+    def draw(cls, seed: int, sky: int, magnitude: float = MAGNITUDE) -> Sky:
+        """phi = 2 pi r1, theta = arcsin r2, r1 and r2 uniform over [0, 1]: eq. 3.9 and 3.10."""
+        r1, r2 = _draw_uniform([seed, STARS, sky], (star_count(magnitude), 2)).T
+        return cls(2 * np.pi * r1, np.arcsin(r2))
+
+    def __len__(self) -> int:
+        return len(self.azimuth_rad)
+
+    def project_to_rim_plane(self, cylinder: Cylinder) -> Array:
+        """Points (n, 2) [m]: from p, star i is visible exactly when |p + point_i| < R."""
+        rho = cylinder.wall_m / np.tan(self.elevation_rad)
+        return rho[:, None] * directions(self.azimuth_rad)
+
+
+def directions(azimuth_rad: Array) -> Array:
+    """Horizontal unit vectors (n, 2), east and north."""
+    return np.stack([np.sin(azimuth_rad), np.cos(azimuth_rad)], axis=-1)
+
+
+def draw_positions(seed: int, sky: int, start: int, stop: int, radius_m: float = DIAMETER_M / 2) -> Array:
+    """Positions number start to stop - 1 (n, 2) [m] of a sky, uniform over the crater's floor."""
+    r1, r2 = _draw_uniform([seed, POSITIONS, sky], (stop, 2))[start:].T
+    return radius_m * np.sqrt(r1)[:, None] * directions(2 * np.pi * r2)
+
+
+def visible_stars(points_m: Array, position_m: Array, radius_m: float) -> Bools:
+    """Which stars (n,), given on the rim's plane, are in sight from a position (2,).
+
+    The thesis tests against a polygon of 360 points of the rim; it differs from the circle by 0.4 m at most.
+    """
+    return np.asarray(
+        np.square(points_m[:, 0] + position_m[0]) + np.square(points_m[:, 1] + position_m[1]) < radius_m**2
+    )
+
+
+def crater_edge(cylinder: Cylinder, position_m: Array) -> tuple[Array, Array]:
+    """Azimuths and elevations (361,) [rad] of the rim from a position, at even steps along the rim, closed."""
+    rim = cylinder.radius_m * directions(np.linspace(0.0, 2 * np.pi, EDGE_POINTS + 1)) - position_m
+    return np.arctan2(rim[:, 0], rim[:, 1]), np.arctan2(cylinder.wall_m, np.hypot(rim[:, 0], rim[:, 1]))
+
+
+@dataclass(frozen=True)
+class Mistakes:
+    """The error rates of a list of stars, which the evidence assumes too."""
+
+    missed: float = 1e-6  # probability for a visible star; 1e-6: none, as in the thesis
+    false: float = 1e-6  # for a hidden star
+
+    def draw_list(self, in_sight: Bools, seed: int, sky: int, number: int) -> Bools:
+        """Draw the list of position `number`: which stars (n,) are on it."""
+        r = _draw_uniform([seed, MISTAKES, sky, number], (len(in_sight),))
+        return np.where(in_sight, r >= self.missed, r < self.false)
+
+    def evidence(self, sky: Sky, listed: Bools) -> Evidence:
+        """ln((1 - missed) / false) for the stars on the list, ln(missed / (1 - false)) for the others."""
+        for_it = float(np.log((1 - self.missed) / self.false))
+        against = float(np.log(self.missed / (1 - self.false)))
+        return Evidence(
+            azimuth_rad=sky.azimuth_rad,
+            elevation_rad=sky.elevation_rad,
+            llr=np.where(listed, for_it, against).astype(np.float64),
+            edge_sigma_rad=np.zeros(len(sky)),
+        )
+
+
+PERFECT = Mistakes()
+
+
+def changes_m(sky: Sky, cylinder: Cylinder) -> Array:
+    """Sorted distances from the centre [m], west to east, at which a star appears or disappears.
+
+    Star i is visible inside the circle of radius R about -point_i, so the changes are where the line north = 0 crosses
+    these circles: exact, where the thesis compares views at steps along the line.
+    """
+    east, north = sky.project_to_rim_plane(cylinder).T
+    met = np.abs(north) < cylinder.radius_m
+    half_chord = np.sqrt(np.square(cylinder.radius_m) - np.square(north[met]))
+    crossings = np.concatenate([-east[met] - half_chord, -east[met] + half_chord])
+    return np.sort(crossings[np.abs(crossings) < cylinder.radius_m])
+
+
+def gaps_m(changes: Array, cylinder: Cylinder) -> Array:
+    """Distances (n - 1,) [m] from one change to the next; the diameter if there are fewer than two changes."""
+    return np.diff(changes) if len(changes) > 1 else np.array([cylinder.diameter_m])
+
+
+def mean_gap_m(changes: Array, cylinder: Cylinder) -> float:
+    """Mean distance between changes: the diameter over their number (the thesis's 14.9031 m is 20 km / 1342)."""
+    return cylinder.diameter_m / max(len(changes), 1)
+
+
+def change_steps_m(changes: Array, cylinder: Cylinder, step_m: float = STEP_M) -> Array:
+    """Ends (n,) [m] of the steps along the traverse within which the view changes.
+
+    Several changes within one step count as one. Source: Kua 2008, figures 3.7-3.9, whose step is not given: 5 m is
+    what its figures at magnitude 6 are multiples of (215 m), and what gives its mean (20 km / 1342).
+    """
+    steps = np.unique(np.floor((changes + cylinder.radius_m) / step_m))
+    return (steps + 1) * step_m - cylinder.radius_m
+
+
+def _draw_uniform(stream: list[int], shape: tuple[int, ...]) -> Array:
+    """Uniform over [0, 1), the same for the same stream; a longer draw begins with the shorter one."""
+    rng = np.random.default_rng(stream)
+    return rng.random(shape)

@@ -1,0 +1,161 @@
+"""One frame as an observation of its position and of the errors that it shares with other frames.
+
+The posterior mean m of position and shared errors by one frame, with its prior, depends on the true ones p and on the
+errors h of the map's posts as m = K p + G h + noise. K is what the evidence adds to the prior. G is the covariance of
+the parameters with the slopes of the log-likelihood: the derivative of a posterior mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from startrack.applications.tracking.frame_model import FrameModel
+from startrack.applications.tracking.frame_sampling import balanced_moments, sample_together
+from startrack.applications.tracking.shared import TrackErrors
+from startrack.core.types import Array, Evidence, Ints
+from startrack.localization.importance_sampling import WeightedPoints, moments
+from startrack.localization.skyline_model import MIDDLES_RAD
+from startrack.terrain import Terrain
+from startrack.terrain.horizon_posts import NO_POST, HorizonPosts
+
+REACH_SIGMAS, MARGIN_M = 6.0, 5.0  # of a Gaussian, to the side of the neighbourhood
+LEAST_HALF_M = 40.0  # of the neighbourhood
+MAX_NEIGHBOURHOODS = 3  # after so many the posterior is taken as it is
+MIN_NOISE_SHARE = 0.3  # of the evidence's covariance: the least noise that a frame has of its own
+NEGLIGIBLE_POST = 1e-4  # part of the variance of a position, by all posts that are left out together
+ROUNDING = 1e-9  # of the covariance, added to the noise so that it can be inverted
+
+
+@dataclass(frozen=True, eq=False)
+class FrameEstimate:
+    """The observation of one frame. Parameters: east and north [m], and k shared errors in their prior's sigma."""
+
+    mean: Array  # (2 + k,) of the posterior with the priors of the shared errors
+    covariance: Array  # (2 + k, 2 + k) of that, with the errors of posts
+    response: Array  # (2 + k, 2 + k) of the mean to the true parameters: K
+    noise: Array  # (2 + k, 2 + k) of the mean, of this frame alone
+    post: Ints  # (c,) numbers of the posts with a measurable effect
+    by_post: Array  # (2 + k, c) of the mean to the error [m] of each: G
+    weight: float = 1.0  # probability of this mode of the frame's posterior
+
+    @property
+    def parameters(self) -> int:
+        """2 + k."""
+        return len(self.mean)
+
+
+def estimate_frame(
+    evidence: Evidence, terrain: Terrain, errors: TrackErrors, position_m: Array, covariance_m2: Array
+) -> FrameEstimate:
+    """The observation by rows of `evidence` and their errors of the image.
+
+    Args:
+        evidence: rows of one exposure.
+        terrain: with the evidence's enu.
+        errors: those that frames share.
+        position_m: (2,) near the posterior's mode that is meant.
+        covariance_m2: (2, 2) about that of the mode.
+    """
+    reference, spread = position_m, covariance_m2
+    for _ in range(MAX_NEIGHBOURHOODS):
+        half = max(REACH_SIGMAS * _widest(spread) + MARGIN_M, LEAST_HALF_M)
+        models = [FrameModel.near(evidence, terrain, errors, reference, half)]
+        found = sample_together(models, reference, spread)
+        mean, covariance = moments(found.points, found.share)
+        if np.abs(mean[:2] - reference).max() + 3.0 * _widest(covariance[:2, :2]) < half:
+            break
+        reference, spread = mean[:2], covariance[:2, :2]
+    return observe_together(models, found)
+
+
+def _widest(covariance: Array) -> float:
+    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+
+
+def observe_together(models: Sequence[FrameModel], found: WeightedPoints) -> FrameEstimate:
+    """The observation by sampled points of exposures of one position."""
+    used = np.isfinite(found.log_weight)
+    mean, covariance = balanced_moments(found)
+    points, share = found.points[used], found.share[used]
+    prior = np.diag(np.concatenate([np.zeros(2), np.ones(len(mean) - 2)]))
+    by_evidence = covariance - covariance @ prior @ covariance  # of the mean at given true parameters
+    plain, spread = moments(points, share)
+    by_horizon, counted = np.zeros((len(mean), len(MIDDLES_RAD))), np.zeros_like(covariance)
+    for model in models:
+        model.settle(mean)
+        slopes = model.slopes(points, share)
+        common = ((points - plain) * share[:, None]).T @ (slopes - share @ slopes)
+        own = covariance @ np.linalg.solve(spread, common)
+        counted += (own * np.square(model.map_sigma_rad)) @ own.T
+        by_horizon += own
+    noise = clipped_noise(by_evidence - counted, by_evidence) + ROUNDING * covariance
+    post, by_post = _posts(models[0], by_horizon, covariance)
+    shared_by_posts = models[0].model.terrain.height_sigma_m ** 2 * by_post @ by_post.T
+    estimate = FrameEstimate(
+        mean, covariance - by_evidence + noise + shared_by_posts, np.eye(len(mean)) - covariance @ prior, noise, post,
+        by_post,
+    )  # fmt: skip
+    seen = np.any([model.rise_rad.any(axis=0) for model in models], axis=0)
+    return _turned(_without(estimate, 2 + np.flatnonzero(~seen)), models[0].errors)
+
+
+def _turned(estimate: FrameEstimate, errors: TrackErrors) -> FrameEstimate:
+    """The estimate with the position after the turn of the clock's error, see `TrackErrors.turn_m`."""
+    to = np.eye(estimate.parameters)
+    to[:2, 2:] = errors.turn_m(estimate.mean[:2])
+    if not to[:2, 2:].any():
+        return estimate
+    return replace(
+        estimate, mean=to @ estimate.mean, covariance=to @ estimate.covariance @ to.T,
+        response=to @ estimate.response @ np.linalg.inv(to), noise=to @ estimate.noise @ to.T,
+        by_post=to @ estimate.by_post,
+    )  # fmt: skip
+
+
+def _without(estimate: FrameEstimate, unseen: Ints) -> FrameEstimate:
+    """The estimate without sampling noise in the parameters (u,) that the evidence does not depend on."""
+    if not len(unseen):
+        return estimate
+    seen = ~np.isin(np.arange(estimate.parameters), unseen)
+    both, own = np.outer(seen, seen), np.diag(np.where(seen, 0.0, 1.0))
+    return replace(
+        estimate, mean=estimate.mean * seen, covariance=estimate.covariance * both + own,
+        response=estimate.response * both, noise=estimate.noise * both + own, by_post=estimate.by_post * seen[:, None],
+    )  # fmt: skip
+
+
+def clipped_noise(noise: Array, whole: Array) -> Array:
+    """`noise` (d, d) with at least the least share of `whole` (d, d) in every direction."""
+    sizes, axes = np.linalg.eigh(0.5 * (whole + whole.T))
+    root = axes * np.sqrt(np.maximum(sizes, 0.0))
+    scale = np.where(sizes > 0.0, 1.0 / np.sqrt(np.maximum(sizes, 1e-300)), 0.0)
+    share, turned = np.linalg.eigh((axes * scale).T @ noise @ (axes * scale))
+    return np.asarray(root @ (turned * np.clip(share, MIN_NOISE_SHARE, 1.0)) @ turned.T @ root.T)
+
+
+def _posts(model: FrameModel, by_horizon: Array, covariance: Array) -> tuple[Ints, Array]:
+    """Posts (c,) of the crests and of the camera's ground, and the response (d, c) of the mean to their heights."""
+    terrain, at = model.model.terrain, model.model.reference_m
+    if not terrain.height_sigma_m:
+        return np.zeros(0, dtype=np.int64), np.zeros((len(by_horizon), 0))
+    parts = [terrain.horizon_posts(at, MIDDLES_RAD), terrain.ground_posts(at, MIDDLES_RAD)]
+    # Ground higher than the map acts on the evidence as a map lower than the ground.
+    post, by_post = _sum_by_post(parts, -by_horizon)
+    scale = terrain.height_sigma_m / np.sqrt(np.diag(covariance))
+    effect = np.square(by_post * scale[:, None]).max(axis=0, initial=0.0)
+    order = np.argsort(effect)
+    kept = np.sort(order[np.cumsum(effect[order]) > NEGLIGIBLE_POST])
+    return post[kept], by_post[:, kept]
+
+
+def _sum_by_post(parts: list[HorizonPosts], by_horizon: Array) -> tuple[Ints, Array]:
+    post = np.concatenate([part.post.ravel() for part in parts])
+    response = np.concatenate(
+        [(by_horizon[:, :, None] * part.rad_per_m).reshape(len(by_horizon), -1) for part in parts], 1
+    )
+    known = post != NO_POST
+    numbers, of = np.unique(post[known], return_inverse=True)
+    return numbers, np.stack([np.bincount(of, weights=row[known], minlength=len(numbers)) for row in response])

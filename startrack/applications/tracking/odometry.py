@@ -1,0 +1,185 @@
+"""Odometry: poses of the rover's body in a frame of its own, and the increments between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from startrack.core.errors import BadInput
+from startrack.core.files import MAX_CAUSE_CHARS, FilePath, printable, read_text
+from startrack.core.types import Array, Value, array
+from startrack.exposure.bag import BAG_SUFFIXES, ODOMETRY_TYPES, is_bag, read_messages
+from startrack.frames import format_utc
+
+TUM_COLUMNS = "time tx ty tz qx qy qz qw"
+LAST_TIME_S = 253_402_300_799.0  # end of the year 9999: larger numbers are milliseconds or nanoseconds
+QUATERNION_LENGTH_1 = 0.01  # error of a quaternion's length from rounding to two digits; more is another quantity
+SPAN_TOLERANCE_S = 1e-3  # some files round times to 0.1 ms; a rover moves less than 0.1 mm in that time
+MAX_ODOMETRY_BYTES = 2**28  # two million poses
+
+
+@dataclass(frozen=True, kw_only=True)
+class Odometry(Value):
+    """Poses of the body at increasing times, in any frame that is fixed to the ground.
+
+    Raises ValueError for fewer than two poses, times that do not increase, numbers that are not finite, times outside
+    0 to 9999-12-31, and quaternions whose length is not 1 (within 1 %).
+    """
+
+    time_s: Array = array("n")  # Unix seconds, UTC
+    position_m: Array = array("n", 3)
+    quat_xyzw: Array = array("n", 4)  # from body to the frame
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self) < 2:
+            raise ValueError(f"{len(self)} pose(s): at least two are needed")
+        fault = _first_fault(np.column_stack([self.time_s, self.position_m, self.quat_xyzw]))
+        if fault is not None:
+            raise ValueError(f"pose {fault[0]}: {fault[1]}")
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def increments_body_m(self, time_s: Array) -> Array:
+        """Increments (m - 1, 3) [m] between the times `time_s` (m,) [Unix s], each in the body frame of its first time.
+
+        Between two poses the position is interpolated linearly, the attitude along the great arc (slerp).
+
+        Raises:
+            BadInput: bad_odometry for times that are not finite, that decrease, or that the odometry does not cover.
+        """
+        from scipy.spatial.transform import Rotation, Slerp
+
+        at_s = self._covered(np.asarray(time_s, dtype=np.float64))
+        position_m = np.stack([np.interp(at_s, self.time_s, axis) for axis in self.position_m.T], axis=-1)
+        if len(at_s) < 2:
+            return np.zeros((0, 3))
+        attitude = Slerp(self.time_s, Rotation.from_quat(self.quat_xyzw))(at_s[:-1])
+        return np.asarray(attitude.inv().apply(np.diff(position_m, axis=0)))
+
+    def _covered(self, time_s: Array) -> Array:
+        """The times (m,), clipped to the span of the poses. Raises BadInput as `increments_body_m`."""
+        if time_s.ndim != 1 or not np.isfinite(time_s).all():
+            _refuse("the frames' times are not a list of finite numbers")
+        if (np.diff(time_s) < 0).any():
+            _refuse("the frames are not in the order of time")
+        first, last = self.time_s[[0, -1]]
+        outside = (time_s < first - SPAN_TOLERANCE_S) | (time_s > last + SPAN_TOLERANCE_S)
+        if outside.any():
+            _refuse(
+                f"{np.count_nonzero(outside)} of {len(time_s)} frames are outside the odometry, which covers "
+                f"{_utc_text(first)} to {_utc_text(last)}; the first of them is at {_utc_text(time_s[outside][0])}"
+            )
+        return np.clip(time_s, first, last)
+
+
+def read_odometry(path: FilePath, topic: str | None = None, *, growing: bool = False) -> Odometry:
+    """The odometry in the file `path`: TUM text, or a ROS bag (.bag, .db3, .mcap, a folder with metadata.yaml).
+
+    TUM text has one pose a line, `time tx ty tz qx qy qz qw`, with the time in Unix seconds (UTC) and comments after
+    `#`. Of a bag, the nav_msgs/Odometry messages of a `topic` are read (None: its only topic of that type), with the
+    times of their headers. `growing`: text that is being written; its last line is left out unless it is complete,
+    with eight numbers and the end of the line.
+
+    Raises:
+        BadInput: bad_odometry with the file and the cause, in one line.
+    """
+    if is_bag(path) or Path(path).is_dir():
+        return _odometry_of_bag(path, topic)
+    if topic is not None:
+        _refuse(f"{printable(path)}: is read as text and has no topic {topic}; bags end in {', '.join(BAG_SUFFIXES)}")
+    return _odometry_of_text(path, growing)
+
+
+def _odometry_of_text(path: FilePath, growing: bool) -> Odometry:
+    rows: list[list[float]] = []
+    numbers: list[int] = []
+    text = read_text(path, "bad_odometry", max_bytes=MAX_ODOMETRY_BYTES)
+    for number, line in enumerate((_complete_lines(text) if growing else text).splitlines(), start=1):
+        words = line.partition("#")[0].split()
+        if not words:
+            continue
+        if len(words) != len(TUM_COLUMNS.split()):
+            _refuse(f"{printable(path)}: line {number}: {len(words)} columns, expected 8: {TUM_COLUMNS}")
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError as cause:
+            why = str(cause)[:MAX_CAUSE_CHARS]
+            raise BadInput("bad_odometry", f"{printable(path)}: line {number}: {why}") from cause
+        numbers.append(number)
+    return _odometry_of_rows(path, rows, lambda row: f"line {numbers[row]}")
+
+
+def _complete_lines(text: str) -> str:
+    """The text without a last line that is being written: it has no end, or too few numbers."""
+    whole = text[: text.rfind("\n") + 1]
+    last = whole.rstrip("\n").rfind("\n") + 1
+    words = whole[last:].partition("#")[0].split()
+    return whole if not words or len(words) >= len(TUM_COLUMNS.split()) else whole[:last]
+
+
+def _odometry_of_bag(path: FilePath, topic: str | None) -> Odometry:
+    rows, frames = [], set()
+    for message in read_messages(path, ODOMETRY_TYPES, topic, reason="bad_odometry", flag="--odometry-topic"):
+        body, pose = message.content, message.content.pose.pose
+        at, q = pose.position, pose.orientation
+        frames.add((body.header.frame_id, body.child_frame_id))
+        rows.append([message.stamp_s, at.x, at.y, at.z, q.x, q.y, q.z, q.w])
+    if len(frames) > 1:
+        named = "; ".join(f"{child!r} in {frame!r}" for frame, child in sorted(frames))
+        _refuse(f"{printable(path)}: the topic has poses of several frames: {named}")
+    rows.sort(key=lambda row: row[0])  # a bag is in the order of arrival
+    return _odometry_of_rows(path, rows, lambda row: f"pose {row}")
+
+
+def _odometry_of_rows(path: FilePath, rows: list[list[float]], name_row: Callable[[int], str]) -> Odometry:
+    values = np.array(rows, dtype=np.float64).reshape(len(rows), len(TUM_COLUMNS.split()))
+    fault = _first_fault(values)
+    if fault is not None:
+        _refuse(f"{printable(path)}: {name_row(fault[0])}: {fault[1]}")
+    try:
+        return Odometry(time_s=values[:, 0], position_m=values[:, 1:4], quat_xyzw=values[:, 4:])
+    except ValueError as cause:
+        raise BadInput("bad_odometry", f"{printable(path)}: {cause}") from cause
+
+
+def _first_fault(rows: Array) -> tuple[int, str] | None:
+    """Index and fault of the first pose that cannot be used among `rows` (n, 8) of TUM's columns; None: all can."""
+    time_s = rows[:, 0]
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = np.linalg.norm(rows[:, 4:], axis=1)
+        infinite = np.asarray(~np.isfinite(rows).all(axis=1))
+        off_calendar = ~((time_s >= 0) & (time_s <= LAST_TIME_S))
+        not_unit = ~(np.abs(length - 1) <= QUATERNION_LENGTH_1)
+        early = np.concatenate([[False], np.diff(time_s) <= 0])[: len(time_s)]
+    faulty = np.flatnonzero(infinite | off_calendar | not_unit | early)
+    if not len(faulty):
+        return None
+    k = int(faulty[0])
+    if infinite[k]:
+        return k, "a number is NaN or infinite"
+    if off_calendar[k]:
+        return k, f"the time {time_s[k]:.6g} is not in Unix seconds"
+    if not_unit[k]:
+        return k, f"the quaternion has the length {length[k]:.3g}, not 1"
+    if time_s[k] == time_s[k - 1]:
+        return k, f"a second pose at the time {time_s[k]:.6f}"
+    return k, f"times are not in order: {time_s[k]:.6f} follows {time_s[k - 1]:.6f}"
+
+
+def _utc_text(time_s: float) -> str:
+    """ISO 8601 of Unix seconds; the number where no calendar has it."""
+    try:
+        return format_utc(datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=float(time_s)))
+    except OverflowError:
+        return f"{time_s:.6g} s"
+
+
+def _refuse(cause: str) -> NoReturn:
+    raise BadInput("bad_odometry", cause)

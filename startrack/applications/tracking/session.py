@@ -1,0 +1,208 @@
+"""The images of one track: each is located once, reduced to what the track needs of it, and kept in a folder."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from startrack.applications.batch.fingerprint import input_hashes, job_sha256
+from startrack.applications.tracking.frame_store import FrameStore
+from startrack.applications.tracking.observe import ObservedFrame, facts_of, observe_again, observe_frame
+from startrack.applications.tracking.odometry import SPAN_TOLERANCE_S, Odometry
+from startrack.applications.tracking.online import RECENT_FRAMES, OnlineTrack
+from startrack.applications.tracking.shared import TrackErrors
+from startrack.applications.tracking.track import (
+    ODOMETRY_FLOOR_M,
+    ODOMETRY_SIGMA,
+    Track,
+    estimate_track,
+    odometry_steps,
+    track_of_newest,
+)
+from startrack.catalog import load_catalog
+from startrack.chain.inputs import load_camera_input, terrain_input
+from startrack.chain.pipeline import NO_TIME, locate
+from startrack.chain.stages import Settings
+from startrack.core.errors import BadInput
+
+if TYPE_CHECKING:
+    from startrack.camera import Camera
+    from startrack.core.types import Array, Exposure
+    from startrack.terrain import Terrain
+
+
+@dataclass
+class TrackSession:
+    """A track that grows image by image. Camera and terrain are those of its first image; all must have them.
+
+    Where an image shows a gross error of a fact that no file states, that error is one of those that the images share;
+    the others are observed anew from their evidence.
+    """
+
+    store: FrameStore | None = None  # None: frames are kept in memory alone
+    settings: Settings = field(default_factory=Settings)
+    facts: dict[str, Any] = field(default_factory=dict)  # from flags, by the parameters of `read_exposure`
+    stated_camera: str | Camera | None = None  # of all images; None: that which each names
+    stated_terrain: str | Terrain | None = None  # the same
+    frames: list[ObservedFrame] = field(default_factory=list)  # in the order of time
+    terrain: Terrain | None = None
+    camera: Camera | None = None
+    shared: TrackErrors | None = None
+    _references: tuple[Any, Any] | None = None  # camera and terrain as the first image has them
+    _filtered: list[ObservedFrame] = field(default_factory=list)  # that the filter has
+    _online: OnlineTrack | None = None
+
+    def add(self, path: str | Path) -> ObservedFrame:
+        """The frame of the image file at `path`, located unless the store has it.
+
+        Raises BadInput where the image, its time, camera or terrain cannot be used, or the terrain is another one.
+        """
+        from startrack.exposure import read_exposure
+
+        return self.add_exposure(read_exposure(path, **self.facts), str(path))
+
+    def add_exposure(self, exposure: Exposure, path: str | None = None) -> ObservedFrame:
+        """The frame of an `exposure`; `path` (None: not from a file) is that of its file. Raises as `add`."""
+        if exposure.time_utc is None:
+            raise BadInput("no_time", "; ".join([NO_TIME, *exposure.warnings]))
+        camera, terrain, shared = self._load_references(exposure)
+        self._check_time(exposure)
+        key = None if self.store is None else self._key(exposure, path, shared)
+        frame = None if self.store is None or key is None else self.store.read(key)
+        if frame is None:
+            outcome = locate(exposure, camera, terrain, load_catalog(), self.settings)
+            frame = observe_frame(outcome, replace(shared, gross=facts_of(outcome, shared)), terrain)
+            if self.store is not None and key is not None:
+                self.store.write(key, frame)
+        frame = self._share_facts(frame, terrain, shared)
+        self.frames.append(frame)
+        self.frames.sort(key=lambda one: (one.time_utc, one.name))
+        return frame
+
+    def _share_facts(self, frame: ObservedFrame, terrain: Terrain, shared: TrackErrors) -> ObservedFrame:
+        """The new `frame` with the gross errors that all images show; the others anew where it shows another one."""
+        together = shared.with_gross(frame.facts)
+        if together.gross != shared.gross:
+            self.frames = [observe_again(one, together, terrain) for one in self.frames]
+            self.shared = together
+        return frame if frame.facts == together.gross else observe_again(frame, together, terrain)
+
+    def estimate(
+        self,
+        odometry: Odometry | None = None,
+        *,
+        odometry_sigma: float = ODOMETRY_SIGMA,
+        odometry_floor_m: float = ODOMETRY_FLOOR_M,
+        at_rest: bool = False,
+        covered_only: bool = False,
+    ) -> Track:
+        """The track of the frames so far.
+
+        `odometry`, `odometry_sigma`, `odometry_floor_m` [m] and `at_rest` are those of `estimate_track`. With
+        `covered_only`, frames after the last pose of the odometry wait for it. Raises BadInput where there is no frame,
+        or none has a position, and as `estimate_track`.
+        """
+        frames: Sequence[ObservedFrame] = self.frames
+        if covered_only:
+            frames = [one for one in frames if _is_reached(one, odometry)]
+        if self.terrain is None or self.shared is None or not frames:
+            raise BadInput("bad_image", "no image of the track could be read")
+        if all(len(frame.modes) != 1 for frame in frames):
+            refused = next((frame for frame in frames if not frame.modes), None)
+            reason = "insufficient_geometry" if refused is None else refused.reason
+            raise BadInput(reason, f"none of {len(frames)} images has a single position")
+        return estimate_track(
+            frames, self.terrain, self.shared, odometry=odometry, odometry_sigma=odometry_sigma,
+            odometry_floor_m=odometry_floor_m, at_rest=at_rest,
+        )  # fmt: skip
+
+    def odometry_positions_m(
+        self, track: Track, odometry: Odometry | None, *, odometry_sigma: float, odometry_floor_m: float
+    ) -> Array:
+        """Positions (n, 2) [m] of the frames of a `track` by odometry alone, from the first smoothed position.
+
+        `odometry`, `odometry_sigma` and `odometry_floor_m` [m] are those of `estimate`. Not a number where no move is
+        known.
+        """
+        steps = odometry_steps(self.frames[: len(track.frames)], odometry, odometry_sigma, odometry_floor_m)
+        move_m = np.where(np.isfinite(steps.sigma_m)[:, None], steps.move_m, np.nan)
+        first_m = track.smoothed.position_enu_m[:1, :2]
+        return np.concatenate([first_m, first_m + np.cumsum(move_m, axis=0)])
+
+    @property
+    def waits(self) -> bool:
+        """Whether frames were not filtered yet."""
+        return self._filtered != self.frames
+
+    def newest(self, odometry: Odometry | None, *, odometry_sigma: float, odometry_floor_m: float) -> Iterator[Track]:
+        """Each frame that was not filtered yet and that the odometry reaches, by the frames before it: one track each.
+
+        `odometry`, `odometry_sigma`, `odometry_floor_m` [m] and the exceptions are those of `estimate`. If a frame
+        comes late, all frames after it are filtered anew.
+        """
+        if self.terrain is None or self.shared is None:
+            return
+        if self._filtered != self.frames[: len(self._filtered)]:
+            self._filtered, self._online = [], None
+        self._online = self._online or OnlineTrack(len(self.shared), self.terrain.height_sigma_m)
+        for k in range(len(self._filtered), len(self.frames)):
+            if not _is_reached(self.frames[k], odometry):
+                return
+            recent = self.frames[max(k - RECENT_FRAMES, 0) : k + 1]
+            steps = odometry_steps(recent, odometry, odometry_sigma, odometry_floor_m)
+            move, sigma = (steps.move_m[-1], float(steps.sigma_m[-1])) if k else (np.zeros(2), 0.0)
+            self._online.add(self.frames[k].modes, move, sigma)
+            self._filtered.append(self.frames[k])
+            yield track_of_newest(self.frames[k], self._online, self.terrain)
+
+    def _check_time(self, exposure: Exposure) -> None:
+        """Raise BadInput for a second image of one time: its evidence would count twice."""
+        same = next((frame for frame in self.frames if frame.time_utc == exposure.time_utc), None)
+        if same is not None:
+            raise BadInput("bad_image", f"{exposure.name} has the time of {same.name}: a track takes an image once")
+
+    def _load_references(self, exposure: Exposure) -> tuple[Camera, Terrain, TrackErrors]:
+        """Camera, terrain and shared errors of the track: those of its first image. Raises BadInput for another's."""
+        camera = exposure.camera if self.stated_camera is None else self.stated_camera
+        terrain = exposure.terrain if self.stated_terrain is None else self.stated_terrain
+        if camera is None:
+            raise BadInput("no_calibration", "no camera is known: give -c FILE (camera=) or a sidecar with camera")
+        if terrain is None:
+            raise BadInput("bad_terrain", "no terrain is known: give -t FILE (terrain=) or a sidecar with terrain")
+        if self.camera is None or self.terrain is None or self.shared is None:
+            lens, ground = load_camera_input(camera), terrain_input(terrain, None)
+            uses_sky = self.settings.evidence_sources != "stars"
+            self.shared = TrackErrors.of_exposure(ground, exposure, uses_sky)
+            self.camera, self.terrain, self._references = lens, ground, (camera, terrain)
+        first_camera, first_terrain = self._references or (None, None)
+        if terrain is not first_terrain and terrain != first_terrain:
+            raise BadInput("bad_terrain", f"{exposure.name} is on the terrain {terrain}, the track on {first_terrain}")
+        if camera is not first_camera and camera != first_camera:
+            raise BadInput("bad_calibration", f"{exposure.name} is of the camera {camera}, the track of {first_camera}")
+        return self.camera, self.terrain, self.shared
+
+    def _key(self, exposure: Exposure, path: str | None, shared: TrackErrors) -> str | None:
+        """Hash of all that decides a frame; None for an image that is not from a file."""
+        if path is None:
+            return None
+        mask = exposure.mask if isinstance(exposure.mask, str) else None
+        files = input_hashes(path, [exposure.camera, exposure.terrain, mask])
+        alone = replace(shared, gross=frozenset())  # with the facts that the image itself shows
+        clock = None if shared.listed.clock is None else shared.listed.clock.turn_rad_s.tolist()
+        errors = [repr(shared.listed.listed), alone.names, alone.sigma.tolist(), clock]
+        job = job_sha256(
+            path, exposure.sha256, self.facts, self.settings.evidence_sources, sorted(files.items()), errors
+        )
+        return hashlib.sha256(f"{exposure.name} {job}".encode()).hexdigest()[:32]
+
+
+def _is_reached(frame: ObservedFrame, odometry: Odometry | None) -> bool:
+    """Whether the odometry has come as far as the frame."""
+    last_s = np.inf if odometry is None else float(odometry.time_s[-1])
+    return frame.time_utc.astimezone(UTC).timestamp() <= last_s + SPAN_TOLERANCE_S

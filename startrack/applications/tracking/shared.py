@@ -1,0 +1,107 @@
+"""The errors that frames of a track share: of the terrain, of the clock, and of the skyline in the sky's light."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from startrack.chain.pipeline import NO_TIME
+from startrack.chain.sky_refinement import EDGE_SIGMA_PX
+from startrack.core.types import Array, BadInput, Clock, Evidence, Exposure, ImageErrors
+from startrack.localization import clock_at
+from startrack.localization.shared_errors import SharedErrors
+from startrack.terrain import Terrain
+
+BIAS, CLOCK, DEPTH, EDGE = "bias_rad", "clock_s", "depth_1", "edge_px"
+
+
+@dataclass(frozen=True, eq=False)
+class TrackErrors:
+    """The errors (k,) that all frames of a track have in common, with their standard deviations.
+
+    Those of the terrain and the clock come first, as `SharedErrors` lists them. Parameters of a track are a position
+    (2,) [m] and the errors in units of their standard deviations.
+    """
+
+    listed: SharedErrors  # of the terrain and the clock
+    uses_sky: bool = False  # whether the light of the sky is part of the evidence
+    gross: frozenset[str] = frozenset()  # facts that no file states, whose gross error an image shows
+
+    @classmethod
+    def of(cls, terrain: Terrain, clock: Clock | None, uses_sky: bool = False) -> Self:
+        """Those of a `terrain`, of a `clock`, and with `uses_sky` of the skyline that the sky's light shows."""
+        return cls(SharedErrors.of(terrain, clock), uses_sky)
+
+    @classmethod
+    def of_exposure(cls, terrain: Terrain, exposure: Exposure, uses_sky: bool = False) -> Self:
+        """Those of a `terrain`, of the clock of an `exposure`, and with `uses_sky` of the skyline in the sky's light.
+
+        Raises BadInput (no_time, bad_terrain) where the exposure has no time, or the terrain no site.
+        """
+        if exposure.time_utc is None:
+            raise BadInput("no_time", "; ".join([NO_TIME, *exposure.warnings]))
+        if terrain.site is None:
+            raise BadInput("bad_terrain", f"terrain {terrain.name} has no site")
+        stated = exposure.time_sigma_s, exposure.time_sigma_is_stated
+        return cls.of(terrain, clock_at(terrain.site, exposure.time_utc, *stated), uses_sky)
+
+    def with_gross(self, facts: Iterable[str]) -> Self:
+        """The same with gross errors of more `facts`; those that the terrain states are left out."""
+        return replace(self, gross=self.gross | (frozenset(facts) & frozenset(self.listed.facts)))
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """(k,); each ends with its unit."""
+        return (*(one.name for one in self.listed.listed), *([EDGE] if self.uses_sky else []))
+
+    @cached_property
+    def sigma(self) -> Array:
+        """(k,) in the units of the names."""
+        found = self.listed.sigma()
+        for fact in self.gross:
+            found = np.where([one.fact == fact for one in self.listed.listed], self.listed.sigma(fact), found)
+        return np.append(found, [EDGE_SIGMA_PX] if self.uses_sky else [])
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def to_model(self, parameters: Array, evidence: Evidence) -> Array:
+        """Parameters (n, 2 + m) of a `SkylineModel` of `evidence`, from `parameters` (n, 2 + k) of the track."""
+        m = len(self.listed)
+        found = parameters[:, : 2 + m] * np.r_[1.0, 1.0, self.sigma[:m]]
+        if self.listed.clock is not None and evidence.clock is not None:
+            found[:, -1] -= evidence.clock.offset_s  # the directions include it
+        return found
+
+    def rise_rad(self, slopes_rad: Array, edge_rad: Array) -> Array:
+        """(n, k) rise of the skyline by one standard deviation of each error.
+
+        `slopes_rad` (m, n) are those of the listed errors by their units, `edge_rad` (n,) by one px of the edge.
+        """
+        units = np.vstack([slopes_rad, edge_rad]) if self.uses_sky else slopes_rad
+        return np.asarray((units * self.sigma[:, None]).T)
+
+    def of_image(self, errors: ImageErrors | None) -> ImageErrors | None:
+        """Errors of one image without that of the edge, where all images share it."""
+        if errors is None or not self.uses_sky:
+            return errors
+        own = errors.covariance.copy()
+        own[0, 0] -= EDGE_SIGMA_PX**2
+        return replace(errors, covariance=own)
+
+    def turn_m(self, position_m: Array) -> Array:
+        """(2, k) by which the positions of parameters are turned with the clock, at `position_m` (2,).
+
+        See `SharedErrors`: in ground that is the same after a turn the parameters hold the position before it.
+        """
+        found = np.zeros((2, len(self)))
+        clock = self.listed.clock
+        if self.listed.axisymmetric and clock is not None:
+            at = self.names.index(CLOCK)
+            angle = clock.turn_rad_s[2] * self.sigma[at]
+            found[:, at] = angle * np.array([-position_m[1], position_m[0]])
+        return found

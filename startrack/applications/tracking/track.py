@@ -1,0 +1,250 @@
+"""Frames of one camera to a track: filtered and smoothed positions with their covariances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from startrack.applications.tracking.at_rest import positions_at_rest
+from startrack.applications.tracking.circles import radius_holding
+from startrack.applications.tracking.contradictions import RobustTrack, smooth_robustly
+from startrack.applications.tracking.frame_model import UNKNOWN_M
+from startrack.applications.tracking.observe import ImageFix, ObservedFrame
+from startrack.applications.tracking.odometry import Odometry
+from startrack.applications.tracking.online import OnlineTrack
+from startrack.applications.tracking.shared import BIAS, CLOCK, DEPTH, TrackErrors
+from startrack.applications.tracking.smoother import Smoothed, Steps
+from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
+from startrack.frames import quat_xyzw_from_R
+from startrack.localization.summary import camera_at
+from startrack.terrain import Terrain
+
+ODOMETRY_SIGMA, ODOMETRY_FLOOR_M = 0.02, 0.05  # of a move, relative to its length, and beside that
+UNKNOWN_SIGMA_M = 1e-3 * UNKNOWN_M  # a position with a larger error is not known
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Positions of the camera; nan and infinite where nothing is known."""
+
+    position_enu_m: Array  # (n, 3)
+    covariance_m2: Array  # (n, 2, 2) of east and north
+    radius95_m: Array  # (n,) circle about the position that holds 95 %
+    radius999_m: Array  # (n,) 99.9 %
+
+    @classmethod
+    def of_normal(cls, position_enu_m: Array, covariance_m2: Array) -> Trajectory:
+        """At `position_enu_m` (3,), with the circles of normal errors of `covariance_m2` (2, 2)."""
+        radius95, radius999 = (radius_holding(covariance_m2, part) for part in (0.95, 0.999))
+        return cls(position_enu_m, covariance_m2, radius95, radius999)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackFrame:
+    """One image of the track."""
+
+    name: str
+    time_utc: datetime
+    status: str  # "used"; "left_out": contradicts the track, or ambiguous to the end; "refused"
+    reason: str  # code; empty where used
+    message: str
+    quat_xyzw_body_enu: Array | None  # (4,) None: no attitude
+
+
+@dataclass(frozen=True, eq=False)
+class CrestHeights:
+    """Errors of the map's posts that make the skylines of the track, by all frames together."""
+
+    post: Ints  # (c,) number in the terrain
+    position_enu_m: Array  # (c, 3) by the map
+    error_m: Array  # (c,) true minus map
+    sigma_m: Array  # (c,) the map's own is the prior
+
+
+@dataclass(frozen=True, eq=False)
+class DepthError:
+    """By which a crater is deeper than its file states, relative."""
+
+    error_1: float
+    sigma_1: float
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A track with what its frames share."""
+
+    frames: tuple[TrackFrame, ...]
+    filtered: Trajectory  # known at the time of each frame
+    smoothed: Trajectory  # known at the end
+    bias_rad: float  # by which the true horizon is higher than the map's, all around
+    bias_sigma_rad: float
+    clock: ClockError | None
+    depth: DepthError | None  # None: the file's depth is taken as exact
+    crests: CrestHeights | None  # None: a terrain without posts, or without errors of their heights
+    slipped: Bools  # (n - 1,) odometry steps judged wheel slip
+    at_rest: bool
+    terrain: Terrain
+
+
+def estimate_track(
+    frames: Sequence[ObservedFrame],
+    terrain: Terrain,
+    shared: TrackErrors,
+    *,
+    odometry: Odometry | None = None,
+    odometry_sigma: float = ODOMETRY_SIGMA,
+    odometry_floor_m: float = ODOMETRY_FLOOR_M,
+    at_rest: bool = False,
+) -> Track:
+    """The track of frames in the order of time.
+
+    Args:
+        frames: what `observe_frame` gave of each image, with the same `shared`.
+        terrain: on which all were located.
+        shared: the errors that the frames share.
+        odometry: moves between the frames; None: not known.
+        odometry_sigma: standard deviation of a move on each horizontal axis, relative to its length.
+        odometry_floor_m: the same, beside that.
+        at_rest: the camera did not move: all exposures have one position.
+
+    Raises BadInput: no_time for frames that are not in the order of time, bad_odometry for odometry that does not cover
+    them; ValueError where no frame has a single position.
+    """
+    times = [frame.time_utc for frame in frames]
+    if any(a > b for a, b in pairwise(times)):
+        raise BadInput("no_time", "the frames are not in the order of their times")
+    n = len(frames)
+    if at_rest:
+        rest = positions_at_rest(frames, terrain, shared)
+        robust = RobustTrack(rest.smoothed, rest.mode, np.zeros(max(n - 1, 0), dtype=bool))
+        smoothed = np.repeat(rest.smoothed.position_m, n, 0), np.repeat(rest.smoothed.covariance_m2, n, 0)
+        filtered = rest.position_m, rest.covariance_m2
+        first, second = [*np.flatnonzero(rest.mode >= 0).tolist(), n][:2]
+        known_by_first = range(first, second)
+    else:
+        steps = odometry_steps(frames, odometry, odometry_sigma, odometry_floor_m)
+        modes = [frame.modes for frame in frames]
+        robust = smooth_robustly(modes, steps, terrain.height_sigma_m)
+        smoothed = robust.smoothed.position_m, robust.smoothed.covariance_m2
+        filtered = filter_positions(modes, steps, len(shared), terrain.height_sigma_m)
+        first = next(k for k, of in enumerate(modes) if len(of) == 1)
+        known_by_first = range(first, first + 1)
+    used = np.flatnonzero(robust.mode >= 0).tolist()
+    by_one = [] if len(used) > 1 else range(n) if at_rest else used
+    return Track(
+        tuple(_track_frame(frame, mode) for frame, mode in zip(frames, robust.mode, strict=True)),
+        _trajectory(*filtered, terrain, frames[first].fixes, known_by_first),
+        _trajectory(*smoothed, terrain, frames[used[0]].fixes, by_one), *_bias(robust.smoothed, shared),
+        _clock(robust.smoothed, shared), _depth(robust.smoothed, shared), _crests(robust.smoothed, terrain),
+        robust.slipped, at_rest, terrain,
+    )  # fmt: skip
+
+
+def track_of_newest(frame: ObservedFrame, online: OnlineTrack, terrain: Terrain) -> Track:
+    """The last `frame` that `online` has, as a track of its own: by all frames up to it."""
+    known_by_one = [0] if online.is_first else []
+    found = _trajectory(online.position_m[None], online.covariance_m2[None], terrain, frame.fixes, known_by_one)
+    none = np.zeros(0, dtype=bool)
+    return Track((_track_frame(frame, online.mode),), found, found, 0.0, 0.0, None, None, None, none, False, terrain)
+
+
+def filter_positions(
+    modes: Sequence[Sequence[Any]], steps: Steps, shared_count: int, height_sigma_m: float
+) -> tuple[Array, Array]:
+    """Positions (n, 2) and covariances (n, 2, 2), each by the frames up to its own."""
+    track, position, covariance = OnlineTrack(shared_count, height_sigma_m), [], []
+    for k, of in enumerate(modes):
+        move, sigma = (np.zeros(2), 0.0) if k == 0 else (steps.move_m[k - 1], float(steps.sigma_m[k - 1]))
+        track.add(of, move, sigma)
+        position.append(track.position_m)
+        covariance.append(track.covariance_m2)
+    return np.array(position), np.array(covariance)
+
+
+def odometry_steps(frames: Sequence[ObservedFrame], odometry: Odometry | None, sigma_1: float, floor_m: float) -> Steps:
+    """Moves between frames in enu, turned by the attitude that the stars show.
+
+    Frames without an attitude of their own take the last one before them, and the odometry's turns since. Moves before
+    the first attitude are not known.
+    """
+    steps = Steps.unknown(len(frames))
+    if odometry is None:
+        return steps
+    time_s = np.array([frame.time_utc.astimezone(UTC).timestamp() for frame in frames])
+    move, sigma, anchor, R = steps.move_m.copy(), steps.sigma_m.copy(), -1, None
+    for k in range(len(frames) - 1):
+        if frames[k].R_body_enu is not None:
+            anchor, R = k, frames[k].R_body_enu
+        if R is None:
+            continue
+        at = np.unique([anchor, k, k + 1])
+        # From the anchor to either frame, in the axes of the anchor's body.
+        ends = [odometry.increments_body_m(time_s[[anchor, end]])[0] for end in at[1:]]
+        move_body = ends[-1] - (ends[-2] if len(ends) > 1 else 0.0)
+        move[k] = (R.T @ move_body)[:2]
+        sigma[k] = np.hypot(sigma_1 * np.linalg.norm(move_body), floor_m)
+    return Steps(move, sigma)
+
+
+def _track_frame(frame: ObservedFrame, mode: int) -> TrackFrame:
+    status, reason, message = "used", "", ""
+    if not frame.modes:
+        status, reason, message = "refused", frame.reason, frame.message
+    elif mode < 0 and len(frame.modes) > 1:
+        status, reason, message = "left_out", "ambiguous", f"none of {len(frame.modes)} positions agrees with the track"
+    elif mode < 0:
+        status, reason, message = "left_out", "inconsistent_evidence", "its position contradicts the other frames"
+    quat = None if frame.R_body_enu is None else quat_xyzw_from_R(frame.R_body_enu)
+    return TrackFrame(frame.name, frame.time_utc, status, reason, message, quat)
+
+
+def _trajectory(
+    position_m: Array, covariance_m2: Array, terrain: Terrain, fixes: Sequence[ImageFix], by_fix: Sequence[int]
+) -> Trajectory:
+    """Positions (n, 2) and covariances (n, 2, 2) as a trajectory.
+
+    Those of the frames `by_fix` are by one image alone: the only one of its `fixes` is what is known of them.
+    """
+    known = np.sqrt(np.trace(covariance_m2, axis1=1, axis2=2)) < UNKNOWN_SIGMA_M
+    position = np.full((len(position_m), 3), np.nan)
+    for k in np.flatnonzero(known):
+        position[k] = camera_at(position_m[k], terrain)
+    found = Trajectory.of_normal(position, np.where(known[:, None, None], covariance_m2, np.inf))
+    for at in by_fix if len(fixes) == 1 else ():
+        found.position_enu_m[at], found.covariance_m2[at] = fixes[0].position_enu_m, fixes[0].covariance_m2
+        found.radius95_m[at], found.radius999_m[at] = fixes[0].radius95_m, fixes[0].radius999_m
+    return found
+
+
+def _bias(found: Smoothed, shared: TrackErrors) -> tuple[float, float]:
+    return _estimate(found, shared, BIAS) or (0.0, 0.0)
+
+
+def _clock(found: Smoothed, shared: TrackErrors) -> ClockError | None:
+    clock = _estimate(found, shared, CLOCK)
+    return None if clock is None else ClockError(*clock)
+
+
+def _depth(found: Smoothed, shared: TrackErrors) -> DepthError | None:
+    depth = _estimate(found, shared, DEPTH)
+    return None if depth is None else DepthError(*depth)
+
+
+def _estimate(found: Smoothed, shared: TrackErrors, name: str) -> tuple[float, float] | None:
+    """The shared error of this name and its standard deviation; None where it is not shared."""
+    if name not in shared.names:
+        return None
+    at = shared.names.index(name)
+    sigma = float(shared.sigma[at])
+    return sigma * float(found.shared[at]), sigma * float(np.sqrt(found.shared_covariance[at, at]))
+
+
+def _crests(found: Smoothed, terrain: Terrain) -> CrestHeights | None:
+    if not len(found.post):
+        return None
+    return CrestHeights(found.post, terrain.post_positions_m(found.post), found.post_error_m, found.post_sigma_m)

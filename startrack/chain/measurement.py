@@ -1,0 +1,177 @@
+"""Photometry of the catalogue stars in one image: add faint stars if needed, measure, remeasure near the skyline."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from startrack.catalog import load_catalog
+from startrack.catalog.gaia import has_deep_catalog, hipparcos_rows_in_deep, load_deep_catalog
+from startrack.chain.stages import Located, Measured, Oriented, Settings, extend
+from startrack.core.types import Array, BadInput, Detections, Ints, Stars
+from startrack.evidence import (
+    Skyline,
+    SkyStep,
+    StarEvidence,
+    StarPhotometry,
+    flux_scale,
+    height_above_px,
+    measure_noise,
+    measure_response,
+    measure_sky_step,
+    reliable_azimuths,
+    subtract_sky_step,
+)  # fmt: skip
+from startrack.evidence.star_evidence import filtered_noise_e
+from startrack.frames import R_enu_icrs, Site, observer_velocity_m_s
+from startrack.localization import clock_at
+from startrack.terrain import Terrain
+
+REMEASURED_PX = 12.0  # stars this near the skyline are measured again
+NEIGHBOURS_PX = 10.0  # and with them the stars up to this distance from them, whose PSFs overlap theirs
+UNDECIDED_PX = 2.0  # farther from the skyline than this, the fix decides which stars are visible
+CERTAIN_PROBABILITY = 0.99  # of being visible, or hidden, for the stars that the fix decides
+HIGH_RAD = np.radians(45.0)  # no skyline is as high, except beside a wall
+LEAST_PART = 0.5  # of the light of the stars that only the deep catalogue has
+SURE_SIGMAS = 5.0
+NO_DEEP_STARS = "the image does not show the faint stars of {}: only Hipparcos is used"
+COMPLETE_V_MAG = 6.5  # frames with 5 sigma at this magnitude show many stars that Hipparcos lacks
+
+
+def measure_evidence(oriented: Oriented, terrain: Terrain, settings: Settings) -> Measured:
+    """Photometry at every catalogue star in view, above a terrain.
+
+    `oriented` is the exposure with its attitude; its time must be known. `settings` has the photometry, and whether
+    Gaia's stars are used. Raises BadInput (bad_terrain, no_time) where the frame `enu` cannot be related to the stars.
+    """
+    when = oriented.exposure.time_utc
+    if terrain.site is None:
+        raise BadInput(
+            "bad_terrain", f"terrain {terrain.name} has no site: locating an image needs its position on a body"
+        )
+    if when is None:
+        raise BadInput("no_time", "the mid-exposure time is not known")
+    shown = oriented
+    if settings.deep_stars:
+        oriented = add_gaia_stars(oriented, terrain.site)
+    R, response = R_enu_icrs(terrain.site, when), None
+    if oriented.damage is not None:
+        oriented = replace(oriented, detections=measure_noise(oriented.detections))
+    light = _photometry(oriented, terrain, R, settings.evidence, oriented.detections)
+    if oriented.catalog_name != shown.catalog_name and not _shows_deep_stars(light, oriented.stars):
+        warnings = (*shown.exposure.warnings, NO_DEEP_STARS.format(oriented.catalog_name))
+        exposure = replace(shown.exposure, warnings=warnings)
+        oriented = replace(shown, exposure=exposure, detections=oriented.detections)
+        light = _photometry(oriented, terrain, R, settings.evidence, oriented.detections)
+    if oriented.damage is not None:
+        response = measure_response(light)
+        light = response.correct(light)
+    stated = oriented.exposure.time_sigma_s, oriented.exposure.time_sigma_is_stated
+    clock = clock_at(terrain.site, when, *stated)
+    return extend(
+        oriented, Measured, terrain=terrain, site=terrain.site, R_enu_icrs=R, clock=clock, light=light,
+        response=response, near=settings.near,
+    )  # fmt: skip
+
+
+def add_gaia_stars(oriented: Oriented, site: Site) -> Oriented:
+    """The same stars in the deeper Gaia list, if that is installed and the frame is deep enough to need it.
+
+    `site` is where the camera stands, for the aberration. Returns `oriented` itself where nothing changes: also with
+    stars that are not the whole shipped catalogue, which are a choice of the caller's.
+    """
+    if not np.array_equal(oriented.stars.hip, load_catalog().hip):
+        return oriented
+    found, when = oriented.identification, oriented.exposure.time_utc
+    scale = flux_scale(oriented.detections, oriented.camera, oriented.stars, found)
+    limiting_mag = scale.zero_mag - 2.5 * np.log10(5.0 * filtered_noise_e(oriented.detections))
+    if when is None or limiting_mag < COMPLETE_V_MAG or not has_deep_catalog():
+        return oriented
+    deep = load_deep_catalog()
+    return replace(
+        oriented,
+        catalog_name=deep.name,
+        stars=deep.at(when, observer_velocity_m_s(site, when)),
+        identification=replace(found, star=hipparcos_rows_in_deep()[found.star]),
+    )
+
+
+def _shows_deep_stars(light: StarPhotometry, stars: Stars) -> bool:
+    """Whether the image shows the stars that Hipparcos lacks, by their light together high above any skyline.
+
+    Synthetic images of Hipparcos alone do not: every one of these stars would then be evidence of a wall.
+    """
+    high = light.usable & (stars.hip[light.star] == 0) & (light.elevation_rad > HIGH_RAD)
+    if not high.any():
+        return True
+    expected, weight = light.expected_e[high], 1.0 / np.square(light.sigma_e[high])
+    information = float(weight @ np.square(expected))
+    part = float((weight * expected) @ light.flux_e[high]) / information
+    return part + SURE_SIGMAS / np.sqrt(information) > LEAST_PART
+
+
+def sky_step_at(located: Located) -> SkyStep | None:
+    """The step of the sky brightness at the terrain's skyline seen from the fix of a `located` image.
+
+    None if the image does not contain that skyline, or is damaged so that levels of light cannot be compared.
+    """
+    if located.damage is not None and not located.damage.has_levels:
+        return None
+    horizon = Skyline.trace(located.position_at_time_m, located.terrain)
+    return measure_sky_step(located.detections, located.camera, located.R_cam_enu, horizon)
+
+
+def remeasure_near_skyline(measured: Located, step: SkyStep, photometry: StarEvidence) -> Located:
+    """The stars near the skyline of a fix measured again, with the `step` of the sky brightness subtracted.
+
+    `photometry` has the settings of the measurement.
+    """
+    camera, terrain, position_m = measured.camera, measured.terrain, measured.position_at_time_m
+    R = measured.R_cam_enu
+    horizon = step.horizon
+    detections = subtract_sky_step(measured.detections, camera, R, horizon)
+    axes = np.linalg.cholesky(measured.fix.covariance_m2).T
+    reliable = reliable_azimuths(horizon, [Skyline.trace(position_m + axis, terrain) for axis in axes], camera, R)
+    light = measured.light
+    azimuth, elevation = light.azimuth_rad, light.elevation_rad
+    above_px, is_reliable = height_above_px(azimuth, elevation, camera, R, horizon), reliable(azimuth)
+    wanted = (np.abs(above_px) < REMEASURED_PX) & is_reliable
+    if measured.blocked is not None:
+        wanted &= ~measured.blocked.hides(azimuth)
+    around = np.abs(above_px) < REMEASURED_PX + NEIGHBOURS_PX
+    # The fix determines the visibility of neighbours better than their faint flux does, except next to the skyline.
+    undecided = (np.abs(above_px) < UNDECIDED_PX) | ~is_reliable
+    by_fix = np.where(above_px > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)
+    visible = np.where(undecided, 1.0 / (1.0 + np.exp(-light.llr)), by_fix)
+    newer = _photometry(
+        measured, terrain, measured.R_enu_icrs, photometry, detections, light.star[around], visible[around]
+    )
+    newer = newer if measured.response is None else measured.response.correct(newer)
+    return replace(measured, light=light.replace_stars(newer, light.star[wanted]))
+
+
+def _photometry(
+    oriented: Oriented,
+    terrain: Terrain,
+    R_enu_icrs: Array,
+    photometry: StarEvidence,
+    detections: Detections,
+    only: Ints | None = None,
+    visible: Array | None = None,
+) -> StarPhotometry:
+    """Photometry of all stars, or of those with the indices `only`; 0 evidence where the terrain is not known."""
+    light = photometry(
+        detections,
+        oriented.camera,
+        oriented.stars if only is None else oriented.stars.take(only),
+        list(oriented.bodies),
+        oriented.attitude_fit.attitude.R_cam_icrs,
+        R_enu_icrs,
+        flux_scale(oriented.detections, oriented.camera, oriented.stars, oriented.identification),
+        oriented.attitude_fit.extra_sigma_px,
+        visible,
+    )
+    light = light if only is None else replace(light, star=only[light.star])
+    rays = light.azimuth_rad, light.elevation_rad
+    return light if terrain.is_informative(*rays).all() else light.masked(terrain.mask_reason(*rays))

@@ -1,0 +1,158 @@
+"""From an exposure to its stars and the attitude: the stages of the pipeline that need no terrain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import datetime
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from startrack.camera import Camera
+from startrack.catalog.bodies import bodies
+from startrack.chain.stages import (
+    Detected,
+    Identified,
+    Inputs,
+    Oriented,
+    extend,
+)  # fmt: skip
+from startrack.core.compilation import announce_compilation
+from startrack.core.types import Array, BadInput, NotIdentified, Stars, TooFewStars
+from startrack.detection import Detector
+from startrack.estimation.attitude import AttitudeFit, solve_attitude
+from startrack.exposure import are_fractions
+from startrack.frames import Site, observer_velocity_m_s
+from startrack.identification import Identifier
+from startrack.identification.second_field import check_single_field
+
+if TYPE_CHECKING:
+    from startrack.catalog import StarCatalog
+
+NO_TIME = (
+    "the mid-exposure time is not known: give --time UTC, a sidecar NAME.json with time_utc, or a header with it; "
+    "nothing is guessed"
+)
+LEAST_SHIFT_PX, MOST_SHIFT_PX = 0.1, 8.0  # of the image's centre; a larger one is another camera
+SHIFT_CHI2 = 30.0  # of a shift in two coordinates: one in three million by chance
+SHIFT_ROUNDS = 3  # stars that the shift made outliers come back
+NO_SITE = "terrain {} has no site: an image can be located only on ground whose position on a body is known"
+ANYWHERE = Site("moon", 0.0, 0.0)  # used for an unknown site: 0.7 arcsec of aberration at most
+
+
+def check_inputs(inputs: Inputs) -> None:
+    """Raises BadInput no_time, bad_terrain or size_mismatch for `inputs` that cannot be solved together."""
+    exposure, camera, terrain = inputs.exposure, inputs.camera, inputs.terrain
+    if terrain is not None and exposure.time_utc is None:
+        raise BadInput("no_time", "; ".join([NO_TIME, *exposure.warnings]))
+    if terrain is not None and terrain.site is None:
+        raise BadInput("bad_terrain", NO_SITE.format(terrain.name))
+    if camera is not None and exposure.size_px != camera.size_px:
+        raise BadInput(
+            "size_mismatch",
+            f"the image is {exposure.size_px[0]} x {exposure.size_px[1]} px, the camera file gives "
+            f"{camera.size_px[0]} x {camera.size_px[1]}",
+        )
+
+
+def detect_sources(inputs: Inputs, camera: Camera | None, detector: Detector) -> Detected:
+    """The point sources. Raises BadInput bad_image for fractions where the camera's levels are in counts.
+
+    `detector` finds them in the exposure of `inputs`; the levels of a `camera` convert counts to electrons.
+    """
+    announce_compilation()
+    stated = camera is not None and camera.sensor is not None
+    if stated and inputs.exposure.saturation_adu is None and are_fractions(inputs.exposure.recorded_adu):
+        raise BadInput(
+            "bad_image",
+            "the pixels are fractions from 0 to 1, and the camera file's gain and levels are for the sensor's counts: "
+            "give those (8- or 16-bit integers, or floating point in ADU)",
+        )
+    return extend(inputs, Detected, detections=detector(inputs.exposure, camera))
+
+
+def identify_stars(
+    detected: Detected, camera: Camera, catalog: StarCatalog, identifier: Identifier, site: Site | None
+) -> Identified:
+    """Which of the point sources `detected` is which star of the `catalog`, found by the `identifier`.
+
+    `site` (None: not known) is where the `camera` stands. Raises NotIdentified, TooFewStars.
+    """
+    when = detected.exposure.time_utc
+    stars = stars_at(catalog, when, site)
+    return extend(
+        detected,
+        Identified,
+        camera=camera,
+        stars=stars,
+        bodies=tuple(bodies(site, when)) if site is not None and when is not None else (),
+        identification=identifier(detected.detections, camera, stars),
+    )
+
+
+def identify_unknown_lens(detected: Detected, fovs_rad: Array, catalog: StarCatalog) -> Identified:
+    """The same as `identify_stars`, with the camera found from an approximate field of view.
+
+    `detected` has the point sources, `catalog` the stars. The first of `fovs_rad` (n,) that identifies the image is
+    taken: an identification is accepted at any of them only where chance would not give it. Raises NotIdentified,
+    TooFewStars.
+    """
+    from startrack.identification import identify_unknown_lens as solve
+
+    stars = stars_at(catalog, detected.exposure.time_utc, None)
+    sources, size_px = detected.detections, detected.exposure.size_px
+    for fov_rad in fovs_rad:
+        try:
+            found = solve(sources, size_px, float(fov_rad), stars, background=sources.background_e)
+        except (NotIdentified, TooFewStars):
+            if len(fovs_rad) == 1:
+                raise
+            continue
+        return extend(
+            detected, Identified, camera=found.camera, stars=stars, bodies=(), identification=found.identification
+        )
+    low, high = np.degrees([fovs_rad[0], fovs_rad[-1]])
+    raise NotIdentified(
+        f"no lens of {low:.3g} to {high:.3g} degrees explains the point sources ({len(fovs_rad)} tried): "
+        "is this the night sky, and in focus?"
+    )
+
+
+def solve_orientation(identified: Identified) -> Oriented:
+    """The attitude that fits the `identified` stars. Raises NotIdentified.
+
+    Where the stars show that the image stands off the centre that the camera file states, as of a loose sensor, the
+    value's camera has the centre by the stars.
+    """
+    camera, fit = identified.camera, _fit_attitude(identified, identified.camera)
+    offset_px = fit.centre_shift_px
+    if LEAST_SHIFT_PX < np.linalg.norm(offset_px) < MOST_SHIFT_PX and fit.centre_chi2 > SHIFT_CHI2:
+        for _ in range(SHIFT_ROUNDS):
+            x, y = np.array(identified.camera.centre_px) + offset_px
+            camera = replace(identified.camera, centre_px=(float(x), float(y)))
+            fit = _fit_attitude(identified, camera)
+            offset_px = offset_px + fit.centre_shift_px
+    moved_px = float(np.linalg.norm(np.subtract(camera.centre_px, identified.camera.centre_px)))
+    return extend(identified, Oriented, camera=camera, attitude_fit=fit, centre_shift_px=moved_px)
+
+
+def check_one_attitude(oriented: Oriented) -> None:
+    """Raises NotLocated (inconsistent_evidence) where the sources of `oriented` show a second attitude, too."""
+    known = replace(oriented.identification, R_cam_icrs=oriented.attitude_fit.attitude.R_cam_icrs)
+    check_single_field(oriented.detections, oriented.camera, oriented.stars, known)
+
+
+def _fit_attitude(identified: Identified, camera: Camera) -> AttitudeFit:
+    found, detections = identified.identification, identified.detections
+    return solve_attitude(
+        camera,
+        detections.xy_px[found.detection],
+        detections.covariance_px2[found.detection],
+        identified.stars.rays_icrs[found.star],
+        found.R_cam_icrs,
+    )
+
+
+def stars_at(catalog: StarCatalog, when: datetime | None, site: Site | None) -> Stars:
+    """The `catalog` as seen at the time `when` from a `site`; at J2000.0 without aberration where the time is None."""
+    return catalog.at(when, observer_velocity_m_s(site or ANYWHERE, when) if when is not None else None)

@@ -1,0 +1,160 @@
+"""From one image to the position: detect, identify, orient, measure, localize. Each stage returns a complete value."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from startrack.camera import Camera
+from startrack.chain.measurement import measure_evidence, remeasure_near_skyline, sky_step_at
+from startrack.chain.orientation import (
+    NO_TIME,
+    check_inputs,
+    check_one_attitude,
+    detect_sources,
+    identify_stars,
+    identify_unknown_lens,
+    solve_orientation,
+)  # fmt: skip
+from startrack.chain.run import Run, with_timing
+from startrack.chain.sky_refinement import refine_by_sky_light
+from startrack.chain.skyline import measured_skyline
+from startrack.chain.stages import Detected, Inputs, Located, Oriented, Refused, Settings
+from startrack.chain.star_fix import fix_position
+from startrack.core.types import BadInput, Exposure, NoSolution
+from startrack.detection import find_damage
+from startrack.evidence.double_exposure import check_single_skyline
+from startrack.frames import Site
+from startrack.localization import localizer_name
+from startrack.terrain import Terrain
+
+if TYPE_CHECKING:
+    from startrack.catalog import StarCatalog
+    from startrack.evidence import SkyStep
+
+__all__ = ["NO_TIME", "Settings", "detect", "identify", "identify_blind", "locate", "locate_exposure"]
+
+
+def locate(
+    exposure: Exposure, camera: Camera, terrain: Terrain, catalog: StarCatalog, settings: Settings | None = None
+) -> Located | Refused:
+    """Position and attitude of the camera, or the reason why there is none.
+
+    `exposure` must have a time and the image size of the `camera`, `terrain` a site; `catalog` is the list of stars.
+    `settings` exchanges stages. Bad input of an image makes a refusal too: no image raises an exception.
+    """
+    settings = settings or Settings()
+    inputs = Inputs(
+        exposure=exposure, camera=camera, terrain=terrain, catalog_name=catalog.name,
+        localizer_name=localizer_name(settings.localizer), damage=find_damage(exposure, camera),
+    )  # fmt: skip
+    run = Run(inputs)
+    try:
+        check_inputs(run.reached)
+        detected = run.run_stage("detect", detect_sources, run.reached, camera, settings.detector)
+        identified = run.run_stage(
+            "identify", identify_stars, detected, camera, catalog, settings.identifier, terrain.site
+        )
+        oriented = run.run_stage("attitude", solve_orientation, identified)
+        run.time_stage("attitude", check_one_attitude, oriented)
+        measured = run.run_stage("evidence", measure_evidence, oriented, terrain, settings)
+        located = run.time_stage("locate", fix_position, measured, Located, settings.localizer)
+        step = _sky_step(run, located)
+        is_bright = step is not None and step.exceeds_noise
+        if is_bright:
+            located = run.time_stage("evidence", remeasure_near_skyline, located, step, settings.evidence)
+        if located.damage is None:  # which changes the light of stars in part
+            run.time_stage("locate", check_single_skyline, located.light, located.terrain, located.position_at_time_m)
+        located = run.time_stage("locate", _refine, located, is_bright, settings)
+        sky_mag = None if step is None else step.brightness_mag_arcsec2(camera, exposure.exposure_s)
+        skyline = run.time_stage("locate", measured_skyline, located)
+        return run.finish(replace(located, sky_brightness_mag_arcsec2=sky_mag, skyline=skyline))
+    except (BadInput, NoSolution) as refusal:
+        return run.refuse(refusal)
+
+
+def _refine(located: Located, is_newer: bool, settings: Settings) -> Located:
+    """The position by all of the evidence that is asked for; `is_newer`: its stars were measured after the fix."""
+    if settings.evidence_sources != "stars":
+        located = refine_by_sky_light(located, settings.localizer, settings.evidence_sources == "both")
+    if located.sky_light is None and is_newer:
+        return fix_position(located, Located, settings.localizer)
+    return located
+
+
+def _sky_step(run: Run, located: Located) -> SkyStep | None:
+    """The step of the sky's light at the skyline; None without one, and where the position is not that of the image."""
+    if located.fix.ambiguous or located.fix.search == "approximate":
+        return None
+    return run.time_stage("evidence", sky_step_at, located)
+
+
+def locate_exposure(exposure: Exposure, settings: Settings | None = None) -> Located | Refused:
+    """`locate` with the camera and the terrain that `exposure` names, and `settings`; stage `read` is reading them.
+
+    Raises BadInput (no_calibration, bad_calibration, bad_terrain) where one is not named or cannot be used.
+    """
+    from startrack.camera import load_camera
+    from startrack.catalog import load_catalog
+    from startrack.terrain import load_terrain
+
+    start = clock.perf_counter()
+    if exposure.camera is None:
+        raise BadInput("no_calibration", "no camera file is known: give -c FILE or a sidecar with camera")
+    if exposure.terrain is None:
+        raise BadInput("bad_terrain", "no terrain file is known: give -t FILE or a sidecar with terrain")
+    camera, terrain = load_camera(exposure.camera), load_terrain(exposure.terrain)
+    read_ms = 1e3 * (clock.perf_counter() - start)
+    return with_timing(locate(exposure, camera, terrain, load_catalog(), settings), read=read_ms)
+
+
+def identify(
+    exposure: Exposure, camera: Camera, catalog: StarCatalog, settings: Settings | None = None, site: Site | None = None
+) -> Oriented | Refused:
+    """Stars and attitude only. Without a time the `catalog` is taken at J2000.0, without aberration.
+
+    `exposure` must have the image size of the `camera`; `settings` exchanges stages; `site` (None: not known) adds
+    planets and the aberration of the body that it is on.
+    """
+    settings = settings or Settings()
+    run = Run(Inputs(exposure=exposure, camera=camera, catalog_name=catalog.name))
+    try:
+        check_inputs(run.reached)
+        detected = run.run_stage("detect", detect_sources, run.reached, camera, settings.detector)
+        identified = run.run_stage("identify", identify_stars, detected, camera, catalog, settings.identifier, site)
+        return run.finish(run.run_stage("attitude", solve_orientation, identified))
+    except (BadInput, NoSolution) as refusal:
+        return run.refuse(refusal)
+
+
+def identify_blind(
+    exposure: Exposure, fov_rad: float | Sequence[float], catalog: StarCatalog, settings: Settings | None = None
+) -> Oriented | Refused:
+    """Stars, attitude and lens of an `exposure` without a camera file, from an approximate field of view alone.
+
+    `fov_rad` [rad], one or several that are tried in their order, is the angle across the image's width
+    below 100 degrees, from there up that of the whole image
+    circle. `catalog` is the list of stars; `settings` has the detector. The lens found is the value's `camera`.
+    """
+    run = Run(Inputs(exposure=exposure, catalog_name=catalog.name))
+    try:
+        detected = run.run_stage("detect", detect_sources, run.reached, None, (settings or Settings()).detector)
+        identified = run.run_stage("identify", identify_unknown_lens, detected, np.atleast_1d(fov_rad), catalog)
+        return run.finish(run.run_stage("attitude", solve_orientation, identified))
+    except (BadInput, NoSolution) as refusal:
+        return run.refuse(refusal)
+
+
+def detect(exposure: Exposure, camera: Camera | None, settings: Settings | None = None) -> Detected | Refused:
+    """Point sources of an `exposure`; `camera` (None: not known) gives fluxes in electrons, `settings` the detector."""
+    run = Run(Inputs(exposure=exposure, camera=camera))
+    try:
+        return run.finish(
+            run.run_stage("detect", detect_sources, run.reached, camera, (settings or Settings()).detector)
+        )
+    except (BadInput, NoSolution) as refusal:
+        return run.refuse(refusal)

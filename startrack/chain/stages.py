@@ -1,0 +1,302 @@
+"""The complete values that the stages of the pipeline return, and the settings of the stages.
+
+    Inputs -> Detected -> Identified -> Oriented -> Measured -> Located, or Refused
+
+Each value has the fields of the one before it and the results of one more stage. All are frozen. Which value a function
+returns states which stages have run; no field is filled in later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from types import MappingProxyType
+from typing import Any, Self, TypeAlias, TypeVar, cast
+
+import numpy as np
+
+from startrack.camera import Camera
+from startrack.core.errors import Reason
+from startrack.core.prior import PositionPrior
+from startrack.core.types import (
+    Array,
+    Attitude,
+    Blocked,
+    Body,
+    Bools,
+    Clock,
+    Detections,
+    Evidence,
+    Exposure,
+    Fix,
+    Identification,
+    ImageErrors,
+    Integrity,
+    MeasuredSkyline,
+    Stars,
+)  # fmt: skip
+from startrack.detection import Damage, Detector
+from startrack.estimation.attitude import AttitudeFit
+from startrack.evidence import DamagedResponse, SkyLight, StarEvidence, StarPhotometry
+from startrack.frames import R_from_rotvec, Site
+from startrack.identification import Identifier
+from startrack.localization import DEFAULT_LOCALIZER, Localizer, has_posterior, require_localizer
+from startrack.terrain import Terrain
+
+EVIDENCE_SOURCES = ("both", "stars", "sky")  # of a position; "sky" begins with a fix by the stars
+UNKNOWN_TIME_SIGMA_RAD = np.radians(60 / 3600)  # aberration and proper motion left out
+STAGES = ("read", "detect", "identify", "attitude", "evidence", "locate")  # keys of `timing_ms`
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The stages and their settings; each can be replaced by another one with the same call.
+
+    `localizer` may be given by its name in `startrack.localization.LOCALIZERS`. Raises TypeError for a class instead of
+    an object, ValueError for another name, also of `evidence_sources`.
+    """
+
+    detector: Detector = field(default_factory=Detector)
+    identifier: Identifier = field(default_factory=Identifier)
+    evidence: StarEvidence = field(default_factory=StarEvidence)
+    localizer: Localizer = field(default_factory=lambda: require_localizer(DEFAULT_LOCALIZER))
+    evidence_sources: str = "both"  # "stars", "sky" (the light of the sky at the skyline) or "both"
+    near: PositionPrior | None = None  # of the position; None: anywhere in the search area of the terrain
+    deep_stars: bool = True  # use Gaia's stars too, where they are installed and the frame is deeper than Hipparcos
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "localizer", require_localizer(self.localizer))
+        if self.evidence_sources not in EVIDENCE_SOURCES:
+            raise ValueError(f"evidence_sources {self.evidence_sources!r}: known are {', '.join(EVIDENCE_SOURCES)}")
+        if self.near is not None and not has_posterior(self.localizer):
+            raise ValueError(f"near={self.near}: only the localizer posterior takes a prior of the position")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)  # eq: arrays have no single answer to ==
+class Inputs:
+    """One exposure and the inputs of its solution. Two values are equal only if they are one object."""
+
+    exposure: Exposure
+    camera: Camera | None = None  # None: not known; `detect` works without, `identify_blind` finds it
+    terrain: Terrain | None = None  # None: identification or detection only
+    catalog_name: str = ""
+    damage: Damage | None = None  # what processing did to the pixels; None: nothing shows
+    localizer_name: str = ""  # in LOCALIZERS, or of its class or function; empty: identification or detection only
+    timing_ms: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))  # stage to wall time [ms]
+
+    @property
+    def status(self) -> str:
+        """The status of the result format: ok, ambiguous or refused."""
+        return "ok"
+
+    @property
+    def reason(self) -> Reason | None:
+        """Code of the reason where the status is not ok, else None."""
+        return None
+
+    @property
+    def message(self) -> str:
+        """One line of text about the status; empty where it is ok."""
+        return ""
+
+    @property
+    def warnings(self) -> list[str]:
+        """Facts in the image's file that were not used."""
+        damage = [] if self.damage is None else [self.damage.message]
+        return [*self.exposure.warnings, *damage]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Detected(Inputs):
+    """An exposure and its point sources."""
+
+    detections: Detections
+
+    @property
+    def warnings(self) -> list[str]:
+        """As before, with the parts of the sensor that show no light."""
+        mask = self.detections.mask
+        if mask is None or not mask.dead_part:
+            return super().warnings
+        return [*super().warnings, f"{100 * mask.dead_part:.0f} % of the image holds one value: left out as if masked"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Identified(Detected):
+    """Detections with the catalogue stars that they are."""
+
+    camera: Camera  # the given one, or the one found
+    stars: Stars  # the catalogue at the time of the exposure
+    bodies: tuple[Body, ...]  # planets, Sun, Moon, Earth; empty without a site and a time
+    identification: Identification
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Oriented(Identified):
+    """Identified stars with the attitude of the camera among the stars."""
+
+    attitude_fit: AttitudeFit
+    centre_shift_px: float = 0.0  # by which `camera` has its centre off that of the camera file, as the stars show it
+
+    @property
+    def warnings(self) -> list[str]:
+        """Those of `Inputs`, and the shift of the image."""
+        shift = f"the image stands {self.centre_shift_px:.2f} px off the camera file's centre: corrected by the stars"
+        return [*super().warnings, *([shift] if self.centre_shift_px else [])]
+
+    @property
+    def attitude(self) -> Attitude:
+        """Attitude with the error of an unknown time included."""
+        attitude = self.attitude_fit.attitude
+        if self.exposure.time_utc is not None:
+            return attitude
+        widened = attitude.covariance_rad2 + UNKNOWN_TIME_SIGMA_RAD**2 * np.eye(3)
+        return Attitude(R_cam_icrs=attitude.R_cam_icrs, covariance_rad2=widened)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StarRays:
+    """Photometry of the catalogue's stars above a terrain: all that a position by the stars needs."""
+
+    terrain: Terrain
+    R_enu_icrs: Array  # (3, 3) at the likeliest time
+    clock: Clock
+    light: StarPhotometry
+    near: PositionPrior | None = None  # of the position
+
+    def evidence(self) -> Evidence:
+        """The rays for the localizer."""
+        return replace(self.light.evidence(), clock=self.clock, near=self.near)
+
+    def later(self, seconds: float, reach_s: float) -> Self:
+        """The same under the sky of a time later by `seconds`, which is right to `reach_s`."""
+        R = R_from_rotvec(seconds * self.clock.turn_rad_s)
+        clock = replace(self.clock, offset_s=self.clock.offset_s + seconds, reach_s=reach_s)
+        return replace(self, R_enu_icrs=R @ self.R_enu_icrs, light=self.light.turned(R), clock=clock)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StarFix(StarRays):
+    """The position that explains the stars, and its integrity."""
+
+    fix: Fix
+
+    @property
+    def integrity(self) -> Integrity | None:
+        """Of the fix; None: not assessed, of several positions or without a posterior."""
+        return self.fix.integrity
+
+    @property
+    def blocked(self) -> Blocked | None:
+        """Parts of the view that something on no map blocks; None: nothing is blocked."""
+        return self.fix.blocked
+
+    @property
+    def status(self) -> str:
+        """ok, or ambiguous where several positions fit."""
+        return "ambiguous" if self.fix.ambiguous else "ok"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measured(StarRays, Oriented):
+    """An attitude above a terrain, with photometry at every catalogue star in view."""
+
+    site: Site  # of the terrain
+    response: DamagedResponse | None = None  # of a damaged image to stars
+
+    @property
+    def R_cam_enu(self) -> Array:
+        """Rotation (3, 3) from enu to the camera."""
+        return np.asarray(self.attitude_fit.attitude.R_cam_icrs @ self.R_enu_icrs.T)
+
+    @property
+    def warnings(self) -> list[str]:
+        """Facts in the image's file that were not used; what the terrain does not cover, and errors it leaves out."""
+        return [*super().warnings, *self.terrain.masked_sectors(), *self.terrain.error_warnings()]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Located(StarFix, Measured):
+    """The whole solution: evidence and the position that explains it."""
+
+    sky_light: SkyLight | None = None  # of the image at the skyline; None: not used for the fix
+    sky_used: Bools | None = None  # (SECTORS,) where it is used
+    image_errors: ImageErrors | None = None  # of it
+    by_stars: bool = True  # whether the stars' rows are in the posterior too
+    sky_unused: str = ""  # why the sky's light is not used
+    skyline: MeasuredSkyline | None = None  # that the image shows; None: not one position, or not right to its error
+    sky_brightness_mag_arcsec2: float | None = (
+        None  # of the sky beyond the ground at the skyline; None: no step, no zero point
+    )
+
+    @property
+    def position_at_time_m(self) -> Array:
+        """East and north (2,) at the time of `R_enu_icrs`: where the skyline and the stars are compared.
+
+        In a round crater the error of the clock spreads the position over an arc, whose mean lies beside it.
+        """
+        return np.asarray(self.fix.at_time_m)
+
+    @property
+    def warnings(self) -> list[str]:
+        """Those of `Measured`, what blocks the view, and errors beyond the defaults of facts that no file states."""
+        blocked = [] if self.blocked is None else [f"blocked and left out: {self.blocked.text}"]
+        shown = [f"the image shows {one.text}, which no file states: it is estimated" for one in self.fix.shown]
+        return [*super().warnings, *blocked, *shown]
+
+    @property
+    def evidence_source(self) -> str:
+        """What the position is from: stars, sky (the light of the sky), or both."""
+        if self.sky_light is None:
+            return "stars"
+        return "both" if self.by_stars else "sky"
+
+    @property
+    def reason(self) -> Reason | None:
+        """`ambiguous` where several positions fit."""
+        return Reason.AMBIGUOUS if self.fix.ambiguous else None
+
+    @property
+    def message(self) -> str:
+        """Number of positions that fit, if there are several."""
+        return f"{len(self.fix.modes)} positions fit the stars" if self.fix.ambiguous else ""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Refused:
+    """An exposure without a solution, why, and the last complete value that was reached."""
+
+    reason: Reason
+    message: str
+    reached: Inputs
+    timing_ms: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))  # the failed stage included
+
+    @property
+    def status(self) -> str:
+        """Always refused."""
+        return "refused"
+
+    @property
+    def exposure(self) -> Exposure:
+        """The exposure that was refused."""
+        return self.reached.exposure
+
+    @property
+    def warnings(self) -> list[str]:
+        """The warnings of the value reached."""
+        return self.reached.warnings
+
+
+Outcome: TypeAlias = Inputs | Refused  # of a command: Detected, Oriented or Located, or a refusal
+
+
+def last_value(outcome: Outcome) -> Inputs:
+    """The last complete value of an outcome: itself, or the value reached before a refusal."""
+    return outcome.reached if isinstance(outcome, Refused) else outcome
+
+
+def extend(value: Any, to: type[T], **more: Any) -> T:
+    """The fields of a value and the results of one more stage as the next value of the chain."""
+    known = {f.name: getattr(value, f.name) for f in fields(cast(Any, to)) if hasattr(value, f.name)}
+    return to(**known | more)

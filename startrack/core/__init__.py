@@ -1,0 +1,1 @@
+"""What every package uses: values, errors with exit codes, files and locks, settings, compiled code, processes."""

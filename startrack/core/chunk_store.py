@@ -1,0 +1,107 @@
+"""Results of many tasks as chunks of arrays: computed in parallel, kept on disk, the same for any number of workers."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from functools import lru_cache
+from pathlib import Path
+from types import TracebackType
+from typing import Generic, Protocol, Self, TypeVar
+
+import numpy as np
+
+from startrack.core.files import write_atomically
+from startrack.core.runner import TASK_LIMIT_S, Died, Runner, RunStopped
+
+Chunk = dict[str, np.ndarray]  # the result of one task, by name
+
+
+class CountedTask(Protocol):
+    """A task whose length is the number of its steps on the progress bar."""
+
+    def __len__(self) -> int: ...
+
+
+class Bar(Protocol):
+    """A progress bar."""
+
+    def advance(self, steps: int = 1) -> None: ...
+
+
+Task = TypeVar("Task", bound=CountedTask)
+Progress = Callable[[str, int], AbstractContextManager[Bar]]  # text and number of steps of a computation
+
+
+class ChunkStore(Generic[Task]):
+    """Applies `work` to tasks and keeps their chunks in `folder`; a context manager that ends its processes.
+
+    `key` is the name of a task's chunk: it must differ where the result may. Memory stays constant: a finished chunk
+    goes to disk, and is read again when it is needed.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        work: Callable[[Task], Chunk],
+        key: Callable[[Task], str],
+        *,
+        jobs: int,
+        progress: Progress,
+        cluster: str | None = None,
+        limit_s: float = TASK_LIMIT_S,
+    ) -> None:
+        self.folder, self.key, self.progress = folder, key, progress
+        self._runner: Runner[Task, Chunk] = Runner(work, jobs=jobs, cluster=cluster, in_process=True, limit_s=limit_s)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, cause: BaseException | None, at: TracebackType | None) -> None:
+        self._runner.__exit__(kind, cause, at)
+
+    def connect(self) -> None:
+        """Connect to the cluster now. Raises BadInput (no_cluster) if no scheduler answers."""
+        self._runner.connect()
+
+    def chunks(self, what: str, tasks: Sequence[Task]) -> Iterator[Chunk]:
+        """The chunks of `what` in the order of the tasks; missing ones are computed. Raises RunStopped."""
+        missing = self.missing(tasks)
+        with self.progress(what, sum(map(len, missing))) as bar:
+            for task, chunk in self._runner.results(missing):
+                if isinstance(chunk, Died):
+                    raise RunStopped(f"{what}: {chunk.cause}")
+                write_atomically(self._path(task), _pack_chunk(chunk), overwrite=True)
+                bar.advance(len(task))
+        for task in tasks:
+            with np.load(self._path(task)) as stored:
+                yield {key: stored[key] for key in stored.files}
+
+    def missing(self, tasks: Iterable[Task]) -> list[Task]:
+        """The tasks without a chunk."""
+        return [task for task in tasks if not self._path(task).exists()]
+
+    def discard(self, tasks: Iterable[Task]) -> None:
+        """Remove the chunks of tasks."""
+        for task in tasks:
+            self._path(task).unlink(missing_ok=True)
+
+    def _path(self, task: Task) -> Path:
+        return self.folder / f"{self.key(task)}.npz"
+
+
+@lru_cache(maxsize=8)
+def source_digest(patterns: tuple[str, ...]) -> str:
+    """SHA-256 of the package's sources that match `patterns`: part of the key of what they compute."""
+    root, digest = Path(__file__).parents[1], hashlib.sha256()
+    for path in sorted(path for pattern in patterns for path in root.glob(pattern)):
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def _pack_chunk(chunk: Chunk) -> bytes:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **chunk)  # type: ignore[arg-type]
+    return buffer.getvalue()

@@ -1,0 +1,142 @@
+"""numba's cache of compiled kernels: where it lies, and whether this machine has compiled them already.
+
+The kernels are compiled at their first use after an installation and then loaded from the cache. numba writes the
+cache beside the package; where that folder is read-only, NUMBA_CACHE_DIR is set to a folder of the user's.
+"""
+
+from __future__ import annotations
+
+import atexit
+import hashlib
+import logging
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from startrack import __version__
+from startrack.core.files import PACKAGE
+
+if TYPE_CHECKING:
+    from multiprocessing.context import BaseContext
+    from multiprocessing.synchronize import Semaphore
+
+LOG = logging.getLogger(__name__)
+VARIABLE = "NUMBA_CACHE_DIR"
+
+
+def choose_cache_folder() -> None:
+    """Set NUMBA_CACHE_DIR unless numba can write beside the package, or the variable is set. Called before numba loads.
+
+    Without any folder to write to, the cache is temporary: without one numba would refuse to load the kernels.
+    """
+    if VARIABLE in os.environ or os.access(PACKAGE, os.W_OK):
+        return
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "startrack" / "numba"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError:
+        # A fresh folder that only this user can write to: numba unpickles the files in its cache.
+        folder = Path(tempfile.mkdtemp(prefix="startrack-numba-"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    os.environ[VARIABLE] = str(folder)
+
+
+class _Turn:
+    """Whether this process may still announce; the first of the processes that share a semaphore does."""
+
+    def __init__(self) -> None:
+        self.is_taken = False
+        self.shared: Semaphore | None = None
+
+    def take(self) -> bool:
+        if self.is_taken:
+            return False
+        self.is_taken = True
+        return self.shared is None or bool(self.shared.acquire(block=False))
+
+
+_TURN = _Turn()
+
+
+def turn_for_pool(context: BaseContext) -> Semaphore:
+    """A semaphore for `share_turn` in the processes that a multiprocessing `context` starts.
+
+    None of them announces where this process has done so.
+    """
+    return context.Semaphore(int(not _TURN.is_taken))
+
+
+def share_turn(semaphore: Semaphore) -> None:
+    """From now on, announce in this process only if no other process that shares the `semaphore` has done so."""
+    _TURN.shared = semaphore
+
+
+@cache
+def announce_compilation() -> None:
+    """From now on, log one line when numba compiles the first kernel of startrack in this process.
+
+    Nothing is logged where all kernels come from the cache. Call this before the first use of a kernel.
+    """
+    from numba.core import event
+
+    class Announcement(event.Listener):  # type: ignore[misc]
+        def on_start(self, event: Any) -> None:
+            if event.data["dispatcher"].py_func.__module__.startswith("startrack.") and _TURN.take():
+                LOG.warning(
+                    "compiling what this command uses first: about 20 s, for height maps a minute; kept on disk"
+                )
+
+        def on_end(self, event: Any) -> None:
+            """Nothing to do."""
+
+    event.register("numba:compile", Announcement())
+
+
+def discard_stale_kernels() -> None:
+    """Have numba forget the kernels that it compiled from other sources of startrack than these.
+
+    numba compares only the file of a kernel itself, by size and time, and neither those of the kernels that it calls
+    nor the types of its arguments. Called before numba loads.
+    """
+    key = hashlib.sha256(__version__.encode())
+    sources = sorted(PACKAGE.rglob("*.py"))
+    for source in sources:
+        status = source.stat()
+        key.update(f"{source.name} {status.st_size} {status.st_mtime_ns}".encode())
+    folder = os.environ.get(VARIABLE)
+    name = f"startrack-{hashlib.sha256(str(PACKAGE).encode()).hexdigest()[:12]}.key"
+    file = Path(folder or PACKAGE / "__pycache__") / name
+    with suppress(OSError):  # another process may be doing the same
+        if file.is_file() and file.read_text() == key.hexdigest():
+            return
+        for source in sources:
+            for index in _indices_of(source):
+                index.unlink(missing_ok=True)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(key.hexdigest())
+
+
+def is_compiled() -> bool:
+    """Whether numba's cache holds localization kernels for this Python.
+
+    For a decision that costs only time if it is wrong: kernels of changed sources count too.
+    """
+    return any(True for source in (PACKAGE / "localization").glob("*.py") for _ in _indices_of(source))
+
+
+def _indices_of(source: Path) -> Iterator[Path]:
+    """numba's index files of a source: MODULE.FUNCTION-LINE.pyXY.nbi, in __pycache__ or below NUMBA_CACHE_DIR."""
+    name = f"{source.stem}.*.py{sys.version_info.major}{sys.version_info.minor}.nbi"
+    folder = os.environ.get(VARIABLE)
+    if not folder:
+        return (source.parent / "__pycache__").glob(name)
+    of_parent = hashlib.sha1(str(source.parent).encode(), usedforsecurity=False).hexdigest()
+    return (Path(folder) / f"{source.parent.name}_{of_parent}").glob(name)

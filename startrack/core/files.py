@@ -1,0 +1,248 @@
+"""Shipped files by name, TOML files, folders for results, atomic writes and file locks."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import tempfile
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from startrack.core.errors import BadInput, BadOutput, OutputExists
+
+PACKAGE = Path(__file__).resolve().parents[1]
+MAX_TEXT_BYTES = 2**20  # camera and terrain files have a few kilobytes
+MAX_CAUSE_CHARS = 200  # of a library's message
+MAX_STEM_BYTES = 200  # file systems take names of 255, and a suffix follows
+FULL_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}  # errors of writing that are not the path's
+FOREIGN_CAMERA_SUFFIXES = ".yaml", ".yml", ".xml", ".txt"  # of other programs' camera files
+FilePath = str | os.PathLike[str]
+
+
+class Locked(Exception):
+    """Another process holds the lock. `owner` is its process number as text, "unknown" if it cannot be read."""
+
+    def __init__(self, owner: str) -> None:
+        super().__init__(f"process {owner} holds the lock")
+        self.owner = owner
+
+
+def data_dir(kind: str) -> Path:
+    """Folder of the shipped `kind` ("catalogs", "calib" or "terrain").
+
+    A wheel carries them inside the package; a checkout has them at the top level.
+    """
+    inside = PACKAGE / "data" / kind
+    return inside if inside.is_dir() else PACKAGE.parent / kind
+
+
+def is_path(reference: FilePath) -> bool:
+    """Whether a camera's or terrain's `reference` is a path; otherwise it is the name of a shipped file.
+
+    A path ends in .toml, or as other programs' camera files do, or contains a separator: "/", or "\\" as on Windows.
+    """
+    text = os.fspath(reference)
+    return text.endswith((".toml", *FOREIGN_CAMERA_SUFFIXES)) or "/" in text or "\\" in text
+
+
+def relative_path(file: FilePath, folder: FilePath) -> str:
+    """The path of a `file` as seen from `folder`, with forward slashes.
+
+    Real paths: `..` of a linked folder is not the folder above the link.
+    """
+    real = os.path.realpath(file)
+    try:
+        return Path(os.path.relpath(real, os.path.realpath(folder))).as_posix()
+    except ValueError:  # another drive of Windows
+        return Path(real).as_posix()
+
+
+def resolve_named(name_or_path: str | Path, kind: str, reason: str) -> Path:
+    """Path of a user's file or of a shipped one. Raises BadInput `reason` if there is none, or if it is no name."""
+    if not isinstance(name_or_path, str | os.PathLike):
+        what = type(name_or_path).__name__
+        raise BadInput(reason, f"{what} is neither a name nor a path: give the name of a shipped file, or a path")
+    if is_path(name_or_path):
+        path = Path(name_or_path)
+        if not os.path.isfile(path):  # False also for names too long for the file system
+            raise BadInput(reason, f"{path}: no such file")
+        return path
+    path = data_dir(kind) / f"{name_or_path}.toml"
+    if not os.path.isfile(path):
+        shipped = ", ".join(sorted(p.stem for p in data_dir(kind).glob("*.toml")))
+        raise BadInput(
+            reason,
+            f"no shipped file is called {name_or_path!r}; shipped: {shipped}; a path ends in .toml or contains a "
+            "separator",
+        )
+    return path
+
+
+def read_text(path: FilePath, reason: str, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
+    """The text of a user's file of at most `max_bytes`, UTF-8. Raises BadInput `reason` with one line of cause."""
+    try:
+        if not os.path.isfile(path):  # a folder; a device or a pipe, which might never end
+            raise ValueError("no such file")
+        with open(path, "rb") as file:
+            raw = file.read(max_bytes + 1)
+        if len(raw) > max_bytes:
+            raise ValueError(f"it has more than {max_bytes // 2**20} MiB")
+        return raw.decode("utf-8")
+    except (OSError, ValueError) as cause:  # ValueError: not UTF-8 too
+        text = (cause.strerror if isinstance(cause, OSError) else None) or str(cause)
+        raise BadInput(reason, f"{printable(path)}: cannot be read ({text[:MAX_CAUSE_CHARS]})") from cause
+
+
+def parse_toml(text: str, reason: str) -> dict[str, Any]:
+    """The keys of a TOML text. Raises BadInput `reason` with one line of cause."""
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as cause:  # TOMLDecodeError, huge integers, deeply nested lists
+        raise BadInput(reason, " ".join(f"not a TOML file: {str(cause)[:MAX_CAUSE_CHARS]}".split())) from cause
+
+
+def existing_folder(folder: FilePath, content: str = "") -> Path:
+    """Path of a user's folder. Raises BadInput bad_image, naming the expected `content`, if it is a file or missing."""
+    path = Path(folder)
+    if not path.is_dir():
+        of_content = f" of {content}" if content else ""
+        cause = "is a file, not a folder" if path.exists() else "no such folder"
+        raise BadInput("bad_image", f"{printable(path)}: {cause}{of_content}")
+    return path
+
+
+def make_folder(folder: FilePath, reason: str = "bad_image") -> Path:
+    """Make a folder for results and check that files can be written there, before anything is computed.
+
+    Raises BadOutput `reason` if they cannot; BadInput if the disk is full.
+    """
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except (OSError, ValueError) as cause:  # ValueError: a name with a null character
+        text = getattr(cause, "strerror", None) or cause
+        raise _write_error(cause)(
+            reason, f"{printable(path)}: results cannot be written to this folder ({text}): choose another"
+        ) from cause
+    return path
+
+
+def check_output(file: FilePath, *, overwrite: bool, reason: str = "bad_image") -> Path:
+    """Path of an output file, before anything is computed; its folder is made.
+
+    Raises BadOutput `reason` if the file exists and not `overwrite`, or is a folder, or if its folder takes no files.
+    """
+    path = Path(file)
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):  # `make_folder` reports what is no folder
+        pass
+    except (OSError, ValueError) as cause:  # a name too long, or with a null character
+        text = getattr(cause, "strerror", None) or cause
+        raise BadOutput(reason, f"{printable(path)}: cannot be written ({text})") from cause
+    if os.path.lexists(path) and not os.path.isfile(path):  # a folder; a pipe or a device, which must not be replaced
+        raise BadOutput(reason, f"{printable(path)}: is no file, so that it cannot be replaced: choose another")
+    check_free(path, overwrite=overwrite, reason=reason)
+    make_folder(path.parent, reason)
+    return path
+
+
+def printable(name: FilePath) -> str:
+    """A file's name as one line of text for messages: undecodable bytes are escaped, white space is one blank."""
+    return " ".join(os.fspath(name).encode("utf-8", "backslashreplace").decode().split())
+
+
+def file_stem(name: str) -> str:
+    """The `name` of a camera or terrain as the stem of a file in one folder: without separators and leading dots."""
+    stem = re.sub(r"[/\\\0]", "_", name).lstrip(".")
+    return stem.encode("utf-8", "replace")[:MAX_STEM_BYTES].decode("utf-8", "ignore") or "unnamed"
+
+
+@contextmanager
+def atomic_file(path: FilePath) -> Iterator[Path]:
+    """A temporary path in the folder of `path`, renamed to it at the end of the block, removed after an exception.
+
+    Missing folders are made. Raises OSError, and ValueError for a name that the system cannot take.
+    """
+    target = Path(path)
+    # In the same folder, because a rename does not cross file systems; tempfile would make the file private.
+    temporary = target.with_name(f".{uuid4().hex}.part")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        yield temporary
+        os.replace(temporary, target)
+    finally:
+        with suppress(OSError):  # renamed already; and a failed clean-up must not hide the cause
+            temporary.unlink()
+
+
+def write_atomically(path: FilePath, data: bytes, *, overwrite: bool, reason: str = "bad_image") -> None:
+    """Write a file that appears under its name only when it is complete; missing folders are made.
+
+    Raises BadOutput `reason` if the file exists and not `overwrite`, or if the path takes no file; BadInput if the
+    disk is full.
+    """
+    check_free(path, overwrite=overwrite, reason=reason)
+    try:
+        with atomic_file(path) as temporary, temporary.open("xb") as file:
+            file.write(data)
+    except (OSError, ValueError) as error:
+        cause = getattr(error, "strerror", None) or error
+        raise _write_error(error)(reason, f"{printable(path)}: cannot be written ({cause})") from error
+
+
+def _write_error(cause: Exception) -> type[BadInput]:
+    """BadInput of a full disk, else BadOutput: the path is at fault."""
+    return BadInput if isinstance(cause, OSError) and cause.errno in FULL_DISK else BadOutput
+
+
+def check_free(path: FilePath, *, overwrite: bool, reason: str = "bad_image") -> None:
+    """Raise OutputExists `reason` if the file exists and may not be replaced."""
+    if not overwrite and os.path.lexists(path):
+        raise OutputExists(reason, printable(path))
+
+
+@contextmanager
+def hold_lock(path: FilePath, *, wait: bool = True, on_wait: Callable[[], None] | None = None) -> Iterator[None]:
+    """Hold the lock file `path` for the length of the block; the system releases it if the process is killed.
+
+    With `wait`, wait for another holder, after one call of `on_wait`; otherwise raise Locked. The lock works between
+    processes of one machine, and on a shared file system as far as that supports locks. Raises OSError if the lock
+    file cannot be made.
+    """
+    from filelock import FileLock, Timeout
+
+    file = Path(path)
+    lock = FileLock(file, thread_local=False)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        if not wait:
+            raise Locked(_owner(file)) from None
+        if on_wait is not None:
+            on_wait()
+        lock.acquire()
+    try:
+        with suppress(OSError):
+            file.write_text(str(os.getpid()), encoding="ascii")
+        yield
+    finally:
+        with suppress(OSError):  # Windows keeps open files; a remaining file is not a lock
+            file.unlink()
+        lock.release()
+
+
+def _owner(lock_file: Path) -> str:
+    """The number of the process that holds a lock."""
+    try:
+        text = lock_file.read_text(encoding="ascii").strip()
+    except (OSError, ValueError):
+        return "unknown"
+    return text if text.isdecimal() else "unknown"

@@ -1,0 +1,137 @@
+"""What a localization gives: the position with its errors, what was left out of it, and what nobody stated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from startrack.core.values import Array, Bools, Value, array
+
+CARRIED_PART = 0.5  # of the information, by the groups that are named
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mode(Value):
+    """One connected region of the posterior."""
+
+    east_m: float
+    north_m: float
+    weight: float  # posterior probability
+    radius95_m: float = np.inf  # circle about it that holds 95 % of the mode's own probability; infinite: not stated
+    radius999_m: float = np.inf
+
+
+@dataclass(frozen=True)
+class ClockError:
+    """How much later the true time is than the stated one."""
+
+    offset_s: float
+    sigma_s: float
+
+
+@dataclass(frozen=True)
+class UnstatedFact:
+    """A fact that no file states, and the 99.9 % circle of the position if it were exact."""
+
+    fact: str  # key of the file that states it
+    radius999_m_if_exact: float
+
+
+@dataclass(frozen=True)
+class ShownError:
+    """An error beyond the default of a fact that no file states, as the image shows it."""
+
+    name: str  # ends with its unit
+    fact: str  # key of the file that states it
+    value: float
+    sigma: float
+
+    @property
+    def text(self) -> str:
+        """The error in words."""
+        words, unit = self.name.rsplit("_", 1)
+        value = f"{100 * self.value:+.2f} %" if unit == "1" else f"{self.value:+.4g} {unit}"
+        return f"an error of {words.replace('_', ' ')} of {value}"
+
+
+@dataclass(frozen=True, eq=False)
+class Blocked:
+    """Probability that something on no map blocks the view, by sectors of azimuth from north eastward."""
+
+    probability: Array  # (n,)
+
+    @property
+    def whole(self) -> Bools:
+        """(n,) which sectors are more likely blocked than not."""
+        return np.asarray(self.probability > 0.5)
+
+    def hides(self, azimuth_rad: Array) -> Bools:
+        """Whether directions (n,) at `azimuth_rad` are in blocked sectors."""
+        n = len(self.probability)
+        return self.whole[(azimuth_rad / (2 * np.pi) * n).astype(np.int64) % n]
+
+    def __bool__(self) -> bool:
+        return bool(self.whole.any())
+
+    @property
+    def ranges_rad(self) -> list[tuple[float, float]]:
+        """From and to of each range in which the skyline is blocked, eastward; across north `to` is the smaller."""
+        if self.whole.all():
+            return [(0.0, 2 * np.pi)]
+        width = 2 * np.pi / len(self.whole)
+        starts = np.flatnonzero(self.whole & ~np.roll(self.whole, 1))
+        ends = np.flatnonzero(self.whole & ~np.roll(self.whole, -1)) + 1
+        if len(ends) and ends[0] <= starts[0]:
+            ends = np.roll(ends, -1)
+        return [(float(a) * width, float(b) * width) for a, b in zip(starts, ends, strict=True)]
+
+    @property
+    def text(self) -> str:
+        """The ranges in words."""
+        return ", ".join(f"{a:.0f} to {b:.0f}" for a, b in np.degrees(self.ranges_rad)) + " degrees"
+
+
+@dataclass(frozen=True, eq=False)
+class Integrity:
+    """Solutions without one group of directions each, of several divisions of the compass into groups."""
+
+    first_azimuth_rad: Array  # (m,) where the groups begin, of all divisions
+    separation_m: Array  # (m, 2) of the fix without the group from the fix; nan where the group alone holds it
+    part: Array  # (groups,) of the information about the position, in each group of the first division
+    protection_level_m: float  # infinite where one group alone holds the fix
+
+    def carriers(self) -> list[int]:
+        """The fewest groups that hold half of the information, the strongest first."""
+        order = np.argsort(-self.part, kind="stable")
+        count = int(np.searchsorted(np.cumsum(self.part[order]), CARRIED_PART * self.part.sum())) + 1
+        return [int(group) for group in order[:count] if self.part[group] > 0.0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fix(Value):
+    """Posterior of the camera's position."""
+
+    position_enu_m: Array = array(3)  # posterior mean of the main mode (east, north) and the camera's height there
+    covariance_m2: Array = array(2, 2)  # (east, north), without gross errors; infinite of a method that states none
+    radius95_m: float  # circle about the position that holds 95 % of the posterior
+    radius999_m: float
+    modes: tuple[Mode, ...]  # heaviest first; weights sum to 1
+    at_time_m: Any = None  # (2,) position if the stated time is right; None: that of `position_enu_m`
+    ambiguous: bool  # modes outside the main mode's 99.9 % circle hold more than 1 %
+    dropped_probability: float | None = None  # bound on the posterior's part that the search left out; None: no search
+    search: str = "proven"  # no other position fits; "beam": not proven to the end; "approximate": no posterior
+    horizon_error_rad: float = 0.0  # common to all azimuths: how much higher the true horizon is than the map's
+    clock: ClockError | None = None  # as the evidence shows it; None: not estimated
+    blocked: Blocked | None = None  # parts of the view; None: nothing is blocked
+    integrity: Integrity | None = None  # None: not assessed, of several positions or without a posterior
+    raised_rad: Any = None  # (sectors,) by the shared errors, how much the skyline stands above the map's; None: 0
+    unstated: tuple[UnstatedFact, ...] = ()  # the one that widens the circle most first
+    shown: tuple[ShownError, ...] = ()  # errors beyond the defaults
+    samples: Any = None  # of the posterior, for a later call with more rows of the same image; None: there are none
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.at_time_m is None:
+            object.__setattr__(self, "at_time_m", self.position_enu_m[:2])

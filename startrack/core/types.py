@@ -1,0 +1,268 @@
+"""The values that cross module borders (and, from errors.py, the exceptions).
+
+Every value is frozen, keyword-only and shape-checked; its arrays are read-only. A stage returns a complete value
+or raises `NoSolution`; there is no sentinel or half-filled result, NaN only where a field allows it (CONVENTIONS.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from datetime import datetime
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.core.correction import Correction
+from startrack.core.errors import BadInput, NoSolution, NotIdentified, NotLocated, TooFewStars
+from startrack.core.fix import Blocked, ClockError, Fix, Integrity, Mode, UnstatedFact
+from startrack.core.mask import Mask
+from startrack.core.prior import PositionPrior
+from startrack.core.values import Array, Bools, Ints, Value, array, take_rows
+
+__all__ = [
+    "Array", "Attitude", "BadInput", "Blocked", "Body", "Bools", "Centroids", "Clock", "ClockError", "Correction",
+    "Detections", "Evidence", "Exposure", "Fix", "Identification", "ImageErrors", "Integrity", "Ints", "Mask",
+    "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated", "Stars", "TooFewStars", "UnstatedFact",
+    "Value", "array",
+]  # fmt: skip
+
+# Beyond the zenith: the search for an error of the horizon shifts the rows, by three sigma at most.
+MOST_ELEVATION_RAD = np.pi / 2 + 0.6
+TIME_SIGMA_S = 1.0  # of the clock, where nothing is stated
+MAX_PIXELS = 200_000_000  # contract: a larger image is refused from its header, before anything is decoded
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exposure(Value):
+    """One image with the facts that travel with it."""
+
+    pixels_adu: NDArray[np.float32]  # (H, W) [ADU]; a sensor's 16 bits fit float32 exactly
+    name: str = ""  # stem of the file's name
+    path: str = ""  # as given by the user
+    time_utc: datetime | None = None  # mid-exposure, timezone-aware UTC; None when unknown
+    time_sigma_s: float = TIME_SIGMA_S  # standard deviation of the clock's error
+    time_sigma_is_stated: bool = False  # by the user or a file; made true where it is not the default
+    exposure_s: float | None = None
+    camera: str | None = None  # resolved path or shipped name of the camera file
+    terrain: str | None = None  # resolved path or shipped name of the terrain file
+    mask: str | Mask | None = None  # resolved path of the mask's file, or the mask; None: every pixel counts
+    saturation_adu: float | None = None  # largest value the file's type can hold, None for float images
+    sha256: str = ""
+    warnings: tuple[str, ...] = ()
+    correction: Correction | None = None  # by dark frame and flat field; None: `pixels_adu` are the recorded counts
+
+    def __post_init__(self) -> None:
+        p = np.asarray(self.pixels_adu, dtype=np.float32)
+        if p.ndim != 2:
+            raise ValueError(f"Exposure.pixels_adu: {p.ndim} dimensions, expected (H, W)")
+        if p.flags.writeable:
+            p = p.view()
+            p.flags.writeable = False
+        object.__setattr__(self, "pixels_adu", p)
+        if self.time_sigma_s != TIME_SIGMA_S:
+            object.__setattr__(self, "time_sigma_is_stated", True)
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(W, H)."""
+        return self.pixels_adu.shape[1], self.pixels_adu.shape[0]
+
+    @property
+    def recorded_adu(self) -> NDArray[np.float32]:
+        """Counts (H, W) [ADU] before dark frame and flat field."""
+        return self.pixels_adu if self.correction is None else self.correction.recorded_adu
+
+
+@dataclass(frozen=True, kw_only=True)
+class Centroids(Value):
+    """Positions and brightness of point sources, brightest first: what identification needs of them."""
+
+    xy_px: Array = array("n", 2)
+    covariance_px2: Array = array("n", 2, 2)
+    flux_e: Array = array("n")  # whole-PSF flux [electrons, or ADU when the gain is unknown]
+    snr: Array = array("n")  # matched-filter signal-to-noise ratio
+    saturated: Bools = array("n", dtype=np.bool_)
+    psf_sigma_px: float  # Gaussian PSF before integration over the pixel, as used
+    brightness_sigma_mag: float = 0.0  # added to each star's sigma; infinite where only the order is known
+
+    def __len__(self) -> int:
+        return len(self.snr)
+
+    def take(self: T, which: Any) -> T:
+        """The sources selected by a mask, slice or index array."""
+        return take_rows(self, which)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detections(Centroids):
+    """Point sources found in an exposure, brightest first, with the images that they were measured against."""
+
+    flux_sigma_e: Array = array("n")
+    image_e: NDArray[np.float32]  # (H, W) the exposure [e], pedestal included
+    dead: NDArray[np.bool_]  # (H, W) saturated and masked pixels
+    background_e: NDArray[np.float32]  # (H, W) smooth background [e], pedestal included
+    noise_e: NDArray[np.float32]  # (H, W) noise of one pixel [e]
+    mask: Mask | None = None  # of camera and image together; masked pixels of `image_e` hold their surroundings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stars(Value):
+    """Catalogue stars as seen at one time and position: proper motion and aberration applied."""
+
+    catalog_id: NDArray[np.str_] = array("n", dtype=np.str_)  # such as "HIP 123"
+    hip: Ints = array("n", dtype=np.int64)  # 0 where the star has no Hipparcos number
+    rays_icrs: Array = array("n", 3)  # apparent directions
+    v_mag: Array = array("n")
+    v_sigma_mag: Array = array("n")  # catalogue, colour, variability, unresolved companions
+
+    def __len__(self) -> int:
+        return len(self.v_mag)
+
+    def take(self, which: Any) -> Stars:
+        """The stars that a mask, slice or index array `which` selects."""
+        return take_rows(self, which)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Body(Value):
+    """A planet, the Earth, the Sun or the Moon as a light source."""
+
+    name: str
+    ray_icrs: Array = array(3)  # apparent direction (light time and aberration applied)
+    v_mag: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attitude(Value):
+    """Rotation of the camera with the covariance of small rotations about the camera's own axes."""
+
+    R_cam_icrs: Array = array(3, 3)
+    covariance_rad2: Array = array(3, 3)  # of the rotation vector w about cam x, y, z: R_true = exp(w) R
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identification(Value):
+    """Which detection is which catalogue star; one-to-one."""
+
+    detection: Ints = array("n", dtype=np.int64)  # index into Detections
+    star: Ints = array("n", dtype=np.int64)  # index into Stars
+    R_cam_icrs: Array = array(3, 3)  # attitude at which the matches were verified
+    false_alarm_probability: float  # that a sky of random detections would be accepted as well matched
+    unexplained: int  # significant detections that no catalogue star explains
+
+    def __len__(self) -> int:
+        return len(self.star)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clock(Value):
+    """How directions in enu depend on an error of the clock.
+
+    The prior of its error is a mixture: `sigma_s`, or with `gross_probability` the wider `gross_sigma_s`, which is
+    also what the error would be if a stated `sigma_s` were wrong.
+    """
+
+    turn_rad_s: Array = array(3)  # rotation vector in enu: by one second that the true time is later
+    sigma_s: float  # of the stated time
+    offset_s: float = 0.0  # by which the directions' time is later than the stated one
+    reach_s: float = np.inf  # the true time is no farther from the directions' time
+    gross_probability: float = 0.0  # above 0 where `sigma_s` is not stated
+    gross_sigma_s: float = 0.0
+
+    def log_prior(self, later_s: Any) -> Any:
+        """Logarithm of the prior density, less its maximum and its gross part, `later_s` than the directions' time."""
+        return -0.5 * np.square((self.offset_s + later_s) / self.sigma_s)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageErrors:
+    """Errors of attitude and lens: they raise the skyline that the sky's light shows, not that of the stars.
+
+    Arrays over sectors of azimuth begin at north and go eastward.
+    """
+
+    raised_rad: Array  # (sectors, j) by one unit of each
+    mean: Array  # (j,)
+    covariance: Array  # (j, j)
+    variance_rad2: Array  # (sectors,) of the skyline by the light of the sky alone; infinite where it shows none
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence(Value):
+    """Rays, each with a log-likelihood ratio l: visible sky against hidden by the terrain.
+
+    Rows may come from stars, from pixels of the diffuse sky, and from several exposures. With V the fraction of the
+    ray above the horizon (a step, or Phi((elevation - horizon) / sigma)) a row contributes
+    log(V e^l + 1 - V) for a point source, and l V + c V (1 - V) / 2 for extended light, c = `extended_nats`.
+
+    `edge_sigma_rad` and `extended_nats` may each be one number for all rows. Raises ValueError for arrays of different
+    lengths, numbers that are not finite, elevations that are no angles in radians, and negative sigmas or light.
+    """
+
+    azimuth_rad: Array = array("n")  # in enu
+    elevation_rad: Array = array("n")  # in enu
+    llr: Array = array("n")  # natural logarithm; 0 carries no information
+    edge_sigma_rad: Array = array("n", default=0.0)  # width of the edge: uncertainty of the elevation, or the PSF
+    extended_nats: Array = array("n", default=0.0)  # (light / noise)^2 of extended light; 0: a point source
+    clock: Clock | None = None  # one for all rows; None: the time is exact
+    near: PositionPrior | None = None  # of the camera's position; None: anywhere in the search area
+    image_errors: ImageErrors | None = None  # of the rows of extended light; None: these are exact
+    support: Any = None  # samples of an earlier fix from much the same rows; None: the whole area is searched
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not all(np.isfinite(getattr(self, name)).all() for name in self._columns()):
+            raise ValueError("Evidence holds an infinite number")
+        if not len(self):
+            return
+        highest = max(self.elevation_rad.max(), -self.elevation_rad.min())
+        if highest > MOST_ELEVATION_RAD:
+            raise ValueError(f"Evidence.elevation_rad: {highest:g} is beyond pi/2, the zenith: is it in radians?")
+        for name in ("edge_sigma_rad", "extended_nats"):
+            least = getattr(self, name).min()
+            if least < 0:
+                raise ValueError(f"Evidence.{name}: {least:g} is negative")
+        if not 0.0 <= self.azimuth_rad.min() <= self.azimuth_rad.max() < 2 * np.pi:
+            wrapped = np.mod(self.azimuth_rad, 2 * np.pi)
+            wrapped.flags.writeable = False
+            object.__setattr__(self, "azimuth_rad", wrapped)
+
+    def take(self, which: Any) -> Evidence:
+        """The rows that a mask, slice or index array `which` selects."""
+        return take_rows(self, which)
+
+    @classmethod
+    def concatenate(cls, *parts: Evidence) -> Evidence:
+        """The rows of all `parts`, of several sources or exposures, in one value, with the first clock and so on."""
+        shared: dict[str, Any] = {
+            name: next((getattr(part, name) for part in parts if getattr(part, name) is not None), None)
+            for name in ("clock", "near", "image_errors", "support")
+        }
+        return cls(**shared | {n: np.concatenate([getattr(part, n) for part in parts]) for n in cls._columns()})
+
+    @classmethod
+    def _columns(cls) -> list[str]:
+        return [f.name for f in fields(cls) if "shape" in f.metadata]
+
+    def __len__(self) -> int:
+        return len(self.llr)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredSkyline(Value):
+    """A skyline measured in photographs: apparent elevations, refraction included, at azimuths in enu."""
+
+    azimuth_rad: Array = array("n")
+    elevation_rad: Array = array("n", may_be_nan=True)  # nan where unknown
+    sigma_rad: Array = array("n")  # infinite where unknown
+    source: NDArray[np.str_] = array("n", dtype=np.str_)  # "stars", "sky light", "both"; "" where unknown
+
+    def __len__(self) -> int:
+        return len(self.azimuth_rad)
+
+    @property
+    def known(self) -> Bools:
+        """Whether the elevation is known at each azimuth (n,)."""
+        return np.isfinite(self.elevation_rad)

@@ -1,0 +1,1 @@
+"""Statistics of directions: attitude, least squares, matches of detections and stars, chance."""

@@ -1,0 +1,293 @@
+"""Least-squares adjustment of attitudes and lens parameters to measured pixels, robust if requested.
+
+One loop serves the attitude of a calibrated camera, the lens of an unknown one and a calibration of many images.
+Callers choose the free lens parameters, the loss, a prior, and whether the variance beyond the stated centroid errors
+(lens, blends, catalogue) is estimated on the way so that the chi-square fits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+
+from startrack.camera import Camera
+from startrack.camera.parameters import with_update
+from startrack.camera.uncertainty import lens_jacobian
+from startrack.core.types import Array, NotIdentified
+from startrack.estimation.normal_equations import NormalEquations, Observations, Terms
+from startrack.frames import R_from_rotvec
+
+CHI2_2DOF_MEDIAN = 1.3863
+OUTLIER_CHI2 = 16.0  # 4 sigma in each axis: rejects one good star in 3000
+HUBER_SIGMAS = 2.5  # residual beyond which the influence of an observation is constant
+MIN_STARS = 3
+SMALLEST_EXTRA_PX2, LARGEST_EXTRA_PX2 = 1e-6, 1e8
+SMALLEST_DAMPING, FIRST_DAMPING, MAX_DAMPING = 1e-12, 1e-6, 1e6
+SMALLEST_RISE_RAD = 0.2  # angle up to which the radius of a valid lens must increase
+
+
+class Adjustable(Protocol):
+    """Interface of the unknowns of `adjust`: State, or a state of boards or of a narrow field."""
+
+    @property
+    def rotations(self) -> Array: ...  # (images, 3, 3)
+    @property
+    def is_valid(self) -> bool: ...
+    def rays_cam(self, points: Observations) -> Array: ...
+    def residual_px(self, points: Observations, rays_cam: Array) -> Array: ...
+    def terms(self, points: Observations, rays_cam: Array, free: tuple[str, ...]) -> Terms: ...
+    def step(self, free: tuple[str, ...], lens: Array, poses: Array) -> Any: ...
+
+
+class CameraState(Adjustable, Protocol):
+    """An adjustable dataclass with a camera."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def camera(self) -> Camera: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """A camera and the attitudes R_cam_icrs (images, 3, 3) of its images: what an adjustment changes."""
+
+    camera: Camera
+    R_cam_icrs: Array
+
+    def rays_cam(self, points: Observations) -> Array:
+        """Directions (n, 3) of the observations in their cameras' axes."""
+        if len(self.R_cam_icrs) == 1:
+            return np.asarray(points.rays_icrs @ self.R_cam_icrs[0].T)
+        return np.einsum("nij,nj->ni", self.R_cam_icrs[points.image], points.rays_icrs)
+
+    def residual_px(self, points: Observations, rays_cam: Array) -> Array:
+        """Measured minus predicted pixels (n, 2), also outside the frame and the calibrated angle."""
+        return points.xy_px - self.camera.project_unlimited(rays_cam)
+
+    def terms(self, points: Observations, rays_cam: Array, free: tuple[str, ...]) -> Terms:
+        """Derivatives of the predicted pixels by the free lens parameters and the attitudes."""
+        lens = lens_jacobian(self.camera, rays_cam, free) if free else np.zeros((len(rays_cam), 2, 0))
+        return Terms(lens, self.camera.jacobian_px_per_rad(rays_cam), points.image, len(self.R_cam_icrs))
+
+    def step(self, free: tuple[str, ...], lens: Array, poses: Array) -> State:
+        """The state after a step of the free lens parameters (m,) and of the attitudes (images, 3) [rad]."""
+        camera = with_update(self.camera, dict(zip(free, lens.tolist(), strict=True))) if free else self.camera
+        return replace(self, camera=camera, R_cam_icrs=R_from_rotvec(poses) @ self.R_cam_icrs)
+
+    @property
+    def rotations(self) -> Array:
+        """R_cam_icrs (images, 3, 3)."""
+        return self.R_cam_icrs
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether the radius of the lens grows with the angle near the axis: a step must not fold the image."""
+        return min(self.camera.focal_px) > 0 and self.camera.lens.max_invertible_rad > SMALLEST_RISE_RAD
+
+
+class Loss(NamedTuple):
+    """A loss as a function of an observation's chi-square, and the factor by which it changes the weight."""
+
+    cost: Callable[[Array], Array]
+    weight_factor: Callable[[Array], Array]
+
+
+def cauchy_loss(scale_chi2: float) -> Loss:
+    """Cauchy's loss: the weight is halved at the chi-square `scale_chi2`, and tends to 0 for wrong matches."""
+    return Loss(lambda chi2: scale_chi2 * np.log1p(chi2 / scale_chi2), lambda chi2: 1.0 / (1.0 + chi2 / scale_chi2))
+
+
+def _huber_factor(chi2: Array) -> Array:
+    factor = np.minimum(1.0, HUBER_SIGMAS / np.sqrt(np.maximum(chi2, 1e-12)))
+    return np.where(chi2 < OUTLIER_CHI2, factor, 0.0)
+
+
+SQUARES = Loss(lambda chi2: chi2, np.ones_like)
+HUBER_WITH_CUT = Loss(lambda chi2: np.minimum(chi2, OUTLIER_CHI2), _huber_factor)
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Knowledge of the free lens parameters before the adjustment, each (m,)."""
+
+    sigma: Array
+    offset: Array  # expected value minus the value at the start
+
+    @property
+    def precision(self) -> Array:
+        """(m,)"""
+        return np.asarray(self.sigma**-2.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scheme:
+    """Settings of the iteration of an adjustment."""
+
+    loss: Loss = SQUARES
+    steps: int = 40
+    settled_px: float = 1e-6  # RMS shift of the predictions below which it ends
+    damped: bool = True  # Levenberg-Marquardt; False: Gauss-Newton, for good starts
+    estimates_extra: bool = False  # variance beyond the stated one from the residuals at each step; not damped
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solution:
+    """Result of `adjust`."""
+
+    state: Any  # of the type of the start
+    terms: Terms
+    equations: NormalEquations  # at the solution
+    residual_px: Array  # (n, 2)
+    chi2: Array  # (n,) with the extra variance added
+    inverse: Array  # (n, 2, 2) inverse covariances, the extra variance added
+    weight: Array  # (n, 2, 2) these, times the factor of the loss
+    extra_px2: float
+
+    @property
+    def parameters(self) -> int:
+        """Number of fitted parameters."""
+        return self.terms.lens.shape[2] + self.terms.pose.shape[2] * self.terms.images
+
+
+def adjust(
+    start: Any, points: Observations, free: tuple[str, ...], scheme: Scheme, *, extra_px2: float = 0.0,
+    prior: Prior | None = None,
+) -> Solution:  # fmt: skip
+    """Adjust a state (State or a class with its methods) to the observations, from a start that is roughly right.
+
+    `extra_px2`: variance per axis beyond the stated one, unless the scheme estimates it. Raises
+    NotIdentified where a loss with a cut leaves fewer than 3 observations.
+    """
+    damped = scheme.damped and not scheme.estimates_extra
+    state, settled, extra, moved = start, False, extra_px2, np.zeros(len(free))
+    rays = state.rays_cam(points)
+    residual = state.residual_px(points, rays)
+    inverse = inverse_covariance(points.covariance_px2, extra)
+    damping = _Damping(points, free, scheme.loss, inverse, prior) if damped else None
+    for k in range(scheme.steps):
+        if scheme.estimates_extra:
+            extra = extra_variance_px2(residual, points.covariance_px2, len(free) + 3 * points.images)
+            inverse = inverse_covariance(points.covariance_px2, extra)
+        factor = scheme.loss.weight_factor(chi_square(residual, inverse))
+        if (agreeing := int(np.count_nonzero(factor))) < MIN_STARS:
+            raise NotIdentified("fewer than 3 stars agree on an attitude", matched=agreeing)
+        weight = inverse * factor[:, None, None]
+        terms = state.terms(points, rays, free)
+        equations = terms.normal_equations(weight, residual)
+        if prior is not None:
+            equations = equations.with_prior(prior.precision, prior.offset - moved)
+        if settled:
+            break
+        before = residual
+        if damping is not None:
+            trial = damping.step(equations, state, residual, moved)
+            if trial is None:
+                break
+            state, rays, residual, lens = trial
+        else:
+            lens, poses = equations.solve()
+            state = state.step(free, lens, poses)
+            if k == scheme.steps - 1 and not scheme.estimates_extra:
+                break  # the residual of a few plain steps is not used
+            rays = state.rays_cam(points)
+            residual = state.residual_px(points, rays)
+        moved = moved + lens
+        settled = len(residual) == 0 or float(np.sqrt(np.mean(np.square(residual - before)))) < scheme.settled_px
+        if settled and not damped:
+            break  # the equations of the last step are good enough
+    return Solution(
+        state=state, terms=terms, equations=equations, residual_px=residual, chi2=chi_square(residual, inverse),
+        inverse=inverse, weight=weight, extra_px2=extra,
+    )  # fmt: skip
+
+
+@dataclass
+class _Damping:
+    """Marquardt's damping: a step is taken only if it lowers the cost."""
+
+    points: Observations
+    free: tuple[str, ...]
+    loss: Loss
+    inverse: Array  # (n, 2, 2)
+    prior: Prior | None
+    damping: float = FIRST_DAMPING
+
+    def step(
+        self, equations: NormalEquations, state: Any, residual_px: Array, moved: Array
+    ) -> tuple[Any, Array, Array, Array] | None:
+        """New state, its rays and residuals, and the step of the lens parameters; None where no step lowers the cost.
+
+        `moved`: sum of the earlier steps of the lens parameters (m,).
+        """
+        cost = self.cost(residual_px, moved)
+        while self.damping < MAX_DAMPING:
+            lens, poses = equations.with_damping(self.damping).solve()
+            trial = state.step(self.free, lens, poses)
+            rays = trial.rays_cam(self.points)
+            residual = trial.residual_px(self.points, rays)
+            if self.cost(residual, moved + lens) <= cost * (1 + 1e-12) and trial.is_valid:
+                self.damping = max(self.damping / 30.0, SMALLEST_DAMPING)
+                return trial, rays, residual, lens
+            self.damping = max(self.damping * 10.0, FIRST_DAMPING)
+        return None
+
+    def cost(self, residual_px: Array, moved: Array) -> float:
+        """Loss of the residuals (n, 2) and of the prior."""
+        by_data = float(np.sum(self.loss.cost(chi_square(residual_px, self.inverse))))
+        if self.prior is None:
+            return by_data
+        return by_data + float(np.sum(self.prior.precision * np.square(self.prior.offset - moved)))
+
+
+def inverse_covariance(covariance_px2: Array, extra_px2: float) -> Array:
+    """Inverses (n, 2, 2) of the covariances (n, 2, 2) with a variance per axis added."""
+    xx, yy, xy = covariance_px2[:, 0, 0] + extra_px2, covariance_px2[:, 1, 1] + extra_px2, covariance_px2[:, 0, 1]
+    by_determinant = 1.0 / (xx * yy - xy * xy)
+    inverse = np.empty((len(xx), 2, 2))
+    inverse[:, 0, 0], inverse[:, 1, 1] = yy * by_determinant, xx * by_determinant
+    inverse[:, 0, 1] = inverse[:, 1, 0] = -xy * by_determinant
+    return inverse
+
+
+def chi_square(residual_px: Array, inverse: Array) -> Array:
+    """Normalised squared residuals (n,) of residuals (n, 2) with inverse covariances (n, 2, 2)."""
+    x, y = residual_px.T
+    return np.asarray(inverse[:, 0, 0] * x * x + 2.0 * inverse[:, 0, 1] * x * y + inverse[:, 1, 1] * y * y)
+
+
+def extra_variance_px2(
+    residual_px: Array, covariance_px2: Array, parameters: int = 3, *, by_sum: bool = False
+) -> float:
+    """Variance per axis [px^2] to add to every centroid so that the chi-square is as expected; at least 1e-6.
+
+    The median of the residuals' chi-squares (n,) is compared with that of two degrees of freedom; `by_sum`: their sum
+    with the degrees of freedom, for residuals without outliers. `parameters`: number of fitted parameters, which
+    are subtracted from the degrees of freedom of the residuals (n, 2).
+    """
+    from scipy.optimize import brentq
+
+    n = len(residual_px)
+    axes_px2, axes = np.linalg.eigh(covariance_px2)
+    squared = np.square(np.einsum("nij,ni->nj", axes, residual_px)).T
+    axes_px2 = np.ascontiguousarray(axes_px2.T)
+    middle_two = (n - 1) // 2, n // 2
+    expected = max(2.0 * n - parameters, 1.0) if by_sum else CHI2_2DOF_MEDIAN * max(1.0 - 0.5 * parameters / n, 0.1)
+
+    def excess(log_extra: float) -> float:
+        along = squared / (axes_px2 + np.exp(log_extra))
+        chi2 = along[0] + along[1]
+        if by_sum:
+            return float(chi2.sum()) - expected
+        ordered = np.partition(chi2, middle_two)  # a third of the time of numpy.median
+        return 0.5 * float(ordered[middle_two[0]] + ordered[middle_two[1]]) - expected
+
+    low, high = float(np.log(SMALLEST_EXTRA_PX2)), 0.0
+    if excess(low) <= 0.0:
+        return SMALLEST_EXTRA_PX2
+    while excess(high) > 0.0 and high < np.log(LARGEST_EXTRA_PX2):
+        low, high = high, high + np.log(4.0)
+    return float(np.exp(brentq(excess, low, high, xtol=1e-6))) if excess(high) < 0.0 else float(np.exp(high))

@@ -1,0 +1,107 @@
+"""Attitude of a calibrated camera from matched stars, with a covariance that includes the lens's uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from startrack.camera import Camera
+from startrack.camera.uncertainty import lens_jacobian
+from startrack.core.types import Array, Attitude, Bools, NotIdentified
+from startrack.estimation.adjust import HUBER_WITH_CUT, MIN_STARS, OUTLIER_CHI2, Scheme, State, adjust
+from startrack.estimation.normal_equations import observations_of_image
+
+MIN_FOR_SCATTER = 30  # stars from which the scatter of the residuals is a better covariance than the stated one
+SCHEME = Scheme(loss=HUBER_WITH_CUT, steps=12, estimates_extra=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttitudeFit:
+    """Result of `solve_attitude`."""
+
+    attitude: Attitude
+    centroid_covariance_rad2: Array  # (3, 3) part of the attitude's covariance that is not the lens's
+    residual_px: Array  # (n, 2) measured minus predicted
+    used: Bools  # (n,) not rejected as outliers
+    rms_px: float  # of the used stars, per axis
+    extra_sigma_px: float  # error per axis beyond the stated centroid errors (lens, blends, catalogue)
+    centre_shift_px: Array  # (2,) by which the image stands off the camera's centre, by the used stars
+    centre_chi2: float  # of that shift, two degrees of freedom
+
+
+def solve_attitude(
+    camera: Camera, xy_px: Array, covariance_px2: Array, rays_icrs: Array, R_cam_icrs: Array
+) -> AttitudeFit:
+    """Attitude that fits measured pixels (n, 2) with covariances (n, 2, 2) of stars (n, 3), outliers rejected.
+
+    `R_cam_icrs` (3, 3): a start within some pixels. The scatter of the residuals sets an error common to all stars,
+    which is added to every centroid. An error of the lens (the camera's covariance) shifts the stars together, so that
+    the scatter does not contain it: it is added to the attitude's covariance. Raises NotIdentified with fewer than 3
+    stars.
+    """
+    if len(xy_px) < MIN_STARS:
+        raise NotIdentified("fewer than 3 stars agree on an attitude", matched=len(xy_px))
+    points = observations_of_image(xy_px, covariance_px2, rays_icrs)
+    start = State(camera=camera, R_cam_icrs=np.array(R_cam_icrs)[None])
+    found = adjust(start, points, (), SCHEME)
+    used = found.chi2 < OUTLIER_CHI2
+    jacobian, weight, residual = found.terms.pose[used], found.weight[used], found.residual_px[used]
+    by_stars = _attitude_covariance(jacobian, found.inverse[used], weight, residual)
+    rays_cam = found.state.rays_cam(points)[used]
+    by_lens = _attitude_covariance_by_lens(camera, rays_cam, jacobian, weight)
+    centre_shift, centre_chi2 = _centre_shift(camera, rays_cam, jacobian, weight, residual)
+    return AttitudeFit(
+        attitude=Attitude(R_cam_icrs=found.state.R_cam_icrs[0], covariance_rad2=by_stars + by_lens),
+        centroid_covariance_rad2=by_stars,
+        residual_px=found.residual_px,
+        used=used,
+        rms_px=float(np.sqrt(np.mean(residual**2))),
+        extra_sigma_px=float(np.sqrt(found.extra_px2)),
+        centre_shift_px=centre_shift,
+        centre_chi2=centre_chi2,
+    )
+
+
+def _attitude_covariance(jacobian: Array, inverse: Array, weight: Array, residual_px: Array) -> Array:
+    """Covariance (3, 3) from the stated errors, or from the scatter of the residuals where that is larger.
+
+    The second is the sandwich H^-1 (sum s s^T) H^-1 of the stars' scores s: it is valid for heavy tails and for
+    centroid errors larger than stated, but is noisy with few stars.
+    """
+    stated = np.linalg.inv(np.einsum("nia,nij,njb->ab", jacobian, inverse, jacobian, optimize=True))
+    n = len(residual_px)
+    if n < MIN_FOR_SCATTER:
+        return np.asarray(stated)
+    bread = np.linalg.inv(np.einsum("nia,nij,njb->ab", jacobian, weight, jacobian, optimize=True))
+    scores = np.einsum("nia,nij,nj->na", jacobian, weight, residual_px, optimize=True)
+    by_scatter = bread @ (scores.T @ scores) @ bread * (n / (n - 3))
+    return np.asarray(stated * max(1.0, float(np.trace(by_scatter) / np.trace(stated))))
+
+
+def _centre_shift(
+    camera: Camera, rays_cam: Array, jacobian: Array, weight: Array, residual_px: Array
+) -> tuple[Array, float]:
+    """Shift (2,) of the image's centre that the residuals ask for beside a rotation, and its chi2; 0 of few stars."""
+    if len(residual_px) < MIN_FOR_SCATTER:
+        return np.zeros(2), 0.0
+    design = np.concatenate([jacobian, lens_jacobian(camera, rays_cam, ("cx", "cy"))], axis=2)
+    weighted = np.einsum("nia,nij->naj", design, weight)
+    covariance = np.linalg.inv(np.einsum("naj,njb->ab", weighted, design))
+    shift = (covariance @ np.einsum("naj,nj->a", weighted, residual_px))[3:]
+    return shift, float(shift @ np.linalg.solve(covariance[3:, 3:], shift))
+
+
+def _attitude_covariance_by_lens(camera: Camera, rays_cam: Array, jacobian: Array, weight: Array) -> Array:
+    """Covariance (3, 3) of the attitude's response to an error of the lens; 0 where the camera has no covariance.
+
+    For a lens fitted to these very stars the sum of both covariances is the marginal of the joint fit, provided that
+    the camera's covariance is its marginal too (the inverse of a matrix in blocks).
+    """
+    if camera.covariance is None:
+        return np.zeros((3, 3))
+    weighted = np.einsum("nia,nij->naj", jacobian, weight)
+    by_rotation = np.einsum("naj,njb->ab", weighted, jacobian)
+    by_lens = np.einsum("naj,njm->am", weighted, lens_jacobian(camera, rays_cam, camera.covariance_order))
+    response = np.linalg.solve(by_rotation, by_lens)
+    return np.asarray(response @ camera.covariance @ response.T)

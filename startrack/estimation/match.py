@@ -1,0 +1,232 @@
+"""One-to-one matches of detections with predicted stars, by position and by brightness.
+
+Three steps are common to all callers: each star takes its nearest detection within a gate; pairs of different
+brightness are dropped; each detection keeps its nearest star. Two policies exist for stars that share one detection:
+`match_by_brightness` drops them, `CandidatePairs.select_unambiguous` names the detection after the brightest of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from startrack.core.types import Array, Bools, Ints
+
+DEPTH_BELOW_THRESHOLD_MAG = 0.7  # stars this much fainter than the faintest detection may still be detected
+BRIGHTER_MAG = 0.8  # a detection is at most this much brighter than its star
+DIMMED_MAG = 1.6  # and at most this much fainter: haze, branches, the edge of the lens
+PX_PER_MAG = 0.6  # distance with the same cost as a difference of one magnitude
+DISTINCT_MAG = 0.3  # if one of the stars that share a detection is this much brighter, the detection is named after it
+DECISIVE_NATS = 12.0  # log-likelihood ratio that decides between two positions
+SIGNIFICANT_SNR = 10.0  # detections above this should have a catalogue star
+MIN_UNSATURATED = 3  # for the photometric scale; below this, saturated stars are used too
+SMALLEST_FLUX = 1e-9
+
+
+def instrumental_mag(flux: Array) -> Array:
+    """-2.5 log10 of fluxes (n,), in any unit; fluxes that are not positive count as very faint."""
+    return np.asarray(-2.5 * np.log10(np.maximum(flux, SMALLEST_FLUX)))
+
+
+def upper_median(values: Array) -> float:
+    """The upper median of values (n,), in a third of the time of numpy.median."""
+    return float(np.sort(values)[len(values) // 2])
+
+
+def is_last_occurrence(numbers: Ints) -> Bools:
+    """Whether each of the numbers (n,), all at least 0, occurs at no later index."""
+    index = np.arange(len(numbers))
+    last = np.empty(numbers.max(initial=-1) + 1, dtype=np.int64)
+    last[numbers] = index  # of equal numbers the last assignment stays
+    standing: Bools = last[numbers] == index
+    return standing
+
+
+def select_closest(detection: Ints, distance: Array) -> Ints:
+    """Ascending indices into the pairs (n,) of the pair with the smallest distance for each detection."""
+    order = np.lexsort((distance, detection))
+    return np.sort(order[np.flatnonzero(np.diff(detection[order], prepend=-1))])
+
+
+def match_nearest(tree: Any, px: Array, gate_px: float) -> tuple[Ints, Ints, Array]:
+    """(detection, star, distance [px]), one-to-one: of the stars nearest to a detection the closest one.
+
+    `tree`: cKDTree of the detections' pixels. `px` (n, 2): predicted pixels. Pairs are sorted by detection.
+    """
+    distance, detection = tree.query(px, distance_upper_bound=gate_px)
+    star = np.flatnonzero(np.isfinite(distance))
+    star = star[np.lexsort((distance[star], detection[star]))]
+    star = star[np.flatnonzero(np.diff(detection[star], prepend=-1))]
+    return detection[star].astype(np.int64), star, distance[star]
+
+
+def match_mutual(xy_px: Array, px: Array, gate_px: float) -> tuple[Ints, Ints]:
+    """(detection, star) that are each other's nearest within the gate, sorted by star.
+
+    Stricter than `match_nearest`: a detection whose nearest star belongs to another detection stays unmatched.
+    """
+    from scipy.spatial import cKDTree
+
+    distance, detection = cKDTree(xy_px).query(px, distance_upper_bound=gate_px)
+    _, back = cKDTree(px).query(xy_px, distance_upper_bound=gate_px)
+    star = np.flatnonzero(np.isfinite(distance))
+    star = star[back[detection[star]] == star]
+    return detection[star].astype(np.int64), star
+
+
+def match_by_brightness(
+    tree: Any, px: Array, star: Ints, gate_px: float, *, star_mag: Array, star_sigma_mag: Array, detection_mag: Array,
+    saturated: Bools, limit_mag: float, tolerance_mag: float,
+) -> tuple[Ints, Ints, Array]:  # fmt: skip
+    """(detection, star, distance [px]) of the nearest pairs of equal brightness, one-to-one, blends included.
+
+    `px` (m, 2): predicted pixels of the catalogue; `star` (n,): its stars in the frame. `star_mag`, `star_sigma_mag`
+    (m,) and `detection_mag` (d,) are on one scale. Stars fainter than `limit_mag` are not matched. A saturated
+    detection may be fainter than its star by any amount.
+    """
+    distance, nearest = tree.query(px[star], distance_upper_bound=gate_px)
+    hit = np.isfinite(distance) & (star_mag[star] < limit_mag)
+    star, detection, distance = star[hit], nearest[hit], distance[hit]
+    fainter = star_mag[star] - detection_mag[detection]
+    agree = np.abs(fainter) < np.hypot(tolerance_mag, 2.0 * star_sigma_mag[star])
+    agree |= saturated[detection] & (fainter < 0)
+    star, detection, distance = star[agree], detection[agree], distance[agree]
+    keep = select_closest(detection, distance)
+    return detection[keep], star[keep], distance[keep]
+
+
+def is_isolated(
+    at_px: Array, star: Ints, px: Array, seen: Ints, mag: Array, radius_px: float, blend_mag: float
+) -> Bools:
+    """Whether no other star of comparable brightness is predicted within the radius of the pixels `at_px` (k, 2).
+
+    `star` (k,): the star matched there. `px` (m, 2), `mag` (m,): the catalogue; `seen` (n,): its stars in the frame.
+    """
+    from scipy.spatial import cKDTree
+
+    if not len(star):
+        return np.zeros(0, dtype=bool)
+    near = cKDTree(px[seen]).query_ball_point(at_px, radius_px)
+    limit = mag[star] + blend_mag
+    return np.array(
+        [
+            not any(seen[j] != own and mag[seen[j]] < faintest for j in others)
+            for others, own, faintest in zip(near, star, limit, strict=True)
+        ],
+        dtype=bool,
+    )
+
+
+@dataclass(frozen=True)
+class PhotometricScale:
+    """Brightness of a list of detections on the catalogue's scale."""
+
+    measured_mag: Array  # (n,) V of the detection if it is a star
+    saturated: Bools  # (n,) then `measured_mag` is an upper limit of V
+    limit_mag: float  # stars fainter than this are not detected
+    complete_mag: float  # stars brighter than this are detected unless something hides them
+
+    @classmethod
+    def from_matches(cls, flux_e: Array, saturated: Bools, v_mag: Array, detection: Ints) -> PhotometricScale:
+        """Scale from stars of magnitudes `v_mag` (k,) that lie on the detections `detection` (k,)."""
+        brightness = instrumental_mag(flux_e)
+        usable = ~saturated[detection]
+        if np.count_nonzero(usable) >= MIN_UNSATURATED:
+            v_mag, detection = v_mag[usable], detection[usable]
+        measured = brightness + upper_median(v_mag - brightness[detection])
+        faintest = float(measured.max())
+        return cls(measured, saturated, faintest + DEPTH_BELOW_THRESHOLD_MAG, faintest)
+
+
+def brightness_agreement(v_mag: Array, measured_mag: Array, dimmed_mag: float = BRIGHTER_MAG) -> float:
+    """Fraction of all pairs (star, detection) that agree in brightness, stars dimmed by at most `dimmed_mag`."""
+    ordered = np.sort(measured_mag)
+    first = np.searchsorted(ordered, v_mag - BRIGHTER_MAG)
+    last = np.searchsorted(ordered, v_mag + dimmed_mag)
+    return float((last - first).sum() / (len(v_mag) * len(ordered))) if len(v_mag) else 1.0
+
+
+@dataclass(frozen=True)
+class CandidatePairs:
+    """All pairs of a detection and a nearby star at one attitude."""
+
+    detection: Ints  # (k,) ascending
+    star: Ints  # (k,)
+    distance_px: Array  # (k,) infinite for stars outside the frame
+    v_mag: Array  # (k,)
+    v_sigma_mag: Array  # (k,)
+    scale: PhotometricScale
+
+    @cached_property
+    def dimming_mag(self) -> Array:
+        """Magnitudes (k,) by which a detection is fainter than its star, beyond twice the catalogue's sigma."""
+        dimmed = self.scale.measured_mag[self.detection] - self.v_mag
+        dimmed[self.scale.saturated[self.detection] & (dimmed > 0)] = 0.0
+        beyond: Array = np.copysign(np.maximum(np.abs(dimmed) - 2 * self.v_sigma_mag, 0.0), dimmed)
+        return beyond
+
+    @cached_property
+    def brightness_misfit(self) -> Array:
+        """Difference in brightness (k,) as a fraction of the limit: DIMMED_MAG or BRIGHTER_MAG."""
+        return np.maximum(self.dimming_mag / DIMMED_MAG, self.dimming_mag / -BRIGHTER_MAG)
+
+    @cached_property
+    def agrees_in_brightness(self) -> Bools:
+        """Whether star and detection (k,) may be equally bright."""
+        return self.brightness_misfit < 1.0
+
+    @cached_property
+    def one_to_one_pairs(self) -> Ints:
+        """Ascending indices of the pairs that are each other's nearest and agree in brightness.
+
+        Distance and difference in brightness are added, PX_PER_MAG for a magnitude.
+        """
+        by_cost = np.argsort(-self.distance_px - PX_PER_MAG * np.abs(self.dimming_mag))
+        by_cost = by_cost[np.isfinite(self.distance_px[by_cost])]
+        by_cost = by_cost[is_last_occurrence(self.star[by_cost])]
+        by_cost = by_cost[self.agrees_in_brightness[by_cost]]
+        return np.sort(by_cost[is_last_occurrence(self.detection[by_cost])])
+
+    def select_unambiguous(self, which: Ints, variance_px2: Array, radius_px: float) -> Ints:
+        """The one-to-one pairs `which` (m,) with an unambiguous star; `variance_px2` (m,) is per axis.
+
+        Stars within the radius of a detection that have no detection of their own are blended with it. The detection is
+        named after the brightest of them if its position allows that. It is dropped if another star is nearly as
+        bright and the position does not decide between them.
+        """
+        sources = len(self.scale.measured_mag)
+        own, faintest = np.full(sources, -1), np.full(sources, -np.inf)
+        own[self.detection[which]] = self.star[which]
+        faintest[self.detection[which]] = self.v_mag[which] + DISTINCT_MAG
+        rival = (self.distance_px < radius_px) & (self.v_mag < faintest[self.detection])
+        rival &= self.star != own[self.detection]
+        crowded = np.unique(self.detection[rival])
+        if not len(crowded):
+            return which
+        named, sure, detected = which.copy(), np.ones(len(which), dtype=bool), set(self.star[which].tolist())
+        rows = np.searchsorted(self.detection, [crowded, crowded + 1]).T  # the pairs of a detection are adjacent
+        for i, (first, last) in zip(np.searchsorted(self.detection[which], crowded), rows, strict=True):
+            group = np.arange(first, last)[self.distance_px[first:last] < radius_px]
+            free = [s == self.star[which[i]] or s not in detected for s in self.star[group].tolist()]
+            group = group[free]
+            named[i] = group[np.argmin(self.v_mag[group])] if len(group) else which[i]
+            sure[i] = self._is_decided(int(named[i]), group, float(variance_px2[i]))
+            detected.add(int(self.star[named[i]]))
+        return named[sure]
+
+    def _is_decided(self, own: int, group: Ints, variance_px2: float) -> bool:
+        """Whether the pair `own` explains its detection, and no nearly as bright star of the pairs `group` does."""
+        squared = np.square(self.distance_px[group]) - self.distance_px[own] ** 2
+        if squared.min(initial=0.0) < -2 * DECISIVE_NATS * variance_px2 or not self.agrees_in_brightness[own]:
+            return False
+        rivals = (self.v_mag[group] < self.v_mag[own] + DISTINCT_MAG) & (self.star[group] != self.star[own])
+        return not np.any(squared[rivals] < 2 * DECISIVE_NATS * variance_px2)
+
+    def count_unexplained(self, snr: Array, gate_px: float) -> int:
+        """Number of significant detections without a star nearer than the gate."""
+        significant = snr > SIGNIFICANT_SNR
+        significant[self.detection[self.distance_px < gate_px]] = False
+        return int(np.count_nonzero(significant))

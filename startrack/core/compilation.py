@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger(__name__)
 VARIABLE = "NUMBA_CACHE_DIR"
+ABOVE_KERNELS = {"api", "applications", "chain", "cli", "identification", "output", "rendering"}  # no kernel uses them
 
 
 def choose_cache_folder() -> None:
@@ -107,7 +108,7 @@ def discard_stale_kernels() -> None:
     nor the types of its arguments. Called before numba loads.
     """
     key = hashlib.sha256(__version__.encode())
-    sources = sorted(PACKAGE.rglob("*.py"))
+    sources = sorted(p for p in PACKAGE.rglob("*.py") if p.relative_to(PACKAGE).parts[0] not in ABOVE_KERNELS)
     for source in sources:
         status = source.stat()
         key.update(f"{source.name} {status.st_size} {status.st_mtime_ns}".encode())

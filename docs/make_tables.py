@@ -12,7 +12,6 @@ import re
 from pathlib import Path
 
 import startrack
-
 from startrack.applications.tracking.quantities import FRAME_QUANTITIES
 from startrack.core.errors import Reason
 from startrack.output.quantities import QUANTITIES

@@ -14,9 +14,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import startrack
-from startrack import frames, types
+from startrack import frames
 from startrack.camera import Camera
 from startrack.catalog import bodies
+from startrack.core import types
 from startrack.frames import Site, parse_utc
 
 ROOT = Path(startrack.__file__).parent

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from scipy.special import ndtr
 from sky_helpers import EDGE_PX, ELEVATION_RAD, GROUND_E, NOISE_E, PX_PER_RAD, level_horizon, paint_pixels
 
+from startrack.core.kernels import normal_cdf
 from startrack.core.types import Array
-from startrack.estimation.normal_cdf import normal_cdf
 from startrack.evidence import Skyline
 from startrack.evidence.sky_checks import sectors_with_step
 from startrack.evidence.sky_levels import GROUND, LEVEL_SECTORS, SECTORS, SKY, SkyLevels, measure_levels, sector_of

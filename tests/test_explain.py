@@ -14,8 +14,7 @@ import pytest
 from startrack.chain.stages import Detected, Measured, Refused, extend
 from startrack.cli.main import main
 from startrack.core.errors import Reason
-from startrack.core.fix import Blocked, UnstatedFact
-from startrack.core.types import Mode
+from startrack.core.types import Blocked, Mode, UnstatedFact
 from startrack.output.explain import explain
 from startrack.output.schema import SCHEMAS
 

@@ -32,7 +32,7 @@ HEAVY = (
     "astropy", "cv2", "lunarsky", "matplotlib", "PIL", "rich", "rosbags", "scipy", "skimage", "skyfield", "spiceypy",
     "tifffile",
 )  # fmt: skip
-CV2_ROOMS = {"detection", "evidence", "exposure", "horizon", "output"}  # image processing at the top
+CV2_ROOMS = {"applications", "detection", "evidence", "exposure", "output"}  # image processing at the top
 
 
 def room_of(path: Path) -> str:

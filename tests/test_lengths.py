@@ -2,7 +2,7 @@
 
 import pytest
 
-from startrack.core.lengths import length_text
+from startrack.core.errors import length_text
 
 
 @pytest.mark.parametrize(

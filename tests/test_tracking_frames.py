@@ -15,8 +15,7 @@ from startrack.applications.tracking.frame_store import decode_frame, encode_fra
 from startrack.applications.tracking.observe import ObservedFrame, observe_again, observe_frame
 from startrack.applications.tracking.shared import BIAS, CLOCK, DEPTH, EDGE, TrackErrors
 from startrack.applications.tracking.smoother import Observations, Steps, smooth
-from startrack.core.fix import ShownError
-from startrack.core.types import BadInput, Clock, Evidence, ImageErrors
+from startrack.core.types import BadInput, Clock, Evidence, ImageErrors, ShownError
 from startrack.localization import ExactPosterior
 from startrack.localization.importance_sampling import sample
 from startrack.terrain import Cylinder, load_terrain

@@ -17,7 +17,6 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.core.errors import Reason
-from startrack.core.prior import PositionPrior
 from startrack.core.types import (
     Array,
     Attitude,
@@ -33,6 +32,7 @@ from startrack.core.types import (
     ImageErrors,
     Integrity,
     MeasuredSkyline,
+    PositionPrior,
     Stars,
 )  # fmt: skip
 from startrack.detection import Damage, Detector

@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
             f"--fov {args.fov} IMAGE... -o CAMERA.toml, then startrack locate -c CAMERA.toml"
         )
     from startrack.chain.pipeline import Settings
-    from startrack.core.prior import PositionPrior
+    from startrack.core.types import PositionPrior
 
     check_localizer(args)
     near = None if args.near is None else PositionPrior(*args.near)

@@ -1,4 +1,4 @@
-"""The reasons of failures with their exit codes and advice, and the exceptions that have them.
+"""The reasons of failures with their exit codes and advice, the exceptions that have them, and lengths in messages.
 
 Separate from the values so that the commands start without numpy. Exit codes, JSON schema, the page's advice and the
 table in docs/formats.md are made from `Reason`; a new reason is one entry here.
@@ -7,6 +7,7 @@ table in docs/formats.md are made from `Reason`; a new reason is one entry here.
 from __future__ import annotations
 
 import re
+from decimal import Decimal
 from enum import StrEnum
 from typing import Any
 
@@ -128,6 +129,11 @@ def next_step(reason: str, message: str) -> str:
 def exit_code_of(reason: str | None) -> int:
     """Exit code of an image's `reason`; 0 for None, which means a solution."""
     return EXIT_OK if reason is None else reason_of(reason).exit_code
+
+
+def length_text(metres: float, digits: int = 2) -> str:
+    """A length with so many significant digits and without an exponent, such as "180 m"."""
+    return f"{Decimal(f'{metres:.{digits}g}'):f} m"
 
 
 class BadInput(Exception):

@@ -1,4 +1,7 @@
-"""What a localization gives: the position with its errors, what was left out of it, and what nobody stated."""
+"""Position and clock: what is known before an image is used, and what a localization gives.
+
+The position has its errors, what was left out of it, and what nobody stated.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,55 @@ import numpy as np
 from startrack.core.values import Array, Bools, Value, array
 
 CARRIED_PART = 0.5  # of the information, by the groups that are named
+
+
+@dataclass(frozen=True)
+class PositionPrior:
+    """A round normal distribution of the camera's position: mean and standard deviation [m] in enu.
+
+    Raises ValueError for numbers that are not finite and a sigma that is not above 0.
+    """
+
+    east_m: float
+    north_m: float
+    sigma_m: float
+
+    def __post_init__(self) -> None:
+        if not np.isfinite([self.east_m, self.north_m, self.sigma_m]).all() or self.sigma_m <= 0:
+            raise ValueError(f"prior {self}: three finite numbers are needed, and a sigma above 0")
+
+    def __str__(self) -> str:
+        return f"{self.east_m:g},{self.north_m:g},{self.sigma_m:g}"
+
+    @property
+    def mean_m(self) -> Array:
+        """East and north (2,) [m]."""
+        return np.array([self.east_m, self.north_m])
+
+    def log_density(self, points_m: Array) -> Array:
+        """Logarithm (n,) of the density at positions (n, 2) [m], less its maximum."""
+        off = points_m - self.mean_m
+        return np.asarray(-0.5 * np.einsum("ni,ni->n", off, off) / self.sigma_m**2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clock(Value):
+    """How directions in enu depend on an error of the clock.
+
+    The prior of its error is a mixture: `sigma_s`, or with `gross_probability` the wider `gross_sigma_s`, which is
+    also what the error would be if a stated `sigma_s` were wrong.
+    """
+
+    turn_rad_s: Array = array(3)  # rotation vector in enu: by one second that the true time is later
+    sigma_s: float  # of the stated time
+    offset_s: float = 0.0  # by which the directions' time is later than the stated one
+    reach_s: float = np.inf  # the true time is no farther from the directions' time
+    gross_probability: float = 0.0  # above 0 where `sigma_s` is not stated
+    gross_sigma_s: float = 0.0
+
+    def log_prior(self, later_s: Any) -> Any:
+        """Logarithm of the prior density, less its maximum and its gross part, `later_s` than the directions' time."""
+        return -0.5 * np.square((self.offset_s + later_s) / self.sigma_s)
 
 
 @dataclass(frozen=True, kw_only=True)

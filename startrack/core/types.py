@@ -13,18 +13,15 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.correction import Correction
 from startrack.core.errors import BadInput, NoSolution, NotIdentified, NotLocated, TooFewStars
-from startrack.core.fix import Blocked, ClockError, Fix, Integrity, Mode, UnstatedFact
-from startrack.core.mask import Mask
-from startrack.core.prior import PositionPrior
+from startrack.core.fix import Blocked, Clock, ClockError, Fix, Integrity, Mode, PositionPrior, ShownError, UnstatedFact
 from startrack.core.values import Array, Bools, Ints, Value, array, take_rows
 
 __all__ = [
     "Array", "Attitude", "BadInput", "Blocked", "Body", "Bools", "Centroids", "Clock", "ClockError", "Correction",
     "Detections", "Evidence", "Exposure", "Fix", "Identification", "ImageErrors", "Integrity", "Ints", "Mask",
-    "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated", "Stars", "TooFewStars", "UnstatedFact",
-    "Value", "array",
+    "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated", "PositionPrior", "ShownError", "Stars",
+    "TooFewStars", "UnstatedFact", "Value", "array",
 ]  # fmt: skip
 
 # Beyond the zenith: the search for an error of the horizon shifts the rows, by three sigma at most.
@@ -32,6 +29,34 @@ MOST_ELEVATION_RAD = np.pi / 2 + 0.6
 TIME_SIGMA_S = 1.0  # of the clock, where nothing is stated
 MAX_PIXELS = 200_000_000  # contract: a larger image is refused from its header, before anything is decoded
 T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Mask:
+    """Pixels of an image that do not count; True means masked, as in numpy's masked arrays."""
+
+    masked: NDArray[np.bool_]  # (H, W)
+    sha256: str  # of its file, or of its values; of a union the hashes of its parts, joined by "+"; "": none is given
+    dead_part: float = 0.0  # of the image, that shows no light: found in the image, not given
+
+    def __post_init__(self) -> None:
+        locked = np.array(self.masked, dtype=np.bool_)
+        if locked.ndim != 2:
+            raise ValueError(f"Mask.masked: {locked.ndim} dimensions, expected (H, W)")
+        locked.flags.writeable = False
+        object.__setattr__(self, "masked", locked)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Correction:
+    """The correction of an exposure by a dark frame, a flat field, or both."""
+
+    recorded_adu: NDArray[np.float32]  # (H, W) counts as the sensor recorded them: they show saturation and clipping
+    mask: Mask | None  # pixels that cannot be corrected; None: all can
+    sensitivity_1: NDArray[np.float32] | None  # (H, W) of the flat field, 1 at its median; None: no flat field
+    scales_black: bool  # the black level was divided too, because without a dark frame it is not known
+    dark_sha256: str | None  # of the file; None: no dark frame
+    flat_sha256: str | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,26 +179,6 @@ class Identification(Value):
 
     def __len__(self) -> int:
         return len(self.star)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Clock(Value):
-    """How directions in enu depend on an error of the clock.
-
-    The prior of its error is a mixture: `sigma_s`, or with `gross_probability` the wider `gross_sigma_s`, which is
-    also what the error would be if a stated `sigma_s` were wrong.
-    """
-
-    turn_rad_s: Array = array(3)  # rotation vector in enu: by one second that the true time is later
-    sigma_s: float  # of the stated time
-    offset_s: float = 0.0  # by which the directions' time is later than the stated one
-    reach_s: float = np.inf  # the true time is no farther from the directions' time
-    gross_probability: float = 0.0  # above 0 where `sigma_s` is not stated
-    gross_sigma_s: float = 0.0
-
-    def log_prior(self, later_s: Any) -> Any:
-        """Logarithm of the prior density, less its maximum and its gross part, `later_s` than the directions' time."""
-        return -0.5 * np.square((self.offset_s + later_s) / self.sigma_s)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,9 +15,8 @@ from math import sqrt
 
 import numpy as np
 
-from startrack.core.kernels import njit
+from startrack.core.kernels import njit, normal_cdf
 from startrack.core.types import Array, Bools, Evidence
-from startrack.estimation.normal_cdf import normal_cdf
 from startrack.evidence.sky_levels import CLIP_SIGMAS, GROUND, SECTORS, SKY, SkyLevels, measure_levels, sector_of
 from startrack.evidence.sky_pixels import SkyPixels
 from startrack.evidence.sky_step import Horizon

@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.correction import Correction
 from startrack.core.files import printable
-from startrack.core.types import BadInput, Bools, Exposure, Mask
+from startrack.core.types import BadInput, Bools, Correction, Exposure, Mask
 from startrack.exposure.decode_file import decode_file
 from startrack.exposure.header import header_number
 from startrack.exposure.mask import require_size

@@ -8,8 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from startrack.core.fix import Blocked, ClockError, Fix, Mode, ShownError, UnstatedFact
-from startrack.core.types import Array, Ints, NotLocated
+from startrack.core.types import Array, Blocked, ClockError, Fix, Ints, Mode, NotLocated, ShownError, UnstatedFact
 from startrack.localization.explored import Explored
 from startrack.localization.hypothesis import Hypothesis
 from startrack.localization.importance_sampling import moments

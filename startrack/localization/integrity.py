@@ -12,9 +12,8 @@ from math import log
 
 import numpy as np
 
-from startrack.core.fix import Integrity
 from startrack.core.kernels import njit
-from startrack.core.types import Array, Bools
+from startrack.core.types import Array, Bools, Integrity
 from startrack.localization.obstacle_chain import fill_clear_emissions
 from startrack.localization.skyline_model import SkylineModel
 from startrack.localization.skyline_profiles import SECTORS

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack.core.prior import PositionPrior
-from startrack.core.types import Array, Bools, NotLocated
+from startrack.core.types import Array, Bools, NotLocated, PositionPrior
 from startrack.localization.explored import Explored
 from startrack.terrain import ForwardingTerrain, Terrain
 

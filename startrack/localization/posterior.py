@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.core.compilation import announce_compilation
-from startrack.core.prior import PositionPrior
-from startrack.core.types import Evidence, Fix, NotLocated
+from startrack.core.types import Evidence, Fix, NotLocated, PositionPrior
 from startrack.localization.branch_and_bound import Search
 from startrack.localization.conclusion import conclude
 from startrack.localization.explored import Explored, log_sum

@@ -8,9 +8,8 @@ from math import erfc, expm1, log1p, sqrt
 
 import numpy as np
 
-from startrack.core.kernels import njit
+from startrack.core.kernels import njit, normal_cdf
 from startrack.core.types import Array, Evidence, Ints
-from startrack.estimation.normal_cdf import normal_cdf
 
 SECTOR_STEP = 10.0  # between the keys of neighbouring sectors: more than any two elevations differ [rad]
 EDGE_SIGMAS = 8.0  # beyond this the edge of a single row is not computed

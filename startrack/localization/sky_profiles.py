@@ -7,9 +7,8 @@ from dataclasses import dataclass
 # mypy: disable-error-code="no-untyped-def"
 import numpy as np
 
-from startrack.core.kernels import njit
+from startrack.core.kernels import njit, normal_cdf
 from startrack.core.types import Array, Evidence, Ints
-from startrack.estimation.normal_cdf import normal_cdf
 
 REACH_SIGMAS = 8.0  # of the edge: from the outer rows to the ends of the splines, beyond which they are constant
 KNOT_SIGMAS = 0.2  # of the edge: distance of the knots; a cubic errs by 0.03 nats in a sector of 2e4 nats

@@ -6,8 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from startrack.core.fix import Blocked
-from startrack.core.types import Array, NotLocated
+from startrack.core.types import Array, Blocked, NotLocated
 from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.gross_errors import GROSS_ROUNDS, sample_gross_error
 from startrack.localization.hypothesis import Hypothesis

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from startrack.core.errors import BadOutput
+from startrack.core.errors import BadOutput, length_text
 from startrack.core.files import check_output
-from startrack.core.lengths import length_text
 from startrack.core.types import BadInput
 from startrack.terrain.geotiff import write_map
 from startrack.terrain.map_comparison import crest_angle_rad_per_m

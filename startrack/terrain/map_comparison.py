@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from startrack.core.lengths import length_text
+from startrack.core.errors import length_text
 from startrack.core.types import Array, BadInput
 from startrack.frames import Site
 from startrack.terrain.height_map import COMMON_PER_POST, HeightMap

@@ -6,8 +6,8 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from startrack.core.errors import length_text
 from startrack.core.files import data_dir
-from startrack.core.lengths import length_text
 from startrack.terrain.map_comparison import MapComparison, compare_with_finest
 from startrack.terrain.map_error import error_between_posts_m
 from startrack.terrain.raster import Raster

@@ -27,8 +27,7 @@ from startrack.applications.prediction.write import (
     write_summary,
     write_table,
 )
-from startrack.core.errors import BadOutput
-from startrack.core.lengths import length_text
+from startrack.core.errors import BadOutput, length_text
 from startrack.frames import format_utc
 from startrack.output.quantities_prediction import FILTERED, FORMAT, SHARES_M, SMOOTHED
 from startrack.terrain import Terrain, load_terrain

@@ -15,8 +15,7 @@ import numpy as np
 from startrack.applications.tracking.frame_estimate import FrameEstimate
 from startrack.applications.tracking.observe import ImageFix, ObservedFrame
 from startrack.core.files import write_atomically
-from startrack.core.fix import ShownError
-from startrack.core.types import Array, Clock, Evidence, ImageErrors
+from startrack.core.types import Array, Clock, Evidence, ImageErrors, ShownError
 
 FORMAT = "startrack.observed-frame/3"
 T = TypeVar("T")

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from startrack.applications.tracking.frame_graph import Series, draw_graph
 from startrack.applications.tracking.track import Track
 from startrack.applications.tracking.track_map import ODOMETRY, REFUSED, draw_track_map
-from startrack.core.lengths import length_text
+from startrack.core.errors import length_text
 from startrack.core.types import Array
 from startrack.output.picture.annotate import draw_legend_sample
 from startrack.output.picture.canvas import DIM_INK, INK, POSITION, SKY_BLUE, Box, Canvas, Colour, wrap_text

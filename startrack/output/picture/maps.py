@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from startrack.core.lengths import length_text
+from startrack.core.errors import length_text
 from startrack.core.types import Array, Fix
 from startrack.estimation.attitude import AttitudeFit
 from startrack.output.picture.canvas import (

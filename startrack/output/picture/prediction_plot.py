@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.lengths import length_text
+from startrack.core.errors import length_text
 from startrack.core.types import Array
 from startrack.output.picture.canvas import (
     BLUISH_GREEN,

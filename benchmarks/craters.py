@@ -25,8 +25,7 @@ from _results import table, write_section
 from _rough_map import rough_terrain
 
 from startrack.camera import load_camera
-from startrack.catalog import load_catalog
-from startrack.catalog.bodies import bodies
+from startrack.catalog import bodies, load_catalog
 from startrack.chain.pipeline import locate
 from startrack.chain.stages import Located
 from startrack.frames import R_enu_icrs, Site

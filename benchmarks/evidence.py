@@ -21,8 +21,7 @@ from _results import table, write_section
 from chain import SENSOR
 
 from startrack.camera import load_camera
-from startrack.catalog import load_catalog
-from startrack.catalog.gaia import load_deep_catalog
+from startrack.catalog import load_catalog, load_deep_catalog
 from startrack.chain.pipeline import Settings, locate
 from startrack.chain.stages import Located, Measured, last_value
 from startrack.core.types import Array, Evidence, Fix, NoSolution

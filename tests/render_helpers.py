@@ -61,6 +61,10 @@ def make_scene(stars: Stars | None = None, *, heading_pitch_roll_deg: Any = (0.0
         R_enu_icrs=np.eye(3),
         exposure_s=1.0,
         sky_v_mag_arcsec2=None,
+        sky_gradient=0.0,
+        sky_gradient_azimuth_rad=0.0,
+        wall_reflectance=0.04,
+        cosmic_rays=0,
     )
     return replace(scene, **changes)
 

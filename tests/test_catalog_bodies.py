@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from startrack.catalog.bodies import bodies
+from startrack.catalog import bodies
 from startrack.core.types import BadInput
 from startrack.frames import R_enu_icrs, Site, angle_between_rad, parse_utc, rays_from_azel
 

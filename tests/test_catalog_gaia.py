@@ -9,8 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from startrack.camera import load_camera
-from startrack.catalog import load_catalog
-from startrack.catalog.gaia import load_deep_catalog
+from startrack.catalog import load_catalog, load_deep_catalog
 from startrack.chain.pipeline import locate
 from startrack.chain.stages import Located
 from startrack.rendering import Series, load_sky_catalog, render

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from startrack.camera import load_camera
-from startrack.catalog import load_catalog
-from startrack.catalog.gaia import load_deep_catalog
+from startrack.catalog import load_catalog, load_deep_catalog
 from startrack.cli import render as command
 from startrack.core.types import BadInput
 from startrack.exposure import read_exposure

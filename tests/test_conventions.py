@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import startrack
 from startrack import frames
 from startrack.camera import Camera
-from startrack.catalog import bodies
+from startrack.catalog import bodies, solar_system
 from startrack.core import types
 from startrack.frames import Site, parse_utc
 
@@ -61,7 +61,7 @@ def test_rotations_act_on_vectors_not_on_axes() -> None:
     # Precession has moved the pole by 0.15 degrees since 2000.
     assert np.degrees(elevation) == pytest.approx(51.48, abs=0.2)
     assert abs(np.degrees((azimuth + np.pi) % (2 * np.pi) - np.pi)) < 0.3
-    sun = bodies.bodies(GREENWICH, TIME)[0]
+    sun = bodies(GREENWICH, TIME)[0]
     azimuth, elevation = frames.azel_from_rays(R_enu_icrs @ sun.ray_icrs)
     assert np.degrees(azimuth) == pytest.approx(180, abs=6)  # the equation of time is 12 minutes
     assert np.degrees(elevation) == pytest.approx(90 - 51.48 - 7.5, abs=0.5)
@@ -144,7 +144,7 @@ def test_constants_are_the_published_ones() -> None:
     import erfa
 
     assert frames.SPEED_OF_LIGHT_M_S == erfa.CMPS
-    assert bodies.ASTRONOMICAL_UNIT_M == erfa.DAU
+    assert solar_system.ASTRONOMICAL_UNIT_M == erfa.DAU
     assert frames.MOON_RADIUS_M == 1_737_400  # IAU 2015, and the label of every LOLA map
     equatorial_m, flattening = erfa.eform(erfa.WGS84)
     pole = frames.position_fixed_m(Site("earth", np.pi / 2, 0.0))

@@ -27,11 +27,11 @@ from startrack.frames import (
     et_s,
     observer_state,
     observer_velocity_m_s,
+    orientation,
     parse_utc,
     rays_from_azel,
-    spice,
 )
-from startrack.frames.earth import R_itrs_icrs
+from startrack.frames.orientation import R_itrs_icrs
 
 ARCSEC_RAD = np.radians(1 / 3600)
 DATA = Path(__file__).parent / "data"
@@ -217,14 +217,14 @@ def test_a_time_without_zone_is_refused() -> None:
 
 
 def test_a_missing_kernel_names_the_package_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(spice, "find_spec", lambda name: None if name == "lunarsky" else find_spec(name))
+    monkeypatch.setattr(orientation, "find_spec", lambda name: None if name == "lunarsky" else find_spec(name))
     with pytest.raises(RuntimeError, match=r"moon_080317\.tf is missing: install the package lunarsky"):
-        spice._kernel_paths.__wrapped__()
+        orientation._kernel_paths.__wrapped__()
 
 
 def test_an_error_inside_spice_leaves_as_one_line() -> None:
     with pytest.raises(RuntimeError, match="SPICE") as error:
-        spice.barycentric_state(-12345, 0.0)
+        orientation.barycentric_state(-12345, 0.0)
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 300
 

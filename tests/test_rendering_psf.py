@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from render_helpers import centroid_px
 
-from startrack.rendering.psf import INVISIBLE_E_PER_PX, splat
+from startrack.rendering.sources import INVISIBLE_E_PER_PX, splat
 
 
 def one_star(x, y, flux=1e5, sigma=1.0, shape=(41, 43)):

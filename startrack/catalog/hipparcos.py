@@ -1,4 +1,4 @@
-"""Star catalogues: read, cut in magnitude, carried to a date and to a moving observer.
+"""Star catalogues: read, cut in magnitude, carried to a date and to a moving observer; names of stars.
 
 A catalogue is one structured .npy file in catalogs/ (columns: catalogs/README.md), brightest first, so that a cut in
 magnitude is a slice.
@@ -7,16 +7,17 @@ magnitude is a slice.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property, lru_cache
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from startrack.catalog.names import id_texts, star_names
 from startrack.core.files import data_dir
 from startrack.core.types import Array, BadInput, Ints, Stars, Value, array
+from startrack.core.values import take_rows
 from startrack.frames import aberrate, as_utc
 
 HIPPARCOS_EPOCH_YR = 1991.25  # J1991.25 (TT), ESA SP-1200 (1997), vol. 1
@@ -65,18 +66,9 @@ class StarCatalog(Value):
         """Whether it has Gaia's stars, so that it lacks none of the sky's to about magnitude 10."""
         return "GAIA" in self.sources
 
-    @property
-    def names(self) -> Mapping[int, str]:
-        """Names by Hipparcos number, as `star_names`."""
-        return star_names()
-
     def brighter_than(self, v_mag: float) -> StarCatalog:
         """The stars with V < v_mag."""
-        return self._take_first(int(np.searchsorted(self.v_mag, v_mag, side="left")))
-
-    def _take_first(self, n: int) -> StarCatalog:
-        kept = {f: getattr(self, f)[:n] for f in self.__dataclass_fields__ if getattr(getattr(self, f), "ndim", 0)}
-        return replace(self, **kept)
+        return take_rows(self, slice(int(np.searchsorted(self.v_mag, v_mag, side="left"))))
 
     def at(self, time: datetime | None, velocity_m_s: ArrayLike | None) -> Stars:
         """Apparent directions and magnitudes of the stars at `time`, brightest first.
@@ -119,22 +111,68 @@ def load_catalog(name: str = "hipparcos") -> StarCatalog:
         known = ", ".join(sorted(p.stem for p in folder.glob("*.npy"))) or "none"
         raise BadInput("bad_calibration", f"no star catalogue is called {name!r} in {folder}; there: {known}")
     t = np.load(path, allow_pickle=False)
-    ra, dec = t["ra"] * ANGLE_UNIT_RAD, t["dec"] * ANGLE_UNIT_RAD
-    sin_ra, cos_ra, sin_dec, cos_dec = np.sin(ra), np.cos(ra), np.sin(dec), np.cos(dec)
-    east = t["pm_ra"] * (0.01 * MAS_RAD)
-    north = t["pm_dec"] * (0.01 * MAS_RAD)
+    rays, motion = rays_and_motion(
+        t["ra"] * ANGLE_UNIT_RAD,
+        t["dec"] * ANGLE_UNIT_RAD,
+        t["pm_ra"] * (0.01 * MAS_RAD),
+        t["pm_dec"] * (0.01 * MAS_RAD),
+    )
     return StarCatalog(
         name=name,
         epoch_yr=HIPPARCOS_EPOCH_YR,
         sources=("HIP", "HR"),
         source=t["hip"] == 0,
         number=np.where(t["hip"] > 0, t["hip"], t["hr"]),
-        rays_icrs=np.stack([cos_dec * cos_ra, cos_dec * sin_ra, sin_dec], axis=1),
-        motion_rad_yr=np.stack(
-            [-sin_ra * east - sin_dec * cos_ra * north, cos_ra * east - sin_dec * sin_ra * north, cos_dec * north],
-            axis=1,
-        ),
+        rays_icrs=rays,
+        motion_rad_yr=motion,
         v_mag=t["v"] * 0.001,
         v_sigma_mag=t["v_sigma"] * 0.001,
         b_v=t["b_v"] * 0.001,
     )
+
+
+def rays_and_motion(ra: Array, dec: Array, east: Array, north: Array) -> tuple[Array, Array]:
+    """Directions (n, 3), and proper motions `east`, `north` (n,) [rad/yr] as vectors, at `ra`, `dec` (n,) [rad]."""
+    sin_ra, cos_ra, sin_dec, cos_dec = np.sin(ra), np.cos(ra), np.sin(dec), np.cos(dec)
+    motion = [-sin_ra * east - sin_dec * cos_ra * north, cos_ra * east - sin_dec * sin_ra * north, cos_dec * north]
+    return np.stack([cos_dec * cos_ra, cos_dec * sin_ra, sin_dec], axis=1), np.stack(motion, axis=1)
+
+
+@lru_cache(maxsize=1)
+def star_names() -> Mapping[int, str]:
+    """Hipparcos number -> proper name ("Sirius"), else Bayer, Flamsteed or variable-star designation ("61 Cyg").
+
+    The stars of the Bright Star Catalogue that have one; read-only.
+    """
+    lines = (data_dir("catalogs") / "star_names.csv").read_text(encoding="utf-8").splitlines()[1:]
+    pairs = (line.split(",", 1) for line in lines)
+    return MappingProxyType({int(hip): name for hip, name in pairs})
+
+
+@lru_cache(maxsize=1)
+def proper_name_designations() -> Mapping[str, str]:
+    """Proper name ("Rigil Kentaurus") -> Bayer, Flamsteed or variable-star designation ("alpha1 Cen"); read-only."""
+    lines = (data_dir("catalogs") / "proper_names.csv").read_text(encoding="utf-8").splitlines()[1:]
+    pairs = (line.split(",", 1) for line in lines)
+    return MappingProxyType({name: designation for designation, name in pairs})
+
+
+def id_texts(sources: tuple[str, ...], source: Ints, number: Ints) -> NDArray[np.str_]:
+    """Ids f"{sources[s]} {n}" (n,) of stars with source index s and number n, by array operations.
+
+    118,000 Python strings would take longer than all the astrometry.
+    """
+    digits = np.searchsorted(10 ** np.arange(1, 19, dtype=np.int64), number, side="right") + 1
+    width = max(map(len, sources)) + 1 + int(digits.max(initial=1))
+    code_points = np.zeros((len(number), width), dtype=np.uint32)
+    for s, prefix in enumerate(sources):
+        start = len(prefix) + 1
+        for d in np.unique(digits[source == s]).tolist():
+            rows = np.flatnonzero((source == s) & (digits == d))
+            code_points[rows, :start] = [ord(c) for c in f"{prefix} "]
+            rest = number[rows]
+            for column in range(start + d - 1, start - 1, -1):
+                rest, last = np.divmod(rest, 10)
+                code_points[rows, column] = ord("0") + last
+    code_points.flags.writeable = False
+    return code_points.view(f"<U{width}")[:, 0]

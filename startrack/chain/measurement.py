@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from startrack.catalog import load_catalog
-from startrack.catalog.gaia import has_deep_catalog, hipparcos_rows_in_deep, load_deep_catalog
+from startrack.catalog import has_deep_catalog, hipparcos_rows_in_deep, load_catalog, load_deep_catalog
 from startrack.chain.stages import Located, Measured, Oriented, Settings, extend
 from startrack.core.types import Array, BadInput, Detections, Ints, Stars
 from startrack.evidence import (

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.catalog.bodies import bodies
+from startrack.catalog import bodies
 from startrack.chain.stages import (
     Detected,
     Identified,

@@ -124,7 +124,7 @@ def _check_shipped_files(kind: str) -> str:
 
 
 def _ephemeris() -> str:
-    from startrack.catalog.bodies import bodies
+    from startrack.catalog import bodies
     from startrack.frames import Site, parse_utc
 
     found = bodies(Site("moon", -1.56, 2.27), parse_utc("2030-01-01T00:00:00"))

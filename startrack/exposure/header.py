@@ -12,7 +12,7 @@ from typing import Any
 from startrack.core.declaration import SHOWN_CHARS, value_text
 from startrack.core.types import BadInput
 from startrack.exposure.sidecar import BAYER_PATTERNS, IMAGE_KEYS, NUMBERS, SIDECAR, is_pattern, resolve_path
-from startrack.frames.time import parse_utc
+from startrack.frames import parse_utc
 
 # Names in a header (FITS keywords, PNG text chunks, TIFF description) and the fact that each one gives. The names of
 # the sidecar's keys are valid there too, except in FITS, where a card called CAMERA is common and names the hardware.

@@ -18,7 +18,7 @@ from startrack.exposure.sidecar import (
     sidecar_value,
     unknown_key_warnings,
 )
-from startrack.frames.time import as_utc
+from startrack.frames import as_utc
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from typing import Any
 from startrack.core.declaration import SHOWN_CHARS, Choice, Number, Table, Text, value_text
 from startrack.core.files import is_path, printable
 from startrack.core.types import BadInput
-from startrack.frames.time import parse_utc
+from startrack.frames import parse_utc
 
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 MAX_EXPOSURE_S = 1e6

@@ -19,7 +19,7 @@ from startrack.core.files import check_free, is_path, printable, relative_path, 
 from startrack.core.types import BadInput, Exposure
 from startrack.exposure.metadata import Facts
 from startrack.exposure.sidecar import sidecars
-from startrack.frames.time import format_utc
+from startrack.frames import format_utc
 
 PACKED = {".gz": lambda data: gzip.compress(data, compresslevel=1, mtime=0), ".bz2": bz2.compress}
 

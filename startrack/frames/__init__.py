@@ -3,6 +3,7 @@
 `icrs` -> (R_enu_icrs) -> `enu` of a site. SPICE, ERFA and SciPy are imported at their first use.
 """
 
+from startrack.frames.orientation import R_mcmf_icrs, barycentric_state, et_s
 from startrack.frames.rays import (
     SPEED_OF_LIGHT_M_S,
     aberrate,
@@ -15,12 +16,14 @@ from startrack.frames.rays import (
     turn_azel,
 )
 from startrack.frames.rotations import (
+    ORTHONORMAL_1,
     R_body_enu_from_heading_pitch_roll,
     R_from_quat_xyzw,
     R_from_rotvec,
     heading_pitch_roll_from_R_body_enu,
     nearest_rotation,
     quat_xyzw_from_R,
+    tum_line,
     wahba,
 )
 from startrack.frames.site import (
@@ -35,42 +38,13 @@ from startrack.frames.site import (
     position_fixed_m,
     sky_rotvec_rad,
 )
-from startrack.frames.spice import R_mcmf_icrs, barycentric_state, et_s
 from startrack.frames.time import as_utc, format_utc, parse_utc
-from startrack.frames.tum import tum_line
 
 __all__ = [
-    "MOON_RADIUS_M",
-    "SPEED_OF_LIGHT_M_S",
-    "R_body_enu_from_heading_pitch_roll",
-    "R_enu_fixed",
-    "R_enu_icrs",
-    "R_from_quat_xyzw",
-    "R_from_rotvec",
-    "R_mcmf_icrs",
-    "Site",
-    "aberrate",
-    "angle_between_rad",
-    "as_utc",
-    "azel_from_rays",
-    "barycentric_state",
-    "enu_from_latlon",
-    "et_s",
-    "format_utc",
-    "heading_pitch_roll_from_R_body_enu",
-    "latlon_from_enu",
-    "length_xy",
-    "nearest_rotation",
-    "observer_state",
-    "observer_velocity_m_s",
-    "off_axis_rad",
-    "parse_utc",
-    "position_fixed_m",
-    "quat_xyzw_from_R",
-    "rays_from_azel",
-    "refract_rad",
-    "sky_rotvec_rad",
-    "tum_line",
-    "turn_azel",
-    "wahba",
-]
+    "MOON_RADIUS_M", "ORTHONORMAL_1", "SPEED_OF_LIGHT_M_S", "R_body_enu_from_heading_pitch_roll", "R_enu_fixed",
+    "R_enu_icrs", "R_from_quat_xyzw", "R_from_rotvec", "R_mcmf_icrs", "Site", "aberrate", "angle_between_rad", "as_utc",
+    "azel_from_rays", "barycentric_state", "enu_from_latlon", "et_s", "format_utc",
+    "heading_pitch_roll_from_R_body_enu", "latlon_from_enu", "length_xy", "nearest_rotation", "observer_state",
+    "observer_velocity_m_s", "off_axis_rad", "parse_utc", "position_fixed_m", "quat_xyzw_from_R", "rays_from_azel",
+    "refract_rad", "sky_rotvec_rad", "tum_line", "turn_azel", "wahba",
+]  # fmt: skip

@@ -100,3 +100,15 @@ def heading_pitch_roll_from_R_body_enu(R_body_enu: ArrayLike) -> tuple[float, fl
         heading, roll = np.arctan2(forward[0], forward[1]), np.arctan2(left[2], up[2])
     heading = heading % (2 * np.pi)
     return float(heading if heading < 2 * np.pi else 0.0), float(pitch), float(roll)
+
+
+def tum_line(time_s: float, position_m: Array, R_frame_body: Array) -> str:
+    """The line of one pose at `time_s` (Unix seconds, UTC) in any frame: time tx ty tz qx qy qz qw, which evo reads.
+
+    `position_m` (3,) is the body's position in the frame, `R_frame_body` (3, 3) the rotation from body to frame.
+    Lines of increasing times sort as text.
+
+    Source: Sturm et al. 2012, A benchmark for the evaluation of RGB-D SLAM systems, IROS.
+    """
+    numbers = [*position_m, *quat_xyzw_from_R(R_frame_body)]
+    return f"{time_s:017.6f} " + " ".join(f"{number:.9f}" for number in numbers) + "\n"

@@ -10,13 +10,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from startrack.core.types import Array, BadInput
-from startrack.frames.earth import EARTH_SPIN_RAD_S, R_itrs_icrs
-from startrack.frames.spice import R_mcmf_icrs, R_mcmf_icrs_rate_1_s, barycentric_state, et_s
+from startrack.frames.orientation import (
+    EARTH_SPIN_RAD_S,
+    NAIF,
+    R_itrs_icrs,
+    R_mcmf_icrs,
+    R_mcmf_icrs_rate_1_s,
+    barycentric_state,
+    et_s,
+)
 
 MOON_RADIUS_M = 1_737_400.0  # sphere of the LOLA maps, IAU 2015
 EARTH_RADIUS_M = 6_378_137.0  # equatorial, WGS 84
 EARTH_FLATTENING_1 = 1 / 298.257223563  # WGS 84
-NAIF_EARTH, NAIF_MOON = 399, 301
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,12 @@ class Site:
 
 def R_enu_fixed(site: Site) -> Array:
     """Rotation (3, 3) from the body-fixed frame (`mcmf` on the Moon, ITRS on the Earth) to `enu` at the site."""
-    return _R_enu_fixed(site.latitude_rad, site.longitude_rad)
+    sin_lat, cos_lat = np.sin(site.latitude_rad), np.cos(site.latitude_rad)
+    sin_lon, cos_lon = np.sin(site.longitude_rad), np.cos(site.longitude_rad)
+    east = [-sin_lon, cos_lon, 0.0]
+    north = [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
+    up = [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]
+    return np.array([east, north, up])
 
 
 def position_fixed_m(site: Site) -> Array:
@@ -119,22 +130,13 @@ def observer_state(site: Site, time: datetime) -> tuple[Array, Array]:
     Raises: as R_enu_icrs.
     """
     r_fixed_m = position_fixed_m(site)
+    centre_m, velocity_m_s = barycentric_state(NAIF[site.body], et_s(time))
     if site.body == "moon":
-        centre_m, velocity_m_s = barycentric_state(NAIF_MOON, et_s(time))
-        return centre_m + r_fixed_m @ R_mcmf_icrs(time), velocity_m_s + r_fixed_m @ R_mcmf_icrs_rate_1_s(time)
-    centre_m, velocity_m_s = barycentric_state(NAIF_EARTH, et_s(time))
-    R_fixed_icrs = R_itrs_icrs(time)
-    spin_fixed_m_s = np.cross([0.0, 0.0, EARTH_SPIN_RAD_S], r_fixed_m)
-    return centre_m + r_fixed_m @ R_fixed_icrs, velocity_m_s + spin_fixed_m_s @ R_fixed_icrs
-
-
-def _R_enu_fixed(latitude_rad: float, longitude_rad: float) -> Array:
-    sin_lat, cos_lat = np.sin(latitude_rad), np.cos(latitude_rad)
-    sin_lon, cos_lon = np.sin(longitude_rad), np.cos(longitude_rad)
-    east = [-sin_lon, cos_lon, 0.0]
-    north = [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
-    up = [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]
-    return np.array([east, north, up])
+        R_fixed_icrs, spin_m_s = R_mcmf_icrs(time), r_fixed_m @ R_mcmf_icrs_rate_1_s(time)
+    else:
+        R_fixed_icrs = R_itrs_icrs(time)
+        spin_m_s = np.cross([0.0, 0.0, EARTH_SPIN_RAD_S], r_fixed_m) @ R_fixed_icrs
+    return centre_m + r_fixed_m @ R_fixed_icrs, velocity_m_s + spin_m_s
 
 
 def _fixed_from_latlon(body: str, latitude_rad: ArrayLike, longitude_rad: ArrayLike, height_m: ArrayLike) -> Array:

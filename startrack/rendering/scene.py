@@ -44,12 +44,12 @@ class Scene(Value):
         default_factory=lambda: np.zeros(3), metadata={"shape": (3,), "dtype": np.float64}
     )
     exposure_s: float
-    sky_v_mag_arcsec2: float | None = 22.0  # diffuse light of the sky per square arcsecond; None: a black sky
-    sky_gradient: float = 0.0  # s: the sky is 1 + s cos(elevation) cos(azimuth - sky_gradient_azimuth_rad) of that
-    sky_gradient_azimuth_rad: float = 0.0
-    wall_reflectance: float = 0.04  # light of the terrain, as a fraction of the sky's
+    sky_v_mag_arcsec2: float | None  # diffuse light of the sky per square arcsecond; None: a black sky
+    sky_gradient: float  # s: the sky is 1 + s cos(elevation) cos(azimuth - sky_gradient_azimuth_rad) of that
+    sky_gradient_azimuth_rad: float
+    wall_reflectance: float  # light of the terrain, as a fraction of the sky's
     hot_pixels: HotPixels = field(default_factory=HotPixels.create_empty)
-    cosmic_rays: int = 0  # tracks in this exposure
+    cosmic_rays: int  # tracks in this exposure
     name: str = ""
     time_utc: datetime | None = None  # mid-exposure
     camera_ref: str | None = None  # how the exposure's metadata name the camera and the terrain

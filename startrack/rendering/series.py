@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.catalog.bodies import bodies
+from startrack.catalog import bodies
 from startrack.core.types import Array, BadInput, Stars, Value, array
 from startrack.frames import (
     R_body_enu_from_heading_pitch_roll,
@@ -20,11 +20,10 @@ from startrack.frames import (
     observer_velocity_m_s,
     sky_rotvec_rad,
 )
-from startrack.rendering.defects import draw_hot_pixels
 from startrack.rendering.drive import Drive, draw_odometry
-from startrack.rendering.field_stars import concatenate_stars, draw_field_stars, draw_v_errors
 from startrack.rendering.scene import Scene
-from startrack.rendering.sources import exposure_for_snr
+from startrack.rendering.sensor import draw_hot_pixels
+from startrack.rendering.sources import concatenate_stars, draw_field_stars, draw_v_errors, exposure_for_snr
 from startrack.terrain import Terrain
 
 if TYPE_CHECKING:
@@ -222,8 +221,7 @@ def load_sky_catalog(stars: str) -> StarCatalog:
     The evidence of long exposures expects Gaia's stars where they are installed; a sky with other faint stars would
     contradict it. Raises BadInput (bad_calibration) for "gaia" where the package is not installed.
     """
-    from startrack.catalog import load_catalog
-    from startrack.catalog.gaia import has_deep_catalog, load_deep_catalog
+    from startrack.catalog import has_deep_catalog, load_catalog, load_deep_catalog
 
     return load_deep_catalog() if stars == "gaia" or (stars == "auto" and has_deep_catalog()) else load_catalog()
 

@@ -13,17 +13,16 @@ import numpy as np
 
 from startrack.catalog import StarCatalog
 from startrack.chain.stages import StarRays
+from startrack.core.statistics import robust_sigma
 from startrack.core.types import TIME_SIGMA_S, Array, BadInput, Bools, Ints
 from startrack.evidence import FluxScale, Skyline, StarEvidence
-from startrack.evidence.expected_stars import ExpectedStars, expect_stars
+from startrack.evidence.expected_stars import expect_stars
 from startrack.evidence.flux_scale import BRIGHT_SNR, MIN_SCATTER, MIN_STARS
 from startrack.exposure import combine_masks
 from startrack.frames import R_enu_icrs, azel_from_rays, observer_velocity_m_s, off_axis_rad
 from startrack.localization import clock_at
 from startrack.psf import noise_area_px
-from startrack.rendering import Scene
-from startrack.rendering.sky import sky_e_per_s, sky_gradient
-from startrack.rendering.sources import flux_e
+from startrack.rendering import Scene, flux_e, sky_e_per_s, sky_gradient
 from startrack.simulation.starlight import Starlight
 from startrack.terrain import Terrain
 
@@ -86,12 +85,16 @@ def simulate_rays(
         least_e=photometry.least_e(typical_e), area_px=photometry.area_px(sensor.psf_sigma_px),
         mask=combine_masks(None, camera.mask, camera.size_px),
     )  # fmt: skip
-    true = _true_rays(found, stars.rays_icrs, scene)
+    true = np.asarray(stars.rays_icrs[found.star] @ scene.R_enu_icrs.T)  # directions at the true time
     above = _height_above(true, frame.skyline)
     sure = np.where(above > 0, CERTAIN_PROBABILITY, 1.0 - CERTAIN_PROBABILITY)
     visible = np.where(np.abs(above) < UNDECIDED_RAD, 0.5, sure)[found.measurable]
     variance = _pixel_variance_e2(scene, true, above > 0)[found.measurable]
-    light = _shining(scene, frame).measure(
+    shining = frame.star[frame.visible]
+    xy_px, _ = camera.project(scene.stars.rays_icrs[shining] @ scene.R_cam_icrs.T)
+    v_mag = scene.stars.v_mag[shining] + scene.v_error_mag[shining]
+    light_e = flux_e(sensor, v_mag, frame.angle_rad[frame.visible], scene.exposure_s)
+    light = Starlight(xy_px, light_e, sensor.psf_sigma_px).measure(
         found.sources(visible), variance, sensor.gain_e_per_adu * (sensor.saturation_adu - sensor.bias_adu), rng=rng
     )
     measured = photometry.judge(found, light)
@@ -125,22 +128,8 @@ def _expected_scale(scene: Scene, frame: _Frame, noise_e: float) -> FluxScale:
     if len(bright) < MIN_STARS:
         return FluxScale(float(zero_mag), 0.0, MIN_SCATTER, len(bright))
     error = scene.v_error_mag[bright]
-    middle = float(np.median(error))
-    scatter = 0.4 * np.log(10) * 1.4826 * float(np.median(np.abs(error - middle)))
+    middle, scatter = float(np.median(error)), 0.4 * np.log(10) * robust_sigma(error)
     return FluxScale(float(zero_mag) - middle, 0.0, max(scatter, MIN_SCATTER), len(bright))
-
-
-def _shining(scene: Scene, frame: _Frame) -> Starlight:
-    star = frame.star[frame.visible]
-    xy_px, _ = scene.camera.project(scene.stars.rays_icrs[star] @ scene.R_cam_icrs.T)
-    v_mag = scene.stars.v_mag[star] + scene.v_error_mag[star]
-    light_e = flux_e(scene.sensor, v_mag, frame.angle_rad[frame.visible], scene.exposure_s)
-    return Starlight(xy_px, light_e, scene.sensor.psf_sigma_px)
-
-
-def _true_rays(found: ExpectedStars, rays_icrs: Array, scene: Scene) -> Array:
-    """Directions (n, 3) of the expected stars in enu at the true time."""
-    return np.asarray(rays_icrs[found.star] @ scene.R_enu_icrs.T)
 
 
 def _height_above(rays_enu: Array, skyline: Skyline) -> Array:

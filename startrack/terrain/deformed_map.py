@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from startrack.core.types import Array
-from startrack.frames.rotations import R_from_rotvec
+from startrack.frames import R_from_rotvec
 from startrack.terrain.horizon_posts import HorizonPosts
 from startrack.terrain.protocol import ForwardingTerrain, Terrain
 from startrack.terrain.shape import ShapeError, select_slopes

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from startrack import __version__
-from startrack.catalog.gaia import has_deep_catalog
+from startrack.catalog import has_deep_catalog
 from startrack.core.errors import BadInput
 from startrack.core.files import is_path, parse_toml, read_text, relative_path
 from startrack.exposure import BagImage

@@ -12,8 +12,7 @@ from startrack.applications.calibration.below_horizon import LOWEST_STAR_RAD, MO
 from startrack.applications.calibration.frame import Sky, frame_of, pressure_hpa, require_body, require_time, sky_at
 from startrack.applications.calibration.region_growing import JointFit, fit_frames
 from startrack.camera import Camera
-from startrack.catalog import StarCatalog
-from startrack.catalog.bodies import bodies
+from startrack.catalog import StarCatalog, bodies
 from startrack.chain.pipeline import identify, identify_blind
 from startrack.chain.stages import Oriented, Refused
 from startrack.core.errors import BadInput, Reason

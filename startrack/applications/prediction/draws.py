@@ -10,8 +10,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from startrack.camera import Camera, load_camera
-from startrack.catalog import StarCatalog, load_catalog
-from startrack.catalog.gaia import has_deep_catalog, load_deep_catalog
+from startrack.catalog import StarCatalog, has_deep_catalog, load_catalog, load_deep_catalog
 from startrack.chain.measurement import COMPLETE_V_MAG
 from startrack.chain.star_fix import locate_rays
 from startrack.core.chunk_store import Chunk

@@ -11,7 +11,7 @@ from startrack.applications.prediction.draws import Place
 from startrack.core.types import Array, BadInput, Ints
 from startrack.frames import Site, enu_from_latlon, latlon_from_enu
 from startrack.output.picture.maps import nice_step
-from startrack.rendering.drive import Drive
+from startrack.rendering import Drive
 from startrack.terrain import Terrain
 from startrack.terrain.raster import EQUIRECTANGULAR, Projection, Raster
 

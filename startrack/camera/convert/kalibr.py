@@ -20,8 +20,7 @@ from startrack.camera.convert.intrinsics import (
     read_yaml,
     yaml_list,
 )
-from startrack.frames import quat_xyzw_from_R
-from startrack.frames.rotations import ORTHONORMAL_1
+from startrack.frames import ORTHONORMAL_1, quat_xyzw_from_R
 
 
 def to_text(camera: Camera) -> str:

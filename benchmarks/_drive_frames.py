@@ -19,8 +19,7 @@ from startrack.core.types import Array, Evidence
 from startrack.evidence.likelihood_ratio import visibility_llr
 from startrack.frames import R_enu_icrs, azel_from_rays, observer_velocity_m_s
 from startrack.rendering import Series, render
-from startrack.terrain import Terrain
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import HeightMap, Terrain
 
 SNR_5_MAG, FAINTEST_MAG = 6.0, 8.6  # of a star with 5 sigma, and of the faintest star used
 FLUX_SCATTER = 0.03  # beyond the catalogue's own

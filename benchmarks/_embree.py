@@ -11,7 +11,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from startrack.frames import enu_from_latlon
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import HeightMap
 
 LOWEST, HIGHEST = np.radians(-15.0), np.radians(60.0)
 HALVINGS = 22  # to 2e-5 degrees

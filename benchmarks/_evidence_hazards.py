@@ -21,8 +21,7 @@ from startrack.chain.star_fix import locate_rays
 from startrack.core.types import Array, NoSolution
 from startrack.rendering import Series
 from startrack.simulation import simulate_rays
-from startrack.terrain import Terrain
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import HeightMap, Terrain
 
 SEEDS = {"choose": 515, "judge": 7321}  # numbers may be fitted on the first half, and are judged on the second
 SHARE, FAINTEST_V_MAG = 0.07, 8.6  # stars fainter than this are no evidence in these frames

@@ -16,9 +16,7 @@ from startrack.chain.stages import StarRays
 from startrack.core.types import Array
 from startrack.frames import R_enu_icrs, Site
 from startrack.rendering import Scene
-from startrack.terrain import Cylinder, Terrain, load_terrain
-from startrack.terrain.height_map import HeightMap
-from startrack.terrain.raster import STEREOGRAPHIC, Projection, Raster
+from startrack.terrain import STEREOGRAPHIC, Cylinder, HeightMap, Projection, Raster, Terrain, load_terrain
 
 WITHIN, GROSS, VISIBLE, UNSEEN = "within", "gross", "visible", "unseen"
 KINDS = {

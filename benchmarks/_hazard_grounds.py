@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.core.types import Array
-from startrack.terrain import Cylinder, Terrain
-from startrack.terrain.protocol import ForwardingTerrain
+from startrack.terrain import Cylinder, ForwardingTerrain, Terrain
 
 Curve = Callable[[Array], Array]  # of azimuths [rad]
 STEPS, TURN_RAD = 40, 1e-6  # rounds of Newton's method to the wall; for the slope of its radius

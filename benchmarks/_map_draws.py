@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from startrack.core.types import Array
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import HeightMap
 
 
 def draw_ground(terrain: HeightMap, sigma_m: float, rng: np.random.Generator) -> HeightMap:

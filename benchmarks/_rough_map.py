@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from startrack.cli.main import main as startrack
-from startrack.terrain.geotiff import write_map
-from startrack.terrain.raster import STEREOGRAPHIC, Projection, Raster
+from startrack.terrain import STEREOGRAPHIC, Projection, Raster, write_map
 
 POSTS, POST_M = 1500, 20.0
 LATITUDE_DEG, LONGITUDE_DEG = 30.0, 12.0

@@ -10,8 +10,7 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.core.types import Array, Bools
-from startrack.terrain import Cylinder, load_terrain
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import Cylinder, HeightMap, load_terrain
 from terrain import BIAS_RAD, SLOPE_ERROR_RAD, SLOPE_RAD, replace_settings
 
 RIM_ANGLE_RAD = np.radians(80.0)  # off the axis; here the lens has the stated error

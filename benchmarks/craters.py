@@ -30,8 +30,7 @@ from startrack.chain.pipeline import locate
 from startrack.chain.stages import Located
 from startrack.frames import R_enu_icrs, Site
 from startrack.rendering import Series, render
-from startrack.terrain import load_terrain
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import HeightMap, load_terrain
 
 FLOOR_DEG, WALL_DEG = (0.0, 15.0), (15.0, 40.0)
 ROUGH_POSITIONS = 5  # each on floor and wall

@@ -25,8 +25,7 @@ from drives import POST_SIGMA_M, RADIUS_M, RAISED_SIGMA_RAD, SLOPE_RAD, mean_err
 from startrack.applications.tracking.smoother import Observations, Steps, smooth
 from startrack.applications.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.types import Array
-from startrack.terrain import load_terrain
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import HeightMap, load_terrain
 
 FRAMES, SPACING_M, EVERY_S = 14, 50.0, 900.0
 LATER = timedelta(days=10)

@@ -28,8 +28,7 @@ from startrack.applications.tracking.frame_estimate import FrameEstimate
 from startrack.applications.tracking.smoother import Observations, Steps, smooth
 from startrack.applications.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA, filter_positions
 from startrack.core.types import Array
-from startrack.terrain import load_terrain
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import HeightMap, load_terrain
 
 POST_SIGMA_M, RAISED_SIGMA_RAD = 5.0, np.radians(0.08)
 RADIUS_M, SLOPE_RAD = 4000.0, np.radians(20.0)

@@ -19,10 +19,9 @@ from _embree import EmbreeHorizons
 from _results import table, write_section
 from numba import njit
 
-from startrack.terrain import load_terrain
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import HeightMap, load_terrain
+from startrack.terrain.ground import ground_up_m
 from startrack.terrain.horizon_kernel import surface
-from startrack.terrain.pyramid import ground_up_m
 
 CROPS_M = {"shackleton": 16_000.0, "haworth": 22_000.0, "kepler": 17_000.0}
 AZIMUTHS_RAD = np.radians(np.arange(0.25, 360, 0.5))

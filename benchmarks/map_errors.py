@@ -18,8 +18,7 @@ from _results import table, write_section
 
 from startrack.core.types import Array, Evidence, NoSolution
 from startrack.localization import ExactPosterior
-from startrack.terrain import load_terrain
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import HeightMap, load_terrain
 
 RAYS, HALF_BAND_RAD, EDGE_RAD = 2000, np.radians(3.5), np.radians(0.01)
 MAX_LLR = 9.0

@@ -26,8 +26,7 @@ from startrack.chain.pipeline import Settings, locate
 from startrack.chain.stages import Located
 from startrack.core.types import Array
 from startrack.rendering import Series, load_sky_catalog, render
-from startrack.terrain import load_terrain
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import HeightMap, load_terrain
 
 SEED, WHEN = 4211, datetime(2031, 2, 14, tzinfo=UTC)
 CAMERA, TERRAINS = "fisheye-2048", ("shackleton-thesis", "shackleton")

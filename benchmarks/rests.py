@@ -23,8 +23,7 @@ from startrack.applications.tracking import ObservedFrame, TrackErrors
 from startrack.applications.tracking.at_rest import positions_at_rest
 from startrack.applications.tracking.frame_estimate import estimate_frame
 from startrack.catalog import load_catalog
-from startrack.terrain import load_terrain
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import HeightMap, load_terrain
 
 EXPOSURES, EVERY_S = (4, 12), 12 * 3600.0
 FIRST_ERROR_M, FIRST_SIGMA_M = 7.0, 8.0  # of the first guess of each exposure, in place of a search

@@ -23,8 +23,7 @@ from startrack.core.types import NoSolution
 from startrack.localization.integrity import Integrity
 from startrack.rendering import Scene, Series, render
 from startrack.simulation import simulate_rays
-from startrack.terrain import load_terrain
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import HeightMap, load_terrain
 
 SEED, SHARE = 7, 0.07
 FLOOR_M, FLOOR_SLOPE_RAD = 4000.0, np.radians(15.0)  # positions on height maps

@@ -27,8 +27,7 @@ from startrack.core.types import Evidence, Fix, NoSolution
 from startrack.localization import ExactPosterior
 from startrack.localization.horizon_bias import lower_evidence
 from startrack.rendering import Series, render
-from startrack.terrain import load_terrain
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import HeightMap, load_terrain
 
 NOISE_M, BIAS_RAD, SLOPE_RAD = 5.0, np.radians(0.08), np.radians(15.0)
 SLOPE_ERROR_RAD = np.radians(6.0)  # errors of 5 m at posts 240 m apart tilt the ground by 1.7 degrees (s.d.)

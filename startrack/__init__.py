@@ -20,7 +20,7 @@ _MODULES = {  # public name to the module that has it
     "predict": "api.synthetic", "render": "api.synthetic",
     "Solution": "api.solution",
     "Camera": "camera", "load_camera": "camera",
-    "Cylinder": "terrain", "HeightMap": "terrain.height_map", "Terrain": "terrain", "load_terrain": "terrain",
+    "Cylinder": "terrain", "HeightMap": "terrain", "Terrain": "terrain", "load_terrain": "terrain",
     "load_catalog": "catalog",
     "Detections": "core.types", "Evidence": "core.types", "Fix": "core.types",
     "ExactPosterior": "localization",
@@ -62,8 +62,7 @@ if TYPE_CHECKING:
     from startrack.core.errors import BadInput, NoSolution
     from startrack.core.types import Detections, Evidence, Fix
     from startrack.localization import ExactPosterior
-    from startrack.terrain import Cylinder, Terrain, load_terrain
-    from startrack.terrain.height_map import HeightMap
+    from startrack.terrain import Cylinder, HeightMap, Terrain, load_terrain
 
 
 def __getattr__(name: str) -> Any:

@@ -15,9 +15,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from startrack.terrain.geotiff import write_map
-from startrack.terrain.raster import EQUIRECTANGULAR, Projection, Raster, polar_stereographic
-from startrack.terrain.raster_io import read_map
+from startrack.terrain import EQUIRECTANGULAR, Projection, Raster, read_map, write_map
+from startrack.terrain.raster import polar_stereographic
 
 HERE = Path(__file__).parent
 SUMS = {

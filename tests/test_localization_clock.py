@@ -14,8 +14,7 @@ from startrack.core.types import Array, Clock, Evidence, Fix, NotLocated
 from startrack.frames import R_enu_icrs, Site, azel_from_rays, sky_rotvec_rad
 from startrack.localization import ExactPosterior
 from startrack.localization.clock import clock_matters, turn_evidence
-from startrack.terrain import Terrain, load_terrain
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import HeightMap, Terrain, load_terrain
 
 TIME = datetime(2030, 6, 3, 4, 5, 6, tzinfo=UTC)
 HOUR_S = 3600.0

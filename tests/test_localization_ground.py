@@ -15,8 +15,7 @@ from startrack.localization.branch_and_bound import Search
 from startrack.localization.horizon_bias import lower_evidence
 from startrack.localization.initial_guess import BEAMS, Guess, beam_search
 from startrack.localization.likelihood import PositionLikelihood
-from startrack.terrain import load_terrain
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import HeightMap, load_terrain
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 

@@ -36,8 +36,7 @@ from startrack.output.picture.prediction_plot import comparison_picture, path_pi
 from startrack.output.quantities_prediction import CELL_QUANTITIES
 from startrack.output.schema import SCHEMAS
 from startrack.rendering import Drive, exposure_for_snr, limiting_v_mag
-from startrack.terrain import Cylinder, load_terrain
-from startrack.terrain.geotiff import write_bands
+from startrack.terrain import Cylinder, load_terrain, write_bands
 
 WHEN = datetime(2030, 6, 1, tzinfo=UTC)
 NAMES = [one.name for one in CELL_QUANTITIES]

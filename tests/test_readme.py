@@ -15,7 +15,7 @@ from page_helpers import ROOT, run_page
 from startrack.camera.io import camera_from_dict
 from startrack.cli.main import COMMANDS, main
 from startrack.core.errors import Reason
-from startrack.terrain.io import terrain_from_dict
+from startrack.terrain import terrain_from_dict
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 FORMATS = (ROOT / "docs/formats.md").read_text(encoding="utf-8")

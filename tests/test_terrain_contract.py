@@ -14,9 +14,8 @@ from startrack.chain.inputs import terrain_input
 from startrack.core.types import Array, BadInput, Evidence
 from startrack.frames import Site
 from startrack.localization import ExactPosterior
-from startrack.terrain import Cylinder, Terrain, load_terrain
-from startrack.terrain.deformed_crater import DeformedCrater
-from startrack.terrain.protocol import ForwardingTerrain
+from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain
+from startrack.terrain.crater import DeformedCrater
 
 SITE = Site("moon", np.radians(-89.66), np.radians(129.78))
 AZIMUTHS = np.linspace(0.01, 2 * np.pi, 12, endpoint=False)

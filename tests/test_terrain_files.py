@@ -15,19 +15,18 @@ from startrack.camera import load_camera
 from startrack.cli.main import main
 from startrack.core.files import data_dir, file_stem
 from startrack.core.types import BadInput
-from startrack.terrain import load_terrain, terrain_from_dict
-from startrack.terrain.geotiff import write_map
-from startrack.terrain.height_map import HeightMap
-from startrack.terrain.raster import (
+from startrack.terrain import (
     EQUIRECTANGULAR,
-    ORTHOGRAPHIC,
+    HeightMap,
     Projection,
     Raster,
-    polar_stereographic,
-    projection_of,
+    load_terrain,
+    read_map,
+    terrain_from_dict,
+    write_map,
 )
-from startrack.terrain.raster_io import read_map
-from startrack.terrain.stated_errors import MEASURED_PER_ESTIMATE
+from startrack.terrain.import_map import MEASURED_PER_ESTIMATE
+from startrack.terrain.raster import ORTHOGRAPHIC, polar_stereographic, projection_of
 
 ROOT = Path(__file__).parent.parent
 pytestmark = pytest.mark.usefixtures("own_cache")

@@ -16,20 +16,19 @@ from startrack.core.types import Evidence
 from startrack.frames import Site, enu_from_latlon, latlon_from_enu
 from startrack.localization import ExactPosterior
 from startrack.localization.horizon_bias import LinearSolution, lower_evidence
-from startrack.terrain import load_terrain, table_building
-from startrack.terrain import table_cache as cache
-from startrack.terrain.deformed_map import DeformedMap
-from startrack.terrain.height_map import HeightMap
-from startrack.terrain.protocol import ForwardingTerrain
-from startrack.terrain.pyramid import ground_up_m
-from startrack.terrain.raster import (
+from startrack.terrain import (
     EQUIRECTANGULAR,
-    ORTHOGRAPHIC,
     STEREOGRAPHIC,
+    ForwardingTerrain,
+    HeightMap,
     Projection,
     Raster,
-    polar_stereographic,
+    load_terrain,
 )
+from startrack.terrain import table_cache as cache
+from startrack.terrain.deformed_map import DeformedMap
+from startrack.terrain.ground import ground_up_m
+from startrack.terrain.raster import ORTHOGRAPHIC, polar_stereographic
 
 DATA = Path(__file__).parent / "data"
 pytestmark = pytest.mark.usefixtures("own_cache")
@@ -156,7 +155,8 @@ def test_bounds_do_not_depend_on_what_was_traced_before(shackleton):
 def test_the_table_is_kept_and_found_again_by_content(shackleton):
     terrain = replace(shackleton, camera_height_m=1.7, search_radius_m=150.0)
     table = terrain.table
-    key, path = cache.key_of(terrain), terrain.table_path
+    kept, path = terrain.kept_table, terrain.table_path
+    key = kept.key
     assert path.is_file()
     assert [p for p in path.parent.iterdir() if p.name.startswith(".")] == []
     cache.TABLES_IN_MEMORY.pop(key)
@@ -166,29 +166,29 @@ def test_the_table_is_kept_and_found_again_by_content(shackleton):
     assert np.array_equal(again.table.values, table.values)
     assert replace(terrain).table is again.table  # variants with the same table share it
     higher = replace(terrain, camera_height_m=3.0)
-    assert cache.key_of(higher) != key
+    assert higher.kept_table.key != key
     first = terrain.maps[0]
     other = replace(first, heights_m=first.heights_m + np.float32(0.5))
-    assert cache.key_of(replace(terrain, maps=(other, *terrain.maps[1:]))) != key
+    assert replace(terrain, maps=(other, *terrain.maps[1:])).kept_table.key != key
     path.write_bytes(path.read_bytes()[:1000])
     cache.TABLES_IN_MEMORY.pop(key)
-    assert cache.load_table(key, terrain.square) is None  # a damaged table is made again
-    cache.keep_table(key, table)
-    assert cache.load_table(key, terrain.square) is table
+    assert kept.load() is None  # a damaged table is made again
+    kept.keep(table)
+    assert kept.load() is table
 
 
 def test_of_two_that_need_a_table_one_makes_it(shackleton, monkeypatch):
     """Each thread represents a process: locks belong to open files, not to processes."""
-    made, build = [], table_building._build
+    made, build = [], cache.build_table
 
-    def slow(terrain, progress):
+    def slow(*arguments):
         made.append(threading.get_ident())
         time.sleep(0.3)
-        return build(terrain, progress)
+        return build(*arguments)
 
-    monkeypatch.setattr(table_building, "_build", slow)
+    monkeypatch.setattr(cache, "build_table", slow)
     terrains = [replace(shackleton, camera_height_m=1.75, search_radius_m=150.0) for _ in range(3)]
-    path = cache.path_of(cache.key_of(terrains[0]))
+    path = terrains[0].table_path
     path.parent.mkdir(parents=True, exist_ok=True)
     path.with_suffix(".lock").touch()  # left by a process that was killed: nobody holds it
     with ThreadPoolExecutor(3) as pool:

@@ -15,12 +15,9 @@ from startrack.core.files import data_dir
 from startrack.core.types import Array, Evidence
 from startrack.frames import enu_from_latlon
 from startrack.localization import ExactPosterior
-from startrack.terrain import load_terrain
-from startrack.terrain.geotiff import write_map
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import STEREOGRAPHIC, HeightMap, Projection, Raster, load_terrain, read_map, write_map
 from startrack.terrain.map_comparison import MapComparison, compare_maps
-from startrack.terrain.raster import ORTHOGRAPHIC, STEREOGRAPHIC, Projection, Raster
-from startrack.terrain.raster_io import read_map
+from startrack.terrain.raster import ORTHOGRAPHIC
 
 DATA = Path(__file__).parent / "data"
 pytestmark = pytest.mark.usefixtures("own_cache")

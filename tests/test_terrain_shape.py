@@ -16,9 +16,8 @@ from startrack.core.types import BadInput
 from startrack.localization.shared_errors import SharedErrors
 from startrack.simulation import draw_ground
 from startrack.simulation.ground_errors import ErringGround
-from startrack.terrain import Cylinder, ForwardingTerrain, Terrain, load_terrain, terrain_from_dict
-from startrack.terrain.deformed_crater import DeformedCrater
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import Cylinder, ForwardingTerrain, HeightMap, Terrain, load_terrain, terrain_from_dict
+from startrack.terrain.crater import DeformedCrater
 
 CRATER = {
     "format": 1, "name": "pit", "body": "moon", "origin": {"latitude_deg": -89.0, "longitude_deg": 0.0},

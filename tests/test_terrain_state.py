@@ -13,8 +13,7 @@ from test_terrain_files import terrain_file
 
 from startrack.cli.main import main
 from startrack.core.types import BadInput
-from startrack.terrain import load_terrain
-from startrack.terrain.state_file import state_errors, stateable_errors
+from startrack.terrain import load_terrain, state_errors, stateable_errors
 
 PIT = """# My crater.
 format = 1

@@ -18,8 +18,7 @@ from startrack.applications.tracking.smoother import Observations, Steps, smooth
 from startrack.core.types import BadInput, Clock, Evidence, ImageErrors, ShownError
 from startrack.localization import ExactPosterior
 from startrack.localization.importance_sampling import sample
-from startrack.terrain import Cylinder, load_terrain
-from startrack.terrain.height_map import HeightMap
+from startrack.terrain import Cylinder, HeightMap, load_terrain
 
 TIME = datetime(2030, 6, 1, tzinfo=UTC)
 HORIZON_ERROR_RAD = np.radians(0.05)

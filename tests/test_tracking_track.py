@@ -14,9 +14,7 @@ from startrack.applications.tracking.track import odometry_steps
 from startrack.core.errors import BadInput
 from startrack.frames import R_body_enu_from_heading_pitch_roll, quat_xyzw_from_R
 from startrack.localization.shared_errors import SharedErrors
-from startrack.terrain import load_terrain
-from startrack.terrain.height_map import HeightMap
-from startrack.terrain.shape import ShapeError
+from startrack.terrain import HeightMap, ShapeError, load_terrain
 
 START, EVERY_S = datetime(2030, 6, 1, tzinfo=UTC), 900.0
 FRAMES = 12

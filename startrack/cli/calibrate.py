@@ -203,7 +203,7 @@ def approximate_camera(args: argparse.Namespace, exposures: list[Exposure]) -> C
 def flag_site(args: argparse.Namespace) -> Site | None:
     """The site of --site; None without it. A usage error for a place that is not on the Earth."""
     from startrack.frames import Site
-    from startrack.terrain.io import KEYS
+    from startrack.terrain import TERRAIN_KEYS as KEYS
 
     if not args.site:
         return None

@@ -134,8 +134,7 @@ def _build_tables(args: argparse.Namespace) -> int:
 
 
 def _import_map(args: argparse.Namespace) -> int:
-    from startrack.terrain import load_terrain
-    from startrack.terrain.import_map import import_maps
+    from startrack.terrain import import_maps, load_terrain
 
     announce_compilation()
     half = list(args.half or [])

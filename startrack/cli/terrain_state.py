@@ -13,7 +13,7 @@ from startrack.core.errors import BadInput
 from startrack.core.files import parse_toml, printable, read_text, resolve_named, write_atomically
 
 if TYPE_CHECKING:
-    from startrack.terrain.state_file import StateableError
+    from startrack.terrain import StateableError
 
 FLAGS = {  # keys of the file, and the unit of each
     "depth_sigma_m": "M", "diameter_sigma_m": "M", "ellipse_sigma_1": "X", "rim_tilt_sigma_deg": "DEG",
@@ -44,7 +44,7 @@ def _flag(key: str) -> str:
 
 def state_terrain(args: argparse.Namespace) -> int:
     """Write the errors; 0, or 2 where there is nothing to write and nobody to ask. Raises BadInput, BadOutput."""
-    from startrack.terrain.state_file import stateable_errors
+    from startrack.terrain import stateable_errors
 
     path = resolve_named(args.file, "terrain", "bad_terrain")
     text = read_text(path, "bad_terrain")
@@ -104,8 +104,7 @@ def _answer(error: StateableError) -> str | None:
 
 def _changed_text(path: Path, text: str, values: Values) -> str:
     """The text of the file with the values. Raises BadInput where it would be no terrain."""
-    from startrack.terrain.io import terrain_from_dict
-    from startrack.terrain.state_file import state_errors
+    from startrack.terrain import state_errors, terrain_from_dict
 
     changed = state_errors(text, values)
     terrain_from_dict(parse_toml(changed, "bad_terrain"), default_name=path.stem, folder=path.parent)

@@ -9,8 +9,7 @@ import numpy as np
 
 from startrack.core.types import Array, Clock
 from startrack.frames import R_from_rotvec, turn_azel
-from startrack.terrain import Terrain
-from startrack.terrain.shape import ShapeError
+from startrack.terrain import ShapeError, Terrain
 
 TURN_STEP_RAD = 2e-3  # of the sky, at which the skyline's change with the time is taken: its crests are no narrower
 ROUGH_RAD = np.radians(0.002)  # of ground that nobody states as exact: 0.35 m of a rim 10 km away

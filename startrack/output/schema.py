@@ -22,7 +22,7 @@ from startrack.output.schema_parts import (
     schema,
 )
 from startrack.output.views import section_schema
-from startrack.terrain.io import KEYS as TERRAIN_KEYS
+from startrack.terrain import TERRAIN_KEYS
 
 CAMERA = schema("Camera file", camera_keys().schema())
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.core.types import Array, Ints
-from startrack.terrain import Terrain
-from startrack.terrain.horizon_posts import NO_POST
-from startrack.terrain.protocol import ForwardingTerrain
+from startrack.terrain import NO_POST, ForwardingTerrain, Terrain
 
 MOST_SIGMAS = 4.0  # of an error of the shape, beyond which none is drawn
 

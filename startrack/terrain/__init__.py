@@ -1,12 +1,46 @@
 """Ground that hides stars: one kind of terrain per file, behind one protocol."""
 
-from startrack.terrain.checks import require_bounds, require_horizons, require_terrain
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from startrack.terrain.cylinder import Cylinder
-from startrack.terrain.io import load_terrain, terrain_from_dict
-from startrack.terrain.protocol import ForwardingTerrain, Terrain
+from startrack.terrain.io import KEYS as TERRAIN_KEYS
+from startrack.terrain.io import body_of_terrain, load_terrain, terrain_from_dict
+from startrack.terrain.protocol import (
+    NO_POST,
+    ForwardingTerrain,
+    HorizonPosts,
+    Terrain,
+    require_bounds,
+    require_horizons,
+    require_terrain,
+)
+from startrack.terrain.raster import EQUIRECTANGULAR, STEREOGRAPHIC, Projection, Raster
 from startrack.terrain.shape import ShapeError
 
+if TYPE_CHECKING:
+    from startrack.terrain.height_map import HeightMap
+    from startrack.terrain.import_map import import_maps
+    from startrack.terrain.map_reading import read_map
+    from startrack.terrain.map_writing import write_bands, write_map
+    from startrack.terrain.state_file import StateableError, state_errors, stateable_errors
+
 __all__ = [
-    "Cylinder", "ForwardingTerrain", "ShapeError", "Terrain", "load_terrain", "require_bounds", "require_horizons",
-    "require_terrain", "terrain_from_dict",
+    "EQUIRECTANGULAR", "NO_POST", "STEREOGRAPHIC", "TERRAIN_KEYS", "Cylinder", "ForwardingTerrain", "HeightMap",
+    "HorizonPosts", "Projection", "Raster", "ShapeError", "StateableError", "Terrain", "body_of_terrain",
+    "import_maps", "load_terrain", "read_map", "require_bounds", "require_horizons", "require_terrain",
+    "state_errors", "stateable_errors", "terrain_from_dict", "write_bands", "write_map",
 ]  # fmt: skip
+_MODULES = {  # of names that few programs use: imported at the first use
+    "HeightMap": "height_map", "StateableError": "state_file", "import_maps": "import_map", "read_map": "map_reading",
+    "state_errors": "state_file", "stateable_errors": "state_file", "write_bands": "map_writing",
+    "write_map": "map_writing",
+}  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -9,10 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.core.kernels import njit
+from startrack.frames import MOON_RADIUS_M
+from startrack.terrain.ground_kernel import level_of, slope_range, steepness
 from startrack.terrain.horizon_kernel import (
     FAR_M,
     LOWEST_TAN,
-    SPHERE_M,
     best_in_step,
     block_at,
     exit_of,
@@ -21,7 +22,6 @@ from startrack.terrain.horizon_kernel import (
     on_map,
     surface,
 )
-from startrack.terrain.slope_kernel import level_of, slope_range, steepness
 
 FINE_POSTS = 1.2  # posts: of narrower bands slopes are taken cell by cell
 KINK_M = 0.02  # by which a traced ray may miss a kink of the ground: NUDGE_M times the change of slope
@@ -141,7 +141,7 @@ def bounds(
         m, column, row = locate(grid, posts, e, n, line)
         r = np.sqrt(e * e + n * n + line * line)
         climb = (e * sin_a + n * cos_a + line * (low + along_rise - tilted * tan_turn)) / r
-        floor = r - SPHERE_M - (aside + width) / moon * width
+        floor = r - MOON_RADIUS_M - (aside + width) / moon * width
         if m < 0 or (not probing and (s >= end_m or (climb >= 0.0 and floor >= highest and s > reach))):
             running = probing
             if probing:

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import atan2, sqrt
 from typing import Any
 
 import numpy as np
 
 from startrack.core.declaration import Flag, Number
+from startrack.core.kernels import njit
 from startrack.core.types import Array, BadInput, Bools
-from startrack.frames import Site
-from startrack.terrain.circle import distance_bounds, distance_to_circle, horizons_of_circle
-from startrack.terrain.deformed_crater import DeformedCrater, slopes_of_round_crater
-from startrack.terrain.protocol import Terrain
+from startrack.terrain.crater import (
+    Crater,
+    DeformedCrater,
+    distance_bounds,
+    distance_to_circle,
+    slopes_of_round_crater,
+)
 from startrack.terrain.shape import CAMERA_ERROR, DEPTH, DIAMETER, ELLIPSE, RIM_TILT, ShapeError, by_name, select_slopes
 
 MAX_LENGTH_M = 1e7  # five times the Moon's radius
@@ -44,7 +49,7 @@ _CLASS_SIGMAS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cylinder(Terrain):
+class Cylinder(Crater):
     """tan H = (depth - camera height) / d(p, a), d the distance from p along azimuth a to the circle of the rim.
 
     Source: Kua 2008, section 3.1 (eq. 3.1 seen from the camera's height instead of the floor). Raises BadInput
@@ -53,11 +58,6 @@ class Cylinder(Terrain):
     """
 
     name: str = "cylinder"
-    site: Site | None = None
-    diameter_m: float
-    depth_m: float
-    camera_height_m: float = 0.0
-    search_radius_m: float = np.inf
     depth_sigma_m: float | None = 0.0  # standard deviations; None: not stated, see `terrain.shape`
     diameter_sigma_m: float | None = 0.0
     ellipse_sigma_1: float | None = 0.0  # relative to the radius, of each of two terms
@@ -84,49 +84,25 @@ class Cylinder(Terrain):
             if (getattr(self, key) or 0.0) >= MAX_SHAPE_SIGMA * size:
                 raise BadInput("bad_terrain", f"{key} must be below {MAX_SHAPE_SIGMA * size:g} m, a fifth of it")
 
-    @property
-    def radius_m(self) -> float:
-        return self.diameter_m / 2
-
-    @property
-    def rim_radius_m(self) -> float:  # type: ignore[override]
-        """The wall's, to be drawn on maps."""
-        return self.radius_m
-
-    @property
-    def reach_m(self) -> float:
-        """The floor, or the search area and a quarter more."""
-        return min(self.radius_m, 1.25 * self.search_radius_m)
-
-    @property
-    def wall_m(self) -> float:
-        """Height of the rim above the camera [m]."""
-        return self.depth_m - self.camera_height_m
-
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad]; pi/2 from inside the wall. See `Terrain`."""
         points, azimuths = np.asarray(points_m, dtype=np.float64), np.asarray(azimuths_rad, dtype=np.float64)
         if points.ndim == 3 and points.shape[1] == 1 and azimuths.ndim == 1:  # each point with each azimuth
-            return np.asarray(horizons_of_circle(points[:, 0], azimuths, self.radius_m, self.wall_m))
+            return _horizons_of_circle(
+                np.ascontiguousarray(points[:, 0]), np.sin(azimuths), np.cos(azimuths), self.radius_m, self.wall_m
+            )
         return np.arctan2(self.wall_m, distance_to_circle(points, azimuths, self.radius_m))
 
     def horizon_bounds_rad(
         self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
     ) -> tuple[Array, Array]:
         """Bounds of the horizon over boxes [rad], from circles grown and shrunk by the half diagonal."""
-        nearest, farthest = distance_bounds(
-            centres_m, half_m, azimuths_rad, azimuth_half_rad, self.radius_m, self.radius_m
-        )
+        nearest, farthest = distance_bounds(centres_m, half_m, azimuths_rad, azimuth_half_rad, *self.radii_m)
         return np.arctan2(self.wall_m, farthest), np.arctan2(self.wall_m, nearest)
 
-    def ground_m(self, points_m: Array) -> Array:
-        """Zero: the floor is the plane z = 0."""
-        return np.zeros(np.shape(points_m)[:-1])
-
-    def allowed(self, points_m: Array) -> Bools:
-        """Whether the points (..., 2) are on the floor and within reach."""
-        away = np.hypot(points_m[..., 0], points_m[..., 1])
-        return np.asarray((away < self.radius_m) & (away <= self.reach_m))
+    def is_within(self, points_m: Array) -> Bools:
+        """Whether the wall surrounds the points (..., 2)."""
+        return np.asarray(np.hypot(points_m[..., 0], points_m[..., 1]) < self.radius_m)
 
     @property
     def shape_errors(self) -> tuple[ShapeError, ...]:  # type: ignore[override]
@@ -142,12 +118,7 @@ class Cylinder(Terrain):
         """In closed form; see `Terrain`. Zero from inside the wall."""
         shape = np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
         errors = self.shape_errors
-        if not errors:
-            return np.zeros((0, *shape))
-        slopes = slopes_of_round_crater(
-            points_m, azimuths_rad, radius_m=self.radius_m, depth_m=self.depth_m, camera_height_m=self.camera_height_m
-        )
-        return select_slopes(errors, slopes, shape)
+        return select_slopes(errors, slopes_of_round_crater(self, points_m, azimuths_rad) if errors else {}, shape)
 
     def with_shape(self, values: Array) -> DeformedCrater:
         """The crater with these errors; see `Terrain`."""
@@ -172,3 +143,17 @@ class Cylinder(Terrain):
         rho = np.divide(self.wall_m, tan, out=np.full_like(tan, 1e12), where=tan > 0)
         u = np.stack([np.sin(azimuths_rad), np.cos(azimuths_rad)], axis=-1)
         return -np.minimum(rho, 1e12)[:, None] * u, self.radius_m
+
+
+@njit(cache=True, nogil=True)
+def _horizons_of_circle(points, sines, cosines, radius, wall):  # type: ignore[no-untyped-def]
+    """Elevations (n, m) [rad] of a rim `wall` above points (n, 2), at azimuths (m,) by their sines and cosines."""
+    found = np.empty((len(points), len(sines)))
+    for i in range(len(points)):
+        x, y = points[i, 0], points[i, 1]
+        inner = radius * radius - x * x - y * y
+        for k in range(len(sines)):
+            along = x * sines[k] + y * cosines[k]
+            distance = max(sqrt(along * along + inner) - along, 0.0) if inner > 0.0 else 0.0
+            found[i, k] = atan2(wall, distance)
+    return found

@@ -6,18 +6,14 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from startrack.core.types import Array
 from startrack.frames import R_from_rotvec
-from startrack.terrain.horizon_posts import HorizonPosts
-from startrack.terrain.protocol import ForwardingTerrain, Terrain
+from startrack.terrain.protocol import ForwardingTerrain, HorizonPosts, Terrain
 from startrack.terrain.shape import ShapeError, select_slopes
-
-if TYPE_CHECKING:
-    from startrack.terrain.height_map import HeightMap
+from startrack.terrain.traced_map import TracedMap
 
 TURNS = 2  # of the azimuth towards that of the turned skyline: each leaves a thousandth of the difference
 WIDER_RAD = 0.1  # by which azimuths are widened to find the highest skyline that a tilt may turn into a direction
@@ -31,17 +27,17 @@ class DeformedMap(ForwardingTerrain):
     map with the camera at the changed height; the horizon does without.
     """
 
+    whole: TracedMap
     shape_errors, common_sigma_rad = (), 0.0
-    near, interpolated, interpolation = Terrain.near, Terrain.interpolated, Terrain.interpolation
-    interpolated_part = Terrain.interpolated_part
+    near, interpolated = Terrain.near, Terrain.interpolated
     shape_slopes_rad, with_shape = Terrain.shape_slopes_rad, Terrain.with_shape
 
     def __init__(
-        self, whole: HeightMap, *, bias_rad: float = 0.0, stretch_1: float = 0.0, vertical_east_rad: float = 0.0,
+        self, whole: TracedMap, *, bias_rad: float = 0.0, stretch_1: float = 0.0, vertical_east_rad: float = 0.0,
         vertical_north_rad: float = 0.0, camera_height_m: float = 0.0,
     ) -> None:  # fmt: skip
         super().__init__(whole)
-        self._map, self._raised_m = whole, camera_height_m
+        self._raised_m = camera_height_m
         self._bias_rad, self._stretch_1 = bias_rad, stretch_1
         self._tilt_rad = float(np.hypot(vertical_east_rad, vertical_north_rad))
         self._R_turned_map = R_from_rotvec([vertical_north_rad, -vertical_east_rad, 0.0])
@@ -49,11 +45,11 @@ class DeformedMap(ForwardingTerrain):
     @property
     def camera_height_m(self) -> float:  # type: ignore[override]
         """Of the camera above the ground, with its error."""
-        return max(self._map.camera_height_m + self._raised_m, 0.0)
+        return max(self.whole.camera_height_m + self._raised_m, 0.0)
 
     @cached_property
-    def _raised(self) -> HeightMap:
-        return replace(self._map, camera_height_m=self.camera_height_m) if self._raised_m else self._map
+    def _raised(self) -> TracedMap:
+        return replace(self.whole, camera_height_m=self.camera_height_m) if self._raised_m else self.whole
 
     def without_table(self) -> DeformedMap:
         """The same ground of the raised camera's map without its table; see `Terrain`."""
@@ -99,19 +95,19 @@ class DeformedMap(ForwardingTerrain):
 
     def horizon_spread_rad(self, points_m: Array, half_m: float, azimuths_rad: Array) -> tuple[Array, Array]:
         """As of the map, about the horizon of this ground; see `Terrain`."""
-        return self.horizon_rad(points_m, azimuths_rad), self._map.horizon_spread_rad(points_m, half_m, azimuths_rad)[1]
+        return self.horizon_rad(points_m, azimuths_rad), self.whole.horizon_spread_rad(points_m, half_m, azimuths_rad)[
+            1
+        ]
 
     def horizon_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
         """Those of the map, with the horizon of this ground; see `Terrain`."""
-        return replace(
-            self._map.horizon_posts(point_m, azimuths_rad), horizon_rad=self.horizon_rad(point_m, azimuths_rad)
-        )
+        posts = self.whole.horizon_posts(point_m, azimuths_rad)
+        return replace(posts, horizon_rad=self.horizon_rad(point_m, azimuths_rad))
 
     def ground_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
         """Those of the map, with the horizon of this ground; see `Terrain`."""
-        return replace(
-            self._map.ground_posts(point_m, azimuths_rad), horizon_rad=self.horizon_rad(point_m, azimuths_rad)
-        )
+        posts = self.whole.ground_posts(point_m, azimuths_rad)
+        return replace(posts, horizon_rad=self.horizon_rad(point_m, azimuths_rad))
 
 
 def slopes_of_map(errors: Sequence[ShapeError], tan: Array, per_m: Array, azimuths_rad: Array) -> Array:

@@ -1,53 +1,32 @@
-"""Height maps as terrain: the horizon traced exactly, with a table of bounds that is computed once and kept."""
+"""Height maps as terrain: traced ground, the errors of its horizon, and azimuths that give no evidence."""
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.types import Array, BadInput, Bools, Ints
-from startrack.frames import Site
-from startrack.terrain import table_cache as cache
-from startrack.terrain import tracing
+from startrack.core.types import Array, Bools, Ints
 from startrack.terrain.deformed_map import DeformedMap, slopes_of_map
+from startrack.terrain.ground import cell_posts, post_positions
 from startrack.terrain.horizon_interpolator import NODES_ACROSS, HorizonInterpolator
-from startrack.terrain.horizon_posts import HorizonPosts, cell_posts, post_positions
-from startrack.terrain.horizon_sigma import HorizonSigma
-from startrack.terrain.horizon_table import BINS, HorizonTable, Square
-from startrack.terrain.masks import GLARE, OFF_MAP, Sectors, describe_masks, in_sectors
-from startrack.terrain.protocol import Progress, Terrain
-from startrack.terrain.pyramid import Ground, ground_up_m, pack_maps
-from startrack.terrain.raster import Projection, Raster
+from startrack.terrain.horizon_table import BINS, HorizonSigma
+from startrack.terrain.protocol import HorizonPosts, Terrain
 from startrack.terrain.shape import BIAS, CAMERA_ERROR, STRETCH, VERTICAL, ShapeError, by_name
-from startrack.terrain.table_building import load_or_build_table
+from startrack.terrain.traced_map import TracedMap
 
-FINEST_BOX_M = 0.45  # half side of the smallest boxes of positions: no height map is more accurate
-CELL_M = 200.0  # cells of the table are no wider
-MAX_CELLS_ACROSS = 128
 COMMON_PER_POST = 3.0
-MARGIN = 1.15  # of the search radius: so far is searched, to notice that the camera left the area
-SLOPE_STEP_M = 5.0
+GLARE, OFF_MAP = "glare of a lit rim", "ground off the map"
+Sectors = tuple[tuple[float, float], ...]  # azimuth ranges [rad], each from the first eastward to the second
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class HeightMap(Terrain):
-    """The surface that is bilinear between the posts of height maps, as true 3-D points on the Moon's sphere.
+class HeightMap(TracedMap):
+    """Height maps and what is known of their errors: see `TracedMap` for the ground, `Terrain` for the methods."""
 
-    tan H = max over s of (z(p + s u) - z(p) - camera height) / s, u the azimuth's direction. Where several maps cover
-    a point the first holds. Raises BadInput bad_terrain if the maps do not cover the search area. See `Terrain`.
-    """
-
-    name: str = "height map"
-    site: Site
-    maps: tuple[Raster, ...]  # finest first
-    camera_height_m: float = 1.5
-    search_radius_m: float = 10_000.0
     height_sigma_m: float = 0.0  # of single posts, independent of each other
     horizon_sigma_common_rad: float | None = None  # of an error that all azimuths share; None: see common_sigma_rad
     stretch_sigma_1: float | None = 0.0  # of the factor of tan H, less 1; None: not stated, see `terrain.shape`
@@ -56,35 +35,11 @@ class HeightMap(Terrain):
     most_slope_rad: float = np.pi / 2  # a rover does not stand on steeper ground
     glare_rad: Sectors = ()  # lit by the Sun: no evidence there
     unstated_errors: tuple[str, ...] = ()
-    finest_m = FINEST_BOX_M
-    _uses_table = True  # traces begin at the horizon's distance of a table in memory
-
-    def __post_init__(self) -> None:
-        if not self.maps:
-            raise BadInput("bad_terrain", "[dem] needs at least one map")
-        if not self._covers(self.search_radius_m):
-            area = f"the search area of {self.search_radius_m:.0f} m about the origin"
-            raise BadInput("bad_terrain", f"the maps do not cover {area}, or have holes in it")
 
     @property
     def hard_edges(self) -> bool:  # type: ignore[override]
         """Whether single posts have no error: the horizon of a point is then exact, but for a common error."""
         return self.height_sigma_m == 0
-
-    @property
-    def projection(self) -> Projection:  # type: ignore[override]
-        """That of the finest map."""
-        return self.maps[0].projection
-
-    @cached_property
-    def ground(self) -> Ground:
-        """The maps packed for tracing."""
-        return pack_maps(list(self.maps), self.site)
-
-    @cached_property
-    def finest_post_m(self) -> float:
-        """Spacing of the posts of the finest map."""
-        return min(m.post_m for m in self.maps)
 
     @cached_property
     def common_sigma_rad(self) -> float:  # type: ignore[override]
@@ -121,80 +76,11 @@ class HeightMap(Terrain):
         """Cells (n,) in the search area."""
         return np.asarray(np.hypot(*self.square.centres_m.T) < self.search_radius_m)
 
-    @cached_property
-    def reach_m(self) -> float:
-        """The search area and a margin, as far as the maps reach."""
-        return self.search_radius_m * MARGIN if self._covers(self.search_radius_m * MARGIN) else self.search_radius_m
-
-    @cached_property
-    def square(self) -> Square:
-        """The cells of the table."""
-        across = 1
-        while 2 * self.reach_m / across > CELL_M and across < MAX_CELLS_ACROSS:
-            across *= 2
-        return Square(self.reach_m, across)
-
-    @cached_property
-    def _key(self) -> str:
-        return cache.key_of(self)
-
-    @property
-    def table_path(self) -> Path:  # type: ignore[override]
-        """File of the table of horizons."""
-        return cache.path_of(self._key)
-
-    @property
-    def is_prepared(self) -> bool:
-        """Whether the table of horizons is in memory or on disk."""
-        return self._key in cache.TABLES_IN_MEMORY or self.table_path.is_file()
-
-    def prepare(self, progress: Progress | None = None) -> None:
-        """Have the table of horizons in memory: from the cache on disk, else computed and cached.
-
-        If several processes need the same table, one computes it and the others wait.
-        """
-        if "table" not in self.__dict__:
-            self.__dict__["table"] = load_or_build_table(self, self._key, progress)
-
-    @cached_property
-    def table(self) -> HorizonTable:
-        """The table of horizons; see `prepare`."""
-        return load_or_build_table(self, self._key)
-
-    def discard_table(self) -> None:
-        """Remove the table of horizons from memory and disk."""
-        self.__dict__.pop("table", None)
-        self.__dict__.pop("_sigma", None)
-        cache.discard_table(self._key)
-
-    def without_table(self) -> HeightMap:
-        """The same map whose traces begin at the camera; see `Terrain`."""
-        other = copy(self)
-        other.__dict__["_uses_table"] = False
-        return other
-
-    def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
-        """Horizon elevation [rad], traced. See `Terrain`."""
-        return np.arctan(self.horizons(points_m, azimuths_rad)[0])
-
-    def horizon_bounds_rad(
-        self, centres_m: Array, half_m: Array, azimuths_rad: Array, azimuth_half_rad: Array | float = 0.0
-    ) -> tuple[Array, Array]:
-        """Bounds of the horizon over boxes [rad]: from the table, and for single rays and small boxes by tracing."""
-        return tracing.bound_horizons(self, self.table, centres_m, half_m, azimuths_rad, azimuth_half_rad)
-
     def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """From the height of the single post that makes the horizon: sigma cos^2 H / its distance."""
         if self.height_sigma_m == 0:
             return np.zeros(np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad)))
         return self._sigma.sigma_rad(points_m, azimuths_rad)
-
-    def horizon_spread_rad(self, points_m: Array, half_m: float, azimuths_rad: Array) -> tuple[Array, Array]:
-        """From the horizon of the middle and its distance d: a move by `half_m` changes tan H by slopes half_m / d."""
-        points = np.asarray(points_m, dtype=np.float64)
-        tan, distance, _ = self.horizons(points, azimuths_rad)
-        slopes = np.abs(tan) + np.tan(self.slope_rad(points))
-        return np.arctan(tan), half_m * slopes / np.maximum(distance, half_m) / (1.0 + tan * tan)
 
     def max_horizon_sigma_rad(
         self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float
@@ -208,25 +94,17 @@ class HeightMap(Terrain):
     def _sigma(self) -> HorizonSigma:
         return HorizonSigma(self.table, self.height_sigma_m)
 
-    def ground_m(self, points_m: Array) -> Array:
-        """Height of the ground in enu (...) [m]."""
-        points = np.asarray(points_m, dtype=np.float64)
-        return tracing.ground_heights(self, points.reshape(-1, 2)).reshape(points.shape[:-1])
+    def discard_table(self) -> None:
+        """Remove the table of horizons from memory and disk."""
+        super().discard_table()
+        self.__dict__.pop("_sigma", None)
 
     def allowed(self, points_m: Array) -> Bools:
         """Whether the points (..., 2) are within reach and not too steep."""
-        points = np.asarray(points_m)
-        inside = np.hypot(points[..., 0], points[..., 1]) <= self.reach_m
+        inside = super().allowed(np.asarray(points_m))
         if self.most_slope_rad >= np.pi / 2:
-            return np.asarray(inside)
-        return np.asarray(inside & (self.slope_rad(points) <= self.most_slope_rad))
-
-    def slope_rad(self, points_m: Array) -> Array:
-        """Slope of the ground (...) over 10 m."""
-        points = np.asarray(points_m, dtype=np.float64)
-        steps = SLOPE_STEP_M * np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])
-        z = self.ground_m(points[..., None, :] + steps)
-        return np.asarray(np.arctan(np.hypot(z[..., 0] - z[..., 1], z[..., 2] - z[..., 3]) / (2 * SLOPE_STEP_M)))
+            return inside
+        return np.asarray(inside & (self.slope_rad(points_m) <= self.most_slope_rad))
 
     def is_informative(self, azimuths_rad: Array, elevations_rad: Array) -> Bools:
         """Whether the map decides if the rays (...) are visible: outside glare, and above unmapped ground."""
@@ -285,16 +163,48 @@ class HeightMap(Terrain):
         """See `Terrain`."""
         return post_positions(self.site, self.maps, posts)
 
-    def horizons(self, points_m: Array, azimuths_rad: Array) -> tuple[Array, Array, Array]:
-        """tan, distance, and distance of the maps' end, of each point and azimuth."""
-        shape = np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
-        points = tracing.flatten(points_m, (*shape, 2)).reshape(-1, 2)
-        table = cache.TABLES_IN_MEMORY.get(self._key) if self._uses_table else None
-        found = tracing.trace_horizons(self, table, points, tracing.flatten(azimuths_rad, shape).ravel())
-        return tuple(a.reshape(shape) for a in found)  # type: ignore[return-value]
 
-    def _covers(self, half_m: float) -> bool:
-        """Whether the maps know all ground in the square about the origin."""
-        line = np.linspace(-half_m, half_m, 65)
-        points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-        return not np.isnan(ground_up_m(self.site, list(self.maps), points)).any()
+def in_sectors(azimuths_rad: Array, sectors_rad: Sectors) -> Bools:
+    """Whether the azimuths (...) are in one of the sectors."""
+    azimuths = np.asarray(azimuths_rad)
+    inside = np.zeros(azimuths.shape, dtype=bool)
+    for start, end in sectors_rad:
+        inside |= (azimuths - start) % (2 * np.pi) <= (end - start) % (2 * np.pi)
+    return inside
+
+
+def describe_masks(glare_rad: Sectors, unknown_rad: Array) -> list[str]:
+    """One line per masked range of azimuths.
+
+    `unknown_rad` (n,) of n equal sectors from north eastward is the elevation below which unmapped ground may stand,
+    or -pi/2.
+    """
+    lines = [
+        f"azimuths {_range_text(start, end)}: no evidence is taken there, {GLARE} (glare_deg)"
+        for start, end in glare_rad
+    ]
+    step = 2 * np.pi / len(unknown_rad)
+    for first, last in _circular_runs(unknown_rad > -np.pi / 2):
+        highest = np.degrees(np.take(unknown_rad, range(first, last), mode="wrap").max())
+        lines.append(
+            f"azimuths {_range_text(first * step, last * step)}: the maps end, and {OFF_MAP} could stand up to "
+            f"{highest:.1f} degrees high; no evidence is taken below that"
+        )
+    return lines
+
+
+def _circular_runs(flags: Bools) -> list[tuple[int, int]]:
+    """First index, and last plus one, of each run of True around the circle; indices may exceed the length."""
+    n = len(flags)
+    if flags.all():
+        return [(0, n)]
+    offset = int(np.argmin(flags))  # of an element that is False
+    steps = np.diff(np.concatenate([[0], np.roll(flags, -offset).astype(np.int8), [0]]))
+    first, last = (np.flatnonzero(steps == sign) + offset for sign in (1, -1))
+    return [(int(a) % n, int(a) % n + int(b - a)) for a, b in zip(first, last, strict=True)]
+
+
+def _range_text(start_rad: float, end_rad: float) -> str:
+    if end_rad - start_rad >= 2 * np.pi - 1e-9:
+        return "0 to 360 degrees"
+    return f"{np.degrees(start_rad) % 360:.0f} to {np.degrees(end_rad) % 360:.0f} degrees"

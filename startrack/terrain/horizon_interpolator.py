@@ -5,21 +5,31 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 
 from startrack.core.types import Array, Bools, Ints
-from startrack.terrain import tracing
 from startrack.terrain.deformed_map import slopes_of_map
-from startrack.terrain.protocol import ForwardingTerrain, Interpolation
-
-if TYPE_CHECKING:
-    from startrack.terrain.height_map import HeightMap
+from startrack.terrain.horizon_kernel import interpolate, interpolate_bounds
+from startrack.terrain.protocol import ForwardingTerrain
+from startrack.terrain.traced_map import TracedMap
+from startrack.terrain.tracing import flatten
 
 NODES_ACROSS = 3  # nodes along each side by default
 MAX_BEND_TAN = 8e-5  # of tan H (0.004 degrees): azimuths whose horizon bends by more between the nodes are traced
 MAX_BEND_SIGMAS = 0.5  # or by more than that part of the map's own error
+
+
+class Nodes(NamedTuple):
+    """Horizons at n azimuths, traced at nodes."""
+
+    tan: Array  # (n, across, across) of the horizon, east first, were the ground at all nodes as high as in the middle
+    per_height: Array  # (n,) decrease of tan of the horizon per metre of the camera's height [1/m]
+    middle_up_m: float  # height of the ground in the middle
+    east_m: float  # of the middle
+    north_m: float
+    half_m: float  # from the middle to the outer nodes
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +41,7 @@ class HorizonInterpolator(ForwardingTerrain):
     themselves show. Azimuths with a larger one are traced.
     """
 
-    whole: HeightMap
+    whole: TracedMap
     centre_m: Array  # (2,)
     half_m: float
     azimuths_rad: Array  # (n,) ascending
@@ -44,30 +54,16 @@ class HorizonInterpolator(ForwardingTerrain):
         return 2 * self.half_m / (self.across - 1)
 
     @cached_property
-    def _traced_nodes(self) -> tuple[Array, Array, float]:
-        """Nodes (n, across, across), one over the crests' distances (n,), and height of the ground in the middle."""
+    def nodes(self) -> Nodes:
+        """The horizons traced at the nodes."""
         line = np.linspace(-self.half_m, self.half_m, self.across)
         points = np.asarray(self.centre_m + np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1), dtype=np.float64)
         tan, distance, _ = self.whole.horizons(points[:, :, None, :], self.azimuths_rad)
         middle = float(self.whole.ground_m(self.centre_m))
         near = 1.0 / np.maximum(np.median(distance, axis=(0, 1)), self.step_m)
-        nodes = tan + (self.whole.ground_m(points) - middle)[:, :, None] * near
-        return np.ascontiguousarray(np.moveaxis(nodes, -1, 0)), near, middle
-
-    @property
-    def nodes(self) -> Array:
-        """(n, across, across) tan of the horizon at the nodes, east first, were they all as high as the middle."""
-        return self._traced_nodes[0]
-
-    @property
-    def per_height(self) -> Array:
-        """(n,) decrease of tan of the horizon per metre of the camera's height [1/m]."""
-        return self._traced_nodes[1]
-
-    @property
-    def middle_up_m(self) -> float:
-        """Height of the ground in the middle."""
-        return self._traced_nodes[2]
+        level = tan + (self.whole.ground_m(points) - middle)[:, :, None] * near
+        tan = np.ascontiguousarray(np.moveaxis(level, -1, 0))
+        return Nodes(tan, near, middle, float(self.centre_m[0]), float(self.centre_m[1]), float(self.half_m))
 
     @cached_property
     def interpolation_error(self) -> Array:
@@ -75,28 +71,20 @@ class HorizonInterpolator(ForwardingTerrain):
 
         A smooth bend errs by an eighth of the second differences, a change from one crest to another by all of one.
         """
-        bends = [np.abs(np.diff(self.nodes, 2, axis=axis)).max(axis=(1, 2), initial=0.0) for axis in (1, 2)]
+        bends = [np.abs(np.diff(self.nodes.tan, 2, axis=axis)).max(axis=(1, 2), initial=0.0) for axis in (1, 2)]
         return np.asarray(bends[0] + bends[1])
 
     @cached_property
     def _smooth(self) -> Bools:
         return np.asarray(self.interpolation_error < np.maximum(MAX_BEND_TAN, MAX_BEND_SIGMAS * self._sigma_rad))
 
-    def interpolation(self, azimuths_rad: Array) -> Interpolation:
-        """See `Terrain`; all azimuths must be among those named."""
-        column = self.column(azimuths_rad)[0]
-        return Interpolation(
-            self.whole.ground, np.ascontiguousarray(self.nodes[column]), self.per_height[column], self.middle_up_m,
-            float(self.centre_m[0]), float(self.centre_m[1]), float(self.half_m),
-        )  # fmt: skip
-
     def interpolated(self) -> HorizonInterpolator:
         """The same nodes, between which all azimuths are interpolated; see `Terrain`."""
-        nodes, other = self._traced_nodes, copy(self)
-        other.__dict__.update(_traced_nodes=nodes, exact=False)
+        nodes, other = self.nodes, copy(self)
+        other.__dict__.update(nodes=nodes, exact=False)
         return other
 
-    def without_table(self) -> HeightMap:
+    def without_table(self) -> TracedMap:
         """The whole map: nothing is interpolated; see `Terrain`."""
         return self.whole.without_table()
 
@@ -125,26 +113,17 @@ class HorizonInterpolator(ForwardingTerrain):
         if not np.all(known):
             return self.whole.shape_slopes_rad(points_m, azimuths_rad)
         tan = np.tan(self.horizon_rad(points_m, azimuths_rad))
-        return slopes_of_map(self.whole.shape_errors, tan, self.per_height[column], azimuths_rad)
-
-    def interpolated_part(self, points_m: Array, azimuths_rad: Array) -> float:
-        """See `Terrain`."""
-        column, known = self.column(azimuths_rad)
-        inside = np.abs(points_m - self.centre_m).max(axis=-1) <= self.half_m * (1 + 1e-9)
-        return float(np.mean(inside & known & self._smooth[column]))
+        return slopes_of_map(self.whole.shape_errors, tan, self.nodes.per_height[column], azimuths_rad)
 
     def horizon_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Horizon elevation [rad]; see `Terrain`."""
-        points_m = np.asarray(points_m, dtype=np.float64)
-        shape = np.broadcast_shapes(points_m.shape[:-1], np.shape(azimuths_rad))
-        points = np.ascontiguousarray(np.broadcast_to(points_m, (*shape, 2))).reshape(-1, 2)
-        azimuths = np.broadcast_to(azimuths_rad, shape).ravel()
-        column, known = self.column(azimuths)
-        found = tracing.interpolate(self, points, column)
-        inside = np.abs(points - self.centre_m).max(axis=-1) <= self.half_m * (1 + 1e-9)
-        other = ~(inside & known & (self._smooth[column] if self.exact else True))
-        if other.any():
-            found[other] = self.whole.horizon_rad(points[other], azimuths[other])
+        shape = np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad))
+        points, azimuths = flatten(points_m, (*shape, 2)).reshape(-1, 2), flatten(azimuths_rad, shape).ravel()
+        column, inside = self._inside(points, azimuths, 0.0, self.exact)
+        found = np.empty(len(column))
+        interpolate(self.whole.ground, self.nodes, points, column, found)
+        if not inside.all():
+            found[~inside] = self.whole.horizon_rad(points[~inside], azimuths[~inside])
         return found.reshape(shape)
 
     def horizon_bounds_rad(
@@ -155,14 +134,17 @@ class HorizonInterpolator(ForwardingTerrain):
         too_wide = half > self.step_m / 2 or 2 * half > self.whole.finest_post_m
         if np.any(azimuth_half_rad) or np.ndim(half_m) or too_wide:
             return self.whole.horizon_bounds_rad(centres_m, half_m, azimuths_rad, azimuth_half_rad)
-        centres_m = np.asarray(centres_m, dtype=np.float64)
-        shape = np.broadcast_shapes(centres_m.shape[:-1], np.shape(azimuths_rad))
-        centres = np.ascontiguousarray(np.broadcast_to(centres_m, (*shape, 2))).reshape(-1, 2)
-        azimuths = np.broadcast_to(azimuths_rad, shape).ravel()
-        column, known = self.column(azimuths)
-        low, high = tracing.interpolate_bounds(self, centres, half, column)
-        inside = np.abs(centres - self.centre_m).max(axis=-1) + half <= self.half_m * (1 + 1e-9)
-        other = ~(inside & known & self._smooth[column])
-        if other.any():
-            low[other], high[other] = self.whole.horizon_bounds_rad(centres[other], half_m, azimuths[other])
+        shape = np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad))
+        centres, azimuths = flatten(centres_m, (*shape, 2)).reshape(-1, 2), flatten(azimuths_rad, shape).ravel()
+        column, inside = self._inside(centres, azimuths, half, True)
+        low, high = np.empty(len(column)), np.empty(len(column))
+        interpolate_bounds(self.whole.ground, self.nodes, self.interpolation_error, centres, half, column, low, high)
+        if not inside.all():
+            low[~inside], high[~inside] = self.whole.horizon_bounds_rad(centres[~inside], half_m, azimuths[~inside])
         return low.reshape(shape), high.reshape(shape)
+
+    def _inside(self, points: Array, azimuths: Array, half: float, exact: bool) -> tuple[Ints, Bools]:
+        """Columns (n,) of rays, and whether they are interpolated: near the centre, and `exact`ly enough if asked."""
+        column, known = self.column(azimuths)
+        inside = np.abs(points - self.centre_m).max(axis=-1) + half <= self.half_m * (1 + 1e-9)
+        return column, np.asarray(inside & known & (self._smooth[column] if exact else True))

@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.core.kernels import njit
+from startrack.frames import MOON_RADIUS_M
 
-SPHERE_M = 1_737_400.0
 LOWEST_TAN = -50.0
 NUDGE_M = 0.05  # past a grid line; a kink is missed by that much at most
 FIXED_POINT_ROUNDS = 3
@@ -72,7 +72,7 @@ def surface(grid, posts, heights, moon, east, north, guess):
         before = up
         m, column, row = locate(grid, posts, east, north, moon + up)
         if m >= 0:
-            r = SPHERE_M + height_at(heights, posts, m, column, row)
+            r = MOON_RADIUS_M + height_at(heights, posts, m, column, row)
             up = np.sqrt(r * r - level2) - moon
     return up
 
@@ -156,7 +156,7 @@ def horizon(ground, east, north, up, sin_a, cos_a, start_m, end_m, hint_m):
         if m < 0:
             edge = s
             running = False
-        elif climb >= 0.0 and r - SPHERE_M >= highest:
+        elif climb >= 0.0 and r - MOON_RADIUS_M >= highest:
             running = False
         else:
             step = post_m[m]
@@ -168,7 +168,7 @@ def horizon(ground, east, north, up, sin_a, cos_a, start_m, end_m, hint_m):
             length = 0.0
             while descending:
                 length = exit_of(column, row, d_column, d_row, level)
-                lowest = r - SPHERE_M + min(climb * length, 0.0)
+                lowest = r - MOON_RADIUS_M + min(climb * length, 0.0)
                 if lowest >= tops[block_at(blocks, m, level, column, row)]:
                     s += length
                     level += 2
@@ -210,8 +210,9 @@ def bilinear(nodes, k, x, y):
 
 
 @njit(cache=True, nogil=True)
-def interpolate(ground, nodes, per_height, middle, east, north, half, points, column, found):
-    """Fill found (n,) with the horizon [rad] at points (n, 2) and columns (n,)."""
+def interpolate(ground, near, points, column, found):
+    """Fill found (n,) with the horizon [rad] at points (n, 2) and columns (n,); near: `horizon_interpolator.Nodes`."""
+    nodes, per_height, middle, east, north, half = near
     scale = (nodes.shape[1] - 1) / (2 * half)
     up = np.empty(1)
     for k in range(len(found)):
@@ -223,14 +224,13 @@ def interpolate(ground, nodes, per_height, middle, east, north, half, points, co
 
 
 @njit(cache=True, nogil=True)
-def interpolate_bounds(
-    ground, nodes, per_height, rough, middle, east, north, half, centres, box_half, column, low, high
-):
+def interpolate_bounds(ground, near, rough, centres, box_half, column, low, high):
     """Fill low and high (n,) [rad] with bounds over boxes no wider than a step of the nodes or a cell of the map.
 
     A bilinear sheet has its extremes at its corners. The ground's kinks bend it by no more than the second differences
     of its heights over the box, the nodes' own bends count twice: within a sheet, and between two that the box touches.
     """
+    nodes, per_height, middle, east, north, half = near
     scale = (nodes.shape[1] - 1) / (2 * half)
     points, up = np.empty((9, 2)), np.empty(9)
     bend = 0.0

@@ -1,4 +1,4 @@
-"""Table of horizons, computed once per map and search area.
+"""Table of horizons, computed once per map and search area, and the errors of the horizon that follow from it.
 
 For each cell of the searched square and each degree of azimuth: bounds of the horizon, its distance, and a line above
 and a point below the ground that makes it.
@@ -6,20 +6,15 @@ and a point below the ground that makes it.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.types import Array, Bools, Ints
-from startrack.terrain.protocol import Progress
-
-if TYPE_CHECKING:
-    from startrack.terrain.trace_memory import BoxMemory
+from startrack.core.types import Array
+from startrack.terrain.ground import merge_blocks
+from startrack.terrain.trace_memory import BoxMemory
 
 BINS = 360  # azimuths; the localizer's sectors are 1.5 degrees wide
 DISTANCE_STEP_M = 4.0
@@ -29,6 +24,8 @@ RISE_STEP = 1e-3
 LOW, HIGH, FIRST, LAST, BEST, LINE_TAN, LINE_M, POINT_S, POINT_M, RISE, POINT_RISE = range(11)  # of what tracing finds
 FARTHEST = 65_535
 NOT_KNOWN_M = -32_768
+NEAREST_M = 50.0  # sigmas do not distinguish crests closer by
+SIGNS = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])  # of the corners of a box
 
 
 @dataclass(frozen=True)
@@ -67,8 +64,6 @@ class HorizonTable:
     @cached_property
     def box_memory(self) -> BoxMemory:
         """Bounds over small boxes that were traced with this table before."""
-        from startrack.terrain.trace_memory import BoxMemory
-
         return BoxMemory()
 
     @cached_property
@@ -81,12 +76,70 @@ class HorizonTable:
             (np.where(nowhere, np.uint16(FARTHEST), cells[..., 0]), np.where(nowhere, np.uint16(0), cells[..., 1]))
         ]
         while levels[-1][0].shape[0] > 1:
-            levels.append((_quarters(levels[-1][0], np.minimum), _quarters(levels[-1][1], np.maximum)))
+            low, high = levels[-1]
+            levels.append((merge_blocks(low, np.minimum), merge_blocks(high, np.maximum)))
         return levels
 
+    def level_for(self, half_m: float) -> int:
+        """Level of the pyramid whose blocks are as wide as a box at least, or the last."""
+        level = 0
+        while level < len(self.pyramid) - 1 and self.square.half_m * 2**level * (1 + 1e-9) < half_m:
+            level += 1
+        return level
 
-def _quarters(a: NDArray[np.uint16], choose: np.ufunc) -> NDArray[np.uint16]:
-    return np.asarray(choose(choose(a[::2, ::2], a[1::2, ::2]), choose(a[::2, 1::2], a[1::2, 1::2])))
+
+@dataclass(frozen=True, eq=False)
+class HorizonSigma:
+    """Sigma of the horizon [rad] by cells and degrees of a table: that of a post, times cos^2 H over its distance."""
+
+    table: HorizonTable
+    height_sigma_m: float
+
+    def sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
+        """Sigma (...) at the points (..., 2) in these azimuths."""
+        square = self.table.square
+        n, side = square.across, 2 * square.half_m
+        cell = np.clip((np.asarray(points_m) + square.reach_m) / side, 0, n - 1).astype(np.int64)
+        b = (np.asarray(azimuths_rad) / (2 * np.pi) * BINS).astype(np.int64) % BINS
+        index = np.broadcast_to(
+            (cell[..., 0] * n + cell[..., 1]) * BINS + b,
+            np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad)),
+        )
+        return np.asarray(self.cells_rad.ravel()[index])
+
+    def max_sigma_rad(self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float) -> Array:
+        """The largest of `sigma_rad` (n,) over boxes and azimuths: it changes from cell to cell of the table."""
+        most = self._blocks[self.table.level_for(half_m)]
+        reach_m = self.table.square.reach_m
+        n, side = len(most), 2 * reach_m / len(most)
+        steps = 2 + int(2 * azimuth_half_rad * BINS / (2 * np.pi)) if azimuth_half_rad > 0 else 1
+        corners = np.array([centres_m + corner for corner in half_m * (1 - 1e-9) * SIGNS])
+        cells = np.clip((corners + reach_m) / side, 0, n - 1).astype(np.int64)
+        if (cells == cells[0]).all():  # boxes of the search lie within blocks
+            cells = cells[:1]
+        found = np.zeros(np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad)))
+        for turn in np.linspace(-azimuth_half_rad, azimuth_half_rad, steps) * (1 - 1e-9):
+            b = np.floor((np.asarray(azimuths_rad) + turn) / (2 * np.pi) * BINS).astype(np.int64) % BINS
+            for cell in cells:
+                found = np.maximum(found, most[cell[..., 0], cell[..., 1], b])
+        return found
+
+    @cached_property
+    def cells_rad(self) -> Array:
+        """(cells, BINS)."""
+        values = self.table.values
+        distance = np.maximum(values[..., BEST].astype(np.float32) * DISTANCE_STEP_M, NEAREST_M)
+        middle = (values[..., 0].astype(np.float32) + values[..., 1]) / 2 * ANGLE_STEP_RAD - np.pi / 2
+        return np.asarray(self.height_sigma_m * np.cos(middle) ** 2 / distance)
+
+    @cached_property
+    def _blocks(self) -> list[Array]:
+        """(m, m, BINS) the largest sigma of the cells, then of ever larger blocks of them."""
+        n = self.table.square.across
+        levels = [self.cells_rad.reshape(n, n, BINS)]
+        while len(levels[-1]) > 1:
+            levels.append(merge_blocks(levels[-1], np.maximum))
+        return levels
 
 
 def quantize_fields(found: Array) -> NDArray[np.uint16]:
@@ -108,39 +161,3 @@ def quantize_fields(found: Array) -> NDArray[np.uint16]:
     # A line beyond the range of its field is left out, and so is a point so far down.
     out[..., 3] = np.where((line > 32_767) | (found[..., LAST] > FARTHEST * DISTANCE_STEP_M), FARTHEST, out[..., 3])
     return out
-
-
-def build_table(
-    square: Square, wanted: Bools, fill: Callable[[Ints], Array], unknown_rad: Array, progress: Progress | None = None
-) -> HorizonTable:
-    """The table; `fill(cells)` traces some cells (n, BINS, 11). Cells that are not `wanted` have bounds of -+ pi/2.
-
-    Cells are traced on all cores: the kernels release Python's lock.
-    """
-    from concurrent.futures import ThreadPoolExecutor
-
-    values = np.zeros((square.across**2, BINS, FIELDS), dtype=np.uint16)
-    values[..., 1] = values[..., 3] = FARTHEST
-    values[..., 8] = np.array(NOT_KNOWN_M, dtype=np.int16).view(np.uint16)
-    cells = np.flatnonzero(wanted)
-    parts = np.array_split(cells, max(1, len(cells) // 64))
-    done = 0
-
-    def work(part: Ints) -> int:
-        values[part] = quantize_fields(fill(part))
-        return len(part)
-
-    pool = ThreadPoolExecutor(cpu_count())
-    try:
-        for count in pool.map(work, parts):
-            done += count
-            if progress is not None:
-                progress(done, len(cells))
-    finally:
-        pool.shutdown(cancel_futures=True)  # an interrupted build does not wait for the other parts
-    return HorizonTable(square, values, unknown_rad)
-
-
-def cpu_count() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,31 +1,58 @@
-"""Import of elevation data: crops as GeoTIFF beside a terrain file, and what should be known about the maps."""
+"""Import of elevation data: crops as GeoTIFF beside a terrain file that states the errors of the maps."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 
 from startrack.core.errors import BadOutput, length_text
-from startrack.core.files import check_output
+from startrack.core.files import check_output, data_dir
 from startrack.core.types import BadInput
-from startrack.terrain.geotiff import write_map
-from startrack.terrain.map_comparison import crest_angle_rad_per_m
+from startrack.terrain.height_map import HeightMap
+from startrack.terrain.io import terrain_from_dict
+from startrack.terrain.map_comparison import MapComparison, compare_with_finest, crest_angle_rad_per_m
 from startrack.terrain.map_error import carried_spacing, error_between_posts_m
+from startrack.terrain.map_reading import read_map
+from startrack.terrain.map_writing import write_map
 from startrack.terrain.raster import Raster
-from startrack.terrain.raster_io import read_map
 from startrack.terrain.shape import CAMERA_ERROR, STRETCH, VERTICAL
-from startrack.terrain.stated_errors import StatedErrors, measure_errors
-
-if TYPE_CHECKING:
-    from startrack.terrain.height_map import HeightMap
 
 MAP_SIGMAS = {"stretch_sigma_1": STRETCH.sigma, "vertical_sigma_deg": round(float(np.degrees(VERTICAL.sigma)), 9)}
 RIM_RADII = 1.5  # of the search area: most of the rim is nearer
 MAX_POST_RADII = 0.2  # of the search area: with posts further apart its shape is not resolved
+MEASURED_PER_ESTIMATE = 1.6  # of the 240 m map on the ground of site01-10m.tif: 5.4 m measured, 3.3 m by its roughness
+COMMENT_CHARS = 118
+OTHER_FACTS = (
+    "The map is taken to be to scale (stretch_sigma_1) and in its place to 15 m (vertical_sigma_deg), the camera at "
+    "its height to 2 cm (camera_height_sigma_m): change what you know better."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatedErrors:
+    """Errors of a map, and their origin: "flag", "comparison" (with a finer map) or "map" (its own roughness)."""
+
+    height_sigma_m: float
+    common_crest_sigma_m: float | None = None  # of heights, shared by the crests about a position; None: not measured
+    origin: str
+    comment: str
+    warnings: tuple[str, ...] = ()
+
+    def comment_lines(self) -> str:
+        """The comment of a terrain file on its errors."""
+        text = f"{self.comment}."
+        if self.common_crest_sigma_m is not None:
+            text += (
+                f" horizon_sigma_deg: crests wrong by {length_text(self.common_crest_sigma_m)} all around, at their "
+                "median distance; at least three times the error of heights, as at the sharp rim of Shackleton."
+            )
+        text += f" {OTHER_FACTS}"
+        return textwrap.fill(text, COMMENT_CHARS, initial_indent="# ", subsequent_indent="# ") + "\n"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,8 +122,6 @@ def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, c
     """
     import tomli_w
 
-    from startrack.terrain.io import terrain_from_dict
-
     output.parent.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     try:
@@ -105,7 +130,7 @@ def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, c
             write_map(path, crop)
         terrain = terrain_from_dict(values, folder=output.parent)
         if errors.common_crest_sigma_m is not None:
-            angle_rad = errors.common_crest_sigma_m * crest_angle_rad_per_m(cast("HeightMap", terrain))
+            angle_rad = errors.common_crest_sigma_m * crest_angle_rad_per_m(cast(HeightMap, terrain))
             values["dem"]["horizon_sigma_deg"] = float(f"{np.degrees(angle_rad):.2g}")
         output.write_text(errors.comment_lines() + tomli_w.dumps(values), encoding="utf-8")
     except BaseException:
@@ -118,6 +143,46 @@ def _rim_map(maps: Sequence[Raster], radius_m: float) -> Raster:
     """The finest map that may hold the rim, or the last."""
     rims = [one for one in maps if 0.5 * min(one.heights_m.shape) * one.post_m >= RIM_RADII * radius_m]
     return (rims or maps[-1:])[0]
+
+
+def measure_errors(rim: Raster, others: Sequence[Raster]) -> StatedErrors:
+    """Errors of the map that makes the horizon, from the finest other or shipped map that covers a part of it.
+
+    Without one they are estimated from the roughness of the map itself.
+    """
+    comparison = compare_with_finest(rim, [*others, *_shipped_maps()])
+    if comparison is not None and comparison.same_ground:
+        return StatedErrors(
+            height_sigma_m=_rounded(comparison.height_sigma_m), common_crest_sigma_m=comparison.common_crest_sigma_m,
+            origin="comparison", comment=f"{rim.source} {comparison.line()}",
+        )  # fmt: skip
+    return StatedErrors(
+        height_sigma_m=_rounded(MEASURED_PER_ESTIMATE * error_between_posts_m(rim)), origin="map",
+        warnings=_other_ground_warnings(rim, comparison),
+        comment=f"{rim.source or 'the map'} could not be compared with a finer map: height_sigma_m is "
+        f"{MEASURED_PER_ESTIMATE:g} times the error that its own roughness shows, the ratio that was measured on the "
+        "240 m map of the south pole. A finer map of a part of the ground (--compare) or a known error (--sigma) is "
+        "better",
+    )  # fmt: skip
+
+
+def _rounded(sigma_m: float) -> float:
+    return float(f"{sigma_m:.2g}")
+
+
+def _shipped_maps() -> list[Raster]:
+    return [read_map(path) for path in sorted(data_dir("terrain").glob("*.tif"))]
+
+
+def _other_ground_warnings(rim: Raster, comparison: MapComparison | None) -> tuple[str, ...]:
+    """A warning where a map was compared and shows other ground."""
+    if comparison is None:
+        return ()
+    return (
+        f"{rim.source} differs from {comparison.finer} by {length_text(comparison.height_sigma_m, 3)} (s.d.) "
+        f"where both are, and heights vary there by {length_text(comparison.heights_sigma_m, 3)}: is its projection or "
+        "its scale wrong?",
+    )
 
 
 def smoothness_warnings(rim: Raster, height_sigma_m: float) -> list[str]:

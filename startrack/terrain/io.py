@@ -172,7 +172,7 @@ def _radians(degrees: float | None) -> float | None:
 
 def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) -> Terrain:
     from startrack.terrain.height_map import HeightMap
-    from startrack.terrain.raster_io import read_map
+    from startrack.terrain.map_reading import read_map
 
     if site.body != "moon":
         raise BadInput("bad_terrain", "[dem] maps are heights above the Moon's sphere: body must be moon")

@@ -5,34 +5,35 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from copy import copy
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.types import Array, Bools, Ints
+from startrack.core.types import Array, BadInput, Bools, Ints
 from startrack.frames import Site
-from startrack.terrain.horizon_posts import HorizonPosts
 from startrack.terrain.raster import STEREOGRAPHIC, Projection
 from startrack.terrain.shape import ShapeError
 
 Progress = Callable[[int, int], None]  # parts done, of how many
+NO_POST = -1
+BOUNDS_ROUNDING_RAD = 1e-9  # by which a least horizon may exceed the greatest
 
 
-class Interpolation(NamedTuple):
-    """tan H between points about a position: bilinear, and lower by `per_height` for each metre the ground rises.
+@dataclass(frozen=True, eq=False)
+class HorizonPosts:
+    """The four posts about the place where each of n sight lines touches the ground, in the numbering of a terrain."""
 
-    Row k is that of azimuth k: nodes[k, i, j] stands at centre - half + (i, j) step, i to the east.
-    """
+    post: Ints  # (n, 4); NO_POST where no map reaches
+    rad_per_m: Array  # (n, 4) rise of the horizon with the height of each
+    horizon_rad: Array  # (n,) of the map; NaN of ground without posts
 
-    ground: Any  # the packed maps, for the height of the ground
-    nodes: Array  # (n, across, across) tan of the horizon, were the ground everywhere as high as in the middle
-    per_height: Array  # (n,) [1/m]
-    middle_up_m: float  # height of the ground in the middle
-    east_m: float
-    north_m: float
-    half_m: float
+    @classmethod
+    def create_empty(cls, rays: int) -> HorizonPosts:
+        """Of ground without posts."""
+        return cls(np.full((rays, 4), NO_POST), np.zeros((rays, 4)), np.full(rays, np.nan))
 
 
 class Terrain(ABC):
@@ -188,14 +189,6 @@ class Terrain(ABC):
         """As this one, with horizons interpolated where `near` prepared them and tracing would take long."""
         return self
 
-    def interpolation(self, azimuths_rad: Array) -> Interpolation | None:
-        """Horizons prepared by `near` as the compiled kernels read them, for the azimuths (n,); None: not prepared."""
-        return None
-
-    def interpolated_part(self, points_m: Array, azimuths_rad: Array) -> float:
-        """Part of the points (n, 2) and azimuths (n,) whose horizons are interpolated instead of traced."""
-        return 0.0
-
     @property
     def is_prepared(self) -> bool:
         """Whether `prepare` has nothing left to do."""
@@ -253,3 +246,58 @@ def _forward(name: str) -> Any:
 for _name in set(vars(Terrain)) - set(vars(ForwardingTerrain)):
     if not _name.startswith("_"):
         setattr(ForwardingTerrain, _name, _forward(_name))
+
+
+def require_terrain(given: Any) -> Terrain:
+    """`given`, if it is a terrain: of a class derived from Terrain, or with every member of one.
+
+    The one check of the members of a user's object; `require_bounds` and `require_horizons` check the values. All other
+    code relies on the protocol. Raises BadInput (bad_terrain) that names the required methods which are missing.
+    """
+    members = [name for name in dir(Terrain) if not name.startswith("_")]
+    if all(hasattr(type(given), name) or hasattr(given, name) for name in members):
+        return given  # type: ignore[no-any-return]
+    if isinstance(given, str):
+        raise BadInput("bad_terrain", f"{given!r} is a text, no terrain: give startrack.load_terrain({given!r})")
+    missing = [name for name in sorted(Terrain.__abstractmethods__) if not hasattr(given, name)]
+    lacks = f" (it has no {', '.join(missing)})" if missing else ""
+    raise BadInput(
+        "bad_terrain",
+        f"{type(given).__name__} is no terrain{lacks}: give a file, a name, or an object of a class derived from "
+        "startrack.Terrain",
+    )
+
+
+def require_bounds(terrain: Terrain, low_rad: Array, high_rad: Array) -> None:
+    """Raise BadInput (bad_terrain) unless what `horizon_bounds_rad` of a `terrain` gave are bounds.
+
+    `low_rad` and `high_rad` (...): the least and greatest horizons. The search asks for those of the whole search area
+    first, so that an error in a user's terrain is named before it misleads the search.
+    """
+    wrong = ~(low_rad <= high_rad + BOUNDS_ROUNDING_RAD)
+    if not wrong.any():
+        return
+    nan = np.isnan(low_rad) | np.isnan(high_rad)
+    fault = "NaN" if nan.any() else "least horizons above the greatest"
+    count = np.count_nonzero(nan if nan.any() else wrong)
+    raise BadInput(
+        "bad_terrain",
+        f"terrain {terrain.name!r} ({type(terrain).__name__}): horizon_bounds_rad gives {fault} for {count} of "
+        f"{wrong.size} sectors of boxes",
+    )
+
+
+def require_horizons(terrain: Terrain, points_m: Array, horizon_rad: Array) -> None:
+    """Raise BadInput (bad_terrain) unless a `terrain` gave finite horizons wherever a camera can stand.
+
+    `points_m` (..., 2) are the positions, `horizon_rad` (...) what `horizon_rad` gave there.
+    """
+    if np.isfinite(horizon_rad).all():
+        return
+    wrong = ~np.isfinite(horizon_rad) & np.asarray(terrain.allowed(points_m))
+    if wrong.any():
+        raise BadInput(
+            "bad_terrain",
+            f"terrain {terrain.name!r} ({type(terrain).__name__}): horizon_rad gives NaN or infinity for "
+            f"{np.count_nonzero(wrong)} of {wrong.size} rays from ground on which a camera can stand",
+        )

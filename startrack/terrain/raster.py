@@ -101,19 +101,6 @@ def polar_stereographic(
     )
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Grid:
-    """The content of a map file: height = offset + scale x value."""
-
-    values: NDArray[Any]  # (rows, columns)
-    projection: Projection
-    first_m: tuple[float, float]  # x, y of the first post
-    step_m: tuple[float, float]  # from a post to the next, in x and y
-    scale: float | None  # [m]; None where the file does not state it
-    offset_m: float
-    no_data: float | None
-
-
 def projection_of(p: Mapping[str, Any]) -> Projection:
     """The projection of PROJ's parameters. Raises BadInput bad_terrain for one that is not known here."""
     radius = float(p.get("R", p.get("a", MOON_RADIUS_M)))

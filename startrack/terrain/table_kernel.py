@@ -7,7 +7,7 @@ import numpy as np
 
 from startrack.core.kernels import njit
 from startrack.terrain.bounds_kernel import bounds
-from startrack.terrain.box_height_kernel import box_height_bounds
+from startrack.terrain.ground_kernel import box_height_bounds
 from startrack.terrain.horizon_kernel import FAR_M, horizon, surfaces
 from startrack.terrain.horizon_table import ANGLE_STEP_RAD, BINS, DISTANCE_STEP_M, FARTHEST, NOT_KNOWN_M, RISE_STEP
 

@@ -21,7 +21,7 @@ from startrack.frames import (
     rays_from_azel,
     refract_rad,
 )
-from startrack.terrain.io import body_of_terrain
+from startrack.terrain import body_of_terrain
 
 LOWEST_RAD = np.radians(3.0)  # on the Earth; below it refraction is not predictable
 SEA_LEVEL_HPA, SCALE_HEIGHT_M = 1010.0, 8430.0  # average air

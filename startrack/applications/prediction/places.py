@@ -12,8 +12,7 @@ from startrack.core.types import Array, BadInput, Ints
 from startrack.frames import Site, enu_from_latlon, latlon_from_enu
 from startrack.output.picture.maps import nice_step
 from startrack.rendering import Drive
-from startrack.terrain import Terrain
-from startrack.terrain.raster import EQUIRECTANGULAR, Projection, Raster
+from startrack.terrain import EQUIRECTANGULAR, Projection, Raster, Terrain
 
 MAX_CELLS = 1_000_000
 CELLS_ACROSS = 10  # of the default spacing

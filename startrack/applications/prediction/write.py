@@ -16,8 +16,7 @@ from startrack.core.types import Array
 from startrack.frames import latlon_from_enu
 from startrack.output.ecsv import Column, ecsv_text, format_values
 from startrack.output.quantities_prediction import CELL_QUANTITIES, PATH_QUANTITIES
-from startrack.terrain import Terrain
-from startrack.terrain.geotiff import write_bands
+from startrack.terrain import Terrain, write_bands
 
 MAP, TABLE, SUMMARY, PICTURE = "predict.tif", "predict.ecsv", "predict.json", "predict.png"
 COMPARISON_TABLE, COMPARISON_PICTURE = "predict-compare.ecsv", "predict-compare.png"

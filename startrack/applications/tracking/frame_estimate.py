@@ -18,8 +18,7 @@ from startrack.applications.tracking.shared import TrackErrors
 from startrack.core.types import Array, Evidence, Ints
 from startrack.localization.importance_sampling import WeightedPoints, moments
 from startrack.localization.skyline_model import MIDDLES_RAD
-from startrack.terrain import Terrain
-from startrack.terrain.horizon_posts import NO_POST, HorizonPosts
+from startrack.terrain import NO_POST, HorizonPosts, Terrain
 
 REACH_SIGMAS, MARGIN_M = 6.0, 5.0  # of a Gaussian, to the side of the neighbourhood
 LEAST_HALF_M = 40.0  # of the neighbourhood

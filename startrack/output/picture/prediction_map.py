@@ -17,8 +17,7 @@ from startrack.output.picture.relief import edge_cover, extrapolate, ground_of_v
 from startrack.output.picture.terrain_picture import draw_distances
 
 if TYPE_CHECKING:
-    from startrack.terrain import Terrain
-    from startrack.terrain.raster import Raster
+    from startrack.terrain import Raster, Terrain
 
 SIZE_PX, LEFT_PX, HEAD_PX, BELOW_PX, LEGEND_PX = 820, 56.0, 84.0, 52.0, 250
 TEXT_PX, TITLE_PX = 17.0, 22.0

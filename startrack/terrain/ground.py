@@ -1,4 +1,6 @@
-"""Height maps packed for tracing: all posts in one array, and pyramids of the highest ground and of its slopes.
+"""Several height maps as one ground, the finest first: packed for tracing; heights and posts at places.
+
+For tracing all posts are in one array, with pyramids of the highest ground and of its slopes.
 
 Level L of a pyramid has blocks of 2^L x 2^L cells, a cell lying between four posts. Of each block the pyramid holds the
 highest post, the highest of it and its eight neighbours, and the range of the slopes of these nine.
@@ -6,16 +8,19 @@ highest post, the highest of it and its eight neighbours, and the range of the s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.types import Array, Ints
-from startrack.frames import MOON_RADIUS_M, Site, latlon_from_enu
+from startrack.frames import MOON_RADIUS_M, Site, enu_from_latlon, latlon_from_enu
+from startrack.terrain.protocol import NO_POST
 from startrack.terrain.raster import GRID_NUMBERS, Raster
 
 SLOPE_STEPS = 127  # a slope is kept as a whole number of 1/127 of the map's steepest, rounded away from the middle
+SURFACE_ROUNDS = 6  # of the height of the ground, each with the place of the last one's height
 SMALLEST_BLOCKS = 4  # a pyramid ends where a level has no more blocks than this along an axis
 
 
@@ -36,7 +41,7 @@ class Ground(NamedTuple):
     highest_m: float  # highest post of all maps
 
 
-def pack_maps(maps: list[Raster], site: Site) -> Ground:
+def pack_maps(site: Site, maps: Sequence[Raster]) -> Ground:
     """The maps, finest first, ready for tracing in the site's enu."""
     heights, posts, tops, wide, slopes, blocks = [], [], [], [], [], []
     first_post, first_block = 0, 0
@@ -58,8 +63,9 @@ def pack_maps(maps: list[Raster], site: Site) -> Ground:
             first_block += top.size
             if max(top.shape) <= SMALLEST_BLOCKS:
                 break
-            top = _coarser(top, np.maximum)
-            slope = np.concatenate([_coarser(slope[..., :4], np.minimum), _coarser(slope[..., 4:], np.maximum)], -1)
+            top = merge_blocks(top, np.maximum)
+            low, high = merge_blocks(slope[..., :4], np.minimum), merge_blocks(slope[..., 4:], np.maximum)
+            slope = np.concatenate([low, high], axis=-1)
         blocks.append(block_table)
     most = max(len(table) for table in blocks)
     return Ground(
@@ -105,12 +111,9 @@ def _cell_slopes(h: NDArray[np.float32], unit: float) -> NDArray[np.int8]:
     return out
 
 
-def _pad(a: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    return np.pad(a, ((0, rows), (0, columns), *[(0, 0)] * (a.ndim - 2)), mode="edge")
-
-
-def _coarser(a: np.ndarray, choose: np.ufunc) -> np.ndarray:
-    a = _pad(a, a.shape[0] % 2, a.shape[1] % 2)
+def merge_blocks(a: np.ndarray, choose: np.ufunc) -> np.ndarray:
+    """An array (rows, columns, ...) at half the resolution: of two by two blocks the one that `choose` prefers."""
+    a = np.pad(a, [(0, n % 2) for n in a.shape[:2]] + [(0, 0)] * (a.ndim - 2), mode="edge")
     return np.asarray(choose(choose(a[::2, ::2], a[1::2, ::2]), choose(a[::2, 1::2], a[1::2, 1::2])))
 
 
@@ -129,14 +132,14 @@ def _slopes_with_neighbours(slope: NDArray[np.int8]) -> NDArray[np.int8]:
     return np.concatenate(parts, axis=-1)
 
 
-def _raise_to_finer_maps(tops: NDArray[np.float32], height_map: Raster, finer: list[Raster]) -> NDArray[np.float32]:
+def _raise_to_finer_maps(tops: NDArray[np.float32], height_map: Raster, finer: Sequence[Raster]) -> NDArray[np.float32]:
     """Cells of a coarse map where finer maps lie are as high as any post of these there or close by."""
     tops = tops.copy()
     for fine in finer:
         size = 1
         high = _cell_tops(fine.heights_m)
         while size * fine.post_m < 0.5 * height_map.post_m and max(high.shape) > 1:
-            high, size = _coarser(high, np.maximum), 2 * size
+            high, size = merge_blocks(high, np.maximum), 2 * size
         rows, columns = (np.indices(high.shape) + 0.5) * size
         middles = np.stack([rows.ravel(), columns.ravel()], axis=-1)
         at = height_map.row_column(*fine.projection.latlon_from_xy(*fine.xy(middles)))
@@ -148,12 +151,12 @@ def _raise_to_finer_maps(tops: NDArray[np.float32], height_map: Raster, finer: l
     return tops
 
 
-def ground_up_m(site: Site, maps: list[Raster], points_m: Array, rounds: int = 6) -> Array:
+def ground_up_m(site: Site, maps: Sequence[Raster], points_m: Array) -> Array:
     """Height in enu (...) of the surface at east and north (..., 2) [m]; NaN where no map reaches."""
     east, north = points_m[..., 0], points_m[..., 1]
     up = np.zeros(np.shape(east))
     level2 = east * east + north * north
-    for _ in range(rounds):
+    for _ in range(SURFACE_ROUNDS):
         lat, lon = latlon_from_enu(site, east, north, np.nan_to_num(up))
         height = np.full(np.shape(east), np.nan)
         for height_map in maps:
@@ -163,3 +166,38 @@ def ground_up_m(site: Site, maps: list[Raster], points_m: Array, rounds: int = 6
             height = np.where(missing, height_map.sample(height_map.row_column(lat, lon)), height)
         up = np.sqrt((MOON_RADIUS_M + height) ** 2 - level2) - MOON_RADIUS_M - site.height_m
     return np.asarray(up)
+
+
+def cell_posts(site: Site, maps: Sequence[Raster], points_enu_m: Array) -> tuple[Ints, Array]:
+    """Posts (n, 4) of the cells that hold points (n, 3) in enu, and their bilinear weights (n, 4).
+
+    The posts of all maps are numbered one map after the other, the finest first, row by row.
+    """
+    latitude, longitude = latlon_from_enu(site, *points_enu_m.T)
+    post, weight = np.full((len(points_enu_m), 4), NO_POST), np.zeros((len(points_enu_m), 4))
+    first = 0
+    for raster in maps:
+        rows, columns = raster.heights_m.shape
+        at = raster.row_column(latitude, longitude)
+        cell = np.floor(at).astype(np.int64)
+        inside = (cell >= 0).all(axis=1) & (cell[:, 0] < rows - 1) & (cell[:, 1] < columns - 1)
+        new = inside & (post[:, 0] == NO_POST)
+        corner = cell[new, None] + [[0, 0], [0, 1], [1, 0], [1, 1]]  # (row, column)
+        post[new] = first + corner[..., 0] * columns + corner[..., 1]
+        weight[new] = np.prod(1.0 - np.abs(at[new, None] - corner), axis=-1)
+        first += raster.heights_m.size
+    return post, weight
+
+
+def post_positions(site: Site, maps: Sequence[Raster], posts: Ints) -> Array:
+    """East, north and up (n, 3) in enu of posts (n,), by the map."""
+    found, first = np.zeros((len(posts), 3)), 0
+    for raster in maps:
+        columns, last = raster.heights_m.shape[1], first + raster.heights_m.size
+        here = (posts >= first) & (posts < last)
+        row_column = np.stack(np.divmod(posts[here] - first, columns), axis=-1)
+        latitude, longitude = raster.projection.latlon_from_xy(*raster.xy(row_column))
+        height = raster.heights_m.ravel()[posts[here] - first]
+        found[here] = enu_from_latlon(site, latitude, longitude, height)
+        first = last
+    return found

@@ -1,0 +1,109 @@
+"""Height maps and other maps on the Moon's sphere, written as GeoTIFF."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from startrack.core.files import atomic_file
+from startrack.terrain.raster import EQUIRECTANGULAR, ORTHOGRAPHIC, STEREOGRAPHIC, Projection, Raster
+
+MIN_STEP_M = 0.01  # of the heights in files that are written
+NO_HEIGHT = 65_535
+# GeoTIFF 1.1: tags that hold keys, and values of keys.
+DOUBLES_TAG, ASCII_TAG, METADATA_TAG, NO_DATA_TAG = 34736, 34737, 42112, 42113
+USER_DEFINED, METRE, DEGREE = 32767, 9001, 9102
+PROJECTION_CODES = {STEREOGRAPHIC: 14, ORTHOGRAPHIC: 21, EQUIRECTANGULAR: 17}  # polar stereographic: 15
+
+
+def write_map(path: str | Path, raster: Raster, *, step_m: float | None = None, offset_m: float | None = None) -> None:
+    """Write a map as deflated 16-bit steps with scale and offset, as GDAL reads them; the file appears when complete.
+
+    Heights are rounded to `step_m`, by default a 65,000th of their range. Raises OSError.
+    """
+    import tifffile
+
+    h = raster.heights_m.astype(np.float64)
+    low, high = float(np.nanmin(h)), float(np.nanmax(h))
+    offset = low if offset_m is None else offset_m
+    step = max((high - low) / 65_000, MIN_STEP_M) if step_m is None else step_m
+    values = np.where(np.isnan(h), NO_HEIGHT, np.round((np.nan_to_num(h) - offset) / step)).astype(np.uint16)
+    items = (
+        f'<Item name="SCALE" sample="0" role="scale">{step!r}</Item>'
+        f'<Item name="OFFSET" sample="0" role="offset">{offset!r}</Item>'
+    )
+    tags = _tags(raster, items, str(NO_HEIGHT) if np.isnan(h).any() else None)
+    with atomic_file(path) as temporary:
+        tifffile.imwrite(
+            temporary, values, compression="deflate", compressionargs={"level": 9}, predictor=True, extratags=tags,
+            metadata=None, rowsperstrip=256, software="startrack",
+        )  # fmt: skip
+
+
+def write_bands(path: str | Path, frame: Raster, bands: Mapping[str, NDArray[np.float32]]) -> None:
+    """Write named bands (rows, columns) at the place of a `frame`'s posts, NaN where there is no value. Raises OSError.
+
+    The file appears when complete.
+    """
+    import tifffile
+
+    items = "".join(
+        f'<Item name="DESCRIPTION" sample="{k}" role="description">{name}</Item>' for k, name in enumerate(bands)
+    )
+    values = np.stack([np.asarray(band, dtype=np.float32) for band in bands.values()])
+    with atomic_file(path) as temporary:
+        tifffile.imwrite(
+            temporary, values, photometric="minisblack", planarconfig="separate", compression="deflate",
+            compressionargs={"level": 9}, extratags=_tags(frame, items, "nan"), metadata=None, software="startrack",
+        )  # fmt: skip
+
+
+def _tags(m: Raster, items: str, no_data: str | None) -> list[tuple[int, str, int, Any, bool]]:
+    """The tags of a map's place (posts are pixel centres: raster type "area"), of GDAL's `items`, and of `no_data`."""
+    doubles: list[float] = []
+    directory, text = [], ""
+    for key, value in _geo_keys(m.projection).items():
+        if isinstance(value, str):
+            directory.append((key, ASCII_TAG, len(value), len(text)))
+            text += value
+        elif isinstance(value, float):
+            directory.append((key, DOUBLES_TAG, 1, len(doubles)))
+            doubles.append(value)
+        else:
+            directory.append((key, 0, 1, value))
+    numbers = 1, 1, 1, len(directory), *(number for entry in sorted(directory) for number in entry)
+    tags = [
+        (METADATA_TAG, "s", 0, f"<GDALMetadata>{items}</GDALMetadata>", True),
+        (33550, "d", 3, (m.dx_m, -m.dy_m, 0.0), True),
+        (33922, "d", 6, (0.0, 0.0, 0.0, m.x0_m - 0.5 * m.dx_m, m.y0_m - 0.5 * m.dy_m, 0.0), True),
+        (34735, "H", len(numbers), numbers, True),
+        (DOUBLES_TAG, "d", len(doubles), tuple(doubles), True),
+        (ASCII_TAG, "s", 0, text, True),
+    ]
+    return tags if no_data is None else [*tags, (NO_DATA_TAG, "s", 0, no_data, True)]
+
+
+def _geo_keys(p: Projection) -> dict[int, int | float | str]:
+    """Keys of a projection: whole numbers as such, others as floats, texts with their end mark."""
+    degrees = p.kind == EQUIRECTANGULAR and p.scale_y != 1.0  # latitude and longitude themselves
+    radius = float(p.radius_m)
+    keys: dict[int, int | float | str] = {
+        1024: 2 if degrees else 1, 1025: 1, 2048: USER_DEFINED, 2049: "Moon 2015 sphere|", 2050: USER_DEFINED,
+        2054: DEGREE, 2056: USER_DEFINED, 2057: radius, 2058: radius,
+    }  # fmt: skip
+    if degrees:
+        return keys
+    latitude, longitude, scale = float(np.degrees(p.latitude_rad)), float(np.degrees(p.longitude_rad)), float(p.scale)
+    polar = p.kind == STEREOGRAPHIC and abs(latitude) == 90.0
+    keys |= {3072: USER_DEFINED, 3074: USER_DEFINED, 3075: PROJECTION_CODES[p.kind] + polar, 3076: METRE}
+    if polar:
+        keys |= {3081: latitude, 3095: longitude, 3092: scale}
+    elif p.kind == EQUIRECTANGULAR:
+        keys |= {3078: float(np.degrees(np.arccos(scale))), 3088: longitude, 3089: 0.0}
+    else:
+        keys |= {3088: longitude, 3089: latitude, 3092: scale}
+    return {**keys, 3082: float(p.false_x_m), 3083: float(p.false_y_m)}

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 from startrack.camera import Camera, load_camera
 from startrack.chain.stages import Settings
 from startrack.core.types import BadInput, Exposure
-from startrack.exposure import exposure_of, read_exposure, with_facts
-from startrack.exposure.metadata import check_time_sigma_s
+from startrack.exposure import check_time_sigma_s, exposure_of, read_exposure, with_facts
 from startrack.frames import parse_utc
 from startrack.terrain import Terrain, load_terrain, require_terrain
 

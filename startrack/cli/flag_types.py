@@ -7,7 +7,7 @@ import math
 
 from startrack.core.declaration import LARGEST, SHOWN_CHARS
 
-MAX_EXPOSURE_S = 1e6  # as startrack.exposure.sidecar has it; written here so that help is quick
+MAX_EXPOSURE_S = 1e6  # as startrack.exposure has it; written here so that help is quick
 MAX_COUNT = 1_000_000
 MAX_MAGNITUDE = 100.0
 GEO_FORMATS = ("geojson", "kml")
@@ -41,7 +41,7 @@ def positive_number(text: str) -> float:
 
 def time_sigma_s(text: str) -> float:
     """A standard deviation of a clock's error [s]."""
-    from startrack.exposure.metadata import check_time_sigma_s
+    from startrack.exposure import check_time_sigma_s
 
     try:
         return check_time_sigma_s(number(text), "SECONDS")

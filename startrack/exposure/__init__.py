@@ -4,7 +4,7 @@
 raw files); `bag.py` and `bag_images.py` read images from ROS bags; `mask.py` reads which pixels count; `correct.py`
 applies dark frame and flat field; `metadata.py` finds time, exposure seconds, camera, terrain, mask, dark frame and
 flat field: in flags, the sidecar (`sidecar.py`) and the header (`header.py`); `write.py` writes images and sidecars.
-A file that cannot be used raises `startrack.core.types.BadInput` and no other exception.
+A file that cannot be used raises `startrack.core.errors.BadInput` and no other exception.
 """
 
 from startrack.exposure.bag import is_bag
@@ -19,14 +19,24 @@ from startrack.exposure.bag_images import (
 from startrack.exposure.correct import correct_exposure, read_dark, read_flat
 from startrack.exposure.decode_file import decode_bytes
 from startrack.exposure.decoded import are_fractions
+from startrack.exposure.facts import Facts, check_time_sigma_s, with_facts
 from startrack.exposure.mask import combine_masks, mask_of, read_mask, touch_masked
-from startrack.exposure.metadata import Facts, with_facts
 from startrack.exposure.read import exposure_of, exposure_of_decoded, read_exposure
+from startrack.exposure.sidecar import (
+    IMAGE_KEYS,
+    PACKING_SUFFIXES,
+    PICTURE_SUFFIXES,
+    RAW_SUFFIXES,
+    SIDECAR,
+    Sidecar,
+    sidecar_of,
+)
 from startrack.exposure.write import write_exposure, write_sidecar
 
 __all__ = [
-    "BagImage", "Facts", "are_fractions", "choose_bag_image", "combine_masks", "correct_exposure", "decode_bytes",
+    "IMAGE_KEYS", "PACKING_SUFFIXES", "PICTURE_SUFFIXES", "RAW_SUFFIXES", "SIDECAR", "BagImage", "Facts", "Sidecar",
+    "are_fractions", "check_time_sigma_s", "choose_bag_image", "combine_masks", "correct_exposure", "decode_bytes",
     "exposure_of", "exposure_of_decoded", "is_bag", "list_bag_images", "mask_of", "read_bag_exposures",
-    "read_bag_image", "read_dark", "read_exposure", "read_flat", "read_mask", "split_bag_path", "touch_masked",
-    "with_facts", "write_exposure", "write_sidecar",
+    "read_bag_image", "read_dark", "read_exposure", "read_flat", "read_mask", "sidecar_of", "split_bag_path",
+    "touch_masked", "with_facts", "write_exposure", "write_sidecar",
 ]  # fmt: skip

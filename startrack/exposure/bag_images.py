@@ -27,7 +27,7 @@ from startrack.exposure.bag import (
 )
 from startrack.exposure.decode_file import decode_bytes
 from startrack.exposure.decoded import Decoded, check_size, grey_float32, largest_value
-from startrack.exposure.metadata import Facts
+from startrack.exposure.facts import Facts
 from startrack.exposure.read import exposure_of_decoded
 
 READING = {"reason": "bad_image", "flag": "--image-topic"}

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from startrack.core.files import printable
 from startrack.core.types import BadInput, Bools, Correction, Exposure, Mask
 from startrack.exposure.decode_file import decode_file
-from startrack.exposure.header import header_number
+from startrack.exposure.facts import header_number
 from startrack.exposure.mask import require_size
 from startrack.exposure.mosaic import PHASES
 

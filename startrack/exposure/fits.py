@@ -18,7 +18,7 @@ from typing import IO, Any
 import numpy as np
 
 from startrack.exposure.decoded import MAX_FILE_BYTES, Decoded, bad_image, check_size, grey_float32
-from startrack.exposure.header import HEADER_KEYS
+from startrack.exposure.facts import HEADER_KEYS
 
 BLOCK_BYTES = 2880
 MAX_HEADER_BYTES = 1000 * BLOCK_BYTES

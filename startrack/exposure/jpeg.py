@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.exposure.decoded import Decoded, bad_image, check_size, exif_warnings, grey_float32, largest_value
-from startrack.exposure.header import facts_in_text
+from startrack.exposure.facts import facts_in_text
 
 START_OF_SCAN, END_OF_IMAGE = 0xDA, b"\xff\xd9"
 STRIP_ROWS = 512

@@ -23,7 +23,7 @@ from startrack.exposure.decoded import (
     exif_warnings,
     grey_float32,
 )
-from startrack.exposure.header import HEADER_KEYS
+from startrack.exposure.facts import HEADER_KEYS
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 COLOUR_TYPES = {0: "grey", 2: "colour", 3: "palette", 4: "grey with alpha", 6: "colour with alpha"}

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from datetime import datetime
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from startrack.core.declaration import SHOWN_CHARS, Choice, Number, Table, Text, value_text
-from startrack.core.files import is_path, printable
+from startrack.core.files import MAX_CAUSE_CHARS, MAX_TEXT_BYTES, is_path, printable
 from startrack.core.types import BadInput
 from startrack.frames import parse_utc
 
@@ -35,11 +35,11 @@ SIDECAR = Table(
         "bayer_pattern": Choice(values=BAYER_PATTERNS, description="colours of the first 2 x 2 pixels of a mosaic"),
     },
 )
+NAMED_FILES = ("camera", "terrain")  # paths, or names of shipped files
 IMAGE_KEYS = ("mask", "dark", "flat")  # always paths: no such image is shipped, and no header names one
 RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".crw", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"}
 PICTURE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".fits", ".fit", ".fts"} | RAW_SUFFIXES
 PACKING_SUFFIXES = {".gz", ".bz2", ".fz"}
-MAX_SIDECAR_BYTES = 2**20
 MAX_UNKNOWN_KEY_WARNINGS = 5
 
 
@@ -70,71 +70,59 @@ def _stems(image: Path) -> list[str]:
     return names
 
 
-def read_sidecar(image: Path) -> tuple[Path, dict[str, Any]]:
-    """The sidecar's path and its keys with their values; the image's path and none without a sidecar."""
-    found = sidecar_of(image)
-    if found is None:
-        return image, {}
-    try:
-        with found.open("rb") as file:
-            raw = file.read(MAX_SIDECAR_BYTES + 1)
-        if len(raw) > MAX_SIDECAR_BYTES:
-            raise ValueError("more than 1 MiB")
-        values = json.loads(raw.decode("utf-8-sig"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise _bad_sidecar(found, f"cannot be read as JSON ({str(error)[:200]})") from error
-    if not isinstance(values, dict):
-        raise _bad_sidecar(found, 'holds no JSON object such as {"time_utc": "2031-03-26T20:58:11Z"}')
-    return found, values
+@dataclass(frozen=True)
+class Sidecar:
+    """The keys of a sidecar as written; they are checked when they are used."""
 
+    path: Path
+    values: Mapping[str, Any] = field(default_factory=dict)
 
-def unknown_key_warnings(sidecar: Path, values: Mapping[str, Any]) -> list[str]:
-    """A warning for each unknown key, which may be a misspelt one."""
-    unknown = [key for key in values if key not in SIDECAR.keys]
-    return [
-        f"sidecar {printable(sidecar.name)}: key {key[:SHOWN_CHARS]!r} is none of {', '.join(SIDECAR.keys)}; not used"
-        for key in unknown[:MAX_UNKNOWN_KEY_WARNINGS]
-    ]
+    @classmethod
+    def read(cls, image: Path) -> Sidecar:
+        """The sidecar of an image; without one, one without keys. Raises BadInput bad_image."""
+        path = sidecar_of(image)
+        if path is None:
+            return cls(image)
+        try:
+            with path.open("rb") as file:
+                raw = file.read(MAX_TEXT_BYTES + 1)
+            if len(raw) > MAX_TEXT_BYTES:
+                raise ValueError("more than 1 MiB")
+            values = json.loads(raw.decode("utf-8-sig"))
+        except (OSError, ValueError, RecursionError) as error:
+            raise cls(path)._fault(f"cannot be read as JSON ({str(error)[:MAX_CAUSE_CHARS]})") from error
+        if not isinstance(values, dict):
+            raise cls(path)._fault('holds no JSON object such as {"time_utc": "2031-03-26T20:58:11Z"}')
+        return cls(path, values)
 
+    def value(self, key: str) -> Any:
+        """The checked value of a key, a path resolved; None if the key is missing or null. Raises BadInput."""
+        value = self.values.get(key)
+        if value is None:
+            return None
+        if key == "bayer_pattern" and isinstance(value, str) and value.strip().upper() in BAYER_PATTERNS:
+            value = value.strip().upper()
+        try:
+            if key == "time_utc":
+                return parse_utc(value if isinstance(value, str) else value_text(value))
+            value = SIDECAR.keys[key].check(value, key)
+        except ValueError as error:
+            raise self._fault(str(error)) from error
+        except BadInput as error:  # of the time
+            raise self._fault(f"{key}: {str(error)[:MAX_CAUSE_CHARS]}", error.reason) from error
+        if key in IMAGE_KEYS:
+            return os.path.join(self.path.parent, value)
+        return resolve_path(self.path, value) if key in NAMED_FILES else value
 
-def _bad_sidecar(sidecar: Path, cause: str, reason: str = "bad_image") -> BadInput:
-    return BadInput(reason, " ".join(f"sidecar {printable(sidecar)}: {cause}".split()))
+    @property
+    def warnings(self) -> list[str]:
+        """A warning for each unknown key, which may be a misspelt one."""
+        unknown = [key for key in self.values if key not in SIDECAR.keys][:MAX_UNKNOWN_KEY_WARNINGS]
+        name, known = printable(self.path.name), ", ".join(SIDECAR.keys)
+        return [f"sidecar {name}: key {key[:SHOWN_CHARS]!r} is none of {known}; not used" for key in unknown]
 
-
-def sidecar_value(sidecar: Path, values: Mapping[str, Any], key: str) -> Any:
-    """The checked value of a sidecar's key; None if the key is missing or null."""
-    value = values.get(key)
-    if value is None:
-        return None
-    try:
-        return SIDECAR.keys[key].check(
-            value.strip().upper() if key == "bayer_pattern" and is_pattern(value) else value, key
-        )
-    except ValueError as error:
-        raise _bad_sidecar(sidecar, str(error)) from error
-
-
-def sidecar_time(sidecar: Path, value: object) -> datetime | None:
-    """Mid-exposure of the key `time_utc`. Raises BadInput (no_time)."""
-    if value is None:
-        return None
-    try:
-        return parse_utc(value if isinstance(value, str) else value_text(value))
-    except BadInput as error:
-        raise _bad_sidecar(sidecar, f"time_utc: {str(error)[:200]}", error.reason) from error
-
-
-def sidecar_reference(sidecar: Path, values: Mapping[str, Any], key: str) -> str | None:
-    """The path or name of a file under a key of the sidecar."""
-    value = sidecar_value(sidecar, values, key)
-    if key in IMAGE_KEYS and value is not None:
-        return os.path.join(sidecar.parent, value)
-    return None if value is None else resolve_path(sidecar, value)
-
-
-def is_pattern(value: object) -> bool:
-    """Whether a value is a pattern of colours, in any case of letters."""
-    return isinstance(value, str) and value.strip().upper() in BAYER_PATTERNS
+    def _fault(self, cause: str, reason: str = "bad_image") -> BadInput:
+        return BadInput(reason, " ".join(f"sidecar {printable(self.path)}: {cause}".split()))
 
 
 def resolve_path(file: Path, reference: str) -> str:

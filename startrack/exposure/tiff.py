@@ -21,7 +21,7 @@ from startrack.exposure.decoded import (
     largest_value,
     orientation_warnings,
 )
-from startrack.exposure.header import facts_in_text
+from startrack.exposure.facts import facts_in_text
 
 MINISWHITE, MINISBLACK, RGB, MOSAIC = 0, 1, 2, 32803
 REFUSED = {MINISWHITE: "white-is-zero", 3: "palette", 4: "a mask", 5: "CMYK", 6: "YCbCr", 8: "CIELab"}

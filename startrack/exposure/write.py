@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.files import check_free, is_path, printable, relative_path, write_atomically
-from startrack.core.types import BadInput, Exposure
-from startrack.exposure.metadata import Facts
-from startrack.exposure.sidecar import sidecars
+from startrack.core.types import BadInput, Exposure, Mask
+from startrack.exposure.facts import HEADER_OF, Facts
+from startrack.exposure.sidecar import IMAGE_KEYS, NAMED_FILES, SIDECAR, sidecars
 from startrack.frames import format_utc
 
 PACKED = {".gz": lambda data: gzip.compress(data, compresslevel=1, mtime=0), ".bz2": bz2.compress}
@@ -56,44 +56,42 @@ def write_sidecar(image: str | os.PathLike[str], facts: Facts | Exposure, *, ove
     Raises BadInput bad_image if the file exists and not `overwrite`, or if it cannot be written.
     """
     target = sidecars(Path(image))[-1]
-    values = {
-        "time_utc": None if facts.time_utc is None else format_utc(facts.time_utc),
-        "time_sigma_s": None if facts.time_utc is None else _stated_time_sigma_s(facts),
-        "exposure_s": facts.exposure_s,
-        "camera": _relative_path(facts.camera, target.parent),
-        "terrain": _relative_path(facts.terrain, target.parent),
-        "mask": relative_path(facts.mask, target.parent) if isinstance(facts.mask, str) else None,
-        **{key: relative_path(path, target.parent) for key in ("dark", "flat") if (path := getattr(facts, key, None))},
-        "bayer_pattern": facts.bayer_pattern if isinstance(facts, Facts) else None,
-    }
-    text = json.dumps({k: v for k, v in values.items() if v is not None}, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(_stated_facts(facts, target.parent), ensure_ascii=False, allow_nan=False)
     write_atomically(target, text.encode("utf-8") + b"\n", overwrite=overwrite)
     return target
 
 
 def header_entries(exposure: Exposure, folder: Path) -> dict[str, str | float]:
     """The known metadata under the names of a FITS header, with both dates; paths relative to `folder`."""
+    stated = _stated_facts(exposure, folder)
     entries: dict[str, str | float] = {}
     if exposure.time_utc is not None:
         entries["TIMESYS"] = "UTC"
         if exposure.exposure_s is not None:
-            start = exposure.time_utc - timedelta(seconds=exposure.exposure_s / 2)
-            entries["DATE-OBS"] = format_utc(start).removesuffix("Z")  # FITS has no zone letter
-        entries["DATE-AVG"] = format_utc(exposure.time_utc).removesuffix("Z")
-        if exposure.time_sigma_is_stated:
-            entries["STTSIG"] = float(exposure.time_sigma_s)
-    if exposure.exposure_s is not None:
-        entries["EXPTIME"] = float(exposure.exposure_s)
-    for key, reference in (("STCAMERA", exposure.camera), ("STTERRAI", exposure.terrain)):
-        relative = _relative_path(reference, folder)
-        if relative is not None:
-            entries[key] = relative
-    return entries
+            entries["DATE-OBS"] = format_utc(exposure.time_utc - timedelta(seconds=exposure.exposure_s / 2))
+    for key, name in HEADER_OF.items():
+        if key in stated:
+            entries[name] = stated[key] if isinstance(stated[key], str) else float(stated[key])
+    dates = {name: str(entries[name]).removesuffix("Z") for name in ("DATE-OBS", "DATE-AVG") if name in entries}
+    return entries | dates  # FITS has no zone letter
 
 
-def _stated_time_sigma_s(facts: Facts | Exposure) -> float | None:
-    """The sigma of the clock that somebody states; None of an exposure with the default."""
-    return facts.time_sigma_s if isinstance(facts, Facts) or facts.time_sigma_is_stated else None
+def _stated_facts(facts: Facts | Exposure, folder: Path) -> dict[str, Any]:
+    """The known facts by the sidecar's keys, as they are written; paths relative to `folder`."""
+    stated: dict[str, Any] = {}
+    for key in SIDECAR.keys:
+        value = getattr(facts, key, None)
+        if key == "time_utc" and value is not None:
+            value = format_utc(value)
+        elif key == "time_sigma_s" and (facts.time_utc is None or not getattr(facts, "time_sigma_is_stated", True)):
+            value = None
+        elif key in NAMED_FILES:
+            value = _relative_path(value, folder)
+        elif key in IMAGE_KEYS:
+            value = None if value is None or isinstance(value, Mask) else relative_path(value, folder)
+        if value is not None:
+            stated[key] = value
+    return stated
 
 
 def _relative_path(reference: str | None, folder: Path) -> str | None:

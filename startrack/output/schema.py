@@ -5,7 +5,7 @@ from __future__ import annotations
 from startrack.camera.io import camera_keys
 from startrack.chain.stages import STAGES
 from startrack.core.errors import Reason
-from startrack.exposure.sidecar import SIDECAR as SIDECAR_KEYS
+from startrack.exposure import SIDECAR as SIDECAR_KEYS
 from startrack.output.quantities import BY_PATH
 from startrack.output.quantities_prediction import PREDICTION
 from startrack.output.record import FORMATS

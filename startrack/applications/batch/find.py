@@ -12,8 +12,7 @@ from pathlib import Path, PurePosixPath
 
 from startrack.core.files import existing_folder
 from startrack.core.types import BadInput
-from startrack.exposure import BagImage, list_bag_images
-from startrack.exposure.sidecar import PACKING_SUFFIXES, PICTURE_SUFFIXES
+from startrack.exposure import PACKING_SUFFIXES, PICTURE_SUFFIXES, BagImage, list_bag_images
 from startrack.output.write import PICTURES
 
 

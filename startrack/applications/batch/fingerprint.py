@@ -16,8 +16,7 @@ from startrack import __version__
 from startrack.catalog import has_deep_catalog
 from startrack.core.errors import BadInput
 from startrack.core.files import is_path, parse_toml, read_text, relative_path
-from startrack.exposure import BagImage
-from startrack.exposure.sidecar import IMAGE_KEYS, RAW_SUFFIXES, read_sidecar, sidecar_of, sidecar_reference
+from startrack.exposure import IMAGE_KEYS, RAW_SUFFIXES, BagImage, Sidecar, sidecar_of
 
 MISSING = "?"  # in place of the hash of a file that cannot be read; once it can, the hash differs
 FILES = ("camera", "terrain", *IMAGE_KEYS)  # facts that may be paths
@@ -57,8 +56,8 @@ def job_sha256(image: str, image_sha256: str, facts: dict[str, Any], *others: ob
 def _correction_sha256(image: Path, facts: dict[str, Any]) -> list[str]:
     """Key and SHA-256 of the dark frame and the flat field of an `image`, by flags, else by its sidecar."""
     try:
-        sidecar, values = read_sidecar(image)
-        files = {key: facts.get(key) or sidecar_reference(sidecar, values, key) for key in ("dark", "flat")}
+        sidecar = Sidecar.read(image)
+        files = {key: facts.get(key) or sidecar.value(key) for key in ("dark", "flat")}
     except BadInput:  # refused when the image is read
         return []
     return [f"{key} {_cached_sha256(Path(file))}" for key, file in files.items() if file]

@@ -1,0 +1,174 @@
+"""Facts about an image besides its pixels: from a flag, else from its sidecar, else from its header.
+
+Any program may have written a header (FITS, PNG, TIFF, JPEG): an unusable value there gives a note and is not used.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from startrack.core.declaration import SHOWN_CHARS, value_text
+from startrack.core.files import MAX_CAUSE_CHARS
+from startrack.core.types import BadInput, Exposure, Mask
+from startrack.exposure.sidecar import BAYER_PATTERNS, NAMED_FILES, NUMBERS, SIDECAR, Sidecar, resolve_path
+from startrack.frames import as_utc, parse_utc
+
+HEADER_OF = {  # the sidecar's key of a fact and its name in a header: FITS keyword, PNG text chunk, TIFF description
+    "time_utc": "DATE-AVG", "time_sigma_s": "STTSIG", "exposure_s": "EXPTIME", "camera": "STCAMERA",
+    "terrain": "STTERRAI", "bayer_pattern": "BAYERPAT",
+}  # fmt: skip
+# The names of the sidecar's keys are valid in a header too, except in FITS, where a card called CAMERA is common and
+# names the hardware.
+HEADER_KEYS = {name: name for name in ("DATE-OBS", "TIMESYS", *HEADER_OF.values())} | HEADER_OF
+
+
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """Metadata of an exposure besides its pixels; None if not known.
+
+    Raises ValueError for an unusable `time_sigma_s`.
+    """
+
+    time_utc: datetime | None = None  # mid-exposure, timezone-aware
+    time_sigma_s: float | None = None  # standard deviation of the clock's error
+    exposure_s: float | None = None
+    camera: str | None = None  # path, or name of a shipped file
+    terrain: str | None = None  # path, or name of a shipped file
+    mask: str | None = None  # path
+    dark: str | None = None  # path of the dark frame
+    flat: str | None = None  # path of the flat field
+    bayer_pattern: str | None = None  # RGGB and the like: the pixels are a mosaic of colours
+    warnings: tuple[str, ...] = ()  # values that were ignored, and why
+
+    def __post_init__(self) -> None:
+        if self.time_sigma_s is not None:
+            object.__setattr__(self, "time_sigma_s", check_time_sigma_s(self.time_sigma_s, "time_sigma_s"))
+
+
+def check_time_sigma_s(value: Any, name: str) -> float:
+    """The standard deviation `value` [s] of a clock's error. Raises ValueError with a line that names it `name`."""
+    return float(NUMBERS["time_sigma_s"].check(value, name))
+
+
+def with_facts(
+    exposure: Exposure,
+    *,
+    time_utc: datetime | None = None,
+    time_sigma_s: float | None = None,
+    exposure_s: float | None = None,
+    camera: str | None = None,
+    terrain: str | None = None,
+    mask: str | Mask | None = None,
+) -> Exposure:
+    """The exposure with the values given here in place of its own; `time_utc` is mid-exposure.
+
+    `time_sigma_s` is the standard deviation of the clock's error. `camera` and `terrain` are names or paths of files,
+    `mask` is a path or the mask itself.
+
+    A mid-exposure time computed from DATE-OBS and a header's EXPTIME does not change with a new `exposure_s`; give it
+    to `read_exposure` for that. Raises ValueError for a time without zone and an unusable `time_sigma_s`.
+    """
+    given: dict[str, Any] = {"exposure_s": exposure_s, "camera": camera, "terrain": terrain, "mask": mask}
+    given["time_utc"] = None if time_utc is None else as_utc(time_utc)
+    if time_sigma_s is not None:
+        given |= {"time_sigma_s": check_time_sigma_s(time_sigma_s, "time_sigma_s"), "time_sigma_is_stated": True}
+    return replace(exposure, **{key: value for key, value in given.items() if value is not None})
+
+
+def resolve_facts(image: Path, header: Mapping[str, Any], given: Facts) -> Facts:
+    """The metadata of `image` from, in this order: `given` (flags), its sidecar, its header.
+
+    A source is read only for values that the sources before it do not have. An unusable value in a sidecar raises
+    BadInput (bad_image, or no_time); in a header it gives a warning.
+    """
+    sidecar = Sidecar.read(image)
+    notes = [*given.warnings, *sidecar.warnings]
+    found: dict[str, Any] = {}
+    for key in sorted(SIDECAR.keys, key=lambda key: key != "exposure_s"):  # the middle of the exposure depends on it
+        value = getattr(given, key)
+        if value is None or value == "":
+            value = sidecar.value(key)
+        if value is None and key in NUMBERS:
+            value = header_number(header, key, notes)
+        elif value is None and key == "time_utc":
+            value = _header_time(header, found["exposure_s"], notes)
+        elif value is None and key in HEADER_OF:
+            value = _header_text(header, key, notes)
+            if value is not None and key in NAMED_FILES:
+                value = resolve_path(image, value)
+        found[key] = as_utc(value) if key == "time_utc" and value is not None else value
+    return Facts(**found, warnings=tuple(notes))
+
+
+def facts_in_text(text: str) -> dict[str, Any]:
+    """Header entries in a free text (TIFF ImageDescription, JPEG comment): a JSON object, or lines `KEY = value`."""
+    try:
+        entries = json.loads(text)
+    except (ValueError, RecursionError):  # no JSON, then: the other form, or a text about something else
+        pairs = (line.partition("=") for line in text.splitlines())
+        entries = {key.strip(): value.strip().strip("'\"") for key, _, value in pairs}
+    if not isinstance(entries, dict):
+        return {}
+    return {HEADER_KEYS[key]: value for key, value in reversed(entries.items()) if key in HEADER_KEYS}
+
+
+def header_number(header: Mapping[str, Any], key: str, notes: list[str]) -> float | None:
+    """The header's number of seconds for a key of the sidecar, within the limits of that key."""
+    declared, name = NUMBERS[key], HEADER_OF[key]
+    value = header.get(name)
+    if value is None or value == "":
+        return None
+    try:
+        return float(declared.check(math.nan if isinstance(value, bool) else float(value), name))
+    except (TypeError, ValueError, OverflowError):
+        notes.append(f"{name} {value_text(value)} is not a number of seconds {declared.limits}; not used")
+        return None
+
+
+def _header_time(header: Mapping[str, Any], exposure_s: float | None, notes: list[str]) -> datetime | None:
+    """Mid-exposure from DATE-AVG, or from DATE-OBS and half the exposure; the notes have the cause if there is none."""
+    given = [key for key in ("DATE-AVG", "DATE-OBS") if str(header.get(key) or "").strip()]
+    scale = str(header.get("TIMESYS") or "UTC").strip().upper()
+    if given and scale != "UTC" and not scale.startswith("UTC("):  # FITS allows UTC(NIST) and the like
+        notes.append(f"{given[0]} not used: it is in the time scale {scale[:20]}, not UTC")
+        return None
+    for key in given:
+        try:
+            time = parse_utc(str(header[key]))
+        except BadInput as error:
+            notes.append(f"{key} not used: {str(error)[:MAX_CAUSE_CHARS]}")
+            continue
+        if key == "DATE-AVG":
+            return time
+        if exposure_s is None:
+            notes.append(
+                "DATE-OBS is when the exposure starts, and without EXPTIME its middle is not known: "
+                "give the time of the middle (time_utc in a sidecar), or exposure_s"
+            )
+            continue
+        try:
+            return time + timedelta(seconds=exposure_s / 2)
+        except OverflowError:
+            notes.append(f"DATE-OBS not used: {time} plus half the exposure is beyond the calendar")
+    return None
+
+
+def _header_text(header: Mapping[str, Any], key: str, notes: list[str]) -> str | None:
+    """The header's name of a file, or pattern of colours; None if it has none."""
+    name = HEADER_OF[key]
+    value = str(header.get(name) or "").strip()
+    if key == "bayer_pattern":
+        value = value.upper()
+        if value and value not in BAYER_PATTERNS:
+            notes.append(f"{name} {value[:SHOWN_CHARS]!r} is none of {', '.join(BAYER_PATTERNS)}; not used")
+            return None
+    elif not value.isprintable():
+        notes.append(f"{name} is no name of a file; not used")
+        return None
+    return value or None

@@ -19,8 +19,8 @@ def robust_sigma(values: Any, centre: Any = None, axis: Any = None) -> Any:
     """
     if centre is None:
         centre = np.median(values, axis=axis, keepdims=axis is not None)
-    sigma = NORMAL_BY_MEDIAN * np.median(np.abs(values - centre), axis=axis)
-    return float(sigma) if axis is None else sigma
+    middle = np.median(np.abs(values - centre), axis=axis)
+    return NORMAL_BY_MEDIAN * (float(middle) if axis is None else middle)
 
 
 def relative_weights(log_weights: Array, axis: int | None = None) -> Array:

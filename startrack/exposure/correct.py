@@ -9,18 +9,17 @@ section 4.5.
 from __future__ import annotations
 
 import hashlib
-import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.core.files import printable
+from startrack.core.files import FilePath, printable
 from startrack.core.types import BadInput, Bools, Correction, Exposure, Mask
-from startrack.exposure.decode_file import decode_file
+from startrack.exposure.decode_file import Stamp, decode_file, read_stamped
 from startrack.exposure.facts import header_number
 from startrack.exposure.mask import require_size
 from startrack.exposure.mosaic import PHASES
@@ -45,9 +44,7 @@ class CalibrationFrame:
     exposure_s: float | None  # by its header
 
 
-def correct_exposure(
-    exposure: Exposure, *, dark: str | os.PathLike[str] | None = None, flat: str | os.PathLike[str] | None = None
-) -> Exposure:
+def correct_exposure(exposure: Exposure, *, dark: FilePath | None = None, flat: FilePath | None = None) -> Exposure:
     """The exposure corrected by the images `dark` and `flat`. Not for mosaics, which `read_exposure` corrects.
 
     Raises BadInput as `correct_counts`, ValueError where the exposure is corrected already.
@@ -62,8 +59,8 @@ def correct_exposure(
 
 
 def correct_counts(
-    recorded_adu: Picture, saturation_adu: float | None, dark: str | os.PathLike[str] | None,
-    flat: str | os.PathLike[str] | None, *, mosaic: bool = False,
+    recorded_adu: Picture, saturation_adu: float | None, dark: FilePath | None,
+    flat: FilePath | None, *, mosaic: bool = False,
 ) -> tuple[Picture, Correction]:  # fmt: skip
     """The corrected counts (H, W) [ADU], not clipped, and the correction; of `dark` and `flat` one may be None.
 
@@ -99,9 +96,7 @@ def correct_counts(
     )
 
 
-def correction_warnings(
-    dark: str | os.PathLike[str] | None, flat: str | os.PathLike[str] | None, exposure_s: float | None
-) -> tuple[str, ...]:
+def correction_warnings(dark: FilePath | None, flat: FilePath | None, exposure_s: float | None) -> tuple[str, ...]:
     """Warnings about a flat field alone, and a dark frame of another exposure time than `exposure_s` of the image."""
     if dark is None:
         return () if flat is None else (FLAT_ALONE,)
@@ -111,34 +106,21 @@ def correction_warnings(
     return (f"the dark frame was exposed for {stated:g} s, the image for {exposure_s:g} s",)
 
 
-def read_dark(path: str | os.PathLike[str]) -> CalibrationFrame:
+def read_dark(path: FilePath) -> CalibrationFrame:
     """The dark frame in the image at `path`. Raises BadInput bad_image if it cannot be read, or is saturated."""
-    return _read(path, "dark frame", _read_dark)
+    return read_stamped(path, _read_dark, "dark frame")
 
 
-def read_flat(path: str | os.PathLike[str], *, mosaic: bool = False) -> CalibrationFrame:
+def read_flat(path: FilePath, *, mosaic: bool = False) -> CalibrationFrame:
     """The flat field in the image at `path`, of a `mosaic` with a median for each colour.
 
     Raises BadInput bad_image if it cannot be read, or is dark.
     """
-    return _read(path, "flat field", _read_mosaic_flat if mosaic else _read_flat)
-
-
-def _read(
-    path: str | os.PathLike[str], kind: str, read: Callable[[str, tuple[int, ...]], CalibrationFrame]
-) -> CalibrationFrame:
-    try:
-        found = os.stat(path)
-        return read(os.fspath(path), (found.st_ino, found.st_size, found.st_mtime_ns))
-    except BadInput as error:
-        raise BadInput(error.reason, f"{kind} {error}") from error
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        cause = getattr(error, "strerror", None) or error
-        raise BadInput("bad_image", f"{kind} {printable(path)}: cannot be opened ({cause})") from error
+    return read_stamped(path, partial(_read_flat, mosaic), "flat field")
 
 
 @lru_cache(maxsize=KEPT_FRAMES)
-def _read_dark(path: str, stamp: tuple[int, ...]) -> CalibrationFrame:
+def _read_dark(path: str, stamp: Stamp) -> CalibrationFrame:
     """The dark frame at `path`, read once as long as the file keeps its `stamp`."""
     raw, decoded = decode_file(path)
     median = float(np.median(decoded.pixels_adu))
@@ -147,23 +129,17 @@ def _read_dark(path: str, stamp: tuple[int, ...]) -> CalibrationFrame:
     return _frame(path, raw, excess, decoded.pixels_adu >= top, median, decoded.header, fill=0.0, cause="is saturated")
 
 
-@lru_cache(maxsize=KEPT_FRAMES)
-def _read_flat(path: str, stamp: tuple[int, ...]) -> CalibrationFrame:
-    """The flat field of a grey or colour image at `path`, read once as long as the file keeps its `stamp`."""
-    raw, decoded = decode_file(path)
-    level = _lit_level(decoded.pixels_adu, path)
-    return _flat_frame(path, raw, decoded.pixels_adu / np.float32(level), level, decoded.header)
-
-
-@lru_cache(maxsize=KEPT_FRAMES)
-def _read_mosaic_flat(path: str, stamp: tuple[int, ...]) -> CalibrationFrame:
-    """The flat field of a mosaic at `path`, each of its colours 1 at its own median."""
+@lru_cache(maxsize=2 * KEPT_FRAMES)
+def _read_flat(mosaic: bool, path: str, stamp: Stamp) -> CalibrationFrame:
+    """The flat field at `path`, each colour of a mosaic 1 at its own median; read once while the `stamp` stays."""
     raw, decoded = decode_file(path)
     sensitivity = np.array(decoded.pixels_adu)
-    levels = [_lit_level(decoded.pixels_adu[i::2, j::2], path) for i, j in PHASES]
-    for (i, j), level in zip(PHASES, levels, strict=True):
-        sensitivity[i::2, j::2] /= np.float32(level)
-    return _flat_frame(path, raw, sensitivity, float(np.mean(levels)), decoded.header)
+    parts = [sensitivity[i::2, j::2] for i, j in PHASES] if mosaic else [sensitivity]
+    levels = [_lit_level(part, path) for part in parts]
+    for part, level in zip(parts, levels, strict=True):
+        part /= np.float32(level)
+    dark, level = sensitivity < MIN_SENSITIVITY_1, float(np.mean(levels))
+    return _frame(path, raw, sensitivity, dark, level, decoded.header, fill=1.0, cause="is dark")
 
 
 def _lit_level(pixels_adu: Picture, path: str) -> float:
@@ -172,13 +148,6 @@ def _lit_level(pixels_adu: Picture, path: str) -> float:
     if limit <= 0:
         raise BadInput("bad_image", f"{printable(path)}: is dark, so it shows no sensitivities")
     return float(np.median(pixels_adu[pixels_adu > limit]))
-
-
-def _flat_frame(
-    path: str, raw: bytes, sensitivity: Picture, level: float, header: Mapping[str, Any]
-) -> CalibrationFrame:  # fmt: skip
-    dark = sensitivity < MIN_SENSITIVITY_1
-    return _frame(path, raw, sensitivity, dark, level, header, fill=1.0, cause="is dark")
 
 
 def _frame(

@@ -5,20 +5,24 @@ from __future__ import annotations
 import os
 import stat
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
-from startrack.core.files import printable
+from startrack.core.files import FilePath, printable
 from startrack.core.types import BadInput
 from startrack.exposure.decoded import MAX_FILE_BYTES, Decoded, bad_image
 from startrack.exposure.sidecar import RAW_SUFFIXES
 
+Stamp = tuple[int, ...]  # of a file: inode, size, time of its last change
+T = TypeVar("T")
 PNG = (b"\x89PNG\r\n\x1a\n",)
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 JPEG = (b"\xff\xd8\xff",)
 FITS = (b"SIMPLE  =", b"\x1f\x8b", b"BZh")
 
 
-def decode_file(path: str | os.PathLike[str]) -> tuple[bytes, Decoded]:
+def decode_file(path: FilePath) -> tuple[bytes, Decoded]:
     """The bytes of the image at `path`, and their content. Raises BadInput bad_image with file and cause."""
     try:
         raw = _read_bytes(path)
@@ -27,7 +31,22 @@ def decode_file(path: str | os.PathLike[str]) -> tuple[bytes, Decoded]:
         raise BadInput(error.reason, " ".join(f"{printable(path)}: {error}".split())) from error
 
 
-def _read_bytes(path: str | os.PathLike[str]) -> bytes:
+def read_stamped(path: FilePath, read: Callable[[str, Stamp], T], kind: str, reason: str | None = None) -> T:
+    """What `read` gives for the file at `path` and a stamp of its present state, by which it may keep results.
+
+    Raises BadInput `reason` (None: that of the cause) with the `kind` of file and the cause.
+    """
+    try:
+        found = os.stat(path)
+        return read(os.fspath(path), (found.st_ino, found.st_size, found.st_mtime_ns))
+    except BadInput as error:
+        raise BadInput(reason or error.reason, f"{kind} {error}") from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        cause = getattr(error, "strerror", None) or error
+        raise BadInput(reason or "bad_image", f"{kind} {printable(path)}: cannot be opened ({cause})") from error
+
+
+def _read_bytes(path: FilePath) -> bytes:
     try:
         status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):

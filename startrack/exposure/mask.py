@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from startrack.core.files import printable
+from startrack.core.files import FilePath, printable
 from startrack.core.types import Array, BadInput, Bools, Correction, Mask
-from startrack.exposure.decode_file import decode_file
+from startrack.exposure.decode_file import Stamp, decode_file, read_stamped
+from startrack.exposure.decoded import bad_image
 
 SKY_FROM = 128  # of 255: darker pixels of a mask's file do not count
 LARGEST_VALUE = 255.0  # of an 8-bit file
@@ -28,14 +28,22 @@ def mask_of(masked: ArrayLike) -> Mask | None:
     )
 
 
-def read_mask(path: str | os.PathLike[str], reason: str = "bad_image") -> Mask:
+def read_mask(path: FilePath, reason: str = "bad_image") -> Mask:
     """The mask in the 8-bit image at `path`. Raises BadInput `reason` if it is none, or if no pixel of it counts."""
-    try:
-        found = os.stat(path)
-        return _read_mask(os.fspath(path), reason, (found.st_ino, found.st_size, found.st_mtime_ns))
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        cause = getattr(error, "strerror", None) or error
-        raise BadInput(reason, f"mask {printable(path)}: cannot be opened ({cause})") from error
+    return read_stamped(path, _read_mask, "mask", reason)
+
+
+@lru_cache(maxsize=KEPT_MASKS)
+def _read_mask(path: str, stamp: Stamp) -> Mask:
+    """The mask at `path`, read once as long as the file keeps its `stamp`."""
+    raw, decoded = decode_file(path)
+    if decoded.saturation_adu != LARGEST_VALUE:
+        raise bad_image(f"{printable(path)}: is not an 8-bit image")
+    masked = decoded.pixels_adu < SKY_FROM
+    if masked.all():
+        cause = f"all pixels are below {SKY_FROM}, so none would count: 255 is sky, 0 masked"
+        raise bad_image(f"{printable(path)}: {cause}")
+    return Mask(masked=masked, sha256=hashlib.sha256(raw).hexdigest())
 
 
 def combine_masks(
@@ -75,21 +83,3 @@ def touch_masked(masked: Bools, xy_px: Array, radius_px: int) -> Bools:
     height, width = masked.shape
     column, row = np.rint(np.clip(xy_px, 0, [width - 1, height - 1])).astype(np.int64).T
     return np.asarray(around[row, column] > 0)
-
-
-@lru_cache(maxsize=KEPT_MASKS)
-def _read_mask(path: str, reason: str, stamp: tuple[int, ...]) -> Mask:
-    """The mask at `path`, read once as long as the file keeps its `stamp`."""
-    try:
-        raw, decoded = decode_file(path)
-        if decoded.saturation_adu != LARGEST_VALUE:
-            raise BadInput(reason, f"{printable(path)}: is not an 8-bit image")
-    except BadInput as error:
-        raise BadInput(reason, f"mask {error}") from error
-    masked = decoded.pixels_adu < SKY_FROM
-    if masked.all():
-        raise BadInput(
-            reason,
-            f"mask {printable(path)}: all pixels are below {SKY_FROM}, so none would count: 255 is sky, 0 masked",
-        )
-    return Mask(masked=masked, sha256=hashlib.sha256(raw).hexdigest())

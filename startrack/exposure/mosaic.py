@@ -17,6 +17,7 @@ from io import BytesIO
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array
 from startrack.exposure.decoded import Decoded, bad_image, check_size
 
@@ -111,9 +112,7 @@ def _gains(excess: Picture, spoilt: NDArray[np.bool_] | None) -> Array:
     import cv2
 
     local = cv2.blur(excess, (STAR_BOX_PX, STAR_BOX_PX))
-    middle = np.median(local)
-    sigma = 1.4826 * float(np.median(np.abs(local - middle)))
-    stars = local > middle + STAR_SIGMAS * max(sigma, 1e-6)
+    stars = local > np.median(local) + STAR_SIGMAS * max(robust_sigma(local), 1e-6)
     if spoilt is not None and spoilt.any():
         stars &= cv2.dilate(spoilt.astype(np.uint8), np.ones((9, 9), np.uint8)) == 0
     ratio = np.where(stars, excess / np.where(stars, local, 1.0), 0.0)

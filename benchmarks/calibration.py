@@ -20,8 +20,7 @@ import numpy as np
 from _results import table, write_section
 
 from startrack.applications.calibration import calibrate, fit_lens, initial_state, observations
-from startrack.camera import Camera, KannalaBrandt
-from startrack.camera.uncertainty import cap_grid, compensating_rotation, lens_jacobian
+from startrack.camera import Camera, KannalaBrandt, cap_grid, compensating_rotation, lens_jacobian
 from startrack.catalog import load_catalog
 from startrack.exposure import read_exposure
 from startrack.frames import R_from_quat_xyzw, R_from_rotvec, Site

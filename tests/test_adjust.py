@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from startrack.camera import Camera, KannalaBrandt, Pinhole
-from startrack.camera.parameters import with_update
+from startrack.camera import Camera, KannalaBrandt, Pinhole, with_update
 from startrack.core.types import NotIdentified
 from startrack.estimation.attitude import AttitudeFit, solve_attitude
 

@@ -19,8 +19,7 @@ import pytest
 from astropy.table import QTable
 
 from startrack.applications.batch import Task, images_under, listed_images, locate_image, write_tables
-from startrack.camera import load_camera
-from startrack.camera.io import save_camera
+from startrack.camera import load_camera, save_camera
 from startrack.catalog import load_catalog
 from startrack.cli.main import main
 from startrack.core.errors import BadInput

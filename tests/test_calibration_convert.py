@@ -12,9 +12,9 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from startrack.camera import Camera, Decentring, KannalaBrandt, Pinhole, load_camera
-from startrack.camera.convert import from_text, to_text
-from startrack.camera.convert.intrinsics import decentring_rms_px
+from startrack.camera import Camera, Decentring, KannalaBrandt, Pinhole, decentring_rms_px, load_camera
+from startrack.camera import camera_from_foreign_text as from_text
+from startrack.camera import foreign_text as to_text
 from startrack.cli.main import main
 from startrack.core.types import BadInput
 

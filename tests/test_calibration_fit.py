@@ -9,9 +9,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from startrack.applications.calibration import fit_lens, initial_state, observations
-from startrack.camera import Camera, Decentring, KannalaBrandt, camera_from_dict, camera_to_dict
-from startrack.camera.parameters import with_update
-from startrack.camera.uncertainty import lens_jacobian
+from startrack.camera import (
+    Camera,
+    Decentring,
+    KannalaBrandt,
+    camera_from_dict,
+    camera_to_dict,
+    lens_jacobian,
+    with_update,
+)
 from startrack.core.types import NotIdentified
 
 FOCAL_PX, SIZE_PX = 652.0, (2048, 2048)

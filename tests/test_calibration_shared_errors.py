@@ -15,8 +15,7 @@ from startrack.applications.calibration import fit_lens, observations
 from startrack.applications.calibration.region_growing import JointFit
 from startrack.applications.calibration.shared_errors import FLOOR_PX, birge_ratio, nights, widen_covariance
 from startrack.applications.calibration.verify import SIGNIFICANT_SIGMAS, difference_px
-from startrack.camera import Camera
-from startrack.camera.uncertainty import cap_grid, projection_covariance_px2
+from startrack.camera import Camera, cap_grid, projection_covariance_px2
 from startrack.core.types import Array
 
 SIGMA_PX, STARS = 0.15, 500

@@ -21,15 +21,15 @@ from startrack.camera import (
     Lens,
     Pinhole,
     camera_from_dict,
+    camera_keys,
     camera_to_dict,
+    lens_jacobian,
     lenses,
     load_camera,
     save_camera,
+    with_update,
 )
-from startrack.camera.convert import to_text
-from startrack.camera.io import camera_keys
-from startrack.camera.parameters import with_update
-from startrack.camera.uncertainty import lens_jacobian
+from startrack.camera import foreign_text as to_text
 from startrack.cli.main import main
 from startrack.core.types import Array, BadInput
 from startrack.output.wcs import header_block, wcs_cards

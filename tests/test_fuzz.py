@@ -12,8 +12,7 @@ from fuzz.seeds import SIDECAR
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from startrack.camera import camera_from_dict, load_camera
-from startrack.camera.io import camera_to_dict
+from startrack.camera import camera_from_dict, camera_to_dict, load_camera
 from startrack.core.errors import BadInput
 from startrack.exposure import read_exposure
 from startrack.terrain import terrain_from_dict

@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 from jsonschema import Draft202012Validator, ValidationError
 
-from startrack.camera.io import camera_to_dict
+from startrack.camera import camera_to_dict
 from startrack.chain.stages import Measured, Oriented, Refused, extend
 from startrack.cli.main import main
 from startrack.core.files import data_dir

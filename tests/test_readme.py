@@ -12,7 +12,7 @@ import pytest
 from astropy.table import Table
 from page_helpers import ROOT, run_page
 
-from startrack.camera.io import camera_from_dict
+from startrack.camera import camera_from_dict
 from startrack.cli.main import COMMANDS, main
 from startrack.core.errors import Reason
 from startrack.terrain import terrain_from_dict

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from render_helpers import CRATER, FISHEYE, SENSOR, SITE, make_scene, stars_at_azel
 
-from startrack.camera import KannalaBrandt
-from startrack.camera.decentring import Decentring
+from startrack.camera import Decentring, KannalaBrandt
 from startrack.frames import azel_from_rays
 from startrack.rendering import light_e, render
 from startrack.rendering.sky import coverage, sky_e_per_s

@@ -1,22 +1,24 @@
-"""Cameras: a lens (one file each, listed in `lenses.py`), a camera around it, and camera files."""
+"""Cameras: lenses (listed in `lenses.py`), a camera around one, and camera files."""
 
-from startrack.camera.camera import Camera, Sensor
-from startrack.camera.decentring import Decentring
-from startrack.camera.io import camera_from_dict, camera_to_dict, save_camera
-from startrack.camera.kannala_brandt import KannalaBrandt
+from startrack.camera.camera import (
+    Camera,
+    cap_grid,
+    compensating_rotation,
+    lens_jacobian,
+    projection_covariance_px2,
+    with_covariance,
+    with_update,
+)
+from startrack.camera.convert import camera_from_foreign_text, decentring_rms_px, foreign_text
+from startrack.camera.io import SENSOR, camera_from_dict, camera_keys, camera_text, camera_to_dict, save_camera
 from startrack.camera.lens import Lens
+from startrack.camera.lenses import KannalaBrandt, Pinhole, default_lens, lens_kinds
 from startrack.camera.load import load_camera
-from startrack.camera.pinhole import Pinhole
+from startrack.camera.optics import MIN_THROUGHPUT_1, Decentring, Sensor
 
 __all__ = [
-    "Camera",
-    "Decentring",
-    "KannalaBrandt",
-    "Lens",
-    "Pinhole",
-    "Sensor",
-    "camera_from_dict",
-    "camera_to_dict",
-    "load_camera",
-    "save_camera",
-]
+    "MIN_THROUGHPUT_1", "SENSOR", "Camera", "Decentring", "KannalaBrandt", "Lens", "Pinhole", "Sensor",
+    "camera_from_dict", "camera_from_foreign_text", "camera_keys", "camera_text", "camera_to_dict", "cap_grid",
+    "compensating_rotation", "decentring_rms_px", "default_lens", "foreign_text", "lens_jacobian", "lens_kinds",
+    "load_camera", "projection_covariance_px2", "save_camera", "with_covariance", "with_update",
+]  # fmt: skip

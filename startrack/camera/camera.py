@@ -1,48 +1,24 @@
-"""The camera: a lens, a sensor and a mount. Rays to pixels and back."""
+"""The camera: a lens, a sensor and a mount. Rays to pixels and back, and what its parameters change."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from startrack.camera.decentring import Decentring
-from startrack.camera.kannala_brandt import KannalaBrandt
 from startrack.camera.lens import Lens
+from startrack.camera.lenses import KannalaBrandt
+from startrack.camera.optics import Decentring, Sensor
 from startrack.core.types import Array, Bools, Mask
 from startrack.frames import length_xy, off_axis_rad
 
 # Body x (forward) = image top = -cam y, body y (left) = +cam x, body z (up) = +cam z: it looks at the zenith.
 ZENITH_MOUNT_R_BODY_CAM = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
-MIN_THROUGHPUT_1 = 0.05  # relative to the axis, up to the calibrated angle: no light for evidence below it (3.3 mag)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sensor:
-    """Sensor and whole optics: from light to numbers."""
-
-    zero_point_e_per_s: float  # electrons per second of a V = 0 star on the axis, whole PSF
-    gain_e_per_adu: float = 1.0
-    bias_adu: float = 0.0
-    read_noise_e: float = 0.0
-    dark_e_per_s: float = 0.0  # per pixel
-    saturation_adu: float = 65535.0
-    psf_sigma_px: float = 1.0  # Gaussian, before integration over the pixel
-    vignetting: tuple[float, float] = (0.0, 0.0)
-
-    def throughput(self, angle_rad: Array) -> Array:
-        """Relative throughput max(1 + v1 a^2 + v2 a^4, 0) at the angles a = `angle_rad` off the axis, any shape."""
-        a2 = np.square(angle_rad)
-        return np.maximum(1.0 + a2 * (self.vignetting[0] + a2 * self.vignetting[1]), 0.0)
-
-    def lowest_throughput(self, angle_rad: float) -> float:
-        """Smallest value of 1 + v1 a^2 + v2 a^4 from the axis to `angle_rad`; negative where the polynomial is."""
-        v1, v2 = self.vignetting
-        ends = [0.0, angle_rad**2]
-        if v2 and 0 < -v1 / (2 * v2) < ends[1]:  # a^2 at the polynomial's extremum
-            ends.append(-v1 / (2 * v2))
-        return min(1.0 + a2 * (v1 + a2 * v2) for a2 in ends)
+GRID_POINTS = 400  # of a cap
+GOLDEN_ANGLE_RAD = np.pi * (3.0 - np.sqrt(5.0))
+SQUARE_PIXEL_SIGMA_1 = 1e-7  # relative sigma of fx / fy where they are fitted as one: just enough for an inverse
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,34 +115,17 @@ class Camera:
         ux, uy = np.where(off_axis, x / divisor, 1.0), np.where(off_axis, y / divisor, 0.0)
         slope = self.lens.slope(angle)
         ratio = np.where(off_axis, self.lens.rho(angle) / divisor, slope)
-        along = slope * z
-        by_ray = np.stack(
-            [
-                np.stack([along * ux * ux + ratio * uy * uy, (along - ratio) * ux * uy, -slope * s * ux], axis=-1),
-                np.stack([(along - ratio) * ux * uy, along * uy * uy + ratio * ux * ux, -slope * s * uy], axis=-1),
-            ],
-            axis=-2,
-        )
-        if self.decentring:
-            by_ray = by_ray + self._decentred_by_ray(x, y, z, s, angle, ux, uy)
+        by_ray = _polar_by_ray(slope * z, ratio, slope * s, ux, uy)
+        if self.decentring:  # d (s, t): as for rho, with rho = a
+            ratio = np.divide(angle, s, out=np.ones_like(s), where=off_axis)
+            gradient = self.decentring.gradient(np.stack([angle * ux, angle * uy], axis=-1))
+            by_ray = by_ray + gradient @ _polar_by_ray(z, ratio, s, ux, uy)
         zero = np.zeros_like(x)
         by_rotation = np.stack(
             [np.stack([zero, z, -y], axis=-1), np.stack([-z, zero, x], axis=-1), np.stack([y, -x, zero], axis=-1)],
             axis=-2,
         )
         return (by_ray @ by_rotation) * np.array(self.handed_focal_px)[:, None]
-
-    def _decentred_by_ray(self, x: Array, y: Array, z: Array, s: Array, angle: Array, ux: Array, uy: Array) -> Array:
-        """d shift / d ray (..., 2, 3): d(s, t) = u da + (a / sin a) v (v . d(x, y)), as for rho."""
-        ratio = np.divide(angle, s, out=np.ones_like(s), where=s > 1e-12)
-        by_angle = np.stack(
-            [
-                np.stack([z * ux * ux + ratio * uy * uy, (z - ratio) * ux * uy, -s * ux], axis=-1),
-                np.stack([(z - ratio) * ux * uy, z * uy * uy + ratio * ux * ux, -s * uy], axis=-1),
-            ],
-            axis=-2,
-        )
-        return self.decentring.gradient(np.stack([angle * ux, angle * uy], axis=-1)) @ by_angle
 
     def pixel_solid_angle_sr(self, angle_rad: Array) -> Array:
         """Solid angle [sr] of one pixel at the angles a = `angle_rad` off the axis, any shape.
@@ -186,7 +145,109 @@ class Camera:
         The part that a rotation of the camera compensates is removed: the attitude, found with this camera, absorbs
         it. Beyond the calibrated angle it is the uncertainty of the fitted law, not of the real lens.
         """
-        from startrack.camera.uncertainty import projection_covariance_px2
-
         variance_px2 = np.trace(projection_covariance_px2(self, rays_cam), axis1=-2, axis2=-1) / 2.0
         return np.sqrt(np.maximum(variance_px2, 0.0))  # below zero by rounding
+
+
+def _polar_by_ray(along: Array, across: Array, down: Array, ux: Array, uy: Array) -> Array:
+    """d (r u) / d ray (..., 2, 3), u = (ux, uy) the direction off the axis: across u it changes by `across`."""
+    return np.stack(
+        [
+            np.stack([along * ux * ux + across * uy * uy, (along - across) * ux * uy, -down * ux], axis=-1),
+            np.stack([(along - across) * ux * uy, along * uy * uy + across * ux * ux, -down * uy], axis=-1),
+        ],
+        axis=-2,
+    )
+
+
+def lens_jacobian(camera: Camera, rays_cam: Array, order: tuple[str, ...]) -> Array:
+    """d px / d parameter (..., 2, m) of a camera at `rays_cam` (..., 3), for the m parameters named in `order`.
+
+    Names: f (both focal lengths, their ratio kept), fx, fy, cx, cy, those of the lens (k1 to k4), and p1 and p2 of the
+    decentring [px per px, or px per 1]. Raises ValueError for a name that the lens does not have.
+    """
+    rays_cam = np.asarray(rays_cam, dtype=np.float64)
+    x, y, z = rays_cam[..., 0], rays_cam[..., 1], rays_cam[..., 2]
+    off_axis = np.hypot(x, y)
+    angle = np.arctan2(off_axis, z)
+    u = np.stack([np.divide(c, off_axis, out=np.zeros_like(c), where=off_axis > 0) for c in (x, y)], axis=-1)
+    st = angle[..., None] * u
+    uv = camera.lens.rho(angle)[..., None] * u + camera.decentring.shift(st)  # image point [focal lengths]
+    handed_px = np.array(camera.handed_focal_px)
+    sign = np.array([-1.0 if camera.mirrored else 1.0, 1.0])
+    x_only, y_only = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+
+    def column(name: str) -> Array:
+        if name == "f":
+            return uv * sign * [1.0, camera.focal_px[1] / camera.focal_px[0]]
+        if name in ("fx", "fy"):
+            return uv * sign * (x_only if name == "fx" else y_only)
+        if name in ("cx", "cy"):
+            return np.broadcast_to(x_only if name == "cx" else y_only, uv.shape)
+        if name in ("p1", "p2"):
+            return handed_px * Decentring(float(name == "p1"), float(name == "p2")).shift(st)
+        return handed_px * camera.lens.derivative(name, angle)[..., None] * u
+
+    return np.stack([column(name) for name in order], axis=-1)
+
+
+def cap_grid(angle_rad: float, points: int = GRID_POINTS) -> Array:
+    """Rays (`points`, 3) spread evenly in solid angle over the cap within `angle_rad` of the axis."""
+    i = np.arange(points) + 0.5
+    z = 1.0 - (1.0 - np.cos(angle_rad)) * i / points
+    r = np.sqrt(np.maximum(1.0 - z * z, 0.0))
+    return np.stack([r * np.cos(GOLDEN_ANGLE_RAD * i), r * np.sin(GOLDEN_ANGLE_RAD * i), z], axis=-1)
+
+
+def compensating_rotation(camera: Camera, order: tuple[str, ...]) -> Array:
+    """Rotation (3, m) of the camera [rad per parameter] that best compensates a change of each parameter in `order`.
+
+    Least squares over the calibrated cap, evenly in solid angle. An image's attitude is found with the same camera, so
+    that this part of a lens error does not reach a prediction.
+    """
+    grid = cap_grid(camera.calibrated_angle_rad)
+    rotation = camera.jacobian_px_per_rad(grid).reshape(-1, 3)
+    lens = lens_jacobian(camera, grid, order).reshape(-1, len(order))
+    return np.asarray(-np.linalg.lstsq(rotation, lens, rcond=None)[0], dtype=np.float64)
+
+
+def projection_covariance_px2(camera: Camera, rays_cam: Array) -> Array:
+    """Covariance (..., 2, 2) [px^2] of the projected `rays_cam` (..., 3), best rotation removed; 0 if not known."""
+    rays_cam = np.asarray(rays_cam, dtype=np.float64)
+    if camera.covariance is None:
+        return np.zeros((*rays_cam.shape[:-1], 2, 2))
+    order = camera.covariance_order
+    jacobian = lens_jacobian(camera, rays_cam, order)
+    jacobian = jacobian + camera.jacobian_px_per_rad(rays_cam) @ compensating_rotation(camera, order)
+    return jacobian @ camera.covariance @ np.swapaxes(jacobian, -1, -2)
+
+
+def with_update(camera: Camera, step: Mapping[str, float]) -> Camera:
+    """The camera with `step` added to its parameters, by name; the lens keeps those that are not named."""
+    fx, fy = camera.focal_px
+    scale = 1.0 + step.get("f", 0.0) / fx
+    p1, p2 = camera.decentring.p1 + step.get("p1", 0.0), camera.decentring.p2 + step.get("p2", 0.0)
+    return replace(
+        camera,
+        focal_px=(float(fx * scale + step.get("fx", 0.0)), float(fy * scale + step.get("fy", 0.0))),
+        centre_px=(
+            float(camera.centre_px[0] + step.get("cx", 0.0)),
+            float(camera.centre_px[1] + step.get("cy", 0.0)),
+        ),
+        lens=camera.lens.with_update(step),
+        decentring=Decentring(float(p1), float(p2)),
+    )
+
+
+def with_covariance(camera: Camera, free: tuple[str, ...], covariance: Array) -> Camera:
+    """The camera with the covariance (m, m) of its free parameters; f becomes fx and fy."""
+    if free[0] == "fx":
+        return replace(camera, covariance_order=free, covariance=0.5 * (covariance + covariance.T))
+    names = ("fx", "fy", *free[1:])
+    by_free = np.zeros((len(names), len(free)))  # d names / d free
+    by_free[0, 0], by_free[1, 0] = 1.0, camera.focal_px[1] / camera.focal_px[0]
+    by_free[np.arange(2, len(names)), np.arange(1, len(free))] = 1.0
+    wide = by_free @ covariance @ by_free.T
+    # With fx / fy exactly known the matrix would be singular, and no use as a weight.
+    wide[[0, 1], [0, 1]] += 0.5 * (SQUARE_PIXEL_SIGMA_1 * camera.focal_px[0]) ** 2
+    return replace(camera, covariance_order=names, covariance=0.5 * (wide + wide.T))

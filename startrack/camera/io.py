@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from startrack.camera.camera import MIN_THROUGHPUT_1, ZENITH_MOUNT_R_BODY_CAM, Camera, Sensor
-from startrack.camera.decentring import Decentring
+from startrack.camera.camera import ZENITH_MOUNT_R_BODY_CAM, Camera
 from startrack.camera.lens import Lens
 from startrack.camera.lenses import default_lens, lens_kinds
+from startrack.camera.optics import MIN_THROUGHPUT_1, Decentring, Sensor
 from startrack.core.declaration import Choice, Flag, List, Number, Table, Text
 from startrack.core.files import relative_path, write_atomically
 from startrack.core.types import MAX_PIXELS, Array, BadInput, Mask

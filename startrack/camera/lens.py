@@ -1,6 +1,6 @@
 """The lens protocol: a radial law, its parameters, and its entries in files.
 
-A new lens is one file beside this one and one line in `lenses.py`. It needs `model`, `rho` and `slope`; with
+A new lens is one file beside this one and one line in LENSES of `lenses.py`. It needs `model`, `rho` and `slope`; with
 parameters also `parameter_names`, `derivative` and a dataclass field of that name for each. The rest has defaults.
 """
 
@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
@@ -130,7 +130,7 @@ class Lens(ABC):
     @classmethod
     def fit_start(cls, lens: Lens, size: int) -> Self:
         """A lens of this kind with `size` free parameters, to begin a fit: `lens` itself if it is of this kind."""
-        return lens if isinstance(lens, cls) else cls()
+        return cast(Self, lens) if lens.model == cls.model else cls()
 
     @classmethod
     def fit_text(cls, size: int) -> str:

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from startrack.camera.camera import Camera
+from startrack.camera.convert import camera_from_foreign_text
+from startrack.camera.formats import find_program
 from startrack.camera.io import camera_from_dict
 from startrack.core.files import FOREIGN_CAMERA_SUFFIXES, parse_toml, printable, read_text, resolve_named
 from startrack.core.types import BadInput
@@ -25,33 +27,16 @@ def load_camera(name_or_path: str | Path) -> Camera:
     path = resolve_named(name_or_path, "calib", "no_calibration")
     text = read_text(path, "bad_calibration")
     try:
-        program = _other_program(path, text)
-        if program is None:
-            return camera_from_dict(parse_toml(text, "bad_calibration"), default_name=path.stem, folder=path.parent)
-        return _converted(path, text, program)
+        program = None if path.suffix == ".toml" else find_program(text)
+        if program is not None:
+            camera = camera_from_foreign_text(text, program, path.stem)
+            _log_angle(printable(path), program, float(np.degrees(camera.calibrated_angle_rad)))
+            return camera
+        if path.suffix in FOREIGN_CAMERA_SUFFIXES:
+            raise BadInput("bad_calibration", "not a camera file of startrack (.toml), ROS, Kalibr, COLMAP or OpenCV")
+        return camera_from_dict(parse_toml(text, "bad_calibration"), default_name=path.stem, folder=path.parent)
     except BadInput as cause:
         raise BadInput(cause.reason, f"{printable(path)}: {cause}") from cause
-
-
-def _other_program(path: Path, text: str) -> str | None:
-    """The program whose camera file the `text` is, None for ours. Raises BadInput for a file of none."""
-    if path.suffix == ".toml":
-        return None
-    from startrack.camera.convert.recognize import find_program
-
-    program = find_program(text)
-    if program is None and path.suffix in FOREIGN_CAMERA_SUFFIXES:
-        raise BadInput("bad_calibration", "not a camera file of startrack (.toml), ROS, Kalibr, COLMAP or OpenCV")
-    return program
-
-
-def _converted(path: Path, text: str, program: str) -> Camera:
-    """The camera of another `program`; the log names the calibrated angle, which no such file states."""
-    from startrack.camera.convert import from_text
-
-    camera = from_text(text, program, path.stem)
-    _log_angle(printable(path), program, float(np.degrees(camera.calibrated_angle_rad)))
-    return camera
 
 
 @lru_cache  # once for a file, however many images name it

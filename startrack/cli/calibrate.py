@@ -129,7 +129,7 @@ def run(args: argparse.Namespace) -> int:
 
 def check_name(args: argparse.Namespace) -> None:
     """A usage error for a name, of --name or of the file, that a camera file cannot hold."""
-    from startrack.camera.io import camera_keys
+    from startrack.camera import camera_keys
 
     for flag, name in (("--name", args.name), ("the stem of --output", args.output and Path(args.output).stem)):
         if name is not None:
@@ -139,7 +139,7 @@ def check_name(args: argparse.Namespace) -> None:
 def _known_sensor(args: argparse.Namespace) -> KnownSensor:
     """The sensor's properties given by flags, within the limits of camera files; else a usage error."""
     from startrack.applications.calibration import KnownSensor
-    from startrack.camera.io import SENSOR
+    from startrack.camera import SENSOR
 
     flags = {"gain_e_per_adu": "--gain", "read_noise_e": "--read-noise", "bias_adu": "--bias"}
     given = (args.gain, args.read_noise, args.bias)

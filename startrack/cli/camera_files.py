@@ -79,10 +79,9 @@ def run_show(args: argparse.Namespace) -> int:
 
 def run_convert(args: argparse.Namespace) -> int:
     """Convert one camera file; 0."""
-    from startrack.camera import load_camera
-    from startrack.camera.convert import from_text, to_text
-    from startrack.camera.convert.intrinsics import decentring_rms_px
-    from startrack.camera.io import camera_text
+    from startrack.camera import camera_from_foreign_text as from_text
+    from startrack.camera import camera_text, decentring_rms_px, load_camera
+    from startrack.camera import foreign_text as to_text
     from startrack.core.files import file_stem, read_text, write_atomically
 
     check_name(args)

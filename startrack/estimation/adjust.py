@@ -13,9 +13,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from startrack.camera import Camera
-from startrack.camera.parameters import with_update
-from startrack.camera.uncertainty import lens_jacobian
+from startrack.camera import Camera, lens_jacobian, with_update
 from startrack.core.types import Array, NotIdentified
 from startrack.estimation.normal_equations import NormalEquations, Observations, Terms
 from startrack.frames import R_from_rotvec

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.camera import Camera
-from startrack.camera.uncertainty import lens_jacobian
+from startrack.camera import Camera, lens_jacobian
 from startrack.core.types import Array, Attitude, Bools, NotIdentified
 from startrack.estimation.adjust import HUBER_WITH_CUT, MIN_STARS, OUTLIER_CHI2, Scheme, State, adjust
 from startrack.estimation.normal_equations import observations_of_image

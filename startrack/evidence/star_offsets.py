@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.camera import Camera
-from startrack.camera.uncertainty import compensating_rotation, lens_jacobian
+from startrack.camera import Camera, compensating_rotation, lens_jacobian
 from startrack.core.types import Array, Bools
 from startrack.evidence.sky_step import Horizon
 from startrack.frames import azel_from_rays, off_axis_rad, rays_from_azel

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.camera import Camera, KannalaBrandt
-from startrack.camera.lenses import lens_kinds
+from startrack.camera import Camera, KannalaBrandt, lens_kinds
 from startrack.core.types import Array, Ints
 from startrack.estimation.adjust import Prior, Scheme, State, adjust, cauchy_loss
 from startrack.estimation.false_alarm import log_p_value_bound

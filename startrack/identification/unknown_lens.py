@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.camera import Camera
-from startrack.camera.parameters import with_covariance
+from startrack.camera import Camera, with_covariance
 from startrack.core.types import Array, Centroids, Identification, Ints, NotIdentified, Stars
 from startrack.estimation.adjust import HUBER_WITH_CUT, Scheme, State, adjust
 from startrack.estimation.false_alarm import probability

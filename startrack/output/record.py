@@ -29,7 +29,7 @@ def result_dict(result: Outcome) -> dict[str, Any]:
 
 def identification_dict(result: Outcome) -> dict[str, Any]:
     """Attitude, the camera that was used and the matches of a `result`: stars with the positions measured for them."""
-    from startrack.camera.io import camera_to_dict
+    from startrack.camera import camera_to_dict
 
     value, own = last_value(result), dict[str, Any]()
     if value.camera is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from startrack.camera.io import camera_keys
+from startrack.camera import camera_keys
 from startrack.chain.stages import STAGES
 from startrack.core.errors import Reason
 from startrack.exposure import SIDECAR as SIDECAR_KEYS

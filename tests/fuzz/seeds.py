@@ -151,8 +151,7 @@ def _dng() -> bytes:
 
 
 def _cameras() -> list[str]:
-    from startrack.camera import Decentring, load_camera
-    from startrack.camera.io import camera_text
+    from startrack.camera import Decentring, camera_text, load_camera
 
     fisheye = load_camera("fisheye-2048")
     bent = replace(fisheye, decentring=Decentring(2e-4, -6e-4), mirrored=True)
@@ -161,10 +160,11 @@ def _cameras() -> list[str]:
 
 def _converted() -> list[bytes]:
     """The camera file in other programs' formats; `targets.PROGRAMS` has the same order."""
+    from startrack.camera import foreign_text as to_text
     from startrack.camera import load_camera
-    from startrack.camera.convert import WRITERS, to_text
+    from startrack.camera.formats import FORMATS
 
-    return [to_text(load_camera("fisheye-2048"), program).encode() for program in WRITERS]
+    return [to_text(load_camera("fisheye-2048"), program).encode() for program in FORMATS]
 
 
 def hill_map() -> bytes:

@@ -110,9 +110,8 @@ def _read_camera(data: bytes, number: int, folder: Path) -> None:
 
 def _read_converted(data: bytes, number: int, folder: Path) -> None:
     """As the command `calibrate convert --from` does."""
-    from startrack.camera import load_camera
-    from startrack.camera.convert import from_text
-    from startrack.camera.io import camera_text
+    from startrack.camera import camera_from_foreign_text as from_text
+    from startrack.camera import camera_text, load_camera
 
     try:
         text = data.decode()
@@ -126,7 +125,7 @@ def _read_converted(data: bytes, number: int, folder: Path) -> None:
 
 def _use_camera(camera: Any) -> None:
     """Pixels to rays and back, and the text of the file."""
-    from startrack.camera.io import camera_text
+    from startrack.camera import camera_text
 
     width, height = camera.size_px
     pixels = np.array([[0.0, 0.0], camera.centre_px, [width - 1.0, height - 1.0]])

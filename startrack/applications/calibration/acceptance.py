@@ -11,8 +11,7 @@ from startrack.applications.calibration.frame import Frame
 from startrack.applications.calibration.initial_camera import fit_attitudes, mirror_camera
 from startrack.applications.calibration.matching import FrameMatches, match_frame
 from startrack.applications.calibration.region_growing import JointFit
-from startrack.camera import Camera
-from startrack.camera.uncertainty import cap_grid
+from startrack.camera import Camera, cap_grid
 from startrack.core.types import Array, Ints
 from startrack.estimation.false_alarm import log_p_value_poisson
 from startrack.estimation.normal_equations import Observations

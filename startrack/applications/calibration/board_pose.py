@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 
 from startrack.applications.calibration.initial_camera import FOCAL_FACTORS, LENSES
-from startrack.camera import Camera
-from startrack.camera.parameters import with_update
-from startrack.camera.uncertainty import lens_jacobian
+from startrack.camera import Camera, lens_jacobian, with_update
 from startrack.core.types import Array, BadInput, Exposure, NotIdentified
 from startrack.estimation.adjust import SMALLEST_RISE_RAD
 from startrack.estimation.normal_equations import Observations, Terms

@@ -19,8 +19,7 @@ from startrack.applications.calibration.lens_models import (
     held_out_residual_px,
     model_of,
 )
-from startrack.camera import Camera
-from startrack.camera.parameters import with_covariance
+from startrack.camera import Camera, with_covariance
 from startrack.core.types import Array, Bools, NotIdentified
 from startrack.estimation.adjust import (
     SMALLEST_EXTRA_PX2,

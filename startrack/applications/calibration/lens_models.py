@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.camera import Camera, Decentring, Lens
-from startrack.camera.lenses import default_lens, lens_kinds
+from startrack.camera import Camera, Decentring, Lens, default_lens, lens_kinds
 from startrack.core.types import Array, Ints
 from startrack.estimation.adjust import SQUARES, CameraState, Scheme, Solution, adjust
 from startrack.estimation.normal_equations import Observations

@@ -15,8 +15,7 @@ import numpy as np
 from startrack.applications.calibration.acceptance import RINGS, SECTORS, rings_and_sectors
 from startrack.applications.calibration.lens_fit import LensFit
 from startrack.applications.calibration.region_growing import JointFit
-from startrack.camera import Camera
-from startrack.camera.uncertainty import cap_grid, projection_covariance_px2
+from startrack.camera import Camera, cap_grid, projection_covariance_px2
 from startrack.core.types import Ints
 from startrack.estimation.adjust import SMALLEST_EXTRA_PX2, inverse_covariance
 from startrack.estimation.normal_equations import Observations

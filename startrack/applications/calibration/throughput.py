@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.applications.calibration.region_growing import JointFit
-from startrack.camera import Sensor
-from startrack.camera.camera import MIN_THROUGHPUT_1
+from startrack.camera import MIN_THROUGHPUT_1, Sensor
 from startrack.core.types import Array, Ints
 
 MIN_STARS = 30

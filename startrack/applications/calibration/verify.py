@@ -12,8 +12,7 @@ from startrack.applications.calibration.frame import load_frame
 from startrack.applications.calibration.region_growing import fit_frames, grow_from_matches
 from startrack.applications.calibration.run import identify_with
 from startrack.applications.calibration.shared_errors import widen_covariance
-from startrack.camera import Camera
-from startrack.camera.uncertainty import cap_grid, projection_covariance_px2
+from startrack.camera import Camera, cap_grid, projection_covariance_px2
 from startrack.catalog import StarCatalog
 from startrack.core.types import Array, Exposure, NotIdentified
 from startrack.frames import Site

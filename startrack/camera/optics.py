@@ -1,4 +1,4 @@
-"""Decentring: shift of the image points if the elements of a lens are not on one axis."""
+"""Parts of a camera beside its lens: decentred elements, and the sensor."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import numpy as np
 
 from startrack.core.types import Array
 
-MAX_INVERSION_STEPS = 30
-INVERSION_TOLERANCE_1 = 1e-14  # in focal lengths
+MAX_DECENTRING_STEPS = 30  # of the inversion
+DECENTRING_TOLERANCE_1 = 1e-14  # in focal lengths
+MIN_THROUGHPUT_1 = 0.05  # relative to the axis, up to the calibrated angle: no light for evidence below it (3.3 mag)
 
 
 @dataclass(frozen=True)
@@ -58,10 +59,37 @@ class Decentring:
         if not self:
             return uv
         centred = uv
-        for _ in range(MAX_INVERSION_STEPS):
+        for _ in range(MAX_DECENTRING_STEPS):
             rho = np.hypot(centred[..., 0], centred[..., 1])
             st = centred * (angle_rad(rho) / np.where(rho > 0, rho, 1.0))[..., None]
             before, centred = centred, uv - self.shift(st)
-            if np.max(np.abs(centred - before), initial=0.0) < INVERSION_TOLERANCE_1:
+            if np.max(np.abs(centred - before), initial=0.0) < DECENTRING_TOLERANCE_1:
                 break
         return centred
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """Sensor and whole optics: from light to numbers."""
+
+    zero_point_e_per_s: float  # electrons per second of a V = 0 star on the axis, whole PSF
+    gain_e_per_adu: float = 1.0
+    bias_adu: float = 0.0
+    read_noise_e: float = 0.0
+    dark_e_per_s: float = 0.0  # per pixel
+    saturation_adu: float = 65535.0
+    psf_sigma_px: float = 1.0  # Gaussian, before integration over the pixel
+    vignetting: tuple[float, float] = (0.0, 0.0)
+
+    def throughput(self, angle_rad: Array) -> Array:
+        """Relative throughput max(1 + v1 a^2 + v2 a^4, 0) at the angles a = `angle_rad` off the axis, any shape."""
+        a2 = np.square(angle_rad)
+        return np.maximum(1.0 + a2 * (self.vignetting[0] + a2 * self.vignetting[1]), 0.0)
+
+    def lowest_throughput(self, angle_rad: float) -> float:
+        """Smallest value of 1 + v1 a^2 + v2 a^4 from the axis to `angle_rad`; negative where the polynomial is."""
+        v1, v2 = self.vignetting
+        ends = [0.0, angle_rad**2]
+        if v2 and 0 < -v1 / (2 * v2) < ends[1]:  # a^2 at the polynomial's extremum
+            ends.append(-v1 / (2 * v2))
+        return min(1.0 + a2 * (v1 + a2 * v2) for a2 in ends)

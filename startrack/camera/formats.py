@@ -1,0 +1,295 @@
+"""Camera files of ROS, Kalibr, COLMAP and OpenCV: their texts, and the numbers of a camera that they hold.
+
+Pixel (0, 0) is the centre of the first pixel, as here and in ROS (REP 104), Kalibr and OpenCV.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from startrack.camera.lenses import MAX_COEFFICIENTS
+from startrack.camera.optics import Decentring
+from startrack.core.types import Array, BadInput
+from startrack.frames import ORTHONORMAL_1, quat_xyzw_from_R
+
+CORNER_PX = 0.5  # COLMAP's origin is the corner of the first pixel
+COLMAP_HEAD = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+COLMAP_LINE = re.compile(r"\d+\s+[A-Z_]+\s+\d+\s+\d+\s")  # CAMERA_ID, MODEL, WIDTH, HEIGHT
+COLMAP_COUNTS = {
+    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "OPENCV_FISHEYE": 8,
+    "THIN_PRISM_FISHEYE": 12,
+}  # fmt: skip
+OPENCV_DISTORTION = "distortion_coefficients"
+OPENCV_COUNTS = 4, 5, 8, 12, 14  # of distortion coefficients of OpenCV's models
+OPENCV_HEAD = re.compile(r"\A\s*%YAML[: ]1\.0|!!opencv-matrix")  # which YAML itself does not have
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intrinsics:
+    """A camera by the numbers that these files have; `k` is None for a pinhole."""
+
+    name: str = ""
+    size_px: tuple[int, int]
+    focal_px: tuple[float, float]
+    centre_px: tuple[float, float]
+    k: tuple[float, ...] | None
+    decentring: Decentring = Decentring()  # noqa: RUF009 - frozen
+    R_body_cam: Array | None = None
+
+    @property
+    def matrix(self) -> list[float]:
+        """Camera matrix K (9,), row by row."""
+        (fx, fy), (cx, cy) = self.focal_px, self.centre_px
+        return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+
+    @classmethod
+    def from_matrix(cls, size_px: tuple[Any, Any], matrix: list[float], **others: Any) -> Intrinsics:
+        """The numbers of a camera matrix (9,), row by row. Raises ValueError if it is skewed."""
+        fx, skew, cx, _, fy, cy, *_ = matrix
+        if skew:
+            raise ValueError("a skewed camera matrix has no counterpart")
+        width, height = size_px
+        return cls(size_px=(int(width), int(height)), focal_px=(fx, fy), centre_px=(cx, cy), **others)
+
+    def coefficients(self, count: int) -> list[float]:
+        """The coefficients of a fisheye, or `count` zeros of a pinhole."""
+        return [0.0] * count if self.k is None else list(self.k)
+
+
+@dataclass(frozen=True)
+class Format:
+    """The camera files of one program. `read` raises ValueError, KeyError or TypeError."""
+
+    title: str
+    write: Callable[[Intrinsics], str]
+    read: Callable[[str], Intrinsics]
+
+
+def find_program(text: str) -> str | None:
+    """The program whose camera file the `text` is, a key of FORMATS; None if it is of none of them."""
+    if "<opencv_storage>" in text or OPENCV_HEAD.search(text):
+        return "opencv"
+    lines = (line.strip() for line in text.splitlines())
+    if COLMAP_LINE.match(next((line for line in lines if line and not line.startswith("#")), "")):
+        return "colmap"
+    try:
+        keys = _read_yaml(text).keys()
+    except ValueError:
+        return None
+    if "cam0" in keys or keys >= {"camera_model", "intrinsics"}:
+        return "kalibr"
+    if keys >= {"camera_matrix", "distortion_model"}:
+        return "ros"
+    return "opencv" if keys >= {"camera_matrix", OPENCV_DISTORTION} else None
+
+
+def _write_ros(lens: Intrinsics) -> str:
+    """A camera_info file (camera_calibration_parsers): equidistant for fisheyes, plumb_bob for pinholes."""
+    model, coefficients = "plumb_bob" if lens.k is None else "equidistant", lens.coefficients(5)
+    (fx, fy), (cx, cy) = lens.focal_px, lens.centre_px
+    name = json.dumps(lens.name, ensure_ascii=False)  # a JSON string is one of YAML
+    return (
+        f"image_width: {lens.size_px[0]}\nimage_height: {lens.size_px[1]}\ncamera_name: {name}\n"
+        f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: {_yaml_list(lens.matrix)}\n"
+        f"distortion_model: {model}\n"
+        f"distortion_coefficients:\n  rows: 1\n  cols: {len(coefficients)}\n  data: {_yaml_list(coefficients)}\n"
+        "rectification_matrix:\n  rows: 3\n  cols: 3\n  data: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]\n"
+        "projection_matrix:\n  rows: 3\n  cols: 4\n"
+        f"  data: {_yaml_list([fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0])}\n"
+    )
+
+
+def _read_ros(text: str) -> Intrinsics:
+    d = _read_yaml(text)
+    k = _read_distortion(
+        d["distortion_model"], d["distortion_coefficients"]["data"],
+        ("equidistant", "fisheye"), ("plumb_bob", "rational_polynomial"),
+    )  # fmt: skip
+    matrix = _read_numbers(d["camera_matrix"]["data"], 9, "camera_matrix")
+    size_px = d["image_width"], d["image_height"]
+    return Intrinsics.from_matrix(size_px, matrix, k=k, name=str(d.get("camera_name") or ""))
+
+
+def _write_kalibr(lens: Intrinsics) -> str:
+    """A camchain of one camera, cam0: pinhole with equidistant distortion for fisheyes; the mount as T_cam_imu.
+
+    T_cam_imu takes points of the rover's body (Kalibr's imu) into the camera.
+    """
+    model, coefficients = "radtan" if lens.k is None else "equidistant", lens.coefficients(4)
+    rows = "".join(f"  - {_yaml_list([*row, 0.0])}\n" for row in np.asarray(lens.R_body_cam).T.tolist())
+    return (
+        f"cam0:\n  cam_overlaps: []\n  camera_model: pinhole\n  distortion_coeffs: {_yaml_list(coefficients)}\n"
+        f"  distortion_model: {model}\n  intrinsics: {_yaml_list([*lens.focal_px, *lens.centre_px])}\n"
+        f"  resolution: [{lens.size_px[0]}, {lens.size_px[1]}]\n"
+        f"  T_cam_imu:\n{rows}  - [0.0, 0.0, 0.0, 1.0]\n"
+    )
+
+
+def _read_kalibr(text: str) -> Intrinsics:
+    """The first camera of a camchain."""
+    chain = _read_yaml(text)
+    d = chain.get("cam0", chain)
+    if d["camera_model"] != "pinhole":
+        raise ValueError(f"camera_model {d['camera_model']!r} has no counterpart")
+    fx, fy, cx, cy = _read_numbers(d["intrinsics"], 4, "intrinsics")
+    width, height = _read_numbers(d["resolution"], 2, "resolution")
+    k = _read_distortion(
+        d["distortion_model"], d.get("distortion_coeffs", []), ("equidistant", "equi"), ("radtan", "none")
+    )
+    R_body_cam = None
+    if "T_cam_imu" in d:
+        R_body_cam = np.array([_read_numbers(row, 4, "T_cam_imu")[:3] for row in d["T_cam_imu"][:3]]).T
+        if R_body_cam.shape != (3, 3) or np.abs(R_body_cam).max() > 1 + ORTHONORMAL_1:
+            raise ValueError("T_cam_imu holds no rotation")
+        quat_xyzw_from_R(R_body_cam.T)  # ValueError for what is no proper rotation
+    return Intrinsics(
+        size_px=(int(width), int(height)), focal_px=(fx, fy), centre_px=(cx, cy), k=k, R_body_cam=R_body_cam
+    )
+
+
+def _write_colmap(lens: Intrinsics) -> str:
+    """A cameras.txt file of one camera: PINHOLE, OPENCV_FISHEYE, or THIN_PRISM_FISHEYE where the lens is decentred."""
+    (fx, fy), (cx, cy), bent = lens.focal_px, lens.centre_px, lens.decentring
+    values = [fx, fy, cx + CORNER_PX, cy + CORNER_PX]
+    model = "PINHOLE"
+    if bent:
+        if lens.k is None:
+            raise BadInput("bad_calibration", "COLMAP has no decentred pinhole on angles")
+        model = "THIN_PRISM_FISHEYE"
+        values += [*lens.k[:2], bent.p1, bent.p2, *lens.k[2:], 0.0, 0.0]
+    elif lens.k is not None:
+        model = "OPENCV_FISHEYE"
+        values += lens.k
+    numbers = " ".join(repr(float(v)) for v in values)
+    return f"{COLMAP_HEAD}# Number of cameras: 1\n1 {model} {lens.size_px[0]} {lens.size_px[1]} {numbers}\n"
+
+
+def _read_colmap(text: str) -> Intrinsics:
+    """The first camera of a cameras.txt file."""
+    lines = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if not lines or len(lines[0]) < 4:
+        raise ValueError("no line CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]")
+    _number, model, width, height, *words = lines[0]
+    values = [float(word) for word in words]
+    if len(values) != COLMAP_COUNTS.get(model, -1):
+        raise ValueError(f"camera model {model} with {len(values)} parameters has no counterpart")
+    if model.startswith("SIMPLE") or model == "RADIAL_FISHEYE":
+        values = [values[0], *values]
+    fx, fy, cx, cy, *rest = values
+    decentring = Decentring()
+    if model == "THIN_PRISM_FISHEYE":
+        k1, k2, p1, p2, k3, k4, sx, sy = rest
+        if sx or sy:
+            raise ValueError("thin-prism coefficients other than 0 have no counterpart")
+        rest, decentring = [k1, k2, k3, k4], Decentring(p1, p2)
+    k = None if model.endswith("PINHOLE") else (*rest, *(MAX_COEFFICIENTS * (0.0,)))[:MAX_COEFFICIENTS]
+    return Intrinsics(
+        size_px=(int(width), int(height)), focal_px=(fx, fy), centre_px=(cx - CORNER_PX, cy - CORNER_PX), k=k,
+        decentring=decentring,
+    )  # fmt: skip
+
+
+def _write_opencv(lens: Intrinsics) -> str:
+    """OpenCV's FileStorage as YAML, with the keys of its calibration program.
+
+    fisheye_model = 1: cv2.fisheye's four coefficients, which are k1 to k4. cv2.fisheye itself mirrors rays past 90
+    degrees: the numbers are right, that program's geometry there is not.
+    """
+
+    def matrix(rows: int, columns: int, data: list[float]) -> str:
+        text = ", ".join(repr(float(v)) for v in data)
+        return f"!!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [ {text} ]\n"
+
+    coefficients = lens.coefficients(5)
+    return (
+        f"%YAML:1.0\n---\nimage_width: {lens.size_px[0]}\nimage_height: {lens.size_px[1]}\n"
+        f"fisheye_model: {int(lens.k is not None)}\ncamera_matrix: {matrix(3, 3, lens.matrix)}"
+        f"{OPENCV_DISTORTION}: {matrix(len(coefficients), 1, coefficients)}"
+    )
+
+
+def _read_opencv(text: str) -> Intrinsics:
+    """YAML or XML; OpenCV's own parser is not used: damaged files end its process."""
+    d = _read_xml(text) if text.lstrip().startswith("<") else _read_yaml(OPENCV_HEAD.sub("", text))
+    arrays = []
+    for key, counts in (("camera_matrix", (9,)), (OPENCV_DISTORTION, OPENCV_COUNTS)):
+        count = int(d[key]["rows"]) * int(d[key]["cols"])
+        if count not in counts:
+            raise ValueError(f"{key} must hold {' or '.join(map(str, counts))} numbers, not {count}")
+        arrays.append(_read_numbers(d[key]["data"], count, key))
+    model = "fisheye" if float(d.get("fisheye_model", 0)) == 1 else "pinhole"
+    k = _read_distortion(model, arrays[1], ("fisheye",), ("pinhole",))
+    return Intrinsics.from_matrix((d["image_width"], d["image_height"]), arrays[0], k=k)
+
+
+FORMATS = {
+    "ros": Format("ROS", _write_ros, _read_ros),
+    "kalibr": Format("Kalibr", _write_kalibr, _read_kalibr),
+    "colmap": Format("COLMAP", _write_colmap, _read_colmap),
+    "opencv": Format("OpenCV", _write_opencv, _read_opencv),
+}
+
+
+def _read_numbers(values: Any, count: int, key: str) -> list[float]:
+    """`count` finite numbers. Raises ValueError naming the key."""
+    if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
+        raise ValueError(f"{key} must be {count} numbers")
+    numbers = [float(v) for v in values]
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{key} must be {count} finite numbers")
+    return numbers
+
+
+def _read_distortion(
+    model: str, coefficients: Any, fisheyes: tuple[str, ...], pinholes: tuple[str, ...]
+) -> tuple[float, ...] | None:
+    """k1 to k4 of a fisheye `model`, None for a pinhole without distortion. Raises ValueError for any other."""
+    if model in fisheyes:
+        return tuple(_read_numbers(coefficients, MAX_COEFFICIENTS, "distortion coefficients"))
+    if model not in pinholes:
+        raise ValueError(f"the distortion model {model!r} has no counterpart")
+    if any(float(c) for c in coefficients):
+        raise ValueError(f"distortion {model} with coefficients other than 0 has no counterpart; fisheye models have")
+    return None
+
+
+def _read_yaml(text: str) -> dict[str, Any]:
+    """The mapping of a YAML file. Raises ValueError if there is none."""
+    import yaml
+
+    try:
+        value = yaml.safe_load(text)
+    except (yaml.YAMLError, RecursionError) as cause:
+        raise ValueError(str(cause)) from cause
+    if not isinstance(value, dict):
+        raise ValueError("no keys")
+    return value
+
+
+def _yaml_list(values: list[float]) -> str:
+    """A list in one line of YAML, numbers to the last digit."""
+    import yaml
+
+    return str(yaml.safe_dump([float(v) for v in values], default_flow_style=True, width=math.inf)).strip()
+
+
+def _read_xml(text: str) -> dict[str, Any]:
+    """The entries of a FileStorage in XML: texts, and matrices as dictionaries. Raises ValueError."""
+    from xml.etree import ElementTree
+
+    try:
+        entries = ElementTree.fromstring(text)
+    except ElementTree.ParseError as cause:
+        raise ValueError(str(cause)) from cause
+    found: dict[str, Any] = {}
+    for entry in entries:
+        parts = {part.tag: (part.text or "").strip() for part in entry}
+        found[entry.tag] = {**parts, "data": parts.get("data", "").split()} if parts else (entry.text or "").strip()
+    return found

@@ -62,7 +62,8 @@ def locate(
         oriented = run.run_stage("attitude", solve_orientation, identified)
         run.time_stage("attitude", check_one_attitude, oriented)
         measured = run.run_stage("evidence", measure_evidence, oriented, terrain, settings)
-        located = run.time_stage("locate", fix_position, measured, Located, settings.localizer)
+        first = replace(measured.evidence(), is_first_look=settings.evidence_sources != "stars")
+        located = run.time_stage("locate", fix_position, measured, Located, settings.localizer, first)
         step = _sky_step(run, located)
         is_bright = step is not None and step.exceeds_noise
         if is_bright:
@@ -79,9 +80,10 @@ def locate(
 
 def _refine(located: Located, is_newer: bool, settings: Settings) -> Located:
     """The position by all of the evidence that is asked for; `is_newer`: its stars were measured after the fix."""
-    if settings.evidence_sources != "stars":
+    by_stars = settings.evidence_sources == "stars"
+    if not by_stars:
         located = refine_by_sky_light(located, settings.localizer, settings.evidence_sources == "both")
-    if located.sky_light is None and is_newer:
+    if located.sky_light is None and (is_newer or not by_stars):
         return fix_position(located, Located, settings.localizer)
     return located
 

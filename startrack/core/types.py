@@ -215,6 +215,7 @@ class Evidence(Value):
     near: PositionPrior | None = None  # of the camera's position; None: anywhere in the search area
     image_errors: ImageErrors | None = None  # of the rows of extended light; None: these are exact
     support: Any = None  # samples of an earlier fix from much the same rows; None: the whole area is searched
+    is_first_look: bool = False  # a fix by more rows of the image follows: this one is sampled roughly and not checked
 
     def __post_init__(self) -> None:
         super().__post_init__()

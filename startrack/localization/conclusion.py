@@ -95,6 +95,7 @@ def label_modes(points_m: Array, share: Array) -> Ints:
 def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, dropped_probability: float) -> Fix:
     """The fix by sampled hypotheses, the heaviest first, in a terrain, after a search.
 
+    A first look is not compared with other explanations, and has no protection level.
     Raises NotLocated: outside_search_area, insufficient_geometry, inconsistent_evidence.
     """
     whole = Posterior(found, terrain)
@@ -108,9 +109,10 @@ def conclude(found: Sequence[Hypothesis], terrain: Terrain, explored: Explored, 
     clear = best.model.states(parameters)[:, 0]
     if not ambiguous and radius95 > USELESS_FRACTION * terrain.search_radius_m:
         raise NotLocated(_useless(whole))
-    require_files(found, parameters, clear)
     integrity = None
-    if not ambiguous:
+    if not best.model.rows.is_first_look:
+        require_files(found, parameters, clear)
+    if not best.model.rows.is_first_look and not ambiguous:
         integrity = assess_integrity(best.model, parameters, near[:2, :2], clear, covariance, radius999)
     blocked = Blocked(1.0 - clear)
     return Fix(

@@ -63,20 +63,21 @@ def _sample_group(model: SkylineModel, start: Start, references_m: Array, number
     A further group is left at its first rounds where it is less likely than the `best` by MODE_NATS. On a height map
     the last rounds are in a neighbourhood as small as the posterior, because horizons are interpolated in it.
     """
+    rounds = FIRST_ROUNDS if model.rows.is_first_look else ROUNDS
     if number == 0 and model.terrain.axisymmetric:
-        return sample_hypothesis(model, references_m, start.modes, first=[start.boxes])
+        return sample_hypothesis(model, references_m, start.modes, first=[start.boxes], rounds=rounds)
     plain = sample_hypothesis(model, references_m, start.modes, first=[start.boxes], rounds=FIRST_ROUNDS)
     if plain.found.log_evidence < best - MODE_NATS:
         return plain
     mean, covariance = _moments_of(plain)
     reach_m = max(REACH_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1])), LEAST_REACH_M)
     if model.terrain.axisymmetric or reach_m > 0.5 * model.half_m:
-        return sample_hypothesis(model, references_m, start.modes, first=[start.boxes])
+        return sample_hypothesis(model, references_m, start.modes, first=[start.boxes], rounds=rounds)
     references_m[number] = mean[:2]
     closer = SkylineModel(
         model.terrain, model.rows, mean[:2], reach_m, model.errors, image_errors=model.image_errors
     )  # fmt: skip
-    return sample_hypothesis(closer, references_m, [_begin_in(closer, mean, covariance)])
+    return sample_hypothesis(closer, references_m, [_begin_in(closer, mean, covariance)], rounds=rounds)
 
 
 def _group_boxes(explored: Explored, reach_m: float) -> list[tuple[Array, float]]:

@@ -9,7 +9,7 @@ of a linear model of the sectors, and the likelihood is taken at those values.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -55,6 +55,7 @@ class SkylineModel:
     gross: str = ""  # fact that has a gross error
     image_errors: ImageErrors | None = None
     is_rough: bool = False  # rows are compared with samples of the skyline alone
+    _prepared: Levels | None = field(default=None, init=False)  # by the first points
 
     @cached_property
     def ground(self) -> Terrain:
@@ -87,7 +88,9 @@ class SkylineModel:
         errors = self.errors if gross in self.errors.facts else SharedErrors.of(self.terrain, self.rows.clock, gross)
         shared = ("above_rad", "profiles", "moments", "image_rise", "clear", "_closing", *OF_GROUND)
         same = shared if errors is self.errors else [name for name in shared if name != "error_slopes_rad"]
-        return self._sharing(replace(self, gross=gross, errors=errors), same)
+        other = self._sharing(replace(self, gross=gross, errors=errors), same)
+        other._prepared = self._prepared
+        return other
 
     def with_rows(self, rows: Evidence, is_rough: bool) -> SkylineModel:
         """The same neighbourhood with other rows and their clock."""
@@ -198,10 +201,10 @@ class SkylineModel:
     def _levels(self, shifts: Array) -> Levels:
         """The emissions of the levels, prepared for at least these shifts (n, SECTORS)."""
         most = np.maximum(shifts.max(axis=0), -shifts.min(axis=0))
-        known = self.__dict__.get("_prepared")
+        known = self._prepared
         if known is None or (most > known.reach).any():
             reach = np.maximum(WIDER * most, LEAST_REACH_RAD)
-            known = self.__dict__["_prepared"] = Levels(reach, prepare_levels(self.profiles, reach))
+            known = self._prepared = Levels(reach, prepare_levels(self.profiles, reach))
         return known
 
     def with_image_errors(self, shifts: Array) -> tuple[Array, Array | float]:

@@ -17,7 +17,7 @@ from _classes import run_classes
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.chain.pipeline import locate
+from startrack.chain import locate
 from startrack.chain.stages import Located
 from startrack.core.files import data_dir
 from startrack.rendering import Series, load_sky_catalog, render

@@ -25,7 +25,7 @@ from _results import table, write_section
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.chain.pipeline import locate
+from startrack.chain import locate
 from startrack.chain.stages import Identified, Located, Oriented, Outcome, last_value
 from startrack.core.types import Evidence, NoSolution
 from startrack.exposure import read_exposure

@@ -26,7 +26,7 @@ from _rough_map import rough_terrain
 
 from startrack.camera import load_camera
 from startrack.catalog import bodies, load_catalog
-from startrack.chain.pipeline import locate
+from startrack.chain import locate
 from startrack.chain.stages import Located
 from startrack.frames import R_enu_icrs, Site
 from startrack.rendering import Series, render

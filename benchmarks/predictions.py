@@ -22,7 +22,7 @@ from _results import table, write_section
 import startrack
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.chain.pipeline import Settings, locate
+from startrack.chain import Settings, locate
 from startrack.chain.stages import Located
 from startrack.core.types import Array
 from startrack.rendering import Series, load_sky_catalog, render

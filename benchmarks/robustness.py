@@ -21,7 +21,7 @@ from chain import SENSOR
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.chain.pipeline import Settings, locate
+from startrack.chain import Settings, locate
 from startrack.chain.stages import Located
 from startrack.core.types import Array
 from startrack.evidence import StarEvidence

@@ -31,7 +31,7 @@ from _sky_view import expose
 
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
-from startrack.chain.pipeline import Settings, locate
+from startrack.chain import Settings, locate
 from startrack.chain.stages import Located
 from startrack.core.types import Array, Exposure
 from startrack.rendering import Series, render

@@ -19,7 +19,7 @@ from _results import table, write_section
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.chain.pipeline import locate
+from startrack.chain import locate
 from startrack.rendering import Series, render
 from startrack.terrain import load_terrain
 

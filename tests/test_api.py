@@ -264,7 +264,7 @@ def test_what_is_no_image_is_named_by_its_type():
 
 
 def test_settings_are_settings():
-    with pytest.raises(TypeError, match=r"settings= is of type dict: give startrack\.pipeline\.Settings"):
+    with pytest.raises(TypeError, match=r"settings= is of type dict: give startrack\.chain\.Settings"):
         startrack.locate(IMAGE, settings={"a": 1})
 
 

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from startrack.catalog import load_catalog
-from startrack.chain.pipeline import identify_blind
+from startrack.chain import identify_blind
 from startrack.core.types import Exposure
 from startrack.detection import Detector
 from startrack.exposure import read_exposure

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.chain.pipeline import identify
+from startrack.chain import identify
 from startrack.exposure import read_exposure
 from startrack.frames import parse_utc
 

@@ -109,18 +109,6 @@ def test_commands_of_the_table_are_the_commands():
     assert re.findall(r"^\| `startrack (\w+)", README, flags=re.MULTILINE) == list(COMMANDS)
 
 
-def test_rooms_of_the_page_are_the_rooms():
-    from test_layers import LAYERS
-
-    (shown,) = [block for block in blocks(README, "text") if block.startswith("cli ")]
-    rows = [row.split("     ")[0].split() for row in shown.splitlines()]  # without the words on the right
-    shown_depth = {room: depth for depth, row in enumerate(rows) for room in row}
-    true_depth = {room: -layer for layer, names in enumerate(LAYERS) for room in names}
-    assert set(shown_depth) == set(true_depth)
-    for room, depth in shown_depth.items():  # never above a room that it is below in the code
-        assert all(true_depth[room] <= true_depth[other] for other in shown_depth if shown_depth[other] > depth)
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_links_have_targets(page):
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
@@ -173,7 +161,7 @@ def test_reasons_and_their_exit_codes_are_those_of_the_code():
 
 
 def test_tables_of_the_format_page_are_made_from_the_code():
-    """After a new quantity or reason: python docs/make_tables.py."""
+    """After a new quantity, reason or package: python docs/make_tables.py."""
     spec = importlib.util.spec_from_file_location("make_tables", ROOT / "docs/make_tables.py")
     make_tables = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(make_tables)

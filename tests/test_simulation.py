@@ -13,7 +13,7 @@ from test_evidence import without_sources
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.chain.pipeline import Settings, locate
+from startrack.chain import Settings, locate
 from startrack.chain.stages import StarRays, extend
 from startrack.chain.star_fix import locate_rays
 from startrack.core.types import BadInput

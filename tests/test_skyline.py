@@ -17,7 +17,7 @@ from startrack.api.solution import Solution
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, load_catalog
 from startrack.chain import pipeline
-from startrack.chain.pipeline import Settings
+from startrack.chain import Settings
 from startrack.chain.sky_refinement import raised_by_image
 from startrack.chain.stages import Inputs, Located, Refused
 from startrack.core.errors import Reason

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole
 from startrack.catalog import load_catalog
-from startrack.chain.pipeline import identify_blind as identify_picture
+from startrack.chain import identify_blind as identify_picture
 from startrack.cli.main import main
 from startrack.core.types import Detections, NotIdentified, Stars
 from startrack.estimation.attitude import solve_attitude

@@ -154,7 +154,7 @@ def settings_input(settings: Settings | None) -> Settings | None:
     if settings is None or isinstance(settings, Settings):
         return settings
     raise TypeError(
-        f"settings= is of type {type(settings).__name__}: give startrack.chain.pipeline.Settings(...), such as "
+        f"settings= is of type {type(settings).__name__}: give startrack.chain.Settings(...), such as "
         "Settings(detector=Detector(threshold_snr=6.0))"
     )
 

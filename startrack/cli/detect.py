@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _detect_image(path: str, stem: str, args: argparse.Namespace) -> Outcome:
-    from startrack.chain.pipeline import detect
+    from startrack.chain import detect
     from startrack.chain.run import with_timing
     from startrack.output import summary_line, write_results
 

@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _identify_image(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     from startrack.catalog import load_catalog
-    from startrack.chain.pipeline import identify, identify_blind
+    from startrack.chain import identify, identify_blind
     from startrack.chain.run import with_timing
     from startrack.chain.stages import Oriented, Refused
     from startrack.output import (

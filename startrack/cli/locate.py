@@ -20,7 +20,7 @@ from startrack.cli.flag_types import geo_formats
 from startrack.cli.preparation import prepare_reference
 
 if TYPE_CHECKING:
-    from startrack.chain.pipeline import Settings
+    from startrack.chain import Settings
 
 FORMAT = "startrack.fix/1"
 
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
             "a position needs the lens better than --fov finds it: make a camera file with startrack calibrate "
             f"--fov {args.fov} IMAGE... -o CAMERA.toml, then startrack locate -c CAMERA.toml"
         )
-    from startrack.chain.pipeline import Settings
+    from startrack.chain import Settings
     from startrack.core.types import PositionPrior
 
     check_localizer(args)
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _locate_image(path: str, stem: str, args: argparse.Namespace, settings: Settings) -> Outcome:
-    from startrack.chain.pipeline import locate_exposure
+    from startrack.chain import locate_exposure
     from startrack.chain.run import with_timing
     from startrack.output import summary_line, verbose_text, write_geo, write_results
     from startrack.output.explain import explain

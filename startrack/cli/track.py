@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     _check_frames(args)
     from startrack.applications.tracking.frame_store import FrameStore
     from startrack.applications.tracking.session import TrackSession
-    from startrack.chain.pipeline import Settings
+    from startrack.chain import Settings
 
     _check_folder(args)
     session = TrackSession(

@@ -168,7 +168,7 @@ def read_task(task: Task) -> Exposure:
 
 def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str, str]]:
     """A value with companions, or the record of a refusal without; and the hashes of camera and terrain files."""
-    from startrack.chain.pipeline import Settings, locate_exposure
+    from startrack.chain import Settings, locate_exposure
     from startrack.chain.stages import Inputs, Refused
     from startrack.core.types import PositionPrior
     from startrack.localization import require_localizer

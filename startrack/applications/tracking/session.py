@@ -27,7 +27,7 @@ from startrack.applications.tracking.track import (
 )
 from startrack.catalog import load_catalog
 from startrack.chain.inputs import load_camera_input, terrain_input
-from startrack.chain.pipeline import NO_TIME, locate
+from startrack.chain import NO_TIME, locate
 from startrack.chain.stages import Settings
 from startrack.core.errors import BadInput
 

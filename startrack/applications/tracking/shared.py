@@ -9,7 +9,7 @@ from typing import Self
 
 import numpy as np
 
-from startrack.chain.pipeline import NO_TIME
+from startrack.chain import NO_TIME
 from startrack.chain.sky_refinement import EDGE_SIGMA_PX
 from startrack.core.types import Array, BadInput, Clock, Evidence, Exposure, ImageErrors
 from startrack.localization import clock_at

@@ -13,8 +13,7 @@ from _cameras import EXPOSURE_S, camera_for_share
 from startrack.applications.tracking import ObservedFrame, TrackErrors, observe_frame
 from startrack.applications.tracking.frame_estimate import estimate_frame
 from startrack.catalog import load_catalog
-from startrack.chain import Settings, locate
-from startrack.chain.stages import Located
+from startrack.chain import Located, Settings, locate
 from startrack.core.types import Array, Evidence
 from startrack.evidence.likelihood_ratio import visibility_llr
 from startrack.frames import R_enu_icrs, azel_from_rays, observer_velocity_m_s

@@ -16,8 +16,7 @@ from _hazard_classes import CLASSES
 from _map_draws import draw_position
 
 from startrack.catalog import load_catalog
-from startrack.chain.stages import StarFix, StarRays
-from startrack.chain.star_fix import locate_rays
+from startrack.chain import StarFix, StarRays, locate_rays
 from startrack.core.types import Array, NoSolution
 from startrack.rendering import Series
 from startrack.simulation import simulate_rays

@@ -12,7 +12,7 @@ import numpy as np
 from _hazard_grounds import NAMES, crater_with, map_with
 from _map_draws import draw_ground
 
-from startrack.chain.stages import StarRays
+from startrack.chain import StarRays
 from startrack.core.types import Array
 from startrack.frames import R_enu_icrs, Site
 from startrack.rendering import Scene

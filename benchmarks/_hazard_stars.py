@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from _hazard_grounds import turn
 
-from startrack.chain.stages import StarRays
+from startrack.chain import StarRays
 from startrack.core.types import Array
 from startrack.evidence.likelihood_ratio import visibility_llr
 from startrack.frames import azel_from_rays

@@ -12,8 +12,7 @@ from _sky_view import expose
 from _view_hazards import VIEW_HAZARDS
 
 from startrack.catalog import load_catalog
-from startrack.chain import Settings, locate
-from startrack.chain.stages import Located
+from startrack.chain import Located, Settings, locate
 from startrack.rendering import Series
 from startrack.terrain import load_terrain
 

@@ -17,8 +17,7 @@ from _classes import run_classes
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.chain import locate
-from startrack.chain.stages import Located
+from startrack.chain import Located, locate
 from startrack.core.files import data_dir
 from startrack.rendering import Series, load_sky_catalog, render
 from startrack.rendering.sources import exposure_for_snr

@@ -25,8 +25,7 @@ from _results import table, write_section
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.chain import locate
-from startrack.chain.stages import Identified, Located, Oriented, Outcome, last_value
+from startrack.chain import Identified, Located, Oriented, Outcome, last_value, locate
 from startrack.core.types import Evidence, NoSolution
 from startrack.exposure import read_exposure
 from startrack.frames import R_from_quat_xyzw

@@ -26,8 +26,7 @@ from _rough_map import rough_terrain
 
 from startrack.camera import load_camera
 from startrack.catalog import bodies, load_catalog
-from startrack.chain import locate
-from startrack.chain.stages import Located
+from startrack.chain import Located, locate
 from startrack.frames import R_enu_icrs, Site
 from startrack.rendering import Series, render
 from startrack.terrain import HeightMap, load_terrain

@@ -22,8 +22,7 @@ from chain import SENSOR
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog, load_deep_catalog
-from startrack.chain import Settings, locate
-from startrack.chain.stages import Located, Measured, last_value
+from startrack.chain import Located, Measured, Settings, last_value, locate
 from startrack.core.types import Array, Evidence, Fix, NoSolution
 from startrack.evidence import StarEvidence, StarPhotometry, flux_scale
 from startrack.localization import ExactPosterior

@@ -22,8 +22,7 @@ from _results import table, write_section
 import startrack
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.chain import Settings, locate
-from startrack.chain.stages import Located
+from startrack.chain import Located, Settings, locate
 from startrack.core.types import Array
 from startrack.rendering import Series, load_sky_catalog, render
 from startrack.terrain import HeightMap, load_terrain

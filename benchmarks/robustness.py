@@ -21,8 +21,7 @@ from chain import SENSOR
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.chain import Settings, locate
-from startrack.chain.stages import Located
+from startrack.chain import Located, Settings, locate
 from startrack.core.types import Array
 from startrack.evidence import StarEvidence
 from startrack.frames import R_from_rotvec

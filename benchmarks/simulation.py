@@ -16,9 +16,7 @@ from _map_draws import draw_position
 from _results import table, write_section
 
 from startrack.catalog import load_catalog
-from startrack.chain import Settings, locate
-from startrack.chain.stages import Located, StarFix
-from startrack.chain.star_fix import locate_rays
+from startrack.chain import Located, Settings, StarFix, locate, locate_rays
 from startrack.core.types import NoSolution
 from startrack.localization.integrity import Integrity
 from startrack.rendering import Scene, Series, render

@@ -31,8 +31,7 @@ from _sky_view import expose
 
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
-from startrack.chain import Settings, locate
-from startrack.chain.stages import Located
+from startrack.chain import Located, Settings, locate
 from startrack.core.types import Array, Exposure
 from startrack.rendering import Series, render
 from startrack.terrain import Cylinder, Terrain, load_terrain

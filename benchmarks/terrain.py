@@ -21,8 +21,7 @@ from chain import SENSOR
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.chain import locate
-from startrack.chain.stages import Measured, last_value
+from startrack.chain import Measured, last_value, locate
 from startrack.core.types import Evidence, Fix, NoSolution
 from startrack.localization import ExactPosterior
 from startrack.localization.horizon_bias import lower_evidence

@@ -15,8 +15,7 @@ import numpy as np
 
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, load_catalog
-from startrack.chain.stages import StarRays
-from startrack.chain.star_fix import locate_rays
+from startrack.chain import StarRays, locate_rays
 from startrack.core.types import Array, Exposure, NoSolution
 from startrack.rendering import Scene, Series, render
 from startrack.simulation import simulate_rays

@@ -20,7 +20,7 @@ from astropy.utils.masked import Masked
 from jsonschema import Draft202012Validator
 
 import startrack
-from startrack.chain.inputs import exposure_input, time_input
+from startrack.chain import exposure_input, time_input
 from startrack.chain.stages import Oriented, Refused, Settings, extend, last_value
 from startrack.core.errors import BadInput
 from startrack.exposure import read_exposure

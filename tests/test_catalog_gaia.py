@@ -10,8 +10,7 @@ from scipy.spatial import cKDTree
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog, load_deep_catalog
-from startrack.chain import locate
-from startrack.chain.stages import Located
+from startrack.chain import Located, locate
 from startrack.rendering import Series, load_sky_catalog, render
 from startrack.rendering.sources import exposure_for_snr
 from startrack.terrain import load_terrain

@@ -10,8 +10,7 @@ from localization_helpers import locate_or_refuse
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.chain.stages import StarRays
-from startrack.chain.star_fix import locate_rays
+from startrack.chain import StarRays, locate_rays
 from startrack.core.types import Fix, NotLocated
 from startrack.rendering import Scene, Series
 from startrack.simulation import simulate_rays

@@ -10,8 +10,7 @@ import pytest
 
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, load_catalog
-from startrack.chain import pipeline
-from startrack.chain.stages import Oriented
+from startrack.chain import Oriented, pipeline
 from startrack.core.types import Array, Exposure, NotLocated
 from startrack.evidence import StarPhotometry
 from startrack.evidence.double_exposure import DECISIVE, check_single_skyline, find_double_exposure

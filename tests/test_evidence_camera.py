@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from startrack.catalog import load_catalog
-from startrack.chain import measurement
+from startrack.chain import Settings, measurement
 from startrack.chain.measurement import measure_evidence
-from startrack.chain.stages import Settings
 
 
 def with_covariance(camera, sigma_px):

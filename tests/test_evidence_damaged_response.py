@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from startrack.catalog import load_catalog
-from startrack.chain import pipeline
-from startrack.chain.stages import Outcome
+from startrack.chain import Outcome, pipeline
 from startrack.output.record import result_dict
 
 EVERY_CHI2_2DOF = 18.4  # 99.99 %

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from localization_helpers import WRAPPERS, ThreeMethods, slow_chain_scores, slow_contributions, slow_scores
 
-from startrack.chain.stages import Settings
+from startrack.chain import Settings
 from startrack.core.types import Array, BadInput, Evidence, NotLocated
 from startrack.localization import ExactPosterior, Hull, Localizer, PseudoGradient
 from startrack.localization.branch_and_bound import Search

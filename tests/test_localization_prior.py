@@ -9,7 +9,7 @@ import pytest
 from localization_helpers import ThreeMethods, slow_chain_scores
 from test_localization import SMALL, TwoCraters, measure_stars
 
-from startrack.chain.stages import Settings
+from startrack.chain import Settings
 from startrack.core.types import Array, Evidence, Fix, NotLocated, PositionPrior
 from startrack.localization import ExactPosterior
 from startrack.terrain import Cylinder, Terrain, load_terrain

@@ -16,8 +16,7 @@ from startrack.applications.batch.fingerprint import are_unchanged, input_hashes
 from startrack.applications.calibration.obstruction import PredictedStars, obstructed_cells
 from startrack.camera import load_camera, save_camera
 from startrack.catalog import StarCatalog, load_catalog
-from startrack.chain import pipeline
-from startrack.chain.stages import Located
+from startrack.chain import Located, pipeline
 from startrack.cli.main import main
 from startrack.core.types import BadInput, Bools, Exposure
 from startrack.detection import Detector

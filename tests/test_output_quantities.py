@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 
-from startrack.chain.stages import Located, Measured
+from startrack.chain import Located, Measured
 from startrack.core.errors import Reason
 from startrack.core.types import Attitude
 from startrack.frames import R_from_rotvec, heading_pitch_roll_from_R_body_enu

@@ -11,8 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from startrack.catalog import StarCatalog, load_catalog
-from startrack.chain import pipeline
-from startrack.chain.stages import Located, Outcome
+from startrack.chain import Located, Outcome, pipeline
 from startrack.core.types import Exposure
 from startrack.frames import R_enu_icrs, azel_from_rays
 

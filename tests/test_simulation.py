@@ -13,9 +13,8 @@ from test_evidence import without_sources
 
 from startrack.camera import load_camera
 from startrack.catalog import load_catalog
-from startrack.chain import Settings, locate
+from startrack.chain import Settings, locate, locate_rays
 from startrack.chain.stages import StarRays, extend
-from startrack.chain.star_fix import locate_rays
 from startrack.core.types import BadInput
 from startrack.evidence.photometry import Sources, half_width, measure
 from startrack.rendering import Series

@@ -16,10 +16,8 @@ from astropy.table import QTable
 from startrack.api.solution import Solution
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, load_catalog
-from startrack.chain import pipeline
-from startrack.chain import Settings
+from startrack.chain import Inputs, Located, Refused, Settings, pipeline
 from startrack.chain.sky_refinement import raised_by_image
-from startrack.chain.stages import Inputs, Located, Refused
 from startrack.core.errors import Reason
 from startrack.core.types import Exposure
 from startrack.evidence.sky_light import MIDDLES_RAD

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from startrack.chain.inputs import terrain_input
+from startrack.chain import terrain_input
 from startrack.core.types import Array, BadInput, Evidence
 from startrack.frames import Site
 from startrack.localization import ExactPosterior

@@ -30,9 +30,7 @@ from localization_helpers import Delegating
 import startrack
 from startrack.api.solution import Solution
 from startrack.applications.tracking.write import track_record
-from startrack.chain import pipeline
-from startrack.chain.stages import Refused, Settings
-from startrack.chain.star_fix import locate_rays
+from startrack.chain import Refused, Settings, locate_rays, pipeline
 from startrack.core.types import Array, Evidence, Fix, NoSolution
 from startrack.localization import ExactPosterior
 from startrack.output.record import result_dict

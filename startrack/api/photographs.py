@@ -10,7 +10,7 @@ from startrack.applications.calibration import calibrate as calibrate_exposures
 from startrack.applications.horizon import measure_skyline
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
-from startrack.chain.inputs import Image, camera_input, exposure_input, field_of_view_rad, load_camera_input
+from startrack.chain import Image, camera_input, exposure_input, field_of_view_rad, load_camera_input
 from startrack.core.errors import BadInput
 from startrack.core.types import MeasuredSkyline
 from startrack.frames import Site

@@ -19,7 +19,7 @@ from startrack.api.values import (
     orientation_of,
     position_of,
 )
-from startrack.chain.stages import Located, Oriented, Outcome, last_value
+from startrack.chain import Located, Oriented, Outcome, last_value
 from startrack.output import prepare_folder, record_of, summary_line, write_results
 from startrack.output.values import boresight_rad
 

@@ -11,21 +11,23 @@ from startrack.applications.tracking import Odometry, Track, TrackSession, read_
 from startrack.applications.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
-from startrack.chain import pipeline
-from startrack.chain.inputs import (
+from startrack.chain import (
     Image,
+    Outcome,
+    Refused,
+    Settings,
     Time,
     camera_input,
     exposure_input,
     field_of_view_rad,
     is_list_of_centroids,
     load_camera_input,
+    pipeline,
     settings_input,
+    stars_at,
     terrain_input,
     time_input,
 )  # fmt: skip
-from startrack.chain.orientation import stars_at
-from startrack.chain.stages import Outcome, Refused, Settings
 from startrack.core.errors import BAD_INPUT_REASONS, BadInput
 from startrack.core.types import Exposure
 from startrack.terrain import Terrain

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.chain.inputs import Time, angle_rad, duration_s, load_camera_input, terrain_input, time_input
+from startrack.chain import Time, angle_rad, duration_s, load_camera_input, terrain_input, time_input
 from startrack.core.errors import BadInput
 from startrack.core.files import file_stem
 from startrack.core.types import Exposure

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from startrack.chain.stages import Located, Measured, Oriented
+from startrack.chain import Located, Measured, Oriented
 from startrack.frames import heading_pitch_roll_from_R_body_enu, latlon_from_enu
 from startrack.output.values import ARCSEC_PER_RAD, R_body_enu, boresight_rad
 from startrack.output.views import Rows, at_stage, rows
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from astropy.units import Quantity
     from scipy.spatial.transform import Rotation
 
-    from startrack.chain.stages import Inputs
+    from startrack.chain import Inputs
 
 
 class Shown:

@@ -1,6 +1,76 @@
 """From one image to the position: the chain of the stages, and the values that they return."""
 
-from startrack.chain import detect, identify, identify_blind, locate, locate_exposure
-from startrack.chain.stages import Settings
+from startrack.chain.inputs import (
+    Image,
+    Time,
+    angle_rad,
+    camera_input,
+    duration_s,
+    exposure_input,
+    field_of_view_rad,
+    is_list_of_centroids,
+    load_camera_input,
+    settings_input,
+    terrain_input,
+    time_input,
+)
+from startrack.chain.measurement import COMPLETE_V_MAG
+from startrack.chain.orientation import stars_at
+from startrack.chain.pipeline import NO_TIME, detect, identify, identify_blind, locate, locate_exposure
+from startrack.chain.run import with_timing
+from startrack.chain.sky_refinement import EDGE_SIGMA_PX
+from startrack.chain.stages import (
+    STAGES,
+    Detected,
+    Identified,
+    Inputs,
+    Located,
+    Measured,
+    Oriented,
+    Outcome,
+    Refused,
+    Settings,
+    StarFix,
+    StarRays,
+    last_value,
+)
+from startrack.chain.star_fix import locate_rays
 
-__all__ = ["Settings", "detect", "identify", "identify_blind", "locate", "locate_exposure"]
+__all__ = [
+    "COMPLETE_V_MAG",
+    "EDGE_SIGMA_PX",
+    "NO_TIME",
+    "STAGES",
+    "Detected",
+    "Identified",
+    "Image",
+    "Inputs",
+    "Located",
+    "Measured",
+    "Oriented",
+    "Outcome",
+    "Refused",
+    "Settings",
+    "StarFix",
+    "StarRays",
+    "Time",
+    "angle_rad",
+    "camera_input",
+    "detect",
+    "duration_s",
+    "exposure_input",
+    "field_of_view_rad",
+    "identify",
+    "identify_blind",
+    "is_list_of_centroids",
+    "last_value",
+    "load_camera_input",
+    "locate",
+    "locate_exposure",
+    "locate_rays",
+    "settings_input",
+    "stars_at",
+    "terrain_input",
+    "time_input",
+    "with_timing",
+]

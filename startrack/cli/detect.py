@@ -29,8 +29,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _detect_image(path: str, stem: str, args: argparse.Namespace) -> Outcome:
-    from startrack.chain import detect
-    from startrack.chain.run import with_timing
+    from startrack.chain import detect, with_timing
     from startrack.output import summary_line, write_results
 
     start = time.perf_counter()

@@ -150,8 +150,7 @@ def _self_test() -> str:
 
     from startrack.camera import load_camera
     from startrack.catalog import load_catalog
-    from startrack.chain import locate
-    from startrack.chain.stages import Refused
+    from startrack.chain import Refused, locate
     from startrack.rendering import Series, render
     from startrack.terrain import load_terrain
 

@@ -63,9 +63,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _identify_image(path: str, stem: str, args: argparse.Namespace) -> Outcome:
     from startrack.catalog import load_catalog
-    from startrack.chain import identify, identify_blind
-    from startrack.chain.run import with_timing
-    from startrack.chain.stages import Oriented, Refused
+    from startrack.chain import Oriented, Refused, identify, identify_blind, with_timing
     from startrack.output import (
         lens_text,
         summary_line,

@@ -73,8 +73,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _locate_image(path: str, stem: str, args: argparse.Namespace, settings: Settings) -> Outcome:
-    from startrack.chain import locate_exposure
-    from startrack.chain.run import with_timing
+    from startrack.chain import locate_exposure, with_timing
     from startrack.output import summary_line, verbose_text, write_geo, write_results
     from startrack.output.explain import explain
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from startrack.chain.stages import Detected, Identified, Located, Measured, Outcome, Refused, last_value
+from startrack.chain import Detected, Identified, Located, Measured, Outcome, Refused, last_value
 from startrack.core.errors import Reason, length_text
 from startrack.core.types import Array, Blocked
 from startrack.evidence.star_evidence import DECIDABLE_SNR

@@ -16,7 +16,7 @@ from startrack.frames import Site, latlon_from_enu
 from startrack.output.record import result_dict
 
 if TYPE_CHECKING:
-    from startrack.chain.stages import Located
+    from startrack.chain import Located
     from startrack.core.types import Array
 
 GEO_FORMATS = ("geojson", "kml")

@@ -7,7 +7,7 @@ and a table of docs/formats.md are made from `QUANTITIES`. A new quantity is one
 from __future__ import annotations
 
 from startrack import __version__
-from startrack.chain.stages import Detected, Inputs, Located, Measured
+from startrack.chain import Detected, Inputs, Located, Measured
 from startrack.frames import format_utc
 from startrack.output.quantities_attitude import ATTITUDE
 from startrack.output.quantities_light import LIGHT

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from startrack.chain.stages import Measured, Oriented
+from startrack.chain import Measured, Oriented
 from startrack.frames import quat_xyzw_from_R
 from startrack.output.quantity import Column, Quantity, Show
 from startrack.output.schema_parts import FLAG, LATITUDE, LONGITUDE, POSITIVE, QUATERNION, TURN, numbers

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from startrack.chain.stages import Detected, Identified, Inputs, Located, Measured, Oriented
+from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented
 from startrack.output.quantity import Column, Listed, Quantity, Show, show_everywhere
 from startrack.output.schema_parts import CHANCE, COUNT, NUMBER, POSITIVE, TEXT, numbers
 from startrack.output.values import blocked_deg, blocked_text, chance_text, predicted_visible, ranges_text

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from startrack.chain.stages import Located
+from startrack.chain import Located
 from startrack.localization.integrity import RISK
 from startrack.output.quantity import Column, Listed, Quantity, Show
 from startrack.output.schema_parts import (

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from startrack.chain.stages import Inputs
+from startrack.chain import Inputs
 from startrack.output.schema_parts import Schema
 
 ABSENT: Any = object()  # of a quantity that has no key before its stage

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from startrack.chain.stages import STAGES, Detected, Identified, Outcome, last_value
+from startrack.chain import STAGES, Detected, Identified, Outcome, last_value
 from startrack.core.errors import reason_of
 from startrack.core.types import Exposure
 from startrack.output.views import record_sections

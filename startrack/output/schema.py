@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from startrack.camera import camera_keys
-from startrack.chain.stages import STAGES
+from startrack.chain import STAGES
 from startrack.core.errors import Reason
 from startrack.exposure import SIDECAR as SIDECAR_KEYS
 from startrack.output.quantities import BY_PATH

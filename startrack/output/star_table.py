@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.catalog import star_names
-from startrack.chain.stages import Identified, Inputs, Measured, Oriented
+from startrack.chain import Identified, Inputs, Measured, Oriented
 from startrack.core.types import Array, Ints, Stars
 from startrack.evidence.star_evidence import SEEN_LLR
 from startrack.output.ecsv import Column, ecsv_text, format_values

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from startrack.chain.stages import STAGES, Outcome, Refused, last_value
+from startrack.chain import STAGES, Outcome, Refused, last_value
 from startrack.core.files import printable
 from startrack.output.record import image_name
 from startrack.output.views import at_stage, rows

@@ -8,7 +8,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from startrack.chain.stages import Located, Measured, Oriented
+from startrack.chain import Located, Measured, Oriented
 from startrack.core.types import Array, Fix
 from startrack.frames import R_from_rotvec, heading_pitch_roll_from_R_body_enu, latlon_from_enu
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from startrack.chain.stages import Inputs, Located
+from startrack.chain import Inputs, Located
 from startrack.output.quantities import BY_PATH, FIRST_COLUMNS, QUANTITIES
 from startrack.output.quantity import ABSENT, Column, Quantity
 from startrack.output.schema_parts import TURN, Schema, or_null, record

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from startrack import __version__
 from startrack.camera import Camera, Decentring
-from startrack.chain.stages import Measured, Oriented
+from startrack.chain import Measured, Oriented
 from startrack.core.types import Array
 from startrack.frames import Site, aberrate, format_utc, observer_velocity_m_s, wahba
 

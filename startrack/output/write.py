@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from startrack.chain.stages import Located, Oriented, Outcome
+    from startrack.chain import Located, Oriented, Outcome
     from startrack.core.types import MeasuredSkyline
 
 ANNOTATED = ".annotated.png"
@@ -103,7 +103,7 @@ def write_results(
 
 
 def _write_companions(outcome: Outcome, path: Path, *, plots: bool) -> None:
-    from startrack.chain.stages import Located, Measured, Oriented, last_value
+    from startrack.chain import Located, Measured, Oriented, last_value
 
     value = last_value(outcome)
     if isinstance(value, Measured) or (isinstance(value, Oriented) and value.terrain is None):
@@ -122,7 +122,7 @@ def write_geo(record: Path, outcome: Outcome, kinds: Sequence[str]) -> None:
 
     `kinds`: which of the two. A former file of another outcome is removed. Raises BadInput where one cannot be written.
     """
-    from startrack.chain.stages import Located
+    from startrack.chain import Located
     from startrack.output.geo import GEO_FORMATS, geo_text
 
     for kind in GEO_FORMATS:
@@ -189,7 +189,7 @@ def write_annotated(path: FilePath, outcome: Outcome, truth_enu_m: tuple[float, 
     `truth_enu_m` (east, north) [m] is drawn if it is given; no stage of the pipeline has it. The file also holds the
     picture without marks and the marks as coordinates, for the HTML page (`picture/layers.py`).
     """
-    from startrack.chain.stages import last_value
+    from startrack.chain import last_value
     from startrack.output.picture.annotate import annotate, bare_picture
     from startrack.output.picture.layers import Layers, add_layers
     from startrack.output.picture.overlay import overlay_of

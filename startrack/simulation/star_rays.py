@@ -12,7 +12,7 @@ from datetime import datetime
 import numpy as np
 
 from startrack.catalog import StarCatalog
-from startrack.chain.stages import StarRays
+from startrack.chain import StarRays
 from startrack.core.statistics import robust_sigma
 from startrack.core.types import TIME_SIGMA_S, Array, BadInput, Bools, Ints
 from startrack.evidence import FluxScale, Skyline, StarEvidence

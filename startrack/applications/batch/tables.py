@@ -22,7 +22,7 @@ from startrack import __version__
 from startrack.applications.batch.find import unique_names
 from startrack.applications.batch.store import INPUTS, JOB, MANIFEST, RESULT, is_solved, stored_record, text_of_name
 from startrack.applications.batch.task import Record, Task, valid_stored_record
-from startrack.chain.stages import STAGES
+from startrack.chain import STAGES
 from startrack.core.files import write_atomically
 from startrack.frames import R_from_quat_xyzw, tum_line
 from startrack.output.ecsv import Column, ecsv_text, format_values

@@ -31,7 +31,7 @@ from startrack.core.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
 from startrack.core.runner import Died, Runner, RunStopped
 
 if TYPE_CHECKING:
-    from startrack.chain.stages import Outcome
+    from startrack.chain import Outcome
     from startrack.core.types import Exposure
     from startrack.exposure import BagImage
 
@@ -168,8 +168,7 @@ def read_task(task: Task) -> Exposure:
 
 def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str, str]]:
     """A value with companions, or the record of a refusal without; and the hashes of camera and terrain files."""
-    from startrack.chain import Settings, locate_exposure
-    from startrack.chain.stages import Inputs, Refused
+    from startrack.chain import Inputs, Refused, Settings, locate_exposure
     from startrack.core.types import PositionPrior
     from startrack.localization import require_localizer
     from startrack.output import refused_dict, result_dict

@@ -13,8 +13,7 @@ from startrack.applications.calibration.frame import Sky, frame_of, pressure_hpa
 from startrack.applications.calibration.region_growing import JointFit, fit_frames
 from startrack.camera import Camera
 from startrack.catalog import StarCatalog, bodies
-from startrack.chain import identify, identify_blind
-from startrack.chain.stages import Oriented, Refused
+from startrack.chain import Oriented, Refused, identify, identify_blind
 from startrack.core.errors import BadInput, Reason
 from startrack.core.types import Array, Body, Detections, Exposure, Ints
 from startrack.frames import R_enu_icrs, Site, azel_from_rays, rays_from_azel, refract_rad

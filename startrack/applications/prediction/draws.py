@@ -11,8 +11,7 @@ import numpy as np
 
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, has_deep_catalog, load_catalog, load_deep_catalog
-from startrack.chain.measurement import COMPLETE_V_MAG
-from startrack.chain.star_fix import locate_rays
+from startrack.chain import COMPLETE_V_MAG, locate_rays
 from startrack.core.chunk_store import Chunk
 from startrack.core.types import Array, BadInput, NoSolution, Stars
 from startrack.localization import require_localizer

@@ -9,7 +9,7 @@ import numpy as np
 
 from startrack.applications.tracking.frame_estimate import FrameEstimate, estimate_frame
 from startrack.applications.tracking.shared import TrackErrors
-from startrack.chain.stages import Located, Measured, Outcome, Refused, last_value
+from startrack.chain import Located, Measured, Outcome, Refused, last_value
 from startrack.core.types import Array, Evidence, Fix, ShownError
 from startrack.evidence.sky_levels import SECTORS
 from startrack.localization.posterior import MIN_ROW_NATS

@@ -26,9 +26,7 @@ from startrack.applications.tracking.track import (
     track_of_newest,
 )
 from startrack.catalog import load_catalog
-from startrack.chain.inputs import load_camera_input, terrain_input
-from startrack.chain import NO_TIME, locate
-from startrack.chain.stages import Settings
+from startrack.chain import NO_TIME, Settings, load_camera_input, locate, terrain_input
 from startrack.core.errors import BadInput
 
 if TYPE_CHECKING:

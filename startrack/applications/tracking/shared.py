@@ -9,8 +9,7 @@ from typing import Self
 
 import numpy as np
 
-from startrack.chain import NO_TIME
-from startrack.chain.sky_refinement import EDGE_SIGMA_PX
+from startrack.chain import EDGE_SIGMA_PX, NO_TIME
 from startrack.core.types import Array, BadInput, Clock, Evidence, Exposure, ImageErrors
 from startrack.localization import clock_at
 from startrack.localization.shared_errors import SharedErrors

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.chain.stages import Detected, Identified, Inputs, Located, Measured, Oriented, Outcome, last_value
+from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented, Outcome, last_value
 from startrack.output.picture.backdrop import View, backdrop, fit_to_canvas
 from startrack.output.picture.canvas import (
     BODY,

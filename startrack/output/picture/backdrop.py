@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from startrack.camera import Camera
-from startrack.chain.stages import Detected, Inputs
+from startrack.chain import Detected, Inputs
 from startrack.core.types import Array, Bools
 from startrack.output.picture.canvas import PAPER, SKY_BRIGHT, SKY_DARK, STARLIGHT, WALL
 

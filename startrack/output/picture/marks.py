@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.chain.stages import Detected, Identified, Inputs, Located, Measured
+from startrack.chain import Detected, Identified, Inputs, Located, Measured
 from startrack.core.types import Array, Ints
 from startrack.frames import azel_from_rays
 from startrack.output.picture.backdrop import View

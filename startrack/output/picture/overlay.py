@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from startrack.chain.stages import Detected, Identified, Inputs, Located, Measured, Oriented
+from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented
 from startrack.core.types import Array, Bools
 from startrack.frames import azel_from_rays, heading_pitch_roll_from_R_body_enu, rays_from_azel
 from startrack.output.values import R_body_enu, skyline_position_m

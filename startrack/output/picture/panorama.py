@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.chain.stages import Located
+from startrack.chain import Located
 from startrack.core.types import Array, MeasuredSkyline
 from startrack.evidence import Skyline
 from startrack.output.picture.canvas import (

@@ -24,10 +24,11 @@ from _results import table, write_section
 
 from startrack.applications.tracking.at_rest import positions_at_rest
 from startrack.applications.tracking.contradictions import smooth_robustly
-from startrack.applications.tracking.frame_estimate import FrameEstimate
-from startrack.applications.tracking.smoother import Observations, Steps, smooth
-from startrack.applications.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA, filter_positions
+from startrack.applications.tracking.online import filter_positions
+from startrack.applications.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
 from startrack.core.types import Array
+from startrack.estimation.observations import FrameEstimate, Observations, Steps
+from startrack.estimation.smoother import smooth
 from startrack.terrain import HeightMap, load_terrain
 
 POST_SIGMA_M, RAISED_SIGMA_RAD = 5.0, np.radians(0.08)

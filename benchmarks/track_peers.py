@@ -19,8 +19,9 @@ from _drive_frames import frames_by_evidence
 from _results import table, write_section
 from drives import Case, course_of, odometry
 
-from startrack.applications.tracking.smoother import Observations, smooth
-from startrack.applications.tracking.track import filter_positions
+from startrack.applications.tracking.online import filter_positions
+from startrack.estimation.observations import Observations
+from startrack.estimation.smoother import smooth
 
 CASE = Case(40, 50.0, 900.0, degraded=True)
 SEED = 43

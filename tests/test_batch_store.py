@@ -13,8 +13,10 @@ from astropy.table import Table
 from batch_helpers import FACTS, frames, task_of
 
 from startrack.applications.batch import locate_image
+from startrack.chain import are_unchanged, input_hashes
 from startrack.cli.main import main
 from startrack.output.schema import SCHEMAS
+from startrack.terrain import ForwardingTerrain, load_terrain
 
 DEM = """
 body = "moon"
@@ -44,6 +46,22 @@ def test_a_refused_image_is_repeated_when_the_missing_height_map_exists(tmp_path
     assert locate_image(task)[1]
     (tmp_path / "heights.tif").write_bytes(b"heights")
     assert not locate_image(task)[1]
+
+
+def test_a_terrain_of_any_class_says_which_files_it_was_read_from(tmp_path, monkeypatch):
+    class Tiles(ForwardingTerrain):
+        files = (tmp_path / "a.tile", tmp_path / "b.tile")
+
+    for file in Tiles.files:
+        file.write_bytes(b"heights")
+    known = load_terrain("shackleton-thesis")
+    monkeypatch.setattr("startrack.terrain.io.load_terrain", lambda path: Tiles(known))
+    (image,) = frames(tmp_path, 1)
+    hashes = input_hashes(str(image), [], str(tmp_path / "tiles.toml"))
+    assert set(hashes) == {"tiles.toml", "a.tile", "b.tile"}
+    assert are_unchanged(str(image), hashes)
+    Tiles.files[1].write_bytes(b"others")
+    assert not are_unchanged(str(image), hashes)
 
 
 def test_an_internal_error_is_always_tried_again(tmp_path):

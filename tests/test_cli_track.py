@@ -17,11 +17,11 @@ from jsonschema import Draft202012Validator
 
 import startrack
 from startrack.applications.tracking import read_odometry
-from startrack.applications.tracking.circles import radius_holding
 from startrack.applications.tracking.frame_store import decode_frame, encode_frame
 from startrack.applications.tracking.schema import TRACK
 from startrack.camera import load_camera, save_camera
 from startrack.cli.main import main
+from startrack.estimation.smoother import radius_holding
 from startrack.frames import R_from_quat_xyzw
 
 FRAMES = 5
@@ -324,13 +324,13 @@ def test_followed_odometry_that_ends_within_a_line_waits(drive, tracked, tmp_pat
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_following_that_is_stopped_before_any_image_has_the_code_of_a_stop(tmp_path, capsys, monkeypatch, number):
-    from startrack.applications.tracking import follow
+    from startrack.applications import tracking
 
     def stopped(*arguments, **more):
         os.kill(os.getpid(), number)
         yield None
 
-    monkeypatch.setattr(follow, "follow_images", stopped)
+    monkeypatch.setattr(tracking, "follow_images", stopped)
     (tmp_path / "live").mkdir()
     assert run("--follow", tmp_path / "live", "-D", tmp_path / "out") == 5
     assert "before the first image" in capsys.readouterr().err

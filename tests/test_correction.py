@@ -16,11 +16,10 @@ from render_helpers import FISHEYE, SENSOR
 from scipy.spatial import cKDTree
 from scipy.stats import kstest
 
-from startrack.applications.batch.fingerprint import job_sha256
 from startrack.applications.calibration.photon_transfer import fit_photon_transfer
 from startrack.camera import save_camera
 from startrack.catalog import load_catalog
-from startrack.chain import pipeline
+from startrack.chain import job_sha256, pipeline
 from startrack.cli.main import main
 from startrack.core.types import BadInput, Exposure
 from startrack.detection import Detector

@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 from render_helpers import FISHEYE
 
-from startrack.applications.batch.fingerprint import are_unchanged, input_hashes
 from startrack.applications.calibration.obstruction import PredictedStars, obstructed_cells
 from startrack.camera import load_camera, save_camera
 from startrack.catalog import StarCatalog, load_catalog
-from startrack.chain import Located, pipeline
+from startrack.chain import Located, are_unchanged, input_hashes, pipeline
 from startrack.cli.main import main
 from startrack.core.types import BadInput, Bools, Exposure
 from startrack.detection import Detector
@@ -219,7 +218,7 @@ def test_a_batch_repeats_an_image_whose_mask_has_changed(tmp_path):
     of_camera, of_image = (write_mask(tmp_path / name, hidden) for name in ("a.png", "b.png"))
     (tmp_path / "camera.toml").write_text('mask = "a.png"\n')
     for changed in (of_camera, of_image):
-        hashes = input_hashes(str(image), [str(tmp_path / "camera.toml"), None, str(of_image)])
+        hashes = input_hashes(str(image), [str(tmp_path / "camera.toml")], None, str(of_image))
         assert set(hashes) == {"camera.toml", "a.png", "b.png"}
         assert are_unchanged(str(image), hashes)
         write_mask(changed, np.eye(8, dtype=bool))

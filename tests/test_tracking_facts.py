@@ -11,10 +11,10 @@ import pytest
 
 import startrack
 from startrack.applications.tracking import ObservedFrame, TrackErrors, estimate_track
-from startrack.applications.tracking.frame_estimate import FrameEstimate
-from startrack.applications.tracking.shared import DEPTH
+from startrack.applications.tracking.track_errors import DEPTH
 from startrack.camera import load_camera, save_camera
 from startrack.cli.main import main
+from startrack.estimation.observations import FrameEstimate
 from startrack.terrain import load_terrain
 
 START = datetime(2030, 6, 1, tzinfo=UTC)

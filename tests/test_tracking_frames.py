@@ -10,12 +10,13 @@ import pytest
 
 from startrack.applications.tracking.at_rest import positions_at_rest
 from startrack.applications.tracking.frame_estimate import MIN_NOISE_SHARE, clipped_noise, estimate_frame
-from startrack.applications.tracking.frame_sampling import balanced_moments
+from startrack.applications.tracking.frame_model import balanced_moments
 from startrack.applications.tracking.frame_store import decode_frame, encode_frame
-from startrack.applications.tracking.observe import ObservedFrame, observe_again, observe_frame
-from startrack.applications.tracking.shared import BIAS, CLOCK, DEPTH, EDGE, TrackErrors
-from startrack.applications.tracking.smoother import Observations, Steps, smooth
+from startrack.applications.tracking.observed_frame import ObservedFrame, observe_again, observe_frame
+from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, EDGE, TrackErrors
 from startrack.core.types import BadInput, Clock, Evidence, ImageErrors, ShownError
+from startrack.estimation.observations import Observations, Steps
+from startrack.estimation.smoother import smooth
 from startrack.localization import ExactPosterior
 from startrack.localization.importance_sampling import sample
 from startrack.terrain import Cylinder, HeightMap, load_terrain

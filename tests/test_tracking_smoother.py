@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from tracking_helpers import HEIGHT_SIGMA_M, STEP_SIGMA_M, Drive, mean_nees, shifted, simulate_drive, with_slips
 
-from startrack.applications.tracking import filter as tracking_filter
 from startrack.applications.tracking.contradictions import smooth_robustly
-from startrack.applications.tracking.filter import TrackFilter
-from startrack.applications.tracking.online import OnlineTrack
-from startrack.applications.tracking.smoother import Observations, Steps, smooth
-from startrack.applications.tracking.track import filter_positions
+from startrack.applications.tracking.online import OnlineTrack, filter_positions
+from startrack.estimation import filter as tracking_filter
+from startrack.estimation.filter import TrackFilter
+from startrack.estimation.observations import Observations, Steps
+from startrack.estimation.smoother import smooth
 
 
 def least_squares(drive: Drive, frames: int) -> tuple[np.ndarray, np.ndarray]:
@@ -74,8 +74,7 @@ def test_the_filter_forgets_posts_without_a_jump(monkeypatch):
     drive = simulate_drive(np.random.default_rng(12), 30)
     modes = [(e,) for e in drive.estimates]
     whole, covariance = filter_positions(modes, drive.steps, 1, HEIGHT_SIGMA_M)
-    monkeypatch.setattr(tracking_filter, "MOST_POSTS", 24)
-    monkeypatch.setattr(tracking_filter, "KEPT_POSTS", 12)  # a frame depends on 8, of which the next has 6
+    monkeypatch.setattr(tracking_filter, "MOST_POSTS", 16)  # 12 are kept: a frame depends on 8, of which the next has 6
     state = TrackFilter(1, HEIGHT_SIGMA_M)
     for k, estimate in enumerate(drive.estimates):
         if k:

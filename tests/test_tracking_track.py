@@ -10,7 +10,7 @@ import pytest
 from tracking_helpers import HEIGHT_SIGMA_M, shifted, simulate_drive
 
 from startrack.applications.tracking import ObservedFrame, Odometry, Track, TrackErrors, estimate_track
-from startrack.applications.tracking.track import odometry_steps
+from startrack.applications.tracking.odometry import odometry_steps
 from startrack.core.errors import BadInput
 from startrack.frames import R_body_enu_from_heading_pitch_roll, quat_xyzw_from_R
 from startrack.localization.shared_errors import SharedErrors

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.applications.tracking.frame_estimate import FrameEstimate
-from startrack.applications.tracking.smoother import Steps
 from startrack.core.types import Array, Ints
+from startrack.estimation.observations import FrameEstimate, Steps
 
 HEIGHT_SIGMA_M = 5.0
 POSTS_IN_PLAY, POSTS_KEPT = 8, 6  # of a frame, and of the frame before

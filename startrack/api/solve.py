@@ -7,8 +7,14 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from startrack.api.solution import Solution
-from startrack.applications.tracking import Odometry, Track, TrackSession, read_odometry
-from startrack.applications.tracking.track import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
+from startrack.applications.tracking import (
+    ODOMETRY_FLOOR_M,
+    ODOMETRY_SIGMA,
+    Odometry,
+    Track,
+    TrackSession,
+    read_odometry,
+)
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
 from startrack.chain import (

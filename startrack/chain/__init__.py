@@ -1,5 +1,6 @@
 """From one image to the position: the chain of the stages, and the values that they return."""
 
+from startrack.chain.fingerprint import MISSING, are_unchanged, content_sha256, input_hashes, job_sha256
 from startrack.chain.inputs import (
     Image,
     Time,
@@ -39,6 +40,7 @@ from startrack.chain.star_fix import locate_rays
 __all__ = [
     "COMPLETE_V_MAG",
     "EDGE_SIGMA_PX",
+    "MISSING",
     "NO_TIME",
     "STAGES",
     "Detected",
@@ -55,14 +57,18 @@ __all__ = [
     "StarRays",
     "Time",
     "angle_rad",
+    "are_unchanged",
     "camera_input",
+    "content_sha256",
     "detect",
     "duration_s",
     "exposure_input",
     "field_of_view_rad",
     "identify",
     "identify_blind",
+    "input_hashes",
     "is_list_of_centroids",
+    "job_sha256",
     "last_value",
     "load_camera_input",
     "locate",

@@ -166,7 +166,7 @@ def run_images(args: argparse.Namespace, format_name: str, one: Callable[[str, s
     A BadInput or an internal error of one image is its outcome and does not stop the others.
     """
     codes = [0]
-    from startrack.applications.batch.find import result_stems
+    from startrack.applications.batch import result_stems
     from startrack.exposure import split_bag_path
 
     if args.image_topic is not None and not any(split_bag_path(path) for path in args.images):

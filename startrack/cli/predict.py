@@ -199,10 +199,10 @@ def _places(args: argparse.Namespace, conditions: Conditions) -> Any:
 
 def _inputs(args: argparse.Namespace) -> tuple[tuple[str, str], ...]:
     """Name and SHA-256 of the files that the flags name, and of the maps that these name."""
-    from startrack.applications.batch.fingerprint import input_hashes
+    from startrack.chain import input_hashes
 
-    references = [_reference(one) for one in (args.camera, args.terrain, args.compare) if one is not None]
-    found = input_hashes(os.path.join(args.dir, "predict.json"), references)
+    cameras = [_reference(one) for one in (args.camera, args.compare) if one is not None]
+    found = input_hashes(os.path.join(args.dir, "predict.json"), cameras, _reference(args.terrain))
     return tuple(sorted({(Path(path).name, sha256) for path, sha256 in found.items()}))
 
 

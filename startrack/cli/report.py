@@ -98,7 +98,7 @@ def write_page_of_images(out: str, images: Sequence[str]) -> None:
 
     An image that could not be read has no result to show.
     """
-    from startrack.applications.batch.find import result_stems
+    from startrack.applications.batch import result_stems
 
     results = [path for stem in result_stems(images) if (path := Path(out) / f"{stem}.fix.json").is_file()]
     if len(images) == 1 and results:

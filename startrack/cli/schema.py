@@ -20,7 +20,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a schema; 0, or a usage error for an unknown kind."""
-    from startrack.applications.tracking.schema import TRACK
+    from startrack.applications.tracking import TRACK
     from startrack.output.schema import SCHEMAS
 
     schemas = {**SCHEMAS, "track": TRACK}

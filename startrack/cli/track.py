@@ -56,8 +56,7 @@ def run(args: argparse.Namespace) -> int:
     """Estimate and write the track; the exit code of its worst image."""
     _check_flags(args)
     _check_frames(args)
-    from startrack.applications.tracking.frame_store import FrameStore
-    from startrack.applications.tracking.session import TrackSession
+    from startrack.applications.tracking import FrameStore, TrackSession
     from startrack.chain import Settings
 
     _check_folder(args)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -17,8 +18,7 @@ from startrack.cli.progress import progress
 from startrack.core.errors import EXIT_BAD_INPUT, EXIT_STOPPED, BadInput, exit_code_of
 
 if TYPE_CHECKING:
-    from startrack.applications.tracking import ObservedFrame, Odometry, Track
-    from startrack.applications.tracking.session import TrackSession
+    from startrack.applications.tracking import ObservedFrame, Odometry, Track, TrackSession
     from startrack.core.types import Exposure
 
 Source = tuple[str, "Callable[[], ObservedFrame]"]  # of one image: its name, and what adds it to the track
@@ -59,15 +59,19 @@ class TrackRun:
         """Take images as they come; Ctrl-C and SIGTERM end it, before the first image with the code of a stop."""
         import signal
 
-        from startrack.applications.tracking.follow import follow_images
+        from startrack.applications.batch import images_under
+        from startrack.applications.tracking import follow_images
 
+        folder = self.args.frames[0]
         former = signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
-            for image in follow_images(
-                self.args.frames[0], self.args.dir, lambda image: self._note(self._add(image.path)),
-                lambda image, cause: self._refuse(image.name, cause), until_idle_s=self.args.until_idle,
+            for path in follow_images(
+                lambda: [image.path for image in images_under(folder, self.args.dir)],
+                lambda path: self._note(self._add(path)),
+                lambda path, cause: self._refuse(os.path.relpath(path, folder), cause),
+                until_idle_s=self.args.until_idle,
             ):  # fmt: skip
-                self._update(image is not None)
+                self._update(path is not None)
         except KeyboardInterrupt:
             if not self.session.frames:
                 print("startrack: interrupted before the first image", file=sys.stderr, flush=True)
@@ -108,7 +112,7 @@ class TrackRun:
 
     def _print_newest(self) -> bool:
         """Print a line about each image that has none yet; whether there was one."""
-        from startrack.applications.tracking.quantities import frame_records
+        from startrack.applications.tracking import frame_records
 
         args, session = self.args, self.session
         before = self._printed
@@ -130,7 +134,7 @@ class TrackRun:
 
     def _paths(self) -> list[str] | None:
         """The image files; None for a bag."""
-        from startrack.applications.batch.find import images_under
+        from startrack.applications.batch import images_under
         from startrack.exposure import is_bag
 
         first = Path(self.args.frames[0])
@@ -201,7 +205,7 @@ class TrackRun:
         return None if self._moves is None else self._moves.read()
 
     def _write(self, track: Track, pictures: bool = True) -> None:
-        from startrack.applications.tracking.write import write_track
+        from startrack.applications.tracking import write_track
 
         args, odometry = self.args, None
         if args.odometry is not None:
@@ -210,8 +214,7 @@ class TrackRun:
         write_track(track, Path(args.dir), odometry=odometry, pictures=made)
 
     def _pictures(self, track: Track) -> dict[str, bytes]:
-        from startrack.applications.tracking.page import track_page
-        from startrack.applications.tracking.picture import draw_track
+        from startrack.applications.tracking import draw_track, track_page
         from startrack.output.write import png_bytes
 
         args, moves_m = self.args, None
@@ -225,7 +228,7 @@ class TrackRun:
         return {"track.png": picture, "track.html": page.encode()}
 
     def _print_frames(self, track: Track) -> None:
-        from startrack.applications.tracking.quantities import frame_records
+        from startrack.applications.tracking import frame_records
 
         for record in frame_records(track):
             if self.args.json:
@@ -234,7 +237,7 @@ class TrackRun:
                 print(_line(record, ""))
 
     def _print_summary(self, track: Track) -> None:
-        from startrack.applications.tracking.write import track_record
+        from startrack.applications.tracking import track_record
 
         if self.args.quiet or self.args.json:
             return

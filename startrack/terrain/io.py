@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -87,6 +88,16 @@ def load_terrain(name_or_path: str | Path) -> Terrain:
         return _load_cached(path.absolute(), text, _map_stamps(path.parent, read_keys(text)))
     except BadInput as cause:
         raise BadInput("bad_terrain", f"{printable(path)}: {cause}") from cause
+
+
+def files_of_terrain(path: str | Path) -> tuple[Path, ...]:
+    """The files that the terrain of the file at `path` is read from, beside it; where it cannot be loaded, its maps."""
+    try:
+        return load_terrain(path).files
+    except BadInput:  # refused when it is used; a map that is missing may come
+        with suppress(BadInput):
+            return tuple(_map_files(read_keys(read_text(path, "bad_terrain")), Path(path).parent))
+        return ()
 
 
 def body_of_terrain(name_or_path: str | Path) -> str:
@@ -183,6 +194,7 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
         name=name,
         site=site,
         maps=tuple(read_map(file, near=near, **scaling) for file in _map_files(keys, folder)),
+        files=tuple(_map_files(keys, folder)),
         camera_height_m=rover.get("camera_height_m", DEFAULT_CAMERA_HEIGHT_M),
         search_radius_m=search.get("radius_m", DEFAULT_MAP_RADIUS_M),
         height_sigma_m=dem.get("height_sigma_m", 0.0),

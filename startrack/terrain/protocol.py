@@ -63,6 +63,7 @@ class Terrain(ABC):
     rim_radius_m: float | None = None  # of a circular rim about the origin, drawn on maps instead of the relief
     table_path: Path | None = None  # file of the table that `prepare` computes; None where it computes none
     unstated_errors: tuple[str, ...] = ()  # keys of errors that the terrain file leaves out: they count as zero
+    files: tuple[Path, ...] = ()  # that it was read from, beside the terrain file: what is made with it depends on them
 
     @property
     def reach_m(self) -> float:

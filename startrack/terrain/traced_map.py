@@ -37,6 +37,7 @@ class TracedMap(Terrain):
     name: str = "height map"
     site: Site
     maps: tuple[Raster, ...]  # finest first
+    files: tuple[Path, ...] = ()  # of them
     camera_height_m: float = 1.5
     search_radius_m: float = 10_000.0
     finest_m = FINEST_BOX_M

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from startrack.applications.batch.find import Image
-from startrack.applications.batch.fingerprint import content_sha256
+from startrack.chain import content_sha256
 from startrack.core.errors import BadInput
 from startrack.core.files import Locked, hold_lock
 from startrack.output.write import COMPANIONS, PICTURES, SKYLINE_FILES
@@ -73,6 +74,15 @@ def image_sha256(record: dict[str, Any]) -> str | None:
     """SHA-256 of the image that a batch made the record from; None for records of `locate`."""
     sha256 = record.get("provenance", {}).get("image_sha256") if JOB in record else None
     return sha256 if isinstance(sha256, str) else None
+
+
+def is_older_than(image: str | os.PathLike[str], result: str | os.PathLike[str]) -> bool:
+    """Whether the image was neither written nor moved after its result was written; neither file is read."""
+    try:
+        of_image, of_result = os.stat(image), os.stat(result)
+    except (OSError, ValueError):  # a NUL in the name
+        return False
+    return max(of_image.st_mtime_ns, of_image.st_ctime_ns) < of_result.st_mtime_ns
 
 
 def text_of_name(name: str) -> str:

@@ -10,23 +10,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack import __version__
-from startrack.applications.batch.fingerprint import (
-    MISSING,
-    are_unchanged,
-    content_sha256,
-    input_hashes,
-    is_older_than,
-    job_sha256,
-)
 from startrack.applications.batch.store import (
     INPUTS,
     JOB,
     has_companions,
     image_sha256,
+    is_older_than,
     is_solved,
     stored_record,
     text_of_name,
 )
+from startrack.chain import MISSING, are_unchanged, content_sha256, input_hashes, job_sha256
 from startrack.core.errors import BAD_INPUT_REASONS, INTERNAL_ERROR, BadInput
 from startrack.core.runner import Died, Runner, RunStopped
 
@@ -179,7 +173,7 @@ def _locate(task: Task, sha256: str) -> tuple[Outcome | dict[str, Any], dict[str
         return {**refused_dict(task.name, cause.reason, str(cause)), **_unread_provenance(sha256)}, {}
     # Before the files are read, so that a change in between is noticed.
     mask = exposure.mask if isinstance(exposure.mask, str) else None
-    inputs = input_hashes(task.path, [exposure.camera, exposure.terrain, mask])
+    inputs = input_hashes(task.path, [exposure.camera], exposure.terrain, mask)
     try:
         near = None if task.near is None else PositionPrior(*task.near)
         settings = Settings(

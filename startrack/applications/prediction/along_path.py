@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from startrack.applications.prediction.statistics import Cells
-from startrack.applications.tracking.circles import radius_holding
-from startrack.applications.tracking.filter import TrackFilter
-from startrack.applications.tracking.frame_estimate import FrameEstimate
-from startrack.applications.tracking.smoother import Observations, Steps, smooth
 from startrack.core.types import Array
+from startrack.estimation.filter import TrackFilter
+from startrack.estimation.observations import FrameEstimate, Observations, Steps
+from startrack.estimation.smoother import radius_holding, smooth
 from startrack.output.quantities_prediction import FILTERED, SMOOTHED
 
 RADIUS_PART = 0.95

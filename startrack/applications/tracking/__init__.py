@@ -1,13 +1,30 @@
 """Many exposures: tracks of a camera at rest or on a drive; odometry from text and ROS bags."""
 
-from startrack.applications.tracking.observe import ObservedFrame, observe_frame
+from startrack.applications.tracking.follow import follow_images
+from startrack.applications.tracking.frame_store import FrameStore
+from startrack.applications.tracking.observed_frame import ObservedFrame, observe_frame
 from startrack.applications.tracking.odometry import Odometry, read_odometry
+from startrack.applications.tracking.page import track_page
+from startrack.applications.tracking.picture import draw_track
+from startrack.applications.tracking.quantities import FRAME_QUANTITIES, frame_records
+from startrack.applications.tracking.schema import TRACK
 from startrack.applications.tracking.session import TrackSession
-from startrack.applications.tracking.shared import TrackErrors
-from startrack.applications.tracking.track import CrestHeights, Track, TrackFrame, Trajectory, estimate_track
+from startrack.applications.tracking.track import (
+    ODOMETRY_FLOOR_M,
+    ODOMETRY_SIGMA,
+    CrestHeights,
+    Track,
+    TrackFrame,
+    Trajectory,
+    estimate_track,
+)
+from startrack.applications.tracking.track_errors import TrackErrors
+from startrack.applications.tracking.write import track_record, write_track
 from startrack.exposure import read_bag_exposures
 
 __all__ = [
-    "CrestHeights", "ObservedFrame", "Odometry", "Track", "TrackErrors", "TrackFrame", "TrackSession", "Trajectory",
-    "estimate_track", "observe_frame", "read_bag_exposures", "read_odometry",
+    "FRAME_QUANTITIES", "ODOMETRY_FLOOR_M", "ODOMETRY_SIGMA", "TRACK", "CrestHeights", "FrameStore", "ObservedFrame",
+    "Odometry", "Track", "TrackErrors", "TrackFrame", "TrackSession", "Trajectory", "draw_track", "estimate_track",
+    "follow_images", "frame_records", "observe_frame", "read_bag_exposures", "read_odometry", "track_page",
+    "track_record", "write_track",
 ]  # fmt: skip

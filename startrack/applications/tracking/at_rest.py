@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.applications.tracking.contradictions import RobustTrack, smooth_robustly
-from startrack.applications.tracking.frame_estimate import LEAST_HALF_M, REACH_SIGMAS, FrameEstimate, observe_together
-from startrack.applications.tracking.frame_model import UNKNOWN_M, FrameModel
-from startrack.applications.tracking.frame_sampling import sample_together
-from startrack.applications.tracking.observe import ObservedFrame
-from startrack.applications.tracking.shared import TrackErrors
-from startrack.applications.tracking.smoother import Observations, Smoothed, Steps, smooth
+from startrack.applications.tracking.contradictions import smooth_robustly
+from startrack.applications.tracking.frame_estimate import LEAST_HALF_M, REACH_SIGMAS, observe_together
+from startrack.applications.tracking.frame_model import FrameModel, sample_together
+from startrack.applications.tracking.observed_frame import ObservedFrame
+from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.core.types import Array, BadInput, Ints
+from startrack.estimation.observations import UNKNOWN_M, FrameEstimate, Observations, Steps
+from startrack.estimation.smoother import Smoothed, smooth
 from startrack.terrain import Terrain
 
 STILL_M = 1e-3  # of a camera at rest from exposure to exposure, in the comparison of single fixes
@@ -38,21 +38,29 @@ def positions_at_rest(frames: Sequence[ObservedFrame], terrain: Terrain, errors:
     those with a single position or more are elsewhere.
     """
     n = len(frames)
-    agreeing = agreeing_fixes([frame.modes for frame in frames], terrain.height_sigma_m)
+    still = Steps(np.zeros((n - 1, 2)), np.full(n - 1, STILL_M))
+    agreeing = smooth_robustly([frame.modes for frame in frames], still, terrain.height_sigma_m, may_slip=False)
     mode, by_fixes = agreeing.mode, agreeing.smoothed
     _require_rest(frames, mode)
     position, covariance = np.zeros((n, 2)), np.repeat([UNKNOWN_M**2 * np.eye(2)], n, axis=0)
+
+    def take(k: int, estimate: FrameEstimate) -> Smoothed:
+        found = smooth(Observations.of([estimate], terrain.height_sigma_m), Steps.unknown(1))
+        position[k:], covariance[k:] = found.position_m[0], found.covariance_m2[0]
+        return found
+
     first, *later = np.flatnonzero(mode >= 0).tolist()
-    found = _alone(frames[first].modes[mode[first]], terrain)
-    position[first:], covariance[first:] = found.position_m[0], found.covariance_m2[0]
+    found = take(first, frames[first].modes[mode[first]])
     reference = by_fixes.position_m[0]
     half = max(REACH_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(found.covariance_m2[0])[1])), LEAST_HALF_M)
-    models = _models(frames[first], terrain, errors, reference, half)
-    for k in later:
-        models += _models(frames[k], terrain, errors, reference, half)
-        points = sample_together(models, reference, by_fixes.covariance_m2[0])
-        found = _alone(observe_together(models, points), terrain)
-        position[k:], covariance[k:] = found.position_m[0], found.covariance_m2[0]
+    models: list[FrameModel] = []
+    for k in (first, *later):
+        evidence = frames[k].evidence
+        if evidence is not None:
+            models.append(FrameModel.near(evidence, terrain, errors, reference, half))
+        if k != first:
+            points = sample_together(models, reference, by_fixes.covariance_m2[0])
+            found = take(k, observe_together(models, points))
     return AtRest(position, covariance, found, mode)
 
 
@@ -64,21 +72,3 @@ def _require_rest(frames: Sequence[ObservedFrame], mode: Ints) -> None:
             "inconsistent_evidence",
             f"only {agree} of {count} images agree on one position: has the camera moved? Then leave --at-rest out",
         )
-
-
-def agreeing_fixes(modes: Sequence[Sequence[FrameEstimate]], height_sigma_m: float) -> RobustTrack:
-    """The single fixes as a track that does not move: which of them agree."""
-    still = Steps(np.zeros((len(modes) - 1, 2)), np.full(len(modes) - 1, STILL_M))
-    return smooth_robustly(modes, still, height_sigma_m, may_slip=False)
-
-
-def _alone(estimate: FrameEstimate, terrain: Terrain) -> Smoothed:
-    return smooth(Observations.of([estimate], terrain.height_sigma_m), Steps.unknown(1))
-
-
-def _models(
-    frame: ObservedFrame, terrain: Terrain, errors: TrackErrors, reference_m: Array, half_m: float
-) -> list[FrameModel]:
-    if frame.evidence is None:
-        return []
-    return [FrameModel.near(frame.evidence, terrain, errors, reference_m, half_m)]

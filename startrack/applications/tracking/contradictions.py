@@ -12,16 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.applications.tracking.frame_estimate import FrameEstimate
-from startrack.applications.tracking.smoother import Observations, Smoothed, Steps, smooth
 from startrack.core.types import Array, Bools, Ints
+from startrack.estimation.observations import FrameEstimate, Observations, Steps
+from startrack.estimation.smoother import Smoothed, smooth
 
 SLIP_PROBABILITY, SLIP_SIGMA_M = 0.05, 20.0  # of a move by wheel slip, and its size on each axis
 WRONG_PROBABILITY, WRONG_SIGMA_M = 1e-3, 200.0  # of a frame, and the error of its position on each axis
-WRONG_SIGMA = 1.0  # of each shared error by a wrong frame, in standard deviations of its prior
 EARLIER_NATS = 1e-6  # of two frames that contradict each other equally the later one is left out
 NEIGHBOURS = 2  # frames and moves to each side that one gross error makes doubtful
-SHIFTS = 4  # moves to each side, to which a slip may belong instead
 MAX_ROUNDS = 30
 
 
@@ -44,6 +42,8 @@ def smooth_robustly(
     """
     mode = np.array([0 if len(of) == 1 else -1 for of in modes])
     slipped = np.zeros(len(modes) - 1, dtype=bool)
+    known = np.isfinite(steps.sigma_m)
+    placed = np.append(known, False) | np.insert(known, 0, False)  # frames with a known move
     tried, observations = set(), _chosen(modes, mode, height_sigma_m)
     for _ in range(MAX_ROUNDS):
         found = smooth(observations, _without(steps, slipped))
@@ -52,7 +52,7 @@ def smooth_robustly(
             break
         tried.add(state)
         doubt_steps = step_doubt(found, steps) if may_slip else np.full(len(slipped), -np.inf)
-        new_mode, doubt_frames = _frame_doubt(found, observations, modes, mode, _has_known_move(steps))
+        new_mode, doubt_frames = _frame_doubt(found, observations, modes, mode, placed)
         # Moves stand between frames: one line of doubts, frame, move, frame, ...
         doubt = np.full(2 * len(modes) - 1, -np.inf)
         doubt[::2], doubt[1::2] = doubt_frames, doubt_steps
@@ -86,19 +86,14 @@ def _improve_slips(found: Smoothed, steps: Steps, slipped: Bools) -> Bools:
     """
     improved = slipped.copy()
     for k in np.flatnonzero(slipped).tolist():
-        near = _near(k, steps)
+        near = np.arange(max(k - 2 * NEIGHBOURS, 0), min(k + 2 * NEIGHBOURS + 1, len(slipped)))
+        near = near[(near != k) & np.isfinite(steps.sigma_m[near])]
         near = near[(improved == slipped)[near]] if improved[k] else near[:0]
         gains = [_gain(found, steps, slipped, k, other) for other in near.tolist()]
         if gains and max(gains) > 0.0:
             other = near[int(np.argmax(gains))]
             improved[k], improved[other] = False, not slipped[other]
     return improved
-
-
-def _near(k: int, steps: Steps) -> Ints:
-    """Known moves to each side of a move."""
-    near = np.arange(max(k - SHIFTS, 0), min(k + SHIFTS + 1, len(steps.sigma_m)))
-    return near[(near != k) & np.isfinite(steps.sigma_m[near])]
 
 
 def _gain(found: Smoothed, steps: Steps, slipped: Bools, here: int, there: int) -> float:
@@ -132,12 +127,6 @@ def log_normal(residual: Array, covariance: Array) -> Array:
     """Logarithm of normal densities at residuals (..., 2) with covariances (..., 2, 2), less a constant."""
     chi2 = np.einsum("...i,...ij,...j->...", residual, np.linalg.inv(covariance), residual)
     return np.asarray(-0.5 * chi2 - 0.5 * np.linalg.slogdet(covariance)[1])
-
-
-def _has_known_move(steps: Steps) -> Bools:
-    """Whether a move to or from each frame (n,) is known."""
-    known = np.isfinite(steps.sigma_m)
-    return np.append(known, False) | np.insert(known, 0, False)
 
 
 def _frame_doubt(
@@ -186,7 +175,7 @@ def wrong_log_odds(residual: Array, covariance: Array, estimate: FrameEstimate, 
 
 def wrong_covariance(estimate: FrameEstimate) -> Array:
     """(p, p) by which the residual of a wrong frame varies beside that of a right one."""
-    sigma = np.r_[WRONG_SIGMA_M, WRONG_SIGMA_M, np.full(estimate.parameters - 2, WRONG_SIGMA)]
+    sigma = np.r_[WRONG_SIGMA_M, WRONG_SIGMA_M, np.ones(estimate.parameters - 2)]  # of shared errors, that of the prior
     return np.asarray((estimate.response * np.square(sigma)) @ estimate.response.T)
 
 

@@ -8,17 +8,17 @@ the parameters with the slopes of the log-likelihood: the derivative of a poster
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from startrack.applications.tracking.frame_model import FrameModel
-from startrack.applications.tracking.frame_sampling import balanced_moments, sample_together
-from startrack.applications.tracking.shared import TrackErrors
+from startrack.applications.tracking.frame_model import FrameModel, balanced_moments, sample_together
+from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.core.types import Array, Evidence, Ints
+from startrack.estimation.observations import FrameEstimate
 from startrack.localization.importance_sampling import WeightedPoints, moments
 from startrack.localization.skyline_model import MIDDLES_RAD
-from startrack.terrain import NO_POST, HorizonPosts, Terrain
+from startrack.terrain import NO_POST, Terrain
 
 REACH_SIGMAS, MARGIN_M = 6.0, 5.0  # of a Gaussian, to the side of the neighbourhood
 LEAST_HALF_M = 40.0  # of the neighbourhood
@@ -26,24 +26,6 @@ MAX_NEIGHBOURHOODS = 3  # after so many the posterior is taken as it is
 MIN_NOISE_SHARE = 0.3  # of the evidence's covariance: the least noise that a frame has of its own
 NEGLIGIBLE_POST = 1e-4  # part of the variance of a position, by all posts that are left out together
 ROUNDING = 1e-9  # of the covariance, added to the noise so that it can be inverted
-
-
-@dataclass(frozen=True, eq=False)
-class FrameEstimate:
-    """The observation of one frame. Parameters: east and north [m], and k shared errors in their prior's sigma."""
-
-    mean: Array  # (2 + k,) of the posterior with the priors of the shared errors
-    covariance: Array  # (2 + k, 2 + k) of that, with the errors of posts
-    response: Array  # (2 + k, 2 + k) of the mean to the true parameters: K
-    noise: Array  # (2 + k, 2 + k) of the mean, of this frame alone
-    post: Ints  # (c,) numbers of the posts with a measurable effect
-    by_post: Array  # (2 + k, c) of the mean to the error [m] of each: G
-    weight: float = 1.0  # probability of this mode of the frame's posterior
-
-    @property
-    def parameters(self) -> int:
-        """2 + k."""
-        return len(self.mean)
 
 
 def estimate_frame(
@@ -88,7 +70,7 @@ def observe_together(models: Sequence[FrameModel], found: WeightedPoints) -> Fra
         slopes = model.slopes(points, share)
         common = ((points - plain) * share[:, None]).T @ (slopes - share @ slopes)
         own = covariance @ np.linalg.solve(spread, common)
-        counted += (own * np.square(model.map_sigma_rad)) @ own.T
+        counted += (own * np.square(model.model.map_sigma_rad)) @ own.T
         by_horizon += own
     noise = clipped_noise(by_evidence - counted, by_evidence) + ROUNDING * covariance
     post, by_post = _posts(models[0], by_horizon, covariance)
@@ -141,20 +123,16 @@ def _posts(model: FrameModel, by_horizon: Array, covariance: Array) -> tuple[Int
     if not terrain.height_sigma_m:
         return np.zeros(0, dtype=np.int64), np.zeros((len(by_horizon), 0))
     parts = [terrain.horizon_posts(at, MIDDLES_RAD), terrain.ground_posts(at, MIDDLES_RAD)]
+    every = np.concatenate([part.post.ravel() for part in parts])
     # Ground higher than the map acts on the evidence as a map lower than the ground.
-    post, by_post = _sum_by_post(parts, -by_horizon)
+    response = np.concatenate(
+        [(-by_horizon[:, :, None] * part.rad_per_m).reshape(len(by_horizon), -1) for part in parts], axis=1
+    )
+    known = every != NO_POST
+    post, of = np.unique(every[known], return_inverse=True)
+    by_post: Array = np.stack([np.bincount(of, weights=row[known], minlength=len(post)) for row in response])
     scale = terrain.height_sigma_m / np.sqrt(np.diag(covariance))
     effect = np.square(by_post * scale[:, None]).max(axis=0, initial=0.0)
     order = np.argsort(effect)
     kept = np.sort(order[np.cumsum(effect[order]) > NEGLIGIBLE_POST])
     return post[kept], by_post[:, kept]
-
-
-def _sum_by_post(parts: list[HorizonPosts], by_horizon: Array) -> tuple[Ints, Array]:
-    post = np.concatenate([part.post.ravel() for part in parts])
-    response = np.concatenate(
-        [(by_horizon[:, :, None] * part.rad_per_m).reshape(len(by_horizon), -1) for part in parts], 1
-    )
-    known = post != NO_POST
-    numbers, of = np.unique(post[known], return_inverse=True)
-    return numbers, np.stack([np.bincount(of, weights=row[known], minlength=len(numbers)) for row in response])

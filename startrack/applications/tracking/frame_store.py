@@ -12,10 +12,10 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from startrack.applications.tracking.frame_estimate import FrameEstimate
-from startrack.applications.tracking.observe import ImageFix, ObservedFrame
+from startrack.applications.tracking.observed_frame import ImageFix, ObservedFrame
 from startrack.core.files import write_atomically
 from startrack.core.types import Array, Clock, Evidence, ImageErrors, ShownError
+from startrack.estimation.observations import FrameEstimate
 
 FORMAT = "startrack.observed-frame/3"
 T = TypeVar("T")
@@ -46,19 +46,15 @@ class FrameStore:
 
 def encode_frame(frame: ObservedFrame) -> bytes:
     """The `frame` as a NumPy archive, without pickled objects."""
-    arrays: dict[str, Array] = {}
-    if frame.R_body_enu is not None:
-        arrays["R_body_enu"] = frame.R_body_enu
-    for number, mode in enumerate(frame.modes):
-        arrays |= _arrays(f"mode{number}", mode)
-    for number, fix in enumerate(frame.fixes):
-        arrays |= _arrays(f"fix{number}", fix)
+    arrays: dict[str, Array] = {} if frame.R_body_enu is None else {"R_body_enu": frame.R_body_enu}
+    parts: dict[str, Any] = {f"mode{number}": mode for number, mode in enumerate(frame.modes)}
+    parts |= {f"fix{number}": fix for number, fix in enumerate(frame.fixes)}
     if frame.evidence is not None:
         arrays |= {f"evidence.{name}": np.asarray(getattr(frame.evidence, name)) for name in ROWS}
-        if frame.evidence.clock is not None:
-            arrays |= _arrays("clock", frame.evidence.clock)
-        if frame.evidence.image_errors is not None:
-            arrays |= _arrays("errors", frame.evidence.image_errors)
+        parts |= {"clock": frame.evidence.clock, "errors": frame.evidence.image_errors}
+    for prefix, part in parts.items():
+        if part is not None:  # a dataclass of numbers and arrays
+            arrays |= {f"{prefix}.{f.name}": np.asarray(getattr(part, f.name)) for f in fields(part)}
     head = {
         "format": FORMAT, "name": frame.name, "time_utc": frame.time_utc.isoformat(), "modes": len(frame.modes),
         "fixes": len(frame.fixes), "shown": [asdict(one) for one in frame.shown], "reason": frame.reason,
@@ -76,28 +72,20 @@ def decode_frame(data: bytes) -> ObservedFrame:
     head = json.loads(str(arrays["head"]))
     if head["format"] != FORMAT:
         raise ValueError(f"format {head['format']}, expected {FORMAT}")
+    rows = None
+    if "evidence.llr" in arrays:
+        clock = _value(Clock, "clock", arrays) if "clock.turn_rad_s" in arrays else None
+        errors = _value(ImageErrors, "errors", arrays) if "errors.covariance" in arrays else None
+        rows = Evidence(clock=clock, image_errors=errors, **{name: arrays[f"evidence.{name}"] for name in ROWS})
     return ObservedFrame(
         head["name"], datetime.fromisoformat(head["time_utc"]), arrays.get("R_body_enu"),
-        tuple(_value(FrameEstimate, f"mode{number}", arrays) for number in range(head["modes"])), _evidence(arrays),
+        tuple(_value(FrameEstimate, f"mode{number}", arrays) for number in range(head["modes"])), rows,
         tuple(_value(ImageFix, f"fix{number}", arrays) for number in range(head["fixes"])),
         tuple(ShownError(**one) for one in head["shown"]), head["reason"], head["message"],
     )  # fmt: skip
 
 
-def _arrays(prefix: str, value: Any) -> dict[str, Array]:
-    """The fields of a dataclass of numbers and arrays."""
-    return {f"{prefix}.{f.name}": np.asarray(getattr(value, f.name)) for f in fields(value)}
-
-
 def _value(kind: type[T], prefix: str, arrays: dict[str, Any]) -> T:
-    """The dataclass that `_arrays` took apart."""
+    """The dataclass that `encode_frame` took apart."""
     values = {f.name: arrays[f"{prefix}.{f.name}"] for f in fields(kind)}  # type: ignore[arg-type]
     return kind(**{name: one if one.ndim else float(one) for name, one in values.items()})
-
-
-def _evidence(arrays: dict[str, Any]) -> Evidence | None:
-    if "evidence.llr" not in arrays:
-        return None
-    clock = _value(Clock, "clock", arrays) if "clock.turn_rad_s" in arrays else None
-    errors = _value(ImageErrors, "errors", arrays) if "errors.covariance" in arrays else None
-    return Evidence(clock=clock, image_errors=errors, **{name: arrays[f"evidence.{name}"] for name in ROWS})

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
 from startrack.core.errors import BadInput
 from startrack.core.files import MAX_CAUSE_CHARS, FilePath, printable, read_text
 from startrack.core.types import Array, Value, array
+from startrack.estimation.observations import Steps
 from startrack.exposure.bag import BAG_SUFFIXES, ODOMETRY_TYPES, is_bag, read_messages
 from startrack.frames import format_utc
 
+if TYPE_CHECKING:
+    from startrack.applications.tracking.observed_frame import ObservedFrame
+
 TUM_COLUMNS = "time tx ty tz qx qy qz qw"
-LAST_TIME_S = 253_402_300_799.0  # end of the year 9999: larger numbers are milliseconds or nanoseconds
+LAST_TIME_S = datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC).timestamp()  # larger numbers are milliseconds or less
 QUATERNION_LENGTH_1 = 0.01  # error of a quaternion's length from rounding to two digits; more is another quantity
 SPAN_TOLERANCE_S = 1e-3  # some files round times to 0.1 ms; a rover moves less than 0.1 mm in that time
 MAX_ODOMETRY_BYTES = 2**28  # two million poses
@@ -77,6 +81,31 @@ class Odometry(Value):
                 f"{_utc_text(first)} to {_utc_text(last)}; the first of them is at {_utc_text(time_s[outside][0])}"
             )
         return np.clip(time_s, first, last)
+
+
+def odometry_steps(frames: Sequence[ObservedFrame], odometry: Odometry | None, sigma_1: float, floor_m: float) -> Steps:
+    """Moves between frames in enu, turned by the attitude that the stars show.
+
+    Frames without an attitude of their own take the last one before them, and the odometry's turns since. Moves before
+    the first attitude are not known.
+    """
+    steps = Steps.unknown(len(frames))
+    if odometry is None:
+        return steps
+    time_s = np.array([frame.time_utc.astimezone(UTC).timestamp() for frame in frames])
+    move, sigma, anchor, R = steps.move_m.copy(), steps.sigma_m.copy(), -1, None
+    for k in range(len(frames) - 1):
+        if frames[k].R_body_enu is not None:
+            anchor, R = k, frames[k].R_body_enu
+        if R is None:
+            continue
+        at = np.unique([anchor, k, k + 1])
+        # From the anchor to either frame, in the axes of the anchor's body.
+        ends = [odometry.increments_body_m(time_s[[anchor, end]])[0] for end in at[1:]]
+        move_body = ends[-1] - (ends[-2] if len(ends) > 1 else 0.0)
+        move[k] = (R.T @ move_body)[:2]
+        sigma[k] = np.hypot(sigma_1 * np.linalg.norm(move_body), floor_m)
+    return Steps(move, sigma)
 
 
 def read_odometry(path: FilePath, topic: str | None = None, *, growing: bool = False) -> Odometry:

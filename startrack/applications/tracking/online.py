@@ -16,10 +16,9 @@ from startrack.applications.tracking.contradictions import (
     wrong_covariance,
     wrong_log_odds,
 )
-from startrack.applications.tracking.filter import TrackFilter
-from startrack.applications.tracking.frame_estimate import FrameEstimate
-from startrack.applications.tracking.smoother import Steps
 from startrack.core.types import Array
+from startrack.estimation.filter import TrackFilter
+from startrack.estimation.observations import FrameEstimate, Steps
 
 CLEAR_NATS = 3.0  # by which a mode must be likelier than the other modes
 SUSPECT_FRAMES = 2  # left out in a row, after which the frames before them are tried anew
@@ -86,9 +85,11 @@ class OnlineTrack:
         for number, mode in enumerate(modes):
             residual, covariance = self._filter.innovation(mode)
             covariance[[0, 1], [0, 1]] += sigma_m**2
+            wider = covariance.copy()
+            wider[[0, 1], [0, 1]] += SLIP_SIGMA_M**2
             share = np.log(mode.weight)
             right = np.log(1.0 - SLIP_PROBABILITY - WRONG_PROBABILITY) + log_normal(residual, covariance)
-            slip = np.log(SLIP_PROBABILITY) + log_normal(residual, _wider(covariance, SLIP_SIGMA_M))
+            slip = np.log(SLIP_PROBABILITY) + log_normal(residual, wider)
             wrong = np.log(WRONG_PROBABILITY) + log_normal(residual, covariance + wrong_covariance(mode))
             found += [(share + right, number, False), (share + slip, number, True), (share + wrong, -1, False)]
         self._filter.predict(-move_m, 0.0)
@@ -120,8 +121,14 @@ class OnlineTrack:
             self._take(modes, move_m, sigma_m, mode, slipped)
 
 
-def _wider(covariance: Array, sigma_m: float) -> Array:
-    """The covariance (p, p) with another error of the position on each axis."""
-    found = covariance.copy()
-    found[[0, 1], [0, 1]] += sigma_m**2
-    return found
+def filter_positions(
+    modes: Sequence[Modes], steps: Steps, shared_count: int, height_sigma_m: float
+) -> tuple[Array, Array]:
+    """Positions (n, 2) and covariances (n, 2, 2), each by the frames up to its own."""
+    track, position, covariance = OnlineTrack(shared_count, height_sigma_m), [], []
+    for k, of in enumerate(modes):
+        move, sigma = (np.zeros(2), 0.0) if k == 0 else (steps.move_m[k - 1], float(steps.sigma_m[k - 1]))
+        track.add(of, move, sigma)
+        position.append(track.position_m)
+        covariance.append(track.covariance_m2)
+    return np.array(position), np.array(covariance)

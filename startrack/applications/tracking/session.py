@@ -11,12 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from startrack.applications.batch.fingerprint import input_hashes, job_sha256
 from startrack.applications.tracking.frame_store import FrameStore
-from startrack.applications.tracking.observe import ObservedFrame, facts_of, observe_again, observe_frame
+from startrack.applications.tracking.observed_frame import ObservedFrame, facts_of, observe_again, observe_frame
 from startrack.applications.tracking.odometry import SPAN_TOLERANCE_S, Odometry
 from startrack.applications.tracking.online import RECENT_FRAMES, OnlineTrack
-from startrack.applications.tracking.shared import TrackErrors
 from startrack.applications.tracking.track import (
     ODOMETRY_FLOOR_M,
     ODOMETRY_SIGMA,
@@ -25,8 +23,9 @@ from startrack.applications.tracking.track import (
     odometry_steps,
     track_of_newest,
 )
+from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.catalog import load_catalog
-from startrack.chain import NO_TIME, Settings, load_camera_input, locate, terrain_input
+from startrack.chain import NO_TIME, Settings, input_hashes, job_sha256, load_camera_input, locate, terrain_input
 from startrack.core.errors import BadInput
 
 if TYPE_CHECKING:
@@ -190,7 +189,7 @@ class TrackSession:
         if path is None:
             return None
         mask = exposure.mask if isinstance(exposure.mask, str) else None
-        files = input_hashes(path, [exposure.camera, exposure.terrain, mask])
+        files = input_hashes(path, [exposure.camera], exposure.terrain, mask)
         alone = replace(shared, gross=frozenset())  # with the facts that the image itself shows
         clock = None if shared.listed.clock is None else shared.listed.clock.turn_rad_s.tolist()
         errors = [repr(shared.listed.listed), alone.names, alone.sigma.tolist(), clock]

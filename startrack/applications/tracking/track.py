@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from startrack.applications.tracking.at_rest import positions_at_rest
-from startrack.applications.tracking.circles import radius_holding
 from startrack.applications.tracking.contradictions import RobustTrack, smooth_robustly
-from startrack.applications.tracking.frame_model import UNKNOWN_M
-from startrack.applications.tracking.observe import ImageFix, ObservedFrame
-from startrack.applications.tracking.odometry import Odometry
-from startrack.applications.tracking.online import OnlineTrack
-from startrack.applications.tracking.shared import BIAS, CLOCK, DEPTH, TrackErrors
-from startrack.applications.tracking.smoother import Smoothed, Steps
+from startrack.applications.tracking.observed_frame import ImageFix, ObservedFrame
+from startrack.applications.tracking.odometry import Odometry, odometry_steps
+from startrack.applications.tracking.online import OnlineTrack, filter_positions
+from startrack.applications.tracking.track_errors import BIAS, CLOCK, DEPTH, TrackErrors
 from startrack.core.types import Array, BadInput, Bools, ClockError, Ints
+from startrack.estimation.observations import UNKNOWN_M
+from startrack.estimation.smoother import Smoothed, radius_holding
 from startrack.frames import quat_xyzw_from_R
 from startrack.localization.summary import camera_at
 from startrack.terrain import Terrain
@@ -136,11 +134,17 @@ def estimate_track(
         known_by_first = range(first, first + 1)
     used = np.flatnonzero(robust.mode >= 0).tolist()
     by_one = [] if len(used) > 1 else range(n) if at_rest else used
+    found = robust.smoothed
+    bias, clock, depth = (_shared_error(found, shared, name) for name in (BIAS, CLOCK, DEPTH))
+    crests = None
+    if len(found.post):
+        places_m = terrain.post_positions_m(found.post)
+        crests = CrestHeights(found.post, places_m, found.post_error_m, found.post_sigma_m)
     return Track(
         tuple(_track_frame(frame, mode) for frame, mode in zip(frames, robust.mode, strict=True)),
         _trajectory(*filtered, terrain, frames[first].fixes, known_by_first),
-        _trajectory(*smoothed, terrain, frames[used[0]].fixes, by_one), *_bias(robust.smoothed, shared),
-        _clock(robust.smoothed, shared), _depth(robust.smoothed, shared), _crests(robust.smoothed, terrain),
+        _trajectory(*smoothed, terrain, frames[used[0]].fixes, by_one), *(bias or (0.0, 0.0)),
+        None if clock is None else ClockError(*clock), None if depth is None else DepthError(*depth), crests,
         robust.slipped, at_rest, terrain,
     )  # fmt: skip
 
@@ -151,44 +155,6 @@ def track_of_newest(frame: ObservedFrame, online: OnlineTrack, terrain: Terrain)
     found = _trajectory(online.position_m[None], online.covariance_m2[None], terrain, frame.fixes, known_by_one)
     none = np.zeros(0, dtype=bool)
     return Track((_track_frame(frame, online.mode),), found, found, 0.0, 0.0, None, None, None, none, False, terrain)
-
-
-def filter_positions(
-    modes: Sequence[Sequence[Any]], steps: Steps, shared_count: int, height_sigma_m: float
-) -> tuple[Array, Array]:
-    """Positions (n, 2) and covariances (n, 2, 2), each by the frames up to its own."""
-    track, position, covariance = OnlineTrack(shared_count, height_sigma_m), [], []
-    for k, of in enumerate(modes):
-        move, sigma = (np.zeros(2), 0.0) if k == 0 else (steps.move_m[k - 1], float(steps.sigma_m[k - 1]))
-        track.add(of, move, sigma)
-        position.append(track.position_m)
-        covariance.append(track.covariance_m2)
-    return np.array(position), np.array(covariance)
-
-
-def odometry_steps(frames: Sequence[ObservedFrame], odometry: Odometry | None, sigma_1: float, floor_m: float) -> Steps:
-    """Moves between frames in enu, turned by the attitude that the stars show.
-
-    Frames without an attitude of their own take the last one before them, and the odometry's turns since. Moves before
-    the first attitude are not known.
-    """
-    steps = Steps.unknown(len(frames))
-    if odometry is None:
-        return steps
-    time_s = np.array([frame.time_utc.astimezone(UTC).timestamp() for frame in frames])
-    move, sigma, anchor, R = steps.move_m.copy(), steps.sigma_m.copy(), -1, None
-    for k in range(len(frames) - 1):
-        if frames[k].R_body_enu is not None:
-            anchor, R = k, frames[k].R_body_enu
-        if R is None:
-            continue
-        at = np.unique([anchor, k, k + 1])
-        # From the anchor to either frame, in the axes of the anchor's body.
-        ends = [odometry.increments_body_m(time_s[[anchor, end]])[0] for end in at[1:]]
-        move_body = ends[-1] - (ends[-2] if len(ends) > 1 else 0.0)
-        move[k] = (R.T @ move_body)[:2]
-        sigma[k] = np.hypot(sigma_1 * np.linalg.norm(move_body), floor_m)
-    return Steps(move, sigma)
 
 
 def _track_frame(frame: ObservedFrame, mode: int) -> TrackFrame:
@@ -221,30 +187,10 @@ def _trajectory(
     return found
 
 
-def _bias(found: Smoothed, shared: TrackErrors) -> tuple[float, float]:
-    return _estimate(found, shared, BIAS) or (0.0, 0.0)
-
-
-def _clock(found: Smoothed, shared: TrackErrors) -> ClockError | None:
-    clock = _estimate(found, shared, CLOCK)
-    return None if clock is None else ClockError(*clock)
-
-
-def _depth(found: Smoothed, shared: TrackErrors) -> DepthError | None:
-    depth = _estimate(found, shared, DEPTH)
-    return None if depth is None else DepthError(*depth)
-
-
-def _estimate(found: Smoothed, shared: TrackErrors, name: str) -> tuple[float, float] | None:
+def _shared_error(found: Smoothed, shared: TrackErrors, name: str) -> tuple[float, float] | None:
     """The shared error of this name and its standard deviation; None where it is not shared."""
     if name not in shared.names:
         return None
     at = shared.names.index(name)
     sigma = float(shared.sigma[at])
     return sigma * float(found.shared[at]), sigma * float(np.sqrt(found.shared_covariance[at, at]))
-
-
-def _crests(found: Smoothed, terrain: Terrain) -> CrestHeights | None:
-    if not len(found.post):
-        return None
-    return CrestHeights(found.post, terrain.post_positions_m(found.post), found.post_error_m, found.post_sigma_m)

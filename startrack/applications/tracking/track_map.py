@@ -6,6 +6,7 @@ import numpy as np
 
 from startrack.applications.tracking.track import Track, Trajectory
 from startrack.core.types import Array
+from startrack.estimation.smoother import SIGMAS_95
 from startrack.output.picture.canvas import (
     FAINT_INK,
     INK,
@@ -25,7 +26,6 @@ from startrack.output.picture.relief import draw_contours, ground_of_view
 Legend = list[tuple[str, Colour, str]]  # kind of the mark, its colour, words
 
 ODOMETRY, REFUSED, LEFT_OUT, SLIP = YELLOW, REDDISH_PURPLE, REDDISH_PURPLE, YELLOW
-SIGMAS_95 = float(np.sqrt(-2.0 * np.log(0.05)))  # half axes of the ellipse that holds 95 % of a Gaussian
 SEEN_PX = 14.0  # half of the longer axis that the median ellipse has at least
 SMALLEST_HALF_M = 0.05
 TRACK_PX = 12.0  # half of the room that the track takes

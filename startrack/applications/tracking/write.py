@@ -11,7 +11,7 @@ import numpy as np
 
 from startrack import __version__
 from startrack.applications.tracking.quantities import FRAME_QUANTITIES, frame_records
-from startrack.applications.tracking.track import Track, Trajectory
+from startrack.applications.tracking.track import CrestHeights, Track, Trajectory
 from startrack.core.files import write_atomically
 from startrack.frames import R_from_quat_xyzw, tum_line
 from startrack.output.ecsv import Column, ecsv_text, format_values
@@ -27,8 +27,9 @@ def track_record(track: Track, odometry: dict[str, Any] | None = None) -> dict[s
     """The object in track.json; `odometry` has the settings of the odometry (None: there is none)."""
     statuses = [frame.status for frame in track.frames]
     clock = None if track.clock is None else {"offset_s": track.clock.offset_s, "sigma_s": track.clock.sigma_s}
-    percents = None if track.depth is None else (100.0 * track.depth.error_1, 100.0 * track.depth.sigma_1)
-    depth = None if percents is None else {"error_percent": percents[0], "sigma_percent": percents[1]}
+    depth = track.depth and {
+        "error_percent": 100.0 * track.depth.error_1, "sigma_percent": 100.0 * track.depth.sigma_1
+    }  # fmt: skip
     error_deg, sigma_deg = np.degrees([track.bias_rad, track.bias_sigma_rad]).tolist()
     return {
         "format": FORMAT,
@@ -93,15 +94,17 @@ def frames_table(records: Sequence[dict[str, Any]]) -> str:
 
 def crests_table(track: Track) -> str:
     """track.crests.ecsv: a row for each post of the map whose height the track depends on."""
-    crests, columns = track.crests, []
-    post = np.zeros(0, dtype=np.int64) if crests is None else crests.post
-    position = np.zeros((0, 3)) if crests is None else crests.position_enu_m
-    error, sigma = (np.zeros(0),) * 2 if crests is None else (crests.error_m, crests.sigma_m)
-    columns.append(Column("post", post, "int64", form="%d", description="number of the post in the terrain's maps"))
-    for axis, values in zip(("east", "north", "up"), position.T, strict=True):
+    crests = track.crests or CrestHeights(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+    number = "number of the post in the terrain's maps"
+    columns = [Column("post", crests.post, "int64", form="%d", description=number)]
+    for axis, values in zip(("east", "north", "up"), crests.position_enu_m.T, strict=True):
         columns.append(Column(f"{axis}_m", values, unit="m", form="%.3f", description=f"{axis} of the post by the map"))
-    columns.append(Column("error_m", error, unit="m", form="%.4f", description="height of the ground less the map's"))
-    columns.append(Column("sigma_m", sigma, unit="m", form="%.4f", description="standard deviation of error_m"))
+    columns.append(
+        Column("error_m", crests.error_m, unit="m", form="%.4f", description="height of the ground less the map's")
+    )
+    columns.append(
+        Column("sigma_m", crests.sigma_m, unit="m", form="%.4f", description="standard deviation of error_m")
+    )
     return ecsv_text(columns)
 
 

@@ -7,17 +7,18 @@ from datetime import datetime
 
 import numpy as np
 
-from startrack.applications.tracking.frame_estimate import FrameEstimate, estimate_frame
-from startrack.applications.tracking.shared import TrackErrors
+from startrack.applications.tracking.frame_estimate import estimate_frame
+from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.chain import Located, Measured, Outcome, Refused, last_value
 from startrack.core.types import Array, Evidence, Fix, ShownError
+from startrack.estimation.observations import FrameEstimate
+from startrack.estimation.smoother import SIGMAS_95
 from startrack.evidence.sky_levels import SECTORS
 from startrack.localization.posterior import MIN_ROW_NATS
 from startrack.localization.skyline_profiles import HIGH_RAD, LOW_RAD
 from startrack.localization.summary import camera_at
 from startrack.terrain import Terrain
 
-CIRCLE_SIGMAS = float(np.sqrt(-2.0 * np.log(0.05)))  # of a round Gaussian, in the radius that holds 95 % of it
 MODE_SIGMA_M = 10.0  # of a mode whose circle is not known
 
 
@@ -60,29 +61,26 @@ def observe_frame(outcome: Outcome, errors: TrackErrors | None = None, terrain: 
     time, for a fix that states no error (another localizer), and for one that shows a gross error of a fact that is not
     among those of `errors` (see `TrackErrors.with_gross`).
     """
-    value, when = last_value(outcome), outcome.exposure.time_utc
+    value, name, when = last_value(outcome), outcome.exposure.name, outcome.exposure.time_utc
     if when is None:
-        raise ValueError(f"{outcome.exposure.name}: an image of a track needs its time")
-    R = None
-    if isinstance(value, Measured):
-        R = value.camera.R_body_cam @ value.R_cam_enu
-    if isinstance(outcome, Refused) or not isinstance(value, Located):
-        reason = str(outcome.reason) if isinstance(outcome, Refused) else ""
-        message = outcome.message if isinstance(outcome, Refused) else ""
-        return ObservedFrame(outcome.exposure.name, when, R, (), None, reason=reason, message=message)
+        raise ValueError(f"{name}: an image of a track needs its time")
+    R = value.camera.R_body_cam @ value.R_cam_enu if isinstance(value, Measured) else None
+    if isinstance(outcome, Refused):
+        return ObservedFrame(name, when, R, (), None, reason=str(outcome.reason), message=outcome.message)
+    if not isinstance(value, Located):
+        return ObservedFrame(name, when, R, (), None)
     if value.fix.search == "approximate":
-        raise ValueError(f"{outcome.exposure.name}: a track needs the localizer posterior")
+        raise ValueError(f"{name}: a track needs the localizer posterior")
     terrain = terrain or value.terrain
     if errors is None:
         errors = TrackErrors.of(terrain, value.clock, value.sky_light is not None)
         errors = errors.with_gross(facts_of(value, errors))
     missing = facts_of(value, errors) - errors.gross
     if missing:
-        raise ValueError(f"{outcome.exposure.name}: it shows a gross error of {', '.join(missing)}: it must be shared")
-    fixes = image_fixes(value.fix, terrain)
-    rows = informative_rows(located_evidence(value), terrain, fixes[0].at_time_m)
-    frame = ObservedFrame(outcome.exposure.name, when, R, (), rows, fixes, value.fix.shown)
-    return observe_again(frame, errors, terrain)
+        raise ValueError(f"{name}: it shows a gross error of {', '.join(missing)}: it must be shared")
+    fixes = _image_fixes(value.fix, terrain)
+    rows = _informative_rows(_located_evidence(value), terrain, fixes[0].at_time_m)
+    return observe_again(ObservedFrame(name, when, R, (), rows, fixes, value.fix.shown), errors, terrain)
 
 
 def facts_of(outcome: Outcome, errors: TrackErrors) -> frozenset[str]:
@@ -102,7 +100,7 @@ def observe_again(frame: ObservedFrame, errors: TrackErrors, terrain: Terrain) -
     return replace(frame, modes=tuple(modes))
 
 
-def image_fixes(fix: Fix, terrain: Terrain) -> tuple[ImageFix, ...]:
+def _image_fixes(fix: Fix, terrain: Terrain) -> tuple[ImageFix, ...]:
     """The position of a `fix` by one image, or each of several."""
     if not fix.ambiguous:
         position, at = np.asarray(fix.position_enu_m), np.asarray(fix.at_time_m)
@@ -110,13 +108,13 @@ def image_fixes(fix: Fix, terrain: Terrain) -> tuple[ImageFix, ...]:
     found = []
     for mode in fix.modes:
         at = np.array([mode.east_m, mode.north_m])
-        sigma = mode.radius95_m / CIRCLE_SIGMAS if np.isfinite(mode.radius95_m) else MODE_SIGMA_M
+        sigma = mode.radius95_m / SIGMAS_95 if np.isfinite(mode.radius95_m) else MODE_SIGMA_M
         position = np.asarray(camera_at(at, terrain))
         found.append(ImageFix(position, sigma**2 * np.eye(2), mode.radius95_m, mode.radius999_m, at, mode.weight))
     return tuple(found)
 
 
-def located_evidence(located: Located) -> Evidence:
+def _located_evidence(located: Located) -> Evidence:
     """Rows of the stars and of the sky's light that a position is from, with the errors of the image."""
     stars = replace(located.evidence(), near=None)
     if located.sky_light is None or located.sky_used is None:
@@ -126,7 +124,7 @@ def located_evidence(located: Located) -> Evidence:
     return replace(rows, clock=stars.clock, image_errors=located.image_errors)
 
 
-def informative_rows(rows: Evidence, terrain: Terrain, position_m: Array) -> Evidence:
+def _informative_rows(rows: Evidence, terrain: Terrain, position_m: Array) -> Evidence:
     """The rows about the skyline seen from a position (2,) that say something about it."""
     azimuth = np.linspace(0.0, 2 * np.pi, 721)
     above = rows.elevation_rad - np.interp(rows.azimuth_rad, azimuth, terrain.horizon_rad(position_m[None], azimuth))

@@ -17,6 +17,7 @@ from startrack.catalog import has_deep_catalog
 from startrack.core.errors import BadInput
 from startrack.core.files import is_path, parse_toml, read_text, relative_path
 from startrack.exposure import IMAGE_KEYS, RAW_SUFFIXES, BagImage, Sidecar, sidecar_of
+from startrack.terrain import files_of_terrain
 
 MISSING = "?"  # in place of the hash of a file that cannot be read; once it can, the hash differs
 FILES = ("camera", "terrain", *IMAGE_KEYS)  # facts that may be paths
@@ -63,13 +64,18 @@ def _correction_sha256(image: Path, facts: dict[str, Any]) -> list[str]:
     return [f"{key} {_cached_sha256(Path(file))}" for key, file in files.items() if file]
 
 
-def input_hashes(image: str, references: Iterable[str | None]) -> dict[str, str]:
-    """Path to SHA-256 of the `references`, of a camera's mask and a terrain's height maps; not of shipped files.
+def input_hashes(
+    image: str, cameras: Iterable[str | None], terrain: str | None, mask: str | None = None
+) -> dict[str, str]:
+    """Path to SHA-256 of the files of `cameras`, a `terrain` and a `mask`, and of those that they are read from.
 
-    Paths are relative to the image's folder, so that a tree may move.
+    Shipped files do not count: they belong to the version. Paths are relative to the folder of the `image`, so that a
+    tree may move.
     """
-    files = [Path(reference) for reference in references if reference and is_path(reference)]
-    files += [named for file in tuple(files) if file.suffix == ".toml" for named in _named_files(file)]
+    named = [reference for reference in cameras if reference and is_path(reference)]
+    files = [Path(reference) for reference in (*named, terrain, mask) if reference and is_path(reference)]
+    files += [one for camera in named for one in _mask_of(Path(camera))]
+    files += files_of_terrain(terrain) if terrain and is_path(terrain) else ()
     return {relative_path(file, Path(image).parent): _cached_sha256(file) for file in files}
 
 
@@ -79,24 +85,13 @@ def are_unchanged(image: str, hashes: dict[str, str]) -> bool:
     return all(_cached_sha256(Path(folder, path)) == sha256 for path, sha256 in hashes.items())
 
 
-def is_older_than(image: str | os.PathLike[str], result: str | os.PathLike[str]) -> bool:
-    """Whether the image was neither written nor moved after its result was written; neither file is read."""
+def _mask_of(camera: Path) -> list[Path]:
+    """The mask that a camera file names, if any."""
     try:
-        of_image, of_result = os.stat(image), os.stat(result)
-    except (OSError, ValueError):  # a NUL in the name
-        return False
-    return max(of_image.st_mtime_ns, of_image.st_ctime_ns) < of_result.st_mtime_ns
-
-
-def _named_files(file: Path) -> list[Path]:
-    """The height maps that a terrain file names, or the mask that a camera file names."""
-    try:
-        values = parse_toml(read_text(file, "bad_terrain"), "bad_terrain")
+        values = parse_toml(read_text(camera, "bad_calibration"), "bad_calibration") if camera.suffix == ".toml" else {}
     except BadInput:  # refused when it is loaded
         return []
-    dem = values.get("dem")
-    names = dem.get("file") if isinstance(dem, dict) else values.get("mask")
-    return [file.parent / str(name) for name in (names if isinstance(names, list) else [names]) if name]
+    return [camera.parent / str(values["mask"])] if "mask" in values else []
 
 
 def _cached_sha256(path: Path) -> str:

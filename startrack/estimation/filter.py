@@ -1,6 +1,6 @@
 """The position known at each frame's own time: a Kalman filter over position, shared errors and posts.
 
-The model is the smoother's. The state has the last position, the shared errors, and the errors of all posts that an
+The model is the smoother's. The state has the last position, the shared errors, and the errors of all posts that a
 recent observation has depended on, in standard deviations. Posts that were not seen for the longest time are left out,
 so that memory stays flat; where they are seen again, they count as new.
 """
@@ -11,11 +11,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from startrack.applications.tracking.frame_estimate import FrameEstimate
-from startrack.applications.tracking.frame_model import UNKNOWN_M
 from startrack.core.types import Array, Ints
+from startrack.estimation.observations import UNKNOWN_M, FrameEstimate
 
-MOST_POSTS, KEPT_POSTS = 2000, 1500  # in the state; 40 frames 50 m apart depend on 500
+MOST_POSTS = 2000  # in the state; 40 frames 50 m apart depend on 500
 
 
 @dataclass(eq=False)
@@ -65,16 +64,11 @@ class TrackFilter:
         self.covariance -= gain @ cross.T
         for number in estimate.post.tolist():  # the last ones of the dictionary are the latest
             self.posts[number] = self.posts.pop(number)
-        if len(self.posts) > MOST_POSTS:
-            self._forget_posts()
-
-    def _forget_posts(self) -> None:
-        """Leave out the posts that were not seen for the longest time."""
-        kept = list(self.posts)[-KEPT_POSTS:]
-        first = 2 + self.shared_count
-        place = np.concatenate([np.arange(first), [self.posts[number] for number in kept]])
-        self.mean, self.covariance = self.mean[place], self.covariance[np.ix_(place, place)]
-        self.posts = {number: first + k for k, number in enumerate(kept)}
+        if len(self.posts) > MOST_POSTS:  # those that were not seen for the longest time are left out
+            kept, first = list(self.posts)[-(3 * MOST_POSTS // 4) :], 2 + self.shared_count
+            place = np.concatenate([np.arange(first), [self.posts[number] for number in kept]])
+            self.mean, self.covariance = self.mean[place], self.covariance[np.ix_(place, place)]
+            self.posts = {number: first + k for k, number in enumerate(kept)}
 
     def _innovation(self, estimate: FrameEstimate, place: Ints) -> tuple[Array, Array, Array]:
         """Residual (p,), its covariance (p, p), and that of the state with it (s, p)."""

@@ -1,0 +1,146 @@
+"""Observations of a camera's positions by its exposures, with the errors that they share, and the moves between them.
+
+Unknowns of a track are the positions and the shared errors. The errors of the map's posts are not among them: they make
+the observations' noise correlated, with the covariance G S G^T.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from startrack.core.types import Array, Ints
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+UNKNOWN_M = 1e6  # standard deviation of a position about which nothing is known
+
+
+@dataclass(frozen=True, eq=False)
+class FrameEstimate:
+    """The observation of one frame. Parameters: east and north [m], and k shared errors in their prior's sigma."""
+
+    mean: Array  # (2 + k,) of the posterior with the priors of the shared errors
+    covariance: Array  # (2 + k, 2 + k) of that, with the errors of posts
+    response: Array  # (2 + k, 2 + k) of the mean to the true parameters: K
+    noise: Array  # (2 + k, 2 + k) of the mean, of this frame alone
+    post: Ints  # (c,) numbers of the posts with a measurable effect
+    by_post: Array  # (2 + k, c) of the mean to the error [m] of each: G
+    weight: float = 1.0  # probability of this mode of the frame's posterior
+
+    @property
+    def parameters(self) -> int:
+        """2 + k."""
+        return len(self.mean)
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Moves between successive frames, in enu, each with an independent error."""
+
+    move_m: Array  # (n - 1, 2)
+    sigma_m: Array  # (n - 1,) on each axis; infinite where the move is not known
+
+    @classmethod
+    def unknown(cls, frames: int) -> Steps:
+        """No move is known."""
+        return cls(np.zeros((max(frames - 1, 0), 2)), np.full(max(frames - 1, 0), np.inf))
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """The observations of some frames of a track of n frames, with the covariance of all of them."""
+
+    frames: tuple[int, ...]
+    estimates: tuple[FrameEstimate, ...]
+    count: int  # n
+    height_sigma_m: float
+
+    @classmethod
+    def of(cls, estimates: Sequence[FrameEstimate | None], height_sigma_m: float) -> Observations:
+        """Those of the frames that have an estimate."""
+        used = [(k, e) for k, e in enumerate(estimates) if e is not None]
+        return cls(tuple(k for k, _ in used), tuple(e for _, e in used), len(estimates), height_sigma_m)
+
+    @property
+    def size(self) -> int:
+        """2 + k, of one observation."""
+        return self.estimates[0].parameters
+
+    @cached_property
+    def value(self) -> Array:
+        """(m,) all means."""
+        return np.concatenate([e.mean for e in self.estimates])
+
+    @cached_property
+    def design(self) -> csr_array:
+        """(m, 2 n + k) response to all positions and the shared errors."""
+        from scipy.sparse import csr_array
+
+        p, n = self.size, self.count
+        matrix = np.concatenate([e.response for e in self.estimates])
+        frame = np.repeat(self.frames, p)[:, None]
+        shared = np.broadcast_to(2 * n + np.arange(p - 2), (len(frame), p - 2))
+        column = np.concatenate([2 * frame, 2 * frame + 1, shared], axis=1)
+        row = np.broadcast_to(np.arange(len(frame))[:, None], column.shape)
+        return csr_array((matrix.ravel(), (row.ravel(), column.ravel())), shape=(len(frame), 2 * n + p - 2))
+
+    @cached_property
+    def posts(self) -> Ints:
+        """(c,) ascending."""
+        return np.unique(np.concatenate([e.post for e in self.estimates]))
+
+    @cached_property
+    def by_post(self) -> csr_array:
+        """(m, c) response to the errors of the posts, in their standard deviations."""
+        from scipy.sparse import csr_array
+
+        p, rows, columns, values = self.size, [], [], []
+        for number, e in enumerate(self.estimates):
+            rows.append(np.repeat(p * number + np.arange(p), len(e.post)))
+            columns.append(np.tile(np.searchsorted(self.posts, e.post), p))
+            values.append(self.height_sigma_m * e.by_post.ravel())
+        at = np.concatenate(rows), np.concatenate(columns)
+        return csr_array((np.concatenate(values), at), shape=(len(self.value), len(self.posts)))
+
+    @cached_property
+    def inverse_covariance(self) -> Array:
+        """(m, m) V^-1, V the noise of each observation and what the posts make common."""
+        covariance = (self.by_post @ self.by_post.T).toarray()
+        for number, e in enumerate(self.estimates):
+            part = slice(self.size * number, self.size * (number + 1))
+            covariance[part, part] += e.noise
+        return inverse(covariance)
+
+    @cached_property
+    def weighted_design(self) -> Array:
+        """(m, 2 n + k) V^-1 A."""
+        return np.asarray(self.inverse_covariance @ self.design)
+
+    @cached_property
+    def information(self) -> Array:
+        """(2 n + k, 2 n + k) by the observations, with the prior of the shared errors."""
+        found = np.asarray(self.design.T @ self.weighted_design)
+        found[np.diag_indices_from(found)] += np.where(np.arange(len(found)) < 2 * self.count, UNKNOWN_M**-2, 1.0)
+        return found
+
+    @cached_property
+    def target(self) -> Array:
+        """(2 n + k,) A^T V^-1 m."""
+        return np.asarray(self.weighted_design.T @ self.value)
+
+
+def inverse(matrix: Array) -> Array:
+    """Of a symmetric positive definite matrix, by Cholesky's factors."""
+    from scipy.linalg import lapack
+
+    factor, info = lapack.dpotrf(matrix, lower=1)
+    if info != 0:
+        raise np.linalg.LinAlgError("the covariance is not positive definite")
+    found: Any = lapack.dpotri(factor, lower=1)[0]
+    return np.tril(found) + np.tril(found, -1).T

@@ -13,13 +13,11 @@ from jsonschema import Draft202012Validator
 
 import startrack
 from startrack.applications.prediction import (
-    AMBIGUOUS,
-    OK,
-    REFUSED,
     Conditions,
     Place,
     Predictions,
     Predictor,
+    Status,
     area_cells,
     evenly_spaced,
     path_points,
@@ -38,6 +36,7 @@ from startrack.output.schema import SCHEMAS
 from startrack.rendering import Drive, exposure_for_snr, limiting_v_mag
 from startrack.terrain import Cylinder, load_terrain, write_bands
 
+OK, AMBIGUOUS, REFUSED = Status
 WHEN = datetime(2030, 6, 1, tzinfo=UTC)
 NAMES = [one.name for one in CELL_QUANTITIES]
 FLAGS = ["predict", "-t", "shackleton-thesis", "-c", "fisheye-2048", "--time", "2030-06-01T00:00:00"]

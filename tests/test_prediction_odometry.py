@@ -9,7 +9,7 @@ import pytest
 from astropy.table import Table
 from jsonschema import Draft202012Validator
 
-from startrack.applications.prediction.along_path import ellipse_m2, with_odometry
+from startrack.applications.prediction.statistics import ellipse_m2, with_odometry
 from startrack.cli.main import main
 from startrack.output.schema import SCHEMAS
 

@@ -17,19 +17,19 @@ from startrack.applications.reproduction import (
     ARTEFACTS,
     FULL,
     QUICK,
-    ChunkStore,
     Context,
     Size,
-    chunks,
+    fix_store,
+    methods,
     published,
     write_artefact,
 )
-from startrack.applications.reproduction.bound import cell_centroid
 from startrack.applications.reproduction.methods import KUA, OURS, Task, compute_chunk, tasks_of
 from startrack.applications.reproduction.simulator import (
     PERFECT,
     Mistakes,
     Sky,
+    cell_centroid,
     change_steps_m,
     changes_m,
     crater,
@@ -44,7 +44,7 @@ from startrack.applications.reproduction.simulator import (
 from startrack.cli import reproduce as cli
 from startrack.cli.main import main
 from startrack.cli.progress import Progress, progress
-from startrack.core import runner
+from startrack.core import chunk_store, runner
 from startrack.core.files import hold_lock
 from startrack.localization import ExactPosterior, Hull, PseudoGradient
 
@@ -65,7 +65,7 @@ def small_run(tmp_path_factory):
     """Every table and figure of a small run, with its files. Workers of pytest-xdist share what is computed."""
     out = tmp_path_factory.mktemp("reproduced")
     shared = tmp_path_factory.getbasetemp().parent if "PYTEST_XDIST_WORKER" in os.environ else out
-    with hold_lock(shared / "reproduced.lock"), ChunkStore(shared, jobs=1, progress=hide_progress) as store:
+    with hold_lock(shared / "reproduced.lock"), fix_store(shared, jobs=1, progress=hide_progress) as store:
         artefacts = {name: make(Context(SMALL, 0, store)) for name, make in ARTEFACTS.items()}
     return {name: (artefact, write_artefact(artefact, out, plots=True)) for name, artefact in artefacts.items()}
 
@@ -291,13 +291,13 @@ def test_a_stopped_run_goes_on_from_where_it_was(tmp_path, monkeypatch):
         computed.append(task)
         return compute_chunk(task)
 
-    monkeypatch.setattr(chunks, "compute_chunk", stop_after)
-    with ChunkStore(tmp_path, jobs=1, progress=hide_progress) as store, pytest.raises(KeyboardInterrupt):
+    monkeypatch.setattr(methods, "compute_chunk", stop_after)
+    with fix_store(tmp_path, jobs=1, progress=hide_progress) as store, pytest.raises(KeyboardInterrupt):
         list(store.chunks("stopped", wanted))
-    assert len(list((tmp_path / chunks.FOLDER).iterdir())) == 2  # whole chunks only, no temporary files
+    assert len(list((tmp_path / methods.FOLDER).iterdir())) == 2  # whole chunks only, no temporary files
     computed.clear()
-    monkeypatch.setattr(chunks, "compute_chunk", lambda task: computed.append(task) or compute_chunk(task))
-    with ChunkStore(tmp_path, jobs=1, progress=hide_progress) as store:
+    monkeypatch.setattr(methods, "compute_chunk", lambda task: computed.append(task) or compute_chunk(task))
+    with fix_store(tmp_path, jobs=1, progress=hide_progress) as store:
         computed_chunks = list(store.chunks("resumed", wanted))
         assert computed == wanted[2:]
         assert len(list(store.chunks("again", wanted))) == 4 and computed == wanted[2:]
@@ -309,9 +309,9 @@ def test_chunks_of_other_settings_are_not_taken(tmp_path, monkeypatch):
     one = Task(KUA, 0, 0, 0, 3)
     others = [replace(one, seed=1), replace(one, stop=4), replace(one, aspect_ratio=5.0), replace(one, method=OURS),
               replace(one, mistakes=Mistakes(0.1, 0.1))]  # fmt: skip
-    keys = {chunks._key(task) for task in [one, *others]}
-    monkeypatch.setattr(chunks, "__version__", "another")
-    assert len(keys | {chunks._key(one)}) == len(others) + 2
+    keys = {task.key for task in [one, *others]}
+    monkeypatch.setattr(chunk_store, "__version__", "another")
+    assert len(keys | {one.key}) == len(others) + 2
 
 
 # The command

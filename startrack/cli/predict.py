@@ -22,9 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from contextlib import AbstractContextManager
 
-    from startrack.applications.prediction import Conditions
-    from startrack.applications.prediction.report import OdometryErrors, Report
-    from startrack.applications.prediction.run import Predictions
+    from startrack.applications.prediction import Conditions, OdometryErrors, Predictions, Report
 
 STOPPED = 5
 MAX_DRAWS = 1000
@@ -88,9 +86,7 @@ def _add_run(group: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Predict, write the files and print the summary; 0, or 5 if the run was stopped."""
     _check_flags(args)
-    from startrack.applications.prediction.report import Report, write_report
-    from startrack.applications.prediction.run import Predictions
-    from startrack.applications.prediction.store import draw_store
+    from startrack.applications.prediction import Predictions, Report, draw_store, write_report
     from startrack.core.runner import RunStopped
 
     conditions, inputs = _conditions(args), _inputs(args)
@@ -159,7 +155,7 @@ def _check_flags(args: argparse.Namespace) -> None:
 
 
 def _odometry(args: argparse.Namespace) -> OdometryErrors:
-    from startrack.applications.prediction.report import OdometryErrors
+    from startrack.applications.prediction import OdometryErrors
 
     floor_m = ODOMETRY_FLOOR_M if args.odometry_floor is None else args.odometry_floor
     return OdometryErrors(args.odometry_sigma, floor_m)

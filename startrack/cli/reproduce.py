@@ -74,13 +74,13 @@ def run(args: argparse.Namespace) -> int:
     _require_extra(args, "matplotlib", "plots", "figures need", unless=args.no_plots)
     _require_extra(args, "distributed", "cluster", "--cluster needs", unless=args.cluster is None)
 
-    from startrack.applications.reproduction import ARTEFACTS, FULL, QUICK, ChunkStore, Context, write_artefact
+    from startrack.applications.reproduction import ARTEFACTS, FULL, QUICK, Context, fix_store, write_artefact
 
     out, size = make_folder(args.dir), FULL if args.full else QUICK
     announce_compilation()
     if args.ours is not None:
         size = size.limit_ours(args.ours)
-    with ChunkStore(out, jobs=args.jobs or cores(), progress=progress, cluster=args.cluster) as store:
+    with fix_store(out, jobs=args.jobs or cores(), progress=progress, cluster=args.cluster) as store:
         if args.cluster is not None:
             store.connect()
         for name in chosen:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 
-from startrack.core.files import write_atomically
+from startrack import __version__
+from startrack.core.files import PACKAGE, write_atomically
 from startrack.core.runner import TASK_LIMIT_S, Died, Runner, RunStopped
 
 Chunk = dict[str, np.ndarray]  # the result of one task, by name
@@ -92,13 +94,22 @@ class ChunkStore(Generic[Task]):
         return self.folder / f"{self.key(task)}.npz"
 
 
+def settings_digest(sources: tuple[str, ...], settings: Any) -> str:
+    """Hash of `settings` (JSON values), the version and the package's files that match `sources`: a chunk's key.
+
+    Raises ValueError for a pattern that no file matches.
+    """
+    whole = json.dumps([__version__, _source_digest(sources), settings], sort_keys=True, default=str)
+    return hashlib.sha256(whole.encode()).hexdigest()[:24]
+
+
 @lru_cache(maxsize=8)
-def source_digest(patterns: tuple[str, ...]) -> str:
-    """SHA-256 of the package's sources that match `patterns`: part of the key of what they compute."""
-    root, digest = Path(__file__).parents[1], hashlib.sha256()
-    for path in sorted(path for pattern in patterns for path in root.glob(pattern)):
-        digest.update(path.name.encode() + path.read_bytes())
-    return digest.hexdigest()
+def _source_digest(patterns: tuple[str, ...]) -> str:
+    found = [path for pattern in patterns for path in sorted(PACKAGE.glob(pattern)) or [PACKAGE / pattern]]
+    missing = [path for path in found if not path.is_file()]
+    if missing:
+        raise ValueError(f"no source of startrack matches {missing[0].relative_to(PACKAGE)}")
+    return hashlib.sha256(b"".join(path.name.encode() + path.read_bytes() for path in sorted(found))).hexdigest()
 
 
 def _pack_chunk(chunk: Chunk) -> bytes:

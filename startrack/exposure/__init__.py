@@ -30,6 +30,7 @@ from startrack.exposure.sidecar import (
     SIDECAR,
     Sidecar,
     sidecar_of,
+    stem,
 )
 from startrack.exposure.write import write_exposure, write_sidecar
 
@@ -37,6 +38,6 @@ __all__ = [
     "IMAGE_KEYS", "PACKING_SUFFIXES", "PICTURE_SUFFIXES", "RAW_SUFFIXES", "SIDECAR", "BagImage", "Facts", "Sidecar",
     "are_fractions", "check_time_sigma_s", "choose_bag_image", "combine_masks", "correct_exposure", "decode_bytes",
     "exposure_of", "exposure_of_decoded", "is_bag", "list_bag_images", "mask_of", "read_bag_exposures",
-    "read_bag_image", "read_dark", "read_exposure", "read_flat", "read_mask", "sidecar_of", "split_bag_path",
+    "read_bag_image", "read_dark", "read_exposure", "read_flat", "read_mask", "sidecar_of", "split_bag_path", "stem",
     "touch_masked", "with_facts", "write_exposure", "write_sidecar",
 ]  # fmt: skip

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 __all__ = [
     "EQUIRECTANGULAR", "NO_POST", "STEREOGRAPHIC", "TERRAIN_KEYS", "Cylinder", "ForwardingTerrain", "HeightMap",
     "HorizonPosts", "Projection", "Raster", "ShapeError", "StateableError", "Terrain", "body_of_terrain",
-    "files_of_terrain", "import_maps", "load_terrain", "read_map", "require_bounds", "require_horizons", "require_terrain",
-    "state_errors", "stateable_errors", "terrain_from_dict", "write_bands", "write_map",
+    "files_of_terrain", "import_maps", "load_terrain", "read_map", "require_bounds", "require_horizons",
+    "require_terrain", "state_errors", "stateable_errors", "terrain_from_dict", "write_bands", "write_map",
 ]  # fmt: skip
 _MODULES = {  # of names that few programs use: imported at the first use
     "HeightMap": "height_map", "StateableError": "state_file", "import_maps": "import_map", "read_map": "map_reading",

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import stat
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path, PurePosixPath
 
 from startrack.core.files import existing_folder
 from startrack.core.types import BadInput
-from startrack.exposure import PACKING_SUFFIXES, PICTURE_SUFFIXES, BagImage, list_bag_images
+from startrack.exposure import PACKING_SUFFIXES, PICTURE_SUFFIXES, BagImage, list_bag_images, stem
 from startrack.output.write import PICTURES
 
 
@@ -28,9 +28,8 @@ class Image:
 
 def images_of_bag(bag: str | os.PathLike[str], topic: str | None = None) -> list[Image]:
     """Every image of a ROS bag's image `topic` (None: its only one). Raises BadInput (bad_image)."""
-    stem = Path(bag).stem
     return [
-        Image(Path(one.path).name, f"{stem}-{one.number:06d}", one.path, one)
+        Image(Path(one.path).name, f"{Path(bag).stem}-{one.number:06d}", one.path, one)
         for one in list_bag_images(os.path.abspath(bag), topic)
     ]
 
@@ -42,7 +41,15 @@ def images_under(folder: str | os.PathLike[str], excluded: str | os.PathLike[str
     and anything but regular files are left out. Raises BadInput (bad_image) if `folder` is none.
     """
     root = existing_folder(folder)
-    return _images(root, _image_names(root, None if excluded is None else os.path.realpath(excluded)))
+    folders: dict[str, list[str]] = {}
+    for name in _image_names(root, None if excluded is None else os.path.realpath(excluded)):
+        folders.setdefault(str(PurePosixPath(name).parent), []).append(name)
+    found = [
+        Image(name, (PurePosixPath(parent) / of_results).as_posix(), str(root / name))
+        for parent, group in folders.items()
+        for name, of_results in zip(group, result_stems(group), strict=True)
+    ]
+    return sorted(found)
 
 
 def listed_images(
@@ -66,17 +73,18 @@ def listed_images(
             name = next((name for name in names if _is_missing(root, name)), None)
             if name is None:
                 raise BadInput("bad_image", f"{text} is not an image under {folder}")
-            known[name] = Image(name, _stem_of_missing(name, known.values()), os.path.join(root, name))
+            of_results = (PurePosixPath(name).parent / stem(Path(name))).as_posix()
+            taken = of_results in {image.stem for image in known.values()}
+            known[name] = Image(name, name if taken else of_results, os.path.join(root, name))
         chosen.add(known[name])
     return sorted(chosen)  # with the results' names of a run over the whole folder
 
 
 def result_stems(images: Sequence[str]) -> list[str]:
     """Unique names of the results: the images' stems, with the suffix where stems are equal."""
-    names = [Path(image).name for image in images]
-    stems = [_stem(name) for name in names]
+    stems = [stem(Path(image)) for image in images]
     often = Counter(stems)
-    return unique_names([name if often[stem] > 1 else stem for name, stem in zip(names, stems, strict=True)])
+    return unique_names([Path(image).name if often[one] > 1 else one for image, one in zip(images, stems, strict=True)])
 
 
 def unique_names(names: Sequence[str]) -> list[str]:
@@ -92,27 +100,10 @@ def unique_names(names: Sequence[str]) -> list[str]:
     return unique
 
 
-def _images(root: Path, names: Sequence[str]) -> list[Image]:
-    folders: dict[str, list[str]] = {}
-    for name in names:
-        folders.setdefault(str(PurePosixPath(name).parent), []).append(name)
-    found = [
-        Image(name, (PurePosixPath(parent) / stem).as_posix(), str(root / name))
-        for parent, group in folders.items()
-        for name, stem in zip(group, result_stems(group), strict=True)
-    ]
-    return sorted(found)
-
-
 def _is_missing(root: str, name: str) -> bool:
     """Whether `name` is that of an image within the folder that does not exist."""
     path = PurePosixPath(name)
     return path.parts[:1] != ("..",) and _is_image(path.name) and not os.path.lexists(os.path.join(root, name))
-
-
-def _stem_of_missing(name: str, others: Iterable[Image]) -> str:
-    stem = (PurePosixPath(name).parent / _stem(PurePosixPath(name).name)).as_posix()
-    return name if stem in {image.stem for image in others} else stem
 
 
 def _image_names(root: Path, excluded: str | None) -> list[str]:
@@ -147,18 +138,6 @@ def _is_file(folder: Path, name: str) -> bool:
 
 def _is_image(name: str) -> bool:
     lower = name.lower()
-    if lower.startswith(".") or lower.endswith(PICTURES):
-        return False
-    return any(Path(one).suffix in PICTURE_SUFFIXES for one in _names_without_compression(lower))
-
-
-def _names_without_compression(name: str) -> Iterator[str]:
-    yield name
-    if Path(name).suffix in PACKING_SUFFIXES:
-        yield Path(name).stem
-
-
-def _stem(name: str) -> str:
-    path = Path(name)
-    packed = path.suffix.lower() in PACKING_SUFFIXES
-    return Path(path.stem).stem if packed and Path(path.stem).suffix else path.stem
+    unpacked = Path(lower).stem if Path(lower).suffix in PACKING_SUFFIXES else lower
+    hidden = lower.startswith(".") or lower.endswith(PICTURES)
+    return not hidden and Path(unpacked).suffix in PICTURE_SUFFIXES

@@ -53,7 +53,7 @@ class TableColumn:
         """One value a record, None if it has none."""
         values = [_value_at(record, self.path) for record in records]
         is_file = ".".join(map(str, self.path)) in FILES
-        return [value if value is None or not is_file else file_stem(value) for value in values]
+        return [value if value is None or not is_file else reference_stem(value) for value in values]
 
 
 COLUMNS = [
@@ -132,7 +132,7 @@ def has_parquet() -> bool:
     return find_spec("pyarrow") is not None
 
 
-def file_stem(reference: str) -> str:
+def reference_stem(reference: str) -> str:
     """Name of a camera or terrain: of a shipped one as it is, of a file its stem."""
     return PurePath(reference.replace("\\", "/")).name.removesuffix(".toml")
 
@@ -172,7 +172,7 @@ def _trajectories(records: Sequence[Record]) -> dict[str, list[str]]:
 
 def _terrain_key(record: Record) -> tuple[str, ...]:
     """Name of the terrain's file, and the hashes of the files of that name: equal for equal terrains only."""
-    stem = file_stem(str(record["provenance"].get("terrain") or record["position"].get("terrain")))
+    stem = reference_stem(str(record["provenance"].get("terrain") or record["position"].get("terrain")))
     inputs = record.get(INPUTS, {})
     return stem, *sorted(sha256 for path, sha256 in inputs.items() if PurePath(path).name == f"{stem}.toml")
 

@@ -1,29 +1,44 @@
-"""Draws of evidence at one place, located as images are."""
+"""Draws of evidence at one place, located as images are, and their store on disk: a stopped prediction is resumed."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
+from enum import IntEnum
 from functools import cached_property, lru_cache
+from pathlib import Path
 
 import numpy as np
 
 from startrack.camera import Camera, load_camera
 from startrack.catalog import StarCatalog, has_deep_catalog, load_catalog, load_deep_catalog
 from startrack.chain import COMPLETE_V_MAG, locate_rays
-from startrack.core.chunk_store import Chunk
+from startrack.core.chunk_store import Chunk, ChunkStore, Progress, settings_digest
+from startrack.core.runner import TASK_LIMIT_S
 from startrack.core.types import Array, BadInput, NoSolution, Stars
 from startrack.localization import require_localizer
 from startrack.rendering import Series, limiting_v_mag, load_sky_catalog
 from startrack.simulation import draw_ground, simulate_rays
 from startrack.terrain import Terrain, load_terrain
 
-OK, AMBIGUOUS, REFUSED = range(3)  # status of a draw
+FOLDER = ".predict"
+SOURCES = (  # their content is part of a chunk's key
+    "localization/*.py", "simulation/*.py", "evidence/*.py", "rendering/*.py", "terrain/*.py", "chain/star_fix.py",
+    "applications/prediction/draws.py",
+)  # fmt: skip
 FAINTEST_V_MAG = 10.0  # of the stars in the sky, as `render` has it; and
 BELOW_LIMIT_MAG = 3.0  # below the limit at 5 sigma: fainter stars add 2 % to the variance of a star's flux
-MAX_DRAWS = 1_000_000
+SEED_STEP = 1_000_000  # from one seed to the next, in the streams of random numbers: the most draws
 LIMIT_SNR = 5.0
+
+
+class Status(IntEnum):
+    """Of a draw."""
+
+    OK = 0
+    AMBIGUOUS = 1
+    REFUSED = 2
 
 
 @dataclass(frozen=True)
@@ -58,6 +73,14 @@ class Task:
 
     def __len__(self) -> int:
         return len(self.conditions.times_utc)
+
+    @property
+    def key(self) -> str:
+        """Hash of all that decides the draws: the content of the files, not their paths."""
+        settings = asdict(self)
+        for name in ("camera", "terrain"):
+            settings["conditions"][name] = Path(settings["conditions"][name]).name
+        return settings_digest(SOURCES, settings)
 
 
 class Predictor:
@@ -102,12 +125,12 @@ class Predictor:
     def draw(self, place: Place) -> Chunk:
         """Arrays over the draws (n,) at a place, which depend on the seed, the place and the conditions only.
 
-        `status` (OK, AMBIGUOUS, REFUSED), and of draws with one position `radius95_m`, `covariance_m2` (n, 2, 2) and
+        `status` (a `Status`), and of draws with one position `radius95_m`, `covariance_m2` (n, 2, 2) and
         `offset_m` (n, 2), found minus true position; NaN of the others.
         """
         n = len(self.conditions.times_utc)
         found = {
-            "status": np.full(n, REFUSED, dtype=np.int8), "radius95_m": np.full(n, np.nan),
+            "status": np.full(n, Status.REFUSED, dtype=np.int8), "radius95_m": np.full(n, np.nan),
             "covariance_m2": np.full((n, 2, 2), np.nan), "offset_m": np.full((n, 2), np.nan),
         }  # fmt: skip
         for draw in range(n):
@@ -129,9 +152,9 @@ class Predictor:
         except NoSolution:
             return
         if located.fix.ambiguous:
-            found["status"][draw] = AMBIGUOUS
+            found["status"][draw] = Status.AMBIGUOUS
             return
-        found["status"][draw] = OK
+        found["status"][draw] = Status.OK
         found["radius95_m"][draw] = located.fix.radius95_m
         found["covariance_m2"][draw] = located.fix.covariance_m2
         found["offset_m"][draw] = (located.fix.position_enu_m - scene.position_enu_m)[:2]
@@ -139,20 +162,32 @@ class Predictor:
     def _series_of(self, draw: int, catalog: StarCatalog, faint_v_mag: float | None) -> Series:
         conditions = self.conditions
         return Series(
-            camera=self.camera, terrain=self.terrain, catalog=catalog, seed=MAX_DRAWS * conditions.seed + draw,
+            camera=self.camera, terrain=self.terrain, catalog=catalog, seed=SEED_STEP * conditions.seed + draw,
             time_utc=conditions.times_utc[draw], exposure_s=conditions.exposure_s,
             sky_v_mag_arcsec2=conditions.sky_v_mag_arcsec2, faint_v_mag=faint_v_mag, hot_pixels=0, cosmic_rays=0,
         )  # fmt: skip
 
 
+@lru_cache(maxsize=2)
+def predictor_of(conditions: Conditions) -> Predictor:
+    """The predictor of the files that the conditions name. Raises BadInput for files that cannot be used."""
+    return Predictor(load_camera(conditions.camera), load_terrain(conditions.terrain), conditions)
+
+
 def draw_task(task: Task) -> Chunk:
     """The draws of a task, in any process."""
-    return _predictor(task.conditions).draw(task.place)
+    return predictor_of(task.conditions).draw(task.place)
 
 
-@lru_cache(maxsize=2)
-def _predictor(conditions: Conditions) -> Predictor:
-    return Predictor(load_camera(conditions.camera), load_terrain(conditions.terrain), conditions)
+def draw_store(out: Path, *, draws: int, jobs: int, progress: Progress, cluster: str | None = None) -> ChunkStore[Task]:
+    """The store of draws under the folder `out`, of which each place has `draws`.
+
+    They are made in `jobs` processes or on a `cluster`, and reported to `progress`.
+    """
+    limit_s = draws * TASK_LIMIT_S  # a draw takes as long as an image
+    return ChunkStore(
+        out / FOLDER, draw_task, lambda task: task.key, jobs=jobs, progress=progress, cluster=cluster, limit_s=limit_s
+    )
 
 
 def evenly_spaced(first: datetime, last: datetime, count: int) -> tuple[datetime, ...]:

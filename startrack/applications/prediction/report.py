@@ -1,4 +1,4 @@
-"""What a prediction found, as a record, as lines of text, and as files."""
+"""What a prediction found, as a record and as lines of text."""
 
 from __future__ import annotations
 
@@ -8,31 +8,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from startrack import __version__
-from startrack.applications.prediction.along_path import with_odometry
-from startrack.applications.prediction.draws import Conditions
+from startrack.applications.prediction.draws import Conditions, predictor_of
 from startrack.applications.prediction.places import AreaCells, PathPoints
-from startrack.applications.prediction.run import predictor_of, variant_record
-from startrack.applications.prediction.statistics import Cells, median_or_none, summarized
-from startrack.applications.prediction.write import (
-    COMPARISON_PICTURE,
-    FILES,
-    PICTURE,
-    SUMMARY,
-    write_comparison_table,
-    write_map,
-    write_picture,
-    write_summary,
-    write_table,
-)
+from startrack.applications.prediction.run import variant_record
+from startrack.applications.prediction.statistics import Cells, median_or_none, summarized, with_odometry
 from startrack.core.errors import BadOutput, length_text
 from startrack.frames import format_utc
 from startrack.output.quantities_prediction import FILTERED, FORMAT, SHARES_M, SMOOTHED
 from startrack.terrain import Terrain, load_terrain
 
-PATH_CURVES = {FILTERED: "images so far, and odometry", SMOOTHED: "all images, and odometry"}
+RECORD_FILE = "predict.json"
 SETTINGS = ("kind", "terrain", "camera", "first_time_utc", "last_time_utc", "spacing_m", "places")  # of one prediction
 
 
@@ -114,7 +100,7 @@ class Report:
     def check_folder(self, out: Path, *, overwrite: bool) -> None:
         """Raise BadOutput if `out` holds a prediction of other places, cameras or times and not `overwrite`."""
         try:
-            before = json.loads((out / SUMMARY).read_text(encoding="utf-8"))
+            before = json.loads((out / RECORD_FILE).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return
         now = self.settings
@@ -137,54 +123,10 @@ class Report:
             lines.append(_odometry_line(self.record["odometry"]))
         if self.depth is not None:
             lines.append(_depth_line(self.depth))
-        return lines + [_variant_line(one) for one in self.variants]
-
-
-def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
-    """Write the files; those of an earlier prediction that this one does not make are removed."""
-    points = report.points
-    files = [write_map(out, points, report.cells)] if isinstance(points, AreaCells) else []
-    distance_m = points.distance_m if isinstance(points, PathPoints) else None
-    files.append(write_table(out, report.terrain, points.position_m, report.cells, distance_m))
-    if plots:
-        files.append(write_picture(out / PICTURE, _picture(report)))
-    if report.variants:
-        files.append(write_comparison_table(out, report.variants))
-        if plots:
-            files.append(write_picture(out / COMPARISON_PICTURE, _comparison_picture(report)))
-    files.append(write_summary(out, report.record))
-    for name in set(FILES) - {path.name for path in files}:
-        (out / name).unlink(missing_ok=True)
-    return files
-
-
-def _picture(report: Report) -> Any:
-    from startrack.output.picture.prediction_map import prediction_picture
-    from startrack.output.picture.prediction_plot import path_picture
-
-    points, cells = report.points, report.cells
-    radius = np.where(np.isnan(cells["radius95_m"]), np.inf, cells["radius95_m"])
-    title = f"How well one image of the stars gives the position: {report.terrain.name}"
-    if isinstance(points, AreaCells):
-        raster = points.raster(radius)
-        return prediction_picture(report.terrain, points.site, raster, title, _caption(report))
-    curves = {words: cells[name] for name, words in PATH_CURVES.items() if name in cells}
-    return path_picture(points.distance_m, radius, cells["p_ok"], title, _caption(report), curves)
-
-
-def _comparison_picture(report: Report) -> Any:
-    from startrack.output.picture.prediction_plot import comparison_picture
-
-    return comparison_picture(report.variants, f"Cameras and exposures at the same places: {report.terrain.name}")
-
-
-def _caption(report: Report) -> list[str]:
-    s = report.settings
-    times = s["first_time_utc"][:16].replace("T", " ")
-    if s["last_time_utc"] != s["first_time_utc"]:
-        times += f" to {s['last_time_utc'][:16].replace('T', ' ')}"
-    draws = f"{s['draws']} draws every {s['spacing_m']:.4g} m"
-    return [f"camera {s['camera']}, {s['exposure_s']:.3g} s, {times} UTC, {draws}"]
+        for one in self.variants:
+            radius = _median_text(one["summary"]["median_radius95_m"])
+            lines.append(f"{one['camera']}, {one['exposure_s']:.3g} s (V {one['limiting_v_mag']:.1f}): {radius}")
+        return lines
 
 
 def _depth_line(depth: dict[str, Any]) -> str:
@@ -206,8 +148,3 @@ def _odometry_line(found: dict[str, Any]) -> str:
         return "with odometry: no position at half of the places"
     filtered, smoothed = (length_text(one, 3) for one in radii)
     return f"with odometry: median 95 % radius {filtered} at each place, {smoothed} by all images"
-
-
-def _variant_line(one: dict[str, Any]) -> str:
-    radius = _median_text(one["summary"]["median_radius95_m"])
-    return f"{one['camera']}, {one['exposure_s']:.3g} s (V {one['limiting_v_mag']:.1f}): {radius}"

@@ -10,14 +10,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from startrack.applications.prediction.draws import LIMIT_SNR, Conditions, Place, Predictor, Task, evenly_spaced, joined
+from startrack.applications.prediction.draws import (
+    LIMIT_SNR,
+    Conditions,
+    Place,
+    Predictor,
+    Task,
+    evenly_spaced,
+    joined,
+    predictor_of,
+)
 from startrack.applications.prediction.places import area_cells, default_spacing_m
 from startrack.applications.prediction.statistics import Cells, predicted, share_within, summarized
 from startrack.camera import Camera, load_camera
 from startrack.core.chunk_store import ChunkStore
 from startrack.core.types import Array
 from startrack.rendering import exposure_for_snr
-from startrack.terrain import Terrain, load_terrain
+from startrack.terrain import Terrain
 
 DEPTH_V_MAG = 3.0, 9.0  # limiting magnitudes that are tried; beyond, the faintest stars of the simulated sky are missed
 DEPTH_STEP_MAG = 0.1  # to which the depth is found: a tenth of the exposure
@@ -80,11 +89,6 @@ def at_depth(conditions: Conditions, v_mag: float) -> Conditions:
     """The conditions with the exposure that reaches `v_mag` on the axis at 5 sigma."""
     camera, sky = load_camera(conditions.camera), conditions.sky_v_mag_arcsec2
     return replace(conditions, exposure_s=exposure_for_snr(camera, sky, v_mag=v_mag, snr=LIMIT_SNR))
-
-
-def predictor_of(conditions: Conditions) -> Predictor:
-    """The predictor of the files that the conditions name. Raises BadInput for files that cannot be used."""
-    return Predictor(load_camera(conditions.camera), load_terrain(conditions.terrain), conditions)
 
 
 def variant_record(conditions: Conditions, cells: Cells) -> dict[str, Any]:

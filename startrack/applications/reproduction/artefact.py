@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from startrack.applications.reproduction.chunks import ChunkStore
+from startrack.applications.reproduction.drawing import png_bytes
+from startrack.core.chunk_store import ChunkStore
 from startrack.core.files import write_atomically
 from startrack.output.ecsv import Column, ecsv_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,15 @@ class Context:
 
     size: Size
     seed: int
-    store: ChunkStore
+    store: ChunkStore[Any]  # of the fixes; see `fix_store`
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure and the caption below it."""
+
+    draw: Callable[[], Figure]
+    caption: str
 
 
 @dataclass(frozen=True)
@@ -55,10 +67,18 @@ class Artefact:
     title: str
     line: str  # the outcome in one line
     text: str  # Markdown: the table, or the caption of the figure with the comparison
+    values: Mapping[str, Any]  # "thesis", "reproduced", "ours"
     columns: tuple[Column, ...] = ()
-    pictures: dict[str, Callable[[], bytes]] = field(default_factory=dict)  # file stem to a function that draws the PNG
-    values: dict[str, Any] = field(default_factory=dict)  # "thesis", "reproduced", "ours"
-    timing_ms: dict[str, float] = field(default_factory=dict)  # per fix
+    pictures: Mapping[str, Picture] = field(default_factory=dict)  # by the stems of their files
+    timing_ms: Mapping[str, float] = field(default_factory=dict)  # per fix
+
+    @classmethod
+    def of_figure(
+        cls, name: str, title: str, line: str, picture: Picture, values: Mapping[str, Any], text: str = "", **more: Any
+    ) -> Artefact:
+        """The figure `name`, whose number the title begins with; the `text` is its caption unless it is given."""
+        title = f"Figure {name.removeprefix('fig')}: {title}"
+        return cls(name, title, line, text or picture.caption, values, pictures={name: picture}, **more)
 
 
 def write_artefact(artefact: Artefact, out: Path, *, plots: bool) -> list[Path]:
@@ -66,20 +86,13 @@ def write_artefact(artefact: Artefact, out: Path, *, plots: bool) -> list[Path]:
     files: dict[str, bytes] = {}
     if artefact.columns:
         files[f"{artefact.name}.ecsv"] = ecsv_text(artefact.columns).encode()
-    if plots:
-        files |= {f"{stem}.png": draw() for stem, draw in artefact.pictures.items()}
-    files[f"{artefact.name}.md"] = markdown(artefact, [name for name in files if name.endswith(".png")]).encode()
+    shown = artefact.pictures if plots else {}
+    files |= {f"{stem}.png": png_bytes(picture.draw(), picture.caption) for stem, picture in shown.items()}
+    parts = [f"## {artefact.title}", *(f"![{stem}.png]({stem}.png)" for stem in shown), artefact.text.strip()]
+    files[f"{artefact.name}.md"] = ("\n\n".join(parts) + "\n").encode()
     for name, data in files.items():
         write_atomically(out / name, data, overwrite=True)
     return [out / name for name in files]
-
-
-def markdown(artefact: Artefact, pictures: Iterable[str] = ()) -> str:
-    """The artefact as a section of Markdown."""
-    return (
-        "\n\n".join([f"## {artefact.title}", *(f"![{name}]({name})" for name in pictures), artefact.text.strip()])
-        + "\n"
-    )
 
 
 def markdown_table(head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from startrack.applications.reproduction import published
-from startrack.applications.reproduction.artefact import Artefact, Context
-from startrack.applications.reproduction.drawing import PUBLISHED, STAR, mark_published, new_figure, png_bytes
+from startrack.applications.reproduction.artefact import Artefact, Context, Picture
+from startrack.applications.reproduction.drawing import PUBLISHED, STAR, mark_published, new_figure
 from startrack.applications.reproduction.simulator import (
     MAGNITUDE,
     STEP_M,
@@ -23,6 +23,9 @@ from startrack.applications.reproduction.simulator import (
 )
 from startrack.core.types import Array
 from startrack.output.ecsv import Column
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MAGNITUDES = np.arange(2.0, 7.01, 0.25)
 ASPECT_RATIOS = np.logspace(-1, 3, 33)
@@ -38,11 +41,13 @@ def fig3_7(context: Context) -> Artefact:
         f"band: all). At magnitude 6: mean {six[0]:.1f} m, thesis 14.9 m; largest {six[1]:.0f} m, thesis 215 m "
         f"({STEPS}; every single change counted, the mean is {six[2]:.1f} m)."
     )
-    axis = "Minimum Detected Magnitude"
-    return _artefact(
-        "fig3.7", "Effects of changing the star detection limit", caption, "magnitude", MAGNITUDES, curves, six,
-        partial(_draw_panels, MAGNITUDES, curves, axis, (700.0, 7000.0), False, caption),
-    )  # fmt: skip
+    draw = partial(_draw_panels, MAGNITUDES, curves, "Minimum Detected Magnitude", (700.0, 7000.0), False)
+    columns = (
+        Column("magnitude", MAGNITUDES, form="%.6g"),
+        Column("stars", [star_count(one) for one in MAGNITUDES], "int64", form="%d"),
+    )
+    title = "Effects of changing the star detection limit"
+    return _artefact("fig3.7", title, Picture(draw, caption), columns, curves, six)
 
 
 def fig3_9(context: Context) -> Artefact:
@@ -55,11 +60,10 @@ def fig3_9(context: Context) -> Artefact:
         f"band: all; {STEPS}; dashed: every change counted). At 10:1 mean {ten[0]:.1f} m and largest {ten[1]:.0f} m "
         f"(thesis 14.9 and 215 m); at 50:1 largest {widest[1]:.0f} m (thesis: approximately 1 km)."
     )
-    axis = "Crater Aspect Ratio (Diameter:Depth)"
-    return _artefact(
-        "fig3.9", "Effects of changing the crater aspect ratio", caption, "aspect_ratio", ASPECT_RATIOS, curves, ten,
-        partial(_draw_panels, ASPECT_RATIOS, curves, axis, (250.0, 8000.0), True, caption),
-    )  # fmt: skip
+    draw = partial(_draw_panels, ASPECT_RATIOS, curves, "Crater Aspect Ratio (Diameter:Depth)", (250.0, 8000.0), True)
+    columns = (Column("aspect_ratio", ASPECT_RATIOS, form="%.6g"),)
+    title = "Effects of changing the crater aspect ratio"
+    return _artefact("fig3.9", title, Picture(draw, caption), columns, curves, ten)
 
 
 def fig3_8(context: Context) -> Artefact:
@@ -73,21 +77,19 @@ def fig3_8(context: Context) -> Artefact:
         f"Largest {gaps.max():.0f} m (thesis 215 m); mean {inner:.1f} m within 2 km of the centre, {outer:.1f} m "
         "beyond 8 km."
     )
-    return Artefact(
-        name="fig3.8",
-        title="Figure 3.8: Plot of the distance between starfield changes along a crater traverse",
-        line=f"largest {gaps.max():.0f} m (thesis 215), {inner:.0f} m near the centre, {outer:.0f} m near the wall",
-        text=caption,
+    return Artefact.of_figure(
+        "fig3.8", "Plot of the distance between starfield changes along a crater traverse",
+        f"largest {gaps.max():.0f} m (thesis 215), {inner:.0f} m near the centre, {outer:.0f} m near the wall",
+        Picture(partial(_draw_traverse, middles, gaps), caption),
+        {
+            "thesis": {"max_m": published.MAX_GAP_M},
+            "reproduced": {"max_m": float(gaps.max()), "mean_inner_m": inner, "mean_outer_m": outer},
+        },
         columns=(
             Column("from_centre", middles, unit="m", form="%.1f", description="middle between two changes"),
             Column("distance", gaps, unit="m", form="%.1f", description="between the two changes"),
         ),
-        pictures={"fig3.8": partial(_draw_traverse, middles, gaps, caption)},
-        values={
-            "thesis": {"max_m": published.MAX_GAP_M},
-            "reproduced": {"max_m": float(gaps.max()), "mean_inner_m": inner, "mean_outer_m": outer},
-        },
-    )
+    )  # fmt: skip
 
 
 def _gaps(context: Context, magnitude: float, aspect_ratio: float) -> Array:
@@ -101,33 +103,25 @@ def _gaps(context: Context, magnitude: float, aspect_ratio: float) -> Array:
 
 
 def _artefact(
-    name: str, title: str, caption: str, along: str, x: Array, curves: Array, standard: Array, draw: Any
+    name: str, title: str, picture: Picture, columns: tuple[Column, ...], curves: Array, standard: Array
 ) -> Artefact:
-    mean = curves.mean(axis=1)
-    columns = [Column(along, x, form="%.6g")]
-    if along == "magnitude":
-        columns.append(Column("stars", [star_count(m) for m in x], "int64", form="%d"))
-    for k, column in enumerate(("mean_distance", "max_distance", "mean_distance_every_change")):
-        columns.append(Column(column, mean[:, k], unit="m", form="%.3f", description="mean of the starfields"))
-    return Artefact(
-        name=name,
-        title=f"Figure {name.removeprefix('fig')}: {title}",
-        line=f"under standard conditions mean {standard[0]:.1f} m (thesis 14.9), largest {standard[1]:.0f} m (215)",
-        text=caption,
-        columns=tuple(columns),
-        pictures={name: draw},
-        values={
+    means = zip(("mean_distance", "max_distance", "mean_distance_every_change"), curves.mean(axis=1).T, strict=True)
+    return Artefact.of_figure(
+        name, title,
+        f"under standard conditions mean {standard[0]:.1f} m (thesis 14.9), largest {standard[1]:.0f} m (215)",
+        picture,
+        {
             "thesis": {"mean_m": published.MEAN_GAP_M, "max_m": published.MAX_GAP_M},
-            "reproduced": {
-                "mean_m": float(standard[0]),
-                "max_m": float(standard[1]),
-                "mean_every_change_m": float(standard[2]),
-            },
+            "reproduced": dict(zip(("mean_m", "max_m", "mean_every_change_m"), map(float, standard), strict=True)),
         },
-    )
+        columns=(
+            *columns,
+            *(Column(key, mean, unit="m", form="%.3f", description="mean of the starfields") for key, mean in means),
+        ),
+    )  # fmt: skip
 
 
-def _draw_panels(x: Array, curves: Array, axis: str, tops: tuple[float, float], log: bool, caption: str) -> bytes:
+def _draw_panels(x: Array, curves: Array, axis: str, tops: tuple[float, float], log: bool) -> Figure:
     figure = new_figure(7.0, 8.6)
     for k, (axes, top, word) in enumerate(zip(figure.subplots(2, 1), tops, ("Mean", "Maximum"), strict=True)):
         axes.fill_between(x, curves[..., k].min(axis=1), curves[..., k].max(axis=1), color=STAR, alpha=0.15, lw=0)
@@ -138,23 +132,18 @@ def _draw_panels(x: Array, curves: Array, axis: str, tops: tuple[float, float], 
         mark_published(axes, 10.0 if log else 6.0, value, f"thesis: {value:g} m")
         if log:
             axes.set_xscale("log")
-            _mark_craters(axes, top)
+            for ratio, text in ((5.0, "5:1"), (10.0, "Shackleton 10:1"), (50.0, "50:1")):
+                axes.axvline(ratio, color="0.75", linewidth=0.8, zorder=0)
+                axes.text(ratio, 0.62 * top, f" {text}", fontsize=8, rotation=90, va="top", ha="right", color="0.35")
         else:
             axes.set_xticks(np.arange(x[0], x[-1] + 0.01, 0.5))
         axes.set(xlim=(x[0], x[-1]), ylim=(0, top), xlabel=axis, ylabel="Distance (m)")
         axes.set_title(f"({'ab'[k]}) {word} distance between changes in the viewed starfield", fontsize=10)
         axes.legend(loc="upper center" if log else "upper right", frameon=False)
-    return png_bytes(figure, caption)
+    return figure
 
 
-def _mark_craters(axes: Any, top: float) -> None:
-    named = ((5.0, "5:1"), (10.0, "Shackleton 10:1"), (50.0, "50:1"))
-    for ratio, text in named:
-        axes.axvline(ratio, color="0.75", linewidth=0.8, zorder=0)
-        axes.text(ratio, 0.62 * top, f" {text}", fontsize=8, rotation=90, va="top", ha="right", color="0.35")
-
-
-def _draw_traverse(middles_m: Array, gaps: Array, caption: str) -> bytes:
+def _draw_traverse(middles_m: Array, gaps: Array) -> Figure:
     figure = new_figure(7.0, 4.8)
     axes = figure.subplots()
     axes.plot(middles_m / 1e3, gaps, ".", color=STAR, markersize=3)
@@ -163,7 +152,7 @@ def _draw_traverse(middles_m: Array, gaps: Array, caption: str) -> bytes:
     axes.set_ylabel("Distance (m)")
     axes.set_title("Distances between appearing/disappearing stars during a crater traverse", fontsize=10)
     axes.legend(frameon=False)
-    return png_bytes(figure, caption)
+    return figure
 
 
 def fig_a2(context: Context) -> Artefact:
@@ -175,26 +164,25 @@ def fig_a2(context: Context) -> Artefact:
         f"Figure A.2: Lunar crater aspect ratio ranges: simple craters {shown[0]} (thesis: approximately 5; axis 4.96 "
         f"to 5.14), complex craters {shown[1]} (thesis: approximately 5 to 50)."
     )
-    return Artefact(
-        name="figA.2",
-        title="Figure A.2: Lunar crater aspect ratio ranges",
-        line=f"simple craters {shown[0]} (thesis 5), complex {shown[1]} (thesis 5 to 50)",
-        text=caption,
+    return Artefact.of_figure(
+        "figA.2", "Lunar crater aspect ratio ranges",
+        f"simple craters {shown[0]} (thesis 5), complex {shown[1]} (thesis 5 to 50)",
+        Picture(partial(_draw_ratios, (simple, complex_), ratios), caption),
+        {
+            "thesis": {"aspect_ratios": list(published.LUNAR_ASPECT_RATIOS)},
+            "reproduced": {
+                form: [float(r.min()), float(r.max())] for form, r in zip(("simple", "complex"), ratios, strict=True)
+            },
+        },
         columns=(
             Column("diameter", np.concatenate([simple, complex_]), unit="km", form="%.3f"),
             Column("aspect_ratio", np.concatenate(ratios), form="%.4f", description="diameter over depth"),
             Column("craterform", ["simple"] * len(simple) + ["complex"] * len(complex_), "string"),
         ),
-        pictures={"figA.2": partial(_draw_ratios, (simple, complex_), ratios, caption)},
-        values={
-            "thesis": {"aspect_ratios": list(published.LUNAR_ASPECT_RATIOS)},
-            "reproduced": {"simple": [*map(float, (ratios[0].min(), ratios[0].max()))],
-                           "complex": [*map(float, (ratios[1].min(), ratios[1].max()))]},
-        },
     )  # fmt: skip
 
 
-def _draw_ratios(diameters: tuple[Array, Array], ratios: tuple[Array, Array], caption: str) -> bytes:
+def _draw_ratios(diameters: tuple[Array, Array], ratios: tuple[Array, Array]) -> Figure:
     figure = new_figure(7.0, 8.0)
     titles = "(a) Aspect ratios for simple craterforms", "(b) Aspect ratios for complex craterforms"
     limits = ((0, 15), (4.96, 5.14)), ((0, 300), (5, 50))
@@ -202,4 +190,4 @@ def _draw_ratios(diameters: tuple[Array, Array], ratios: tuple[Array, Array], ca
         axes.plot(x, y, color=STAR)
         axes.set(xlim=xlim, ylim=ylim, xlabel="Diameter (km)", ylabel="Aspect Ratio (X:1)")
         axes.set_title(title, fontsize=10)
-    return png_bytes(figure, caption)
+    return figure

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 DPI = 100
 EDGE = "#1a9641"  # the thesis draws the crater's edge in green
 STAR, OTHER_STAR = "#20304a", "#b9c0cc"
-CENTRE = "#d7191c"  # and centres of mass in red
-PUBLISHED = "#d7191c"
+CENTRE = PUBLISHED = "#d7191c"  # and centres of mass in red
 COLOURS = 128  # of a PNG's palette: enough for these drawings, at a third of the size
 
 
@@ -58,8 +57,10 @@ def fisheye_axes(axes: Axes) -> None:
         spine.set_visible(False)
 
 
-def error_map(positions_m: Array, errors_m: Array, title: str, caption: str) -> bytes:
+def error_map(positions_m: Array, errors_m: Array, title: str) -> Figure:
     """Position errors over the crater's floor, point size and colour scaled to the error."""
+    from matplotlib.patches import Circle
+
     figure = new_figure(7.0, 6.6)
     axes = figure.subplots()
     order = np.argsort(errors_m, kind="stable")  # the large ones on top
@@ -67,19 +68,13 @@ def error_map(positions_m: Array, errors_m: Array, title: str, caption: str) -> 
     area = (0.6 + 28.0 * share**1.5) * min(2.0, (2e4 / len(order)) ** 0.5)
     east, north = positions_m[order].T / 1e3
     points = axes.scatter(east, north, s=area, c=errors_m[order], cmap="turbo", linewidths=0)
-    _floor(axes, title)
-    figure.colorbar(points, ax=axes, label="position error (m)", shrink=0.85)
-    return png_bytes(figure, caption)
-
-
-def _floor(axes: Axes, title: str) -> None:
-    from matplotlib.patches import Circle
-
     radius = DIAMETER_M / 2e3
     axes.add_patch(Circle((0, 0), radius, fill=False, color="0.3", linewidth=0.8))
     axes.set(aspect="equal", xlim=(-1.03 * radius, 1.03 * radius), ylim=(-1.03 * radius, 1.03 * radius))
     axes.set(xlabel="east (km)", ylabel="north (km)")
     axes.set_title(title, fontsize=10)
+    figure.colorbar(points, ax=axes, label="position error (m)", shrink=0.85)
+    return figure
 
 
 def mark_published(axes: Any, x: float, y: float, text: str) -> None:

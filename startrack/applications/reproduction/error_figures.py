@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from startrack.applications.reproduction import published
-from startrack.applications.reproduction.artefact import Artefact, Context, markdown_table
-from startrack.applications.reproduction.drawing import STAR, error_map, new_figure, png_bytes
-from startrack.applications.reproduction.methods import BOUND, KUA, OURS, tasks_of
-from startrack.applications.reproduction.simulator import MAGNITUDE, star_count
-from startrack.applications.reproduction.statistics import MethodErrors, collect_errors, format_errors, statistics
+from startrack.applications.reproduction.artefact import Artefact, Context, Picture, markdown_table
+from startrack.applications.reproduction.drawing import PUBLISHED, STAR, error_map, new_figure
+from startrack.applications.reproduction.methods import (
+    BOUND,
+    KUA,
+    OURS,
+    MethodErrors,
+    collect_errors,
+    error_statistics,
+    format_errors,
+)
+from startrack.applications.reproduction.simulator import DIAMETER_M, star_count
 from startrack.output.ecsv import Column
 
-RINGS_KM = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0)
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RINGS_KM = np.linspace(0.0, DIAMETER_M / 2e3, 6)
 SCALED = "Point size and colour scaled to position error."
 SWEEP_MAGNITUDES = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
 SWEEP_ASPECT_RATIOS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
@@ -27,28 +37,26 @@ SweepRow = tuple[MethodErrors, MethodErrors, MethodErrors, MethodErrors]  # as S
 def fig3_4(context: Context) -> Artefact:
     """Error of the skyline estimate over the crater."""
     count = context.size.one_sky
-    hull, _ = collect_errors(context, "fig 3.4", [tasks_of(KUA, context.seed, 0, count)])
+    hull, _ = collect_errors(context, "fig 3.4", KUA, 1, count)
     caption = (
         f"Figure 3.4: Position error at {count:,} sampled points for the skyline estimate. {SCALED} "
         f"Mean / s.d. / largest: {format_errors(hull.errors, '{:.0f} / {:.0f} / {:.0f}')} m; thesis 637 / 275 / 1735 m."
     )
-    return Artefact(
-        name="fig3.4",
-        title="Figure 3.4: Position error at sampled points for the skyline estimate",
-        line=f"skyline estimate {hull.errors.mean():.0f} m (thesis 637)",
-        text=f"{caption}\n\n{_ring_table({'skyline estimate': hull})}",
-        columns=_ring_columns({"hull": hull}),
-        pictures={"fig3.4": partial(error_map, hull.positions_m[0], hull.errors, "Skyline estimate", caption)},
-        values={"thesis": vars(published.HULL), "reproduced": statistics(hull.errors)},
+    return Artefact.of_figure(
+        "fig3.4", "Position error at sampled points for the skyline estimate",
+        f"skyline estimate {hull.errors.mean():.0f} m (thesis 637)",
+        Picture(partial(error_map, hull.positions_m[0], hull.errors, "Skyline estimate"), caption),
+        {"thesis": vars(published.HULL), "reproduced": hull.statistics},
+        f"{caption}\n\n{_ring_table({'skyline estimate': hull})}", columns=_ring_columns({"hull": hull}),
         timing_ms={"hull_and_descent": hull.ms_per_fix},
-    )
+    )  # fmt: skip
 
 
 def fig3_10(context: Context) -> Artefact:
     """Error of the pseudo-gradient over the crater, and ours."""
     size = context.size
-    hull, descent = collect_errors(context, "fig 3.10", [tasks_of(KUA, context.seed, 0, size.one_sky)])
-    (ours,) = collect_errors(context, "fig 3.10, ours", [tasks_of(OURS, context.seed, 0, size.ours_one_sky)])
+    hull, descent = collect_errors(context, "fig 3.10", KUA, 1, size.one_sky)
+    (ours,) = collect_errors(context, "fig 3.10, ours", OURS, 1, size.ours_one_sky)
     unsettled = descent.errors[~descent.answered[0]]
     caption = (
         f"Figure 3.10: Position error at {size.one_sky:,} sampled points. {SCALED} "
@@ -72,13 +80,13 @@ def fig3_10(context: Context) -> Artefact:
         text=f"{caption} {settling}\n\n{of_ours}\n\n{_ring_table(rings)}",
         columns=_ring_columns({"hull": hull, "descent": descent, "ours": ours}),
         pictures={
-            "fig3.10": partial(error_map, descent.positions_m[0], descent.errors, "Pseudo-gradient", caption),
-            "fig3.10.ours": partial(error_map, ours.positions_m[0], ours.errors, "Ours", of_ours),
+            "fig3.10": Picture(partial(error_map, descent.positions_m[0], descent.errors, "Pseudo-gradient"), caption),
+            "fig3.10.ours": Picture(partial(error_map, ours.positions_m[0], ours.errors, "Ours"), of_ours),
         },
         values={
             "thesis": {**vars(published.OVERALL), "never_settle": published.NEVER_SETTLE},
-            "reproduced": {**statistics(descent.errors), "never_settle": descent.refused_fraction},
-            "ours": {**statistics(ours.errors), "refused": ours.refused_count},
+            "reproduced": {**descent.statistics, "never_settle": descent.refused_fraction},
+            "ours": {**ours.statistics, "refused": ours.refused_count},
         },
         timing_ms={"hull_and_descent": descent.ms_per_fix, "ours": ours.ms_per_fix},
     )
@@ -87,28 +95,25 @@ def fig3_10(context: Context) -> Artefact:
 def fig_b(context: Context) -> Artefact:
     """Figures B.1 to B.10: the ten starfields of table 3.1."""
     size = context.size
-    by_sky = [tasks_of(KUA, context.seed, sky, size.per_sky) for sky in range(size.skies)]
-    _, descent = collect_errors(context, "figures B.1 to B.10", by_sky)
-    pictures: dict[str, Callable[[], bytes]] = {}
-    captions = []
+    _, descent = collect_errors(context, "figures B.1 to B.10", KUA, size.skies, size.per_sky)
+    pictures = {}
     for k, trial in enumerate(published.TRIALS[: size.skies]):
-        captions.append(
+        caption = (
             f"Figure B.{k + 1}: Position error at {size.per_sky:,} sampled points in a Shackleton-style crater, "
             f"starfield {k + 1}. {SCALED} Mean / s.d. / largest: {format_errors(descent.errors_m[k])} m; "
             f"thesis {trial.mean_m} / {trial.sd_m} / {trial.max_m} m."
         )
-        pictures[f"figB.{k + 1}"] = partial(
-            error_map, descent.positions_m[k], descent.errors_m[k], f"Starfield {k + 1}", captions[-1]
-        )
+        draw = partial(error_map, descent.positions_m[k], descent.errors_m[k], f"Starfield {k + 1}")
+        pictures[f"figB.{k + 1}"] = Picture(draw, caption)
     return Artefact(
         name="figB",
         title="Figures B.1 to B.10: Position error in a Shackleton-style crater",
         line=f"ten starfields, pseudo-gradient {descent.errors.mean():.1f} m (thesis 34.2)",
-        text="\n\n".join(captions),
+        text="\n\n".join(picture.caption for picture in pictures.values()),
         pictures=pictures,
         values={
             "thesis": {"trials": [vars(trial) for trial in published.TRIALS]},
-            "reproduced": {"trials": [statistics(errors) for errors in descent.errors_m]},
+            "reproduced": {"trials": [error_statistics(errors) for errors in descent.errors_m]},
         },
         timing_ms={"hull_and_descent": descent.ms_per_fix},
     )
@@ -122,21 +127,15 @@ def _ring_means(method: MethodErrors) -> list[float | None]:
 
 
 def _ring_table(methods: dict[str, MethodErrors]) -> str:
-    means = {name: _ring_means(method) for name, method in methods.items()}
-    rows = [
-        [
-            f"{low:.0f} to {low + 2:.0f} km",
-            *("" if means[name][k] is None else f"{means[name][k]:.1f}" for name in means),
-        ]
-        for k, low in enumerate(RINGS_KM[:-1])
-    ]
-    return markdown_table(["from the centre", *(f"{name}: mean error (m)" for name in means)], rows)
+    means = [["" if mean is None else f"{mean:.1f}" for mean in _ring_means(method)] for method in methods.values()]
+    rows = [(f"{a:.0f} to {b:.0f} km", *cells) for (a, b), *cells in zip(pairwise(RINGS_KM), *means, strict=True)]
+    return markdown_table(["from the centre", *(f"{name}: mean error (m)" for name in methods)], rows)
 
 
 def _ring_columns(methods: dict[str, MethodErrors]) -> tuple[Column, ...]:
     columns = [
-        Column("from_km", list(RINGS_KM[:-1]), unit="km", form="%.0f", description="distance from the centre"),
-        Column("to_km", list(RINGS_KM[1:]), unit="km", form="%.0f"),
+        Column("from_km", RINGS_KM[:-1], unit="km", form="%.0f", description="distance from the centre"),
+        Column("to_km", RINGS_KM[1:], unit="km", form="%.0f"),
     ]
     for name, method in methods.items():
         values = ["" if mean is None else f"{mean:.3f}" for mean in _ring_means(method)]
@@ -146,47 +145,38 @@ def _ring_columns(methods: dict[str, MethodErrors]) -> tuple[Column, ...]:
 
 def magnitude_sweep(context: Context) -> Artefact:
     """Position error against the faintest magnitude."""
-    rows = [_sweep_row(context, f"magnitude {value:g}", value, 10.0) for value in SWEEP_MAGNITUDES]
-    extra = [f"{star_count(value):,}" for value in SWEEP_MAGNITUDES]
-    return _sweep_artefact(
-        context, "magnitude", "Position error against the star detection limit (with figure 3.7)", SWEEP_MAGNITUDES,
-        rows,
-        ("magnitude", "stars"), extra,
-    )  # fmt: skip
+    rows = [_sweep_row(context, f"magnitude {value:g}", magnitude=value) for value in SWEEP_MAGNITUDES]
+    more = [f"{star_count(value):,}" for value in SWEEP_MAGNITUDES]
+    title = "Position error against the star detection limit (with figure 3.7)"
+    return _sweep_artefact(context, "magnitude", title, SWEEP_MAGNITUDES, rows, ("magnitude", "stars"), more)
 
 
 def aspect_ratio_sweep(context: Context) -> Artefact:
     """Position error against the crater's aspect ratio."""
-    rows = [_sweep_row(context, f"aspect ratio {value:g}", MAGNITUDE, value) for value in SWEEP_ASPECT_RATIOS]
-    extra = [f"{20_000 / value:,.0f} m" for value in SWEEP_ASPECT_RATIOS]
-    return _sweep_artefact(
-        context, "aspect", "Position error against the crater aspect ratio (with figure 3.9)", SWEEP_ASPECT_RATIOS,
-        rows,
-        ("aspect ratio", "depth"), extra,
-    )  # fmt: skip
+    rows = [_sweep_row(context, f"aspect ratio {value:g}", aspect_ratio=value) for value in SWEEP_ASPECT_RATIOS]
+    more = [f"{DIAMETER_M / value:,.0f} m" for value in SWEEP_ASPECT_RATIOS]
+    title = "Position error against the crater aspect ratio (with figure 3.9)"
+    return _sweep_artefact(context, "aspect", title, SWEEP_ASPECT_RATIOS, rows, ("aspect ratio", "depth"), more)
 
 
-def _sweep_row(context: Context, what: str, magnitude: float, aspect_ratio: float) -> SweepRow:
-    size, found = context.size, []
-    for method in (KUA, OURS, BOUND):
-        by_sky = [
-            tasks_of(method, context.seed, sky, size.sweep_per_sky, magnitude=magnitude, aspect_ratio=aspect_ratio)
-            for sky in range(size.sweep_skies)
-        ]
-        found += collect_errors(context, f"{what}, {method}", by_sky)
-    hull, descent, ours, limit = found
+def _sweep_row(context: Context, what: str, **settings: float) -> SweepRow:
+    skies, per_sky = context.size.sweep_skies, context.size.sweep_per_sky
+    hull, descent = collect_errors(context, f"{what}, {KUA}", KUA, skies, per_sky, **settings)
+    (ours,), (limit,) = (
+        collect_errors(context, f"{what}, {method}", method, skies, per_sky, **settings) for method in (OURS, BOUND)
+    )
     return hull, descent, ours, limit
 
 
 def _sweep_artefact(
     context: Context, name: str, title: str, x: tuple[float, ...], rows: list[SweepRow], head: tuple[str, str],
-    extra: list[str],
+    more: list[str],
 ) -> Artefact:  # fmt: skip
     means = np.array([[one.errors.mean() for one in row] for row in rows])
     cells = [
-        [f"{value:g}", more, *(f"{mean:.3g}" for mean in means[k]), f"{100 * rows[k][1].refused_fraction:.1f} %",
+        [f"{value:g}", one, *(f"{mean:.3g}" for mean in means[k]), f"{100 * rows[k][1].refused_fraction:.1f} %",
          rows[k][2].refused_count]
-        for k, (value, more) in enumerate(zip(x, extra, strict=True))
+        for k, (value, one) in enumerate(zip(x, more, strict=True))
     ]  # fmt: skip
     table = markdown_table(
         [*head, *(f"{n}: mean (m)" for n in SWEEP_METHODS), "never settles", "refused by ours"], cells
@@ -208,7 +198,7 @@ def _sweep_artefact(
         line=f"under standard conditions ours {standard[2]:.1f} m, pseudo-gradient {standard[1]:.1f} m",
         text=f"{caption}\n\n{table}",
         columns=tuple(columns),
-        pictures={name: partial(_draw_sweep, x, means, head[0], caption)},
+        pictures={name: Picture(partial(_draw_sweep, x, means, head[0]), caption)},
         values={
             "reproduced": {"hull_m": means[:, 0].tolist(), "descent_m": means[:, 1].tolist()},
             "ours": {
@@ -221,10 +211,10 @@ def _sweep_artefact(
     )
 
 
-def _draw_sweep(x: tuple[float, ...], means: np.ndarray, label: str, caption: str) -> bytes:
+def _draw_sweep(x: tuple[float, ...], means: np.ndarray, label: str) -> Figure:
     figure = new_figure(7.0, 5.4)
     axes = figure.subplots()
-    styles = (("s:", "0.6"), ("^--", "#2166ac"), ("o-", STAR), ("x", "#d7191c"))
+    styles = (("s:", "0.6"), ("^--", "#2166ac"), ("o-", STAR), ("x", PUBLISHED))
     for k, (style, colour) in enumerate(styles):
         axes.plot(x, means[:, k], style, color=colour, label=SWEEP_METHODS[k])
     axes.set_yscale("log")
@@ -233,4 +223,4 @@ def _draw_sweep(x: tuple[float, ...], means: np.ndarray, label: str, caption: st
     axes.set(xlabel=label, ylabel="mean position error (m)")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
-    return png_bytes(figure, caption)
+    return figure

@@ -1,32 +1,45 @@
-"""The methods on one chunk of positions. Sky and positions depend on the seed only, not on the method or the order."""
+"""The methods on chunks of positions, which are kept on disk, and their errors by sky.
+
+Sky and positions depend on the seed only, not on the method or the order.
+"""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from startrack.applications.reproduction.bound import cell_centroid
+from startrack.applications.reproduction.artefact import Context
 from startrack.applications.reproduction.simulator import (
     ASPECT_RATIO,
     MAGNITUDE,
     PERFECT,
     Mistakes,
     Sky,
+    cell_centroid,
     crater,
     draw_positions,
     visible_stars,
 )
-from startrack.core.types import Array, Bools, Evidence, Fix, NotLocated
+from startrack.core.chunk_store import Chunk, ChunkStore, Progress, settings_digest
+from startrack.core.types import Array, Bools, Fix, NotLocated
 from startrack.localization import ExactPosterior
 from startrack.localization.convex_hull import hull_position
 from startrack.localization.pseudo_gradient import PseudoGradient, descend
 from startrack.terrain import Cylinder
 
+FOLDER = ".chunks"
+SOURCES = (  # their content is part of a chunk's key
+    "localization/*.py", "terrain/cylinder.py", "applications/reproduction/simulator.py",
+    "applications/reproduction/methods.py",
+)  # fmt: skip
 KUA, OURS, BOUND = "kua", "ours", "bound"  # the thesis's two steps; ours; the limit for a perfect list
 FIXES_PER_CHUNK = {KUA: 1000, OURS: 100, BOUND: 200}  # about a second of work
-Chunk = dict[str, np.ndarray]  # the result of one task, by name
+ERROR_OF = {KUA: ("hull_m", "refined_m"), OURS: ("fix_m",), BOUND: ("centroid_m",)}
+ANSWERED = {KUA: "settled", OURS: "located"}
 
 
 @dataclass(frozen=True)
@@ -45,81 +58,137 @@ class Task:
     def __len__(self) -> int:
         return self.stop - self.start
 
+    @property
+    def key(self) -> str:
+        """Of its chunk."""
+        return settings_digest(SOURCES, asdict(self))
 
-def tasks_of(
-    method: str, seed: int, sky: int, count: int, *, magnitude: float = MAGNITUDE, aspect_ratio: float = ASPECT_RATIO,
-    mistakes: Mistakes = PERFECT,
-) -> list[Task]:  # fmt: skip
-    """The first `count` positions of a sky, in chunks."""
+
+def tasks_of(method: str, seed: int, sky: int, count: int, **settings: Any) -> list[Task]:
+    """The first `count` positions of a sky, in chunks; `settings` are the further fields of the tasks."""
     step = FIXES_PER_CHUNK[method]
-    starts = range(0, count, step)
-    return [
-        Task(method, seed, sky, start, min(start + step, count), magnitude, aspect_ratio, mistakes) for start in starts
-    ]
+    return [Task(method, seed, sky, at, min(at + step, count), **settings) for at in range(0, count, step)]
+
+
+def fix_store(out: Path, *, jobs: int, progress: Progress, cluster: str | None = None) -> ChunkStore[Task]:
+    """The store of chunks of fixes under the folder `out`, made in `jobs` processes or on a `cluster`."""
+    return ChunkStore(
+        out / FOLDER, compute_chunk, lambda task: task.key, jobs=jobs, progress=progress, cluster=cluster
+    )  # fmt: skip
 
 
 def compute_chunk(task: Task) -> Chunk:
     """Arrays over the task's positions: `truth_m` (n, 2), the method's own, and `seconds` (1,) of processor time for
     the method.
 
-    kua: `hull_m`, `refined_m` (n, 2), `settled` (n,). ours: `located` (n,); of the located ones `fix_m` (m, 2),
-    `nees` (m,), the squared error over the stated covariance, and `ambiguous` (m,). cell: `centroid_m` (n, 2).
+    kua: `hull_m`, `refined_m` (n, 2), `settled` (n,). ours: `located` (n,), and of the located ones `fix_m` (m, 2).
+    bound: `centroid_m` (n, 2).
     """
     sky, cylinder = Sky.draw(task.seed, task.sky, task.magnitude), crater(task.aspect_ratio)
-    points = sky.project_to_rim_plane(cylinder)
+    points, radius_m = sky.project_to_rim_plane(cylinder), cylinder.radius_m
     truth = draw_positions(task.seed, task.sky, task.start, task.stop)
-    seen = [visible_stars(points, position, cylinder.radius_m) for position in truth]
+    seen = [visible_stars(points, position, radius_m) for position in truth]
+    if task.method == OURS:
+        evidence = [
+            task.mistakes.evidence(sky, task.mistakes.draw_list(one, task.seed, task.sky, task.start + k))
+            for k, one in enumerate(seen)
+        ]
+        localizer = ExactPosterior()
+
+        def fix_or_none(k: int) -> Fix | None:
+            try:
+                return localizer(evidence[k], cylinder)
+            except NotLocated:
+                return None  # `located` is False then
+
+        fix_or_none(0)  # compiles and loads before the clock starts
+    start = time.thread_time()
     if task.method == KUA:
-        own = _solve_kua(points, seen, cylinder.wall_m, cylinder.radius_m)
+        own = _solve_kua(points, seen, cylinder)
     elif task.method == BOUND:
-        start = time.thread_time()
-        own = {"centroid_m": np.stack([cell_centroid(points, position, cylinder.radius_m) for position in truth])}
-        own["seconds"] = np.array([time.thread_time() - start])
+        own = {"centroid_m": np.stack([cell_centroid(points, position, radius_m) for position in truth])}
     else:
-        own = _solve_ours(task, sky, seen, truth)
-    return {"truth_m": truth, **own}
+        fixes = [fix_or_none(k) for k in range(len(truth))]
+        found = [fix.position_enu_m[:2] for fix in fixes if fix is not None]
+        own = {"located": np.array([fix is not None for fix in fixes]), "fix_m": np.array(found).reshape(-1, 2)}
+    return {"truth_m": truth, **own, "seconds": np.array([time.thread_time() - start])}
 
 
-def _solve_kua(points: Array, seen: list[Bools], wall_m: float, radius_m: float) -> Chunk:
-    method, start = PseudoGradient(), time.thread_time()
-    hull = np.stack([hull_position(points[one], wall_m, radius_m) for one in seen])
+def _solve_kua(points: Array, seen: list[Bools], cylinder: Cylinder) -> Chunk:
+    method = PseudoGradient()
+    hull = np.stack([hull_position(points[one], cylinder.wall_m, cylinder.radius_m) for one in seen])
     ends = [
-        descend(points, one, first, radius_m, method.gain, method.most_steps)
+        descend(points, one, first, cylinder.radius_m, method.gain, method.most_steps)
         for one, first in zip(seen, hull, strict=True)
     ]
     return {
         "hull_m": hull,
         "refined_m": np.stack([end for end, _ in ends]),
         "settled": np.array([settled for _, settled in ends]),
-        "seconds": np.array([time.thread_time() - start]),
     }
 
 
-def _solve_ours(task: Task, sky: Sky, seen: list[Bools], truth: Array) -> Chunk:
-    localizer = ExactPosterior()
-    cylinder = crater(task.aspect_ratio)
-    evidence = [
-        task.mistakes.evidence(sky, task.mistakes.draw_list(one, task.seed, task.sky, task.start + k))
-        for k, one in enumerate(seen)
-    ]
-    _fix_or_none(localizer, evidence[0], cylinder)  # compiles and loads before the clock starts
-    start = time.thread_time()
-    fixes = [_fix_or_none(localizer, one, cylinder) for one in evidence]
-    seconds = time.thread_time() - start
-    error = [
-        (fix, fix.position_enu_m[:2] - position) for fix, position in zip(fixes, truth, strict=True) if fix is not None
-    ]
-    return {
-        "located": np.array([fix is not None for fix in fixes]),
-        "fix_m": np.array([fix.position_enu_m[:2] for fix, _ in error]).reshape(-1, 2),
-        "nees": np.array([d @ np.linalg.solve(fix.covariance_m2, d) for fix, d in error]),
-        "ambiguous": np.array([fix.ambiguous for fix, _ in error], dtype=np.bool_),
-        "seconds": np.array([seconds]),
-    }
+@dataclass(frozen=True)
+class MethodErrors:
+    """Errors of one estimate."""
+
+    positions_m: tuple[Array, ...]  # by sky: (n, 2) [m], where there is an estimate
+    errors_m: tuple[Array, ...]  # by sky: (n,) [m]
+    answered: tuple[Bools, ...]  # by sky: settled (kua) or located (ours), for every position
+    ms_per_fix: float
+
+    @property
+    def errors(self) -> Array:
+        """Errors of all skies (n,) [m]."""
+        return np.concatenate(self.errors_m)
+
+    @property
+    def refused_count(self) -> int:
+        """Positions without an estimate; for the pseudo-gradient, with one that never settled."""
+        return int(sum((~one).sum() for one in self.answered))
+
+    @property
+    def refused_fraction(self) -> float:
+        return self.refused_count / max(sum(map(len, self.answered)), 1)
+
+    @property
+    def statistics(self) -> dict[str, float]:
+        """Mean, standard deviation and largest of the errors [m], and their number."""
+        return error_statistics(self.errors)
 
 
-def _fix_or_none(localizer: ExactPosterior, evidence: Evidence, cylinder: Cylinder) -> Fix | None:
-    try:
-        return localizer(evidence, cylinder)
-    except NotLocated:
-        return None  # `located` is False then
+def error_statistics(errors_m: Array) -> dict[str, float]:
+    """Mean, standard deviation and largest of errors (n,) [m], and their number."""
+    mean, sd, largest = (float(one) for one in (errors_m.mean(), errors_m.std(), errors_m.max()))
+    return {"mean_m": mean, "sd_m": sd, "max_m": largest, "count": len(errors_m)}
+
+
+def format_errors(errors_m: Array, form: str = "{:.1f} / {:.1f} / {:.1f}") -> str:
+    """Mean / standard deviation / largest."""
+    return form.format(errors_m.mean(), errors_m.std(), errors_m.max())
+
+
+def collect_errors(
+    context: Context, what: str, method: str, skies: int, per_sky: int, **settings: Any
+) -> list[MethodErrors]:  # fmt: skip
+    """Errors of every estimate of a `method`, in the order of `ERROR_OF`, at `per_sky` positions of each of `skies`.
+
+    `what` names them in the progress bar; `settings` are those of `tasks_of`.
+    """
+    by_sky = [tasks_of(method, context.seed, sky, per_sky, **settings) for sky in range(skies)]
+    found = context.store.chunks(what, [task for tasks in by_sky for task in tasks])
+    chunks = [_join_chunks([next(found) for _ in tasks]) for tasks in by_sky]
+    ms_per_fix = 1e3 * sum(float(chunk["seconds"].sum()) for chunk in chunks) / (skies * per_sky)
+    answered = tuple(chunk[ANSWERED[method]] for chunk in chunks) if method in ANSWERED else ()
+    truth = tuple(chunk["truth_m"][chunk["located"]] if method == OURS else chunk["truth_m"] for chunk in chunks)
+    return [
+        MethodErrors(
+            truth, tuple(np.hypot(*(chunk[key] - at).T) for chunk, at in zip(chunks, truth, strict=True)), answered,
+            ms_per_fix,
+        )
+        for key in ERROR_OF[method]
+    ]  # fmt: skip
+
+
+def _join_chunks(chunks: list[Chunk]) -> Chunk:
+    return {key: np.concatenate([chunk[key] for chunk in chunks]) for key in chunks[0]}

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from startrack.applications.reproduction.artefact import Artefact, Context
+from startrack.applications.reproduction import published
+from startrack.applications.reproduction.artefact import Artefact, Context, Picture
 from startrack.applications.reproduction.drawing import (
     CENTRE,
     EDGE,
@@ -16,7 +17,6 @@ from startrack.applications.reproduction.drawing import (
     fisheye_axes,
     fisheye_points,
     new_figure,
-    png_bytes,
 )
 from startrack.applications.reproduction.simulator import (
     Sky,
@@ -27,6 +27,9 @@ from startrack.applications.reproduction.simulator import (
     visible_stars,
 )
 from startrack.core.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ALONG_KM = (-9.0, -6.0, -3.0, 0.0, 3.0, 6.0, 9.0, 9.9)  # positions of figure 3.3
 EXAMPLE_M = np.array([5000.0, 2000.0])  # of figure 3.6, and the true position of figure 3.5
@@ -43,10 +46,10 @@ def fig3_3(context: Context) -> Artefact:
         "indicates the position of the edge. Fisheye picture (equidistant, the outer circle is the horizontal), east "
         f"to the right, {len(sky)} stars; the number in sight is given."
     )
-    return _picture(
-        "fig3.3", "Viewed starfields at different positions along the centerline of the crater", caption,
-        f"{max(counts)} to {min(counts)} of {len(sky)} stars in sight", partial(_draw_line, sky, caption),
-        {"in_sight": dict(zip(map(str, ALONG_KM), counts, strict=True))},
+    return Artefact.of_figure(
+        "fig3.3", "Viewed starfields at different positions along the centerline of the crater",
+        f"{max(counts)} to {min(counts)} of {len(sky)} stars in sight", Picture(partial(_draw_line, sky), caption),
+        {"thesis": {}, "reproduced": {"in_sight": dict(zip(map(str, ALONG_KM), counts, strict=True))}},
     )  # fmt: skip
 
 
@@ -64,11 +67,11 @@ def fig3_5(context: Context) -> Artefact:
         f"{np.hypot(*step) / 1e3:.2f} km where {np.hypot(*wanted) / 1e3:.2f} km are wanted, {abs(angle):.1f} degrees "
         "off."
     )
-    return _picture(
-        "fig3.5", "Example showing pseudo-gradient computation", caption,
+    return Artefact.of_figure(
+        "fig3.5", "Example showing pseudo-gradient computation",
         f"a step of {np.hypot(*step) / 1e3:.2f} km towards a position {np.hypot(*wanted) / 1e3:.2f} km away",
-        partial(_draw_step, points, views, centres, caption),
-        {"step_m": step.tolist(), "wanted_m": wanted.tolist()},
+        Picture(partial(_draw_step, points, views, centres), caption),
+        {"thesis": {}, "reproduced": {"step_m": step.tolist(), "wanted_m": wanted.tolist()}},
     )  # fmt: skip
 
 
@@ -80,9 +83,9 @@ def fig3_6(context: Context) -> Artefact:
         "Figure 3.6: Example showing viewed starfield computation. The green line is the crater edge projected onto "
         f"the entire starfield. Stars within the crater edge are the viewed stars: {in_sight} of {len(sky)}."
     )
-    return _picture(
-        "fig3.6", "Example showing viewed starfield computation", caption, f"{in_sight} of {len(sky)} stars in sight",
-        partial(_draw_view, sky, caption), {"in_sight": in_sight},
+    return Artefact.of_figure(
+        "fig3.6", "Example showing viewed starfield computation", f"{in_sight} of {len(sky)} stars in sight",
+        Picture(partial(_draw_view, sky), caption), {"thesis": {}, "reproduced": {"in_sight": in_sight}},
     )  # fmt: skip
 
 
@@ -93,25 +96,14 @@ def fig_a1(context: Context) -> Artefact:
         "Figure A.1: Simulation generated starfield for a magnitude 6 detection limit: (a) projected on the unit "
         f"hemisphere, (b) fisheye projection. {star_count(6.0)} stars (thesis: 2142)."
     )
-    return _picture(
-        "figA.1", "Simulation generated starfield for a magnitude 6 detection limit", caption,
-        f"{len(sky)} stars (thesis 2142)", partial(_draw_sky, sky, caption), {"stars": len(sky)},
+    return Artefact.of_figure(
+        "figA.1", "Simulation generated starfield for a magnitude 6 detection limit",
+        f"{len(sky)} stars (thesis {published.STAR_COUNT})", Picture(partial(_draw_sky, sky), caption),
+        {"thesis": {"stars": published.STAR_COUNT}, "reproduced": {"stars": len(sky)}},
     )  # fmt: skip
 
 
-def _picture(name: str, title: str, caption: str, line: str, draw: Any, values: dict[str, Any]) -> Artefact:
-    number = name.removeprefix("fig")
-    return Artefact(
-        name=name,
-        title=f"Figure {number}: {title}",
-        line=line,
-        text=caption,
-        pictures={name: draw},
-        values={"thesis": {"stars": 2142} if name == "figA.1" else {}, "reproduced": values},
-    )
-
-
-def _draw_line(sky: Sky, caption: str) -> bytes:
+def _draw_line(sky: Sky) -> Figure:
     figure = new_figure(10.0, 5.9)
     cylinder, stars = crater(), fisheye_points(sky.azimuth_rad, sky.elevation_rad)
     points = sky.project_to_rim_plane(cylinder)
@@ -122,10 +114,10 @@ def _draw_line(sky: Sky, caption: str) -> bytes:
         axes.plot(*fisheye_points(*crater_edge(cylinder, position)).T, color=EDGE, linewidth=1.0)
         fisheye_axes(axes)
         axes.set_title(f"{east:g} km: {int(seen.sum())} stars", fontsize=9)
-    return png_bytes(figure, caption)
+    return figure
 
 
-def _draw_step(points_m: Array, views: list[Any], centres_m: Array, caption: str) -> bytes:
+def _draw_step(points_m: Array, views: list[Any], centres_m: Array) -> Figure:
     figure = new_figure(10.0, 4.2)
     titles = "Estimated view", "Observed view", "Both, and the vector (×4)"
     for k, (axes, title) in enumerate(zip(figure.subplots(1, 3), titles, strict=True)):
@@ -144,10 +136,10 @@ def _draw_step(points_m: Array, views: list[Any], centres_m: Array, caption: str
         axes.set(aspect="equal", xlim=(-16, 16), ylim=(-14, 14), xlabel="east (km)")
         axes.set_title(title, fontsize=10)
     figure.axes[0].set_ylabel("north (km)")
-    return png_bytes(figure, caption)
+    return figure
 
 
-def _draw_view(sky: Sky, caption: str) -> bytes:
+def _draw_view(sky: Sky) -> Figure:
     figure = new_figure(6.4, 6.8)
     axes, cylinder = figure.subplots(), crater()
     stars = fisheye_points(sky.azimuth_rad, sky.elevation_rad)
@@ -157,10 +149,10 @@ def _draw_view(sky: Sky, caption: str) -> bytes:
     axes.plot(*fisheye_points(*crater_edge(cylinder, EXAMPLE_M)).T, color=EDGE, linewidth=1.5)
     fisheye_axes(axes)
     axes.set_title(f"{EXAMPLE_M[0] / 1e3:.0f} km east, {EXAMPLE_M[1] / 1e3:.0f} km north of the centre", fontsize=10)
-    return png_bytes(figure, caption)
+    return figure
 
 
-def _draw_sky(sky: Sky, caption: str) -> bytes:
+def _draw_sky(sky: Sky) -> Figure:
     figure = new_figure(6.4, 10.6)
     up = figure.add_subplot(2, 1, 1, projection="3d")
     level = np.cos(sky.elevation_rad)
@@ -172,4 +164,4 @@ def _draw_sky(sky: Sky, caption: str) -> bytes:
     flat.plot(*fisheye_points(sky.azimuth_rad, sky.elevation_rad).T, ".", color=STAR, markersize=2)
     fisheye_axes(flat)
     flat.set_title("(b) Fisheye projection of the starfield", fontsize=10)
-    return png_bytes(figure, caption)
+    return figure

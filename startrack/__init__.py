@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 _MODULES = {  # public name to the module that has it
     "detect": "api.solve", "identify": "api.solve", "locate": "api.solve", "track": "api.solve",
-    "calibrate": "api.photographs", "measure_horizon": "api.photographs",
-    "predict": "api.synthetic", "render": "api.synthetic",
+    "calibrate": "api.applications", "measure_horizon": "api.applications",
+    "predict": "api.applications", "render": "api.applications",
     "Solution": "api.solution",
     "Camera": "camera", "load_camera": "camera",
     "Cylinder": "terrain", "HeightMap": "terrain", "Terrain": "terrain", "load_terrain": "terrain",
@@ -27,36 +27,15 @@ _MODULES = {  # public name to the module that has it
     "BadInput": "core.errors", "NoSolution": "core.errors",
 }  # fmt: skip
 __all__ = [
-    "BadInput",
-    "Camera",
-    "Cylinder",
-    "Detections",
-    "Evidence",
-    "ExactPosterior",
-    "Fix",
-    "HeightMap",
-    "NoSolution",
-    "Solution",
-    "Terrain",
-    "__version__",
-    "calibrate",
-    "detect",
-    "identify",
-    "load_camera",
-    "load_catalog",
-    "load_terrain",
-    "locate",
-    "measure_horizon",
-    "predict",
-    "render",
-    "track",
-]
+    "BadInput", "Camera", "Cylinder", "Detections", "Evidence", "ExactPosterior", "Fix", "HeightMap", "NoSolution",
+    "Solution", "Terrain", "__version__", "calibrate", "detect", "identify", "load_camera", "load_catalog",
+    "load_terrain", "locate", "measure_horizon", "predict", "render", "track",
+]  # fmt: skip
 
 if TYPE_CHECKING:
-    from startrack.api.photographs import calibrate, measure_horizon
+    from startrack.api.applications import calibrate, measure_horizon, predict, render
     from startrack.api.solution import Solution
     from startrack.api.solve import detect, identify, locate, track
-    from startrack.api.synthetic import predict, render
     from startrack.camera import Camera, load_camera
     from startrack.catalog import load_catalog
     from startrack.core.errors import BadInput, NoSolution

@@ -20,7 +20,7 @@ from startrack.applications.calibration.report import write_report
 from startrack.applications.calibration.verify import Verification, verify, verify_dict, verify_line
 from startrack.camera import load_camera, save_camera
 from startrack.catalog import load_catalog
-from startrack.cli.calibration_files import write_camera
+from startrack.cli.camera_files import write_camera
 from startrack.cli.main import main
 from startrack.core.types import BadInput, Exposure, NotIdentified
 from startrack.exposure import read_exposure, read_mask, write_exposure

@@ -512,7 +512,14 @@ def test_a_wrong_time_rotates_the_position_about_the_axis_of_a_round_crater(fold
 
 
 def test_the_flag_of_the_evidence_has_the_sources_of_the_settings():
-    from startrack.chain.stages import EVIDENCE_SOURCES as SOURCES_OF_SETTINGS
-    from startrack.cli.common import EVIDENCE_SOURCES
+    from startrack.chain.stages import EVIDENCE_SOURCES
+    from startrack.cli.flags import EVIDENCE
 
-    assert EVIDENCE_SOURCES == SOURCES_OF_SETTINGS
+    assert EVIDENCE.options["choices"] == EVIDENCE_SOURCES
+
+
+def test_the_flags_of_the_odometry_have_the_defaults_of_the_track():
+    from startrack.applications.tracking import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
+    from startrack.cli.flags import ODOMETRY
+
+    assert [one.options["default"] for one in ODOMETRY] == [ODOMETRY_SIGMA, ODOMETRY_FLOOR_M]

@@ -46,7 +46,7 @@ def folder(tmp_path, monkeypatch):
 
 def render(*flags):
     parser = argparse.ArgumentParser("startrack")
-    command.add_parser(parser.add_subparsers())
+    command.COMMANDS[0].add_to(parser.add_subparsers())
     return command.run(
         parser.parse_args(["render", "-c", "small.toml", "--faint-stars", "8", "--stars", "hipparcos", *flags])
     )

@@ -338,7 +338,7 @@ def test_usage(tmp_path, monkeypatch, capsys):
     assert code("fig9.9") == 2 and "fig3.10" in capsys.readouterr().err
     assert code("--quick", "--full") == 2
     assert code("-j", "0") == 2
-    monkeypatch.setattr(cli, "find_spec", lambda name: None)
+    monkeypatch.setattr("startrack.cli.flags.find_spec", lambda name: None)
     assert code("fig3.4") == 2
     message = capsys.readouterr().err
     assert "'.[plots]'" in message and "--no-plots" in message

@@ -17,7 +17,8 @@ from PIL import Image, PngImagePlugin
 from startrack.applications.batch import locate_image
 from startrack.applications.batch.task import valid_stored_record
 from startrack.chain.inputs import exposure_input, time_sigma_input
-from startrack.cli.common import add_fact_flags, flag_facts
+from startrack.cli.flags import FACTS
+from startrack.cli.inputs import flag_facts
 from startrack.cli.main import main
 from startrack.core.errors import BadInput
 from startrack.core.types import TIME_SIGMA_S, Exposure
@@ -149,7 +150,8 @@ def test_with_facts_leaves_the_rest_alone():
 
 def flags(*words):
     parser = argparse.ArgumentParser()
-    add_fact_flags(parser)
+    for one in FACTS:
+        parser.add_argument(*one.names, **one.options)
     return flag_facts(argparse.Namespace(**vars(parser.parse_args(words))))
 
 

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
+from startrack import chain
 from startrack.api.solution import Solution
 from startrack.applications.tracking import (
     ODOMETRY_FLOOR_M,
@@ -17,23 +18,7 @@ from startrack.applications.tracking import (
 )
 from startrack.camera import Camera
 from startrack.catalog import load_catalog
-from startrack.chain import (
-    Image,
-    Outcome,
-    Refused,
-    Settings,
-    Time,
-    camera_input,
-    exposure_input,
-    field_of_view_rad,
-    is_list_of_centroids,
-    load_camera_input,
-    pipeline,
-    settings_input,
-    stars_at,
-    terrain_input,
-    time_input,
-)  # fmt: skip
+from startrack.chain import Image, Outcome, Refused, Settings, Time, stars_at
 from startrack.core.errors import BAD_INPUT_REASONS, BadInput
 from startrack.core.types import Exposure
 from startrack.terrain import Terrain
@@ -43,8 +28,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from startrack.identification import IdentifiedCentroids
-
-TIME_FLAG, TIME_ARGUMENT = "--time UTC", "time="  # messages of the stages name the flags of the commands
 
 
 def locate(
@@ -76,10 +59,10 @@ def locate(
         BadInput: something is missing (no_time, no_calibration, bad_terrain) or cannot be used (exit code 4).
         TypeError: `settings` of another type.
     """
-    settings = settings_input(settings)
-    exposure = exposure_input(image, time, time_sigma)
-    known = camera_input(camera, exposure), terrain_input(terrain, exposure)
-    return _solution(pipeline.locate(exposure, *known, load_catalog(), settings), "fix")
+    settings = chain.settings_input(settings)
+    exposure = chain.exposure_input(image, time, time_sigma)
+    known = chain.camera_input(camera, exposure), chain.terrain_input(terrain, exposure)
+    return _solution(chain.locate(exposure, *known, load_catalog(), settings), "fix")
 
 
 def track(
@@ -113,11 +96,10 @@ def track(
             for another camera and bad_terrain for another terrain than those of the first image; the reason of the
             first refused image where none has a single position.
     """
-    session = TrackSession(
-        settings=settings_input(settings) or Settings(), stated_camera=camera, stated_terrain=terrain
-    )  # fmt: skip
+    settings = chain.settings_input(settings) or Settings()
+    session = TrackSession(settings=settings, stated_camera=camera, stated_terrain=terrain)
     for image in images:
-        session.add_exposure(exposure_input(image, None))
+        session.add_exposure(chain.exposure_input(image, None))
     moves = odometry if odometry is None or isinstance(odometry, Odometry) else read_odometry(odometry)
     return session.estimate(
         moves, odometry_sigma=odometry_sigma, odometry_floor_m=odometry_floor_m, at_rest=at_rest
@@ -163,12 +145,23 @@ def identify(
     given = [f"{name}=" for name, value in of_list.items() if value is not None]
     if given and isinstance(image, str | os.PathLike | Exposure):
         raise ValueError(f"{' and '.join(given)}: for lists of centroids only, and this is an image")
-    if given or is_list_of_centroids(image):
-        return _identify_list(image, camera, time, fov, size_px, flux, sigma_px)
-    exposure = exposure_input(image, time)
+    if given or chain.is_list_of_centroids(image):
+        from startrack.identification import identify_centroids
+
+        if camera is None and (fov is None or size_px is None):
+            raise ValueError("centroids: give a camera, or fov= with size_px=")
+        xy_px: Any = image
+        return identify_centroids(
+            xy_px, camera=None if camera is None else chain.load_camera_input(camera),
+            fov_rad=None if fov is None else chain.field_of_view_rad(fov), size_px=size_px, flux=flux,
+            sigma_px=sigma_px, stars=stars_at(load_catalog(), chain.time_input(time), None),
+        )  # fmt: skip
+    exposure = chain.exposure_input(image, time)
     if fov is not None:
-        return _solution(pipeline.identify_blind(exposure, field_of_view_rad(fov), load_catalog()), "identification")
-    return _solution(pipeline.identify(exposure, camera_input(camera, exposure), load_catalog()), "identification")
+        outcome = chain.identify_blind(exposure, chain.field_of_view_rad(fov), load_catalog())
+    else:
+        outcome = chain.identify(exposure, chain.camera_input(camera, exposure), load_catalog())
+    return _solution(outcome, "identification")
 
 
 def detect(image: Image, *, camera: str | Camera | None = None) -> Solution:
@@ -181,37 +174,14 @@ def detect(image: Image, *, camera: str | Camera | None = None) -> Solution:
     Raises:
         BadInput: as `locate`.
     """
-    exposure = exposure_input(image, None)
+    exposure = chain.exposure_input(image, None)
     is_known = camera is not None or exposure.camera is not None
-    return _solution(pipeline.detect(exposure, camera_input(camera, exposure) if is_known else None), "detections")
-
-
-def _identify_list(
-    xy_px: Any,
-    camera: str | Camera | None,
-    time: Time,
-    fov: float | Quantity | None,
-    size_px: tuple[int, int] | None,
-    flux: ArrayLike | None,
-    sigma_px: ArrayLike | None,
-) -> IdentifiedCentroids:
-    from startrack.identification import identify_centroids
-
-    if camera is None and (fov is None or size_px is None):
-        raise ValueError("centroids: give a camera, or fov= with size_px=")
-    return identify_centroids(
-        xy_px,
-        camera=None if camera is None else load_camera_input(camera),
-        fov_rad=None if fov is None else field_of_view_rad(fov),
-        size_px=size_px,
-        flux=flux,
-        sigma_px=sigma_px,
-        stars=stars_at(load_catalog(), time_input(time), None),
-    )
+    lens = chain.camera_input(camera, exposure) if is_known else None
+    return _solution(chain.detect(exposure, lens), "detections")
 
 
 def _solution(outcome: Outcome, kind: str) -> Solution:
     """Raises BadInput where the input was at fault, whichever stage found that."""
-    if isinstance(outcome, Refused) and outcome.reason in BAD_INPUT_REASONS:
-        raise BadInput(outcome.reason, outcome.message.replace(TIME_FLAG, TIME_ARGUMENT))
+    if isinstance(outcome, Refused) and outcome.reason in BAD_INPUT_REASONS:  # the stages name flags of the commands
+        raise BadInput(outcome.reason, outcome.message.replace("--time UTC", "time="))
     return Solution(outcome, kind)

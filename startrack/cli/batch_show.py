@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from startrack.cli.outcomes import discard_stdout
 from startrack.cli.progress import progress
 from startrack.core.errors import EXIT_BAD_INPUT, INTERNAL_ERROR, exit_code_of
 
@@ -82,7 +83,7 @@ def show_outcomes(total: int, args: argparse.Namespace, halt: Halt) -> Iterator[
             elif record["reason"] and exit_code_of(record["reason"]) == EXIT_BAD_INPUT and not args.quiet:
                 print(f"{record['image']}: {record['reason']}: {record['message']}", file=sys.stderr, flush=True)
         except BrokenPipeError:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            discard_stdout()
             halt("the output is no longer read")
 
     with progress("locate", total, shown=not args.quiet) as bar:

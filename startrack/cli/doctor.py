@@ -1,4 +1,4 @@
-"""`startrack doctor`: versions, extras, data files, compiled kernels and a self-test of the whole chain."""
+"""`startrack doctor`: versions, extras, data files, kernels and a self-test; `schema`: JSON schemas of the files."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from importlib import metadata
 from typing import Any
 
 from startrack import __version__
+from startrack.cli.flags import JSON, MORE, Command, flag
 
 REQUIRED = (
     "numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "astropy", "isal", "pillow", "tifffile",
@@ -31,43 +32,10 @@ SELF_TEST_SEED = 20080501
 SELF_TEST_LIMIT_M = 40.0
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add `doctor` to the commands of the `startrack` parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "doctor",
-        help="versions, data files, compiled kernels, self-test",
-        description="Check the installation: versions, extras, data files, and one rendered exposure located from its "
-        "pixels, for which the kernels are compiled (once for each installation). Exit code 0 if all is well, 1 "
-        "otherwise.",
-    )
-    parser.add_argument(
-        "-t", "--terrain", metavar="FILE", help="compute this terrain's horizons and compile its kernels ahead of time"
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("-v", "--verbose", action="count", default=0, help="more output; tracebacks of internal errors")
-    parser.add_argument("-q", "--quiet", action="store_true", help="print failures only")
-    parser.set_defaults(run=run)
-
-
 def run(args: argparse.Namespace) -> int:
     """Run the checks; 0 if all pass, else 1."""
-    checks = [_run_check(name, check) for name, check in _checks(args).items()]
-    if args.json:
-        record = {"version": __version__, "python": platform.python_version(), "checks": checks}
-        print(json.dumps(record, indent=2))
-        return 0 if all(check["ok"] for check in checks) else 1
-    if not args.quiet:
-        where = f"{platform.system()} {platform.machine()}"
-        print(f"startrack {__version__}, Python {platform.python_version()} on {where}")
-    for check in checks:
-        if not args.quiet or not check["ok"]:
-            print(f"  {'ok  ' if check['ok'] else 'FAIL'}  {check['name']:<10} {check['message']}")
-    return 0 if all(check["ok"] for check in checks) else 1
-
-
-def _checks(args: argparse.Namespace) -> dict[str, Callable[[], str]]:
     checks: dict[str, Callable[[], str]] = {
-        "packages": _packages,
+        "packages": lambda: ", ".join(f"{name} {metadata.version(name)}" for name in REQUIRED),
         "extras": _extras,
         "catalogue": _catalogue,
         "cameras": lambda: _check_shipped_files("calib"),
@@ -76,7 +44,17 @@ def _checks(args: argparse.Namespace) -> dict[str, Callable[[], str]]:
         "kernels": lambda: _kernels(args),
         "self-test": _self_test,
     }
-    return checks
+    done = [_run_check(name, check) for name, check in checks.items()]
+    if args.json:
+        record = {"version": __version__, "python": platform.python_version(), "checks": done}
+        print(json.dumps(record, indent=2))
+    elif not args.quiet:
+        where = f"{platform.system()} {platform.machine()}"
+        print(f"startrack {__version__}, Python {platform.python_version()} on {where}")
+    for check in () if args.json else done:
+        if not args.quiet or not check["ok"]:
+            print(f"  {'ok  ' if check['ok'] else 'FAIL'}  {check['name']:<10} {check['message']}")
+    return 0 if all(check["ok"] for check in done) else 1
 
 
 def _run_check(name: str, check: Callable[[], str]) -> dict[str, Any]:
@@ -84,10 +62,6 @@ def _run_check(name: str, check: Callable[[], str]) -> dict[str, Any]:
         return {"name": name, "ok": True, "message": check()}
     except Exception as cause:  # noqa: BLE001 - doctor reports every error
         return {"name": name, "ok": False, "message": f"{type(cause).__name__}: {cause}"}
-
-
-def _packages() -> str:
-    return ", ".join(f"{name} {metadata.version(name)}" for name in REQUIRED)
 
 
 def _extras() -> str:
@@ -133,7 +107,7 @@ def _ephemeris() -> str:
 
 def _kernels(args: argparse.Namespace) -> str:
     """Compile the kernels of the cylinder, and of the terrain of the flag, with its horizons."""
-    from startrack.cli.preparation import compile_kernels, prepare
+    from startrack.cli.progress import compile_kernels, prepare
     from startrack.terrain import load_terrain
 
     names = dict.fromkeys(["shackleton-thesis", *([args.terrain] if args.terrain else [])])
@@ -165,3 +139,40 @@ def _self_test() -> str:
     if error > SELF_TEST_LIMIT_M:
         raise RuntimeError(f"the rendered exposure was located {error:.0f} m from the truth")
     return f"a rendered exposure was located to {error:.1f} m"
+
+
+def run_schema(args: argparse.Namespace) -> int:
+    """Print a schema; 0, or a usage error for an unknown kind."""
+    from startrack.applications.tracking import TRACK
+    from startrack.output.schema import SCHEMAS
+
+    schemas = {**SCHEMAS, "track": TRACK}
+    if args.name is None:
+        print("\n".join(schemas))
+    elif args.name in schemas:
+        print(json.dumps(schemas[args.name], indent=2))
+    else:
+        args.usage_error(f"no schema is called {args.name!r}; there are: {', '.join(schemas)}")
+    return 0
+
+
+COMMANDS = (
+    Command(
+        "doctor", run, "versions, data files, compiled kernels, self-test",
+        "Check the installation: versions, extras, data files, and one rendered exposure located from its pixels, for "
+        "which the kernels are compiled (once for each installation). Exit code 0 if all is well, 1 otherwise.",
+        {
+            "input": (
+                flag("-t --terrain FILE", "compute this terrain's horizons and compile its kernels ahead of time"),
+            ),
+            "more": (JSON, *MORE),
+        },
+        "startrack doctor",
+    ),
+    Command(
+        "schema", run_schema, "JSON schemas of the files",
+        "Print the JSON schema of one kind of file, or without a name the list of kinds.",
+        {"input": (flag("name KIND", "such as fix, identification, camera, terrain", nargs="?"),)},
+        "startrack schema fix",
+    ),
+)  # fmt: skip

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from startrack.cli.flag_types import amount, positive_number, seconds
+from startrack.cli.flags import flag
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -15,24 +16,21 @@ if TYPE_CHECKING:
     from startrack.rendering import Drive, Pose, Series
 
 TRUTH, ODOMETRY = "truth.tum", "odometry.tum"
-ODOMETRY_SIGMA_1, ODOMETRY_FLOOR_M = 0.02, 0.05
 ODOMETRY_HEAD = (
     "# time tx ty tz qx qy qz qw (Unix seconds UTC, m); frame: begins at the first pose, level, heading arbitrary\n"
     "# error of each increment on each horizontal axis: sqrt(({sigma:g} length)^2 + ({floor:g} m)^2)\n"
 )
 TRUTH_HEAD = "# time tx ty tz qx qy qz qw (Unix seconds UTC as stated in the images, m); body in enu, true\n"
-
-
-def add_drive_flags(group: Any) -> None:
-    """Add the flags to a group of the parser."""
-    help_path = "CSV file of waypoints, columns east_m,north_m: the rover drives along it, its nose forward"
-    help_sigma = f"error of the odometry, as a part of each increment ({ODOMETRY_SIGMA_1})"
-    help_floor = f"error of the odometry, added in quadrature to each increment ({ODOMETRY_FLOOR_M})"
-    group.add_argument("--every", type=seconds, metavar="SECONDS", help="time between the exposures")
-    group.add_argument("--path", metavar="WAYPOINTS", help=help_path)
-    group.add_argument("--speed", type=positive_number, metavar="M_PER_S", help="along the path")
-    group.add_argument("--odometry-sigma", type=amount, metavar="F", help=help_sigma)
-    group.add_argument("--odometry-floor", type=amount, metavar="M", help=help_floor)
+DRIVE_FLAGS = (
+    flag("--every SECONDS", "time between the exposures", seconds),
+    flag(
+        "--path WAYPOINTS",
+        "CSV file of waypoints, columns east_m,north_m: the rover drives along it, its nose forward",
+    ),
+    flag("--speed M_PER_S", "along the path", positive_number),
+    flag("--odometry-sigma F", "error of the odometry, as a part of each increment (as of `track`)", amount),
+    flag("--odometry-floor M", "error of the odometry, added in quadrature to each increment (as of `track`)", amount),
+)
 
 
 def read_drive_flags(args: argparse.Namespace) -> Drive | None:
@@ -73,6 +71,7 @@ def trajectory_paths(args: argparse.Namespace) -> list[Path]:
 
 def write_trajectories(args: argparse.Namespace, series: Series, poses: Sequence[Pose]) -> None:
     """Write the true `poses` of the series and, of a drive, its odometry, as TUM text with the stated times."""
+    from startrack.applications.tracking import ODOMETRY_FLOOR_M, ODOMETRY_SIGMA
     from startrack.core.files import write_atomically
     from startrack.frames import tum_line
 
@@ -85,7 +84,7 @@ def write_trajectories(args: argparse.Namespace, series: Series, poses: Sequence
     write_atomically(Path(args.dir) / TRUTH, (TRUTH_HEAD + true).encode(), overwrite=args.overwrite)
     if series.drive is None:
         return
-    sigma_1 = ODOMETRY_SIGMA_1 if args.odometry_sigma is None else args.odometry_sigma
+    sigma_1 = ODOMETRY_SIGMA if args.odometry_sigma is None else args.odometry_sigma
     floor_m = ODOMETRY_FLOOR_M if args.odometry_floor is None else args.odometry_floor
     measured = text(*series.odometry(poses, sigma_1=sigma_1, floor_m=floor_m))
     head = ODOMETRY_HEAD.format(sigma=sigma_1, floor=floor_m)

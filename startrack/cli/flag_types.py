@@ -1,16 +1,18 @@
-"""Numbers on the command line, as argparse types with messages in words."""
+"""Types of the values on the command line, with messages in words."""
 
 from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable
+from typing import TypeVar
 
 from startrack.core.declaration import LARGEST, SHOWN_CHARS
 
+T = TypeVar("T")
 MAX_EXPOSURE_S = 1e6  # as startrack.exposure has it; written here so that help is quick
 MAX_COUNT = 1_000_000
 MAX_MAGNITUDE = 100.0
-GEO_FORMATS = ("geojson", "kml")
 FIELD_TOLERANCE_1 = 0.1  # as startrack.identification.unknown_lens has it; written here so that help is quick
 
 
@@ -25,18 +27,41 @@ def number(text: str) -> float:
     return value
 
 
-def amount(text: str) -> float:
-    """A number from 0 up."""
-    if number(text) < 0:
+def count(text: str) -> int:
+    """A whole number from 0 up."""
+    try:
+        value = int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+    if value < 0:
         raise argparse.ArgumentTypeError(f"{text!r} is negative")
-    return number(text)
+    return value
 
 
-def positive_number(text: str) -> float:
-    """A number above 0."""
-    if number(text) <= 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not above 0")
-    return number(text)
+def limited(convert: Callable[[str], T], is_allowed: Callable[[T], bool], fault: str) -> Callable[[str], T]:
+    """The type of the values that `is_allowed`; `fault` is the message about another one, "{}" in it the text."""
+
+    def checked(text: str) -> T:
+        value = convert(text)
+        if not is_allowed(value):
+            raise argparse.ArgumentTypeError(fault.format(text[:SHOWN_CHARS]))
+        return value
+
+    return checked
+
+
+amount = limited(number, lambda value: value >= 0, "{!r} is negative")
+positive_number = limited(number, lambda value: value > 0, "{!r} is not above 0")
+magnitude = limited(
+    number,
+    lambda value: abs(value) <= MAX_MAGNITUDE,
+    f"{{!r}} is no magnitude from -{MAX_MAGNITUDE:g} to {MAX_MAGNITUDE:g}",
+)
+seconds = limited(
+    number, lambda value: 0 < value <= MAX_EXPOSURE_S, f"{{!r}} is not above 0 and up to {MAX_EXPOSURE_S:g} seconds"
+)
+positive_count = limited(count, lambda value: value > 0, "{!r} is not above 0")
+limited_count = limited(count, lambda value: value <= MAX_COUNT, f"{{}} is more than {MAX_COUNT}")
 
 
 def time_sigma_s(text: str) -> float:
@@ -52,45 +77,6 @@ def time_sigma_s(text: str) -> float:
 def clock_offset_s(text: str) -> float:
     """An error of a clock [s], no larger than the largest sigma."""
     return math.copysign(time_sigma_s(str(abs(number(text)))), number(text))
-
-
-def magnitude(text: str) -> float:
-    """A magnitude, from -100 to 100."""
-    if not abs(number(text)) <= MAX_MAGNITUDE:
-        raise argparse.ArgumentTypeError(f"{text!r} is no magnitude from -{MAX_MAGNITUDE:g} to {MAX_MAGNITUDE:g}")
-    return number(text)
-
-
-def seconds(text: str) -> float:
-    """An exposure time [s]."""
-    if not 0 < number(text) <= MAX_EXPOSURE_S:
-        raise argparse.ArgumentTypeError(f"{text!r} is not above 0 and up to {MAX_EXPOSURE_S:g} seconds")
-    return number(text)
-
-
-def count(text: str) -> int:
-    """A whole number from 0 up."""
-    try:
-        value = int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is negative")
-    return value
-
-
-def limited_count(text: str) -> int:
-    """A whole number from 0 to a million."""
-    if count(text) > MAX_COUNT:
-        raise argparse.ArgumentTypeError(f"{text[:SHOWN_CHARS]} is more than {MAX_COUNT}")
-    return count(text)
-
-
-def positive_count(text: str) -> int:
-    """A whole number from 1 up."""
-    if count(text) == 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not above 0")
-    return count(text)
 
 
 def field_of_view_rad(text: str, narrowest_deg: float = 0.5, widest_deg: float = 360.0) -> float:
@@ -119,9 +105,9 @@ def fields_of_view_rad(text: str, narrowest_deg: float, widest_deg: float) -> tu
 
 
 def geo_formats(text: str) -> list[str]:
-    """Names of GEO_FORMATS with commas between them."""
+    """Names of formats with commas between them."""
     found = text.split(",")
-    if any(one not in GEO_FORMATS for one in found):
+    if not set(found) <= {"geojson", "kml"}:
         raise argparse.ArgumentTypeError(f"{text[:SHOWN_CHARS]!r} is not geojson, kml or geojson,kml")
     return found
 
@@ -132,10 +118,3 @@ def position_prior(text: str) -> tuple[float, float, float]:
     if len(words) != 3:
         raise argparse.ArgumentTypeError(f"{text[:SHOWN_CHARS]!r} is not EAST,NORTH,SIGMA in metres, as -3000,1500,200")
     return number(words[0]), number(words[1]), positive_number(words[2])
-
-
-def calibrated_angle_rad(text: str) -> float:
-    """An angle off the axis, above 0 and up to 180, given in degrees [rad]."""
-    if not 0 < number(text) <= 180:
-        raise argparse.ArgumentTypeError(f"{text} is not above 0 and up to 180 degrees")
-    return math.radians(number(text))

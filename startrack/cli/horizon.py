@@ -8,59 +8,34 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.calibrate import approximate_camera, print_outcome, site_of
-from startrack.cli.common import add_fact_flags, add_output_flags, read
+from startrack.cli import flags
 from startrack.cli.flag_types import field_of_view_rad
+from startrack.cli.flags import Command, flag
+from startrack.cli.inputs import approximate_camera, check_fov, check_one_time, read, site_of
+from startrack.cli.outcomes import Outcome, print_outcome, refusal
 from startrack.cli.progress import progress
 from startrack.core.errors import BadInput, BadOutput, NoSolution
 
 if TYPE_CHECKING:
-    from startrack.applications.horizon import LeftOut, SkylineResult
-    from startrack.core.types import Exposure
-    from startrack.frames import Site
+    from startrack.applications.horizon import SkylineResult
 
 FORMAT = "startrack.horizon/1"
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add `horizon` to the commands of the `startrack` parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "horizon",
-        help="the horizon of a fixed camera from photographs of the night sky",
-        description="Measure the skyline (obstruction profile) of a fixed camera on the Earth from one or several "
-        "photographs of the night sky: from stars seen, stars missing, and the place where the sky's light stops. The "
-        "suffix of -o chooses the format: .csv, .ecsv, .hrz (N.I.N.A.), .png (panorama), none (folder of a Stellarium "
-        "landscape).",
-    )
-    parser.add_argument("images", nargs="+", metavar="IMAGE", help="PNG, TIFF, FITS, JPEG or camera raw")
-    parser.add_argument("-o", "--output", metavar="FILE", required=True, help="the skyline")
-    parser.add_argument("--site", metavar="LAT,LON[,M]", help="where the camera stands, in degrees and metres "
-                        "(--site=-30.2,...)")  # fmt: skip
-    parser.add_argument("-t", "--terrain", metavar="FILE", help="terrain file on the Earth whose origin is the site")
-    parser.add_argument("--fov", type=field_of_view_rad, metavar="DEG", help="no camera file: field of view, good to "
-                        "10 %%; below 100 across the width, from 100 up of the image circle")  # fmt: skip
-    add_fact_flags(parser)
-    add_output_flags(parser)
-    parser.set_defaults(run=run, usage_error=parser.error)
-
-
 def run(args: argparse.Namespace) -> int:
     """Measure and write the skyline; the exit code."""
-    if args.fov is not None and args.camera is not None:
-        args.usage_error("--fov is for an unknown lens, -c for a known one: give one of them")
-    if args.time is not None and len(args.images) > 1:
-        args.usage_error("--time is the time of one image; give each of several its own in a sidecar NAME.json")
+    check_fov(args)
+    check_one_time(args)
     try:
         return print_outcome(args, *_measure(args))
     except BadOutput:
         raise
     except (BadInput, NoSolution) as cause:
-        record = {"format": FORMAT, "status": "refused", "reason": cause.reason, "message": str(cause),
-                  "advice": cause.reason.advice}  # fmt: skip
+        record = refusal(cause.reason, str(cause), format=FORMAT)
         return print_outcome(args, record, f"{Path(args.output).name}  refused {cause.reason}: {cause}")
 
 
-def _measure(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+def _measure(args: argparse.Namespace) -> Outcome:
     """The record and the line of a skyline that was measured and written."""
     from startrack.applications.horizon.frames import orient_frames
     from startrack.applications.horizon.measure import measure_frames
@@ -69,34 +44,23 @@ def _measure(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
     check_output(args.output, overwrite=args.overwrite)
     exposures = [read(path, args) for path in args.images]
-    site = _earth_site(args, exposures)
+    site = site_of(args, exposures)
+    if site is None:
+        raise BadInput("bad_terrain", "the site is not known: give --site LAT,LON[,M]; without it there is no azimuth")
+    if site.body != "earth":
+        raise BadInput("bad_terrain", f"the site is on the {site.body}: this command is for cameras on the Earth")
     camera = approximate_camera(args, exposures)
     with progress("horizon", 2, shown=not (args.quiet or args.json)) as bar:
         bar.advance(0, text="identifying the stars")
         frames, left_out = orient_frames(exposures, load_catalog(), site, camera=camera, fov_rad=args.fov)
-        if frames:  # else the refusal names them
-            _name_left_out(left_out)
+        for one in left_out if frames else ():  # else the refusal names them
+            print(f"{one.name}: left out, {one.reason}: {one.message}", file=sys.stderr, flush=True)
         bar.advance(text="measuring the skyline")
         found = measure_frames(frames, left_out, site)
     write_skyline(args.output, found.skyline, site, overwrite=args.overwrite)
     unknown = int((~found.skyline.known).sum())
     note = f"{unknown} of them interpolated" if needs_all_azimuths(args.output) and unknown else ""
     return _record(args, found, note), _line(args, found, note)
-
-
-def _earth_site(args: argparse.Namespace, exposures: list[Exposure]) -> Site:
-    """The site. Raises BadInput (bad_terrain) where none is known or it is not on the Earth."""
-    site = site_of(args, exposures)
-    if site is None:
-        raise BadInput("bad_terrain", "the site is not known: give --site LAT,LON[,M]; without it there is no azimuth")
-    if site.body != "earth":
-        raise BadInput("bad_terrain", f"the site is on the {site.body}: this command is for cameras on the Earth")
-    return site
-
-
-def _name_left_out(left_out: tuple[LeftOut, ...]) -> None:
-    for one in left_out:
-        print(f"{one.name}: left out, {one.reason}: {one.message}", file=sys.stderr, flush=True)
 
 
 def _record(args: argparse.Namespace, found: SkylineResult, note: str) -> dict[str, Any]:
@@ -137,3 +101,27 @@ def _median_deg(values_rad: Any) -> float | None:
     import numpy as np
 
     return float(np.degrees(np.median(values_rad))) if len(values_rad) else None
+
+
+COMMANDS = (
+    Command(
+        "horizon", run, "the horizon of a fixed camera from photographs of the night sky",
+        "Measure the skyline (obstruction profile) of a fixed camera on the Earth from one or several photographs of "
+        "the night sky: from stars seen, stars missing, and the place where the sky's light stops. The suffix of -o "
+        "chooses the format: .csv, .ecsv, .hrz (N.I.N.A.), .png (panorama), none (folder of a Stellarium landscape).",
+        {
+            "input": (
+                flags.PHOTOGRAPHS, *flags.FACTS, flags.SITE, flags.TERRAIN,
+                flag(
+                    "--fov DEG",
+                    "no camera file: field of view, good to 10 %%; below 100 across the width, from 100 up of the "
+                    "image circle",
+                    field_of_view_rad,
+                ),
+            ),
+            "output": (flag("-o --output FILE", "the skyline", required=True), *flags.OUTPUT),
+            "more": (flags.NO_SEED, *flags.MORE),
+        },
+        "startrack horizon NIGHT.jpg... --fov 180 --site 34.74,-111.42 -o horizon.csv",
+    ),
+)  # fmt: skip

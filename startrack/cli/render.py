@@ -10,9 +10,9 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.common import add_time_sigma_flag
+from startrack.cli import flags
 from startrack.cli.drive import (
-    add_drive_flags,
+    DRIVE_FLAGS,
     count_images,
     read_drive_flags,
     trajectory_paths,
@@ -27,7 +27,9 @@ from startrack.cli.flag_types import (
     number,
     positive_count,
     seconds,
+    time_sigma_s,
 )
+from startrack.cli.flags import Command, Either, flag
 from startrack.cli.progress import progress
 from startrack.core.files import check_output
 
@@ -38,31 +40,12 @@ if TYPE_CHECKING:
 SUFFIXES = {"png": ".png", "tiff": ".tif", "fits": ".fits"}
 KNOWN_SUFFIXES = {".png", ".tif", ".tiff", ".fits", ".fit", ".fts"}
 CATALOG_V_MAG = 10.0  # catalogue stars drawn when there are no faint ones to go with them
-STAR_LISTS = ("auto", "hipparcos", "gaia")
 PROGRESS_FROM = 3  # images
-
-
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
-    """Add `render` to the commands of the `startrack` parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "render",
-        help="make synthetic exposures and files with their truth",
-        description="Render the image of a camera on the crater's floor. Position, heading, tilt and time are drawn "
-        "from the seed unless they are given. With --every the exposures are at equal steps of time, at rest or, with "
-        "--path, on a drive with odometry. Beside NAME.png: NAME.json (time, exposure, camera, terrain), "
-        "NAME.truth.json (pose, settings) and NAME.truth.ecsv (stars).",
-    )
-    parser.add_argument("-c", "--camera", default="fisheye-2048", metavar="FILE", help="default %(default)s")
-    parser.add_argument("-t", "--terrain", default="shackleton-thesis", metavar="FILE", help="default %(default)s")
-    parser.add_argument("--seed", type=count, default=0, metavar="N", help="same seed, same bytes (default 0)")
-    help_count = "images (default 1; of a drive all along its path)"
-    parser.add_argument("-n", "--count", type=positive_count, metavar="N", help=help_count)
-    _add_pose(parser.add_argument_group("pose and time (what is not given is drawn from the seed)"))
-    add_drive_flags(parser.add_argument_group("series at rest (--every alone) or along a path"))
-    _add_light(parser.add_argument_group("light and defects"))
-    _add_output(parser.add_argument_group("output"))
-    parser.set_defaults(run=run, usage_error=parser.error)
-    return parser
+ANGLES = ("heading", "pitch", "roll")
+SETTINGS = (  # flags that determine the pixels, without those of the pose and of the files' names
+    "max_tilt", "sky_mag", "sky_gradient", "sky_gradient_azimuth", "wall_reflectance", "faint_stars", "no_faint_stars",
+    "flux_scatter", "hot_pixels", "cosmic_rays", "truth_mag",
+)  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -81,50 +64,6 @@ def run(args: argparse.Namespace) -> int:
     if poses:
         write_trajectories(args, series, poses)
     return 0
-
-
-def _add_pose(group: Any) -> None:
-    group.add_argument("--time", metavar="UTC", help="middle of the exposure; else between 2024 and 2034")
-    add_time_sigma_flag(group, default="0; with --clock-offset not stated")
-    help_offset = "true minus stated time, for image and sidecar with the time of a wrong clock (0)"
-    group.add_argument("--clock-offset", type=clock_offset_s, default=0.0, metavar="SECONDS", help=help_offset)
-    group.add_argument("--east", type=number, metavar="M", help="from the terrain's origin")
-    group.add_argument("--north", type=number, metavar="M", help="from the terrain's origin")
-    group.add_argument("--heading", type=number, metavar="DEG", help="azimuth of the rover's nose")
-    group.add_argument("--pitch", type=number, metavar="DEG", help="nose up positive")
-    group.add_argument("--roll", type=number, metavar="DEG", help="right side down positive")
-    group.add_argument("--max-tilt", type=amount, default=5.0, metavar="DEG", help="of random tilts (5)")
-
-
-def _add_light(group: Any) -> None:
-    help_exposure = "seconds; default: a V 6 star on the axis reaches 5 sigma, which takes fisheye-2048 0.40 s"
-    help_faint = "no stars fainter than this; down to it, stars that Hipparcos lacks are drawn at random (FIELD n) (10)"
-    help_stars = "whose stars the sky has (auto: Gaia's where the extra `deep` is installed)"
-    help_scatter = "of each star's flux, beyond the catalogue's own errors (0.03); 0 turns both off"
-    group.add_argument("--exposure", type=seconds, metavar="S", help=help_exposure)
-    group.add_argument("--sky-mag", type=magnitude, default=22.0, metavar="V", help="diffuse sky per arcsec^2 (22.0)")
-    group.add_argument("--sky-gradient", type=number, default=0.0, metavar="F", help="its slope to the horizon (0)")
-    group.add_argument("--sky-gradient-azimuth", type=number, default=0.0, metavar="DEG", help="where it rises to (0)")
-    group.add_argument("--wall-reflectance", type=amount, default=0.04, metavar="F", help="of the sky's light (0.04)")
-    group.add_argument("--stars", choices=STAR_LISTS, default="auto", help=help_stars)
-    group.add_argument("--faint-stars", type=magnitude, default=10.0, metavar="V", help=help_faint)
-    group.add_argument("--no-faint-stars", action="store_true", help="the catalogue's stars alone")
-    group.add_argument("--flux-scatter", type=amount, default=0.03, metavar="MAG", help=help_scatter)
-    group.add_argument("--hot-pixels", type=limited_count, default=200, metavar="N", help="of the sensor (200)")
-    group.add_argument("--cosmic-rays", type=limited_count, default=5, metavar="N", help="tracks per exposure (5)")
-
-
-def _add_output(group: Any) -> None:
-    where = group.add_mutually_exclusive_group()
-    where.add_argument("-o", "--output", metavar="FILE", help="one image: .png, .tif or .fits")
-    where.add_argument("-D", "--dir", default="startrack-out", metavar="OUT", help="folder (default %(default)s)")
-    group.add_argument("--format", choices=SUFFIXES, default="png", help="of images in the folder (png)")
-    group.add_argument("--truth-mag", type=magnitude, default=8.5, metavar="V", help="faintest star in the table (8.5)")
-    group.add_argument("-O", "--overwrite", action="store_true", help="replace existing files")
-    group.add_argument("--json", action="store_true", help="one JSON object per image on stdout")
-    group.add_argument("--no-plots", action="store_true", help="accepted everywhere; render draws no plots")
-    group.add_argument("-v", "--verbose", action="count", default=0, help="tracebacks of internal errors")
-    group.add_argument("-q", "--quiet", action="store_true", help="print errors only")
 
 
 def _targets(args: argparse.Namespace, count: int) -> list[Path]:
@@ -160,31 +99,16 @@ def _series(args: argparse.Namespace, drive: Drive | None) -> Series:
     catalog = load_sky_catalog(args.stars)
     faint = None if args.no_faint_stars else args.faint_stars
     return Series(
-        camera=load_camera(args.camera),
-        terrain=load_terrain(args.terrain),
-        catalog=catalog.brighter_than(CATALOG_V_MAG if faint is None else faint),
-        seed=args.seed,
-        time_utc=None if args.time is None else parse_utc(args.time),
-        east_m=args.east,
-        north_m=args.north,
-        heading_rad=_radians(args.heading),
-        pitch_rad=_radians(args.pitch),
-        roll_rad=_radians(args.roll),
-        max_tilt_rad=math.radians(args.max_tilt),
-        exposure_s=args.exposure,
-        sky_v_mag_arcsec2=args.sky_mag,
-        sky_gradient=args.sky_gradient,
-        sky_gradient_azimuth_rad=math.radians(args.sky_gradient_azimuth),
-        wall_reflectance=args.wall_reflectance,
-        faint_v_mag=faint,
-        flux_scatter_mag=args.flux_scatter,
-        hot_pixels=args.hot_pixels,
-        cosmic_rays=args.cosmic_rays,
-        every_s=args.every,
-        drive=drive,
-        camera_ref=args.camera,
-        terrain_ref=args.terrain,
-    )
+        camera=load_camera(args.camera), terrain=load_terrain(args.terrain),
+        catalog=catalog.brighter_than(CATALOG_V_MAG if faint is None else faint), seed=args.seed,
+        time_utc=None if args.time is None else parse_utc(args.time), east_m=args.east, north_m=args.north,
+        **{f"{name}_rad": math.radians(deg) for name in ANGLES if (deg := getattr(args, name)) is not None},
+        max_tilt_rad=math.radians(args.max_tilt), exposure_s=args.exposure, sky_v_mag_arcsec2=args.sky_mag,
+        sky_gradient=args.sky_gradient, sky_gradient_azimuth_rad=math.radians(args.sky_gradient_azimuth),
+        wall_reflectance=args.wall_reflectance, faint_v_mag=faint, flux_scatter_mag=args.flux_scatter,
+        hot_pixels=args.hot_pixels, cosmic_rays=args.cosmic_rays, every_s=args.every, drive=drive,
+        camera_ref=args.camera, terrain_ref=args.terrain,
+    )  # fmt: skip
 
 
 def _render_one(args: argparse.Namespace, series: Series, number: int, image: Path) -> dict[str, Any]:
@@ -199,7 +123,8 @@ def _render_one(args: argparse.Namespace, series: Series, number: int, image: Pa
     pose = {**_pose(scene, truth), "clock_offset_s": args.clock_offset}
     write_exposure(image, exposure, overwrite=args.overwrite)
     write_sidecar(image, exposure, overwrite=args.overwrite)
-    facts = {**pose, "seed": args.seed, "number": number, "catalog": series.catalog.name, "settings": _settings(args)}
+    settings = {name: getattr(args, name) for name in SETTINGS}
+    facts = {**pose, "seed": args.seed, "number": number, "catalog": series.catalog.name, "settings": settings}
     pose_path, table_path = write_truth(image, truth, facts, to_v_mag=args.truth_mag, overwrite=args.overwrite)
     return {"image": str(image), "truth": str(pose_path), "table": str(table_path), **facts}
 
@@ -230,15 +155,6 @@ def _pose(scene: Scene, truth: Truth) -> dict[str, Any]:
     }
 
 
-def _settings(args: argparse.Namespace) -> dict[str, Any]:
-    """The flags that determine the pixels, without the flags for the files' names."""
-    names = (
-        "max_tilt sky_mag sky_gradient sky_gradient_azimuth wall_reflectance faint_stars no_faint_stars flux_scatter "
-        "hot_pixels cosmic_rays truth_mag"
-    )
-    return {name: getattr(args, name) for name in names.split()}
-
-
 def _line(summary: dict[str, Any]) -> str:
     return (
         f"{summary['image']}: east {summary['east_m']:.1f} m, north {summary['north_m']:.1f} m, "
@@ -248,5 +164,74 @@ def _line(summary: dict[str, Any]) -> str:
     )
 
 
-def _radians(degrees: float | None) -> float | None:
-    return None if degrees is None else math.radians(degrees)
+COMMANDS = (
+    Command(
+        "render", run, "make synthetic exposures and files with their truth",
+        "Render the image of a camera on the crater's floor. Position, heading, tilt and time are drawn from the seed "
+        "unless they are given. With --every the exposures are at equal steps of time, at rest or, with --path, on a "
+        "drive with odometry. Beside NAME.png: NAME.json (time, exposure, camera, terrain), NAME.truth.json (pose, "
+        "settings) and NAME.truth.ecsv (stars).",
+        {
+            "input": (
+                flag("-c --camera FILE", "camera file, or a shipped name", default="fisheye-2048"),
+                flag("-t --terrain FILE", "terrain file, or a shipped name", default="shackleton-thesis"),
+                flag("--seed N", "same seed, same bytes", count, default=0),
+                flag("-n --count N", "images (default 1; of a drive all along its path)", positive_count),
+            ),
+            "pose and time (what is not given is drawn from the seed)": (
+                flag("--time UTC", "middle of the exposure; else between 2024 and 2034"),
+                flag(
+                    "--time-sigma SECONDS",
+                    "standard deviation of the clock's error (0; with --clock-offset not stated)", time_sigma_s,
+                ),
+                flag(
+                    "--clock-offset SECONDS",
+                    "true minus stated time, for image and sidecar with the time of a wrong clock", clock_offset_s,
+                    default=0.0,
+                ),
+                flag("--east M", "from the terrain's origin", number),
+                flag("--north M", "from the terrain's origin", number),
+                flag("--heading DEG", "azimuth of the rover's nose", number),
+                flag("--pitch DEG", "nose up positive", number),
+                flag("--roll DEG", "right side down positive", number),
+                flag("--max-tilt DEG", "of random tilts", amount, default=5.0),
+            ),
+            "series at rest (--every alone) or along a path": DRIVE_FLAGS,
+            "light and defects": (
+                flag(
+                    "--exposure S",
+                    "seconds; default: a V 6 star on the axis reaches 5 sigma, which takes fisheye-2048 0.40 s",
+                    seconds,
+                ),
+                flag("--sky-mag V", "diffuse sky per arcsec^2", magnitude, default=22.0),
+                flag("--sky-gradient F", "its slope to the horizon", number, default=0.0),
+                flag("--sky-gradient-azimuth DEG", "where it rises to", number, default=0.0),
+                flag("--wall-reflectance F", "of the sky's light", amount, default=0.04),
+                flag(
+                    "--stars", "whose stars the sky has (auto: Gaia's where the extra `deep` is installed)",
+                    choices=("auto", "hipparcos", "gaia"), default="auto",
+                ),
+                flag(
+                    "--faint-stars V",
+                    "no stars fainter than this; down to it, stars that Hipparcos lacks are drawn at random (FIELD n)",
+                    magnitude, default=10.0,
+                ),
+                flag("--no-faint-stars", "the catalogue's stars alone"),
+                flag(
+                    "--flux-scatter MAG",
+                    "of each star's flux, beyond the catalogue's own errors; 0 turns both off", amount, default=0.03,
+                ),
+                flag("--hot-pixels N", "of the sensor", limited_count, default=200),
+                flag("--cosmic-rays N", "tracks per exposure", limited_count, default=5),
+            ),
+            "output": (
+                Either((flag("-o --output FILE", "one image: .png, .tif or .fits"), flags.DIR)),
+                flag("--format", "of images in the folder", choices=SUFFIXES, default="png"),
+                flag("--truth-mag V", "faintest star in the table", magnitude, default=8.5),
+                flags.OVERWRITE, flags.JSON, flags.NO_PLOTS,
+            ),
+            "more": flags.MORE,
+        },
+        "startrack render --seed 1",
+    ),
+)  # fmt: skip

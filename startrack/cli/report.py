@@ -1,4 +1,4 @@
-"""`startrack report`: results as one page that any browser opens."""
+"""`startrack report`: results as one page that any browser opens; `demo` makes a picture and opens its page."""
 
 from __future__ import annotations
 
@@ -8,41 +8,20 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from startrack.cli.flag_types import count
+from startrack.cli.flags import DIR, MORE, Command, flag
 from startrack.core.errors import BadInput
 from startrack.core.files import check_output, existing_folder
 
 if TYPE_CHECKING:
     from startrack.output.html import Found
 
-PAGE = "report.html"
-OF_ONE = ".report.html"
+PAGE = "report.html"  # of a folder; of one result NAME.report.html
 DEFAULT_IMAGES = 30
 FEW = 3
-
-
-def add_parser(subparsers: Any) -> None:
-    """Add `report` to the commands of the `startrack` parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "report",
-        help="results as one page for a browser",
-        description="Write OUT/report.html: every result of the folder OUT, in one file that needs no server and no "
-        "network. Of a single NAME.fix.json it writes NAME.report.html beside it.",
-    )
-    parser.add_argument("out", metavar="OUT", help="folder of results, or one NAME.fix.json")
-    parser.add_argument("-o", "--output", metavar="FILE", help="file of the page")
-    parser.add_argument(
-        "--images", type=count, default=DEFAULT_IMAGES, metavar="N",
-        help="number of images with picture and stars (%(default)s); the table contains all",
-    )  # fmt: skip
-    parser.add_argument(
-        "--truth", metavar="FOLDER", help="folder with NAME.truth.json of the images, to show the errors"
-    )
-    parser.add_argument("-v", "--verbose", action="count", default=0, help="tracebacks of internal errors")
-    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
-    parser.set_defaults(run=run)
+POSITION_M = (-6900.0, 4700.0)  # of the demo: near the wall of the thesis's crater, where the position is known best
 
 
 def run(args: argparse.Namespace) -> int:
@@ -63,7 +42,7 @@ def write_page_of(
         check_output(output, overwrite=True)
     if Path(out).is_file():
         one = result_at(out)
-        path = Path(output) if output else one.companion(OF_ONE)
+        path = Path(output) if output else one.companion(f".{PAGE}")
         write_page(path, [one], real=_true_positions([one], truth), images=images, single=True)
         return path
     found, unread = results_under(out)
@@ -130,3 +109,55 @@ def _true_position(folder: Path, one: Found) -> tuple[float, float] | None:
     if not (math.isfinite(east) and math.isfinite(north)):
         raise BadInput("bad_image", f"{path}: position_enu_m is not finite")
     return east, north
+
+
+def run_demo(args: argparse.Namespace) -> int:
+    """Render, locate, report; the exit code of `locate`."""
+    from startrack.cli.main import main
+
+    image, east_north = Path(args.dir) / "demo.png", [f"{metres:g}" for metres in POSITION_M]
+    pose = ["--seed", str(args.seed), "--east", east_north[0], "--north", east_north[1]]
+    made = main(["render", *pose, "-o", str(image), "-O", "-q"])
+    if made:
+        return made
+    code = main(["locate", str(image), "-D", args.dir, "-O", *(["-q"] if args.quiet else [])])
+    page = write_page_of(str(image.with_suffix(".fix.json")), truth=args.dir)
+    if not args.quiet:
+        print(f"the camera stood at E {east_north[0]} m, N {east_north[1]} m; report: {page}")
+    if not args.no_open:
+        import webbrowser
+
+        webbrowser.open(page.resolve().as_uri())
+    return code
+
+
+COMMANDS = (
+    Command(
+        "report", run, "results as one page for a browser",
+        "Write OUT/report.html: every result of the folder OUT, in one file that needs no server and no network. Of a "
+        "single NAME.fix.json it writes NAME.report.html beside it.",
+        {
+            "input": (
+                flag("out OUT", "folder of results, or one NAME.fix.json"),
+                flag("--truth FOLDER", "folder with NAME.truth.json of the images, to show the errors"),
+            ),
+            "output": (
+                flag("-o --output FILE", "file of the page"),
+                flag("--images N", "number of images with picture and stars; the table contains all", count,
+                     default=DEFAULT_IMAGES),
+            ),
+            "more": MORE,
+        },
+        "startrack report startrack-out",
+    ),
+    Command(
+        "demo", run_demo, "make a picture, locate it and open the report",
+        "Render a fisheye picture from a crater floor, locate it, and open the report in a browser. Writes demo.png "
+        "with the truth beside it, and the results of startrack locate.",
+        {
+            "output": (DIR, flag("--no-open", "do not open the report in a browser")),
+            "more": (flag("--seed N", "of attitude, time and noise", int, default=1), *MORE),
+        },
+        "startrack demo",
+    ),
+)  # fmt: skip

@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from startrack.cli.common import DEFAULT_OUT, cores
+from startrack.cli import flags
 from startrack.cli.flag_types import count, positive_count
+from startrack.cli.flags import Command, Either, check_cluster, check_extra, cores, flag
 from startrack.cli.progress import progress
 from startrack.core.compilation import announce_compilation
 from startrack.core.files import make_folder
@@ -23,44 +23,6 @@ NAMES = (
     "table3.1", "fig3.3", "fig3.4", "fig3.5", "fig3.6", "fig3.7", "fig3.8", "fig3.9", "fig3.10", "figA.1", "figA.2",
     "figB", "magnitude", "aspect",
 )  # fmt: skip
-USAGE = 2
-
-
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
-    """Add `reproduce` to the commands of the `startrack` parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "reproduce",
-        help="the thesis's tables and figures, ours beside them",
-        description="Reproduce the tables and figures of Kua 2008 in its crater simulator, with its method and ours "
-        "on the same draws. Each NAME gives NAME.md, NAME.png and, with numbers, NAME.ecsv. Computed chunks are kept "
-        "in OUT/.chunks: a stopped run is resumed.",
-    )
-    parser.add_argument(
-        "what", nargs="*", default=["all"], metavar="NAME", help=f"all (default), or any of: {', '.join(NAMES)}"
-    )
-    size = parser.add_mutually_exclusive_group()
-    size.add_argument(
-        "--quick", action="store_true", help="fewer positions than the thesis, in about a minute (default)"
-    )
-    size.add_argument("--full", action="store_true", help="as in the thesis: 10 x 10,000, and 100,000 positions")
-    parser.add_argument(
-        "--ours",
-        type=positive_count,
-        metavar="N",
-        help="our method on at most N positions per starfield, 10 N in figure 3.10",
-    )
-    parser.add_argument(
-        "-j", "--jobs", type=positive_count, default=None, metavar="N", help="processes (default: all cores)"
-    )
-    parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask cluster to use instead (extra: cluster)")
-    parser.add_argument("--seed", type=count, default=0, metavar="N", help="same seed, same files (default 0)")
-    parser.add_argument("-D", "--dir", metavar="OUT", default=DEFAULT_OUT, help="folder of the results (%(default)s)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object per table or figure")
-    parser.add_argument("--no-plots", action="store_true", help="no pictures")
-    parser.add_argument("-v", "--verbose", action="count", default=0, help="tracebacks of internal errors")
-    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
-    parser.set_defaults(run=run, usage_error=parser.error)
-    return parser
 
 
 def run(args: argparse.Namespace) -> int:
@@ -71,8 +33,9 @@ def run(args: argparse.Namespace) -> int:
             f"{', '.join(unknown)}: not a table or figure of the thesis; known are {', '.join(NAMES)}, all"
         )
     chosen = NAMES if "all" in args.what else [name for name in NAMES if name in args.what]
-    _require_extra(args, "matplotlib", "plots", "figures need", unless=args.no_plots)
-    _require_extra(args, "distributed", "cluster", "--cluster needs", unless=args.cluster is None)
+    if not args.no_plots:
+        check_extra(args, "matplotlib", "plots", "figures need", ", or omit them with --no-plots")
+    check_cluster(args)
 
     from startrack.applications.reproduction import ARTEFACTS, FULL, QUICK, Context, fix_store, write_artefact
 
@@ -91,12 +54,6 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _require_extra(args: argparse.Namespace, module: str, extra: str, what: str, *, unless: bool) -> None:
-    if not unless and find_spec(module) is None:
-        hint = "" if extra != "plots" else ", or omit them with --no-plots"
-        args.usage_error(f"{what} {module}: pip install '.[{extra}]' in a clone of startrack{hint}")
-
-
 def _print_artefact(args: argparse.Namespace, artefact: Artefact, size: str, files: list[Path], seconds: float) -> None:
     if args.json:
         record = {
@@ -113,3 +70,30 @@ def _print_artefact(args: argparse.Namespace, artefact: Artefact, size: str, fil
     elif not args.quiet:
         per_fix = ", ".join(f"{key} {value:.1f}" for key, value in artefact.timing_ms.items())
         print(f"{artefact.name}: {artefact.line}{f' [ms per fix: {per_fix}]' if per_fix else ''}", flush=True)
+
+
+COMMANDS = (
+    Command(
+        "reproduce", run, "the thesis's tables and figures, ours beside them",
+        "Reproduce the tables and figures of Kua 2008 in its crater simulator, with its method and ours on the same "
+        "draws. Each NAME gives NAME.md, NAME.png and, with numbers, NAME.ecsv. Computed chunks are kept in "
+        "OUT/.chunks: a stopped run is resumed.",
+        {
+            "input": (
+                flag("what NAME", f"all (default), or any of: {', '.join(NAMES)}", nargs="*", default=["all"]),
+            ),
+            "method": (
+                Either((
+                    flag("--quick", "fewer positions than the thesis, in about a minute (default)"),
+                    flag("--full", "as in the thesis: 10 x 10,000, and 100,000 positions"),
+                )),
+                flag("--ours N", "our method on at most N positions per starfield, 10 N in figure 3.10",
+                     positive_count),
+                flag("--seed N", "same seed, same files", count, default=0),
+            ),
+            "output": (flags.DIR, flags.JSON, flags.NO_PLOTS),
+            "more": (flags.JOBS, flags.CLUSTER, *flags.MORE),
+        },
+        "startrack reproduce table3.1 --quick",
+    ),
+)  # fmt: skip

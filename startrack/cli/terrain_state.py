@@ -6,9 +6,10 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from startrack.cli.flag_types import amount
+from startrack.cli.flags import JSON, MORE, Command, flag
 from startrack.core.errors import BadInput
 from startrack.core.files import parse_toml, printable, read_text, resolve_named, write_atomically
 
@@ -21,21 +22,6 @@ FLAGS = {  # keys of the file, and the unit of each
     "camera_height_sigma_m": "M",
 }  # fmt: skip
 Values = dict[tuple[str, str], float | bool]  # by table and key
-
-
-def add_state_parser(actions: Any) -> argparse.ArgumentParser:
-    """Add `state` to the actions of `startrack terrain`."""
-    parser: argparse.ArgumentParser = actions.add_parser(
-        "state", help="write into a terrain file the errors that it leaves out",
-        description="An error that the file states is trusted; for one that it leaves out a default counts, and that "
-        "it may be grossly wrong. Without flags the missing ones are asked for, or listed where there is no terminal.",
-    )  # fmt: skip
-    parser.add_argument("file", metavar="FILE", help="the terrain file; its comments stay")
-    for key, unit in FLAGS.items():
-        parser.add_argument(_flag(key), dest=key, type=amount, metavar=unit, help=f"{key}: one standard deviation")
-    parser.add_argument("--exact", action="store_true", help="the terrain is a model: errors that it leaves out are 0")
-    parser.set_defaults(usage_error=parser.error)
-    return parser
 
 
 def _flag(key: str) -> str:
@@ -125,3 +111,19 @@ def _show(args: argparse.Namespace, path: Path, missing: list[StateableError], v
     if left and not written and not sys.stdin.isatty():
         flags = " ".join(f"{_flag(error.key)} {FLAGS[error.key]}" for error in left)
         print(f"startrack terrain state {path}: give {flags}, or --exact", file=sys.stderr)
+
+
+COMMAND = Command(
+    "state", state_terrain, "write into a terrain file the errors that it leaves out",
+    "An error that the file states is trusted; for one that it leaves out a default counts, and that it may be grossly "
+    "wrong. Without flags the missing ones are asked for, or listed where there is no terminal.",
+    {
+        "input": (
+            flag("file FILE", "the terrain file; its comments stay"),
+            *(flag(f"{_flag(key)} {unit}", "one standard deviation", amount, dest=key) for key, unit in FLAGS.items()),
+            flag("--exact", "the terrain is a model: errors that it leaves out are 0"),
+        ),
+        "more": (JSON, *MORE),
+    },
+    "startrack terrain state own.toml --depth-sigma 30",
+)  # fmt: skip

@@ -5,17 +5,17 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.odometry_file import OdometryFile
-from startrack.cli.preparation import prepare_reference
-from startrack.cli.progress import progress
-from startrack.core.errors import EXIT_BAD_INPUT, EXIT_STOPPED, BadInput, exit_code_of
+from startrack.cli.progress import prepare_reference, progress
+from startrack.core.errors import EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_STOPPED, BadInput, exit_code_of
 
 if TYPE_CHECKING:
     from startrack.applications.tracking import ObservedFrame, Odometry, Track, TrackSession
@@ -25,40 +25,75 @@ Source = tuple[str, "Callable[[], ObservedFrame]"]  # of one image: its name, an
 QUICK_S = 0.2  # files that take longer are written when no image waits
 
 
+class OdometryFile:
+    """A file of odometry that is read again where it has changed."""
+
+    def __init__(self, path: str, topic: str | None, is_followed: bool) -> None:
+        """Of a `path`, and of a bag the `topic`; `is_followed`: its last line may be incomplete."""
+        self.path, self.topic, self.is_followed = path, topic, is_followed
+        self._has_ended = False
+        self._read: tuple[object, Odometry] | None = None  # with the stamp of the file
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether the file is another one than was read."""
+        return self._read is None or self._read[0] != self._stamp()
+
+    def read(self) -> Odometry:
+        """The odometry as it is now. Raises BadInput as `read_odometry`."""
+        from startrack.applications.tracking import read_odometry
+
+        stamp = self._stamp()
+        if self._read is not None and self._read[0] == stamp:
+            return self._read[1]
+        try:
+            moves = read_odometry(self.path, self.topic, growing=self.is_followed and not self._has_ended)
+        except BadInput:
+            if not self._has_ended:
+                raise
+            moves = read_odometry(self.path, self.topic, growing=True)  # without the last line
+        self._read = stamp, moves
+        return moves
+
+    def end(self) -> None:
+        """The file grows no more: its last line counts too, if it can be read."""
+        self._has_ended, self._read = True, None
+
+    def _stamp(self) -> object:
+        with suppress(OSError):
+            found = Path(self.path).stat()
+            return found.st_size, found.st_mtime_ns
+        return None
+
+
 class TrackRun:
     """One run of the command: what it prints and writes."""
 
     def __init__(self, args: argparse.Namespace, session: TrackSession) -> None:
         self.args, self.session = args, session
-        self.codes: set[int] = {0}
+        self.codes: set[int] = set()
         self._is_old, self._write_s = False, 0.0  # the files; what writing them took
         self._printed = 0  # lines at rest
         self._shown: set[str] = set()  # facts whose gross error an image showed
-        self._moves = (
-            None if args.odometry is None else OdometryFile(args.odometry, args.odometry_topic, bool(args.follow))
-        )  # fmt: skip
+        self._errors = {"odometry_sigma": args.odometry_sigma, "odometry_floor_m": args.odometry_floor}
+        self._moves: OdometryFile | None = None
+        if args.odometry is not None:
+            self._moves = OdometryFile(args.odometry, args.odometry_topic, bool(args.follow))
 
     def take_all(self) -> None:
         """Locate all images, then estimate and write the track."""
         paths = self._paths()
         with progress("track", len(paths or ()), shown=paths is not None and not self.args.quiet) as bar:
-            for name, add in self._exposures_of_bag() if paths is None else self._images(paths):
+            for name, add in self._sources(paths):
                 try:
                     self._note(add())
                 except BadInput as cause:
                     self._refuse(name, cause)
                 bar.advance()
-        track = self._whole_track()
-        if track is not None:
-            self._write(track)
-            self._note_unused(track)
-            self._print_frames(track)
-            self._print_summary(track)
+        self._finish()
 
     def follow(self) -> None:
         """Take images as they come; Ctrl-C and SIGTERM end it, before the first image with the code of a stop."""
-        import signal
-
         from startrack.applications.batch import images_under
         from startrack.applications.tracking import follow_images
 
@@ -70,7 +105,7 @@ class TrackRun:
                 lambda path: self._note(self._add(path)),
                 lambda path, cause: self._refuse(os.path.relpath(path, folder), cause),
                 until_idle_s=self.args.until_idle,
-            ):  # fmt: skip
+            ):
                 self._update(path is not None)
         except KeyboardInterrupt:
             if not self.session.frames:
@@ -81,19 +116,39 @@ class TrackRun:
             signal.signal(signal.SIGTERM, former)
         if self._moves is not None:
             self._moves.end()
-        track = self._whole_track(growing=True)
-        if track is not None:
-            self._write(track)
-            self._note_unused(track)
-            self._print_summary(track)
+        self._finish(growing=True)
 
-    def _note_unused(self, track: Track) -> None:
+    def _finish(self, growing: bool = False) -> None:
+        """Write and print the track of all images, `growing` in front of the user; the reasons where there is none."""
+        from startrack.applications.tracking import frame_records, track_record
+
+        try:
+            track = self._estimate(growing)
+        except BadInput as cause:
+            if exit_code_of(cause.reason) == EXIT_BAD_INPUT:
+                raise
+            for frame in self.session.frames:
+                if frame.reason:
+                    print(f"{frame.name}  refused  {frame.reason}: {frame.message}", file=sys.stderr, flush=True)
+            print(f"startrack: {cause.reason}: {cause}", file=sys.stderr, flush=True)
+            self.codes.add(exit_code_of(cause.reason))
+            return
+        self._write(track)
         if any(frame.status != "used" for frame in track.frames):
-            self.codes.add(3)
+            self.codes.add(EXIT_REFUSED)
+        if not growing:
+            self._print_records(frame_records(track), "")
+        if not (self.args.quiet or self.args.json):
+            counts = track_record(track)["counts"]
+            print(
+                f"{counts['frames']} frames: {counts['used']} used, {counts['left_out']} left out, {counts['refused']} "
+                f"refused; {counts['slips']} slips of the odometry; files in {self.args.dir}/track.*"
+            )
 
     def _update(self, has_come: bool) -> None:
         """A line about each image that the odometry reaches; the files, unless the next image would wait for them."""
-        if not (has_come or self._is_old or self._waits()):
+        waits = self._moves is not None and self.session.waits and self._moves.has_changed
+        if not (has_come or self._is_old or waits):
             return
         try:
             self._is_old |= self._print_newest()
@@ -106,31 +161,25 @@ class TrackRun:
                 print(f"waiting: {cause}", file=sys.stderr, flush=True)
             self._is_old = False
 
-    def _waits(self) -> bool:
-        """Whether images wait for the odometry, whose file has changed."""
-        return self._moves is not None and self.session.waits and self._moves.has_changed
-
     def _print_newest(self) -> bool:
         """Print a line about each image that has none yet; whether there was one."""
         from startrack.applications.tracking import frame_records
 
-        args, session = self.args, self.session
-        before = self._printed
-        if args.at_rest:
-            self._printed = len(session.frames)
+        if self.args.at_rest:
+            before, self._printed = self._printed, len(self.session.frames)
             records = frame_records(self._estimate())[before:]
         else:
-            records = []
-            for track in session.newest(
-                self._odometry(), odometry_sigma=args.odometry_sigma, odometry_floor_m=args.odometry_floor
-            ):
-                records += frame_records(track)
-        for record in records:
-            if args.json:
-                print(json.dumps(record), flush=True)
-            elif not args.quiet:
-                print(_line(record, "filtered_"), flush=True)
+            newest = self.session.newest(self._odometry(), **self._errors)
+            records = [record for track in newest for record in frame_records(track)]
+        self._print_records(records, "filtered_")
         return bool(records)
+
+    def _print_records(self, records: Sequence[dict[str, Any]], prefix: str) -> None:
+        for record in records:
+            if self.args.json:
+                print(json.dumps(record), flush=True)
+            elif not self.args.quiet:
+                print(_line(record, prefix), flush=True)
 
     def _paths(self) -> list[str] | None:
         """The image files; None for a bag."""
@@ -140,17 +189,20 @@ class TrackRun:
         first = Path(self.args.frames[0])
         if len(self.args.frames) == 1 and is_bag(first):
             return None
-        paths = [one.path for one in images_under(first, self.args.dir)] if first.is_dir() else self.args.frames
+        if not first.is_dir():
+            return list(self.args.frames)
+        paths = [one.path for one in images_under(first, self.args.dir)]
         if not paths:
             raise BadInput("bad_image", f"{first}: no images in this folder")
-        return list(paths)
+        return paths
 
-    def _images(self, paths: list[str]) -> Iterator[Source]:
-        yield from ((Path(path).name, partial(self._add, path)) for path in paths)
-
-    def _exposures_of_bag(self) -> Iterator[Source]:
+    def _sources(self, paths: list[str] | None) -> Iterator[Source]:
+        """The images of `paths`, or those of the bag."""
         from startrack.applications.tracking import read_bag_exposures
 
+        if paths is not None:
+            yield from ((Path(path).name, partial(self._add, path)) for path in paths)
+            return
         for exposure in read_bag_exposures(self.args.frames[0], self.args.image_topic, **self.session.facts):
             yield exposure.name, partial(self._add_exposure, exposure)
 
@@ -168,84 +220,37 @@ class TrackRun:
         for one in frame.shown:
             if one.fact not in self._shown:
                 self._shown.add(one.fact)
-                print(
-                    f"{frame.name}  the image shows {one.text}, which no file states: the track estimates it",
-                    file=sys.stderr, flush=True,
-                )  # fmt: skip
+                what = f"the image shows {one.text}, which no file states: the track estimates it"
+                print(f"{frame.name}  {what}", file=sys.stderr, flush=True)
         if not frame.modes:
-            self.codes.add(3)
+            self.codes.add(EXIT_REFUSED)
 
     def _refuse(self, name: str, cause: BadInput) -> None:
         self.codes.add(exit_code_of(cause.reason))
         print(f"{name}  refused  {cause.reason}: {cause}", file=sys.stderr, flush=True)
 
-    def _whole_track(self, growing: bool = False) -> Track | None:
-        """The track of all images; None, with the reasons on stderr, where none has a position."""
-        try:
-            return self._estimate(growing)
-        except BadInput as cause:
-            if exit_code_of(cause.reason) == EXIT_BAD_INPUT:
-                raise
-            for frame in self.session.frames:
-                if not frame.reason:
-                    continue
-                print(f"{frame.name}  refused  {frame.reason}: {frame.message}", file=sys.stderr, flush=True)
-            print(f"startrack: {cause.reason}: {cause}", file=sys.stderr, flush=True)
-            self.codes.add(exit_code_of(cause.reason))
-            return None
-
     def _estimate(self, growing: bool = False) -> Track:
-        args = self.args
-        return self.session.estimate(
-            self._odometry(), odometry_sigma=args.odometry_sigma, odometry_floor_m=args.odometry_floor,
-            at_rest=args.at_rest, covered_only=growing,
-        )  # fmt: skip
+        at_rest = self.args.at_rest
+        return self.session.estimate(self._odometry(), **self._errors, at_rest=at_rest, covered_only=growing)
 
     def _odometry(self) -> Odometry | None:
         return None if self._moves is None else self._moves.read()
 
     def _write(self, track: Track, pictures: bool = True) -> None:
-        from startrack.applications.tracking import write_track
+        from startrack.applications.tracking import draw_track, track_page, write_track
+        from startrack.output import png_bytes
 
-        args, odometry = self.args, None
+        args, odometry, made, moves_m = self.args, None, {}, None
         if args.odometry is not None:
             odometry = {"file": Path(args.odometry).name, "sigma": args.odometry_sigma, "floor_m": args.odometry_floor}
-        made = self._pictures(track) if pictures and not args.no_plots else {}
+        if pictures and not args.no_plots:
+            if odometry is not None and not args.at_rest:
+                moves_m = self.session.odometry_positions_m(track, self._odometry(), **self._errors)
+            picture = png_bytes(draw_track(track, moves_m))
+            title = f"Track of {Path(args.frames[0]).resolve().name}"
+            page = track_page(track, picture, title=title, odometry_m=moves_m)
+            made = {"track.png": picture, "track.html": page.encode()}
         write_track(track, Path(args.dir), odometry=odometry, pictures=made)
-
-    def _pictures(self, track: Track) -> dict[str, bytes]:
-        from startrack.applications.tracking import draw_track, track_page
-        from startrack.output.write import png_bytes
-
-        args, moves_m = self.args, None
-        if args.odometry is not None and not args.at_rest:
-            moves_m = self.session.odometry_positions_m(
-                track, self._odometry(), odometry_sigma=args.odometry_sigma, odometry_floor_m=args.odometry_floor
-            )
-        picture = png_bytes(draw_track(track, moves_m))
-        title = f"Track of {Path(args.frames[0]).resolve().name}"
-        page = track_page(track, picture, title=title, odometry_m=moves_m)
-        return {"track.png": picture, "track.html": page.encode()}
-
-    def _print_frames(self, track: Track) -> None:
-        from startrack.applications.tracking import frame_records
-
-        for record in frame_records(track):
-            if self.args.json:
-                print(json.dumps(record))
-            elif not self.args.quiet:
-                print(_line(record, ""))
-
-    def _print_summary(self, track: Track) -> None:
-        from startrack.applications.tracking import track_record
-
-        if self.args.quiet or self.args.json:
-            return
-        counts = track_record(track)["counts"]
-        print(
-            f"{counts['frames']} frames: {counts['used']} used, {counts['left_out']} left out, {counts['refused']} "
-            f"refused; {counts['slips']} slips of the odometry; files in {self.args.dir}/track.*"
-        )
 
 
 def _line(record: dict[str, Any], prefix: str) -> str:

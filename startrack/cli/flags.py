@@ -1,0 +1,185 @@
+"""Flags of the commands: the tables that commands share, and the parser of a command."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from typing import Any, NamedTuple
+
+from startrack.cli.flag_types import amount, position_prior, positive_count, seconds, time_sigma_s
+
+DEFAULT_LOCALIZER = "posterior"
+
+
+class Flag(NamedTuple):
+    """One argument of a command, as `argparse` takes it."""
+
+    names: Sequence[str]
+    options: dict[str, Any]
+
+
+class Either(NamedTuple):
+    """Flags that exclude each other."""
+
+    flags: Sequence[Flag]
+    required: bool = False
+
+
+Group = Sequence[Flag | Either]
+
+
+def flag(words: str, text: str, convert: Callable[[str], Any] | None = None, **options: Any) -> Flag:
+    """A flag or argument. Its `words` are its names and, where it takes a value, what help texts call the value.
+
+    A flag without a value is true where it is given. The help `text` ends with the default value.
+    """
+    names = [word for word in words.split() if word.startswith("-")] or words.split()[:1]
+    values = words.split()[len(names) :]
+    if values:
+        options["metavar"] = values[0] if len(values) == 1 else tuple(values)
+    elif not {"choices", "action"} & set(options):
+        options["action"] = "store_true"
+    if isinstance(options.get("default"), str | float | int) and "action" not in options:
+        text += " (%(default)s)"
+    return Flag(names, {"type": convert, **options, "help": text} if convert else {**options, "help": text})
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command: its name, the function that runs it, its texts, and its flags by the titles of their groups.
+
+    `summary` stands in the list of commands, which lacks the command without one. `example` is the end of its help.
+    `start` is printed in place of an error where nothing follows the command's name.
+    """
+
+    name: str
+    run: Callable[[argparse.Namespace], int] | None
+    summary: str | None
+    description: str | None
+    groups: dict[str, Group] = field(default_factory=dict)
+    example: str = ""
+    start: str = ""
+    actions: Sequence[Command] = ()
+
+    def add_to(self, subparsers: Any) -> None:
+        """Add the parser of the command to those of the `startrack` command."""
+        parser: argparse.ArgumentParser = subparsers.add_parser(
+            self.name,
+            **({} if self.summary is None else {"help": self.summary}),
+            description=self.description,
+            epilog=self.start.partition("\n\n")[2] or (self.example and f"example: {self.example}"),
+            formatter_class=_Formatter,
+        )
+        for title, flags in self.groups.items():
+            _add_flags(parser.add_argument_group(title), flags)
+        if self.actions:
+            nested = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+            for action in self.actions:
+                action.add_to(nested)
+        else:
+            parser.set_defaults(run=self.run, usage_error=parser.error)
+
+
+class _Formatter(argparse.HelpFormatter):
+    """Keeps the lines of a text that has several."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return text if "\n" in text else super()._fill_text(text, width, indent)
+
+
+def _add_flags(parser: Any, flags: Group) -> None:
+    for one in flags:
+        if isinstance(one, Either):
+            _add_flags(parser.add_mutually_exclusive_group(required=one.required), one.flags)
+        else:
+            parser.add_argument(*one.names, **one.options)
+
+
+def check_localizer(args: argparse.Namespace) -> None:
+    """A usage error for an unknown name after --localizer, and for one that takes no --near."""
+    from startrack.localization import LOCALIZERS
+
+    if getattr(args, "near", None) is not None and args.localizer != DEFAULT_LOCALIZER:
+        args.usage_error(f"--near: only --localizer {DEFAULT_LOCALIZER} takes a prior of the position")
+    if args.localizer not in LOCALIZERS:
+        args.usage_error(f"--localizer {args.localizer}: known are {', '.join(LOCALIZERS)}")
+
+
+def check_extra(args: argparse.Namespace, module: str, extra: str, user: str, hint: str = "") -> None:
+    """A usage error where the `module` of an `extra` is missing that the `user` needs; `hint`: what else helps."""
+    if find_spec(module) is None:
+        args.usage_error(f"{user} {module}: pip install '.[{extra}]' in a clone of startrack{hint}")
+
+
+def check_cluster(args: argparse.Namespace) -> None:
+    """A usage error for --cluster where Dask is missing."""
+    if args.cluster is not None:
+        check_extra(args, "distributed", "cluster", "--cluster needs")
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+IMAGES = flag("images IMAGE", "PNG, TIFF, FITS, JPEG, camera raw, ROS bag, or BAG#NUMBER", nargs="+")
+PHOTOGRAPHS = flag("images IMAGE", "PNG, TIFF, FITS, JPEG or camera raw", nargs="+")
+TOPIC = flag("--image-topic TOPIC", "of a ROS bag with several")
+CAMERA = flag(
+    "-c --camera FILE", "camera file of startrack, ROS, Kalibr, COLMAP or OpenCV, or the name of a shipped one"
+)
+TERRAIN = flag("-t --terrain FILE", "terrain file, or the name of a shipped one")
+TIME = flag("--time UTC", "middle of the exposure, ISO 8601 (of one image)")
+EXPOSURE = flag("--exposure S", "exposure time in seconds", seconds)
+PIXELS = (
+    flag("--mask FILE", "8-bit image of the frame's size: pixels below 128 do not count (a mast, a lamp)"),
+    flag("--dark FILE", "dark frame of the frame's size: subtracted, its median kept"),
+    flag("--flat FILE", "flat field of the frame's size, its own dark subtracted"),
+)
+TIME_SIGMA = flag(
+    "--time-sigma SECONDS", "standard deviation of the clock's error (1, and more where it is not stated)", time_sigma_s
+)
+FACTS = (CAMERA, TIME, TIME_SIGMA, EXPOSURE, *PIXELS)  # that images may lack
+SITE = flag("--site LAT,LON[,M]", "where the camera stands on the Earth, in degrees and metres (--site=-30.2,...)")
+SKY = (PHOTOGRAPHS, CAMERA, TIME, EXPOSURE, *PIXELS, SITE, TERRAIN)  # of photographs of the night sky
+
+LOCALIZER = flag(
+    "--localizer NAME",
+    "posterior, pseudo-gradient, hull, or another of startrack.localization.LOCALIZERS",
+    default=DEFAULT_LOCALIZER,
+)
+EVIDENCE = flag(
+    "--evidence",
+    "of the position: stars, the light of the sky that stops at the skyline, or both",
+    choices=("both", "stars", "sky"),  # as startrack.chain.stages has them; written here so that help is quick
+    default="both",
+)
+NEAR = flag(
+    "--near EAST,NORTH,SIGMA",
+    "prior of the position, a normal distribution [m]: the posterior contains it, and an image that contradicts it "
+    "is refused",
+    position_prior,
+)
+METHOD = (LOCALIZER, EVIDENCE, NEAR)
+
+ODOMETRY = (  # the defaults are those of startrack.applications.tracking; written here so that help is quick
+    flag("--odometry-sigma F", "error of a move on each horizontal axis, relative", amount, default=0.02),
+    flag("--odometry-floor M", "the same, beside that in quadrature", amount, default=0.05),
+)
+
+DIR = flag("-D --dir OUT", "folder of the results", default="startrack-out")
+FILE = flag("-o --output FILE", "what to write, instead of a file in OUT")
+OVERWRITE = flag("-O --overwrite", "replace existing files, also results of another image of this name")
+AGAIN = Either((flag("--resume", "keep the results that are there (default)"), OVERWRITE))
+JSON = flag("--json", "print JSON objects instead of lines")
+NO_PLOTS = flag("--no-plots", "no pictures")
+OUTPUT = (DIR, OVERWRITE, JSON, NO_PLOTS)
+JOBS = flag("-j --jobs N", "processes (default: all cores)", positive_count)
+CLUSTER_TEXTS = "--cluster ADDRESS", "a Dask cluster to use instead (extra: cluster)"
+CLUSTER = flag(*CLUSTER_TEXTS)
+NO_SEED = flag("--seed N", "accepted everywhere; here nothing is random", int, default=0)
+VERBOSE = flag("-v --verbose", "more output; tracebacks of internal errors", action="count", default=0)
+MORE = (VERBOSE, flag("-q --quiet", "print errors only"))

@@ -65,7 +65,9 @@ def run_convert(args: argparse.Namespace) -> int:
         note = f"; {args.to} has no decentring: {lost:.2f} px RMS are lost" if lost else ""
     else:
         angle_rad = None if args.calibrated_angle is None else math.radians(args.calibrated_angle)
-        camera = camera_from_foreign_text(read_text(args.file, "no_calibration"), args.source, Path(args.file).stem, angle_rad)
+        camera = camera_from_foreign_text(
+            read_text(args.file, "no_calibration"), args.source, Path(args.file).stem, angle_rad
+        )
         text = camera_text(replace(camera, name=args.name or camera.name))
         default, note = f"{Path(args.file).stem}.toml", ""
         if angle_rad is None:

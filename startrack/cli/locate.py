@@ -84,8 +84,8 @@ def identify(args: argparse.Namespace) -> int:
 
 
 def _identify_image(args: argparse.Namespace, path: str, stem: str) -> Outcome:
-    from startrack.catalog import load_catalog
     from startrack import chain
+    from startrack.catalog import load_catalog
     from startrack.output import lens_text, summary_line, verbose_text, write_results
 
     exposure, camera, out, read_ms = _read_timed(

@@ -14,7 +14,7 @@ from test_localization_shape import evidence_at
 
 from startrack.core.types import Array, Clock, Evidence
 from startrack.frames import Site, sky_rotvec_rad
-from startrack.localization import ExactPosterior, distributions
+from startrack.localization import ExactPosterior, importance_sampling
 from startrack.localization.clock import turn_evidence
 from startrack.localization.free_skyline import free_log_likelihood
 from startrack.localization.importance_sampling import moments
@@ -218,13 +218,13 @@ def test_evidence_and_moments_are_those_of_a_grid(seed: int) -> None:
 @pytest.mark.slow
 def test_circles_vary_little_with_the_points_that_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """The Monte Carlo error of the 99.9 % radius is at most 5 %, in the mean of six skies with ten draws each."""
-    sequence, errors = distributions.normal_sequence, []
+    sequence, errors = importance_sampling.normal_sequence, []
     for seed in range(6):
         rows, radii = evidence_at(((2000.0, -1000.0), (-6500.0, 1000.0))[seed % 2], 20 + seed), []
         for draw in range(10):
             first = 7919 * draw
             with monkeypatch.context() as patch:
-                patch.setattr(distributions, "normal_sequence", lambda d, n, m, k=first: sequence(d, n + k, m))
+                patch.setattr(importance_sampling, "normal_sequence", lambda d, n, m, k=first: sequence(d, n + k, m))
                 radii.append(ExactPosterior()(rows, CRATER).radius999_m)
         errors.append(np.std(radii) / np.mean(radii))
     assert np.sqrt(np.mean(np.square(errors))) < 0.05, np.round(errors, 3)

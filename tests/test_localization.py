@@ -12,9 +12,8 @@ from localization_helpers import WRAPPERS, ThreeMethods, slow_chain_scores, slow
 from startrack.chain import Settings
 from startrack.core.types import Array, BadInput, Evidence, NotLocated
 from startrack.localization import ExactPosterior, Hull, Localizer, PseudoGradient
-from startrack.localization.branch_and_bound import Search
-from startrack.localization.initial_guess import Guess
 from startrack.localization.likelihood import PositionLikelihood
+from startrack.localization.search import Guess, Search
 from startrack.localization.sector_likelihood import add_contributions
 from startrack.terrain import Cylinder, ForwardingTerrain, load_terrain
 

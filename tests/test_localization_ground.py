@@ -10,11 +10,10 @@ from localization_helpers import WRAPPERS, slow_scores
 
 from startrack.core.types import Array, Clock, Evidence, NotLocated
 from startrack.localization import ExactPosterior
-from startrack.localization.box_average import BoxAverage
-from startrack.localization.branch_and_bound import Search
+from startrack.localization.box_sums import BoxAverage
 from startrack.localization.horizon_bias import lower_evidence
-from startrack.localization.initial_guess import BEAMS, Guess, beam_search
 from startrack.localization.likelihood import PositionLikelihood
+from startrack.localization.search import BEAMS, Guess, Search, beam_search
 from startrack.terrain import HeightMap, load_terrain
 
 pytestmark = pytest.mark.usefixtures("own_cache")

@@ -15,8 +15,8 @@ from test_localization_shape import TRUE, evidence_at
 from startrack.core.types import Array, Bools, Fix
 from startrack.evidence.sky_light import MIDDLES_RAD
 from startrack.localization import ExactPosterior
-from startrack.localization.explored import Explored
 from startrack.localization.integrity import DIVISIONS, GROUPS, RISK, WRONG_GROUP, _divide
+from startrack.localization.search import Explored
 from startrack.localization.skyline_profiles import SECTORS
 from startrack.output import result_dict, verbose_text
 from startrack.output.schema import SCHEMAS

@@ -16,8 +16,8 @@ from startrack.evidence.sky_levels import SECTORS
 from startrack.evidence.sky_light import HEIGHT_PX, LEVELS, MIDDLES_RAD
 from startrack.evidence.star_offsets import offset_terms
 from startrack.localization import ExactPosterior
-from startrack.localization.explored import Explored
 from startrack.localization.likelihood import PositionLikelihood
+from startrack.localization.search import Explored
 from startrack.localization.sector_likelihood import row_contribution
 from startrack.localization.sky_profiles import SkyProfiles
 from startrack.localization.skyline_profiles import _cubic

@@ -1,21 +1,34 @@
-"""An error of the clock turns the sky about the axis of the body."""
+"""The clock: its error turns the sky about the axis of the body; the times that real ground allows."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 
 import numpy as np
 
-from startrack.core.types import Clock, Evidence
+from startrack.core.types import Array, Clock, Evidence, NotLocated
 from startrack.frames import R_from_rotvec, Site, sky_rotvec_rad, turn_azel
+from startrack.localization.horizon_bias import LinearSolution, at_likeliest_bias
+from startrack.localization.likelihood import PositionLikelihood
+from startrack.localization.search import BEAMS, Explored, Guess, beam_search, local_posterior
+from startrack.localization.sector_moments import solve_linear
+from startrack.localization.shared_errors import is_noticeable
+from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
 
 REACH_SIGMAS = 4.0  # of the stated error, to the last time that is tried
 TURN_S = 600.0  # over which the sky's turn is taken
 GROSS_PROBABILITY, GROSS_SIGMA_S = 0.01, 3600.0  # of a clock whose error nobody states
 WRONG_SIGMA_S = 21_600.0  # of one whose stated error is wrong: a local time, a half of the day
-NEGLIGIBLE_M = 0.05  # by which a row may move over the search area, within one sigma, without an effect on the fix
+TIME_STEP_RAD = np.radians(0.26)  # of the turn between two times at which a position is searched
+MOST_SCANNED = 250  # of these times: 65 degrees of turn, five days on the Moon
+TRACKED_NATS = 30.0  # less than the best: a time is not looked at more closely
+TIME_ROUNDS = 6  # in which the rows are turned to the time that they show, at most
+LINEAR_TURN_RAD = np.radians(0.05)  # of the sky: up to it the skyline of a map changes linearly with the time
+GROSS_REACH_SIGMAS = 3.0  # of a gross error of the clock, to the last time that is tried
+APART_RAD = np.radians(0.3)  # of the turn between two times that are sampled
+MOST_TIMES, TIME_NATS = 3, 12.0  # that are sampled; less likely ones than the best by more are not
 
 
 def clock_at(site: Site, time_utc: datetime, sigma_s: float, is_stated: bool = True) -> Clock:
@@ -52,6 +65,148 @@ def turn_evidence(evidence: Evidence, later_s: float) -> Evidence:
 
 def clock_matters(clock: Clock | None, terrain: Terrain) -> bool:
     """Whether the error of the clock moves a position on a terrain noticeably."""
-    if clock is None:
+    return clock is not None and is_noticeable(clock, clock.sigma_s, terrain)
+
+
+@dataclass(frozen=True)
+class Track:
+    """Times that the clock of rows allows on a terrain."""
+
+    evidence: Evidence
+    terrain: Terrain
+    clock: Clock
+
+    def likely_way(self) -> tuple[Array, Array, Array]:
+        """Times (n,) that matter [s later], the logarithms of their shares (n,), and the best positions (n, 2).
+
+        Raises NotLocated (outside_search_area, insufficient_geometry).
+        """
+        found: list[tuple[float, float, Array]] = []
+        for later_s, position_m in self._seeds():
+            if all(abs(later_s - other_s) > 0.5 * self.step_s for other_s, _, _ in found):
+                found.append(self._settled(later_s, position_m))
+        later, share, position = zip(*found, strict=True)
+        return np.array(later), np.array(share), np.array(position)
+
+    @property
+    def limits_s(self) -> tuple[float, float]:
+        """First and last time that is tried [s later]."""
+        clock = self.clock
+        low, high = (-clock.offset_s + side * REACH_SIGMAS * clock.sigma_s for side in (-1, 1))
+        return max(low, -clock.reach_s), min(high, clock.reach_s)
+
+    @property
+    def step_s(self) -> float:
+        """Between two times."""
+        return float(TIME_STEP_RAD / np.linalg.norm(self.clock.turn_rad_s))
+
+    def _seeds(self) -> list[tuple[float, Array]]:
+        """Likely times [s later], the best first, each with a position (2,)."""
+        low, high = self.limits_s
+        times = np.linspace(low, high, 2 * int(np.ceil(0.5 * (high - low) / self.step_s)) + 1)
+        if len(times) > MOST_SCANNED:
+            raise NotLocated(
+                f"a clock that is right to {duration(self.clock.sigma_s)} leaves too many times to search on this "
+                "terrain: find the time more exactly (--time-sigma states its error)"
+            )
+        found = []
+        for later_s in times:
+            likelihood = self._likelihood(later_s)
+            guess = beam_search(likelihood, BEAMS[0])
+            if len(guess.points_m):
+                found.append((guess.best + self._log_offset(later_s, likelihood), later_s, guess.points_m[0]))
+        if not found:
+            raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
+        found.sort(key=lambda one: -one[0])
+        return [(later_s, position) for fit, later_s, position in found if fit > found[0][0] - TRACKED_NATS]
+
+    def _settled(self, later_s: float, position_m: Array) -> tuple[float, float, Array]:
+        """The time that the rows show about a time [s later], the logarithm of its share, and the best position."""
+        low, high = self.limits_s
+        for _ in range(TIME_ROUNDS):
+            solution = LinearSolution.near(turn_evidence(self.evidence, later_s), self.terrain, position_m)
+            later_s = min(max(later_s + solution.later_s, low), high)
+            position_m = solution.position_m
+            if is_linear(self.clock, solution.later_s):
+                break
+        likelihood = self._likelihood(later_s)
+        points = position_m[None]
+        _, guess = at_likeliest_bias(likelihood, Guess(points, likelihood.exact_scores(points)))
+        return later_s, guess.best + self._log_offset(later_s, likelihood), guess.points_m[0]
+
+    def _log_offset(self, later_s: float, likelihood: PositionLikelihood) -> float:
+        """The prior, and what makes likelihoods at different times comparable: their sectors hold different rows."""
+        return float(self.clock.log_prior(later_s)) + float(likelihood.sectors.ceiling.sum())
+
+    def _likelihood(self, later_s: float) -> PositionLikelihood:
+        return PositionLikelihood.from_evidence(turn_evidence(self.evidence, later_s), self.terrain)
+
+
+def is_wide(clock: Clock, terrain: Terrain) -> bool:
+    """Whether the stated error of a clock turns the sky over more than a skyline's shape is linear in."""
+    if terrain.axisymmetric:
         return False
-    return clock.sigma_s * float(np.linalg.norm(clock.turn_rad_s)) * terrain.reach_m > NEGLIGIBLE_M
+    return not is_linear(clock, clock.sigma_s)
+
+
+def is_linear(clock: Clock, error_s: float) -> bool:
+    """Whether the skyline of real ground is linear in an error of the clock of this size."""
+    return abs(error_s) * float(np.linalg.norm(clock.turn_rad_s)) <= LINEAR_TURN_RAD
+
+
+def explore_times(plain: PositionLikelihood, evidence: Evidence, clock: Clock) -> list[tuple[Evidence, Explored]]:
+    """The rows turned to each likely time that a wide clock allows, and the boxes there.
+
+    `plain` is the likelihood of the search. Raises NotLocated as `Track` does.
+    """
+    later_s, log_share, way_m = Track(evidence, plain.terrain, clock).likely_way()
+    found: list[tuple[Evidence, Explored]] = []
+    for at in _peaks(later_s, log_share, clock):
+        rows = turn_evidence(evidence, float(later_s[at]))
+        likelihood = replace_rows(plain, rows)
+        found.append((rows, local_posterior(likelihood, Guess(way_m[at][None], np.zeros(1)), -np.inf)))
+    return found
+
+
+def replace_rows(likelihood: PositionLikelihood, rows: Evidence) -> PositionLikelihood:
+    """The same likelihood of other rows."""
+    sectors = likelihood.sectors
+    return PositionLikelihood.from_evidence(rows, likelihood.terrain, 2 * np.pi / sectors.count, sectors.epsilon)
+
+
+def turned_model(model: SkylineModel, later_s: float, is_rough: bool = False) -> SkylineModel:
+    """The model with its rows turned to a later time; see `SkylineModel.is_rough`."""
+    return model.with_rows(turn_evidence(model.rows, later_s), is_rough)
+
+
+def turned_models(model: SkylineModel, clock: Clock) -> list[SkylineModel]:
+    """The model at the likeliest times of a gross error of its `clock`, far enough from the stated one."""
+    turn = float(np.linalg.norm(clock.turn_rad_s))
+    count = int(np.ceil(GROSS_REACH_SIGMAS * clock.gross_sigma_s * turn / (0.5 * TIME_STEP_RAD)))
+    later_s = np.arange(-count, count + 1) * 0.5 * TIME_STEP_RAD / turn
+    fits = np.array([_fit(turned_model(model, later, is_rough=True)) for later in later_s])
+    fits -= 0.5 * np.square(later_s / clock.gross_sigma_s)
+    likely = [float(later_s[at]) for at in _peaks(later_s, fits, clock)]
+    return [turned_model(model, later) for later in likely if later != 0.0]
+
+
+def _fit(model: SkylineModel) -> float:
+    """Log-likelihood of the rows where position and shared errors suit them, by the linear model of the sectors."""
+    k = 2 + len(model.basis)
+    design = np.vstack([model.position_slopes, model.slopes_rad]).T
+    prior = np.diag(np.r_[np.full(2, model.terrain.reach_m**-2.0), np.ones(k - 2)])
+    parameters, _, _ = solve_linear(model.moments, design, np.zeros(k), prior)
+    parameters[:2] += model.reference_m
+    return float(model.log_likelihood(parameters[None])[0]) + model.log_offset
+
+
+def _peaks(later_s: Array, fits: Array, clock: Clock) -> list[int]:
+    """The likeliest times that are apart from each other."""
+    apart_s = APART_RAD / float(np.linalg.norm(clock.turn_rad_s))
+    chosen: list[int] = []
+    for at in np.argsort(-fits):
+        if fits[at] < fits.max() - TIME_NATS or len(chosen) == MOST_TIMES:
+            break
+        if all(abs(later_s[at] - later_s[other]) > apart_s for other in chosen):
+            chosen.append(int(at))
+    return chosen

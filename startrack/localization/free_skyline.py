@@ -10,19 +10,19 @@ import numpy as np
 from startrack.core.kernels import njit
 from startrack.core.types import Array
 from startrack.localization.obstacle_chain import clear_emission
-from startrack.localization.skyline_profiles import Profiles
+from startrack.localization.skyline_profiles import LOW_RAD, Profiles
 
-REACH_RAD, NODES, SPREAD = np.radians(12.0), 121, 6.5  # of heights about the map's skyline, closer about it
-ROUGH_RAD = np.radians([0.003, 0.01, 0.03, 0.1])  # mean steps from sector to sector, equally likely
+NODES, SPREAD = 121, 6.5  # of heights about the map's skyline, closer about it
+ROUGHNESS_RAD = np.radians([0.003, 0.01, 0.03, 0.1])  # mean steps from sector to sector, equally likely
 JUMP = 1e-4  # probability of a step to anywhere
-HEIGHTS_RAD = REACH_RAD * np.sinh(SPREAD * np.linspace(-1, 1, NODES)) / np.sinh(SPREAD)
+HEIGHTS_RAD = -LOW_RAD * np.sinh(SPREAD * np.linspace(-1, 1, NODES)) / np.sinh(SPREAD)
 CELLS_RAD = np.gradient(HEIGHTS_RAD)
 
 
 def free_log_likelihood(profiles: Profiles, shift: Array) -> float:
     """Log-likelihood of the rows if the skyline is the map's, higher by `shift` (SECTORS,), and any smooth curve."""
     likelihood = _emissions(profiles, shift, HEIGHTS_RAD)
-    logs = [_pass(likelihood, HEIGHTS_RAD, CELLS_RAD, rough) for rough in ROUGH_RAD]
+    logs = [_pass(likelihood, HEIGHTS_RAD, CELLS_RAD, rough) for rough in ROUGHNESS_RAD]
     return float(np.logaddexp.reduce(logs)) - log(len(logs))
 
 

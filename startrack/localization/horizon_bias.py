@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.core.types import Array, Evidence
-from startrack.localization.initial_guess import BEAMS, Guess, beam_search
 from startrack.localization.likelihood import PositionLikelihood
+from startrack.localization.search import BEAMS, Guess, beam_search
 from startrack.localization.sector_moments import solve_linear
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel

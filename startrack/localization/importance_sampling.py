@@ -1,32 +1,123 @@
-"""Adaptive importance sampling of a posterior about its modes, with all rounds weighed together.
-
-Each round draws from t distributions about the modes, a part of the points farther out in position; the weight of a
-point is the posterior over the mixture of all rounds' distributions. Between rounds the distributions move to the
-weighted points. Source: adaptive multiple importance sampling, Cornuet et al. 2012, Scand. J. Statist. 39, 798.
-"""
+"""Adaptive importance sampling of a posterior about its modes, with all rounds weighed together."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import log
+from functools import lru_cache
+from math import log, pi
+from typing import Protocol
 
 import numpy as np
 
 from startrack.core.types import Array
-from startrack.localization.distributions import Distribution, TDistribution
 
 DEGREES, FAR_DEGREES = 5.0, 3.0  # of freedom of the t distributions
 FAR_PART, FAR, FAR_OTHERS = 0.4, 4.0, 1.4  # of the points; how much farther out, in position and in the others
 ROUNDS = (200, 400, 800, 1000, 1200)  # points
 MORE_POINTS = 0.3  # part by which each further dimension has more
-LEAST_ROUNDS, ENOUGH = 3, 600.0  # after so many rounds so many effective points end them
+ENOUGH = 600.0  # effective points that end the rounds
 TEMPERED = 7.0  # effective points a dimension to which weights are tempered before the distributions move
 KEPT_PART = 0.03  # of the former covariance
 LEAST_WEIGHT = 1e-5  # of a mode; a lighter one is dropped
 
 LogDensity = Callable[[Array], Array]
 Gaussian = tuple[Array, Array]  # mean (d,) and covariance (d, d)
+
+
+class Distribution(Protocol):
+    """A distribution of which `count` points are drawn."""
+
+    @property
+    def count(self) -> int: ...
+
+    def draw(self, first: int) -> Array:
+        """Points (count, d), from the sequence's number `first` on."""
+
+    def log_density(self, points: Array) -> Array:
+        """(n,) at points (n, d)."""
+
+
+@dataclass(frozen=True, eq=False)
+class TDistribution:
+    """A t distribution of `degrees` of freedom."""
+
+    mean: Array
+    root: Array  # (d, d) of its covariance, lower triangular
+    degrees: float
+    count: int
+
+    def draw(self, first: int) -> Array:
+        """Points (count, d), from the sequence's number `first` on."""
+        from scipy.special import gammaincinv
+
+        unit, uniform = normal_sequence(len(self.mean), first, self.count)
+        size = np.sqrt(self.degrees / (2.0 * gammaincinv(0.5 * self.degrees, uniform)))
+        return np.asarray(self.mean + (unit * size[:, None]) @ self.root.T)
+
+    def log_density(self, points: Array) -> Array:
+        """(n,) at points (n, d)."""
+        return log_t_density(np.asarray(np.linalg.solve(self.root, (points - self.mean).T)), self.degrees) - float(
+            np.log(np.diag(self.root)).sum()
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class BoxDistribution:
+    """Equal square boxes of positions, uniform in each, with normal other parameters about its own."""
+
+    centres: Array  # (m, d)
+    half_m: float
+    share: Array  # (m,) of the probability
+    root: Array  # (d - 2, d - 2) of the other parameters' covariance, lower triangular
+    count: int
+
+    def draw(self, first: int) -> Array:
+        """Points (count, d), from the sequence's number `first` on."""
+        from scipy.special import ndtr
+
+        d = self.centres.shape[1]
+        unit, uniform = normal_sequence(d, first, self.count)
+        box = np.minimum(np.searchsorted(np.cumsum(self.share), uniform), len(self.share) - 1)
+        found = self.centres[box]
+        found[:, :2] += self.half_m * (2.0 * ndtr(unit[:, :2]) - 1.0)
+        found[:, 2:] += unit[:, 2:] @ self.root.T
+        return found
+
+    def log_density(self, points: Array) -> Array:
+        """(n,) at points (n, d)."""
+        inside = np.abs(points[:, None, 0] - self.centres[:, 0]) <= self.half_m
+        inside &= np.abs(points[:, None, 1] - self.centres[:, 1]) <= self.half_m
+        point, box = np.nonzero(inside)
+        off = np.linalg.solve(self.root, (points[point, 2:] - self.centres[box, 2:]).T)
+        log = -0.5 * np.square(off).sum(axis=0) - 0.5 * len(off) * np.log(2 * pi) - np.log(np.diag(self.root)).sum()
+        each = self.share[box] / (4 * self.half_m**2) * np.exp(log)
+        return np.log(np.bincount(point, weights=each, minlength=len(points)) + np.finfo(float).tiny)
+
+
+def log_t_density(off: Array, degrees: float) -> Array:
+    """(n,) of a t distribution of unit size at offsets (d, n)."""
+    from scipy.special import gammaln
+
+    d = len(off)
+    norm = gammaln(0.5 * (degrees + d)) - gammaln(0.5 * degrees) - 0.5 * d * log(degrees * pi)
+    return np.asarray(norm - 0.5 * (degrees + d) * np.log1p(np.square(off).sum(axis=0) / degrees))
+
+
+@lru_cache(maxsize=256)
+def normal_sequence(dimensions: int, first: int, count: int) -> tuple[Array, Array]:
+    """Normal numbers (count, dimensions) and uniform ones (count,), evenly spread, always the same.
+
+    Source: the additive recurrence of Roberts 2018 with the roots of x^(d + 1) = x + 1.
+    """
+    from scipy.special import ndtri
+
+    root = 2.0
+    for _ in range(40):
+        root = (1.0 + root) ** (1.0 / (dimensions + 2))
+    step = root ** -np.arange(1.0, dimensions + 2)
+    uniform = np.clip((0.5 + np.arange(first + 1, first + count + 1)[:, None] * step) % 1.0, 1e-9, 1 - 1e-9)
+    return ndtri(uniform[:, :-1]), np.clip(uniform[:, -1], 1e-6, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +182,7 @@ def sample(
         found = _weigh(np.concatenate(points), np.concatenate(density), parts)
         if not np.isfinite(found.log_weight).any():
             continue
-        if number + 1 >= LEAST_ROUNDS and found.effective > ENOUGH:
+        if found.effective > ENOUGH:
             break
         modes = _move(found, modes)
     return found

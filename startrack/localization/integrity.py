@@ -27,7 +27,7 @@ WIDER_CIRCLE = 1.05  # radius that holds all but half of RISK, in that of the 99
 # point sums over a normal distribution are right to 1 %, and what is left without a group is wider.
 GRIDS = ((6.0, 13), (15.0, 17), (40.0, 25))
 RIM_PART, RIM_MASS = 0.9, 1e-3  # of the grid's reach; a posterior with more mass beyond is not on the grid
-LEAST_PART = 1e-9  # of the covariance, added so that one on a single point of a grid can be inverted
+TINY_PART = 1e-9  # of the covariance, added so that one on a single point of a grid can be inverted
 
 
 def assess_integrity(
@@ -117,7 +117,7 @@ def _conclude(
     spread = np.sqrt(-2.0 * np.log(0.5 * RISK / WRONG_GROUP) * np.linalg.eigvalsh(without[held] + shared)[:, 1])
     level[held] = np.linalg.norm(mean[held] - best, axis=1) + spread
     known = np.zeros_like(without)
-    known[held] = np.linalg.inv(without[held] + LEAST_PART * covariance)
+    known[held] = np.linalg.inv(without[held] + TINY_PART * covariance)
     part = np.maximum(2.0 - np.einsum("gij,ij->g", known[:GROUPS], covariance), 0.0)
     first = np.arange(GROUPS) / GROUPS + np.arange(DIVISIONS)[:, None] / (DIVISIONS * GROUPS)
     return Integrity(

@@ -7,24 +7,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from startrack.core.types import Array, Evidence, NotLocated
-from startrack.localization.distributions import BoxDistribution
-from startrack.localization.explored import Explored
-from startrack.localization.gross_errors import sample_gross_errors
-from startrack.localization.hypothesis import Hypothesis, sample_hypothesis, solve_model
-from startrack.localization.importance_sampling import ROUNDS, Gaussian, effective_points, moments
+from startrack.localization.horizon_bias import NEARBY_M
+from startrack.localization.hypothesis import WIDER, Hypothesis, sample_gross_errors, sample_hypothesis, solve_model
+from startrack.localization.importance_sampling import ROUNDS, BoxDistribution, Gaussian, effective_points, moments
+from startrack.localization.search import NATS, Explored
 from startrack.localization.shared_errors import SharedErrors
 from startrack.localization.skyline_model import SkylineModel
 from startrack.terrain import Terrain
 
 REACH_M = 300.0  # of a group of boxes about its best one, with one neighbourhood
-LEAST_REACH_M, REACH_SIGMAS = 40.0, 16.0  # of a neighbourhood in which the posterior is sampled
-MOST_GROUPS, MOST_BOXES = 6, 160  # groups of boxes; boxes of a group that the chain is computed at
-MOST_MODES, MODE_NATS = 4, 14.0  # of a group; less likely ones than the best by more are none
+REACH_SIGMAS = 16.0  # of a neighbourhood in which the posterior is sampled
+MOST_GROUPS, MOST_MODES = 6, 4  # groups of boxes, and modes of a group
+MOST_BOXES = 160  # of a group, that the chain is computed at; and the points drawn from them
 FIRST_ROUNDS = ROUNDS[:2]  # that show whether a group of boxes is likely, and how wide the posterior is
-BOX_POINTS = 160  # drawn from the boxes
-LINEAR_WIDER = 2.0  # variance about the solution of the linear model with which sampling begins
 APART_BOXES = 3.0  # between two modes that sampling begins with
-FEW, MORE_ROUNDS = 60.0, (300, 500, 900)  # effective points of the best hypothesis, below which it is sampled anew
+FEW = 60.0  # effective points of the best hypothesis, below which it is sampled anew
 
 
 def sample_posterior(explored: Explored, rows: Evidence, terrain: Terrain) -> list[Hypothesis]:
@@ -39,7 +36,7 @@ def sample_posterior(explored: Explored, rows: Evidence, terrain: Terrain) -> li
     references_m = np.array([centres_m[0] for centres_m, _ in groups])
     found: list[Hypothesis] = []
     for number, (centres_m, reach_m) in enumerate(groups):
-        half_m = max(reach_m, LEAST_REACH_M)
+        half_m = max(reach_m, NEARBY_M)
         model = SkylineModel(terrain, rows, centres_m[0], half_m, errors, image_errors=rows.image_errors)
         start = _start(model, centres_m, explored.half_m)
         if start is None:
@@ -47,30 +44,30 @@ def sample_posterior(explored: Explored, rows: Evidence, terrain: Terrain) -> li
         best = max((one.found.log_evidence for one in found), default=-np.inf)
         plain = _sample_group(model, start, references_m, number, best)
         found.append(plain)
-        if plain.found.log_evidence >= best - MODE_NATS:
+        if plain.found.log_evidence >= best - NATS:
             found.extend(sample_gross_errors(plain, references_m))
     if not found:
         raise NotLocated("no position in the search area is allowed", reason="outside_search_area")
     found.sort(key=lambda one: -one.found.log_evidence)
     if found[0].found.effective < FEW:
-        found[0] = sample_hypothesis(found[0].model, references_m, [_moments_of(found[0])], rounds=MORE_ROUNDS)
+        found[0] = sample_hypothesis(found[0].model, references_m, [_moments_of(found[0])])
     return found
 
 
 def _sample_group(model: SkylineModel, start: Start, references_m: Array, number: int, best: float) -> Hypothesis:
     """The plain hypothesis of a group of boxes, with the reference `number` of all (g, 2), which may move.
 
-    A further group is left at its first rounds where it is less likely than the `best` by MODE_NATS. On a height map
+    A further group is left at its first rounds where it is less likely than the `best` by NATS. On a height map
     the last rounds are in a neighbourhood as small as the posterior, because horizons are interpolated in it.
     """
     rounds = FIRST_ROUNDS if model.rows.is_first_look else ROUNDS
     if number == 0 and model.terrain.axisymmetric:
         return sample_hypothesis(model, references_m, start.modes, first=[start.boxes], rounds=rounds)
     plain = sample_hypothesis(model, references_m, start.modes, first=[start.boxes], rounds=FIRST_ROUNDS)
-    if plain.found.log_evidence < best - MODE_NATS:
+    if plain.found.log_evidence < best - NATS:
         return plain
     mean, covariance = _moments_of(plain)
-    reach_m = max(REACH_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1])), LEAST_REACH_M)
+    reach_m = max(REACH_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1])), NEARBY_M)
     if model.terrain.axisymmetric or reach_m > 0.5 * model.half_m:
         return sample_hypothesis(model, references_m, start.modes, first=[start.boxes], rounds=rounds)
     references_m[number] = mean[:2]
@@ -119,7 +116,7 @@ def _start(model: SkylineModel, centres_m: Array, half_m: float) -> Start | None
     value, by_linear = value[:-1], value[-1]
     chosen: list[Array] = []
     for i in np.argsort(-value):
-        if value[i] < value.max() - MODE_NATS or len(chosen) == MOST_MODES:
+        if value[i] < value.max() - NATS or len(chosen) == MOST_MODES:
             break
         if all(np.abs(boxes[i, :2] - one[:2]).max() > APART_BOXES * 2 * half_m for one in chosen):
             chosen.append(boxes[i])
@@ -133,10 +130,10 @@ def _start(model: SkylineModel, centres_m: Array, half_m: float) -> Start | None
     whole = covariance.copy()
     whole[:2, :2] += spread
     left = covariance[2:, 2:] - covariance[2:, :2] @ np.linalg.solve(covariance[:2, :2], covariance[:2, 2:])
-    drawn = BoxDistribution(boxes, half_m, share, np.asarray(np.linalg.cholesky(left)), BOX_POINTS)
+    drawn = BoxDistribution(boxes, half_m, share, np.asarray(np.linalg.cholesky(left)), MOST_BOXES)
     modes = [(one, whole) for one in chosen]
     if by_linear > value.max():
-        modes = [(linear, LINEAR_WIDER * covariance), *modes[: MOST_MODES - 1]]
+        modes = [(linear, WIDER * covariance), *modes[: MOST_MODES - 1]]
     return Start(modes, drawn)
 
 

@@ -1,4 +1,4 @@
-"""The log-likelihood by which positions are searched: of points, and sums of rows that bound it over boxes."""
+"""The likelihood of a position in the search: sums of rows over elevation, sector by sector."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from functools import cached_property
 import numpy as np
 
 from startrack.core.types import Array, Evidence
-from startrack.localization.box_average import BoxAverage
-from startrack.localization.prefix_sums import PrefixSums
+from startrack.localization.box_sums import BoxAverage, PrefixSums
 from startrack.localization.sector_likelihood import Sectors, add_contributions
+from startrack.localization.skyline_profiles import SECTORS
 from startrack.terrain import Terrain, require_horizons
 
-SECTOR_RAD, SECTOR_EPSILON = float(np.radians(1.5)), 1e-4  # width of a sector; probability that one is wholly wrong
+SECTOR_RAD = 2 * np.pi / SECTORS
+SECTOR_EPSILON = 1e-4  # probability that a sector is wholly wrong
 POINT_M = 0.5  # half side of a box that stands for a point
 
 

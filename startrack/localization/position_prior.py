@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from startrack.core.types import Array, Bools, NotLocated, PositionPrior
-from startrack.localization.explored import Explored
+from startrack.localization.search import Explored
 from startrack.terrain import ForwardingTerrain, Terrain
 
 REACH_SIGMAS = 6.0  # of the prior, to the edge of the area that is searched

@@ -8,14 +8,13 @@ import numpy as np
 
 from startrack.core.compilation import announce_compilation
 from startrack.core.types import Evidence, Fix, NotLocated, PositionPrior
-from startrack.localization.branch_and_bound import Search
+from startrack.localization.clock import explore_times, is_wide
 from startrack.localization.conclusion import conclude
-from startrack.localization.explored import Explored, log_sum
 from startrack.localization.horizon_bias import find_start
 from startrack.localization.joint_posterior import sample_posterior
 from startrack.localization.likelihood import SECTOR_RAD, PositionLikelihood
-from startrack.localization.other_times import explore_times, is_wide
 from startrack.localization.position_prior import SearchedNear, name_prior, weigh_by_prior
+from startrack.localization.search import NATS, Explored, Search, log_sum
 from startrack.terrain import Terrain, require_terrain
 
 MIN_ROWS = 8
@@ -23,7 +22,6 @@ MIN_ROW_NATS = 1e-3  # |llr| below which a row is left out
 SEARCH_EPSILON = 0.1  # of a sector in the search: an obstacle costs the true position 2.3 nats a sector, not 9
 SLACK_NATS = 44.0  # by which the published model may favour a position over the search: 29 degrees of obstacles
 NEAR_BOXES = 60  # likely with a prior, whose middles are compared with the best position
-NATS = 16.0  # positions that are e^-16 as likely as the best are dropped
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ from startrack.core.kernels import njit, normal_cdf
 from startrack.core.types import Array, Evidence, Ints
 
 SECTOR_STEP = 10.0  # between the keys of neighbouring sectors: more than any two elevations differ [rad]
-EDGE_SIGMAS = 8.0  # beyond this the edge of a single row is not computed
+EDGE_SIGMAS = 8.0  # beyond this the edge of a single row is not computed, and splines of rows are constant
+CERTAIN_SIGMAS = 6.0  # to the ends of a normal distribution: a ray beyond is visible or hidden, to 1e-9
 CEILING_STEP = 0.01  # of the edge's width: last step to the best level skyline
 
 

@@ -15,7 +15,7 @@ from startrack.localization.skyline_profiles import Profiles, cell_at
 REACH_RAD = np.radians(1.2)  # of heights about the reference's skyline
 LEAST_SIGMA_RAD, LEAST_INFORMATION = 1e-7, 1e-9
 FREEDOM = 3.0  # degrees of freedom of the residuals: obstacles and wrong rows do not lead the solution
-ROUNDS = 6
+REWEIGHTINGS = 6
 
 
 class SectorMoments(NamedTuple):
@@ -73,7 +73,7 @@ def solve_linear(moments: SectorMoments, design: Array, mean: Array, prior: Arra
         prior: (d, d) inverse of their covariance before.
     """
     weight, left = np.ones(len(design)), moments.mean_rad - design @ mean
-    for _ in range(ROUNDS):
+    for _ in range(REWEIGHTINGS):
         weighted = design * (weight / moments.variance_rad2)[:, None]
         covariance = np.linalg.inv(weighted.T @ design + prior)
         step = covariance @ (weighted.T @ left)

@@ -1,4 +1,4 @@
-"""Errors that raise the skyline at all azimuths together: of the terrain's shape, and of the clock."""
+"""Errors that raise the skyline at all azimuths together, of terrain and clock, and the directions that rows show."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ import numpy as np
 
 from startrack.core.types import Array, Clock
 from startrack.frames import R_from_rotvec, turn_azel
+from startrack.localization.sector_moments import SectorMoments
 from startrack.terrain import ShapeError, Terrain
 
 TURN_STEP_RAD = 2e-3  # of the sky, at which the skyline's change with the time is taken: its crests are no narrower
 ROUGH_RAD = np.radians(0.002)  # of ground that nobody states as exact: 0.35 m of a rim 10 km away
 CLOCK_FACT = "time_sigma_s"
-LEAST_PART = 1e-3  # of a gross error: the sigma of an error that is zero unless it is gross
+RESIDUAL_PART = 1e-3  # of a gross error: the sigma of an error that is zero unless it is gross
 NEGLIGIBLE_M = 0.05  # by which an error of the clock moves a row over the search area, without an effect on the fix
+LEAST_INFORMATION = 0.03  # beside that of the prior, from which on a direction is sampled: a sigma smaller by 1.5 %
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +60,7 @@ class SharedErrors:
 
     def sigma(self, gross: str = "") -> Array:
         """Standard deviations (k,); those of the fact `gross` as of a gross error."""
-        least = [max(one.sigma, LEAST_PART * one.gross_sigma) for one in self.listed]
+        least = [max(one.sigma, RESIDUAL_PART * one.gross_sigma) for one in self.listed]
         return np.array(
             [one.gross_sigma if one.fact == gross else low for one, low in zip(self.listed, least, strict=True)]
         )
@@ -130,12 +132,73 @@ def _known_errors(terrain: Terrain, clock: Clock | None) -> list[ShapeError]:
     return [*terrain.shape_errors, *([] if clock is None else [_clock_error(clock, terrain)])]
 
 
+def is_noticeable(clock: Clock, error_s: float, terrain: Terrain) -> bool:
+    """Whether an error of a clock moves a row noticeably over the search area of a terrain."""
+    return error_s * float(np.linalg.norm(clock.turn_rad_s)) * terrain.reach_m > NEGLIGIBLE_M
+
+
 def _clock_error(clock: Clock, terrain: Terrain) -> ShapeError:
     """The error of a `clock`; zero where it moves no position on a `terrain` noticeably."""
-    m_per_s = float(np.linalg.norm(clock.turn_rad_s)) * terrain.reach_m
-    most_s = max(clock.sigma_s, clock.gross_sigma_s if clock.gross_probability > 0.0 else 0.0)
-    noticed = most_s * m_per_s > NEGLIGIBLE_M
+    noticed = is_noticeable(clock, max(clock.sigma_s, clock.gross_sigma_s * (clock.gross_probability > 0.0)), terrain)
     return ShapeError(
         name="clock_s", fact=CLOCK_FACT, sigma=clock.sigma_s if noticed else 0.0,
         gross_probability=clock.gross_probability if noticed else 0.0, gross_sigma=clock.gross_sigma_s,
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorBasis:
+    """Values of the k shared errors: mean + shown z + hidden y, with z and y normal of unit variance."""
+
+    gross: str  # fact with a gross error; "": none
+    log_probability: float  # of that
+    mean: Array  # (k,)
+    shown: Array  # (k, a) directions that the rows show
+    hidden: Array  # (k, b)
+    drift_m: Array  # (b, 2) move of the position that leaves the skyline as it is, by one unit of each hidden one
+
+    @classmethod
+    def of(
+        cls,
+        errors: SharedErrors,
+        gross: str,
+        slopes_rad: Array,
+        position_slopes: Array,
+        moments: SectorMoments,
+        reach_m: float,
+    ) -> ErrorBasis:
+        """Of errors that raise the skyline by `slopes_rad` (k, n), a position that does by `position_slopes` (2, n).
+
+        The position is known to `reach_m` before.
+        """
+        sigma = errors.sigma(gross)
+        weight = 1.0 / moments.variance_rad2
+        rise, moved = sigma[:, None] * slopes_rad, position_slopes
+        normal = (moved * weight) @ moved.T + reach_m**-2.0 * np.eye(2)
+        to_move = np.linalg.solve(normal, (moved * weight) @ rise.T)  # (2, k) of the position, by each error
+        left = rise - to_move.T @ moved
+        information, axes = np.linalg.eigh((left * weight) @ left.T)
+        is_shown = information > LEAST_INFORMATION
+        hidden = axes[:, ~is_shown]
+        return cls(
+            gross, errors.log_probability(gross), errors.mean, sigma[:, None] * axes[:, is_shown],
+            sigma[:, None] * hidden, -(to_move @ hidden).T,
+        )  # fmt: skip
+
+    @classmethod
+    def whole(cls, errors: SharedErrors) -> ErrorBasis:
+        """All `errors` in their own units, as directions of their own, about zero."""
+        k = len(errors)
+        return cls("", 0.0, np.zeros(k), np.eye(k), np.zeros((k, 0)), np.zeros((0, 2)))
+
+    def __len__(self) -> int:
+        return self.shown.shape[1]
+
+    def values(self, shown: Array, hidden: Array) -> Array:
+        """Values (n, k) of the errors at coordinates (n, a) and (n, b)."""
+        return np.asarray(self.mean + shown @ self.shown.T + hidden @ self.hidden.T)
+
+    def log_prior(self, shown: Array) -> Array:
+        """Logarithm (n,) of the prior density of coordinates (n, a), with the probability of the hypothesis."""
+        norm = 0.5 * shown.shape[1] * np.log(2 * np.pi)
+        return np.asarray(self.log_probability - norm - 0.5 * np.square(shown).sum(axis=1))

@@ -9,12 +9,11 @@ import numpy as np
 
 from startrack.core.kernels import njit, normal_cdf
 from startrack.core.types import Array, Evidence, Ints
+from startrack.localization.sector_likelihood import CERTAIN_SIGMAS, EDGE_SIGMAS
 
-REACH_SIGMAS = 8.0  # of the edge: from the outer rows to the ends of the splines, beyond which they are constant
 KNOT_SIGMAS = 0.2  # of the edge: distance of the knots; a cubic errs by 0.03 nats in a sector of 2e4 nats
-MAP_SIGMAS = 6.0  # of the map's error: from the middle of the normal distribution to its ends
 MAP_STEPS = 3.0  # points of the average in a standard deviation, of the map's error or of the sector's likelihood
-LEAST_PART = 1e-30  # of the best elevation's likelihood: the floor of a sector is far above it
+LEAST_LIKELIHOOD = 1e-30  # of the best elevation's likelihood: the floor of a sector is far above it
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +37,7 @@ class SkyProfiles:
         first = np.flatnonzero(np.diff(azimuth, prepend=-1.0) > 0)
         last = np.append(first[1:], len(rows)) - 1
         edge, map_sigma = evidence.edge_sigma_rad[rows[first]], map_sigma_rad[rows[first]]
-        around = REACH_SIGMAS * edge + MAP_SIGMAS * map_sigma
+        around = EDGE_SIGMAS * edge + CERTAIN_SIGMAS * map_sigma
         low = elevation[first] - around
         span = elevation[last] - elevation[first] + 2 * around
         knots = max(int(np.ceil(np.max(span / (KNOT_SIGMAS * edge)))) + 1, 4)
@@ -84,14 +83,14 @@ def _fill_averages(values, cubics, fine, sigma_knots, averaged):
         between[last] = values[m, knots - 1]
         top = between.max()
         likelihood = np.exp(between - top)
-        reach = max(int(np.ceil(MAP_SIGMAS * sigma_knots[m] * fine[m])), 1)
+        reach = max(int(np.ceil(CERTAIN_SIGMAS * sigma_knots[m] * fine[m])), 1)
         weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (sigma_knots[m] * fine[m])) ** 2)
         weight /= weight.sum()
         for j in range(knots):
             mean = 0.0
             for i in range(-reach, reach + 1):
                 mean += weight[i + reach] * likelihood[min(max(j * fine[m] + i, 0), last)]
-            averaged[m, j] = top + np.log(max(mean, LEAST_PART))
+            averaged[m, j] = top + np.log(max(mean, LEAST_LIKELIHOOD))
 
 
 @njit(cache=True, nogil=True)

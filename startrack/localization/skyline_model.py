@@ -15,7 +15,6 @@ from functools import cached_property
 import numpy as np
 
 from startrack.core.types import Array, Evidence, ImageErrors, Ints
-from startrack.localization.error_basis import ErrorBasis
 from startrack.localization.obstacle_chain import (
     MOVES,
     Levels,
@@ -25,7 +24,7 @@ from startrack.localization.obstacle_chain import (
     state_probabilities,
 )
 from startrack.localization.sector_moments import SectorMoments, measure_moments
-from startrack.localization.shared_errors import SharedErrors
+from startrack.localization.shared_errors import ErrorBasis, SharedErrors
 from startrack.localization.skyline_profiles import HIGH_RAD, ROW_NATS, SECTORS, Profiles, profiles_of
 from startrack.terrain import Terrain
 
@@ -33,9 +32,9 @@ MIDDLES_RAD = (np.arange(SECTORS) + 0.5) * 2 * np.pi / SECTORS
 SAMPLES = 6 * SECTORS  # of the skyline around the reference, between which rows are compared with it
 TRACED_RAD = np.radians(0.7)  # rows this near the skyline are compared with its own elevation at their azimuth
 LEAST_REACH_RAD = np.radians(0.1)  # of shifts, for which levels are prepared
-WIDER = 1.5  # of the shifts that are met
+MARGIN = 1.5  # of the shifts that are met
 OF_GROUND = ("ground", "horizon_rad", "error_slopes_rad", "position_slopes", "skyline_rad", "map_sigma_rad")
-ACROSS = 5  # traced horizons along each side of the neighbourhood
+NODES_ACROSS = 5  # traced horizons along each side of the neighbourhood
 
 NO_IMAGE_ERRORS = ImageErrors(np.zeros((SECTORS, 0)), np.zeros(0), np.zeros((0, 0)), np.full(SECTORS, np.inf))
 
@@ -60,7 +59,7 @@ class SkylineModel:
     @cached_property
     def ground(self) -> Terrain:
         """The terrain, prepared for the neighbourhood."""
-        return self.terrain.near(self.reference_m, self.half_m, MIDDLES_RAD, ACROSS).interpolated()
+        return self.terrain.near(self.reference_m, self.half_m, MIDDLES_RAD, NODES_ACROSS).interpolated()
 
     @cached_property
     def horizon_rad(self) -> Array:
@@ -203,7 +202,7 @@ class SkylineModel:
         most = np.maximum(shifts.max(axis=0), -shifts.min(axis=0))
         known = self._prepared
         if known is None or (most > known.reach).any():
-            reach = np.maximum(WIDER * most, LEAST_REACH_RAD)
+            reach = np.maximum(MARGIN * most, LEAST_REACH_RAD)
             known = self._prepared = Levels(reach, prepare_levels(self.profiles, reach))
         return known
 

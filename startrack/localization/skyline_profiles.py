@@ -16,6 +16,7 @@ import numpy as np
 
 from startrack.core.kernels import njit
 from startrack.core.types import Array, Evidence, Ints
+from startrack.localization.sector_likelihood import EDGE_SIGMAS
 from startrack.localization.sky_profiles import SkyProfiles
 
 SECTORS = 240  # of 1.5 degrees: an obstacle on no map hides stars together, faint and bright ones
@@ -23,7 +24,7 @@ LOW_RAD, HIGH_RAD = np.radians(-12.0), np.radians(20.0)  # window of heights: be
 ROW_NATS = 6.0  # most that one star counts: one in 400 is variable, misnamed or not in the catalogue
 SKY_STEP_PX = 0.1  # of the edge's width: cells of the sky's light, quadratic in each, right to 0.02 nats
 SOFT_BINS = np.linspace(-3.5, 3.5, 15)  # of a normal error of the map, whose mean is taken bin by bin
-SOFT_REACH_RAD, SOFT_SIGMAS = np.radians(0.3), 8.0  # about the map's skyline, where its error is averaged over
+SOFT_REACH_RAD = np.radians(0.3)  # beside EDGE_SIGMAS, about the map's skyline, where its error is averaged over
 LEAST_MEAN = 1e-8  # of exp (F - R) over such an error: differences of the integral have no more digits
 SOFT_STEP, MOST_SOFT_CELLS = 0.5, 120.0  # of the error: cells of the average; at most, to each side
 
@@ -212,7 +213,7 @@ def _average_over_map(profiles, sigma, bins):
     sectors, room = len(sigma), len(profiles.x)
     reach, step = np.zeros(sectors), np.zeros(sectors)
     for s in range(sectors):
-        reach[s] = SOFT_REACH_RAD + SOFT_SIGMAS * sigma[s]
+        reach[s] = SOFT_REACH_RAD + EDGE_SIGMAS * sigma[s]
         step[s] = max(SOFT_STEP * sigma[s], reach[s] / MOST_SOFT_CELLS)
         room += int(2.0 * reach[s] / step[s]) + 4
     first = np.zeros(sectors + 1, dtype=np.int64)

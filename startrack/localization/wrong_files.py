@@ -8,14 +8,13 @@ import numpy as np
 
 from startrack.core.types import Array, Blocked, NotLocated
 from startrack.localization.free_skyline import free_log_likelihood
-from startrack.localization.gross_errors import GROSS_ROUNDS, sample_gross_error
-from startrack.localization.hypothesis import Hypothesis
+from startrack.localization.hypothesis import GROSS_ROUNDS, Hypothesis, sample_gross_error
 from startrack.localization.shared_errors import SharedErrors
 
 WRONG_FACT_NATS = 3.0  # by which a gross error of a stated fact must explain the rows better: 1 of 100 clean skies
 MOST_BLOCKED = 0.5  # of the skyline that the rows show: where more is on no map, another place may explain them as well
 WIDE_SHAPE = 0.4  # relative range of a wrong map's steepness: a free skyline is compared with a map of any of them
-FEW_ROUNDS = (120,)  # points by which facts are screened: of 34 frames refused with GROSS_ROUNDS it leaves 32
+FEW_ROUNDS = GROSS_ROUNDS[:1]  # points by which facts are screened: of 34 frames refused with GROSS_ROUNDS it leaves 32
 
 
 def require_files(found: Sequence[Hypothesis], parameters: Array, clear: Array) -> None:

@@ -12,10 +12,10 @@ import numpy as np
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.core.types import Array, Evidence
 from startrack.estimation.observations import UNKNOWN_M
-from startrack.localization.error_basis import ErrorBasis
 from startrack.localization.importance_sampling import Gaussian, WeightedPoints, moments, sample
 from startrack.localization.integrity import clear_logs
 from startrack.localization.sector_moments import solve_linear
+from startrack.localization.shared_errors import ErrorBasis
 from startrack.localization.skyline_model import NO_IMAGE_ERRORS, SECTORS, SkylineModel
 from startrack.terrain import Terrain
 

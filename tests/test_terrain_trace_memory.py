@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from startrack.terrain.trace_memory import SLOTS, BoxMemory
+from startrack.terrain.horizon_table import SLOTS, BoxMemory
 
 
 class Tracer:

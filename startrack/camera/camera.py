@@ -16,7 +16,7 @@ from startrack.frames import length_xy, off_axis_rad
 # Body x (forward) = image top = -cam y, body y (left) = +cam x, body z (up) = +cam z: it looks at the zenith.
 ZENITH_MOUNT_R_BODY_CAM = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
-GRID_POINTS = 400  # of a cap
+CAP_POINTS = 400  # of a cap
 GOLDEN_ANGLE_RAD = np.pi * (3.0 - np.sqrt(5.0))
 SQUARE_PIXEL_SIGMA_1 = 1e-7  # relative sigma of fx / fy where they are fitted as one: just enough for an inverse
 
@@ -191,7 +191,7 @@ def lens_jacobian(camera: Camera, rays_cam: Array, order: tuple[str, ...]) -> Ar
     return np.stack([column(name) for name in order], axis=-1)
 
 
-def cap_grid(angle_rad: float, points: int = GRID_POINTS) -> Array:
+def cap_grid(angle_rad: float, points: int = CAP_POINTS) -> Array:
     """Rays (`points`, 3) spread evenly in solid angle over the cap within `angle_rad` of the axis."""
     i = np.arange(points) + 0.5
     z = 1.0 - (1.0 - np.cos(angle_rad)) * i / points

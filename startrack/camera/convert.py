@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from startrack.camera.camera import Camera, cap_grid
-from startrack.camera.formats import FORMATS, Intrinsics
+from startrack.camera.formats import FOREIGN_FORMATS, Intrinsics
 from startrack.camera.io import camera_from_dict
 from startrack.camera.optics import Decentring
 from startrack.core.files import MAX_CAUSE_CHARS
@@ -22,7 +22,7 @@ SMALL_ANGLE_DEG = 1e-3  # of an image circle within any lens
 
 
 def foreign_text(camera: Camera, program: str) -> str:
-    """The camera as text of a file of `program`, a key of FORMATS.
+    """The camera as text of a file of `program`, a key of FOREIGN_FORMATS.
 
     Raises BadInput bad_calibration for a mirrored camera, and if the format cannot hold the lens.
     """
@@ -37,7 +37,7 @@ def foreign_text(camera: Camera, program: str) -> str:
         raise BadInput("bad_calibration", f"no other program's format has the {camera.lens.model} lens")
     model, coefficients = distortion
     fx, fy, cx, cy = (float(v) for v in (*camera.focal_px, *camera.centre_px))
-    return FORMATS[program].write(
+    return FOREIGN_FORMATS[program].write(
         Intrinsics(
             name=camera.name, size_px=camera.size_px, focal_px=(fx, fy), centre_px=(cx, cy),
             k=None if model == "pinhole" else coefficients, decentring=camera.decentring,
@@ -52,9 +52,9 @@ def camera_from_foreign_text(text: str, program: str, name: str, calibrated_angl
     No such file states up to which angle off the axis [rad] the lens was calibrated: None takes the angle at the edge
     of the frame that is nearest to the centre. Raises BadInput bad_calibration.
     """
-    refusal = f"not a camera file of {FORMATS[program].title} that can be used"
+    refusal = f"not a camera file of {FOREIGN_FORMATS[program].title} that can be used"
     try:
-        camera = _camera(FORMATS[program].read(text), name)
+        camera = _camera(FOREIGN_FORMATS[program].read(text), name)
         angle = _nearest_edge_rad(camera) if calibrated_angle_rad is None else calibrated_angle_rad
         return replace(camera, calibrated_angle_rad=min(angle, camera.max_angle_rad))
     except BadInput as error:

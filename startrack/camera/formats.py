@@ -73,7 +73,7 @@ class Format:
 
 
 def find_program(text: str) -> str | None:
-    """The program whose camera file the `text` is, a key of FORMATS; None if it is of none of them."""
+    """The program whose camera file the `text` is, a key of FOREIGN_FORMATS; None if it is of none of them."""
     if "<opencv_storage>" in text or OPENCV_HEAD.search(text):
         return "opencv"
     lines = (line.strip() for line in text.splitlines())
@@ -229,7 +229,7 @@ def _read_opencv(text: str) -> Intrinsics:
     return Intrinsics.from_matrix((d["image_width"], d["image_height"]), arrays[0], k=k)
 
 
-FORMATS = {
+FOREIGN_FORMATS = {
     "ros": Format("ROS", _write_ros, _read_ros),
     "kalibr": Format("Kalibr", _write_kalibr, _read_kalibr),
     "colmap": Format("COLMAP", _write_colmap, _read_colmap),

@@ -33,7 +33,7 @@ __all__ = [
     "files_of_terrain", "import_maps", "load_terrain", "read_map", "require_bounds", "require_horizons",
     "require_terrain", "state_errors", "stateable_errors", "terrain_from_dict", "write_bands", "write_map",
 ]  # fmt: skip
-_MODULES = {  # of names that few programs use: imported at the first use
+_LAZY_MODULES = {  # of names that few programs use: imported at the first use
     "HeightMap": "height_map", "StateableError": "state_file", "import_maps": "import_map", "read_map": "map_reading",
     "state_errors": "state_file", "stateable_errors": "state_file", "write_bands": "map_writing",
     "write_map": "map_writing",
@@ -41,6 +41,6 @@ _MODULES = {  # of names that few programs use: imported at the first use
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
+    if name not in _LAZY_MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    return getattr(importlib.import_module(f"{__name__}.{_LAZY_MODULES[name]}"), name)

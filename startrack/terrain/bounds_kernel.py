@@ -25,7 +25,7 @@ from startrack.terrain.horizon_kernel import (
 
 FINE_POSTS = 1.2  # posts: of narrower bands slopes are taken cell by cell
 KINK_M = 0.02  # by which a traced ray may miss a kink of the ground: NUDGE_M times the change of slope
-PARTS = 4  # of a step, whose slopes are taken one by one
+STEP_PARTS = 4  # of a step, whose slopes are taken one by one
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -89,7 +89,7 @@ def bounds(
     no higher than the steepest slope along the ray, as the camera stands above the ground.
 
     Slopes to the side come from the pyramid. With `tilt_to_crest`, where a step may make the horizon and w is below
-    about a post, they are taken again from the cells that the band touches, in PARTS parts of the step.
+    about a post, they are taken again from the cells that the band touches, in STEP_PARTS parts of the step.
 
     All heights (low_up and high_up too) may be relative to a plane through the middle of the box that rises by slope_e
     to the east and slope_n to the north: a tan then is less by the plane's own rise along the ray. With `tilt_to_crest`
@@ -200,7 +200,7 @@ def bounds(
                 )
                 parts, part_slack = 1, KINK_M * min(width, 1.0)
                 if tilt_to_crest and top >= low and width < FINE_POSTS * post_m[m]:
-                    parts = PARTS
+                    parts = STEP_PARTS
                     column0, row0 = on_map(grid, m, e, n, moon + z0 + along_rise * s)
                 bend_k = (z0 - 2 * z1 + z2) * 2 / (length * length)
                 rise_k = (z2 - z0) / length - bend_k * length

@@ -15,7 +15,7 @@ from startrack.terrain.protocol import ForwardingTerrain, HorizonPosts, Terrain
 from startrack.terrain.shape import ShapeError, select_slopes
 from startrack.terrain.traced_map import TracedMap
 
-TURNS = 2  # of the azimuth towards that of the turned skyline: each leaves a thousandth of the difference
+TILT_ROUNDS = 2  # of the azimuth towards that of the turned skyline: each leaves a thousandth of the difference
 WIDER_RAD = 0.1  # by which azimuths are widened to find the highest skyline that a tilt may turn into a direction
 
 
@@ -68,7 +68,7 @@ class DeformedMap(ForwardingTerrain):
             return found
         azimuths = np.broadcast_to(azimuths_rad, found.shape)
         own = np.array(azimuths)
-        for _ in range(TURNS):
+        for _ in range(TILT_ROUNDS):
             own += (azimuths - self._turned(own, found)[0] + np.pi) % (2 * np.pi) - np.pi
             found = self._level_rad(self._raised.horizon_rad(points_m, own))
         return self._turned(own, found)[1]

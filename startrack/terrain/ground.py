@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from startrack.core.types import Array, Ints
 from startrack.frames import MOON_RADIUS_M, Site, enu_from_latlon, latlon_from_enu
 from startrack.terrain.protocol import NO_POST
-from startrack.terrain.raster import GRID_NUMBERS, Raster
+from startrack.terrain.raster import Raster
 
-SLOPE_STEPS = 127  # a slope is kept as a whole number of 1/127 of the map's steepest, rounded away from the middle
+SLOPE_STEPS = 127  # a slope is kept as a whole number of 1/127 of the map's steepest, rounded up
 SURFACE_ROUNDS = 6  # of the height of the ground, each with the place of the last one's height
 SMALLEST_BLOCKS = 4  # a pyramid ends where a level has no more blocks than this along an axis
 
@@ -32,7 +32,7 @@ class Ground(NamedTuple):
     posts: Ints  # (maps, 3): where a map's posts begin, rows, columns
     tops: NDArray[np.float32]  # highest post of each block [m]
     wide_tops: NDArray[np.float32]  # highest post of each block and its neighbours [m]
-    slopes: NDArray[np.int8]  # (blocks, 8): least and most rise per step along column, row, both, and -column +row
+    slopes: NDArray[np.int8]  # (blocks, 8): most fall and rise per step along column, row, both, and -column +row
     blocks: Ints  # (maps, levels, 3): where a level's blocks begin, block rows, block columns
     levels: Ints  # (maps,)
     slope_unit: Array  # (maps,) [m per post]
@@ -58,18 +58,17 @@ def pack_maps(site: Site, maps: Sequence[Raster]) -> Ground:
         while True:
             tops.append(top.ravel())
             wide.append(_with_neighbours(top).ravel())
-            slopes.append(_slopes_with_neighbours(slope).reshape(-1, 8))
+            slopes.append(_with_neighbours(slope).reshape(-1, 8))
             block_table.append((first_block, *top.shape))
             first_block += top.size
             if max(top.shape) <= SMALLEST_BLOCKS:
                 break
             top = merge_blocks(top, np.maximum)
-            low, high = merge_blocks(slope[..., :4], np.minimum), merge_blocks(slope[..., 4:], np.maximum)
-            slope = np.concatenate([low, high], axis=-1)
+            slope = merge_blocks(slope, np.maximum)
         blocks.append(block_table)
     most = max(len(table) for table in blocks)
     return Ground(
-        grid=np.array([m.grid_numbers(site) for m in maps]).reshape(len(maps), GRID_NUMBERS),
+        grid=np.array([m.grid_numbers(site) for m in maps]),
         heights=np.concatenate(heights),
         posts=np.array(posts, dtype=np.int64),
         tops=np.concatenate(tops),
@@ -94,7 +93,7 @@ def _steepest_rise(h: NDArray[np.float32]) -> float:
 
 
 def _cell_slopes(h: NDArray[np.float32], unit: float) -> NDArray[np.int8]:
-    """(rows, columns, 8): least, then most, rise per step along (1, 0), (0, 1), (1, 1), (-1, 1) in (column, row).
+    """(rows, columns, 8): most fall, then most rise, per step along (1, 0), (0, 1), (1, 1), (-1, 1) in (column, row).
 
     In a bilinear cell the rise along columns lies between those of its two edges, whatever the row, and so for rows.
     """
@@ -104,10 +103,10 @@ def _cell_slopes(h: NDArray[np.float32], unit: float) -> NDArray[np.int8]:
     low_r, high_r = np.minimum(down[:, :-1], down[:, 1:]), np.maximum(down[:, :-1], down[:, 1:])
     out = np.empty((*low_c.shape, 8), dtype=np.int8)
     slack = np.float32(0.01)  # of a step: more than single precision can lose
-    for k, least in enumerate((low_c, low_r, low_c + low_r, low_r - high_c)):
-        out[..., k] = np.floor(least - slack)
-    for k, most in enumerate((high_c, high_r, high_c + high_r, high_r - low_c)):
-        out[..., 4 + k] = np.ceil(most + slack)
+    falls = -low_c, -low_r, -(low_c + low_r), high_c - low_r
+    rises = high_c, high_r, high_c + high_r, high_r - low_c
+    for k, most in enumerate((*falls, *rises)):
+        out[..., k] = np.ceil(most + slack)
     return out
 
 
@@ -117,19 +116,15 @@ def merge_blocks(a: np.ndarray, choose: np.ufunc) -> np.ndarray:
     return np.asarray(choose(choose(a[::2, ::2], a[1::2, ::2]), choose(a[::2, 1::2], a[1::2, 1::2])))
 
 
-def _with_neighbours(a: np.ndarray, choose: np.ufunc = np.maximum) -> np.ndarray:
+def _with_neighbours(a: np.ndarray) -> np.ndarray:
+    """The largest values (rows, columns, ...) of blocks and their neighbours."""
     tall = a.copy()
-    choose(tall[1:], a[:-1], out=tall[1:])
-    choose(tall[:-1], a[1:], out=tall[:-1])
+    np.maximum(tall[1:], a[:-1], out=tall[1:])
+    np.maximum(tall[:-1], a[1:], out=tall[:-1])
     wide = tall.copy()
-    choose(wide[:, 1:], tall[:, :-1], out=wide[:, 1:])
-    choose(wide[:, :-1], tall[:, 1:], out=wide[:, :-1])
+    np.maximum(wide[:, 1:], tall[:, :-1], out=wide[:, 1:])
+    np.maximum(wide[:, :-1], tall[:, 1:], out=wide[:, :-1])
     return wide
-
-
-def _slopes_with_neighbours(slope: NDArray[np.int8]) -> NDArray[np.int8]:
-    parts = _with_neighbours(slope[..., :4], np.minimum), _with_neighbours(slope[..., 4:], np.maximum)
-    return np.concatenate(parts, axis=-1)
 
 
 def _raise_to_finer_maps(tops: NDArray[np.float32], height_map: Raster, finer: Sequence[Raster]) -> NDArray[np.float32]:

@@ -14,7 +14,7 @@ from startrack.terrain.horizon_kernel import block_at, locate, on_map, surface
 SHIFT_HEIGHT_M = 1000.0  # height of a sight line above the ground that its place on the map allows for
 MAX_TOUCHED = 25  # cells of a part
 TOUCH_MARGIN = 0.02  # of a cell: more than maps bend over a step
-ACROSS = 8  # steps along each side of a box
+BOX_STEPS = 8  # steps along each side of a box
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -22,13 +22,13 @@ def steepness(slopes, at, unit, d_column, d_row):
     """Most rise per metre in a block and its neighbours, going (d_column, d_row) per metre."""
     a, b = abs(d_column), abs(d_row)
     if a >= b:
-        straight = slopes[at, 4] if d_column > 0.0 else -slopes[at, 0]
+        straight = slopes[at, 4] if d_column > 0.0 else slopes[at, 0]
     else:
-        straight = slopes[at, 5] if d_row > 0.0 else -slopes[at, 1]
+        straight = slopes[at, 5] if d_row > 0.0 else slopes[at, 1]
     if d_column * d_row >= 0.0:
-        slanted = slopes[at, 6] if d_row + d_column > 0.0 else -slopes[at, 2]
+        slanted = slopes[at, 6] if d_row + d_column > 0.0 else slopes[at, 2]
     else:
-        slanted = slopes[at, 7] if d_row > 0.0 else -slopes[at, 3]
+        slanted = slopes[at, 7] if d_row > 0.0 else slopes[at, 3]
     return unit * (abs(a - b) * straight + min(a, b) * slanted)
 
 
@@ -121,10 +121,10 @@ def box_height_bounds(ground, east, north, half, tilted):
         twist = abs(heights[at] - heights[at + 1] - heights[at + columns] + heights[at + columns + 1])
         slack = twist * wide_column * wide_row / 2 + half * half / moon
     else:
-        step = 2 * half / ACROSS
-        for k in range((ACROSS + 1) * (ACROSS + 1)):
-            i = k // (ACROSS + 1)
-            e, n = east - half + step * i, north - half + step * (k - i * (ACROSS + 1))
+        step = 2 * half / BOX_STEPS
+        for k in range((BOX_STEPS + 1) * (BOX_STEPS + 1)):
+            i = k // (BOX_STEPS + 1)
+            e, n = east - half + step * i, north - half + step * (k - i * (BOX_STEPS + 1))
             z = surface(grid, posts, heights, moon, e, n, middle) - slope_e * (e - east) - slope_n * (n - north)
             low, high = min(low, z), max(high, z)
         m, column, row = locate(grid, posts, east, north, moon + middle)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from startrack.core.types import Array, Bools, Ints
 from startrack.terrain.deformed_map import DeformedMap, slopes_of_map
 from startrack.terrain.ground import cell_posts, post_positions
-from startrack.terrain.horizon_interpolator import NODES_ACROSS, HorizonInterpolator
-from startrack.terrain.horizon_table import BINS, HorizonSigma
+from startrack.terrain.horizon_interpolator import DEFAULT_NODES, HorizonInterpolator
+from startrack.terrain.horizon_table import AZIMUTH_BINS, HorizonSigma
 from startrack.terrain.protocol import HorizonPosts, Terrain
 from startrack.terrain.shape import BIAS, CAMERA_ERROR, STRETCH, VERTICAL, ShapeError, by_name
 from startrack.terrain.traced_map import TracedMap
@@ -50,7 +50,10 @@ class HeightMap(TracedMap):
         """
         if not self.height_sigma_m and not self.horizon_sigma_common_rad:
             return 0.0
-        own = float(np.median(self._sigma.cells_rad[self._search_area_cells])) if self.height_sigma_m else 0.0
+        own = 0.0
+        if self.height_sigma_m:
+            cells = np.hypot(*self.square.centres_m.T) < self.search_radius_m
+            own = float(np.median(self._sigma.blocks_rad[0].reshape(-1, AZIMUTH_BINS)[cells]))
         known = self.horizon_sigma_common_rad
         return float(np.hypot(own, COMMON_PER_POST * own if known is None else known))
 
@@ -70,11 +73,6 @@ class HeightMap(TracedMap):
     def with_shape(self, values: Array) -> DeformedMap:
         """The ground with these errors; see `Terrain`."""
         return DeformedMap(self, **by_name(self.shape_errors, values))
-
-    @cached_property
-    def _search_area_cells(self) -> Bools:
-        """Cells (n,) in the search area."""
-        return np.asarray(np.hypot(*self.square.centres_m.T) < self.search_radius_m)
 
     def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """From the height of the single post that makes the horizon: sigma cos^2 H / its distance."""
@@ -109,7 +107,7 @@ class HeightMap(TracedMap):
     def is_informative(self, azimuths_rad: Array, elevations_rad: Array) -> Bools:
         """Whether the map decides if the rays (...) are visible: outside glare, and above unmapped ground."""
         azimuths = np.asarray(azimuths_rad) % (2 * np.pi)
-        b = (azimuths / (2 * np.pi) * BINS).astype(np.int64) % BINS
+        b = (azimuths / (2 * np.pi) * AZIMUTH_BINS).astype(np.int64) % AZIMUTH_BINS
         above = np.asarray(elevations_rad) > self.unknown_rad[b]
         return np.asarray(above & ~in_sectors(azimuths, self.glare_rad))
 
@@ -127,6 +125,17 @@ class HeightMap(TracedMap):
         """One line of text per range of azimuths that is not informative."""
         return describe_masks(self.glare_rad, self.unknown_rad)
 
+    def error_warnings(self) -> list[str]:
+        """One line of text if the terrain file leaves out errors: the ground then counts as exact."""
+        missing = [key for key in self.unstated_errors if not getattr(self, key)]
+        if not missing:
+            return []
+        keys = " and ".join(missing)
+        return [
+            f"terrain {self.name}: its file states no {keys}: taken as 0; circles are too small unless the ground is "
+            "exactly so; state the errors (0 for a model from which pictures are rendered)"
+        ]
+
     def facts(self) -> dict[str, Any]:
         """Facts about the maps and their errors, as JSON values."""
         common = self.horizon_sigma_common_rad
@@ -139,7 +148,7 @@ class HeightMap(TracedMap):
             "horizons_ready": self.table_path.is_file(),
         }
 
-    def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = NODES_ACROSS) -> Terrain:
+    def near(self, centre_m: Array, half_m: float, azimuths_rad: Array, across: int = DEFAULT_NODES) -> Terrain:
         """The ground near a centre (2,), see `HorizonInterpolator`."""
         centre = np.asarray(centre_m, dtype=np.float64)
         return HorizonInterpolator(self, centre, half_m, np.unique(azimuths_rad), across)

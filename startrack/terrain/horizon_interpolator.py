@@ -16,7 +16,7 @@ from startrack.terrain.protocol import ForwardingTerrain
 from startrack.terrain.traced_map import TracedMap
 from startrack.terrain.tracing import flatten
 
-NODES_ACROSS = 3  # nodes along each side by default
+DEFAULT_NODES = 3  # nodes along each side by default
 MAX_BEND_TAN = 8e-5  # of tan H (0.004 degrees): azimuths whose horizon bends by more between the nodes are traced
 MAX_BEND_SIGMAS = 0.5  # or by more than that part of the map's own error
 
@@ -45,7 +45,7 @@ class HorizonInterpolator(ForwardingTerrain):
     centre_m: Array  # (2,)
     half_m: float
     azimuths_rad: Array  # (n,) ascending
-    across: int = NODES_ACROSS
+    across: int = DEFAULT_NODES
     exact: bool = True  # azimuths with a large interpolation error are traced
 
     @cached_property

@@ -6,26 +6,32 @@ and a point below the ground that makes it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.kernels import njit
 from startrack.core.types import Array
 from startrack.terrain.ground import merge_blocks
-from startrack.terrain.trace_memory import BoxMemory
 
-BINS = 360  # azimuths; the localizer's sectors are 1.5 degrees wide
+AZIMUTH_BINS = 360  # azimuths; the localizer's sectors are 1.5 degrees wide
 DISTANCE_STEP_M = 4.0
 ANGLE_STEP_RAD = np.pi / 65_000
 FIELDS = 11
 RISE_STEP = 1e-3
-LOW, HIGH, FIRST, LAST, BEST, LINE_TAN, LINE_M, POINT_S, POINT_M, RISE, POINT_RISE = range(11)  # of what tracing finds
 FARTHEST = 65_535
-NOT_KNOWN_M = -32_768
+NOT_KNOWN_M, HIGHEST_M = -32_768, 32_767  # range of fields that hold heights
 NEAREST_M = 50.0  # sigmas do not distinguish crests closer by
-SIGNS = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])  # of the corners of a box
+SLOTS = 2**18  # boxes and azimuths that are kept: 15 MB; a draw on Shackleton's floor traces 20,000 to 110,000
+BOX_NUMBERS = 5  # of a box and its azimuths
+NEW = np.uint64(0xFFFF_FFFF_FFFF_FFFF)  # a NaN, which no box has
+MIX_1, MIX_2, SHIFT = np.uint64(0x9E37_79B9_7F4A_7C15), np.uint64(0xBF58_476D_1CE4_E5B9), np.uint64(29)
+Trace = Callable[..., None]  # of centres, half sides, azimuths, their half widths; fills low and high
 
 
 @dataclass(frozen=True)
@@ -47,6 +53,41 @@ class Square:
         return np.stack([east.ravel(), north.ravel()], axis=-1)
 
 
+class BoxMemory:
+    """Bounds of the horizon over boxes that were traced before: images and draws of one place ask for them again.
+
+    The search cuts its square at the same lines for every image. It bounds the same parts of sectors in the same boxes,
+    and under the sky of one time the same stars, too. What is kept is what was traced, bit for bit; later bounds
+    replace earlier ones in the slots.
+    """
+
+    def __init__(self) -> None:
+        self._keys, self._bounds = np.full((SLOTS, BOX_NUMBERS), NEW), np.empty((SLOTS, 2))
+        self._lock = Lock()
+
+    def __reduce__(self) -> tuple[type[BoxMemory], tuple[()]]:
+        return BoxMemory, ()  # another process traces for itself
+
+    def fill(
+        self, trace: Trace, centres: Array, half: Array, azimuths: Array, turn: Array, low: Array, high: Array
+    ) -> None:
+        """Fill low and high (n,) for boxes at centres (n, 2), azimuths and their half widths (n,).
+
+        `trace` fills those that are not kept.
+        """
+        keys = np.column_stack([centres, half, azimuths, turn]).view(np.uint64)
+        missing = np.empty(len(low), dtype=np.bool_)
+        with self._lock:
+            _recall(self._keys, self._bounds, keys, low, high, missing)
+        if not missing.any():
+            return
+        results = np.empty((2, np.count_nonzero(missing)))
+        trace(centres[missing], half[missing], azimuths[missing], turn[missing], *results)
+        low[missing], high[missing] = results
+        with self._lock:
+            _keep(self._keys, self._bounds, keys[missing], *results)
+
+
 @dataclass(frozen=True, eq=False)
 class HorizonTable:
     """The cells' horizons, rounded so that bounds stay bounds.
@@ -58,8 +99,10 @@ class HorizonTable:
     """
 
     square: Square
-    values: NDArray[np.uint16]  # (cells, BINS, 11)
-    unknown_rad: Array  # (BINS,) elevation below which ground off the maps might stand, seen from anywhere; or -pi/2
+    values: NDArray[np.uint16]  # (cells, AZIMUTH_BINS, FIELDS)
+    unknown_rad: (
+        Array  # (AZIMUTH_BINS,) elevation below which ground off the maps might stand, seen from anywhere; or -pi/2
+    )
 
     @cached_property
     def box_memory(self) -> BoxMemory:
@@ -68,9 +111,9 @@ class HorizonTable:
 
     @cached_property
     def pyramid(self) -> list[tuple[NDArray[np.uint16], NDArray[np.uint16]]]:
-        """Least and most elevation (n, n, BINS) of the cells, then of ever larger blocks of them."""
+        """Least and most elevation (n, n, AZIMUTH_BINS) of the cells, then of ever larger blocks of them."""
         n = self.square.across
-        cells = self.values.reshape(n, n, BINS, FIELDS)
+        cells = self.values.reshape(n, n, AZIMUTH_BINS, FIELDS)
         nowhere = (cells[..., 0] == 0) & (cells[..., 1] == FARTHEST)  # no camera can be there: no part of any block
         levels = [
             (np.where(nowhere, np.uint16(FARTHEST), cells[..., 0]), np.where(nowhere, np.uint16(0), cells[..., 1]))
@@ -98,66 +141,89 @@ class HorizonSigma:
     def sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """Sigma (...) at the points (..., 2) in these azimuths."""
         square = self.table.square
-        n, side = square.across, 2 * square.half_m
-        cell = np.clip((np.asarray(points_m) + square.reach_m) / side, 0, n - 1).astype(np.int64)
-        b = (np.asarray(azimuths_rad) / (2 * np.pi) * BINS).astype(np.int64) % BINS
-        index = np.broadcast_to(
-            (cell[..., 0] * n + cell[..., 1]) * BINS + b,
-            np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad)),
-        )
-        return np.asarray(self.cells_rad.ravel()[index])
+        cell = np.clip((np.asarray(points_m) + square.reach_m) / (2 * square.half_m), 0, square.across - 1)
+        cell = cell.astype(np.int64)
+        b = (np.asarray(azimuths_rad) / (2 * np.pi) * AZIMUTH_BINS).astype(np.int64) % AZIMUTH_BINS
+        return self.blocks_rad[0][cell[..., 0], cell[..., 1], b]
 
     def max_sigma_rad(self, centres_m: Array, half_m: float, azimuths_rad: Array, azimuth_half_rad: float) -> Array:
         """The largest of `sigma_rad` (n,) over boxes and azimuths: it changes from cell to cell of the table."""
-        most = self._blocks[self.table.level_for(half_m)]
+        most = self.blocks_rad[self.table.level_for(half_m)]
         reach_m = self.table.square.reach_m
         n, side = len(most), 2 * reach_m / len(most)
-        steps = 2 + int(2 * azimuth_half_rad * BINS / (2 * np.pi)) if azimuth_half_rad > 0 else 1
-        corners = np.array([centres_m + corner for corner in half_m * (1 - 1e-9) * SIGNS])
+        steps = 2 + int(2 * azimuth_half_rad * AZIMUTH_BINS / (2 * np.pi)) if azimuth_half_rad > 0 else 1
+        corners = np.array([centres_m + half_m * (1 - 1e-9) * np.array(signs) for signs in product((1, -1), repeat=2)])
         cells = np.clip((corners + reach_m) / side, 0, n - 1).astype(np.int64)
         if (cells == cells[0]).all():  # boxes of the search lie within blocks
             cells = cells[:1]
         found = np.zeros(np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad)))
         for turn in np.linspace(-azimuth_half_rad, azimuth_half_rad, steps) * (1 - 1e-9):
-            b = np.floor((np.asarray(azimuths_rad) + turn) / (2 * np.pi) * BINS).astype(np.int64) % BINS
+            b = np.floor((np.asarray(azimuths_rad) + turn) / (2 * np.pi) * AZIMUTH_BINS).astype(np.int64) % AZIMUTH_BINS
             for cell in cells:
                 found = np.maximum(found, most[cell[..., 0], cell[..., 1], b])
         return found
 
     @cached_property
-    def cells_rad(self) -> Array:
-        """(cells, BINS)."""
-        values = self.table.values
-        distance = np.maximum(values[..., BEST].astype(np.float32) * DISTANCE_STEP_M, NEAREST_M)
+    def blocks_rad(self) -> list[Array]:
+        """(m, m, AZIMUTH_BINS) the sigma of the cells, then the largest of ever larger blocks of them."""
+        n, values = self.table.square.across, self.table.values
+        distance = np.maximum(values[..., 4].astype(np.float32) * DISTANCE_STEP_M, NEAREST_M)
         middle = (values[..., 0].astype(np.float32) + values[..., 1]) / 2 * ANGLE_STEP_RAD - np.pi / 2
-        return np.asarray(self.height_sigma_m * np.cos(middle) ** 2 / distance)
-
-    @cached_property
-    def _blocks(self) -> list[Array]:
-        """(m, m, BINS) the largest sigma of the cells, then of ever larger blocks of them."""
-        n = self.table.square.across
-        levels = [self.cells_rad.reshape(n, n, BINS)]
+        levels = [np.asarray(self.height_sigma_m * np.cos(middle) ** 2 / distance).reshape(n, n, AZIMUTH_BINS)]
         while len(levels[-1]) > 1:
             levels.append(merge_blocks(levels[-1], np.maximum))
         return levels
 
 
 def quantize_fields(found: Array) -> NDArray[np.uint16]:
-    """The fields (..., 11) that tracing found, rounded so that every bound still holds."""
-    out = np.empty(found.shape, dtype=np.uint16)
-    out[..., 0] = np.clip(np.floor((np.arctan(found[..., LOW]) + np.pi / 2) / ANGLE_STEP_RAD), 0, FARTHEST)
-    out[..., 1] = np.clip(np.ceil((np.arctan(found[..., HIGH]) + np.pi / 2) / ANGLE_STEP_RAD), 0, FARTHEST)
-    for to, name, rounded in ((2, FIRST, np.floor), (3, LAST, np.ceil), (4, BEST, np.round), (7, POINT_S, np.floor)):
-        out[..., to] = np.clip(rounded(found[..., name] / DISTANCE_STEP_M), 0, FARTHEST)
-    tilt = np.round((np.arctan(found[..., LINE_TAN]) + np.pi / 2) / ANGLE_STEP_RAD)
-    out[..., 5] = np.clip(tilt, 0, FARTHEST)
-    flatter = np.maximum(found[..., LINE_TAN] - np.tan(tilt * ANGLE_STEP_RAD - np.pi / 2), 0.0)
-    line = np.ceil(found[..., LINE_M] + flatter * np.maximum(found[..., LAST], 0.0))
-    out[..., 6] = np.clip(line, NOT_KNOWN_M, 32_767).astype(np.int16).view(np.uint16)
-    low = np.floor(found[..., POINT_M])
-    out[..., 8] = np.where(low < NOT_KNOWN_M, NOT_KNOWN_M, np.minimum(low, 32_767)).astype(np.int16).view(np.uint16)
-    out[..., 9] = np.clip(np.ceil(found[..., RISE] / RISE_STEP), 0, FARTHEST)
-    out[..., 10] = np.clip(np.floor(found[..., POINT_RISE] / RISE_STEP), 0, FARTHEST)
+    """The fields (..., FIELDS) that tracing found, rounded so that every bound still holds."""
+    low, high, first, last, best, line_tan, line_m, point_s, point_m, rise, point_rise = np.moveaxis(found, -1, 0)
+
+    def steps(values: Array, step: float, rounded: np.ufunc) -> Array:
+        return np.asarray(np.clip(rounded(values / step), 0, FARTHEST))
+
+    def angles(tan: Array, rounded: np.ufunc) -> Array:
+        return steps(np.arctan(tan) + np.pi / 2, ANGLE_STEP_RAD, rounded)
+
+    def heights(metres: Array) -> NDArray[np.uint16]:
+        return np.clip(metres, NOT_KNOWN_M, HIGHEST_M).astype(np.int16).view(np.uint16)
+
+    tilt = angles(line_tan, np.rint)
+    flatter = np.maximum(line_tan - np.tan(tilt * ANGLE_STEP_RAD - np.pi / 2), 0.0)
+    line = np.ceil(line_m + flatter * np.maximum(last, 0.0))
     # A line beyond the range of its field is left out, and so is a point so far down.
-    out[..., 3] = np.where((line > 32_767) | (found[..., LAST] > FARTHEST * DISTANCE_STEP_M), FARTHEST, out[..., 3])
-    return out
+    beyond = (line > HIGHEST_M) | (last > FARTHEST * DISTANCE_STEP_M)
+    fields = [
+        angles(low, np.floor), angles(high, np.ceil), steps(first, DISTANCE_STEP_M, np.floor),
+        np.where(beyond, FARTHEST, steps(last, DISTANCE_STEP_M, np.ceil)), steps(best, DISTANCE_STEP_M, np.rint),
+        tilt, heights(line), steps(point_s, DISTANCE_STEP_M, np.floor), heights(np.floor(point_m)),
+        steps(rise, RISE_STEP, np.ceil), steps(point_rise, RISE_STEP, np.floor),
+    ]  # fmt: skip
+    return np.stack(fields, axis=-1).astype(np.uint16)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _slot(keys, k):  # type: ignore[no-untyped-def]
+    mixed = keys[k, 0] * MIX_1
+    for number in range(1, BOX_NUMBERS):
+        mixed = ((mixed ^ (mixed >> SHIFT)) + keys[k, number]) * (MIX_2 if number & 1 else MIX_1)
+    return (mixed ^ (mixed >> SHIFT)) % np.uint64(SLOTS)
+
+
+@njit(cache=True, nogil=True)
+def _recall(kept, bounds, keys, low, high, missing):  # type: ignore[no-untyped-def]
+    for k in range(len(low)):
+        s = _slot(keys, k)
+        missing[k] = False
+        for number in range(BOX_NUMBERS):
+            missing[k] |= kept[s, number] != keys[k, number]
+        low[k], high[k] = bounds[s, 0], bounds[s, 1]
+
+
+@njit(cache=True, nogil=True)
+def _keep(kept, bounds, keys, low, high):  # type: ignore[no-untyped-def]
+    for k in range(len(low)):
+        s = _slot(keys, k)
+        for number in range(BOX_NUMBERS):
+            kept[s, number] = keys[k, number]
+        bounds[s, 0], bounds[s, 1] = low[k], high[k]

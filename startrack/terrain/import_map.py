@@ -15,14 +15,14 @@ from startrack.core.files import check_output, data_dir
 from startrack.core.types import BadInput
 from startrack.terrain.height_map import HeightMap
 from startrack.terrain.io import terrain_from_dict
-from startrack.terrain.map_comparison import MapComparison, compare_with_finest, crest_angle_rad_per_m
+from startrack.terrain.map_comparison import compare_with_finest, crest_angle_rad_per_m
 from startrack.terrain.map_error import carried_spacing, error_between_posts_m
 from startrack.terrain.map_reading import read_map
 from startrack.terrain.map_writing import write_map
 from startrack.terrain.raster import Raster
 from startrack.terrain.shape import CAMERA_ERROR, STRETCH, VERTICAL
 
-MAP_SIGMAS = {"stretch_sigma_1": STRETCH.sigma, "vertical_sigma_deg": round(float(np.degrees(VERTICAL.sigma)), 9)}
+STATED_SIGMAS = {"stretch_sigma_1": STRETCH.sigma, "vertical_sigma_deg": round(float(np.degrees(VERTICAL.sigma)), 9)}
 RIM_RADII = 1.5  # of the search area: most of the rim is nearer
 MAX_POST_RADII = 0.2  # of the search area: with posts further apart its shape is not resolved
 MEASURED_PER_ESTIMATE = 1.6  # of the 240 m map on the ground of site01-10m.tif: 5.4 m measured, 3.3 m by its roughness
@@ -97,7 +97,8 @@ def import_maps(
         if min(crop.heights_m.shape) < 2:
             raise BadInput("bad_terrain", f"{source}: it does not reach {latitude_deg:g}, {longitude_deg:g}")
         crops.append(replace(crop, source=Path(source).name))
-    rim = _rim_map(crops, radius_m)
+    rims = [one for one in crops if 0.5 * min(one.heights_m.shape) * one.post_m >= RIM_RADII * radius_m]
+    rim = (rims or crops[-1:])[0]  # the finest map that may hold the rim, or the last
     if height_sigma_m is None:
         errors = measure_errors(rim, [*crops, *map(read_map, compare)])
     else:
@@ -105,7 +106,7 @@ def import_maps(
     values = {
         "format": 1, "name": output.stem, "body": "moon",
         "origin": {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg},
-        "dem": {"file": [path.name for path in files], "height_sigma_m": errors.height_sigma_m, **MAP_SIGMAS},
+        "dem": {"file": [path.name for path in files], "height_sigma_m": errors.height_sigma_m, **STATED_SIGMAS},
         "rover": {"camera_height_m": float(camera_height_m), "camera_height_sigma_m": CAMERA_ERROR.sigma},
         "search": {"radius_m": float(radius_m)},
     }  # fmt: skip
@@ -139,26 +140,28 @@ def _write_terrain(output: Path, values: dict[str, Any], errors: StatedErrors, c
         raise
 
 
-def _rim_map(maps: Sequence[Raster], radius_m: float) -> Raster:
-    """The finest map that may hold the rim, or the last."""
-    rims = [one for one in maps if 0.5 * min(one.heights_m.shape) * one.post_m >= RIM_RADII * radius_m]
-    return (rims or maps[-1:])[0]
-
-
 def measure_errors(rim: Raster, others: Sequence[Raster]) -> StatedErrors:
     """Errors of the map that makes the horizon, from the finest other or shipped map that covers a part of it.
 
     Without one they are estimated from the roughness of the map itself.
     """
-    comparison = compare_with_finest(rim, [*others, *_shipped_maps()])
+    shipped = map(read_map, sorted(data_dir("terrain").glob("*.tif")))
+    comparison = compare_with_finest(rim, [*others, *shipped])
     if comparison is not None and comparison.same_ground:
         return StatedErrors(
             height_sigma_m=_rounded(comparison.height_sigma_m), common_crest_sigma_m=comparison.common_crest_sigma_m,
             origin="comparison", comment=f"{rim.source} {comparison.line()}",
         )  # fmt: skip
+    warnings: tuple[str, ...] = ()
+    if comparison is not None:
+        warnings = (
+            f"{rim.source} differs from {comparison.finer} by {length_text(comparison.height_sigma_m, 3)} (s.d.) where "
+            f"both are, and heights vary there by {length_text(comparison.heights_sigma_m, 3)}: is its projection or "
+            "its scale wrong?",
+        )
     return StatedErrors(
         height_sigma_m=_rounded(MEASURED_PER_ESTIMATE * error_between_posts_m(rim)), origin="map",
-        warnings=_other_ground_warnings(rim, comparison),
+        warnings=warnings,
         comment=f"{rim.source or 'the map'} could not be compared with a finer map: height_sigma_m is "
         f"{MEASURED_PER_ESTIMATE:g} times the error that its own roughness shows, the ratio that was measured on the "
         "240 m map of the south pole. A finer map of a part of the ground (--compare) or a known error (--sigma) is "
@@ -168,21 +171,6 @@ def measure_errors(rim: Raster, others: Sequence[Raster]) -> StatedErrors:
 
 def _rounded(sigma_m: float) -> float:
     return float(f"{sigma_m:.2g}")
-
-
-def _shipped_maps() -> list[Raster]:
-    return [read_map(path) for path in sorted(data_dir("terrain").glob("*.tif"))]
-
-
-def _other_ground_warnings(rim: Raster, comparison: MapComparison | None) -> tuple[str, ...]:
-    """A warning where a map was compared and shows other ground."""
-    if comparison is None:
-        return ()
-    return (
-        f"{rim.source} differs from {comparison.finer} by {length_text(comparison.height_sigma_m, 3)} (s.d.) "
-        f"where both are, and heights vary there by {length_text(comparison.heights_sigma_m, 3)}: is its projection or "
-        "its scale wrong?",
-    )
 
 
 def smoothness_warnings(rim: Raster, height_sigma_m: float) -> list[str]:

@@ -19,7 +19,7 @@ MIN_POSTS_ACROSS = 20.0  # of the map, in the overlap
 SAMPLES_ACROSS = 400  # posts of the finer map at which heights are compared
 SMALLER = 0.8  # from one size of the compared square to the next, where maps have holes or edges
 OTHER_GROUND = 0.5  # s.d. of the differences, relative to that of the heights: above it the maps show other ground
-POSITIONS, AZIMUTHS = 150, 90  # from which, and in which, horizons are compared
+CREST_POSITIONS, CREST_AZIMUTHS = 150, 90  # from which, and in which, horizons are compared
 CREST_POSTS = 4.0  # least distance of the crests compared; crests farther apart than this on the two maps are two
 MIN_CRESTS = 15  # of one position, for its mean
 SAME_RAD = 1e-6  # latitudes that differ by more are two: an orthographic map holds places on its far side, too
@@ -82,7 +82,8 @@ def compare_with_finest(height_map: Raster, others: Iterable[Raster]) -> MapComp
 
 def compare_maps(height_map: Raster, finer: Raster) -> MapComparison | None:
     """Differences of a map and a finer one; None where the square that both cover is too small."""
-    at = _sampled_posts(finer)
+    lines = [np.arange(0, n, max(n // SAMPLES_ACROSS, 1), dtype=np.float64) for n in finer.heights_m.shape]
+    at = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)  # rows and columns of posts spread over the map
     lat, lon = finer.projection.latlon_from_xy(*finer.xy(at))
     where = height_map.row_column(lat, lon)
     fine_m, coarse_m = finer.sample(at), height_map.sample(where)
@@ -104,12 +105,6 @@ def crest_angle_rad_per_m(terrain: HeightMap) -> float:
     positions = _positions(terrain.search_radius_m)
     tan, distance, _ = terrain.horizons(positions[:, None], _azimuths())
     return float(np.median(1.0 / ((1.0 + tan**2) * distance)))
-
-
-def _sampled_posts(raster: Raster) -> Array:
-    """Rows and columns (..., 2) of posts spread over a map."""
-    lines = [np.arange(0, n, max(n // SAMPLES_ACROSS, 1), dtype=np.float64) for n in raster.heights_m.shape]
-    return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
 
 
 def _terrains_of(height_map: Raster, finer: Raster, overlap: Array) -> tuple[HeightMap, HeightMap] | None:
@@ -156,9 +151,9 @@ def _crest_errors(coarse: HeightMap, fine: HeightMap, apart_m: float) -> dict[st
 def _positions(radius_m: float) -> Array:
     """Positions (n, 2) spread evenly over a circle."""
     rng = np.random.default_rng(SEED)
-    azimuth, distance = rng.uniform(0, 2 * np.pi, POSITIONS), radius_m * np.sqrt(rng.random(POSITIONS))
+    azimuth, distance = rng.uniform(0, 2 * np.pi, CREST_POSITIONS), radius_m * np.sqrt(rng.random(CREST_POSITIONS))
     return distance[:, None] * np.stack([np.sin(azimuth), np.cos(azimuth)], axis=-1)
 
 
 def _azimuths() -> Array:
-    return np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS
+    return np.arange(CREST_AZIMUTHS) * 2 * np.pi / CREST_AZIMUTHS

@@ -15,7 +15,7 @@ MIN_RATIO_ROUGH = 0.5  # natural ground is no smoother: errors fall with the dis
 MIN_RATIO_SMOOTH = 0.25  # a curve without any roughness: errors fall with the square
 MIN_POSTS = 9  # a side
 SPACING_TOLERANCE_OCTAVES = 0.25  # error of `carried_spacing`
-STRETCH = 64  # posts of one spectrum
+SPECTRUM_POSTS = 64  # posts of one spectrum
 MIN_CYCLES = 4  # per stretch; longer waves contain the rest of the trend
 STEEPEST_SPECTRUM = -6.5  # d ln power / d ln frequency; rough ground -2.6 to -4, measured maps of the Moon to -5.6
 MIN_DROP = 3.0  # of that slope where the power of an interpolated map ends
@@ -69,20 +69,16 @@ def _left_out_rms(h: Array, cubic: bool = False) -> float:
     Midway bilinear, or with `cubic` on the cubic through four posts.
     """
     h = h[: len(h) - 1 + len(h) % 2, : h.shape[1] - 1 + h.shape[1] % 2]
-    kept, midway = h[::2, ::2], _midway_cubic if cubic else _midway
+
+    def midway(a: Array) -> Array:
+        return np.asarray((9 * (a[1:-2] + a[2:-1]) - a[:-3] - a[3:]) / 16 if cubic else 0.5 * (a[1:] + a[:-1]))
+
+    kept = h[::2, ::2]
     down, across = midway(kept), midway(kept.T).T
     middle = midway(across)
     inner = slice(3, -3, 2) if cubic else slice(1, None, 2)
     off = [h[::2, inner] - across, h[inner, ::2] - down, h[inner, inner] - middle]
     return _rms(np.concatenate([np.ravel(o) for o in off]))
-
-
-def _midway(h: Array) -> Array:
-    return np.asarray(0.5 * (h[1:] + h[:-1]))
-
-
-def _midway_cubic(h: Array) -> Array:
-    return np.asarray((9 * (h[1:-2] + h[2:-1]) - h[:-3] - h[3:]) / 16)
 
 
 def _rms(values: Array) -> float:
@@ -97,7 +93,9 @@ def carried_spacing(heights_m: Array) -> float:
     A smooth surface through posts further apart has little power at wavelengths below two of their spacings; one
     with straight lines between them bends only there. NaN are holes.
     """
-    return max(_spacing_by_spectrum(heights_m), float(_spacing_by_bends(heights_m)))
+    directions = heights_m, heights_m.T
+    bends = (s for s in range(2, MAX_SPACING + 1) for lines in directions if _bends_at_posts(lines, s))
+    return max(_spacing_by_spectrum(heights_m), float(max(bends, default=1)))
 
 
 def _spacing_by_spectrum(h: Array) -> float:
@@ -119,32 +117,27 @@ def _spacing_by_spectrum(h: Array) -> float:
 
 
 def _power(h: Array) -> Array | None:
-    """Mean power (STRETCH / 2 + 1) of stretches of rows and of columns without holes, trends taken off."""
+    """Mean power (SPECTRUM_POSTS / 2 + 1) of stretches of rows and of columns without holes, trends taken off."""
     found = []
     for lines in (h, h.T):
-        if lines.shape[1] < STRETCH:
+        if lines.shape[1] < SPECTRUM_POSTS:
             continue
         lines = lines[:: max(len(lines) // MAX_ROWS, 1)]
-        stretches = np.lib.stride_tricks.sliding_window_view(lines, STRETCH, axis=1)[:, :: STRETCH // 2]
-        found.append(stretches.reshape(-1, STRETCH))
+        stretches = np.lib.stride_tricks.sliding_window_view(lines, SPECTRUM_POSTS, axis=1)[:, :: SPECTRUM_POSTS // 2]
+        found.append(stretches.reshape(-1, SPECTRUM_POSTS))
     known = [part[np.isfinite(part).all(axis=1)] for part in found]
     if sum(map(len, known)) < MIN_STRETCHES:
         return None
     z = np.concatenate(known)
-    along = np.arange(STRETCH) - (STRETCH - 1) / 2
+    along = np.arange(SPECTRUM_POSTS) - (SPECTRUM_POSTS - 1) / 2
     z = z - z.mean(axis=1, keepdims=True)
     z -= (z @ along / (along @ along))[:, None] * along
-    power = np.mean(np.abs(np.fft.rfft(z * np.hanning(STRETCH), axis=1)) ** 2, axis=0)
+    power = np.mean(np.abs(np.fft.rfft(z * np.hanning(SPECTRUM_POSTS), axis=1)) ** 2, axis=0)
     return np.asarray(np.maximum(power, 1e-12 * max(float(power.max()), 1e-30)))
 
 
-def _spacing_by_bends(h: Array) -> int:
-    """The widest spacing at which all bends lie at one post, or at two neighbours, in each period."""
-    return max((s for s in range(2, MAX_SPACING + 1) for lines in (h, h.T) if _bends_at_posts(lines, s)), default=1)
-
-
 def _bends_at_posts(lines: Array, spacing: int) -> bool:
-    """Whether the bends down the first axis are `spacing` apart."""
+    """Whether all bends down the first axis lie at one post, or at two neighbours, in each period of `spacing`."""
     bends = np.diff(lines, 2, axis=0) ** 2
     if len(bends) < 4 * spacing:
         return False

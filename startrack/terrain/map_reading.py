@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 from startrack.core.files import MAX_CAUSE_CHARS
 from startrack.core.types import MAX_PIXELS, BadInput
 from startrack.frames import MOON_RADIUS_M
-from startrack.terrain.map_writing import METADATA_TAG, METRE, NO_DATA_TAG, PROJECTION_CODES
+from startrack.terrain.map_writing import METRE, PROJECTION_CODES
 from startrack.terrain.raster import EQUIRECTANGULAR, ORTHOGRAPHIC, STEREOGRAPHIC, Projection, Raster, projection_of
 
 WINDOW_HALF_M = 300_000.0  # about the origin; farther away even 10 km mountains are below the horizontal
-MIN_RADIUS_M = 1_000_000.0  # larger heights are counted from the Moon's centre
 MAX_HEIGHT_M = 1e7  # larger values are marks of missing heights
 METRES = {"m", "meter", "meters", "metre", "metres"}
 STEREOGRAPHIC_CODES = (PROJECTION_CODES[STEREOGRAPHIC], 15, 16)  # oblique, and two variants of the polar one
@@ -96,7 +95,7 @@ def _raster_of(grid: Grid, path: Path, scale: float | None, offset_m: float | No
         missing |= values == grid.no_data
     if missing.all():
         raise BadInput("bad_terrain", f"{path}: no post has a height")
-    if np.median(heights[~missing]) > MIN_RADIUS_M:
+    if np.median(heights[~missing]) > MOON_RADIUS_M / 2:  # counted from the Moon's centre
         heights -= MOON_RADIUS_M
     heights[missing] = np.nan
     return Raster(
@@ -140,8 +139,8 @@ def _read_geotiff(path: Path) -> Grid | None:
         decoded = page.compression in DECODED and page.size <= MAX_PIXELS and len(page.shape) == 2
         if parameters is None or not decoded:
             return None
-        scale, offset = _gdal_scale(page.tags.valueof(METADATA_TAG))
-        no_data = page.tags.get(NO_DATA_TAG)
+        scale, offset = _gdal_scale(page.tags.valueof("GDAL_METADATA"))
+        no_data = page.tags.valueof("GDAL_NODATA")
         dx, dy = float(keys["ModelPixelScale"][0]), -float(keys["ModelPixelScale"][1])
         i, j, _, x, y, _ = (float(v) for v in keys["ModelTiepoint"][:6])
         middle = 0.0 if int(keys.get("GTRasterTypeGeoKey", 1)) == 2 else 0.5  # 2: the tie point is a post
@@ -152,7 +151,7 @@ def _read_geotiff(path: Path) -> Grid | None:
             step_m=(dx, dy),
             scale=scale,
             offset_m=offset,
-            no_data=None if no_data is None else float(str(no_data.value).strip("\x00 ")),
+            no_data=None if no_data is None else float(str(no_data).strip("\x00 ")),
         )
 
 

@@ -14,9 +14,7 @@ from startrack.terrain.raster import EQUIRECTANGULAR, ORTHOGRAPHIC, STEREOGRAPHI
 
 MIN_STEP_M = 0.01  # of the heights in files that are written
 NO_HEIGHT = 65_535
-# GeoTIFF 1.1: tags that hold keys, and values of keys.
-DOUBLES_TAG, ASCII_TAG, METADATA_TAG, NO_DATA_TAG = 34736, 34737, 42112, 42113
-USER_DEFINED, METRE, DEGREE = 32767, 9001, 9102
+USER_DEFINED, METRE, DEGREE = 32767, 9001, 9102  # values of keys, GeoTIFF 1.1
 PROJECTION_CODES = {STEREOGRAPHIC: 14, ORTHOGRAPHIC: 21, EQUIRECTANGULAR: 17}  # polar stereographic: 15
 
 
@@ -64,27 +62,32 @@ def write_bands(path: str | Path, frame: Raster, bands: Mapping[str, NDArray[np.
 
 def _tags(m: Raster, items: str, no_data: str | None) -> list[tuple[int, str, int, Any, bool]]:
     """The tags of a map's place (posts are pixel centres: raster type "area"), of GDAL's `items`, and of `no_data`."""
+    import tifffile
+
+    codes = tifffile.TIFF.TAGS
     doubles: list[float] = []
     directory, text = [], ""
     for key, value in _geo_keys(m.projection).items():
         if isinstance(value, str):
-            directory.append((key, ASCII_TAG, len(value), len(text)))
+            directory.append((key, codes["GeoAsciiParamsTag"], len(value), len(text)))
             text += value
         elif isinstance(value, float):
-            directory.append((key, DOUBLES_TAG, 1, len(doubles)))
+            directory.append((key, codes["GeoDoubleParamsTag"], 1, len(doubles)))
             doubles.append(value)
         else:
             directory.append((key, 0, 1, value))
     numbers = 1, 1, 1, len(directory), *(number for entry in sorted(directory) for number in entry)
-    tags = [
-        (METADATA_TAG, "s", 0, f"<GDALMetadata>{items}</GDALMetadata>", True),
-        (33550, "d", 3, (m.dx_m, -m.dy_m, 0.0), True),
-        (33922, "d", 6, (0.0, 0.0, 0.0, m.x0_m - 0.5 * m.dx_m, m.y0_m - 0.5 * m.dy_m, 0.0), True),
-        (34735, "H", len(numbers), numbers, True),
-        (DOUBLES_TAG, "d", len(doubles), tuple(doubles), True),
-        (ASCII_TAG, "s", 0, text, True),
-    ]
-    return tags if no_data is None else [*tags, (NO_DATA_TAG, "s", 0, no_data, True)]
+    tags = {
+        "GDAL_METADATA": ("s", 0, f"<GDALMetadata>{items}</GDALMetadata>"),
+        "ModelPixelScaleTag": ("d", 3, (m.dx_m, -m.dy_m, 0.0)),
+        "ModelTiepointTag": ("d", 6, (0.0, 0.0, 0.0, m.x0_m - 0.5 * m.dx_m, m.y0_m - 0.5 * m.dy_m, 0.0)),
+        "GeoKeyDirectoryTag": ("H", len(numbers), numbers),
+        "GeoDoubleParamsTag": ("d", len(doubles), tuple(doubles)),
+        "GeoAsciiParamsTag": ("s", 0, text),
+    }
+    if no_data is not None:
+        tags["GDAL_NODATA"] = ("s", 0, no_data)
+    return [(codes[name], *tag, True) for name, tag in tags.items()]
 
 
 def _geo_keys(p: Projection) -> dict[int, int | float | str]:

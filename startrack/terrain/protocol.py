@@ -134,14 +134,7 @@ class Terrain(ABC):
 
     def error_warnings(self) -> list[str]:
         """One line of text if the terrain file leaves out errors: the ground then counts as exact."""
-        missing = [key for key in self.unstated_errors if not getattr(self, key)]
-        if not missing:
-            return []
-        keys = " and ".join(missing)
-        return [
-            f"terrain {self.name}: its file states no {keys}: taken as 0; circles are too small unless the ground is "
-            "exactly so; state the errors (0 for a model from which pictures are rendered)"
-        ]
+        return []
 
     def horizon_posts(self, point_m: Array, azimuths_rad: Array) -> HorizonPosts:
         """The posts of the map that make the horizon seen from `point_m` (2,), at the azimuths (n,)."""

@@ -13,9 +13,8 @@ from startrack.core.types import Array, BadInput
 from startrack.frames import MOON_RADIUS_M, R_enu_fixed, Site, latlon_from_enu
 
 STEREOGRAPHIC, ORTHOGRAPHIC, EQUIRECTANGULAR = 0, 1, 2
-NAMES = ("stereographic", "orthographic", "equirectangular")
+PROJECTION_NAMES = ("stereographic", "orthographic", "equirectangular")
 RADIUS_TOLERANCE_M = 50.0  # maps name 1737.4 km or, rarely, 1737.4 with other digits; Mars and the Earth are far away
-GRID_NUMBERS = 16  # see Raster.grid_numbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,7 +161,7 @@ class Raster:
             "file": self.source,
             "posts": list(self.heights_m.shape),
             "post_m": round(self.post_m, 3),
-            "projection": NAMES[self.projection.kind],
+            "projection": PROJECTION_NAMES[self.projection.kind],
             "lowest_m": round(float(self.heights_m.min()), 1),
             "highest_m": round(float(self.heights_m.max()), 1),
         }
@@ -197,13 +196,10 @@ class Raster:
         p = self.projection
         R_projection_enu = p.R_projection_fixed @ R_enu_fixed(site).T
         size = p.radius_m * p.scale * (2.0 if p.kind == STEREOGRAPHIC else 1.0)
-        numbers = np.empty(GRID_NUMBERS)
-        numbers[0] = p.kind
-        numbers[1:10] = R_projection_enu.ravel()
-        numbers[10:12] = size, p.radius_m * p.scale_y
-        numbers[12:14] = self.x0_m - p.false_x_m, 1 / self.dx_m
-        numbers[14:16] = self.y0_m - p.false_y_m, 1 / self.dy_m
-        return numbers
+        return np.array([
+            p.kind, *R_projection_enu.ravel(), size, p.radius_m * p.scale_y,
+            self.x0_m - p.false_x_m, 1 / self.dx_m, self.y0_m - p.false_y_m, 1 / self.dy_m,
+        ], dtype=np.float64)  # fmt: skip
 
     def crop(self, rows: slice, columns: slice) -> Raster:
         """The part of the map within the given rows and columns."""

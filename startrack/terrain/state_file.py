@@ -14,13 +14,13 @@ from startrack.core.types import BadInput
 from startrack.terrain.io import read_keys
 from startrack.terrain.shape import BIAS, CAMERA_ERROR, CYLINDER_FACTS, DEPTH, DIAMETER, STRETCH, VERTICAL, Fact
 
-HEIGHTS = "height_sigma_m"
+HEIGHT_KEY = "height_sigma_m"
 MEANINGS = {
     DEPTH.key: "error of the depth [m]",
     DIAMETER.key: "error of the width [m]",
     "ellipse_sigma_1": "each of the two terms of an elliptic rim, relative to its radius",
     "rim_tilt_sigma_deg": "tilt of the rim about each of two axes [deg]",
-    HEIGHTS: "error of single heights of the map [m]",
+    HEIGHT_KEY: "error of single heights of the map [m]",
     BIAS.key: "error of the horizon that all azimuths share [deg]",
     STRETCH.key: "error of the scale of heights, relative",
     VERTICAL.key: "tilt of the whole map about each of two axes [deg]",
@@ -56,8 +56,8 @@ def _cylinder_errors(keys: Mapping[str, Any]) -> Iterator[StateableError]:
 
 def _map_errors(keys: Mapping[str, Any]) -> Iterator[StateableError]:
     dem, rover = keys.get("dem", {}), keys.get("rover", {})
-    yield _stateable("dem", HEIGHTS, "0, with a warning", HEIGHTS not in dem)
-    yield _stateable("dem", BIAS.key, f"three times what {HEIGHTS} makes of the horizon", BIAS.key not in dem)
+    yield _stateable("dem", HEIGHT_KEY, "0, with a warning", HEIGHT_KEY not in dem)
+    yield _stateable("dem", BIAS.key, f"three times what {HEIGHT_KEY} makes of the horizon", BIAS.key not in dem)
     for fact in (STRETCH, VERTICAL):
         yield _stateable("dem", fact.key, _default_text(fact), fact.key not in dem)
     yield _stateable("rover", CAMERA_ERROR.key, _default_text(CAMERA_ERROR), CAMERA_ERROR.key not in rover)

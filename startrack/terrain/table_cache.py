@@ -20,7 +20,15 @@ import numpy as np
 from startrack.core.files import atomic_file, hold_lock
 from startrack.core.types import Array, Ints
 from startrack.frames import Site
-from startrack.terrain.horizon_table import BINS, FARTHEST, FIELDS, NOT_KNOWN_M, HorizonTable, Square, quantize_fields
+from startrack.terrain.horizon_table import (
+    AZIMUTH_BINS,
+    FARTHEST,
+    FIELDS,
+    NOT_KNOWN_M,
+    HorizonTable,
+    Square,
+    quantize_fields,
+)
 from startrack.terrain.protocol import Progress
 from startrack.terrain.raster import Raster
 from startrack.terrain.tracing import Tracer, cpu_count
@@ -53,7 +61,7 @@ class KeptTable:
     @cached_property
     def key(self) -> str:
         """SHA-256 over the maps' posts and geometry, the origin, the square, the camera's height and the format."""
-        digest = hashlib.sha256(f"startrack horizons {VERSION} {BINS}".encode())
+        digest = hashlib.sha256(f"startrack horizons {VERSION} {AZIMUTH_BINS}".encode())
         numbers = [self.site.latitude_rad, self.site.longitude_rad, self.site.height_m, self.camera_height_m]
         numbers += [self.square.reach_m, float(self.square.across), self.search_radius_m]
         digest.update(np.array(numbers).tobytes())
@@ -81,7 +89,7 @@ class KeptTable:
                     values, unknown = arrays["values"], arrays["unknown_rad"]
             except (OSError, ValueError, KeyError, EOFError, BadZipFile):
                 return None
-            if values.shape != (self.square.across**2, BINS, FIELDS) or unknown.shape != (BINS,):
+            if values.shape != (self.square.across**2, AZIMUTH_BINS, FIELDS) or unknown.shape != (AZIMUTH_BINS,):
                 return None
             TABLES_IN_MEMORY[self.key] = table = HorizonTable(self.square, values, unknown)
         return table
@@ -143,15 +151,15 @@ def build_table(
 
     Cells that contain no position within reach have bounds of -+ pi/2.
     """
-    values = np.zeros((square.across**2, BINS, FIELDS), dtype=np.uint16)
+    values = np.zeros((square.across**2, AZIMUTH_BINS, FIELDS), dtype=np.uint16)
     values[..., 1] = values[..., 3] = FARTHEST
     values[..., 8] = np.array(NOT_KNOWN_M, dtype=np.int16).view(np.uint16)
-    centres, middles = square.centres_m, (np.arange(BINS) + 0.5) * 2 * np.pi / BINS
+    centres, middles = square.centres_m, (np.arange(AZIMUTH_BINS) + 0.5) * 2 * np.pi / AZIMUTH_BINS
     cells = np.flatnonzero(np.hypot(*centres.T) < square.reach_m + 1.42 * square.half_m)
     done = 0
 
     def trace(part: Ints) -> int:
-        values[part] = quantize_fields(tracer.cell_fields(centres[part], square.half_m, middles, np.pi / BINS))
+        values[part] = quantize_fields(tracer.cell_fields(centres[part], square.half_m, middles, np.pi / AZIMUTH_BINS))
         return len(part)
 
     pool = ThreadPoolExecutor(cpu_count())
@@ -166,16 +174,21 @@ def build_table(
 
 
 def _unknown_rad(tracer: Tracer, radius_m: float) -> Array:
-    """(BINS,) elevation below which ground beyond the maps might be seen from somewhere in the search area."""
+    """(AZIMUTH_BINS,) elevation below which ground beyond the maps might be seen from somewhere in the search area."""
     line = np.linspace(-1, 1, UNKNOWN_FROM) * radius_m
     places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     places = places[np.hypot(*places.T) <= radius_m]
-    azimuths = np.repeat((np.arange(BINS)[:, None] + [0.02, 0.5, 0.98]).ravel(), len(places)) * 2 * np.pi / BINS
-    where = np.tile(places, (3 * BINS, 1))
+    azimuths = (
+        np.repeat((np.arange(AZIMUTH_BINS)[:, None] + [0.02, 0.5, 0.98]).ravel(), len(places))
+        * 2
+        * np.pi
+        / AZIMUTH_BINS
+    )
+    where = np.tile(places, (3 * AZIMUTH_BINS, 1))
     tan, _, edge = tracer.horizons(None, where, azimuths)
     up = tracer.heights_m(places) + tracer.camera_height_m
     away = where + edge[:, None] * np.stack([np.sin(azimuths), np.cos(azimuths)], axis=-1)
     drop = np.sum(np.minimum(np.abs(away), 1e7) ** 2, axis=-1) / (2 * tracer.ground.radius_m)
-    possible = (tracer.ground.highest_m - drop - np.tile(up, 3 * BINS)) / edge
+    possible = (tracer.ground.highest_m - drop - np.tile(up, 3 * AZIMUTH_BINS)) / edge
     unknown = np.where((edge < 1e9) & (possible > tan), np.arctan(possible), -np.pi / 2)
-    return np.asarray(unknown.reshape(BINS, -1).max(axis=1))
+    return np.asarray(unknown.reshape(AZIMUTH_BINS, -1).max(axis=1))

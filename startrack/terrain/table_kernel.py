@@ -9,10 +9,17 @@ from startrack.core.kernels import njit
 from startrack.terrain.bounds_kernel import bounds
 from startrack.terrain.ground_kernel import box_height_bounds
 from startrack.terrain.horizon_kernel import FAR_M, horizon, surfaces
-from startrack.terrain.horizon_table import ANGLE_STEP_RAD, BINS, DISTANCE_STEP_M, FARTHEST, NOT_KNOWN_M, RISE_STEP
+from startrack.terrain.horizon_table import (
+    ANGLE_STEP_RAD,
+    AZIMUTH_BINS,
+    DISTANCE_STEP_M,
+    FARTHEST,
+    NOT_KNOWN_M,
+    RISE_STEP,
+)
 
-BIN_RAD = 2 * np.pi / BINS
-EDGE = 1e-9  # of a cell or a bin: what only touches it does not count
+BIN_RAD = 2 * np.pi / AZIMUTH_BINS
+TOUCHING = 1e-9  # of a cell or a bin: what only touches it does not count
 
 
 @njit(cache=True, nogil=True)
@@ -25,18 +32,18 @@ def sector_bounds(values, lows, highs, across, reach, east, north, half, low_up,
     n = lows.shape[0]
     side = 2 * reach / n
     fine = n == across and half < 0.5 * side
-    i0 = min(max(int(np.floor((east - half + reach) / side + EDGE)), 0), n - 1)
-    i1 = min(max(int(np.ceil((east + half + reach) / side - EDGE)) - 1, i0), n - 1)
-    j0 = min(max(int(np.floor((north - half + reach) / side + EDGE)), 0), n - 1)
-    j1 = min(max(int(np.ceil((north + half + reach) / side - EDGE)) - 1, j0), n - 1)
-    first = int(np.floor((azimuth - turn) / BIN_RAD + EDGE))
-    last = max(int(np.ceil((azimuth + turn) / BIN_RAD - EDGE)) - 1, first)
-    last = min(last, first + BINS - 1)
+    i0 = min(max(int(np.floor((east - half + reach) / side + TOUCHING)), 0), n - 1)
+    i1 = min(max(int(np.ceil((east + half + reach) / side - TOUCHING)) - 1, i0), n - 1)
+    j0 = min(max(int(np.floor((north - half + reach) / side + TOUCHING)), 0), n - 1)
+    j1 = min(max(int(np.ceil((north + half + reach) / side - TOUCHING)) - 1, j0), n - 1)
+    first = int(np.floor((azimuth - turn) / BIN_RAD + TOUCHING))
+    last = max(int(np.ceil((azimuth + turn) / BIN_RAD - TOUCHING)) - 1, first)
+    last = min(last, first + AZIMUTH_BINS - 1)
     low, high = np.inf, -np.inf
     for i in range(i0, i1 + 1):
         for j in range(j0, j1 + 1):
             for k in range(first, last + 1):
-                b = k % BINS
+                b = k % AZIMUTH_BINS
                 if not fine:
                     below = lows[i, j, b] * ANGLE_STEP_RAD - np.pi / 2
                     above = highs[i, j, b] * ANGLE_STEP_RAD - np.pi / 2
@@ -93,7 +100,7 @@ def look_up(values, across, reach, east, north, azimuth, out):
     i, j = int(np.floor((east + reach) / side)), int(np.floor((north + reach) / side))
     out[0], out[1], out[2] = 0.0, 1e9, 0.0
     if 0 <= i < across and 0 <= j < across:
-        b = int(np.floor(azimuth / BIN_RAD)) % BINS
+        b = int(np.floor(azimuth / BIN_RAD)) % AZIMUTH_BINS
         v = values[i * across + j, b]
         if v[2] <= v[3]:
             middle = (b + 0.5) * BIN_RAD

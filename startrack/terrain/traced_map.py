@@ -19,10 +19,9 @@ from startrack.terrain.raster import Projection, Raster
 from startrack.terrain.table_cache import KeptTable
 from startrack.terrain.tracing import Tracer
 
-FINEST_BOX_M = 0.45  # half side of the smallest boxes of positions: no height map is more accurate
 CELL_M = 200.0  # cells of the table are no wider
 MAX_CELLS_ACROSS = 128
-MARGIN = 1.15  # of the search radius: so far is searched, to notice that the camera left the area
+REACH_RADII = 1.15  # of the search radius: so far is searched, to notice that the camera left the area
 SLOPE_STEP_M = 5.0
 
 
@@ -39,8 +38,8 @@ class TracedMap(Terrain):
     maps: tuple[Raster, ...]  # finest first
     files: tuple[Path, ...] = ()  # of them
     camera_height_m: float = 1.5
-    search_radius_m: float = 10_000.0
-    finest_m = FINEST_BOX_M
+    search_radius_m: float = Terrain.search_radius_m
+    finest_m = 0.45  # no height map is more accurate
     _uses_table = True  # traces begin at the horizon's distance of a table in memory
 
     def __post_init__(self) -> None:
@@ -73,7 +72,11 @@ class TracedMap(Terrain):
     @cached_property
     def reach_m(self) -> float:
         """The search area and a margin, as far as the maps reach."""
-        return self.search_radius_m * MARGIN if self._covers(self.search_radius_m * MARGIN) else self.search_radius_m
+        return (
+            self.search_radius_m * REACH_RADII
+            if self._covers(self.search_radius_m * REACH_RADII)
+            else self.search_radius_m
+        )
 
     @cached_property
     def square(self) -> Square:

@@ -12,13 +12,13 @@ import numpy as np
 from startrack.core.types import Array
 from startrack.terrain.ground import Ground
 from startrack.terrain.horizon_kernel import surfaces
-from startrack.terrain.horizon_table import BINS, FIELDS, HorizonTable
+from startrack.terrain.horizon_table import AZIMUTH_BINS, FIELDS, HorizonTable
 from startrack.terrain.table_kernel import box_bounds, fill_cells, horizons, many_sector_bounds
 
 MIN_RAYS_FOR_THREADS = 1500  # fewer take less time than starting threads
 MAX_THREADS = 8
-MAX_TRACED_TURN_RAD = 0.25 * 2 * np.pi / BINS  # half widths of azimuths: bounds over wider ones are looked up
-NO_VALUES = np.zeros((0, BINS, FIELDS), dtype=np.uint16)
+MAX_TRACED_TURN_RAD = 0.25 * 2 * np.pi / AZIMUTH_BINS  # half widths of azimuths: bounds over wider ones are looked up
+NO_VALUES = np.zeros((0, AZIMUTH_BINS, FIELDS), dtype=np.uint16)
 
 
 class Tracer(NamedTuple):

@@ -162,9 +162,9 @@ def _converted() -> list[bytes]:
     """The camera file in other programs' formats; `targets.PROGRAMS` has the same order."""
     from startrack.camera import foreign_text as to_text
     from startrack.camera import load_camera
-    from startrack.camera.formats import FORMATS
+    from startrack.camera.formats import FOREIGN_FORMATS
 
-    return [to_text(load_camera("fisheye-2048"), program).encode() for program in FORMATS]
+    return [to_text(load_camera("fisheye-2048"), program).encode() for program in FOREIGN_FORMATS]
 
 
 def hill_map() -> bytes:

@@ -12,39 +12,19 @@ import re
 from pathlib import Path
 
 import startrack
-from startrack.applications.tracking.quantities import FRAME_QUANTITIES
+from startrack.applications.prediction import CELL_QUANTITIES, PATH_QUANTITIES
+from startrack.applications.tracking import FRAME_QUANTITIES
 from startrack.core.errors import Reason
-from startrack.output.quantities import QUANTITIES
-from startrack.output.quantities_prediction import CELL_QUANTITIES, PATH_QUANTITIES
+from startrack.output import QUANTITIES, markdown_table
 
 PAGES = [Path(__file__).parent / name for name in ("../README.md", "formats.md", "track.md")]
 PACKAGE = Path(startrack.__file__).parent
-
-
-def quantity_table() -> str:
-    """Keys of the result record with unit and meaning."""
-    rows = [
-        f"| `{one.path}` | {one.unit} | {one.description} |" for one in QUANTITIES if one.recorded and not one.derived
-    ]
-    return "\n".join(["| key | unit | meaning |", "| --- | --- | --- |", *rows])
-
-
-def track_table() -> str:
-    """Columns of track.ecsv with unit and meaning."""
-    rows = [f"| `{one.key}` | {one.unit} | {one.description} |" for one in FRAME_QUANTITIES]
-    return "\n".join(["| column | unit | meaning |", "| --- | --- | --- |", *rows])
 
 
 def reason_table() -> str:
     """Reasons with their exit codes and meanings."""
     rows = [f"| `{one.value}` | {one.exit_code} | {one.meaning} |" for one in Reason]
     return "\n".join(["| reason | exit code | meaning |", "| --- | --- | --- |", *rows])
-
-
-def prediction_table() -> str:
-    """Bands of predict.tif and columns of predict.ecsv."""
-    rows = [f"| `{one.name}` | {one.unit} | {one.description} |" for one in (*CELL_QUANTITIES, *PATH_QUANTITIES)]
-    return "\n".join(["| band, column | unit | meaning |", "| --- | --- | --- |", *rows])
 
 
 def package_list() -> str:
@@ -73,10 +53,10 @@ def page_with_tables(text: str) -> str:
     """The page `text` with its tables as the code has them."""
     tables = {
         "packages": package_list(),
-        "quantities": quantity_table(),
+        "quantities": markdown_table(QUANTITIES, "key"),
         "reasons": reason_table(),
-        "track": track_table(),
-        "prediction": prediction_table(),
+        "track": markdown_table(FRAME_QUANTITIES, "column"),
+        "prediction": markdown_table((*CELL_QUANTITIES, *PATH_QUANTITIES), "band, column"),
     }
     return re.sub(
         r"(<!-- table (\w+) -->\n).*?(\n?<!-- end -->)",

@@ -25,7 +25,7 @@ from startrack.chain.stages import Oriented, Refused, Settings, extend, last_val
 from startrack.core.errors import BadInput
 from startrack.exposure import read_exposure
 from startrack.localization import Hull
-from startrack.output.schema import SCHEMAS
+from startrack.output import SCHEMAS
 
 IMAGE = "sample_images/near-wall.png"
 LOWELL = "sample_images/lowell-2018-08-06.fits.bz2"

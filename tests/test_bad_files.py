@@ -19,7 +19,7 @@ from batch_helpers import frames
 from startrack.cli.main import main
 from startrack.core.errors import BadInput
 from startrack.exposure import read_exposure
-from startrack.output.write import remove_companions, write_results
+from startrack.output import remove_companions, write_results
 
 ROOT = Path(__file__).parent.parent
 BAD_INPUT, NOT_ALL = 4, 5

@@ -15,7 +15,7 @@ from batch_helpers import FACTS, frames, task_of
 from startrack.applications.batch import locate_image
 from startrack.chain import are_unchanged, input_hashes
 from startrack.cli.main import main
-from startrack.output.schema import SCHEMAS
+from startrack.output import SCHEMAS
 from startrack.terrain import ForwardingTerrain, load_terrain
 
 DEM = """

@@ -12,7 +12,7 @@ from startrack.catalog import load_catalog
 from startrack.chain import pipeline
 from startrack.detection import find_damage
 from startrack.detection.dead_parts import find_dead_parts
-from startrack.output.record import result_dict
+from startrack.output import result_dict
 
 HEIGHT, WIDTH = 700, 900
 PARTS = {

@@ -11,7 +11,7 @@ import pytest
 
 from startrack.catalog import load_catalog
 from startrack.chain import Outcome, pipeline
-from startrack.output.record import result_dict
+from startrack.output import result_dict
 
 EVERY_CHI2_2DOF = 18.4  # 99.99 %
 

@@ -15,8 +15,7 @@ from startrack.chain.stages import Detected, Measured, Refused, extend
 from startrack.cli.main import main
 from startrack.core.errors import Reason
 from startrack.core.types import Blocked, Mode, UnstatedFact
-from startrack.output.explain import explain
-from startrack.output.schema import SCHEMAS
+from startrack.output import SCHEMAS, explain
 
 SAMPLE = str(Path(__file__).parents[1] / "sample_images/near-centre.png")
 

@@ -34,8 +34,7 @@ from startrack.core.errors import BadInput, NoSolution
 from startrack.core.types import MeasuredSkyline
 from startrack.exposure import read_exposure
 from startrack.frames import Site
-from startrack.output.schema import SCHEMAS
-from startrack.output.skyline_table import skyline_table_text
+from startrack.output import SCHEMAS, skyline_table_text
 
 ROOT = Path(__file__).parent.parent
 PHOTO = ROOT / "sample_images/lowell-2018-08-06.fits.bz2"

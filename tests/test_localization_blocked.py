@@ -15,7 +15,7 @@ from startrack.chain import pipeline
 from startrack.core.types import Array, Evidence, Fix
 from startrack.evidence.likelihood_ratio import visibility_llr
 from startrack.localization import ExactPosterior
-from startrack.output.record import result_dict
+from startrack.output import result_dict
 from startrack.terrain import load_terrain
 
 CRATER = load_terrain("shackleton-thesis")

@@ -18,8 +18,7 @@ from startrack.localization import ExactPosterior
 from startrack.localization.integrity import DIVISIONS, GROUPS, RISK, WRONG_GROUP, _divide
 from startrack.localization.search import Explored
 from startrack.localization.skyline_profiles import SECTORS
-from startrack.output import result_dict, verbose_text
-from startrack.output.schema import SCHEMAS
+from startrack.output import SCHEMAS, result_dict, verbose_text
 from startrack.terrain import Cylinder
 
 WIDTH_RAD = 2 * np.pi / GROUPS

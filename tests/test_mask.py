@@ -31,7 +31,7 @@ from startrack.exposure import (
 )
 from startrack.frames import azel_from_rays
 from startrack.output import result_dict
-from startrack.output.star_table import status_of
+from startrack.output.tables import status_of
 
 LIT_ADU, DARK_ADU = 30_000.0, 100.0
 EVERY_CHI2_2DOF = 18.4  # 99.99 %

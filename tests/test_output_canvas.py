@@ -10,6 +10,7 @@ import pytest
 
 from startrack.core.types import Fix, Mode
 from startrack.frames import Site
+from startrack.output import relief_picture
 from startrack.output.picture.backdrop import View
 from startrack.output.picture.canvas import (
     MAP,
@@ -24,7 +25,6 @@ from startrack.output.picture.canvas import (
 )
 from startrack.output.picture.maps import distance_text, draw_overview, draw_zoom, map_view, nice_step
 from startrack.output.picture.relief import draw_contours, draw_relief, ground_of_view
-from startrack.output.picture.terrain_picture import relief_picture
 from startrack.terrain import Terrain
 
 WHITE = (255, 255, 255)

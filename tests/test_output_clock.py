@@ -10,12 +10,11 @@ from astropy import units as u
 from jsonschema import Draft202012Validator, ValidationError
 
 from startrack.api.solution import Solution
-from startrack.applications.batch.tables import COLUMNS, table_values
+from startrack.applications.batch.tables import COLUMNS, column_values, table_values
 from startrack.chain.stages import Measured, Refused, extend
 from startrack.core.types import ClockError, Mode
-from startrack.output import detection_dict, identification_dict, result_dict, verbose_text
+from startrack.output import SCHEMAS, detection_dict, identification_dict, result_dict, verbose_text
 from startrack.output.html.rows import facts_of
-from startrack.output.schema import SCHEMAS
 
 CLOCK = ClockError(offset_s=-12.3456, sigma_s=0.25)
 CHECK = Draft202012Validator(SCHEMAS["fix"])
@@ -85,9 +84,9 @@ def test_an_ambiguous_fix_keeps_its_clock(located):
 def test_the_table_of_a_batch_has_columns_of_the_clock(located):
     records = [table_values(result_dict(with_clock(located, clock))) for clock in (CLOCK, None)]
     columns = {one.name: one for one in COLUMNS}
-    assert columns["clock_offset_s"].values(records) == [CLOCK.offset_s, None]
-    assert columns["clock_sigma_s"].values(records) == [CLOCK.sigma_s, None]
-    assert columns["time_sigma_s"].values(records) == [20.0, 20.0]
+    assert column_values(columns["clock_offset_s"], records) == [CLOCK.offset_s, None]
+    assert column_values(columns["clock_sigma_s"], records) == [CLOCK.sigma_s, None]
+    assert column_values(columns["time_sigma_s"], records) == [20.0, 20.0]
     assert {columns[name].unit for name in ("clock_offset_s", "clock_sigma_s", "time_sigma_s")} == {"s"}
 
 

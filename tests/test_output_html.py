@@ -21,11 +21,9 @@ from startrack.cli.main import main
 from startrack.cli.report import write_page_of_images
 from startrack.core.errors import Reason
 from startrack.localization.rim_plane import point_fix
-from startrack.output import result_dict, write_json, write_results
-from startrack.output.html import page_text, result_at, results_under
+from startrack.output import page_text, result_at, result_dict, results_under, write_json, write_results
 from startrack.output.html.details import SOURCES, ground_map, skyline_of
-from startrack.output.html.gather import folder_of
-from startrack.output.html.rows import COLUMNS, facts_of
+from startrack.output.html.rows import COLUMNS, facts_of, folder_of
 from startrack.terrain import load_terrain
 
 VOID = {"meta", "link", "input", "br", "img"}

@@ -13,8 +13,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 from html_helpers import DESKTOP, NASTY, PHONE, SMALL, Window, results_in
 
-from startrack.output.html import page_text, results_under, write_page
-from startrack.output.html.gather import Found
+from startrack.output import Found, page_text, results_under, write_page
 
 REAL = {"small": (6010.0, -2507.0)}
 

@@ -10,7 +10,7 @@ import pytest
 from html_helpers import DESKTOP, NASTY, SMALL, Window, results_in
 
 from startrack.catalog import proper_name_designations, star_names
-from startrack.output.html import page_text, result_at, results_under
+from startrack.output import page_text, result_at, results_under
 
 READ_TWICE = "willReadFrequently"  # a hint of Chromium where a test reads a canvas more than once
 VIEW = "document.querySelector('#detail .stage canvas').view"

@@ -14,10 +14,22 @@ from startrack.chain import Located, Measured
 from startrack.core.errors import Reason
 from startrack.core.types import Attitude
 from startrack.frames import R_from_rotvec, heading_pitch_roll_from_R_body_enu
-from startrack.output import quantities, result_dict, views
-from startrack.output.quantity import Column, Listed, Quantity, show_everywhere
-from startrack.output.schema import SCHEMAS
-from startrack.output.schema_parts import POSITIVE
+from startrack.output import (
+    POSITIVE,
+    SCHEMAS,
+    Quantity,
+    at_stage,
+    quantities,
+    record,
+    result_dict,
+    rows,
+    schema_of,
+    show_everywhere,
+    table_columns,
+    text,
+)
+from startrack.output.quantity import Listed
+from startrack.output.record import at_record
 from startrack.output.values import body_sigmas_deg
 
 ROOT = Path(__file__).parent.parent
@@ -27,21 +39,21 @@ ARCSEC = np.pi / 648_000
 def test_a_new_quantity_is_one_entry(located, monkeypatch):
     new = Quantity(
         "position.twice_m", "m", Located, lambda v: 2 * v.fix.radius95_m, "twice the radius", POSITIVE, optional=True,
-        columns=(Column("twice_m", "%.2f"),), shown=show_everywhere("Twice", "{:.1f} m", "error"),
+        form="%.2f", shown=show_everywhere("Twice", "{:.1f} m", "error"),
         listed=Listed("Twice", 1),
     )  # fmt: skip
     table = (*quantities.QUANTITIES, new)
-    monkeypatch.setattr(quantities, "QUANTITIES", table)
-    monkeypatch.setattr(views, "QUANTITIES", table)
+    for module in (quantities, record, text):
+        monkeypatch.setattr(module, "QUANTITIES", table)
     monkeypatch.setitem(quantities.BY_PATH, new.path, new)
-    at, record = views.at_stage(located.result), result_dict(located.result)
-    assert record["position"]["twice_m"] == 2 * located.result.fix.radius95_m
-    assert views.section_schema("position")["properties"]["twice_m"]["minimum"] == 0
-    assert [column.name for _, column in views.columns()][-1] == "twice_m"
-    text = f"{2 * located.result.fix.radius95_m:.1f} m"
-    assert f"; twice {text}" in dict(views.rows("text", at))["error"]
-    for place, values in (("panel", at), ("notebook", at), ("page", views.at_record(record))):
-        assert dict(views.rows(place, values))["twice" if place == "notebook" else "Twice"] == text
+    at, found = at_stage(located.result), result_dict(located.result)
+    assert found["position"]["twice_m"] == 2 * located.result.fix.radius95_m
+    assert schema_of(table, "position")["properties"]["twice_m"]["minimum"] == 0
+    assert table_columns()[-1].name == "twice_m"
+    words = f"{2 * located.result.fix.radius95_m:.1f} m"
+    assert f"; twice {words}" in dict(rows("text", at))["error"]
+    for place, values in (("panel", at), ("notebook", at), ("page", at_record(found))):
+        assert dict(rows(place, values))["twice" if place == "notebook" else "Twice"] == words
 
 
 def test_documentation_is_made_from_the_table(monkeypatch):
@@ -49,13 +61,13 @@ def test_documentation_is_made_from_the_table(monkeypatch):
     assert spec is not None and spec.loader is not None
     make_tables = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(make_tables)
-    table = make_tables.quantity_table()
+    table = make_tables.markdown_table(quantities.QUANTITIES, "key")
     assert all(f"`{one.path}`" in table for one in quantities.QUANTITIES if one.recorded and not one.derived)
     assert all(f"`{one.value}` | {one.exit_code} |" in make_tables.reason_table() for one in Reason)
 
 
 def test_old_columns_keep_their_order_and_new_ones_follow():
-    names = [column.name for _, column in views.columns()]
+    names = [column.name for column in table_columns()]
     assert tuple(names[: len(quantities.FIRST_COLUMNS)]) == quantities.FIRST_COLUMNS
     assert {"search", "sigma_heading_deg", "sky_mag_arcsec2"} <= set(names[len(quantities.FIRST_COLUMNS) :])
 

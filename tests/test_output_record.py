@@ -14,9 +14,15 @@ from startrack.chain import pipeline
 from startrack.chain.stages import Oriented, extend
 from startrack.core.types import BadInput, Mode
 from startrack.localization.rim_plane import point_fix
-from startrack.output import detection_dict, identification_dict, refused_dict, result_dict, write_json
-from startrack.output.text import verbose_text
-from startrack.output.values import boresight_rad
+from startrack.output import (
+    boresight_rad,
+    detection_dict,
+    identification_dict,
+    refused_dict,
+    result_dict,
+    verbose_text,
+    write_json,
+)
 
 ARCSEC = np.pi / 648_000
 KEYS = {

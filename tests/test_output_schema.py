@@ -16,8 +16,7 @@ from startrack.cli.main import main
 from startrack.core.files import data_dir
 from startrack.core.types import Mode
 from startrack.exposure import write_sidecar
-from startrack.output import detection_dict, identification_dict, refused_dict, result_dict
-from startrack.output.schema import SCHEMAS
+from startrack.output import SCHEMAS, detection_dict, identification_dict, refused_dict, result_dict
 from startrack.rendering import write_truth
 
 

@@ -10,9 +10,8 @@ from astropy import units
 from astropy.table import Table
 
 from startrack.chain.stages import Identified, Oriented, extend
-from startrack.output import write_star_table
-from startrack.output.ecsv import Column, ecsv_text
-from startrack.output.star_table import star_table_text, status_of
+from startrack.output import Column, ecsv_text, write_star_table
+from startrack.output.tables import star_table_text, status_of
 
 COLUMNS = (
     "catalog_id hip name v_mag azimuth_deg elevation_deg x_px y_px x_measured_px y_measured_px expected_e flux_e "

@@ -13,6 +13,8 @@ from jsonschema import Draft202012Validator
 
 import startrack
 from startrack.applications.prediction import (
+    CELL_QUANTITIES,
+    PREDICTION,
     Conditions,
     Place,
     Predictions,
@@ -29,16 +31,14 @@ from startrack.camera import load_camera
 from startrack.cli.main import main
 from startrack.core.types import BadInput
 from startrack.frames import Site, latlon_from_enu
-from startrack.output.picture.prediction_map import class_bounds_m, prediction_picture
-from startrack.output.picture.prediction_plot import comparison_picture, path_picture
-from startrack.output.quantities_prediction import CELL_QUANTITIES
-from startrack.output.schema import SCHEMAS
+from startrack.output import comparison_picture, path_picture
+from startrack.output.picture.prediction import class_bounds_m, prediction_picture
 from startrack.rendering import Drive, exposure_for_snr, limiting_v_mag
 from startrack.terrain import Cylinder, load_terrain, write_bands
 
 OK, AMBIGUOUS, REFUSED = Status
 WHEN = datetime(2030, 6, 1, tzinfo=UTC)
-NAMES = [one.name for one in CELL_QUANTITIES]
+NAMES = [one.key for one in CELL_QUANTITIES]
 FLAGS = ["predict", "-t", "shackleton-thesis", "-c", "fisheye-2048", "--time", "2030-06-01T00:00:00"]
 
 
@@ -72,7 +72,7 @@ def test_the_map_is_a_geotiff_in_the_projection_of_the_terrain(area):
 
 def test_the_summary_fits_its_schema_and_the_table(area):
     record = json.loads((area / "predict.json").read_text())
-    Draft202012Validator(SCHEMAS["predict"], format_checker=Draft202012Validator.FORMAT_CHECKER).validate(record)
+    Draft202012Validator(PREDICTION, format_checker=Draft202012Validator.FORMAT_CHECKER).validate(record)
     radius = np.asarray(Table.read(area / "predict.ecsv")["radius95_m"])
     assert record["summary"]["share_below_20_m"] == pytest.approx(np.mean(radius < 20))
     assert record["summary"]["median_radius95_m"] == pytest.approx(np.median(radius), rel=1e-5)
@@ -366,5 +366,5 @@ def test_along_a_path_there_is_a_table_with_distances_and_no_map(waypoints, tmp_
     assert record["kind"] == "path"
     assert record["variants"][0]["summary"] == record["summary"]
     assert record["variants"][0]["limiting_v_mag"] < record["variants"][1]["limiting_v_mag"]
-    Draft202012Validator(SCHEMAS["predict"]).validate(record)
+    Draft202012Validator(PREDICTION).validate(record)
     assert (out / "predict-compare.png").exists()

@@ -9,9 +9,9 @@ import pytest
 from astropy.table import Table
 from jsonschema import Draft202012Validator
 
+from startrack.applications.prediction import PREDICTION
 from startrack.applications.prediction.statistics import ellipse_m2, with_odometry
 from startrack.cli.main import main
-from startrack.output.schema import SCHEMAS
 
 POSITION_M = np.array([[0.0, 0.0], [300.0, 0.0], [300.0, 400.0], [700.0, 400.0], [700.0, 900.0]])
 SIGMA_1, FLOOR_M = 0.02, 3.0
@@ -89,7 +89,7 @@ def test_a_path_with_odometry_has_two_more_columns(tmp_path, capsys):
     assert np.all(smoothed < filtered * 1.001)
     assert np.all(smoothed < alone)
     record = json.loads((out / "predict.json").read_text())
-    Draft202012Validator(SCHEMAS["predict"]).validate(record)
+    Draft202012Validator(PREDICTION).validate(record)
     assert record["odometry"]["median_radius95_smoothed_m"] == pytest.approx(np.median(smoothed), rel=1e-5)
     assert (out / "predict.png").exists()
 

@@ -22,7 +22,7 @@ from startrack.core.errors import Reason
 from startrack.core.types import Exposure
 from startrack.evidence.sky_light import MIDDLES_RAD
 from startrack.localization import PseudoGradient
-from startrack.output import write_results
+from startrack.output import prepare_folder, write_results
 from startrack.output.picture.canvas import MEASURED
 from startrack.output.picture.panorama import (
     ABOVE_PX,
@@ -34,8 +34,7 @@ from startrack.output.picture.panorama import (
     WIDTH_PX,
     located_picture,
 )
-from startrack.output.skyline_table import half_range_rad
-from startrack.output.write import prepare_folder
+from startrack.output.tables import half_range_rad
 from startrack.rendering import Series, Truth, render
 from startrack.terrain import load_terrain
 

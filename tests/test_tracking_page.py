@@ -14,7 +14,7 @@ from synthetic_track import NASTY, odometry_alone, synthetic_track
 
 from startrack.applications.tracking.page import track_page
 from startrack.estimation.smoother import radius_holding
-from startrack.output.write import png_bytes
+from startrack.output import png_bytes
 
 PICTURE = png_bytes(np.full((40, 60, 3), 90, dtype=np.uint8))
 TITLE = 'A drive & </script><i>"more"</i>'

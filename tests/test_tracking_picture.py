@@ -10,7 +10,7 @@ from synthetic_track import odometry_alone, synthetic_track
 
 from startrack.applications.tracking.picture import HEIGHT_PX, WIDTH_PX, draw_graph, draw_track
 from startrack.applications.tracking.track_map import ODOMETRY, REFUSED, draw_track_map, half_axes_95_m, track_extent
-from startrack.output.picture.canvas import POSITION, SKY_BLUE, Canvas
+from startrack.output import POSITION, SKY_BLUE, Canvas
 from startrack.terrain import load_terrain
 
 BOX = (0.0, 0.0, 600.0, 600.0)

@@ -33,7 +33,7 @@ from startrack.applications.tracking.write import track_record
 from startrack.chain import Refused, Settings, locate_rays, pipeline
 from startrack.core.types import Array, Evidence, Fix, NoSolution
 from startrack.localization import ExactPosterior
-from startrack.output.record import result_dict
+from startrack.output import result_dict
 from startrack.terrain import Cylinder, ForwardingTerrain, Terrain
 
 THESIS, RENDERED, SHACKLETON = "shackleton-thesis", "shackleton-rendered", "shackleton"

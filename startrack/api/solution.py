@@ -20,8 +20,7 @@ from startrack.api.values import (
     position_of,
 )
 from startrack.chain import Located, Oriented, Outcome, last_value
-from startrack.output import prepare_folder, record_of, summary_line, write_results
-from startrack.output.values import boresight_rad
+from startrack.output import boresight_rad, prepare_folder, record_of, summary_line, write_results
 
 if TYPE_CHECKING:
     from astropy.coordinates import Angle, SkyCoord
@@ -143,7 +142,7 @@ class Solution:
             return None
         from astropy.table import QTable
 
-        from startrack.output.star_table import star_table_text
+        from startrack.output import star_table_text
 
         return QTable.read(star_table_text(value), format="ascii.ecsv")
 
@@ -154,7 +153,7 @@ class Solution:
             return None
         from astropy.table import QTable
 
-        from startrack.output.skyline_table import skyline_table_text
+        from startrack.output import skyline_table_text
 
         return QTable.read(skyline_table_text(self.result.skyline), format="ascii.ecsv")
 

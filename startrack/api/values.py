@@ -10,8 +10,7 @@ import numpy as np
 
 from startrack.chain import Located, Measured, Oriented
 from startrack.frames import heading_pitch_roll_from_R_body_enu, latlon_from_enu
-from startrack.output.values import ARCSEC_PER_RAD, R_body_enu, boresight_rad
-from startrack.output.views import Rows, at_stage, rows
+from startrack.output import ARCSEC_PER_RAD, R_body_enu, Rows, at_stage, boresight_rad, rows
 
 if TYPE_CHECKING:
     from astropy.coordinates import Angle

@@ -143,10 +143,11 @@ def _self_test() -> str:
 
 def run_schema(args: argparse.Namespace) -> int:
     """Print a schema; 0, or a usage error for an unknown kind."""
+    from startrack.applications.prediction import PREDICTION
     from startrack.applications.tracking import TRACK
-    from startrack.output.schema import SCHEMAS
+    from startrack.output import SCHEMAS
 
-    schemas = {**SCHEMAS, "track": TRACK}
+    schemas = {**SCHEMAS, "predict": PREDICTION, "track": TRACK}
     if args.name is None:
         print("\n".join(schemas))
     elif args.name in schemas:

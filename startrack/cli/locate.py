@@ -49,8 +49,7 @@ def locate(args: argparse.Namespace) -> int:
 
 def _locate_image(args: argparse.Namespace, settings: Settings, path: str, stem: str) -> Outcome:
     from startrack.chain import locate_exposure, with_timing
-    from startrack.output import summary_line, verbose_text, write_geo, write_results
-    from startrack.output.explain import explain
+    from startrack.output import explain, summary_line, verbose_text, write_geo, write_results
 
     exposure, _, out, read_ms = _read_timed(args, path, stem, ".fix.json", lambda exposure: None)
     if exposure.time_utc is not None and exposure.camera is not None:

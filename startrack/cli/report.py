@@ -16,7 +16,7 @@ from startrack.core.errors import BadInput
 from startrack.core.files import check_output, existing_folder
 
 if TYPE_CHECKING:
-    from startrack.output.html import Found
+    from startrack.output import Found
 
 PAGE = "report.html"  # of a folder; of one result NAME.report.html
 DEFAULT_IMAGES = 30
@@ -36,7 +36,7 @@ def write_page_of(
     out: str, *, truth: str | None = None, images: int = DEFAULT_IMAGES, output: str | None = None
 ) -> Path:
     """Write the page of a folder of results or of one NAME.fix.json; its path. Raises BadInput, BadOutput."""
-    from startrack.output.html import result_at, results_under, write_page
+    from startrack.output import result_at, results_under, write_page
 
     if output is not None:
         check_output(output, overwrite=True)

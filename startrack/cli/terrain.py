@@ -45,8 +45,7 @@ def _draw(args: argparse.Namespace, terrain: Terrain, position: tuple[float, flo
     """Write the relief and, seen from a position, the horizon; the paths of the pictures."""
     from PIL import Image
 
-    from startrack.output.picture.panorama import horizon_picture
-    from startrack.output.picture.terrain_picture import relief_picture
+    from startrack.output import horizon_picture, relief_picture
 
     out, stem = make_folder(args.dir, "bad_terrain"), file_stem(terrain.name)
     pictures = {out / f"{stem}.relief.png": relief_picture(terrain, position)}

@@ -1,9 +1,84 @@
-"""Results for people and programs: results as JSON, star tables, annotated pictures, one-line summaries."""
+"""Results for people and programs: JSON, tables, pictures, pages, one-line summaries, and the table of quantities."""
 
-from startrack.output.record import detection_dict, identification_dict, record_of, refused_dict, result_dict
-from startrack.output.text import lens_text, refusal_line, summary_line, verbose_text
-from startrack.output.write import (
+from startrack.output.explain import explain
+from startrack.output.geo import feature, geojson_text
+from startrack.output.html.details import ground_map
+from startrack.output.html.rows import Found, result_at, results_under
+from startrack.output.html.write import filled_frame, page_text, write_page
+from startrack.output.picture.annotate import annotate, draw_legend_sample
+from startrack.output.picture.canvas import (
+    DIM_INK,
+    FAINT_INK,
+    GRID,
+    INK,
+    MAP,
+    POSITION,
+    REDDISH_PURPLE,
+    SKY_BLUE,
+    YELLOW,
+    Box,
+    Canvas,
+    Colour,
+    box_around,
+    mix_colours,
     png_bytes,
+    wrap_text,
+)
+from startrack.output.picture.maps import (
+    CAPTION_SIZE,
+    MapView,
+    distance_text,
+    draw_distances,
+    draw_frame,
+    draw_ground,
+    draw_overview,
+    ellipse_m,
+    map_view,
+    nice_step,
+    relief_picture,
+)
+from startrack.output.picture.panorama import horizon_picture, skyline_picture
+from startrack.output.picture.prediction import comparison_picture, path_picture, prediction_picture
+from startrack.output.picture.relief import draw_contours, ground_of_view
+from startrack.output.quantities import QUANTITIES, table_columns
+from startrack.output.quantity import (
+    ABSENT,
+    CHANCE,
+    COUNT,
+    FLAG,
+    NUMBER,
+    POSITIVE,
+    TEXT,
+    TIME,
+    Quantity,
+    Schema,
+    TableColumn,
+    file_schema,
+    markdown_table,
+    object_schema,
+    or_null,
+    record_from,
+    schema_of,
+    show_everywhere,
+)
+from startrack.output.record import at_stage, detection_dict, identification_dict, record_of, refused_dict, result_dict
+from startrack.output.schema import SCHEMAS
+from startrack.output.tables import (
+    Column,
+    ecsv_text,
+    format_values,
+    quantity_columns,
+    skyline_table_text,
+    skyline_texts_deg,
+    star_table_text,
+)
+from startrack.output.text import Rows, lens_text, refusal_line, rows, summary_line, verbose_text
+from startrack.output.values import ARCSEC_PER_RAD, R_body_enu, boresight_rad
+from startrack.output.write import (
+    COMPANIONS,
+    PICTURES,
+    SKYLINE_FILES,
+    json_text,
     prepare_folder,
     remove_companions,
     write_annotated,
@@ -15,22 +90,18 @@ from startrack.output.write import (
 )
 
 __all__ = [
-    "detection_dict",
-    "identification_dict",
-    "lens_text",
-    "png_bytes",
-    "prepare_folder",
-    "record_of",
-    "refusal_line",
-    "refused_dict",
-    "remove_companions",
-    "result_dict",
-    "summary_line",
-    "verbose_text",
-    "write_annotated",
-    "write_geo",
-    "write_json",
-    "write_results",
-    "write_star_table",
-    "write_wcs",
-]
+    "ABSENT", "ARCSEC_PER_RAD", "CAPTION_SIZE", "CHANCE", "COMPANIONS", "COUNT", "DIM_INK", "FAINT_INK", "FLAG", "GRID",
+    "INK", "MAP", "NUMBER", "PICTURES", "POSITION", "POSITIVE", "QUANTITIES", "REDDISH_PURPLE", "SCHEMAS",
+    "SKYLINE_FILES", "SKY_BLUE", "TEXT", "TIME", "YELLOW", "Box", "Canvas", "Colour", "Column", "Found", "MapView",
+    "Quantity", "R_body_enu", "Rows", "Schema", "TableColumn", "annotate", "at_stage", "boresight_rad",
+    "box_around", "comparison_picture", "detection_dict", "distance_text", "draw_contours", "draw_distances",
+    "draw_frame", "draw_ground", "draw_legend_sample", "draw_overview", "ecsv_text", "ellipse_m", "explain",
+    "feature", "file_schema", "filled_frame", "format_values", "geojson_text", "ground_map", "ground_of_view",
+    "horizon_picture", "identification_dict", "json_text", "lens_text", "map_view", "markdown_table", "mix_colours",
+    "nice_step", "object_schema", "or_null", "page_text", "path_picture", "png_bytes", "prediction_picture",
+    "prepare_folder", "quantity_columns", "record_from", "record_of", "refusal_line", "refused_dict",
+    "relief_picture", "remove_companions", "result_at", "result_dict", "results_under", "rows", "schema_of",
+    "show_everywhere", "skyline_picture", "skyline_table_text", "skyline_texts_deg", "star_table_text",
+    "summary_line", "table_columns", "verbose_text", "wrap_text", "write_annotated", "write_geo", "write_json",
+    "write_page", "write_results", "write_star_table", "write_wcs",
+]  # fmt: skip

@@ -7,36 +7,94 @@ and a table of docs/formats.md are made from `QUANTITIES`. A new quantity is one
 from __future__ import annotations
 
 from startrack import __version__
-from startrack.chain import Detected, Inputs, Located, Measured
+from startrack.chain import Detected, Identified, Inputs, Located, Measured, Oriented
 from startrack.frames import format_utc
-from startrack.output.quantities_attitude import ATTITUDE
-from startrack.output.quantities_light import LIGHT
-from startrack.output.quantities_position import POSITION
-from startrack.output.quantity import Column, Quantity, Show
-from startrack.output.schema_parts import NUMBER, POSITIVE, TEXT
+from startrack.output.quantities_pose import ATTITUDE_QUANTITIES, POSITION_QUANTITIES
+from startrack.output.quantity import (
+    CHANCE,
+    COUNT,
+    NUMBER,
+    POSITIVE,
+    TEXT,
+    TIME,
+    Listed,
+    Quantity,
+    Show,
+    TableColumn,
+    numbers,
+    show_everywhere,
+)
+from startrack.output.values import blocked_deg, chance_text, predicted_visible, ranges_text
 
 Q = Quantity
-RUN: tuple[Quantity, ...] = (
+LIGHT_QUANTITIES: tuple[Quantity, ...] = (
+    Q("stars.detected", "", Detected, lambda v: len(v.detections), "point sources", COUNT, before=0, form="%d",
+      shown=(Show("summary", "sources", "{} point sources", "stars.identified"),
+             Show("text", "stars", "{} point sources"), Show("panel", "Stars", "{:,} point sources"),
+             Show("page", "Point sources", "{:,}"))),
+    Q("stars.identified", "", Identified, lambda v: len(v.identification), "point sources with a name", COUNT, before=0,
+      form="%d",
+      shown=(Show("summary", "stars", "{} stars"), Show("text", "stars", ", {} identified"),
+             Show("panel", "Stars", ", {:,} identified"), Show("page", "Named", "{:,}")), listed=Listed("Stars", 0)),
+    Q("stars.unexplained", "", Identified, lambda v: v.identification.unexplained,
+      "significant point sources that no catalogue star explains; null: not identified", COUNT, before=None,
+      shown=(Show("text", "stars", ", {} significant ones unexplained"), Show("page", "Unexplained", "{:,}"))),
+    Q("stars.measured", "", Measured, lambda v: int(v.light.usable.sum()), "catalogue stars whose light was measured",
+      recorded=False,
+      shown=(Show("text", "evidence", "{} catalogue stars measured"), Show("panel", "Evidence", "{:,} stars"))),
+    Q("stars.predicted_visible", "", Located, predicted_visible,
+      "stars whose light was measured and which stand above the skyline of the fix; 0 without a fix, null of "
+      "`identify` and `detect`", COUNT, before=lambda v: None if v.terrain is None else 0,
+      shown=(Show("text", "evidence", ", {} above the skyline of the fix"),
+             Show("panel", "Evidence", ", {:,} above the skyline"),
+             Show("page", "Above the skyline", "{:,}"))),
+    Q("stars.rms_px", "px", Oriented, lambda v: v.attitude_fit.rms_px,
+      "of the identified stars, per axis; null: not identified", POSITIVE, before=None, form="%.5f",
+      shown=(Show("text", "stars", "; rms {:.3f} px"), Show("panel", "Residual", "{:.2f} px"),
+             Show("page", "Residual", "{:.3f} px"))),
+    Q("stars.false_alarm_probability", "", Identified, lambda v: v.identification.false_alarm_probability,
+      "that chance would match as many; numbers below 1e-100 (none is below 1e-300) mean only that, and are "
+      "printed so; null: not identified", CHANCE, before=None,
+      shown=(Show("text", "stars", lambda p: f"; false alarm {chance_text(p)}"),
+             Show("panel", "Residual", lambda p: f"   false alarm {chance_text(p)}"),
+             Show("page", "Chance match", chance_text))),
+    Q("evidence.blocked", "deg", Located, blocked_deg,
+      "list of [from, to]: azimuths in which something on no map more likely hides the map's skyline than not; across "
+      "north `to` is the smaller", {"type": "array", "items": numbers(2)}, optional=True,
+      shown=(Show("text", "evidence", lambda a: f"; blocked {ranges_text(a)}" if a else ""),
+             Show("page", "Blocked azimuths", ranges_text))),
+    Q("evidence.damage", "", Inputs, lambda v: None if v.damage is None else v.damage.cause,
+      "what processing did to the pixels, where the evidence is measured on the frame itself; null: nothing shows",
+      TEXT, nullable=True, optional=True),
+    Q("sky.brightness_mag_arcsec2", "mag/arcsec^2", Located, lambda v: v.sky_brightness_mag_arcsec2,
+      "V of the sky beyond that of the ground at the skyline, by the camera's zero point and the exposure's duration; "
+      "null where the image shows no step of light there, or one of the two is not known",
+      NUMBER, nullable=True, form="%.4f", columns={"sky_mag_arcsec2": ()},
+      shown=show_everywhere("Sky", "{:.2f} mag/arcsec2", "evidence")),
+    Q("sky.unused", "", Located, lambda v: v.sky_unused or None,
+      "why the light of the sky is not evidence of the position; null: it is, or was not asked for", TEXT,
+      nullable=True, optional=True,
+      shown=(Show("text", "evidence", "; sky not used: {}"), Show("page", "Sky not used", "{}"))),
+)  # fmt: skip
+RUN_QUANTITIES: tuple[Quantity, ...] = (
     Q("clock.offset_s", "s", Located, lambda v: None if v.fix.clock is None else v.fix.clock.offset_s,
       "true minus stated time: mean of the posterior; 0 in a round crater, where the image does not show it; null: a "
-      "method without a posterior", NUMBER, nullable=True,
-      columns=(Column("clock_offset_s", "%.6g"),),
+      "method without a posterior", NUMBER, nullable=True, form="%.6g", columns={"clock_offset_s": ()},
       shown=(Show("text", "clock", "offset {:+.3f} s"), Show("notebook", "clock", "{:+.3f} s"),
              Show("page", "Clock", "{:+.3f} s"))),
     Q("clock.sigma_s", "s", Located, lambda v: None if v.fix.clock is None else v.fix.clock.sigma_s,
       "standard deviation of the offset; as stated (`provenance.time_sigma_s`) where the image does not show it; null: "
-      "as above", POSITIVE, nullable=True,
-      columns=(Column("clock_sigma_s", "%.6g"),),
+      "as above", POSITIVE, nullable=True, form="%.6g", columns={"clock_sigma_s": ()},
       shown=(Show("text", "clock", "; sigma {:.3f} s"), Show("notebook", "clock", " ± {:.3f} s"),
              Show("page", "Clock", " ± {:.3f} s"))),
     Q("provenance.version", "", Inputs, lambda v: __version__, "of startrack", TEXT),
     Q("provenance.image_sha256", "", Inputs, lambda v: v.exposure.sha256,
-      "of the file; of an array: of its type, shape and values", TEXT, columns=(Column("image_sha256", "%s"),)),
+      "of the file; of an array: of its type, shape and values", TEXT, form="%s"),
     Q("provenance.camera", "", Inputs, lambda v: v.exposure.camera or (v.camera.name if v.camera is not None else None),
-      "camera file or name", TEXT, before=None, columns=(Column("camera", "%s"),)),
+      "camera file or name", TEXT, before=None, form="%s"),
     Q("provenance.terrain", "", Inputs,
       lambda v: v.exposure.terrain or (v.terrain.name if v.terrain is not None else None), "terrain file or name", TEXT,
-      before=None, columns=(Column("terrain", "%s"),)),
+      before=None, form="%s"),
     Q("provenance.catalog", "", Inputs, lambda v: v.catalog_name or None, "star catalogue", TEXT, before=None),
     Q("provenance.localizer", "", Inputs, lambda v: v.localizer_name or None,
       "method of localization, by its name for `--localizer`; of one of your own the name of its class or function; "
@@ -46,14 +104,13 @@ RUN: tuple[Quantity, ...] = (
       nullable=True, optional=True),
     Q("provenance.time_utc", "", Inputs,
       lambda v: None if v.exposure.time_utc is None else format_utc(v.exposure.time_utc),
-      "middle of the exposure; null: not known", {"type": "string", "format": "date-time"}, before=None,
-      columns=(Column("time_utc", "%s"),)),
+      "middle of the exposure; null: not known", TIME, before=None, form="%s"),
     Q("provenance.time_sigma_s", "s", Inputs,
       lambda v: None if v.exposure.time_utc is None else v.exposure.time_sigma_s,
       "standard deviation of the clock's error, as stated, or 1; null: no time is known", POSITIVE, before=None,
-      optional=True, columns=(Column("time_sigma_s", "%.9g"),)),
+      optional=True, form="%.9g"),
     Q("provenance.exposure_s", "s", Inputs, lambda v: v.exposure.exposure_s, "null: not known", NUMBER, before=None,
-      columns=(Column("exposure_s", "%.9g"),)),
+      form="%.9g"),
     Q("provenance.mask_sha256", "", Detected,
       lambda v: None if v.detections.mask is None else v.detections.mask.sha256 or None,
       "of the file of the mask, or of the array that is masked; with the camera's and the image's mask both, joined by "
@@ -65,7 +122,7 @@ RUN: tuple[Quantity, ...] = (
       lambda v: None if v.exposure.correction is None else v.exposure.correction.flat_sha256,
       "of the file of the flat field; null: none was used", TEXT, before=None, nullable=True, optional=True),
 )  # fmt: skip
-QUANTITIES: tuple[Quantity, ...] = POSITION + ATTITUDE + LIGHT + RUN
+QUANTITIES: tuple[Quantity, ...] = POSITION_QUANTITIES + ATTITUDE_QUANTITIES + LIGHT_QUANTITIES + RUN_QUANTITIES
 BY_PATH = {one.path: one for one in QUANTITIES}
 # The batch's columns came in this order before the table did; a column that is not named here is appended.
 FIRST_COLUMNS = (
@@ -74,3 +131,10 @@ FIRST_COLUMNS = (
     "roll_body_deg", "qx_cam_icrs", "qy_cam_icrs", "qz_cam_icrs", "qw_cam_icrs", "sigma_x_arcsec", "sigma_y_arcsec",
     "sigma_z_arcsec", "detected", "identified", "rms_px", "image_sha256",
 )  # fmt: skip
+
+
+def table_columns() -> list[TableColumn]:
+    """The columns of the batch's table, in their order."""
+    order = {name: k for k, name in enumerate(FIRST_COLUMNS)}
+    found = [column for one in QUANTITIES for column in one.table_columns]
+    return sorted(found, key=lambda column: order.get(column.name, len(order)))

@@ -1,15 +1,53 @@
-"""What a quantity of the result record is: its path, unit and value, and the places where it is shown."""
+"""What an output quantity is, and what follows from a table of them: records, JSON schemas, columns of tables."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from startrack.chain import Inputs
-from startrack.output.schema_parts import Schema
+Schema = dict[str, Any]
+NUMBER: Schema = {"type": "number"}
+ABOVE_0: Schema = {"type": "number", "exclusiveMinimum": 0}
+POSITIVE: Schema = {"type": "number", "minimum": 0}
+COUNT: Schema = {"type": "integer", "minimum": 0}
+CHANCE: Schema = {"type": "number", "minimum": 0, "maximum": 1}
+TURN: Schema = {"type": "number", "minimum": 0, "exclusiveMaximum": 360}
+LATITUDE: Schema = {"type": "number", "minimum": -90, "maximum": 90}
+LONGITUDE: Schema = {"type": "number", "minimum": -180, "maximum": 180}
+TEXT: Schema = {"type": "string"}
+TIME: Schema = {"type": "string", "format": "date-time"}
+FLAG: Schema = {"type": "boolean"}
+
+
+def numbers(count: int, each: Schema = NUMBER) -> Schema:
+    """An array of `count` items that fit the schema `each`."""
+    return {"type": "array", "items": each, "minItems": count, "maxItems": count}
+
+
+QUATERNION: Schema = {**numbers(4, {"type": "number", "minimum": -1, "maximum": 1}), "description": "x, y, z, w"}
+
+
+def or_null(one: Schema, description: str) -> Schema:
+    """The schema `one`, or null."""
+    return {"anyOf": [one, {"type": "null"}], "description": description}
+
+
+def object_schema(required: Schema, description: str = "", optional: Schema | None = None) -> Schema:
+    """An object with the keys of `required` and `optional`. Further keys are no error: a later version may add some."""
+    d: Schema = {"type": "object", "properties": {**required, **(optional or {})}, "required": list(required)}
+    return {**d, "description": description} if description else d
+
+
+def file_schema(title: str, body: Schema) -> Schema:
+    """A schema that stands on its own: `body` with its `title` and dialect."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title, **body}
+
 
 ABSENT: Any = object()  # of a quantity that has no key before its stage
+ASTROPY_UNITS = {
+    "m": "m", "m^2": "m2", "deg": "deg", "arcsec": "arcsec", "px": "pix", "s": "s", "mag/arcsec^2": "mag / arcsec2",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -27,15 +65,6 @@ class Show:
 
 
 @dataclass(frozen=True)
-class Column:
-    """A column of the batch's table: its name, its printf format, and which element of the value it holds."""
-
-    name: str
-    form: str
-    at: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True)
 class Listed:
     """A column in the page's list of images: heading, decimals, and whether narrow screens have it too."""
 
@@ -46,18 +75,19 @@ class Listed:
 
 @dataclass(frozen=True)
 class Quantity:
-    """One quantity of the result record, or one that is only shown."""
+    """One quantity of a record, or one that is only shown."""
 
     path: str  # KEY or SECTION.KEY of the record
     unit: str  # as docs/formats.md spells it; empty for texts and pure numbers
-    since: type[Inputs]  # the first value of the pipeline that determines it
+    since: type[Any] | Callable[[Any], bool]  # the values that determine it: of a class, or those that fulfil this
     value: Callable[[Any], Any]  # of such a value; where `derived`, of the function from paths to values
     description: str
     schema: Schema = field(default_factory=dict)
     before: Any = ABSENT  # in the record of a value that has not come as far: ABSENT, None, a number, or a function
     nullable: bool = False  # whether it may be null of a value that has come as far
     optional: bool = False  # whether records of earlier stages or versions lack it although they have its section
-    columns: tuple[Column, ...] = ()
+    form: str = ""  # printf format of its columns in a table; empty: it has none
+    columns: Mapping[str, tuple[int, ...]] = field(default_factory=dict)  # their elements by name; empty: one, the key
     shown: tuple[Show, ...] = ()
     listed: Listed | None = None
     derived: bool = False  # made from other quantities, and not in the record
@@ -73,8 +103,84 @@ class Quantity:
         """Its key in the section."""
         return self.path.rpartition(".")[2]
 
+    def is_determined(self, value: Any) -> bool:
+        """Whether the `value` has come as far."""
+        return isinstance(value, self.since) if isinstance(self.since, type) else self.since(value)
+
+    @property
+    def table_columns(self) -> list[TableColumn]:
+        """Its columns in a table; none without a format."""
+        if not self.form:
+            return []
+        kind, unit = {"d": "int64", "s": "string"}.get(self.form[-1], "float64"), ASTROPY_UNITS.get(self.unit)
+        columns = self.columns or {self.key: ()}
+        return [
+            TableColumn(name, kind, unit, self.form, (*self.path.split("."), *at), self.description)
+            for name, at in columns.items()
+        ]
+
+
+@dataclass(frozen=True)
+class TableColumn:
+    """A column of a table of records."""
+
+    name: str
+    datatype: str  # as ECSV names it
+    unit: str | None  # as astropy spells it
+    form: str  # printf format
+    path: tuple[Any, ...]  # keys and indices that lead to the value in a record
+    description: str = ""
+
+    def value(self, record: Any) -> Any:
+        """The value in a `record`; None if that lacks it."""
+        for key in self.path:
+            if record is None or (isinstance(key, str) and key not in record):
+                return None
+            record = record[key]
+        return record
+
 
 def show_everywhere(label: str, form: str, line: str) -> tuple[Show, ...]:
     """A quantity shown as `label` with its `form` in text (on the `line`), panel, notebook and page."""
     where = (("text", line), ("panel", label), ("notebook", label.lower()), ("page", label))
     return tuple(Show(place, row, f"; {label.lower()} {form}" if place == "text" else form) for place, row in where)
+
+
+def record_from(quantities: Iterable[Quantity], value: Any) -> dict[str, Any]:
+    """The record of a `value` by a table of `quantities`, in the order of the table."""
+    found: dict[str, Any] = {}
+    for one in quantities:
+        if one.derived or not one.recorded:
+            continue
+        if one.is_determined(value):
+            entry = one.value(value)
+        else:
+            entry = one.before(value) if callable(one.before) else one.before
+        if entry is not ABSENT:
+            part = found.setdefault(one.section, {}) if one.section else found
+            part[one.key] = entry
+    return found
+
+
+def schema_of(quantities: Iterable[Quantity], section: str = "", description: str = "", units: bool = False) -> Schema:
+    """The JSON schema of a `section` of the record of `quantities`, with a `description`; `units`: with their units."""
+    required: Schema = {}
+    optional: Schema = {}
+    for one in quantities:
+        if one.section == section and not one.derived and one.recorded:
+            words = f"{one.description} [{one.unit}]" if units and one.unit else one.description
+            schema = {**one.schema, "description": words}
+            if one.nullable:  # a list of types, so that a validator names what is wrong with an array
+                schema["type"] = [one.schema["type"], "null"]
+            elif one.before is None or callable(one.before):
+                schema = or_null(one.schema, words)
+            (optional if one.optional else required)[one.key] = schema
+    return object_schema(required, description, optional)
+
+
+def markdown_table(quantities: Sequence[Quantity], heading: str) -> str:
+    """The recorded `quantities` for documentation, with unit and meaning; `heading` of their names."""
+    rows = [
+        f"| `{one.path}` | {one.unit} | {one.description} |" for one in quantities if one.recorded and not one.derived
+    ]
+    return "\n".join([f"| {heading} | unit | meaning |", "| --- | --- | --- |", *rows])

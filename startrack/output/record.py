@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from startrack.chain import STAGES, Detected, Identified, Outcome, last_value
+from startrack.chain import STAGES, Detected, Identified, Inputs, Outcome, last_value
 from startrack.core.errors import reason_of
 from startrack.core.types import Exposure
-from startrack.output.views import record_sections
+from startrack.output.quantities import BY_PATH, QUANTITIES
+from startrack.output.quantity import Schema, record_from
+from startrack.output.values import At
 
 FORMATS = {
     "fix": "startrack.fix/1",
@@ -81,7 +84,7 @@ def _record(
     kind: str, result: Outcome, own: dict[str, Any] | None = None, without: tuple[str, ...] = ()
 ) -> dict[str, Any]:
     """The record with its `own` keys after the attitude, and without some sections."""
-    sections = {key: part for key, part in record_sections(last_value(result)).items() if key not in without}
+    sections = {key: part for key, part in record_from(QUANTITIES, last_value(result)).items() if key not in without}
     first: dict[str, Any] = {
         key: sections.pop(key) for key in ("position", "modes", "search", "attitude") if key in sections
     }
@@ -100,3 +103,45 @@ def _record(
         "provenance": provenance,
         "warnings": result.warnings,
     }
+
+
+def at_stage(value: Inputs) -> At:
+    """From the path of a quantity to its value in a `value` of the pipeline; None where it is not determined there."""
+    known: dict[str, Any] = {}
+
+    def value_at(path: str) -> Any:
+        if path not in known:
+            one = BY_PATH[path]
+            known[path] = one.value(value_at if one.derived else value) if one.is_determined(value) else None
+        return known[path]
+
+    return value_at
+
+
+def at_record(result: Mapping[str, Any]) -> At:
+    """From the path of a quantity to its value in a `result` record; None where that lacks it or has another type."""
+
+    def value_at(path: str) -> Any:
+        one = BY_PATH[path]
+        if one.derived:
+            return one.value(value_at)
+        part = result.get(one.section) if one.section else result
+        value = part.get(one.key) if isinstance(part, Mapping) else None
+        return value if _has_type(value, one.schema) else None
+
+    return value_at
+
+
+def _has_type(value: Any, schema: Schema) -> bool:
+    """Whether a value of a file has the type that the schema states; its limits are not checked."""
+    kind = schema.get("type")
+    if kind == "array":
+        items, least = schema.get("items", {}), schema.get("minItems", 0)
+        return isinstance(value, list) and len(value) >= least and all(_has_type(one, items) for one in value)
+    if kind == "object":
+        parts = schema["properties"]
+        return isinstance(value, dict) and all(_has_type(value.get(key), parts[key]) for key in schema["required"])
+    kinds: dict[str, Any] = {"number": (int, float), "integer": int, "string": str, "boolean": bool}
+    if kind is None:
+        return value is not None
+    return isinstance(value, kinds[kind]) and isinstance(value, bool) == (kind == "boolean")

@@ -6,46 +6,38 @@ from startrack.camera import camera_keys
 from startrack.chain import STAGES
 from startrack.core.errors import Reason
 from startrack.exposure import SIDECAR as SIDECAR_KEYS
-from startrack.output.quantities import BY_PATH
-from startrack.output.quantities_prediction import PREDICTION
-from startrack.output.record import FORMATS
-from startrack.output.schema_parts import (
+from startrack.output.quantities import BY_PATH, QUANTITIES
+from startrack.output.quantity import (
     COUNT,
     NUMBER,
     POSITIVE,
     QUATERNION,
     TEXT,
     Schema,
+    file_schema,
     numbers,
+    object_schema,
     or_null,
-    record,
-    schema,
+    schema_of,
 )
-from startrack.output.views import section_schema
+from startrack.output.record import FORMATS
 from startrack.terrain import TERRAIN_KEYS
 
-CAMERA = schema("Camera file", camera_keys().schema())
-
-TERRAIN = schema("Terrain file", TERRAIN_KEYS.schema() | {"oneOf": [{"required": ["cylinder"]}, {"required": ["dem"]}]})
-SIDECAR = schema("Facts beside an image", SIDECAR_KEYS.schema())
-
-
+TERRAIN: Schema = TERRAIN_KEYS.schema() | {"oneOf": [{"required": ["cylinder"]}, {"required": ["dem"]}]}
 REFUSALS = [one.value for one in Reason if one is not Reason.AMBIGUOUS]
-
-
-def _part_of(whole: Schema) -> Schema:
-    """A schema as a part of another: only the whole names its dialect."""
-    return {key: value for key, value in whole.items() if key != "$schema"}
-
-
-POSITION = section_schema("position", "The camera's centre. covariance_m2 is of (east, north).")
-MODES: Schema = {**BY_PATH["modes"].schema, "description": BY_PATH["modes"].description}
-ATTITUDE = section_schema("attitude", "Of the camera among the stars and, with terrain and time, of the rover's body.")
-EVIDENCE = section_schema("evidence", "What is left out of the evidence, and why.")
-SKY = section_schema("sky", "Diffuse light of the sky.")
-SEARCH = section_schema("search", "How far other positions are excluded.")
-CLOCK = section_schema("clock", "Error of the stated time.")
-PROVENANCE = section_schema("provenance")
+SECTIONS = {
+    name: schema_of(QUANTITIES, name, description)
+    for name, description in {
+        "position": "The camera's centre. covariance_m2 is of (east, north).",
+        "search": "How far other positions are excluded.",
+        "attitude": "Of the camera among the stars and, with terrain and time, of the rover's body.",
+        "evidence": "What is left out of the evidence, and why.",
+        "sky": "Diffuse light of the sky.",
+        "clock": "Error of the stated time.",
+        "stars": "",
+        "provenance": "",
+    }.items()
+}
 COMMON: Schema = {
     "image": TEXT,
     "status": {"enum": ["ok", "ambiguous", "refused"]},
@@ -54,9 +46,9 @@ COMMON: Schema = {
 }
 # An image that could not even be read has no more than the common keys.
 MEASURED: Schema = {
-    "stars": section_schema("stars"),
-    "timing_ms": record(dict.fromkeys(STAGES, POSITIVE)),
-    "provenance": PROVENANCE,
+    "stars": SECTIONS["stars"],
+    "timing_ms": object_schema(dict.fromkeys(STAGES, POSITIVE)),
+    "provenance": SECTIONS["provenance"],
 }
 
 WARNINGS: Schema = {"type": "array", "items": TEXT, "description": "what was found in the image's file and not used"}
@@ -69,9 +61,9 @@ ADVICE: Schema = {"type": "string", "description": "what to do next, by the reas
 
 def _result(kind: str, title: str, own: Schema, rules: list[Schema]) -> Schema:
     keys = {"format": {"const": FORMATS[kind]}, **COMMON}
-    return schema(
+    return file_schema(
         title,
-        record(keys, optional={"advice": ADVICE, **own, **MEASURED, "warnings": WARNINGS})
+        object_schema(keys, optional={"advice": ADVICE, **own, **MEASURED, "warnings": WARNINGS})
         | {"allOf": [*_STATUS_RULES, *rules]},
     )
 
@@ -90,13 +82,14 @@ _FIX_RULES = [
     _if_status("ambiguous", {"required": ["modes", "attitude"], "properties": {"position": False}}),
     _if_status("refused", {"properties": {"position": False}}),
 ]
-MATCH = record({
+MATCH = object_schema({
     "hip": or_null({"type": "integer", "minimum": 1}, "Hipparcos number; null: the star has none"),
     "x_px": NUMBER,
     "y_px": NUMBER,
 })  # fmt: skip
-DETECTION = record({"x_px": NUMBER, "y_px": NUMBER, "flux_e": NUMBER, "snr": NUMBER})
-HORIZON = record(
+DETECTION = object_schema({"x_px": NUMBER, "y_px": NUMBER, "flux_e": NUMBER, "snr": NUMBER})
+LEFT_OUT = object_schema({"image": TEXT, "reason": {"enum": REFUSALS}, "message": TEXT})
+HORIZON = object_schema(
     {
         "format": {"const": "startrack.horizon/1"},
         "status": {"enum": ["ok", "refused"]},
@@ -107,8 +100,11 @@ HORIZON = record(
         "advice": ADVICE,
         "output": TEXT,
         "images": {"type": "array", "items": TEXT},
-        "left_out": {"type": "array", "items": record({"image": TEXT, "reason": {"enum": REFUSALS}, "message": TEXT})},
-        "azimuths": record(dict.fromkeys(("known", "stars", "sky_light", "both"), COUNT)),
+        "left_out": {
+            "type": "array",
+            "items": object_schema({"image": TEXT, "reason": {"enum": REFUSALS}, "message": TEXT}),
+        },
+        "azimuths": object_schema(dict.fromkeys(("known", "stars", "sky_light", "both"), COUNT)),
         "median_sigma_deg": or_null(POSITIVE, "of the known azimuths"),
         "lowest_deg": or_null(NUMBER, "apparent elevation"),
         "highest_deg": or_null(NUMBER, "apparent elevation"),
@@ -124,13 +120,9 @@ SCHEMAS: dict[str, Schema] = {
         "fix",
         "Position and attitude of one image",
         {
-            "position": POSITION,
-            "modes": MODES,
-            "search": SEARCH,
-            "attitude": ATTITUDE,
-            "evidence": EVIDENCE,
-            "sky": SKY,
-            "clock": CLOCK,
+            "position": SECTIONS["position"],
+            "modes": {**BY_PATH["modes"].schema, "description": BY_PATH["modes"].description},
+            **{name: SECTIONS[name] for name in ("search", "attitude", "evidence", "sky", "clock")},
             "explain": EXPLAIN,
         },
         _FIX_RULES,
@@ -138,7 +130,11 @@ SCHEMAS: dict[str, Schema] = {
     "identification": _result(
         "identification",
         "Stars and attitude of one image",
-        {"attitude": ATTITUDE, "camera": _part_of(CAMERA), "matches": {"type": "array", "items": MATCH}},
+        {
+            "attitude": SECTIONS["attitude"],
+            "camera": {"title": "Camera file", **camera_keys().schema()},
+            "matches": {"type": "array", "items": MATCH},
+        },
         [_if_status("ok", {"required": ["attitude", "camera", "matches"]})],
     ),
     "detection": _result(
@@ -147,13 +143,13 @@ SCHEMAS: dict[str, Schema] = {
         {"detections": {"type": "array", "items": DETECTION}},
         [_if_status("ok", {"required": ["detections"]})],
     ),
-    "horizon": schema("Summary of a measured skyline", HORIZON | {"allOf": _HORIZON_RULES}),
-    "predict": PREDICTION,
-    "truth": schema(
+    "horizon": file_schema("Summary of a measured skyline", HORIZON | {"allOf": _HORIZON_RULES}),
+    "truth": file_schema(
         "What is true of a rendered image, for tests and scorers",
-        record({"position_enu_m": numbers(3), "quat_xyzw_cam_icrs": QUATERNION}) | {"additionalProperties": True},
+        object_schema({"position_enu_m": numbers(3), "quat_xyzw_cam_icrs": QUATERNION})
+        | {"additionalProperties": True},
     ),
-    "sidecar": SIDECAR,
-    "camera": CAMERA,
-    "terrain": TERRAIN,
+    "sidecar": file_schema("Facts beside an image", SIDECAR_KEYS.schema()),
+    "camera": file_schema("Camera file", camera_keys().schema()),
+    "terrain": file_schema("Terrain file", TERRAIN),
 }

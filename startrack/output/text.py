@@ -1,7 +1,8 @@
-"""Results as text: one line for a terminal, and some more lines for -v."""
+"""Results as text: rows of names and texts, one line for a terminal, and some more lines for -v."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,13 +10,37 @@ import numpy as np
 
 from startrack.chain import STAGES, Outcome, Refused, last_value
 from startrack.core.files import printable
-from startrack.output.record import image_name
-from startrack.output.views import at_stage, rows
+from startrack.output.quantities import QUANTITIES
+from startrack.output.quantity import TURN
+from startrack.output.record import at_stage, image_name
+from startrack.output.values import Angle, At
 
 if TYPE_CHECKING:
     from startrack.camera import Camera
 
 NAME_LETTERS = 11  # width of the names in the detailed text
+Rows = list[tuple[str, str]]
+
+
+def rows(place: str, at: At, sections: Collection[str] | None = None) -> Rows:
+    """The rows of a `place` (summary, text, panel, notebook or page): each a name and a text.
+
+    `at` gives the values, `sections` restricts the quantities to these parts of the record.
+    """
+    found: dict[str, str] = {}
+    for one in QUANTITIES:
+        if sections is not None and one.section not in sections:
+            continue
+        for show in one.shown:
+            if show.place != place or (show.unless and at(show.unless) is not None):
+                continue
+            value = at(one.path)
+            if value is None:
+                continue
+            value = Angle(value) if one.schema is TURN else value
+            text = show.form(value) if callable(show.form) else show.form.format(value)
+            found[show.row] = found[show.row] + text if show.row in found else text.lstrip(" ,;")
+    return [(row, text) for row, text in found.items() if text]
 
 
 def summary_line(result: Outcome, seconds: float | None = None) -> str:

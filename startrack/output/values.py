@@ -28,19 +28,17 @@ class Angle(float):
         return format(0.0, spec) if text == format(360.0, spec) else text
 
 
+def has_position(value: Any) -> bool:
+    """Whether a `value` of the pipeline states a position: the only one that fits."""
+    return isinstance(value, Located) and not value.fix.ambiguous
+
+
 def skyline_position_m(value: Located) -> tuple[float, float]:
     """East and north [m] of the position whose skyline a located `value` is compared with."""
     if value.fix.ambiguous:
-        return best_position_m(value.fix)
+        return value.fix.modes[0].east_m, value.fix.modes[0].north_m
     east_m, north_m = value.position_at_time_m
     return float(east_m), float(north_m)
-
-
-def best_position_m(fix: Fix) -> tuple[float, float]:
-    """East and north [m] of the position of a `fix`, or of its heaviest mode where several positions fit."""
-    if fix.ambiguous:
-        return fix.modes[0].east_m, fix.modes[0].north_m
-    return float(fix.position_enu_m[0]), float(fix.position_enu_m[1])
 
 
 def boresight_rad(R_cam_icrs: Array) -> tuple[float, float, float]:
@@ -56,11 +54,6 @@ def boresight_rad(R_cam_icrs: Array) -> tuple[float, float, float]:
     north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
     roll = np.arctan2(up @ east, up @ north)
     return positive_turn(float(ra)), float(dec), positive_turn(float(roll))
-
-
-def protection_level_m(value: Located) -> float | None:
-    """The protection level of a `value`; None where it is not bounded or not assessed."""
-    return None if value.integrity is None else finite_or_none(value.integrity.protection_level_m)
 
 
 def carrying_azimuths(value: Located) -> list[list[float]] | None:
@@ -210,11 +203,6 @@ def blocked_deg(value: Located) -> list[list[float]]:
     return [[round(float(edge), 6) for edge in np.degrees(one)] for one in ranges]
 
 
-def unstated_record(fix: Fix) -> list[dict[str, Any]]:
-    """The facts that no file states, with the 99.9 % circle [m] if each were exact."""
-    return [{"fact": one.fact, "radius999_m_if_exact": round(one.radius999_m_if_exact, 6)} for one in fix.unstated]
-
-
 def dominant_fact(at: At) -> str | None:
     """The fact that widens the 99.9 % circle by more than three times, and the circle without it."""
     unstated, radius_m = at("position.unstated"), at("position.radius999_m")
@@ -226,8 +214,3 @@ def dominant_fact(at: At) -> str | None:
 def ranges_text(ranges: list[list[float]]) -> str:
     """Ranges of azimuth [deg] in words; empty where there are none."""
     return ", ".join(f"{start:.0f}° to {end:.0f}°" for start, end in ranges)
-
-
-def blocked_text(ranges: list[list[float]]) -> str:
-    """The part of a line about blocked azimuths [deg]; empty where there are none."""
-    return f"; blocked {ranges_text(ranges)}" if ranges else ""

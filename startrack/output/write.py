@@ -7,17 +7,19 @@ import os
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from startrack.chain import Located, Measured, Oriented, Outcome, last_value
 from startrack.core.errors import BadInput
 from startrack.core.files import make_folder, write_atomically
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from startrack.chain import Located, Oriented, Outcome
-    from startrack.core.types import MeasuredSkyline
+from startrack.output.geo import GEO_FORMATS, geo_text
+from startrack.output.picture.annotate import annotate, bare_picture
+from startrack.output.picture.canvas import png_bytes
+from startrack.output.picture.overlay import Layers, add_layers, overlay_of
+from startrack.output.picture.panorama import located_picture
+from startrack.output.record import record_of
+from startrack.output.tables import skyline_table_text, star_table_text
+from startrack.output.wcs import matches_bytes, wcs_bytes
 
 ANNOTATED = ".annotated.png"
 SKYLINE_TABLE, SKYLINE_PICTURE = SKYLINE_FILES = (".skyline.ecsv", ".skyline.png")  # where the image shows a skyline
@@ -88,8 +90,6 @@ def write_results(
     `plots` and `write_record`: whether the pictures and the record are written; `more`: keys that are added to the
     record. Raises BadInput where a file cannot be written; none of them is then left.
     """
-    from startrack.output.record import record_of
-
     record = record_of(outcome, _stem_and_kind(path)[1]) | (more or {})
     try:
         _write_companions(outcome, path, plots=plots)
@@ -103,16 +103,17 @@ def write_results(
 
 
 def _write_companions(outcome: Outcome, path: Path, *, plots: bool) -> None:
-    from startrack.chain import Located, Measured, Oriented, last_value
-
     value = last_value(outcome)
     if isinstance(value, Measured) or (isinstance(value, Oriented) and value.terrain is None):
         write_star_table(companion(path, ".stars.ecsv"), value)
         write_wcs(companion(path, ".wcs"), companion(path, ".corr"), value)
     if isinstance(value, Located) and value.skyline is not None:
-        write_skyline(companion(path, SKYLINE_TABLE), value.skyline)
+        write_atomically(
+            companion(path, SKYLINE_TABLE), skyline_table_text(value.skyline).encode("utf-8"), overwrite=True
+        )
         if plots:
-            write_panorama(companion(path, SKYLINE_PICTURE), value, value.skyline)
+            panorama = png_bytes(located_picture(value, value.skyline))
+            write_atomically(companion(path, SKYLINE_PICTURE), panorama, overwrite=True)
     if plots:
         write_annotated(companion(path, ANNOTATED), outcome)
 
@@ -122,8 +123,6 @@ def write_geo(record: Path, outcome: Outcome, kinds: Sequence[str]) -> None:
 
     `kinds`: which of the two. A former file of another outcome is removed. Raises BadInput where one cannot be written.
     """
-    from startrack.chain import Located
-    from startrack.output.geo import GEO_FORMATS, geo_text
 
     for kind in GEO_FORMATS:
         path = record.with_name(f"{_stem_and_kind(record)[0]}.{kind}")
@@ -143,29 +142,15 @@ def write_json(path: FilePath, record: dict[str, Any]) -> None:
 
 def json_text(record: dict[str, Any]) -> str:
     """JSON of a `record` with one top-level key a line."""
-    lines = (f" {json.dumps(key)}: {_json(value)}" for key, value in record.items())
+    lines = (
+        f" {json.dumps(key)}: {json.dumps(value, ensure_ascii=False, allow_nan=False)}" for key, value in record.items()
+    )
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 def write_star_table(path: FilePath, value: Oriented) -> None:
     """Write the star table of an identified `value` to `path`. Raises BadInput where it cannot be written."""
-    from startrack.output.star_table import star_table_text
-
     write_atomically(path, star_table_text(value).encode("utf-8"), overwrite=True)
-
-
-def write_skyline(path: FilePath, skyline: MeasuredSkyline) -> None:
-    """Write the table of a `skyline` to `path`. Raises BadInput where it cannot be written."""
-    from startrack.output.skyline_table import skyline_table_text
-
-    write_atomically(path, skyline_table_text(skyline).encode("utf-8"), overwrite=True)
-
-
-def write_panorama(path: FilePath, value: Located, skyline: MeasuredSkyline) -> None:
-    """Write the panorama of a located `value` with its `skyline` to `path` (PNG). Raises BadInput as the others do."""
-    from startrack.output.picture.panorama import located_picture
-
-    write_atomically(path, png_bytes(located_picture(value, skyline)), overwrite=True)
 
 
 def write_wcs(path: FilePath, corr_path: FilePath, value: Oriented) -> None:
@@ -173,7 +158,6 @@ def write_wcs(path: FilePath, corr_path: FilePath, value: Oriented) -> None:
 
     No NAME.wcs is left if no FITS projection describes the lens. Raises BadInput where they cannot be written.
     """
-    from startrack.output.wcs import matches_bytes, wcs_bytes
 
     header = wcs_bytes(value)
     if header is None:
@@ -189,27 +173,8 @@ def write_annotated(path: FilePath, outcome: Outcome, truth_enu_m: tuple[float, 
     `truth_enu_m` (east, north) [m] is drawn if it is given; no stage of the pipeline has it. The file also holds the
     picture without marks and the marks as coordinates, for the HTML page (`picture/layers.py`).
     """
-    from startrack.chain import last_value
-    from startrack.output.picture.annotate import annotate, bare_picture
-    from startrack.output.picture.layers import Layers, add_layers
-    from startrack.output.picture.overlay import overlay_of
 
     value = last_value(outcome)
     bare = bare_picture(value)
     png = png_bytes(annotate(outcome, truth_enu_m, bare))
     write_atomically(path, add_layers(png, Layers(bare, overlay_of(value))), overwrite=True)
-
-
-def png_bytes(picture: NDArray[np.uint8]) -> bytes:
-    """A `picture` (H, W, 3), red, green, blue, as the content of a PNG file."""
-    import cv2
-
-    run_lengths = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]  # smaller and quicker for flat colours
-    ok, data = cv2.imencode(".png", picture[:, :, ::-1], run_lengths)
-    if not ok:
-        raise RuntimeError("OpenCV could not encode the picture as PNG")
-    return data.tobytes()
-
-
-def _json(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False, allow_nan=False)

@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from startrack.core.files import existing_folder
 from startrack.core.types import BadInput
 from startrack.exposure import PACKING_SUFFIXES, PICTURE_SUFFIXES, BagImage, list_bag_images, stem
-from startrack.output.write import PICTURES
+from startrack.output import PICTURES
 
 
 @dataclass(frozen=True, order=True)

@@ -14,7 +14,7 @@ from startrack.applications.batch.find import Image
 from startrack.chain import content_sha256
 from startrack.core.errors import BadInput
 from startrack.core.files import Locked, hold_lock
-from startrack.output.write import COMPANIONS, PICTURES, SKYLINE_FILES
+from startrack.output import COMPANIONS, PICTURES, SKYLINE_FILES
 
 JOB = "job_sha256"  # hash of a result's inputs (content of its files, flags, version); null: the next run repeats it
 INPUTS = "inputs"  # camera and terrain files that the result was made with: path from the image to SHA-256

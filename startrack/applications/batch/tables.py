@@ -25,47 +25,17 @@ from startrack.applications.batch.task import Record, Task, valid_stored_record
 from startrack.chain import STAGES
 from startrack.core.files import write_atomically
 from startrack.frames import R_from_quat_xyzw, tum_line
-from startrack.output.ecsv import Column, ecsv_text, format_values
-from startrack.output.views import columns
+from startrack.output import Column, TableColumn, ecsv_text, format_values, table_columns
 
 FORMAT = "startrack.manifest/1"
 TRAJECTORY = "trajectory.tum"
 PARQUET = "results.parquet"
 NOT_IN_TABLES = ("modes", "message", "warnings", "format")
 FILES = ("provenance.camera", "provenance.terrain")  # names or paths of files: the tables hold the stem, no path
-ASTROPY_UNITS = {
-    "m": "m", "m^2": "m2", "deg": "deg", "arcsec": "arcsec", "px": "pix", "s": "s", "mag/arcsec^2": "mag / arcsec2",
-}  # fmt: skip
-DATATYPES = {"d": "int64", "s": "string"}  # by the last letter of the format, else float64
-
-
-@dataclass(frozen=True)
-class TableColumn:
-    """A column of the results table."""
-
-    name: str
-    datatype: str
-    unit: str | None
-    form: str  # printf format
-    path: tuple[Any, ...]  # keys and indices that lead to the value in a record
-
-    def values(self, records: Sequence[Record]) -> list[Any]:
-        """One value a record, None if it has none."""
-        values = [_value_at(record, self.path) for record in records]
-        is_file = ".".join(map(str, self.path)) in FILES
-        return [value if value is None or not is_file else reference_stem(value) for value in values]
-
-
 COLUMNS = [
     *(TableColumn(name, "string", None, "%s", (name,)) for name in ("image", "status", "reason")),
-    *(
-        TableColumn(
-            column.name, DATATYPES.get(column.form[-1], "float64"), ASTROPY_UNITS.get(quantity.unit), column.form,
-            (*quantity.path.split("."), *column.at),
-        )
-        for quantity, column in columns()
-    ),
-]  # fmt: skip
+    *table_columns(),
+]
 
 
 @dataclass
@@ -137,8 +107,18 @@ def reference_stem(reference: str) -> str:
     return PurePath(reference.replace("\\", "/")).name.removesuffix(".toml")
 
 
+def column_values(column: TableColumn, records: Sequence[Record]) -> list[Any]:
+    """The values of a `column`, one a record, None if it has none."""
+    values = [column.value(record) for record in records]
+    is_file = ".".join(map(str, column.path)) in FILES
+    return [value if value is None or not is_file else reference_stem(value) for value in values]
+
+
 def _results(records: Sequence[Record]) -> bytes:
-    table = [Column(one.name, format_values(one.form, one.values(records)), one.datatype, one.unit) for one in COLUMNS]
+    table = [
+        Column(one.name, format_values(one.form, column_values(one, records)), one.datatype, one.unit)
+        for one in COLUMNS
+    ]
     return ecsv_text(table).encode()
 
 
@@ -151,7 +131,7 @@ def _parquet(records: Sequence[Record]) -> bytes:
     fields = [
         pa.field(one.name, types[one.datatype], metadata={"unit": one.unit} if one.unit else None) for one in COLUMNS
     ]
-    table = pa.table([one.values(records) for one in COLUMNS], schema=pa.schema(fields))
+    table = pa.table([column_values(one, records) for one in COLUMNS], schema=pa.schema(fields))
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink)
     return bytes(sink.getvalue().to_pybytes())
@@ -188,7 +168,7 @@ def _pose(record: Record) -> str:
 def _timings(records: Sequence[Record]) -> bytes:
     table = [Column("image", [record["image"] for record in records], "string")]
     for stage in STAGES:
-        times = [_value_at(record, ("timing_ms", stage)) for record in records]
+        times = [record.get("timing_ms", {}).get(stage) for record in records]
         table.append(Column(f"{stage}_ms", format_values("%.3f", times), "float64", "ms"))
     return ecsv_text(table).encode()
 
@@ -206,12 +186,3 @@ def _manifest(records: Sequence[Record], settings: dict[str, Any]) -> bytes:
     ]
     whole = {"format": FORMAT, "version": __version__, "settings": settings, "images": images}
     return (json.dumps(whole, indent=1, ensure_ascii=False) + "\n").encode()
-
-
-def _value_at(record: Any, path: Iterable[Any]) -> Any:
-    """The value in a record that keys and indices lead to; None if the record lacks it."""
-    for key in path:
-        if record is None or (isinstance(key, str) and key not in record):
-            return None
-        record = record[key]
-    return record

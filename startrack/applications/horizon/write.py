@@ -11,8 +11,7 @@ from startrack.core.files import check_output as check_file
 from startrack.core.files import write_atomically
 from startrack.core.types import Array, BadInput, MeasuredSkyline
 from startrack.frames import Site
-from startrack.output import png_bytes
-from startrack.output.skyline_table import skyline_table_text, skyline_texts_deg
+from startrack.output import png_bytes, skyline_table_text, skyline_texts_deg
 
 SUFFIXES = (".csv", ".ecsv", ".hrz", ".png")  # and none: the folder of a Stellarium landscape
 LANDSCAPE, HORIZON_LIST = "landscape.ini", "horizon.txt"
@@ -123,6 +122,6 @@ def _closed_deg(skyline: MeasuredSkyline) -> tuple[Array, Array]:
 
 def _picture(skyline: MeasuredSkyline) -> bytes:
     """The panorama as PNG."""
-    from startrack.output.picture.panorama import skyline_picture
+    from startrack.output import skyline_picture
 
     return png_bytes(skyline_picture(skyline))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from startrack.applications.prediction.draws import Place
 from startrack.core.types import Array, BadInput, Ints
 from startrack.frames import Site, enu_from_latlon, latlon_from_enu
-from startrack.output.picture.maps import nice_step
+from startrack.output import nice_step
 from startrack.rendering import Drive
 from startrack.terrain import EQUIRECTANGULAR, Projection, Raster, Terrain
 

@@ -11,11 +11,19 @@ from typing import Any
 from startrack import __version__
 from startrack.applications.prediction.draws import Conditions, predictor_of
 from startrack.applications.prediction.places import AreaCells, PathPoints
+from startrack.applications.prediction.quantities import (
+    FILTERED,
+    FORMAT,
+    SHARES_M,
+    SMOOTHED,
+    Cells,
+    median_or_none,
+    summarized,
+)
 from startrack.applications.prediction.run import variant_record
-from startrack.applications.prediction.statistics import Cells, median_or_none, summarized, with_odometry
+from startrack.applications.prediction.statistics import with_odometry
 from startrack.core.errors import BadOutput, length_text
 from startrack.frames import format_utc
-from startrack.output.quantities_prediction import FILTERED, FORMAT, SHARES_M, SMOOTHED
 from startrack.terrain import Terrain, load_terrain
 
 RECORD_FILE = "predict.json"

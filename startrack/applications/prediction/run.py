@@ -21,7 +21,8 @@ from startrack.applications.prediction.draws import (
     predictor_of,
 )
 from startrack.applications.prediction.places import area_cells, default_spacing_m
-from startrack.applications.prediction.statistics import Cells, predicted, share_within, summarized
+from startrack.applications.prediction.quantities import Cells, summarized
+from startrack.applications.prediction.statistics import predicted, share_within
 from startrack.camera import Camera, load_camera
 from startrack.core.chunk_store import ChunkStore
 from startrack.core.types import Array

@@ -1,20 +1,16 @@
-"""From draws to the predicted quantities of places, to those along a path with odometry, and to their summary."""
+"""From draws to the predicted quantities of places, and to those along a path with odometry."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 
 from startrack.applications.prediction.draws import Status
+from startrack.applications.prediction.quantities import CELL_QUANTITIES, ERROR_RATIO, FILTERED, SMOOTHED, Cells
 from startrack.core.chunk_store import Chunk
 from startrack.core.types import Array, Bools
 from startrack.estimation.filter import TrackFilter
 from startrack.estimation.observations import FrameEstimate, Observations, Steps
 from startrack.estimation.smoother import radius_holding, smooth
-from startrack.output.quantities_prediction import CELL_QUANTITIES, ERROR_RATIO, FILTERED, SHARE_KEYS, SMOOTHED
-
-Cells = dict[str, Array]  # the quantities of places (k,), by the names of CELL_QUANTITIES; and ERROR_RATIO
 
 
 def predicted(draws: Chunk) -> Cells:
@@ -25,7 +21,7 @@ def predicted(draws: Chunk) -> Cells:
     radius = np.median(np.where(status == Status.OK, draws["radius95_m"], np.inf), axis=1)
     radius[~np.isfinite(radius)] = np.nan
     found = (radius, *shares, *_ellipses(draws["covariance_m2"], located))
-    cells = {one.name: values for one, values in zip(CELL_QUANTITIES, found, strict=True)}
+    cells = {one.key: values for one, values in zip(CELL_QUANTITIES, found, strict=True)}
     return cells | {ERROR_RATIO: _error_ratio(draws, located)}
 
 
@@ -49,23 +45,6 @@ def _ellipses(covariance_m2: Array, located: Bools) -> tuple[Array, Array, Array
     east, north = axes[:, :, 1].T
     azimuth[known] = np.degrees(np.arctan2(east, north)) % 180.0
     return major, minor, azimuth
-
-
-def summarized(cells: Cells) -> dict[str, Any]:
-    """The summary of the places in `cells`, by the keys of the schema."""
-    radius, ratio = cells["radius95_m"], cells[ERROR_RATIO]
-    return {
-        "median_radius95_m": median_or_none(radius),
-        **{key: float(np.mean(radius < bound)) for key, bound in SHARE_KEYS.items()},
-        **{name: float(np.mean(cells[name])) for name in ("p_ok", "p_ambiguous", "p_refused")},
-        ERROR_RATIO: float(np.sqrt(np.nanmean(np.square(ratio)))) if np.isfinite(ratio).any() else None,
-    }
-
-
-def median_or_none(radius_m: Array) -> float | None:
-    """Median of radii (k,), NaN where there is no position; None if half of them or more are such."""
-    median = float(np.median(np.where(np.isnan(radius_m), np.inf, radius_m)))
-    return median if np.isfinite(median) else None
 
 
 def share_within(cells: Cells, radius95_m: float) -> float:

@@ -9,11 +9,28 @@ from typing import Any
 import numpy as np
 
 from startrack.applications.prediction.places import AreaCells, PathPoints
+from startrack.applications.prediction.quantities import (
+    CELL_QUANTITIES,
+    FILTERED,
+    PATH_QUANTITIES,
+    PLACE_QUANTITIES,
+    SMOOTHED,
+    SUMMARY_QUANTITIES,
+)
 from startrack.applications.prediction.report import RECORD_FILE, Report
 from startrack.core.files import write_atomically
 from startrack.frames import latlon_from_enu
-from startrack.output.ecsv import Column, ecsv_text, format_values
-from startrack.output.quantities_prediction import CELL_QUANTITIES, FILTERED, PATH_QUANTITIES, SMOOTHED
+from startrack.output import (
+    Column,
+    TableColumn,
+    comparison_picture,
+    ecsv_text,
+    format_values,
+    path_picture,
+    png_bytes,
+    prediction_picture,
+    quantity_columns,
+)
 from startrack.terrain import write_bands
 
 MAP, TABLE, PICTURE = "predict.tif", "predict.ecsv", "predict.png"
@@ -24,11 +41,9 @@ PATH_CURVES = {FILTERED: "images so far, and odometry", SMOOTHED: "all images, a
 
 def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
     """Write the files; those of an earlier prediction that this one does not make are removed."""
-    from startrack.output import png_bytes
-
     points, made = report.points, dict[str, bytes]()
     if isinstance(points, AreaCells):  # the quantities as bands, in the projection of the terrain's map
-        bands = {one.name: points.band(report.cells[one.name]) for one in CELL_QUANTITIES}
+        bands = {one.key: points.band(report.cells[one.key]) for one in CELL_QUANTITIES}
         write_bands(out / MAP, points.frame, bands)
     made[TABLE] = _table(report).encode()
     if plots:
@@ -49,45 +64,33 @@ def write_report(report: Report, out: Path, *, plots: bool) -> list[Path]:
 def _table(report: Report) -> str:
     """One row a place; with the distance along the path, if there is one."""
     points, site, (east_m, north_m) = report.points, report.terrain.site, report.points.position_m.T
-    columns = []
+    values = {**report.cells, "east_m": east_m, "north_m": north_m}
     if isinstance(points, PathPoints):
-        columns.append(_column("distance_m", points.distance_m, "m", "%.3f", "from the path's start"))
-    for name, values in (("east_m", east_m), ("north_m", north_m)):
-        columns.append(_column(name, values, "m", "%.3f", "of the camera from the terrain's origin"))
+        values["distance_m"] = points.distance_m
     if site is not None:
         up_m = np.asarray(report.terrain.ground_m(points.position_m)) + report.terrain.camera_height_m
-        angles = latlon_from_enu(site, east_m, north_m, up_m)
-        for name, angle in zip(("latitude_deg", "longitude_deg"), angles, strict=True):
-            columns.append(_column(name, np.degrees(angle), "deg", "%.9f", "of the camera"))
-    columns += [
-        _column(one.name, report.cells[one.name], one.unit, one.form, one.description)
-        for one in (*CELL_QUANTITIES, *PATH_QUANTITIES)
-        if one.name in report.cells
-    ]
-    return ecsv_text(columns)
+        values |= zip(
+            ("latitude_deg", "longitude_deg"), np.degrees(latlon_from_enu(site, east_m, north_m, up_m)), strict=True
+        )
+    return ecsv_text(quantity_columns((*PLACE_QUANTITIES, *CELL_QUANTITIES, *PATH_QUANTITIES), values))
 
 
 def _comparison_table(variants: list[dict[str, Any]]) -> str:
     """One row a camera and exposure: the summary of the same places."""
-    heads = {"exposure_s": ("s", "%.6g"), "limiting_v_mag": ("mag", "%.3f")}
-    columns = [Column("camera", [one["camera"] for one in variants], "string")]
-    columns += [_column(key, [one[key] for one in variants], unit, form) for key, (unit, form) in heads.items()]
-    columns += [
-        _column(key, [one["summary"][key] for one in variants], "m" if key.startswith("median") else "", "%.6g")
-        for key in variants[0]["summary"]
+    rows = [{**one, **one["summary"]} for one in variants]
+    columns = [
+        TableColumn("camera", "string", None, "%s", ("camera",)),
+        TableColumn("exposure_s", "float64", "s", "%.6g", ("exposure_s",)),
+        TableColumn("limiting_v_mag", "float64", "mag", "%.3f", ("limiting_v_mag",)),
+        *(column for quantity in SUMMARY_QUANTITIES for column in quantity.table_columns),
     ]
-    return ecsv_text(columns)
-
-
-def _column(name: str, values: Any, unit: str, form: str, description: str = "") -> Column:
-    known = [None if value is None or np.isnan(value) else float(value) for value in values]
-    return Column(name, format_values(form, known), "float64", unit or None, description=description)
+    return ecsv_text([
+        Column(one.name, format_values(one.form, [one.value(row) for row in rows]), one.datatype, one.unit)
+        for one in columns
+    ])  # fmt: skip
 
 
 def _picture(report: Report) -> Any:
-    from startrack.output.picture.prediction_map import prediction_picture
-    from startrack.output.picture.prediction_plot import path_picture
-
     points, cells = report.points, report.cells
     radius = np.where(np.isnan(cells["radius95_m"]), np.inf, cells["radius95_m"])
     title = f"How well one image of the stars gives the position: {report.terrain.name}"
@@ -99,8 +102,6 @@ def _picture(report: Report) -> Any:
 
 
 def _comparison_picture(report: Report) -> Any:
-    from startrack.output.picture.prediction_plot import comparison_picture
-
     return comparison_picture(report.variants, f"Cameras and exposures at the same places: {report.terrain.name}")
 
 

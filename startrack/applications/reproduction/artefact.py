@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from startrack.applications.reproduction.drawing import png_bytes
 from startrack.core.chunk_store import ChunkStore
 from startrack.core.files import write_atomically
-from startrack.output.ecsv import Column, ecsv_text
+from startrack.output import Column, ecsv_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -22,7 +22,7 @@ from startrack.applications.reproduction.simulator import (
     star_count,
 )
 from startrack.core.types import Array
-from startrack.output.ecsv import Column
+from startrack.output import Column
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

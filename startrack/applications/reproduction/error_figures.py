@@ -21,7 +21,7 @@ from startrack.applications.reproduction.methods import (
     format_errors,
 )
 from startrack.applications.reproduction.simulator import DIAMETER_M, star_count
-from startrack.output.ecsv import Column
+from startrack.output import Column
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

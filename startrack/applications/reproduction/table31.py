@@ -16,7 +16,7 @@ from startrack.applications.reproduction.methods import (
     format_errors,
 )
 from startrack.applications.reproduction.simulator import MAGNITUDE, Mistakes, star_count
-from startrack.output.ecsv import Column
+from startrack.output import Column
 
 DEEP_MAGNITUDE, DEEP_MISTAKES = 8.0, Mistakes(missed=0.10, false=0.01)
 WHOLE, HUNDREDTHS = "{:.0f} / {:.0f} / {:.0f}", "{:.2f} / {:.2f} / {:.1f}"

@@ -6,8 +6,7 @@ from startrack.applications.tracking.observed_frame import ObservedFrame, observ
 from startrack.applications.tracking.odometry import Odometry, read_odometry
 from startrack.applications.tracking.page import track_page
 from startrack.applications.tracking.picture import draw_track
-from startrack.applications.tracking.quantities import FRAME_QUANTITIES, frame_records
-from startrack.applications.tracking.schema import TRACK
+from startrack.applications.tracking.quantities import FRAME_QUANTITIES, TRACK, frame_records
 from startrack.applications.tracking.session import TrackSession
 from startrack.applications.tracking.track import (
     ODOMETRY_FLOOR_M,

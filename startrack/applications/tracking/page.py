@@ -12,8 +12,7 @@ from startrack.applications.tracking.quantities import FRAME_QUANTITIES, frame_r
 from startrack.applications.tracking.track import Track
 from startrack.applications.tracking.track_map import known_points, track_extent
 from startrack.core.types import Array
-from startrack.output.html import filled_frame
-from startrack.output.html.details import ground_map
+from startrack.output import filled_frame, ground_map
 
 HERE = Path(__file__).parent
 SCRIPTS = ("basics.js", "view.js", "input.js", "map.js")  # of the page of results

@@ -11,8 +11,8 @@ from startrack.applications.tracking.track import Track
 from startrack.applications.tracking.track_map import ODOMETRY, REFUSED, draw_track_map
 from startrack.core.errors import length_text
 from startrack.core.types import Array, Ints
-from startrack.output.picture.annotate import draw_legend_sample
-from startrack.output.picture.canvas import (
+from startrack.output import (
+    CAPTION_SIZE,
     DIM_INK,
     FAINT_INK,
     GRID,
@@ -23,10 +23,14 @@ from startrack.output.picture.canvas import (
     Box,
     Canvas,
     Colour,
+    MapView,
+    distance_text,
+    draw_distances,
+    draw_legend_sample,
+    draw_overview,
+    nice_step,
     wrap_text,
 )
-from startrack.output.picture.maps import CAPTION_SIZE, MapView, distance_text, draw_overview, nice_step
-from startrack.output.picture.terrain_picture import draw_distances
 
 TITLE_SIZE, GRAPH_TEXT_SIZE = 1.5 * CAPTION_SIZE, CAPTION_SIZE - 1.0
 LEFT_PX, TOP_PX, SIDE_PX, PANEL_PX = 70.0, 62.0, 860.0, 354.0  # of the map; width of the panel beside it

@@ -3,118 +3,147 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from startrack.applications.tracking.track import Track
+from startrack.applications.tracking.track import Track, TrackFrame
+from startrack.core.errors import Reason
 from startrack.core.types import Array
 from startrack.frames import format_utc, latlon_from_enu
+from startrack.output import (
+    ABSENT,
+    COUNT,
+    FLAG,
+    NUMBER,
+    POSITIVE,
+    TEXT,
+    Quantity,
+    Schema,
+    file_schema,
+    object_schema,
+    or_null,
+    record_from,
+    schema_of,
+)
 
+FORMAT = "startrack.track/1"
 STATUSES = ("used", "left_out", "refused")
+Value = Callable[["FrameValues"], Any]
 
 
-class TrackValues:
-    """A track with what is computed of its trajectories."""
+class FrameValues(NamedTuple):
+    """Frame k of a track, with what is computed of all its frames."""
 
-    def __init__(self, track: Track) -> None:
-        """Of a `track`."""
-        self.track = track
-
-    @cached_property
-    def latlon_deg(self) -> Array:
-        """(n, 2) of the smoothed positions."""
-        site = self.track.terrain.site
-        if site is None:
-            return np.full((len(self.track.frames), 2), np.nan)
-        return np.degrees(np.stack(latlon_from_enu(site, *self.track.smoothed.position_enu_m.T), axis=-1))
-
-
-@dataclass(frozen=True)
-class FrameQuantity:
-    """A quantity of a frame: a key of its object in track.json, and a column of track.ecsv."""
-
-    key: str
-    unit: str  # as docs/formats.md spells it
-    form: str  # printf
-    description: str
-    value: Callable[[TrackValues, int], Any]  # of frame k; None where it is not known
+    track: Track
+    latlon_rad: Array  # (n, 2) of the smoothed positions
+    k: int
 
     @property
-    def datatype(self) -> str:
-        """As ECSV names it."""
-        return {"s": "string", "d": "int64"}.get(self.form[-1], "float64")
+    def frame(self) -> TrackFrame:
+        """The frame."""
+        return self.track.frames[self.k]
+
+
+def _frame(
+    key: str, unit: str, form: str, description: str, value: Value, schema: Schema = NUMBER, known: bool = False
+) -> Quantity:
+    """A quantity of a frame; one that is not always `known` may be None."""
+    before = ABSENT if known else None
+    return Quantity(key, unit, FrameValues, value, description, schema, before, form=form)
+
+
+def _element(name: str, field: str, *at: int) -> Value:
+    """An element of an array of a trajectory at the frame; None where it is not finite."""
+    return lambda v: _number(getattr(getattr(v.track, name), field)[(v.k, *at)])
 
 
 def _number(value: Any) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _of(name: str, axis: int) -> Callable[[TrackValues, int], Any]:
-    return lambda values, k: _number(getattr(values.track, name).position_enu_m[k, axis])
+def _angle(axis: int) -> Value:
+    """Latitude or longitude (`axis` 0, 1) [deg]."""
+    return lambda v: _number(np.degrees(v.latlon_rad[v.k, axis]))
 
 
-def _covariance(name: str, row: int, column: int) -> Callable[[TrackValues, int], Any]:
-    return lambda values, k: _number(getattr(values.track, name).covariance_m2[k, row, column])
+def _quaternion(axis: int) -> Value:
+    return lambda v: None if v.frame.quat_xyzw_body_enu is None else float(v.frame.quat_xyzw_body_enu[axis])
 
 
-def _radius(name: str, key: str) -> Callable[[TrackValues, int], Any]:
-    return lambda values, k: _number(getattr(getattr(values.track, name), key)[k])
-
-
-def _quaternion(axis: int) -> Callable[[TrackValues, int], Any]:
-    def value(values: TrackValues, k: int) -> float | None:
-        found = values.track.frames[k].quat_xyzw_body_enu
-        return None if found is None else float(found[axis])
-
-    return value
-
-
-def _trajectory(name: str, prefix: str, when: str) -> list[FrameQuantity]:
-    position = [
-        FrameQuantity(f"{prefix}{axis}_m", "m", "%.4f", f"{axis} of the camera, {when}", _of(name, k))
-        for k, axis in enumerate(("east", "north", "up"))
-    ]
-    covariance = [
-        FrameQuantity(
-            f"{prefix}covariance_{text}_m2", "m^2", "%.6g", f"covariance ({text}) of that", _covariance(name, *at)
-        )
-        for text, at in (("ee", (0, 0)), ("en", (0, 1)), ("nn", (1, 1)))
-    ]
-    radii = [
-        FrameQuantity(f"{prefix}{key}", "m", "%.4f", f"circle about it that holds {part} %", _radius(name, key))
-        for key, part in (("radius95_m", "95"), ("radius999_m", "99.9"))
-    ]
-    return [*position, *covariance, *radii]
+def _trajectory(name: str, prefix: str, when: str) -> list[Quantity]:
+    elements = (("ee", (0, 0)), ("en", (0, 1)), ("nn", (1, 1)))
+    return [
+        *(
+            _frame(
+                f"{prefix}{axis}_m", "m", "%.4f", f"{axis} of the camera, {when}", _element(name, "position_enu_m", k)
+            )
+            for k, axis in enumerate(("east", "north", "up"))
+        ),
+        *(
+            _frame(
+                f"{prefix}covariance_{text}_m2", "m^2", "%.6g", f"covariance ({text}) of that",
+                _element(name, "covariance_m2", *at),
+            )
+            for text, at in elements
+        ),
+        *(
+            _frame(f"{prefix}{key}", "m", "%.4f", f"circle about it that holds {part} %", _element(name, key))
+            for key, part in (("radius95_m", "95"), ("radius999_m", "99.9"))
+        ),
+    ]  # fmt: skip
 
 
 FRAME_QUANTITIES = (
-    FrameQuantity("image", "", "%s", "name of the image", lambda v, k: v.track.frames[k].name),
-    FrameQuantity("time_utc", "", "%s", "middle of the exposure", lambda v, k: format_utc(v.track.frames[k].time_utc)),
-    FrameQuantity(
+    _frame("image", "", "%s", "name of the image", lambda v: v.frame.name, TEXT, known=True),
+    _frame("time_utc", "", "%s", "middle of the exposure", lambda v: format_utc(v.frame.time_utc), TEXT, known=True),
+    _frame(
         "status", "", "%s", "used; left_out: contradicts the track, or ambiguous to the end; refused: no position",
-        lambda v, k: v.track.frames[k].status,
+        lambda v: v.frame.status, {"enum": list(STATUSES)}, known=True,
     ),
-    FrameQuantity("reason", "", "%s", "of a frame that is not used", lambda v, k: v.track.frames[k].reason or None),
-    FrameQuantity("message", "", "%s", "the same in words", lambda v, k: v.track.frames[k].message or None),
-    FrameQuantity(
+    _frame(
+        "reason", "", "%s", "of a frame that is not used", lambda v: v.frame.reason or None,
+        {"enum": [None, *(one.value for one in Reason)]}, known=True,
+    ),
+    _frame("message", "", "%s", "the same in words", lambda v: v.frame.message or None, TEXT),
+    _frame(
         "slipped", "", "%d", "1: the odometry's move to this frame is judged wheel slip",
-        lambda v, k: int(k > 0 and bool(v.track.slipped[k - 1])),
+        lambda v: int(v.k > 0 and bool(v.track.slipped[v.k - 1])), {"enum": [0, 1]}, known=True,
     ),
     *_trajectory("smoothed", "", "by all frames"),
     *_trajectory("filtered", "filtered_", "by the frames up to this one"),
-    FrameQuantity("latitude_deg", "deg", "%.8f", "of the smoothed position", lambda v, k: _number(v.latlon_deg[k, 0])),
-    FrameQuantity("longitude_deg", "deg", "%.8f", "of the smoothed position", lambda v, k: _number(v.latlon_deg[k, 1])),
+    _frame("latitude_deg", "deg", "%.8f", "of the smoothed position", _angle(0)),
+    _frame("longitude_deg", "deg", "%.8f", "of the smoothed position", _angle(1)),
     *(
-        FrameQuantity(f"q{axis}_body_enu", "", "%.9f", "quaternion, enu to body (SciPy's order)", _quaternion(k))
+        _frame(f"q{axis}_body_enu", "", "%.9f", "quaternion, enu to body (SciPy's order)", _quaternion(k))
         for k, axis in enumerate("xyzw")
     ),
+)  # fmt: skip
+TRACK = file_schema(
+    "Trajectory of a camera",
+    object_schema({
+        "format": {"const": FORMAT},
+        "terrain": TEXT,
+        "at_rest": FLAG,
+        "odometry": or_null(
+            object_schema({"file": TEXT, "sigma": POSITIVE, "floor_m": POSITIVE}), "its file and stated errors"
+        ),
+        "counts": object_schema(dict.fromkeys(("frames", *STATUSES, "slips"), COUNT)),
+        "horizon": object_schema({"error_deg": NUMBER, "sigma_deg": POSITIVE}, "true horizon less the map's"),
+        "clock": or_null(object_schema({"offset_s": NUMBER, "sigma_s": POSITIVE}), "true time less the stated one"),
+        "depth": or_null(
+            object_schema({"error_percent": NUMBER, "sigma_percent": POSITIVE}),
+            "true depth of a crater less that of its file; null where that is taken as exact",
+        ),
+        "frames": {"type": "array", "items": schema_of(FRAME_QUANTITIES, units=True)},
+        "provenance": object_schema({"version": TEXT}),
+    }),
 )  # fmt: skip
 
 
 def frame_records(track: Track) -> list[dict[str, Any]]:
     """The objects of all frames in track.json; None where a quantity is not known."""
-    values = TrackValues(track)
-    return [{q.key: q.value(values, k) for q in FRAME_QUANTITIES} for k in range(len(track.frames))]
+    latlon_rad, site = np.full((len(track.frames), 2), np.nan), track.terrain.site
+    if site is not None:
+        latlon_rad = np.stack(latlon_from_enu(site, *track.smoothed.position_enu_m.T), axis=-1)
+    return [record_from(FRAME_QUANTITIES, FrameValues(track, latlon_rad, k)) for k in range(len(track.frames))]

@@ -7,7 +7,8 @@ import numpy as np
 from startrack.applications.tracking.track import Track, Trajectory
 from startrack.core.types import Array
 from startrack.estimation.smoother import SIGMAS_95
-from startrack.output.picture.canvas import (
+from startrack.output import (
+    CAPTION_SIZE,
     FAINT_INK,
     INK,
     POSITION,
@@ -17,11 +18,17 @@ from startrack.output.picture.canvas import (
     Box,
     Canvas,
     Colour,
+    MapView,
     box_around,
+    draw_contours,
+    draw_frame,
+    draw_ground,
+    ellipse_m,
+    ground_of_view,
+    map_view,
     mix_colours,
+    nice_step,
 )
-from startrack.output.picture.maps import CAPTION_SIZE, MapView, draw_frame, draw_ground, ellipse_m, map_view, nice_step
-from startrack.output.picture.relief import draw_contours, ground_of_view
 
 Legend = list[tuple[str, Colour, str]]  # kind of the mark, its colour, words
 

@@ -10,16 +10,12 @@ from typing import Any
 import numpy as np
 
 from startrack import __version__
-from startrack.applications.tracking.quantities import FRAME_QUANTITIES, frame_records
+from startrack.applications.tracking.quantities import FORMAT, FRAME_QUANTITIES, STATUSES, frame_records
 from startrack.applications.tracking.track import CrestHeights, Track, Trajectory
 from startrack.core.files import write_atomically
 from startrack.frames import R_from_quat_xyzw, tum_line
-from startrack.output.ecsv import Column, ecsv_text, format_values
-from startrack.output.geo import feature, geojson_text
-from startrack.output.write import json_text
+from startrack.output import Column, ecsv_text, feature, geojson_text, json_text, quantity_columns
 
-FORMAT = "startrack.track/1"
-UNITS = {"m": "m", "m^2": "m2", "deg": "deg"}  # as astropy spells them
 FILES = ("track.tum", "track.filtered.tum", "track.ecsv", "track.geojson", "track.json", "track.crests.ecsv")
 
 
@@ -37,7 +33,7 @@ def track_record(track: Track, odometry: dict[str, Any] | None = None) -> dict[s
         "at_rest": track.at_rest,
         "odometry": odometry,
         "counts": {
-            "frames": len(statuses), **{name: statuses.count(name) for name in ("used", "left_out", "refused")},
+            "frames": len(statuses), **{name: statuses.count(name) for name in STATUSES},
             "slips": int(np.count_nonzero(track.slipped)),
         },
         "horizon": {"error_deg": error_deg, "sigma_deg": sigma_deg},
@@ -83,13 +79,8 @@ def tum_text(track: Track, trajectory: Trajectory) -> str:
 
 def frames_table(records: Sequence[dict[str, Any]]) -> str:
     """track.ecsv: a row for each of the frames' `records`."""
-    return ecsv_text([
-        Column(
-            q.key, format_values(q.form, [record[q.key] for record in records]), q.datatype, UNITS.get(q.unit),
-            description=q.description,
-        )
-        for q in FRAME_QUANTITIES
-    ])  # fmt: skip
+    values = {q.key: [record[q.key] for record in records] for q in FRAME_QUANTITIES}
+    return ecsv_text(quantity_columns(FRAME_QUANTITIES, values))
 
 
 def crests_table(track: Track) -> str:

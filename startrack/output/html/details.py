@@ -4,24 +4,20 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.camera import load_camera
 from startrack.core.types import Array, BadInput
-from startrack.output.html.stars import read_ecsv
-from startrack.output.picture.annotate import PANEL_WIDTH
-from startrack.output.picture.backdrop import fit_to_canvas
-from startrack.output.picture.layers import layers_of
+from startrack.output.html.stars import Horizon, read_ecsv
+from startrack.output.picture.canvas import encoded_bytes
+from startrack.output.picture.overlay import layers_of
 from startrack.output.picture.relief import edge_cover, ground_cells, hill_shading
-from startrack.output.skyline_table import half_range_rad
+from startrack.output.tables import half_range_rad
 from startrack.terrain import Terrain, load_terrain
-
-Horizon = Callable[[Array], Array]  # azimuths (n,) to elevations (n,) [rad]
 
 RELIEF_CELLS = 420
 MARGIN = 1.03  # beyond the map, for its edge
@@ -136,42 +132,26 @@ def _relief(terrain: Terrain, centre_m: tuple[float, float], half_m: float) -> s
     return data_uri(np.stack([grey, grey, grey, cover], axis=-1))
 
 
-CARD = 80  # bytes of a line of a FITS header
 QUALITY = 82
 
 
-def picture_of(picture: Path, wcs: Path, record: dict[str, Any], longest_px: int) -> dict[str, Any] | None:
-    """`src` (a data URI), `width`, `height` [px of the picture], and, where the image's size is known, `scale`.
+def picture_of(picture: Path, longest_px: int) -> dict[str, Any] | None:
+    """`src` (a data URI), `width`, `height` [px of the picture], `scale` and `marks`; None without a picture.
 
     The image's pixel (x, y) lies at scale (x + 1/2), scale (y + 1/2) from the picture's top-left corner. `marks`: those
-    of `overlay_of`, to be drawn on the picture; absent where its file has no layers and shows its marks itself. None
-    without a picture.
+    of `overlay_of`, to be drawn on the picture. A file without layers is shown as it is, without these two.
     """
     data = picture.read_bytes() if picture.is_file() else b""
     layers = layers_of(data)
     if layers is not None:
         shown = _shown(layers.bare[:, :, ::-1], longest_px)
         return {**shown, "scale": round(shown["width"] / layers.overlay["size"][0], 6), "marks": layers.overlay}
-    whole = _decoded(data)
-    if whole is None or whole.shape[1] <= PANEL_WIDTH:
-        return None
-    size_px = image_size(wcs, record)
-    sky, known = _sky_part(whole, size_px)
-    shown = _shown(sky, longest_px)
-    return {**shown, "scale": round(shown["width"] / size_px[0], 6)} if known and size_px is not None else shown
-
-
-def _decoded(data: bytes) -> NDArray[np.uint8] | None:
-    import cv2
-
     whole = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
-    return None if whole is None else np.asarray(whole, dtype=np.uint8)
+    return None if whole is None else _shown(np.asarray(whole, dtype=np.uint8), longest_px)
 
 
 def _shown(sky: NDArray[np.uint8], longest_px: int) -> dict[str, Any]:
     """The picture (H, W, 3), blue first, for the page."""
-    import cv2
-
     shrink = min(1.0, longest_px / max(sky.shape[:2]))
     if shrink < 1:
         size = tuple(max(1, round(n * shrink)) for n in sky.shape[1::-1])
@@ -179,43 +159,7 @@ def _shown(sky: NDArray[np.uint8], longest_px: int) -> dict[str, Any]:
     return {"src": data_uri(sky), "width": sky.shape[1], "height": sky.shape[0]}
 
 
-def image_size(wcs: Path, record: dict[str, Any]) -> tuple[int, int] | None:
-    """Width and height of the image [px]: from NAME.wcs, the record's camera, or the camera file; None if unknown."""
-    if wcs.is_file():
-        cards = wcs.read_bytes().decode("ascii", "replace")
-        found = {cards[k : k + 8].strip(): cards[k + 10 : k + 30].strip() for k in range(0, len(cards), CARD)}
-        if found.get("IMAGEW", "").isdigit() and found.get("IMAGEH", "").isdigit():
-            return int(found["IMAGEW"]), int(found["IMAGEH"])
-    provenance = record.get("provenance")
-    camera = record.get("camera")
-    if isinstance(camera, dict) and isinstance(camera.get("size_px"), list) and len(camera["size_px"]) == 2:
-        return int(camera["size_px"][0]), int(camera["size_px"][1])
-    name = provenance.get("camera") if isinstance(provenance, dict) else None
-    if not isinstance(name, str):
-        return None
-    try:
-        return load_camera(name).size_px
-    except BadInput:  # its file is not here: the picture is shown without stars to point at
-        return None
-
-
 def data_uri(pixels: NDArray[np.uint8]) -> str:
     """A picture (H, W, 3), blue first, or (H, W, 4) with its cover, as a WebP data URI: a fifth of the PNG."""
-    import cv2
-
-    ok, data = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
-    if not ok:
-        raise RuntimeError("OpenCV could not encode the picture as WebP")
-    return f"data:image/webp;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
-
-
-def _sky_part(whole: NDArray[np.uint8], size_px: tuple[int, int] | None) -> tuple[NDArray[np.uint8], bool]:
-    """The part of the annotated picture that shows the exposure, and whether it shows nothing else."""
-    left = whole[:, : whole.shape[1] - PANEL_WIDTH]
-    if size_px is None:
-        return left, False
-    _, (width, height) = fit_to_canvas(size_px)
-    if width != left.shape[1] or height > left.shape[0]:
-        return left, False
-    top = (left.shape[0] - height) // 2
-    return left[top : top + height], True
+    data = encoded_bytes(".webp", pixels, cv2.IMWRITE_WEBP_QUALITY, QUALITY)
+    return f"data:image/webp;base64,{base64.b64encode(data).decode('ascii')}"

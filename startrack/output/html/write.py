@@ -21,20 +21,20 @@ from startrack.output.html.details import (
     picture_of,
     skyline_of,
 )
-from startrack.output.html.gather import Found, folder_of
 from startrack.output.html.rows import (
     COLUMNS,
+    Found,
     Position,
     errors_of,
     facts_of,
+    folder_of,
     headings,
     images_with_details,
     number_of,
     row_of,
     section_of,
 )
-from startrack.output.html.sectors import sectors_of
-from startrack.output.html.stars import star_table_of
+from startrack.output.html.stars import sectors_of, star_table_of
 
 HERE = Path(__file__).parent
 STYLES = ("page.css",)
@@ -149,7 +149,7 @@ def _detail(found: Found, terrains: TerrainsByName, size: tuple[int, int, int]) 
     return {
         "record": {key: value for key, value in record.items() if key not in ("matches", "detections", "camera")},
         "facts": facts_of(record),
-        "picture": picture_of(found.companion(".annotated.png"), found.companion(".wcs"), record, longest_px),
+        "picture": picture_of(found.companion(".annotated.png"), longest_px),
         "stars": stars,
         "horizon": line,
         "skyline": skyline,

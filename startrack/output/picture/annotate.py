@@ -38,9 +38,9 @@ from startrack.output.picture.marks import (
     name_stars,
     wall_mask,
 )
-from startrack.output.record import image_name
+from startrack.output.record import at_stage, image_name
+from startrack.output.text import Rows, rows
 from startrack.output.values import mode_text, modes_record
-from startrack.output.views import Rows, at_stage, rows
 
 PANEL_WIDTH, PANEL_HEIGHT = 620, 1160
 MARGIN = 28

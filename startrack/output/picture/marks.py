@@ -38,7 +38,7 @@ from startrack.output.picture.overlay import (
     project_azel,
     skyline_stretches_px,
 )
-from startrack.output.star_table import names_of, status_of
+from startrack.output.tables import names_of, status_of
 
 MAX_CIRCLES = 4000
 MAX_CROSSES = 150  # of hidden stars, the brightest: more would hide the picture

@@ -29,8 +29,7 @@ from startrack.output.picture.canvas import (
 )
 from startrack.output.picture.maps import nice_step
 from startrack.output.record import image_name
-from startrack.output.skyline_table import half_range_rad
-from startrack.output.star_table import status_of
+from startrack.output.tables import half_range_rad, status_of
 from startrack.terrain import Terrain
 
 WIDTH_PX, HEIGHT_PX, ENLARGED_PX = 1440, 420, 300

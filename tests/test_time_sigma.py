@@ -18,7 +18,7 @@ from startrack.applications.batch import locate_image
 from startrack.applications.batch.task import valid_stored_record
 from startrack.chain.inputs import exposure_input, time_sigma_input
 from startrack.cli.flags import FACTS
-from startrack.cli.inputs import flag_facts
+from startrack.cli.images import flag_facts
 from startrack.cli.main import main
 from startrack.core.errors import BadInput
 from startrack.core.types import TIME_SIGMA_S, Exposure

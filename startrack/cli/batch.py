@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli import flags
 from startrack.cli.batch_show import Counts, Halt, halt_on_signals, omission_lines, show_outcomes, summary
 from startrack.cli.flags import Command, Either, check_cluster, check_localizer, cores, flag
-from startrack.cli.inputs import absolute_facts
+from startrack.cli.images import absolute_facts
 from startrack.cli.progress import compile_kernels, prepare_reference
 from startrack.core.compilation import is_compiled
 from startrack.core.errors import EXIT_INTERNAL_ERROR, EXIT_OK, EXIT_STOPPED, INTERNAL_ERROR, BadInput

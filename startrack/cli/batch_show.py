@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from startrack.cli.outcomes import discard_stdout
+from startrack.cli.images import discard_stdout
 from startrack.cli.progress import progress
 from startrack.core.errors import EXIT_BAD_INPUT, INTERNAL_ERROR, exit_code_of
 

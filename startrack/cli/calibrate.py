@@ -18,8 +18,15 @@ from startrack.cli.camera_files import (
 )
 from startrack.cli.flag_types import amount, field_of_view_rad, limited, number, positive_number
 from startrack.cli.flags import Command, flag
-from startrack.cli.inputs import approximate_camera, check_one_time, checked_flag, flag_site, read, site_of
-from startrack.cli.outcomes import print_outcome
+from startrack.cli.images import (
+    approximate_camera,
+    check_one_time,
+    checked_flag,
+    flag_site,
+    print_outcome,
+    read,
+    site_of,
+)
 from startrack.core.compilation import announce_compilation
 from startrack.core.errors import NoSolution
 

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli import flags
 from startrack.cli.flag_types import limited, number
 from startrack.cli.flags import Command, Either, flag
-from startrack.cli.inputs import checked_flag, read, site_of
-from startrack.cli.outcomes import print_outcome, refusal
+from startrack.cli.images import checked_flag, print_outcome, read, refusal, site_of
 from startrack.cli.progress import progress
 from startrack.core.errors import BadInput, NoSolution
 from startrack.core.files import check_output, file_stem, read_text, resolve_named, write_atomically

@@ -11,8 +11,16 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli import flags
 from startrack.cli.flag_types import field_of_view_rad
 from startrack.cli.flags import Command, flag
-from startrack.cli.inputs import approximate_camera, check_fov, check_one_time, read, site_of
-from startrack.cli.outcomes import Outcome, print_outcome, refusal
+from startrack.cli.images import (
+    Outcome,
+    approximate_camera,
+    check_fov,
+    check_one_time,
+    print_outcome,
+    read,
+    refusal,
+    site_of,
+)
 from startrack.cli.progress import progress
 from startrack.core.errors import BadInput, BadOutput, NoSolution
 
@@ -60,12 +68,21 @@ def _measure(args: argparse.Namespace) -> Outcome:
     write_skyline(args.output, found.skyline, site, overwrite=args.overwrite)
     unknown = int((~found.skyline.known).sum())
     note = f"{unknown} of them interpolated" if needs_all_azimuths(args.output) and unknown else ""
-    return _record(args, found, note), _line(args, found, note)
+    record, skyline = _record(args, found, note), found.skyline
+    words = [f"{record['azimuths']['known']} of {len(skyline)} azimuths"]
+    if record["median_sigma_deg"] is not None:
+        words.append(f"median sigma {record['median_sigma_deg']:.2f}°")
+    words.append(f"{len(found.frames)} image{'s' if len(found.frames) > 1 else ''}")
+    line = "  ".join([Path(args.output).name, "ok", *words, *([note] if note else [])])
+    if args.verbose:
+        line += "".join(f"\n  {one.name}: {len(one.matched_star)} stars fit the lens" for one in found.frames)
+    return record, line
 
 
 def _record(args: argparse.Namespace, found: SkylineResult, note: str) -> dict[str, Any]:
-    skyline = found.skyline
-    known = skyline.known
+    import numpy as np
+
+    skyline, known = found.skyline, found.skyline.known
     return {
         "format": FORMAT,
         "status": "ok",
@@ -78,29 +95,10 @@ def _record(args: argparse.Namespace, found: SkylineResult, note: str) -> dict[s
             "known": int(known.sum()),
             **{name.replace(" ", "_"): int((skyline.source == name).sum()) for name in ("stars", "sky light", "both")},
         },
-        "median_sigma_deg": _median_deg(skyline.sigma_rad[known]),
+        "median_sigma_deg": float(np.degrees(np.median(skyline.sigma_rad[known]))) if known.any() else None,
         "lowest_deg": math.degrees(skyline.elevation_rad[known].min()) if known.any() else None,
         "highest_deg": math.degrees(skyline.elevation_rad[known].max()) if known.any() else None,
     }
-
-
-def _line(args: argparse.Namespace, found: SkylineResult, note: str) -> str:
-    skyline = found.skyline
-    words = [f"{int(skyline.known.sum())} of {len(skyline)} azimuths"]
-    sigma = _median_deg(skyline.sigma_rad[skyline.known])
-    words += [f"median sigma {sigma:.2f}°"] if sigma is not None else []
-    words += [f"{len(found.frames)} image{'s' if len(found.frames) > 1 else ''}"]
-    line = "  ".join([Path(args.output).name, "ok", *words, *([note] if note else [])])
-    if args.verbose:
-        for frame in found.frames:
-            line += f"\n  {frame.name}: {len(frame.matched_star)} stars fit the lens"
-    return line
-
-
-def _median_deg(values_rad: Any) -> float | None:
-    import numpy as np
-
-    return float(np.degrees(np.median(values_rad))) if len(values_rad) else None
 
 
 COMMANDS = (

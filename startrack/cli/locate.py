@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 from startrack.cli import flags
 from startrack.cli.flag_types import fields_of_view_rad, geo_formats
 from startrack.cli.flags import Command, check_localizer, flag
-from startrack.cli.inputs import camera_of, check_fov, read
-from startrack.cli.outcomes import Outcome, result_path, run_images
+from startrack.cli.images import Outcome, camera_of, check_fov, read, result_path, run_images
 from startrack.cli.progress import prepare_reference
 
 if TYPE_CHECKING:

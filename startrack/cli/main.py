@@ -18,7 +18,7 @@ from typing import Any
 
 from startrack import __version__
 from startrack.cli.flags import Command
-from startrack.cli.outcomes import discard_stdout, print_advice
+from startrack.cli.images import discard_stdout, print_advice
 from startrack.core.errors import (
     EXIT_BAD_INPUT,
     EXIT_INTERNAL_ERROR,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from startrack.cli import flags
 from startrack.cli.flag_types import amount, count, magnitude, positive_count, positive_number, seconds
 from startrack.cli.flags import Command, Either, check_cluster, check_localizer, cores, flag
-from startrack.cli.inputs import absolute_reference
+from startrack.cli.images import absolute_reference
 from startrack.cli.progress import compile_kernels, prepare, progress
 from startrack.core.compilation import is_compiled
 from startrack.core.errors import EXIT_STOPPED

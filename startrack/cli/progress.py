@@ -7,14 +7,13 @@ import logging
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from startrack.core.compilation import announce_compilation
 from startrack.core.errors import BadInput
 
 if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
-    from rich.progress import TaskID
 
     from startrack.terrain import Terrain
 
@@ -23,28 +22,21 @@ OFFSET_RAD = 0.01  # of these rays from the skyline
 
 
 class Progress:
-    """Progress of a command without output."""
+    """One row of a bar of rich; without a bar there is no output."""
 
-    def advance(self, steps: int = 1, text: str | None = None) -> None:
-        """Further steps are done; `text` names the current step."""
-
-    def update(self, completed: int, total: int) -> None:
-        """Numbers of steps done and of all steps."""
-
-
-class _Bar(Progress):
-    """One row of a bar of rich."""
-
-    def __init__(self, bar: RichProgress, row: TaskID) -> None:
+    def __init__(self, bar: RichProgress | None = None, row: Any = None) -> None:
         self._bar, self._row = bar, row
 
     def advance(self, steps: int = 1, text: str | None = None) -> None:
-        self._bar.advance(self._row, steps)
-        if text is not None:
-            self._bar.update(self._row, text=text)
+        """Further steps are done; `text` names the current step."""
+        fields: dict[str, Any] = {} if text is None else {"text": text}
+        if self._bar is not None:
+            self._bar.update(self._row, advance=steps, **fields)
 
     def update(self, completed: int, total: int) -> None:
-        self._bar.update(self._row, completed=completed, total=total)
+        """Numbers of steps done and of all steps."""
+        if self._bar is not None:
+            self._bar.update(self._row, completed=completed, total=total)
 
 
 @contextmanager
@@ -59,7 +51,7 @@ def progress(what: str, total: int | None = None, *, shown: bool = True) -> Iter
 
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with RichProgress(*columns, TextColumn("{task.fields[text]}"), console=Console(stderr=True), transient=True) as bar:
-        yield _Bar(bar, bar.add_task(what, total=total, text=""))
+        yield Progress(bar, bar.add_task(what, total=total, text=""))
 
 
 def prepare_reference(reference: str | None, args: argparse.Namespace) -> Terrain | None:

@@ -34,13 +34,11 @@ from startrack.cli.progress import progress
 from startrack.core.files import check_output
 
 if TYPE_CHECKING:
-    from startrack.core.types import Exposure
     from startrack.rendering import Drive, Scene, Series, Truth
 
 SUFFIXES = {"png": ".png", "tiff": ".tif", "fits": ".fits"}
 KNOWN_SUFFIXES = {".png", ".tif", ".tiff", ".fits", ".fit", ".fts"}
 CATALOG_V_MAG = 10.0  # catalogue stars drawn when there are no faint ones to go with them
-PROGRESS_FROM = 3  # images
 ANGLES = ("heading", "pitch", "roll")
 SETTINGS = (  # flags that determine the pixels, without those of the pose and of the files' names
     "max_tilt", "sky_mag", "sky_gradient", "sky_gradient_azimuth", "wall_reflectance", "faint_stars", "no_faint_stars",
@@ -50,12 +48,16 @@ SETTINGS = (  # flags that determine the pixels, without those of the pose and o
 
 def run(args: argparse.Namespace) -> int:
     """Render and write the images; 0. Raises BadInput for files and values that cannot be used, BadOutput for paths."""
+    from startrack.rendering import truth_paths
+
     drive = read_drive_flags(args)
     images = _targets(args, count_images(args, drive))
     series = _series(args, drive)
-    _check_targets(images, args)
+    written = (p for image in images for p in (image, image.with_suffix(".json"), *truth_paths(image)))
+    for path in (*written, *trajectory_paths(args)):  # all first: nothing is written half-way to an error
+        check_output(path, overwrite=args.overwrite)
     poses = [series.pose(number) for number in range(len(images))] if args.every is not None else []
-    with progress("render", len(images), shown=len(images) >= PROGRESS_FROM) as bar:
+    with progress("render", len(images), shown=len(images) > 2) as bar:
         for number, image in enumerate(images):
             summary = _render_one(args, series, number, image)
             if args.json or not args.quiet:
@@ -70,24 +72,13 @@ def _targets(args: argparse.Namespace, count: int) -> list[Path]:
     """The images to write."""
     if args.output is not None and count != 1:
         args.usage_error(f"--output names one image, but --count is {count}: give --dir")
-    if args.output is not None:
-        images = [Path(args.output)]
-        if images[0].suffix.lower() not in KNOWN_SUFFIXES:
-            args.usage_error(f"--output {args.output}: the suffix must be .png, .tif or .fits")
-    else:
+    if args.output is None:
         stem = f"{Path(args.terrain).name.removesuffix('.toml')}-{args.seed}"
         digits = max(3, len(str(count - 1)))
-        images = [Path(args.dir) / f"{stem}-{k:0{digits}d}{SUFFIXES[args.format]}" for k in range(count)]
-    return images
-
-
-def _check_targets(images: list[Path], args: argparse.Namespace) -> None:
-    """Check every file first, so that nothing is written half-way to an error. Raises BadOutput."""
-    from startrack.rendering import truth_paths
-
-    ours = (p for image in images for p in (image, image.with_suffix(".json"), *truth_paths(image)))
-    for path in (*ours, *trajectory_paths(args)):
-        check_output(path, overwrite=args.overwrite)
+        return [Path(args.dir) / f"{stem}-{k:0{digits}d}{SUFFIXES[args.format]}" for k in range(count)]
+    if Path(args.output).suffix.lower() not in KNOWN_SUFFIXES:
+        args.usage_error(f"--output {args.output}: the suffix must be .png, .tif or .fits")
+    return [Path(args.output)]
 
 
 def _series(args: argparse.Namespace, drive: Drive | None) -> Series:
@@ -113,13 +104,17 @@ def _series(args: argparse.Namespace, drive: Drive | None) -> Series:
 
 def _render_one(args: argparse.Namespace, series: Series, number: int, image: Path) -> dict[str, Any]:
     """Render, write image, sidecar and truth, and return the text about it."""
+    from startrack.core.types import TIME_SIGMA_S
     from startrack.exposure import with_facts, write_exposure, write_sidecar
     from startrack.rendering import render, write_truth
 
     scene, rng = series.scene(number, image.stem)
     exposure, truth = render(scene, rng=rng)
     stated = None if scene.time_utc is None else scene.time_utc - timedelta(seconds=args.clock_offset)
-    exposure = _with_stated_clock(with_facts(exposure, time_utc=stated), args)
+    exposure = with_facts(exposure, time_utc=stated)
+    if args.time_sigma is not None or args.clock_offset != 0.0:  # else a right clock, which is exact
+        sigma_s = TIME_SIGMA_S if args.time_sigma is None else args.time_sigma
+        exposure = replace(exposure, time_sigma_s=sigma_s, time_sigma_is_stated=args.time_sigma is not None)
     pose = {**_pose(scene, truth), "clock_offset_s": args.clock_offset}
     write_exposure(image, exposure, overwrite=args.overwrite)
     write_sidecar(image, exposure, overwrite=args.overwrite)
@@ -127,17 +122,6 @@ def _render_one(args: argparse.Namespace, series: Series, number: int, image: Pa
     facts = {**pose, "seed": args.seed, "number": number, "catalog": series.catalog.name, "settings": settings}
     pose_path, table_path = write_truth(image, truth, facts, to_v_mag=args.truth_mag, overwrite=args.overwrite)
     return {"image": str(image), "truth": str(pose_path), "table": str(table_path), **facts}
-
-
-def _with_stated_clock(exposure: Exposure, args: argparse.Namespace) -> Exposure:
-    """The exposure with `--time-sigma`; without it a right clock is exact, and nothing is stated of a wrong one."""
-    from startrack.core.types import TIME_SIGMA_S
-
-    if args.time_sigma is None and args.clock_offset == 0.0:
-        return exposure
-
-    sigma_s = TIME_SIGMA_S if args.time_sigma is None else args.time_sigma
-    return replace(exposure, time_sigma_s=sigma_s, time_sigma_is_stated=args.time_sigma is not None)
 
 
 def _pose(scene: Scene, truth: Truth) -> dict[str, Any]:

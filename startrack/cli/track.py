@@ -9,8 +9,7 @@ from pathlib import Path
 from startrack.cli import flags
 from startrack.cli.flag_types import seconds
 from startrack.cli.flags import Command, flag
-from startrack.cli.inputs import flag_facts
-from startrack.cli.outcomes import worst_code
+from startrack.cli.images import flag_facts, worst_code
 from startrack.cli.track_run import TrackRun
 from startrack.core.errors import BadInput, BadOutput
 from startrack.core.files import make_folder, printable

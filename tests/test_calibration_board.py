@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from startrack.applications.calibration.board import calibrate_board
-from startrack.applications.calibration.board_pose import Board, BoardState, Corners, find_corners, initial_board_state
-from startrack.applications.calibration.lens_fit import fit_state
+from startrack.applications.calibration.board import Board, Corners, calibrate_board, find_corners
+from startrack.applications.calibration.board_pose import BoardState, initial_board_state
 from startrack.camera import Camera, KannalaBrandt, load_camera
 from startrack.cli.main import main
 from startrack.core.types import Exposure, NotIdentified
+from startrack.estimation.lens_fit import fit_state
 from startrack.estimation.normal_equations import observations
 from startrack.exposure import write_exposure
 

@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from test_calibration_fit import CENTRE_PX, FOCAL_PX, ROUGH, simulate_frames
 
 from startrack.applications.calibration import fit_lens, observations
-from startrack.applications.calibration.region_growing import JointFit
 from startrack.applications.calibration.shared_errors import FLOOR_PX, birge_ratio, nights, widen_covariance
 from startrack.applications.calibration.verify import SIGNIFICANT_SIGMAS, difference_px
 from startrack.camera import Camera, cap_grid, projection_covariance_px2
 from startrack.core.types import Array
+from startrack.estimation.joint_fit import JointFit
 
 SIGMA_PX, STARS = 0.15, 500
 FIRST_NIGHT = datetime(2030, 6, 1, 22, tzinfo=UTC)

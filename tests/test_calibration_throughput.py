@@ -11,11 +11,11 @@ import pytest
 
 from startrack.applications.calibration import KnownSensor, calibrate
 from startrack.applications.calibration.photometry import measure_photometry
-from startrack.applications.calibration.photon_transfer import fit_photon_transfer
-from startrack.applications.calibration.throughput import StarFluxes, airmass, fit_throughput
+from startrack.applications.calibration.sensor import fit_photon_transfer
+from startrack.applications.calibration.throughput import StarFluxes, fit_throughput
 from startrack.applications.calibration.verify import difference_px
 from startrack.camera import Camera, KannalaBrandt, Sensor, cap_grid
-from startrack.catalog import load_catalog
+from startrack.catalog import airmass, load_catalog
 from startrack.core.types import Exposure
 from startrack.rendering import Series, render
 from startrack.terrain import load_terrain

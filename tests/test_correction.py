@@ -16,7 +16,7 @@ from render_helpers import FISHEYE, SENSOR
 from scipy.spatial import cKDTree
 from scipy.stats import kstest
 
-from startrack.applications.calibration.photon_transfer import fit_photon_transfer
+from startrack.applications.calibration.sensor import fit_photon_transfer
 from startrack.camera import save_camera
 from startrack.catalog import load_catalog
 from startrack.chain import job_sha256, pipeline

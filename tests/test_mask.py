@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from render_helpers import FISHEYE
 
-from startrack.applications.calibration.obstruction import PredictedStars, obstructed_cells
+from startrack.applications.calibration.static_parts import PredictedStars, obstructed_cells
 from startrack.camera import load_camera, save_camera
 from startrack.catalog import StarCatalog, load_catalog
 from startrack.chain import Located, are_unchanged, input_hashes, pipeline

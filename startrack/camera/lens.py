@@ -133,6 +133,11 @@ class Lens(ABC):
         return cast(Self, lens) if lens.model == cls.model else cls()
 
     @classmethod
+    def typical_shapes(cls) -> tuple[Lens, ...]:
+        """Lenses of this kind that a calibration without a camera file tries first."""
+        return (cls(),)
+
+    @classmethod
     def fit_text(cls, size: int) -> str:
         """Name of the lens with `size` free parameters in reports."""
         return f"{cls.label} with {', '.join(cls.parameter_names[:size])}" if size else cls.label

@@ -108,6 +108,11 @@ class KannalaBrandt(Lens):
         return cls(tuple((c[1:] / c[0]).tolist())), float(c[0])
 
     @classmethod
+    def typical_shapes(cls) -> tuple[Lens, ...]:
+        """Equidistant, equisolid, stereographic and orthographic lenses as short polynomials."""
+        return cls(), cls((-1 / 24,)), cls((1 / 12, 1 / 120)), cls((-1 / 6, 1 / 120))
+
+    @classmethod
     def fit_text(cls, size: int) -> str:
         """Name of the lens with `size` coefficients in reports."""
         return f"{cls.label} with {size} k"

@@ -1,10 +1,20 @@
-"""Stars and bodies: Hipparcos, Gaia's fainter stars, names, and the Sun, planets, Moon and Earth."""
+"""Stars (Hipparcos, Gaia's fainter ones) and their names, the Sun, planets, Moon and Earth; the sky over a site."""
 
 from startrack.catalog.gaia import has_deep_catalog, hipparcos_rows_in_deep, load_deep_catalog
 from startrack.catalog.hipparcos import StarCatalog, load_catalog, proper_name_designations, star_names
+from startrack.catalog.sky import (
+    LOWEST_STAR_RAD,
+    MOST_BELOW_PART,
+    Sky,
+    airmass,
+    apparent_elevation_rad,
+    is_below_horizon,
+    sky_at,
+)
 from startrack.catalog.solar_system import bodies
 
 __all__ = [
-    "StarCatalog", "bodies", "has_deep_catalog", "hipparcos_rows_in_deep", "load_catalog", "load_deep_catalog",
-    "proper_name_designations", "star_names",
+    "LOWEST_STAR_RAD", "MOST_BELOW_PART", "Sky", "StarCatalog", "airmass", "apparent_elevation_rad", "bodies",
+    "has_deep_catalog", "hipparcos_rows_in_deep", "is_below_horizon", "load_catalog", "load_deep_catalog",
+    "proper_name_designations", "sky_at", "star_names",
 ]  # fmt: skip

@@ -17,7 +17,7 @@ from startrack.chain.inputs import (
 )
 from startrack.chain.measurement import COMPLETE_V_MAG
 from startrack.chain.orientation import stars_at
-from startrack.chain.pipeline import NO_TIME, detect, identify, identify_blind, locate, locate_exposure
+from startrack.chain.pipeline import detect, identify, identify_blind, locate, locate_exposure
 from startrack.chain.run import with_timing
 from startrack.chain.sky_refinement import EDGE_SIGMA_PX
 from startrack.chain.stages import (
@@ -41,7 +41,6 @@ __all__ = [
     "COMPLETE_V_MAG",
     "EDGE_SIGMA_PX",
     "MISSING",
-    "NO_TIME",
     "STAGES",
     "Detected",
     "Identified",

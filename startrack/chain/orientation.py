@@ -21,7 +21,7 @@ from startrack.core.compilation import announce_compilation
 from startrack.core.types import Array, BadInput, NotIdentified, Stars, TooFewStars
 from startrack.detection import Detector
 from startrack.estimation.attitude import AttitudeFit, solve_attitude
-from startrack.exposure import are_fractions
+from startrack.exposure import NO_TIME, are_fractions
 from startrack.frames import Site, observer_velocity_m_s
 from startrack.identification import Identifier
 from startrack.identification.second_field import check_single_field
@@ -29,10 +29,6 @@ from startrack.identification.second_field import check_single_field
 if TYPE_CHECKING:
     from startrack.catalog import StarCatalog
 
-NO_TIME = (
-    "the mid-exposure time is not known: give --time UTC, a sidecar NAME.json with time_utc, or a header with it; "
-    "nothing is guessed"
-)
 LEAST_SHIFT_PX, MOST_SHIFT_PX = 0.1, 8.0  # of the image's centre; a larger one is another camera
 SHIFT_CHI2 = 30.0  # of a shift in two coordinates: one in three million by chance
 SHIFT_ROUNDS = 3  # stars that the shift made outliers come back

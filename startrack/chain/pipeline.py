@@ -12,7 +12,6 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.chain.measurement import measure_evidence, remeasure_near_skyline, sky_step_at
 from startrack.chain.orientation import (
-    NO_TIME,
     check_inputs,
     check_one_attitude,
     detect_sources,
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from startrack.catalog import StarCatalog
     from startrack.evidence import SkyStep
 
-__all__ = ["NO_TIME", "Settings", "detect", "identify", "identify_blind", "locate", "locate_exposure"]
+__all__ = ["Settings", "detect", "identify", "identify_blind", "locate", "locate_exposure"]
 
 
 def locate(

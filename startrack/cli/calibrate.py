@@ -48,8 +48,7 @@ other programs   startrack calibrate convert CAMERA.toml --to ros            ros
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate; the exit code."""
-    from startrack.applications.calibration import calibrate
-    from startrack.applications.calibration.record import refusal_dict
+    from startrack.applications.calibration import calibrate, refusal_dict
     from startrack.catalog import load_catalog
 
     check_one_time(args)
@@ -94,8 +93,7 @@ def _known_sensor(args: argparse.Namespace) -> KnownSensor:
 
 def _write_calibration(args: argparse.Namespace, out: Path, found: Calibration, masks: list[str | Mask | None]) -> int:
     """Write and print a calibration of images with `masks`; the exit code."""
-    from startrack.applications.calibration.record import calibration_dict, summary
-    from startrack.applications.calibration.report import write_report
+    from startrack.applications.calibration import calibration_dict, summary, write_report
 
     record = calibration_dict(found)
     line = _line_with_message(summary(found, out.name), record)
@@ -120,8 +118,7 @@ def _line_with_message(line: str, record: dict[str, Any]) -> str:
 
 def run_board(args: argparse.Namespace) -> int:
     """Calibrate with the board; the exit code."""
-    from startrack.applications.calibration.board import board_dict, board_line, calibrate_board
-    from startrack.applications.calibration.board_pose import Board
+    from startrack.applications.calibration import Board, board_dict, board_line, calibrate_board
     from startrack.camera import save_camera
 
     try:

@@ -36,12 +36,12 @@ CAMERA_OUTPUT = (flags.FILE, NAME, flags.DIR, flags.OVERWRITE, flags.NO_PLOTS, f
 
 def run_show(args: argparse.Namespace) -> int:
     """Print the contents of camera files; 0."""
-    from startrack.applications.calibration.record import camera_properties, camera_text
+    from startrack.applications.calibration import camera_properties, camera_summary
     from startrack.camera import load_camera
 
     for name in args.cameras:
         camera = load_camera(name)
-        print(json.dumps(camera_properties(camera)) if args.json else camera_text(camera))
+        print(json.dumps(camera_properties(camera)) if args.json else camera_summary(camera))
     return 0
 
 
@@ -84,7 +84,7 @@ def run_convert(args: argparse.Namespace) -> int:
 
 def run_verify(args: argparse.Namespace) -> int:
     """Check a camera file against exposures of the stars; the exit code of the worst."""
-    from startrack.applications.calibration.verify import verify, verify_dict, verify_line
+    from startrack.applications.calibration import verify, verify_dict, verify_line
     from startrack.camera import load_camera
     from startrack.catalog import load_catalog
 
@@ -145,7 +145,7 @@ def check_camera_output(args: argparse.Namespace) -> Path:
 
 def _has_site(camera_file: Path) -> bool | None:
     """Whether the record beside a camera file states a site on the Earth; None where no record states that."""
-    from startrack.applications.calibration.record import REFRACTION_REMOVED
+    from startrack.applications.calibration import REFRACTION_REMOVED
 
     refraction = _recorded(camera_file, "lens", "refraction")
     return None if refraction is None else bool(refraction == REFRACTION_REMOVED)

@@ -45,9 +45,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _measure(args: argparse.Namespace) -> Outcome:
     """The record and the line of a skyline that was measured and written."""
-    from startrack.applications.horizon.frames import orient_frames
-    from startrack.applications.horizon.measure import measure_frames
-    from startrack.applications.horizon.write import check_output, needs_all_azimuths, write_skyline
+    from startrack.applications.horizon import (
+        check_output,
+        measure_frames,
+        needs_all_azimuths,
+        orient_frames,
+        write_skyline,
+    )
     from startrack.catalog import load_catalog
 
     check_output(args.output, overwrite=args.overwrite)

@@ -19,7 +19,7 @@ from startrack.exposure.bag_images import (
 from startrack.exposure.correct import correct_exposure, read_dark, read_flat
 from startrack.exposure.decode_file import decode_bytes
 from startrack.exposure.decoded import are_fractions
-from startrack.exposure.facts import Facts, check_time_sigma_s, with_facts
+from startrack.exposure.facts import NO_TIME, Facts, check_time_sigma_s, with_facts
 from startrack.exposure.mask import combine_masks, mask_of, read_mask, touch_masked
 from startrack.exposure.read import exposure_of, exposure_of_decoded, read_exposure
 from startrack.exposure.sidecar import (
@@ -35,9 +35,9 @@ from startrack.exposure.sidecar import (
 from startrack.exposure.write import write_exposure, write_sidecar
 
 __all__ = [
-    "IMAGE_KEYS", "PACKING_SUFFIXES", "PICTURE_SUFFIXES", "RAW_SUFFIXES", "SIDECAR", "BagImage", "Facts", "Sidecar",
-    "are_fractions", "check_time_sigma_s", "choose_bag_image", "combine_masks", "correct_exposure", "decode_bytes",
-    "exposure_of", "exposure_of_decoded", "is_bag", "list_bag_images", "mask_of", "read_bag_exposures",
-    "read_bag_image", "read_dark", "read_exposure", "read_flat", "read_mask", "sidecar_of", "split_bag_path", "stem",
-    "touch_masked", "with_facts", "write_exposure", "write_sidecar",
+    "IMAGE_KEYS", "NO_TIME", "PACKING_SUFFIXES", "PICTURE_SUFFIXES", "RAW_SUFFIXES", "SIDECAR", "BagImage", "Facts",
+    "Sidecar", "are_fractions", "check_time_sigma_s", "choose_bag_image", "combine_masks", "correct_exposure",
+    "decode_bytes", "exposure_of", "exposure_of_decoded", "is_bag", "list_bag_images", "mask_of",
+    "read_bag_exposures", "read_bag_image", "read_dark", "read_exposure", "read_flat", "read_mask", "sidecar_of",
+    "split_bag_path", "stem", "touch_masked", "with_facts", "write_exposure", "write_sidecar",
 ]  # fmt: skip

@@ -19,6 +19,10 @@ from startrack.core.types import BadInput, Exposure, Mask
 from startrack.exposure.sidecar import BAYER_PATTERNS, NAMED_FILES, NUMBERS, SIDECAR, Sidecar, resolve_path
 from startrack.frames import as_utc, parse_utc
 
+NO_TIME = (
+    "the mid-exposure time is not known: give --time UTC, a sidecar NAME.json with time_utc, or a header with it; "
+    "nothing is guessed"
+)
 HEADER_OF = {  # the sidecar's key of a fact and its name in a header: FITS keyword, PNG text chunk, TIFF description
     "time_utc": "DATE-AVG", "time_sigma_s": "STTSIG", "exposure_s": "EXPTIME", "camera": "STCAMERA",
     "terrain": "STTERRAI", "bayer_pattern": "BAYERPAT",

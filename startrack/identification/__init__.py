@@ -2,6 +2,9 @@
 
 from startrack.identification.centroids import IdentifiedCentroids, identify_centroids
 from startrack.identification.lost_in_space import Identifier
-from startrack.identification.unknown_lens import UnknownLensSolution, identify_unknown_lens
+from startrack.identification.unknown_lens import WIDE_FIELD_RAD, UnknownLensSolution, identify_unknown_lens
 
-__all__ = ["IdentifiedCentroids", "Identifier", "UnknownLensSolution", "identify_centroids", "identify_unknown_lens"]
+__all__ = [
+    "WIDE_FIELD_RAD", "IdentifiedCentroids", "Identifier", "UnknownLensSolution", "identify_centroids",
+    "identify_unknown_lens",
+]  # fmt: skip

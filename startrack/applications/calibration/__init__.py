@@ -1,18 +1,30 @@
-"""Camera calibration from the stars: lens with covariance, throughput, sensor, and acceptance checks."""
+"""Camera calibration from the stars: lens with covariance, throughput, sensor, and acceptance checks.
 
+`run.py` tells the story; `lens_fit.py` and `joint_fit.py` of the estimation fit the lens. Boards: `board.py`.
+"""
+
+from startrack.applications.calibration.board import Board, BoardCalibration, calibrate_board
 from startrack.applications.calibration.initial_camera import initial_state
-from startrack.applications.calibration.lens_fit import LensFit, fit_lens
 from startrack.applications.calibration.photometry import KnownSensor
+from startrack.applications.calibration.record import (
+    REFRACTION_REMOVED,
+    board_dict,
+    board_line,
+    calibration_dict,
+    camera_properties,
+    camera_summary,
+    refusal_dict,
+    summary,
+)
+from startrack.applications.calibration.report import write_report
 from startrack.applications.calibration.run import Calibration, calibrate
+from startrack.applications.calibration.verify import Verification, verify, verify_dict, verify_line
+from startrack.estimation.lens_fit import LensFit, fit_lens
 from startrack.estimation.normal_equations import Observations, observations
 
 __all__ = [
-    "Calibration",
-    "KnownSensor",
-    "LensFit",
-    "Observations",
-    "calibrate",
-    "fit_lens",
-    "initial_state",
-    "observations",
-]
+    "REFRACTION_REMOVED", "Board", "BoardCalibration", "Calibration", "KnownSensor", "LensFit", "Observations",
+    "Verification", "board_dict", "board_line", "calibrate", "calibrate_board", "calibration_dict",
+    "camera_properties", "camera_summary", "fit_lens", "initial_state", "observations", "refusal_dict", "summary",
+    "verify", "verify_dict", "verify_line", "write_report",
+]  # fmt: skip

@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.applications.calibration.frame import Frame
-from startrack.applications.calibration.initial_camera import fit_attitudes, mirror_camera
-from startrack.applications.calibration.matching import FrameMatches, match_frame
-from startrack.applications.calibration.region_growing import JointFit
+from startrack.applications.calibration.initial_camera import fit_attitudes
 from startrack.camera import Camera, cap_grid
-from startrack.core.types import Array, Ints
+from startrack.catalog import MOST_BELOW_PART, StarCatalog, is_below_horizon, sky_at
+from startrack.core.types import Array, Bools, Ints
 from startrack.estimation.false_alarm import log_p_value_poisson
+from startrack.estimation.frame_matching import Frame, FrameMatches, match_frame
+from startrack.estimation.joint_fit import JointFit
 from startrack.estimation.normal_equations import Observations
-from startrack.frames import R_from_rotvec
+from startrack.frames import R_from_rotvec, Site
 
-MIN_MATCHES = 40
+MIN_STARS_MATCHED = 40
 SMALLEST_FRACTION = 0.6
 LARGEST_HELD_OUT_RMS_PX = 1.0
 LARGEST_MAP_SIGMA_PX = 0.5
 MAX_FALSE_ALARM = 1e-9
-RINGS = 4
-SECTORS = 8
+IMAGE_RINGS, IMAGE_SECTORS = 4, 8
 STARS_PER_RING = 3
 STARS_PER_SECTOR = 2
-MIN_SECTORS = 5
+MIN_IMAGE_SECTORS = 5
 WRONG_ROTATIONS_RAD = tuple(np.radians((-31.0, -17.0, 13.0, 29.0)))  # attitudes at which only chance matches
 MIN_CHANCE_MATCHES = 0.5
 
@@ -58,33 +57,61 @@ class Checked:
         """Whether the camera may be used."""
         return not self.failed_checks
 
+    @property
+    def message(self) -> str:
+        """Failed checks and advice; empty where the calibration is accepted."""
+        return "; ".join(f"{c.name} is {c.value:.3g}, required {c.limit}: {c.advice}" for c in self.failed_checks)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefusedImage:
+    """An image that the calibration does not use."""
+
+    name: str
+    reason: str
+    message: str
+
 
 @dataclass(frozen=True)
 class Coverage:
-    """Stars by ring and sector of the calibrated cap."""
+    """The used stars of all frames by ring (equal widths) and sector (clockwise from image right)."""
 
-    ring_edges_rad: Array  # (rings + 1,)
+    ring_edges_rad: Array  # (rings + 1,) to the calibrated angle
     stars: Array  # (rings, sectors) counts
+    ring_rms_px: Array  # (rings,) held-out RMS distance; NaN where there is no star
+    rms_px: Array  # (rings, sectors) the same
 
 
 def star_coverage(joint: JointFit) -> Coverage:
-    """Counts of the used stars of all frames by ring (equal widths) and sector (clockwise from image right)."""
-    camera, points = joint.fit.camera, joint.points.take(joint.fit.used)
-    angle, ring, sector = rings_and_sectors(camera, points)
-    edges = np.linspace(0.0, camera.calibrated_angle_rad, RINGS + 1)
+    """Counts and held-out residuals of the used stars of all frames within the calibrated angle."""
+    camera, used = joint.fit.camera, joint.fit.used
+    angle, ring, sector = rings_and_sectors(camera, joint.points.take(used))
     inside = angle <= camera.calibrated_angle_rad
-    stars = np.zeros((RINGS, SECTORS))
-    np.add.at(stars, (ring[inside], sector[inside]), 1)
-    return Coverage(edges, stars)
+    stars, squared = np.zeros((2, IMAGE_RINGS, IMAGE_SECTORS))
+    np.add.at(stars, (ring[inside], sector[inside]), 1.0)
+    np.add.at(squared, (ring[inside], sector[inside]), np.sum(joint.fit.held_out_px[used][inside] ** 2, axis=1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return Coverage(
+            ring_edges_rad=np.linspace(0.0, camera.calibrated_angle_rad, IMAGE_RINGS + 1),
+            stars=stars,
+            ring_rms_px=np.sqrt(squared.sum(axis=1) / stars.sum(axis=1)),
+            rms_px=np.sqrt(squared / stars),
+        )
 
 
 def rings_and_sectors(camera: Camera, points: Observations) -> tuple[Array, Ints, Ints]:
     """Angle off the axis, ring and sector, each (n,), of observations."""
     angle = camera.angle_rad(points.xy_px)
-    ring = np.clip((RINGS * angle / camera.calibrated_angle_rad).astype(int), 0, RINGS - 1)
+    ring = np.clip((IMAGE_RINGS * angle / camera.calibrated_angle_rad).astype(int), 0, IMAGE_RINGS - 1)
     offset = points.xy_px - np.asarray(camera.centre_px)
     around = np.arctan2(offset[:, 1], offset[:, 0]) % (2 * np.pi)
-    return angle, ring, np.minimum((SECTORS * around / (2 * np.pi)).astype(int), SECTORS - 1)
+    return angle, ring, np.minimum((IMAGE_SECTORS * around / (2 * np.pi)).astype(int), IMAGE_SECTORS - 1)
+
+
+def corner_angle_rad(camera: Camera) -> float:
+    """The largest angle off the axis [rad] of the frame's corners."""
+    right, bottom = (side - 0.5 for side in camera.size_px)
+    return float(np.max(camera.angle_rad(np.array([[x, y] for x in (-0.5, right) for y in (-0.5, bottom)]))))
 
 
 def joint_log_p_value(joint: JointFit) -> float:
@@ -92,12 +119,15 @@ def joint_log_p_value(joint: JointFit) -> float:
 
     The number expected by chance is measured by the same matching at certainly wrong attitudes.
     """
-    found = sum(map(len, joint.matches))
-    wrong = [sum(map(len, rotated_matches(joint, joint.frames, angle))) for angle in WRONG_ROTATIONS_RAD]
-    return log_p_value_poisson(found, max(float(np.mean(wrong)), MIN_CHANCE_MATCHES))
+    wrong = (sum(map(len, _rotated_matches(joint, joint.frames, angle))) for angle in WRONG_ROTATIONS_RAD)
+    return _log_p_value(sum(map(len, joint.matches)), wrong)
 
 
-def rotated_matches(joint: JointFit, frames: Sequence[Frame], rotation_rad: float) -> list[FrameMatches]:
+def _log_p_value(found: int, by_chance: Iterable[int]) -> float:
+    return log_p_value_poisson(found, max(float(np.mean(list(by_chance))), MIN_CHANCE_MATCHES))
+
+
+def _rotated_matches(joint: JointFit, frames: Sequence[Frame], rotation_rad: float) -> list[FrameMatches]:
     """The matches of `frames` with the lens and the attitudes of a `joint` fit, these rotated by an angle."""
     camera, rotation = joint.fit.camera, R_from_rotvec(np.array([0.0, 0.3 * rotation_rad, rotation_rad]))
     return [
@@ -106,9 +136,10 @@ def rotated_matches(joint: JointFit, frames: Sequence[Frame], rotation_rad: floa
     ]
 
 
-def mirrored_residual_px(joint: JointFit) -> float:
+def _mirrored_residual_px(joint: JointFit) -> float:
     """Median residual [px] of the same stars with the mirror-image camera."""
-    mirrored, points = mirror_camera(joint.fit.camera), joint.points.take(joint.fit.used)
+    camera, points = joint.fit.camera, joint.points.take(joint.fit.used)
+    mirrored = replace(camera, mirrored=not camera.mirrored)
     R = fit_attitudes(mirrored, points)
     rays = np.einsum("nij,nj->ni", R[points.image], points.rays_icrs)
     return float(np.median(np.linalg.norm(mirrored.project(rays)[0] - points.xy_px, axis=1)))
@@ -123,11 +154,9 @@ def check_acceptance(joint: JointFit) -> tuple[Check, ...]:
     cover = star_coverage(joint)
     rings = int(np.sum(cover.stars.sum(axis=1) >= STARS_PER_RING))
     sectors = int(np.sum(cover.stars.sum(axis=0) >= STARS_PER_SECTOR))
-    sigma = float(np.max(fit.camera.projection_sigma_px(calibrated_rays(fit.camera))))
-    held = fit.held_out_rms_px
-    mirrored = mirrored_residual_px(joint)
+    held, mirrored, least_mirrored = fit.held_out_rms_px, _mirrored_residual_px(joint), 5 * LARGEST_HELD_OUT_RMS_PX
     return (
-        Check("matched stars", stars, f">= {MIN_MATCHES}", stars >= MIN_MATCHES, "not_identified",
+        Check("matched stars", stars, f">= {MIN_STARS_MATCHED}", stars >= MIN_STARS_MATCHED, "not_identified",
              "expose longer or open the lens, or add more pictures of the clear night sky"),
         Check("matched fraction", fraction, f">= {SMALLEST_FRACTION}", fraction >= SMALLEST_FRACTION,
              "inconsistent_evidence",
@@ -135,24 +164,60 @@ def check_acceptance(joint: JointFit) -> tuple[Check, ...]:
              "and check the time and the site"),
         Check("log10 chance of as many matches", log_p / np.log(10), "<= -9", log_p <= np.log(MAX_FALSE_ALARM),
              "not_identified", "more stars are needed: expose longer, focus better"),
-        Check("held-out RMS [px]", held, f"<= {LARGEST_HELD_OUT_RMS_PX}", held <= LARGEST_HELD_OUT_RMS_PX,
-             "inconsistent_evidence", "sharp stars are needed: focus, expose shorter, keep the camera still"),
-        Check("rings with stars", rings, f"= {RINGS}", rings == RINGS, "insufficient_geometry",
-             "take pictures where stars fill the image from its middle to its edge: open sky, no walls"),
-        Check("sectors with stars", sectors, f">= {MIN_SECTORS} of {SECTORS}", sectors >= MIN_SECTORS,
+        held_out_check(held, "sharp stars are needed: focus, expose shorter, keep the camera still"),
+        ring_check("rings with stars", rings, "take pictures where stars fill the image from its middle to its edge: "
+                   "open sky, no walls"),
+        Check("sectors with stars", sectors, f">= {MIN_IMAGE_SECTORS} of {IMAGE_SECTORS}", sectors >= MIN_IMAGE_SECTORS,
              "insufficient_geometry", "add pictures with the camera turned about its axis, so that stars fall on the "
              "empty side of the image too"),
-        Check("map sigma [px]", sigma, f"<= {LARGEST_MAP_SIGMA_PX}", sigma <= LARGEST_MAP_SIGMA_PX,
-             "insufficient_geometry",
-             "more stars near the edge of the image are needed: add pictures at other attitudes of the camera"),
-        Check("opposite handedness [px]", mirrored, f">= {5 * LARGEST_HELD_OUT_RMS_PX:g}",
-             mirrored >= 5 * LARGEST_HELD_OUT_RMS_PX,
+        map_check(fit.camera, "more stars near the edge of the image are needed: add pictures at other attitudes of "
+                  "the camera"),
+        Check("opposite handedness [px]", mirrored, f">= {least_mirrored:g}", mirrored >= least_mirrored,
              "inconsistent_evidence", "stars on one line do not determine the handedness: add pictures"),
     )  # fmt: skip
 
 
-def calibrated_rays(camera: Camera) -> Array:
-    """Rays (n, 3) of the calibrated cap that fall into the frame."""
+def held_out_check(rms_px: float, advice: str) -> Check:
+    """The check that fits predict observations that they do not contain."""
+    limit = LARGEST_HELD_OUT_RMS_PX
+    return Check("held-out RMS [px]", rms_px, f"<= {limit}", rms_px <= limit, "inconsistent_evidence", advice)
+
+
+def ring_check(name: str, rings: int, advice: str) -> Check:
+    """The check that every ring of the image has observations."""
+    return Check(name, rings, f"= {IMAGE_RINGS}", rings == IMAGE_RINGS, "insufficient_geometry", advice)
+
+
+def map_check(camera: Camera, advice: str) -> Check:
+    """The check that the projection is determined up to the calibrated angle, where this is inside the frame."""
     grid = cap_grid(camera.calibrated_angle_rad)
     inside = camera.project(grid)[1]
-    return grid[inside] if inside.any() else grid
+    sigma = float(np.max(camera.projection_sigma_px(grid[inside] if inside.any() else grid)))
+    limit = LARGEST_MAP_SIGMA_PX
+    return Check("map sigma [px]", sigma, f"<= {limit}", sigma <= limit, "insufficient_geometry", advice)
+
+
+def horizon_checks(joint: JointFit, catalog: StarCatalog, site: Site | None) -> tuple[Check, ...]:
+    """The check that the frames do not show stars below the horizon of their site; none without a site on the Earth.
+
+    The fit has no stars below it: the frames are matched again with the whole `catalog`, and at attitudes at which only
+    chance matches. Refraction is left out: stars seen below the stated horizon are high in the true sky.
+    """
+    if site is None or site.body != "earth":
+        return ()
+    whole = tuple(replace(f, sky=sky_at(catalog, f.time_utc, None)) for f in joint.frames)
+
+    def below_horizon(rotation_rad: float) -> Bools:
+        """Whether the matched stars (n,) are below it."""
+        matches = zip(whole, _rotated_matches(joint, whole, rotation_rad), strict=True)
+        return np.concatenate([is_below_horizon(f.sky.stars.rays_icrs[m.star], site, f.time_utc) for f, m in matches])
+
+    matched = below_horizon(0.0)
+    below, part = int(matched.sum()), float(matched.sum() / max(len(matched), 1))
+    by_chance = _log_p_value(below, (int(below_horizon(angle).sum()) for angle in WRONG_ROTATIONS_RAD))
+    return (
+        Check("part of stars below the horizon", part, f"<= {MOST_BELOW_PART}",
+              by_chance > np.log(MAX_FALSE_ALARM) or part <= MOST_BELOW_PART, "inconsistent_evidence",
+              f"{below} of {len(matched)} stars are "
+              "below the horizon of this site at this time: check --site (signs) and the time"),
+    )  # fmt: skip

@@ -1,83 +1,20 @@
-"""Calibration boards in pictures: corners by OpenCV's detectors, and poses at finite distances through any lens."""
+"""Poses of flat boards at finite distances through any lens."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from startrack.applications.calibration.initial_camera import FOCAL_FACTORS, LENSES
+from startrack.applications.calibration.initial_camera import points_of_fullest_images, simple_cameras
 from startrack.camera import Camera, lens_jacobian, with_update
-from startrack.core.types import Array, BadInput, Exposure, NotIdentified
+from startrack.core.types import Array, NotIdentified
 from startrack.estimation.adjust import SMALLEST_RISE_RAD
 from startrack.estimation.normal_equations import Observations, Terms
 from startrack.frames import R_from_rotvec, nearest_rotation
 
-IMAGES_TRIED = 4
 LARGEST_ERROR_RAD = 0.05  # median error of the corners' rays with a usable initial camera
 FOCAL_PARTS = (0.33, 1.0)  # of the frame's width: initial focal lengths
-MIN_CHARUCO_CORNERS = 4
-CONTRAST_PERCENTILES = (0.5, 99.5)
-
-
-@dataclass(frozen=True)
-class Board:
-    """A flat pattern; positions on it are in squares."""
-
-    columns: int  # inner corners of a chessboard, squares of a ChArUco board
-    rows: int
-    charuco: str | None = None  # name of the dictionary, such as DICT_5X5_100
-    marker_fraction: float = 0.75  # marker's side over the square's
-
-
-@dataclass(frozen=True)
-class Corners:
-    """Corners found in one picture."""
-
-    xy_px: Array  # (n, 2)
-    position: Array  # (n, 3) on the board, in squares, z = 0
-
-
-def find_corners(exposure: Exposure, board: Board) -> Corners | None:
-    """Corners in a picture; None where the board is not found. Raises BadInput for an unknown dictionary."""
-    grey = _as_8_bits(exposure)
-    return _find_chessboard(grey, board) if board.charuco is None else _find_charuco(grey, board)
-
-
-def _as_8_bits(exposure: Exposure) -> Any:
-    """The picture in 8 bits, which the detectors need, stretched between two percentiles."""
-    p = np.asarray(exposure.pixels_adu)
-    low, high = np.percentile(p[::3, ::3], CONTRAST_PERCENTILES)
-    return np.clip((p - low) * (255.0 / max(high - low, 1e-6)), 0, 255).astype(np.uint8)
-
-
-def _find_chessboard(grey: Any, board: Board) -> Corners | None:
-    import cv2
-
-    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
-    found, px = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=flags)
-    if not found or px is None:
-        return None
-    x, y = np.meshgrid(np.arange(board.columns), np.arange(board.rows))
-    position = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1).astype(np.float64)
-    return Corners(px.reshape(-1, 2).astype(np.float64), position)
-
-
-def _find_charuco(grey: Any, board: Board) -> Corners | None:
-    import cv2
-
-    name = str(board.charuco)
-    number = vars(cv2.aruco).get(name) if name.startswith("DICT_") else None
-    if number is None:
-        raise BadInput("bad_calibration", f"{name} is not an ArUco dictionary of OpenCV, such as DICT_5X5_100")
-    dictionary = cv2.aruco.getPredefinedDictionary(number)
-    pattern = cv2.aruco.CharucoBoard((board.columns, board.rows), 1.0, board.marker_fraction, dictionary)
-    px, ids, _, _ = cv2.aruco.CharucoDetector(pattern).detectBoard(grey)
-    if ids is None or px is None or len(ids) < MIN_CHARUCO_CORNERS:
-        return None
-    position = np.asarray(pattern.getChessboardCorners(), dtype=np.float64)[np.asarray(ids).ravel()]
-    return Corners(np.asarray(px, dtype=np.float64).reshape(-1, 2), position)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,25 +71,14 @@ class BoardState:
 
 def initial_board_state(points: Observations, size_px: tuple[int, int]) -> BoardState:
     """The best of many simple cameras with the axis in the middle of the frame. Raises NotIdentified if none fits."""
-    width, height = size_px
-    most = np.argsort(-np.bincount(points.image), kind="stable")[:IMAGES_TRIED]
-    some = points.take(np.isin(points.image, most))
-    cameras = [
-        Camera(
-            name="initial", size_px=size_px, focal_px=(part * width * factor, part * width * factor),
-            centre_px=((width - 1) / 2, (height - 1) / 2), max_angle_rad=min(np.pi, lens.max_invertible_rad),
-            calibrated_angle_rad=min(np.pi / 2, lens.max_invertible_rad), lens=lens,
-        )
-        for lens in LENSES
-        for factor in FOCAL_FACTORS
-        for part in FOCAL_PARTS
-    ]  # fmt: skip
-    errors = [_board_poses(camera, some)[2] for camera in cameras]
-    best = int(np.argmin(errors))
-    if errors[best] > LARGEST_ERROR_RAD:
+    some = points_of_fullest_images(points)
+    focals_px = [part * size_px[0] for part in FOCAL_PARTS]
+    cameras = [camera for f in focals_px for camera in simple_cameras(f, size_px) if not camera.mirrored]
+    best = min(cameras, key=lambda camera: _board_poses(camera, some)[2])
+    if _board_poses(best, some)[2] > LARGEST_ERROR_RAD:
         raise NotIdentified("no lens images flat boards at these corners: is --pattern right?")
-    R, position, _ = _board_poses(cameras[best], points)
-    return BoardState(camera=cameras[best], R_cam_board=R, position_cam=position)
+    R, position, _ = _board_poses(best, points)
+    return BoardState(camera=best, R_cam_board=R, position_cam=position)
 
 
 def _board_poses(camera: Camera, points: Observations) -> tuple[Array, Array, float]:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
-from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole
-from startrack.core.types import Array, Ints, NotIdentified
+from startrack.camera import Camera, lens_kinds
+from startrack.core.types import Array, NotIdentified
 from startrack.estimation.adjust import State
 from startrack.estimation.normal_equations import Observations
 from startrack.frames import angle_between_rad, wahba
@@ -16,18 +15,9 @@ from startrack.frames import angle_between_rad, wahba
 PAIR_STARS = 80  # of an image, whose pairs give the focal length
 NEAR_PAIRS_QUANTILE = 0.3
 FOCAL_FACTORS = np.geomspace(0.6, 1.7, 23)
-# Equidistant, equisolid, stereographic and orthographic as short polynomials.
-LENSES: tuple[Lens, ...] = (
-    KannalaBrandt(),
-    KannalaBrandt((-1 / 24,)),
-    KannalaBrandt((1 / 12, 1 / 120)),
-    KannalaBrandt((-1 / 6, 1 / 120)),
-    Pinhole(),
-)
-ROUNDS = 8
+ATTITUDE_ROUNDS = 8
 IMAGES_TRIED = 3
 OUTLIER_RAD = np.radians(4.0)  # larger errors of a ray count as this one
-FIRST_TOLERANCE_RAD = np.radians(1.0)
 SMALLEST_TOLERANCE_RAD = 1e-4
 
 
@@ -39,42 +29,39 @@ def initial_state(points: Observations, size_px: tuple[int, int]) -> State:
     """
     if not len(points):
         raise NotIdentified("a calibration needs matched stars")
-    some = points.take(np.isin(points.image, _fullest_images(points)))
-    best = min(_cameras(_focal_px(some), size_px), key=lambda camera: float(np.sum(_fit_rays(camera, some)[1])))
+    some = points_of_fullest_images(points)
+    cameras = simple_cameras(_focal_px(some), size_px)
+    best = min(cameras, key=lambda camera: float(np.sum(_fit_rays(camera, some)[1])))
     return State(camera=best, R_cam_icrs=fit_attitudes(best, points))
 
 
-def mirror_camera(camera: Camera) -> Camera:
-    """The camera of the mirror image."""
-    return replace(camera, mirrored=not camera.mirrored)
+def points_of_fullest_images(points: Observations) -> Observations:
+    """The observations of the images that have most."""
+    most = np.argsort(-np.bincount(points.image), kind="stable")[:IMAGES_TRIED]
+    return points.take(np.isin(points.image, most))
+
+
+def simple_cameras(focal_px: float, size_px: tuple[int, int]) -> Iterator[Camera]:
+    """Cameras of all kinds of lenses, focal lengths about `focal_px` and handednesses, for a frame of `size_px`."""
+    for kind in lens_kinds().values():
+        for lens in kind.typical_shapes():
+            for factor in FOCAL_FACTORS:
+                for mirrored in (False, True):
+                    yield Camera(
+                        name="initial",
+                        size_px=size_px,
+                        focal_px=(focal_px * factor, focal_px * factor),
+                        centre_px=((size_px[0] - 1) / 2, (size_px[1] - 1) / 2),
+                        max_angle_rad=min(np.pi, lens.max_invertible_rad),
+                        calibrated_angle_rad=min(np.pi / 2, lens.max_invertible_rad),
+                        lens=lens,
+                        mirrored=mirrored,
+                    )
 
 
 def fit_attitudes(camera: Camera, points: Observations) -> Array:
     """R_cam_icrs (images, 3, 3), robustly weighted; identity where an image has no observations."""
     return _fit_rays(camera, points)[0]
-
-
-def _cameras(focal_px: float, size_px: tuple[int, int]) -> Iterator[Camera]:
-    """All lenses, focal lengths and handednesses that are tried."""
-    width, height = size_px
-    for lens in LENSES:
-        for factor in FOCAL_FACTORS:
-            for mirrored in (False, True):
-                yield Camera(
-                    name="initial",
-                    size_px=size_px,
-                    focal_px=(focal_px * factor, focal_px * factor),
-                    centre_px=((width - 1) / 2, (height - 1) / 2),
-                    max_angle_rad=min(np.pi, lens.max_invertible_rad),
-                    calibrated_angle_rad=min(np.pi / 2, lens.max_invertible_rad),
-                    lens=lens,
-                    mirrored=mirrored,
-                )
-
-
-def _fullest_images(points: Observations) -> Ints:
-    """Images with the most observations."""
-    return np.argsort(-np.bincount(points.image), kind="stable")[:IMAGES_TRIED]
 
 
 def _focal_px(points: Observations) -> float:
@@ -101,8 +88,8 @@ def _fit_rays(camera: Camera, points: Observations) -> tuple[Array, Array]:
     squared_error = np.empty(len(points))
     for i in np.unique(points.image):
         own = np.flatnonzero(points.image == i)
-        weight, tolerance = np.ones(len(own)), FIRST_TOLERANCE_RAD
-        for _ in range(ROUNDS):
+        weight = np.ones(len(own))
+        for _ in range(ATTITUDE_ROUNDS):
             R[i] = wahba(rays[own], points.rays_icrs[own], weight)
             squared = np.sum(np.square(rays[own] - points.rays_icrs[own] @ R[i].T), axis=1)
             tolerance = max(float(np.sqrt(np.median(squared))), SMALLEST_TOLERANCE_RAD)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from startrack.applications.calibration.acceptance import RINGS
-from startrack.applications.calibration.region_growing import JointFit
 from startrack.applications.calibration.sensor import SensorProperties, measure_sensor
 from startrack.applications.calibration.throughput import Throughput, measure_throughput
 from startrack.camera import Sensor
+from startrack.estimation.joint_fit import JointFit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +32,7 @@ class Photometry:
 
 def measure_photometry(joint: JointFit, known: KnownSensor) -> Photometry:
     """Throughput and sensor from the exposures of a calibration."""
-    properties = measure_sensor(joint, RINGS)
+    properties = measure_sensor(joint)
     fit = measure_throughput(joint, properties.flux_ratio)
     throughput = fit.throughput
     notes = list(fit.warnings)

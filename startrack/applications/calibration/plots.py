@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from startrack.applications.calibration.acceptance import star_coverage
 from startrack.applications.calibration.record import projection_by_angle
-from startrack.applications.calibration.report import ring_rms_px
 from startrack.applications.calibration.run import Calibration
 from startrack.camera import Camera
 from startrack.core.types import Array
@@ -107,7 +107,8 @@ def _draw_sigma(axes: Axes, camera: Camera) -> None:
 
 
 def _draw_sectors(axes: Axes, calibration: Calibration) -> None:
-    cover, _, by_sector = ring_rms_px(calibration)
+    cover = star_coverage(calibration.joint)
+    by_sector = cover.rms_px
     drawn = axes.imshow(np.ma.masked_invalid(by_sector), cmap="magma", aspect="auto", vmin=0.0)
     axes.figure.colorbar(drawn, ax=axes, shrink=0.85, label="held-out RMS px")
     dark = np.nanmax(by_sector) * 0.5 if np.isfinite(by_sector).any() else 0.0

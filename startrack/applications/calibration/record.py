@@ -1,4 +1,4 @@
-"""A calibration as the dictionary of its JSON file and as one line; a camera file as text."""
+"""Calibrations as the dictionary of the JSON file and as one line; a camera file as text."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from startrack import __version__
-from startrack.applications.calibration.acceptance import star_coverage
+from startrack.applications.calibration.acceptance import Checked, RefusedImage, star_coverage
+from startrack.applications.calibration.board import BoardCalibration
 from startrack.applications.calibration.photometry import photometry_dict
-from startrack.applications.calibration.run import Calibration, RefusedImage
+from startrack.applications.calibration.run import Calibration
 from startrack.camera import Camera, camera_to_dict
 from startrack.core.errors import reason_of
 from startrack.core.types import Array
@@ -22,14 +23,9 @@ MAP_ANGLES = 10
 
 def calibration_dict(calibration: Calibration) -> dict[str, Any]:
     """The calibration's JSON object, with the camera only if all checks passed."""
-    fit, failed = calibration.joint.fit, calibration.failed_checks
-    cover, refracted = star_coverage(calibration.joint), _is_refracted(calibration)
+    fit, cover = calibration.joint.fit, star_coverage(calibration.joint)
     return {
-        "format": FORMAT,
-        "status": "refused" if failed else "ok",
-        "reason": failed[0].reason if failed else None,
-        "message": message(calibration),
-        "camera": None if failed else camera_to_dict(calibration.camera),
+        **_outcome(calibration, calibration.camera),
         "lens": {
             "stars": int(fit.used.sum()),
             "clipped": int((~fit.used).sum()),
@@ -40,13 +36,12 @@ def calibration_dict(calibration: Calibration) -> dict[str, Any]:
             "chi2_per_dof": fit.chi2_per_dof,
             "birge_ratio": calibration.joint.birge_ratio,
             "map_sigma_px": next(check.value for check in calibration.checks if check.name.startswith("map sigma")),
-            "refraction": REFRACTION_REMOVED if refracted else "not taken out: no site on the Earth was given",
+            "refraction": REFRACTION_REMOVED
+            if calibration.is_free_of_refraction
+            else "not taken out: no site on the Earth was given",
             "models": [vars(candidate) for candidate in fit.candidates],
         },
-        "gates": [
-            {"name": check.name, "value": _json_number(check.value), "limit": check.limit, "passed": bool(check.passed)}
-            for check in calibration.checks
-        ],
+        "gates": _gates(calibration),
         "coverage": {
             "ring_edges_deg": np.degrees(cover.ring_edges_rad).round(3).tolist(),
             "stars": cover.stars.astype(int).tolist(),
@@ -57,6 +52,43 @@ def calibration_dict(calibration: Calibration) -> dict[str, Any]:
         "refused": [vars(refused) for refused in calibration.refused],
         "provenance": {"version": __version__, "false_alarm_probability": calibration.false_alarm_probability},
     }
+
+
+def board_dict(found: BoardCalibration) -> dict[str, Any]:
+    """The JSON object of a calibration with boards, with the camera only if all checks passed."""
+    fit = found.fit
+    return {
+        **_outcome(found, found.camera),
+        "lens": {
+            "corners": int(fit.used.sum()),
+            "clipped": int((~fit.used).sum()),
+            "rms_px": fit.rms_px,
+            "held_out_rms_px": fit.held_out_rms_px,
+            "models": [vars(candidate) for candidate in fit.candidates],
+        },
+        "gates": _gates(found),
+        "images": [{"image": image} for image in found.images],
+        "refused": [vars(refused) for refused in found.refused],
+        "provenance": {"version": __version__},
+    }
+
+
+def _outcome(found: Checked, camera: Camera) -> dict[str, Any]:
+    failed = found.failed_checks
+    return {
+        "format": FORMAT,
+        "status": "refused" if failed else "ok",
+        "reason": failed[0].reason if failed else None,
+        "message": found.message,
+        "camera": None if failed else camera_to_dict(camera),
+    }
+
+
+def _gates(found: Checked) -> list[dict[str, Any]]:
+    return [
+        {"name": c.name, "value": float(np.clip(c.value, -1e6, 1e6)), "limit": c.limit, "passed": bool(c.passed)}
+        for c in found.checks
+    ]
 
 
 def refusal_dict(reason: str, text: str, refused: tuple[RefusedImage, ...] = ()) -> dict[str, Any]:
@@ -70,14 +102,6 @@ def refusal_dict(reason: str, text: str, refused: tuple[RefusedImage, ...] = ())
         "camera": None,
         "refused": [vars(one) for one in refused],
     }
-
-
-def message(calibration: Calibration) -> str:
-    """Failed checks and advice; empty where the calibration is accepted."""
-    return "; ".join(
-        f"{check.name} is {check.value:.3g}, required {check.limit}: {check.advice}"
-        for check in calibration.failed_checks
-    )
 
 
 def summary(calibration: Calibration, name: str) -> str:
@@ -98,12 +122,15 @@ def arcmin_per_px(camera: Camera) -> float:
     return float(np.degrees(camera.mean_scale_rad_per_px(np.array(0.5 * camera.calibrated_angle_rad))) * 60.0)
 
 
-def _is_refracted(calibration: Calibration) -> bool:
-    return all(frame.sky.includes_refraction for frame in calibration.joint.frames)
-
-
-def _json_number(value: float) -> float:
-    return float(np.clip(value, -1e6, 1e6))
+def board_line(found: BoardCalibration, name: str) -> str:
+    """Summary of a calibration with boards in one line."""
+    fit, camera = found.fit, found.camera
+    verdict = "ok" if found.accepted else f"refused {found.failed_checks[0].reason}"
+    return (
+        f"{name}  {verdict}  {len(found.images)} of {len(found.images) + len(found.refused)} pictures  "
+        f"{int(fit.used.sum())} corners  held-out {fit.held_out_rms_px:.2f} px  f {camera.focal_px[0]:.2f} px/rad  "
+        f"calibrated to {np.degrees(camera.calibrated_angle_rad):.1f}°"
+    )
 
 
 def _images(calibration: Calibration) -> list[dict[str, Any]]:
@@ -114,7 +141,7 @@ def _images(calibration: Calibration) -> list[dict[str, Any]]:
         own = (joint.points.image == i) & fit.used
         held = fit.held_out_px[own]
         row: dict[str, Any] = {
-            "image": frame.name,
+            "image": frame.exposure.name,
             "sha256": frame.exposure.sha256,
             "time_utc": format_utc(frame.time_utc),
             "stars": int(own.sum()),
@@ -164,7 +191,7 @@ def projection_by_angle(camera: Camera, angle_rad: Array) -> tuple[Array, Array,
     return radius, np.degrees(camera.mean_scale_rad_per_px(np.maximum(angle_rad, 1e-6))) * 60.0, sigma
 
 
-def camera_text(camera: Camera) -> str:
+def camera_summary(camera: Camera) -> str:
     """The camera file's content in several lines."""
     (fx, fy), (cx, cy) = camera.focal_px, camera.centre_px
     lines = [

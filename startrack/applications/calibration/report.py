@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from startrack.applications.calibration.acceptance import RINGS, SECTORS, Coverage, rings_and_sectors, star_coverage
-from startrack.applications.calibration.record import arcmin_per_px, camera_text, message, summary
+from startrack.applications.calibration.acceptance import star_coverage
+from startrack.applications.calibration.record import arcmin_per_px, camera_summary, summary
 from startrack.applications.calibration.run import Calibration
 from startrack.core.files import write_atomically
-from startrack.core.types import Array
 from startrack.frames import format_utc
 
 NO_PICTURE = "no picture: it needs matplotlib, the extra plots (pip install '.[plots]' in a clone of startrack)"
@@ -48,7 +47,7 @@ def report_html(calibration: Calibration, picture: bytes | None) -> str:
     """The page, without scripts or other files."""
     camera = calibration.camera
     verdict = "ok" if calibration.accepted else "no"
-    text = "accepted" if calibration.accepted else f"refused: {html.escape(message(calibration))}"
+    text = "accepted" if calibration.accepted else f"refused: {html.escape(calibration.message)}"
     image = (
         f'<img alt="residuals and map sigma" src="data:image/png;base64,{base64.b64encode(picture).decode()}">'
         if picture
@@ -66,26 +65,8 @@ def report_html(calibration: Calibration, picture: bytes | None) -> str:
         f"<h2>Lens models, tested with held-out stars</h2>{_models_table(calibration)}"
         f"<h2>Pictures</h2>{_pictures_table(calibration)}"
         f"<h2>Throughput and sensor</h2>{_photometry_table(calibration)}"
-        f"<h2>The camera</h2><pre>{html.escape(camera_text(camera))}</pre></html>\n"
+        f"<h2>The camera</h2><pre>{html.escape(camera_summary(camera))}</pre></html>\n"
     )
-
-
-def ring_rms_px(calibration: Calibration) -> tuple[Coverage, Array, Array]:
-    """Coverage, and held-out RMS distance [px] by ring (rings,) and by ring and sector (rings, sectors); NaN if empty.
-
-    For drawing and tables only.
-    """
-    joint = calibration.joint
-    used = joint.fit.used
-    points, held = joint.points.take(used), joint.fit.held_out_px[used]
-    angle, ring, sector = rings_and_sectors(calibration.camera, points)
-    inside = angle <= calibration.camera.calibrated_angle_rad
-    squared, count = np.zeros((RINGS, SECTORS)), np.zeros((RINGS, SECTORS))
-    np.add.at(squared, (ring[inside], sector[inside]), np.sum(held[inside] ** 2, axis=1))
-    np.add.at(count, (ring[inside], sector[inside]), 1.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        by_ring = np.sqrt(squared.sum(axis=1) / count.sum(axis=1))
-        return star_coverage(joint), by_ring, np.sqrt(squared / count)
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:
@@ -108,14 +89,14 @@ def _checks_table(calibration: Calibration) -> str:
 
 
 def _rings_table(calibration: Calibration) -> str:
-    cover, by_ring, by_sector = ring_rms_px(calibration)
+    cover = star_coverage(calibration.joint)
     scale = arcmin_per_px(calibration.camera)
     edges = np.degrees(cover.ring_edges_rad)
-    sectors = [f"{360 * k // SECTORS}°" for k in range(SECTORS)]
+    rings, sectors = cover.stars.shape
     rows = [
-        [f"{edges[k]:.0f}° to {edges[k + 1]:.0f}°", f"{cover.stars[k].sum():.0f}", _two_decimals(by_ring[k]),
-         _two_decimals(by_ring[k] * scale), *(_two_decimals(value) for value in by_sector[k])]
-        for k in range(RINGS)
+        [f"{edges[k]:.0f}° to {edges[k + 1]:.0f}°", f"{cover.stars[k].sum():.0f}", _two_decimals(cover.ring_rms_px[k]),
+         _two_decimals(cover.ring_rms_px[k] * scale), *map(_two_decimals, cover.rms_px[k])]
+        for k in range(rings)
     ]  # fmt: skip
     fit = calibration.joint.fit
     note = (
@@ -124,7 +105,8 @@ def _rings_table(calibration: Calibration) -> str:
         f"stated centroid errors {fit.chi2_per_dof:.2f}; additional error {fit.extra_sigma_px:.3f} px per axis. "
         f"{int((~fit.used).sum())} of {len(fit.used)} matches were rejected.</p>"
     )
-    return _table(["ring", "stars", "RMS px", "RMS '", *sectors], rows) + note
+    head = ["ring", "stars", "RMS px", "RMS '", *(f"{360 * k // sectors}°" for k in range(sectors))]
+    return _table(head, rows) + note
 
 
 def _two_decimals(value: float) -> str:
@@ -144,30 +126,16 @@ def _pictures_table(calibration: Calibration) -> str:
     rows = []
     for i, (frame, matched) in enumerate(zip(joint.frames, joint.matches, strict=True)):
         own = (joint.points.image == i) & joint.fit.used
-        rms = np.sqrt(np.mean(np.sum(joint.fit.held_out_px[own] ** 2, axis=1))) if own.any() else np.nan
+        rms = float(np.sqrt(np.mean(np.sum(joint.fit.held_out_px[own] ** 2, axis=1)))) if own.any() else np.nan
         rows.append(
-            [
-                html.escape(frame.name),
-                html.escape(format_utc(frame.time_utc)),
-                str(int(own.sum())),
-                f"{matched.fraction:.2f}",
-                _two_decimals(float(rms)),
-                "used",
-            ]
-        )
+            [html.escape(frame.exposure.name), html.escape(format_utc(frame.time_utc)), str(int(own.sum())),
+             f"{matched.fraction:.2f}", _two_decimals(rms), "used"]
+        )  # fmt: skip
     rows += [
-        [
-            html.escape(r.name),
-            "",
-            "",
-            "",
-            "",
-            f'<span class="no">{html.escape(r.reason)}: {html.escape(r.message)}</span>',
-        ]
+        [html.escape(r.name), *4 * [""], f'<span class="no">{html.escape(r.reason)}: {html.escape(r.message)}</span>']
         for r in calibration.refused
     ]
-    air = all(frame.sky.includes_refraction for frame in joint.frames)
-    note = "Refraction is taken out." if air else (
+    note = "Refraction is taken out." if calibration.is_free_of_refraction else (
         "No site on the Earth was given: of pictures taken through air this lens contains the refraction (up to half a "
         "degree at the horizon). Give --site."
     )  # fmt: skip

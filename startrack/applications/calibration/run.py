@@ -7,32 +7,29 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from startrack.applications.calibration.acceptance import Check, Checked, check_acceptance
-from startrack.applications.calibration.below_horizon import horizon_checks
-from startrack.applications.calibration.frame import Frame, load_frame, remove_static_sources
-from startrack.applications.calibration.initial_camera import mirror_camera
-from startrack.applications.calibration.obstruction import find_obstructions
+from startrack.applications.calibration.acceptance import (
+    Check,
+    Checked,
+    RefusedImage,
+    check_acceptance,
+    corner_angle_rad,
+    horizon_checks,
+)
 from startrack.applications.calibration.photometry import KnownSensor, Photometry, measure_photometry
-from startrack.applications.calibration.region_growing import JointFit, fit_frames, grow_from_matches
 from startrack.applications.calibration.shared_errors import widen_covariance
+from startrack.applications.calibration.static_parts import find_obstructions, remove_static_sources
 from startrack.camera import Camera
 from startrack.catalog import StarCatalog
 from startrack.core.types import Array, BadInput, Bools, Exposure, Identification, NoSolution, NotIdentified
+from startrack.detection import Detector
+from startrack.estimation.frame_matching import Frame, frame_of, require_body, require_time
+from startrack.estimation.joint_fit import JointFit, fit_frames, grow_from_matches
+from startrack.exposure import combine_masks, with_facts
 from startrack.frames import Site
-from startrack.identification import Identifier, identify_unknown_lens
+from startrack.identification import WIDE_FIELD_RAD, Identifier, identify_unknown_lens
 
-WIDE_FIELD_RAD = np.radians(100.0)  # from here up a field of view is that of the image circle
 BRIGHTEST_IDENTIFIED = 100  # the region growing starts from the inner half of these stars
 Progress = Callable[[str], None]
-
-
-@dataclass(frozen=True, kw_only=True)
-class RefusedImage:
-    """An image that the calibration does not use."""
-
-    name: str
-    reason: str
-    message: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,13 +45,18 @@ class Calibration(Checked):
     photometry: Photometry
     obstructed: Bools | None  # (H, W) pixels proposed for the mask: no star is ever seen there; None: no such pixels
 
+    @property
+    def is_free_of_refraction(self) -> bool:
+        """Whether the lens does not contain the refraction of the air."""
+        return all(frame.sky.includes_refraction for frame in self.joint.frames)
 
-@dataclass
+
+@dataclass(frozen=True)
 class _IdentifiedFrame:
     frame: Frame
     camera: Camera
     R_cam_icrs: Array
-    stars: int
+    found: Identification
 
 
 @dataclass
@@ -66,7 +68,15 @@ class _Run:
     progress: Progress
     identified: list[_IdentifiedFrame] = field(default_factory=list)
     refused: list[RefusedImage] = field(default_factory=list)
-    largest_false_alarm: float = 0.0
+
+    @property
+    def lead(self) -> _IdentifiedFrame:
+        """The frame with the most identified stars."""
+        return max(self.identified, key=lambda one: len(one.found))
+
+    def refuse(self, image: str, cause: NoSolution) -> None:
+        """Leave an image out."""
+        self.refused.append(RefusedImage(name=image, reason=cause.reason, message=str(cause)))
 
 
 def calibrate(
@@ -104,8 +114,7 @@ def calibrate(
     _identify_all(run, frames)
     joint, same = _fit_jointly(run)
     joint = widen_covariance(joint)
-    fitted = replace(joint.fit.camera, name=name)
-    fitted = replace(fitted, max_angle_rad=_max_angle_rad(fitted, camera, fov_rad))
+    fitted = replace(joint.fit.camera, name=name, max_angle_rad=_max_angle_rad(joint.fit.camera, camera, fov_rad))
     joint = replace(joint, fit=replace(joint.fit, camera=fitted))
     progress("measuring throughput and sensor")
     photometry = measure_photometry(joint, known_sensor or KnownSensor())
@@ -116,10 +125,22 @@ def calibrate(
         checks=(*horizon_checks(joint, catalog, site), *check_acceptance(joint)),
         refused=tuple(run.refused),
         site=site,
-        false_alarm_probability=run.largest_false_alarm,
+        false_alarm_probability=max(one.found.false_alarm_probability for one in run.identified),
         photometry=photometry,
         obstructed=find_obstructions(joint, same) if mask is None else None,
     )
+
+
+def load_frame(exposure: Exposure, catalog: StarCatalog, site: Site | None, camera: Camera | None = None) -> Frame:
+    """Detect the sources outside the masks of exposure and `camera`, and compute the sky at the exposure's time.
+
+    Raises BadInput (no_time, bad_terrain of another body, or a mask that cannot be used), TooFewStars.
+    """
+    require_time(exposure)
+    require_body(exposure, site)
+    if camera is not None:
+        exposure = with_facts(exposure, mask=combine_masks(exposure.mask, camera.mask, exposure.size_px))
+    return frame_of(exposure, Detector()(exposure, None), catalog, site)
 
 
 def _frames(run: _Run, exposures: Sequence[Exposure]) -> list[Frame]:
@@ -136,7 +157,7 @@ def _frames(run: _Run, exposures: Sequence[Exposure]) -> list[Frame]:
         try:
             frames.append(load_frame(exposure, run.catalog, run.site, camera=run.start))
         except NoSolution as cause:
-            run.refused.append(RefusedImage(name=exposure.name, reason=cause.reason, message=str(cause)))
+            run.refuse(exposure.name, cause)
     if not frames:
         raise NotIdentified(run.refused[0].message if run.refused else "no image was given", reason="no_stars")
     return frames
@@ -156,7 +177,7 @@ def _identify_all(run: _Run, frames: list[Frame]) -> None:
                 raise refusal
             _identify(run, frame)
         except NoSolution as cause:
-            run.refused.append(RefusedImage(name=frame.name, reason=cause.reason, message=str(cause)))
+            run.refuse(frame.exposure.name, cause)
     if not run.identified:
         raise NotIdentified(
             f"the stars of no image could be identified ({run.refused[0].message}). Take pictures of the clear, dark "
@@ -167,29 +188,26 @@ def _identify_all(run: _Run, frames: list[Frame]) -> None:
 
 
 def _identify(run: _Run, frame: Frame) -> None:
-    run.progress(f"identifying the stars of {frame.name}")
+    run.progress(f"identifying the stars of {frame.exposure.name}")
     camera, found = _first_identification(run, frame)
     R = found.R_cam_icrs
     if not run.identified:
-        run.progress(f"growing the lens outwards in {frame.name}")
+        run.progress(f"growing the lens outwards in {frame.exposure.name}")
         camera, R = grow_from_matches(frame, camera, R, found.star, found.detection)
-    run.largest_false_alarm = max(run.largest_false_alarm, found.false_alarm_probability)
-    run.identified.append(_IdentifiedFrame(frame, camera, R, len(found)))
+    run.identified.append(_IdentifiedFrame(frame, camera, R, found))
 
 
 def _first_identification(run: _Run, frame: Frame) -> tuple[Camera, Identification]:
     """Camera and identification: with the lens of earlier frames, else the approximate one, else without a lens."""
-    known = max(run.identified, key=lambda n: n.stars).camera if run.identified else run.start
-    refusal: NotIdentified | None = None
+    known = run.lead.camera if run.identified else run.start
     if known is not None:
         try:
             return identify_with(known, frame)
-        except NotIdentified as cause:
-            refusal = cause
-    if refusal is not None and run.identified:
-        raise refusal
+        except NotIdentified:
+            if run.identified:
+                raise
     # An approximate camera with another kind of lens still gives the field of view.
-    solution = identify_unknown_lens(frame.sources, frame.size_px, run.fov_rad, frame.sky.stars)
+    solution = identify_unknown_lens(frame.sources, frame.exposure.size_px, run.fov_rad, frame.sky.stars)
     return solution.camera, solution.identification
 
 
@@ -217,7 +235,7 @@ def identify_with(camera: Camera, frame: Frame) -> tuple[Camera, Identification]
     except NotIdentified as cause:
         if cause.reason != "mirrored":
             raise
-        camera = mirror_camera(camera)
+        camera = replace(camera, mirrored=not camera.mirrored)
         found = identifier(frame.sources, camera, frame.sky.stars)
     # Where the lens is wrong by pixels, faint stars are confused with their neighbours, above all far off the axis.
     # Sources are sorted by brightness.
@@ -229,23 +247,22 @@ def identify_with(camera: Camera, frame: Frame) -> tuple[Camera, Identification]
 
 def _fit_jointly(run: _Run) -> tuple[JointFit, tuple[Frame, ...]]:
     """The joint fit without static sources, and its frames with them; images of the other handedness are left out."""
-    lead = max(run.identified, key=lambda n: n.stars)
-    same = [n for n in run.identified if n.camera.mirrored == lead.camera.mirrored]
-    for other in run.identified:
-        if other not in same:
+    camera, same = run.lead.camera, []
+    for one in run.identified:
+        if one.camera.mirrored == camera.mirrored:
+            same.append(one)
+        else:
             text = "it is the mirror image of the others: one camera has one handedness"
-            run.refused.append(RefusedImage(name=other.frame.name, reason="mirrored", message=text))
-    R = np.stack([n.R_cam_icrs for n in same])
+            run.refuse(one.frame.exposure.name, NotIdentified(text, reason="mirrored"))
+    R = np.stack([one.R_cam_icrs for one in same])
     run.progress("fitting the lens to all images")
-    frames = tuple(n.frame for n in same)
-    return fit_frames(remove_static_sources(frames, R), lead.camera, R), frames
+    frames = tuple(one.frame for one in same)
+    return fit_frames(remove_static_sources(frames, R), camera, R), frames
 
 
 def _max_angle_rad(fitted: Camera, start: Camera | None, fov_rad: float | None) -> float:
     """Edge of the image circle: as given, else the frame's corner; at most the turning point of the polynomial."""
-    width, height = fitted.size_px
-    corners = np.array([[-0.5, -0.5], [width - 0.5, -0.5], [-0.5, height - 0.5], [width - 0.5, height - 0.5]])
-    edge = float(np.max(fitted.angle_rad(corners)))
+    edge = corner_angle_rad(fitted)
     if start is not None:
         edge = start.max_angle_rad
     elif fov_rad is not None and fov_rad >= WIDE_FIELD_RAD:

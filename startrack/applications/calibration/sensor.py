@@ -1,30 +1,54 @@
-"""Sensor properties from the pixels: gain and read noise, dark level, saturation, PSF width, hot pixels."""
+"""Sensor properties from the pixels: gain and read noise, dark level, saturation, PSF width, hot pixels.
+
+Gain by photon transfer: the variance of the difference of two frames grows with their level by one over the gain.
+Source: Janesick 2007, Photon Transfer, SPIE Press.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import reduce
 from itertools import pairwise
 
 import numpy as np
 
-from startrack.applications.calibration.frame import Frame, has_turned
-from startrack.applications.calibration.photon_transfer import PhotonTransfer, fit_photon_transfer
-from startrack.applications.calibration.psf_width import measure_psf_widths
-from startrack.applications.calibration.region_growing import JointFit
+from startrack.applications.calibration.acceptance import IMAGE_RINGS
+from startrack.applications.calibration.static_parts import find_hot_pixels
 from startrack.camera import Camera
-from startrack.core.types import Array, Bools, Exposure, Ints
+from startrack.core.statistics import robust_sigma
+from startrack.core.types import Array, Exposure
+from startrack.estimation.joint_fit import JointFit
+from startrack.psf import pixel_profile, stamp_radius
 
 DARK_BEYOND_1 = 1.06  # of the image circle's radius: the sensor is dark beyond
-MIN_DARK_PIXELS = 4000
+SAMPLE = 4  # every so many rows and columns
+MIN_DARK_SAMPLES = 250
 LARGEST_DARK_SPREAD_1 = 0.2  # of the levels of the dark corners, over their difference from the sky
 MIN_SATURATED_PIXELS = 12
-MIN_STARS_FOR_WIDTH = 5
-HOT_SIGMA = 8.0
-MAX_HOT_PIXELS = 20_000
-STAR_RADIUS_PX = 3
 STILL_PX = 0.3
-NEIGHBOURS = np.array([[0, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0]])  # twice the mean of the four
+TRANSFER_BLOCK_PX = 32
+MIN_BLOCKS = 60
+LARGEST_GAIN_ERROR_1 = 0.1  # relative
+CLIP_SIGMA = 3.0
+CLIP_ROUNDS, LINE_ROUNDS = 8, 12
+CORE_SIGMA = 2.0
+CORE_VARIANCE_1 = 0.773741  # of a Gaussian truncated there: 1 - 2 c phi(c) / (2 Phi(c) - 1)
+MIN_WIDTH_SNR = 25.0
+MIN_WIDTHS, MAX_WIDTHS = 5, 400  # stars of a ring, and of an image
+TRIED_WIDTHS_PX = np.geomspace(0.35, 6.0, 40)
+
+
+@dataclass(frozen=True)
+class PhotonTransfer:
+    """Line of the photon transfer: variance [ADU^2] of one pixel = level / gain + offset."""
+
+    gain_e_per_adu: float
+    gain_sigma: float
+    offset_adu2: float
+
+    def read_noise_e(self, bias_adu: float) -> float | None:
+        """Read noise [e]; None where the line is negative at the bias."""
+        squared = self.gain_e_per_adu**2 * (self.offset_adu2 + bias_adu / self.gain_e_per_adu)
+        return float(np.sqrt(squared)) if squared > 0 else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,34 +65,34 @@ class SensorProperties:
     hot_px: Array | None  # (n, 2) x, y
 
 
-def measure_sensor(joint: JointFit, rings: int) -> SensorProperties:
-    """Sensor properties from the exposures of a calibration; the PSF in rings."""
-    widths = measure_psf_widths(joint)
+def measure_sensor(joint: JointFit) -> SensorProperties:
+    """Sensor properties from the exposures of a calibration."""
+    camera, exposures = joint.fit.camera, [frame.exposure for frame in joint.frames]
     pairs, same_sky = _pairs(joint)
-    camera = joint.fit.camera
-    edges = np.linspace(0.0, camera.calibrated_angle_rad, rings + 1)
-    by_ring = tuple(
-        float(np.median(widths.sigma_px[inside])) if inside.sum() >= MIN_STARS_FOR_WIDTH else None
-        for inside in ((widths.angle_rad >= a) & (widths.angle_rad < b) for a, b in pairwise(edges))
-    )
+    sigma_px, angle, ratio = _measure_widths(joint)
+    edges = np.linspace(0.0, camera.calibrated_angle_rad, IMAGE_RINGS + 1)
     return SensorProperties(
         transfer=fit_photon_transfer(pairs),
         same_sky=same_sky,
-        bias_adu=_dark_level(joint.frames, camera),
-        saturation_adu=_saturation_level(joint.frames),
-        psf_sigma_px=float(np.median(widths.sigma_px)) if len(widths.sigma_px) >= MIN_STARS_FOR_WIDTH else None,
-        flux_ratio=float(np.median(widths.flux_ratio)) if len(widths.sigma_px) >= MIN_STARS_FOR_WIDTH else 1.0,
-        psf_by_ring_px=by_ring,
-        hot_px=_find_hot_pixels(joint),
+        bias_adu=_dark_level(exposures, camera),
+        saturation_adu=_saturation_level(exposures),
+        psf_sigma_px=_median_of_enough(sigma_px),
+        flux_ratio=_median_of_enough(ratio) or 1.0,
+        psf_by_ring_px=tuple(_median_of_enough(sigma_px[(angle >= a) & (angle < b)]) for a, b in pairwise(edges)),
+        hot_px=find_hot_pixels(joint),
     )
+
+
+def _median_of_enough(values: Array) -> float | None:
+    return float(np.median(values)) if len(values) >= MIN_WIDTHS else None
 
 
 def _pairs(joint: JointFit) -> tuple[list[tuple[Exposure, Exposure]], bool]:
     """Successive exposures between which the sky stood still, and True; without such all successive ones, and False."""
-    frames, R = joint.frames, joint.fit.R_cam_icrs
+    R = joint.fit.R_cam_icrs
     still: list[tuple[Exposure, Exposure]] = []
     moving: list[tuple[Exposure, Exposure]] = []
-    for i, (a, b) in enumerate(pairwise(frames)):
+    for i, (a, b) in enumerate(pairwise(joint.frames)):
         rotation = R[i + 1] @ R[i].T
         angle = float(np.linalg.norm(rotation - rotation.T) / np.sqrt(8.0))
         near = angle * max(joint.fit.camera.focal_px) < STILL_PX and np.trace(rotation) > 0
@@ -76,66 +100,145 @@ def _pairs(joint: JointFit) -> tuple[list[tuple[Exposure, Exposure]], bool]:
     return (still, True) if still else (moving, False)
 
 
-def _dark_level(frames: tuple[Frame, ...], camera: Camera) -> float | None:
+def _dark_level(exposures: list[Exposure], camera: Camera) -> float | None:
     """Level [ADU] of the corners beyond the image circle, where these are uniform and darker than the sky.
 
     It contains the dark current. The lowest of several frames is taken, because scattered light adds to it.
     """
     width, height = camera.size_px
-    x, y = np.meshgrid(np.arange(0, width, 4), np.arange(0, height, 4))
-    fx, fy = camera.focal_px
-    off = np.hypot((x - camera.centre_px[0]) / fx, (y - camera.centre_px[1]) / fy)
+    x, y = np.meshgrid(
+        (np.arange(0, width, SAMPLE) - camera.centre_px[0]) / camera.focal_px[0],
+        (np.arange(0, height, SAMPLE) - camera.centre_px[1]) / camera.focal_px[1],
+    )
     rim = float(camera.lens.rho(np.array(camera.max_angle_rad)))
-    dark, lit = off > DARK_BEYOND_1 * rim, off < 0.8 * rim
-    if np.count_nonzero(dark) < MIN_DARK_PIXELS // 16:
+    dark, lit = np.hypot(x, y) > DARK_BEYOND_1 * rim, np.hypot(x, y) < 0.8 * rim
+    if np.count_nonzero(dark) < MIN_DARK_SAMPLES:
         return None
+    corners = [dark & (right == (x > 0)) & (below == (y > 0)) for right in (True, False) for below in (True, False)]
     levels = []
-    for frame in frames:
-        p = frame.exposure.pixels_adu[::4, ::4]
+    for exposure in exposures:
+        p = exposure.pixels_adu[::SAMPLE, ::SAMPLE]
         level, sky = float(np.median(p[dark])), float(np.median(p[lit]))
-        corners = [float(np.median(p[dark & side])) for side in _quarters(x, y, camera) if (dark & side).sum() > 50]
-        if max(corners) - min(corners) < LARGEST_DARK_SPREAD_1 * (sky - level):
+        in_corners = [float(np.median(p[corner])) for corner in corners if corner.sum() > MIN_DARK_SAMPLES // 5]
+        if max(in_corners) - min(in_corners) < LARGEST_DARK_SPREAD_1 * (sky - level):
             levels.append(level)
     return min(levels) if levels else None
 
 
-def _quarters(x: Ints, y: Ints, camera: Camera) -> list[Bools]:
-    right, below = x > camera.centre_px[0], y > camera.centre_px[1]
-    return [right & below, right & ~below, ~right & below, ~right & ~below]
-
-
-def _saturation_level(frames: tuple[Frame, ...]) -> float | None:
+def _saturation_level(exposures: list[Exposure]) -> float | None:
     """The largest value [ADU], where several pixels share it; None where nothing is saturated."""
-    top = max(float(frame.exposure.recorded_adu.max()) for frame in frames)
-    count = sum(int(np.count_nonzero(frame.exposure.recorded_adu >= top)) for frame in frames)
+    top = max(float(exposure.recorded_adu.max()) for exposure in exposures)
+    count = sum(int(np.count_nonzero(exposure.recorded_adu >= top)) for exposure in exposures)
     return top if count >= MIN_SATURATED_PIXELS else None
 
 
-def _find_hot_pixels(joint: JointFit) -> Array | None:
-    """Pixels (n, 2) that stand out in all frames although the sky has turned; None where it has not."""
-    first, R = joint.frames[0], joint.fit.R_cam_icrs
-    others = [i for i in range(1, len(joint.frames)) if has_turned(R[0], R[i], first.size_px)]
-    if not others:
+def fit_photon_transfer(pairs: list[tuple[Exposure, Exposure]]) -> PhotonTransfer | None:
+    """Photon transfer of pairs of frames; None without a pair, or with too small a range of levels.
+
+    From the counts as recorded: after a flat field, variance and level would differ by its sensitivity.
+
+    Where the sky has moved between the two frames, stars below the detection limit add to the variance, by some per
+    cent in deep wide-field frames; the gain is then as much too low.
+    """
+    if not pairs:
         return None
-    least = reduce(np.minimum, (_excess_sigmas(joint, i) for i in (0, *others)))
-    y, x = np.nonzero(least > HOT_SIGMA)
-    order = np.argsort(-least[y, x], kind="stable")[:MAX_HOT_PIXELS]
-    return np.stack([x[order], y[order]], axis=1).astype(np.float64)
+    blocks = [_block_statistics(a.recorded_adu.astype(np.float64), b.recorded_adu.astype(np.float64)) for a, b in pairs]
+    level, variance = np.concatenate(blocks, axis=1)
+    good = variance > 0
+    return _fit_line(level[good], variance[good]) if good.sum() >= MIN_BLOCKS else None
 
 
-def _excess_sigmas(joint: JointFit, i: int) -> Array:
-    """How far each pixel (H, W) of frame `i` exceeds those around it, in sigmas of the noise; 0 at identified stars."""
-    import cv2
+def _block_statistics(a: Array, b: Array) -> tuple[Array, Array]:
+    """Median level (n,) of one frame [ADU] and variance (n,) of one pixel [ADU^2], block by block.
 
-    frame = joint.frames[i]
-    image = np.asarray(frame.exposure.pixels_adu)
-    excess = image - cv2.medianBlur(image, 5)
-    noise = 1.4826 * float(np.median(np.abs(excess[::3, ::3]))) or 1.0
-    # The light of a star or planet spreads over neighbouring pixels, that of a hot pixel does not.
-    beside = cv2.filter2D(np.maximum(excess, 0.0), -1, NEIGHBOURS)
-    sigmas = np.asarray((excess - beside) / noise, dtype=np.float64)
-    for px in frame.sources.xy_px[joint.matches[i].detection]:
-        x, y = np.rint(px).astype(int)
-        reach = STAR_RADIUS_PX
-        sigmas[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1] = 0.0
-    return sigmas
+    The variance is that of differences between neighbouring pixels in the difference of the frames, which the slope of
+    the sky and the sensitivities of the pixels do not affect; clipping excludes the stars.
+    """
+    side = TRANSFER_BLOCK_PX
+    height, width = (n // side * side for n in a.shape)
+
+    def split_blocks(image: Array) -> Array:
+        rows = image[:height, :width].reshape(height // side, side, width // side, side)
+        return rows.transpose(0, 2, 1, 3).reshape(-1, side, side)
+
+    step = np.diff(split_blocks(a - b), axis=2).reshape(-1, side * (side - 1))
+    step -= np.median(step, axis=1, keepdims=True)
+    variance = np.square(robust_sigma(step, 0.0, axis=1))
+    for _ in range(CLIP_ROUNDS):  # clipped to the core of the distribution, without stars
+        core = np.square(step) < CORE_SIGMA**2 * variance[:, None]
+        variance = np.sum(np.square(step) * core, axis=1) / np.maximum(core.sum(axis=1), 1) / CORE_VARIANCE_1
+    level = 0.5 * np.median(split_blocks(a) + split_blocks(b), axis=(1, 2))
+    return level, variance / 4.0
+
+
+def _fit_line(level: Array, variance: Array) -> PhotonTransfer | None:
+    """Robust straight line of variance over level (n,)."""
+    weight = np.ones(len(level))
+    for _ in range(LINE_ROUNDS):
+        design = weight[:, None] * np.stack([level, np.ones_like(level)], axis=1)
+        ridge = 1e-6 * np.linalg.norm(design) * np.eye(2)
+        observed = np.append(weight * variance, [0.0, 0.0])
+        slope, offset = np.linalg.lstsq(np.concatenate([design, ridge]), observed, rcond=None)[0]
+        fitted = np.maximum(slope * level + offset, 1e-3 * np.median(variance))
+        relative = (variance - fitted) / fitted
+        spread = max(robust_sigma(relative, 0.0), 1e-6)
+        weight = np.where(np.abs(relative) < CLIP_SIGMA * spread, 1.0 / (fitted * spread), 0.0)
+        if np.count_nonzero(weight) < MIN_BLOCKS:
+            return None
+    error = 1.0 / np.sqrt(np.sum(weight**2) * np.cov(level, aweights=weight**2, ddof=0))
+    if slope <= 0 or error > LARGEST_GAIN_ERROR_1 * slope:
+        return None
+    return PhotonTransfer(float(1.0 / slope), float(error / slope**2), float(offset))
+
+
+def _measure_widths(joint: JointFit) -> tuple[Array, Array, Array]:
+    """Best-fitting Gaussian widths of the bright, unsaturated stars of all frames, each (n,).
+
+    PSF sigma [px] before integration over the pixel, angle off the axis [rad], and the flux with the star's own width
+    over the flux of the detector.
+    """
+    parts = [np.zeros((3, 0))]
+    for i, (frame, matched) in enumerate(zip(joint.frames, joint.matches, strict=True)):
+        found = frame.sources
+        used = matched.detection[joint.fit.used[joint.points.image == i]]
+        used = used[(found.snr[used] > MIN_WIDTH_SNR) & ~found.saturated[used]][:MAX_WIDTHS]
+        radius = stamp_radius(1.6 * found.psf_sigma_px) + 2
+        px = found.xy_px[used]
+        whole = np.all((px > radius + 1) & (px < np.array(frame.exposure.size_px) - radius - 2), axis=1)
+        if whole.any():
+            width_px, flux = _fit_widths(np.asarray(frame.exposure.pixels_adu), px[whole], radius)
+            angle = joint.fit.camera.angle_rad(px[whole])
+            parts.append(np.stack([width_px, angle, flux / found.flux_e[used[whole]]]))
+    sigma_px, angle, ratio = np.concatenate(parts, axis=1)
+    return sigma_px, angle, ratio
+
+
+def _fit_widths(image: Array, px: Array, radius: int) -> tuple[Array, Array]:
+    """Width (n,) that fits each stamp best, interpolated between TRIED_WIDTHS_PX, and the flux (n,) with it."""
+    centre = np.rint(px).astype(int)
+    side = 2 * radius + 1
+    windows = np.lib.stride_tricks.sliding_window_view(image, (side, side))
+    data = windows[centre[:, 1] - radius, centre[:, 0] - radius].astype(np.float64).reshape(len(px), -1)
+    data = data - data.mean(axis=1, keepdims=True)
+    offset = px - centre
+    misfit = np.empty((len(TRIED_WIDTHS_PX), len(px)))
+    for k, width in enumerate(TRIED_WIDTHS_PX):
+        shape = _star_shape(offset, float(width), radius)
+        misfit[k] = np.sum(data**2, axis=1) - np.sum(data * shape, axis=1) ** 2 / np.sum(shape**2, axis=1)
+    best = np.clip(np.argmin(misfit, axis=0), 1, len(TRIED_WIDTHS_PX) - 2)
+    n = np.arange(len(px))
+    left, middle, right = misfit[best - 1, n], misfit[best, n], misfit[best + 1, n]
+    bend = left - 2 * middle + right
+    shift = np.divide(0.5 * (left - right), bend, out=np.zeros_like(bend), where=bend > 0)
+    step = np.log(TRIED_WIDTHS_PX[1] / TRIED_WIDTHS_PX[0])
+    sigma = np.asarray(TRIED_WIDTHS_PX[best] * np.exp(np.clip(shift, -1, 1) * step))
+    shape = _star_shape(offset, sigma, radius)
+    return sigma, np.sum(data * shape, axis=1) / np.sum(shape**2, axis=1)
+
+
+def _star_shape(offset: Array, sigma_px: float | Array, radius: int) -> Array:
+    """Star of unit flux in each stamp (n, pixels), its mean subtracted."""
+    x, _ = pixel_profile(offset[:, 0], sigma_px, radius)
+    y, _ = pixel_profile(offset[:, 1], sigma_px, radius)
+    shape = (y[:, :, None] * x[:, None, :]).reshape(len(offset), -1)
+    return np.asarray(shape - shape.mean(axis=1, keepdims=True))

@@ -12,12 +12,12 @@ from datetime import timedelta
 
 import numpy as np
 
-from startrack.applications.calibration.acceptance import RINGS, SECTORS, rings_and_sectors
-from startrack.applications.calibration.lens_fit import LensFit
-from startrack.applications.calibration.region_growing import JointFit
-from startrack.camera import Camera, cap_grid, projection_covariance_px2
+from startrack.applications.calibration.acceptance import IMAGE_RINGS, IMAGE_SECTORS, rings_and_sectors
+from startrack.camera import cap_grid, projection_covariance_px2
 from startrack.core.types import Ints
 from startrack.estimation.adjust import SMALLEST_EXTRA_PX2, inverse_covariance
+from startrack.estimation.joint_fit import JointFit
+from startrack.estimation.lens_fit import LensFit
 from startrack.estimation.normal_equations import Observations
 
 # RMS of the projection, per calibration. All-sky camera of the Lowell Discovery Telescope, nights of 2018-06-29 and
@@ -33,16 +33,12 @@ def widen_covariance(joint: JointFit) -> JointFit:
     ratio = max(
         birge_ratio(joint.fit, joint.points, groups) for groups in (nights(joint), np.arange(len(joint.frames)))
     )
-    camera = _widen(joint.fit.camera, ratio)
+    camera = joint.fit.camera
+    if camera.covariance is not None:
+        rays = cap_grid(camera.calibrated_angle_rad)
+        mean_px2 = float(np.mean(np.trace(projection_covariance_px2(camera, rays), axis1=1, axis2=2)))
+        camera = replace(camera, covariance=(ratio**2 + FLOOR_PX**2 / mean_px2) * camera.covariance)
     return replace(joint, fit=replace(joint.fit, camera=camera), birge_ratio=ratio)
-
-
-def _widen(camera: Camera, ratio: float) -> Camera:
-    if camera.covariance is None:
-        return camera
-    rays = cap_grid(camera.calibrated_angle_rad)
-    mean_px2 = float(np.mean(np.trace(projection_covariance_px2(camera, rays), axis1=1, axis2=2)))
-    return replace(camera, covariance=(ratio**2 + FLOOR_PX**2 / mean_px2) * camera.covariance)
 
 
 def birge_ratio(fit: LensFit, points: Observations, groups: Ints) -> float:
@@ -52,7 +48,7 @@ def birge_ratio(fit: LensFit, points: Observations, groups: Ints) -> float:
     """
     good = points.take(fit.used)
     _, ring, sector = rings_and_sectors(fit.camera, good)
-    region = (groups[good.image] * RINGS + ring) * SECTORS + sector
+    region = (groups[good.image] * IMAGE_RINGS + ring) * IMAGE_SECTORS + sector
     count = np.bincount(region)
     weight, weighted = np.zeros((len(count), 2, 2)), np.zeros((len(count), 2))
     inverse = inverse_covariance(good.covariance_px2, max(fit.extra_sigma_px**2, SMALLEST_EXTRA_PX2))

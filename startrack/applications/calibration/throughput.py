@@ -11,9 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from startrack.applications.calibration.region_growing import JointFit
 from startrack.camera import MIN_THROUGHPUT_1, Sensor
+from startrack.catalog import airmass
+from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array, Ints
+from startrack.estimation.joint_fit import JointFit
 
 MIN_STARS = 30
 BRIGHT_SNR = 10.0
@@ -31,7 +33,6 @@ LARGEST_HELD_OUT_MAG = 0.4  # median scatter of held-out stars
 LARGEST_HELD_OUT_RATIO = 1.5  # of held-out scatter to that of the fit
 LARGEST_IMAGE_OFFSET_MAG = 0.15  # of an image's zero point from the common one: clouds, or twilight
 MIN_STARS_PER_IMAGE = 10
-NORMAL_BY_MAD = 1.4826
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,12 +84,6 @@ class _Fit:
     scatter_mag: float
     at_bound: tuple[str, ...]
     edge_rad: float
-
-
-def airmass(elevation_rad: Array) -> Array:
-    """Airmass along the line of sight, zenith = 1. Source: Rozenberg 1966, Twilight, p. 160."""
-    s = np.sin(elevation_rad)
-    return 1.0 / (s + 0.025 * np.exp(-11.0 * s))
 
 
 def measure_throughput(joint: JointFit, flux_ratio: float = 1.0) -> ThroughputFit:
@@ -147,7 +142,7 @@ def _failures(stars: StarFluxes, terms: list[str], fit: _Fit) -> list[str]:
     if {"middle", "edge"} & set(fit.at_bound) or sensor.lowest_throughput(fit.edge_rad) < MIN_THROUGHPUT_1:
         failures.append("the fitted vignetting is not physical")
     held_out = _held_out_mag(stars, terms, fit.edge_rad)
-    scatter = NORMAL_BY_MAD * float(np.median(np.abs(held_out)))
+    scatter = robust_sigma(held_out, 0.0)
     if scatter > min(LARGEST_HELD_OUT_MAG, LARGEST_HELD_OUT_RATIO * max(fit.scatter_mag, PHOTOMETRY_MAG)):
         failures.append(f"held-out stars scatter by {scatter:.2f} mag, the fitted ones by {fit.scatter_mag:.2f}")
     residual = stars.gain_mag - _model(stars, fit.values, fit.edge_rad)
@@ -239,14 +234,14 @@ def _fit(stars: StarFluxes, terms: list[str], edge_rad: float) -> _Fit:
         ftol=1e-12, gtol=1e-12,
     )  # fmt: skip
     residual = misfit(fit.x)
-    spread = NORMAL_BY_MAD * float(np.median(np.abs(residual)))
+    spread = robust_sigma(residual, 0.0)
     covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * max(spread, 1.0) ** 2
     margin = AT_BOUND_1 * (high - low)
     at_bound = (fit.x < low + margin) | (fit.x > high - margin)
     return _Fit(
         values=dict(zip(terms, fit.x.tolist(), strict=True)),
         sigma=dict(zip(terms, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
-        scatter_mag=NORMAL_BY_MAD * float(np.median(np.abs(residual * stars.sigma_mag))),
+        scatter_mag=robust_sigma(residual * stars.sigma_mag, 0.0),
         at_bound=tuple(t for t, reached in zip(terms, at_bound, strict=True) if reached),
         edge_rad=edge_rad,
     )

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from startrack.applications.calibration.below_horizon import horizon_checks
-from startrack.applications.calibration.frame import load_frame
-from startrack.applications.calibration.region_growing import fit_frames, grow_from_matches
-from startrack.applications.calibration.run import identify_with
+from startrack.applications.calibration.acceptance import horizon_checks
+from startrack.applications.calibration.run import identify_with, load_frame
 from startrack.applications.calibration.shared_errors import widen_covariance
 from startrack.camera import Camera, cap_grid, projection_covariance_px2
 from startrack.catalog import StarCatalog
 from startrack.core.types import Array, Exposure, NotIdentified
+from startrack.estimation.joint_fit import fit_frames, grow_from_matches
 from startrack.frames import Site
 
 ALLOWED_PX = 0.3  # acceptable RMS change of the projection: a tenth of it propagates to the position

@@ -8,17 +8,24 @@ from datetime import datetime
 
 import numpy as np
 
-from startrack.applications.calibration.below_horizon import LOWEST_STAR_RAD, MOST_BELOW_PART, is_below_horizon
-from startrack.applications.calibration.frame import Sky, frame_of, pressure_hpa, require_body, require_time, sky_at
-from startrack.applications.calibration.region_growing import JointFit, fit_frames
 from startrack.camera import Camera
-from startrack.catalog import StarCatalog, bodies
+from startrack.catalog import (
+    LOWEST_STAR_RAD,
+    MOST_BELOW_PART,
+    Sky,
+    StarCatalog,
+    apparent_elevation_rad,
+    bodies,
+    is_below_horizon,
+    sky_at,
+)
 from startrack.chain import Oriented, Refused, identify, identify_blind
 from startrack.core.errors import BadInput, Reason
 from startrack.core.types import Array, Body, Detections, Exposure, Ints
-from startrack.frames import R_enu_icrs, Site, azel_from_rays, rays_from_azel, refract_rad
-
-CIRCLE_FROM_RAD = np.radians(100.0)  # from here up a field of view is that of the image circle
+from startrack.estimation.frame_matching import frame_of, require_body, require_time
+from startrack.estimation.joint_fit import JointFit, fit_frames
+from startrack.frames import R_enu_icrs, Site, azel_from_rays, rays_from_azel
+from startrack.identification import WIDE_FIELD_RAD
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,7 +128,7 @@ def _edge_rad(fitted: Camera, given: Camera | None, fov_rad: float | None) -> fl
     edge = fitted.max_angle_rad
     if given is not None:
         edge = given.max_angle_rad
-    elif fov_rad is not None and fov_rad >= CIRCLE_FROM_RAD:
+    elif fov_rad is not None and fov_rad >= WIDE_FIELD_RAD:
         edge = 0.5 * fov_rad
     return float(min(edge, fitted.lens.max_invertible_rad))
 
@@ -152,6 +159,6 @@ def _lifted_bodies(site: Site, time_utc: datetime, R: Array) -> tuple[Body, ...]
     found = []
     for body in bodies(site, time_utc):
         azimuth, elevation = azel_from_rays(R @ body.ray_icrs)
-        lifted = rays_from_azel(azimuth, refract_rad(elevation, pressure_hpa(site.height_m)))
+        lifted = rays_from_azel(azimuth, apparent_elevation_rad(elevation, site))
         found.append(replace(body, ray_icrs=lifted @ R))
     return tuple(found)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.applications.horizon.columns import lost_pixels
-from startrack.applications.horizon.frames import LeftOut, SkyFrame, orient_frames, pressure_hpa
+from startrack.applications.horizon.frames import LeftOut, SkyFrame, orient_frames
 from startrack.applications.horizon.grid import BINS, COLUMNS, COLUMNS_PER_BIN
 from startrack.applications.horizon.posterior import (
     Marginals,
@@ -20,10 +20,10 @@ from startrack.applications.horizon.posterior import (
 from startrack.applications.horizon.skylight import Steps, find_steps
 from startrack.applications.horizon.starlight import StarLight, measure_stars
 from startrack.camera import Camera
-from startrack.catalog import StarCatalog
+from startrack.catalog import StarCatalog, apparent_elevation_rad
 from startrack.core.errors import NoSolution
 from startrack.core.types import Array, Bools, Exposure, MeasuredSkyline
-from startrack.frames import Site, off_axis_rad, rays_from_azel, refract_rad
+from startrack.frames import Site, off_axis_rad, rays_from_azel
 
 BEYOND_CIRCLE_RAD = np.radians(4.5)  # the edge of the image circle is stated to some degrees; light is followed so far
 WIDTHS = ((1, 0.6), (7, 0.3), (21, 0.2))  # columns averaged, and weight: they share their pixels with their neighbours
@@ -166,7 +166,7 @@ def _common_sigma_rad(frames: Sequence[SkyFrame], azimuth: Array, elevation: Arr
         angle = np.minimum(off_axis_rad(rays), frame.camera.max_angle_rad)
         scale = frame.camera.mean_scale_rad_per_px(angle)
         by_frame.append(np.hypot(frame.camera.projection_sigma_px(rays) * scale, frame.attitude_sigma_rad))
-    lift = refract_rad(elevation, pressure_hpa(site.height_m)) - elevation
+    lift = apparent_elevation_rad(elevation, site) - elevation
     return np.hypot(np.min(by_frame, axis=0), WEATHER_1 * lift)
 
 

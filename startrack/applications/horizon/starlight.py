@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.applications.calibration.throughput import airmass
 from startrack.applications.horizon.frames import SkyFrame
+from startrack.catalog import airmass
 from startrack.core.types import Array, Evidence, Stars
 from startrack.evidence import FluxScale, StarEvidence, StarPhotometry
 from startrack.evidence.star_evidence import SEEN_LLR

@@ -25,8 +25,9 @@ from startrack.applications.tracking.track import (
 )
 from startrack.applications.tracking.track_errors import TrackErrors
 from startrack.catalog import load_catalog
-from startrack.chain import NO_TIME, Settings, input_hashes, job_sha256, load_camera_input, locate, terrain_input
+from startrack.chain import Settings, input_hashes, job_sha256, load_camera_input, locate, terrain_input
 from startrack.core.errors import BadInput
+from startrack.exposure import NO_TIME
 
 if TYPE_CHECKING:
     from startrack.camera import Camera

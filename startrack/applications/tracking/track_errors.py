@@ -9,8 +9,9 @@ from typing import Self
 
 import numpy as np
 
-from startrack.chain import EDGE_SIGMA_PX, NO_TIME
+from startrack.chain import EDGE_SIGMA_PX
 from startrack.core.types import Array, BadInput, Clock, Evidence, Exposure, ImageErrors
+from startrack.exposure import NO_TIME
 from startrack.localization import clock_at
 from startrack.localization.shared_errors import SharedErrors
 from startrack.terrain import Terrain

@@ -1,4 +1,4 @@
-"""Region growing: from the stars that a rough camera identifies outwards to all stars of the frame."""
+"""One lens for several frames: from the stars that a rough camera identifies to all stars of the frames."""
 
 from __future__ import annotations
 
@@ -6,26 +6,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.applications.calibration.frame import Frame
-from startrack.applications.calibration.lens_fit import MIN_STARS, LensFit, fit_lens
-from startrack.applications.calibration.matching import NO_BRIGHT_STARS, FrameMatches, match_frame
 from startrack.camera import Camera
 from startrack.core.types import Array, Ints, NotIdentified
-from startrack.estimation.normal_equations import Observations
+from startrack.estimation.frame_matching import NO_BRIGHT_STARS, Frame, FrameMatches, match_frame
+from startrack.estimation.lens_fit import MIN_STARS, LensFit, fit_lens
+from startrack.estimation.normal_equations import Observations, observations
+from startrack.frames import off_axis_rad
 
 RING_RAD = np.radians(8.0)  # width of the ring added in each round
 SMALLEST_GROWTH_RAD = np.radians(0.5)
-FIRST_GATE_PX = 6.0
 BRIGHTEST_SOURCES = 1000  # sources used; hot pixels may outnumber the bright stars
-GATES_PX = (4.0, 3.0, 2.0)
+GATES_PX = (6.0, 4.0, 3.0, 2.0)  # the first while the region grows, the others for all stars
 GATE_SIGMAS = 4.5  # of the residuals, for the last gates
 NARROWEST_GATE_PX = 0.8
 GROWTH_ROUNDS = 16
 FINAL_ROUNDS = 8
 SETTLED_FRACTION = 0.003  # change of the number of matches
-ALL_ORDERS_STARS = 100  # number of stars from which the order of the polynomial follows from the angle alone
 MIN_FOR_POLYNOMIAL = 25
-DEGREES_PER_COEFFICIENT = 25
+RAD_PER_COEFFICIENT = np.radians(25.0)
 KNOWN_QUANTILE = 0.95
 
 
@@ -50,18 +48,18 @@ def grow_from_matches(
     Raises NotIdentified where too few stars agree.
     """
     frame = replace(frame, sources=frame.sources.take(slice(BRIGHTEST_SOURCES)))
-    star, detection = star[detection < BRIGHTEST_SOURCES], detection[detection < BRIGHTEST_SOURCES]
-    rays = frame.sky.stars.rays_icrs[star] @ R_cam_icrs.T
-    known = _outer_angle(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
-    fit = _fit(
-        (frame,), (_pairs(detection, star),), camera, R_cam_icrs[None], coefficients=_coefficients(known, len(star))
-    )
+    bright = np.flatnonzero(detection < BRIGHTEST_SOURCES)
+    bright = bright[np.argsort(detection[bright])]
+    matched = FrameMatches(detection[bright], star[bright], 0, 0, 0, 0, NO_BRIGHT_STARS)
+    off_axis = off_axis_rad(frame.sky.stars.rays_icrs[matched.star] @ R_cam_icrs.T)
+    known = float(np.quantile(off_axis, KNOWN_QUANTILE)) if len(off_axis) else 0.0
+    fit = _fit_matches((frame,), (matched,), camera, R_cam_icrs[None], _coefficients(known, len(matched)))
     for _ in range(GROWTH_ROUNDS):
         within = known + RING_RAD
-        matched = match_frame(frame, fit.camera, fit.R_cam_icrs[0], within, FIRST_GATE_PX)
+        matched = match_frame(frame, fit.camera, fit.R_cam_icrs[0], within, GATES_PX[0])
         if len(matched) < MIN_STARS:
             break
-        fit = _fit((frame,), (matched,), fit.camera, fit.R_cam_icrs, coefficients=_coefficients(within, len(matched)))
+        fit = _fit_matches((frame,), (matched,), fit.camera, fit.R_cam_icrs, _coefficients(within, len(matched)))
         reached = fit.camera.calibrated_angle_rad
         if reached < known + SMALLEST_GROWTH_RAD:
             break
@@ -74,63 +72,44 @@ def fit_frames(frames: tuple[Frame, ...], camera: Camera, R_cam_icrs: Array) -> 
 
     `R_cam_icrs` (frames, 3, 3) and the camera must be right within a few pixels where stars were matched.
     """
-    before, gate_px = 0, GATES_PX[0]
+    before, gates_px, gate_px = 0, GATES_PX[1:], 0.0
     for k in range(FINAL_ROUNDS):
-        first = k < len(GATES_PX)
-        gate_px = GATES_PX[k] if first else gate_px
+        first = k < len(gates_px)
+        gate_px = gates_px[k] if first else gate_px
         within = camera.calibrated_angle_rad + RING_RAD
         matches = tuple(
             match_frame(frame, camera, R, within, gate_px) for frame, R in zip(frames, R_cam_icrs, strict=True)
         )
-        fit = _fit(frames, matches, camera, R_cam_icrs, _coefficients(within, ALL_ORDERS_STARS) if first else None)
+        fit = _fit_matches(frames, matches, camera, R_cam_icrs, _coefficients(within) if first else None)
         camera, R_cam_icrs = fit.camera, fit.R_cam_icrs
         total = sum(map(len, matches))
-        if k > len(GATES_PX) and abs(total - before) <= SETTLED_FRACTION * total:
+        if k > len(gates_px) and abs(total - before) <= SETTLED_FRACTION * total:
             break
-        before, gate_px = total, _gate_px(fit)
+        before = total
+        gate_px = float(np.clip(GATE_SIGMAS * fit.rms_px / np.sqrt(2.0), NARROWEST_GATE_PX, gates_px[-1]))
     return JointFit(frames=frames, matches=matches, points=_points(frames, matches), fit=fit, gate_px=gate_px)
 
 
-def _gate_px(fit: LensFit) -> float:
-    return float(np.clip(GATE_SIGMAS * fit.rms_px / np.sqrt(2.0), NARROWEST_GATE_PX, GATES_PX[-1]))
-
-
-def _fit(
-    frames: tuple[Frame, ...],
-    matches: tuple[FrameMatches, ...],
-    camera: Camera,
-    R_cam_icrs: Array,
+def _fit_matches(
+    frames: tuple[Frame, ...], matches: tuple[FrameMatches, ...], camera: Camera, R_cam_icrs: Array,
     coefficients: int | None,
 ) -> LensFit:  # fmt: skip
     points = _points(frames, matches)
     if not len(points):
         raise NotIdentified("no star lies where the camera predicts it")
-    return fit_lens(
-        replace(camera, covariance=None, covariance_order=()), R_cam_icrs, points, coefficients=coefficients
-    )
+    start = replace(camera, covariance=None, covariance_order=())
+    return fit_lens(start, R_cam_icrs, points, coefficients=coefficients)
 
 
 def _points(frames: tuple[Frame, ...], matches: tuple[FrameMatches, ...]) -> Observations:
     pairs = list(zip(frames, matches, strict=True))
-    return Observations(
-        image=np.repeat(np.arange(len(pairs)), [len(m) for _, m in pairs]),
-        xy_px=np.concatenate([f.sources.xy_px[m.detection] for f, m in pairs]),
-        covariance_px2=np.concatenate([f.sources.covariance_px2[m.detection] for f, m in pairs]),
-        rays_icrs=np.concatenate([f.sky.stars.rays_icrs[m.star] for f, m in pairs]),
+    return observations(
+        [f.sources.xy_px[m.detection] for f, m in pairs],
+        [f.sky.stars.rays_icrs[m.star] for f, m in pairs],
+        [f.sources.covariance_px2[m.detection] for f, m in pairs],
     )
 
 
-def _pairs(detection: Ints, star: Ints) -> FrameMatches:
-    order = np.argsort(detection)
-    return FrameMatches(detection[order], star[order], 0, 0, 0, 0, NO_BRIGHT_STARS)
-
-
-def _outer_angle(angle_rad: Array) -> float:
-    return float(np.quantile(angle_rad, KNOWN_QUANTILE)) if len(angle_rad) else 0.0
-
-
-def _coefficients(angle_rad: float, stars: int) -> int:
-    """Number of k that stars out to this angle determine."""
-    if stars < MIN_FOR_POLYNOMIAL:
-        return 1
-    return int(np.clip(1 + np.degrees(angle_rad) // DEGREES_PER_COEFFICIENT, 1, 4))
+def _coefficients(angle_rad: float, stars: int | None = None) -> int:
+    """Number of the default lens's coefficients that stars out to this angle determine; without `stars` of many."""
+    return 1 if stars is not None and stars < MIN_FOR_POLYNOMIAL else 1 + int(angle_rad // RAD_PER_COEFFICIENT)

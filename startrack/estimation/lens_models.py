@@ -10,6 +10,7 @@ from startrack.camera import Camera, Decentring, Lens, default_lens, lens_kinds
 from startrack.core.types import Array, Ints
 from startrack.estimation.adjust import SQUARES, CameraState, Scheme, Solution, adjust
 from startrack.estimation.normal_equations import Observations
+from startrack.frames import off_axis_rad
 
 FOLDS = 10
 EQUALLY_GOOD_CHI2 = 4.0  # up to this difference the longer polynomial is chosen: its covariance is valid up to the edge
@@ -88,14 +89,6 @@ def extensions_of(camera: Camera) -> tuple[bool, bool]:
     return camera.focal_px[0] != camera.focal_px[1], bool(camera.decentring)
 
 
-def candidate_models(outermost_rad: float) -> list[LensModel]:
-    """Models for stars up to this angle off the axis: lenses of fixed shape first, then by number of parameters."""
-    lenses = sorted(lens_kinds().values(), key=lambda lens: len(lens.fit_sizes()))
-    return [
-        LensModel(lens=lens, size=n) for lens in lenses if outermost_rad < lens.max_fit_rad for n in lens.fit_sizes()
-    ]
-
-
 @dataclass(frozen=True, kw_only=True)
 class ModelScore:
     """Result of one lens model."""
@@ -122,18 +115,21 @@ def best_model(
     and a centred lens.
     """
     rays = state.rays_cam(points)
-    off_axis = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
-    fold = assign_folds(points, off_axis)
+    off_axis = off_axis_rad(rays)
+    outermost, fold = float(off_axis.max()), assign_folds(points, off_axis)
 
     def fit(model: LensModel, start: CameraState) -> _Fitted:
         return _fit(model, model.start_from(start), points, extra_px2, fold)
 
     if coefficients is None:
-        models = candidate_models(float(off_axis.max()))
+        lenses = sorted(lens_kinds().values(), key=lambda lens: len(lens.fit_sizes()))  # those of fixed shape first
+        models = [
+            LensModel(lens=lens, size=n) for lens in lenses if outermost < lens.max_fit_rad for n in lens.fit_sizes()
+        ]
     else:
         models = [LensModel(lens=default_lens(), size=default_lens().fit_size(coefficients))]
     fitted = [fit(model, state) for model in models]
-    chosen = _choose_longest(fitted, float(off_axis.max()))
+    chosen = _choose_longest(fitted, outermost)
     for _ in range(0 if square else 2):
         more = [fit(model, chosen.solution.state) for model in _extensions(chosen.model)]
         fitted += more

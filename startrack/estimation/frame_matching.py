@@ -1,17 +1,22 @@
-"""Matches of a frame's sources with predicted stars during a calibration, and how complete they are."""
+"""An exposure's point sources and the sky above it; the matches of both, and how complete they are."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from startrack.applications.calibration.frame import Frame
 from startrack.camera import Camera
-from startrack.core.types import Array, Bools, Ints
+from startrack.catalog import Sky, StarCatalog, sky_at
+from startrack.core.types import Array, BadInput, Bools, Centroids, Exposure, Ints
 from startrack.estimation.match import instrumental_mag, is_isolated, match_by_brightness
+from startrack.exposure import NO_TIME
+from startrack.frames import Site, off_axis_rad
+from startrack.terrain import body_of_terrain
 
 TOLERANCE_MAG = 0.9
 BLEND_MAG = 2.0  # a neighbour less than this fainter than the star shifts its centroid
@@ -24,6 +29,47 @@ CURVE_ROUNDS = 4
 SECURE_MAG = 0.7  # a star this much brighter than the frame's limit is detected where the sky is open
 LIMIT_QUANTILE = 0.85
 CELLS_ACROSS = 12  # of the frame's longer side; a cell without matches is not open sky
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """An exposure with its sources and its sky."""
+
+    exposure: Exposure
+    time_utc: datetime
+    sources: Centroids  # fluxes in ADU
+    sky: Sky
+
+
+def frame_of(exposure: Exposure, found: Centroids, catalog: StarCatalog, site: Site | None) -> Frame:
+    """The frame of an exposure whose point sources are `found`. Raises BadInput no_time."""
+    time_utc = require_time(exposure)
+    return Frame(
+        exposure=exposure,
+        time_utc=time_utc,
+        sources=Centroids(**{f.name: getattr(found, f.name) for f in fields(Centroids)}),
+        sky=sky_at(catalog, time_utc, site),
+    )
+
+
+def require_time(exposure: Exposure) -> datetime:
+    """The middle of the exposure. Raises BadInput no_time if it is not known."""
+    if exposure.time_utc is None:
+        raise BadInput("no_time", f"{exposure.name}: {NO_TIME}")
+    return exposure.time_utc
+
+
+def require_body(exposure: Exposure, site: Site | None) -> None:
+    """Raise BadInput bad_terrain where the exposure names a terrain on another body than the site."""
+    if site is None or exposure.terrain is None:
+        return
+    body = body_of_terrain(exposure.terrain)
+    if body != site.body:
+        raise BadInput(
+            "bad_terrain",
+            f"{exposure.name} names the terrain {Path(exposure.terrain).name}, which is on the {body.title()}, but the "
+            f"site is on the {site.body.title()}: correct the site, or the terrain in the image's sidecar or header",
+        )
 
 
 @dataclass(frozen=True)
@@ -86,7 +132,7 @@ def match_frame(frame: Frame, camera: Camera, R_cam_icrs: Array, within_rad: flo
     alone = is_isolated(px[star], star, px, seen, stars.v_mag, BLEND_SIGMAS * found.psf_sigma_px, BLEND_MAG)
     faintest = float(np.quantile(source_mag[detection], LIMIT_QUANTILE)) if len(detection) else -np.inf
     bright = seen[star_mag[seen] < faintest - SECURE_MAG]
-    expected = bright[_is_open_sky(px[bright], found.xy_px[detection], frame.size_px)]
+    expected = bright[_is_open_sky(px[bright], found.xy_px[detection], frame.exposure.size_px)]
     significant = (camera.angle_rad(found.xy_px) < within_rad) & (source_mag < faintest - SECURE_MAG)
     return FrameMatches(
         detection=detection[alone],
@@ -112,8 +158,8 @@ def predict_pixels(
     rays = rays_icrs[near] @ R_cam_icrs.T
     px, angle = np.zeros((len(rays_icrs), 2)), np.zeros(len(rays_icrs))
     px[near] = camera.project_unlimited(rays)
-    angle[near] = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
-    width, height = frame.size_px
+    angle[near] = off_axis_rad(rays)
+    width, height = frame.exposure.size_px
     inside = np.all((px[near] > -0.5) & (px[near] < np.array([width, height]) - 0.5), axis=1)
     return px, angle, near[inside]
 

@@ -9,16 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.applications.calibration.lens_models import (
-    LEAST_SQUARES,
-    LensModel,
-    ModelScore,
-    assign_folds,
-    best_model,
-    extensions_of,
-    held_out_residual_px,
-    model_of,
-)
 from startrack.camera import Camera, with_covariance
 from startrack.core.types import Array, Bools, NotIdentified
 from startrack.estimation.adjust import (
@@ -33,7 +23,18 @@ from startrack.estimation.adjust import (
     extra_variance_px2,
     inverse_covariance,
 )
+from startrack.estimation.lens_models import (
+    LEAST_SQUARES,
+    LensModel,
+    ModelScore,
+    assign_folds,
+    best_model,
+    extensions_of,
+    held_out_residual_px,
+    model_of,
+)
 from startrack.estimation.normal_equations import Observations
+from startrack.frames import off_axis_rad
 
 MIN_STARS = 12
 OUTLIER_CHI2 = 20.0  # two axes: rejects one good star in 20,000
@@ -126,20 +127,19 @@ def _finish(
     stated = inverse_covariance(good.covariance_px2, SMALLEST_EXTRA_PX2)
     chi2 = float(np.sum(chi_square(best.residual_px, stated)))
     believed = chi2 < dof + SCATTER_SIGMAS * np.sqrt(2.0 * dof)
-    extra_px2 = 0.0
-    if not believed:
-        extra_px2 = extra_variance_px2(best.residual_px, good.covariance_px2, best.parameters, by_sum=True)
+    extra_px2 = (
+        0.0 if believed else extra_variance_px2(best.residual_px, good.covariance_px2, best.parameters, by_sum=True)
+    )
     last = adjust(best.state, good, model.free, LEAST_SQUARES, extra_px2=max(extra_px2, SMALLEST_EXTRA_PX2))
     rays = last.state.rays_cam(points)
-    off_axis = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    off_axis = off_axis_rad(rays)
     residual = last.state.residual_px(points, rays)
     held = np.array(residual)
     held[used] = held_out_residual_px(last, assign_folds(good, off_axis[used]))
     fitted, widest = last.state.camera, last.state.camera.lens.max_invertible_rad
     calibrated = min(calibrated_radius_rad(off_axis[used]), widest)
-    camera = replace(
-        fitted, calibrated_angle_rad=calibrated, max_angle_rad=max(min(fitted.max_angle_rad, widest), calibrated)
-    )
+    edge = max(min(fitted.max_angle_rad, widest), calibrated)
+    camera = replace(fitted, calibrated_angle_rad=calibrated, max_angle_rad=edge)
     return LensFit(
         camera=with_covariance(camera, model.free, last.equations.lens_covariance),
         R_cam_icrs=last.state.rotations,

@@ -1,0 +1,146 @@
+"""What keeps its place in the image while the sky moves: lamps and dust, hot pixels, and what hides the sky."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+
+import numpy as np
+
+from startrack.core.statistics import robust_sigma
+from startrack.core.types import Array, Bools, Ints, take_rows
+from startrack.estimation.frame_matching import Frame, match_frame
+from startrack.estimation.joint_fit import JointFit
+from startrack.exposure import combine_masks
+
+SAME_PX = 0.7
+TURNED_PX = 4.0  # motion of the sky above which a source that keeps its pixel is not a star
+HOT_SIGMA = 8.0
+MAX_HOT_PIXELS = 20_000
+STAR_RADIUS_PX = 3
+BESIDE = np.array([[0, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0]])  # twice the mean of the four
+CELLS_PX = (128, 64, 32, 16)  # sides; the smallest that have enough stars trace the outline
+MAX_RATE_1 = 0.95  # of bright stars that are detected where the sky is open: variable stars, and errors of catalogues
+MIN_RATE_1 = 0.5  # of a frame that is used; below it clouds hide most stars
+FALSE_ALARM = 0.01  # expected cells of open sky without a star, all tests of a calibration together
+
+
+def has_turned(one: Array, other: Array, size_px: tuple[int, int]) -> bool:
+    """Whether the sky has clearly moved in the image between two attitudes (3, 3), except near the rotation's axis."""
+    between = other @ one.T
+    angle = np.arctan2(np.linalg.norm(between - between.T) / np.sqrt(8.0), (np.trace(between) - 1.0) / 2.0)
+    return bool(angle * max(size_px) / 4.0 > TURNED_PX)
+
+
+def remove_static_sources(frames: tuple[Frame, ...], R_cam_icrs: Array) -> tuple[Frame, ...]:
+    """The frames without sources that keep their pixel while the sky moves: hot pixels, dust, lamps.
+
+    `R_cam_icrs`: attitudes (frames, 3, 3).
+    """
+    from scipy.spatial import cKDTree
+
+    trees, moving = [cKDTree(frame.sources.xy_px) for frame in frames], []
+    for frame, R in zip(frames, R_cam_icrs, strict=True):
+        static = np.zeros(len(frame.sources), dtype=bool)
+        for tree, other in zip(trees, R_cam_icrs, strict=True):
+            if has_turned(R, other, frame.exposure.size_px):
+                static |= np.isfinite(tree.query(frame.sources.xy_px, distance_upper_bound=SAME_PX)[0])
+        moving.append(replace(frame, sources=take_rows(frame.sources, ~static)))
+    return tuple(moving)
+
+
+def find_hot_pixels(joint: JointFit) -> Array | None:
+    """Pixels (n, 2), x and y, that stand out in all frames although the sky has turned; None where it has not."""
+    R, size_px = joint.fit.R_cam_icrs, joint.fit.camera.size_px
+    others = [i for i in range(1, len(joint.frames)) if has_turned(R[0], R[i], size_px)]
+    if not others:
+        return None
+    least = reduce(np.minimum, (_excess_sigmas(joint, i) for i in (0, *others)))
+    y, x = np.nonzero(least > HOT_SIGMA)
+    order = np.argsort(-least[y, x], kind="stable")[:MAX_HOT_PIXELS]
+    return np.stack([x[order], y[order]], axis=1).astype(np.float64)
+
+
+def _excess_sigmas(joint: JointFit, i: int) -> Array:
+    """How far each pixel (H, W) of frame `i` exceeds those around it, in sigmas of the noise; 0 at identified stars."""
+    import cv2
+
+    frame = joint.frames[i]
+    image = np.asarray(frame.exposure.pixels_adu)
+    excess = image - cv2.medianBlur(image, 5)
+    noise = robust_sigma(excess[::3, ::3], 0.0) or 1.0
+    # The light of a star or planet spreads over neighbouring pixels, that of a hot pixel does not.
+    sigmas = np.asarray((excess - cv2.filter2D(np.maximum(excess, 0.0), -1, BESIDE)) / noise, dtype=np.float64)
+    reach = STAR_RADIUS_PX
+    for x, y in np.rint(frame.sources.xy_px[joint.matches[i].detection]).astype(int).tolist():
+        sigmas[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1] = 0.0
+    return sigmas
+
+
+@dataclass(frozen=True)
+class PredictedStars:
+    """Bright stars (n,) predicted in all frames; a star has a row in each frame."""
+
+    star: Ints  # a number of the star
+    xy_px: Array  # (n, 2)
+    found: Bools
+    rate: Array  # of such stars detected under the open sky of the frame
+
+
+def find_obstructions(joint: JointFit, frames: Sequence[Frame]) -> Bools | None:
+    """Pixels (H, W) in cells that never show a star; None where there are none.
+
+    `frames` are those of the `joint` fit with all their sources. Bright stars count, those in masked pixels do not, and
+    frames under clouds are left out.
+    """
+    camera = joint.fit.camera
+    parts = [(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))]
+    for frame, R in zip(frames, joint.fit.R_cam_icrs, strict=True):
+        matched = match_frame(frame, camera, R, camera.calibrated_angle_rad, joint.gate_px)
+        rate = matched.expected_found / max(matched.expected, 1)
+        if rate < MIN_RATE_1:
+            continue
+        mask = combine_masks(frame.exposure.mask, None, camera.size_px, frame.exposure.correction)
+        bright = matched.bright
+        column, row = np.rint(bright.xy_px).astype(np.int64).T
+        counts = np.ones(len(row), dtype=bool) if mask is None else ~mask.masked[row, column]
+        hip = frame.sky.stars.hip[bright.star[counts]]
+        parts.append((hip, bright.xy_px[counts], bright.found[counts], np.full(len(hip), min(rate, MAX_RATE_1))))
+    predicted = PredictedStars(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    obstructed = obstructed_cells(predicted, camera.size_px)
+    return obstructed if obstructed.any() else None
+
+
+def obstructed_cells(predicted: PredictedStars, size_px: tuple[int, int]) -> Bools:
+    """Pixels (H, W) of an image of `size_px` (W, H) in cells where the `predicted` stars are missing.
+
+    In a cell of open sky each bright star i, counted once however many frames show it there, is missed with probability
+    1 - p_i, where p_i is the rate of detected bright stars in the frame's open sky. The probability that all are missed
+    is the product P. The cell is obstructed where no star is found and P times the number of cells tested is below
+    FALSE_ALARM. Squares of several sides are tested, each at four offsets, and the obstructed ones joined.
+    """
+    width, height = size_px
+    obstructed = np.zeros((height, width), dtype=bool)
+    grids = [(side, dx, dy) for side in CELLS_PX for dx in (0, side // 2) for dy in (0, side // 2)]
+    tests = [_test_cells(predicted, *grid, width) for grid in grids]
+    limit = np.log(FALSE_ALARM / max(sum(len(log_p) for _, log_p in tests), 1))
+    for (side, dx, dy), (corners, log_p) in zip(grids, tests, strict=True):
+        for x, y in corners[log_p < limit].tolist():
+            obstructed[max(y - dy, 0) : y - dy + side, max(x - dx, 0) : x - dx + side] = True
+    return obstructed
+
+
+def _test_cells(predicted: PredictedStars, side: int, dx: int, dy: int, width: int) -> tuple[Ints, Array]:
+    """Upper left corners (m, 2) of the cells with stars, shifted by (dx, dy), and log P (m,); 0 where one is found."""
+    column, row = np.rint(predicted.xy_px).astype(np.int64).T
+    column, row = (column + dx) // side, (row + dy) // side
+    columns = width // side + 2
+    stars = int(predicted.star.max(initial=0)) + 1
+    key = (row * columns + column) * stars + predicted.star
+    pairs, first, pair = np.unique(key, return_index=True, return_inverse=True)
+    found = np.bincount(pair, predicted.found, len(pairs)) > 0
+    cells, cell = np.unique(pairs // stars, return_inverse=True)
+    log_p = np.asarray(np.bincount(cell, np.log1p(-predicted.rate[first]), len(cells)), dtype=np.float64)
+    log_p[np.bincount(cell, found, len(cells)) > 0] = 0.0
+    return np.stack([cells % columns, cells // columns], axis=1).astype(np.int64) * side, log_p

@@ -79,16 +79,11 @@ def _camera(numbers: Intrinsics, name: str) -> Camera:
     if numbers.decentring:
         keys["decentring"] = numbers.decentring.p1, numbers.decentring.p2
     camera = camera_from_dict(keys)  # the limits are checked here
-    camera = _with_angles(camera, camera.lens.max_invertible_rad)
     if numbers.R_body_cam is not None:
         camera = replace(camera, R_body_cam=numbers.R_body_cam)
-    x, y = _frame_edges(camera)
-    corners = np.stack(np.meshgrid(x, y), axis=-1)
-    return _with_angles(camera, float(np.max(camera.angle_rad(corners))))
-
-
-def _with_angles(camera: Camera, angle_rad: float) -> Camera:
-    return replace(camera, max_angle_rad=angle_rad, calibrated_angle_rad=angle_rad)
+    corners = np.stack(np.meshgrid(*_frame_edges(camera)), axis=-1)
+    edge = float(np.max(camera.angle_rad(corners)))
+    return replace(camera, max_angle_rad=edge, calibrated_angle_rad=edge)
 
 
 def _frame_edges(camera: Camera) -> Array:

@@ -19,7 +19,7 @@ from startrack.frames import MOON_RADIUS_M, Site, enu_from_latlon, latlon_from_e
 from startrack.terrain.protocol import NO_POST
 from startrack.terrain.raster import Raster
 
-SLOPE_STEPS = 127  # a slope is kept as a whole number of 1/127 of the map's steepest, rounded up
+SLOPE_STEPS = np.iinfo(np.int8).max  # a slope is kept as a whole number of 1/127 of the map's steepest, rounded up
 SURFACE_ROUNDS = 6  # of the height of the ground, each with the place of the last one's height
 SMALLEST_BLOCKS = 4  # a pyramid ends where a level has no more blocks than this along an axis
 

@@ -77,7 +77,7 @@ class HeightMap(TracedMap):
     def horizon_sigma_rad(self, points_m: Array, azimuths_rad: Array) -> Array:
         """From the height of the single post that makes the horizon: sigma cos^2 H / its distance."""
         if self.height_sigma_m == 0:
-            return np.zeros(np.broadcast_shapes(np.shape(points_m)[:-1], np.shape(azimuths_rad)))
+            return super().horizon_sigma_rad(points_m, azimuths_rad)
         return self._sigma.sigma_rad(points_m, azimuths_rad)
 
     def max_horizon_sigma_rad(
@@ -85,7 +85,7 @@ class HeightMap(TracedMap):
     ) -> Array:
         """The largest `horizon_sigma_rad` (n,) over boxes and azimuths."""
         if self.height_sigma_m == 0:
-            return np.zeros(np.broadcast_shapes(np.shape(centres_m)[:-1], np.shape(azimuths_rad)))
+            return super().max_horizon_sigma_rad(centres_m, half_m, azimuths_rad, azimuth_half_rad)
         return self._sigma.max_sigma_rad(centres_m, half_m, azimuths_rad, azimuth_half_rad)
 
     @cached_property
@@ -108,13 +108,8 @@ class HeightMap(TracedMap):
         """Whether the map decides if the rays (...) are visible: outside glare, and above unmapped ground."""
         azimuths = np.asarray(azimuths_rad) % (2 * np.pi)
         b = (azimuths / (2 * np.pi) * AZIMUTH_BINS).astype(np.int64) % AZIMUTH_BINS
-        above = np.asarray(elevations_rad) > self.unknown_rad[b]
+        above = np.asarray(elevations_rad) > self.table.unknown_rad[b]
         return np.asarray(above & ~in_sectors(azimuths, self.glare_rad))
-
-    @property
-    def unknown_rad(self) -> Array:
-        """(n,) of n sectors from north eastward: below which elevation ground off the maps may stand, or -pi/2."""
-        return self.table.unknown_rad
 
     def mask_reason(self, azimuths_rad: Array, elevations_rad: Array) -> NDArray[np.str_]:
         """Why rays (n,) are not informative; empty where they are."""
@@ -123,17 +118,15 @@ class HeightMap(TracedMap):
 
     def masked_sectors(self) -> list[str]:
         """One line of text per range of azimuths that is not informative."""
-        return describe_masks(self.glare_rad, self.unknown_rad)
+        return describe_masks(self.glare_rad, self.table.unknown_rad)
 
     def error_warnings(self) -> list[str]:
         """One line of text if the terrain file leaves out errors: the ground then counts as exact."""
-        missing = [key for key in self.unstated_errors if not getattr(self, key)]
-        if not missing:
-            return []
-        keys = " and ".join(missing)
         return [
-            f"terrain {self.name}: its file states no {keys}: taken as 0; circles are too small unless the ground is "
+            f"terrain {self.name}: its file states no {key}: taken as 0; circles are too small unless the ground is "
             "exactly so; state the errors (0 for a model from which pictures are rendered)"
+            for key in self.unstated_errors
+            if not getattr(self, key)
         ]
 
     def facts(self) -> dict[str, Any]:

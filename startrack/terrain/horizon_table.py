@@ -24,13 +24,13 @@ DISTANCE_STEP_M = 4.0
 ANGLE_STEP_RAD = np.pi / 65_000
 FIELDS = 11
 RISE_STEP = 1e-3
-FARTHEST = 65_535
-NOT_KNOWN_M, HIGHEST_M = -32_768, 32_767  # range of fields that hold heights
+FARTHEST = np.iinfo(np.uint16).max
+NOT_KNOWN_M, HIGHEST_M = np.iinfo(np.int16).min, np.iinfo(np.int16).max  # range of fields that hold heights
 NEAREST_M = 50.0  # sigmas do not distinguish crests closer by
 SLOTS = 2**18  # boxes and azimuths that are kept: 15 MB; a draw on Shackleton's floor traces 20,000 to 110,000
 BOX_NUMBERS = 5  # of a box and its azimuths
-NEW = np.uint64(0xFFFF_FFFF_FFFF_FFFF)  # a NaN, which no box has
-MIX_1, MIX_2, SHIFT = np.uint64(0x9E37_79B9_7F4A_7C15), np.uint64(0xBF58_476D_1CE4_E5B9), np.uint64(29)
+NEW = np.uint64(np.iinfo(np.uint64).max)  # a NaN, which no box has
+MIX, SHIFT = np.uint64(0xBF58_476D_1CE4_E5B9), np.uint64(29)  # of a hash
 Trace = Callable[..., None]  # of centres, half sides, azimuths, their half widths; fills low and high
 
 
@@ -204,9 +204,9 @@ def quantize_fields(found: Array) -> NDArray[np.uint16]:
 
 @njit(cache=True, nogil=True, inline="always")
 def _slot(keys, k):  # type: ignore[no-untyped-def]
-    mixed = keys[k, 0] * MIX_1
+    mixed = keys[k, 0] * MIX
     for number in range(1, BOX_NUMBERS):
-        mixed = ((mixed ^ (mixed >> SHIFT)) + keys[k, number]) * (MIX_2 if number & 1 else MIX_1)
+        mixed = ((mixed ^ (mixed >> SHIFT)) + keys[k, number]) * MIX
     return (mixed ^ (mixed >> SHIFT)) % np.uint64(SLOTS)
 
 

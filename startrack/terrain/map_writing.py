@@ -13,7 +13,7 @@ from startrack.core.files import atomic_file
 from startrack.terrain.raster import EQUIRECTANGULAR, ORTHOGRAPHIC, STEREOGRAPHIC, Projection, Raster
 
 MIN_STEP_M = 0.01  # of the heights in files that are written
-NO_HEIGHT = 65_535
+NO_HEIGHT = np.iinfo(np.uint16).max
 USER_DEFINED, METRE, DEGREE = 32767, 9001, 9102  # values of keys, GeoTIFF 1.1
 PROJECTION_CODES = {STEREOGRAPHIC: 14, ORTHOGRAPHIC: 21, EQUIRECTANGULAR: 17}  # polar stereographic: 15
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -42,29 +41,26 @@ class StateableError:
 def stateable_errors(text: str) -> list[StateableError]:
     """The errors that a terrain file with this `text` states or could state. Raises BadInput bad_terrain."""
     keys = read_keys(text)
-    return list(_cylinder_errors(keys) if "cylinder" in keys else _map_errors(keys))
-
-
-def _cylinder_errors(keys: Mapping[str, Any]) -> Iterator[StateableError]:
-    cylinder = keys["cylinder"]
-    for fact in CYLINDER_FACTS:
-        unit = {DEPTH.key: cylinder["depth_m"], DIAMETER.key: cylinder["diameter_m"]}.get(fact.key)
-        missing = fact.key not in cylinder and not cylinder.get("exact", False)
-        yield _stateable("cylinder", fact.key, _default_text(fact, unit), missing)
-    yield _stateable("rover", CAMERA_ERROR.key, "0", False)
-
-
-def _map_errors(keys: Mapping[str, Any]) -> Iterator[StateableError]:
-    dem, rover = keys.get("dem", {}), keys.get("rover", {})
-    yield _stateable("dem", HEIGHT_KEY, "0, with a warning", HEIGHT_KEY not in dem)
-    yield _stateable("dem", BIAS.key, f"three times what {HEIGHT_KEY} makes of the horizon", BIAS.key not in dem)
-    for fact in (STRETCH, VERTICAL):
-        yield _stateable("dem", fact.key, _default_text(fact), fact.key not in dem)
-    yield _stateable("rover", CAMERA_ERROR.key, _default_text(CAMERA_ERROR), CAMERA_ERROR.key not in rover)
-
-
-def _stateable(table: str, key: str, default: str, missing: bool) -> StateableError:
-    return StateableError(table=table, key=key, meaning=MEANINGS[key], default=default, is_missing=missing)
+    dem, rover, cylinder = keys.get("dem", {}), keys.get("rover", {}), keys.get("cylinder")
+    if cylinder is not None:
+        sizes_m = {DEPTH.key: cylinder["depth_m"], DIAMETER.key: cylinder["diameter_m"]}
+        inexact = not cylinder.get("exact", False)
+        rows = [
+            ("cylinder", fact.key, _default_text(fact, sizes_m.get(fact.key)), inexact and fact.key not in cylinder)
+            for fact in CYLINDER_FACTS
+        ]
+        rows.append(("rover", CAMERA_ERROR.key, "0", False))
+    else:
+        rows = [
+            ("dem", HEIGHT_KEY, "0, with a warning", HEIGHT_KEY not in dem),
+            ("dem", BIAS.key, f"three times what {HEIGHT_KEY} makes of the horizon", BIAS.key not in dem),
+            *(("dem", fact.key, _default_text(fact), fact.key not in dem) for fact in (STRETCH, VERTICAL)),
+            ("rover", CAMERA_ERROR.key, _default_text(CAMERA_ERROR), CAMERA_ERROR.key not in rover),
+        ]
+    return [
+        StateableError(table=table, key=key, meaning=MEANINGS[key], default=default, is_missing=missing)
+        for table, key, default, missing in rows
+    ]
 
 
 def _default_text(fact: Fact, size_m: float | None = None) -> str:

@@ -21,10 +21,10 @@ from startrack.frames import (
     barycentric_state,
     et_s,
     observer_state,
+    rays_from_azel,
 )
 
 ASTRONOMICAL_UNIT_M = 149_597_870_700.0  # IAU 2012, resolution B2
-_NAIF_SUN = 10
 
 
 def bodies(site: Site, time: datetime) -> list[Body]:
@@ -52,32 +52,22 @@ def bodies(site: Site, time: datetime) -> list[Body]:
 
 @dataclass(frozen=True)
 class _View:
-    """The triangle of Sun, body and observer as the light left the body; angles in degrees, as in the source."""
+    """The triangle of Sun, body and observer as the light left the body."""
 
     from_sun_au: Array  # (3,) ICRS axes
     from_observer_au: Array  # (3,) ICRS axes
     year: float
 
     @property
-    def distances_mag(self) -> float:
-        return float(5 * np.log10(np.linalg.norm(self.from_sun_au) * np.linalg.norm(self.from_observer_au)))
-
-    @property
     def phase_deg(self) -> float:
         """Sun - body - observer: 0 when full."""
         return float(np.degrees(angle_between_rad(self.from_sun_au, self.from_observer_au)))
 
-    def latitudes_deg(self, pole: Array) -> tuple[float, float]:
+    def latitudes_deg(self, pole_ra_deg: float, pole_dec_deg: float) -> tuple[float, float]:
         """Latitudes on the body of the points below the Sun and below the observer."""
+        pole = rays_from_azel(np.radians(90.0 - pole_ra_deg), np.radians(pole_dec_deg))
         sun, observer = (angle_between_rad(pole, v) for v in (self.from_sun_au, self.from_observer_au))
         return float(np.degrees(sun)) - 90, float(np.degrees(observer)) - 90
-
-
-@dataclass(frozen=True)
-class _Source:
-    name: str
-    naif: int
-    v_mag: Callable[[_View], float]
 
 
 def _apparent_body(source: _Source, observer_m: Array, velocity_m_s: Array, et: float) -> Body:
@@ -85,7 +75,7 @@ def _apparent_body(source: _Source, observer_m: Array, velocity_m_s: Array, et: 
     for _ in range(3):  # each round shrinks the error by v / c = 1e-4
         body_m, _ = barycentric_state(source.naif, et - light_time_s)
         light_time_s = float(np.linalg.norm(body_m - observer_m)) / SPEED_OF_LIGHT_M_S
-    sun_m, _ = barycentric_state(_NAIF_SUN, et - light_time_s)
+    sun_m, _ = barycentric_state(_SUN.naif, et - light_time_s)
     to_body_m = body_m - observer_m
     view = _View(
         from_sun_au=(body_m - sun_m) / ASTRONOMICAL_UNIT_M,
@@ -96,88 +86,63 @@ def _apparent_body(source: _Source, observer_m: Array, velocity_m_s: Array, et: 
     return Body(name=source.name, ray_icrs=ray, v_mag=source.v_mag(view))
 
 
-def _sun(view: _View) -> float:
-    """V -26.76 at 1 au: Willmer (2018), ApJS 236, 47."""
-    return float(-26.76 + 5 * np.log10(np.linalg.norm(view.from_observer_au)))
-
-
-def _mercury(view: _View) -> float:
-    """Equation 2."""
-    phase = polyval(view.phase_deg, [0, 6.3280e-2, -1.6336e-3, 3.3644e-5, -3.4265e-7, 1.6893e-9, -3.0334e-12])
-    return float(-0.613 + view.distances_mag + phase)
-
-
-def _venus(view: _View) -> float:
-    """Equations 3 (to 163.7 degrees) and 4 (beyond, where the atmosphere dominates)."""
-    if view.phase_deg < 163.7:
-        return float(
-            -4.384 + view.distances_mag + polyval(view.phase_deg, [0, -1.044e-3, 3.687e-4, -2.814e-6, 8.938e-9])
-        )
-    return float(view.distances_mag + polyval(view.phase_deg, [236.05828, -2.81914, 8.39034e-3]))
-
-
-def _earth(view: _View) -> float:
-    """Equation 5: the mean over rotation and weather."""
-    return float(-3.99 + view.distances_mag + polyval(view.phase_deg, [0, -1.060e-3, 2.054e-4]))
-
-
-def _moon(view: _View) -> float:
-    """Krisciunas and Schaefer (1991), PASP 103, 1033, eq. 9, after Allen (1976), Astrophysical Quantities.
-
-    Their -12.73 at the mean distance of 384 400 km is +0.22 at 1 au from both. No opposition surge.
-    """
-    return float(0.22 + view.distances_mag + polyval(view.phase_deg, [0, 0.026, 0, 0, 4.0e-9]))
-
-
-def _mars(view: _View) -> float:
-    """Equations 6 and 7 without their terms for rotation and season, at most 0.15 mag together."""
-    if view.phase_deg <= 50:
-        return float(-1.601 + view.distances_mag + polyval(view.phase_deg, [0, 2.267e-2, -1.302e-4]))
-    return float(-0.367 + view.distances_mag + polyval(view.phase_deg, [0, -0.02573, 3.445e-4]))
-
-
-def _jupiter(view: _View) -> float:
-    """Equation 8; its phase never exceeds 12 degrees from Earth or Moon."""
-    return float(-9.395 + view.distances_mag + polyval(view.phase_deg, [0, -3.7e-4, 6.16e-4]))
-
-
-def _saturn(view: _View) -> float:
-    """Equation 10, globe and rings; the rings show their dark side when Sun and observer are on opposite sides."""
-    sun, observer = view.latitudes_deg(_SATURN_POLE)
+def _saturns_rings(view: _View) -> float:
+    """They show their dark side when Sun and observer are on opposite sides."""
+    sun, observer = view.latitudes_deg(40.589, 83.537)
     tilt = np.sin(np.radians(np.sqrt(max(sun * observer, 0.0))))
-    phase = view.phase_deg
-    return float(-8.914 + view.distances_mag - 1.825 * tilt + 0.026 * phase - 0.378 * tilt * np.exp(-2.25 * phase))
+    return float(-1.825 * tilt - 0.378 * tilt * np.exp(-2.25 * view.phase_deg))
 
 
-def _uranus(view: _View) -> float:
-    """Equation 13; the poles are brighter than the equator. Its phase never exceeds 3.1 degrees from Earth or Moon."""
-    sun, observer = view.latitudes_deg(_URANUS_POLE)
-    return -7.110 + view.distances_mag - 0.00084 * (abs(sun) + abs(observer)) / 2
+def _uranus_poles(view: _View) -> float:
+    """They are brighter than the equator. The phase never exceeds 3.1 degrees from Earth or Moon."""
+    return -0.00084 * sum(map(abs, view.latitudes_deg(257.311, -15.175))) / 2
 
 
-def _neptune(view: _View) -> float:
-    """Equation 16: it grew brighter from 1980 to 2000. Its phase never exceeds 1.9 degrees from Earth or Moon."""
-    return float(np.clip(-6.89 - 0.0054 * (view.year - 1980), -7.00, -6.89)) + view.distances_mag
+def _neptunes_rise(view: _View) -> float:
+    """It grew brighter from 1980 to 2000. Its phase never exceeds 1.9 degrees from Earth or Moon."""
+    return float(np.clip(-6.89 - 0.0054 * (view.year - 1980), -7.00, -6.89))
 
 
-def _pole(ra_deg: float, dec_deg: float) -> Array:
-    ra, dec = np.radians([ra_deg, dec_deg])
-    return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+@dataclass(frozen=True)
+class _Source:
+    """A body and its magnitude at 1 au from Sun and observer: a polynomial of the phase, up to an angle, and the rest.
+
+    Poles: Archinal et al. (2018), Celestial Mechanics and Dynamical Astronomy 130, 22, at J2000.
+    """
+
+    name: str
+    naif: int
+    by_phase: tuple[tuple[float, tuple[float, ...]], ...]  # largest phase angle [deg], coefficients
+    rest: Callable[[_View], float] = lambda view: 0.0
+
+    def v_mag(self, view: _View) -> float:
+        """Apparent magnitude."""
+        far_au = np.linalg.norm(view.from_observer_au)
+        if self is not _SUN:
+            far_au = far_au * np.linalg.norm(view.from_sun_au)
+        phase_deg = 0.0 if self is _SUN else view.phase_deg
+        coefficients = next(one for most_deg, one in self.by_phase if phase_deg <= most_deg)
+        return float(5 * np.log10(far_au) + polyval(phase_deg, coefficients) + self.rest(view))
 
 
-# Archinal et al. (2018), Celestial Mechanics and Dynamical Astronomy 130, 22, at J2000.
-_SATURN_POLE = _pole(40.589, 83.537)
-_URANUS_POLE = _pole(257.311, -15.175)
-
+_SUN = _Source("Sun", 10, ((180, (-26.76,)),))  # Willmer (2018), ApJS 236, 47
 _SOURCES = (
-    _Source("Sun", _NAIF_SUN, _sun),
-    _Source("Mercury", 199, _mercury),
-    _Source("Venus", 299, _venus),
-    _Source("Earth", 399, _earth),
-    _Source("Moon", 301, _moon),
-    _Source("Mars", 4, _mars),
-    _Source("Jupiter", 5, _jupiter),
-    _Source("Saturn", 6, _saturn),
-    _Source("Uranus", 7, _uranus),
-    _Source("Neptune", 8, _neptune),
-)
+    _SUN,
+    _Source(  # equation 2
+        "Mercury", 199, ((180, (-0.613, 6.3280e-2, -1.6336e-3, 3.3644e-5, -3.4265e-7, 1.6893e-9, -3.0334e-12)),)
+    ),
+    _Source(  # equations 3, and 4 where the atmosphere dominates
+        "Venus", 299,
+        ((163.7, (-4.384, -1.044e-3, 3.687e-4, -2.814e-6, 8.938e-9)), (180, (236.05828, -2.81914, 8.39034e-3))),
+    ),
+    _Source("Earth", 399, ((180, (-3.99, -1.060e-3, 2.054e-4)),)),  # equation 5: the mean over rotation and weather
+    # Krisciunas and Schaefer (1991), PASP 103, 1033, eq. 9, after Allen (1976), Astrophysical Quantities. Their -12.73
+    # at the mean distance of 384 400 km is +0.22 at 1 au from both. No opposition surge.
+    _Source("Moon", 301, ((180, (0.22, 0.026, 0, 0, 4.0e-9)),)),
+    # Equations 6 and 7 without their terms for rotation and season, at most 0.15 mag together.
+    _Source("Mars", 4, ((50, (-1.601, 2.267e-2, -1.302e-4)), (180, (-0.367, -0.02573, 3.445e-4)))),
+    _Source("Jupiter", 5, ((180, (-9.395, -3.7e-4, 6.16e-4)),)),  # equation 8; its phase never exceeds 12 degrees
+    _Source("Saturn", 6, ((180, (-8.914, 0.026)),), _saturns_rings),  # equation 10, globe and rings
+    _Source("Uranus", 7, ((180, (-7.110,)),), _uranus_poles),  # equation 13
+    _Source("Neptune", 8, ((180, (0.0,)),), _neptunes_rise),  # equation 16
+)  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 from startrack.camera import Camera, lens_jacobian
 from startrack.core.types import Array, Attitude, Bools, NotIdentified
 from startrack.estimation.adjust import HUBER_WITH_CUT, MIN_STARS, OUTLIER_CHI2, Scheme, State, adjust
-from startrack.estimation.normal_equations import observations_of_image
+from startrack.estimation.normal_equations import NormalEquations, Terms, observations_of_image
 
 MIN_FOR_SCATTER = 30  # stars from which the scatter of the residuals is a better covariance than the stated one
 SCHEME = Scheme(loss=HUBER_WITH_CUT, steps=12, estimates_extra=True)
@@ -26,7 +26,7 @@ class AttitudeFit:
     rms_px: float  # of the used stars, per axis
     extra_sigma_px: float  # error per axis beyond the stated centroid errors (lens, blends, catalogue)
     centre_shift_px: Array  # (2,) by which the image stands off the camera's centre, by the used stars
-    centre_chi2: float  # of that shift, two degrees of freedom
+    centre_chi2: float  # of that shift, which is fitted beside a rotation: two degrees of freedom; 0 of few stars
 
 
 def solve_attitude(
@@ -45,11 +45,26 @@ def solve_attitude(
     start = State(camera=camera, R_cam_icrs=np.array(R_cam_icrs)[None])
     found = adjust(start, points, (), SCHEME)
     used = found.chi2 < OUTLIER_CHI2
-    jacobian, weight, residual = found.terms.pose[used], found.weight[used], found.residual_px[used]
-    by_stars = _attitude_covariance(jacobian, found.inverse[used], weight, residual)
+    pose, weight, residual = found.terms.pose[used], found.weight[used], found.residual_px[used]
+    by_stars = _covariance_by_stars(pose, found.inverse[used], weight, residual)
     rays_cam = found.state.rays_cam(points)[used]
-    by_lens = _attitude_covariance_by_lens(camera, rays_cam, jacobian, weight)
-    centre_shift, centre_chi2 = _centre_shift(camera, rays_cam, jacobian, weight, residual)
+
+    def equations_with(free: tuple[str, ...]) -> NormalEquations:
+        """The equations of the used stars with the lens parameters `free` beside the attitude."""
+        terms = Terms(lens_jacobian(camera, rays_cam, free), pose, np.zeros(len(pose), dtype=np.int64), 1)
+        return terms.normal_equations(weight, residual)
+
+    by_lens = np.zeros((3, 3))
+    if camera.covariance is not None:
+        # For a lens fitted to these very stars the sum of both covariances is the marginal of the joint fit, provided
+        # that the camera's covariance is its marginal too (the inverse of a matrix in blocks).
+        (response,) = equations_with(camera.covariance_order).pose_by_lens
+        by_lens = response @ camera.covariance @ response.T
+    centre_shift, centre_chi2 = np.zeros(2), 0.0
+    if len(residual) >= MIN_FOR_SCATTER:
+        shifted = equations_with(("cx", "cy"))
+        centre_shift, _ = shifted.solve()
+        centre_chi2 = float(centre_shift @ np.linalg.solve(shifted.lens_covariance, centre_shift))
     return AttitudeFit(
         attitude=Attitude(R_cam_icrs=found.state.R_cam_icrs[0], covariance_rad2=by_stars + by_lens),
         centroid_covariance_rad2=by_stars,
@@ -62,45 +77,17 @@ def solve_attitude(
     )
 
 
-def _attitude_covariance(jacobian: Array, inverse: Array, weight: Array, residual_px: Array) -> Array:
+def _covariance_by_stars(pose: Array, inverse: Array, weight: Array, residual_px: Array) -> Array:
     """Covariance (3, 3) from the stated errors, or from the scatter of the residuals where that is larger.
 
     The second is the sandwich H^-1 (sum s s^T) H^-1 of the stars' scores s: it is valid for heavy tails and for
     centroid errors larger than stated, but is noisy with few stars.
     """
-    stated = np.linalg.inv(np.einsum("nia,nij,njb->ab", jacobian, inverse, jacobian, optimize=True))
+    stated = np.linalg.inv(np.einsum("nia,nij,njb->ab", pose, inverse, pose, optimize=True))
     n = len(residual_px)
     if n < MIN_FOR_SCATTER:
         return np.asarray(stated)
-    bread = np.linalg.inv(np.einsum("nia,nij,njb->ab", jacobian, weight, jacobian, optimize=True))
-    scores = np.einsum("nia,nij,nj->na", jacobian, weight, residual_px, optimize=True)
+    bread = np.linalg.inv(np.einsum("nia,nij,njb->ab", pose, weight, pose, optimize=True))
+    scores = np.einsum("nia,nij,nj->na", pose, weight, residual_px, optimize=True)
     by_scatter = bread @ (scores.T @ scores) @ bread * (n / (n - 3))
     return np.asarray(stated * max(1.0, float(np.trace(by_scatter) / np.trace(stated))))
-
-
-def _centre_shift(
-    camera: Camera, rays_cam: Array, jacobian: Array, weight: Array, residual_px: Array
-) -> tuple[Array, float]:
-    """Shift (2,) of the image's centre that the residuals ask for beside a rotation, and its chi2; 0 of few stars."""
-    if len(residual_px) < MIN_FOR_SCATTER:
-        return np.zeros(2), 0.0
-    design = np.concatenate([jacobian, lens_jacobian(camera, rays_cam, ("cx", "cy"))], axis=2)
-    weighted = np.einsum("nia,nij->naj", design, weight)
-    covariance = np.linalg.inv(np.einsum("naj,njb->ab", weighted, design))
-    shift = (covariance @ np.einsum("naj,nj->a", weighted, residual_px))[3:]
-    return shift, float(shift @ np.linalg.solve(covariance[3:, 3:], shift))
-
-
-def _attitude_covariance_by_lens(camera: Camera, rays_cam: Array, jacobian: Array, weight: Array) -> Array:
-    """Covariance (3, 3) of the attitude's response to an error of the lens; 0 where the camera has no covariance.
-
-    For a lens fitted to these very stars the sum of both covariances is the marginal of the joint fit, provided that
-    the camera's covariance is its marginal too (the inverse of a matrix in blocks).
-    """
-    if camera.covariance is None:
-        return np.zeros((3, 3))
-    weighted = np.einsum("nia,nij->naj", jacobian, weight)
-    by_rotation = np.einsum("naj,njb->ab", weighted, jacobian)
-    by_lens = np.einsum("naj,njm->am", weighted, lens_jacobian(camera, rays_cam, camera.covariance_order))
-    response = np.linalg.solve(by_rotation, by_lens)
-    return np.asarray(response @ camera.covariance @ response.T)

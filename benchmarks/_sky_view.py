@@ -13,7 +13,7 @@ from startrack.camera import Camera
 from startrack.core.types import Array, Exposure
 from startrack.frames import azel_from_rays
 from startrack.rendering import Scene, Truth, truth_of
-from startrack.rendering.sensor import ADC_MAX_ADU, add_cosmic_rays, add_hot_pixels, read_out
+from startrack.rendering.compose import ADC_MAX_ADU, add_cosmic_rays, add_hot_pixels, read_out
 from startrack.rendering.sky import diffuse_e
 from startrack.rendering.sources import add_sources
 from startrack.terrain import Terrain

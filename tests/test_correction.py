@@ -27,7 +27,7 @@ from startrack.detection.damage import find_damage
 from startrack.detection.frame import electrons
 from startrack.exposure import Facts, correct_exposure, read_exposure, write_exposure, write_sidecar
 from startrack.rendering import Series, light_e
-from startrack.rendering.sensor import read_out
+from startrack.rendering.compose import read_out
 
 TOP_ADU = 65535.0
 EVERY_CHI2_2DOF = 18.4  # 99.99 %

@@ -17,8 +17,7 @@ from startrack.evidence.double_exposure import DECISIVE, check_single_skyline, f
 from startrack.frames import R_from_rotvec
 from startrack.identification.second_field import find_second_field
 from startrack.rendering import Scene, Series
-from startrack.rendering.compose import light_e
-from startrack.rendering.sensor import ADC_MAX_ADU, read_out
+from startrack.rendering.compose import ADC_MAX_ADU, light_e, read_out
 from startrack.simulation import simulate_rays
 from startrack.terrain import load_terrain
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from startrack.core.errors import BadInput
-from startrack.exposure.png import SIGNATURE, chunk, decode_png
+from startrack.exposure.png import SIGNATURE, chunk
+from startrack.exposure.png import decode as decode_png
 from startrack.exposure.png_rows import decode_rows
 
 WIDTH, HEIGHT = 23, 40

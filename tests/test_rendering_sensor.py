@@ -7,7 +7,7 @@ import pytest
 from render_helpers import FISHEYE, SENSOR, make_scene, stars_at_azel
 
 from startrack.rendering import HotPixels, draw_hot_pixels, render
-from startrack.rendering.sensor import add_cosmic_rays, photons, read_out
+from startrack.rendering.compose import add_cosmic_rays, photons, read_out
 
 
 @pytest.mark.parametrize("mean", [0.3, 20.0, 200.0, 5000.0])

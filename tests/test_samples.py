@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from startrack.exposure import read_exposure
-from startrack.exposure.png import decode_png
+from startrack.exposure.png import decode as decode_png
 from startrack.frames import R_enu_icrs, R_from_quat_xyzw, parse_utc
 from startrack.terrain import load_terrain
 

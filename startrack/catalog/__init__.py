@@ -1,7 +1,5 @@
 """Stars (Hipparcos, Gaia's fainter ones) and their names, the Sun, planets, Moon and Earth; the sky over a site."""
 
-from startrack.catalog.gaia import has_deep_catalog, hipparcos_rows_in_deep, load_deep_catalog
-from startrack.catalog.hipparcos import StarCatalog, load_catalog, proper_name_designations, star_names
 from startrack.catalog.sky import (
     LOWEST_STAR_RAD,
     MOST_BELOW_PART,
@@ -12,6 +10,15 @@ from startrack.catalog.sky import (
     sky_at,
 )
 from startrack.catalog.solar_system import bodies
+from startrack.catalog.stars import (
+    StarCatalog,
+    has_deep_catalog,
+    hipparcos_rows_in_deep,
+    load_catalog,
+    load_deep_catalog,
+    proper_name_designations,
+    star_names,
+)
 
 __all__ = [
     "LOWEST_STAR_RAD", "MOST_BELOW_PART", "Sky", "StarCatalog", "airmass", "apparent_elevation_rad", "bodies",

@@ -7,7 +7,7 @@ from datetime import datetime
 
 import numpy as np
 
-from startrack.catalog.hipparcos import StarCatalog
+from startrack.catalog.stars import StarCatalog
 from startrack.core.types import Array, Bools, Stars
 from startrack.frames import R_enu_icrs, Site, azel_from_rays, observer_velocity_m_s, rays_from_azel, refract_rad
 

@@ -28,7 +28,7 @@ class Key(ABC):
 
     description: str = ""
     required: bool = False
-    default: Any = None  # None: the key is left out of the values, or None there
+    default: Any = None  # None: the key is left out of the values; {}: a table of defaults
 
     @abstractmethod
     def check(self, value: Any, name: str) -> Any:
@@ -41,7 +41,7 @@ class Key(ABC):
     def schema(self) -> Schema:
         """The JSON schema of the key."""
         schema = self.body()
-        if self.default is not None:
+        if self.default is not None and not isinstance(self.default, dict):
             schema["default"] = list(self.default) if isinstance(self.default, tuple) else self.default
         return {**schema, "description": self.description} if self.description else schema
 
@@ -200,7 +200,7 @@ class Table(Key):
             elif declared.required:
                 raise ValueError(f"{prefix}{key} is missing")
             elif declared.default is not None:
-                checked[key] = declared.default
+                checked[key] = declared.check(declared.default, prefix + key)
         return checked
 
     def body(self) -> Schema:

@@ -24,7 +24,7 @@ class Reason(StrEnum):
     meaning: str
     advice: str
 
-    def __new__(cls, code: str, exit_code: int, meaning: str, advice: str) -> Reason:
+    def __new__(cls, code: str, exit_code: int = 0, meaning: str = "", advice: str = "") -> Reason:
         one = str.__new__(cls, code)
         one._value_ = code
         one.exit_code, one.meaning, one.advice = exit_code, meaning, advice
@@ -112,23 +112,17 @@ ADVICE_IN_MESSAGE = re.compile(  # the imperatives of our messages, a flag, or a
     r"\?|(^|\s)--[a-z]"
     r"|\b(give|choose|correct|enlarge|expose|find|flip|install|make|replace|run|set|state|try|use|widen) "
 )
-_OF_CODE = {one.value: one for one in Reason}
 BAD_INPUT_REASONS = frozenset(one for one in Reason if one.exit_code == EXIT_BAD_INPUT)  # BadInput in the library
-
-
-def reason_of(code: str) -> Reason:
-    """The reason with a `code` of the result format. Raises KeyError for any other text."""
-    return _OF_CODE[code]
 
 
 def next_step(reason: str, message: str) -> str:
     """The advice of a `reason` for a terminal; empty where the `message` itself contains what to do, or a question."""
-    return "" if ADVICE_IN_MESSAGE.search(message) else reason_of(reason).advice
+    return "" if ADVICE_IN_MESSAGE.search(message) else Reason(reason).advice
 
 
 def exit_code_of(reason: str | None) -> int:
     """Exit code of an image's `reason`; 0 for None, which means a solution."""
-    return EXIT_OK if reason is None else reason_of(reason).exit_code
+    return EXIT_OK if reason is None else Reason(reason).exit_code
 
 
 def length_text(metres: float, digits: int = 2) -> str:
@@ -141,7 +135,7 @@ class BadInput(Exception):
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
-        self.reason = reason_of(reason)
+        self.reason = Reason(reason)
 
 
 class BadOutput(BadInput):
@@ -174,7 +168,7 @@ class NoSolution(Exception):
     def __init__(self, message: str, reason: str | None = None, **evidence: Any) -> None:
         super().__init__(message)
         if reason is not None:
-            self.reason = reason_of(reason)
+            self.reason = Reason(reason)
         self.evidence = evidence
 
 

@@ -6,29 +6,28 @@ or raises `NoSolution`; there is no sentinel or half-filled result, NaN only whe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.errors import BadInput, NoSolution, NotIdentified, NotLocated, TooFewStars
 from startrack.core.fix import Blocked, Clock, ClockError, Fix, Integrity, Mode, PositionPrior, ShownError, UnstatedFact
-from startrack.core.values import Array, Bools, Ints, Value, array, take_rows
+from startrack.core.values import Array, Bools, Ints, Rows, Value, array
 
 __all__ = [
     "Array", "Attitude", "BadInput", "Blocked", "Body", "Bools", "Centroids", "Clock", "ClockError", "Correction",
     "Detections", "Evidence", "Exposure", "Fix", "Identification", "ImageErrors", "Integrity", "Ints", "Mask",
-    "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated", "PositionPrior", "ShownError", "Stars",
-    "TooFewStars", "UnstatedFact", "Value", "array",
+    "MeasuredSkyline", "Mode", "NoSolution", "NotIdentified", "NotLocated", "PositionPrior", "Rows", "ShownError",
+    "Stars", "TooFewStars", "UnstatedFact", "Value", "array",
 ]  # fmt: skip
 
 # Beyond the zenith: the search for an error of the horizon shifts the rows, by three sigma at most.
 MOST_ELEVATION_RAD = np.pi / 2 + 0.6
 TIME_SIGMA_S = 1.0  # of the clock, where nothing is stated
 MAX_PIXELS = 200_000_000  # contract: a larger image is refused from its header, before anything is decoded
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -101,7 +100,7 @@ class Exposure(Value):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Centroids(Value):
+class Centroids(Rows):
     """Positions and brightness of point sources, brightest first: what identification needs of them."""
 
     xy_px: Array = array("n", 2)
@@ -111,13 +110,6 @@ class Centroids(Value):
     saturated: Bools = array("n", dtype=np.bool_)
     psf_sigma_px: float  # Gaussian PSF before integration over the pixel, as used
     brightness_sigma_mag: float = 0.0  # added to each star's sigma; infinite where only the order is known
-
-    def __len__(self) -> int:
-        return len(self.snr)
-
-    def take(self: T, which: Any) -> T:
-        """The sources selected by a mask, slice or index array."""
-        return take_rows(self, which)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +125,7 @@ class Detections(Centroids):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stars(Value):
+class Stars(Rows):
     """Catalogue stars as seen at one time and position: proper motion and aberration applied."""
 
     catalog_id: NDArray[np.str_] = array("n", dtype=np.str_)  # such as "HIP 123"
@@ -141,13 +133,6 @@ class Stars(Value):
     rays_icrs: Array = array("n", 3)  # apparent directions
     v_mag: Array = array("n")
     v_sigma_mag: Array = array("n")  # catalogue, colour, variability, unresolved companions
-
-    def __len__(self) -> int:
-        return len(self.v_mag)
-
-    def take(self, which: Any) -> Stars:
-        """The stars that a mask, slice or index array `which` selects."""
-        return take_rows(self, which)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,7 +153,7 @@ class Attitude(Value):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Identification(Value):
+class Identification(Rows):
     """Which detection is which catalogue star; one-to-one."""
 
     detection: Ints = array("n", dtype=np.int64)  # index into Detections
@@ -176,9 +161,6 @@ class Identification(Value):
     R_cam_icrs: Array = array(3, 3)  # attitude at which the matches were verified
     false_alarm_probability: float  # that a sky of random detections would be accepted as well matched
     unexplained: int  # significant detections that no catalogue star explains
-
-    def __len__(self) -> int:
-        return len(self.star)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +177,7 @@ class ImageErrors:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evidence(Value):
+class Evidence(Rows):
     """Rays, each with a log-likelihood ratio l: visible sky against hidden by the terrain.
 
     Rows may come from stars, from pixels of the diffuse sky, and from several exposures. With V the fraction of the
@@ -235,10 +217,6 @@ class Evidence(Value):
             wrapped.flags.writeable = False
             object.__setattr__(self, "azimuth_rad", wrapped)
 
-    def take(self, which: Any) -> Evidence:
-        """The rows that a mask, slice or index array `which` selects."""
-        return take_rows(self, which)
-
     @classmethod
     def concatenate(cls, *parts: Evidence) -> Evidence:
         """The rows of all `parts`, of several sources or exposures, in one value, with the first clock and so on."""
@@ -248,25 +226,15 @@ class Evidence(Value):
         }
         return cls(**shared | {n: np.concatenate([getattr(part, n) for part in parts]) for n in cls._columns()})
 
-    @classmethod
-    def _columns(cls) -> list[str]:
-        return [f.name for f in fields(cls) if "shape" in f.metadata]
-
-    def __len__(self) -> int:
-        return len(self.llr)
-
 
 @dataclass(frozen=True, kw_only=True)
-class MeasuredSkyline(Value):
+class MeasuredSkyline(Rows):
     """A skyline measured in photographs: apparent elevations, refraction included, at azimuths in enu."""
 
     azimuth_rad: Array = array("n")
     elevation_rad: Array = array("n", may_be_nan=True)  # nan where unknown
     sigma_rad: Array = array("n")  # infinite where unknown
     source: NDArray[np.str_] = array("n", dtype=np.str_)  # "stars", "sky light", "both"; "" where unknown
-
-    def __len__(self) -> int:
-        return len(self.azimuth_rad)
 
     @property
     def known(self) -> Bools:

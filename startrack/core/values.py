@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import field, fields
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,24 +25,6 @@ def array(
     """
     metadata = {"shape": shape, "dtype": dtype, "default": default, "may_be_nan": may_be_nan}
     return field(metadata=metadata) if default is None else field(default=None, metadata=metadata)
-
-
-def take_rows(value: T, which: Any) -> T:
-    """The value with all its array fields of common length n cut to a mask, slice or index array.
-
-    Parts of checked rows need no check.
-    """
-    taken = object.__new__(type(value))
-    for f in fields(value):  # type: ignore[arg-type]
-        part = whole = getattr(value, f.name)
-        if f.metadata.get("shape", ())[:1] == ("n",):
-            part = whole[which]
-            if part.ndim != whole.ndim:
-                raise ValueError(f"{which!r} selects no rows: give a mask, a slice or an index array")
-            part = np.ascontiguousarray(part)
-            part.flags.writeable = False
-        object.__setattr__(taken, f.name, part)
-    return taken
 
 
 def _is_locked(given: Any, dtype: Any) -> bool:
@@ -76,3 +59,30 @@ class Value:
                 raise ValueError(f"{type(self).__name__}.{f.name} holds NaN")
             a.flags.writeable = False
             object.__setattr__(self, f.name, a)
+
+
+class Rows(Value):
+    """A value whose array fields have a common length n: that of the value."""
+
+    def __len__(self) -> int:
+        return len(getattr(self, self._columns()[0]))
+
+    def take(self: T, which: Any) -> T:
+        """The rows that a mask, slice or index array `which` selects; parts of checked rows need no check."""
+        taken = object.__new__(type(self))
+        for f in fields(self):  # type: ignore[arg-type]
+            part = whole = getattr(self, f.name)
+            if f.metadata.get("shape", ())[:1] == ("n",):
+                part = whole[which]
+                if part.ndim != whole.ndim:
+                    raise ValueError(f"{which!r} selects no rows: give a mask, a slice or an index array")
+                part = np.ascontiguousarray(part)
+                part.flags.writeable = False
+            object.__setattr__(taken, f.name, part)
+        return taken
+
+    @classmethod
+    @cache
+    def _columns(cls) -> list[str]:
+        """Names of the array fields of the common length."""
+        return [f.name for f in fields(cls) if f.metadata.get("shape", ())[:1] == ("n",)]  # type: ignore[arg-type]

@@ -9,18 +9,17 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
-from startrack.core.types import Array, Ints, Value, array
+from startrack.core.types import Array, Ints, Rows, array
 
 RIDGE_1 = 1e-14  # relative to the diagonal; the system stays solvable with unconstrained parameters
 TINY = 1e-300
 
 
 @dataclass(frozen=True, kw_only=True)
-class Observations(Value):
+class Observations(Rows):
     """Measured pixels with known directions, sorted by image."""
 
     image: Ints = array("n", dtype=np.int64)  # 0 ... images - 1, ascending
@@ -33,20 +32,10 @@ class Observations(Value):
         if np.any(np.diff(self.image) < 0) or np.any(self.image[:1] < 0):
             raise ValueError("Observations.image must ascend from 0")
 
-    def __len__(self) -> int:
-        return len(self.image)
-
     @property
     def images(self) -> int:
         """Number of images."""
         return int(self.image[-1]) + 1 if len(self.image) else 0
-
-    def take(self, which: Any) -> Observations:
-        """The observations that a mask or ascending indices `which` select; the images keep their numbers."""
-        return replace(
-            self, image=self.image[which], xy_px=self.xy_px[which], covariance_px2=self.covariance_px2[which],
-            rays_icrs=self.rays_icrs[which],
-        )  # fmt: skip
 
 
 def observations(

@@ -1,9 +1,9 @@
 """One image with the facts that travel with it: read, validate, write.
 
-`decode_file.py` opens a file and picks its decoder (`png.py`, `tiff.py`, `jpeg.py`, `fits.py`, `mosaic.py` for camera
-raw files); `bag.py` and `bag_images.py` read images from ROS bags; `mask.py` reads which pixels count; `correct.py`
-applies dark frame and flat field; `metadata.py` finds time, exposure seconds, camera, terrain, mask, dark frame and
-flat field: in flags, the sidecar (`sidecar.py`) and the header (`header.py`); `write.py` writes images and sidecars.
+`decoding.py` opens a file and picks its decoder (`png.py`, `tiff.py`, `jpeg.py`, `fits.py`, `mosaic.py` for camera
+raw files); `bag.py` and `bag_images.py` read images from ROS bags; `correction.py` reads which pixels count and applies
+dark frame and flat field; `facts.py` finds the other facts, in flags, the sidecar (`sidecar.py`) and the header;
+`write.py` writes images and sidecars.
 A file that cannot be used raises `startrack.core.errors.BadInput` and no other exception.
 """
 
@@ -16,11 +16,17 @@ from startrack.exposure.bag_images import (
     read_bag_image,
     split_bag_path,
 )
-from startrack.exposure.correct import correct_exposure, read_dark, read_flat
-from startrack.exposure.decode_file import decode_bytes
-from startrack.exposure.decoded import are_fractions
+from startrack.exposure.correction import (
+    combine_masks,
+    correct_exposure,
+    mask_of,
+    read_dark,
+    read_flat,
+    read_mask,
+    touch_masked,
+)
+from startrack.exposure.decoding import are_fractions, decode_bytes
 from startrack.exposure.facts import NO_TIME, Facts, check_time_sigma_s, with_facts
-from startrack.exposure.mask import combine_masks, mask_of, read_mask, touch_masked
 from startrack.exposure.read import exposure_of, exposure_of_decoded, read_exposure
 from startrack.exposure.sidecar import (
     IMAGE_KEYS,

@@ -25,8 +25,7 @@ from startrack.exposure.bag import (
     read_message,
     read_messages,
 )
-from startrack.exposure.decode_file import decode_bytes
-from startrack.exposure.decoded import Decoded, check_size, grey_float32, largest_value
+from startrack.exposure.decoding import Decoded, check_size, decode_bytes, grey_float32, largest_value
 from startrack.exposure.facts import Facts
 from startrack.exposure.read import exposure_of_decoded
 

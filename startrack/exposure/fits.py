@@ -17,7 +17,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from startrack.exposure.decoded import MAX_FILE_BYTES, Decoded, bad_image, check_size, grey_float32
+from startrack.exposure.decoding import MAX_FILE_BYTES, Decoded, bad_image, check_size, grey_float32
 from startrack.exposure.facts import HEADER_KEYS
 
 BLOCK_BYTES = 2880
@@ -27,7 +27,7 @@ INTEGER_CARD = re.compile(rb"(NAXIS\d*|TFIELDS|BITPIX|PCOUNT|GCOUNT) *= *([+-]?\
 GZIP, BZIP2 = b"\x1f\x8b", b"BZh"
 
 
-def decode_fits(raw: bytes) -> Decoded:
+def decode(raw: bytes) -> Decoded:
     """Pixels and header of the only image of a FITS file: BZERO applied, native byte order, rows as stored.
 
     Raises BadInput bad_image if it is truncated, damaged (DATASUM), a cube, or if it has several images or undefined

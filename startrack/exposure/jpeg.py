@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.exposure.decoded import Decoded, bad_image, check_size, exif_warnings, grey_float32, largest_value
+from startrack.exposure.decoding import Decoded, bad_image, check_size, exif_warnings, grey_float32, largest_value
 from startrack.exposure.facts import facts_in_text
 
 START_OF_SCAN, END_OF_IMAGE = 0xDA, b"\xff\xd9"
@@ -26,7 +26,7 @@ PARAMETERLESS = {0x01, *range(0xD0, 0xD8)}  # markers without a length: TEM and 
 FILLER = b"".join(bytes((37 * i + 11) % 251 for i in range(128)) + bytes((0xFF, 0xD0 + k)) for k in range(8))
 
 
-def decode_jpeg(raw: bytes) -> Decoded:
+def decode(raw: bytes) -> Decoded:
     """Pixels of a grey or colour JPEG, 0 to 255; metadata from its comment.
 
     Raises BadInput bad_image if it is truncated, damaged or CMYK.

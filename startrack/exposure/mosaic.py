@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from startrack.core.statistics import robust_sigma
 from startrack.core.types import Array
-from startrack.exposure.decoded import Decoded, bad_image, check_size
+from startrack.exposure.decoding import Decoded, bad_image, check_size
 
 STDERR = 2  # its file descriptor
 Picture = NDArray[np.float32]
@@ -34,7 +34,7 @@ NEARLY_SATURATED_1 = 0.9  # of the saturation
 PHASES = ((0, 0), (0, 1), (1, 0), (1, 1))
 
 
-def decode_camera_raw(raw: bytes) -> Decoded:
+def decode(raw: bytes) -> Decoded:
     """The mosaic as the sensor gave it, without its masked border, black level not subtracted.
 
     No time is taken from it: such cameras write local times. Raises BadInput bad_image if it is damaged, if its pixels

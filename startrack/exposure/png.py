@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.compilation import announce_compilation
-from startrack.exposure.decoded import (
+from startrack.exposure.decoding import (
     Decoded,
     bad_image,
     check_size,
@@ -31,7 +31,7 @@ MAX_TEXT_BYTES = 4096  # of one fact; a compressed chunk is not inflated beyond 
 IHDR_END = len(SIGNATURE) + 12 + 13  # text is spliced in after the header chunk
 
 
-def decode_png(raw: bytes) -> Decoded:
+def decode(raw: bytes) -> Decoded:
     """Pixels and facts of a PNG file of 8 or 16 bits, grey or colour.
 
     `BadInput` if truncated or damaged, with alpha or palette, animated, or of fewer bits.

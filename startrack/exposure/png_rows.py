@@ -8,7 +8,7 @@ from isal import isal_zlib
 from numpy.typing import NDArray
 
 from startrack.core.kernels import njit
-from startrack.exposure.decoded import bad_image
+from startrack.exposure.decoding import bad_image
 
 DAMAGED = "damaged PNG: its picture data cannot be decoded"
 

@@ -12,11 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from startrack.core.types import TIME_SIGMA_S, Bools, Exposure
-from startrack.exposure.correct import correct_counts, correction_warnings
-from startrack.exposure.decode_file import decode_file
-from startrack.exposure.decoded import COLOUR_WARNING, Decoded, bad_image, check_size, grey_float32, largest_value
+from startrack.exposure.correction import correct_counts, correction_warnings, mask_of
+from startrack.exposure.decoding import (
+    COLOUR_WARNING,
+    Decoded,
+    bad_image,
+    check_size,
+    decode_file,
+    grey_float32,
+    largest_value,
+)
 from startrack.exposure.facts import Facts, resolve_facts
-from startrack.exposure.mask import mask_of
 from startrack.exposure.mosaic import MOSAIC_WARNING, equalize_mosaic
 from startrack.exposure.sidecar import stem
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from startrack.exposure.decoded import (
+from startrack.exposure.decoding import (
     Decoded,
     bad_image,
     check_size,
@@ -33,7 +33,7 @@ READ = "integers of 8, 16 or 32 bits and floating point"
 TYPES = {"uint8", "uint16", "uint32", "int8", "int16", "int32", "float16", "float32", "float64"}
 
 
-def decode_tiff(raw: bytes) -> Decoded:
+def decode(raw: bytes) -> Decoded:
     """Pixels of a TIFF with one grey or colour picture of whole bytes; metadata from its ImageDescription.
 
     Raises BadInput bad_image if it is truncated, has alpha, palette or CMYK, or holds several pictures (reduced copies

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from startrack.chain import STAGES, Detected, Identified, Inputs, Outcome, last_value
-from startrack.core.errors import reason_of
+from startrack.core.errors import Reason
 from startrack.core.types import Exposure
 from startrack.output.quantities import BY_PATH, QUANTITIES
 from startrack.output.quantity import Schema, record_from
@@ -71,7 +71,7 @@ def refused_dict(image: str, reason: str, message: str, kind: str = "fix") -> di
         "status": "refused",
         "reason": str(reason),
         "message": message,
-        "advice": reason_of(reason).advice,
+        "advice": Reason(reason).advice,
     }
 
 
@@ -95,7 +95,7 @@ def _record(
         "status": result.status,
         "reason": None if result.reason is None else str(result.reason),
         "message": result.message,
-        **({} if result.reason is None else {"advice": reason_of(result.reason).advice}),
+        **({} if result.reason is None else {"advice": Reason(result.reason).advice}),
         **first,
         **(own or {}),
         **sections,

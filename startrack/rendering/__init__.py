@@ -1,9 +1,8 @@
 """An exposure and its truth from catalogue, camera, terrain and a true pose."""
 
-from startrack.rendering.compose import light_e, render, truth_of, truth_paths, write_truth
+from startrack.rendering.compose import draw_hot_pixels, light_e, render, truth_of, truth_paths, write_truth
 from startrack.rendering.drive import Drive, draw_odometry, read_drive
 from startrack.rendering.scene import HotPixels, Scene, Truth
-from startrack.rendering.sensor import draw_hot_pixels
 from startrack.rendering.series import Pose, Series, load_sky_catalog
 from startrack.rendering.sky import sky_e_per_s, sky_gradient
 from startrack.rendering.sources import (

@@ -20,9 +20,9 @@ from startrack.frames import (
     observer_velocity_m_s,
     sky_rotvec_rad,
 )
+from startrack.rendering.compose import draw_hot_pixels
 from startrack.rendering.drive import Drive, draw_odometry
 from startrack.rendering.scene import Scene
-from startrack.rendering.sensor import draw_hot_pixels
 from startrack.rendering.sources import concatenate_stars, draw_field_stars, draw_v_errors, exposure_for_snr
 from startrack.terrain import Terrain
 

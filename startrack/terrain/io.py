@@ -19,7 +19,6 @@ from startrack.terrain.protocol import Terrain
 from startrack.terrain.shape import CYLINDER_FACTS
 
 DEFAULT_MAP_RADIUS_M = 10_000.0  # of the search area on height maps
-DEFAULT_CAMERA_HEIGHT_M = 1.5
 
 FILE = Text(max_chars=4000)
 KEYS = Table(
@@ -60,12 +59,14 @@ KEYS = Table(
             },
         ),
         "rover": Table(
+            default={},
             keys={
-                "camera_height_m": replace(CAMERA_HEIGHT, default=DEFAULT_CAMERA_HEIGHT_M),
+                "camera_height_m": replace(CAMERA_HEIGHT, default=1.5),
                 "camera_height_sigma_m": CAMERA_SIGMA,
             }
         ),
         "search": Table(
+            default={},
             keys={
                 "radius_m": LENGTH,
                 "max_slope_deg": Number(low=0.0, high=90.0, above=True, default=90.0),
@@ -127,11 +128,9 @@ def _map_stamps(folder: Path, keys: dict[str, Any]) -> tuple[Any, ...]:
     """Values that change when one of the maps does."""
     stamps = []
     for path in _map_files(keys, folder):
-        try:
+        with suppress(OSError, ValueError):  # `read_map` reports it
             status = path.stat()
-        except (OSError, ValueError):  # `read_map` reports it
-            continue
-        stamps.append((status.st_ino, status.st_size, status.st_mtime_ns))
+            stamps.append((status.st_ino, status.st_size, status.st_mtime_ns))
     return tuple(stamps)
 
 
@@ -158,9 +157,9 @@ def terrain_from_dict(values: dict[str, Any], default_name: str = "terrain", fol
 
 
 def _make_cylinder(keys: dict[str, Any], name: str, site: Site) -> Cylinder:
-    cylinder, search, rover = dict(keys["cylinder"]), keys.get("search", {}), keys.get("rover", {})
-    sigmas = {key: cylinder.pop(key, None) for key in [fact.key for fact in CYLINDER_FACTS]}
-    if cylinder.pop("exact", False):
+    cylinder, rover = keys["cylinder"], keys["rover"]
+    sigmas: dict[str, Any] = {fact.key: cylinder.get(fact.key) for fact in CYLINDER_FACTS}
+    if cylinder.get("exact", False):
         wrong = [key for key, sigma in sigmas.items() if sigma]
         if wrong:
             raise BadInput("bad_terrain", f"cylinder.exact is true, but {wrong[0]} is not 0: leave one of them out")
@@ -168,11 +167,12 @@ def _make_cylinder(keys: dict[str, Any], name: str, site: Site) -> Cylinder:
     return Cylinder(
         name=name,
         site=site,
-        camera_height_m=rover.get("camera_height_m", DEFAULT_CAMERA_HEIGHT_M),
-        search_radius_m=search.get("radius_m", cylinder["diameter_m"] / 2),
+        camera_height_m=rover["camera_height_m"],
+        diameter_m=cylinder["diameter_m"],
+        depth_m=cylinder["depth_m"],
+        search_radius_m=keys["search"].get("radius_m", cylinder["diameter_m"] / 2),
         camera_height_sigma_m=rover.get("camera_height_sigma_m", 0.0),
         rim_tilt_sigma_rad=_radians(sigmas.pop("rim_tilt_sigma_deg")),
-        **cylinder,
         **sigmas,
     )
 
@@ -187,15 +187,15 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
 
     if site.body != "moon":
         raise BadInput("bad_terrain", "[dem] maps are heights above the Moon's sphere: body must be moon")
-    dem, search, rover = keys["dem"], keys.get("search", {}), keys.get("rover", {})
+    dem, rover, search = keys["dem"], keys["rover"], keys["search"]
     scaling = {key: dem[key] for key in ("scale", "offset_m") if key in dem}
-    near = site.latitude_rad, site.longitude_rad
+    near, files = (site.latitude_rad, site.longitude_rad), _map_files(keys, folder)
     return HeightMap(
         name=name,
         site=site,
-        maps=tuple(read_map(file, near=near, **scaling) for file in _map_files(keys, folder)),
-        files=tuple(_map_files(keys, folder)),
-        camera_height_m=rover.get("camera_height_m", DEFAULT_CAMERA_HEIGHT_M),
+        camera_height_m=rover["camera_height_m"],
+        maps=tuple(read_map(file, near=near, **scaling) for file in files),
+        files=tuple(files),
         search_radius_m=search.get("radius_m", DEFAULT_MAP_RADIUS_M),
         height_sigma_m=dem.get("height_sigma_m", 0.0),
         unstated_errors=() if "height_sigma_m" in dem else ("height_sigma_m",),
@@ -203,6 +203,6 @@ def _make_height_map(keys: dict[str, Any], name: str, site: Site, folder: Path) 
         stretch_sigma_1=dem.get("stretch_sigma_1"),
         vertical_sigma_rad=_radians(dem.get("vertical_sigma_deg")),
         camera_height_sigma_m=rover.get("camera_height_sigma_m"),
-        most_slope_rad=float(np.radians(search.get("max_slope_deg", 90.0))),
+        most_slope_rad=float(np.radians(search["max_slope_deg"])),
         glare_rad=tuple((float(np.radians(a)), float(np.radians(b))) for a, b in search.get("glare_deg", ())),
     )

@@ -12,7 +12,7 @@ from startrack.applications.calibration.board import BoardCalibration
 from startrack.applications.calibration.photometry import photometry_dict
 from startrack.applications.calibration.run import Calibration
 from startrack.camera import Camera, camera_to_dict
-from startrack.core.errors import reason_of
+from startrack.core.errors import Reason
 from startrack.core.types import Array
 from startrack.frames import format_utc, quat_xyzw_from_R
 
@@ -98,7 +98,7 @@ def refusal_dict(reason: str, text: str, refused: tuple[RefusedImage, ...] = ())
         "status": "refused",
         "reason": reason,
         "message": text,
-        "advice": reason_of(reason).advice,
+        "advice": Reason(reason).advice,
         "camera": None,
         "refused": [vars(one) for one in refused],
     }

@@ -9,7 +9,7 @@ from functools import reduce
 import numpy as np
 
 from startrack.core.statistics import robust_sigma
-from startrack.core.types import Array, Bools, Ints, take_rows
+from startrack.core.types import Array, Bools, Ints
 from startrack.estimation.frame_matching import Frame, match_frame
 from startrack.estimation.joint_fit import JointFit
 from startrack.exposure import combine_masks
@@ -46,7 +46,7 @@ def remove_static_sources(frames: tuple[Frame, ...], R_cam_icrs: Array) -> tuple
         for tree, other in zip(trees, R_cam_icrs, strict=True):
             if has_turned(R, other, frame.exposure.size_px):
                 static |= np.isfinite(tree.query(frame.sources.xy_px, distance_upper_bound=SAME_PX)[0])
-        moving.append(replace(frame, sources=take_rows(frame.sources, ~static)))
+        moving.append(replace(frame, sources=frame.sources.take(~static)))
     return tuple(moving)
 
 

@@ -1,16 +1,26 @@
-"""The value that every decoder returns, and the checks that decoders share."""
+"""From a file to its pixels and header: open, find the type from its first bytes, decode strictly.
+
+The decoders, one module each, return the value `Decoded` and share the checks here.
+"""
 
 from __future__ import annotations
 
+import os
+import stat
 import struct
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from importlib import import_module
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from startrack.core.files import MAX_CAUSE_CHARS, FilePath, printable
 from startrack.core.types import MAX_PIXELS, BadInput
+from startrack.exposure.sidecar import RAW_SUFFIXES
 
 MAX_FILE_BYTES = 8 * MAX_PIXELS + 2**24  # the largest image at the widest pixel type, and its headers
 EXACT_IN_FLOAT32 = 2**24
@@ -20,6 +30,14 @@ FRACTIONS_WARNING = (
     "counts themselves (integers, or floating point in ADU)"
 )
 COLOUR_WARNING = "colour image: the plain mean of its three channels is used"
+Stamp = tuple[int, ...]  # of a file: inode, size, time of its last change
+T = TypeVar("T")
+STARTS = {  # of files, by their kind, whose module in lower case has the function `decode`
+    "PNG": (b"\x89PNG\r\n\x1a\n",),
+    "TIFF": (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"),
+    "JPEG": (b"\xff\xd8\xff",),
+    "FITS": (b"SIMPLE  =", b"\x1f\x8b", b"BZh"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,3 +121,71 @@ def exif_warnings(read_exif: Callable[[], Any]) -> tuple[str, ...]:
         return orientation_warnings(read_exif().get(0x0112))
     except (OSError, SyntaxError, ValueError, TypeError, LookupError, struct.error) as error:
         return (f"EXIF data cannot be read ({error}); ignored",)
+
+
+def decode_file(path: FilePath) -> tuple[bytes, Decoded]:
+    """The bytes of the image at `path`, and their content. Raises BadInput bad_image with file and cause."""
+    try:
+        raw = _read_bytes(path)
+        return raw, decode_bytes(raw, camera_raw=Path(path).suffix.lower() in RAW_SUFFIXES)
+    except BadInput as error:
+        raise BadInput(error.reason, " ".join(f"{printable(path)}: {error}".split())) from error
+
+
+def read_stamped(path: FilePath, read: Callable[[str, Stamp], T], kind: str, reason: str | None = None) -> T:
+    """What `read` gives for the file at `path` and a stamp of its present state, by which it may keep results.
+
+    Raises BadInput `reason` (None: that of the cause) with the `kind` of file and the cause.
+    """
+    try:
+        found = os.stat(path)
+        return read(os.fspath(path), (found.st_ino, found.st_size, found.st_mtime_ns))
+    except BadInput as error:
+        raise BadInput(reason or error.reason, f"{kind} {error}") from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        cause = getattr(error, "strerror", None) or error
+        raise BadInput(reason or "bad_image", f"{kind} {printable(path)}: cannot be opened ({cause})") from error
+
+
+def _read_bytes(path: FilePath) -> bytes:
+    try:
+        status = os.stat(path)
+        if stat.S_ISDIR(status.st_mode):
+            raise bad_image("is a folder, not an image")
+        if not stat.S_ISREG(status.st_mode):  # a pipe would block, a device never end
+            raise bad_image("is not a regular file")
+        if status.st_size == 0:
+            raise bad_image("is empty")
+        if status.st_size > MAX_FILE_BYTES:
+            raise bad_image(f"is {status.st_size / 1e9:.1f} GB, more than any image startrack reads")
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise bad_image(f"cannot be opened ({error.strerror or error})") from error
+    except ValueError as error:  # a NUL in the name
+        raise bad_image(f"cannot be opened ({error})") from error
+
+
+def decode_bytes(raw: bytes, *, camera_raw: bool = False) -> Decoded:
+    """The decoded content of a file, of a camera's raw file where `camera_raw` is set.
+
+    Camera raw files are known by their suffix: they are TIFFs with a thumbnail.
+
+    Raises BadInput bad_image; whatever else a decoder raises for damaged bytes is turned into it.
+    """
+    kind = next((kind for kind, starts in STARTS.items() if raw.startswith(starts)), None)
+    if camera_raw:
+        kind = "camera raw file"
+    if kind is None:
+        raise bad_image("is not a PNG, TIFF, JPEG or FITS file, nor named as a camera raw file")
+    try:
+        decoder = import_module(f"startrack.exposure.{'mosaic' if camera_raw else kind.lower()}")
+        with warnings.catch_warnings():  # the decoders' checks refuse the file or fill `Exposure.warnings`
+            warnings.simplefilter("ignore")
+            decoded: Decoded = decoder.decode(raw)
+            return decoded
+    except BadInput:
+        raise
+    except Exception as error:
+        raise bad_image(
+            f"truncated or damaged {kind} ({type(error).__name__}: {str(error)[:MAX_CAUSE_CHARS]})"
+        ) from error

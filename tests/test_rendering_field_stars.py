@@ -9,7 +9,7 @@ from render_helpers import SITE, stars_at
 from startrack.catalog import load_catalog
 from startrack.core.types import Stars
 from startrack.frames import R_enu_icrs, R_from_rotvec, Site, sky_rotvec_rad
-from startrack.rendering import concatenate_stars, draw_field_stars, draw_v_errors
+from startrack.rendering import draw_field_stars, draw_v_errors
 
 TIME = datetime(2026, 3, 1, 12, tzinfo=UTC)
 
@@ -17,7 +17,7 @@ TIME = datetime(2026, 3, 1, 12, tzinfo=UTC)
 def test_catalogue_and_field_together_follow_the_counts_of_the_sky():
     catalogue = load_catalog().at(None, None)
     field = draw_field_stars(catalogue, 10.0, rng=np.random.default_rng(1))
-    both = concatenate_stars(catalogue, field)
+    both = Stars.concatenate(catalogue, field)
     # The usual table of star counts (after Allen 1973, Astrophysical Quantities, 3rd ed.); editions differ by 10 %.
     for v, count in ((8, 42_000), (9, 117_000), (10, 324_000)):
         assert (both.v_mag < v).sum() == pytest.approx(count, rel=0.25)

@@ -22,50 +22,27 @@ MIN_SIGMA = 1e-15  # of a parameter, px or 1; smaller ones count as zero
 ROUNDING_1 = 1e-6  # of correlations: asymmetry and negative eigenvalues up to this are rounding
 MAX_PARAMETERS = 32
 CAMERA_PARAMETERS = ("fx", "fy", "cx", "cy", "p1", "p2")  # beside those of the lens
-SENSOR = Table(
-    closed=True,
-    keys={
-        "zero_point_e_per_s": Number(
-            low=1e-6,
-            high=1e15,
-            required=True,
-            description="electrons per second of a V = 0 star on the axis, whole PSF",
-        ),
-        "gain_e_per_adu": Number(low=1e-6, high=1e6, default=1.0),
-        "bias_adu": Number(low=-1e9, high=1e9, default=0.0),
-        "read_noise_e": Number(low=0, high=1e6, default=0.0),
-        "dark_e_per_s": Number(low=0, high=1e9, default=0.0, description="per pixel"),
-        "saturation_adu": Number(low=1, high=1e12, default=65535.0),
-        "psf_sigma_px": Number(low=0.01, high=50, default=1.0, description="before integration over the pixel"),
-        "vignetting": List(
-            each=Number(low=-100, high=100),
-            count=2,
-            default=(0.0, 0.0),
-            description="relative throughput 1 + v1 a^2 + v2 a^4",
-        ),
-    },
-)
-MOUNT = Table(
-    keys={
-        "quat_xyzw_body_cam": List(
-            each=Number(low=-1, high=1),
-            count=4,
-            description="x, y, z, w of the rotation from cam to body; default: a camera that looks up",
-        )
-    }
-)
-COVARIANCE = Table(
-    keys={
-        "order": List(each=Text(max_chars=20), required=True, least=1, most=MAX_PARAMETERS),
-        "matrix": List(
-            each=List(each=Number(), most=MAX_PARAMETERS),
-            required=True,
-            least=1,
-            most=MAX_PARAMETERS,
-            description="px and 1",
-        ),
-    }
-)
+SENSOR = Table(closed=True, keys={
+    "zero_point_e_per_s": Number(low=1e-6, high=1e15, required=True,
+                                 description="electrons per second of a V = 0 star on the axis, whole PSF"),
+    "gain_e_per_adu": Number(low=1e-6, high=1e6, default=1.0),
+    "bias_adu": Number(low=-1e9, high=1e9, default=0.0),
+    "read_noise_e": Number(low=0, high=1e6, default=0.0),
+    "dark_e_per_s": Number(low=0, high=1e9, default=0.0, description="per pixel"),
+    "saturation_adu": Number(low=1, high=1e12, default=65535.0),
+    "psf_sigma_px": Number(low=0.01, high=50, default=1.0, description="before integration over the pixel"),
+    "vignetting": List(each=Number(low=-100, high=100), count=2, default=(0.0, 0.0),
+                       description="relative throughput 1 + v1 a^2 + v2 a^4"),
+})  # fmt: skip
+MOUNT = Table(keys={
+    "quat_xyzw_body_cam": List(each=Number(low=-1, high=1), count=4, description="x, y, z, w of the rotation from cam "
+                               "to body; default: a camera that looks up"),
+})  # fmt: skip
+COVARIANCE = Table(keys={
+    "order": List(each=Text(max_chars=20), required=True, least=1, most=MAX_PARAMETERS),
+    "matrix": List(each=List(each=Number(), most=MAX_PARAMETERS), required=True, least=1, most=MAX_PARAMETERS,
+                   description="px and 1"),
+})  # fmt: skip
 
 
 def camera_keys(lens: type[Lens] | None = None) -> Table:
@@ -176,9 +153,18 @@ def _camera(values: dict[str, Any], default_name: str, folder: Path) -> Camera:
     if width * height > MAX_PIXELS:
         raise ValueError(f"size_px is {width} x {height}: more than {MAX_PIXELS / 1e6:.0f} Mpx")
     lens = lens_kinds()[values["model"]].from_file(values)
-    max_angle, calibrated = _angles_rad(values, lens)
+    max_angle = float(np.radians(values["max_angle_deg"]))
+    if max_angle > lens.max_invertible_rad + 1e-9:
+        limit = np.degrees(lens.max_invertible_rad)
+        raise ValueError(f"max_angle_deg: the radius of this lens only rises to {limit:.2f} degrees")
+    calibrated = float(np.radians(min(values.get("calibrated_angle_deg", np.inf), values["max_angle_deg"])))
     order, covariance = _covariance(values.get("covariance"), lens)
     sensor = None if "sensor" not in values else _sensor(values["sensor"], calibrated)
+    R_body_cam, quat_xyzw = ZENITH_MOUNT_R_BODY_CAM, values.get("mount", {}).get("quat_xyzw_body_cam")
+    if quat_xyzw is not None:
+        if abs(np.linalg.norm(quat_xyzw) - 1) > UNIT_QUATERNION_1:
+            raise ValueError("mount.quat_xyzw_body_cam is not a unit quaternion")
+        R_body_cam = R_from_quat_xyzw(quat_xyzw)
     return Camera(
         name=values.get("name", default_name),
         size_px=values["size_px"],
@@ -189,22 +175,12 @@ def _camera(values: dict[str, Any], default_name: str, folder: Path) -> Camera:
         lens=lens,
         mirrored=values["mirrored"],
         decentring=Decentring(*values.get("decentring", ())),
-        R_body_cam=_mount(values.get("mount", {})),
+        R_body_cam=R_body_cam,
         sensor=sensor,
         covariance_order=order,
         covariance=covariance,
         mask=str(folder / values["mask"]) if "mask" in values else None,
     )
-
-
-def _angles_rad(values: dict[str, Any], lens: Lens) -> tuple[float, float]:
-    """max_angle and calibrated_angle [rad]."""
-    max_angle = np.radians(values["max_angle_deg"])
-    if max_angle > lens.max_invertible_rad + 1e-9:
-        limit = np.degrees(lens.max_invertible_rad)
-        raise ValueError(f"max_angle_deg: the radius of this lens only rises to {limit:.2f} degrees")
-    calibrated = np.radians(values.get("calibrated_angle_deg", values["max_angle_deg"]))
-    return float(max_angle), float(min(calibrated, max_angle))
 
 
 def _sensor(values: dict[str, Any], calibrated_rad: float) -> Sensor:
@@ -217,15 +193,6 @@ def _sensor(values: dict[str, Any], calibrated_rad: float) -> Sensor:
             f"throughput falls to {lowest:.2g} of that on the axis, below {MIN_THROUGHPUT_1:g}: no lens is that dark"
         )
     return sensor
-
-
-def _mount(values: dict[str, Any]) -> Array:
-    if "quat_xyzw_body_cam" not in values:
-        return ZENITH_MOUNT_R_BODY_CAM
-    q = np.array(values["quat_xyzw_body_cam"])
-    if abs(np.linalg.norm(q) - 1) > UNIT_QUATERNION_1:
-        raise ValueError("mount.quat_xyzw_body_cam is not a unit quaternion")
-    return R_from_quat_xyzw(q)
 
 
 def _covariance(values: dict[str, Any] | None, lens: Lens) -> tuple[tuple[str, ...], Array | None]:

@@ -63,9 +63,8 @@ class _View:
         """Sun - body - observer: 0 when full."""
         return float(np.degrees(angle_between_rad(self.from_sun_au, self.from_observer_au)))
 
-    def latitudes_deg(self, pole_ra_deg: float, pole_dec_deg: float) -> tuple[float, float]:
-        """Latitudes on the body of the points below the Sun and below the observer."""
-        pole = rays_from_azel(np.radians(90.0 - pole_ra_deg), np.radians(pole_dec_deg))
+    def latitudes_deg(self, pole: Array) -> tuple[float, float]:
+        """Latitudes on the body, with a `pole` (3,), of the points below the Sun and below the observer."""
         sun, observer = (angle_between_rad(pole, v) for v in (self.from_sun_au, self.from_observer_au))
         return float(np.degrees(sun)) - 90, float(np.degrees(observer)) - 90
 
@@ -86,16 +85,21 @@ def _apparent_body(source: _Source, observer_m: Array, velocity_m_s: Array, et: 
     return Body(name=source.name, ray_icrs=ray, v_mag=source.v_mag(view))
 
 
+# Archinal et al. (2018), Celestial Mechanics and Dynamical Astronomy 130, 22, at J2000: 90 degrees less the right
+# ascension, and the declination.
+_SATURN_POLE, _URANUS_POLE = (rays_from_azel(*np.radians(at)) for at in ((49.411, 83.537), (-167.311, -15.175)))
+
+
 def _saturns_rings(view: _View) -> float:
     """They show their dark side when Sun and observer are on opposite sides."""
-    sun, observer = view.latitudes_deg(40.589, 83.537)
+    sun, observer = view.latitudes_deg(_SATURN_POLE)
     tilt = np.sin(np.radians(np.sqrt(max(sun * observer, 0.0))))
     return float(-1.825 * tilt - 0.378 * tilt * np.exp(-2.25 * view.phase_deg))
 
 
 def _uranus_poles(view: _View) -> float:
     """They are brighter than the equator. The phase never exceeds 3.1 degrees from Earth or Moon."""
-    return -0.00084 * sum(map(abs, view.latitudes_deg(257.311, -15.175))) / 2
+    return -0.00084 * sum(map(abs, view.latitudes_deg(_URANUS_POLE))) / 2
 
 
 def _neptunes_rise(view: _View) -> float:
@@ -105,10 +109,7 @@ def _neptunes_rise(view: _View) -> float:
 
 @dataclass(frozen=True)
 class _Source:
-    """A body and its magnitude at 1 au from Sun and observer: a polynomial of the phase, up to an angle, and the rest.
-
-    Poles: Archinal et al. (2018), Celestial Mechanics and Dynamical Astronomy 130, 22, at J2000.
-    """
+    """A body and its magnitude at 1 au from Sun and observer: a polynomial of the phase, up to an angle, and the rest."""
 
     name: str
     naif: int

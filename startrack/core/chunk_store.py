@@ -75,7 +75,9 @@ class ChunkStore(Generic[Task]):
             for task, chunk in self._runner.results(missing):
                 if isinstance(chunk, Died):
                     raise RunStopped(f"{what}: {chunk.cause}")
-                write_atomically(self._path(task), _pack_chunk(chunk), overwrite=True)
+                buffer = io.BytesIO()
+                np.savez_compressed(buffer, **chunk)  # type: ignore[arg-type]
+                write_atomically(self._path(task), buffer.getvalue(), overwrite=True)
                 bar.advance(len(task))
         for task in tasks:
             with np.load(self._path(task)) as stored:
@@ -110,9 +112,3 @@ def _source_digest(patterns: tuple[str, ...]) -> str:
     if missing:
         raise ValueError(f"no source of startrack matches {missing[0].relative_to(PACKAGE)}")
     return hashlib.sha256(b"".join(path.name.encode() + path.read_bytes() for path in sorted(found))).hexdigest()
-
-
-def _pack_chunk(chunk: Chunk) -> bytes:
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **chunk)  # type: ignore[arg-type]
-    return buffer.getvalue()

@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 CONNECT_S = 10.0
 CLOSE_S = 5.0  # for idle processes to end by themselves
 TASK_LIMIT_S = 900.0  # without any result: far above the slowest image, reached only by a blocked process
-TASKS_PER_PROCESS = 2  # submitted at a time: one in progress and the next
-TASKS_PER_CLUSTER_THREAD = 4  # submitted at a time: 100,000 tasks take no more memory than a hundred
+TASKS_PER_PROCESS = 2  # submitted at a time: one in progress and the next; twice as many far away, on a cluster
 DIED = "the process that worked on it died (out of memory?) or stood still, alone as it did beside others"
 DIED_ON_CLUSTER = "the Dask workers that worked on it died, one after the other (out of memory?)"
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -172,7 +171,7 @@ class Runner(Generic[Task, Result]):
 
         client = self.connect()
         coming, running, submitted = iter(tasks), as_completed(), dict[Any, Task]()
-        free = TASKS_PER_CLUSTER_THREAD * max(sum(client.nthreads().values()), 1)
+        free = 2 * TASKS_PER_PROCESS * max(sum(client.nthreads().values()), 1)
         while True:
             for task in islice(coming, 0 if self._stopping else free):
                 future = client.submit(self.work, task, pure=False)

@@ -218,13 +218,11 @@ class Evidence(Rows):
             object.__setattr__(self, "azimuth_rad", wrapped)
 
     @classmethod
-    def concatenate(cls, *parts: Evidence) -> Evidence:
+    def concatenate(cls, *parts: Evidence, **shared: Any) -> Evidence:
         """The rows of all `parts`, of several sources or exposures, in one value, with the first clock and so on."""
-        shared: dict[str, Any] = {
-            name: next((getattr(part, name) for part in parts if getattr(part, name) is not None), None)
-            for name in ("clock", "near", "image_errors", "support")
-        }
-        return cls(**shared | {n: np.concatenate([getattr(part, n) for part in parts]) for n in cls._columns()})
+        for name in ("clock", "near", "image_errors", "support"):
+            shared[name] = next((getattr(part, name) for part in parts if getattr(part, name) is not None), None)
+        return super().concatenate(*parts, **shared)
 
 
 @dataclass(frozen=True, kw_only=True)

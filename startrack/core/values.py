@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import field, fields
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
-T = TypeVar("T")
 
 
 def array(
@@ -67,7 +66,7 @@ class Rows(Value):
     def __len__(self) -> int:
         return len(getattr(self, self._columns()[0]))
 
-    def take(self: T, which: Any) -> T:
+    def take(self, which: Any) -> Self:
         """The rows that a mask, slice or index array `which` selects; parts of checked rows need no check."""
         taken = object.__new__(type(self))
         for f in fields(self):  # type: ignore[arg-type]
@@ -80,6 +79,11 @@ class Rows(Value):
                 part.flags.writeable = False
             object.__setattr__(taken, f.name, part)
         return taken
+
+    @classmethod
+    def concatenate(cls, *parts: Self, **shared: Any) -> Self:
+        """The rows of all `parts` in one value; its other fields are `shared`."""
+        return cls(**shared | {name: np.concatenate([getattr(one, name) for one in parts]) for name in cls._columns()})
 
     @classmethod
     @cache

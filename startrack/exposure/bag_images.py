@@ -30,6 +30,7 @@ from startrack.exposure.facts import Facts
 from startrack.exposure.read import exposure_of_decoded
 
 READING = {"reason": "bad_image", "flag": "--image-topic"}
+UNIX_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 NUMBERED = re.compile(r"(?P<bag>.+)#(?P<number>\d{1,9})")
 # Encodings of sensor_msgs/Image (image_encodings.h) of one channel.
 RAW_ENCODING = re.compile(r"(?:mono|bayer_(?P<pattern>rggb|bggr|gbrg|grbg))(?P<bits>8|16)")
@@ -111,14 +112,11 @@ def _exposure_of(message: Message, where: str, name: str, path: str, given: dict
     """The exposure of a message with the facts `given`; a refusal names `where` it is."""
     try:
         decoded, pattern = _decode(message)
-        facts = Facts(**{"time_utc": _utc(message.stamp_ns), "bayer_pattern": pattern, **given})
+        time_utc = UNIX_EPOCH + timedelta(microseconds=message.stamp_ns // 1000)
+        facts = Facts(**{"time_utc": time_utc, "bayer_pattern": pattern, **given})
         return exposure_of_decoded(decoded, facts, raw=message.raw, name=name, path=path)
     except BadInput as cause:
         raise BadInput(cause.reason, f"{where}: {cause}") from cause
-
-
-def _utc(stamp_ns: int) -> datetime:
-    return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=stamp_ns // 1000)
 
 
 def _decode(message: Message) -> tuple[Decoded, str | None]:

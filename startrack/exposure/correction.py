@@ -23,14 +23,13 @@ from startrack.exposure.decoding import Stamp, bad_image, decode_file, read_stam
 from startrack.exposure.facts import header_number
 from startrack.exposure.mosaic import PHASES
 
-SKY_FROM = 128  # of 255: darker pixels of a mask's file do not count
-LARGEST_VALUE = 255.0  # of an 8-bit file
-KEPT_MASKS = 2  # the camera's and the image's
+SKY_FROM = 128  # half of the range: darker pixels of a mask's file do not count
+LARGEST_VALUE = 2.0 * SKY_FROM - 1.0  # of an 8-bit file
 MIN_SENSITIVITY_1 = 0.05  # of the median: darker pixels of a flat field do not count
 LIT_PERCENTILE = 99.0  # of a flat field: pixels above MIN_SENSITIVITY_1 of this are in the image circle
 SATURATED_1 = 0.98  # of the largest value: a dark frame is saturated there
 LONGEST_OTHER_1 = 1.1  # ratio of the exposure times of dark frame and image above which a warning is given
-KEPT_FRAMES = 2  # of each kind: a night has one, seldom two
+KEPT_FILES = 2  # of each kind: masks of camera and image; a night has one dark frame and flat field, seldom two
 FLAT_ALONE = "flat field without a dark frame: the black level is divided too, unless the camera file has its bias_adu"
 Picture = NDArray[np.float32]
 
@@ -50,7 +49,7 @@ def read_mask(path: FilePath, reason: str = "bad_image") -> Mask:
     return read_stamped(path, _read_mask, "mask", reason)
 
 
-@lru_cache(maxsize=KEPT_MASKS)
+@lru_cache(maxsize=KEPT_FILES)
 def _read_mask(path: str, stamp: Stamp) -> Mask:
     """The mask at `path`, read once as long as the file keeps its `stamp`."""
     raw, decoded = decode_file(path)
@@ -188,7 +187,7 @@ def read_flat(path: FilePath, *, mosaic: bool = False) -> CalibrationFrame:
     return read_stamped(path, partial(_read_flat, mosaic), "flat field")
 
 
-@lru_cache(maxsize=KEPT_FRAMES)
+@lru_cache(maxsize=KEPT_FILES)
 def _read_dark(path: str, stamp: Stamp) -> CalibrationFrame:
     """The dark frame at `path`, read once as long as the file keeps its `stamp`."""
     raw, decoded = decode_file(path)
@@ -198,7 +197,7 @@ def _read_dark(path: str, stamp: Stamp) -> CalibrationFrame:
     return _frame(path, raw, excess, decoded.pixels_adu >= top, median, decoded.header, fill=0.0, cause="is saturated")
 
 
-@lru_cache(maxsize=2 * KEPT_FRAMES)
+@lru_cache(maxsize=2 * KEPT_FILES)
 def _read_flat(mosaic: bool, path: str, stamp: Stamp) -> CalibrationFrame:
     """The flat field at `path`, each colour of a mosaic 1 at its own median; read once while the `stamp` stays."""
     raw, decoded = decode_file(path)

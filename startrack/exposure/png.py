@@ -27,7 +27,7 @@ from startrack.exposure.facts import HEADER_KEYS
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 COLOUR_TYPES = {0: "grey", 2: "colour", 3: "palette", 4: "grey with alpha", 6: "colour with alpha"}
-MAX_TEXT_BYTES = 4096  # of one fact; a compressed chunk is not inflated beyond it
+MAX_FACT_BYTES = 4096  # of one fact; a compressed chunk is not inflated beyond it
 IHDR_END = len(SIGNATURE) + 12 + 13  # text is spliced in after the header chunk
 
 
@@ -126,8 +126,8 @@ def _read_text(kind: bytes, body: bytes, header: dict[str, str]) -> None:
         compressed, encoding = rest[:1] == b"\1", "utf-8"
         rest = rest[2:].partition(b"\0")[2].partition(b"\0")[2]
     if compressed:
-        rest = zlib.decompressobj().decompress(rest, MAX_TEXT_BYTES)
-    header[key] = rest[:MAX_TEXT_BYTES].decode(encoding)
+        rest = zlib.decompressobj().decompress(rest, MAX_FACT_BYTES)
+    header[key] = rest[:MAX_FACT_BYTES].decode(encoding)
 
 
 def _text_chunk(keyword: str, text: str) -> bytes:

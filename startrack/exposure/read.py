@@ -68,7 +68,8 @@ def exposure_of_decoded(decoded: Decoded, facts: Facts, *, raw: bytes, name: str
     Raises BadInput (bad_image, size_mismatch) for a dark frame or flat field that cannot be used.
     """
     pixels, correction, notes = decoded.pixels_adu, None, decoded.warnings
-    mosaic = _is_mosaic(decoded, facts)
+    colour_already = decoded.mosaic is None and COLOUR_WARNING in decoded.warnings
+    mosaic = not colour_already and bool(decoded.mosaic or facts.bayer_pattern)
     if facts.dark is not None or facts.flat is not None:
         pixels, correction = correct_counts(pixels, decoded.saturation_adu, facts.dark, facts.flat, mosaic=mosaic)
         notes += correction_warnings(facts.dark, facts.flat, facts.exposure_s)
@@ -117,9 +118,3 @@ def exposure_of(
         sha256=hashlib.sha256(f"{pixels.dtype.str} {pixels.shape}".encode() + pixels.tobytes()).hexdigest(),
         warnings=notes,
     )
-
-
-def _is_mosaic(decoded: Decoded, facts: Facts) -> bool:
-    """Whether the pixels are a mosaic of colours, by the kind of file or by the facts."""
-    colour_already = decoded.mosaic is None and COLOUR_WARNING in decoded.warnings
-    return not colour_already and bool(decoded.mosaic or facts.bayer_pattern)

@@ -6,7 +6,6 @@ from startrack.rendering.scene import HotPixels, Scene, Truth
 from startrack.rendering.series import Pose, Series, load_sky_catalog
 from startrack.rendering.sky import sky_e_per_s, sky_gradient
 from startrack.rendering.sources import (
-    concatenate_stars,
     draw_field_stars,
     draw_v_errors,
     exposure_for_snr,
@@ -15,7 +14,7 @@ from startrack.rendering.sources import (
 )
 
 __all__ = [
-    "Drive", "HotPixels", "Pose", "Scene", "Series", "Truth", "concatenate_stars", "draw_field_stars",
+    "Drive", "HotPixels", "Pose", "Scene", "Series", "Truth", "draw_field_stars",
     "draw_hot_pixels", "draw_odometry", "draw_v_errors", "exposure_for_snr", "flux_e", "light_e", "limiting_v_mag",
     "load_sky_catalog", "read_drive", "render", "sky_e_per_s", "sky_gradient", "truth_of", "truth_paths", "write_truth",
 ]  # fmt: skip

@@ -18,7 +18,7 @@ from startrack.core.types import Array, Exposure, Stars
 from startrack.frames import off_axis_rad, quat_xyzw_from_R
 from startrack.rendering.scene import HotPixels, Scene, Truth
 from startrack.rendering.sky import diffuse_e
-from startrack.rendering.sources import add_sources, concatenate_stars, flux_e, is_above_terrain, splat
+from startrack.rendering.sources import add_sources, flux_e, is_above_terrain, splat
 
 # ECSV 1.0 (astropy enhancement proposal 6), written as text: astropy.table would take longer than the rendering.
 _COLUMNS = (
@@ -72,7 +72,15 @@ def light_e(scene: Scene) -> Array:
 
 def truth_of(scene: Scene) -> Truth:
     """Pixel at mid-exposure of each star and body of a `scene`, its stated flux, and whether the terrain hides it."""
-    sources = concatenate_stars(scene.stars, _bodies_as_stars(scene))
+    n = len(scene.bodies)
+    bodies = Stars(
+        catalog_id=np.array([body.name for body in scene.bodies], dtype=np.str_),
+        hip=np.zeros(n, dtype=np.int64),
+        rays_icrs=np.array([body.ray_icrs for body in scene.bodies]).reshape(n, 3),
+        v_mag=np.array([body.v_mag for body in scene.bodies]),
+        v_sigma_mag=np.zeros(n),
+    )
+    sources = Stars.concatenate(scene.stars, bodies)
     rays_enu = sources.rays_icrs @ scene.R_enu_icrs.T
     rays_cam = rays_enu @ scene.R_cam_enu.T
     xy_px, inside = scene.camera.project(rays_cam)
@@ -85,17 +93,6 @@ def truth_of(scene: Scene) -> Truth:
         xy_px=xy_px[inside],
         flux_e=flux_e(scene.sensor, sources.v_mag, off_axis_rad(rays_cam[inside]), scene.exposure_s),
         hidden=~is_above_terrain(scene, rays_enu),
-    )
-
-
-def _bodies_as_stars(scene: Scene) -> Stars:
-    n = len(scene.bodies)
-    return Stars(
-        catalog_id=np.array([body.name for body in scene.bodies], dtype=np.str_),
-        hip=np.zeros(n, dtype=np.int64),
-        rays_icrs=np.array([body.ray_icrs for body in scene.bodies]).reshape(n, 3),
-        v_mag=np.array([body.v_mag for body in scene.bodies]),
-        v_sigma_mag=np.zeros(n),
     )
 
 

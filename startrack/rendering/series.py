@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from enum import IntEnum
 from functools import cached_property
 from typing import TYPE_CHECKING, TypeVar
 
@@ -23,7 +24,7 @@ from startrack.frames import (
 from startrack.rendering.compose import draw_hot_pixels
 from startrack.rendering.drive import Drive, draw_odometry
 from startrack.rendering.scene import Scene
-from startrack.rendering.sources import concatenate_stars, draw_field_stars, draw_v_errors, exposure_for_snr
+from startrack.rendering.sources import draw_field_stars, draw_v_errors, exposure_for_snr
 from startrack.terrain import Terrain
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ EXPOSURE_V_MAG, EXPOSURE_SNR = 6.0, 5.0  # magnitude and SNR on the axis that de
 RANDOM_TIMES = datetime(2024, 1, 1, tzinfo=UTC), datetime(2034, 1, 1, tzinfo=UTC)
 MAX_POSITION_TRIES = 1000
 # Streams of the seed. Sky and sensor are the same in every exposure of a series: errors that exposures share.
-_SKY, _SENSOR, _EXPOSURE, _ODOMETRY = 0, 1, 2, 3
+Stream = IntEnum("Stream", "SKY SENSOR EXPOSURE ODOMETRY", start=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +111,7 @@ class Series:
         pose, rng = self._pose_and_rng(number)
         time, site, exposure_s = pose.time_utc, self._site(), self.exposure_used_s
         stars, v_error_mag = sky or self.draw_sky(time)
-        sensor_rng = np.random.default_rng([self.seed, _SENSOR])
+        sensor_rng = np.random.default_rng([self.seed, Stream.SENSOR])
         scene = Scene(
             camera=self.camera,
             terrain=self.terrain,
@@ -155,15 +156,15 @@ class Series:
         """
         position_enu_m = np.array([pose.position_enu_m for pose in poses])
         R_body_enu = np.array([pose.R_body_enu for pose in poses])
-        rng = np.random.default_rng([self.seed, _ODOMETRY])
+        rng = np.random.default_rng([self.seed, Stream.ODOMETRY])
         return draw_odometry(position_enu_m, R_body_enu, sigma_1=sigma_1, floor_m=floor_m, rng=rng)
 
     def _pose_and_rng(self, number: int) -> tuple[Pose, np.random.Generator]:
         """The pose of exposure `number`, and the generator in the state after the pose was drawn."""
-        rng = np.random.default_rng([self.seed, _EXPOSURE, number])
+        rng = np.random.default_rng([self.seed, Stream.EXPOSURE, number])
         time, position_m, heading, pitch, roll = self._draw_pose(rng)
         if self.every_s is not None:
-            first = self._draw_pose(np.random.default_rng([self.seed, _EXPOSURE, 0]))
+            first = self._draw_pose(np.random.default_rng([self.seed, Stream.EXPOSURE, 0]))
             time = _time_after(first[0], number * self.every_s)
             if self.drive is None:  # at rest
                 _, position_m, heading, pitch, roll = first
@@ -204,7 +205,7 @@ class Series:
         Raises BadInput (bad_terrain) where the terrain has no site.
         """
         site = self._site()
-        rng = np.random.default_rng([self.seed, _SKY])
+        rng = np.random.default_rng([self.seed, Stream.SKY])
         stars = self.catalog.at(time, observer_velocity_m_s(site, time))
         errors = np.zeros(len(stars))
         if self.flux_scatter_mag > 0:
@@ -212,7 +213,7 @@ class Series:
         if self.faint_v_mag is None or self.catalog.is_deep:
             return stars, errors
         field = draw_field_stars(stars, self.faint_v_mag, rng=rng)
-        return concatenate_stars(stars, field), np.concatenate([errors, np.zeros(len(field))])
+        return Stars.concatenate(stars, field), np.concatenate([errors, np.zeros(len(field))])
 
 
 def load_sky_catalog(stars: str) -> StarCatalog:

@@ -193,35 +193,19 @@ def draw_field_stars(stars: Stars, to_v_mag: float, *, rng: np.random.Generator)
     catalogue star; uniform without catalogue stars.
     """
     edges = np.arange(FIRST_LACKING_MAG, to_v_mag + 1e-9, BIN_MAG)
-    if len(edges) < 2:
-        return _field_stars(np.empty((0, 3)), np.empty(0))
-    expected = np.diff(N_REF * np.exp(GROWTH_PER_MAG * (edges - V_REF_MAG)))
-    listed = np.histogram(stars.v_mag, edges)[0]
-    lacking = rng.poisson(np.maximum(expected - listed, MIN_LACKING * listed))
-    low = np.repeat(edges[:-1], lacking)
-    # Inverse of the cumulative e^(GROWTH V) within a bin.
-    steep = np.expm1(GROWTH_PER_MAG * BIN_MAG)
-    v_mag = np.sort(low + np.log1p(rng.random(len(low)) * steep) / GROWTH_PER_MAG)
-    rays = rng.standard_normal((len(v_mag), 3))
-    if len(stars):
-        rays = stars.rays_icrs[rng.integers(len(stars), size=len(v_mag))] + CLUSTER_RAD * rays
-    return _field_stars(rays / np.linalg.norm(rays, axis=1, keepdims=True), v_mag)
-
-
-def concatenate_stars(first: Stars, second: Stars) -> Stars:
-    """The stars of `first` and `second`, in that order."""
-    return Stars(
-        catalog_id=np.concatenate([first.catalog_id, second.catalog_id]),
-        hip=np.concatenate([first.hip, second.hip]),
-        rays_icrs=np.concatenate([first.rays_icrs, second.rays_icrs]),
-        v_mag=np.concatenate([first.v_mag, second.v_mag]),
-        v_sigma_mag=np.concatenate([first.v_sigma_mag, second.v_sigma_mag]),
-    )
-
-
-def _field_stars(rays_icrs: Array, v_mag: Array) -> Stars:
+    rays, v_mag = np.empty((0, 3)), np.empty(0)
+    if len(edges) > 1:
+        expected = np.diff(N_REF * np.exp(GROWTH_PER_MAG * (edges - V_REF_MAG)))
+        listed = np.histogram(stars.v_mag, edges)[0]
+        lacking = rng.poisson(np.maximum(expected - listed, MIN_LACKING * listed))
+        low = np.repeat(edges[:-1], lacking)
+        # Inverse of the cumulative e^(GROWTH V) within a bin.
+        steep = np.expm1(GROWTH_PER_MAG * BIN_MAG)
+        v_mag = np.sort(low + np.log1p(rng.random(len(low)) * steep) / GROWTH_PER_MAG)
+        rays = rng.standard_normal((len(v_mag), 3))
+        if len(stars):
+            rays = stars.rays_icrs[rng.integers(len(stars), size=len(v_mag))] + CLUSTER_RAD * rays
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     n = len(v_mag)
-    ids = np.char.add("FIELD ", np.arange(1, n + 1).astype(str)) if n else np.empty(0, dtype="U9")
-    return Stars(
-        catalog_id=ids, hip=np.zeros(n, dtype=np.int64), rays_icrs=rays_icrs, v_mag=v_mag, v_sigma_mag=np.zeros(n)
-    )
+    ids = np.char.add("FIELD ", np.arange(1, n + 1).astype(str))
+    return Stars(catalog_id=ids, hip=np.zeros(n, dtype=np.int64), rays_icrs=rays, v_mag=v_mag, v_sigma_mag=np.zeros(n))

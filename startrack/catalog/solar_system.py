@@ -109,7 +109,7 @@ def _neptunes_rise(view: _View) -> float:
 
 @dataclass(frozen=True)
 class _Source:
-    """A body and its magnitude at 1 au from Sun and observer: a polynomial of the phase, up to an angle, and the rest."""
+    """A body with its magnitude at 1 au from Sun and observer: by the phase, up to an angle, and the rest."""
 
     name: str
     naif: int

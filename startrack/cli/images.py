@@ -21,9 +21,9 @@ from startrack.core.errors import (
     INTERNAL_ERROR,
     BadInput,
     BadOutput,
+    Reason,
     exit_code_of,
     next_step,
-    reason_of,
 )
 from startrack.core.files import is_path, make_folder
 
@@ -182,7 +182,7 @@ def worst_code(codes: set[int]) -> int:
 
 def refusal(reason: str, message: str, **first: Any) -> dict[str, Any]:
     """The JSON object of what was refused; `first` stands at its beginning."""
-    return {**first, "status": "refused", "reason": reason, "message": message, "advice": reason_of(reason).advice}
+    return {**first, "status": "refused", "reason": reason, "message": message, "advice": Reason(reason).advice}
 
 
 def print_outcome(args: argparse.Namespace, record: dict[str, Any], line: str) -> int:

@@ -1,7 +1,11 @@
-"""Selection of point sources among the fitted candidates by significance and shape, without edges and hot pixels."""
+"""Selection of point sources among the fitted candidates by significance and shape, without edges and hot pixels.
+
+Of a saturated star only the wings are fitted, and a real PSF has wider wings than the Gaussian.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -9,14 +13,13 @@ from numpy.typing import NDArray
 
 from startrack.core.types import Array, Bools, Ints
 from startrack.detection.deblend import Fitted, own_signal
-from startrack.detection.fit import PointFits, Stamps
+from startrack.detection.fit import ROUNDS_AGAIN, PointFits, Stamps, fit_points
 from startrack.detection.frame import Frame, Pixels, SourceNoise
-from startrack.detection.psf_width import BRIGHT_SNR, MIN_BRIGHT_SOURCES
-from startrack.detection.saturated import are_saturated
+from startrack.detection.psf_width import MIN_BRIGHT_SOURCES, WIDTH_SNR
 
 WIDTHS_PX = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0)
 HEIGHTS = (5.80, 5.70, 5.54, 5.43, 5.33, 5.18, 5.09)  # measured at USUAL_SKEWNESS: equal rates of false stars
-HEIGHT_AT_NOMINAL = 5.42
+NOMINAL_HEIGHT = 5.42
 USUAL_SKEWNESS, LARGEST_SKEWNESS = 0.088, 0.3  # the first: 100 photons and 3 electrons of read noise
 FILTERED_SKEWNESS = 0.376  # 2 / (3 sqrt(pi)): fraction that remains after a matched filter of 1 px
 NOISE_TOO_SMALL = 0.17  # relative underestimate of the noise per unit of skewness
@@ -29,11 +32,35 @@ ROUGH_PSF_SPREAD = 2.0  # largest misfit of a star in such a frame over the typi
 SATURATED_MISFIT = 0.2  # largest misfit of a star measured by its wings, which differ most from the Gaussian
 EDGE_DIRECTIONS = 8  # directions of straight edges or lines that are fitted
 LARGEST_SIGMA_PX = 2.0  # of the position
-WING_SIGMAS, WING_BRIGHTER, WING_HEIGHT = (
-    3.0,
-    2.0,
-    1.4,
-)  # within this radius of a source this much brighter the threshold is higher
+WIDTH_FACTORS = (1.15, 1.3, 1.5)  # widths of a saturated star's wings over the width of the PSF
+POOR_CHI2_PER_DOF = 2.0  # of a saturated star with the PSF's own width; below it no wider one is tried
+# Within this radius of a source this much brighter the threshold is so much higher.
+WING_SIGMAS, WING_BRIGHTER, WING_HEIGHT = 3.0, 2.0, 1.4
+
+
+def refit_saturated(fitted: Fitted, sigma: float) -> tuple[Fitted, Array]:
+    """The fits, saturated sources with the width that fits their wings best, and the widths (n,) [px].
+
+    With the Gaussian of unsaturated stars the flux of a saturated one would be up to twice too large.
+    """
+    fits, width = fitted.fits, np.full(len(fitted.fits.flux), sigma)
+    clipped = np.flatnonzero(are_saturated(fitted.stamps) & (fits.chi2 > POOR_CHI2_PER_DOF * fits.dof))
+    for wider in WIDTH_FACTORS if len(clipped) else ():
+        stamps = fitted.stamps.take(clipped)
+        again = fit_points(stamps, fits.xy_px[clipped], wider * sigma, fitted.source_noise, 0.0, ROUNDS_AGAIN)
+        better = np.flatnonzero(again.chi2 < fits.chi2[clipped])
+        fits = fits.with_rows(clipped[better], again.take(better))
+        width[clipped[better]] = wider * sigma
+    return replace(fitted, fits=fits), width
+
+
+def are_saturated(stamps: Stamps) -> Bools:
+    """Which sources (n,) have an unusable pixel at or beside their middle one."""
+    if stamps.usable is None:
+        return np.zeros(len(stamps.data), dtype=bool)
+    middle = stamps.usable.shape[1] // 2
+    around = slice(middle - 1, middle + 2)
+    return np.asarray(~stamps.usable[:, around, around].all(axis=(1, 2)))
 
 
 def select_stars(fitted: Fitted, width_px: Array, threshold: float) -> Ints:
@@ -50,8 +77,10 @@ def select_stars(fitted: Fitted, width_px: Array, threshold: float) -> Ints:
         return left
     misfit, edge = _psf_and_edge_misfit(fitted.stamps.take(left), fits.take(left), width_px[left], fitted.source_noise)
     unlike_an_edge = fits.chi2[left] < edge + EDGE_MARGIN
-    bright = fits.flux[left] > BRIGHT_SNR * np.sqrt(fits.covariance[left, 2, 2])
-    typical = _typical_misfit(misfit[unlike_an_edge & bright])
+    bright = fits.flux[left] > WIDTH_SNR * np.sqrt(fits.covariance[left, 2, 2])
+    alike = misfit[unlike_an_edge & bright]
+    typical = float(np.median(alike)) if len(alike) >= MIN_BRIGHT_SOURCES else 0.0
+    typical = ROUGH_PSF_SPREAD * typical if typical > ROUGH_PSF_MISFIT else 0.0  # 0: stars fit the Gaussian
     good_fit = fits.chi2[left] < BAD_FIT_CHI2_PER_DOF * fits.dof[left]
     allowed = np.where(are_saturated(fitted.stamps.take(left)), max(typical, SATURATED_MISFIT), typical)
     return left[unlike_an_edge & (good_fit | (misfit < allowed))]
@@ -106,7 +135,7 @@ def detection_threshold(threshold_snr: float, sigma_px: float, skewness: float) 
     height = float(np.interp(np.log(sigma_px), np.log(WIDTHS_PX), HEIGHTS))
     filtered = FILTERED_SKEWNESS / np.sqrt(sigma_px**2 + 1.0 / 12.0)
     height += (skewness - USUAL_SKEWNESS) * (filtered * (height**2 - 1.0) / 6.0 + NOISE_TOO_SMALL * height)
-    return float(np.sqrt(max(height**2 + threshold_snr**2 - HEIGHT_AT_NOMINAL**2, 9.0)))
+    return float(np.sqrt(max(height**2 + threshold_snr**2 - NOMINAL_HEIGHT**2, 9.0)))
 
 
 def noise_skewness(frame: Frame) -> float:
@@ -117,14 +146,6 @@ def noise_skewness(frame: Frame) -> float:
     noise = float(np.median(frame.noise[some]))
     photons = min(max(float(np.median(frame.background[some])), 0.0), noise**2)
     return min(photons / max(noise, 1e-6) ** 3, LARGEST_SKEWNESS)
-
-
-def _typical_misfit(misfit: Array) -> float:
-    """Largest accepted misfit from the frame's bright sources; 0 where these fit the Gaussian."""
-    if len(misfit) < MIN_BRIGHT_SOURCES:
-        return 0.0
-    typical = float(np.median(misfit))
-    return ROUGH_PSF_SPREAD * typical if typical > ROUGH_PSF_MISFIT else 0.0
 
 
 def _psf_and_edge_misfit(s: Stamps, fits: PointFits, width_px: Array, own: SourceNoise) -> tuple[Array, Array]:
@@ -153,9 +174,7 @@ def edge_chi2(data: Pixels, weights: Pixels) -> Array:
     """
     n, side = len(data), data.shape[1]
     stripes, starts = _stripes(side)
-    counts = np.diff(starts, append=stripes.shape[1]).astype(
-        np.float32
-    )  # number of stripes: expected reduction of chi^2 by noise
+    counts = np.diff(starts, append=stripes.shape[1]).astype(np.float32)  # expected reduction of chi^2 by noise
     w = weights.reshape(n, -1).astype(np.float32)
     flat = data.reshape(n, -1).astype(np.float32)
     moment = w * flat

@@ -7,10 +7,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from startrack.core.types import Array, Ints
-from startrack.detection.fit import ROUNDS, ROUNDS_AGAIN, PointFits, Stamps, concatenate_fits, fit_points
+from startrack.detection.fit import (
+    ROUNDS,
+    ROUNDS_AGAIN,
+    PointFits,
+    Stamps,
+    concatenate_fits,
+    fit_points,
+    measure_source_noise,
+)  # fmt: skip
 from startrack.detection.frame import Frame, Pixels, SourceNoise, radius_for
 from startrack.detection.peaks import Peaks
-from startrack.detection.source_noise import measure_source_noise
 from startrack.psf import pixel_profile_single
 
 CROWDED_ROUNDS = 3  # of subtracting neighbours and fitting again
@@ -30,30 +37,34 @@ class Fitted:
 
 def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = None) -> Fitted:
     """Fits of all candidates. `known`: earlier fits of the first peaks, refined once; `frame.found` contains them."""
-    radius = radius_for(sigma)
-    centres = peaks.centres
-    data, variance, usable = (
-        frame.data(centres, radius),
-        frame.variance(centres, radius),
-        frame.usable_pixels(centres, radius),
-    )
-    stamps = Stamps(data, variance, usable, centres, peaks.surround)
+    radius, centres = radius_for(sigma), peaks.centres
+    data, variance = frame.data(centres, radius), frame.variance(centres, radius)
+    stamps = Stamps(data, variance, frame.usable_pixels(centres, radius), centres, peaks.surround)
     last = np.zeros_like(data)  # neighbours' signal subtracted in the last fit
+    refined = 0 if known is None else len(known.flux)
     if known is not None and frame.found is not None:
         last = frame.found_signal(centres, radius)
-        last[: len(known.flux)] -= own_signal(centres[: len(known.flux)], known, sigma, radius)
+        last[:refined] -= own_signal(centres[:refined], known, sigma, radius)
         last[np.square(last).max(axis=(1, 2)) <= NEIGHBOUR_SIGMA**2 * variance[:, radius, radius]] = 0.0
-    fits = _first_fits(frame, peaks, _subtract_neighbours(stamps, last), sigma, 0 if known is None else len(known.flux))
+    cleaned = _subtract_neighbours(stamps, last)
+    fits = concatenate_fits([
+        fit_points(cleaned.take(which), peaks.start_xy_px[which], sigma, frame.source_noise, peaks.own_part, rounds)
+        for which, rounds in ((slice(0, refined), ROUNDS_AGAIN), (slice(refined, None), ROUNDS))
+        if len(centres[which])
+    ])  # fmt: skip
     star, other = _find_pairs(centres, 1.5 * radius + 3.0 * sigma)
     alone = np.ones(len(centres), dtype=bool)
     alone[star[_are_relevant(stamps, fits, star, other, sigma)]] = False
     source_noise = measure_source_noise(stamps, fits, alone, sigma, frame.source_noise)
+
+    def fit_again(which: Ints, signal: Pixels) -> PointFits:
+        part = _subtract_neighbours(stamps.take(which), signal)
+        again = fit_points(part, fits.xy_px[which], sigma, source_noise, peaks.own_part, ROUNDS_AGAIN)
+        return fits.with_rows(which, again)
+
     bright = _find_reweighted(fits, sigma, variance, frame.source_noise, source_noise)
     if len(bright):
-        start = fits.xy_px[bright]
-        part = _subtract_neighbours(stamps.take(bright), last[bright])
-        again = fit_points(part, start, sigma, source_noise, peaks.own_part, ROUNDS_AGAIN)
-        fits = fits.with_rows(bright, again)
+        fits = fit_again(bright, last[bright])
     for _ in range(CROWDED_ROUNDS):
         crowded, signal = _sum_neighbour_signal(stamps, fits, star, other, sigma)
         changed = (np.square(signal - last[crowded]) > NEIGHBOUR_SIGMA**2 * variance[crowded]).any(axis=(1, 2))
@@ -61,20 +72,8 @@ def fit_all(frame: Frame, peaks: Peaks, sigma: float, known: PointFits | None = 
         if not len(crowded):
             break
         last[crowded] = signal
-        cleaned = _subtract_neighbours(stamps.take(crowded), signal)
-        again = fit_points(cleaned, fits.xy_px[crowded], sigma, source_noise, peaks.own_part, ROUNDS_AGAIN)
-        fits = fits.with_rows(crowded, again)
+        fits = fit_again(crowded, signal)
     return Fitted(stamps, fits, source_noise)
-
-
-def _first_fits(frame: Frame, peaks: Peaks, stamps: Stamps, sigma: float, known: int) -> PointFits:
-    """Fits of all candidates; the first ones start from the `known` fits and need fewer iterations."""
-    fits = [
-        fit_points(stamps.take(which), peaks.start_xy_px[which], sigma, frame.source_noise, peaks.own_part, rounds)
-        for which, rounds in ((slice(0, known), ROUNDS_AGAIN), (slice(known, None), ROUNDS))
-        if len(stamps.centres[which])
-    ]
-    return concatenate_fits(fits)
 
 
 def _subtract_neighbours(stamps: Stamps, signal: Pixels) -> Stamps:
@@ -156,9 +155,7 @@ def paint_sources(fits: PointFits, sigma: float, shape: tuple[int, int]) -> Pixe
     size = max(1, BATCH_PIXELS // (side * side))
     for at in range(0, len(centres), size):
         here = np.arange(at, min(at + size, len(centres)))
-        corners = centres[here] + side - radius
-        for (column, row), signal in zip(
-            corners, own_signal(centres[here], fits.take(here), sigma, radius), strict=True
-        ):
+        signals = own_signal(centres[here], fits.take(here), sigma, radius)
+        for (column, row), signal in zip(centres[here] + side - radius, signals, strict=True):
             image[row : row + side, column : column + side] += signal
     return image[side:-side, side:-side]

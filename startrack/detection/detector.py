@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from math import ceil
 
 import numpy as np
 
 from startrack.camera import Camera
-from startrack.core.types import Array, Bools, Detections, Exposure, Ints, Mask, TooFewStars
-from startrack.detection.background import background_and_noise, block_side, smallest_step
+from startrack.core.types import Array, Bools, Detections, Exposure, Mask, TooFewStars
+from startrack.detection.background import Image, background_and_noise, block_side, smallest_step
 from startrack.detection.classify import (
+    NOMINAL_HEIGHT,
     detection_threshold,
     noise_skewness,
     peak_heights,
+    refit_saturated,
     reject_wing_misfits,
     select_brightest_per_position,
     select_stars,
-)
-from startrack.detection.dead_parts import find_dead_parts, with_dead_parts
+)  # fmt: skip
 from startrack.detection.deblend import Fitted, fit_all, paint_sources
 from startrack.detection.fit import PointFits, unbin_fits
 from startrack.detection.frame import (
     Frame,
-    Image,
     SourceNoise,
     bin_frame,
     binning_factor,
@@ -32,19 +33,16 @@ from startrack.detection.frame import (
     radius_for,
     recorded_step,
 )  # fmt: skip
-from startrack.detection.masked import fill_masked
 from startrack.detection.peaks import Peaks, find_peaks, unbin_peaks
 from startrack.detection.psf_width import WIDTH_TOLERANCE, guess_psf_width, measure_psf_width
-from startrack.detection.saturated import refit_saturated
-from startrack.detection.streaks import Streaks, are_elongated, find_streaks
+from startrack.detection.streaks import are_elongated, find_streaks
+from startrack.detection.unusable import fill_masked, find_dead_parts
 from startrack.exposure import combine_masks, touch_masked
 
 UNKNOWN_WIDTH_PX = 1.2  # first guess where the camera file does not state the width
 FIRST_PASS_LOWER = 1.1  # sigma of the filtered noise: threshold of the stars minus that of the candidates
 WINGS_SIGMAS = 4.0  # radius of the area that a star covers
-CROWDED_FRACTION = (
-    0.06  # of the frame covered by stars, above which they are subtracted to measure the background again
-)
+CROWDED_PART = 0.06  # of the frame, covered by stars: above it they are subtracted to measure the background again
 NOTHING_SEEN = "no point source stands above the noise: was the lens cap on, or the exposure too short?"
 
 
@@ -56,20 +54,14 @@ class _Candidates:
     small: Frame
     side: int
     sigma: float  # of the PSF in the frame [px]
-    quantum: float  # smallest step between the values that the sensor recorded
     fitted: Fitted
-
-    @property
-    def centres(self) -> Ints:
-        """Pixels (n, 2) of the candidates in the frame."""
-        return self.side * self.fitted.stamps.centres + self.side // 2
 
 
 @dataclass(frozen=True)
 class Detector:
     """Detects point sources: Exposure -> Detections."""
 
-    threshold_snr: float = 5.42  # for a PSF of 1.25 px; scaled to an equal rate of false stars for other widths
+    threshold_snr: float = NOMINAL_HEIGHT  # for a PSF of 1.25 px; for other widths scaled to as many false stars
     max_candidates: int = 15000  # a frame with more peaks is noise, a bright day or a defect: the highest are kept
     psf_sigma_px: float | None = None  # used without measuring it; None: from the camera file and the frame
 
@@ -79,86 +71,92 @@ class Detector:
         Raises TooFewStars (reason no_stars) if the frame has no point source, BadInput for a mask that cannot be used.
         """
         image, dead = electrons(exposure, camera)
-        given = combine_masks(
+        mask = combine_masks(
             exposure.mask, None if camera is None else camera.mask, exposure.size_px, exposure.correction
         )
-        mask = with_dead_parts(given, find_dead_parts(exposure.recorded_adu))
+        parts = find_dead_parts(exposure.recorded_adu)
+        if parts is not None:
+            mask = mask or Mask(masked=np.zeros_like(parts), sha256="")
+            mask = replace(mask, masked=mask.masked | parts, dead_part=float(parts.mean()))
         if mask is not None:
             image, dead = fill_masked(image, mask.masked), dead & ~mask.masked
-        if _is_flat(image):
+        if float(image[0, 0]) == float(image[-1, -1]) == float(image[::64, ::64].max()) and not np.ptp(image):
             raise TooFewStars("the frame is flat: every pixel has the same value (lens cap, or a saturated day sky?)")
         known = camera.sensor.psf_sigma_px if camera is not None and camera.sensor is not None else None
-        source_noise = SourceNoise(per_unit=0.0 if known is None else 1.0)
         quantum = smallest_step(image) if exposure.correction is None else recorded_step(exposure, camera)
-        source = _FrameSource(image, quantum, mask_or_none(dead), source_noise, None if mask is None else mask.masked)
+        source = _FrameSource(
+            image, quantum, mask_or_none(dead), SourceNoise(per_unit=0.0 if known is None else 1.0),
+            None if mask is None else mask.masked,
+        )  # fmt: skip
         candidates = self._candidates(source, self.psf_sigma_px or known)
-        frame, sigma = candidates.frame, candidates.sigma
-        if are_elongated(frame, candidates.centres) and (streaks := find_streaks(frame)) is not None:
-            return _detections_of_streaks(frame, dead, streaks, mask)
-        stars = self._select_stars(frame, candidates.fitted, candidates.side, sigma)
-        if candidates.side > 1 or _covered_fraction(stars, sigma, frame.shape) > CROWDED_FRACTION:
-            frame, stars = self._detect_again(candidates, unbin_fits(stars, candidates.side))
+        frame, sigma, side = candidates.frame, candidates.sigma, candidates.side
+        complete = partial(
+            Detections, image_e=image, dead=dead if mask is None else dead | mask.masked,
+            background_e=frame.background, noise_e=frame.noise, mask=mask,
+        )  # fmt: skip
+        centres = side * candidates.fitted.stamps.centres + side // 2
+        if are_elongated(frame, centres) and (streaks := find_streaks(frame)) is not None:
+            if mask is not None:
+                half_px = ceil(0.5 * streaks.length_px + WINGS_SIGMAS * streaks.width_px)
+                streaks = streaks.take(~touch_masked(mask.masked, streaks.xy_px, half_px))
+            return complete(
+                xy_px=streaks.xy_px, covariance_px2=streaks.covariance_px2, flux_e=streaks.flux,
+                flux_sigma_e=streaks.flux_sigma, snr=streaks.flux / streaks.flux_sigma,
+                saturated=np.zeros(len(streaks.flux), dtype=bool), psf_sigma_px=streaks.psf_sigma_px,
+            )  # fmt: skip
+        stars = self._select_stars(frame, candidates.fitted, side, sigma)
+        covered_px = len(stars.flux) * np.pi * np.square(WINGS_SIGMAS * sigma)  # overlaps counted twice
+        if side > 1 or covered_px > CROWDED_PART * image.size:
+            frame, stars = self._detect_again(source, candidates, unbin_fits(stars, side))
         if not len(stars.flux):
             raise TooFewStars(NOTHING_SEEN)
-        return Detections(
-            xy_px=stars.xy_px,
-            covariance_px2=stars.covariance[:, :2, :2],
-            flux_e=stars.flux,
-            flux_sigma_e=np.sqrt(stars.covariance[:, 2, 2]),
-            snr=stars.snr,
-            saturated=_saturated_mask(frame, stars),
-            psf_sigma_px=sigma,
-            image_e=image,
-            dead=_unusable(dead, mask),
-            background_e=frame.background,
-            noise_e=frame.noise,
-            mask=mask,
-        )
+        saturated = np.zeros(len(stars.flux), dtype=bool)
+        if frame.dead is not None:
+            column, row = np.rint(stars.xy_px).astype(int).T
+            saturated = frame.dead[np.clip(row, 0, image.shape[0] - 1), np.clip(column, 0, image.shape[1] - 1)]
+        return complete(
+            xy_px=stars.xy_px, covariance_px2=stars.covariance[:, :2, :2], flux_e=stars.flux,
+            flux_sigma_e=np.sqrt(stars.covariance[:, 2, 2]), snr=stars.snr, saturated=saturated, psf_sigma_px=sigma,
+            background_e=frame.background, noise_e=frame.noise,
+        )  # fmt: skip
 
     def _candidates(self, source: _FrameSource, expected: float | None) -> _Candidates:
         """Candidates and their fits, with the PSF width measured in the frame."""
         if expected is None:
             return self._candidates_at(source, guess_psf_width(source.frame, UNKNOWN_WIDTH_PX))
-        candidates = self._candidates_at(source, expected)
+        found = self._candidates_at(source, expected)
         if self.psf_sigma_px:
-            return candidates
-        measured = measure_psf_width(
-            candidates.small,
-            candidates.fitted.stamps.centres,
-            candidates.fitted.fits,
-            candidates.sigma / candidates.side,
-        )
-        if measured is None or abs(np.log(measured * candidates.side / expected)) < WIDTH_TOLERANCE:
-            return candidates
-        return self._candidates_at(source, guess_psf_width(source.frame, measured * candidates.side))
+            return found
+        stamps, fits, side = found.fitted.stamps, found.fitted.fits, found.side
+        measured = measure_psf_width(found.small, stamps.centres, fits, found.sigma / side)
+        if measured is None or abs(np.log(measured * side / expected)) < WIDTH_TOLERANCE:
+            return found
+        return self._candidates_at(source, guess_psf_width(source.frame, measured * side))
 
     def _candidates_at(self, source: _FrameSource, sigma: float) -> _Candidates:
         """Candidates and their fits; where the PSF is wide, in the binned frame."""
-        side = binning_factor(sigma)
-        frame = source.frame(sigma)
+        side, frame = binning_factor(sigma), source.frame(sigma)
         small = bin_frame(frame, side)
         peaks = self._find_peaks(frame, small, side, sigma)
-        if not len(peaks.centres):
-            raise TooFewStars(NOTHING_SEEN)
-        return _Candidates(frame, small, side, sigma, source.quantum, fit_all(small, peaks, sigma / side))
+        return _Candidates(frame, small, side, sigma, fit_all(small, peaks, sigma / side))
 
-    def _detect_again(self, candidates: _Candidates, stars: PointFits) -> tuple[Frame, PointFits]:
+    def _detect_again(self, source: _FrameSource, candidates: _Candidates, stars: PointFits) -> tuple[Frame, PointFits]:
         """The frame and its stars; known stars are subtracted before the background and faint stars are measured."""
-        side, sigma, frame = candidates.side, candidates.sigma, candidates.frame
-        noise = candidates.fitted.source_noise
-        source = _FrameSource(frame.image, candidates.quantum, frame.dead, noise, frame.masked)
-        frame = source.frame(sigma, paint_sources(stars, sigma, frame.shape))
+        side, sigma = candidates.side, candidates.sigma
+        frame = source.frame(sigma, paint_sources(stars, sigma, source.image.shape))
+        frame = replace(frame, source_noise=candidates.fitted.source_noise)
         positions = (stars.xy_px - 0.5 * (side - 1)) / side
         peaks = self._find_peaks(frame, bin_frame(frame, side), side, sigma, known=positions)
         peaks = unbin_peaks(peaks, side, frame.shape, radius_for(sigma))
-        if not len(peaks.centres):
-            raise TooFewStars(NOTHING_SEEN)
         return frame, self._select_stars(frame, fit_all(frame, peaks, sigma, known=stars), 1, sigma)
 
     def _find_peaks(self, frame: Frame, small: Frame, side: int, sigma: float, known: Array | None = None) -> Peaks:
         """Candidates in the binned frame; their threshold is lower: the filtered image is sampled at pixels only."""
         lowest = detection_threshold(self.threshold_snr, sigma, noise_skewness(frame)) - FIRST_PASS_LOWER
-        return find_peaks(small, sigma / side, lowest, self.max_candidates, known)
+        peaks = find_peaks(small, sigma / side, lowest, self.max_candidates, known)
+        if not len(peaks.centres):
+            raise TooFewStars(NOTHING_SEEN)
+        return peaks
 
     def _select_stars(self, frame: Frame, fitted: Fitted, side: int, sigma: float) -> PointFits:
         """The point sources among the candidates of the binned frame, brightest first."""
@@ -175,35 +173,6 @@ class Detector:
         return stars.take(np.flatnonzero(clear))
 
 
-def _unusable(saturated: Bools, mask: Mask | None) -> Bools:
-    return saturated if mask is None else saturated | mask.masked
-
-
-def _detections_of_streaks(frame: Frame, dead: Bools, streaks: Streaks, mask: Mask | None) -> Detections:
-    """The stars of a frame taken by a rotating camera; the PSF width is that of the whole streak."""
-    if mask is not None:
-        half_px = ceil(0.5 * streaks.length_px + WINGS_SIGMAS * streaks.width_px)
-        streaks = streaks.take(~touch_masked(mask.masked, streaks.xy_px, half_px))
-    return Detections(
-        xy_px=streaks.xy_px,
-        covariance_px2=streaks.covariance_px2,
-        flux_e=streaks.flux,
-        flux_sigma_e=streaks.flux_sigma,
-        snr=streaks.flux / streaks.flux_sigma,
-        saturated=np.zeros(len(streaks.flux), dtype=bool),
-        psf_sigma_px=float(np.hypot(streaks.width_px, streaks.length_px / np.sqrt(12.0))),
-        image_e=frame.image,
-        dead=_unusable(dead, mask),
-        background_e=frame.background,
-        noise_e=frame.noise,
-        mask=mask,
-    )
-
-
-def _is_flat(image: Image) -> bool:
-    return float(image[0, 0]) == float(image[-1, -1]) == float(image[::64, ::64].max()) and not np.ptp(image)
-
-
 class _FrameSource:
     """An image with its unusable pixels; backgrounds are computed once for each block size."""
 
@@ -215,23 +184,11 @@ class _FrameSource:
 
     def frame(self, sigma: float, found: Image | None = None) -> Frame:
         """The prepared frame; stars in `found` are excluded from background and noise."""
+        side = block_side(sigma)
         if found is not None:
             maps = background_and_noise(self.image - found, self.quantum, sigma)
-            return Frame(self.image, *maps, self.dead, self.source_noise, self.masked, found)
-        side = block_side(sigma)
-        if side not in self._kept:
-            self._kept[side] = background_and_noise(self.image, self.quantum, sigma)
-        return Frame(self.image, *self._kept[side], self.dead, self.source_noise, self.masked)
-
-
-def _covered_fraction(stars: PointFits, sigma: float, shape: tuple[int, int]) -> float:
-    """Fraction of the frame that the wings of its stars cover, overlaps counted twice."""
-    return float(len(stars.flux) * np.pi * np.square(WINGS_SIGMAS * sigma) / (shape[0] * shape[1]))
-
-
-def _saturated_mask(frame: Frame, stars: PointFits) -> Bools:
-    if frame.dead is None:
-        return np.zeros(len(stars.flux), dtype=bool)
-    height, width = frame.dead.shape
-    column, row = np.rint(stars.xy_px).astype(int).T
-    return np.asarray(frame.dead[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)])
+        elif side in self._kept:
+            maps = self._kept[side]
+        else:
+            maps = self._kept[side] = background_and_noise(self.image, self.quantum, sigma)
+        return Frame(self.image, *maps, self.dead, self.source_noise, self.masked, found)

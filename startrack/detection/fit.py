@@ -1,4 +1,4 @@
-"""Least-squares fits of point sources: centroids and fluxes at the Cramer-Rao bound."""
+"""Least-squares fits of point sources, at the Cramer-Rao bound, and the noise that their residuals show."""
 
 from __future__ import annotations
 
@@ -7,10 +7,19 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from startrack.core.types import Array, Bools, Ints
-from startrack.detection.frame import Pixels, SourceNoise
+from startrack.detection.frame import MODEL_ERROR, Pixels, SourceNoise
+from startrack.psf import pixel_profile
 
 ROUNDS, ROUNDS_AGAIN = 3, 2  # iterations of a first fit, and of a repeated one
 ALL_USABLE = np.zeros((0, 0, 0), dtype=np.bool_)
+BRIGHT_STAR_SNR = 15.0  # of stars that show what the frame's stars are like
+MIN_NOISE_STARS, MAX_NOISE_STARS = 20, 120
+FAINT_FRACTION = 0.3  # of the pixel's variance: pixels with less signal are left out
+MAX_LEVERAGE = 0.5  # residuals of pixels with a larger leverage do not show the noise
+BINS, MIN_PIXELS_PER_BIN = 12, 15
+MAX_CORRELATION = 2.0
+MEDIAN_OF_SQUARE = 0.4549  # of a unit Gaussian
+MIN_MODEL_ERROR = 0.005
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,12 +66,7 @@ class Stamps:
 
 
 def fit_points(
-    stamps: Stamps,
-    start_xy_px: Array,
-    sigma_px: float,
-    source_noise: SourceNoise,
-    own_part: float,
-    rounds: int = ROUNDS,
+    stamps: Stamps, start_xy_px: Array, sigma_px: float, source_noise: SourceNoise, own_part: float, rounds: int
 ) -> PointFits:
     """Position, flux and local level of one point source in each stamp.
 
@@ -80,8 +84,7 @@ def fit_points(
         source_noise.model_error, rounds, stamps.surround, offset, values, covariance,
     )  # fmt: skip
     flux, level, chi2, chi2_pixel, count, above, norm, own = np.ascontiguousarray(values.T)
-    # The level of the surroundings was taken from pixels that hold the star: it lowers signal by `own_part`, noise by
-    # its root.
+    # Pixels of the surroundings hold the star: their level lowers signal by `own_part`, noise by its root.
     undiluted = np.sqrt(np.maximum(norm, 1e-30) * (1.0 - own_part))
     return PointFits(
         xy_px=stamps.centres + offset,
@@ -114,3 +117,67 @@ def unbin_fits(fits: PointFits, side: int) -> PointFits:
         surround=fits.surround / side**2,
         covariance=fits.covariance * np.outer(unit, unit),
     )
+
+
+def measure_source_noise(s: Stamps, fits: PointFits, alone: Bools, sigma: float, expected: SourceNoise) -> SourceNoise:
+    """The source noise of the frame; `expected` where bright stars are too few. Stated photon noise is kept.
+
+    From isolated stars `alone` (n,): in bins of a pixel's signal s, the median squared residual minus the variance
+    without the star is a s + b s^2. The PSF misfit is at most the expected one. If the residuals of different stars are
+    correlated, the PSF differs from the model, and unknown photon noise cannot be separated from that.
+    """
+    good = alone & (fits.snr > BRIGHT_STAR_SNR) & (fits.chi2 < fits.chi2_pixel)
+    if s.usable is not None:
+        good &= s.usable.all(axis=(1, 2))
+    which = np.flatnonzero(good)
+    # Stars of every brightness: the brightest determine the PSF misfit, the others the photon noise.
+    bright = which[np.argsort(-fits.snr[which], kind="stable")][:: max(1, len(which) // MAX_NOISE_STARS)]
+    if len(bright) < MIN_NOISE_STARS:
+        return expected
+    signal, squared, variance, correlation = _squared_residuals(s.take(bright), fits.take(bright), sigma)
+    if (expected.per_unit == 0.0 and correlation > MAX_CORRELATION) or len(signal) < BINS * MIN_PIXELS_PER_BIN:
+        return expected
+    order = np.argsort(signal, kind="stable")
+    bins = [part for part in np.array_split(order, BINS) if len(part) >= MIN_PIXELS_PER_BIN]
+    level, total, dark = (
+        np.array([np.median(values[part]) for part in bins]) for values in (signal, squared, variance)
+    )
+    total /= MEDIAN_OF_SQUARE
+    beyond, error = total - dark, np.maximum(total, dark) * 2.0 / np.sqrt([len(part) for part in bins])
+    # Weighted least squares for a and b, neither below 0.
+    one, two = level / error, level**2 / error
+    per_unit = expected.per_unit
+    if per_unit == 0.0:
+        normal = np.array([[one @ one, one @ two], [one @ two, two @ two]])
+        right = np.array([one @ (beyond / error), two @ (beyond / error)])
+        per_unit, b = np.linalg.solve(normal, right)
+        per_unit = float(max(per_unit if b >= 0 else right[0] / normal[0, 0], 0.0))
+    b = float(two @ ((beyond - per_unit * level) / error) / (two @ two))
+    return SourceNoise(per_unit, float(np.clip(np.sqrt(max(b, 0.0)), MIN_MODEL_ERROR, MODEL_ERROR)))
+
+
+def _squared_residuals(s: Stamps, fits: PointFits, sigma: float) -> tuple[Array, Array, Array, float]:
+    """Signal, squared residual (leverage corrected) and variance without the star of pixels (m,) that the stars light.
+
+    Last, the correlation of the stars' residuals: 1 for independent ones.
+    """
+    radius = s.data.shape[1] // 2
+    offset, n = fits.xy_px - s.centres, len(s.data)
+    px, dx = pixel_profile(offset[:, 0], sigma, radius)
+    py, dy = pixel_profile(offset[:, 1], sigma, radius)
+    flux = np.maximum(fits.flux, 0.0)[:, None, None]
+    shape = py[:, :, None] * px[:, None, :]
+    signal = flux * shape
+    gradient = [flux * py[:, :, None] * dx[:, None, :], flux * dy[:, :, None] * px[:, None, :], shape, 1.0 + 0 * shape]
+    g = np.stack([q.reshape(n, -1) for q in gradient], axis=1)
+    residual = (s.data - signal - fits.level[:, None, None]).reshape(n, -1)
+    squared = np.square(residual)
+    variance = s.variance.reshape(n, -1).astype(np.float64)
+    seen = np.maximum(squared, variance + np.square(MODEL_ERROR * signal.reshape(n, -1)))
+    leverage = np.sum(g * np.matmul(fits.covariance, g), axis=1) / seen
+    use = (signal.reshape(n, -1) > FAINT_FRACTION * variance) & (leverage < MAX_LEVERAGE)
+    relative = residual / flux[:, :, 0]
+    # Equal weight for each star.
+    relative /= np.maximum(np.sqrt(np.mean(np.square(relative), axis=1, keepdims=True)), 1e-30)
+    correlation = float(np.sum(np.square(relative.sum(axis=0))) / np.sum(np.square(relative)))
+    return signal.reshape(n, -1)[use], (squared / (1.0 - leverage))[use], variance[use], correlation

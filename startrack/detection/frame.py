@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from startrack.camera import Camera
 from startrack.core.types import Bools, Exposure, Ints
-from startrack.detection.background import smallest_step
+from startrack.detection.background import Image, smallest_step
 from startrack.psf import stamp_radius
 
-Image = NDArray[np.float32]
 Pixels = NDArray[np.floating[Any]]  # stamps, in either precision
 SATURATED_FRACTION = 0.98
 MIN_BINNED_SIGMA_PX = 1.8  # PSF width from which the frame is binned

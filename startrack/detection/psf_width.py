@@ -12,15 +12,11 @@ from startrack.detection.frame import Frame, Pixels, radius_for
 from startrack.detection.peaks import bright_pixels, find_peaks
 from startrack.psf import pixel_profile_single
 
-BRIGHT_SNR = 12.0  # of the sources from which the width is measured
+WIDTH_SNR = 12.0  # of the sources from which the width is measured
 WIDTH_TOLERANCE = 0.12  # a measured PSF that differs by more than this fraction from the expected one replaces it
 WIDTH_ROUNDS = 4  # a stamp of the wrong size measures a much wider PSF too small
 BRIGHT_PIXEL_SIGMAS, MAX_BRIGHT_PIXELS, MIN_BRIGHT_PIXELS = 8.0, 64, 30
-MIN_BESIDE, MIN_FALL, MAX_FALL = (
-    0.02,
-    0.05,
-    3.5,
-)  # relative signal beside a peak; its logarithmic fall for 4.5 px and 0.45 px
+MIN_BESIDE, MIN_FALL, MAX_FALL = 0.02, 0.05, 3.5  # relative signal beside a peak; its fall for 4.5 px and 0.45 px
 MIN_BRIGHT_SOURCES = 8
 MAX_BRIGHT_SOURCES, MAX_SOURCES_ALL_WIDTHS = 100, 40  # the second where many widths are tried
 NEAR_WIDTHS = np.geomspace(0.72, 1.4, 8)  # widths tried first, in units of the expected one
@@ -39,7 +35,7 @@ def measure_psf_width(frame: Frame, centres: Ints, fits: PointFits, sigma: float
     are left out; if two groups of widths remain, the narrower one is the stars'.
     """
     radius = radius_for(sigma)
-    bright = np.flatnonzero((fits.snr > BRIGHT_SNR) & (fits.chi2 < fits.chi2_pixel))
+    bright = np.flatnonzero((fits.snr > WIDTH_SNR) & (fits.chi2 < fits.chi2_pixel))
     bright = bright[np.argsort(-fits.snr[bright], kind="stable")]
     usable = frame.usable_pixels(centres[bright], radius)
     bright = (bright if usable is None else bright[usable.all(axis=(1, 2))])[:MAX_BRIGHT_SOURCES]
@@ -106,7 +102,7 @@ def guess_psf_width(prepare: Callable[[float], Frame], sigma: float) -> float:
     frame = prepare(sigma)
     pixels = bright_pixels(frame, BRIGHT_PIXEL_SIGMAS, MAX_BRIGHT_PIXELS, 1)
     if len(pixels) < MIN_BRIGHT_PIXELS:  # too few stand out by one pixel
-        found = find_peaks(frame, sigma, BRIGHT_SNR, MAX_BRIGHT_PIXELS).centres
+        found = find_peaks(frame, sigma, WIDTH_SNR, MAX_BRIGHT_PIXELS).centres
         pixels = found if len(found) > len(pixels) else pixels
     elif (guess := _width_by_fall(frame, pixels)) is not None:
         sigma = guess

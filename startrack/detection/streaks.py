@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 
 from startrack.core.types import Array, Bools, Ints
+from startrack.detection.fit import BRIGHT_STAR_SNR
 from startrack.detection.frame import Frame
 
 PIXEL_SIGMAS = 2.5  # of the lightly smoothed image: pixels of a streak
 SMOOTH_PX = 1.0
 MIN_AREA_PX, MAX_AREA_PX = 12, 20_000
-BRIGHT_SNR = 15.0  # of the whole streak
-MIN_STARS = 6  # streaks of similar direction and length
+MIN_STREAKS = 6  # streaks of similar direction and length
 LONG_PX, SLENDER = 4.5, 2.5  # shortest streak, and its length over its width
 SAME_DIRECTION, SAME_LENGTH = np.cos(np.radians(15.0)), 0.3
 ELONGATION_RADIUS_PX, ELONGATION_PEAKS, ELONGATION_SIGMAS, ELONGATION_PX2, ELONGATION_RATIO = 7, 100, 4.0, 2.2, 2.2
@@ -33,6 +33,11 @@ class Streaks:
     length_px: float  # typical
     width_px: float  # typical standard deviation across
 
+    @property
+    def psf_sigma_px(self) -> float:
+        """Standard deviation of the whole streak, the typical one."""
+        return float(np.hypot(self.width_px, self.length_px / np.sqrt(12.0)))
+
     def take(self, which: Bools) -> Streaks:
         """The streaks that a mask (n,) selects."""
         rows = {name: getattr(self, name)[which] for name in ("xy_px", "covariance_px2", "flux", "flux_sigma")}
@@ -44,7 +49,7 @@ def are_elongated(frame: Frame, centres: Ints) -> bool:
     height, width = frame.shape
     margin = np.minimum(centres, np.array([width, height]) - 1 - centres).min(axis=1)
     centres = centres[margin >= ELONGATION_RADIUS_PX][:ELONGATION_PEAKS]
-    if len(centres) < MIN_STARS:
+    if len(centres) < MIN_STREAKS:
         return False
     signal, noise = frame.data(centres, ELONGATION_RADIUS_PX), np.sqrt(frame.variance(centres, ELONGATION_RADIUS_PX))
     signal = np.where(signal > ELONGATION_SIGMAS * noise, signal, 0.0)
@@ -83,22 +88,20 @@ def find_streaks(frame: Frame) -> Streaks | None:
     variance += frame.source_noise.per_unit * np.maximum(signal, 0.0)
     blobs = _moments(label, np.stack([columns, rows], axis=1).astype(np.float64), signal, variance, count)
     flux, flux_sigma, xy, spread, covariance = blobs
-    bright = (area >= MIN_AREA_PX) & (area <= MAX_AREA_PX) & off_border & (flux > BRIGHT_SNR * flux_sigma)
+    bright = (area >= MIN_AREA_PX) & (area <= MAX_AREA_PX) & off_border & (flux > BRIGHT_STAR_SNR * flux_sigma)
     bright[0] = False
     which = np.flatnonzero(bright)
-    if len(which) < MIN_STARS:
+    if len(which) < MIN_STREAKS:
         return None
     values, vectors = np.linalg.eigh(spread[which])
-    length, across = (
-        np.sqrt(12.0 * np.maximum(values[:, 1] - values[:, 0], 0.0)),
-        np.sqrt(np.maximum(values[:, 0], 0.1)),
-    )
+    length = np.sqrt(12.0 * np.maximum(values[:, 1] - values[:, 0], 0.0))
+    across = np.sqrt(np.maximum(values[:, 0], 0.1))
     streaked = (length > LONG_PX) & (length > SLENDER * across)
-    if streaked.sum() < MIN_STARS or streaked.mean() < STREAKED_FRACTION:
+    if streaked.sum() < MIN_STREAKS or streaked.mean() < STREAKED_FRACTION:
         return None
     which, length, across, along = which[streaked], length[streaked], across[streaked], vectors[streaked][:, :, 1]
     alike = _resemble_neighbours(xy[which], along, length)
-    if alike.sum() < MIN_STARS or alike.mean() < STREAKED_FRACTION:
+    if alike.sum() < MIN_STREAKS or alike.mean() < STREAKED_FRACTION:
         return None
     which, length, across = which[alike], length[alike], across[alike]
     order = np.argsort(-flux[which], kind="stable")

@@ -28,8 +28,7 @@ from startrack.frames import R_from_rotvec, wahba
 from startrack.identification import Identifier
 from startrack.identification.attitude_search import AttitudeSearch
 from startrack.identification.index import CatalogPatterns, PerObject
-from startrack.identification.pairs import build_pairs
-from startrack.identification.triangles import sides_of_few, triangles
+from startrack.identification.triangles import build_pairs, sides_of_few, triangles
 
 
 def hundred_stars(seed: int, false: int = 20, true: int = 80, noise_px: float = 0.2) -> Frame:

@@ -21,20 +21,15 @@ from startrack.core.types import Detections, NotIdentified, Stars
 from startrack.estimation.attitude import solve_attitude
 from startrack.exposure import read_exposure
 from startrack.frames import angle_between_rad
-from startrack.identification.proximity_mask import proximity_mask
-from startrack.identification.radial_lens_family import (
-    EQUIDISTANT,
-    EQUISOLID,
-    ORTHOGRAPHIC,
-    STEREOGRAPHIC,
-    RadialFamily,
-)
+from startrack.identification.lens_guesses import RadialFamily
+from startrack.identification.similar_triangles import proximity_mask
 from startrack.identification.unknown_lens import UnknownLensSolution, identify_unknown_lens
 
 DATA = Path(__file__).parent / "data"
 PHOTO = Path(__file__).parent.parent / "sample_images/lowell-2018-08-06.fits.bz2"
 SIZE = (1400, 1100)
 ARCSEC = np.pi / 648_000
+ORTHOGRAPHIC, EQUISOLID, EQUIDISTANT, STEREOGRAPHIC = -1.0, -0.5, 0.0, 0.5  # shapes of the family
 
 
 @lru_cache(maxsize=1)

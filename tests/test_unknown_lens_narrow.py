@@ -8,15 +8,17 @@ from test_unknown_lens import SIZE, detections, lens_camera, picture, sky
 
 from startrack.camera import KannalaBrandt, Pinhole
 from startrack.core.types import Detections
-from startrack.identification.narrow_field import NarrowFieldSearch
-from startrack.identification.triangles import shape_index, triangles
+from startrack.identification.hypotheses import HypothesisSearch
+from startrack.identification.narrow_field import NarrowField
+from startrack.identification.similar_triangles import shape_index
+from startrack.identification.triangles import triangles
 from startrack.identification.unknown_lens import LOG_FALSE_ALARM, identify_unknown_lens
 
 FIELD_SR = 0.05
 
 
-def search(seen: Detections, fov: float, size: tuple[int, int] = SIZE) -> NarrowFieldSearch:
-    return NarrowFieldSearch(seen, np.arange(min(len(seen), 100)), size, np.radians(fov), FIELD_SR, sky())
+def search(seen: Detections, fov: float, size: tuple[int, int] = SIZE) -> NarrowField:
+    return NarrowField(seen, HypothesisSearch(seen.xy_px, size), np.radians(fov), FIELD_SR, sky())
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -26,14 +28,13 @@ def test_the_first_view_voted_for_is_right(seed: int, wrong_by: float, mirrored:
     camera = lens_camera(Pinhole(), 16, 700, mirrored=mirrored)
     seen, truth, R = picture(camera, seed=seed, limit=7.0, hidden=0.2)
     narrow = search(seen, 16 * wrong_by)
-    found = next(narrow.views())
-    assert narrow.tried < 30_000
-    assert found.lens.log_p < LOG_FALSE_ALARM
-    assert found.view.mirrored == mirrored
-    assert found.view.focal_px == pytest.approx(camera.focal_px[0], rel=1e-3)
-    names = found.around[found.lens.star]
-    assert np.mean(truth[found.lens.detection] == names) >= 0.98
-    assert np.trace(found.view.R_cam_icrs.T @ R) > 3 - 1e-7
+    found = next(narrow.lenses())
+    assert narrow.search.tried < 30_000
+    assert found.log_p < LOG_FALSE_ALARM
+    assert found.camera.mirrored == mirrored
+    assert found.camera.focal_px[0] == pytest.approx(camera.focal_px[0], rel=1e-3)
+    assert np.mean(truth[found.detection] == found.star) >= 0.98
+    assert np.trace(found.R_cam_icrs.T @ R) > 3 - 1e-7
 
 
 @pytest.mark.parametrize("bend_px", [-12.0, 12.0])
@@ -67,8 +68,8 @@ def test_noise_with_or_without_clumps_is_far_from_acceptance(seed: int) -> None:
     )
     noise = detections(np.clip(xy, 0, np.array(SIZE) - 1), 100 * np.sort(rng.pareto(1.5, n) + 1)[::-1])
     narrow = search(noise, 14)
-    assert all(found.lens.log_p > -12 for found in narrow.views())
-    assert narrow.tried > 1000
+    assert all(found.log_p > -12 for found in narrow.lenses())
+    assert narrow.search.tried > 1000
 
 
 def test_similar_triangles_equal_those_of_an_exhaustive_comparison() -> None:

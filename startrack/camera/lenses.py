@@ -166,8 +166,9 @@ class Pinhole(Lens):
         return "pinhole", ()
 
 
-LENSES: tuple[type[Lens], ...] = (  # the first is the default
-    KannalaBrandt,
+DEFAULT = KannalaBrandt  # can follow any curve
+LENSES: tuple[type[Lens], ...] = (
+    DEFAULT,
     Pinhole,
 )
 
@@ -177,6 +178,6 @@ def lens_kinds() -> dict[str, type[Lens]]:
     return {lens.model: lens for lens in LENSES}
 
 
-def default_lens() -> type[Lens]:
-    """The lens of a camera file without the key `model`."""
-    return LENSES[0]
+def default_lens() -> type[KannalaBrandt]:
+    """The lens of a camera file without the key `model`, and of a camera that is found without one."""
+    return DEFAULT

@@ -1,4 +1,4 @@
-"""Search for attitudes: triangles of detections that match the catalogue's, tested against the bright stars.
+"""Attitudes: triangles of detections that match the catalogue's, tested against bright stars, refined with all stars.
 
 All arrays are small and the number of numpy calls is kept low: a typical search ends with its first triangles.
 """
@@ -11,27 +11,35 @@ from itertools import pairwise
 
 import numpy as np
 
-from startrack.core.types import Array, Ints
+from startrack.camera import Camera
+from startrack.core.types import Array, Bools, Centroids, Ints
+from startrack.estimation.adjust import CHI2_2DOF_MEDIAN, OUTLIER_CHI2, SMALLEST_EXTRA_PX2
 from startrack.estimation.false_alarm import PATTERN_MATCHES, expected_false_alarms
+from startrack.estimation.match import CandidatePairs, PhotometricScale, upper_median
 from startrack.frames import wahba
-from startrack.identification.index import CatalogPatterns, Neighbours, PatternIndex, PixelScale
-from startrack.identification.triangles import sides_of_few, triangles
+from startrack.identification.index import CatalogPatterns, Neighbours, PixelScale, pixel_scale_of
+from startrack.identification.triangles import PatternIndex, sides_of_few, triangles
 
 PREFIXES = (0, 7, 10, 14, 20, 28)  # number of brightest detections that form triangles, round by round
-WINDOW_RANKS, NEW_RANKS = 24, 12  # ranks of brightness that form triangles beyond these, and how many of them are new
-DEEPEST_RANK = 240
-ROUGH_DEPTH, ROUGH_SIDE_RAD, ROUGH_FRACTION = 120, np.radians(20.0), 0.4
+WINDOW_RANKS = 24  # ranks of brightness that form triangles beyond these, half of them new in each window
+NEW_RANKS = WINDOW_RANKS // 2
+DEEPEST_RANK = 10 * WINDOW_RANKS
+ROUGH_SIDE_RAD, ROUGH_FRACTION = np.radians(20.0), 0.4  # longest sides of short triangles, the second of the field
 PIVOTS = 16  # brightest detections about which triangles of catalogue pairs are tried
 MATCHES_EACH, ROUGH_MATCHES_EACH = 3, 8  # catalogue triangles looked up for a triangle of detections
 MAX_IMAGE_TRIANGLES, MAX_ROUGH = 20_000, 3000  # short triangles of detections; their matches that are tried
 VERIFIED_DETECTIONS = 256  # detections tested against the stars
-PRETESTED_DETECTIONS, PRETEST_BATCH = (
-    64,
-    64,
-)  # detections in the first test of many hypotheses; hypotheses tested together
+PRETESTED = VERIFIED_DETECTIONS // 4  # detections in the first test of many hypotheses; as many are tested together
 DEPTH_FACTOR = 4  # catalogue stars per detection (of the whole sky): some are hidden or too faint
-MIN_HITS = 6
+MIN_MATCHES = 6
 PLAUSIBLE = 1e-2  # expected false alarms below which a hypothesis is refined; the final limit is tested later
+GATE_PX = 6.0  # from a predicted star, in which detections are matched
+FIRST_GATE_PX = GATE_PX / 2
+INLIER_PX = 1.5  # largest distance of a detection on its star
+BLEND_SIGMAS = 3.0  # of the PSF: radius within which stars share one detection
+ROUNDS = 4  # of matching and rotating; one suffices if the bright stars determine the attitude
+SETTLED_PX = 0.15
+MAX_DRIFT_PX = 0.7  # change of the attitude up to which the neighbours remain valid
 
 
 @dataclass(frozen=True)
@@ -62,7 +70,13 @@ class AttitudeSearch:
         then from triangles assembled from catalogue pairs; last from short ones, for rays with errors of `rough_px`:
         over short distances a rough calibration is still accurate.
         """
-        brightest, beyond = list(self._prefixes()), list(self._windows())
+        n = len(self.rays_cam)
+        brightest = [(0, done, min(end, n)) for done, end in pairwise(PREFIXES) if done < n]
+        most, overlap = min(n, DEEPEST_RANK), WINDOW_RANKS - NEW_RANKS
+        beyond = [
+            (first, overlap, min(first + WINDOW_RANKS, most))
+            for first in range(PREFIXES[-1] - overlap, most - overlap, NEW_RANKS)
+        ]
         tolerance = tolerance_px * self.scale.axis_rad_per_px
         for windows in (brightest, beyond):
             for deep in (False, True):
@@ -77,18 +91,6 @@ class AttitudeSearch:
         flip = np.array([-1.0, 1.0, 1.0])
         for cam, icrs, first, tolerance in self.mirrored:
             yield from self._plausible_attitudes(cam * flip, icrs, self.rays_cam * flip, first, tolerance)
-
-    def _prefixes(self) -> Iterator[tuple[int, int, int]]:
-        n = len(self.rays_cam)
-        return ((0, done, min(end, n)) for done, end in pairwise(PREFIXES) if done < n)
-
-    def _windows(self) -> Iterator[tuple[int, int, int]]:
-        n = min(len(self.rays_cam), DEEPEST_RANK)
-        start = PREFIXES[-1] - (WINDOW_RANKS - NEW_RANKS)
-        return (
-            (k, WINDOW_RANKS - NEW_RANKS, min(k + WINDOW_RANKS, n))
-            for k in range(start, n - WINDOW_RANKS + NEW_RANKS, NEW_RANKS)
-        )
 
     def _attitudes_from_triangles(
         self, index: PatternIndex, first: int, fresh: int, end: int, tolerance: float
@@ -116,7 +118,7 @@ class AttitudeSearch:
     def _attitudes_from_short_triangles(self, tolerance: float) -> Iterator[AttitudeHypothesis]:
         index = self.patterns.deep_index
         longest = min(ROUGH_SIDE_RAD, ROUGH_FRACTION * self.scale.diameter_rad)
-        image = triangles(self.rays_cam[:ROUGH_DEPTH], longest, MAX_IMAGE_TRIANGLES)
+        image = triangles(self.rays_cam[: DEEPEST_RANK // 2], longest, MAX_IMAGE_TRIANGLES)
         left, right = index.candidates(2 * np.sin(image.sides_rad / 2), tolerance, ROUGH_MATCHES_EACH)
         self.tried += max(len(left) - MAX_ROUGH, 0)
         left, right = left[:MAX_ROUGH], right[:MAX_ROUGH]
@@ -142,12 +144,12 @@ class AttitudeSearch:
         some, radius = rays_cam[: first + VERIFIED_DETECTIONS], 2.0 * tolerance
         depth = int(DEPTH_FACTOR * 4 * np.pi / self.patterns.field_sr * len(some))
         for R in self._supported_attitudes(
-            cam, icrs, some[max(first - WINDOW_RANKS, 0) : first + PRETESTED_DETECTIONS], radius, depth
+            cam, icrs, some[max(first - WINDOW_RANKS, 0) : first + PRETESTED], radius, depth
         ):
             near = self.patterns.neighbours(some @ R, self.neighbour_radius_rad, depth)
             hit = near.chord < radius
             hits = min(int(np.count_nonzero(hit)), len(some))
-            if hits < MIN_HITS:
+            if hits < MIN_MATCHES:
                 continue
             if self._false_alarms(hits - PATTERN_MATCHES, len(some), near.depth, radius) < PLAUSIBLE:
                 yield AttitudeHypothesis(R, near.ray[hit], near.star[hit], near if len(some) == len(rays_cam) else None)
@@ -157,8 +159,8 @@ class AttitudeSearch:
         if len(cam):
             yield wahba(cam[0], icrs[0])
         tree = self.patterns.tree(depth)
-        for start in range(1, len(cam), PRETEST_BATCH):
-            R = wahba(cam[start : start + PRETEST_BATCH], icrs[start : start + PRETEST_BATCH])
+        for start in range(1, len(cam), PRETESTED):
+            R = wahba(cam[start : start + PRETESTED], icrs[start : start + PRETESTED])
             distance = tree.query(some @ R, distance_upper_bound=radius)[0]
             hits = np.count_nonzero(distance < radius, axis=1)
             best = np.argsort(-hits, kind="stable")
@@ -168,3 +170,88 @@ class AttitudeSearch:
     def _false_alarms(self, further: Ints | int, rays: int, depth: int, radius: float) -> Array:
         """Expected number of trials in which so many further rays hit one of the `depth` brightest stars by chance."""
         return expected_false_alarms(self.tried, further, rays, min(depth * radius**2 / 4, 1.0))
+
+
+@dataclass(frozen=True)
+class AttitudeMatch:
+    """An attitude with its matches."""
+
+    R_cam_icrs: Array
+    pairs: CandidatePairs
+    matched: Ints  # (m,) indices of pairs: mutually nearest, agreeing in brightness, within GATE_PX
+    named: Bools  # (m,) close enough to be identified
+    inlier: Bools  # (m,) as close as the stated centroid errors predict
+    variance_px2: Array  # (m,) per axis, the error common to all stars added
+    visible_v_mag: Array  # of the stars in the image circle that are bright enough to be detected
+
+
+@dataclass(frozen=True)
+class AttitudeRefiner:
+    """Refinement by position and brightness: AttitudeHypothesis -> AttitudeMatch."""
+
+    camera: Camera
+    centroids: Centroids
+    rays_cam: Array  # (n, 3)
+    variance_px2: Array  # (n,) per axis
+    patterns: CatalogPatterns
+
+    def __call__(self, hypothesis: AttitudeHypothesis) -> AttitudeMatch | None:
+        """Match all stars, starting from the bright ones that coincide; None where too few agree."""
+        d, stars, scale = self.centroids, self.patterns.stars, pixel_scale_of(self.camera)
+        R = wahba(self.rays_cam[hypothesis.detection], stars.rays_icrs[hypothesis.star])
+        photometry = PhotometricScale.from_matches(
+            d.flux_e, d.saturated, stars.v_mag[hypothesis.star], hypothesis.detection
+        )
+        limit, complete = np.searchsorted(stars.v_mag, [photometry.limit_mag, photometry.complete_mag]).tolist()
+        near = hypothesis.near
+        drift_px = np.abs(hypothesis.R_cam_icrs - R).max() / scale.axis_rad_per_px
+        if near is None or near.depth < limit or drift_px > MAX_DRIFT_PX:
+            radius_rad = neighbour_radius_px(d.psf_sigma_px) * scale.largest_rad_per_px
+            near = self.patterns.neighbours(self.rays_cam @ R, radius_rad, limit)
+        detection, star = near.ray, near.star
+        rays_icrs, v_mag = stars.rays_icrs[star], stars.v_mag[star]
+        v_sigma_mag = stars.v_sigma_mag[star] + d.brightness_sigma_mag
+        xy_px = d.xy_px[detection]
+        for _ in range(ROUNDS):
+            px, inside = self.camera.project(rays_icrs @ R.T)
+            off = px - xy_px
+            distance = np.sqrt(np.einsum("ni,ni->n", off, off))
+            distance[~inside | (distance > GATE_PX)] = np.inf
+            pairs = CandidatePairs(detection, star, distance, v_mag, v_sigma_mag, photometry)
+            matched = pairs.one_to_one_pairs
+            if len(matched) < MIN_MATCHES:
+                return None
+            agree, variance = self._select_inliers(pairs, matched)
+            used = matched[agree]
+            if len(used) < MIN_MATCHES:
+                return None
+            refined = wahba(self.rays_cam[detection[used]] / variance[agree][:, None], rays_icrs[used])
+            if np.abs(refined - R).max() / scale.axis_rad_per_px < SETTLED_PX:
+                break
+            R = refined
+        visible = stars.rays_icrs[:complete] @ R[2] > np.cos(self.camera.max_angle_rad)
+        squared, misfit = np.square(pairs.distance_px[matched]), pairs.brightness_misfit[matched]
+        inlier = squared < np.maximum(INLIER_PX**2, OUTLIER_CHI2 * self.variance_px2[detection[matched]])
+        # Position and brightness may not both be at the edge of what is allowed.
+        named = inlier & agree & (squared / (OUTLIER_CHI2 * variance) + misfit * misfit < 1.0)
+        return AttitudeMatch(refined, pairs, matched, named, inlier, variance, stars.v_mag[:complete][visible])
+
+    def _select_inliers(self, pairs: CandidatePairs, which: Ints) -> tuple[Bools, Array]:
+        """Which of the pairs are no outliers, and their variance per axis [px^2], the common error added.
+
+        The common error is estimated as in `extra_variance_px2`, but in closed form: for one variance per star.
+        """
+        distance = pairs.distance_px[which]
+        stated = self.variance_px2[pairs.detection[which]]
+        first = distance < FIRST_GATE_PX
+        if not first.any():
+            return first, stated
+        squared = np.square(distance)
+        extra = upper_median(squared[first]) / CHI2_2DOF_MEDIAN - upper_median(stated[first])
+        variance = stated + max(extra, SMALLEST_EXTRA_PX2)
+        return first & (squared < OUTLIER_CHI2 * variance), variance
+
+
+def neighbour_radius_px(psf_sigma_px: float) -> float:
+    """Distance from a detection within which stars are looked up at a rough attitude."""
+    return max(GATE_PX, BLEND_SIGMAS * psf_sigma_px) + 1.0

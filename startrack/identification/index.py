@@ -1,4 +1,4 @@
-"""Catalogue patterns for one field of view: triangles of bright stars by their sides, and k-d trees of stars by depth.
+"""Catalogue patterns for one field of view: triangles and pairs of bright stars, and k-d trees of stars by depth.
 
 Patterns and the angular size of a camera's pixels are computed once per catalogue and camera, and kept.
 """
@@ -7,26 +7,27 @@ from __future__ import annotations
 
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from startrack.camera import Camera
 from startrack.core.types import Array, Ints, Stars
-from startrack.identification.triangles import triangles
+from startrack.identification.triangles import (
+    BRIGHT,
+    DEEP,
+    PairIndex,
+    PatternIndex,
+    build_index,
+    build_pairs,
+)  # fmt: skip
 
-if TYPE_CHECKING:
-    from startrack.identification.pairs import PairIndex
-
-CLOSE_PAIR_RAD = np.radians(0.05)  # stars this close are one detection
 SHALLOWEST_TREE = 1000  # brightest stars in the smallest tree; each next one holds twice as many
 NEIGHBOURS_OF_RAY = 10  # looked up at once; more only in clusters
-CACHED_PATTERNS = 4
-LONGEST_SIDE_OF_FIELD = 0.8  # of a field's diameter: longer sides seldom fit into it
-CLOSURE_PROBABILITY = 0.59  # that two neighbours of a star in the plane are neighbours of each other
+CACHED_PATTERNS = 6  # of catalogues and fields
 SCALE_GRID = 33  # pixels per axis at which the solid angle of the field is summed
 SCALE_ANGLES = 64
 LARGEST_SCALE_1 = 3.0  # limit of the scale over that on the axis, for lenses strongly compressed at the edge
@@ -76,96 +77,17 @@ class PixelScale:
         focal = min(camera.focal_px)
         radial, across = 1.0 / camera.lens.slope(angle), np.sin(angle) / camera.lens.rho(angle)
         largest = min(1.05 * float(np.maximum(radial, across).max() / focal), LARGEST_SCALE_1 / focal)
-        field_sr = _field_sr(camera)
+        width, height = camera.size_px
+        x, y = np.meshgrid(np.linspace(0, width - 1, SCALE_GRID), np.linspace(0, height - 1, SCALE_GRID))
+        off_axis_rad = camera.angle_rad(np.stack([x, y], axis=-1))
+        lit = off_axis_rad[off_axis_rad < camera.max_angle_rad]
+        field_sr = float(np.sum(camera.pixel_solid_angle_sr(lit) * (width * height / SCALE_GRID**2)))
         circle_sr = 2 * np.pi * (1 - np.cos(camera.max_angle_rad))
         on_axis = float(camera.mean_scale_rad_per_px(off_axis))
         return cls(on_axis, largest, field_sr, min(float(field_sr / circle_sr), 1.0))
 
 
-def _field_sr(camera: Camera) -> float:
-    """Solid angle of the part of the frame inside the image circle."""
-    width, height = camera.size_px
-    x, y = np.meshgrid(np.linspace(0, width - 1, SCALE_GRID), np.linspace(0, height - 1, SCALE_GRID))
-    angle = camera.angle_rad(np.stack([x, y], axis=-1))
-    cell = width * height / angle.size
-    lit = angle < camera.max_angle_rad
-    return float(np.sum(camera.pixel_solid_angle_sr(angle[lit]) * cell))
-
-
 pixel_scale_of = PerObject(PixelScale.measure)
-
-
-@dataclass(frozen=True)
-class PatternSize:
-    """Numbers of stars and of triangles of an index."""
-
-    stars_in_field: int
-    min_stars: int  # of the whole sky
-    max_stars: int
-    triangles: int
-    widest_rad: float
-
-
-# The brightest few, with sides nearly as long as the field allows: a long triangle seldom matches by chance.
-BRIGHT = PatternSize(20, 150, 40_000, 200_000, np.radians(75.0))
-# More stars, shorter sides: where walls, clouds or false stars leave too few of the brightest.
-DEEP = PatternSize(60, 700, 60_000, 400_000, np.radians(45.0))
-
-
-@dataclass(frozen=True)
-class PatternIndex:
-    """Triangles of the brightest stars of the sky, looked up by their sides, which are chords of the unit sphere."""
-
-    star: Ints  # (m,) indices of the pattern stars in Stars
-    rays_icrs: Array  # (m, 3)
-    longest_chord: float  # of the sides
-    vertices: Ints  # (n, 3) indices into rays_icrs, ordered by the opposite side, shortest first
-    handedness: Array  # (n,) sign of the triple product
-    tree: Any  # scipy.spatial.cKDTree over the sides (n, 3), ascending
-
-    def candidates(self, sides: Array, tolerance: float, most: int) -> tuple[Ints, Ints]:
-        """Pairs (row of the sides (m, 3), triangle) that agree within the tolerance, best relative agreement first.
-
-        At most `most` for each row: one look-up of fixed size takes a tenth of the time of a complete one.
-        """
-        distance, found = self.tree.query(sides, most, p=np.inf, distance_upper_bound=tolerance)
-        distance = distance.ravel()
-        close = np.flatnonzero(distance < tolerance)
-        close = close[np.argsort(distance[close] / sides[close // most, 0])]
-        return close // most, found.ravel()[close]
-
-
-def build_index(stars: Stars, field_sr: float, size: PatternSize) -> PatternIndex:
-    """The index of the brightest stars (sorted, brightest first) for a camera that sees `field_sr`."""
-    from scipy.spatial import cKDTree
-
-    star = separate_bright_stars(
-        stars, int(np.clip(size.stars_in_field * 4 * np.pi / field_sr, size.min_stars, size.max_stars))
-    )
-    rays = stars.rays_icrs[star]
-    neighbours = np.sqrt(6 * size.triangles / (CLOSURE_PROBABILITY * len(star)))
-    longest_side = min(
-        size.widest_rad,
-        2 * np.arcsin(np.sqrt(min(neighbours / len(star), 1.0))),
-        LONGEST_SIDE_OF_FIELD * np.sqrt(4 * field_sr / np.pi),
-    )
-    found = triangles(rays, longest_side)
-    sides = 2 * np.sin(found.sides_rad / 2)
-    return PatternIndex(
-        star, rays, float(2 * np.sin(longest_side / 2)), found.vertices, found.handedness, cKDTree(sides)
-    )
-
-
-def separate_bright_stars(stars: Stars, depth: int) -> Ints:
-    """Indices of the brightest stars; of each close pair only the brighter, as a camera does not resolve them."""
-    from scipy.spatial import cKDTree
-
-    rays = stars.rays_icrs[: 2 * depth]
-    pairs = cKDTree(rays).query_pairs(CLOSE_PAIR_RAD, output_type="ndarray")
-    keep = np.ones(len(rays), dtype=bool)
-    if len(pairs):
-        keep[pairs.max(axis=1)] = False
-    return np.flatnonzero(keep)[:depth]
 
 
 class CatalogPatterns:
@@ -189,8 +111,6 @@ class CatalogPatterns:
     @cached_property
     def pairs(self) -> PairIndex:
         """Pairs of bright stars."""
-        from startrack.identification.pairs import build_pairs
-
         return build_pairs(self.stars, self.field_sr)
 
     def tree(self, count: int) -> Any:
@@ -236,14 +156,18 @@ def _neighbours(tree: Any, rays_icrs: Array, chord: float, most: int) -> Neighbo
 
 def patterns_of(stars: Stars, field_sr: float) -> CatalogPatterns:
     """The patterns of these stars; patterns of the last few catalogues and fields are kept."""
-    key = (_fingerprint_of(stars), field_sr)
-    if key not in _CACHE:
-        _CACHE[key] = CatalogPatterns(stars, field_sr)
-        while len(_CACHE) > CACHED_PATTERNS:
-            _CACHE.popitem(last=False)
-    _CACHE.move_to_end(key)
-    return _CACHE[key]
+    return keep_last_few(_KEPT, (_fingerprint_of(stars), field_sr), lambda: CatalogPatterns(stars, field_sr))
 
 
-_CACHE: OrderedDict[tuple[object, float], CatalogPatterns] = OrderedDict()
+def keep_last_few(kept: OrderedDict[Any, Computed], key: Hashable, compute: Callable[[], Computed]) -> Computed:
+    """The value of the `key`, computed unless it is among the last few that were asked for."""
+    if key not in kept:
+        kept[key] = compute()
+        while len(kept) > CACHED_PATTERNS:
+            kept.popitem(last=False)
+    kept.move_to_end(key)
+    return kept[key]
+
+
+_KEPT: OrderedDict[Any, CatalogPatterns] = OrderedDict()
 _fingerprint_of = PerObject(lambda stars: (stars.rays_icrs.shape, stars.rays_icrs[:2000].tobytes()))

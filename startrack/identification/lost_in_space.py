@@ -18,19 +18,21 @@ from startrack.estimation.false_alarm import (
     probability,
 )
 from startrack.estimation.match import DIMMED_MAG, SIGNIFICANT_SNR, brightness_agreement, upper_median
-from startrack.identification.attitude_search import AttitudeHypothesis, AttitudeSearch
-from startrack.identification.index import CatalogPatterns, PixelScale, patterns_of, pixel_scale_of
-from startrack.identification.refine_attitude import (
+from startrack.identification.attitude_search import (
     BLEND_SIGMAS,
     FIRST_GATE_PX,
     GATE_PX,
     INLIER_PX,
+    MIN_MATCHES,
+    AttitudeHypothesis,
     AttitudeMatch,
     AttitudeRefiner,
+    AttitudeSearch,
     neighbour_radius_px,
-)
+)  # fmt: skip
+from startrack.identification.index import CatalogPatterns, PixelScale, patterns_of, pixel_scale_of
 
-MIN_MATCHES = 6
+MAX_FALSE_ALARM = 1e-9  # probability that chance gives an accepted identification
 SMALLEST_RADIUS_PX = 0.5
 BRIGHT_DETECTIONS = 300  # brightest detections that decide whether the camera file is right
 INLIER_FRACTION = 0.7  # of the stars within GATE_PX that lie within INLIER_PX if the camera file is right
@@ -47,7 +49,7 @@ class Identifier:
     hypotheses tried included; otherwise NotIdentified is raised.
     """
 
-    max_false_alarm: float = 1e-9
+    max_false_alarm: float = MAX_FALSE_ALARM
     tolerances_px: tuple[float, float] = (0.7, 3.0)  # error of a ray: centroids alone; rough calibration included
     whole_field: bool = True  # refuse a camera that fits only a part of its field; a calibration may begin with one
 

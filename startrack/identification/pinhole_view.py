@@ -10,15 +10,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.camera import Camera, KannalaBrandt, Lens, Pinhole
+from startrack.camera import Camera, Lens, Pinhole, default_lens
 from startrack.core.types import Array, Bools
-from startrack.estimation.adjust import Scheme, adjust, cauchy_loss
+from startrack.estimation.adjust import Scheme, adjust
 from startrack.estimation.normal_equations import Observations, Terms, observations_of_image
 from startrack.frames import R_from_rotvec
+from startrack.identification.region_growing import MATCH_LOSS
 
 TANGENT = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)  # series of tan a beyond a: to 1e-7 up to 20 degrees
-STEEPEST_RAD = 1.0
-LOSS_CHI2 = 4.0  # chi-square of a match whose weight is halved
 LONGEST_STEP = 0.1  # of a parameter: radians, logarithm of the focal length, distortion
 
 
@@ -63,13 +62,9 @@ class PinholeView:
         covariance = np.broadcast_to(sigma_px**2 * np.eye(2), (len(xy_px), 2, 2))
         points = observations_of_image(xy_px, covariance, rays_icrs)
         free = ("log_focal", "distortion") if distorted else ("log_focal",)
-        scheme = Scheme(loss=cauchy_loss(LOSS_CHI2), steps=steps, settled_px=0.0, damped=False)
+        scheme = Scheme(loss=MATCH_LOSS, steps=steps, settled_px=0.0, damped=False)
         found: PinholeView = adjust(self, points, free, scheme).state
         return found
-
-    def to_pinhole(self) -> PinholeView:
-        """The same view by a pinhole."""
-        return replace(self, distortion=0.0)
 
     def rays_cam(self, points: Observations) -> Array:
         """Positions (n, 2) [focal lengths] of the observations in the pinhole's image plane."""
@@ -108,12 +103,13 @@ class PinholeView:
 
     def camera(self) -> Camera:
         """The camera, as wide as its frame."""
-        lens: Lens = KannalaBrandt((TANGENT[0] + self.distortion, *TANGENT[1:])) if self.distortion else Pinhole()
-        x, y = self.centre_px
+        lens: Lens = Pinhole()
+        if self.distortion:
+            lens = default_lens()((TANGENT[0] + self.distortion, *TANGENT[1:]))
+        (x, y), widest = self.centre_px.tolist(), lens.max_invertible_rad
         camera = Camera(
-            name="unknown", size_px=self.size_px, focal_px=(self.focal_px, self.focal_px),
-            centre_px=(float(x), float(y)), max_angle_rad=STEEPEST_RAD, calibrated_angle_rad=STEEPEST_RAD, lens=lens,
-            mirrored=self.mirrored,
+            name="unknown", size_px=self.size_px, focal_px=(self.focal_px, self.focal_px), centre_px=(x, y),
+            max_angle_rad=widest, calibrated_angle_rad=widest, lens=lens, mirrored=self.mirrored,
         )  # fmt: skip
         corner = float(camera.angle_rad(np.array([-0.5, -0.5])))
         return replace(camera, max_angle_rad=corner, calibrated_angle_rad=corner)

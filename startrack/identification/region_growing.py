@@ -6,24 +6,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from startrack.camera import Camera, KannalaBrandt, lens_kinds
+from startrack.camera import Camera, default_lens, lens_kinds
 from startrack.core.types import Array, Ints
 from startrack.estimation.adjust import Prior, Scheme, State, adjust, cauchy_loss
 from startrack.estimation.false_alarm import log_p_value_bound
 from startrack.estimation.match import match_mutual
 from startrack.estimation.normal_equations import observations_of_image
+from startrack.identification.attitude_search import INLIER_PX
 
 ROUNDS = 2  # of matching and fitting within a stage
-FEWEST = 5
-SMALLEST_GATE_PX = 1.5
+FEWEST = 5  # matches
 GATE_SIGMAS = 4.0  # the gate over the sigma of the loss
-LOSS_CHI2 = 4.0  # chi-square of a match whose weight is halved
+MATCH_LOSS = cauchy_loss(4.0)  # chi-square of a match whose weight is halved
 SHAPE_SIGMA = 0.5  # prior of the family's shape
 FOCAL_SIGMA, CENTRE_SIGMA = 0.1, 0.06  # priors, in focal lengths
 K_SIGMA = (0.1, 0.1, 0.05, 0.02)  # priors of the polynomial's coefficients
 STARS_PER_DETECTION = 1.5
 SAME_RADIUS_1 = 1e-12  # relative difference of the radii of lenses that are the same
-FIT = Scheme(loss=cauchy_loss(LOSS_CHI2), steps=4, settled_px=1e-3)
+WHOLE_LENS = ("f", "shape", "cx", "cy")
+FIT = Scheme(loss=MATCH_LOSS, steps=4, settled_px=1e-3)
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,10 @@ class GrowthStage:
 
 WIDE_STAGES = (
     GrowthStage(np.radians(45.0), np.radians(2.0), 60, ("f",), 0.0),
-    GrowthStage(np.radians(70.0), np.radians(2.0), 60, ("f", "shape", "cx", "cy"), -3.0),
-    GrowthStage(np.pi, np.radians(2.0), 80, ("f", "shape", "cx", "cy"), -6.0),
-    GrowthStage(np.pi, np.radians(1.0), 120, ("f", "shape", "cx", "cy"), -10.0),
-    GrowthStage(np.pi, np.radians(0.6), 200, ("f", "shape", "cx", "cy"), -14.0),
+    GrowthStage(np.radians(70.0), np.radians(2.0), 60, WHOLE_LENS, -3.0),
+    GrowthStage(np.pi, np.radians(2.0), 80, WHOLE_LENS, -6.0),
+    GrowthStage(np.pi, np.radians(1.0), 120, WHOLE_LENS, -10.0),
+    GrowthStage(np.pi, np.radians(0.6), 200, WHOLE_LENS, -14.0),
 )
 
 
@@ -67,7 +68,7 @@ class GrownLens:
 
 
 def grow(
-    hypothesis: LensHypothesis, xy_px: Array, rays_icrs: Array, stages: tuple[GrowthStage, ...] = WIDE_STAGES
+    hypothesis: LensHypothesis, xy_px: Array, rays_icrs: Array, stages: tuple[GrowthStage, ...]
 ) -> GrownLens | None:
     """The hypothesis after all stages; None where it is given up. Detections (n, 2), stars (m, 3): brightest first."""
     camera, R = hypothesis.camera, hypothesis.R_cam_icrs
@@ -76,7 +77,7 @@ def grow(
     for stage in stages:
         some = xy_px[: stage.detections]
         for _ in range(ROUNDS):
-            gate_px = max(stage.gate_rad * camera.focal_px[0], SMALLEST_GATE_PX)
+            gate_px = max(stage.gate_rad * camera.focal_px[0], INLIER_PX)
             near = (middle_icrs, stage.radius_rad)
             detection, star, predicted = match_in_view(camera, R, some, rays_icrs, gate_px, near)
             if len(star) < FEWEST:
@@ -85,7 +86,9 @@ def grow(
                 camera, R, some[detection], rays_icrs[star], stage.free, gate_px / GATE_SIGMAS, hypothesis.camera
             )
             grown = GrownLens(camera, R, detection, star)
-        if log_p_value_bound(distance, gate_px, predicted, _density_px2(some)) > stage.most_log_p:
+        # The detections' density in the rectangle between their 5th and 95th percentiles.
+        area_px2 = float(np.prod(np.ptp(np.percentile(some, (5, 95), axis=0), axis=0)) / 0.81) + 1.0
+        if log_p_value_bound(distance, gate_px, predicted, len(some) / area_px2) > stage.most_log_p:
             return None
     return grown
 
@@ -98,7 +101,13 @@ def match_in_view(
     About as many of the brightest stars in view take part as there are detections (n, 2). `near`: only stars about
     this direction (3,) in ICRS, up to this angle [rad].
     """
-    some = _brightest_in_view(camera, R, rays_icrs, int(STARS_PER_DETECTION * len(xy_px)) + 5)
+    wanted = int(STARS_PER_DETECTION * len(xy_px)) + 5
+    count = wanted
+    while True:
+        count *= 4
+        some = np.flatnonzero(camera.project(rays_icrs[:count] @ R.T)[1])[:wanted]
+        if len(some) == wanted or count >= len(rays_icrs):
+            break
     if near is not None:
         some = some[rays_icrs[some] @ near[0] > np.cos(near[1])]
     if not len(some):
@@ -125,44 +134,23 @@ def prior_of(camera: Camera, prior: Camera, free: tuple[str, ...]) -> Prior:
     focal = prior.focal_px[0]
     sigma = {"f": FOCAL_SIGMA * focal, "cx": CENTRE_SIGMA * focal, "cy": CENTRE_SIGMA * focal, "shape": SHAPE_SIGMA}
     sigma |= {f"k{n + 1}": value for n, value in enumerate(K_SIGMA)}
-    now, expected = _parameters(camera), _parameters(prior)
+    now, expected = (
+        {"f": c.focal_px[0], "cx": c.centre_px[0], "cy": c.centre_px[1], **c.lens.parameters} for c in (camera, prior)
+    )
     return Prior(np.array([sigma[n] for n in free]), np.array([expected[n] - now[n] for n in free]))
-
-
-def _parameters(camera: Camera) -> dict[str, float]:
-    """Values of the lens parameters by name."""
-    centre = {"cx": camera.centre_px[0], "cy": camera.centre_px[1]}
-    return {"f": camera.focal_px[0], **centre, **camera.lens.parameters}
-
-
-def _density_px2(xy_px: Array) -> float:
-    """Detections per square pixel of the rectangle between the 5th and 95th percentiles of the detections (n, 2)."""
-    area = float(np.prod(np.ptp(np.percentile(xy_px, (5, 95), axis=0), axis=0)) / 0.81) + 1.0
-    return len(xy_px) / area
-
-
-def _brightest_in_view(camera: Camera, R: Array, rays_icrs: Array, wanted: int) -> Ints:
-    """Indices of the brightest stars within the frame."""
-    count = 4 * wanted
-    while True:
-        _, inside = camera.project(rays_icrs[:count] @ R.T)
-        seen = np.flatnonzero(inside)
-        if len(seen) >= wanted or count >= len(rays_icrs):
-            return seen[:wanted]
-        count *= 4
 
 
 def with_file_lens(camera: Camera, size: int, widest_rad: float) -> Camera:
     """The camera with its family lens replaced by one of camera files.
 
-    A lens of fixed shape if it has the same radii up to `widest_rad`, else the Kannala-Brandt lens of `size`
-    coefficients that fits them best.
+    A lens of fixed shape if it has the same radii up to `widest_rad`, else the default one, with the
+    `size` coefficients that fit them best.
     """
     a = np.linspace(0.02, min(widest_rad, 0.98 * camera.lens.max_invertible_rad), 200)
     rho = camera.lens.rho(a)
     for kind in lens_kinds().values():
         if not kind.parameter_names and np.allclose(kind().rho(a), rho, rtol=SAME_RADIUS_1, atol=0.0):
             return replace(camera, lens=kind())
-    lens, scale = KannalaBrandt.fit_curve(a, rho, size)
+    lens, scale = default_lens().fit_curve(a, rho, size)
     focal = scale * camera.focal_px[0]
     return replace(camera, lens=lens, focal_px=(focal, focal))

@@ -18,12 +18,12 @@ import numpy as np
 from startrack.camera import Camera
 from startrack.core.types import Array, Centroids, Identification, Ints, NotIdentified, NotLocated, Stars
 from startrack.estimation.match import SIGNIFICANT_SNR
+from startrack.identification.attitude_search import INLIER_PX
 from startrack.identification.lost_in_space import Identifier
 
 LEAST_UNEXPLAINED = 12  # significant sources; untouched frames have 0 to 4
 LEAST_PART = 0.03  # of them, to the identified stars: second exposures of 30 to 50 % had 0.11 to 0.39, ghosts to 0.015
 LEAST_STARS = 8  # of a second field
-EXPLAINED_PX = 1.5  # from a predicted star; nearer sources belong to the first attitude
 FAINTER_MAG = 1.0  # predicted stars fainter than the faintest identified one explain sources, too
 MOST_SOURCES = 150  # brightest ones that are identified
 LEAST_TURN_PX = 3.0  # of the stars: below it both images of a star are one source
@@ -100,7 +100,7 @@ def _unexplained(centroids: Centroids, camera: Camera, stars: Stars, first: Iden
 
     faintest = float(stars.v_mag[first.star].max()) + FAINTER_MAG
     predicted_px, inside = camera.project(stars.rays_icrs[stars.v_mag < faintest] @ first.R_cam_icrs.T)
-    distance, _ = cKDTree(predicted_px[inside]).query(centroids.xy_px, distance_upper_bound=EXPLAINED_PX)
+    distance, _ = cKDTree(predicted_px[inside]).query(centroids.xy_px, distance_upper_bound=INLIER_PX)
     far = np.isinf(distance) & (centroids.snr > SIGNIFICANT_SNR)
     far[first.detection] = False
     return np.flatnonzero(far)

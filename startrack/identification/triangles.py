@@ -1,4 +1,4 @@
-"""Triangles of rays, whose sides do not depend on the attitude; and their index by shape, for an unknown scale."""
+"""Triangles of rays, whose sides do not depend on the attitude; and indexes of the catalogue's, for a known scale."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from startrack.core.types import Array, Ints
+from startrack.core.types import Array, Ints, Stars
 
-CELL_LENGTH = 16.0  # range of the logarithm of the size within a cell of the key
-SMALLEST_LOG = -12.0
+CLOSE_PAIR_RAD = np.radians(0.05)  # stars this close are one detection
+LONGEST_SIDE_OF_FIELD = 0.8  # of a field's diameter: longer sides seldom fit into it
+CLOSURE_PROBABILITY = 0.59  # that two neighbours of a star in the plane are neighbours of each other
+PAIRS_WANTED = 180_000
+DEEPEST_PAIR = 5000
+WIDEST_PAIR_RAD = np.radians(110.0)
+NARROWEST_PAIR_1 = 0.07  # of the widest; closer pairs determine the roll poorly
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +46,13 @@ def triangles(rays: Array, longest_rad: float, most: int = 2_000_000) -> Triangl
     """
     vertices = _triples(rays, 2 * np.sin(longest_rad / 2), most)
     a, b, c = rays[vertices[:, 0]], rays[vertices[:, 1]], rays[vertices[:, 2]]
-    return _sort_by_opposite_side(rays, vertices, np.stack([_angle(b, c), _angle(c, a), _angle(a, b)], axis=1))
+    sides = np.stack([_angle(b, c), _angle(c, a), _angle(a, b)], axis=1)
+    order = np.argsort(sides, axis=1)
+    sides = np.take_along_axis(sides, order, axis=1)
+    vertices = np.take_along_axis(vertices, order, axis=1)
+    volume = np.linalg.det(rays[vertices])
+    good = (np.abs(volume) > 0.05 * sides[:, 2] ** 2 * 0.5) & (np.diff(sides, axis=1).min(axis=1) > 0.01 * sides[:, 2])
+    return Triangles(vertices=vertices[good], sides_rad=sides[good], handedness=np.sign(volume[good]))
 
 
 def sides_of_few(rays: Array, fresh: int = 0) -> tuple[Ints, Array]:
@@ -81,16 +91,6 @@ def triad_attitude(cam: Array, icrs: Array) -> Array:
     return frame(cam) @ np.swapaxes(frame(icrs), 1, 2)
 
 
-def _sort_by_opposite_side(rays: Array, vertices: Ints, sides: Array) -> Triangles:
-    """Triangles with vertices (n, 3) sorted by their opposite sides (n, 3); degenerate ones are left out."""
-    order = np.argsort(sides, axis=1)
-    sides = np.take_along_axis(sides, order, axis=1)
-    vertices = np.take_along_axis(vertices, order, axis=1)
-    volume = np.linalg.det(rays[vertices])
-    good = (np.abs(volume) > 0.05 * sides[:, 2] ** 2 * 0.5) & (np.diff(sides, axis=1).min(axis=1) > 0.01 * sides[:, 2])
-    return Triangles(vertices=vertices[good], sides_rad=sides[good], handedness=np.sign(volume[good]))
-
-
 def _triples(rays: Array, chord: float, most: int) -> Ints:
     """Index triples i < j < k (m, 3) of rays that are pairwise closer than the chord."""
     from scipy.spatial import cKDTree
@@ -126,48 +126,124 @@ def _angle(a: Array, b: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class ShapeIndex:
-    """Catalogue triangles sorted by a key: the cell of their two ratios of sides, then the logarithm of the size."""
+class PatternSize:
+    """Numbers of stars and of triangles of an index."""
 
-    triangles: Triangles
-    key: Array  # (n,) ascending
-    ratios: NDArray[np.float32]  # (n, 2)
-    shape_tolerance: float
-    size_tolerance: float  # of the logarithm
-
-    def candidates(self, image: Triangles) -> tuple[Ints, Ints]:
-        """Pairs (image triangle, catalogue triangle) that agree, mirror images included; sorted by the first."""
-        ratios, log_size = _features(image)
-        cell = np.floor(ratios / (2 * self.shape_tolerance) - 0.5).astype(np.int64)
-        # The tolerance is half a cell, so that candidates lie in at most four cells.
-        cells = cell[:, None] + np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
-        keys = _key(cells, log_size[:, None], self.shape_tolerance).ravel()
-        first = np.searchsorted(self.key, keys - self.size_tolerance)
-        count = np.searchsorted(self.key, keys + self.size_tolerance) - first
-        total = np.cumsum(count)
-        left = np.repeat(np.arange(len(keys)) // 4, count)
-        right = np.arange(total[-1] if len(total) else 0) + np.repeat(first - (total - count), count)
-        off = np.abs(self.ratios[right] - ratios.astype(np.float32)[left])
-        agree = np.maximum(off[:, 0], off[:, 1]) < self.shape_tolerance
-        return left[agree], right[agree]
+    stars_in_field: int
+    min_stars: int  # of the whole sky
+    max_stars: int
+    triangles: int
+    widest_rad: float
 
 
-def shape_index(found: Triangles, shape_tolerance: float, size_tolerance: float) -> ShapeIndex:
-    """Index of the triangles; the tolerances are relative."""
-    ratios, log_size = _features(found)
-    key = _key(np.floor(ratios / (2 * shape_tolerance)).astype(np.int64), log_size, shape_tolerance)
-    order = np.argsort(key)
-    return ShapeIndex(found.take(order), key[order], ratios[order].astype(np.float32), shape_tolerance, size_tolerance)
+# The brightest few, with sides nearly as long as the field allows: a long triangle seldom matches by chance.
+BRIGHT = PatternSize(20, 150, 40_000, 200_000, np.radians(75.0))
+# More stars, shorter sides: where walls, clouds or false stars leave too few of the brightest.
+DEEP = PatternSize(60, 700, 60_000, 400_000, np.radians(45.0))
 
 
-def _features(found: Triangles) -> tuple[Array, Array]:
-    """The two shorter sides over the longest (n, 2), and its logarithm (n,)."""
-    longest = found.sides_rad[:, 2]
-    return found.sides_rad[:, :2] / longest[:, None], np.log(longest)
+@dataclass(frozen=True)
+class PatternIndex:
+    """Triangles of the brightest stars of the sky, looked up by their sides, which are chords of the unit sphere."""
+
+    rays_icrs: Array  # (m, 3) of the pattern stars
+    longest_chord: float  # of the sides
+    vertices: Ints  # (n, 3) indices into rays_icrs, ordered by the opposite side, shortest first
+    handedness: Array  # (n,) sign of the triple product
+    tree: Any  # scipy.spatial.cKDTree over the sides (n, 3), ascending
+
+    def candidates(self, sides: Array, tolerance: float, most: int) -> tuple[Ints, Ints]:
+        """Pairs (row of the sides (m, 3), triangle) that agree within the tolerance, best relative agreement first.
+
+        At most `most` for each row: one look-up of fixed size takes a tenth of the time of a complete one.
+        """
+        distance, found = self.tree.query(sides, most, p=np.inf, distance_upper_bound=tolerance)
+        distance = distance.ravel()
+        close = np.flatnonzero(distance < tolerance)
+        close = close[np.argsort(distance[close] / sides[close // most, 0])]
+        return close // most, found.ravel()[close]
 
 
-def _key(cell: Ints, log_size: Array, shape_tolerance: float) -> Array:
-    """Cells (..., 2) first, sizes (...) within them."""
-    cells_in_row = int(1.0 / (2 * shape_tolerance)) + 3
-    size = np.clip(log_size - SMALLEST_LOG, 1.0, CELL_LENGTH - 1.0)
-    return (cell[..., 0] * cells_in_row + cell[..., 1]) * CELL_LENGTH + size
+def build_index(stars: Stars, field_sr: float, size: PatternSize) -> PatternIndex:
+    """The index of the brightest stars (sorted, brightest first) for a camera that sees `field_sr`."""
+    from scipy.spatial import cKDTree
+
+    star = separate_bright_stars(
+        stars, int(np.clip(size.stars_in_field * 4 * np.pi / field_sr, size.min_stars, size.max_stars))
+    )
+    rays = stars.rays_icrs[star]
+    neighbours = np.sqrt(6 * size.triangles / (CLOSURE_PROBABILITY * len(star)))
+    longest_side = min(
+        size.widest_rad,
+        2 * np.arcsin(np.sqrt(min(neighbours / len(star), 1.0))),
+        LONGEST_SIDE_OF_FIELD * np.sqrt(4 * field_sr / np.pi),
+    )
+    found = triangles(rays, longest_side)
+    sides = 2 * np.sin(found.sides_rad / 2)
+    return PatternIndex(rays, float(2 * np.sin(longest_side / 2)), found.vertices, found.handedness, cKDTree(sides))
+
+
+@dataclass(frozen=True)
+class PairIndex:
+    """Pairs of bright stars, by separation; both orders of each. For frames so poor that no indexed triangle fits."""
+
+    rays_icrs: Array  # (m, 3)
+    pairs: Ints  # (k, 2) indices into rays_icrs
+    sides: Array  # (k,) chords, ascending
+    narrowest: float
+
+    def triangles(self, rays_cam: Array, tolerance: float) -> tuple[Ints, Ints]:
+        """Triangles of the rays (n, 3), the first among them, and of the catalogue, (c, 3) each, whose sides agree.
+
+        Two pairs with one star at the pivot form a triangle if their other ends are as far apart as in the image.
+        """
+        apart = rays_cam[:, None] - rays_cam
+        chords = np.sqrt(np.einsum("ijk,ijk->ij", apart, apart))
+        wide = np.flatnonzero((chords[0] > self.narrowest) & (chords[0] < self.sides[-1] + tolerance))
+        first = np.searchsorted(self.sides, chords[0, wide] - tolerance)
+        count = np.searchsorted(self.sides, chords[0, wide] + tolerance) - first
+        at = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
+        end, pair = np.repeat(wide, count), self.pairs[at]
+        order = np.argsort(pair[:, 0], kind="stable")
+        end, pair = end[order], pair[order]
+        own = np.arange(len(pair))
+        later = np.searchsorted(pair[:, 0], pair[:, 0], side="right") - own - 1
+        one = np.repeat(own, later)
+        other = np.arange(later.sum()) - np.repeat(np.cumsum(later) - later, later) + one + 1
+        wanted = chords[end[one], end[other]]  # 0 for an end and itself
+        apart = self.rays_icrs[pair[one, 1]] - self.rays_icrs[pair[other, 1]]
+        found = np.sqrt(np.einsum("ij,ij->i", apart, apart))
+        fits = (np.abs(found - wanted) < tolerance) & (wanted > 0)
+        one, other = one[fits], other[fits]
+        image = np.stack([np.zeros(len(one), dtype=np.int64), end[one], end[other]], axis=1)
+        return image, np.stack([pair[one, 0], pair[one, 1], pair[other, 1]], axis=1)
+
+
+def build_pairs(stars: Stars, field_sr: float) -> PairIndex:
+    """Index of the pairs no wider than the field, of as many bright stars as give about PAIRS_WANTED pairs."""
+    from scipy.spatial import cKDTree
+
+    diameter = 2 * np.arccos(np.clip(1 - field_sr / (2 * np.pi), -1, 1))
+    widest = min(WIDEST_PAIR_RAD, float(diameter))
+    within = 0.5 * (1 - np.cos(widest))  # fraction of the sphere that contains a star's partners
+    star = separate_bright_stars(stars, int(min(np.sqrt(2 * PAIRS_WANTED / within), DEEPEST_PAIR)))
+    rays = stars.rays_icrs[star]
+    pairs = cKDTree(rays).query_pairs(2 * np.sin(widest / 2), output_type="ndarray").astype(np.int64)
+    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    sides = np.linalg.norm(rays[pairs[:, 0]] - rays[pairs[:, 1]], axis=1)
+    order = np.argsort(sides, kind="stable")
+    narrowest = 2 * np.sin(NARROWEST_PAIR_1 * widest / 2)
+    order = order[np.searchsorted(sides[order], narrowest) :]
+    return PairIndex(rays, pairs[order], sides[order], float(narrowest))
+
+
+def separate_bright_stars(stars: Stars, depth: int) -> Ints:
+    """Indices of the brightest stars; of each close pair only the brighter, as a camera does not resolve them."""
+    from scipy.spatial import cKDTree
+
+    rays = stars.rays_icrs[: 2 * depth]
+    pairs = cKDTree(rays).query_pairs(CLOSE_PAIR_RAD, output_type="ndarray")
+    keep = np.ones(len(rays), dtype=bool)
+    if len(pairs):
+        keep[pairs.max(axis=1)] = False
+    return np.flatnonzero(keep)[:depth]

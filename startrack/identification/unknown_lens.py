@@ -14,51 +14,47 @@ from startrack.core.types import Array, Centroids, Identification, Ints, NotIden
 from startrack.estimation.adjust import HUBER_WITH_CUT, Scheme, State, adjust
 from startrack.estimation.false_alarm import probability
 from startrack.estimation.normal_equations import observations_of_image
-from startrack.identification.hypotheses import (
-    HypothesisSearch,
+from startrack.identification.hypotheses import HypothesisSearch, Window, remove_clumps
+from startrack.identification.lens_guesses import (
+    MIDDLE_SHAPES,
+    PINHOLE,
     LensGuess,
+    guess_fisheyes,
+    guess_lenses,
+    image_circle,
+)  # fmt: skip
+from startrack.identification.lost_in_space import MAX_FALSE_ALARM
+from startrack.identification.narrow_field import NarrowField
+from startrack.identification.region_growing import WIDE_STAGES, GrowthStage, grow, prior_of
+from startrack.identification.similar_triangles import (
+    MAX_DETECTIONS,
     PatternSizes,
-    Window,
     narrow_sizes,
     patterns_for,
-    remove_clumps,
     wide_sizes,
-)
-from startrack.identification.image_circle import ImageCircle, image_circle
-from startrack.identification.narrow_field import NarrowFieldSearch
-from startrack.identification.radial_lens_family import PINHOLE, radius
-from startrack.identification.region_growing import WIDE_STAGES, GrownLens, GrowthStage, grow, prior_of
+)  # fmt: skip
 from startrack.identification.verify_unknown_lens import VerifiedLens, verify
 
 WIDE_FIELD_RAD = np.radians(100.0)  # from here up, `fov_rad` is the angle of the image circle
 NARROW_FIELD_RAD = np.radians(40.0)  # up to here all lenses are nearly pinholes
 MIN_WIDE, MIN_NARROW = 12, 7  # matches
-MAX_PATTERN_DETECTIONS = 100
 WINDOWS = (  # the brightest; those after them, as hot pixels may be brighter than stars; and more of all
     Window(0, 0, 16), Window(0, 16, 26), Window(26, 26, 46), Window(0, 26, 40), Window(46, 46, 70), Window(0, 40, 60),
 )  # fmt: skip
+NARROW_WINDOWS = (
+    Window(0, 0, 8), Window(0, 8, 14), Window(14, 14, 26), Window(0, 14, 22), Window(26, 26, 40), Window(0, 22, 32),
+)  # fmt: skip
+NARROW_PATTERNS = ((10, 0.8, 2), (18, 0.5, 6), (48, 0.28, 6))  # stars in the field, longest side over it, windows
 LOG_PLAUSIBLE = -11.0  # log p-value of a hypothesis that is grown: random skies reach -15 in a whole search
-LOG_FALSE_ALARM = float(np.log(1e-9))
+LOG_FALSE_ALARM = float(np.log(MAX_FALSE_ALARM))
 MAX_TRIED = 600_000  # patterns; a search without an answer ends here, after some seconds
 MAX_TRIED_IN_CIRCLE = 250_000  # where the image circle is seen: real photographs take 1000 to 110,000
 MAX_TRIED_BEYOND = 100_000  # further patterns without the image circle, in case the disc found is not it
 FIELD_MARGIN = 1.3  # of a narrow field: its focal length and centre are not known
 CLUMP_FRACTION = 0.01  # of the frame: detections used for patterns are no closer
-CIRCLES = (0.5, 0.62, 0.42, 0.78, 1.0)  # radius of the image circle over the frame's shorter side
-SEEN_CIRCLES = (1.0, 1.25)  # radius at half the field over that of the visible disc: a dome may hide the horizon
 CIRCLE_EDGE = 1.01  # of the disc's radius: detections beyond it are no stars
-NARROW_WINDOWS = (
-    Window(0, 0, 8), Window(0, 8, 14), Window(14, 14, 26), Window(0, 14, 22), Window(26, 26, 40), Window(0, 22, 32),
-)  # fmt: skip
-NARROW_PATTERNS = (
-    (10, 0.8, 2),
-    (18, 0.5, 6),
-    (48, 0.28, 6),
-)  # stars in the field, longest side over its diameter, windows
 FIELD_STEPS_PER_E = 4.0  # indexes are made for fields a fourth part of a factor e apart
-WIDE_SHAPES = (-0.35, 0.25, -0.8, 0.7)
-MIDDLE_SHAPES = (PINHOLE, 0.4, -0.4)
-SAME_ATTITUDE_RAD = 0.05
+SAME_LENS_RAD = 0.05  # between attitudes
 JOINT_FIT = Scheme(loss=HUBER_WITH_CUT, steps=12, settled_px=3e-4, estimates_extra=True)
 ADVICE = "is the field of view right, is this the night sky, and in focus? With a camera file fewer stars suffice"
 
@@ -86,45 +82,20 @@ def identify_unknown_lens(
     if not 0 < fov_rad <= 2 * np.pi:
         raise ValueError(f"fov_rad= is {fov_rad:g}: give radians, more than 0, at most 2 pi")
     search = _Search(centroids, size_px, fov_rad, stars, tolerance, background)
-    if search.narrow and (solution := _solve_narrow_field(search, centroids)) is not None:
-        return solution
-    for grown, around in search.grown_lenses():
-        lens = verify(grown, centroids, stars.take(around), search.patterns_tried, search.widest_rad)
-        if lens is not None and lens.log_p < LOG_FALSE_ALARM and lens.matched >= search.min_matches:
-            return _solution(lens, around, search, centroids)
+    for lens in search.lenses():
+        if lens.log_p < LOG_FALSE_ALARM and len(lens.star) >= search.min_matches:
+            camera, R = _fit_with_covariance(lens, centroids, stars.rays_icrs[lens.star], centre=not search.narrow)
+            identification = Identification(
+                detection=lens.detection, star=lens.star, R_cam_icrs=R, unexplained=lens.unexplained,
+                false_alarm_probability=probability(lens.log_p),
+            )  # fmt: skip
+            return UnknownLensSolution(camera, identification)
+    tried = search.hypotheses.tried
     raise NotIdentified(
         f"no lens of {np.degrees(fov_rad):.3g} degrees ({100 * tolerance:.0f} % more or less) explains the "
-        f"{len(centroids)} point sources better than chance ({search.patterns_tried} patterns tried): {ADVICE}",
+        f"{len(centroids)} point sources better than chance ({tried} patterns tried): {ADVICE}",
         detected=len(centroids),
-        tried=search.patterns_tried,
-    )
-
-
-def _solve_narrow_field(search: _Search, centroids: Centroids) -> UnknownLensSolution | None:
-    """A narrow field by votes of the triangles of its brightest stars; None where they do not suffice."""
-    narrow = NarrowFieldSearch(
-        centroids, search.chosen, search.size_px, search.fov_rad, search.rounded_field_sr(), search.stars
-    )
-    for view in narrow.views():
-        if view.lens.log_p < LOG_FALSE_ALARM and view.lens.matched >= search.min_matches:
-            return _solution(view.lens, view.around, search, centroids)
-    search.hypotheses.tried += narrow.tried
-    return None
-
-
-def _solution(lens: VerifiedLens, around: Ints, search: _Search, centroids: Centroids) -> UnknownLensSolution:
-    """The solution, lens and attitude fitted together to all its stars so that the lens has its covariance."""
-    star, detection = around[lens.star], lens.detection
-    camera, R = _fit_with_covariance(lens, centroids, search.stars.rays_icrs[star], centre=not search.narrow)
-    return UnknownLensSolution(
-        camera=camera,
-        identification=Identification(
-            detection=detection,
-            star=star,
-            R_cam_icrs=R,
-            false_alarm_probability=probability(lens.log_p),
-            unexplained=lens.unexplained,
-        ),
+        tried=tried,
     )
 
 
@@ -153,112 +124,84 @@ def _fit_with_covariance(
 
 
 class _Search:
-    """Lens hypotheses in order of likelihood."""
+    """Lenses that may explain a list of centroids, in order of likelihood."""
 
     def __init__(
         self, centroids: Centroids, size_px: tuple[int, int], fov_rad: float, stars: Stars, tolerance: float,
         background: NDArray[Any] | None,
     ) -> None:  # fmt: skip
-        self.size_px, self.fov_rad, self.stars, self.tolerance = size_px, fov_rad, stars, tolerance
-        self.wide = fov_rad >= WIDE_FIELD_RAD
+        self.centroids, self.size_px, self.fov_rad, self.stars = centroids, size_px, fov_rad, stars
+        self.widest_rad = 0.5 * fov_rad * (1 + tolerance)
+        self.wide, self.narrow = fov_rad >= WIDE_FIELD_RAD, fov_rad <= NARROW_FIELD_RAD
         self.min_matches = MIN_WIDE if self.wide else MIN_NARROW
         self.circle = image_circle(background) if self.wide and background is not None else None
         self.xy_px = centroids.xy_px
         if self.circle is not None:
             off = np.linalg.norm(self.xy_px - self.circle.centre_px, axis=1)
             self.xy_px = self.xy_px[off < CIRCLE_EDGE * self.circle.radius_px]
-        self.narrow = fov_rad <= NARROW_FIELD_RAD
-        self.chosen = remove_clumps(self.xy_px, CLUMP_FRACTION * min(size_px), MAX_PATTERN_DETECTIONS)
-        if len(self.chosen) < self.min_matches:
+        chosen = remove_clumps(self.xy_px, CLUMP_FRACTION * min(size_px), MAX_DETECTIONS)
+        if len(chosen) < self.min_matches:
             raise NotIdentified(
-                f"{len(self.chosen)} point sources are too few to identify without a camera file, which takes "
+                f"{len(chosen)} point sources are too few to identify without a camera file, which takes "
                 f"{self.min_matches}: expose longer, or {ADVICE}",
                 detected=len(centroids),
             )
-        self.hypotheses = HypothesisSearch(self.xy_px[self.chosen], size_px)
+        self.hypotheses = HypothesisSearch(self.xy_px[chosen], size_px)
+        self.field_sr = self._field_sr()
+        # Rounded, one index serves many fields.
+        self.rounded_sr = float(np.exp(np.round(FIELD_STEPS_PER_E * np.log(self.field_sr)) / FIELD_STEPS_PER_E))
 
-    @property
-    def patterns_tried(self) -> int:
-        """Number of patterns tried so far."""
-        return self.hypotheses.tried
-
-    @property
-    def widest_rad(self) -> float:
-        """Half the field of view, its tolerance added."""
-        return 0.5 * self.fov_rad * (1 + self.tolerance)
-
-    def grown_lenses(self) -> Iterator[tuple[GrownLens, Ints]]:
-        """Lenses that survive growing, and the catalogue indices to which their stars refer."""
-        if self.circle is None:
-            yield from self._grow_all(self._guesses(), MAX_TRIED)
+    def lenses(self) -> Iterator[VerifiedLens]:
+        """Verified lenses, whatever their p-value."""
+        if self.narrow:
+            yield from NarrowField(self.centroids, self.hypotheses, self.fov_rad, self.rounded_sr, self.stars).lenses()
+        if not self.wide:
+            shapes = (PINHOLE,) if self.narrow else MIDDLE_SHAPES
+            yield from self._grow_all(guess_lenses(self.size_px, self.fov_rad, shapes), MAX_TRIED)
             return
-        yield from self._grow_all(self._guesses_from_circle(self.circle), MAX_TRIED_IN_CIRCLE)
-        yield from self._grow_all(self._guesses(), self.patterns_tried + MAX_TRIED_BEYOND)
+        most = MAX_TRIED
+        if self.circle is not None:
+            yield from self._grow_all(guess_fisheyes(self.size_px, self.fov_rad, self.circle), MAX_TRIED_IN_CIRCLE)
+            most = self.hypotheses.tried + MAX_TRIED_BEYOND
+        yield from self._grow_all(guess_fisheyes(self.size_px, self.fov_rad, None), most)
 
-    def _grow_all(self, guesses: list[LensGuess], max_tried: int) -> Iterator[tuple[GrownLens, Ints]]:
-        """`grown_lenses` of these guesses, until so many patterns have been tried."""
-        stages = self._stages()
+    def _grow_all(self, guesses: list[LensGuess], max_tried: int) -> Iterator[VerifiedLens]:
+        """The lenses that the hypotheses of these guesses grow to, until so many patterns have been tried."""
+        search, stages = self.hypotheses, self._stages()
         for sizes, window in self._rounds():
             patterns = patterns_for(self.stars, sizes)
-            if window.done >= len(self.hypotheses.xy_px):
+            if window.done >= len(search.xy_px):
                 continue
             for guess in guesses:
                 seen: list[Array] = []
-                for hypothesis in self.hypotheses.hypotheses(patterns, guess, window, LOG_PLAUSIBLE):
+                for hypothesis in search.likely_hypotheses(patterns, guess, window, LOG_PLAUSIBLE):
                     R = hypothesis.R_cam_icrs
-                    if any(np.trace(other.T @ R) > 1 + 2 * np.cos(SAME_ATTITUDE_RAD) for other in seen):
+                    if any(np.trace(other.T @ R) > 1 + 2 * np.cos(SAME_LENS_RAD) for other in seen):
                         continue
                     seen.append(R)
-                    around = self._stars_around(R[2])
-                    rays = self.stars.rays_icrs if self.wide else self.stars.rays_icrs[around]
-                    found = grow(hypothesis, self.xy_px, rays, stages)
-                    if found is not None and (not self.wide or len(found.star) >= self.min_matches):
-                        yield found, around
-                if self.patterns_tried > max_tried:
+                    around = None if self.wide else self._stars_around(R[2])
+                    stars = self.stars if around is None else self.stars.take(around)
+                    grown = grow(hypothesis, self.xy_px, stars.rays_icrs, stages)
+                    if grown is None or (self.wide and len(grown.star) < self.min_matches):
+                        continue
+                    lens = verify(grown, self.centroids, stars, search.tried, self.widest_rad)
+                    if lens is not None:
+                        yield lens if around is None else replace(lens, star=around[lens.star])
+                if search.tried > max_tried:
                     return
 
     def _rounds(self) -> Iterator[tuple[PatternSizes, Window]]:
         """Patterns of the catalogue and windows of detections, in turn."""
-        field_sr = self.rounded_field_sr()
         if not self.narrow:
-            yield from ((wide_sizes(field_sr), window) for window in WINDOWS)
+            yield from ((wide_sizes(self.rounded_sr), window) for window in WINDOWS)
             return
         for in_field, side, windows in NARROW_PATTERNS:
-            yield from ((narrow_sizes(field_sr, in_field, side), window) for window in NARROW_WINDOWS[:windows])
+            yield from ((narrow_sizes(self.rounded_sr, in_field, side), w) for w in NARROW_WINDOWS[:windows])
 
     def _stars_around(self, axis_icrs: Array) -> Ints:
-        """Indices of the stars that a narrow camera may see; for wide ones all of them."""
-        if self.wide:
-            return np.arange(len(self.stars))
+        """Indices of the stars that a camera that is not wide may see."""
         corner = np.arctan(np.tan(self.fov_rad / 2) * np.hypot(*self.size_px) / self.size_px[0])
         return np.flatnonzero(self.stars.rays_icrs @ axis_icrs > np.cos(corner * FIELD_MARGIN))
-
-    def _guesses(self) -> list[LensGuess]:
-        """Initial lenses: shapes and focal lengths, the likelier first."""
-        width, height = self.size_px
-        centre = ((width - 1) / 2, (height - 1) / 2)
-        if not self.wide:
-            shapes = (PINHOLE,) if self.narrow else MIDDLE_SHAPES
-            return [LensGuess(width / 2 / float(radius(np.array(self.fov_rad / 2), s)), s, centre) for s in shapes]
-        shorter, diagonal = min(self.size_px), float(np.hypot(*self.size_px))
-        circles = [c * shorter for c in CIRCLES if c * shorter < 0.56 * diagonal]
-        return self._fisheye_guesses(circles, centre)
-
-    def _guesses_from_circle(self, circle: ImageCircle) -> list[LensGuess]:
-        """Lenses whose image circle is the visible one, or somewhat larger."""
-        return self._fisheye_guesses([c * circle.radius_px for c in SEEN_CIRCLES], circle.centre_px)
-
-    def _fisheye_guesses(self, circles_px: list[float], centre_px: tuple[float, float]) -> list[LensGuess]:
-        return [
-            LensGuess(circle / float(radius(np.array(self.fov_rad / 2), shape)), shape, centre_px)
-            for circle in circles_px
-            for shape in WIDE_SHAPES
-            if abs(shape) * self.fov_rad / 2 < np.radians(80.0)
-        ]
-
-    def rounded_field_sr(self) -> float:
-        """Solid angle of the field, rounded so that one index serves many fields."""
-        return float(np.exp(np.round(FIELD_STEPS_PER_E * np.log(self._field_sr())) / FIELD_STEPS_PER_E))
 
     def _field_sr(self) -> float:
         """Solid angle of the frame, or of the image circle."""
@@ -272,9 +215,9 @@ class _Search:
         """The stages of growth, smaller for smaller fields."""
         if self.wide:
             return WIDE_STAGES
-        part = float(np.sqrt(self._field_sr() / (2 * np.pi)))
-        whole = [s for s in WIDE_STAGES if s.radius_rad == np.pi]
+        part = float(np.sqrt(self.field_sr / (2 * np.pi)))
         if self.narrow:
+            whole = (s for s in WIDE_STAGES if s.radius_rad == np.pi)
             return tuple(replace(s, gate_rad=s.gate_rad * part, free=("f",)) for s in whole)
         return tuple(
             replace(s, radius_rad=s.radius_rad * (part if s.radius_rad < np.pi else 1.0), gate_rad=s.gate_rad * part)

@@ -8,7 +8,13 @@ import numpy as np
 
 from startrack.camera import Camera
 from startrack.core.types import Array, Bools, Centroids, Ints, Stars
-from startrack.estimation.false_alarm import coincidence_probability, density_per_sr, log_p_value, log_trials
+from startrack.estimation.false_alarm import (
+    PATTERN_MATCHES,
+    coincidence_probability,
+    density_per_sr,
+    log_p_value,
+    log_trials,
+)  # fmt: skip
 from startrack.estimation.match import (
     BRIGHTER_MAG,
     DEPTH_BELOW_THRESHOLD_MAG,
@@ -19,22 +25,28 @@ from startrack.estimation.match import (
     is_isolated,
     match_by_brightness,
 )
-from startrack.identification.region_growing import GrownLens, fit_camera, match_in_view, with_file_lens
+from startrack.identification.attitude_search import BLEND_SIGMAS, GATE_PX, INLIER_PX
+from startrack.identification.region_growing import (
+    FEWEST,
+    GATE_SIGMAS,
+    GrownLens,
+    fit_camera,
+    match_in_view,
+    with_file_lens,
+)  # fmt: skip
 
 FITS = ((4.0, 200), (2.5, 500), (1.8, 3000))  # gate [px] and number of brightest detections
-GATES_PX = (2.0, 1.5)  # of the matches by brightness
+FIRST_BRIGHTNESS_GATE_PX = 2.0  # of the matches by brightness; the last one is INLIER_PX
 TESTED = 400  # brightest detections that the p-value rests on
-NEAR_PX = 6.0  # stars this near their predicted pixel show whether the lens is right there
-SMALLEST_RADIUS_PX, RADIUS_SIGMAS = 0.6, 2.5
+SMALLEST_COINCIDENCE_PX, RADIUS_SIGMAS = 0.6, 2.5
 ON_PLACE_FRACTION = 0.5  # of the stars near their predicted pixels, where the lens is right
 STARS_OF_A_RING, MAX_RINGS = 8, 12
-FEWEST = 5
-FREE_MATCHES, FREE_MATCHES_FIXED_LENS = 8, 3  # that a fit of attitude and lens produces by itself
+FREE_MATCHES = 8  # that a fit of attitude and lens produces by itself; a lens of fixed shape: as a triangle
 MIN_TIMES_CHANCE = 3.0  # matches over those expected by chance
 ORDERS = ((150, 4), (60, 3), (25, 2), (0, 1))  # coefficients of the polynomial from this many matches on
 MIN_FOR_CENTRE = 30
 FITTED_BEYOND_1 = 1.3  # of half the field of view: up to here a fitted lens may have stars
-BLEND_SIGMAS, WIDEST_PSF_PX = 3.0, 1.5
+WIDEST_PSF_PX = 1.5  # for blends
 BLEND_FLUX_RATIO = 0.25  # a neighbour with more than this part of a star's flux makes the match ambiguous
 BLEND_MAG = float(-2.5 * np.log10(BLEND_FLUX_RATIO))
 SCALE_STARS, SCALE_MATCHES = 5000, 200  # brightest stars predicted, and matches used, for the photometric scale
@@ -51,11 +63,6 @@ class VerifiedLens:
     star: Ints
     log_p: float  # that a random sky would be matched as well by one of all trials
     unexplained: int
-
-    @property
-    def matched(self) -> int:
-        """Number of matches."""
-        return len(self.star)
 
 
 @dataclass(frozen=True)
@@ -118,18 +125,40 @@ def agreement_of(centroids: Centroids, v_mag: Array, measured_mag: Array) -> flo
 
 
 def verify(grown: GrownLens, centroids: Centroids, stars: Stars, tried: int, widest_rad: float) -> VerifiedLens | None:
-    """The grown lens refined with all stars and verified; None where too few stars agree."""
+    """The grown lens refined with all stars and verified; None where too few stars agree.
+
+    `tried`: number of hypotheses so far. `widest_rad`: half the field of view, its tolerance added.
+    """
     refined = _refine(grown, centroids, stars, widest_rad)
     if refined is None:
         return None
     camera, R = refined
-    matches = match_by_flux(centroids.take(slice(TESTED)), camera, stars, R, NEAR_PX, 0.0)
-    off_axis = camera.angle_rad(centroids.xy_px[matches.detection])
-    trusted_rad = trusted_radius(off_axis, matches.distance_px < GATES_PX[-1])
+    tested = centroids.take(slice(TESTED))
+    near = match_by_flux(tested, camera, stars, R, GATE_PX, 0.0)
+    trusted_rad = trusted_radius(camera.angle_rad(centroids.xy_px[near.detection]), near.distance_px < INLIER_PX)
     if trusted_rad is None:
         return None
     camera = replace(camera, calibrated_angle_rad=min(trusted_rad, camera.max_angle_rad))
-    return _match_field(camera, R, centroids, stars, tried)
+    matches = match_by_flux(centroids, camera, stars, R, INLIER_PX, blend_radius_px(centroids))
+    inside = camera.angle_rad(centroids.xy_px[matches.detection]) <= camera.calibrated_angle_rad
+    if np.count_nonzero(inside) < FEWEST:
+        return None
+    trusted = replace(camera, max_angle_rad=camera.calibrated_angle_rad)
+    some = match_by_flux(tested, trusted, stars, R, INLIER_PX, 0.0)
+    radius_px = coincidence_radius_px(matches.distance_px[inside])
+    hits = int(np.count_nonzero(some.coincident_px < radius_px))
+    rays = camera.unproject(tested.xy_px[camera.angle_rad(tested.xy_px) <= camera.calibrated_angle_rad])
+    radius_rad = radius_px * float(camera.mean_scale_rad_per_px(np.array(camera.calibrated_angle_rad / 2)))
+    each = some.agreement * float(coincidence_probability(density_per_sr(rays) * np.pi * radius_rad**2))
+    free = FREE_MATCHES if camera.lens.parameters else PATTERN_MATCHES
+    return VerifiedLens(
+        camera=camera,
+        R_cam_icrs=R,
+        detection=matches.detection[inside],
+        star=matches.star[inside],
+        log_p=significance(hits, max(some.predicted, hits), each, free) + log_trials(tried),
+        unexplained=_count_unexplained(centroids, camera, stars, R, matches.zero_mag),
+    )
 
 
 def trusted_radius(off_axis: Array, on_place: Bools) -> float | None:
@@ -160,21 +189,23 @@ def _refine(grown: GrownLens, centroids: Centroids, stars: Stars, widest_rad: fl
     order = next(order for fewest, order in ORDERS if len(grown.star) >= fewest)
     prior = camera = _limit_angles(with_file_lens(grown.camera, order, widest_rad), widest_rad)
     R = grown.R_cam_icrs
+
+    def fit_again(detection: Ints, star: Ints, gate_px: float) -> tuple[Camera, Array]:
+        free = _free_parameters(camera, len(star))
+        xy, rays = centroids.xy_px[detection], stars.rays_icrs[star]
+        fitted, attitude, _ = fit_camera(camera, R, xy, rays, free, gate_px / GATE_SIGMAS, prior)
+        return _limit_angles(fitted, widest_rad), attitude
+
     for gate_px, count in FITS:
-        xy = centroids.xy_px[:count]
-        detection, star, _ = match_in_view(camera, R, xy, stars.rays_icrs, gate_px)
+        detection, star, _ = match_in_view(camera, R, centroids.xy_px[:count], stars.rays_icrs, gate_px)
         if len(star) < FEWEST:
             return None
-        free = _free_parameters(camera, len(star))
-        camera, R, _ = fit_camera(camera, R, xy[detection], stars.rays_icrs[star], free, gate_px / 4, prior)
-        camera = _limit_angles(camera, widest_rad)
-    for gate_px in GATES_PX:
-        matches = match_by_flux(centroids, camera, stars, R, gate_px, _blend_px(centroids))
+        camera, R = fit_again(detection, star, gate_px)
+    for gate_px in (FIRST_BRIGHTNESS_GATE_PX, INLIER_PX):
+        matches = match_by_flux(centroids, camera, stars, R, gate_px, blend_radius_px(centroids))
         if len(matches.star) < FEWEST:
             return None
-        xy, rays = centroids.xy_px[matches.detection], stars.rays_icrs[matches.star]
-        camera, R, _ = fit_camera(camera, R, xy, rays, _free_parameters(camera, len(rays)), gate_px / 4, prior)
-        camera = _limit_angles(camera, widest_rad)
+        camera, R = fit_again(matches.detection, matches.star, gate_px)
     return camera, R
 
 
@@ -196,36 +227,15 @@ def _limit_angles(camera: Camera, widest_rad: float) -> Camera:
     return replace(camera, max_angle_rad=widest, calibrated_angle_rad=widest)
 
 
-def _blend_px(centroids: Centroids) -> float:
+def blend_radius_px(centroids: Centroids) -> float:
+    """Distance [px] within which stars share one detection."""
     return BLEND_SIGMAS * min(centroids.psf_sigma_px, WIDEST_PSF_PX)
 
 
-def _match_field(camera: Camera, R: Array, centroids: Centroids, stars: Stars, tried: int) -> VerifiedLens | None:
-    """All matches inside the trusted field, with the p-value of those of the brightest detections."""
-    matches = match_by_flux(centroids, camera, stars, R, GATES_PX[-1], _blend_px(centroids))
-    inside = camera.angle_rad(centroids.xy_px[matches.detection]) <= camera.calibrated_angle_rad
-    detection, star = matches.detection[inside], matches.star[inside]
-    if len(star) < FEWEST:
-        return None
-    tested = centroids.take(slice(TESTED))
-    trusted = replace(camera, max_angle_rad=camera.calibrated_angle_rad)
-    some = match_by_flux(tested, trusted, stars, R, GATES_PX[-1], 0.0)
-    rms_px = float(np.sqrt(np.mean(matches.distance_px[inside] ** 2)))
-    radius_px = float(np.clip(RADIUS_SIGMAS * rms_px, SMALLEST_RADIUS_PX, GATES_PX[-1]))
-    hits = int(np.count_nonzero(some.coincident_px < radius_px))
-    predicted = max(some.predicted, hits)
-    rays = camera.unproject(tested.xy_px[camera.angle_rad(tested.xy_px) <= camera.calibrated_angle_rad])
-    radius_rad = radius_px * float(camera.mean_scale_rad_per_px(np.array(camera.calibrated_angle_rad / 2)))
-    each = some.agreement * float(coincidence_probability(density_per_sr(rays) * np.pi * radius_rad**2))
-    free = FREE_MATCHES if camera.lens.parameters else FREE_MATCHES_FIXED_LENS
-    return VerifiedLens(
-        camera=camera,
-        R_cam_icrs=R,
-        detection=detection,
-        star=star,
-        log_p=significance(hits, predicted, each, free) + log_trials(tried),
-        unexplained=_count_unexplained(centroids, camera, stars, R, matches.zero_mag),
-    )
+def coincidence_radius_px(distance_px: Array) -> float:
+    """Distance [px] within which a star coincides with a detection, by the distances (n,) of the matches."""
+    rms_px = float(np.sqrt(np.mean(np.square(distance_px))))
+    return float(np.clip(RADIUS_SIGMAS * rms_px, SMALLEST_COINCIDENCE_PX, INLIER_PX))
 
 
 def _count_unexplained(centroids: Centroids, camera: Camera, stars: Stars, R: Array, zero_mag: float) -> int:
@@ -239,5 +249,5 @@ def _count_unexplained(centroids: Centroids, camera: Camera, stars: Stars, R: Ar
     px, inside = camera.project(stars.rays_icrs[: int(np.searchsorted(stars.v_mag, faintest))] @ R.T)
     if not inside.any():
         return len(significant)
-    distance, _ = cKDTree(px[inside]).query(centroids.xy_px[significant], distance_upper_bound=GATES_PX[-1])
+    distance, _ = cKDTree(px[inside]).query(centroids.xy_px[significant], distance_upper_bound=INLIER_PX)
     return int(np.count_nonzero(~np.isfinite(distance)))
